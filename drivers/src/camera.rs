@@ -1,0 +1,278 @@
+//! Camera models and the calibration of a rig.
+//!
+//! Pinhole with radial-tangential distortion (Brown; OpenCV's order k1 k2 p1 p2), Kannala-Brandt
+//! (KB4, "equidistant"), and double sphere (Usenko et al., 3DV 2018). `project` takes a point in
+//! the camera frame (x right, y down, z forward, metres) to pixels (integer = pixel centre);
+//! `unproject` gives the unit bearing. Both answer `None` outside the model's domain, so a
+//! returned value is always finite and invertible. Radtan: the domain ends where the radial
+//! polynomial stops growing, else far off-axis points would fold back into the image.
+
+use crate::types::Pose;
+use glam::{DVec2, DVec3};
+
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Lens {
+    Radtan { k1: f64, k2: f64, p1: f64, p2: f64 },
+    KannalaBrandt { k: [f64; 4] },
+    DoubleSphere { xi: f64, alpha: f64 },
+}
+
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Camera {
+    pub width: usize,
+    pub height: usize,
+    pub fx: f64,
+    pub fy: f64,
+    pub cx: f64,
+    pub cy: f64,
+    pub lens: Lens,
+}
+
+/// Rows of d(px)/d(point), px/m.
+pub type ProjectionJacobian = [[f64; 3]; 2];
+
+/// A camera of the rig and where it sits.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct RigCamera {
+    pub camera: Camera,
+    pub body_from_cam: Pose,
+}
+
+/// Continuous-time noise densities and range of the inertial unit.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ImuCalibration {
+    pub rate_hz: f64,
+    /// rad/s/√Hz
+    pub gyro_noise: f64,
+    /// rad/s²/√Hz
+    pub gyro_walk: f64,
+    /// m/s²/√Hz
+    pub accel_noise: f64,
+    /// m/s³/√Hz
+    pub accel_walk: f64,
+}
+
+#[derive(Clone, Debug, PartialEq)]
+pub struct Calibration {
+    pub cameras: Vec<RigCamera>,
+    pub imu: ImuCalibration,
+}
+
+const Z_MIN: f64 = 1e-6;
+
+impl Camera {
+    pub fn contains(&self, px: DVec2, margin: f64) -> bool {
+        px.x >= margin
+            && px.y >= margin
+            && px.x <= self.width as f64 - 1.0 - margin
+            && px.y <= self.height as f64 - 1.0 - margin
+    }
+
+    /// Pixel of a point in the camera frame, m. `None` where the model is not defined.
+    pub fn project(&self, p_cam: DVec3) -> Option<DVec2> {
+        self.project_with_jacobian(p_cam).map(|(px, _)| px)
+    }
+
+    /// Pixel and d(px)/d(p_cam).
+    pub fn project_with_jacobian(&self, p: DVec3) -> Option<(DVec2, ProjectionJacobian)> {
+        let (m, dm) = match self.lens {
+            Lens::Radtan { k1, k2, p1, p2 } => radtan(p, k1, k2, p1, p2)?,
+            Lens::KannalaBrandt { k } => kannala_brandt(p, &k)?,
+            Lens::DoubleSphere { xi, alpha } => double_sphere(p, xi, alpha)?,
+        };
+        let px = DVec2::new(self.fx * m.x + self.cx, self.fy * m.y + self.cy);
+        let j = [dm[0].map(|d| d * self.fx), dm[1].map(|d| d * self.fy)];
+        px.is_finite().then_some((px, j))
+    }
+
+    /// Unit bearing in the camera frame of a pixel.
+    pub fn unproject(&self, px: DVec2) -> Option<DVec3> {
+        let m = DVec2::new((px.x - self.cx) / self.fx, (px.y - self.cy) / self.fy);
+        let b = match self.lens {
+            Lens::Radtan { k1, k2, p1, p2 } => radtan_inverse(m, k1, k2, p1, p2)?,
+            Lens::KannalaBrandt { k } => kannala_brandt_inverse(m, &k)?,
+            Lens::DoubleSphere { xi, alpha } => double_sphere_inverse(m, xi, alpha)?,
+        };
+        b.is_finite().then(|| b.normalize())
+    }
+}
+
+type Normalised = (DVec2, [[f64; 3]; 2]);
+
+/// Squared radius (of x/z, y/z) at which r(1 + k1 r² + k2 r⁴) stops growing.
+fn radtan_r2_max(k1: f64, k2: f64) -> f64 {
+    // d/dr = 1 + 3 k1 u + 5 k2 u², u = r²; smallest positive root
+    const UNBOUNDED: f64 = 1e4;
+    if k2.abs() < 1e-12 {
+        return if k1 < 0.0 { -1.0 / (3.0 * k1) } else { UNBOUNDED };
+    }
+    let disc = 9.0 * k1 * k1 - 20.0 * k2;
+    if disc < 0.0 {
+        return UNBOUNDED;
+    }
+    let roots = [(-3.0 * k1 - disc.sqrt()) / (10.0 * k2), (-3.0 * k1 + disc.sqrt()) / (10.0 * k2)];
+    roots.into_iter().filter(|u| *u > 0.0).fold(UNBOUNDED, f64::min)
+}
+
+fn radtan_distort(a: DVec2, k1: f64, k2: f64, p1: f64, p2: f64) -> (DVec2, [[f64; 2]; 2]) {
+    let (x, y) = (a.x, a.y);
+    let u = x * x + y * y;
+    let radial = 1.0 + u * (k1 + u * k2);
+    let d_radial = k1 + 2.0 * k2 * u; // d(radial)/du
+    let m = DVec2::new(
+        x * radial + 2.0 * p1 * x * y + p2 * (u + 2.0 * x * x),
+        y * radial + p1 * (u + 2.0 * y * y) + 2.0 * p2 * x * y,
+    );
+    let xy = 2.0 * x * y * d_radial + 2.0 * p1 * x + 2.0 * p2 * y;
+    let j = [
+        [radial + 2.0 * x * x * d_radial + 2.0 * p1 * y + 6.0 * p2 * x, xy],
+        [xy, radial + 2.0 * y * y * d_radial + 6.0 * p1 * y + 2.0 * p2 * x],
+    ];
+    (m, j)
+}
+
+fn radtan(p: DVec3, k1: f64, k2: f64, p1: f64, p2: f64) -> Option<Normalised> {
+    if !(p.z > Z_MIN) {
+        return None;
+    }
+    let iz = 1.0 / p.z;
+    let a = DVec2::new(p.x * iz, p.y * iz);
+    if !(a.length_squared() < radtan_r2_max(k1, k2)) {
+        return None;
+    }
+    let (m, d) = radtan_distort(a, k1, k2, p1, p2);
+    let row = |r: [f64; 2]| [r[0] * iz, r[1] * iz, -(r[0] * a.x + r[1] * a.y) * iz];
+    Some((m, [row(d[0]), row(d[1])]))
+}
+
+fn radtan_inverse(m: DVec2, k1: f64, k2: f64, p1: f64, p2: f64) -> Option<DVec3> {
+    // Newton on the 2-D distortion; the start is inside the domain and steps are kept there.
+    let r2_max = radtan_r2_max(k1, k2);
+    let mut a = m;
+    if a.length_squared() >= r2_max {
+        a *= 0.95 * (r2_max / a.length_squared()).sqrt();
+    }
+    for _ in 0..30 {
+        let (f, j) = radtan_distort(a, k1, k2, p1, p2);
+        let e = f - m;
+        let det = j[0][0] * j[1][1] - j[0][1] * j[1][0];
+        if det.abs() < 1e-9 {
+            return None;
+        }
+        let step = DVec2::new(j[1][1] * e.x - j[0][1] * e.y, j[0][0] * e.y - j[1][0] * e.x) / det;
+        a -= step;
+        if a.length_squared() >= r2_max {
+            a *= 0.99 * (r2_max / a.length_squared()).sqrt();
+        }
+        if step.length_squared() < 1e-24 {
+            break;
+        }
+    }
+    let (f, _) = radtan_distort(a, k1, k2, p1, p2);
+    ((f - m).length_squared() < 1e-16).then(|| a.extend(1.0))
+}
+
+fn kannala_brandt(p: DVec3, k: &[f64; 4]) -> Option<Normalised> {
+    let u = p.x * p.x + p.y * p.y;
+    let r = u.sqrt();
+    let rho2 = u + p.z * p.z;
+    if !(rho2 > Z_MIN * Z_MIN) || !rho2.is_finite() {
+        return None;
+    }
+    if r < 1e-8 * p.z.abs() {
+        if p.z <= 0.0 {
+            return None;
+        }
+        let iz = 1.0 / p.z;
+        let m = DVec2::new(p.x * iz, p.y * iz);
+        return Some((m, [[iz, 0.0, -m.x * iz], [0.0, iz, -m.y * iz]]));
+    }
+    let th = r.atan2(p.z);
+    let (d, b) = kb_polynomial(th, k);
+    if !(b > 0.0) {
+        return None; // past the monotonic range
+    }
+    let a = d / r;
+    let h = b / rho2;
+    let g = (p.z * h - a) / u;
+    let m = DVec2::new(a * p.x, a * p.y);
+    let j = [[a + p.x * p.x * g, p.x * p.y * g, -p.x * h], [p.x * p.y * g, a + p.y * p.y * g, -p.y * h]];
+    Some((m, j))
+}
+
+/// d(θ) and its derivative.
+fn kb_polynomial(th: f64, k: &[f64; 4]) -> (f64, f64) {
+    let t2 = th * th;
+    let d = th * (1.0 + t2 * (k[0] + t2 * (k[1] + t2 * (k[2] + t2 * k[3]))));
+    let b = 1.0 + t2 * (3.0 * k[0] + t2 * (5.0 * k[1] + t2 * (7.0 * k[2] + t2 * 9.0 * k[3])));
+    (d, b)
+}
+
+fn kannala_brandt_inverse(m: DVec2, k: &[f64; 4]) -> Option<DVec3> {
+    let r = m.length();
+    if r < 1e-12 {
+        return Some(DVec3::Z);
+    }
+    let mut th = r.min(std::f64::consts::PI);
+    for _ in 0..50 {
+        let (d, b) = kb_polynomial(th, k);
+        if b.abs() < 1e-9 {
+            return None;
+        }
+        let step = ((d - r) / b).clamp(-0.3, 0.3);
+        th -= step;
+        if step.abs() < 1e-14 {
+            break;
+        }
+    }
+    let (d, b) = kb_polynomial(th, k);
+    if (d - r).abs() > 1e-9 || b <= 0.0 || !(0.0..=std::f64::consts::PI).contains(&th) {
+        return None;
+    }
+    Some((m / r * th.sin()).extend(th.cos()))
+}
+
+fn double_sphere(p: DVec3, xi: f64, alpha: f64) -> Option<Normalised> {
+    let u = p.x * p.x + p.y * p.y;
+    let d1 = (u + p.z * p.z).sqrt();
+    if !(d1 > Z_MIN) {
+        return None;
+    }
+    let w1 = if alpha > 0.5 { (1.0 - alpha) / alpha } else { alpha / (1.0 - alpha) };
+    let w2 = (w1 + xi) / (2.0 * w1 * xi + xi * xi + 1.0).sqrt();
+    if !(p.z > -w2 * d1) {
+        return None;
+    }
+    let z1 = xi * d1 + p.z;
+    let d2 = (u + z1 * z1).sqrt();
+    let n = alpha * d2 + (1.0 - alpha) * z1;
+    if !(n > Z_MIN) {
+        return None;
+    }
+    let inv = 1.0 / n;
+    let m = DVec2::new(p.x * inv, p.y * inv);
+    // dn/d(x,y,z)
+    let dz1 = DVec3::new(xi * p.x / d1, xi * p.y / d1, xi * p.z / d1 + 1.0);
+    let dd2 = DVec3::new(p.x + z1 * dz1.x, p.y + z1 * dz1.y, z1 * dz1.z) / d2;
+    let dn = alpha * dd2 + (1.0 - alpha) * dz1;
+    let j = [
+        [inv - m.x * dn.x * inv, -m.x * dn.y * inv, -m.x * dn.z * inv],
+        [-m.y * dn.x * inv, inv - m.y * dn.y * inv, -m.y * dn.z * inv],
+    ];
+    Some((m, j))
+}
+
+fn double_sphere_inverse(m: DVec2, xi: f64, alpha: f64) -> Option<DVec3> {
+    let r2 = m.length_squared();
+    let disc = 1.0 - (2.0 * alpha - 1.0) * r2;
+    if disc < 0.0 {
+        return None;
+    }
+    let mz = (1.0 - alpha * alpha * r2) / (alpha * disc.sqrt() + 1.0 - alpha);
+    let s = mz * mz + (1.0 - xi * xi) * r2;
+    if s < 0.0 {
+        return None;
+    }
+    let f = (mz * xi + s.sqrt()) / (mz * mz + r2);
+    Some(DVec3::new(f * m.x, f * m.y, f * mz - xi))
+}

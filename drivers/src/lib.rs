@@ -1,0 +1,16 @@
+//! Sensors of Stipple and the vocabulary they speak.
+//!
+//! This crate builds and tests without Vulkan or OpenCV. It owns the plain data that crosses from
+//! sensors to estimators (`Nanos`, `ImuSample`, `Image`, `Frames`, `Pose`, `Calibration`, `Fault`),
+//! the camera models (calibration is a property of the sensor, and the simulator renders with the
+//! same models the estimator inverts), the reader of recordings and the simulator.
+
+pub mod camera;
+pub mod fault;
+pub mod replay;
+pub mod sim;
+pub mod types;
+
+pub use camera::{Calibration, Camera, ImuCalibration, Lens, RigCamera};
+pub use fault::{Exit, Fault};
+pub use types::{Frames, Image, ImuSample, Nanos, Pose, Span, TimedPose};

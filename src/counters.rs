@@ -1,0 +1,63 @@
+//! Every drop, reject, overflow and fault has a counter and a name. Counters never wrap and never
+//! allocate; the report lists those that are not zero.
+
+use std::sync::atomic::{AtomicU64, Ordering};
+
+macro_rules! counters {
+    ($($(#[doc = $doc:literal])* $name:ident),+ $(,)?) => {
+        #[derive(Debug, Default)]
+        pub struct Counters { $($(#[doc = $doc])* pub $name: Counter),+ }
+        impl Counters {
+            /// Name and value of each, in declaration order.
+            pub fn list(&self) -> Vec<(&'static str, u64)> {
+                vec![$((stringify!($name), self.$name.get())),+]
+            }
+        }
+    };
+}
+
+counters! {
+    /// Frames replaced in the mailbox before the tracker took them.
+    frames_overwritten,
+    /// Inertial samples that did not fit between two frames.
+    imu_overflow,
+    /// Inertial samples refused: not finite, or not newer than the last.
+    imu_rejected,
+    /// Tracks beyond TRACKS.
+    tracks_full,
+    /// Landmarks beyond LANDMARKS.
+    landmarks_full,
+    /// Observations dropped as outliers after optimisation.
+    outliers,
+    /// Optimisations whose step was not finite.
+    solver_failures,
+    /// Keyframes offered while every slot was taken.
+    keyframes_rejected,
+    /// Keyframes dropped because the mapper's store was full.
+    keyframe_store_full,
+    /// Seeds that did not fit into the pool.
+    splats_full,
+    /// Seeds refused because their cell was occupied.
+    seeds_occupied,
+    /// Occupancy cells that found no room in the hash table.
+    occupancy_full,
+    /// Steps whose (Gaussian, tile) list overflowed.
+    intersections_overflow,
+    /// Gaussians skipped by the optimiser because a gradient was not finite.
+    gradients_rejected,
+    /// GPU submissions that failed.
+    gpu_failures,
+}
+
+#[derive(Debug, Default)]
+pub struct Counter(AtomicU64);
+
+impl Counter {
+    pub fn add(&self, n: u64) {
+        self.0.fetch_add(n, Ordering::Relaxed);
+    }
+
+    pub fn get(&self) -> u64 {
+        self.0.load(Ordering::Relaxed)
+    }
+}

@@ -1,0 +1,1 @@
+//! Raw Vulkan compute core.

@@ -1,0 +1,27 @@
+//! Stipple: live stereo-inertial odometry and a 3D Gaussian map, in fixed memory, on small GPUs.
+//!
+//! Sensors push time-stamped samples into bounded queues; a sans-IO estimator turns them into
+//! states and keyframes; a mapper spends a fixed GPU budget on them; every byte is bought at boot
+//! from a board file.
+//!
+//! ```text
+//! frames -> Mailbox(newest) -> frontend -Tracks-> vio -Keyframe(try)-> map.step(deadline)
+//! imu    -> Ring ----------------------------------^                   map -> report, map.ply
+//! ```
+//!
+//! Allowed edges, checked by `tests/tidy.rs`: `math`, `mem`, `limits`, `config` and `counters` are seen by
+//! all; `frontend` and `vio` see the vocabulary of `stipple-drivers`; `vio` also sees `frontend`'s
+//! `Tracks`; `stereo` and `map` see `gpu`; `map` sees `stereo`; `vio` never sees `gpu`; `map` never sees
+//! `frontend`; nobody sees `daemon`.
+
+pub mod config;
+pub mod counters;
+pub mod frontend;
+pub mod gpu;
+pub mod limits;
+pub mod map;
+pub mod math;
+pub mod mem;
+pub mod output;
+pub mod stereo;
+pub mod vio;

@@ -1,0 +1,23 @@
+//! Compile-time shape of the estimator. Capacities that depend on the board live in its `[budget]`.
+
+/// Cameras on a rig. Two is what every board has; four is what headsets have.
+pub const CAMERAS_MAX: usize = 4;
+/// Newest frames kept with velocity and biases (15 dof).
+pub const STATES: usize = 3;
+/// Older frames kept as poses only (6 dof).
+pub const KEYFRAMES: usize = 7;
+/// Window dimension at its peak: one more of each just before marginalisation.
+pub const WINDOW_DIM: usize = 15 * (STATES + 1) + 6 * (KEYFRAMES + 1);
+/// Points tracked in one camera at a time.
+pub const TRACKS: usize = 300;
+/// Landmarks alive in the window.
+pub const LANDMARKS: usize = 1200;
+/// Observations of one landmark: every camera of every frame of the window.
+pub const OBSERVATIONS: usize = CAMERAS_MAX * (STATES + 1 + KEYFRAMES + 1);
+/// Inertial samples between two frames: 1 kHz over half a second.
+pub const IMU_BETWEEN_FRAMES: usize = 512;
+/// Pyramid levels, the full image included.
+pub const PYRAMID_LEVELS: usize = 4;
+
+const _: () = assert!(LANDMARKS >= 2 * TRACKS, "a keyframe change keeps the old landmarks while new ones arrive");
+const _: () = assert!(STATES >= 2, "an inertial factor needs two states");

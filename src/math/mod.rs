@@ -1,0 +1,2 @@
+//! Rotations and rigid transforms (one perturbation convention).
+pub mod so3;

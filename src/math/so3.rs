@@ -1,0 +1,1 @@
+//! SO(3): exponential, logarithm, Jacobians. Rotations are perturbed on the right: R <- R Exp(θ).

@@ -1,0 +1,158 @@
+//! Fixed memory: fixed-capacity lists, the byte table, and the seal.
+//!
+//! After construction every thread of ours calls `seal_thread`; from then on a heap allocation on
+//! it is counted (`heap_after_seal`) in release and aborts in tests that ask for it. OpenCV and the
+//! Vulkan driver allocate behind us, inside `unsealed` sections named for them.
+#![allow(unsafe_code)]
+
+use std::alloc::{GlobalAlloc, Layout, System};
+use std::cell::Cell;
+use std::sync::atomic::{AtomicU64, Ordering};
+
+/// A list of at most `N` items, in place. `push` on a full list gives the item back.
+#[derive(Clone, Debug)]
+pub struct List<T, const N: usize> {
+    items: [T; N],
+    len: usize,
+}
+
+impl<T: Copy + Default, const N: usize> Default for List<T, N> {
+    fn default() -> Self {
+        List { items: [T::default(); N], len: 0 }
+    }
+}
+
+impl<T: Copy + Default, const N: usize> List<T, N> {
+    pub fn push(&mut self, item: T) -> Result<(), T> {
+        if self.len == N {
+            return Err(item);
+        }
+        self.items[self.len] = item;
+        self.len += 1;
+        Ok(())
+    }
+
+    pub fn clear(&mut self) {
+        self.len = 0;
+    }
+
+    /// Keeps the items for which `keep` is true, in order.
+    pub fn retain(&mut self, mut keep: impl FnMut(&T) -> bool) {
+        let mut kept = 0;
+        for i in 0..self.len {
+            if keep(&self.items[i]) {
+                self.items[kept] = self.items[i];
+                kept += 1;
+            }
+        }
+        self.len = kept;
+    }
+}
+
+impl<T, const N: usize> std::ops::Deref for List<T, N> {
+    type Target = [T];
+    fn deref(&self) -> &[T] {
+        &self.items[..self.len]
+    }
+}
+
+impl<T, const N: usize> std::ops::DerefMut for List<T, N> {
+    fn deref_mut(&mut self) -> &mut [T] {
+        &mut self.items[..self.len]
+    }
+}
+
+/// Bytes a part takes, by name; `stipple check` prints the sum of all of them.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Footprint {
+    pub rows: Vec<Row>,
+}
+
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Row {
+    pub name: &'static str,
+    pub bytes: u64,
+    pub gpu: bool,
+}
+
+impl Footprint {
+    pub fn host(&mut self, name: &'static str, bytes: usize) {
+        self.rows.push(Row { name, bytes: bytes as u64, gpu: false });
+    }
+
+    pub fn gpu(&mut self, name: &'static str, bytes: usize) {
+        self.rows.push(Row { name, bytes: bytes as u64, gpu: true });
+    }
+
+    pub fn extend(&mut self, other: Footprint) {
+        self.rows.extend(other.rows);
+    }
+
+    pub fn total(&self) -> u64 {
+        self.rows.iter().map(|r| r.bytes).sum()
+    }
+
+    pub fn gpu_total(&self) -> u64 {
+        self.rows.iter().filter(|r| r.gpu).map(|r| r.bytes).sum()
+    }
+}
+
+thread_local! {
+    static SEALED: Cell<bool> = const { Cell::new(false) };
+}
+
+static HEAP_AFTER_SEAL: AtomicU64 = AtomicU64::new(0);
+
+/// From here on heap allocations of this thread are counted.
+pub fn seal_thread() {
+    SEALED.set(true);
+}
+
+/// Runs code that is known to allocate (a driver, a library, a report) with the seal lifted.
+pub fn unsealed<R>(f: impl FnOnce() -> R) -> R {
+    let was = SEALED.replace(false);
+    let r = f();
+    SEALED.set(was);
+    r
+}
+
+/// Allocations made by sealed threads since the program started.
+pub fn heap_after_seal() -> u64 {
+    HEAP_AFTER_SEAL.load(Ordering::Relaxed)
+}
+
+/// The system allocator, counting what sealed threads ask of it.
+pub struct CountingAllocator;
+
+fn count() {
+    // try_with: a thread being torn down has no flag any more, and is not ours to judge.
+    if SEALED.try_with(Cell::get).unwrap_or(false) {
+        HEAP_AFTER_SEAL.fetch_add(1, Ordering::Relaxed);
+    }
+}
+
+// SAFETY: every call is passed to the system allocator unchanged; counting touches no heap.
+unsafe impl GlobalAlloc for CountingAllocator {
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        count();
+        // SAFETY: the caller's contract is the system allocator's.
+        unsafe { System.alloc(layout) }
+    }
+
+    unsafe fn dealloc(&self, ptr: *mut u8, layout: Layout) {
+        // SAFETY: as above; `ptr` came from `System`.
+        unsafe { System.dealloc(ptr, layout) }
+    }
+
+    unsafe fn alloc_zeroed(&self, layout: Layout) -> *mut u8 {
+        count();
+        // SAFETY: as above.
+        unsafe { System.alloc_zeroed(layout) }
+    }
+
+    unsafe fn realloc(&self, ptr: *mut u8, layout: Layout, new_size: usize) -> *mut u8 {
+        count();
+        // SAFETY: as above.
+        unsafe { System.realloc(ptr, layout, new_size) }
+    }
+}
