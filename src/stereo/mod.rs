@@ -1,7 +1,19 @@
-//! Rectification and stereo depth.
-use stipple_drivers::Pose;
+//! Stereo: a raw pair in, a rectified left image and a depth map at mapping resolution out.
+//!
+//! `Stereo` owns the maps made at boot and every buffer it works in. Rectification runs at full
+//! resolution (matching needs it) and the mapping resolution is a box average of it, so that a
+//! mapping pixel is the mean of the light that fell on it. Depth is asked for anchors only.
 
-/// An undistorted camera at mapping resolution: px = (fx x/z + cx, fy y/z + cy), integer = pixel centre.
+pub mod bm;
+pub mod rectify;
+
+use crate::config::{StereoConfig, StereoMethod};
+use crate::mem::Footprint;
+use bm::BlockMatcher;
+use rectify::{box_average, Rectification, Remap};
+use stipple_drivers::{Calibration, Fault, Image, Pose};
+
+/// An undistorted camera: px = (fx x/z + cx, fy y/z + cy), integer = pixel centre.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Pinhole {
     pub width: usize,
@@ -12,11 +24,230 @@ pub struct Pinhole {
     pub cy: f64,
 }
 
+impl Pinhole {
+    /// The same view with `divisor` x `divisor` pixels averaged into one.
+    pub fn divided(&self, divisor: usize) -> Pinhole {
+        let s = divisor as f64;
+        Pinhole {
+            width: self.width / divisor,
+            height: self.height / divisor,
+            fx: self.fx / s,
+            fy: self.fy / s,
+            cx: (self.cx + 0.5) / s - 0.5,
+            cy: (self.cy + 0.5) / s - 0.5,
+        }
+    }
+}
+
 /// Where the rectified left camera sits on the rig.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RectifiedCamera {
     pub pinhole: Pinhole,
     pub body_from_rect: Pose,
-    /// m
     pub baseline_m: f64,
+}
+
+/// Depth along the optical axis, m; 0 where unknown.
+#[derive(Clone, Debug, PartialEq)]
+pub struct DepthMap {
+    pub width: usize,
+    pub height: usize,
+    pub metres: Vec<f32>,
+}
+
+impl DepthMap {
+    pub fn new(width: usize, height: usize) -> DepthMap {
+        DepthMap { width, height, metres: vec![0.0; width * height] }
+    }
+}
+
+pub struct Stereo {
+    full: RectifiedCamera,
+    mapping: RectifiedCamera,
+    divisor: usize,
+    maps: [Remap; 2],
+    rectified: [Image; 2],
+    matcher: BlockMatcher,
+    /// Disparity at full resolution in 1/16 px, negative where unknown.
+    disparity: Vec<i16>,
+    valid: Vec<u8>,
+    depth_range_m: [f64; 2],
+}
+
+impl Stereo {
+    pub fn footprint(calibration: &Calibration, config: &StereoConfig, divisor: u32) -> Footprint {
+        let camera = &calibration.cameras[0].camera;
+        let px = camera.width * camera.height;
+        let mut f = Footprint::default();
+        f.host("stereo: rectification maps", 2 * px * size_of::<rectify::Tap>());
+        f.host("stereo: rectified pair", 2 * px);
+        f.host("stereo: disparity", px * size_of::<i16>());
+        f.host("stereo: valid mask", px / (divisor * divisor) as usize);
+        f.host("stereo: OpenCV block matching (estimate)", BlockMatcher::bytes(camera.width, camera.height, config));
+        f
+    }
+
+    pub fn new(calibration: &Calibration, config: &StereoConfig, divisor: u32) -> Result<Stereo, Fault> {
+        let StereoMethod::Bm = config.method;
+        let r = Rectification::new(calibration)?;
+        let full = r.camera;
+        let divisor = divisor as usize;
+        let Pinhole { width, height, .. } = full.pinhole;
+        let maps = [r.map(&calibration.cameras[0]), r.map(&calibration.cameras[1])];
+        let mapping = RectifiedCamera { pinhole: full.pinhole.divided(divisor), ..full };
+        let valid = maps[0].valid_blocks(divisor);
+        Ok(Stereo {
+            full,
+            mapping,
+            divisor,
+            maps,
+            rectified: [Image::new(width, height), Image::new(width, height)],
+            matcher: BlockMatcher::new(width, height, config)?,
+            disparity: vec![0; width * height],
+            valid,
+            depth_range_m: [config.depth_min_m, config.depth_max_m],
+        })
+    }
+
+    /// The rectified left camera at mapping resolution.
+    pub fn camera(&self) -> RectifiedCamera {
+        self.mapping
+    }
+
+    /// 1 where a mapping pixel is wholly covered by the raw left image, else 0.
+    pub fn valid_mask(&self) -> &[u8] {
+        &self.valid
+    }
+
+    /// The left image without distortion, at mapping resolution. `out` is pre-shaped.
+    pub fn rectify(&mut self, raw_left: &Image, out: &mut Image) {
+        self.maps[0].apply(raw_left, &mut self.rectified[0]);
+        box_average(&self.rectified[0], self.divisor, out);
+    }
+
+    /// Depth at mapping resolution. `out` is pre-shaped. Answers how many pixels have depth.
+    pub fn depth(&mut self, raw_left: &Image, raw_right: &Image, out: &mut DepthMap) -> Result<usize, Fault> {
+        self.maps[0].apply(raw_left, &mut self.rectified[0]);
+        self.maps[1].apply(raw_right, &mut self.rectified[1]);
+        self.matcher.compute(&self.rectified[0], &self.rectified[1], &mut self.disparity)?;
+        Ok(self.disparity_to_depth(out))
+    }
+
+    /// A mapping pixel takes the median of its block's disparities, and none when less than half
+    /// of the block has one: the mean would invent surfaces between foreground and background.
+    fn disparity_to_depth(&self, out: &mut DepthMap) -> usize {
+        const BLOCK_MAX: usize = 16; // divisor 4
+        let (w, s) = (self.full.pinhole.width, self.divisor);
+        let fb = self.full.pinhole.fx * self.full.baseline_m * f64::from(bm::SUBPIXEL);
+        let mut found = 0;
+        for y in 0..out.height {
+            for x in 0..out.width {
+                let mut block = [0i16; BLOCK_MAX];
+                let mut n = 0;
+                for row in 0..s {
+                    for &d in &self.disparity[(y * s + row) * w + x * s..][..s] {
+                        if d > 0 {
+                            block[n] = d;
+                            n += 1;
+                        }
+                    }
+                }
+                let mut depth = 0.0;
+                if 2 * n >= s * s && n > 0 && self.valid[y * out.width + x] != 0 {
+                    block[..n].sort_unstable();
+                    let z = fb / f64::from(block[n / 2]);
+                    if (self.depth_range_m[0]..=self.depth_range_m[1]).contains(&z) {
+                        depth = z as f32;
+                        found += 1;
+                    }
+                }
+                out.metres[y * out.width + x] = depth;
+            }
+        }
+        found
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use stipple_drivers::{Camera, ImuCalibration, Lens, RigCamera};
+
+    fn rig(lens: Lens, f: f64) -> Calibration {
+        let camera = Camera { width: 320, height: 240, fx: f, fy: f, cx: 160.3, cy: 118.9, lens };
+        let right = Pose::new(glam::DQuat::from_rotation_y(0.01), glam::DVec3::new(0.1, 0.002, -0.001));
+        Calibration {
+            cameras: vec![
+                RigCamera { camera, body_from_cam: Pose::IDENTITY },
+                RigCamera { camera, body_from_cam: right },
+            ],
+            imu: ImuCalibration {
+                rate_hz: 200.0,
+                gyro_noise: 1e-4,
+                gyro_walk: 1e-5,
+                accel_noise: 1e-3,
+                accel_walk: 1e-4,
+            },
+        }
+    }
+
+    #[cfg(feature = "opencv")]
+    #[test]
+    fn plane_has_its_depth() {
+        let lens = Lens::Radtan { k1: -0.2, k2: 0.05, p1: 1e-4, p2: -1e-4 };
+        let rig = rig(lens, 200.0);
+        let z_world = 2.0;
+        let draw = |c: &RigCamera| {
+            let mut image = Image::new(320, 240);
+            for y in 0..240 {
+                for x in 0..320 {
+                    let b = c.camera.unproject(glam::DVec2::new(x as f64, y as f64)).expect("inside the model");
+                    let d = c.body_from_cam.q * b;
+                    let p = c.body_from_cam.p + d * ((z_world - c.body_from_cam.p.z) / d.z);
+                    let cell = |s: f64| ((p.x * s).sin() * (p.y * s * 1.3 + p.x).cos()) * 40.0;
+                    image.pixels[y * 320 + x] = (128.0 + cell(23.0) + cell(61.0) + cell(7.0)) as u8;
+                }
+            }
+            image
+        };
+        let (left, right) = (draw(&rig.cameras[0]), draw(&rig.cameras[1]));
+        for divisor in [1, 2] {
+            let mut stereo = Stereo::new(&rig, &StereoConfig::default(), divisor).expect("a sound rig");
+            let camera = stereo.camera();
+            let mut depth = DepthMap::new(camera.pinhole.width, camera.pinhole.height);
+            let found = stereo.depth(&left, &right, &mut depth).expect("matching runs");
+            assert!(found * 2 > depth.metres.len(), "{found} of {}", depth.metres.len());
+            let mut worst = vec![];
+            for y in 0..depth.height {
+                for x in 0..depth.width {
+                    let z = f64::from(depth.metres[y * depth.width + x]);
+                    if z > 0.0 {
+                        let p = camera.pinhole;
+                        let ray = glam::DVec3::new((x as f64 - p.cx) / p.fx, (y as f64 - p.cy) / p.fy, 1.0) * z;
+                        worst.push((camera.body_from_rect.transform(ray).z - z_world).abs());
+                    }
+                }
+            }
+            worst.sort_by(f64::total_cmp);
+            assert!(worst[worst.len() / 2] < 0.02, "median error {} m", worst[worst.len() / 2]);
+            assert!(worst[worst.len() * 95 / 100] < 0.1, "95 % error {} m", worst[worst.len() * 95 / 100]);
+        }
+    }
+
+    #[test]
+    fn divided_pinhole_sees_the_same_rays() {
+        let p = Pinhole { width: 64, height: 48, fx: 50.0, fy: 51.0, cx: 31.2, cy: 24.1 };
+        let h = p.divided(2);
+        // The centre of mapping pixel (3, 5) is the corner between four full pixels, (6.5, 10.5).
+        assert!(((3.0 - h.cx) / h.fx - (6.5 - p.cx) / p.fx).abs() < 1e-12);
+        assert!(((5.0 - h.cy) / h.fy - (10.5 - p.cy) / p.fy).abs() < 1e-12);
+    }
+
+    #[test]
+    fn fisheye_is_rectified_to_a_bounded_angle() {
+        let rig = rig(Lens::KannalaBrandt { k: [0.01, -0.01, 0.005, -0.001] }, 100.0);
+        let r = Rectification::new(&rig).expect("a sound rig");
+        let half = (r.camera.pinhole.width as f64 / 2.0 / r.camera.pinhole.fx).atan().to_degrees();
+        assert!((30.0..61.0).contains(&half), "{half}");
+    }
 }

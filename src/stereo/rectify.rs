@@ -1,0 +1,185 @@
+//! Rectification: both cameras turned so that their rows are parallel to the baseline, lens
+//! distortion removed (any model of `stipple_drivers::camera`), as look-up tables made at boot.
+//!
+//! The common focal length and principal point are the ones that show the widest view without
+//! blank borders along the middle row and column of both cameras, and no ray further off-axis than
+//! `TAN_MAX`: a pinhole cannot hold a fisheye's whole view, and beyond that angle one raw pixel
+//! would be smeared over many.
+
+use super::{Pinhole, RectifiedCamera};
+use glam::{DMat3, DQuat, DVec2, DVec3};
+use stipple_drivers::{Calibration, Exit, Fault, Image, Pose, RigCamera};
+
+/// tan of the widest half angle of a rectified view (60°, 1.73; 50° keeps fisheye pixels under 2.4x stretch).
+const TAN_MAX: f64 = 1.2;
+/// Weights are in 1/128 px.
+const WEIGHT_BITS: u32 = 7;
+/// Marks a pixel without source.
+const OUTSIDE: u32 = u32::MAX;
+
+pub struct Rectification {
+    pub camera: RectifiedCamera,
+    /// Rotation of each rectified camera on the rig; both are the same.
+    body_from_rect: DQuat,
+}
+
+impl Rectification {
+    pub fn new(calibration: &Calibration) -> Result<Rectification, Fault> {
+        let bad = |what: &str| {
+            Fault::new(
+                Exit::Config,
+                "calibration",
+                what,
+                "stereo needs cameras 0 and 1 side by side, looking the same way",
+            )
+        };
+        let [left, right, ..] = &calibration.cameras[..] else {
+            return Err(bad("has fewer than two cameras"));
+        };
+        let along = right.body_from_cam.p - left.body_from_cam.p;
+        let baseline_m = along.length();
+        if !(baseline_m > 1e-4) {
+            return Err(bad("has a zero baseline between cameras 0 and 1"));
+        }
+        let axis = |c: &RigCamera| c.body_from_cam.q * DVec3::Z;
+        let x = along / baseline_m;
+        let forward = axis(left) + axis(right);
+        let z = forward - x * x.dot(forward);
+        if z.length() < 0.5 || (left.body_from_cam.q * DVec3::X).dot(x) < 0.5 {
+            return Err(bad("has cameras 0 and 1 not side by side (is camera 1 the right one?)"));
+        }
+        let z = z.normalize();
+        let body_from_rect = DQuat::from_mat3(&DMat3::from_cols(x, z.cross(x), z)).normalize();
+        let pinhole = common_pinhole(left, right, body_from_rect)
+            .ok_or_else(|| bad("leaves no common view after rectification"))?;
+        let pose = Pose::new(body_from_rect, left.body_from_cam.p);
+        Ok(Rectification { camera: RectifiedCamera { pinhole, body_from_rect: pose, baseline_m }, body_from_rect })
+    }
+
+    /// Where each rectified pixel comes from in a raw image of `camera`.
+    pub fn map(&self, camera: &RigCamera) -> Remap {
+        let p = &self.camera.pinhole;
+        let cam_from_rect = camera.body_from_cam.q.conjugate() * self.body_from_rect;
+        let raw = &camera.camera;
+        let mut taps = Vec::with_capacity(p.width * p.height);
+        for y in 0..p.height {
+            for x in 0..p.width {
+                let ray = DVec3::new((x as f64 - p.cx) / p.fx, (y as f64 - p.cy) / p.fy, 1.0);
+                let tap = raw.project(cam_from_rect * ray).filter(|px| raw.contains(*px, 0.0));
+                taps.push(tap.map_or(Tap { index: OUTSIDE, wx: 0, wy: 0 }, |px| Tap::at(px, raw.width, raw.height)));
+            }
+        }
+        Remap { width: p.width, height: p.height, source_width: raw.width, taps }
+    }
+}
+
+/// The common intrinsics of both rectified views; see the module's text.
+fn common_pinhole(left: &RigCamera, right: &RigCamera, body_from_rect: DQuat) -> Option<Pinhole> {
+    let (width, height) = (left.camera.width, left.camera.height);
+    let mut side = [TAN_MAX; 4]; // left, right, top, bottom: tangents of the view's edges
+    for c in [left, right] {
+        let rect_from_cam = body_from_rect.conjugate() * c.body_from_cam.q;
+        let (w, h) = ((c.camera.width - 1) as f64, (c.camera.height - 1) as f64);
+        let edges = [(0.0, h / 2.0), (w, h / 2.0), (w / 2.0, 0.0), (w / 2.0, h)];
+        for (i, (x, y)) in edges.into_iter().enumerate() {
+            // An edge outside the model's domain (fisheye past 180°) or behind does not limit.
+            let Some(b) = c.camera.unproject(DVec2::new(x, y)) else { continue };
+            let r = rect_from_cam * b;
+            if r.z > 0.05 {
+                let t = [-r.x, r.x, -r.y, r.y][i] / r.z;
+                side[i] = side[i].min(t);
+            }
+        }
+    }
+    let [l, r, t, b] = side;
+    if l + r < 0.1 || t + b < 0.1 {
+        return None;
+    }
+    let f = (width as f64 / (l + r)).max(height as f64 / (t + b));
+    let cx = 0.5 * (width as f64 - 1.0) + 0.5 * (l - r) * f;
+    let cy = 0.5 * (height as f64 - 1.0) + 0.5 * (t - b) * f;
+    Some(Pinhole { width, height, fx: f, fy: f, cx, cy })
+}
+
+/// One bilinear look-up.
+#[derive(Clone, Copy, Debug)]
+pub struct Tap {
+    /// Upper left source pixel.
+    index: u32,
+    wx: u16,
+    wy: u16,
+}
+
+impl Tap {
+    fn at(px: DVec2, width: usize, height: usize) -> Tap {
+        let one = f64::from(1 << WEIGHT_BITS);
+        // The last row and column are reached with weight one from the pixel before them.
+        let x0 = (px.x.floor() as usize).min(width - 2);
+        let y0 = (px.y.floor() as usize).min(height - 2);
+        Tap {
+            index: (y0 * width + x0) as u32,
+            wx: ((px.x - x0 as f64) * one).round() as u16,
+            wy: ((px.y - y0 as f64) * one).round() as u16,
+        }
+    }
+}
+
+pub struct Remap {
+    width: usize,
+    height: usize,
+    source_width: usize,
+    taps: Vec<Tap>,
+}
+
+impl Remap {
+    /// Pixels without source become 0.
+    pub fn apply(&self, raw: &Image, out: &mut Image) {
+        debug_assert!(raw.width == self.source_width && out.width == self.width);
+        let one = 1u32 << WEIGHT_BITS;
+        for (tap, px) in self.taps.iter().zip(&mut out.pixels) {
+            *px = if tap.index == OUTSIDE {
+                0
+            } else {
+                let i = tap.index as usize;
+                let j = i + self.source_width;
+                let (wx, wy) = (u32::from(tap.wx), u32::from(tap.wy));
+                let top = u32::from(raw.pixels[i]) * (one - wx) + u32::from(raw.pixels[i + 1]) * wx;
+                let bottom = u32::from(raw.pixels[j]) * (one - wx) + u32::from(raw.pixels[j + 1]) * wx;
+                ((top * (one - wy) + bottom * wy + (1 << (2 * WEIGHT_BITS - 1))) >> (2 * WEIGHT_BITS)) as u8
+            };
+        }
+    }
+
+    /// 1 for each `divisor` x `divisor` block that has a source everywhere.
+    pub fn valid_blocks(&self, divisor: usize) -> Vec<u8> {
+        let (w, h) = (self.width / divisor, self.height / divisor);
+        let mut valid = vec![1u8; w * h];
+        for y in 0..h * divisor {
+            for x in 0..w * divisor {
+                if self.taps[y * self.width + x].index == OUTSIDE {
+                    valid[(y / divisor) * w + x / divisor] = 0;
+                }
+            }
+        }
+        valid
+    }
+}
+
+/// Mean of each `divisor` x `divisor` block; `out` is pre-shaped.
+pub fn box_average(image: &Image, divisor: usize, out: &mut Image) {
+    if divisor == 1 {
+        out.copy_from(image);
+        return;
+    }
+    let n = (divisor * divisor) as u32;
+    for y in 0..out.height {
+        for x in 0..out.width {
+            let mut sum = n / 2;
+            for row in 0..divisor {
+                let start = (y * divisor + row) * image.width + x * divisor;
+                sum += image.pixels[start..start + divisor].iter().map(|p| u32::from(*p)).sum::<u32>();
+            }
+            out.pixels[y * out.width + x] = (sum / n) as u8;
+        }
+    }
+}
