@@ -7,8 +7,12 @@
 //! returned value is always finite and invertible. Radtan: the domain ends where the radial
 //! polynomial stops growing, else far off-axis points would fold back into the image.
 
+// `!(a > b)` and not `a <= b`: it also refuses NaN.
+#![allow(clippy::neg_cmp_op_on_partial_ord)]
+
 use crate::types::Pose;
 use glam::{DVec2, DVec3};
+use std::f64::consts::PI;
 
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Lens {
@@ -101,17 +105,11 @@ type Normalised = (DVec2, [[f64; 3]; 2]);
 
 /// Squared radius (of x/z, y/z) at which r(1 + k1 r² + k2 r⁴) stops growing.
 fn radtan_r2_max(k1: f64, k2: f64) -> f64 {
-    // d/dr = 1 + 3 k1 u + 5 k2 u², u = r²; smallest positive root
+    // 89.4 degrees off axis
     const UNBOUNDED: f64 = 1e4;
-    if k2.abs() < 1e-12 {
-        return if k1 < 0.0 { -1.0 / (3.0 * k1) } else { UNBOUNDED };
-    }
-    let disc = 9.0 * k1 * k1 - 20.0 * k2;
-    if disc < 0.0 {
-        return UNBOUNDED;
-    }
-    let roots = [(-3.0 * k1 - disc.sqrt()) / (10.0 * k2), (-3.0 * k1 + disc.sqrt()) / (10.0 * k2)];
-    roots.into_iter().filter(|u| *u > 0.0).fold(UNBOUNDED, f64::min)
+    // d/dr = 1 + 3 k1 u + 5 k2 u², u = r²; its smallest positive root, in the form that stands k2 = 0
+    let root = (9.0 * k1 * k1 - 20.0 * k2).sqrt();
+    [2.0 / (-3.0 * k1 + root), 2.0 / (-3.0 * k1 - root)].into_iter().filter(|u| *u > 0.0).fold(UNBOUNDED, f64::min)
 }
 
 fn radtan_distort(a: DVec2, k1: f64, k2: f64, p1: f64, p2: f64) -> (DVec2, [[f64; 2]; 2]) {
@@ -141,6 +139,9 @@ fn radtan(p: DVec3, k1: f64, k2: f64, p1: f64, p2: f64) -> Option<Normalised> {
         return None;
     }
     let (m, d) = radtan_distort(a, k1, k2, p1, p2);
+    if !(d[0][0] * d[1][1] > d[0][1] * d[1][0]) {
+        return None; // folded by the tangential part
+    }
     let row = |r: [f64; 2]| [r[0] * iz, r[1] * iz, -(r[0] * a.x + r[1] * a.y) * iz];
     Some((m, [row(d[0]), row(d[1])]))
 }
@@ -188,10 +189,10 @@ fn kannala_brandt(p: DVec3, k: &[f64; 4]) -> Option<Normalised> {
         return Some((m, [[iz, 0.0, -m.x * iz], [0.0, iz, -m.y * iz]]));
     }
     let th = r.atan2(p.z);
-    let (d, b) = kb_polynomial(th, k);
-    if !(b > 0.0) {
-        return None; // past the monotonic range
+    if !kb_grows(th, k) {
+        return None;
     }
+    let (d, b) = kb_polynomial(th, k);
     let a = d / r;
     let h = b / rho2;
     let g = (p.z * h - a) / u;
@@ -208,28 +209,49 @@ fn kb_polynomial(th: f64, k: &[f64; 4]) -> (f64, f64) {
     (d, b)
 }
 
+/// Whether d grows all the way from the axis to `th`; past a maximum it may grow again, which is no
+/// longer the same lens. Sampled: a dip between samples is shallower than the fold it stands for.
+fn kb_grows(th: f64, k: &[f64; 4]) -> bool {
+    const SAMPLES: u32 = 8;
+    (1..=SAMPLES).all(|i| kb_polynomial(th * f64::from(i) / f64::from(SAMPLES), k).1 > 0.0)
+}
+
 fn kannala_brandt_inverse(m: DVec2, k: &[f64; 4]) -> Option<DVec3> {
+    const STEP: f64 = 0.1; // rad
     let r = m.length();
     if r < 1e-12 {
         return Some(DVec3::Z);
     }
-    let mut th = r.min(std::f64::consts::PI);
-    for _ in 0..50 {
-        let (d, b) = kb_polynomial(th, k);
-        if b.abs() < 1e-9 {
+    // Bracket on the first growing stretch, then Newton, which alone may end beyond the maximum.
+    let (mut low, mut high) = (0.0, STEP);
+    loop {
+        let (d, b) = kb_polynomial(high, k);
+        if !(b > 0.0) || d >= r {
+            break;
+        }
+        if high >= PI {
             return None;
         }
-        let step = ((d - r) / b).clamp(-0.3, 0.3);
-        th -= step;
-        if step.abs() < 1e-14 {
+        (low, high) = (high, (high + STEP).min(PI));
+    }
+    let mut th = 0.5 * (low + high);
+    for _ in 0..60 {
+        let (d, b) = kb_polynomial(th, k);
+        if !(b > 0.0) || d > r {
+            high = th;
+        } else {
+            low = th;
+        }
+        let newton = th - (d - r) / b;
+        let next = if newton >= low && newton <= high { newton } else { 0.5 * (low + high) };
+        let step = next - th;
+        th = next;
+        if step.abs() < 1e-15 {
             break;
         }
     }
     let (d, b) = kb_polynomial(th, k);
-    if (d - r).abs() > 1e-9 || b <= 0.0 || !(0.0..=std::f64::consts::PI).contains(&th) {
-        return None;
-    }
-    Some((m / r * th.sin()).extend(th.cos()))
+    ((d - r).abs() < 1e-9 && b > 0.0).then(|| (m / r * th.sin()).extend(th.cos()))
 }
 
 fn double_sphere(p: DVec3, xi: f64, alpha: f64) -> Option<Normalised> {

@@ -1,1 +1,148 @@
-//! (under construction)
+//! Recorded stereo-inertial datasets: EuRoC ASL (`mav0`, sensor.yaml) and TUM-VI (`mav0` beside a
+//! Kalibr camchain.yaml), images as 8- or 16-bit PNG or JPEG.
+//!
+//! `Recording::open` reads every table and the calibration, pairs the images by stamp and checks the
+//! inertial stream against them; a `Reader` decodes the images of one pair at a time. What makes the
+//! whole recording useless (no calibration, an empty table) is a `Fault`; what spoils one row or one
+//! image costs that row or image, a named counter and a warning with file and line. Stamps that do
+//! not grow are dropped so that the most rows stay (`order`), hence one corrupt stamp far in the
+//! future costs itself and not the rest of the recording.
+
+mod calibration;
+mod findings;
+mod images;
+mod order;
+mod pairing;
+mod table;
+mod trajectory;
+
+pub use calibration::read_calibration;
+pub use findings::ReplayCounters;
+pub use images::{FrameFault, FrameFaultKind, Reader};
+pub use pairing::{ImageFile, Pair};
+pub use trajectory::read_trajectory;
+
+use crate::types::{ImuSample, Nanos, Span, TimedPose};
+use crate::{Calibration, Exit, Fault};
+use findings::Findings;
+use glam::DVec3;
+use std::path::{Path, PathBuf};
+use table::Row;
+
+/// Cameras read from one recording at most; the first two are required.
+pub const CAMERAS_MAX: usize = 4;
+
+#[derive(Clone, Debug, PartialEq)]
+pub struct OpenOptions {
+    /// Largest stamp difference of images of one pair.
+    pub pair_tolerance: Span,
+    /// Gap between inertial samples that counts as a hole.
+    pub imu_hole: Span,
+    /// Calibration used instead of the recording's own; see `read_calibration`.
+    pub calibration: Option<PathBuf>,
+}
+
+impl Default for OpenOptions {
+    fn default() -> Self {
+        OpenOptions { pair_tolerance: Span(2_000_000), imu_hole: Span(20_000_000), calibration: None }
+    }
+}
+
+/// A dataset with every table in memory and every image on disk. All stamps grow strictly.
+#[derive(Clone, Debug)]
+pub struct Recording {
+    pub calibration: Calibration,
+    pub imu: Vec<ImuSample>,
+    pub pairs: Vec<Pair>,
+    /// Ground truth, `world_from_body`; empty where the recording has none.
+    pub truth: Vec<TimedPose>,
+    /// "file:line: what", at most `findings::WARNINGS_OF_A_KIND` of each kind.
+    pub warnings: Vec<String>,
+    pub counters: ReplayCounters,
+}
+
+impl Recording {
+    /// `dataset` holds `mav0/` or is it.
+    pub fn open(dataset: &Path, options: &OpenOptions) -> Result<Recording, Fault> {
+        let (home, mav0) = layout(dataset)?;
+        let mut findings = Findings::default();
+        let mut calibration = match &options.calibration {
+            Some(path) => calibration::read(path, &mut findings)?,
+            None => calibration::of_recording(&home, &mav0, &mut findings)?,
+        };
+        let lists = pairing::image_lists(&mav0, &mut calibration, &mut findings)?;
+        let pairs = pairing::pair(&mav0, &lists, options.pair_tolerance, &mut findings)?;
+        let imu = read_imu(&mav0.join("imu0/data.csv"), options.imu_hole, &mut findings)?;
+        check_cover(&pairs, &imu, &mut findings);
+        let truth = ["state_groundtruth_estimate0/data.csv", "mocap0/data.csv"]
+            .into_iter()
+            .map(|name| mav0.join(name))
+            .find(|path| path.is_file())
+            .map_or(Ok(Vec::new()), |path| trajectory::read(&path, &mut findings))?;
+        let Findings { warnings, counters } = findings;
+        Ok(Recording { calibration, imu, pairs, truth, warnings, counters })
+    }
+
+    /// A decoder of the pairs with scratch of its own, for a thread of its own.
+    pub fn reader(&self) -> Reader {
+        Reader::new(self.pairs.clone())
+    }
+}
+
+/// The folder that holds `mav0`, and `mav0`.
+fn layout(dataset: &Path) -> Result<(PathBuf, PathBuf), Fault> {
+    let missing = |what: &str| {
+        let fix = "name a folder that holds mav0/ (EuRoC ASL or TUM-VI)";
+        Err(Fault::new(Exit::NoInput, dataset.display().to_string(), what, fix))
+    };
+    if !dataset.is_dir() {
+        return missing("no such folder");
+    }
+    let inner = dataset.join("mav0");
+    if inner.is_dir() {
+        return Ok((dataset.to_path_buf(), inner));
+    }
+    if dataset.join("cam0").is_dir() {
+        return Ok((dataset.join(".."), dataset.to_path_buf()));
+    }
+    missing("holds neither mav0/ nor cam0/")
+}
+
+fn read_imu(path: &Path, hole: Span, findings: &mut Findings) -> Result<Vec<ImuSample>, Fault> {
+    const COLUMNS: &str = "stamp [ns], gyro x y z [rad/s], accelerometer x y z [m/s²]";
+    let parse = |fields: &[&str]| -> Option<ImuSample> {
+        let [t, values @ ..] = fields else { return None };
+        let v: [f64; 6] = table::numbers(values)?.try_into().ok()?;
+        let (gyro_body, accel_body) = (DVec3::new(v[0], v[1], v[2]), DVec3::new(v[3], v[4], v[5]));
+        Some(ImuSample { t: Nanos(t.parse().ok()?), gyro_body, accel_body })
+    };
+    let mut rows = table::read(path, COLUMNS, parse, findings)?;
+    rows.retain(|row| {
+        if !row.value.is_finite() {
+            findings.warn(|c| &mut c.imu_not_finite, path, row.line, "sample is not finite: dropped");
+        }
+        row.value.is_finite()
+    });
+    let rows = order::increasing(rows, |s| s.t, path, findings);
+    if rows.is_empty() {
+        return Err(Fault::new(Exit::Data, path.display().to_string(), "holds no finite sample", "record again"));
+    }
+    for pair in rows.windows(2) {
+        let gap = pair[1].value.t - pair[0].value.t;
+        if gap > hole {
+            let what = format!("hole of {:.4} s before this sample", gap.secs());
+            findings.warn(|c| &mut c.imu_holes, path, pair[1].line, what);
+        }
+    }
+    Ok(rows.into_iter().map(|r: Row<ImuSample>| r.value).collect())
+}
+
+/// Pairs outside the inertial stream stay (mapping with given poses can use them) but are counted.
+fn check_cover(pairs: &[Pair], imu: &[ImuSample], findings: &mut Findings) {
+    let (Some(first), Some(last)) = (imu.first(), imu.last()) else { return };
+    for pair in pairs.iter().filter(|p| p.t < first.t || p.t > last.t) {
+        let image = &pair.images[0];
+        let what = "image outside the span of the inertial samples";
+        findings.warn(|c| &mut c.images_outside_imu, &image.list, image.line, what);
+    }
+}

@@ -1,0 +1,109 @@
+//! A YAML or JSON file as a tree whose faults name the key and the line. Keys are JSON pointers
+//! (`/cam0/intrinsics`).
+
+use super::super::{findings, table};
+use super::rigid;
+use crate::types::Pose;
+use crate::{Exit, Fault};
+use serde_json::Value;
+use std::path::{Path, PathBuf};
+
+pub struct Document {
+    pub path: PathBuf,
+    text: String,
+    root: Value,
+}
+
+impl Document {
+    pub fn read(path: &Path) -> Result<Document, Fault> {
+        let bytes = table::read_bytes(path)?;
+        let wrong = |line: usize, what: String| {
+            let place = findings::place(path, line);
+            Fault::new(Exit::Config, place, what.replace('\n', " "), "correct the calibration file")
+        };
+        let mut text = String::from_utf8(bytes).map_err(|_| wrong(0, "is not text".into()))?;
+        if text.starts_with('%') {
+            // OpenCV writes "%YAML:1.0", which is not YAML; blanked so that lines keep their numbers
+            let end = text.find('\n').unwrap_or(text.len());
+            text.replace_range(..end, "");
+        }
+        let root: Result<Value, _> = if text.trim_start().starts_with('{') {
+            serde_json::from_str(&text).map_err(|e| wrong(e.line(), e.to_string()))
+        } else {
+            serde_yaml_ng::from_str(&text)
+                .map_err(|e| wrong(e.location().map_or(0, |l| l.line()), format!("not YAML: {e}")))
+        };
+        Ok(Document { path: path.to_path_buf(), root: root?, text })
+    }
+
+    pub fn has(&self, key: &str) -> bool {
+        self.root.pointer(key).is_some()
+    }
+
+    /// Where the key stands, or the deepest part of it that is there; 0 if none is.
+    pub fn line(&self, key: &str) -> usize {
+        let mut found = 0;
+        for part in key.split('/').filter(|p| !p.is_empty() && p.parse::<usize>().is_err()) {
+            let names = |l: &str| {
+                let l = l.trim_start().trim_start_matches(['"', '\'']);
+                l.strip_prefix(part).is_some_and(|rest| rest.trim_start_matches(['"', '\'', ' ']).starts_with(':'))
+            };
+            match self.text.lines().enumerate().skip(found).find(|(_, l)| names(l)) {
+                Some((i, _)) => found = i + 1,
+                None => break,
+            }
+        }
+        found
+    }
+
+    pub fn fault(&self, key: &str, what: &str) -> Fault {
+        let name = key.trim_start_matches('/').replace('/', ".");
+        let what = if name.is_empty() { what.to_string() } else { format!("{name}: {what}") };
+        Fault::new(Exit::Config, findings::place(&self.path, self.line(key)), what, "correct the calibration file")
+    }
+
+    fn get(&self, key: &str) -> Result<&Value, Fault> {
+        self.root.pointer(key).ok_or_else(|| self.fault(key, "this key is missing"))
+    }
+
+    pub fn text(&self, key: &str) -> Result<&str, Fault> {
+        self.get(key)?.as_str().ok_or_else(|| self.fault(key, "must be a word"))
+    }
+
+    pub fn number(&self, key: &str) -> Result<f64, Fault> {
+        finite(self.get(key)?).ok_or_else(|| self.fault(key, "must be a number"))
+    }
+
+    pub fn positive(&self, key: &str) -> Result<f64, Fault> {
+        let value = self.number(key)?;
+        if value > 0.0 {
+            return Ok(value);
+        }
+        Err(self.fault(key, "must be positive"))
+    }
+
+    /// A list of numbers, or a list of such lists row by row.
+    pub fn all_numbers(&self, key: &str) -> Result<Vec<f64>, Fault> {
+        let wrong = || self.fault(key, "must be a list of numbers");
+        let items = self.get(key)?.as_array().ok_or_else(wrong)?;
+        let flat = items.iter().flat_map(|v| v.as_array().map_or(std::slice::from_ref(v), Vec::as_slice));
+        flat.map(|v| finite(v).ok_or_else(wrong)).collect()
+    }
+
+    pub fn numbers(&self, key: &str, n: usize) -> Result<Vec<f64>, Fault> {
+        let values = self.all_numbers(key)?;
+        if values.len() != n {
+            return Err(self.fault(key, &format!("must be {n} numbers, found {}", values.len())));
+        }
+        Ok(values)
+    }
+
+    pub fn transform(&self, key: &str) -> Result<Pose, Fault> {
+        rigid(&self.numbers(key, 16)?).map_err(|what| self.fault(key, what))
+    }
+}
+
+fn finite(value: &Value) -> Option<f64> {
+    let number = value.as_f64().or_else(|| value.as_str()?.parse().ok())?;
+    number.is_finite().then_some(number)
+}

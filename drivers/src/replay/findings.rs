@@ -1,0 +1,84 @@
+//! What was wrong with a recording: a counter for each kind, and warnings, of which only the first
+//! few of a kind are kept so that a spoilt recording cannot fill memory or the screen.
+
+use std::path::Path;
+
+/// Warnings printed of one kind; the rest are only counted.
+pub const WARNINGS_OF_A_KIND: u64 = 20;
+
+macro_rules! counters {
+    ($($(#[doc = $doc:literal])* $name:ident),+ $(,)?) => {
+        /// Faults of a recording, by kind.
+        #[derive(Clone, Debug, Default, PartialEq, Eq)]
+        pub struct ReplayCounters { $($(#[doc = $doc])* pub $name: u64),+ }
+        impl ReplayCounters {
+            /// Name and value of each, in declaration order.
+            pub fn list(&self) -> Vec<(&'static str, u64)> {
+                vec![$((stringify!($name), self.$name)),+]
+            }
+
+            /// Adds the counts of another (those of a `Reader` to those of its `Recording`).
+            pub fn add(&mut self, other: &ReplayCounters) {
+                $(self.$name += other.$name;)+
+            }
+        }
+    };
+}
+
+counters! {
+    /// Rows of a csv that could not be read: letters, missing or additional fields.
+    rows_malformed,
+    /// Rows with the stamp of another row of the same table.
+    stamps_duplicated,
+    /// Rows out of time order.
+    stamps_out_of_order,
+    /// Image rows without a partner in every other camera.
+    images_unpaired,
+    /// Images listed whose file is missing.
+    images_missing,
+    /// Image files that are truncated or otherwise not decodable.
+    images_undecodable,
+    /// Image files whose size differs from the calibration's.
+    images_wrong_size,
+    /// Image pairs before the first or after the last inertial sample.
+    images_outside_imu,
+    /// Inertial samples that are not finite.
+    imu_not_finite,
+    /// Gaps in the inertial stream.
+    imu_holes,
+    /// Calibration facts that are missing and taken from defaults, or present and not used.
+    calibration_notes,
+}
+
+#[derive(Clone, Debug, Default)]
+pub struct Findings {
+    pub warnings: Vec<String>,
+    pub counters: ReplayCounters,
+}
+
+impl Findings {
+    /// Counts a fault and keeps its warning; line 0 stands for the whole file.
+    pub fn warn(
+        &mut self,
+        kind: fn(&mut ReplayCounters) -> &mut u64,
+        path: &Path,
+        line: usize,
+        what: impl std::fmt::Display,
+    ) {
+        let count = kind(&mut self.counters);
+        *count += 1;
+        if *count > WARNINGS_OF_A_KIND {
+            return;
+        }
+        let place = place(path, line);
+        let more = if *count == WARNINGS_OF_A_KIND { " (more of this kind are only counted)" } else { "" };
+        self.warnings.push(format!("{place}: {what}{more}"));
+    }
+}
+
+pub fn place(path: &Path, line: usize) -> String {
+    match line {
+        0 => path.display().to_string(),
+        _ => format!("{}:{line}", path.display()),
+    }
+}

@@ -1,0 +1,110 @@
+//! Image lists of the cameras and the pairs made of them.
+
+use super::findings::Findings;
+use super::table::{self, Row};
+use super::{order, CAMERAS_MAX};
+use crate::types::{Nanos, Span};
+use crate::{Calibration, Exit, Fault};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+/// An image file and where it is listed.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ImageFile {
+    pub path: PathBuf,
+    pub list: Arc<Path>,
+    pub line: usize,
+}
+
+/// One image of every camera, taken together; `t` is camera 0's stamp.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Pair {
+    pub t: Nanos,
+    pub images: Vec<ImageFile>,
+}
+
+pub struct ImageRow {
+    t: Nanos,
+    file: String,
+}
+
+/// The image lists of the calibrated cameras. Cameras beyond the second that were not recorded
+/// leave the calibration.
+pub fn image_lists(
+    mav0: &Path,
+    calibration: &mut Calibration,
+    findings: &mut Findings,
+) -> Result<Vec<Vec<Row<ImageRow>>>, Fault> {
+    let list = |k: usize| list_path(mav0, k);
+    for k in 2..calibration.cameras.len() {
+        if !list(k).is_file() {
+            let what = format!("cameras {k} and above are calibrated but not recorded: not used");
+            findings.warn(|c| &mut c.calibration_notes, &list(k), 0, what);
+            calibration.cameras.truncate(k);
+            break;
+        }
+    }
+    let unused = list(calibration.cameras.len());
+    if unused.is_file() {
+        let what = format!("recorded but not calibrated, or beyond {CAMERAS_MAX} cameras: not used");
+        findings.warn(|c| &mut c.calibration_notes, &unused, 0, what);
+    }
+    let parse = |fields: &[&str]| match fields {
+        [t, file] if !file.is_empty() => Some(ImageRow { t: Nanos(t.parse().ok()?), file: file.to_string() }),
+        _ => None,
+    };
+    let read = |k: usize| {
+        let rows = table::read(&list(k), "stamp [ns], file name", parse, findings)?;
+        Ok(order::increasing(rows, |r| r.t, &list(k), findings))
+    };
+    (0..calibration.cameras.len()).map(read).collect()
+}
+
+fn list_path(mav0: &Path, camera: usize) -> PathBuf {
+    mav0.join(format!("cam{camera}/data.csv"))
+}
+
+/// Walks all lists together, oldest first: an image whose partners are all within the tolerance
+/// makes a pair with them, any other is unpaired.
+pub fn pair(
+    mav0: &Path,
+    lists: &[Vec<Row<ImageRow>>],
+    tolerance: Span,
+    findings: &mut Findings,
+) -> Result<Vec<Pair>, Fault> {
+    let paths: Vec<Arc<Path>> = (0..lists.len()).map(|k| list_path(mav0, k).into()).collect();
+    let mut heads = vec![0usize; lists.len()];
+    let mut pairs = Vec::new();
+    loop {
+        let stamp = |k: usize, ahead: usize| lists[k].get(heads[k] + ahead).map(|r| r.value.t);
+        let cameras = 0..lists.len();
+        let Some(oldest) = cameras.clone().filter(|k| stamp(*k, 0).is_some()).min_by_key(|k| stamp(*k, 0)) else {
+            break;
+        };
+        let t = stamp(oldest, 0).expect("chosen among those with a stamp");
+        let newest = cameras.clone().map(|k| stamp(k, 0).unwrap_or(Nanos(i64::MAX))).max().unwrap_or(t);
+        let ended = cameras.clone().any(|k| stamp(k, 0).is_none());
+        // Where the oldest camera's next image is closer to the others, that one is the partner.
+        let next_is_closer = newest > t && stamp(oldest, 1).is_some_and(|n| n <= newest);
+        if !ended && newest - t <= tolerance && !next_is_closer {
+            let image = |k: usize| {
+                let row = &lists[k][heads[k]];
+                let path = paths[k].with_file_name("data").join(&row.value.file);
+                ImageFile { path, list: paths[k].clone(), line: row.line }
+            };
+            pairs.push(Pair { t: lists[0][heads[0]].value.t, images: cameras.map(image).collect() });
+            heads.iter_mut().for_each(|h| *h += 1);
+        } else {
+            let line = lists[oldest][heads[oldest]].line;
+            let what = format!("image {} has no partner within {:.4} s: dropped", t.0, tolerance.secs());
+            findings.warn(|c| &mut c.images_unpaired, &paths[oldest], line, what);
+            heads[oldest] += 1;
+        }
+    }
+    if pairs.is_empty() {
+        let what = format!("no image has a partner within {:.4} s in every camera", tolerance.secs());
+        let fix = "check that the cameras are synchronised, or raise replay.pair_tolerance_s";
+        return Err(Fault::new(Exit::Data, mav0.display().to_string(), what, fix));
+    }
+    Ok(pairs)
+}

@@ -1,0 +1,77 @@
+//! Rows of a csv with their line numbers. `#` lines and one headline without it are not data; CRLF,
+//! spaces and empty lines are tolerated.
+
+use super::findings::Findings;
+use crate::{Exit, Fault};
+use std::path::Path;
+
+#[derive(Clone, Debug)]
+pub struct Row<T> {
+    pub line: usize,
+    pub value: T,
+}
+
+/// Reads a file that must exist.
+pub fn read_bytes(path: &Path) -> Result<Vec<u8>, Fault> {
+    std::fs::read(path).map_err(|e| {
+        let fix = "check the path and that the recording is complete";
+        Fault::new(Exit::NoInput, path.display().to_string(), format!("cannot read: {e}"), fix)
+    })
+}
+
+/// Parses every row. A row that cannot be read is counted and skipped, but if it is the first one
+/// the file is not of the expected kind; `columns` says what that is.
+pub fn read<T>(
+    path: &Path,
+    columns: &str,
+    parse: impl Fn(&[&str]) -> Option<T>,
+    findings: &mut Findings,
+) -> Result<Vec<Row<T>>, Fault> {
+    let bytes = read_bytes(path)?;
+    let text = String::from_utf8_lossy(&bytes);
+    let mut rows = Vec::new();
+    let mut headline = true;
+    for (i, content) in text.lines().enumerate() {
+        let (line, content) = (i + 1, content.trim().trim_start_matches('\u{feff}'));
+        if content.is_empty() || content.starts_with('#') {
+            continue;
+        }
+        let fields: Vec<&str> = split(content);
+        let names_columns = headline && fields.iter().all(|f| f.parse::<f64>().is_err());
+        headline = false;
+        match parse(&fields) {
+            Some(value) => rows.push(Row { line, value }),
+            None if names_columns => {}
+            None if rows.is_empty() => {
+                let what = format!("expected {columns}, found \"{}\"", excerpt(content));
+                return Err(Fault::at(Exit::Data, path, line, what, "check that this is the right file"));
+            }
+            None => {
+                let what = format!("expected {columns}, found \"{}\": row dropped", excerpt(content));
+                findings.warn(|c| &mut c.rows_malformed, path, line, what);
+            }
+        }
+    }
+    if rows.is_empty() {
+        let what = format!("holds no rows of {columns}");
+        return Err(Fault::new(Exit::Data, path.display().to_string(), what, "check that the recording is complete"));
+    }
+    Ok(rows)
+}
+
+/// Fields between commas, or between blanks where there is no comma.
+fn split(content: &str) -> Vec<&str> {
+    if content.contains(',') {
+        content.split(',').map(str::trim).collect()
+    } else {
+        content.split_whitespace().collect()
+    }
+}
+
+fn excerpt(content: &str) -> String {
+    content.chars().take(60).filter(|c| !c.is_control()).collect()
+}
+
+pub fn numbers(fields: &[&str]) -> Option<Vec<f64>> {
+    fields.iter().map(|f| f.parse().ok()).collect()
+}
