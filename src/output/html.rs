@@ -1,0 +1,367 @@
+//! `report.html`: the report, plots and renders in one file that needs nothing else.
+//!
+//! A page reads from the top: what was run, the headline numbers, error against run time, the
+//! trajectory, the time spent, the pictures, and what went wrong. What was not measured is a dash.
+
+use super::chart::{bars, escape, histogram, Chart, Series};
+use super::metrics::{percentile, TrajectoryError};
+use super::panel::Picture;
+use super::report::Report;
+use std::fmt::Write;
+use std::io;
+use stipple_drivers::{Nanos, TimedPose};
+
+/// Pictures embedded, and their width, px: a page of a few megabytes still opens at once.
+const PICTURES_MAX: usize = 6;
+const PICTURE_WIDTH_MAX: usize = 1600;
+const WARNINGS_MAX: usize = 50;
+const KERNELS_MAX: usize = 20;
+
+/// What the page shows beyond the figures of the report.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Evidence<'a> {
+    /// The trajectory of the run, in its own frame.
+    pub estimated: &'a [TimedPose],
+    /// Empty where there is none.
+    pub truth: &'a [TimedPose],
+    pub error: Option<&'a TrajectoryError>,
+    /// Stamp of each tracked frame and the time it took, ms.
+    pub tracking_ms: &'a [(Nanos, f64)],
+    /// Caption and picture, in the order to be shown.
+    pub pictures: &'a [(String, Picture)],
+    pub warnings: &'a [String],
+}
+
+pub fn write_html(out: &mut impl io::Write, report: &Report, evidence: &Evidence) -> io::Result<()> {
+    let dataset = report.dataset.as_deref().unwrap_or("run");
+    let name = dataset.trim_end_matches('/').rsplit('/').next().unwrap_or(dataset);
+    write!(out, "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\">")?;
+    write!(out, "<meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">")?;
+    write!(out, "<title>{} \u{2013} Stipple</title><style>{STYLE}</style></head><body><main>", escape(name))?;
+    write!(
+        out,
+        "<header><p class=\"over\">Stipple</p><h1>{}</h1><p class=\"what\">{}</p></header>",
+        escape(name),
+        subtitle(report)
+    )?;
+    out.write_all(tables(report).as_bytes())?;
+    section(out, "Map quality against run time", &quality(report))?;
+    section(out, "Trajectory", &trajectory(evidence))?;
+    section(out, "Time", &time(report, evidence))?;
+    pictures(out, evidence.pictures)?;
+    out.write_all(events(report, evidence.warnings).as_bytes())?;
+    writeln!(out, "</main></body></html>")
+}
+
+fn section(out: &mut impl io::Write, title: &str, charts: &[Option<String>]) -> io::Result<()> {
+    if charts.iter().all(Option::is_none) {
+        return Ok(());
+    }
+    write!(out, "<section><h2>{title}</h2><div class=\"charts\">")?;
+    for chart in charts.iter().flatten() {
+        write!(out, "<figure>{chart}</figure>")?;
+    }
+    write!(out, "</div></section>")
+}
+
+fn subtitle(report: &Report) -> String {
+    let parts = [
+        report.board.as_ref().map(|b| format!("board {b}")),
+        report.pace.as_ref().map(|p| format!("{p} pace")),
+        report.scale.map(|s| if s == 1 { "full resolution".to_string() } else { format!("1/{s} resolution") }),
+        report.device.clone(),
+    ];
+    escape(&parts.into_iter().flatten().collect::<Vec<_>>().join(" \u{b7} "))
+}
+
+/// Name, value, unit.
+type Row = (&'static str, Option<String>, &'static str);
+
+fn tables(report: &Report) -> String {
+    let f = |v: Option<f64>, decimals: usize| v.filter(|v| v.is_finite()).map(|v| format!("{v:.decimals$}"));
+    let n = |v: Option<u64>| v.map(grouped);
+    let mib = |v: Option<u64>| v.map(|b| format!("{:.1}", b as f64 / (1 << 20) as f64));
+    let odometry: [Row; 8] = [
+        ("Absolute trajectory error, RMSE", f(report.ate_rmse_m, 4), "m"),
+        ("Relative error over 1 s", f(report.rte_1s_m, 4), "m"),
+        ("Relative rotation error over 1 s", f(report.rpe_deg, 3), "\u{b0}"),
+        ("Tracking rate", f(report.tracking_fps, 1), "frames/s"),
+        ("Tracking time, median", f(report.tracking_ms_p50, 2), "ms"),
+        ("Tracking time, 99 %", f(report.tracking_ms_p99, 2), "ms"),
+        ("Frames tracked", n(report.frames), ""),
+        ("Frames dropped", n(report.frames_dropped), ""),
+    ];
+    let map: [Row; 8] = [
+        ("PSNR, training views", f(report.psnr_db, 2), "dB"),
+        ("PSNR, held-out views", f(report.psnr_heldout_db, 2), "dB"),
+        ("PSNR, held-out, pose refined", f(report.psnr_heldout_aligned_db, 2), "dB"),
+        ("SSIM, training views", f(report.ssim, 3), ""),
+        ("SSIM, held-out views", f(report.ssim_heldout, 3), ""),
+        ("Gaussians", n(report.splats), ""),
+        ("Iterations", n(report.iterations), ""),
+        ("Iteration time, median", f(report.iteration_ms_p50, 1), "ms"),
+    ];
+    let cost: [Row; 6] = [
+        ("Run time", f(report.wall_s, 1), "s"),
+        ("Keyframes", n(report.keyframes), ""),
+        ("Anchors", n(report.anchors), ""),
+        ("GPU memory", mib(report.gpu_bytes), "MiB"),
+        ("Resident memory, peak", mib(report.rss_peak_bytes), "MiB"),
+        ("Heap allocations after seal", n(report.heap_after_seal), ""),
+    ];
+    let parts = [table("Odometry", &odometry), table("Map", &map), table("Cost", &cost)];
+    format!("<section class=\"tables\">{}</section>", parts.concat())
+}
+
+fn table(title: &str, rows: &[Row]) -> String {
+    let mut html = format!("<table><caption>{title}</caption>");
+    for (name, value, unit) in rows {
+        let value = value.as_deref().unwrap_or("\u{2013}");
+        let _ = write!(html, "<tr><th scope=\"row\">{name}</th><td>{value}</td><td class=\"u\">{unit}</td></tr>");
+    }
+    html + "</table>"
+}
+
+fn quality(report: &Report) -> [Option<String>; 3] {
+    let curve = &report.curve;
+    let of = |value: &dyn Fn(usize) -> Option<f64>| -> Vec<(f64, f64)> {
+        (0..curve.len()).filter_map(|i| value(i).map(|v| (curve[i].t_s, v))).collect()
+    };
+    let line = |name, ink, points| Series { name, ink, dots: true, points };
+    let run_time = "run time, s";
+    let psnr = Chart {
+        title: "PSNR",
+        x: run_time,
+        y: "dB",
+        series: vec![
+            line("training views", 1, of(&|i| curve[i].psnr_db)),
+            line("held-out views", 2, of(&|i| curve[i].psnr_heldout_db)),
+        ],
+        ..Chart::default()
+    };
+    let count = |title, value: &dyn Fn(usize) -> f64| Chart {
+        title,
+        x: run_time,
+        from_zero: true,
+        series: vec![line(title, 1, of(&|i| Some(value(i))))],
+        ..Chart::default()
+    };
+    let splats = count("Gaussians", &|i| curve[i].splats as f64);
+    let iterations = count("Iterations", &|i| curve[i].iterations as f64);
+    [psnr.svg(), splats.svg(), iterations.svg()]
+}
+
+fn trajectory(evidence: &Evidence) -> [Option<String>; 3] {
+    let Some(start) = evidence.estimated.first().map(|e| e.t) else { return [None, None, None] };
+    let end = evidence.estimated.last().map_or(start, |e| e.t);
+    let onto_truth = evidence.error.map(|e| e.truth_from_estimate).unwrap_or_default();
+    let estimated: Vec<TimedPose> =
+        evidence.estimated.iter().map(|e| TimedPose { t: e.t, pose: onto_truth * e.pose }).collect();
+    // Truth without an alignment is in another frame than the estimate: it is not drawn.
+    let truth: Vec<TimedPose> = match evidence.error {
+        Some(_) => evidence.truth.iter().copied().filter(|e| e.t >= start && e.t <= end).collect(),
+        None => Vec::new(),
+    };
+    let line = |name, ink, poses: &[TimedPose], point: &dyn Fn(&TimedPose) -> (f64, f64)| Series {
+        name,
+        ink,
+        dots: false,
+        points: poses.iter().map(point).collect(),
+    };
+    let two = |point: &dyn Fn(&TimedPose) -> (f64, f64)| {
+        vec![line("ground truth", 3, &truth, point), line("estimate", 1, &estimated, point)]
+    };
+    let secs = |t: Nanos| (t - start).secs();
+    let above = Chart {
+        title: "Seen from above",
+        x: "x, m",
+        y: "y, m",
+        equal: true,
+        series: two(&|e| (e.pose.p.x, e.pose.p.y)),
+        ..Chart::default()
+    };
+    let height = Chart {
+        title: "Height",
+        x: "time, s",
+        y: "z, m",
+        series: two(&|e| (secs(e.t), e.pose.p.z)),
+        ..Chart::default()
+    };
+    let errors = evidence.error.map(|e| Chart {
+        title: "Position error after alignment",
+        x: "time, s",
+        y: "m",
+        from_zero: true,
+        series: vec![Series {
+            name: "error",
+            ink: 2,
+            dots: false,
+            points: e.errors.iter().map(|&(t, m)| (secs(t), m)).collect(),
+        }],
+        levels: vec![("RMSE", e.ate_rmse_m)],
+        ..Chart::default()
+    });
+    [above.svg(), height.svg(), errors.and_then(|c| c.svg())]
+}
+
+fn time(report: &Report, evidence: &Evidence) -> [Option<String>; 3] {
+    let values: Vec<f64> = evidence.tracking_ms.iter().map(|m| m.1).collect();
+    let (p50, p99) = (percentile(&values, 0.5), percentile(&values, 0.99));
+    let start = evidence.tracking_ms.first().map_or(Nanos(0), |m| m.0);
+    let levels: Vec<(&str, f64)> =
+        [("median", p50), ("99 %", p99)].into_iter().filter_map(|(n, v)| Some((n, v?))).collect();
+    // A single hiccup of the machine must not flatten the rest.
+    let y_max = p99.map(|p| 2.0 * p);
+    let frames = Chart {
+        title: "Tracking time of each frame",
+        x: "time, s",
+        y: "ms",
+        from_zero: true,
+        y_max,
+        levels,
+        series: vec![Series {
+            name: "frame",
+            ink: 1,
+            dots: false,
+            points: evidence.tracking_ms.iter().map(|&(t, ms)| ((t - start).secs(), ms)).collect(),
+        }],
+        ..Chart::default()
+    };
+    let spread = y_max.filter(|m| *m > 0.0).and_then(|max| {
+        Chart {
+            title: "Distribution of tracking time",
+            x: "ms",
+            y: "frames",
+            from_zero: true,
+            series: vec![Series { name: "frames", ink: 1, dots: false, points: histogram(&values, max, 40) }],
+            ..Chart::default()
+        }
+        .svg()
+    });
+    let total: f64 = report.kernels.iter().map(|k| k.total_ms).sum();
+    let mut kernels: Vec<_> = report.kernels.iter().collect();
+    kernels.sort_by(|a, b| b.total_ms.total_cmp(&a.total_ms));
+    let row = |k: &&super::report::KernelTime| {
+        let share = 100.0 * k.total_ms / total.max(f64::MIN_POSITIVE);
+        let each = k.total_ms / (k.dispatches.max(1)) as f64;
+        (k.name.clone(), k.total_ms, format!("{share:.1} % \u{b7} {each:.3} ms each"))
+    };
+    let rows: Vec<_> = kernels.iter().take(KERNELS_MAX).map(row).collect();
+    [frames.svg(), spread, bars("GPU time by kernel", "share of GPU time \u{b7} mean time", &rows)]
+}
+
+fn pictures(out: &mut impl io::Write, pictures: &[(String, Picture)]) -> io::Result<()> {
+    if pictures.is_empty() {
+        return Ok(());
+    }
+    write!(out, "<section><h2>Renders</h2><p class=\"note\">Observed, rendered, absolute error, depth.</p>")?;
+    for index in spread_indices(pictures.len(), PICTURES_MAX) {
+        let (caption, picture) = &pictures[index];
+        let mut bytes = Vec::new();
+        picture.shrunk(PICTURE_WIDTH_MAX).write_png(&mut bytes)?;
+        write!(out, "<figure class=\"wide\"><img alt=\"{0}\" src=\"data:image/png;base64,{1}\"><figcaption>{0}</figcaption></figure>", escape(caption), base64(&bytes))?;
+    }
+    write!(out, "</section>")
+}
+
+/// At most `count` indices of `len`, evenly spread, ends included.
+fn spread_indices(len: usize, count: usize) -> Vec<usize> {
+    let n = len.min(count);
+    (0..n).map(|i| if n == 1 { 0 } else { i * (len - 1) / (n - 1) }).collect()
+}
+
+fn events(report: &Report, warnings: &[String]) -> String {
+    let mut html = String::from("<section><h2>Counters and warnings</h2>");
+    let counted: Vec<(&str, u64)> = report.counted().collect();
+    if counted.is_empty() {
+        html.push_str("<p class=\"note\">Every counter is zero: nothing was dropped, refused or cut.</p>");
+    } else {
+        html.push_str("<table class=\"counters\">");
+        for (name, n) in counted {
+            let _ = write!(
+                html,
+                "<tr><th scope=\"row\">{}</th><td>{}</td></tr>",
+                escape(&name.replace('_', " ")),
+                grouped(n)
+            );
+        }
+        html.push_str("</table>");
+    }
+    match warnings.len() {
+        0 => html.push_str("<p class=\"note\">No warnings about the input.</p>"),
+        n => {
+            html.push_str("<ul class=\"warnings\">");
+            warnings.iter().take(WARNINGS_MAX).for_each(|w| {
+                let _ = write!(html, "<li>{}</li>", escape(w));
+            });
+            html.push_str("</ul>");
+            if n > WARNINGS_MAX {
+                let _ = write!(html, "<p class=\"note\">and {} more</p>", n - WARNINGS_MAX);
+            }
+        }
+    }
+    if let Some(hash) = &report.vio_hash {
+        let _ = write!(html, "<p class=\"note\">Hash of the odometry: <code>{}</code></p>", escape(hash));
+    }
+    html + "</section>"
+}
+
+/// Thousands set apart by narrow spaces.
+fn grouped(n: u64) -> String {
+    let digits = n.to_string();
+    let mut text = String::new();
+    for (i, c) in digits.chars().enumerate() {
+        if i > 0 && (digits.len() - i) % 3 == 0 {
+            text.push('\u{202f}');
+        }
+        text.push(c);
+    }
+    text
+}
+
+fn base64(bytes: &[u8]) -> String {
+    const DIGITS: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
+    let mut text = String::with_capacity(bytes.len().div_ceil(3) * 4);
+    for chunk in bytes.chunks(3) {
+        let group = (0..3).fold(0u32, |g, i| g << 8 | chunk.get(i).copied().unwrap_or(0) as u32);
+        for i in 0..4 {
+            let digit = DIGITS[(group >> (18 - 6 * i) & 63) as usize] as char;
+            text.push(if i <= chunk.len() { digit } else { '=' });
+        }
+    }
+    text
+}
+
+const STYLE: &str = include_str!("report.css");
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+
+    #[test]
+    fn base64_pads_every_remainder() {
+        assert_eq!(base64(b"Man"), "TWFu");
+        assert_eq!(base64(b"Ma"), "TWE=");
+        assert_eq!(base64(b"M"), "TQ==");
+        assert_eq!(base64(&[0xff, 0xfe, 0xfd]), "//79");
+    }
+
+    #[test]
+    fn spread_keeps_both_ends() {
+        assert_eq!(spread_indices(11, 6), [0, 2, 4, 6, 8, 10]);
+        assert_eq!(spread_indices(2, 6), [0, 1]);
+        assert_eq!(spread_indices(1, 6), [0]);
+        assert!(spread_indices(0, 6).is_empty());
+    }
+
+    #[test]
+    fn nothing_measured_still_makes_a_page_without_outside_references() {
+        let mut page = Vec::new();
+        write_html(&mut page, &Report::default(), &Evidence::default()).unwrap();
+        let page = String::from_utf8(page).unwrap();
+        assert!(page.starts_with("<!doctype html>") && page.ends_with("</main></body></html>\n"));
+        assert!(!page.contains("http") && !page.contains("NaN"));
+        assert!(page.contains("\u{2013}</td>"), "a dash where nothing was measured");
+    }
+}

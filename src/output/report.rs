@@ -1,0 +1,147 @@
+//! `report.json`: one flat object. A figure that was not measured is null, never zero.
+
+use crate::counters::Counters;
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+use std::io::{self, Write};
+
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct Report {
+    /// What was run.
+    pub dataset: Option<String>,
+    pub board: Option<String>,
+    /// `recorded` or `lockstep`.
+    pub pace: Option<String>,
+    /// Mapping resolution divisor.
+    pub scale: Option<u32>,
+    pub device: Option<String>,
+
+    /// Stereo pairs tracked; pairs that arrived and were not.
+    pub frames: Option<u64>,
+    pub frames_dropped: Option<u64>,
+    pub keyframes: Option<u64>,
+    pub anchors: Option<u64>,
+
+    pub ate_rmse_m: Option<f64>,
+    pub rte_1s_m: Option<f64>,
+    pub rpe_deg: Option<f64>,
+    /// Frames over wall time in frontend and estimator, the mapper running.
+    pub tracking_fps: Option<f64>,
+    pub tracking_ms_p50: Option<f64>,
+    pub tracking_ms_p99: Option<f64>,
+    /// Of every odometry state, bit for bit.
+    pub vio_hash: Option<String>,
+
+    pub psnr_db: Option<f64>,
+    pub ssim: Option<f64>,
+    pub psnr_heldout_db: Option<f64>,
+    pub ssim_heldout: Option<f64>,
+    /// With the pose of each held-out view refined on its image alone.
+    pub psnr_heldout_aligned_db: Option<f64>,
+    pub splats: Option<u64>,
+    pub iterations: Option<u64>,
+    pub iteration_ms_p50: Option<f64>,
+
+    pub gpu_bytes: Option<u64>,
+    pub rss_peak_bytes: Option<u64>,
+    pub heap_after_seal: Option<u64>,
+    pub wall_s: Option<f64>,
+    /// Number of warnings about the input.
+    pub warnings: u64,
+
+    /// Error against run time.
+    pub curve: Vec<CurvePoint>,
+    /// GPU time by kernel, most expensive first.
+    pub kernels: Vec<KernelTime>,
+
+    /// `count_<name>` of every counter.
+    #[serde(flatten)]
+    pub counts: BTreeMap<String, u64>,
+}
+
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct CurvePoint {
+    /// Seconds since the run began.
+    pub t_s: f64,
+    pub psnr_db: Option<f64>,
+    pub psnr_heldout_db: Option<f64>,
+    pub splats: u64,
+    pub iterations: u64,
+}
+
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct KernelTime {
+    pub name: String,
+    pub dispatches: u64,
+    pub total_ms: f64,
+}
+
+const COUNT: &str = "count_";
+
+impl Report {
+    pub fn set_counters(&mut self, counters: &Counters) {
+        self.counts = counters.list().into_iter().map(|(name, n)| (format!("{COUNT}{name}"), n)).collect();
+    }
+
+    /// Counters that are not zero, without their prefix.
+    pub fn counted(&self) -> impl Iterator<Item = (&str, u64)> {
+        self.counts.iter().filter(|(_, n)| **n > 0).map(|(name, n)| (name.strip_prefix(COUNT).unwrap_or(name), *n))
+    }
+
+    pub fn write_json(&self, out: &mut impl Write) -> io::Result<()> {
+        serde_json::to_writer_pretty(&mut *out, self)?;
+        writeln!(out)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+
+    const KEYS: &str =
+        "frames keyframes anchors frames_dropped ate_rmse_m rte_1s_m rpe_deg tracking_fps tracking_ms_p50 \
+        tracking_ms_p99 psnr_db ssim psnr_heldout_db ssim_heldout psnr_heldout_aligned_db splats iterations \
+        iteration_ms_p50 gpu_bytes rss_peak_bytes heap_after_seal wall_s device vio_hash dataset board pace scale";
+
+    #[test]
+    fn unmeasured_figures_are_null_and_present() {
+        let json: serde_json::Value = serde_json::to_value(Report::default()).unwrap();
+        for key in KEYS.split_whitespace() {
+            assert_eq!(json.get(key), Some(&serde_json::Value::Null), "{key}");
+        }
+        assert!(json["curve"].is_array() && json["kernels"].is_array() && json["warnings"] == 0);
+    }
+
+    #[test]
+    fn report_is_flat_and_reads_back() {
+        let counters = Counters::default();
+        counters.outliers.add(7);
+        let mut report = Report { psnr_db: Some(24.5), ..Report::default() };
+        report.set_counters(&counters);
+        report.curve.push(CurvePoint {
+            t_s: 5.0,
+            psnr_db: Some(20.0),
+            psnr_heldout_db: None,
+            splats: 10,
+            iterations: 20,
+        });
+        let mut bytes = Vec::new();
+        report.write_json(&mut bytes).unwrap();
+        let json: serde_json::Value = serde_json::from_slice(&bytes).unwrap();
+        assert_eq!(json["count_outliers"], 7);
+        assert_eq!(json["curve"][0]["psnr_heldout_db"], serde_json::Value::Null);
+        let nested = json.as_object().unwrap().iter().filter(|(_, v)| v.is_object());
+        assert_eq!(nested.count(), 0);
+        assert_eq!(serde_json::from_slice::<Report>(&bytes).unwrap(), report);
+        assert_eq!(report.counted().collect::<Vec<_>>(), [("outliers", 7)]);
+    }
+
+    #[test]
+    fn figures_that_are_not_numbers_become_null() {
+        let report = Report { ssim: Some(f64::NAN), psnr_db: Some(f64::INFINITY), ..Report::default() };
+        let json = serde_json::to_value(&report).unwrap();
+        assert!(json["ssim"].is_null() && json["psnr_db"].is_null());
+    }
+}

@@ -1,0 +1,42 @@
+//! Trajectories in the TUM format: `t tx ty tz qx qy qz qw`, seconds and metres, one pose a line.
+//! Seconds are printed from the integer nanoseconds: a double holds a Unix stamp only to 0.2 µs.
+
+use std::io::{self, Write};
+use stipple_drivers::TimedPose;
+
+pub fn write_tum(out: &mut impl Write, poses: &[TimedPose]) -> io::Result<()> {
+    writeln!(out, "# t_s tx_m ty_m tz_m qx qy qz qw (world from body)")?;
+    for TimedPose { t, pose } in poses {
+        let sign = if t.0 < 0 { "-" } else { "" };
+        let (s, ns) = (t.0.unsigned_abs() / 1_000_000_000, t.0.unsigned_abs() % 1_000_000_000);
+        let ([x, y, z], [qx, qy, qz, qw]) = (pose.p.to_array(), pose.q.to_array());
+        writeln!(out, "{sign}{s}.{ns:09} {x:.6} {y:.6} {z:.6} {qx:.8} {qy:.8} {qz:.8} {qw:.8}")?;
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+    use glam::{DQuat, DVec3};
+    use stipple_drivers::{Nanos, Pose};
+
+    #[test]
+    fn stamps_keep_their_nanoseconds_and_quaternions_end_with_w() {
+        let pose = Pose { q: DQuat::from_xyzw(0.0, 0.6, 0.0, 0.8), p: DVec3::new(1.0, -2.5, 0.25) };
+        let poses = [
+            TimedPose { t: Nanos(1_403_636_579_763_555_584), pose },
+            TimedPose { t: Nanos(5), pose },
+            TimedPose { t: Nanos(-1_500_000_000), pose },
+        ];
+        let mut text = Vec::new();
+        write_tum(&mut text, &poses).unwrap();
+        let text = String::from_utf8(text).unwrap();
+        let lines: Vec<&str> = text.lines().skip(1).collect();
+        let rest = "1.000000 -2.500000 0.250000 0.00000000 0.60000000 0.00000000 0.80000000";
+        assert_eq!(lines[0], format!("1403636579.763555584 {rest}"));
+        assert_eq!(lines[1], format!("0.000000005 {rest}"));
+        assert_eq!(lines[2], format!("-1.500000000 {rest}"));
+    }
+}
