@@ -1,7 +1,30 @@
-//! Images in, tracked points out.
-use crate::limits::{CAMERAS_MAX, TRACKS};
-use crate::mem::List;
-use stipple_drivers::Nanos;
+//! Images in, tracked points out: a stereo patch tracker.
+//!
+//! ```text
+//! frames -> pyramids -> follow every view from the last frame (IMU-predicted start, refined
+//!                       against the patch first seen, checked backwards)
+//!        -> epipolar gate -> match views that are missing -> detect in free cells -> match those
+//! ```
+//!
+//! Camera 0 finds points; the same id in another camera is the same point. Each view is followed
+//! in its own camera; a point lives while any camera sees it, and what one camera lost is looked
+//! for again from another in every frame. The patch of the last frame finds the point, the patch
+//! first seen (the anchor) places it: without an anchor each frame adds its own rounding to the
+//! drift. Same frames and predictions, same bits out.
+
+pub mod detect;
+pub mod patch;
+pub mod pyramid;
+mod rig;
+
+use crate::config::FrontendConfig;
+use crate::limits::{CAMERAS_MAX, PYRAMID_LEVELS, TRACKS};
+use crate::mem::{Footprint, List};
+use detect::Detector;
+use patch::{align_stack, take_stack, Stack, Template, Warp};
+use pyramid::Pyramid;
+use rig::Rig;
+use stipple_drivers::{Calibration, Exit, Fault, Frames, Nanos, Pose};
 
 /// A point tracked in one camera. The same `id` in two cameras is the same point in space.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -16,4 +39,373 @@ pub struct Track {
 pub struct Tracks {
     pub t: Nanos,
     pub cameras: [List<Track, TRACKS>; CAMERAS_MAX],
+}
+
+/// What is known of the motion before the images are looked at.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Prediction {
+    /// Motion of the body since the previous frame, from the IMU.
+    pub prev_from_now: Option<Pose>,
+}
+
+/// What happened to points since the start.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Stats {
+    pub frames: u64,
+    pub created: u64,
+    /// Views that were not found again (of a point that may live on in another camera).
+    pub lost: u64,
+    /// Views found from another camera.
+    pub matched: u64,
+    /// Views dropped because their ray misses that of camera 0.
+    pub epipolar_rejected: u64,
+    /// Corners that did not fit.
+    pub full: u64,
+}
+
+/// Views end this close to the border, px.
+const MARGIN_PX: f32 = 2.0;
+/// Share of a patch's contrast that may stay unexplained from one frame to the next, and between
+/// cameras, whose views differ more.
+const UNEXPLAINED_MAX: f32 = 0.4;
+const UNEXPLAINED_MATCH_MAX: f32 = 0.6;
+/// The anchor places a point while it explains this much and does not pull it further than this, px.
+const UNEXPLAINED_ANCHOR_MAX: f32 = 0.1;
+const ANCHOR_PULL_MAX_PX: f32 = 1.0;
+/// Guess before anything was triangulated, 1/m.
+const INVERSE_DEPTH_START: f64 = 0.25;
+/// Inverse depths tried along the epipolar curve when the first guess fails: 0 to this, 1/m.
+const SEARCH_INVERSE_DEPTH_MAX: f64 = 2.0;
+/// At f·b = 50 px·m two steps differ by 6.7 px of disparity: 1.7 px at the level that judges them,
+/// inside the basin of the alignment.
+const SEARCH_STEPS: usize = 16;
+const SEARCH_LEVEL: usize = 2;
+/// Best of them that are tried in full.
+const SEARCH_TRIES: usize = 3;
+
+#[derive(Clone, Copy)]
+struct Point {
+    id: u64,
+    slot: usize,
+    /// Along the ray of camera 0; kept while no second camera sees the point.
+    inverse_depth: Option<f64>,
+    views: [Option<[f32; 2]>; CAMERAS_MAX],
+}
+
+/// What a view looked like: in the last frame at all levels, and at its anchor.
+#[derive(Clone, Default)]
+struct Patch {
+    last: Stack,
+    anchor: Template,
+    /// Turn since the anchor.
+    turn: [f32; 2],
+}
+
+impl Patch {
+    fn restart(&mut self, stack: &Stack) {
+        self.last = *stack;
+        self.anchor = stack[0];
+        self.turn = [1.0, 0.0];
+    }
+}
+
+pub struct Frontend {
+    rig: Rig,
+    iterations: usize,
+    recovered_max_px: f32,
+    now: Vec<Pyramid>,
+    before: Vec<Pyramid>,
+    detector: Detector,
+    /// Ascending id.
+    points: Vec<Point>,
+    /// `patches[camera][slot]`
+    patches: Vec<Vec<Patch>>,
+    free: Vec<usize>,
+    scratch: Stack,
+    inverse_depths: Vec<f64>,
+    next_id: u64,
+    tracks: Tracks,
+    stats: Stats,
+}
+
+impl Frontend {
+    pub fn new(calibration: &Calibration, config: &FrontendConfig) -> Result<Frontend, Fault> {
+        let n = calibration.cameras.len();
+        let least = 4 * detect::BORDER;
+        let small = calibration.cameras.iter().any(|c| c.camera.width < least || c.camera.height < least);
+        if n == 0 || n > CAMERAS_MAX || small {
+            let what = format!("the tracker takes 1 to {CAMERAS_MAX} cameras of at least {least} px a side");
+            return Err(Fault::new(Exit::Config, "calibration", what, "use a calibration of this rig"));
+        }
+        let pyramids = || calibration.cameras.iter().map(|c| Pyramid::new(c.camera.width, c.camera.height)).collect();
+        let first = &calibration.cameras[0].camera;
+        Ok(Frontend {
+            rig: Rig::new(calibration, config.epipolar_max),
+            iterations: config.iterations as usize,
+            recovered_max_px: config.recovered_max_px as f32,
+            now: pyramids(),
+            before: pyramids(),
+            detector: Detector::new(first.width, first.height, config),
+            points: Vec::with_capacity(TRACKS),
+            patches: (0..n).map(|_| vec![Patch::default(); TRACKS]).collect(),
+            free: (0..TRACKS).rev().collect(),
+            scratch: Default::default(),
+            inverse_depths: Vec::with_capacity(TRACKS),
+            next_id: 0,
+            tracks: Tracks::default(),
+            stats: Stats::default(),
+        })
+    }
+
+    pub fn footprint(calibration: &Calibration, config: &FrontendConfig) -> Footprint {
+        let mut f = Footprint::default();
+        let sizes = calibration.cameras.iter().map(|c| (c.camera.width, c.camera.height));
+        f.host("frontend pyramids", 2 * sizes.clone().map(|(w, h)| Pyramid::bytes(w, h)).sum::<usize>());
+        f.host("frontend patches", calibration.cameras.len() * TRACKS * size_of::<Patch>());
+        let grid = sizes.take(1).map(|(w, h)| Detector::bytes(w, h, config)).sum::<usize>();
+        let points = TRACKS * (size_of::<Point>() + size_of::<usize>() + size_of::<f64>());
+        f.host("frontend points", size_of::<Frontend>() + points + grid);
+        f
+    }
+
+    pub fn stats(&self) -> &Stats {
+        &self.stats
+    }
+
+    /// Follows all points into the new images, replaces what was lost.
+    pub fn track(&mut self, frames: &Frames, prediction: &Prediction) -> &Tracks {
+        std::mem::swap(&mut self.now, &mut self.before);
+        for (pyramid, image) in self.now.iter_mut().zip(&frames.images) {
+            pyramid.build(image);
+        }
+        self.stats.frames += 1;
+        let median = self.median_inverse_depth();
+        self.follow(prediction, median);
+        let median = self.median_inverse_depth();
+        self.find_missing(0, median);
+        self.drop_unseen();
+        let first_new = self.points.len();
+        self.detect();
+        self.find_missing(first_new, median);
+        self.publish(frames.t);
+        &self.tracks
+    }
+
+    fn median_inverse_depth(&mut self) -> f64 {
+        self.inverse_depths.clear();
+        self.inverse_depths.extend(self.points.iter().filter_map(|p| p.inverse_depth));
+        let middle = self.inverse_depths.len() / 2;
+        if self.inverse_depths.is_empty() {
+            return INVERSE_DEPTH_START;
+        }
+        *self.inverse_depths.select_nth_unstable_by(middle, f64::total_cmp).1
+    }
+
+    fn follow(&mut self, prediction: &Prediction, median: f64) {
+        for camera in 0..self.now.len() {
+            let motion = prediction.prev_from_now.map(|m| self.rig.motion(camera, &m));
+            for i in 0..self.points.len() {
+                let point = self.points[i];
+                let Some(px) = point.views[camera] else { continue };
+                let q = point.inverse_depth.unwrap_or(median);
+                let start = motion.and_then(|m| self.rig.transfer(camera, camera, &m, px, q));
+                let moved = start.and_then(|s| self.follow_view(camera, point.slot, px, s));
+                // A wrong prediction must not lose what a still camera would keep.
+                let view = moved.or_else(|| self.follow_view(camera, point.slot, px, Warp::upright(px)));
+                self.points[i].views[camera] = view;
+                self.stats.lost += u64::from(view.is_none());
+            }
+        }
+        for i in 0..self.points.len() {
+            self.gate(i);
+        }
+    }
+
+    /// One view from the last frame to this one.
+    fn follow_view(&mut self, camera: usize, slot: usize, from: [f32; 2], start: Warp) -> Option<[f32; 2]> {
+        let (now, before) = (&self.now[camera], &self.before[camera]);
+        let patch = &mut self.patches[camera][slot];
+        let (mut warp, left) = align_stack(&patch.last, now, start, PYRAMID_LEVELS - 1, self.iterations)?;
+        if left > UNEXPLAINED_MAX {
+            return None;
+        }
+        let mut anchored = warp;
+        anchored.turn(patch.turn[0], patch.turn[1]);
+        let left = patch.anchor.align(&now.levels[0], &mut anchored, self.iterations);
+        let held =
+            left.is_some_and(|l| l < UNEXPLAINED_ANCHOR_MAX) && distance(anchored.px(), warp.px()) < ANCHOR_PULL_MAX_PX;
+        if held {
+            (warp.x, warp.y) = (anchored.x, anchored.y);
+        }
+        confirm(&mut self.scratch, now, before, from, start, warp, self.iterations, self.recovered_max_px)?;
+        if held {
+            patch.last = self.scratch;
+            patch.turn = [anchored.c, anchored.s];
+        } else {
+            patch.restart(&self.scratch);
+        }
+        Some(warp.px())
+    }
+
+    /// Drops views that disagree with camera 0 and triangulates from those that agree.
+    fn gate(&mut self, i: usize) {
+        let point = &mut self.points[i];
+        let Some(f) = point.views[0].and_then(|px| self.rig.bearing(0, px)) else { return };
+        let (mut sum, mut weights) = (0.0, 0.0);
+        for camera in 1..self.now.len() {
+            let Some(px) = point.views[camera] else { continue };
+            let seen = self.rig.bearing(camera, px).and_then(|g| self.rig.triangulate(0, camera, f, g));
+            match seen {
+                Some((q, weight)) => {
+                    sum += weight * q;
+                    weights += weight;
+                }
+                None => {
+                    point.views[camera] = None;
+                    self.stats.epipolar_rejected += 1;
+                }
+            }
+        }
+        if weights > 0.0 {
+            point.inverse_depth = Some((sum / weights).max(0.0));
+        }
+    }
+
+    /// Looks for the missing views of points `first..` from a camera that has them.
+    fn find_missing(&mut self, first: usize, median: f64) {
+        for i in first..self.points.len() {
+            let views = self.points[i].views;
+            let Some(from) = views.iter().position(Option::is_some) else { continue };
+            for to in 0..self.now.len() {
+                if views[to].is_none() {
+                    let found = self.find_view(i, from, to, median);
+                    self.points[i].views[to] = found;
+                    self.stats.matched += u64::from(found.is_some());
+                }
+            }
+            self.gate(i);
+        }
+    }
+
+    /// One view from another camera of the same instant.
+    fn find_view(&mut self, i: usize, from: usize, to: usize, median: f64) -> Option<[f32; 2]> {
+        let point = self.points[i];
+        let px = point.views[from]?;
+        let relative = self.rig.between(from, to);
+        let q = point.inverse_depth.unwrap_or(median);
+        let guess = self.rig.transfer(from, to, &relative, px, q);
+        if let Some(found) = guess.and_then(|g| self.match_view(point.slot, from, to, px, g, PYRAMID_LEVELS - 1)) {
+            return Some(found);
+        }
+        let template = &self.patches[from][point.slot].last[SEARCH_LEVEL];
+        if !template.usable() {
+            return None;
+        }
+        let mut best = [(f32::MAX, Warp::default()); SEARCH_TRIES];
+        for k in 0..SEARCH_STEPS {
+            let q = SEARCH_INVERSE_DEPTH_MAX * k as f64 / (SEARCH_STEPS - 1) as f64;
+            let Some(warp) = self.rig.transfer(from, to, &relative, px, q) else { continue };
+            let small = warp.at_level(SEARCH_LEVEL);
+            let Some((_, left)) = template.residual(&self.now[to].levels[SEARCH_LEVEL], &small) else { continue };
+            let at = best.partition_point(|b| b.0 <= left);
+            if at < SEARCH_TRIES {
+                best[at..].rotate_right(1);
+                best[at] = (left, warp);
+            }
+        }
+        let tries = best.into_iter().filter(|b| b.0 < f32::MAX);
+        tries.map(|b| b.1).find_map(|warp| self.match_view(point.slot, from, to, px, warp, SEARCH_LEVEL))
+    }
+
+    /// Aligns the patch of one camera in another, both ways, and accepts it only where rays meet.
+    fn match_view(
+        &mut self,
+        slot: usize,
+        from: usize,
+        to: usize,
+        px: [f32; 2],
+        start: Warp,
+        coarsest: usize,
+    ) -> Option<[f32; 2]> {
+        let stack = &self.patches[from][slot].last;
+        let (warp, left) = align_stack(stack, &self.now[to], start, coarsest, self.iterations)?;
+        let (f, g) = (self.rig.bearing(from, px)?, self.rig.bearing(to, warp.px())?);
+        if left > UNEXPLAINED_MATCH_MAX || self.rig.triangulate(from, to, f, g).is_none() {
+            return None;
+        }
+        let (now, before) = (&self.now[to], &self.now[from]);
+        confirm(&mut self.scratch, now, before, px, start, warp, self.iterations, self.recovered_max_px)?;
+        self.patches[to][slot].restart(&self.scratch);
+        Some(warp.px())
+    }
+
+    fn drop_unseen(&mut self) {
+        let free = &mut self.free;
+        self.points.retain(|p| {
+            let seen = p.views.iter().any(Option::is_some);
+            if !seen {
+                free.push(p.slot);
+            }
+            seen
+        });
+    }
+
+    fn detect(&mut self) {
+        let seen = self.points.iter().filter_map(|p| p.views[0]);
+        let (corners, excess) = self.detector.detect(&self.now[0].levels[0], seen, self.free.len());
+        self.stats.full += excess as u64;
+        for corner in corners {
+            let px = [corner.x as f32, corner.y as f32];
+            take_stack(&mut self.scratch, &self.now[0], px);
+            if !self.scratch[0].usable() || self.rig.bearing(0, px).is_none() {
+                continue;
+            }
+            let slot = self.free.pop().expect("no more corners than free slots");
+            self.patches[0][slot].restart(&self.scratch);
+            let mut views = [None; CAMERAS_MAX];
+            views[0] = Some(px);
+            self.points.push(Point { id: self.next_id, slot, inverse_depth: None, views });
+            self.next_id += 1;
+            self.stats.created += 1;
+        }
+    }
+
+    fn publish(&mut self, t: Nanos) {
+        self.tracks.t = t;
+        for (camera, list) in self.tracks.cameras.iter_mut().enumerate() {
+            list.clear();
+            for p in &self.points {
+                if let Some(px) = p.views[camera] {
+                    list.push(Track { id: p.id, px }).expect("there are no more points than TRACKS");
+                }
+            }
+        }
+    }
+}
+
+/// Takes the patch where alignment ended and aligns it back: it must arrive where it came from.
+/// The way back starts as far off as the way there did.
+fn confirm(
+    scratch: &mut Stack,
+    now: &Pyramid,
+    before: &Pyramid,
+    from: [f32; 2],
+    start: Warp,
+    found: Warp,
+    iterations: usize,
+    recovered_max_px: f32,
+) -> Option<()> {
+    let image = &now.levels[0];
+    let (right, bottom) = ((image.width - 1) as f32 - MARGIN_PX, (image.height - 1) as f32 - MARGIN_PX);
+    if !(found.x >= MARGIN_PX && found.y >= MARGIN_PX && found.x <= right && found.y <= bottom) {
+        return None;
+    }
+    take_stack(scratch, now, found.px());
+    let back = Warp { x: found.x + from[0] - start.x, y: found.y + from[1] - start.y, c: found.c, s: -found.s };
+    let (recovered, _) = align_stack(scratch, before, back, PYRAMID_LEVELS - 1, iterations)?;
+    (distance(recovered.px(), from) <= recovered_max_px).then_some(())
+}
+
+fn distance(a: [f32; 2], b: [f32; 2]) -> f32 {
+    (a[0] - b[0]).hypot(a[1] - b[1])
 }

@@ -1,0 +1,247 @@
+//! Corners: FAST-9 (Rosten and Drummond, ECCV 2006), the strongest of each free grid cell.
+//!
+//! The score of a pixel is the largest threshold at which it is still a corner, so the strongest
+//! corner of a cell does not depend on the threshold it was found with; halving the threshold
+//! only saves time where there is texture. Ties go to the first in scan order.
+
+use crate::config::FrontendConfig;
+use stipple_drivers::Image;
+
+/// Corners keep this far from the image border, so that coarse levels see most of the patch, px.
+pub const BORDER: usize = 19;
+/// Widest cell a board file may ask for, px.
+const CELL_MAX: usize = 200;
+const ARC: usize = 9;
+const RING: [(isize, isize); 16] = [
+    (0, -3),
+    (1, -3),
+    (2, -2),
+    (3, -1),
+    (3, 0),
+    (3, 1),
+    (2, 2),
+    (1, 3),
+    (0, 3),
+    (-1, 3),
+    (-2, 2),
+    (-3, 1),
+    (-3, 0),
+    (-3, -1),
+    (-2, -2),
+    (-1, -3),
+];
+
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Corner {
+    pub x: usize,
+    pub y: usize,
+    pub score: u8,
+}
+
+/// The detection grid of one camera, and which of its cells hold a point.
+pub struct Detector {
+    cell: usize,
+    columns: usize,
+    origin: [usize; 2],
+    taken: Vec<bool>,
+    corners: Vec<Corner>,
+    threshold: u8,
+    threshold_min: u8,
+}
+
+impl Detector {
+    pub fn new(width: usize, height: usize, config: &FrontendConfig) -> Detector {
+        let cell = (config.grid_px as usize).min(CELL_MAX);
+        let (columns, rows) = (width / cell, height / cell);
+        Detector {
+            cell,
+            columns,
+            origin: [(width % cell) / 2, (height % cell) / 2],
+            taken: vec![false; columns * rows],
+            corners: Vec::with_capacity(columns * rows),
+            threshold: config.fast_threshold.min(255) as u8,
+            threshold_min: config.fast_threshold_min.clamp(1, 255) as u8,
+        }
+    }
+
+    pub fn bytes(width: usize, height: usize, config: &FrontendConfig) -> usize {
+        let cell = (config.grid_px as usize).min(CELL_MAX);
+        (width / cell) * (height / cell) * (size_of::<bool>() + size_of::<Corner>())
+    }
+
+    /// Finds at most `room` corners, one in each cell free of `points`; the strongest when there
+    /// are more. Also answers how many did not fit.
+    pub fn detect(&mut self, image: &Image, points: impl Iterator<Item = [f32; 2]>, room: usize) -> (&[Corner], usize) {
+        self.taken.fill(false);
+        let rows = self.taken.len() / self.columns.max(1);
+        for [x, y] in points {
+            let i = (x - self.origin[0] as f32) / self.cell as f32;
+            let j = (y - self.origin[1] as f32) / self.cell as f32;
+            if i >= 0.0 && j >= 0.0 && i < self.columns as f32 && j < rows as f32 {
+                self.taken[j as usize * self.columns + i as usize] = true;
+            }
+        }
+        self.corners.clear();
+        for k in 0..self.taken.len() {
+            if !self.taken[k] {
+                let x = self.origin[0] + (k % self.columns) * self.cell;
+                let y = self.origin[1] + (k / self.columns) * self.cell;
+                let corner = strongest(image, [x, y], self.cell, self.threshold, self.threshold_min);
+                self.corners.extend(corner); // one a cell: the capacity is the number of cells
+            }
+        }
+        let excess = self.corners.len().saturating_sub(room);
+        if excess > 0 {
+            self.corners.sort_unstable_by_key(|c| (std::cmp::Reverse(c.score), c.y, c.x));
+            self.corners.truncate(room);
+        }
+        (&self.corners, excess)
+    }
+}
+
+/// The strongest corner of the square cell at `at`, if any exceeds the least threshold.
+pub fn strongest(image: &Image, at: [usize; 2], cell: usize, threshold: u8, threshold_min: u8) -> Option<Corner> {
+    let mut t = threshold.max(threshold_min);
+    loop {
+        let best = scan(image, at, cell, t);
+        if best.is_some() || t == threshold_min {
+            return best;
+        }
+        t = (t / 2).max(threshold_min);
+    }
+}
+
+/// The strongest corner whose score exceeds `threshold`.
+fn scan(image: &Image, at: [usize; 2], cell: usize, threshold: u8) -> Option<Corner> {
+    let w = image.width;
+    let x0 = at[0].max(BORDER);
+    let x1 = (at[0] + cell).min(w.saturating_sub(BORDER));
+    let y1 = (at[1] + cell).min(image.height.saturating_sub(BORDER));
+    let mut best = Corner { x: 0, y: 0, score: threshold };
+    let mut maybe = [false; CELL_MAX];
+    if x0 >= x1 {
+        return None;
+    }
+    for y in at[1].max(BORDER)..y1 {
+        let row = y * w + x0;
+        candidates(&image.pixels, row, w, best.score, &mut maybe[..x1 - x0]);
+        for (x, _) in maybe[..x1 - x0].iter().enumerate().filter(|(_, m)| **m) {
+            let s = score(&image.pixels, row + x, w);
+            if s > best.score {
+                best = Corner { x: x0 + x, y, score: s };
+            }
+        }
+    }
+    (best.score > threshold).then_some(best)
+}
+
+/// Marks the pixels of a row that can be corners: an arc of nine of sixteen holds one of every
+/// opposite pair. Four pairs are looked at, many pixels at once.
+fn candidates(pixels: &[u8], row: usize, stride: usize, threshold: u8, maybe: &mut [bool]) {
+    let n = maybe.len();
+    let ring = |k: usize| {
+        let start = (row as isize + RING[k].1 * stride as isize + RING[k].0) as usize;
+        &pixels[start..start + n]
+    };
+    let centre = &pixels[row..row + n];
+    let (a0, a1, b0, b1) = (ring(0), ring(8), ring(4), ring(12));
+    let (c0, c1, d0, d1) = (ring(2), ring(10), ring(6), ring(14));
+    for i in 0..n {
+        let high = centre[i].saturating_add(threshold);
+        let low = centre[i].saturating_sub(threshold);
+        let brighter = a0[i].max(a1[i]).min(b0[i].max(b1[i])).min(c0[i].max(c1[i])).min(d0[i].max(d1[i]));
+        let darker = a0[i].min(a1[i]).max(b0[i].min(b1[i])).max(c0[i].min(c1[i])).max(d0[i].min(d1[i]));
+        maybe[i] = (brighter > high) | (darker < low);
+    }
+}
+
+/// The largest difference exceeded in one direction by nine neighbouring pixels of the ring, or 0.
+fn score(pixels: &[u8], at: usize, stride: usize) -> u8 {
+    let c = pixels[at] as i16;
+    let mut d = [0i16; 32];
+    for k in 0..16 {
+        d[k] = pixels[(at as isize + RING[k].1 * stride as isize + RING[k].0) as usize] as i16 - c;
+        d[k + 16] = d[k];
+    }
+    // Extremes of windows of 2, 4, 8, 9 by doubling.
+    let (mut low, mut high) = (d, d);
+    for step in [1, 2, 4] {
+        for k in 0..32 - step {
+            low[k] = low[k].min(low[k + step]);
+            high[k] = high[k].max(high[k + step]);
+        }
+    }
+    let mut best = 0;
+    for k in 0..16 {
+        best = best.max(low[k].min(d[k + ARC - 1])).max(-high[k].max(d[k + ARC - 1]));
+    }
+    best as u8
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+    use proptest::prelude::*;
+
+    /// The definition, word by word.
+    fn is_corner(image: &Image, x: usize, y: usize, t: i32) -> bool {
+        let c = image.at(x, y) as i32;
+        let at = |k: usize| {
+            let (dx, dy) = RING[k % 16];
+            image.at((x as isize + dx) as usize, (y as isize + dy) as usize) as i32
+        };
+        (0..16).any(|s| (s..s + ARC).all(|k| at(k) > c + t) || (s..s + ARC).all(|k| at(k) < c - t))
+    }
+
+    fn noise(seed: u64, contrast: u64, block: usize) -> Image {
+        let mut image = Image::new(96, 90);
+        for y in 0..image.height {
+            for x in 0..image.width {
+                let cell = (x / block) as u64 * 7919 + (y / block) as u64 * 104729;
+                let s = (seed ^ cell).wrapping_mul(0x9E3779B97F4A7C15);
+                let s = (s ^ (s >> 29)).wrapping_mul(0xBF58476D1CE4E5B9);
+                image.pixels[y * image.width + x] = ((s >> 40) % contrast) as u8;
+            }
+        }
+        image
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(48))]
+        #[test]
+        fn strongest_corner_is_that_of_the_definition(seed in any::<u64>(), contrast in 2u64..256, block in 1usize..6) {
+            let image = noise(seed, contrast, block);
+            for cell in [[0, 0], [30, 20], [60, 60]] {
+                let (mut expect, mut best) = (None, 5);
+                for y in cell[1].max(BORDER)..(cell[1] + 30).min(image.height - BORDER) {
+                    for x in cell[0].max(BORDER)..(cell[0] + 30).min(image.width - BORDER) {
+                        while is_corner(&image, x, y, best) {
+                            best += 1;
+                            expect = Some((x, y));
+                        }
+                    }
+                }
+                let got = strongest(&image, cell, 30, 40, 5);
+                prop_assert_eq!(got.map(|c| (c.x, c.y)), expect);
+                prop_assert_eq!(got.map_or(5, |c| c.score as i32), best);
+            }
+        }
+    }
+
+    #[test]
+    fn taken_cells_are_skipped_and_full_rooms_keep_the_strongest() {
+        let image = noise(3, 256, 4);
+        let config = FrontendConfig { grid_px: 20, ..FrontendConfig::default() };
+        let mut detector = Detector::new(image.width, image.height, &config);
+        let all = detector.detect(&image, std::iter::empty(), 100).0.to_vec();
+        assert!(all.len() > 4);
+        let hit = all[0];
+        let without = detector.detect(&image, std::iter::once([hit.x as f32, hit.y as f32]), 100).0.to_vec();
+        assert_eq!(without, all[1..]);
+        let (few, excess) = detector.detect(&image, std::iter::empty(), 3);
+        assert_eq!((few.len(), excess), (3, all.len() - 3));
+        let weakest = few.iter().map(|c| c.score).min().unwrap();
+        assert!(all.iter().filter(|c| c.score > weakest).count() < 3);
+    }
+}

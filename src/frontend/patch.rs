@@ -1,0 +1,386 @@
+//! Patch alignment: inverse-compositional SE(2) on mean-normalised patches, coarse to fine.
+//!
+//! A template is taken once, upright, at a point of one image; alignment moves and turns it over
+//! another image until the two agree (Baker and Matthews, IJCV 2004). Dividing a patch by its mean
+//! makes the residual blind to exposure and gain.
+//!
+//! ```text
+//! d_i = I_i / m, m = mean I            values of the template
+//! J_i = (g_i - d_i mean(g)) / m        g_i = ∇I_i [1 0 -y_i; 0 1 x_i], the mean moves too
+//! r_i = I'(T o_i) / mean I' - d_i      inc = -(JᵀJ)⁻¹ Jᵀ r      T <- T exp(inc)
+//! ```
+//!
+//! Offsets o_i sit on half pixels: 52 of them (thirteen vectors of four) fill a disc of radius 4.
+//! A template is upright, so its pixels share one bilinear fraction and gradients are differences
+//! on the same grid.
+
+use super::pyramid::Pyramid;
+use crate::limits::PYRAMID_LEVELS;
+use stipple_drivers::Image;
+
+/// Offsets of the pattern.
+pub const N: usize = 52;
+const SIDE: usize = 8;
+/// Pattern, one pixel more on every side for the differences.
+const GRID: usize = SIDE + 2;
+/// Grid index of each offset; the offset is `index - GRID/2 + 1/2`.
+const PATTERN: [[usize; 2]; N] = pattern();
+const DX: [f32; N] = offsets(0);
+const DY: [f32; N] = offsets(1);
+/// No offset is longer (3.5² + 1.5² = 14.5 = 3.81²), px.
+const RADIUS: f32 = 3.9;
+
+/// A level is left when its step is below this, px of the level (and rad times four pixels).
+const STEP_MIN: f32 = 0.01;
+/// A step this long has left the basin, px.
+const STEP_MAX: f32 = 10.0;
+
+const fn pattern() -> [[usize; 2]; N] {
+    let mut p = [[0; 2]; N];
+    let (mut n, mut k) = (0, 0);
+    while k < SIDE * SIDE {
+        let (x, y) = (2 * (k % SIDE) as i32 - 7, 2 * (k / SIDE) as i32 - 7); // twice the offset
+        if x * x + y * y < 64 {
+            p[n] = [k % SIDE + 1, k / SIDE + 1];
+            n += 1;
+        }
+        k += 1;
+    }
+    assert!(n == N);
+    p
+}
+
+const fn offsets(axis: usize) -> [f32; N] {
+    let mut o = [0.0; N];
+    let mut k = 0;
+    while k < N {
+        o[k] = PATTERN[k][axis] as f32 - (GRID as f32 - 1.0) / 2.0;
+        k += 1;
+    }
+    o
+}
+
+/// Where the patch is and how it is turned: (x, y) + [c -s; s c] o.
+#[derive(Clone, Copy, Debug, PartialEq, Default)]
+pub struct Warp {
+    pub x: f32,
+    pub y: f32,
+    pub c: f32,
+    pub s: f32,
+}
+
+impl Warp {
+    pub fn upright(px: [f32; 2]) -> Warp {
+        Warp { x: px[0], y: px[1], c: 1.0, s: 0.0 }
+    }
+
+    pub fn px(&self) -> [f32; 2] {
+        [self.x, self.y]
+    }
+
+    /// The same turn, seen `2^level` times smaller.
+    pub fn at_level(&self, level: usize) -> Warp {
+        let k = 1.0 / (1 << level) as f32;
+        Warp { x: self.x * k, y: self.y * k, ..*self }
+    }
+
+    fn from_level(&self, level: usize) -> Warp {
+        let k = (1 << level) as f32;
+        Warp { x: self.x * k, y: self.y * k, ..*self }
+    }
+
+    /// T <- T exp(inc), to first order in translation; the rotation stays orthonormal.
+    fn step(&mut self, inc: [f32; 3]) {
+        self.x += self.c * inc[0] - self.s * inc[1];
+        self.y += self.s * inc[0] + self.c * inc[1];
+        self.turn(1.0, inc[2]);
+    }
+
+    /// Turns further by the direction (c, s), which need not be of unit length.
+    pub fn turn(&mut self, c: f32, s: f32) {
+        let (tc, ts) = (self.c * c - self.s * s, self.s * c + self.c * s);
+        let n = 1.0 / (tc * tc + ts * ts).sqrt();
+        (self.c, self.s) = (tc * n, ts * n);
+    }
+}
+
+/// What alignment to one patch of one image needs.
+#[derive(Clone, Copy)]
+pub struct Template {
+    /// I/mean; 0 outside the image.
+    value: [f32; N],
+    /// (JᵀJ)⁻¹Jᵀ
+    gain: [[f32; N]; 3],
+    /// Σ(value - 1)²
+    contrast: f32,
+    /// Bit i: offset i was inside the image. 0: not usable.
+    inside: u64,
+}
+
+pub const ALL: u64 = (1 << N) - 1;
+
+impl Default for Template {
+    fn default() -> Self {
+        Template { value: [0.0; N], gain: [[0.0; N]; 3], contrast: 0.0, inside: 0 }
+    }
+}
+
+impl Template {
+    pub fn usable(&self) -> bool {
+        self.inside != 0
+    }
+
+    /// Takes the patch at a pixel of a level.
+    pub fn take(&mut self, image: &Image, x: f32, y: f32) {
+        self.inside = 0;
+        if !(x >= 0.0 && y >= 0.0 && x <= (image.width - 1) as f32 && y <= (image.height - 1) as f32) {
+            return;
+        }
+        let Some((grid, inside)) = sample_grid(image, x, y) else { return };
+        let mut g = [[0f32; N]; 3];
+        let (mut sum, mut g_sum, mut count) = (0.0, [0f32; 3], 0.0);
+        for k in 0..N {
+            let [i, j] = PATTERN[k];
+            let on = if inside >> k & 1 == 1 { 1.0 } else { 0.0 };
+            let gx = 0.5 * on * (grid[j][i + 1] - grid[j][i - 1]);
+            let gy = 0.5 * on * (grid[j + 1][i] - grid[j - 1][i]);
+            self.value[k] = on * grid[j][i];
+            (g[0][k], g[1][k], g[2][k]) = (gx, gy, DX[k] * gy - DY[k] * gx);
+            sum += self.value[k];
+            count += on;
+        }
+        let mean = sum / count;
+        if !(mean > 1.0) {
+            return; // black: a ratio of noise
+        }
+        for a in 0..3 {
+            g_sum[a] = g[a].iter().sum::<f32>() / count;
+        }
+        self.contrast = 0.0;
+        for k in 0..N {
+            let on = if inside >> k & 1 == 1 { 1.0 } else { 0.0 };
+            self.value[k] /= mean;
+            self.contrast += on * (self.value[k] - 1.0) * (self.value[k] - 1.0);
+            for a in 0..3 {
+                g[a][k] = on * (g[a][k] - self.value[k] * g_sum[a]) / mean;
+            }
+        }
+        let Some(inv) = invert_normal(&g) else { return };
+        for a in 0..3 {
+            for k in 0..N {
+                self.gain[a][k] = inv[a][0] * g[0][k] + inv[a][1] * g[1][k] + inv[a][2] * g[2][k];
+            }
+        }
+        self.inside = inside;
+    }
+
+    /// Moves `warp` (pixels of this level) onto the template. Answers what share of the template's
+    /// contrast was left unexplained before the last step, or `None` when it slid off.
+    pub fn align(&self, image: &Image, warp: &mut Warp, iterations: usize) -> Option<f32> {
+        let mut left = f32::MAX;
+        for _ in 0..iterations {
+            let (r, unexplained) = self.residual(image, warp)?;
+            left = unexplained;
+            let mut inc = [0f32; 3];
+            for a in 0..3 {
+                inc[a] = -dot(&self.gain[a], &r);
+            }
+            let length = inc[0].abs().max(inc[1].abs()).max(4.0 * inc[2].abs());
+            if !(length < STEP_MAX) {
+                return None;
+            }
+            warp.step(inc);
+            if length < STEP_MIN {
+                break;
+            }
+        }
+        Some(left)
+    }
+
+    /// r_i at a warp, and Σr²/contrast. `None` unless more than half of the pattern is in both images.
+    pub fn residual(&self, image: &Image, warp: &Warp) -> Option<([f32; N], f32)> {
+        let mut r = [0f32; N];
+        let inside = self.inside & sample(image, warp, &mut r);
+        if inside.count_ones() <= N as u32 / 2 {
+            return None;
+        }
+        // Both means over the same pixels; the template's is 1 over its own.
+        let (mut mean, mut own) = (r.iter().sum::<f32>() / N as f32, 1.0);
+        if inside != ALL {
+            let count = inside.count_ones() as f32;
+            let over = |v: &[f32; N]| (0..N).filter(|k| inside >> k & 1 == 1).map(|k| v[k]).sum::<f32>() / count;
+            (mean, own) = (over(&r), over(&self.value));
+        }
+        if !(mean > 1.0 && own > 0.0) {
+            return None;
+        }
+        let (scale, own) = (1.0 / mean, 1.0 / own);
+        for k in 0..N {
+            r[k] = r[k] * scale - self.value[k] * own;
+        }
+        if inside != ALL {
+            for (k, r) in r.iter_mut().enumerate() {
+                if inside >> k & 1 == 0 {
+                    *r = 0.0;
+                }
+            }
+        }
+        let unexplained = dot(&r, &r) / self.contrast;
+        Some((r, unexplained))
+    }
+}
+
+/// Templates of all levels at one point.
+pub type Stack = [Template; PYRAMID_LEVELS];
+
+pub fn take_stack(stack: &mut Stack, pyramid: &Pyramid, px: [f32; 2]) {
+    for (l, t) in stack.iter_mut().enumerate() {
+        let k = 1.0 / (1 << l) as f32;
+        t.take(&pyramid.levels[l], px[0] * k, px[1] * k);
+    }
+}
+
+/// Aligns from level `coarsest` down to the full image. A coarse level that cannot be aligned
+/// leaves the guess to the next; the last must succeed.
+pub fn align_stack(
+    stack: &Stack,
+    pyramid: &Pyramid,
+    start: Warp,
+    coarsest: usize,
+    iterations: usize,
+) -> Option<(Warp, f32)> {
+    let mut warp = start;
+    for l in (1..=coarsest).rev() {
+        let mut w = warp.at_level(l);
+        if stack[l].usable() && stack[l].align(&pyramid.levels[l], &mut w, iterations).is_some() {
+            warp = w.from_level(l);
+        }
+    }
+    let left = stack[0].usable().then(|| stack[0].align(&pyramid.levels[0], &mut warp, 2 * iterations))??;
+    Some((warp, left))
+}
+
+/// Sums in four lanes: the order is fixed, and the compiler may use vectors.
+fn dot(a: &[f32; N], b: &[f32; N]) -> f32 {
+    let mut s = [0f32; 4];
+    for (a, b) in a.chunks_exact(4).zip(b.chunks_exact(4)) {
+        for i in 0..4 {
+            s[i] += a[i] * b[i];
+        }
+    }
+    (s[0] + s[1]) + (s[2] + s[3])
+}
+
+/// (JᵀJ)⁻¹ of three columns, by cofactors in f64; `None` when nearly singular.
+fn invert_normal(j: &[[f32; N]; 3]) -> Option<[[f32; 3]; 3]> {
+    let h = |a: usize, b: usize| dot(&j[a], &j[b]) as f64;
+    let (xx, xy, xt, yy, yt, tt) = (h(0, 0), h(0, 1), h(0, 2), h(1, 1), h(1, 2), h(2, 2));
+    let c = [
+        [yy * tt - yt * yt, xt * yt - xy * tt, xy * yt - xt * yy],
+        [xt * yt - xy * tt, xx * tt - xt * xt, xy * xt - xx * yt],
+        [xy * yt - xt * yy, xy * xt - xx * yt, xx * yy - xy * xy],
+    ];
+    let det = xx * c[0][0] + xy * c[0][1] + xt * c[0][2];
+    // Relative to the product of the diagonal, which bounds it from above (Hadamard).
+    if !(det > 1e-6 * xx * yy * tt && det.is_finite()) {
+        return None;
+    }
+    let inv = c.map(|row| row.map(|v| (v / det) as f32));
+    inv.iter().flatten().all(|v| v.is_finite()).then_some(inv)
+}
+
+/// Upright bilinear samples on the grid around a point inside the image, and which offsets (with
+/// their four neighbours) lie inside it. `None` when half of them or more do not.
+fn sample_grid(image: &Image, x: f32, y: f32) -> Option<([[f32; GRID]; GRID], u64)> {
+    let half = (GRID as f32 - 1.0) / 2.0;
+    let (left, top) = ((x - half).floor(), (y - half).floor());
+    let (fx, fy) = (x - half - left, y - half - top);
+    let (left, top) = (left as isize, top as isize);
+    let (w, h) = (image.width as isize, image.height as isize);
+    let whole = left >= 0 && top >= 0 && left + (GRID as isize) < w && top + (GRID as isize) < h;
+    let mut raw = [[0f32; GRID + 1]; GRID + 1];
+    for (j, row) in raw.iter_mut().enumerate() {
+        let line = (top + j as isize).clamp(0, h - 1) as usize * image.width;
+        if whole {
+            let from = line + left as usize;
+            for (v, p) in row.iter_mut().zip(&image.pixels[from..from + GRID + 1]) {
+                *v = *p as f32;
+            }
+        } else {
+            for (i, v) in row.iter_mut().enumerate() {
+                *v = image.pixels[line + (left + i as isize).clamp(0, w - 1) as usize] as f32;
+            }
+        }
+    }
+    let mut inside = ALL;
+    if !whole {
+        let ok = |at: isize, n: isize| at >= 0 && at + 1 < n;
+        for (k, [i, j]) in PATTERN.iter().enumerate() {
+            let (i, j) = (left + *i as isize, top + *j as isize);
+            if !(ok(i - 1, w) && ok(i + 1, w) && ok(j - 1, h) && ok(j + 1, h)) {
+                inside &= !(1 << k);
+            }
+        }
+        if inside.count_ones() <= N as u32 / 2 {
+            return None;
+        }
+    }
+    let mut grid = [[0f32; GRID]; GRID];
+    let (w00, w10, w01, w11) = ((1.0 - fx) * (1.0 - fy), fx * (1.0 - fy), (1.0 - fx) * fy, fx * fy);
+    for j in 0..GRID {
+        let (a, b) = (&raw[j], &raw[j + 1]);
+        for i in 0..GRID {
+            grid[j][i] = w00 * a[i] + w10 * a[i + 1] + w01 * b[i] + w11 * b[i + 1];
+        }
+    }
+    Some((grid, inside))
+}
+
+/// Bilinear samples at the warped offsets; answers which were inside.
+fn sample(image: &Image, warp: &Warp, out: &mut [f32; N]) -> u64 {
+    let (mut x, mut y) = ([0f32; N], [0f32; N]);
+    for k in 0..N {
+        x[k] = warp.x + (warp.c * DX[k] - warp.s * DY[k]);
+        y[k] = warp.y + (warp.s * DX[k] + warp.c * DY[k]);
+    }
+    let (w, h) = (image.width, image.height);
+    let (right, bottom) = ((w - 1) as f32, (h - 1) as f32);
+    let p = &image.pixels[..];
+    let whole = warp.x >= RADIUS + 1.0
+        && warp.y >= RADIUS + 1.0
+        && warp.x <= right - RADIUS - 1.0
+        && warp.y <= bottom - RADIUS - 1.0;
+    if !whole {
+        let mut inside = 0;
+        for k in 0..N {
+            if x[k] >= 0.0 && y[k] >= 0.0 && x[k] < right && y[k] < bottom {
+                let (i, j) = (x[k] as usize, y[k] as usize);
+                let q = &p[j * w + i..];
+                out[k] = bilinear(q, w, x[k] - i as f32, y[k] - j as f32);
+                inside |= 1 << k;
+            }
+        }
+        return inside;
+    }
+    // Rounding x - 1/2 to an integer by adding 2^23 is a floor that vectorises.
+    const ROUND: f32 = 8388608.0;
+    let mut at = [0u32; N];
+    for k in 0..N {
+        let (i, j) = (x[k] - 0.5 + ROUND, y[k] - 0.5 + ROUND);
+        x[k] -= i - ROUND;
+        y[k] -= j - ROUND;
+        at[k] = (j.to_bits() & 0x7f_ffff) * w as u32 + (i.to_bits() & 0x7f_ffff);
+    }
+    for k in 0..N {
+        out[k] = bilinear(&p[at[k] as usize..], w, x[k], y[k]);
+    }
+    ALL
+}
+
+#[inline]
+fn bilinear(q: &[u8], stride: usize, fx: f32, fy: f32) -> f32 {
+    let q = &q[..stride + 2];
+    let (a, b, c, d) = (q[0] as f32, q[1] as f32, q[stride] as f32, q[stride + 1] as f32);
+    let (top, bottom) = (a + fx * (b - a), c + fx * (d - c));
+    top + fy * (bottom - top)
+}

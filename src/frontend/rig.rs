@@ -1,0 +1,126 @@
+//! Two-view geometry between the cameras of a rig, and between a camera and itself a moment ago.
+
+use super::patch::Warp;
+use glam::{DVec2, DVec3};
+use stipple_drivers::{Calibration, Camera, Pose};
+
+/// Half the width of the patch: the lever that shows how it turns, px.
+const LEVER_PX: f32 = 4.0;
+/// A negative inverse depth of this many pixels of disparity is a far point and noise, px.
+const DISPARITY_SLACK_PX: f64 = 2.0;
+/// Nearer than this there is no point to follow, m.
+const DEPTH_MIN: f64 = 0.1;
+
+pub struct Rig {
+    cameras: Vec<Camera>,
+    body_from_cam: Vec<Pose>,
+    epipolar_max: f64,
+}
+
+impl Rig {
+    pub fn new(calibration: &Calibration, epipolar_max: f64) -> Rig {
+        Rig {
+            cameras: calibration.cameras.iter().map(|c| c.camera).collect(),
+            body_from_cam: calibration.cameras.iter().map(|c| c.body_from_cam).collect(),
+            epipolar_max,
+        }
+    }
+
+    pub fn bearing(&self, camera: usize, px: [f32; 2]) -> Option<DVec3> {
+        self.cameras[camera].unproject(DVec2::new(px[0] as f64, px[1] as f64))
+    }
+
+    /// Motion of one camera: `now_from_before`, from that of the body.
+    pub fn motion(&self, camera: usize, before_from_now: &Pose) -> Pose {
+        let body_from_cam = self.body_from_cam[camera];
+        body_from_cam.inverse() * before_from_now.inverse() * body_from_cam
+    }
+
+    /// `to_from_from` between two cameras at one instant.
+    pub fn between(&self, from: usize, to: usize) -> Pose {
+        self.body_from_cam[to].inverse() * self.body_from_cam[from]
+    }
+
+    /// Where a patch at an inverse distance (1/m) appears in camera `to`, and how it is turned.
+    pub fn transfer(
+        &self,
+        from: usize,
+        to: usize,
+        to_from_from: &Pose,
+        px: [f32; 2],
+        inverse_depth: f64,
+    ) -> Option<Warp> {
+        let send = |px: [f32; 2]| {
+            let p = to_from_from.q * self.bearing(from, px)? + to_from_from.p * inverse_depth;
+            let at = self.cameras[to].project(p)?;
+            self.cameras[to].contains(at, 0.0).then_some([at.x as f32, at.y as f32])
+        };
+        let centre = send(px)?;
+        let mut warp = Warp::upright(centre);
+        if let Some(side) = send([px[0] + LEVER_PX, px[1]]) {
+            warp.turn(side[0] - centre[0], side[1] - centre[1]);
+        }
+        Some(warp)
+    }
+
+    /// Inverse distance of a point seen in two cameras, 1/m, along the ray of `from`, and its weight:
+    /// the q that best puts R f + q t on the other ray. `None` when the rays miss each other by more
+    /// than the epipolar gate or meet behind a camera.
+    pub fn triangulate(&self, from: usize, to: usize, f: DVec3, g: DVec3) -> Option<(f64, f64)> {
+        let Pose { q: r, p: t } = self.between(from, to);
+        let f = r * f;
+        if g.dot(t.normalize().cross(f)).abs() > self.epipolar_max {
+            return None;
+        }
+        let (a, b) = (g.cross(t), g.cross(f));
+        let weight = a.length_squared();
+        let q = -a.dot(b) / weight;
+        let slack = DISPARITY_SLACK_PX / (self.cameras[from].fx * t.length());
+        (q > -slack && q < 1.0 / DEPTH_MIN && g.dot(f + t * q.max(0.0)) > 0.0).then_some((q, weight))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+    use glam::DQuat;
+    use stipple_drivers::{ImuCalibration, Lens, RigCamera};
+
+    fn rig() -> Rig {
+        let lens = Lens::KannalaBrandt { k: [0.01, -0.01, 0.006, -0.0017] };
+        let camera = Camera { width: 640, height: 480, fx: 300.0, fy: 300.0, cx: 320.0, cy: 240.0, lens };
+        let turned = Pose::new(DQuat::from_euler(glam::EulerRot::XYZ, 0.02, -0.05, 0.2), DVec3::new(0.1, 0.01, 0.0));
+        let cameras = [Pose::IDENTITY, turned].map(|body_from_cam| RigCamera { camera, body_from_cam }).to_vec();
+        let imu =
+            ImuCalibration { rate_hz: 200.0, gyro_noise: 1e-3, gyro_walk: 1e-5, accel_noise: 1e-2, accel_walk: 1e-4 };
+        Rig::new(&Calibration { cameras, imu }, 0.005)
+    }
+
+    #[test]
+    fn transfer_and_triangulation_agree() {
+        let rig = rig();
+        for q in [0.0, 0.2, 1.0] {
+            let px = [250.0, 200.0];
+            let warp = rig.transfer(0, 1, &rig.between(0, 1), px, q).unwrap();
+            let (f, g) = (rig.bearing(0, px).unwrap(), rig.bearing(1, warp.px()).unwrap());
+            assert!((rig.triangulate(0, 1, f, g).unwrap().0 - q).abs() < 1e-3);
+            // the second camera is rolled by 0.2 rad, so the patch turns the other way
+            assert!((warp.s.atan2(warp.c) + 0.2).abs() < 0.05);
+        }
+    }
+
+    #[test]
+    fn points_off_the_epipolar_line_or_behind_are_refused() {
+        let rig = rig();
+        let px = [330.0, 250.0];
+        let f = rig.bearing(0, px).unwrap();
+        let [x, y] = rig.transfer(0, 1, &rig.between(0, 1), px, 0.0).unwrap().px();
+        let t = rig.between(0, 1).p.normalize();
+        for (along, across, ok) in [(30.0, 0.0, true), (-30.0, 0.0, false), (30.0, 4.0, false)] {
+            let (dx, dy) = (t.x as f32, t.y as f32);
+            let g = rig.bearing(1, [x + along * dx - across * dy, y + along * dy + across * dx]).unwrap();
+            assert_eq!(rig.triangulate(0, 1, f, g).is_some(), ok, "{along} {across}");
+        }
+    }
+}
