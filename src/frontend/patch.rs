@@ -84,7 +84,7 @@ impl Warp {
         Warp { x: self.x * k, y: self.y * k, ..*self }
     }
 
-    fn from_level(&self, level: usize) -> Warp {
+    fn at_full(&self, level: usize) -> Warp {
         let k = (1 << level) as f32;
         Warp { x: self.x * k, y: self.y * k, ..*self }
     }
@@ -253,7 +253,7 @@ pub fn align_stack(
     for l in (1..=coarsest).rev() {
         let mut w = warp.at_level(l);
         if stack[l].usable() && stack[l].align(&pyramid.levels[l], &mut w, iterations).is_some() {
-            warp = w.from_level(l);
+            warp = w.at_full(l);
         }
     }
     let left = stack[0].usable().then(|| stack[0].align(&pyramid.levels[0], &mut warp, 2 * iterations))??;
