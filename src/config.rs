@@ -92,6 +92,9 @@ pub struct VioConfig {
     pub gyro_bias_sigma: f64,
     /// Observations further than this from their prediction after optimisation are dropped, px.
     pub outlier_px: f64,
+    /// Factors on the calibration's noise densities, for vibration and scale errors it does not state.
+    pub gyro_noise_scale: f64,
+    pub accel_noise_scale: f64,
 }
 
 impl Default for VioConfig {
@@ -106,6 +109,8 @@ impl Default for VioConfig {
             accel_bias_sigma: 0.3,
             gyro_bias_sigma: 0.1,
             outlier_px: 3.0,
+            gyro_noise_scale: 2.0,
+            accel_noise_scale: 4.0,
         }
     }
 }
@@ -305,6 +310,7 @@ impl Board {
             (v.huber_px > 0.0, "vio.huber_px", "must be positive"),
             ((1..=100).contains(&v.iterations_max), "vio.iterations_max", "must be 1..100"),
             (v.accel_bias_sigma > 0.0 && v.gyro_bias_sigma > 0.0, "vio.*_bias_sigma", "must be positive"),
+            (v.gyro_noise_scale > 0.0 && v.accel_noise_scale > 0.0, "vio.*_noise_scale", "must be positive"),
             (v.triangulation_baseline_min_m > 0.0, "vio.triangulation_baseline_min_m", "must be positive"),
             (
                 s.disparities > 0 && s.disparities % 16 == 0 && s.disparities <= 512,

@@ -1,2 +1,4 @@
-//! Rotations and rigid transforms (one perturbation convention).
+//! Rotations and the small dense algebra of the estimator.
+
+pub mod dense;
 pub mod so3;

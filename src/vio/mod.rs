@@ -1,6 +1,41 @@
-//! Sliding-window visual-inertial estimator, sans-IO.
+//! Sliding-window stereo-inertial estimator, sans-IO: samples and tracks in, odometry out.
+//!
+//! Per frame: preintegrate the inertial samples since the last one and predict; attach tracks to
+//! landmarks; perhaps declare a keyframe and triangulate; optimise the window; drop outliers;
+//! marginalise back to the resting size (`STATES` states, `KEYFRAMES` keyframe poses). After Usenko
+//! et al., RA-L 2020, with the state of a new frame output after its own optimisation.
+//!
+//! Until motion and gravity are known (`init`) tracks give no odometry. The same input gives
+//! bit-identical output; `hash` proves it. Nothing is allocated after `new`.
+
+pub mod init;
+pub mod landmarks;
+pub mod marginalise;
+pub mod preintegration;
+pub mod residuals;
+pub mod solve;
+pub mod window;
+
+use crate::config::VioConfig;
+use crate::frontend::Tracks;
+use crate::limits::{CAMERAS_MAX, STATES};
+use crate::mem::Footprint;
 use glam::DVec3;
-use stipple_drivers::{Nanos, Pose};
+use init::{Aligner, Start};
+use landmarks::Landmarks;
+use marginalise::{marginalise, Prior};
+use preintegration::{ImuRing, Increment, Noise};
+use residuals::{Eye, InertialWeight, Motion};
+use solve::{Model, Outcome, Solver};
+use stipple_drivers::{Calibration, ImuSample, Nanos, Pose};
+use window::{Frame, Window, FRAMES};
+
+/// With fewer landmarks in view than this a keyframe is declared at once.
+const CONNECTED_FEW: usize = 20;
+/// A state this far from sense is a failure, and the estimator starts again: m/s, m/s², rad/s.
+const SPEED_MAX: f64 = 100.0;
+const ACCEL_BIAS_MAX: f64 = 5.0;
+const GYRO_BIAS_MAX: f64 = 1.0;
 
 /// The estimate at one instant.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -14,3 +49,265 @@ pub struct Odometry {
     /// m/s², body frame.
     pub accel_bias: DVec3,
 }
+
+/// What one frame led to.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Update {
+    /// `None` until initialised.
+    pub odometry: Option<Odometry>,
+    pub keyframe: bool,
+    /// Tracks of camera 0 that are landmarks.
+    pub connected: usize,
+    pub outcome: Outcome,
+}
+
+/// What was dropped, refused, or went wrong so far.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Stats {
+    pub frames: u64,
+    pub keyframes: u64,
+    pub imu_rejected: u64,
+    pub imu_overflow: u64,
+    /// Frames not newer than the last.
+    pub frames_rejected: u64,
+    pub landmarks_full: u64,
+    pub outliers: u64,
+    pub solver_failures: u64,
+    pub resets: u64,
+    pub iterations: u64,
+}
+
+#[derive(Debug)]
+pub struct Vio {
+    model: Model,
+    config: VioConfig,
+    noise: Noise,
+    imu: ImuRing,
+    window: Window,
+    /// What was seen in each slot of the window.
+    tracks: Vec<Tracks>,
+    landmarks: Landmarks,
+    prior: Prior,
+    solver: Solver,
+    aligner: Aligner,
+    running: bool,
+    frames_since_keyframe: u32,
+    stats: Stats,
+    hash: u64,
+}
+
+impl Vio {
+    pub fn new(calibration: &Calibration, config: &VioConfig) -> Vio {
+        let eyes: Vec<Eye> = calibration.cameras.iter().take(CAMERAS_MAX).map(Eye::from).collect();
+        Vio {
+            model: Model::new(eyes, config),
+            config: config.clone(),
+            noise: Noise::new(&calibration.imu, config.gyro_noise_scale, config.accel_noise_scale),
+            imu: ImuRing::new(),
+            window: Window::new(),
+            tracks: vec![Tracks::default(); FRAMES],
+            landmarks: Landmarks::new(),
+            prior: Prior::new(),
+            solver: Solver::new(),
+            aligner: Aligner::new(),
+            running: false,
+            frames_since_keyframe: 0,
+            stats: Stats::default(),
+            hash: FNV_START,
+        }
+    }
+
+    pub fn footprint() -> Footprint {
+        let mut f = Footprint::default();
+        f.host("vio: inertial ring", ImuRing::BYTES);
+        f.host("vio: window", Window::BYTES + FRAMES * size_of::<Tracks>());
+        f.host("vio: landmarks", Landmarks::BYTES);
+        f.host("vio: solver and prior", Solver::BYTES + Prior::BYTES);
+        f.host("vio: initialisation", Aligner::BYTES);
+        f
+    }
+
+    /// Takes a sample; refuses what is not finite or not newer than the last.
+    pub fn on_imu(&mut self, s: ImuSample) {
+        if !s.is_finite() || self.imu.newest().is_some_and(|n| s.t <= n.t) {
+            self.stats.imu_rejected += 1;
+            return;
+        }
+        let overwritten = self.imu.push(s);
+        let needed_from = self.window.newest().map(|n| self.window.frame(n).t);
+        if let (Some(old), Some(t)) = (overwritten, needed_from) {
+            self.stats.imu_overflow += (old.t > t) as u64;
+        }
+    }
+
+    /// Takes what the cameras saw at one instant. Inertial samples up to it must have come before;
+    /// the newest is held where they have not.
+    pub fn on_tracks(&mut self, tracks: &Tracks) -> Update {
+        let last =
+            if self.running { self.window.newest().map(|n| self.window.frame(n).t) } else { self.aligner.last() };
+        if last.is_some_and(|t| tracks.t <= t) {
+            self.stats.frames_rejected += 1;
+            return Update::default();
+        }
+        self.stats.frames += 1;
+        let mut update = if self.running { self.advance(tracks) } else { self.try_start(tracks) };
+        if self.running && !self.is_sane() {
+            self.reset();
+            update = Update::default();
+        }
+        update
+    }
+
+    /// First frame of the window, once motion and gravity are known.
+    fn try_start(&mut self, tracks: &Tracks) -> Update {
+        let Some(Start { motion, sigma }) = self.aligner.add(tracks, &self.imu, &self.noise, &self.model, &self.config)
+        else {
+            return Update::default();
+        };
+        let Some(slot) = self.window.push(Frame::first(tracks.t, motion)) else { return Update::default() };
+        self.window.frame_mut(slot).fix_anchor();
+        self.prior.start(slot, &motion, &sigma);
+        self.tracks[slot].clone_from(tracks);
+        self.running = true;
+        self.make_keyframe(slot);
+        self.output(slot, true, 0, Outcome::default())
+    }
+
+    fn advance(&mut self, tracks: &Tracks) -> Update {
+        let Some(before) = self.window.newest() else { return Update::default() };
+        let from = self.window.frame(before).now;
+        let inc = self.imu.integrate(self.window.frame(before).t, tracks.t, from.bg, from.ba, &self.noise);
+        let mut frame = Frame::first(tracks.t, from.propagate(&inc));
+        frame.weight = self.inertial_weight(&inc);
+        frame.increment = inc;
+        let slot = self.window.push(frame).expect("marginalisation left room for one frame");
+        self.tracks[slot].clone_from(tracks);
+
+        let (connected, unconnected) = self.landmarks.attach(slot, tracks);
+        self.frames_since_keyframe += 1;
+        let fraction = connected as f64 / (connected + unconnected).max(1) as f64;
+        let due =
+            fraction < self.config.keyframe_connected_min && self.frames_since_keyframe > self.config.keyframe_gap_min;
+        let keyframe = unconnected > 0 && (due || connected < CONNECTED_FEW);
+        if keyframe {
+            self.make_keyframe(slot);
+        }
+
+        let outcome = self.solver.optimise(&mut self.window, &mut self.landmarks, &self.prior, &self.model);
+        self.stats.solver_failures += outcome.failures as u64;
+        self.stats.iterations += outcome.iterations as u64;
+        let dropped = self.landmarks.drop_outliers(&self.window, &self.model.eyes, self.config.outlier_px);
+        self.stats.outliers += dropped as u64;
+        let update = self.output(slot, keyframe, connected, outcome);
+        marginalise(&mut self.window, &mut self.landmarks, &mut self.prior, &mut self.solver, &self.model);
+        update
+    }
+
+    fn inertial_weight(&self, inc: &Increment) -> InertialWeight {
+        let root_dt = inc.dt.sqrt();
+        InertialWeight {
+            // A covariance that cannot be factored says nothing; zero weight leaves the step to vision.
+            increment: inc.whitening().unwrap_or_default(),
+            bg: 1.0 / (self.noise.gyro_walk * root_dt),
+            ba: 1.0 / (self.noise.accel_walk * root_dt),
+        }
+    }
+
+    fn make_keyframe(&mut self, slot: usize) {
+        let (made, full) = self.landmarks.triangulate(
+            slot,
+            &self.window,
+            &self.tracks,
+            &self.model.eyes,
+            self.config.triangulation_baseline_min_m,
+            self.config.outlier_px,
+        );
+        self.stats.landmarks_full += full as u64;
+        self.stats.keyframes += 1;
+        self.frames_since_keyframe = 0;
+        let frame = self.window.frame_mut(slot);
+        (frame.keyframe, frame.hosted) = (true, made);
+    }
+
+    fn output(&mut self, slot: usize, keyframe: bool, connected: usize, outcome: Outcome) -> Update {
+        let f = self.window.frame(slot);
+        let odometry = odometry(f.t, &f.now);
+        if keyframe {
+            let (p, q) = (odometry.world_from_body.p, odometry.world_from_body.q);
+            self.hash = fnv(self.hash, odometry.t.0 as u64);
+            for x in [p.x, p.y, p.z, q.x, q.y, q.z, q.w] {
+                self.hash = fnv(self.hash, x.to_bits());
+            }
+        }
+        Update { odometry: Some(odometry), keyframe, connected, outcome }
+    }
+
+    fn is_sane(&self) -> bool {
+        self.window.newest().is_some_and(|n| {
+            let m = &self.window.frame(n).now;
+            m.is_finite() && m.v.length() < SPEED_MAX && m.ba.length() < ACCEL_BIAS_MAX && m.bg.length() < GYRO_BIAS_MAX
+        })
+    }
+
+    /// Forgets everything but the inertial samples, and initialises again.
+    pub fn reset(&mut self) {
+        self.window.clear();
+        self.landmarks.clear();
+        self.prior.clear();
+        self.aligner.clear();
+        self.running = false;
+        self.frames_since_keyframe = 0;
+        self.stats.resets += 1;
+    }
+
+    /// The newest state carried by the inertial samples to `t`. `None` until initialised.
+    pub fn predict(&self, t: Nanos) -> Option<Odometry> {
+        let f = self.running.then(|| self.window.newest().map(|n| self.window.frame(n)))??;
+        let inc = self.imu.integrate(f.t, t.max(f.t), f.now.bg, f.now.ba, &self.noise);
+        Some(odometry(f.t.max(t), &f.now.propagate(&inc)))
+    }
+
+    /// Motion of the body since the newest frame, for the tracker's start at `t`: before
+    /// initialisation the rotation only, and nothing before the first frame.
+    pub fn predict_motion(&self, t: Nanos) -> Option<Pose> {
+        if let (Some(now), Some(n)) = (self.predict(t), self.window.newest()) {
+            return Some(self.window.frame(n).now.pose.inverse() * now.world_from_body);
+        }
+        let inc = self.imu.integrate(self.aligner.last()?, t, DVec3::ZERO, DVec3::ZERO, &self.noise);
+        Some(Pose::new(inc.q, DVec3::ZERO))
+    }
+
+    /// Instant, pose, and whether it is a keyframe, of every frame of the window, oldest first.
+    pub fn window(&self) -> impl Iterator<Item = (Nanos, Pose, bool)> + '_ {
+        self.window.slots().map(|s| self.window.frame(s)).map(|f| (f.t, f.now.pose, f.keyframe))
+    }
+
+    /// FNV-1a over stamp and pose bits of every keyframe as it was output.
+    pub fn hash(&self) -> u64 {
+        self.hash
+    }
+
+    pub fn stats(&self) -> &Stats {
+        &self.stats
+    }
+
+    pub fn landmarks(&self) -> usize {
+        self.landmarks.pool.len()
+    }
+
+    pub fn is_running(&self) -> bool {
+        self.running
+    }
+}
+
+fn odometry(t: Nanos, m: &Motion) -> Odometry {
+    Odometry { t, world_from_body: m.pose, v_world: m.v, gyro_bias: m.bg, accel_bias: m.ba }
+}
+
+const FNV_START: u64 = 0xcbf2_9ce4_8422_2325;
+
+fn fnv(hash: u64, word: u64) -> u64 {
+    word.to_le_bytes().iter().fold(hash, |h, b| (h ^ *b as u64).wrapping_mul(0x0000_0100_0000_01b3))
+}
+
+const _: () = assert!(FRAMES > STATES + 1 && FRAMES <= u8::MAX as usize);

@@ -1,0 +1,302 @@
+//! The first state: where down is, how fast we move, and the gyro's bias.
+//!
+//! At rest (quiet samples and still tracks) gravity and gyro bias are means. Otherwise stereo gives
+//! metric points at a first frame and, by resection against them, poses of the next half second; the
+//! preintegrated increments between these poses are then linear in the first velocity and gravity,
+//! and, through rotation, in the gyro bias (Martinelli, IJCV 2014). The poses do not drift, so half
+//! a second fixes gravity to well under a degree even while shaken by hand. If resection keeps
+//! failing, gravity is the mean specific force and the window must find the rest.
+
+use super::landmarks::find_track;
+use super::marginalise::Sigma;
+use super::preintegration::{ImuRing, Increment, Noise, GRAVITY};
+use super::residuals::{huber, reproject, Body, Eye, Motion, Point};
+use super::solve::Model;
+use crate::config::VioConfig;
+use crate::frontend::Tracks;
+use crate::limits::TRACKS;
+use crate::math::so3;
+use glam::{DMat3, DQuat, DVec2, DVec3};
+use nalgebra::{SMatrix, SVector};
+use stipple_drivers::{Nanos, Pose, Span};
+
+/// At rest: quiet this long, s; spread of gyro rad/s and accelerometer m/s² below these; a gyro mean
+/// that a bias can explain, rad/s; tracks that moved less than this, px.
+const REST_SPAN: f64 = 0.5;
+const REST_GYRO: f64 = 0.03;
+const REST_ACCEL: f64 = 0.3;
+const REST_GYRO_MEAN: f64 = 0.15;
+const REST_PX: f64 = 0.5;
+
+/// Alignment: span, s, and frames it takes at least and at most.
+const ALIGN_SPAN: f64 = 0.45;
+const ALIGN_FRAMES_MIN: usize = 6;
+const ALIGN_FRAMES_MAX: usize = 64;
+/// Points a resection needs.
+const RESECTION_MIN: usize = 12;
+const RESECTION_ITERATIONS: usize = 12;
+/// Misfit accepted: of the length of gravity, m/s², and of positions, m.
+const GRAVITY_MISFIT: f64 = 1.5;
+const POSITION_MISFIT: f64 = 0.05;
+/// Rotation noise of one resection, rad: the weight of the gyro bias' prior.
+const RESECTION_ROTATION: f64 = 2e-3;
+/// Alignments that may fail before the mean force has to do.
+const ATTEMPTS: u32 = 3;
+/// Position and yaw are ours to choose; this fixes them, m and rad.
+const GAUGE_SIGMA: f64 = 1e-4;
+
+#[derive(Clone, Copy, Debug)]
+pub struct Start {
+    pub motion: Motion,
+    pub sigma: Sigma,
+}
+
+#[derive(Clone, Copy, Debug)]
+struct Sighting {
+    id: u64,
+    px: DVec2,
+    point: Point,
+}
+
+#[derive(Clone, Copy, Debug)]
+struct Step {
+    t: Nanos,
+    reference_from_body: Pose,
+    increment: Increment,
+}
+
+#[derive(Clone, Debug)]
+pub struct Aligner {
+    sightings: Vec<Sighting>,
+    steps: Vec<Step>,
+    attempts: u32,
+}
+
+impl Aligner {
+    pub fn new() -> Aligner {
+        Aligner { sightings: Vec::with_capacity(TRACKS), steps: Vec::with_capacity(ALIGN_FRAMES_MAX), attempts: 0 }
+    }
+
+    pub const BYTES: usize = TRACKS * size_of::<Sighting>() + ALIGN_FRAMES_MAX * size_of::<Step>();
+
+    pub fn clear(&mut self) {
+        self.sightings.clear();
+        self.steps.clear();
+        self.attempts = 0;
+    }
+
+    pub fn last(&self) -> Option<Nanos> {
+        self.steps.last().map(|s| s.t)
+    }
+
+    pub fn add(
+        &mut self,
+        tracks: &Tracks,
+        imu: &ImuRing,
+        noise: &Noise,
+        model: &Model,
+        config: &VioConfig,
+    ) -> Option<Start> {
+        let Some(last) = self.steps.last().copied() else {
+            self.refer_to(tracks, model, config);
+            return None;
+        };
+        if let Some(start) = self.at_rest(tracks, imu, config) {
+            return Some(start);
+        }
+        let increment = imu.integrate(last.t, tracks.t, DVec3::ZERO, DVec3::ZERO, noise);
+        let before =
+            self.steps.len().checked_sub(2).map_or(last.reference_from_body, |i| self.steps[i].reference_from_body);
+        let stride = last.reference_from_body.p - before.p;
+        let guess = Pose::new(last.reference_from_body.q * increment.q, last.reference_from_body.p + stride);
+        let start = match resect(&self.sightings, tracks, model, guess) {
+            Some(reference_from_body) => {
+                self.steps.push(Step { t: tracks.t, reference_from_body, increment });
+                let span = (tracks.t - self.steps[0].t).secs();
+                if !(span >= ALIGN_SPAN && self.steps.len() >= ALIGN_FRAMES_MIN) && self.steps.len() < ALIGN_FRAMES_MAX
+                {
+                    return None;
+                }
+                align(&self.steps, config)
+            }
+            None => None,
+        };
+        if start.is_none() {
+            self.attempts += 1;
+            self.refer_to(tracks, model, config);
+            if self.attempts >= ATTEMPTS {
+                return from_mean_force(tracks.t, imu, noise, config);
+            }
+        }
+        start
+    }
+
+    /// Starts over from this frame: its stereo points are the metric reference.
+    fn refer_to(&mut self, tracks: &Tracks, model: &Model, config: &VioConfig) {
+        self.steps.clear();
+        self.steps.push(Step {
+            t: tracks.t,
+            reference_from_body: Pose::IDENTITY,
+            increment: Increment::new(DVec3::ZERO, DVec3::ZERO),
+        });
+        self.sightings.clear();
+        for track in tracks.cameras[0].iter() {
+            let px = DVec2::new(track.px[0] as f64, track.px[1] as f64);
+            if let Some(point) = stereo_point(track.id, px, tracks, &model.eyes, config) {
+                self.sightings.push(Sighting { id: track.id, px, point });
+            }
+        }
+    }
+
+    fn at_rest(&self, tracks: &Tracks, imu: &ImuRing, config: &VioConfig) -> Option<Start> {
+        let s = imu.statistics(tracks.t, Span::from_secs(REST_SPAN))?;
+        let quiet = s.gyro_sigma < REST_GYRO && s.accel_sigma < REST_ACCEL && s.gyro.length() < REST_GYRO_MEAN;
+        let (mut still, mut seen) = (0, 0);
+        for s in &self.sightings {
+            if let Some(t) = find_track(&tracks.cameras[0], s.id) {
+                seen += 1;
+                still += ((DVec2::new(t.px[0] as f64, t.px[1] as f64) - s.px).length() < REST_PX) as usize;
+            }
+        }
+        if !quiet || seen < RESECTION_MIN || 2 * still < seen {
+            return None;
+        }
+        let q = DQuat::from_rotation_arc(s.accel.normalize(), DVec3::Z);
+        let motion = Motion { pose: Pose::new(q, DVec3::ZERO), bg: s.gyro, ..Motion::default() };
+        // The tilt is as good as the unknown accelerometer bias lets it be.
+        let tilt = config.accel_bias_sigma / -GRAVITY.z;
+        Some(Start { motion, sigma: sigma(config, tilt, 0.02, 0.01) })
+    }
+}
+
+impl Default for Aligner {
+    fn default() -> Self {
+        Aligner::new()
+    }
+}
+
+fn sigma(config: &VioConfig, tilt: f64, v: f64, bg: f64) -> Sigma {
+    Sigma { p: GAUGE_SIGMA, yaw: GAUGE_SIGMA, tilt, v, bg: bg.min(config.gyro_bias_sigma), ba: config.accel_bias_sigma }
+}
+
+/// A point from the stereo views of one frame, in its camera 0.
+fn stereo_point(id: u64, px: DVec2, tracks: &Tracks, eyes: &[Eye], config: &VioConfig) -> Option<Point> {
+    let bearing = eyes[0].camera.unproject(px)?;
+    let host = &eyes[0].body_from_cam;
+    let (mut num, mut den) = (0.0, 0.0);
+    for (camera, eye) in eyes.iter().enumerate().skip(1) {
+        let Some(seen) = find_track(&tracks.cameras[camera], id) else { continue };
+        let to_view = eye.body_from_cam.r.transpose();
+        let offset = host.p - eye.body_from_cam.p;
+        let view = eye.camera.unproject(DVec2::new(seen.px[0] as f64, seen.px[1] as f64))?;
+        if offset.length() < config.triangulation_baseline_min_m {
+            continue;
+        }
+        let (a, b) = (view.cross(to_view * (host.r * bearing)), view.cross(to_view * offset));
+        num -= a.dot(b);
+        den += b.length_squared();
+    }
+    let rho = num / den;
+    (den > 0.0 && rho > 0.0).then(|| Point::new(bearing, rho))
+}
+
+/// The body's pose from the reference's points: Gauss-Newton with Huber on all cameras' views.
+fn resect(sightings: &[Sighting], tracks: &Tracks, model: &Model, guess: Pose) -> Option<Pose> {
+    let reference = Body { r: DMat3::IDENTITY, p: DVec3::ZERO };
+    let mut pose = guess;
+    let mut inliers = 0;
+    for iteration in 0..RESECTION_ITERATIONS {
+        let body = Body::from(&pose);
+        let mut h = SMatrix::<f64, 6, 6>::identity() * 1e-6;
+        let mut b = SVector::<f64, 6>::zeros();
+        inliers = 0;
+        for s in sightings {
+            for (camera, eye) in model.eyes.iter().enumerate() {
+                let Some(seen) = find_track(&tracks.cameras[camera], s.id) else { continue };
+                let Some(r) = reproject(&s.point, &model.eyes[0].body_from_cam, &reference, eye, &body) else {
+                    continue;
+                };
+                let e = r.px - DVec2::new(seen.px[0] as f64, seen.px[1] as f64);
+                inliers += (camera == 0 && e.length() < 3.0 * model.huber_px) as usize;
+                let (w, _) = huber(e.length(), model.huber_px);
+                for (row, e) in [e.x, e.y].into_iter().enumerate() {
+                    let j = SVector::<f64, 6>::from_row_slice(&r.d_target[row]);
+                    h += j * j.transpose() * w;
+                    b += j * (e * w);
+                }
+            }
+        }
+        let d = h.cholesky()?.solve(&-b);
+        if !d.iter().all(|x| x.is_finite()) {
+            return None;
+        }
+        pose = Pose::new(pose.q * so3::exp(DVec3::new(d[3], d[4], d[5])), pose.p + DVec3::new(d[0], d[1], d[2]));
+        if d.norm() < 1e-5 && iteration > 0 {
+            break;
+        }
+    }
+    (inliers >= RESECTION_MIN).then_some(pose)
+}
+
+/// Velocity, gravity and gyro bias from resected poses and the increments between them.
+fn align(steps: &[Step], config: &VioConfig) -> Option<Start> {
+    let ridge = (RESECTION_ROTATION / config.gyro_bias_sigma).powi(2);
+    let (mut h, mut b) = (DMat3::IDENTITY * ridge, DVec3::ZERO);
+    for k in 1..steps.len() {
+        let (from, to) = (&steps[k - 1].reference_from_body, &steps[k]);
+        let turned = from.q.conjugate() * to.reference_from_body.q;
+        let j = to.increment.d_q_bg();
+        h += j.transpose() * j;
+        b += j.transpose() * so3::log(to.increment.q.conjugate() * turned);
+    }
+    let bg = h.inverse() * b;
+
+    // p_k = v0 T + ½ g T² + S_k: two unknown vectors, the same scalars on every axis.
+    let (mut t, mut s, mut v) = (0.0, DVec3::ZERO, DVec3::ZERO);
+    let (mut h, mut b) = ([0.0; 3], [DVec3::ZERO; 2]);
+    let mut rows = [(0.0, DVec3::ZERO); ALIGN_FRAMES_MAX];
+    for k in 1..steps.len() {
+        let inc = &steps[k].increment;
+        let (dp, _, dv) = inc.corrected(bg, DVec3::ZERO);
+        let q = steps[k - 1].reference_from_body.q;
+        s += v * inc.dt + q * dp;
+        v += q * dv;
+        t += inc.dt;
+        let y = steps[k].reference_from_body.p - s;
+        let a = [t, 0.5 * t * t];
+        h[0] += a[0] * a[0];
+        h[1] += a[0] * a[1];
+        h[2] += a[1] * a[1];
+        b[0] += y * a[0];
+        b[1] += y * a[1];
+        rows[k] = (t, y);
+    }
+    let g = (b[1] * h[0] - b[0] * h[1]) / (h[0] * h[2] - h[1] * h[1]);
+    if !g.is_finite() || (g.length() + GRAVITY.z).abs() > GRAVITY_MISFIT {
+        return None;
+    }
+    let g = g.normalize() * -GRAVITY.z;
+    let v0 = (b[0] - g * h[1]) / h[0];
+    let misfit =
+        rows[1..steps.len()].iter().map(|(t, y)| (*y - v0 * *t - g * (0.5 * t * t)).length_squared()).sum::<f64>();
+    if !((misfit / steps.len() as f64).sqrt() < POSITION_MISFIT) {
+        return None;
+    }
+    let world_from_reference = Pose::new(DQuat::from_rotation_arc(-g.normalize(), DVec3::Z), DVec3::ZERO);
+    let last = &steps[steps.len() - 1].reference_from_body;
+    let motion = Motion {
+        pose: world_from_reference * *last,
+        v: world_from_reference.q * (v0 + g * t + v),
+        bg,
+        ba: DVec3::ZERO,
+    };
+    Some(Start { motion, sigma: sigma(config, 0.05, 0.1, 0.02) })
+}
+
+/// Tilt from the mean specific force of the last second, the rest unknown.
+fn from_mean_force(t: Nanos, imu: &ImuRing, noise: &Noise, config: &VioConfig) -> Option<Start> {
+    let inc = imu.integrate(t - Span::from_secs(1.0), t, DVec3::ZERO, DVec3::ZERO, noise);
+    let up = inc.q.conjugate() * inc.v.try_normalize()?;
+    let motion = Motion { pose: Pose::new(DQuat::from_rotation_arc(up, DVec3::Z), DVec3::ZERO), ..Motion::default() };
+    Some(Start { motion, sigma: sigma(config, 0.3, 1.0, config.gyro_bias_sigma) })
+}
