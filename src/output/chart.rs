@@ -7,6 +7,8 @@ const WIDTH: f64 = 560.0;
 const HEIGHT: f64 = 300.0;
 const LEFT: f64 = 56.0;
 const RIGHT: f64 = 16.0;
+/// Right margin that holds the names of levels.
+const RIGHT_NAMED: f64 = 56.0;
 const TOP: f64 = 46.0;
 const BOTTOM: f64 = 40.0;
 /// Points drawn per series; more cannot be told apart at this width.
@@ -20,6 +22,12 @@ pub struct Series<'a> {
     /// Draws each point; for curves of few samples.
     pub dots: bool,
     pub points: Vec<(f64, f64)>,
+}
+
+impl<'a> Series<'a> {
+    pub fn line(name: &'a str, ink: u8, points: Vec<(f64, f64)>) -> Series<'a> {
+        Series { name, ink, dots: false, points }
+    }
 }
 
 #[derive(Clone, Debug, Default)]
@@ -55,29 +63,28 @@ impl Scale {
 }
 
 impl Chart<'_> {
+    fn right(&self) -> f64 {
+        WIDTH - if self.levels.is_empty() { RIGHT } else { RIGHT_NAMED }
+    }
+
     /// `None` when no series has a point.
     pub fn svg(&self) -> Option<String> {
         let lines: Vec<Vec<(f64, f64)>> = self.series.iter().map(|s| thinned(&s.points, self.equal)).collect();
         let (xs, ys) = self.scales(&lines)?;
         let mut svg = String::new();
         let _ = write!(svg, r#"<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{}">"#, escape(self.title));
-        let _ = write!(svg, r#"<text class="title" x="0" y="14">{}</text>"#, escape(self.title));
+        text(&mut svg, "title", (0.0, 14.0), "start", self.title);
         self.legend(&mut svg);
         self.axes(&mut svg, xs, ys);
         for (series, line) in self.series.iter().zip(&lines) {
             draw_line(&mut svg, series, line, xs, ys);
         }
         for (name, v) in self.levels.iter().filter(|(_, v)| (ys.from..=ys.to).contains(v)) {
-            let (x, y) = (WIDTH - RIGHT, ys.at(*v));
+            let (x, y) = (self.right(), ys.at(*v));
             let _ = write!(svg, r#"<path class="level" d="M{LEFT} {y:.1}H{x}"/>"#);
-            let _ = write!(
-                svg,
-                r#"<text class="tick halo" x="{:.1}" y="{:.1}" text-anchor="end">{}</text>"#,
-                x - 2.0,
-                y - 4.0,
-                escape(name)
-            );
+            text(&mut svg, "tick", (x + 5.0, y + 4.0), "start", name);
         }
+        self.say_what_is_cut(&mut svg, ys);
         svg.push_str("</svg>");
         Some(svg)
     }
@@ -94,7 +101,7 @@ impl Chart<'_> {
         if let Some(max) = self.y_max {
             y1 = y1.min(max);
         }
-        let (wide, high) = (WIDTH - LEFT - RIGHT, HEIGHT - TOP - BOTTOM);
+        let (wide, high) = (self.right() - LEFT, HEIGHT - TOP - BOTTOM);
         (y0, y1) = widened(y0, y1, if self.from_zero { 0.0 } else { 0.06 }, 0.06);
         if self.equal {
             (x0, x1) = widened(x0, x1, 0.06, 0.06);
@@ -104,8 +111,17 @@ impl Chart<'_> {
         } else {
             (x0, x1) = widened(x0, x1, 0.0, 0.0);
         }
-        let x = Scale { from: x0, to: x1, start: LEFT, end: WIDTH - RIGHT };
+        let x = Scale { from: x0, to: x1, start: LEFT, end: self.right() };
         Some((x, Scale { from: y0, to: y1, start: HEIGHT - BOTTOM, end: TOP }))
+    }
+
+    fn say_what_is_cut(&self, svg: &mut String, ys: Scale) {
+        let above = self.series.iter().flat_map(|s| &s.points).map(|p| p.1).filter(|y| y.is_finite() && *y > ys.to);
+        let (count, most) = above.fold((0, 0.0f64), |(n, most), y| (n + 1, most.max(y)));
+        if count > 0 {
+            let said = format!("{count} above the chart, at most {most:.0} {}", self.y);
+            text(svg, "tick", (LEFT, 34.0), "start", &said);
+        }
     }
 
     fn legend(&self, svg: &mut String) {
@@ -115,45 +131,29 @@ impl Chart<'_> {
         let mut x = LEFT;
         for s in self.series.iter().filter(|s| !s.points.is_empty()) {
             let _ = write!(svg, r#"<path class="line ink{}" d="M{x} 30h16"/>"#, s.ink);
-            let _ = write!(svg, r#"<text class="tick" x="{}" y="34">{}</text>"#, x + 21.0, escape(s.name));
+            text(svg, "tick", (x + 21.0, 34.0), "start", s.name);
             // 6.2 px a character: the mean advance of a 12 px sans-serif face.
             x += 21.0 + 6.2 * s.name.chars().count() as f64 + 18.0;
         }
     }
 
     fn axes(&self, svg: &mut String, xs: Scale, ys: Scale) {
-        let (floor, right) = (HEIGHT - BOTTOM, WIDTH - RIGHT);
+        let (floor, right) = (HEIGHT - BOTTOM, self.right());
         let (labels, step) = ticks(ys, 5);
         for v in labels {
             let y = ys.at(v);
             let _ = write!(svg, r#"<path class="grid" d="M{LEFT} {y:.1}H{right}"/>"#);
-            let _ = write!(
-                svg,
-                r#"<text class="tick" x="{}" y="{:.1}" text-anchor="end">{}</text>"#,
-                LEFT - 7.0,
-                y + 4.0,
-                number(v, step)
-            );
+            text(svg, "tick", (LEFT - 7.0, y + 4.0), "end", &number(v, step));
         }
         let (labels, step) = ticks(xs, 8);
         for v in labels {
             let x = xs.at(v);
             let _ = write!(svg, r#"<path class="axis" d="M{x:.1} {floor}v4"/>"#);
-            let _ = write!(
-                svg,
-                r#"<text class="tick" x="{x:.1}" y="{}" text-anchor="middle">{}</text>"#,
-                floor + 17.0,
-                number(v, step)
-            );
+            text(svg, "tick", (x, floor + 17.0), "middle", &number(v, step));
         }
         let _ = write!(svg, r#"<path class="axis" d="M{LEFT} {floor}H{right}"/>"#);
-        let _ = write!(
-            svg,
-            r#"<text class="unit" x="{right}" y="{}" text-anchor="end">{}</text>"#,
-            HEIGHT - 4.0,
-            escape(self.x)
-        );
-        let _ = write!(svg, r#"<text class="unit" x="{right}" y="14" text-anchor="end">{}</text>"#, escape(self.y));
+        text(svg, "tick", (right, HEIGHT - 4.0), "end", self.x);
+        text(svg, "tick", (right, 14.0), "end", self.y);
     }
 }
 
@@ -181,35 +181,19 @@ fn draw_line(svg: &mut String, series: &Series, line: &[(f64, f64)], xs: Scale, 
 pub fn bars(title: &str, unit: &str, rows: &[(String, f64, String)]) -> Option<String> {
     const ROW: f64 = 22.0;
     const NAMES: f64 = 150.0;
-    const VALUES: f64 = 130.0;
+    const VALUES: f64 = 180.0;
     let (_, most) = range(rows.iter().map(|r| r.1))?;
     let height = 34.0 + ROW * rows.len() as f64;
     let mut svg = String::new();
     let _ = write!(svg, r#"<svg viewBox="0 0 {WIDTH} {height}" role="img" aria-label="{}">"#, escape(title));
-    let _ = write!(svg, r#"<text class="title" x="0" y="14">{}</text>"#, escape(title));
-    let _ = write!(svg, r#"<text class="unit" x="{}" y="14" text-anchor="end">{}</text>"#, WIDTH - RIGHT, escape(unit));
-    for (i, (name, value, text)) in rows.iter().enumerate() {
+    text(&mut svg, "title", (0.0, 14.0), "start", title);
+    text(&mut svg, "tick", (WIDTH - RIGHT, 14.0), "end", unit);
+    for (i, (name, value, note)) in rows.iter().enumerate() {
         let y = 28.0 + ROW * i as f64;
-        let long = (WIDTH - NAMES - VALUES) * value / most.max(f64::MIN_POSITIVE);
-        let _ = write!(
-            svg,
-            r#"<text class="tick" x="{}" y="{:.1}" text-anchor="end">{}</text>"#,
-            NAMES - 8.0,
-            y + 11.0,
-            escape(name)
-        );
-        let _ = write!(
-            svg,
-            r#"<rect class="bar ink1" x="{NAMES}" y="{y}" width="{:.1}" height="15" rx="1.5"/>"#,
-            long.max(1.0)
-        );
-        let _ = write!(
-            svg,
-            r#"<text class="tick" x="{:.1}" y="{:.1}">{}</text>"#,
-            NAMES + long.max(1.0) + 6.0,
-            y + 11.0,
-            escape(text)
-        );
+        let long = ((WIDTH - NAMES - VALUES) * value / most.max(f64::MIN_POSITIVE)).max(1.0);
+        text(&mut svg, "tick", (NAMES - 8.0, y + 11.0), "end", name);
+        let _ = write!(svg, r#"<rect class="bar ink1" x="{NAMES}" y="{y}" width="{long:.1}" height="15" rx="1.5"/>"#);
+        text(&mut svg, "tick", (NAMES + long + 6.0, y + 11.0), "start", note);
     }
     svg.push_str("</svg>");
     Some(svg)
@@ -228,6 +212,11 @@ pub fn histogram(values: &[f64], max: f64, bins: usize) -> Vec<(f64, f64)> {
     }
     outline.push((max, 0.0));
     outline
+}
+
+fn text(svg: &mut String, class: &str, (x, y): (f64, f64), anchor: &str, words: &str) {
+    let words = escape(words);
+    let _ = write!(svg, r#"<text class="{class}" x="{x:.1}" y="{y:.1}" text-anchor="{anchor}">{words}</text>"#);
 }
 
 pub fn escape(text: &str) -> String {

@@ -6,7 +6,8 @@
 use super::chart::{bars, escape, histogram, Chart, Series};
 use super::metrics::{percentile, TrajectoryError};
 use super::panel::Picture;
-use super::report::Report;
+use super::report::{KernelTime, Report};
+use glam::DVec3;
 use std::fmt::Write;
 use std::io;
 use stipple_drivers::{Nanos, TimedPose};
@@ -45,9 +46,9 @@ pub fn write_html(out: &mut impl io::Write, report: &Report, evidence: &Evidence
         subtitle(report)
     )?;
     out.write_all(tables(report).as_bytes())?;
-    section(out, "Map quality against run time", &quality(report))?;
+    section(out, "Mapping", &mapping(report))?;
     section(out, "Trajectory", &trajectory(evidence))?;
-    section(out, "Time", &time(report, evidence))?;
+    section(out, "Tracking time", &tracking_time(evidence.tracking_ms))?;
     pictures(out, evidence.pictures)?;
     out.write_all(events(report, evidence.warnings).as_bytes())?;
     writeln!(out, "</main></body></html>")
@@ -82,10 +83,10 @@ fn tables(report: &Report) -> String {
     let n = |v: Option<u64>| v.map(grouped);
     let mib = |v: Option<u64>| v.map(|b| format!("{:.1}", b as f64 / (1 << 20) as f64));
     let odometry: [Row; 8] = [
-        ("Absolute trajectory error, RMSE", f(report.ate_rmse_m, 4), "m"),
-        ("Relative error over 1 s", f(report.rte_1s_m, 4), "m"),
-        ("Relative rotation error over 1 s", f(report.rpe_deg, 3), "\u{b0}"),
-        ("Tracking rate", f(report.tracking_fps, 1), "frames/s"),
+        ("Trajectory error (ATE)", f(report.ate_rmse_m, 4), "m"),
+        ("Error over 1 s (RTE)", f(report.rte_1s_m, 4), "m"),
+        ("Rotation over 1 s (RPE)", f(report.rpe_deg, 3), "\u{b0}"),
+        ("Tracking rate", f(report.tracking_fps, 1), "fps"),
         ("Tracking time, median", f(report.tracking_ms_p50, 2), "ms"),
         ("Tracking time, 99 %", f(report.tracking_ms_p99, 2), "ms"),
         ("Frames tracked", n(report.frames), ""),
@@ -122,7 +123,7 @@ fn table(title: &str, rows: &[Row]) -> String {
     html + "</table>"
 }
 
-fn quality(report: &Report) -> [Option<String>; 3] {
+fn mapping(report: &Report) -> [Option<String>; 4] {
     let curve = &report.curve;
     let of = |value: &dyn Fn(usize) -> Option<f64>| -> Vec<(f64, f64)> {
         (0..curve.len()).filter_map(|i| value(i).map(|v| (curve[i].t_s, v))).collect()
@@ -148,106 +149,88 @@ fn quality(report: &Report) -> [Option<String>; 3] {
     };
     let splats = count("Gaussians", &|i| curve[i].splats as f64);
     let iterations = count("Iterations", &|i| curve[i].iterations as f64);
-    [psnr.svg(), splats.svg(), iterations.svg()]
+    [psnr.svg(), splats.svg(), iterations.svg(), kernel_bars(&report.kernels)]
 }
 
-fn trajectory(evidence: &Evidence) -> [Option<String>; 3] {
-    let Some(start) = evidence.estimated.first().map(|e| e.t) else { return [None, None, None] };
+fn trajectory(evidence: &Evidence) -> [Option<String>; 4] {
+    let Some(start) = evidence.estimated.first().map(|e| e.t) else { return [const { None }; 4] };
     let end = evidence.estimated.last().map_or(start, |e| e.t);
     let onto_truth = evidence.error.map(|e| e.truth_from_estimate).unwrap_or_default();
-    let estimated: Vec<TimedPose> =
-        evidence.estimated.iter().map(|e| TimedPose { t: e.t, pose: onto_truth * e.pose }).collect();
-    // Truth without an alignment is in another frame than the estimate: it is not drawn.
-    let truth: Vec<TimedPose> = match evidence.error {
-        Some(_) => evidence.truth.iter().copied().filter(|e| e.t >= start && e.t <= end).collect(),
-        None => Vec::new(),
-    };
-    let line = |name, ink, poses: &[TimedPose], point: &dyn Fn(&TimedPose) -> (f64, f64)| Series {
-        name,
-        ink,
-        dots: false,
-        points: poses.iter().map(point).collect(),
-    };
-    let two = |point: &dyn Fn(&TimedPose) -> (f64, f64)| {
-        vec![line("ground truth", 3, &truth, point), line("estimate", 1, &estimated, point)]
-    };
     let secs = |t: Nanos| (t - start).secs();
+    let series = |point: &dyn Fn(Nanos, DVec3) -> (f64, f64)| {
+        let seen = |e: &&TimedPose| e.t >= start && e.t <= end;
+        // Truth without an alignment is in another frame than the estimate: it is not drawn.
+        let truth = if evidence.error.is_some() { evidence.truth } else { &[] };
+        let truth = truth.iter().filter(seen).map(|e| point(e.t, e.pose.p)).collect();
+        let estimate = evidence.estimated.iter().map(|e| point(e.t, onto_truth.transform(e.pose.p))).collect();
+        vec![Series::line("ground truth", 3, truth), Series::line("estimate", 1, estimate)]
+    };
     let above = Chart {
         title: "Seen from above",
         x: "x, m",
         y: "y, m",
         equal: true,
-        series: two(&|e| (e.pose.p.x, e.pose.p.y)),
+        series: series(&|_, p| (p.x, p.y)),
         ..Chart::default()
     };
-    let height = Chart {
-        title: "Height",
-        x: "time, s",
-        y: "z, m",
-        series: two(&|e| (secs(e.t), e.pose.p.z)),
-        ..Chart::default()
-    };
-    let errors = evidence.error.map(|e| Chart {
-        title: "Position error after alignment",
-        x: "time, s",
-        y: "m",
-        from_zero: true,
-        series: vec![Series {
-            name: "error",
-            ink: 2,
-            dots: false,
-            points: e.errors.iter().map(|&(t, m)| (secs(t), m)).collect(),
-        }],
-        levels: vec![("RMSE", e.ate_rmse_m)],
-        ..Chart::default()
+    let side = Chart { title: "Seen from the side", y: "z, m", series: series(&|_, p| (p.x, p.z)), ..above.clone() };
+    let height =
+        Chart { title: "Height", x: "time, s", y: "z, m", series: series(&|t, p| (secs(t), p.z)), ..Chart::default() };
+    let errors = evidence.error.and_then(|e| {
+        let points = e.errors.iter().map(|&(t, m)| (secs(t), m)).collect();
+        let chart = Chart {
+            title: "Position error after alignment",
+            x: "time, s",
+            y: "m",
+            from_zero: true,
+            series: vec![Series::line("error", 2, points)],
+            levels: vec![("RMSE", e.ate_rmse_m)],
+            ..Chart::default()
+        };
+        chart.svg()
     });
-    [above.svg(), height.svg(), errors.and_then(|c| c.svg())]
+    [above.svg(), side.svg(), height.svg(), errors]
 }
 
-fn time(report: &Report, evidence: &Evidence) -> [Option<String>; 3] {
-    let values: Vec<f64> = evidence.tracking_ms.iter().map(|m| m.1).collect();
-    let (p50, p99) = (percentile(&values, 0.5), percentile(&values, 0.99));
-    let start = evidence.tracking_ms.first().map_or(Nanos(0), |m| m.0);
-    let levels: Vec<(&str, f64)> =
-        [("median", p50), ("99 %", p99)].into_iter().filter_map(|(n, v)| Some((n, v?))).collect();
+fn tracking_time(frames: &[(Nanos, f64)]) -> [Option<String>; 2] {
+    let values: Vec<f64> = frames.iter().map(|m| m.1).collect();
+    let (Some(p50), Some(p99)) = (percentile(&values, 0.5), percentile(&values, 0.99)) else { return [None, None] };
+    let start = frames[0].0;
     // A single hiccup of the machine must not flatten the rest.
-    let y_max = p99.map(|p| 2.0 * p);
-    let frames = Chart {
+    let most = (2.0 * p99).max(f64::MIN_POSITIVE);
+    let points = frames.iter().map(|&(t, ms)| ((t - start).secs(), ms)).collect();
+    let over_time = Chart {
         title: "Tracking time of each frame",
         x: "time, s",
         y: "ms",
         from_zero: true,
-        y_max,
-        levels,
-        series: vec![Series {
-            name: "frame",
-            ink: 1,
-            dots: false,
-            points: evidence.tracking_ms.iter().map(|&(t, ms)| ((t - start).secs(), ms)).collect(),
-        }],
+        y_max: Some(most),
+        levels: vec![("median", p50), ("99 %", p99)],
+        series: vec![Series::line("frame", 1, points)],
         ..Chart::default()
     };
-    let spread = y_max.filter(|m| *m > 0.0).and_then(|max| {
-        Chart {
-            title: "Distribution of tracking time",
-            x: "ms",
-            y: "frames",
-            from_zero: true,
-            series: vec![Series { name: "frames", ink: 1, dots: false, points: histogram(&values, max, 40) }],
-            ..Chart::default()
-        }
-        .svg()
-    });
-    let total: f64 = report.kernels.iter().map(|k| k.total_ms).sum();
-    let mut kernels: Vec<_> = report.kernels.iter().collect();
-    kernels.sort_by(|a, b| b.total_ms.total_cmp(&a.total_ms));
-    let row = |k: &&super::report::KernelTime| {
-        let share = 100.0 * k.total_ms / total.max(f64::MIN_POSITIVE);
-        let each = k.total_ms / (k.dispatches.max(1)) as f64;
-        (k.name.clone(), k.total_ms, format!("{share:.1} % \u{b7} {each:.3} ms each"))
+    let spread = Chart {
+        title: "Distribution of tracking time",
+        x: "ms, the last bin holds all above",
+        y: "frames",
+        from_zero: true,
+        series: vec![Series::line("frames", 1, histogram(&values, most, 40))],
+        ..Chart::default()
     };
-    let rows: Vec<_> = kernels.iter().take(KERNELS_MAX).map(row).collect();
-    [frames.svg(), spread, bars("GPU time by kernel", "share of GPU time \u{b7} mean time", &rows)]
+    [over_time.svg(), spread.svg()]
+}
+
+fn kernel_bars(kernels: &[KernelTime]) -> Option<String> {
+    let total: f64 = kernels.iter().map(|k| k.total_ms).sum();
+    let mut sorted: Vec<&KernelTime> = kernels.iter().collect();
+    sorted.sort_by(|a, b| b.total_ms.total_cmp(&a.total_ms));
+    let row = |k: &KernelTime| {
+        let share = 100.0 * k.total_ms / total.max(f64::MIN_POSITIVE);
+        let each = k.total_ms / k.dispatches.max(1) as f64;
+        (k.name.clone(), k.total_ms, format!("{share:.1} % \u{b7} {each:.3} ms"))
+    };
+    let rows: Vec<_> = sorted.into_iter().take(KERNELS_MAX).map(row).collect();
+    bars("GPU time by kernel", "share \u{b7} mean of a dispatch", &rows)
 }
 
 fn pictures(out: &mut impl io::Write, pictures: &[(String, Picture)]) -> io::Result<()> {
