@@ -1,1 +1,281 @@
-//! (under construction)
+//! A seeded simulator: a textured room, a rig flying through it, its images and its inertial unit.
+//!
+//! `Scenario` (which rig, which path, which seed) goes in; `Sim` gives stereo images, exact depth,
+//! inertial samples and exact states at any instant, and `write_euroc` puts them on disk in the
+//! EuRoC ASL layout. Geometry is ray-cast analytically through the same camera models the
+//! estimator inverts, so whatever error remains downstream is the estimator's.
+//! Read in this order: `scenario` (paths), `spline` (motion), `room` and `furnish` (geometry),
+//! `texture` and `light` (appearance), `render` (images), `imu`.
+
+mod furnish;
+pub mod imu;
+mod light;
+mod recording;
+mod render;
+mod room;
+pub mod scenario;
+pub mod spline;
+mod texture;
+mod write;
+
+pub use imu::{Bias, ImuErrors, GRAVITY};
+pub use render::Sensor;
+pub use scenario::{euroc_rig, Flight, Recording, Scenario};
+pub use write::write_euroc;
+
+use crate::camera::Calibration;
+use crate::fault::{Exit, Fault};
+use crate::types::{Frames, ImuSample, Nanos, Pose, Span, TimedPose};
+use glam::{DVec3, Vec3};
+use render::{Exposure, Lens, Scratch, View};
+use room::Room;
+use spline::Spline;
+
+/// Stamp at which invented flights start.
+const START: Nanos = Nanos(1_000_000_000);
+/// Knots of an invented flight and of a recorded one, s. The latter resolves vibration up to about
+/// 15 Hz.
+const KNOT: f64 = 0.1;
+const KNOT_RECORDED: f64 = 0.03;
+const FIT_ROUNDS: usize = 6;
+/// A fit is loose where samples end, s.
+const FIT_MARGIN: f64 = 0.15;
+/// Room left around a recorded path: sideways, below, above, m.
+const ROOM_SIDE: f64 = 1.7;
+const ROOM_BELOW: f64 = 0.9;
+const ROOM_ABOVE: f64 = 1.0;
+/// Mean grey level the exposure meter steers to, how far it goes there, and its period.
+const METER_LEVEL: f32 = 105.0;
+const METER_STRENGTH: f32 = 0.6;
+const METER_PERIOD: f64 = 0.5;
+
+/// Truth at an instant.
+#[derive(Clone, Copy, Debug)]
+pub struct State {
+    /// `world_from_body`
+    pub pose: Pose,
+    pub v_world: DVec3,
+    pub gyro_bias: DVec3,
+    pub accel_bias: DVec3,
+}
+
+pub struct Sim {
+    seed: u64,
+    sensor: Sensor,
+    calibration: Calibration,
+    spline: Spline,
+    /// Stamp of spline time 0.
+    start: Nanos,
+    stamps: Vec<Nanos>,
+    imu: Vec<ImuSample>,
+    biases: Vec<Bias>,
+    room: Room,
+    lenses: Vec<Lens>,
+    /// Logarithm of the gain every `METER_PERIOD` from the first frame.
+    log_gain: Vec<f32>,
+    scratch: Scratch,
+}
+
+impl Sim {
+    /// Renders with as many threads as the machine has.
+    pub fn new(scenario: &Scenario) -> Result<Sim, Fault> {
+        Sim::with_threads(scenario, std::thread::available_parallelism().map_or(1, |n| n.get()))
+    }
+
+    /// The images do not depend on `threads`.
+    pub fn with_threads(scenario: &Scenario, threads: usize) -> Result<Sim, Fault> {
+        check(scenario)?;
+        let calibration = scenario.rig();
+        let (spline, start, first, last) = motion(scenario, &calibration)?;
+        let span = (first - start).secs()..(last - start).secs();
+        let (low, high) = bounds(scenario, &spline, span.clone());
+        let path: Vec<Vec3> = sample_path(&spline, span).map(|p| p.as_vec3()).collect();
+        let room = furnish::furnish(low, high, &path, scenario.seed, threads);
+        let recorded = match &scenario.path {
+            Flight::Recorded(r) => r.imu.as_ref().map(|imu| (imu, &r.biases)),
+            _ => None,
+        };
+        let (imu, biases) = match recorded {
+            Some((imu, biases)) => {
+                let within = imu.iter().filter(|s| s.t >= first && s.t <= last).copied().collect();
+                (within, biases.clone())
+            }
+            None => {
+                let ticks = imu::ticks(first, last, calibration.imu.rate_hz);
+                imu::simulate(&spline, start, &ticks, &calibration.imu, &scenario.imu_errors, scenario.seed)
+            }
+        };
+        let lenses: Vec<Lens> = calibration.cameras.iter().map(|c| Lens::new(&c.camera)).collect();
+        let pixels = calibration.cameras.iter().map(|c| c.camera.width * c.camera.height).max().unwrap_or(0);
+        let scratch = Scratch::new(&room, pixels, threads);
+        let stamps = imu::ticks(first, last, scenario.rate_hz);
+        let (seed, sensor) = (scenario.seed, scenario.sensor);
+        let log_gain = Vec::new();
+        let mut sim =
+            Sim { seed, sensor, calibration, spline, start, stamps, imu, biases, room, lenses, log_gain, scratch };
+        sim.log_gain = sim.metered();
+        Ok(sim)
+    }
+
+    pub fn calibration(&self) -> &Calibration {
+        &self.calibration
+    }
+
+    /// All inertial samples of the run; they begin and end with the frames.
+    pub fn imu(&self) -> &[ImuSample] {
+        &self.imu
+    }
+
+    pub fn frame_count(&self) -> usize {
+        self.stamps.len()
+    }
+
+    /// Mid-exposure of frame `i`.
+    pub fn stamp(&self, i: usize) -> Nanos {
+        self.stamps[i]
+    }
+
+    pub fn truth_at(&self, t: Nanos) -> State {
+        let m = self.spline.at((t - self.start).secs());
+        let bias = imu::bias_at(&self.biases, t);
+        State { pose: m.pose, v_world: m.v_world, gyro_bias: bias.gyro, accel_bias: bias.accel }
+    }
+
+    /// `world_from_body` at every inertial sample.
+    pub fn truth(&self) -> Vec<TimedPose> {
+        self.imu.iter().map(|s| TimedPose { t: s.t, pose: self.truth_at(s.t).pose }).collect()
+    }
+
+    /// Low and high corner of the room, m.
+    pub fn room(&self) -> (DVec3, DVec3) {
+        (self.room.low.as_dvec3(), self.room.high.as_dvec3())
+    }
+
+    /// Distance from a point to the nearest surface, m; not positive inside furniture or outside.
+    pub fn clearance(&self, p_world: DVec3) -> f64 {
+        self.room.clearance(p_world.as_vec3()) as f64
+    }
+
+    /// Images of all cameras at frame `i` into `out`, which must be shaped for the rig.
+    pub fn render(&mut self, i: usize, out: &mut Frames) {
+        let t = self.stamps[i];
+        out.t = t;
+        let gain = self.gain_at(t);
+        for camera in 0..self.lenses.len() {
+            let view = self.view(t, camera);
+            // streams of different images are unrelated, whatever the order of rendering
+            let run = texture::hash(self.seed as i32, (self.seed >> 32) as i32, 0x5354_5250);
+            let stream = texture::hash(i as i32, camera as i32, run);
+            // two sensors never respond quite alike
+            let gain = gain * (1.0 + 0.03 * camera as f32);
+            let exposure = Exposure { gain, sensor: self.sensor, stream };
+            render::cast(&self.room, &self.lenses[camera], view, &mut self.scratch);
+            let pixels = &mut out.images[camera].pixels;
+            render::shade(&self.room, &self.lenses[camera], view, &exposure, &mut self.scratch, pixels);
+        }
+    }
+
+    /// Depth (z in the camera frame, m; 0 = none) of frame `i`, row-major, `width * height` values.
+    pub fn depth(&mut self, i: usize, camera: usize, out: &mut [f32]) {
+        let view = self.view(self.stamps[i], camera);
+        render::cast(&self.room, &self.lenses[camera], view, &mut self.scratch);
+        render::depths(&self.lenses[camera], &self.scratch.hits, out);
+    }
+
+    fn view(&self, t: Nanos, camera: usize) -> View {
+        View::new(&(self.truth_at(t).pose * self.calibration.cameras[camera].body_from_cam))
+    }
+
+    /// What an exposure meter on camera 0 would settle on through the run, smoothed.
+    fn metered(&self) -> Vec<f32> {
+        let n = ((self.last() - self.stamps[0]).secs() / METER_PERIOD).ceil() as usize + 1;
+        let at = |k: usize| (self.stamps[0] + Span::from_secs(k as f64 * METER_PERIOD)).min(self.last());
+        let Some(lens) = self.lenses.first() else { return vec![0.0] };
+        let light: Vec<f32> =
+            (0..n).map(|k| render::meter(&self.room, lens, self.view(at(k), 0)).max(1e-3).ln()).collect();
+        let mean = light.iter().sum::<f32>() / n as f32;
+        let smooth = |k: usize| (light[k.saturating_sub(1)] + 2.0 * light[k] + light[(k + 1).min(n - 1)]) / 4.0;
+        (0..n).map(|k| METER_LEVEL.ln() - mean - METER_STRENGTH * (smooth(k) - mean)).collect()
+    }
+
+    fn gain_at(&self, t: Nanos) -> f32 {
+        let x = ((t - self.stamps[0]).secs() / METER_PERIOD).max(0.0);
+        let k = (x as usize).min(self.log_gain.len() - 1);
+        let next = self.log_gain[(k + 1).min(self.log_gain.len() - 1)];
+        (self.log_gain[k] + (x.fract() as f32) * (next - self.log_gain[k])).exp()
+    }
+
+    fn last(&self) -> Nanos {
+        self.stamps[self.stamps.len() - 1]
+    }
+}
+
+fn check(s: &Scenario) -> Result<(), Fault> {
+    let wrong = |what: &str, fix: &str| Err(Fault::new(Exit::Config, format!("scenario {}", s.name), what, fix));
+    if s.calibration.cameras.is_empty() {
+        return wrong("the rig has no camera", "give a calibration with cameras");
+    }
+    let d = s.image_divisor;
+    if d == 0 || s.calibration.cameras.iter().any(|c| c.camera.width / d < 16 || c.camera.height / d < 16) {
+        return wrong("the image divisor leaves no image", "use 1, 2 or 4");
+    }
+    if !(s.rate_hz > 0.0 && s.calibration.imu.rate_hz > 0.0 && s.duration.0 > 0) {
+        return wrong("rates and duration must be positive", "correct them");
+    }
+    Ok(())
+}
+
+/// The spline, the stamp of its time 0, and the first and last instant to simulate.
+fn motion(scenario: &Scenario, rig: &Calibration) -> Result<(Spline, Nanos, Nanos, Nanos), Fault> {
+    let Flight::Recorded(r) = &scenario.path else {
+        let cam_from_body = rig.cameras[0].body_from_cam.inverse();
+        let look = |t: f64| {
+            let world_from_cam = scenario.path.look(t).unwrap_or_default();
+            Pose::new(world_from_cam.q * cam_from_body.q, world_from_cam.p)
+        };
+        let spline = Spline::sampled(scenario.duration.secs(), KNOT, look);
+        return Ok((spline, START, START, START + scenario.duration));
+    };
+    let short = || {
+        let fix = "give longer files that overlap in time";
+        Fault::new(Exit::Data, format!("scenario {}", scenario.name), "less than half a second to simulate", fix)
+    };
+    let start = r.poses.first().ok_or_else(short)?.t;
+    let samples: Vec<(f64, Pose)> = r.poses.iter().map(|p| ((p.t - start).secs(), p.pose)).collect();
+    let end = samples[samples.len() - 1].0;
+    let (mut first, mut last) = (start + Span::from_secs(FIT_MARGIN), start + Span::from_secs(end - FIT_MARGIN));
+    if let Some(imu) = &r.imu {
+        // frames begin on an inertial sample, as on hardware that triggers both
+        first = imu.iter().map(|s| s.t).find(|t| *t >= first).ok_or_else(short)?;
+        last = imu.last().map_or(last, |s| s.t.min(last));
+    }
+    last = last.min(first + scenario.duration);
+    if (last - first).secs() < 0.5 {
+        return Err(short());
+    }
+    Ok((Spline::fit(&samples, KNOT_RECORDED, FIT_ROUNDS), start, first, last))
+}
+
+fn sample_path(spline: &Spline, span: std::ops::Range<f64>) -> impl Iterator<Item = DVec3> + '_ {
+    const STEP: f64 = 0.05;
+    let n = ((span.end - span.start) / STEP).ceil() as usize;
+    (0..=n).map(move |k| spline.at(span.start + k as f64 * STEP).pose.p)
+}
+
+/// The box of the room: fixed for invented flights, around the path of a recorded one.
+fn bounds(scenario: &Scenario, spline: &Spline, span: std::ops::Range<f64>) -> (Vec3, Vec3) {
+    if !matches!(scenario.path, Flight::Recorded(_)) {
+        return (Vec3::new(-4.0, -3.0, 0.0), Vec3::new(4.0, 3.0, 3.5));
+    }
+    let start = spline.at(span.start).pose.p;
+    let (mut low, mut high) = (start, start);
+    for p in sample_path(spline, span) {
+        (low, high) = (low.min(p), high.max(p));
+    }
+    let (mut low, mut high) =
+        (low - DVec3::new(ROOM_SIDE, ROOM_SIDE, ROOM_BELOW), high + DVec3::new(ROOM_SIDE, ROOM_SIDE, ROOM_ABOVE));
+    let grow = (DVec3::new(6.0, 5.0, 3.0) - (high - low)).max(DVec3::ZERO);
+    low -= 0.5 * grow.with_z(0.0);
+    high += grow * DVec3::new(0.5, 0.5, 1.0);
+    (low.as_vec3(), high.as_vec3())
+}

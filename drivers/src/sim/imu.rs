@@ -1,0 +1,87 @@
+//! An inertial unit carried along a spline: point samples of angular velocity and specific force
+//! Rᵀ(a - g), with white noise, biases that start somewhere and walk, and a range that clips.
+
+use super::spline::Spline;
+use crate::camera::ImuCalibration;
+use crate::types::{ImuSample, Nanos, Span};
+use glam::DVec3;
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use rand_distr::StandardNormal;
+
+pub const GRAVITY: DVec3 = DVec3::new(0.0, 0.0, -9.81);
+
+/// What a calibration file does not say of an inertial unit.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ImuErrors {
+    /// Standard deviations of the biases at the start: rad/s, m/s².
+    pub gyro_bias: f64,
+    pub accel_bias: f64,
+    /// Range of an axis: rad/s, m/s².
+    pub gyro_max: f64,
+    pub accel_max: f64,
+}
+
+impl ImuErrors {
+    /// The ADIS16448 of EuRoC: 1000 °/s, 18 g.
+    pub const EUROC: ImuErrors =
+        ImuErrors { gyro_bias: 0.02, accel_bias: 0.05, gyro_max: 17.453_293, accel_max: 18.0 * 9.81 };
+}
+
+/// True biases at an instant.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Bias {
+    pub t: Nanos,
+    pub gyro: DVec3,
+    pub accel: DVec3,
+}
+
+/// Samples of the spline (whose time 0 is `start`) at `stamps`.
+pub fn simulate(
+    spline: &Spline,
+    start: Nanos,
+    stamps: &[Nanos],
+    noise: &ImuCalibration,
+    errors: &ImuErrors,
+    seed: u64,
+) -> (Vec<ImuSample>, Vec<Bias>) {
+    let mut rng = ChaCha8Rng::seed_from_u64(seed ^ 0x0049_4D55);
+    let mut normal = || DVec3::from_array(std::array::from_fn(|_| rng.sample::<f64, _>(StandardNormal)));
+    // a continuous-time density becomes the deviation of one sample through the root of the rate
+    let root_rate = noise.rate_hz.sqrt();
+    let mut gyro = normal() * errors.gyro_bias;
+    let mut accel = normal() * errors.accel_bias;
+    let mut samples = Vec::with_capacity(stamps.len());
+    let mut biases = Vec::with_capacity(stamps.len());
+    for &t in stamps {
+        let m = spline.at((t - start).secs());
+        let force = m.pose.q.conjugate() * (m.a_world - GRAVITY);
+        let w = m.gyro_body + gyro + normal() * (noise.gyro_noise * root_rate);
+        let f = force + accel + normal() * (noise.accel_noise * root_rate);
+        let (w_max, f_max) = (DVec3::splat(errors.gyro_max), DVec3::splat(errors.accel_max));
+        samples.push(ImuSample { t, gyro_body: w.clamp(-w_max, w_max), accel_body: f.clamp(-f_max, f_max) });
+        biases.push(Bias { t, gyro, accel });
+        gyro += normal() * (noise.gyro_walk / root_rate);
+        accel += normal() * (noise.accel_walk / root_rate);
+    }
+    (samples, biases)
+}
+
+/// Biases at `t`, linear between table entries and held at the ends; zero for an empty table.
+pub fn bias_at(table: &[Bias], t: Nanos) -> Bias {
+    let after = table.partition_point(|b| b.t < t);
+    match (after.checked_sub(1).map(|i| table[i]), table.get(after).copied()) {
+        (Some(a), Some(b)) => {
+            let s = (t - a.t).secs() / (b.t - a.t).secs();
+            Bias { t, gyro: a.gyro.lerp(b.gyro, s), accel: a.accel.lerp(b.accel, s) }
+        }
+        (Some(b), None) | (None, Some(b)) => Bias { t, ..b },
+        (None, None) => Bias { t, gyro: DVec3::ZERO, accel: DVec3::ZERO },
+    }
+}
+
+/// Stamps of a clock of `rate_hz` from `first` up to and including `last`.
+pub fn ticks(first: Nanos, last: Nanos, rate_hz: f64) -> Vec<Nanos> {
+    let n = ((last - first).secs() * rate_hz + 1e-6).floor().max(0.0) as i64;
+    (0..=n).map(|k| first + Span::from_secs(k as f64 / rate_hz)).collect()
+}

@@ -1,0 +1,120 @@
+//! Baked light: irradiance on a grid of nodes over every face, bilinear between nodes.
+//!
+//! The room does not change, so lamps (Lambert, inverse square, soft shadows) and the ambient term
+//! (occluded in corners and under furniture) are computed once; a pixel then costs one look-up.
+
+use super::room::{Face, Light, Room};
+use glam::{Vec2, Vec3};
+
+#[derive(Clone, Debug, Default)]
+pub struct LightMap {
+    grids: Vec<Grid>,
+    nodes: Vec<f32>,
+}
+
+#[derive(Clone, Copy, Debug)]
+struct Grid {
+    first: usize,
+    columns: usize,
+    rows: usize,
+    /// Nodes a metre along u and v.
+    density: Vec2,
+}
+
+/// Light of white walls all around, per unit of hemisphere left open.
+const AMBIENT: f32 = 0.42;
+/// Ambient light is blocked by what is nearer than this, m.
+const AMBIENT_REACH: f32 = 0.9;
+const AMBIENT_RAYS: usize = 24;
+/// Side of the square lamps, m: the width of penumbrae.
+const LAMP: f32 = 0.35;
+/// Faint lamps are not worth their shadow rays.
+const FAINT: f32 = 0.01;
+
+impl LightMap {
+    /// Nodes every `pitch` metres, no fewer than two a side.
+    pub fn bake(room: &Room, pitch: f32, threads: usize) -> LightMap {
+        let mut grids = Vec::with_capacity(room.faces.len());
+        let mut first = 0;
+        for face in &room.faces {
+            let cells = (face.size / pitch).ceil().max(Vec2::ONE);
+            let (columns, rows) = (cells.x as usize + 1, cells.y as usize + 1);
+            grids.push(Grid { first, columns, rows, density: cells / face.size });
+            first += columns * rows;
+        }
+        let mut nodes = vec![0.0; first];
+        let share = first.div_ceil(threads.max(1)).max(1);
+        std::thread::scope(|scope| {
+            for (k, out) in nodes.chunks_mut(share).enumerate() {
+                let grids = &grids;
+                scope.spawn(move || {
+                    for (i, node) in out.iter_mut().enumerate() {
+                        let i = k * share + i;
+                        let f = grids.partition_point(|g| g.first <= i) - 1;
+                        let (g, i) = (&grids[f], i - grids[f].first);
+                        let at = Vec2::new((i % g.columns) as f32, (i / g.columns) as f32) / g.density;
+                        *node = irradiance(room, &room.faces[f], at);
+                    }
+                });
+            }
+        });
+        LightMap { grids, nodes }
+    }
+
+    /// Irradiance at a surface coordinate of a face.
+    #[inline]
+    pub fn at(&self, face: usize, at: Vec2) -> f32 {
+        let g = &self.grids[face];
+        let x = (at.x * g.density.x).clamp(0.0, (g.columns - 1) as f32 - 1e-3);
+        let y = (at.y * g.density.y).clamp(0.0, (g.rows - 1) as f32 - 1e-3);
+        let (i, j) = (x as usize, y as usize);
+        let (a, b) = (x - i as f32, y - j as f32);
+        let k = g.first + j * g.columns + i;
+        let n = &self.nodes;
+        let low = n[k] + a * (n[k + 1] - n[k]);
+        let high = n[k + g.columns] + a * (n[k + g.columns + 1] - n[k + g.columns]);
+        low + b * (high - low)
+    }
+}
+
+fn irradiance(room: &Room, face: &Face, at: Vec2) -> f32 {
+    // nodes on an edge are pulled in, so that they see what the face sees
+    let margin = face.size.min_element() * 0.02;
+    let at = at.clamp(Vec2::splat(margin), face.size - margin);
+    let (p, n) = face.point(at);
+    let p = p + n * 2e-3;
+    let lamps: f32 = room.lights.iter().map(|l| lamp(room, l, p, n)).sum();
+    lamps + ambient(room, p, n)
+}
+
+fn lamp(room: &Room, light: &Light, p: Vec3, n: Vec3) -> f32 {
+    let to = light.at - p;
+    let full = light.power * n.dot(to).max(0.0) / (to.length() * (to.length_squared() + 0.3));
+    if full < FAINT {
+        return full;
+    }
+    let mut seen = 0.0;
+    for k in 0..4 {
+        let corner = Vec3::new((k & 1) as f32 - 0.5, (k >> 1) as f32 - 0.5, 0.0) * LAMP;
+        let to = light.at + corner - p;
+        let reach = to.length();
+        if !room.blocked(p, to / reach, reach) {
+            seen += 0.25;
+        }
+    }
+    full * seen
+}
+
+fn ambient(room: &Room, p: Vec3, n: Vec3) -> f32 {
+    let (u, v) = n.any_orthonormal_pair();
+    let mut open = 0.0;
+    for k in 0..AMBIENT_RAYS {
+        // cosine-weighted spiral
+        let r = ((k as f32 + 0.5) / AMBIENT_RAYS as f32).sqrt();
+        let (sin, cos) = (k as f32 * 2.399_963).sin_cos();
+        let d = u * (r * cos) + v * (r * sin) + n * (1.0 - r * r).sqrt();
+        let (t, _) = room.nearest(p, d);
+        open += (t / AMBIENT_REACH).min(1.0);
+    }
+    AMBIENT * open / AMBIENT_RAYS as f32
+}

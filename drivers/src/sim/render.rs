@@ -1,0 +1,375 @@
+//! Rays of a camera, what they meet, and what the sensor makes of it.
+//!
+//! A frame is made in two passes over 16-pixel tiles: `cast` finds distance and face at every pixel
+//! centre; `shade` turns them into grey levels. Textures are filtered to the pixel in closed form,
+//! so one sample does inside a face; pixels whose neighbours see another face are averaged over
+//! `EDGE x EDGE` rays. Per tile only the solids that meet the tile's cone are tried, nearest first.
+//!
+//! Work is split over threads by tile rows and every random number is a hash of (seed, frame,
+//! camera, pixel), so the image does not depend on the number of threads.
+//! A global shutter without motion blur is modelled.
+
+use super::room::{Room, NOTHING};
+use super::texture::{self, Spot};
+use crate::camera::Camera;
+use crate::types::Pose;
+use glam::{DVec2, Quat, Vec2, Vec3};
+
+const TILE: usize = 16;
+const EDGE: usize = 4;
+
+/// The sensor behind the lens. Grey levels (DN) are those of the 8-bit image.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Sensor {
+    /// Standard deviation of the read noise, DN.
+    pub read_noise: f64,
+    /// Variance of the shot noise per grey level, DN.
+    pub shot_noise: f64,
+    /// Light lost at the edge of a field of view of 45° half angle, fraction.
+    pub vignette: f64,
+}
+
+/// What a pixel centre sees.
+#[derive(Clone, Copy, Debug)]
+pub struct Hit {
+    /// Along the unit ray, m.
+    pub distance: f32,
+    pub face: u32,
+}
+
+/// Bearings of all pixels of a camera, and the cones of its tiles.
+pub struct Lens {
+    width: usize,
+    height: usize,
+    /// Unit bearing in the camera frame (zero outside the lens' domain).
+    bearings: Vec<Vec3>,
+    /// Angle a pixel spans, rad.
+    pixel_angle: Vec<f32>,
+    cones: Vec<Cone>,
+}
+
+#[derive(Clone, Copy)]
+struct Cone {
+    axis: Vec3,
+    cos: f32,
+    sin: f32,
+}
+
+/// A camera at an instant, in the room's frame.
+#[derive(Clone, Copy)]
+pub struct View {
+    pub origin: Vec3,
+    pub turn: Quat,
+}
+
+impl View {
+    pub fn new(world_from_cam: &Pose) -> View {
+        View { origin: world_from_cam.p.as_vec3(), turn: world_from_cam.q.as_quat() }
+    }
+}
+
+/// Exposure and the noise stream of one image.
+#[derive(Clone, Copy)]
+pub struct Exposure {
+    /// Grey levels per unit of radiance.
+    pub gain: f32,
+    pub sensor: Sensor,
+    /// Differs for every image of a run.
+    pub stream: u32,
+}
+
+/// A solid as seen from a view: for the tile tests.
+#[derive(Clone, Copy)]
+struct Seen {
+    solid: u32,
+    /// Nearest it can be, m.
+    near: f32,
+    axis: Vec3,
+    cos: f32,
+    sin: f32,
+}
+
+/// Reused between frames: nothing here allocates after construction.
+pub struct Scratch {
+    seen: Vec<Seen>,
+    lists: Vec<Vec<Seen>>,
+    pub hits: Vec<Hit>,
+}
+
+impl Scratch {
+    pub fn new(room: &Room, pixels: usize, threads: usize) -> Scratch {
+        let n = room.solids.len();
+        Scratch {
+            seen: Vec::with_capacity(n),
+            lists: (0..threads.max(1)).map(|_| Vec::with_capacity(n)).collect(),
+            hits: vec![Hit { distance: 0.0, face: NOTHING }; pixels],
+        }
+    }
+}
+
+impl Lens {
+    pub fn new(camera: &Camera) -> Lens {
+        let (width, height) = (camera.width, camera.height);
+        let at = |x: f64, y: f64| camera.unproject(DVec2::new(x, y)).map(|b| b.as_vec3());
+        let mut bearings = Vec::with_capacity(width * height);
+        let mut pixel_angle = Vec::with_capacity(width * height);
+        for i in 0..width * height {
+            let (x, y) = ((i % width) as f64, (i / width) as f64);
+            let rays = (at(x, y), at(x + 0.5, y), at(x - 0.5, y), at(x, y + 0.5), at(x, y - 0.5));
+            if let (Some(b), Some(r), Some(l), Some(d), Some(u)) = rays {
+                bearings.push(b);
+                pixel_angle.push((r - l).cross(d - u).length().sqrt());
+            } else {
+                bearings.push(Vec3::ZERO);
+                pixel_angle.push(0.0);
+            }
+        }
+        let mut lens = Lens { width, height, bearings, pixel_angle, cones: Vec::new() };
+        for ty in 0..height.div_ceil(TILE) {
+            for tx in 0..width.div_ceil(TILE) {
+                lens.cones.push(lens.cone(tx, ty));
+            }
+        }
+        lens
+    }
+
+    fn cone(&self, tx: usize, ty: usize) -> Cone {
+        let rays = || {
+            let ys = ty * TILE..((ty + 1) * TILE).min(self.height);
+            let row = move |y: usize| y * self.width + tx * TILE..y * self.width + ((tx + 1) * TILE).min(self.width);
+            ys.flat_map(row).filter(|i| self.pixel_angle[*i] > 0.0)
+        };
+        let axis = rays().map(|i| self.bearings[i]).sum::<Vec3>().normalize_or_zero();
+        // a pixel reaches half its diagonal beyond its centre
+        let reach = |i: usize| self.bearings[i].dot(axis).clamp(-1.0, 1.0).acos() + self.pixel_angle[i];
+        let (sin, cos) = rays().map(reach).fold(0.0, f32::max).min(std::f32::consts::PI).sin_cos();
+        Cone { axis, cos, sin }
+    }
+
+    fn tiles_across(&self) -> usize {
+        self.width.div_ceil(TILE)
+    }
+
+    /// Bearing of a place inside the pixel, `offset` in pixels, by the slope of the neighbours.
+    fn bearing_near(&self, x: usize, y: usize, offset: Vec2) -> Vec3 {
+        let at = |x: usize, y: usize| self.bearings[y * self.width + x];
+        let (x0, x1) = (x.saturating_sub(1), (x + 1).min(self.width - 1));
+        let (y0, y1) = (y.saturating_sub(1), (y + 1).min(self.height - 1));
+        let du = (at(x1, y) - at(x0, y)) / (x1 - x0) as f32;
+        let dv = (at(x, y1) - at(x, y0)) / (y1 - y0) as f32;
+        (at(x, y) + du * offset.x + dv * offset.y).normalize()
+    }
+}
+
+/// Distance and face at every pixel centre, into `scratch.hits`.
+pub fn cast(room: &Room, lens: &Lens, view: View, scratch: &mut Scratch) {
+    look_around(room, view, &mut scratch.seen);
+    let Scratch { seen, lists, hits } = scratch;
+    let band = band_rows(lens, lists.len()) * lens.width;
+    let hits = &mut hits[..lens.width * lens.height];
+    let work = |first_row: usize, hits: &mut [Hit], list: &mut Vec<Seen>| {
+        let rows = hits.len() / lens.width;
+        for ty in first_row / TILE..(first_row + rows).div_ceil(TILE) {
+            for tx in 0..lens.tiles_across() {
+                tile_list(seen, &lens.cones[ty * lens.tiles_across() + tx], view, list);
+                for y in ty * TILE..((ty + 1) * TILE).min(first_row + rows) {
+                    for x in tx * TILE..((tx + 1) * TILE).min(lens.width) {
+                        let d = lens.bearings[y * lens.width + x];
+                        let hit = if d == Vec3::ZERO {
+                            Hit { distance: 0.0, face: NOTHING }
+                        } else {
+                            meet(room, list, view.origin, view.turn * d)
+                        };
+                        hits[(y - first_row) * lens.width + x] = hit;
+                    }
+                }
+            }
+        }
+    };
+    let (mut bands, mut lists) = (hits.chunks_mut(band).enumerate(), lists.iter_mut());
+    let (first, spare) = (bands.next(), lists.next());
+    std::thread::scope(|scope| {
+        for ((k, hits), list) in bands.zip(lists) {
+            let work = &work;
+            scope.spawn(move || work(k * band / lens.width, hits, list));
+        }
+        if let (Some((_, hits)), Some(list)) = (first, spare) {
+            work(0, hits, list);
+        }
+    });
+}
+
+/// Grey levels from the hits of the last `cast` of the same view.
+pub fn shade(room: &Room, lens: &Lens, view: View, exposure: &Exposure, scratch: &mut Scratch, out: &mut [u8]) {
+    let Scratch { seen, lists, hits } = scratch;
+    let band = band_rows(lens, lists.len()) * lens.width;
+    let hits = &hits[..lens.width * lens.height];
+    let work = |first_row: usize, out: &mut [u8], list: &mut Vec<Seen>| {
+        let rows = out.len() / lens.width;
+        for ty in first_row / TILE..(first_row + rows).div_ceil(TILE) {
+            for tx in 0..lens.tiles_across() {
+                let mut listed = false;
+                for y in ty * TILE..((ty + 1) * TILE).min(first_row + rows) {
+                    for x in tx * TILE..((tx + 1) * TILE).min(lens.width) {
+                        let i = y * lens.width + x;
+                        let light = if is_edge(hits, lens, x, y) {
+                            if !listed {
+                                tile_list(seen, &lens.cones[ty * lens.tiles_across() + tx], view, list);
+                                listed = true;
+                            }
+                            edge_radiance(room, lens, view, list, x, y)
+                        } else if hits[i].face == NOTHING {
+                            0.0
+                        } else {
+                            radiance(room, view, view.turn * lens.bearings[i], hits[i], lens.pixel_angle[i])
+                        };
+                        out[i - first_row * lens.width] = develop(light, lens.bearings[i].z, i, exposure);
+                    }
+                }
+            }
+        }
+    };
+    let (mut bands, mut lists) = (out.chunks_mut(band).enumerate(), lists.iter_mut());
+    let (first, spare) = (bands.next(), lists.next());
+    std::thread::scope(|scope| {
+        for ((k, out), list) in bands.zip(lists) {
+            let work = &work;
+            scope.spawn(move || work(k * band / lens.width, out, list));
+        }
+        if let (Some((_, out)), Some(list)) = (first, spare) {
+            work(0, out, list);
+        }
+    });
+}
+
+/// Mean radiance of a sparse set of pixels: what an exposure meter sees.
+pub fn meter(room: &Room, lens: &Lens, view: View) -> f32 {
+    const STEP: usize = 24;
+    let (mut sum, mut n) = (0.0, 0.0);
+    for y in (STEP / 2..lens.height).step_by(STEP) {
+        for x in (STEP / 2..lens.width).step_by(STEP) {
+            let i = y * lens.width + x;
+            if lens.pixel_angle[i] > 0.0 {
+                let d = view.turn * lens.bearings[i];
+                let (distance, face) = room.nearest(view.origin, d);
+                sum += radiance(room, view, d, Hit { distance, face }, lens.pixel_angle[i] * STEP as f32);
+                n += 1.0;
+            }
+        }
+    }
+    sum / f32::max(n, 1.0)
+}
+
+/// Depth (z in the camera frame, m) of the hits of the last `cast`; 0 where there is none.
+pub fn depths(lens: &Lens, hits: &[Hit], out: &mut [f32]) {
+    for ((z, hit), b) in out.iter_mut().zip(hits).zip(&lens.bearings) {
+        *z = if hit.face == NOTHING { 0.0 } else { (hit.distance * b.z).max(0.0) };
+    }
+}
+
+/// Rows a thread takes: whole tile rows, as equal as can be.
+fn band_rows(lens: &Lens, threads: usize) -> usize {
+    lens.height.div_ceil(TILE).div_ceil(threads) * TILE
+}
+
+/// All solids from a view, nearest first.
+fn look_around(room: &Room, view: View, seen: &mut Vec<Seen>) {
+    seen.clear();
+    for (k, s) in room.solids.iter().enumerate() {
+        let c = s.centre - view.origin;
+        let range = c.length().max(1e-6);
+        let sin = (s.bound / range).min(1.0);
+        let cos = (1.0 - sin * sin).sqrt();
+        let near = (range - s.bound).max(0.0);
+        seen.push(Seen { solid: k as u32, near, axis: c / range, cos, sin });
+    }
+    seen.sort_unstable_by(|a, b| a.near.total_cmp(&b.near).then(a.solid.cmp(&b.solid)));
+}
+
+/// The solids whose bounding sphere may meet the cone.
+fn tile_list(seen: &[Seen], cone: &Cone, view: View, list: &mut Vec<Seen>) {
+    list.clear();
+    let axis = view.turn * cone.axis;
+    list.extend(seen.iter().filter(|s| {
+        // angle between the axes against the sum of the half angles, in cosines; the sum may pass π
+        let cos_sum = s.cos * cone.cos - s.sin * cone.sin;
+        let sin_sum = s.sin * cone.cos + s.cos * cone.sin;
+        s.near <= 0.0 || sin_sum < 0.0 || s.axis.dot(axis) >= cos_sum - 1e-5
+    }));
+}
+
+#[inline]
+fn meet(room: &Room, list: &[Seen], o: Vec3, d: Vec3) -> Hit {
+    let mut best = room.shell(o, d);
+    for s in list {
+        if s.near > best.0 {
+            break;
+        }
+        room.solids[s.solid as usize].meet(o, d, &mut best);
+    }
+    Hit { distance: best.0, face: best.1 }
+}
+
+fn is_edge(hits: &[Hit], lens: &Lens, x: usize, y: usize) -> bool {
+    let i = y * lens.width + x;
+    let face = hits[i].face;
+    let around = [
+        (x > 0).then(|| i - 1),
+        (x + 1 < lens.width).then_some(i + 1),
+        (y > 0).then(|| i - lens.width),
+        (y + 1 < lens.height).then_some(i + lens.width),
+    ];
+    let faces = around.into_iter().flatten().map(|j| hits[j].face);
+    // at the end of the lens' domain there are no bearings to interpolate
+    let (mut differs, mut outside) = (false, face == NOTHING);
+    for f in faces {
+        differs |= f != face;
+        outside |= f == NOTHING;
+    }
+    differs && !outside
+}
+
+/// Light leaving a surface towards the camera.
+#[inline]
+fn radiance(room: &Room, view: View, d: Vec3, hit: Hit, angle: f32) -> f32 {
+    let face = &room.faces[hit.face as usize];
+    let place = face.place(view.origin + d * hit.distance);
+    // a ray turned by `angle` slides by angle·distance·|u - n (u·d)/(n·d)| along u
+    let slope = 1.0 / place.normal.dot(d).abs().max(0.02);
+    let slide = |u: Vec3| {
+        let tilt = u.dot(d) * slope;
+        (u.length_squared() + tilt * tilt).sqrt()
+    };
+    let footprint = Vec2::new(slide(place.u), slide(place.v)) * (angle * hit.distance);
+    let spot = Spot { at: place.at, footprint, size: face.size };
+    texture::albedo(face.material, face.seed, spot) * room.light_map.at(hit.face as usize, place.at)
+}
+
+fn edge_radiance(room: &Room, lens: &Lens, view: View, list: &[Seen], x: usize, y: usize) -> f32 {
+    let angle = lens.pixel_angle[y * lens.width + x] / EDGE as f32;
+    if angle == 0.0 {
+        return 0.0;
+    }
+    let mut sum = 0.0;
+    for k in 0..EDGE * EDGE {
+        let offset = (Vec2::new((k % EDGE) as f32, (k / EDGE) as f32) + 0.5) / EDGE as f32 - 0.5;
+        let d = view.turn * lens.bearing_near(x, y, offset);
+        sum += radiance(room, view, d, meet(room, list, view.origin, d), angle);
+    }
+    sum / (EDGE * EDGE) as f32
+}
+
+/// Vignette, exposure, shot and read noise, quantisation.
+#[inline]
+fn develop(light: f32, cos_off_axis: f32, pixel: usize, e: &Exposure) -> u8 {
+    let lost = e.sensor.vignette as f32 * 2.0 * (1.0 - cos_off_axis * cos_off_axis);
+    let level = light * e.gain * (1.0 - lost).max(0.0);
+    let read = e.sensor.read_noise as f32;
+    let sigma = (read * read + e.sensor.shot_noise as f32 * level).sqrt();
+    let a = texture::hash(pixel as i32, 0, e.stream);
+    let b = texture::hash(pixel as i32, 1, e.stream);
+    // the sum of four uniform numbers, scaled to unit variance
+    let sum = (a & 0xFFFF) + (a >> 16) + (b & 0xFFFF) + (b >> 16);
+    let normal = (sum as f32 / 65536.0 - 2.0) * 1.732_050_8;
+    (level + sigma * normal + 0.5).clamp(0.0, 255.0) as u8
+}

@@ -1,0 +1,340 @@
+//! The room: solids with analytic ray intersection, faces that carry material and light.
+//!
+//! A `Room` is one box seen from inside and solids in it: blocks (boxes turned about z), balls and
+//! drums (upright cylinders). `nearest` answers which face a ray meets first, exactly. Furniture
+//! is in `furnish.rs`, baked light in `light.rs`, surface patterns in `texture.rs`. World frame:
+//! z up, metres, f32 (a metre of room at 1e-7 is finer than any sensor here).
+
+use super::light::LightMap;
+use super::texture::Material;
+use glam::{Vec2, Vec3};
+
+/// No face: the ray left the room (only rays outside the lens' domain do).
+pub const NOTHING: u32 = u32::MAX;
+
+#[derive(Clone, Copy, Debug)]
+pub enum Shape {
+    Block { half: Vec3 },
+    Ball { radius: f32 },
+    Drum { radius: f32, half_height: f32 },
+}
+
+#[derive(Clone, Copy, Debug)]
+pub struct Solid {
+    pub shape: Shape,
+    pub centre: Vec3,
+    /// Turn about z.
+    pub cos: f32,
+    pub sin: f32,
+    /// Its first face; a block has six, a ball one, a drum a side, a top and a bottom.
+    pub face: u32,
+    /// Radius of the bounding sphere.
+    pub bound: f32,
+}
+
+/// How a face maps points to surface coordinates.
+#[derive(Clone, Copy, Debug)]
+pub enum Chart {
+    /// `origin` is the corner where u = v = 0.
+    Flat { origin: Vec3, u: Vec3, v: Vec3 },
+    Ball { centre: Vec3, radius: f32 },
+    Drum { base: Vec3, radius: f32 },
+}
+
+#[derive(Clone, Copy, Debug)]
+pub struct Face {
+    pub chart: Chart,
+    /// Extent along u and v, m.
+    pub size: Vec2,
+    pub material: Material,
+    pub seed: u32,
+}
+
+/// Surface coordinate, outward normal and tangents at a point.
+#[derive(Clone, Copy, Debug)]
+pub struct Place {
+    pub at: Vec2,
+    pub normal: Vec3,
+    pub u: Vec3,
+    pub v: Vec3,
+}
+
+#[derive(Clone, Copy, Debug)]
+pub struct Light {
+    pub at: Vec3,
+    /// Radiant intensity, in units in which 1 at 1 m lights a white surface fully.
+    pub power: f32,
+}
+
+pub struct Room {
+    pub low: Vec3,
+    pub high: Vec3,
+    pub solids: Vec<Solid>,
+    /// The first six are the room's: -x, +x, -y, +y, floor, ceiling.
+    pub faces: Vec<Face>,
+    pub lights: Vec<Light>,
+    pub light_map: LightMap,
+}
+
+impl Room {
+    /// An empty room, dark until `light_map` is baked.
+    pub fn empty(low: Vec3, high: Vec3, walls: [Material; 4], seed: u32) -> Room {
+        let e = high - low;
+        let (x, y, z) = (Vec3::X, Vec3::Y, Vec3::Z);
+        let corner = |x: f32, y: f32| Vec3::new(x, y, low.z);
+        let wall = |origin, u, width: f32, k: usize| face(origin, u, z, Vec2::new(width, e.z), walls[k], seed.wrapping_add(k as u32));
+        let faces = vec![
+            wall(corner(low.x, low.y), y, e.y, 0),
+            wall(corner(high.x, high.y), -y, e.y, 1),
+            wall(corner(high.x, low.y), -x, e.x, 2),
+            wall(corner(low.x, high.y), x, e.x, 3),
+            face(corner(low.x, low.y), x, y, Vec2::new(e.x, e.y), Material::Parquet, seed.wrapping_add(4)),
+            face(Vec3::new(low.x, high.y, high.z), x, -y, Vec2::new(e.x, e.y), Material::CeilingTile, seed.wrapping_add(5)),
+        ];
+        Room { low, high, solids: Vec::new(), faces, lights: Vec::new(), light_map: LightMap::default() }
+    }
+
+    /// Adds a block standing on `base` (the centre of its underside); `turn` is (cos, sin) about z.
+    pub fn add_block(&mut self, base: Vec3, half: Vec3, turn: (f32, f32), side: Material, top: Material, seed: u32) {
+        let (cos, sin) = turn;
+        let (ex, ey) = (Vec3::new(cos, sin, 0.0), Vec3::new(-sin, cos, 0.0));
+        let centre = base + Vec3::Z * half.z;
+        let first = self.faces.len() as u32;
+        let size = half * 2.0;
+        let mut wall = |n: Vec3, u: Vec3, reach: f32, width: f32, k: u32| {
+            let origin = base + n * reach - u * (0.5 * width);
+            self.faces.push(face(origin, u, Vec3::Z, Vec2::new(width, size.z), side, seed.wrapping_add(k)));
+        };
+        wall(ex, ey, half.x, size.y, 0);
+        wall(-ex, -ey, half.x, size.y, 1);
+        wall(ey, -ex, half.y, size.x, 2);
+        wall(-ey, ex, half.y, size.x, 3);
+        let corner = centre - ex * half.x - ey * half.y;
+        let flat = Vec2::new(size.x, size.y);
+        self.faces.push(face(corner + Vec3::Z * half.z, ex, ey, flat, top, seed.wrapping_add(4)));
+        self.faces.push(face(corner + ey * size.y - Vec3::Z * half.z, ex, -ey, flat, top, seed.wrapping_add(5)));
+        self.solids.push(Solid { shape: Shape::Block { half }, centre, cos, sin, face: first, bound: half.length() });
+    }
+
+    pub fn add_ball(&mut self, centre: Vec3, radius: f32, material: Material, seed: u32) {
+        let pi = std::f32::consts::PI;
+        let size = Vec2::new(2.0 * pi, pi) * radius;
+        let first = self.faces.len() as u32;
+        self.faces.push(Face { chart: Chart::Ball { centre, radius }, size, material, seed });
+        let shape = Shape::Ball { radius };
+        self.solids.push(Solid { shape, centre, cos: 1.0, sin: 0.0, face: first, bound: radius });
+    }
+
+    /// Adds an upright cylinder standing on `base`.
+    pub fn add_drum(&mut self, base: Vec3, radius: f32, height: f32, material: Material, seed: u32) {
+        let size = Vec2::new(2.0 * std::f32::consts::PI * radius, height);
+        let first = self.faces.len() as u32;
+        self.faces.push(Face { chart: Chart::Drum { base, radius }, size, material, seed });
+        let corner = base - Vec3::new(radius, radius, 0.0);
+        let flat = Vec2::splat(2.0 * radius);
+        self.faces.push(face(corner + Vec3::Z * height, Vec3::X, Vec3::Y, flat, material, seed.wrapping_add(1)));
+        self.faces.push(face(corner + Vec3::Y * flat.y, Vec3::X, -Vec3::Y, flat, material, seed.wrapping_add(2)));
+        let half_height = 0.5 * height;
+        let bound = radius.hypot(half_height);
+        let centre = base + Vec3::Z * half_height;
+        let shape = Shape::Drum { radius, half_height };
+        self.solids.push(Solid { shape, centre, cos: 1.0, sin: 0.0, face: first, bound });
+    }
+
+    /// Where a ray from inside leaves the room.
+    #[inline]
+    pub fn shell(&self, o: Vec3, d: Vec3) -> (f32, u32) {
+        let far = |o: f32, d: f32, low: f32, high: f32, face: u32| {
+            if d > 0.0 {
+                ((high - o) / d, face + 1)
+            } else if d < 0.0 {
+                ((low - o) / d, face)
+            } else {
+                (f32::INFINITY, face)
+            }
+        };
+        let x = far(o.x, d.x, self.low.x, self.high.x, 0);
+        let y = far(o.y, d.y, self.low.y, self.high.y, 2);
+        let z = far(o.z, d.z, self.low.z, self.high.z, 4);
+        let xy = if y.0 < x.0 { y } else { x };
+        if z.0 < xy.0 {
+            z
+        } else {
+            xy
+        }
+    }
+
+    /// First surface along a unit ray among all solids: distance and face.
+    pub fn nearest(&self, o: Vec3, d: Vec3) -> (f32, u32) {
+        let mut best = self.shell(o, d);
+        for s in &self.solids {
+            if s.may_meet(o, d, best.0) {
+                s.meet(o, d, &mut best);
+            }
+        }
+        best
+    }
+
+    /// Whether a solid stands between `o` and the point `reach` along the unit ray.
+    pub fn blocked(&self, o: Vec3, d: Vec3, reach: f32) -> bool {
+        let mut best = (reach, NOTHING);
+        self.solids.iter().any(|s| {
+            if s.may_meet(o, d, reach) {
+                s.meet(o, d, &mut best);
+            }
+            best.1 != NOTHING
+        })
+    }
+
+    /// Distance from a point to the nearest solid or wall; zero or negative inside one.
+    pub fn clearance(&self, p: Vec3) -> f32 {
+        let wall = (p - self.low).min(self.high - p).min_element();
+        self.solids.iter().map(|s| s.distance(p)).fold(wall, f32::min)
+    }
+}
+
+fn face(origin: Vec3, u: Vec3, v: Vec3, size: Vec2, material: Material, seed: u32) -> Face {
+    Face { chart: Chart::Flat { origin, u, v }, size, material, seed }
+}
+
+impl Solid {
+    /// Cheap test against the bounding sphere.
+    #[inline]
+    fn may_meet(&self, o: Vec3, d: Vec3, reach: f32) -> bool {
+        let c = self.centre - o;
+        let along = c.dot(d);
+        along > -self.bound
+            && along < reach + self.bound
+            && c.length_squared() - along * along <= self.bound * self.bound
+    }
+
+    /// Replaces `best` if the ray enters this solid sooner. Rays start outside.
+    #[inline]
+    pub fn meet(&self, o: Vec3, d: Vec3, best: &mut (f32, u32)) {
+        match self.shape {
+            Shape::Block { half } => self.meet_block(half, o, d, best),
+            Shape::Ball { radius } => {
+                let c = self.centre - o;
+                let along = c.dot(d);
+                let q = radius * radius - (c - d * along).length_squared();
+                if q > 0.0 {
+                    let t = along - q.sqrt();
+                    if t > 0.0 && t < best.0 {
+                        *best = (t, self.face);
+                    }
+                }
+            }
+            Shape::Drum { radius, half_height } => self.meet_drum(radius, half_height, o, d, best),
+        }
+    }
+
+    #[inline]
+    fn meet_block(&self, half: Vec3, o: Vec3, d: Vec3, best: &mut (f32, u32)) {
+        let turn = |v: Vec3| Vec3::new(self.cos * v.x + self.sin * v.y, self.cos * v.y - self.sin * v.x, v.z);
+        let (o, d) = (turn(o - self.centre), turn(d));
+        let inv = Vec3::ONE / d;
+        let mid = -o * inv;
+        let reach = (half * inv).abs();
+        let (near, far) = (mid - reach, mid + reach);
+        let t0 = near.x.max(near.y).max(near.z);
+        let t1 = far.x.min(far.y).min(far.z);
+        if !(t0 < t1 && t0 > 0.0 && t0 < best.0) {
+            return;
+        }
+        let face = if t0 == near.x {
+            (d.x > 0.0) as u32
+        } else if t0 == near.y {
+            2 + (d.y > 0.0) as u32
+        } else {
+            4 + (d.z > 0.0) as u32
+        };
+        *best = (t0, self.face + face);
+    }
+
+    fn meet_drum(&self, radius: f32, half_height: f32, o: Vec3, d: Vec3, best: &mut (f32, u32)) {
+        let o = o - self.centre;
+        if d.z.abs() > 1e-9 {
+            let cap = if d.z < 0.0 { half_height } else { -half_height };
+            let t = (cap - o.z) / d.z;
+            let p = (o + d * t).truncate();
+            if t > 0.0 && t < best.0 && p.length_squared() < radius * radius {
+                *best = (t, self.face + 1 + (d.z > 0.0) as u32);
+                return;
+            }
+        }
+        let (p, r) = (o.truncate(), d.truncate());
+        let a = r.length_squared();
+        if a < 1e-12 {
+            return;
+        }
+        let along = -p.dot(r) / a;
+        let q = radius * radius - (p + r * along).length_squared();
+        if q > 0.0 {
+            let t = along - (q / a).sqrt();
+            if t > 0.0 && t < best.0 && (o.z + d.z * t).abs() <= half_height {
+                *best = (t, self.face);
+            }
+        }
+    }
+
+    /// Signed distance of a point from the surface, m.
+    pub fn distance(&self, p: Vec3) -> f32 {
+        let o = p - self.centre;
+        match self.shape {
+            Shape::Ball { radius } => o.length() - radius,
+            Shape::Drum { radius, half_height } => {
+                let q = Vec2::new(o.truncate().length() - radius, o.z.abs() - half_height);
+                q.max(Vec2::ZERO).length() + q.max_element().min(0.0)
+            }
+            Shape::Block { half } => {
+                let l = Vec3::new(self.cos * o.x + self.sin * o.y, self.cos * o.y - self.sin * o.x, o.z);
+                let q = l.abs() - half;
+                q.max(Vec3::ZERO).length() + q.max_element().min(0.0)
+            }
+        }
+    }
+}
+
+impl Face {
+    #[inline]
+    pub fn place(&self, p: Vec3) -> Place {
+        match self.chart {
+            Chart::Flat { origin, u, v } => {
+                let d = p - origin;
+                Place { at: Vec2::new(d.dot(u), d.dot(v)), normal: u.cross(v), u, v }
+            }
+            Chart::Ball { centre, radius } => {
+                let n = (p - centre) / radius;
+                let ring = n.truncate().length().max(1e-3);
+                let u = Vec3::new(-n.y, n.x, 0.0) / ring;
+                let longitude = n.y.atan2(n.x) + std::f32::consts::PI;
+                let latitude = n.z.clamp(-1.0, 1.0).asin() + std::f32::consts::FRAC_PI_2;
+                // the chart is stretched along u towards the poles
+                Place { at: Vec2::new(longitude, latitude) * radius, normal: n, u: u / ring, v: n.cross(u) }
+            }
+            Chart::Drum { base, radius } => {
+                let d = p - base;
+                let n = Vec3::new(d.x, d.y, 0.0) / radius;
+                let at = Vec2::new((n.y.atan2(n.x) + std::f32::consts::PI) * radius, d.z);
+                Place { at, normal: n, u: Vec3::new(-n.y, n.x, 0.0), v: Vec3::Z }
+            }
+        }
+    }
+
+    /// The point at a surface coordinate, and its outward normal.
+    pub fn point(&self, at: Vec2) -> (Vec3, Vec3) {
+        match self.chart {
+            Chart::Flat { origin, u, v } => (origin + u * at.x + v * at.y, u.cross(v)),
+            Chart::Ball { centre, radius } => {
+                let (a, b) = (at.x / radius - std::f32::consts::PI, at.y / radius - std::f32::consts::FRAC_PI_2);
+                let n = Vec3::new(a.cos() * b.cos(), a.sin() * b.cos(), b.sin());
+                (centre + n * radius, n)
+            }
+            Chart::Drum { base, radius } => {
+                let a = at.x / radius - std::f32::consts::PI;
+                let n = Vec3::new(a.cos(), a.sin(), 0.0);
+                (base + n * radius + Vec3::Z * at.y, n)
+            }
+        }
+    }
+}

@@ -1,0 +1,221 @@
+//! What to simulate: a rig, a path and a seed. The same scenario gives the same bytes.
+//!
+//! Named scenarios fly a room of 8 x 6 x 3.5 m and begin with a second at rest. A recorded
+//! scenario takes its path (and, if given, its inertial samples) from csv files in EuRoC's format.
+
+use super::imu::{Bias, ImuErrors};
+use super::recording;
+use super::render::Sensor;
+use crate::camera::{Calibration, Camera, ImuCalibration, Lens, RigCamera};
+use crate::fault::Fault;
+use crate::types::{ImuSample, Pose, Span, TimedPose};
+use glam::{DMat3, DQuat, DVec3};
+use std::f64::consts::TAU;
+use std::path::Path;
+
+#[derive(Clone, Debug)]
+pub struct Scenario {
+    pub name: String,
+    pub seed: u64,
+    /// Length of the run; a recorded path may end sooner.
+    pub duration: Span,
+    /// Stereo pairs a second.
+    pub rate_hz: f64,
+    /// The rig at full resolution.
+    pub calibration: Calibration,
+    /// Images are made this many times smaller a side.
+    pub image_divisor: usize,
+    pub sensor: Sensor,
+    pub imu_errors: ImuErrors,
+    pub path: Flight,
+}
+
+/// Where the body goes.
+#[derive(Clone, Debug)]
+pub enum Flight {
+    /// At rest.
+    Static,
+    /// Holds its place as a small multicopter does: 0.2 m, 5°.
+    Hover,
+    /// Around the room, looking across it.
+    Circle,
+    /// Around the room at about 1 m/s, looking at walls and furniture.
+    Demo,
+    /// Up to 4 m/s, 8 m/s² and 3 rad/s.
+    Aggressive,
+    Recorded(Recording),
+}
+
+#[derive(Clone, Debug)]
+pub struct Recording {
+    /// `world_from_body`, z up.
+    pub poses: Vec<TimedPose>,
+    /// Empty where the file does not state them.
+    pub biases: Vec<Bias>,
+    /// Real inertial samples; simulated ones when `None`.
+    pub imu: Option<Vec<ImuSample>>,
+}
+
+const NAMED: [(&str, Flight, f64); 5] = [
+    ("demo", Flight::Demo, 10.0),
+    ("hover", Flight::Hover, 10.0),
+    ("circle", Flight::Circle, 12.0),
+    ("aggressive", Flight::Aggressive, 12.0),
+    ("static", Flight::Static, 5.0),
+];
+
+/// Rest at the start, then gathering way, s.
+const REST: f64 = 1.2;
+const GATHER: f64 = 1.2;
+
+impl Scenario {
+    pub fn names() -> impl Iterator<Item = &'static str> {
+        NAMED.iter().map(|n| n.0)
+    }
+
+    pub fn named(name: &str) -> Option<Scenario> {
+        let (name, flight, secs) = NAMED.iter().find(|n| n.0 == name)?;
+        let mut scenario = Scenario::flying(name, flight.clone(), *secs);
+        if matches!(flight, Flight::Demo) {
+            scenario.image_divisor = 2; // maps in minutes on a software rasteriser
+        }
+        Some(scenario)
+    }
+
+    /// The path of a EuRoC `state_groundtruth_estimate0` csv; inertial samples from `imu` (EuRoC
+    /// `imu0` csv) or, without it, simulated along the smoothed path.
+    pub fn from_euroc(truth: &Path, imu: Option<&Path>) -> Result<Scenario, Fault> {
+        let recording = recording::read(truth, imu)?;
+        let span = |p: &[TimedPose]| p.last().map_or(0.0, |l| (l.t - p[0].t).secs());
+        let secs = span(&recording.poses);
+        Ok(Scenario::flying("euroc", Flight::Recorded(recording), secs))
+    }
+
+    fn flying(name: &str, path: Flight, secs: f64) -> Scenario {
+        Scenario {
+            name: name.to_string(),
+            seed: 1,
+            duration: Span::from_secs(secs),
+            rate_hz: 20.0,
+            calibration: euroc_rig(),
+            image_divisor: 1,
+            sensor: Sensor { read_noise: 1.2, shot_noise: 0.025, vignette: 0.35 },
+            imu_errors: ImuErrors::EUROC,
+            path,
+        }
+    }
+
+    /// The rig whose images are made: `calibration` at the resolution of `image_divisor`.
+    pub fn rig(&self) -> Calibration {
+        let mut rig = self.calibration.clone();
+        let d = self.image_divisor.max(1);
+        for c in &mut rig.cameras {
+            c.camera = shrunk(&c.camera, d);
+        }
+        rig
+    }
+}
+
+fn shrunk(c: &Camera, divisor: usize) -> Camera {
+    let s = divisor as f64;
+    // pixel centres are integers, so the corner of the image is at -0.5
+    Camera {
+        width: c.width / divisor,
+        height: c.height / divisor,
+        fx: c.fx / s,
+        fy: c.fy / s,
+        cx: (c.cx + 0.5) / s - 0.5,
+        cy: (c.cy + 0.5) / s - 0.5,
+        lens: c.lens,
+    }
+}
+
+/// The VI-sensor of EuRoC (Burri et al., IJRR 2016): 752x480, 0.11 m baseline.
+pub fn euroc_rig() -> Calibration {
+    let camera = |f: [f64; 4], k1, k2, p1, p2| Camera {
+        width: 752,
+        height: 480,
+        fx: f[0],
+        fy: f[1],
+        cx: f[2],
+        cy: f[3],
+        lens: Lens::Radtan { k1, k2, p1, p2 },
+    };
+    let rows = |x: [f64; 3], y: [f64; 3], z: [f64; 3]| {
+        DQuat::from_mat3(&DMat3::from_cols_array_2d(&[x, y, z]).transpose())
+    };
+    let q0 = rows(
+        [0.0148655429818, -0.999880929698, 0.00414029679422],
+        [0.999557249008, 0.0149672133247, 0.025715529948],
+        [-0.0257744366974, 0.00375618835797, 0.999660727178],
+    );
+    let q1 = rows(
+        [0.0125552670891, -0.999755099723, 0.0182237714554],
+        [0.999598781151, 0.0130119051815, 0.0251588363115],
+        [-0.0253898008918, 0.0179005838253, 0.999517347078],
+    );
+    let p0 = DVec3::new(-0.0216401454975, -0.064676986768, 0.00981073058949);
+    let p1 = DVec3::new(-0.0198435579556, 0.0453689425024, 0.00786212447038);
+    let cam0 = camera([458.654, 457.296, 367.215, 248.375], -0.28340811, 0.07395907, 0.00019359, 1.76187114e-05);
+    let cam1 = camera([457.587, 456.134, 379.999, 255.238], -0.28368365, 0.07451284, -0.00010473, -3.555907e-05);
+    Calibration {
+        cameras: vec![
+            RigCamera { camera: cam0, body_from_cam: Pose::new(q0, p0) },
+            RigCamera { camera: cam1, body_from_cam: Pose::new(q1, p1) },
+        ],
+        imu: ImuCalibration {
+            rate_hz: 200.0,
+            gyro_noise: 1.6968e-4,
+            gyro_walk: 1.9393e-5,
+            accel_noise: 2.0e-3,
+            accel_walk: 3.0e-3,
+        },
+    }
+}
+
+impl Flight {
+    /// `world_from_cam0` of an invented flight, `t` seconds from its start. The room is centred on
+    /// the origin with its floor at z = 0. `None` for a recording.
+    pub fn look(&self, t: f64) -> Option<Pose> {
+        let s = way(t);
+        Some(match self {
+            Flight::Recorded(_) => return None,
+            Flight::Static => look(DVec3::new(0.3, -0.4, 1.4), 0.9, -0.1, 0.0),
+            Flight::Hover => {
+                let wobble = |f: f64| (TAU * f * s).sin();
+                let p = DVec3::new(0.3, -0.4, 1.4) + DVec3::new(0.2 * wobble(0.21), 0.15 * wobble(0.33), 0.12 * wobble(0.27));
+                look(p, 0.9 + 0.09 * wobble(0.37), -0.1 + 0.07 * wobble(0.43), 0.06 * wobble(0.51))
+            }
+            Flight::Circle => {
+                let a = 0.7 * s;
+                let p = DVec3::new(1.7 * a.cos(), 1.1 * a.sin(), 1.5 + 0.25 * (2.0 * a).sin());
+                look(p, a + TAU / 2.0 + 0.25 * (1.5 * a).sin(), -0.12 + 0.08 * (3.0 * a).sin(), 0.05 * (2.0 * a).sin())
+            }
+            Flight::Demo => {
+                let a = 0.766 * s; // once round in ten seconds
+                let p = DVec3::new(1.6 * a.cos(), 1.05 * a.sin(), 1.35 + 0.3 * (2.0 * a).sin());
+                let yaw = a + 0.35 * (2.0 * a).sin();
+                look(p, yaw, -0.12 + 0.14 * (3.0 * a).sin(), 0.08 * (2.5 * a).sin())
+            }
+            Flight::Aggressive => {
+                let a = 1.05 * s;
+                let p = DVec3::new(2.1 * a.sin(), 1.3 * (2.0 * a).sin(), 1.6 + 0.45 * (3.0 * a).sin());
+                look(p, 0.8 * a + 1.2 * (1.3 * a).sin(), 0.35 * (2.1 * a).sin(), 0.5 * (1.7 * a).sin())
+            }
+        })
+    }
+}
+
+/// Seconds under way at `t`: at rest, then gathering way smoothly, then as time goes.
+fn way(t: f64) -> f64 {
+    let h = ((t - REST) / GATHER).clamp(0.0, 1.0);
+    GATHER * (h * h * h - 0.5 * h * h * h * h) + (t - REST - GATHER).max(0.0)
+}
+
+/// `world_from_cam` at `p`, looking along `yaw` (from x towards y) and `pitch` (up), rolled clockwise.
+fn look(p: DVec3, yaw: f64, pitch: f64, roll: f64) -> Pose {
+    let forward = DVec3::new(yaw.cos() * pitch.cos(), yaw.sin() * pitch.cos(), pitch.sin());
+    let right = DVec3::new(yaw.sin(), -yaw.cos(), 0.0);
+    let level = DQuat::from_mat3(&DMat3::from_cols(right, forward.cross(right), forward));
+    Pose::new(level * DQuat::from_rotation_z(roll), p)
+}
