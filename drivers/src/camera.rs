@@ -140,19 +140,44 @@ fn radtan(p: DVec3, k1: f64, k2: f64, p1: f64, p2: f64) -> Option<Normalised> {
     }
     let (m, d) = radtan_distort(a, k1, k2, p1, p2);
     if !(d[0][0] * d[1][1] > d[0][1] * d[1][0]) {
-        return None; // folded by the tangential part
+        return None; // folded here by the tangential part
     }
     let row = |r: [f64; 2]| [r[0] * iz, r[1] * iz, -(r[0] * a.x + r[1] * a.y) * iz];
     Some((m, [row(d[0]), row(d[1])]))
 }
 
-fn radtan_inverse(m: DVec2, k1: f64, k2: f64, p1: f64, p2: f64) -> Option<DVec3> {
-    // Newton on the 2-D distortion; the start is inside the domain and steps are kept there.
-    let r2_max = radtan_r2_max(k1, k2);
-    let mut a = m;
-    if a.length_squared() >= r2_max {
-        a *= 0.95 * (r2_max / a.length_squared()).sqrt();
+/// Where a function that grows on low..high (given with its slope) reaches `target`: Newton, halving
+/// the bracket where that leaves it. A slope that is not positive counts as beyond.
+fn growing_root(target: f64, mut low: f64, mut high: f64, f: impl Fn(f64) -> (f64, f64)) -> f64 {
+    let mut x = target.clamp(low, high);
+    for _ in 0..60 {
+        let (value, slope) = f(x);
+        let grows = slope > 0.0;
+        if grows && value <= target {
+            low = x;
+        } else {
+            high = x;
+        }
+        let newton = x - (value - target) / slope;
+        let next = if grows && newton >= low && newton <= high { newton } else { 0.5 * (low + high) };
+        let step = next - x;
+        x = next;
+        if step.abs() < 1e-15 {
+            break;
+        }
     }
+    x
+}
+
+fn radtan_inverse(m: DVec2, k1: f64, k2: f64, p1: f64, p2: f64) -> Option<DVec3> {
+    // The radial part in one dimension, then Newton in two for the tangential part.
+    let r2_max = radtan_r2_max(k1, k2);
+    let radial = |r: f64| (r * (1.0 + r * r * (k1 + r * r * k2)), 1.0 + r * r * (3.0 * k1 + r * r * 5.0 * k2));
+    let distorted = m.length();
+    if !(distorted > 1e-12) {
+        return (distorted >= 0.0).then_some(DVec3::Z);
+    }
+    let mut a = m * (growing_root(distorted, 0.0, 0.999 * r2_max.sqrt(), radial) / distorted);
     for _ in 0..30 {
         let (f, j) = radtan_distort(a, k1, k2, p1, p2);
         let e = f - m;
@@ -210,10 +235,31 @@ fn kb_polynomial(th: f64, k: &[f64; 4]) -> (f64, f64) {
 }
 
 /// Whether d grows all the way from the axis to `th`; past a maximum it may grow again, which is no
-/// longer the same lens. Sampled: a dip between samples is shallower than the fold it stands for.
+/// longer the same lens. d' as a polynomial in θ² lies above the least of its Bernstein coefficients
+/// on [0, th²].
 fn kb_grows(th: f64, k: &[f64; 4]) -> bool {
-    const SAMPLES: u32 = 8;
-    (1..=SAMPLES).all(|i| kb_polynomial(th * f64::from(i) / f64::from(SAMPLES), k).1 > 0.0)
+    let u = th * th;
+    let (a1, a2, a3, a4) = (3.0 * k[0] * u, 5.0 * k[1] * u * u, 7.0 * k[2] * u.powi(3), 9.0 * k[3] * u.powi(4));
+    let b3 = 1.0 + 0.75 * a1 + 0.5 * a2 + 0.25 * a3;
+    bernstein_positive([1.0, 1.0 + 0.25 * a1, 1.0 + 0.5 * a1 + a2 / 6.0, b3, 1.0 + a1 + a2 + a3 + a4], 10)
+}
+
+/// Exact but for polynomials that touch zero, which `splits` halvings do not tell from negative.
+fn bernstein_positive(b: [f64; 5], splits: u32) -> bool {
+    if b.iter().all(|c| *c > 0.0) {
+        return true;
+    }
+    if !(b[0] > 0.0 && b[4] > 0.0) || splits == 0 {
+        return false;
+    }
+    let (mut left, mut right) = (b, b); // de Casteljau at one half
+    for level in 1..5 {
+        for i in 0..5 - level {
+            right[i] = 0.5 * (right[i] + right[i + 1]);
+        }
+        left[level] = right[0];
+    }
+    bernstein_positive(left, splits - 1) && bernstein_positive(right, splits - 1)
 }
 
 fn kannala_brandt_inverse(m: DVec2, k: &[f64; 4]) -> Option<DVec3> {
@@ -234,24 +280,9 @@ fn kannala_brandt_inverse(m: DVec2, k: &[f64; 4]) -> Option<DVec3> {
         }
         (low, high) = (high, (high + STEP).min(PI));
     }
-    let mut th = 0.5 * (low + high);
-    for _ in 0..60 {
-        let (d, b) = kb_polynomial(th, k);
-        if !(b > 0.0) || d > r {
-            high = th;
-        } else {
-            low = th;
-        }
-        let newton = th - (d - r) / b;
-        let next = if newton >= low && newton <= high { newton } else { 0.5 * (low + high) };
-        let step = next - th;
-        th = next;
-        if step.abs() < 1e-15 {
-            break;
-        }
-    }
-    let (d, b) = kb_polynomial(th, k);
-    ((d - r).abs() < 1e-9 && b > 0.0).then(|| (m / r * th.sin()).extend(th.cos()))
+    let th = growing_root(r, low, high, |th| kb_polynomial(th, k));
+    let (d, _) = kb_polynomial(th, k);
+    ((d - r).abs() < 1e-9 && kb_grows(th, k)).then(|| (m / r * th.sin()).extend(th.cos()))
 }
 
 fn double_sphere(p: DVec3, xi: f64, alpha: f64) -> Option<Normalised> {
@@ -260,17 +291,15 @@ fn double_sphere(p: DVec3, xi: f64, alpha: f64) -> Option<Normalised> {
     if !(d1 > Z_MIN) {
         return None;
     }
-    let w1 = if alpha > 0.5 { (1.0 - alpha) / alpha } else { alpha / (1.0 - alpha) };
-    let w2 = (w1 + xi) / (2.0 * w1 * xi + xi * xi + 1.0).sqrt();
-    if !(p.z > -w2 * d1) {
-        return None;
-    }
     let z1 = xi * d1 + p.z;
     let d2 = (u + z1 * z1).sqrt();
-    let n = alpha * d2 + (1.0 - alpha) * z1;
-    if !(n > Z_MIN) {
+    // The radius grows with the angle about the second sphere's centre until its cosine is -w; the
+    // bound on p.z printed in the paper lies beyond that for xi < 0 and lets points fold back.
+    let w = if alpha > 0.5 { (1.0 - alpha) / alpha } else { alpha / (1.0 - alpha) };
+    if !(z1 > -w * d2) {
         return None;
     }
+    let n = alpha * d2 + (1.0 - alpha) * z1;
     let inv = 1.0 / n;
     let m = DVec2::new(p.x * inv, p.y * inv);
     // dn/d(x,y,z)

@@ -220,8 +220,8 @@ fn checked(file: &Document, at: &str, size: [f64; 2], f: [f64; 4], lens: Lens) -
         return wrong("focal lengths fx and fy must be positive");
     }
     if let Lens::DoubleSphere { xi, alpha } = lens {
-        if !(0.0..=1.0).contains(&alpha) || xi <= -1.0 {
-            return wrong("double sphere needs alpha in 0..1 and xi above -1");
+        if !(0.0..=1.0).contains(&alpha) || xi.abs() >= 1.0 {
+            return wrong("double sphere needs alpha in 0..1 and xi between -1 and 1");
         }
     }
     let [fx, fy, cx, cy] = f;

@@ -1,0 +1,624 @@
+//! The reader of recordings: real ones, and small generated ones with every fault it must survive.
+#![allow(clippy::unwrap_used)]
+
+use proptest::prelude::*;
+use proptest::test_runner::RngSeed;
+use std::fs;
+use std::path::{Path, PathBuf};
+use stipple_drivers::replay::*;
+use stipple_drivers::types::pose_at;
+use stipple_drivers::{Exit, Fault, Frames, Lens, Nanos, Span};
+use tempfile::TempDir;
+
+/// A file or folder of the recordings, or `None` (said aloud) where they are not installed.
+fn recorded(test: &str, name: &str) -> Option<PathBuf> {
+    let beside = || Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/data");
+    let path = std::env::var_os("STIPPLE_RECORDINGS").map_or_else(beside, PathBuf::from).join(name);
+    if !path.exists() {
+        println!("ignored: {test}: no recordings");
+        return None;
+    }
+    Some(path)
+}
+
+/// Opens a recording, decodes every pair, and finds nothing wrong with it.
+fn assert_clean(path: &Path, pairs: usize) -> Recording {
+    let recording = Recording::open(path, &OpenOptions::default()).unwrap();
+    assert_eq!(recording.warnings, Vec::<String>::new());
+    assert_eq!(recording.pairs.len(), pairs);
+    assert!(recording.pairs.windows(2).all(|p| p[0].t < p[1].t));
+    let mut reader = recording.reader();
+    let mut frames = Frames::for_rig(&recording.calibration);
+    for i in 0..pairs {
+        reader.read(i, &mut frames).unwrap();
+        assert_eq!(frames.t, recording.pairs[i].t);
+        for image in &frames.images {
+            let mean = image.pixels.iter().map(|p| u64::from(*p)).sum::<u64>() / image.pixels.len() as u64;
+            assert!((10..245).contains(&mean), "pair {i} is grey on average {mean}");
+        }
+    }
+    let posed = recording.pairs.iter().filter(|p| pose_at(&recording.truth, p.t, Span(100_000_000)).is_some());
+    assert!(posed.count() * 10 >= pairs * 9, "most pairs have a true pose");
+    recording
+}
+
+#[test]
+fn euroc_png_recording_is_clean() {
+    let Some(path) = recorded("euroc_png_recording_is_clean", "euroc_MH_01_easy_11s") else { return };
+    let r = assert_clean(&path, 220);
+    assert_eq!((r.imu.len(), r.truth.len()), (3000, 3000));
+    let baseline = r.calibration.cameras[0].body_from_cam.inverse() * r.calibration.cameras[1].body_from_cam;
+    assert!((baseline.p.length() - 0.110).abs() < 1e-3, "EuRoC's cameras are 11 cm apart");
+    assert!(baseline.p.x > 0.1, "camera 1 is to the right of camera 0");
+    // the folder itself may be named
+    assert_eq!(Recording::open(&path.join("mav0"), &OpenOptions::default()).unwrap().imu, r.imu);
+}
+
+#[test]
+fn euroc_jpeg_recording_is_clean() {
+    let Some(path) = recorded("euroc_jpeg_recording_is_clean", "euroc_V1_01_easy_keyframes") else { return };
+    assert_eq!(assert_clean(&path, 100).imu.len(), 27501);
+}
+
+#[test]
+fn euroc_static_recording_is_clean() {
+    let Some(path) = recorded("euroc_static_recording_is_clean", "euroc_V1_01_easy_static_1s") else { return };
+    let r = assert_clean(&path, 20);
+    let g = r.imu.iter().map(|s| s.accel_body.length()).sum::<f64>() / r.imu.len() as f64;
+    assert!((g - 9.81).abs() < 0.15, "at rest the accelerometer measures gravity, not {g}");
+}
+
+#[test]
+fn tumvi_16_bit_recording_is_clean() {
+    let Some(path) = recorded("tumvi_16_bit_recording_is_clean", "tumvi_room1_fisheye_16") else { return };
+    let r = assert_clean(&path, 16);
+    assert_eq!((r.imu.len(), r.truth.len()), (607, 332));
+    assert!(matches!(r.calibration.cameras[0].camera.lens, Lens::KannalaBrandt { .. }));
+    let baseline = r.calibration.cameras[0].body_from_cam.inverse() * r.calibration.cameras[1].body_from_cam;
+    assert!((baseline.p.length() - 0.101).abs() < 1e-3 && baseline.p.x > 0.1, "{baseline:?}");
+    assert_eq!(r.calibration.imu.gyro_noise, 0.00016);
+}
+
+#[test]
+fn trajectories_of_whole_flights_are_clean() {
+    for flight in ["MH_04_difficult", "V1_02_medium", "V2_02_medium"] {
+        let name = format!("euroc_text/{flight}/state_groundtruth_estimate0.csv");
+        let Some(path) = recorded("trajectories_of_whole_flights_are_clean", &name) else { return };
+        let poses = read_trajectory(&path).unwrap();
+        assert_eq!(poses.len(), fs::read_to_string(&path).unwrap().lines().count() - 1);
+    }
+}
+
+#[test]
+fn basalt_calibrations_are_read_and_unknown_lenses_refused() {
+    let name = "basalt_calibrations_are_read_and_unknown_lenses_refused";
+    let Some(dir) = recorded(name, "calibration") else { return };
+    let ds = read_calibration(&dir.join("euroc_double_sphere_basalt.json")).unwrap();
+    assert!(matches!(ds.cameras[1].camera.lens, Lens::DoubleSphere { xi, .. } if (xi + 0.213).abs() < 1e-3));
+    assert_eq!(ds.imu.rate_hz, 200.0);
+    for kb4 in ["msdmi_calib.json", "odysseyplus_kb4_calib.json"] {
+        let c = read_calibration(&dir.join(kb4)).unwrap();
+        assert!(matches!(c.cameras[0].camera.lens, Lens::KannalaBrandt { .. }));
+    }
+    let fault = read_calibration(&dir.join("reverbg2v2_calib.json")).unwrap_err();
+    assert_eq!(fault.exit, Exit::Config);
+    assert!(fault.what.contains("pinhole-radtan8"), "{fault}");
+    let (_, line) = fault.place.rsplit_once(':').unwrap();
+    let text = fs::read_to_string(dir.join("reverbg2v2_calib.json")).unwrap();
+    assert!(text.lines().nth(line.parse::<usize>().unwrap() - 1).unwrap().contains("camera_type"), "{fault}");
+}
+
+// ---- generated folders ----
+
+const W: usize = 32;
+const H: usize = 24;
+const PAIRS: usize = 6;
+const T0: i64 = 1_000_000_000;
+const FRAME: i64 = 50_000_000;
+
+const CAMERA: &str = "%YAML:1.0
+sensor_type: camera
+T_BS:
+  cols: 4
+  rows: 4
+  data: [1.0, 0.0, 0.0, BASELINE,
+         0.0, 1.0, 0.0, 0.0,
+         0.0, 0.0, 1.0, 0.0,
+         0.0, 0.0, 0.0, 1.0]
+rate_hz: 20
+resolution: [32, 24]
+camera_model: pinhole
+intrinsics: [20.0, 20.0, 15.5, 11.5] #fu, fv, cu, cv
+distortion_model: radial-tangential
+distortion_coefficients: [-0.1, 0.01, 0.0, 0.0]
+";
+const IMU: &str = "rate_hz: 200
+gyroscope_noise_density: 1.6968e-04     # [ rad / s / sqrt(Hz) ]
+gyroscope_random_walk: 1.9393e-05
+accelerometer_noise_density: 2.0000e-3
+accelerometer_random_walk: 3.0000e-3
+";
+
+fn grey() -> Vec<u8> {
+    (0..W * H).map(|i| (i * 7 % 251) as u8).collect()
+}
+
+fn png(colour: png::ColorType, depth: png::BitDepth, w: usize, h: usize, bytes: &[u8]) -> Vec<u8> {
+    let mut out = Vec::new();
+    let mut e = png::Encoder::new(&mut out, w as u32, h as u32);
+    e.set_color(colour);
+    e.set_depth(depth);
+    e.write_header().unwrap().write_image_data(bytes).unwrap();
+    out
+}
+
+/// A dataset of six pairs at 20 Hz with 200 Hz inertial samples around them and two true poses.
+struct Folder(TempDir);
+
+impl Folder {
+    fn new() -> Folder {
+        let f = Folder(tempfile::tempdir().unwrap());
+        let image = png(png::ColorType::Grayscale, png::BitDepth::Eight, W, H, &grey());
+        for k in 0..2 {
+            f.write(&format!("cam{k}/sensor.yaml"), CAMERA.replace("BASELINE", &format!("{}", 0.1 * f64::from(k))));
+            let rows: Vec<String> = (0..PAIRS as i64).map(|i| format!("{0},{0}.png", T0 + i * FRAME)).collect();
+            f.write(&format!("cam{k}/data.csv"), format!("#timestamp [ns],filename\n{}\n", rows.join("\n")));
+            for i in 0..PAIRS as i64 {
+                f.write(&format!("cam{k}/data/{}.png", T0 + i * FRAME), &image);
+            }
+        }
+        f.write("imu0/sensor.yaml", IMU);
+        let row = |i: i64| format!("{},0.0,0.1,0.2,0.0,0.0,9.81", T0 - FRAME + i * 5_000_000);
+        let rows: Vec<String> = (0..80).map(row).collect();
+        f.write("imu0/data.csv", format!("#timestamp [ns],w_x,w_y,w_z,a_x,a_y,a_z\n{}\n", rows.join("\n")));
+        let truth = format!("#timestamp,p,p,p,q,q,q,q,v\n{},1,2,3,1,0,0,0,9\n{},2,2,3,0,1,0,0,9\n", T0, T0 + FRAME);
+        f.write("state_groundtruth_estimate0/data.csv", truth);
+        f
+    }
+
+    fn path(&self, name: &str) -> PathBuf {
+        self.0.path().join("mav0").join(name)
+    }
+
+    fn write(&self, name: &str, content: impl AsRef<[u8]>) {
+        fs::create_dir_all(self.path(name).parent().unwrap()).unwrap();
+        fs::write(self.path(name), content).unwrap();
+    }
+
+    /// Replaces the text of line `line` (1 is the first).
+    fn edit(&self, name: &str, line: usize, f: impl Fn(&str) -> String) {
+        let text = fs::read_to_string(self.path(name)).unwrap();
+        let lines = text.lines().enumerate().map(|(i, l)| if i + 1 == line { f(l) } else { l.to_string() });
+        self.write(name, lines.collect::<Vec<_>>().join("\n") + "\n");
+    }
+
+    fn replace(&self, name: &str, from: &str, to: &str) {
+        let text = fs::read_to_string(self.path(name)).unwrap();
+        assert!(text.contains(from));
+        self.write(name, text.replace(from, to));
+    }
+
+    fn open(&self) -> Result<Recording, Fault> {
+        Recording::open(self.0.path(), &OpenOptions::default())
+    }
+
+    /// The one counter that is not zero, as (name, count), and the warnings.
+    fn one_fault(&self) -> (Recording, (&'static str, u64)) {
+        let r = self.open().unwrap();
+        let counted: Vec<_> = r.counters.list().into_iter().filter(|(_, n)| *n > 0).collect();
+        assert_eq!(counted.len(), 1, "{counted:?} {:?}", r.warnings);
+        (r, counted[0])
+    }
+
+    /// Opening fails with this code, naming this place (a file, or file:line) and this word.
+    fn refused(&self, exit: Exit, place: &str, word: &str) {
+        let fault = self.open().unwrap_err();
+        assert_eq!(fault.exit, exit, "{fault}");
+        assert!(fault.place.contains(place), "{fault}");
+        assert!(fault.what.contains(word), "{fault}");
+        assert!(!fault.fix.is_empty() && !fault.to_string().contains('\n'), "{fault}");
+    }
+}
+
+#[test]
+fn generated_folder_is_clean() {
+    let f = Folder::new();
+    let r = f.open().unwrap();
+    assert_eq!((r.pairs.len(), r.imu.len(), r.truth.len(), r.warnings.len()), (PAIRS, 80, 2, 0));
+    assert_eq!((r.imu[1].gyro_body.z, r.imu[1].accel_body.z), (0.2, 9.81));
+    assert_eq!((r.truth[1].pose.q.x, r.truth[1].pose.p.x), (1.0, 2.0));
+    let mut frames = Frames::for_rig(&r.calibration);
+    r.reader().read(5, &mut frames).unwrap();
+    assert_eq!((frames.t, &frames.images[1].pixels), (Nanos(T0 + 5 * FRAME), &grey()));
+}
+
+#[test]
+fn carriage_returns_spaces_and_plain_headlines_are_read() {
+    let f = Folder::new();
+    for name in ["cam0/data.csv", "cam1/data.csv", "imu0/data.csv", "state_groundtruth_estimate0/data.csv"] {
+        let text = fs::read_to_string(f.path(name)).unwrap();
+        f.write(name, text.trim_start_matches('#').replace(',', " , ").replace('\n', "\r\n\r\n"));
+    }
+    let r = f.open().unwrap();
+    assert_eq!((r.pairs.len(), r.imu.len(), r.truth.len(), r.warnings.len()), (PAIRS, 80, 2, 0));
+    r.reader().read(0, &mut Frames::for_rig(&r.calibration)).unwrap();
+}
+
+#[test]
+fn image_without_partner_is_dropped_and_counted() {
+    let f = Folder::new();
+    f.edit("cam1/data.csv", 4, |_| String::new());
+    let (r, counted) = f.one_fault();
+    assert_eq!((r.pairs.len(), counted), (PAIRS - 1, ("images_unpaired", 1)));
+    assert!(r.warnings[0].contains("cam0/data.csv:4: "), "{:?}", r.warnings);
+}
+
+#[test]
+fn pair_tolerance_is_kept() {
+    for (shift, pairs, unpaired) in [(2_000_000, PAIRS, 0), (-2_000_000, PAIRS, 0), (2_000_001, PAIRS - 1, 2)] {
+        let f = Folder::new();
+        f.edit("cam1/data.csv", 3, |_| format!("{},{}.png", T0 + FRAME + shift, T0 + FRAME));
+        let r = f.open().unwrap();
+        assert_eq!((r.pairs.len(), r.counters.images_unpaired), (pairs, unpaired), "{shift}");
+        assert!(r.pairs.iter().all(|p| (p.t.0 - T0) % FRAME == 0), "the stamp is camera 0's");
+    }
+}
+
+#[test]
+fn closest_of_two_candidates_is_paired() {
+    let f = Folder::new();
+    f.edit("cam1/data.csv", 3, |l| format!("{},early.png\n{l}", T0 + FRAME - 1_500_000));
+    let (r, counted) = f.one_fault();
+    assert_eq!((r.pairs.len(), counted), (PAIRS, ("images_unpaired", 1)));
+    assert!(r.warnings[0].contains("cam1/data.csv:3: "), "{:?}", r.warnings);
+}
+
+#[test]
+fn cameras_that_never_meet_are_refused() {
+    let f = Folder::new();
+    f.write("cam1/data.csv", "1,a.png\n2,b.png\n");
+    f.refused(Exit::Data, "mav0", "no image has a partner");
+}
+
+#[test]
+fn duplicated_stamp_is_dropped_and_counted() {
+    let f = Folder::new();
+    f.edit("imu0/data.csv", 10, |l| format!("{l}\n{l}"));
+    let (r, counted) = f.one_fault();
+    assert_eq!((r.imu.len(), counted), (80, ("stamps_duplicated", 1)));
+    assert!(r.warnings[0].contains("imu0/data.csv:11: "), "{:?}", r.warnings);
+}
+
+#[test]
+fn corrupt_stamp_costs_its_row_only() {
+    for stamp in ["9000000000000", "17"] {
+        let f = Folder::new();
+        f.edit("imu0/data.csv", 10, |l| format!("{stamp},{}", l.split_once(',').unwrap().1));
+        let (r, counted) = f.one_fault();
+        assert_eq!((r.imu.len(), counted), (79, ("stamps_out_of_order", 1)));
+        assert!(r.warnings[0].contains("imu0/data.csv:10: "), "{:?}", r.warnings);
+    }
+}
+
+#[test]
+fn malformed_row_is_dropped_and_counted() {
+    for row in
+        ["1000000,x,0,0,0,0,0", "1000000,0,0", "1000000,0,0,0,0,0,0,0", "abc", "1.5,0,0,0,0,0,0", "\u{0}\u{fffd}"]
+    {
+        let f = Folder::new();
+        f.edit("imu0/data.csv", 20, |_| row.to_string());
+        let (r, counted) = f.one_fault();
+        assert_eq!((r.imu.len(), counted), (79, ("rows_malformed", 1)), "{row}");
+        assert!(r.warnings[0].contains("imu0/data.csv:20: "), "{:?}", r.warnings);
+    }
+}
+
+#[test]
+fn sample_that_is_not_finite_is_dropped_and_counted() {
+    let f = Folder::new();
+    f.edit("imu0/data.csv", 20, |l| l.replace("9.81", "NaN"));
+    f.edit("imu0/data.csv", 30, |l| l.replace("0.1", "inf"));
+    let (r, counted) = f.one_fault();
+    assert_eq!((r.imu.len(), counted), (78, ("imu_not_finite", 2)));
+    assert!(r.warnings[0].contains("imu0/data.csv:20: "), "{:?}", r.warnings);
+}
+
+#[test]
+fn hole_in_the_inertial_stream_is_counted() {
+    let f = Folder::new();
+    (20..24).for_each(|i| f.edit("imu0/data.csv", i, |_| String::new()));
+    let (r, counted) = f.one_fault();
+    assert_eq!(counted, ("imu_holes", 1));
+    assert!(r.warnings[0].contains("imu0/data.csv:24: hole of 0.0250 s"), "{:?}", r.warnings);
+}
+
+#[test]
+fn images_outside_the_inertial_stream_are_counted_and_kept() {
+    let f = Folder::new();
+    let text = fs::read_to_string(f.path("imu0/data.csv")).unwrap();
+    f.write("imu0/data.csv", text.lines().take(40).collect::<Vec<_>>().join("\n"));
+    let (r, counted) = f.one_fault();
+    assert_eq!((r.pairs.len(), counted), (PAIRS, ("images_outside_imu", 3)));
+    assert!(r.warnings[0].contains("cam0/data.csv:5: "), "{:?}", r.warnings);
+}
+
+#[test]
+fn warnings_of_one_kind_are_capped_and_counting_goes_on() {
+    let f = Folder::new();
+    (10..60).for_each(|i| f.edit("imu0/data.csv", i, |_| "letters".to_string()));
+    let r = f.open().unwrap();
+    assert_eq!(r.counters.rows_malformed, 50);
+    let malformed: Vec<_> = r.warnings.iter().filter(|w| w.contains("letters")).collect();
+    assert_eq!(malformed.len(), 20);
+    assert!(malformed[19].ends_with("(more of this kind are only counted)"));
+}
+
+#[test]
+fn useless_folders_are_refused() {
+    let o = OpenOptions::default();
+    assert_eq!(Recording::open(Path::new("/no/such/folder"), &o).unwrap_err().exit, Exit::NoInput);
+    let empty = tempfile::tempdir().unwrap();
+    assert_eq!(Recording::open(empty.path(), &o).unwrap_err().exit, Exit::NoInput);
+    for name in ["cam0/data.csv", "cam1/data.csv", "imu0/data.csv", "cam1/sensor.yaml"] {
+        let f = Folder::new();
+        fs::remove_file(f.path(name)).unwrap();
+        f.refused(Exit::NoInput, name, "cannot read");
+    }
+    let f = Folder::new();
+    fs::remove_file(f.path("cam0/sensor.yaml")).unwrap();
+    f.refused(Exit::NoInput, "mav0", "no calibration");
+}
+
+#[test]
+fn tables_of_another_kind_are_refused() {
+    for name in ["cam0/data.csv", "imu0/data.csv", "state_groundtruth_estimate0/data.csv"] {
+        for content in ["", "#timestamp\n", "\n\n", "letters,and,more\nletters,and,more\n"] {
+            let f = Folder::new();
+            f.write(name, content);
+            f.refused(Exit::Data, name, if content.contains("letters") { "letters" } else { "holds no rows" });
+        }
+    }
+    let f = Folder::new();
+    fs::copy(f.path("state_groundtruth_estimate0/data.csv"), f.path("imu0/data.csv")).unwrap();
+    f.refused(Exit::Data, "imu0/data.csv:2", "gyro x y z");
+    let f = Folder::new();
+    fs::copy(f.path("imu0/data.csv"), f.path("cam1/data.csv")).unwrap();
+    f.refused(Exit::Data, "cam1/data.csv:2", "file name");
+}
+
+#[test]
+fn wrong_calibrations_are_refused_by_key_and_line() {
+    let keys = ["T_BS", "resolution", "camera_model", "intrinsics", "distortion_model", "distortion_coefficients"];
+    for key in keys {
+        let f = Folder::new();
+        f.replace("cam1/sensor.yaml", &format!("{key}:"), "other:");
+        f.refused(Exit::Config, "cam1/sensor.yaml", key);
+    }
+    for key in IMU.lines().filter_map(|l| l.split_once(':')).map(|(k, _)| k) {
+        let f = Folder::new();
+        f.replace("imu0/sensor.yaml", key, "other");
+        f.refused(Exit::Config, "imu0/sensor.yaml", key);
+    }
+    let cases = [
+        ("data: [1.0,", "data: [1.002,", ":6", "orthonormal"),
+        ("data: [1.0,", "data: [-1.0,", ":6", "right-handed"),
+        ("0.0, 0.0, 0.0, 1.0]", "0.0, 0.0, 0.0]", ":6", "16 numbers, found 15"),
+        ("0.0, 0.0, 0.0, 1.0]", "0.0, 0.0, 0.5, 1.0]", ":6", "last row"),
+        ("[20.0,", "[-20.0,", "sensor.yaml", "must be positive"),
+        ("[20.0,", "[.nan,", ":13", "numbers"),
+        ("[20.0,", "[twenty,", ":13", "numbers"),
+        ("[32, 24]", "[32, 0]", "sensor.yaml", "resolution"),
+        ("[32, 24]", "[32, 999999999]", "sensor.yaml", "resolution"),
+        ("radial-tangential", "fov", ":14", "fov"),
+        ("camera_model: pinhole", "camera_model: [", "sensor.yaml:", "not YAML"),
+        ("0.1,", "0.0,", "mav0", "zero baseline"),
+    ];
+    for (from, to, place, word) in cases {
+        let f = Folder::new();
+        f.replace("cam1/sensor.yaml", from, to);
+        f.refused(Exit::Config, place, word);
+    }
+}
+
+#[test]
+fn missing_noise_falls_back_to_defaults_with_a_warning() {
+    let f = Folder::new();
+    fs::remove_file(f.path("imu0/sensor.yaml")).unwrap();
+    let (r, counted) = f.one_fault();
+    assert_eq!(counted, ("calibration_notes", 1));
+    assert_eq!(r.calibration.imu.rate_hz, 200.0);
+    assert!(r.warnings[0].contains("imu0/sensor.yaml: "), "{:?}", r.warnings);
+}
+
+#[test]
+fn rounded_rotations_are_made_orthonormal() {
+    let f = Folder::new();
+    f.replace("cam1/sensor.yaml", "data: [1.0,", "data: [1.0003,");
+    let q = f.open().unwrap().calibration.cameras[1].body_from_cam.q;
+    assert!(q.is_normalized() && q.w > 1.0 - 1e-9);
+}
+
+#[test]
+fn third_camera_joins_the_rig_and_needs_images() {
+    let f = Folder::new();
+    let copy = |name: &str, to: &str| f.write(to, fs::read(f.path(name)).unwrap());
+    f.write("cam2/sensor.yaml", CAMERA.replace("BASELINE", "0.3"));
+    let (r, counted) = f.one_fault();
+    assert_eq!((r.calibration.cameras.len(), counted), (2, ("calibration_notes", 1)));
+    copy("cam1/data.csv", "cam2/data.csv");
+    for i in 0..PAIRS as i64 {
+        let name = format!("data/{}.png", T0 + i * FRAME);
+        copy(&format!("cam1/{name}"), &format!("cam2/{name}"));
+    }
+    let r = f.open().unwrap();
+    let mut frames = Frames::for_rig(&r.calibration);
+    r.reader().read(0, &mut frames).unwrap();
+    assert_eq!((frames.images.len(), r.pairs.len(), r.warnings.len()), (3, PAIRS, 0));
+    f.edit("cam2/data.csv", 2, |_| String::new());
+    let r = f.open().unwrap();
+    assert_eq!((r.pairs.len(), r.counters.images_unpaired), (PAIRS - 1, 2));
+}
+
+#[test]
+fn kalibr_chain_is_read_and_may_give_steps_between_cameras() {
+    let camera = |pose: &str| {
+        format!(
+            "  {pose}:\n  - [1.0, 0.0, 0.0, -0.1]\n  - [0.0, 1.0, 0.0, 0.0]\n  - [0.0, 0.0, 1.0, 0.0]\n  \
+             - [0.0, 0.0, 0.0, 1.0]\n  camera_model: ds\n  distortion_model: none\n  distortion_coeffs: []\n  \
+             intrinsics: [-0.2, 0.57, 20, 20, 15.5, 11.5]\n  resolution: [32, 24]\n  timeshift_cam_imu: 0.001\n"
+        )
+    };
+    let f = Folder::new();
+    fs::remove_file(f.path("cam0/sensor.yaml")).unwrap();
+    let chain = format!("cam0:\n{}cam1:\n{}", camera("T_cam_imu"), camera("T_cn_cnm1"));
+    f.write("../camchain.yaml", &chain);
+    let r = f.open().unwrap();
+    assert_eq!(r.counters.calibration_notes, 3, "two time shifts and the missing imu_config.yaml");
+    let c = &r.calibration.cameras;
+    assert!((c[0].body_from_cam.p.x - 0.1).abs() < 1e-12 && (c[1].body_from_cam.p.x - 0.2).abs() < 1e-12);
+    assert_eq!(c[1].camera.lens, Lens::DoubleSphere { xi: -0.2, alpha: 0.57 });
+    f.write("../camchain.yaml", chain.replace("cam1:", "cam2:"));
+    f.refused(Exit::Config, "camchain.yaml", "cam1");
+    // named from outside, as with replay.calibration
+    let o = OpenOptions { calibration: Some(f.path("../camchain.yaml")), ..OpenOptions::default() };
+    assert_eq!(Recording::open(f.0.path(), &o).unwrap_err().exit, Exit::Config);
+}
+
+#[test]
+fn trajectory_formats_agree() {
+    let f = Folder::new();
+    f.write("a.csv", "#t,x,y,z,w,x,y,z,v\r\n1403636584763555584,1,2,3,0.5,-0.5,0.5,0.5,7\r\n");
+    f.write("a.txt", "# t x y z qx qy qz qw\n1403636584.763555584  1 2 3 -0.5 0.5 0.5 0.5\n");
+    let euroc = read_trajectory(&f.path("a.csv")).unwrap();
+    assert_eq!(euroc, read_trajectory(&f.path("a.txt")).unwrap());
+    assert_eq!((euroc[0].t.0, euroc[0].pose.q.w), (1403636584763555584, 0.5));
+    for (bad, exit, place) in [
+        ("1,0,0,0,1,0,0,0\n2,0,0,0,9,0,0,0\n", Exit::Data, "a.csv:2"),
+        ("1,0,0,0,1,0,0,0\n1,0,0,0,1,0,0,0\n", Exit::Data, "a.csv:2"),
+        ("1,0,0,0,1,0,0\n", Exit::Data, "a.csv:1"),
+        ("", Exit::Data, "a.csv"),
+    ] {
+        f.write("a.csv", bad);
+        let fault = read_trajectory(&f.path("a.csv")).unwrap_err();
+        assert!(fault.exit == exit && fault.place.ends_with(place), "{fault}");
+    }
+    assert_eq!(read_trajectory(&f.path("none.csv")).unwrap_err().exit, Exit::NoInput);
+}
+
+/// Replaces the first image of camera 1 and reads the first pair.
+fn read_with(image: &[u8]) -> (Result<(), FrameFault>, Vec<u8>, ReplayCounters) {
+    let f = Folder::new();
+    f.write(&format!("cam1/data/{T0}.png"), image);
+    let r = f.open().unwrap();
+    let (mut reader, mut frames) = (r.reader(), Frames::for_rig(&r.calibration));
+    let result = reader.read(0, &mut frames);
+    assert_eq!(reader.read(1, &mut frames), Ok(()), "a bad image does not spoil the next pair");
+    assert_eq!(reader.warnings().len(), usize::from(result.is_err()));
+    r.reader().read(1, &mut frames).unwrap();
+    let _ = reader.read(0, &mut frames);
+    (result, frames.images.swap_remove(1).pixels, reader.counters().clone())
+}
+
+#[test]
+fn every_png_format_becomes_grey() {
+    use png::{BitDepth::*, ColorType::*};
+    let grey = grey();
+    let wide: Vec<u8> = grey.iter().flat_map(|g| [*g, 0xff - *g]).collect();
+    assert_eq!(read_with(&png(Grayscale, Sixteen, W, H, &wide)).1, grey, "the high byte");
+    let alpha: Vec<u8> = grey.iter().flat_map(|g| [*g, 9]).collect();
+    assert_eq!(read_with(&png(GrayscaleAlpha, Eight, W, H, &alpha)).1, grey);
+    let rgb: Vec<u8> = grey.iter().flat_map(|g| [*g, *g, *g]).collect();
+    assert_eq!(read_with(&png(Rgb, Eight, W, H, &rgb)).1, grey);
+    let rgba: Vec<u8> = grey.iter().flat_map(|g| [0, *g, 0, 255]).collect();
+    let green = read_with(&png(Rgba, Eight, W, H, &rgba)).1;
+    assert!(green.iter().zip(&grey).all(|(a, g)| (f64::from(*a) - 0.587 * f64::from(*g)).abs() < 1.0));
+    let bits = vec![0b1010_1010u8; W * H / 8];
+    assert_eq!(read_with(&png(Grayscale, One, W, H, &bits)).1[..2], [255, 0]);
+}
+
+#[test]
+fn spoilt_images_are_counted_and_name_their_row() {
+    let good = png(png::ColorType::Grayscale, png::BitDepth::Eight, W, H, &grey());
+    let small = png(png::ColorType::Grayscale, png::BitDepth::Eight, W, H - 1, &grey()[W..]);
+    let cases: [(&[u8], FrameFaultKind); 6] = [
+        (&good[..good.len() / 2], FrameFaultKind::Undecodable),
+        (&good[..good.len() - 4], FrameFaultKind::Undecodable),
+        (&good[..4], FrameFaultKind::Undecodable),
+        (b"", FrameFaultKind::Undecodable),
+        (b"GIF89a", FrameFaultKind::Undecodable),
+        (&small, FrameFaultKind::WrongSize),
+    ];
+    for (image, kind) in cases {
+        let (result, _, counters) = read_with(image);
+        let fault = result.unwrap_err();
+        assert_eq!(fault.kind, kind, "{fault}");
+        assert!(fault.place.ends_with("cam1/data.csv:2") && fault.what.contains(&format!("{T0}.png")), "{fault}");
+        assert_eq!(counters.images_undecodable + counters.images_wrong_size, 2);
+    }
+    let f = Folder::new();
+    fs::remove_file(f.path(&format!("cam0/data/{T0}.png"))).unwrap();
+    let r = f.open().unwrap();
+    let mut reader = r.reader();
+    let fault = reader.read(0, &mut Frames::for_rig(&r.calibration)).unwrap_err();
+    assert_eq!((fault.kind, reader.counters().images_missing), (FrameFaultKind::Missing, 1));
+}
+
+#[test]
+fn truncated_jpeg_is_undecodable() {
+    let Some(path) = recorded("truncated_jpeg_is_undecodable", "euroc_V1_01_easy_keyframes") else { return };
+    let r = Recording::open(&path, &OpenOptions::default()).unwrap();
+    let bytes = fs::read(&r.pairs[0].images[0].path).unwrap();
+    let f = Folder::new();
+    (0..2).for_each(|k| f.replace(&format!("cam{k}/sensor.yaml"), "[32, 24]", "[752, 480]"));
+    for part in [2, 100, 700, bytes.len() / 2, bytes.len() * 9 / 10, bytes.len() - 20, bytes.len() - 6, bytes.len()] {
+        f.write(&format!("cam0/data/{T0}.png"), &bytes[..part]);
+        f.write(&format!("cam1/data/{T0}.png"), &bytes);
+        let r = f.open().unwrap();
+        let result = r.reader().read(0, &mut Frames::for_rig(&r.calibration));
+        let kind = result.map_err(|f| f.kind);
+        let expected = if part == bytes.len() { Ok(()) } else { Err(FrameFaultKind::Undecodable) };
+        assert_eq!(kind, expected, "{part} bytes of {}", bytes.len());
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 150, failure_persistence: None, rng_seed: RngSeed::Fixed(1), ..ProptestConfig::default() })]
+
+    /// Whatever is in one file, opening and reading answer; they never panic.
+    #[test]
+    fn garbage_in_any_file_never_panics(
+        name in prop::sample::select(vec!["cam0/data.csv", "cam1/data.csv", "imu0/data.csv", "cam0/sensor.yaml",
+            "imu0/sensor.yaml", "state_groundtruth_estimate0/data.csv", "cam0/data/1000000000.png"]),
+        at in 0.0..1.0f64,
+        length in 0usize..60,
+        garbage in prop::collection::vec(any::<u8>(), 0..60),
+        text in "[-0-9.,:# \\n\\[\\]{}a-zA-Z\"&*!]{0,40}",
+        as_text in any::<bool>(),
+    ) {
+        let f = Folder::new();
+        let mut bytes = fs::read(f.path(name)).unwrap();
+        let start = (at * bytes.len() as f64) as usize;
+        let end = (start + length).min(bytes.len());
+        bytes.splice(start..end, if as_text { text.into_bytes() } else { garbage });
+        f.write(name, &bytes);
+        if let Ok(r) = f.open() {
+            let (mut reader, mut frames) = (r.reader(), Frames::for_rig(&r.calibration));
+            for i in 0..r.pairs.len() {
+                let _ = reader.read(i, &mut frames);
+            }
+            prop_assert!(r.imu.iter().all(|s| s.is_finite()));
+            prop_assert!(r.imu.windows(2).all(|s| s[0].t < s[1].t));
+        }
+    }
+
+    #[test]
+    fn pure_garbage_never_panics(garbage in prop::collection::vec(any::<u8>(), 0..400), kind in 0usize..3) {
+        let f = Folder::new();
+        let magic: [&[u8]; 3] = [b"", b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff\xe0\x00\x10JFIF"];
+        let bytes = [magic[kind], &garbage].concat();
+        f.write("x.yaml", &bytes);
+        let _ = read_calibration(&f.path("x.yaml"));
+        let _ = read_trajectory(&f.path("x.yaml"));
+        prop_assert!(read_with(&bytes).0.is_err());
+    }
+}
