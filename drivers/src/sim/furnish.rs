@@ -141,14 +141,8 @@ fn inside(room: &mut Room, path: &[Vec3], rng: &mut ChaCha8Rng) {
 fn place(room: &mut Room, set: Set, stand: Stand, path: &[Vec3], rng: &mut ChaCha8Rng) {
     let half = set.extent() * 0.5;
     let centre = stand.at(0.0, 0.0, half.z);
-    let hull = Solid {
-        shape: Shape::Block { half },
-        centre,
-        cos: stand.cos,
-        sin: stand.sin,
-        face: 0,
-        bound: half.length(),
-    };
+    let hull =
+        Solid { shape: Shape::Block { half }, centre, cos: stand.cos, sin: stand.sin, face: 0, bound: half.length() };
     if path.iter().any(|p| hull.distance(*p) < KEEP_CLEAR) {
         return;
     }
@@ -171,7 +165,14 @@ fn place(room: &mut Room, set: Set, stand: Stand, path: &[Vec3], rng: &mut ChaCh
             room.add_drum(stand.base, 0.16, height, Material::Marble, rng.random());
         }
         Set::Column => {
-            room.add_block(stand.base, Vec3::new(0.2, 0.2, 0.45), (stand.cos, stand.sin), Material::Marble, Material::Marble, rng.random());
+            room.add_block(
+                stand.base,
+                Vec3::new(0.2, 0.2, 0.45),
+                (stand.cos, stand.sin),
+                Material::Marble,
+                Material::Marble,
+                rng.random(),
+            );
             room.add_ball(stand.at(0.0, 0.0, 1.08), 0.18, Material::Marble, rng.random());
         }
     }
@@ -182,16 +183,37 @@ fn cabinet(room: &mut Room, stand: Stand, rng: &mut ChaCha8Rng) {
     room.add_block(stand.base, Vec3::new(0.4, 0.22, 0.54), turn, Material::Drawers, Material::Crate, rng.random());
     room.add_ball(stand.at(-0.2, 0.0, 1.08 + 0.15), 0.15, Material::Marble, rng.random());
     let turn = stand.turned(rng.random_range(-0.5..0.5));
-    room.add_block(stand.at(0.18, 0.0, 1.08), Vec3::new(0.13, 0.1, 0.14), turn, Material::Print, Material::Print, rng.random());
+    room.add_block(
+        stand.at(0.18, 0.0, 1.08),
+        Vec3::new(0.13, 0.1, 0.14),
+        turn,
+        Material::Print,
+        Material::Print,
+        rng.random(),
+    );
 }
 
 fn table(room: &mut Room, stand: Stand, rng: &mut ChaCha8Rng) {
     let turn = (stand.cos, stand.sin);
     const HEIGHT: f32 = 0.72;
     for (x, y) in [(-0.66, -0.3), (0.66, -0.3), (-0.66, 0.3), (0.66, 0.3)] {
-        room.add_block(stand.at(x, y, 0.0), Vec3::new(0.03, 0.03, 0.5 * HEIGHT), turn, Material::Parquet, Material::Parquet, rng.random());
+        room.add_block(
+            stand.at(x, y, 0.0),
+            Vec3::new(0.03, 0.03, 0.5 * HEIGHT),
+            turn,
+            Material::Parquet,
+            Material::Parquet,
+            rng.random(),
+        );
     }
-    room.add_block(stand.at(0.0, 0.0, HEIGHT), Vec3::new(0.74, 0.36, 0.02), turn, Material::Parquet, Material::Parquet, rng.random());
+    room.add_block(
+        stand.at(0.0, 0.0, HEIGHT),
+        Vec3::new(0.74, 0.36, 0.02),
+        turn,
+        Material::Parquet,
+        Material::Parquet,
+        rng.random(),
+    );
     let top = HEIGHT + 0.04;
     for x in [-0.5, -0.1, 0.35] {
         let turn = stand.turned(rng.random_range(-0.6..0.6));
@@ -199,8 +221,22 @@ fn table(room: &mut Room, stand: Stand, rng: &mut ChaCha8Rng) {
         match rng.random_range(0..4) {
             0 => room.add_ball(stand.at(x, y, top + 0.12), 0.12, Material::Plaid, rng.random()),
             1 => room.add_drum(stand.at(x, y, top), 0.08, 0.24, Material::Marble, rng.random()),
-            2 => room.add_block(stand.at(x, y, top), Vec3::new(0.15, 0.11, 0.03), turn, Material::Books, Material::Print, rng.random()),
-            _ => room.add_block(stand.at(x, y, top), Vec3::new(0.13, 0.12, 0.15), turn, Material::Print, Material::Poster, rng.random()),
+            2 => room.add_block(
+                stand.at(x, y, top),
+                Vec3::new(0.15, 0.11, 0.03),
+                turn,
+                Material::Books,
+                Material::Print,
+                rng.random(),
+            ),
+            _ => room.add_block(
+                stand.at(x, y, top),
+                Vec3::new(0.13, 0.12, 0.15),
+                turn,
+                Material::Print,
+                Material::Poster,
+                rng.random(),
+            ),
         }
     }
 }
@@ -215,7 +251,14 @@ fn sofa(room: &mut Room, stand: Stand, rng: &mut ChaCha8Rng) {
     room.add_block(stand.at(0.83, 0.0, 0.0), Vec3::new(0.1, 0.41, 0.3), turn, cloth, cloth, seed);
     for x in [-0.4, 0.35] {
         let turn = stand.turned(rng.random_range(-0.7..0.7));
-        room.add_block(stand.at(x, 0.0, 0.42), Vec3::new(0.17, 0.07, 0.15), turn, Material::Rug, Material::Rug, rng.random());
+        room.add_block(
+            stand.at(x, 0.0, 0.42),
+            Vec3::new(0.17, 0.07, 0.15),
+            turn,
+            Material::Rug,
+            Material::Rug,
+            rng.random(),
+        );
     }
 }
 

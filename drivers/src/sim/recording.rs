@@ -16,7 +16,13 @@ pub fn read(truth: &Path, imu: Option<&Path>) -> Result<Recording, Fault> {
         let v = &row.values;
         let q = DQuat::from_xyzw(v[4], v[5], v[6], v[3]);
         if !(0.9..1.1).contains(&q.length()) {
-            return Err(Fault::at(Exit::Data, truth, row.line, "the quaternion is not of unit length", "columns are stamp, p xyz, q wxyz"));
+            return Err(Fault::at(
+                Exit::Data,
+                truth,
+                row.line,
+                "the quaternion is not of unit length",
+                "columns are stamp, p xyz, q wxyz",
+            ));
         }
         recording.poses.push(TimedPose { t: row.t, pose: Pose::new(q, DVec3::new(v[0], v[1], v[2])) });
         if v.len() >= 16 {
@@ -43,9 +49,16 @@ struct Row {
 
 /// Rows of a stamp and at least `columns` finite numbers, by increasing stamp; two at least.
 fn rows(path: &Path, columns: usize) -> Result<Vec<Row>, Fault> {
-    let open = |e: csv::Error| Fault::new(Exit::NoInput, path.display().to_string(), e.to_string(), "give a csv in EuRoC's format");
-    let mut reader =
-        csv::ReaderBuilder::new().has_headers(false).comment(Some(b'#')).flexible(true).trim(csv::Trim::All).from_path(path).map_err(open)?;
+    let open = |e: csv::Error| {
+        Fault::new(Exit::NoInput, path.display().to_string(), e.to_string(), "give a csv in EuRoC's format")
+    };
+    let mut reader = csv::ReaderBuilder::new()
+        .has_headers(false)
+        .comment(Some(b'#'))
+        .flexible(true)
+        .trim(csv::Trim::All)
+        .from_path(path)
+        .map_err(open)?;
     let mut rows: Vec<Row> = Vec::new();
     for record in reader.records() {
         let record = record.map_err(|e| {
@@ -56,7 +69,9 @@ fn rows(path: &Path, columns: usize) -> Result<Vec<Row>, Fault> {
         let wrong = |what: String| Fault::at(Exit::Data, path, line, what, "give a csv in EuRoC's format");
         let stamp = record.get(0).unwrap_or_default();
         let t = Nanos(stamp.parse().map_err(|_| wrong(format!("'{stamp}' is not a stamp in nanoseconds")))?);
-        let number = |s: &str| s.parse::<f64>().ok().filter(|v| v.is_finite()).ok_or_else(|| wrong(format!("'{s}' is not a number")));
+        let number = |s: &str| {
+            s.parse::<f64>().ok().filter(|v| v.is_finite()).ok_or_else(|| wrong(format!("'{s}' is not a number")))
+        };
         let values = record.iter().skip(1).map(number).collect::<Result<Vec<f64>, Fault>>()?;
         if values.len() < columns {
             return Err(wrong(format!("{} columns, {} are needed", values.len() + 1, columns + 1)));
@@ -67,7 +82,12 @@ fn rows(path: &Path, columns: usize) -> Result<Vec<Row>, Fault> {
         rows.push(Row { line, t, values });
     }
     if rows.len() < 2 {
-        return Err(Fault::new(Exit::Data, path.display().to_string(), "has fewer than two rows", "give a csv in EuRoC's format"));
+        return Err(Fault::new(
+            Exit::Data,
+            path.display().to_string(),
+            "has fewer than two rows",
+            "give a csv in EuRoC's format",
+        ));
     }
     Ok(rows)
 }

@@ -36,9 +36,19 @@ pub struct Solid {
 #[derive(Clone, Copy, Debug)]
 pub enum Chart {
     /// `origin` is the corner where u = v = 0.
-    Flat { origin: Vec3, u: Vec3, v: Vec3 },
-    Ball { centre: Vec3, radius: f32 },
-    Drum { base: Vec3, radius: f32 },
+    Flat {
+        origin: Vec3,
+        u: Vec3,
+        v: Vec3,
+    },
+    Ball {
+        centre: Vec3,
+        radius: f32,
+    },
+    Drum {
+        base: Vec3,
+        radius: f32,
+    },
 }
 
 #[derive(Clone, Copy, Debug)]
@@ -82,14 +92,23 @@ impl Room {
         let e = high - low;
         let (x, y, z) = (Vec3::X, Vec3::Y, Vec3::Z);
         let corner = |x: f32, y: f32| Vec3::new(x, y, low.z);
-        let wall = |origin, u, width: f32, k: usize| face(origin, u, z, Vec2::new(width, e.z), walls[k], seed.wrapping_add(k as u32));
+        let wall = |origin, u, width: f32, k: usize| {
+            face(origin, u, z, Vec2::new(width, e.z), walls[k], seed.wrapping_add(k as u32))
+        };
         let faces = vec![
             wall(corner(low.x, low.y), y, e.y, 0),
             wall(corner(high.x, high.y), -y, e.y, 1),
             wall(corner(high.x, low.y), -x, e.x, 2),
             wall(corner(low.x, high.y), x, e.x, 3),
             face(corner(low.x, low.y), x, y, Vec2::new(e.x, e.y), Material::Parquet, seed.wrapping_add(4)),
-            face(Vec3::new(low.x, high.y, high.z), x, -y, Vec2::new(e.x, e.y), Material::CeilingTile, seed.wrapping_add(5)),
+            face(
+                Vec3::new(low.x, high.y, high.z),
+                x,
+                -y,
+                Vec2::new(e.x, e.y),
+                Material::CeilingTile,
+                seed.wrapping_add(5),
+            ),
         ];
         Room { low, high, solids: Vec::new(), faces, lights: Vec::new(), light_map: LightMap::default() }
     }

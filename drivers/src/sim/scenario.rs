@@ -141,9 +141,8 @@ pub fn euroc_rig() -> Calibration {
         cy: f[3],
         lens: Lens::Radtan { k1, k2, p1, p2 },
     };
-    let rows = |x: [f64; 3], y: [f64; 3], z: [f64; 3]| {
-        DQuat::from_mat3(&DMat3::from_cols_array_2d(&[x, y, z]).transpose())
-    };
+    let rows =
+        |x: [f64; 3], y: [f64; 3], z: [f64; 3]| DQuat::from_mat3(&DMat3::from_cols_array_2d(&[x, y, z]).transpose());
     let q0 = rows(
         [0.0148655429818, -0.999880929698, 0.00414029679422],
         [0.999557249008, 0.0149672133247, 0.025715529948],
@@ -183,7 +182,8 @@ impl Flight {
             Flight::Static => look(DVec3::new(0.3, -0.4, 1.4), 0.9, -0.1, 0.0),
             Flight::Hover => {
                 let wobble = |f: f64| (TAU * f * s).sin();
-                let p = DVec3::new(0.3, -0.4, 1.4) + DVec3::new(0.2 * wobble(0.21), 0.15 * wobble(0.33), 0.12 * wobble(0.27));
+                let p = DVec3::new(0.3, -0.4, 1.4)
+                    + DVec3::new(0.2 * wobble(0.21), 0.15 * wobble(0.33), 0.12 * wobble(0.27));
                 look(p, 0.9 + 0.09 * wobble(0.37), -0.1 + 0.07 * wobble(0.43), 0.06 * wobble(0.51))
             }
             Flight::Circle => {

@@ -192,7 +192,8 @@ mod tests {
     #[test]
     fn fit_follows_samples_of_a_resolved_motion() {
         let truth = wild();
-        let samples: Vec<(f64, Pose)> = (0..=800).map(|k| (k as f64 * 0.005, truth.at(k as f64 * 0.005).pose)).collect();
+        let samples: Vec<(f64, Pose)> =
+            (0..=800).map(|k| (k as f64 * 0.005, truth.at(k as f64 * 0.005).pose)).collect();
         let fitted = Spline::fit(&samples, 0.05, 8);
         for k in 20..380 {
             let (a, b) = (truth.at(k as f64 * 0.01), fitted.at(k as f64 * 0.01));

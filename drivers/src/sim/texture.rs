@@ -60,7 +60,8 @@ pub fn albedo(material: Material, seed: u32, s: Spot) -> f32 {
 /// Counter-based hash of a lattice point (xxHash-like avalanche).
 #[inline]
 pub fn hash(x: i32, y: i32, seed: u32) -> u32 {
-    let mut h = (x as u32).wrapping_mul(0x9E37_79B1) ^ (y as u32).wrapping_mul(0x85EB_CA77) ^ seed.wrapping_mul(0xC2B2_AE3D);
+    let mut h =
+        (x as u32).wrapping_mul(0x9E37_79B1) ^ (y as u32).wrapping_mul(0x85EB_CA77) ^ seed.wrapping_mul(0xC2B2_AE3D);
     h = (h ^ (h >> 15)).wrapping_mul(0x2C1B_3C6D);
     h = (h ^ (h >> 12)).wrapping_mul(0x297A_2D39);
     h ^ (h >> 15)
@@ -203,7 +204,8 @@ fn parquet(s: Spot, seed: u32) -> f32 {
     let shifted = Spot { at: Vec2::new(s.at.x + cell(row, 7, seed) * plank.x, s.at.y), ..s };
     let tone = blocks(shifted, plank, seed);
     let stretch = Vec2::new(0.12, 1.0);
-    let grain = fbm(Spot { at: shifted.at * stretch, footprint: s.footprint * stretch, ..s }, 0.03, 0.001, 0.75, seed ^ 1);
+    let grain =
+        fbm(Spot { at: shifted.at * stretch, footprint: s.footprint * stretch, ..s }, 0.03, 0.001, 0.75, seed ^ 1);
     let knots = blotches(s, 0.11, 0.4, seed ^ 2);
     let seam = lines(shifted.at.x, plank.x, 0.006, s.footprint.x).max(lines(s.at.y, plank.y, 0.005, s.footprint.y));
     mix(mix(0.24 + 0.3 * tone + 0.22 * grain, 0.12, 0.7 * knots), 0.05, seam)
@@ -270,8 +272,16 @@ fn poster(s: Spot, seed: u32) -> f32 {
 }
 
 fn plaid(s: Spot, seed: u32) -> f32 {
-    let warp = blocks(Spot { at: Vec2::new(s.at.x, 0.5), footprint: Vec2::new(s.footprint.x, 1e-3), ..s }, Vec2::new(0.07, 1.0), seed);
-    let weft = blocks(Spot { at: Vec2::new(0.5, s.at.y), footprint: Vec2::new(1e-3, s.footprint.y), ..s }, Vec2::new(1.0, 0.07), seed ^ 1);
+    let warp = blocks(
+        Spot { at: Vec2::new(s.at.x, 0.5), footprint: Vec2::new(s.footprint.x, 1e-3), ..s },
+        Vec2::new(0.07, 1.0),
+        seed,
+    );
+    let weft = blocks(
+        Spot { at: Vec2::new(0.5, s.at.y), footprint: Vec2::new(1e-3, s.footprint.y), ..s },
+        Vec2::new(1.0, 0.07),
+        seed ^ 1,
+    );
     let threads = blocks(s, Vec2::new(0.006, 0.004), seed ^ 2);
     0.06 + 0.32 * warp + 0.32 * weft + 0.14 * (threads - 0.5) + 0.14 * fbm(s, 0.3, 0.001, 0.65, seed ^ 3)
 }
@@ -280,7 +290,8 @@ fn crate_boards(s: Spot, seed: u32) -> f32 {
     let f = s.footprint;
     let frame = 0.07;
     let inner = band(s.at.x, frame, s.size.x - frame, f.x) * band(s.at.y, frame, s.size.y - frame, f.y);
-    let rim = band(s.at.x, frame - 0.006, s.size.x - frame + 0.006, f.x) * band(s.at.y, frame - 0.006, s.size.y - frame + 0.006, f.y);
+    let rim = band(s.at.x, frame - 0.006, s.size.x - frame + 0.006, f.x)
+        * band(s.at.y, frame - 0.006, s.size.y - frame + 0.006, f.y);
     let tone = blocks(s, Vec2::new(9.0, 0.11), seed);
     let stretch = Vec2::new(0.15, 1.0);
     let grain = fbm(Spot { at: s.at * stretch, footprint: f * stretch, ..s }, 0.03, 0.001, 0.75, seed ^ 1);

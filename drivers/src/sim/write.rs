@@ -139,7 +139,9 @@ fn camera_yaml(c: &RigCamera, k: usize, rate_hz: f64) -> String {
     let m = &c.camera;
     let pinhole = format!("[{}, {}, {}, {}]", m.fx, m.fy, m.cx, m.cy);
     let (model, intrinsics, distortion, coefficients) = match m.lens {
-        Lens::Radtan { k1, k2, p1, p2 } => ("pinhole", pinhole, "radial-tangential", format!("[{k1}, {k2}, {p1}, {p2}]")),
+        Lens::Radtan { k1, k2, p1, p2 } => {
+            ("pinhole", pinhole, "radial-tangential", format!("[{k1}, {k2}, {p1}, {p2}]"))
+        }
         Lens::KannalaBrandt { k: [a, b, c, d] } => ("pinhole", pinhole, "equidistant", format!("[{a}, {b}, {c}, {d}]")),
         Lens::DoubleSphere { xi, alpha } => {
             let intrinsics = format!("[{xi}, {alpha}, {}, {}, {}, {}]", m.fx, m.fy, m.cx, m.cy);
