@@ -257,112 +257,259 @@ impl Board {
     }
 
     pub fn parse(place: &str, text: &str, overrides: &[String]) -> Result<Board, Fault> {
-        let bad = |e: toml::de::Error| {
-            let line = e.span().map(|s| 1 + text[..s.start.min(text.len())].matches('\n').count());
-            let at = line.map_or(place.to_string(), |l| format!("{place}:{l}"));
-            Fault::new(Exit::Config, at, e.message().replace('\n', " "), "see board-configs/ for every key")
-        };
         // Checked as written first, so that an error names the line of the file.
-        let board: Board = toml::from_str(text).map_err(bad)?;
-        let board = if overrides.is_empty() {
-            board
-        } else {
-            let mut table: toml::Table = toml::from_str(text).map_err(bad)?;
-            for o in overrides {
-                set(&mut table, o)?;
+        let mut board: Board = toml::from_str(text).map_err(|e| in_file(place, text, &e))?;
+        if !overrides.is_empty() {
+            let mut table: toml::Table = toml::from_str(text).map_err(|e| in_file(place, text, &e))?;
+            for assignment in overrides {
+                set(&mut table, assignment)?;
+                // After each, so that the one that is wrong is the one that is named.
+                board = Board::deserialize(table.clone()).map_err(|e| in_override(assignment, e.message()))?;
             }
-            Board::deserialize(table).map_err(|e| {
-                Fault::new(
-                    Exit::Config,
-                    format!("--set {}", overrides.join(" ")),
-                    e.message().replace('\n', " "),
-                    "keys are section.key as in board-configs/",
-                )
-            })?
-        };
-        board.validate(place)?;
+        }
+        board.validate().map_err(|(key, what)| {
+            let set_by = overrides.iter().rev().find(|o| o.split('=').next().is_some_and(|k| k.trim() == key));
+            let at = match (set_by, line_of(text, key)) {
+                (Some(assignment), _) => shown(assignment),
+                (None, Some(line)) => format!("{place}:{line}"),
+                (None, None) => format!("{place} (default)"),
+            };
+            Fault::new(Exit::Config, at, what, format!("change {key}"))
+        })?;
         Ok(board)
     }
 
-    fn validate(&self, place: &str) -> Result<(), Fault> {
-        let b = &self.budget;
-        let m = &self.map;
-        let s = &self.stereo;
-        let v = &self.vio;
-        let f = &self.frontend;
-        let rules: &[(bool, &str, &str)] = &[
-            (self.memory_max_mib >= 16, "memory_max_mib", "must be at least 16"),
-            ((256..=4_000_000).contains(&b.splats), "budget.splats", "must be 256..4000000"),
-            ((1024..=64_000_000).contains(&b.intersections), "budget.intersections", "must be 1024..64000000"),
-            ((2..=4096).contains(&b.keyframes), "budget.keyframes", "must be 2..4096"),
-            ((64..=4096).contains(&b.image_width_max), "budget.image_width_max", "must be 64..4096"),
-            ((64..=4096).contains(&b.image_height_max), "budget.image_height_max", "must be 64..4096"),
-            ((16..=200).contains(&f.grid_px), "frontend.grid_px", "must be 16..200"),
+    /// The first key that is out of bounds, and what is wrong with it.
+    fn validate(&self) -> Result<(), (&'static str, String)> {
+        let table = toml::Table::try_from(self).expect("a board is a table of numbers, strings and booleans");
+        for (key, bound) in BOUNDS {
+            let value = lookup(&table, key).expect("BOUNDS names keys of the board");
+            let number = value.as_float().or(value.as_integer().map(|i| i as f64)).unwrap_or(f64::NAN);
+            if !bound.holds(number) {
+                return Err((key, format!("{key} = {value} must be {bound}")));
+            }
+        }
+        let among: &[(bool, &'static str, &str)] = &[
             (
-                f.fast_threshold_min >= 1 && f.fast_threshold >= f.fast_threshold_min && f.fast_threshold <= 255,
+                self.frontend.fast_threshold >= self.frontend.fast_threshold_min,
                 "frontend.fast_threshold",
-                "must be fast_threshold_min..255",
+                "must not be less than frontend.fast_threshold_min",
             ),
-            ((1..=50).contains(&f.iterations), "frontend.iterations", "must be 1..50"),
-            (f.recovered_max_px > 0.0, "frontend.recovered_max_px", "must be positive"),
-            (f.epipolar_max > 0.0, "frontend.epipolar_max", "must be positive"),
-            (v.observation_sigma_px > 0.0, "vio.observation_sigma_px", "must be positive"),
-            (v.huber_px > 0.0, "vio.huber_px", "must be positive"),
-            ((1..=100).contains(&v.iterations_max), "vio.iterations_max", "must be 1..100"),
-            (v.accel_bias_sigma > 0.0 && v.gyro_bias_sigma > 0.0, "vio.*_bias_sigma", "must be positive"),
-            (v.gyro_noise_scale > 0.0 && v.accel_noise_scale > 0.0, "vio.*_noise_scale", "must be positive"),
-            (v.triangulation_baseline_min_m > 0.0, "vio.triangulation_baseline_min_m", "must be positive"),
+            (self.stereo.depth_max_m > self.stereo.depth_min_m, "stereo.depth_max_m", "must exceed stereo.depth_min_m"),
             (
-                s.disparities > 0 && s.disparities % 16 == 0 && s.disparities <= 512,
-                "stereo.disparities",
-                "must be a multiple of 16 up to 512",
-            ),
-            (s.block_px % 2 == 1 && (5..=51).contains(&s.block_px), "stereo.block_px", "must be odd, 5..51"),
-            (s.depth_min_m > 0.0 && s.depth_max_m > s.depth_min_m, "stereo.depth_max_m", "must exceed depth_min_m > 0"),
-            (matches!(m.scale, 1 | 2 | 4), "map.scale", "must be 1, 2 or 4"),
-            (m.occupancy_cell_m > 0.0, "map.occupancy_cell_m", "must be positive"),
-            (
-                m.occupancy_cells.is_power_of_two() && m.occupancy_cells >= 1024,
-                "map.occupancy_cells",
-                "must be a power of two of at least 1024",
-            ),
-            ((0.0..=1.0).contains(&m.ssim_weight), "map.ssim_weight", "must be 0..1"),
-            (m.seeds_per_anchor >= 1, "map.seeds_per_anchor", "must be positive"),
-            (m.curve_period_s > 0.0, "map.curve_period_s", "must be positive"),
-            (self.gpu.submission_max_ms > 0.0, "gpu.submission_max_ms", "must be positive"),
-            (
-                self.replay.pair_tolerance_s >= 0.0 && self.replay.imu_hole_s > 0.0,
-                "replay.imu_hole_s",
-                "must be positive",
+                self.budget.intersections >= self.budget.splats,
+                "budget.intersections",
+                "must not be less than budget.splats: a Gaussian in view covers at least one tile",
             ),
         ];
-        match rules.iter().find(|(ok, _, _)| !ok) {
-            Some((_, key, rule)) => {
-                Err(Fault::new(Exit::Config, format!("{place}: {key}"), *rule, "change the board file"))
-            }
+        match among.iter().find(|(holds, _, _)| !holds) {
+            Some((_, key, rule)) => Err((key, format!("{key} {rule}"))),
             None => Ok(()),
         }
     }
 }
 
+/// What a number of a board file may be.
+#[derive(Clone, Copy, Debug)]
+enum Bound {
+    Within(f64, f64),
+    /// Finite and above zero.
+    Positive,
+    /// Within, and `divisor * n + rest`.
+    Stepped(f64, f64, f64, f64),
+    PowerOfTwo(f64, f64),
+}
+
+impl Bound {
+    fn holds(self, v: f64) -> bool {
+        match self {
+            Within(low, high) => (low..=high).contains(&v),
+            Positive => v.is_finite() && v > 0.0,
+            Stepped(low, high, divisor, rest) => (low..=high).contains(&v) && v % divisor == rest,
+            PowerOfTwo(low, high) => (low..=high).contains(&v) && v.log2().fract() == 0.0,
+        }
+    }
+}
+
+impl std::fmt::Display for Bound {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Within(low, high) => write!(f, "{low} to {high}"),
+            Positive => write!(f, "positive"),
+            Stepped(low, high, divisor, rest) if *divisor == 2.0 && *rest == 1.0 => write!(f, "odd, {low} to {high}"),
+            Stepped(low, high, divisor, _) => write!(f, "a multiple of {divisor}, {low} to {high}"),
+            PowerOfTwo(low, high) => write!(f, "a power of two, {low} to {high}"),
+        }
+    }
+}
+
+use Bound::{Positive, PowerOfTwo, Stepped, Within};
+
+/// Every number of a board file, with what it may be.
+const BOUNDS: &[(&str, Bound)] = &[
+    ("memory_max_mib", Within(16.0, 1_048_576.0)),
+    ("budget.splats", Within(256.0, 4_000_000.0)),
+    ("budget.intersections", Within(1024.0, 64_000_000.0)),
+    ("budget.keyframes", Within(2.0, 4096.0)),
+    ("budget.image_width_max", Within(64.0, 4096.0)),
+    ("budget.image_height_max", Within(64.0, 4096.0)),
+    ("frontend.grid_px", Within(16.0, 200.0)),
+    ("frontend.fast_threshold", Within(1.0, 255.0)),
+    ("frontend.fast_threshold_min", Within(1.0, 255.0)),
+    ("frontend.iterations", Within(1.0, 50.0)),
+    ("frontend.recovered_max_px", Positive),
+    ("frontend.epipolar_max", Positive),
+    ("vio.observation_sigma_px", Positive),
+    ("vio.huber_px", Positive),
+    ("vio.iterations_max", Within(1.0, 100.0)),
+    ("vio.keyframe_connected_min", Within(0.0, 1.0)),
+    ("vio.keyframe_gap_min", Within(0.0, 1000.0)),
+    ("vio.triangulation_baseline_min_m", Positive),
+    ("vio.accel_bias_sigma", Positive),
+    ("vio.gyro_bias_sigma", Positive),
+    ("vio.outlier_px", Positive),
+    ("vio.gyro_noise_scale", Positive),
+    ("vio.accel_noise_scale", Positive),
+    ("stereo.disparities", Stepped(16.0, 512.0, 16.0, 0.0)),
+    ("stereo.block_px", Stepped(5.0, 51.0, 2.0, 1.0)),
+    ("stereo.uniqueness_percent", Within(0.0, 100.0)),
+    ("stereo.depth_min_m", Positive),
+    ("stereo.depth_max_m", Positive),
+    ("map.scale", PowerOfTwo(1.0, 4.0)),
+    ("map.anchor_uncovered_min", Within(0.0, 1.0)),
+    ("map.covered_alpha", Within(0.0, 1.0)),
+    ("map.occupancy_cell_m", Positive),
+    ("map.occupancy_cells", PowerOfTwo(1024.0, 16_777_216.0)),
+    ("map.seeds_per_anchor", Within(1.0, 1_000_000.0)),
+    ("map.burst_iterations", Within(0.0, 10_000.0)),
+    ("map.lockstep_iterations", Within(0.0, 1000.0)),
+    ("map.ssim_weight", Within(0.0, 1.0)),
+    ("map.lr_position", Positive),
+    ("map.lr_scale", Positive),
+    ("map.lr_rotation", Positive),
+    ("map.lr_opacity", Positive),
+    ("map.lr_colour", Positive),
+    ("map.curve_period_s", Positive),
+    ("map.seed", Within(0.0, u64::MAX as f64)),
+    ("gpu.submission_max_ms", Positive),
+    ("replay.pair_tolerance_s", Within(0.0, 1.0)),
+    ("replay.imu_hole_s", Positive),
+];
+
+fn lookup<'a>(table: &'a toml::Table, key: &str) -> Option<&'a toml::Value> {
+    match key.split_once('.') {
+        Some((section, rest)) => lookup(table.get(section)?.as_table()?, rest),
+        None => table.get(key),
+    }
+}
+
+/// Line of the file on which a key stands.
+fn line_of(text: &str, key: &str) -> Option<usize> {
+    let document = toml::de::DeTable::parse(text).ok()?;
+    let mut parts = key.split('.');
+    let mut value = document.get_ref().get(parts.next()?)?;
+    for part in parts {
+        value = value.get_ref().get(part)?;
+    }
+    Some(line_at(text, value.span().start))
+}
+
+fn line_at(text: &str, byte: usize) -> usize {
+    1 + text.as_bytes()[..byte.min(text.len())].iter().filter(|b| **b == b'\n').count()
+}
+
+fn in_file(place: &str, text: &str, e: &toml::de::Error) -> Fault {
+    // A missing key has no place of its own: the span is empty or the whole table.
+    let line = e.span().filter(|s| !s.is_empty()).map(|s| line_at(text, s.start));
+    let at = line.map_or(place.to_string(), |l| format!("{place}:{l}"));
+    let written = line.and_then(|l| text.lines().nth(l - 1)).map_or(String::new(), |l| format!(" (`{}`)", l.trim()));
+    let what = e.message().replace('\n', " ");
+    Fault::new(Exit::Config, at, format!("{what}{written}"), "board-configs/ shows every section")
+}
+
+/// An override as part of a one-line message.
+fn shown(assignment: &str) -> String {
+    format!("--set {}", assignment.replace('\n', "\\n"))
+}
+
+fn in_override(assignment: &str, what: &str) -> Fault {
+    Fault::new(
+        Exit::Config,
+        shown(assignment),
+        what.replace('\n', " "),
+        "write section.key=value with a key of board-configs/",
+    )
+}
+
 /// Applies one `a.b=value`; the value is TOML, and a bare word is a string.
 fn set(table: &mut toml::Table, assignment: &str) -> Result<(), Fault> {
-    let wrong =
-        |what: &str| Fault::new(Exit::Usage, format!("--set {assignment}"), what, "write --set section.key=value");
-    let (key, value) = assignment.split_once('=').ok_or_else(|| wrong("no '='"))?;
+    let wrong = |what: &str| Fault::new(Exit::Usage, shown(assignment), what, "write --set section.key=value");
+    let (key, value) = assignment.split_once('=').ok_or_else(|| wrong("there is no '='"))?;
     let parsed: toml::Table = toml::from_str(&format!("v = {value}"))
         .or_else(|_| toml::from_str(&format!("v = {value:?}")))
         .map_err(|_| wrong("the value is not TOML"))?;
+    // A line break could smuggle in a second key.
+    let value = parsed.get("v").filter(|_| parsed.len() == 1).ok_or_else(|| wrong("the value is not one value"))?;
     let mut at = table;
     let mut parts: Vec<&str> = key.trim().split('.').collect();
-    let last = parts.pop().filter(|k| !k.is_empty()).ok_or_else(|| wrong("no key"))?;
+    let last = parts.pop().filter(|k| !k.is_empty()).ok_or_else(|| wrong("there is no key before '='"))?;
     for part in parts {
         at = at
             .entry(part)
             .or_insert_with(|| toml::Value::Table(toml::Table::new()))
             .as_table_mut()
-            .ok_or_else(|| wrong("the section is a value"))?;
+            .ok_or_else(|| wrong(&format!("`{part}` is a value, not a section")))?;
     }
-    at.insert(last.to_string(), parsed["v"].clone());
+    at.insert(last.to_string(), value.clone());
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+    use std::collections::BTreeSet;
+
+    const MINIMAL: &str = "name = \"t\"\nmemory_max_mib = 64\n[budget]\nsplats = 1000\nintersections = 10000\n\
+        keyframes = 8\nimage_width_max = 752\nimage_height_max = 480\n";
+
+    /// Dotted names of every number in a table.
+    fn numbers(table: &toml::Table, prefix: &str, into: &mut BTreeSet<String>) {
+        for (key, value) in table {
+            match value {
+                toml::Value::Table(t) => numbers(t, &format!("{prefix}{key}."), into),
+                v if v.is_integer() || v.is_float() => drop(into.insert(format!("{prefix}{key}"))),
+                _ => {}
+            }
+        }
+    }
+
+    #[test]
+    fn every_number_has_a_bound_and_every_bound_a_number() {
+        let board = Board::parse("t.toml", MINIMAL, &[]).unwrap();
+        let mut keys = BTreeSet::new();
+        numbers(&toml::Table::try_from(&board).unwrap(), "", &mut keys);
+        let bounded: BTreeSet<String> = BOUNDS.iter().map(|b| b.0.to_string()).collect();
+        assert_eq!(keys, bounded);
+    }
+
+    #[test]
+    fn bounds_say_what_they_are_and_refuse_what_is_not_a_number() {
+        for (_, bound) in BOUNDS {
+            assert!(!bound.holds(f64::NAN) && !bound.holds(f64::INFINITY) && !bound.holds(-1.0), "{bound}");
+        }
+        assert!(Stepped(5.0, 51.0, 2.0, 1.0).holds(11.0) && !Stepped(5.0, 51.0, 2.0, 1.0).holds(12.0));
+        assert!(PowerOfTwo(1.0, 4.0).holds(2.0) && !PowerOfTwo(1.0, 4.0).holds(3.0));
+        assert_eq!(Stepped(16.0, 512.0, 16.0, 0.0).to_string(), "a multiple of 16, 16 to 512");
+    }
+
+    #[test]
+    fn lines_are_found_in_sections_and_in_dotted_keys() {
+        let text = "name = \"t\"\n\n[budget]\nsplats = 3\n[map]\nscale = 2\n";
+        assert_eq!(line_of(text, "name"), Some(1));
+        assert_eq!(line_of(text, "budget.splats"), Some(4));
+        assert_eq!(line_of(text, "map.scale"), Some(6));
+        assert_eq!(line_of("a.b = 1\n", "a.b"), Some(1));
+        assert_eq!(line_of(text, "map.seed"), None);
+    }
 }

@@ -1,0 +1,147 @@
+//! Board files as their users meet them: what is wrong is named with its place, and the boards
+//! that ship load.
+#![allow(clippy::unwrap_used)]
+
+use std::path::Path;
+use stipple::config::{Board, StereoMethod};
+use stipple_drivers::{Exit, Fault};
+
+const BOARD: &str = r#"name = "test"
+memory_max_mib = 256
+
+[budget]
+splats = 10000
+intersections = 200000
+keyframes = 40
+image_width_max = 752
+image_height_max = 480
+
+[map]
+scale = 2
+"#;
+
+fn parse(text: &str, overrides: &[&str]) -> Result<Board, Fault> {
+    let overrides: Vec<String> = overrides.iter().map(|o| o.to_string()).collect();
+    Board::parse("test.toml", text, &overrides)
+}
+
+/// The fault must be one line, exit with the code, and contain every part.
+fn refused(result: Result<Board, Fault>, exit: Exit, parts: &[&str]) {
+    let fault = result.expect_err("must be refused");
+    let line = fault.to_string();
+    assert_eq!(fault.exit, exit, "{line}");
+    assert!(!line.contains('\n') && !fault.fix.is_empty(), "{line}");
+    for part in parts {
+        assert!(line.contains(part), "`{part}` is not in `{line}`");
+    }
+}
+
+#[test]
+fn unknown_key_is_named_with_its_line() {
+    refused(
+        parse(&BOARD.replace("keyframes", "keyframs"), &[]),
+        Exit::Config,
+        &["test.toml:7", "keyframs", "keyframes"],
+    );
+    refused(parse(&format!("{BOARD}colour = 3\n"), &[]), Exit::Config, &["test.toml:13", "colour"]);
+    refused(parse(&format!("{BOARD}[maps]\n"), &[]), Exit::Config, &["test.toml:13", "maps"]);
+}
+
+#[test]
+fn missing_key_and_broken_syntax_are_named() {
+    refused(parse(&BOARD.replace("splats = 10000\n", ""), &[]), Exit::Config, &["test.toml", "missing", "splats"]);
+    refused(parse(&BOARD.replace("= 40", "= = 40"), &[]), Exit::Config, &["test.toml:7"]);
+    refused(parse("", &[]), Exit::Config, &["test.toml", "name"]);
+}
+
+#[test]
+fn value_of_the_wrong_type_is_named_with_its_line() {
+    refused(parse(&BOARD.replace("= 40", "= \"forty\""), &[]), Exit::Config, &["test.toml:7", "keyframes", "forty"]);
+    refused(parse(&BOARD.replace("= 40", "= -40"), &[]), Exit::Config, &["test.toml:7", "-40"]);
+}
+
+#[test]
+fn value_out_of_bounds_is_named_with_its_line_and_its_bound() {
+    refused(
+        parse(&BOARD.replace("= 10000\n", "= 10\n"), &[]),
+        Exit::Config,
+        &["test.toml:5", "budget.splats = 10", "256"],
+    );
+    refused(parse(&BOARD.replace("scale = 2", "scale = 3"), &[]), Exit::Config, &["test.toml:12", "map.scale = 3"]);
+    let text = format!("{BOARD}[stereo]\nblock_px = 10\n");
+    refused(parse(&text, &[]), Exit::Config, &["test.toml:14", "stereo.block_px = 10", "odd"]);
+    let text = format!("{BOARD}[vio]\nhuber_px = nan\n");
+    refused(parse(&text, &[]), Exit::Config, &["test.toml:14", "vio.huber_px", "positive"]);
+}
+
+#[test]
+fn values_that_contradict_each_other_are_named() {
+    let text = format!("{BOARD}[stereo]\ndepth_min_m = 3.0\ndepth_max_m = 2.0\n");
+    refused(parse(&text, &[]), Exit::Config, &["test.toml:15", "stereo.depth_max_m", "depth_min_m"]);
+    refused(parse(BOARD, &["budget.intersections=5000"]), Exit::Config, &["--set budget.intersections=5000", "splats"]);
+    // The key at fault may be a default that the file does not write.
+    let text = format!("{BOARD}[frontend]\nfast_threshold_min = 90\n");
+    refused(parse(&text, &[]), Exit::Config, &["test.toml", "default", "fast_threshold"]);
+}
+
+#[test]
+fn overrides_reach_nested_keys_strings_numbers_and_booleans() {
+    let set = [
+        "name=other",
+        "map.scale=4",
+        "map.enabled=false",
+        "gpu.device=llvmpipe (LLVM",
+        "vio.huber_px=2",
+        "stereo.method=bm",
+    ];
+    let board = parse(BOARD, &set).unwrap();
+    assert_eq!((board.name.as_str(), board.map.scale, board.map.enabled), ("other", 4, false));
+    assert_eq!((board.gpu.device.as_str(), board.vio.huber_px), ("llvmpipe (LLVM", 2.0));
+    assert_eq!(board.stereo.method, StereoMethod::Bm);
+    assert_eq!(parse(BOARD, &["replay.calibration=\"a b.yaml\""]).unwrap().replay.calibration, "a b.yaml");
+    assert_eq!(parse(BOARD, &["map.scale=4", "map.scale=1"]).unwrap().map.scale, 1, "the last one counts");
+}
+
+#[test]
+fn overrides_obey_the_rules_of_the_file() {
+    refused(parse(BOARD, &["map.scale=4", "map.scales=1"]), Exit::Config, &["--set map.scales=1", "scales"]);
+    refused(parse(BOARD, &["nothing.here=1"]), Exit::Config, &["nothing"]);
+    refused(parse(BOARD, &["map.scale=three"]), Exit::Config, &["--set map.scale=three", "three"]);
+    refused(parse(BOARD, &["budget.splats=1"]), Exit::Config, &["--set budget.splats=1", "256"]);
+    refused(parse(BOARD, &["map.scale"]), Exit::Usage, &["--set map.scale", "'='"]);
+    refused(parse(BOARD, &["=1"]), Exit::Usage, &["--set =1", "key"]);
+    refused(parse(BOARD, &["name.x=1"]), Exit::Usage, &["`name` is a value"]);
+    refused(parse(BOARD, &["map.scale=1\nname = 2"]), Exit::Usage, &["not one value"]);
+}
+
+#[test]
+fn an_override_cannot_hide_an_error_of_the_file() {
+    refused(parse(&format!("{BOARD}scales = 3\n"), &["map.scale=1"]), Exit::Config, &["test.toml:13", "scales"]);
+}
+
+#[test]
+fn missing_file_is_named() {
+    refused(Board::load(Path::new("no/such.toml"), &[]), Exit::NoInput, &["no/such.toml", "--board"]);
+}
+
+#[test]
+fn written_and_read_again_a_board_is_the_same() {
+    let board = parse(BOARD, &[]).unwrap();
+    assert_eq!(parse(&toml::to_string(&board).unwrap(), &[]).unwrap(), board);
+}
+
+#[test]
+fn shipped_boards_load_and_are_named_after_their_file() {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("board-configs");
+    let mut seen: Vec<String> = Vec::new();
+    for entry in std::fs::read_dir(folder).unwrap() {
+        let path = entry.unwrap().path();
+        if path.extension().is_some_and(|e| e == "toml") {
+            let stem = path.file_stem().unwrap().to_str().unwrap().to_string();
+            assert_eq!(Board::load(&path, &[]).unwrap().name, stem);
+            seen.push(stem);
+        }
+    }
+    seen.sort();
+    assert_eq!(seen, ["jetson-orin-nano", "lavapipe", "raspberry-pi-5", "x86-igpu"]);
+}
