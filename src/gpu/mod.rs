@@ -1,1 +1,306 @@
-//! Raw Vulkan compute core.
+//! Raw Vulkan compute: one device, one arena, pipelines, recordings. No engine.
+//!
+//! The kernels of shaders-glsl/ are Rust modules here (`kernels::<file stem>`): `Bind` has one field a buffer
+//! block, named after the block (or its instance), `Push` is the push block, `Spec` the specialisation
+//! constants. Layouts come from the SPIR-V, so host and shader cannot disagree.
+//!
+//! ```
+//! use stipple::gpu::{kernels::axpy, Gpu, Threads};
+//! # fn main() -> Result<(), Box<dyn std::error::Error>> {
+//! let mut gpu = Gpu::open(&Default::default(), 1 << 20)?;       // device, 1 MiB arena
+//! let (x, y) = (gpu.alloc::<f32>("x", 1000)?, gpu.alloc::<f32>("y", 1000)?);
+//! let k = gpu.kernel::<axpy::K>(axpy::Spec::default())?;         // pipeline
+//! gpu.upload(x, 0, &[2.0; 1000])?;
+//! let mut rec = gpu.record();
+//! rec.fill(y, 1f32.to_bits());
+//! rec.dispatch(&k, axpy::Bind { x: x.read(), y: y.read_write() }, axpy::Push { n: 1000, a: 3.0 }, Threads::d1(1000));
+//! gpu.submit(rec)?;                                              // the barrier between the two is inserted
+//! let mut out = [0f32; 1000];
+//! gpu.download(y, 0, &mut out)?;
+//! assert_eq!(out, [7.0; 1000]);
+//! # Ok(()) }
+//! ```
+//!
+//! A buffer that the shader writes cannot be bound as one it reads:
+//! ```compile_fail
+//! use stipple::gpu::{kernels::axpy, Buf};
+//! fn bind(x: Buf<f32>, y: Buf<f32>) -> axpy::Bind { axpy::Bind { x: x.read(), y: y.read() } }
+//! ```
+//! nor one of another type, nor none at all:
+//! ```compile_fail
+//! use stipple::gpu::{kernels::axpy, Buf};
+//! fn bind(x: Buf<u32>, y: Buf<f32>) -> axpy::Bind { axpy::Bind { x: x.read(), y: y.read_write() } }
+//! ```
+#![allow(unsafe_code)]
+
+mod device;
+mod kernel;
+pub mod kernels;
+mod memory;
+mod record;
+mod submit;
+
+pub use device::{Caps, DeviceKind, Subgroup};
+pub use kernel::{Access, Kernel, KernelDef, Reflected, Variant, BUFFERS_MAX, PUSH_MAX, SPECS_MAX};
+pub use memory::{Buf, Range, Read, ReadWrite, Write, ALIGN, STAGING_BYTES};
+pub use record::{Recorder, Threads, COMMANDS_MAX, GROUPS_MAX};
+pub use submit::Timing;
+
+use crate::config::GpuConfig;
+use crate::mem::Footprint;
+use ash::vk;
+use device::Device;
+use kernel::Pipelines;
+use memory::{Arena, Staging};
+use std::fmt;
+use std::sync::Arc;
+use stipple_drivers::{Exit, Fault};
+use submit::Submitter;
+
+/// What can go wrong after boot. Plain data: making one allocates nothing.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum GpuError {
+    /// A Vulkan call failed with this code.
+    Vulkan { call: &'static str, code: i32 },
+    /// The device is gone, or hung; every later call says so too.
+    Lost,
+    /// More commands than one recording holds.
+    RecordingFull,
+    /// Elements outside a buffer.
+    OutOfRange { at: usize, len: usize, of: usize },
+    /// Bytes that cannot be bound: unaligned, empty, overlapping, or more than a binding takes.
+    Binding { kernel: &'static str, start: u64, end: u64 },
+    /// More workgroups than a dispatch takes.
+    Groups { kernel: &'static str },
+}
+
+impl GpuError {
+    fn of(call: &'static str) -> impl Fn(vk::Result) -> GpuError {
+        move |r| match r {
+            vk::Result::ERROR_DEVICE_LOST | vk::Result::TIMEOUT => GpuError::Lost,
+            _ => GpuError::Vulkan { call, code: r.as_raw() },
+        }
+    }
+}
+
+impl fmt::Display for GpuError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            GpuError::Vulkan { call, code } => write!(f, "{call} failed: {}", vk::Result::from_raw(*code)),
+            GpuError::Lost => write!(f, "the Vulkan device is lost or hangs"),
+            GpuError::RecordingFull => write!(f, "more than {COMMANDS_MAX} commands in one recording"),
+            GpuError::OutOfRange { at, len, of } => write!(f, "elements {at}+{len} of a buffer of {of}"),
+            GpuError::Binding { kernel, start, end } => write!(f, "{kernel}: cannot use arena bytes {start}..{end}"),
+            GpuError::Groups { kernel } => write!(f, "{kernel}: too many workgroups"),
+        }
+    }
+}
+
+impl std::error::Error for GpuError {}
+
+impl From<GpuError> for Fault {
+    fn from(e: GpuError) -> Fault {
+        Fault::new(Exit::Unavailable, "gpu", e.to_string(), "see the counters of the report and the kernel log")
+    }
+}
+
+/// How a device is opened, beside the board's `[gpu]`.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct GpuOptions {
+    /// Khronos validation with synchronisation checks; `Gpu::validation_messages` collects what it says.
+    pub validation: bool,
+}
+
+/// A Vulkan device with its arena and pipelines. One thread at a time uses it.
+pub struct Gpu {
+    submitter: Submitter,
+    pipelines: Pipelines,
+    staging: Staging,
+    arena: Arena,
+    /// The recording's memory while nobody records.
+    spare: Option<Recorder>,
+    in_flight: Option<Recorder>,
+    lost: bool,
+    device: Arc<Device>,
+}
+
+const _: () = {
+    const fn is_send<T: Send>() {}
+    is_send::<Gpu>()
+};
+
+impl Gpu {
+    /// Opens the device `config` names with an arena of `arena_bytes`, all zero. `STIPPLE_VALIDATION=1` in
+    /// the environment turns validation on.
+    pub fn open(config: &GpuConfig, arena_bytes: u64) -> Result<Gpu, Fault> {
+        let validation = std::env::var_os("STIPPLE_VALIDATION").is_some_and(|v| v == "1");
+        Gpu::open_with(config, arena_bytes, GpuOptions { validation })
+    }
+
+    pub fn open_with(config: &GpuConfig, arena_bytes: u64, options: GpuOptions) -> Result<Gpu, Fault> {
+        let device = Arc::new(Device::open(config, options.validation)?);
+        let mut gpu = Gpu {
+            submitter: Submitter::new(&device)?,
+            pipelines: Pipelines::new(&device)?,
+            staging: Staging::new(&device)?,
+            arena: Arena::new(&device, arena_bytes)?,
+            spare: Some(Recorder::new()),
+            in_flight: None,
+            lost: false,
+            device,
+        };
+        let mut rec = gpu.record();
+        rec.fill(gpu.arena.whole(), 0);
+        gpu.submit(rec)?;
+        Ok(gpu)
+    }
+
+    pub fn caps(&self) -> &Caps {
+        &self.device.caps
+    }
+
+    /// Takes `len` elements from the arena, at boot. `name` should say which budget sizes it.
+    pub fn alloc<T: bytemuck::Pod>(&mut self, name: &'static str, len: usize) -> Result<Buf<T>, Fault> {
+        self.arena.alloc(name, len)
+    }
+
+    /// Makes a pipeline, of the fastest variant of the kernel that the device has.
+    pub fn kernel<K: KernelDef>(&mut self, spec: K::Spec) -> Result<Kernel<K>, Fault> {
+        self.make(&spec, None)
+    }
+
+    /// Makes a pipeline of one variant: `""` is the baseline.
+    pub fn kernel_variant<K: KernelDef>(&mut self, spec: K::Spec, variant: &str) -> Result<Kernel<K>, Fault> {
+        self.make(&spec, Some(variant))
+    }
+
+    fn make<K: KernelDef>(&mut self, spec: &K::Spec, variant: Option<&str>) -> Result<Kernel<K>, Fault> {
+        let kernel = self.pipelines.make::<K>(spec, variant)?;
+        self.submitter.add_kernel(kernel.name());
+        Ok(kernel)
+    }
+
+    /// An empty recording. Its memory comes back with `submit`; a second one at the same time allocates.
+    pub fn record(&mut self) -> Recorder {
+        self.spare.take().unwrap_or_else(Recorder::new)
+    }
+
+    /// Runs a recording and waits for it.
+    pub fn submit(&mut self, rec: Recorder) -> Result<(), GpuError> {
+        self.submit_nowait(rec)?;
+        self.wait()
+    }
+
+    /// Starts a recording, after waiting for the one before.
+    pub fn submit_nowait(&mut self, rec: Recorder) -> Result<(), GpuError> {
+        let started = self.wait().and_then(|()| match rec.error {
+            Some(e) => Err(e),
+            None if rec.is_empty() => Ok(false),
+            None => self.submitter.start(&rec, &mut self.pipelines, self.arena.buffer()).map(|()| true),
+        });
+        match started {
+            Ok(true) => self.in_flight = Some(rec),
+            _ => self.put_back(rec),
+        }
+        self.note(started).map(|_| ())
+    }
+
+    /// Waits for what is in flight, if anything.
+    pub fn wait(&mut self) -> Result<(), GpuError> {
+        if self.lost {
+            return Err(GpuError::Lost);
+        }
+        let Some(rec) = self.in_flight.take() else { return Ok(()) };
+        let done = self.submitter.finish(&rec);
+        self.put_back(rec);
+        self.note(done)
+    }
+
+    /// Copies `items` to `buf[at..]` and waits.
+    pub fn upload<T: bytemuck::Pod>(&mut self, buf: Buf<T>, at: usize, items: &[T]) -> Result<(), GpuError> {
+        self.wait()?;
+        let start = checked(&buf, at, items.len())?;
+        let mut done = 0;
+        for piece in bytemuck::cast_slice::<T, u8>(items).chunks(STAGING_BYTES) {
+            self.staging.bytes_mut()[..piece.len()].copy_from_slice(piece);
+            let size = piece.len() as u64;
+            let region = vk::BufferCopy { src_offset: 0, dst_offset: start + done, size };
+            let moved = self.submitter.transfer(self.staging.buffer(), self.arena.buffer(), region);
+            self.note(moved)?;
+            done += size;
+        }
+        Ok(())
+    }
+
+    /// Copies `buf[at..]` to `items` and waits.
+    pub fn download<T: bytemuck::Pod>(&mut self, buf: Buf<T>, at: usize, items: &mut [T]) -> Result<(), GpuError> {
+        self.wait()?;
+        let start = checked(&buf, at, items.len())?;
+        let mut done = 0;
+        for piece in bytemuck::cast_slice_mut::<T, u8>(items).chunks_mut(STAGING_BYTES) {
+            let size = piece.len() as u64;
+            let region = vk::BufferCopy { src_offset: start + done, dst_offset: 0, size };
+            let moved = self.submitter.transfer(self.arena.buffer(), self.staging.buffer(), region);
+            self.note(moved)?;
+            piece.copy_from_slice(&self.staging.bytes()[..piece.len()]);
+            done += size;
+        }
+        Ok(())
+    }
+
+    /// Time on the device of the last submission, ms; without timestamps, until the host saw its end.
+    pub fn last_submit_ms(&self) -> f64 {
+        self.submitter.last_ms
+    }
+
+    /// Time on the device, by kernel (and `fill`, `copy`), since boot. A command's time runs from the end of the
+    /// one before, so the times of a submission add up to the whole.
+    pub fn timings(&self) -> &[Timing] {
+        &self.submitter.timings
+    }
+
+    pub fn arena_bytes(&self) -> u64 {
+        self.arena.bytes()
+    }
+
+    pub fn arena_used(&self) -> u64 {
+        self.arena.used()
+    }
+
+    /// Arena bytes by name, alignment included.
+    pub fn footprint(&self) -> Footprint {
+        self.arena.footprint()
+    }
+
+    /// Warnings and errors of the validation layer so far; none without validation.
+    pub fn validation_messages(&self) -> Vec<String> {
+        self.device.messages()
+    }
+
+    fn put_back(&mut self, mut rec: Recorder) {
+        rec.clear();
+        self.spare = Some(rec);
+    }
+
+    /// Remembers a loss: what is in flight then never ends.
+    fn note<R>(&mut self, result: Result<R, GpuError>) -> Result<R, GpuError> {
+        self.lost |= matches!(result, Err(GpuError::Lost));
+        result
+    }
+}
+
+impl Drop for Gpu {
+    fn drop(&mut self) {
+        // SAFETY: the queue is used by this thread alone. If waiting fails the device is lost, and
+        // destroying the objects of a lost device is allowed.
+        let _ = unsafe { self.device.raw.device_wait_idle() };
+    }
+}
+
+/// Arena offset of `buf[at]`, if `len` elements from there are inside.
+fn checked<T>(buf: &Buf<T>, at: usize, len: usize) -> Result<u64, GpuError> {
+    match at.checked_add(len) {
+        Some(end) if end <= buf.len() => Ok(buf.range().start + (at * size_of::<T>()) as u64),
+        _ => Err(GpuError::OutOfRange { at, len, of: buf.len() }),
+    }
+}

@@ -1,0 +1,347 @@
+//! Instance, device, queue: chosen once, destroyed last.
+//!
+//! Everything that owns a Vulkan object holds an `Arc<Device>`, so that the device outlives it whatever
+//! order things are dropped in. The loader is opened at run time: a machine without Vulkan gets a
+//! sentence, not a linker error.
+
+use crate::config::GpuConfig;
+use ash::vk;
+use std::ffi::{c_void, CStr, CString};
+use std::sync::Mutex;
+use stipple_drivers::{Exit, Fault};
+
+const VALIDATION_LAYER: &CStr = c"VK_LAYER_KHRONOS_validation";
+/// Validation messages kept; the rest are only counted out by the log of the layer itself.
+const MESSAGES_MAX: usize = 256;
+
+/// In the order devices are preferred.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum DeviceKind {
+    Discrete,
+    Integrated,
+    Virtual,
+    Cpu,
+    Other,
+}
+
+impl DeviceKind {
+    fn new(kind: vk::PhysicalDeviceType) -> DeviceKind {
+        match kind {
+            vk::PhysicalDeviceType::DISCRETE_GPU => DeviceKind::Discrete,
+            vk::PhysicalDeviceType::INTEGRATED_GPU => DeviceKind::Integrated,
+            vk::PhysicalDeviceType::VIRTUAL_GPU => DeviceKind::Virtual,
+            vk::PhysicalDeviceType::CPU => DeviceKind::Cpu,
+            _ => DeviceKind::Other,
+        }
+    }
+}
+
+/// What the device can do, as far as kernels and budgets care.
+#[derive(Clone, Debug)]
+pub struct Caps {
+    pub name: String,
+    pub kind: DeviceKind,
+    pub subgroup_size: u32,
+    pub subgroup: Subgroup,
+    pub invocations_max: u32,
+    pub shared_max_bytes: u32,
+    /// Largest buffer a kernel can bind, bytes.
+    pub binding_max_bytes: u64,
+    /// Largest single allocation, bytes.
+    pub allocation_max_bytes: u64,
+    /// Nanoseconds of one timestamp tick; zero when the queue has no timestamps.
+    pub timestamp_period_ns: f64,
+    pub(super) timestamp_bits: u32,
+}
+
+/// Subgroup operations compute kernels may use. `GpuConfig::subgroups = false` clears all of them.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Subgroup {
+    pub vote: bool,
+    pub arithmetic: bool,
+    pub ballot: bool,
+    pub shuffle: bool,
+    pub shuffle_relative: bool,
+    pub clustered: bool,
+    pub quad: bool,
+}
+
+impl Subgroup {
+    fn new(p: &vk::PhysicalDeviceSubgroupProperties) -> Subgroup {
+        let compute = p.supported_stages.contains(vk::ShaderStageFlags::COMPUTE);
+        let has = |f: vk::SubgroupFeatureFlags| compute && p.supported_operations.contains(f);
+        Subgroup {
+            vote: has(vk::SubgroupFeatureFlags::VOTE),
+            arithmetic: has(vk::SubgroupFeatureFlags::ARITHMETIC),
+            ballot: has(vk::SubgroupFeatureFlags::BALLOT),
+            shuffle: has(vk::SubgroupFeatureFlags::SHUFFLE),
+            shuffle_relative: has(vk::SubgroupFeatureFlags::SHUFFLE_RELATIVE),
+            clustered: has(vk::SubgroupFeatureFlags::CLUSTERED),
+            quad: has(vk::SubgroupFeatureFlags::QUAD),
+        }
+    }
+}
+
+impl Caps {
+    /// Whether a module that declares this SPIR-V capability may run.
+    pub fn allows(&self, capability: u32) -> bool {
+        let s = &self.subgroup;
+        match capability {
+            // Matrix, Shader, GroupNonUniform: every Vulkan 1.1 compute queue.
+            0 | 1 | 61 => true,
+            62 => s.vote,
+            63 => s.arithmetic,
+            64 => s.ballot,
+            65 => s.shuffle,
+            66 => s.shuffle_relative,
+            67 => s.clustered,
+            68 => s.quad,
+            _ => false,
+        }
+    }
+}
+
+pub struct Device {
+    pub raw: ash::Device,
+    pub queue: vk::Queue,
+    pub family: u32,
+    pub caps: Caps,
+    pub memory: vk::PhysicalDeviceMemoryProperties,
+    names: Option<ash::ext::debug_utils::Device>,
+    messenger: Option<Messenger>,
+    /// Boxed: the messenger holds its address.
+    messages: Box<Mutex<Vec<String>>>,
+    instance: ash::Instance,
+    /// The loaded library; its functions are used until the instance is gone.
+    _entry: ash::Entry,
+}
+
+pub(super) fn unavailable(what: impl Into<String>) -> Fault {
+    Fault::new(
+        Exit::Unavailable,
+        "vulkan",
+        what,
+        "apt-get install mesa-vulkan-drivers (a CPU device and the integrated ones) or the vendor's driver; vulkaninfo lists devices",
+    )
+}
+
+/// Turns a failed boot-time call into a fault that names it.
+pub(super) fn boot(call: &'static str) -> impl Fn(vk::Result) -> Fault {
+    move |r| unavailable(format!("{call} failed: {r}"))
+}
+
+impl Device {
+    pub fn open(config: &GpuConfig, validation: bool) -> Result<Device, Fault> {
+        // SAFETY: the library found is the system's Vulkan loader; it has no unsound initialiser.
+        let entry = unsafe { ash::Entry::load() }
+            .map_err(|e| unavailable(format!("no Vulkan loader (libvulkan.so.1): {e}")))?;
+        let messages = Box::new(Mutex::new(Vec::with_capacity(MESSAGES_MAX)));
+        let (instance, debug) = instance(&entry, validation)?;
+        let messenger = match (validation && debug).then(|| messenger(&entry, &instance, &messages)).transpose() {
+            Ok(m) => m,
+            Err(fault) => {
+                destroy_instance(&instance, &None);
+                return Err(fault);
+            }
+        };
+        let (physical, family, mut caps) = choose(&instance, config).inspect_err(|_| {
+            destroy_instance(&instance, &messenger);
+        })?;
+        if !config.subgroups {
+            caps.subgroup = Subgroup::default();
+        }
+        let queues = [vk::DeviceQueueCreateInfo::default().queue_family_index(family).queue_priorities(&[1.0])];
+        let info = vk::DeviceCreateInfo::default().queue_create_infos(&queues);
+        // SAFETY: `physical` belongs to `instance`, and `family` is one of its queue families.
+        let raw = unsafe { instance.create_device(physical, &info, None) }.map_err(|r| {
+            destroy_instance(&instance, &messenger);
+            boot("vkCreateDevice")(r)
+        })?;
+        // SAFETY: one queue of this family was requested above; `physical` is alive.
+        let (queue, memory) =
+            unsafe { (raw.get_device_queue(family, 0), instance.get_physical_device_memory_properties(physical)) };
+        let names = debug.then(|| ash::ext::debug_utils::Device::new(&instance, &raw));
+        Ok(Device { raw, queue, family, caps, memory, names, messenger, messages, instance, _entry: entry })
+    }
+
+    /// What the validation layer said so far, warnings and errors.
+    pub fn messages(&self) -> Vec<String> {
+        self.messages.lock().map(|m| m.clone()).unwrap_or_default()
+    }
+
+    /// Names an object for validation messages and GPU debuggers.
+    pub fn name<H: vk::Handle>(&self, object: H, name: &str) {
+        let (Some(debug), Ok(name)) = (&self.names, CString::new(name)) else { return };
+        let info = vk::DebugUtilsObjectNameInfoEXT::default().object_handle(object).object_name(&name);
+        // SAFETY: the object is alive and of this device. A refused name changes nothing.
+        let _ = unsafe { debug.set_debug_utils_object_name(&info) };
+    }
+
+    /// The first memory type among `allowed` that has `wanted` and none of `unwanted`.
+    pub fn memory_type(
+        &self,
+        allowed: u32,
+        wanted: vk::MemoryPropertyFlags,
+        unwanted: vk::MemoryPropertyFlags,
+    ) -> Option<u32> {
+        (0..self.memory.memory_type_count).find(|&i| {
+            let flags = self.memory.memory_types[i as usize].property_flags;
+            allowed & (1 << i) != 0 && flags.contains(wanted) && !flags.intersects(unwanted)
+        })
+    }
+}
+
+impl Drop for Device {
+    fn drop(&mut self) {
+        // SAFETY: whoever made objects of this device held an Arc of it, so they are gone, and they waited
+        // for their work. The instance goes after the device, the loader (a field) after both.
+        unsafe { self.raw.destroy_device(None) };
+        destroy_instance(&self.instance, &self.messenger);
+    }
+}
+
+type Messenger = (ash::ext::debug_utils::Instance, vk::DebugUtilsMessengerEXT);
+
+fn destroy_instance(instance: &ash::Instance, messenger: &Option<Messenger>) {
+    // SAFETY: the messenger is of this instance, and no device of it is left.
+    unsafe {
+        if let Some((debug, m)) = messenger {
+            debug.destroy_debug_utils_messenger(*m, None);
+        }
+        instance.destroy_instance(None);
+    }
+}
+
+fn instance(entry: &ash::Entry, validation: bool) -> Result<(ash::Instance, bool), Fault> {
+    // SAFETY: plain queries of the loader.
+    let (version, layers, extensions) = unsafe {
+        (
+            entry.try_enumerate_instance_version().map_err(boot("vkEnumerateInstanceVersion"))?,
+            entry.enumerate_instance_layer_properties().map_err(boot("vkEnumerateInstanceLayerProperties"))?,
+            entry
+                .enumerate_instance_extension_properties(None)
+                .map_err(boot("vkEnumerateInstanceExtensionProperties"))?,
+        )
+    };
+    if version.unwrap_or(vk::API_VERSION_1_0) < vk::API_VERSION_1_1 {
+        return Err(unavailable("the Vulkan loader is older than 1.1"));
+    }
+    let has_layer = layers.iter().any(|l| l.layer_name_as_c_str() == Ok(VALIDATION_LAYER));
+    if validation && !has_layer {
+        return Err(Fault::new(
+            Exit::Unavailable,
+            "vulkan",
+            "validation was asked for and its layer is not installed",
+            "apt-get install vulkan-validationlayers, or unset STIPPLE_VALIDATION",
+        ));
+    }
+    let debug = extensions.iter().any(|e| e.extension_name_as_c_str() == Ok(ash::ext::debug_utils::NAME));
+    let mut names = Vec::new();
+    if debug {
+        names.push(ash::ext::debug_utils::NAME.as_ptr());
+    }
+    let mut layer_names = Vec::new();
+    let enabled = [vk::ValidationFeatureEnableEXT::SYNCHRONIZATION_VALIDATION];
+    let mut features = vk::ValidationFeaturesEXT::default().enabled_validation_features(&enabled);
+    let app = vk::ApplicationInfo::default().application_name(c"stipple").api_version(vk::API_VERSION_1_1);
+    if validation {
+        layer_names.push(VALIDATION_LAYER.as_ptr());
+        names.push(ash::ext::validation_features::NAME.as_ptr());
+    }
+    let mut info = vk::InstanceCreateInfo::default()
+        .application_info(&app)
+        .enabled_layer_names(&layer_names)
+        .enabled_extension_names(&names);
+    if validation {
+        info = info.push_next(&mut features);
+    }
+    // SAFETY: every pointer in `info` outlives the call.
+    let instance = unsafe { entry.create_instance(&info, None) }.map_err(boot("vkCreateInstance"))?;
+    Ok((instance, debug))
+}
+
+fn messenger(entry: &ash::Entry, instance: &ash::Instance, messages: &Mutex<Vec<String>>) -> Result<Messenger, Fault> {
+    let debug = ash::ext::debug_utils::Instance::new(entry, instance);
+    let info = vk::DebugUtilsMessengerCreateInfoEXT::default()
+        .message_severity(vk::DebugUtilsMessageSeverityFlagsEXT::WARNING | vk::DebugUtilsMessageSeverityFlagsEXT::ERROR)
+        // Not GENERAL: the loader reports every driver that does not match this machine there.
+        .message_type(vk::DebugUtilsMessageTypeFlagsEXT::VALIDATION | vk::DebugUtilsMessageTypeFlagsEXT::PERFORMANCE)
+        .pfn_user_callback(Some(collect))
+        .user_data(std::ptr::from_ref(messages).cast_mut().cast());
+    // SAFETY: `messages` is boxed by the caller and outlives the messenger; the callback only locks it.
+    let m =
+        unsafe { debug.create_debug_utils_messenger(&info, None) }.map_err(boot("vkCreateDebugUtilsMessengerEXT"))?;
+    Ok((debug, m))
+}
+
+unsafe extern "system" fn collect(
+    _severity: vk::DebugUtilsMessageSeverityFlagsEXT,
+    _kind: vk::DebugUtilsMessageTypeFlagsEXT,
+    data: *const vk::DebugUtilsMessengerCallbackDataEXT<'_>,
+    user: *mut c_void,
+) -> vk::Bool32 {
+    // SAFETY: `user` is the boxed list given to the messenger; `data` is valid during the call.
+    let (messages, data) = unsafe { (&*user.cast::<Mutex<Vec<String>>>(), &*data) };
+    // SAFETY: the layer passes a zero-terminated string or null.
+    let text = unsafe { data.message_as_c_str() }.map(|s| s.to_string_lossy().into_owned());
+    if let Ok(mut list) = messages.lock() {
+        if list.len() < MESSAGES_MAX {
+            list.push(text.unwrap_or_default());
+        }
+    }
+    vk::FALSE
+}
+
+type Choice = (vk::PhysicalDevice, u32, Caps);
+
+fn choose(instance: &ash::Instance, config: &GpuConfig) -> Result<Choice, Fault> {
+    // SAFETY: the instance is alive.
+    let all = unsafe { instance.enumerate_physical_devices() }.map_err(boot("vkEnumeratePhysicalDevices"))?;
+    let usable: Vec<Choice> = all.into_iter().filter_map(|d| describe(instance, d)).collect();
+    if usable.is_empty() {
+        return Err(unavailable("no Vulkan 1.1 device with a compute queue"));
+    }
+    let names: Vec<String> = usable.iter().map(|(_, _, caps)| format!("\"{}\"", caps.name)).collect();
+    let wanted = config.device.to_lowercase();
+    usable
+        .into_iter()
+        .filter(|(_, _, caps)| caps.name.to_lowercase().contains(&wanted))
+        .min_by_key(|c| c.2.kind)
+        .ok_or_else(|| {
+            Fault::new(
+                Exit::Unavailable,
+                "gpu.device",
+                format!("no Vulkan device has \"{}\" in its name", config.device),
+                format!("devices here: {}", names.join(", ")),
+            )
+        })
+}
+
+fn describe(instance: &ash::Instance, physical: vk::PhysicalDevice) -> Option<Choice> {
+    let mut subgroup = vk::PhysicalDeviceSubgroupProperties::default();
+    let mut maintenance = vk::PhysicalDeviceMaintenance3Properties::default();
+    // SAFETY: `physical` is of this instance; the 1.1 query is made only of devices that have 1.1.
+    let (families, properties) = unsafe {
+        if instance.get_physical_device_properties(physical).api_version < vk::API_VERSION_1_1 {
+            return None;
+        }
+        let mut all = vk::PhysicalDeviceProperties2::default().push_next(&mut subgroup).push_next(&mut maintenance);
+        instance.get_physical_device_properties2(physical, &mut all);
+        (instance.get_physical_device_queue_family_properties(physical), all.properties)
+    };
+    let family = families.iter().position(|f| f.queue_flags.contains(vk::QueueFlags::COMPUTE))?;
+    let bits = families[family].timestamp_valid_bits;
+    let caps = Caps {
+        name: properties.device_name_as_c_str().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default(),
+        kind: DeviceKind::new(properties.device_type),
+        subgroup_size: subgroup.subgroup_size,
+        subgroup: Subgroup::new(&subgroup),
+        invocations_max: properties.limits.max_compute_work_group_invocations,
+        shared_max_bytes: properties.limits.max_compute_shared_memory_size,
+        binding_max_bytes: u64::from(properties.limits.max_storage_buffer_range),
+        allocation_max_bytes: maintenance.max_memory_allocation_size,
+        timestamp_period_ns: if bits == 0 { 0.0 } else { f64::from(properties.limits.timestamp_period) },
+        timestamp_bits: bits,
+    };
+    Some((physical, family as u32, caps))
+}

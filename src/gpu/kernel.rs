@@ -1,0 +1,284 @@
+//! Pipelines: a kernel's SPIR-V with its specialisation constants, made once at boot.
+//!
+//! `KernelDef` is implemented by what the build writes from GLSL, never by hand. A kernel with faster
+//! variants takes the first one whose SPIR-V capabilities the device has.
+
+use super::device::{boot, Device};
+use super::memory::{Range, ALIGN};
+use super::GpuError;
+use ash::vk;
+use std::collections::HashMap;
+use std::marker::PhantomData;
+use std::sync::Arc;
+use stipple_drivers::{Exit, Fault};
+
+/// Storage buffers and specialisation constants of one kernel; the build refuses more.
+pub const BUFFERS_MAX: usize = 8;
+pub const SPECS_MAX: usize = 16;
+/// Bytes of push constants every Vulkan device has.
+pub const PUSH_MAX: usize = 128;
+/// Distinct (kernel, buffers) combinations remembered; past it the cache starts over.
+const SETS_MAX: usize = 1024;
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Access {
+    Read,
+    Write,
+    ReadWrite,
+}
+
+/// One SPIR-V module of a kernel.
+#[derive(Clone, Copy, Debug)]
+pub struct Variant {
+    /// Preprocessor name it was compiled with; empty is the baseline.
+    pub define: &'static str,
+    pub name: &'static str,
+    pub spirv: &'static [u8],
+    pub shared_bytes: u32,
+    pub capabilities: &'static [u32],
+}
+
+/// What a module declares, for the test of the baseline.
+#[derive(Clone, Copy, Debug)]
+pub struct Reflected {
+    pub name: &'static str,
+    pub baseline: bool,
+    pub local: [u32; 3],
+    pub shared_bytes: u32,
+    pub buffers: usize,
+    pub push_bytes: u32,
+    pub capabilities: &'static [u32],
+}
+
+/// A kernel as the build reflects it.
+pub trait KernelDef: 'static {
+    type Push: bytemuck::Pod;
+    type Spec;
+    type Bind;
+    const NAME: &'static str;
+    const BINDINGS: &'static [(u32, Access)];
+    const SPEC_IDS: &'static [u32];
+    const VARIANTS: &'static [Variant];
+    fn local(spec: &Self::Spec) -> [u32; 3];
+    fn spec_words(spec: &Self::Spec) -> [u32; SPECS_MAX];
+    fn ranges(bind: &Self::Bind) -> [Range; BUFFERS_MAX];
+}
+
+/// A pipeline of one `Gpu`; a plain handle.
+pub struct Kernel<K> {
+    pub(super) index: u32,
+    pub(super) local: [u32; 3],
+    name: &'static str,
+    of: PhantomData<fn() -> K>,
+}
+
+impl<K> Kernel<K> {
+    /// Name of the variant taken.
+    pub fn name(&self) -> &'static str {
+        self.name
+    }
+}
+
+impl<K> Clone for Kernel<K> {
+    fn clone(&self) -> Self {
+        *self
+    }
+}
+impl<K> Copy for Kernel<K> {}
+
+pub(super) struct Pipeline {
+    pub name: &'static str,
+    pub raw: vk::Pipeline,
+    pub layout: vk::PipelineLayout,
+    pub push_bytes: usize,
+    set_layout: vk::DescriptorSetLayout,
+    module: vk::ShaderModule,
+    bindings: &'static [(u32, Access)],
+}
+
+/// All pipelines, and the descriptor sets made for them so far.
+pub(super) struct Pipelines {
+    device: Arc<Device>,
+    list: Vec<Pipeline>,
+    pool: vk::DescriptorPool,
+    sets: HashMap<(u32, [Range; BUFFERS_MAX]), vk::DescriptorSet>,
+}
+
+impl Pipelines {
+    pub fn new(device: &Arc<Device>) -> Result<Pipelines, Fault> {
+        let sizes = [vk::DescriptorPoolSize::default()
+            .ty(vk::DescriptorType::STORAGE_BUFFER)
+            .descriptor_count((SETS_MAX * BUFFERS_MAX) as u32)];
+        let info = vk::DescriptorPoolCreateInfo::default().max_sets(SETS_MAX as u32).pool_sizes(&sizes);
+        // SAFETY: the device is alive.
+        let pool = unsafe { device.raw.create_descriptor_pool(&info, None) }.map_err(boot("vkCreateDescriptorPool"))?;
+        Ok(Pipelines { device: device.clone(), list: Vec::new(), pool, sets: HashMap::with_capacity(SETS_MAX) })
+    }
+
+    pub fn get(&self, index: u32) -> &Pipeline {
+        &self.list[index as usize]
+    }
+
+    /// Makes the pipeline of variant `define`, or of the fastest the device has.
+    pub fn make<K: KernelDef>(&mut self, spec: &K::Spec, define: Option<&str>) -> Result<Kernel<K>, Fault> {
+        let refuse =
+            |what: String| Fault::new(Exit::Unavailable, format!("kernel {}", K::NAME), what, "use another device");
+        let caps = &self.device.caps;
+        let runs = |v: &&Variant| v.capabilities.iter().all(|&c| caps.allows(c));
+        let variant = match define {
+            Some(d) => K::VARIANTS.iter().find(|v| v.define.eq_ignore_ascii_case(d)).filter(runs),
+            // The baseline is first in the list; variants pay, so they are tried from the end.
+            None => K::VARIANTS.iter().rev().find(runs),
+        }
+        .ok_or_else(|| refuse(format!("{} runs no such variant of it", caps.name)))?;
+        let local = K::local(spec);
+        let invocations = local.iter().product::<u32>();
+        if invocations == 0 || invocations > caps.invocations_max || variant.shared_bytes > caps.shared_max_bytes {
+            return Err(refuse(format!(
+                "{invocations} invocations and {} B of shared memory; {} has {} and {}",
+                variant.shared_bytes, caps.name, caps.invocations_max, caps.shared_max_bytes
+            )));
+        }
+        // Filled step by step: a failure half-way drops what is there through `Pipelines`.
+        self.list.push(Pipeline {
+            name: variant.name,
+            raw: vk::Pipeline::null(),
+            layout: vk::PipelineLayout::null(),
+            push_bytes: size_of::<K::Push>(),
+            set_layout: vk::DescriptorSetLayout::null(),
+            module: vk::ShaderModule::null(),
+            bindings: K::BINDINGS,
+        });
+        let index = self.list.len() - 1;
+        self.list[index].build(&self.device, variant, K::SPEC_IDS, &K::spec_words(spec))?;
+        Ok(Kernel { index: index as u32, local, name: variant.name, of: PhantomData })
+    }
+
+    /// Forgets all sets when fewer than `commands` are left. Call only while the device is idle.
+    pub fn reserve_sets(&mut self, commands: usize) -> Result<(), GpuError> {
+        if self.sets.len() + commands.min(SETS_MAX) > SETS_MAX {
+            self.sets.clear();
+            // SAFETY: no submission that uses these sets is in flight.
+            unsafe { self.device.raw.reset_descriptor_pool(self.pool, vk::DescriptorPoolResetFlags::empty()) }
+                .map_err(GpuError::of("vkResetDescriptorPool"))?;
+        }
+        Ok(())
+    }
+
+    pub fn set(
+        &mut self,
+        index: u32,
+        ranges: &[Range; BUFFERS_MAX],
+        arena: vk::Buffer,
+    ) -> Result<vk::DescriptorSet, GpuError> {
+        if let Some(&set) = self.sets.get(&(index, *ranges)) {
+            return Ok(set);
+        }
+        let pipeline = &self.list[index as usize];
+        let layouts = [pipeline.set_layout];
+        let info = vk::DescriptorSetAllocateInfo::default().descriptor_pool(self.pool).set_layouts(&layouts);
+        let mut set = [vk::DescriptorSet::null()];
+        // SAFETY: pool and layout are alive; one set is asked for and one place is given.
+        unsafe {
+            (self.device.raw.fp_v1_0().allocate_descriptor_sets)(self.device.raw.handle(), &info, set.as_mut_ptr())
+        }
+        .result()
+        .map_err(GpuError::of("vkAllocateDescriptorSets"))?;
+        let mut infos = [vk::DescriptorBufferInfo::default(); BUFFERS_MAX];
+        let mut writes = [vk::WriteDescriptorSet::default(); BUFFERS_MAX];
+        for (i, r) in ranges.iter().enumerate().take(pipeline.bindings.len()) {
+            if r.start % ALIGN != 0 || r.end <= r.start || r.end - r.start > self.device.caps.binding_max_bytes {
+                return Err(GpuError::Binding { kernel: pipeline.name, start: r.start, end: r.end });
+            }
+            infos[i] = vk::DescriptorBufferInfo { buffer: arena, offset: r.start, range: r.end - r.start };
+        }
+        for ((write, info), &(binding, _)) in writes.iter_mut().zip(&infos).zip(pipeline.bindings) {
+            *write = vk::WriteDescriptorSet::default()
+                .dst_set(set[0])
+                .dst_binding(binding)
+                .descriptor_type(vk::DescriptorType::STORAGE_BUFFER)
+                .buffer_info(std::slice::from_ref(info));
+        }
+        // SAFETY: the set is new, so nothing in flight uses it; ranges were checked and lie in the arena.
+        unsafe { self.device.raw.update_descriptor_sets(&writes[..pipeline.bindings.len()], &[]) };
+        self.sets.insert((index, *ranges), set[0]);
+        Ok(set[0])
+    }
+}
+
+impl Pipeline {
+    fn build(
+        &mut self,
+        device: &Device,
+        variant: &Variant,
+        ids: &[u32],
+        words: &[u32; SPECS_MAX],
+    ) -> Result<(), Fault> {
+        let code = ash::util::read_spv(&mut std::io::Cursor::new(variant.spirv))
+            .map_err(|e| Fault::new(Exit::Software, variant.name, format!("bad SPIR-V: {e}"), "build again"))?;
+        let bindings: Vec<_> = self
+            .bindings
+            .iter()
+            .map(|&(binding, _)| {
+                vk::DescriptorSetLayoutBinding::default()
+                    .binding(binding)
+                    .descriptor_type(vk::DescriptorType::STORAGE_BUFFER)
+                    .descriptor_count(1)
+                    .stage_flags(vk::ShaderStageFlags::COMPUTE)
+            })
+            .collect();
+        let entries: Vec<_> = ids
+            .iter()
+            .enumerate()
+            .map(|(i, &id)| vk::SpecializationMapEntry { constant_id: id, offset: 4 * i as u32, size: 4 })
+            .collect();
+        let specialisation =
+            vk::SpecializationInfo::default().map_entries(&entries).data(bytemuck::cast_slice(&words[..ids.len()]));
+        let pushes = [vk::PushConstantRange {
+            stage_flags: vk::ShaderStageFlags::COMPUTE,
+            offset: 0,
+            size: self.push_bytes as u32,
+        }];
+        let pushes = if self.push_bytes == 0 { &pushes[..0] } else { &pushes[..] };
+        // SAFETY: the device is alive, each object is made from ones made just before, and every pointer
+        // outlives its call. The SPIR-V comes from the build's own compiler.
+        unsafe {
+            let info = vk::DescriptorSetLayoutCreateInfo::default().bindings(&bindings);
+            self.set_layout =
+                device.raw.create_descriptor_set_layout(&info, None).map_err(boot("vkCreateDescriptorSetLayout"))?;
+            let layouts = [self.set_layout];
+            let info = vk::PipelineLayoutCreateInfo::default().set_layouts(&layouts).push_constant_ranges(pushes);
+            self.layout = device.raw.create_pipeline_layout(&info, None).map_err(boot("vkCreatePipelineLayout"))?;
+            let info = vk::ShaderModuleCreateInfo::default().code(&code);
+            self.module = device.raw.create_shader_module(&info, None).map_err(boot("vkCreateShaderModule"))?;
+            let stage = vk::PipelineShaderStageCreateInfo::default()
+                .stage(vk::ShaderStageFlags::COMPUTE)
+                .module(self.module)
+                .name(c"main")
+                .specialization_info(&specialisation);
+            let info = [vk::ComputePipelineCreateInfo::default().stage(stage).layout(self.layout)];
+            let made = device
+                .raw
+                .create_compute_pipelines(vk::PipelineCache::null(), &info, None)
+                .map_err(|(_, r)| boot("vkCreateComputePipelines")(r))?;
+            self.raw = made[0];
+        }
+        device.name(self.raw, variant.name);
+        Ok(())
+    }
+}
+
+impl Drop for Pipelines {
+    fn drop(&mut self) {
+        // SAFETY: `Gpu` waits for the device before its fields are dropped; null handles are ignored.
+        unsafe {
+            for p in &self.list {
+                self.device.raw.destroy_pipeline(p.raw, None);
+                self.device.raw.destroy_pipeline_layout(p.layout, None);
+                self.device.raw.destroy_shader_module(p.module, None);
+                self.device.raw.destroy_descriptor_set_layout(p.set_layout, None);
+            }
+            self.device.raw.destroy_descriptor_pool(self.pool, None);
+        }
+    }
+}
