@@ -16,7 +16,13 @@ pub mod residuals;
 pub mod solve;
 pub mod window;
 
+#[cfg(test)]
+#[path = "../../tests/world/mod.rs"]
+mod world;
+
 use crate::config::VioConfig;
+#[cfg(test)]
+use crate::frontend::Track;
 use crate::frontend::Tracks;
 use crate::limits::{CAMERAS_MAX, STATES};
 use crate::mem::Footprint;
@@ -311,3 +317,140 @@ fn fnv(hash: u64, word: u64) -> u64 {
 }
 
 const _: () = assert!(FRAMES > STATES + 1 && FRAMES <= u8::MAX as usize);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use marginalise::Sigma;
+    use stipple_drivers::Span;
+    use world::{Path, World, FRAME_SECS, RATE_HZ};
+
+    fn run(vio: &mut Vio, frames: std::ops::Range<usize>, world: &mut World) {
+        let mut tracks = Tracks::default();
+        for frame in frames {
+            let t = frame as f64 * FRAME_SECS + 0.0012;
+            let mut sample = ((t - FRAME_SECS) * RATE_HZ).max(0.0) as usize;
+            while (sample as f64) / RATE_HZ < t + 1.0 / RATE_HZ {
+                let s = world.imu(sample as f64 / RATE_HZ);
+                if vio.imu.newest().is_none_or(|n| s.t > n.t) {
+                    vio.on_imu(s);
+                }
+                sample += 1;
+            }
+            world.tracks(t, &mut tracks);
+            vio.on_tracks(&tracks);
+        }
+    }
+
+    /// The direction in which the whole window moves (or turns about the world's axis).
+    fn gauge(vio: &Vio, shift: DVec3, turn: DVec3, slot: usize) -> [f64; 15] {
+        let m = &vio.window.frame(slot).anchor;
+        let (p, th, v) = (shift + turn.cross(m.pose.p), m.pose.q.conjugate() * turn, turn.cross(m.v));
+        let mut d = [0.0; 15];
+        (0..3).for_each(|i| (d[i], d[3 + i], d[6 + i]) = (p[i], th[i], v[i]));
+        d
+    }
+
+    #[test]
+    fn prior_learns_nothing_about_position_and_yaw_from_a_hundred_marginalisations() {
+        let mut world = World::new(Path { rest: -1.0 });
+        let mut vio = Vio::new(&world.rig, &VioConfig::default());
+        run(&mut vio, 0..12, &mut world);
+        assert!(vio.running);
+        // The first state is still in the window; start its prior again with the gauge left free, and with
+        // it the velocity, which as a vector of the world would tell yaw.
+        let first = vio.window.slots().next().expect("a running window has frames");
+        let motion = vio.window.frame(first).anchor;
+        let sigma = Sigma { p: 1e9, yaw: 1e9, tilt: 0.05, v: 1e9, bg: 0.02, ba: 0.3 };
+        vio.prior.start(first, &motion, &sigma);
+        run(&mut vio, 12..120, &mut world);
+        assert!(vio.stats.resets == 0 && vio.window.keyframe_poses().count() > 3);
+        let energy = |shift: DVec3, turn: DVec3| vio.prior.energy(|slot| gauge(&vio, shift, turn, slot));
+        let tilt = energy(DVec3::ZERO, DVec3::X).min(energy(DVec3::ZERO, DVec3::Y));
+        assert!(tilt > 1e4, "tilt is observable: {tilt}");
+        for (what, e) in [
+            ("x", energy(DVec3::X, DVec3::ZERO)),
+            ("y", energy(DVec3::Y, DVec3::ZERO)),
+            ("z", energy(DVec3::Z, DVec3::ZERO)),
+            ("yaw", energy(DVec3::ZERO, DVec3::Z)),
+        ] {
+            assert!(e.abs() < 1e-3, "{what}: {e} beside tilt {tilt}");
+        }
+    }
+
+    #[test]
+    fn marginalising_keeps_the_step_of_what_stays() {
+        // Between these frames only inertial factors and finished landmarks act, so the window before and
+        // after marginalisation holds the same quadratic on what stays.
+        let mut world = World::new(Path { rest: -1.0 });
+        let mut vio = Vio::new(&world.rig, &VioConfig::default());
+        run(&mut vio, 0..40, &mut world);
+        let oldest = vio.window.states().next().expect("a running window has states");
+        let newest = vio.window.newest().expect("a running window has a newest frame");
+        // One more state, by inertia alone, so that one is due to leave; and no live landmark.
+        let from = vio.window.frame(newest).now;
+        let t = vio.window.frame(newest).t + Span::from_secs(0.05);
+        let inc = vio.imu.integrate(vio.window.frame(newest).t, t, from.bg, from.ba, &vio.noise);
+        let mut frame = Frame::first(t, from.propagate(&inc).plus(&[0.01; 15]));
+        frame.weight = vio.inertial_weight(&inc);
+        frame.increment = inc;
+        vio.window.push(frame).expect("room for one");
+        let boundary = vio.window.states().nth(1).expect("a second state");
+        let (window, old) = (&vio.window, vio.window.frame(boundary).t);
+        vio.landmarks.retain(|l| l.observations.iter().all(|o| window.frame(o.slot as usize).t <= old));
+        assert!(vio.window.frame(oldest).moving);
+
+        let before = vio.solver.newton_step(&vio.window, &vio.landmarks, &vio.prior, &vio.model);
+        marginalise(&mut vio.window, &mut vio.landmarks, &mut vio.prior, &mut vio.solver, &vio.model);
+        let after = vio.solver.newton_step(&vio.window, &vio.landmarks, &vio.prior, &vio.model);
+        for slot in vio.window.states() {
+            for i in 0..15 {
+                let (a, b) = (before[slot][i], after[slot][i]);
+                assert!((a - b).abs() < 1e-7 + 1e-5 * a.abs(), "slot {slot} error {i}: {a} then {b}");
+            }
+        }
+    }
+
+    #[test]
+    fn same_input_gives_the_same_bits() {
+        let once = || {
+            let mut world = World::new(Path { rest: -1.0 });
+            let mut vio = Vio::new(&world.rig, &VioConfig::default());
+            run(&mut vio, 0..40, &mut world);
+            (vio.hash(), vio.stats)
+        };
+        let (a, b) = (once(), once());
+        assert_eq!(a, b);
+        assert_ne!(a.0, FNV_START);
+    }
+
+    #[test]
+    fn samples_that_are_not_finite_or_not_newer_are_counted_and_refused() {
+        let mut vio = Vio::new(&world::calibration(), &VioConfig::default());
+        let sample = |t: i64, x: f64| ImuSample { t: Nanos(t), gyro_body: DVec3::splat(x), accel_body: DVec3::Z };
+        for (t, x) in [(1, 0.0), (1, 0.0), (0, 0.0), (2, f64::NAN), (3, f64::INFINITY), (4, 0.0)] {
+            vio.on_imu(sample(t, x));
+        }
+        assert_eq!(vio.stats.imu_rejected, 4);
+        assert_eq!(vio.imu.iter().count(), 2);
+    }
+
+    #[test]
+    fn prediction_meets_the_next_estimate() {
+        let mut world = World::new(Path { rest: -1.0 });
+        let mut vio = Vio::new(&world.rig, &VioConfig::default());
+        run(&mut vio, 0..60, &mut world);
+        let last = vio.window().last().expect("a running window has frames");
+        let t = last.0 + Span::from_secs(FRAME_SECS);
+        for k in 1..=10 {
+            vio.on_imu(world.imu((last.0 .0 as f64 * 1e-9) + k as f64 / RATE_HZ));
+        }
+        let predicted = vio.predict(t).expect("running");
+        let motion = vio.predict_motion(t).expect("running");
+        let mut tracks = Tracks::default();
+        world.tracks(t.0 as f64 * 1e-9, &mut tracks);
+        let update = vio.on_tracks(&tracks).odometry.expect("running");
+        assert!((predicted.world_from_body.p - update.world_from_body.p).length() < 0.005);
+        assert!((last.1 * motion).p.distance(predicted.world_from_body.p) < 1e-12);
+    }
+}

@@ -196,7 +196,7 @@ impl ImuRing {
         old
     }
 
-    pub fn len(&self) -> usize {
+    fn len(&self) -> usize {
         self.count.min(IMU_BETWEEN_FRAMES)
     }
 
@@ -302,4 +302,126 @@ pub struct Statistics {
     pub accel: DVec3,
     pub gyro_sigma: f64,
     pub accel_sigma: f64,
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::super::residuals::Motion;
+    use super::super::world;
+    use super::*;
+    use stipple_drivers::Pose;
+
+    const NOISE: Noise = Noise { gyro: 1e-3, accel: 2e-2, gyro_walk: 1e-4, accel_walk: 1e-3, period: 0.005 };
+    const PATH: world::Path = world::Path { rest: -1.0 };
+
+    fn at(t: f64) -> Nanos {
+        Nanos((t * 1e9).round() as i64)
+    }
+
+    fn ring(rate: f64, t1: f64) -> ImuRing {
+        let mut ring = ImuRing::new();
+        for i in 0..=(t1 * rate) as usize + 1 {
+            let t = i as f64 / rate;
+            let (gyro_body, accel_body) = PATH.imu(t);
+            ring.push(ImuSample { t: at(t), gyro_body, accel_body });
+        }
+        ring
+    }
+
+    fn start(t: f64) -> Motion {
+        const H: f64 = 1e-5;
+        let v = (PATH.pose(t + H).p - PATH.pose(t - H).p) / (2.0 * H);
+        Motion { pose: PATH.pose(t), v, ..Motion::default() }
+    }
+
+    fn error(a: &Pose, b: &Pose) -> (f64, f64) {
+        ((a.p - b.p).length(), so3::log(a.q.conjugate() * b.q).length())
+    }
+
+    #[test]
+    fn increment_follows_the_path_and_converges_with_the_square_of_the_rate() {
+        let (t0, t1) = (0.0123, 0.2104);
+        let miss = |rate: f64| {
+            let inc = ring(rate, t1).integrate(at(t0), at(t1), DVec3::ZERO, DVec3::ZERO, &NOISE);
+            error(&start(t0).propagate(&inc).pose, &PATH.pose(t1))
+        };
+        let (coarse, fine) = (miss(200.0), miss(2000.0));
+        assert!(coarse.0 < 1e-4 && coarse.1 < 1e-4, "{coarse:?}");
+        assert!(fine.0 < coarse.0 / 20.0 + 1e-8 && fine.1 < coarse.1 / 20.0 + 1e-8, "{coarse:?} {fine:?}");
+    }
+
+    #[test]
+    fn first_order_bias_correction_matches_integrating_again() {
+        let ring = ring(200.0, 0.2);
+        let (bg, ba) = (DVec3::new(0.002, -0.003, 0.001), DVec3::new(0.05, 0.02, -0.04));
+        let once = ring.integrate(at(0.0), at(0.1), DVec3::ZERO, DVec3::ZERO, &NOISE);
+        let (p, q, v) = once.corrected(bg, ba);
+        let again = ring.integrate(at(0.0), at(0.1), bg, ba, &NOISE);
+        // The corrections are of order 1e-3 (v) and 1e-4 (p, q); what is left is of second order.
+        assert!((p - again.p).length() < 1e-7, "{}", (p - again.p).length());
+        assert!(so3::log(q.conjugate() * again.q).length() < 1e-7);
+        assert!((v - again.v).length() < 5e-6, "{}", (v - again.v).length());
+    }
+
+    #[test]
+    fn covariance_matches_monte_carlo() {
+        const RUNS: usize = 4000;
+        const STEPS: usize = 20;
+        const DT: f64 = 0.005;
+        let mut random = world::Noise(3);
+        let sample = |k: usize| PATH.imu(0.5 + (k as f64 + 0.5) * DT);
+        let clean = (0..STEPS).fold(Increment::new(DVec3::ZERO, DVec3::ZERO), |mut inc, k| {
+            inc.step(sample(k).0, sample(k).1, DT, &NOISE);
+            inc
+        });
+        let samples: Vec<_> = (0..STEPS).map(sample).collect();
+        let mut sum = Mat9::zeros();
+        for _ in 0..RUNS {
+            let mut inc = Increment::new(DVec3::ZERO, DVec3::ZERO);
+            for (gyro, accel) in &samples {
+                let gyro = *gyro + random.vector() * (NOISE.gyro / DT.sqrt());
+                inc.step(gyro, *accel + random.vector() * (NOISE.accel / DT.sqrt()), DT, &NOISE);
+            }
+            let th = so3::log(clean.q.conjugate() * inc.q);
+            let (p, v) = (inc.p - clean.p, inc.v - clean.v);
+            let e = nalgebra::SVector::<f64, 9>::from_row_slice(&[p.x, p.y, p.z, th.x, th.y, th.z, v.x, v.y, v.z]);
+            sum += e * e.transpose() / RUNS as f64;
+        }
+        // The position noise is modelling error, not drawn here.
+        let mut expected = clean.covariance;
+        (0..3).for_each(|i| expected[(i, i)] -= POSITION_NOISE * POSITION_NOISE * DT * STEPS as f64);
+        for i in 0..9 {
+            for j in 0..9 {
+                let scale = (expected[(i, i)] * expected[(j, j)]).sqrt();
+                // 4000 runs estimate a correlation to about 1/√4000 = 0.016.
+                assert!((sum[(i, j)] - expected[(i, j)]).abs() < 0.08 * scale, "{i} {j}");
+            }
+        }
+    }
+
+    #[test]
+    fn gap_widens_the_covariance() {
+        let full = ring(200.0, 0.3);
+        let mut holed = ImuRing::new();
+        full.iter().filter(|s| s.t < at(0.1) || s.t > at(0.2)).for_each(|s| {
+            holed.push(*s);
+        });
+        let integrate = |r: &ImuRing| r.integrate(at(0.0), at(0.3), DVec3::ZERO, DVec3::ZERO, &NOISE);
+        let (a, b) = (integrate(&full), integrate(&holed));
+        assert!(b.covariance[(6, 6)] > 100.0 * a.covariance[(6, 6)]);
+        assert!((a.dt - b.dt).abs() < 1e-12);
+    }
+
+    #[test]
+    fn ring_keeps_the_newest_and_gives_back_what_it_overwrote() {
+        let mut ring = ImuRing::new();
+        let sample = |i: usize| ImuSample { t: Nanos(i as i64), ..ImuSample::default() };
+        for i in 0..IMU_BETWEEN_FRAMES {
+            assert!(ring.push(sample(i)).is_none());
+        }
+        assert_eq!(ring.push(sample(IMU_BETWEEN_FRAMES)).map(|s| s.t), Some(Nanos(0)));
+        assert_eq!(ring.iter().next().map(|s| s.t), Some(Nanos(1)));
+        assert_eq!(ring.iter().count(), IMU_BETWEEN_FRAMES);
+    }
 }

@@ -231,3 +231,155 @@ pub fn huber(length: f64, width: f64) -> (f64, f64) {
         (width / length, width * (length - 0.5 * width))
     }
 }
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::super::preintegration::Noise;
+    use super::*;
+    use glam::DQuat;
+    use stipple_drivers::Lens;
+
+    const H: f64 = 1e-6;
+
+    fn close(analytic: f64, numeric: f64, what: &str) {
+        let error = (analytic - numeric).abs() / (1.0 + analytic.abs().max(numeric.abs()));
+        assert!(error < 2e-6, "{what}: analytic {analytic}, numeric {numeric}");
+    }
+
+    fn moved(m: &Motion, i: usize, h: f64) -> Motion {
+        let mut d = [0.0; 15];
+        d[i] = h;
+        m.plus(&d)
+    }
+
+    fn motion(k: f64) -> Motion {
+        Motion {
+            pose: Pose::new(DQuat::from_scaled_axis(DVec3::new(0.3, -0.2, 0.4) * k), DVec3::new(0.5, -0.3, 0.2) * k),
+            v: DVec3::new(0.3, 0.8, -0.4) * k,
+            bg: DVec3::new(0.01, -0.02, 0.03) * k,
+            ba: DVec3::new(-0.1, 0.05, 0.2) * k,
+        }
+    }
+
+    fn eyes() -> Vec<Eye> {
+        let lenses = [
+            Lens::Radtan { k1: -0.28, k2: 0.07, p1: 2e-4, p2: 2e-5 },
+            Lens::KannalaBrandt { k: [0.01, -0.005, 0.003, -0.001] },
+            Lens::DoubleSphere { xi: -0.2, alpha: 0.6 },
+        ];
+        let eye = |lens| Eye {
+            camera: Camera { width: 752, height: 480, fx: 458.0, fy: 457.0, cx: 367.0, cy: 248.0, lens },
+            body_from_cam: Body::from(&Pose::new(
+                DQuat::from_scaled_axis(DVec3::new(0.1, 0.2, -0.3)),
+                DVec3::new(0.05, 0.1, -0.02),
+            )),
+        };
+        lenses.into_iter().map(eye).collect()
+    }
+
+    #[test]
+    fn reprojection_jacobians_match_differences_to_host_target_and_point() {
+        let (host, target) = (motion(1.0), motion(1.3));
+        for eye in eyes() {
+            for point in [
+                Point::new(DVec3::new(0.1, -0.2, 1.0).normalize(), 0.4),
+                Point::new(DVec3::new(-0.3, 0.1, 1.0).normalize(), 0.0),
+                Point::new(DVec3::new(0.4, 0.3, 1.0).normalize(), 1.5),
+            ] {
+                let f = |point: &Point, host: &Motion, target: &Motion| {
+                    predict(point, &eye.body_from_cam, &Body::from(&host.pose), &eye, &Body::from(&target.pose))
+                        .unwrap()
+                };
+                let r = reproject(&point, &eye.body_from_cam, &Body::from(&host.pose), &eye, &Body::from(&target.pose))
+                    .unwrap();
+                assert!((r.px - f(&point, &host, &target)).length() < 1e-12);
+                for i in 0..6 {
+                    let d_host = (f(&point, &moved(&host, i, H), &target) - f(&point, &moved(&host, i, -H), &target))
+                        / (2.0 * H);
+                    let d_target = (f(&point, &host, &moved(&target, i, H)) - f(&point, &host, &moved(&target, i, -H)))
+                        / (2.0 * H);
+                    for row in 0..2 {
+                        close(r.d_host[row][i], d_host[row], "host");
+                        close(r.d_target[row][i], d_target[row], "target");
+                    }
+                }
+                for i in 0..3 {
+                    let at = |h: f64| {
+                        let mut p = point;
+                        match i {
+                            2 => p.rho += h,
+                            _ => p.s[i] += h,
+                        }
+                        f(&p, &host, &target)
+                    };
+                    let d = (at(H) - at(-H)) / (2.0 * H);
+                    (0..2).for_each(|row| close(r.d_point[row][i], d[row], "point"));
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn stereographic_point_keeps_its_bearing() {
+        for b in [DVec3::Z, DVec3::new(0.9, -0.4, 0.1), DVec3::new(-0.5, 0.5, -0.5)] {
+            assert!((Point::new(b.normalize(), 1.0).bearing() - b.normalize()).length() < 1e-14);
+        }
+    }
+
+    fn increment() -> (Increment, InertialWeight) {
+        let noise = Noise { gyro: 1e-3, accel: 1e-2, gyro_walk: 1e-4, accel_walk: 1e-3, period: 0.005 };
+        let mut inc = Increment::new(DVec3::new(0.005, 0.0, -0.01), DVec3::new(0.05, -0.05, 0.1));
+        for k in 0..12 {
+            let t = k as f64 * 0.3;
+            inc.step(DVec3::new(t.sin(), 0.7, -t.cos()), DVec3::new(1.0, t.cos(), 9.0 + t.sin()), 0.005, &noise);
+        }
+        let weight = InertialWeight { increment: inc.whitening().unwrap(), bg: 300.0, ba: 20.0 };
+        (inc, weight)
+    }
+
+    #[test]
+    fn inertial_and_bias_jacobians_match_differences() {
+        // Unit weights: whitening is a constant factor and would only hide digits.
+        let (inc, _) = increment();
+        let w = InertialWeight { increment: Mat9::identity(), bg: 1.0, ba: 1.0 };
+        let (a, b) = (motion(1.0), motion(1.4));
+        let (ja, jb) = inertial_jacobians(&inc, &w, &a, &b);
+        for i in 0..15 {
+            let f = |a: &Motion, b: &Motion| inertial_residual(&inc, &w, a, b);
+            let da = (f(&moved(&a, i, H), &b) - f(&moved(&a, i, -H), &b)) / (2.0 * H);
+            let db = (f(&a, &moved(&b, i, H)) - f(&a, &moved(&b, i, -H))) / (2.0 * H);
+            for row in 0..15 {
+                close(ja[(row, i)], da[row], "start");
+                close(jb[(row, i)], db[row], "end");
+            }
+        }
+    }
+
+    #[test]
+    fn inertial_residual_is_zero_where_the_increment_leads() {
+        let (inc, w) = increment();
+        let a = motion(0.7);
+        assert!(inertial_residual(&inc, &w, &a, &a.propagate(&inc)).norm() < 1e-8);
+    }
+
+    #[test]
+    fn weighted_inertial_jacobian_is_the_weight_times_the_plain_one() {
+        let (inc, w) = increment();
+        let plain = InertialWeight { increment: Mat9::identity(), bg: 1.0, ba: 1.0 };
+        let (a, b) = (motion(1.0), motion(1.4));
+        let ((ja, _), (pa, _)) = (inertial_jacobians(&inc, &w, &a, &b), inertial_jacobians(&inc, &plain, &a, &b));
+        let expected = w.increment * pa.fixed_rows::<9>(0);
+        assert!((ja.fixed_rows::<9>(0) - expected).norm() < 1e-9 * expected.norm());
+        assert!((ja[(9, 9)] + 300.0).abs() < 1e-12 && (ja[(12, 12)] + 20.0).abs() < 1e-12);
+    }
+
+    #[test]
+    fn huber_cost_and_weight_agree() {
+        // d(cost)/d(length) = weight * length, on both sides of the width.
+        for x in [0.3, 0.999, 1.001, 4.0] {
+            let slope = (huber(x + H, 1.0).1 - huber(x - H, 1.0).1) / (2.0 * H);
+            close(huber(x, 1.0).0 * x, slope, "huber");
+        }
+    }
+}
