@@ -149,7 +149,7 @@ impl World {
                 let Some(px) = view else { continue };
                 let wrong = if self.noise.uniform() < 0.01 { 15.0 } else { 0.0 };
                 let px = *px + DVec2::new(self.noise.normal(), self.noise.normal()) * SIGMA_PX + wrong;
-                out.cameras[camera].push(Track { id, px: [px.x as f32, px.y as f32] }).unwrap();
+                out.cameras[camera].push(Track { id, px: [px.x as f32, px.y as f32] }).expect("120 fit");
             }
         }
     }
