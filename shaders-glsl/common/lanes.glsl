@@ -1,0 +1,120 @@
+// One tile is shaded by LANES invocations in step. Each fetches one Gaussian; then all take them in
+// turn. The subgroup variant keeps the batch in registers and passes it by shuffle, with several
+// tiles to a workgroup where subgroups are narrower than it; the baseline keeps it in shared memory,
+// with one tile of 32 lanes to a workgroup.
+
+#ifdef SUBGROUP
+
+uint lane() {
+    return gl_SubgroupInvocationID;
+}
+
+uint tile_index() {
+    return group_index() * (gl_WorkGroupSize.x / LANES) + gl_SubgroupID;
+}
+
+struct Batch {
+    vec4 a, b;
+    uint slot;
+};
+Batch held;
+
+void batch_put(vec4 a, vec4 b, uint slot) {
+    held = Batch(a, b, slot);
+}
+
+Batch batch_get(uint i) {
+    return Batch(subgroupShuffle(held.a, i), subgroupShuffle(held.b, i), subgroupShuffle(held.slot, i));
+}
+
+bool all_lanes(bool done) {
+    return subgroupAll(done);
+}
+
+/// Sums 8 values over the lanes by halving: lane l gets the sum of value l & 7.
+float sum_of_eight(float v[8]) {
+    const uint l = lane();
+    float r[4];
+    [[unroll]] for (uint i = 0; i < 4; ++i) {
+        const bool up = (l & 4u) != 0;
+        r[i] = (up ? v[i + 4] : v[i]) + subgroupShuffleXor(up ? v[i] : v[i + 4], 4);
+    }
+    [[unroll]] for (uint i = 0; i < 2; ++i) {
+        const bool up = (l & 2u) != 0;
+        r[i] = (up ? r[i + 2] : r[i]) + subgroupShuffleXor(up ? r[i] : r[i + 2], 2);
+    }
+    const bool up = (l & 1u) != 0;
+    float s = (up ? r[1] : r[0]) + subgroupShuffleXor(up ? r[0] : r[1], 1);
+    if (LANES > 8) {
+        s += subgroupShuffleXor(s, 8);
+    }
+    if (LANES > 16) {
+        s += subgroupShuffleXor(s, 16);
+    }
+    return s;
+}
+
+#else
+
+uint lane() {
+    return gl_LocalInvocationID.x;
+}
+
+uint tile_index() {
+    return group_index();
+}
+
+struct Batch {
+    vec4 a, b;
+    uint slot;
+};
+shared vec4 batch_a[32];
+shared vec4 batch_b[32];
+shared uint batch_slot[32];
+shared uint pending;
+shared float terms[8 * 33];
+
+void batch_put(vec4 a, vec4 b, uint slot) {
+    barrier();
+    batch_a[lane()] = a;
+    batch_b[lane()] = b;
+    batch_slot[lane()] = slot;
+    barrier();
+}
+
+Batch batch_get(uint i) {
+    return Batch(batch_a[i], batch_b[i], batch_slot[i]);
+}
+
+bool all_lanes(bool done) {
+    barrier();
+    if (lane() == 0) {
+        pending = 0;
+    }
+    barrier();
+    if (!done) {
+        atomicOr(pending, 1u);
+    }
+    barrier();
+    return pending == 0;
+}
+
+float sum_of_eight(float v[8]) {
+    const uint l = lane();
+    barrier();
+    [[unroll]] for (uint i = 0; i < 8; ++i) {
+        terms[i * 33 + l] = v[i];
+    }
+    barrier();
+    float s = 0.0;
+    [[unroll]] for (uint i = 0; i < 8; ++i) {
+        s += terms[(l & 7u) * 33 + (l >> 3) * 8 + i];
+    }
+    barrier();
+    terms[(l & 7u) * 33 + (l >> 3)] = s;
+    barrier();
+    const uint row = (l & 7u) * 33;
+    return (terms[row] + terms[row + 1]) + (terms[row + 2] + terms[row + 3]);
+}
+
+#endif

@@ -1,0 +1,67 @@
+// Last pass of the loss (1 - λ)|x - y| + λ(1 - SSIM), mean over valid pixels: its gradient by the rendered image.
+// in   filtered_planes (slopes filtered along rows), grey (rendered), targets, mask
+// out  grey_gradient, zero where masked; l1_sums[group]
+#version 450
+#extension GL_GOOGLE_include_directive : require
+#extension GL_EXT_control_flow_attributes : require
+layout(local_size_x = 64) in;
+
+#include "../common/index.glsl"
+#include "../common/ssim.glsl"
+#include "../common/sum64.glsl"
+
+layout(push_constant) uniform Push {
+    uvec2 size;
+    uint target;       // word offset of the keyframe
+    float l1_weight;   // (1 - λ) / valid pixels
+    float ssim_weight; // λ / valid pixels
+} push;
+
+layout(set = 0, binding = 0, std430) readonly buffer Filtered { float filtered_planes[]; };
+layout(set = 0, binding = 1, std430) readonly buffer Grey { float grey[]; };
+layout(set = 0, binding = 2, std430) readonly buffer Targets { uint targets[]; };
+layout(set = 0, binding = 3, std430) readonly buffer Mask { uint mask[]; };
+layout(set = 0, binding = 4, std430) writeonly buffer GreyGradient { float grey_gradient[]; };
+layout(set = 0, binding = 5, std430) writeonly buffer L1Sums { float l1_sums[]; };
+
+float column_run(uint x, uint y0) {
+    const uint plane = push.size.x * push.size.y;
+    float slope[3][RUN];
+    [[unroll]] for (uint q = 0; q < 3; ++q) {
+        float v[REACH];
+        [[unroll]] for (uint k = 0; k < REACH; ++k) {
+            const int y = int(y0 + k) - int(RADIUS);
+            const float m = filtered_planes[q * plane + uint(clamp(y, 0, int(push.size.y) - 1)) * push.size.x + x];
+            v[k] = y >= 0 && y < int(push.size.y) ? m : 0.0;
+        }
+        [[unroll]] for (uint k = 0; k < RUN; ++k) {
+            slope[q][k] = filtered(v, k);
+        }
+    }
+    const uint stride = byte_stride(push.size.x);
+    float sum = 0.0;
+    [[unroll]] for (uint k = 0; k < RUN; ++k) {
+        const uint y = y0 + k;
+        if (y < push.size.y) {
+            const uint at = y * push.size.x + x, byte = y * stride + x;
+            const bool valid = ((mask[byte / 4] >> (8 * (byte % 4))) & 255u) != 0;
+            const float a = grey[at];
+            const float b = float((targets[push.target + byte / 4] >> (8 * (byte % 4))) & 255u) / 255.0;
+            const float d_ssim = slope[0][k] + 2.0 * a * slope[1][k] + b * slope[2][k];
+            grey_gradient[at] = valid ? push.l1_weight * sign(a - b) - push.ssim_weight * d_ssim : 0.0;
+            sum += valid ? abs(a - b) : 0.0;
+        }
+    }
+    return sum;
+}
+
+void main() {
+    const uint at = thread_index();
+    const uint runs = (push.size.y + RUN - 1) / RUN;
+    // All threads stay for the sum.
+    const float s = at < push.size.x * runs ? column_run(at % push.size.x, at / push.size.x * RUN) : 0.0;
+    const float total = sum64(s);
+    if (gl_LocalInvocationID.x == 0) {
+        l1_sums[group_index()] = total;
+    }
+}

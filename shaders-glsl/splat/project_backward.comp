@@ -1,0 +1,137 @@
+// Sums each visible Gaussian's intersection gradients in fixed order, carries them back to its parameters
+// and to the camera pose, adds the regularisers, and takes one Adam step: one thread a rank.
+// in   visible_count, slots (by depth), tile_offsets, isect_gradients
+// out  splats, moments, steps (Adam's count, of this Gaussian); sums[8 group + ..]: gradient by a small
+//      translation (3) and rotation (3) of the camera frame applied to points, count of refused gradients, 0
+// A step whose gradient is not finite is not taken, and counted.
+#version 450
+#extension GL_GOOGLE_include_directive : require
+#extension GL_EXT_control_flow_attributes : require
+layout(local_size_x = 64) in;
+
+#include "../common/types.glsl"
+#include "../common/camera.glsl"
+#include "../common/backward.glsl"
+#include "../common/index.glsl"
+
+layout(push_constant) uniform Push {
+    Camera camera;
+    uvec2 size;
+    uint capacity;            // intersections
+    float rate_position;      // Adam step sizes: m, ln m, 1, logit, grey
+    float rate_scale;
+    float rate_rotation;
+    float rate_opacity;
+    float rate_colour;
+    float weight_needle;      // regularisers, mean over the visible: see regularise()
+    float weight_scale;
+    float log_scale_soft;     // ln m
+    float weight_opacity;
+} push;
+
+layout(set = 0, binding = 0, std430) readonly buffer VisibleCount { uint visible_count[]; };
+layout(set = 0, binding = 1, std430) readonly buffer Slots { uint slots[]; };
+layout(set = 0, binding = 2, std430) readonly buffer TileOffsets { uint tile_offsets[]; };
+layout(set = 0, binding = 3, std430) readonly buffer IsectGradients { vec4 isect_gradients[]; };
+layout(set = 0, binding = 4, std430) buffer Splats { Splat splats[]; };
+layout(set = 0, binding = 5, std430) buffer MomentsInOut { Moments moments[]; };
+layout(set = 0, binding = 6, std430) buffer Steps { uint steps[]; };
+layout(set = 0, binding = 7, std430) writeonly buffer Sums { float sums[]; };
+
+const float BETA1 = 0.9;
+const float BETA2 = 0.999;
+const float EPSILON = 1e-15;
+const float NEEDLE_LOG_RATIO = 1.0986123;  // ln 3: discs are free, needles are not
+
+/// Gradient by log scale of: how far the longest axis exceeds three times the second, and a soft bound.
+vec3 regularise(vec3 log_scale, float per_splat) {
+    const vec3 l = log_scale;
+    const int longest = l.x >= l.y ? (l.x >= l.z ? 0 : 2) : (l.y >= l.z ? 1 : 2);
+    const int next = (longest + 1) % 3, last = (longest + 2) % 3;
+    const int second = l[next] >= l[last] ? next : last;
+    vec3 g = vec3(0.0);
+    if (l[longest] - l[second] > NEEDLE_LOG_RATIO) {
+        g[longest] += push.weight_needle * per_splat;
+        g[second] -= push.weight_needle * per_splat;
+    }
+    if (l[longest] > push.log_scale_soft) {
+        g[longest] += push.weight_scale * per_splat;
+    }
+    return g;
+}
+
+vec4 adam(inout vec4 m, inout vec4 v, vec4 g, vec4 rate, vec2 debias) {
+    m = BETA1 * m + (1.0 - BETA1) * g;
+    v = BETA2 * v + (1.0 - BETA2) * g * g;
+    return rate * (m * debias.x) / (sqrt(v * debias.y) + EPSILON);
+}
+
+/// Takes the step; the six pose terms, or a one in the seventh place.
+float[7] update(uint rank) {
+    float pose[7] = float[7](0, 0, 0, 0, 0, 0, 0);
+    const uint begin = tile_offsets[rank], end = min(tile_offsets[rank + 1], push.capacity);
+    vec4 v0 = vec4(0.0), v1 = vec4(0.0);
+    for (uint i = begin; i < end; ++i) {
+        v0 += isect_gradients[2 * i];
+        v1 += isect_gradients[2 * i + 1];
+    }
+    if (begin >= end) {
+        return pose;
+    }
+    const uint slot = slots[rank];
+    Splat s = splats[slot];
+    Local l;
+    place(push.camera, s, l);
+    flatten(push.camera, vec2(push.size), l);
+    const Gradient g = pull_back(push.camera, l, s.scale_colour.xyz, v0.xy, vec3(v0.zw, v1.x));
+    const float per_splat = 1.0 / float(visible_count[0]);
+    const float opacity = sigmoid(s.mean_opacity.w);
+    const float v_logit = (1.0 - opacity) * (v1.y + push.weight_opacity * per_splat * opacity);
+    const vec4 d0 = vec4(transpose(cam_from_world(push.camera)) * g.cam, v_logit);
+    const vec4 d1 = vec4(g.scale + regularise(s.scale_colour.xyz, per_splat), v1.z);
+    if (!(finite(d0) && finite(d1) && finite(g.quat) && finite(vec4(g.turn, 0.0)))) {
+        pose[6] = 1.0;
+        return pose;
+    }
+    const vec3 turn = cross(l.p, g.cam) + g.turn;
+    pose = float[7](g.cam.x, g.cam.y, g.cam.z, turn.x, turn.y, turn.z, 0.0);
+
+    const uint step = min(steps[slot] + 1, 65535u);
+    const vec2 debias = 1.0 / (1.0 - exp2(float(step) * log2(vec2(BETA1, BETA2))));
+    Moments a = moments[slot];
+    s.mean_opacity -= adam(a.m[0], a.v[0], d0, vec4(vec3(push.rate_position), push.rate_opacity), debias);
+    s.scale_colour -= adam(a.m[1], a.v[1], d1, vec4(vec3(push.rate_scale), push.rate_colour), debias);
+    s.quat -= adam(a.m[2], a.v[2], g.quat, vec4(push.rate_rotation), debias);
+    s.scale_colour.w = clamp(s.scale_colour.w, 0.0, 1.0);
+    s.scale_colour.xyz = clamp(s.scale_colour.xyz, LOG_SCALE_MIN, LOG_SCALE_MAX);
+    s.quat /= max(length(s.quat), 1e-3);
+    if (!(finite(s.mean_opacity) && finite(s.scale_colour) && finite(s.quat))) {
+        pose[6] = 1.0;
+        return pose;
+    }
+    splats[slot] = s;
+    moments[slot] = a;
+    steps[slot] = step;
+    return pose;
+}
+
+shared float terms[7 * 65];
+
+void main() {
+    const uint rank = thread_index(), i = gl_LocalInvocationID.x;
+    float pose[7] = float[7](0, 0, 0, 0, 0, 0, 0);
+    if (rank < visible_count[0]) {
+        pose = update(rank);
+    }
+    [[unroll]] for (uint q = 0; q < 7; ++q) {
+        terms[q * 65 + i] = pose[q];
+    }
+    barrier();
+    if (i < 8) {
+        float sum = 0.0;
+        for (uint k = 0; k < 64 && i < 7; ++k) {
+            sum += terms[i * 65 + k];
+        }
+        sums[group_index() * 8 + i] = sum;
+    }
+}

@@ -1,0 +1,85 @@
+// Blends the Gaussians of each tile front to back: one column of 8 pixels a lane.
+// in   ranges, intersections (by tile, then depth), owners, projected
+// out  grey, transmittance; depth (expected, m) when DEPTH is set
+// A pixel ends after the contribution that makes it opaque, so that transmittance alone tells, here
+// and in the backward pass, who contributed.
+#version 450
+#extension GL_GOOGLE_include_directive : require
+#extension GL_EXT_control_flow_attributes : require
+// variants: subgroup
+#ifdef SUBGROUP
+#extension GL_KHR_shader_subgroup_basic : require
+#extension GL_KHR_shader_subgroup_vote : require
+#extension GL_KHR_shader_subgroup_shuffle : require
+#endif
+layout(local_size_x = 32) in;
+layout(constant_id = 1) const uint DEPTH = 0;
+
+#include "../common/types.glsl"
+#include "../common/index.glsl"
+#include "../common/tiles.glsl"
+#include "../common/lanes.glsl"
+#include "../common/shade.glsl"
+
+layout(push_constant) uniform Push {
+    uvec2 size;
+} push;
+
+layout(set = 0, binding = 0, std430) readonly buffer Ranges { uvec2 ranges[]; };
+layout(set = 0, binding = 1, std430) readonly buffer Intersections { uint intersections[]; };
+layout(set = 0, binding = 2, std430) readonly buffer Owners { uint owners[]; };
+layout(set = 0, binding = 3, std430) readonly buffer ProjectedIn { Projected projected[]; };
+layout(set = 0, binding = 4, std430) writeonly buffer Grey { float grey[]; };
+layout(set = 0, binding = 5, std430) writeonly buffer Transmittance { float transmittance[]; };
+layout(set = 0, binding = 6, std430) writeonly buffer Depth { float depth[]; };
+
+void main() {
+    const uint tile = tile_index();
+    const uvec2 grid = tile_grid(push.size);
+    if (tile >= grid.x * grid.y) {
+        return;
+    }
+    const uvec2 pixel = column_of(tile, push.size);
+    const vec2 top = vec2(pixel) + 0.5;
+    float t[COLUMN], c[COLUMN], z[COLUMN];
+    [[unroll]] for (uint k = 0; k < COLUMN; ++k) {
+        // Pixels outside the image are opaque from the start and never hold the tile up.
+        t[k] = pixel.x < push.size.x && pixel.y + k < push.size.y ? 1.0 : 0.0;
+        c[k] = z[k] = 0.0;
+    }
+    const uvec2 range = ranges[tile];
+    for (uint base = range.x; base < range.y; base += LANES) {
+        const uint i = min(base + lane(), range.y - 1);
+        const Projected g = projected[owners[intersections[i]]];
+        batch_put(g.centre_conic, vec4(g.conic_shade.x, log2(g.conic_shade.y), g.conic_shade.zw), 0);
+        const uint n = min(LANES, range.y - base);
+        for (uint j = 0; j < n; ++j) {
+            const Column s = column_terms(batch_get(j), top);
+            [[unroll]] for (uint k = 0; k < COLUMN; ++k) {
+                const float w = effective(alpha_at(s, s.d.y - float(k)), t[k]) * t[k];
+                c[k] += w * s.grey;
+                if (DEPTH != 0) {
+                    z[k] += w * s.depth;
+                }
+                t[k] -= w;
+            }
+        }
+        float clearest = t[0];
+        [[unroll]] for (uint k = 1; k < COLUMN; ++k) {
+            clearest = max(clearest, t[k]);
+        }
+        if (all_lanes(clearest <= TRANSMITTANCE_MIN)) {
+            break;
+        }
+    }
+    [[unroll]] for (uint k = 0; k < COLUMN; ++k) {
+        if (pixel.x < push.size.x && pixel.y + k < push.size.y) {
+            const uint at = (pixel.y + k) * push.size.x + pixel.x;
+            grey[at] = c[k];
+            transmittance[at] = t[k];
+            if (DEPTH != 0) {
+                depth[at] = z[k] / max(1.0 - t[k], 1e-6);
+            }
+        }
+    }
+}

@@ -1,0 +1,69 @@
+// Second pass of SSIM: filters along columns, evaluates SSIM, and writes its derivatives by E[x], E[x²], E[xy].
+// in   filtered_planes (moments filtered along rows), mask
+// out  slopes: planes of dS/dE[x], dS/dE[x²], dS/dE[xy], zero where masked; ssim_sums[group] of S over valid pixels
+#version 450
+#extension GL_GOOGLE_include_directive : require
+#extension GL_EXT_control_flow_attributes : require
+layout(local_size_x = 64) in;
+
+#include "../common/index.glsl"
+#include "../common/ssim.glsl"
+#include "../common/sum64.glsl"
+
+layout(push_constant) uniform Push {
+    uvec2 size;
+} push;
+
+layout(set = 0, binding = 0, std430) readonly buffer Filtered { float filtered_planes[]; };
+layout(set = 0, binding = 1, std430) readonly buffer Mask { uint mask[]; };
+layout(set = 0, binding = 2, std430) writeonly buffer Slopes { float slopes[]; };
+layout(set = 0, binding = 3, std430) writeonly buffer SsimSums { float ssim_sums[]; };
+
+float column_run(uint x, uint y0) {
+    const uint plane = push.size.x * push.size.y;
+    float e[5][RUN];
+    [[unroll]] for (uint q = 0; q < 5; ++q) {
+        float v[REACH];
+        [[unroll]] for (uint k = 0; k < REACH; ++k) {
+            const int y = int(y0 + k) - int(RADIUS);
+            const bool inside = y >= 0 && y < int(push.size.y);
+            const float m = filtered_planes[q * plane + uint(clamp(y, 0, int(push.size.y) - 1)) * push.size.x + x];
+            v[k] = inside ? m : 0.0;
+        }
+        [[unroll]] for (uint k = 0; k < RUN; ++k) {
+            e[q][k] = filtered(v, k);
+        }
+    }
+    const uint stride = byte_stride(push.size.x);
+    float sum = 0.0;
+    [[unroll]] for (uint k = 0; k < RUN; ++k) {
+        const uint y = y0 + k;
+        const uint byte = min(y, push.size.y - 1) * stride + x;
+        const bool valid = y < push.size.y && ((mask[byte / 4] >> (8 * (byte % 4))) & 255u) != 0;
+        const float mx = e[0][k], my = e[1][k];
+        const float a1 = 2.0 * mx * my + C1, b1 = mx * mx + my * my + C1;
+        const float a2 = 2.0 * (e[4][k] - mx * my) + C2;
+        const float b2 = max(e[2][k] - mx * mx, 0.0) + max(e[3][k] - my * my, 0.0) + C2;
+        const float inv = 1.0 / (b1 * b2);
+        const float s = a1 * a2 * inv;
+        if (y < push.size.y) {
+            const uint at = y * push.size.x + x;
+            slopes[at] = valid ? 2.0 * (my * (a2 - a1) * inv - mx * s / b1 + mx * s / b2) : 0.0;
+            slopes[plane + at] = valid ? -s / b2 : 0.0;
+            slopes[2 * plane + at] = valid ? 2.0 * a1 * inv : 0.0;
+        }
+        sum += valid ? s : 0.0;
+    }
+    return sum;
+}
+
+void main() {
+    const uint at = thread_index();
+    const uint runs = (push.size.y + RUN - 1) / RUN;
+    // All threads stay for the sum.
+    const float s = at < push.size.x * runs ? column_run(at % push.size.x, at / push.size.x * RUN) : 0.0;
+    const float total = sum64(s);
+    if (gl_LocalInvocationID.x == 0) {
+        ssim_sums[group_index()] = total;
+    }
+}

@@ -1,0 +1,61 @@
+// First pass of SSIM: filters both images, their squares and their product along rows.
+// in   grey (rendered), targets (8 bit, four to a word), mask (8 bit, zero = ignore)
+// out  filtered_planes: of E[x], E[y], E[x²], E[y²], E[xy]
+#version 450
+#extension GL_GOOGLE_include_directive : require
+#extension GL_EXT_control_flow_attributes : require
+layout(local_size_x = 64) in;
+
+#include "../common/index.glsl"
+#include "../common/ssim.glsl"
+
+layout(push_constant) uniform Push {
+    uvec2 size;
+    uint target;  // word offset of the keyframe
+} push;
+
+layout(set = 0, binding = 0, std430) readonly buffer Grey { float grey[]; };
+layout(set = 0, binding = 1, std430) readonly buffer Targets { uint targets[]; };
+layout(set = 0, binding = 2, std430) readonly buffer Mask { uint mask[]; };
+layout(set = 0, binding = 3, std430) writeonly buffer Filtered { float filtered_planes[]; };
+
+void main() {
+    const uint runs = (push.size.x + RUN - 1) / RUN;
+    const uint at = thread_index();
+    if (at >= runs * push.size.y) {
+        return;
+    }
+    const uint y = at / runs, x0 = at % runs * RUN;
+    const uint words = byte_stride(push.size.x) / 4;
+    float a[REACH], b[REACH], product[REACH];
+    // The run with its margins spans six words, from x0 - 8.
+    [[unroll]] for (uint w = 0; w < 6; ++w) {
+        const int word = int(x0 / 4 + w) - 2;
+        const bool inside = word >= 0 && word < int(words);
+        const uint i = y * words + uint(clamp(word, 0, int(words) - 1));
+        const uint m = inside ? mask[i] : 0;
+        const uint t = targets[push.target + i];
+        [[unroll]] for (uint byte = 0; byte < 4; ++byte) {
+            const int k = int(w * 4 + byte) - 3;
+            if (k >= 0 && k < int(REACH)) {
+                const bool valid = ((m >> (8 * byte)) & 255u) != 0;
+                const uint x = min(uint(max(word, 0)) * 4 + byte, push.size.x - 1);
+                a[k] = valid ? grey[y * push.size.x + x] : 0.0;
+                b[k] = valid ? float((t >> (8 * byte)) & 255u) / 255.0 : 0.0;
+            }
+        }
+    }
+    const uint plane = push.size.x * push.size.y;
+    const uint out0 = y * push.size.x + x0;
+    const uint n = min(RUN, push.size.x - x0);
+    [[unroll]] for (uint q = 0; q < 5; ++q) {
+        [[unroll]] for (uint k = 0; k < REACH; ++k) {
+            product[k] = q == 0 ? a[k] : q == 1 ? b[k] : q == 2 ? a[k] * a[k] : q == 3 ? b[k] * b[k] : a[k] * b[k];
+        }
+        [[unroll]] for (uint k = 0; k < RUN; ++k) {
+            if (k < n) {
+                filtered_planes[q * plane + out0 + k] = filtered(product, k);
+            }
+        }
+    }
+}

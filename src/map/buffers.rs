@@ -1,0 +1,114 @@
+//! What the splat kernels keep in the arena, sized once by `Shape`.
+
+use super::sort::{Pairs, Sorter};
+use crate::gpu::kernels::types::{Moments, Projected, Splat, Status};
+use crate::gpu::{Buf, Gpu};
+use crate::mem::Footprint;
+use stipple_drivers::Fault;
+
+/// Capacities of the mapper, from the board's budget and the rectified camera.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Shape {
+    /// Mapping resolution, px.
+    pub width: u32,
+    pub height: u32,
+    pub splats: u32,
+    /// (Gaussian, tile) pairs of one view.
+    pub intersections: u32,
+    /// Images kept to train on.
+    pub keyframes: u32,
+}
+
+/// Gaussians that travel to the GPU at a time.
+pub const ARRIVALS: usize = 4096;
+/// Pixels of a run filtered by one thread of the loss: RUN of ssim.glsl.
+pub const RUN: u32 = 8;
+/// Invocations of a workgroup of every kernel that reduces.
+pub const GROUP: u32 = 64;
+/// Narrowest tile, px: what the narrowest subgroup makes of it.
+const TILE_MIN: u32 = 8;
+
+impl Shape {
+    pub fn pixels(&self) -> usize {
+        self.width as usize * self.height as usize
+    }
+
+    /// Words of one stored 8-bit image; rows are padded to whole words.
+    pub fn image_words(&self) -> usize {
+        self.width.div_ceil(4) as usize * self.height as usize
+    }
+
+    fn tiles_max(&self) -> usize {
+        self.width.div_ceil(TILE_MIN) as usize * self.height.div_ceil(TILE_MIN) as usize
+    }
+}
+
+macro_rules! buffers {
+    ($($field:ident: $of:ty, $name:literal, |$s:ident| $len:expr;)+) => {
+        /// Every buffer, by what it holds.
+        pub struct Buffers { $(pub $field: Buf<$of>),+ }
+
+        impl Buffers {
+            pub fn new(gpu: &mut Gpu, shape: &Shape) -> Result<Buffers, Fault> {
+                Ok(Buffers { $($field: { let $s = shape; gpu.alloc::<$of>($name, $len)? }),+ })
+            }
+
+            pub fn footprint(shape: &Shape) -> Footprint {
+                let mut f = Footprint::default();
+                $(f.gpu($name, { let $s = shape; $len } * size_of::<$of>());)+
+                f.extend(Sorter::footprint(shape.splats.max(shape.intersections) as usize));
+                f
+            }
+        }
+    };
+}
+
+buffers! {
+    splats: Splat, "splats: parameters", |s| s.splats as usize;
+    moments: Moments, "splats: Adam moments", |s| s.splats as usize;
+    steps: u32, "splats: Adam steps", |s| s.splats as usize;
+    projected: Projected, "splats: projected", |s| s.splats as usize;
+    visible: u32, "splats: visible, then its prefix sum", |s| s.splats as usize + 1;
+    depth_keys: u32, "splats: depth keys", |s| s.splats as usize;
+    slots: u32, "splats: visible slots", |s| s.splats as usize;
+    ranked: u32, "splats: visible slots by depth", |s| s.splats as usize;
+    tile_offsets: u32, "splats: tiles touched, then their prefix sum", |s| s.splats as usize + 1;
+    pose_sums: f32, "splats: pose gradient by workgroup", |s| 8 * (s.splats.div_ceil(GROUP) as usize);
+    freed: u32, "splats: freed slots", |s| s.splats as usize;
+    arrivals: Splat, "splats: arrivals", |_s| ARRIVALS;
+    arrival_slots: u32, "splats: slots of arrivals", |_s| ARRIVALS;
+    isect_keys: u32, "intersections: tiles", |s| s.intersections as usize;
+    isects: u32, "intersections: their index", |s| s.intersections as usize;
+    owners: u32, "intersections: slots", |s| s.intersections as usize;
+    isect_gradients: f32, "intersections: gradients", |s| 8 * s.intersections as usize;
+    ranges: [u32; 2], "tiles: ranges", |s| s.tiles_max();
+    grey: f32, "pixels: grey", |s| s.pixels();
+    transmittance: f32, "pixels: transmittance", |s| s.pixels();
+    depth: f32, "pixels: depth", |s| s.pixels();
+    grey_gradient: f32, "pixels: gradient", |s| s.pixels();
+    filtered: f32, "pixels: filtered moments", |s| 5 * s.pixels();
+    slopes: f32, "pixels: SSIM slopes", |s| 3 * s.pixels();
+    ssim_sums: f32, "pixels: SSIM by workgroup", |s| image_groups(s.width, s.height) as usize;
+    l1_sums: f32, "pixels: L1 by workgroup", |s| image_groups(s.width, s.height) as usize;
+    mask: u32, "keyframes: mask", |s| s.image_words();
+    targets: u32, "keyframes: images", |s| s.image_words() * s.keyframes as usize;
+    visible_count: u32, "counts: visible", |_s| 1;
+    isect_count: u32, "counts: intersections listed, needed, workgroups", |_s| 5;
+    failed: u32, "counts: not finite", |_s| 1;
+    status: Status, "status", |_s| 1;
+}
+
+impl Buffers {
+    pub fn by_depth(&self) -> Pairs {
+        Pairs { keys: self.depth_keys, payload: self.slots }
+    }
+
+    pub fn by_tile(&self) -> Pairs {
+        Pairs { keys: self.isect_keys, payload: self.isects }
+    }
+}
+
+/// Workgroups of the column passes of the loss.
+pub fn image_groups(width: u32, height: u32) -> u32 {
+    (width * height.div_ceil(RUN)).div_ceil(GROUP)
+}

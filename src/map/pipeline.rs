@@ -1,0 +1,529 @@
+//! The splat kernels in the order they run. Rendering is `project` to `raster_forward`; a training step
+//! goes on through the loss and back to the parameters.
+//!
+//! ```text
+//! project -> scan -> compact -> sort by depth            Gaussians -> visible, front to back
+//! count_tiles -> scan -> emit_tiles -> sort by tile -> tile_ranges -> raster_forward
+//! ssim_rows -> ssim_columns -> loss_rows -> loss_columns  picture -> gradient by pixel
+//! raster_backward -> project_backward (Adam) -> summary   -> gradient by intersection -> Gaussian
+//! ```
+//!
+//! Counts stay on the GPU: every dispatch is sized by capacity and ends early. The host reads 64 bytes after a
+//! step. Sums have one order, so that a step is the same in every run (3D Gaussian splatting: Kerbl et al. 2023;
+//! one gradient slot per intersection instead of atomics).
+
+pub use super::buffers::Shape;
+use super::buffers::{image_groups, Buffers, ARRIVALS, GROUP, RUN};
+pub use super::pool::{PruneRule, SplatInit};
+use super::sort::{Pairs, Scan, Sorter};
+use crate::gpu::kernels::types::{Camera, Splat, Status};
+use crate::gpu::kernels::*;
+use crate::gpu::{Gpu, GpuError, Kernel, KernelDef, Recorder, Threads};
+use crate::mem::Footprint;
+use crate::stereo::Pinhole;
+use glam::DVec3;
+use stipple_drivers::{Exit, Fault, Pose};
+
+/// Bits of a depth key: DEPTH_BITS of compact.comp.
+const DEPTH_BITS: u32 = 22;
+/// Pixels of a lane's column: COLUMN of tiles.glsl.
+const COLUMN: u32 = 8;
+
+/// A camera where it is looked from.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct View {
+    pub world_from_cam: Pose,
+    pub camera: Pinhole,
+}
+
+/// Adam step sizes: m, ln m, quaternion, logit, grey.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct LearningRates {
+    pub position: f32,
+    pub scale: f32,
+    pub rotation: f32,
+    pub opacity: f32,
+    pub colour: f32,
+}
+
+/// Of the loss (1 - ssim)·L1 + ssim·(1 - SSIM) + mean over the visible of the rest.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Weights {
+    pub ssim: f32,
+    /// On ln(longest axis / second axis) above ln 3.
+    pub needle: f32,
+    /// On ln(longest axis) above ln(scale_soft_m).
+    pub scale: f32,
+    pub scale_soft_m: f32,
+    /// On the opacity.
+    pub opacity: f32,
+}
+
+impl Default for Weights {
+    fn default() -> Self {
+        Weights { ssim: 0.2, needle: 0.0, scale: 0.0, scale_soft_m: 1.0, opacity: 0.0 }
+    }
+}
+
+/// A picture of the map; sized by the view.
+#[derive(Clone, Debug, Default)]
+pub struct Rendered {
+    pub width: usize,
+    pub height: usize,
+    pub grey: Vec<f32>,
+    pub alpha: Vec<f32>,
+    /// Expected depth, m; zero where nothing was hit.
+    pub depth: Vec<f32>,
+}
+
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Stats {
+    pub visible: u32,
+    pub intersections: u32,
+    /// Intersections there was no room for: the farthest.
+    pub overflow: u32,
+    /// Gaussians culled for not being finite.
+    pub failed: u32,
+}
+
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct StepStats {
+    pub stats: Stats,
+    pub loss: f64,
+    pub l1: f64,
+    pub ssim: f64,
+    /// Gaussians not moved because their gradient was not finite.
+    pub gradients_rejected: u32,
+    /// By [p, θ] of world_from_cam: p additive in world, rotation perturbed on the right.
+    pub pose_gradient: [f64; 6],
+}
+
+pub(super) struct Kernels {
+    project: Kernel<project::K>,
+    compact: Kernel<compact::K>,
+    count_tiles: Kernel<count_tiles::K>,
+    emit_tiles: Kernel<emit_tiles::K>,
+    tile_ranges: Kernel<tile_ranges::K>,
+    raster_training: Kernel<raster_forward::K>,
+    raster_picture: Kernel<raster_forward::K>,
+    ssim_rows: Kernel<ssim_rows::K>,
+    ssim_columns: Kernel<ssim_columns::K>,
+    loss_rows: Kernel<loss_rows::K>,
+    loss_columns: Kernel<loss_columns::K>,
+    raster_backward: Kernel<raster_backward::K>,
+    project_backward: Kernel<project_backward::K>,
+    summary: Kernel<summary::K>,
+    pub(super) insert: Kernel<insert::K>,
+    pub(super) prune: Kernel<prune::K>,
+}
+
+pub struct Pipeline {
+    pub(super) shape: Shape,
+    /// Invocations that shade a tile in step.
+    lanes: u32,
+    pub(super) k: Kernels,
+    pub(super) b: Buffers,
+    scan: Scan,
+    sorter: Sorter,
+    /// Slots below this were used at least once.
+    pub(super) high_water: u32,
+    pub(super) free: Vec<u32>,
+    pub(super) valid_pixels: u32,
+    /// Host side of images, slots and pool transfers.
+    pub(super) words: Vec<u32>,
+    pub(super) pool: Vec<Splat>,
+}
+
+impl Pipeline {
+    pub fn footprint(shape: &Shape) -> Footprint {
+        let mut f = Buffers::footprint(shape);
+        let n = shape.splats as usize;
+        f.host("pipeline: free slots", n * size_of::<u32>());
+        f.host("pipeline: transfers", words_max(shape) * size_of::<u32>() + n * size_of::<Splat>());
+        f
+    }
+
+    /// Arena bytes that `new` takes, alignment included.
+    pub fn arena_bytes(shape: &Shape) -> u64 {
+        let align = |bytes: u64| bytes.next_multiple_of(crate::gpu::ALIGN);
+        let rows = Pipeline::footprint(shape).rows;
+        // Two scans: the sorter's and ours; some rows are two buffers.
+        rows.iter().filter(|r| r.gpu).map(|r| align(r.bytes) + crate::gpu::ALIGN).sum::<u64>() + (64 << 10)
+    }
+
+    pub fn new(gpu: &mut Gpu, shape: Shape) -> Result<Pipeline, Fault> {
+        let caps = gpu.caps();
+        let sub = caps.subgroup.vote && caps.subgroup.shuffle;
+        let (lanes, variant) = match caps.subgroup_size {
+            n @ (8 | 16 | 32 | 64) if sub => (n.min(32), "subgroup"),
+            _ => (32, ""),
+        };
+        Pipeline::with_lanes(gpu, shape, lanes, variant)
+    }
+
+    /// As `new`, with the raster variant chosen: `("", 32)` is the baseline that every device runs.
+    pub fn with_lanes(gpu: &mut Gpu, shape: Shape, lanes: u32, variant: &str) -> Result<Pipeline, Fault> {
+        if shape.width == 0
+            || shape.height == 0
+            || shape.splats == 0
+            || shape.intersections == 0
+            || shape.keyframes == 0
+        {
+            return Err(Fault::new(Exit::Config, "map", format!("{shape:?} has a zero"), "raise the board's [budget]"));
+        }
+        let raster = |depth| raster_forward::Spec { lanes, depth };
+        let k = Kernels {
+            project: gpu.kernel::<project::K>(project::Spec { lanes })?,
+            compact: plain::<compact::K>(gpu)?,
+            count_tiles: gpu.kernel::<count_tiles::K>(count_tiles::Spec { lanes })?,
+            emit_tiles: gpu.kernel::<emit_tiles::K>(emit_tiles::Spec { lanes })?,
+            tile_ranges: plain::<tile_ranges::K>(gpu)?,
+            raster_training: gpu.kernel_variant::<raster_forward::K>(raster(0), variant)?,
+            raster_picture: gpu.kernel_variant::<raster_forward::K>(raster(1), variant)?,
+            ssim_rows: plain::<ssim_rows::K>(gpu)?,
+            ssim_columns: plain::<ssim_columns::K>(gpu)?,
+            loss_rows: plain::<loss_rows::K>(gpu)?,
+            loss_columns: plain::<loss_columns::K>(gpu)?,
+            raster_backward: gpu.kernel_variant::<raster_backward::K>(raster_backward::Spec { lanes }, variant)?,
+            project_backward: plain::<project_backward::K>(gpu)?,
+            summary: plain::<summary::K>(gpu)?,
+            insert: plain::<insert::K>(gpu)?,
+            prune: plain::<prune::K>(gpu)?,
+        };
+        let sortable = shape.splats.max(shape.intersections) as usize;
+        let mut p = Pipeline {
+            shape,
+            lanes,
+            k,
+            b: Buffers::new(gpu, &shape)?,
+            scan: Scan::new(gpu)?,
+            sorter: Sorter::new(gpu, sortable)?,
+            high_water: 0,
+            free: Vec::with_capacity(shape.splats as usize),
+            valid_pixels: 0,
+            words: Vec::with_capacity(words_max(&shape)),
+            pool: Vec::with_capacity(shape.splats as usize),
+        };
+        let all = vec![255; shape.pixels()];
+        p.set_mask(gpu, &all).map_err(Fault::from)?;
+        Ok(p)
+    }
+
+    pub fn shape(&self) -> &Shape {
+        &self.shape
+    }
+
+    /// What is in the arena, for tests of single stages.
+    pub fn buffers(&self) -> &Buffers {
+        &self.b
+    }
+
+    /// Draws the map. Views up to the pipeline's shape in size.
+    pub fn render(&mut self, gpu: &mut Gpu, view: &View, out: &mut Rendered) -> Result<Stats, GpuError> {
+        let mut rec = gpu.record();
+        self.record_picture(&mut rec, view, &self.k.raster_picture);
+        self.record_summary(&mut rec, 0, 0);
+        gpu.submit(rec)?;
+        let n = view.camera.width * view.camera.height;
+        (out.width, out.height) = (view.camera.width, view.camera.height);
+        for (buf, pixels) in
+            [(self.b.grey, &mut out.grey), (self.b.transmittance, &mut out.alpha), (self.b.depth, &mut out.depth)]
+        {
+            pixels.resize(n, 0.0);
+            gpu.download(buf, 0, pixels)?;
+        }
+        out.alpha.iter_mut().for_each(|t| *t = 1.0 - *t);
+        Ok(stats(&self.status(gpu)?))
+    }
+
+    /// One step on keyframe `slot`. The view must have the pipeline's shape.
+    pub fn train(
+        &mut self,
+        gpu: &mut Gpu,
+        view: &View,
+        slot: u32,
+        rates: &LearningRates,
+        weights: &Weights,
+    ) -> Result<StepStats, GpuError> {
+        let (w, h) = (self.shape.width, self.shape.height);
+        assert!(
+            (view.camera.width, view.camera.height) == (w as usize, h as usize) && slot < self.shape.keyframes,
+            "training views are of the shape the pipeline was made with"
+        );
+        let mut rec = gpu.record();
+        let by_tile = self.record_picture(&mut rec, view, &self.k.raster_training);
+        self.record_loss(&mut rec, slot, weights);
+        self.record_update(&mut rec, view, by_tile, rates, weights);
+        self.record_summary(&mut rec, image_groups(w, h), self.high_water.div_ceil(GROUP));
+        gpu.submit(rec)?;
+        let s = self.status(gpu)?;
+        let valid = f64::from(self.valid_pixels.max(1));
+        let (l1, ssim) = (f64::from(s.l1_sum) / valid, f64::from(s.ssim_sum) / valid);
+        let lambda = f64::from(weights.ssim);
+        Ok(StepStats {
+            stats: stats(&s),
+            loss: (1.0 - lambda) * l1 + lambda * (1.0 - ssim),
+            l1,
+            ssim,
+            gradients_rejected: s.gradients_refused as u32,
+            pose_gradient: pose_gradient(view, &s.pose),
+        })
+    }
+
+    fn status(&self, gpu: &mut Gpu) -> Result<Status, GpuError> {
+        let mut s = [Status::default()];
+        gpu.download(self.b.status, 0, &mut s)?;
+        Ok(s[0])
+    }
+
+    fn tiles(&self, view: &View) -> u32 {
+        let (tw, th) = (self.lanes.min(16), COLUMN * self.lanes / self.lanes.min(16));
+        (view.camera.width as u32).div_ceil(tw) * (view.camera.height as u32).div_ceil(th)
+    }
+
+    fn record_picture(&self, rec: &mut Recorder, view: &View, raster: &Kernel<raster_forward::K>) -> Pairs {
+        let (k, b, n) = (&self.k, &self.b, self.high_water);
+        let size = size(view);
+        let per_slot = Threads::d1(n + 1);
+        rec.fill(b.failed, 0);
+        rec.dispatch(
+            &k.project,
+            project::Bind {
+                splats: b.splats.read(),
+                projected_out: b.projected.write(),
+                visible: b.visible.write(),
+                failed: b.failed.read_write(),
+            },
+            project::Push { camera: camera(view), size, splats: n },
+            per_slot,
+        );
+        self.scan.record(rec, b.visible.part(0, n as usize + 1));
+        rec.dispatch(
+            &k.compact,
+            compact::Bind {
+                projected_in: b.projected.read(),
+                visible_offsets: b.visible.read(),
+                keys: b.depth_keys.write(),
+                slots: b.slots.write(),
+                visible_count: b.visible_count.write(),
+            },
+            compact::Push { splats: n },
+            per_slot,
+        );
+        let sorted = self.sorter.record(rec, b.by_depth(), b.visible_count, DEPTH_BITS);
+        // The sorter's own buffers are needed again for the tiles.
+        rec.copy(sorted.payload, b.ranked, n as usize);
+
+        rec.dispatch(
+            &k.count_tiles,
+            count_tiles::Bind {
+                visible_count: b.visible_count.read(),
+                slots: b.ranked.read(),
+                projected_in: b.projected.read(),
+                tile_counts: b.tile_offsets.write(),
+            },
+            count_tiles::Push { size, splats: n },
+            per_slot,
+        );
+        self.scan.record(rec, b.tile_offsets.part(0, n as usize + 1));
+        rec.dispatch(
+            &k.emit_tiles,
+            emit_tiles::Bind {
+                visible_count: b.visible_count.read(),
+                slots: b.ranked.read(),
+                projected_in: b.projected.read(),
+                tile_offsets: b.tile_offsets.read(),
+                keys: b.isect_keys.write(),
+                intersections: b.isects.write(),
+                owners: b.owners.write(),
+                isect_count: b.isect_count.write(),
+            },
+            emit_tiles::Push { size, splats: n, capacity: self.shape.intersections },
+            per_slot,
+        );
+        let tiles = self.tiles(view);
+        let sorted = self.sorter.record(rec, b.by_tile(), b.isect_count.part(0, 1), u32::BITS - tiles.leading_zeros());
+        rec.fill(b.ranges, 0);
+        rec.dispatch_indirect(
+            &k.tile_ranges,
+            tile_ranges::Bind { isect_count: b.isect_count.read(), keys: sorted.keys.read(), ranges: b.ranges.write() },
+            tile_ranges::Push { tiles },
+            b.isect_count,
+            2,
+        );
+        rec.dispatch(
+            raster,
+            raster_forward::Bind {
+                ranges: b.ranges.read(),
+                intersections: sorted.payload.read(),
+                owners: b.owners.read(),
+                projected_in: b.projected.read(),
+                grey: b.grey.write(),
+                transmittance: b.transmittance.write(),
+                depth: b.depth.write(),
+            },
+            raster_forward::Push { size },
+            Threads::d1(tiles * self.lanes),
+        );
+        sorted
+    }
+
+    fn record_loss(&self, rec: &mut Recorder, slot: u32, weights: &Weights) {
+        let (k, b) = (&self.k, &self.b);
+        let (w, h) = (self.shape.width, self.shape.height);
+        let (size, target) = ([w, h], slot * self.shape.image_words() as u32);
+        let (rows, columns) = (Threads::d1(w.div_ceil(RUN) * h), Threads::d1(w * h.div_ceil(RUN)));
+        let valid = self.valid_pixels.max(1) as f32;
+        rec.dispatch(
+            &k.ssim_rows,
+            ssim_rows::Bind {
+                grey: b.grey.read(),
+                targets: b.targets.read(),
+                mask: b.mask.read(),
+                filtered: b.filtered.write(),
+            },
+            ssim_rows::Push { size, target },
+            rows,
+        );
+        rec.dispatch(
+            &k.ssim_columns,
+            ssim_columns::Bind {
+                filtered: b.filtered.read(),
+                mask: b.mask.read(),
+                slopes: b.slopes.write(),
+                ssim_sums: b.ssim_sums.write(),
+            },
+            ssim_columns::Push { size },
+            columns,
+        );
+        rec.dispatch(
+            &k.loss_rows,
+            loss_rows::Bind { slopes: b.slopes.read(), filtered: b.filtered.write() },
+            loss_rows::Push { size },
+            rows,
+        );
+        rec.dispatch(
+            &k.loss_columns,
+            loss_columns::Bind {
+                filtered: b.filtered.read(),
+                grey: b.grey.read(),
+                targets: b.targets.read(),
+                mask: b.mask.read(),
+                grey_gradient: b.grey_gradient.write(),
+                l1_sums: b.l1_sums.write(),
+            },
+            loss_columns::Push {
+                size,
+                target,
+                l1_weight: (1.0 - weights.ssim) / valid,
+                ssim_weight: weights.ssim / valid,
+            },
+            columns,
+        );
+    }
+
+    fn record_update(&self, rec: &mut Recorder, view: &View, by_tile: Pairs, rates: &LearningRates, weights: &Weights) {
+        let (k, b) = (&self.k, &self.b);
+        let size = size(view);
+        rec.dispatch(
+            &k.raster_backward,
+            raster_backward::Bind {
+                ranges: b.ranges.read(),
+                intersections: by_tile.payload.read(),
+                owners: b.owners.read(),
+                projected_in: b.projected.read(),
+                grey: b.grey.read(),
+                grey_gradient: b.grey_gradient.read(),
+                isect_gradients: b.isect_gradients.write(),
+            },
+            raster_backward::Push { size },
+            Threads::d1(self.tiles(view) * self.lanes),
+        );
+        rec.dispatch(
+            &k.project_backward,
+            project_backward::Bind {
+                visible_count: b.visible_count.read(),
+                slots: b.ranked.read(),
+                tile_offsets: b.tile_offsets.read(),
+                isect_gradients: b.isect_gradients.cast().read(),
+                splats: b.splats.read_write(),
+                moments_in_out: b.moments.read_write(),
+                steps: b.steps.read_write(),
+                sums: b.pose_sums.write(),
+            },
+            project_backward::Push {
+                camera: camera(view),
+                size,
+                capacity: self.shape.intersections,
+                rate_position: rates.position,
+                rate_scale: rates.scale,
+                rate_rotation: rates.rotation,
+                rate_opacity: rates.opacity,
+                rate_colour: rates.colour,
+                weight_needle: weights.needle,
+                weight_scale: weights.scale,
+                log_scale_soft: weights.scale_soft_m.ln(),
+                weight_opacity: weights.opacity,
+            },
+            Threads::d1(self.high_water),
+        );
+    }
+
+    fn record_summary(&self, rec: &mut Recorder, image_groups: u32, splat_groups: u32) {
+        let b = &self.b;
+        rec.dispatch(
+            &self.k.summary,
+            summary::Bind {
+                visible_count: b.visible_count.read(),
+                isect_count: b.isect_count.read(),
+                failed: b.failed.read(),
+                ssim_sums: b.ssim_sums.read(),
+                l1_sums: b.l1_sums.read(),
+                sums: b.pose_sums.read(),
+                status_out: b.status.write(),
+            },
+            summary::Push { image_groups, splat_groups },
+            Threads::groups(1, 1, 1),
+        );
+    }
+}
+
+/// Words the host moves at once: an image, the flags of all slots, or slots of arrivals.
+fn words_max(shape: &Shape) -> usize {
+    shape.image_words().max(shape.splats as usize).max(ARRIVALS)
+}
+
+fn plain<K: KernelDef>(gpu: &mut Gpu) -> Result<Kernel<K>, Fault>
+where
+    K::Spec: Default,
+{
+    gpu.kernel::<K>(K::Spec::default())
+}
+
+fn size(view: &View) -> [u32; 2] {
+    [view.camera.width as u32, view.camera.height as u32]
+}
+
+fn camera(view: &View) -> Camera {
+    let cam_from_world = view.world_from_cam.inverse();
+    let (r, t) = (cam_from_world.rotation().transpose(), cam_from_world.p);
+    let row = |i: usize| [r.col(i).x as f32, r.col(i).y as f32, r.col(i).z as f32, t[i] as f32];
+    let c = &view.camera;
+    Camera { row0: row(0), row1: row(1), row2: row(2), focal_centre: [c.fx, c.fy, c.cx, c.cy].map(|v| v as f32) }
+}
+
+fn stats(s: &Status) -> Stats {
+    Stats {
+        visible: s.visible,
+        intersections: s.intersections,
+        overflow: s.intersections_needed - s.intersections,
+        failed: s.not_finite,
+    }
+}
+
+/// From points moved in the camera frame to the camera moved in the world.
+fn pose_gradient(view: &View, g: &[f32; 6]) -> [f64; 6] {
+    let v = |i: usize| DVec3::new(f64::from(g[i]), f64::from(g[i + 1]), f64::from(g[i + 2]));
+    let (p, turn) = (-(view.world_from_cam.q * v(0)), -v(3));
+    [p.x, p.y, p.z, turn.x, turn.y, turn.z]
+}

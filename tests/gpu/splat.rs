@@ -1,0 +1,408 @@
+//! The splat kernels: each stage against its twin, the twins against finite differences, and what must hold
+//! whatever the picture: determinism, capacity, bad input, odd sizes, convergence.
+
+use super::twins::{self, project::Parameters};
+use glam::{DQuat, DVec3};
+use stipple::config::GpuConfig;
+use stipple::gpu::{Gpu, GpuOptions};
+use stipple::map::pipeline::{
+    LearningRates, Pipeline, PruneRule, Rendered, Shape, SplatInit, StepStats, View, Weights,
+};
+use stipple::stereo::Pinhole;
+use stipple_drivers::Pose;
+
+const STILL: LearningRates = LearningRates { position: 0.0, scale: 0.0, rotation: 0.0, opacity: 0.0, colour: 0.0 };
+const SSIM: f32 = 0.2;
+
+/// SplitMix64.
+pub struct Rng(pub u64);
+
+impl Rng {
+    pub fn uniform(&mut self, low: f64, high: f64) -> f64 {
+        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
+        let mut z = self.0;
+        z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+        z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
+        low + (high - low) * ((z ^ (z >> 31)) >> 11) as f64 / (1u64 << 53) as f64
+    }
+}
+
+pub fn view(width: usize, height: usize) -> View {
+    let f = 0.8 * width.max(height) as f64;
+    let camera =
+        Pinhole { width, height, fx: f, fy: 1.1 * f, cx: 0.5 * width as f64 - 0.3, cy: 0.5 * height as f64 + 0.4 };
+    let q = DQuat::from_scaled_axis(DVec3::new(0.3, -0.5, 0.2));
+    View { world_from_cam: Pose::new(q, DVec3::new(1.0, -2.0, 0.5)), camera }
+}
+
+/// Gaussians in and a little outside the view, some behind the camera.
+fn scene(n: usize, view: &View, seed: u64) -> Vec<SplatInit> {
+    let mut r = Rng(seed);
+    let c = &view.camera;
+    (0..n)
+        .map(|_| {
+            let z = if r.uniform(0.0, 1.0) < 0.05 { -1.0 } else { r.uniform(1.0, 4.0) };
+            let x = r.uniform(-0.1, 1.1) * c.width as f64 - c.cx;
+            let y = r.uniform(-0.1, 1.1) * c.height as f64 - c.cy;
+            let p = view.world_from_cam.transform(DVec3::new(x / c.fx * z, y / c.fy * z, z));
+            let q: [f64; 4] = std::array::from_fn(|_| r.uniform(-1.0, 1.0));
+            SplatInit {
+                mean: p.as_vec3().to_array(),
+                log_scale: std::array::from_fn(|_| r.uniform(-4.0, -1.2) as f32),
+                quat_xyzw: q.map(|v| v as f32),
+                opacity_logit: r.uniform(-3.0, 3.5) as f32,
+                colour: r.uniform(0.05, 0.95) as f32,
+            }
+        })
+        .collect()
+}
+
+fn target(width: usize, height: usize) -> Vec<u8> {
+    let level = |i: usize| {
+        let (x, y) = ((i % width) as f64, (i / width) as f64);
+        127.0 + 80.0 * (0.35 * x).sin() * (0.21 * y + 0.1 * x).cos() + 30.0 * ((x - y) * 0.8).sin()
+    };
+    (0..width * height).map(|i| level(i) as u8).collect()
+}
+
+/// A corner and a stripe are not seen.
+fn mask(width: usize, height: usize) -> Vec<u8> {
+    (0..width * height).map(|i| if i % width + i / width < 6 || i % width == width - 4 { 0 } else { 255 }).collect()
+}
+
+fn shape(v: &View, splats: u32, intersections: u32) -> Shape {
+    let (width, height) = (v.camera.width as u32, v.camera.height as u32);
+    Shape { width, height, splats, intersections, keyframes: 2 }
+}
+
+fn open(shape: Shape) -> (Gpu, Pipeline) {
+    let mut gpu = Gpu::open(&GpuConfig::default(), Pipeline::arena_bytes(&shape)).unwrap();
+    let p = Pipeline::new(&mut gpu, shape).unwrap();
+    (gpu, p)
+}
+
+fn render(gpu: &mut Gpu, p: &mut Pipeline, v: &View) -> Rendered {
+    let mut out = Rendered::default();
+    p.render(gpu, v, &mut out).unwrap();
+    out
+}
+
+fn worst(a: impl IntoIterator<Item = f64>, b: impl IntoIterator<Item = f64>) -> f64 {
+    a.into_iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)
+}
+
+fn wide(v: &[f32]) -> Vec<f64> {
+    v.iter().map(|x| f64::from(*x)).collect()
+}
+
+#[test]
+fn twin_gradients_agree_with_finite_differences() {
+    const STEP: f64 = 1e-6;
+    let v = view(23, 17);
+    let splats: Vec<Parameters> = scene(24, &v, 3).iter().map(twins::project::parameters).collect();
+    let goal: Vec<f64> = target(23, 17).iter().map(|g| f64::from(*g) / 255.0).collect();
+    let seen = mask(23, 17);
+    let lambda = f64::from(SSIM);
+    let run = |s: &[Parameters], twist: &[f64; 6]| twins::step(s, &v, twist, &goal, &seen, lambda);
+    let at = run(&splats, &[0.0; 6]);
+    assert!(at.rendered.margin > 1e-5, "a decision is too close for differences: {}", at.rendered.margin);
+    let slope = |f: &dyn Fn(f64) -> f64| (f(STEP) - f(-STEP)) / (2.0 * STEP);
+    let close = |analytic: f64, numeric: f64, what: String| {
+        let error = (analytic - numeric).abs();
+        assert!(error <= 1e-7 + 1e-5 * numeric.abs(), "{what}: {analytic} against {numeric}");
+    };
+    for i in 0..splats.len() {
+        for k in 0..12 {
+            let numeric = slope(&|h| {
+                let mut moved = splats.clone();
+                moved[i][k] += h;
+                run(&moved, &[0.0; 6]).loss.total(lambda)
+            });
+            close(at.splats[i][k], numeric, format!("splat {i} parameter {k}"));
+        }
+    }
+    for k in 0..6 {
+        let numeric = slope(&|h| {
+            let mut twist = [0.0; 6];
+            twist[k] = h;
+            run(&splats, &twist).loss.total(lambda)
+        });
+        close(at.twist[k], numeric, format!("twist {k}"));
+    }
+}
+
+/// Everything a step leaves behind, beside what its twin says.
+fn compare_step(v: &View, n: usize, seed: u64, lanes: Option<(u32, &str)>) {
+    let (w, h) = (v.camera.width, v.camera.height);
+    let splats = scene(n, v, seed);
+    let s = shape(v, 64, 1 << 16);
+    let mut gpu = Gpu::open(&GpuConfig::default(), Pipeline::arena_bytes(&s)).unwrap();
+    let mut p = match lanes {
+        Some((lanes, variant)) => Pipeline::with_lanes(&mut gpu, s, lanes, variant).unwrap(),
+        None => Pipeline::new(&mut gpu, s).unwrap(),
+    };
+    assert_eq!(p.append(&mut gpu, &splats).unwrap(), n);
+    p.set_keyframe(&mut gpu, 1, &target(w, h)).unwrap();
+    p.set_mask(&mut gpu, &mask(w, h)).unwrap();
+
+    let doubles: Vec<Parameters> = splats.iter().map(twins::project::parameters).collect();
+    let goal: Vec<f64> = target(w, h).iter().map(|g| f64::from(*g) / 255.0).collect();
+    let twin = twins::step(&doubles, v, &[0.0; 6], &goal, &mask(w, h), f64::from(SSIM));
+
+    // project
+    let picture = render(&mut gpu, &mut p, v);
+    let mut projected = vec![Default::default(); n];
+    gpu.download(p.buffers().projected, 0, &mut projected).unwrap();
+    for (i, t) in twins::project_all(&doubles, v, &[0.0; 6]).iter().enumerate() {
+        // Those off the image are culled by the kernel and keep zeros.
+        let (Some(t), true) = (t, projected[i].conic_shade[3] != 0.0) else { continue };
+        let (a, b) = (projected[i].centre_conic, projected[i].conic_shade);
+        let got = [a[0] - 0.5, a[1] - 0.5, a[2], a[3], b[0], b[1], b[2], b[3]];
+        for (k, (g, t)) in got.iter().zip(t).enumerate() {
+            let error = (f64::from(*g) - t.v).abs() / (1.0 + t.v.abs());
+            assert!(error < 2e-5, "splat {i} projected {k}: {g} against {}", t.v);
+        }
+    }
+
+    // raster_forward: a decision on the alpha floor may fall either way, which is worth 1/255 of a grey level.
+    let flip = if twin.rendered.margin > 1e-5 { 0.0 } else { 1.0 / 255.0 };
+    let alpha = twin.rendered.transmittance.iter().map(|t| 1.0 - t);
+    assert!(worst(wide(&picture.grey), twin.rendered.grey.iter().copied()) < 1e-5 + flip);
+    assert!(worst(wide(&picture.alpha), alpha) < 1e-5 + flip);
+    assert!(worst(wide(&picture.depth), twin.rendered.depth.iter().copied()) < 1e-3 + 4.0 * flip);
+
+    // loss
+    let weights = Weights { ssim: SSIM, ..Default::default() };
+    let step = p.train(&mut gpu, v, 1, &STILL, &weights).unwrap();
+    let mut gradient = vec![0f32; w * h];
+    gpu.download(p.buffers().grey_gradient, 0, &mut gradient).unwrap();
+    let scale = twin.loss.gradient.iter().fold(0.0f64, |m, g| m.max(g.abs()));
+    assert!((step.l1 - twin.loss.l1).abs() < 1e-5 + flip && (step.ssim - twin.loss.ssim).abs() < 1e-4 + flip);
+    let error = worst(wide(&gradient), twin.loss.gradient.iter().copied());
+    assert!(error < (2e-3 + 50.0 * flip) * scale, "loss gradient off by {error} of {scale}");
+
+    // raster_backward and project_backward: after one step from rest Adam's first moment is a tenth of the gradient.
+    let mut moments = vec![Default::default(); n];
+    gpu.download(p.buffers().moments, 0, &mut moments).unwrap();
+    let groups: [(&str, std::ops::Range<usize>); 5] =
+        [("mean", 0..3), ("log scale", 3..6), ("quaternion", 6..10), ("opacity", 10..11), ("grey", 11..12)];
+    for (name, range) in groups {
+        let scale = twin.splats.iter().flat_map(|g| &g[range.clone()]).fold(0.0f64, |m, g| m.max(g.abs()));
+        for (i, m) in moments.iter().enumerate() {
+            let [a, b, q] = m.m;
+            let got = [a[0], a[1], a[2], b[0], b[1], b[2], q[0], q[1], q[2], q[3], a[3], b[3]];
+            for k in range.clone() {
+                let error = (f64::from(got[k]) * 10.0 - twin.splats[i][k]).abs();
+                let bound = (1e-3 + 50.0 * flip) * scale;
+                assert!(error < bound, "splat {i} {name} {k}: {} against {}", got[k] * 10.0, twin.splats[i][k]);
+            }
+        }
+    }
+
+    // pose: R <- R Exp(θ) moves points by Exp(-θ), p <- p + δ by -Rᵀδ.
+    let (rho, phi) = (DVec3::from_slice(&twin.twist[..3]), DVec3::from_slice(&twin.twist[3..]));
+    let dp = -(v.world_from_cam.q * rho);
+    let want = [dp.x, dp.y, dp.z, -phi.x, -phi.y, -phi.z];
+    let scale = want.iter().fold(0.0f64, |m, g| m.max(g.abs()));
+    let error = worst(step.pose_gradient, want);
+    assert!(error < (1e-3 + 50.0 * flip) * scale, "pose gradient off by {error} of {scale}");
+}
+
+#[test]
+fn every_stage_agrees_with_its_twin() {
+    compare_step(&view(33, 21), 40, 1, None);
+    compare_step(&view(64, 48), 64, 2, None);
+}
+
+#[test]
+fn the_baseline_without_subgroups_agrees_with_its_twin() {
+    compare_step(&view(33, 21), 40, 1, Some((32, "")));
+}
+
+#[test]
+fn one_pixel_and_odd_sizes_agree_with_their_twin() {
+    for (w, h) in [(1, 1), (1, 9), (7, 1), (17, 5), (9, 33)] {
+        let v = view(w, h);
+        let (mut gpu, mut p) = open(shape(&v, 16, 4096));
+        let splats = scene(16, &v, 5);
+        p.append(&mut gpu, &splats).unwrap();
+        let doubles: Vec<Parameters> = splats.iter().map(twins::project::parameters).collect();
+        let twin = twins::raster::forward(&twins::project_all(&doubles, &v, &[0.0; 6]), w, h);
+        let picture = render(&mut gpu, &mut p, &v);
+        assert!(worst(wide(&picture.grey), twin.grey) < 1e-5, "{w}x{h}");
+        p.set_keyframe(&mut gpu, 0, &target(w, h)).unwrap();
+        assert!(p.train(&mut gpu, &v, 0, &STILL, &Weights::default()).unwrap().loss.is_finite());
+    }
+}
+
+#[test]
+fn an_empty_map_renders_nothing_and_trains() {
+    let v = view(33, 21);
+    let (mut gpu, mut p) = open(shape(&v, 16, 1024));
+    let picture = render(&mut gpu, &mut p, &v);
+    assert!(picture.grey.iter().chain(&picture.alpha).chain(&picture.depth).all(|x| *x == 0.0));
+    p.set_keyframe(&mut gpu, 0, &target(33, 21)).unwrap();
+    let step = p.train(&mut gpu, &v, 0, &STILL, &Weights::default()).unwrap();
+    assert_eq!((step.stats.visible, step.stats.intersections), (0, 0));
+    assert!(step.l1 > 0.1);
+    assert_eq!(step.pose_gradient.map(f64::abs), [0.0; 6]);
+}
+
+const FAST: LearningRates = LearningRates { position: 4e-3, scale: 2e-2, rotation: 1e-2, opacity: 5e-2, colour: 2e-2 };
+
+fn train(gpu: &mut Gpu, p: &mut Pipeline, v: &View, steps: usize) -> Vec<StepStats> {
+    (0..steps).map(|_| p.train(gpu, v, 0, &FAST, &Weights::default()).unwrap()).collect()
+}
+
+#[test]
+fn two_runs_are_bit_identical() {
+    let v = view(65, 47);
+    let run = || {
+        let (mut gpu, mut p) = open(shape(&v, 512, 1 << 16));
+        p.append(&mut gpu, &scene(500, &v, 9)).unwrap();
+        p.set_keyframe(&mut gpu, 0, &target(65, 47)).unwrap();
+        let steps = train(&mut gpu, &mut p, &v, 10);
+        let mut map = Vec::new();
+        p.download(&mut gpu, &mut map).unwrap();
+        (steps, map, render(&mut gpu, &mut p, &v).grey)
+    };
+    let (a, b) = (run(), run());
+    assert_eq!(a.0, b.0);
+    assert_eq!(bytemuck::cast_slice::<_, u32>(&a.1), bytemuck::cast_slice::<_, u32>(&b.1));
+    assert_eq!(a.2, b.2);
+}
+
+#[test]
+fn a_full_intersection_list_loses_the_farthest_and_says_so() {
+    let v = view(64, 48);
+    let mut splats = scene(64, &v, 2);
+    let (mut gpu, mut p) = open(shape(&v, 64, 1 << 16));
+    p.append(&mut gpu, &splats).unwrap();
+    let mut out = Rendered::default();
+    let full = p.render(&mut gpu, &v, &mut out).unwrap();
+    assert_eq!(full.overflow, 0);
+
+    let capacity = full.intersections / 2;
+    let (mut gpu, mut p) = open(shape(&v, 64, capacity));
+    p.append(&mut gpu, &splats).unwrap();
+    let cut = p.render(&mut gpu, &v, &mut out).unwrap();
+    assert_eq!((cut.intersections, cut.overflow), (capacity, full.intersections - capacity));
+    p.set_keyframe(&mut gpu, 0, &target(64, 48)).unwrap();
+    assert!(train(&mut gpu, &mut p, &v, 3).iter().all(|s| s.loss.is_finite()));
+
+    // The nearest third alone fits, and the cut picture has all of it: where it is opaque nothing changed.
+    let cam_from_world = v.world_from_cam.inverse();
+    let depth = |s: &SplatInit| cam_from_world.transform(glam::Vec3::from(s.mean).as_dvec3()).z;
+    splats.retain(|s| depth(s) > 0.0);
+    splats.sort_by(|a, b| depth(a).total_cmp(&depth(b)));
+    splats.truncate(splats.len() / 3);
+    let (mut gpu, mut p) = open(shape(&v, 64, 1 << 16));
+    p.append(&mut gpu, &splats).unwrap();
+    let near = render(&mut gpu, &mut p, &v);
+    assert!(near.alpha.iter().zip(&out.alpha).all(|(n, c)| *c >= n - 1e-6));
+}
+
+#[test]
+fn splats_that_are_not_finite_do_not_change_the_picture() {
+    let v = view(64, 48);
+    let good = scene(60, &v, 4);
+    let mut mixed = good.clone();
+    for (i, bad) in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, f32::NAN].into_iter().enumerate() {
+        let mut s = good[i];
+        match i {
+            0 => s.mean[1] = bad,
+            1 => s.log_scale[2] = bad,
+            2 => s.opacity_logit = bad,
+            _ => s.quat_xyzw[0] = bad,
+        }
+        mixed.insert(7 * i, s);
+    }
+    let run = |splats: &[SplatInit]| {
+        let (mut gpu, mut p) = open(shape(&v, 64, 1 << 16));
+        p.append(&mut gpu, splats).unwrap();
+        let picture = render(&mut gpu, &mut p, &v);
+        p.set_keyframe(&mut gpu, 0, &target(64, 48)).unwrap();
+        let steps = train(&mut gpu, &mut p, &v, 3);
+        let pruned = p.prune(&mut gpu, &PruneRule { opacity_min: 1e-6, scale_max_m: 100.0 }).unwrap();
+        (picture.grey, steps, pruned)
+    };
+    let (clean, dirty) = (run(&good), run(&mixed));
+    assert_eq!(clean.0, dirty.0);
+    assert_eq!((clean.1[0].stats.failed, dirty.1[0].stats.failed), (0, 4));
+    assert_eq!(clean.1[2].loss, dirty.1[2].loss);
+    assert_eq!((clean.2, dirty.2), (0, 4));
+}
+
+#[test]
+fn a_full_pool_takes_no_more_and_reuses_what_was_pruned() {
+    let v = view(33, 21);
+    let (mut gpu, mut p) = open(shape(&v, 20, 4096));
+    let mut splats = scene(30, &v, 6);
+    splats[..5].iter_mut().for_each(|s| s.opacity_logit = -8.0);
+    splats[5..].iter_mut().for_each(|s| s.opacity_logit = 1.0);
+    assert_eq!(p.append(&mut gpu, &splats).unwrap(), 20);
+    assert_eq!(p.append(&mut gpu, &splats).unwrap(), 0);
+    assert_eq!(p.prune(&mut gpu, &PruneRule::default()).unwrap(), 5);
+    assert_eq!(p.prune(&mut gpu, &PruneRule::default()).unwrap(), 0);
+    assert_eq!(p.count(), 15);
+    assert_eq!(p.append(&mut gpu, &splats[20..]).unwrap(), 5);
+    let mut map = Vec::new();
+    p.download(&mut gpu, &mut map).unwrap();
+    assert_eq!(map.len(), 20);
+    assert!(splats[5..25].iter().all(|s| map.contains(s)));
+}
+
+fn psnr(picture: &[f32], goal: &[u8]) -> f64 {
+    let square = |(a, b): (&f32, &u8)| (f64::from(*a) - f64::from(*b) / 255.0).powi(2);
+    let mse = picture.iter().zip(goal).map(square).sum::<f64>() / goal.len() as f64;
+    -10.0 * mse.log10()
+}
+
+#[test]
+fn training_on_one_picture_converges() {
+    let (w, h) = (96, 64);
+    let v = view(w, h);
+    let goal = target(w, h);
+    let (mut gpu, mut p) = open(shape(&v, 1024, 1 << 16));
+    p.append(&mut gpu, &scene(1024, &v, 8)).unwrap();
+    p.set_keyframe(&mut gpu, 0, &goal).unwrap();
+    let before = psnr(&render(&mut gpu, &mut p, &v).grey, &goal);
+    let steps = train(&mut gpu, &mut p, &v, 150);
+    let picture = render(&mut gpu, &mut p, &v);
+    let after = psnr(&picture.grey, &goal);
+    println!("PSNR {before:.1} -> {after:.1} dB, loss {:.4} -> {:.4}", steps[0].loss, steps[149].loss);
+    write_png("converged", &picture.grey, &goal, w, h);
+    assert!(before < 15.0 && after > 25.0, "PSNR {before:.1} -> {after:.1} dB");
+}
+
+/// Picture and goal side by side, in $STIPPLE_PICTURES if it is set.
+fn write_png(name: &str, picture: &[f32], goal: &[u8], width: usize, height: usize) {
+    let Some(folder) = std::env::var_os("STIPPLE_PICTURES") else { return };
+    let mut bytes = Vec::new();
+    for y in 0..height {
+        bytes.extend(picture[y * width..][..width].iter().map(|g| (g.clamp(0.0, 1.0) * 255.0) as u8));
+        bytes.extend(&goal[y * width..][..width]);
+    }
+    let file = std::fs::File::create(std::path::Path::new(&folder).join(format!("{name}.png"))).unwrap();
+    let mut e = png::Encoder::new(file, 2 * width as u32, height as u32);
+    e.set_color(png::ColorType::Grayscale);
+    e.write_header().unwrap().write_image_data(&bytes).unwrap();
+}
+
+#[test]
+fn the_validation_layer_is_silent() {
+    let v = view(33, 21);
+    let s = shape(&v, 64, 4096);
+    let opened = Gpu::open_with(&GpuConfig::default(), Pipeline::arena_bytes(&s), GpuOptions { validation: true });
+    let mut gpu = match opened {
+        Ok(gpu) => gpu,
+        Err(fault) => return println!("ignored: the_validation_layer_is_silent: {fault}"),
+    };
+    let mut p = Pipeline::new(&mut gpu, s).unwrap();
+    p.append(&mut gpu, &scene(64, &v, 1)).unwrap();
+    p.set_keyframe(&mut gpu, 0, &target(33, 21)).unwrap();
+    train(&mut gpu, &mut p, &v, 2);
+    render(&mut gpu, &mut p, &v);
+    p.prune(&mut gpu, &PruneRule::default()).unwrap();
+    assert_eq!(gpu.validation_messages(), Vec::<String>::new());
+}
