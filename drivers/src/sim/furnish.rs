@@ -291,7 +291,7 @@ fn add_lamps(room: &mut Room) {
     let n = (e / SPACING).round().max(Vec2::ONE);
     for k in 0..(n.x * n.y) as usize {
         let cell = Vec2::new((k % n.x as usize) as f32 + 0.45, (k / n.x as usize) as f32 + 0.55);
-        let at = (room.low.truncate() + e * cell / n).extend(room.high.z - 0.25);
+        let at = (room.low.truncate() + e * cell / n).extend(room.high.z - 0.5);
         let power = if k % 2 == 0 { 2.4 } else { 1.7 };
         room.lights.push(Light { at, power });
     }

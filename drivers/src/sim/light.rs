@@ -22,12 +22,14 @@ struct Grid {
 }
 
 /// Light of white walls all around, per unit of hemisphere left open.
-const AMBIENT: f32 = 0.42;
+const AMBIENT: f32 = 0.6;
 /// Ambient light is blocked by what is nearer than this, m.
 const AMBIENT_REACH: f32 = 0.9;
 const AMBIENT_RAYS: usize = 24;
 /// Side of the square lamps, m: the width of penumbrae.
 const LAMP: f32 = 0.35;
+/// Keeps the spot above a lamp from outshining the room, m².
+const SOFTEN: f32 = 0.8;
 /// Faint lamps are not worth their shadow rays.
 const FAINT: f32 = 0.01;
 
@@ -89,7 +91,7 @@ fn irradiance(room: &Room, face: &Face, at: Vec2) -> f32 {
 
 fn lamp(room: &Room, light: &Light, p: Vec3, n: Vec3) -> f32 {
     let to = light.at - p;
-    let full = light.power * n.dot(to).max(0.0) / (to.length() * (to.length_squared() + 0.3));
+    let full = light.power * n.dot(to).max(0.0) / (to.length() * (to.length_squared() + SOFTEN));
     if full < FAINT {
         return full;
     }

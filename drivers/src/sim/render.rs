@@ -2,7 +2,7 @@
 //!
 //! A frame is made in two passes over 16-pixel tiles: `cast` finds distance and face at every pixel
 //! centre; `shade` turns them into grey levels. Textures are filtered to the pixel in closed form,
-//! so one sample does inside a face; pixels whose neighbours see another face are averaged over
+//! so one sample does inside a face; pixels whose neighbours see another face cast
 //! `EDGE x EDGE` rays. Per tile only the solids that meet the tile's cone are tried, nearest first.
 //!
 //! Work is split over threads by tile rows and every random number is a hash of (seed, frame,
@@ -110,21 +110,15 @@ impl Scratch {
 impl Lens {
     pub fn new(camera: &Camera) -> Lens {
         let (width, height) = (camera.width, camera.height);
-        let at = |x: f64, y: f64| camera.unproject(DVec2::new(x, y)).map(|b| b.as_vec3());
-        let mut bearings = Vec::with_capacity(width * height);
-        let mut pixel_angle = Vec::with_capacity(width * height);
+        let at = |i: usize| camera.unproject(DVec2::new((i % width) as f64, (i / width) as f64));
+        let bearings: Vec<Vec3> = (0..width * height).map(|i| at(i).map_or(Vec3::ZERO, |b| b.as_vec3())).collect();
+        let mut lens = Lens { width, height, bearings, pixel_angle: vec![0.0; width * height], cones: Vec::new() };
         for i in 0..width * height {
-            let (x, y) = ((i % width) as f64, (i / width) as f64);
-            let rays = (at(x, y), at(x + 0.5, y), at(x - 0.5, y), at(x, y + 0.5), at(x, y - 0.5));
-            if let (Some(b), Some(r), Some(l), Some(d), Some(u)) = rays {
-                bearings.push(b);
-                pixel_angle.push((r - l).cross(d - u).length().sqrt());
-            } else {
-                bearings.push(Vec3::ZERO);
-                pixel_angle.push(0.0);
+            if lens.bearings[i] != Vec3::ZERO {
+                let (du, dv) = lens.slopes(i % width, i / width);
+                lens.pixel_angle[i] = du.cross(dv).length().sqrt();
             }
         }
-        let mut lens = Lens { width, height, bearings, pixel_angle, cones: Vec::new() };
         for ty in 0..height.div_ceil(TILE) {
             for tx in 0..width.div_ceil(TILE) {
                 lens.cones.push(lens.cone(tx, ty));
@@ -150,14 +144,23 @@ impl Lens {
         self.width.div_ceil(TILE)
     }
 
-    /// Bearing of a place inside the pixel, `offset` in pixels, by the slope of the neighbours.
-    fn bearing_near(&self, x: usize, y: usize, offset: Vec2) -> Vec3 {
+    /// Change of the bearing a pixel to the right and a pixel down, from the neighbours.
+    fn slopes(&self, x: usize, y: usize) -> (Vec3, Vec3) {
         let at = |x: usize, y: usize| self.bearings[y * self.width + x];
-        let (x0, x1) = (x.saturating_sub(1), (x + 1).min(self.width - 1));
-        let (y0, y1) = (y.saturating_sub(1), (y + 1).min(self.height - 1));
-        let du = (at(x1, y) - at(x0, y)) / (x1 - x0) as f32;
-        let dv = (at(x, y1) - at(x, y0)) / (y1 - y0) as f32;
-        (at(x, y) + du * offset.x + dv * offset.y).normalize()
+        let here = at(x, y);
+        // at the end of the lens' domain a neighbour is missing and the pixel itself stands in
+        let slope = |low: Vec3, high: Vec3| match (low == Vec3::ZERO, high == Vec3::ZERO) {
+            (false, false) => (high - low) * 0.5,
+            (true, false) => high - here,
+            (false, true) => here - low,
+            (true, true) => Vec3::ZERO,
+        };
+        let near = |inside: bool, x: usize, y: usize| if inside { at(x, y) } else { Vec3::ZERO };
+        let left = near(x > 0, x.saturating_sub(1), y);
+        let up = near(y > 0, x, y.saturating_sub(1));
+        let right = near(x + 1 < self.width, (x + 1).min(self.width - 1), y);
+        let down = near(y + 1 < self.height, x, (y + 1).min(self.height - 1));
+        (slope(left, right), slope(up, down))
     }
 }
 
@@ -345,18 +348,32 @@ fn radiance(room: &Room, view: View, d: Vec3, hit: Hit, angle: f32) -> f32 {
     texture::albedo(face.material, face.seed, spot) * room.light_map.at(hit.face as usize, place.at)
 }
 
+/// A pixel that several faces share: its rays are gathered by face, and each face is shaded once
+/// where its rays meet it on average.
 fn edge_radiance(room: &Room, lens: &Lens, view: View, list: &[Seen], x: usize, y: usize) -> f32 {
-    let angle = lens.pixel_angle[y * lens.width + x] / EDGE as f32;
-    if angle == 0.0 {
-        return 0.0;
+    const RAYS: usize = EDGE * EDGE;
+    let angle = lens.pixel_angle[y * lens.width + x];
+    let (du, dv) = lens.slopes(x, y);
+    let (du, dv) = (view.turn * du / EDGE as f32, view.turn * dv / EDGE as f32);
+    let corner = view.turn * lens.bearings[y * lens.width + x] - (du + dv) * (0.5 * (EDGE - 1) as f32);
+    let mut parts = [(NOTHING, 0.0f32, Vec3::ZERO); RAYS];
+    let mut used = 0;
+    for k in 0..RAYS {
+        let d = (corner + du * (k % EDGE) as f32 + dv * (k / EDGE) as f32).normalize();
+        let hit = meet(room, list, view.origin, d);
+        let part = parts[..used].iter().position(|p| p.0 == hit.face).unwrap_or(used);
+        used = used.max(part + 1);
+        let (_, n, sum) = parts[part];
+        parts[part] = (hit.face, n + 1.0, sum + d * hit.distance);
     }
-    let mut sum = 0.0;
-    for k in 0..EDGE * EDGE {
-        let offset = (Vec2::new((k % EDGE) as f32, (k / EDGE) as f32) + 0.5) / EDGE as f32 - 0.5;
-        let d = view.turn * lens.bearing_near(x, y, offset);
-        sum += radiance(room, view, d, meet(room, list, view.origin, d), angle);
+    let mut light = 0.0;
+    for (face, n, sum) in &parts[..used] {
+        let distance = sum.length() / n;
+        let hit = Hit { distance, face: *face };
+        let share = n / RAYS as f32;
+        light += share * radiance(room, view, *sum / (distance * n), hit, angle * share.sqrt());
     }
-    sum / (EDGE * EDGE) as f32
+    light
 }
 
 /// Vignette, exposure, shot and read noise, quantisation.
