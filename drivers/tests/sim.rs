@@ -5,6 +5,7 @@
 
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use std::path::PathBuf;
+use stipple_drivers::replay::{OpenOptions, Recording};
 use stipple_drivers::sim::{write_euroc, Flight, Scenario, Sim, GRAVITY};
 use stipple_drivers::{Camera, Exit, Frames, ImuCalibration, Lens, Nanos, Span};
 
@@ -328,6 +329,19 @@ fn a_written_run_is_whole_and_can_be_flown_again() {
         assert!(apart.to_cols_array().iter().all(|e| e.abs() < 1e-8));
     }
     assert_eq!(recording.imu.unwrap().len(), sim.imu().len());
+    let read = Recording::open(&dir, &OpenOptions::default()).unwrap();
+    assert!(read.warnings.is_empty(), "{:?}", read.warnings);
+    assert_eq!((read.pairs.len(), read.imu.len(), read.truth.len()), (17, sim.imu().len(), sim.imu().len()));
+    for (a, b) in read.calibration.cameras.iter().zip(&sim.calibration().cameras) {
+        assert_eq!(a.camera, b.camera);
+        assert!((a.body_from_cam.inverse() * b.body_from_cam).p.length() < 1e-9);
+        assert!(a.body_from_cam.q.angle_between(b.body_from_cam.q) < 1e-7);
+    }
+    assert_eq!(read.calibration.imu, sim.calibration().imu);
+    let (mut shown, mut made) = (Frames::for_rig(&read.calibration), Frames::for_rig(&read.calibration));
+    read.reader().read(16, &mut shown).unwrap();
+    sim.render(16, &mut made);
+    assert!(shown.t == made.t && shown.images == made.images);
     let refused = write_euroc(&mut sim, &dir, |_, _| {}).unwrap_err();
     assert_eq!(refused.exit, Exit::CantCreate);
 }

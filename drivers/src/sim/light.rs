@@ -3,7 +3,7 @@
 //! The room does not change, so lamps (Lambert, inverse square, soft shadows) and the ambient term
 //! (occluded in corners and under furniture) are computed once; a pixel then costs one look-up.
 
-use super::room::{Face, Light, Room};
+use super::room::{Face, Light, Room, Solid};
 use glam::{Vec2, Vec3};
 
 #[derive(Clone, Debug, Default)]
@@ -31,7 +31,7 @@ const LAMP: f32 = 0.35;
 /// Keeps the spot above a lamp from outshining the room, m².
 const SOFTEN: f32 = 0.8;
 /// Faint lamps are not worth their shadow rays.
-const FAINT: f32 = 0.01;
+const FAINT: f32 = 0.02;
 
 impl LightMap {
     /// Nodes every `pitch` metres, no fewer than two a side.
@@ -50,12 +50,13 @@ impl LightMap {
             for (k, out) in nodes.chunks_mut(share).enumerate() {
                 let grids = &grids;
                 scope.spawn(move || {
+                    let mut near = Vec::with_capacity(room.solids.len());
                     for (i, node) in out.iter_mut().enumerate() {
                         let i = k * share + i;
                         let f = grids.partition_point(|g| g.first <= i) - 1;
                         let (g, i) = (&grids[f], i - grids[f].first);
                         let at = Vec2::new((i % g.columns) as f32, (i / g.columns) as f32) / g.density;
-                        *node = irradiance(room, &room.faces[f], at);
+                        *node = irradiance(room, &room.faces[f], at, &mut near);
                     }
                 });
             }
@@ -79,14 +80,17 @@ impl LightMap {
     }
 }
 
-fn irradiance(room: &Room, face: &Face, at: Vec2) -> f32 {
+/// `near` is scratch.
+fn irradiance(room: &Room, face: &Face, at: Vec2, near: &mut Vec<Solid>) -> f32 {
     // nodes on an edge are pulled in, so that they see what the face sees
     let margin = face.size.min_element() * 0.02;
     let at = at.clamp(Vec2::splat(margin), face.size - margin);
     let (p, n) = face.point(at);
     let p = p + n * 2e-3;
     let lamps: f32 = room.lights.iter().map(|l| lamp(room, l, p, n)).sum();
-    lamps + ambient(room, p, n)
+    near.clear();
+    near.extend(room.solids.iter().filter(|s| s.centre.distance(p) < s.bound + AMBIENT_REACH));
+    lamps + ambient(room, near, p, n)
 }
 
 fn lamp(room: &Room, light: &Light, p: Vec3, n: Vec3) -> f32 {
@@ -107,7 +111,7 @@ fn lamp(room: &Room, light: &Light, p: Vec3, n: Vec3) -> f32 {
     full * seen
 }
 
-fn ambient(room: &Room, p: Vec3, n: Vec3) -> f32 {
+fn ambient(room: &Room, near: &[Solid], p: Vec3, n: Vec3) -> f32 {
     let (u, v) = n.any_orthonormal_pair();
     let mut open = 0.0;
     for k in 0..AMBIENT_RAYS {
@@ -115,8 +119,11 @@ fn ambient(room: &Room, p: Vec3, n: Vec3) -> f32 {
         let r = ((k as f32 + 0.5) / AMBIENT_RAYS as f32).sqrt();
         let (sin, cos) = (k as f32 * 2.399_963).sin_cos();
         let d = u * (r * cos) + v * (r * sin) + n * (1.0 - r * r).sqrt();
-        let (t, _) = room.nearest(p, d);
-        open += (t / AMBIENT_REACH).min(1.0);
+        let mut first = room.shell(p, d);
+        for s in near {
+            s.meet(p, d, &mut first);
+        }
+        open += (first.0 / AMBIENT_REACH).min(1.0);
     }
     AMBIENT * open / AMBIENT_RAYS as f32
 }
