@@ -13,7 +13,7 @@ const GAP_PX: usize = 4;
 const MISSING: [u8; 3] = [48, 48, 48];
 const INK: [u8; 3] = [235, 235, 235];
 /// Panel width at which labels are drawn one font pixel to one image pixel.
-const LABEL_WIDTH_PX: usize = 320;
+const LABEL_WIDTH_PX: usize = 220;
 
 /// Near to far: warm to cool, lightness rising to the middle.
 const DEPTH_RAMP: [[u8; 3]; 8] = [
@@ -24,7 +24,7 @@ const DEPTH_RAMP: [[u8; 3]; 8] = [
     [125, 254, 95],
     [27, 208, 213],
     [70, 107, 227],
-    [48, 18, 59],
+    [66, 52, 148],
 ];
 /// None to full: black through violet and orange to pale yellow, lightness rising throughout.
 const ERROR_RAMP: [[u8; 3]; 6] =
