@@ -67,31 +67,32 @@ pub fn hash(x: i32, y: i32, seed: u32) -> u32 {
     h ^ (h >> 15)
 }
 
-/// Random bytes on a lattice that repeats every `PERIOD` cells: each entry packs the four corners of
-/// a cell, so that interpolated noise costs one load. Seeds and octaves read it shifted.
-const PERIOD: usize = 128;
-static CORNERS: [u32; PERIOD * PERIOD] = corners();
+/// Random numbers in [0, 1) on a lattice that repeats every `PERIOD` cells: each entry holds the four
+/// corners of a cell, so that interpolated noise costs one load from 64 KiB. Seeds and octaves read
+/// it shifted.
+const PERIOD: usize = 64;
+static CORNERS: [[f32; 4]; PERIOD * PERIOD] = corners();
 
-const fn corners() -> [u32; PERIOD * PERIOD] {
-    let mut bytes = [0u8; PERIOD * PERIOD];
+const fn corners() -> [[f32; 4]; PERIOD * PERIOD] {
+    let mut values = [0.0; PERIOD * PERIOD];
     let mut state = 0x2545_F491u32; // xorshift32 (Marsaglia)
     let mut k = 0;
-    while k < bytes.len() {
+    while k < values.len() {
         state ^= state << 13;
         state ^= state >> 17;
         state ^= state << 5;
-        bytes[k] = (state >> 24) as u8;
+        values[k] = (state >> 8) as f32 / 16_777_216.0;
         k += 1;
     }
-    let mut packed = [0u32; PERIOD * PERIOD];
+    let mut cells = [[0.0; 4]; PERIOD * PERIOD];
     k = 0;
-    while k < packed.len() {
+    while k < cells.len() {
         let (x, y) = (k % PERIOD, k / PERIOD);
         let (x1, y1) = ((x + 1) % PERIOD, (y + 1) % PERIOD * PERIOD);
-        packed[k] = u32::from_le_bytes([bytes[k], bytes[y * PERIOD + x1], bytes[y1 + x], bytes[y1 + x1]]);
+        cells[k] = [values[k], values[y * PERIOD + x1], values[y1 + x], values[y1 + x1]];
         k += 1;
     }
-    packed
+    cells
 }
 
 /// Uniform in [0, 1) at a lattice point; does not repeat.
@@ -100,27 +101,30 @@ fn cell(x: i32, y: i32, seed: u32) -> f32 {
     (hash(x, y, seed) >> 8) as f32 * (1.0 / 16_777_216.0)
 }
 
-#[inline]
-fn floor(x: f32) -> i32 {
-    let i = x as i32; // truncation; `f32::floor` is a library call on baseline x86-64
-    i - (x < i as f32) as i32
+/// The cell `x` is in, as integer and as float; exact below 2²² cells. At an integer it may be the
+/// cell below, whose upper end is the same place.
+#[inline(always)]
+fn floor(x: f32) -> (i32, f32) {
+    const SHIFT: f32 = 12_582_912.0; // 1.5 * 2²³: the sum's mantissa is the rounded integer
+    let y = (x - 0.5) + SHIFT;
+    ((y.to_bits() as i32).wrapping_sub(SHIFT.to_bits() as i32), y - SHIFT)
 }
 
 /// The two cells a footprint of `f` cells touches: the lower one and the weight of the upper one.
 #[inline]
 fn span(x: f32, f: f32) -> (i32, f32) {
     let f = f.clamp(1e-4, 1.0);
-    let i = floor(x - 0.5 * f);
-    (i, ((x + 0.5 * f - (i + 1) as f32) / f).clamp(0.0, 1.0))
+    let (i, low) = floor(x - 0.5 * f);
+    (i, ((x + 0.5 * f - (low + 1.0)) / f).clamp(0.0, 1.0))
 }
 
-/// The four corners of cell (i, j), 0 to 255.
+/// The four corners of cell (i, j).
 #[inline(always)]
-fn corners_of(i: i32, j: i32, seed: u32) -> [u8; 4] {
+fn corners_of(i: i32, j: i32, seed: u32) -> [f32; 4] {
     let shift = seed.wrapping_mul(0x9E37_79B1);
     let x = (i as u32).wrapping_add(shift >> 25) as usize % PERIOD;
     let y = (j as u32).wrapping_add(shift >> 18) as usize % PERIOD;
-    CORNERS[y * PERIOD + x].to_le_bytes()
+    CORNERS[y * PERIOD + x]
 }
 
 #[inline(always)]
@@ -133,7 +137,7 @@ fn between([c00, c10, c01, c11]: [f32; 4], a: f32, b: f32) -> f32 {
 /// Noise in [0, 1] between the corners of cell (i, j).
 #[inline(always)]
 fn bilinear(i: i32, j: i32, a: f32, b: f32, seed: u32) -> f32 {
-    between(corners_of(i, j, seed).map(|c| c as f32), a, b) * (1.0 / 255.0)
+    between(corners_of(i, j, seed), a, b)
 }
 
 /// Part of the footprint on cells of `pitch` metres of which `share`, chosen at random, are set.
@@ -142,7 +146,7 @@ fn scattered(s: Spot, pitch: Vec2, share: f32, seed: u32) -> f32 {
     let (x, f) = (s.at / pitch, s.footprint / pitch);
     let fade = 1.0 / (f.x.max(1.0) * f.y.max(1.0));
     let ((i, a), (j, b)) = (span(x.x, f.x), span(x.y, f.y));
-    let set = corners_of(i, j, seed).map(|c| ((c as f32) < share * 255.0) as u8 as f32);
+    let set = corners_of(i, j, seed).map(|c| if c < share { 1.0 } else { 0.0 });
     share + fade * (between(set, a, b) - share)
 }
 
@@ -177,8 +181,8 @@ fn fbm_until(s: Spot, coarse: f32, fine: f32, gain: f32, seed: u32, level: f32) 
     while pitch > floor_pitch && sum + tail * amplitude > level {
         let fade = ((pitch * per_foot - 1.0) * 0.7).min(1.0);
         let x = s.at * per_pitch;
-        let (i, j) = (floor(x.x), floor(x.y));
-        let (a, b) = (x.x - i as f32, x.y - j as f32);
+        let ((i, left), (j, bottom)) = (floor(x.x), floor(x.y));
+        let (a, b) = (x.x - left, x.y - bottom);
         let smooth = |a: f32| a * a * (3.0 - 2.0 * a);
         sum += amplitude * fade * (bilinear(i, j, smooth(a), smooth(b), octave) - 0.5);
         pitch *= 1.0 / LACUNARITY;
@@ -207,7 +211,7 @@ fn band(x: f32, lo: f32, hi: f32, f: f32) -> f32 {
 fn lines(x: f32, pitch: f32, width: f32, f: f32) -> f32 {
     let (x, w, f) = (x / pitch, width / pitch, (f / pitch).max(1e-4));
     let integral = |x: f32| {
-        let i = floor(x) as f32;
+        let i = floor(x).1;
         i * w + (x - i).min(w)
     };
     (integral(x + 0.5 * f) - integral(x - 0.5 * f)) / f
@@ -238,7 +242,7 @@ fn brick(s: Spot, seed: u32) -> f32 {
     const HEIGHT: f32 = 0.078;
     const LENGTH: f32 = 0.25;
     const MORTAR: f32 = 0.012;
-    let row = floor(s.at.y / HEIGHT);
+    let row = floor(s.at.y / HEIGHT).0;
     let shifted = Spot { at: Vec2::new(s.at.x + (row & 1) as f32 * 0.5 * LENGTH, s.at.y), ..s };
     let tone = blocks(shifted, Vec2::new(LENGTH, HEIGHT), seed);
     let joint_u = lines(shifted.at.x, LENGTH, MORTAR, s.footprint.x);
@@ -256,7 +260,7 @@ fn concrete(s: Spot, seed: u32) -> f32 {
     let runs = fbm(Spot { at: s.at * Vec2::new(1.0, 0.12), ..s }, 0.16, 0.01, 0.6, seed ^ 2);
     let seam = lines(s.at.x, panel.x, 0.012, s.footprint.x).max(lines(s.at.y, panel.y, 0.012, s.footprint.y));
     let q = Vec2::new(s.at.x / 0.6 - 0.5, s.at.y / 0.45 - 0.5);
-    let hole = (q - Vec2::new(floor(q.x) as f32, floor(q.y) as f32) - 0.5) * Vec2::new(0.6, 0.45);
+    let hole = (q - Vec2::new(floor(q.x).1, floor(q.y).1) - 0.5) * Vec2::new(0.6, 0.45);
     let hole = step(0.022 - hole.length(), s.footprint.max_element());
     let pores = blotches(s, 0.04, 0.36, seed ^ 4);
     mix(mix(base + 0.16 * runs, 0.14, 0.75 * pores), 0.08, seam.max(hole))
@@ -264,7 +268,7 @@ fn concrete(s: Spot, seed: u32) -> f32 {
 
 fn parquet(s: Spot, seed: u32) -> f32 {
     let plank = Vec2::new(1.05, 0.135);
-    let row = floor(s.at.y / plank.y);
+    let row = floor(s.at.y / plank.y).0;
     let shifted = Spot { at: Vec2::new(s.at.x + cell(row, 7, seed) * plank.x, s.at.y), ..s };
     let tone = blocks(shifted, plank, seed);
     let stretch = Vec2::new(0.12, 1.0);
@@ -289,7 +293,7 @@ fn ceiling_tile(s: Spot, seed: u32) -> f32 {
 fn books(s: Spot, seed: u32) -> f32 {
     const SHELF: f32 = 0.33;
     const BOARD: f32 = 0.028;
-    let row = floor(s.at.y / SHELF);
+    let row = floor(s.at.y / SHELF).0;
     let y = s.at.y - row as f32 * SHELF;
     let board = lines(s.at.y, SHELF, BOARD, s.footprint.y);
     // a monotonic warp of u makes the spines uneven without a search
@@ -392,7 +396,7 @@ fn drawers(s: Spot, seed: u32) -> f32 {
     let tone = blocks(s, pitch, seed);
     let seam = lines(s.at.x, pitch.x, 0.01, f.x).max(lines(s.at.y, pitch.y, 0.01, f.y));
     let q = s.at / pitch;
-    let c = (q - Vec2::new(floor(q.x) as f32, floor(q.y) as f32) - 0.5) * pitch;
+    let c = (q - Vec2::new(floor(q.x).1, floor(q.y).1) - 0.5) * pitch;
     let handle = band(c.x, -0.06, 0.06, f.x) * band(c.y, 0.03, 0.05, f.y);
     let label = band(c.x, -0.04, 0.05, f.x) * band(c.y, -0.06, -0.015, f.y);
     let text = blocks(s, Vec2::new(0.008, 0.009), seed ^ 1);
