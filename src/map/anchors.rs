@@ -1,0 +1,349 @@
+//! Seeds of an anchor keyframe: where its view is uncovered, Gaussians are put on the stereo depth.
+//!
+//! Pixels are picked by error diffusion (Floyd and Steinberg 1976) of a density that follows the image
+//! gradient: evenly spaced where the image is flat, denser on detail, never random, and the spacing is known,
+//! so the size of a Gaussian is the distance to its neighbours. Where matching found no depth (bare walls)
+//! the inverse depth of the nearest matches left, right, above and below is carried over, the background
+//! preferred; such seeds start large and faint so that others overrule them.
+
+use super::occupancy::{Cell, Occupancy};
+use crate::counters::Counters;
+use crate::mem::Footprint;
+use crate::stereo::{DepthMap, Pinhole};
+use glam::DVec3;
+use stipple_drivers::{Image, Pose};
+
+/// A Gaussian to be: isotropic, at a pixel's depth.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Seed {
+    pub p_world: DVec3,
+    /// Standard deviation, m.
+    pub sigma_m: f64,
+    pub opacity: f64,
+    /// 0..=1
+    pub grey: f64,
+}
+
+/// σ over the spacing of seeds: neighbours meet at about 0.6 of their peak.
+const SPREAD: f64 = 0.5;
+/// Spacing of seeds, px.
+const SPACING_PX: [f64; 2] = [1.0, 12.0];
+const OPACITY_MATCHED: f64 = 0.7;
+const OPACITY_FILLED: f64 = 0.5;
+/// Density of a filled pixel over that of a matched one: bare walls need few Gaussians.
+const DENSITY_FILLED: f64 = 0.5;
+/// Gradient, grey levels a pixel, that doubles the density of a flat area.
+const GRADIENT_DOUBLES: f64 = 6.0;
+/// Neighbours whose inverse depth exceeds the farthest's by this are foreground, and not carried over.
+const FOREGROUND: f32 = 1.25;
+/// Below this rendered alpha a pixel takes seeds even in an occupied cell.
+const SEED_ALPHA: f32 = 0.5;
+
+/// What an anchor sees.
+pub struct View<'a> {
+    pub image: &'a Image,
+    pub valid: &'a [u8],
+    pub depth: &'a DepthMap,
+    /// Rendered alpha before the anchor was added.
+    pub alpha: &'a [f32],
+    pub camera: Pinhole,
+    pub world_from_cam: Pose,
+    pub anchor: u32,
+}
+
+/// Fraction of valid pixels whose rendered alpha is below `covered_alpha`.
+pub fn uncovered(alpha: &[f32], valid: &[u8], covered_alpha: f64) -> f64 {
+    let (mut bare, mut n) = (0u32, 0u32);
+    for (a, v) in alpha.iter().zip(valid) {
+        if *v != 0 {
+            n += 1;
+            bare += u32::from(f64::from(*a) < covered_alpha);
+        }
+    }
+    f64::from(bare) / f64::from(n.max(1))
+}
+
+/// Picks seeds; owns the scratch it needs.
+pub struct Seeder {
+    occupancy: Occupancy,
+    filled: Vec<f32>,
+    density: Vec<f32>,
+    /// Index of the nearest matched pixel left, right, above, below; `NONE` without.
+    nearest: [Vec<u32>; 4],
+    /// Error carried to the row being walked and to the next, one pixel of margin on each side.
+    carried: [Vec<f32>; 2],
+    seeds: Vec<Seed>,
+    seeds_max: usize,
+}
+
+const NONE: u32 = u32::MAX;
+
+impl Seeder {
+    pub fn footprint(pixels: usize, seeds_max: usize, cells: u32) -> Footprint {
+        let mut f = Occupancy::footprint(cells);
+        f.host("map: seeding scratch", pixels * 6 * size_of::<f32>());
+        f.host("map: seeds", seeds_max * size_of::<Seed>());
+        f
+    }
+
+    pub fn new(width: usize, height: usize, seeds_max: usize, cell_m: f64, cells: u32) -> Seeder {
+        let n = width * height;
+        Seeder {
+            occupancy: Occupancy::new(cell_m, cells),
+            filled: vec![0.0; n],
+            density: vec![0.0; n],
+            nearest: std::array::from_fn(|_| vec![NONE; n]),
+            carried: std::array::from_fn(|_| vec![0.0; width + 2]),
+            seeds: Vec::with_capacity(seeds_max),
+            seeds_max,
+        }
+    }
+
+    /// Seeds for at most `room` Gaussians. Pixels an earlier anchor's Gaussians already show are left alone.
+    pub fn seed(&mut self, view: &View, room: usize, counters: &Counters) -> &[Seed] {
+        self.fill(&view.depth.metres, view.depth.width);
+        self.set_density(view);
+        self.seeds.clear();
+        let (w, h) = (view.image.width, view.image.height);
+        let room = room.min(self.seeds_max);
+        self.carried.iter_mut().for_each(|c| c.fill(0.0));
+        for y in 0..h {
+            for step in 0..w {
+                // Alternate rows run backwards, else the pattern leans.
+                let x = if y % 2 == 0 { step } else { w - 1 - step };
+                let wanted = self.density[y * w + x] + self.carried[0][x + 1];
+                let picked = wanted >= 0.5;
+                let rest = wanted - if picked { 1.0 } else { 0.0 };
+                let (ahead, behind) = if y % 2 == 0 { (x + 2, x) } else { (x, x + 2) };
+                self.carried[0][ahead] += rest * (7.0 / 16.0);
+                self.carried[1][behind] += rest * (3.0 / 16.0);
+                self.carried[1][x + 1] += rest * (5.0 / 16.0);
+                self.carried[1][ahead] += rest * (1.0 / 16.0);
+                if picked && self.density[y * w + x] > 0.0 {
+                    if self.seeds.len() == room {
+                        counters.splats_full.add(1);
+                    } else {
+                        self.put(view, x, y, counters);
+                    }
+                }
+            }
+            self.carried.swap(0, 1);
+            self.carried[1].fill(0.0);
+        }
+        &self.seeds
+    }
+
+    fn put(&mut self, view: &View, x: usize, y: usize, counters: &Counters) {
+        let i = y * view.image.width + x;
+        let c = view.camera;
+        let matched = view.depth.metres[i] > 0.0;
+        let z = f64::from(if matched { view.depth.metres[i] } else { self.filled[i] });
+        let p_cam = DVec3::new((x as f64 - c.cx) / c.fx, (y as f64 - c.cy) / c.fy, 1.0) * z;
+        let p_world = view.world_from_cam.transform(p_cam);
+        match self.occupancy.claim(p_world, view.anchor) {
+            Cell::Held if view.alpha[i] >= SEED_ALPHA => return counters.seeds_occupied.add(1),
+            Cell::Full => counters.occupancy_full.add(1),
+            _ => {}
+        }
+        let spacing_px = (1.0 / f64::from(self.density[i])).sqrt().clamp(SPACING_PX[0], SPACING_PX[1]);
+        self.seeds.push(Seed {
+            p_world,
+            sigma_m: SPREAD * spacing_px * z / c.fx,
+            opacity: if matched { OPACITY_MATCHED } else { OPACITY_FILLED },
+            grey: f64::from(view.image.pixels[i]) / 255.0,
+        });
+    }
+
+    /// Seeds a pixel, so that a whole uncovered view gets `seeds_max` of them.
+    fn set_density(&mut self, view: &View) {
+        let (w, h) = (view.image.width, view.image.height);
+        let px = |x: usize, y: usize| f64::from(view.image.pixels[y * w + x]);
+        let mut sum = 0.0;
+        for y in 0..h {
+            for x in 0..w {
+                let i = y * w + x;
+                let mut weight = 0.0;
+                if view.valid[i] != 0 && self.filled[i] > 0.0 {
+                    let (x0, x1) = (x.saturating_sub(1), (x + 1).min(w - 1));
+                    let (y0, y1) = (y.saturating_sub(1), (y + 1).min(h - 1));
+                    let gradient = 0.5 * (px(x1, y) - px(x0, y)).hypot(px(x, y1) - px(x, y0));
+                    weight = 1.0 + gradient / GRADIENT_DOUBLES;
+                    if view.depth.metres[i] <= 0.0 {
+                        weight *= DENSITY_FILLED;
+                    }
+                    sum += weight;
+                }
+                self.density[i] = weight as f32;
+            }
+        }
+        let scale = (self.seeds_max as f64 / f64::max(sum, 1.0)) as f32;
+        for i in 0..w * h {
+            self.density[i] = (self.density[i] * scale).min(1.0);
+        }
+    }
+
+    /// Depth where there is a match, else inverse depth carried over from the nearest matches around.
+    fn fill(&mut self, metres: &[f32], width: usize) {
+        let height = metres.len() / width;
+        let [left, right, up, down] = &mut self.nearest;
+        for y in 0..height {
+            for x in 0..width {
+                let i = y * width + x;
+                let own = if metres[i] > 0.0 { i as u32 } else { NONE };
+                left[i] = if own == NONE && x > 0 { left[i - 1] } else { own };
+                up[i] = if own == NONE && y > 0 { up[i - width] } else { own };
+            }
+        }
+        for y in (0..height).rev() {
+            for x in (0..width).rev() {
+                let i = y * width + x;
+                let own = if metres[i] > 0.0 { i as u32 } else { NONE };
+                right[i] = if own == NONE && x + 1 < width { right[i + 1] } else { own };
+                down[i] = if own == NONE && y + 1 < height { down[i + width] } else { own };
+            }
+        }
+        for i in 0..metres.len() {
+            self.filled[i] = if metres[i] > 0.0 {
+                metres[i]
+            } else {
+                let around = self.nearest.each_ref().map(|n| n[i]);
+                carried_depth(metres, width, i, around)
+            };
+        }
+    }
+}
+
+fn carried_depth(metres: &[f32], width: usize, i: usize, around: [u32; 4]) -> f32 {
+    let inverse = |j: u32| 1.0 / metres[j as usize];
+    let known = || around.iter().copied().filter(|&j| j != NONE);
+    let farthest = known().map(inverse).fold(f32::INFINITY, f32::min);
+    let (mut sum, mut weights) = (0.0, 0.0);
+    for j in known().filter(|&j| inverse(j) <= FOREGROUND * farthest) {
+        let (dx, dy) = ((j as usize % width).abs_diff(i % width), (j as usize / width).abs_diff(i / width));
+        let weight = 1.0 / (dx + dy) as f32;
+        sum += weight * inverse(j);
+        weights += weight;
+    }
+    if weights > 0.0 {
+        weights / sum
+    } else {
+        0.0
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const W: usize = 64;
+    const H: usize = 48;
+
+    fn camera() -> Pinhole {
+        Pinhole { width: W, height: H, fx: 50.0, fy: 50.0, cx: 31.5, cy: 23.5 }
+    }
+
+    fn seed(seeder: &mut Seeder, image: &Image, depth: &DepthMap, alpha: f32, anchor: u32) -> Vec<Seed> {
+        let view = View {
+            image,
+            valid: &[1; W * H],
+            depth,
+            alpha: &[alpha; W * H],
+            camera: camera(),
+            world_from_cam: Pose::IDENTITY,
+            anchor,
+        };
+        seeder.seed(&view, usize::MAX, &Counters::default()).to_vec()
+    }
+
+    fn flat(z: f32) -> DepthMap {
+        DepthMap { width: W, height: H, metres: vec![z; W * H] }
+    }
+
+    #[test]
+    fn uncovered_counts_valid_pixels_only() {
+        assert_eq!(uncovered(&[0.0, 0.9, 0.0, 0.04], &[1, 1, 0, 1], 0.05), 2.0 / 3.0);
+        assert_eq!(uncovered(&[0.0], &[0], 0.05), 0.0);
+    }
+
+    #[test]
+    fn flat_view_is_seeded_evenly_and_within_budget() {
+        let mut s = Seeder::new(W, H, 300, 0.1, 4096);
+        let seeds = seed(&mut s, &Image::new(W, H), &flat(2.0), 0.0, 1);
+        assert!((270..=300).contains(&seeds.len()), "{}", seeds.len());
+        // Every 16x16 block gets its share.
+        let mut blocks = [0; 12];
+        for k in &seeds {
+            let (x, y) = (k.p_world.x / 2.0 * 50.0 + 31.5, k.p_world.y / 2.0 * 50.0 + 23.5);
+            blocks[(y / 16.0) as usize * 4 + (x / 16.0) as usize] += 1;
+            assert!((k.p_world.z - 2.0).abs() < 1e-6);
+        }
+        assert!(blocks.iter().all(|n| (20..=30).contains(n)), "{blocks:?}");
+    }
+
+    #[test]
+    fn detail_is_seeded_denser() {
+        let mut image = Image::new(W, H);
+        for (i, p) in image.pixels.iter_mut().enumerate() {
+            *p = if i % W >= W / 2 && (i % W / 2) % 2 == 0 { 200 } else { 60 };
+        }
+        let seeds = seed(&mut Seeder::new(W, H, 300, 0.1, 4096), &image, &flat(2.0), 0.0, 1);
+        let right = seeds.iter().filter(|k| k.p_world.x > 0.1).count();
+        assert!(right > 3 * (seeds.len() - right), "{right} of {}", seeds.len());
+    }
+
+    #[test]
+    fn occupied_cells_take_no_seed_unless_bare() {
+        let mut s = Seeder::new(W, H, 300, 0.1, 4096);
+        let image = Image::new(W, H);
+        let first = seed(&mut s, &image, &flat(2.0), 0.0, 1).len();
+        // One cell in a dozen may have been missed by the first picks.
+        assert!(seed(&mut s, &image, &flat(2.0), 1.0, 2).len() < first / 8);
+        assert_eq!(seed(&mut s, &image, &flat(2.0), 0.0, 3).len(), first);
+    }
+
+    #[test]
+    fn room_is_never_exceeded() {
+        let mut s = Seeder::new(W, H, 300, 0.1, 4096);
+        let counters = Counters::default();
+        let (image, depth) = (Image::new(W, H), flat(1.0));
+        let view = View {
+            image: &image,
+            valid: &[1; W * H],
+            depth: &depth,
+            alpha: &[0.0; W * H],
+            camera: camera(),
+            world_from_cam: Pose::IDENTITY,
+            anchor: 1,
+        };
+        assert_eq!(s.seed(&view, 40, &counters).len(), 40);
+        assert!(counters.splats_full.get() > 200);
+    }
+
+    #[test]
+    fn holes_take_the_background() {
+        let mut depth = flat(0.0);
+        for y in 0..H {
+            for x in 0..W {
+                depth.metres[y * W + x] = match x {
+                    0..=19 => 1.0,
+                    20..=39 => 0.0,
+                    _ => 3.0,
+                };
+            }
+        }
+        let mut s = Seeder::new(W, H, 300, 0.1, 4096);
+        s.fill(&depth.metres, W);
+        assert!((s.filled[10 * W + 22] - 3.0).abs() < 1e-5);
+        assert_eq!(s.filled[10 * W + 5], 1.0);
+        // A plane is continued as a plane: inverse depth is linear in the image.
+        for y in 0..H {
+            for x in 0..W {
+                let inv = 0.5 + 0.004 * x as f32;
+                depth.metres[y * W + x] = if (20..40).contains(&x) && (10..30).contains(&y) { 0.0 } else { 1.0 / inv };
+            }
+        }
+        s.fill(&depth.metres, W);
+        let error = (1.0 / s.filled[20 * W + 25] - (0.5 + 0.004 * 25.0)).abs();
+        assert!(error < 0.01, "{error}");
+    }
+}

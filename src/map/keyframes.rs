@@ -1,0 +1,245 @@
+//! Keyframes: the plain data that crosses the border, the queue of those not yet looked at, and the store of
+//! rectified images the map is trained and judged on. Everything is sized at boot; full is a value.
+
+use crate::mem::Footprint;
+use stipple_drivers::{Image, Nanos, Pose};
+
+/// A raw stereo pair and where the body was, mid-exposure.
+#[derive(Clone, Debug, Default)]
+pub struct Keyframe {
+    pub id: u64,
+    pub t: Nanos,
+    pub world_from_body: Pose,
+    /// Left, right; as the cameras gave them.
+    pub images: [Image; 2],
+    /// Never trained on, only evaluated.
+    pub held_out: bool,
+}
+
+impl Keyframe {
+    /// Pre-shaped, so that filling it allocates nothing.
+    pub fn for_images(sizes: [(usize, usize); 2]) -> Keyframe {
+        Keyframe { images: sizes.map(|(w, h)| Image::new(w, h)), ..Keyframe::default() }
+    }
+
+    pub fn copy_from(&mut self, other: &Keyframe) {
+        (self.id, self.t, self.world_from_body, self.held_out) =
+            (other.id, other.t, other.world_from_body, other.held_out);
+        for (to, from) in self.images.iter_mut().zip(&other.images) {
+            to.copy_from(from);
+        }
+    }
+}
+
+/// A better pose for a keyframe offered earlier.
+#[derive(Clone, Copy, Debug)]
+pub struct PoseCorrection {
+    pub id: u64,
+    pub world_from_body: Pose,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Offer {
+    Accepted,
+    /// The queue or the store is full; the caller goes on without.
+    Full,
+}
+
+/// Pairs waiting for the mapper, oldest first; full rejects the newest.
+pub struct Queue {
+    slots: Vec<Keyframe>,
+    first: usize,
+    len: usize,
+}
+
+/// The mapper takes at most one step between looks; two absorb a keyframe during an anchor.
+pub const QUEUE_LEN: usize = 2;
+
+impl Queue {
+    pub fn new(sizes: [(usize, usize); 2]) -> Queue {
+        Queue { slots: (0..QUEUE_LEN).map(|_| Keyframe::for_images(sizes)).collect(), first: 0, len: 0 }
+    }
+
+    pub fn len(&self) -> usize {
+        self.len
+    }
+
+    pub fn is_empty(&self) -> bool {
+        self.len == 0
+    }
+
+    pub fn push(&mut self, keyframe: &Keyframe) -> Offer {
+        let n = self.slots.len();
+        let same_shape = |slot: &Keyframe| {
+            slot.images
+                .iter()
+                .zip(&keyframe.images)
+                .all(|(a, b)| a.pixels.len() == b.pixels.len() && a.width == b.width)
+        };
+        if self.len == n || !same_shape(&self.slots[0]) {
+            return Offer::Full;
+        }
+        self.slots[(self.first + self.len) % n].copy_from(keyframe);
+        self.len += 1;
+        Offer::Accepted
+    }
+
+    pub fn front(&self) -> Option<&Keyframe> {
+        (self.len > 0).then(|| &self.slots[self.first])
+    }
+
+    pub fn pop(&mut self) {
+        if self.len > 0 {
+            self.first = (self.first + 1) % self.slots.len();
+            self.len -= 1;
+        }
+    }
+
+    /// A keyframe still waiting takes its correction too.
+    pub fn correct(&mut self, correction: &PoseCorrection) {
+        let n = self.slots.len();
+        for i in 0..self.len {
+            let slot = &mut self.slots[(self.first + i) % n];
+            if slot.id == correction.id {
+                slot.world_from_body = correction.world_from_body;
+            }
+        }
+    }
+}
+
+/// A keyframe in the store.
+#[derive(Clone, Copy, Debug)]
+pub struct Stored {
+    pub id: u64,
+    pub t: Nanos,
+    pub world_from_body: Pose,
+    pub held_out: bool,
+    pub anchor: bool,
+}
+
+/// Rectified left images at mapping resolution, and what is known of each.
+pub struct Store {
+    entries: Vec<Stored>,
+    images: Vec<Image>,
+    training: Vec<u32>,
+}
+
+impl Store {
+    pub fn footprint(capacity: usize, pixels: usize) -> Footprint {
+        let mut f = Footprint::default();
+        f.host("map: keyframe images", capacity * pixels);
+        f.host("map: keyframes", capacity * (size_of::<Stored>() + size_of::<Image>() + size_of::<u32>()));
+        f
+    }
+
+    pub fn new(capacity: usize, width: usize, height: usize) -> Store {
+        Store {
+            entries: Vec::with_capacity(capacity),
+            images: (0..capacity).map(|_| Image::new(width, height)).collect(),
+            training: Vec::with_capacity(capacity),
+        }
+    }
+
+    pub fn len(&self) -> usize {
+        self.entries.len()
+    }
+
+    pub fn is_empty(&self) -> bool {
+        self.entries.is_empty()
+    }
+
+    pub fn is_full(&self) -> bool {
+        self.entries.len() == self.images.len()
+    }
+
+    /// Takes a keyframe whose image `draw` makes; `None` when the store is full.
+    pub fn add(&mut self, keyframe: &Keyframe, draw: impl FnOnce(&mut Image)) -> Option<usize> {
+        let index = self.entries.len();
+        let image = self.images.get_mut(index)?;
+        draw(image);
+        let &Keyframe { id, t, world_from_body, held_out, .. } = keyframe;
+        self.entries.push(Stored { id, t, world_from_body, held_out, anchor: false });
+        if !held_out {
+            self.training.push(index as u32);
+        }
+        Some(index)
+    }
+
+    pub fn get(&self, index: usize) -> &Stored {
+        &self.entries[index]
+    }
+
+    pub fn get_mut(&mut self, index: usize) -> &mut Stored {
+        &mut self.entries[index]
+    }
+
+    pub fn image(&self, index: usize) -> &Image {
+        &self.images[index]
+    }
+
+    pub fn iter(&self) -> impl Iterator<Item = &Stored> {
+        self.entries.iter()
+    }
+
+    /// Indices of keyframes that may be trained on.
+    pub fn training(&self) -> &[u32] {
+        &self.training
+    }
+
+    pub fn anchors(&self) -> usize {
+        self.entries.iter().filter(|e| e.anchor).count()
+    }
+
+    pub fn correct(&mut self, correction: &PoseCorrection) {
+        if let Some(e) = self.entries.iter_mut().find(|e| e.id == correction.id) {
+            e.world_from_body = correction.world_from_body;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::DVec3;
+
+    fn keyframe(id: u64, held_out: bool) -> Keyframe {
+        let mut k = Keyframe::for_images([(4, 3); 2]);
+        k.images[0].pixels.fill(id as u8);
+        (k.id, k.held_out) = (id, held_out);
+        k
+    }
+
+    #[test]
+    fn full_queue_rejects_newest_and_keeps_order() {
+        let mut q = Queue::new([(4, 3); 2]);
+        assert_eq!(q.push(&keyframe(1, false)), Offer::Accepted);
+        assert_eq!(q.push(&keyframe(2, false)), Offer::Accepted);
+        assert_eq!(q.push(&keyframe(3, false)), Offer::Full);
+        q.correct(&PoseCorrection { id: 2, world_from_body: Pose { p: DVec3::X, ..Pose::IDENTITY } });
+        assert_eq!(q.front().map(|k| (k.id, k.images[0].pixels[0])), Some((1, 1)));
+        q.pop();
+        assert_eq!(q.push(&keyframe(4, false)), Offer::Accepted);
+        assert_eq!(q.front().map(|k| (k.id, k.world_from_body.p)), Some((2, DVec3::X)));
+        q.pop();
+        assert_eq!(q.front().map(|k| k.id), Some(4));
+        q.pop();
+        assert!(q.front().is_none());
+    }
+
+    #[test]
+    fn images_of_another_shape_are_refused() {
+        let mut q = Queue::new([(4, 3); 2]);
+        assert_eq!(q.push(&Keyframe::for_images([(3, 4); 2])), Offer::Full);
+    }
+
+    #[test]
+    fn held_out_keyframes_are_stored_but_not_for_training() {
+        let mut s = Store::new(3, 2, 2);
+        for id in 0..3 {
+            assert_eq!(s.add(&keyframe(id, id == 1), |i| i.pixels.fill(9)), Some(id as usize));
+        }
+        assert_eq!(s.add(&keyframe(3, false), |_| {}), None);
+        assert_eq!(s.training(), [0, 2]);
+        assert_eq!((s.len(), s.image(1).pixels[3]), (3, 9));
+    }
+}
