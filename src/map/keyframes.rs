@@ -1,6 +1,7 @@
 //! Keyframes: the plain data that crosses the border, the queue of those not yet looked at, and the store of
 //! rectified images the map is trained and judged on. Everything is sized at boot; full is a value.
 
+use super::pose::PoseAdam;
 use crate::mem::Footprint;
 use stipple_drivers::{Image, Nanos, Pose};
 
@@ -18,15 +19,18 @@ pub struct Keyframe {
 
 impl Keyframe {
     /// Pre-shaped, so that filling it allocates nothing.
-    pub fn for_images(sizes: [(usize, usize); 2]) -> Keyframe {
-        Keyframe { images: sizes.map(|(w, h)| Image::new(w, h)), ..Keyframe::default() }
+    pub fn with_images(images: [Image; 2]) -> Keyframe {
+        Keyframe { images, ..Keyframe::default() }
     }
 
-    pub fn copy_from(&mut self, other: &Keyframe) {
+    /// Allocates nothing as long as the images fit what was allocated for them.
+    fn copy_from(&mut self, other: &Keyframe) {
         (self.id, self.t, self.world_from_body, self.held_out) =
             (other.id, other.t, other.world_from_body, other.held_out);
         for (to, from) in self.images.iter_mut().zip(&other.images) {
-            to.copy_from(from);
+            (to.width, to.height) = (from.width, from.height);
+            to.pixels.clear();
+            to.pixels.extend_from_slice(&from.pixels);
         }
     }
 }
@@ -48,20 +52,26 @@ pub enum Offer {
 /// Pairs waiting for the mapper, oldest first; full rejects the newest.
 pub struct Queue {
     slots: Vec<Keyframe>,
+    pixels_max: usize,
     first: usize,
     len: usize,
 }
 
-/// The mapper takes at most one step between looks; two absorb a keyframe during an anchor.
-pub const QUEUE_LEN: usize = 2;
+/// The mapper takes one between two steps; four absorb the keyframes of one slow step.
+pub const QUEUE_LEN: usize = 4;
 
 impl Queue {
-    pub fn new(sizes: [(usize, usize); 2]) -> Queue {
-        Queue { slots: (0..QUEUE_LEN).map(|_| Keyframe::for_images(sizes)).collect(), first: 0, len: 0 }
+    pub fn footprint(pixels_max: usize) -> Footprint {
+        let mut f = Footprint::default();
+        f.host("map: keyframes waiting", QUEUE_LEN * 2 * pixels_max);
+        f
     }
 
-    pub fn len(&self) -> usize {
-        self.len
+    /// `pixels_max` is the largest image the board accepts.
+    pub fn new(pixels_max: usize) -> Queue {
+        let image = || Image { pixels: Vec::with_capacity(pixels_max), ..Image::default() };
+        let slots = (0..QUEUE_LEN).map(|_| Keyframe::with_images([image(), image()])).collect();
+        Queue { slots, pixels_max, first: 0, len: 0 }
     }
 
     pub fn is_empty(&self) -> bool {
@@ -69,17 +79,10 @@ impl Queue {
     }
 
     pub fn push(&mut self, keyframe: &Keyframe) -> Offer {
-        let n = self.slots.len();
-        let same_shape = |slot: &Keyframe| {
-            slot.images
-                .iter()
-                .zip(&keyframe.images)
-                .all(|(a, b)| a.pixels.len() == b.pixels.len() && a.width == b.width)
-        };
-        if self.len == n || !same_shape(&self.slots[0]) {
+        if self.len == QUEUE_LEN || keyframe.images.iter().any(|i| i.pixels.len() > self.pixels_max) {
             return Offer::Full;
         }
-        self.slots[(self.first + self.len) % n].copy_from(keyframe);
+        self.slots[(self.first + self.len) % QUEUE_LEN].copy_from(keyframe);
         self.len += 1;
         Offer::Accepted
     }
@@ -90,16 +93,15 @@ impl Queue {
 
     pub fn pop(&mut self) {
         if self.len > 0 {
-            self.first = (self.first + 1) % self.slots.len();
+            self.first = (self.first + 1) % QUEUE_LEN;
             self.len -= 1;
         }
     }
 
     /// A keyframe still waiting takes its correction too.
     pub fn correct(&mut self, correction: &PoseCorrection) {
-        let n = self.slots.len();
         for i in 0..self.len {
-            let slot = &mut self.slots[(self.first + i) % n];
+            let slot = &mut self.slots[(self.first + i) % QUEUE_LEN];
             if slot.id == correction.id {
                 slot.world_from_body = correction.world_from_body;
             }
@@ -115,6 +117,8 @@ pub struct Stored {
     pub world_from_body: Pose,
     pub held_out: bool,
     pub anchor: bool,
+    /// Of its refinement on the image.
+    pub adam: PoseAdam,
 }
 
 /// Rectified left images at mapping resolution, and what is known of each.
@@ -158,7 +162,7 @@ impl Store {
         let image = self.images.get_mut(index)?;
         draw(image);
         let &Keyframe { id, t, world_from_body, held_out, .. } = keyframe;
-        self.entries.push(Stored { id, t, world_from_body, held_out, anchor: false });
+        self.entries.push(Stored { id, t, world_from_body, held_out, anchor: false, adam: PoseAdam::default() });
         if !held_out {
             self.training.push(index as u32);
         }
@@ -203,7 +207,7 @@ mod tests {
     use glam::DVec3;
 
     fn keyframe(id: u64, held_out: bool) -> Keyframe {
-        let mut k = Keyframe::for_images([(4, 3); 2]);
+        let mut k = Keyframe::with_images([Image::new(4, 3), Image::new(4, 3)]);
         k.images[0].pixels.fill(id as u8);
         (k.id, k.held_out) = (id, held_out);
         k
@@ -211,25 +215,26 @@ mod tests {
 
     #[test]
     fn full_queue_rejects_newest_and_keeps_order() {
-        let mut q = Queue::new([(4, 3); 2]);
-        assert_eq!(q.push(&keyframe(1, false)), Offer::Accepted);
-        assert_eq!(q.push(&keyframe(2, false)), Offer::Accepted);
-        assert_eq!(q.push(&keyframe(3, false)), Offer::Full);
+        let mut q = Queue::new(12);
+        for id in 1..=4 {
+            assert_eq!(q.push(&keyframe(id, false)), Offer::Accepted);
+        }
+        assert_eq!(q.push(&keyframe(5, false)), Offer::Full);
         q.correct(&PoseCorrection { id: 2, world_from_body: Pose { p: DVec3::X, ..Pose::IDENTITY } });
         assert_eq!(q.front().map(|k| (k.id, k.images[0].pixels[0])), Some((1, 1)));
         q.pop();
-        assert_eq!(q.push(&keyframe(4, false)), Offer::Accepted);
+        assert_eq!(q.push(&keyframe(6, false)), Offer::Accepted);
         assert_eq!(q.front().map(|k| (k.id, k.world_from_body.p)), Some((2, DVec3::X)));
-        q.pop();
-        assert_eq!(q.front().map(|k| k.id), Some(4));
-        q.pop();
-        assert!(q.front().is_none());
+        for id in [2, 3, 4, 6] {
+            assert_eq!(q.front().map(|k| k.id), Some(id));
+            q.pop();
+        }
+        assert!(q.front().is_none() && q.is_empty());
     }
 
     #[test]
-    fn images_of_another_shape_are_refused() {
-        let mut q = Queue::new([(4, 3); 2]);
-        assert_eq!(q.push(&Keyframe::for_images([(3, 4); 2])), Offer::Full);
+    fn images_beyond_the_budget_are_refused() {
+        assert_eq!(Queue::new(11).push(&keyframe(1, false)), Offer::Full);
     }
 
     #[test]

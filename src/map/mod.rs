@@ -7,5 +7,6 @@ pub mod keyframes;
 pub mod occupancy;
 pub mod pipeline;
 pub mod pool;
+pub mod pose;
 pub mod schedule;
 pub mod sort;

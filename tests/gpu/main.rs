@@ -1,6 +1,7 @@
-//! Kernels against their f64 twins, on whatever Vulkan device there is (lavapipe in CI).
+//! Kernels against their twins, on whatever Vulkan device there is (lavapipe in CI).
 #![allow(clippy::unwrap_used)]
 
+mod sort;
 mod speed;
 mod splat;
 mod twins;

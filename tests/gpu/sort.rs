@@ -1,0 +1,167 @@
+//! Radix sort and prefix sum against their CPU twins, bit for bit.
+
+use stipple::config::GpuConfig;
+use stipple::gpu::{Buf, Gpu};
+use stipple::map::sort::{Pairs, Scan, Sorter};
+
+const CAPACITY: usize = 40_000;
+
+/// Twin of `Sorter::record`: a stable sort of the first `count` pairs by the low `bits`.
+fn sorted(keys: &[u32], count: usize, bits: u32) -> (Vec<u32>, Vec<u32>) {
+    let n = count.min(keys.len());
+    let mask = u32::MAX >> (32 - bits);
+    let mut order: Vec<u32> = (0..n as u32).collect();
+    order.sort_by_key(|&i| keys[i as usize] & mask);
+    (order.iter().map(|&i| keys[i as usize]).collect(), order)
+}
+
+/// Twin of `Scan::record_counted`.
+fn scanned(data: &[u32], count: usize) -> Vec<u32> {
+    let mut sum = 0u32;
+    let mut out = data.to_vec();
+    for v in out.iter_mut().take(count) {
+        (*v, sum) = (sum, sum.wrapping_add(*v));
+    }
+    out
+}
+
+fn noise(seed: u32, n: usize) -> Vec<u32> {
+    let mut s = seed;
+    (0..n)
+        .map(|_| {
+            s ^= s << 13;
+            s ^= s >> 17;
+            s ^= s << 5;
+            s
+        })
+        .collect()
+}
+
+struct Rig {
+    gpu: Gpu,
+    sorter: Sorter,
+    scan: Scan,
+    pairs: Pairs,
+    count: Buf<u32>,
+}
+
+impl Rig {
+    fn new(capacity: usize) -> Rig {
+        let bytes = Sorter::footprint(capacity).gpu_total() + (capacity as u64) * 8 + (1 << 20);
+        let mut gpu = Gpu::open(&GpuConfig::default(), bytes).expect("a Vulkan device");
+        let sorter = Sorter::new(&mut gpu, capacity).unwrap();
+        let scan = Scan::new(&mut gpu).unwrap();
+        let pairs =
+            Pairs { keys: gpu.alloc("keys", capacity).unwrap(), payload: gpu.alloc("payload", capacity).unwrap() };
+        let count = gpu.alloc("count", 1).unwrap();
+        Rig { gpu, sorter, scan, pairs, count }
+    }
+
+    /// Sorts `keys[..count]` with their indices as payload; milliseconds on the device beside it.
+    fn sort(&mut self, keys: &[u32], count: u32, bits: u32) -> (Vec<u32>, Vec<u32>, f64) {
+        let index: Vec<u32> = (0..keys.len() as u32).collect();
+        self.gpu.upload(self.pairs.keys, 0, keys).unwrap();
+        self.gpu.upload(self.pairs.payload, 0, &index).unwrap();
+        self.gpu.upload(self.count, 0, &[count]).unwrap();
+        let mut rec = self.gpu.record();
+        let at = self.sorter.record(&mut rec, self.pairs, self.count, bits);
+        self.gpu.submit(rec).unwrap();
+        let ms = self.gpu.last_submit_ms();
+        let n = (count as usize).min(keys.len());
+        let (mut k, mut p) = (vec![0; n], vec![0; n]);
+        self.gpu.download(at.keys, 0, &mut k).unwrap();
+        self.gpu.download(at.payload, 0, &mut p).unwrap();
+        (k, p, ms)
+    }
+
+    fn check(&mut self, what: &str, keys: &[u32], count: u32, bits: u32) {
+        let (k, p, _) = self.sort(keys, count, bits);
+        let twin = sorted(keys, count as usize, bits);
+        assert!((k, p) == twin, "{what}, {count} keys of {bits} bits");
+    }
+}
+
+#[test]
+fn sort_is_stable_and_equals_its_twin() {
+    let mut rig = Rig::new(CAPACITY);
+    for count in [0, 1, 31, 32, 33, 255, 256, 257, 1023, 1024, 1025, 10_000, CAPACITY] {
+        let keys = noise(count as u32 + 1, count);
+        for bits in [1, 8, 11, 12, 16, 22, 31, 32] {
+            rig.check("noise", &keys, count as u32, bits);
+        }
+    }
+    let n = CAPACITY as u32;
+    rig.check("equal", &vec![7; CAPACITY], n, 11);
+    rig.check("few values", &noise(3, CAPACITY).iter().map(|k| k % 3).collect::<Vec<_>>(), n, 11);
+    rig.check("sorted", &(0..n).collect::<Vec<_>>(), n, 16);
+    rig.check("reversed", &(0..n).rev().collect::<Vec<_>>(), n, 16);
+    rig.check(
+        "extremes",
+        &noise(4, CAPACITY).iter().map(|k| if k & 1 == 0 { 0 } else { u32::MAX }).collect::<Vec<_>>(),
+        n,
+        32,
+    );
+}
+
+#[test]
+fn count_on_the_device_bounds_the_sort() {
+    let mut rig = Rig::new(CAPACITY);
+    let keys = noise(9, CAPACITY);
+    rig.check("part", &keys, 12_345, 16);
+    rig.check("more than there is room for", &keys, CAPACITY as u32 + 1000, 16);
+    let (_, _, _) = rig.sort(&keys, 5000, 16);
+    let mut rest = vec![0; CAPACITY - 5000];
+    rig.gpu.download(rig.pairs.keys, 5000, &mut rest).unwrap();
+    assert_eq!(rest, keys[5000..], "pairs past the count are left alone");
+}
+
+#[test]
+fn scan_equals_its_twin() {
+    let n = 300_000;
+    let mut rig = Rig::new(n);
+    let data = noise(5, n); // wraps around many times
+    for count in [0, 1, 15, 16, 17, 4095, 4096, 4097, 65_537, n, n + 1] {
+        rig.gpu.upload(rig.pairs.keys, 0, &data).unwrap();
+        rig.gpu.upload(rig.count, 0, &[count as u32]).unwrap();
+        let mut rec = rig.gpu.record();
+        rig.scan.record_counted(&mut rec, rig.pairs.keys, rig.count);
+        rig.gpu.submit(rec).unwrap();
+        let mut out = vec![0; n];
+        rig.gpu.download(rig.pairs.keys, 0, &mut out).unwrap();
+        assert!(out == scanned(&data, count), "{count}");
+    }
+    // The length of the buffer, without a count.
+    let part = rig.pairs.keys.part(0, 70_001);
+    rig.gpu.upload(rig.pairs.keys, 0, &data).unwrap();
+    let mut rec = rig.gpu.record();
+    rig.scan.record(&mut rec, part);
+    rig.gpu.submit(rec).unwrap();
+    let mut out = vec![0; n];
+    rig.gpu.download(rig.pairs.keys, 0, &mut out).unwrap();
+    assert!(out == scanned(&data, 70_001));
+}
+
+/// Prints times; run with `--ignored --nocapture`.
+#[test]
+#[ignore = "a measurement"]
+fn sort_and_scan_times() {
+    for n in [30_000, 300_000, 3_000_000] {
+        let mut rig = Rig::new(n);
+        let keys = noise(1, n);
+        for bits in [11, 16, 22, 32] {
+            let best = (0..5).map(|_| rig.sort(&keys, n as u32, bits).2).fold(f64::INFINITY, f64::min);
+            println!("sort {n:8} keys {bits:2} bits {best:8.3} ms");
+        }
+        let mut best = f64::INFINITY;
+        for _ in 0..5 {
+            let mut rec = rig.gpu.record();
+            rig.scan.record(&mut rec, rig.pairs.keys);
+            rig.gpu.submit(rec).unwrap();
+            best = best.min(rig.gpu.last_submit_ms());
+        }
+        println!("scan {n:8}              {best:8.3} ms");
+        for t in rig.gpu.timings() {
+            println!("    {t:?}");
+        }
+    }
+}
