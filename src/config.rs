@@ -178,6 +178,8 @@ pub struct MapConfig {
     pub lr_rotation: f64,
     pub lr_opacity: f64,
     pub lr_colour: f64,
+    /// Of keyframe poses, m and rad; 0 leaves them as given.
+    pub lr_pose: f64,
     /// Seconds between samples of the error-against-time curve.
     pub curve_period_s: f64,
     pub seed: u64,
@@ -201,6 +203,7 @@ impl Default for MapConfig {
             lr_rotation: 2e-3,
             lr_opacity: 5e-2,
             lr_colour: 5e-3,
+            lr_pose: 0.0,
             curve_period_s: 5.0,
             seed: 1,
         }

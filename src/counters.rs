@@ -35,6 +35,8 @@ counters! {
     keyframes_rejected,
     /// Keyframes dropped because the mapper's store was full.
     keyframe_store_full,
+    /// Anchors not made because their pair could not be matched.
+    depth_failures,
     /// Seeds that did not fit into the pool.
     splats_full,
     /// Seeds refused because their cell was occupied.
