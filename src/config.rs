@@ -392,6 +392,7 @@ const BOUNDS: &[(&str, Bound)] = &[
     ("map.lr_rotation", Positive),
     ("map.lr_opacity", Positive),
     ("map.lr_colour", Positive),
+    ("map.lr_pose", Within(0.0, 0.1)),
     ("map.curve_period_s", Positive),
     ("map.seed", Within(0.0, u64::MAX as f64)),
     ("gpu.submission_max_ms", Positive),

@@ -1,4 +1,10 @@
-//! The mapper.
+//! The mapper: keyframes in, a map of Gaussians out, a bounded amount of work at a time.
+//!
+//! `step` looks at waiting keyframes first. One whose view the map does not cover becomes an anchor: stereo
+//! depth, seeds, then a burst of training steps on it alone. Otherwise single training steps go to keyframes
+//! drawn uniformly at random (the map sees its past as often as its present, so it does not forget).
+//! Held-out keyframes are stored, never trained on, never anchors. Read `pipeline` for what a step does on
+//! the GPU.
 
 pub mod anchors;
 pub mod buffers;
@@ -7,6 +13,360 @@ pub mod keyframes;
 pub mod occupancy;
 pub mod pipeline;
 pub mod pool;
-pub mod pose;
+mod pose;
+pub mod quality;
 pub mod schedule;
 pub mod sort;
+
+use crate::config::{Board, MapConfig};
+use crate::counters::Counters;
+use crate::gpu::{Gpu, GpuError, Timing};
+use crate::mem::{unsealed, Footprint};
+use crate::stereo::{DepthMap, Stereo};
+use anchors::{uncovered, Seed, Seeder};
+use keyframes::{Queue, Store};
+use pipeline::{LearningRates, Pipeline, Rendered, Shape, View, Weights};
+use schedule::Schedule;
+use std::time::Instant;
+use stipple_drivers::{Calibration, Fault, Image, Pose};
+
+pub use keyframes::{Keyframe, Offer, PoseCorrection};
+pub use pipeline::SplatInit;
+pub use quality::{CurvePoint, Evaluation, Panel};
+
+/// What a call of `step` did; an anchor ends the call, so none is missed.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub enum Did {
+    /// There was nothing to do.
+    #[default]
+    Idle,
+    /// A keyframe was stored.
+    Stored,
+    /// A keyframe became an anchor.
+    Anchor { seeded: u32 },
+    /// Training steps on the newest anchor alone.
+    Burst,
+    /// Training steps on keyframes drawn at random.
+    Train,
+}
+
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct StepReport {
+    pub did: Did,
+    pub ms: f64,
+    /// Training steps taken.
+    pub iterations: u32,
+    /// Of the last training step.
+    pub loss: f64,
+}
+
+pub struct Mapper {
+    gpu: Gpu,
+    stereo: Stereo,
+    pipeline: Pipeline,
+    config: MapConfig,
+    queue: Queue,
+    store: Store,
+    seeder: Seeder,
+    schedule: Schedule,
+    /// Depth of the newest anchor, m.
+    depth: DepthMap,
+    rendered: Rendered,
+    arrivals: Vec<SplatInit>,
+    /// Median depth of the first anchor, m: what a position step is measured in.
+    scene_depth_m: f64,
+    iterations: u64,
+    counters: Counters,
+}
+
+/// Of a scene nothing is known of yet, m.
+const SCENE_DEPTH_M: f64 = 3.0;
+
+impl Mapper {
+    pub fn footprint(calibration: &Calibration, board: &Board) -> Footprint {
+        let camera = &calibration.cameras[0].camera;
+        let scale = board.map.scale as usize;
+        let (width, height) = (camera.width / scale, camera.height / scale);
+        let shape = shape(board, width, height);
+        let (pixels, keyframes) = (width * height, shape.keyframes as usize);
+        let seeds_max = board.map.seeds_per_anchor as usize;
+        let mut f = Pipeline::footprint(&shape);
+        f.gpu("alignment", Pipeline::arena_bytes(&shape).saturating_sub(f.gpu_total()) as usize);
+        f.extend(Queue::footprint(raw_pixels_max(board)));
+        f.extend(Store::footprint(keyframes, pixels));
+        f.extend(Seeder::footprint(pixels, seeds_max, board.map.occupancy_cells));
+        f.host("map: rendering and depth", pixels * 4 * size_of::<f32>());
+        f.host("map: arrivals", seeds_max * size_of::<SplatInit>());
+        f
+    }
+
+    /// The arena of `gpu` must hold `footprint(..).gpu_total()`.
+    pub fn new(mut gpu: Gpu, stereo: Stereo, board: &Board) -> Result<Mapper, Fault> {
+        let camera = stereo.camera().pinhole;
+        let (width, height) = (camera.width, camera.height);
+        let shape = shape(board, width, height);
+        let mut pipeline = Pipeline::new(&mut gpu, shape)?;
+        pipeline.set_mask(&mut gpu, stereo.valid_mask())?;
+        let config = board.map.clone();
+        let seeds_max = config.seeds_per_anchor as usize;
+        let blank = || vec![0.0; width * height];
+        Ok(Mapper {
+            gpu,
+            pipeline,
+            queue: Queue::new(raw_pixels_max(board)),
+            store: Store::new(shape.keyframes as usize, width, height),
+            seeder: Seeder::new(width, height, seeds_max, config.occupancy_cell_m, config.occupancy_cells),
+            schedule: Schedule::new(config.seed),
+            depth: DepthMap::new(width, height),
+            rendered: Rendered { width, height, grey: blank(), alpha: blank(), depth: blank() },
+            arrivals: Vec::with_capacity(seeds_max),
+            scene_depth_m: SCENE_DEPTH_M,
+            iterations: 0,
+            counters: Counters::default(),
+            stereo,
+            config,
+        })
+    }
+
+    /// Copies what it needs. Never waits for the GPU.
+    pub fn offer(&mut self, keyframe: &Keyframe) -> Offer {
+        let offer = self.queue.push(keyframe);
+        if offer == Offer::Full {
+            self.counters.keyframes_rejected.add(1);
+        }
+        offer
+    }
+
+    pub fn correct(&mut self, correction: &PoseCorrection) {
+        self.queue.correct(correction);
+        self.store.correct(correction);
+    }
+
+    /// Works until `deadline`, and does at least one thing: takes in a waiting keyframe, else trains once.
+    pub fn step(&mut self, deadline: Instant) -> Result<StepReport, GpuError> {
+        let start = Instant::now();
+        let mut report = StepReport::default();
+        loop {
+            if !self.queue.is_empty() {
+                if report.iterations > 0 {
+                    break; // the next call's
+                }
+                report.did = self.take_in()?;
+                if matches!(report.did, Did::Anchor { .. }) {
+                    break;
+                }
+            } else {
+                let burst = self.schedule.in_burst();
+                let Some(loss) = self.train()? else { break };
+                report.did = if burst { Did::Burst } else { Did::Train };
+                report.iterations += 1;
+                report.loss = loss;
+            }
+            if Instant::now() >= deadline {
+                break;
+            }
+        }
+        report.ms = start.elapsed().as_secs_f64() * 1e3;
+        Ok(report)
+    }
+
+    /// Stores the oldest waiting keyframe, and makes it an anchor when the map does not cover its view.
+    fn take_in(&mut self) -> Result<Did, GpuError> {
+        let index = {
+            let Some(keyframe) = self.queue.front() else { return Ok(Did::Idle) };
+            let left = &keyframe.images[0];
+            self.store.add(keyframe, |image| self.stereo.rectify(left, image))
+        };
+        let Some(index) = index else {
+            self.counters.keyframe_store_full.add(1);
+            self.queue.pop();
+            return Ok(Did::Idle);
+        };
+        self.pipeline.set_keyframe(&mut self.gpu, index as u32, &self.store.image(index).pixels)?;
+        let did = if self.store.get(index).held_out { Did::Stored } else { self.cover(index)? };
+        self.queue.pop();
+        Ok(did)
+    }
+
+    fn cover(&mut self, index: usize) -> Result<Did, GpuError> {
+        let view = self.view(index);
+        self.pipeline.render(&mut self.gpu, &view, &mut self.rendered)?;
+        let bare = uncovered(&self.rendered.alpha, self.stereo.valid_mask(), self.config.covered_alpha);
+        let room = self.config_room();
+        if bare <= self.config.anchor_uncovered_min || room == 0 {
+            return Ok(Did::Stored);
+        }
+        let Some(keyframe) = self.queue.front() else { return Ok(Did::Stored) };
+        let [left, right] = &keyframe.images;
+        // A pair that cannot be matched gives no depth, and no anchor; the keyframe is still trained on.
+        if unsealed(|| self.stereo.depth(left, right, &mut self.depth)).is_err() {
+            self.counters.depth_failures.add(1);
+            return Ok(Did::Stored);
+        }
+        if self.store.anchors() == 0 {
+            self.scene_depth_m = median_depth(&self.depth.metres).unwrap_or(SCENE_DEPTH_M);
+        }
+        let seen = anchors::View {
+            image: self.store.image(index),
+            valid: self.stereo.valid_mask(),
+            depth: &self.depth,
+            alpha: &self.rendered.alpha,
+            camera: view.camera,
+            world_from_cam: view.world_from_cam,
+            anchor: index as u32,
+        };
+        self.arrivals.clear();
+        self.arrivals.extend(self.seeder.seed(&seen, room, &self.counters).iter().map(gaussian));
+        let seeded = self.pipeline.append(&mut self.gpu, &self.arrivals)? as u32;
+        self.store.get_mut(index).anchor = true;
+        self.schedule.start_burst(index, self.config.burst_iterations);
+        Ok(Did::Anchor { seeded })
+    }
+
+    /// One training step; its loss, or `None` when there is nothing to train.
+    fn train(&mut self) -> Result<Option<f64>, GpuError> {
+        if self.pipeline.count() == 0 {
+            return Ok(None);
+        }
+        let Some(index) = self.schedule.next(self.store.training()) else { return Ok(None) };
+        let view = self.view(index);
+        let (rates, weights) = (self.rates(), self.weights());
+        let done = self.pipeline.train(&mut self.gpu, &view, index as u32, &rates, &weights)?;
+        self.iterations += 1;
+        self.counters.intersections_overflow.add(u64::from(done.stats.overflow > 0));
+        self.counters.gradients_rejected.add(u64::from(done.gradients_rejected));
+        if self.config.lr_pose > 0.0 && index as u32 != self.store.training()[0] {
+            let rect_from_body = self.stereo.camera().body_from_rect.inverse();
+            let mut world_from_cam = view.world_from_cam;
+            let entry = self.store.get_mut(index);
+            entry.adam.step(&mut world_from_cam, &done.pose_gradient, self.config.lr_pose);
+            entry.world_from_body = world_from_cam * rect_from_body;
+        }
+        Ok(Some(done.loss))
+    }
+
+    fn view(&self, index: usize) -> View {
+        self.view_from(self.store.get(index).world_from_body)
+    }
+
+    fn view_from(&self, world_from_body: Pose) -> View {
+        let camera = self.stereo.camera();
+        View { world_from_cam: world_from_body * camera.body_from_rect, camera: camera.pinhole }
+    }
+
+    fn rates(&self) -> LearningRates {
+        let c = &self.config;
+        LearningRates {
+            position: (c.lr_position * self.scene_depth_m) as f32,
+            scale: c.lr_scale as f32,
+            rotation: c.lr_rotation as f32,
+            opacity: c.lr_opacity as f32,
+            colour: c.lr_colour as f32,
+        }
+    }
+
+    fn weights(&self) -> Weights {
+        Weights { ssim: self.config.ssim_weight as f32, ..Weights::default() }
+    }
+
+    fn config_room(&self) -> usize {
+        self.pipeline.shape().splats as usize - self.pipeline.count()
+    }
+
+    /// The Gaussians alive. Allocates.
+    pub fn splats(&mut self) -> Result<Vec<SplatInit>, GpuError> {
+        let mut out = Vec::with_capacity(self.pipeline.count());
+        self.pipeline.download(&mut self.gpu, &mut out)?;
+        Ok(out)
+    }
+
+    pub fn splat_count(&self) -> usize {
+        self.pipeline.count()
+    }
+
+    pub fn anchor_count(&self) -> usize {
+        self.store.anchors()
+    }
+
+    pub fn keyframe_count(&self) -> usize {
+        self.store.len()
+    }
+
+    pub fn iterations(&self) -> u64 {
+        self.iterations
+    }
+
+    pub fn counters(&self) -> &Counters {
+        &self.counters
+    }
+
+    pub fn gpu_bytes(&self) -> u64 {
+        self.gpu.arena_used()
+    }
+
+    pub fn device(&self) -> &str {
+        &self.gpu.caps().name
+    }
+
+    pub fn kernel_times(&self) -> Vec<Timing> {
+        self.gpu.timings().to_vec()
+    }
+
+    pub fn gpu(&self) -> &Gpu {
+        &self.gpu
+    }
+}
+
+fn shape(board: &Board, width: usize, height: usize) -> Shape {
+    let b = &board.budget;
+    Shape {
+        width: width as u32,
+        height: height as u32,
+        splats: b.splats,
+        intersections: b.intersections,
+        keyframes: b.keyframes,
+    }
+}
+
+fn raw_pixels_max(board: &Board) -> usize {
+    board.budget.image_width_max as usize * board.budget.image_height_max as usize
+}
+
+fn gaussian(seed: &Seed) -> SplatInit {
+    let log_sigma = seed.sigma_m.ln() as f32;
+    SplatInit {
+        mean: seed.p_world.as_vec3().to_array(),
+        log_scale: [log_sigma; 3],
+        quat_xyzw: [0.0, 0.0, 0.0, 1.0],
+        opacity_logit: (seed.opacity / (1.0 - seed.opacity)).ln() as f32,
+        colour: seed.grey as f32,
+    }
+}
+
+/// Median of the pixels that have depth, by counting them in 256 bins of 1/depth; allocates nothing.
+fn median_depth(metres: &[f32]) -> Option<f64> {
+    const BINS: usize = 256;
+    const NEAREST_M: f32 = 0.1;
+    let mut bins = [0u32; BINS];
+    let bin = |z: f32| ((NEAREST_M / z * BINS as f32) as usize).min(BINS - 1);
+    metres.iter().filter(|z| **z > 0.0).for_each(|&z| bins[bin(z)] += 1);
+    let half = bins.iter().sum::<u32>().div_ceil(2);
+    let mut passed = 0;
+    let at = bins.iter().position(|n| {
+        passed += n;
+        half > 0 && passed >= half
+    })?;
+    Some(f64::from(NEAREST_M) * BINS as f64 / (at as f64 + 0.5))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn median_depth_ignores_holes() {
+        assert_eq!(median_depth(&[0.0; 9]), None);
+        let z = median_depth(&[0.0, 0.0, 1.0, 2.0, 9.0, 0.0]).expect("three have depth");
+        assert!((z - 2.0).abs() < 0.1, "{z}");
+    }
+}
