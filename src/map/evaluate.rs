@@ -111,6 +111,7 @@ fn blur(image: &mut [f64], rows: &mut [f64], width: usize, height: usize, w: &[f
 
 #[cfg(test)]
 mod tests {
+    #![allow(clippy::unwrap_used)]
     use super::*;
 
     fn noise(seed: u32, n: usize) -> Vec<f32> {

@@ -28,7 +28,7 @@ use keyframes::{Queue, Store};
 use pipeline::{LearningRates, Pipeline, Rendered, Shape, View, Weights};
 use schedule::Schedule;
 use std::time::Instant;
-use stipple_drivers::{Calibration, Fault, Image, Pose};
+use stipple_drivers::{Calibration, Fault, Pose};
 
 pub use keyframes::{Keyframe, Offer, PoseCorrection};
 pub use pipeline::SplatInit;
