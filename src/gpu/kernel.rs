@@ -4,7 +4,8 @@
 //! variants takes the first one whose SPIR-V capabilities the device has.
 
 use super::device::{boot, Device};
-use super::memory::{Range, ALIGN};
+use super::memory::{Arena, Range, ALIGN};
+use super::record::COMMANDS_MAX;
 use super::GpuError;
 use ash::vk;
 use std::collections::HashMap;
@@ -17,8 +18,9 @@ pub const BUFFERS_MAX: usize = 8;
 pub const SPECS_MAX: usize = 16;
 /// Bytes of push constants every Vulkan device has.
 pub const PUSH_MAX: usize = 128;
-/// Distinct (kernel, buffers) combinations remembered; past it the cache starts over.
-const SETS_MAX: usize = 1024;
+/// Distinct (kernel, buffers) combinations remembered; past it the cache starts over. Twice what one
+/// recording can ask for, so that a recording always fits after a restart and restarts are rare.
+const SETS_MAX: usize = 2 * COMMANDS_MAX;
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Access {
@@ -101,10 +103,15 @@ pub(super) struct Pipelines {
     device: Arc<Device>,
     list: Vec<Pipeline>,
     pool: vk::DescriptorPool,
-    sets: HashMap<(u32, [Range; BUFFERS_MAX]), vk::DescriptorSet>,
+    sets: HashMap<SetKey, vk::DescriptorSet>,
 }
 
+type SetKey = (u32, [Range; BUFFERS_MAX]);
+
 impl Pipelines {
+    /// The table is a power of two of slots, at most 7/8 full, with a control byte each.
+    pub const BYTES: usize = (SETS_MAX * 8 / 7).next_power_of_two() * (size_of::<(SetKey, vk::DescriptorSet)>() + 1);
+
     pub fn new(device: &Arc<Device>) -> Result<Pipelines, Fault> {
         let sizes = [vk::DescriptorPoolSize::default()
             .ty(vk::DescriptorType::STORAGE_BUFFER)
@@ -156,7 +163,7 @@ impl Pipelines {
 
     /// Forgets all sets when fewer than `commands` are left. Call only while the device is idle.
     pub fn reserve_sets(&mut self, commands: usize) -> Result<(), GpuError> {
-        if self.sets.len() + commands.min(SETS_MAX) > SETS_MAX {
+        if self.sets.len() + commands > SETS_MAX {
             self.sets.clear();
             // SAFETY: no submission that uses these sets is in flight.
             unsafe { self.device.raw.reset_descriptor_pool(self.pool, vk::DescriptorPoolResetFlags::empty()) }
@@ -169,12 +176,19 @@ impl Pipelines {
         &mut self,
         index: u32,
         ranges: &[Range; BUFFERS_MAX],
-        arena: vk::Buffer,
+        arena: &Arena,
     ) -> Result<vk::DescriptorSet, GpuError> {
         if let Some(&set) = self.sets.get(&(index, *ranges)) {
             return Ok(set);
         }
         let pipeline = &self.list[index as usize];
+        for r in &ranges[..pipeline.bindings.len()] {
+            let bindable =
+                r.start % ALIGN == 0 && r.start < r.end && r.end - r.start <= self.device.caps.binding_max_bytes;
+            if !bindable || r.end > arena.bytes() {
+                return Err(GpuError::Binding { kernel: pipeline.name, start: r.start, end: r.end });
+            }
+        }
         let layouts = [pipeline.set_layout];
         let info = vk::DescriptorSetAllocateInfo::default().descriptor_pool(self.pool).set_layouts(&layouts);
         let mut set = [vk::DescriptorSet::null()];
@@ -187,10 +201,7 @@ impl Pipelines {
         let mut infos = [vk::DescriptorBufferInfo::default(); BUFFERS_MAX];
         let mut writes = [vk::WriteDescriptorSet::default(); BUFFERS_MAX];
         for (i, r) in ranges.iter().enumerate().take(pipeline.bindings.len()) {
-            if r.start % ALIGN != 0 || r.end <= r.start || r.end - r.start > self.device.caps.binding_max_bytes {
-                return Err(GpuError::Binding { kernel: pipeline.name, start: r.start, end: r.end });
-            }
-            infos[i] = vk::DescriptorBufferInfo { buffer: arena, offset: r.start, range: r.end - r.start };
+            infos[i] = vk::DescriptorBufferInfo { buffer: arena.buffer(), offset: r.start, range: r.end - r.start };
         }
         for ((write, info), &(binding, _)) in writes.iter_mut().zip(&infos).zip(pipeline.bindings) {
             *write = vk::WriteDescriptorSet::default()
@@ -199,7 +210,7 @@ impl Pipelines {
                 .descriptor_type(vk::DescriptorType::STORAGE_BUFFER)
                 .buffer_info(std::slice::from_ref(info));
         }
-        // SAFETY: the set is new, so nothing in flight uses it; ranges were checked and lie in the arena.
+        // SAFETY: the set is new, so nothing in flight uses it; the ranges were checked above.
         unsafe { self.device.raw.update_descriptor_sets(&writes[..pipeline.bindings.len()], &[]) };
         self.sets.insert((index, *ranges), set[0]);
         Ok(set[0])

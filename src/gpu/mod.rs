@@ -39,6 +39,8 @@ pub mod kernels;
 mod memory;
 mod record;
 mod submit;
+#[cfg(test)]
+mod tests;
 
 pub use device::{Caps, DeviceKind, Subgroup};
 pub use kernel::{Access, Kernel, KernelDef, Reflected, Variant, BUFFERS_MAX, PUSH_MAX, SPECS_MAX};
@@ -196,7 +198,7 @@ impl Gpu {
         let started = self.wait().and_then(|()| match rec.error {
             Some(e) => Err(e),
             None if rec.is_empty() => Ok(false),
-            None => self.submitter.start(&rec, &mut self.pipelines, self.arena.buffer()).map(|()| true),
+            None => self.submitter.start(&rec, &mut self.pipelines, &self.arena).map(|()| true),
         });
         match started {
             Ok(true) => self.in_flight = Some(rec),
@@ -270,6 +272,15 @@ impl Gpu {
     /// Arena bytes by name, alignment included.
     pub fn footprint(&self) -> Footprint {
         self.arena.footprint()
+    }
+
+    /// Host memory one `Gpu` takes, whatever the board.
+    pub fn host_footprint() -> Footprint {
+        let mut f = Footprint::default();
+        f.host("gpu staging", STAGING_BYTES);
+        f.host("gpu recording", Recorder::BYTES);
+        f.host("gpu descriptor sets", Pipelines::BYTES);
+        f
     }
 
     /// Warnings and errors of the validation layer so far; none without validation.

@@ -79,13 +79,14 @@ pub struct Recorder {
     pub(super) error: Option<GpuError>,
 }
 
+/// Ranges open at most: every buffer of every command, and indirect arguments.
+const OPEN_MAX: usize = COMMANDS_MAX * (BUFFERS_MAX + 1);
+
 impl Recorder {
+    pub(super) const BYTES: usize = COMMANDS_MAX * size_of::<Command>() + OPEN_MAX * size_of::<(Range, bool)>();
+
     pub(super) fn new() -> Recorder {
-        Recorder {
-            commands: Vec::with_capacity(COMMANDS_MAX),
-            open: Vec::with_capacity(COMMANDS_MAX * (BUFFERS_MAX + 1)),
-            error: None,
-        }
+        Recorder { commands: Vec::with_capacity(COMMANDS_MAX), open: Vec::with_capacity(OPEN_MAX), error: None }
     }
 
     pub(super) fn clear(&mut self) {

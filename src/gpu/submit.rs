@@ -5,6 +5,7 @@
 
 use super::device::{boot, Device};
 use super::kernel::Pipelines;
+use super::memory::{Arena, Range};
 use super::record::{Command, Recorder, Work, COMMANDS_MAX};
 use super::GpuError;
 use ash::vk;
@@ -90,31 +91,44 @@ impl Submitter {
     }
 
     /// Encodes a recording and starts it.
-    pub fn start(&mut self, rec: &Recorder, pipelines: &mut Pipelines, arena: vk::Buffer) -> Result<(), GpuError> {
+    pub fn start(&mut self, rec: &Recorder, pipelines: &mut Pipelines, arena: &Arena) -> Result<(), GpuError> {
         pipelines.reserve_sets(rec.commands.len())?;
         self.begin()?;
-        let (raw, cb) = (&self.device.raw, self.commands);
-        let timed = self.queries != vk::QueryPool::null();
-        if timed {
-            // SAFETY: recording; the pool has a query for each command and one more.
-            unsafe {
-                raw.cmd_reset_query_pool(cb, self.queries, 0, rec.commands.len() as u32 + 1);
-                raw.cmd_write_timestamp(cb, vk::PipelineStageFlags::BOTTOM_OF_PIPE, self.queries, 0);
-            }
-        }
-        for (i, command) in rec.commands.iter().enumerate() {
-            self.encode(command, pipelines, arena)?;
-            if timed {
-                // SAFETY: as above.
-                unsafe {
-                    raw.cmd_write_timestamp(cb, vk::PipelineStageFlags::BOTTOM_OF_PIPE, self.queries, i as u32 + 1);
-                }
-            }
+        if let Err(e) = self.encode_all(rec, pipelines, arena) {
+            // SAFETY: recording, not in flight: back to where the next `begin` expects it.
+            unsafe { self.device.raw.reset_command_buffer(self.commands, vk::CommandBufferResetFlags::empty()) }
+                .map_err(GpuError::of("vkResetCommandBuffer"))?;
+            return Err(e);
         }
         self.end()
     }
 
-    fn encode(&self, command: &Command, pipelines: &mut Pipelines, arena: vk::Buffer) -> Result<(), GpuError> {
+    fn encode_all(&self, rec: &Recorder, pipelines: &mut Pipelines, arena: &Arena) -> Result<(), GpuError> {
+        let timed = self.queries != vk::QueryPool::null();
+        let stamp = |i: usize| {
+            // SAFETY: recording; the pool has a query for each command and one more, reset just below.
+            unsafe {
+                let stage = vk::PipelineStageFlags::BOTTOM_OF_PIPE;
+                self.device.raw.cmd_write_timestamp(self.commands, stage, self.queries, i as u32);
+            }
+        };
+        if timed {
+            // SAFETY: recording; no submission that uses the queries is in flight.
+            unsafe {
+                self.device.raw.cmd_reset_query_pool(self.commands, self.queries, 0, rec.commands.len() as u32 + 1);
+            }
+            stamp(0);
+        }
+        for (i, command) in rec.commands.iter().enumerate() {
+            self.encode(command, pipelines, arena)?;
+            if timed {
+                stamp(i + 1);
+            }
+        }
+        Ok(())
+    }
+
+    fn encode(&self, command: &Command, pipelines: &mut Pipelines, arena: &Arena) -> Result<(), GpuError> {
         let (raw, cb) = (&self.device.raw, self.commands);
         if command.barrier_before {
             self.barrier();
@@ -133,7 +147,18 @@ impl Submitter {
                 }
             }
         }
-        // SAFETY: recording; ranges lie in the arena and are aligned, which the recorder checked.
+        let inside = |kernel: &'static str, r: Range| match r.end <= arena.bytes() {
+            true => Ok(()),
+            false => Err(GpuError::Binding { kernel, start: r.start, end: r.end }),
+        };
+        match command.work {
+            Work::Dispatch { .. } => {}
+            Work::Indirect { at, .. } => inside("indirect", Range { start: at, end: at + 12 })?,
+            Work::Fill { range, .. } => inside("fill", range)?,
+            Work::Copy { from, to } => inside("copy", from).and(inside("copy", to))?,
+        }
+        let arena = arena.buffer();
+        // SAFETY: recording; ranges lie in the arena, and the recorder checked their alignment.
         unsafe {
             match command.work {
                 Work::Dispatch { groups: [x, y, z], .. } => raw.cmd_dispatch(cb, x, y, z),

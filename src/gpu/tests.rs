@@ -1,0 +1,39 @@
+//! Controls: what the tests of the public interface rely on to notice mistakes does notice them.
+#![allow(clippy::unwrap_used)]
+
+use super::kernels::axpy;
+use super::*;
+
+fn open() -> Gpu {
+    Gpu::open_with(&GpuConfig::default(), 1 << 16, GpuOptions { validation: true }).unwrap()
+}
+
+#[test]
+fn validation_reports_a_wrong_call() {
+    let gpu = open();
+    let info = vk::BufferCreateInfo::default().size(0).usage(vk::BufferUsageFlags::STORAGE_BUFFER);
+    // SAFETY: deliberately invalid; the layer reports it, and the CPU device survives it.
+    if let Ok(buffer) = unsafe { gpu.device.raw.create_buffer(&info, None) } {
+        // SAFETY: just made.
+        unsafe { gpu.device.raw.destroy_buffer(buffer, None) };
+    }
+    assert!(gpu.validation_messages().iter().any(|m| m.contains("VUID-VkBufferCreateInfo-size")));
+}
+
+#[test]
+fn validation_names_kernels_and_reports_a_missing_barrier() {
+    let mut gpu = open();
+    let [x, y, z] = ["x", "y", "z"].map(|name| gpu.alloc::<f32>(name, 64).unwrap());
+    let k = gpu.kernel::<axpy::K>(axpy::Spec::default()).unwrap();
+    let mut rec = gpu.record();
+    for (from, to) in [(x, y), (y, z)] {
+        let bind = axpy::Bind { x: from.read(), y: to.read_write() };
+        rec.dispatch(&k, bind, axpy::Push { n: 64, a: 1.0 }, Threads::d1(64));
+    }
+    assert!(rec.commands[1].barrier_before);
+    rec.commands[1].barrier_before = false;
+    gpu.submit(rec).unwrap();
+    let said = gpu.validation_messages();
+    assert!(said.iter().any(|m| m.contains("SYNC-HAZARD")), "{said:?}");
+    assert!(said.iter().any(|m| m.contains("axpy")), "{said:?}");
+}
