@@ -13,7 +13,8 @@ use stipple::mem::{heap_after_seal, seal_thread, unsealed, CountingAllocator};
 use stipple::output::metrics::trajectory_error;
 use stipple::vio::Vio;
 use stipple_drivers::replay::{OpenOptions, Recording};
-use stipple_drivers::{Frames, ImuSample, Span, TimedPose};
+use stipple_drivers::sim::{Scenario, Sim};
+use stipple_drivers::{Calibration, Frames, ImuSample, Span, TimedPose};
 use world::{Path, World, FRAME_SECS, RATE_HZ};
 
 #[global_allocator]
@@ -27,6 +28,17 @@ struct Run {
 
 /// Ten seconds after `before` seconds of inertial samples alone; frames for which `keep` is false are lost.
 fn simulate(path: Path, before: f64, keep: impl Fn(usize) -> bool) -> Run {
+    simulate_spoiled(path, before, keep, |_| true, |_, _| {})
+}
+
+/// As above, with inertial samples for which `keep_imu` is false lost, and tracks spoiled.
+fn simulate_spoiled(
+    path: Path,
+    before: f64,
+    keep: impl Fn(usize) -> bool,
+    keep_imu: impl Fn(f64) -> bool,
+    spoil: impl Fn(usize, &mut Tracks),
+) -> Run {
     let mut world = World::new(path);
     let mut vio = Vio::new(&world.rig, &VioConfig::default());
     let mut tracks = Tracks::default();
@@ -35,10 +47,14 @@ fn simulate(path: Path, before: f64, keep: impl Fn(usize) -> bool) -> Run {
     for frame in 0..200 {
         let t = before + frame as f64 * FRAME_SECS + 0.0012;
         while (sample as f64) / RATE_HZ < t + 1.0 / RATE_HZ {
-            vio.on_imu(world.imu(sample as f64 / RATE_HZ));
+            let s = world.imu(sample as f64 / RATE_HZ);
+            if keep_imu(sample as f64 / RATE_HZ) {
+                vio.on_imu(s);
+            }
             sample += 1;
         }
         world.tracks(t, &mut tracks);
+        spoil(frame, &mut tracks);
         if !keep(frame) {
             continue;
         }
@@ -74,6 +90,37 @@ fn room_with_lost_frames_stays_within_two_centimetres() {
     check("lost frames", &simulate(Path { rest: -1.0 }, 0.0, keep), 155, 0.02);
 }
 
+#[test]
+fn hole_in_the_inertial_stream_is_bridged_by_vision() {
+    let run = simulate_spoiled(Path { rest: -1.0 }, 0.0, |_| true, |t| !(4.0..4.3).contains(&t), |_, _| {});
+    check("inertial hole", &run, 185, 0.03);
+}
+
+#[test]
+fn second_without_tracks_is_bridged_by_inertia() {
+    let dark = |frame: usize, tracks: &mut Tracks| {
+        if (80..100).contains(&frame) {
+            tracks.cameras.iter_mut().for_each(|c| c.clear());
+        }
+    };
+    check("dark second", &simulate_spoiled(Path { rest: -1.0 }, 0.0, |_| true, |_| true, dark), 185, 0.10);
+}
+
+#[test]
+fn garbage_tracks_give_finite_odometry_or_none() {
+    let garbage = |frame: usize, tracks: &mut Tracks| {
+        if frame % 3 == 1 || frame > 120 {
+            for camera in tracks.cameras.iter_mut() {
+                for (i, t) in camera.iter_mut().enumerate() {
+                    t.px = [((i * 7919 + frame * 31) % 752) as f32, if i % 5 == 0 { f32::NAN } else { 100.0 }];
+                }
+            }
+        }
+    };
+    let run = simulate_spoiled(Path { rest: -1.0 }, 0.0, |_| true, |_| true, garbage);
+    assert!(run.estimated.iter().all(|e| e.pose.is_finite()));
+}
+
 fn recording(name: &str) -> Option<PathBuf> {
     let root = std::env::var("STIPPLE_RECORDINGS")
         .map(PathBuf::from)
@@ -86,19 +133,24 @@ fn recording(name: &str) -> Option<PathBuf> {
     Some(path)
 }
 
-/// Tracks and estimates a recording; answers estimate, the recording, and mean ms a frame of each.
-fn replay(name: &str, config: &VioConfig) -> Option<(Run, [f64; 2])> {
-    let recording = Recording::open(&recording(name)?, &OpenOptions::default()).unwrap();
-    let mut frontend = Frontend::new(&recording.calibration, &FrontendConfig::default()).unwrap();
-    let mut vio = Vio::new(&recording.calibration, config);
-    let mut reader = recording.reader();
-    let mut frames = Frames::for_rig(&recording.calibration);
+/// Tracks and estimates frames given by `read`; answers estimate and truth, and mean ms a frame of tracker
+/// and estimator.
+fn follow(
+    rig: &Calibration,
+    imu: &[ImuSample],
+    truth: Vec<TimedPose>,
+    count: usize,
+    mut read: impl FnMut(usize, &mut Frames),
+) -> (Run, [f64; 2]) {
+    let mut frontend = Frontend::new(rig, &FrontendConfig::default()).unwrap();
+    let mut vio = Vio::new(rig, &VioConfig::default());
+    let mut frames = Frames::for_rig(rig);
     let mut estimated = Vec::new();
     let mut secs = [0.0; 2];
-    let mut imu = recording.imu.iter().peekable();
-    let period = Span::from_secs(1.0 / recording.calibration.imu.rate_hz);
-    for i in 0..recording.pairs.len() {
-        reader.read(i, &mut frames).unwrap();
+    let mut imu = imu.iter().peekable();
+    let period = Span::from_secs(1.0 / rig.imu.rate_hz);
+    for i in 0..count {
+        read(i, &mut frames);
         while let Some(s) = imu.next_if(|s| s.t <= frames.t + period) {
             vio.on_imu(*s);
         }
@@ -109,14 +161,27 @@ fn replay(name: &str, config: &VioConfig) -> Option<(Run, [f64; 2])> {
         secs[0] += (middle - start).as_secs_f64();
         secs[1] += middle.elapsed().as_secs_f64();
         if std::env::var("VIO_TRACE").is_ok() {
-            trace(i, tracks, &vio, &update, &recording.truth);
+            trace(i, tracks, &vio, &update, &truth);
         }
         if let Some(o) = update.odometry {
             estimated.push(TimedPose { t: o.t, pose: o.world_from_body });
         }
     }
-    let ms = secs.map(|s| 1e3 * s / recording.pairs.len() as f64);
-    Some((Run { estimated, truth: recording.truth, vio }, ms))
+    (Run { estimated, truth, vio }, secs.map(|s| 1e3 * s / count as f64))
+}
+
+fn replay(name: &str) -> Option<(Run, [f64; 2])> {
+    let recording = Recording::open(&recording(name)?, &OpenOptions::default()).unwrap();
+    let mut reader = recording.reader();
+    let truth = recording.truth.clone();
+    let count = recording.pairs.len();
+    Some(follow(&recording.calibration, &recording.imu, truth, count, |i, out| reader.read(i, out).unwrap()))
+}
+
+fn fly(scenario: &Scenario) -> (Run, [f64; 2]) {
+    let mut sim = Sim::new(scenario).unwrap();
+    let (rig, imu, truth) = (sim.calibration().clone(), sim.imu().to_vec(), sim.truth());
+    follow(&rig, &imu, truth, sim.frame_count(), |i, out| sim.render(i, out))
 }
 
 fn trace(i: usize, tracks: &Tracks, vio: &Vio, u: &stipple::vio::Update, truth: &[TimedPose]) {
@@ -144,15 +209,37 @@ fn trace(i: usize, tracks: &Tracks, vio: &Vio, u: &stipple::vio::Update, truth: 
 
 #[test]
 fn shaken_recording_stays_within_five_centimetres() {
-    let Some((run, ms)) = replay("euroc_MH_01_easy_11s", &VioConfig::default()) else { return };
+    let Some((run, ms)) = replay("euroc_MH_01_easy_11s") else { return };
     eprintln!("tracker {:.1} ms, estimator {:.1} ms a frame", ms[0], ms[1]);
     check("MH_01 11 s", &run, 205, 0.05);
 }
 
 #[test]
 fn resting_recording_starts_at_rest_and_stays() {
-    let Some((run, _)) = replay("euroc_V1_01_easy_static_1s", &VioConfig::default()) else { return };
+    let Some((run, _)) = replay("euroc_V1_01_easy_static_1s") else { return };
     check("V1_01 at rest", &run, 8, 0.005);
+}
+
+#[test]
+fn rendered_aggressive_flight_is_followed() {
+    let mut scenario = Scenario::named("aggressive").unwrap();
+    (scenario.image_divisor, scenario.duration) = (2, Span::from_secs(6.0));
+    check("aggressive", &fly(&scenario).0, 110, 0.05);
+}
+
+/// Recorded flights and their real inertial samples, rendered: minutes; `cargo test --test vio -- --ignored --nocapture`.
+#[test]
+#[ignore = "takes minutes"]
+fn rendered_recorded_flights_are_followed() {
+    for name in ["V1_02_medium", "V2_02_medium", "MH_04_difficult"] {
+        let Some(dir) = recording("euroc_text").map(|d| d.join(name)) else { return };
+        let truth = dir.join("state_groundtruth_estimate0.csv");
+        let mut scenario = Scenario::from_euroc(&truth, Some(&dir.join("imu0.csv"))).unwrap();
+        scenario.duration = Span::from_secs(40.0);
+        let (run, ms) = fly(&scenario);
+        eprintln!("{name}: tracker {:.1} ms, estimator {:.1} ms a frame", ms[0], ms[1]);
+        check(name, &run, 500, 0.3);
+    }
 }
 
 #[test]

@@ -26,7 +26,7 @@ use crate::frontend::Track;
 use crate::frontend::Tracks;
 use crate::limits::{CAMERAS_MAX, STATES};
 use crate::mem::Footprint;
-use glam::DVec3;
+use glam::{DQuat, DVec3};
 use init::{Aligner, Start};
 use landmarks::Landmarks;
 use marginalise::{marginalise, Prior};
@@ -97,6 +97,8 @@ pub struct Vio {
     solver: Solver,
     aligner: Aligner,
     running: bool,
+    /// Where the last sane output was: a restart goes on from there.
+    last_pose: Option<Pose>,
     frames_since_keyframe: u32,
     stats: Stats,
     hash: u64,
@@ -117,6 +119,7 @@ impl Vio {
             solver: Solver::new(),
             aligner: Aligner::new(),
             running: false,
+            last_pose: None,
             frames_since_keyframe: 0,
             stats: Stats::default(),
             hash: FNV_START,
@@ -161,15 +164,20 @@ impl Vio {
             self.reset();
             update = Update::default();
         }
+        self.last_pose = update.odometry.map(|o| o.world_from_body).or(self.last_pose);
         update
     }
 
     /// First frame of the window, once motion and gravity are known.
     fn try_start(&mut self, tracks: &Tracks) -> Update {
-        let Some(Start { motion, sigma }) = self.aligner.add(tracks, &self.imu, &self.noise, &self.model, &self.config)
+        let Some(Start { mut motion, sigma }) =
+            self.aligner.add(tracks, &self.imu, &self.noise, &self.model, &self.config)
         else {
             return Update::default();
         };
+        if let Some(last) = &self.last_pose {
+            motion = go_on_from(last, &motion);
+        }
         let Some(slot) = self.window.push(Frame::first(tracks.t, motion)) else { return Update::default() };
         self.window.frame_mut(slot).fix_anchor();
         self.prior.start(slot, &motion, &sigma);
@@ -255,7 +263,7 @@ impl Vio {
         })
     }
 
-    /// Forgets everything but the inertial samples, and initialises again.
+    /// Forgets everything but the inertial samples and where it was, and initialises again.
     pub fn reset(&mut self) {
         self.window.clear();
         self.landmarks.clear();
@@ -308,6 +316,15 @@ impl Vio {
 
 fn odometry(t: Nanos, m: &Motion) -> Odometry {
     Odometry { t, world_from_body: m.pose, v_world: m.v, gyro_bias: m.bg, accel_bias: m.ba }
+}
+
+/// Position and yaw of `last`, the rest of `start`.
+fn go_on_from(last: &Pose, start: &Motion) -> Motion {
+    let turn = last.q * start.pose.q.conjugate();
+    // The part of the turn about the world's axis; none is left when it is half a turn about a level axis.
+    let twist = DQuat::from_xyzw(0.0, 0.0, turn.z, turn.w);
+    let twist = if twist.length_squared() > 1e-12 { twist.normalize() } else { DQuat::IDENTITY };
+    Motion { pose: Pose::new(twist * start.pose.q, last.p), v: twist * start.v, ..*start }
 }
 
 const FNV_START: u64 = 0xcbf2_9ce4_8422_2325;
@@ -422,6 +439,21 @@ mod tests {
         let (a, b) = (once(), once());
         assert_eq!(a, b);
         assert_ne!(a.0, FNV_START);
+    }
+
+    #[test]
+    fn restart_goes_on_where_it_was() {
+        let mut world = World::new(Path { rest: -1.0 });
+        let mut vio = Vio::new(&world.rig, &VioConfig::default());
+        run(&mut vio, 0..60, &mut world);
+        let before = vio.last_pose.expect("running");
+        vio.reset();
+        run(&mut vio, 60..80, &mut world);
+        assert!(vio.running && vio.stats.resets == 1);
+        let after = vio.window().next().expect("a running window has frames").1;
+        // Half a second of alignment at up to 1 m/s and 0.6 rad/s.
+        assert!(before.p.distance(after.p) < 0.5 && before.q.angle_between(after.q) < 0.4);
+        assert_eq!(vio.window().last().map(|w| w.0), Some(Nanos(((79.0 * FRAME_SECS + 0.0012) * 1e9) as i64)));
     }
 
     #[test]
