@@ -221,6 +221,12 @@ fn resting_recording_starts_at_rest_and_stays() {
 }
 
 #[test]
+fn fisheye_recording_is_followed() {
+    let Some((run, _)) = replay("tumvi_room1_fisheye_16") else { return };
+    check("TUM-VI room1, 16 frames", &run, 4, 0.01);
+}
+
+#[test]
 fn rendered_aggressive_flight_is_followed() {
     let mut scenario = Scenario::named("aggressive").unwrap();
     (scenario.image_divisor, scenario.duration) = (2, Span::from_secs(6.0));
