@@ -21,7 +21,7 @@ use crate::config::FrontendConfig;
 use crate::limits::{CAMERAS_MAX, PYRAMID_LEVELS, TRACKS};
 use crate::mem::{Footprint, List};
 use detect::Detector;
-use patch::{align_stack, take_stack, Stack, Template, Warp};
+use patch::{align_stack, take_stack, Stack, Template, Warp, STEP_MIN};
 use pyramid::Pyramid;
 use rig::Rig;
 use stipple_drivers::{Calibration, Exit, Fault, Frames, Nanos, Pose};
@@ -59,6 +59,8 @@ pub struct Stats {
     pub matched: u64,
     /// Views dropped because their ray misses that of camera 0.
     pub epipolar_rejected: u64,
+    /// Points dropped because an older one is near.
+    pub crowded: u64,
     /// Corners that did not fit.
     pub full: u64,
 }
@@ -69,9 +71,15 @@ const MARGIN_PX: f32 = 2.0;
 /// cameras, whose views differ more.
 const UNEXPLAINED_MAX: f32 = 0.4;
 const UNEXPLAINED_MATCH_MAX: f32 = 0.6;
-/// The anchor places a point while it explains this much and does not pull it further than this, px.
-const UNEXPLAINED_ANCHOR_MAX: f32 = 0.1;
+/// The anchor places a point while it leaves at most this many times what the last frame's patch
+/// leaves unexplained, and does not pull it further than this, px. (Measured: an anchor kept longer
+/// trades drift for the bias of a view that has changed, an affine one adds its own noise.)
+const ANCHOR_LEFT_MAX: f32 = 2.0;
 const ANCHOR_PULL_MAX_PX: f32 = 1.0;
+/// A corner is worth following when one grey level of noise moves it less than this, px.
+const SIGMA_MAX_PX: f32 = 0.1;
+/// Points keep this share of a cell from each other.
+const SPACING: f32 = 0.25;
 /// Guess before anything was triangulated, 1/m.
 const INVERSE_DEPTH_START: f64 = 0.25;
 /// Inverse depths tried along the epipolar curve when the first guess fails: 0 to this, 1/m.
@@ -82,6 +90,8 @@ const SEARCH_STEPS: usize = 16;
 const SEARCH_LEVEL: usize = 2;
 /// Best of them that are tried in full.
 const SEARCH_TRIES: usize = 3;
+/// A point that no search found is searched for less and less often, frames.
+const SEARCH_WAIT_MAX: u64 = 16;
 
 #[derive(Clone, Copy)]
 struct Point {
@@ -89,6 +99,9 @@ struct Point {
     slot: usize,
     /// Along the ray of camera 0; kept while no second camera sees the point.
     inverse_depth: Option<f64>,
+    /// Frame of the next search along the epipolar curve, and the wait after it.
+    search_at: u64,
+    search_wait: u64,
     views: [Option<[f32; 2]>; CAMERAS_MAX],
 }
 
@@ -97,7 +110,7 @@ struct Point {
 struct Patch {
     last: Stack,
     anchor: Template,
-    /// Turn since the anchor.
+    /// Direction of the turn since the anchor.
     turn: [f32; 2],
 }
 
@@ -113,6 +126,7 @@ pub struct Frontend {
     rig: Rig,
     iterations: usize,
     recovered_max_px: f32,
+    spacing_px: f32,
     now: Vec<Pyramid>,
     before: Vec<Pyramid>,
     detector: Detector,
@@ -143,6 +157,7 @@ impl Frontend {
             rig: Rig::new(calibration, config.epipolar_max),
             iterations: config.iterations as usize,
             recovered_max_px: config.recovered_max_px as f32,
+            spacing_px: SPACING * config.grid_px as f32,
             now: pyramids(),
             before: pyramids(),
             detector: Detector::new(first.width, first.height, config),
@@ -219,32 +234,45 @@ impl Frontend {
         for i in 0..self.points.len() {
             self.gate(i);
         }
+        self.thin();
+    }
+
+    /// Of points that came too near to each other in camera 0 the oldest stays.
+    fn thin(&mut self) {
+        for i in 1..self.points.len() {
+            let crowded = self.points[i].views[0].is_some_and(|px| is_near(&self.points[..i], px, self.spacing_px));
+            if crowded {
+                self.points[i].views = [None; CAMERAS_MAX];
+                self.stats.crowded += 1;
+            }
+        }
     }
 
     /// One view from the last frame to this one.
-    fn follow_view(&mut self, camera: usize, slot: usize, from: [f32; 2], start: Warp) -> Option<[f32; 2]> {
-        let (now, before) = (&self.now[camera], &self.before[camera]);
+    fn follow_view(&mut self, camera: usize, slot: usize, px: [f32; 2], start: Warp) -> Option<[f32; 2]> {
+        let coarsest = PYRAMID_LEVELS - 1;
+        let search = Search { from: &self.before[camera], to: &self.now[camera], px, start, coarsest };
         let patch = &mut self.patches[camera][slot];
-        let (mut warp, left) = align_stack(&patch.last, now, start, PYRAMID_LEVELS - 1, self.iterations)?;
+        let (found, left) = align_stack(&patch.last, search.to, start, coarsest, self.iterations)?;
         if left > UNEXPLAINED_MAX {
             return None;
         }
-        let mut anchored = warp;
+        let mut anchored = found;
         anchored.turn(patch.turn[0], patch.turn[1]);
-        let left = patch.anchor.align(&now.levels[0], &mut anchored, self.iterations);
-        let held =
-            left.is_some_and(|l| l < UNEXPLAINED_ANCHOR_MAX) && distance(anchored.px(), warp.px()) < ANCHOR_PULL_MAX_PX;
-        if held {
-            (warp.x, warp.y) = (anchored.x, anchored.y);
+        let anchor_left = patch.anchor.align(&search.to.levels[0], &mut anchored, self.iterations, STEP_MIN);
+        let held = anchor_left.is_some_and(|l| l < ANCHOR_LEFT_MAX * left)
+            && distance(anchored.px(), found.px()) < ANCHOR_PULL_MAX_PX;
+        let placed = if held { anchored.px() } else { found.px() };
+        if !search.returns(&mut self.scratch, found, placed, self.iterations, self.recovered_max_px) {
+            return None;
         }
-        confirm(&mut self.scratch, now, before, from, start, warp, self.iterations, self.recovered_max_px)?;
         if held {
             patch.last = self.scratch;
             patch.turn = [anchored.c, anchored.s];
         } else {
             patch.restart(&self.scratch);
         }
-        Some(warp.px())
+        Some(placed)
     }
 
     /// Drops views that disagree with camera 0 and triangulates from those that agree.
@@ -297,6 +325,11 @@ impl Frontend {
         if let Some(found) = guess.and_then(|g| self.match_view(point.slot, from, to, px, g, PYRAMID_LEVELS - 1)) {
             return Some(found);
         }
+        if self.stats.frames < point.search_at {
+            return None;
+        }
+        let wait = (2 * point.search_wait).clamp(1, SEARCH_WAIT_MAX);
+        (self.points[i].search_at, self.points[i].search_wait) = (self.stats.frames + wait, wait);
         let template = &self.patches[from][point.slot].last[SEARCH_LEVEL];
         if !template.usable() {
             return None;
@@ -333,8 +366,10 @@ impl Frontend {
         if left > UNEXPLAINED_MATCH_MAX || self.rig.triangulate(from, to, f, g).is_none() {
             return None;
         }
-        let (now, before) = (&self.now[to], &self.now[from]);
-        confirm(&mut self.scratch, now, before, px, start, warp, self.iterations, self.recovered_max_px)?;
+        let search = Search { from: &self.now[from], to: &self.now[to], px, start, coarsest };
+        if !search.returns(&mut self.scratch, warp, warp.px(), self.iterations, self.recovered_max_px) {
+            return None;
+        }
         self.patches[to][slot].restart(&self.scratch);
         Some(warp.px())
     }
@@ -357,14 +392,22 @@ impl Frontend {
         for corner in corners {
             let px = [corner.x as f32, corner.y as f32];
             take_stack(&mut self.scratch, &self.now[0], px);
-            if !self.scratch[0].usable() || self.rig.bearing(0, px).is_none() {
+            let sharp = self.scratch[0].usable() && self.scratch[0].sigma_px() < SIGMA_MAX_PX;
+            if !sharp || self.rig.bearing(0, px).is_none() || is_near(&self.points, px, self.spacing_px) {
                 continue;
             }
             let slot = self.free.pop().expect("no more corners than free slots");
             self.patches[0][slot].restart(&self.scratch);
             let mut views = [None; CAMERAS_MAX];
             views[0] = Some(px);
-            self.points.push(Point { id: self.next_id, slot, inverse_depth: None, views });
+            self.points.push(Point {
+                id: self.next_id,
+                slot,
+                inverse_depth: None,
+                search_at: 0,
+                search_wait: 0,
+                views,
+            });
             self.next_id += 1;
             self.stats.created += 1;
         }
@@ -383,27 +426,44 @@ impl Frontend {
     }
 }
 
-/// Takes the patch where alignment ended and aligns it back: it must arrive where it came from.
-/// The way back starts as far off as the way there did.
-fn confirm(
-    scratch: &mut Stack,
-    now: &Pyramid,
-    before: &Pyramid,
-    from: [f32; 2],
+/// A patch at `px` of one image looked for around `start` in another.
+struct Search<'a> {
+    from: &'a Pyramid,
+    to: &'a Pyramid,
+    px: [f32; 2],
     start: Warp,
-    found: Warp,
-    iterations: usize,
-    recovered_max_px: f32,
-) -> Option<()> {
-    let image = &now.levels[0];
-    let (right, bottom) = ((image.width - 1) as f32 - MARGIN_PX, (image.height - 1) as f32 - MARGIN_PX);
-    if !(found.x >= MARGIN_PX && found.y >= MARGIN_PX && found.x <= right && found.y <= bottom) {
-        return None;
+    coarsest: usize,
+}
+
+impl Search<'_> {
+    /// Takes the patch where it was placed and aligns it back: it must arrive where it came from.
+    /// The way back starts as far off as the way there did, and at the coarsest level too.
+    fn returns(
+        &self,
+        stack: &mut Stack,
+        found: Warp,
+        placed: [f32; 2],
+        iterations: usize,
+        recovered_max_px: f32,
+    ) -> bool {
+        let image = &self.to.levels[0];
+        let [right, bottom] = [image.width, image.height].map(|n| (n - 1) as f32 - MARGIN_PX);
+        if !(placed[0] >= MARGIN_PX && placed[1] >= MARGIN_PX && placed[0] <= right && placed[1] <= bottom) {
+            return false;
+        }
+        take_stack(stack, self.to, placed);
+        // What the anchor moved here, it moves there.
+        let (dx, dy) = (placed[0] - found.x, placed[1] - found.y);
+        let origin = [self.px[0] + found.c * dx + found.s * dy, self.px[1] + found.c * dy - found.s * dx];
+        let (x, y) = (found.x + origin[0] - self.start.x, found.y + origin[1] - self.start.y);
+        let back = Warp { x, y, c: found.c, s: -found.s };
+        align_stack(stack, self.from, back, self.coarsest, iterations)
+            .is_some_and(|(recovered, _)| distance(recovered.px(), origin) <= recovered_max_px)
     }
-    take_stack(scratch, now, found.px());
-    let back = Warp { x: found.x + from[0] - start.x, y: found.y + from[1] - start.y, c: found.c, s: -found.s };
-    let (recovered, _) = align_stack(scratch, before, back, PYRAMID_LEVELS - 1, iterations)?;
-    (distance(recovered.px(), from) <= recovered_max_px).then_some(())
+}
+
+fn is_near(points: &[Point], px: [f32; 2], spacing_px: f32) -> bool {
+    points.iter().any(|p| p.views[0].is_some_and(|q| distance(px, q) < spacing_px))
 }
 
 fn distance(a: [f32; 2], b: [f32; 2]) -> f32 {

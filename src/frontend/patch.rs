@@ -30,8 +30,10 @@ const DY: [f32; N] = offsets(1);
 /// No offset is longer (3.5² + 1.5² = 14.5 = 3.81²), px.
 const RADIUS: f32 = 3.9;
 
-/// A level is left when its step is below this, px of the level (and rad times four pixels).
-const STEP_MIN: f32 = 0.01;
+/// A level is left when its step is below this, px of the level. Coarse levels only need to hand on
+/// a guess inside the next basin.
+pub const STEP_MIN: f32 = 0.02;
+const STEP_MIN_COARSE: f32 = 0.1;
 /// A step this long has left the basin, px.
 const STEP_MAX: f32 = 10.0;
 
@@ -78,7 +80,7 @@ impl Warp {
         [self.x, self.y]
     }
 
-    /// The same turn, seen `2^level` times smaller.
+    /// The same place and turn on a coarser level.
     pub fn at_level(&self, level: usize) -> Warp {
         let k = 1.0 / (1 << level) as f32;
         Warp { x: self.x * k, y: self.y * k, ..*self }
@@ -113,6 +115,8 @@ pub struct Template {
     gain: [[f32; N]; 3],
     /// Σ(value - 1)²
     contrast: f32,
+    /// See `sigma_px`.
+    sigma_px: f32,
     /// Bit i: offset i was inside the image. 0: not usable.
     inside: u64,
 }
@@ -121,13 +125,18 @@ pub const ALL: u64 = (1 << N) - 1;
 
 impl Default for Template {
     fn default() -> Self {
-        Template { value: [0.0; N], gain: [[0.0; N]; 3], contrast: 0.0, inside: 0 }
+        Template { value: [0.0; N], gain: [[0.0; N]; 3], contrast: 0.0, sigma_px: 0.0, inside: 0 }
     }
 }
 
 impl Template {
     pub fn usable(&self) -> bool {
         self.inside != 0
+    }
+
+    /// Standard deviation of the aligned place for one grey level of image noise, px.
+    pub fn sigma_px(&self) -> f32 {
+        self.sigma_px
     }
 
     /// Takes the patch at a pixel of a level.
@@ -138,7 +147,7 @@ impl Template {
         }
         let Some((grid, inside)) = sample_grid(image, x, y) else { return };
         let mut g = [[0f32; N]; 3];
-        let (mut sum, mut g_sum, mut count) = (0.0, [0f32; 3], 0.0);
+        let mut g_mean = [0f32; 3];
         for k in 0..N {
             let [i, j] = PATTERN[k];
             let on = if inside >> k & 1 == 1 { 1.0 } else { 0.0 };
@@ -146,15 +155,14 @@ impl Template {
             let gy = 0.5 * on * (grid[j + 1][i] - grid[j - 1][i]);
             self.value[k] = on * grid[j][i];
             (g[0][k], g[1][k], g[2][k]) = (gx, gy, DX[k] * gy - DY[k] * gx);
-            sum += self.value[k];
-            count += on;
         }
-        let mean = sum / count;
+        let count = inside.count_ones() as f32;
+        let mean = sum(&self.value) / count;
         if !(mean > 1.0) {
             return; // black: a ratio of noise
         }
         for a in 0..3 {
-            g_sum[a] = g[a].iter().sum::<f32>() / count;
+            g_mean[a] = sum(&g[a]) / count;
         }
         self.contrast = 0.0;
         for k in 0..N {
@@ -162,21 +170,25 @@ impl Template {
             self.value[k] /= mean;
             self.contrast += on * (self.value[k] - 1.0) * (self.value[k] - 1.0);
             for a in 0..3 {
-                g[a][k] = on * (g[a][k] - self.value[k] * g_sum[a]) / mean;
+                g[a][k] = on * (g[a][k] - self.value[k] * g_mean[a]) / mean;
             }
         }
         let Some(inv) = invert_normal(&g) else { return };
         for a in 0..3 {
-            for k in 0..N {
-                self.gain[a][k] = inv[a][0] * g[0][k] + inv[a][1] * g[1][k] + inv[a][2] * g[2][k];
+            self.gain[a] = [0.0; N];
+            for b in 0..3 {
+                for k in 0..N {
+                    self.gain[a][k] += inv[a][b] * g[b][k];
+                }
             }
         }
+        self.sigma_px = (inv[0][0] + inv[1][1]).sqrt() / mean;
         self.inside = inside;
     }
 
     /// Moves `warp` (pixels of this level) onto the template. Answers what share of the template's
     /// contrast was left unexplained before the last step, or `None` when it slid off.
-    pub fn align(&self, image: &Image, warp: &mut Warp, iterations: usize) -> Option<f32> {
+    pub fn align(&self, image: &Image, warp: &mut Warp, iterations: usize, step_min: f32) -> Option<f32> {
         let mut left = f32::MAX;
         for _ in 0..iterations {
             let (r, unexplained) = self.residual(image, warp)?;
@@ -185,12 +197,12 @@ impl Template {
             for a in 0..3 {
                 inc[a] = -dot(&self.gain[a], &r);
             }
-            let length = inc[0].abs().max(inc[1].abs()).max(4.0 * inc[2].abs());
+            let length = inc[0].abs().max(inc[1].abs()).max(RADIUS * inc[2].abs());
             if !(length < STEP_MAX) {
                 return None;
             }
             warp.step(inc);
-            if length < STEP_MIN {
+            if length < step_min {
                 break;
             }
         }
@@ -205,7 +217,7 @@ impl Template {
             return None;
         }
         // Both means over the same pixels; the template's is 1 over its own.
-        let (mut mean, mut own) = (r.iter().sum::<f32>() / N as f32, 1.0);
+        let (mut mean, mut own) = (sum(&r) / N as f32, 1.0);
         if inside != ALL {
             let count = inside.count_ones() as f32;
             let over = |v: &[f32; N]| (0..N).filter(|k| inside >> k & 1 == 1).map(|k| v[k]).sum::<f32>() / count;
@@ -252,11 +264,11 @@ pub fn align_stack(
     let mut warp = start;
     for l in (1..=coarsest).rev() {
         let mut w = warp.at_level(l);
-        if stack[l].usable() && stack[l].align(&pyramid.levels[l], &mut w, iterations).is_some() {
+        if stack[l].usable() && stack[l].align(&pyramid.levels[l], &mut w, iterations, STEP_MIN_COARSE).is_some() {
             warp = w.at_full(l);
         }
     }
-    let left = stack[0].usable().then(|| stack[0].align(&pyramid.levels[0], &mut warp, 2 * iterations))??;
+    let left = stack[0].usable().then(|| stack[0].align(&pyramid.levels[0], &mut warp, 2 * iterations, STEP_MIN))??;
     Some((warp, left))
 }
 
@@ -266,6 +278,16 @@ fn dot(a: &[f32; N], b: &[f32; N]) -> f32 {
     for (a, b) in a.chunks_exact(4).zip(b.chunks_exact(4)) {
         for i in 0..4 {
             s[i] += a[i] * b[i];
+        }
+    }
+    (s[0] + s[1]) + (s[2] + s[3])
+}
+
+fn sum(a: &[f32; N]) -> f32 {
+    let mut s = [0f32; 4];
+    for a in a.chunks_exact(4) {
+        for i in 0..4 {
+            s[i] += a[i];
         }
     }
     (s[0] + s[1]) + (s[2] + s[3])
@@ -346,10 +368,8 @@ fn sample(image: &Image, warp: &Warp, out: &mut [f32; N]) -> u64 {
     let (w, h) = (image.width, image.height);
     let (right, bottom) = ((w - 1) as f32, (h - 1) as f32);
     let p = &image.pixels[..];
-    let whole = warp.x >= RADIUS + 1.0
-        && warp.y >= RADIUS + 1.0
-        && warp.x <= right - RADIUS - 1.0
-        && warp.y <= bottom - RADIUS - 1.0;
+    let reach = RADIUS + 1.0;
+    let whole = warp.x >= reach && warp.y >= reach && warp.x <= right - reach && warp.y <= bottom - reach;
     if !whole {
         let mut inside = 0;
         for k in 0..N {
@@ -364,15 +384,23 @@ fn sample(image: &Image, warp: &Warp, out: &mut [f32; N]) -> u64 {
     }
     // Rounding x - 1/2 to an integer by adding 2^23 is a floor that vectorises.
     const ROUND: f32 = 8388608.0;
-    let mut at = [0u32; N];
+    let mut quad = [0u32; N];
     for k in 0..N {
         let (i, j) = (x[k] - 0.5 + ROUND, y[k] - 0.5 + ROUND);
         x[k] -= i - ROUND;
         y[k] -= j - ROUND;
-        at[k] = (j.to_bits() & 0x7f_ffff) * w as u32 + (i.to_bits() & 0x7f_ffff);
+        quad[k] = (j.to_bits() & 0x7f_ffff) * w as u32 + (i.to_bits() & 0x7f_ffff);
+    }
+    // Only the fetch is one pixel at a time: the four bytes travel in one word.
+    for q in &mut quad {
+        let q0 = &p[*q as usize..][..w + 2];
+        *q = u32::from_le_bytes([q0[0], q0[1], q0[w], q0[w + 1]]);
     }
     for k in 0..N {
-        out[k] = bilinear(&p[at[k] as usize..], w, x[k], y[k]);
+        let byte = |n: u32| ((quad[k] >> n) & 255) as i32 as f32;
+        let (a, b, c, d) = (byte(0), byte(8), byte(16), byte(24));
+        let (top, bottom) = (a + x[k] * (b - a), c + x[k] * (d - c));
+        out[k] = top + y[k] * (bottom - top);
     }
     ALL
 }

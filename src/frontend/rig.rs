@@ -14,6 +14,8 @@ const DEPTH_MIN: f64 = 0.1;
 pub struct Rig {
     cameras: Vec<Camera>,
     body_from_cam: Vec<Pose>,
+    /// `between[to * cameras + from]` is `to_from_from`.
+    between: Vec<Pose>,
     epipolar_max: f64,
 }
 
@@ -21,6 +23,11 @@ impl Rig {
     pub fn new(calibration: &Calibration, epipolar_max: f64) -> Rig {
         Rig {
             cameras: calibration.cameras.iter().map(|c| c.camera).collect(),
+            between: calibration
+                .cameras
+                .iter()
+                .flat_map(|to| calibration.cameras.iter().map(|from| to.body_from_cam.inverse() * from.body_from_cam))
+                .collect(),
             body_from_cam: calibration.cameras.iter().map(|c| c.body_from_cam).collect(),
             epipolar_max,
         }
@@ -38,7 +45,7 @@ impl Rig {
 
     /// `to_from_from` between two cameras at one instant.
     pub fn between(&self, from: usize, to: usize) -> Pose {
-        self.body_from_cam[to].inverse() * self.body_from_cam[from]
+        self.between[to * self.cameras.len() + from]
     }
 
     /// Where a patch at an inverse distance (1/m) appears in camera `to`, and how it is turned.
