@@ -28,8 +28,8 @@ void main() {
     const uint y = at / runs, x0 = at % runs * RUN;
     const uint words = byte_stride(push.size.x) / 4;
     float a[REACH], b[REACH], product[REACH];
-    // The run with its margins spans six words, from x0 - 8.
-    [[unroll]] for (uint w = 0; w < 6; ++w) {
+    // The run with its margins, in whole words from x0 - 8.
+    [[unroll]] for (uint w = 0; w < (RUN + 16) / 4; ++w) {
         const int word = int(x0 / 4 + w) - 2;
         const bool inside = word >= 0 && word < int(words);
         const uint i = y * words + uint(clamp(word, 0, int(words) - 1));

@@ -153,7 +153,9 @@ impl Pipeline {
 
     pub fn new(gpu: &mut Gpu, shape: Shape) -> Result<Pipeline, Fault> {
         let caps = gpu.caps();
-        let sub = caps.subgroup.vote && caps.subgroup.shuffle;
+        // Intel's compiler picks a width per kernel, narrower than the one it reports.
+        let fixed_width = !caps.name.contains("Intel");
+        let sub = caps.subgroup.vote && caps.subgroup.shuffle && fixed_width;
         let (lanes, variant) = match caps.subgroup_size {
             n @ (8 | 16 | 32 | 64) if sub => (n.min(32), "subgroup"),
             _ => (32, ""),

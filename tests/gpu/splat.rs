@@ -81,7 +81,7 @@ fn open(shape: Shape) -> (Gpu, Pipeline) {
     (gpu, p)
 }
 
-fn render(gpu: &mut Gpu, p: &mut Pipeline, v: &View) -> Rendered {
+pub fn render(gpu: &mut Gpu, p: &mut Pipeline, v: &View) -> Rendered {
     let mut out = Rendered::default();
     p.render(gpu, v, &mut out).unwrap();
     out
@@ -352,7 +352,7 @@ fn a_full_pool_takes_no_more_and_reuses_what_was_pruned() {
     assert!(splats[5..25].iter().all(|s| map.contains(s)));
 }
 
-fn psnr(picture: &[f32], goal: &[u8]) -> f64 {
+pub fn psnr(picture: &[f32], goal: &[u8]) -> f64 {
     let square = |(a, b): (&f32, &u8)| (f64::from(*a) - f64::from(*b) / 255.0).powi(2);
     let mse = picture.iter().zip(goal).map(square).sum::<f64>() / goal.len() as f64;
     -10.0 * mse.log10()
@@ -376,7 +376,7 @@ fn training_on_one_picture_converges() {
 }
 
 /// Picture and goal side by side, in $STIPPLE_PICTURES if it is set.
-fn write_png(name: &str, picture: &[f32], goal: &[u8], width: usize, height: usize) {
+pub fn write_png(name: &str, picture: &[f32], goal: &[u8], width: usize, height: usize) {
     let Some(folder) = std::env::var_os("STIPPLE_PICTURES") else { return };
     let mut bytes = Vec::new();
     for y in 0..height {
