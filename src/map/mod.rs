@@ -17,6 +17,7 @@ mod pose;
 pub mod quality;
 pub mod schedule;
 pub mod sort;
+pub mod view;
 
 use crate::config::{Board, MapConfig};
 use crate::counters::Counters;

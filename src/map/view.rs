@@ -1,0 +1,104 @@
+//! What goes into a rendering or a training step and what comes out of it, and how it crosses to the kernels.
+
+use crate::gpu::kernels::types::{Camera, Status};
+use crate::stereo::Pinhole;
+use glam::DVec3;
+use stipple_drivers::Pose;
+
+/// A camera where it is looked from.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct View {
+    pub world_from_cam: Pose,
+    pub camera: Pinhole,
+}
+
+/// Adam step sizes: m, ln m, quaternion, logit, grey.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct LearningRates {
+    pub position: f32,
+    pub scale: f32,
+    pub rotation: f32,
+    pub opacity: f32,
+    pub colour: f32,
+}
+
+/// Of the loss (1 - ssim)·L1 + ssim·(1 - SSIM) + mean over the visible of the rest.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Weights {
+    pub ssim: f32,
+    /// On ln(longest axis / second axis) above ln 3.
+    pub needle: f32,
+    /// On ln(longest axis) above ln(scale_soft_m).
+    pub scale: f32,
+    pub scale_soft_m: f32,
+    /// On the opacity.
+    pub opacity: f32,
+}
+
+impl Default for Weights {
+    fn default() -> Self {
+        // On held-out views of a synthetic wall (tests/gpu/held_out.rs): +0.10 dB together; opacity costs 0.2 dB.
+        Weights { ssim: 0.2, needle: 0.1, scale: 0.01, scale_soft_m: 0.1, opacity: 0.0 }
+    }
+}
+
+/// A picture of the map; sized by the view.
+#[derive(Clone, Debug, Default)]
+pub struct Rendered {
+    pub width: usize,
+    pub height: usize,
+    pub grey: Vec<f32>,
+    pub alpha: Vec<f32>,
+    /// Expected depth, m; zero where nothing was hit.
+    pub depth: Vec<f32>,
+}
+
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Stats {
+    pub visible: u32,
+    pub intersections: u32,
+    /// Intersections there was no room for: the farthest.
+    pub overflow: u32,
+    /// Gaussians culled for not being finite.
+    pub failed: u32,
+}
+
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct StepStats {
+    pub stats: Stats,
+    pub loss: f64,
+    pub l1: f64,
+    pub ssim: f64,
+    /// Gaussians not moved because their gradient was not finite.
+    pub gradients_rejected: u32,
+    /// By [p, θ] of world_from_cam: p additive in world, rotation perturbed on the right.
+    pub pose_gradient: [f64; 6],
+}
+
+pub(super) fn size(view: &View) -> [u32; 2] {
+    [view.camera.width as u32, view.camera.height as u32]
+}
+
+pub(super) fn camera(view: &View) -> Camera {
+    let cam_from_world = view.world_from_cam.inverse();
+    let (r, t) = (cam_from_world.rotation().transpose(), cam_from_world.p);
+    let row = |i: usize| [r.col(i).x as f32, r.col(i).y as f32, r.col(i).z as f32, t[i] as f32];
+    let c = &view.camera;
+    Camera { row0: row(0), row1: row(1), row2: row(2), focal_centre: [c.fx, c.fy, c.cx, c.cy].map(|v| v as f32) }
+}
+
+pub(super) fn stats(s: &Status) -> Stats {
+    Stats {
+        visible: s.visible,
+        intersections: s.intersections,
+        overflow: s.intersections_needed - s.intersections,
+        failed: s.not_finite,
+    }
+}
+
+/// From points moved in the camera frame to the camera moved in the world.
+pub(super) fn pose_gradient(view: &View, g: &[f32; 6]) -> [f64; 6] {
+    let v = |i: usize| DVec3::new(f64::from(g[i]), f64::from(g[i + 1]), f64::from(g[i + 2]));
+    let (p, turn) = (-(view.world_from_cam.q * v(0)), -v(3));
+    [p.x, p.y, p.z, turn.x, turn.y, turn.z]
+}
