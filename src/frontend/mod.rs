@@ -77,7 +77,7 @@ const UNEXPLAINED_MATCH_MAX: f32 = 0.6;
 const ANCHOR_LEFT_MAX: f32 = 2.0;
 const ANCHOR_PULL_MAX_PX: f32 = 1.0;
 /// A corner is worth following when one grey level of noise moves it less than this, px.
-const SIGMA_MAX_PX: f32 = 0.1;
+const SIGMA_MAX_PX: f32 = 0.2;
 /// Points keep this share of a cell from each other.
 const SPACING: f32 = 0.25;
 /// Guess before anything was triangulated, 1/m.

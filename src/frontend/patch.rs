@@ -412,3 +412,87 @@ fn bilinear(q: &[u8], stride: usize, fx: f32, fy: f32) -> f32 {
     let (top, bottom) = (a + fx * (b - a), c + fx * (d - c));
     top + fy * (bottom - top)
 }
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+
+    /// Smooth in every direction at every level: wavelengths of 9 to 60 px.
+    fn smooth(x: f64, y: f64) -> f64 {
+        let wave = |kx: f64, ky: f64, phase: f64| (x * kx + y * ky + phase).sin();
+        let fine = wave(0.5, 0.3, 0.1) + wave(-0.25, 0.55, 1.7);
+        let coarse = wave(0.17, -0.09, 0.4) + wave(0.06, 0.14, 2.2) + wave(-0.1, 0.08, 5.0);
+        120.0 + 16.0 * fine + 20.0 * coarse
+    }
+
+    /// The image in which the patch at (60, 50) appears at `place`, turned by `angle`, `gain` times as bright.
+    fn moved(place: [f64; 2], angle: f64, gain: f64) -> Pyramid {
+        let mut image = Image::new(128, 104);
+        let (s, c) = angle.sin_cos();
+        for v in 0..image.height {
+            for u in 0..image.width {
+                let (x, y) = (u as f64 - place[0], v as f64 - place[1]);
+                let value = smooth(60.0 + c * x + s * y, 50.0 - s * x + c * y);
+                image.pixels[v * image.width + u] = (gain * value).round().clamp(0.0, 255.0) as u8;
+            }
+        }
+        let mut pyramid = Pyramid::new(image.width, image.height);
+        pyramid.build(&image);
+        pyramid
+    }
+
+    fn follow(place: [f64; 2], angle: f64, gain: f64) -> (Warp, f32) {
+        let mut stack = Stack::default();
+        take_stack(&mut stack, &moved([60.0, 50.0], 0.0, 1.0), [60.0, 50.0]);
+        let target = moved(place, angle, gain);
+        align_stack(&stack, &target, Warp::upright([60.0, 50.0]), PYRAMID_LEVELS - 1, 5).unwrap()
+    }
+
+    #[test]
+    fn sub_pixel_shifts_and_turns_are_recovered() {
+        for (dx, dy, angle) in
+            [(0.0, 0.0, 0.0), (0.37, -0.81, 0.0), (5.3, 3.6, 0.05), (-9.2, 6.1, -0.1), (2.5, 2.5, 0.2)]
+        {
+            let (warp, left) = follow([60.0 + dx, 50.0 + dy], angle, 1.0);
+            let error = (warp.x as f64 - 60.0 - dx).hypot(warp.y as f64 - 50.0 - dy);
+            let turn = (warp.s as f64).atan2(warp.c as f64) - angle;
+            assert!(error < 0.05 && turn.abs() < 0.01, "({dx}, {dy}, {angle}): {error} px, {turn} rad");
+            assert!(left < 0.01, "{left}");
+        }
+    }
+
+    #[test]
+    fn gain_changes_nothing() {
+        let (plain, _) = follow([63.4, 48.9], 0.03, 1.0);
+        for gain in [0.4, 1.3] {
+            let (warp, _) = follow([63.4, 48.9], 0.03, gain);
+            assert!((warp.x - plain.x).hypot(warp.y - plain.y) < 0.03, "gain {gain}");
+        }
+    }
+
+    #[test]
+    fn a_patch_cut_by_the_border_still_aligns() {
+        let (a, b) = (moved([60.0, 50.0], 0.0, 1.0), moved([60.4, 50.3], 0.0, 1.0));
+        let mut stack = Stack::default();
+        take_stack(&mut stack, &a, [2.0, 30.0]);
+        let (warp, _) = align_stack(&stack, &b, Warp::upright([2.0, 30.0]), PYRAMID_LEVELS - 1, 5).unwrap();
+        assert!((warp.x - 2.4).hypot(warp.y - 30.3) < 0.1, "{warp:?}");
+        assert!(stack[0].residual(&b.levels[0], &Warp::upright([-1.0, 30.0])).is_none());
+        assert!(stack[0].residual(&b.levels[0], &Warp::upright([f32::NAN, 30.0])).is_none());
+    }
+
+    #[test]
+    fn flat_black_or_one_dimensional_patches_are_refused() {
+        let fill = |f: fn(usize) -> u8| {
+            let mut image = Image::new(40, 40);
+            (0..1600).for_each(|k| image.pixels[k] = f(k % 40));
+            let mut template = Template::default();
+            template.take(&image, 20.0, 20.0);
+            template.usable()
+        };
+        assert!(!fill(|_| 80));
+        assert!(!fill(|_| 0));
+        assert!(!fill(|x| (6 * x) as u8));
+    }
+}
