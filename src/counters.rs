@@ -19,6 +19,10 @@ macro_rules! counters {
 counters! {
     /// Frames replaced in the mailbox before the tracker took them.
     frames_overwritten,
+    /// Frames whose stamp the table of poses does not cover.
+    frames_without_pose,
+    /// Frames that could not be read.
+    frames_unreadable,
     /// Inertial samples that did not fit between two frames.
     imu_overflow,
     /// Inertial samples refused: not finite, or not newer than the last.
@@ -33,6 +37,8 @@ counters! {
     solver_failures,
     /// Keyframes offered while every slot was taken.
     keyframes_rejected,
+    /// Pose corrections that found their queue full.
+    corrections_full,
     /// Keyframes dropped because the mapper's store was full.
     keyframe_store_full,
     /// Anchors not made because their pair could not be matched.

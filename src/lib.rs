@@ -16,6 +16,7 @@
 
 pub mod config;
 pub mod counters;
+pub mod daemon;
 pub mod frontend;
 pub mod gpu;
 pub mod limits;

@@ -7,6 +7,7 @@
 
 pub mod camera;
 pub mod fault;
+pub mod host;
 pub mod replay;
 pub mod sim;
 pub mod types;

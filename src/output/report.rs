@@ -1,6 +1,5 @@
 //! `report.json`: one flat object. A figure that was not measured is null, never zero.
 
-use crate::counters::Counters;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::io::{self, Write};
@@ -80,8 +79,8 @@ pub struct KernelTime {
 const COUNT: &str = "count_";
 
 impl Report {
-    pub fn set_counters(&mut self, counters: &Counters) {
-        self.counts = counters.list().into_iter().map(|(name, n)| (format!("{COUNT}{name}"), n)).collect();
+    pub fn set_counters(&mut self, counters: &[(&str, u64)]) {
+        self.counts = counters.iter().map(|(name, n)| (format!("{COUNT}{name}"), *n)).collect();
     }
 
     /// Counters that are not zero, without their prefix.
@@ -99,6 +98,7 @@ impl Report {
 mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
+    use crate::counters::Counters;
 
     const KEYS: &str =
         "frames keyframes anchors frames_dropped ate_rmse_m rte_1s_m rpe_deg tracking_fps tracking_ms_p50 \
@@ -119,7 +119,7 @@ mod tests {
         let counters = Counters::default();
         counters.outliers.add(7);
         let mut report = Report { psnr_db: Some(24.5), ..Report::default() };
-        report.set_counters(&counters);
+        report.set_counters(&counters.list());
         report.curve.push(CurvePoint {
             t_s: 5.0,
             psnr_db: Some(20.0),

@@ -1,5 +1,5 @@
 //! Block matching by Debian's OpenCV (`cv::StereoBM`, Konolige's algorithm) behind a C++ shim of
-//! four functions: no OpenCV type crosses it, exceptions end in it. Built with the feature
+//! three functions: no OpenCV type crosses it, exceptions end in it. Built with the feature
 //! `opencv`; without it the method is refused at boot.
 #![allow(unsafe_code)]
 
@@ -21,7 +21,8 @@ impl BlockMatcher {
     /// disparity range for each of its row strips, the cost image of the left-right check.
     pub fn bytes(width: usize, height: usize, config: &StereoConfig) -> usize {
         let strip = (config.disparities as usize + 2) * 4 * (height + config.block_px as usize + 2);
-        2 * width * height + 4 * width * height + 4 * strip
+        let padded = (width + config.disparities as usize) * height;
+        8 * padded + 4 * strip
     }
 }
 

@@ -1,0 +1,36 @@
+# Two commands for a newcomer on Debian 12 with git, make and a Rust toolchain:
+#   make demo    fly and map a simulated room, write out/demo/report.html
+#   make test    run every test
+# Both install what is missing (the list below, with sudo when not root) and say so.
+
+# The one place where Debian packages are listed:
+#   g++                    linker, and the compiler of the OpenCV shim
+#   glslang-tools          GLSL -> SPIR-V in the build
+#   libopencv-calib3d-dev  block matching
+#   libvulkan1             Vulkan loader
+#   mesa-vulkan-drivers    lavapipe (Vulkan on the CPU), and the drivers of Intel, AMD and Pi GPUs
+#   vulkan-validationlayers  the tests run the pipeline under the Khronos validation layer
+PACKAGES := g++ glslang-tools libopencv-calib3d-dev libvulkan1 mesa-vulkan-drivers vulkan-validationlayers
+
+OUT ?= out/demo
+
+.PHONY: demo test lint deps
+
+demo: deps
+	cargo build --release --locked
+	target/release/stipple demo --board board-configs/lavapipe.toml --out $(OUT)
+
+test: deps
+	cargo test --workspace --locked --no-fail-fast
+
+lint:
+	cargo fmt --all --check
+	cargo clippy --workspace --all-targets --locked -- -D warnings
+
+deps:
+	@missing=; for p in $(PACKAGES); do \
+	  dpkg-query -W -f='$${Status}' $$p 2>/dev/null | grep -q 'ok installed' || missing="$$missing $$p"; done; \
+	if [ -n "$$missing" ]; then \
+	  echo "installing:$$missing"; \
+	  as=; [ "$$(id -u)" = 0 ] || as=sudo; \
+	  $$as apt-get update -qq && DEBIAN_FRONTEND=noninteractive $$as apt-get install -y -qq --no-install-recommends $$missing; fi

@@ -1,0 +1,118 @@
+//! What a run plays: a recording on disk, or a flight the simulator rendered into memory.
+
+use crate::config::ReplayConfig;
+use std::path::{Path, PathBuf};
+use stipple_drivers::replay::{FrameFault, OpenOptions, Reader, Recording};
+use stipple_drivers::sim::{Scenario, Sim};
+use stipple_drivers::{Calibration, Fault, Frames, ImuSample, Nanos, Span, TimedPose};
+
+pub struct Input {
+    pub name: String,
+    pub calibration: Calibration,
+    pub imu: Vec<ImuSample>,
+    pub stamps: Vec<Nanos>,
+    /// world_from_body; empty where there is none.
+    pub truth: Vec<TimedPose>,
+    pub warnings: Vec<String>,
+    pub counters: Vec<(&'static str, u64)>,
+    pub source: Source,
+}
+
+pub enum Source {
+    Recording(Reader),
+    Rendered(Vec<Frames>),
+}
+
+impl Source {
+    /// Reads frame `index` into pre-shaped `out`; one that cannot be read is kept among `warnings`.
+    pub fn read(&mut self, index: usize, out: &mut Frames) -> Result<(), FrameFault> {
+        match self {
+            Source::Recording(reader) => reader.read(index, out),
+            Source::Rendered(frames) => {
+                let from = &frames[index];
+                out.t = from.t;
+                for (to, from) in out.images.iter_mut().zip(&from.images) {
+                    to.copy_from(from);
+                }
+                Ok(())
+            }
+        }
+    }
+
+    pub fn warnings(&self) -> &[String] {
+        match self {
+            Source::Recording(reader) => reader.warnings(),
+            Source::Rendered(_) => &[],
+        }
+    }
+
+    /// What reading met: counters by name.
+    pub fn counters(&self) -> Vec<(&'static str, u64)> {
+        match self {
+            Source::Recording(reader) => reader.counters().list(),
+            Source::Rendered(_) => vec![],
+        }
+    }
+}
+
+impl Input {
+    pub fn recording(dataset: &Path, config: &ReplayConfig) -> Result<Input, Fault> {
+        let options = OpenOptions {
+            pair_tolerance: Span::from_secs(config.pair_tolerance_s),
+            imu_hole: Span::from_secs(config.imu_hole_s),
+            calibration: (!config.calibration.is_empty()).then(|| PathBuf::from(&config.calibration)),
+        };
+        let r = Recording::open(dataset, &options)?;
+        let reader = r.reader();
+        let name =
+            dataset.file_name().map_or_else(|| dataset.display().to_string(), |n| n.to_string_lossy().into_owned());
+        Ok(Input {
+            name,
+            stamps: r.pairs.iter().map(|p| p.t).collect(),
+            counters: r.counters.list(),
+            calibration: r.calibration,
+            imu: r.imu,
+            truth: r.truth,
+            warnings: r.warnings,
+            source: Source::Recording(reader),
+        })
+    }
+
+    /// Renders every frame before the flight starts, so that rendering takes nothing from it.
+    pub fn rendered(scenario: &Scenario, mut progress: impl FnMut(usize, usize)) -> Result<Input, Fault> {
+        let mut sim = Sim::new(scenario)?;
+        let count = sim.frame_count();
+        let mut frames = Vec::with_capacity(count);
+        for i in 0..count {
+            let mut f = Frames::for_rig(sim.calibration());
+            sim.render(i, &mut f);
+            frames.push(f);
+            progress(i + 1, count);
+        }
+        Ok(Input {
+            name: format!("simulated flight `{}`", scenario.name),
+            calibration: sim.calibration().clone(),
+            imu: sim.imu().to_vec(),
+            stamps: frames.iter().map(|f| f.t).collect(),
+            truth: sim.truth(),
+            warnings: vec![],
+            counters: vec![],
+            source: Source::Rendered(frames),
+        })
+    }
+
+    /// Frames whose stamp is less than `duration_s` after the first.
+    pub fn frames_within(&self, duration_s: Option<f64>) -> usize {
+        match (duration_s, self.stamps.first()) {
+            (Some(s), Some(&first)) => self.stamps.partition_point(|t| (*t - first).secs() < s),
+            _ => self.stamps.len(),
+        }
+    }
+
+    pub fn length_s(&self) -> f64 {
+        match (self.stamps.first(), self.stamps.last()) {
+            (Some(a), Some(b)) => (*b - *a).secs(),
+            _ => 0.0,
+        }
+    }
+}

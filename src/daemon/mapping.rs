@@ -1,0 +1,160 @@
+//! The mapping side of a run: keyframes in, a map and its error against run time out.
+
+use super::progress::Gauges;
+use crate::config::Board;
+use crate::gpu::{Gpu, GpuError};
+use crate::map::{CurvePoint, Did, Keyframe, Mapper, PoseCorrection};
+use crate::mem::unsealed;
+use crate::stereo::Stereo;
+use crossbeam_queue::ArrayQueue;
+use std::sync::atomic::Ordering::Relaxed;
+use std::time::{Duration, Instant};
+use stipple_drivers::{host, Calibration, Fault, Frames, Image};
+
+/// Time handed to the mapper at once; between slices it looks at its queues.
+pub const SLICE: Duration = Duration::from_millis(50);
+/// Iterations whose time is kept for the median.
+const ITERATION_TIMES: usize = 1 << 16;
+/// Samples of error against run time.
+const CURVE_POINTS: usize = 4096;
+
+pub struct Mapping {
+    pub mapper: Mapper,
+    pub curve: Vec<CurvePoint>,
+    pub iteration_ms: Vec<f32>,
+    pub iterations: u64,
+    pub anchors: u64,
+    pub keyframes: u64,
+    /// Why mapping stopped before the end, if it did; odometry goes on.
+    pub failure: Option<String>,
+    period_s: f64,
+    next_curve_s: f64,
+}
+
+impl Mapping {
+    /// Opens the device on a thread of low priority: the threads of a CPU device inherit it, so
+    /// that odometry is served first.
+    pub fn open(calibration: &Calibration, board: &Board) -> Result<Mapping, Fault> {
+        let build = || {
+            host::lower_priority();
+            let stereo = Stereo::new(calibration, &board.stereo, board.map.scale)?;
+            let bytes = Mapper::footprint(calibration, board).gpu_total();
+            let gpu = Gpu::open(&board.gpu, bytes)?;
+            Mapper::new(gpu, stereo, board)
+        };
+        let mapper = std::thread::scope(|s| s.spawn(build).join().expect("boot faults are values, not panics"))?;
+        Ok(Mapping {
+            mapper,
+            curve: Vec::with_capacity(CURVE_POINTS),
+            iteration_ms: Vec::with_capacity(ITERATION_TIMES),
+            iterations: 0,
+            anchors: 0,
+            keyframes: 0,
+            failure: None,
+            period_s: board.map.curve_period_s,
+            next_curve_s: board.map.curve_period_s,
+        })
+    }
+
+    pub fn offer(&mut self, keyframe: &Keyframe) {
+        self.keyframes += 1;
+        self.mapper.offer(keyframe);
+    }
+
+    /// One slice of work. Answers false when there was nothing to do.
+    pub fn step(&mut self, deadline: Instant, gauges: &Gauges) -> bool {
+        if self.failure.is_some() {
+            return false;
+        }
+        let report = match self.mapper.step(deadline) {
+            Ok(report) => report,
+            Err(e) => {
+                self.fail(e);
+                return false;
+            }
+        };
+        self.iterations += u64::from(report.iterations);
+        if report.iterations > 0 && self.iteration_ms.len() < ITERATION_TIMES {
+            self.iteration_ms.push((report.ms / f64::from(report.iterations)) as f32);
+        }
+        self.anchors += u64::from(matches!(report.did, Did::Anchor { .. }));
+        gauges.anchors.store(self.anchors, Relaxed);
+        gauges.iterations.store(self.iterations, Relaxed);
+        gauges.splats.store(self.mapper.splat_count() as u64, Relaxed);
+        !matches!(report.did, Did::Idle)
+    }
+
+    /// Samples the curve when its period has passed; `t_s` is the run time so far.
+    pub fn sample_if_due(&mut self, t_s: f64, gauges: &Gauges) {
+        if t_s < self.next_curve_s {
+            return;
+        }
+        self.next_curve_s = (t_s / self.period_s).floor() * self.period_s + self.period_s;
+        self.sample(t_s, gauges);
+    }
+
+    pub fn sample(&mut self, t_s: f64, gauges: &Gauges) {
+        if self.failure.is_some() || self.curve.len() == CURVE_POINTS {
+            return;
+        }
+        match unsealed(|| self.mapper.sample(t_s)) {
+            Ok(point) => {
+                gauges.psnr_cdb.store((point.psnr_db.unwrap_or(0.0).max(0.0) * 100.0) as u64, Relaxed);
+                self.curve.push(point);
+            }
+            Err(e) => self.fail(e),
+        }
+    }
+
+    fn fail(&mut self, e: GpuError) {
+        self.failure = Some(unsealed(|| e.to_string()));
+    }
+}
+
+/// Keyframes on their way to the mapper: a fixed number of pre-shaped boxes going round.
+pub struct KeyframeQueue {
+    spare: ArrayQueue<Box<Keyframe>>,
+    offered: ArrayQueue<Box<Keyframe>>,
+    pub corrections: ArrayQueue<PoseCorrection>,
+}
+
+/// Keyframes in flight; the mapper takes one within a slice, an anchor holds it for a burst.
+pub const KEYFRAME_SLOTS: usize = 8;
+
+impl KeyframeQueue {
+    pub fn new(calibration: &Calibration) -> KeyframeQueue {
+        let q = KeyframeQueue {
+            spare: ArrayQueue::new(KEYFRAME_SLOTS),
+            offered: ArrayQueue::new(KEYFRAME_SLOTS),
+            corrections: ArrayQueue::new(16 * KEYFRAME_SLOTS),
+        };
+        for _ in 0..KEYFRAME_SLOTS {
+            let shape = |i: usize| {
+                let c = &calibration.cameras[i].camera;
+                Image::new(c.width, c.height)
+            };
+            let _ = q.spare.push(Box::new(Keyframe::with_images([shape(0), shape(1)])));
+        }
+        q
+    }
+
+    /// Copies a keyframe in; false when every slot is taken.
+    pub fn offer(&self, frames: &Frames, fill: impl FnOnce(&mut Keyframe)) -> bool {
+        let Some(mut slot) = self.spare.pop() else { return false };
+        slot.t = frames.t;
+        for (to, from) in slot.images.iter_mut().zip(&frames.images) {
+            to.copy_from(from);
+        }
+        fill(&mut slot);
+        // As many places as slots: there is always room.
+        let _ = self.offered.push(slot);
+        true
+    }
+
+    pub fn take(&self, use_it: impl FnOnce(&Keyframe)) -> bool {
+        let Some(slot) = self.offered.pop() else { return false };
+        use_it(&slot);
+        let _ = self.spare.push(slot);
+        true
+    }
+}

@@ -1,0 +1,71 @@
+//! The byte table: everything a board buys at boot, summed before anything is bought.
+
+use super::mapping::KEYFRAME_SLOTS;
+use super::play::FRAME_SLOTS;
+use crate::config::Board;
+use crate::frontend::Frontend;
+use crate::map::Mapper;
+use crate::mem::Footprint;
+use crate::stereo::Stereo;
+use crate::vio::Vio;
+use stipple_drivers::{Calibration, Camera, Exit, Fault, ImuCalibration, Lens, Pose, RigCamera};
+
+/// Everything a run with this rig takes, without the operating system's and the drivers' own.
+pub fn footprint(calibration: &Calibration, board: &Board) -> Footprint {
+    let pixels: usize = calibration.cameras.iter().map(|c| c.camera.width * c.camera.height).sum();
+    let pair: usize = calibration.cameras[..2].iter().map(|c| c.camera.width * c.camera.height).sum();
+    let mut f = Footprint::default();
+    f.host("queues: frames", FRAME_SLOTS * pixels);
+    f.extend(Frontend::footprint(calibration, &board.frontend));
+    f.extend(Vio::footprint());
+    if board.map.enabled {
+        f.host("queues: keyframes", KEYFRAME_SLOTS * pair);
+        f.extend(Stereo::footprint(calibration, &board.stereo, board.map.scale));
+        f.extend(Mapper::footprint(calibration, board));
+    }
+    f
+}
+
+/// The largest rig a board accepts: a stereo pair of its widest image.
+pub fn largest_rig(board: &Board) -> Calibration {
+    let (width, height) = (board.budget.image_width_max as usize, board.budget.image_height_max as usize);
+    let f = width as f64 * 0.6;
+    let lens = Lens::Radtan { k1: 0.0, k2: 0.0, p1: 0.0, p2: 0.0 };
+    let camera = Camera { width, height, fx: f, fy: f, cx: width as f64 / 2.0, cy: height as f64 / 2.0, lens };
+    let at = |x: f64| RigCamera { camera, body_from_cam: Pose { p: glam::DVec3::new(x, 0.0, 0.0), ..Pose::IDENTITY } };
+    let imu = ImuCalibration { rate_hz: 200.0, gyro_noise: 1e-4, gyro_walk: 1e-5, accel_noise: 1e-3, accel_walk: 1e-4 };
+    Calibration { cameras: vec![at(0.0), at(0.1)], imu }
+}
+
+/// Refuses a rig whose images or bytes exceed the board's budget.
+pub fn admit(place: &str, calibration: &Calibration, board: &Board) -> Result<Footprint, Fault> {
+    let (w, h) = (board.budget.image_width_max as usize, board.budget.image_height_max as usize);
+    for (i, c) in calibration.cameras.iter().enumerate() {
+        if c.camera.width > w || c.camera.height > h {
+            let what =
+                format!("camera {i} is {}x{} px, the board's budget is {w}x{h}", c.camera.width, c.camera.height);
+            return Err(Fault::new(Exit::Config, place, what, "raise budget.image_width_max and image_height_max"));
+        }
+    }
+    let f = footprint(calibration, board);
+    let max = board.memory_max_mib << 20;
+    if f.total() > max {
+        let largest = f.rows.iter().max_by_key(|r| r.bytes).map_or("", |r| r.name);
+        let what = format!("needs {:.1} MiB, memory_max_mib is {}", mib(f.total()), board.memory_max_mib);
+        let fix = format!("raise memory_max_mib or shrink [budget]; the largest part is `{largest}`");
+        return Err(Fault::new(Exit::Config, place, what, fix));
+    }
+    Ok(f)
+}
+
+pub fn print(f: &Footprint) {
+    for row in &f.rows {
+        println!("{:>12}  {:4} {}", row.bytes, if row.gpu { "gpu" } else { "host" }, row.name);
+    }
+    println!("{:>12}  gpu  total ({:.1} MiB)", f.gpu_total(), mib(f.gpu_total()));
+    println!("{:>12}       total ({:.1} MiB)", f.total(), mib(f.total()));
+}
+
+pub fn mib(bytes: u64) -> f64 {
+    bytes as f64 / f64::from(1 << 20)
+}

@@ -1,0 +1,157 @@
+//! The program's commands, and the threads of a run. Threads are started here and nowhere else:
+//!
+//! | thread | work | heap |
+//! |---|---|---|
+//! | main | boot, progress, report | free |
+//! | source | stands for the sensors: decodes files, delivers frames and inertial samples when they are due | free |
+//! | tracking | frontend, estimator; offers keyframes | sealed |
+//! | mapping | rectification, depth, training; low priority, as are the CPU device's own threads | sealed; OpenCV and the driver allocate behind it |
+//!
+//! Queues between them: frames (newest wins, the rest are counted as dropped), inertial samples
+//! (never dropped), keyframes (an offer may fail, counted), pose corrections. Tracking waits for
+//! nobody. Shutdown: source ends, tracking drains and ends, mapping ends with the run's time.
+
+mod input;
+mod mapping;
+mod memory;
+mod play;
+mod progress;
+mod summary;
+mod tracking;
+
+pub use play::Pace;
+
+use crate::config::Board;
+use crate::output::OutputDir;
+use input::Input;
+use mapping::Mapping;
+use play::{play, Play};
+use std::path::{Path, PathBuf};
+use stipple_drivers::replay::read_trajectory;
+use stipple_drivers::sim::{write_euroc, Scenario, Sim};
+use stipple_drivers::{Exit, Fault, Span};
+use tracking::{OdometryRun, Tracking};
+
+pub struct Replay {
+    pub pace: Pace,
+    pub poses: Option<PathBuf>,
+    pub holdout: u32,
+    pub duration_s: Option<f64>,
+}
+
+/// `stipple replay`
+pub fn replay(dataset: &Path, board: &Path, out: &Path, set: &[String], options: &Replay) -> Result<(), Fault> {
+    let board = Board::load(board, set)?;
+    let input = Input::recording(dataset, &board.replay)?;
+    let out = OutputDir::create(out)?;
+    run(input, &dataset.display().to_string(), &board, &out, options)
+}
+
+/// Held-out keyframes and length of the demo: ten seconds of flight, then mapping alone.
+const DEMO_HOLDOUT: u32 = 8;
+const DEMO_SECONDS: f64 = 40.0;
+const DEMO_BOARD: &str = include_str!("../../board-configs/lavapipe.toml");
+
+/// `stipple demo`
+pub fn demo(board: Option<&Path>, out: &Path, set: &[String]) -> Result<(), Fault> {
+    let board = match board {
+        Some(path) => Board::load(path, set)?,
+        None => Board::parse("board-configs/lavapipe.toml", DEMO_BOARD, set)?,
+    };
+    let out = OutputDir::create(out)?;
+    let scenario = Scenario::named("demo").expect("the demo's scenario is compiled in");
+    let input = Input::rendered(&scenario, rendering_progress)?;
+    let options = Replay { pace: Pace::Recorded, poses: None, holdout: DEMO_HOLDOUT, duration_s: Some(DEMO_SECONDS) };
+    run(input, "the simulated flight", &board, &out, &options)
+}
+
+fn rendering_progress(done: usize, of: usize) {
+    if done % 50 == 0 || done == of {
+        eprintln!("rendering the flight: {done} of {of} stereo pairs");
+    }
+}
+
+fn run(mut input: Input, place: &str, board: &Board, out: &OutputDir, options: &Replay) -> Result<(), Fault> {
+    memory::admit(place, &input.calibration, board)?;
+    let frames = input.frames_within(options.duration_s);
+    let tracking = match &options.poses {
+        Some(path) => Tracking::Table(read_trajectory(path)?),
+        None => Tracking::Odometry(Box::new(OdometryRun::new(&input.calibration, board, frames)?)),
+    };
+    let mapping = if board.map.enabled { Some(Mapping::open(&input.calibration, board)?) } else { None };
+    for warning in &input.warnings {
+        eprintln!("stipple: warning: {warning}");
+    }
+    let title = summary::Title {
+        dataset: input.name.clone(),
+        board: board.name.clone(),
+        pace: format!("{:?}", options.pace).to_lowercase(),
+        scale: board.map.scale,
+        truth: std::mem::take(&mut input.truth),
+        opened: std::mem::take(&mut input.counters),
+    };
+    let opened = input.warnings.len();
+    let options = Play {
+        pace: options.pace,
+        holdout: options.holdout,
+        duration_s: options.duration_s,
+        lockstep_iterations: board.map.lockstep_iterations,
+    };
+    let played = play(input, tracking, mapping, &options);
+    for warning in &played.warnings[opened..] {
+        eprintln!("stipple: warning: {warning}");
+    }
+    let report = summary::conclude(title, played, out)?;
+    println!("{}", summary::six_lines(&report, out));
+    Ok(())
+}
+
+pub struct Simulate {
+    pub scenario: String,
+    pub truth: Option<PathBuf>,
+    pub imu: Option<PathBuf>,
+    pub duration_s: Option<f64>,
+    pub seed: Option<u64>,
+}
+
+/// `stipple sim`
+pub fn simulate(options: &Simulate, out: &Path) -> Result<(), Fault> {
+    let mut scenario = match (&options.truth, options.scenario.as_str()) {
+        (Some(truth), "euroc") => Scenario::from_euroc(truth, options.imu.as_deref())?,
+        (None, name) => Scenario::named(name).ok_or_else(|| unknown_scenario(name))?,
+        (Some(_), name) => {
+            return Err(Fault::new(
+                Exit::Usage,
+                name,
+                "does not fly a given trajectory",
+                "use the scenario `euroc` with --truth",
+            ))
+        }
+    };
+    if let Some(s) = options.duration_s {
+        scenario.duration = scenario.duration.min(Span::from_secs(s));
+    }
+    if let Some(seed) = options.seed {
+        scenario.seed = seed;
+    }
+    let mut sim = Sim::new(&scenario)?;
+    write_euroc(&mut sim, out, rendering_progress)?;
+    println!("{}", out.display());
+    Ok(())
+}
+
+fn unknown_scenario(name: &str) -> Fault {
+    let known = Scenario::names().collect::<Vec<_>>().join(", ");
+    Fault::new(Exit::Usage, name, "is not a scenario", format!("choose one of {known}, or `euroc` with --truth"))
+}
+
+/// `stipple check`
+pub fn check(path: &Path, set: &[String]) -> Result<(), Fault> {
+    let board = Board::load(path, set)?;
+    let rig = memory::largest_rig(&board);
+    let footprint = memory::footprint(&rig, &board);
+    memory::print(&footprint);
+    memory::admit(&path.display().to_string(), &rig, &board)?;
+    println!("{:>12}       fits memory_max_mib = {}", "", board.memory_max_mib);
+    Ok(())
+}

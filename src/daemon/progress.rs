@@ -1,0 +1,76 @@
+//! What is seen while a run goes on: a bar on a terminal, one line a second otherwise.
+
+use indicatif::{ProgressBar, ProgressStyle};
+use std::io::IsTerminal;
+use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
+use std::time::{Duration, Instant};
+
+/// Written by the threads of a run, read by whoever shows it.
+#[derive(Default)]
+pub struct Gauges {
+    pub frames: AtomicU64,
+    pub keyframes: AtomicU64,
+    pub anchors: AtomicU64,
+    pub splats: AtomicU64,
+    pub iterations: AtomicU64,
+    /// Training PSNR of the last probe, 0.01 dB.
+    pub psnr_cdb: AtomicU64,
+    /// Time of the recording played so far, ms.
+    pub played_ms: AtomicU64,
+}
+
+pub struct Progress {
+    bar: Option<ProgressBar>,
+    total_ms: u64,
+    next_line: Instant,
+}
+
+const LINE_PERIOD: Duration = Duration::from_secs(1);
+
+impl Progress {
+    pub fn new(total_s: f64) -> Progress {
+        let total_ms = (total_s.max(0.0) * 1e3) as u64;
+        let bar = std::io::stderr().is_terminal().then(|| {
+            let bar = ProgressBar::new(total_ms);
+            let style = ProgressStyle::with_template("{bar:30} {percent:>3}% {elapsed} {msg}");
+            bar.set_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()));
+            bar
+        });
+        Progress { bar, total_ms, next_line: Instant::now() + LINE_PERIOD }
+    }
+
+    /// Cheap to call often: draws at most once a second without a terminal.
+    pub fn show(&mut self, g: &Gauges) {
+        let played = g.played_ms.load(Relaxed).min(self.total_ms);
+        match &self.bar {
+            Some(bar) => {
+                bar.set_position(played);
+                bar.set_message(line(g));
+            }
+            None if Instant::now() >= self.next_line => {
+                self.next_line += LINE_PERIOD;
+                eprintln!("{:.1} of {:.1} s: {}", played as f64 * 1e-3, self.total_ms as f64 * 1e-3, line(g));
+            }
+            None => {}
+        }
+    }
+
+    pub fn finish(&self) {
+        if let Some(bar) = &self.bar {
+            bar.finish_and_clear();
+        }
+    }
+}
+
+fn line(g: &Gauges) -> String {
+    let psnr = g.psnr_cdb.load(Relaxed);
+    let psnr = if psnr == 0 { String::new() } else { format!(", {:.2} dB", psnr as f64 * 0.01) };
+    format!(
+        "{} frames, {} keyframes, {} anchors, {} Gaussians, {} iterations{psnr}",
+        g.frames.load(Relaxed),
+        g.keyframes.load(Relaxed),
+        g.anchors.load(Relaxed),
+        g.splats.load(Relaxed),
+        g.iterations.load(Relaxed),
+    )
+}

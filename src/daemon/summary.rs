@@ -1,0 +1,224 @@
+//! What a finished run says: the report, the files of DIR, six lines.
+
+use super::memory::mib;
+use super::play::Played;
+use super::tracking::Tracking;
+use crate::map::{Evaluation, Mapper, Panel};
+use crate::mem;
+use crate::output::html::{write_html, Evidence};
+use crate::output::metrics::{percentile, trajectory_error, TrajectoryError};
+use crate::output::panel::{panel, Picture, View};
+use crate::output::report::{CurvePoint, KernelTime, Report};
+use crate::output::{atomically, ply, process, trajectory, OutputDir};
+use stipple_drivers::{Fault, Nanos, TimedPose};
+
+/// Keyframes drawn into DIR/renders.
+const PANELS: usize = 12;
+
+/// What was run, as the report names it.
+pub struct Title {
+    pub dataset: String,
+    pub board: String,
+    pub pace: String,
+    pub scale: u32,
+    pub truth: Vec<TimedPose>,
+    /// Counters of opening the recording.
+    pub opened: Vec<(&'static str, u64)>,
+}
+
+/// Measures a finished run, writes DIR, and answers the report.
+pub fn conclude(title: Title, mut played: Played, out: &OutputDir) -> Result<Report, Fault> {
+    let heap = mem::heap_after_seal();
+    let mut report = Report {
+        dataset: Some(title.dataset),
+        board: Some(title.board),
+        pace: Some(title.pace),
+        scale: Some(title.scale),
+        keyframes: Some(played.keyframes),
+        wall_s: Some(played.wall_s),
+        heap_after_seal: Some(heap),
+        warnings: played.warnings.len() as u64,
+        ..Report::default()
+    };
+    let estimated = track_figures(&mut report, &played);
+    let error = trajectory_error(&estimated, &title.truth).filter(|_| matches!(played.tracking, Tracking::Odometry(_)));
+    if let Some(e) = &error {
+        report.ate_rmse_m = Some(e.ate_rmse_m);
+        report.rte_1s_m = e.rte_1s_m;
+        report.rpe_deg = e.rpe_deg;
+    }
+    let mut panels = vec![];
+    if let Some(m) = &mut played.mapping {
+        report.anchors = Some(m.anchors);
+        report.iterations = Some(m.iterations);
+        report.iteration_ms_p50 = percentile(&m.iteration_ms.iter().map(|v| f64::from(*v)).collect::<Vec<_>>(), 0.5);
+        report.splats = Some(m.mapper.splat_count() as u64);
+        report.gpu_bytes = Some(m.mapper.gpu_bytes());
+        report.device = Some(m.mapper.device().to_string());
+        report.curve = m.curve.iter().map(curve_point).collect();
+        report.kernels = m.mapper.kernel_times().into_iter().map(kernel_time).collect();
+        report.kernels.sort_by(|a, b| b.total_ms.total_cmp(&a.total_ms));
+        if m.failure.is_none() {
+            match measure(&mut m.mapper) {
+                Ok((quality, drawn, splats)) => {
+                    map_figures(&mut report, &quality);
+                    panels = drawn;
+                    out.write("map.ply", |w| ply::write_ply(w, splats.into_iter()))?;
+                }
+                Err(e) => m.failure = Some(e),
+            }
+        }
+        if let Some(why) = &m.failure {
+            played.warnings.push(format!("the map is incomplete: {why}"));
+        }
+    }
+    report.rss_peak_bytes = process::rss_peak_bytes();
+    report.set_counters(&counted(&played, &title.opened));
+    write_files(&report, &played, &estimated, &title.truth, error.as_ref(), &panels, out)?;
+    Ok(report)
+}
+
+/// Every counter of a run, each under one name.
+fn counted(played: &Played, opened: &[(&'static str, u64)]) -> Vec<(&'static str, u64)> {
+    let mut all = played.counters.list();
+    let mapper = played.mapping.as_ref().map(|m| m.mapper.counters().list()).unwrap_or_default();
+    for (name, n) in opened.iter().chain(&played.source).chain(&played.tracking.counters()).chain(&mapper) {
+        match all.iter_mut().find(|(known, _)| *known == *name) {
+            Some((_, sum)) => *sum += n,
+            None => all.push((name, *n)),
+        }
+    }
+    all
+}
+
+/// Fills in the tracking figures; answers the trajectory.
+fn track_figures(report: &mut Report, played: &Played) -> Vec<TimedPose> {
+    let dropped = played.counters.frames_overwritten.get() + played.counters.frames_unreadable.get();
+    report.frames_dropped = Some(dropped);
+    report.frames = Some((played.frames as u64).saturating_sub(dropped));
+    let run = match &played.tracking {
+        Tracking::Table(poses) => return poses.clone(),
+        Tracking::Odometry(run) => run,
+    };
+    let ms: Vec<f64> = run.frame_ms.iter().map(|(_, ms)| *ms).collect();
+    let total_ms: f64 = ms.iter().sum();
+    report.tracking_fps = (total_ms > 0.0).then(|| ms.len() as f64 * 1e3 / total_ms);
+    report.tracking_ms_p50 = percentile(&ms, 0.5);
+    report.tracking_ms_p99 = percentile(&ms, 0.99);
+    report.vio_hash = played.tracking.hash().map(|h| format!("{h:016x}"));
+    run.trajectory.iter().map(|o| TimedPose { t: o.t, pose: o.world_from_body }).collect()
+}
+
+fn map_figures(report: &mut Report, q: &Evaluation) {
+    report.psnr_db = q.psnr_db;
+    report.ssim = q.ssim;
+    report.psnr_heldout_db = q.psnr_heldout_db;
+    report.ssim_heldout = q.ssim_heldout;
+    report.psnr_heldout_aligned_db = q.psnr_heldout_aligned_db;
+}
+
+type Measured = (Evaluation, Vec<Panel>, Vec<ply::SplatRecord>);
+
+fn measure(mapper: &mut Mapper) -> Result<Measured, String> {
+    let quality = mapper.evaluate().map_err(|e| e.to_string())?;
+    let panels = mapper.panels(PANELS).map_err(|e| e.to_string())?;
+    let splats = mapper.splats().map_err(|e| e.to_string())?;
+    let record = |s: &crate::map::SplatInit| ply::SplatRecord {
+        mean: s.mean,
+        log_scale: s.log_scale,
+        quat_xyzw: s.quat_xyzw,
+        opacity_logit: s.opacity_logit,
+        colour: [s.colour; 3],
+    };
+    Ok((quality, panels, splats.iter().map(record).collect()))
+}
+
+fn write_files(
+    report: &Report,
+    played: &Played,
+    estimated: &[TimedPose],
+    truth: &[TimedPose],
+    error: Option<&TrajectoryError>,
+    panels: &[Panel],
+    out: &OutputDir,
+) -> Result<(), Fault> {
+    out.write("trajectory.tum", |w| trajectory::write_tum(w, estimated))?;
+    let pictures: Vec<(String, Picture)> = panels.iter().map(|p| (p.name.clone(), panel(&view(p)))).collect();
+    if !pictures.is_empty() {
+        out.replace_folder("renders", |dir| {
+            pictures.iter().try_for_each(|(name, p)| atomically(&dir.join(format!("{name}.png")), |w| p.write_png(w)))
+        })?;
+    }
+    let tracking_ms: &[(Nanos, f64)] = match &played.tracking {
+        Tracking::Odometry(run) => &run.frame_ms,
+        Tracking::Table(_) => &[],
+    };
+    let shown: Vec<(String, Picture)> = pictures.iter().map(|(n, p)| (n.clone(), p.shrunk(1600))).collect();
+    let evidence = Evidence { estimated, truth, error, tracking_ms, pictures: &shown, warnings: &played.warnings };
+    out.write("report.html", |w| write_html(w, report, &evidence))?;
+    // Last: whoever finds report.json finds everything it speaks of.
+    out.write("report.json", |w| report.write_json(w))
+}
+
+fn view(p: &Panel) -> View<'_> {
+    View {
+        width: p.width,
+        height: p.height,
+        observed: &p.observed,
+        rendered: &p.rendered,
+        depth: &p.depth,
+        valid: &p.valid,
+        psnr_db: p.psnr_db,
+    }
+}
+
+fn curve_point(c: &crate::map::CurvePoint) -> CurvePoint {
+    CurvePoint {
+        t_s: c.t_s,
+        psnr_db: c.psnr_db,
+        psnr_heldout_db: c.psnr_heldout_db,
+        splats: u64::from(c.splats),
+        iterations: c.iterations,
+    }
+}
+
+fn kernel_time(k: crate::gpu::Timing) -> KernelTime {
+    KernelTime { name: k.name.to_string(), dispatches: k.count, total_ms: k.total_ms }
+}
+
+/// Six lines a person reads.
+pub fn six_lines(r: &Report, out: &OutputDir) -> String {
+    let or_dash = |v: Option<f64>, digits: usize, unit: &str| {
+        v.map_or_else(|| "-".to_string(), |v| format!("{v:.digits$} {unit}"))
+    };
+    let count = |v: Option<u64>| v.map_or_else(|| "-".to_string(), |v| v.to_string());
+    let bytes = |v: Option<u64>| or_dash(v.map(mib), 1, "MiB");
+    format!(
+        "trajectory  ATE {}, 1 s: {} {}\n\
+         tracking    {} frames ({} dropped), {} a frame, {} at the 99th percentile\n\
+         map         {} keyframes, {} anchors, {} Gaussians, {} iterations of {}\n\
+         quality     {} PSNR, {} SSIM; held out {} ({} with the pose refined)\n\
+         memory      GPU {}, resident {}, {} heap allocations after the seal\n\
+         report      {}",
+        or_dash(r.ate_rmse_m, 4, "m"),
+        or_dash(r.rte_1s_m, 4, "m"),
+        or_dash(r.rpe_deg, 2, "deg"),
+        count(r.frames),
+        count(r.frames_dropped),
+        or_dash(r.tracking_ms_p50, 1, "ms"),
+        or_dash(r.tracking_ms_p99, 1, "ms"),
+        count(r.keyframes),
+        count(r.anchors),
+        count(r.splats),
+        count(r.iterations),
+        or_dash(r.iteration_ms_p50, 1, "ms"),
+        or_dash(r.psnr_db, 2, "dB"),
+        r.ssim.map_or_else(|| "-".to_string(), |v| format!("{v:.3}")),
+        or_dash(r.psnr_heldout_db, 2, "dB"),
+        or_dash(r.psnr_heldout_aligned_db, 2, "dB"),
+        bytes(r.gpu_bytes),
+        bytes(r.rss_peak_bytes),
+        count(r.heap_after_seal),
+        out.file("report.html").display(),
+    )
+}

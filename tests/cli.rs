@@ -1,0 +1,165 @@
+//! The program as a stranger meets it: bad input is named, explained, and leaves nothing behind.
+#![allow(clippy::unwrap_used)]
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+const USAGE: i32 = 64;
+const DATA: i32 = 65;
+const NOINPUT: i32 = 66;
+const UNAVAILABLE: i32 = 69;
+const CANTCREATE: i32 = 73;
+const CONFIG: i32 = 78;
+const BOARD: &str = "board-configs/lavapipe.toml";
+
+fn root() -> &'static Path {
+    Path::new(env!("CARGO_MANIFEST_DIR"))
+}
+
+fn stipple(args: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_stipple")).args(args).current_dir(root()).output().unwrap()
+}
+
+fn text(o: &Output) -> String {
+    String::from_utf8_lossy(&o.stderr).into_owned() + &String::from_utf8_lossy(&o.stdout)
+}
+
+/// A short flight on disk, one for each test that damages it.
+fn flight(dir: &Path, seconds: &str) -> PathBuf {
+    let out = dir.join("flight");
+    let o = stipple(&["sim", "demo", "--out", out.to_str().unwrap(), "--duration", seconds]);
+    assert!(o.status.success(), "{}", text(&o));
+    out
+}
+
+fn replay(dataset: &Path, out: &Path, more: &[&str]) -> Output {
+    let mut args = vec!["replay", dataset.to_str().unwrap(), "--board", BOARD, "--out", out.to_str().unwrap()];
+    args.extend(["--pace", "lockstep"]);
+    args.extend(more);
+    stipple(&args)
+}
+
+/// The run fails with `code`, its message says all of `words`, and DIR holds no result.
+fn refused(o: &Output, code: i32, words: &[&str], out: &Path) {
+    let said = text(o);
+    assert_eq!(o.status.code(), Some(code), "{said}");
+    for word in words {
+        assert!(said.contains(word), "`{word}` is missing in: {said}");
+    }
+    assert!(!said.contains("panicked"), "{said}");
+    let left: Vec<_> = fs::read_dir(out).map(|d| d.map(|e| e.unwrap().path()).collect()).unwrap_or_default();
+    assert!(left.is_empty(), "left behind: {left:?}");
+}
+
+#[test]
+fn missing_folder_is_named() {
+    let dir = tempfile::tempdir().unwrap();
+    let out = dir.path().join("out");
+    refused(&replay(&dir.path().join("nowhere"), &out, &[]), NOINPUT, &["nowhere"], &out);
+}
+
+#[test]
+fn empty_csv_is_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    let data = flight(dir.path(), "0.3");
+    fs::write(data.join("mav0/cam0/data.csv"), "").unwrap();
+    let out = dir.path().join("out");
+    refused(&replay(&data, &out, &[]), DATA, &["cam0/data.csv"], &out);
+}
+
+#[test]
+fn csv_of_letters_is_refused_with_its_line() {
+    let dir = tempfile::tempdir().unwrap();
+    let data = flight(dir.path(), "0.3");
+    fs::write(data.join("mav0/imu0/data.csv"), "#timestamp [ns],w,w,w,a,a,a\nabc,def,ghi,j,k,l,m\n").unwrap();
+    let out = dir.path().join("out");
+    refused(&replay(&data, &out, &[]), DATA, &["imu0/data.csv:2"], &out);
+}
+
+#[test]
+fn calibration_without_a_key_names_it() {
+    let dir = tempfile::tempdir().unwrap();
+    let data = flight(dir.path(), "0.3");
+    let file = data.join("mav0/cam1/sensor.yaml");
+    let whole = fs::read_to_string(&file).unwrap();
+    let kept: Vec<&str> = whole.lines().filter(|l| !l.starts_with("intrinsics")).collect();
+    fs::write(&file, kept.join("\n")).unwrap();
+    let out = dir.path().join("out");
+    refused(&replay(&data, &out, &[]), CONFIG, &["cam1/sensor.yaml", "intrinsics"], &out);
+}
+
+#[test]
+fn unknown_key_of_a_board_is_named_with_its_line() {
+    let dir = tempfile::tempdir().unwrap();
+    let board = dir.path().join("board.toml");
+    fs::write(&board, format!("spats = 3\n{}", fs::read_to_string(root().join(BOARD)).unwrap())).unwrap();
+    let o = stipple(&["check", board.to_str().unwrap()]);
+    refused(&o, CONFIG, &["board.toml:1", "spats"], &dir.path().join("none"));
+}
+
+#[test]
+fn budget_that_does_not_fit_is_refused() {
+    let o = stipple(&["check", BOARD, "--set", "memory_max_mib=20"]);
+    assert_eq!(o.status.code(), Some(CONFIG), "{}", text(&o));
+    assert!(text(&o).contains("memory_max_mib") && text(&o).contains("MiB"), "{}", text(&o));
+}
+
+#[test]
+fn every_board_fits_its_own_limit() {
+    for entry in fs::read_dir(root().join("board-configs")).unwrap() {
+        let path = entry.unwrap().path();
+        if path.extension().is_some_and(|e| e == "toml") {
+            let o = stipple(&["check", path.to_str().unwrap()]);
+            assert!(o.status.success(), "{}: {}", path.display(), text(&o));
+        }
+    }
+}
+
+#[test]
+fn no_vulkan_device_is_said_with_the_package_to_install() {
+    let dir = tempfile::tempdir().unwrap();
+    let data = flight(dir.path(), "0.3");
+    let out = dir.path().join("out");
+    let o = Command::new(env!("CARGO_BIN_EXE_stipple"))
+        .args(["replay", data.to_str().unwrap(), "--board", BOARD, "--out", out.to_str().unwrap()])
+        .current_dir(root())
+        .env("VK_DRIVER_FILES", "/nonexistent.json")
+        .env("VK_ICD_FILENAMES", "/nonexistent.json")
+        .output()
+        .unwrap();
+    refused(&o, UNAVAILABLE, &["ulkan", "mesa-vulkan-drivers"], &out);
+}
+
+#[test]
+fn folder_that_cannot_be_made_is_refused_before_any_work() {
+    let dir = tempfile::tempdir().unwrap();
+    let data = flight(dir.path(), "0.3");
+    fs::write(dir.path().join("file"), "").unwrap();
+    let out = dir.path().join("file/out");
+    refused(&replay(&data, &out, &[]), CANTCREATE, &["file/out"], &out);
+}
+
+#[test]
+fn truncated_image_is_counted_and_the_run_goes_on() {
+    let dir = tempfile::tempdir().unwrap();
+    let data = flight(dir.path(), "1.0");
+    let images = fs::read_dir(data.join("mav0/cam0/data")).unwrap();
+    let mut names: Vec<_> = images.map(|e| e.unwrap().path()).collect();
+    names.sort();
+    let bytes = fs::read(&names[5]).unwrap();
+    fs::write(&names[5], &bytes[..bytes.len() / 2]).unwrap();
+    let out = dir.path().join("out");
+    let o = replay(&data, &out, &["--set", "map.enabled=false"]);
+    assert!(o.status.success(), "{}", text(&o));
+    let name = names[5].file_name().unwrap().to_str().unwrap();
+    assert!(text(&o).contains(name), "the warning names the file: {}", text(&o));
+    let report: serde_json::Value = serde_json::from_slice(&fs::read(out.join("report.json")).unwrap()).unwrap();
+    assert_eq!(report["count_frames_unreadable"], 1);
+}
+
+#[test]
+fn wrong_usage_is_exit_64() {
+    assert_eq!(stipple(&["replay"]).status.code(), Some(USAGE));
+    assert_eq!(stipple(&["sim", "nonesuch", "--out", "/nonexistent/x"]).status.code(), Some(USAGE));
+}
