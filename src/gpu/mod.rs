@@ -261,6 +261,14 @@ impl Gpu {
         &self.submitter.timings
     }
 
+    /// Whether each command is timed, as it is after boot, or only whole submissions: a timestamp drains the
+    /// device, which costs lavapipe 50 µs a command.
+    pub fn time_commands(&mut self, each: bool) -> Result<(), GpuError> {
+        self.wait()?;
+        self.submitter.each = each;
+        Ok(())
+    }
+
     pub fn arena_bytes(&self) -> u64 {
         self.arena.bytes()
     }

@@ -42,6 +42,8 @@ pub(super) struct Submitter {
     rows: Vec<usize>,
     started: Instant,
     pub last_ms: f64,
+    /// Time every command, or only the whole.
+    pub each: bool,
 }
 
 impl Submitter {
@@ -57,6 +59,7 @@ impl Submitter {
             rows: Vec::new(),
             started: Instant::now(),
             last_ms: 0.0,
+            each: true,
         };
         s.row("fill");
         s.row("copy");
@@ -115,17 +118,29 @@ impl Submitter {
         if timed {
             // SAFETY: recording; no submission that uses the queries is in flight.
             unsafe {
-                self.device.raw.cmd_reset_query_pool(self.commands, self.queries, 0, rec.commands.len() as u32 + 1);
+                self.device.raw.cmd_reset_query_pool(self.commands, self.queries, 0, self.stamped(rec) as u32 + 1);
             }
             stamp(0);
         }
         for (i, command) in rec.commands.iter().enumerate() {
             self.encode(command, pipelines, arena)?;
-            if timed {
+            if timed && self.each {
                 stamp(i + 1);
             }
         }
+        if timed && !self.each {
+            stamp(1);
+        }
         Ok(())
+    }
+
+    /// Timestamps of a recording beside the first.
+    fn stamped(&self, rec: &Recorder) -> usize {
+        if self.each {
+            rec.commands.len()
+        } else {
+            1
+        }
     }
 
     fn encode(&self, command: &Command, pipelines: &mut Pipelines, arena: &Arena) -> Result<(), GpuError> {
@@ -179,7 +194,8 @@ impl Submitter {
     /// Waits for what `start` started, and adds its times to the table.
     pub fn finish(&mut self, rec: &Recorder) -> Result<(), GpuError> {
         self.wait()?;
-        let stamps = &mut self.stamps[..rec.commands.len() + 1];
+        let last = self.stamped(rec);
+        let stamps = &mut self.stamps[..last + 1];
         if self.queries == vk::QueryPool::null() {
             self.last_ms = self.started.elapsed().as_secs_f64() * 1e3;
             return Ok(());
@@ -191,6 +207,10 @@ impl Submitter {
         let caps = &self.device.caps;
         let mask = u64::MAX >> (64 - caps.timestamp_bits.min(64));
         let ms = |a: u64, b: u64| (b.wrapping_sub(a) & mask) as f64 * caps.timestamp_period_ns * 1e-6;
+        self.last_ms = ms(stamps[0], stamps[last]);
+        if !self.each {
+            return Ok(());
+        }
         for (command, pair) in rec.commands.iter().zip(stamps.windows(2)) {
             let row = match command.work {
                 Work::Dispatch { kernel, .. } | Work::Indirect { kernel, .. } => self.rows[kernel as usize],
@@ -202,7 +222,6 @@ impl Submitter {
             t.total_ms += t.last_ms;
             t.count += 1;
         }
-        self.last_ms = ms(stamps[0], stamps[rec.commands.len()]);
         Ok(())
     }
 

@@ -1,9 +1,13 @@
 //! The Vulkan core: transfers, barriers, dispatches, capacities, and a validation layer with nothing to say.
+//!
+//! NVIDIA's driver can deadlock when threads that used it end while others of the process use it (seen with
+//! an H200: a dozen devices opened by a dozen short-lived threads). Run it there with `--test-threads 1`.
 #![allow(clippy::unwrap_used)]
 
 #[path = "../../shaders-glsl/emit.rs"]
 mod emit;
 mod interface;
+mod overhead;
 #[path = "../../shaders-glsl/reflect.rs"]
 mod reflect;
 
@@ -381,35 +385,6 @@ fn more_bindings_than_remembered_still_run() {
         gpu.submit(rec).unwrap();
     }
     assert!(read(&mut gpu, y).iter().all(|&v| v == 1.0));
-}
-
-#[test]
-fn timings_name_every_command_and_add_up() {
-    let mut gpu = open(1 << 22);
-    let x = floats(&mut gpu, "x", &[1.0; 100_000]);
-    let y = gpu.alloc::<f32>("y", 100_000).unwrap();
-    let z = gpu.alloc::<f32>("z", 100_000).unwrap();
-    let k = gpu.kernel::<axpy::K>(axpy::Spec::default()).unwrap();
-    gpu.kernel::<axpy::K>(axpy::Spec::default()).unwrap();
-    let before: f64 = gpu.timings().iter().map(|t| t.total_ms).sum();
-    let fills = gpu.timings()[0].count;
-    let start = std::time::Instant::now();
-    let mut rec = gpu.record();
-    rec.fill(y, 0);
-    (0..3).for_each(|_| axpy(&mut rec, &k, x, y, 1.0));
-    rec.copy(y, z, 100_000);
-    gpu.submit(rec).unwrap();
-    let wall_ms = start.elapsed().as_secs_f64() * 1e3;
-    let t = gpu.timings();
-    assert_eq!(t.iter().map(|t| t.name).collect::<Vec<_>>(), ["fill", "copy", "axpy"]);
-    assert_eq!((t[0].count - fills, t[1].count), (1, 1));
-    if gpu.caps().timestamp_period_ns > 0.0 {
-        assert_eq!(t[2].count, 3);
-        assert!(t[2].total_ms > 0.0 && t[2].total_ms >= t[2].last_ms);
-        let sum = t.iter().map(|t| t.total_ms).sum::<f64>() - before;
-        assert!((sum - gpu.last_submit_ms()).abs() < 1e-6 * sum, "{sum} against {}", gpu.last_submit_ms());
-    }
-    assert!(gpu.last_submit_ms() > 0.0 && gpu.last_submit_ms() <= wall_ms);
 }
 
 #[test]
