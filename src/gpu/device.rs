@@ -196,6 +196,8 @@ impl Drop for Device {
         // SAFETY: whoever made objects of this device held an Arc of it, so they are gone, and they waited
         // for their work. The instance goes after the device, the loader (a field) after both.
         unsafe { self.raw.destroy_device(None) };
+        // Whoever asked for validation gets to see what it said, leaks at destruction included.
+        self.messages().iter().for_each(|m| eprintln!("vulkan validation: {m}"));
         destroy_instance(&self.instance, &self.messenger);
     }
 }

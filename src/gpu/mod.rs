@@ -133,7 +133,7 @@ const _: () = {
 
 impl Gpu {
     /// Opens the device `config` names with an arena of `arena_bytes`, all zero. `STIPPLE_VALIDATION=1` in
-    /// the environment turns validation on.
+    /// the environment turns validation on; what it said is printed when the device is closed.
     pub fn open(config: &GpuConfig, arena_bytes: u64) -> Result<Gpu, Fault> {
         let validation = std::env::var_os("STIPPLE_VALIDATION").is_some_and(|v| v == "1");
         Gpu::open_with(config, arena_bytes, GpuOptions { validation })
