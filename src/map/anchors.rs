@@ -39,13 +39,19 @@ const FOREGROUND: f32 = 1.25;
 /// Below this rendered alpha a pixel takes seeds even in an occupied cell.
 const SEED_ALPHA: f32 = 0.5;
 
+/// A pixel rendered this far from what was seen takes seeds even in an occupied cell.
+const SEED_ERROR: f32 = 0.1;
+/// Part of the free pool that a whole uncovered view may take: there is always room for the next.
+const ROOM_SHARE: usize = 8;
+
 /// What an anchor sees.
 pub struct View<'a> {
     pub image: &'a Image,
     pub valid: &'a [u8],
     pub depth: &'a DepthMap,
-    /// Rendered alpha before the anchor was added.
+    /// Rendered before the anchor was added.
     pub alpha: &'a [f32],
+    pub grey: &'a [f32],
     pub camera: Pinhole,
     pub world_from_cam: Pose,
     pub anchor: u32,
@@ -102,7 +108,7 @@ impl Seeder {
     /// Seeds for at most `room` Gaussians. Pixels an earlier anchor's Gaussians already show are left alone.
     pub fn seed(&mut self, view: &View, room: usize, counters: &Counters) -> &[Seed] {
         self.fill(&view.depth.metres, view.depth.width);
-        self.set_density(view);
+        self.set_density(view, self.seeds_max.min(room.div_ceil(ROOM_SHARE)));
         self.seeds.clear();
         let (w, h) = (view.image.width, view.image.height);
         let room = room.min(self.seeds_max);
@@ -140,8 +146,9 @@ impl Seeder {
         let z = f64::from(if matched { view.depth.metres[i] } else { self.filled[i] });
         let p_cam = DVec3::new((x as f64 - c.cx) / c.fx, (y as f64 - c.cy) / c.fy, 1.0) * z;
         let p_world = view.world_from_cam.transform(p_cam);
+        let error = (view.grey[i] - f32::from(view.image.pixels[i]) / 255.0).abs();
         match self.occupancy.claim(p_world, view.anchor) {
-            Cell::Held if view.alpha[i] >= SEED_ALPHA => return counters.seeds_occupied.add(1),
+            Cell::Held if view.alpha[i] >= SEED_ALPHA && error < SEED_ERROR => return counters.seeds_occupied.add(1),
             Cell::Full => counters.occupancy_full.add(1),
             _ => {}
         }
@@ -154,8 +161,8 @@ impl Seeder {
         });
     }
 
-    /// Seeds a pixel, so that a whole uncovered view gets `seeds_max` of them.
-    fn set_density(&mut self, view: &View) {
+    /// Seeds a pixel, so that a whole uncovered view gets `seeds` of them.
+    fn set_density(&mut self, view: &View, seeds: usize) {
         let (w, h) = (view.image.width, view.image.height);
         let px = |x: usize, y: usize| f64::from(view.image.pixels[y * w + x]);
         let mut sum = 0.0;
@@ -176,7 +183,7 @@ impl Seeder {
                 self.density[i] = weight as f32;
             }
         }
-        let scale = (self.seeds_max as f64 / f64::max(sum, 1.0)) as f32;
+        let scale = (seeds as f64 / f64::max(sum, 1.0)) as f32;
         for i in 0..w * h {
             self.density[i] = (self.density[i] * scale).min(1.0);
         }
@@ -248,6 +255,7 @@ mod tests {
             valid: &[1; W * H],
             depth,
             alpha: &[alpha; W * H],
+            grey: &[0.0; W * H],
             camera: camera(),
             world_from_cam: Pose::IDENTITY,
             anchor,
@@ -311,12 +319,17 @@ mod tests {
             valid: &[1; W * H],
             depth: &depth,
             alpha: &[0.0; W * H],
+            grey: &[0.0; W * H],
             camera: camera(),
             world_from_cam: Pose::IDENTITY,
             anchor: 1,
         };
-        assert_eq!(s.seed(&view, 40, &counters).len(), 40);
-        assert!(counters.splats_full.get() > 200);
+        assert!(s.seed(&view, 40, &counters).len() <= 40 / ROOM_SHARE);
+        let mut room = 1000;
+        for _ in 0..100 {
+            room -= s.seed(&view, room, &counters).len();
+        }
+        assert!((1..200).contains(&room), "{room}");
     }
 
     #[test]

@@ -212,6 +212,7 @@ impl Mapper {
             valid: self.stereo.valid_mask(),
             depth: &self.depth,
             alpha: &self.rendered.alpha,
+            grey: &self.rendered.grey,
             camera: view.camera,
             world_from_cam: view.world_from_cam,
             anchor: index as u32,
