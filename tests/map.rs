@@ -107,6 +107,16 @@ fn v1_01_quality() {
     println!("{:?}", mapper.evaluate().unwrap());
     if let Some(dir) = std::env::var_os("OUT").map(PathBuf::from) {
         std::fs::create_dir_all(&dir).unwrap();
-        mapper.panels(env("PANELS", 8)).unwrap().iter().for_each(|p| write_png(&dir, p));
+        for p in mapper.panels(env("PANELS", 8)).unwrap() {
+            write_png(&dir, &p);
+            let (mut n, mut sx, mut sy, mut sxx, mut sxy, mut syy) = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0);
+            for i in (0..p.valid.len()).filter(|&i| p.valid[i] != 0) {
+                let (x, y) = (f64::from(p.rendered[i]), f64::from(p.observed[i]) / 255.0);
+                (n, sx, sy, sxx, sxy, syy) = (n + 1.0, sx + x, sy + y, sxx + x * x, sxy + x * y, syy + y * y);
+            }
+            let gain = (n * sxy - sx * sy) / (n * sxx - sx * sx);
+            let rest = (syy - sy * sy / n) / n - gain * gain * (sxx - sx * sx / n) / n;
+            println!("{:14} {:6.2} dB, {:6.2} dB with gain {gain:.3}, mean {:.3} for {:.3}", p.name, p.psnr_db.unwrap(), -10.0 * rest.log10(), sx / n, sy / n);
+        }
     }
 }
