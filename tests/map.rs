@@ -116,7 +116,14 @@ fn v1_01_quality() {
             }
             let gain = (n * sxy - sx * sy) / (n * sxx - sx * sx);
             let rest = (syy - sy * sy / n) / n - gain * gain * (sxx - sx * sx / n) / n;
-            println!("{:14} {:6.2} dB, {:6.2} dB with gain {gain:.3}, mean {:.3} for {:.3}", p.name, p.psnr_db.unwrap(), -10.0 * rest.log10(), sx / n, sy / n);
+            println!(
+                "{:14} {:6.2} dB, {:6.2} dB with gain {gain:.3}, mean {:.3} for {:.3}",
+                p.name,
+                p.psnr_db.unwrap(),
+                -10.0 * rest.log10(),
+                sx / n,
+                sy / n
+            );
         }
     }
 }

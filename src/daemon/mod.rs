@@ -49,14 +49,17 @@ pub fn replay(dataset: &Path, board: &Path, out: &Path, set: &[String], options:
 
 /// Held-out keyframes and length of the demo: ten seconds of flight, then mapping alone.
 const DEMO_HOLDOUT: u32 = 8;
-const DEMO_SECONDS: f64 = 40.0;
+const DEMO_SECONDS: f64 = 60.0;
+/// The demo's cameras are small already.
+const DEMO_SCALE: &str = "map.scale=1";
 const DEMO_BOARD: &str = include_str!("../../board-configs/lavapipe.toml");
 
 /// `stipple demo`
 pub fn demo(board: Option<&Path>, out: &Path, set: &[String]) -> Result<(), Fault> {
+    let set = [&[DEMO_SCALE.to_string()], set].concat();
     let board = match board {
-        Some(path) => Board::load(path, set)?,
-        None => Board::parse("board-configs/lavapipe.toml", DEMO_BOARD, set)?,
+        Some(path) => Board::load(path, &set)?,
+        None => Board::parse("board-configs/lavapipe.toml", DEMO_BOARD, &set)?,
     };
     let out = OutputDir::create(out)?;
     let scenario = Scenario::named("demo").expect("the demo's scenario is compiled in");

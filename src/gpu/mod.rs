@@ -142,7 +142,7 @@ impl Gpu {
     pub fn open_with(config: &GpuConfig, arena_bytes: u64, options: GpuOptions) -> Result<Gpu, Fault> {
         let device = Arc::new(Device::open(config, options.validation)?);
         let mut gpu = Gpu {
-            submitter: Submitter::new(&device)?,
+            submitter: Submitter::new(&device, config.submission_max_ms)?,
             pipelines: Pipelines::new(&device)?,
             staging: Staging::new(&device)?,
             arena: Arena::new(&device, arena_bytes)?,
@@ -213,7 +213,7 @@ impl Gpu {
             return Err(GpuError::Lost);
         }
         let Some(rec) = self.in_flight.take() else { return Ok(()) };
-        let done = self.submitter.finish(&rec);
+        let done = self.submitter.finish(&rec, &mut self.pipelines, &self.arena);
         self.put_back(rec);
         self.note(done)
     }
@@ -267,6 +267,11 @@ impl Gpu {
         self.wait()?;
         self.submitter.each = each;
         Ok(())
+    }
+
+    /// Submissions so far; a recording that takes longer than `submission_max_ms` is several.
+    pub fn submissions(&self) -> u64 {
+        self.submitter.submissions
     }
 
     pub fn arena_bytes(&self) -> u64 {

@@ -41,13 +41,22 @@ pub(super) struct Submitter {
     /// Row of each kernel, by index.
     rows: Vec<usize>,
     started: Instant,
+    /// Of the last whole recording.
     pub last_ms: f64,
+    /// Of a command of it, on average.
+    mean_ms: f64,
+    /// Of the parts of the recording in flight that have ended.
+    total_ms: f64,
+    /// Commands in flight, or last in flight.
+    part: std::ops::Range<usize>,
+    submission_max_ms: f64,
+    pub submissions: u64,
     /// Time every command, or only the whole.
     pub each: bool,
 }
 
 impl Submitter {
-    pub fn new(device: &Arc<Device>) -> Result<Submitter, Fault> {
+    pub fn new(device: &Arc<Device>, submission_max_ms: f64) -> Result<Submitter, Fault> {
         let mut s = Submitter {
             device: device.clone(),
             pool: vk::CommandPool::null(),
@@ -59,6 +68,11 @@ impl Submitter {
             rows: Vec::new(),
             started: Instant::now(),
             last_ms: 0.0,
+            mean_ms: 0.0,
+            total_ms: 0.0,
+            part: 0..0,
+            submission_max_ms,
+            submissions: 0,
             each: true,
         };
         s.row("fill");
@@ -93,20 +107,48 @@ impl Submitter {
         self.timings.len() - 1
     }
 
-    /// Encodes a recording and starts it.
+    /// Encodes a recording and starts its first part; `finish` goes on with the others.
     pub fn start(&mut self, rec: &Recorder, pipelines: &mut Pipelines, arena: &Arena) -> Result<(), GpuError> {
         pipelines.reserve_sets(rec.commands.len())?;
+        self.total_ms = 0.0;
+        self.part = 0..0;
+        self.start_part(rec, pipelines, arena)
+    }
+
+    /// Starts what follows the last part.
+    fn start_part(&mut self, rec: &Recorder, pipelines: &mut Pipelines, arena: &Arena) -> Result<(), GpuError> {
+        self.part = self.part.end..self.cut(rec, self.part.end);
         self.begin()?;
-        if let Err(e) = self.encode_all(rec, pipelines, arena) {
+        if let Err(e) = self.encode_part(rec, pipelines, arena) {
             // SAFETY: recording, not in flight: back to where the next `begin` expects it.
             unsafe { self.device.raw.reset_command_buffer(self.commands, vk::CommandBufferResetFlags::empty()) }
                 .map_err(GpuError::of("vkResetCommandBuffer"))?;
             return Err(e);
         }
+        self.submissions += 1;
         self.end()
     }
 
-    fn encode_all(&self, rec: &Recorder, pipelines: &mut Pipelines, arena: &Arena) -> Result<(), GpuError> {
+    /// Where the part that begins at `from` ends: integrated GPUs reset on long submissions, so a part is
+    /// what took `submission_max_ms` when its commands last ran, and at least one command.
+    fn cut(&self, rec: &Recorder, from: usize) -> usize {
+        let mut ms = 0.0;
+        let fitting = rec.commands[from..].iter().take_while(|command| {
+            ms += if self.each { self.timings[self.row_of(command)].last_ms } else { self.mean_ms };
+            ms <= self.submission_max_ms
+        });
+        from + fitting.count().max(1)
+    }
+
+    fn row_of(&self, command: &Command) -> usize {
+        match command.work {
+            Work::Dispatch { kernel, .. } | Work::Indirect { kernel, .. } => self.rows[kernel as usize],
+            Work::Fill { .. } => FILL,
+            Work::Copy { .. } => COPY,
+        }
+    }
+
+    fn encode_part(&self, rec: &Recorder, pipelines: &mut Pipelines, arena: &Arena) -> Result<(), GpuError> {
         let timed = self.queries != vk::QueryPool::null();
         let stamp = |i: usize| {
             // SAFETY: recording; the pool has a query for each command and one more, reset just below.
@@ -118,11 +160,11 @@ impl Submitter {
         if timed {
             // SAFETY: recording; no submission that uses the queries is in flight.
             unsafe {
-                self.device.raw.cmd_reset_query_pool(self.commands, self.queries, 0, self.stamped(rec) as u32 + 1);
+                self.device.raw.cmd_reset_query_pool(self.commands, self.queries, 0, self.stamped() as u32 + 1);
             }
             stamp(0);
         }
-        for (i, command) in rec.commands.iter().enumerate() {
+        for (i, command) in rec.commands[self.part.clone()].iter().enumerate() {
             self.encode(command, pipelines, arena)?;
             if timed && self.each {
                 stamp(i + 1);
@@ -134,10 +176,10 @@ impl Submitter {
         Ok(())
     }
 
-    /// Timestamps of a recording beside the first.
-    fn stamped(&self, rec: &Recorder) -> usize {
+    /// Timestamps of the part beside its first.
+    fn stamped(&self) -> usize {
         if self.each {
-            rec.commands.len()
+            self.part.len()
         } else {
             1
         }
@@ -191,34 +233,43 @@ impl Submitter {
         Ok(())
     }
 
-    /// Waits for what `start` started, and adds its times to the table.
-    pub fn finish(&mut self, rec: &Recorder) -> Result<(), GpuError> {
-        self.wait()?;
-        let last = self.stamped(rec);
-        let stamps = &mut self.stamps[..last + 1];
+    /// Waits for what `start` started, part after part, and adds its times to the table.
+    pub fn finish(&mut self, rec: &Recorder, pipelines: &mut Pipelines, arena: &Arena) -> Result<(), GpuError> {
+        loop {
+            self.wait()?;
+            self.read_stamps(rec)?;
+            if self.part.end == rec.commands.len() {
+                break;
+            }
+            self.start_part(rec, pipelines, arena)?;
+        }
+        self.last_ms = self.total_ms;
+        self.mean_ms = self.total_ms / rec.commands.len().max(1) as f64;
+        Ok(())
+    }
+
+    fn read_stamps(&mut self, rec: &Recorder) -> Result<(), GpuError> {
         if self.queries == vk::QueryPool::null() {
-            self.last_ms = self.started.elapsed().as_secs_f64() * 1e3;
+            self.total_ms += self.started.elapsed().as_secs_f64() * 1e3;
             return Ok(());
         }
+        let last = self.stamped();
+        let stamps = &mut self.stamps[..last + 1];
         let flags = vk::QueryResultFlags::TYPE_64 | vk::QueryResultFlags::WAIT;
         // SAFETY: these queries were reset and written by the submission that has just ended.
         unsafe { self.device.raw.get_query_pool_results(self.queries, 0, stamps, flags) }
             .map_err(GpuError::of("vkGetQueryPoolResults"))?;
         let caps = &self.device.caps;
-        let mask = u64::MAX >> (64 - caps.timestamp_bits.min(64));
-        let ms = |a: u64, b: u64| (b.wrapping_sub(a) & mask) as f64 * caps.timestamp_period_ns * 1e-6;
-        self.last_ms = ms(stamps[0], stamps[last]);
+        let (mask, period_ms) = (u64::MAX >> (64 - caps.timestamp_bits.min(64)), caps.timestamp_period_ns * 1e-6);
+        let ms = |a: u64, b: u64| (b.wrapping_sub(a) & mask) as f64 * period_ms;
+        self.total_ms += ms(self.stamps[0], self.stamps[last]);
         if !self.each {
             return Ok(());
         }
-        for (command, pair) in rec.commands.iter().zip(stamps.windows(2)) {
-            let row = match command.work {
-                Work::Dispatch { kernel, .. } | Work::Indirect { kernel, .. } => self.rows[kernel as usize],
-                Work::Fill { .. } => FILL,
-                Work::Copy { .. } => COPY,
-            };
+        for (i, command) in rec.commands[self.part.clone()].iter().enumerate() {
+            let row = self.row_of(command);
             let t = &mut self.timings[row];
-            t.last_ms = ms(pair[0], pair[1]);
+            t.last_ms = ms(self.stamps[i], self.stamps[i + 1]);
             t.total_ms += t.last_ms;
             t.count += 1;
         }

@@ -465,3 +465,29 @@ fn every_kernel_fits_the_baseline() {
         assert!(k.capabilities.iter().all(|c| ALLOWED.contains(c)), "{}: capabilities {:?}", k.name, k.capabilities);
     }
 }
+
+#[test]
+fn long_recording_is_several_submissions_with_the_same_result() {
+    let chain = |submission_max_ms: f64| {
+        let config = GpuConfig { submission_max_ms, ..GpuConfig::default() };
+        let mut gpu = Silent(Gpu::open_with(&config, 1 << 16, GpuOptions { validation: true }).unwrap());
+        let (x, y) = (floats(&mut gpu, "x", &[1.0; 1000]), floats(&mut gpu, "y", &[0.0; 1000]));
+        let k = gpu.kernel::<axpy::K>(axpy::Spec::default()).unwrap();
+        let before = gpu.submissions();
+        for _ in 0..2 {
+            let mut rec = gpu.record();
+            for a in 1..=20 {
+                let bind = axpy::Bind { x: x.read(), y: y.read_write() };
+                rec.dispatch(&k, bind, axpy::Push { n: 1000, a: a as f32 }, Threads::d1(1000));
+            }
+            gpu.submit(rec).unwrap();
+        }
+        (gpu.submissions() - before, read(&mut gpu, y))
+    };
+    let (whole, parts) = (chain(1e6), chain(1e-9));
+    assert_eq!(whole.0, 2);
+    // The first recording is timed, from then on every command is a part of its own.
+    assert!(parts.0 >= 21, "{}", parts.0);
+    assert_eq!(whole.1, vec![420.0; 1000]);
+    assert_eq!(whole.1, parts.1);
+}
