@@ -1,34 +1,153 @@
-//! The mapper as a whole: a recording with its true poses in, a map with a measured error out.
+//! The mapper as a whole: keyframes with their true poses in, a map with a measured error out.
 #![allow(clippy::unwrap_used)]
 
 use std::path::PathBuf;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 use stipple::config::Board;
 use stipple::gpu::Gpu;
-use stipple::map::{Did, Keyframe, Mapper, Panel};
+use stipple::map::{Did, Keyframe, Mapper, Offer, Panel, PoseCorrection};
+use stipple::mem::{heap_after_seal, seal_thread, CountingAllocator};
 use stipple::output::panel::{panel, View};
 use stipple::stereo::Stereo;
 use stipple_drivers::replay::{OpenOptions, Recording};
+use stipple_drivers::sim::{Scenario, Sim};
 use stipple_drivers::types::pose_at;
-use stipple_drivers::{Frames, Span};
+use stipple_drivers::{Calibration, Frames, Pose, Span};
+
+#[global_allocator]
+static ALLOCATOR: CountingAllocator = CountingAllocator;
+
+fn board(overrides: &[&str]) -> Board {
+    let text = "name = \"test\"\nmemory_max_mib = 2048\n[budget]\nsplats = 20000\nintersections = 400000\n\
+                keyframes = 16\nimage_width_max = 1024\nimage_height_max = 1024\n";
+    let overrides: Vec<String> = overrides.iter().map(|s| s.to_string()).collect();
+    Board::parse("tests/map.rs", text, &overrides).unwrap()
+}
+
+fn open(calibration: &Calibration, board: &Board) -> Mapper {
+    let stereo = Stereo::new(calibration, &board.stereo, board.map.scale).unwrap();
+    let bytes = Mapper::footprint(calibration, board).gpu_total();
+    Mapper::new(Gpu::open(&board.gpu, bytes).unwrap(), stereo, board).unwrap()
+}
+
+/// `count` keyframes of a simulated flight, half a second apart, at 188 x 120 px; every fourth is held out.
+fn flight(count: usize) -> (Calibration, Vec<Keyframe>) {
+    let mut scenario = Scenario::named("demo").unwrap();
+    scenario.image_divisor = 4;
+    let mut sim = Sim::new(&scenario).unwrap();
+    let calibration = sim.calibration().clone();
+    let mut frames = Frames::for_rig(&calibration);
+    let apart = (scenario.rate_hz / 2.0) as usize;
+    let mut keyframe = |k: usize| {
+        sim.render(k * apart, &mut frames);
+        let images = [frames.images[0].clone(), frames.images[1].clone()];
+        let world_from_body = sim.truth_at(frames.t).pose;
+        Keyframe { id: k as u64, t: frames.t, world_from_body, images, held_out: k % 4 == 3 }
+    };
+    let keyframes = (0..count).map(&mut keyframe).collect();
+    (calibration, keyframes)
+}
+
+/// One thing at a time until `steps` training steps are taken.
+fn train(mapper: &mut Mapper, steps: u32) {
+    let mut taken = 0;
+    while taken < steps {
+        let report = mapper.step(Instant::now()).unwrap();
+        assert!(report.iterations <= 1);
+        if report.did == Did::Idle {
+            break;
+        }
+        taken += report.iterations;
+    }
+}
+
+#[test]
+fn flight_becomes_a_map_that_held_out_views_confirm() {
+    let (calibration, keyframes) = flight(8);
+    let run = || {
+        let mut mapper = open(&calibration, &board(&[]));
+        for k in &keyframes {
+            assert_eq!(mapper.offer(k), Offer::Accepted);
+            train(&mut mapper, 20);
+        }
+        mapper
+    };
+    let mut mapper = run();
+    let quality = mapper.evaluate().unwrap();
+    assert_eq!((mapper.keyframe_count(), mapper.iterations()), (8, 160));
+    assert!(mapper.anchor_count() >= 1 && mapper.splat_count() > 1000);
+    assert!(quality.psnr_db.unwrap() > 20.0, "{quality:?}");
+    assert!(quality.psnr_heldout_db.unwrap() > 17.0, "{quality:?}");
+    assert!(quality.psnr_heldout_aligned_db.unwrap() > quality.psnr_heldout_db.unwrap() - 0.2, "{quality:?}");
+    let panels = mapper.panels(3).unwrap();
+    assert_eq!(panels.iter().map(|p| p.name.as_str()).collect::<Vec<_>>(), ["0000", "0003_heldout", "0007_heldout"]);
+    // The same keyframes in lockstep give the same map.
+    assert!(run().splats().unwrap() == run().splats().unwrap());
+}
+
+#[test]
+fn held_out_views_are_never_anchors_and_never_trained_on() {
+    let (calibration, mut keyframes) = flight(2);
+    keyframes.iter_mut().for_each(|k| k.held_out = true);
+    let mut mapper = open(&calibration, &board(&[]));
+    for k in &keyframes {
+        mapper.offer(k);
+        assert_eq!(mapper.step(Instant::now()).unwrap().did, Did::Stored);
+    }
+    assert_eq!(mapper.step(Instant::now() + Duration::from_millis(5)).unwrap().did, Did::Idle);
+    assert_eq!((mapper.splat_count(), mapper.iterations(), mapper.anchor_count()), (0, 0, 0));
+    assert_eq!(mapper.evaluate().unwrap().psnr_db, None);
+}
+
+#[test]
+fn full_store_queue_and_pool_are_counted_values() {
+    let (calibration, keyframes) = flight(6);
+    let tight = ["budget.keyframes=2", "budget.splats=256"];
+    let mut mapper = open(&calibration, &board(&tight));
+    let offers: Vec<Offer> = keyframes.iter().map(|k| mapper.offer(k)).collect();
+    assert_eq!(offers[3..], [Offer::Accepted, Offer::Full, Offer::Full]);
+    train(&mut mapper, 10);
+    assert_eq!((mapper.keyframe_count(), mapper.iterations()), (2, 10));
+    assert!(mapper.splat_count() <= 256);
+    assert_eq!(mapper.counters().keyframe_store_full.get(), 2);
+    assert_eq!(mapper.counters().keyframes_rejected.get(), 2);
+}
+
+#[test]
+fn corrections_reach_waiting_and_stored_keyframes() {
+    let (calibration, keyframes) = flight(2);
+    let mut mapper = open(&calibration, &board(&[]));
+    mapper.offer(&keyframes[0]);
+    let truth = keyframes[0].world_from_body;
+    let far = Pose { p: truth.p + glam::DVec3::X * 100.0, ..truth };
+    mapper.correct(&PoseCorrection { id: 0, world_from_body: far });
+    train(&mut mapper, 1);
+    let x = mapper.splats().unwrap()[0].mean[0];
+    assert!((f64::from(x) - far.p.x).abs() < 20.0, "seeded where the correction said: {x}");
+    mapper.correct(&PoseCorrection { id: 0, world_from_body: truth });
+    assert!(mapper.panels(1).unwrap()[0].psnr_db.unwrap() < 12.0, "the map is a hundred metres away");
+}
+
+#[test]
+fn steps_allocate_nothing() {
+    let (calibration, keyframes) = flight(3);
+    let mut mapper = open(&calibration, &board(&[]));
+    let sealed = std::thread::spawn(move || {
+        seal_thread();
+        for k in &keyframes {
+            mapper.offer(k);
+            train(&mut mapper, 25);
+        }
+        heap_after_seal()
+    });
+    assert_eq!(sealed.join().unwrap(), 0);
+}
 
 fn recording(name: &str) -> Option<PathBuf> {
     let beside = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../shared/data");
     let root = std::env::var_os("STIPPLE_RECORDINGS").map_or(beside, PathBuf::from);
     let path = root.join(name);
     path.is_dir().then_some(path)
-}
-
-fn board(overrides: &[String]) -> Board {
-    let text = "name = \"test\"\nmemory_max_mib = 2048\n[budget]\nsplats = 65536\nintersections = 524288\n\
-                keyframes = 160\nimage_width_max = 1024\nimage_height_max = 1024\n";
-    Board::parse("tests/map.rs", text, overrides).unwrap()
-}
-
-fn open(recording: &Recording, board: &Board) -> Mapper {
-    let stereo = Stereo::new(&recording.calibration, &board.stereo, board.map.scale).unwrap();
-    let bytes = Mapper::footprint(&recording.calibration, board).gpu_total();
-    Mapper::new(Gpu::open(&board.gpu, bytes).unwrap(), stereo, board).unwrap()
 }
 
 /// Every pair with a true pose is a keyframe, every eighth held out, `steps` training steps after each.
@@ -40,22 +159,23 @@ fn play(mapper: &mut Mapper, recording: &Recording, keyframes: usize, steps: u32
         let Some(world_from_body) = pose_at(&recording.truth, pair.t, Span(50_000_000)) else { continue };
         reader.read(i, &mut frames).unwrap();
         let images = [frames.images[0].clone(), frames.images[1].clone()];
-        let held_out = id % 8 == 7;
-        mapper.offer(&Keyframe { id, t: pair.t, world_from_body, images, held_out });
+        mapper.offer(&Keyframe { id, t: pair.t, world_from_body, images, held_out: id % 8 == 7 });
         id += 1;
-        let mut left = steps;
-        while left > 0 {
-            let report = mapper.step(Instant::now()).unwrap();
-            match report.did {
-                Did::Idle => break,
-                Did::Anchor { seeded } => {
-                    println!("keyframe {} is an anchor: {seeded} seeds, {:.0} ms", id - 1, report.ms)
-                }
-                _ => {}
-            }
-            left -= report.iterations.min(left);
-        }
+        train(mapper, steps);
     }
+}
+
+#[test]
+fn recorded_room_becomes_a_map() {
+    let Some(path) = recording("euroc_V1_01_easy_keyframes") else {
+        return println!("ignored: recorded_room_becomes_a_map: no recordings");
+    };
+    let recording = Recording::open(&path, &OpenOptions::default()).unwrap();
+    let mut mapper = open(&recording.calibration, &board(&["map.scale=4"]));
+    play(&mut mapper, &recording, 12, 25);
+    let quality = mapper.evaluate().unwrap();
+    assert!(quality.psnr_db.unwrap() > 18.0, "{quality:?}");
+    assert!(quality.psnr_heldout_db.unwrap() > 13.0, "{quality:?}");
 }
 
 fn write_png(dir: &std::path::Path, p: &Panel) {
@@ -73,11 +193,13 @@ fn v1_01_quality() {
         return println!("ignored: v1_01_quality: no recordings");
     };
     let env = |key: &str, default: usize| std::env::var(key).map_or(default, |v| v.parse().unwrap());
-    let mut overrides = vec!["map.scale=2".to_string()];
-    overrides.extend(std::env::var("SET").unwrap_or_default().split_whitespace().map(String::from));
+    let set = std::env::var("SET").unwrap_or_default();
+    let mut overrides =
+        vec!["map.scale=2", "budget.keyframes=160", "budget.splats=60000", "budget.intersections=1500000"];
+    overrides.extend(set.split_whitespace());
     let recording = Recording::open(&path, &OpenOptions::default()).unwrap();
     let board = board(&overrides);
-    let mut mapper = open(&recording, &board);
+    let mut mapper = open(&recording.calibration, &board);
     println!("{}", mapper.device());
     let start = Instant::now();
     play(&mut mapper, &recording, env("KEYFRAMES", 1000), env("STEPS", 20) as u32);

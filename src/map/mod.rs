@@ -43,6 +43,8 @@ pub enum Did {
     Idle,
     /// A keyframe was stored.
     Stored,
+    /// A keyframe was dropped: the store is full.
+    Dropped,
     /// A keyframe became an anchor.
     Anchor { seeded: u32 },
     /// Training steps on the newest anchor alone.
@@ -82,6 +84,10 @@ pub struct Mapper {
 
 /// Of a scene nothing is known of yet, m.
 const SCENE_DEPTH_M: f64 = 3.0;
+
+/// Steps a keyframe after which the learning rates are halved, and what is always left of them.
+const STEPS_HALVING: f64 = 50.0;
+const RATE_PART_MIN: f64 = 0.1;
 
 impl Mapper {
     pub fn footprint(calibration: &Calibration, board: &Board) -> Footprint {
@@ -181,7 +187,7 @@ impl Mapper {
         let Some(index) = index else {
             self.counters.keyframe_store_full.add(1);
             self.queue.pop();
-            return Ok(Did::Idle);
+            return Ok(Did::Dropped);
         };
         self.pipeline.set_keyframe(&mut self.gpu, index as u32, &self.store.image(index).pixels)?;
         let did = if self.store.get(index).held_out { Did::Stored } else { self.cover(index)? };
@@ -193,7 +199,7 @@ impl Mapper {
         let view = self.view(index);
         self.pipeline.render(&mut self.gpu, &view, &mut self.rendered)?;
         let bare = uncovered(&self.rendered.alpha, self.stereo.valid_mask(), self.config.covered_alpha);
-        let room = self.config_room();
+        let room = self.room();
         if bare <= self.config.anchor_uncovered_min || room == 0 {
             return Ok(Did::Stored);
         }
@@ -256,14 +262,17 @@ impl Mapper {
         View { world_from_cam: world_from_body * camera.body_from_rect, camera: camera.pinhole }
     }
 
+    /// Smaller as the steps a keyframe has had grow: large ones find the picture, small ones settle it.
     fn rates(&self) -> LearningRates {
         let c = &self.config;
+        let steps = self.iterations as f64 / self.store.len().max(1) as f64;
+        let part = f64::max(RATE_PART_MIN, 1.0 / (1.0 + steps / STEPS_HALVING));
         LearningRates {
-            position: (c.lr_position * self.scene_depth_m) as f32,
-            scale: c.lr_scale as f32,
-            rotation: c.lr_rotation as f32,
-            opacity: c.lr_opacity as f32,
-            colour: c.lr_colour as f32,
+            position: (part * c.lr_position * self.scene_depth_m) as f32,
+            scale: (part * c.lr_scale) as f32,
+            rotation: (part * c.lr_rotation) as f32,
+            opacity: (part * c.lr_opacity) as f32,
+            colour: (part * c.lr_colour) as f32,
         }
     }
 
@@ -271,7 +280,7 @@ impl Mapper {
         Weights { ssim: self.config.ssim_weight as f32, ..Weights::default() }
     }
 
-    fn config_room(&self) -> usize {
+    fn room(&self) -> usize {
         self.pipeline.shape().splats as usize - self.pipeline.count()
     }
 
