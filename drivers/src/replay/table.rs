@@ -34,6 +34,7 @@ pub fn read<T>(
     for (i, content) in text.lines().enumerate() {
         let (line, content) = (i + 1, content.trim().trim_start_matches('\u{feff}'));
         if content.is_empty() || content.starts_with('#') {
+            headline &= content.is_empty(); // a `#` line has named the columns
             continue;
         }
         let fields: Vec<&str> = split(content);
