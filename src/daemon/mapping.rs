@@ -24,7 +24,6 @@ pub struct Mapping {
     pub iteration_ms: Vec<f32>,
     pub iterations: u64,
     pub anchors: u64,
-    pub keyframes: u64,
     /// Why mapping stopped before the end, if it did; odometry goes on.
     pub failure: Option<String>,
     period_s: f64,
@@ -49,16 +48,10 @@ impl Mapping {
             iteration_ms: Vec::with_capacity(ITERATION_TIMES),
             iterations: 0,
             anchors: 0,
-            keyframes: 0,
             failure: None,
             period_s: board.map.curve_period_s,
             next_curve_s: board.map.curve_period_s,
         })
-    }
-
-    pub fn offer(&mut self, keyframe: &Keyframe) {
-        self.keyframes += 1;
-        self.mapper.offer(keyframe);
     }
 
     /// One slice of work. Answers false when there was nothing to do.
@@ -118,15 +111,18 @@ pub struct KeyframeQueue {
     pub corrections: ArrayQueue<PoseCorrection>,
 }
 
-/// Keyframes in flight; the mapper takes one within a slice, an anchor holds it for a burst.
-pub const KEYFRAME_SLOTS: usize = 8;
+/// Keyframes between tracking and the mapper's own queue: what comes while an anchor is being made.
+pub const KEYFRAME_SLOTS: usize = 4;
+
+/// Four windows of poses.
+const CORRECTION_SLOTS: usize = 64;
 
 impl KeyframeQueue {
     pub fn new(calibration: &Calibration) -> KeyframeQueue {
         let q = KeyframeQueue {
             spare: ArrayQueue::new(KEYFRAME_SLOTS),
             offered: ArrayQueue::new(KEYFRAME_SLOTS),
-            corrections: ArrayQueue::new(16 * KEYFRAME_SLOTS),
+            corrections: ArrayQueue::new(CORRECTION_SLOTS),
         };
         for _ in 0..KEYFRAME_SLOTS {
             let shape = |i: usize| {
@@ -151,10 +147,11 @@ impl KeyframeQueue {
         true
     }
 
-    pub fn take(&self, use_it: impl FnOnce(&Keyframe)) -> bool {
-        let Some(slot) = self.offered.pop() else { return false };
-        use_it(&slot);
+    /// Lends the oldest keyframe out and takes its slot back; `None` when there is none.
+    pub fn take<R>(&self, lend: impl FnOnce(&Keyframe) -> R) -> Option<R> {
+        let slot = self.offered.pop()?;
+        let r = lend(&slot);
         let _ = self.spare.push(slot);
-        true
+        Some(r)
     }
 }

@@ -195,9 +195,10 @@ fn pass_on(
 }
 
 fn drain(queue: &KeyframeQueue, mapping: &mut Mapping) {
-    while queue.take(|keyframe| mapping.offer(keyframe)) {}
+    let mapper = &mut mapping.mapper;
+    while mapper.has_room() && queue.take(|keyframe| mapper.offer(keyframe)).is_some() {}
     while let Some(correction) = queue.corrections.pop() {
-        mapping.mapper.correct(&correction);
+        mapper.correct(&correction);
     }
 }
 

@@ -78,8 +78,12 @@ impl Queue {
         self.len == 0
     }
 
+    pub fn is_full(&self) -> bool {
+        self.len == QUEUE_LEN
+    }
+
     pub fn push(&mut self, keyframe: &Keyframe) -> Offer {
-        if self.len == QUEUE_LEN || keyframe.images.iter().any(|i| i.pixels.len() > self.pixels_max) {
+        if self.is_full() || keyframe.images.iter().any(|i| i.pixels.len() > self.pixels_max) {
             return Offer::Full;
         }
         self.slots[(self.first + self.len) % QUEUE_LEN].copy_from(keyframe);

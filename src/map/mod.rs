@@ -144,6 +144,11 @@ impl Mapper {
         offer
     }
 
+    /// Whether an offer now would be accepted.
+    pub fn has_room(&self) -> bool {
+        !self.queue.is_full()
+    }
+
     pub fn correct(&mut self, correction: &PoseCorrection) {
         self.queue.correct(correction);
         self.store.correct(correction);
