@@ -112,7 +112,7 @@ pub struct KeyframeQueue {
 }
 
 /// Keyframes between tracking and the mapper's own queue: what comes while an anchor is being made.
-pub const KEYFRAME_SLOTS: usize = 4;
+pub const KEYFRAME_SLOTS: usize = 8;
 
 /// Four windows of poses.
 const CORRECTION_SLOTS: usize = 64;
