@@ -159,6 +159,18 @@ fn truncated_image_is_counted_and_the_run_goes_on() {
 }
 
 #[test]
+fn recording_without_a_readable_pair_is_no_result() {
+    let dir = tempfile::tempdir().unwrap();
+    let data = flight(dir.path(), "0.3");
+    for image in fs::read_dir(data.join("mav0/cam1/data")).unwrap() {
+        fs::write(image.unwrap().path(), "not an image").unwrap();
+    }
+    let out = dir.path().join("out");
+    let o = replay(&data, &out, &["--set", "map.enabled=false"]);
+    refused(&o, DATA, &["none of its", "stereo pairs can be read", "cam1/data"], &out);
+}
+
+#[test]
 fn wrong_usage_is_exit_64() {
     assert_eq!(stipple(&["replay"]).status.code(), Some(USAGE));
     assert_eq!(stipple(&["sim", "nonesuch", "--out", "/nonexistent/x"]).status.code(), Some(USAGE));

@@ -94,6 +94,7 @@ fn run(mut input: Input, place: &str, board: &Board, out: &OutputDir, options: &
         opened: std::mem::take(&mut input.counters),
     };
     let opened = input.warnings.len();
+    let asked = frames as u64;
     let options = Play {
         pace: options.pace,
         holdout: options.holdout,
@@ -103,6 +104,11 @@ fn run(mut input: Input, place: &str, board: &Board, out: &OutputDir, options: &
     let played = play(input, tracking, mapping, &options);
     for warning in &played.warnings[opened..] {
         eprintln!("stipple: warning: {warning}");
+    }
+    if played.counters.frames_unreadable.get() == asked {
+        let first = played.warnings.get(opened).map_or("", String::as_str);
+        let what = format!("none of its {asked} stereo pairs can be read, the first: {first}");
+        return Err(Fault::new(Exit::Data, place, what, "check that the recording is complete"));
     }
     let report = summary::conclude(title, played, out)?;
     println!("{}", summary::six_lines(&report, out));
