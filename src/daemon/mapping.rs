@@ -99,7 +99,9 @@ impl Mapping {
         }
     }
 
+    /// Ends mapping: a device that fails once is lost or hangs.
     fn fail(&mut self, e: GpuError) {
+        self.mapper.counters().gpu_failures.add(1);
         self.failure = Some(unsealed(|| e.to_string()));
     }
 }

@@ -69,7 +69,9 @@ pub fn conclude(title: Title, mut played: Played, out: &OutputDir) -> Result<Rep
             }
         }
         if let Some(why) = &m.failure {
-            played.warnings.push(format!("the map is incomplete: {why}"));
+            let warning = format!("the map is incomplete: {why}");
+            eprintln!("stipple: warning: {warning}");
+            played.warnings.push(warning);
         }
     }
     report.rss_peak_bytes = process::rss_peak_bytes();

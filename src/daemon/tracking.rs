@@ -108,7 +108,10 @@ impl Tracking {
                     ("tracks_full", f.full),
                 ];
                 let v = run.vio.stats();
+                // The first frames of a run that starts in motion, and those after a reset.
+                let without = run.frame_ms.len().saturating_sub(run.trajectory.len());
                 list.extend([
+                    ("frames_without_odometry", without as u64),
                     ("imu_rejected", v.imu_rejected),
                     ("imu_overflow", v.imu_overflow),
                     ("frames_rejected", v.frames_rejected),
