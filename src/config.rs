@@ -95,6 +95,11 @@ pub struct VioConfig {
     /// Factors on the calibration's noise densities, for vibration and scale errors it does not state.
     pub gyro_noise_scale: f64,
     pub accel_noise_scale: f64,
+    /// Hold velocity and gyro bias when nothing moves.
+    pub zero_velocity: bool,
+    /// Ends of the sensors' ranges, rad/s and m/s²: samples there are clipped and weigh little.
+    pub gyro_max: f64,
+    pub accel_max: f64,
 }
 
 impl Default for VioConfig {
@@ -111,6 +116,9 @@ impl Default for VioConfig {
             outlier_px: 3.0,
             gyro_noise_scale: 2.0,
             accel_noise_scale: 4.0,
+            zero_velocity: true,
+            gyro_max: 34.9,
+            accel_max: 156.9,
         }
     }
 }
@@ -373,6 +381,8 @@ const BOUNDS: &[(&str, Bound)] = &[
     ("vio.outlier_px", Positive),
     ("vio.gyro_noise_scale", Positive),
     ("vio.accel_noise_scale", Positive),
+    ("vio.gyro_max", Positive),
+    ("vio.accel_max", Positive),
     ("stereo.disparities", Stepped(16.0, 512.0, 16.0, 0.0)),
     ("stereo.block_px", Stepped(5.0, 51.0, 2.0, 1.0)),
     ("stereo.uniqueness_percent", Within(0.0, 100.0)),

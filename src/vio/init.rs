@@ -23,10 +23,10 @@ use stipple_drivers::{Nanos, Pose, Span};
 /// At rest: quiet this long, s; spread of gyro rad/s and accelerometer m/s² below these; a gyro mean
 /// that a bias can explain, rad/s; tracks that moved less than this, px.
 const REST_SPAN: f64 = 0.5;
-const REST_GYRO: f64 = 0.03;
-const REST_ACCEL: f64 = 0.3;
+pub const REST_GYRO: f64 = 0.03;
+pub const REST_ACCEL: f64 = 0.3;
 const REST_GYRO_MEAN: f64 = 0.15;
-const REST_PX: f64 = 0.5;
+pub const REST_PX: f64 = 0.5;
 
 /// Alignment: span, s, and frames it takes at least and at most.
 const ALIGN_SPAN: f64 = 0.45;

@@ -8,6 +8,7 @@
 
 use super::landmarks::Landmarks;
 use super::residuals::Motion;
+use super::rest::add_rest;
 use super::solve::{add_inertial, eliminate_landmark, Model, Solver};
 use super::window::{Layout, Window, FRAMES, MOTION_DIM, POSE_DIM};
 use crate::limits::{KEYFRAMES, STATES, WINDOW_DIM};
@@ -228,6 +229,7 @@ pub fn marginalise(
     system.clear(layout.dim);
     prior.add_to(window, &layout, system);
     add_inertial(window, oldest, boundary, &layout, system);
+    add_rest(window.frame(oldest), oldest, &layout, system);
     let finished = |l: &super::landmarks::Landmark| {
         Some(l.host as usize) == removed || l.observations.iter().all(|o| layout.pose(o.slot as usize).is_some())
     };

@@ -13,6 +13,7 @@ pub mod landmarks;
 pub mod marginalise;
 pub mod preintegration;
 pub mod residuals;
+pub mod rest;
 pub mod solve;
 pub mod window;
 
@@ -32,6 +33,7 @@ use landmarks::Landmarks;
 use marginalise::{marginalise, Prior};
 use preintegration::{ImuRing, Increment, Noise};
 use residuals::{Eye, InertialWeight, Motion};
+use rest::at_rest;
 use solve::{Model, Outcome, Solver};
 use stipple_drivers::{Calibration, ImuSample, Nanos, Pose};
 use window::{Frame, Window, FRAMES};
@@ -42,6 +44,8 @@ const CONNECTED_FEW: usize = 20;
 const SPEED_MAX: f64 = 100.0;
 const ACCEL_BIAS_MAX: f64 = 5.0;
 const GYRO_BIAS_MAX: f64 = 1.0;
+/// Inertia alone is not believed for longer than this, s; the ring of samples may not hold more either.
+const FRAME_GAP_MAX: f64 = 2.0;
 
 /// The estimate at one instant.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -74,6 +78,8 @@ pub struct Stats {
     pub keyframes: u64,
     pub imu_rejected: u64,
     pub imu_overflow: u64,
+    /// Samples at the end of the sensor's range.
+    pub imu_saturated: u64,
     /// Frames not newer than the last.
     pub frames_rejected: u64,
     pub landmarks_full: u64,
@@ -81,6 +87,8 @@ pub struct Stats {
     pub solver_failures: u64,
     pub resets: u64,
     pub iterations: u64,
+    /// Frames held still because nothing moved.
+    pub zero_velocity_updates: u64,
 }
 
 #[derive(Debug)]
@@ -110,7 +118,7 @@ impl Vio {
         Vio {
             model: Model::new(eyes, config),
             config: config.clone(),
-            noise: Noise::new(&calibration.imu, config.gyro_noise_scale, config.accel_noise_scale),
+            noise: Noise::new(&calibration.imu, config),
             imu: ImuRing::new(),
             window: Window::new(),
             tracks: vec![Tracks::default(); FRAMES],
@@ -142,6 +150,8 @@ impl Vio {
             self.stats.imu_rejected += 1;
             return;
         }
+        let clipped = self.noise.clipped(s.gyro_body, s.accel_body);
+        self.stats.imu_saturated += (clipped.0 || clipped.1) as u64;
         let overwritten = self.imu.push(s);
         let needed_from = self.window.newest().map(|n| self.window.frame(n).t);
         if let (Some(old), Some(t)) = (overwritten, needed_from) {
@@ -159,6 +169,9 @@ impl Vio {
             return Update::default();
         }
         self.stats.frames += 1;
+        if self.running && last.is_some_and(|t| (tracks.t - t).secs() > FRAME_GAP_MAX) {
+            self.reset();
+        }
         let mut update = if self.running { self.advance(tracks) } else { self.try_start(tracks) };
         if self.running && !self.is_sane() {
             self.reset();
@@ -197,6 +210,10 @@ impl Vio {
         let slot = self.window.push(frame).expect("marginalisation left room for one frame");
         self.tracks[slot].clone_from(tracks);
 
+        if self.config.zero_velocity {
+            self.window.frame_mut(slot).rest = at_rest(slot, &self.window, &self.tracks, &self.imu);
+            self.stats.zero_velocity_updates += self.window.frame(slot).rest.is_some() as u64;
+        }
         let (connected, unconnected) = self.landmarks.attach(slot, tracks);
         self.frames_since_keyframe += 1;
         let fraction = connected as f64 / (connected + unconnected).max(1) as f64;

@@ -6,6 +6,7 @@
 //! the mean of its two samples and the rotation at mid-step. Gaps are integrated across with the
 //! last samples' mean and the noise of not having measured.
 
+use crate::config::VioConfig;
 use crate::limits::IMU_BETWEEN_FRAMES;
 use crate::math::so3;
 use glam::{DMat3, DQuat, DVec3};
@@ -22,6 +23,11 @@ pub const GRAVITY: DVec3 = DVec3::new(0.0, 0.0, -9.81);
 const GAP_PERIODS: f64 = 4.0;
 const GAP_GYRO: f64 = 0.2;
 const GAP_ACCEL: f64 = 1.0;
+/// A sample this near the end of its range is clipped, and what it hides, as densities: a shock is several
+/// samples long and all of one sign.
+const RANGE_FRACTION: f64 = 0.99;
+const CLIPPED_GYRO: f64 = 1.0;
+const CLIPPED_ACCEL: f64 = 5.0;
 /// Position noise of integrating in steps, m/√s; keeps one-step increments invertible.
 const POSITION_NOISE: f64 = 1e-4;
 
@@ -34,17 +40,38 @@ pub struct Noise {
     pub accel_walk: f64,
     /// Nominal sample period, s.
     pub period: f64,
+    /// Ends of the sensors' ranges, rad/s and m/s².
+    pub gyro_max: f64,
+    pub accel_max: f64,
 }
 
 impl Noise {
-    /// `scale` covers what the data sheet does not: vibration, scale and misalignment errors.
-    pub fn new(imu: &ImuCalibration, gyro_scale: f64, accel_scale: f64) -> Noise {
+    /// The config's scales cover what the data sheet does not: vibration, scale and misalignment errors.
+    pub fn new(imu: &ImuCalibration, config: &VioConfig) -> Noise {
         Noise {
-            gyro: imu.gyro_noise * gyro_scale,
-            accel: imu.accel_noise * accel_scale,
+            gyro: imu.gyro_noise * config.gyro_noise_scale,
+            accel: imu.accel_noise * config.accel_noise_scale,
             gyro_walk: imu.gyro_walk,
             accel_walk: imu.accel_walk,
             period: 1.0 / imu.rate_hz,
+            gyro_max: config.gyro_max,
+            accel_max: config.accel_max,
+        }
+    }
+
+    /// Whether the (gyro, accelerometer) is at the end of its range on any axis.
+    pub fn clipped(&self, gyro: DVec3, accel: DVec3) -> (bool, bool) {
+        let at_end = |x: DVec3, max: f64| x.abs().max_element() >= RANGE_FRACTION * max;
+        (at_end(gyro, self.gyro_max), at_end(accel, self.accel_max))
+    }
+
+    /// The noise of a step between two samples: that of not having measured where one is clipped.
+    fn between(&self, a: (DVec3, DVec3), b: (DVec3, DVec3)) -> Noise {
+        let (first, second) = (self.clipped(a.0, a.1), self.clipped(b.0, b.1));
+        Noise {
+            gyro: if first.0 || second.0 { CLIPPED_GYRO } else { self.gyro },
+            accel: if first.1 || second.1 { CLIPPED_ACCEL } else { self.accel },
+            ..*self
         }
     }
 }
@@ -148,7 +175,8 @@ impl Increment {
         put(&mut h, 6, 0, &v_a);
 
         let gap = dt > GAP_PERIODS * noise.period;
-        let (sg, sa) = if gap { (GAP_GYRO, GAP_ACCEL) } else { (noise.gyro, noise.accel) };
+        let (sg, sa) =
+            if gap { (noise.gyro.max(GAP_GYRO), noise.accel.max(GAP_ACCEL)) } else { (noise.gyro, noise.accel) };
         self.covariance = f * self.covariance * f.transpose()
             + g * g.transpose() * (sg * sg / dt)
             + h * h.transpose() * (sa * sa / dt);
@@ -252,7 +280,7 @@ impl ImuRing {
         };
         let mut t = t0;
         let mut step = |to: Nanos, w1: DVec3, a1: DVec3| {
-            inc.step((w + w1) * 0.5, (a + a1) * 0.5, (to - t).secs(), noise);
+            inc.step((w + w1) * 0.5, (a + a1) * 0.5, (to - t).secs(), &noise.between((w, a), (w1, a1)));
             (t, w, a) = (to, w1, a1);
         };
         for i in self.after(t0)..self.after(t1) {
@@ -312,7 +340,15 @@ mod tests {
     use super::*;
     use stipple_drivers::Pose;
 
-    const NOISE: Noise = Noise { gyro: 1e-3, accel: 2e-2, gyro_walk: 1e-4, accel_walk: 1e-3, period: 0.005 };
+    const NOISE: Noise = Noise {
+        gyro: 1e-3,
+        accel: 2e-2,
+        gyro_walk: 1e-4,
+        accel_walk: 1e-3,
+        period: 0.005,
+        gyro_max: 35.0,
+        accel_max: 160.0,
+    };
     const PATH: world::Path = world::Path { rest: -1.0 };
 
     fn at(t: f64) -> Nanos {
@@ -323,7 +359,7 @@ mod tests {
         let mut ring = ImuRing::new();
         for i in 0..=(t1 * rate) as usize + 1 {
             let t = i as f64 / rate;
-            let (gyro_body, accel_body) = PATH.imu(t);
+            let (gyro_body, accel_body) = world::rate_and_force(|t| PATH.pose(t), t);
             ring.push(ImuSample { t: at(t), gyro_body, accel_body });
         }
         ring
@@ -370,7 +406,7 @@ mod tests {
         const STEPS: usize = 20;
         const DT: f64 = 0.005;
         let mut random = world::Noise(3);
-        let sample = |k: usize| PATH.imu(0.5 + (k as f64 + 0.5) * DT);
+        let sample = |k: usize| world::rate_and_force(|t| PATH.pose(t), 0.5 + (k as f64 + 0.5) * DT);
         let clean = (0..STEPS).fold(Increment::new(DVec3::ZERO, DVec3::ZERO), |mut inc, k| {
             inc.step(sample(k).0, sample(k).1, DT, &NOISE);
             inc

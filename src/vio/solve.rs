@@ -6,6 +6,7 @@
 use super::landmarks::{Landmark, Landmarks};
 use super::marginalise::Prior;
 use super::residuals::{huber, inertial_jacobians, inertial_residual, predict, reproject, Eye, Point, Reprojection};
+use super::rest::{add_rest, rest_cost};
 use super::window::{Layout, Window, FRAMES};
 use crate::config::VioConfig;
 use crate::limits::{LANDMARKS, WINDOW_DIM};
@@ -255,6 +256,7 @@ fn cost_of(window: &Window, landmarks: &Landmarks, prior: &Prior, model: &Model)
             let (a, b) = (window.frame(from), window.frame(slot));
             cost += 0.5 * inertial_residual(&b.increment, &b.weight, &a.now, &b.now).norm_squared();
         }
+        cost += rest_cost(window.frame(slot));
         before = Some(slot);
     }
     let inv_sigma = 1.0 / model.sigma_px;
@@ -305,6 +307,7 @@ impl Solver {
             if let Some(from) = before {
                 cost += add_inertial(window, from, slot, layout, system);
             }
+            cost += add_rest(window.frame(slot), slot, layout, system);
             before = Some(slot);
         }
         for (l, out) in landmarks.pool.iter().zip(&mut self.eliminated) {

@@ -9,6 +9,7 @@ use super::preintegration::{Increment, Mat9};
 use super::residuals::{Body, InertialWeight, Motion};
 use crate::limits::{KEYFRAMES, STATES};
 use crate::mem::List;
+use glam::DVec3;
 use stipple_drivers::Nanos;
 
 /// Frames at the peak, just before marginalisation.
@@ -30,6 +31,8 @@ pub struct Frame {
     /// From the frame before, when that one is moving.
     pub increment: Increment,
     pub weight: InertialWeight,
+    /// Mean rate of a frame found at rest, rad/s.
+    pub rest: Option<DVec3>,
     /// Landmarks it hosted when it became a keyframe.
     pub hosted: usize,
     pub body: Body,
@@ -49,6 +52,7 @@ impl Frame {
             delta: [0.0; 15],
             increment: Increment::new(now.bg, now.ba),
             weight: InertialWeight { increment: Mat9::zeros(), bg: 0.0, ba: 0.0 },
+            rest: None,
             hosted: 0,
             body: Body::default(),
             body_jacobian: Body::default(),

@@ -65,19 +65,20 @@ impl Path {
         );
         Pose::new(q, p)
     }
+}
 
-    pub fn imu(&self, t: f64) -> (DVec3, DVec3) {
-        const H: f64 = 1e-4;
-        let (a, b, c) = (self.pose(t - H), self.pose(t), self.pose(t + H));
-        let turn = a.q.conjugate() * c.q;
-        let gyro = turn.to_scaled_axis() / (2.0 * H);
-        let accel = (a.p + c.p - 2.0 * b.p) / (H * H) - DVec3::new(0.0, 0.0, -9.81);
-        (gyro, b.q.conjugate() * accel)
-    }
+/// What a perfect inertial sensor on the path `pose` reads at `t`.
+pub fn rate_and_force(pose: impl Fn(f64) -> Pose, t: f64) -> (DVec3, DVec3) {
+    const H: f64 = 1e-4;
+    let (a, b, c) = (pose(t - H), pose(t), pose(t + H));
+    let turn = a.q.conjugate() * c.q;
+    let gyro = turn.to_scaled_axis() / (2.0 * H);
+    let accel = (a.p + c.p - 2.0 * b.p) / (H * H) - DVec3::new(0.0, 0.0, -9.81);
+    (gyro, b.q.conjugate() * accel)
 }
 
 /// Points on the walls of a room of 8 x 8 x 4 m.
-fn room(n: usize, noise: &mut Noise) -> Vec<DVec3> {
+pub fn room(n: usize, noise: &mut Noise) -> Vec<DVec3> {
     let wall = |noise: &mut Noise| {
         let (u, v) = (8.0 * noise.uniform() - 4.0, 4.0 * noise.uniform() - 2.0);
         match noise.bits() % 6 {
@@ -99,18 +100,22 @@ pub struct World {
     ids: Vec<Option<u64>>,
     next_id: u64,
     noise: Noise,
-    path: Path,
+    pose: Box<dyn Fn(f64) -> Pose>,
 }
 
 impl World {
     pub fn new(path: Path) -> World {
         let mut noise = Noise(7);
         let points = room(1500, &mut noise);
-        World { rig: calibration(), ids: vec![None; points.len()], points, next_id: 0, noise, path }
+        World::seen_from(move |t| path.pose(t), points, noise)
+    }
+
+    pub fn seen_from(pose: impl Fn(f64) -> Pose + 'static, points: Vec<DVec3>, noise: Noise) -> World {
+        World { rig: calibration(), ids: vec![None; points.len()], points, next_id: 0, noise, pose: Box::new(pose) }
     }
 
     pub fn imu(&mut self, t: f64) -> ImuSample {
-        let (gyro, accel) = self.path.imu(t);
+        let (gyro, accel) = rate_and_force(&self.pose, t);
         let root = RATE_HZ.sqrt();
         ImuSample {
             t: Nanos((t * 1e9).round() as i64),
@@ -120,7 +125,7 @@ impl World {
     }
 
     pub fn tracks(&mut self, t: f64, out: &mut Tracks) {
-        let body = self.path.pose(t).inverse();
+        let body = (self.pose)(t).inverse();
         out.t = Nanos((t * 1e9).round() as i64);
         out.cameras.iter_mut().for_each(|c| c.clear());
         let mut seen: Vec<(u64, [Option<DVec2>; 2])> = Vec::new();
