@@ -12,8 +12,9 @@
 //! Allowed edges, checked by `tests/tidy.rs`: `math`, `mem`, `limits`, `config` and `counters` are seen by
 //! all; `frontend` and `vio` see the vocabulary of `stipple-drivers`; `vio` also sees `frontend`'s
 //! `Tracks`; `stereo` and `map` see `gpu`; `map` sees `stereo`; `vio` never sees `gpu`; `map` never sees
-//! `frontend`; nobody sees `daemon`.
+//! `frontend`; `bench` sees all but `daemon`; nobody sees `daemon`.
 
+pub mod bench;
 pub mod config;
 pub mod counters;
 pub mod daemon;

@@ -3,6 +3,7 @@
 use clap::{Parser, Subcommand};
 use std::path::PathBuf;
 use std::process::ExitCode;
+use stipple::bench;
 use stipple::daemon::{self, Pace};
 use stipple::mem::CountingAllocator;
 use stipple_drivers::{Exit, Fault};
@@ -83,6 +84,29 @@ enum Command {
         #[arg(long = "set", value_name = "SECTION.KEY=VALUE")]
         set: Vec<String>,
     },
+    /// Measure what the parameters cost and what they buy
+    Bench {
+        #[command(subcommand)]
+        what: Bench,
+    },
+}
+
+#[derive(Subcommand)]
+enum Bench {
+    /// Error against run time of frontend and estimator over flights and settings
+    Odometry {
+        #[arg(long, value_name = "DIR")]
+        out: PathBuf,
+        /// Folder of recordings; otherwise $STIPPLE_RECORDINGS, otherwise ../shared/data
+        #[arg(long, value_name = "FOLDER")]
+        recordings: Option<PathBuf>,
+        /// Seconds of each input, 40 at most
+        #[arg(long, value_name = "S", value_parser = seconds)]
+        seconds: Option<f64>,
+        /// One small flight, two settings
+        #[arg(long)]
+        quick: bool,
+    },
 }
 
 fn seconds(text: &str) -> Result<f64, String> {
@@ -104,6 +128,9 @@ fn run(command: Command) -> Result<(), Fault> {
             daemon::simulate(&daemon::Simulate { scenario, truth, imu, duration_s: duration, seed }, &out)
         }
         Command::Check { board, set } => daemon::check(&board, &set),
+        Command::Bench { what: Bench::Odometry { out, recordings, seconds, quick } } => {
+            bench::odometry(&bench::Options { recordings, seconds, quick }, &out)
+        }
     }
 }
 

@@ -1,0 +1,194 @@
+//! `odometry.html`: error against run time, in one file that needs nothing else.
+
+use super::measure::Figures;
+use super::settings::{curves, Curve, DEFAULT};
+use super::{knee, tables, Sweep};
+use crate::output::chart::{escape, Chart, Series};
+use std::fmt::Write as _;
+use std::io::{self, Write};
+
+const STYLE: &str = include_str!("../output/report.css");
+/// On top of the reports' style: settings that are not of the curve are points without a line, of
+/// which only a first dot stays, for the legend.
+const MORE_STYLE: &str = ".line.ink3 { stroke-width: 5.2; stroke-dasharray: 0 9999; } .dot.ink3 { fill: var(--ink3); opacity: .6; } \
+    .wide-table { overflow-x: auto; } .wide-table td, .wide-table th { padding-left: 10px; font-size: 13.5px; } \
+    .wide-table td { font-weight: 400; } tr.default td, tr.default th { font-weight: 700; } \
+    thead th { text-align: right; color: var(--soft); border-top: 0; } .wide-table th:first-child { text-align: left; padding-left: 0; }";
+/// Errors this many times the default's are drawn along the upper edge.
+const CUT: f64 = 3.0;
+const CM: f64 = 100.0;
+
+type Points = [Option<(f64, f64)>];
+
+pub fn write(out: &mut impl Write, sweep: &Sweep) -> io::Result<()> {
+    write!(out, "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\">")?;
+    write!(out, "<meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">")?;
+    write!(out, "<title>Odometry: error against run time \u{2013} Stipple</title>")?;
+    write!(out, "<style>{STYLE}{MORE_STYLE}</style></head><body><main>")?;
+    write!(out, "<header><p class=\"over\">Stipple</p><h1>Odometry: error against run time</h1>")?;
+    let frames: usize = sweep.inputs.iter().map(|i| i.frames).sum();
+    let (inputs, settings) = (sweep.inputs.len(), sweep.settings.len());
+    write!(out, "<p class=\"what\">{inputs} inputs, {frames} stereo frames, {settings} settings; frontend and estimator on one thread, no mapper</p></header>")?;
+    write!(out, "<section><h2>Knee</h2><p>{}</p>", escape(&tables::conclusion(sweep)))?;
+    write!(out, "<p class=\"note\">ATE after rigid alignment. Over all inputs: geometric mean of the errors, mean of the CPU time. Stages are wall time, so their 99th percentile holds what else the machine did.</p></section>")?;
+    out.write_all(defaults(sweep).as_bytes())?;
+    let points = sweep.points();
+    let charts: Vec<_> = curves(&sweep.settings).iter().map(|c| parameter(c, &points)).collect();
+    section(out, "One parameter at a time, all inputs", &charts)?;
+    let charts: Vec<_> = (0..inputs).map(|i| front(&sweep.inputs[i].name, &sweep.points_of(i), sweep)).collect();
+    section(out, "All settings on each input", &charts)?;
+    out.write_all(settings_table(sweep).as_bytes())?;
+    writeln!(out, "</main></body></html>")
+}
+
+fn section(out: &mut impl Write, title: &str, charts: &[Option<String>]) -> io::Result<()> {
+    write!(out, "<section><h2>{title}</h2><div class=\"charts\">")?;
+    for chart in charts.iter().flatten() {
+        write!(out, "<figure>{chart}</figure>")?;
+    }
+    write!(out, "</div></section>")
+}
+
+fn table(title: &str, head: &[&str], rows: &[(bool, Vec<String>)]) -> String {
+    let mut html = format!("<section><h2>{title}</h2><div class=\"wide-table\"><table><thead><tr>");
+    for name in head {
+        let _ = write!(html, "<th scope=\"col\">{name}</th>");
+    }
+    html.push_str("</tr></thead>");
+    for (marked, cells) in rows {
+        html.push_str(if *marked { "<tr class=\"default\">" } else { "<tr>" });
+        for (i, cell) in cells.iter().enumerate() {
+            let cell = escape(cell);
+            let _ =
+                if i == 0 { write!(html, "<th scope=\"row\">{cell}</th>") } else { write!(html, "<td>{cell}</td>") };
+        }
+        html.push_str("</tr>");
+    }
+    html + "</table></div></section>"
+}
+
+fn number(v: Option<f64>, decimals: usize) -> String {
+    v.map_or("\u{2013}".into(), |v| format!("{v:.decimals$}"))
+}
+
+fn defaults(sweep: &Sweep) -> String {
+    let head = [
+        "input",
+        "frames",
+        "ATE, cm",
+        "RTE 1 s, cm",
+        "RPE, \u{b0}",
+        "frontend, ms: median / 99 %",
+        "estimator, ms: median / 99 %",
+        "iterations a frame",
+        "CPU, ms a frame",
+        "frames/s",
+        "keyframes",
+        "resets",
+        "knee",
+    ];
+    let pair = |a: f64, b: f64| format!("{a:.2} / {b:.2}");
+    let row = |i: usize| {
+        let f: &Figures = sweep.row(i, 0);
+        let knee = knee(&sweep.points_of(i)).map_or("\u{2013}".into(), |s| sweep.settings[s].name.clone());
+        let cells = vec![
+            sweep.inputs[i].name.clone(),
+            format!("{} of {}", f.tracked, sweep.inputs[i].frames),
+            number(f.ate_m.map(|m| m * CM), 2),
+            number(f.rte_1s_m.map(|m| m * CM), 2),
+            number(f.rpe_deg, 3),
+            pair(f.frontend_ms_p50, f.frontend_ms_p99),
+            pair(f.estimator_ms_p50, f.estimator_ms_p99),
+            format!("{:.1}", f.iterations_per_frame),
+            format!("{:.2}", f.cpu_ms_per_frame),
+            format!("{:.1}", f.fps_one_thread),
+            f.keyframes.to_string(),
+            f.resets.to_string(),
+            knee,
+        ];
+        (false, cells)
+    };
+    let rows: Vec<_> = (0..sweep.inputs.len()).map(row).collect();
+    table("Each input at the default setting", &head, &rows)
+        + &format!(
+            "<p class=\"note\">{}</p>",
+            sweep.inputs.iter().map(|i| escape(&format!("{}: {}.", i.name, i.about))).collect::<Vec<_>>().join(" ")
+        )
+}
+
+/// Fastest first.
+fn settings_table(sweep: &Sweep) -> String {
+    let knee = knee(&sweep.points());
+    let mut order: Vec<usize> = (0..sweep.settings.len()).collect();
+    let time = |s: &usize| sweep.overall(*s).map_or(f64::INFINITY, |o| o.cpu_ms_per_frame);
+    order.sort_by(|a, b| time(a).total_cmp(&time(b)));
+    let row = |s: usize| {
+        let o = sweep.overall(s);
+        let mark = match (s == 0, knee == Some(s)) {
+            (true, true) => "default and knee",
+            (true, false) => DEFAULT,
+            (false, true) => "knee",
+            (false, false) => "",
+        };
+        let setting = &sweep.settings[s];
+        let cells = vec![
+            setting.name.clone(),
+            if setting.set.len() > 1 { setting.set.join(" ") } else { String::new() },
+            number(o.map(|o| o.ate_m * CM), 2),
+            number(o.map(|o| o.ate_worst_m * CM), 2),
+            number(o.map(|o| o.cpu_ms_per_frame), 2),
+            mark.into(),
+        ];
+        (s == 0, cells)
+    };
+    let rows: Vec<_> = order.into_iter().map(row).collect();
+    let head = ["setting", "set", "ATE, cm: geometric mean", "worst", "CPU, ms a frame", ""];
+    table("All settings over all inputs", &head, &rows)
+}
+
+fn chart(title: &str, mut series: Vec<Series>, points: &Points) -> Option<String> {
+    let scaled = |s: &mut Series| s.points.iter_mut().for_each(|p| p.1 *= CM);
+    series.iter_mut().for_each(scaled);
+    let cut = points.first().copied().flatten().map(|p| CUT * CM * p.1);
+    let x = "CPU time a frame, ms";
+    Chart { title, x, y: "ATE, cm", series, from_zero: true, y_max: cut, ..Chart::default() }.svg()
+}
+
+fn dots<'a>(name: &'a str, ink: u8, points: Vec<(f64, f64)>) -> Series<'a> {
+    Series { name, ink, dots: true, points }
+}
+
+/// The curve of a parameter before all other settings.
+fn parameter(curve: &Curve, points: &Points) -> Option<String> {
+    let along = curve.settings.iter().filter_map(|s| points[*s]).collect();
+    let others = (0..points.len()).filter(|s| !curve.settings.contains(s)).filter_map(|s| points[s]).collect();
+    let title = format!("{}: {}", curve.name, curve.values.join(", "));
+    let series = vec![
+        dots("all others", 3, others),
+        dots("along the parameter", 1, along),
+        dots(DEFAULT, 2, points[0].into_iter().collect()),
+    ];
+    chart(&title, series, points)
+}
+
+/// All settings of an input, and those that none beats in both time and error.
+fn front(name: &str, points: &Points, sweep: &Sweep) -> Option<String> {
+    let mut sorted: Vec<(f64, f64)> = points.iter().flatten().copied().collect();
+    sorted.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.total_cmp(&b.1)));
+    let mut front: Vec<(f64, f64)> = Vec::new();
+    for p in &sorted {
+        if front.last().is_none_or(|best| p.1 < best.1) {
+            front.push(*p);
+        }
+    }
+    let title = match knee(points) {
+        Some(s) => format!("{name}; knee: {}", sweep.settings[s].name),
+        None => name.to_string(),
+    };
+    let series = vec![
+        dots("settings", 3, sorted.clone()),
+        dots("not beaten in both", 1, front),
+        dots(DEFAULT, 2, points[0].into_iter().collect()),
+    ];
+    chart(&title, series, points)
+}

@@ -1,0 +1,38 @@
+//! `stipple bench odometry --quick` leaves figures that can be read and drawn.
+#![allow(clippy::unwrap_used)]
+
+use std::process::Command;
+
+#[test]
+fn quick_sweep_writes_finite_figures_and_marks_the_default() {
+    let dir = tempfile::tempdir().unwrap();
+    let out = dir.path().join("out");
+    let o = Command::new(env!("CARGO_BIN_EXE_stipple"))
+        .args(["bench", "odometry", "--quick", "--out", out.to_str().unwrap()])
+        .output()
+        .unwrap();
+    let said = String::from_utf8_lossy(&o.stderr).into_owned() + &String::from_utf8_lossy(&o.stdout);
+    assert!(o.status.success(), "{said}");
+
+    let csv = std::fs::read_to_string(out.join("odometry.csv")).unwrap();
+    let mut lines = csv.lines().map(|l| l.split(',').collect::<Vec<_>>());
+    let head = lines.next().unwrap();
+    let rows: Vec<_> = lines.collect();
+    assert_eq!(
+        rows.iter().map(|r| &r[..2]).collect::<Vec<_>>(),
+        [["demo", "default"], ["demo", "vio.iterations_max=3"]]
+    );
+    for row in &rows {
+        assert_eq!(row.len(), head.len());
+        for (name, field) in head.iter().zip(row).skip(2).filter(|(name, _)| **name != "hash") {
+            assert!(field.parse::<f64>().is_ok_and(f64::is_finite), "{name} is `{field}`");
+        }
+    }
+    let ate = head.iter().position(|name| *name == "ate_m").unwrap();
+    assert!(rows[0][ate].parse::<f64>().unwrap() < 0.2, "{csv}");
+
+    let json: serde_json::Value = serde_json::from_slice(&std::fs::read(out.join("odometry.json")).unwrap()).unwrap();
+    assert!(json["knee"].is_string() && json["rows"][0]["default"] == true && json["rows"][1]["default"] == false);
+    let html = std::fs::read_to_string(out.join("odometry.html")).unwrap();
+    assert!(html.contains("<svg") && html.contains("class=\"default\"") && !html.contains("NaN"));
+}
