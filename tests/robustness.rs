@@ -7,12 +7,15 @@
 mod world;
 
 use glam::{DQuat, DVec3};
+use std::ops::RangeInclusive;
 use stipple::config::VioConfig;
 use stipple::frontend::{Track, Tracks};
 use stipple::output::metrics::trajectory_error;
-use stipple::vio::Vio;
+use stipple::vio::health::Health;
+use stipple::vio::residuals::{Mat15, Vec15};
+use stipple::vio::{Odometry, Vio};
 use stipple_drivers::{ImuSample, Nanos, Pose, TimedPose};
-use world::{room, Noise, Path, World, FRAME_SECS, RATE_HZ};
+use world::{room, Noise, Path, World, ACCEL_BIAS, FRAME_SECS, GYRO_BIAS, RATE_HZ};
 
 /// Inertial samples alone before the first frame, s.
 const BEFORE: f64 = 1.0;
@@ -29,7 +32,9 @@ struct Row {
     spoil: fn(usize, &mut Tracks),
     warp: fn(&mut ImuSample, &mut Noise),
     ate_max: f64,
-    resets_max: u64,
+    resets: RangeInclusive<u64>,
+    /// Bits that must have been set on some frame.
+    health: Health,
 }
 
 impl Default for Row {
@@ -45,7 +50,8 @@ impl Default for Row {
             spoil: |_, _| {},
             warp: |_, _| {},
             ate_max: 0.02,
-            resets_max: 0,
+            resets: 0..=0,
+            health: Health::default(),
         }
     }
 }
@@ -55,6 +61,9 @@ struct Run {
     /// Distance of the estimate from its first, at the end.
     travelled: f64,
     vio: Vio,
+    /// Of all frames.
+    health: Health,
+    quality: Vec<u8>,
 }
 
 fn flight(t: f64) -> Pose {
@@ -66,6 +75,11 @@ fn resting(_: f64) -> Pose {
 }
 
 fn run(row: &Row, seed: u64) -> Run {
+    run_checked(row, seed, |_, _, _| {})
+}
+
+/// As above; `check` sees every frame's odometry and covariance.
+fn run_checked(row: &Row, seed: u64, mut check: impl FnMut(usize, &Odometry, &[[f64; 15]; 15])) -> Run {
     let mut noise = Noise(seed);
     let points = (row.scene)(&mut noise);
     let mut world = World::seen_from(row.pose, points, Noise(seed + 1));
@@ -74,7 +88,7 @@ fn run(row: &Row, seed: u64) -> Run {
     let mut vio = Vio::new(&world.rig, &config);
     let mut tracks = Tracks::default();
     let (mut estimated, mut truth) = (Vec::new(), Vec::new());
-    let mut sample = 0;
+    let (mut sample, mut health, mut quality) = (0, Health::default(), Vec::new());
     for frame in 0..row.frames {
         let t = BEFORE + frame as f64 * FRAME_SECS + 0.0012;
         while (sample as f64) / RATE_HZ < t + 1.0 / RATE_HZ {
@@ -92,8 +106,14 @@ fn run(row: &Row, seed: u64) -> Run {
             continue;
         }
         truth.push(TimedPose { t: tracks.t, pose: (row.pose)(t) });
-        if let Some(o) = vio.on_tracks(&tracks).odometry {
+        let update = vio.on_tracks(&tracks);
+        health.set(update.health, true);
+        quality.push(update.quality);
+        if let Some(o) = update.odometry {
             assert!(o.world_from_body.is_finite(), "{}: not finite", row.name);
+            if let Some(c) = vio.covariance() {
+                check(frame, &o, c);
+            }
             estimated.push(TimedPose { t: o.t, pose: o.world_from_body });
         }
     }
@@ -102,7 +122,7 @@ fn run(row: &Row, seed: u64) -> Run {
         (Some(a), Some(b)) => a.pose.p.distance(b.pose.p),
         _ => f64::INFINITY,
     };
-    Run { ate, travelled, vio }
+    Run { ate, travelled, vio, health, quality }
 }
 
 #[test]
@@ -201,6 +221,13 @@ fn scatter(frame: usize, tracks: &mut Tracks) {
     }
 }
 
+/// An accelerometer that lies for two seconds.
+fn lean(s: &mut ImuSample, _: &mut Noise) {
+    if (5_000_000_000..7_000_000_000).contains(&s.t.0) {
+        s.accel_body += DVec3::new(8.0, 0.0, 0.0);
+    }
+}
+
 fn jitter(s: &mut ImuSample, noise: &mut Noise) {
     s.t = Nanos(s.t.0 + ((noise.uniform() - 0.5) * 4e6) as i64);
 }
@@ -210,21 +237,24 @@ fn rows() -> Vec<Row> {
     let row = Row::default;
     vec![
         Row { name: "clean", ..row() },
-        Row { name: "static start", pose: |t| Path { rest: 2.0 }.pose(t), ..row() },
+        Row { name: "static start", health: Health::ZERO_VELOCITY, pose: |t| Path { rest: 2.0 }.pose(t), ..row() },
         Row { name: "imu gap 5 ms", sample: |t| !(4.0..4.004).contains(&t), ..row() },
         Row { name: "imu gap 50 ms", sample: |t| !(4.0..4.05).contains(&t), ..row() },
-        Row { name: "imu gap 500 ms", sample: |t| !(4.0..4.5).contains(&t), ate_max: 0.03, ..row() },
+        Row { name: "imu gap 500 ms", health: Health::IMU_GAP, sample: |t| !(4.0..4.5).contains(&t), ate_max: 0.03, ..row() },
         Row { name: "imu stamps +-2 ms", warp: jitter, ate_max: 0.03, ..row() },
-        Row { name: "imu clipped", warp: clip, config: |c| (c.gyro_max, c.accel_max) = (0.3, 10.5), ate_max: 0.03, ..row() },
+        Row { name: "imu clipped", health: Health::IMU_SATURATED, warp: clip, config: |c| (c.gyro_max, c.accel_max) = (0.3, 10.5), ate_max: 0.03, ..row() },
         Row { name: "1 frame dropped", frame: |i| i != 80, ..row() },
         Row { name: "10 frames dropped", frame: |i| !(80..90).contains(&i), ate_max: 0.03, ..row() },
-        Row { name: "100 frames dropped", frames: 240, frame: |i| !(80..180).contains(&i), ate_max: 1.5, resets_max: 1, ..row() },
-        Row { name: "right camera blind", spoil: |i, t| if i > 60 { t.cameras[1].clear() }, ate_max: 0.05, ..row() },
-        Row { name: "left camera blind 1 s", spoil: |i, t| if (80..100).contains(&i) { t.cameras[0].clear() }, ate_max: 0.1, ..row() },
+        Row { name: "100 frames dropped", health: Health::DIVERGED_RESET, frames: 240, frame: |i| !(80..180).contains(&i), ate_max: 1.5, resets: 1..=1, ..row() },
+        Row { name: "right camera blind", health: Health::ONE_CAMERA_BLIND, spoil: |i, t| if i > 60 { t.cameras[1].clear() }, ate_max: 0.05, ..row() },
+        Row { name: "left camera blind 1 s", health: Health::ONE_CAMERA_BLIND, spoil: |i, t| if (80..100).contains(&i) { t.cameras[0].clear() }, ate_max: 0.1, ..row() },
         Row { name: "low texture: 20 tracks", spoil: |_, t| thin(t, 2), ate_max: 0.05, ..row() },
-        Row { name: "low texture: 10 tracks", spoil: |i, t| if i > 40 { thin(t, 1) }, ate_max: 0.1, ..row() },
-        Row { name: "dark 1 s", spoil: |i, t| if (80..100).contains(&i) { thin(t, 0) }, ate_max: 0.1, ..row() },
-        Row { name: "tracks scattered 1 s", frames: 200, spoil: |i, t| if (80..100).contains(&i) { scatter(i, t) }, ate_max: 0.5, resets_max: 1, ..row() },
+        Row { name: "low texture: 10 tracks", health: Health::FEW_LANDMARKS, spoil: |i, t| if i > 40 { thin(t, 1) }, ate_max: 0.1, ..row() },
+        Row { name: "dark 1 s", health: Health::NO_TRACKS, spoil: |i, t| if (80..100).contains(&i) { thin(t, 0) }, ate_max: 0.1, ..row() },
+        Row { name: "tracks scattered 1 s", frames: 200, spoil: |i, t| if (80..100).contains(&i) { scatter(i, t) }, ate_max: 0.5, resets: 0..=1, ..row() },
+        Row { name: "tracks scattered for good", spoil: |i, t| if i >= 80 { scatter(0, t) }, ate_max: 3.0, resets: 0..=9, ..row() },
+        Row { name: "dark 4 s", frames: 200, spoil: |i, t| if (60..140).contains(&i) { thin(t, 0) }, ate_max: 1.5, resets: 1..=1, health: Health::NO_TRACKS, ..row() },
+        Row { name: "accel 8 m/s2 wrong 2 s", warp: lean, frames: 200, ate_max: 1.5, resets: 1..=5, health: Health::DIVERGED_RESET, ..row() },
         Row { name: "pure rotation", pose: |t| turned(t, DVec3::ZERO), ..row() },
         Row { name: "hover", pose: hover, ..row() },
         Row { name: "free fall", pose: fall, ate_max: 0.03, ..row() },
@@ -239,17 +269,78 @@ fn rows() -> Vec<Row> {
 #[test]
 fn flights_gone_wrong_are_survived_or_noticed() {
     let mut failed = Vec::new();
-    eprintln!("{:24} {:>8} {:>7} {:>7} {:>6} {:>6} {:>6}", "", "ATE m", "resets", "outlier", "clip", "reject", "still");
+    let head = ["resets", "diverged", "outliers", "clipped", "gaps", "blind", "still", "quality"];
+    eprintln!("{:26} {:>7} {:>8}  health", "", "ATE m", head.map(|h| format!("{h:>8}")).join(" "));
     for row in rows() {
         let r = run(&row, 7);
         let s = r.vio.stats();
-        eprintln!(
-            "{:24} {:8.4} {:7} {:7} {:6} {:6} {:6}",
-            row.name, r.ate, s.resets, s.outliers, s.imu_saturated, s.imu_rejected, s.zero_velocity_updates
-        );
-        if !(r.ate < row.ate_max && s.resets <= row.resets_max) {
+        let half = &r.quality[r.quality.len() / 2..];
+        let quality = half.iter().map(|q| *q as u64).sum::<u64>() / half.len() as u64;
+        let numbers = [
+            s.resets,
+            s.divergences,
+            s.outliers,
+            s.imu_saturated,
+            s.imu_gaps,
+            s.camera_blind,
+            s.zero_velocity_updates,
+            quality,
+        ];
+        let reasons = r.health.reasons().collect::<Vec<_>>().join(" ");
+        eprintln!("{:26} {:7.4} {}  {reasons}", row.name, r.ate, numbers.map(|n| format!("{n:8}")).join(" "));
+        if !(r.ate < row.ate_max && row.resets.contains(&s.resets) && r.health.has(row.health)) {
             failed.push(row.name);
         }
     }
     assert!(failed.is_empty(), "{failed:?}");
+}
+
+/// Normalised squared error of 15 errors, mean over the frames of a flight, in the estimate's own world:
+/// truth is moved there by the position and yaw of the first frame.
+fn nees(seed: u64, config: fn(&mut VioConfig)) -> f64 {
+    let row = Row { name: "consistency", pose: |t| Path { rest: 2.0 }.pose(t), config, ..Row::default() };
+    let (mut sum, mut n) = (0.0, 0);
+    let mut to_estimate: Option<Pose> = None;
+    run_checked(&row, seed, |_, o, c| {
+        let t = o.t.0 as f64 * 1e-9;
+        let velocity = ((row.pose)(t + 1e-4).p - (row.pose)(t - 1e-4).p) / 2e-4;
+        let truth = (row.pose)(t);
+        let moved = *to_estimate.get_or_insert_with(|| {
+            let turn = o.world_from_body.q * truth.q.conjugate();
+            let yaw = DQuat::from_xyzw(0.0, 0.0, turn.z, turn.w).normalize();
+            Pose::new(yaw, o.world_from_body.p - yaw * truth.p)
+        });
+        let truth = moved * truth;
+        let angle = (o.world_from_body.q.conjugate() * truth.q).to_scaled_axis();
+        let parts = [
+            truth.p - o.world_from_body.p,
+            angle,
+            moved.q * velocity - o.v_world,
+            GYRO_BIAS - o.gyro_bias,
+            ACCEL_BIAS - o.accel_bias,
+        ];
+        let error = Vec15::from_fn(|i, _| parts[i / 3][i % 3]);
+        let covariance = Mat15::from_fn(|i, j| c[i][j]);
+        assert!((covariance - covariance.transpose()).norm() <= 1e-9 * covariance.norm(), "symmetric");
+        let factor = covariance.cholesky().expect("positive definite");
+        sum += error.dot(&factor.solve(&error));
+        n += 1;
+    });
+    sum / n as f64
+}
+
+#[test]
+fn covariance_is_positive_definite_and_as_large_as_the_errors() {
+    // As the world is made: the noise stated, and 0.3 px.
+    let honest = |c: &mut VioConfig| {
+        (c.gyro_noise_scale, c.accel_noise_scale, c.observation_sigma_px) = (1.0, 1.0, 0.3);
+    };
+    let mean = |config: fn(&mut VioConfig)| {
+        let all: Vec<f64> = (0..10).map(|seed| nees(100 + 10 * seed, config)).collect();
+        eprintln!("NEES of 15 over ten flights: {all:.1?}");
+        all.iter().sum::<f64>() / all.len() as f64
+    };
+    let (stated, default) = (mean(honest), mean(|_| {}));
+    eprintln!("mean: {stated:.2} with the world's noise, {default:.2} with the defaults, which claim less");
+    assert!((1.0..40.0).contains(&stated) && default < 15.0);
 }

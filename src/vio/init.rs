@@ -33,7 +33,7 @@ const ALIGN_SPAN: f64 = 0.45;
 const ALIGN_FRAMES_MIN: usize = 6;
 const ALIGN_FRAMES_MAX: usize = 64;
 /// Points a resection needs.
-const RESECTION_MIN: usize = 12;
+pub const RESECTION_MIN: usize = 12;
 const RESECTION_ITERATIONS: usize = 12;
 /// Misfit accepted: of the length of gravity, m/s², and of positions, m.
 const GRAVITY_MISFIT: f64 = 1.5;

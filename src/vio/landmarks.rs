@@ -95,6 +95,11 @@ impl Landmarks {
         (connected, unconnected)
     }
 
+    /// Views of one frame.
+    pub fn views_in(&self, slot: usize) -> usize {
+        self.pool.iter().map(|l| l.observations.iter().filter(|o| o.slot as usize == slot).count()).sum()
+    }
+
     /// Forgets a frame; landmarks hosted there or left with fewer than two views go.
     pub fn forget(&mut self, slot: usize) {
         self.retain_views(|l| l.host as usize != slot, |_, o| o.slot as usize != slot);

@@ -8,6 +8,7 @@
 //! Until motion and gravity are known (`init`) tracks give no odometry. The same input gives
 //! bit-identical output; `hash` proves it. Nothing is allocated after `new`.
 
+pub mod health;
 pub mod init;
 pub mod landmarks;
 pub mod marginalise;
@@ -27,12 +28,13 @@ use crate::frontend::Track;
 use crate::frontend::Tracks;
 use crate::limits::{CAMERAS_MAX, STATES};
 use crate::mem::Footprint;
-use glam::{DQuat, DVec3};
-use init::{Aligner, Start};
+use glam::DVec3;
+use health::{quality, Evidence, Health, Trusted, Watch};
+use init::{Aligner, Start, RESECTION_MIN};
 use landmarks::Landmarks;
 use marginalise::{marginalise, Prior};
 use preintegration::{ImuRing, Increment, Noise};
-use residuals::{Eye, InertialWeight, Motion};
+use residuals::{inertial_residual, Eye, InertialWeight, Motion};
 use rest::at_rest;
 use solve::{Model, Outcome, Solver};
 use stipple_drivers::{Calibration, ImuSample, Nanos, Pose};
@@ -46,6 +48,8 @@ const ACCEL_BIAS_MAX: f64 = 5.0;
 const GYRO_BIAS_MAX: f64 = 1.0;
 /// Inertia alone is not believed for longer than this, s; the ring of samples may not hold more either.
 const FRAME_GAP_MAX: f64 = 2.0;
+/// A camera with fewer than one in so many of another's tracks is blind.
+const BLIND_FRACTION: usize = 10;
 
 /// The estimate at one instant.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -69,6 +73,9 @@ pub struct Update {
     /// Tracks of camera 0 that are landmarks.
     pub connected: usize,
     pub outcome: Outcome,
+    pub health: Health,
+    /// 0 to 100, see `health::quality`.
+    pub quality: u8,
 }
 
 /// What was dropped, refused, or went wrong so far.
@@ -86,6 +93,12 @@ pub struct Stats {
     pub outliers: u64,
     pub solver_failures: u64,
     pub resets: u64,
+    /// Resets because vision and inertia disagreed, or nothing was seen for too long.
+    pub divergences: u64,
+    /// Holes in the inertial samples.
+    pub imu_gaps: u64,
+    /// Frames of which a camera saw next to nothing while another did.
+    pub camera_blind: u64,
     pub iterations: u64,
     /// Frames held still because nothing moved.
     pub zero_velocity_updates: u64,
@@ -105,8 +118,12 @@ pub struct Vio {
     solver: Solver,
     aligner: Aligner,
     running: bool,
-    /// Where the last sane output was: a restart goes on from there.
-    last_pose: Option<Pose>,
+    /// Where the last trusted output was: a restart goes on from there.
+    trusted: Option<Trusted>,
+    watch: Watch,
+    /// What the inertial samples since the last frame suffered.
+    pending: Health,
+    covariance: Option<[[f64; 15]; 15]>,
     frames_since_keyframe: u32,
     stats: Stats,
     hash: u64,
@@ -127,7 +144,10 @@ impl Vio {
             solver: Solver::new(),
             aligner: Aligner::new(),
             running: false,
-            last_pose: None,
+            trusted: None,
+            watch: Watch::default(),
+            pending: Health::default(),
+            covariance: None,
             frames_since_keyframe: 0,
             stats: Stats::default(),
             hash: FNV_START,
@@ -148,10 +168,15 @@ impl Vio {
     pub fn on_imu(&mut self, s: ImuSample) {
         if !s.is_finite() || self.imu.newest().is_some_and(|n| s.t <= n.t) {
             self.stats.imu_rejected += 1;
+            self.pending.set(Health::IMU_REJECTED, true);
             return;
         }
+        let gap = self.imu.newest().is_some_and(|n| self.noise.is_gap((s.t - n.t).secs()));
+        self.stats.imu_gaps += gap as u64;
+        self.pending.set(Health::IMU_GAP, gap);
         let clipped = self.noise.clipped(s.gyro_body, s.accel_body);
         self.stats.imu_saturated += (clipped.0 || clipped.1) as u64;
+        self.pending.set(Health::IMU_SATURATED, clipped.0 || clipped.1);
         let overwritten = self.imu.push(s);
         let needed_from = self.window.newest().map(|n| self.window.frame(n).t);
         if let (Some(old), Some(t)) = (overwritten, needed_from) {
@@ -169,6 +194,7 @@ impl Vio {
             return Update::default();
         }
         self.stats.frames += 1;
+        let resets = self.stats.resets;
         if self.running && last.is_some_and(|t| (tracks.t - t).secs() > FRAME_GAP_MAX) {
             self.reset();
         }
@@ -177,19 +203,46 @@ impl Vio {
             self.reset();
             update = Update::default();
         }
-        self.last_pose = update.odometry.map(|o| o.world_from_body).or(self.last_pose);
+        update.health = self.health_of(tracks, &update);
+        update.health.set(Health::DIVERGED_RESET, self.stats.resets > resets);
+        self.stats.camera_blind += update.health.has(Health::ONE_CAMERA_BLIND) as u64;
+        update.quality = quality(self.covariance(), update.connected);
+        if let (Some(o), true) = (update.odometry, self.watch.trusts()) {
+            self.trusted = Some(Trusted::at(&o, self.covariance(), self.trusted.as_ref()));
+        }
         update
+    }
+
+    fn health_of(&mut self, tracks: &Tracks, update: &Update) -> Health {
+        let mut h = std::mem::take(&mut self.pending);
+        let seen = tracks.cameras[..self.model.eyes.len()].iter().map(|c| c.len());
+        let (least, most) = seen.fold((usize::MAX, 0), |(a, b), n| (a.min(n), b.max(n)));
+        let held = self.imu.newest().is_none_or(|n| self.noise.is_gap((tracks.t - n.t).secs()));
+        let rests = self.window.newest().is_some_and(|n| self.window.frame(n).rest.is_some());
+        h.set(Health::INITIALISING, !self.running);
+        h.set(Health::NO_TRACKS, most == 0);
+        h.set(Health::FEW_LANDMARKS, update.connected < CONNECTED_FEW);
+        h.set(Health::IMU_GAP, held);
+        h.set(Health::SOLVER_FAILED, update.outcome.failures > 0);
+        h.set(Health::ZERO_VELOCITY, rests);
+        h.set(Health::ONE_CAMERA_BLIND, BLIND_FRACTION * least < most);
+        h
     }
 
     /// First frame of the window, once motion and gravity are known.
     fn try_start(&mut self, tracks: &Tracks) -> Update {
-        let Some(Start { mut motion, sigma }) =
+        // Without anything to see, the mean force would start a flight that nothing corrects.
+        if tracks.cameras[0].len() < RESECTION_MIN {
+            return Update::default();
+        }
+        let Some(Start { mut motion, mut sigma }) =
             self.aligner.add(tracks, &self.imu, &self.noise, &self.model, &self.config)
         else {
             return Update::default();
         };
-        if let Some(last) = &self.last_pose {
-            motion = go_on_from(last, &motion);
+        if let Some(last) = &self.trusted {
+            motion = last.go_on(&motion);
+            last.widen(tracks.t, &mut sigma);
         }
         let Some(slot) = self.window.push(Frame::first(tracks.t, motion)) else { return Update::default() };
         self.window.frame_mut(slot).fix_anchor();
@@ -227,8 +280,19 @@ impl Vio {
         let outcome = self.solver.optimise(&mut self.window, &mut self.landmarks, &self.prior, &self.model);
         self.stats.solver_failures += outcome.failures as u64;
         self.stats.iterations += outcome.iterations as u64;
+        self.covariance = self.solver.newest_covariance();
+        let views = self.landmarks.views_in(slot);
         let dropped = self.landmarks.drop_outliers(&self.window, &self.model.eyes, self.config.outlier_px);
         self.stats.outliers += dropped as u64;
+        let f = self.window.frame(slot);
+        let misfit =
+            inertial_residual(&f.increment, &f.weight, &self.window.frame(before).now, &f.now).norm_squared() / 15.0;
+        let inliers = self.landmarks.views_in(slot);
+        if self.watch.diverged(&Evidence { t: f.t, views, inliers, misfit }) {
+            self.stats.divergences += 1;
+            self.reset();
+            return Update { outcome, ..Update::default() };
+        }
         let update = self.output(slot, keyframe, connected, outcome);
         marginalise(&mut self.window, &mut self.landmarks, &mut self.prior, &mut self.solver, &self.model);
         update
@@ -270,7 +334,7 @@ impl Vio {
                 self.hash = fnv(self.hash, x.to_bits());
             }
         }
-        Update { odometry: Some(odometry), keyframe, connected, outcome }
+        Update { odometry: Some(odometry), keyframe, connected, outcome, ..Update::default() }
     }
 
     fn is_sane(&self) -> bool {
@@ -287,8 +351,16 @@ impl Vio {
         self.prior.clear();
         self.aligner.clear();
         self.running = false;
+        self.watch = Watch::default();
+        self.covariance = None;
         self.frames_since_keyframe = 0;
         self.stats.resets += 1;
+    }
+
+    /// Covariance of the newest state, errors [p, θ, v, bg, ba]: p and v in the world, θ on the right of the
+    /// rotation. `None` until a frame has been optimised.
+    pub fn covariance(&self) -> Option<&[[f64; 15]; 15]> {
+        self.covariance.as_ref()
     }
 
     /// The newest state carried by the inertial samples to `t`. `None` until initialised.
@@ -333,15 +405,6 @@ impl Vio {
 
 fn odometry(t: Nanos, m: &Motion) -> Odometry {
     Odometry { t, world_from_body: m.pose, v_world: m.v, gyro_bias: m.bg, accel_bias: m.ba }
-}
-
-/// Position and yaw of `last`, the rest of `start`.
-fn go_on_from(last: &Pose, start: &Motion) -> Motion {
-    let turn = last.q * start.pose.q.conjugate();
-    // The part of the turn about the world's axis; none is left when it is half a turn about a level axis.
-    let twist = DQuat::from_xyzw(0.0, 0.0, turn.z, turn.w);
-    let twist = if twist.length_squared() > 1e-12 { twist.normalize() } else { DQuat::IDENTITY };
-    Motion { pose: Pose::new(twist * start.pose.q, last.p), v: twist * start.v, ..*start }
 }
 
 const FNV_START: u64 = 0xcbf2_9ce4_8422_2325;
@@ -463,7 +526,7 @@ mod tests {
         let mut world = World::new(Path { rest: -1.0 });
         let mut vio = Vio::new(&world.rig, &VioConfig::default());
         run(&mut vio, 0..60, &mut world);
-        let before = vio.last_pose.expect("running");
+        let before = vio.trusted.expect("running").pose;
         vio.reset();
         run(&mut vio, 60..80, &mut world);
         assert!(vio.running && vio.stats.resets == 1);

@@ -59,6 +59,11 @@ impl Noise {
         }
     }
 
+    /// Whether samples this far apart, s, have others missing between them.
+    pub fn is_gap(&self, dt: f64) -> bool {
+        dt > GAP_PERIODS * self.period
+    }
+
     /// Whether the (gyro, accelerometer) is at the end of its range on any axis.
     pub fn clipped(&self, gyro: DVec3, accel: DVec3) -> (bool, bool) {
         let at_end = |x: DVec3, max: f64| x.abs().max_element() >= RANGE_FRACTION * max;
@@ -174,7 +179,7 @@ impl Increment {
         put(&mut h, 0, 0, &(v_a * (0.5 * dt)));
         put(&mut h, 6, 0, &v_a);
 
-        let gap = dt > GAP_PERIODS * noise.period;
+        let gap = noise.is_gap(dt);
         let (sg, sa) =
             if gap { (noise.gyro.max(GAP_GYRO), noise.accel.max(GAP_ACCEL)) } else { (noise.gyro, noise.accel) };
         self.covariance = f * self.covariance * f.transpose()

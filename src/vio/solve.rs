@@ -5,7 +5,9 @@
 
 use super::landmarks::{Landmark, Landmarks};
 use super::marginalise::Prior;
-use super::residuals::{huber, inertial_jacobians, inertial_residual, predict, reproject, Eye, Point, Reprojection};
+use super::residuals::{
+    huber, inertial_jacobians, inertial_residual, predict, reproject, Eye, Mat15, Point, Reprojection,
+};
 use super::rest::{add_rest, rest_cost};
 use super::window::{Layout, Window, FRAMES};
 use crate::config::VioConfig;
@@ -372,6 +374,17 @@ impl Solver {
             }
         }
         steps
+    }
+
+    /// Covariance of the newest state from the last linearisation, all else eliminated. Its columns are
+    /// the last ones of `Layout::of`. `None` when the normal equations do not determine it.
+    pub fn newest_covariance(&mut self) -> Option<[[f64; 15]; 15]> {
+        let first = self.system.dim.checked_sub(15)?;
+        self.factor.copy_from(&self.system);
+        self.factor.eliminate(first);
+        let information = Mat15::from_fn(|i, j| self.factor.at(first + i, first + j));
+        let covariance = information.cholesky()?.inverse();
+        covariance.iter().all(|x| x.is_finite()).then(|| covariance.into())
     }
 
     pub fn optimise(

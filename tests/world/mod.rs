@@ -31,8 +31,8 @@ impl Noise {
 pub const RATE_HZ: f64 = 200.0;
 pub const FRAME_SECS: f64 = 0.05;
 const SIGMA_PX: f64 = 0.3;
-const GYRO_BIAS: DVec3 = DVec3::new(-0.003, 0.02, 0.07);
-const ACCEL_BIAS: DVec3 = DVec3::new(-0.02, 0.1, 0.05);
+pub const GYRO_BIAS: DVec3 = DVec3::new(-0.003, 0.02, 0.07);
+pub const ACCEL_BIAS: DVec3 = DVec3::new(-0.02, 0.1, 0.05);
 
 pub fn calibration() -> Calibration {
     let lens = Lens::Radtan { k1: -0.28, k2: 0.07, p1: 2e-4, p2: 2e-5 };
