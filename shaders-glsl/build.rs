@@ -4,6 +4,9 @@
 //! it, `emit.rs` writes `$OUT_DIR/kernels.rs`. A kernel with the line `// variants: subgroup` is compiled once
 //! more with `SUBGROUP` defined; the pipeline takes the variant where the device has what it declares.
 
+#[path = "../drivers/build.rs"]
+#[allow(dead_code)] // its `main`
+mod drivers_build;
 mod emit;
 mod reflect;
 
@@ -12,6 +15,7 @@ use std::process::Command;
 
 fn main() {
     opencv_shim();
+    drivers_build::recordings("../shared/data");
     println!("cargo:rerun-if-changed=shaders-glsl");
     if let Err(errors) = kernels() {
         for e in errors {

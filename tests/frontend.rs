@@ -297,6 +297,7 @@ fn judge(name: &str, recording: &Recording, config: &FrontendConfig) -> [f64; 5]
 }
 
 #[test]
+#[cfg_attr(not(recordings), ignore = "no recordings")]
 fn shaken_recording_agrees_with_its_ground_truth() {
     let Some(recording) = recording("euroc_MH_01_easy_11s") else { return };
     let [points, stereo, length, one, five] = judge("MH_01", &recording, &FrontendConfig::default());
@@ -305,6 +306,7 @@ fn shaken_recording_agrees_with_its_ground_truth() {
 }
 
 #[test]
+#[cfg_attr(not(recordings), ignore = "no recordings")]
 fn fisheye_recording_agrees_with_its_ground_truth() {
     let Some(recording) = recording("tumvi_room1_fisheye_16") else { return };
     let config = FrontendConfig { grid_px: 70, ..FrontendConfig::default() };
@@ -314,6 +316,7 @@ fn fisheye_recording_agrees_with_its_ground_truth() {
 }
 
 #[test]
+#[cfg_attr(not(recordings), ignore = "no recordings")]
 fn at_rest_points_stay() {
     let Some(recording) = recording("euroc_V1_01_easy_static_1s") else { return };
     let [points, stereo, length, one, five] = judge("V1_01 at rest", &recording, &FrontendConfig::default());

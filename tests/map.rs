@@ -166,6 +166,7 @@ fn play(mapper: &mut Mapper, recording: &Recording, keyframes: usize, steps: u32
 }
 
 #[test]
+#[cfg_attr(not(recordings), ignore = "no recordings")]
 fn recorded_room_becomes_a_map() {
     let Some(path) = recording("euroc_V1_01_easy_keyframes") else {
         return println!("ignored: recorded_room_becomes_a_map: no recordings");

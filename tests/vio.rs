@@ -208,6 +208,7 @@ fn trace(i: usize, tracks: &Tracks, vio: &Vio, u: &stipple::vio::Update, truth: 
 }
 
 #[test]
+#[cfg_attr(not(recordings), ignore = "no recordings")]
 fn shaken_recording_stays_within_five_centimetres() {
     let Some((run, ms)) = replay("euroc_MH_01_easy_11s") else { return };
     eprintln!("tracker {:.1} ms, estimator {:.1} ms a frame", ms[0], ms[1]);
@@ -215,12 +216,14 @@ fn shaken_recording_stays_within_five_centimetres() {
 }
 
 #[test]
+#[cfg_attr(not(recordings), ignore = "no recordings")]
 fn resting_recording_starts_at_rest_and_stays() {
     let Some((run, _)) = replay("euroc_V1_01_easy_static_1s") else { return };
     check("V1_01 at rest", &run, 8, 0.005);
 }
 
 #[test]
+#[cfg_attr(not(recordings), ignore = "no recordings")]
 fn fisheye_recording_is_followed() {
     let Some((run, _)) = replay("tumvi_room1_fisheye_16") else { return };
     check("TUM-VI room1, 16 frames", &run, 4, 0.01);

@@ -100,6 +100,7 @@ fn pixels_come_back_over_the_whole_image() {
 }
 
 #[test]
+#[cfg_attr(not(recordings), ignore = "no recordings")]
 fn pixels_come_back_for_every_recorded_calibration() {
     let beside = || Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/data");
     let root = std::env::var_os("STIPPLE_RECORDINGS").map_or_else(beside, PathBuf::from);

@@ -32,6 +32,7 @@ fn assert_clean(path: &Path, pairs: usize) -> Recording {
 }
 
 #[test]
+#[cfg_attr(not(recordings), ignore = "no recordings")]
 fn euroc_png_recording_is_clean() {
     let Some(path) = recorded("euroc_png_recording_is_clean", "euroc_MH_01_easy_11s") else { return };
     let r = assert_clean(&path, 220);
@@ -44,12 +45,14 @@ fn euroc_png_recording_is_clean() {
 }
 
 #[test]
+#[cfg_attr(not(recordings), ignore = "no recordings")]
 fn euroc_jpeg_recording_is_clean() {
     let Some(path) = recorded("euroc_jpeg_recording_is_clean", "euroc_V1_01_easy_keyframes") else { return };
     assert_eq!(assert_clean(&path, 100).imu.len(), 27501);
 }
 
 #[test]
+#[cfg_attr(not(recordings), ignore = "no recordings")]
 fn euroc_static_recording_is_clean() {
     let Some(path) = recorded("euroc_static_recording_is_clean", "euroc_V1_01_easy_static_1s") else { return };
     let r = assert_clean(&path, 20);
@@ -58,6 +61,7 @@ fn euroc_static_recording_is_clean() {
 }
 
 #[test]
+#[cfg_attr(not(recordings), ignore = "no recordings")]
 fn tumvi_16_bit_recording_is_clean() {
     let Some(path) = recorded("tumvi_16_bit_recording_is_clean", "tumvi_room1_fisheye_16") else { return };
     let r = assert_clean(&path, 16);
@@ -69,6 +73,7 @@ fn tumvi_16_bit_recording_is_clean() {
 }
 
 #[test]
+#[cfg_attr(not(recordings), ignore = "no recordings")]
 fn trajectories_of_whole_flights_are_clean() {
     for flight in ["MH_04_difficult", "V1_02_medium", "V2_02_medium"] {
         let name = format!("euroc_text/{flight}/state_groundtruth_estimate0.csv");
@@ -79,6 +84,7 @@ fn trajectories_of_whole_flights_are_clean() {
 }
 
 #[test]
+#[cfg_attr(not(recordings), ignore = "no recordings")]
 fn basalt_calibrations_are_read_and_unknown_lenses_refused() {
     let name = "basalt_calibrations_are_read_and_unknown_lenses_refused";
     let Some(dir) = recorded(name, "calibration") else { return };
@@ -98,6 +104,7 @@ fn basalt_calibrations_are_read_and_unknown_lenses_refused() {
 }
 
 #[test]
+#[cfg_attr(not(recordings), ignore = "no recordings")]
 fn truncated_jpeg_is_undecodable() {
     let Some(path) = recorded("truncated_jpeg_is_undecodable", "euroc_V1_01_easy_keyframes") else { return };
     let r = Recording::open(&path, &OpenOptions::default()).unwrap();

@@ -254,6 +254,7 @@ fn a_fisheye_camera_is_rendered_over_its_whole_domain() {
 }
 
 #[test]
+#[cfg_attr(not(recordings), ignore = "no recordings")]
 fn recorded_flights_stay_in_their_room_and_keep_their_velocity() {
     let Some(root) = recordings("recorded_flights_stay_in_their_room_and_keep_their_velocity") else { return };
     for name in ["MH_04_difficult", "V1_02_medium", "V2_02_medium"] {
