@@ -119,6 +119,11 @@ impl Tracking {
                     ("outliers", v.outliers),
                     ("solver_failures", v.solver_failures),
                     ("resets", v.resets),
+                    ("divergences", v.divergences),
+                    ("imu_gaps", v.imu_gaps),
+                    ("imu_saturated", v.imu_saturated),
+                    ("camera_blind", v.camera_blind),
+                    ("zero_velocity_updates", v.zero_velocity_updates),
                 ]);
                 list
             }
