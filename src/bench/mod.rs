@@ -95,7 +95,7 @@ fn fly(inputs: &[Input], settings: Vec<Setting>, seconds: f64) -> Result<Sweep, 
             let figures = measure(&flight, &setting.board)?;
             let ate = figures.ate_m.map_or("none".to_string(), |m| format!("{m:.4} m"));
             eprintln!(
-                "{:6.1} s  {} of {}  {:<24} {:<34} ATE {ate}, {:.2} ms a frame",
+                "{:6.1} s  {} of {}  {:<30} {:<32} ATE {ate}, {:.2} ms a frame",
                 start.elapsed().as_secs_f64(),
                 i + 1,
                 inputs.len(),

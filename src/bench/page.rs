@@ -8,13 +8,13 @@ use std::fmt::Write as _;
 use std::io::{self, Write};
 
 const STYLE: &str = include_str!("../output/report.css");
-/// On top of the reports' style: settings that are not of the curve are points without a line, of
+/// On top of the reports' style: settings that are not on the front are points without a line, of
 /// which only a first dot stays, for the legend.
 const MORE_STYLE: &str = ".line.ink3 { stroke-width: 5.2; stroke-dasharray: 0 9999; } .dot.ink3 { fill: var(--ink3); opacity: .6; } \
     .wide-table { overflow-x: auto; } .wide-table td, .wide-table th { padding-left: 10px; font-size: 13.5px; } \
     .wide-table td { font-weight: 400; } tr.default td, tr.default th { font-weight: 700; } \
     thead th { text-align: right; color: var(--soft); border-top: 0; } .wide-table th:first-child { text-align: left; padding-left: 0; }";
-/// Errors this many times the default's are drawn along the upper edge.
+/// Errors of more than this many times the default's are drawn at that height.
 const CUT: f64 = 3.0;
 const CM: f64 = 100.0;
 
@@ -30,7 +30,7 @@ pub fn write(out: &mut impl Write, sweep: &Sweep) -> io::Result<()> {
     let (inputs, settings) = (sweep.inputs.len(), sweep.settings.len());
     write!(out, "<p class=\"what\">{inputs} inputs, {frames} stereo frames, {settings} settings; frontend and estimator on one thread, no mapper</p></header>")?;
     write!(out, "<section><h2>Knee</h2><p>{}</p>", escape(&tables::conclusion(sweep)))?;
-    write!(out, "<p class=\"note\">ATE after rigid alignment. Over all inputs: geometric mean of the errors, mean of the CPU time. Stages are wall time, so their 99th percentile holds what else the machine did.</p></section>")?;
+    write!(out, "<p class=\"note\">ATE after rigid alignment. Over all inputs: geometric mean of the errors, mean of the CPU time. Stages are wall time, so their 99th percentile holds what else the machine did. Errors above {CUT} times the default's are drawn at that height. Run times repeat to a few per cent, and the error of one flight moves by tens of per cent between settings that differ in nothing that matters: read the curves over all inputs first.</p></section>")?;
     out.write_all(defaults(sweep).as_bytes())?;
     let points = sweep.points();
     let charts: Vec<_> = curves(&sweep.settings).iter().map(|c| parameter(c, &points)).collect();
@@ -134,8 +134,8 @@ fn settings_table(sweep: &Sweep) -> String {
         let cells = vec![
             setting.name.clone(),
             if setting.set.len() > 1 { setting.set.join(" ") } else { String::new() },
-            number(o.map(|o| o.ate_m * CM), 2),
-            number(o.map(|o| o.ate_worst_m * CM), 2),
+            number(o.map(|o| o.ate_m * CM), 3),
+            number(o.map(|o| o.ate_worst_m * CM), 3),
             number(o.map(|o| o.cpu_ms_per_frame), 2),
             mark.into(),
         ];
@@ -147,27 +147,22 @@ fn settings_table(sweep: &Sweep) -> String {
 }
 
 fn chart(title: &str, mut series: Vec<Series>, points: &Points) -> Option<String> {
-    let scaled = |s: &mut Series| s.points.iter_mut().for_each(|p| p.1 *= CM);
+    let cut = points.first().copied().flatten().map_or(f64::INFINITY, |p| CUT * p.1);
+    let scaled = |s: &mut Series| s.points.iter_mut().for_each(|p| p.1 = CM * p.1.min(cut));
     series.iter_mut().for_each(scaled);
-    let cut = points.first().copied().flatten().map(|p| CUT * CM * p.1);
     let x = "CPU time a frame, ms";
-    Chart { title, x, y: "ATE, cm", series, from_zero: true, y_max: cut, ..Chart::default() }.svg()
+    Chart { title, x, y: "ATE, cm", series, from_zero: true, ..Chart::default() }.svg()
 }
 
 fn dots<'a>(name: &'a str, ink: u8, points: Vec<(f64, f64)>) -> Series<'a> {
     Series { name, ink, dots: true, points }
 }
 
-/// The curve of a parameter before all other settings.
+/// The curve of a parameter, in the order of its values.
 fn parameter(curve: &Curve, points: &Points) -> Option<String> {
     let along = curve.settings.iter().filter_map(|s| points[*s]).collect();
-    let others = (0..points.len()).filter(|s| !curve.settings.contains(s)).filter_map(|s| points[s]).collect();
     let title = format!("{}: {}", curve.name, curve.values.join(", "));
-    let series = vec![
-        dots("all others", 3, others),
-        dots("along the parameter", 1, along),
-        dots(DEFAULT, 2, points[0].into_iter().collect()),
-    ];
+    let series = vec![dots("along the parameter", 1, along), dots(DEFAULT, 2, points[0].into_iter().collect())];
     chart(&title, series, points)
 }
 
