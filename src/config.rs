@@ -17,6 +17,8 @@ pub struct Board {
     pub memory_max_mib: u64,
     pub budget: Budget,
     #[serde(default)]
+    pub rig: RigConfig,
+    #[serde(default)]
     pub frontend: FrontendConfig,
     #[serde(default)]
     pub vio: VioConfig,
@@ -43,6 +45,16 @@ pub struct Budget {
     /// Widest camera image the board accepts, px.
     pub image_width_max: u32,
     pub image_height_max: u32,
+}
+
+/// What the board knows of its sensors and their calibration does not say.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct RigConfig {
+    /// The cameras have a rolling shutter.
+    pub rolling_shutter: bool,
+    /// First row to last, s; 0: as the calibration says.
+    pub readout_s: f64,
 }
 
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -306,6 +318,11 @@ impl Board {
                 "frontend.fast_threshold",
                 "must not be less than frontend.fast_threshold_min",
             ),
+            (
+                self.rig.readout_s > 0.0 || !self.rig.rolling_shutter,
+                "rig.rolling_shutter",
+                "needs rig.readout_s: without the time of a readout every image would bend",
+            ),
             (self.stereo.depth_max_m > self.stereo.depth_min_m, "stereo.depth_max_m", "must exceed stereo.depth_min_m"),
             (
                 self.budget.intersections >= self.budget.splats,
@@ -364,6 +381,8 @@ const BOUNDS: &[(&str, Bound)] = &[
     ("budget.keyframes", Within(2.0, 4096.0)),
     ("budget.image_width_max", Within(64.0, 4096.0)),
     ("budget.image_height_max", Within(64.0, 4096.0)),
+    // Above a tenth of a second the body's motion between rows is no longer of first order.
+    ("rig.readout_s", Within(0.0, 0.1)),
     ("frontend.grid_px", Within(16.0, 200.0)),
     ("frontend.fast_threshold", Within(1.0, 255.0)),
     ("frontend.fast_threshold_min", Within(1.0, 255.0)),

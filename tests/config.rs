@@ -79,6 +79,9 @@ fn values_that_contradict_each_other_are_named() {
     let text = format!("{BOARD}[stereo]\ndepth_min_m = 3.0\ndepth_max_m = 2.0\n");
     refused(parse(&text, &[]), Exit::Config, &["test.toml:15", "stereo.depth_max_m", "depth_min_m"]);
     refused(parse(BOARD, &["budget.intersections=5000"]), Exit::Config, &["--set budget.intersections=5000", "splats"]);
+    let rolling = parse(BOARD, &["rig.rolling_shutter=true"]);
+    refused(rolling, Exit::Config, &["--set rig.rolling_shutter=true", "readout_s"]);
+    assert!(parse(BOARD, &["rig.readout_s=0.02", "rig.rolling_shutter=true"]).is_ok());
     // The key at fault may be a default that the file does not write.
     let text = format!("{BOARD}[frontend]\nfast_threshold_min = 90\n");
     refused(parse(&text, &[]), Exit::Config, &["test.toml", "default", "fast_threshold"]);

@@ -11,7 +11,7 @@ use stipple::limits::TRACKS;
 use stipple::mem::{heap_after_seal, seal_thread, unsealed, CountingAllocator};
 use stipple_drivers::replay::{OpenOptions, Recording};
 use stipple_drivers::types::pose_at;
-use stipple_drivers::{Calibration, Camera, Frames, ImuCalibration, Lens, Nanos, Pose, RigCamera, Span};
+use stipple_drivers::{Calibration, Camera, Frames, ImuCalibration, ImuCorrection, Lens, Nanos, Pose, RigCamera, Span};
 
 #[global_allocator]
 static HEAP: CountingAllocator = CountingAllocator;
@@ -23,8 +23,15 @@ fn rig(width: usize, height: usize) -> Calibration {
     let lens = Lens::Radtan { k1: 0.0, k2: 0.0, p1: 0.0, p2: 0.0 };
     let (cx, cy) = ((width - 1) as f64 / 2.0, (height - 1) as f64 / 2.0);
     let camera = Camera { width, height, fx: FOCAL_PX, fy: FOCAL_PX, cx, cy, lens };
-    let at = |x: f64| RigCamera { camera, body_from_cam: Pose::new(DQuat::IDENTITY, DVec3::new(x, 0.0, 0.0)) };
-    let imu = ImuCalibration { rate_hz: 200.0, gyro_noise: 1e-4, gyro_walk: 1e-5, accel_noise: 1e-3, accel_walk: 1e-4 };
+    let at = |x: f64| RigCamera::new(camera, Pose::new(DQuat::IDENTITY, DVec3::new(x, 0.0, 0.0)));
+    let imu = ImuCalibration {
+        rate_hz: 200.0,
+        gyro_noise: 1e-4,
+        gyro_walk: 1e-5,
+        accel_noise: 1e-3,
+        accel_walk: 1e-4,
+        correction: ImuCorrection::NONE,
+    };
     Calibration { cameras: vec![at(0.0), at(BASELINE)], imu }
 }
 

@@ -1,24 +1,41 @@
-//! Camera models and the calibration of a rig.
+//! Camera models.
 //!
-//! Pinhole with radial-tangential distortion (Brown; OpenCV's order k1 k2 p1 p2), Kannala-Brandt
-//! (KB4, "equidistant"), and double sphere (Usenko et al., 3DV 2018). `project` takes a point in
-//! the camera frame (x right, y down, z forward, metres) to pixels (integer = pixel centre);
-//! `unproject` gives the unit bearing. Both answer `None` outside the model's domain, so a
-//! returned value is always finite and invertible. Radtan: the domain ends where the radial
-//! polynomial stops growing, else far off-axis points would fold back into the image.
+//! Pinhole with radial-tangential distortion (Brown; OpenCV's order k1 k2 p1 p2), the same with a
+//! rational radial part (OpenCV's eight coefficients), Kannala-Brandt (KB4, "equidistant"), and double
+//! sphere (Usenko et al., 3DV 2018). `project` takes a point in the camera frame (x right, y down, z
+//! forward, metres) to pixels (integer = pixel centre); `unproject` gives the unit bearing. Both answer
+//! `None` outside the model's domain, so a returned value is always finite and invertible. Radtan and
+//! rational: the domain ends where the radius stops growing, else far off-axis points would fold back
+//! into the image.
 
 // `!(a > b)` and not `a <= b`: it also refuses NaN.
 #![allow(clippy::neg_cmp_op_on_partial_ord)]
 
-use crate::types::Pose;
 use glam::{DVec2, DVec3};
 use std::f64::consts::PI;
 
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Lens {
-    Radtan { k1: f64, k2: f64, p1: f64, p2: f64 },
-    KannalaBrandt { k: [f64; 4] },
-    DoubleSphere { xi: f64, alpha: f64 },
+    Radtan {
+        k1: f64,
+        k2: f64,
+        p1: f64,
+        p2: f64,
+    },
+    /// Radial factor (1 + k1 u + k2 u² + k3 u³) / (1 + k4 u + k5 u² + k6 u³), u = r²; see `Lens::rational`.
+    Rational {
+        k: [f64; 6],
+        p1: f64,
+        p2: f64,
+        r2_max: f64,
+    },
+    KannalaBrandt {
+        k: [f64; 4],
+    },
+    DoubleSphere {
+        xi: f64,
+        alpha: f64,
+    },
 }
 
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -35,34 +52,27 @@ pub struct Camera {
 /// Rows of d(px)/d(point), px/m.
 pub type ProjectionJacobian = [[f64; 3]; 2];
 
-/// A camera of the rig and where it sits.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct RigCamera {
-    pub camera: Camera,
-    pub body_from_cam: Pose,
-}
-
-/// Continuous-time noise densities and range of the inertial unit.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct ImuCalibration {
-    pub rate_hz: f64,
-    /// rad/s/√Hz
-    pub gyro_noise: f64,
-    /// rad/s²/√Hz
-    pub gyro_walk: f64,
-    /// m/s²/√Hz
-    pub accel_noise: f64,
-    /// m/s³/√Hz
-    pub accel_walk: f64,
-}
-
-#[derive(Clone, Debug, PartialEq)]
-pub struct Calibration {
-    pub cameras: Vec<RigCamera>,
-    pub imu: ImuCalibration,
-}
-
 const Z_MIN: f64 = 1e-6;
+/// Squared radius 89.4 degrees off axis: as far as a pinhole goes.
+const R2_UNBOUNDED: f64 = 1e4;
+
+impl Lens {
+    /// The domain ends where the calibration says (`r_max` of x/z, y/z; 0: it does not say), and not
+    /// beyond the place where the radius stops growing, which is found by steps of 0.1 % of it.
+    pub fn rational(k: [f64; 6], p1: f64, p2: f64, r_max: f64) -> Lens {
+        let end = if r_max > 0.0 { r_max.min(R2_UNBOUNDED.sqrt()) } else { R2_UNBOUNDED.sqrt() };
+        let mut r = 1e-3;
+        while r < end {
+            let (radial, slope) = rational_radial(r * r, &k);
+            if !(radial > 0.0 && radial + 2.0 * r * r * slope > 0.0) {
+                break;
+            }
+            r *= 1.001;
+        }
+        let r = r.min(end) / 1.001;
+        Lens::Rational { k, p1, p2, r2_max: r * r }
+    }
+}
 
 impl Camera {
     pub fn contains(&self, px: DVec2, margin: f64) -> bool {
@@ -80,7 +90,10 @@ impl Camera {
     /// Pixel and d(px)/d(p_cam).
     pub fn project_with_jacobian(&self, p: DVec3) -> Option<(DVec2, ProjectionJacobian)> {
         let (m, dm) = match self.lens {
-            Lens::Radtan { k1, k2, p1, p2 } => radtan(p, k1, k2, p1, p2)?,
+            Lens::Radtan { k1, k2, p1, p2 } => {
+                brown(p, radtan_r2_max(k1, k2), |u| (1.0 + u * (k1 + u * k2), k1 + 2.0 * k2 * u), p1, p2)?
+            }
+            Lens::Rational { k, p1, p2, r2_max } => brown(p, r2_max, |u| rational_radial(u, &k), p1, p2)?,
             Lens::KannalaBrandt { k } => kannala_brandt(p, &k)?,
             Lens::DoubleSphere { xi, alpha } => double_sphere(p, xi, alpha)?,
         };
@@ -93,7 +106,11 @@ impl Camera {
     pub fn unproject(&self, px: DVec2) -> Option<DVec3> {
         let m = DVec2::new((px.x - self.cx) / self.fx, (px.y - self.cy) / self.fy);
         let b = match self.lens {
-            Lens::Radtan { k1, k2, p1, p2 } => radtan_inverse(m, k1, k2, p1, p2)?,
+            Lens::Radtan { k1, k2, p1, p2 } => {
+                let r2_max = radtan_r2_max(k1, k2);
+                brown_inverse(m, r2_max, |u| (1.0 + u * (k1 + u * k2), k1 + 2.0 * k2 * u), p1, p2)?
+            }
+            Lens::Rational { k, p1, p2, r2_max } => brown_inverse(m, r2_max, |u| rational_radial(u, &k), p1, p2)?,
             Lens::KannalaBrandt { k } => kannala_brandt_inverse(m, &k)?,
             Lens::DoubleSphere { xi, alpha } => double_sphere_inverse(m, xi, alpha)?,
         };
@@ -105,18 +122,26 @@ type Normalised = (DVec2, [[f64; 3]; 2]);
 
 /// Squared radius (of x/z, y/z) at which r(1 + k1 r² + k2 r⁴) stops growing.
 fn radtan_r2_max(k1: f64, k2: f64) -> f64 {
-    // 89.4 degrees off axis
-    const UNBOUNDED: f64 = 1e4;
     // d/dr = 1 + 3 k1 u + 5 k2 u², u = r²; its smallest positive root, in the form that stands k2 = 0
     let root = (9.0 * k1 * k1 - 20.0 * k2).sqrt();
-    [2.0 / (-3.0 * k1 + root), 2.0 / (-3.0 * k1 - root)].into_iter().filter(|u| *u > 0.0).fold(UNBOUNDED, f64::min)
+    [2.0 / (-3.0 * k1 + root), 2.0 / (-3.0 * k1 - root)].into_iter().filter(|u| *u > 0.0).fold(R2_UNBOUNDED, f64::min)
 }
 
-fn radtan_distort(a: DVec2, k1: f64, k2: f64, p1: f64, p2: f64) -> (DVec2, [[f64; 2]; 2]) {
+/// The factor of the radius at u = r², and its derivative to u.
+fn rational_radial(u: f64, k: &[f64; 6]) -> (f64, f64) {
+    let n = 1.0 + u * (k[0] + u * (k[1] + u * k[2]));
+    let d = 1.0 + u * (k[3] + u * (k[4] + u * k[5]));
+    let dn = k[0] + u * (2.0 * k[1] + u * 3.0 * k[2]);
+    let dd = k[3] + u * (2.0 * k[4] + u * 3.0 * k[5]);
+    (n / d, (dn * d - n * dd) / (d * d))
+}
+
+/// Brown's distortion; `radial` gives the factor of the radius at u = r² and its derivative to u.
+#[inline(always)]
+fn brown_distort(a: DVec2, radial: impl Fn(f64) -> (f64, f64), p1: f64, p2: f64) -> (DVec2, [[f64; 2]; 2]) {
     let (x, y) = (a.x, a.y);
     let u = x * x + y * y;
-    let radial = 1.0 + u * (k1 + u * k2);
-    let d_radial = k1 + 2.0 * k2 * u; // d(radial)/du
+    let (radial, d_radial) = radial(u);
     let m = DVec2::new(
         x * radial + 2.0 * p1 * x * y + p2 * (u + 2.0 * x * x),
         y * radial + p1 * (u + 2.0 * y * y) + 2.0 * p2 * x * y,
@@ -129,16 +154,17 @@ fn radtan_distort(a: DVec2, k1: f64, k2: f64, p1: f64, p2: f64) -> (DVec2, [[f64
     (m, j)
 }
 
-fn radtan(p: DVec3, k1: f64, k2: f64, p1: f64, p2: f64) -> Option<Normalised> {
+#[inline(always)]
+fn brown(p: DVec3, r2_max: f64, radial: impl Fn(f64) -> (f64, f64), p1: f64, p2: f64) -> Option<Normalised> {
     if !(p.z > Z_MIN) {
         return None;
     }
     let iz = 1.0 / p.z;
     let a = DVec2::new(p.x * iz, p.y * iz);
-    if !(a.length_squared() < radtan_r2_max(k1, k2)) {
+    if !(a.length_squared() < r2_max) {
         return None;
     }
-    let (m, d) = radtan_distort(a, k1, k2, p1, p2);
+    let (m, d) = brown_distort(a, radial, p1, p2);
     if !(d[0][0] * d[1][1] > d[0][1] * d[1][0]) {
         return None; // folded here by the tangential part
     }
@@ -169,17 +195,19 @@ fn growing_root(target: f64, mut low: f64, mut high: f64, f: impl Fn(f64) -> (f6
     x
 }
 
-fn radtan_inverse(m: DVec2, k1: f64, k2: f64, p1: f64, p2: f64) -> Option<DVec3> {
+fn brown_inverse(m: DVec2, r2_max: f64, radial: impl Fn(f64) -> (f64, f64), p1: f64, p2: f64) -> Option<DVec3> {
     // The radial part in one dimension, then Newton in two for the tangential part.
-    let r2_max = radtan_r2_max(k1, k2);
-    let radial = |r: f64| (r * (1.0 + r * r * (k1 + r * r * k2)), 1.0 + r * r * (3.0 * k1 + r * r * 5.0 * k2));
+    let radius = |r: f64| {
+        let (factor, slope) = radial(r * r);
+        (r * factor, factor + 2.0 * r * r * slope)
+    };
     let distorted = m.length();
     if !(distorted > 1e-12) {
         return (distorted >= 0.0).then_some(DVec3::Z);
     }
-    let mut a = m * (growing_root(distorted, 0.0, 0.999 * r2_max.sqrt(), radial) / distorted);
+    let mut a = m * (growing_root(distorted, 0.0, 0.999 * r2_max.sqrt(), radius) / distorted);
     for _ in 0..30 {
-        let (f, j) = radtan_distort(a, k1, k2, p1, p2);
+        let (f, j) = brown_distort(a, &radial, p1, p2);
         let e = f - m;
         let det = j[0][0] * j[1][1] - j[0][1] * j[1][0];
         if det.abs() < 1e-9 {
@@ -194,7 +222,7 @@ fn radtan_inverse(m: DVec2, k1: f64, k2: f64, p1: f64, p2: f64) -> Option<DVec3>
             break;
         }
     }
-    let (f, _) = radtan_distort(a, k1, k2, p1, p2);
+    let (f, _) = brown_distort(a, &radial, p1, p2);
     ((f - m).length_squared() < 1e-16).then(|| a.extend(1.0))
 }
 

@@ -5,6 +5,7 @@
 //! the camera models (calibration is a property of the sensor, and the simulator renders with the
 //! same models the estimator inverts), the reader of recordings and the simulator.
 
+pub mod calibration;
 pub mod camera;
 pub mod fault;
 pub mod host;
@@ -12,6 +13,7 @@ pub mod replay;
 pub mod sim;
 pub mod types;
 
-pub use camera::{Calibration, Camera, ImuCalibration, Lens, RigCamera};
+pub use calibration::{Calibration, ImuCalibration, ImuCorrection, RigCamera};
+pub use camera::{Camera, Lens};
 pub use fault::{Exit, Fault};
 pub use types::{Frames, Image, ImuSample, Nanos, Pose, Span, TimedPose};

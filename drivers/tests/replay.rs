@@ -9,7 +9,7 @@ use proptest::test_runner::RngSeed;
 use std::fs;
 use std::path::Path;
 use stipple_drivers::replay::*;
-use stipple_drivers::{Exit, Frames, Lens, Nanos};
+use stipple_drivers::{Exit, Frames, Lens, Nanos, Span};
 
 #[test]
 fn generated_folder_is_clean() {
@@ -264,7 +264,9 @@ fn kalibr_chain_is_read_and_may_give_steps_between_cameras() {
     let chain = format!("cam0:\n{}cam1:\n{}", camera("T_cam_imu"), camera("T_cn_cnm1"));
     f.write("../camchain.yaml", &chain);
     let r = f.open().unwrap();
-    assert_eq!(r.counters.calibration_notes, 3, "two time shifts and the missing imu_config.yaml");
+    assert_eq!(r.counters.calibration_notes, 1, "the missing imu_config.yaml");
+    let stamps: Vec<i64> = r.pairs.iter().map(|p| p.t.0).collect();
+    assert_eq!(stamps[..2], [T0 + 1_000_000, T0 + FRAME + 1_000_000], "in the inertial unit's clock");
     let c = &r.calibration.cameras;
     assert!((c[0].body_from_cam.p.x - 0.1).abs() < 1e-12 && (c[1].body_from_cam.p.x - 0.2).abs() < 1e-12);
     assert_eq!(c[1].camera.lens, Lens::DoubleSphere { xi: -0.2, alpha: 0.57 });
@@ -273,6 +275,68 @@ fn kalibr_chain_is_read_and_may_give_steps_between_cameras() {
     // named from outside, as with replay.calibration
     let o = OpenOptions { calibration: Some(f.path("../camchain.yaml")), ..OpenOptions::default() };
     assert_eq!(Recording::open(f.0.path(), &o).unwrap_err().exit, Exit::Config);
+}
+
+#[test]
+fn a_rolling_shutter_needs_its_readout_time() {
+    let f = Folder::new();
+    let state = |line: &str| {
+        for k in 0..2 {
+            let text = CAMERA.replace("BASELINE", &format!("{}", 0.1 * f64::from(k)));
+            f.write(&format!("cam{k}/sensor.yaml"), text.replace("rate_hz", &format!("{line}\nrate_hz")));
+        }
+    };
+    state("shutter: rolling");
+    let fault = f.refused(Exit::Config, "cam0/sensor.yaml:10", "rolling");
+    assert!(fault.fix.contains("rig.readout_s"), "{fault}");
+    let stated = OpenOptions { readout: Some(Span::from_secs(0.016)), ..OpenOptions::default() };
+    let r = Recording::open(f.0.path(), &stated).unwrap();
+    assert!(r.calibration.cameras.iter().all(|c| c.readout == Span(16_000_000)));
+    assert_eq!(r.pairs[0].t.0, T0 + 8_000_000, "the middle row");
+    for (line, readout) in [
+        ("shutter: global", 0),
+        ("readout_time: 0.02", 20_000_000),
+        ("line_delay: 0.001", 23_000_000), // of 24 rows, 23 steps
+    ] {
+        state(line);
+        assert!(f.open().unwrap().calibration.cameras.iter().all(|c| c.readout == Span(readout)), "{line}");
+    }
+    for (line, word) in
+        [("shutter: slow", "global or rolling"), ("readout_time: -0.01", "readout"), ("line_delay: 1.0", "readout")]
+    {
+        state(line);
+        f.refused(Exit::Config, "cam0/sensor.yaml:10", word);
+    }
+}
+
+#[test]
+fn basalt_axes_and_time_offset_reach_the_samples_and_the_stamps() {
+    let f = Folder::new();
+    let pose = |x: f64| format!(r#"{{"px":{x},"py":0,"pz":0,"qx":0,"qy":0,"qz":0,"qw":1}}"#);
+    let lens = r#"{"camera_type":"pinhole","intrinsics":{"fx":20,"fy":20,"cx":15.5,"cy":11.5}}"#;
+    let json = format!(
+        r#"{{"value0":{{"T_imu_cam":[{},{}],"intrinsics":[{lens},{lens}],"resolution":[[32,24],[32,24]],
+        "calib_accel_bias":[0.1,0.2,0.3,0.01,0.02,0.03,0.04,0.05,0.06],
+        "calib_gyro_bias":[0.001,0.002,0.003,0.1,0.2,0.3,0.4,0.5,0.6,0.7,0.8,0.9],
+        "imu_update_rate":200,"accel_noise_std":[1,1,1],"gyro_noise_std":[1,1,1],
+        "accel_bias_std":[1,1,1],"gyro_bias_std":[1,1,1],"cam_time_offset_ns":-3000000}}}}"#,
+        pose(0.0),
+        pose(0.1)
+    );
+    f.write("basalt.json", json);
+    let plain = f.open().unwrap();
+    let o = OpenOptions { calibration: Some(f.path("basalt.json")), ..OpenOptions::default() };
+    let r = Recording::open(f.0.path(), &o).unwrap();
+    assert_eq!(r.pairs[0].t.0, T0 - 3_000_000);
+    let (a, b) = (plain.imu[0], r.imu[0]);
+    let close = |a: f64, b: f64| assert!((a - b).abs() < 1e-12, "{a} {b}");
+    let (w, s) = (a.gyro_body, a.accel_body);
+    close(b.gyro_body.x, w.x + 0.1 * w.x + 0.4 * w.y + 0.7 * w.z - 0.001);
+    close(b.gyro_body.z, w.z + 0.3 * w.x + 0.6 * w.y + 0.9 * w.z - 0.003);
+    close(b.accel_body.x, s.x + 0.01 * s.x - 0.1);
+    close(b.accel_body.z, s.z + 0.03 * s.x + 0.05 * s.y + 0.06 * s.z - 0.3);
+    let axes = r.calibration.imu.correction;
+    assert!((axes.undo(&b).gyro_body - w).length() < 1e-12 && (axes.undo(&b).accel_body - s).length() < 1e-12);
 }
 
 #[test]

@@ -1,6 +1,6 @@
 //! What a run plays: a recording on disk, or a flight the simulator rendered into memory.
 
-use crate::config::ReplayConfig;
+use crate::config::{ReplayConfig, RigConfig};
 use std::path::{Path, PathBuf};
 use stipple_drivers::replay::{FrameFault, OpenOptions, Reader, Recording};
 use stipple_drivers::sim::{Scenario, Sim};
@@ -56,11 +56,12 @@ impl Source {
 }
 
 impl Input {
-    pub fn recording(dataset: &Path, config: &ReplayConfig) -> Result<Input, Fault> {
+    pub fn recording(dataset: &Path, config: &ReplayConfig, rig: &RigConfig) -> Result<Input, Fault> {
         let options = OpenOptions {
             pair_tolerance: Span::from_secs(config.pair_tolerance_s),
             imu_hole: Span::from_secs(config.imu_hole_s),
             calibration: (!config.calibration.is_empty()).then(|| PathBuf::from(&config.calibration)),
+            readout: (rig.readout_s > 0.0).then(|| Span::from_secs(rig.readout_s)),
         };
         let r = Recording::open(dataset, &options)?;
         let reader = r.reader();

@@ -42,7 +42,7 @@ pub struct Replay {
 /// `stipple replay`
 pub fn replay(dataset: &Path, board: &Path, out: &Path, set: &[String], options: &Replay) -> Result<(), Fault> {
     let board = Board::load(board, set)?;
-    let input = Input::recording(dataset, &board.replay)?;
+    let input = Input::recording(dataset, &board.replay, &board.rig)?;
     let out = OutputDir::create(out)?;
     run(input, &dataset.display().to_string(), &board, &out, options)
 }

@@ -92,15 +92,21 @@ mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
     use glam::DQuat;
-    use stipple_drivers::{ImuCalibration, Lens, RigCamera};
+    use stipple_drivers::{ImuCalibration, ImuCorrection, Lens, RigCamera};
 
     fn rig() -> Rig {
         let lens = Lens::KannalaBrandt { k: [0.01, -0.01, 0.006, -0.0017] };
         let camera = Camera { width: 640, height: 480, fx: 300.0, fy: 300.0, cx: 320.0, cy: 240.0, lens };
         let turned = Pose::new(DQuat::from_euler(glam::EulerRot::XYZ, 0.02, -0.05, 0.2), DVec3::new(0.1, 0.01, 0.0));
-        let cameras = [Pose::IDENTITY, turned].map(|body_from_cam| RigCamera { camera, body_from_cam }).to_vec();
-        let imu =
-            ImuCalibration { rate_hz: 200.0, gyro_noise: 1e-3, gyro_walk: 1e-5, accel_noise: 1e-2, accel_walk: 1e-4 };
+        let cameras = [Pose::IDENTITY, turned].map(|body_from_cam| RigCamera::new(camera, body_from_cam)).to_vec();
+        let imu = ImuCalibration {
+            rate_hz: 200.0,
+            gyro_noise: 1e-3,
+            gyro_walk: 1e-5,
+            accel_noise: 1e-2,
+            accel_walk: 1e-4,
+            correction: ImuCorrection::NONE,
+        };
         Rig::new(&Calibration { cameras, imu }, 0.005)
     }
 

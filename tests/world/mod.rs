@@ -2,7 +2,7 @@
 //! noise, and the inertial samples of that path. Shared by the estimator's unit and integration tests.
 
 use glam::{DMat3, DQuat, DVec2, DVec3};
-use stipple_drivers::{Calibration, Camera, ImuCalibration, ImuSample, Lens, Nanos, Pose, RigCamera};
+use stipple_drivers::{Calibration, Camera, ImuCalibration, ImuCorrection, ImuSample, Lens, Nanos, Pose, RigCamera};
 
 // The unit tests see the crate as `crate`, the integration tests as `stipple`.
 use super::{Track, Tracks};
@@ -38,9 +38,15 @@ pub fn calibration() -> Calibration {
     let lens = Lens::Radtan { k1: -0.28, k2: 0.07, p1: 2e-4, p2: 2e-5 };
     let camera = Camera { width: 752, height: 480, fx: 458.0, fy: 457.0, cx: 367.0, cy: 248.0, lens };
     let q = DQuat::from_mat3(&DMat3::from_cols(DVec3::NEG_Y, DVec3::NEG_Z, DVec3::X));
-    let eye = |y: f64| RigCamera { camera, body_from_cam: Pose::new(q, DVec3::new(0.02, y, 0.01)) };
-    let imu =
-        ImuCalibration { rate_hz: RATE_HZ, gyro_noise: 1.7e-4, gyro_walk: 2e-5, accel_noise: 2e-3, accel_walk: 3e-3 };
+    let eye = |y: f64| RigCamera::new(camera, Pose::new(q, DVec3::new(0.02, y, 0.01)));
+    let imu = ImuCalibration {
+        rate_hz: RATE_HZ,
+        gyro_noise: 1.7e-4,
+        gyro_walk: 2e-5,
+        accel_noise: 2e-3,
+        accel_walk: 3e-3,
+        correction: ImuCorrection::NONE,
+    };
     Calibration { cameras: vec![eye(0.055), eye(-0.055)], imu }
 }
 

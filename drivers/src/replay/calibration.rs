@@ -1,12 +1,18 @@
 //! Calibration files: EuRoC sensor.yaml (`T_BS` = body_from_cam), Kalibr camchain.yaml (`T_cam_imu`
 //! = cam_from_body) with imu_config.yaml beside it, Basalt json (`T_imu_cam` = body_from_cam). The body is
-//! the inertial unit. Distortion: none, Brown with four coefficients, Kannala-Brandt, double sphere; any
-//! other model is refused, since a wrong lens looks like noise to an estimator.
+//! the inertial unit. Distortion: none, Brown with four coefficients or eight (rational), Kannala-Brandt,
+//! double sphere; any other model is refused, since a wrong lens looks like noise to an estimator.
+//!
+//! Time: `timeshift_cam_imu` and `cam_time_offset_ns` become `RigCamera::time_offset`. A camera of the yaml
+//! files is rolling where it has `readout_time` (s, first row to last), `line_delay` (s a row, as Kalibr's
+//! rolling-shutter calibration prints) or `shutter: rolling`; the last alone is refused unless the
+//! board file states the time, which stands above what the files say.
 
 use super::findings::Findings;
 use super::CAMERAS_MAX;
-use crate::camera::{Calibration, Camera, ImuCalibration, Lens, RigCamera};
-use crate::types::Pose;
+use crate::calibration::{Calibration, ImuCalibration, ImuCorrection, RigCamera};
+use crate::camera::{Camera, Lens};
+use crate::types::{Pose, Span};
 use crate::{Exit, Fault};
 use glam::{DMat3, DQuat, DVec3};
 use std::path::{Path, PathBuf};
@@ -16,28 +22,40 @@ use document::Document;
 
 /// Noise of a consumer MEMS unit (BMI160 with the white noise doubled and the walks times ten, as
 /// TUM-VI recommends for estimators), taken where a recording does not say.
-pub const IMU_DEFAULTS: ImuCalibration =
-    ImuCalibration { rate_hz: 200.0, gyro_noise: 1.6e-4, gyro_walk: 2.2e-5, accel_noise: 2.8e-3, accel_walk: 8.6e-4 };
+pub const IMU_DEFAULTS: ImuCalibration = ImuCalibration {
+    rate_hz: 200.0,
+    gyro_noise: 1.6e-4,
+    gyro_walk: 2.2e-5,
+    accel_noise: 2.8e-3,
+    accel_walk: 8.6e-4,
+    correction: ImuCorrection::NONE,
+};
+/// A camera of one frame a second does not read out for longer, s.
+const READOUT_MAX: f64 = 1.0;
 
 /// Reads a Kalibr camchain.yaml, a Basalt json, or a EuRoC `mav0` folder.
 pub fn read_calibration(path: &Path) -> Result<Calibration, Fault> {
-    read(path, &mut Findings::default())
+    read(path, None, &mut Findings::default())
 }
 
-pub fn read(path: &Path, findings: &mut Findings) -> Result<Calibration, Fault> {
-    let calibration = if path.is_dir() {
-        euroc(path, findings)?
+/// `readout` is the board's word on the shutters, which stands above the file's.
+pub fn read(path: &Path, readout: Option<Span>, findings: &mut Findings) -> Result<Calibration, Fault> {
+    let mut calibration = if path.is_dir() {
+        euroc(path, readout, findings)?
     } else {
         let file = Document::read(path)?;
         if file.has("/value0") {
-            basalt(&file, findings)?
+            basalt(&file)?
         } else if file.has("/cam0") {
-            kalibr(&file, findings)?
+            kalibr(&file, readout, findings)?
         } else {
             let what = "neither a Kalibr camchain (no key cam0) nor a Basalt calibration (no key value0)";
             return Err(file.fault("", what));
         }
     };
+    if let Some(readout) = readout {
+        calibration.cameras.iter_mut().for_each(|c| c.readout = readout);
+    }
     let baseline = calibration.cameras[1].body_from_cam.p - calibration.cameras[0].body_from_cam.p;
     if baseline.length() < 1e-6 {
         let what = "cameras 0 and 1 are at the same place (zero baseline): stereo has no depth";
@@ -47,13 +65,18 @@ pub fn read(path: &Path, findings: &mut Findings) -> Result<Calibration, Fault> 
 }
 
 /// The calibration that a recording carries: sensor.yaml in its folders, else a Kalibr camchain.
-pub fn of_recording(home: &Path, mav0: &Path, findings: &mut Findings) -> Result<Calibration, Fault> {
+pub fn of_recording(
+    home: &Path,
+    mav0: &Path,
+    readout: Option<Span>,
+    findings: &mut Findings,
+) -> Result<Calibration, Fault> {
     if sensor_yaml(mav0, "cam0").is_file() {
-        return read(mav0, findings);
+        return read(mav0, readout, findings);
     }
     let candidates = ["camchain.yaml", "dso/camchain.yaml"];
     match candidates.iter().map(|name| home.join(name)).find(|path| path.is_file()) {
-        Some(path) => read(&path, findings),
+        Some(path) => read(&path, readout, findings),
         None => {
             let fix = "add it, or name one with replay.calibration";
             let what = "no calibration: neither cam0/sensor.yaml in it nor camchain.yaml beside it";
@@ -66,7 +89,7 @@ fn sensor_yaml(mav0: &Path, sensor: &str) -> PathBuf {
     mav0.join(sensor).join("sensor.yaml")
 }
 
-fn euroc(mav0: &Path, findings: &mut Findings) -> Result<Calibration, Fault> {
+fn euroc(mav0: &Path, stated: Option<Span>, findings: &mut Findings) -> Result<Calibration, Fault> {
     let mut cameras = Vec::new();
     for k in 0..CAMERAS_MAX {
         let path = sensor_yaml(mav0, &format!("cam{k}"));
@@ -75,13 +98,14 @@ fn euroc(mav0: &Path, findings: &mut Findings) -> Result<Calibration, Fault> {
         }
         let file = Document::read(&path)?;
         let camera = yaml_camera(&file, "", "distortion_coefficients")?;
-        cameras.push(RigCamera { camera, body_from_cam: file.transform("/T_BS/data")? });
+        let readout = readout(&file, "", &camera, stated)?;
+        cameras.push(RigCamera { readout, ..RigCamera::new(camera, file.transform("/T_BS/data")?) });
     }
     let imu = yaml_imu(&sensor_yaml(mav0, "imu0"), "rate_hz", findings)?;
     Ok(Calibration { cameras, imu })
 }
 
-fn kalibr(file: &Document, findings: &mut Findings) -> Result<Calibration, Fault> {
+fn kalibr(file: &Document, stated: Option<Span>, findings: &mut Findings) -> Result<Calibration, Fault> {
     let mut cameras: Vec<RigCamera> = Vec::new();
     for k in 0..CAMERAS_MAX {
         let at = format!("/cam{k}");
@@ -97,14 +121,39 @@ fn kalibr(file: &Document, findings: &mut Findings) -> Result<Calibration, Fault
             }
             _ => file.transform(&own)?.inverse(),
         };
-        if file.has(&format!("{at}/timeshift_cam_imu")) && file.number(&format!("{at}/timeshift_cam_imu"))? != 0.0 {
-            let what = format!("cam{k}.timeshift_cam_imu is not applied");
-            findings.warn(|c| &mut c.calibration_notes, &file.path, file.line(&at), what);
-        }
-        cameras.push(RigCamera { camera: yaml_camera(file, &at, "distortion_coeffs")?, body_from_cam });
+        let shift = format!("{at}/timeshift_cam_imu");
+        let time_offset = if file.has(&shift) { Span::from_secs(file.number(&shift)?) } else { Span(0) };
+        let camera = yaml_camera(file, &at, "distortion_coeffs")?;
+        let readout = readout(file, &at, &camera, stated)?;
+        cameras.push(RigCamera { camera, body_from_cam, time_offset, readout });
     }
     let imu = yaml_imu(&file.path.with_file_name("imu_config.yaml"), "update_rate", findings)?;
     Ok(Calibration { cameras, imu })
+}
+
+/// From the first row to the last, as the file says.
+fn readout(file: &Document, at: &str, camera: &Camera, stated: Option<Span>) -> Result<Span, Fault> {
+    let key = |name: &str| format!("{at}/{name}");
+    let (time, line, shutter) = (key("readout_time"), key("line_delay"), key("shutter"));
+    let (named, secs) = if file.has(&time) {
+        (time, file.number(&key("readout_time"))?)
+    } else if file.has(&line) {
+        (line, file.number(&key("line_delay"))? * (camera.height - 1) as f64)
+    } else if !file.has(&shutter) || file.text(&shutter)? == "global" {
+        return Ok(Span(0));
+    } else if file.text(&shutter)? != "rolling" {
+        return Err(file.fault(&shutter, "must be global or rolling"));
+    } else if stated.is_none() {
+        let mut fault = file.fault(&shutter, "a rolling shutter whose readout time is not stated");
+        fault.fix = "state readout_time (s) beside it, or rig.readout_s in the board file".to_string();
+        return Err(fault);
+    } else {
+        return Ok(Span(0));
+    };
+    match (0.0..READOUT_MAX).contains(&secs) {
+        true => Ok(Span::from_secs(secs)),
+        false => Err(file.fault(&named, "a readout takes from 0 to 1 s")),
+    }
 }
 
 /// The camera keys that EuRoC and Kalibr share.
@@ -119,6 +168,11 @@ fn yaml_camera(file: &Document, at: &str, coefficients: &str) -> Result<Camera, 
             let d = numbers(coefficients, 4)?;
             (numbers("intrinsics", 4)?, Lens::Radtan { k1: d[0], k2: d[1], p1: d[2], p2: d[3] })
         }
+        ("pinhole", "rational_polynomial") => {
+            let d = numbers(coefficients, 8)?;
+            let k = [d[0], d[1], d[4], d[5], d[6], d[7]];
+            (numbers("intrinsics", 4)?, Lens::rational(k, d[2], d[3], 0.0))
+        }
         ("pinhole", "equidistant") => {
             let d = numbers(coefficients, 4)?;
             (numbers("intrinsics", 4)?, Lens::KannalaBrandt { k: [d[0], d[1], d[2], d[3]] })
@@ -129,7 +183,7 @@ fn yaml_camera(file: &Document, at: &str, coefficients: &str) -> Result<Camera, 
         }
         _ => {
             let what = format!(
-                "lens {model} with {distortion} is not known (pinhole with none, radtan or equidistant; ds with none)"
+                "lens {model} with {distortion} is not known (pinhole with none, radtan, rational_polynomial or equidistant; ds with none)"
             );
             return Err(file.fault(&key("distortion_model"), &what));
         }
@@ -151,6 +205,11 @@ fn yaml_imu(path: &Path, rate: &str, findings: &mut Findings) -> Result<ImuCalib
             return Err(file.fault("/T_BS", "must be the identity: the body is the inertial unit"));
         }
     }
+    let model = format!("{at}/model");
+    if file.has(&model) && file.text(&model)? != "calibrated" {
+        let what = "scale and misalignment of this model are not applied (those of a Basalt json are)";
+        findings.warn(|c| &mut c.calibration_notes, path, file.line(&model), what);
+    }
     let positive = |name: &str| file.positive(&format!("{at}/{name}"));
     Ok(ImuCalibration {
         rate_hz: positive(rate)?,
@@ -158,10 +217,13 @@ fn yaml_imu(path: &Path, rate: &str, findings: &mut Findings) -> Result<ImuCalib
         gyro_walk: positive("gyroscope_random_walk")?,
         accel_noise: positive("accelerometer_noise_density")?,
         accel_walk: positive("accelerometer_random_walk")?,
+        correction: ImuCorrection::NONE,
     })
 }
 
-fn basalt(file: &Document, findings: &mut Findings) -> Result<Calibration, Fault> {
+fn basalt(file: &Document) -> Result<Calibration, Fault> {
+    let offset = "/value0/cam_time_offset_ns";
+    let time_offset = Span(if file.has(offset) { file.number(offset)?.round() as i64 } else { 0 });
     let mut cameras = Vec::new();
     for k in 0..CAMERAS_MAX {
         let (at, pose) = (format!("/value0/intrinsics/{k}"), format!("/value0/T_imu_cam/{k}"));
@@ -174,8 +236,13 @@ fn basalt(file: &Document, findings: &mut Findings) -> Result<Calibration, Fault
             "pinhole" => Lens::Radtan { k1: 0.0, k2: 0.0, p1: 0.0, p2: 0.0 },
             "kb4" => Lens::KannalaBrandt { k: [number("k1")?, number("k2")?, number("k3")?, number("k4")?] },
             "ds" => Lens::DoubleSphere { xi: number("xi")?, alpha: number("alpha")? },
+            "pinhole-radtan8" => {
+                let k = [number("k1")?, number("k2")?, number("k3")?, number("k4")?, number("k5")?, number("k6")?];
+                let r_max = if file.has(&format!("{at}/intrinsics/rpmax")) { number("rpmax")? } else { 0.0 };
+                Lens::rational(k, number("p1")?, number("p2")?, r_max)
+            }
             other => {
-                let what = format!("camera type {other} is not known (pinhole, kb4, ds)");
+                let what = format!("camera type {other} is not known (pinhole, pinhole-radtan8, kb4, ds)");
                 return Err(file.fault(&format!("{at}/camera_type"), &what));
             }
         };
@@ -186,14 +253,8 @@ fn basalt(file: &Document, findings: &mut Findings) -> Result<Calibration, Fault
             return Err(file.fault(&pose, "the quaternion is not of unit length"));
         }
         let body_from_cam = Pose::new(q, DVec3::new(part("px")?, part("py")?, part("pz")?));
-        cameras.push(RigCamera { camera: checked(file, &at, [size[0], size[1]], f, lens)?, body_from_cam });
-    }
-    // after the bias, which is estimated, come scale and misalignment of the axes
-    for key in ["/value0/calib_accel_bias", "/value0/calib_gyro_bias"] {
-        if file.has(key) && file.all_numbers(key)?.iter().skip(3).any(|v| *v != 0.0) {
-            let what = format!("scale and misalignment in {} are not applied", &key[8..]);
-            findings.warn(|c| &mut c.calibration_notes, &file.path, file.line(key), what);
-        }
+        let camera = checked(file, &at, [size[0], size[1]], f, lens)?;
+        cameras.push(RigCamera { time_offset, ..RigCamera::new(camera, body_from_cam) });
     }
     let noise = |name: &str| file.positive(&format!("/value0/{name}/0"));
     let imu = ImuCalibration {
@@ -202,8 +263,24 @@ fn basalt(file: &Document, findings: &mut Findings) -> Result<Calibration, Fault
         gyro_walk: noise("gyro_bias_std")?,
         accel_noise: noise("accel_noise_std")?,
         accel_walk: noise("accel_bias_std")?,
+        correction: basalt_correction(file)?,
     };
     Ok(Calibration { cameras, imu })
+}
+
+/// Readings become `(I + S) reading - bias`: the accelerometer's S is lower triangular, the gyro's full, both
+/// by columns after the three numbers of the bias.
+fn basalt_correction(file: &Document) -> Result<ImuCorrection, Fault> {
+    let numbers = |key: &str, n: usize| if file.has(key) { file.numbers(key, n) } else { Ok(vec![0.0; n]) };
+    let a = numbers("/value0/calib_accel_bias", 9)?;
+    let g = numbers("/value0/calib_gyro_bias", 12)?;
+    let columns = |s: [f64; 9]| DMat3::IDENTITY + DMat3::from_cols_array(&s);
+    Ok(ImuCorrection {
+        gyro_scale: columns(std::array::from_fn(|i| g[3 + i])),
+        accel_scale: columns([a[3], a[4], a[5], 0.0, a[6], a[7], 0.0, 0.0, a[8]]),
+        gyro_bias: DVec3::new(g[0], g[1], g[2]),
+        accel_bias: DVec3::new(a[0], a[1], a[2]),
+    })
 }
 
 /// Calibrated rotations are printed rounded; more than this is a mistake.

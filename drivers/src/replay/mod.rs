@@ -40,15 +40,19 @@ pub struct OpenOptions {
     pub imu_hole: Span,
     /// Calibration used instead of the recording's own; see `read_calibration`.
     pub calibration: Option<PathBuf>,
+    /// First row to last of every camera, where the board states it.
+    pub readout: Option<Span>,
 }
 
 impl Default for OpenOptions {
     fn default() -> Self {
-        OpenOptions { pair_tolerance: Span(2_000_000), imu_hole: Span(20_000_000), calibration: None }
+        OpenOptions { pair_tolerance: Span(2_000_000), imu_hole: Span(20_000_000), calibration: None, readout: None }
     }
 }
 
-/// A dataset with every table in memory and every image on disk. All stamps grow strictly.
+/// A dataset with every table in memory and every image on disk. All stamps grow strictly. What the
+/// calibration says of time and of the unit's axes is applied: stamps of images are in the inertial
+/// unit's clock, samples are corrected.
 #[derive(Clone, Debug)]
 pub struct Recording {
     pub calibration: Calibration,
@@ -67,12 +71,13 @@ impl Recording {
         let (home, mav0) = layout(dataset)?;
         let mut findings = Findings::default();
         let mut calibration = match &options.calibration {
-            Some(path) => calibration::read(path, &mut findings)?,
-            None => calibration::of_recording(&home, &mav0, &mut findings)?,
+            Some(path) => calibration::read(path, options.readout, &mut findings)?,
+            None => calibration::of_recording(&home, &mav0, options.readout, &mut findings)?,
         };
         let lists = pairing::image_lists(&mav0, &mut calibration, &mut findings)?;
         let pairs = pairing::pair(&mav0, &lists, options.pair_tolerance, &mut findings)?;
-        let imu = read_imu(&mav0.join("imu0/data.csv"), options.imu_hole, &mut findings)?;
+        let mut imu = read_imu(&mav0.join("imu0/data.csv"), options.imu_hole, &mut findings)?;
+        imu.iter_mut().for_each(|s| *s = calibration.imu.correction.apply(s));
         check_cover(&pairs, &imu, &mut findings);
         let truth = ["state_groundtruth_estimate0/data.csv", "mocap0/data.csv"]
             .into_iter()

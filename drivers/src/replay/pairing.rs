@@ -16,7 +16,7 @@ pub struct ImageFile {
     pub line: usize,
 }
 
-/// One image of every camera, taken together; `t` is camera 0's stamp.
+/// One image of every camera, taken together; `t` is camera 0's stamp in the inertial unit's clock.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Pair {
     pub t: Nanos,
@@ -55,7 +55,9 @@ pub fn image_lists(
     };
     let read = |k: usize| {
         let rows = table::read(&list(k), "stamp [ns], file name", parse, findings)?;
-        Ok(order::increasing(rows, |r| r.t, &list(k), findings))
+        let mut rows = order::increasing(rows, |r| r.t, &list(k), findings);
+        rows.iter_mut().for_each(|r| r.value.t = calibration.cameras[k].to_imu_clock(r.value.t));
+        Ok(rows)
     };
     (0..calibration.cameras.len()).map(read).collect()
 }

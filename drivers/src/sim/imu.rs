@@ -2,7 +2,7 @@
 //! Rᵀ(a - g), with white noise, biases that start somewhere and walk, and a range that clips.
 
 use super::spline::Spline;
-use crate::camera::ImuCalibration;
+use crate::calibration::ImuCalibration;
 use crate::types::{ImuSample, Nanos, Span};
 use glam::DVec3;
 use rand::{Rng, SeedableRng};

@@ -23,7 +23,7 @@ pub use render::Sensor;
 pub use scenario::{euroc_rig, Flight, Recording, Scenario};
 pub use write::write_euroc;
 
-use crate::camera::Calibration;
+use crate::calibration::Calibration;
 use crate::fault::{Exit, Fault};
 use crate::types::{Frames, ImuSample, Nanos, Pose, Span, TimedPose};
 use glam::{DVec3, Vec3};

@@ -6,7 +6,8 @@
 use super::imu::{Bias, ImuErrors};
 use super::recording;
 use super::render::Sensor;
-use crate::camera::{Calibration, Camera, ImuCalibration, Lens, RigCamera};
+use crate::calibration::{Calibration, ImuCalibration, ImuCorrection, RigCamera};
+use crate::camera::{Camera, Lens};
 use crate::fault::Fault;
 use crate::types::{ImuSample, Pose, Span, TimedPose};
 use glam::{DMat3, DQuat, DVec3};
@@ -158,16 +159,14 @@ pub fn euroc_rig() -> Calibration {
     let cam0 = camera([458.654, 457.296, 367.215, 248.375], -0.28340811, 0.07395907, 0.00019359, 1.76187114e-05);
     let cam1 = camera([457.587, 456.134, 379.999, 255.238], -0.28368365, 0.07451284, -0.00010473, -3.555907e-05);
     Calibration {
-        cameras: vec![
-            RigCamera { camera: cam0, body_from_cam: Pose::new(q0, p0) },
-            RigCamera { camera: cam1, body_from_cam: Pose::new(q1, p1) },
-        ],
+        cameras: vec![RigCamera::new(cam0, Pose::new(q0, p0)), RigCamera::new(cam1, Pose::new(q1, p1))],
         imu: ImuCalibration {
             rate_hz: 200.0,
             gyro_noise: 1.6968e-4,
             gyro_walk: 1.9393e-5,
             accel_noise: 2.0e-3,
             accel_walk: 3.0e-3,
+            correction: ImuCorrection::NONE,
         },
     }
 }

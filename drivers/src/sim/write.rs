@@ -4,7 +4,8 @@
 //! none). Everything goes to a sibling folder first and is renamed when whole.
 
 use super::Sim;
-use crate::camera::{Lens, RigCamera};
+use crate::calibration::RigCamera;
+use crate::camera::Lens;
 use crate::fault::{Exit, Fault};
 use crate::types::{Frames, Pose};
 use glam::{DMat3, DVec3};
@@ -141,6 +142,10 @@ fn camera_yaml(c: &RigCamera, k: usize, rate_hz: f64) -> String {
     let (model, intrinsics, distortion, coefficients) = match m.lens {
         Lens::Radtan { k1, k2, p1, p2 } => {
             ("pinhole", pinhole, "radial-tangential", format!("[{k1}, {k2}, {p1}, {p2}]"))
+        }
+        Lens::Rational { k: [k1, k2, k3, k4, k5, k6], p1, p2, .. } => {
+            let k = format!("[{k1}, {k2}, {p1}, {p2}, {k3}, {k4}, {k5}, {k6}]");
+            ("pinhole", pinhole, "rational_polynomial", k)
         }
         Lens::KannalaBrandt { k: [a, b, c, d] } => ("pinhole", pinhole, "equidistant", format!("[{a}, {b}, {c}, {d}]")),
         Lens::DoubleSphere { xi, alpha } => {

@@ -120,11 +120,12 @@ impl Folder {
     }
 
     /// Opening fails with this code, naming this place (a file, or file:line) and this word.
-    pub fn refused(&self, exit: Exit, place: &str, word: &str) {
+    pub fn refused(&self, exit: Exit, place: &str, word: &str) -> Fault {
         let fault = self.open().unwrap_err();
         assert_eq!(fault.exit, exit, "{fault}");
         assert!(fault.place.contains(place), "{fault}");
         assert!(fault.what.contains(word), "{fault}");
         assert!(!fault.fix.is_empty() && !fault.to_string().contains('\n'), "{fault}");
+        fault
     }
 }
