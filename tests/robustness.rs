@@ -3,19 +3,16 @@
 //! `cargo test --test robustness -- --nocapture` prints the table.
 #![allow(clippy::unwrap_used)]
 
-#[allow(dead_code)]
-mod world;
-
 use glam::{DQuat, DVec3};
 use std::ops::RangeInclusive;
+use stipple::bench::world::{room, Noise, Path, World, ACCEL_BIAS, FRAME_SECS, GYRO_BIAS, RATE_HZ};
 use stipple::config::VioConfig;
-use stipple::frontend::{Track, Tracks};
+use stipple::frontend::Tracks;
 use stipple::output::metrics::trajectory_error;
 use stipple::vio::health::Health;
 use stipple::vio::residuals::{Mat15, Vec15};
 use stipple::vio::{Odometry, Vio};
 use stipple_drivers::{ImuSample, Nanos, Pose, TimedPose};
-use world::{room, Noise, Path, World, ACCEL_BIAS, FRAME_SECS, GYRO_BIAS, RATE_HZ};
 
 /// Inertial samples alone before the first frame, s.
 const BEFORE: f64 = 1.0;

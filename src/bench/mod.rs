@@ -10,6 +10,7 @@ mod measure;
 mod page;
 mod settings;
 mod tables;
+pub mod world;
 
 use crate::output::OutputDir;
 use inputs::{Flight, Input};

@@ -19,12 +19,8 @@ pub mod solve;
 pub mod window;
 
 #[cfg(test)]
-#[path = "../../tests/world/mod.rs"]
-mod world;
-
+use crate::bench::world;
 use crate::config::VioConfig;
-#[cfg(test)]
-use crate::frontend::Track;
 use crate::frontend::Tracks;
 use crate::limits::{CAMERAS_MAX, STATES};
 use crate::mem::Footprint;

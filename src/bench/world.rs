@@ -1,11 +1,9 @@
 //! A made-up world without images: points on the walls of a room, seen along an analytic path with
 //! noise, and the inertial samples of that path. Shared by the estimator's unit and integration tests.
 
+use crate::frontend::{Track, Tracks};
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use stipple_drivers::{Calibration, Camera, ImuCalibration, ImuCorrection, ImuSample, Lens, Nanos, Pose, RigCamera};
-
-// The unit tests see the crate as `crate`, the integration tests as `stipple`.
-use super::{Track, Tracks};
 
 /// SplitMix64; normal values by summing twelve uniforms.
 pub struct Noise(pub u64);
