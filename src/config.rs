@@ -109,6 +109,10 @@ pub struct VioConfig {
     pub accel_noise_scale: f64,
     /// Hold velocity and gyro bias when nothing moves.
     pub zero_velocity: bool,
+    /// How inertial samples are summed.
+    pub preintegration: Scheme,
+    /// Refine the scale of the inertial unit's axes while flying.
+    pub estimate_imu_scale: bool,
     /// Ends of the sensors' ranges, rad/s and m/s²: samples there are clipped and weigh little.
     pub gyro_max: f64,
     pub accel_max: f64,
@@ -129,10 +133,21 @@ impl Default for VioConfig {
             gyro_noise_scale: 2.0,
             accel_noise_scale: 4.0,
             zero_velocity: true,
+            preintegration: Scheme::Midpoint,
+            estimate_imu_scale: false,
             gyro_max: 34.9,
             accel_max: 156.9,
         }
     }
+}
+
+/// Rules of inertial integration; see `vio::preintegration`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Scheme {
+    Euler,
+    Midpoint,
+    Rk4,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]

@@ -19,19 +19,24 @@ const PARAMETERS: [(&str, &[f64]); 8] = [
 ];
 
 /// The defaults of all parameters that set the run time, moved together.
-const SHAPES: [(&str, &[&str]); 4] = [
+const SHAPES: [Named; 4] = [
     ("smallest", &["frontend.grid_px=80", "frontend.iterations=2", "vio.iterations_max=2"]),
     ("small", &["frontend.grid_px=60", "frontend.iterations=3", "vio.iterations_max=4"]),
     ("large", &["frontend.grid_px=40", "frontend.iterations=7", "vio.iterations_max=10"]),
     ("largest", &["frontend.grid_px=30", "frontend.iterations=10", "vio.iterations_max=12"]),
 ];
-/// Where the defaults stand among the shapes, from small to large.
-const SHAPES_BELOW_DEFAULT: usize = 2;
+/// Rules of inertial integration, by rising order.
+const SCHEMES: [Named; 2] = [("euler", &["vio.preintegration=euler"]), ("rk4", &["vio.preintegration=rk4"])];
 pub const SHAPE: &str = "shape";
+const SCHEME: &str = "preintegration";
+/// A name and its assignments.
+type Named = (&'static str, &'static [&'static str]);
+/// Families of named settings, and where the defaults stand in each.
+const FAMILIES: [(&str, &[Named], usize); 2] = [(SHAPE, &SHAPES, 2), (SCHEME, &SCHEMES, 1)];
 pub const DEFAULT: &str = "default";
 
 pub struct Setting {
-    /// `default`, an assignment, or the name of a shape.
+    /// `default`, an assignment, or a family and the name of a member.
     pub name: String,
     pub set: Vec<String>,
     pub board: Board,
@@ -40,7 +45,7 @@ pub struct Setting {
 /// A curve of the plots: settings by index, along the parameter.
 pub struct Curve {
     pub name: &'static str,
-    /// What each point is, for the axis of the reader: a value or the name of a shape.
+    /// What each point is, for the axis of the reader: a value or a name.
     pub values: Vec<String>,
     pub settings: Vec<usize>,
 }
@@ -63,7 +68,9 @@ pub fn all() -> Vec<Setting> {
         all.extend(values.iter().filter(|v| **v != default).map(|v| assigned(key, *v)));
     }
     let owned = |set: &[&str]| set.iter().map(|s| s.to_string()).collect();
-    all.extend(SHAPES.iter().map(|(name, set)| setting(format!("{SHAPE} {name}"), owned(set))));
+    for (family, members, _) in FAMILIES {
+        all.extend(members.iter().map(|(name, set)| setting(format!("{family} {name}"), owned(set))));
+    }
     all
 }
 
@@ -85,10 +92,12 @@ pub fn curves(settings: &[Setting]) -> Vec<Curve> {
         let found: Vec<(String, usize)> = visited.iter().filter_map(|v| Some((v.to_string(), at(v)?))).collect();
         curves.push(curve(key, found));
     }
-    let mut shapes: Vec<(String, usize)> =
-        SHAPES.iter().filter_map(|(name, _)| Some((name.to_string(), find(&format!("{SHAPE} {name}"))?))).collect();
-    shapes.insert(shapes.len().min(SHAPES_BELOW_DEFAULT), (DEFAULT.into(), 0));
-    curves.push(curve(SHAPE, shapes));
+    for (family, members, below_default) in FAMILIES {
+        let found = |name: &str| Some((name.to_string(), find(&format!("{family} {name}"))?));
+        let mut points: Vec<(String, usize)> = members.iter().filter_map(|(name, _)| found(name)).collect();
+        points.insert(points.len().min(below_default), (DEFAULT.into(), 0));
+        curves.push(curve(family, points));
+    }
     curves.retain(|c| c.settings.len() > 1);
     curves
 }

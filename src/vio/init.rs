@@ -9,8 +9,9 @@
 
 use super::landmarks::find_track;
 use super::marginalise::Sigma;
-use super::preintegration::{ImuRing, Increment, Noise, GRAVITY};
+use super::preintegration::{Increment, Noise, GRAVITY};
 use super::residuals::{huber, reproject, Body, Eye, Motion, Point};
+use super::samples::ImuRing;
 use super::solve::Model;
 use crate::config::VioConfig;
 use crate::frontend::Tracks;

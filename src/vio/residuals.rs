@@ -237,6 +237,7 @@ mod tests {
     #![allow(clippy::unwrap_used)]
     use super::super::preintegration::Noise;
     use super::*;
+    use crate::config::Scheme;
     use glam::DQuat;
     use stipple_drivers::Lens;
 
@@ -336,6 +337,8 @@ mod tests {
             period: 0.005,
             gyro_max: 35.0,
             accel_max: 160.0,
+            scheme: Scheme::Midpoint,
+            scale: false,
         };
         let mut inc = Increment::new(DVec3::new(0.005, 0.0, -0.01), DVec3::new(0.05, -0.05, 0.1));
         for k in 0..12 {

@@ -9,8 +9,8 @@
 
 use super::init::{REST_ACCEL, REST_GYRO, REST_PX};
 use super::landmarks::find_track;
-use super::preintegration::ImuRing;
 use super::residuals::Motion;
+use super::samples::ImuRing;
 use super::window::{Frame, Layout, Window};
 use crate::frontend::Tracks;
 use crate::limits::TRACKS;
