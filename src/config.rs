@@ -60,6 +60,8 @@ pub struct RigConfig {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct FrontendConfig {
+    /// 1: tracker and estimator take turns; 2: a thread each, the same poses bit for bit.
+    pub threads: u32,
     /// Detection cell, one point per cell, px.
     pub grid_px: u32,
     /// FAST thresholds, grey levels: halved from the first down to the second.
@@ -76,6 +78,7 @@ pub struct FrontendConfig {
 impl Default for FrontendConfig {
     fn default() -> Self {
         FrontendConfig {
+            threads: 2,
             grid_px: 50,
             fast_threshold: 40,
             fast_threshold_min: 5,
@@ -398,6 +401,7 @@ const BOUNDS: &[(&str, Bound)] = &[
     ("budget.image_height_max", Within(64.0, 4096.0)),
     // Above a tenth of a second the body's motion between rows is no longer of first order.
     ("rig.readout_s", Within(0.0, 0.1)),
+    ("frontend.threads", Within(1.0, 2.0)),
     ("frontend.grid_px", Within(16.0, 200.0)),
     ("frontend.fast_threshold", Within(1.0, 255.0)),
     ("frontend.fast_threshold_min", Within(1.0, 255.0)),

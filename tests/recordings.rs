@@ -63,17 +63,58 @@ fn machine_hall_is_tracked_to_the_end_and_mapped_live() {
     assert!(run.number("anchors") >= 1.0 && run.number("splats") > 1000.0);
 }
 
+/// Replays in lockstep without a mapper, front end and estimator on so many threads.
+fn odometry(data: &Path, threads: u32) -> Run {
+    let threads = format!("frontend.threads={threads}");
+    let data = data.to_str().unwrap();
+    stipple(&["replay", data, "--pace", "lockstep", "--set", "map.enabled=false", "--set", &threads], false)
+}
+
+/// Twice on each number of threads.
+fn gives_the_same_bits(data: &Path) -> Run {
+    let [first, again, two, two_again] = [1, 1, 2, 2].map(|threads| odometry(data, threads));
+    for (run, threads) in [(&first, 1), (&again, 1), (&two, 2), (&two_again, 2)] {
+        assert!(run.report["vio_hash"].is_string());
+        assert_eq!(run.report["vio_hash"], first.report["vio_hash"]);
+        assert_eq!(run.report["ate_rmse_m"], first.report["ate_rmse_m"]);
+        assert_eq!(run.report["tracking_threads"], threads);
+        assert_eq!(run.number("heap_after_seal"), 0.0);
+        assert_eq!(run.number("count_keyframes_rejected"), 0.0, "without a mapper none is offered");
+        assert!(run.number("tracking_fps") > 0.0 && run.number("tracking_cpu_ms") > 0.0);
+        assert!(run.number("frontend_ms_p99") >= run.number("frontend_ms_p50"));
+        assert!(run.number("tracking_ms_p50") >= run.number("estimator_ms_p50"));
+    }
+    first
+}
+
 #[test]
 #[cfg_attr(not(recordings), ignore = "no recordings")]
-fn machine_hall_gives_the_same_bits_twice() {
-    let name = "machine_hall_gives_the_same_bits_twice";
+fn machine_hall_gives_the_same_bits_on_one_thread_and_on_two() {
+    let name = "machine_hall_gives_the_same_bits_on_one_thread_and_on_two";
     let Some(data) = recording(name, "euroc_MH_01_easy_11s") else { return };
-    let odometry = ["replay", data.to_str().unwrap(), "--pace", "lockstep", "--set", "map.enabled=false"];
-    let runs = [stipple(&odometry, false), stipple(&odometry, false)];
-    assert_eq!(runs[0].report["vio_hash"], runs[1].report["vio_hash"]);
-    assert_eq!(runs[0].report["frames"], 220);
-    assert!(runs[0].number("ate_rmse_m") <= 0.05);
-    assert!(runs[0].report["psnr_db"].is_null(), "not measured is null");
+    let run = gives_the_same_bits(&data);
+    assert_eq!(run.report["frames"], 220);
+    assert!(run.number("ate_rmse_m") <= 0.006 && run.number("rte_1s_m") <= 0.0065, "{}", run.said);
+    assert!(run.report["psnr_db"].is_null(), "not measured is null");
+}
+
+#[test]
+fn simulated_flight_gives_the_same_bits_on_one_thread_and_on_two() {
+    let dir = tempfile::tempdir().unwrap();
+    let flight = dir.path().join("flight");
+    let made = Command::new(env!("CARGO_BIN_EXE_stipple"))
+        .args(["sim", "demo", "--out", flight.to_str().unwrap(), "--duration", "4"])
+        .output()
+        .unwrap();
+    assert!(made.status.success());
+    // A frame that cannot be read leaves its samples to the next on either number of threads.
+    let images = flight.join("mav0/cam0/data");
+    let mut names: Vec<_> = std::fs::read_dir(&images).unwrap().map(|e| e.unwrap().path()).collect();
+    names.sort();
+    std::fs::write(&names[40], b"not an image").unwrap();
+    let run = gives_the_same_bits(&flight);
+    assert_eq!(run.number("count_frames_unreadable"), 1.0);
+    assert!(run.number("ate_rmse_m") < 0.02, "{}", run.said);
 }
 
 /// As many steps as two cores take in the recording's own time, without depending on how busy they are.

@@ -1,7 +1,8 @@
 //! The byte table: everything a board buys at boot, summed before anything is bought.
 
 use super::mapping::KEYFRAME_SLOTS;
-use super::play::FRAME_SLOTS;
+use super::play::frame_slots;
+use super::tracking::Slot;
 use crate::config::Board;
 use crate::frontend::Frontend;
 use crate::map::Mapper;
@@ -15,7 +16,7 @@ pub fn footprint(calibration: &Calibration, board: &Board) -> Footprint {
     let pixels: usize = calibration.cameras.iter().map(|c| c.camera.width * c.camera.height).sum();
     let pair: usize = calibration.cameras[..2].iter().map(|c| c.camera.width * c.camera.height).sum();
     let mut f = Footprint::default();
-    f.host("queues: frames", FRAME_SLOTS * pixels);
+    f.host("queues: frames", frame_slots(board.frontend.threads) * (pixels + Slot::BYTES));
     f.extend(Frontend::footprint(calibration, &board.frontend));
     f.extend(Vio::footprint());
     if board.map.enabled {

@@ -4,16 +4,23 @@
 //! |---|---|---|
 //! | main | boot, progress, report | free |
 //! | source | stands for the sensors: decodes files, delivers frames and inertial samples when they are due | free |
-//! | tracking | frontend, estimator; offers keyframes | sealed |
+//! | tracking | front end and back end in turns; offers keyframes | sealed |
+//! | or frontend | follows points (`frontend.threads = 2`) | sealed |
+//! | and estimator | estimates, one frame behind at most; offers keyframes | sealed |
 //! | mapping | rectification, depth, training; low priority, as are the CPU device's own threads | sealed; OpenCV and the driver allocate behind it |
 //!
+//! In lockstep pace the main thread is source and mapping too.
+//!
 //! Queues between them: frames (newest wins, the rest are counted as dropped), inertial samples
-//! (never dropped), keyframes (an offer may fail, counted), pose corrections. Tracking waits for
-//! nobody. Shutdown: source ends, tracking drains and ends, mapping ends with the run's time.
+//! (never dropped), tracks (two frames: the front end waits for the back end), keyframes (an offer may
+//! fail, counted), pose corrections. Tracking waits for nobody. Shutdown: source ends, tracking drains
+//! and ends, mapping ends with the run's time.
 
 mod input;
+mod lockstep;
 mod mapping;
 mod memory;
+mod pipeline;
 mod play;
 mod progress;
 mod summary;

@@ -102,13 +102,18 @@ fn track_figures(report: &mut Report, played: &Played) -> Vec<TimedPose> {
         Tracking::Table(poses) => return poses.clone(),
         Tracking::Odometry(run) => run,
     };
-    let ms: Vec<f64> = run.frame_ms.iter().map(|(_, ms)| *ms).collect();
-    let total_ms: f64 = ms.iter().sum();
-    report.tracking_fps = (total_ms > 0.0).then(|| ms.len() as f64 * 1e3 / total_ms);
+    let ms: Vec<f64> = run.back.frame_ms.iter().map(|(_, ms)| *ms).collect();
+    report.tracking_threads = Some(run.threads);
+    report.tracking_fps = run.fps();
+    report.tracking_cpu_ms = run.cpu_ms();
     report.tracking_ms_p50 = percentile(&ms, 0.5);
     report.tracking_ms_p99 = percentile(&ms, 0.99);
+    report.frontend_ms_p50 = percentile(&run.front.ms, 0.5);
+    report.frontend_ms_p99 = percentile(&run.front.ms, 0.99);
+    report.estimator_ms_p50 = percentile(&run.back.ms, 0.5);
+    report.estimator_ms_p99 = percentile(&run.back.ms, 0.99);
     report.vio_hash = played.tracking.hash().map(|h| format!("{h:016x}"));
-    run.trajectory.iter().map(|o| TimedPose { t: o.t, pose: o.world_from_body }).collect()
+    run.back.trajectory.iter().map(|o| TimedPose { t: o.t, pose: o.world_from_body }).collect()
 }
 
 fn map_figures(report: &mut Report, q: &Evaluation) {
@@ -152,7 +157,7 @@ fn write_files(
         })?;
     }
     let tracking_ms: &[(Nanos, f64)] = match &played.tracking {
-        Tracking::Odometry(run) => &run.frame_ms,
+        Tracking::Odometry(run) => &run.back.frame_ms,
         Tracking::Table(_) => &[],
     };
     let shown: Vec<(String, Picture)> = pictures.iter().map(|(n, p)| (n.clone(), p.shrunk(1600))).collect();

@@ -1,10 +1,20 @@
-//! The tracking side of a run: inertial samples and frames in, poses and keyframes out.
+//! The tracking side of a run: a stereo frame with its inertial samples in, pose and keyframe out.
+//!
+//! Two halves, on one thread in turns or on a thread each: the front end follows points, the back
+//! end estimates. All that passes between them travels in a `Slot`, besides the `Predictor` that the
+//! back end gives back. The front end predicts frame k from the state after frame k-2 even where that
+//! after k-1 is known, so the poses are the same bit for bit on one thread and on two.
 //!
 //! With `--poses` the poses come from a table, odometry is skipped, and every frame is a keyframe.
 
 use crate::config::Board;
 use crate::counters::Counters;
-use crate::frontend::{Frontend, Prediction};
+use crate::frontend::{Frontend, Prediction, Tracks};
+use crate::limits::IMU_BETWEEN_FRAMES;
+use crate::mem::List;
+use crate::vio::predict::Predictor;
+use crate::vio::samples::ImuRing;
+use crate::vio::window::FRAMES;
 use crate::vio::{Odometry, Vio};
 use std::time::Instant;
 use stipple_drivers::types::pose_at;
@@ -17,6 +27,43 @@ const POSE_HOLE: Span = Span(100_000_000);
 pub struct Tracked {
     pub world_from_body: Pose,
     pub keyframe: bool,
+    /// Beside a keyframe: newest poses of all keyframes still being optimised.
+    pub corrections: List<(Nanos, Pose), FRAMES>,
+}
+
+/// What travels through tracking and back: a frame, the samples since the one before it, and what
+/// was made of them.
+pub struct Slot {
+    pub frames: Frames,
+    pub imu: List<ImuSample, IMU_BETWEEN_FRAMES>,
+    pub tracks: Tracks,
+    pub tracked: Option<Tracked>,
+    /// When the front end took it.
+    begun: Instant,
+}
+
+impl Slot {
+    pub fn for_rig(calibration: &Calibration) -> Box<Slot> {
+        Box::new(Slot {
+            frames: Frames::for_rig(calibration),
+            imu: List::default(),
+            tracks: Tracks::default(),
+            tracked: None,
+            begun: Instant::now(),
+        })
+    }
+
+    /// Without its images.
+    pub const BYTES: usize = size_of::<Slot>();
+
+    /// Of more samples than fit the newest are kept, as in the estimator's ring.
+    pub fn push_imu(&mut self, sample: ImuSample, counters: &Counters) {
+        if self.imu.push(sample).is_err() {
+            counters.imu_overflow.add(1);
+            self.imu.rotate_left(1);
+            self.imu[IMU_BETWEEN_FRAMES - 1] = sample;
+        }
+    }
 }
 
 pub enum Tracking {
@@ -25,73 +72,154 @@ pub enum Tracking {
 }
 
 pub struct OdometryRun {
+    pub front: Front,
+    pub back: Back,
+    /// 1 or 2.
+    pub threads: u32,
+}
+
+/// Follows points.
+pub struct Front {
     frontend: Frontend,
+    imu: ImuRing,
+    last: Option<Nanos>,
+    /// Wall time of each frame, ms, and of all of them with what was waited for the back end, s.
+    pub ms: Vec<f64>,
+    pub busy_s: f64,
+    /// CPU time of the thread, s; that of both halves where they share one.
+    pub cpu_s: Option<f64>,
+}
+
+impl Front {
+    pub fn track(&mut self, slot: &mut Slot, predictor: &Predictor) {
+        slot.begun = Instant::now();
+        for sample in slot.imu.iter() {
+            if self.imu.admits(sample) {
+                self.imu.push(*sample);
+            }
+        }
+        let t = slot.frames.t;
+        let prediction = Prediction { prev_from_now: self.last.map(|prev| predictor.motion(&self.imu, prev, t)) };
+        self.last = Some(t);
+        slot.tracks.clone_from(self.frontend.track(&slot.frames, &prediction));
+        let secs = slot.begun.elapsed().as_secs_f64();
+        self.busy_s += secs;
+        keep(&mut self.ms, secs * 1e3);
+    }
+}
+
+/// Estimates.
+pub struct Back {
     vio: Vio,
     /// One entry a frame, room for all of them bought at the start.
     pub trajectory: Vec<Odometry>,
+    /// Wall time of each frame, ms, and of all of them, s.
+    pub ms: Vec<f64>,
+    pub busy_s: f64,
+    /// From when the front end took a frame until its pose was there, ms.
     pub frame_ms: Vec<(Nanos, f64)>,
+    pub cpu_s: Option<f64>,
+}
+
+impl Back {
+    pub fn predictor(&self) -> Predictor {
+        self.vio.predictor()
+    }
+
+    /// Fills in `slot.tracked`.
+    pub fn estimate(&mut self, slot: &mut Slot) {
+        let begun = Instant::now();
+        slot.imu.iter().for_each(|s| self.vio.on_imu(*s));
+        let update = self.vio.on_tracks(&slot.tracks);
+        slot.tracked = update.odometry.map(|o| Tracked {
+            world_from_body: o.world_from_body,
+            keyframe: update.keyframe,
+            corrections: if update.keyframe { self.keyframe_poses() } else { List::default() },
+        });
+        if let Some(odometry) = update.odometry {
+            keep(&mut self.trajectory, odometry);
+        }
+        let secs = begun.elapsed().as_secs_f64();
+        self.busy_s += secs;
+        keep(&mut self.ms, secs * 1e3);
+        keep(&mut self.frame_ms, (slot.frames.t, slot.begun.elapsed().as_secs_f64() * 1e3));
+    }
+
+    fn keyframe_poses(&self) -> List<(Nanos, Pose), FRAMES> {
+        let mut list = List::default();
+        for (t, pose, _) in self.vio.window().filter(|(_, _, keyframe)| *keyframe) {
+            list.push((t, pose)).expect("a window has at most FRAMES frames");
+        }
+        list
+    }
+}
+
+/// Appends where there is room: these lists are bought at the start.
+fn keep<T>(list: &mut Vec<T>, item: T) {
+    if list.len() < list.capacity() {
+        list.push(item);
+    }
 }
 
 impl OdometryRun {
     pub fn new(calibration: &Calibration, board: &Board, frames: usize) -> Result<OdometryRun, Fault> {
         Ok(OdometryRun {
-            frontend: Frontend::new(calibration, &board.frontend)?,
-            vio: Vio::new(calibration, &board.vio),
-            trajectory: Vec::with_capacity(frames),
-            frame_ms: Vec::with_capacity(frames),
+            front: Front {
+                frontend: Frontend::new(calibration, &board.frontend)?,
+                imu: ImuRing::new(),
+                last: None,
+                ms: Vec::with_capacity(frames),
+                busy_s: 0.0,
+                cpu_s: None,
+            },
+            back: Back {
+                vio: Vio::new(calibration, &board.vio),
+                trajectory: Vec::with_capacity(frames),
+                ms: Vec::with_capacity(frames),
+                busy_s: 0.0,
+                frame_ms: Vec::with_capacity(frames),
+                cpu_s: None,
+            },
+            threads: board.frontend.threads,
         })
     }
 
-    fn frame(&mut self, frames: &Frames) -> Option<Tracked> {
-        let start = Instant::now();
-        let prediction = Prediction { prev_from_now: self.vio.predict_motion(frames.t) };
-        let tracks = self.frontend.track(frames, &prediction);
-        let update = self.vio.on_tracks(tracks);
-        if self.frame_ms.len() < self.frame_ms.capacity() {
-            self.frame_ms.push((frames.t, start.elapsed().as_secs_f64() * 1e3));
-        }
-        let odometry = update.odometry?;
-        if self.trajectory.len() < self.trajectory.capacity() {
-            self.trajectory.push(odometry);
-        }
-        Some(Tracked { world_from_body: odometry.world_from_body, keyframe: update.keyframe })
+    /// Frames a second while there are frames to track: over the time in which the busier thread was
+    /// not waiting for one.
+    pub fn fps(&self) -> Option<f64> {
+        let (front, back) = (self.front.busy_s, self.back.busy_s);
+        let busy = if self.threads == 1 { front + back } else { front.max(back) };
+        (busy > 0.0).then(|| self.back.ms.len() as f64 / busy)
+    }
+
+    /// CPU time of all threads of tracking, ms a frame.
+    pub fn cpu_ms(&self) -> Option<f64> {
+        let total = self.front.cpu_s? + if self.threads == 1 { 0.0 } else { self.back.cpu_s? };
+        let frames = self.back.ms.len();
+        (frames > 0).then(|| 1e3 * total / frames as f64)
     }
 }
 
+/// The pose of a frame from a table: every frame is a keyframe.
+pub fn look_up(poses: &[TimedPose], slot: &mut Slot, counters: &Counters) {
+    let pose = pose_at(poses, slot.frames.t, POSE_HOLE);
+    counters.frames_without_pose.add(u64::from(pose.is_none()));
+    slot.tracked =
+        pose.map(|world_from_body| Tracked { world_from_body, keyframe: true, corrections: List::default() });
+}
+
 impl Tracking {
-    pub fn imu(&mut self, sample: ImuSample) {
-        if let Tracking::Odometry(run) = self {
-            run.vio.on_imu(sample);
-        }
-    }
-
-    pub fn frame(&mut self, frames: &Frames, counters: &Counters) -> Option<Tracked> {
+    /// Threads it takes.
+    pub fn threads(&self) -> u32 {
         match self {
-            Tracking::Odometry(run) => run.frame(frames),
-            Tracking::Table(poses) => {
-                let pose = pose_at(poses, frames.t, POSE_HOLE);
-                if pose.is_none() {
-                    counters.frames_without_pose.add(1);
-                }
-                pose.map(|world_from_body| Tracked { world_from_body, keyframe: true })
-            }
-        }
-    }
-
-    /// Newest poses of the keyframes still being optimised.
-    pub fn corrections(&self, mut each: impl FnMut(Nanos, Pose)) {
-        if let Tracking::Odometry(run) = self {
-            for (t, pose, keyframe) in run.vio.window() {
-                if keyframe {
-                    each(t, pose);
-                }
-            }
+            Tracking::Odometry(run) => run.threads,
+            Tracking::Table(_) => 1,
         }
     }
 
     pub fn hash(&self) -> Option<u64> {
         match self {
-            Tracking::Odometry(run) => Some(run.vio.hash()),
+            Tracking::Odometry(run) => Some(run.back.vio.hash()),
             Tracking::Table(_) => None,
         }
     }
@@ -99,7 +227,7 @@ impl Tracking {
     pub fn counters(&self) -> Vec<(&'static str, u64)> {
         match self {
             Tracking::Odometry(run) => {
-                let f = run.frontend.stats();
+                let f = run.front.frontend.stats();
                 let mut list = vec![
                     ("tracks_created", f.created),
                     ("tracks_lost", f.lost),
@@ -107,9 +235,9 @@ impl Tracking {
                     ("tracks_epipolar_rejected", f.epipolar_rejected),
                     ("tracks_full", f.full),
                 ];
-                let v = run.vio.stats();
+                let v = run.back.vio.stats();
                 // The first frames of a run that starts in motion, and those after a reset.
-                let without = run.frame_ms.len().saturating_sub(run.trajectory.len());
+                let without = run.back.frame_ms.len().saturating_sub(run.back.trajectory.len());
                 list.extend([
                     ("frames_without_odometry", without as u64),
                     ("imu_rejected", v.imu_rejected),

@@ -25,10 +25,19 @@ pub struct Report {
     pub ate_rmse_m: Option<f64>,
     pub rte_1s_m: Option<f64>,
     pub rpe_deg: Option<f64>,
-    /// Frames over wall time in frontend and estimator, the mapper running.
+    /// Threads of tracking: 1, or 2 for front end and estimator.
+    pub tracking_threads: Option<u32>,
+    /// Frames over the wall time in which tracking was not waiting for one.
     pub tracking_fps: Option<f64>,
+    /// CPU time of all its threads, a frame.
+    pub tracking_cpu_ms: Option<f64>,
+    /// Wall time from taking a frame to its pose, and in each half.
     pub tracking_ms_p50: Option<f64>,
     pub tracking_ms_p99: Option<f64>,
+    pub frontend_ms_p50: Option<f64>,
+    pub frontend_ms_p99: Option<f64>,
+    pub estimator_ms_p50: Option<f64>,
+    pub estimator_ms_p99: Option<f64>,
     /// Of every odometry state, bit for bit.
     pub vio_hash: Option<String>,
 
@@ -102,7 +111,8 @@ mod tests {
 
     const KEYS: &str =
         "frames keyframes anchors frames_dropped ate_rmse_m rte_1s_m rpe_deg tracking_fps tracking_ms_p50 \
-        tracking_ms_p99 psnr_db ssim psnr_heldout_db ssim_heldout psnr_heldout_aligned_db splats iterations \
+        tracking_ms_p99 tracking_threads tracking_cpu_ms frontend_ms_p50 frontend_ms_p99 estimator_ms_p50 \
+        estimator_ms_p99 psnr_db ssim psnr_heldout_db ssim_heldout psnr_heldout_aligned_db splats iterations \
         iteration_ms_p50 gpu_bytes rss_peak_bytes heap_after_seal wall_s device vio_hash dataset board pace scale";
 
     #[test]

@@ -26,6 +26,11 @@ impl ImuRing {
         self.count = 0;
     }
 
+    /// Whether a sample is finite and newer than the last.
+    pub fn admits(&self, s: &ImuSample) -> bool {
+        s.is_finite() && self.newest().is_none_or(|n| s.t > n.t)
+    }
+
     /// Returns the sample that was overwritten.
     pub fn push(&mut self, s: ImuSample) -> Option<ImuSample> {
         let at = self.count % IMU_BETWEEN_FRAMES;

@@ -1,0 +1,141 @@
+//! The deterministic pace: every frame is tracked, and each gets a stated number of mapper steps.
+//!
+//! Frames are decoded a batch at a time into memory and tracked when the batch is there, so decoding
+//! is in no figure and takes no core from tracking; reading a recording into memory whole would do
+//! the same, but a flight of minutes does not fit. This thread decodes, then runs the mapper on the
+//! frames that tracking gives back, in their order, while tracking goes on.
+
+use super::input::Input;
+use super::mapping::{KeyframeQueue, Mapping};
+use super::pipeline::{Bell, Ends, Pipeline};
+use super::play::{drain, Keyframes, Play, Played};
+use super::progress::{Gauges, Progress};
+use super::tracking::{Slot, Tracking};
+use crate::counters::Counters;
+use crossbeam_queue::ArrayQueue;
+use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
+use std::time::Instant;
+use stipple_drivers::ImuSample;
+
+/// Frames in memory at once: 24 MiB of 752x480 pairs. What the threads of tracking lose at its ends is
+/// one stage of one frame in so many.
+const BATCH: usize = 32;
+
+pub fn lockstep(
+    mut input: Input,
+    mut tracking: Tracking,
+    mut mapping: Option<Mapping>,
+    options: &Play,
+    progress: &mut Progress,
+) -> Played {
+    let counters = Counters::default();
+    let gauges = Gauges::default();
+    let queue = mapping.is_some().then(|| KeyframeQueue::new(&input.calibration));
+    let mut keyframes = Keyframes::new(options.holdout);
+    let mut warnings = std::mem::take(&mut input.warnings);
+    let total = input.frames_within(options.duration_s);
+    let mut slots: Vec<Box<Slot>> = (0..BATCH.min(total)).map(|_| Slot::for_rig(&input.calibration)).collect();
+    let (waiting, done) = (ArrayQueue::new(BATCH), ArrayQueue::new(BATCH));
+    let (over, ended, bell, pipeline) =
+        (AtomicBool::new(false), AtomicBool::new(false), Bell::default(), Pipeline::new());
+    let start = Instant::now();
+    std::thread::scope(|scope| {
+        let (taken, given, rung) = (&waiting, &done, &bell);
+        let give = move |slot| {
+            // As many places as slots.
+            let _ = given.push(slot);
+            rung.ring();
+        };
+        let last = Ends(&ended, Some(rung));
+        pipeline.start(scope, &mut tracking, &over, &counters, || taken.pop(), give, last);
+        let _over = Ends(&over, Some(&pipeline.taker));
+        let mut reading = Reading { next: 0, samples: 0 };
+        while reading.next < total {
+            let mut sent = read_batch(&mut input, total, &mut reading, &mut slots, &waiting, &counters);
+            pipeline.taker.ring();
+            while sent > 0 {
+                let Some(slot) = bell.wait(&ended, || done.pop()) else { return };
+                sent -= 1;
+                keyframes.pass_on(&slot, queue.as_ref(), &counters);
+                gauges.frames.fetch_add(1, Relaxed);
+                gauges.keyframes.store(keyframes.count, Relaxed);
+                gauges.played_ms.store(((slot.frames.t - input.stamps[0]).secs() * 1e3) as u64, Relaxed);
+                slots.push(slot);
+                if let (Some(m), Some(queue)) = (&mut mapping, &queue) {
+                    drain(queue, m);
+                    steps(m, u64::from(options.lockstep_iterations), start, &gauges);
+                }
+                progress.show(&gauges);
+            }
+        }
+    });
+    if let Some(m) = &mut mapping {
+        for _ in 0..extra_iterations(&input, total, options) {
+            steps(m, 1, start, &gauges);
+            progress.show(&gauges);
+        }
+        m.sample(start.elapsed().as_secs_f64(), &gauges);
+    }
+    let wall_s = start.elapsed().as_secs_f64();
+    warnings.extend_from_slice(input.source.warnings());
+    let source = input.source.counters();
+    Played { tracking, mapping, counters, frames: total, keyframes: keyframes.count, wall_s, warnings, source }
+}
+
+fn steps(m: &mut Mapping, n: u64, start: Instant, gauges: &Gauges) {
+    for _ in 0..n {
+        m.step(Instant::now(), gauges);
+    }
+    m.sample_if_due(start.elapsed().as_secs_f64(), gauges);
+}
+
+/// How far the input has been read.
+struct Reading {
+    next: usize,
+    samples: usize,
+}
+
+/// Decodes frames until every slot is full or the input ends, hands them over together, and answers
+/// how many. A frame that cannot be read leaves its samples to the next.
+fn read_batch(
+    input: &mut Input,
+    total: usize,
+    reading: &mut Reading,
+    slots: &mut Vec<Box<Slot>>,
+    waiting: &ArrayQueue<Box<Slot>>,
+    counters: &Counters,
+) -> usize {
+    let mut sent = 0;
+    for slot in slots.iter_mut() {
+        slot.imu.clear();
+        let mut read = false;
+        while reading.next < total && !read {
+            let i = reading.next;
+            reading.next += 1;
+            // One sample past the frame, to interpolate at its stamp.
+            let samples: &[ImuSample] = &input.imu[reading.samples..];
+            let upto = samples.iter().position(|s| s.t >= input.stamps[i]).map_or(samples.len(), |at| at + 1);
+            samples[..upto].iter().for_each(|s| slot.push_imu(*s, counters));
+            reading.samples += upto;
+            read = input.source.read(i, &mut slot.frames).is_ok();
+            counters.frames_unreadable.add(u64::from(!read));
+        }
+        sent += usize::from(read);
+    }
+    for slot in slots.drain(..sent) {
+        let _ = waiting.push(slot);
+    }
+    sent
+}
+
+/// Lockstep time past the end of the recording, in iterations at the recording's frame rate.
+fn extra_iterations(input: &Input, total: usize, options: &Play) -> u64 {
+    let length_s = input.length_s();
+    match options.duration_s {
+        Some(s) if s > length_s && total > 1 && length_s > 0.0 => {
+            let frames = (s - length_s) * (total - 1) as f64 / length_s;
+            frames as u64 * u64::from(options.lockstep_iterations)
+        }
+        _ => 0,
+    }
+}
