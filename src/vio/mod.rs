@@ -17,6 +17,7 @@ pub mod preintegration;
 pub mod residuals;
 pub mod rest;
 pub mod samples;
+pub mod shutter;
 pub mod solve;
 pub mod window;
 

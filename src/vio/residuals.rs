@@ -4,7 +4,7 @@
 //! `rho`. Its point, scaled by `rho`, is `b(s)`, so points at infinity are ordinary:
 //! `x_w = R_h (R_c b + rho t_c) + rho p_h`, `x_t = R_tᵀ (x_w - rho p_t)`; projection ignores the scale.
 
-use super::preintegration::{Increment, Mat9, GRAVITY};
+use super::preintegration::{block, Increment, Mat9, GRAVITY};
 use crate::math::so3;
 use glam::{DMat3, DVec2, DVec3};
 use nalgebra::SMatrix;
@@ -28,11 +28,20 @@ impl From<&Pose> for Body {
 pub struct Eye {
     pub camera: Camera,
     pub body_from_cam: Body,
+    /// First row to last, s; zero is a global shutter.
+    pub readout: f64,
 }
 
 impl From<&RigCamera> for Eye {
     fn from(c: &RigCamera) -> Eye {
-        Eye { camera: c.camera, body_from_cam: Body::from(&c.body_from_cam) }
+        Eye { camera: c.camera, body_from_cam: Body::from(&c.body_from_cam), readout: c.readout.secs() }
+    }
+}
+
+impl Eye {
+    /// When a row is exposed, after the stamp, which is the middle row's, s.
+    pub fn row_delay(&self, row: f64) -> f64 {
+        self.readout * (row / (self.camera.height - 1).max(1) as f64 - 0.5)
     }
 }
 
@@ -83,7 +92,55 @@ pub fn predict(point: &Point, host_eye: &Body, host: &Body, eye: &Eye, target: &
     eye.camera.project(x_cam)
 }
 
+/// Derivatives to [p, θ] of the cameras on the body, host's and target's.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct EyeDerivatives {
+    pub host: [[f64; 6]; 2],
+    pub target: [[f64; 6]; 2],
+}
+
+#[inline]
 pub fn reproject(point: &Point, host_eye: &Body, host: &Body, eye: &Eye, target: &Body) -> Option<Reprojection> {
+    trace(point, host_eye, host, eye, target, |_, _| {})
+}
+
+/// The same, with derivatives to where the cameras sit.
+pub fn reproject_with_eyes(
+    point: &Point,
+    host_eye: &Body,
+    host: &Body,
+    eye: &Eye,
+    target: &Body,
+) -> Option<(Reprojection, EyeDerivatives)> {
+    let mut d = EyeDerivatives::default();
+    let bearing = point.bearing();
+    let r = trace(point, host_eye, host, eye, target, |k, g| {
+        let (th_host, th_target) = (bearing.cross(g.point), g.cam.cross(g.x_cam));
+        let (p_host, p_target) = (g.host * point.rho, g.target * -point.rho);
+        d.host[k] = [p_host.x, p_host.y, p_host.z, th_host.x, th_host.y, th_host.z];
+        d.target[k] = [p_target.x, p_target.y, p_target.z, th_target.x, th_target.y, th_target.z];
+    })?;
+    Some((r, d))
+}
+
+/// A row of d(px)/d(x_cam), carried back through each frame on the ray's way.
+struct Gradient {
+    x_cam: DVec3,
+    cam: DVec3,
+    target: DVec3,
+    host: DVec3,
+    point: DVec3,
+}
+
+#[inline(always)]
+fn trace(
+    point: &Point,
+    host_eye: &Body,
+    host: &Body,
+    eye: &Eye,
+    target: &Body,
+    mut each: impl FnMut(usize, &Gradient),
+) -> Option<Reprojection> {
     let rho = point.rho;
     let x_host = host_eye.r * point.bearing() + host_eye.p * rho;
     let x_rel = host.r * x_host + (host.p - target.p) * rho;
@@ -94,8 +151,8 @@ pub fn reproject(point: &Point, host_eye: &Body, host: &Body, eye: &Eye, target:
     let d_rho_rel = host.r * host_eye.p + host.p - target.p;
     let mut out = Reprojection { px, ..Reprojection::default() };
     for k in 0..2 {
-        // The row g of d(px)/d(x_cam), carried back through each frame.
-        let g_target = eye.body_from_cam.r * DVec3::from_array(d_px[k]);
+        let g_cam = DVec3::from_array(d_px[k]);
+        let g_target = eye.body_from_cam.r * g_cam;
         let g_world = target.r * g_target;
         let g_host = host.r.transpose() * g_world;
         let g_point = host_eye.r.transpose() * g_host;
@@ -106,6 +163,7 @@ pub fn reproject(point: &Point, host_eye: &Body, host: &Body, eye: &Eye, target:
         out.d_target[k] = [-p.x, -p.y, -p.z, th_target.x, th_target.y, th_target.z];
         let d_rho = g_world.dot(d_rho_rel) - g_target.dot(eye.body_from_cam.p);
         out.d_point[k] = [g_point.dot(d_bearing[0]), g_point.dot(d_bearing[1]), d_rho];
+        each(k, &Gradient { x_cam, cam: g_cam, target: g_target, host: g_host, point: g_point });
     }
     Some(out)
 }
@@ -222,6 +280,35 @@ pub fn inertial_jacobians(inc: &Increment, w: &InertialWeight, a: &Motion, b: &M
     (ja, jb)
 }
 
+/// Derivatives of the whitened residual of `inc.rescaled(gyro, accel)` to those scales, gyro's first.
+pub fn scale_jacobian(
+    inc: &Increment,
+    w: &InertialWeight,
+    a: &Motion,
+    b: &Motion,
+    gyro: DVec3,
+    accel: DVec3,
+) -> SMatrix<f64, 15, 6> {
+    let scaled = inc.rescaled(gyro, accel);
+    let (_, q, _) = scaled.corrected(a.bg, a.ba);
+    let r_q = so3::log(q.conjugate() * a.pose.q.conjugate() * b.pose.q);
+    let (of_gyro, of_accel) = (&inc.d_gyro_scale, &inc.d_accel_scale);
+    // The rotation is q Exp(D s) Exp(D_bg db): what s adds is carried through the second, then to r_q.
+    let shift = so3::exp(inc.d_q_bg() * (a.bg - inc.bg)).conjugate();
+    let turn = block(of_gyro, 3) * gyro + block(of_accel, 3) * accel;
+    let carry =
+        -so3::right_jacobian_inverse(r_q) * DMat3::from_quat(so3::exp(-r_q) * shift) * so3::right_jacobian(turn);
+    let mut plain = SMatrix::<f64, 9, 6>::zeros();
+    for (col, d) in [(0, of_gyro), (3, of_accel)] {
+        for (row, m) in [(0, -block(d, 0)), (3, carry * block(d, 3)), (6, -block(d, 6))] {
+            (0..9).for_each(|i| plain[(row + i % 3, col + i / 3)] = m.col(i / 3)[i % 3]);
+        }
+    }
+    let mut out = SMatrix::<f64, 15, 6>::zeros();
+    out.fixed_rows_mut::<9>(0).copy_from(&(w.increment * plain));
+    out
+}
+
 /// Huber on a whitened length: (weight of the squared residual, cost).
 #[inline]
 pub fn huber(length: f64, width: f64) -> (f64, f64) {
@@ -275,6 +362,7 @@ mod tests {
                 DQuat::from_scaled_axis(DVec3::new(0.1, 0.2, -0.3)),
                 DVec3::new(0.05, 0.1, -0.02),
             )),
+            readout: 0.0,
         };
         lenses.into_iter().map(eye).collect()
     }
@@ -338,7 +426,7 @@ mod tests {
             gyro_max: 35.0,
             accel_max: 160.0,
             scheme: Scheme::Midpoint,
-            scale: false,
+            scale: true,
         };
         let mut inc = Increment::new(DVec3::new(0.005, 0.0, -0.01), DVec3::new(0.05, -0.05, 0.1));
         for k in 0..12 {
@@ -364,6 +452,24 @@ mod tests {
                 close(ja[(row, i)], da[row], "start");
                 close(jb[(row, i)], db[row], "end");
             }
+        }
+    }
+
+    #[test]
+    fn scale_jacobian_matches_differences() {
+        let (inc, _) = increment();
+        let w = InertialWeight { increment: Mat9::identity(), bg: 1.0, ba: 1.0 };
+        let (a, b) = (motion(1.0), motion(1.4));
+        let (gyro, accel) = (DVec3::new(0.02, -0.01, 0.03), DVec3::new(-0.02, 0.01, 0.02));
+        let j = scale_jacobian(&inc, &w, &a, &b, gyro, accel);
+        for i in 0..6 {
+            let at = |h: f64| {
+                let e = DVec3::AXES[i % 3] * h;
+                let (g, s) = if i < 3 { (gyro + e, accel) } else { (gyro, accel + e) };
+                inertial_residual(&inc.rescaled(g, s), &w, &a, &b)
+            };
+            let d = (at(H) - at(-H)) / (2.0 * H);
+            (0..15).for_each(|row| close(j[(row, i)], d[row], "scale"));
         }
     }
 
