@@ -235,24 +235,10 @@ impl Tracking {
                     ("tracks_epipolar_rejected", f.epipolar_rejected),
                     ("tracks_full", f.full),
                 ];
-                let v = run.back.vio.stats();
                 // The first frames of a run that starts in motion, and those after a reset.
                 let without = run.back.frame_ms.len().saturating_sub(run.back.trajectory.len());
-                list.extend([
-                    ("frames_without_odometry", without as u64),
-                    ("imu_rejected", v.imu_rejected),
-                    ("imu_overflow", v.imu_overflow),
-                    ("frames_rejected", v.frames_rejected),
-                    ("landmarks_full", v.landmarks_full),
-                    ("outliers", v.outliers),
-                    ("solver_failures", v.solver_failures),
-                    ("resets", v.resets),
-                    ("divergences", v.divergences),
-                    ("imu_gaps", v.imu_gaps),
-                    ("imu_saturated", v.imu_saturated),
-                    ("camera_blind", v.camera_blind),
-                    ("zero_velocity_updates", v.zero_velocity_updates),
-                ]);
+                list.push(("frames_without_odometry", without as u64));
+                list.extend(run.back.vio.stats().counters());
                 list
             }
             Tracking::Table(_) => vec![],

@@ -4,13 +4,14 @@
 //! metric points at a first frame and, by resection against them, poses of the next half second; the
 //! preintegrated increments between these poses are then linear in the first velocity and gravity,
 //! and, through rotation, in the gyro bias (Martinelli, IJCV 2014). The poses do not drift, so half
-//! a second fixes gravity to well under a degree even while shaken by hand. If resection keeps
-//! failing, gravity is the mean specific force and the window must find the rest.
+//! a second fixes gravity to well under a degree even while shaken by hand. Points whose stereo parallax
+//! is noise have no depth and give no pose: where there are only such, gravity is the mean specific
+//! force, the velocity is unknown and said to be, and the window must find it.
 
 use super::landmarks::find_track;
 use super::marginalise::Sigma;
 use super::preintegration::{Increment, Noise, GRAVITY};
-use super::residuals::{huber, reproject, Body, Eye, Motion, Point};
+use super::residuals::{huber, reproject, Body, Motion, Point};
 use super::samples::ImuRing;
 use super::solve::Model;
 use crate::config::VioConfig;
@@ -41,8 +42,23 @@ const GRAVITY_MISFIT: f64 = 1.5;
 const POSITION_MISFIT: f64 = 0.05;
 /// Rotation noise of one resection, rad: the weight of the gyro bias' prior.
 const RESECTION_ROTATION: f64 = 2e-3;
-/// Alignments that may fail before the mean force has to do.
+/// An inverse distance of this many standard deviations is a measured one.
+const DEPTH_SIGNIFICANT: f64 = 3.0;
+/// Resections that may fail before the mean force has to do; and alignments that vision and inertia may
+/// refuse by contradicting each other, which starting all the same would not mend: some ten seconds.
 const ATTEMPTS: u32 = 3;
+const REFUSALS: u32 = 20;
+/// The mean force: over this long, s; how far from gravity's length it may be, m/s²; and what is then known of
+/// tilt, rad, and of velocity, m/s.
+const MEAN_SPAN: f64 = 1.0;
+const MEAN_FORCE_MISFIT: f64 = 2.5;
+const MEAN_FORCE_TILT: f64 = 0.3;
+const MEAN_FORCE_V: f64 = 3.0;
+/// Least deviations of an alignment in motion: tilt, rad; velocity, m/s; gyro bias, rad/s. The accelerometer's
+/// unknown bias sets them.
+const ALIGNED_TILT: f64 = 0.05;
+const ALIGNED_V: f64 = 0.1;
+const ALIGNED_GYRO: f64 = 0.02;
 /// Position and yaw are ours to choose; this fixes them, m and rad.
 const GAUGE_SIGMA: f64 = 1e-4;
 
@@ -56,13 +72,16 @@ pub struct Start {
 struct Sighting {
     id: u64,
     px: DVec2,
-    point: Point,
+    /// With its standard deviation relative to the inverse distance; none where stereo does not measure one.
+    point: Option<(Point, f64)>,
 }
 
 #[derive(Clone, Copy, Debug)]
 struct Step {
     t: Nanos,
     reference_from_body: Pose,
+    /// Standard deviation of the position along its worst axis, m.
+    sigma: f64,
     increment: Increment,
 }
 
@@ -71,11 +90,17 @@ pub struct Aligner {
     sightings: Vec<Sighting>,
     steps: Vec<Step>,
     attempts: u32,
+    refusals: u32,
 }
 
 impl Aligner {
     pub fn new() -> Aligner {
-        Aligner { sightings: Vec::with_capacity(TRACKS), steps: Vec::with_capacity(ALIGN_FRAMES_MAX), attempts: 0 }
+        Aligner {
+            sightings: Vec::with_capacity(TRACKS),
+            steps: Vec::with_capacity(ALIGN_FRAMES_MAX),
+            attempts: 0,
+            refusals: 0,
+        }
     }
 
     pub const BYTES: usize = TRACKS * size_of::<Sighting>() + ALIGN_FRAMES_MAX * size_of::<Step>();
@@ -83,11 +108,7 @@ impl Aligner {
     pub fn clear(&mut self) {
         self.sightings.clear();
         self.steps.clear();
-        self.attempts = 0;
-    }
-
-    pub fn last(&self) -> Option<Nanos> {
-        self.steps.last().map(|s| s.t)
+        (self.attempts, self.refusals) = (0, 0);
     }
 
     pub fn add(
@@ -110,26 +131,32 @@ impl Aligner {
             self.steps.len().checked_sub(2).map_or(last.reference_from_body, |i| self.steps[i].reference_from_body);
         let stride = last.reference_from_body.p - before.p;
         let guess = Pose::new(last.reference_from_body.q * increment.q, last.reference_from_body.p + stride);
-        let start = match resect(&self.sightings, tracks, model, guess) {
-            Some(reference_from_body) => {
-                self.steps.push(Step { t: tracks.t, reference_from_body, increment });
-                let span = (tracks.t - self.steps[0].t).secs();
-                if !(span >= ALIGN_SPAN && self.steps.len() >= ALIGN_FRAMES_MIN) && self.steps.len() < ALIGN_FRAMES_MAX
-                {
-                    return None;
-                }
-                align(&self.steps, config)
+        let resected = resect(&self.sightings, tracks, model, guess);
+        if let Some((reference_from_body, sigma)) = resected {
+            self.steps.push(Step { t: tracks.t, reference_from_body, sigma, increment });
+            let span = (tracks.t - self.steps[0].t).secs();
+            if !(span >= ALIGN_SPAN && self.steps.len() >= ALIGN_FRAMES_MIN) && self.steps.len() < ALIGN_FRAMES_MAX {
+                return None;
             }
-            None => None,
-        };
-        if start.is_none() {
+            let start = align(&self.steps, self.scale_sigma(), config);
+            if start.is_some() {
+                return start;
+            }
+            self.refusals += 1;
+        } else {
             self.attempts += 1;
-            self.refer_to(tracks, model, config);
-            if self.attempts >= ATTEMPTS {
-                return from_mean_force(tracks.t, imu, noise, config);
-            }
         }
-        start
+        self.refer_to(tracks, model, config);
+        if self.attempts >= ATTEMPTS || self.refusals >= REFUSALS {
+            return from_mean_force(tracks.t, imu, noise, config);
+        }
+        None
+    }
+
+    /// Relative deviation of all distances together.
+    fn scale_sigma(&self) -> f64 {
+        let information: f64 = self.sightings.iter().filter_map(|s| s.point).map(|(_, r)| 1.0 / (r * r)).sum();
+        1.0 / information.max(1.0).sqrt()
     }
 
     /// Starts over from this frame: its stereo points are the metric reference.
@@ -138,14 +165,14 @@ impl Aligner {
         self.steps.push(Step {
             t: tracks.t,
             reference_from_body: Pose::IDENTITY,
+            sigma: 0.0,
             increment: Increment::new(DVec3::ZERO, DVec3::ZERO),
         });
         self.sightings.clear();
         for track in tracks.cameras[0].iter() {
             let px = DVec2::new(track.px[0] as f64, track.px[1] as f64);
-            if let Some(point) = stereo_point(track.id, px, tracks, &model.eyes, config) {
-                self.sightings.push(Sighting { id: track.id, px, point });
-            }
+            let point = stereo_point(track.id, px, tracks, model, config);
+            self.sightings.push(Sighting { id: track.id, px, point });
         }
     }
 
@@ -180,8 +207,10 @@ fn sigma(config: &VioConfig, tilt: f64, v: f64, bg: f64) -> Sigma {
     Sigma { p: GAUGE_SIGMA, yaw: GAUGE_SIGMA, tilt, v, bg: bg.min(config.gyro_bias_sigma), ba: config.accel_bias_sigma }
 }
 
-/// A point from the stereo views of one frame, in its camera 0.
-fn stereo_point(id: u64, px: DVec2, tracks: &Tracks, eyes: &[Eye], config: &VioConfig) -> Option<Point> {
+/// A point from the stereo views of one frame, in its camera 0, and the relative deviation of its inverse
+/// distance; `None` when that is not significant.
+fn stereo_point(id: u64, px: DVec2, tracks: &Tracks, model: &Model, config: &VioConfig) -> Option<(Point, f64)> {
+    let eyes = &model.eyes;
     let bearing = eyes[0].camera.unproject(px)?;
     let host = &eyes[0].body_from_cam;
     let (mut num, mut den) = (0.0, 0.0);
@@ -197,24 +226,28 @@ fn stereo_point(id: u64, px: DVec2, tracks: &Tracks, eyes: &[Eye], config: &VioC
         num -= a.dot(b);
         den += b.length_squared();
     }
+    // Two views, each with the noise of a pixel.
+    let sigma = std::f64::consts::SQRT_2 * model.sigma_px / (eyes[0].camera.fx * den.sqrt());
     let rho = num / den;
-    (den > 0.0 && rho > 0.0).then(|| Point::new(bearing, rho))
+    (rho > DEPTH_SIGNIFICANT * sigma).then(|| (Point::new(bearing, rho), sigma / rho))
 }
 
-/// The body's pose from the reference's points: Gauss-Newton with Huber on all cameras' views.
-fn resect(sightings: &[Sighting], tracks: &Tracks, model: &Model, guess: Pose) -> Option<Pose> {
+/// The body's pose from the reference's points, and the deviation of its position along the worst axis:
+/// Gauss-Newton with Huber on all cameras' views.
+fn resect(sightings: &[Sighting], tracks: &Tracks, model: &Model, guess: Pose) -> Option<(Pose, f64)> {
     let reference = Body { r: DMat3::IDENTITY, p: DVec3::ZERO };
     let mut pose = guess;
-    let mut inliers = 0;
+    let (mut inliers, mut sigma) = (0, 0.0);
     for iteration in 0..RESECTION_ITERATIONS {
         let body = Body::from(&pose);
         let mut h = SMatrix::<f64, 6, 6>::identity() * 1e-6;
         let mut b = SVector::<f64, 6>::zeros();
         inliers = 0;
         for s in sightings {
+            let Some((point, _)) = &s.point else { continue };
             for (camera, eye) in model.eyes.iter().enumerate() {
                 let Some(seen) = find_track(&tracks.cameras[camera], s.id) else { continue };
-                let Some(r) = reproject(&s.point, &model.eyes[0].body_from_cam, &reference, eye, &body) else {
+                let Some(r) = reproject(point, &model.eyes[0].body_from_cam, &reference, eye, &body) else {
                     continue;
                 };
                 let e = r.px - DVec2::new(seen.px[0] as f64, seen.px[1] as f64);
@@ -227,20 +260,24 @@ fn resect(sightings: &[Sighting], tracks: &Tracks, model: &Model, guess: Pose) -
                 }
             }
         }
-        let d = h.cholesky()?.solve(&-b);
+        let factor = h.cholesky()?;
+        let d = factor.solve(&-b);
         if !d.iter().all(|x| x.is_finite()) {
             return None;
         }
         pose = Pose::new(pose.q * so3::exp(DVec3::new(d[3], d[4], d[5])), pose.p + DVec3::new(d[0], d[1], d[2]));
-        if d.norm() < 1e-5 && iteration > 0 {
+        if d.norm() < 1e-5 && iteration > 0 || iteration + 1 == RESECTION_ITERATIONS {
+            let position = factor.inverse().fixed_view::<3, 3>(0, 0).into_owned();
+            sigma = model.sigma_px * position.symmetric_eigenvalues().max().max(0.0).sqrt();
             break;
         }
     }
-    (inliers >= RESECTION_MIN).then_some(pose)
+    (inliers >= RESECTION_MIN).then_some((pose, sigma))
 }
 
-/// Velocity, gravity and gyro bias from resected poses and the increments between them.
-fn align(steps: &[Step], config: &VioConfig) -> Option<Start> {
+/// Velocity, gravity and gyro bias from resected poses and the increments between them. `scale_sigma`: how
+/// wrong all distances may be together.
+fn align(steps: &[Step], scale_sigma: f64, config: &VioConfig) -> Option<Start> {
     let ridge = (RESECTION_ROTATION / config.gyro_bias_sigma).powi(2);
     let (mut h, mut b) = (DMat3::IDENTITY * ridge, DVec3::ZERO);
     for k in 1..steps.len() {
@@ -280,9 +317,15 @@ fn align(steps: &[Step], config: &VioConfig) -> Option<Start> {
     let v0 = (b[0] - g * h[1]) / h[0];
     let misfit =
         rows[1..steps.len()].iter().map(|(t, y)| (*y - v0 * *t - g * (0.5 * t * t)).length_squared()).sum::<f64>();
-    if !((misfit / steps.len() as f64).sqrt() < POSITION_MISFIT) {
+    let misfit = (misfit / steps.len() as f64).sqrt();
+    if !(misfit < POSITION_MISFIT) {
         return None;
     }
+    // Of the two unknowns, each by the deviation of one position.
+    let noise = steps[1..].iter().map(|s| s.sigma).fold(misfit, f64::max);
+    let det = h[0] * h[2] - h[1] * h[1];
+    let (sigma_g, sigma_v) =
+        (noise * (h[0] / det).sqrt(), noise * ((h[2] - 2.0 * t * h[1] + t * t * h[0]) / det).max(0.0).sqrt());
     let world_from_reference = Pose::new(DQuat::from_rotation_arc(-g.normalize(), DVec3::Z), DVec3::ZERO);
     let last = &steps[steps.len() - 1].reference_from_body;
     let motion = Motion {
@@ -291,13 +334,20 @@ fn align(steps: &[Step], config: &VioConfig) -> Option<Start> {
         bg,
         ba: DVec3::ZERO,
     };
-    Some(Start { motion, sigma: sigma(config, 0.05, 0.1, 0.02) })
+    let tilt = ALIGNED_TILT.hypot(sigma_g / -GRAVITY.z);
+    let v = ALIGNED_V.hypot(sigma_v).hypot(scale_sigma * motion.v.length());
+    Some(Start { motion, sigma: sigma(config, tilt, v, ALIGNED_GYRO) })
 }
 
 /// Tilt from the mean specific force of the last second, the rest unknown.
 fn from_mean_force(t: Nanos, imu: &ImuRing, noise: &Noise, config: &VioConfig) -> Option<Start> {
-    let inc = imu.integrate(t - Span::from_secs(1.0), t, DVec3::ZERO, DVec3::ZERO, noise);
+    let span = Span::from_secs(MEAN_SPAN);
+    imu.statistics(t, span)?;
+    let inc = imu.integrate(t - span, t, DVec3::ZERO, DVec3::ZERO, noise);
+    if (inc.v.length() / inc.dt + GRAVITY.z).abs() > MEAN_FORCE_MISFIT {
+        return None;
+    }
     let up = inc.q.conjugate() * inc.v.try_normalize()?;
     let motion = Motion { pose: Pose::new(DQuat::from_rotation_arc(up, DVec3::Z), DVec3::ZERO), ..Motion::default() };
-    Some(Start { motion, sigma: sigma(config, 0.3, 1.0, config.gyro_bias_sigma) })
+    Some(Start { motion, sigma: sigma(config, MEAN_FORCE_TILT, MEAN_FORCE_V, config.gyro_bias_sigma) })
 }

@@ -165,6 +165,24 @@ pub struct Sigma {
     pub ba: f64,
 }
 
+impl Sigma {
+    /// As the covariance of a motion's errors.
+    pub fn covariance(&self, motion: &Motion) -> [[f64; 15]; 15] {
+        let r = motion.pose.rotation();
+        let mut c = [[0.0; 15]; 15];
+        for i in 0..3 {
+            for (at, sigma) in [(0, self.p), (6, self.v), (9, self.bg), (12, self.ba)] {
+                c[at + i][at + i] = sigma * sigma;
+            }
+            for j in 0..3 {
+                let world = [self.tilt, self.tilt, self.yaw];
+                c[3 + i][3 + j] = (0..3).map(|k| r.col(i)[k] * world[k] * world[k] * r.col(j)[k]).sum();
+            }
+        }
+        c
+    }
+}
+
 /// The keyframe pose whose removal costs least: one hardly seen any more, else the one most crowded
 /// by the others and farthest from now (Engel et al., PAMI 2018).
 fn least_useful(window: &Window, landmarks: &Landmarks, newest: usize) -> Option<usize> {

@@ -19,6 +19,8 @@ pub mod rest;
 pub mod samples;
 pub mod shutter;
 pub mod solve;
+mod stats;
+mod trust;
 pub mod window;
 
 #[cfg(test)]
@@ -28,9 +30,9 @@ use crate::frontend::Tracks;
 use crate::limits::{CAMERAS_MAX, STATES};
 use crate::mem::Footprint;
 use glam::DVec3;
-use health::{quality, Evidence, Health, Trusted, Watch};
-use init::{Aligner, Start, RESECTION_MIN};
-use landmarks::Landmarks;
+use health::{quality, sigma_v, Evidence, Health, Reset, Watch, SIGMA_V_UNOBSERVED};
+use init::{Aligner, RESECTION_MIN};
+use landmarks::{Landmark, Landmarks};
 use marginalise::{marginalise, Prior};
 use predict::Predictor;
 use preintegration::{Increment, Noise};
@@ -38,7 +40,9 @@ use residuals::{inertial_residual, Eye, InertialWeight, Motion};
 use rest::at_rest;
 use samples::ImuRing;
 use solve::{Model, Outcome, Solver};
+pub use stats::Stats;
 use stipple_drivers::{Calibration, ImuSample, Nanos, Pose};
+use trust::Trust;
 use window::{Frame, Window, FRAMES};
 
 /// With fewer landmarks in view than this a keyframe is declared at once.
@@ -79,32 +83,6 @@ pub struct Update {
     pub quality: u8,
 }
 
-/// What was dropped, refused, or went wrong so far.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Stats {
-    pub frames: u64,
-    pub keyframes: u64,
-    pub imu_rejected: u64,
-    pub imu_overflow: u64,
-    /// Samples at the end of the sensor's range.
-    pub imu_saturated: u64,
-    /// Frames not newer than the last.
-    pub frames_rejected: u64,
-    pub landmarks_full: u64,
-    pub outliers: u64,
-    pub solver_failures: u64,
-    pub resets: u64,
-    /// Resets because vision and inertia disagreed, or nothing was seen for too long.
-    pub divergences: u64,
-    /// Holes in the inertial samples.
-    pub imu_gaps: u64,
-    /// Frames of which a camera saw next to nothing while another did.
-    pub camera_blind: u64,
-    pub iterations: u64,
-    /// Frames held still because nothing moved.
-    pub zero_velocity_updates: u64,
-}
-
 #[derive(Debug)]
 pub struct Vio {
     model: Model,
@@ -122,8 +100,9 @@ pub struct Vio {
     /// As `predictor` before the newest frame, and the stamp of that frame.
     before: Predictor,
     last: Option<Nanos>,
-    /// Where the last trusted output was: a restart goes on from there.
-    trusted: Option<Trusted>,
+    /// Where a restart goes on, and why there is one.
+    trust: Trust,
+    reset_by: Reset,
     watch: Watch,
     /// What the inertial samples since the last frame suffered.
     pending: Health,
@@ -151,7 +130,8 @@ impl Vio {
             running: false,
             before: Predictor { noise, state: None },
             last: None,
-            trusted: None,
+            trust: Trust::default(),
+            reset_by: Reset::Asked,
             watch: Watch::default(),
             pending: Health::default(),
             covariance: None,
@@ -185,6 +165,7 @@ impl Vio {
         self.stats.imu_saturated += (clipped.0 || clipped.1) as u64;
         self.pending.set(Health::IMU_SATURATED, clipped.0 || clipped.1);
         let overwritten = self.imu.push(s);
+        self.trust.fold(s.t, &self.imu, &self.noise);
         let needed_from = self.window.newest().map(|n| self.window.frame(n).t);
         if let (Some(old), Some(t)) = (overwritten, needed_from) {
             self.stats.imu_overflow += (old.t > t) as u64;
@@ -194,46 +175,57 @@ impl Vio {
     /// Takes what the cameras saw at one instant. Inertial samples up to it must have come before;
     /// the newest is held where they have not.
     pub fn on_tracks(&mut self, tracks: &Tracks) -> Update {
-        let last =
-            if self.running { self.window.newest().map(|n| self.window.frame(n).t) } else { self.aligner.last() };
+        let last = self.last;
         if last.is_some_and(|t| tracks.t <= t) {
             self.stats.frames_rejected += 1;
             return Update::default();
         }
         self.stats.frames += 1;
         (self.before, self.last) = (self.predictor(), Some(tracks.t));
-        let resets = self.stats.resets;
+        let mut given_up = None;
         if self.running && last.is_some_and(|t| (tracks.t - t).secs() > FRAME_GAP_MAX) {
-            self.reset();
+            given_up = Some(Reset::FrameGap);
+            self.give_up(Reset::FrameGap);
         }
-        let mut update = if self.running { self.advance(tracks) } else { self.try_start(tracks) };
-        if self.running && !self.is_sane() {
-            self.reset();
-            update = Update::default();
-        }
+        let tried = if self.running { self.advance(tracks) } else { Ok(self.try_start(tracks)) };
+        let mut update = match tried {
+            Ok(update) if !self.running || self.is_sane() => update,
+            failed => {
+                let why = failed.err().unwrap_or(Reset::State);
+                given_up = Some(why);
+                self.give_up(why);
+                Update::default()
+            }
+        };
         update.health = self.health_of(tracks, &update);
-        update.health.set(Health::DIVERGED_RESET, self.stats.resets > resets);
+        given_up.into_iter().for_each(|why| update.health.set(why.bit(), true));
         self.stats.camera_blind += update.health.has(Health::ONE_CAMERA_BLIND) as u64;
         update.quality = quality(self.covariance(), update.connected);
-        if let (Some(o), true) = (update.odometry, self.watch.trusts()) {
-            self.trusted = Some(Trusted::at(&o, self.covariance(), self.trusted.as_ref()));
+        match (self.window.newest(), &self.covariance) {
+            (Some(n), Some(c)) if self.watch.trusts() => {
+                let f = self.window.frame(n);
+                self.trust.add(f.t, &f.now, c);
+            }
+            _ => self.trust.doubt(),
         }
         update
     }
 
     fn health_of(&mut self, tracks: &Tracks, update: &Update) -> Health {
-        let mut h = std::mem::take(&mut self.pending);
+        let mut h = std::mem::take(&mut self.pending) | self.watch.bits();
         let seen = tracks.cameras[..self.model.eyes.len()].iter().map(|c| c.len());
         let (least, most) = seen.fold((usize::MAX, 0), |(a, b), n| (a.min(n), b.max(n)));
         let held = self.imu.newest().is_none_or(|n| self.noise.is_gap((tracks.t - n.t).secs()));
         let rests = self.window.newest().is_some_and(|n| self.window.frame(n).rest.is_some());
+        let unobserved = self.covariance.as_ref().is_none_or(|c| !(sigma_v(c) < SIGMA_V_UNOBSERVED));
         h.set(Health::INITIALISING, !self.running);
         h.set(Health::NO_TRACKS, most == 0);
-        h.set(Health::FEW_LANDMARKS, update.connected < CONNECTED_FEW);
+        h.set(Health::FEW_LANDMARKS, self.running && update.connected < CONNECTED_FEW);
         h.set(Health::IMU_GAP, held);
         h.set(Health::SOLVER_FAILED, update.outcome.failures > 0);
         h.set(Health::ZERO_VELOCITY, rests);
         h.set(Health::ONE_CAMERA_BLIND, BLIND_FRACTION * least < most);
+        h.set(Health::VELOCITY_UNOBSERVED, self.running && unobserved);
         h
     }
 
@@ -243,26 +235,27 @@ impl Vio {
         if tracks.cameras[0].len() < RESECTION_MIN {
             return Update::default();
         }
-        let Some(Start { mut motion, mut sigma }) =
-            self.aligner.add(tracks, &self.imu, &self.noise, &self.model, &self.config)
-        else {
+        let Some(start) = self.aligner.add(tracks, &self.imu, &self.noise, &self.model, &self.config) else {
             return Update::default();
         };
-        if let Some(last) = &self.trusted {
-            motion = last.go_on(&motion);
-            last.widen(tracks.t, &mut sigma);
-        }
+        let Some(start) = self.trust.go_on(&start, self.reset_by, tracks.t, &self.imu, &self.noise) else {
+            self.aligner.clear();
+            return Update::default();
+        };
+        let (motion, sigma) = (start.motion, start.sigma);
         let Some(slot) = self.window.push(Frame::first(tracks.t, motion)) else { return Update::default() };
         self.window.frame_mut(slot).fix_anchor();
         self.prior.start(slot, &motion, &sigma);
+        self.covariance = Some(sigma.covariance(&motion));
         self.tracks[slot].clone_from(tracks);
         self.running = true;
         self.make_keyframe(slot);
-        self.output(slot, true, 0, Outcome::default())
+        self.output(slot, true, self.landmarks.pool.len(), Outcome::default())
     }
 
-    fn advance(&mut self, tracks: &Tracks) -> Update {
-        let Some(before) = self.window.newest() else { return Update::default() };
+    /// One more frame, or why the estimate is to be given up.
+    fn advance(&mut self, tracks: &Tracks) -> Result<Update, Reset> {
+        let Some(before) = self.window.newest() else { return Err(Reset::State) };
         let from = self.window.frame(before).now;
         let inc = self.imu.integrate(self.window.frame(before).t, tracks.t, from.bg, from.ba, &self.noise);
         let mut frame = Frame::first(tracks.t, from.propagate(&inc));
@@ -296,14 +289,15 @@ impl Vio {
         let misfit =
             inertial_residual(&f.increment, &f.weight, &self.window.frame(before).now, &f.now).norm_squared() / 15.0;
         let inliers = self.landmarks.views_in(slot);
-        if self.watch.diverged(&Evidence { t: f.t, views, inliers, misfit }) {
-            self.stats.divergences += 1;
-            self.reset();
-            return Update { outcome, ..Update::default() };
+        let seen_before = |l: &&Landmark| l.host as usize != slot;
+        let in_frame = |l: &Landmark| l.observations.iter().filter(|o| o.slot as usize == slot).count();
+        let known = self.landmarks.pool.iter().filter(seen_before).map(in_frame).sum();
+        if let Some(why) = self.watch.judge(&Evidence { t: f.t, views, inliers, known, misfit }) {
+            return Err(why);
         }
         let update = self.output(slot, keyframe, connected, outcome);
         marginalise(&mut self.window, &mut self.landmarks, &mut self.prior, &mut self.solver, &self.model);
-        update
+        Ok(update)
     }
 
     fn inertial_weight(&self, inc: &Increment) -> InertialWeight {
@@ -354,6 +348,11 @@ impl Vio {
 
     /// Forgets everything but the inertial samples and where it was, and initialises again.
     pub fn reset(&mut self) {
+        self.give_up(Reset::Asked);
+    }
+
+    fn give_up(&mut self, why: Reset) {
+        self.reset_by = why;
         self.window.clear();
         self.landmarks.clear();
         self.prior.clear();
@@ -363,6 +362,13 @@ impl Vio {
         self.covariance = None;
         self.frames_since_keyframe = 0;
         self.stats.resets += 1;
+        match why {
+            Reset::FrameGap => self.stats.resets_frame_gap += 1,
+            Reset::Disagreement => self.stats.resets_disagreement += 1,
+            Reset::Unseen => self.stats.resets_unseen += 1,
+            Reset::State => self.stats.resets_state += 1,
+            Reset::Asked => {}
+        }
     }
 
     /// Covariance of the newest state, errors [p, θ, v, bg, ba]: p and v in the world, θ on the right of the
@@ -536,13 +542,17 @@ mod tests {
         let mut world = World::new(Path { rest: -1.0 });
         let mut vio = Vio::new(&world.rig, &VioConfig::default());
         run(&mut vio, 0..60, &mut world);
-        let before = vio.trusted.expect("running").pose;
+        let path = Path { rest: -1.0 };
+        let before = vio.window().last().expect("a running window has frames");
         vio.reset();
         run(&mut vio, 60..80, &mut world);
         assert!(vio.running && vio.stats.resets == 1);
-        let after = vio.window().next().expect("a running window has frames").1;
-        // Half a second of alignment at up to 1 m/s and 0.6 rad/s.
-        assert!(before.p.distance(after.p) < 0.5 && before.q.angle_between(after.q) < 0.4);
+        let after = vio.window().next().expect("a running window has frames");
+        // Half a second of alignment at up to 1 m/s, carried by inertia.
+        let truly = |t: Nanos| path.pose(t.0 as f64 * 1e-9);
+        let (moved, true_move) = (before.1.inverse() * after.1, truly(before.0).inverse() * truly(after.0));
+        assert!((after.0 - before.0).secs() > 0.3 && true_move.p.length() > 0.1);
+        assert!(moved.p.distance(true_move.p) < 0.02 && moved.q.angle_between(true_move.q) < 0.02);
         assert_eq!(vio.window().last().map(|w| w.0), Some(Nanos(((79.0 * FRAME_SECS + 0.0012) * 1e9) as i64)));
     }
 

@@ -1,0 +1,264 @@
+//! Where a restart goes on: the last estimate nothing spoke against, carried on by inertia.
+//!
+//! Vision or inertia go wrong some frames before it shows, so after a disagreement it is an estimate of
+//! `LAG` before the first doubt that a restart goes on from. While nothing speaks against the inertial samples either (no frame came, nothing was seen) the carried
+//! pose is the best there is, and its covariance, propagated with it, says how good. Where a restart
+//! finds another velocity than the carried state expects, inertia lied meanwhile: the trusted pose is
+//! kept as it was, widened by how far the rig may have come since. Down is carried by the gyro alone; a
+//! restart that finds another one, for some seconds, is refused, for its accelerometer lies.
+
+use super::health::Reset;
+use super::init::Start;
+use super::marginalise::Sigma;
+use super::preintegration::{Increment, Noise};
+use super::residuals::{Mat15, Motion};
+use super::samples::ImuRing;
+use crate::math::so3;
+use glam::{DMat3, DQuat, DVec3};
+use nalgebra::SMatrix;
+use stipple_drivers::{Nanos, Pose, Span};
+
+type Mat3 = SMatrix<f64, 3, 3>;
+
+/// An estimate is confirmed when nothing spoke against it for this long, s. Less than the ring of samples holds.
+const LAG: f64 = 0.4;
+/// For this long after the trusted estimate its down is better than a restart's that contradicts it, s.
+const DOWN_HOLDS: f64 = 5.0;
+/// Samples are folded in this long after they came, s: the ring of samples need not hold a whole outage, and
+/// no frame is that late.
+const FOLD: f64 = 0.2;
+/// How fast an estimator that is down assumes to move at least, m/s, and to turn, rad/s.
+const SPEED_UNSEEN: f64 = 0.5;
+const RATE_UNSEEN: f64 = 0.5;
+/// Squared distances beyond which a restart contradicts the carried state: three and two dimensions, 99.9 %.
+const VELOCITY_GATE: f64 = 16.3;
+const TILT_GATE: f64 = 13.8;
+/// A restart this unsure of its velocity, m/s, cannot vouch for the inertial samples.
+const VOUCHING_V: f64 = 0.3;
+
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Trust {
+    newest: Option<Trusted>,
+    /// Waits for `LAG`, then is the confirmed one.
+    candidate: Option<Trusted>,
+    confirmed: Option<Trusted>,
+}
+
+#[derive(Clone, Copy, Debug)]
+struct Trusted {
+    t: Nanos,
+    pose: Pose,
+    speed: f64,
+    sigma_p: f64,
+    sigma_yaw: f64,
+    carried: Carried,
+}
+
+/// A motion and its covariance, errors [p, θ, v, bg, ba].
+#[derive(Clone, Copy, Debug)]
+struct Carried {
+    t: Nanos,
+    motion: Motion,
+    covariance: Mat15,
+}
+
+impl Trust {
+    /// An estimate nothing speaks against.
+    pub fn add(&mut self, t: Nanos, motion: &Motion, covariance: &[[f64; 15]; 15]) {
+        let newest = Trusted::at(t, motion, covariance);
+        match &self.candidate {
+            Some(c) if (t - c.t).secs() < LAG => {}
+            waited => (self.confirmed, self.candidate) = (waited.or(self.confirmed), Some(newest)),
+        }
+        self.newest = Some(newest);
+    }
+
+    /// Something speaks against the newest estimate.
+    pub fn doubt(&mut self) {
+        self.candidate = None;
+    }
+
+    /// Carries on as time passes.
+    pub fn fold(&mut self, now: Nanos, imu: &ImuRing, noise: &Noise) {
+        let t = now - Span::from_secs(FOLD);
+        for trusted in [&mut self.newest, &mut self.confirmed].into_iter().flatten() {
+            if (t - trusted.carried.t).secs() > 0.5 * FOLD {
+                trusted.carried.advance(t, imu, noise);
+            }
+        }
+    }
+
+    /// A restart at `t` in the world of before: position and yaw as trusted, the rest of `start`. `None` while
+    /// the start cannot be true.
+    pub fn go_on(&mut self, start: &Start, why: Reset, t: Nanos, imu: &ImuRing, noise: &Noise) -> Option<Start> {
+        let suspect = matches!(why, Reset::Disagreement | Reset::State);
+        let from = if suspect { self.confirmed } else { self.newest.or(self.confirmed) };
+        self.candidate = None;
+        from.map_or(Some(*start), |mut from| from.go_on(start, suspect, t, imu, noise))
+    }
+}
+
+impl Trusted {
+    fn at(t: Nanos, motion: &Motion, covariance: &[[f64; 15]; 15]) -> Trusted {
+        let covariance = Mat15::from_fn(|i, j| covariance[i][j]);
+        let carried = Carried { t, motion: *motion, covariance };
+        let (sigma_p, sigma_yaw) = (carried.sigma_p(), carried.about_world_axis(DVec3::Z));
+        Trusted { t, pose: motion.pose, speed: motion.v.length(), sigma_p, sigma_yaw, carried }
+    }
+
+    fn go_on(&mut self, start: &Start, suspect: bool, t: Nanos, imu: &ImuRing, noise: &Noise) -> Option<Start> {
+        self.carried.advance(t, imu, noise);
+        let away = (t - self.t).secs();
+        let mut sigma = start.sigma;
+        let moved = in_world_of(&self.carried.motion.pose, &start.motion);
+        if away < DOWN_HOLDS && !self.carried.expects_down(&moved, &sigma) {
+            return None;
+        }
+        if self.carried.expects_velocity(&moved, &sigma) && (!suspect || sigma.v < VOUCHING_V) {
+            sigma.p = sigma.p.hypot(self.carried.sigma_p());
+            sigma.yaw = sigma.yaw.hypot(self.carried.about_world_axis(DVec3::Z));
+            return Some(Start { motion: moved, sigma });
+        }
+        let speed = self.speed.max(moved.v.length()).max(SPEED_UNSEEN);
+        sigma.p += self.sigma_p + speed * away;
+        // Beyond half a turn a yaw is no more unknown.
+        sigma.yaw = (sigma.yaw + self.sigma_yaw + RATE_UNSEEN * away).min(std::f64::consts::PI);
+        Some(Start { motion: in_world_of(&self.pose, &start.motion), sigma })
+    }
+}
+
+/// `start` with the position and the yaw of `pose`.
+fn in_world_of(pose: &Pose, start: &Motion) -> Motion {
+    let turn = pose.q * start.pose.q.conjugate();
+    // The part of the turn about the world's axis; none is left when it is half a turn about a level axis.
+    let twist = DQuat::from_xyzw(0.0, 0.0, turn.z, turn.w);
+    let twist = if twist.length_squared() > 1e-12 { twist.normalize() } else { DQuat::IDENTITY };
+    Motion { pose: Pose::new(twist * start.pose.q, pose.p), v: twist * start.v, ..*start }
+}
+
+fn put(m: &mut Mat15, row: usize, col: usize, x: DMat3) {
+    for c in 0..3 {
+        for r in 0..3 {
+            m[(row + r, col + c)] = x.col(c)[r];
+        }
+    }
+}
+
+/// Derivative of the motion after an increment to the motion before it.
+fn transition(from: &Motion, inc: &Increment) -> Mat15 {
+    let (dp, dq, dv) = inc.corrected(from.bg, from.ba);
+    let r = from.pose.rotation();
+    let mut f = Mat15::identity();
+    put(&mut f, 0, 3, r * so3::hat(dp) * -1.0);
+    put(&mut f, 0, 6, DMat3::IDENTITY * inc.dt);
+    put(&mut f, 0, 9, r * inc.d_p_bg());
+    put(&mut f, 0, 12, r * inc.d_p_ba());
+    put(&mut f, 3, 3, DMat3::from_quat(dq.conjugate()));
+    put(&mut f, 3, 9, inc.d_q_bg());
+    put(&mut f, 6, 3, r * so3::hat(dv) * -1.0);
+    put(&mut f, 6, 9, r * inc.d_v_bg());
+    put(&mut f, 6, 12, r * inc.d_v_ba());
+    f
+}
+
+impl Carried {
+    fn advance(&mut self, t: Nanos, imu: &ImuRing, noise: &Noise) {
+        if t <= self.t {
+            return;
+        }
+        let from = self.motion;
+        let inc = imu.integrate(self.t, t, from.bg, from.ba, noise);
+        let f = transition(&from, &inc);
+        let mut p = f * self.covariance * f.transpose();
+        // Increment errors are in the first body frame, but for the rotation's, which is on the right.
+        let r = from.pose.rotation();
+        let mut turn = SMatrix::<f64, 9, 9>::identity();
+        for c in 0..3 {
+            for row in 0..3 {
+                turn[(row, c)] = r.col(c)[row];
+                turn[(6 + row, 6 + c)] = r.col(c)[row];
+            }
+        }
+        let added = turn * inc.covariance * turn.transpose();
+        for i in 0..9 {
+            for j in 0..9 {
+                p[(i, j)] += added[(i, j)];
+            }
+        }
+        for i in 0..3 {
+            p[(9 + i, 9 + i)] += noise.gyro_walk * noise.gyro_walk * inc.dt;
+            p[(12 + i, 12 + i)] += noise.accel_walk * noise.accel_walk * inc.dt;
+        }
+        (self.t, self.motion, self.covariance) = (t, from.propagate(&inc), p);
+    }
+
+    fn block(&self, at: usize) -> Mat3 {
+        self.covariance.fixed_view::<3, 3>(at, at).into_owned()
+    }
+
+    /// Along the axis on which it is largest.
+    fn sigma_p(&self) -> f64 {
+        self.block(0).symmetric_eigenvalues().max().max(0.0).sqrt()
+    }
+
+    fn about_world_axis(&self, axis: DVec3) -> f64 {
+        let a = self.motion.pose.q.conjugate() * axis;
+        let a = SMatrix::<f64, 3, 1>::new(a.x, a.y, a.z);
+        a.dot(&(self.block(3) * a)).max(0.0).sqrt()
+    }
+
+    /// Whether a restart's velocity is what this leads one to expect.
+    fn expects_velocity(&self, start: &Motion, sigma: &Sigma) -> bool {
+        let dv = start.v - self.motion.v;
+        let dv = SMatrix::<f64, 3, 1>::new(dv.x, dv.y, dv.z);
+        let spread = self.block(6) + Mat3::identity() * (sigma.v * sigma.v);
+        spread.cholesky().is_some_and(|factor| dv.dot(&factor.solve(&dv)) < VELOCITY_GATE)
+    }
+
+    /// Whether a restart's down is.
+    fn expects_down(&self, start: &Motion, sigma: &Sigma) -> bool {
+        let tilt = (self.motion.pose.q.conjugate() * DVec3::Z).angle_between(start.pose.q.conjugate() * DVec3::Z);
+        let [x, y] = [DVec3::X, DVec3::Y].map(|axis| self.about_world_axis(axis));
+        tilt * tilt < TILT_GATE * (x.max(y).powi(2) + sigma.tilt * sigma.tilt)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::world::{Path, World, RATE_HZ};
+    use super::*;
+    use crate::config::VioConfig;
+
+    #[test]
+    fn transition_matches_differences_of_the_propagation() {
+        let mut world = World::new(Path { rest: -1.0 });
+        let mut ring = ImuRing::new();
+        for i in 0..100 {
+            ring.push(world.imu(i as f64 / RATE_HZ));
+        }
+        let noise = Noise::new(&world.rig.imu, &VioConfig::default());
+        let from = Motion {
+            pose: Path { rest: -1.0 }.pose(0.1),
+            v: DVec3::new(0.3, -0.5, 0.2),
+            bg: DVec3::new(0.01, -0.02, 0.03),
+            ba: DVec3::new(0.1, 0.2, -0.1),
+        };
+        let inc = ring.integrate(Nanos(100_000_000), Nanos(350_000_000), from.bg, from.ba, &noise);
+        let (f, after) = (transition(&from, &inc), from.propagate(&inc));
+        const H: f64 = 1e-6;
+        for i in 0..15 {
+            let moved = |h: f64| {
+                let mut d = [0.0; 15];
+                d[i] = h;
+                let m = from.plus(&d).propagate(&inc);
+                let th = so3::log(after.pose.q.conjugate() * m.pose.q);
+                [m.pose.p - after.pose.p, th, m.v - after.v, m.bg - after.bg, m.ba - after.ba]
+            };
+            let (a, b) = (moved(H), moved(-H));
+            for j in 0..15 {
+                let numeric = (a[j / 3][j % 3] - b[j / 3][j % 3]) / (2.0 * H);
+                assert!((f[(j, i)] - numeric).abs() < 1e-6, "error {j} to {i}: {} {numeric}", f[(j, i)]);
+            }
+        }
+    }
+}
