@@ -5,6 +5,7 @@
 //! `--set section.key=value` edits the parsed table before it is checked, so an override obeys
 //! the same rules as the file.
 
+use crate::limits::{KEYFRAMES, STATES};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 use stipple_drivers::{Exit, Fault};
@@ -96,6 +97,9 @@ pub struct VioConfig {
     pub observation_sigma_px: f64,
     pub huber_px: f64,
     pub iterations_max: u32,
+    /// Newest frames kept with velocity and biases, and older ones kept as poses.
+    pub states: u32,
+    pub keyframes: u32,
     /// New keyframe when fewer than this fraction of points are landmarks, and not sooner than
     /// `keyframe_gap_min` frames.
     pub keyframe_connected_min: f64,
@@ -127,6 +131,8 @@ impl Default for VioConfig {
             observation_sigma_px: 0.5,
             huber_px: 1.0,
             iterations_max: 7,
+            states: 3,
+            keyframes: 7,
             keyframe_connected_min: 0.7,
             keyframe_gap_min: 5,
             triangulation_baseline_min_m: 0.05,
@@ -411,6 +417,8 @@ const BOUNDS: &[(&str, Bound)] = &[
     ("vio.observation_sigma_px", Positive),
     ("vio.huber_px", Positive),
     ("vio.iterations_max", Within(1.0, 100.0)),
+    ("vio.states", Within(2.0, STATES as f64)),
+    ("vio.keyframes", Within(3.0, KEYFRAMES as f64)),
     ("vio.keyframe_connected_min", Within(0.0, 1.0)),
     ("vio.keyframe_gap_min", Within(0.0, 1000.0)),
     ("vio.triangulation_baseline_min_m", Positive),

@@ -2,12 +2,14 @@
 
 /// Cameras on a rig. Two is what every board has; four is what headsets have.
 pub const CAMERAS_MAX: usize = 4;
-/// Newest frames kept with velocity and biases (15 dof).
-pub const STATES: usize = 3;
-/// Older frames kept as poses only (6 dof).
-pub const KEYFRAMES: usize = 7;
+/// Newest frames kept with velocity and biases (15 dof), at most; the board says how many.
+pub const STATES: usize = 5;
+/// Older frames kept as poses only (6 dof), at most.
+pub const KEYFRAMES: usize = 10;
+/// Time offset, extrinsics of every camera, scale of the inertial unit, where they are estimated.
+pub const RIG_DIM: usize = 1 + 6 * CAMERAS_MAX + 6;
 /// Window dimension at its peak: one more of each just before marginalisation.
-pub const WINDOW_DIM: usize = 15 * (STATES + 1) + 6 * (KEYFRAMES + 1);
+pub const WINDOW_DIM: usize = 15 * (STATES + 1) + 6 * (KEYFRAMES + 1) + RIG_DIM;
 /// Points tracked in one camera at a time.
 pub const TRACKS: usize = 300;
 /// Landmarks alive in the window.

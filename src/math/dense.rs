@@ -1,40 +1,60 @@
 //! Symmetric systems in fixed storage: `½ xᵀ H x + bᵀ x`, dimension up to a capacity bought once.
 //!
-//! Only the lower triangle of H is written and read. Factorisation is an unpivoted LDLᵀ that skips
-//! pivots that are zero to working precision, so eliminating an unobserved direction drops it
-//! instead of dividing by rounding noise.
+//! Only the lower triangle of H is written and read. Solving scales the diagonal to one first, so
+//! that metres, radians and biases do not cost digits, and factors LDLᵀ without exchange, skipping
+//! pivots that are zero to working precision: an unobserved direction is dropped, not divided by
+//! rounding noise.
 
-/// A pivot smaller than this fraction of its diagonal before elimination is rounding noise.
-const PIVOT_MIN: f64 = 1e-13;
+use super::real::Real;
+
+/// A pivot that elimination brought under so many epsilons of its diagonal is rounding noise.
+const PIVOT_EPSILONS: f64 = 100.0;
 
 #[derive(Clone, Debug)]
-pub struct System {
-    h: Vec<f64>,
-    pub b: Vec<f64>,
+pub struct System<S> {
+    h: Vec<S>,
+    pub b: Vec<S>,
+    scale: Vec<S>,
+    column: Vec<S>,
     capacity: usize,
     pub dim: usize,
 }
 
-impl System {
-    pub fn new(capacity: usize) -> System {
-        System { h: vec![0.0; capacity * capacity], b: vec![0.0; capacity], capacity, dim: 0 }
+/// Consecutive columns: where they are in the system, and how many.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Span {
+    pub at: usize,
+    pub len: usize,
+}
+
+impl<S: Real> System<S> {
+    pub fn new(capacity: usize) -> System<S> {
+        let zeros = |n: usize| vec![S::ZERO; n];
+        System {
+            h: zeros(capacity * capacity),
+            b: zeros(capacity),
+            scale: zeros(capacity),
+            column: zeros(capacity),
+            capacity,
+            dim: 0,
+        }
     }
 
-    pub fn bytes(capacity: usize) -> usize {
-        (capacity * capacity + capacity) * size_of::<f64>()
+    pub const fn bytes(capacity: usize) -> usize {
+        (capacity * capacity + 3 * capacity) * size_of::<S>()
     }
 
     /// Sets the dimension and zeroes.
     pub fn clear(&mut self, dim: usize) {
         debug_assert!(dim <= self.capacity);
         self.dim = dim;
-        self.b[..dim].fill(0.0);
+        self.b[..dim].fill(S::ZERO);
         for i in 0..dim {
-            self.h[i * self.capacity..][..dim].fill(0.0);
+            self.h[i * self.capacity..][..dim].fill(S::ZERO);
         }
     }
 
-    pub fn copy_from(&mut self, other: &System) {
+    pub fn copy_from(&mut self, other: &System<S>) {
         self.dim = other.dim;
         self.b[..other.dim].copy_from_slice(&other.b[..other.dim]);
         for i in 0..other.dim {
@@ -44,27 +64,50 @@ impl System {
 
     /// Element of the symmetric matrix.
     #[inline]
-    pub fn at(&self, i: usize, j: usize) -> f64 {
+    pub fn at(&self, i: usize, j: usize) -> S {
         let (i, j) = if i >= j { (i, j) } else { (j, i) };
         self.h[i * self.capacity + j]
     }
 
     /// Adds to the pair (i, j) = (j, i).
     #[inline]
-    pub fn add(&mut self, i: usize, j: usize, x: f64) {
+    pub fn add(&mut self, i: usize, j: usize, x: S) {
         let (i, j) = if i >= j { (i, j) } else { (j, i) };
         self.h[i * self.capacity + j] += x;
     }
 
-    /// The first `n` entries of row `i` from column `j`; inside the lower triangle or a diagonal block.
-    #[inline]
-    pub fn row_mut(&mut self, i: usize, j: usize, n: usize) -> &mut [f64] {
-        &mut self.h[i * self.capacity + j..][..n]
+    /// Adds a product of rows `[A | b]` (lower triangle, see `qr::Rows::gram`) whose columns, from
+    /// `first`, belong to `spans`, ascending, with b after them.
+    #[inline(always)]
+    pub fn add_gram(&mut self, gram: &[S], stride: usize, first: usize, spans: &[Span]) {
+        let mut i = first;
+        for (k, rows) in spans.iter().enumerate() {
+            for r in 0..rows.len {
+                let from = &gram[i * stride..][..stride];
+                let to = &mut self.h[(rows.at + r) * self.capacity..][..self.capacity];
+                let mut j = first;
+                for columns in &spans[..k] {
+                    let pairs = to[columns.at..].iter_mut().zip(&from[j..]);
+                    pairs.take(columns.len).for_each(|(to, from)| *to += *from);
+                    j += columns.len;
+                }
+                let pairs = to[rows.at..].iter_mut().zip(&from[j..]);
+                pairs.take(r + 1).for_each(|(to, from)| *to += *from);
+                i += 1;
+            }
+        }
+        let from = &gram[i * stride..][..stride];
+        let mut j = first;
+        for span in spans {
+            let pairs = self.b[span.at..].iter_mut().zip(&from[j..]);
+            pairs.take(span.len).for_each(|(to, from)| *to += *from);
+            j += span.len;
+        }
     }
 
     /// `y = H x`.
-    pub fn multiply(&self, x: &[f64], y: &mut [f64]) {
-        y[..self.dim].fill(0.0);
+    pub fn multiply(&self, x: &[S], y: &mut [S]) {
+        y[..self.dim].fill(S::ZERO);
         for i in 0..self.dim {
             let row = &self.h[i * self.capacity..][..=i];
             let mut s = row[i] * x[i];
@@ -79,32 +122,36 @@ impl System {
     /// Eliminates the first `m` variables in place: the trailing block of (H, b) becomes the Schur
     /// complement, the leading columns hold L and the leading diagonal D (0 where skipped).
     pub fn eliminate(&mut self, m: usize) {
+        super::real::wide(|| self.eliminate_here(m));
+    }
+
+    #[inline(always)]
+    fn eliminate_here(&mut self, m: usize) {
         let (n, c) = (self.dim, self.capacity);
-        let mut diagonal = [0.0; crate::limits::WINDOW_DIM];
+        let least = S::of(PIVOT_EPSILONS * S::EPSILON);
         for i in 0..n {
-            diagonal[i] = self.h[i * c + i];
+            self.scale[i] = self.h[i * c + i];
         }
         for k in 0..m {
             let d = self.h[k * c + k];
-            if !(d > PIVOT_MIN * diagonal[k]) {
-                self.h[k * c + k] = 0.0;
-                (k + 1..n).for_each(|i| self.h[i * c + k] = 0.0);
+            if !(d > least * self.scale[k]) {
+                self.h[k * c + k] = S::ZERO;
+                (k + 1..n).for_each(|i| self.h[i * c + k] = S::ZERO);
                 continue;
             }
             // Column k, contiguous, so that the update below vectorises.
-            let mut column = [0.0; crate::limits::WINDOW_DIM];
             for i in k + 1..n {
-                column[i] = self.h[i * c + k];
+                self.column[i] = self.h[i * c + k];
             }
             let bk = self.b[k];
             for i in k + 1..n {
-                let l = column[i] / d;
-                if l == 0.0 {
+                let l = self.column[i] / d;
+                if l == S::ZERO {
                     continue;
                 }
                 let row = &mut self.h[i * c..][..=i];
-                for (x, y) in row[k + 1..].iter_mut().zip(&column[k + 1..=i]) {
-                    *x -= l * y;
+                for (x, y) in row[k + 1..].iter_mut().zip(&self.column[k + 1..=i]) {
+                    *x -= l * *y;
                 }
                 row[k] = l;
                 self.b[i] -= l * bk;
@@ -113,18 +160,30 @@ impl System {
     }
 
     /// Solves `H x = -b` into `x`, destroying the system. Skipped directions get zero.
-    pub fn solve(&mut self, x: &mut [f64]) {
+    pub fn solve(&mut self, x: &mut [S]) {
         let (n, c) = (self.dim, self.capacity);
+        // The diagonal scaled to one; x carries the scales through the elimination.
+        for i in 0..n {
+            let d = self.h[i * c + i];
+            x[i] = if d > S::ZERO { S::ONE / d.sqrt() } else { S::ZERO };
+        }
+        for i in 0..n {
+            self.b[i] *= x[i];
+            let s = x[i];
+            let row = &mut self.h[i * c..][..=i];
+            row.iter_mut().zip(&x[..=i]).for_each(|(h, t)| *h *= s * *t);
+        }
         self.eliminate(n);
         // After elimination b = D Lᵀ(-x) row by row.
         for k in (0..n).rev() {
             let d = self.h[k * c + k];
-            let mut s = if d == 0.0 { 0.0 } else { -self.b[k] / d };
+            let mut s = if d == S::ZERO { S::ZERO } else { -self.b[k] / d };
             for i in k + 1..n {
-                s -= self.h[i * c + k] * x[i];
+                s -= self.h[i * c + k] * self.b[i];
             }
-            x[k] = if d == 0.0 { 0.0 } else { s };
+            self.b[k] = if d == S::ZERO { S::ZERO } else { s };
         }
+        x[..n].iter_mut().zip(&self.b).for_each(|(x, b)| *x *= *b);
     }
 }
 
@@ -132,32 +191,37 @@ impl System {
 mod tests {
     use super::*;
 
-    fn example(n: usize) -> System {
+    fn example<S: Real>(n: usize) -> System<S> {
         let mut s = System::new(n);
         s.clear(n);
-        // Gram matrix of a fixed full-rank set of rows.
+        // Gram matrix of a fixed full-rank set of rows, with columns of very different units.
         for r in 0..3 * n {
-            let row: Vec<f64> = (0..n).map(|i| ((r * 7 + i * 13 + r * i) as f64).sin()).collect();
+            let unit = |i: usize| if i % 3 == 0 { 1e3 } else { 1e-2 };
+            let row: Vec<f64> = (0..n).map(|i| ((r * 7 + i * 13 + r * i) as f64).sin() * unit(i)).collect();
             for i in 0..n {
-                s.b[i] += row[i] * (r as f64).cos();
-                (0..=i).for_each(|j| s.add(i, j, row[i] * row[j]));
+                s.b[i] += S::of(row[i] * (r as f64).cos());
+                (0..=i).for_each(|j| s.add(i, j, S::of(row[i] * row[j])));
             }
         }
         s
     }
 
-    #[test]
-    fn solve_satisfies_the_system() {
-        let s = example(20);
-        let (mut x, mut y) = (vec![0.0; 20], vec![0.0; 20]);
+    fn residual<S: Real>() -> f64 {
+        let s = example::<S>(20);
+        let (mut x, mut y) = (vec![S::ZERO; 20], vec![S::ZERO; 20]);
         s.clone().solve(&mut x);
         s.multiply(&x, &mut y);
-        assert!((0..20).all(|i| (y[i] + s.b[i]).abs() < 1e-10));
+        (0..20).map(|i| (y[i] + s.b[i]).f64().abs() / s.at(i, i).f64().sqrt()).fold(0.0, f64::max)
+    }
+
+    #[test]
+    fn solve_satisfies_the_system_in_both_precisions() {
+        assert!(residual::<f64>() < 1e-12 && residual::<f32>() < 1e-3, "{} {}", residual::<f64>(), residual::<f32>());
     }
 
     #[test]
     fn eliminated_system_has_the_solution_of_the_full_one() {
-        let s = example(12);
+        let s = example::<f64>(12);
         let mut x = vec![0.0; 12];
         s.clone().solve(&mut x);
         let mut e = s.clone();
@@ -170,12 +234,12 @@ mod tests {
         }
         let mut z = vec![0.0; 7];
         kept.solve(&mut z);
-        assert!((0..7).all(|i| (z[i] - x[5 + i]).abs() < 1e-9));
+        assert!((0..7).all(|i| (z[i] - x[5 + i]).abs() < 1e-9 * (1.0 + x[5 + i].abs())));
     }
 
     #[test]
     fn unobserved_direction_is_dropped() {
-        let mut s = System::new(3);
+        let mut s = System::<f64>::new(3);
         s.clear(3);
         // Only x0 + x1 and x2 are observed.
         for (i, j) in [(0, 0), (1, 0), (1, 1)] {
@@ -186,5 +250,29 @@ mod tests {
         let mut x = vec![f64::NAN; 3];
         s.solve(&mut x);
         assert!((x[0] + x[1] - 1.0).abs() < 1e-12 && (x[2] - 1.0).abs() < 1e-12);
+    }
+
+    #[test]
+    fn product_of_rows_lands_in_its_spans() {
+        let mut rows = super::super::qr::Rows::<f64>::new(5, 5);
+        rows.clear(5);
+        for r in 0..5 {
+            let row = rows.push();
+            (0..5).for_each(|c| row[c] = ((r * 3 + c * c) as f64).cos());
+        }
+        let mut gram = vec![0.0; super::super::qr::Rows::<f64>::gram_len(5)];
+        let stride = rows.gram(0, &mut gram);
+        let mut s = System::new(8);
+        s.clear(8);
+        // The first column is left out, the second goes to 1, the others to 4 and 5.
+        s.add_gram(&gram, stride, 1, &[Span { at: 1, len: 1 }, Span { at: 4, len: 2 }]);
+        let dot = |i: usize, j: usize| (0..5).map(|r| rows.row(r)[i] * rows.row(r)[j]).sum::<f64>();
+        for (i, a) in [(1, 1), (4, 2), (5, 3)] {
+            assert!((s.b[i] - dot(a, 4)).abs() < 1e-14);
+            for (j, b) in [(1, 1), (4, 2), (5, 3)] {
+                assert!((s.at(i, j) - dot(a, b)).abs() < 1e-14, "{i} {j}");
+            }
+        }
+        assert_eq!((s.at(0, 0), s.at(2, 1)), (0.0, 0.0));
     }
 }

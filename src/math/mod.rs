@@ -1,4 +1,6 @@
 //! Rotations and the small dense algebra of the estimator.
 
 pub mod dense;
+pub mod qr;
+pub mod real;
 pub mod so3;

@@ -29,6 +29,8 @@ impl Observation {
 pub struct Landmark {
     pub id: u64,
     pub host: u8,
+    /// The camera of the host whose ray the point is on.
+    pub host_camera: u8,
     pub point: Point,
     pub observations: List<Observation, OBSERVATIONS>,
 }
@@ -76,7 +78,7 @@ impl Landmarks {
         self.reindex();
     }
 
-    /// Adds every track that already is a landmark; answers how many of camera 0 are and are not.
+    /// Adds every track that already is a landmark; answers how many points are and are not.
     pub fn attach(&mut self, slot: usize, tracks: &Tracks) -> (usize, usize) {
         let (mut connected, mut unconnected) = (0, 0);
         for (camera, list) in tracks.cameras.iter().enumerate() {
@@ -87,7 +89,8 @@ impl Landmarks {
                     // Capacity is every camera of every frame, so a push cannot fail.
                     let _ = self.pool[i].observations.push(seen);
                 }
-                if camera == 0 {
+                // A point that several cameras see counts once.
+                if !tracks.cameras[..camera].iter().any(|c| find_track(c, track.id).is_some()) {
                     *if found.is_some() { &mut connected } else { &mut unconnected } += 1;
                 }
             }
@@ -126,7 +129,7 @@ impl Landmarks {
             |l, o| {
                 let eye = &eyes[o.camera as usize];
                 let (host, target) = (&window.frame(l.host as usize).body, &window.frame(o.slot as usize).body);
-                let seen = predict(&l.point, &eyes[0].body_from_cam, host, eye, target);
+                let seen = predict(&l.point, &eyes[l.host_camera as usize].body_from_cam, host, eye, target);
                 let ok = seen.is_some_and(|px| (px - o.px()).length() <= px_max);
                 dropped += !ok as usize;
                 ok
@@ -135,7 +138,8 @@ impl Landmarks {
         dropped
     }
 
-    /// Makes landmarks of the newest frame's unconnected tracks; answers (made, refused because full).
+    /// Makes landmarks of the newest frame's unconnected tracks, each hosted by the first camera that can;
+    /// answers (made, refused because full).
     pub fn triangulate(
         &mut self,
         slot: usize,
@@ -146,21 +150,28 @@ impl Landmarks {
         px_max: f64,
     ) -> (usize, usize) {
         let (mut made, mut full) = (0, 0);
-        for track in tracks[slot].cameras[0].iter() {
-            if self.find(track.id).is_some() {
-                continue;
+        for (camera, list) in tracks[slot].cameras.iter().enumerate() {
+            let fresh = self.pool.len();
+            for track in list.iter() {
+                if self.find(track.id).is_some() {
+                    continue;
+                }
+                let host = (slot, camera);
+                let Some(landmark) = triangulate_one(track, host, window, tracks, eyes, baseline_min, px_max) else {
+                    continue;
+                };
+                if self.pool.len() == LANDMARKS {
+                    full += 1;
+                } else {
+                    self.pool.push(landmark);
+                    made += 1;
+                }
             }
-            let Some(landmark) = triangulate_one(track, slot, window, tracks, eyes, baseline_min, px_max) else {
-                continue;
-            };
-            if self.pool.len() == LANDMARKS {
-                full += 1;
-            } else {
-                self.pool.push(landmark);
-                made += 1;
+            // The next camera finds what this one made.
+            if self.pool.len() > fresh {
+                self.reindex();
             }
         }
-        self.reindex();
         (made, full)
     }
 }
@@ -181,7 +192,7 @@ fn camera_in_world(body: &Body, eye: &Eye) -> Body {
 
 fn views_of(
     track: &Track,
-    slot: usize,
+    (slot, host_camera): (usize, usize),
     window: &Window,
     tracks: &[Tracks],
     eyes: &[Eye],
@@ -190,7 +201,7 @@ fn views_of(
     let mut n = 0;
     for s in window.slots() {
         for (camera, eye) in eyes.iter().enumerate() {
-            if s == slot && camera == 0 {
+            if s == slot && camera == host_camera {
                 continue;
             }
             let Some(seen) = find_track(&tracks[s].cameras[camera], track.id) else { continue };
@@ -207,18 +218,19 @@ fn views_of(
 /// baseline: `b_t × (R b + rho t) = 0`, in which the angles of the far views are small and weigh alike.
 fn triangulate_one(
     track: &Track,
-    slot: usize,
+    (slot, host_camera): (usize, usize),
     window: &Window,
     tracks: &[Tracks],
     eyes: &[Eye],
     baseline_min: f64,
     px_max: f64,
 ) -> Option<Landmark> {
-    let host_view = Observation { slot: slot as u8, camera: 0, px: track.px };
-    let bearing = eyes[0].camera.unproject(host_view.px())?;
+    let host_view = Observation { slot: slot as u8, camera: host_camera as u8, px: track.px };
+    let host_eye = &eyes[host_camera];
+    let bearing = host_eye.camera.unproject(host_view.px())?;
     let host_body = &window.frame(slot).body;
-    let host = camera_in_world(host_body, &eyes[0]);
-    let (views, n) = views_of(track, slot, window, tracks, eyes);
+    let host = camera_in_world(host_body, host_eye);
+    let (views, n) = views_of(track, (slot, host_camera), window, tracks, eyes);
     let (mut num, mut den) = (0.0, 0.0);
     for v in views[..n].iter().flatten() {
         let to_view = v.camera.r.transpose();
@@ -237,14 +249,19 @@ fn triangulate_one(
     if !(rho < RHO_MAX && rho > -3.0 * BEARING_SIGMA / den.sqrt()) {
         return None;
     }
-    let mut landmark =
-        Landmark { id: track.id, host: slot as u8, point: Point::new(bearing, rho.max(0.0)), ..Landmark::default() };
+    let mut landmark = Landmark {
+        id: track.id,
+        host: slot as u8,
+        host_camera: host_camera as u8,
+        point: Point::new(bearing, rho.max(0.0)),
+        ..Landmark::default()
+    };
     let _ = landmark.observations.push(host_view);
     for v in views[..n].iter().flatten() {
         let o = v.observation;
         let body = &window.frame(o.slot as usize).body;
         let eye = &eyes[o.camera as usize];
-        let seen = predict(&landmark.point, &eyes[0].body_from_cam, host_body, eye, body);
+        let seen = predict(&landmark.point, &host_eye.body_from_cam, host_body, eye, body);
         if seen.is_some_and(|px| (px - o.px()).length() <= px_max) {
             let _ = landmark.observations.push(o);
         }

@@ -1,18 +1,23 @@
 //! What leaves the window becomes a prior on what it touched.
 //!
-//! Per frame: the oldest state leaves once there are more than `STATES`; a keyframe keeps its pose,
-//! another frame goes whole. Beyond `KEYFRAMES` poses the least useful keyframe goes. The factors
-//! that leave with them (the old prior, the inertial factor, finished landmarks, landmarks of the
-//! removed keyframe) are linearised and the leaving variables eliminated. The state after the
-//! leaving one is the boundary: nothing newer is linearised.
+//! Per frame: the oldest state leaves once there are more than rest in the window; a keyframe keeps
+//! its pose, another frame goes whole. Beyond the resting number of keyframe poses the least useful
+//! goes. The factors that leave with them (the old prior, the inertial factor, finished landmarks,
+//! landmarks of the removed keyframe) are stacked as rows, leaving columns first, and a
+//! rank-revealing QR takes those columns out. What stays is a square root: its rows times a
+//! direction are zero where nothing was observed, and single precision holds it (Demmel et al.,
+//! ICCV 2021). The state after the leaving one is the boundary: nothing newer is linearised.
 
-use super::landmarks::Landmarks;
+use super::landmarks::{Landmark, Landmarks};
+use super::linear::{inertial_rows, landmark_rows, rest_rows, Linear, POINT_DIM, STACK_ROWS};
 use super::residuals::Motion;
-use super::rest::add_rest;
-use super::solve::{add_inertial, eliminate_landmark, Model, Solver};
+use super::rig::RigState;
+use super::solve::Model;
 use super::window::{Layout, Window, FRAMES, MOTION_DIM, POSE_DIM};
-use crate::limits::{KEYFRAMES, STATES, WINDOW_DIM};
-use crate::math::dense::System;
+use crate::limits::{RIG_DIM, WINDOW_DIM};
+use crate::math::dense::{Span, System};
+use crate::math::qr::Rows;
+use crate::math::real::{wide, Real};
 use crate::mem::List;
 
 /// A keyframe of which fewer than this fraction of landmarks is still seen goes first.
@@ -20,135 +25,190 @@ const SEEN_FRACTION_MIN: f64 = 0.1;
 /// Newest keyframes that are never removed.
 const KEYFRAMES_SAFE: usize = 2;
 
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-struct Block {
-    slot: u8,
-    motion: bool,
+/// What a run of columns of the prior belongs to.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Block {
+    Pose(u8),
+    Motion(u8),
+    /// Cameras, then inertial unit.
+    Rig(bool),
 }
 
-/// `½ δᵀ H δ + bᵀ δ` on the errors δ of anchored frames.
+impl Default for Block {
+    fn default() -> Block {
+        Block::Rig(false)
+    }
+}
+
+type Blocks = List<Block, { 2 * FRAMES }>;
+
+/// `½ ‖J δ + r‖²` on the errors δ of what is anchored.
 #[derive(Clone, Debug)]
-pub struct Prior {
-    system: System,
-    blocks: List<Block, { 2 * FRAMES }>,
+pub struct Prior<S> {
+    rows: Rows<S>,
+    /// JᵀJ, which every linearisation adds; its last row is r's and changes.
+    gram: Vec<S>,
+    stride: usize,
+    blocks: Blocks,
 }
 
-impl Prior {
-    pub fn new() -> Prior {
-        Prior { system: System::new(WINDOW_DIM), blocks: List::default() }
+impl<S: Real> Prior<S> {
+    pub fn new() -> Prior<S> {
+        let cols = WINDOW_DIM + 1;
+        let gram = vec![S::ZERO; Rows::<S>::gram_len(cols)];
+        let mut rows = Rows::new(cols, cols);
+        rows.clear(1);
+        Prior { rows, gram, stride: 0, blocks: List::default() }
     }
 
-    pub const BYTES: usize = WINDOW_DIM * (WINDOW_DIM + 1) * 8;
+    pub const BYTES: usize = Rows::<S>::bytes(WINDOW_DIM + 1, WINDOW_DIM + 1)
+        + Rows::<S>::gram_len(WINDOW_DIM + 1) * size_of::<S>();
 
     pub fn clear(&mut self) {
         self.blocks.clear();
-        self.system.clear(0);
+        self.rows.clear(1);
     }
 
     /// Starts with one state and its standard deviations; tilt and yaw are about world axes.
     pub fn start(&mut self, slot: usize, motion: &Motion, sigma: &Sigma) {
         self.blocks.clear();
-        let _ = self.blocks.push(Block { slot: slot as u8, motion: false });
-        let _ = self.blocks.push(Block { slot: slot as u8, motion: true });
-        self.system.clear(15);
+        let _ = self.blocks.push(Block::Pose(slot as u8));
+        let _ = self.blocks.push(Block::Motion(slot as u8));
+        self.rows.clear(15 + 1);
         let r = motion.pose.rotation();
-        let info = |s: f64| 1.0 / (s * s);
+        let mut diagonal = |i: usize, s: f64| self.rows.push()[i] = S::of(1.0 / s);
         for i in 0..3 {
-            self.system.add(i, i, info(sigma.p));
-            for j in 0..=i {
-                let world = [sigma.tilt, sigma.tilt, sigma.yaw];
-                let x: f64 = (0..3).map(|k| r.col(i)[k] * info(world[k]) * r.col(j)[k]).sum();
-                self.system.add(3 + i, 3 + j, x);
-            }
-            self.system.add(6 + i, 6 + i, info(sigma.v));
-            self.system.add(9 + i, 9 + i, info(sigma.bg));
-            self.system.add(12 + i, 12 + i, info(sigma.ba));
+            diagonal(i, sigma.p);
+            diagonal(6 + i, sigma.v);
+            diagonal(9 + i, sigma.bg);
+            diagonal(12 + i, sigma.ba);
+        }
+        for (axis, s) in [sigma.tilt, sigma.tilt, sigma.yaw].into_iter().enumerate() {
+            let row = self.rows.push();
+            (0..3).for_each(|i| row[3 + i] = S::of(r.col(i)[axis] / s));
+        }
+        self.stride = self.rows.gram(0, &mut self.gram);
+    }
+
+    fn width(block: Block, rig: &RigState) -> usize {
+        match block {
+            Block::Pose(_) => POSE_DIM,
+            Block::Motion(_) => MOTION_DIM,
+            Block::Rig(false) => rig.camera_dim(),
+            Block::Rig(true) => rig.parts.imu_dim(),
         }
     }
 
-    /// Errors of the anchored frames, and where they sit in `layout`.
-    fn delta(&self, window: &Window) -> [f64; WINDOW_DIM] {
+    fn place(block: Block, layout: &Layout) -> Span {
+        let place = match block {
+            Block::Pose(s) => layout.state(s as usize)[0],
+            Block::Motion(s) => layout.state(s as usize)[1],
+            Block::Rig(false) => layout.cameras(),
+            Block::Rig(true) => layout.imu(),
+        };
+        place.expect("the layout holds all that the prior is about")
+    }
+
+    /// `J δ` and r, a row at a time, for the errors δ `of` each block.
+    fn residuals<'a>(
+        &'a self,
+        window: &Window,
+        of: impl Fn(Block, &mut [f64]),
+    ) -> impl Iterator<Item = (f64, f64)> + 'a {
         let mut d = [0.0; WINDOW_DIM];
         let mut at = 0;
         for b in self.blocks.iter() {
-            let delta = &window.frame(b.slot as usize).delta;
-            let part = if b.motion { &delta[POSE_DIM..] } else { &delta[..POSE_DIM] };
-            d[at..at + part.len()].copy_from_slice(part);
-            at += part.len();
+            let width = Self::width(*b, &window.rig);
+            of(*b, &mut d[at..at + width]);
+            at += width;
         }
-        d
+        (0..self.rows.len()).map(move |i| {
+            let row = self.rows.row(i);
+            ((0..at).map(|c| row[c].f64() * d[c]).sum::<f64>(), row[at].f64())
+        })
     }
 
-    fn columns(&self, layout: &Layout) -> [usize; WINDOW_DIM] {
-        let mut columns = [0; WINDOW_DIM];
-        let mut at = 0;
-        for b in self.blocks.iter() {
-            let slot = b.slot as usize;
-            let (place, n) = if b.motion { (layout.motion(slot), MOTION_DIM) } else { (layout.pose(slot), POSE_DIM) };
-            let place = place.expect("the layout holds every frame of the prior");
-            (0..n).for_each(|i| columns[at + i] = place + i);
-            at += n;
+    fn delta(window: &Window, block: Block, out: &mut [f64]) {
+        let n = out.len();
+        match block {
+            Block::Pose(s) => out.copy_from_slice(&window.frame(s as usize).delta[..POSE_DIM]),
+            Block::Motion(s) => out.copy_from_slice(&window.frame(s as usize).delta[POSE_DIM..]),
+            Block::Rig(false) => out.copy_from_slice(&window.rig.delta[..n]),
+            Block::Rig(true) => out.copy_from_slice(&window.rig.delta[window.rig.camera_dim()..][..n]),
         }
-        columns
     }
 
     pub fn cost(&self, window: &Window) -> f64 {
-        let d = self.delta(window);
-        let mut hd = [0.0; WINDOW_DIM];
-        self.system.multiply(&d, &mut hd);
-        (0..self.system.dim).map(|i| d[i] * (0.5 * hd[i] + self.system.b[i])).sum()
+        self.residuals(window, |b, out| Self::delta(window, b, out)).map(|(jd, r)| 0.5 * (jd + r) * (jd + r)).sum()
     }
 
-    pub fn add_to(&self, window: &Window, layout: &Layout, system: &mut System) -> f64 {
-        let d = self.delta(window);
-        let columns = self.columns(layout);
-        let mut hd = [0.0; WINDOW_DIM];
-        self.system.multiply(&d, &mut hd);
-        let mut cost = 0.0;
-        for i in 0..self.system.dim {
-            system.b[columns[i]] += hd[i] + self.system.b[i];
-            cost += d[i] * (0.5 * hd[i] + self.system.b[i]);
-            for j in 0..=i {
-                system.add(columns[i], columns[j], self.system.at(i, j));
-            }
+    fn spans(&self, layout: &Layout) -> List<Span, { 2 * FRAMES }> {
+        let mut spans = List::default();
+        for b in self.blocks.iter() {
+            let _ = spans.push(Self::place(*b, layout));
         }
+        spans
+    }
+
+    /// Adds the square of the prior; answers its cost.
+    pub fn add_to(&mut self, window: &Window, layout: &Layout, system: &mut System<S>) -> f64 {
+        let mut cost = 0.0;
+        let mut b = [S::ZERO; WINDOW_DIM];
+        let n = self.rows.cols() - 1;
+        for (i, (jd, r)) in self.residuals(window, |b, out| Self::delta(window, b, out)).enumerate() {
+            let e = jd + r;
+            cost += 0.5 * e * e;
+            b[..n].iter_mut().zip(self.rows.row(i)).for_each(|(b, j)| *b += *j * S::of(e));
+        }
+        self.gram[n * self.stride..][..n].copy_from_slice(&b[..n]);
+        let spans = self.spans(layout);
+        wide(|| system.add_gram(&self.gram, self.stride, 0, &spans));
         cost
     }
 
-    /// Takes the trailing block of an eliminated system as the new prior, re-based to the anchors.
-    fn take(&mut self, system: &System, eliminated: usize, blocks: List<Block, { 2 * FRAMES }>, window: &Window) {
-        self.blocks = blocks;
-        let n = system.dim - eliminated;
-        self.system.clear(n);
-        for i in 0..n {
-            self.system.b[i] = system.b[eliminated + i];
-            for j in 0..=i {
-                self.system.add(i, j, system.at(eliminated + i, eliminated + j));
+    /// Stacks the prior's rows at the estimate.
+    fn append_to(&self, window: &Window, layout: &Layout, stack: &mut Rows<S>) {
+        let spans = self.spans(layout);
+        for (i, (jd, r)) in self.residuals(window, |b, out| Self::delta(window, b, out)).enumerate() {
+            let (row, out) = (self.rows.row(i), stack.push());
+            let mut at = 0;
+            for s in spans.iter() {
+                out[s.at..s.at + s.len].copy_from_slice(&row[at..at + s.len]);
+                at += s.len;
             }
+            out[out.len() - 1] = S::of(jd + r);
         }
-        let d = self.delta(window);
-        let mut hd = [0.0; WINDOW_DIM];
-        self.system.multiply(&d, &mut hd);
-        (0..n).for_each(|i| self.system.b[i] -= hd[i]);
     }
 
-    /// `½ nᵀ H n` of a direction given per frame as [p, θ, v, bg, ba].
-    pub fn energy(&self, direction: impl Fn(usize) -> [f64; 15]) -> f64 {
-        let mut d = [0.0; WINDOW_DIM];
-        let mut at = 0;
-        for b in self.blocks.iter() {
-            let full = direction(b.slot as usize);
-            let part = if b.motion { &full[POSE_DIM..] } else { &full[..POSE_DIM] };
-            d[at..at + part.len()].copy_from_slice(part);
-            at += part.len();
+    /// Takes what is left of a stack, whose first columns have left, as the new prior, re-based to the anchors.
+    fn take(&mut self, stack: &Rows<S>, left: usize, blocks: Blocks, window: &Window) {
+        self.blocks = blocks;
+        let n = stack.cols() - left;
+        self.rows.clear(n);
+        for i in 0..stack.len() {
+            self.rows.push().copy_from_slice(&stack.row(i)[left..]);
         }
-        let mut hd = [0.0; WINDOW_DIM];
-        self.system.multiply(&d, &mut hd);
-        0.5 * (0..self.system.dim).map(|i| d[i] * hd[i]).sum::<f64>()
+        let mut shift = [0.0; WINDOW_DIM + 1];
+        let moved = self.residuals(window, |b, out| Self::delta(window, b, out));
+        shift.iter_mut().zip(moved).for_each(|(to, (jd, _))| *to = jd);
+        for (i, shift) in shift[..self.rows.len()].iter().enumerate() {
+            self.rows.row_mut(i)[n - 1] -= S::of(*shift);
+        }
+        self.stride = self.rows.gram(0, &mut self.gram);
+    }
+
+    /// `½ ‖J n‖²` of a direction given per frame as [p, θ, v, bg, ba]; nothing of the rig moves.
+    pub fn energy(&self, window: &Window, direction: impl Fn(usize) -> [f64; 15]) -> f64 {
+        let of = |b: Block, out: &mut [f64]| match b {
+            Block::Pose(s) => out.copy_from_slice(&direction(s as usize)[..POSE_DIM]),
+            Block::Motion(s) => out.copy_from_slice(&direction(s as usize)[POSE_DIM..]),
+            Block::Rig(_) => out.fill(0.0),
+        };
+        self.residuals(window, of).map(|(jd, _)| 0.5 * jd * jd).sum()
     }
 }
 
-impl Default for Prior {
+impl<S: Real> Default for Prior<S> {
     fn default() -> Self {
         Prior::new()
     }
@@ -191,7 +251,7 @@ fn least_useful(window: &Window, landmarks: &Landmarks, newest: usize) -> Option
     for s in window.keyframe_poses().take(n.saturating_sub(KEYFRAMES_SAFE)) {
         candidates.push(s as u8).ok()?;
     }
-    let sees = |l: &super::landmarks::Landmark| l.observations.iter().any(|o| o.slot as usize == newest);
+    let sees = |l: &Landmark| l.observations.iter().any(|o| o.slot as usize == newest);
     for s in candidates.iter() {
         let seen = landmarks.pool.iter().filter(|l| l.host == *s && sees(l)).count();
         if (seen as f64) < SEEN_FRACTION_MIN * window.frame(*s as usize).hosted as f64 {
@@ -207,69 +267,103 @@ fn least_useful(window: &Window, landmarks: &Landmarks, newest: usize) -> Option
     candidates.iter().map(|s| *s as usize).min_by(|a, b| score(*a).total_cmp(&score(*b)))
 }
 
-/// Shrinks the window back to its resting size.
-pub fn marginalise(
-    window: &mut Window,
-    landmarks: &mut Landmarks,
-    prior: &mut Prior,
-    solver: &mut Solver,
-    model: &Model,
-) {
-    let mut states = window.states();
-    let (Some(oldest), Some(boundary)) = (states.next(), states.next()) else { return };
-    if 2 + states.count() <= STATES {
-        return;
-    }
-    let newest = window.newest().expect("a window with states has a newest frame");
-    let keeps_pose = window.frame(oldest).keyframe;
-    let poses = window.keyframe_poses().count() + keeps_pose as usize;
-    let removed = if poses > KEYFRAMES { least_useful(window, landmarks, newest) } else { None };
+/// Rows and a factor's block, bought once.
+#[derive(Clone, Debug)]
+pub struct Marginaliser<S> {
+    stack: Rows<S>,
+}
 
-    // Leaving columns first; every frame up to the boundary is in.
-    let mut layout = Layout::empty();
-    layout.add_motion(oldest);
-    if !keeps_pose {
-        layout.add_pose(oldest);
+impl<S: Real> Marginaliser<S> {
+    pub fn new() -> Marginaliser<S> {
+        Marginaliser { stack: Rows::new(STACK_ROWS, WINDOW_DIM + 1) }
     }
-    removed.into_iter().for_each(|s| layout.add_pose(s));
-    let leaving = layout.dim;
-    let mut blocks = List::default();
-    for s in
-        window.keyframe_poses().filter(|s| Some(*s) != removed).chain(keeps_pose.then_some(oldest)).chain([boundary])
-    {
-        layout.add_pose(s);
-        let _ = blocks.push(Block { slot: s as u8, motion: false });
-    }
-    layout.add_motion(boundary);
-    let _ = blocks.push(Block { slot: boundary as u8, motion: true });
 
-    let (system, scratch) = solver.scratch();
-    system.clear(layout.dim);
-    prior.add_to(window, &layout, system);
-    add_inertial(window, oldest, boundary, &layout, system);
-    add_rest(window.frame(oldest), oldest, &layout, system);
-    let finished = |l: &super::landmarks::Landmark| {
-        Some(l.host as usize) == removed || l.observations.iter().all(|o| layout.pose(o.slot as usize).is_some())
-    };
-    for l in landmarks.pool.iter().filter(|l| finished(l)) {
-        eliminate_landmark(l, window, model, &layout, system, scratch);
-    }
-    landmarks.retain(|l| !finished(l));
+    pub const BYTES: usize = Rows::<S>::bytes(STACK_ROWS, WINDOW_DIM + 1);
 
-    system.eliminate(leaving);
-    for b in blocks.iter() {
-        window.frame_mut(b.slot as usize).fix_anchor();
-    }
-    prior.take(system, leaving, blocks, window);
+    /// Shrinks the window back to its resting size.
+    pub fn shrink(
+        &mut self,
+        window: &mut Window,
+        landmarks: &mut Landmarks,
+        prior: &mut Prior<S>,
+        linear: &mut Linear<S>,
+        model: &Model,
+    ) {
+        let mut states = window.states();
+        let (Some(oldest), Some(boundary)) = (states.next(), states.next()) else { return };
+        if 2 + states.count() <= model.states {
+            return;
+        }
+        let newest = window.newest().expect("a window with states has a newest frame");
+        let keeps_pose = window.frame(oldest).keyframe;
+        let poses = window.keyframe_poses().count() + keeps_pose as usize;
+        let removed = if poses > model.keyframes { least_useful(window, landmarks, newest) } else { None };
 
-    if keeps_pose {
-        window.frame_mut(oldest).moving = false;
-    } else {
-        window.remove(oldest);
-        landmarks.forget(oldest);
-    }
-    if let Some(s) = removed {
-        window.remove(s);
-        landmarks.forget(s);
+        // Leaving columns first; every frame up to the boundary is in.
+        let mut layout = Layout::empty();
+        layout.add_motion(oldest);
+        if !keeps_pose {
+            layout.add_pose(oldest);
+        }
+        removed.into_iter().for_each(|s| layout.add_pose(s));
+        let leaving = layout.dim;
+        let mut blocks = Blocks::default();
+        let mut keep = |b: Block| blocks.push(b).expect("a block a frame, one of motion and two of the rig");
+        layout.add_rig(&window.rig);
+        layout.cameras().into_iter().for_each(|_| keep(Block::Rig(false)));
+        layout.imu().into_iter().for_each(|_| keep(Block::Rig(true)));
+        let kept = window.keyframe_poses().filter(|s| Some(*s) != removed);
+        for s in kept.chain(keeps_pose.then_some(oldest)).chain([boundary]) {
+            layout.add_pose(s);
+            keep(Block::Pose(s as u8));
+        }
+        layout.add_motion(boundary);
+        keep(Block::Motion(boundary as u8));
+
+        let stack = &mut self.stack;
+        stack.clear(layout.dim + 1);
+        prior.append_to(window, &layout, stack);
+        inertial_rows(window, oldest, boundary, &layout, linear);
+        linear.append_to(0, stack);
+        if rest_rows(window, oldest, &layout, linear).is_some() {
+            linear.append_to(0, stack);
+        }
+        let finished = |l: &Landmark| {
+            Some(l.host as usize) == removed || l.observations.iter().all(|o| layout.pose(o.slot as usize).is_some())
+        };
+        for l in landmarks.pool.iter().filter(|l| finished(l)) {
+            if landmark_rows(l, window, model, &layout, linear).1 {
+                linear.append_to(POINT_DIM, stack);
+            }
+        }
+        landmarks.retain(|l| !finished(l));
+
+        stack.marginalise(leaving);
+        for b in blocks.iter() {
+            match b {
+                Block::Pose(s) | Block::Motion(s) => window.frame_mut(*s as usize).fix_anchor(),
+                Block::Rig(_) => window.rig.fix_anchor(),
+            }
+        }
+        prior.take(stack, leaving, blocks, window);
+
+        if keeps_pose {
+            window.frame_mut(oldest).moving = false;
+        } else {
+            window.remove(oldest);
+            landmarks.forget(oldest);
+        }
+        if let Some(s) = removed {
+            window.remove(s);
+            landmarks.forget(s);
+        }
     }
 }
+
+impl<S: Real> Default for Marginaliser<S> {
+    fn default() -> Self {
+        Marginaliser::new()
+    }
+}
+
+const _: () = assert!(FRAMES + 4 <= 2 * FRAMES && RIG_DIM < WINDOW_DIM);

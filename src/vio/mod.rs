@@ -11,11 +11,13 @@
 pub mod health;
 pub mod init;
 pub mod landmarks;
+pub mod linear;
 pub mod marginalise;
 pub mod predict;
 pub mod preintegration;
 pub mod residuals;
 pub mod rest;
+pub mod rig;
 pub mod samples;
 pub mod shutter;
 pub mod solve;
@@ -28,16 +30,18 @@ use crate::bench::world;
 use crate::config::VioConfig;
 use crate::frontend::Tracks;
 use crate::limits::{CAMERAS_MAX, STATES};
+use crate::math::real::Real;
 use crate::mem::Footprint;
 use glam::DVec3;
 use health::{quality, sigma_v, Evidence, Health, Reset, Watch, SIGMA_V_UNOBSERVED};
 use init::{Aligner, RESECTION_MIN};
 use landmarks::{Landmark, Landmarks};
-use marginalise::{marginalise, Prior};
+use marginalise::{Marginaliser, Prior};
 use predict::Predictor;
 use preintegration::{Increment, Noise};
 use residuals::{inertial_residual, Eye, InertialWeight, Motion};
 use rest::at_rest;
+use rig::{Parts, RigState};
 use samples::ImuRing;
 use solve::{Model, Outcome, Solver};
 pub use stats::Stats;
@@ -83,8 +87,14 @@ pub struct Update {
     pub quality: u8,
 }
 
+/// The scalar of the linear algebra: single precision where the last digits of information do not matter
+/// and bytes and vector registers do.
+pub type Scalar = f32;
+/// The estimator as it is built.
+pub type Vio = Estimator<Scalar>;
+
 #[derive(Debug)]
-pub struct Vio {
+pub struct Estimator<S: Real = Scalar> {
     model: Model,
     config: VioConfig,
     noise: Noise,
@@ -93,8 +103,9 @@ pub struct Vio {
     /// What was seen in each slot of the window.
     tracks: Vec<Tracks>,
     landmarks: Landmarks,
-    prior: Prior,
-    solver: Solver,
+    prior: Prior<S>,
+    solver: Solver<S>,
+    marginaliser: Marginaliser<S>,
     aligner: Aligner,
     running: bool,
     /// As `predictor` before the newest frame, and the stamp of that frame.
@@ -112,20 +123,23 @@ pub struct Vio {
     hash: u64,
 }
 
-impl Vio {
-    pub fn new(calibration: &Calibration, config: &VioConfig) -> Vio {
+impl<S: Real> Estimator<S> {
+    pub fn new(calibration: &Calibration, config: &VioConfig) -> Estimator<S> {
         let eyes: Vec<Eye> = calibration.cameras.iter().take(CAMERAS_MAX).map(Eye::from).collect();
+        let poses: Vec<Pose> = calibration.cameras.iter().take(CAMERAS_MAX).map(|c| c.body_from_cam).collect();
+        let rig = RigState::new(&eyes, &poses, Parts::default());
         let noise = Noise::new(&calibration.imu, config);
-        Vio {
+        Estimator {
             model: Model::new(eyes, config),
             config: config.clone(),
             noise,
             imu: ImuRing::new(),
-            window: Window::new(),
+            window: Window::new(rig),
             tracks: vec![Tracks::default(); FRAMES],
             landmarks: Landmarks::new(),
             prior: Prior::new(),
             solver: Solver::new(),
+            marginaliser: Marginaliser::new(),
             aligner: Aligner::new(),
             running: false,
             before: Predictor { noise, state: None },
@@ -146,7 +160,8 @@ impl Vio {
         f.host("vio: inertial ring", ImuRing::BYTES);
         f.host("vio: window", Window::BYTES + FRAMES * size_of::<Tracks>());
         f.host("vio: landmarks", Landmarks::BYTES);
-        f.host("vio: solver and prior", Solver::BYTES + Prior::BYTES);
+        f.host("vio: solver", Solver::<S>::BYTES);
+        f.host("vio: prior and marginalisation", Prior::<S>::BYTES + Marginaliser::<S>::BYTES);
         f.host("vio: initialisation", Aligner::BYTES);
         f
     }
@@ -278,12 +293,12 @@ impl Vio {
             self.make_keyframe(slot);
         }
 
-        let outcome = self.solver.optimise(&mut self.window, &mut self.landmarks, &self.prior, &self.model);
+        let outcome = self.solver.optimise(&mut self.window, &mut self.landmarks, &mut self.prior, &self.model);
         self.stats.solver_failures += outcome.failures as u64;
         self.stats.iterations += outcome.iterations as u64;
         self.covariance = self.solver.newest_covariance();
         let views = self.landmarks.views_in(slot);
-        let dropped = self.landmarks.drop_outliers(&self.window, &self.model.eyes, self.config.outlier_px);
+        let dropped = self.landmarks.drop_outliers(&self.window, self.window.rig.eyes(), self.config.outlier_px);
         self.stats.outliers += dropped as u64;
         let f = self.window.frame(slot);
         let misfit =
@@ -296,8 +311,13 @@ impl Vio {
             return Err(why);
         }
         let update = self.output(slot, keyframe, connected, outcome);
-        marginalise(&mut self.window, &mut self.landmarks, &mut self.prior, &mut self.solver, &self.model);
+        self.shrink();
         Ok(update)
+    }
+
+    fn shrink(&mut self) {
+        let (window, landmarks, linear) = (&mut self.window, &mut self.landmarks, &mut self.solver.linear);
+        self.marginaliser.shrink(window, landmarks, &mut self.prior, linear, &self.model);
     }
 
     fn inertial_weight(&self, inc: &Increment) -> InertialWeight {
@@ -315,7 +335,7 @@ impl Vio {
             slot,
             &self.window,
             &self.tracks,
-            &self.model.eyes,
+            self.window.rig.eyes(),
             self.config.triangulation_baseline_min_m,
             self.config.outlier_px,
         );
@@ -478,7 +498,7 @@ mod tests {
         vio.prior.start(first, &motion, &sigma);
         run(&mut vio, 12..120, &mut world);
         assert!(vio.stats.resets == 0 && vio.window.keyframe_poses().count() > 3);
-        let energy = |shift: DVec3, turn: DVec3| vio.prior.energy(|slot| gauge(&vio, shift, turn, slot));
+        let energy = |shift: DVec3, turn: DVec3| vio.prior.energy(&vio.window, |slot| gauge(&vio, shift, turn, slot));
         let tilt = energy(DVec3::ZERO, DVec3::X).min(energy(DVec3::ZERO, DVec3::Y));
         assert!(tilt > 1e4, "tilt is observable: {tilt}");
         for (what, e) in [
@@ -513,9 +533,9 @@ mod tests {
         vio.landmarks.retain(|l| l.observations.iter().all(|o| window.frame(o.slot as usize).t <= old));
         assert!(vio.window.frame(oldest).moving);
 
-        let before = vio.solver.newton_step(&vio.window, &vio.landmarks, &vio.prior, &vio.model);
-        marginalise(&mut vio.window, &mut vio.landmarks, &mut vio.prior, &mut vio.solver, &vio.model);
-        let after = vio.solver.newton_step(&vio.window, &vio.landmarks, &vio.prior, &vio.model);
+        let before = vio.solver.newton_step(&vio.window, &vio.landmarks, &mut vio.prior, &vio.model);
+        vio.shrink();
+        let after = vio.solver.newton_step(&vio.window, &vio.landmarks, &mut vio.prior, &vio.model);
         for slot in vio.window.states() {
             for i in 0..15 {
                 let (a, b) = (before[slot][i], after[slot][i]);

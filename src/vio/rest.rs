@@ -9,12 +9,10 @@
 
 use super::init::{REST_ACCEL, REST_GYRO, REST_PX};
 use super::landmarks::find_track;
-use super::residuals::Motion;
 use super::samples::ImuRing;
-use super::window::{Frame, Layout, Window};
+use super::window::{Frame, Window};
 use crate::frontend::Tracks;
 use crate::limits::TRACKS;
-use crate::math::dense::System;
 use crate::mem::List;
 use glam::DVec3;
 use stipple_drivers::Span;
@@ -91,53 +89,46 @@ fn median_displacement(from: &Tracks, to: &Tracks) -> Option<f32> {
     Some(median(x).max(median(y)))
 }
 
-/// Whitened residual: velocity, then gyro bias beside the mean rate.
-fn residual(rate: DVec3, now: &Motion) -> [f64; 6] {
-    let (v, g) = (now.v / SIGMA_V, (now.bg - rate) / SIGMA_GYRO);
-    [v.x, v.y, v.z, g.x, g.y, g.z]
+/// Reciprocal deviations of the residual: of velocity, then of the gyro's bias.
+pub const REST_WEIGHTS: [f64; 6] = {
+    let (v, g) = (1.0 / SIGMA_V, 1.0 / SIGMA_GYRO);
+    [v, v, v, g, g, g]
+};
+
+/// Whitened residual of a frame at rest: velocity, then gyro bias beside the mean rate. Its derivative to
+/// [v, bg] is the diagonal of `REST_WEIGHTS`.
+pub fn rest_residual(frame: &Frame) -> Option<[f64; 6]> {
+    let (v, g) = (frame.now.v / SIGMA_V, (frame.now.bg - frame.rest?) / SIGMA_GYRO);
+    Some([v.x, v.y, v.z, g.x, g.y, g.z])
 }
 
 pub fn rest_cost(frame: &Frame) -> f64 {
-    frame.rest.map_or(0.0, |rate| 0.5 * residual(rate, &frame.now).iter().map(|r| r * r).sum::<f64>())
-}
-
-/// Adds a frame's factor, if it is at rest; answers its cost. It is linear, so it has no linearisation
-/// point to keep.
-pub fn add_rest(frame: &Frame, slot: usize, layout: &Layout, system: &mut System) -> f64 {
-    if let (Some(rate), Some(at)) = (frame.rest, layout.motion(slot)) {
-        for (i, r) in residual(rate, &frame.now).into_iter().enumerate() {
-            let weight = 1.0 / if i < 3 { SIGMA_V } else { SIGMA_GYRO };
-            system.b[at + i] += r * weight;
-            system.add(at + i, at + i, weight * weight);
-        }
-    }
-    rest_cost(frame)
+    rest_residual(frame).map_or(0.0, |r| 0.5 * r.iter().map(|r| r * r).sum::<f64>())
 }
 
 #[cfg(test)]
 mod tests {
+    use super::super::residuals::Motion;
     use super::*;
     use stipple_drivers::Nanos;
 
     #[test]
-    fn gradient_of_the_rest_factor_matches_differences_of_its_cost() {
+    fn weights_of_the_rest_factor_are_the_derivatives_of_its_residual() {
         let now = Motion { v: DVec3::new(0.02, -0.01, 0.03), bg: DVec3::new(0.01, 0.0, -0.02), ..Motion::default() };
         let mut frame = Frame::first(Nanos(0), now);
+        assert_eq!(rest_cost(&frame), 0.0);
         frame.rest = Some(DVec3::new(0.012, 0.001, -0.021));
-        let mut window = Window::new();
-        let slot = window.push(frame).expect("an empty window has room");
-        let layout = Layout::of(&window);
-        let mut system = System::new(15);
-        system.clear(15);
-        add_rest(window.frame(slot), slot, &layout, &mut system);
         for i in 0..15 {
-            let cost = |h: f64| {
+            let at = |h: f64| {
                 let mut d = [0.0; 15];
                 d[i] = h;
-                rest_cost(&Frame { now: now.plus(&d), ..frame })
+                rest_residual(&Frame { now: now.plus(&d), ..frame }).expect("at rest")
             };
-            let slope = (cost(1e-6) - cost(-1e-6)) / 2e-6;
-            assert!((slope - system.b[i]).abs() < 1e-5 * (1.0 + slope.abs()), "error {i}: {slope} {}", system.b[i]);
+            let (up, down) = (at(1e-6), at(-1e-6));
+            for k in 0..6 {
+                let expected = if i == k + 6 { REST_WEIGHTS[k] } else { 0.0 };
+                assert!(((up[k] - down[k]) / 2e-6 - expected).abs() < 1e-5, "error {i}, residual {k}");
+            }
         }
     }
 }

@@ -7,7 +7,9 @@
 
 use super::preintegration::{Increment, Mat9};
 use super::residuals::{Body, InertialWeight, Motion};
+use super::rig::RigState;
 use crate::limits::{KEYFRAMES, STATES};
+use crate::math::dense::Span;
 use crate::mem::List;
 use glam::DVec3;
 use stipple_drivers::Nanos;
@@ -101,12 +103,13 @@ pub struct Window {
     used: [bool; FRAMES],
     /// Slots, oldest first.
     pub order: List<u8, FRAMES>,
+    pub rig: RigState,
 }
 
 impl Window {
-    pub fn new() -> Window {
+    pub fn new(rig: RigState) -> Window {
         let frames = vec![Frame::first(Nanos(0), Motion::default()); FRAMES];
-        Window { saved: frames.clone(), frames, used: [false; FRAMES], order: List::default() }
+        Window { saved: frames.clone(), frames, used: [false; FRAMES], order: List::default(), rig }
     }
 
     pub const BYTES: usize = 2 * FRAMES * size_of::<Frame>();
@@ -114,6 +117,7 @@ impl Window {
     pub fn clear(&mut self) {
         self.used = [false; FRAMES];
         self.order.clear();
+        self.rig.release();
     }
 
     /// The slot taken, or `None` when the window is full.
@@ -157,10 +161,12 @@ impl Window {
 
     pub fn save(&mut self) {
         self.saved.copy_from_slice(&self.frames);
+        self.rig.save();
     }
 
     pub fn restore(&mut self) {
         self.frames.copy_from_slice(&self.saved);
+        self.rig.restore();
     }
 
     pub fn step(&mut self, layout: &Layout, dx: &[f64]) {
@@ -175,12 +181,10 @@ impl Window {
             }
             self.frames[slot].step(&d);
         }
-    }
-}
-
-impl Default for Window {
-    fn default() -> Self {
-        Window::new()
+        let part = |span: Option<Span>| span.map_or(&[][..], |s| &dx[s.at..s.at + s.len]);
+        if layout.cameras.is_some() || layout.imu.is_some() {
+            self.rig.step(part(layout.cameras), part(layout.imu));
+        }
     }
 }
 
@@ -191,17 +195,20 @@ const ABSENT: usize = usize::MAX;
 pub struct Layout {
     pose: [usize; FRAMES],
     motion: [usize; FRAMES],
+    cameras: Option<Span>,
+    imu: Option<Span>,
     pub dim: usize,
 }
 
 impl Layout {
     pub fn empty() -> Layout {
-        Layout { pose: [ABSENT; FRAMES], motion: [ABSENT; FRAMES], dim: 0 }
+        Layout { pose: [ABSENT; FRAMES], motion: [ABSENT; FRAMES], cameras: None, imu: None, dim: 0 }
     }
 
     /// Every variable of the window.
     pub fn of(window: &Window) -> Layout {
         let mut l = Layout::empty();
+        l.add_rig(&window.rig);
         for slot in window.slots() {
             l.add_pose(slot);
             if window.frame(slot).moving {
@@ -226,6 +233,31 @@ impl Layout {
         }
     }
 
+    /// What is estimated of the rig, if anything.
+    pub fn add_rig(&mut self, rig: &RigState) {
+        let mut add = |len: usize| {
+            let span = Span { at: self.dim, len };
+            self.dim += len;
+            (len > 0).then_some(span)
+        };
+        (self.cameras, self.imu) = (add(rig.camera_dim()), add(rig.parts.imu_dim()));
+    }
+
+    /// Columns of the rig that views touch.
+    pub fn cameras(&self) -> Option<Span> {
+        self.cameras
+    }
+
+    /// Columns of the rig that inertial factors touch.
+    pub fn imu(&self) -> Option<Span> {
+        self.imu
+    }
+
+    /// Pose, then velocity and biases.
+    pub fn state(&self, slot: usize) -> [Option<Span>; 2] {
+        [self.pose(slot).map(|at| Span { at, len: POSE_DIM }), self.motion(slot).map(|at| Span { at, len: MOTION_DIM })]
+    }
+
     #[inline]
     pub fn pose(&self, slot: usize) -> Option<usize> {
         (self.pose[slot] != ABSENT).then_some(self.pose[slot])
@@ -234,11 +266,5 @@ impl Layout {
     #[inline]
     pub fn motion(&self, slot: usize) -> Option<usize> {
         (self.motion[slot] != ABSENT).then_some(self.motion[slot])
-    }
-
-    /// Columns of the 15 errors of a state.
-    pub fn columns(&self, slot: usize) -> Option<[usize; 15]> {
-        let (p, m) = (self.pose(slot)?, self.motion(slot)?);
-        Some(std::array::from_fn(|i| if i < POSE_DIM { p + i } else { m + i - POSE_DIM }))
     }
 }

@@ -1,0 +1,301 @@
+//! Rows of a linear least-squares problem, `‖A x + b‖²`, and their Householder QR.
+//!
+//! A row is `[A | b]`. Orthogonal transforms of the rows change neither the sum of squares nor its
+//! minimum, and never square the condition of A. Columns that depend on earlier ones to working
+//! precision are recognised (rank-revealing without column exchange, so that the caller's order of
+//! elimination stands): what rounding left of them is dropped, so that a direction nobody observed
+//! stays unobserved.
+
+use super::real::{wide, Real};
+
+/// What is left of a column is rounding when it is under this many epsilons of its length before
+/// elimination: a few roundings in each of a hundred reflections.
+const RANK_EPSILONS: f64 = 200.0;
+/// Elements a row is padded to: a whole number of the widest vectors.
+const LANES: usize = 8;
+/// Rows of the product computed together, to use each load several times.
+const GRAM_ROWS: usize = 4;
+
+/// `[A | b]`, row-major, with capacity bought once.
+#[derive(Clone, Debug)]
+pub struct Rows<S> {
+    a: Vec<S>,
+    /// The reflection's combination of rows, and its vector.
+    combination: Vec<S>,
+    reflection: Vec<S>,
+    /// Squared length of each column when elimination began.
+    lengths: Vec<S>,
+    rows: usize,
+    cols: usize,
+    stride: usize,
+    rows_max: usize,
+}
+
+const fn padded(n: usize) -> usize {
+    n.div_ceil(LANES) * LANES
+}
+
+impl<S: Real> Rows<S> {
+    /// Room for `rows_max` rows of `cols_max` columns, b included.
+    pub fn new(rows_max: usize, cols_max: usize) -> Rows<S> {
+        let stride = padded(cols_max);
+        Rows {
+            a: vec![S::ZERO; rows_max * stride],
+            combination: vec![S::ZERO; stride],
+            reflection: vec![S::ZERO; rows_max],
+            lengths: vec![S::ZERO; stride],
+            rows: 0,
+            cols: 0,
+            stride: 0,
+            rows_max,
+        }
+    }
+
+    pub const fn bytes(rows_max: usize, cols_max: usize) -> usize {
+        ((rows_max + 2) * padded(cols_max) + rows_max) * size_of::<S>()
+    }
+
+    /// Empties, for rows of `cols` columns, b included.
+    pub fn clear(&mut self, cols: usize) {
+        (self.rows, self.cols, self.stride) = (0, cols, padded(cols));
+        debug_assert!(self.rows_max * self.stride <= self.a.len());
+    }
+
+    pub fn len(&self) -> usize {
+        self.rows
+    }
+
+    pub fn is_empty(&self) -> bool {
+        self.rows == 0
+    }
+
+    pub fn cols(&self) -> usize {
+        self.cols
+    }
+
+    /// Rows that can still be pushed.
+    pub fn room(&self) -> usize {
+        self.rows_max - self.rows
+    }
+
+    /// A new row of zeros.
+    #[inline]
+    pub fn push(&mut self) -> &mut [S] {
+        debug_assert!(self.rows < self.rows_max);
+        let row = &mut self.a[self.rows * self.stride..][..self.stride];
+        row.fill(S::ZERO);
+        self.rows += 1;
+        &mut row[..self.cols]
+    }
+
+    #[inline]
+    pub fn row(&self, i: usize) -> &[S] {
+        &self.a[i * self.stride..][..self.cols]
+    }
+
+    #[inline]
+    pub fn row_mut(&mut self, i: usize) -> &mut [S] {
+        &mut self.a[i * self.stride..][..self.cols]
+    }
+
+    /// Eliminates columns `0..n`: afterwards the first `rank` rows are triangular in them, and the others
+    /// do not contain them. Answers the rank.
+    pub fn eliminate(&mut self, n: usize) -> usize {
+        wide(|| {
+            self.measure();
+            self.reflect(0, n, 0)
+        })
+    }
+
+    /// The same with the remaining columns, of the rows below the first `rank`, which are dropped with the
+    /// first `n` columns' information. So are rows that speak of no column any more.
+    pub fn marginalise(&mut self, n: usize) {
+        let end = self.cols - 1;
+        wide(|| {
+            self.measure();
+            let rank = self.reflect(0, n, 0);
+            let last = self.reflect(n, end, rank);
+            self.a.copy_within(rank * self.stride..last * self.stride, 0);
+            self.rows = last - rank;
+        });
+    }
+
+    /// As few rows as hold the same information.
+    pub fn triangularise(&mut self) {
+        self.marginalise(0);
+    }
+
+    #[inline(always)]
+    fn measure(&mut self) {
+        let stride = self.stride;
+        self.lengths[..stride].fill(S::ZERO);
+        for row in self.a[..self.rows * stride].chunks_exact(stride) {
+            for (l, x) in self.lengths[..stride].iter_mut().zip(row) {
+                *l += *x * *x;
+            }
+        }
+    }
+
+    #[inline(always)]
+    fn reflect(&mut self, from: usize, to: usize, mut pivot: usize) -> usize {
+        let stride = self.stride;
+        let least = S::of((RANK_EPSILONS * S::EPSILON).powi(2));
+        for c in from..to {
+            if pivot == self.rows {
+                break;
+            }
+            let v = &mut self.reflection[..self.rows];
+            let mut square = S::ZERO;
+            for i in pivot..self.rows {
+                v[i] = self.a[i * stride + c];
+                square += v[i] * v[i];
+            }
+            // Also false where anything is not finite.
+            if !(square > least * self.lengths[c]) {
+                (pivot..self.rows).for_each(|i| self.a[i * stride + c] = S::ZERO);
+                continue;
+            }
+            let norm = square.sqrt();
+            let x = v[pivot];
+            let (alpha, size) = if x > S::ZERO { (-norm, x) } else { (norm, -x) };
+            v[pivot] = x - alpha;
+            let scale = S::ONE / (norm * (norm + size));
+            // From the lane c is in, so that the loops below stay aligned.
+            let begin = c / LANES * LANES;
+            let w = &mut self.combination[begin..stride];
+            w.fill(S::ZERO);
+            for i in pivot..self.rows {
+                // Rows are sparse before they are mixed.
+                if v[i] != S::ZERO {
+                    let row = &self.a[i * stride + begin..(i + 1) * stride];
+                    w.iter_mut().zip(row).for_each(|(w, x)| *w += v[i] * *x);
+                }
+            }
+            w.iter_mut().for_each(|w| *w *= scale);
+            w[..c - begin].fill(S::ZERO);
+            for i in pivot..self.rows {
+                if v[i] != S::ZERO {
+                    let row = &mut self.a[i * stride + begin..(i + 1) * stride];
+                    row.iter_mut().zip(&*w).for_each(|(x, w)| *x -= v[i] * *w);
+                }
+            }
+            self.a[pivot * stride + c] = alpha;
+            (pivot + 1..self.rows).for_each(|i| self.a[i * stride + c] = S::ZERO);
+            pivot += 1;
+        }
+        pivot
+    }
+
+    /// `[A | b]ᵀ [A | b]` of the rows from `first`, lower triangle, into `out` with the stride it answers.
+    pub fn gram(&self, first: usize, out: &mut [S]) -> usize {
+        let stride = self.stride;
+        let rows = &self.a[first * stride..self.rows * stride];
+        wide(|| {
+            for i in (0..self.cols).step_by(GRAM_ROWS) {
+                for j in (0..i + GRAM_ROWS).step_by(LANES) {
+                    let mut sum = [[S::ZERO; LANES]; GRAM_ROWS];
+                    for row in rows.chunks_exact(stride) {
+                        let right: &[S; LANES] = row[j..j + LANES].try_into().expect("rows are padded to lanes");
+                        let left: &[S; GRAM_ROWS] = row[i..i + GRAM_ROWS].try_into().expect("lanes are whole");
+                        for (sum, x) in sum.iter_mut().zip(left) {
+                            for (s, y) in sum.iter_mut().zip(right) {
+                                *s += *x * *y;
+                            }
+                        }
+                    }
+                    for (k, sum) in sum.iter().enumerate() {
+                        out[(i + k) * stride + j..][..LANES].copy_from_slice(sum);
+                    }
+                }
+            }
+        });
+        stride
+    }
+
+    /// Elements `gram` writes at most.
+    pub const fn gram_len(cols_max: usize) -> usize {
+        padded(cols_max) * padded(cols_max)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn example<S: Real>(rows: usize, cols: usize) -> Rows<S> {
+        let mut a = Rows::new(rows, cols);
+        a.clear(cols);
+        for r in 0..rows {
+            let row = a.push();
+            (0..cols).for_each(|c| row[c] = S::of(((r * 7 + c * 13 + r * c) as f64).sin()));
+        }
+        a
+    }
+
+    fn gram<S: Real>(a: &Rows<S>, first: usize) -> Vec<Vec<f64>> {
+        let mut out = vec![S::ZERO; Rows::<S>::gram_len(a.cols())];
+        let stride = a.gram(first, &mut out);
+        (0..a.cols()).map(|i| (0..=i).map(|j| out[i * stride + j].f64()).collect()).collect()
+    }
+
+    fn close(a: &[Vec<f64>], b: &[Vec<f64>], tolerance: f64) {
+        for (a, b) in a.iter().flatten().zip(b.iter().flatten()) {
+            assert!((a - b).abs() <= tolerance, "{a} {b}");
+        }
+    }
+
+    #[test]
+    fn product_is_that_of_the_rows() {
+        let a = example::<f64>(11, 13);
+        let dot = |i: usize, j: usize| (0..11).map(|r| a.row(r)[i] * a.row(r)[j]).sum::<f64>();
+        let expected: Vec<Vec<f64>> = (0..13).map(|i| (0..=i).map(|j| dot(i, j)).collect()).collect();
+        close(&gram(&a, 0), &expected, 1e-13);
+    }
+
+    fn keeps_the_product<S: Real>(tolerance: f64) {
+        let a = example::<S>(30, 12);
+        let mut b = a.clone();
+        assert_eq!(b.eliminate(5), 5);
+        close(&gram(&a, 0), &gram(&b, 0), tolerance);
+        assert!((0..30).all(|r| (0..5.min(r)).all(|c| b.row(r)[c] == S::ZERO)));
+        // What no column explains is dropped: all but b's own square stays.
+        let mut c = a.clone();
+        c.triangularise();
+        assert_eq!(c.len(), 11);
+        let (before, after) = (gram(&a, 0), gram(&c, 0));
+        close(&before[..11], &after[..11], tolerance);
+        assert!(after[11][11] < before[11][11]);
+        (0..11).for_each(|j| assert!((after[11][j] - before[11][j]).abs() < tolerance));
+    }
+
+    #[test]
+    fn elimination_and_triangularisation_keep_the_product() {
+        keeps_the_product::<f64>(1e-12);
+        keeps_the_product::<f32>(3e-5);
+    }
+
+    fn dependent<S: Real>() -> usize {
+        // The third column is the sum of the first two, the fourth is nobody's.
+        let mut a = example::<S>(40, 8);
+        let n = a.stride;
+        for r in 0..40 {
+            let row = &mut a.a[r * n..][..n];
+            (row[2], row[3]) = (row[0] + row[1], S::ZERO);
+        }
+        let rank = a.eliminate(5);
+        assert!((rank..40).all(|r| a.row(r)[2] == S::ZERO && a.row(r)[3] == S::ZERO));
+        rank
+    }
+
+    #[test]
+    fn dependent_columns_are_recognised_in_both_precisions() {
+        assert_eq!((dependent::<f64>(), dependent::<f32>()), (3, 3));
+    }
+
+    #[test]
+    fn rows_that_are_not_finite_are_not_made_worse() {
+        let mut a = example::<f64>(6, 4);
+        a.a[3] = f64::NAN;
+        assert!(a.eliminate(3) <= 3);
+    }
+}

@@ -1,0 +1,217 @@
+//! Factors as rows `[J | r]` of a least-squares problem: what the solver sums up and
+//! marginalisation stacks. A row holds only the columns its factor touches.
+//!
+//! A landmark's block is `[point | frames | r]`; Householder QR of the three columns of the point
+//! leaves rows that do not contain it (Demmel et al., ICCV 2021). Residuals are taken at the
+//! estimate, Jacobians at the linearisation points.
+
+use super::landmarks::Landmark;
+use super::residuals::{huber, inertial_jacobians, inertial_residual, predict, reproject, Reprojection};
+use super::rest::{rest_residual, REST_WEIGHTS};
+use super::solve::Model;
+use super::window::{Layout, Window, FRAMES, MOTION_DIM, POSE_DIM};
+use crate::limits::{OBSERVATIONS, RIG_DIM, WINDOW_DIM};
+use crate::math::dense::{Span, System};
+use crate::math::qr::Rows;
+use crate::math::real::{wide, Real};
+use crate::mem::List;
+
+/// Columns of a point, first in a landmark's block.
+pub const POINT_DIM: usize = 3;
+/// Square root of the information on an inverse distance nothing observes, m.
+const RHO_RIDGE: f64 = 1e-3;
+/// An observation whose point has left the camera model costs as if this far off, px.
+const LOST_PX: f64 = 20.0;
+/// Parts of the window that one factor can touch: the poses a landmark sees, or all of two states.
+pub const SPANS: usize = FRAMES + 2;
+/// Columns of a landmark's block besides the point.
+pub const LOCAL_DIM: usize = POSE_DIM * FRAMES + RIG_DIM;
+const COLS_MAX: usize = POINT_DIM + LOCAL_DIM + 1;
+const ROWS_MAX: usize = 2 * OBSERVATIONS + 1;
+
+/// The rows of one factor; reused for every factor.
+#[derive(Clone, Debug)]
+pub struct Linear<S> {
+    pub rows: Rows<S>,
+    /// Of the layout, ascending; they follow each other in the rows after the point's columns.
+    pub spans: List<Span, SPANS>,
+    lead: usize,
+    gram: Vec<S>,
+}
+
+impl<S: Real> Linear<S> {
+    pub fn new() -> Linear<S> {
+        Linear {
+            rows: Rows::new(ROWS_MAX, COLS_MAX),
+            spans: List::default(),
+            lead: 0,
+            gram: vec![S::ZERO; Rows::<S>::gram_len(COLS_MAX)],
+        }
+    }
+
+    pub const BYTES: usize = Rows::<S>::bytes(ROWS_MAX, COLS_MAX) + Rows::<S>::gram_len(COLS_MAX) * size_of::<S>();
+
+    /// Empties, for rows with `lead` columns of their own before those of `spans`.
+    fn begin(&mut self, lead: usize, spans: impl Iterator<Item = Span>) {
+        self.spans.clear();
+        for span in spans {
+            self.spans.push(span).expect("SPANS is the most a factor touches");
+        }
+        self.spans.sort_unstable_by_key(|s| s.at);
+        self.lead = lead;
+        self.rows.clear(lead + self.spans.iter().map(|s| s.len).sum::<usize>() + 1);
+    }
+
+    /// Where the columns of the layout from `at` are in the rows.
+    fn offset(&self, at: usize) -> usize {
+        self.lead + self.spans.iter().take_while(|s| s.at != at).map(|s| s.len).sum::<usize>()
+    }
+
+    /// Adds the square of the rows from `first`, the point's columns left out.
+    pub fn add_to(&mut self, first: usize, system: &mut System<S>) {
+        let stride = self.rows.gram(first, &mut self.gram);
+        wide(|| system.add_gram(&self.gram, stride, self.lead, &self.spans));
+    }
+
+    /// Appends the rows from `first`, the point's columns left out; makes room when there is none.
+    pub fn append_to(&self, first: usize, stack: &mut Rows<S>) {
+        if stack.room() < self.rows.len() - first {
+            stack.triangularise();
+        }
+        for i in first..self.rows.len() {
+            let row = self.rows.row(i);
+            let out = stack.push();
+            let mut j = self.lead;
+            for s in self.spans.iter() {
+                out[s.at..s.at + s.len].copy_from_slice(&row[j..j + s.len]);
+                j += s.len;
+            }
+            out[out.len() - 1] = row[j];
+        }
+    }
+}
+
+impl<S: Real> Default for Linear<S> {
+    fn default() -> Self {
+        Linear::new()
+    }
+}
+
+/// Rows of the stack of a marginalisation: what stays of it when triangular, and the largest factor.
+pub const STACK_ROWS: usize = WINDOW_DIM + 4 * ROWS_MAX;
+
+/// Residual at the estimate, Jacobians at the linearisation points.
+fn observe(landmark: &Landmark, view: usize, window: &Window) -> Option<Reprojection> {
+    let o = &landmark.observations[view];
+    let (h, t) = (window.frame(landmark.host as usize), window.frame(o.slot as usize));
+    let (host, camera) = (landmark.host_camera as usize, o.camera as usize);
+    let (fixed, now) = (window.rig.eyes_jacobian(), window.rig.eyes());
+    let host_eye = &fixed[host].body_from_cam;
+    let mut r = reproject(&landmark.point, host_eye, &h.body_jacobian, &fixed[camera], &t.body_jacobian)?;
+    if h.anchored || t.anchored || window.rig.anchored {
+        r.px = predict(&landmark.point, &now[host].body_from_cam, &h.body, &now[camera], &t.body)?;
+    }
+    r.px -= o.px();
+    Some(r)
+}
+
+/// A landmark's views in frames of the layout, its point eliminated: the first `POINT_DIM` rows hold it,
+/// the others do not. Answers its cost, and whether there is anything beside it.
+pub fn landmark_rows<S: Real>(
+    landmark: &Landmark,
+    window: &Window,
+    model: &Model,
+    layout: &Layout,
+    out: &mut Linear<S>,
+) -> (f64, bool) {
+    let host = landmark.host as usize;
+    let views = landmark.observations.iter().enumerate().filter(|(_, o)| layout.pose(o.slot as usize).is_some());
+    let mut touched = [false; FRAMES];
+    views.clone().for_each(|(_, o)| touched[o.slot as usize] = true);
+    let others = (0..FRAMES).any(|s| touched[s] && s != host);
+    touched[host] = others;
+    let frames = (0..FRAMES).filter(|s| touched[*s] && others).filter_map(|s| layout.pose(s));
+    out.begin(POINT_DIM, frames.map(|at| Span { at, len: POSE_DIM }).chain(layout.cameras()));
+    let host_at = layout.pose(host).filter(|_| others).map(|at| out.offset(at));
+
+    let mut cost = 0.0;
+    let inv_sigma = 1.0 / model.sigma_px;
+    for (k, o) in views {
+        let Some(r) = observe(landmark, k, window) else {
+            cost += huber(LOST_PX * inv_sigma, model.huber_px * inv_sigma).1;
+            continue;
+        };
+        let (weight, c) = huber(r.px.length() * inv_sigma, model.huber_px * inv_sigma);
+        cost += c;
+        let weight = weight.sqrt() * inv_sigma;
+        let target_at = layout.pose(o.slot as usize).filter(|_| o.slot != landmark.host).map(|at| out.offset(at));
+        for axis in 0..2 {
+            let row = out.rows.push();
+            let mut put = |at: usize, x: &[f64]| {
+                row[at..].iter_mut().zip(x).for_each(|(to, x)| *to = S::of(x * weight));
+            };
+            put(0, &r.d_point[axis]);
+            // In its host's own frame a view says nothing about poses.
+            if let (Some(host_at), Some(target_at)) = (host_at, target_at) {
+                put(host_at, &r.d_host[axis]);
+                put(target_at, &r.d_target[axis]);
+            }
+            let last = row.len() - 1;
+            row[last] = S::of(r.px[axis] * weight);
+        }
+    }
+    out.rows.push()[POINT_DIM - 1] = S::of(RHO_RIDGE);
+    // A point that its views do not determine says nothing of them.
+    (cost, out.rows.eliminate(POINT_DIM) == POINT_DIM)
+}
+
+/// The inertial factor between two states; answers its cost.
+pub fn inertial_rows<S: Real>(window: &Window, from: usize, slot: usize, layout: &Layout, out: &mut Linear<S>) -> f64 {
+    let (a, b) = (window.frame(from), window.frame(slot));
+    let r = inertial_residual(&b.increment, &b.weight, &a.now, &b.now);
+    let (ja, jb) = inertial_jacobians(&b.increment, &b.weight, a.motion_jacobian(), b.motion_jacobian());
+    out.begin(0, layout.state(from).into_iter().chain(layout.state(slot)).flatten());
+    let at = [from, slot].map(|s| layout.state(s).map(|part| part.map(|p| out.offset(p.at))));
+    for i in 0..r.len() {
+        let row = out.rows.push();
+        for (at, j) in at.iter().zip([&ja, &jb]) {
+            for (part, columns) in at.iter().zip([0..POSE_DIM, POSE_DIM..POSE_DIM + MOTION_DIM]) {
+                let Some(part) = part else { continue };
+                columns.enumerate().for_each(|(k, c)| row[part + k] = S::of(j[(i, c)]));
+            }
+        }
+        row[row.len() - 1] = S::of(r[i]);
+    }
+    0.5 * r.norm_squared()
+}
+
+/// The factor of a frame at rest, `None` when it is not; answers its cost. It is linear, so it has no
+/// linearisation point to keep.
+pub fn rest_rows<S: Real>(window: &Window, slot: usize, layout: &Layout, out: &mut Linear<S>) -> Option<f64> {
+    let (r, [_, motion]) = (rest_residual(window.frame(slot))?, layout.state(slot));
+    out.begin(0, motion.into_iter());
+    for (i, (r, weight)) in r.into_iter().zip(REST_WEIGHTS).enumerate() {
+        let row = out.rows.push();
+        (row[i], row[MOTION_DIM]) = (S::of(weight), S::of(r));
+    }
+    Some(0.5 * r.iter().map(|r| r * r).sum::<f64>())
+}
+
+/// What the views of all landmarks cost at the estimate.
+pub fn cost_of_views(landmarks: &[Landmark], window: &Window, model: &Model) -> f64 {
+    let inv_sigma = 1.0 / model.sigma_px;
+    let eyes = window.rig.eyes();
+    let lost = huber(LOST_PX * inv_sigma, model.huber_px * inv_sigma).1;
+    let mut cost = 0.0;
+    for l in landmarks {
+        let (host, host_eye) = (&window.frame(l.host as usize).body, &eyes[l.host_camera as usize].body_from_cam);
+        for o in l.observations.iter() {
+            let target = &window.frame(o.slot as usize).body;
+            cost += match predict(&l.point, host_eye, host, &eyes[o.camera as usize], target) {
+                Some(px) => huber((px - o.px()).length() * inv_sigma, model.huber_px * inv_sigma).1,
+                None => lost,
+            };
+        }
+    }
+    cost
+}
