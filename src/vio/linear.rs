@@ -115,15 +115,14 @@ fn observe(landmark: &Landmark, view: usize, window: &Window) -> Option<Reprojec
     Some(r)
 }
 
-/// A landmark's views in frames of the layout, its point eliminated: the first `POINT_DIM` rows hold it,
-/// the others do not. Answers its cost, and whether there is anything beside it.
-pub fn landmark_rows<S: Real>(
+/// A landmark's views in frames of the layout; answers their cost.
+fn view_rows<S: Real>(
     landmark: &Landmark,
     window: &Window,
     model: &Model,
     layout: &Layout,
     out: &mut Linear<S>,
-) -> (f64, bool) {
+) -> f64 {
     let host = landmark.host as usize;
     let views = landmark.observations.iter().enumerate().filter(|(_, o)| layout.pose(o.slot as usize).is_some());
     let mut touched = [false; FRAMES];
@@ -161,8 +160,45 @@ pub fn landmark_rows<S: Real>(
         }
     }
     out.rows.push()[POINT_DIM - 1] = S::of(RHO_RIDGE);
-    // A point that its views do not determine says nothing of them.
+    cost
+}
+
+/// The same with its point eliminated: the first `POINT_DIM` rows hold it, the others do not. Answers the cost
+/// of its views, and whether they determine the point; one that they do not says nothing of the frames.
+pub fn landmark_rows<S: Real>(
+    landmark: &Landmark,
+    window: &Window,
+    model: &Model,
+    layout: &Layout,
+    out: &mut Linear<S>,
+) -> (f64, bool) {
+    let cost = view_rows(landmark, window, model, layout, out);
     (cost, out.rows.eliminate(POINT_DIM) == POINT_DIM)
+}
+
+/// Rows before elimination, `[point | all columns of the layout | r]`, for tests; `None` where `landmark_rows`
+/// would say nothing.
+#[cfg(test)]
+pub fn raw_landmark_rows<S: Real>(
+    landmark: &Landmark,
+    window: &Window,
+    model: &Model,
+    layout: &Layout,
+    out: &mut Linear<S>,
+) -> Option<Vec<Vec<f64>>> {
+    view_rows(landmark, window, model, layout, out);
+    let mut full = Vec::new();
+    for i in 0..out.rows.len() {
+        let (row, mut wide, mut j) = (out.rows.row(i), vec![0.0; POINT_DIM + layout.dim + 1], POINT_DIM);
+        (0..POINT_DIM).for_each(|k| wide[k] = row[k].f64());
+        for s in out.spans.iter() {
+            (0..s.len).for_each(|k| wide[POINT_DIM + s.at + k] = row[j + k].f64());
+            j += s.len;
+        }
+        wide[POINT_DIM + layout.dim] = row[j].f64();
+        full.push(wide);
+    }
+    (out.rows.eliminate(POINT_DIM) == POINT_DIM).then_some(full)
 }
 
 /// The inertial factor between two states; answers its cost.

@@ -61,8 +61,8 @@ impl<S: Real> Prior<S> {
         Prior { rows, gram, stride: 0, blocks: List::default() }
     }
 
-    pub const BYTES: usize = Rows::<S>::bytes(WINDOW_DIM + 1, WINDOW_DIM + 1)
-        + Rows::<S>::gram_len(WINDOW_DIM + 1) * size_of::<S>();
+    pub const BYTES: usize =
+        Rows::<S>::bytes(WINDOW_DIM + 1, WINDOW_DIM + 1) + Rows::<S>::gram_len(WINDOW_DIM + 1) * size_of::<S>();
 
     pub fn clear(&mut self) {
         self.blocks.clear();

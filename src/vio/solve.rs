@@ -109,23 +109,20 @@ impl<S: Real> Eliminated<S> {
         }
     }
 
-    fn step(&self, dx: &[S]) -> [f64; POINT_DIM] {
-        let mut d = [S::ZERO; POINT_DIM];
+    fn step(&self, dx: &[f64]) -> [f64; POINT_DIM] {
+        let mut d = [0.0; POINT_DIM];
         if self.determined {
             for i in (0..POINT_DIM).rev() {
-                let mut sum = self.own.g[i];
-                let mut at = 0;
+                let mut sum = self.own.g[i].f64();
+                let mut w = self.own.w[i].iter();
                 for s in self.spans.iter() {
-                    for k in 0..s.len {
-                        sum += self.own.w[i][at + k] * dx[s.at + k];
-                    }
-                    at += s.len;
+                    sum += w.by_ref().zip(&dx[s.at..s.at + s.len]).map(|(w, x)| w.f64() * x).sum::<f64>();
                 }
-                (i + 1..POINT_DIM).for_each(|j| sum += self.own.r[i][j] * d[j]);
-                d[i] = -sum / self.own.r[i][i];
+                (i + 1..POINT_DIM).for_each(|j| sum += self.own.r[i][j].f64() * d[j]);
+                d[i] = -sum / self.own.r[i][i].f64();
             }
         }
-        d.map(Real::f64)
+        d
     }
 }
 
@@ -136,8 +133,7 @@ pub struct Solver<S> {
     factor: System<S>,
     pub linear: Linear<S>,
     eliminated: Vec<Eliminated<S>>,
-    dx: Vec<S>,
-    dx_window: Vec<f64>,
+    dx: Vec<f64>,
 }
 
 #[derive(Clone, Copy, Debug, Default)]
@@ -170,15 +166,14 @@ impl<S: Real> Solver<S> {
             factor: System::new(WINDOW_DIM),
             linear: Linear::new(),
             eliminated: vec![Eliminated::empty(); LANDMARKS],
-            dx: vec![S::ZERO; WINDOW_DIM],
-            dx_window: vec![0.0; WINDOW_DIM],
+            dx: vec![0.0; WINDOW_DIM],
         }
     }
 
     pub const BYTES: usize = LANDMARKS * size_of::<Eliminated<S>>()
         + 2 * System::<S>::bytes(WINDOW_DIM)
         + Linear::<S>::BYTES
-        + WINDOW_DIM * (size_of::<S>() + size_of::<f64>());
+        + WINDOW_DIM * size_of::<f64>();
 
     fn linearise(
         &mut self,
@@ -217,24 +212,18 @@ impl<S: Real> Solver<S> {
     /// Solves the damped system; answers the decrease it predicts, `None` when not finite.
     fn step(&mut self, lambda: f64, landmarks: usize) -> Option<f64> {
         let n = self.system.dim;
-        self.factor.copy_from(&self.system);
-        let damping = |h: S| (lambda * h.f64()).max(DAMPING_MIN);
-        for i in 0..n {
-            self.factor.add(i, i, S::of(damping(self.system.at(i, i))));
-        }
-        self.factor.solve(&mut self.dx);
+        let damping = |h: f64| (lambda * h).max(DAMPING_MIN);
+        self.system.solve_damped(damping, &mut self.factor, &mut self.dx);
         let mut decrease = 0.0;
-        for i in 0..n {
-            let (d, x) = (damping(self.system.at(i, i)), self.dx[i].f64());
-            decrease += 0.5 * (d * x * x - x * self.system.b[i].f64());
-            self.dx_window[i] = x;
+        for (i, x) in self.dx[..n].iter().enumerate() {
+            decrease += 0.5 * (damping(self.system.at(i, i).f64()) * x * x - x * self.system.b[i].f64());
         }
         decrease += self.eliminated[..landmarks].iter().map(Eliminated::decrease).sum::<f64>();
-        (decrease.is_finite() && self.dx_window[..n].iter().all(|x| x.is_finite())).then_some(decrease)
+        (decrease.is_finite() && self.dx[..n].iter().all(|x| x.is_finite())).then_some(decrease)
     }
 
     fn apply(&self, window: &mut Window, landmarks: &mut Landmarks, layout: &Layout) {
-        window.step(layout, &self.dx_window);
+        window.step(layout, &self.dx);
         for (l, e) in landmarks.pool.iter_mut().zip(&self.eliminated) {
             let [x, y, rho] = e.step(&self.dx);
             l.point.s += DVec2::new(x, y);
@@ -253,12 +242,12 @@ impl<S: Real> Solver<S> {
     ) -> [[f64; 15]; FRAMES] {
         let layout = Layout::of(window);
         self.linearise(window, landmarks, prior, model, &layout);
-        self.system.solve(&mut self.dx);
+        self.system.solve_damped(|_| 0.0, &mut self.factor, &mut self.dx);
         let mut steps = [[0.0; 15]; FRAMES];
         for slot in window.slots() {
             for (part, first) in layout.state(slot).into_iter().zip([0, POSE_DIM]) {
                 let Some(part) = part else { continue };
-                (0..part.len).for_each(|i| steps[slot][first + i] = self.dx[part.at + i].f64());
+                (0..part.len).for_each(|i| steps[slot][first + i] = self.dx[part.at + i]);
             }
         }
         steps
@@ -298,7 +287,7 @@ impl<S: Real> Solver<S> {
             let trial = cost_of(window, landmarks, prior, model);
             let gain = (cost - trial) / predicted;
             if gain > 0.0 && predicted > 0.0 {
-                let largest = self.dx_window[..layout.dim].iter().fold(0.0f64, |m, x| m.max(x.abs()));
+                let largest = self.dx[..layout.dim].iter().fold(0.0f64, |m, x| m.max(x.abs()));
                 let done = largest < STEP_SETTLED || cost - trial < COST_SETTLED;
                 cost = trial;
                 (lambda, growth) = ((lambda * (1.0 - (2.0 * gain - 1.0).powi(3)).max(1.0 / 3.0)).max(LAMBDA_MIN), 2.0);

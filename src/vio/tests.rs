@@ -1,0 +1,271 @@
+//! The estimator on the made-up world, where its insides are seen.
+
+use super::*;
+use crate::bench::world::{self, Path, World, FRAME_SECS, RATE_HZ};
+use crate::math::dense::System;
+use marginalise::Sigma;
+use stipple_drivers::Span;
+use window::Layout;
+
+fn run<S: Real>(vio: &mut Estimator<S>, frames: std::ops::Range<usize>, world: &mut World) {
+    let mut tracks = Tracks::default();
+    for frame in frames {
+        let t = frame as f64 * FRAME_SECS + 0.0012;
+        let mut sample = ((t - FRAME_SECS) * RATE_HZ).max(0.0) as usize;
+        while (sample as f64) / RATE_HZ < t + 1.0 / RATE_HZ {
+            let s = world.imu(sample as f64 / RATE_HZ);
+            if vio.imu.newest().is_none_or(|n| s.t > n.t) {
+                vio.on_imu(s);
+            }
+            sample += 1;
+        }
+        world.tracks(t, &mut tracks);
+        vio.on_tracks(&tracks);
+    }
+}
+
+/// The direction in which the whole window moves (or turns about the world's axis).
+fn gauge<S: Real>(vio: &Estimator<S>, shift: DVec3, turn: DVec3, slot: usize) -> [f64; 15] {
+    let m = vio.window.frame(slot).motion_jacobian();
+    let (p, th, v) = (shift + turn.cross(m.pose.p), m.pose.q.conjugate() * turn, turn.cross(m.v));
+    let mut d = [0.0; 15];
+    (0..3).for_each(|i| (d[i], d[3 + i], d[6 + i]) = (p[i], th[i], v[i]));
+    d
+}
+
+const UNOBSERVABLE: [(&str, DVec3, DVec3); 4] = [
+    ("x", DVec3::X, DVec3::ZERO),
+    ("y", DVec3::Y, DVec3::ZERO),
+    ("z", DVec3::Z, DVec3::ZERO),
+    ("yaw", DVec3::ZERO, DVec3::Z),
+];
+
+/// Energies of the prior along the four unobservable directions, and the least along tilt, after so many
+/// frames of a flight whose prior was started again with the gauge left free.
+fn energies<S: Real>(frames: usize) -> ([f64; 4], f64) {
+    let mut world = World::new(Path { rest: -1.0 });
+    let mut vio = Estimator::<S>::new(&world.rig, &VioConfig::default());
+    run(&mut vio, 0..12, &mut world);
+    assert!(vio.running);
+    // The first state is still in the window; with its position and yaw its velocity is left free too,
+    // which as a vector of the world would tell yaw.
+    let first = vio.window.slots().next().expect("a running window has frames");
+    let motion = vio.window.frame(first).anchor;
+    let sigma = Sigma { p: 1e9, yaw: 1e9, tilt: 0.05, v: 1e9, bg: 0.02, ba: 0.3 };
+    vio.prior.start(first, &motion, &sigma);
+    run(&mut vio, 12..frames, &mut world);
+    assert!(vio.stats.resets == 0 && vio.window.keyframe_poses().count() > 3);
+    let energy = |shift: DVec3, turn: DVec3| vio.prior.energy(&vio.window, |slot| gauge(&vio, shift, turn, slot));
+    let tilt = energy(DVec3::ZERO, DVec3::X).min(energy(DVec3::ZERO, DVec3::Y));
+    (UNOBSERVABLE.map(|(_, shift, turn)| energy(shift, turn)), tilt)
+}
+
+/// In double precision the four directions are empty. In single precision what rounding has put there by the
+/// thousandth frame would by itself place the rig to no better than `sigma` (m, rad).
+fn four_directions_stay_empty<S: Real>(energy_max: f64) {
+    for frames in [120, 1012] {
+        let (free, tilt) = energies::<S>(frames);
+        let shown = free.map(|e| format!("{e:.1e}")).join(" ");
+        eprintln!("{} after {frames} frames: x y z yaw {shown}, tilt {tilt:.1e}", S::NAME);
+        assert!(tilt > 1e4, "tilt is observable: {tilt}");
+        for ((name, ..), e) in UNOBSERVABLE.iter().zip(free) {
+            assert!(e < energy_max, "{name} after {frames} frames: {e} beside tilt {tilt}");
+        }
+    }
+}
+
+#[test]
+fn prior_learns_nothing_about_position_and_yaw_in_a_thousand_frames() {
+    four_directions_stay_empty::<f64>(1e-9);
+    four_directions_stay_empty::<f32>(1.0);
+}
+
+/// A window in which only inertial factors and finished landmarks act between the frames that leave and
+/// those that stay, so that before and after marginalisation it holds the same quadratic on what stays.
+/// The newest is pushed off by `push` in every error.
+fn ready_to_shrink<S: Real>(push: f64) -> Estimator<S> {
+    let mut world = World::new(Path { rest: -1.0 });
+    let mut vio = Estimator::<S>::new(&world.rig, &VioConfig::default());
+    run(&mut vio, 0..40, &mut world);
+    let oldest = vio.window.states().next().expect("a running window has states");
+    let newest = vio.window.newest().expect("a running window has a newest frame");
+    // One more state, by inertia alone, so that one is due to leave; and no live landmark.
+    let from = vio.window.frame(newest).now;
+    let t = vio.window.frame(newest).t + Span::from_secs(0.05);
+    let inc = vio.imu.integrate(vio.window.frame(newest).t, t, from.bg, from.ba, &vio.noise);
+    let mut frame = Frame::first(t, from.propagate(&inc).plus(&[push; 15]));
+    frame.weight = vio.inertial_weight(&inc);
+    frame.increment = inc;
+    vio.window.push(frame).expect("room for one");
+    let boundary = vio.window.states().nth(1).expect("a second state");
+    let (window, old) = (&vio.window, vio.window.frame(boundary).t);
+    vio.landmarks.retain(|l| l.observations.iter().all(|o| window.frame(o.slot as usize).t <= old));
+    assert!(vio.window.frame(oldest).moving);
+    vio
+}
+
+fn newton<S: Real>(vio: &mut Estimator<S>) -> [[f64; 15]; FRAMES] {
+    vio.solver.newton_step(&vio.window, &vio.landmarks, &mut vio.prior, &vio.model)
+}
+
+fn marginalising_keeps_the_step<S: Real>(push: f64, absolute: f64, relative: f64) {
+    let mut vio = ready_to_shrink::<S>(push);
+    let before = newton(&mut vio);
+    vio.shrink();
+    let after = newton(&mut vio);
+    for slot in vio.window.states() {
+        for i in 0..15 {
+            let (a, b) = (before[slot][i], after[slot][i]);
+            assert!((a - b).abs() < absolute + relative * a.abs(), "{} slot {slot} error {i}: {a} then {b}", S::NAME);
+        }
+    }
+}
+
+#[test]
+fn marginalising_keeps_the_step_of_what_stays() {
+    marginalising_keeps_the_step::<f64>(0.01, 1e-7, 1e-5);
+    // A tenth of what a window's accelerometer bias is known to, m/s².
+    marginalising_keeps_the_step::<f32>(1e-3, 1e-3, 2e-2);
+}
+
+/// The normal equations of the same window by the textbook: landmarks eliminated by Schur complement, in f64,
+/// from rows that are not yet eliminated.
+fn schur_step(vio: &mut Estimator<f64>) -> (Vec<f64>, Vec<f64>) {
+    let layout = Layout::of(&vio.window);
+    let mut system = System::<f64>::new(layout.dim);
+    system.clear(layout.dim);
+    vio.prior.add_to(&vio.window, &layout, &mut system);
+    let mut linear = linear::Linear::new();
+    let states: Vec<usize> = vio.window.states().collect();
+    for pair in states.windows(2) {
+        linear::inertial_rows(&vio.window, pair[0], pair[1], &layout, &mut linear);
+        linear.add_to(0, &mut system);
+    }
+    for l in &vio.landmarks.pool {
+        let Some(rows) = linear::raw_landmark_rows(l, &vio.window, &vio.model, &layout, &mut linear) else { continue };
+        let n = layout.dim;
+        let mut v = nalgebra::Matrix3::<f64>::zeros();
+        let (mut w, mut g) = (vec![[0.0; 3]; n], nalgebra::Vector3::<f64>::zeros());
+        for row in &rows {
+            let j = nalgebra::Vector3::from_row_slice(&row[..3]);
+            v += j * j.transpose();
+            g += j * row[3 + n];
+            for a in 0..n {
+                (0..3).for_each(|k| w[a][k] += row[3 + a] * j[k]);
+                system.b[a] += row[3 + a] * row[3 + n];
+                (0..=a).for_each(|b| system.add(a, b, row[3 + a] * row[3 + b]));
+            }
+        }
+        let inverse = v.try_inverse().expect("a determined point");
+        let w: Vec<_> = w.iter().map(|w| nalgebra::Vector3::from_row_slice(w)).collect();
+        for a in 0..n {
+            system.b[a] -= w[a].dot(&(inverse * g));
+            (0..=a).for_each(|b| system.add(a, b, -w[a].dot(&(inverse * w[b]))));
+        }
+    }
+    let (b, mut x) = (system.b.clone(), vec![0.0; layout.dim]);
+    system.solve_damped(|_| 0.0, &mut system.clone(), &mut x);
+    (b, x)
+}
+
+#[test]
+fn qr_and_schur_complement_agree() {
+    let mut world = World::new(Path { rest: -1.0 });
+    let mut vio = Estimator::<f64>::new(&world.rig, &VioConfig::default());
+    run(&mut vio, 0..60, &mut world);
+    assert!(vio.landmarks.pool.len() > 50);
+    let steps = newton(&mut vio);
+    let (b, x) = schur_step(&mut vio);
+    let layout = Layout::of(&vio.window);
+    let largest = |x: &[f64]| x.iter().fold(0.0f64, |m, x| m.max(x.abs()));
+    assert!(largest(&b) > 0.0);
+    for slot in vio.window.slots() {
+        for (part, first) in layout.state(slot).into_iter().zip([0, 6]) {
+            let Some(part) = part else { continue };
+            for i in 0..part.len {
+                let (qr, schur) = (steps[slot][first + i], x[part.at + i]);
+                assert!((qr - schur).abs() < 1e-7 + 1e-5 * qr.abs(), "slot {slot} error {}: {qr} {schur}", first + i);
+            }
+        }
+    }
+}
+
+#[test]
+fn single_and_double_precision_end_at_the_same_place() {
+    fn fly<S: Real>() -> Pose {
+        let mut world = World::new(Path { rest: -1.0 });
+        let mut vio = Estimator::<S>::new(&world.rig, &VioConfig::default());
+        run(&mut vio, 0..160, &mut world);
+        let newest = vio.window.newest().expect("running");
+        vio.window.frame(newest).now.pose
+    }
+    let (a, b) = (fly::<f32>(), fly::<f64>());
+    let (away, turned) = (a.p.distance(b.p), a.q.angle_between(b.q));
+    eprintln!("f32 and f64 end {away:.2e} m and {turned:.2e} rad apart after eight seconds");
+    assert!(away < 2e-3 && turned < 1e-3, "{away} m, {turned} rad");
+}
+
+#[test]
+fn same_input_gives_the_same_bits() {
+    let once = || {
+        let mut world = World::new(Path { rest: -1.0 });
+        let mut vio = Vio::new(&world.rig, &VioConfig::default());
+        run(&mut vio, 0..40, &mut world);
+        (vio.hash(), vio.stats)
+    };
+    let (a, b) = (once(), once());
+    assert_eq!(a, b);
+    assert_ne!(a.0, FNV_START);
+}
+
+#[test]
+fn restart_goes_on_where_it_was() {
+    let mut world = World::new(Path { rest: -1.0 });
+    let mut vio = Vio::new(&world.rig, &VioConfig::default());
+    run(&mut vio, 0..60, &mut world);
+    let path = Path { rest: -1.0 };
+    let before = vio.window().last().expect("a running window has frames");
+    vio.reset();
+    run(&mut vio, 60..80, &mut world);
+    assert!(vio.running && vio.stats.resets == 1);
+    let after = vio.window().next().expect("a running window has frames");
+    // Half a second of alignment at up to 1 m/s, carried by inertia.
+    let truly = |t: Nanos| path.pose(t.0 as f64 * 1e-9);
+    let (moved, true_move) = (before.1.inverse() * after.1, truly(before.0).inverse() * truly(after.0));
+    assert!((after.0 - before.0).secs() > 0.3 && true_move.p.length() > 0.1);
+    assert!(moved.p.distance(true_move.p) < 0.02 && moved.q.angle_between(true_move.q) < 0.02);
+    assert_eq!(vio.window().last().map(|w| w.0), Some(Nanos(((79.0 * FRAME_SECS + 0.0012) * 1e9) as i64)));
+}
+
+#[test]
+fn samples_that_are_not_finite_or_not_newer_are_counted_and_refused() {
+    let mut vio = Vio::new(&world::calibration(), &VioConfig::default());
+    let sample = |t: i64, x: f64| ImuSample { t: Nanos(t), gyro_body: DVec3::splat(x), accel_body: DVec3::Z };
+    for (t, x) in [(1, 0.0), (1, 0.0), (0, 0.0), (2, f64::NAN), (3, f64::INFINITY), (4, 0.0)] {
+        vio.on_imu(sample(t, x));
+    }
+    assert_eq!(vio.stats.imu_rejected, 4);
+    assert_eq!(vio.imu.iter().count(), 2);
+}
+
+#[test]
+fn prediction_meets_the_next_estimate() {
+    let mut world = World::new(Path { rest: -1.0 });
+    let mut vio = Vio::new(&world.rig, &VioConfig::default());
+    run(&mut vio, 0..59, &mut world);
+    let published = vio.predictor();
+    run(&mut vio, 59..60, &mut world);
+    let last = vio.window().last().expect("a running window has frames");
+    let t = last.0 + Span::from_secs(FRAME_SECS);
+    for k in 1..=10 {
+        vio.on_imu(world.imu((last.0 .0 as f64 * 1e-9) + k as f64 / RATE_HZ));
+    }
+    let predicted = vio.predict(t).expect("running");
+    let motion = vio.predict_motion(t).expect("running");
+    let mut tracks = Tracks::default();
+    world.tracks(t.0 as f64 * 1e-9, &mut tracks);
+    let update = vio.on_tracks(&tracks).odometry.expect("running");
+    assert!((predicted.world_from_body.p - update.world_from_body.p).length() < 0.005);
+    assert!((last.1 * motion).p.distance(predicted.world_from_body.p) < 0.005);
+    assert_eq!(motion, published.motion(&vio.imu, last.0, t), "a tracker of its own predicts the same");
+}
