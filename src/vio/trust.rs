@@ -225,8 +225,8 @@ impl Carried {
 
 #[cfg(test)]
 mod tests {
-    use super::super::world::{Path, World, RATE_HZ};
     use super::*;
+    use crate::bench::world::{Path, World, RATE_HZ};
     use crate::config::VioConfig;
 
     #[test]
