@@ -76,6 +76,11 @@ enum Command {
         duration: Option<f64>,
         #[arg(long)]
         seed: Option<u64>,
+        /// Cameras: mono, stereo, opposed, four
+        #[arg(long, value_name = "NAME")]
+        rig: Option<String>,
+        #[command(flatten)]
+        defects: daemon::Defects,
     },
     /// Print a board's byte table; refuse what does not fit
     Check {
@@ -124,8 +129,8 @@ fn run(command: Command) -> Result<(), Fault> {
             daemon::replay(&dataset, &board, &out, &set, &options)
         }
         Command::Demo { board, out, set } => daemon::demo(board.as_deref(), &out, &set),
-        Command::Sim { scenario, out, truth, imu, duration, seed } => {
-            daemon::simulate(&daemon::Simulate { scenario, truth, imu, duration_s: duration, seed }, &out)
+        Command::Sim { scenario, out, truth, imu, duration, seed, rig, defects } => {
+            daemon::simulate(&daemon::Simulate { scenario, truth, imu, duration_s: duration, seed, rig, defects }, &out)
         }
         Command::Check { board, set } => daemon::check(&board, &set),
         Command::Bench { what: Bench::Odometry { out, recordings, seconds, quick } } => {

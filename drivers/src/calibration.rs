@@ -35,6 +35,11 @@ impl RigCamera {
         t + self.time_offset + Span(self.readout.0 / 2)
     }
 
+    /// The camera's own stamp of an image of which downstream says `t`.
+    pub fn from_imu_clock(&self, t: Nanos) -> Nanos {
+        t - self.time_offset - Span(self.readout.0 / 2)
+    }
+
     /// When a row is exposed, after the image's stamp downstream.
     pub fn row_delay(&self, row: f64) -> f64 {
         self.readout.secs() * (row / (self.camera.height - 1).max(1) as f64 - 0.5)

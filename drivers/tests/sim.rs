@@ -6,8 +6,8 @@
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use std::path::PathBuf;
 use stipple_drivers::replay::{OpenOptions, Recording};
-use stipple_drivers::sim::{write_euroc, Flight, Scenario, Sim, GRAVITY};
-use stipple_drivers::{Camera, Exit, Frames, ImuCalibration, Lens, Nanos, Span};
+use stipple_drivers::sim::{rig_named, write_euroc, Flight, Scenario, Sim, GRAVITY, RIGS};
+use stipple_drivers::{Camera, Exit, Frames, ImuCalibration, Lens, Nanos, Pose, Span};
 
 fn quiet(name: &str) -> Scenario {
     let mut s = Scenario::named(name).unwrap();
@@ -387,4 +387,152 @@ fn wrong_csv_is_refused_by_line() {
     std::fs::write(&path, row("1") + &row("2")).unwrap();
     let short = Sim::new(&Scenario::from_euroc(&path, None).unwrap()).map(|_| ()).unwrap_err();
     assert_eq!(short.exit, Exit::Data);
+}
+
+#[test]
+fn a_time_offset_moves_stamps_and_not_images_and_its_calibration_moves_them_back() {
+    let mut scenario = quiet("circle");
+    scenario.image_divisor = 4;
+    scenario.duration = Span::from_secs(3.0);
+    let mut exact = Sim::new(&scenario).unwrap();
+    let offset = Span::from_secs(0.008);
+    scenario.camera_errors.time_offset = offset;
+    let mut late = Sim::new(&scenario).unwrap();
+    let mut frames = [Frames::for_rig(exact.calibration()), Frames::for_rig(exact.calibration())];
+    exact.render(50, &mut frames[0]);
+    late.render(50, &mut frames[1]);
+    assert!(frames[0].images == frames[1].images, "the same instant of the flight");
+    assert_eq!(frames[1].t + offset, frames[0].t, "t_imu = t_cam + offset");
+    assert_eq!(exact.imu(), late.imu());
+
+    let dir = tempfile::tempdir().unwrap();
+    let (out, chain) = (dir.path().join("late"), dir.path().join("camchain.yaml"));
+    write_euroc(&mut late, &out, |_, _| {}).unwrap();
+    let mut text = String::new();
+    for (k, c) in exact.calibration().cameras.iter().enumerate() {
+        let m = c.camera;
+        let pose = c.body_from_cam.inverse();
+        let rows: Vec<String> = (0..3)
+            .map(|i| {
+                let r = DMat3::from_quat(pose.q).row(i);
+                format!("[{:.12}, {:.12}, {:.12}, {:.12}]", r.x, r.y, r.z, pose.p[i])
+            })
+            .collect();
+        text += &format!(
+            "cam{k}:\n  T_cam_imu: [{}, [0.0, 0.0, 0.0, 1.0]]\n  camera_model: pinhole\n  distortion_model: none\n  \
+             intrinsics: [{}, {}, {}, {}]\n  resolution: [{}, {}]\n  timeshift_cam_imu: 0.008\n",
+            rows.join(", "),
+            m.fx,
+            m.fy,
+            m.cx,
+            m.cy,
+            m.width,
+            m.height
+        );
+    }
+    std::fs::write(&chain, text).unwrap();
+    let options = OpenOptions { calibration: Some(chain), ..OpenOptions::default() };
+    let read = Recording::open(&out, &options).unwrap();
+    let stamps: Vec<Nanos> = read.pairs.iter().map(|p| p.t).collect();
+    let taken: Vec<Nanos> = (0..late.frame_count()).map(|i| late.taken(i)).collect();
+    assert_eq!(stamps, taken, "Kalibr's shift and ours have the same sign");
+}
+
+#[test]
+fn a_written_rolling_shutter_comes_back_with_its_middle_rows_at_the_stamp() {
+    let mut scenario = Scenario::named("circle").unwrap();
+    scenario.image_divisor = 4;
+    scenario.duration = Span::from_secs(0.3);
+    scenario.calibration.cameras.iter_mut().for_each(|c| c.readout = Span::from_secs(0.02));
+    let mut sim = Sim::new(&scenario).unwrap();
+    let dir = tempfile::tempdir().unwrap();
+    let out = dir.path().join("rolling");
+    write_euroc(&mut sim, &out, |_, _| {}).unwrap();
+    let read = Recording::open(&out, &OpenOptions::default()).unwrap();
+    assert!(read.calibration.cameras.iter().all(|c| c.readout == Span(20_000_000)));
+    assert_eq!(read.pairs[3].t, sim.stamp(3));
+}
+
+#[test]
+fn errors_are_in_what_sensors_give_and_not_in_the_calibration_handed_out() {
+    let exact = Sim::new(&quiet("circle")).unwrap();
+    let mut scenario = quiet("circle");
+    let scale = DMat3::from_diagonal(DVec3::new(1.02, 0.99, 1.01));
+    (scenario.imu_errors.axes.gyro_scale, scenario.imu_errors.axes.accel_scale) = (scale, scale * 0.98);
+    let error = Pose::new(DQuat::from_rotation_x(0.02), DVec3::new(0.005, 0.0, 0.0));
+    scenario.camera_errors.extrinsics = vec![Pose::IDENTITY, error];
+    let mut sim = Sim::new(&scenario).unwrap();
+    for (read, truth) in sim.imu().iter().zip(exact.imu()) {
+        let right = scenario.imu_errors.axes.apply(read);
+        assert!((right.gyro_body - truth.gyro_body).length() < 1e-12);
+        assert!((right.accel_body - truth.accel_body).length() < 1e-12);
+        assert!(
+            (read.gyro_body.x * 1.02 - truth.gyro_body.x).abs() < 1e-12,
+            "reads too little where its scale is large"
+        );
+    }
+    assert_eq!(sim.calibration().imu.correction, exact.calibration().imu.correction);
+    let (found, truth) = (sim.calibration().cameras[1].body_from_cam, exact.calibration().cameras[1].body_from_cam);
+    assert!((found.p - (truth * error).p).length() < 1e-12 && found != truth);
+    let mut frames = [Frames::for_rig(exact.calibration()), Frames::for_rig(exact.calibration())];
+    let mut exact = exact;
+    exact.render(40, &mut frames[0]);
+    sim.render(40, &mut frames[1]);
+    assert!(frames[0].images == frames[1].images, "images are of the true rig");
+}
+
+#[test]
+fn exposure_steps_and_flicker_reach_the_pixels() {
+    let mut scenario = quiet("static");
+    scenario.image_divisor = 4;
+    scenario.light.steps = vec![(Span::from_secs(1.0), 0.5, 0.0), (Span::from_secs(2.0), 1.0, 20.0)];
+    let mut sim = Sim::new(&scenario).unwrap();
+    let mut frames = Frames::for_rig(sim.calibration());
+    let mut grey = |sim: &mut Sim, i: usize| {
+        sim.render(i, &mut frames);
+        frames.images[0].pixels.iter().map(|p| f64::from(*p)).sum::<f64>() / frames.images[0].pixels.len() as f64
+    };
+    let (before, dark, lifted) = (grey(&mut sim, 10), grey(&mut sim, 30), grey(&mut sim, 50));
+    assert!((dark / before - 0.5).abs() < 0.03 && (lifted - before - 20.0).abs() < 2.0, "{before} {dark} {lifted}");
+    // A quarter of a period between frames: light at its mean, its most, its mean, its least; none of it clipped.
+    scenario.light = stipple_drivers::sim::Light { steps: vec![(Span(0), 0.5, 0.0)], flicker: 0.3, flicker_hz: 5.0 };
+    let mut sim = Sim::new(&scenario).unwrap();
+    let (mean, most, least) = (grey(&mut sim, 20), grey(&mut sim, 21), grey(&mut sim, 23));
+    assert!((most / mean - 1.3).abs() < 0.05 && (least / mean - 0.7).abs() < 0.03, "{mean} {most} {least}");
+}
+
+#[test]
+fn named_rigs_see_as_much_in_common_as_they_should() {
+    for (name, cameras) in RIGS.into_iter().zip([1, 2, 2, 4]) {
+        let rig = rig_named(name).unwrap();
+        assert_eq!(rig.cameras.len(), cameras, "{name}");
+        // share of camera 0's pixels that camera k sees at 3 m
+        let shared = |k: usize| {
+            let (a, b) = (&rig.cameras[0], &rig.cameras[k]);
+            let from_a = b.body_from_cam.inverse() * a.body_from_cam;
+            let px = (0..480).step_by(20).flat_map(|y| (0..752).step_by(20).map(move |x| (x, y)));
+            let sees = |(x, y): (i32, i32)| {
+                let p = from_a.transform(a.camera.unproject(DVec2::new(x.into(), y.into())).unwrap() * 3.0);
+                b.camera.project(p).is_some_and(|px| b.camera.contains(px, 0.0))
+            };
+            let seen: Vec<bool> = px.map(sees).collect();
+            seen.iter().filter(|s| **s).count() as f64 / seen.len() as f64
+        };
+        match name {
+            "stereo" => assert!(shared(1) > 0.8),
+            "opposed" => assert_eq!(shared(1), 0.0),
+            "four" => {
+                let all = [1, 2, 3].map(shared);
+                assert!(all[0] > 0.8 && all[1..].iter().all(|s| *s > 0.0 && *s < 0.3), "{all:?}");
+            }
+            _ => {}
+        }
+        let mut scenario = quiet("circle");
+        (scenario.calibration, scenario.image_divisor) = (rig, 4);
+        let mut sim = Sim::new(&scenario).unwrap();
+        let mut frames = Frames::for_rig(sim.calibration());
+        sim.render(100, &mut frames);
+        assert!(frames.images.iter().all(|i| i.pixels.iter().filter(|p| **p > 10).count() * 10 > i.pixels.len() * 9));
+    }
+    assert!(rig_named("three").is_none());
 }

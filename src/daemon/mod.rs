@@ -35,7 +35,7 @@ use mapping::Mapping;
 use play::{play, Play};
 use std::path::{Path, PathBuf};
 use stipple_drivers::replay::read_trajectory;
-use stipple_drivers::sim::{write_euroc, Scenario, Sim};
+use stipple_drivers::sim::{rig_named, write_euroc, Scenario, Sim, RIGS};
 use stipple_drivers::{Exit, Fault, Span};
 use tracking::{OdometryRun, Tracking};
 
@@ -128,6 +128,53 @@ pub struct Simulate {
     pub imu: Option<PathBuf>,
     pub duration_s: Option<f64>,
     pub seed: Option<u64>,
+    pub rig: Option<String>,
+    pub defects: Defects,
+}
+
+/// What is wrong with simulated sensors.
+#[derive(Clone, Debug, Default, clap::Args)]
+pub struct Defects {
+    /// Clock of the inertial unit over that of the images, s; the calibration does not say so
+    #[arg(long, value_name = "S", allow_negative_numbers = true, default_value_t = 0.0)]
+    time_offset: f64,
+    /// Rolling shutter: from the first row to the last, s
+    #[arg(long, value_name = "S", default_value_t = 0.0)]
+    readout: f64,
+    /// The inertial unit reads this fraction too little on every axis
+    #[arg(long, value_name = "FRACTION", allow_negative_numbers = true, default_value_t = 0.0)]
+    imu_scale: f64,
+    /// Fraction of the light that comes and goes
+    #[arg(long, value_name = "FRACTION", default_value_t = 0.0)]
+    flicker: f64,
+    /// How often it does a second
+    #[arg(long, value_name = "HZ", default_value_t = 100.0)]
+    flicker_hz: f64,
+}
+
+impl Defects {
+    fn spoil(&self, scenario: &mut Scenario) -> Result<(), Fault> {
+        let within = [
+            ("--time-offset", self.time_offset, -1.0..=1.0),
+            ("--readout", self.readout, 0.0..=0.1),
+            ("--imu-scale", self.imu_scale, -0.5..=0.5),
+            ("--flicker", self.flicker, 0.0..=1.0),
+            ("--flicker-hz", self.flicker_hz, 0.0..=1e4),
+        ];
+        for (name, value, range) in within {
+            if !range.contains(&value) {
+                let what = format!("is {value}, must be {} to {}", range.start(), range.end());
+                return Err(Fault::new(Exit::Usage, name, what, "choose a value in that range"));
+            }
+        }
+        scenario.camera_errors.time_offset = Span::from_secs(self.time_offset);
+        scenario.calibration.cameras.iter_mut().for_each(|c| c.readout = Span::from_secs(self.readout));
+        let axes = &mut scenario.imu_errors.axes;
+        axes.gyro_scale *= 1.0 + self.imu_scale;
+        axes.accel_scale *= 1.0 + self.imu_scale;
+        (scenario.light.flicker, scenario.light.flicker_hz) = (self.flicker, self.flicker_hz);
+        Ok(())
+    }
 }
 
 /// `stipple sim`
@@ -150,6 +197,11 @@ pub fn simulate(options: &Simulate, out: &Path) -> Result<(), Fault> {
     if let Some(seed) = options.seed {
         scenario.seed = seed;
     }
+    if let Some(name) = &options.rig {
+        let known = || Fault::new(Exit::Usage, name, "is not a rig", format!("choose one of {}", RIGS.join(", ")));
+        scenario.calibration = rig_named(name).ok_or_else(known)?;
+    }
+    options.defects.spoil(&mut scenario)?;
     let mut sim = Sim::new(&scenario)?;
     write_euroc(&mut sim, out, rendering_progress)?;
     println!("{}", out.display());

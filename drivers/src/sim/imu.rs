@@ -2,7 +2,7 @@
 //! Rᵀ(a - g), with white noise, biases that start somewhere and walk, and a range that clips.
 
 use super::spline::Spline;
-use crate::calibration::ImuCalibration;
+use crate::calibration::{ImuCalibration, ImuCorrection};
 use crate::types::{ImuSample, Nanos, Span};
 use glam::DVec3;
 use rand::{Rng, SeedableRng};
@@ -20,12 +20,19 @@ pub struct ImuErrors {
     /// Range of an axis: rad/s, m/s².
     pub gyro_max: f64,
     pub accel_max: f64,
+    /// Scales and misalignments that would make the readings right again.
+    pub axes: ImuCorrection,
 }
 
 impl ImuErrors {
     /// The ADIS16448 of EuRoC: 1000 °/s, 18 g.
-    pub const EUROC: ImuErrors =
-        ImuErrors { gyro_bias: 0.02, accel_bias: 0.05, gyro_max: 17.453_293, accel_max: 18.0 * 9.81 };
+    pub const EUROC: ImuErrors = ImuErrors {
+        gyro_bias: 0.02,
+        accel_bias: 0.05,
+        gyro_max: 17.453_293,
+        accel_max: 18.0 * 9.81,
+        axes: ImuCorrection::NONE,
+    };
 }
 
 /// True biases at an instant.

@@ -3,7 +3,8 @@
 //! `Scenario` (which rig, which path, which seed) goes in; `Sim` gives stereo images, exact depth,
 //! inertial samples and exact states at any instant, and `write_euroc` puts them on disk in the
 //! EuRoC ASL layout. Geometry is ray-cast analytically through the same camera models the
-//! estimator inverts, so whatever error remains downstream is the estimator's.
+//! estimator inverts, so whatever error remains downstream is the estimator's. What is wrong with the
+//! sensors (`CameraErrors`, `ImuErrors`) is in what they give and not in the calibration handed out.
 //! Read in this order: `scenario` (paths), `spline` (motion), `room` and `furnish` (geometry),
 //! `texture` and `light` (appearance), `render` (images), `imu`.
 
@@ -20,14 +21,14 @@ mod write;
 
 pub use imu::{Bias, ImuErrors, GRAVITY};
 pub use render::Sensor;
-pub use scenario::{euroc_rig, Flight, Recording, Scenario};
+pub use scenario::{euroc_rig, rig_named, CameraErrors, Flight, Light, Recording, Scenario, RIGS};
 pub use write::write_euroc;
 
 use crate::calibration::Calibration;
 use crate::fault::{Exit, Fault};
 use crate::types::{Frames, ImuSample, Nanos, Pose, Span, TimedPose};
 use glam::{DVec3, Vec3};
-use render::{Exposure, Lens, Scratch, View};
+use render::{Exposure, Lens, Row, Rows, Scratch, View};
 use room::Room;
 use spline::Spline;
 
@@ -62,7 +63,11 @@ pub struct State {
 pub struct Sim {
     seed: u64,
     sensor: Sensor,
+    light: Light,
+    /// As handed out, and as it is.
     calibration: Calibration,
+    rig: Calibration,
+    time_offset: Span,
     spline: Spline,
     /// Stamp of spline time 0.
     start: Nanos,
@@ -74,6 +79,7 @@ pub struct Sim {
     /// Logarithm of the gain every `METER_PERIOD` from the first frame.
     log_gain: Vec<f32>,
     scratch: Scratch,
+    rows: Vec<Row>,
 }
 
 impl Sim {
@@ -85,8 +91,12 @@ impl Sim {
     /// The images do not depend on `threads`.
     pub fn with_threads(scenario: &Scenario, threads: usize) -> Result<Sim, Fault> {
         check(scenario)?;
-        let calibration = scenario.rig();
-        let (spline, start, first, last) = motion(scenario, &calibration)?;
+        let rig = scenario.rig();
+        let mut calibration = rig.clone();
+        for (camera, error) in calibration.cameras.iter_mut().zip(&scenario.camera_errors.extrinsics) {
+            camera.body_from_cam = camera.body_from_cam * *error;
+        }
+        let (spline, start, first, last) = motion(scenario, &rig)?;
         let span = (first - start).secs()..(last - start).secs();
         let (low, high) = bounds(scenario, &spline, span.clone());
         let path: Vec<Vec3> = sample_path(&spline, span).map(|p| p.as_vec3()).collect();
@@ -95,7 +105,7 @@ impl Sim {
             Flight::Recorded(r) => r.imu.as_ref().map(|imu| (imu, &r.biases)),
             _ => None,
         };
-        let (imu, biases) = match recorded {
+        let (mut imu, biases) = match recorded {
             Some((imu, biases)) => {
                 let within = imu.iter().filter(|s| s.t >= first && s.t <= last).copied().collect();
                 (within, biases.clone())
@@ -105,14 +115,28 @@ impl Sim {
                 imu::simulate(&spline, start, &ticks, &calibration.imu, &scenario.imu_errors, scenario.seed)
             }
         };
+        imu.iter_mut().for_each(|s| *s = scenario.imu_errors.axes.undo(s));
         let lenses: Vec<Lens> = calibration.cameras.iter().map(|c| Lens::new(&c.camera)).collect();
         let pixels = calibration.cameras.iter().map(|c| c.camera.width * c.camera.height).max().unwrap_or(0);
         let scratch = Scratch::new(&room, pixels, threads);
-        let stamps = imu::ticks(first, last, scenario.rate_hz);
-        let (seed, sensor) = (scenario.seed, scenario.sensor);
-        let log_gain = Vec::new();
-        let mut sim =
-            Sim { seed, sensor, calibration, spline, start, stamps, imu, biases, room, lenses, log_gain, scratch };
+        let mut sim = Sim {
+            seed: scenario.seed,
+            sensor: scenario.sensor,
+            light: scenario.light.clone(),
+            calibration,
+            rig,
+            time_offset: scenario.camera_errors.time_offset,
+            spline,
+            start,
+            stamps: imu::ticks(first, last, scenario.rate_hz),
+            imu,
+            biases,
+            room,
+            lenses,
+            log_gain: Vec::new(),
+            scratch,
+            rows: Vec::new(),
+        };
         sim.log_gain = sim.metered();
         Ok(sim)
     }
@@ -130,8 +154,13 @@ impl Sim {
         self.stamps.len()
     }
 
-    /// Mid-exposure of frame `i`.
+    /// Stamp of frame `i`: mid-exposure of its middle row, by the cameras' clock.
     pub fn stamp(&self, i: usize) -> Nanos {
+        self.stamps[i] - self.time_offset
+    }
+
+    /// When frame `i` was taken, by the clock of inertial samples and truth.
+    pub fn taken(&self, i: usize) -> Nanos {
         self.stamps[i]
     }
 
@@ -159,31 +188,45 @@ impl Sim {
     /// Images of all cameras at frame `i` into `out`, which must be shaped for the rig.
     pub fn render(&mut self, i: usize, out: &mut Frames) {
         let t = self.stamps[i];
-        out.t = t;
-        let gain = self.gain_at(t);
+        out.t = self.stamp(i);
         for camera in 0..self.lenses.len() {
-            let view = self.view(t, camera);
             // streams of different images are unrelated, whatever the order of rendering
             let run = texture::hash(self.seed as i32, (self.seed >> 32) as i32, 0x5354_5250);
             let stream = texture::hash(i as i32, camera as i32, run);
-            // two sensors never respond quite alike
-            let gain = gain * (1.0 + 0.03 * camera as f32);
-            let exposure = Exposure { gain, sensor: self.sensor, stream };
-            render::cast(&self.room, &self.lenses[camera], view, &mut self.scratch);
+            let exposure = Exposure { sensor: self.sensor, stream };
+            self.expose(t, camera);
+            let rows = Rows(&self.rows);
+            render::cast(&self.room, &self.lenses[camera], rows, &mut self.scratch);
             let pixels = &mut out.images[camera].pixels;
-            render::shade(&self.room, &self.lenses[camera], view, &exposure, &mut self.scratch, pixels);
+            render::shade(&self.room, &self.lenses[camera], rows, &exposure, &mut self.scratch, pixels);
         }
     }
 
     /// Depth (z in the camera frame, m; 0 = none) of frame `i`, row-major, `width * height` values.
     pub fn depth(&mut self, i: usize, camera: usize, out: &mut [f32]) {
-        let view = self.view(self.stamps[i], camera);
-        render::cast(&self.room, &self.lenses[camera], view, &mut self.scratch);
+        self.expose(self.stamps[i], camera);
+        render::cast(&self.room, &self.lenses[camera], Rows(&self.rows), &mut self.scratch);
         render::depths(&self.lenses[camera], &self.scratch.hits, out);
     }
 
+    /// Views and exposures of a camera's rows, one for all under a global shutter.
+    fn expose(&mut self, t: Nanos, camera: usize) {
+        let c = &self.rig.cameras[camera];
+        let (rolls, n) = (c.readout.0 > 0, c.camera.height);
+        let mut rows = std::mem::take(&mut self.rows);
+        rows.clear();
+        rows.extend((0..if rolls { n } else { 1 }).map(|y| {
+            let t = if rolls { t + Span::from_secs(c.row_delay(y as f64)) } else { t };
+            let (factor, offset) = self.light.at(t - self.stamps[0]);
+            // two sensors never respond quite alike
+            let gain = self.gain_at(t) * (1.0 + 0.03 * camera as f32) * factor as f32;
+            Row { view: self.view(t, camera), gain, offset: offset as f32 }
+        }));
+        self.rows = rows;
+    }
+
     fn view(&self, t: Nanos, camera: usize) -> View {
-        View::new(&(self.truth_at(t).pose * self.calibration.cameras[camera].body_from_cam))
+        View::new(&(self.truth_at(t).pose * self.rig.cameras[camera].body_from_cam))
     }
 
     /// What an exposure meter on camera 0 would settle on through the run, smoothed.
@@ -325,7 +368,8 @@ mod tests {
         let mut sim = Sim::with_threads(&Scenario::named("circle").unwrap(), 3).unwrap();
         for frame in [0, 60, 120, 180] {
             let view = sim.view(sim.stamp(frame), 1);
-            render::cast(&sim.room, &sim.lenses[1], view, &mut sim.scratch);
+            let rows = [Row { view, gain: 1.0, offset: 0.0 }];
+            render::cast(&sim.room, &sim.lenses[1], Rows(&rows), &mut sim.scratch);
             let camera = sim.calibration.cameras[1].camera;
             for i in (0..camera.width * camera.height).step_by(11) {
                 let px = DVec2::new((i % camera.width) as f64, (i / camera.width) as f64);
@@ -335,6 +379,31 @@ mod tests {
                 assert!(hit.face == face || (hit.distance - t).abs() < 1e-4, "frame {frame} pixel {px}");
             }
         }
+    }
+
+    /// A row of a rolling image is that row of an image taken whole at the row's own time.
+    #[test]
+    fn rolling_rows_see_what_is_there_at_their_time() {
+        let mut scenario = Scenario::named("aggressive").unwrap();
+        scenario.calibration.cameras.iter_mut().for_each(|c| c.readout = Span(30_000_000));
+        let mut sim = Sim::with_threads(&scenario, 3).unwrap();
+        let camera = sim.rig.cameras[1];
+        for frame in [60, 110, 160] {
+            let t = sim.taken(frame);
+            sim.expose(t, 1);
+            render::cast(&sim.room, &sim.lenses[1], Rows(&sim.rows), &mut sim.scratch);
+            let rolled: Vec<_> = sim.scratch.hits.iter().map(|h| (h.face, h.distance)).collect();
+            for y in [0, 100, 239, 240, 479] {
+                let view = sim.view(t + Span::from_secs(camera.row_delay(y as f64)), 1);
+                let whole = [Row { view, gain: 1.0, offset: 0.0 }];
+                render::cast(&sim.room, &sim.lenses[1], Rows(&whole), &mut sim.scratch);
+                for i in y * 752..(y + 1) * 752 {
+                    let h = sim.scratch.hits[i];
+                    assert_eq!(rolled[i], (h.face, h.distance), "frame {frame} row {y}");
+                }
+            }
+        }
+        assert!((camera.row_delay(0.0) + 0.015).abs() < 1e-12 && (camera.row_delay(479.0) - 0.015).abs() < 1e-12);
     }
 
     #[test]

@@ -7,7 +7,8 @@
 //!
 //! Work is split over threads by tile rows and every random number is a hash of (seed, frame,
 //! camera, pixel), so the image does not depend on the number of threads.
-//! A global shutter without motion blur is modelled.
+//! There is no motion blur. Under a rolling shutter every row has a view of its own; lists of solids
+//! are those of the middle row of a tile, with a margin for what the rig moves in the others.
 
 use super::room::{Room, NOTHING};
 use super::texture::{self, Spot};
@@ -17,6 +18,10 @@ use glam::{DVec2, Quat, Vec2, Vec3};
 
 const TILE: usize = 16;
 const EDGE: usize = 4;
+/// What a rig moves and turns in half a tile's rows under a rolling shutter, m and rad: 20 m/s and 20 rad/s
+/// at 1 ms.
+const ROLL_MOVE: f32 = 0.02;
+const ROLL_TURN: f32 = 0.02;
 
 /// The sensor behind the lens. Grey levels (DN) are those of the 8-bit image.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -68,11 +73,33 @@ impl View {
     }
 }
 
-/// Exposure and the noise stream of one image.
+/// What a row sees and how it is exposed.
+#[derive(Clone, Copy)]
+pub struct Row {
+    pub view: View,
+    /// Grey levels per unit of radiance, and grey levels added.
+    pub gain: f32,
+    pub offset: f32,
+}
+
+/// Rows of an image, or the one that stands for all under a global shutter.
+#[derive(Clone, Copy)]
+pub struct Rows<'a>(pub &'a [Row]);
+
+impl Rows<'_> {
+    #[inline]
+    fn at(&self, y: usize) -> &Row {
+        &self.0[y.min(self.0.len() - 1)]
+    }
+
+    fn roll(&self) -> bool {
+        self.0.len() > 1
+    }
+}
+
+/// The sensor and the noise stream of one image.
 #[derive(Clone, Copy)]
 pub struct Exposure {
-    /// Grey levels per unit of radiance.
-    pub gain: f32,
     pub sensor: Sensor,
     /// Differs for every image of a run.
     pub stream: u32,
@@ -91,17 +118,39 @@ struct Seen {
 
 /// Reused between frames: nothing here allocates after construction.
 pub struct Scratch {
-    seen: Vec<Seen>,
-    lists: Vec<Vec<Seen>>,
+    lists: Vec<Lists>,
     pub hits: Vec<Hit>,
+}
+
+/// One thread's: all solids nearest first, and those of a tile.
+struct Lists {
+    seen: Vec<Seen>,
+    tile: Vec<Seen>,
+}
+
+impl Lists {
+    /// For the tiles of a row of tiles; under a global shutter the first is that of all.
+    fn look_around(&mut self, room: &Room, rows: Rows, ty: usize, first: bool) {
+        if first || rows.roll() {
+            let slack = if rows.roll() { ROLL_MOVE } else { 0.0 };
+            look_around(room, rows.at(ty * TILE + TILE / 2).view, slack, &mut self.seen);
+        }
+    }
+
+    fn tile(&mut self, lens: &Lens, rows: Rows, tx: usize, ty: usize) {
+        let slack = if rows.roll() { ROLL_TURN } else { 0.0 };
+        let cone = &lens.cones[ty * lens.tiles_across() + tx];
+        tile_list(&self.seen, cone, rows.at(ty * TILE + TILE / 2).view, slack, &mut self.tile);
+    }
 }
 
 impl Scratch {
     pub fn new(room: &Room, pixels: usize, threads: usize) -> Scratch {
         let n = room.solids.len();
         Scratch {
-            seen: Vec::with_capacity(n),
-            lists: (0..threads.max(1)).map(|_| Vec::with_capacity(n)).collect(),
+            lists: (0..threads.max(1))
+                .map(|_| Lists { seen: Vec::with_capacity(n), tile: Vec::with_capacity(n) })
+                .collect(),
             hits: vec![Hit { distance: 0.0, face: NOTHING }; pixels],
         }
     }
@@ -165,23 +214,24 @@ impl Lens {
 }
 
 /// Distance and face at every pixel centre, into `scratch.hits`.
-pub fn cast(room: &Room, lens: &Lens, view: View, scratch: &mut Scratch) {
-    look_around(room, view, &mut scratch.seen);
-    let Scratch { seen, lists, hits } = scratch;
+pub fn cast(room: &Room, lens: &Lens, views: Rows, scratch: &mut Scratch) {
+    let Scratch { lists, hits } = scratch;
     let band = band_rows(lens, lists.len()) * lens.width;
     let hits = &mut hits[..lens.width * lens.height];
-    let work = |first_row: usize, hits: &mut [Hit], list: &mut Vec<Seen>| {
+    let work = |first_row: usize, hits: &mut [Hit], lists: &mut Lists| {
         let rows = hits.len() / lens.width;
         for ty in first_row / TILE..(first_row + rows).div_ceil(TILE) {
+            lists.look_around(room, views, ty, ty == first_row / TILE);
             for tx in 0..lens.tiles_across() {
-                tile_list(seen, &lens.cones[ty * lens.tiles_across() + tx], view, list);
+                lists.tile(lens, views, tx, ty);
                 for y in ty * TILE..((ty + 1) * TILE).min(first_row + rows) {
+                    let view = views.at(y).view;
                     for x in tx * TILE..((tx + 1) * TILE).min(lens.width) {
                         let d = lens.bearings[y * lens.width + x];
                         let hit = if d == Vec3::ZERO {
                             Hit { distance: 0.0, face: NOTHING }
                         } else {
-                            meet(room, list, view.origin, view.turn * d)
+                            meet(room, &lists.tile, view.origin, view.turn * d)
                         };
                         hits[(y - first_row) * lens.width + x] = hit;
                     }
@@ -202,31 +252,34 @@ pub fn cast(room: &Room, lens: &Lens, view: View, scratch: &mut Scratch) {
     });
 }
 
-/// Grey levels from the hits of the last `cast` of the same view.
-pub fn shade(room: &Room, lens: &Lens, view: View, exposure: &Exposure, scratch: &mut Scratch, out: &mut [u8]) {
-    let Scratch { seen, lists, hits } = scratch;
+/// Grey levels from the hits of the last `cast` of the same rows.
+pub fn shade(room: &Room, lens: &Lens, views: Rows, exposure: &Exposure, scratch: &mut Scratch, out: &mut [u8]) {
+    let Scratch { lists, hits } = scratch;
     let band = band_rows(lens, lists.len()) * lens.width;
     let hits = &hits[..lens.width * lens.height];
-    let work = |first_row: usize, out: &mut [u8], list: &mut Vec<Seen>| {
+    let work = |first_row: usize, out: &mut [u8], lists: &mut Lists| {
         let rows = out.len() / lens.width;
         for ty in first_row / TILE..(first_row + rows).div_ceil(TILE) {
+            lists.look_around(room, views, ty, ty == first_row / TILE);
             for tx in 0..lens.tiles_across() {
                 let mut listed = false;
                 for y in ty * TILE..((ty + 1) * TILE).min(first_row + rows) {
+                    let Row { view, gain, offset } = *views.at(y);
                     for x in tx * TILE..((tx + 1) * TILE).min(lens.width) {
                         let i = y * lens.width + x;
                         let light = if is_edge(hits, lens, x, y) {
                             if !listed {
-                                tile_list(seen, &lens.cones[ty * lens.tiles_across() + tx], view, list);
+                                lists.tile(lens, views, tx, ty);
                                 listed = true;
                             }
-                            edge_radiance(room, lens, view, list, x, y)
+                            edge_radiance(room, lens, view, &lists.tile, x, y)
                         } else if hits[i].face == NOTHING {
                             0.0
                         } else {
                             radiance(room, view, view.turn * lens.bearings[i], hits[i], lens.pixel_angle[i])
                         };
-                        out[i - first_row * lens.width] = develop(light, lens.bearings[i].z, i, exposure);
+                        out[i - first_row * lens.width] =
+                            develop(light * gain, offset, lens.bearings[i].z, i, exposure);
                     }
                 }
             }
@@ -276,28 +329,29 @@ fn band_rows(lens: &Lens, threads: usize) -> usize {
 }
 
 /// All solids from a view, nearest first.
-fn look_around(room: &Room, view: View, seen: &mut Vec<Seen>) {
+fn look_around(room: &Room, view: View, slack: f32, seen: &mut Vec<Seen>) {
     seen.clear();
     for (k, s) in room.solids.iter().enumerate() {
         let c = s.centre - view.origin;
         let range = c.length().max(1e-6);
-        let sin = (s.bound / range).min(1.0);
+        let bound = s.bound + slack;
+        let sin = (bound / range).min(1.0);
         let cos = (1.0 - sin * sin).sqrt();
-        let near = (range - s.bound).max(0.0);
+        let near = (range - bound).max(0.0);
         seen.push(Seen { solid: k as u32, near, axis: c / range, cos, sin });
     }
     seen.sort_unstable_by(|a, b| a.near.total_cmp(&b.near).then(a.solid.cmp(&b.solid)));
 }
 
 /// The solids whose bounding sphere may meet the cone.
-fn tile_list(seen: &[Seen], cone: &Cone, view: View, list: &mut Vec<Seen>) {
+fn tile_list(seen: &[Seen], cone: &Cone, view: View, slack: f32, list: &mut Vec<Seen>) {
     list.clear();
     let axis = view.turn * cone.axis;
     list.extend(seen.iter().filter(|s| {
         // angle between the axes against the sum of the half angles, in cosines; the sum may pass π
         let cos_sum = s.cos * cone.cos - s.sin * cone.sin;
         let sin_sum = s.sin * cone.cos + s.cos * cone.sin;
-        s.near <= 0.0 || sin_sum < 0.0 || s.axis.dot(axis) >= cos_sum - 1e-5
+        s.near <= 0.0 || sin_sum < slack || s.axis.dot(axis) >= cos_sum - 1e-5 - slack
     }));
 }
 
@@ -378,9 +432,9 @@ fn edge_radiance(room: &Room, lens: &Lens, view: View, list: &[Seen], x: usize, 
 
 /// Vignette, exposure, shot and read noise, quantisation.
 #[inline]
-fn develop(light: f32, cos_off_axis: f32, pixel: usize, e: &Exposure) -> u8 {
+fn develop(light: f32, offset: f32, cos_off_axis: f32, pixel: usize, e: &Exposure) -> u8 {
     let lost = e.sensor.vignette as f32 * 2.0 * (1.0 - cos_off_axis * cos_off_axis);
-    let level = light * e.gain * (1.0 - lost).max(0.0);
+    let level = (light * (1.0 - lost).max(0.0) + offset).max(0.0);
     let read = e.sensor.read_noise as f32;
     let sigma = (read * read + e.sensor.shot_noise as f32 * level).sqrt();
     let a = texture::hash(pixel as i32, 0, e.stream);

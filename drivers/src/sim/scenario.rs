@@ -27,8 +27,38 @@ pub struct Scenario {
     /// Images are made this many times smaller a side.
     pub image_divisor: usize,
     pub sensor: Sensor,
+    pub light: Light,
+    pub camera_errors: CameraErrors,
     pub imu_errors: ImuErrors,
     pub path: Flight,
+}
+
+/// What is wrong with the cameras and the calibration handed out does not say. A rolling shutter is no
+/// error: it is `readout` of the calibration's cameras, middle rows at the stamp.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct CameraErrors {
+    /// Of the inertial unit's clock over the stamps of images.
+    pub time_offset: Span,
+    /// Camera k is handed out where `body_from_cam * extrinsics[k]` is; beyond the list, where it is.
+    pub extrinsics: Vec<Pose>,
+}
+
+/// How exposure departs from what a smooth meter would give.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Light {
+    /// From an instant of the run on: factor of the exposure, and grey levels added.
+    pub steps: Vec<(Span, f64, f64)>,
+    /// Lamps: share of the light that comes and goes, and how often a second.
+    pub flicker: f64,
+    pub flicker_hz: f64,
+}
+
+impl Light {
+    /// Factor and grey levels added, `t` after the start.
+    pub fn at(&self, t: Span) -> (f64, f64) {
+        let (gain, offset) = self.steps.iter().rev().find(|s| s.0 <= t).map_or((1.0, 0.0), |s| (s.1, s.2));
+        (gain * (1.0 + self.flicker * (TAU * self.flicker_hz * t.secs()).sin()), offset)
+    }
 }
 
 /// Where the body goes.
@@ -101,6 +131,8 @@ impl Scenario {
             calibration: euroc_rig(),
             image_divisor: 1,
             sensor: Sensor { read_noise: 1.2, shot_noise: 0.025, vignette: 0.35 },
+            light: Light::default(),
+            camera_errors: CameraErrors::default(),
             imu_errors: ImuErrors::EUROC,
             path,
         }
@@ -129,6 +161,31 @@ fn shrunk(c: &Camera, divisor: usize) -> Camera {
         cy: (c.cy + 0.5) / s - 0.5,
         lens: c.lens,
     }
+}
+
+/// Rigs by name, of EuRoC's cameras and inertial unit: one camera, two that look the same way, two that
+/// look opposite ways and share nothing, and four (two ahead, one to each side).
+pub const RIGS: [&str; 4] = ["mono", "stereo", "opposed", "four"];
+
+pub fn rig_named(name: &str) -> Option<Calibration> {
+    let mut rig = euroc_rig();
+    let turned = |c: &RigCamera, yaw: f64, p: DVec3| RigCamera {
+        body_from_cam: Pose::new(c.body_from_cam.q * DQuat::from_rotation_y(yaw), c.body_from_cam.p + p),
+        ..*c
+    };
+    let [left, right] = [rig.cameras[0], rig.cameras[1]];
+    match name {
+        "mono" => rig.cameras.truncate(1),
+        "stereo" => {}
+        "opposed" => rig.cameras[1] = turned(&right, TAU / 2.0, DVec3::ZERO),
+        // 70°: a few degrees seen by two, as headsets have it
+        "four" => rig.cameras.extend([
+            turned(&left, -1.222, DVec3::new(0.0, 0.0, -0.02)),
+            turned(&right, 1.222, DVec3::new(0.0, 0.0, -0.02)),
+        ]),
+        _ => return None,
+    }
+    Some(rig)
 }
 
 /// The VI-sensor of EuRoC (Burri et al., IJRR 2016): 752x480, 0.11 m baseline.

@@ -37,10 +37,10 @@ fn write_all(sim: &mut Sim, mav: &Path, progress: impl FnMut(usize, usize)) -> R
         let folder = mav.join(format!("cam{k}"));
         make_dir(&folder.join("data"))?;
         put(&folder.join("sensor.yaml"), &camera_yaml(camera, k, frame_rate(sim)))?;
-        put(&folder.join("data.csv"), &image_table(sim))?;
+        put(&folder.join("data.csv"), &image_table(sim, camera))?;
     }
     make_dir(&mav.join("depth0").join("data"))?;
-    put(&mav.join("depth0").join("data.csv"), &image_table(sim))?;
+    put(&mav.join("depth0").join("data.csv"), &image_table(sim, &rig.cameras[0]))?;
     let about = format!(
         "sensor_type: depth\ncomment: z in the frame of cam0, 16-bit, mm, 0 = none\n{}",
         transform_yaml(&rig.cameras[0].body_from_cam)
@@ -66,16 +66,16 @@ fn write_images(sim: &mut Sim, mav: &Path, mut progress: impl FnMut(usize, usize
     let count = sim.frame_count();
     for i in 0..count {
         sim.render(i, &mut frames);
-        let file = format!("{}.png", frames.t.0);
+        let name = |camera: usize| format!("{}.png", sim.calibration().cameras[camera].from_imu_clock(frames.t).0);
         for (k, image) in frames.images.iter().enumerate() {
-            let path = mav.join(format!("cam{k}")).join("data").join(&file);
+            let path = mav.join(format!("cam{k}")).join("data").join(name(k));
             write_png(&path, image.width, image.height, png::BitDepth::Eight, &image.pixels)?;
         }
+        let path = mav.join("depth0").join("data").join(name(0));
         sim.depth(i, 0, &mut depth);
         for (out, z) in millimetres.chunks_exact_mut(2).zip(&depth) {
             out.copy_from_slice(&((z * 1000.0).round().min(65535.0) as u16).to_be_bytes());
         }
-        let path = mav.join("depth0").join("data").join(&file);
         write_png(&path, width, height, png::BitDepth::Sixteen, &millimetres)?;
         progress(i + 1, count);
     }
@@ -101,10 +101,11 @@ fn frame_rate(sim: &Sim) -> f64 {
     ((n - 1) as f64 / (sim.stamp(n - 1) - sim.stamp(0)).secs() * 1e6).round() / 1e6
 }
 
-fn image_table(sim: &Sim) -> String {
+/// By the camera's own clock.
+fn image_table(sim: &Sim, camera: &RigCamera) -> String {
     let mut s = "#timestamp [ns],filename\n".to_string();
     for i in 0..sim.frame_count() {
-        let t = sim.stamp(i).0;
+        let t = camera.from_imu_clock(sim.stamp(i)).0;
         line(&mut s, format_args!("{t},{t}.png"));
     }
     s
@@ -153,10 +154,14 @@ fn camera_yaml(c: &RigCamera, k: usize, rate_hz: f64) -> String {
             ("ds", intrinsics, "none", "[]".to_string())
         }
     };
+    let readout = match c.readout.0 {
+        0 => String::new(),
+        _ => format!("readout_time: {}\n", c.readout.secs()),
+    };
     format!(
         "sensor_type: camera\ncomment: simulated cam{k}\n{}rate_hz: {rate_hz}\nresolution: [{}, {}]\n\
          camera_model: {model}\nintrinsics: {intrinsics}\ndistortion_model: {distortion}\n\
-         distortion_coefficients: {coefficients}\n",
+         distortion_coefficients: {coefficients}\n{readout}",
         transform_yaml(&c.body_from_cam),
         m.width,
         m.height
