@@ -5,7 +5,7 @@
 //! pivots that are zero to working precision: an unobserved direction is dropped, not divided by
 //! rounding noise.
 
-use super::real::Real;
+use super::real::{Real, Wide};
 
 /// A pivot that elimination brought under so many epsilons of its diagonal is rounding noise.
 const PIVOT_EPSILONS: f64 = 100.0;
@@ -78,8 +78,12 @@ impl<S: Real> System<S> {
 
     /// Adds a product of rows `[A | b]` (lower triangle, see `qr::Rows::gram`) whose columns, from
     /// `first`, belong to `spans`, ascending, with b after them.
-    #[inline(always)]
     pub fn add_gram(&mut self, gram: &[S], stride: usize, first: usize, spans: &[Span]) {
+        AddGram { system: self, gram, stride, first, spans }.wide();
+    }
+
+    #[inline(always)]
+    fn add_gram_here(&mut self, gram: &[S], stride: usize, first: usize, spans: &[Span]) {
         let mut i = first;
         for (k, rows) in spans.iter().enumerate() {
             for r in 0..rows.len {
@@ -108,7 +112,7 @@ impl<S: Real> System<S> {
     /// Eliminates the first `m` variables in place: the trailing block of (H, b) becomes the Schur
     /// complement, the leading columns hold L and the leading diagonal D (0 where skipped).
     pub fn eliminate(&mut self, m: usize) {
-        super::real::wide(|| self.eliminate_here(m));
+        Eliminate(self, m).wide();
     }
 
     #[inline(always)]
@@ -212,6 +216,32 @@ impl<S: Real> System<S> {
             factor.substitute(&r, &mut part);
             x.iter_mut().zip(&part).for_each(|(x, d)| *x += d.f64());
         }
+    }
+}
+
+struct Eliminate<'a, S>(&'a mut System<S>, usize);
+
+impl<S: Real> Wide for Eliminate<'_, S> {
+    type Output = ();
+    #[inline(always)]
+    fn run(self) {
+        self.0.eliminate_here(self.1);
+    }
+}
+
+struct AddGram<'a, S> {
+    system: &'a mut System<S>,
+    gram: &'a [S],
+    stride: usize,
+    first: usize,
+    spans: &'a [Span],
+}
+
+impl<S: Real> Wide for AddGram<'_, S> {
+    type Output = ();
+    #[inline(always)]
+    fn run(self) {
+        self.system.add_gram_here(self.gram, self.stride, self.first, self.spans);
     }
 }
 

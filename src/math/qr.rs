@@ -6,7 +6,7 @@
 //! elimination stands): what rounding left of them is dropped, so that a direction nobody observed
 //! stays unobserved.
 
-use super::real::{wide, Real};
+use super::real::{Real, Wide};
 
 /// What is left of a column is rounding when it is under this many epsilons of its length before
 /// elimination: a few roundings in each of a hundred reflections.
@@ -101,23 +101,13 @@ impl<S: Real> Rows<S> {
     /// Eliminates columns `0..n`: afterwards the first `rank` rows are triangular in them, and the others
     /// do not contain them. Answers the rank.
     pub fn eliminate(&mut self, n: usize) -> usize {
-        wide(|| {
-            self.measure();
-            self.reflect(0, n, 0)
-        })
+        Eliminate(self, n).wide()
     }
 
     /// The same with the remaining columns, of the rows below the first `rank`, which are dropped with the
     /// first `n` columns' information. So are rows that speak of no column any more.
     pub fn marginalise(&mut self, n: usize) {
-        let end = self.cols - 1;
-        wide(|| {
-            self.measure();
-            let rank = self.reflect(0, n, 0);
-            let last = self.reflect(n, end, rank);
-            self.a.copy_within(rank * self.stride..last * self.stride, 0);
-            self.rows = last - rank;
-        });
+        Marginalise(self, n).wide();
     }
 
     /// As few rows as hold the same information.
@@ -126,11 +116,11 @@ impl<S: Real> Rows<S> {
     }
 
     #[inline(always)]
-    fn measure(&mut self) {
-        let stride = self.stride;
-        self.lengths[..stride].fill(S::ZERO);
+    fn measure(&mut self, columns: usize) {
+        let (stride, n) = (self.stride, padded(columns));
+        self.lengths[..n].fill(S::ZERO);
         for row in self.a[..self.rows * stride].chunks_exact(stride) {
-            for (l, x) in self.lengths[..stride].iter_mut().zip(row) {
+            for (l, x) in self.lengths[..n].iter_mut().zip(row) {
                 *l += *x * *x;
             }
         }
@@ -189,32 +179,70 @@ impl<S: Real> Rows<S> {
     /// `[A | b]ᵀ [A | b]` of the rows from `first`, lower triangle, into `out` with the stride it answers.
     pub fn gram(&self, first: usize, out: &mut [S]) -> usize {
         let stride = self.stride;
-        let rows = &self.a[first * stride..self.rows * stride];
-        wide(|| {
-            for i in (0..self.cols).step_by(GRAM_ROWS) {
-                for j in (0..i + GRAM_ROWS).step_by(LANES) {
-                    let mut sum = [[S::ZERO; LANES]; GRAM_ROWS];
-                    for row in rows.chunks_exact(stride) {
-                        let right: &[S; LANES] = row[j..j + LANES].try_into().expect("rows are padded to lanes");
-                        let left: &[S; GRAM_ROWS] = row[i..i + GRAM_ROWS].try_into().expect("lanes are whole");
-                        for (sum, x) in sum.iter_mut().zip(left) {
-                            for (s, y) in sum.iter_mut().zip(right) {
-                                *s += *x * *y;
-                            }
-                        }
-                    }
-                    for (k, sum) in sum.iter().enumerate() {
-                        out[(i + k) * stride + j..][..LANES].copy_from_slice(sum);
-                    }
-                }
-            }
-        });
+        Gram { rows: &self.a[first * stride..self.rows * stride], stride, cols: self.cols, out }.wide();
         stride
     }
 
     /// Elements `gram` writes at most.
     pub const fn gram_len(cols_max: usize) -> usize {
         padded(cols_max) * padded(cols_max)
+    }
+}
+
+struct Eliminate<'a, S>(&'a mut Rows<S>, usize);
+
+impl<S: Real> Wide for Eliminate<'_, S> {
+    type Output = usize;
+    #[inline(always)]
+    fn run(self) -> usize {
+        self.0.measure(self.1);
+        self.0.reflect(0, self.1, 0)
+    }
+}
+
+struct Marginalise<'a, S>(&'a mut Rows<S>, usize);
+
+impl<S: Real> Wide for Marginalise<'_, S> {
+    type Output = ();
+    #[inline(always)]
+    fn run(self) {
+        let Marginalise(rows, n) = self;
+        rows.measure(rows.cols);
+        let rank = rows.reflect(0, n, 0);
+        let last = rows.reflect(n, rows.cols - 1, rank);
+        rows.a.copy_within(rank * rows.stride..last * rows.stride, 0);
+        rows.rows = last - rank;
+    }
+}
+
+struct Gram<'a, S> {
+    rows: &'a [S],
+    stride: usize,
+    cols: usize,
+    out: &'a mut [S],
+}
+
+impl<S: Real> Wide for Gram<'_, S> {
+    type Output = ();
+    #[inline(always)]
+    fn run(self) {
+        for i in (0..self.cols).step_by(GRAM_ROWS) {
+            for j in (0..i + GRAM_ROWS).step_by(LANES) {
+                let mut sum = [[S::ZERO; LANES]; GRAM_ROWS];
+                for row in self.rows.chunks_exact(self.stride) {
+                    let right: &[S; LANES] = row[j..j + LANES].try_into().expect("rows are padded to lanes");
+                    let left: &[S; GRAM_ROWS] = row[i..i + GRAM_ROWS].try_into().expect("lanes are whole");
+                    for (sum, x) in sum.iter_mut().zip(left) {
+                        for (s, y) in sum.iter_mut().zip(right) {
+                            *s += *x * *y;
+                        }
+                    }
+                }
+                for (k, sum) in sum.iter().enumerate() {
+                    self.out[(i + k) * self.stride + j..][..LANES].copy_from_slice(sum);
+                }
+            }
+        }
     }
 }
 

@@ -13,7 +13,7 @@ use super::window::{Layout, Window, FRAMES, MOTION_DIM, POSE_DIM};
 use crate::limits::{OBSERVATIONS, RIG_DIM, WINDOW_DIM};
 use crate::math::dense::{Span, System};
 use crate::math::qr::Rows;
-use crate::math::real::{wide, Real};
+use crate::math::real::Real;
 use crate::mem::List;
 
 /// Columns of a point, first in a landmark's block.
@@ -70,7 +70,7 @@ impl<S: Real> Linear<S> {
     /// Adds the square of the rows from `first`, the point's columns left out.
     pub fn add_to(&mut self, first: usize, system: &mut System<S>) {
         let stride = self.rows.gram(first, &mut self.gram);
-        wide(|| system.add_gram(&self.gram, stride, self.lead, &self.spans));
+        system.add_gram(&self.gram, stride, self.lead, &self.spans);
     }
 
     /// Appends the rows from `first`, the point's columns left out; makes room when there is none.

@@ -17,7 +17,7 @@ use super::window::{Layout, Window, FRAMES, MOTION_DIM, POSE_DIM};
 use crate::limits::{RIG_DIM, WINDOW_DIM};
 use crate::math::dense::{Span, System};
 use crate::math::qr::Rows;
-use crate::math::real::{wide, Real};
+use crate::math::real::Real;
 use crate::mem::List;
 
 /// A keyframe of which fewer than this fraction of landmarks is still seen goes first.
@@ -162,7 +162,7 @@ impl<S: Real> Prior<S> {
         }
         self.gram[n * self.stride..][..n].copy_from_slice(&b[..n]);
         let spans = self.spans(layout);
-        wide(|| system.add_gram(&self.gram, self.stride, 0, &spans));
+        system.add_gram(&self.gram, self.stride, 0, &spans);
         cost
     }
 
