@@ -111,6 +111,9 @@ enum Bench {
         /// One small flight, two settings
         #[arg(long)]
         quick: bool,
+        /// The default settings only, in both precisions: a row a flight
+        #[arg(long, conflicts_with = "quick")]
+        defaults: bool,
     },
 }
 
@@ -133,8 +136,8 @@ fn run(command: Command) -> Result<(), Fault> {
             daemon::simulate(&daemon::Simulate { scenario, truth, imu, duration_s: duration, seed, rig, defects }, &out)
         }
         Command::Check { board, set } => daemon::check(&board, &set),
-        Command::Bench { what: Bench::Odometry { out, recordings, seconds, quick } } => {
-            bench::odometry(&bench::Options { recordings, seconds, quick }, &out)
+        Command::Bench { what: Bench::Odometry { out, recordings, seconds, quick, defaults } } => {
+            bench::odometry(&bench::Options { recordings, seconds, quick, defaults }, &out)
         }
     }
 }

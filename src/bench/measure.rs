@@ -1,11 +1,13 @@
 //! One flight with one setting: error against its truth, and the time of each stage.
 
 use super::inputs::Flight;
+use super::settings::Setting;
 use crate::config::Board;
 use crate::frontend::{Frontend, Prediction};
+use crate::math::real::Real;
 use crate::output::metrics::{percentile, trajectory_error};
 use crate::output::process::thread_cpu_secs;
-use crate::vio::Vio;
+use crate::vio::{Estimator, Scalar};
 use std::time::Instant;
 use stipple_drivers::{Fault, TimedPose};
 
@@ -33,9 +35,17 @@ pub struct Figures {
     pub hash: u64,
 }
 
-pub fn measure(flight: &Flight, board: &Board) -> Result<Figures, Fault> {
+pub fn measure(flight: &Flight, setting: &Setting) -> Result<Figures, Fault> {
+    if setting.double {
+        measure_in::<f64>(flight, &setting.board)
+    } else {
+        measure_in::<Scalar>(flight, &setting.board)
+    }
+}
+
+fn measure_in<S: Real>(flight: &Flight, board: &Board) -> Result<Figures, Fault> {
     let mut frontend = Frontend::new(&flight.calibration, &board.frontend)?;
-    let mut vio = Vio::new(&flight.calibration, &board.vio);
+    let mut vio = Estimator::<S>::new(&flight.calibration, &board.vio);
     let n = flight.frames.len();
     let mut trajectory: Vec<TimedPose> = Vec::with_capacity(n);
     let (mut frontend_ms, mut estimator_ms) = (Vec::with_capacity(n), Vec::with_capacity(n));

@@ -34,6 +34,8 @@ pub struct Options {
     pub seconds: Option<f64>,
     /// One small flight and two settings.
     pub quick: bool,
+    /// All inputs at the default settings, in both precisions.
+    pub defaults: bool,
 }
 
 /// One input at one setting.
@@ -73,7 +75,7 @@ pub fn odometry(options: &Options, out: &Path) -> Result<(), Fault> {
         true => (inputs::quick(), settings::quick(), options.seconds.unwrap_or(QUICK_SECONDS)),
         false => (
             inputs::all(options.recordings.as_deref())?,
-            settings::all(),
+            if options.defaults { settings::defaults() } else { settings::all() },
             options.seconds.unwrap_or(SECONDS).min(SECONDS_MAX),
         ),
     };
@@ -93,7 +95,7 @@ fn fly(inputs: &[Input], settings: Vec<Setting>, seconds: f64) -> Result<Sweep, 
         let frames = flight.frames.len();
         sweep.inputs.push(Flown { name: input.name.clone(), about: input.about.clone(), frames });
         for (s, setting) in sweep.settings.iter().enumerate() {
-            let figures = measure(&flight, &setting.board)?;
+            let figures = measure(&flight, setting)?;
             let ate = figures.ate_m.map_or("none".to_string(), |m| format!("{m:.4} m"));
             eprintln!(
                 "{:6.1} s  {} of {}  {:<30} {:<32} ATE {ate}, {:.2} ms a frame",

@@ -2,16 +2,20 @@
 //! few whole shapes. A setting is a list of `--set` assignments, so any of them can be replayed.
 
 use crate::config::Board;
+use crate::math::real::Real;
+use crate::vio::Scalar;
 
 /// A board that leaves the estimator at the method's defaults.
 const BOARD: &str = include_str!("../../board-configs/lavapipe.toml");
 
 /// Parameter and values; the default joins them where it is not among them.
-const PARAMETERS: [(&str, &[f64]); 8] = [
+const PARAMETERS: [(&str, &[f64]); 10] = [
     ("frontend.grid_px", &[30.0, 40.0, 50.0, 60.0, 70.0, 80.0]),
     ("frontend.fast_threshold_min", &[3.0, 5.0, 10.0, 20.0]),
     ("frontend.iterations", &[2.0, 3.0, 5.0, 7.0, 10.0]),
     ("vio.iterations_max", &[2.0, 3.0, 5.0, 7.0, 9.0, 12.0]),
+    ("vio.states", &[2.0, 3.0, 4.0, 5.0]),
+    ("vio.keyframes", &[3.0, 5.0, 7.0, 10.0]),
     ("vio.keyframe_connected_min", &[0.5, 0.6, 0.7, 0.8, 0.9]),
     ("vio.observation_sigma_px", &[0.25, 0.5, 1.0]),
     ("vio.gyro_noise_scale", &[1.0, 2.0, 4.0, 8.0]),
@@ -28,6 +32,9 @@ const SHAPES: [Named; 4] = [
 /// Rules of inertial integration, by rising order.
 const SCHEMES: [Named; 2] = [("euler", &["vio.preintegration=euler"]), ("rk4", &["vio.preintegration=rk4"])];
 pub const SHAPE: &str = "shape";
+/// The other scalar of the estimator's linear algebra, which no board chooses.
+const SCALAR: &str = "scalar";
+const DOUBLE: &str = "scalar f64";
 const SCHEME: &str = "preintegration";
 /// A name and its assignments.
 type Named = (&'static str, &'static [&'static str]);
@@ -40,6 +47,8 @@ pub struct Setting {
     pub name: String,
     pub set: Vec<String>,
     pub board: Board,
+    /// Linear algebra in f64 and not in `vio::Scalar`.
+    pub double: bool,
 }
 
 /// A curve of the plots: settings by index, along the parameter.
@@ -52,7 +61,7 @@ pub struct Curve {
 
 fn setting(name: String, set: Vec<String>) -> Setting {
     let board = Board::parse("board-configs/lavapipe.toml", BOARD, &set).expect("the sweep stays within the bounds");
-    Setting { name, set, board }
+    Setting { name, set, board, double: false }
 }
 
 fn assigned(key: &str, value: f64) -> Setting {
@@ -71,7 +80,17 @@ pub fn all() -> Vec<Setting> {
     for (family, members, _) in FAMILIES {
         all.extend(members.iter().map(|(name, set)| setting(format!("{family} {name}"), owned(set))));
     }
+    all.push(double());
     all
+}
+
+fn double() -> Setting {
+    Setting { double: true, ..setting(DOUBLE.into(), vec![]) }
+}
+
+/// The default in both precisions.
+pub fn defaults() -> Vec<Setting> {
+    vec![setting(DEFAULT.into(), vec![]), double()]
 }
 
 /// The default and one cheaper setting.
@@ -98,6 +117,8 @@ pub fn curves(settings: &[Setting]) -> Vec<Curve> {
         points.insert(points.len().min(below_default), (DEFAULT.into(), 0));
         curves.push(curve(family, points));
     }
+    let scalars = [Some((Scalar::NAME.to_string(), 0)), find(DOUBLE).map(|i| ("f64".to_string(), i))];
+    curves.push(curve(SCALAR, scalars.into_iter().flatten().collect()));
     curves.retain(|c| c.settings.len() > 1);
     curves
 }
@@ -126,7 +147,7 @@ mod tests {
         assert!(settings[0].set.is_empty() && curves.iter().all(|c| c.settings.contains(&0)));
         for (i, s) in settings.iter().enumerate().skip(1) {
             assert!(curves.iter().any(|c| c.settings.contains(&i)), "{} is on no curve", s.name);
-            assert_ne!(s.board, settings[0].board, "{} is the default", s.name);
+            assert!(s.double || s.board != settings[0].board, "{} is the default", s.name);
         }
     }
 }
