@@ -6,7 +6,7 @@ use stipple_drivers::replay::{OpenOptions, Recording};
 use stipple_drivers::sim::{self, Scenario, Sim};
 use stipple_drivers::{Calibration, Exit, Fault, Frames, ImuSample, Span, TimedPose};
 
-const NAMED: [&str; 3] = ["demo", "circle", "aggressive"];
+const NAMED: [&str; 2] = ["demo", "aggressive"];
 const RECORDING: &str = "euroc_MH_01_easy_11s";
 /// Recorded flights and where in them to begin, s: at rest, just before taking off.
 const RECORDED: [(&str, f64); 3] = [("MH_04_difficult", 16.0), ("V1_02_medium", 1.0), ("V2_02_medium", 0.0)];

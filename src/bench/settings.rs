@@ -10,16 +10,16 @@ const BOARD: &str = include_str!("../../board-configs/lavapipe.toml");
 
 /// Parameter and values; the default joins them where it is not among them.
 const PARAMETERS: [(&str, &[f64]); 10] = [
-    ("frontend.grid_px", &[30.0, 40.0, 50.0, 60.0, 70.0, 80.0]),
-    ("frontend.fast_threshold_min", &[3.0, 5.0, 10.0, 20.0]),
-    ("frontend.iterations", &[2.0, 3.0, 5.0, 7.0, 10.0]),
-    ("vio.iterations_max", &[2.0, 3.0, 5.0, 7.0, 9.0, 12.0]),
+    ("frontend.grid_px", &[30.0, 40.0, 50.0, 60.0, 80.0]),
+    ("frontend.fast_threshold_min", &[5.0, 10.0, 20.0]),
+    ("frontend.iterations", &[2.0, 3.0, 5.0, 8.0]),
+    ("vio.iterations_max", &[2.0, 3.0, 5.0, 7.0, 10.0]),
     ("vio.states", &[2.0, 3.0, 4.0, 5.0]),
-    ("vio.keyframes", &[3.0, 5.0, 7.0, 10.0]),
-    ("vio.keyframe_connected_min", &[0.5, 0.6, 0.7, 0.8, 0.9]),
+    ("vio.keyframes", &[4.0, 7.0, 10.0]),
+    ("vio.keyframe_connected_min", &[0.6, 0.7, 0.8, 0.9]),
     ("vio.observation_sigma_px", &[0.25, 0.5, 1.0]),
-    ("vio.gyro_noise_scale", &[1.0, 2.0, 4.0, 8.0]),
-    ("vio.accel_noise_scale", &[1.0, 2.0, 4.0, 8.0]),
+    ("vio.gyro_noise_scale", &[1.0, 2.0, 4.0]),
+    ("vio.accel_noise_scale", &[2.0, 4.0, 8.0]),
 ];
 
 /// The defaults of all parameters that set the run time, moved together.
