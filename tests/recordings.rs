@@ -84,7 +84,30 @@ fn gives_the_same_bits(data: &Path) -> Run {
         assert!(run.number("frontend_ms_p99") >= run.number("frontend_ms_p50"));
         assert!(run.number("tracking_ms_p50") >= run.number("estimator_ms_p50"));
     }
+    let mapped = stipple(
+        &[
+            "replay",
+            data.to_str().unwrap(),
+            "--pace",
+            "lockstep",
+            "--set",
+            "map.lockstep_iterations=1",
+            "--set",
+            "map.burst_iterations=0",
+        ],
+        false,
+    );
+    assert_eq!(mapped.report["vio_hash"], first.report["vio_hash"], "the mapper changes nothing");
     first
+}
+
+#[test]
+#[cfg_attr(not(recordings), ignore = "no recordings")]
+fn short_recordings_give_the_same_bits() {
+    for name in ["euroc_V1_01_easy_static_1s", "tumvi_room1_fisheye_16"] {
+        let Some(data) = recording("short_recordings_give_the_same_bits", name) else { continue };
+        gives_the_same_bits(&data);
+    }
 }
 
 #[test]
