@@ -115,6 +115,14 @@ enum Bench {
         #[arg(long, conflicts_with = "quick")]
         defaults: bool,
     },
+    /// What becomes of the estimator when something goes wrong: one row a case
+    Stability {
+        #[arg(long, value_name = "DIR")]
+        out: PathBuf,
+        /// Flights of each case; the worst is shown
+        #[arg(long, value_name = "N", default_value = "5", value_parser = clap::value_parser!(u64).range(1..=1000))]
+        seeds: u64,
+    },
 }
 
 fn seconds(text: &str) -> Result<f64, String> {
@@ -139,6 +147,7 @@ fn run(command: Command) -> Result<(), Fault> {
         Command::Bench { what: Bench::Odometry { out, recordings, seconds, quick, defaults } } => {
             bench::odometry(&bench::Options { recordings, seconds, quick, defaults }, &out)
         }
+        Command::Bench { what: Bench::Stability { out, seeds } } => bench::stability::stability(seeds, &out),
     }
 }
 

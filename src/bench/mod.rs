@@ -5,10 +5,12 @@
 //! leaves `odometry.csv` (a row an input and setting), `odometry.json` and `odometry.html` (error
 //! against run time). Each input is rendered or read into memory once and dropped before the next.
 
+pub mod flight;
 mod inputs;
 mod measure;
 mod page;
 mod settings;
+pub mod stability;
 mod tables;
 pub mod world;
 

@@ -20,15 +20,26 @@ const CM: f64 = 100.0;
 
 type Points = [Option<(f64, f64)>];
 
-pub fn write(out: &mut impl Write, sweep: &Sweep) -> io::Result<()> {
+/// Opens a page of the bench.
+pub fn head(out: &mut impl Write, title: &str, what: &str) -> io::Result<()> {
     write!(out, "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\">")?;
     write!(out, "<meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">")?;
-    write!(out, "<title>Odometry: error against run time \u{2013} Stipple</title>")?;
+    write!(out, "<title>{title} \u{2013} Stipple</title>")?;
     write!(out, "<style>{STYLE}{MORE_STYLE}</style></head><body><main>")?;
-    write!(out, "<header><p class=\"over\">Stipple</p><h1>Odometry: error against run time</h1>")?;
+    write!(out, "<header><p class=\"over\">Stipple</p><h1>{title}</h1><p class=\"what\">{what}</p></header>")
+}
+
+pub fn foot(out: &mut impl Write) -> io::Result<()> {
+    writeln!(out, "</main></body></html>")
+}
+
+pub fn write(out: &mut impl Write, sweep: &Sweep) -> io::Result<()> {
     let frames: usize = sweep.inputs.iter().map(|i| i.frames).sum();
     let (inputs, settings) = (sweep.inputs.len(), sweep.settings.len());
-    write!(out, "<p class=\"what\">{inputs} inputs, {frames} stereo frames, {settings} settings; frontend and estimator on one thread, no mapper</p></header>")?;
+    let what = format!(
+        "{inputs} inputs, {frames} stereo frames, {settings} settings; frontend and estimator on one thread, no mapper"
+    );
+    head(out, "Odometry: error against run time", &what)?;
     write!(out, "<section><h2>Knee</h2><p>{}</p>", escape(&tables::conclusion(sweep)))?;
     write!(out, "<p class=\"note\">ATE after rigid alignment. Over all inputs: geometric mean of the errors, mean of the CPU time. Stages are wall time, so their 99th percentile holds what else the machine did. Errors above {CUT} times the default's are drawn at that height. Run times repeat to a few per cent, and the error of one flight moves by tens of per cent between settings that differ in nothing that matters: read the curves over all inputs first.</p></section>")?;
     out.write_all(defaults(sweep).as_bytes())?;
@@ -38,10 +49,10 @@ pub fn write(out: &mut impl Write, sweep: &Sweep) -> io::Result<()> {
     let charts: Vec<_> = (0..inputs).map(|i| front(&sweep.inputs[i].name, &sweep.points_of(i), sweep)).collect();
     section(out, "All settings on each input", &charts)?;
     out.write_all(settings_table(sweep).as_bytes())?;
-    writeln!(out, "</main></body></html>")
+    foot(out)
 }
 
-fn section(out: &mut impl Write, title: &str, charts: &[Option<String>]) -> io::Result<()> {
+pub fn section(out: &mut impl Write, title: &str, charts: &[Option<String>]) -> io::Result<()> {
     write!(out, "<section><h2>{title}</h2><div class=\"charts\">")?;
     for chart in charts.iter().flatten() {
         write!(out, "<figure>{chart}</figure>")?;
@@ -49,7 +60,7 @@ fn section(out: &mut impl Write, title: &str, charts: &[Option<String>]) -> io::
     write!(out, "</div></section>")
 }
 
-fn table(title: &str, head: &[&str], rows: &[(bool, Vec<String>)]) -> String {
+pub fn table(title: &str, head: &[&str], rows: &[(bool, Vec<String>)]) -> String {
     let mut html = format!("<section><h2>{title}</h2><div class=\"wide-table\"><table><thead><tr>");
     for name in head {
         let _ = write!(html, "<th scope=\"col\">{name}</th>");

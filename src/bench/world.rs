@@ -26,9 +26,19 @@ impl Noise {
     }
 }
 
+/// Values of unrelated streams for seeds that differ by little.
+pub fn stream(seed: u64, which: u64) -> Noise {
+    let mut noise = Noise(seed.wrapping_mul(0x1000_0000_01b3) ^ which);
+    noise.bits();
+    noise
+}
+
 pub const RATE_HZ: f64 = 200.0;
 pub const FRAME_SECS: f64 = 0.05;
-const SIGMA_PX: f64 = 0.3;
+/// Noise of a view, px.
+pub const SIGMA_PX: f64 = 0.3;
+/// Seed of the walk of the biases, apart from that of all else.
+const WALK: u64 = 0x5741_4c4b;
 pub const GYRO_BIAS: DVec3 = DVec3::new(-0.003, 0.02, 0.07);
 pub const ACCEL_BIAS: DVec3 = DVec3::new(-0.02, 0.1, 0.05);
 
@@ -104,6 +114,10 @@ pub struct World {
     ids: Vec<Option<u64>>,
     next_id: u64,
     noise: Noise,
+    walk: Noise,
+    /// As they are now; they walk as the calibration says.
+    pub gyro_bias: DVec3,
+    pub accel_bias: DVec3,
     pose: Box<dyn Fn(f64) -> Pose>,
 }
 
@@ -115,16 +129,29 @@ impl World {
     }
 
     pub fn seen_from(pose: impl Fn(f64) -> Pose + 'static, points: Vec<DVec3>, noise: Noise) -> World {
-        World { rig: calibration(), ids: vec![None; points.len()], points, next_id: 0, noise, pose: Box::new(pose) }
+        World {
+            rig: calibration(),
+            ids: vec![None; points.len()],
+            points,
+            next_id: 0,
+            walk: stream(noise.0, WALK),
+            noise,
+            gyro_bias: GYRO_BIAS,
+            accel_bias: ACCEL_BIAS,
+            pose: Box::new(pose),
+        }
     }
 
+    /// The next sample; the biases walk on by one.
     pub fn imu(&mut self, t: f64) -> ImuSample {
         let (gyro, accel) = rate_and_force(&self.pose, t);
         let root = RATE_HZ.sqrt();
+        self.gyro_bias += self.walk.vector() * (self.rig.imu.gyro_walk / root);
+        self.accel_bias += self.walk.vector() * (self.rig.imu.accel_walk / root);
         ImuSample {
             t: Nanos((t * 1e9).round() as i64),
-            gyro_body: gyro + GYRO_BIAS + self.noise.vector() * self.rig.imu.gyro_noise * root,
-            accel_body: accel + ACCEL_BIAS + self.noise.vector() * self.rig.imu.accel_noise * root,
+            gyro_body: gyro + self.gyro_bias + self.noise.vector() * self.rig.imu.gyro_noise * root,
+            accel_body: accel + self.accel_bias + self.noise.vector() * self.rig.imu.accel_noise * root,
         }
     }
 

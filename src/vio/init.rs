@@ -179,14 +179,16 @@ impl Aligner {
     fn at_rest(&self, tracks: &Tracks, imu: &ImuRing, config: &VioConfig) -> Option<Start> {
         let s = imu.statistics(tracks.t, Span::from_secs(REST_SPAN))?;
         let quiet = s.gyro_sigma < REST_GYRO && s.accel_sigma < REST_ACCEL && s.gyro.length() < REST_GYRO_MEAN;
-        let (mut still, mut seen) = (0, 0);
+        // By axis, so that noise of both does not add up to a motion.
+        let (mut still, mut seen) = ([0, 0], 0);
         for s in &self.sightings {
             if let Some(t) = find_track(&tracks.cameras[0], s.id) {
                 seen += 1;
-                still += ((DVec2::new(t.px[0] as f64, t.px[1] as f64) - s.px).length() < REST_PX) as usize;
+                still[0] += ((t.px[0] as f64 - s.px.x).abs() < REST_PX) as usize;
+                still[1] += ((t.px[1] as f64 - s.px.y).abs() < REST_PX) as usize;
             }
         }
-        if !quiet || seen < RESECTION_MIN || 2 * still < seen {
+        if !quiet || seen < RESECTION_MIN || still.iter().any(|n| 2 * n < seen) {
             return None;
         }
         let q = DQuat::from_rotation_arc(s.accel.normalize(), DVec3::Z);

@@ -102,7 +102,7 @@ impl Trusted {
     fn at(t: Nanos, motion: &Motion, covariance: &[[f64; 15]; 15]) -> Trusted {
         let covariance = Mat15::from_fn(|i, j| covariance[i][j]);
         let carried = Carried { t, motion: *motion, covariance };
-        let (sigma_p, sigma_yaw) = (carried.sigma_p(), carried.about_world_axis(DVec3::Z));
+        let (sigma_p, sigma_yaw) = (carried.sigma(0), carried.about_world_axis(DVec3::Z));
         Trusted { t, pose: motion.pose, speed: motion.v.length(), sigma_p, sigma_yaw, carried }
     }
 
@@ -110,12 +110,16 @@ impl Trusted {
         self.carried.advance(t, imu, noise);
         let away = (t - self.t).secs();
         let mut sigma = start.sigma;
+        if !suspect && sigma.v > self.carried.sigma(6) {
+            // Dead reckoning knows the motion better than a start that does not see it.
+            return Some(Start { motion: self.carried.motion, sigma: self.carried.sigmas() });
+        }
         let moved = in_world_of(&self.carried.motion.pose, &start.motion);
         if away < DOWN_HOLDS && !self.carried.expects_down(&moved, &sigma) {
             return None;
         }
         if self.carried.expects_velocity(&moved, &sigma) && (!suspect || sigma.v < VOUCHING_V) {
-            sigma.p = sigma.p.hypot(self.carried.sigma_p());
+            sigma.p = sigma.p.hypot(self.carried.sigma(0));
             sigma.yaw = sigma.yaw.hypot(self.carried.about_world_axis(DVec3::Z));
             return Some(Start { motion: moved, sigma });
         }
@@ -196,9 +200,15 @@ impl Carried {
         self.covariance.fixed_view::<3, 3>(at, at).into_owned()
     }
 
-    /// Along the axis on which it is largest.
-    fn sigma_p(&self) -> f64 {
-        self.block(0).symmetric_eigenvalues().max().max(0.0).sqrt()
+    /// Of the three errors from `at`, along the axis on which it is largest.
+    fn sigma(&self, at: usize) -> f64 {
+        self.block(at).symmetric_eigenvalues().max().max(0.0).sqrt()
+    }
+
+    fn sigmas(&self) -> Sigma {
+        let [x, y, yaw] = [DVec3::X, DVec3::Y, DVec3::Z].map(|axis| self.about_world_axis(axis));
+        let [p, v, bg, ba] = [0, 6, 9, 12].map(|at| self.sigma(at));
+        Sigma { p, tilt: x.max(y), yaw, v, bg, ba }
     }
 
     fn about_world_axis(&self, axis: DVec3) -> f64 {
