@@ -60,7 +60,7 @@ const ALIGNED_TILT: f64 = 0.05;
 const ALIGNED_V: f64 = 0.1;
 const ALIGNED_GYRO: f64 = 0.02;
 /// Position and yaw are ours to choose; this fixes them, m and rad.
-const GAUGE_SIGMA: f64 = 1e-4;
+pub const GAUGE_SIGMA: f64 = 1e-4;
 
 #[derive(Clone, Copy, Debug)]
 pub struct Start {

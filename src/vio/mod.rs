@@ -44,7 +44,7 @@ use samples::ImuRing;
 use solve::{Model, Outcome, Solver};
 pub use stats::Stats;
 use stipple_drivers::{Calibration, ImuSample, Nanos, Pose};
-use trust::Trust;
+use trust::{Origin, Trust};
 use window::{Frame, Window, FRAMES};
 
 /// With fewer landmarks in view than this a keyframe is declared at once.
@@ -111,6 +111,7 @@ pub struct Estimator<S: Real = Scalar> {
     last: Option<Nanos>,
     /// Where a restart goes on, and why there is one.
     trust: Trust,
+    origin: Origin,
     reset_by: Reset,
     watch: Watch,
     /// What the inertial samples since the last frame suffered.
@@ -143,6 +144,7 @@ impl<S: Real> Estimator<S> {
             before: Predictor { noise, state: None },
             last: None,
             trust: Trust::default(),
+            origin: Origin::default(),
             reset_by: Reset::Asked,
             watch: Watch::default(),
             pending: Health::default(),
@@ -251,15 +253,16 @@ impl<S: Real> Estimator<S> {
         let Some(start) = self.aligner.add(tracks, &self.imu, &self.noise, &self.model, &self.config) else {
             return Update::default();
         };
-        let Some(start) = self.trust.go_on(&start, self.reset_by, tracks.t, &self.imu, &self.noise) else {
+        let Some(mut start) = self.trust.go_on(&start, self.reset_by, tracks.t, &self.imu, &self.noise) else {
             self.aligner.clear();
             return Update::default();
         };
+        self.origin = Origin::split(&mut start);
         let (motion, sigma) = (start.motion, start.sigma);
         let Some(slot) = self.window.push(Frame::first(tracks.t, motion)) else { return Update::default() };
         self.window.frame_mut(slot).fix_anchor();
         self.prior.start(slot, &motion, &sigma);
-        self.covariance = Some(sigma.covariance(&motion));
+        self.covariance = Some(self.origin.add_to(sigma.covariance(&motion), &motion));
         self.tracks[slot].clone_from(tracks);
         self.running = true;
         self.make_keyframe(slot);
@@ -294,7 +297,8 @@ impl<S: Real> Estimator<S> {
         let outcome = self.solver.optimise(&mut self.window, &mut self.landmarks, &mut self.prior, &self.model);
         self.stats.solver_failures += outcome.failures as u64;
         self.stats.iterations += outcome.iterations as u64;
-        self.covariance = self.solver.newest_covariance();
+        let now = &self.window.frame(slot).now;
+        self.covariance = self.solver.newest_covariance().map(|c| self.origin.add_to(c, now));
         let views = self.landmarks.views_in(slot);
         let dropped = self.landmarks.drop_outliers(&self.window, self.window.rig.eyes(), self.config.outlier_px);
         self.stats.outliers += dropped as u64;

@@ -8,7 +8,7 @@
 //! restart that finds another one, for some seconds, is refused, for its accelerometer lies.
 
 use super::health::Reset;
-use super::init::Start;
+use super::init::{Start, GAUGE_SIGMA};
 use super::marginalise::Sigma;
 use super::preintegration::{Increment, Noise};
 use super::residuals::{Mat15, Motion};
@@ -42,6 +42,42 @@ pub struct Trust {
     /// Waits for `LAG`, then is the confirmed one.
     candidate: Option<Trusted>,
     confirmed: Option<Trusted>,
+}
+
+/// What a restart does not know of where it is in the world of before: position and yaw, which no sensor
+/// observes. Apart from the window's covariance, whose precision it would cost, it is what it was at the
+/// start and is added.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Origin {
+    p: DVec3,
+    sigma_p: f64,
+    sigma_yaw: f64,
+}
+
+impl Origin {
+    /// Takes its share out of the deviations of a start.
+    pub fn split(start: &mut Start) -> Origin {
+        let apart = |sigma: &mut f64| {
+            let rest = (sigma.powi(2) - GAUGE_SIGMA.powi(2)).max(0.0).sqrt();
+            *sigma = sigma.min(GAUGE_SIGMA);
+            rest
+        };
+        let p = start.motion.pose.p;
+        Origin { p, sigma_p: apart(&mut start.sigma.p), sigma_yaw: apart(&mut start.sigma.yaw) }
+    }
+
+    /// The covariance of a motion whose errors within its own world have covariance `c`.
+    pub fn add_to(&self, mut c: [[f64; 15]; 15], motion: &Motion) -> [[f64; 15]; 15] {
+        let turn =
+            [DVec3::Z.cross(motion.pose.p - self.p), motion.pose.q.conjugate() * DVec3::Z, DVec3::Z.cross(motion.v)];
+        for i in 0..9 {
+            c[i][i] += if i < 3 { self.sigma_p.powi(2) } else { 0.0 };
+            for j in 0..9 {
+                c[i][j] += turn[i / 3][i % 3] * turn[j / 3][j % 3] * self.sigma_yaw.powi(2);
+            }
+        }
+        c
+    }
 }
 
 #[derive(Clone, Copy, Debug)]
@@ -238,6 +274,28 @@ mod tests {
     use super::*;
     use crate::bench::world::{Path, World, RATE_HZ};
     use crate::config::VioConfig;
+
+    #[test]
+    fn origin_turns_and_shifts_what_is_seen_from_it() {
+        let motion = Motion { pose: Path { rest: -1.0 }.pose(0.4), v: DVec3::new(1.0, 2.0, 3.0), ..Motion::default() };
+        let sigma = Sigma { p: 0.5, yaw: 0.2, tilt: 0.1, v: 0.3, bg: 0.1, ba: 0.1 };
+        let mut start = Start { motion: Motion::default(), sigma };
+        let origin = Origin::split(&mut start);
+        let c = origin.add_to([[0.0; 15]; 15], &motion);
+        // A turn of the world by a small angle moves the motion by these errors.
+        const H: f64 = 1e-6;
+        let turn = DQuat::from_rotation_z(H);
+        let th = so3::log(motion.pose.q.conjugate() * turn * motion.pose.q);
+        let d = [turn * motion.pose.p - motion.pose.p, th, turn * motion.v - motion.v].map(|x| x / H);
+        for i in 0..9 {
+            for j in 0..9 {
+                let shift = if i == j && i < 3 { 0.25 } else { 0.0 };
+                let expected = shift + 0.04 * d[i / 3][i % 3] * d[j / 3][j % 3];
+                assert!((c[i][j] - expected).abs() < 1e-5 * (1.0 + expected.abs()), "{i} {j}: {} {expected}", c[i][j]);
+            }
+        }
+        assert!(start.sigma.p == GAUGE_SIGMA && start.sigma.yaw == GAUGE_SIGMA && start.sigma.v == 0.3);
+    }
 
     #[test]
     fn transition_matches_differences_of_the_propagation() {
