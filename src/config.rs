@@ -118,8 +118,15 @@ pub struct VioConfig {
     pub zero_velocity: bool,
     /// How inertial samples are summed.
     pub preintegration: Scheme,
-    /// Refine the scale of the inertial unit's axes while flying.
+    /// Refine while flying: the cameras' time offset, where they sit, the scale of the inertial unit's axes; and
+    /// how well each is known before.
+    pub estimate_time_offset: bool,
+    pub estimate_extrinsics: bool,
     pub estimate_imu_scale: bool,
+    pub time_offset_sigma_s: f64,
+    pub extrinsics_sigma_m: f64,
+    pub extrinsics_sigma_rad: f64,
+    pub imu_scale_sigma: f64,
     /// Ends of the sensors' ranges, rad/s and m/s²: samples there are clipped and weigh little.
     pub gyro_max: f64,
     pub accel_max: f64,
@@ -143,7 +150,13 @@ impl Default for VioConfig {
             accel_noise_scale: 4.0,
             zero_velocity: true,
             preintegration: Scheme::Midpoint,
+            estimate_time_offset: false,
+            estimate_extrinsics: false,
             estimate_imu_scale: false,
+            time_offset_sigma_s: 0.01,
+            extrinsics_sigma_m: 0.01,
+            extrinsics_sigma_rad: 0.02,
+            imu_scale_sigma: 0.02,
             gyro_max: 34.9,
             accel_max: 156.9,
         }
@@ -427,6 +440,10 @@ const BOUNDS: &[(&str, Bound)] = &[
     ("vio.outlier_px", Positive),
     ("vio.gyro_noise_scale", Positive),
     ("vio.accel_noise_scale", Positive),
+    ("vio.time_offset_sigma_s", Within(1e-6, 0.1)),
+    ("vio.extrinsics_sigma_m", Within(1e-6, 1.0)),
+    ("vio.extrinsics_sigma_rad", Within(1e-6, 0.5)),
+    ("vio.imu_scale_sigma", Within(1e-6, 0.5)),
     ("vio.gyro_max", Positive),
     ("vio.accel_max", Positive),
     ("stereo.disparities", Stepped(16.0, 512.0, 16.0, 0.0)),

@@ -8,8 +8,9 @@ use crate::mem;
 use crate::output::html::{write_html, Evidence};
 use crate::output::metrics::{percentile, trajectory_error, TrajectoryError};
 use crate::output::panel::{panel, Picture, View};
-use crate::output::report::{CurvePoint, KernelTime, Report};
+use crate::output::report::{CurvePoint, ExtrinsicsFound, KernelTime, Report};
 use crate::output::{atomically, ply, process, trajectory, OutputDir};
+use crate::vio::rig::RigEstimate;
 use stipple_drivers::{Fault, Nanos, TimedPose};
 
 /// Keyframes drawn into DIR/renders.
@@ -112,8 +113,29 @@ fn track_figures(report: &mut Report, played: &Played) -> Vec<TimedPose> {
     report.frontend_ms_p99 = percentile(&run.front.ms, 0.99);
     report.estimator_ms_p50 = percentile(&run.back.ms, 0.5);
     report.estimator_ms_p99 = percentile(&run.back.ms, 0.99);
+    played.tracking.rig().into_iter().for_each(|rig| rig_figures(report, &rig));
     report.vio_hash = played.tracking.hash().map(|h| format!("{h:016x}"));
     run.back.trajectory.iter().map(|o| TimedPose { t: o.t, pose: o.world_from_body }).collect()
+}
+
+fn rig_figures(report: &mut Report, rig: &RigEstimate) {
+    let three = |v: &[f64], at: usize| std::array::from_fn(|i| v[at + i]);
+    (report.time_offset_s, report.time_offset_sigma_s) = rig.time_offset.map(|[t, s]| (t, s)).unzip();
+    let found = rig.extrinsics.iter().enumerate().filter_map(|(camera, e)| {
+        let [v, s] = (*e)?;
+        Some(ExtrinsicsFound {
+            camera,
+            p_m: three(&v, 0),
+            p_sigma_m: three(&s, 0),
+            theta_rad: three(&v, 3),
+            theta_sigma_rad: three(&s, 3),
+        })
+    });
+    report.extrinsics = found.collect();
+    if let Some([v, s]) = rig.imu_scale {
+        (report.gyro_scale, report.gyro_scale_sigma) = (Some(three(&v, 0)), Some(three(&s, 0)));
+        (report.accel_scale, report.accel_scale_sigma) = (Some(three(&v, 3)), Some(three(&s, 3)));
+    }
 }
 
 fn map_figures(report: &mut Report, q: &Evaluation) {

@@ -13,6 +13,7 @@ use crate::frontend::{Frontend, Prediction, Tracks};
 use crate::limits::IMU_BETWEEN_FRAMES;
 use crate::mem::List;
 use crate::vio::predict::Predictor;
+use crate::vio::rig::RigEstimate;
 use crate::vio::samples::ImuRing;
 use crate::vio::window::FRAMES;
 use crate::vio::{Odometry, Vio};
@@ -214,6 +215,14 @@ impl Tracking {
         match self {
             Tracking::Odometry(run) => run.threads,
             Tracking::Table(_) => 1,
+        }
+    }
+
+    /// What was estimated of the rig, where the board asks.
+    pub fn rig(&self) -> Option<RigEstimate> {
+        match self {
+            Tracking::Odometry(run) => run.back.vio.rig(),
+            Tracking::Table(_) => None,
         }
     }
 

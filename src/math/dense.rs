@@ -217,6 +217,21 @@ impl<S: Real> System<S> {
             x.iter_mut().zip(&part).for_each(|(x, d)| *x += d.f64());
         }
     }
+
+    /// Standard deviations of the first variables, were this the information of all; infinite where there is
+    /// none. Factored in `factor`.
+    pub fn deviations(&self, factor: &mut System<S>, out: &mut [f64]) {
+        factor.copy_from(self);
+        factor.factor();
+        let mut x = [S::ZERO; crate::limits::WINDOW_DIM];
+        let mut r = [0.0; crate::limits::WINDOW_DIM];
+        for (i, out) in out.iter_mut().enumerate() {
+            r[i] = -1.0;
+            factor.substitute(&r, &mut x);
+            r[i] = 0.0;
+            *out = if x[i] > S::ZERO { x[i].f64().sqrt() } else { f64::INFINITY };
+        }
+    }
 }
 
 struct Eliminate<'a, S>(&'a mut System<S>, usize);

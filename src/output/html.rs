@@ -76,7 +76,7 @@ fn subtitle(report: &Report) -> String {
 }
 
 /// Name, value, unit.
-type Row = (&'static str, Option<String>, &'static str);
+type Row<'a> = (&'a str, Option<String>, &'a str);
 
 fn tables(report: &Report) -> String {
     let f = |v: Option<f64>, decimals: usize| v.filter(|v| v.is_finite()).map(|v| format!("{v:.decimals$}"));
@@ -110,8 +110,41 @@ fn tables(report: &Report) -> String {
         ("Resident memory, peak", mib(report.rss_peak_bytes), "MiB"),
         ("Heap allocations after seal", n(report.heap_after_seal), ""),
     ];
-    let parts = [table("Odometry", &odometry), table("Map", &map), table("Cost", &cost)];
+    let parts = [table("Odometry", &odometry), table("Map", &map), table("Cost", &cost), table_of_rig(report)];
     format!("<section class=\"tables\">{}</section>", parts.concat())
+}
+
+/// What was estimated of the rig; empty where nothing was.
+fn table_of_rig(report: &Report) -> String {
+    let three = |v: [f64; 3], unit: f64| v.map(|x| format!("{:.2}", x * unit)).join(", ");
+    let pair = |v: Option<[f64; 3]>, s: Option<[f64; 3]>, unit: f64| {
+        v.zip(s).map(|(v, s)| format!("{} ± {}", three(v, unit), three(s, unit)))
+    };
+    const MM: f64 = 1e3;
+    const DEGREES: f64 = 180.0 / std::f64::consts::PI;
+    const PERCENT: f64 = 100.0;
+    let mut rows: Vec<(String, Option<String>, &str)> = Vec::new();
+    if let Some((t, s)) = report.time_offset_s.zip(report.time_offset_sigma_s) {
+        rows.push(("Time offset of the cameras".into(), Some(format!("{:.3} ± {:.3}", t * 1e3, s * 1e3)), "ms"));
+    }
+    for e in &report.extrinsics {
+        let k = e.camera;
+        rows.push((format!("Camera {k}, position"), pair(Some(e.p_m), Some(e.p_sigma_m), MM), "mm"));
+        let turn = pair(Some(e.theta_rad), Some(e.theta_sigma_rad), DEGREES);
+        rows.push((format!("Camera {k}, rotation"), turn, "\u{b0}"));
+    }
+    let scales = [
+        ("Gyro scale", report.gyro_scale, report.gyro_scale_sigma),
+        ("Accelerometer scale", report.accel_scale, report.accel_scale_sigma),
+    ];
+    for (name, v, s) in scales {
+        rows.extend(pair(v, s, PERCENT).map(|shown| (name.to_string(), Some(shown), "%")));
+    }
+    let rows: Vec<Row> = rows.iter().map(|(name, value, unit)| (name.as_str(), value.clone(), *unit)).collect();
+    if rows.is_empty() {
+        return String::new();
+    }
+    table("Rig, over its calibration", &rows)
 }
 
 fn table(title: &str, rows: &[Row]) -> String {

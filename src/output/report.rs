@@ -41,6 +41,16 @@ pub struct Report {
     /// Of every odometry state, bit for bit.
     pub vio_hash: Option<String>,
 
+    /// What was estimated of the rig, over its calibration, and standard deviations.
+    pub time_offset_s: Option<f64>,
+    pub time_offset_sigma_s: Option<f64>,
+    pub extrinsics: Vec<ExtrinsicsFound>,
+    /// Factors less one, by axis.
+    pub gyro_scale: Option<[f64; 3]>,
+    pub gyro_scale_sigma: Option<[f64; 3]>,
+    pub accel_scale: Option<[f64; 3]>,
+    pub accel_scale_sigma: Option<[f64; 3]>,
+
     pub psnr_db: Option<f64>,
     pub ssim: Option<f64>,
     pub psnr_heldout_db: Option<f64>,
@@ -66,6 +76,16 @@ pub struct Report {
     /// `count_<name>` of every counter.
     #[serde(flatten)]
     pub counts: BTreeMap<String, u64>,
+}
+
+/// Where a camera sits over where it was calibrated: position in the body frame, rotation vector in its own.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct ExtrinsicsFound {
+    pub camera: usize,
+    pub p_m: [f64; 3],
+    pub p_sigma_m: [f64; 3],
+    pub theta_rad: [f64; 3],
+    pub theta_sigma_rad: [f64; 3],
 }
 
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -113,7 +133,8 @@ mod tests {
         "frames keyframes anchors frames_dropped ate_rmse_m rte_1s_m rpe_deg tracking_fps tracking_ms_p50 \
         tracking_ms_p99 tracking_threads tracking_cpu_ms frontend_ms_p50 frontend_ms_p99 estimator_ms_p50 \
         estimator_ms_p99 psnr_db ssim psnr_heldout_db ssim_heldout psnr_heldout_aligned_db splats iterations \
-        iteration_ms_p50 gpu_bytes rss_peak_bytes heap_after_seal wall_s device vio_hash dataset board pace scale";
+        iteration_ms_p50 gpu_bytes rss_peak_bytes heap_after_seal wall_s device vio_hash dataset board pace scale \
+        time_offset_s time_offset_sigma_s gyro_scale gyro_scale_sigma accel_scale accel_scale_sigma";
 
     #[test]
     fn unmeasured_figures_are_null_and_present() {
@@ -121,7 +142,12 @@ mod tests {
         for key in KEYS.split_whitespace() {
             assert_eq!(json.get(key), Some(&serde_json::Value::Null), "{key}");
         }
-        assert!(json["curve"].is_array() && json["kernels"].is_array() && json["warnings"] == 0);
+        assert!(
+            json["curve"].is_array()
+                && json["extrinsics"].is_array()
+                && json["kernels"].is_array()
+                && json["warnings"] == 0
+        );
     }
 
     #[test]

@@ -1,6 +1,7 @@
 //! The points of the window: a fixed pool, found by track id; triangulation; outliers.
 
-use super::residuals::{predict, Body, Eye, Point};
+use super::residuals::{Body, Eye, Point};
+use super::sight::{placed, predicted};
 use super::window::{Window, FRAMES};
 use crate::frontend::{Track, Tracks};
 use crate::limits::{CAMERAS_MAX, LANDMARKS, OBSERVATIONS};
@@ -31,6 +32,8 @@ pub struct Landmark {
     pub host: u8,
     /// The camera of the host whose ray the point is on.
     pub host_camera: u8,
+    /// Row of that view, px: a rolling shutter takes each at its own time.
+    pub host_row: f32,
     pub point: Point,
     pub observations: List<Observation, OBSERVATIONS>,
 }
@@ -122,15 +125,12 @@ impl Landmarks {
     }
 
     /// Drops views further than `px_max` from their prediction; answers how many.
-    pub fn drop_outliers(&mut self, window: &Window, eyes: &[Eye], px_max: f64) -> usize {
+    pub fn drop_outliers(&mut self, window: &Window, px_max: f64) -> usize {
         let mut dropped = 0;
         self.retain_views(
             |_| true,
             |l, o| {
-                let eye = &eyes[o.camera as usize];
-                let (host, target) = (&window.frame(l.host as usize).body, &window.frame(o.slot as usize).body);
-                let seen = predict(&l.point, &eyes[l.host_camera as usize].body_from_cam, host, eye, target);
-                let ok = seen.is_some_and(|px| (px - o.px()).length() <= px_max);
+                let ok = predicted(l, o, window).is_some_and(|px| (px - o.px()).length() <= px_max);
                 dropped += !ok as usize;
                 ok
             },
@@ -186,8 +186,10 @@ pub fn find_track(list: &[Track], id: u64) -> Option<&Track> {
     list.binary_search_by_key(&id, |t| t.id).ok().map(|i| &list[i])
 }
 
-fn camera_in_world(body: &Body, eye: &Eye) -> Body {
-    Body { r: body.r * eye.body_from_cam.r, p: body.r * eye.body_from_cam.p + body.p }
+fn camera_in_world(o: &Observation, window: &Window) -> Body {
+    let (body, eye) =
+        (&window.frame(o.slot as usize).body, placed(o.camera as usize, o.px[1], o.slot as usize, window));
+    Body { r: body.r * eye.r, p: body.r * eye.p + body.p }
 }
 
 fn views_of(
@@ -207,7 +209,7 @@ fn views_of(
             let Some(seen) = find_track(&tracks[s].cameras[camera], track.id) else { continue };
             let observation = Observation { slot: s as u8, camera: camera as u8, px: seen.px };
             let Some(bearing) = eye.camera.unproject(observation.px()) else { continue };
-            views[n] = Some(View { observation, camera: camera_in_world(&window.frame(s).body, eye), bearing });
+            views[n] = Some(View { observation, camera: camera_in_world(&observation, window), bearing });
             n += 1;
         }
     }
@@ -228,8 +230,7 @@ fn triangulate_one(
     let host_view = Observation { slot: slot as u8, camera: host_camera as u8, px: track.px };
     let host_eye = &eyes[host_camera];
     let bearing = host_eye.camera.unproject(host_view.px())?;
-    let host_body = &window.frame(slot).body;
-    let host = camera_in_world(host_body, host_eye);
+    let host = camera_in_world(&host_view, window);
     let (views, n) = views_of(track, (slot, host_camera), window, tracks, eyes);
     let (mut num, mut den) = (0.0, 0.0);
     for v in views[..n].iter().flatten() {
@@ -253,15 +254,14 @@ fn triangulate_one(
         id: track.id,
         host: slot as u8,
         host_camera: host_camera as u8,
+        host_row: track.px[1],
         point: Point::new(bearing, rho.max(0.0)),
         ..Landmark::default()
     };
     let _ = landmark.observations.push(host_view);
     for v in views[..n].iter().flatten() {
         let o = v.observation;
-        let body = &window.frame(o.slot as usize).body;
-        let eye = &eyes[o.camera as usize];
-        let seen = predict(&landmark.point, &host_eye.body_from_cam, host_body, eye, body);
+        let seen = predicted(&landmark, &o, window);
         if seen.is_some_and(|px| (px - o.px()).length() <= px_max) {
             let _ = landmark.observations.push(o);
         }

@@ -3,11 +3,13 @@
 //!
 //! A landmark's block is `[point | frames | r]`; Householder QR of the three columns of the point
 //! leaves rows that do not contain it (Demmel et al., ICCV 2021). Residuals are taken at the
-//! estimate, Jacobians at the linearisation points.
+//! estimate, Jacobians at the linearisation points, those to the rig's columns too.
 
 use super::landmarks::Landmark;
-use super::residuals::{huber, inertial_jacobians, inertial_residual, predict, reproject, Reprojection};
+use super::residuals::{huber, inertial_jacobians, inertial_residual, scale_jacobian, Vec15};
 use super::rest::{rest_residual, REST_WEIGHTS};
+use super::rig::SCALE_DIM;
+use super::sight::{observe, predicted, CameraColumns};
 use super::solve::Model;
 use super::window::{Layout, Window, FRAMES, MOTION_DIM, POSE_DIM};
 use crate::limits::{OBSERVATIONS, RIG_DIM, WINDOW_DIM};
@@ -100,21 +102,6 @@ impl<S: Real> Default for Linear<S> {
 /// Rows of the stack of a marginalisation: what stays of it when triangular, and the largest factor.
 pub const STACK_ROWS: usize = WINDOW_DIM + 4 * ROWS_MAX;
 
-/// Residual at the estimate, Jacobians at the linearisation points.
-fn observe(landmark: &Landmark, view: usize, window: &Window) -> Option<Reprojection> {
-    let o = &landmark.observations[view];
-    let (h, t) = (window.frame(landmark.host as usize), window.frame(o.slot as usize));
-    let (host, camera) = (landmark.host_camera as usize, o.camera as usize);
-    let (fixed, now) = (window.rig.eyes_jacobian(), window.rig.eyes());
-    let host_eye = &fixed[host].body_from_cam;
-    let mut r = reproject(&landmark.point, host_eye, &h.body_jacobian, &fixed[camera], &t.body_jacobian)?;
-    if h.anchored || t.anchored || window.rig.anchored {
-        r.px = predict(&landmark.point, &now[host].body_from_cam, &h.body, &now[camera], &t.body)?;
-    }
-    r.px -= o.px();
-    Some(r)
-}
-
 /// A landmark's views in frames of the layout; answers their cost.
 fn view_rows<S: Real>(
     landmark: &Landmark,
@@ -124,9 +111,9 @@ fn view_rows<S: Real>(
     out: &mut Linear<S>,
 ) -> f64 {
     let host = landmark.host as usize;
-    let views = landmark.observations.iter().enumerate().filter(|(_, o)| layout.pose(o.slot as usize).is_some());
+    let views = landmark.observations.iter().filter(|o| layout.pose(o.slot as usize).is_some());
     let mut touched = [false; FRAMES];
-    views.clone().for_each(|(_, o)| touched[o.slot as usize] = true);
+    views.clone().for_each(|o| touched[o.slot as usize] = true);
     let others = (0..FRAMES).any(|s| touched[s] && s != host);
     touched[host] = others;
     let frames = (0..FRAMES).filter(|s| touched[*s] && others).filter_map(|s| layout.pose(s));
@@ -135,8 +122,10 @@ fn view_rows<S: Real>(
 
     let mut cost = 0.0;
     let inv_sigma = 1.0 / model.sigma_px;
-    for (k, o) in views {
-        let Some(r) = observe(landmark, k, window) else {
+    let cameras_at = layout.cameras().map(|s| (out.offset(s.at), s.len));
+    let mut columns: CameraColumns = [[0.0; RIG_DIM - SCALE_DIM]; 2];
+    for o in views {
+        let Some(r) = observe(landmark, o, window, &mut columns) else {
             cost += huber(LOST_PX * inv_sigma, model.huber_px * inv_sigma).1;
             continue;
         };
@@ -150,6 +139,9 @@ fn view_rows<S: Real>(
                 row[at..].iter_mut().zip(x).for_each(|(to, x)| *to = S::of(x * weight));
             };
             put(0, &r.d_point[axis]);
+            if let Some((at, len)) = cameras_at {
+                put(at, &columns[axis][..len]);
+            }
             // In its host's own frame a view says nothing about poses.
             if let (Some(host_at), Some(target_at)) = (host_at, target_at) {
                 put(host_at, &r.d_host[axis]);
@@ -201,12 +193,32 @@ pub fn raw_landmark_rows<S: Real>(
     (out.rows.eliminate(POINT_DIM) == POINT_DIM).then_some(full)
 }
 
+/// The whitened inertial residual between two states at the estimate, the unit's scale included.
+pub fn inertial_residual_at(window: &Window, from: usize, slot: usize) -> Vec15 {
+    let (a, b, rig) = (window.frame(from), window.frame(slot), &window.rig);
+    if rig.parts.imu_scale {
+        let scaled = b.increment.rescaled(rig.now.gyro_scale, rig.now.accel_scale);
+        inertial_residual(&scaled, &b.weight, &a.now, &b.now)
+    } else {
+        inertial_residual(&b.increment, &b.weight, &a.now, &b.now)
+    }
+}
+
 /// The inertial factor between two states; answers its cost.
 pub fn inertial_rows<S: Real>(window: &Window, from: usize, slot: usize, layout: &Layout, out: &mut Linear<S>) -> f64 {
     let (a, b) = (window.frame(from), window.frame(slot));
-    let r = inertial_residual(&b.increment, &b.weight, &a.now, &b.now);
-    let (ja, jb) = inertial_jacobians(&b.increment, &b.weight, a.motion_jacobian(), b.motion_jacobian());
-    out.begin(0, layout.state(from).into_iter().chain(layout.state(slot)).flatten());
+    let rig = &window.rig;
+    let r = inertial_residual_at(window, from, slot);
+    let (before, after) = (a.motion_jacobian(), b.motion_jacobian());
+    let (gyro, accel) = (rig.linearised().gyro_scale, rig.linearised().accel_scale);
+    let (ja, jb) = if rig.parts.imu_scale {
+        inertial_jacobians(&b.increment.rescaled(gyro, accel), &b.weight, before, after)
+    } else {
+        inertial_jacobians(&b.increment, &b.weight, before, after)
+    };
+    let scale = layout.imu();
+    out.begin(0, layout.state(from).into_iter().chain(layout.state(slot)).flatten().chain(scale));
+    let scale = scale.map(|s| (out.offset(s.at), scale_jacobian(&b.increment, &b.weight, before, after, gyro, accel)));
     let at = [from, slot].map(|s| layout.state(s).map(|part| part.map(|p| out.offset(p.at))));
     for i in 0..r.len() {
         let row = out.rows.push();
@@ -215,6 +227,9 @@ pub fn inertial_rows<S: Real>(window: &Window, from: usize, slot: usize, layout:
                 let Some(part) = part else { continue };
                 columns.enumerate().for_each(|(k, c)| row[part + k] = S::of(j[(i, c)]));
             }
+        }
+        if let Some((at, j)) = &scale {
+            (0..SCALE_DIM).for_each(|k| row[at + k] = S::of(j[(i, k)]));
         }
         row[row.len() - 1] = S::of(r[i]);
     }
@@ -236,14 +251,11 @@ pub fn rest_rows<S: Real>(window: &Window, slot: usize, layout: &Layout, out: &m
 /// What the views of all landmarks cost at the estimate.
 pub fn cost_of_views(landmarks: &[Landmark], window: &Window, model: &Model) -> f64 {
     let inv_sigma = 1.0 / model.sigma_px;
-    let eyes = window.rig.eyes();
     let lost = huber(LOST_PX * inv_sigma, model.huber_px * inv_sigma).1;
     let mut cost = 0.0;
     for l in landmarks {
-        let (host, host_eye) = (&window.frame(l.host as usize).body, &eyes[l.host_camera as usize].body_from_cam);
         for o in l.observations.iter() {
-            let target = &window.frame(o.slot as usize).body;
-            cost += match predict(&l.point, host_eye, host, &eyes[o.camera as usize], target) {
+            cost += match predicted(l, o, window) {
                 Some(px) => huber((px - o.px()).length() * inv_sigma, model.huber_px * inv_sigma).1,
                 None => lost,
             };

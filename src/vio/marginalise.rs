@@ -11,7 +11,7 @@
 use super::landmarks::{Landmark, Landmarks};
 use super::linear::{inertial_rows, landmark_rows, rest_rows, Linear, POINT_DIM, STACK_ROWS};
 use super::residuals::Motion;
-use super::rig::RigState;
+use super::rig::{RigSigma, RigState};
 use super::solve::Model;
 use super::window::{Layout, Window, FRAMES, MOTION_DIM, POSE_DIM};
 use crate::limits::{RIG_DIM, WINDOW_DIM};
@@ -69,12 +69,19 @@ impl<S: Real> Prior<S> {
         self.rows.clear(1);
     }
 
-    /// Starts with one state and its standard deviations; tilt and yaw are about world axes.
-    pub fn start(&mut self, slot: usize, motion: &Motion, sigma: &Sigma) {
+    /// Starts with one state and the rig, which are to be anchored, and their standard deviations; tilt and yaw
+    /// are about world axes.
+    pub fn start(&mut self, slot: usize, motion: &Motion, sigma: &Sigma, rig: (&RigState, &RigSigma)) {
         self.blocks.clear();
         let _ = self.blocks.push(Block::Pose(slot as u8));
         let _ = self.blocks.push(Block::Motion(slot as u8));
-        self.rows.clear(15 + 1);
+        let (cameras, imu) = (rig.0.camera_dim(), rig.0.parts.imu_dim());
+        for (width, is_imu) in [(cameras, false), (imu, true)] {
+            if width > 0 {
+                let _ = self.blocks.push(Block::Rig(is_imu));
+            }
+        }
+        self.rows.clear(15 + cameras + imu + 1);
         let r = motion.pose.rotation();
         let mut diagonal = |i: usize, s: f64| self.rows.push()[i] = S::of(1.0 / s);
         for i in 0..3 {
@@ -82,6 +89,9 @@ impl<S: Real> Prior<S> {
             diagonal(6 + i, sigma.v);
             diagonal(9 + i, sigma.bg);
             diagonal(12 + i, sigma.ba);
+        }
+        for (i, s) in rig.0.sigmas(rig.1)[..cameras + imu].iter().enumerate() {
+            diagonal(15 + i, *s);
         }
         for (axis, s) in [sigma.tilt, sigma.tilt, sigma.yaw].into_iter().enumerate() {
             let row = self.rows.push();

@@ -20,6 +20,7 @@ pub mod rest;
 pub mod rig;
 pub mod samples;
 pub mod shutter;
+pub mod sight;
 pub mod solve;
 mod stats;
 mod trust;
@@ -27,19 +28,20 @@ pub mod window;
 
 use crate::config::VioConfig;
 use crate::frontend::Tracks;
-use crate::limits::{CAMERAS_MAX, STATES};
+use crate::limits::{CAMERAS_MAX, RIG_DIM, STATES};
 use crate::math::real::Real;
 use crate::mem::Footprint;
 use glam::DVec3;
 use health::{quality, sigma_v, Evidence, Health, Reset, Watch, SIGMA_V_UNOBSERVED};
 use init::{Aligner, RESECTION_MIN};
 use landmarks::{Landmark, Landmarks};
+use linear::inertial_residual_at;
 use marginalise::{Marginaliser, Prior};
 use predict::Predictor;
 use preintegration::{Increment, Noise};
-use residuals::{inertial_residual, Eye, InertialWeight, Motion};
+use residuals::{Eye, InertialWeight, Motion};
 use rest::at_rest;
-use rig::{Parts, RigState};
+use rig::{Parts, RigEstimate, RigSigma, RigState};
 use samples::ImuRing;
 use solve::{Model, Outcome, Solver};
 pub use stats::Stats;
@@ -55,6 +57,8 @@ const ACCEL_BIAS_MAX: f64 = 5.0;
 const GYRO_BIAS_MAX: f64 = 1.0;
 /// Inertia alone is not believed for longer than this, s; the ring of samples may not hold more either.
 const FRAME_GAP_MAX: f64 = 2.0;
+/// Of the rig's deviations, by which an outlier's distance is widened.
+const RIG_SIGMAS: f64 = 3.0;
 /// A camera with fewer than one in so many of another's tracks is blind.
 const BLIND_FRACTION: usize = 10;
 
@@ -105,6 +109,9 @@ pub struct Estimator<S: Real = Scalar> {
     solver: Solver<S>,
     marginaliser: Marginaliser<S>,
     aligner: Aligner,
+    /// What is known of the rig at a start, and now, in the order of its columns.
+    rig_sigma: RigSigma,
+    rig_deviations: [f64; RIG_DIM],
     running: bool,
     /// As `predictor` before the newest frame, and the stamp of that frame.
     before: Predictor,
@@ -126,7 +133,9 @@ impl<S: Real> Estimator<S> {
     pub fn new(calibration: &Calibration, config: &VioConfig) -> Estimator<S> {
         let eyes: Vec<Eye> = calibration.cameras.iter().take(CAMERAS_MAX).map(Eye::from).collect();
         let poses: Vec<Pose> = calibration.cameras.iter().take(CAMERAS_MAX).map(|c| c.body_from_cam).collect();
-        let rig = RigState::new(&eyes, &poses, Parts::default());
+        let rig = RigState::new(&eyes, &poses, Parts::new(config));
+        let rig_sigma = RigSigma::new(config);
+        let rig_deviations = rig.sigmas(&rig_sigma);
         let noise = Noise::new(&calibration.imu, config);
         Estimator {
             model: Model::new(eyes, config),
@@ -140,6 +149,8 @@ impl<S: Real> Estimator<S> {
             solver: Solver::new(),
             marginaliser: Marginaliser::new(),
             aligner: Aligner::new(),
+            rig_sigma,
+            rig_deviations,
             running: false,
             before: Predictor { noise, state: None },
             last: None,
@@ -259,9 +270,13 @@ impl<S: Real> Estimator<S> {
         };
         self.origin = Origin::split(&mut start);
         let (motion, sigma) = (start.motion, start.sigma);
-        let Some(slot) = self.window.push(Frame::first(tracks.t, motion)) else { return Update::default() };
-        self.window.frame_mut(slot).fix_anchor();
-        self.prior.start(slot, &motion, &sigma);
+        let mut frame = Frame::first(tracks.t, motion);
+        frame.rate = self.imu.rate_at(tracks.t);
+        frame.hold_twist();
+        frame.fix_anchor();
+        let Some(slot) = self.window.push(frame) else { return Update::default() };
+        self.window.rig.fix_anchor();
+        self.prior.start(slot, &motion, &sigma, (&self.window.rig, &self.rig_sigma));
         self.covariance = Some(self.origin.add_to(sigma.covariance(&motion), &motion));
         self.tracks[slot].clone_from(tracks);
         self.running = true;
@@ -274,10 +289,12 @@ impl<S: Real> Estimator<S> {
         let Some(before) = self.window.newest() else { return Err(Reset::State) };
         let from = self.window.frame(before).now;
         let inc = self.imu.integrate(self.window.frame(before).t, tracks.t, from.bg, from.ba, &self.noise);
-        let mut frame = Frame::first(tracks.t, from.propagate(&inc));
+        let mut frame = Frame::first(tracks.t, from.propagate(&self.scaled(&inc)));
         frame.weight = self.inertial_weight(&inc);
         frame.increment = inc;
+        frame.rate = self.imu.rate_at(tracks.t);
         let slot = self.window.push(frame).expect("marginalisation left room for one frame");
+        self.window.hold_twists();
         self.tracks[slot].clone_from(tracks);
 
         if self.config.zero_velocity {
@@ -300,11 +317,14 @@ impl<S: Real> Estimator<S> {
         let now = &self.window.frame(slot).now;
         self.covariance = self.solver.newest_covariance().map(|c| self.origin.add_to(c, now));
         let views = self.landmarks.views_in(slot);
-        let dropped = self.landmarks.drop_outliers(&self.window, self.window.rig.eyes(), self.config.outlier_px);
+        if keyframe && self.window.rig.parts.any() {
+            let n = self.window.rig.camera_dim() + self.window.rig.parts.imu_dim();
+            self.solver.rig_deviations(&mut self.rig_deviations[..n]);
+        }
+        let dropped = self.landmarks.drop_outliers(&self.window, self.outlier_px(slot));
         self.stats.outliers += dropped as u64;
         let f = self.window.frame(slot);
-        let misfit =
-            inertial_residual(&f.increment, &f.weight, &self.window.frame(before).now, &f.now).norm_squared() / 15.0;
+        let misfit = inertial_residual_at(&self.window, before, slot).norm_squared() / 15.0;
         let inliers = self.landmarks.views_in(slot);
         let seen_before = |l: &&Landmark| l.host as usize != slot;
         let in_frame = |l: &Landmark| l.observations.iter().filter(|o| o.slot as usize == slot).count();
@@ -320,6 +340,28 @@ impl<S: Real> Estimator<S> {
     fn shrink(&mut self) {
         let (window, landmarks, linear) = (&mut self.window, &mut self.landmarks, &mut self.solver.linear);
         self.marginaliser.shrink(window, landmarks, &mut self.prior, linear, &self.model);
+    }
+
+    fn scaled(&self, inc: &Increment) -> Increment {
+        let rig = &self.window.rig.now;
+        inc.rescaled(rig.gyro_scale, rig.accel_scale)
+    }
+
+    /// Views further than this from their prediction are wrong: wider while the rig is not known well.
+    fn outlier_px(&self, slot: usize) -> f64 {
+        let rig = &self.window.rig;
+        let known = &self.rig_deviations;
+        let focal = self.model.eyes.iter().fold(0.0f64, |f, e| f.max(e.camera.fx));
+        let time = if rig.parts.time_offset { known[0] * self.window.frame(slot).twist.w.length() } else { 0.0 };
+        let thetas = (0..self.model.eyes.len()).filter_map(|c| rig.eye_column(c)).flat_map(|at| at + 3..at + 6);
+        let turn = thetas.fold(0.0f64, |m, i| m.max(known[i]));
+        self.config.outlier_px + RIG_SIGMAS * focal * (time + turn)
+    }
+
+    /// What is estimated of the rig; `None` when nothing is.
+    pub fn rig(&self) -> Option<RigEstimate> {
+        let rig = &self.window.rig;
+        rig.parts.any().then(|| RigEstimate::new(rig, &self.rig_deviations))
     }
 
     fn inertial_weight(&self, inc: &Increment) -> InertialWeight {
@@ -339,7 +381,7 @@ impl<S: Real> Estimator<S> {
             &self.tracks,
             self.window.rig.eyes(),
             self.config.triangulation_baseline_min_m,
-            self.config.outlier_px,
+            self.outlier_px(slot),
         );
         self.stats.landmarks_full += full as u64;
         self.stats.keyframes += 1;
@@ -403,7 +445,7 @@ impl<S: Real> Estimator<S> {
     pub fn predict(&self, t: Nanos) -> Option<Odometry> {
         let f = self.running.then(|| self.window.newest().map(|n| self.window.frame(n)))??;
         let inc = self.imu.integrate(f.t, t.max(f.t), f.now.bg, f.now.ba, &self.noise);
-        Some(odometry(f.t.max(t), &f.now.propagate(&inc)))
+        Some(odometry(f.t.max(t), &f.now.propagate(&self.scaled(&inc))))
     }
 
     /// What a tracker on another thread predicts with, two frames on.

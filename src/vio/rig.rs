@@ -5,6 +5,7 @@
 //! Like a frame, the block is anchored once the prior touches it.
 
 use super::residuals::{Body, Eye};
+use crate::config::VioConfig;
 use crate::limits::{CAMERAS_MAX, RIG_DIM};
 use crate::math::so3;
 use glam::DVec3;
@@ -24,7 +25,39 @@ pub struct Parts {
     pub imu_scale: bool,
 }
 
+/// What is known of the rig before flying: standard deviations, s, m, rad, and of scales.
+#[derive(Clone, Copy, Debug)]
+pub struct RigSigma {
+    pub time_offset: f64,
+    pub eye_p: f64,
+    pub eye_theta: f64,
+    pub imu_scale: f64,
+}
+
+impl RigSigma {
+    pub fn new(config: &VioConfig) -> RigSigma {
+        RigSigma {
+            time_offset: config.time_offset_sigma_s,
+            eye_p: config.extrinsics_sigma_m,
+            eye_theta: config.extrinsics_sigma_rad,
+            imu_scale: config.imu_scale_sigma,
+        }
+    }
+}
+
 impl Parts {
+    pub fn new(config: &VioConfig) -> Parts {
+        Parts {
+            time_offset: config.estimate_time_offset,
+            extrinsics: config.estimate_extrinsics,
+            imu_scale: config.estimate_imu_scale,
+        }
+    }
+
+    pub fn any(self) -> bool {
+        self.time_offset || self.extrinsics || self.imu_scale
+    }
+
     /// Columns that cameras touch: time offset, then extrinsics of `cameras`.
     pub fn camera_dim(self, cameras: usize) -> usize {
         self.time_offset as usize * TIME_DIM + self.extrinsics as usize * EYE_DIM * cameras
@@ -37,12 +70,41 @@ impl Parts {
 
 #[derive(Clone, Copy, Debug)]
 pub struct Rig {
-    /// Added to the stamps of images, s.
+    /// Added to the stamps of images, beyond what the calibration adds, s.
     pub time_offset: f64,
     pub body_from_cam: [Pose; CAMERAS_MAX],
     /// Factors on what the unit reads, less one.
     pub gyro_scale: DVec3,
     pub accel_scale: DVec3,
+}
+
+/// Estimate and standard deviation of what the board asks for; `None` for the rest.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct RigEstimate {
+    /// Beyond the calibration's, s.
+    pub time_offset: Option<[f64; 2]>,
+    /// Of each camera: [p, θ] over the calibration, m and rad, θ on the right; and deviations.
+    pub extrinsics: [Option<[[f64; EYE_DIM]; 2]>; CAMERAS_MAX],
+    /// Factors less one of the gyro's axes and the accelerometer's; and deviations.
+    pub imu_scale: Option<[[f64; SCALE_DIM]; 2]>,
+}
+
+impl RigEstimate {
+    pub fn new(rig: &RigState, deviations: &[f64; RIG_DIM]) -> RigEstimate {
+        let eye = |c: usize| {
+            let at = rig.eye_column(c).filter(|_| c < rig.eyes.len())?;
+            let (from, to) = (&rig.calibrated[c], &rig.now.body_from_cam[c]);
+            let (p, th) = (to.p - from.p, so3::log(from.q.conjugate() * to.q));
+            Some([[p.x, p.y, p.z, th.x, th.y, th.z], std::array::from_fn(|i| deviations[at + i])])
+        };
+        let (g, a) = (rig.now.gyro_scale, rig.now.accel_scale);
+        let scales = [g.x, g.y, g.z, a.x, a.y, a.z];
+        RigEstimate {
+            time_offset: rig.parts.time_offset.then(|| [rig.now.time_offset, deviations[0]]),
+            extrinsics: std::array::from_fn(eye),
+            imu_scale: rig.parts.imu_scale.then(|| [scales, std::array::from_fn(|i| deviations[rig.camera_dim() + i])]),
+        }
+    }
 }
 
 #[derive(Clone, Debug)]
@@ -57,6 +119,8 @@ pub struct RigState {
     eyes: Vec<Eye>,
     eyes_jacobian: Vec<Eye>,
     saved: (Rig, [f64; RIG_DIM]),
+    rolls: bool,
+    calibrated: [Pose; CAMERAS_MAX],
 }
 
 impl RigState {
@@ -73,7 +137,37 @@ impl RigState {
             eyes: eyes.to_vec(),
             eyes_jacobian: eyes.to_vec(),
             saved: (rig, [0.0; RIG_DIM]),
+            calibrated: body_from_cam,
+            rolls: eyes.iter().any(|e| e.readout > 0.0),
         }
+    }
+
+    /// Whether every view is taken at its stamp by a camera that sits where it was calibrated.
+    #[inline]
+    pub fn is_plain(&self) -> bool {
+        !(self.rolls || self.parts.time_offset || self.parts.extrinsics)
+    }
+
+    /// The rig at which Jacobians are taken.
+    pub fn linearised(&self) -> &Rig {
+        if self.anchored {
+            &self.anchor
+        } else {
+            &self.now
+        }
+    }
+
+    /// Standard deviations of the estimated parts at the start, in the order of the columns.
+    pub fn sigmas(&self, s: &RigSigma) -> [f64; RIG_DIM] {
+        let (cameras, n) = (self.camera_dim(), self.camera_dim() + self.parts.imu_dim());
+        let of = |i: usize| match i {
+            i if i >= n => f64::INFINITY,
+            i if i >= cameras => s.imu_scale,
+            0 if self.parts.time_offset => s.time_offset,
+            i if (i - self.parts.time_offset as usize * TIME_DIM) % EYE_DIM < 3 => s.eye_p,
+            _ => s.eye_theta,
+        };
+        std::array::from_fn(of)
     }
 
     pub fn camera_dim(&self) -> usize {

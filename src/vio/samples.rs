@@ -87,6 +87,11 @@ impl ImuRing {
         Some((a.gyro_body.lerp(b.gyro_body, s), a.accel_body.lerp(b.accel_body, s)))
     }
 
+    /// What the gyro read at `t`, rad/s; zero without any sample.
+    pub fn rate_at(&self, t: Nanos) -> DVec3 {
+        self.sample_at(t).map_or(DVec3::ZERO, |s| s.0)
+    }
+
     /// The increment over `[t0, t1]`. Without any sample: gravity-free rest with the noise of a gap.
     pub fn integrate(&self, t0: Nanos, t1: Nanos, bg: DVec3, ba: DVec3, noise: &Noise) -> Increment {
         let mut inc = Increment::new(bg, ba);

@@ -5,9 +5,11 @@
 //! solved with its diagonal scaled to one.
 
 use super::landmarks::Landmarks;
-use super::linear::{cost_of_views, inertial_rows, landmark_rows, rest_rows, Linear, POINT_DIM, SPANS};
+use super::linear::{
+    cost_of_views, inertial_residual_at, inertial_rows, landmark_rows, rest_rows, Linear, POINT_DIM, SPANS,
+};
 use super::marginalise::Prior;
-use super::residuals::{inertial_residual, Eye, Mat15, Point};
+use super::residuals::{Eye, Mat15, Point};
 use super::rest::rest_cost;
 use super::window::{Layout, Window, FRAMES, POSE_DIM};
 use crate::config::VioConfig;
@@ -150,8 +152,7 @@ fn cost_of<S: Real>(window: &Window, landmarks: &Landmarks, prior: &Prior<S>, mo
     let mut before = None;
     for slot in window.states() {
         if let Some(from) = before {
-            let (a, b) = (window.frame(from), window.frame(slot));
-            cost += 0.5 * inertial_residual(&b.increment, &b.weight, &a.now, &b.now).norm_squared();
+            cost += 0.5 * inertial_residual_at(window, from, slot).norm_squared();
         }
         cost += rest_cost(window.frame(slot));
         before = Some(slot);
@@ -262,6 +263,13 @@ impl<S: Real> Solver<S> {
         let information = Mat15::from_fn(|i, j| self.factor.at(first + i, first + j).f64());
         let covariance = information.cholesky()?.inverse();
         covariance.iter().all(|x| x.is_finite()).then(|| covariance.into())
+    }
+
+    /// Standard deviations of the rig's columns, which are the first of `Layout::of`, from the last
+    /// linearisation.
+    pub fn rig_deviations(&mut self, out: &mut [f64]) {
+        let n = out.len().min(self.system.dim);
+        self.system.deviations(&mut self.factor, &mut out[..n]);
     }
 
     pub fn optimise(

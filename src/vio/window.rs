@@ -8,6 +8,7 @@
 use super::preintegration::{Increment, Mat9};
 use super::residuals::{Body, InertialWeight, Motion};
 use super::rig::RigState;
+use super::shutter::Twist;
 use crate::limits::{KEYFRAMES, STATES};
 use crate::math::dense::Span;
 use crate::mem::List;
@@ -33,6 +34,9 @@ pub struct Frame {
     /// From the frame before, when that one is moving.
     pub increment: Increment,
     pub weight: InertialWeight,
+    /// What the gyro reads at the stamp, and the twist held from it through an optimisation.
+    pub rate: DVec3,
+    pub twist: Twist,
     /// Mean rate of a frame found at rest, rad/s.
     pub rest: Option<DVec3>,
     /// Landmarks it hosted when it became a keyframe.
@@ -54,6 +58,8 @@ impl Frame {
             delta: [0.0; 15],
             increment: Increment::new(now.bg, now.ba),
             weight: InertialWeight { increment: Mat9::zeros(), bg: 0.0, ba: 0.0 },
+            rate: DVec3::ZERO,
+            twist: Twist::default(),
             rest: None,
             hosted: 0,
             body: Body::default(),
@@ -66,6 +72,14 @@ impl Frame {
     pub fn refresh(&mut self) {
         self.body = Body::from(&self.now.pose);
         self.body_jacobian = if self.anchored { Body::from(&self.anchor.pose) } else { self.body };
+    }
+
+    /// Takes the twist of the estimate; an anchored frame has its own for good.
+    pub fn hold_twist(&mut self) {
+        if !self.anchored {
+            let to_body = self.now.pose.q.conjugate();
+            self.twist = Twist { v: to_body * self.now.v, w: self.rate - self.now.bg };
+        }
     }
 
     /// Motion at which Jacobians are taken.
@@ -157,6 +171,13 @@ impl Window {
 
     pub fn frame_mut(&mut self, slot: usize) -> &mut Frame {
         &mut self.frames[slot]
+    }
+
+    /// Before views are predicted: see `shutter`. Frames of a plain rig need none.
+    pub fn hold_twists(&mut self) {
+        if !self.rig.is_plain() {
+            self.frames.iter_mut().for_each(Frame::hold_twist);
+        }
     }
 
     pub fn save(&mut self) {

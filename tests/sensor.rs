@@ -1,0 +1,183 @@
+//! Sensors that are not what their calibration says, on rendered flights: what the estimator finds of
+//! clocks, extrinsics and scales, what rolling rows cost when they are modelled and when not, and rigs of
+//! one to four cameras. Errors are against truth after the best rigid alignment.
+#![allow(clippy::unwrap_used)]
+
+use glam::{DMat3, DQuat, DVec3};
+use std::sync::OnceLock;
+use stipple::config::{FrontendConfig, VioConfig};
+use stipple::frontend::{Frontend, Prediction};
+use stipple::output::metrics::trajectory_error;
+use stipple::vio::rig::RigEstimate;
+use stipple::vio::Vio;
+use stipple_drivers::sim::{rig_named, Scenario, Sim};
+use stipple_drivers::{Calibration, Frames, ImuSample, Pose, Span, TimedPose};
+
+struct Flight {
+    calibration: Calibration,
+    frames: Vec<Frames>,
+    imu: Vec<ImuSample>,
+    truth: Vec<TimedPose>,
+}
+
+struct Found {
+    ate: f64,
+    poses: usize,
+    rig: Option<RigEstimate>,
+}
+
+/// Half resolution keeps rendering to seconds.
+fn scenario(name: &str) -> Scenario {
+    let mut s = Scenario::named(name).unwrap();
+    (s.image_divisor, s.duration) = (2, Span::from_secs(9.0));
+    s
+}
+
+fn render(scenario: &Scenario) -> Flight {
+    let mut sim = Sim::new(scenario).unwrap();
+    let count = sim.frame_count();
+    let frame = |i: usize| {
+        let mut frames = Frames::for_rig(sim.calibration());
+        sim.render(i, &mut frames);
+        frames
+    };
+    let frames = (0..count).map(frame).collect();
+    Flight { calibration: sim.calibration().clone(), frames, imu: sim.imu().to_vec(), truth: sim.truth() }
+}
+
+fn fly(what: &str, flight: &Flight, vio: &VioConfig, frontend: &FrontendConfig) -> Found {
+    let mut tracker = Frontend::new(&flight.calibration, frontend).unwrap();
+    let mut vio = Vio::new(&flight.calibration, vio);
+    let mut estimated = Vec::new();
+    let mut samples = flight.imu.iter();
+    for frames in &flight.frames {
+        for s in samples.by_ref() {
+            vio.on_imu(*s);
+            if s.t >= frames.t {
+                break;
+            }
+        }
+        let prediction = Prediction { prev_from_now: vio.predict_motion(frames.t) };
+        let tracks = tracker.track(frames, &prediction);
+        if let Some(o) = vio.on_tracks(tracks).odometry {
+            estimated.push(TimedPose { t: o.t, pose: o.world_from_body });
+        }
+    }
+    let ate = trajectory_error(&estimated, &flight.truth).unwrap().ate_rmse_m;
+    let stats = vio.stats();
+    eprintln!("{what}: ATE {ate:.4} m over {} frames, {} resets", estimated.len(), stats.resets);
+    if let Some(rig) = vio.rig() {
+        eprintln!("  {rig:?}");
+    }
+    Found { ate, poses: estimated.len(), rig: vio.rig() }
+}
+
+fn usual() -> (VioConfig, FrontendConfig) {
+    (VioConfig::default(), FrontendConfig::default())
+}
+
+/// Sensors as calibrated, and what the estimator makes of them.
+fn clean() -> &'static (Flight, Found) {
+    static CLEAN: OnceLock<(Flight, Found)> = OnceLock::new();
+    CLEAN.get_or_init(|| {
+        let flight = render(&scenario("aggressive"));
+        let (vio, frontend) = usual();
+        let found = fly("as calibrated", &flight, &vio, &frontend);
+        (flight, found)
+    })
+}
+
+#[test]
+fn a_time_offset_of_eight_milliseconds_is_found() {
+    let (exact, clean) = clean();
+    let mut late = scenario("aggressive");
+    late.camera_errors.time_offset = Span::from_secs(0.008);
+    let late = render(&late);
+    let (vio, frontend) = usual();
+    let estimating = VioConfig { estimate_time_offset: true, ..vio.clone() };
+    let sure = fly("as calibrated, offset estimated", exact, &estimating, &frontend);
+    let off = fly("8 ms late", &late, &vio, &frontend);
+    let found = fly("8 ms late, offset estimated", &late, &estimating, &frontend);
+    let offset = |f: &Found| f.rig.unwrap().time_offset.unwrap();
+    for (truth, [offset, sigma]) in [(0.0, offset(&sure)), (0.008, offset(&found))] {
+        assert!((offset - truth).abs() < 0.0005 && sigma < 0.0005, "{offset} ± {sigma} s for {truth} s");
+    }
+    assert!(off.ate > 3.0 * clean.ate && found.ate < 1.3 * clean.ate && sure.ate < 1.3 * clean.ate);
+}
+
+/// One degree and five millimetres, another way in each camera. The epipolar gate of the tracker, which
+/// trusts the calibration, has to be opened by as much.
+#[test]
+fn extrinsics_wrong_by_a_degree_are_recovered_to_a_tenth() {
+    let mut s = scenario("aggressive");
+    let error = |w: DVec3, p: DVec3| {
+        Pose::new(DQuat::from_scaled_axis(w.normalize() * 1f64.to_radians()), p.normalize() * 0.005)
+    };
+    s.camera_errors.extrinsics = vec![
+        error(DVec3::new(1.0, 1.0, -1.0), DVec3::new(1.0, -1.0, 0.5)),
+        error(DVec3::new(-1.0, 1.0, 1.0), DVec3::new(-0.5, 1.0, 1.0)),
+    ];
+    let wrong = render(&s);
+    let (vio, frontend) = usual();
+    let frontend = FrontendConfig { epipolar_max: 0.05, ..frontend };
+    let estimating = VioConfig { estimate_extrinsics: true, ..vio.clone() };
+    let off = fly("extrinsics off", &wrong, &vio, &frontend);
+    let found = fly("extrinsics off, estimated", &wrong, &estimating, &frontend);
+    for (c, error) in s.camera_errors.extrinsics.iter().enumerate() {
+        let [e, _] = found.rig.unwrap().extrinsics[c].unwrap();
+        let handed = wrong.calibration.cameras[c].body_from_cam;
+        let q = handed.q * DQuat::from_scaled_axis(DVec3::new(e[3], e[4], e[5]));
+        let now = Pose::new(q, handed.p + DVec3::new(e[0], e[1], e[2]));
+        let truth = handed * error.inverse();
+        let (turn, shift) = (now.q.angle_between(truth.q).to_degrees(), now.p.distance(truth.p));
+        eprintln!("  camera {c}: {turn:.3} of 1 degree and {:.2} of 5 mm left", shift * 1e3);
+        assert!(turn < 0.1 && shift < 0.0035, "camera {c}: {turn} degrees, {shift} m");
+    }
+    assert!(found.ate < 0.1 * off.ate && found.ate < 0.03, "{} m, {} m as handed out", found.ate, off.ate);
+}
+
+#[test]
+fn a_scale_of_two_percent_is_found() {
+    let (exact, clean) = clean();
+    let mut s = scenario("aggressive");
+    let axes = &mut s.imu_errors.axes;
+    (axes.gyro_scale, axes.accel_scale) = (DMat3::IDENTITY * 1.02, DMat3::IDENTITY * 1.02);
+    let wrong = render(&s);
+    let (vio, frontend) = usual();
+    let estimating = VioConfig { estimate_imu_scale: true, ..vio.clone() };
+    let sure = fly("as calibrated, scale estimated", exact, &estimating, &frontend);
+    let off = fly("scale off", &wrong, &vio, &frontend);
+    let found = fly("scale off, estimated", &wrong, &estimating, &frontend);
+    for (truth, run) in [(0.0, &sure), (0.02, &found)] {
+        let [scale, _] = run.rig.unwrap().imu_scale.unwrap();
+        for (axis, x) in scale.iter().enumerate() {
+            let most = if axis < 3 { 0.002 } else { 0.006 };
+            assert!((x - truth).abs() < most, "axis {axis}: {x} for {truth}");
+        }
+    }
+    assert!(off.ate > 3.0 * clean.ate && found.ate < 1.5 * clean.ate && sure.ate < 1.5 * clean.ate);
+}
+
+#[test]
+fn a_rolling_shutter_costs_little_once_modelled() {
+    let (_, clean) = clean();
+    let mut s = scenario("aggressive");
+    s.calibration.cameras.iter_mut().for_each(|c| c.readout = Span::from_secs(0.02));
+    let mut rolling = render(&s);
+    let (vio, frontend) = usual();
+    let modelled = fly("20 ms readout", &rolling, &vio, &frontend);
+    rolling.calibration.cameras.iter_mut().for_each(|c| c.readout = Span(0));
+    let not = fly("20 ms readout, not modelled", &rolling, &vio, &frontend);
+    assert!(modelled.ate < 1.5 * clean.ate && not.ate > 3.0 * modelled.ate);
+}
+
+#[test]
+fn rigs_of_one_to_four_cameras_are_followed() {
+    let (vio, frontend) = usual();
+    for name in ["mono", "opposed", "four"] {
+        let mut s = scenario("demo");
+        s.calibration = rig_named(name).unwrap();
+        let found = fly(name, &render(&s), &vio, &frontend);
+        assert!(found.poses > 150 && found.ate < 0.03, "{name}");
+    }
+}
