@@ -2,8 +2,8 @@
 //!
 //! `odometry` flies every input with the defaults and with one parameter at a time moved away
 //! from them, frontend and estimator on the calling thread, in lockstep, without a mapper. It
-//! leaves `odometry.csv` (a row an input and setting), `odometry.json` and `odometry.html` (error
-//! against run time). Each input is rendered or read into memory once and dropped before the next.
+//! leaves `odometry.csv` (a row an input and setting), `odometry.json`, `odometry.html` and
+//! `odometry.svg` (error against run time). Each input is rendered or read into memory once and dropped before the next.
 
 pub mod flight;
 mod inputs;
@@ -85,6 +85,7 @@ pub fn odometry(options: &Options, out: &Path) -> Result<(), Fault> {
     out.write("odometry.csv", |w| tables::csv(w, &sweep))?;
     out.write("odometry.json", |w| tables::json(w, &sweep))?;
     out.write("odometry.html", |w| page::write(w, &sweep))?;
+    out.write("odometry.svg", |w| page::picture(w, &sweep))?;
     println!("{}\n{}", tables::conclusion(&sweep), out.file("odometry.html").display());
     Ok(())
 }

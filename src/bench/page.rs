@@ -17,6 +17,8 @@ const MORE_STYLE: &str = ".line.ink3 { stroke-width: 5.2; stroke-dasharray: 0 99
 /// Errors of more than this many times the default's are drawn at that height.
 const CUT: f64 = 3.0;
 const CM: f64 = 100.0;
+/// What stands for the mean over inputs.
+const ALL: &str = "all inputs";
 
 type Points = [Option<(f64, f64)>];
 
@@ -44,12 +46,22 @@ pub fn write(out: &mut impl Write, sweep: &Sweep) -> io::Result<()> {
     write!(out, "<p class=\"note\">ATE after rigid alignment. Over all inputs: geometric mean of the errors, mean of the CPU time. Stages are wall time, so their 99th percentile holds what else the machine did. Errors above {CUT} times the default's are drawn at that height. Run times repeat to a few per cent, and the error of one flight moves by tens of per cent between settings that differ in nothing that matters: read the curves over all inputs first.</p></section>")?;
     out.write_all(defaults(sweep).as_bytes())?;
     let points = sweep.points();
+    section(out, "All settings, all inputs", &[front(ALL, &points, sweep)])?;
     let charts: Vec<_> = curves(&sweep.settings).iter().map(|c| parameter(c, &points)).collect();
     section(out, "One parameter at a time, all inputs", &charts)?;
     let charts: Vec<_> = (0..inputs).map(|i| front(&sweep.inputs[i].name, &sweep.points_of(i), sweep)).collect();
     section(out, "All settings on each input", &charts)?;
     out.write_all(settings_table(sweep).as_bytes())?;
     foot(out)
+}
+
+/// Error against run time of all settings over all inputs, as a drawing that stands alone.
+pub fn picture(out: &mut impl Write, sweep: &Sweep) -> io::Result<()> {
+    let chart = front(ALL, &sweep.points(), sweep).unwrap_or_default();
+    let namespace = "<svg xmlns=\"http://www.w3.org/2000/svg\" ";
+    let (open, rest) = chart.split_at(chart.find('>').map_or(0, |i| i + 1));
+    write!(out, "{}<style>{STYLE}{MORE_STYLE}</style>", open.replacen("<svg ", namespace, 1))?;
+    writeln!(out, "<rect width=\"100%\" height=\"100%\" fill=\"var(--page)\"/>{rest}")
 }
 
 pub fn section(out: &mut impl Write, title: &str, charts: &[Option<String>]) -> io::Result<()> {
