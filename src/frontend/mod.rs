@@ -10,7 +10,8 @@
 //! in its own camera; a point lives while any camera sees it, and what one camera lost is looked
 //! for again from another in every frame. The patch of the last frame finds the point, the patch
 //! first seen (the anchor) places it: without an anchor each frame adds its own rounding to the
-//! drift. Same frames and predictions, same bits out.
+//! drift. A prediction is refined over the fine levels alone, which is faster and slips less; where it fails
+//! the whole pyramid is searched. Same frames and predictions, same bits out.
 
 pub mod detect;
 pub mod patch;
@@ -65,6 +66,10 @@ pub struct Stats {
     pub full: u64,
 }
 
+/// Levels a prediction is refined over, the full image included; the rest are for where it fails.
+const FINE_LEVELS: usize = 2;
+/// The way back only has to arrive: it is refined until a step is below this, px.
+const STEP_MIN_CHECK: f32 = 0.05;
 /// Views end this close to the border, px.
 const MARGIN_PX: f32 = 2.0;
 /// Share of a patch's contrast that may stay unexplained from one frame to the next, and between
@@ -90,7 +95,8 @@ const SEARCH_STEPS: usize = 16;
 const SEARCH_LEVEL: usize = 2;
 /// Best of them that are tried in full.
 const SEARCH_TRIES: usize = 3;
-/// A point that no search found is searched for less and less often, frames.
+/// A point that no search found is searched for less and less often, and one of unknown depth not even
+/// guessed at in between, frames.
 const SEARCH_WAIT_MAX: u64 = 16;
 
 #[derive(Clone, Copy)]
@@ -105,10 +111,11 @@ struct Point {
     views: [Option<[f32; 2]>; CAMERAS_MAX],
 }
 
-/// What a view looked like: in the last frame at all levels, and at its anchor.
+/// What a view looked like: in the last frame at the fine levels, and at its anchor. Coarse levels
+/// are taken from the last frame's pyramid when they are needed.
 #[derive(Clone, Default)]
 struct Patch {
-    last: Stack,
+    last: [Template; FINE_LEVELS],
     anchor: Template,
     /// Direction of the turn since the anchor.
     turn: [f32; 2],
@@ -116,7 +123,7 @@ struct Patch {
 
 impl Patch {
     fn restart(&mut self, stack: &Stack) {
-        self.last = *stack;
+        self.last.copy_from_slice(&stack[..FINE_LEVELS]);
         self.anchor = stack[0];
         self.turn = [1.0, 0.0];
     }
@@ -135,6 +142,8 @@ pub struct Frontend {
     /// `patches[camera][slot]`
     patches: Vec<Vec<Patch>>,
     free: Vec<usize>,
+    /// Patch that is looked for, and where it was found.
+    source: Stack,
     scratch: Stack,
     inverse_depths: Vec<f64>,
     next_id: u64,
@@ -164,6 +173,7 @@ impl Frontend {
             points: Vec::with_capacity(TRACKS),
             patches: (0..n).map(|_| vec![Patch::default(); TRACKS]).collect(),
             free: (0..TRACKS).rev().collect(),
+            source: Default::default(),
             scratch: Default::default(),
             inverse_depths: Vec::with_capacity(TRACKS),
             next_id: 0,
@@ -224,9 +234,13 @@ impl Frontend {
                 let Some(px) = point.views[camera] else { continue };
                 let q = point.inverse_depth.unwrap_or(median);
                 let start = motion.and_then(|m| self.rig.transfer(camera, camera, &m, px, q));
-                let moved = start.and_then(|s| self.follow_view(camera, point.slot, px, s));
+                let fine = FINE_LEVELS - 1;
+                let predicted = start.and_then(|s| self.follow_view(camera, point.slot, px, s, fine));
                 // A wrong prediction must not lose what a still camera would keep.
-                let view = moved.or_else(|| self.follow_view(camera, point.slot, px, Warp::upright(px)));
+                let view = predicted.or_else(|| {
+                    let coarse = PYRAMID_LEVELS - 1;
+                    self.follow_view(camera, point.slot, px, start.unwrap_or(Warp::upright(px)), coarse)
+                });
                 self.points[i].views[camera] = view;
                 self.stats.lost += u64::from(view.is_none());
             }
@@ -248,12 +262,24 @@ impl Frontend {
         }
     }
 
-    /// One view from the last frame to this one.
-    fn follow_view(&mut self, camera: usize, slot: usize, px: [f32; 2], start: Warp) -> Option<[f32; 2]> {
-        let coarsest = PYRAMID_LEVELS - 1;
+    /// One view from the last frame to this one, from level `coarsest` on.
+    fn follow_view(
+        &mut self,
+        camera: usize,
+        slot: usize,
+        px: [f32; 2],
+        start: Warp,
+        coarsest: usize,
+    ) -> Option<[f32; 2]> {
         let search = Search { from: &self.before[camera], to: &self.now[camera], px, start, coarsest };
         let patch = &mut self.patches[camera][slot];
-        let (found, left) = align_stack(&patch.last, search.to, start, coarsest, self.iterations)?;
+        let mut stack = &patch.last[..];
+        if coarsest >= FINE_LEVELS {
+            self.source[..FINE_LEVELS].copy_from_slice(stack);
+            take_stack(&mut self.source, search.from, px, FINE_LEVELS..coarsest + 1);
+            stack = &self.source;
+        }
+        let (found, left) = align_stack(stack, search.to, start, coarsest, self.iterations, STEP_MIN)?;
         if left > UNEXPLAINED_MAX {
             return None;
         }
@@ -267,7 +293,7 @@ impl Frontend {
             return None;
         }
         if held {
-            patch.last = self.scratch;
+            patch.last.copy_from_slice(&self.scratch[..FINE_LEVELS]);
             patch.turn = [anchored.c, anchored.s];
         } else {
             patch.restart(&self.scratch);
@@ -319,18 +345,24 @@ impl Frontend {
     fn find_view(&mut self, i: usize, from: usize, to: usize, median: f64) -> Option<[f32; 2]> {
         let point = self.points[i];
         let px = point.views[from]?;
+        let due = self.stats.frames >= point.search_at;
+        if !due && point.inverse_depth.is_none() {
+            return None;
+        }
         let relative = self.rig.between(from, to);
         let q = point.inverse_depth.unwrap_or(median);
+        self.source[..FINE_LEVELS].copy_from_slice(&self.patches[from][point.slot].last);
+        take_stack(&mut self.source, &self.now[from], px, FINE_LEVELS..PYRAMID_LEVELS);
         let guess = self.rig.transfer(from, to, &relative, px, q);
         if let Some(found) = guess.and_then(|g| self.match_view(point.slot, from, to, px, g, PYRAMID_LEVELS - 1)) {
             return Some(found);
         }
-        if self.stats.frames < point.search_at {
+        if !due {
             return None;
         }
         let wait = (2 * point.search_wait).clamp(1, SEARCH_WAIT_MAX);
         (self.points[i].search_at, self.points[i].search_wait) = (self.stats.frames + wait, wait);
-        let template = &self.patches[from][point.slot].last[SEARCH_LEVEL];
+        let template = &self.source[SEARCH_LEVEL];
         if !template.usable() {
             return None;
         }
@@ -339,7 +371,7 @@ impl Frontend {
             let q = SEARCH_INVERSE_DEPTH_MAX * k as f64 / (SEARCH_STEPS - 1) as f64;
             let Some(warp) = self.rig.transfer(from, to, &relative, px, q) else { continue };
             let small = warp.at_level(SEARCH_LEVEL);
-            let Some((_, left)) = template.residual(&self.now[to].levels[SEARCH_LEVEL], &small) else { continue };
+            let Some(left) = template.unexplained(&self.now[to].levels[SEARCH_LEVEL], &small) else { continue };
             let at = best.partition_point(|b| b.0 <= left);
             if at < SEARCH_TRIES {
                 best[at..].rotate_right(1);
@@ -350,7 +382,7 @@ impl Frontend {
         tries.map(|b| b.1).find_map(|warp| self.match_view(point.slot, from, to, px, warp, SEARCH_LEVEL))
     }
 
-    /// Aligns the patch of one camera in another, both ways, and accepts it only where rays meet.
+    /// Aligns the source patch of one camera in another, both ways, and accepts it only where rays meet.
     fn match_view(
         &mut self,
         slot: usize,
@@ -360,8 +392,7 @@ impl Frontend {
         start: Warp,
         coarsest: usize,
     ) -> Option<[f32; 2]> {
-        let stack = &self.patches[from][slot].last;
-        let (warp, left) = align_stack(stack, &self.now[to], start, coarsest, self.iterations)?;
+        let (warp, left) = align_stack(&self.source, &self.now[to], start, coarsest, self.iterations, STEP_MIN)?;
         let (f, g) = (self.rig.bearing(from, px)?, self.rig.bearing(to, warp.px())?);
         if left > UNEXPLAINED_MATCH_MAX || self.rig.triangulate(from, to, f, g).is_none() {
             return None;
@@ -391,7 +422,7 @@ impl Frontend {
         self.stats.full += excess as u64;
         for corner in corners {
             let px = [corner.x as f32, corner.y as f32];
-            take_stack(&mut self.scratch, &self.now[0], px);
+            take_stack(&mut self.scratch, &self.now[0], px, 0..FINE_LEVELS);
             let sharp = self.scratch[0].usable() && self.scratch[0].sigma_px() < SIGMA_MAX_PX;
             if !sharp || self.rig.bearing(0, px).is_none() || is_near(&self.points, px, self.spacing_px) {
                 continue;
@@ -451,13 +482,13 @@ impl Search<'_> {
         if !(placed[0] >= MARGIN_PX && placed[1] >= MARGIN_PX && placed[0] <= right && placed[1] <= bottom) {
             return false;
         }
-        take_stack(stack, self.to, placed);
+        take_stack(stack, self.to, placed, 0..FINE_LEVELS.max(self.coarsest + 1));
         // What the anchor moved here, it moves there.
         let (dx, dy) = (placed[0] - found.x, placed[1] - found.y);
         let origin = [self.px[0] + found.c * dx + found.s * dy, self.px[1] + found.c * dy - found.s * dx];
         let (x, y) = (found.x + origin[0] - self.start.x, found.y + origin[1] - self.start.y);
         let back = Warp { x, y, c: found.c, s: -found.s };
-        align_stack(stack, self.from, back, self.coarsest, iterations)
+        align_stack(&stack[..], self.from, back, self.coarsest, iterations, STEP_MIN_CHECK)
             .is_some_and(|(recovered, _)| distance(recovered.px(), origin) <= recovered_max_px)
     }
 }

@@ -37,6 +37,23 @@ const STEP_MIN_COARSE: f32 = 0.1;
 /// A step this long has left the basin, px.
 const STEP_MAX: f32 = 10.0;
 
+/// First pixel and length of the pattern's run in each row of its square.
+const RUNS: [(usize, usize); SIDE] = runs();
+
+const fn runs() -> [(usize, usize); SIDE] {
+    let mut runs = [(0, 0); SIDE];
+    let mut k = 0;
+    while k < N {
+        let [x, y] = PATTERN[k];
+        if runs[y - 1].1 == 0 {
+            runs[y - 1].0 = x - 1;
+        }
+        runs[y - 1].1 += 1;
+        k += 1;
+    }
+    runs
+}
+
 const fn pattern() -> [[usize; 2]; N] {
     let mut p = [[0; 2]; N];
     let (mut n, mut k) = (0, 0);
@@ -148,13 +165,19 @@ impl Template {
         let Some((grid, inside)) = sample_grid(image, x, y) else { return };
         let mut g = [[0f32; N]; 3];
         let mut g_mean = [0f32; 3];
+        let on = weights(inside);
+        let mut k = 0;
+        for (j, (from, run)) in RUNS.into_iter().enumerate() {
+            let (up, row, down) = (&grid[j], &grid[j + 1], &grid[j + 2]);
+            for i in from..from + run {
+                self.value[k] = on[k] * row[i + 1];
+                g[0][k] = 0.5 * on[k] * (row[i + 2] - row[i]);
+                g[1][k] = 0.5 * on[k] * (down[i + 1] - up[i + 1]);
+                k += 1;
+            }
+        }
         for k in 0..N {
-            let [i, j] = PATTERN[k];
-            let on = if inside >> k & 1 == 1 { 1.0 } else { 0.0 };
-            let gx = 0.5 * on * (grid[j][i + 1] - grid[j][i - 1]);
-            let gy = 0.5 * on * (grid[j + 1][i] - grid[j - 1][i]);
-            self.value[k] = on * grid[j][i];
-            (g[0][k], g[1][k], g[2][k]) = (gx, gy, DX[k] * gy - DY[k] * gx);
+            g[2][k] = DX[k] * g[1][k] - DY[k] * g[0][k];
         }
         let count = inside.count_ones() as f32;
         let mean = sum(&self.value) / count;
@@ -164,22 +187,20 @@ impl Template {
         for a in 0..3 {
             g_mean[a] = sum(&g[a]) / count;
         }
-        self.contrast = 0.0;
+        let scale = 1.0 / mean;
+        let mut spread = [0f32; N];
         for k in 0..N {
-            let on = if inside >> k & 1 == 1 { 1.0 } else { 0.0 };
-            self.value[k] /= mean;
-            self.contrast += on * (self.value[k] - 1.0) * (self.value[k] - 1.0);
+            self.value[k] *= scale;
+            spread[k] = on[k] * (self.value[k] - 1.0);
             for a in 0..3 {
-                g[a][k] = on * (g[a][k] - self.value[k] * g_mean[a]) / mean;
+                g[a][k] = on[k] * (g[a][k] - self.value[k] * g_mean[a]) * scale;
             }
         }
+        self.contrast = dot(&spread, &spread);
         let Some(inv) = invert_normal(&g) else { return };
         for a in 0..3 {
-            self.gain[a] = [0.0; N];
-            for b in 0..3 {
-                for k in 0..N {
-                    self.gain[a][k] += inv[a][b] * g[b][k];
-                }
+            for k in 0..N {
+                self.gain[a][k] = inv[a][0] * g[0][k] + inv[a][1] * g[1][k] + inv[a][2] * g[2][k];
             }
         }
         self.sigma_px = (inv[0][0] + inv[1][1]).sqrt() / mean;
@@ -190,9 +211,13 @@ impl Template {
     /// contrast was left unexplained before the last step, or `None` when it slid off.
     pub fn align(&self, image: &Image, warp: &mut Warp, iterations: usize, step_min: f32) -> Option<f32> {
         let mut left = f32::MAX;
+        let mut block: Option<Block> = None;
+        let mut r = [0f32; N];
         for _ in 0..iterations {
-            let (r, unexplained) = self.residual(image, warp)?;
-            left = unexplained;
+            if !block.as_ref().is_some_and(|b| b.holds(warp)) {
+                block = Block::around(image, warp.x, warp.y);
+            }
+            left = self.difference(image, block.as_ref(), warp, &mut r)?;
             let mut inc = [0f32; 3];
             for a in 0..3 {
                 inc[a] = -dot(&self.gain[a], &r);
@@ -209,19 +234,28 @@ impl Template {
         Some(left)
     }
 
-    /// r_i at a warp, and Σr²/contrast. `None` unless more than half of the pattern is in both images.
-    pub fn residual(&self, image: &Image, warp: &Warp) -> Option<([f32; N], f32)> {
-        let mut r = [0f32; N];
-        let inside = self.inside & sample(image, warp, &mut r);
+    /// Σr²/contrast at a warp. `None` unless more than half of the pattern is in both images.
+    pub fn unexplained(&self, image: &Image, warp: &Warp) -> Option<f32> {
+        let block = Block::around(image, warp.x, warp.y);
+        self.difference(image, block.as_ref(), warp, &mut [0f32; N])
+    }
+
+    /// r_i, and as above. The block, where there is one, holds the warp.
+    fn difference(&self, image: &Image, block: Option<&Block>, warp: &Warp, r: &mut [f32; N]) -> Option<f32> {
+        let mut inside = self.inside;
+        match block {
+            Some(block) => block.sample(warp, r),
+            None => inside &= sample(image, warp, r),
+        }
         if inside.count_ones() <= N as u32 / 2 {
             return None;
         }
         // Both means over the same pixels; the template's is 1 over its own.
-        let (mut mean, mut own) = (sum(&r) / N as f32, 1.0);
+        let (mut mean, mut own) = (sum(r) / N as f32, 1.0);
         if inside != ALL {
             let count = inside.count_ones() as f32;
             let over = |v: &[f32; N]| (0..N).filter(|k| inside >> k & 1 == 1).map(|k| v[k]).sum::<f32>() / count;
-            (mean, own) = (over(&r), over(&self.value));
+            (mean, own) = (over(r), over(&self.value));
         }
         if !(mean > 1.0 && own > 0.0) {
             return None;
@@ -237,16 +271,16 @@ impl Template {
                 }
             }
         }
-        let unexplained = dot(&r, &r) / self.contrast;
-        Some((r, unexplained))
+        Some(dot(r, r) / self.contrast)
     }
 }
 
 /// Templates of all levels at one point.
 pub type Stack = [Template; PYRAMID_LEVELS];
 
-pub fn take_stack(stack: &mut Stack, pyramid: &Pyramid, px: [f32; 2]) {
-    for (l, t) in stack.iter_mut().enumerate() {
+/// Takes some of the levels: `levels` of the stack.
+pub fn take_stack(stack: &mut Stack, pyramid: &Pyramid, px: [f32; 2], levels: std::ops::Range<usize>) {
+    for (l, t) in stack.iter_mut().enumerate().take(levels.end).skip(levels.start) {
         let k = 1.0 / (1 << l) as f32;
         t.take(&pyramid.levels[l], px[0] * k, px[1] * k);
     }
@@ -255,11 +289,12 @@ pub fn take_stack(stack: &mut Stack, pyramid: &Pyramid, px: [f32; 2]) {
 /// Aligns from level `coarsest` down to the full image. A coarse level that cannot be aligned
 /// leaves the guess to the next; the last must succeed.
 pub fn align_stack(
-    stack: &Stack,
+    stack: &[Template],
     pyramid: &Pyramid,
     start: Warp,
     coarsest: usize,
     iterations: usize,
+    step_min: f32,
 ) -> Option<(Warp, f32)> {
     let mut warp = start;
     for l in (1..=coarsest).rev() {
@@ -268,7 +303,7 @@ pub fn align_stack(
             warp = w.at_full(l);
         }
     }
-    let left = stack[0].usable().then(|| stack[0].align(&pyramid.levels[0], &mut warp, 2 * iterations, STEP_MIN))??;
+    let left = stack[0].usable().then(|| stack[0].align(&pyramid.levels[0], &mut warp, 2 * iterations, step_min))??;
     Some((warp, left))
 }
 
@@ -309,6 +344,15 @@ fn invert_normal(j: &[[f32; N]; 3]) -> Option<[[f32; 3]; 3]> {
     }
     let inv = c.map(|row| row.map(|v| (v / det) as f32));
     inv.iter().flatten().all(|v| v.is_finite()).then_some(inv)
+}
+
+/// 1 for the offsets that were inside, 0 for the others.
+fn weights(inside: u64) -> [f32; N] {
+    let mut on = [1.0; N];
+    if inside != ALL {
+        (0..N).for_each(|k| on[k] = (inside >> k & 1) as f32);
+    }
+    on
 }
 
 /// Upright bilinear samples on the grid around a point inside the image, and which offsets (with
@@ -358,51 +402,83 @@ fn sample_grid(image: &Image, x: f32, y: f32) -> Option<([[f32; GRID]; GRID], u6
     Some((grid, inside))
 }
 
-/// Bilinear samples at the warped offsets; answers which were inside.
-fn sample(image: &Image, warp: &Warp, out: &mut [f32; N]) -> u64 {
-    let (mut x, mut y) = ([0f32; N], [0f32; N]);
-    for k in 0..N {
-        x[k] = warp.x + (warp.c * DX[k] - warp.s * DY[k]);
-        y[k] = warp.y + (warp.s * DX[k] + warp.c * DY[k]);
-    }
-    let (w, h) = (image.width, image.height);
-    let (right, bottom) = ((w - 1) as f32, (h - 1) as f32);
-    let p = &image.pixels[..];
-    let reach = RADIUS + 1.0;
-    let whole = warp.x >= reach && warp.y >= reach && warp.x <= right - reach && warp.y <= bottom - reach;
-    if !whole {
-        let mut inside = 0;
-        for k in 0..N {
-            if x[k] >= 0.0 && y[k] >= 0.0 && x[k] < right && y[k] < bottom {
-                let (i, j) = (x[k] as usize, y[k] as usize);
-                let q = &p[j * w + i..];
-                out[k] = bilinear(q, w, x[k] - i as f32, y[k] - j as f32);
-                inside |= 1 << k;
-            }
+/// The neighbourhood of a patch: the part of an image that alignment reads while it moves the patch by
+/// up to three pixels. Its size is known to the compiler, so that samples are fetched unchecked.
+struct Block {
+    pixels: [u8; BLOCK * (BLOCK + 2)],
+    left: f32,
+    top: f32,
+}
+
+const BLOCK: usize = 16;
+/// From a sample to the end of the block, px: a sample's neighbour, and a pixel for rounding.
+const REACH: f32 = RADIUS + 1.0;
+/// 2^23: adding it to a float leaves no bits for a fraction.
+const ROUND: f32 = 8388608.0;
+
+impl Block {
+    /// Around a place; `None` where it does not lie within the image.
+    fn around(image: &Image, x: f32, y: f32) -> Option<Block> {
+        let (left, top) = ((x - 0.5 * BLOCK as f32).round(), (y - 0.5 * BLOCK as f32).round());
+        let (right, bottom) = (image.width as f32 - BLOCK as f32, image.height as f32 - BLOCK as f32);
+        if !(left >= 0.0 && top >= 0.0 && left <= right && top <= bottom) {
+            return None;
         }
-        return inside;
+        let mut pixels = [0; BLOCK * (BLOCK + 2)];
+        let from = top as usize * image.width + left as usize;
+        for (j, row) in pixels.chunks_exact_mut(BLOCK).take(BLOCK).enumerate() {
+            row.copy_from_slice(&image.pixels[from + j * image.width..][..BLOCK]);
+        }
+        Some(Block { pixels, left, top })
     }
-    // Rounding x - 1/2 to an integer by adding 2^23 is a floor that vectorises.
-    const ROUND: f32 = 8388608.0;
-    let mut quad = [0u32; N];
+
+    fn holds(&self, warp: &Warp) -> bool {
+        let within = |v: f32| v >= REACH && v <= (BLOCK - 1) as f32 - REACH;
+        within(warp.x - self.left) && within(warp.y - self.top)
+    }
+
+    /// Bilinear samples at the warped offsets.
+    fn sample(&self, warp: &Warp, out: &mut [f32; N]) {
+        let (cx, cy) = (warp.x - self.left, warp.y - self.top);
+        let (mut fx, mut fy, mut at) = ([0f32; N], [0f32; N], [0u32; N]);
+        for k in 0..N {
+            let x = cx + (warp.c * DX[k] - warp.s * DY[k]);
+            let y = cy + (warp.s * DX[k] + warp.c * DY[k]);
+            // Adding 2^23 to x - 1/2 rounds it down to an integer in the low bits, in vectors.
+            let (i, j) = (x - 0.5 + ROUND, y - 0.5 + ROUND);
+            (fx[k], fy[k]) = (x - (i - ROUND), y - (j - ROUND));
+            at[k] = (j.to_bits() & 15) * BLOCK as u32 + (i.to_bits() & 15);
+        }
+        let mut quad = [0u32; N];
+        for k in 0..N {
+            let q = at[k] as usize % (BLOCK * BLOCK);
+            let pair = |q: usize| u16::from_le_bytes([self.pixels[q], self.pixels[q + 1]]) as u32;
+            quad[k] = pair(q) | pair(q + BLOCK) << 16;
+        }
+        for k in 0..N {
+            let byte = |n: u32| ((quad[k] >> n) & 255) as i32 as f32;
+            let (a, b, c, d) = (byte(0), byte(8), byte(16), byte(24));
+            let (top, bottom) = (a + fx[k] * (b - a), c + fx[k] * (d - c));
+            out[k] = top + fy[k] * (bottom - top);
+        }
+    }
+}
+
+/// Bilinear samples at the warped offsets near the border; answers which were inside.
+fn sample(image: &Image, warp: &Warp, out: &mut [f32; N]) -> u64 {
+    let w = image.width;
+    let (right, bottom) = ((w - 1) as f32, (image.height - 1) as f32);
+    let mut inside = 0;
     for k in 0..N {
-        let (i, j) = (x[k] - 0.5 + ROUND, y[k] - 0.5 + ROUND);
-        x[k] -= i - ROUND;
-        y[k] -= j - ROUND;
-        quad[k] = (j.to_bits() & 0x7f_ffff) * w as u32 + (i.to_bits() & 0x7f_ffff);
+        let x = warp.x + (warp.c * DX[k] - warp.s * DY[k]);
+        let y = warp.y + (warp.s * DX[k] + warp.c * DY[k]);
+        if x >= 0.0 && y >= 0.0 && x < right && y < bottom {
+            let (i, j) = (x as usize, y as usize);
+            out[k] = bilinear(&image.pixels[j * w + i..], w, x - i as f32, y - j as f32);
+            inside |= 1 << k;
+        }
     }
-    // Only the fetch is one pixel at a time: the four bytes travel in one word.
-    for q in &mut quad {
-        let q0 = &p[*q as usize..][..w + 2];
-        *q = u32::from_le_bytes([q0[0], q0[1], q0[w], q0[w + 1]]);
-    }
-    for k in 0..N {
-        let byte = |n: u32| ((quad[k] >> n) & 255) as i32 as f32;
-        let (a, b, c, d) = (byte(0), byte(8), byte(16), byte(24));
-        let (top, bottom) = (a + x[k] * (b - a), c + x[k] * (d - c));
-        out[k] = top + y[k] * (bottom - top);
-    }
-    ALL
+    inside
 }
 
 #[inline]
@@ -444,9 +520,9 @@ mod tests {
 
     fn follow(place: [f64; 2], angle: f64, gain: f64) -> (Warp, f32) {
         let mut stack = Stack::default();
-        take_stack(&mut stack, &moved([60.0, 50.0], 0.0, 1.0), [60.0, 50.0]);
+        take_stack(&mut stack, &moved([60.0, 50.0], 0.0, 1.0), [60.0, 50.0], 0..PYRAMID_LEVELS);
         let target = moved(place, angle, gain);
-        align_stack(&stack, &target, Warp::upright([60.0, 50.0]), PYRAMID_LEVELS - 1, 5).unwrap()
+        align_stack(&stack, &target, Warp::upright([60.0, 50.0]), PYRAMID_LEVELS - 1, 5, STEP_MIN).unwrap()
     }
 
     #[test]
@@ -475,11 +551,11 @@ mod tests {
     fn a_patch_cut_by_the_border_still_aligns() {
         let (a, b) = (moved([60.0, 50.0], 0.0, 1.0), moved([60.4, 50.3], 0.0, 1.0));
         let mut stack = Stack::default();
-        take_stack(&mut stack, &a, [2.0, 30.0]);
-        let (warp, _) = align_stack(&stack, &b, Warp::upright([2.0, 30.0]), PYRAMID_LEVELS - 1, 5).unwrap();
+        take_stack(&mut stack, &a, [2.0, 30.0], 0..PYRAMID_LEVELS);
+        let (warp, _) = align_stack(&stack, &b, Warp::upright([2.0, 30.0]), PYRAMID_LEVELS - 1, 5, STEP_MIN).unwrap();
         assert!((warp.x - 2.4).hypot(warp.y - 30.3) < 0.1, "{warp:?}");
-        assert!(stack[0].residual(&b.levels[0], &Warp::upright([-1.0, 30.0])).is_none());
-        assert!(stack[0].residual(&b.levels[0], &Warp::upright([f32::NAN, 30.0])).is_none());
+        assert!(stack[0].unexplained(&b.levels[0], &Warp::upright([-1.0, 30.0])).is_none());
+        assert!(stack[0].unexplained(&b.levels[0], &Warp::upright([f32::NAN, 30.0])).is_none());
     }
 
     #[test]
