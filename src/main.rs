@@ -123,6 +123,14 @@ enum Bench {
         #[arg(long, value_name = "N", default_value = "5", value_parser = clap::value_parser!(u64).range(1..=1000))]
         seeds: u64,
     },
+    /// Errors beside what the covariance claims, and beside the quality
+    Consistency {
+        #[arg(long, value_name = "DIR")]
+        out: PathBuf,
+        /// Seeded flights
+        #[arg(long, value_name = "N", default_value = "50", value_parser = clap::value_parser!(u64).range(2..=10_000))]
+        flights: u64,
+    },
 }
 
 fn seconds(text: &str) -> Result<f64, String> {
@@ -146,6 +154,9 @@ fn run(command: Command) -> Result<(), Fault> {
         Command::Check { board, set } => daemon::check(&board, &set),
         Command::Bench { what: Bench::Odometry { out, recordings, seconds, quick, defaults } } => {
             bench::odometry(&bench::Options { recordings, seconds, quick, defaults }, &out)
+        }
+        Command::Bench { what: Bench::Consistency { out, flights } } => {
+            bench::consistency::consistency(flights as usize, &out)
         }
         Command::Bench { what: Bench::Stability { out, seeds } } => bench::stability::stability(seeds, &out),
     }

@@ -4,7 +4,7 @@
 #![allow(clippy::unwrap_used)]
 
 use glam::{DQuat, DVec3};
-use stipple::bench::flight::{fly, record, Plan};
+use stipple::bench::flight::{record, Plan};
 use stipple::bench::stability;
 use stipple::bench::world::Noise;
 use stipple::config::VioConfig;
@@ -89,42 +89,4 @@ fn restart_goes_on_from_the_trusted_pose_with_honest_covariance() {
             assert!(sigmas < THREE_SIGMA, "{name}, frame {}: {sigmas:.1} sigma from the truth", r.frame);
         }
     }
-}
-
-/// Normalised squared error of 15 errors, mean over the frames of a flight, in the estimate's own world:
-/// truth is moved there by the position and yaw of the first frame.
-fn nees(seed: u64, config: fn(&mut VioConfig)) -> f64 {
-    use stipple::bench::flight::{errors, estimate_from_truth, from_rest};
-    use stipple::vio::residuals::{Mat15, Vec15};
-    let plan = Plan { pose: from_rest, config, ..Plan::default() };
-    let (mut sum, mut n) = (0.0, 0);
-    let mut to_estimate: Option<Pose> = None;
-    fly(&plan, seed, |seen| {
-        let (Some(o), Some(c)) = (seen.update.odometry, seen.vio.covariance()) else { return };
-        let moved = *to_estimate.get_or_insert_with(|| estimate_from_truth(&o.world_from_body, &seen.truth.pose));
-        let parts = errors(seen, &moved).unwrap();
-        let error = Vec15::from_fn(|i, _| parts[i / 3][i % 3]);
-        let covariance = Mat15::from_fn(|i, j| c[i][j]);
-        assert!((covariance - covariance.transpose()).norm() <= 1e-9 * covariance.norm(), "symmetric");
-        let factor = covariance.cholesky().expect("positive definite");
-        sum += error.dot(&factor.solve(&error));
-        n += 1;
-    });
-    sum / n as f64
-}
-
-#[test]
-fn covariance_is_positive_definite_and_as_large_as_the_errors() {
-    // As the world is made: the noise stated, and 0.3 px.
-    let honest = |c: &mut VioConfig| {
-        (c.gyro_noise_scale, c.accel_noise_scale, c.observation_sigma_px) = (1.0, 1.0, 0.3);
-    };
-    let mean = |config: fn(&mut VioConfig)| {
-        let all: Vec<f64> = (0..10).map(|seed| nees(100 + 10 * seed, config)).collect();
-        eprintln!("NEES of 15 over ten flights: {all:.1?}");
-        all.iter().sum::<f64>() / all.len() as f64
-    };
-    let (stated, default) = (mean(honest), mean(|_| {}));
-    eprintln!("mean: {stated:.2} with the world's noise, {default:.2} with the defaults, which claim less");
-    assert!((1.0..40.0).contains(&stated) && default < 15.0);
 }

@@ -155,6 +155,8 @@ pub struct Record {
     pub resets: u64,
     /// Distance of the position's error in its covariance, `√(eᵀ P⁻¹ e)`; the world is that of the first estimate.
     pub position_sigmas: Option<f64>,
+    /// Error of the velocity in the body's frame, m/s.
+    pub velocity_error: Option<f64>,
 }
 
 /// Flies a plan and keeps a record of each frame.
@@ -181,6 +183,10 @@ pub fn record(plan: &Plan, seed: u64) -> (Vec<Record>, Vio) {
             quality: seen.update.quality,
             resets: seen.vio.stats().resets,
             position_sigmas: sigmas(),
+            velocity_error: seen.update.odometry.map(|o| {
+                let in_body = |pose: &Pose, v: DVec3| pose.q.conjugate() * v;
+                in_body(&o.world_from_body, o.v_world).distance(in_body(&seen.truth.pose, seen.truth.v_world))
+            }),
         });
     });
     (records, vio)

@@ -1,10 +1,12 @@
-//! `stipple bench`: what the estimator's parameters cost and what they buy.
+//! `stipple bench`: what the estimator's parameters cost and what they buy (`odometry`), what becomes of it
+//! when something goes wrong (`stability`), and whether it is as good as it says (`consistency`).
 //!
 //! `odometry` flies every input with the defaults and with one parameter at a time moved away
 //! from them, frontend and estimator on the calling thread, in lockstep, without a mapper. It
 //! leaves `odometry.csv` (a row an input and setting), `odometry.json`, `odometry.html` and
 //! `odometry.svg` (error against run time). Each input is rendered or read into memory once and dropped before the next.
 
+pub mod consistency;
 pub mod flight;
 mod inputs;
 mod measure;

@@ -225,6 +225,11 @@ pub fn rows(seeds: &[u64]) -> Result<Vec<Row>, Fault> {
     Ok(rows)
 }
 
+/// Every case on made-up tracks, frame by frame.
+pub fn flights(seed: u64) -> Vec<Vec<Record>> {
+    cases::all().iter().map(|case| record(&case.plan, seed).0).collect()
+}
+
 /// Frames flown after a fault that ended, where only the restart matters.
 const RESTART_FRAMES: usize = 40;
 

@@ -113,6 +113,7 @@ fn fly(flight: &Flight, light: fn(usize, usize) -> Light) -> Result<(Vec<Record>
             quality: update.quality,
             resets: vio.stats().resets,
             position_sigmas: None,
+            velocity_error: None,
         });
     }
     Ok((records, vio))
