@@ -156,6 +156,15 @@ fn truncated_image_is_counted_and_the_run_goes_on() {
     assert!(text(&o).contains(name), "the warning names the file: {}", text(&o));
     let report: serde_json::Value = serde_json::from_slice(&fs::read(out.join("report.json")).unwrap()).unwrap();
     assert_eq!(report["count_frames_unreadable"], 1);
+    // What the report says of the estimator's state, every bit and reason by name.
+    for bit in stipple::vio::health::Health::NAMES {
+        assert!(report[format!("health_{bit}_frames")].is_u64(), "{bit}");
+    }
+    for (counter, _) in stipple::vio::Stats::default().counters() {
+        assert!(report[format!("count_{counter}")].is_u64(), "{counter}");
+    }
+    assert!(report["quality_p50"].as_u64().unwrap() > 0 && report["quality_under_50"].is_number());
+    assert!(report["estimator_bytes"].as_u64().unwrap() <= 24 << 20);
 }
 
 #[test]

@@ -77,6 +77,9 @@ pub fn conclude(title: Title, mut played: Played, out: &OutputDir) -> Result<Rep
     }
     report.rss_peak_bytes = process::rss_peak_bytes();
     report.set_counters(&counted(&played, &title.opened));
+    if let Tracking::Odometry(run) = &played.tracking {
+        report.set_health(run.back.tally().health());
+    }
     write_files(&report, &played, &estimated, &title.truth, error.as_ref(), &panels, out)?;
     Ok(report)
 }
@@ -114,6 +117,11 @@ fn track_figures(report: &mut Report, played: &Played) -> Vec<TimedPose> {
     report.estimator_ms_p50 = percentile(&run.back.ms, 0.5);
     report.estimator_ms_p99 = percentile(&run.back.ms, 0.99);
     played.tracking.rig().into_iter().for_each(|rig| rig_figures(report, &rig));
+    report.estimator_bytes = Some(run.bytes);
+    if let Some((least, median, under)) = run.back.tally().quality() {
+        (report.quality_min, report.quality_p50) = (Some(least.into()), Some(median.into()));
+        report.quality_under_50 = Some(under);
+    }
     report.vio_hash = played.tracking.hash().map(|h| format!("{h:016x}"));
     run.back.trajectory.iter().map(|o| TimedPose { t: o.t, pose: o.world_from_body }).collect()
 }

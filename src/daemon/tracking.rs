@@ -16,7 +16,7 @@ use crate::vio::predict::Predictor;
 use crate::vio::rig::RigEstimate;
 use crate::vio::samples::ImuRing;
 use crate::vio::window::FRAMES;
-use crate::vio::{Odometry, Vio};
+use crate::vio::{Odometry, Tally, Vio};
 use std::time::Instant;
 use stipple_drivers::types::pose_at;
 use stipple_drivers::{Calibration, Fault, Frames, ImuSample, Nanos, Pose, Span, TimedPose};
@@ -77,6 +77,8 @@ pub struct OdometryRun {
     pub back: Back,
     /// 1 or 2.
     pub threads: u32,
+    /// Of tracker and estimator together.
+    pub bytes: u64,
 }
 
 /// Follows points.
@@ -123,6 +125,11 @@ pub struct Back {
 }
 
 impl Back {
+    /// Frames by health and quality.
+    pub fn tally(&self) -> &Tally {
+        self.vio.tally()
+    }
+
     pub fn predictor(&self) -> Predictor {
         self.vio.predictor()
     }
@@ -182,6 +189,7 @@ impl OdometryRun {
                 cpu_s: None,
             },
             threads: board.frontend.threads,
+            bytes: Frontend::footprint(calibration, &board.frontend).total() + Vio::footprint().total(),
         })
     }
 

@@ -82,7 +82,7 @@ fn tables(report: &Report) -> String {
     let f = |v: Option<f64>, decimals: usize| v.filter(|v| v.is_finite()).map(|v| format!("{v:.decimals$}"));
     let n = |v: Option<u64>| v.map(grouped);
     let mib = |v: Option<u64>| v.map(|b| format!("{:.1}", b as f64 / (1 << 20) as f64));
-    let odometry: [Row; 8] = [
+    let odometry: [Row; 11] = [
         ("Trajectory error (ATE)", f(report.ate_rmse_m, 4), "m"),
         ("Error over 1 s (RTE)", f(report.rte_1s_m, 4), "m"),
         ("Rotation over 1 s (RPE)", f(report.rpe_deg, 3), "\u{b0}"),
@@ -91,6 +91,9 @@ fn tables(report: &Report) -> String {
         ("Tracking time, 99 %", f(report.tracking_ms_p99, 2), "ms"),
         ("Frames tracked", n(report.frames), ""),
         ("Frames dropped", n(report.frames_dropped), ""),
+        ("Quality, median", n(report.quality_p50.map(u64::from)), "of 100"),
+        ("Quality, lowest", n(report.quality_min.map(u64::from)), "of 100"),
+        ("Frames of quality under 50", f(report.quality_under_50.map(|v| 100.0 * v), 1), "%"),
     ];
     let map: [Row; 8] = [
         ("PSNR, training views", f(report.psnr_db, 2), "dB"),
@@ -102,10 +105,11 @@ fn tables(report: &Report) -> String {
         ("Iterations", n(report.iterations), ""),
         ("Iteration time, median", f(report.iteration_ms_p50, 1), "ms"),
     ];
-    let cost: [Row; 6] = [
+    let cost: [Row; 7] = [
         ("Run time", f(report.wall_s, 1), "s"),
         ("Keyframes", n(report.keyframes), ""),
         ("Anchors", n(report.anchors), ""),
+        ("Tracker and estimator", mib(report.estimator_bytes), "MiB"),
         ("GPU memory", mib(report.gpu_bytes), "MiB"),
         ("Resident memory, peak", mib(report.rss_peak_bytes), "MiB"),
         ("Heap allocations after seal", n(report.heap_after_seal), ""),

@@ -38,6 +38,10 @@ pub struct Report {
     pub frontend_ms_p99: Option<f64>,
     pub estimator_ms_p50: Option<f64>,
     pub estimator_ms_p99: Option<f64>,
+    /// Quality of the odometry, 0 to 100: lowest, median, and the share of frames under 50.
+    pub quality_min: Option<u32>,
+    pub quality_p50: Option<u32>,
+    pub quality_under_50: Option<f64>,
     /// Of every odometry state, bit for bit.
     pub vio_hash: Option<String>,
 
@@ -62,6 +66,8 @@ pub struct Report {
     pub iteration_ms_p50: Option<f64>,
 
     pub gpu_bytes: Option<u64>,
+    /// Tracker and estimator, whole.
+    pub estimator_bytes: Option<u64>,
     pub rss_peak_bytes: Option<u64>,
     pub heap_after_seal: Option<u64>,
     pub wall_s: Option<f64>,
@@ -73,7 +79,7 @@ pub struct Report {
     /// GPU time by kernel, most expensive first.
     pub kernels: Vec<KernelTime>,
 
-    /// `count_<name>` of every counter.
+    /// `count_<name>` of every counter, `health_<bit>_frames` of every bit of the odometry's health.
     #[serde(flatten)]
     pub counts: BTreeMap<String, u64>,
 }
@@ -112,6 +118,11 @@ impl Report {
         self.counts = counters.iter().map(|(name, n)| (format!("{COUNT}{name}"), *n)).collect();
     }
 
+    /// Frames on which each bit of the odometry's health was set; after the counters.
+    pub fn set_health(&mut self, frames: impl Iterator<Item = (&'static str, u64)>) {
+        self.counts.extend(frames.map(|(name, n)| (format!("health_{name}_frames"), n)));
+    }
+
     /// Counters that are not zero, without their prefix.
     pub fn counted(&self) -> impl Iterator<Item = (&str, u64)> {
         self.counts.iter().filter(|(_, n)| **n > 0).map(|(name, n)| (name.strip_prefix(COUNT).unwrap_or(name), *n))
@@ -133,7 +144,7 @@ mod tests {
         "frames keyframes anchors frames_dropped ate_rmse_m rte_1s_m rpe_deg tracking_fps tracking_ms_p50 \
         tracking_ms_p99 tracking_threads tracking_cpu_ms frontend_ms_p50 frontend_ms_p99 estimator_ms_p50 \
         estimator_ms_p99 psnr_db ssim psnr_heldout_db ssim_heldout psnr_heldout_aligned_db splats iterations \
-        iteration_ms_p50 gpu_bytes rss_peak_bytes heap_after_seal wall_s device vio_hash dataset board pace scale \
+        iteration_ms_p50 gpu_bytes estimator_bytes quality_min quality_p50 quality_under_50 rss_peak_bytes heap_after_seal wall_s device vio_hash dataset board pace scale \
         time_offset_s time_offset_sigma_s gyro_scale gyro_scale_sigma accel_scale accel_scale_sigma";
 
     #[test]
@@ -156,6 +167,7 @@ mod tests {
         counters.outliers.add(7);
         let mut report = Report { psnr_db: Some(24.5), ..Report::default() };
         report.set_counters(&counters.list());
+        report.set_health([("imu_gap", 3)].into_iter());
         report.curve.push(CurvePoint {
             t_s: 5.0,
             psnr_db: Some(20.0),
@@ -166,12 +178,12 @@ mod tests {
         let mut bytes = Vec::new();
         report.write_json(&mut bytes).unwrap();
         let json: serde_json::Value = serde_json::from_slice(&bytes).unwrap();
-        assert_eq!(json["count_outliers"], 7);
+        assert_eq!((&json["count_outliers"], &json["health_imu_gap_frames"]), (&7.into(), &3.into()));
         assert_eq!(json["curve"][0]["psnr_heldout_db"], serde_json::Value::Null);
         let nested = json.as_object().unwrap().iter().filter(|(_, v)| v.is_object());
         assert_eq!(nested.count(), 0);
         assert_eq!(serde_json::from_slice::<Report>(&bytes).unwrap(), report);
-        assert_eq!(report.counted().collect::<Vec<_>>(), [("outliers", 7)]);
+        assert_eq!(report.counted().collect::<Vec<_>>(), [("outliers", 7), ("health_imu_gap_frames", 3)]);
     }
 
     #[test]

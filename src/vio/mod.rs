@@ -44,7 +44,7 @@ use rest::at_rest;
 use rig::{Parts, RigEstimate, RigSigma, RigState};
 use samples::ImuRing;
 use solve::{Model, Outcome, Solver};
-pub use stats::Stats;
+pub use stats::{Stats, Tally};
 use stipple_drivers::{Calibration, ImuSample, Nanos, Pose};
 use trust::{Origin, Trust};
 use window::{Frame, Window, FRAMES};
@@ -126,6 +126,7 @@ pub struct Estimator<S: Real = Scalar> {
     covariance: Option<[[f64; 15]; 15]>,
     frames_since_keyframe: u32,
     stats: Stats,
+    tally: Tally,
     hash: u64,
 }
 
@@ -162,6 +163,7 @@ impl<S: Real> Estimator<S> {
             covariance: None,
             frames_since_keyframe: 0,
             stats: Stats::default(),
+            tally: Tally::default(),
             hash: FNV_START,
         }
     }
@@ -227,6 +229,7 @@ impl<S: Real> Estimator<S> {
         given_up.into_iter().for_each(|why| update.health.set(why.bit(), true));
         self.stats.camera_blind += update.health.has(Health::ONE_CAMERA_BLIND) as u64;
         update.quality = quality(self.covariance(), update.connected);
+        self.tally.add(update.health, update.odometry.map(|_| update.quality));
         match (self.window.newest(), &self.covariance) {
             (Some(n), Some(c)) if self.watch.trusts() => {
                 let f = self.window.frame(n);
@@ -472,6 +475,10 @@ impl<S: Real> Estimator<S> {
 
     pub fn stats(&self) -> &Stats {
         &self.stats
+    }
+
+    pub fn tally(&self) -> &Tally {
+        &self.tally
     }
 
     pub fn landmarks(&self) -> usize {

@@ -1,5 +1,7 @@
 //! What the estimator counts, and under which names it reaches the report.
 
+use super::health::Health;
+
 /// What was dropped, refused, or went wrong so far.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Stats {
@@ -54,5 +56,72 @@ impl Stats {
             ("zero_velocity_updates", self.zero_velocity_updates),
             ("solver_iterations", self.iterations),
         ]
+    }
+}
+
+/// Frames by what their health and their quality were.
+#[derive(Clone, Debug)]
+pub struct Tally {
+    health: [u64; Health::NAMES.len()],
+    quality: [u64; 101],
+}
+
+impl Default for Tally {
+    fn default() -> Tally {
+        Tally { health: [0; Health::NAMES.len()], quality: [0; 101] }
+    }
+}
+
+impl Tally {
+    /// A frame; its quality counts where there is odometry.
+    pub fn add(&mut self, health: Health, quality: Option<u8>) {
+        for (i, n) in self.health.iter_mut().enumerate() {
+            *n += u64::from(health.0 >> i & 1);
+        }
+        if let Some(q) = quality {
+            self.quality[usize::from(q.min(100))] += 1;
+        }
+    }
+
+    /// Frames on which each bit was set, by its name.
+    pub fn health(&self) -> impl Iterator<Item = (&'static str, u64)> + '_ {
+        Health::NAMES.into_iter().zip(self.health)
+    }
+
+    fn frames(&self) -> u64 {
+        self.quality.iter().sum()
+    }
+
+    /// Lowest and median quality, and the share of frames under 50; `None` without odometry.
+    pub fn quality(&self) -> Option<(u8, u8, f64)> {
+        let n = self.frames();
+        let rank = |from: u64| {
+            let mut seen = 0;
+            self.quality.iter().position(|count| {
+                seen += count;
+                seen > from
+            })
+        };
+        let under: u64 = self.quality[..50].iter().sum();
+        (n > 0).then_some(())?;
+        Some((rank(0)? as u8, rank(n / 2)? as u8, under as f64 / n as f64))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn tally_tells_frames_by_bit_and_quality() {
+        let mut tally = Tally::default();
+        assert_eq!(tally.quality(), None);
+        tally.add(Health::INITIALISING, None);
+        for q in [90, 20, 40, 95] {
+            tally.add(Health::IMU_GAP | Health::INERTIA_ALONE, Some(q));
+        }
+        assert_eq!(tally.quality(), Some((20, 90, 0.5)));
+        let set: Vec<_> = tally.health().filter(|(_, n)| *n > 0).collect();
+        assert_eq!(set, [("initialising", 1), ("imu_gap", 4), ("inertia_alone", 4)]);
     }
 }
