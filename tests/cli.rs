@@ -53,6 +53,29 @@ fn refused(o: &Output, code: i32, words: &[&str], out: &Path) {
 }
 
 #[test]
+fn a_rolling_shutter_is_refused_until_the_board_states_its_readout_and_the_report_tells_the_clock() {
+    let dir = tempfile::tempdir().unwrap();
+    let (dataset, out) = (dir.path().join("flight"), dir.path().join("out"));
+    let to = dataset.to_str().unwrap();
+    let o = stipple(&["sim", "demo", "--out", to, "--duration", "4", "--readout", "0.02", "--time-offset", "0.005"]);
+    assert!(o.status.success(), "{}", text(&o));
+    for k in 0..2 {
+        let yaml = dataset.join(format!("mav0/cam{k}/sensor.yaml"));
+        let stated = fs::read_to_string(&yaml).unwrap();
+        assert!(stated.contains("readout_time: 0.02"), "{stated}");
+        fs::write(&yaml, stated.replace("readout_time: 0.02", "shutter: rolling")).unwrap();
+    }
+    let flown = ["--set", "map.enabled=false", "--set", "vio.estimate_time_offset=true"];
+    refused(&replay(&dataset, &out, &flown), CONFIG, &["cam0/sensor.yaml", "rolling", "rig.readout_s"], &out);
+    let o = replay(&dataset, &out, &[&flown[..], &["--set", "rig.readout_s=0.02"]].concat());
+    assert!(o.status.success(), "{}", text(&o));
+    let report: serde_json::Value = serde_json::from_slice(&fs::read(out.join("report.json")).unwrap()).unwrap();
+    let (offset, sigma) = (report["time_offset_s"].as_f64().unwrap(), report["time_offset_sigma_s"].as_f64().unwrap());
+    assert!((offset - 0.005).abs() < 0.0015 && sigma > 0.0 && sigma < 0.001, "{offset} ± {sigma}");
+    assert!(fs::read_to_string(out.join("report.html")).unwrap().contains("Time offset of the cameras"));
+}
+
+#[test]
 fn missing_folder_is_named() {
     let dir = tempfile::tempdir().unwrap();
     let out = dir.path().join("out");

@@ -26,6 +26,19 @@ pub fn exp(phi: DVec3) -> DQuat {
     DQuat::from_xyzw(s * phi.x, s * phi.y, s * phi.z, w).normalize()
 }
 
+/// The same as a matrix (Rodrigues).
+pub fn exp_matrix(phi: DVec3) -> DMat3 {
+    let th2 = phi.length_squared();
+    let (a, b) = if th2 < SMALL_ANGLE2 {
+        (1.0 - th2 / 6.0, 0.5 - th2 / 24.0)
+    } else {
+        let (sin, cos) = th2.sqrt().sin_cos();
+        (sin / th2.sqrt(), (1.0 - cos) / th2)
+    };
+    let k = hat(phi);
+    DMat3::IDENTITY + k * a + k * k * b
+}
+
 /// Rotation vector of a unit quaternion, |log| <= π.
 pub fn log(q: DQuat) -> DVec3 {
     let q = if q.w < 0.0 { -q } else { q };

@@ -1,7 +1,7 @@
 //! The points of the window: a fixed pool, found by track id; triangulation; outliers.
 
 use super::residuals::{Body, Eye, Point};
-use super::sight::{placed, predicted};
+use super::sight::{host_eye, placed, predicted};
 use super::window::{Window, FRAMES};
 use crate::frontend::{Track, Tracks};
 use crate::limits::{CAMERAS_MAX, LANDMARKS, OBSERVATIONS};
@@ -130,7 +130,8 @@ impl Landmarks {
         self.retain_views(
             |_| true,
             |l, o| {
-                let ok = predicted(l, o, window).is_some_and(|px| (px - o.px()).length() <= px_max);
+                let ok =
+                    predicted(l, &host_eye(l, window), o, window).is_some_and(|px| (px - o.px()).length() <= px_max);
                 dropped += !ok as usize;
                 ok
             },
@@ -228,8 +229,7 @@ fn triangulate_one(
     px_max: f64,
 ) -> Option<Landmark> {
     let host_view = Observation { slot: slot as u8, camera: host_camera as u8, px: track.px };
-    let host_eye = &eyes[host_camera];
-    let bearing = host_eye.camera.unproject(host_view.px())?;
+    let bearing = eyes[host_camera].camera.unproject(host_view.px())?;
     let host = camera_in_world(&host_view, window);
     let (views, n) = views_of(track, (slot, host_camera), window, tracks, eyes);
     let (mut num, mut den) = (0.0, 0.0);
@@ -259,9 +259,10 @@ fn triangulate_one(
         ..Landmark::default()
     };
     let _ = landmark.observations.push(host_view);
+    let sits = host_eye(&landmark, window);
     for v in views[..n].iter().flatten() {
         let o = v.observation;
-        let seen = predicted(&landmark, &o, window);
+        let seen = predicted(&landmark, &sits, &o, window);
         if seen.is_some_and(|px| (px - o.px()).length() <= px_max) {
             let _ = landmark.observations.push(o);
         }

@@ -9,7 +9,7 @@ use super::landmarks::Landmark;
 use super::residuals::{huber, inertial_jacobians, inertial_residual, scale_jacobian, Vec15};
 use super::rest::{rest_residual, REST_WEIGHTS};
 use super::rig::SCALE_DIM;
-use super::sight::{observe, predicted, CameraColumns};
+use super::sight::{host_eye, observe, predicted, CameraColumns, Host};
 use super::solve::Model;
 use super::window::{Layout, Window, FRAMES, MOTION_DIM, POSE_DIM};
 use crate::limits::{OBSERVATIONS, RIG_DIM, WINDOW_DIM};
@@ -123,9 +123,10 @@ fn view_rows<S: Real>(
     let mut cost = 0.0;
     let inv_sigma = 1.0 / model.sigma_px;
     let cameras_at = layout.cameras().map(|s| (out.offset(s.at), s.len));
+    let host_eye = Host::of(landmark, window);
     let mut columns: CameraColumns = [[0.0; RIG_DIM - SCALE_DIM]; 2];
     for o in views {
-        let Some(r) = observe(landmark, o, window, &mut columns) else {
+        let Some(r) = observe(landmark, &host_eye, o, window, &mut columns) else {
             cost += huber(LOST_PX * inv_sigma, model.huber_px * inv_sigma).1;
             continue;
         };
@@ -254,8 +255,9 @@ pub fn cost_of_views(landmarks: &[Landmark], window: &Window, model: &Model) -> 
     let lost = huber(LOST_PX * inv_sigma, model.huber_px * inv_sigma).1;
     let mut cost = 0.0;
     for l in landmarks {
+        let host_eye = host_eye(l, window);
         for o in l.observations.iter() {
-            cost += match predicted(l, o, window) {
+            cost += match predicted(l, &host_eye, o, window) {
                 Some(px) => huber((px - o.px()).length() * inv_sigma, model.huber_px * inv_sigma).1,
                 None => lost,
             };

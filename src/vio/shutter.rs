@@ -30,7 +30,7 @@ pub struct Shifted {
 
 impl Shifted {
     pub fn new(body_from_cam: &Body, twist: &Twist, tau: f64) -> Shifted {
-        let turn = DMat3::from_quat(so3::exp(twist.w * tau));
+        let turn = so3::exp_matrix(twist.w * tau);
         Shifted {
             body_from_cam: Body { r: turn * body_from_cam.r, p: turn * body_from_cam.p + twist.v * tau },
             turn,

@@ -29,34 +29,54 @@ pub fn placed(camera: usize, row: f32, slot: usize, window: &Window) -> Body {
     shifted(eye, window.rig.now.time_offset, row, slot, window).body_from_cam
 }
 
+/// Where the camera sits that a landmark is hosted in, for all its views.
+pub fn host_eye(l: &Landmark, window: &Window) -> Body {
+    placed(l.host_camera as usize, l.host_row, l.host as usize, window)
+}
+
 /// Pixel at which the observation should be.
-pub fn predicted(l: &Landmark, o: &Observation, window: &Window) -> Option<DVec2> {
+pub fn predicted(l: &Landmark, host_eye: &Body, o: &Observation, window: &Window) -> Option<DVec2> {
     let eye = &window.rig.eyes()[o.camera as usize];
     let (host, target) = (&window.frame(l.host as usize).body, &window.frame(o.slot as usize).body);
     if window.rig.is_plain() {
-        let host_eye = &window.rig.eyes()[l.host_camera as usize].body_from_cam;
         return predict(&l.point, host_eye, host, eye, target);
     }
-    let host_eye = placed(l.host_camera as usize, l.host_row, l.host as usize, window);
     let eye = Eye { body_from_cam: placed(o.camera as usize, o.px[1], o.slot as usize, window), ..*eye };
-    predict(&l.point, &host_eye, host, &eye, target)
+    predict(&l.point, host_eye, host, &eye, target)
+}
+
+/// The host's camera at the estimate, and at the linearisation point where that has to be carried.
+pub struct Host {
+    now: Body,
+    fixed: Option<Shifted>,
+}
+
+impl Host {
+    pub fn of(l: &Landmark, window: &Window) -> Host {
+        let (rig, slot) = (&window.rig, l.host as usize);
+        let eye = &rig.eyes_jacobian()[l.host_camera as usize];
+        let fixed = || shifted(eye, rig.linearised().time_offset, l.host_row, slot, window);
+        Host { now: host_eye(l, window), fixed: (!rig.is_plain()).then(fixed) }
+    }
 }
 
 /// Prediction minus observation, and derivatives; those to the rig, where it has columns, go to `columns`.
-pub fn observe(l: &Landmark, o: &Observation, window: &Window, columns: &mut CameraColumns) -> Option<Reprojection> {
+pub fn observe(
+    l: &Landmark,
+    host: &Host,
+    o: &Observation,
+    window: &Window,
+    columns: &mut CameraColumns,
+) -> Option<Reprojection> {
     let rig = &window.rig;
     let (h, t) = (window.frame(l.host as usize), window.frame(o.slot as usize));
     let (host_camera, camera) = (l.host_camera as usize, o.camera as usize);
     let (host_eye, eye) = (&rig.eyes_jacobian()[host_camera], &rig.eyes_jacobian()[camera]);
-    let mut r = if rig.is_plain() {
-        reproject(&l.point, &host_eye.body_from_cam, &h.body_jacobian, eye, &t.body_jacobian)?
-    } else {
-        let time_offset = rig.linearised().time_offset;
-        let host = shifted(host_eye, time_offset, l.host_row, l.host as usize, window);
-        let target = shifted(eye, time_offset, o.px[1], o.slot as usize, window);
+    let mut r = if let Some(host) = &host.fixed {
+        let target = shifted(eye, rig.linearised().time_offset, o.px[1], o.slot as usize, window);
         let eye = Eye { body_from_cam: target.body_from_cam, ..*eye };
         let (r, mut d) = reproject_with_eyes(&l.point, &host.body_from_cam, &h.body_jacobian, &eye, &t.body_jacobian)?;
-        let d_time = carry_back(&mut d, &host, &target);
+        let d_time = carry_back(&mut d, host, &target);
         for (k, row) in columns.iter_mut().enumerate() {
             row.fill(0.0);
             if rig.parts.time_offset {
@@ -69,9 +89,11 @@ pub fn observe(l: &Landmark, o: &Observation, window: &Window, columns: &mut Cam
             }
         }
         r
+    } else {
+        reproject(&l.point, &host_eye.body_from_cam, &h.body_jacobian, eye, &t.body_jacobian)?
     };
     if h.anchored || t.anchored || rig.anchored {
-        r.px = predicted(l, o, window)?;
+        r.px = predicted(l, &host.now, o, window)?;
     }
     r.px -= o.px();
     Some(r)
