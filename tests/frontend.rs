@@ -10,6 +10,7 @@ use stipple::frontend::{Frontend, Prediction, Stats, Tracks};
 use stipple::limits::TRACKS;
 use stipple::mem::{heap_after_seal, seal_thread, unsealed, CountingAllocator};
 use stipple_drivers::replay::{OpenOptions, Recording};
+use stipple_drivers::sim::{rig_named, Scenario, Sim};
 use stipple_drivers::types::pose_at;
 use stipple_drivers::{Calibration, Camera, Frames, ImuCalibration, ImuCorrection, Lens, Nanos, Pose, RigCamera, Span};
 
@@ -202,6 +203,107 @@ fn tracking_is_deterministic_and_allocates_nothing() {
         }
         unsealed(|| assert_eq!(seen[0], seen[1]));
     }
+}
+
+/// Flies a rig of the simulator's through its room; answers what the tracker saw, frame by frame, and with it
+/// the true poses.
+fn fly(rig: &str) -> (Calibration, Vec<(Tracks, Pose)>) {
+    let mut scenario = Scenario::named("circle").unwrap();
+    (scenario.calibration, scenario.image_divisor) = (rig_named(rig).unwrap(), 2);
+    let mut sim = Sim::new(&scenario).unwrap();
+    let (calibration, truth) = (sim.calibration().clone(), sim.truth());
+    let config = FrontendConfig { grid_px: 40, ..FrontendConfig::default() };
+    let mut frontend = Frontend::new(&calibration, &config).unwrap();
+    let mut frames = Frames::for_rig(&calibration);
+    let (mut flown, mut last) = (Vec::new(), None::<Pose>);
+    for i in 20..32 {
+        sim.render(i, &mut frames);
+        let pose = pose_at(&truth, frames.t, Span::from_secs(0.1)).unwrap();
+        let prev_from_now = last.map(|l| l.inverse() * pose);
+        last = Some(pose);
+        flown.push((frontend.track(&frames, &Prediction { prev_from_now }).clone(), pose));
+    }
+    eprintln!("{rig}: {:?}", frontend.stats());
+    (calibration, flown)
+}
+
+/// Median distance of a followed point from the plane its ray and the camera's true motion span, rad.
+fn off_plane(calibration: &Calibration, flown: &[(Tracks, Pose)], camera: usize) -> f64 {
+    let eye = calibration.cameras[camera];
+    let ray = |p: [f32; 2]| eye.camera.unproject(DVec2::new(p[0] as f64, p[1] as f64)).unwrap().normalize();
+    let mut off = Vec::new();
+    for pair in flown.windows(2) {
+        let [then, now] =
+            [&pair[0], &pair[1]].map(|(tracks, pose)| (&tracks.cameras[camera], *pose * eye.body_from_cam));
+        let now_from_then = now.1.inverse() * then.1;
+        for a in then.0.iter() {
+            let Ok(i) = now.0.binary_search_by_key(&a.id, |b| b.id) else { continue };
+            let (f, g) = (now_from_then.q * ray(a.px), ray(now.0[i].px));
+            off.push(g.dot(now_from_then.p.cross(f).normalize()).abs());
+        }
+    }
+    off.sort_by(f64::total_cmp);
+    assert!(off.len() >= 100, "camera {camera}: {} followed", off.len());
+    off[off.len() / 2]
+}
+
+/// Points that two cameras share.
+fn shared(tracks: &Tracks, a: usize, b: usize) -> usize {
+    let other = &tracks.cameras[b];
+    tracks.cameras[a].iter().filter(|t| other.binary_search_by_key(&t.id, |o| o.id).is_ok()).count()
+}
+
+#[test]
+fn every_camera_of_any_rig_follows_points() {
+    for (rig, cameras) in [("mono", 1), ("stereo", 2), ("opposed", 2), ("four", 4)] {
+        let (calibration, flown) = fly(rig);
+        let seen: Vec<usize> = flown.last().unwrap().0.cameras.iter().map(|c| c.len()).collect();
+        assert_eq!(calibration.cameras.len(), cameras);
+        assert!(seen[..cameras].iter().all(|n| *n >= 20) && seen[cameras..].iter().all(|n| *n == 0), "{rig}: {seen:?}");
+        for camera in 0..cameras {
+            let off = off_plane(&calibration, &flown, camera);
+            assert!(off < 2e-3, "{rig}, camera {camera}: {off} rad");
+        }
+    }
+}
+
+#[test]
+fn what_two_cameras_see_is_one_point_and_what_one_sees_is_its_own() {
+    let (_, opposed) = fly("opposed");
+    assert!(opposed.iter().all(|(t, _)| shared(t, 0, 1) == 0), "cameras that look apart share nothing");
+    for rig in ["stereo", "four"] {
+        let (_, flown) = fly(rig);
+        let tracks = &flown.last().unwrap().0;
+        let (both, own) = (shared(tracks, 0, 1), tracks.cameras[1].len());
+        assert!(both >= 20 && 10 * both >= 8 * own, "{rig}: {both} of {own}");
+        for camera in tracks.cameras.iter() {
+            let near = |a: [f32; 2], b: [f32; 2]| (a[0] - b[0]).hypot(a[1] - b[1]) < 3.0;
+            let twice =
+                camera.iter().enumerate().filter(|(i, a)| camera[..*i].iter().any(|b| near(a.px, b.px))).count();
+            assert!(20 * twice <= camera.len(), "{rig}: {twice} of {} are followed twice", camera.len());
+        }
+    }
+}
+
+#[test]
+fn a_camera_whose_partner_is_covered_finds_its_own_points() {
+    let calibration = rig(320, 240);
+    let mut frames = Frames::for_rig(&calibration);
+    let mut frontend = Frontend::new(&calibration, &FrontendConfig::default()).unwrap();
+    for k in 0..3 {
+        see(&calibration, [0.004 * k as f64, 0.0], 2.0, 0.0, &mut frames);
+        frames.images[0].pixels.fill(12);
+        let tracks = frontend.track(&frames, &Prediction::default());
+        assert!(
+            tracks.cameras[0].is_empty() && tracks.cameras[1].len() >= 15,
+            "frame {k}: {}",
+            tracks.cameras[1].len()
+        );
+    }
+    // uncovered: the same points are found in it, not new ones
+    see(&calibration, [0.012, 0.0], 2.0, 0.0, &mut frames);
+    let tracks = frontend.track(&frames, &Prediction::default());
+    assert!(shared(tracks, 0, 1) >= 12, "{}", shared(tracks, 0, 1));
 }
 
 fn recording(name: &str) -> Option<Recording> {

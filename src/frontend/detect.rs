@@ -44,6 +44,8 @@ pub struct Detector {
     columns: usize,
     origin: [usize; 2],
     taken: Vec<bool>,
+    /// Bit of each other camera that sees a cell too.
+    shared: Vec<u8>,
     corners: Vec<Corner>,
     threshold: u8,
     threshold_min: u8,
@@ -58,6 +60,7 @@ impl Detector {
             columns,
             origin: [(width % cell) / 2, (height % cell) / 2],
             taken: vec![false; columns * rows],
+            shared: vec![0; columns * rows],
             corners: Vec::with_capacity(columns * rows),
             threshold: config.fast_threshold.min(255) as u8,
             threshold_min: config.fast_threshold_min.clamp(1, 255) as u8,
@@ -66,12 +69,26 @@ impl Detector {
 
     pub fn bytes(width: usize, height: usize, config: &FrontendConfig) -> usize {
         let cell = (config.grid_px as usize).min(CELL_MAX);
-        (width / cell) * (height / cell) * (size_of::<bool>() + size_of::<Corner>())
+        (width / cell) * (height / cell) * (size_of::<bool>() + size_of::<u8>() + size_of::<Corner>())
     }
 
-    /// Finds at most `room` corners, one in each cell free of `points`; the strongest when there
-    /// are more. Also answers how many did not fit.
-    pub fn detect(&mut self, image: &Image, points: impl Iterator<Item = [f32; 2]>, room: usize) -> (&[Corner], usize) {
+    /// Marks each cell by the cameras that see its middle.
+    pub fn share(&mut self, sees: impl Fn([f32; 2]) -> u8) {
+        for k in 0..self.shared.len() {
+            let middle = |origin: usize, n: usize| (origin + n * self.cell) as f32 + 0.5 * (self.cell - 1) as f32;
+            self.shared[k] = sees([middle(self.origin[0], k % self.columns), middle(self.origin[1], k / self.columns)]);
+        }
+    }
+
+    /// Finds at most `room` corners, one in each cell that is free of `points` and that none of the cameras
+    /// `others` (bits) sees too; the strongest when there are more. Also answers how many did not fit.
+    pub fn detect(
+        &mut self,
+        image: &Image,
+        points: impl Iterator<Item = [f32; 2]>,
+        others: u8,
+        room: usize,
+    ) -> (&[Corner], usize) {
         self.taken.fill(false);
         let rows = self.taken.len() / self.columns.max(1);
         for [x, y] in points {
@@ -83,7 +100,7 @@ impl Detector {
         }
         self.corners.clear();
         for k in 0..self.taken.len() {
-            if !self.taken[k] {
+            if !self.taken[k] && self.shared[k] & others == 0 {
                 let x = self.origin[0] + (k % self.columns) * self.cell;
                 let y = self.origin[1] + (k / self.columns) * self.cell;
                 let corner = strongest(image, [x, y], self.cell, self.threshold, self.threshold_min);
@@ -234,12 +251,12 @@ mod tests {
         let image = noise(3, 256, 4);
         let config = FrontendConfig { grid_px: 20, ..FrontendConfig::default() };
         let mut detector = Detector::new(image.width, image.height, &config);
-        let all = detector.detect(&image, std::iter::empty(), 100).0.to_vec();
+        let all = detector.detect(&image, std::iter::empty(), 0, 100).0.to_vec();
         assert!(all.len() > 4);
         let hit = all[0];
-        let without = detector.detect(&image, std::iter::once([hit.x as f32, hit.y as f32]), 100).0.to_vec();
+        let without = detector.detect(&image, std::iter::once([hit.x as f32, hit.y as f32]), 0, 100).0.to_vec();
         assert_eq!(without, all[1..]);
-        let (few, excess) = detector.detect(&image, std::iter::empty(), 3);
+        let (few, excess) = detector.detect(&image, std::iter::empty(), 0, 3);
         assert_eq!((few.len(), excess), (3, all.len() - 3));
         let weakest = few.iter().map(|c| c.score).min().unwrap();
         assert!(all.iter().filter(|c| c.score > weakest).count() < 3);

@@ -3,13 +3,16 @@
 //! ```text
 //! frames -> pyramids -> follow every view from the last frame (IMU-predicted start, refined
 //!                       against the patch first seen, checked backwards)
-//!        -> epipolar gate -> match views that are missing -> detect in free cells -> match those
+//!        -> epipolar gate -> match views that are missing
+//!        -> camera by camera: detect in free cells -> match those in the others
 //! ```
 //!
-//! Camera 0 finds points; the same id in another camera is the same point. Each view is followed
-//! in its own camera; a point lives while any camera sees it, and what one camera lost is looked
-//! for again from another in every frame. The patch of the last frame finds the point, the patch
-//! first seen (the anchor) places it: without an anchor each frame adds its own rounding to the
+//! Any number of cameras, with or without overlap: each finds points where it sees what no earlier camera
+//! does, or where those that do are blind, so that what is seen twice is found once. The same id in another
+//! camera is the same point. Each view is followed in its own camera; a point lives while any camera sees
+//! it, and what one camera lost is looked for again from another in every frame. The patch of the last
+//! frame finds the point, the patch first seen (the anchor) places it: without an anchor each frame adds its
+//! own rounding to the
 //! drift. A prediction is refined over the fine levels alone, which is faster and slips less; where it fails
 //! the whole pyramid is searched. Same frames and predictions, same bits out.
 
@@ -58,11 +61,11 @@ pub struct Stats {
     pub lost: u64,
     /// Views found from another camera.
     pub matched: u64,
-    /// Views dropped because their ray misses that of camera 0.
+    /// Views dropped because their ray misses that of the first camera that sees the point.
     pub epipolar_rejected: u64,
     /// Points dropped because an older one is near.
     pub crowded: u64,
-    /// Corners that did not fit.
+    /// Corners and views that did not fit.
     pub full: u64,
 }
 
@@ -99,16 +102,26 @@ const SEARCH_TRIES: usize = 3;
 /// guessed at in between, frames.
 const SEARCH_WAIT_MAX: u64 = 16;
 
+/// A camera with fewer points than this gives none to the others: they look for their own.
+const GIVES_MIN: usize = 8;
+
 #[derive(Clone, Copy)]
 struct Point {
     id: u64,
-    slot: usize,
-    /// Along the ray of camera 0; kept while no second camera sees the point.
+    /// Along the ray of the first camera that sees it; kept while no second camera does.
     inverse_depth: Option<f64>,
-    /// Frame of the next search along the epipolar curve, and the wait after it.
-    search_at: u64,
-    search_wait: u64,
+    /// Frame of the next search along the epipolar curve in each camera, and the wait after it.
+    search_at: [u64; CAMERAS_MAX],
+    search_wait: [u64; CAMERAS_MAX],
     views: [Option<[f32; 2]>; CAMERAS_MAX],
+    /// Of each view, in the camera's `patches`.
+    slots: [usize; CAMERAS_MAX],
+}
+
+impl Point {
+    fn first(&self) -> Option<usize> {
+        self.views.iter().position(Option::is_some)
+    }
 }
 
 /// What a view looked like: in the last frame at the fine levels, and at its anchor. Coarse levels
@@ -136,12 +149,13 @@ pub struct Frontend {
     spacing_px: f32,
     now: Vec<Pyramid>,
     before: Vec<Pyramid>,
-    detector: Detector,
+    detectors: Vec<Detector>,
     /// Ascending id.
     points: Vec<Point>,
     /// `patches[camera][slot]`
     patches: Vec<Vec<Patch>>,
-    free: Vec<usize>,
+    /// Free slots of each camera.
+    free: Vec<Vec<usize>>,
     /// Patch that is looked for, and where it was found.
     source: Stack,
     scratch: Stack,
@@ -161,21 +175,21 @@ impl Frontend {
             return Err(Fault::new(Exit::Config, "calibration", what, "use a calibration of this rig"));
         }
         let pyramids = || calibration.cameras.iter().map(|c| Pyramid::new(c.camera.width, c.camera.height)).collect();
-        let first = &calibration.cameras[0].camera;
+        let rig = Rig::new(calibration, config.epipolar_max);
         Ok(Frontend {
-            rig: Rig::new(calibration, config.epipolar_max),
+            detectors: (0..n).map(|camera| detector(calibration, &rig, camera, config)).collect(),
+            rig,
             iterations: config.iterations as usize,
             recovered_max_px: config.recovered_max_px as f32,
             spacing_px: SPACING * config.grid_px as f32,
             now: pyramids(),
             before: pyramids(),
-            detector: Detector::new(first.width, first.height, config),
-            points: Vec::with_capacity(TRACKS),
+            points: Vec::with_capacity(n * TRACKS),
             patches: (0..n).map(|_| vec![Patch::default(); TRACKS]).collect(),
-            free: (0..TRACKS).rev().collect(),
+            free: (0..n).map(|_| (0..TRACKS).rev().collect()).collect(),
             source: Default::default(),
             scratch: Default::default(),
-            inverse_depths: Vec::with_capacity(TRACKS),
+            inverse_depths: Vec::with_capacity(n * TRACKS),
             next_id: 0,
             tracks: Tracks::default(),
             stats: Stats::default(),
@@ -187,8 +201,9 @@ impl Frontend {
         let sizes = calibration.cameras.iter().map(|c| (c.camera.width, c.camera.height));
         f.host("frontend pyramids", 2 * sizes.clone().map(|(w, h)| Pyramid::bytes(w, h)).sum::<usize>());
         f.host("frontend patches", calibration.cameras.len() * TRACKS * size_of::<Patch>());
-        let grid = sizes.take(1).map(|(w, h)| Detector::bytes(w, h, config)).sum::<usize>();
-        let points = TRACKS * (size_of::<Point>() + size_of::<usize>() + size_of::<f64>());
+        let grid = sizes.map(|(w, h)| Detector::bytes(w, h, config)).sum::<usize>();
+        let each = size_of::<Point>() + size_of::<usize>() + size_of::<f64>();
+        let points = calibration.cameras.len() * TRACKS * each;
         f.host("frontend points", size_of::<Frontend>() + points + grid);
         f
     }
@@ -209,9 +224,11 @@ impl Frontend {
         let median = self.median_inverse_depth();
         self.find_missing(0, median);
         self.drop_unseen();
-        let first_new = self.points.len();
-        self.detect();
-        self.find_missing(first_new, median);
+        for camera in 0..self.now.len() {
+            let first_new = self.points.len();
+            self.detect(camera);
+            self.find_missing(first_new, median);
+        }
         self.publish(frames.t);
         &self.tracks
     }
@@ -235,14 +252,19 @@ impl Frontend {
                 let q = point.inverse_depth.unwrap_or(median);
                 let start = motion.and_then(|m| self.rig.transfer(camera, camera, &m, px, q));
                 let fine = FINE_LEVELS - 1;
-                let predicted = start.and_then(|s| self.follow_view(camera, point.slot, px, s, fine));
+                let predicted = start.and_then(|s| self.follow_view(camera, point.slots[camera], px, s, fine));
                 // A wrong prediction must not lose what a still camera would keep.
                 let view = predicted.or_else(|| {
                     let coarse = PYRAMID_LEVELS - 1;
-                    self.follow_view(camera, point.slot, px, start.unwrap_or(Warp::upright(px)), coarse)
+                    self.follow_view(camera, point.slots[camera], px, start.unwrap_or(Warp::upright(px)), coarse)
                 });
-                self.points[i].views[camera] = view;
-                self.stats.lost += u64::from(view.is_none());
+                match view {
+                    Some(_) => self.points[i].views[camera] = view,
+                    None => {
+                        self.lose(i, camera);
+                        self.stats.lost += 1;
+                    }
+                }
             }
         }
         for i in 0..self.points.len() {
@@ -251,12 +273,20 @@ impl Frontend {
         self.thin();
     }
 
-    /// Of points that came too near to each other in camera 0 the oldest stays.
+    /// Ends a view and frees its patch.
+    fn lose(&mut self, i: usize, camera: usize) {
+        if self.points[i].views[camera].take().is_some() {
+            self.free[camera].push(self.points[i].slots[camera]);
+        }
+    }
+
+    /// Of points that came too near to each other the oldest stays: judged where the younger is seen first.
     fn thin(&mut self) {
         for i in 1..self.points.len() {
-            let crowded = self.points[i].views[0].is_some_and(|px| is_near(&self.points[..i], px, self.spacing_px));
-            if crowded {
-                self.points[i].views = [None; CAMERAS_MAX];
+            let Some(first) = self.points[i].first() else { continue };
+            let px = self.points[i].views[first].expect("it is seen there");
+            if is_near(&self.points[..i], first, px, self.spacing_px) {
+                (0..self.now.len()).for_each(|camera| self.lose(i, camera));
                 self.stats.crowded += 1;
             }
         }
@@ -301,27 +331,28 @@ impl Frontend {
         Some(placed)
     }
 
-    /// Drops views that disagree with camera 0 and triangulates from those that agree.
+    /// Drops views that disagree with the first and triangulates from those that agree.
     fn gate(&mut self, i: usize) {
-        let point = &mut self.points[i];
-        let Some(f) = point.views[0].and_then(|px| self.rig.bearing(0, px)) else { return };
+        let Point { views, .. } = self.points[i];
+        let Some(first) = self.points[i].first() else { return };
+        let Some(f) = views[first].and_then(|px| self.rig.bearing(first, px)) else { return };
         let (mut sum, mut weights) = (0.0, 0.0);
-        for camera in 1..self.now.len() {
-            let Some(px) = point.views[camera] else { continue };
-            let seen = self.rig.bearing(camera, px).and_then(|g| self.rig.triangulate(0, camera, f, g));
+        for camera in first + 1..self.now.len() {
+            let Some(px) = views[camera] else { continue };
+            let seen = self.rig.bearing(camera, px).and_then(|g| self.rig.triangulate(first, camera, f, g));
             match seen {
                 Some((q, weight)) => {
                     sum += weight * q;
                     weights += weight;
                 }
                 None => {
-                    point.views[camera] = None;
+                    self.lose(i, camera);
                     self.stats.epipolar_rejected += 1;
                 }
             }
         }
         if weights > 0.0 {
-            point.inverse_depth = Some((sum / weights).max(0.0));
+            self.points[i].inverse_depth = Some((sum / weights).max(0.0));
         }
     }
 
@@ -329,12 +360,10 @@ impl Frontend {
     fn find_missing(&mut self, first: usize, median: f64) {
         for i in first..self.points.len() {
             let views = self.points[i].views;
-            let Some(from) = views.iter().position(Option::is_some) else { continue };
+            let Some(from) = self.points[i].first() else { continue };
             for to in 0..self.now.len() {
                 if views[to].is_none() {
-                    let found = self.find_view(i, from, to, median);
-                    self.points[i].views[to] = found;
-                    self.stats.matched += u64::from(found.is_some());
+                    self.find_view(i, from, to, median);
                 }
             }
             self.gate(i);
@@ -342,26 +371,39 @@ impl Frontend {
     }
 
     /// One view from another camera of the same instant.
-    fn find_view(&mut self, i: usize, from: usize, to: usize, median: f64) -> Option<[f32; 2]> {
+    fn find_view(&mut self, i: usize, from: usize, to: usize, median: f64) {
+        let Some(&slot) = self.free[to].last() else {
+            self.stats.full += 1;
+            return;
+        };
+        if let Some(px) = self.search_view(i, from, to, slot, median) {
+            self.free[to].pop();
+            (self.points[i].views[to], self.points[i].slots[to]) = (Some(px), slot);
+            self.stats.matched += 1;
+        }
+    }
+
+    /// Where it is; its patch goes to `slot`.
+    fn search_view(&mut self, i: usize, from: usize, to: usize, slot: usize, median: f64) -> Option<[f32; 2]> {
         let point = self.points[i];
         let px = point.views[from]?;
-        let due = self.stats.frames >= point.search_at;
+        let due = self.stats.frames >= point.search_at[to];
         if !due && point.inverse_depth.is_none() {
             return None;
         }
         let relative = self.rig.between(from, to);
         let q = point.inverse_depth.unwrap_or(median);
-        self.source[..FINE_LEVELS].copy_from_slice(&self.patches[from][point.slot].last);
+        self.source[..FINE_LEVELS].copy_from_slice(&self.patches[from][point.slots[from]].last);
         take_stack(&mut self.source, &self.now[from], px, FINE_LEVELS..PYRAMID_LEVELS);
         let guess = self.rig.transfer(from, to, &relative, px, q);
-        if let Some(found) = guess.and_then(|g| self.match_view(point.slot, from, to, px, g, PYRAMID_LEVELS - 1)) {
+        if let Some(found) = guess.and_then(|g| self.match_view(slot, from, to, px, g, PYRAMID_LEVELS - 1)) {
             return Some(found);
         }
         if !due {
             return None;
         }
-        let wait = (2 * point.search_wait).clamp(1, SEARCH_WAIT_MAX);
-        (self.points[i].search_at, self.points[i].search_wait) = (self.stats.frames + wait, wait);
+        let wait = (2 * point.search_wait[to]).clamp(1, SEARCH_WAIT_MAX);
+        (self.points[i].search_at[to], self.points[i].search_wait[to]) = (self.stats.frames + wait, wait);
         let template = &self.source[SEARCH_LEVEL];
         if !template.usable() {
             return None;
@@ -379,7 +421,7 @@ impl Frontend {
             }
         }
         let tries = best.into_iter().filter(|b| b.0 < f32::MAX);
-        tries.map(|b| b.1).find_map(|warp| self.match_view(point.slot, from, to, px, warp, SEARCH_LEVEL))
+        tries.map(|b| b.1).find_map(|warp| self.match_view(slot, from, to, px, warp, SEARCH_LEVEL))
     }
 
     /// Aligns the source patch of one camera in another, both ways, and accepts it only where rays meet.
@@ -406,39 +448,40 @@ impl Frontend {
     }
 
     fn drop_unseen(&mut self) {
-        let free = &mut self.free;
-        self.points.retain(|p| {
-            let seen = p.views.iter().any(Option::is_some);
-            if !seen {
-                free.push(p.slot);
-            }
-            seen
-        });
+        self.points.retain(|p| p.first().is_some());
     }
 
-    fn detect(&mut self) {
-        let seen = self.points.iter().filter_map(|p| p.views[0]);
-        let (corners, excess) = self.detector.detect(&self.now[0].levels[0], seen, self.free.len());
+    /// New points of one camera. What an earlier camera sees too it has looked for already.
+    fn detect(&mut self, camera: usize) {
+        let mut seen = [0; CAMERAS_MAX];
+        for p in &self.points {
+            (0..CAMERAS_MAX).for_each(|c| seen[c] += usize::from(p.views[c].is_some()));
+        }
+        let others = (0..camera).filter(|c| seen[*c] >= GIVES_MIN).fold(0, |bits, c| bits | 1 << c);
+        let points = self.points.iter().filter_map(|p| p.views[camera]);
+        let room = self.free[camera].len().min(self.points.capacity() - self.points.len());
+        let (corners, excess) = self.detectors[camera].detect(&self.now[camera].levels[0], points, others, room);
         self.stats.full += excess as u64;
         for corner in corners {
             let px = [corner.x as f32, corner.y as f32];
-            take_stack(&mut self.scratch, &self.now[0], px, 0..FINE_LEVELS);
+            take_stack(&mut self.scratch, &self.now[camera], px, 0..FINE_LEVELS);
             let sharp = self.scratch[0].usable() && self.scratch[0].sigma_px() < SIGMA_MAX_PX;
-            if !sharp || self.rig.bearing(0, px).is_none() || is_near(&self.points, px, self.spacing_px) {
+            let known = self.rig.bearing(camera, px).is_some();
+            if !sharp || !known || is_near(&self.points, camera, px, self.spacing_px) {
                 continue;
             }
-            let slot = self.free.pop().expect("no more corners than free slots");
-            self.patches[0][slot].restart(&self.scratch);
-            let mut views = [None; CAMERAS_MAX];
-            views[0] = Some(px);
-            self.points.push(Point {
+            let slot = self.free[camera].pop().expect("no more corners than free slots");
+            self.patches[camera][slot].restart(&self.scratch);
+            let mut point = Point {
                 id: self.next_id,
-                slot,
                 inverse_depth: None,
-                search_at: 0,
-                search_wait: 0,
-                views,
-            });
+                search_at: [0; CAMERAS_MAX],
+                search_wait: [0; CAMERAS_MAX],
+                views: [None; CAMERAS_MAX],
+                slots: [0; CAMERAS_MAX],
+            };
+            (point.views[camera], point.slots[camera]) = (Some(px), slot);
+            self.points.push(point);
             self.next_id += 1;
             self.stats.created += 1;
         }
@@ -450,7 +493,7 @@ impl Frontend {
             list.clear();
             for p in &self.points {
                 if let Some(px) = p.views[camera] {
-                    list.push(Track { id: p.id, px }).expect("there are no more points than TRACKS");
+                    list.push(Track { id: p.id, px }).expect("a camera has TRACKS patches, one a view");
                 }
             }
         }
@@ -493,8 +536,17 @@ impl Search<'_> {
     }
 }
 
-fn is_near(points: &[Point], px: [f32; 2], spacing_px: f32) -> bool {
-    points.iter().any(|p| p.views[0].is_some_and(|q| distance(px, q) < spacing_px))
+/// The grid of a camera, knowing which cells earlier cameras see at the distance guessed before any is known.
+fn detector(calibration: &Calibration, rig: &Rig, camera: usize, config: &FrontendConfig) -> Detector {
+    let of = &calibration.cameras[camera].camera;
+    let mut detector = Detector::new(of.width, of.height, config);
+    let sees = |px, other| rig.transfer(camera, other, &rig.between(camera, other), px, INVERSE_DEPTH_START).is_some();
+    detector.share(|px| (0..camera).filter(|other| sees(px, *other)).fold(0, |bits, other| bits | 1 << other));
+    detector
+}
+
+fn is_near(points: &[Point], camera: usize, px: [f32; 2], spacing_px: f32) -> bool {
+    points.iter().any(|p| p.views[camera].is_some_and(|q| distance(px, q) < spacing_px))
 }
 
 fn distance(a: [f32; 2], b: [f32; 2]) -> f32 {
