@@ -14,7 +14,7 @@ PACKAGES := g++ glslang-tools libopencv-calib3d-dev libvulkan1 mesa-vulkan-drive
 
 OUT ?= out/demo
 
-.PHONY: demo test lint deps
+.PHONY: demo test soak lint deps
 
 demo: deps
 	cargo build --release --locked
@@ -22,6 +22,10 @@ demo: deps
 
 test: deps
 	cargo test --workspace --locked --no-fail-fast
+
+# A minute of garbage for the tracker and the estimator.
+soak: deps
+	cargo test --locked --test soak -- --ignored
 
 lint:
 	cargo fmt --all --check

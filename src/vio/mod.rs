@@ -55,6 +55,8 @@ const CONNECTED_FEW: usize = 20;
 const SPEED_MAX: f64 = 100.0;
 const ACCEL_BIAS_MAX: f64 = 5.0;
 const GYRO_BIAS_MAX: f64 = 1.0;
+/// No image is this wide.
+const PX_MAX: f32 = 65536.0;
 /// Inertia alone is not believed for longer than this, s; the ring of samples may not hold more either.
 const FRAME_GAP_MAX: f64 = 2.0;
 /// Of the rig's deviations, by which an outlier's distance is widened.
@@ -209,6 +211,7 @@ impl<S: Real> Estimator<S> {
             return Update::default();
         }
         self.stats.frames += 1;
+        let tracks = &self.admitted(tracks);
         (self.before, self.last) = (self.predictor(), Some(tracks.t));
         let mut given_up = None;
         if self.running && last.is_some_and(|t| (tracks.t - t).secs() > FRAME_GAP_MAX) {
@@ -238,6 +241,22 @@ impl<S: Real> Estimator<S> {
             _ => self.trust.doubt(),
         }
         update
+    }
+
+    /// Without what no tracker of this rig says: cameras it has not, pixels that are none, ids out of order.
+    fn admitted(&mut self, tracks: &Tracks) -> Tracks {
+        let mut clean = tracks.clone();
+        for (camera, list) in clean.cameras.iter_mut().enumerate() {
+            let before = list.len();
+            let (known, mut last) = (camera < self.model.eyes.len(), None);
+            list.retain(|t| {
+                let ok = known && t.px.iter().all(|x| x.abs() < PX_MAX) && last.is_none_or(|id| t.id > id);
+                last = if ok { Some(t.id) } else { last };
+                ok
+            });
+            self.stats.tracks_rejected += (before - list.len()) as u64;
+        }
+        clean
     }
 
     fn health_of(&mut self, tracks: &Tracks, update: &Update) -> Health {

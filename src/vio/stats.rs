@@ -13,6 +13,8 @@ pub struct Stats {
     pub imu_saturated: u64,
     /// Frames not newer than the last.
     pub frames_rejected: u64,
+    /// Tracks of cameras the rig has not, with pixels that are none, or out of order.
+    pub tracks_rejected: u64,
     pub landmarks_full: u64,
     pub outliers: u64,
     pub solver_failures: u64,
@@ -37,13 +39,14 @@ pub struct Stats {
 
 impl Stats {
     /// What was dropped, refused or went wrong, by name.
-    pub fn counters(&self) -> [(&'static str, u64); 16] {
+    pub fn counters(&self) -> [(&'static str, u64); 17] {
         [
             ("imu_rejected", self.imu_rejected),
             ("imu_overflow", self.imu_overflow),
             ("imu_saturated", self.imu_saturated),
             ("imu_gaps", self.imu_gaps),
             ("frames_rejected", self.frames_rejected),
+            ("tracks_rejected", self.tracks_rejected),
             ("landmarks_full", self.landmarks_full),
             ("outliers", self.outliers),
             ("solver_failures", self.solver_failures),

@@ -1,0 +1,209 @@
+//! Garbage into the estimator and the tracker, mixed with good stretches: what they say stays finite, what
+//! they refuse is counted, nothing panics, and they recover. A few seconds of it in `make test`, a
+//! minute of it in `make soak`. The cases are drawn by proptest from a fixed seed.
+#![allow(clippy::unwrap_used)]
+
+use glam::DVec3;
+use proptest::prelude::*;
+use proptest::test_runner::{Config, TestRunner};
+use stipple::bench::world::{Noise, Path, World, FRAME_SECS, RATE_HZ};
+use stipple::config::{FrontendConfig, VioConfig};
+use stipple::frontend::{Frontend, Prediction, Track, Tracks};
+use stipple::vio::{Update, Vio};
+use stipple_drivers::sim::euroc_rig;
+use stipple_drivers::{Frames, ImuSample, Nanos, Pose};
+
+/// Frames of good data at the end: a divergence noticed, a start, and time to settle.
+const GOOD: usize = 100;
+/// Velocity error after them, m/s.
+const RECOVERED: f64 = 0.2;
+
+#[derive(Clone, Copy, Debug)]
+enum Kind {
+    Good,
+    NotFiniteSamples,
+    HugeSamples,
+    RandomSamples,
+    LateSamples,
+    RandomTracks,
+    NotFiniteTracks,
+    Unsorted,
+    Empty,
+    OneCamera,
+    LateFrames,
+}
+
+const KINDS: [Kind; 11] = [
+    Kind::Good,
+    Kind::NotFiniteSamples,
+    Kind::HugeSamples,
+    Kind::RandomSamples,
+    Kind::LateSamples,
+    Kind::RandomTracks,
+    Kind::NotFiniteTracks,
+    Kind::Unsorted,
+    Kind::Empty,
+    Kind::OneCamera,
+    Kind::LateFrames,
+];
+
+/// Kind and length, frames.
+fn segments() -> impl Strategy<Value = (u64, Vec<(Kind, usize)>)> {
+    (any::<u64>(), prop::collection::vec((prop::sample::select(&KINDS[..]), 1usize..40), 1..6))
+}
+
+fn runner(cases: u32) -> TestRunner {
+    TestRunner::new_with_rng(
+        Config { cases, failure_persistence: None, ..Config::default() },
+        proptest::test_runner::TestRng::deterministic_rng(proptest::test_runner::RngAlgorithm::ChaCha),
+    )
+}
+
+fn spoil_sample(kind: Kind, s: &mut ImuSample, noise: &mut Noise) {
+    match kind {
+        Kind::NotFiniteSamples if noise.uniform() < 0.5 => {
+            let bad = [f64::NAN, f64::INFINITY, f64::NEG_INFINITY][noise.bits() as usize % 3];
+            let hurt = if noise.uniform() < 0.5 { &mut s.gyro_body } else { &mut s.accel_body };
+            hurt[noise.bits() as usize % 3] = bad;
+        }
+        Kind::HugeSamples => {
+            s.gyro_body = noise.vector() * 1e6;
+            s.accel_body = noise.vector() * 10f64.powf(noise.uniform() * 300.0);
+        }
+        Kind::RandomSamples => (s.gyro_body, s.accel_body) = (noise.vector() * 3.0, noise.vector() * 20.0),
+        Kind::LateSamples if noise.uniform() < 0.5 => {
+            let back = [0, 1, 5_000_000, 3_000_000_000, i64::MAX / 2][noise.bits() as usize % 5];
+            s.t = Nanos(s.t.0.saturating_sub(back));
+        }
+        _ => {}
+    }
+}
+
+fn spoil_tracks(kind: Kind, tracks: &mut Tracks, noise: &mut Noise) {
+    let mut pixel = |scale: f64| [(noise.uniform() * scale) as f32, (noise.uniform() * scale) as f32];
+    match kind {
+        Kind::RandomTracks => tracks.cameras.iter_mut().flat_map(|c| c.iter_mut()).for_each(|t| t.px = pixel(700.0)),
+        Kind::NotFiniteTracks => {
+            let bad = [f32::NAN, f32::INFINITY, -f32::INFINITY, f32::MAX, -1e30, 0.0];
+            let list = tracks.cameras.iter_mut().flat_map(|c| c.iter_mut());
+            list.for_each(|t| t.px[t.id as usize % 2] = bad[noise.bits() as usize % bad.len()]);
+        }
+        Kind::Unsorted => {
+            for list in tracks.cameras.iter_mut() {
+                list.reverse();
+                let first = list.first().copied().unwrap_or_default();
+                let _ = list.push(first);
+                let _ = list.push(Track { id: u64::MAX, px: pixel(700.0) });
+            }
+        }
+        Kind::Empty => tracks.cameras.iter_mut().for_each(|c| c.clear()),
+        Kind::OneCamera => tracks.cameras[noise.bits() as usize % 2].clear(),
+        Kind::LateFrames if noise.uniform() < 0.5 => tracks.t = Nanos(tracks.t.0 - (noise.bits() % 200_000_000) as i64),
+        _ => {}
+    }
+}
+
+fn finite(vio: &Vio, update: &Update, kind: Kind) {
+    if let Some(o) = update.odometry {
+        let biases = o.gyro_bias.is_finite() && o.accel_bias.is_finite();
+        assert!(o.world_from_body.is_finite() && o.v_world.is_finite() && biases, "{kind:?}: {o:?}");
+    }
+    if let Some(c) = vio.covariance() {
+        assert!(c.iter().flatten().all(|x| x.is_finite()), "{kind:?}: {c:?}");
+    }
+    assert!(update.quality <= 100);
+}
+
+/// One flight of segments; answers the velocity error at its end, if the estimator is up.
+fn fly(seed: u64, segments: &[(Kind, usize)]) -> Option<f64> {
+    let path = Path { rest: -1.0 };
+    let mut world = World::new(path);
+    let mut noise = Noise(seed);
+    let mut vio = Vio::new(&world.rig, &VioConfig::default());
+    let mut tracks = Tracks::default();
+    let (mut sample, mut sent, mut refused, mut newest) = (0, 0u64, 0u64, Nanos::MIN);
+    let kinds = segments.iter().flat_map(|(kind, n)| std::iter::repeat_n(*kind, *n));
+    let mut error = None;
+    for (frame, kind) in kinds.chain(std::iter::repeat_n(Kind::Good, GOOD)).enumerate() {
+        let t = frame as f64 * FRAME_SECS + 0.0012;
+        while (sample as f64) / RATE_HZ < t + 1.0 / RATE_HZ {
+            let mut s = world.imu(sample as f64 / RATE_HZ);
+            spoil_sample(kind, &mut s, &mut noise);
+            if s.is_finite() && s.t > newest {
+                newest = s.t;
+            } else {
+                refused += 1;
+            }
+            vio.on_imu(s);
+            sample += 1;
+        }
+        world.tracks(t, &mut tracks);
+        spoil_tracks(kind, &mut tracks, &mut noise);
+        let update = vio.on_tracks(&tracks);
+        sent += 1;
+        finite(&vio, &update, kind);
+        let v = |t: f64| (path.pose(t + 1e-4).p - path.pose(t - 1e-4).p) / 2e-4;
+        let in_body = |pose: &Pose, v: DVec3| pose.q.conjugate() * v;
+        error = update.odometry.map(|o| in_body(&o.world_from_body, o.v_world).distance(in_body(&path.pose(t), v(t))));
+    }
+    let s = vio.stats();
+    assert_eq!(s.imu_rejected, refused, "every refused sample is counted");
+    assert_eq!(s.frames + s.frames_rejected, sent, "every frame is counted");
+    error
+}
+
+fn estimator(cases: u32) {
+    let result = runner(cases).run(&segments(), |(seed, segments)| {
+        let error = fly(seed, &segments);
+        prop_assert!(error.is_some_and(|e| e < RECOVERED), "velocity error {error:?} m/s at the end");
+        Ok(())
+    });
+    result.unwrap_or_else(|e| panic!("{e}"));
+}
+
+/// Random images, with stripes and flat stretches, and wild predictions.
+fn tracker(frames: usize) {
+    let rig = euroc_rig();
+    let mut frontend = Frontend::new(&rig, &FrontendConfig::default()).unwrap();
+    let mut images = Frames::for_rig(&rig);
+    let mut noise = Noise(5);
+    for i in 0..frames {
+        images.t = Nanos(i as i64 * 50_000_000);
+        let mode = noise.bits() % 4;
+        for image in &mut images.images {
+            let flat = noise.bits() as u8;
+            for (k, p) in image.pixels.iter_mut().enumerate() {
+                *p = match mode {
+                    0 => noise.bits() as u8,
+                    1 => flat,
+                    2 => ((k / 9 % 2) * 255) as u8,
+                    _ => (k % 752 / 20 * 37 + k / 752 / 20 * 91) as u8,
+                };
+            }
+        }
+        let wild = [0.01, 1.0, 1e6, f64::NAN][noise.bits() as usize % 4];
+        let prev_from_now = Some(Pose { q: glam::DQuat::from_scaled_axis(noise.vector()), p: noise.vector() * wild });
+        let tracks = frontend.track(&images, &Prediction { prev_from_now });
+        for (camera, list) in rig.cameras.iter().zip(&tracks.cameras) {
+            let inside = |t: &Track| {
+                let [x, y] = t.px.map(f64::from);
+                camera.camera.contains(glam::DVec2::new(x, y), 0.0)
+            };
+            assert!(list.iter().all(inside), "frame {i}: {list:?}");
+            assert!(list.windows(2).all(|w| w[0].id < w[1].id), "ids ascend");
+        }
+    }
+}
+
+#[test]
+fn garbage_is_refused_and_forgotten() {
+    estimator(6);
+    tracker(6);
+}
+
+#[test]
+#[ignore = "a minute of it: make soak"]
+fn garbage_for_a_minute() {
+    estimator(90);
+    tracker(100);
+}
