@@ -112,6 +112,71 @@ fn calibration_without_a_key_names_it() {
     refused(&replay(&data, &out, &[]), CONFIG, &["cam1/sensor.yaml", "intrinsics"], &out);
 }
 
+/// A line of cam1's calibration replaced, and what must be said of it.
+const WRONG_CALIBRATIONS: [(&str, &str, &[&str]); 9] = [
+    ("0.0, 0.0, 0.0, 1.0]", "0.0, 0.0, 0.5, 1.0]", &["T_BS", "last row"]),
+    ("rotation", "2.0", &["T_BS", "orthonormal"]),
+    ("rotation", "nan", &["T_BS", "numbers"]),
+    ("intrinsics:", "intrinsics: [0.0, 228.648, 183.3575, 123.9375]", &["intrinsics", "positive"]),
+    ("intrinsics:", "intrinsics: [229.3, -228.6, 183.3575, 123.9375]", &["intrinsics", "positive"]),
+    ("intrinsics:", "intrinsics: [229.3, 228.6, 183.3575]", &["intrinsics", "4 numbers"]),
+    ("resolution:", "resolution: [0, 240]", &["resolution"]),
+    ("distortion_model:", "distortion_model: fisheye62", &["fisheye62", "not known"]),
+    (
+        "distortion_coefficients:",
+        "distortion_coefficients: [.inf, 0.0, 0.0, 0.0]",
+        &["distortion_coefficients", "numbers"],
+    ),
+];
+
+#[test]
+fn wrong_calibration_is_refused_at_boot_by_file_and_key() {
+    let dir = tempfile::tempdir().unwrap();
+    let data = flight(dir.path(), "0.3");
+    let file = data.join("mav0/cam1/sensor.yaml");
+    let whole = fs::read_to_string(&file).unwrap();
+    let out = dir.path().join("out");
+    for (line, replaced, said) in WRONG_CALIBRATIONS {
+        let changed = match line {
+            // The first number of the rotation.
+            "rotation" => {
+                let from = whole.find("data: [").unwrap() + "data: [".len();
+                let to = from + whole[from..].find(',').unwrap();
+                format!("{}{replaced}{}", &whole[..from], &whole[to..])
+            }
+            _ => {
+                let keep =
+                    |l: &str| if l.trim_start().starts_with(line) { replaced.to_string() } else { l.to_string() };
+                whole.lines().map(keep).collect::<Vec<_>>().join("\n")
+            }
+        };
+        assert_ne!(changed, whole, "{line}");
+        fs::write(&file, changed).unwrap();
+        let words = [&["cam1/sensor.yaml"], said].concat();
+        refused(&replay(&data, &out, &[]), CONFIG, &words, &out);
+    }
+}
+
+#[test]
+fn cameras_at_one_place_are_refused_at_boot() {
+    let dir = tempfile::tempdir().unwrap();
+    let data = flight(dir.path(), "0.3");
+    fs::copy(data.join("mav0/cam0/sensor.yaml"), data.join("mav0/cam1/sensor.yaml")).unwrap();
+    let out = dir.path().join("out");
+    refused(&replay(&data, &out, &[]), CONFIG, &["baseline"], &out);
+}
+
+#[test]
+fn images_of_another_size_than_the_calibration_says_are_counted_and_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    let data = flight(dir.path(), "0.3");
+    let file = data.join("mav0/cam1/sensor.yaml");
+    let whole = fs::read_to_string(&file).unwrap();
+    fs::write(&file, whole.replace("resolution: [376, 240]", "resolution: [640, 480]")).unwrap();
+    let out = dir.path().join("out");
+    refused(&replay(&data, &out, &["--set", "map.enabled=false"]), DATA, &["376x240", "640x480"], &out);
+}
+
 #[test]
 fn unknown_key_of_a_board_is_named_with_its_line() {
     let dir = tempfile::tempdir().unwrap();

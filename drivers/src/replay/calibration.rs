@@ -291,10 +291,13 @@ const SIDE_MAX: f64 = 16384.0;
 fn checked(file: &Document, at: &str, size: [f64; 2], f: [f64; 4], lens: Lens) -> Result<Camera, Fault> {
     let wrong = |what: &str| Err(file.fault(at, what));
     if size.iter().any(|s| !(1.0..=SIDE_MAX).contains(s) || s.fract() != 0.0) {
-        return wrong("resolution must be two whole numbers from 1 to 16384");
+        // Basalt keeps sizes beside the intrinsics.
+        let key =
+            if at.contains("intrinsics") { at.replace("intrinsics", "resolution") } else { format!("{at}/resolution") };
+        return Err(file.fault(&key, "resolution must be two whole numbers from 1 to 16384"));
     }
     if !(f[0] > 0.0 && f[1] > 0.0) {
-        return wrong("focal lengths fx and fy must be positive");
+        return Err(file.fault(&format!("{at}/intrinsics"), "focal lengths fx and fy must be positive"));
     }
     if let Lens::DoubleSphere { xi, alpha } = lens {
         if !(0.0..=1.0).contains(&alpha) || xi.abs() >= 1.0 {
