@@ -119,7 +119,7 @@ pub struct VioConfig {
     /// How inertial samples are summed.
     pub preintegration: Scheme,
     /// Refine while flying: the cameras' time offset, where they sit, the scale of the inertial unit's axes; and
-    /// how well each is known before.
+    /// how well each is known before. Extrinsics wrong by an angle need `frontend.epipolar_max` above it.
     pub estimate_time_offset: bool,
     pub estimate_extrinsics: bool,
     pub estimate_imu_scale: bool,

@@ -5,8 +5,9 @@
 
 use glam::{DMat3, DQuat, DVec3};
 use std::sync::OnceLock;
+use stipple::bench::world::{Noise, Path, World, FRAME_SECS, RATE_HZ};
 use stipple::config::{FrontendConfig, VioConfig};
-use stipple::frontend::{Frontend, Prediction};
+use stipple::frontend::{Frontend, Prediction, Tracks};
 use stipple::output::metrics::trajectory_error;
 use stipple::vio::rig::RigEstimate;
 use stipple::vio::Vio;
@@ -180,4 +181,41 @@ fn rigs_of_one_to_four_cameras_are_followed() {
         let found = fly(name, &render(&s), &vio, &frontend);
         assert!(found.poses > 150 && found.ate < 0.03, "{name}");
     }
+}
+
+/// Views at random, twenty a frame: nothing in them fits any rig.
+#[test]
+fn garbage_leaves_the_rig_one_that_could_be() {
+    let all = VioConfig {
+        estimate_time_offset: true,
+        estimate_extrinsics: true,
+        estimate_imu_scale: true,
+        ..VioConfig::default()
+    };
+    let mut world = World::new(Path { rest: -1.0 });
+    let mut vio = Vio::new(&world.rig, &all);
+    let mut noise = Noise(11);
+    let mut tracks = Tracks::default();
+    let mut sample = 0;
+    for frame in 0..300 {
+        let t = frame as f64 * FRAME_SECS + 0.0012;
+        while (sample as f64) / RATE_HZ < t + 1.0 / RATE_HZ {
+            vio.on_imu(world.imu(sample as f64 / RATE_HZ));
+            sample += 1;
+        }
+        world.tracks(t, &mut tracks);
+        if frame % 100 > 40 {
+            for track in tracks.cameras.iter_mut().flat_map(|c| c.iter_mut()) {
+                track.px = [752.0 * noise.uniform() as f32, 480.0 * noise.uniform() as f32];
+            }
+        }
+        if let Some(o) = vio.on_tracks(&tracks).odometry {
+            assert!(o.world_from_body.is_finite() && o.v_world.is_finite(), "frame {frame}");
+        }
+        let rig = vio.rig().unwrap();
+        let numbers = rig.extrinsics.iter().flatten().map(|e| e[0]).chain(rig.imu_scale.map(|s| s[0]));
+        let sane = numbers.flatten().chain(rig.time_offset.map(|t| t[0])).all(|x| x.abs() < 5.0);
+        assert!(sane, "frame {frame}: {rig:?}");
+    }
+    eprintln!("{:?}", vio.stats());
 }

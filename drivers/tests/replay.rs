@@ -317,13 +317,13 @@ fn basalt_axes_and_time_offset_reach_the_samples_and_the_stamps() {
     let json = format!(
         r#"{{"value0":{{"T_imu_cam":[{},{}],"intrinsics":[{lens},{lens}],"resolution":[[32,24],[32,24]],
         "calib_accel_bias":[0.1,0.2,0.3,0.01,0.02,0.03,0.04,0.05,0.06],
-        "calib_gyro_bias":[0.001,0.002,0.003,0.1,0.2,0.3,0.4,0.5,0.6,0.7,0.8,0.9],
+        "calib_gyro_bias":[0.001,0.002,0.003,0.01,0.02,0.03,0.04,0.05,0.06,0.07,0.08,0.09],
         "imu_update_rate":200,"accel_noise_std":[1,1,1],"gyro_noise_std":[1,1,1],
         "accel_bias_std":[1,1,1],"gyro_bias_std":[1,1,1],"cam_time_offset_ns":-3000000}}}}"#,
         pose(0.0),
         pose(0.1)
     );
-    f.write("basalt.json", json);
+    f.write("basalt.json", &json);
     let plain = f.open().unwrap();
     let o = OpenOptions { calibration: Some(f.path("basalt.json")), ..OpenOptions::default() };
     let r = Recording::open(f.0.path(), &o).unwrap();
@@ -331,10 +331,13 @@ fn basalt_axes_and_time_offset_reach_the_samples_and_the_stamps() {
     let (a, b) = (plain.imu[0], r.imu[0]);
     let close = |a: f64, b: f64| assert!((a - b).abs() < 1e-12, "{a} {b}");
     let (w, s) = (a.gyro_body, a.accel_body);
-    close(b.gyro_body.x, w.x + 0.1 * w.x + 0.4 * w.y + 0.7 * w.z - 0.001);
-    close(b.gyro_body.z, w.z + 0.3 * w.x + 0.6 * w.y + 0.9 * w.z - 0.003);
+    close(b.gyro_body.x, w.x + 0.01 * w.x + 0.04 * w.y + 0.07 * w.z - 0.001);
+    close(b.gyro_body.z, w.z + 0.03 * w.x + 0.06 * w.y + 0.09 * w.z - 0.003);
     close(b.accel_body.x, s.x + 0.01 * s.x - 0.1);
     close(b.accel_body.z, s.z + 0.03 * s.x + 0.05 * s.y + 0.06 * s.z - 0.3);
+    f.write("basalt.json", json.replace("0.04,0.05,0.06]", "0.04,0.05,-1.0]"));
+    let fault = Recording::open(f.0.path(), &o).unwrap_err();
+    assert!(fault.exit == Exit::Config && fault.what.contains("calib_accel_bias"), "{fault}");
     let axes = r.calibration.imu.correction;
     assert!((axes.undo(&b).gyro_body - w).length() < 1e-12 && (axes.undo(&b).accel_body - s).length() < 1e-12);
 }

@@ -298,6 +298,7 @@ impl<S: Real> Estimator<S> {
         frame.fix_anchor();
         let Some(slot) = self.window.push(frame) else { return Update::default() };
         self.window.rig.fix_anchor();
+        self.rig_deviations = self.window.rig.sigmas(&self.rig_sigma);
         self.prior.start(slot, &motion, &sigma, (&self.window.rig, &self.rig_sigma));
         self.covariance = Some(self.origin.add_to(sigma.covariance(&motion), &motion));
         self.tracks[slot].clone_from(tracks);
@@ -428,7 +429,11 @@ impl<S: Real> Estimator<S> {
     fn is_sane(&self) -> bool {
         self.window.newest().is_some_and(|n| {
             let m = &self.window.frame(n).now;
-            m.is_finite() && m.v.length() < SPEED_MAX && m.ba.length() < ACCEL_BIAS_MAX && m.bg.length() < GYRO_BIAS_MAX
+            self.window.rig.is_sane()
+                && m.is_finite()
+                && m.v.length() < SPEED_MAX
+                && m.ba.length() < ACCEL_BIAS_MAX
+                && m.bg.length() < GYRO_BIAS_MAX
         })
     }
 

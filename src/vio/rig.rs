@@ -17,6 +17,13 @@ pub const EYE_DIM: usize = 6;
 pub const SCALE_DIM: usize = 6;
 const _: () = assert!(RIG_DIM == TIME_DIM + EYE_DIM * CAMERAS_MAX + SCALE_DIM);
 
+/// Further than this from its calibration a rig is not estimated but lost: s, m, rad, and of scales. The
+/// bounds of the deviations that a board may state lie well within.
+const TIME_OFFSET_MAX: f64 = 0.3;
+const EYE_MOVED_MAX: f64 = 3.0;
+const EYE_TURNED_MAX: f64 = 1.5;
+const SCALE_MAX: f64 = 0.9;
+
 /// What is estimated. Nothing unless the board asks.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Parts {
@@ -196,10 +203,29 @@ impl RigState {
         }
     }
 
-    /// What was learnt stays; the prior that anchored it is gone.
+    /// What was learnt stays, unless it makes no sense; the prior that anchored it is gone.
     pub fn release(&mut self) {
         self.anchored = false;
+        if !self.is_sane() {
+            let body_from_cam = self.calibrated;
+            self.now = Rig { time_offset: 0.0, body_from_cam, gyro_scale: DVec3::ZERO, accel_scale: DVec3::ZERO };
+        }
         self.refresh();
+    }
+
+    /// Whether a rig could be like this.
+    pub fn is_sane(&self) -> bool {
+        let (rig, n) = (&self.now, self.eyes.len());
+        let near = |(a, b): (&Pose, &Pose)| {
+            let turn = so3::log(a.q.conjugate() * b.q).length();
+            a.p.distance(b.p) < EYE_MOVED_MAX && turn < EYE_TURNED_MAX
+        };
+        let scale = rig.gyro_scale.abs().max(rig.accel_scale.abs()).max_element();
+        let finite = rig.gyro_scale.is_finite() && rig.accel_scale.is_finite();
+        rig.time_offset.abs() < TIME_OFFSET_MAX
+            && finite
+            && scale < SCALE_MAX
+            && rig.body_from_cam[..n].iter().zip(&self.calibrated[..n]).all(near)
     }
 
     fn refresh(&mut self) {

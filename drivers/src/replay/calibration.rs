@@ -268,12 +268,20 @@ fn basalt(file: &Document) -> Result<Calibration, Fault> {
     Ok(Calibration { cameras, imu })
 }
 
+/// A unit whose axes are off by more is not one to fly with, and far below this a matrix stays invertible.
+const AXES_MAX: f64 = 0.1;
+
 /// Readings become `(I + S) reading - bias`: the accelerometer's S is lower triangular, the gyro's full, both
 /// by columns after the three numbers of the bias.
 fn basalt_correction(file: &Document) -> Result<ImuCorrection, Fault> {
     let numbers = |key: &str, n: usize| if file.has(key) { file.numbers(key, n) } else { Ok(vec![0.0; n]) };
     let a = numbers("/value0/calib_accel_bias", 9)?;
     let g = numbers("/value0/calib_gyro_bias", 12)?;
+    for (key, values) in [("/value0/calib_accel_bias", &a[3..]), ("/value0/calib_gyro_bias", &g[3..])] {
+        if values.iter().any(|v| v.abs() > AXES_MAX) {
+            return Err(file.fault(key, "scale and misalignment of no more than a tenth, one is larger"));
+        }
+    }
     let columns = |s: [f64; 9]| DMat3::IDENTITY + DMat3::from_cols_array(&s);
     Ok(ImuCorrection {
         gyro_scale: columns(std::array::from_fn(|i| g[3 + i])),
