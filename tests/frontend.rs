@@ -12,7 +12,9 @@ use stipple::mem::{heap_after_seal, seal_thread, unsealed, CountingAllocator};
 use stipple_drivers::replay::{OpenOptions, Recording};
 use stipple_drivers::sim::{rig_named, Scenario, Sim};
 use stipple_drivers::types::pose_at;
-use stipple_drivers::{Calibration, Camera, Frames, ImuCalibration, ImuCorrection, Lens, Nanos, Pose, RigCamera, Span};
+use stipple_drivers::{
+    Calibration, Camera, Frames, Image, ImuCalibration, ImuCorrection, Lens, Nanos, Pose, RigCamera, Span,
+};
 
 #[global_allocator]
 static HEAP: CountingAllocator = CountingAllocator;
@@ -304,6 +306,48 @@ fn a_camera_whose_partner_is_covered_finds_its_own_points() {
     see(&calibration, [0.012, 0.0], 2.0, 0.0, &mut frames);
     let tracks = frontend.track(&frames, &Prediction::default());
     assert!(shared(tracks, 0, 1) >= 12, "{}", shared(tracks, 0, 1));
+}
+
+#[test]
+fn a_camera_with_an_image_of_another_size_sees_nothing_that_frame() {
+    let calibration = rig(320, 240);
+    let cut = |pixels: usize| Image { pixels: vec![0; pixels], ..Image::new(320, 240) };
+    for wrong in [Image::new(160, 240), Image::new(240, 320), Image::new(640, 480), Image::default(), cut(7)] {
+        let mut frontend = Frontend::new(&calibration, &FrontendConfig::default()).unwrap();
+        let mut frames = Frames::for_rig(&calibration);
+        see(&calibration, [0.0; 2], 2.0, 0.0, &mut frames);
+        let before = frontend.track(&frames, &Prediction::default()).clone();
+        let good = std::mem::replace(&mut frames.images[1], wrong);
+        let lost = frontend.stats().lost;
+        let blind = frontend.track(&frames, &Prediction::default()).clone();
+        assert_eq!((frontend.stats().images_refused, blind.cameras[1].len()), (1, 0));
+        assert_eq!(frontend.stats().lost - lost, before.cameras[1].len() as u64);
+        // nothing moved, and the other camera did not notice
+        let kept = blind.cameras[0].iter().filter(|a| before.cameras[0].iter().any(|b| a.id == b.id)).count();
+        assert_eq!(kept, before.cameras[0].len());
+        frames.images[1] = good;
+        let after = frontend.track(&frames, &Prediction::default());
+        assert!(10 * shared(after, 0, 1) >= 9 * shared(&before, 0, 1), "{}", shared(after, 0, 1));
+    }
+}
+
+#[test]
+fn missing_images_blind_their_cameras_and_spare_ones_are_ignored() {
+    let calibration = rig(320, 240);
+    let mut frontend = Frontend::new(&calibration, &FrontendConfig::default()).unwrap();
+    let mut frames = Frames::for_rig(&calibration);
+    see(&calibration, [0.0; 2], 2.0, 0.0, &mut frames);
+    let images = frames.images.clone();
+    let mut refused = 0;
+    for (count, new) in [(0, 2), (2, 0), (1, 1), (2, 0), (0, 2), (3, 1), (0, 2), (2, 0)] {
+        frames.images = images.iter().cycle().take(count).cloned().collect();
+        refused += new;
+        let tracks = frontend.track(&frames, &Prediction::default());
+        for camera in 0..2 {
+            assert_eq!(tracks.cameras[camera].is_empty(), camera >= count, "camera {camera} of {count} images");
+        }
+        assert_eq!(frontend.stats().images_refused, refused, "{count} images");
+    }
 }
 
 fn recording(name: &str) -> Option<Recording> {

@@ -11,7 +11,7 @@ use stipple::config::{FrontendConfig, VioConfig};
 use stipple::frontend::{Frontend, Prediction, Track, Tracks};
 use stipple::vio::{Update, Vio};
 use stipple_drivers::sim::euroc_rig;
-use stipple_drivers::{Frames, ImuSample, Nanos, Pose};
+use stipple_drivers::{Frames, Image, ImuSample, Nanos, Pose};
 
 /// Frames of good data at the end: a divergence noticed, a start, and time to settle.
 const GOOD: usize = 100;
@@ -161,13 +161,34 @@ fn estimator(cases: u32) {
     result.unwrap_or_else(|e| panic!("{e}"));
 }
 
-/// Random images, with stripes and flat stretches, and wild predictions.
+/// Images of another size, missing and left over: answers how many are to be refused.
+fn spoil_images(images: &mut Vec<Image>, noise: &mut Noise) -> u64 {
+    let camera = noise.bits() as usize % images.len();
+    let image = &mut images[camera];
+    match noise.bits() % 10 {
+        0 => *image = Image::new(image.height, image.width),
+        1 => *image = Image::new(noise.bits() as usize % 2000, noise.bits() as usize % 40),
+        2 => image.pixels.truncate(noise.bits() as usize % image.pixels.len()),
+        3 => images.push(Image::default()),
+        4 => {
+            images.truncate(camera);
+            return 2 - camera as u64;
+        }
+        _ => return 0,
+    }
+    1
+}
+
+/// Random images, with stripes and flat stretches, some of another size or missing, and wild predictions.
 fn tracker(frames: usize) {
     let rig = euroc_rig();
     let mut frontend = Frontend::new(&rig, &FrontendConfig::default()).unwrap();
-    let mut images = Frames::for_rig(&rig);
+    let whole = Frames::for_rig(&rig);
+    let mut images = whole.clone();
     let mut noise = Noise(5);
+    let mut refused = 0;
     for i in 0..frames {
+        images.images.clone_from(&whole.images);
         images.t = Nanos(i as i64 * 50_000_000);
         let mode = noise.bits() % 4;
         for image in &mut images.images {
@@ -181,6 +202,7 @@ fn tracker(frames: usize) {
                 };
             }
         }
+        refused += spoil_images(&mut images.images, &mut noise);
         let wild = [0.01, 1.0, 1e6, f64::NAN][noise.bits() as usize % 4];
         let prev_from_now = Some(Pose { q: glam::DQuat::from_scaled_axis(noise.vector()), p: noise.vector() * wild });
         let tracks = frontend.track(&images, &Prediction { prev_from_now });
@@ -192,13 +214,14 @@ fn tracker(frames: usize) {
             assert!(list.iter().all(inside), "frame {i}: {list:?}");
             assert!(list.windows(2).all(|w| w[0].id < w[1].id), "ids ascend");
         }
+        assert_eq!(frontend.stats().images_refused, refused, "frame {i}: every refused image is counted");
     }
 }
 
 #[test]
 fn garbage_is_refused_and_forgotten() {
     estimator(6);
-    tracker(6);
+    tracker(16);
 }
 
 #[test]

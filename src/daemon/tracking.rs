@@ -250,7 +250,10 @@ impl Tracking {
                     ("tracks_lost", f.lost),
                     ("tracks_matched", f.matched),
                     ("tracks_epipolar_rejected", f.epipolar_rejected),
+                    ("tracks_crowded", f.crowded),
                     ("tracks_full", f.full),
+                    // `images_wrong_size` is the reader's.
+                    ("frontend_images_refused", f.images_refused),
                 ];
                 // The first frames of a run that starts in motion, and those after a reset.
                 let without = run.back.frame_ms.len().saturating_sub(run.back.trajectory.len());

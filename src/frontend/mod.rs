@@ -14,7 +14,8 @@
 //! frame finds the point, the patch first seen (the anchor) places it: without an anchor each frame adds its
 //! own rounding to the
 //! drift. A prediction is refined over the fine levels alone, which is faster and slips less; where it fails
-//! the whole pyramid is searched. Same frames and predictions, same bits out.
+//! the whole pyramid is searched. An image that is missing or not of its camera's size is refused: that
+//! camera sees nothing in this frame. Same frames and predictions, same bits out.
 
 pub mod detect;
 pub mod patch;
@@ -28,7 +29,7 @@ use detect::Detector;
 use patch::{align_stack, take_stack, Stack, Template, Warp, STEP_MIN};
 use pyramid::Pyramid;
 use rig::Rig;
-use stipple_drivers::{Calibration, Exit, Fault, Frames, Nanos, Pose};
+use stipple_drivers::{Calibration, Exit, Fault, Frames, Image, Nanos, Pose};
 
 /// A point tracked in one camera. The same `id` in two cameras is the same point in space.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -67,6 +68,8 @@ pub struct Stats {
     pub crowded: u64,
     /// Corners and views that did not fit.
     pub full: u64,
+    /// Images that were missing, not of their camera's size, or of a camera the rig has not.
+    pub images_refused: u64,
 }
 
 /// Levels a prediction is refined over, the full image included; the rest are for where it fails.
@@ -149,6 +152,8 @@ pub struct Frontend {
     spacing_px: f32,
     now: Vec<Pyramid>,
     before: Vec<Pyramid>,
+    /// Cameras whose image was taken; the pyramids of the others hold an old one and are not looked at.
+    seeing: [bool; CAMERAS_MAX],
     detectors: Vec<Detector>,
     /// Ascending id.
     points: Vec<Point>,
@@ -184,6 +189,7 @@ impl Frontend {
             spacing_px: SPACING * config.grid_px as f32,
             now: pyramids(),
             before: pyramids(),
+            seeing: [false; CAMERAS_MAX],
             points: Vec::with_capacity(n * TRACKS),
             patches: (0..n).map(|_| vec![Patch::default(); TRACKS]).collect(),
             free: (0..n).map(|_| (0..TRACKS).rev().collect()).collect(),
@@ -215,10 +221,8 @@ impl Frontend {
     /// Follows all points into the new images, replaces what was lost.
     pub fn track(&mut self, frames: &Frames, prediction: &Prediction) -> &Tracks {
         std::mem::swap(&mut self.now, &mut self.before);
-        for (pyramid, image) in self.now.iter_mut().zip(&frames.images) {
-            pyramid.build(image);
-        }
         self.stats.frames += 1;
+        self.look(&frames.images);
         let median = self.median_inverse_depth();
         self.follow(prediction, median);
         let median = self.median_inverse_depth();
@@ -226,11 +230,33 @@ impl Frontend {
         self.drop_unseen();
         for camera in 0..self.now.len() {
             let first_new = self.points.len();
-            self.detect(camera);
+            if self.seeing[camera] {
+                self.detect(camera);
+            }
             self.find_missing(first_new, median);
         }
         self.publish(frames.t);
         &self.tracks
+    }
+
+    /// Takes the images that are of their camera's size; the cameras of the others lose all their views.
+    fn look(&mut self, images: &[Image]) {
+        let cameras = self.now.len();
+        self.stats.images_refused += images.len().saturating_sub(cameras) as u64;
+        for camera in 0..cameras {
+            let pyramid = &mut self.now[camera];
+            let image = images.get(camera).filter(|image| pyramid.fits(image));
+            self.seeing[camera] = image.is_some();
+            if let Some(image) = image {
+                pyramid.build(image);
+                continue;
+            }
+            self.stats.images_refused += 1;
+            for i in 0..self.points.len() {
+                self.stats.lost += u64::from(self.points[i].views[camera].is_some());
+                self.lose(i, camera);
+            }
+        }
     }
 
     fn median_inverse_depth(&mut self) -> f64 {
@@ -362,7 +388,7 @@ impl Frontend {
             let views = self.points[i].views;
             let Some(from) = self.points[i].first() else { continue };
             for to in 0..self.now.len() {
-                if views[to].is_none() {
+                if views[to].is_none() && self.seeing[to] {
                     self.find_view(i, from, to, median);
                 }
             }

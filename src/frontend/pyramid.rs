@@ -33,7 +33,13 @@ impl Pyramid {
         (0..PYRAMID_LEVELS).map(|l| w[l] * h[l]).sum::<usize>() + 2 * (width + 5)
     }
 
-    /// Fills all levels from an image of the size given at construction.
+    /// Whether an image has the size given at construction, and all its pixels.
+    pub fn fits(&self, image: &Image) -> bool {
+        let full = &self.levels[0];
+        (image.width, image.height, image.pixels.len()) == (full.width, full.height, full.pixels.len())
+    }
+
+    /// Fills all levels from an image that fits.
     pub fn build(&mut self, image: &Image) {
         self.levels[0].copy_from(image);
         for l in 1..PYRAMID_LEVELS {
