@@ -287,7 +287,7 @@ impl Default for GpuConfig {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ReplayConfig {
-    /// Largest stamp difference of a stereo pair, s.
+    /// Largest stamp difference of the images of one frame, s.
     pub pair_tolerance_s: f64,
     /// Gap between inertial samples that counts as a hole, s.
     pub imu_hole_s: f64,

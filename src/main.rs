@@ -23,7 +23,7 @@ struct Cli {
 enum Command {
     /// Play a recording: trajectory, map, renders and report go to DIR
     Replay {
-        /// EuRoC ASL folder (holding mav0), or TUM-VI with a Kalibr camchain.yaml
+        /// EuRoC ASL folder (holding mav0) of one to four cameras, or TUM-VI with a Kalibr camchain.yaml
         dataset: PathBuf,
         /// Board file, see board-configs/
         #[arg(long, value_name = "FILE")]
@@ -32,7 +32,7 @@ enum Command {
         out: PathBuf,
         #[arg(long, value_enum, default_value = "recorded")]
         pace: Pace,
-        /// Skip odometry: poses from this table (EuRoC or TUM csv); every pair it covers is a keyframe
+        /// Skip odometry: poses from this table (EuRoC or TUM csv); every frame it covers is a keyframe
         #[arg(long, value_name = "CSV")]
         poses: Option<PathBuf>,
         /// Every Nth keyframe is never trained on, only evaluated

@@ -386,7 +386,7 @@ fn replay(recording: &Recording, config: &FrontendConfig) -> Run {
     let mut frames = Frames::for_rig(&recording.calibration);
     let mut frontend = Frontend::new(&recording.calibration, config).unwrap();
     let (mut tracks, mut truth, mut last) = (Vec::new(), Vec::new(), None);
-    for i in 0..recording.pairs.len() {
+    for i in 0..recording.frames.len() {
         reader.read(i, &mut frames).unwrap();
         let prev_from_now = last.map(|t| Pose::new(turn(recording, t, frames.t), DVec3::ZERO));
         last = Some(frames.t);

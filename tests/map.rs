@@ -150,16 +150,16 @@ fn recording(name: &str) -> Option<PathBuf> {
     path.is_dir().then_some(path)
 }
 
-/// Every pair with a true pose is a keyframe, every eighth held out, `steps` training steps after each.
+/// Every frame with a true pose is a keyframe, every eighth held out, `steps` training steps after each.
 fn play(mapper: &mut Mapper, recording: &Recording, keyframes: usize, steps: u32) {
     let mut frames = Frames::for_rig(&recording.calibration);
     let mut reader = recording.reader();
     let mut id = 0;
-    for (i, pair) in recording.pairs.iter().enumerate().take(keyframes) {
-        let Some(world_from_body) = pose_at(&recording.truth, pair.t, Span(50_000_000)) else { continue };
+    for (i, frame) in recording.frames.iter().enumerate().take(keyframes) {
+        let Some(world_from_body) = pose_at(&recording.truth, frame.t, Span(50_000_000)) else { continue };
         reader.read(i, &mut frames).unwrap();
         let images = [frames.images[0].clone(), frames.images[1].clone()];
-        mapper.offer(&Keyframe { id, t: pair.t, world_from_body, images, held_out: id % 8 == 7 });
+        mapper.offer(&Keyframe { id, t: frame.t, world_from_body, images, held_out: id % 8 == 7 });
         id += 1;
         train(mapper, steps);
     }

@@ -172,7 +172,7 @@ fn replay(name: &str) -> Option<(Run, [f64; 2])> {
     let recording = Recording::open(&recording(name)?, &OpenOptions::default()).unwrap();
     let mut reader = recording.reader();
     let truth = recording.truth.clone();
-    let count = recording.pairs.len();
+    let count = recording.frames.len();
     Some(follow(&recording.calibration, &recording.imu, truth, count, |i, out| reader.read(i, out).unwrap()))
 }
 

@@ -14,19 +14,19 @@ use stipple_drivers::{Frames, Lens, Span};
 fn assert_clean(path: &Path, pairs: usize) -> Recording {
     let recording = Recording::open(path, &OpenOptions::default()).unwrap();
     assert_eq!(recording.warnings, Vec::<String>::new());
-    assert_eq!(recording.pairs.len(), pairs);
-    assert!(recording.pairs.windows(2).all(|p| p[0].t < p[1].t));
+    assert_eq!(recording.frames.len(), pairs);
+    assert!(recording.frames.windows(2).all(|p| p[0].t < p[1].t));
     let mut reader = recording.reader();
     let mut frames = Frames::for_rig(&recording.calibration);
     for i in 0..pairs {
         reader.read(i, &mut frames).unwrap();
-        assert_eq!(frames.t, recording.pairs[i].t);
+        assert_eq!(frames.t, recording.frames[i].t);
         for image in &frames.images {
             let mean = image.pixels.iter().map(|p| u64::from(*p)).sum::<u64>() / image.pixels.len() as u64;
             assert!((10..245).contains(&mean), "pair {i} is grey on average {mean}");
         }
     }
-    let posed = recording.pairs.iter().filter(|p| pose_at(&recording.truth, p.t, Span(100_000_000)).is_some());
+    let posed = recording.frames.iter().filter(|p| pose_at(&recording.truth, p.t, Span(100_000_000)).is_some());
     assert!(posed.count() * 10 >= pairs * 9, "most pairs have a true pose");
     recording
 }
@@ -111,7 +111,7 @@ fn basalt_calibrations_are_read_whole() {
 fn truncated_jpeg_is_undecodable() {
     let Some(path) = recorded("truncated_jpeg_is_undecodable", "euroc_V1_01_easy_keyframes") else { return };
     let r = Recording::open(&path, &OpenOptions::default()).unwrap();
-    let bytes = fs::read(&r.pairs[0].images[0].path).unwrap();
+    let bytes = fs::read(&r.frames[0].images[0].path).unwrap();
     let f = Folder::new();
     (0..2).for_each(|k| f.replace(&format!("cam{k}/sensor.yaml"), "[32, 24]", "[752, 480]"));
     for part in [2, 100, 700, bytes.len() / 2, bytes.len() * 9 / 10, bytes.len() - 20, bytes.len() - 6, bytes.len()] {

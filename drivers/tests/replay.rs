@@ -15,7 +15,7 @@ use stipple_drivers::{Exit, Frames, Lens, Nanos, Span};
 fn generated_folder_is_clean() {
     let f = Folder::new();
     let r = f.open().unwrap();
-    assert_eq!((r.pairs.len(), r.imu.len(), r.truth.len(), r.warnings.len()), (PAIRS, 80, 2, 0));
+    assert_eq!((r.frames.len(), r.imu.len(), r.truth.len(), r.warnings.len()), (PAIRS, 80, 2, 0));
     assert_eq!((r.imu[1].gyro_body.z, r.imu[1].accel_body.z), (0.2, 9.81));
     assert_eq!((r.truth[1].pose.q.x, r.truth[1].pose.p.x), (1.0, 2.0));
     let mut frames = Frames::for_rig(&r.calibration);
@@ -31,7 +31,7 @@ fn carriage_returns_spaces_and_plain_headlines_are_read() {
         f.write(name, text.trim_start_matches('#').replace(',', " , ").replace('\n', "\r\n\r\n"));
     }
     let r = f.open().unwrap();
-    assert_eq!((r.pairs.len(), r.imu.len(), r.truth.len(), r.warnings.len()), (PAIRS, 80, 2, 0));
+    assert_eq!((r.frames.len(), r.imu.len(), r.truth.len(), r.warnings.len()), (PAIRS, 80, 2, 0));
     r.reader().read(0, &mut Frames::for_rig(&r.calibration)).unwrap();
 }
 
@@ -40,7 +40,7 @@ fn image_without_partner_is_dropped_and_counted() {
     let f = Folder::new();
     f.edit("cam1/data.csv", 4, |_| String::new());
     let (r, counted) = f.one_fault();
-    assert_eq!((r.pairs.len(), counted), (PAIRS - 1, ("images_unpaired", 1)));
+    assert_eq!((r.frames.len(), counted), (PAIRS - 1, ("images_unpaired", 1)));
     assert!(r.warnings[0].contains("cam0/data.csv:4: "), "{:?}", r.warnings);
 }
 
@@ -50,8 +50,8 @@ fn pair_tolerance_is_kept() {
         let f = Folder::new();
         f.edit("cam1/data.csv", 3, |_| format!("{},{}.png", T0 + FRAME + shift, T0 + FRAME));
         let r = f.open().unwrap();
-        assert_eq!((r.pairs.len(), r.counters.images_unpaired), (pairs, unpaired), "{shift}");
-        assert!(r.pairs.iter().all(|p| (p.t.0 - T0) % FRAME == 0), "the stamp is camera 0's");
+        assert_eq!((r.frames.len(), r.counters.images_unpaired), (pairs, unpaired), "{shift}");
+        assert!(r.frames.iter().all(|p| (p.t.0 - T0) % FRAME == 0), "the stamp is camera 0's");
     }
 }
 
@@ -60,7 +60,7 @@ fn closest_of_two_candidates_is_paired() {
     let f = Folder::new();
     f.edit("cam1/data.csv", 3, |l| format!("{},early.png\n{l}", T0 + FRAME - 1_500_000));
     let (r, counted) = f.one_fault();
-    assert_eq!((r.pairs.len(), counted), (PAIRS, ("images_unpaired", 1)));
+    assert_eq!((r.frames.len(), counted), (PAIRS, ("images_unpaired", 1)));
     assert!(r.warnings[0].contains("cam1/data.csv:3: "), "{:?}", r.warnings);
 }
 
@@ -129,7 +129,7 @@ fn images_outside_the_inertial_stream_are_counted_and_kept() {
     let text = fs::read_to_string(f.path("imu0/data.csv")).unwrap();
     f.write("imu0/data.csv", text.lines().take(40).collect::<Vec<_>>().join("\n"));
     let (r, counted) = f.one_fault();
-    assert_eq!((r.pairs.len(), counted), (PAIRS, ("images_outside_imu", 3)));
+    assert_eq!((r.frames.len(), counted), (PAIRS, ("images_outside_imu", 3)));
     assert!(r.warnings[0].contains("cam0/data.csv:5: "), "{:?}", r.warnings);
 }
 
@@ -230,42 +230,91 @@ fn rounded_rotations_are_made_orthonormal() {
 }
 
 #[test]
-fn third_camera_joins_the_rig_and_needs_images() {
+fn rigs_of_one_to_four_cameras_are_read() {
     let f = Folder::new();
-    let copy = |name: &str, to: &str| f.write(to, fs::read(f.path(name)).unwrap());
-    f.write("cam2/sensor.yaml", CAMERA.replace("BASELINE", "0.3"));
-    let (r, counted) = f.one_fault();
-    assert_eq!((r.calibration.cameras.len(), counted), (2, ("calibration_notes", 1)));
-    copy("cam1/data.csv", "cam2/data.csv");
-    for i in 0..PAIRS as i64 {
-        let name = format!("data/{}.png", T0 + i * FRAME);
-        copy(&format!("cam1/{name}"), &format!("cam2/{name}"));
+    f.remove_camera(1);
+    for cameras in 1..=4 {
+        if cameras > 1 {
+            f.add_camera(cameras - 1, 0.1 * cameras as f64);
+        }
+        let r = f.open().unwrap();
+        let mut frames = Frames::for_rig(&r.calibration);
+        r.reader().read(0, &mut frames).unwrap();
+        let read = (r.calibration.cameras.len(), frames.images.len(), r.frames.len(), r.warnings.len());
+        assert_eq!(read, (cameras, cameras, PAIRS, 0));
     }
-    let r = f.open().unwrap();
-    let mut frames = Frames::for_rig(&r.calibration);
-    r.reader().read(0, &mut frames).unwrap();
-    assert_eq!((frames.images.len(), r.pairs.len(), r.warnings.len()), (3, PAIRS, 0));
-    f.edit("cam2/data.csv", 2, |_| String::new());
-    let r = f.open().unwrap();
-    assert_eq!((r.pairs.len(), r.counters.images_unpaired), (PAIRS - 1, 2));
 }
 
 #[test]
-fn kalibr_chain_is_read_and_may_give_steps_between_cameras() {
-    let camera = |pose: &str| {
+fn a_frame_that_lacks_one_of_four_images_is_left_out_and_counted() {
+    let f = Folder::new();
+    (2..4).for_each(|k| f.add_camera(k, 0.1 + 0.1 * k as f64));
+    f.edit("cam3/data.csv", 4, |_| String::new());
+    let (r, counted) = f.one_fault();
+    assert_eq!((r.frames.len(), counted), (PAIRS - 1, ("images_unpaired", 3)));
+    assert!((0..3).all(|k| r.warnings.iter().any(|w| w.contains(&format!("cam{k}/data.csv:4: ")))), "{:?}", r.warnings);
+    assert!(r.frames.iter().all(|f| f.images.len() == 4));
+}
+
+#[test]
+fn too_many_cameras_and_gaps_among_them_are_refused() {
+    let f = Folder::new();
+    f.write("cam4/sensor.yaml", CAMERA.replace("BASELINE", "0.5"));
+    let fault = f.refused(Exit::Data, "mav0", "4 cameras at most");
+    assert!(fault.fix.contains("cam4"), "{fault}");
+    f.remove_camera(4);
+    f.add_camera(3, 0.3);
+    f.refused(Exit::NoInput, "cam2/sensor.yaml", "cannot read");
+    f.add_camera(2, 0.3);
+    f.refused(Exit::Config, "mav0", "cameras 2 and 3");
+    f.replace("cam2/sensor.yaml", "0.3", "0.2");
+    f.open().unwrap();
+    fs::remove_file(f.path("cam2/data.csv")).unwrap();
+    f.refused(Exit::NoInput, "cam2/data.csv", "cannot read");
+}
+
+#[test]
+fn a_calibration_of_another_number_of_cameras_is_refused() {
+    let f = Folder::new();
+    let with = |calibration: &str| {
+        let o = OpenOptions { calibration: Some(f.path(calibration)), ..OpenOptions::default() };
+        Recording::open(f.0.path(), &o)
+    };
+    for (cameras, said) in [(1, "holds 2 cameras, the calibration has 1 camera"), (3, "has 3 cameras")] {
+        f.write("../chain.yaml", camchain(cameras));
+        let fault = with("../chain.yaml").unwrap_err();
+        assert!(fault.exit == Exit::Config && fault.what.contains(said), "{fault}");
+        assert!(fault.fix.contains("replay.calibration"), "{fault}");
+    }
+    f.write("../chain.yaml", camchain(5));
+    let fault = with("../chain.yaml").unwrap_err();
+    assert!(fault.exit == Exit::Config && fault.what.contains("4 cameras at most"), "{fault}");
+    f.write("../chain.yaml", camchain(2));
+    assert_eq!(with("../chain.yaml").unwrap().calibration.cameras.len(), 2);
+}
+
+/// A Kalibr chain of cameras 0.1 m apart; the first says where the unit is, the others step on.
+fn camchain(cameras: usize) -> String {
+    let camera = |k: usize| {
+        let pose = if k == 0 { "T_cam_imu" } else { "T_cn_cnm1" };
         format!(
-            "  {pose}:\n  - [1.0, 0.0, 0.0, -0.1]\n  - [0.0, 1.0, 0.0, 0.0]\n  - [0.0, 0.0, 1.0, 0.0]\n  \
+            "cam{k}:\n  {pose}:\n  - [1.0, 0.0, 0.0, -0.1]\n  - [0.0, 1.0, 0.0, 0.0]\n  - [0.0, 0.0, 1.0, 0.0]\n  \
              - [0.0, 0.0, 0.0, 1.0]\n  camera_model: ds\n  distortion_model: none\n  distortion_coeffs: []\n  \
              intrinsics: [-0.2, 0.57, 20, 20, 15.5, 11.5]\n  resolution: [32, 24]\n  timeshift_cam_imu: 0.001\n"
         )
     };
+    (0..cameras).map(camera).collect()
+}
+
+#[test]
+fn kalibr_chain_is_read_and_may_give_steps_between_cameras() {
     let f = Folder::new();
     fs::remove_file(f.path("cam0/sensor.yaml")).unwrap();
-    let chain = format!("cam0:\n{}cam1:\n{}", camera("T_cam_imu"), camera("T_cn_cnm1"));
+    let chain = camchain(2);
     f.write("../camchain.yaml", &chain);
     let r = f.open().unwrap();
     assert_eq!(r.counters.calibration_notes, 1, "the missing imu_config.yaml");
-    let stamps: Vec<i64> = r.pairs.iter().map(|p| p.t.0).collect();
+    let stamps: Vec<i64> = r.frames.iter().map(|p| p.t.0).collect();
     assert_eq!(stamps[..2], [T0 + 1_000_000, T0 + FRAME + 1_000_000], "in the inertial unit's clock");
     let c = &r.calibration.cameras;
     assert!((c[0].body_from_cam.p.x - 0.1).abs() < 1e-12 && (c[1].body_from_cam.p.x - 0.2).abs() < 1e-12);
@@ -292,7 +341,7 @@ fn a_rolling_shutter_needs_its_readout_time() {
     let stated = OpenOptions { readout: Some(Span::from_secs(0.016)), ..OpenOptions::default() };
     let r = Recording::open(f.0.path(), &stated).unwrap();
     assert!(r.calibration.cameras.iter().all(|c| c.readout == Span(16_000_000)));
-    assert_eq!(r.pairs[0].t.0, T0 + 8_000_000, "the middle row");
+    assert_eq!(r.frames[0].t.0, T0 + 8_000_000, "the middle row");
     for (line, readout) in [
         ("shutter: global", 0),
         ("readout_time: 0.02", 20_000_000),
@@ -327,7 +376,7 @@ fn basalt_axes_and_time_offset_reach_the_samples_and_the_stamps() {
     let plain = f.open().unwrap();
     let o = OpenOptions { calibration: Some(f.path("basalt.json")), ..OpenOptions::default() };
     let r = Recording::open(f.0.path(), &o).unwrap();
-    assert_eq!(r.pairs[0].t.0, T0 - 3_000_000);
+    assert_eq!(r.frames[0].t.0, T0 - 3_000_000);
     let (a, b) = (plain.imu[0], r.imu[0]);
     let close = |a: f64, b: f64| assert!((a - b).abs() < 1e-12, "{a} {b}");
     let (w, s) = (a.gyro_body, a.accel_body);
@@ -443,7 +492,7 @@ proptest! {
         f.write(name, &bytes);
         if let Ok(r) = f.open() {
             let (mut reader, mut frames) = (r.reader(), Frames::for_rig(&r.calibration));
-            for i in 0..r.pairs.len() {
+            for i in 0..r.frames.len() {
                 let _ = reader.read(i, &mut frames);
             }
             prop_assert!(r.imu.iter().all(|s| s.is_finite()));

@@ -332,7 +332,7 @@ fn a_written_run_is_whole_and_can_be_flown_again() {
     assert_eq!(recording.imu.unwrap().len(), sim.imu().len());
     let read = Recording::open(&dir, &OpenOptions::default()).unwrap();
     assert!(read.warnings.is_empty(), "{:?}", read.warnings);
-    assert_eq!((read.pairs.len(), read.imu.len(), read.truth.len()), (17, sim.imu().len(), sim.imu().len()));
+    assert_eq!((read.frames.len(), read.imu.len(), read.truth.len()), (17, sim.imu().len(), sim.imu().len()));
     for (a, b) in read.calibration.cameras.iter().zip(&sim.calibration().cameras) {
         assert_eq!(a.camera, b.camera);
         assert!((a.body_from_cam.inverse() * b.body_from_cam).p.length() < 1e-9);
@@ -433,7 +433,7 @@ fn a_time_offset_moves_stamps_and_not_images_and_its_calibration_moves_them_back
     std::fs::write(&chain, text).unwrap();
     let options = OpenOptions { calibration: Some(chain), ..OpenOptions::default() };
     let read = Recording::open(&out, &options).unwrap();
-    let stamps: Vec<Nanos> = read.pairs.iter().map(|p| p.t).collect();
+    let stamps: Vec<Nanos> = read.frames.iter().map(|p| p.t).collect();
     let taken: Vec<Nanos> = (0..late.frame_count()).map(|i| late.taken(i)).collect();
     assert_eq!(stamps, taken, "Kalibr's shift and ours have the same sign");
 }
@@ -450,7 +450,7 @@ fn a_written_rolling_shutter_comes_back_with_its_middle_rows_at_the_stamp() {
     write_euroc(&mut sim, &out, |_, _| {}).unwrap();
     let read = Recording::open(&out, &OpenOptions::default()).unwrap();
     assert!(read.calibration.cameras.iter().all(|c| c.readout == Span(20_000_000)));
-    assert_eq!(read.pairs[3].t, sim.stamp(3));
+    assert_eq!(read.frames[3].t, sim.stamp(3));
 }
 
 #[test]

@@ -130,8 +130,8 @@ fn read(path: &Path, seconds: f64) -> Result<Flight, Fault> {
     let recording = Recording::open(path, &OpenOptions::default())?;
     let mut reader = recording.reader();
     let mut frames = Vec::new();
-    for (i, pair) in recording.pairs.iter().enumerate() {
-        if (pair.t - recording.pairs[0].t).secs() >= seconds {
+    for (i, frame) in recording.frames.iter().enumerate() {
+        if (frame.t - recording.frames[0].t).secs() >= seconds {
             break;
         }
         let mut images = Frames::for_rig(&recording.calibration);

@@ -69,7 +69,7 @@ impl Input {
             dataset.file_name().map_or_else(|| dataset.display().to_string(), |n| n.to_string_lossy().into_owned());
         Ok(Input {
             name,
-            stamps: r.pairs.iter().map(|p| p.t).collect(),
+            stamps: r.frames.iter().map(|f| f.t).collect(),
             counters: r.counters.list(),
             calibration: r.calibration,
             imu: r.imu,

@@ -17,7 +17,7 @@ use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::time::Instant;
 use stipple_drivers::ImuSample;
 
-/// Frames in memory at once: 24 MiB of 752x480 pairs. What the threads of tracking lose at its ends is
+/// Frames in memory at once: 24 MiB of two 752x480 cameras. What the threads of tracking lose at its ends is
 /// one stage of one frame in so many.
 const BATCH: usize = 32;
 

@@ -14,7 +14,7 @@ use stipple_drivers::{Calibration, Camera, Exit, Fault, ImuCalibration, ImuCorre
 /// Everything a run with this rig takes, without the operating system's and the drivers' own.
 pub fn footprint(calibration: &Calibration, board: &Board) -> Footprint {
     let pixels: usize = calibration.cameras.iter().map(|c| c.camera.width * c.camera.height).sum();
-    let pair: usize = calibration.cameras[..2].iter().map(|c| c.camera.width * c.camera.height).sum();
+    let pair: usize = calibration.cameras.iter().take(2).map(|c| c.camera.width * c.camera.height).sum();
     let mut f = Footprint::default();
     f.host("queues: frames", frame_slots(board.frontend.threads) * (pixels + Slot::BYTES));
     f.extend(Frontend::footprint(calibration, &board.frontend));

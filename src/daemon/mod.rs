@@ -77,7 +77,7 @@ pub fn demo(board: Option<&Path>, out: &Path, set: &[String]) -> Result<(), Faul
 
 fn rendering_progress(done: usize, of: usize) {
     if done % 50 == 0 || done == of {
-        eprintln!("rendering the flight: {done} of {of} stereo pairs");
+        eprintln!("rendering the flight: {done} of {of} frames");
     }
 }
 
@@ -114,7 +114,7 @@ fn run(mut input: Input, place: &str, board: &Board, out: &OutputDir, options: &
     }
     if played.counters.frames_unreadable.get() == asked {
         let first = played.warnings.get(opened).map_or("", String::as_str);
-        let what = format!("none of its {asked} stereo pairs can be read, the first: {first}");
+        let what = format!("none of its {asked} frames can be read, the first: {first}");
         return Err(Fault::new(Exit::Data, place, what, "check that the recording is complete"));
     }
     let report = summary::conclude(title, played, out)?;

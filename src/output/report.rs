@@ -16,7 +16,7 @@ pub struct Report {
     pub scale: Option<u32>,
     pub device: Option<String>,
 
-    /// Stereo pairs tracked; pairs that arrived and were not.
+    /// Frames tracked; frames that arrived and were not.
     pub frames: Option<u64>,
     pub frames_dropped: Option<u64>,
     pub keyframes: Option<u64>,

@@ -30,7 +30,7 @@ impl Rectification {
                 Exit::Config,
                 "calibration",
                 what,
-                "stereo needs cameras 0 and 1 side by side, looking the same way",
+                "a map needs cameras 0 and 1 side by side, looking the same way; without a map: --set map.enabled=false",
             )
         };
         let [left, right, ..] = &calibration.cameras[..] else {

@@ -90,7 +90,7 @@ fn recorded() -> Option<Flight> {
         reader.read(i, &mut frames).unwrap();
         frames
     };
-    let frames = (0..FRAMES.min(recording.pairs.len())).map(read).collect();
+    let frames = (0..FRAMES.min(recording.frames.len())).map(read).collect();
     Some(prepare("MH_01", recording.calibration, recording.imu, frames))
 }
 

@@ -8,8 +8,8 @@
 //! rolling-shutter calibration prints) or `shutter: rolling`; the last alone is refused unless the
 //! board file states the time, which stands above what the files say.
 
+use super::cameras;
 use super::findings::Findings;
-use super::CAMERAS_MAX;
 use crate::calibration::{Calibration, ImuCalibration, ImuCorrection, RigCamera};
 use crate::camera::{Camera, Lens};
 use crate::types::{Pose, Span};
@@ -56,12 +56,31 @@ pub fn read(path: &Path, readout: Option<Span>, findings: &mut Findings) -> Resu
     if let Some(readout) = readout {
         calibration.cameras.iter_mut().for_each(|c| c.readout = readout);
     }
-    let baseline = calibration.cameras[1].body_from_cam.p - calibration.cameras[0].body_from_cam.p;
-    if baseline.length() < 1e-6 {
-        let what = "cameras 0 and 1 are at the same place (zero baseline): stereo has no depth";
-        return Err(Fault::new(Exit::Config, path.display().to_string(), what, "correct their extrinsics"));
+    match doubled(&calibration.cameras) {
+        None => Ok(calibration),
+        Some((i, j)) => {
+            let what = format!("cameras {i} and {j} see the same from the same place (zero baseline): no depth");
+            Err(Fault::new(Exit::Config, path.display().to_string(), what, "correct their extrinsics"))
+        }
     }
-    Ok(calibration)
+}
+
+/// Two cameras at one place whose axes are less than a right angle apart; back to back they may be.
+fn doubled(cameras: &[RigCamera]) -> Option<(usize, usize)> {
+    let axis = |c: &RigCamera| c.body_from_cam.q * DVec3::Z;
+    let same = |a: &RigCamera, b: &RigCamera| {
+        a.body_from_cam.p.distance(b.body_from_cam.p) < 1e-6 && axis(a).dot(axis(b)) > 1e-6
+    };
+    let pairs = (0..cameras.len()).flat_map(|j| (0..j).map(move |i| (i, j)));
+    pairs.into_iter().find(|&(i, j)| same(&cameras[i], &cameras[j]))
+}
+
+/// The number of a file's cameras, where it is one that a rig may have.
+fn admitted(file: &Document, at: &str, count: usize) -> Result<usize, Fault> {
+    match count {
+        0..=cameras::CAMERAS_MAX => Ok(count.max(1)),
+        _ => Err(Fault { fix: "take the others out of it".to_string(), ..file.fault(at, &cameras::too_many(count)) }),
+    }
 }
 
 /// The calibration that a recording carries: sensor.yaml in its folders, else a Kalibr camchain.
@@ -91,11 +110,8 @@ fn sensor_yaml(mav0: &Path, sensor: &str) -> PathBuf {
 
 fn euroc(mav0: &Path, stated: Option<Span>, findings: &mut Findings) -> Result<Calibration, Fault> {
     let mut cameras = Vec::new();
-    for k in 0..CAMERAS_MAX {
+    for k in 0..cameras::recorded(mav0)? {
         let path = sensor_yaml(mav0, &format!("cam{k}"));
-        if k >= 2 && !path.is_file() {
-            break;
-        }
         let file = Document::read(&path)?;
         let camera = yaml_camera(&file, "", "distortion_coefficients")?;
         let readout = readout(&file, "", &camera, stated)?;
@@ -107,11 +123,8 @@ fn euroc(mav0: &Path, stated: Option<Span>, findings: &mut Findings) -> Result<C
 
 fn kalibr(file: &Document, stated: Option<Span>, findings: &mut Findings) -> Result<Calibration, Fault> {
     let mut cameras: Vec<RigCamera> = Vec::new();
-    for k in 0..CAMERAS_MAX {
+    for k in 0..admitted(file, "", cameras::count(file.keys()))? {
         let at = format!("/cam{k}");
-        if k >= 2 && !file.has(&at) {
-            break;
-        }
         let own = format!("{at}/T_cam_imu");
         let chained = format!("{at}/T_cn_cnm1");
         let body_from_cam = match cameras.last() {
@@ -225,11 +238,9 @@ fn basalt(file: &Document) -> Result<Calibration, Fault> {
     let offset = "/value0/cam_time_offset_ns";
     let time_offset = Span(if file.has(offset) { file.number(offset)?.round() as i64 } else { 0 });
     let mut cameras = Vec::new();
-    for k in 0..CAMERAS_MAX {
-        let (at, pose) = (format!("/value0/intrinsics/{k}"), format!("/value0/T_imu_cam/{k}"));
-        if k >= 2 && !file.has(&at) {
-            break;
-        }
+    let lenses = "/value0/intrinsics";
+    for k in 0..admitted(file, lenses, file.length(lenses))? {
+        let (at, pose) = (format!("{lenses}/{k}"), format!("/value0/T_imu_cam/{k}"));
         let size = file.numbers(&format!("/value0/resolution/{k}"), 2)?;
         let number = |name: &str| file.number(&format!("{at}/intrinsics/{name}"));
         let lens = match file.text(&format!("{at}/camera_type"))? {

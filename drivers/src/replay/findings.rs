@@ -40,7 +40,7 @@ counters! {
     images_undecodable,
     /// Image files whose size differs from the calibration's.
     images_wrong_size,
-    /// Image pairs before the first or after the last inertial sample.
+    /// Frames before the first or after the last inertial sample.
     images_outside_imu,
     /// Inertial samples that are not finite.
     imu_not_finite,

@@ -1,9 +1,9 @@
-//! Decoding of one pair's images to 8-bit grey: PNG of 8 or 16 bits (the high byte is taken:
+//! Decoding of one frame's images to 8-bit grey: PNG of 8 or 16 bits (the high byte is taken:
 //! recordings use the full range), grey, palette or colour; JPEG, grey or colour. Decoding is strict, so that
 //! half an image is a fault and not a half-grey picture.
 
 use super::findings::{self, Findings, ReplayCounters};
-use super::pairing::{ImageFile, Pair};
+use super::pairing::{FrameFiles, ImageFile};
 use crate::types::{Frames, Image};
 use std::fmt;
 use std::io::{Cursor, Read};
@@ -18,7 +18,7 @@ pub enum FrameFaultKind {
     WrongSize,
 }
 
-/// Why one pair has no images. The recording goes on without it.
+/// Why one frame has no images. The recording goes on without it.
 #[derive(Clone, Debug, PartialEq)]
 pub struct FrameFault {
     pub kind: FrameFaultKind,
@@ -35,18 +35,18 @@ impl fmt::Display for FrameFault {
 
 impl std::error::Error for FrameFault {}
 
-/// Decodes the pairs of a recording.
+/// Decodes the frames of a recording.
 #[derive(Debug, Default)]
 pub struct Reader {
-    pairs: Vec<Pair>,
+    frames: Vec<FrameFiles>,
     file: Vec<u8>,
     decoded: Vec<u8>,
     findings: Findings,
 }
 
 impl Reader {
-    pub(super) fn new(pairs: Vec<Pair>) -> Reader {
-        Reader { pairs, ..Reader::default() }
+    pub(super) fn new(frames: Vec<FrameFiles>) -> Reader {
+        Reader { frames, ..Reader::default() }
     }
 
     /// Faults of the images read so far; add them to the recording's.
@@ -61,12 +61,12 @@ impl Reader {
 
     /// Fills `out`, which is shaped by `Frames::for_rig`. After a fault its pixels are unspecified.
     ///
-    /// Panics where `index` is not that of a pair or `out` has not one image a camera.
+    /// Panics where `index` is not that of a frame or `out` has not one image a camera.
     pub fn read(&mut self, index: usize, out: &mut Frames) -> Result<(), FrameFault> {
-        let pair = &self.pairs[index];
-        assert_eq!(pair.images.len(), out.images.len(), "Frames::for_rig gives one image a camera");
-        out.t = pair.t;
-        for (file, image) in pair.images.iter().zip(&mut out.images) {
+        let frame = &self.frames[index];
+        assert_eq!(frame.images.len(), out.images.len(), "Frames::for_rig gives one image a camera");
+        out.t = frame.t;
+        for (file, image) in frame.images.iter().zip(&mut out.images) {
             let Err((kind, what)) = read_image(file, &mut self.file, &mut self.decoded, image) else { continue };
             let counter: fn(&mut ReplayCounters) -> &mut u64 = match kind {
                 FrameFaultKind::Missing => |c| &mut c.images_missing,

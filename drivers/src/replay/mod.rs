@@ -1,14 +1,15 @@
-//! Recorded stereo-inertial datasets: EuRoC ASL (`mav0`, sensor.yaml) and TUM-VI (`mav0` beside a
+//! Recorded datasets of one to four cameras and an inertial unit: EuRoC ASL (`mav0`, sensor.yaml) and TUM-VI (`mav0` beside a
 //! Kalibr camchain.yaml), images as 8- or 16-bit PNG or JPEG.
 //!
-//! `Recording::open` reads every table and the calibration, pairs the images by stamp and checks the
-//! inertial stream against them; a `Reader` decodes the images of one pair at a time. What makes the
+//! `Recording::open` reads every table and the calibration, makes frames of the images by stamp and checks the
+//! inertial stream against them; a `Reader` decodes the images of one frame at a time. What makes the
 //! whole recording useless (no calibration, an empty table) is a `Fault`; what spoils one row or one
 //! image costs that row or image, a named counter and a warning with file and line. Stamps that do
 //! not grow are dropped so that the most rows stay (`order`), hence one corrupt stamp far in the
 //! future costs itself and not the rest of the recording.
 
 mod calibration;
+mod cameras;
 mod findings;
 mod images;
 mod order;
@@ -17,9 +18,10 @@ mod table;
 mod trajectory;
 
 pub use calibration::read_calibration;
+pub use cameras::CAMERAS_MAX;
 pub use findings::ReplayCounters;
 pub use images::{FrameFault, FrameFaultKind, Reader};
-pub use pairing::{ImageFile, Pair};
+pub use pairing::{FrameFiles, ImageFile};
 pub use trajectory::read_trajectory;
 
 use crate::types::{ImuSample, Nanos, Span, TimedPose};
@@ -29,12 +31,9 @@ use glam::DVec3;
 use std::path::{Path, PathBuf};
 use table::Row;
 
-/// Cameras read from one recording at most; the first two are required.
-pub const CAMERAS_MAX: usize = 4;
-
 #[derive(Clone, Debug, PartialEq)]
 pub struct OpenOptions {
-    /// Largest stamp difference of images of one pair.
+    /// Largest stamp difference of images of one frame.
     pub pair_tolerance: Span,
     /// Gap between inertial samples that counts as a hole.
     pub imu_hole: Span,
@@ -57,7 +56,7 @@ impl Default for OpenOptions {
 pub struct Recording {
     pub calibration: Calibration,
     pub imu: Vec<ImuSample>,
-    pub pairs: Vec<Pair>,
+    pub frames: Vec<FrameFiles>,
     /// Ground truth, `world_from_body`; empty where the recording has none.
     pub truth: Vec<TimedPose>,
     /// "file:line: what", at most `findings::WARNINGS_OF_A_KIND` of each kind.
@@ -70,27 +69,27 @@ impl Recording {
     pub fn open(dataset: &Path, options: &OpenOptions) -> Result<Recording, Fault> {
         let (home, mav0) = layout(dataset)?;
         let mut findings = Findings::default();
-        let mut calibration = match &options.calibration {
+        let calibration = match &options.calibration {
             Some(path) => calibration::read(path, options.readout, &mut findings)?,
             None => calibration::of_recording(&home, &mav0, options.readout, &mut findings)?,
         };
-        let lists = pairing::image_lists(&mav0, &mut calibration, &mut findings)?;
-        let pairs = pairing::pair(&mav0, &lists, options.pair_tolerance, &mut findings)?;
+        let lists = pairing::image_lists(&mav0, &calibration, &mut findings)?;
+        let frames = pairing::into_frames(&mav0, &lists, options.pair_tolerance, &mut findings)?;
         let mut imu = read_imu(&mav0.join("imu0/data.csv"), options.imu_hole, &mut findings)?;
         imu.iter_mut().for_each(|s| *s = calibration.imu.correction.apply(s));
-        check_cover(&pairs, &imu, &mut findings);
+        check_cover(&frames, &imu, &mut findings);
         let truth = ["state_groundtruth_estimate0/data.csv", "mocap0/data.csv"]
             .into_iter()
             .map(|name| mav0.join(name))
             .find(|path| path.is_file())
             .map_or(Ok(Vec::new()), |path| trajectory::read(&path, &mut findings))?;
         let Findings { warnings, counters } = findings;
-        Ok(Recording { calibration, imu, pairs, truth, warnings, counters })
+        Ok(Recording { calibration, imu, frames, truth, warnings, counters })
     }
 
-    /// A decoder of the pairs with scratch of its own, for a thread of its own.
+    /// A decoder of the frames with scratch of its own, for a thread of its own.
     pub fn reader(&self) -> Reader {
-        Reader::new(self.pairs.clone())
+        Reader::new(self.frames.clone())
     }
 }
 
@@ -142,11 +141,11 @@ fn read_imu(path: &Path, hole: Span, findings: &mut Findings) -> Result<Vec<ImuS
     Ok(rows.into_iter().map(|r: Row<ImuSample>| r.value).collect())
 }
 
-/// Pairs outside the inertial stream stay (mapping with given poses can use them) but are counted.
-fn check_cover(pairs: &[Pair], imu: &[ImuSample], findings: &mut Findings) {
+/// Frames outside the inertial stream stay (mapping with given poses can use them) but are counted.
+fn check_cover(frames: &[FrameFiles], imu: &[ImuSample], findings: &mut Findings) {
     let (Some(first), Some(last)) = (imu.first(), imu.last()) else { return };
-    for pair in pairs.iter().filter(|p| p.t < first.t || p.t > last.t) {
-        let image = &pair.images[0];
+    for frame in frames.iter().filter(|f| f.t < first.t || f.t > last.t) {
+        let image = &frame.images[0];
         let what = "image outside the span of the inertial samples";
         findings.warn(|c| &mut c.images_outside_imu, &image.list, image.line, what);
     }

@@ -1,8 +1,8 @@
-//! Image lists of the cameras and the pairs made of them.
+//! Image lists of the cameras, and the frames made of them: one image of every camera, taken together.
 
 use super::findings::Findings;
 use super::table::{self, Row};
-use super::{order, CAMERAS_MAX};
+use super::{cameras, order};
 use crate::types::{Nanos, Span};
 use crate::{Calibration, Exit, Fault};
 use std::path::{Path, PathBuf};
@@ -18,7 +18,7 @@ pub struct ImageFile {
 
 /// One image of every camera, taken together; `t` is camera 0's stamp in the inertial unit's clock.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Pair {
+pub struct FrameFiles {
     pub t: Nanos,
     pub images: Vec<ImageFile>,
 }
@@ -28,27 +28,19 @@ pub struct ImageRow {
     file: String,
 }
 
-/// The image lists of the calibrated cameras. Cameras beyond the second that were not recorded
-/// leave the calibration.
+/// The image lists of all cameras, each of which must be calibrated and recorded.
 pub fn image_lists(
     mav0: &Path,
-    calibration: &mut Calibration,
+    calibration: &Calibration,
     findings: &mut Findings,
 ) -> Result<Vec<Vec<Row<ImageRow>>>, Fault> {
+    let (recorded, calibrated) = (cameras::recorded(mav0)?, calibration.cameras.len());
+    if recorded != calibrated {
+        let what = format!("holds {}, the calibration has {}", cameras::named(recorded), cameras::named(calibrated));
+        let fix = "take the others out of the one that has more, or name the right calibration with replay.calibration";
+        return Err(Fault::new(Exit::Config, mav0.display().to_string(), what, fix));
+    }
     let list = |k: usize| list_path(mav0, k);
-    for k in 2..calibration.cameras.len() {
-        if !list(k).is_file() {
-            let what = format!("cameras {k} and above are calibrated but not recorded: not used");
-            findings.warn(|c| &mut c.calibration_notes, &list(k), 0, what);
-            calibration.cameras.truncate(k);
-            break;
-        }
-    }
-    let unused = list(calibration.cameras.len());
-    if unused.is_file() {
-        let what = format!("recorded but not calibrated, or beyond {CAMERAS_MAX} cameras: not used");
-        findings.warn(|c| &mut c.calibration_notes, &unused, 0, what);
-    }
     let parse = |fields: &[&str]| match fields {
         [t, file] if !file.is_empty() => Some(ImageRow { t: Nanos(t.parse().ok()?), file: file.to_string() }),
         _ => None,
@@ -59,7 +51,7 @@ pub fn image_lists(
         rows.iter_mut().for_each(|r| r.value.t = calibration.cameras[k].to_imu_clock(r.value.t));
         Ok(rows)
     };
-    (0..calibration.cameras.len()).map(read).collect()
+    (0..recorded).map(read).collect()
 }
 
 fn list_path(mav0: &Path, camera: usize) -> PathBuf {
@@ -67,16 +59,16 @@ fn list_path(mav0: &Path, camera: usize) -> PathBuf {
 }
 
 /// Walks all lists together, oldest first: an image whose partners are all within the tolerance
-/// makes a pair with them, any other is unpaired.
-pub fn pair(
+/// makes a frame with them, any other is unpaired: a frame that lacks one camera's image is none.
+pub fn into_frames(
     mav0: &Path,
     lists: &[Vec<Row<ImageRow>>],
     tolerance: Span,
     findings: &mut Findings,
-) -> Result<Vec<Pair>, Fault> {
+) -> Result<Vec<FrameFiles>, Fault> {
     let paths: Vec<Arc<Path>> = (0..lists.len()).map(|k| list_path(mav0, k).into()).collect();
     let mut heads = vec![0usize; lists.len()];
-    let mut pairs = Vec::new();
+    let mut frames = Vec::new();
     loop {
         let stamp = |k: usize, ahead: usize| lists[k].get(heads[k] + ahead).map(|r| r.value.t);
         let cameras = 0..lists.len();
@@ -94,7 +86,7 @@ pub fn pair(
                 let path = paths[k].with_file_name("data").join(&row.value.file);
                 ImageFile { path, list: paths[k].clone(), line: row.line }
             };
-            pairs.push(Pair { t: lists[0][heads[0]].value.t, images: cameras.map(image).collect() });
+            frames.push(FrameFiles { t: lists[0][heads[0]].value.t, images: cameras.map(image).collect() });
             heads.iter_mut().for_each(|h| *h += 1);
         } else {
             let line = lists[oldest][heads[oldest]].line;
@@ -103,10 +95,10 @@ pub fn pair(
             heads[oldest] += 1;
         }
     }
-    if pairs.is_empty() {
+    if frames.is_empty() {
         let what = format!("no image has a partner within {:.4} s in every camera", tolerance.secs());
         let fix = "check that the cameras are synchronised, or raise replay.pair_tolerance_s";
         return Err(Fault::new(Exit::Data, mav0.display().to_string(), what, fix));
     }
-    Ok(pairs)
+    Ok(frames)
 }

@@ -20,7 +20,7 @@ pub struct Scenario {
     pub seed: u64,
     /// Length of the run; a recorded path may end sooner.
     pub duration: Span,
-    /// Stereo pairs a second.
+    /// Frames a second.
     pub rate_hz: f64,
     /// The rig at full resolution.
     pub calibration: Calibration,

@@ -94,6 +94,19 @@ impl Folder {
         fs::write(self.path(name), content).unwrap();
     }
 
+    /// One more camera, which sees what camera 0 does.
+    pub fn add_camera(&self, k: usize, baseline: f64) {
+        let copy =
+            |name: &str| self.write(&format!("cam{k}/{name}"), fs::read(self.path(&format!("cam0/{name}"))).unwrap());
+        self.write(&format!("cam{k}/sensor.yaml"), CAMERA.replace("BASELINE", &format!("{baseline}")));
+        copy("data.csv");
+        (0..PAIRS as i64).for_each(|i| copy(&format!("data/{}.png", T0 + i * FRAME)));
+    }
+
+    pub fn remove_camera(&self, k: usize) {
+        fs::remove_dir_all(self.path(&format!("cam{k}"))).unwrap();
+    }
+
     /// Replaces the text of line `line` (1 is the first).
     pub fn edit(&self, name: &str, line: usize, f: impl Fn(&str) -> String) {
         let text = fs::read_to_string(self.path(name)).unwrap();

@@ -40,6 +40,16 @@ impl Document {
         self.root.pointer(key).is_some()
     }
 
+    /// The keys of the outermost level.
+    pub fn keys(&self) -> impl Iterator<Item = &str> {
+        self.root.as_object().into_iter().flat_map(|o| o.keys().map(String::as_str))
+    }
+
+    /// Of the list there; 0 where there is none.
+    pub fn length(&self, key: &str) -> usize {
+        self.root.pointer(key).and_then(Value::as_array).map_or(0, Vec::len)
+    }
+
     /// Where the key stands, or the deepest part of it that is there; 0 if none is.
     pub fn line(&self, key: &str) -> usize {
         let mut found = 0;

@@ -1,0 +1,57 @@
+//! How many cameras a recording or a calibration has: cam0, cam1 and so on without a gap, at most
+//! `CAMERAS_MAX`. A gap is found when the missing one is read, so that its file or key is named.
+
+use crate::{Exit, Fault};
+use std::path::Path;
+
+/// Cameras of one rig at most; as many as the estimator takes.
+pub const CAMERAS_MAX: usize = 4;
+
+/// One more than the highest number among these names of cameras; others are passed over.
+pub fn count<'a>(names: impl Iterator<Item = &'a str>) -> usize {
+    names.filter_map(number).map(|k| k.saturating_add(1)).max().unwrap_or(0)
+}
+
+/// Of `cam12`, 12.
+fn number(name: &str) -> Option<usize> {
+    let digits = name.strip_prefix("cam")?;
+    digits.bytes().all(|b| b.is_ascii_digit()).then(|| digits.parse().ok())?
+}
+
+/// The folders of cameras in `mav0`; one at least, as a recording without any lacks cam0.
+pub fn recorded(mav0: &Path) -> Result<usize, Fault> {
+    let entries = std::fs::read_dir(mav0).map_err(|e| {
+        Fault::new(Exit::NoInput, mav0.display().to_string(), format!("cannot read: {e}"), "check the path")
+    })?;
+    let folders = entries.flatten().filter(|e| e.path().is_dir());
+    let names: Vec<String> = folders.map(|e| e.file_name().to_string_lossy().into_owned()).collect();
+    let count = count(names.iter().map(String::as_str)).max(1);
+    if count > CAMERAS_MAX {
+        let fix = format!("move the folders from cam{CAMERAS_MAX} on elsewhere");
+        return Err(Fault::new(Exit::Data, mav0.display().to_string(), too_many(count), fix));
+    }
+    Ok(count)
+}
+
+pub fn too_many(count: usize) -> String {
+    format!("holds cam{}, a rig has {CAMERAS_MAX} cameras at most (cam0 to cam{})", count - 1, CAMERAS_MAX - 1)
+}
+
+/// "1 camera", "4 cameras".
+pub fn named(count: usize) -> String {
+    format!("{count} camera{}", if count == 1 { "" } else { "s" })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_names_of_cameras_count() {
+        assert_eq!(count(["imu0", "cam0", "camera", "cam", "cam-1", "camx", "depth0"].into_iter()), 1);
+        assert_eq!(count(["cam12", "cam0"].into_iter()), 13);
+        assert_eq!(count(["cam99999999999999999999999"].into_iter()), 0);
+        assert_eq!(count([format!("cam{}", usize::MAX).as_str()].into_iter()), usize::MAX);
+        assert_eq!(count([].into_iter()), 0);
+    }
+}
