@@ -118,7 +118,7 @@ fn run(mut input: Input, place: &str, board: &Board, out: &OutputDir, options: &
         return Err(Fault::new(Exit::Data, place, what, "check that the recording is complete"));
     }
     let report = summary::conclude(title, played, out)?;
-    println!("{}", summary::six_lines(&report, out));
+    println!("{}", summary::seven_lines(&report, out));
     Ok(())
 }
 

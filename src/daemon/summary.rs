@@ -1,4 +1,4 @@
-//! What a finished run says: the report, the files of DIR, six lines.
+//! What a finished run says: the report, the files of DIR, seven lines.
 
 use super::memory::mib;
 use super::play::Played;
@@ -224,7 +224,7 @@ fn kernel_time(k: crate::gpu::Timing) -> KernelTime {
 }
 
 /// Six lines a person reads.
-pub fn six_lines(r: &Report, out: &OutputDir) -> String {
+pub fn seven_lines(r: &Report, out: &OutputDir) -> String {
     let or_dash = |v: Option<f64>, digits: usize, unit: &str| {
         v.map_or_else(|| "-".to_string(), |v| format!("{v:.digits$} {unit}"))
     };
@@ -233,6 +233,7 @@ pub fn six_lines(r: &Report, out: &OutputDir) -> String {
     format!(
         "trajectory  ATE {}, 1 s: {} {}\n\
          tracking    {} frames ({} dropped), {} a frame, {} at the 99th percentile\n\
+         odometry    {} frames/s on {} threads, {} of CPU a frame, {}, quality {}, hash {}\n\
          map         {} keyframes, {} anchors, {} Gaussians, {} iterations of {}\n\
          quality     {} PSNR, {} SSIM; held out {} ({} with the pose refined)\n\
          memory      GPU {}, resident {}, {} heap allocations after the seal\n\
@@ -244,6 +245,12 @@ pub fn six_lines(r: &Report, out: &OutputDir) -> String {
         count(r.frames_dropped),
         or_dash(r.tracking_ms_p50, 1, "ms"),
         or_dash(r.tracking_ms_p99, 1, "ms"),
+        r.tracking_fps.map_or_else(|| "-".to_string(), |v| format!("{v:.0}")),
+        count(r.tracking_threads.map(u64::from)),
+        or_dash(r.tracking_cpu_ms, 1, "ms"),
+        bytes(r.estimator_bytes),
+        count(r.quality_p50.map(u64::from)),
+        r.vio_hash.as_deref().unwrap_or("-"),
         count(r.keyframes),
         count(r.anchors),
         count(r.splats),
