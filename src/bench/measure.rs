@@ -36,8 +36,8 @@ pub struct Figures {
 }
 
 pub fn measure(flight: &Flight, setting: &Setting) -> Result<Figures, Fault> {
-    if setting.double {
-        measure_in::<f64>(flight, &setting.board)
+    if setting.single {
+        measure_in::<f32>(flight, &setting.board)
     } else {
         measure_in::<Scalar>(flight, &setting.board)
     }

@@ -34,7 +34,7 @@ const SCHEMES: [Named; 2] = [("euler", &["vio.preintegration=euler"]), ("rk4", &
 pub const SHAPE: &str = "shape";
 /// The other scalar of the estimator's linear algebra, which no board chooses.
 const SCALAR: &str = "scalar";
-const DOUBLE: &str = "scalar f64";
+const SINGLE: &str = "scalar f32";
 const SCHEME: &str = "preintegration";
 /// A name and its assignments.
 type Named = (&'static str, &'static [&'static str]);
@@ -47,8 +47,8 @@ pub struct Setting {
     pub name: String,
     pub set: Vec<String>,
     pub board: Board,
-    /// Linear algebra in f64 and not in `vio::Scalar`.
-    pub double: bool,
+    /// Linear algebra in f32 and not in `vio::Scalar`.
+    pub single: bool,
 }
 
 /// A curve of the plots: settings by index, along the parameter.
@@ -61,7 +61,7 @@ pub struct Curve {
 
 fn setting(name: String, set: Vec<String>) -> Setting {
     let board = Board::parse("board-configs/lavapipe.toml", BOARD, &set).expect("the sweep stays within the bounds");
-    Setting { name, set, board, double: false }
+    Setting { name, set, board, single: false }
 }
 
 fn assigned(key: &str, value: f64) -> Setting {
@@ -80,17 +80,17 @@ pub fn all() -> Vec<Setting> {
     for (family, members, _) in FAMILIES {
         all.extend(members.iter().map(|(name, set)| setting(format!("{family} {name}"), owned(set))));
     }
-    all.push(double());
+    all.push(single());
     all
 }
 
-fn double() -> Setting {
-    Setting { double: true, ..setting(DOUBLE.into(), vec![]) }
+fn single() -> Setting {
+    Setting { single: true, ..setting(SINGLE.into(), vec![]) }
 }
 
 /// The default in both precisions.
 pub fn defaults() -> Vec<Setting> {
-    vec![setting(DEFAULT.into(), vec![]), double()]
+    vec![setting(DEFAULT.into(), vec![]), single()]
 }
 
 /// The default and one cheaper setting.
@@ -117,7 +117,7 @@ pub fn curves(settings: &[Setting]) -> Vec<Curve> {
         points.insert(points.len().min(below_default), (DEFAULT.into(), 0));
         curves.push(curve(family, points));
     }
-    let scalars = [Some((Scalar::NAME.to_string(), 0)), find(DOUBLE).map(|i| ("f64".to_string(), i))];
+    let scalars = [find(SINGLE).map(|i| ("f32".to_string(), i)), Some((Scalar::NAME.to_string(), 0))];
     curves.push(curve(SCALAR, scalars.into_iter().flatten().collect()));
     curves.retain(|c| c.settings.len() > 1);
     curves
@@ -147,7 +147,7 @@ mod tests {
         assert!(settings[0].set.is_empty() && curves.iter().all(|c| c.settings.contains(&0)));
         for (i, s) in settings.iter().enumerate().skip(1) {
             assert!(curves.iter().any(|c| c.settings.contains(&i)), "{} is on no curve", s.name);
-            assert!(s.double || s.board != settings[0].board, "{} is the default", s.name);
+            assert!(s.single || s.board != settings[0].board, "{} is the default", s.name);
         }
     }
 }

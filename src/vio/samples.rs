@@ -7,17 +7,40 @@ use crate::limits::IMU_BETWEEN_FRAMES;
 use glam::DVec3;
 use stipple_drivers::{ImuSample, Nanos, Span};
 
+/// A stamp further ahead than this of the one before it is not believed alone, s.
+const LEAP_MAX: f64 = 5.0;
+
+/// Refuses a stamp that leaps ahead, since believing it would make every later one too old; the next that
+/// agrees with it is believed.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Leap {
+    to: Option<Nanos>,
+}
+
+impl Leap {
+    pub fn refuses(&mut self, last: Option<Nanos>, t: Nanos) -> bool {
+        let far = |from: Nanos| (t - from).secs() > LEAP_MAX;
+        if !last.is_some_and(far) || self.to.is_some_and(|to| t > to && !far(to)) {
+            self.to = None;
+            return false;
+        }
+        self.to = Some(t);
+        true
+    }
+}
+
 /// The newest samples; old ones are overwritten.
 #[derive(Clone, Debug)]
 pub struct ImuRing {
     samples: Vec<ImuSample>,
     /// Samples ever pushed.
     count: usize,
+    leap: Leap,
 }
 
 impl ImuRing {
     pub fn new() -> ImuRing {
-        ImuRing { samples: vec![ImuSample::default(); IMU_BETWEEN_FRAMES], count: 0 }
+        ImuRing { samples: vec![ImuSample::default(); IMU_BETWEEN_FRAMES], count: 0, leap: Leap::default() }
     }
 
     pub const BYTES: usize = IMU_BETWEEN_FRAMES * size_of::<ImuSample>();
@@ -26,9 +49,10 @@ impl ImuRing {
         self.count = 0;
     }
 
-    /// Whether a sample is finite and newer than the last.
-    pub fn admits(&self, s: &ImuSample) -> bool {
-        s.is_finite() && self.newest().is_none_or(|n| s.t > n.t)
+    /// Whether a sample is finite, newer than the last, and does not leap ahead of it.
+    pub fn admits(&mut self, s: &ImuSample) -> bool {
+        let last = self.newest().map(|n| n.t);
+        s.is_finite() && last.is_none_or(|n| s.t > n) && !self.leap.refuses(last, s.t)
     }
 
     /// Returns the sample that was overwritten.

@@ -281,3 +281,25 @@ fn prediction_meets_the_next_estimate() {
     assert!((last.1 * motion).p.distance(predicted.world_from_body.p) < 0.005);
     assert_eq!(motion, published.motion(&vio.imu, last.0, t), "a tracker of its own predicts the same");
 }
+
+#[test]
+fn uncertainty_of_position_and_yaw_only_grows() {
+    fn sigmas<S: Real>() -> Vec<(f64, f64)> {
+        let mut world = World::new(Path { rest: -1.0 });
+        let mut vio = Estimator::<S>::new(&world.rig, &VioConfig::default());
+        let mut after = Vec::new();
+        for frames in [0..100, 100..300, 300..600] {
+            run(&mut vio, frames, &mut world);
+            let c = vio.covariance().expect("running");
+            let world_from_body = vio.window.frame(vio.window.newest().expect("running")).now.pose.rotation();
+            let theta = nalgebra::Matrix3::from_fn(|i, j| c[3 + i][3 + j]);
+            let up = world_from_body.transpose() * DVec3::Z;
+            let up = nalgebra::Vector3::new(up.x, up.y, up.z);
+            after.push(((0..3).map(|i| c[i][i]).sum::<f64>().sqrt(), up.dot(&(theta * up)).sqrt()));
+        }
+        after
+    }
+    let (single, double) = (sigmas::<f32>(), sigmas::<f64>());
+    eprintln!("position, m, and yaw, rad, after 5, 15 and 30 s: {double:.4?} in f64, {single:.4?} in f32");
+    assert!(double.windows(2).all(|w| w[1].0 > w[0].0 && w[1].1 > w[0].1), "{double:?}");
+}
