@@ -80,10 +80,10 @@ impl Default for FrontendConfig {
     fn default() -> Self {
         FrontendConfig {
             threads: 2,
-            grid_px: 50,
+            grid_px: 60,
             fast_threshold: 40,
             fast_threshold_min: 5,
-            iterations: 5,
+            iterations: 3,
             recovered_max_px: 0.2,
             epipolar_max: 0.005,
         }
@@ -137,7 +137,7 @@ impl Default for VioConfig {
         VioConfig {
             observation_sigma_px: 0.5,
             huber_px: 1.0,
-            iterations_max: 7,
+            iterations_max: 4,
             states: 3,
             keyframes: 7,
             keyframe_connected_min: 0.7,

@@ -29,8 +29,10 @@ pub const SECONDS: f64 = 12.0;
 pub const SECONDS_MAX: f64 = 40.0;
 /// The quick run ends while its flight is still near its start.
 const QUICK_SECONDS: f64 = 4.0;
-/// A setting is as accurate as the best when its error is at most this many times the best's.
-const AS_GOOD: f64 = 1.1;
+/// A setting is as accurate as the best when its error is at most this many times the best's, and as fast as
+/// the fastest of those at this many times its run time: what the flights and the clock can tell apart.
+const AS_GOOD: f64 = 1.15;
+const AS_FAST: f64 = 1.1;
 
 pub struct Options {
     /// Folder of recordings; otherwise that of `$STIPPLE_RECORDINGS`, otherwise one beside the project.
@@ -146,12 +148,14 @@ impl Sweep {
     }
 }
 
-/// The fastest among (time, error) whose error is within 10 % of the best.
+/// Among (time, error), the fastest of those as good as the best; the first, which is the default, when it
+/// is as good and as fast as any.
 fn knee(points: &[Option<(f64, f64)>]) -> Option<usize> {
     let best = points.iter().flatten().map(|p| p.1).min_by(f64::total_cmp)?;
     let near = |p: &(f64, f64)| p.1 <= AS_GOOD * best;
     let candidates = points.iter().enumerate().filter_map(|(i, p)| p.filter(near).map(|p| (i, p.0)));
-    candidates.min_by(|a, b| a.1.total_cmp(&b.1)).map(|c| c.0)
+    let (fastest, ms) = candidates.clone().min_by(|a, b| a.1.total_cmp(&b.1))?;
+    Some(candidates.take(1).find(|(i, t)| *i == 0 && *t <= AS_FAST * ms).map_or(fastest, |c| c.0))
 }
 
 #[cfg(test)]
@@ -160,8 +164,10 @@ mod tests {
 
     #[test]
     fn knee_is_the_fastest_of_those_as_good_as_the_best() {
-        let points = [Some((9.0, 1.0)), Some((4.0, 1.09)), Some((2.0, 1.11)), None, Some((5.0, 1.05))];
+        let points = [Some((9.0, 1.0)), Some((4.0, 1.14)), Some((2.0, 1.16)), None, Some((5.0, 1.05))];
         assert_eq!(knee(&points), Some(1));
+        assert_eq!(knee(&[Some((4.3, 1.1)), Some((4.0, 1.0))]), Some(0));
+        assert_eq!(knee(&[Some((4.3, 1.2)), Some((4.0, 1.0))]), Some(1));
         assert_eq!(knee(&[None, Some((3.0, 7.0))]), Some(1));
         assert_eq!(knee(&[None]), None);
     }

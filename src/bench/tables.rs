@@ -89,9 +89,9 @@ pub fn conclusion(sweep: &Sweep) -> String {
     };
     let default = format!("default: {}", said(0));
     match knee(&sweep.points()) {
-        Some(0) => format!("{default}. It is the knee: no faster setting is within 10 % of the best error."),
+        Some(0) => format!("{default}. It is the knee: none that is as good (15 %) is faster (10 %)."),
         Some(s) => format!(
-            "{default}. Knee, the fastest within 10 % of the best error: {}: {}.",
+            "{default}. Knee, the fastest within 15 % of the best error: {}: {}.",
             sweep.settings[s].name,
             said(s)
         ),

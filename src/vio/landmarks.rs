@@ -35,6 +35,8 @@ pub struct Landmark {
     /// Row of that view, px: a rolling shutter takes each at its own time.
     pub host_row: f32,
     pub point: Point,
+    /// Standard deviation of its inverse distance, the frames taken as known, 1/m.
+    pub rho_sigma: f32,
     pub observations: List<Observation, OBSERVATIONS>,
 }
 

@@ -8,6 +8,7 @@
 //! Until motion and gravity are known (`init`) tracks give no odometry. The same input gives
 //! bit-identical output; `hash` proves it. Nothing is allocated after `new`.
 
+pub mod gate;
 pub mod health;
 pub mod init;
 pub mod landmarks;
@@ -31,6 +32,7 @@ use crate::frontend::Tracks;
 use crate::limits::{CAMERAS_MAX, RIG_DIM, STATES};
 use crate::math::real::Real;
 use crate::mem::Footprint;
+use gate::{gate, predicted_covariance};
 use glam::DVec3;
 use health::{quality, sigma_v, Evidence, Health, Reset, Watch, SIGMA_V_UNOBSERVED};
 use init::{Aligner, RESECTION_MIN};
@@ -322,12 +324,13 @@ impl<S: Real> Estimator<S> {
         let slot = self.window.push(frame).expect("marginalisation left room for one frame");
         self.window.hold_twists();
         self.tracks[slot].clone_from(tracks);
+        self.gate(slot);
 
         if self.config.zero_velocity {
             self.window.frame_mut(slot).rest = at_rest(slot, &self.window, &self.tracks, &self.imu);
             self.stats.zero_velocity_updates += self.window.frame(slot).rest.is_some() as u64;
         }
-        let (connected, unconnected) = self.landmarks.attach(slot, tracks);
+        let (connected, unconnected) = self.landmarks.attach(slot, &self.tracks[slot]);
         self.frames_since_keyframe += 1;
         let fraction = connected as f64 / (connected + unconnected).max(1) as f64;
         let due =
@@ -361,6 +364,18 @@ impl<S: Real> Estimator<S> {
         let update = self.output(slot, keyframe, connected, outcome);
         self.shrink();
         Ok(update)
+    }
+
+    /// Takes out of what was seen in `slot` what cannot be what it claims.
+    fn gate(&mut self, slot: usize) {
+        let Some(covariance) = &self.covariance else { return };
+        let p = predicted_covariance(&self.window, slot, covariance);
+        // Wider while the rig is not known well.
+        let sigma_px = self.config.observation_sigma_px + self.outlier_px(slot) - self.config.outlier_px;
+        let tracks = &mut self.tracks[slot];
+        let passed = gate(slot, tracks, &self.landmarks, &self.window, &p, sigma_px);
+        self.stats.tracks_gated += passed.refused as u64;
+        self.stats.gates_opened += passed.open as u64;
     }
 
     fn shrink(&mut self) {

@@ -111,6 +111,15 @@ impl<S: Real> Eliminated<S> {
         }
     }
 
+    /// Of the inverse distance, the frames taken as known; infinite when nothing determines it.
+    fn rho_sigma(&self) -> f32 {
+        if self.determined {
+            (1.0 / self.own.r[POINT_DIM - 1][POINT_DIM - 1].f64().abs()) as f32
+        } else {
+            f32::INFINITY
+        }
+    }
+
     fn step(&self, dx: &[f64]) -> [f64; POINT_DIM] {
         let mut d = [0.0; POINT_DIM];
         if self.determined {
@@ -313,6 +322,9 @@ impl<S: Real> Solver<S> {
                 }
                 (lambda, growth) = (lambda * growth, growth * 2.0);
             }
+        }
+        for (l, e) in landmarks.pool.iter_mut().zip(&self.eliminated) {
+            l.rho_sigma = e.rho_sigma();
         }
         outcome.cost = cost;
         outcome

@@ -15,6 +15,10 @@ pub struct Stats {
     pub frames_rejected: u64,
     /// Tracks of cameras the rig has not, with pixels that are none, or out of order.
     pub tracks_rejected: u64,
+    /// Views of known landmarks too far from where these must be.
+    pub tracks_gated: u64,
+    /// Frames of which so many were that the prediction must have been wrong, and none was refused.
+    pub gates_opened: u64,
     pub landmarks_full: u64,
     pub outliers: u64,
     pub solver_failures: u64,
@@ -39,7 +43,7 @@ pub struct Stats {
 
 impl Stats {
     /// What was dropped, refused or went wrong, by name.
-    pub fn counters(&self) -> [(&'static str, u64); 17] {
+    pub fn counters(&self) -> [(&'static str, u64); 19] {
         [
             ("imu_rejected", self.imu_rejected),
             ("imu_overflow", self.imu_overflow),
@@ -47,6 +51,8 @@ impl Stats {
             ("imu_gaps", self.imu_gaps),
             ("frames_rejected", self.frames_rejected),
             ("tracks_rejected", self.tracks_rejected),
+            ("tracks_gated", self.tracks_gated),
+            ("gates_opened", self.gates_opened),
             ("landmarks_full", self.landmarks_full),
             ("outliers", self.outliers),
             ("solver_failures", self.solver_failures),

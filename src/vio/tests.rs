@@ -303,3 +303,39 @@ fn uncertainty_of_position_and_yaw_only_grows() {
     eprintln!("position, m, and yaw, rad, after 5, 15 and 30 s: {double:.4?} in f64, {single:.4?} in f32");
     assert!(double.windows(2).all(|w| w[1].0 > w[0].0 && w[1].1 > w[0].1), "{double:?}");
 }
+
+/// The next frame of a running flight, with every landmark's view for which `moved` answers true moved by 12 px;
+/// answers how many were moved, and how many views and frames the gate refused and left alone.
+fn gated(moved: impl Fn(u64) -> bool) -> (u64, u64, u64) {
+    let mut world = World::new(Path { rest: -1.0 });
+    let mut vio = Vio::new(&world.rig, &VioConfig::default());
+    run(&mut vio, 0..60, &mut world);
+    let mut tracks = Tracks::default();
+    world.tracks(60.0 * FRAME_SECS + 0.0012, &mut tracks);
+    let mut count = 0;
+    for track in tracks.cameras.iter_mut().flat_map(|c| c.iter_mut()) {
+        if vio.landmarks.find(track.id).is_some() && moved(track.id) {
+            (track.px[0], count) = (track.px[0] + 12.0, count + 1);
+        }
+    }
+    let before = vio.stats;
+    vio.on_tracks(&tracks);
+    (count, vio.stats.tracks_gated - before.tracks_gated, vio.stats.gates_opened - before.gates_opened)
+}
+
+#[test]
+fn views_that_cannot_be_their_landmarks_are_refused_and_true_ones_are_not() {
+    let (none, by_itself, _) = gated(|_| false);
+    let (moved, refused, opened) = gated(|id| id % 5 == 0);
+    // Of the world's own views one in a hundred is 15 px off.
+    assert!(none == 0 && by_itself <= 6, "{by_itself} refused of a true frame");
+    assert!(moved > 20 && refused >= moved && refused <= moved + by_itself, "{refused} of {moved}");
+    assert_eq!(opened, 0);
+}
+
+#[test]
+fn prediction_that_nearly_all_contradict_refuses_nothing() {
+    let (moved, refused, opened) = gated(|_| true);
+    assert!(moved > 100);
+    assert_eq!((refused, opened), (0, 1));
+}

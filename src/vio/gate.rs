@@ -1,0 +1,99 @@
+//! Innovation gate: which tracks can be the landmarks they claim to be.
+//!
+//! A known landmark is predicted into the newest frame before any of its views is believed; what lies
+//! further from that than the uncertainty of the prediction allows is left out. The uncertainty is that
+//! of the motion since the frame before (inertial increment, and the velocity and gyro bias it
+//! started from), of the landmark's inverse distance, and of both views: `eᵀ S⁻¹ e` with
+//! `S = J P Jᵀ + J_ρ σ_ρ² J_ρᵀ + 2 σ² I` against a chi-square bound. When many fail at once it is the
+//! prediction that is wrong, and the gate is left open.
+
+use super::landmarks::{Landmark, Landmarks, Observation};
+use super::rig::{EYE_DIM, TIME_DIM};
+use super::sight::{observe, Host};
+use super::window::{Window, POSE_DIM};
+use crate::frontend::Tracks;
+use crate::limits::{CAMERAS_MAX, TRACKS};
+use glam::DMat3;
+use nalgebra::{SMatrix, SVector};
+
+/// Two degrees of freedom pass with all but 4e-6 of true views.
+const CHI_SQUARE_MAX: f64 = 25.0;
+/// Of fewer known views, or when a smaller share passes, nothing is refused.
+const VIEWS_MIN: usize = 8;
+const PASS_MIN: f64 = 0.6;
+
+/// Covariance of the predicted pose relative to the window, errors [p in the world, θ on the right].
+pub type PoseCovariance = SMatrix<f64, POSE_DIM, POSE_DIM>;
+
+/// Of a frame predicted from `slot` by an increment: its covariance, and that of velocity and gyro bias over it.
+pub fn predicted_covariance(window: &Window, slot: usize, from: &[[f64; 15]; 15]) -> PoseCovariance {
+    let frame = window.frame(slot);
+    let (dt, inc) = (frame.increment.dt, &frame.increment.covariance);
+    let before = window.slots().rev().nth(1).map_or(DMat3::IDENTITY, |s| window.frame(s).body.r);
+    let r = SMatrix::<f64, 3, 3>::from_fn(|i, j| before.col(j)[i]);
+    let block = |row: usize, col: usize| inc.fixed_view::<3, 3>(row, col).into_owned();
+    let of = |at: usize| SMatrix::<f64, 3, 3>::from_fn(|i, j| from[at + i][at + j]) * (dt * dt);
+    let mut p = PoseCovariance::zeros();
+    p.fixed_view_mut::<3, 3>(0, 0).copy_from(&(r * block(0, 0) * r.transpose() + of(6)));
+    p.fixed_view_mut::<3, 3>(3, 3).copy_from(&(block(3, 3) + of(9)));
+    let cross = r * block(0, 3);
+    p.fixed_view_mut::<3, 3>(0, 3).copy_from(&cross);
+    p.fixed_view_mut::<3, 3>(3, 0).copy_from(&cross.transpose());
+    p
+}
+
+/// Squared Mahalanobis distance of a view from its prediction; `None` where it cannot be predicted.
+fn distance(l: &Landmark, o: &Observation, window: &Window, p: &PoseCovariance, sigma_px: f64) -> Option<f64> {
+    let mut columns = [[0.0; TIME_DIM + EYE_DIM * CAMERAS_MAX]; 2];
+    let r = observe(l, &Host::of(l, window), o, window, &mut columns)?;
+    let j = SMatrix::<f64, 2, POSE_DIM>::from_fn(|i, k| r.d_target[i][k]);
+    let d_rho = SVector::<f64, 2>::new(r.d_point[0][2], r.d_point[1][2]) * f64::from(l.rho_sigma);
+    let mut s = j * p * j.transpose() + d_rho * d_rho.transpose();
+    (0..2).for_each(|i| s[(i, i)] += 2.0 * sigma_px * sigma_px);
+    let e = SVector::<f64, 2>::new(r.px.x, r.px.y);
+    Some(e.dot(&(s.try_inverse()? * e)))
+}
+
+/// What became of a frame's tracks at the gate.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Passed {
+    pub refused: usize,
+    /// Most would have been refused, so none was.
+    pub open: bool,
+}
+
+/// Takes out of `tracks` the views of known landmarks that cannot be theirs.
+pub fn gate(
+    slot: usize,
+    tracks: &mut Tracks,
+    landmarks: &Landmarks,
+    window: &Window,
+    p: &PoseCovariance,
+    sigma_px: f64,
+) -> Passed {
+    let mut wrong = [[false; TRACKS]; CAMERAS_MAX];
+    let (mut known, mut refused) = (0, 0);
+    for (camera, list) in tracks.cameras.iter().enumerate() {
+        for (i, track) in list.iter().enumerate() {
+            let Some(l) = landmarks.find(track.id).map(|at| &landmarks.pool[at]) else { continue };
+            let seen = Observation { slot: slot as u8, camera: camera as u8, px: track.px };
+            // A point that cannot be predicted is left to the optimisation to judge.
+            let Some(d) = distance(l, &seen, window, p, sigma_px) else { continue };
+            known += 1;
+            // Also when it is not a number.
+            wrong[camera][i] = !(d <= CHI_SQUARE_MAX);
+            refused += wrong[camera][i] as usize;
+        }
+    }
+    if known < VIEWS_MIN || ((known - refused) as f64) < PASS_MIN * known as f64 {
+        return Passed { refused: 0, open: refused > 0 };
+    }
+    for (list, wrong) in tracks.cameras.iter_mut().zip(&wrong) {
+        let mut i = 0;
+        list.retain(|_| {
+            i += 1;
+            !wrong[i - 1]
+        });
+    }
+    Passed { refused, open: false }
+}
