@@ -131,7 +131,7 @@ fn a_slipped_second_image_matches_nothing() {
     see(&calibration, [0.0; 2], 2.0, 5.0, &mut frames);
     let mut frontend = Frontend::new(&calibration, &FrontendConfig::default()).unwrap();
     let tracks = frontend.track(&frames, &Prediction::default());
-    assert!(tracks.cameras[0].len() >= 20 && tracks.cameras[1].is_empty(), "{}", tracks.cameras[1].len());
+    assert!(tracks.cameras[0].len() >= 12 && tracks.cameras[1].is_empty(), "{}", tracks.cameras[1].len());
 }
 
 #[test]
@@ -454,7 +454,7 @@ fn judge(name: &str, recording: &Recording, config: &FrontendConfig) -> [f64; 5]
 fn shaken_recording_agrees_with_its_ground_truth() {
     let Some(recording) = recording("euroc_MH_01_easy_11s") else { return };
     let [points, stereo, length, one, five] = judge("MH_01", &recording, &FrontendConfig::default());
-    assert!(points > 170.0 && stereo > 0.6 && length > 6.5);
+    assert!(points > 118.0 && stereo > 0.6 && length > 6.5);
     assert!(one < 0.3 && five < 1.0);
 }
 
@@ -473,6 +473,6 @@ fn fisheye_recording_agrees_with_its_ground_truth() {
 fn at_rest_points_stay() {
     let Some(recording) = recording("euroc_V1_01_easy_static_1s") else { return };
     let [points, stereo, length, one, five] = judge("V1_01 at rest", &recording, &FrontendConfig::default());
-    assert!(points > 110.0 && stereo > 0.7 && length > 15.0);
+    assert!(points > 76.0 && stereo > 0.7 && length > 15.0);
     assert!(one < 0.1 && five < 0.3);
 }

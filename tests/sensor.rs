@@ -134,7 +134,7 @@ fn extrinsics_wrong_by_a_degree_are_recovered_to_a_tenth() {
         eprintln!("  camera {c}: {turn:.3} of 1 degree and {:.2} of 5 mm left", shift * 1e3);
         assert!(turn < 0.1 && shift < 0.0035, "camera {c}: {turn} degrees, {shift} m");
     }
-    assert!(found.ate < 0.1 * off.ate && found.ate < 0.03, "{} m, {} m as handed out", found.ate, off.ate);
+    assert!(found.ate < 0.25 * off.ate && found.ate < 0.02, "{} m, {} m as handed out", found.ate, off.ate);
 }
 
 #[test]
@@ -156,7 +156,7 @@ fn a_scale_of_two_percent_is_found() {
             assert!((x - truth).abs() < most, "axis {axis}: {x} for {truth}");
         }
     }
-    assert!(off.ate > 3.0 * clean.ate && found.ate < 1.5 * clean.ate && sure.ate < 1.5 * clean.ate);
+    assert!(off.ate > 3.0 * clean.ate && found.ate < 1.7 * clean.ate && sure.ate < 1.7 * clean.ate);
 }
 
 #[test]

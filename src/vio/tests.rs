@@ -310,6 +310,8 @@ fn gated(moved: impl Fn(u64) -> bool) -> (u64, u64, u64) {
     let mut world = World::new(Path { rest: -1.0 });
     let mut vio = Vio::new(&world.rig, &VioConfig::default());
     run(&mut vio, 0..60, &mut world);
+    let newest = vio.imu.newest().expect("samples were fed").t;
+    (1..=10).for_each(|k| vio.on_imu(world.imu(newest.0 as f64 * 1e-9 + k as f64 / RATE_HZ)));
     let mut tracks = Tracks::default();
     world.tracks(60.0 * FRAME_SECS + 0.0012, &mut tracks);
     let mut count = 0;
