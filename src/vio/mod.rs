@@ -23,6 +23,7 @@ pub mod samples;
 pub mod shutter;
 pub mod sight;
 pub mod solve;
+pub mod stages;
 mod stats;
 mod trust;
 pub mod window;
@@ -100,7 +101,7 @@ pub type Scalar = f64;
 /// The estimator as it is built.
 pub type Vio = Estimator<Scalar>;
 
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub struct Estimator<S: Real = Scalar> {
     model: Model,
     config: VioConfig,
@@ -312,15 +313,20 @@ impl<S: Real> Estimator<S> {
         self.output(slot, true, self.landmarks.pool.len(), Outcome::default())
     }
 
-    /// One more frame, or why the estimate is to be given up.
-    fn advance(&mut self, tracks: &Tracks) -> Result<Update, Reset> {
-        let Some(before) = self.window.newest() else { return Err(Reset::State) };
-        let from = self.window.frame(before).now;
-        let inc = self.imu.integrate(self.window.frame(before).t, tracks.t, from.bg, from.ba, &self.noise);
-        let mut frame = Frame::first(tracks.t, from.propagate(&self.scaled(&inc)));
+    /// The frame after that in slot `before`, where inertia puts it.
+    fn propagated(&self, before: usize, t: Nanos) -> Frame {
+        let before = self.window.frame(before);
+        let inc = self.imu.integrate(before.t, t, before.now.bg, before.now.ba, &self.noise);
+        let mut frame = Frame::first(t, before.now.propagate(&self.scaled(&inc)));
         frame.weight = self.inertial_weight(&inc);
         frame.increment = inc;
-        frame.rate = self.imu.rate_at(tracks.t);
+        frame.rate = self.imu.rate_at(t);
+        frame
+    }
+
+    /// Takes a frame into the window; answers its slot, and how many of its points are landmarks and are not.
+    fn enter(&mut self, before: usize, tracks: &Tracks) -> (usize, usize, usize) {
+        let frame = self.propagated(before, tracks.t);
         let slot = self.window.push(frame).expect("marginalisation left room for one frame");
         self.window.hold_twists();
         self.tracks[slot].clone_from(tracks);
@@ -332,10 +338,21 @@ impl<S: Real> Estimator<S> {
         }
         let (connected, unconnected) = self.landmarks.attach(slot, &self.tracks[slot]);
         self.frames_since_keyframe += 1;
+        (slot, connected, unconnected)
+    }
+
+    fn is_keyframe_due(&self, connected: usize, unconnected: usize) -> bool {
         let fraction = connected as f64 / (connected + unconnected).max(1) as f64;
         let due =
             fraction < self.config.keyframe_connected_min && self.frames_since_keyframe > self.config.keyframe_gap_min;
-        let keyframe = unconnected > 0 && (due || connected < CONNECTED_FEW);
+        unconnected > 0 && (due || connected < CONNECTED_FEW)
+    }
+
+    /// One more frame, or why the estimate is to be given up.
+    fn advance(&mut self, tracks: &Tracks) -> Result<Update, Reset> {
+        let Some(before) = self.window.newest() else { return Err(Reset::State) };
+        let (slot, connected, unconnected) = self.enter(before, tracks);
+        let keyframe = self.is_keyframe_due(connected, unconnected);
         if keyframe {
             self.make_keyframe(slot);
         }

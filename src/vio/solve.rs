@@ -19,7 +19,7 @@ use crate::math::real::Real;
 use crate::mem::List;
 use glam::DVec2;
 
-const LAMBDA_START: f64 = 1e-4;
+pub(super) const LAMBDA_START: f64 = 1e-4;
 const LAMBDA_MIN: f64 = 1e-6;
 const LAMBDA_MAX: f64 = 1e2;
 /// Done when a step changes no error by this (m, rad, m/s ...), or the cost, in variances, by this: a
@@ -156,7 +156,7 @@ pub struct Outcome {
     pub cost: f64,
 }
 
-fn cost_of<S: Real>(window: &Window, landmarks: &Landmarks, prior: &Prior<S>, model: &Model) -> f64 {
+pub(super) fn cost_of<S: Real>(window: &Window, landmarks: &Landmarks, prior: &Prior<S>, model: &Model) -> f64 {
     let mut cost = prior.cost(window);
     let mut before = None;
     for slot in window.states() {
@@ -185,7 +185,7 @@ impl<S: Real> Solver<S> {
         + Linear::<S>::BYTES
         + WINDOW_DIM * size_of::<f64>();
 
-    fn linearise(
+    pub(super) fn linearise(
         &mut self,
         window: &Window,
         landmarks: &Landmarks,
@@ -220,7 +220,7 @@ impl<S: Real> Solver<S> {
     }
 
     /// Solves the damped system; answers the decrease it predicts, `None` when not finite.
-    fn step(&mut self, lambda: f64, landmarks: usize) -> Option<f64> {
+    pub(super) fn step(&mut self, lambda: f64, landmarks: usize) -> Option<f64> {
         let n = self.system.dim;
         let damping = |h: f64| (lambda * h).max(DAMPING_MIN);
         self.system.solve_damped(damping, &mut self.factor, &mut self.dx);

@@ -1,10 +1,11 @@
-//! Times of the odometry: each stage of the tracker and whole frames of tracker and estimator on one
-//! thread (criterion), then the program's own figures of whole runs on one thread and on two.
+//! Times of the odometry: each stage of tracker and estimator and whole frames of both on one thread
+//! (criterion), then the program's own figures of whole runs on one thread and on two.
 //!
 //! On frames the simulator renders and, where the recordings are, on MH_01. `make bench-odometry`.
 #![allow(clippy::unwrap_used)]
 
-use criterion::{BatchSize, Criterion};
+use criterion::measurement::WallTime;
+use criterion::{BatchSize, Bencher, BenchmarkGroup, Criterion};
 use std::hint::black_box;
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -15,6 +16,7 @@ use stipple::frontend::patch::{align_stack, take_stack, Stack, Warp, STEP_MIN};
 use stipple::frontend::pyramid::Pyramid;
 use stipple::frontend::{Frontend, Prediction, Tracks};
 use stipple::limits::PYRAMID_LEVELS;
+use stipple::vio::stages::{Extent, Stages};
 use stipple::vio::Vio;
 use stipple_drivers::replay::{OpenOptions, Recording};
 use stipple_drivers::sim::{Scenario, Sim};
@@ -22,8 +24,8 @@ use stipple_drivers::{Calibration, Frames, ImuSample, Pose};
 
 /// Frames of a flight held in memory, and how many of them pass before any is timed: the estimator's
 /// window is full by then.
-const FRAMES: usize = 80;
-const FRAMES_BEFORE: usize = 30;
+const FRAMES: usize = 160;
+const FRAMES_BEFORE: usize = 120;
 /// Flights of the whole-run figures, s.
 const RUN_SECONDS: &str = "11";
 
@@ -95,7 +97,7 @@ fn recorded() -> Option<Flight> {
 }
 
 /// The stages of the tracker on a frame in the middle of the flight.
-fn stages(c: &mut Criterion, flight: &Flight) {
+fn tracker_stages(c: &mut Criterion, flight: &Flight) {
     let mut group = c.benchmark_group(flight.name);
     let config = FrontendConfig::default();
     let camera = &flight.calibration.cameras[0].camera;
@@ -138,51 +140,98 @@ fn stages(c: &mut Criterion, flight: &Flight) {
     group.finish();
 }
 
-/// Time of `n` frames past the first, starting over as often as it takes. `start` makes what `step` moves on by
-/// a frame, answering the time that counts.
+/// The last windows of the flight stopped as a frame came in: one that is no keyframe, one that becomes one, and,
+/// optimised, one that only a state leaves and one that a keyframe leaves too.
+fn windows(flight: &Flight) -> [Option<Stages>; 4] {
+    let mut vio = Vio::new(&flight.calibration, &VioConfig::default());
+    let (mut imu, mut found) = (flight.imu.iter(), [const { None }; 4]);
+    for (i, f) in flight.frames.iter().enumerate() {
+        deliver(&mut vio, &mut imu, f);
+        let entered = Stages::new(&vio, &flight.tracks[i]).filter(|_| i >= FRAMES_BEFORE);
+        vio.on_tracks(&flight.tracks[i]);
+        let Some(mut stages) = entered else { continue };
+        found[usize::from(stages.keyframe)] = Some(stages.clone());
+        if stages.keyframe {
+            stages.triangulate();
+        }
+        stages.optimise();
+        let left = stages.clone().marginalise();
+        found[2 + left.min(1)] = Some(stages);
+    }
+    found
+}
+
+/// The stages of the estimator.
+fn estimator_stages(c: &mut Criterion, flight: &Flight) {
+    let [plain, keyframe, state_leaves, keyframe_leaves] = windows(flight);
+    let mut group = c.benchmark_group(flight.name);
+    if let Some(mut s) = plain {
+        let (Extent { frames, landmarks, views, columns }, n) = (s.extent(), s.clone().optimise().iterations);
+        let of = format!("{landmarks} landmarks in {views} views, {columns} columns, {n} iterations");
+        println!("{}: a window of {frames} frames, {of}", flight.name);
+        group.bench_function("preintegration, a frame interval", |b| b.iter(|| black_box(s.preintegrate())));
+        group.bench_function("landmark rows and their elimination", |b| b.iter(|| black_box(s.eliminate())));
+        group.bench_function("linearisation, all factors summed", |b| b.iter(|| black_box(s.linearise())));
+        group.bench_function("damped solve", |b| b.iter(|| black_box(s.solve())));
+        group.bench_function("covariance of the newest state", |b| b.iter(|| black_box(s.covariance())));
+        group.bench_function("cost", |b| b.iter(|| black_box(s.cost())));
+        group.bench_function("all iterations", |b| on_copies(b, &s, Stages::optimise));
+    }
+    let mut apart = |name, stages: Option<Stages>, stage: fn(&mut Stages) -> usize| match stages {
+        Some(s) => drop(group.bench_function(name, |b| on_copies(b, &s, stage))),
+        None => println!("{}: {name}: no such frame", flight.name),
+    };
+    apart("triangulation of a keyframe", keyframe, Stages::triangulate);
+    apart("marginalisation, a state leaves", state_leaves, Stages::marginalise);
+    apart("marginalisation, a keyframe too", keyframe_leaves, Stages::marginalise);
+    group.finish();
+}
+
+/// A stage that changes what it works on.
+fn on_copies<T>(b: &mut Bencher, stages: &Stages, run: impl FnMut(&mut Stages) -> T) {
+    b.iter_batched_ref(|| stages.clone(), run, BatchSize::PerIteration)
+}
+
+/// Times the frames past the first in turn, starting over as often as it takes. `start` makes what `step` moves
+/// on by a frame, answering the time that counts.
 fn play<T>(
+    group: &mut BenchmarkGroup<WallTime>,
+    name: &str,
     flight: &Flight,
-    n: u64,
     start: impl Fn() -> T,
     mut step: impl FnMut(&mut T, usize) -> Duration,
-) -> Duration {
-    let (mut left, mut sum) = (n, Duration::ZERO);
-    while left > 0 {
-        let mut state = start();
-        for i in 0..flight.frames.len() {
-            let took = step(&mut state, i);
-            if i >= FRAMES_BEFORE && left > 0 {
-                sum += took;
-                left -= 1;
-            }
+) {
+    let (mut state, mut i) = (start(), 0);
+    let mut next = || loop {
+        if i == flight.frames.len() {
+            (state, i) = (start(), 0);
         }
-    }
-    sum
+        let took = step(&mut state, i);
+        i += 1;
+        if i > FRAMES_BEFORE {
+            return took;
+        }
+    };
+    // Criterion would take the frames before for a part of the first.
+    next();
+    group.bench_function(name, |b| b.iter_custom(|n| (0..n).map(|_| next()).sum()));
 }
 
 /// Whole frames of each half, one thread.
 fn frames(c: &mut Criterion, flight: &Flight) {
     let mut group = c.benchmark_group(flight.name);
-    group.bench_function("tracker, a frame", |b| {
-        let start = || Frontend::new(&flight.calibration, &FrontendConfig::default()).unwrap();
-        b.iter_custom(|n| {
-            play(flight, n, start, |frontend, i| {
-                let begun = Instant::now();
-                black_box(frontend.track(&flight.frames[i], &Prediction { prev_from_now: flight.predicted[i] }));
-                begun.elapsed()
-            })
-        })
+    let start = || Frontend::new(&flight.calibration, &FrontendConfig::default()).unwrap();
+    play(&mut group, "tracker, a frame", flight, start, |frontend, i| {
+        let begun = Instant::now();
+        black_box(frontend.track(&flight.frames[i], &Prediction { prev_from_now: flight.predicted[i] }));
+        begun.elapsed()
     });
-    group.bench_function("estimator, a frame", |b| {
-        let start = || (Vio::new(&flight.calibration, &VioConfig::default()), flight.imu.iter());
-        b.iter_custom(|n| {
-            play(flight, n, start, |(vio, imu), i| {
-                let begun = Instant::now();
-                deliver(vio, imu, &flight.frames[i]);
-                black_box(vio.on_tracks(&flight.tracks[i]));
-                begun.elapsed()
-            })
-        })
+    let start = || (Vio::new(&flight.calibration, &VioConfig::default()), flight.imu.iter());
+    play(&mut group, "estimator, a frame", flight, start, |(vio, imu), i| {
+        let begun = Instant::now();
+        deliver(vio, imu, &flight.frames[i]);
+        black_box(vio.on_tracks(&flight.tracks[i]));
+        begun.elapsed()
     });
     group.finish();
 }
@@ -219,12 +268,14 @@ fn runs(dataset: &Path, name: &str, scratch: &Path) {
 fn main() {
     let mut criterion = Criterion::default()
         .sample_size(10)
-        .warm_up_time(Duration::from_millis(500))
-        .measurement_time(Duration::from_secs(2))
+        .nresamples(10_000)
+        .warm_up_time(Duration::from_millis(100))
+        .measurement_time(Duration::from_millis(700))
         .without_plots()
         .configure_from_args();
     for flight in std::iter::once(simulated()).chain(recorded()) {
-        stages(&mut criterion, &flight);
+        tracker_stages(&mut criterion, &flight);
+        estimator_stages(&mut criterion, &flight);
         frames(&mut criterion, &flight);
     }
     criterion.final_summary();
