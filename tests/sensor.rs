@@ -175,11 +175,11 @@ fn a_rolling_shutter_costs_little_once_modelled() {
 #[test]
 fn rigs_of_one_to_four_cameras_are_followed() {
     let (vio, frontend) = usual();
-    for name in ["mono", "opposed", "four"] {
+    for (name, most) in [("mono", 0.01), ("opposed", 0.015), ("four", 0.003)] {
         let mut s = scenario("demo");
         s.calibration = rig_named(name).unwrap();
         let found = fly(name, &render(&s), &vio, &frontend);
-        assert!(found.poses > 150 && found.ate < 0.03, "{name}");
+        assert!(found.poses > 150 && found.ate < most, "{name}");
     }
 }
 

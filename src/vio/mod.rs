@@ -43,7 +43,6 @@ use marginalise::{Marginaliser, Prior};
 use predict::Predictor;
 use preintegration::{Increment, Noise};
 use residuals::{Eye, InertialWeight, Motion};
-use rest::at_rest;
 use rig::{Parts, RigEstimate, RigSigma, RigState};
 use samples::{ImuRing, Leap};
 use solve::{Model, Outcome, Solver};
@@ -119,6 +118,8 @@ pub struct Estimator<S: Real = Scalar> {
     rig_sigma: RigSigma,
     rig_deviations: [f64; RIG_DIM],
     running: bool,
+    /// The zero-velocity update held the frame before the last.
+    rests: bool,
     /// As `predictor` before the newest frame, and the stamp of that frame.
     before: Predictor,
     last: Option<Nanos>,
@@ -160,6 +161,7 @@ impl<S: Real> Estimator<S> {
             rig_sigma,
             rig_deviations,
             running: false,
+            rests: false,
             before: Predictor { noise, state: None },
             last: None,
             leap: Leap::default(),
@@ -270,14 +272,13 @@ impl<S: Real> Estimator<S> {
         let seen = tracks.cameras[..self.model.eyes.len()].iter().map(|c| c.len());
         let (least, most) = seen.fold((usize::MAX, 0), |(a, b), n| (a.min(n), b.max(n)));
         let held = self.imu.newest().is_none_or(|n| self.noise.is_gap((tracks.t - n.t).secs()));
-        let rests = self.window.newest().is_some_and(|n| self.window.frame(n).rest.is_some());
         let unobserved = self.covariance.as_ref().is_none_or(|c| !(sigma_v(c) < SIGMA_V_UNOBSERVED));
         h.set(Health::INITIALISING, !self.running);
         h.set(Health::NO_TRACKS, most == 0);
         h.set(Health::FEW_LANDMARKS, self.running && update.connected < CONNECTED_FEW);
         h.set(Health::IMU_GAP, held);
         h.set(Health::SOLVER_FAILED, update.outcome.failures > 0);
-        h.set(Health::ZERO_VELOCITY, rests);
+        h.set(Health::ZERO_VELOCITY, self.running && self.rests);
         h.set(Health::ONE_CAMERA_BLIND, BLIND_FRACTION * least < most);
         h.set(Health::VELOCITY_UNOBSERVED, self.running && unobserved);
         h
@@ -333,8 +334,8 @@ impl<S: Real> Estimator<S> {
         self.gate(slot);
 
         if self.config.zero_velocity {
-            self.window.frame_mut(slot).rest = at_rest(slot, &self.window, &self.tracks, &self.imu);
-            self.stats.zero_velocity_updates += self.window.frame(slot).rest.is_some() as u64;
+            self.rests = rest::hold(slot, &mut self.window, &self.tracks, &self.imu);
+            self.stats.zero_velocity_updates += self.rests as u64;
         }
         let (connected, unconnected) = self.landmarks.attach(slot, &self.tracks[slot]);
         self.frames_since_keyframe += 1;
@@ -483,7 +484,7 @@ impl<S: Real> Estimator<S> {
         self.landmarks.clear();
         self.prior.clear();
         self.aligner.clear();
-        self.running = false;
+        (self.running, self.rests) = (false, false);
         self.watch = Watch::default();
         self.covariance = None;
         self.frames_since_keyframe = 0;
