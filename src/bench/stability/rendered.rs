@@ -69,6 +69,7 @@ fn cases() -> Vec<Shown> {
         },
         Shown {
             health: Health::ONE_CAMERA_BLIND,
+            limits: Limits { jump: 0.012, ..Limits::default() },
             ..shown("right lens covered", |i, camera| if bad(i) && camera == 1 { (0.0, 0.0) } else { AS_IS })
         },
         Shown {
