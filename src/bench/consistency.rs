@@ -218,7 +218,7 @@ fn write_page(out: &mut impl Write, told: &Consistency, defaults: &Consistency, 
         y: "NEES",
         series: vec![
             Series::line("told the world's noise", 1, told.over_time.clone()),
-            Series::line("defaults", 3, defaults.over_time.clone()),
+            Series::line("defaults", 2, defaults.over_time.clone()),
         ],
         levels: vec![("2.5 %", told.bounds.0), ("97.5 %", told.bounds.1)],
         from_zero: true,
@@ -238,7 +238,7 @@ fn write_page(out: &mut impl Write, told: &Consistency, defaults: &Consistency, 
         title,
         x: "quality",
         y,
-        series: vec![dots("mean", 1, mean), dots("90 %", 2, high), Series::line("claimed", 3, claimed.clone())],
+        series: vec![dots("mean", 1, mean), dots("90 %", 2, high), dots("claimed", 3, claimed.clone())],
         ..Chart::default()
     };
     let drift = chart("Error of the motion over the next second", "log10 m", by(&|b| b.drift), by(&|b| b.drift_p90));
