@@ -137,7 +137,7 @@ impl Default for VioConfig {
         VioConfig {
             observation_sigma_px: 0.5,
             huber_px: 1.0,
-            iterations_max: 4,
+            iterations_max: 7,
             states: 3,
             keyframes: 7,
             keyframe_connected_min: 0.7,

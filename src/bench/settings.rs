@@ -13,7 +13,7 @@ const PARAMETERS: [(&str, &[f64]); 10] = [
     ("frontend.grid_px", &[40.0, 50.0, 60.0, 70.0, 80.0]),
     ("frontend.fast_threshold_min", &[5.0, 10.0, 20.0]),
     ("frontend.iterations", &[2.0, 3.0, 5.0, 8.0]),
-    ("vio.iterations_max", &[2.0, 3.0, 4.0, 7.0]),
+    ("vio.iterations_max", &[2.0, 4.0, 7.0, 10.0]),
     ("vio.states", &[2.0, 3.0, 4.0, 5.0]),
     ("vio.keyframes", &[4.0, 7.0, 10.0]),
     ("vio.keyframe_connected_min", &[0.6, 0.7, 0.8, 0.9]),
@@ -25,7 +25,7 @@ const PARAMETERS: [(&str, &[f64]); 10] = [
 /// The defaults of all parameters that set the run time, moved together.
 const SHAPES: [Named; 4] = [
     ("smallest", &["frontend.grid_px=80", "frontend.iterations=2", "vio.iterations_max=2"]),
-    ("large", &["frontend.grid_px=50", "frontend.iterations=5", "vio.iterations_max=7"]),
+    ("large", &["frontend.grid_px=50", "frontend.iterations=5"]),
     ("larger", &["frontend.grid_px=40", "frontend.iterations=7", "vio.iterations_max=10"]),
     ("largest", &["frontend.grid_px=30", "frontend.iterations=10", "vio.iterations_max=12"]),
 ];
