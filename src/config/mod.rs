@@ -5,7 +5,11 @@
 //! `--set section.key=value` edits the parsed table before it is checked, so an override obeys
 //! the same rules as the file.
 
-use crate::limits::{KEYFRAMES, STATES};
+mod bounds;
+mod map;
+
+use bounds::BOUNDS;
+pub use map::MapConfig;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 use stipple_drivers::{Exit, Fault};
@@ -209,66 +213,6 @@ impl Default for StereoConfig {
 
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
-pub struct MapConfig {
-    pub enabled: bool,
-    /// Mapping resolution divisor: 1, 2 or 4.
-    pub scale: u32,
-    /// A keyframe becomes an anchor when more than this fraction of its valid view is uncovered
-    /// (rendered alpha under `covered_alpha`).
-    pub anchor_uncovered_min: f64,
-    pub covered_alpha: f64,
-    /// Occupancy grid cell, m, and its capacity (cells).
-    pub occupancy_cell_m: f64,
-    pub occupancy_cells: u32,
-    /// Gaussians an anchor may seed.
-    pub seeds_per_anchor: u32,
-    /// Steps on a new anchor alone before uniform sampling resumes.
-    pub burst_iterations: u32,
-    /// Mapper iterations a frame in lockstep pace.
-    pub lockstep_iterations: u32,
-    /// Weight of 1 - SSIM beside L1.
-    pub ssim_weight: f64,
-    /// Adam learning rates: position (per metre of median scene depth), log scale, quaternion,
-    /// opacity logit, colour.
-    pub lr_position: f64,
-    pub lr_scale: f64,
-    pub lr_rotation: f64,
-    pub lr_opacity: f64,
-    pub lr_colour: f64,
-    /// Of keyframe poses, m and rad; 0 leaves them as given.
-    pub lr_pose: f64,
-    /// Seconds between samples of the error-against-time curve.
-    pub curve_period_s: f64,
-    pub seed: u64,
-}
-
-impl Default for MapConfig {
-    fn default() -> Self {
-        MapConfig {
-            enabled: true,
-            scale: 1,
-            anchor_uncovered_min: 0.05,
-            covered_alpha: 0.05,
-            occupancy_cell_m: 0.1,
-            occupancy_cells: 1 << 18,
-            seeds_per_anchor: 8192,
-            burst_iterations: 20,
-            lockstep_iterations: 2,
-            ssim_weight: 0.2,
-            lr_position: 2e-3,
-            lr_scale: 3e-2,
-            lr_rotation: 1e-2,
-            lr_opacity: 5e-2,
-            lr_colour: 1e-2,
-            lr_pose: 0.0,
-            curve_period_s: 5.0,
-            seed: 1,
-        }
-    }
-}
-
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
 pub struct GpuConfig {
     /// Substring of the Vulkan device name; empty takes the first discrete, else integrated, else CPU device.
     pub device: String,
@@ -374,105 +318,6 @@ impl Board {
     }
 }
 
-/// What a number of a board file may be.
-#[derive(Clone, Copy, Debug)]
-enum Bound {
-    Within(f64, f64),
-    /// Finite and above zero.
-    Positive,
-    /// Within, and `divisor * n + rest`.
-    Stepped(f64, f64, f64, f64),
-    PowerOfTwo(f64, f64),
-}
-
-impl Bound {
-    fn holds(self, v: f64) -> bool {
-        match self {
-            Within(low, high) => (low..=high).contains(&v),
-            Positive => v.is_finite() && v > 0.0,
-            Stepped(low, high, divisor, rest) => (low..=high).contains(&v) && v % divisor == rest,
-            PowerOfTwo(low, high) => (low..=high).contains(&v) && v.log2().fract() == 0.0,
-        }
-    }
-}
-
-impl std::fmt::Display for Bound {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        match self {
-            Within(low, high) => write!(f, "{low} to {high}"),
-            Positive => write!(f, "positive"),
-            Stepped(low, high, divisor, rest) if *divisor == 2.0 && *rest == 1.0 => write!(f, "odd, {low} to {high}"),
-            Stepped(low, high, divisor, _) => write!(f, "a multiple of {divisor}, {low} to {high}"),
-            PowerOfTwo(low, high) => write!(f, "a power of two, {low} to {high}"),
-        }
-    }
-}
-
-use Bound::{Positive, PowerOfTwo, Stepped, Within};
-
-/// Every number of a board file, with what it may be.
-const BOUNDS: &[(&str, Bound)] = &[
-    ("memory_max_mib", Within(16.0, 1_048_576.0)),
-    ("budget.splats", Within(256.0, 4_000_000.0)),
-    ("budget.intersections", Within(1024.0, 64_000_000.0)),
-    ("budget.keyframes", Within(2.0, 4096.0)),
-    ("budget.image_width_max", Within(64.0, 4096.0)),
-    ("budget.image_height_max", Within(64.0, 4096.0)),
-    // Above a tenth of a second the body's motion between rows is no longer of first order.
-    ("rig.readout_s", Within(0.0, 0.1)),
-    ("frontend.threads", Within(1.0, 2.0)),
-    ("frontend.grid_px", Within(16.0, 200.0)),
-    ("frontend.fast_threshold", Within(1.0, 255.0)),
-    ("frontend.fast_threshold_min", Within(1.0, 255.0)),
-    ("frontend.iterations", Within(1.0, 50.0)),
-    ("frontend.recovered_max_px", Positive),
-    ("frontend.epipolar_max", Positive),
-    ("vio.observation_sigma_px", Positive),
-    ("vio.huber_px", Positive),
-    ("vio.iterations_max", Within(1.0, 100.0)),
-    ("vio.states", Within(2.0, STATES as f64)),
-    ("vio.keyframes", Within(3.0, KEYFRAMES as f64)),
-    ("vio.keyframe_connected_min", Within(0.0, 1.0)),
-    ("vio.keyframe_gap_min", Within(0.0, 1000.0)),
-    ("vio.triangulation_baseline_min_m", Positive),
-    ("vio.accel_bias_sigma", Positive),
-    ("vio.gyro_bias_sigma", Positive),
-    ("vio.outlier_px", Positive),
-    ("vio.gyro_noise_scale", Positive),
-    ("vio.accel_noise_scale", Positive),
-    ("vio.time_offset_sigma_s", Within(1e-6, 0.1)),
-    ("vio.extrinsics_sigma_m", Within(1e-6, 1.0)),
-    ("vio.extrinsics_sigma_rad", Within(1e-6, 0.5)),
-    ("vio.imu_scale_sigma", Within(1e-6, 0.5)),
-    ("vio.gyro_max", Positive),
-    ("vio.accel_max", Positive),
-    ("stereo.disparities", Stepped(16.0, 512.0, 16.0, 0.0)),
-    ("stereo.block_px", Stepped(5.0, 51.0, 2.0, 1.0)),
-    ("stereo.uniqueness_percent", Within(0.0, 100.0)),
-    ("stereo.depth_min_m", Positive),
-    ("stereo.depth_max_m", Positive),
-    ("map.scale", PowerOfTwo(1.0, 4.0)),
-    ("map.anchor_uncovered_min", Within(0.0, 1.0)),
-    ("map.covered_alpha", Within(0.0, 1.0)),
-    ("map.occupancy_cell_m", Positive),
-    ("map.occupancy_cells", PowerOfTwo(1024.0, 16_777_216.0)),
-    ("map.seeds_per_anchor", Within(1.0, 1_000_000.0)),
-    ("map.burst_iterations", Within(0.0, 10_000.0)),
-    ("map.lockstep_iterations", Within(0.0, 1000.0)),
-    ("map.ssim_weight", Within(0.0, 1.0)),
-    ("map.lr_position", Positive),
-    ("map.lr_scale", Positive),
-    ("map.lr_rotation", Positive),
-    ("map.lr_opacity", Positive),
-    ("map.lr_colour", Positive),
-    ("map.lr_pose", Within(0.0, 0.1)),
-    ("map.curve_period_s", Positive),
-    ("map.seed", Within(0.0, u64::MAX as f64)),
-    ("gpu.submission_max_ms", Positive),
-    ("replay.pair_tolerance_s", Within(0.0, 1.0)),
-    ("replay.imu_hole_s", Positive),
-];
-
 fn lookup<'a>(table: &'a toml::Table, key: &str) -> Option<&'a toml::Value> {
     match key.split_once('.') {
         Some((section, rest)) => lookup(table.get(section)?.as_table()?, rest),
@@ -544,6 +389,7 @@ fn set(table: &mut toml::Table, assignment: &str) -> Result<(), Fault> {
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used)]
+    use super::bounds::Bound::{PowerOfTwo, Stepped};
     use super::*;
     use std::collections::BTreeSet;
 

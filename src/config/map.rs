@@ -1,0 +1,63 @@
+//! `[map]`: what the mapper does with its budget.
+
+use serde::{Deserialize, Serialize};
+
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct MapConfig {
+    pub enabled: bool,
+    /// Mapping resolution divisor: 1, 2 or 4.
+    pub scale: u32,
+    /// A keyframe becomes an anchor when more than this fraction of its valid view is uncovered
+    /// (rendered alpha under `covered_alpha`).
+    pub anchor_uncovered_min: f64,
+    pub covered_alpha: f64,
+    /// Occupancy grid cell, m, and its capacity (cells).
+    pub occupancy_cell_m: f64,
+    pub occupancy_cells: u32,
+    /// Gaussians an anchor may seed.
+    pub seeds_per_anchor: u32,
+    /// Steps on a new anchor alone before uniform sampling resumes.
+    pub burst_iterations: u32,
+    /// Mapper iterations a frame in lockstep pace.
+    pub lockstep_iterations: u32,
+    /// Weight of 1 - SSIM beside L1.
+    pub ssim_weight: f64,
+    /// Adam learning rates: position (per metre of median scene depth), log scale, quaternion,
+    /// opacity logit, colour.
+    pub lr_position: f64,
+    pub lr_scale: f64,
+    pub lr_rotation: f64,
+    pub lr_opacity: f64,
+    pub lr_colour: f64,
+    /// Of keyframe poses, m and rad; 0 leaves them as given.
+    pub lr_pose: f64,
+    /// Seconds between samples of the error-against-time curve.
+    pub curve_period_s: f64,
+    pub seed: u64,
+}
+
+impl Default for MapConfig {
+    fn default() -> Self {
+        MapConfig {
+            enabled: true,
+            scale: 1,
+            anchor_uncovered_min: 0.05,
+            covered_alpha: 0.05,
+            occupancy_cell_m: 0.1,
+            occupancy_cells: 1 << 18,
+            seeds_per_anchor: 8192,
+            burst_iterations: 20,
+            lockstep_iterations: 2,
+            ssim_weight: 0.2,
+            lr_position: 2e-3,
+            lr_scale: 3e-2,
+            lr_rotation: 1e-2,
+            lr_opacity: 5e-2,
+            lr_colour: 1e-2,
+            lr_pose: 0.0,
+            curve_period_s: 5.0,
+            seed: 1,
+        }
+    }
+}
