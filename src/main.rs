@@ -123,6 +123,28 @@ enum Bench {
         #[arg(long, value_name = "N", default_value = "5", value_parser = clap::value_parser!(u64).range(1..=1000))]
         seeds: u64,
     },
+    /// Quality of the map at equal time: against the cap of Gaussians, and without parts of the method
+    Map {
+        /// As for replay; without it the simulated flight of the demo
+        dataset: Option<PathBuf>,
+        #[arg(long, value_name = "DIR")]
+        out: PathBuf,
+        /// Board file; without it the one for Vulkan on the CPU
+        #[arg(long, value_name = "FILE")]
+        board: Option<PathBuf>,
+        /// Skip odometry, as for replay
+        #[arg(long, value_name = "CSV")]
+        poses: Option<PathBuf>,
+        /// Of mapping, each run
+        #[arg(long, value_name = "S", value_parser = seconds)]
+        seconds: Option<f64>,
+        /// Two small caps and one ablation
+        #[arg(long)]
+        quick: bool,
+        /// Override a key of the board file in every run
+        #[arg(long = "set", value_name = "SECTION.KEY=VALUE")]
+        set: Vec<String>,
+    },
     /// Errors beside what the covariance claims, and beside the quality
     Consistency {
         #[arg(long, value_name = "DIR")]
@@ -144,7 +166,8 @@ fn run(command: Command) -> Result<(), Fault> {
     match command {
         Command::Replay { dataset, board, out, pace, poses, holdout, duration, scale, mut set } => {
             set.extend(scale.map(|s| format!("map.scale={s}")));
-            let options = daemon::Replay { pace, poses, holdout: holdout.unwrap_or(0), duration_s: duration };
+            let options =
+                daemon::Replay { pace, poses, holdout: holdout.unwrap_or(0), duration_s: duration, mapping_s: None };
             daemon::replay(&dataset, &board, &out, &set, &options)
         }
         Command::Demo { board, out, set } => daemon::demo(board.as_deref(), &out, &set),
@@ -154,6 +177,10 @@ fn run(command: Command) -> Result<(), Fault> {
         Command::Check { board, set } => daemon::check(&board, &set),
         Command::Bench { what: Bench::Odometry { out, recordings, seconds, quick, defaults } } => {
             bench::odometry(&bench::Options { recordings, seconds, quick, defaults }, &out)
+        }
+        Command::Bench { what: Bench::Map { dataset, out, board, poses, seconds, quick, set } } => {
+            let what = daemon::Benched { dataset, board, poses, set };
+            bench::map::map(&bench::map::Options { seconds, quick }, &out, &|job, dir| daemon::benched(&what, job, dir))
         }
         Command::Bench { what: Bench::Consistency { out, flights } } => {
             bench::consistency::consistency(flights as usize, &out)

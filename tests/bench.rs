@@ -1,4 +1,4 @@
-//! `stipple bench odometry --quick` leaves figures that can be read and drawn.
+//! `stipple bench .. --quick` leaves figures that can be read and drawn.
 #![allow(clippy::unwrap_used)]
 
 use std::process::Command;
@@ -34,5 +34,33 @@ fn quick_sweep_writes_finite_figures_and_marks_the_default() {
     let json: serde_json::Value = serde_json::from_slice(&std::fs::read(out.join("odometry.json")).unwrap()).unwrap();
     assert!(json["knee"].is_string() && json["rows"][0]["default"] == true && json["rows"][1]["default"] == false);
     let html = std::fs::read_to_string(out.join("odometry.html")).unwrap();
+    assert!(html.contains("<svg") && html.contains("class=\"default\"") && !html.contains("NaN"));
+}
+
+#[test]
+fn quick_map_bench_gives_every_run_the_same_time_and_draws_it() {
+    let dir = tempfile::tempdir().unwrap();
+    let out = dir.path().join("out");
+    let o = Command::new(env!("CARGO_BIN_EXE_stipple"))
+        .args(["bench", "map", "--quick", "--set", "map.scale=4", "--out", out.to_str().unwrap()])
+        .output()
+        .unwrap();
+    let said = String::from_utf8_lossy(&o.stderr).into_owned() + &String::from_utf8_lossy(&o.stdout);
+    assert!(o.status.success(), "{said}");
+
+    let csv = std::fs::read_to_string(out.join("map.csv")).unwrap();
+    let rows: Vec<Vec<&str>> = csv.lines().map(|l| l.split(',').collect()).collect();
+    let column = |name: &str| rows[0].iter().position(|n| *n == name).unwrap();
+    assert!(rows.len() >= 5, "{csv}");
+    for row in &rows[1..] {
+        let of = |name: &str| row[column(name)].parse::<f64>().unwrap();
+        assert!(of("psnr_db").is_finite() && of("splats") <= of("cap") && of("splats") > 0.0, "{csv}");
+        // Time over steps times steps: the same for every run.
+        let spent = of("step_ms") * of("iterations");
+        assert!((spent - 1500.0).abs() < 15.0, "{csv}");
+    }
+    let json: serde_json::Value = serde_json::from_slice(&std::fs::read(out.join("map.json")).unwrap()).unwrap();
+    assert_eq!(json["mapping_s"], 1.5);
+    let html = std::fs::read_to_string(out.join("map.html")).unwrap();
     assert!(html.contains("<svg") && html.contains("class=\"default\"") && !html.contains("NaN"));
 }

@@ -1,4 +1,5 @@
-//! The deterministic pace: every frame is tracked, and each gets a stated number of mapper steps.
+//! The deterministic pace: every frame is tracked, and each gets a stated number of mapper steps. For comparisons at
+//! equal time each gets an equal part of a stated mapping time instead; then only the tracking is deterministic.
 //!
 //! Frames are decoded a batch at a time into memory and tracked when the batch is there, so decoding
 //! is in no figure and takes no core from tracking; reading a recording into memory whole would do
@@ -6,7 +7,7 @@
 //! frames that tracking gives back, in their order, while tracking goes on.
 
 use super::input::Input;
-use super::mapping::{KeyframeQueue, Mapping};
+use super::mapping::{KeyframeQueue, Mapping, SLICE};
 use super::pipeline::{Bell, Ends, Pipeline};
 use super::play::{drain, Keyframes, Play, Played};
 use super::progress::{Gauges, Progress};
@@ -14,7 +15,7 @@ use super::tracking::{Slot, Tracking};
 use crate::counters::Counters;
 use crossbeam_queue::ArrayQueue;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 use stipple_drivers::ImuSample;
 
 /// Frames in memory at once: 24 MiB of two 752x480 cameras. What the threads of tracking lose at its ends is
@@ -63,18 +64,27 @@ pub fn lockstep(
                 slots.push(slot);
                 if let (Some(m), Some(queue)) = (&mut mapping, &queue) {
                     drain(queue, m);
-                    steps(m, u64::from(options.lockstep_iterations), start, &gauges);
+                    let played = gauges.frames.load(Relaxed) as f64 / total as f64;
+                    match options.mapping_s {
+                        Some(s) => work_until(m, s * played, &gauges),
+                        None => steps(m, u64::from(options.lockstep_iterations), start, &gauges),
+                    }
                 }
                 progress.show(&gauges);
             }
         }
     });
     if let Some(m) = &mut mapping {
-        for _ in 0..extra_iterations(&input, total, options) {
-            steps(m, 1, start, &gauges);
-            progress.show(&gauges);
+        match options.mapping_s {
+            Some(s) => work_until(m, s, &gauges),
+            None => {
+                for _ in 0..extra_iterations(&input, total, options) {
+                    steps(m, 1, start, &gauges);
+                    progress.show(&gauges);
+                }
+            }
         }
-        m.sample(start.elapsed().as_secs_f64(), &gauges);
+        m.sample(options.mapping_s.unwrap_or_else(|| start.elapsed().as_secs_f64()), &gauges);
     }
     let wall_s = start.elapsed().as_secs_f64();
     warnings.extend_from_slice(input.source.warnings());
@@ -87,6 +97,17 @@ fn steps(m: &mut Mapping, n: u64, start: Instant, gauges: &Gauges) {
         m.step(Instant::now(), gauges);
     }
     m.sample_if_due(start.elapsed().as_secs_f64(), gauges);
+}
+
+/// Maps until `busy_s` seconds of it are done; what is left over by a map that has nothing to do stays for later frames.
+fn work_until(m: &mut Mapping, busy_s: f64, gauges: &Gauges) {
+    while m.busy_s < busy_s {
+        let left = Duration::from_secs_f64(busy_s - m.busy_s).min(SLICE);
+        if !m.step(Instant::now() + left, gauges) {
+            break;
+        }
+        m.sample_if_due(m.busy_s, gauges);
+    }
 }
 
 /// How far the input has been read.

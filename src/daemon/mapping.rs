@@ -23,6 +23,8 @@ pub struct Mapping {
     pub curve: Vec<CurvePoint>,
     pub iteration_ms: Vec<f32>,
     pub iterations: u64,
+    /// Time spent in steps, s.
+    pub busy_s: f64,
     pub anchors: u64,
     /// Why mapping stopped before the end, if it did; odometry goes on.
     pub failure: Option<String>,
@@ -47,6 +49,7 @@ impl Mapping {
             curve: Vec::with_capacity(CURVE_POINTS),
             iteration_ms: Vec::with_capacity(ITERATION_TIMES),
             iterations: 0,
+            busy_s: 0.0,
             anchors: 0,
             failure: None,
             period_s: board.map.curve_period_s,
@@ -67,6 +70,7 @@ impl Mapping {
             }
         };
         self.iterations += u64::from(report.iterations);
+        self.busy_s += report.ms * 1e-3;
         if report.iterations > 0 && self.iteration_ms.len() < ITERATION_TIMES {
             self.iteration_ms.push((report.ms / f64::from(report.iterations)) as f32);
         }

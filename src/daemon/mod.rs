@@ -28,7 +28,9 @@ mod tracking;
 
 pub use play::Pace;
 
+use crate::bench::map::Job;
 use crate::config::Board;
+use crate::output::report::Report;
 use crate::output::OutputDir;
 use input::Input;
 use mapping::Mapping;
@@ -44,6 +46,8 @@ pub struct Replay {
     pub poses: Option<PathBuf>,
     pub holdout: u32,
     pub duration_s: Option<f64>,
+    /// See `play::Play`.
+    pub mapping_s: Option<f64>,
 }
 
 /// `stipple replay`
@@ -51,7 +55,9 @@ pub fn replay(dataset: &Path, board: &Path, out: &Path, set: &[String], options:
     let board = Board::load(board, set)?;
     let input = Input::recording(dataset, &board.replay, &board.rig)?;
     let out = OutputDir::create(out)?;
-    run(input, &dataset.display().to_string(), &board, &out, options)
+    let report = run(input, &dataset.display().to_string(), &board, &out, options)?;
+    println!("{}", summary::seven_lines(&report, &out));
+    Ok(())
 }
 
 /// Held-out keyframes and length of the demo: ten seconds of flight, then mapping alone.
@@ -71,8 +77,50 @@ pub fn demo(board: Option<&Path>, out: &Path, set: &[String]) -> Result<(), Faul
     let out = OutputDir::create(out)?;
     let scenario = Scenario::named("demo").expect("the demo's scenario is compiled in");
     let input = Input::rendered(&scenario, rendering_progress)?;
-    let options = Replay { pace: Pace::Recorded, poses: None, holdout: DEMO_HOLDOUT, duration_s: Some(DEMO_SECONDS) };
-    run(input, "the simulated flight", &board, &out, &options)
+    let options = Replay {
+        pace: Pace::Recorded,
+        poses: None,
+        holdout: DEMO_HOLDOUT,
+        duration_s: Some(DEMO_SECONDS),
+        mapping_s: None,
+    };
+    let report = run(input, "the simulated flight", &board, &out, &options)?;
+    println!("{}", summary::seven_lines(&report, &out));
+    Ok(())
+}
+
+/// What `stipple bench map` plays; without a dataset the demo's flight.
+pub struct Benched {
+    pub dataset: Option<PathBuf>,
+    pub board: Option<PathBuf>,
+    pub poses: Option<PathBuf>,
+    pub set: Vec<String>,
+}
+
+/// Seconds of the demo's flight that a quick run of the bench plays.
+const QUICK_FLIGHT_S: f64 = 3.0;
+
+/// One run of `stipple bench map`: lockstep by time, every eighth keyframe held out.
+pub fn benched(what: &Benched, job: &Job, out: &OutputDir) -> Result<Report, Fault> {
+    let demo_scale = what.dataset.is_none().then(|| DEMO_SCALE.to_string());
+    let set: Vec<String> = demo_scale.iter().chain(&what.set).chain(job.set).cloned().collect();
+    let board = match &what.board {
+        Some(path) => Board::load(path, &set)?,
+        None => Board::parse("board-configs/lavapipe.toml", DEMO_BOARD, &set)?,
+    };
+    let (input, place) = match &what.dataset {
+        Some(path) => (Input::recording(path, &board.replay, &board.rig)?, path.display().to_string()),
+        None => {
+            let mut scenario = Scenario::named("demo").expect("the demo's scenario is compiled in");
+            if job.quick {
+                scenario.duration = scenario.duration.min(Span::from_secs(QUICK_FLIGHT_S));
+            }
+            (Input::rendered(&scenario, |_, _| {})?, "the simulated flight".into())
+        }
+    };
+    let (poses, mapping_s) = (what.poses.clone(), Some(job.seconds));
+    let options = Replay { pace: Pace::Lockstep, poses, holdout: DEMO_HOLDOUT, duration_s: None, mapping_s };
+    run(input, &place, &board, out, &options)
 }
 
 fn rendering_progress(done: usize, of: usize) {
@@ -81,7 +129,7 @@ fn rendering_progress(done: usize, of: usize) {
     }
 }
 
-fn run(mut input: Input, place: &str, board: &Board, out: &OutputDir, options: &Replay) -> Result<(), Fault> {
+fn run(mut input: Input, place: &str, board: &Board, out: &OutputDir, options: &Replay) -> Result<Report, Fault> {
     memory::admit(place, &input.calibration, board)?;
     let frames = input.frames_within(options.duration_s);
     let tracking = match &options.poses {
@@ -107,6 +155,7 @@ fn run(mut input: Input, place: &str, board: &Board, out: &OutputDir, options: &
         holdout: options.holdout,
         duration_s: options.duration_s,
         lockstep_iterations: board.map.lockstep_iterations,
+        mapping_s: options.mapping_s,
     };
     let played = play(input, tracking, mapping, &options);
     for warning in &played.warnings[opened..] {
@@ -117,9 +166,7 @@ fn run(mut input: Input, place: &str, board: &Board, out: &OutputDir, options: &
         let what = format!("none of its {asked} frames can be read, the first: {first}");
         return Err(Fault::new(Exit::Data, place, what, "check that the recording is complete"));
     }
-    let report = summary::conclude(title, played, out)?;
-    println!("{}", summary::seven_lines(&report, out));
-    Ok(())
+    summary::conclude(title, played, out)
 }
 
 pub struct Simulate {

@@ -33,6 +33,8 @@ pub struct Play {
     /// Ends the run after this time of the recording; past its end the mapper goes on alone.
     pub duration_s: Option<f64>,
     pub lockstep_iterations: u32,
+    /// In lockstep: instead of iterations, an equal part of these seconds of mapping a frame.
+    pub mapping_s: Option<f64>,
 }
 
 pub struct Played {
