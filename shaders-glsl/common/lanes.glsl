@@ -3,6 +3,13 @@
 // tiles to a workgroup where subgroups are narrower than it; the baseline keeps it in shared memory,
 // with one tile of 32 lanes to a workgroup.
 
+struct Batch {
+    vec4 a;     // centre x, y; conic a, b
+    vec4 b;     // conic c; log2 opacity; grey or red; depth or its inverse
+    vec2 tint;  // green, blue
+    uint slot;  // gradient slot
+};
+
 #ifdef SUBGROUP
 
 uint lane() {
@@ -13,18 +20,15 @@ uint tile_index() {
     return group_index() * (gl_WorkGroupSize.x / LANES) + gl_SubgroupID;
 }
 
-struct Batch {
-    vec4 a, b;
-    uint slot;
-};
 Batch held;
 
-void batch_put(vec4 a, vec4 b, uint slot) {
-    held = Batch(a, b, slot);
+void batch_put(Batch b) {
+    held = b;
 }
 
 Batch batch_get(uint i) {
-    return Batch(subgroupShuffle(held.a, i), subgroupShuffle(held.b, i), subgroupShuffle(held.slot, i));
+    const vec2 tint = CHANNELS == 3 ? subgroupShuffle(held.tint, i) : vec2(0.0);
+    return Batch(subgroupShuffle(held.a, i), subgroupShuffle(held.b, i), tint, subgroupShuffle(held.slot, i));
 }
 
 bool all_lanes(bool done) {
@@ -54,6 +58,16 @@ float sum_of_eight(float v[8]) {
     return s;
 }
 
+/// Sums 2 values: lane l gets the sum of value l & 1.
+float sum_of_two(float a, float b) {
+    const bool up = (lane() & 1u) != 0;
+    float s = (up ? b : a) + subgroupShuffleXor(up ? a : b, 1);
+    [[unroll]] for (uint step = 2; step < LANES; step *= 2) {
+        s += subgroupShuffleXor(s, step);
+    }
+    return s;
+}
+
 #else
 
 uint lane() {
@@ -64,26 +78,26 @@ uint tile_index() {
     return group_index();
 }
 
-struct Batch {
-    vec4 a, b;
-    uint slot;
-};
 shared vec4 batch_a[32];
 shared vec4 batch_b[32];
+shared vec2 batch_tint[32];
 shared uint batch_slot[32];
 shared uint pending;
 shared float terms[8 * 33];
 
-void batch_put(vec4 a, vec4 b, uint slot) {
+void batch_put(Batch b) {
     barrier();
-    batch_a[lane()] = a;
-    batch_b[lane()] = b;
-    batch_slot[lane()] = slot;
+    batch_a[lane()] = b.a;
+    batch_b[lane()] = b.b;
+    if (CHANNELS == 3) {
+        batch_tint[lane()] = b.tint;
+    }
+    batch_slot[lane()] = b.slot;
     barrier();
 }
 
 Batch batch_get(uint i) {
-    return Batch(batch_a[i], batch_b[i], batch_slot[i]);
+    return Batch(batch_a[i], batch_b[i], CHANNELS == 3 ? batch_tint[i] : vec2(0.0), batch_slot[i]);
 }
 
 bool all_lanes(bool done) {
@@ -115,6 +129,10 @@ float sum_of_eight(float v[8]) {
     barrier();
     const uint row = (l & 7u) * 33;
     return (terms[row] + terms[row + 1]) + (terms[row + 2] + terms[row + 3]);
+}
+
+float sum_of_two(float a, float b) {
+    return sum_of_eight(float[8](a, b, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0));
 }
 
 #endif

@@ -4,6 +4,9 @@
 // Beyond the last visible contribution: (1 - ALPHA_MAX)².
 const float TRANSMITTANCE_MIN = 1e-4;
 const float ALPHA_MAX = 0.99;
+// Values of DEPTH: what is accumulated beside the colour.
+const uint EXPECTED_DEPTH = 1;  // m
+const uint INVERSE_DEPTH = 2;   // 1/m
 const float LOG2_E = 1.4426950408889634;
 
 /// Top pixel of this lane's column of COLUMN pixels.
@@ -13,12 +16,19 @@ uvec2 column_of(uint tile, uvec2 size) {
     return corner + uvec2(lane() % TILE_W, lane() / TILE_W * COLUMN);
 }
 
+/// What every lane needs of a Gaussian: its record and, in colour, its green and blue.
+Batch batch_of(Projected g, vec2 tint, uint slot) {
+    const float depth = DEPTH == INVERSE_DEPTH ? 1.0 / g.conic_shade.w : g.conic_shade.w;
+    return Batch(g.centre_conic, vec4(g.conic_shade.x, log2(g.conic_shade.y), g.conic_shade.z, depth), tint, slot);
+}
+
 /// A Gaussian as seen by one column: log2 α(y) = peak - y' (slope + curve y'), y' = centre - pixel.
 struct Column {
     vec2 d;       // centre - top pixel, px
     vec3 conic;
     float peak, slope, curve;
-    float grey, depth;
+    vec3 colour;  // grey, or red, green, blue
+    float depth;
 };
 
 Column column_terms(Batch g, vec2 top) {
@@ -28,7 +38,7 @@ Column column_terms(Batch g, vec2 top) {
     c.peak = g.b.y - 0.5 * LOG2_E * c.conic.x * c.d.x * c.d.x;  // b.y holds log2 opacity
     c.slope = LOG2_E * c.conic.y * c.d.x;
     c.curve = 0.5 * LOG2_E * c.conic.z;
-    c.grey = g.b.z;
+    c.colour = vec3(g.b.z, g.tint);
     c.depth = g.b.w;
     return c;
 }

@@ -16,5 +16,5 @@ struct Moments {
 // A Gaussian on the image. Pixel centres are at half-integers.
 struct Projected {
     vec4 centre_conic;  // x, y, px; conic a, b of σ = ½(a dx² + c dy²) + b dx dy
-    vec4 conic_shade;   // conic c; opacity; grey level; depth, m
+    vec4 conic_shade;   // conic c; opacity; grey level or red; depth, m
 };

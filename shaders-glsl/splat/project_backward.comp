@@ -1,6 +1,6 @@
 // Sums each visible Gaussian's intersection gradients in fixed order, carries them back to its parameters
 // and to the camera pose, adds the regularisers, and takes one Adam step: one thread a rank.
-// in   visible_count, slots (by depth), tile_offsets, isect_gradients
+// in   visible_count, slots (by depth), tile_offsets, isect_gradients (slots of raster_backward)
 // out  splats, moments, steps (Adam's count, of this Gaussian); sums[8 group + ..]: gradient by a small
 //      translation (3) and rotation (3) of the camera frame applied to points, count of refused gradients, 0
 // A step whose gradient is not finite is not taken, and counted.
@@ -8,6 +8,7 @@
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
 layout(local_size_x = 64) in;
+layout(constant_id = 2) const uint CHANNELS = 1;
 
 #include "../common/types.glsl"
 #include "../common/camera.glsl"
@@ -38,6 +39,7 @@ layout(set = 0, binding = 5, std430) buffer MomentsInOut { Moments moments[]; };
 layout(set = 0, binding = 6, std430) buffer Steps { uint steps[]; };
 layout(set = 0, binding = 7, std430) writeonly buffer Sums { float sums[]; };
 
+const uint SLOT_QUADS = CHANNELS == 3 ? 3 : 2;
 const float BETA1 = 0.9;
 const float BETA2 = 0.999;
 const float EPSILON = 1e-15;
@@ -72,8 +74,8 @@ float[7] update(uint rank) {
     const uint begin = tile_offsets[rank], end = min(tile_offsets[rank + 1], push.capacity);
     vec4 v0 = vec4(0.0), v1 = vec4(0.0);
     for (uint i = begin; i < end; ++i) {
-        v0 += isect_gradients[2 * i];
-        v1 += isect_gradients[2 * i + 1];
+        v0 += isect_gradients[SLOT_QUADS * i];
+        v1 += isect_gradients[SLOT_QUADS * i + 1];
     }
     if (begin >= end) {
         return pose;
@@ -83,7 +85,8 @@ float[7] update(uint rank) {
     Local l;
     place(push.camera, s, l);
     flatten(push.camera, vec2(push.size), l);
-    const Gradient g = pull_back(push.camera, l, s.scale_colour.xyz, v0.xy, vec3(v0.zw, v1.x));
+    Gradient g = pull_back(push.camera, l, s.scale_colour.xyz, v0.xy, vec3(v0.zw, v1.x));
+    g.cam.z -= v1.w * l.inv_z * l.inv_z;  // by inverse depth
     const float per_splat = 1.0 / float(visible_count[0]);
     const float opacity = sigmoid(s.mean_opacity.w);
     const float v_logit = (1.0 - opacity) * (v1.y + push.weight_opacity * per_splat * opacity);

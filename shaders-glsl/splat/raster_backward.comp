@@ -1,9 +1,12 @@
 // Replays the blend front to back and writes, for every intersection, the sum over its tile's pixels of
 // the loss gradient: one slot has one writer, so there are no atomics and every run sums in the same order.
-// in   ranges, intersections, owners, projected; grey (as rendered), grey_gradient
-// out  isect_gradients[8 e + ..]: centre x, y; conic a, b, c; α dL/dα; grey; 0
+// in   ranges, intersections, owners, projected, tints; rendered (planes of raster_forward); pixel_gradient, in
+//      planes: by the colour's CHANNELS; with DEPTH by accumulated inverse depth and by transmittance
+// out  isect_gradients[SLOT e + ..]: centre x, y; conic a, b, c; α dL/dα; grey or red; inverse depth;
+//      with three CHANNELS green, blue, 0, 0
 //      α dL/dα = o dL/do where the cap does not bind: project_backward needs it as it is
-// What lies behind Gaussian j is the rendered grey minus everything up to j.
+// All that is blended enters the loss linearly, so what lies behind Gaussian j matters by one number a pixel:
+// the gradient-weighted sum of what was rendered minus everything up to j. Transmittance is never used up.
 #version 450
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
@@ -14,12 +17,16 @@
 #extension GL_KHR_shader_subgroup_shuffle : require
 #endif
 layout(local_size_x = 32) in;
+layout(constant_id = 1) const uint DEPTH = 0;  // or INVERSE_DEPTH
+layout(constant_id = 2) const uint CHANNELS = 1;
 
 #include "../common/types.glsl"
 #include "../common/index.glsl"
 #include "../common/tiles.glsl"
 #include "../common/lanes.glsl"
 #include "../common/shade.glsl"
+
+const uint SLOT = CHANNELS == 3 ? 12 : 8;
 
 layout(push_constant) uniform Push {
     uvec2 size;
@@ -29,9 +36,10 @@ layout(set = 0, binding = 0, std430) readonly buffer Ranges { uvec2 ranges[]; };
 layout(set = 0, binding = 1, std430) readonly buffer Intersections { uint intersections[]; };
 layout(set = 0, binding = 2, std430) readonly buffer Owners { uint owners[]; };
 layout(set = 0, binding = 3, std430) readonly buffer ProjectedIn { Projected projected[]; };
-layout(set = 0, binding = 4, std430) readonly buffer Grey { float grey[]; };
-layout(set = 0, binding = 5, std430) readonly buffer GreyGradient { float grey_gradient[]; };
-layout(set = 0, binding = 6, std430) writeonly buffer IsectGradients { float isect_gradients[]; };
+layout(set = 0, binding = 4, std430) readonly buffer Tints { vec2 tints[]; };
+layout(set = 0, binding = 5, std430) readonly buffer Rendered { float rendered[]; };
+layout(set = 0, binding = 6, std430) readonly buffer PixelGradient { float pixel_gradient[]; };
+layout(set = 0, binding = 7, std430) writeonly buffer IsectGradients { float isect_gradients[]; };
 
 void main() {
     const uint tile = tile_index();
@@ -41,38 +49,61 @@ void main() {
     }
     const uvec2 pixel = column_of(tile, push.size);
     const vec2 top = vec2(pixel) + 0.5;
-    float t[COLUMN], behind[COLUMN], v[COLUMN];
+    const uint plane = push.size.x * push.size.y;
+    vec3 v[COLUMN];  // gradient by colour
+    float t[COLUMN], behind[COLUMN], v_depth[COLUMN];
     [[unroll]] for (uint k = 0; k < COLUMN; ++k) {
         const bool inside = pixel.x < push.size.x && pixel.y + k < push.size.y;
         const uint at = inside ? (pixel.y + k) * push.size.x + pixel.x : 0;
         t[k] = inside ? 1.0 : 0.0;
-        behind[k] = grey[at];
-        v[k] = grey_gradient[at];
+        v[k].x = pixel_gradient[at];
+        behind[k] = v[k].x * rendered[at];
+        if (CHANNELS == 3) {
+            v[k].yz = vec2(pixel_gradient[plane + at], pixel_gradient[2 * plane + at]);
+            behind[k] += v[k].y * rendered[plane + at] + v[k].z * rendered[2 * plane + at];
+        }
+        if (DEPTH != 0) {
+            const uint light = CHANNELS * plane + at, depth = light + plane;
+            v_depth[k] = pixel_gradient[light];
+            behind[k] += v_depth[k] * rendered[depth] + pixel_gradient[depth] * rendered[light];
+        }
     }
     const uvec2 range = ranges[tile];
     uint base = range.x;
     for (; base < range.y; base += LANES) {
         const uint isect = intersections[min(base + lane(), range.y - 1)];
-        const Projected g = projected[owners[isect]];
-        batch_put(g.centre_conic, vec4(g.conic_shade.x, log2(g.conic_shade.y), g.conic_shade.zw), isect);
+        const uint slot = owners[isect];
+        batch_put(batch_of(projected[slot], CHANNELS == 3 ? tints[slot] : vec2(0.0), isect));
         const uint n = min(LANES, range.y - base);
         for (uint j = 0; j < n; ++j) {
             const Batch b = batch_get(j);
             const Column s = column_terms(b, top);
-            // Moments of v_σ = -α dL/dα over the column, and the grey gradient.
-            float s0 = 0.0, s1 = 0.0, s2 = 0.0, shade = 0.0;
+            // Over the column: moments of v_σ = -α dL/dα, and the gradients by colour and inverse depth.
+            float s0 = 0.0, s1 = 0.0, s2 = 0.0, by_depth = 0.0;
+            vec3 by_colour = vec3(0.0);
             [[unroll]] for (uint k = 0; k < COLUMN; ++k) {
                 const float dy = s.d.y - float(k);
                 const float raw = alpha_at(s, dy);
                 const float alpha = effective(raw, t[k]);
                 const float w = alpha * t[k];
                 const float after = t[k] - w;
-                const float seen = w * s.grey;
+                const float wx = w * v[k].x;
+                float seen = wx * s.colour.x;
+                by_colour.x += wx;
+                if (CHANNELS == 3) {
+                    const vec2 wyz = w * v[k].yz;
+                    seen += dot(wyz, s.colour.yz);
+                    by_colour.yz += wyz;
+                }
+                if (DEPTH != 0) {
+                    const float wd = w * v_depth[k];
+                    seen += wd * s.depth;
+                    by_depth += wd;
+                }
                 behind[k] -= seen;
-                shade += w * v[k];
                 // (1 - α) is at least 0.01 and T > TRANSMITTANCE_MIN before, so w / after is bounded.
                 const float ratio = w > 0.0 ? alpha / (1.0 - alpha) : 0.0;
-                const float v_sigma = raw > ALPHA_MAX ? 0.0 : v[k] * (behind[k] * ratio - seen);
+                const float v_sigma = raw > ALPHA_MAX ? 0.0 : behind[k] * ratio - seen;
                 s0 += v_sigma;
                 s1 += v_sigma * dy;
                 s2 += v_sigma * dy * dy;
@@ -80,9 +111,15 @@ void main() {
             }
             const float xs = s.d.x * s0;
             const float sum = sum_of_eight(float[8](s.conic.x * xs + s.conic.y * s1, s.conic.y * xs + s.conic.z * s1,
-                                                    0.5 * s.d.x * xs, s.d.x * s1, 0.5 * s2, -s0, shade, 0.0));
+                                                    0.5 * s.d.x * xs, s.d.x * s1, 0.5 * s2, -s0, by_colour.x, by_depth));
             if (lane() < 8) {
-                isect_gradients[b.slot * 8 + lane()] = sum;
+                isect_gradients[b.slot * SLOT + lane()] = sum;
+            }
+            if (CHANNELS == 3) {
+                const float tint = sum_of_two(by_colour.y, by_colour.z);
+                if (lane() < 4) {
+                    isect_gradients[b.slot * SLOT + 8 + lane()] = lane() < 2 ? tint : 0.0;
+                }
             }
         }
         float clearest = t[0];
@@ -95,7 +132,7 @@ void main() {
         }
     }
     // Those behind an opaque tile got nothing.
-    for (uint i = base * 8 + lane(); i < range.y * 8; i += LANES) {
-        isect_gradients[intersections[i / 8] * 8 + i % 8] = 0.0;
+    for (uint i = base * SLOT + lane(); i < range.y * SLOT; i += LANES) {
+        isect_gradients[intersections[i / SLOT] * SLOT + i % SLOT] = 0.0;
     }
 }

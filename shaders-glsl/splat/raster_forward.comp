@@ -1,6 +1,7 @@
 // Blends the Gaussians of each tile front to back: one column of 8 pixels a lane.
-// in   ranges, intersections (by tile, then depth), owners, projected
-// out  grey, transmittance; depth (expected, m) when DEPTH is set
+// in   ranges, intersections (by tile, then depth), owners, projected; tints (green, blue) with three CHANNELS
+// out  rendered, in planes: the colour's CHANNELS; transmittance; and by DEPTH
+//      0 nothing   1 expected depth Σ w z / Σ w, m   2 accumulated inverse depth Σ w / z, 1/m
 // A pixel ends after the contribution that makes it opaque, so that transmittance alone tells, here
 // and in the backward pass, who contributed.
 #version 450
@@ -14,6 +15,7 @@
 #endif
 layout(local_size_x = 32) in;
 layout(constant_id = 1) const uint DEPTH = 0;
+layout(constant_id = 2) const uint CHANNELS = 1;
 
 #include "../common/types.glsl"
 #include "../common/index.glsl"
@@ -29,9 +31,8 @@ layout(set = 0, binding = 0, std430) readonly buffer Ranges { uvec2 ranges[]; };
 layout(set = 0, binding = 1, std430) readonly buffer Intersections { uint intersections[]; };
 layout(set = 0, binding = 2, std430) readonly buffer Owners { uint owners[]; };
 layout(set = 0, binding = 3, std430) readonly buffer ProjectedIn { Projected projected[]; };
-layout(set = 0, binding = 4, std430) writeonly buffer Grey { float grey[]; };
-layout(set = 0, binding = 5, std430) writeonly buffer Transmittance { float transmittance[]; };
-layout(set = 0, binding = 6, std430) writeonly buffer Depth { float depth[]; };
+layout(set = 0, binding = 4, std430) readonly buffer Tints { vec2 tints[]; };
+layout(set = 0, binding = 5, std430) writeonly buffer Rendered { float rendered[]; };
 
 void main() {
     const uint tile = tile_index();
@@ -41,23 +42,27 @@ void main() {
     }
     const uvec2 pixel = column_of(tile, push.size);
     const vec2 top = vec2(pixel) + 0.5;
-    float t[COLUMN], c[COLUMN], z[COLUMN];
+    vec3 c[COLUMN];
+    float t[COLUMN], z[COLUMN];
     [[unroll]] for (uint k = 0; k < COLUMN; ++k) {
         // Pixels outside the image are opaque from the start and never hold the tile up.
         t[k] = pixel.x < push.size.x && pixel.y + k < push.size.y ? 1.0 : 0.0;
-        c[k] = z[k] = 0.0;
+        c[k] = vec3(0.0);
+        z[k] = 0.0;
     }
     const uvec2 range = ranges[tile];
     for (uint base = range.x; base < range.y; base += LANES) {
-        const uint i = min(base + lane(), range.y - 1);
-        const Projected g = projected[owners[intersections[i]]];
-        batch_put(g.centre_conic, vec4(g.conic_shade.x, log2(g.conic_shade.y), g.conic_shade.zw), 0);
+        const uint slot = owners[intersections[min(base + lane(), range.y - 1)]];
+        batch_put(batch_of(projected[slot], CHANNELS == 3 ? tints[slot] : vec2(0.0), 0));
         const uint n = min(LANES, range.y - base);
         for (uint j = 0; j < n; ++j) {
             const Column s = column_terms(batch_get(j), top);
             [[unroll]] for (uint k = 0; k < COLUMN; ++k) {
                 const float w = effective(alpha_at(s, s.d.y - float(k)), t[k]) * t[k];
-                c[k] += w * s.grey;
+                c[k].x += w * s.colour.x;
+                if (CHANNELS == 3) {
+                    c[k].yz += w * s.colour.yz;
+                }
                 if (DEPTH != 0) {
                     z[k] += w * s.depth;
                 }
@@ -72,13 +77,19 @@ void main() {
             break;
         }
     }
+    const uint plane = push.size.x * push.size.y;
     [[unroll]] for (uint k = 0; k < COLUMN; ++k) {
         if (pixel.x < push.size.x && pixel.y + k < push.size.y) {
             const uint at = (pixel.y + k) * push.size.x + pixel.x;
-            grey[at] = c[k];
-            transmittance[at] = t[k];
+            rendered[at] = c[k].x;
+            if (CHANNELS == 3) {
+                rendered[plane + at] = c[k].y;
+                rendered[2 * plane + at] = c[k].z;
+            }
+            rendered[CHANNELS * plane + at] = t[k];
             if (DEPTH != 0) {
-                depth[at] = z[k] / max(1.0 - t[k], 1e-6);
+                const float per_alpha = DEPTH == EXPECTED_DEPTH ? 1.0 / max(1.0 - t[k], 1e-6) : 1.0;
+                rendered[(CHANNELS + 1) * plane + at] = z[k] * per_alpha;
             }
         }
     }

@@ -17,6 +17,10 @@ pub struct Shape {
     pub intersections: u32,
     /// Images kept to train on.
     pub keyframes: u32,
+    /// Of a Gaussian's colour: 1, grey, or 3.
+    pub channels: u32,
+    /// Whether steps may train on inverse depth: two more planes of gradients.
+    pub inverse_depth: bool,
 }
 
 /// Gaussians that travel to the GPU at a time.
@@ -36,6 +40,34 @@ impl Shape {
     /// Words of one stored 8-bit image; rows are padded to whole words.
     pub fn image_words(&self) -> usize {
         self.width.div_ceil(4) as usize * self.height as usize
+    }
+
+    /// Colour, transmittance, depth or its inverse: planes of raster_forward.
+    fn rendered_planes(&self) -> usize {
+        self.channels as usize + 2
+    }
+
+    /// By colour; by inverse depth and transmittance: planes of raster_backward.
+    fn gradient_planes(&self) -> usize {
+        self.channels as usize + if self.inverse_depth { 2 } else { 0 }
+    }
+
+    /// Words of an intersection's gradient: SLOT of raster_backward.
+    fn slot_words(&self) -> usize {
+        if self.channels == 3 {
+            12
+        } else {
+            8
+        }
+    }
+
+    /// Gaussians whose colour needs more than the grey of their record.
+    fn tinted(&self) -> usize {
+        if self.channels == 3 {
+            self.splats as usize
+        } else {
+            1
+        }
     }
 
     fn tiles_max(&self) -> usize {
@@ -68,6 +100,7 @@ buffers! {
     moments: Moments, "splats: Adam moments", |s| s.splats as usize;
     steps: u32, "splats: Adam steps", |s| s.splats as usize;
     projected: Projected, "splats: projected", |s| s.splats as usize;
+    tints: [f32; 2], "splats: green and blue", |s| s.tinted();
     visible: u32, "splats: visible, then its prefix sum", |s| s.splats as usize + 1;
     depth_keys: u32, "splats: depth keys", |s| s.splats as usize;
     slots: u32, "splats: visible slots", |s| s.splats as usize;
@@ -80,12 +113,10 @@ buffers! {
     isect_keys: u32, "intersections: tiles", |s| s.intersections as usize;
     isects: u32, "intersections: their index", |s| s.intersections as usize;
     owners: u32, "intersections: slots", |s| s.intersections as usize;
-    isect_gradients: f32, "intersections: gradients", |s| 8 * s.intersections as usize;
+    isect_gradients: f32, "intersections: gradients", |s| s.slot_words() * s.intersections as usize;
     ranges: [u32; 2], "tiles: ranges", |s| s.tiles_max();
-    grey: f32, "pixels: grey", |s| s.pixels();
-    transmittance: f32, "pixels: transmittance", |s| s.pixels();
-    depth: f32, "pixels: depth", |s| s.pixels();
-    grey_gradient: f32, "pixels: gradient", |s| s.pixels();
+    rendered: f32, "pixels: colour, transmittance, depth", |s| s.rendered_planes() * s.pixels();
+    pixel_gradient: f32, "pixels: gradient", |s| s.gradient_planes() * s.pixels();
     filtered: f32, "pixels: filtered moments", |s| 5 * s.pixels();
     slopes: f32, "pixels: SSIM slopes", |s| 3 * s.pixels();
     ssim_sums: f32, "pixels: SSIM by workgroup", |s| image_groups(s.width, s.height) as usize;

@@ -341,6 +341,8 @@ fn shape(board: &Board, width: usize, height: usize) -> Shape {
         splats: b.splats,
         intersections: b.intersections,
         keyframes: b.keyframes,
+        channels: 1,
+        inverse_depth: false,
     }
 }
 

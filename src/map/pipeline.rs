@@ -20,14 +20,23 @@ use super::view::{camera, pose_gradient, size, stats};
 pub use super::view::{LearningRates, Rendered, Stats, StepStats, View, Weights};
 use crate::gpu::kernels::types::{Splat, Status};
 use crate::gpu::kernels::*;
-use crate::gpu::{Gpu, GpuError, Kernel, KernelDef, Recorder, Threads};
+use crate::gpu::{Caps, Gpu, GpuError, Kernel, KernelDef, Recorder, Threads};
 use crate::mem::Footprint;
 use stipple_drivers::{Exit, Fault};
 
 /// Bits of a depth key: DEPTH_BITS of compact.comp.
 const DEPTH_BITS: u32 = 22;
+/// What the raster blends beside the colour: shade.glsl.
+const EXPECTED_DEPTH: u32 = 1;
+const INVERSE_DEPTH: u32 = 2;
 /// Pixels of a lane's column: COLUMN of tiles.glsl.
 const COLUMN: u32 = 8;
+
+/// The raster both ways; what is blended beside the colour is compiled in.
+struct Raster {
+    forward: Kernel<raster_forward::K>,
+    backward: Kernel<raster_backward::K>,
+}
 
 pub(super) struct Kernels {
     project: Kernel<project::K>,
@@ -35,13 +44,14 @@ pub(super) struct Kernels {
     count_tiles: Kernel<count_tiles::K>,
     emit_tiles: Kernel<emit_tiles::K>,
     tile_ranges: Kernel<tile_ranges::K>,
-    raster_training: Kernel<raster_forward::K>,
+    raster: Raster,
+    /// Of shapes that train on inverse depth.
+    raster_depth: Option<Raster>,
     raster_picture: Kernel<raster_forward::K>,
     ssim_rows: Kernel<ssim_rows::K>,
     ssim_columns: Kernel<ssim_columns::K>,
     loss_rows: Kernel<loss_rows::K>,
     loss_columns: Kernel<loss_columns::K>,
-    raster_backward: Kernel<raster_backward::K>,
     project_backward: Kernel<project_backward::K>,
     summary: Kernel<summary::K>,
     pub(super) insert: Kernel<insert::K>,
@@ -83,14 +93,7 @@ impl Pipeline {
     }
 
     pub fn new(gpu: &mut Gpu, shape: Shape) -> Result<Pipeline, Fault> {
-        let caps = gpu.caps();
-        // Intel's compiler picks a width per kernel, narrower than the one it reports.
-        let fixed_width = !caps.name.contains("Intel");
-        let sub = caps.subgroup.vote && caps.subgroup.shuffle && fixed_width;
-        let (lanes, variant) = match caps.subgroup_size {
-            n @ (8 | 16 | 32 | 64) if sub => (n.min(32), "subgroup"),
-            _ => (32, ""),
-        };
+        let (lanes, variant) = raster_variant(gpu.caps());
         Pipeline::with_lanes(gpu, shape, lanes, variant)
     }
 
@@ -101,24 +104,32 @@ impl Pipeline {
             || shape.splats == 0
             || shape.intersections == 0
             || shape.keyframes == 0
+            || !matches!(shape.channels, 1 | 3)
         {
-            return Err(Fault::new(Exit::Config, "map", format!("{shape:?} has a zero"), "raise the board's [budget]"));
+            let what = format!("{shape:?} has a zero, or neither 1 nor 3 channels");
+            return Err(Fault::new(Exit::Config, "map", what, "raise the board's [budget]"));
         }
-        let raster = |depth| raster_forward::Spec { lanes, depth };
+        let channels = shape.channels;
         let k = Kernels {
             project: gpu.kernel::<project::K>(project::Spec { lanes })?,
             compact: plain::<compact::K>(gpu)?,
             count_tiles: gpu.kernel::<count_tiles::K>(count_tiles::Spec { lanes })?,
             emit_tiles: gpu.kernel::<emit_tiles::K>(emit_tiles::Spec { lanes })?,
             tile_ranges: plain::<tile_ranges::K>(gpu)?,
-            raster_training: gpu.kernel_variant::<raster_forward::K>(raster(0), variant)?,
-            raster_picture: gpu.kernel_variant::<raster_forward::K>(raster(1), variant)?,
+            raster: Raster::new(gpu, lanes, variant, 0, channels)?,
+            raster_depth: shape
+                .inverse_depth
+                .then(|| Raster::new(gpu, lanes, variant, INVERSE_DEPTH, channels))
+                .transpose()?,
+            raster_picture: gpu.kernel_variant::<raster_forward::K>(
+                raster_forward::Spec { lanes, depth: EXPECTED_DEPTH, channels },
+                variant,
+            )?,
             ssim_rows: plain::<ssim_rows::K>(gpu)?,
             ssim_columns: plain::<ssim_columns::K>(gpu)?,
             loss_rows: plain::<loss_rows::K>(gpu)?,
             loss_columns: plain::<loss_columns::K>(gpu)?,
-            raster_backward: gpu.kernel_variant::<raster_backward::K>(raster_backward::Spec { lanes }, variant)?,
-            project_backward: plain::<project_backward::K>(gpu)?,
+            project_backward: gpu.kernel::<project_backward::K>(project_backward::Spec { channels })?,
             summary: plain::<summary::K>(gpu)?,
             insert: plain::<insert::K>(gpu)?,
             prune: plain::<prune::K>(gpu)?,
@@ -159,11 +170,10 @@ impl Pipeline {
         gpu.submit(rec)?;
         let n = view.camera.width * view.camera.height;
         (out.width, out.height) = (view.camera.width, view.camera.height);
-        for (buf, pixels) in
-            [(self.b.grey, &mut out.grey), (self.b.transmittance, &mut out.alpha), (self.b.depth, &mut out.depth)]
-        {
+        let light = self.shape.channels as usize;
+        for (plane, pixels) in [(0, &mut out.grey), (light, &mut out.alpha), (light + 1, &mut out.depth)] {
             pixels.resize(n, 0.0);
-            gpu.download(buf, 0, pixels)?;
+            gpu.download(self.b.rendered, plane * n, pixels)?;
         }
         out.alpha.iter_mut().for_each(|t| *t = 1.0 - *t);
         Ok(stats(&self.status(gpu)?))
@@ -184,9 +194,10 @@ impl Pipeline {
             "training views are of the shape the pipeline was made with"
         );
         let mut rec = gpu.record();
-        let by_tile = self.record_picture(&mut rec, view, &self.k.raster_training);
+        let raster = self.raster(false);
+        let by_tile = self.record_picture(&mut rec, view, &raster.forward);
         self.record_loss(&mut rec, slot, weights);
-        self.record_update(&mut rec, view, by_tile, rates, weights);
+        self.record_update(&mut rec, view, &raster.backward, by_tile, rates, weights);
         self.record_summary(&mut rec, image_groups(w, h), self.high_water.div_ceil(GROUP));
         gpu.submit(rec)?;
         let s = self.status(gpu)?;
@@ -201,6 +212,37 @@ impl Pipeline {
             gradients_rejected: s.gradients_refused as u32,
             pose_gradient: pose_gradient(view, &s.pose),
         })
+    }
+
+    /// One step down a gradient by pixel that the caller gives in place of a loss: planes by colour, and, of a
+    /// shape with inverse depth, by accumulated inverse depth and by transmittance.
+    pub fn descend(
+        &mut self,
+        gpu: &mut Gpu,
+        view: &View,
+        pixel_gradient: &[f32],
+        rates: &LearningRates,
+        weights: &Weights,
+    ) -> Result<StepStats, GpuError> {
+        gpu.upload(self.b.pixel_gradient, 0, pixel_gradient)?;
+        let mut rec = gpu.record();
+        let raster = self.raster(true);
+        let by_tile = self.record_picture(&mut rec, view, &raster.forward);
+        self.record_update(&mut rec, view, &raster.backward, by_tile, rates, weights);
+        self.record_summary(&mut rec, 0, self.high_water.div_ceil(GROUP));
+        gpu.submit(rec)?;
+        let s = self.status(gpu)?;
+        Ok(StepStats {
+            stats: stats(&s),
+            gradients_rejected: s.gradients_refused as u32,
+            pose_gradient: pose_gradient(view, &s.pose),
+            ..StepStats::default()
+        })
+    }
+
+    /// With inverse depth where it is wanted and the shape has it.
+    fn raster(&self, inverse_depth: bool) -> &Raster {
+        self.k.raster_depth.as_ref().filter(|_| inverse_depth).unwrap_or(&self.k.raster)
     }
 
     fn status(&self, gpu: &mut Gpu) -> Result<Status, GpuError> {
@@ -291,9 +333,8 @@ impl Pipeline {
                 intersections: sorted.payload.read(),
                 owners: b.owners.read(),
                 projected_in: b.projected.read(),
-                grey: b.grey.write(),
-                transmittance: b.transmittance.write(),
-                depth: b.depth.write(),
+                tints: b.tints.read(),
+                rendered: b.rendered.write(),
             },
             raster_forward::Push { size },
             Threads::d1(tiles * self.lanes),
@@ -310,7 +351,7 @@ impl Pipeline {
         rec.dispatch(
             &k.ssim_rows,
             ssim_rows::Bind {
-                grey: b.grey.read(),
+                grey: b.rendered.read(),
                 targets: b.targets.read(),
                 mask: b.mask.read(),
                 filtered: b.filtered.write(),
@@ -339,10 +380,10 @@ impl Pipeline {
             &k.loss_columns,
             loss_columns::Bind {
                 filtered: b.filtered.read(),
-                grey: b.grey.read(),
+                grey: b.rendered.read(),
                 targets: b.targets.read(),
                 mask: b.mask.read(),
-                grey_gradient: b.grey_gradient.write(),
+                grey_gradient: b.pixel_gradient.write(),
                 l1_sums: b.l1_sums.write(),
             },
             loss_columns::Push {
@@ -355,18 +396,27 @@ impl Pipeline {
         );
     }
 
-    fn record_update(&self, rec: &mut Recorder, view: &View, by_tile: Pairs, rates: &LearningRates, weights: &Weights) {
+    fn record_update(
+        &self,
+        rec: &mut Recorder,
+        view: &View,
+        raster_backward: &Kernel<raster_backward::K>,
+        by_tile: Pairs,
+        rates: &LearningRates,
+        weights: &Weights,
+    ) {
         let (k, b) = (&self.k, &self.b);
         let size = size(view);
         rec.dispatch(
-            &k.raster_backward,
+            raster_backward,
             raster_backward::Bind {
                 ranges: b.ranges.read(),
                 intersections: by_tile.payload.read(),
                 owners: b.owners.read(),
                 projected_in: b.projected.read(),
-                grey: b.grey.read(),
-                grey_gradient: b.grey_gradient.read(),
+                tints: b.tints.read(),
+                rendered: b.rendered.read(),
+                pixel_gradient: b.pixel_gradient.read(),
                 isect_gradients: b.isect_gradients.write(),
             },
             raster_backward::Push { size },
@@ -418,6 +468,26 @@ impl Pipeline {
             summary::Push { image_groups, splat_groups },
             Threads::groups(1, 1, 1),
         );
+    }
+}
+
+impl Raster {
+    fn new(gpu: &mut Gpu, lanes: u32, variant: &str, depth: u32, channels: u32) -> Result<Raster, Fault> {
+        Ok(Raster {
+            forward: gpu.kernel_variant(raster_forward::Spec { lanes, depth, channels }, variant)?,
+            backward: gpu.kernel_variant(raster_backward::Spec { lanes, depth, channels }, variant)?,
+        })
+    }
+}
+
+/// How many lanes shade a tile on this device, and by which variant of the raster.
+pub fn raster_variant(caps: &Caps) -> (u32, &'static str) {
+    // Intel's compiler picks a width per kernel, narrower than the one it reports.
+    let fixed_width = !caps.name.contains("Intel");
+    let sub = caps.subgroup.vote && caps.subgroup.shuffle && fixed_width;
+    match caps.subgroup_size {
+        n @ (8 | 16 | 32 | 64) if sub => (n.min(32), "subgroup"),
+        _ => (32, ""),
     }
 }
 

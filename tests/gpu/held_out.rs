@@ -50,7 +50,15 @@ fn wall(n: usize, sigma: f64, noise: f64, logit: f32, r: &mut Rng) -> Vec<SplatI
 #[ignore = "measures"]
 fn held_out_views_by_regulariser() {
     let (width, height) = (SIZE.0 as u32, SIZE.1 as u32);
-    let s = Shape { width, height, splats: 40_000, intersections: 1 << 19, keyframes: TRAINED as u32 };
+    let s = Shape {
+        width,
+        height,
+        splats: 40_000,
+        intersections: 1 << 19,
+        keyframes: TRAINED as u32,
+        channels: 1,
+        inverse_depth: false,
+    };
     let mut gpu = Gpu::open(&GpuConfig::default(), Pipeline::arena_bytes(&s)).unwrap();
     let mut p = Pipeline::new(&mut gpu, s).unwrap();
     let training: Vec<View> =

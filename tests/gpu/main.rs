@@ -2,6 +2,7 @@
 #![allow(clippy::unwrap_used)]
 
 mod held_out;
+mod raster;
 mod sort;
 mod speed;
 mod splat;

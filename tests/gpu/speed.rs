@@ -46,6 +46,8 @@ fn a_training_step() {
         splats: n[2] as u32,
         intersections: 20 * n[2] as u32,
         keyframes: 1,
+        channels: 1,
+        inverse_depth: false,
     };
     let mut gpu = Gpu::open(&GpuConfig::default(), Pipeline::arena_bytes(&shape)).unwrap();
     let mut p = Pipeline::new(&mut gpu, shape).unwrap();

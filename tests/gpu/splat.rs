@@ -11,7 +11,7 @@ use stipple::map::pipeline::{
 use stipple::stereo::Pinhole;
 use stipple_drivers::Pose;
 
-const STILL: LearningRates = LearningRates { position: 0.0, scale: 0.0, rotation: 0.0, opacity: 0.0, colour: 0.0 };
+pub const STILL: LearningRates = LearningRates { position: 0.0, scale: 0.0, rotation: 0.0, opacity: 0.0, colour: 0.0 };
 const SSIM: f32 = 0.2;
 
 /// SplitMix64.
@@ -36,7 +36,7 @@ pub fn view(width: usize, height: usize) -> View {
 }
 
 /// Gaussians in and a little outside the view, some behind the camera.
-fn scene(n: usize, view: &View, seed: u64) -> Vec<SplatInit> {
+pub fn scene(n: usize, view: &View, seed: u64) -> Vec<SplatInit> {
     let mut r = Rng(seed);
     let c = &view.camera;
     (0..n)
@@ -66,17 +66,23 @@ fn target(width: usize, height: usize) -> Vec<u8> {
 }
 
 /// A corner and a stripe are not seen.
-fn mask(width: usize, height: usize) -> Vec<u8> {
+pub fn mask(width: usize, height: usize) -> Vec<u8> {
     (0..width * height).map(|i| if i % width + i / width < 6 || i % width == width - 4 { 0 } else { 255 }).collect()
 }
 
-fn shape(v: &View, splats: u32, intersections: u32) -> Shape {
+pub fn shape(v: &View, splats: u32, intersections: u32) -> Shape {
     let (width, height) = (v.camera.width as u32, v.camera.height as u32);
-    Shape { width, height, splats, intersections, keyframes: 2 }
+    Shape { width, height, splats, intersections, keyframes: 2, channels: 1, inverse_depth: true }
 }
 
 fn open(shape: Shape) -> (Gpu, Pipeline) {
-    let mut gpu = Gpu::open(&GpuConfig::default(), Pipeline::arena_bytes(&shape)).unwrap();
+    open_with(shape, false)
+}
+
+/// With or without what only some devices have.
+pub fn open_with(shape: Shape, baseline: bool) -> (Gpu, Pipeline) {
+    let config = GpuConfig { subgroups: !baseline, ..GpuConfig::default() };
+    let mut gpu = Gpu::open(&config, Pipeline::arena_bytes(&shape)).unwrap();
     let p = Pipeline::new(&mut gpu, shape).unwrap();
     (gpu, p)
 }
@@ -87,7 +93,7 @@ pub fn render(gpu: &mut Gpu, p: &mut Pipeline, v: &View) -> Rendered {
     out
 }
 
-fn worst(a: impl IntoIterator<Item = f64>, b: impl IntoIterator<Item = f64>) -> f64 {
+pub fn worst(a: impl IntoIterator<Item = f64>, b: impl IntoIterator<Item = f64>) -> f64 {
     a.into_iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)
 }
 
@@ -166,8 +172,8 @@ fn compare_step(v: &View, n: usize, seed: u64, lanes: Option<(u32, &str)>) {
 
     // raster_forward: a decision on the alpha floor may fall either way, which is worth 1/255 of a grey level.
     let flip = if twin.rendered.margin > 1e-5 { 0.0 } else { 1.0 / 255.0 };
-    let alpha = twin.rendered.transmittance.iter().map(|t| 1.0 - t);
-    assert!(worst(wide(&picture.grey), twin.rendered.grey.iter().copied()) < 1e-5 + flip);
+    let alpha = twin.rendered.planes.transmittance.iter().map(|t| 1.0 - t);
+    assert!(worst(wide(&picture.grey), twin.rendered.planes.colour[0].iter().copied()) < 1e-5 + flip);
     assert!(worst(wide(&picture.alpha), alpha) < 1e-5 + flip);
     assert!(worst(wide(&picture.depth), twin.rendered.depth.iter().copied()) < 1e-3 + 4.0 * flip);
 
@@ -175,7 +181,7 @@ fn compare_step(v: &View, n: usize, seed: u64, lanes: Option<(u32, &str)>) {
     let weights = Weights { ssim: SSIM, needle: 0.0, scale: 0.0, scale_soft_m: 1.0, opacity: 0.0 };
     let step = p.train(&mut gpu, v, 1, &STILL, &weights).unwrap();
     let mut gradient = vec![0f32; w * h];
-    gpu.download(p.buffers().grey_gradient, 0, &mut gradient).unwrap();
+    gpu.download(p.buffers().pixel_gradient, 0, &mut gradient).unwrap();
     let scale = twin.loss.gradient.iter().fold(0.0f64, |m, g| m.max(g.abs()));
     assert!((step.l1 - twin.loss.l1).abs() < 1e-5 + flip && (step.ssim - twin.loss.ssim).abs() < 1e-4 + flip);
     let error = worst(wide(&gradient), twin.loss.gradient.iter().copied());
@@ -227,9 +233,9 @@ fn one_pixel_and_odd_sizes_agree_with_their_twin() {
         let splats = scene(16, &v, 5);
         p.append(&mut gpu, &splats).unwrap();
         let doubles: Vec<Parameters> = splats.iter().map(twins::project::parameters).collect();
-        let twin = twins::raster::forward(&twins::project_all(&doubles, &v, &[0.0; 6]), w, h);
+        let twin = twins::raster::forward(&twins::flat(&twins::project_all(&doubles, &v, &[0.0; 6])), w, h);
         let picture = render(&mut gpu, &mut p, &v);
-        assert!(worst(wide(&picture.grey), twin.grey) < 1e-5, "{w}x{h}");
+        assert!(worst(wide(&picture.grey), twin.planes.colour[0].clone()) < 1e-5, "{w}x{h}");
         p.set_keyframe(&mut gpu, 0, &target(w, h)).unwrap();
         assert!(p.train(&mut gpu, &v, 0, &STILL, &Weights::default()).unwrap().loss.is_finite());
     }
@@ -402,6 +408,7 @@ fn the_validation_layer_is_silent() {
     p.append(&mut gpu, &scene(64, &v, 1)).unwrap();
     p.set_keyframe(&mut gpu, 0, &target(33, 21)).unwrap();
     train(&mut gpu, &mut p, &v, 2);
+    p.descend(&mut gpu, &v, &[1.0; 3 * 33 * 21], &FAST, &Weights::default()).unwrap();
     render(&mut gpu, &mut p, &v);
     p.prune(&mut gpu, &PruneRule::default()).unwrap();
     assert_eq!(gpu.validation_messages(), Vec::<String>::new());

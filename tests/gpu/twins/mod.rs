@@ -31,16 +31,28 @@ pub fn step(
 ) -> Step {
     let (w, h) = (view.camera.width, view.camera.height);
     let projected = project_all(splats, view, twist);
-    let rendered = raster::forward(&projected, w, h);
-    let loss = loss::loss(&rendered.grey, target, mask, w, h, ssim_weight);
-    let image = raster::backward(&projected, w, h, &loss.gradient);
-    let mut out = Step { rendered, loss, splats: vec![[0.0; 12]; splats.len()], twist: [0.0; 6] };
+    let rendered = raster::forward(&flat(&projected), w, h);
+    let loss = loss::loss(&rendered.planes.colour[0], target, mask, w, h, ssim_weight);
+    let (splats, twist) = descend(&projected, view, &raster::Planes::grey(&loss.gradient));
+    Step { rendered, loss, splats, twist }
+}
+
+pub fn flat(projected: &[Option<Projected>]) -> Vec<Option<raster::Flat>> {
+    projected.iter().map(|p| p.as_ref().map(raster::flat)).collect()
+}
+
+/// From a gradient by pixel to that by every parameter and the pose twist.
+pub fn descend(projected: &[Option<Projected>], view: &View, v: &raster::Planes) -> (Vec<[f64; 12]>, [f64; 6]) {
+    let image = raster::backward(&flat(projected), view.camera.width, view.camera.height, v);
+    let (mut splats, mut twist) = (vec![[0.0; 12]; projected.len()], [0.0; 6]);
     for (i, p) in projected.iter().enumerate() {
         let Some(p) = p else { continue };
-        for (v, d) in image[i].iter().zip(p) {
-            (0..12).for_each(|k| out.splats[i][k] += v * d.d[k]);
-            (0..6).for_each(|k| out.twist[k] += v * d.d[12 + k]);
+        let mut g = image[i];
+        g[7] *= -1.0 / (p[7].v * p[7].v); // from inverse depth to depth
+        for (v, d) in g.iter().zip(p) {
+            (0..12).for_each(|k| splats[i][k] += v * d.d[k]);
+            (0..6).for_each(|k| twist[k] += v * d.d[12 + k]);
         }
     }
-    out
+    (splats, twist)
 }
