@@ -38,7 +38,7 @@ bool project(Splat s, uint slot) {
         return false;
     }
     projected[slot].centre_conic = vec4(l.centre, l.conic.xy);
-    projected[slot].conic_shade = vec4(l.conic.z, opacity, s.scale_colour.w, l.p.z);
+    projected[slot].conic_shade = vec4(l.conic.z, opacity, s.scale_colour.w, l.depth);
     return true;
 }
 

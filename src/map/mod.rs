@@ -264,7 +264,7 @@ impl Mapper {
 
     fn view_from(&self, world_from_body: Pose) -> View {
         let camera = self.stereo.camera();
-        View { world_from_cam: world_from_body * camera.body_from_rect, camera: camera.pinhole }
+        View { world_from_cam: world_from_body * camera.body_from_rect, camera: camera.pinhole, fisheye: None }
     }
 
     /// Smaller as the steps a keyframe has had grow: large ones find the picture, small ones settle it.

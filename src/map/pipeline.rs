@@ -17,7 +17,7 @@ use super::buffers::{image_groups, Buffers, ARRIVALS, GROUP, RUN};
 pub use super::pool::{PruneRule, SplatInit};
 use super::sort::{Pairs, Scan, Sorter};
 use super::view::{camera, pose_gradient, size, stats};
-pub use super::view::{LearningRates, Rendered, Stats, StepStats, View, Weights};
+pub use super::view::{Fisheye, LearningRates, Rendered, Stats, StepStats, View, Weights};
 use crate::gpu::kernels::types::{Splat, Status};
 use crate::gpu::kernels::*;
 use crate::gpu::{Caps, Gpu, GpuError, Kernel, KernelDef, Recorder, Threads};
@@ -39,7 +39,7 @@ struct Raster {
 }
 
 pub(super) struct Kernels {
-    project: Kernel<project::K>,
+    project: ByLens<project::K>,
     compact: Kernel<compact::K>,
     count_tiles: Kernel<count_tiles::K>,
     emit_tiles: Kernel<emit_tiles::K>,
@@ -52,10 +52,25 @@ pub(super) struct Kernels {
     ssim_columns: Kernel<ssim_columns::K>,
     loss_rows: Kernel<loss_rows::K>,
     loss_columns: Kernel<loss_columns::K>,
-    project_backward: Kernel<project_backward::K>,
+    project_backward: ByLens<project_backward::K>,
     summary: Kernel<summary::K>,
     pub(super) insert: Kernel<insert::K>,
     pub(super) prune: Kernel<prune::K>,
+}
+
+/// A kernel made for each of the two lenses.
+struct ByLens<K> {
+    pinhole: Kernel<K>,
+    fisheye: Kernel<K>,
+}
+
+impl<K> ByLens<K> {
+    fn of(&self, view: &View) -> &Kernel<K> {
+        match view.fisheye {
+            None => &self.pinhole,
+            Some(_) => &self.fisheye,
+        }
+    }
 }
 
 pub struct Pipeline {
@@ -111,7 +126,10 @@ impl Pipeline {
         }
         let channels = shape.channels;
         let k = Kernels {
-            project: gpu.kernel::<project::K>(project::Spec { lanes })?,
+            project: ByLens {
+                pinhole: gpu.kernel::<project::K>(project::Spec { lanes, fisheye: false })?,
+                fisheye: gpu.kernel::<project::K>(project::Spec { lanes, fisheye: true })?,
+            },
             compact: plain::<compact::K>(gpu)?,
             count_tiles: gpu.kernel::<count_tiles::K>(count_tiles::Spec { lanes })?,
             emit_tiles: gpu.kernel::<emit_tiles::K>(emit_tiles::Spec { lanes })?,
@@ -129,7 +147,10 @@ impl Pipeline {
             ssim_columns: plain::<ssim_columns::K>(gpu)?,
             loss_rows: plain::<loss_rows::K>(gpu)?,
             loss_columns: plain::<loss_columns::K>(gpu)?,
-            project_backward: gpu.kernel::<project_backward::K>(project_backward::Spec { channels })?,
+            project_backward: ByLens {
+                pinhole: gpu.kernel::<project_backward::K>(project_backward::Spec { channels, fisheye: false })?,
+                fisheye: gpu.kernel::<project_backward::K>(project_backward::Spec { channels, fisheye: true })?,
+            },
             summary: plain::<summary::K>(gpu)?,
             insert: plain::<insert::K>(gpu)?,
             prune: plain::<prune::K>(gpu)?,
@@ -262,7 +283,7 @@ impl Pipeline {
         let per_slot = Threads::d1(n + 1);
         rec.fill(b.failed, 0);
         rec.dispatch(
-            &k.project,
+            k.project.of(view),
             project::Bind {
                 splats: b.splats.read(),
                 projected_out: b.projected.write(),
@@ -423,7 +444,7 @@ impl Pipeline {
             Threads::d1(self.tiles(view) * self.lanes),
         );
         rec.dispatch(
-            &k.project_backward,
+            k.project_backward.of(view),
             project_backward::Bind {
                 visible_count: b.visible_count.read(),
                 slots: b.ranked.read(),

@@ -10,6 +10,44 @@ use stipple_drivers::Pose;
 pub struct View {
     pub world_from_cam: Pose,
     pub camera: Pinhole,
+    /// The lens that bends what `camera` would see; a pinhole without.
+    pub fisheye: Option<Fisheye>,
+}
+
+/// A Kannala-Brandt lens, as far as its image is seen.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Fisheye {
+    pub k: [f64; 4],
+    /// Gaussians further off the axis are not drawn, rad.
+    pub theta_max: f64,
+}
+
+impl Fisheye {
+    /// A little beyond the corners, so that what only reaches in with its rim is drawn too.
+    const BEYOND_CORNERS: f64 = 1.05;
+    /// Short of π, where the image is a circle and no point.
+    const THETA_END: f64 = 3.0;
+    const THETA_STEP: f64 = 1e-3;
+
+    /// Ends where the image does, or before it where the radius stops growing and points would fold back.
+    pub fn new(k: [f64; 4], camera: &Pinhole) -> Fisheye {
+        let reach = |at: f64, size: usize, f: f64| f64::max(at + 0.5, size as f64 - 0.5 - at) / f;
+        let corner = reach(camera.cx, camera.width, camera.fx).hypot(reach(camera.cy, camera.height, camera.fy));
+        let series = |t: f64, c: [f64; 4]| {
+            let t2 = t * t;
+            1.0 + t2 * (c[0] + t2 * (c[1] + t2 * (c[2] + t2 * c[3])))
+        };
+        let slopes = [3.0 * k[0], 5.0 * k[1], 7.0 * k[2], 9.0 * k[3]];
+        let thetas = (1..).map(|i| f64::from(i) * Fisheye::THETA_STEP).take_while(|t| *t < Fisheye::THETA_END);
+        let (mut theta_max, mut seen) = (0.0, None);
+        for t in thetas.take_while(|t| series(*t, slopes) > 0.0) {
+            theta_max = t;
+            if seen.is_none() && t * series(t, k) >= corner {
+                seen = Some(t * Fisheye::BEYOND_CORNERS);
+            }
+        }
+        Fisheye { k, theta_max: seen.map_or(theta_max, |seen| theta_max.min(seen)) }
+    }
 }
 
 /// Adam step sizes: m, ln m, quaternion, logit, grey.
@@ -82,10 +120,14 @@ pub(super) fn size(view: &View) -> [u32; 2] {
 
 pub(super) fn camera(view: &View) -> Camera {
     let cam_from_world = view.world_from_cam.inverse();
-    let (r, t) = (cam_from_world.rotation().transpose(), cam_from_world.p);
-    let row = |i: usize| [r.col(i).x as f32, r.col(i).y as f32, r.col(i).z as f32, t[i] as f32];
-    let c = &view.camera;
-    Camera { row0: row(0), row1: row(1), row2: row(2), focal_centre: [c.fx, c.fy, c.cx, c.cy].map(|v| v as f32) }
+    let (q, t, c) = (cam_from_world.q.as_quat(), cam_from_world.p.as_vec3(), &view.camera);
+    let (k, theta_max) = view.fisheye.map_or(([0.0; 4], 0.0), |f| (f.k, f.theta_max));
+    Camera {
+        turn: q.to_array(),
+        shift: [t.x, t.y, t.z, theta_max as f32],
+        focal_centre: [c.fx, c.fy, c.cx, c.cy].map(|v| v as f32),
+        bend: k.map(|k| k as f32),
+    }
 }
 
 pub(super) fn stats(s: &Status) -> Stats {

@@ -17,7 +17,7 @@ const STEPS: usize = 900;
 fn view(x: f64, y: f64, turn: f64) -> View {
     let (width, height) = SIZE;
     let camera = Pinhole { width, height, fx: 130.0, fy: 130.0, cx: 79.5, cy: 59.5 };
-    View { world_from_cam: Pose::new(DQuat::from_rotation_y(turn), DVec3::new(x, y, 0.0)), camera }
+    View { world_from_cam: Pose::new(DQuat::from_rotation_y(turn), DVec3::new(x, y, 0.0)), camera, fisheye: None }
 }
 
 fn relief(x: f64, y: f64) -> f64 {

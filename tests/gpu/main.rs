@@ -1,6 +1,7 @@
 //! Kernels against their twins, on whatever Vulkan device there is (lavapipe in CI).
 #![allow(clippy::unwrap_used)]
 
+mod fisheye;
 mod held_out;
 mod raster;
 mod sort;

@@ -32,7 +32,7 @@ pub fn view(width: usize, height: usize) -> View {
     let camera =
         Pinhole { width, height, fx: f, fy: 1.1 * f, cx: 0.5 * width as f64 - 0.3, cy: 0.5 * height as f64 + 0.4 };
     let q = DQuat::from_scaled_axis(DVec3::new(0.3, -0.5, 0.2));
-    View { world_from_cam: Pose::new(q, DVec3::new(1.0, -2.0, 0.5)), camera }
+    View { world_from_cam: Pose::new(q, DVec3::new(1.0, -2.0, 0.5)), camera, fisheye: None }
 }
 
 /// Gaussians in and a little outside the view, some behind the camera.
@@ -57,7 +57,7 @@ pub fn scene(n: usize, view: &View, seed: u64) -> Vec<SplatInit> {
         .collect()
 }
 
-fn target(width: usize, height: usize) -> Vec<u8> {
+pub fn target(width: usize, height: usize) -> Vec<u8> {
     let level = |i: usize| {
         let (x, y) = ((i % width) as f64, (i / width) as f64);
         127.0 + 80.0 * (0.35 * x).sin() * (0.21 * y + 0.1 * x).cos() + 30.0 * ((x - y) * 0.8).sin()
@@ -75,7 +75,7 @@ pub fn shape(v: &View, splats: u32, intersections: u32) -> Shape {
     Shape { width, height, splats, intersections, keyframes: 2, channels: 1, inverse_depth: true }
 }
 
-fn open(shape: Shape) -> (Gpu, Pipeline) {
+pub fn open(shape: Shape) -> (Gpu, Pipeline) {
     open_with(shape, false)
 }
 
@@ -97,19 +97,25 @@ pub fn worst(a: impl IntoIterator<Item = f64>, b: impl IntoIterator<Item = f64>)
     a.into_iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)
 }
 
-fn wide(v: &[f32]) -> Vec<f64> {
+pub fn wide(v: &[f32]) -> Vec<f64> {
     v.iter().map(|x| f64::from(*x)).collect()
 }
 
 #[test]
 fn twin_gradients_agree_with_finite_differences() {
-    const STEP: f64 = 1e-6;
     let v = view(23, 17);
-    let splats: Vec<Parameters> = scene(24, &v, 3).iter().map(twins::project::parameters).collect();
-    let goal: Vec<f64> = target(23, 17).iter().map(|g| f64::from(*g) / 255.0).collect();
-    let seen = mask(23, 17);
+    compare_differences(&v, &scene(24, &v, 3));
+}
+
+/// The twin's gradient by every parameter of every Gaussian and by the pose.
+pub fn compare_differences(v: &View, splats: &[SplatInit]) {
+    const STEP: f64 = 1e-6;
+    let (w, h) = (v.camera.width, v.camera.height);
+    let splats: Vec<Parameters> = splats.iter().map(twins::project::parameters).collect();
+    let goal: Vec<f64> = target(w, h).iter().map(|g| f64::from(*g) / 255.0).collect();
+    let seen = mask(w, h);
     let lambda = f64::from(SSIM);
-    let run = |s: &[Parameters], twist: &[f64; 6]| twins::step(s, &v, twist, &goal, &seen, lambda);
+    let run = |s: &[Parameters], twist: &[f64; 6]| twins::step(s, v, twist, &goal, &seen, lambda);
     let at = run(&splats, &[0.0; 6]);
     assert!(at.rendered.margin > 1e-5, "a decision is too close for differences: {}", at.rendered.margin);
     let slope = |f: &dyn Fn(f64) -> f64| (f(STEP) - f(-STEP)) / (2.0 * STEP);
@@ -138,16 +144,16 @@ fn twin_gradients_agree_with_finite_differences() {
 }
 
 /// Everything a step leaves behind, beside what its twin says.
-fn compare_step(v: &View, n: usize, seed: u64, lanes: Option<(u32, &str)>) {
+pub fn compare_step(v: &View, splats: &[SplatInit], lanes: Option<(u32, &str)>) {
     let (w, h) = (v.camera.width, v.camera.height);
-    let splats = scene(n, v, seed);
-    let s = shape(v, 64, 1 << 16);
+    let n = splats.len();
+    let s = shape(v, n as u32, 1 << 16);
     let mut gpu = Gpu::open(&GpuConfig::default(), Pipeline::arena_bytes(&s)).unwrap();
     let mut p = match lanes {
         Some((lanes, variant)) => Pipeline::with_lanes(&mut gpu, s, lanes, variant).unwrap(),
         None => Pipeline::new(&mut gpu, s).unwrap(),
     };
-    assert_eq!(p.append(&mut gpu, &splats).unwrap(), n);
+    assert_eq!(p.append(&mut gpu, splats).unwrap(), n);
     p.set_keyframe(&mut gpu, 1, &target(w, h)).unwrap();
     p.set_mask(&mut gpu, &mask(w, h)).unwrap();
 
@@ -199,7 +205,8 @@ fn compare_step(v: &View, n: usize, seed: u64, lanes: Option<(u32, &str)>) {
             let got = [a[0], a[1], a[2], b[0], b[1], b[2], q[0], q[1], q[2], q[3], a[3], b[3]];
             for k in range.clone() {
                 let error = (f64::from(got[k]) * 10.0 - twin.splats[i][k]).abs();
-                let bound = (1e-3 + 50.0 * flip) * scale;
+                // The loss is of order one: a billionth of it is nothing, and what rounding leaves of zero.
+                let bound = (1e-3 + 50.0 * flip) * scale + 1e-9;
                 assert!(error < bound, "splat {i} {name} {k}: {} against {}", got[k] * 10.0, twin.splats[i][k]);
             }
         }
@@ -216,13 +223,15 @@ fn compare_step(v: &View, n: usize, seed: u64, lanes: Option<(u32, &str)>) {
 
 #[test]
 fn every_stage_agrees_with_its_twin() {
-    compare_step(&view(33, 21), 40, 1, None);
-    compare_step(&view(64, 48), 64, 2, None);
+    for (n, seed, v) in [(40, 1, view(33, 21)), (64, 2, view(64, 48))] {
+        compare_step(&v, &scene(n, &v, seed), None);
+    }
 }
 
 #[test]
 fn the_baseline_without_subgroups_agrees_with_its_twin() {
-    compare_step(&view(33, 21), 40, 1, Some((32, "")));
+    let v = view(33, 21);
+    compare_step(&v, &scene(40, &v, 1), Some((32, "")));
 }
 
 #[test]
@@ -254,9 +263,10 @@ fn an_empty_map_renders_nothing_and_trains() {
     assert_eq!(step.pose_gradient.map(f64::abs), [0.0; 6]);
 }
 
-const FAST: LearningRates = LearningRates { position: 4e-3, scale: 2e-2, rotation: 1e-2, opacity: 5e-2, colour: 2e-2 };
+pub const FAST: LearningRates =
+    LearningRates { position: 4e-3, scale: 2e-2, rotation: 1e-2, opacity: 5e-2, colour: 2e-2 };
 
-fn train(gpu: &mut Gpu, p: &mut Pipeline, v: &View, steps: usize) -> Vec<StepStats> {
+pub fn train(gpu: &mut Gpu, p: &mut Pipeline, v: &View, steps: usize) -> Vec<StepStats> {
     (0..steps).map(|_| p.train(gpu, v, 0, &FAST, &Weights::default()).unwrap()).collect()
 }
 

@@ -34,6 +34,13 @@ impl Dual {
         self.map(self.v.sqrt(), 0.5 / self.v.sqrt())
     }
 
+    /// atan2(self, x) for self >= 0.
+    pub fn atan2(self, x: Dual) -> Dual {
+        let n = self.v * self.v + x.v * x.v;
+        let v = self.v.atan2(x.v);
+        Dual { v, d: std::array::from_fn(|i| (self.d[i] * x.v - x.d[i] * self.v) / n) }
+    }
+
     pub fn sigmoid(self) -> Dual {
         let s = 1.0 / (1.0 + (-self.v).exp());
         self.map(s, s * (1.0 - s))

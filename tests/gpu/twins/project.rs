@@ -8,6 +8,7 @@ use stipple::map::pipeline::{SplatInit, View};
 pub const NEAR: f64 = 0.05;
 pub const LOW_PASS: f64 = 0.3;
 const MARGIN: f64 = 0.15;
+const LOG_SCALE: (f64, f64) = (-11.5, 4.6);
 
 /// Parameters in the order of `SplatInit`: mean, log scale, quaternion xyzw, opacity logit, grey.
 pub type Parameters = [f64; 12];
@@ -22,7 +23,62 @@ pub fn parameters(s: &SplatInit) -> Parameters {
 /// centre x, y (integer = pixel centre), conic a, b, c, opacity, grey, depth.
 pub type Projected = [Dual; 8];
 
-/// `None` behind the camera. `twist` moves points of the camera frame: x -> Exp(twist) x, translation first.
+/// Centre without the principal point, and its Jacobian by the position, rows x and y.
+struct Lens {
+    centre: [Dual; 2],
+    jacobian: [[Dual; 3]; 2],
+}
+
+fn pinhole(c: &[Dual; 3], view: &View) -> Lens {
+    let k = &view.camera;
+    let focal = [constant(k.fx), constant(k.fy)];
+    let slope = [c[0] / c[2], c[1] / c[2]];
+    let edge = |pp: f64, size: usize, f: f64| {
+        ((-MARGIN * size as f64 - pp - 0.5) / f, ((1.0 + MARGIN) * size as f64 - pp - 0.5) / f)
+    };
+    let ((lx, hx), (ly, hy)) = (edge(k.cx, k.width, k.fx), edge(k.cy, k.height, k.fy));
+    let held = [slope[0].clamp(lx, hx), slope[1].clamp(ly, hy)];
+    let (j, zero) = ([focal[0] / c[2], focal[1] / c[2]], constant(0.0));
+    Lens {
+        centre: [focal[0] * slope[0], focal[1] * slope[1]],
+        jacobian: [[j[0], zero, -(j[0] * held[0])], [zero, j[1], -(j[1] * held[1])]],
+    }
+}
+
+/// Radius and angle instead of the kernel's three scalars: D(θ) along the unit vector (x, y) / r.
+fn fisheye(c: &[Dual; 3], view: &View, k: &[f64; 4]) -> Lens {
+    let [x, y, z] = *c;
+    let r = (x * x + y * y).sqrt();
+    let theta = r.atan2(z);
+    let t2 = theta * theta;
+    let series = |c: [f64; 4]| {
+        let one = constant(1.0);
+        one + t2 * (constant(c[0]) + t2 * (constant(c[1]) + t2 * (constant(c[2]) + t2 * constant(c[3]))))
+    };
+    let along = series([3.0 * k[0], 5.0 * k[1], 7.0 * k[2], 9.0 * k[3]]) / (r * r + z * z);
+    let (across, outwards) = (theta * series(*k) / r, along * z);
+    let e = [x / r, y / r];
+    let focal = [constant(view.camera.fx), constant(view.camera.fy)];
+    let stretch = outwards - across;
+    let row = |i: usize| {
+        let mut j = [stretch * e[i] * e[0], stretch * e[i] * e[1], -(along * c[i])];
+        j[i] = j[i] + across;
+        j.map(|v| focal[i] * v)
+    };
+    Lens { centre: [focal[0] * across * x, focal[1] * across * y], jacobian: [row(0), row(1)] }
+}
+
+/// Depth that orders, or `None` where the kernel draws nothing.
+fn depth(c: &[Dual; 3], view: &View) -> Option<Dual> {
+    let range = dot(*c, *c).sqrt();
+    let seen = match view.fisheye {
+        None => c[2].v >= NEAR,
+        Some(f) => range.v >= NEAR && c[0].v.hypot(c[1].v).atan2(c[2].v) <= f.theta_max,
+    };
+    seen.then_some(if view.fisheye.is_some() { range } else { c[2] })
+}
+
+/// `None` behind the camera, or not finite. `twist` moves points of the camera frame: x -> Exp(twist) x, translation first.
 pub fn project(p: &Parameters, view: &View, twist: &[f64; 6]) -> Option<Projected> {
     let x: [Dual; 12] = std::array::from_fn(|i| variable(p[i], i));
     let xi: [Dual; 6] = std::array::from_fn(|i| variable(0.0, 12 + i));
@@ -41,10 +97,11 @@ pub fn project(p: &Parameters, view: &View, twist: &[f64; 6]) -> Option<Projecte
     let moved = cross([xi[3], xi[4], xi[5]], offset);
     let rotated = rotate([x[0], x[1], x[2]]);
     let c: [Dual; 3] = std::array::from_fn(|i| rotated[i] + offset[i] + moved[i] + xi[i]);
-    if c[2].v.is_nan() || c[2].v < NEAR {
+    let norm2: f64 = p[6..10].iter().map(|q| q * q).sum();
+    if !(c.iter().all(|c| c.v.is_finite()) && p.iter().all(|p| p.is_finite()) && norm2 >= 1e-6) {
         return None;
     }
-
+    let depth = depth(&c, view)?;
     let norm = (x[6] * x[6] + x[7] * x[7] + x[8] * x[8] + x[9] * x[9]).sqrt();
     let (qx, qy, qz, qw) = (x[6] / norm, x[7] / norm, x[8] / norm, x[9] / norm);
     let (one, two) = (constant(1.0), constant(2.0));
@@ -54,26 +111,23 @@ pub fn project(p: &Parameters, view: &View, twist: &[f64; 6]) -> Option<Projecte
         [two * (qx * qz + qw * qy), two * (qy * qz - qw * qx), one - two * (qx * qx + qy * qy)],
     ];
 
-    let k = &view.camera;
-    let (fx, fy) = (constant(k.fx), constant(k.fy));
-    let (slope_x, slope_y) = (c[0] / c[2], c[1] / c[2]);
-    let edge = |pp: f64, size: usize, f: f64| {
-        ((-MARGIN * size as f64 - pp - 0.5) / f, ((1.0 + MARGIN) * size as f64 - pp - 0.5) / f)
+    let lens = match &view.fisheye {
+        None => pinhole(&c, view),
+        Some(f) => fisheye(&c, view, &f.k),
     };
-    let (lx, hx) = edge(k.cx, k.width, k.fx);
-    let (ly, hy) = edge(k.cy, k.height, k.fy);
-    let (jx, jy) = (slope_x.clamp(lx, hx), slope_y.clamp(ly, hy));
     let mut vx = [constant(0.0); 3];
     let mut vy = vx;
     for i in 0..3 {
-        let s = x[3 + i].exp();
+        let s = x[3 + i].clamp(LOG_SCALE.0, LOG_SCALE.1).exp();
         let axis = rotate(columns[i].map(|e| e * s));
-        vx[i] = fx / c[2] * (axis[0] - jx * axis[2]);
-        vy[i] = fy / c[2] * (axis[1] - jy * axis[2]);
+        vx[i] = dot(lens.jacobian[0], axis);
+        vy[i] = dot(lens.jacobian[1], axis);
     }
     let low_pass = constant(LOW_PASS);
     let (cxx, cxy, cyy) = (dot(vx, vx) + low_pass, dot(vx, vy), dot(vy, vy) + low_pass);
-    let det = cxx * cyy - cxy * cxy;
-    let centre = (fx * slope_x + constant(k.cx), fy * slope_y + constant(k.cy));
-    Some([centre.0, centre.1, cyy / det, -cxy / det, cxx / det, x[10].sigmoid(), x[11], c[2]])
+    // As the kernel: by Lagrange's identity no digits are lost on needles.
+    let n = cross(vx, vy);
+    let det = dot(n, n) + low_pass * (cxx + cyy) - low_pass * low_pass;
+    let centre = [lens.centre[0] + constant(view.camera.cx), lens.centre[1] + constant(view.camera.cy)];
+    Some([centre[0], centre[1], cyy / det, -cxy / det, cxx / det, x[10].sigmoid(), x[11], depth])
 }
