@@ -108,7 +108,9 @@ float[7] update(uint rank) {
     s.scale_colour.w = clamp(s.scale_colour.w, 0.0, 1.0);
     s.scale_colour.xyz = clamp(s.scale_colour.xyz, LOG_SCALE_MIN, LOG_SCALE_MAX);
     s.quat /= max(length(s.quat), 1e-3);
-    if (!(finite(s.mean_opacity) && finite(s.scale_colour) && finite(s.quat))) {
+    // A square beyond f32 would leave a moment that never comes down.
+    const bool settled = finite(a.v[0]) && finite(a.v[1]) && finite(a.v[2]);
+    if (!(settled && finite(s.mean_opacity) && finite(s.scale_colour) && finite(s.quat))) {
         pose[6] = 1.0;
         return pose;
     }

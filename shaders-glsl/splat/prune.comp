@@ -26,7 +26,8 @@ void main() {
     const Splat s = splats[slot];
     const bool alive = any(notEqual(floatBitsToUint(s.quat), uvec4(0)));
     const float longest = max(s.scale_colour.x, max(s.scale_colour.y, s.scale_colour.z));
-    const bool sound = finite(s.mean_opacity) && finite(s.scale_colour) && finite(s.quat) && dot(s.quat, s.quat) >= 1e-6;
+    const bool sound = finite(s.mean_opacity) && finite(s.scale_colour) && finite(s.quat) &&
+                       finite(dot(s.quat, s.quat)) && dot(s.quat, s.quat) >= 1e-6;
     const bool keep = sound && s.mean_opacity.w >= push.opacity_logit_min && longest <= push.log_scale_max;
     if (alive && !keep) {
         splats[slot] = Splat(vec4(0.0), vec4(0.0), vec4(0.0));

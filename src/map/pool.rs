@@ -66,14 +66,15 @@ impl Pipeline {
         }
     }
 
-    /// Takes Gaussians until the pool is full; how many.
+    /// Takes Gaussians until the pool is full; how many. Those without a rotation are left out: a slot whose
+    /// quaternion is zero is free.
     pub fn append(&mut self, gpu: &mut Gpu, arrivals: &[SplatInit]) -> Result<usize, GpuError> {
         let room = self.free.len() + (self.shape.splats - self.high_water) as usize;
-        let accepted = &arrivals[..arrivals.len().min(room)];
-        for chunk in accepted.chunks(ARRIVALS) {
+        let before = self.count();
+        for chunk in arrivals[..arrivals.len().min(room)].chunks(ARRIVALS) {
             self.words.clear();
             self.pool.clear();
-            for s in chunk {
+            for s in chunk.iter().filter(|s| s.quat_xyzw != [0.0; 4]) {
                 self.pool.push(packed(s));
                 self.words.push(self.free.pop().unwrap_or_else(|| {
                     self.high_water += 1;
@@ -91,11 +92,11 @@ impl Pipeline {
                 steps: b.steps.write(),
             };
             let mut rec = gpu.record();
-            let n = chunk.len() as u32;
+            let n = self.words.len() as u32;
             rec.dispatch(&self.k.insert, bind, insert::Push { arrivals: n }, Threads::d1(n));
             gpu.submit(rec)?;
         }
-        Ok(accepted.len())
+        Ok(self.count() - before)
     }
 
     /// Frees the slots of Gaussians that are faint, huge or not finite; how many.

@@ -7,4 +7,5 @@ mod raster;
 mod sort;
 mod speed;
 mod splat;
+mod stiff;
 mod twins;
