@@ -12,7 +12,7 @@ use stipple_drivers::{Camera, Lens};
 const K: [f64; 4] = [0.0034, 0.0008, -0.0017, 0.0003];
 
 /// Sees about 95 degrees off its axis at the sides, and more in the corners.
-fn wide_view(width: usize, height: usize) -> View {
+pub fn wide_view(width: usize, height: usize) -> View {
     let f = 0.3 * width as f64;
     let camera =
         Pinhole { width, height, fx: f, fy: 1.05 * f, cx: 0.5 * width as f64 - 0.3, cy: 0.5 * height as f64 + 0.4 };
@@ -31,7 +31,7 @@ fn at(v: &View, theta: f64, phi: f64, range: f64, r: &mut Rng) -> SplatInit {
     }
 }
 
-fn around(n: usize, v: &View, seed: u64) -> Vec<SplatInit> {
+pub fn around(n: usize, v: &View, seed: u64) -> Vec<SplatInit> {
     let mut r = Rng(seed);
     let mut one = |i: usize| {
         let theta = match i % 4 {

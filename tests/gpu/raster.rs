@@ -8,7 +8,7 @@ use super::twins::{descend, project_all};
 use stipple::config::GpuConfig;
 use stipple::gpu::kernels::{raster_backward, raster_forward, types::Projected};
 use stipple::gpu::{Buf, Gpu, Threads};
-use stipple::map::pipeline::{raster_variant, Weights};
+use stipple::map::pipeline::{raster_variant, SplatInit, View, Weights};
 
 const W: usize = 37;
 const H: usize = 21;
@@ -240,19 +240,24 @@ fn twin_gradients_by_inverse_depth_and_transmittance_agree_with_finite_differenc
 #[test]
 fn gradients_by_inverse_depth_reach_the_parameters_and_the_pose() {
     let view = view(W, H);
-    let splats = scene(64, &view, 3);
+    inverse_depth_reaches_the_parameters(&view, &scene(64, &view, 3));
+    let view = super::fisheye::wide_view(W, H);
+    inverse_depth_reaches_the_parameters(&view, &super::fisheye::around(64, &view, 3));
+}
+
+fn inverse_depth_reaches_the_parameters(view: &View, splats: &[SplatInit]) {
     let doubles: Vec<Parameters> = splats.iter().map(parameters).collect();
     let seen = mask(W, H);
     let mut v = planes(1, true, 7);
     for plane in [&mut v.colour[0], &mut v.inverse_depth, &mut v.transmittance] {
         plane.iter_mut().zip(&seen).filter(|(_, m)| **m == 0).for_each(|(v, _)| *v = 0.0);
     }
-    let (want, twist) = descend(&project_all(&doubles, &view, &[0.0; 6]), &view, &v);
+    let (want, twist) = descend(&project_all(&doubles, view, &[0.0; 6]), view, &v);
     for baseline in [true, false] {
-        let (mut gpu, mut p) = open_with(shape(&view, 64, 1 << 16), baseline);
-        p.append(&mut gpu, &splats).unwrap();
+        let (mut gpu, mut p) = open_with(shape(view, 64, 1 << 16), baseline);
+        p.append(&mut gpu, splats).unwrap();
         let weights = Weights { needle: 0.0, scale: 0.0, opacity: 0.0, ..Weights::default() };
-        let step = p.descend(&mut gpu, &view, &words(&v, 1), &STILL, &weights).unwrap();
+        let step = p.descend(&mut gpu, view, &words(&v, 1), &STILL, &weights).unwrap();
         let mut moments = vec![Default::default(); splats.len()];
         gpu.download(p.buffers().moments, 0, &mut moments).unwrap();
         for k in 0..12 {
