@@ -141,10 +141,11 @@ impl Gpu {
 
     pub fn open_with(config: &GpuConfig, arena_bytes: u64, options: GpuOptions) -> Result<Gpu, Fault> {
         let device = Arc::new(Device::open(config, options.validation)?);
+        let staging = Staging::new(&device)?;
         let mut gpu = Gpu {
-            submitter: Submitter::new(&device, config.submission_max_ms)?,
+            submitter: Submitter::new(&device, staging.buffer(), config.submission_max_ms)?,
             pipelines: Pipelines::new(&device)?,
-            staging: Staging::new(&device)?,
+            staging,
             arena: Arena::new(&device, arena_bytes)?,
             spare: Some(Recorder::new()),
             in_flight: None,
@@ -250,12 +251,23 @@ impl Gpu {
         Ok(())
     }
 
+    /// What the last submission's `Recorder::read_back` brought, until the next transfer.
+    pub fn read_back<T: bytemuck::Pod>(&mut self, items: &mut [T]) -> Result<(), GpuError> {
+        self.wait()?;
+        let bytes = bytemuck::cast_slice_mut::<T, u8>(items);
+        let of = STAGING_BYTES;
+        let read =
+            self.staging.bytes().get(..bytes.len()).ok_or(GpuError::OutOfRange { at: 0, len: bytes.len(), of })?;
+        bytes.copy_from_slice(read);
+        Ok(())
+    }
+
     /// Time on the device of the last submission, ms; without timestamps, until the host saw its end.
     pub fn last_submit_ms(&self) -> f64 {
         self.submitter.last_ms
     }
 
-    /// Time on the device, by kernel (and `fill`, `copy`), since boot. A command's time runs from the end of the
+    /// Time on the device, by kernel (and `fill`, `copy`, `read back`), since boot. A command's time runs from the end of the
     /// one before, so the times of a submission add up to the whole.
     pub fn timings(&self) -> &[Timing] {
         &self.submitter.timings

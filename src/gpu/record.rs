@@ -6,7 +6,7 @@
 //! there is.
 
 use super::kernel::{Access, Kernel, KernelDef, BUFFERS_MAX, PUSH_MAX};
-use super::memory::{Buf, Range};
+use super::memory::{Buf, Range, STAGING_BYTES};
 use super::GpuError;
 
 /// Commands of one recording.
@@ -63,6 +63,7 @@ pub(super) enum Work {
     Indirect { kernel: u32, ranges: [Range; BUFFERS_MAX], push: [u8; PUSH_MAX], at: u64 },
     Fill { range: Range, value: u32 },
     Copy { from: Range, to: Range },
+    ReadBack { from: Range },
 }
 
 #[derive(Clone, Copy)]
@@ -76,6 +77,7 @@ pub struct Recorder {
     pub(super) commands: Vec<Command>,
     /// Bytes touched since the last barrier, and whether they were written.
     open: Vec<(Range, bool)>,
+    reads_back: bool,
     pub(super) error: Option<GpuError>,
 }
 
@@ -86,12 +88,18 @@ impl Recorder {
     pub(super) const BYTES: usize = COMMANDS_MAX * size_of::<Command>() + OPEN_MAX * size_of::<(Range, bool)>();
 
     pub(super) fn new() -> Recorder {
-        Recorder { commands: Vec::with_capacity(COMMANDS_MAX), open: Vec::with_capacity(OPEN_MAX), error: None }
+        Recorder {
+            commands: Vec::with_capacity(COMMANDS_MAX),
+            open: Vec::with_capacity(OPEN_MAX),
+            reads_back: false,
+            error: None,
+        }
     }
 
     pub(super) fn clear(&mut self) {
         self.commands.clear();
         self.open.clear();
+        self.reads_back = false;
         self.error = None;
     }
 
@@ -149,6 +157,18 @@ impl Recorder {
         if from.start < from.end {
             let touched = [(from, Access::Read), (to, Access::Write)];
             self.push(Work::Copy { from, to }, touched.into_iter());
+        }
+    }
+
+    /// Brings `buf` to the host within this submission: `Gpu::read_back` has it afterwards. One a recording.
+    pub fn read_back<T>(&mut self, buf: Buf<T>) {
+        let from = buf.range();
+        if buf.bytes() > STAGING_BYTES as u64 || self.reads_back {
+            return self.fail(GpuError::Binding { kernel: "read back", start: from.start, end: from.end });
+        }
+        self.reads_back = true;
+        if from.start < from.end {
+            self.push(Work::ReadBack { from }, std::iter::once((from, Access::Read)));
         }
     }
 

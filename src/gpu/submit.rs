@@ -29,6 +29,7 @@ pub struct Timing {
 /// Rows of `Submitter::timings` that are not kernels.
 const FILL: usize = 0;
 const COPY: usize = 1;
+const READ_BACK: usize = 2;
 
 pub(super) struct Submitter {
     device: Arc<Device>,
@@ -36,6 +37,8 @@ pub(super) struct Submitter {
     commands: vk::CommandBuffer,
     fence: vk::Fence,
     queries: vk::QueryPool,
+    /// Where read-backs go.
+    staging: vk::Buffer,
     stamps: Vec<u64>,
     pub timings: Vec<Timing>,
     /// Row of each kernel, by index.
@@ -56,13 +59,14 @@ pub(super) struct Submitter {
 }
 
 impl Submitter {
-    pub fn new(device: &Arc<Device>, submission_max_ms: f64) -> Result<Submitter, Fault> {
+    pub fn new(device: &Arc<Device>, staging: vk::Buffer, submission_max_ms: f64) -> Result<Submitter, Fault> {
         let mut s = Submitter {
             device: device.clone(),
             pool: vk::CommandPool::null(),
             commands: vk::CommandBuffer::null(),
             fence: vk::Fence::null(),
             queries: vk::QueryPool::null(),
+            staging,
             stamps: vec![0; STAMPS],
             timings: Vec::new(),
             rows: Vec::new(),
@@ -77,6 +81,7 @@ impl Submitter {
         };
         s.row("fill");
         s.row("copy");
+        s.row("read back");
         let raw = &device.raw;
         // SAFETY: the device is alive; each object is destroyed by `Drop`, also after a failure here.
         unsafe {
@@ -145,6 +150,7 @@ impl Submitter {
             Work::Dispatch { kernel, .. } | Work::Indirect { kernel, .. } => self.rows[kernel as usize],
             Work::Fill { .. } => FILL,
             Work::Copy { .. } => COPY,
+            Work::ReadBack { .. } => READ_BACK,
         }
     }
 
@@ -213,6 +219,7 @@ impl Submitter {
             Work::Indirect { at, .. } => inside("indirect", Range { start: at, end: at + 12 })?,
             Work::Fill { range, .. } => inside("fill", range)?,
             Work::Copy { from, to } => inside("copy", from).and(inside("copy", to))?,
+            Work::ReadBack { from } => inside("read back", from)?,
         }
         let arena = arena.buffer();
         // SAFETY: recording; ranges lie in the arena, and the recorder checked their alignment.
@@ -227,6 +234,12 @@ impl Submitter {
                     let region =
                         [vk::BufferCopy { src_offset: from.start, dst_offset: to.start, size: from.end - from.start }];
                     raw.cmd_copy_buffer(cb, arena, arena, &region);
+                }
+                Work::ReadBack { from } => {
+                    let region =
+                        [vk::BufferCopy { src_offset: from.start, dst_offset: 0, size: from.end - from.start }];
+                    raw.cmd_copy_buffer(cb, arena, self.staging, &region);
+                    self.barrier_to_host();
                 }
             }
         }
@@ -281,10 +294,17 @@ impl Submitter {
         self.begin()?;
         // SAFETY: recording; the caller keeps the region inside both buffers.
         unsafe { self.device.raw.cmd_copy_buffer(self.commands, from, to, &[region]) };
+        self.barrier_to_host();
+        self.end()?;
+        self.wait()
+    }
+
+    /// What was copied is visible to the host after the fence.
+    fn barrier_to_host(&self) {
         let barrier = [vk::MemoryBarrier::default()
             .src_access_mask(vk::AccessFlags::TRANSFER_WRITE)
             .dst_access_mask(vk::AccessFlags::HOST_READ)];
-        // SAFETY: recording; makes the copy visible to the host, which reads staging after the fence.
+        // SAFETY: recording.
         unsafe {
             self.device.raw.cmd_pipeline_barrier(
                 self.commands,
@@ -296,8 +316,6 @@ impl Submitter {
                 &[],
             );
         }
-        self.end()?;
-        self.wait()
     }
 
     fn begin(&mut self) -> Result<(), GpuError> {

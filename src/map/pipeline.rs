@@ -8,8 +8,8 @@
 //! raster_backward -> project_backward (Adam) -> summary   -> gradient by intersection -> Gaussian
 //! ```
 //!
-//! Counts stay on the GPU: every dispatch is sized by capacity and ends early. The host reads 64 bytes after a
-//! step. Sums have one order, so that a step is the same in every run (3D Gaussian splatting: Kerbl et al. 2023;
+//! Counts stay on the GPU: every dispatch is sized by capacity and ends early. A submission
+//! ends by bringing 64 bytes to the host. Sums have one order, so that a step is the same in every run (3D Gaussian splatting: Kerbl et al. 2023;
 //! one gradient slot per intersection instead of atomics).
 
 pub use super::buffers::Shape;
@@ -189,6 +189,7 @@ impl Pipeline {
         self.record_picture(&mut rec, view, &self.k.raster_picture);
         self.record_summary(&mut rec, 0, 0);
         gpu.submit(rec)?;
+        let status = self.status(gpu)?;
         let n = view.camera.width * view.camera.height;
         (out.width, out.height) = (view.camera.width, view.camera.height);
         let light = self.shape.channels as usize;
@@ -197,7 +198,7 @@ impl Pipeline {
             gpu.download(self.b.rendered, plane * n, pixels)?;
         }
         out.alpha.iter_mut().for_each(|t| *t = 1.0 - *t);
-        Ok(stats(&self.status(gpu)?))
+        Ok(stats(&status))
     }
 
     /// One step on keyframe `slot`. The view must have the pipeline's shape.
@@ -266,9 +267,10 @@ impl Pipeline {
         self.k.raster_depth.as_ref().filter(|_| inverse_depth).unwrap_or(&self.k.raster)
     }
 
+    /// What the last summary said.
     fn status(&self, gpu: &mut Gpu) -> Result<Status, GpuError> {
         let mut s = [Status::default()];
-        gpu.download(self.b.status, 0, &mut s)?;
+        gpu.read_back(&mut s)?;
         Ok(s[0])
     }
 
@@ -489,6 +491,7 @@ impl Pipeline {
             summary::Push { image_groups, splat_groups },
             Threads::groups(1, 1, 1),
         );
+        rec.read_back(b.status);
     }
 }
 

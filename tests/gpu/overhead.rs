@@ -38,11 +38,11 @@ fn timings_name_every_command_and_add_up() {
     gpu.submit(rec).unwrap();
     let wall_ms = start.elapsed().as_secs_f64() * 1e3;
     let t = gpu.timings();
-    assert_eq!(t.iter().map(|t| t.name).collect::<Vec<_>>(), ["fill", "copy", "axpy"]);
+    assert_eq!(t.iter().map(|t| t.name).collect::<Vec<_>>(), ["fill", "copy", "read back", "axpy"]);
     assert_eq!((t[0].count - fills, t[1].count), (1, 1));
     if gpu.caps().timestamp_period_ns > 0.0 {
-        assert_eq!(t[2].count, 3);
-        assert!(t[2].total_ms > 0.0 && t[2].total_ms >= t[2].last_ms);
+        assert_eq!(t[3].count, 3);
+        assert!(t[3].total_ms > 0.0 && t[3].total_ms >= t[3].last_ms);
         let sum = t.iter().map(|t| t.total_ms).sum::<f64>() - before;
         assert!((sum - gpu.last_submit_ms()).abs() < 1e-6 * sum, "{sum} against {}", gpu.last_submit_ms());
     }
