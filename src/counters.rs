@@ -49,6 +49,8 @@ counters! {
     seeds_occupied,
     /// Occupancy cells that found no room in the hash table.
     occupancy_full,
+    /// Anchors whose Gaussians were moved after a correction.
+    blocks_moved,
     /// Steps whose (Gaussian, tile) list overflowed.
     intersections_overflow,
     /// Gaussians skipped by the optimiser because a gradient was not finite.

@@ -114,7 +114,7 @@ fn full_store_queue_and_pool_are_counted_values() {
 }
 
 #[test]
-fn corrections_reach_waiting_and_stored_keyframes() {
+fn corrections_reach_waiting_and_stored_keyframes_and_their_gaussians() {
     let (calibration, keyframes) = flight(2);
     let mut mapper = open(&calibration, &board(&[]));
     mapper.offer(&keyframes[0]);
@@ -124,8 +124,19 @@ fn corrections_reach_waiting_and_stored_keyframes() {
     train(&mut mapper, 1);
     let x = mapper.splats().unwrap()[0].mean[0];
     assert!((f64::from(x) - far.p.x).abs() < 20.0, "seeded where the correction said: {x}");
+    let before = mapper.panels(1).unwrap()[0].psnr_db.unwrap();
     mapper.correct(&PoseCorrection { id: 0, world_from_body: truth });
-    assert!(mapper.panels(1).unwrap()[0].psnr_db.unwrap() < 12.0, "the map is a hundred metres away");
+    train(&mut mapper, 1);
+    let x = mapper.splats().unwrap()[0].mean[0];
+    assert!((f64::from(x) - truth.p.x).abs() < 20.0, "moved with its anchor: {x}");
+    let after = mapper.panels(1).unwrap()[0].psnr_db.unwrap();
+    assert!(after > before - 0.5, "the same picture from there: {before} {after}");
+    assert_eq!(mapper.counters().blocks_moved.get(), 1);
+    // What is not finite is refused, and a keyframe nobody knows is ignored.
+    mapper.correct(&PoseCorrection { id: 0, world_from_body: Pose { p: truth.p * f64::NAN, ..truth } });
+    mapper.correct(&PoseCorrection { id: 77, world_from_body: far });
+    train(&mut mapper, 1);
+    assert_eq!(mapper.counters().blocks_moved.get(), 1);
 }
 
 #[test]

@@ -1,7 +1,7 @@
 // Sums each visible Gaussian's intersection gradients in fixed order, carries them back to its parameters
 // and to the camera pose, adds the regularisers, and takes one Adam step: one thread a rank.
 // in   visible_count, slots (by depth), tile_offsets, isect_gradients (slots of raster_backward)
-// out  splats, moments, steps (Adam's count, of this Gaussian); sums[8 group + ..]: gradient by a small
+// out  splats, moments, steps (count and importance of this Gaussian, see worth.glsl); sums[8 group + ..]: gradient by a small
 //      translation (3) and rotation (3) of the camera frame applied to points, count of refused gradients, 0
 // A step whose gradient is not finite is not taken, and counted.
 #version 450
@@ -14,6 +14,7 @@ layout(constant_id = 2) const uint CHANNELS = 1;
 #include "../common/camera.glsl"
 #include "../common/backward.glsl"
 #include "../common/index.glsl"
+#include "../common/worth.glsl"
 
 layout(push_constant) uniform Push {
     Camera camera;
@@ -73,9 +74,12 @@ float[7] update(uint rank) {
     float pose[7] = float[7](0, 0, 0, 0, 0, 0, 0);
     const uint begin = tile_offsets[rank], end = min(tile_offsets[rank + 1], push.capacity);
     vec4 v0 = vec4(0.0), v1 = vec4(0.0);
+    // Visibility x opacity x gradient, tile by tile: to first order, what the loss would change without it.
+    float worth = 0.0;
     for (uint i = begin; i < end; ++i) {
         v0 += isect_gradients[SLOT_QUADS * i];
         v1 += isect_gradients[SLOT_QUADS * i + 1];
+        worth += abs(isect_gradients[SLOT_QUADS * i + 1].y);
     }
     if (begin >= end) {
         return pose;
@@ -99,8 +103,8 @@ float[7] update(uint rank) {
     const vec3 turn = cross(l.p, g.cam) + g.turn;
     pose = float[7](g.cam.x, g.cam.y, g.cam.z, turn.x, turn.y, turn.z, 0.0);
 
-    const uint step = min(steps[slot] + 1, 65535u);
-    const vec2 debias = 1.0 / (1.0 - exp2(float(step) * log2(vec2(BETA1, BETA2))));
+    const uint state = after_step(steps[slot], worth);
+    const vec2 debias = 1.0 / (1.0 - exp2(float(steps_of(state)) * log2(vec2(BETA1, BETA2))));
     Moments a = moments[slot];
     s.mean_opacity -= adam(a.m[0], a.v[0], d0, vec4(vec3(push.rate_position), push.rate_opacity), debias);
     s.scale_colour -= adam(a.m[1], a.v[1], d1, vec4(vec3(push.rate_scale), push.rate_colour), debias);
@@ -116,7 +120,7 @@ float[7] update(uint rank) {
     }
     splats[slot] = s;
     moments[slot] = a;
-    steps[slot] = step;
+    steps[slot] = state;
     return pose;
 }
 

@@ -15,6 +15,8 @@ pub struct MapConfig {
     /// Occupancy grid cell, m, and its capacity (cells).
     pub occupancy_cell_m: f64,
     pub occupancy_cells: u32,
+    /// A correction moves an anchor's Gaussians when it exceeds this since they were last moved, m and rad.
+    pub move_tolerance: f64,
     /// Gaussians an anchor may seed.
     pub seeds_per_anchor: u32,
     /// Steps on a new anchor alone before uniform sampling resumes.
@@ -46,6 +48,7 @@ impl Default for MapConfig {
             covered_alpha: 0.05,
             occupancy_cell_m: 0.1,
             occupancy_cells: 1 << 18,
+            move_tolerance: 0.0,
             seeds_per_anchor: 8192,
             burst_iterations: 20,
             lockstep_iterations: 2,

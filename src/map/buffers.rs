@@ -29,6 +29,8 @@ pub const ARRIVALS: usize = 4096;
 pub const RUN: u32 = 8;
 /// Invocations of a workgroup of every kernel that reduces.
 pub const GROUP: u32 = 64;
+/// Bins of importance.comp.
+pub const IMPORTANCE_BINS: usize = 256;
 /// Narrowest tile, px: what the narrowest subgroup makes of it.
 const TILE_MIN: u32 = 8;
 
@@ -98,7 +100,7 @@ macro_rules! buffers {
 buffers! {
     splats: Splat, "splats: parameters", |s| s.splats as usize;
     moments: Moments, "splats: Adam moments", |s| s.splats as usize;
-    steps: u32, "splats: Adam steps", |s| s.splats as usize;
+    steps: u32, "splats: Adam steps and importance", |s| s.splats as usize;
     projected: Projected, "splats: projected", |s| s.splats as usize;
     tints: [f32; 2], "splats: green and blue", |s| s.tinted();
     visible: u32, "splats: visible, then its prefix sum", |s| s.splats as usize + 1;
@@ -107,7 +109,8 @@ buffers! {
     ranked: u32, "splats: visible slots by depth", |s| s.splats as usize;
     tile_offsets: u32, "splats: tiles touched, then their prefix sum", |s| s.splats as usize + 1;
     pose_sums: f32, "splats: pose gradient by workgroup", |s| 8 * (s.splats.div_ceil(GROUP) as usize);
-    freed: u32, "splats: freed slots", |s| s.splats as usize;
+    kept: u32, "splats: kept, then their prefix sum", |s| s.splats as usize + 1;
+    importance_bins: u32, "splats: how many of which importance", |_s| IMPORTANCE_BINS;
     arrivals: Splat, "splats: arrivals", |_s| ARRIVALS;
     arrival_slots: u32, "splats: slots of arrivals", |_s| ARRIVALS;
     isect_keys: u32, "intersections: tiles", |s| s.intersections as usize;

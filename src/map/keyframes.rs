@@ -118,7 +118,12 @@ impl Queue {
 pub struct Stored {
     pub id: u64,
     pub t: Nanos,
+    /// Where it is drawn from: `given`, refined.
     pub world_from_body: Pose,
+    /// By odometry, with its corrections.
+    pub given: Pose,
+    /// `given` when its Gaussians were last put in place; of an anchor.
+    pub placed: Pose,
     pub held_out: bool,
     pub anchor: bool,
     /// Of its refinement on the image.
@@ -166,7 +171,16 @@ impl Store {
         let image = self.images.get_mut(index)?;
         draw(image);
         let &Keyframe { id, t, world_from_body, held_out, .. } = keyframe;
-        self.entries.push(Stored { id, t, world_from_body, held_out, anchor: false, adam: PoseAdam::default() });
+        self.entries.push(Stored {
+            id,
+            t,
+            world_from_body,
+            given: world_from_body,
+            placed: world_from_body,
+            held_out,
+            anchor: false,
+            adam: PoseAdam::default(),
+        });
         if !held_out {
             self.training.push(index as u32);
         }
@@ -198,10 +212,29 @@ impl Store {
         self.entries.iter().filter(|e| e.anchor).count()
     }
 
-    pub fn correct(&mut self, correction: &PoseCorrection) {
-        if let Some(e) = self.entries.iter_mut().find(|e| e.id == correction.id) {
-            e.world_from_body = correction.world_from_body;
-        }
+    /// A correction moves what was refined along; what is not finite moves nothing. Answers whether there was one to take.
+    pub fn correct(&mut self, correction: &PoseCorrection) -> bool {
+        let to = correction.world_from_body;
+        // The newest are corrected most.
+        let found = self.entries.iter_mut().rev().find(|e| e.id == correction.id);
+        let Some(e) = found.filter(|_| to.p.is_finite() && to.q.is_finite()) else { return false };
+        e.world_from_body = to * e.given.inverse() * e.world_from_body;
+        e.given = to;
+        true
+    }
+
+    /// Anchors whose pose was corrected by more than `tolerance` (m, rad) since their Gaussians were put in place, and
+    /// by what; they count as in place from here on.
+    pub fn displaced(&mut self, tolerance: f64) -> impl Iterator<Item = (u32, Pose)> + '_ {
+        self.entries.iter_mut().enumerate().filter(|(_, e)| e.anchor).filter_map(move |(i, e)| {
+            let by = e.given * e.placed.inverse();
+            let turned = (e.given.q * e.placed.q.inverse()).to_scaled_axis().length();
+            if (e.given.p - e.placed.p).length() <= tolerance && turned <= tolerance {
+                return None;
+            }
+            e.placed = e.given;
+            Some((i as u32, by))
+        })
     }
 }
 

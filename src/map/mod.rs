@@ -7,6 +7,7 @@
 //! the GPU.
 
 pub mod anchors;
+pub mod blocks;
 pub mod buffers;
 pub mod evaluate;
 pub mod keyframes;
@@ -80,6 +81,8 @@ pub struct Mapper {
     scene_depth_m: f64,
     iterations: u64,
     counters: Counters,
+    /// Corrections came since anchors were last put in place.
+    corrected: bool,
 }
 
 /// Of a scene nothing is known of yet, m.
@@ -130,6 +133,7 @@ impl Mapper {
             scene_depth_m: SCENE_DEPTH_M,
             iterations: 0,
             counters: Counters::default(),
+            corrected: false,
             stereo,
             config,
         })
@@ -149,15 +153,29 @@ impl Mapper {
         !self.queue.is_full()
     }
 
+    /// Moves a keyframe, and with the next step the Gaussians of an anchor. Never waits for the GPU.
     pub fn correct(&mut self, correction: &PoseCorrection) {
         self.queue.correct(correction);
-        self.store.correct(correction);
+        self.corrected |= self.store.correct(correction);
+    }
+
+    /// Puts the Gaussians of corrected anchors where their anchors are now.
+    fn follow(&mut self) -> Result<(), GpuError> {
+        let (mut moved, tolerance) = (0, self.config.move_tolerance);
+        let displaced = self.store.displaced(tolerance).inspect(|_| moved += 1);
+        self.pipeline.move_blocks(&mut self.gpu, displaced)?;
+        self.counters.blocks_moved.add(moved);
+        self.corrected = false;
+        Ok(())
     }
 
     /// Works until `deadline`, and does at least one thing: takes in a waiting keyframe, else trains once.
     pub fn step(&mut self, deadline: Instant) -> Result<StepReport, GpuError> {
         let start = Instant::now();
         let mut report = StepReport::default();
+        if self.corrected {
+            self.follow()?;
+        }
         loop {
             if !self.queue.is_empty() {
                 if report.iterations > 0 {
@@ -228,10 +246,12 @@ impl Mapper {
             world_from_cam: view.world_from_cam,
             anchor: index as u32,
         };
+        self.pipeline.open_block(index as u32);
         self.arrivals.clear();
         self.arrivals.extend(self.seeder.seed(&seen, room, &self.counters).iter().map(gaussian));
         let seeded = self.pipeline.append(&mut self.gpu, &self.arrivals)? as u32;
-        self.store.get_mut(index).anchor = true;
+        let entry = self.store.get_mut(index);
+        (entry.anchor, entry.placed) = (true, entry.given);
         self.schedule.start_burst(index, self.config.burst_iterations);
         Ok(Did::Anchor { seeded })
     }

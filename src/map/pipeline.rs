@@ -12,6 +12,7 @@
 //! ends by bringing 64 bytes to the host. Sums have one order, so that a step is the same in every run (3D Gaussian splatting: Kerbl et al. 2023;
 //! one gradient slot per intersection instead of atomics).
 
+use super::blocks::Block;
 pub use super::buffers::Shape;
 use super::buffers::{image_groups, Buffers, ARRIVALS, GROUP, RUN};
 pub use super::pool::{PruneRule, SplatInit};
@@ -56,6 +57,9 @@ pub(super) struct Kernels {
     summary: Kernel<summary::K>,
     pub(super) insert: Kernel<insert::K>,
     pub(super) prune: Kernel<prune::K>,
+    pub(super) repack: Kernel<repack::K>,
+    pub(super) importance: Kernel<importance::K>,
+    pub(super) move_block: Kernel<move_block::K>,
 }
 
 /// A kernel made for each of the two lenses.
@@ -79,11 +83,11 @@ pub struct Pipeline {
     lanes: u32,
     pub(super) k: Kernels,
     pub(super) b: Buffers,
-    scan: Scan,
+    pub(super) scan: Scan,
     sorter: Sorter,
-    /// Slots below this were used at least once.
+    /// Slots below this are in use.
     pub(super) high_water: u32,
-    pub(super) free: Vec<u32>,
+    pub(super) blocks: Vec<Block>,
     pub(super) valid_pixels: u32,
     /// Host side of images, slots and pool transfers.
     pub(super) words: Vec<u32>,
@@ -94,7 +98,7 @@ impl Pipeline {
     pub fn footprint(shape: &Shape) -> Footprint {
         let mut f = Buffers::footprint(shape);
         let n = shape.splats as usize;
-        f.host("pipeline: free slots", n * size_of::<u32>());
+        f.host("pipeline: blocks", shape.keyframes as usize * size_of::<Block>());
         f.host("pipeline: transfers", words_max(shape) * size_of::<u32>() + n * size_of::<Splat>());
         f
     }
@@ -154,6 +158,9 @@ impl Pipeline {
             summary: plain::<summary::K>(gpu)?,
             insert: plain::<insert::K>(gpu)?,
             prune: plain::<prune::K>(gpu)?,
+            repack: plain::<repack::K>(gpu)?,
+            importance: plain::<importance::K>(gpu)?,
+            move_block: plain::<move_block::K>(gpu)?,
         };
         let sortable = shape.splats.max(shape.intersections) as usize;
         let mut p = Pipeline {
@@ -164,7 +171,7 @@ impl Pipeline {
             scan: Scan::new(gpu)?,
             sorter: Sorter::new(gpu, sortable)?,
             high_water: 0,
-            free: Vec::with_capacity(shape.splats as usize),
+            blocks: Vec::with_capacity(shape.keyframes as usize),
             valid_pixels: 0,
             words: Vec::with_capacity(words_max(&shape)),
             pool: Vec::with_capacity(shape.splats as usize),
@@ -517,7 +524,7 @@ pub fn raster_variant(caps: &Caps) -> (u32, &'static str) {
 
 /// Words the host moves at once: an image, the flags of all slots, or slots of arrivals.
 fn words_max(shape: &Shape) -> usize {
-    shape.image_words().max(shape.splats as usize).max(ARRIVALS)
+    shape.image_words().max(shape.splats as usize + 1).max(ARRIVALS)
 }
 
 fn plain<K: KernelDef>(gpu: &mut Gpu) -> Result<Kernel<K>, Fault>

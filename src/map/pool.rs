@@ -1,10 +1,10 @@
-//! The pool of Gaussians and the stored images, from the host's side: what goes in, what comes out, which
-//! slots are free. The pool never grows; a freed slot is taken again first.
+//! The pool of Gaussians and the stored images, from the host's side: what goes in and what comes out. Slots in use
+//! have no gaps (see `blocks` for how they are closed); the pool never grows.
 
 use super::buffers::ARRIVALS;
 use super::pipeline::Pipeline;
+use crate::gpu::kernels::insert;
 use crate::gpu::kernels::types::Splat;
-use crate::gpu::kernels::{insert, prune};
 use crate::gpu::{Gpu, GpuError, Threads};
 
 /// A Gaussian as the host sees it.
@@ -27,18 +27,21 @@ pub struct SplatInit {
 pub struct PruneRule {
     pub opacity_min: f64,
     pub scale_max_m: f64,
+    /// Less important ones go, of those that have had `steps_min` steps.
+    pub importance_min: f32,
+    pub steps_min: u32,
 }
 
 impl Default for PruneRule {
     fn default() -> Self {
-        PruneRule { opacity_min: 0.005, scale_max_m: 5.0 }
+        PruneRule { opacity_min: 0.005, scale_max_m: 5.0, importance_min: 0.0, steps_min: 0 }
     }
 }
 
 impl Pipeline {
     /// Gaussians alive.
     pub fn count(&self) -> usize {
-        self.high_water as usize - self.free.len()
+        self.high_water as usize
     }
 
     /// Stores the image that keyframe `slot` is trained on, row-major, stride = width.
@@ -66,20 +69,18 @@ impl Pipeline {
         }
     }
 
-    /// Takes Gaussians until the pool is full; how many. Those without a rotation are left out: a slot whose
-    /// quaternion is zero is free.
+    /// Takes Gaussians into the newest block until the pool is full; how many. Those without a rotation are left out:
+    /// nothing would ever be drawn of them.
     pub fn append(&mut self, gpu: &mut Gpu, arrivals: &[SplatInit]) -> Result<usize, GpuError> {
-        let room = self.free.len() + (self.shape.splats - self.high_water) as usize;
+        let room = (self.shape.splats - self.high_water) as usize;
         let before = self.count();
         for chunk in arrivals[..arrivals.len().min(room)].chunks(ARRIVALS) {
             self.words.clear();
             self.pool.clear();
             for s in chunk.iter().filter(|s| s.quat_xyzw != [0.0; 4]) {
                 self.pool.push(packed(s));
-                self.words.push(self.free.pop().unwrap_or_else(|| {
-                    self.high_water += 1;
-                    self.high_water - 1
-                }));
+                self.words.push(self.high_water);
+                self.high_water += 1;
             }
             gpu.upload(self.b.arrivals, 0, &self.pool)?;
             gpu.upload(self.b.arrival_slots, 0, &self.words)?;
@@ -99,30 +100,10 @@ impl Pipeline {
         Ok(self.count() - before)
     }
 
-    /// Frees the slots of Gaussians that are faint, huge or not finite; how many.
-    pub fn prune(&mut self, gpu: &mut Gpu, rule: &PruneRule) -> Result<usize, GpuError> {
-        let n = self.high_water;
-        let bind = prune::Bind { splats: self.b.splats.read_write(), freed: self.b.freed.write() };
-        let push = prune::Push {
-            splats: n,
-            opacity_logit_min: (rule.opacity_min / (1.0 - rule.opacity_min)).ln() as f32,
-            log_scale_max: rule.scale_max_m.ln() as f32,
-        };
-        let mut rec = gpu.record();
-        rec.dispatch(&self.k.prune, bind, push, Threads::d1(n));
-        gpu.submit(rec)?;
-        self.words.clear();
-        self.words.resize(n as usize, 0);
-        gpu.download(self.b.freed, 0, &mut self.words)?;
-        let before = self.free.len();
-        self.free.extend((0..n).filter(|slot| self.words[*slot as usize] != 0));
-        Ok(self.free.len() - before)
-    }
-
     /// Empties the pool.
     pub fn clear(&mut self) {
         self.high_water = 0;
-        self.free.clear();
+        self.blocks.clear();
     }
 
     /// The Gaussians alive, in slot order.
@@ -131,7 +112,7 @@ impl Pipeline {
         self.pool.resize(self.high_water as usize, Splat::default());
         gpu.download(self.b.splats, 0, &mut self.pool)?;
         out.clear();
-        out.extend(self.pool.iter().filter(|s| s.quat != [0.0; 4]).map(unpacked));
+        out.extend(self.pool.iter().map(unpacked));
         Ok(())
     }
 }

@@ -3,6 +3,7 @@
 
 mod fisheye;
 mod held_out;
+mod pool;
 mod raster;
 mod sort;
 mod speed;

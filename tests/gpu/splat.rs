@@ -339,7 +339,8 @@ fn splats_that_are_not_finite_do_not_change_the_picture() {
         let picture = render(&mut gpu, &mut p, &v);
         p.set_keyframe(&mut gpu, 0, &target(64, 48)).unwrap();
         let steps = train(&mut gpu, &mut p, &v, 3);
-        let pruned = p.prune(&mut gpu, &PruneRule { opacity_min: 1e-6, scale_max_m: 100.0 }).unwrap();
+        let pruned =
+            p.prune(&mut gpu, &PruneRule { opacity_min: 1e-6, scale_max_m: 100.0, ..PruneRule::default() }).unwrap();
         (picture.grey, steps, pruned)
     };
     let (clean, dirty) = (run(&good), run(&mixed));

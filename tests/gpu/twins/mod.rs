@@ -2,6 +2,7 @@
 
 pub mod dual;
 pub mod loss;
+pub mod pool;
 pub mod project;
 pub mod raster;
 
