@@ -3,10 +3,12 @@
 
 use std::path::{Path, PathBuf};
 use stipple_drivers::replay::{OpenOptions, Recording};
-use stipple_drivers::sim::{self, Scenario, Sim};
+use stipple_drivers::sim::{self, rig_named, Scenario, Sim};
 use stipple_drivers::{Calibration, Exit, Fault, Frames, ImuSample, Span, TimedPose};
 
-const NAMED: [&str; 2] = ["demo", "aggressive"];
+/// Name, scenario and rig: two cameras, or one, whose window says less and needs more iterations.
+const NAMED: [(&str, &str, Option<&str>); 3] =
+    [("demo", "demo", None), ("aggressive", "aggressive", None), ("demo, one camera", "demo", Some("mono"))];
 const RECORDING: &str = "euroc_MH_01_easy_11s";
 /// Recorded flights and where in them to begin, s: at rest, just before taking off.
 const RECORDED: [(&str, f64); 3] = [("MH_04_difficult", 16.0), ("V1_02_medium", 1.0), ("V2_02_medium", 0.0)];
@@ -22,7 +24,7 @@ pub struct Input {
 }
 
 enum Source {
-    Named(&'static str),
+    Named { scenario: &'static str, rig: Option<&'static str> },
     Recording(PathBuf),
     Recorded { truth: PathBuf, imu: Option<PathBuf>, start_s: f64 },
 }
@@ -35,12 +37,13 @@ pub struct Flight {
     pub truth: Vec<TimedPose>,
 }
 
-fn named(name: &'static str) -> Input {
-    Input { name: name.into(), about: "simulated cameras and inertial unit".into(), source: Source::Named(name) }
+fn named((name, scenario, rig): (&str, &'static str, Option<&'static str>)) -> Input {
+    let about = "simulated cameras and inertial unit".into();
+    Input { name: name.into(), about, source: Source::Named { scenario, rig } }
 }
 
 pub fn quick() -> Vec<Input> {
-    vec![named("demo")]
+    vec![named(NAMED[0])]
 }
 
 /// Those whose files are in the folder of recordings; the simulated flights in any case.
@@ -90,8 +93,12 @@ impl Input {
     pub fn load(&self, seconds: f64) -> Result<Flight, Fault> {
         eprintln!("loading {}: {}", self.name, self.about);
         match &self.source {
-            Source::Named(name) => {
-                rendered(Scenario::named(name).expect("NAMED are scenarios of the simulator"), seconds)
+            Source::Named { scenario, rig } => {
+                let mut scenario = Scenario::named(scenario).expect("NAMED are scenarios of the simulator");
+                if let Some(rig) = rig {
+                    scenario.calibration = rig_named(rig).expect("NAMED has rigs of the simulator");
+                }
+                rendered(scenario, seconds)
             }
             Source::Recording(path) => read(path, seconds),
             Source::Recorded { truth, imu, start_s } => {

@@ -11,8 +11,9 @@
 //! ```
 //!
 //! Offsets o_i sit on half pixels: 52 of them (thirteen vectors of four) fill a disc of radius 4.
-//! A template is upright, so its pixels share one bilinear fraction and gradients are differences
-//! on the same grid.
+//! A template is upright, so its pixels share one bilinear fraction. Its gradients are central differences of
+//! the 8-bit pixels, interpolated in 16 bits, a row of eight to a vector register; they only say which way to
+//! go, and where the residual vanishes is left to the values, which are not rounded.
 
 use super::pyramid::Pyramid;
 use crate::limits::PYRAMID_LEVELS;
@@ -23,6 +24,10 @@ pub const N: usize = 52;
 const SIDE: usize = 8;
 /// Pattern, one pixel more on every side for the differences.
 const GRID: usize = SIDE + 2;
+/// Pixels around a template: the grid, and one more for the bilinear neighbours.
+type Pixels = [[i16; GRID + 1]; GRID + 1];
+/// Of an interpolated gradient: 255·64 fits 16 bits.
+const FRACTION: f32 = 64.0;
 /// Grid index of each offset; the offset is `index - GRID/2 + 1/2`.
 const PATTERN: [[usize; 2]; N] = pattern();
 const DX: [f32; N] = offsets(0);
@@ -162,18 +167,25 @@ impl Template {
         if !(x >= 0.0 && y >= 0.0 && x <= (image.width - 1) as f32 && y <= (image.height - 1) as f32) {
             return;
         }
-        let Some((grid, inside)) = sample_grid(image, x, y) else { return };
+        let Some((pixels, [fx, fy], inside)) = pixels_around(image, x, y) else { return };
         let mut g = [[0f32; N]; 3];
         let mut g_mean = [0f32; 3];
         let on = weights(inside);
+        let value = values(&pixels, fx, fy);
+        let [gx, gy] = gradients(&pixels, fx, fy).map(|g| g.map(|row| row.map(|v| 0.5 / FRACTION * f32::from(v))));
+        let [g0, g1, _] = &mut g;
         let mut k = 0;
         for (j, (from, run)) in RUNS.into_iter().enumerate() {
-            let (up, row, down) = (&grid[j], &grid[j + 1], &grid[j + 2]);
-            for i in from..from + run {
-                self.value[k] = on[k] * row[i + 1];
-                g[0][k] = 0.5 * on[k] * (row[i + 2] - row[i]);
-                g[1][k] = 0.5 * on[k] * (down[i + 1] - up[i + 1]);
-                k += 1;
+            for (out, row) in [(&mut self.value, &value[j]), (&mut *g0, &gx[j]), (&mut *g1, &gy[j])] {
+                out[k..k + run].copy_from_slice(&row[from..from + run]);
+            }
+            k += run;
+        }
+        if inside != ALL {
+            for k in 0..N {
+                self.value[k] *= on[k];
+                g[0][k] *= on[k];
+                g[1][k] *= on[k];
             }
         }
         for k in 0..N {
@@ -355,26 +367,26 @@ fn weights(inside: u64) -> [f32; N] {
     on
 }
 
-/// Upright bilinear samples on the grid around a point inside the image, and which offsets (with
-/// their four neighbours) lie inside it. `None` when half of them or more do not.
-fn sample_grid(image: &Image, x: f32, y: f32) -> Option<([[f32; GRID]; GRID], u64)> {
+/// Pixels around a point inside the image, the bilinear fraction of the samples among them, and which offsets
+/// (with their four neighbours) lie inside it. `None` when half of them or more do not.
+fn pixels_around(image: &Image, x: f32, y: f32) -> Option<(Pixels, [f32; 2], u64)> {
     let half = (GRID as f32 - 1.0) / 2.0;
     let (left, top) = ((x - half).floor(), (y - half).floor());
-    let (fx, fy) = (x - half - left, y - half - top);
+    let fraction = [x - half - left, y - half - top];
     let (left, top) = (left as isize, top as isize);
     let (w, h) = (image.width as isize, image.height as isize);
     let whole = left >= 0 && top >= 0 && left + (GRID as isize) < w && top + (GRID as isize) < h;
-    let mut raw = [[0f32; GRID + 1]; GRID + 1];
-    for (j, row) in raw.iter_mut().enumerate() {
+    let mut pixels = [[0i16; GRID + 1]; GRID + 1];
+    for (j, row) in pixels.iter_mut().enumerate() {
         let line = (top + j as isize).clamp(0, h - 1) as usize * image.width;
         if whole {
             let from = line + left as usize;
             for (v, p) in row.iter_mut().zip(&image.pixels[from..from + GRID + 1]) {
-                *v = *p as f32;
+                *v = i16::from(*p);
             }
         } else {
             for (i, v) in row.iter_mut().enumerate() {
-                *v = image.pixels[line + (left + i as isize).clamp(0, w - 1) as usize] as f32;
+                *v = i16::from(image.pixels[line + (left + i as isize).clamp(0, w - 1) as usize]);
             }
         }
     }
@@ -391,15 +403,40 @@ fn sample_grid(image: &Image, x: f32, y: f32) -> Option<([[f32; GRID]; GRID], u6
             return None;
         }
     }
-    let mut grid = [[0f32; GRID]; GRID];
+    Some((pixels, fraction, inside))
+}
+
+/// Bilinear samples of the pattern's square.
+fn values(pixels: &Pixels, fx: f32, fy: f32) -> [[f32; SIDE]; SIDE] {
     let (w00, w10, w01, w11) = ((1.0 - fx) * (1.0 - fy), fx * (1.0 - fy), (1.0 - fx) * fy, fx * fy);
-    for j in 0..GRID {
-        let (a, b) = (&raw[j], &raw[j + 1]);
-        for i in 0..GRID {
-            grid[j][i] = w00 * a[i] + w10 * a[i + 1] + w01 * b[i] + w11 * b[i + 1];
+    let mut out = [[0.0; SIDE]; SIDE];
+    for (j, out) in out.iter_mut().enumerate() {
+        let (row, below) = (pixels[j + 1].map(f32::from), pixels[j + 2].map(f32::from));
+        for i in 0..SIDE {
+            out[i] = w00 * row[i + 1] + w10 * row[i + 2] + w01 * below[i + 1] + w11 * below[i + 2];
         }
     }
-    Some((grid, inside))
+    out
+}
+
+/// Twice the gradient by x and by y at the samples of the pattern's square, in 1/FRACTION grey a pixel.
+fn gradients(pixels: &Pixels, fx: f32, fy: f32) -> [[[i16; SIDE]; SIDE]; 2] {
+    let whole = |v: f32| (v * FRACTION).round() as i16;
+    let (x, y, w11) = (whole(fx), whole(fy), whole(fx * fy));
+    let (w10, w01) = (x - w11, y - w11);
+    let w00 = whole(1.0) - w10 - w01 - w11;
+    let mut g = [[[0; SIDE]; SIDE]; 2];
+    for j in 0..SIDE {
+        let rows = [&pixels[j], &pixels[j + 1], &pixels[j + 2], &pixels[j + 3]];
+        for i in 0..SIDE {
+            // By x and by y at column i + k of row j + n of the pattern's grid.
+            let dx = |n: usize, k: usize| rows[n + 1][i + k + 2] - rows[n + 1][i + k];
+            let dy = |n: usize, k: usize| rows[n + 2][i + k + 1] - rows[n][i + k + 1];
+            g[0][j][i] = w00 * dx(0, 0) + w10 * dx(0, 1) + w01 * dx(1, 0) + w11 * dx(1, 1);
+            g[1][j][i] = w00 * dy(0, 0) + w10 * dy(0, 1) + w01 * dy(1, 0) + w11 * dy(1, 1);
+        }
+    }
+    g
 }
 
 /// The neighbourhood of a patch: the part of an image that alignment reads while it moves the patch by
@@ -493,6 +530,34 @@ fn bilinear(q: &[u8], stride: usize, fx: f32, fy: f32) -> f32 {
 mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
+
+    #[test]
+    fn sixteen_bit_gradients_are_those_of_the_samples() {
+        // Black and white pixels at every phase are the largest a sum can get.
+        for case in 0..3 * 33 * 33 {
+            let (fx, fy) = ((case % 33) as f32 / 33.0, (case / 33 % 33) as f32 / 33.0);
+            let pixel = |i: usize, j: usize| match case / (33 * 33) {
+                0 => 255 * ((i / 2 + j / 2) % 2) as i16,
+                1 => 255 * (i / 2 % 2) as i16,
+                _ => (i * i * 37 + j * 91 + i * j * 53) as i16 % 256,
+            };
+            let pixels: Pixels = std::array::from_fn(|j| std::array::from_fn(|i| pixel(i, j)));
+            let at = |i: usize, j: usize| {
+                let p = |i: usize, j: usize| f32::from(pixel(i, j));
+                let (top, bottom) =
+                    (p(i, j) + fx * (p(i + 1, j) - p(i, j)), p(i, j + 1) + fx * (p(i + 1, j + 1) - p(i, j + 1)));
+                top + fy * (bottom - top)
+            };
+            let [gx, gy] = gradients(&pixels, fx, fy);
+            for (j, i) in (0..SIDE).flat_map(|j| (0..SIDE).map(move |i| (j, i))) {
+                let exact = [at(i + 2, j + 1) - at(i, j + 1), at(i + 1, j + 2) - at(i + 1, j)];
+                for (g, exact) in [gx[j][i], gy[j][i]].into_iter().zip(exact) {
+                    // Weights are off by a half, one, one and one and a half steps at most.
+                    assert!((f32::from(g) / FRACTION - exact).abs() <= 4.0 * 255.0 / FRACTION, "{g} {exact}");
+                }
+            }
+        }
+    }
 
     /// Smooth in every direction at every level: wavelengths of 9 to 60 px.
     fn smooth(x: f64, y: f64) -> f64 {
