@@ -19,6 +19,7 @@
 layout(local_size_x = 32) in;
 layout(constant_id = 1) const uint DEPTH = 0;  // or INVERSE_DEPTH
 layout(constant_id = 2) const uint CHANNELS = 1;
+layout(constant_id = 3) const uint DEGREE = 0;  // of the harmonics, whose backward pass uses the slot's third quad
 
 #include "../common/types.glsl"
 #include "../common/index.glsl"
@@ -26,7 +27,7 @@ layout(constant_id = 2) const uint CHANNELS = 1;
 #include "../common/lanes.glsl"
 #include "../common/shade.glsl"
 
-const uint SLOT = CHANNELS == 3 ? 12 : 8;
+const uint SLOT = CHANNELS == 3 || DEGREE > 0 ? 12 : 8;
 
 layout(push_constant) uniform Push {
     uvec2 size;

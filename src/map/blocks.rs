@@ -71,9 +71,14 @@ impl Pipeline {
         let Some(first) = (0..n).find(|slot| self.words[*slot as usize + 1] == *slot) else { return Ok(0) };
         let mut rec = gpu.record();
         // Every array over the pool that outlives a step.
-        self.record_repack(&mut rec, first, self.b.splats);
-        self.record_repack(&mut rec, first, self.b.moments);
-        self.record_repack(&mut rec, first, self.b.steps);
+        self.record_repack(&mut rec, first, self.b.splats, 1);
+        self.record_repack(&mut rec, first, self.b.moments, 1);
+        self.record_repack(&mut rec, first, self.b.steps, 1);
+        if let Some(h) = &self.harmonics {
+            let each = self.shape.colour_extra();
+            self.record_repack(&mut rec, first, h.coefficients, each);
+            self.record_repack(&mut rec, first, h.moments, each);
+        }
         gpu.submit(rec)?;
         for block in &mut self.blocks {
             block.first = self.words[block.first as usize];
@@ -82,10 +87,10 @@ impl Pipeline {
         Ok((n - self.high_water) as usize)
     }
 
-    /// Sets the kept slots from `first` on down to where `kept` says.
-    fn record_repack<T>(&self, rec: &mut Recorder, first: u32, array: Buf<T>) {
+    /// Sets the kept slots from `first` on down to where `kept` says; a slot has `each` elements.
+    fn record_repack<T>(&self, rec: &mut Recorder, first: u32, array: Buf<T>, each: usize) {
         let b = &self.b;
-        let stride = (size_of::<T>() / size_of::<u32>()) as u32;
+        let stride = (each * size_of::<T>() / size_of::<u32>()) as u32;
         // Gradients of intersections live for one step.
         let scratch = b.isect_gradients.cast::<u32>();
         let at_once = (scratch.len() as u32 / stride).max(1);
@@ -139,6 +144,9 @@ impl Pipeline {
             let bind =
                 move_block::Bind { splats: self.b.splats.read_write(), moments_in_out: self.b.moments.read_write() };
             rec.dispatch(&self.k.move_block, bind, push, Threads::d1(push.count));
+            if let Some(h) = &self.harmonics {
+                h.record_turn(&mut rec, &by, self.block(anchor));
+            }
         }
         gpu.submit(rec)
     }

@@ -19,6 +19,8 @@ pub struct Shape {
     pub keyframes: u32,
     /// Of a Gaussian's colour: 1, grey, or 3.
     pub channels: u32,
+    /// Of the spherical harmonics of a colour: 0 to 3.
+    pub sh_degree: u32,
     /// Whether steps may train on inverse depth: two more planes of gradients.
     pub inverse_depth: bool,
 }
@@ -54,9 +56,14 @@ impl Shape {
         self.channels as usize + if self.inverse_depth { 2 } else { 0 }
     }
 
+    /// Coefficients of a colour beyond the level in a Gaussian's record: EXTRA of harmonics.glsl.
+    pub fn colour_extra(&self) -> usize {
+        (self.channels * (self.sh_degree + 1).pow(2)) as usize - 1
+    }
+
     /// Words of an intersection's gradient: SLOT of raster_backward.
     fn slot_words(&self) -> usize {
-        if self.channels == 3 {
+        if self.channels == 3 || self.sh_degree > 0 {
             12
         } else {
             8

@@ -10,6 +10,7 @@ pub mod anchors;
 pub mod blocks;
 pub mod buffers;
 pub mod evaluate;
+pub mod harmonics;
 pub mod keyframes;
 pub mod occupancy;
 pub mod pipeline;
@@ -362,6 +363,7 @@ fn shape(board: &Board, width: usize, height: usize) -> Shape {
         intersections: b.intersections,
         keyframes: b.keyframes,
         channels: 1,
+        sh_degree: 0,
         inverse_depth: false,
     }
 }

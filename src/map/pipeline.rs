@@ -15,6 +15,7 @@
 use super::blocks::Block;
 pub use super::buffers::Shape;
 use super::buffers::{image_groups, Buffers, ARRIVALS, GROUP, RUN};
+use super::harmonics::Harmonics;
 pub use super::pool::{PruneRule, SplatInit};
 use super::sort::{Pairs, Scan, Sorter};
 use super::view::{camera, pose_gradient, size, stats};
@@ -83,6 +84,8 @@ pub struct Pipeline {
     lanes: u32,
     pub(super) k: Kernels,
     pub(super) b: Buffers,
+    /// Where a colour is more than one grey level.
+    pub(super) harmonics: Option<Harmonics>,
     pub(super) scan: Scan,
     sorter: Sorter,
     /// Slots below this are in use.
@@ -97,6 +100,7 @@ pub struct Pipeline {
 impl Pipeline {
     pub fn footprint(shape: &Shape) -> Footprint {
         let mut f = Buffers::footprint(shape);
+        f.extend(Harmonics::footprint(shape));
         let n = shape.splats as usize;
         f.host("pipeline: blocks", shape.keyframes as usize * size_of::<Block>());
         f.host("pipeline: transfers", words_max(shape) * size_of::<u32>() + n * size_of::<Splat>());
@@ -124,11 +128,13 @@ impl Pipeline {
             || shape.intersections == 0
             || shape.keyframes == 0
             || !matches!(shape.channels, 1 | 3)
+            || shape.sh_degree > 3
         {
-            let what = format!("{shape:?} has a zero, or neither 1 nor 3 channels");
+            let what = format!("{shape:?} has a zero, neither 1 nor 3 channels, or harmonics past degree 3");
             return Err(Fault::new(Exit::Config, "map", what, "raise the board's [budget]"));
         }
-        let channels = shape.channels;
+        let (channels, degree) = (shape.channels, shape.sh_degree);
+        let backward = |fisheye| project_backward::Spec { channels, degree, fisheye };
         let k = Kernels {
             project: ByLens {
                 pinhole: gpu.kernel::<project::K>(project::Spec { lanes, fisheye: false })?,
@@ -138,10 +144,10 @@ impl Pipeline {
             count_tiles: gpu.kernel::<count_tiles::K>(count_tiles::Spec { lanes })?,
             emit_tiles: gpu.kernel::<emit_tiles::K>(emit_tiles::Spec { lanes })?,
             tile_ranges: plain::<tile_ranges::K>(gpu)?,
-            raster: Raster::new(gpu, lanes, variant, 0, channels)?,
+            raster: Raster::new(gpu, lanes, variant, 0, &shape)?,
             raster_depth: shape
                 .inverse_depth
-                .then(|| Raster::new(gpu, lanes, variant, INVERSE_DEPTH, channels))
+                .then(|| Raster::new(gpu, lanes, variant, INVERSE_DEPTH, &shape))
                 .transpose()?,
             raster_picture: gpu.kernel_variant::<raster_forward::K>(
                 raster_forward::Spec { lanes, depth: EXPECTED_DEPTH, channels },
@@ -152,8 +158,8 @@ impl Pipeline {
             loss_rows: plain::<loss_rows::K>(gpu)?,
             loss_columns: plain::<loss_columns::K>(gpu)?,
             project_backward: ByLens {
-                pinhole: gpu.kernel::<project_backward::K>(project_backward::Spec { channels, fisheye: false })?,
-                fisheye: gpu.kernel::<project_backward::K>(project_backward::Spec { channels, fisheye: true })?,
+                pinhole: gpu.kernel::<project_backward::K>(backward(false))?,
+                fisheye: gpu.kernel::<project_backward::K>(backward(true))?,
             },
             summary: plain::<summary::K>(gpu)?,
             insert: plain::<insert::K>(gpu)?,
@@ -168,6 +174,7 @@ impl Pipeline {
             lanes,
             k,
             b: Buffers::new(gpu, &shape)?,
+            harmonics: (shape.colour_extra() > 0).then(|| Harmonics::new(gpu, &shape)).transpose()?,
             scan: Scan::new(gpu)?,
             sorter: Sorter::new(gpu, sortable)?,
             high_water: 0,
@@ -183,6 +190,10 @@ impl Pipeline {
 
     pub fn shape(&self) -> &Shape {
         &self.shape
+    }
+
+    pub fn harmonics(&self) -> Option<&Harmonics> {
+        self.harmonics.as_ref()
     }
 
     /// What is in the arena, for tests of single stages.
@@ -346,6 +357,9 @@ impl Pipeline {
             emit_tiles::Push { size, splats: n, capacity: self.shape.intersections },
             per_slot,
         );
+        if let Some(h) = &self.harmonics {
+            h.record_colours(rec, b, view, n);
+        }
         let tiles = self.tiles(view);
         let sorted = self.sorter.record(rec, b.by_tile(), b.isect_count.part(0, 1), u32::BITS - tiles.leading_zeros());
         rec.fill(b.ranges, 0);
@@ -452,6 +466,9 @@ impl Pipeline {
             raster_backward::Push { size },
             Threads::d1(self.tiles(view) * self.lanes),
         );
+        if let Some(h) = &self.harmonics {
+            h.record_update(rec, b, view, self.high_water, rates);
+        }
         rec.dispatch(
             k.project_backward.of(view),
             project_backward::Bind {
@@ -503,10 +520,11 @@ impl Pipeline {
 }
 
 impl Raster {
-    fn new(gpu: &mut Gpu, lanes: u32, variant: &str, depth: u32, channels: u32) -> Result<Raster, Fault> {
+    fn new(gpu: &mut Gpu, lanes: u32, variant: &str, depth: u32, shape: &Shape) -> Result<Raster, Fault> {
+        let (channels, degree) = (shape.channels, shape.sh_degree);
         Ok(Raster {
             forward: gpu.kernel_variant(raster_forward::Spec { lanes, depth, channels }, variant)?,
-            backward: gpu.kernel_variant(raster_backward::Spec { lanes, depth, channels }, variant)?,
+            backward: gpu.kernel_variant(raster_backward::Spec { lanes, depth, channels, degree }, variant)?,
         })
     }
 }

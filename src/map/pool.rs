@@ -18,7 +18,7 @@ pub struct SplatInit {
     /// world_from_splat
     pub quat_xyzw: [f32; 4],
     pub opacity_logit: f32,
-    /// Grey, linear 0..1.
+    /// Grey or red, linear 0..1.
     pub colour: f32,
 }
 
@@ -72,9 +72,19 @@ impl Pipeline {
     /// Takes Gaussians into the newest block until the pool is full; how many. Those without a rotation are left out:
     /// nothing would ever be drawn of them.
     pub fn append(&mut self, gpu: &mut Gpu, arrivals: &[SplatInit]) -> Result<usize, GpuError> {
+        self.append_tinted(gpu, arrivals, &[])
+    }
+
+    /// As `append`, with the green and blue of each; where there are none, colours are grey.
+    pub fn append_tinted(
+        &mut self,
+        gpu: &mut Gpu,
+        arrivals: &[SplatInit],
+        tints: &[[f32; 2]],
+    ) -> Result<usize, GpuError> {
         let room = (self.shape.splats - self.high_water) as usize;
         let before = self.count();
-        for chunk in arrivals[..arrivals.len().min(room)].chunks(ARRIVALS) {
+        for (i, chunk) in arrivals[..arrivals.len().min(room)].chunks(ARRIVALS).enumerate() {
             self.words.clear();
             self.pool.clear();
             for s in chunk.iter().filter(|s| s.quat_xyzw != [0.0; 4]) {
@@ -84,6 +94,12 @@ impl Pipeline {
             }
             gpu.upload(self.b.arrivals, 0, &self.pool)?;
             gpu.upload(self.b.arrival_slots, 0, &self.words)?;
+            if let Some(h) = &mut self.harmonics {
+                let of_chunk = tints.get(i * ARRIVALS..).unwrap_or_default();
+                let tint = |(k, s): (usize, &SplatInit)| of_chunk.get(k).copied().unwrap_or([s.colour; 2]);
+                let sound = chunk.iter().enumerate().filter(|(_, s)| s.quat_xyzw != [0.0; 4]);
+                h.take_tints(gpu, sound.map(tint))?;
+            }
             let b = &self.b;
             let bind = insert::Bind {
                 arrivals: b.arrivals.read(),
@@ -95,6 +111,9 @@ impl Pipeline {
             let mut rec = gpu.record();
             let n = self.words.len() as u32;
             rec.dispatch(&self.k.insert, bind, insert::Push { arrivals: n }, Threads::d1(n));
+            if let Some(h) = &self.harmonics {
+                h.record_insert(&mut rec, b, n);
+            }
             gpu.submit(rec)?;
         }
         Ok(self.count() - before)
@@ -114,6 +133,16 @@ impl Pipeline {
         out.clear();
         out.extend(self.pool.iter().map(unpacked));
         Ok(())
+    }
+}
+
+impl Pipeline {
+    /// Of the Gaussians that `download` gives, in its order: the coefficients of their colour beyond the first level.
+    pub fn download_colours(&mut self, gpu: &mut Gpu, out: &mut Vec<f32>) -> Result<(), GpuError> {
+        out.clear();
+        let Some(h) = &self.harmonics else { return Ok(()) };
+        out.resize(self.high_water as usize * self.shape.colour_extra(), 0.0);
+        gpu.download(h.coefficients, 0, out)
     }
 }
 

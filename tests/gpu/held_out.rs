@@ -57,6 +57,7 @@ fn held_out_views_by_regulariser() {
         intersections: 1 << 19,
         keyframes: TRAINED as u32,
         channels: 1,
+        sh_degree: 0,
         inverse_depth: false,
     };
     let mut gpu = Gpu::open(&GpuConfig::default(), Pipeline::arena_bytes(&s)).unwrap();

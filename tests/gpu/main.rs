@@ -2,6 +2,7 @@
 #![allow(clippy::unwrap_used)]
 
 mod fisheye;
+mod harmonics;
 mod held_out;
 mod pool;
 mod raster;

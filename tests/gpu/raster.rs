@@ -115,7 +115,7 @@ impl Rig {
 
         let spec = raster_forward::Spec { lanes, depth, channels };
         let forward = self.gpu.kernel_variant::<raster_forward::K>(spec, variant).unwrap();
-        let spec = raster_backward::Spec { lanes, depth, channels };
+        let spec = raster_backward::Spec { lanes, depth, channels, degree: 0 };
         let backward = self.gpu.kernel_variant::<raster_backward::K>(spec, variant).unwrap();
         let size = [W as u32, H as u32];
         let mut rec = self.gpu.record();

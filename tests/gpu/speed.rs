@@ -47,6 +47,7 @@ fn a_training_step() {
         intersections: 20 * n[2] as u32,
         keyframes: 1,
         channels: 1,
+        sh_degree: 0,
         inverse_depth: false,
     };
     let mut gpu = Gpu::open(&GpuConfig::default(), Pipeline::arena_bytes(&shape)).unwrap();
