@@ -19,6 +19,7 @@
 
 pub mod detect;
 pub mod patch;
+mod pattern;
 pub mod pyramid;
 mod rig;
 
