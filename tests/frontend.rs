@@ -12,9 +12,7 @@ use stipple::mem::{heap_after_seal, seal_thread, unsealed, CountingAllocator};
 use stipple_drivers::replay::{OpenOptions, Recording};
 use stipple_drivers::sim::{rig_named, Scenario, Sim};
 use stipple_drivers::types::pose_at;
-use stipple_drivers::{
-    Calibration, Camera, Frames, Image, ImuCalibration, ImuCorrection, Lens, Nanos, Pose, RigCamera, Span,
-};
+use stipple_drivers::{Calibration, Camera, Frames, Image, ImuCalibration, Lens, Nanos, Pose, RigCamera, Span};
 
 #[global_allocator]
 static HEAP: CountingAllocator = CountingAllocator;
@@ -27,15 +25,7 @@ fn rig(width: usize, height: usize) -> Calibration {
     let (cx, cy) = ((width - 1) as f64 / 2.0, (height - 1) as f64 / 2.0);
     let camera = Camera { width, height, fx: FOCAL_PX, fy: FOCAL_PX, cx, cy, lens };
     let at = |x: f64| RigCamera::new(camera, Pose::new(DQuat::IDENTITY, DVec3::new(x, 0.0, 0.0)));
-    let imu = ImuCalibration {
-        rate_hz: 200.0,
-        gyro_noise: 1e-4,
-        gyro_walk: 1e-5,
-        accel_noise: 1e-3,
-        accel_walk: 1e-4,
-        correction: ImuCorrection::NONE,
-    };
-    Calibration { cameras: vec![at(0.0), at(BASELINE)], imu }
+    Calibration { cameras: vec![at(0.0), at(BASELINE)], imu: ImuCalibration::CONSUMER }
 }
 
 /// Grey levels on a wall: random values seven pixels apart, smoothly joined.

@@ -98,6 +98,18 @@ pub struct ImuCalibration {
     pub correction: ImuCorrection,
 }
 
+impl ImuCalibration {
+    /// A good consumer unit at 200 Hz.
+    pub const CONSUMER: ImuCalibration = ImuCalibration {
+        rate_hz: 200.0,
+        gyro_noise: 1e-4,
+        gyro_walk: 1e-5,
+        accel_noise: 1e-3,
+        accel_walk: 1e-4,
+        correction: ImuCorrection::NONE,
+    };
+}
+
 #[derive(Clone, Debug, PartialEq)]
 pub struct Calibration {
     pub cameras: Vec<RigCamera>,

@@ -9,7 +9,7 @@ use crate::map::Mapper;
 use crate::mem::Footprint;
 use crate::stereo::Stereo;
 use crate::vio::Vio;
-use stipple_drivers::{Calibration, Camera, Exit, Fault, ImuCalibration, ImuCorrection, Lens, Pose, RigCamera};
+use stipple_drivers::{Calibration, Camera, Exit, Fault, ImuCalibration, Lens, Pose, RigCamera};
 
 /// Everything a run with this rig takes, without the operating system's and the drivers' own.
 pub fn footprint(calibration: &Calibration, board: &Board) -> Footprint {
@@ -34,15 +34,7 @@ pub fn largest_rig(board: &Board) -> Calibration {
     let lens = Lens::Radtan { k1: 0.0, k2: 0.0, p1: 0.0, p2: 0.0 };
     let camera = Camera { width, height, fx: f, fy: f, cx: width as f64 / 2.0, cy: height as f64 / 2.0, lens };
     let at = |x: f64| RigCamera::new(camera, Pose { p: glam::DVec3::new(x, 0.0, 0.0), ..Pose::IDENTITY });
-    let imu = ImuCalibration {
-        rate_hz: 200.0,
-        gyro_noise: 1e-4,
-        gyro_walk: 1e-5,
-        accel_noise: 1e-3,
-        accel_walk: 1e-4,
-        correction: ImuCorrection::NONE,
-    };
-    Calibration { cameras: vec![at(0.0), at(0.1)], imu }
+    Calibration { cameras: vec![at(0.0), at(0.1)], imu: ImuCalibration::CONSUMER }
 }
 
 /// Refuses a rig whose images or bytes exceed the board's budget.

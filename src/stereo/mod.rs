@@ -171,21 +171,14 @@ impl Stereo {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use stipple_drivers::{Camera, ImuCalibration, ImuCorrection, Lens, RigCamera};
+    use stipple_drivers::{Camera, ImuCalibration, Lens, RigCamera};
 
     fn rig(lens: Lens, f: f64) -> Calibration {
         let camera = Camera { width: 320, height: 240, fx: f, fy: f, cx: 160.3, cy: 118.9, lens };
         let right = Pose::new(glam::DQuat::from_rotation_y(0.01), glam::DVec3::new(0.1, 0.002, -0.001));
         Calibration {
             cameras: vec![RigCamera::new(camera, Pose::IDENTITY), RigCamera::new(camera, right)],
-            imu: ImuCalibration {
-                rate_hz: 200.0,
-                gyro_noise: 1e-4,
-                gyro_walk: 1e-5,
-                accel_noise: 1e-3,
-                accel_walk: 1e-4,
-                correction: ImuCorrection::NONE,
-            },
+            imu: ImuCalibration::CONSUMER,
         }
     }
 
