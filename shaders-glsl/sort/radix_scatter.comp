@@ -1,15 +1,20 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Downsweep of one radix pass: every key and its payload go to the place the scanned table gives them.
-// In:  keys_in, payload_in, table (exclusive sums). Out: keys_out, payload_out, stably ordered by digit.
+// Downsweep of one radix pass: every key and its payload go to their place, stably ordered by digit.
+// In:  keys_in, payload_in, count, table (of radix_count). Out: keys_out, payload_out; sorted_count[0] (first pass).
 //
-// Rank without subgroup operations: 32 keys a round set their bit in the word of their digit, so one
-// word holds all peers of a round, and a population count of the lower lanes is the stable rank.
-// Setting bits commutes: deterministic. A wide digit (11 bits: 16 KiB) sorts tile keys in one pass.
+// A group finds its places itself, from the whole table: a few hundred reads a lane, in place of a scan of the table
+// in two more dispatches, each of which costs a GPU as much as this kernel.
+//
+// Rank without subgroup operations: each row of 32 lanes sets its bits in the word of their digit, so one word holds
+// all peers of the row, and population counts of the rows above and of the lower lanes are the stable rank. Setting
+// bits and adding commute: deterministic. A CPU runs this with one row and digits of 11 bits, which sort tiles in
+// one pass.
 #include "split.glsl"
 
-layout(local_size_x = 32) in;
-layout(constant_id = 0) const uint DIGITS_MAX = 2048;
+layout(local_size_x = 256, local_size_x_id = 1) in;
+layout(constant_id = 1) const uint LANES = 256;
+const uint ROWS = LANES / 32;
 
 layout(set = 0, binding = 0, std430) readonly buffer KeysIn { uint keys_in[]; };
 layout(set = 0, binding = 1, std430) readonly buffer PayloadIn { uint payload_in[]; };
@@ -17,52 +22,98 @@ layout(set = 0, binding = 2, std430) readonly buffer Count { uint count[]; };
 layout(set = 0, binding = 3, std430) readonly buffer Table { uint table[]; };
 layout(set = 0, binding = 4, std430) writeonly buffer KeysOut { uint keys_out[]; };
 layout(set = 0, binding = 5, std430) writeonly buffer PayloadOut { uint payload_out[]; };
+layout(set = 0, binding = 6, std430) writeonly buffer SortedCount { uint sorted_count[]; };
 
-layout(push_constant) uniform Push {
-    uint capacity;
-    uint groups_max;
-    uint shift;
-    uint digits;
-};
-
-shared uint peers_of[DIGITS_MAX];
+shared uint peers_of[ROWS * DIGITS_MAX];
 shared uint next[DIGITS_MAX];
+shared uint ladder[2 * LANES];
+
+// Exclusive sum over the lanes of the group, and the sum of all.
+uint lanes_exclusive(uint lane, uint value, out uint total) {
+    uint at = 0u;
+    ladder[lane] = value;
+    barrier();
+    for (uint step = 1u; step < LANES; step <<= 1u) {
+        uint sum = ladder[at + lane];
+        if (lane >= step) sum += ladder[at + lane - step];
+        at ^= LANES;
+        ladder[at + lane] = sum;
+        barrier();
+    }
+    total = ladder[at + LANES - 1u];
+    return ladder[at + lane] - value;
+}
+
+// next[digit]: where this group's first key of the digit goes. Leaves peers_of zero.
+void find_places(uint lane, uint group, uint groups) {
+    for (uint d = lane; d < digits; d += LANES) {
+        next[d] = 0u;
+        peers_of[d] = 0u;
+    }
+    barrier();
+    // All of a digit's keys are counted in peers_of, those in groups before this one in next. Lanes that digits leave
+    // over share the groups.
+    uint shares = max(1u, LANES / digits);
+    for (uint i = lane; i < digits * shares; i += LANES) {
+        uint digit = i & (digits - 1u), before = 0u, all = 0u;
+        for (uint g = i / digits; g < groups; g += shares) {
+            uint n = table[g * digits + digit];
+            all += n;
+            before += g < group ? n : 0u;
+        }
+        atomicAdd(next[digit], before);
+        atomicAdd(peers_of[digit], all);
+    }
+    barrier();
+    uint each = max(1u, digits / LANES), own = lane * each;
+    uint sum = 0u, total;
+    if (own < digits) {
+        for (uint d = own; d < own + each; ++d) sum += peers_of[d];
+    }
+    uint running = lanes_exclusive(lane, sum, total);
+    if (own < digits) {
+        for (uint d = own; d < own + each; ++d) {
+            next[d] += running;
+            running += peers_of[d];
+        }
+    }
+    if (group == 0u && lane == 0u && first != 0u) sorted_count[0] = total;
+    barrier();
+    for (uint i = lane; i < ROWS * digits; i += LANES) peers_of[i] = 0u;
+    barrier();
+}
 
 void main() {
     uint lane = gl_LocalInvocationID.x;
     uint group = gl_WorkGroupID.x;
     uint n = min(count[0], capacity);
-    uint groups = groups_of(n, groups_max);
+    uint groups = groups_of(n);
     if (group >= groups) return;
-    for (uint d = lane; d < digits; d += ROUND) {
-        peers_of[d] = 0u;
-        next[d] = table[d * groups + group];
-    }
-    barrier();
-    uint below = (1u << lane) - 1u;
+    find_places(lane, group, groups);
+    uint row = lane / 32u, bit = 1u << (lane & 31u);
     uvec2 range = range_of(n, groups, group);
-    for (uint first = range.x; first < range.y; first += ROUND) {
-        uint i = first + lane;
-        bool live = i < range.y;
-        uint key = 0u, digit = 0u, peers = 0u, place = 0u;
+    for (uint base = range.x; base < range.y; base += LANES) {
+        uint i = base + lane;
+        uint key = i < range.y ? keys_in[i] : NONE;
+        bool live = i < range.y && sorted(key);
+        uint digit = (key >> shift) & (digits - 1u);
+        uint mine = row * digits + digit;
+        if (live) atomicOr(peers_of[mine], bit);
+        barrier();
+        uint peers = 0u, place = 0u;
         if (live) {
-            key = keys_in[i];
-            digit = (key >> shift) & (digits - 1u);
-            atomicOr(peers_of[digit], 1u << lane);
+            peers = peers_of[mine];
+            place = next[digit] + bitCount(peers & (bit - 1u));
+            for (uint r = 0u; r < row; ++r) place += bitCount(peers_of[r * digits + digit]);
         }
         barrier();
         if (live) {
-            peers = peers_of[digit];
-            place = next[digit] + bitCount(peers & below);
-        }
-        barrier();
-        if (live) {
-            if ((peers & below) == 0u) { // the first of its digit opens the next round for it
-                next[digit] = place + bitCount(peers);
-                peers_of[digit] = 0u;
+            if ((peers & (bit - 1u)) == 0u) { // the first of its digit and row opens the next round for them
+                atomicAdd(next[digit], bitCount(peers));
+                peers_of[mine] = 0u;
             }
             keys_out[place] = key;
-            payload_out[place] = payload_in[i];
+            payload_out[place] = first != 0u ? i : payload_in[i];
         }
         barrier();
     }

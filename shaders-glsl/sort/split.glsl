@@ -1,17 +1,31 @@
-// How `n` keys are split over the workgroups of a radix pass. Both kernels of a pass must agree on it.
-// Groups below KEYS_MIN keys cost more in table rows than they gain in parallelism.
+// What the two kernels of a radix pass must agree on: who has which keys, and which keys are sorted.
 
-const uint ROUND = 32u;      // keys one scatter workgroup ranks at a time
-const uint KEYS_MIN = 1024u;
+layout(constant_id = 0) const uint DIGITS_MAX = 256;
 
-uint groups_of(uint n, uint groups_max) {
-    return clamp((n + KEYS_MIN - 1u) / KEYS_MIN, 1u, groups_max);
+layout(push_constant) uniform Push {
+    uint capacity;
+    uint groups_max;
+    uint keys_min;   // fewer keys to a workgroup cost more in table rows than they gain in parallelism
+    uint round;      // keys one scatter workgroup ranks at a time
+    uint shift;
+    uint digits;     // 1 << bits of this pass
+    uint first;      // 1: keys that are NONE are left out, and a key's payload is its index
+};
+
+const uint NONE = 0xffffffffu;
+
+uint groups_of(uint n) {
+    return clamp((n + keys_min - 1u) / keys_min, 1u, groups_max);
 }
 
 // First key of a group and one past its last. Whole rounds, so only the last group has a ragged end.
 uvec2 range_of(uint n, uint groups, uint group) {
-    uint rounds = (n + ROUND - 1u) / ROUND;
-    uint keys = (rounds + groups - 1u) / groups * ROUND;
+    uint rounds = (n + round - 1u) / round;
+    uint keys = (rounds + groups - 1u) / groups * round;
     uint begin = min(group * keys, n);
     return uvec2(begin, min(begin + keys, n));
+}
+
+bool sorted(uint key) {
+    return first == 0u || key != NONE;
 }

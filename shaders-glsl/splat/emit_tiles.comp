@@ -1,9 +1,9 @@
 // Lists (tile, intersection) pairs front to back, so that a full list loses the farthest: one thread a rank.
 // in   visible_count, slots (by depth), projected, tile_offsets (prefix sum of tile_counts)
-// out  keys (tile), intersections (their own index, the payload of the sort), owners (slot of each);
+// out  keys (tile), owners (slot of each);
 //      isect_count[0] those listed, [1] those there are, [2..5] workgroups of 64 over those listed
 // The walk repeats count_tiles'. Should two compilations round differently, what it counted too much is
-// padded with a tile that is never read, and what it counted too little is dropped.
+// padded with a tile past the last, where nothing is drawn, and what it counted too little is dropped.
 #version 450
 #extension GL_GOOGLE_include_directive : require
 layout(local_size_x = 64) in;
@@ -23,9 +23,8 @@ layout(set = 0, binding = 1, std430) readonly buffer Slots { uint slots[]; };
 layout(set = 0, binding = 2, std430) readonly buffer ProjectedIn { Projected projected[]; };
 layout(set = 0, binding = 3, std430) readonly buffer TileOffsets { uint tile_offsets[]; };
 layout(set = 0, binding = 4, std430) writeonly buffer Keys { uint keys[]; };
-layout(set = 0, binding = 5, std430) writeonly buffer Intersections { uint intersections[]; };
-layout(set = 0, binding = 6, std430) writeonly buffer Owners { uint owners[]; };
-layout(set = 0, binding = 7, std430) writeonly buffer IsectCount { uint isect_count[]; };
+layout(set = 0, binding = 5, std430) writeonly buffer Owners { uint owners[]; };
+layout(set = 0, binding = 6, std430) writeonly buffer IsectCount { uint isect_count[]; };
 
 void main() {
     const uint rank = thread_index();
@@ -52,14 +51,12 @@ void main() {
         const ivec2 columns = columns_of(e, row, push.size);
         for (int column = columns.x; column <= columns.y && at < end; ++column) {
             keys[at] = uint(row) * grid.x + uint(column);
-            intersections[at] = at;
             owners[at] = slot;
             ++at;
         }
     }
     for (; at < end; ++at) {
         keys[at] = grid.x * grid.y;
-        intersections[at] = at;
         owners[at] = slot;
     }
 }

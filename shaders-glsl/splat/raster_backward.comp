@@ -45,7 +45,7 @@ layout(set = 0, binding = 7, std430) writeonly buffer IsectGradients { float ise
 void main() {
     const uint tile = tile_index();
     const uvec2 grid = tile_grid(push.size);
-    if (tile >= grid.x * grid.y) {
+    if (tile > grid.x * grid.y) {  // the one past the last holds emit_tiles' padding, which gets zeros
         return;
     }
     const uvec2 pixel = column_of(tile, push.size);

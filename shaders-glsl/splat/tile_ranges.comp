@@ -8,7 +8,7 @@ layout(local_size_x = 64) in;
 #include "../common/index.glsl"
 
 layout(push_constant) uniform Push {
-    uint tiles;
+    uint tiles;  // with the one of emit_tiles' padding
 } push;
 
 layout(set = 0, binding = 0, std430) readonly buffer IsectCount { uint isect_count[]; };

@@ -92,7 +92,7 @@ impl Pipeline {
         let b = &self.b;
         let stride = (each * size_of::<T>() / size_of::<u32>()) as u32;
         // Gradients of intersections live for one step.
-        let scratch = b.isect_gradients.cast::<u32>();
+        let scratch = b.over.isect_gradients.cast::<u32>();
         let at_once = (scratch.len() as u32 / stride).max(1);
         for first in (first..self.high_water).step_by(at_once as usize) {
             let count = at_once.min(self.high_water - first);

@@ -1,8 +1,8 @@
 //! What the splat kernels keep in the arena, sized once by `Shape`.
 
-use super::sort::{Pairs, Sorter};
+use super::sort::{Pairs, Scan, Sorter};
 use crate::gpu::kernels::types::{Moments, Projected, Splat, Status};
-use crate::gpu::{Buf, Gpu};
+use crate::gpu::{Buf, Gpu, ALIGN};
 use crate::mem::Footprint;
 use stipple_drivers::Fault;
 
@@ -87,17 +87,20 @@ impl Shape {
 macro_rules! buffers {
     ($($field:ident: $of:ty, $name:literal, |$s:ident| $len:expr;)+) => {
         /// Every buffer, by what it holds.
-        pub struct Buffers { $(pub $field: Buf<$of>),+ }
+        pub struct Buffers { $(pub $field: Buf<$of>),+, pub over: Overlay }
 
         impl Buffers {
             pub fn new(gpu: &mut Gpu, shape: &Shape) -> Result<Buffers, Fault> {
-                Ok(Buffers { $($field: { let $s = shape; gpu.alloc::<$of>($name, $len)? }),+ })
+                let over = Overlay::new(gpu, shape)?;
+                Ok(Buffers { $($field: { let $s = shape; gpu.alloc::<$of>($name, $len)? }),+, over })
             }
 
             pub fn footprint(shape: &Shape) -> Footprint {
                 let mut f = Footprint::default();
                 $(f.gpu($name, { let $s = shape; $len } * size_of::<$of>());)+
-                f.extend(Sorter::footprint(shape.splats.max(shape.intersections) as usize));
+                f.gpu(OVERLAY, size_of::<u32>() * Overlay::words(shape));
+                f.extend(Scan::footprint());
+                f.extend(Sorter::footprint());
                 f
             }
         }
@@ -110,42 +113,83 @@ buffers! {
     steps: u32, "splats: Adam steps and importance", |s| s.splats as usize;
     projected: Projected, "splats: projected", |s| s.splats as usize;
     tints: [f32; 2], "splats: green and blue", |s| s.tinted();
-    visible: u32, "splats: visible, then its prefix sum", |s| s.splats as usize + 1;
-    depth_keys: u32, "splats: depth keys", |s| s.splats as usize;
-    slots: u32, "splats: visible slots", |s| s.splats as usize;
-    ranked: u32, "splats: visible slots by depth", |s| s.splats as usize;
+    ranked: u32, "splats: visible slots by depth", |s| s.splats as usize + 1;
     tile_offsets: u32, "splats: tiles touched, then their prefix sum", |s| s.splats as usize + 1;
     pose_sums: f32, "splats: pose gradient by workgroup", |s| 8 * (s.splats.div_ceil(GROUP) as usize);
     kept: u32, "splats: kept, then their prefix sum", |s| s.splats as usize + 1;
     importance_bins: u32, "splats: how many of which importance", |_s| IMPORTANCE_BINS;
     arrivals: Splat, "splats: arrivals", |_s| ARRIVALS;
     arrival_slots: u32, "splats: slots of arrivals", |_s| ARRIVALS;
-    isect_keys: u32, "intersections: tiles", |s| s.intersections as usize;
-    isects: u32, "intersections: their index", |s| s.intersections as usize;
+    isects: u32, "intersections: by tile", |s| s.intersections as usize;
     owners: u32, "intersections: slots", |s| s.intersections as usize;
-    isect_gradients: f32, "intersections: gradients", |s| s.slot_words() * s.intersections as usize;
-    ranges: [u32; 2], "tiles: ranges", |s| s.tiles_max();
+    ranges: [u32; 2], "tiles: ranges", |s| s.tiles_max() + 1;
     rendered: f32, "pixels: colour, transmittance, depth", |s| s.rendered_planes() * s.pixels();
     pixel_gradient: f32, "pixels: gradient", |s| s.gradient_planes() * s.pixels();
-    filtered: f32, "pixels: filtered moments", |s| 5 * s.pixels();
-    slopes: f32, "pixels: SSIM slopes", |s| 3 * s.pixels();
     ssim_sums: f32, "pixels: SSIM by workgroup", |s| image_groups(s.width, s.height) as usize;
     l1_sums: f32, "pixels: L1 by workgroup", |s| image_groups(s.width, s.height) as usize;
     mask: u32, "keyframes: mask", |s| s.image_words();
     targets: u32, "keyframes: images", |s| s.image_words() * s.keyframes as usize;
     visible_count: u32, "counts: visible", |_s| 1;
     isect_count: u32, "counts: intersections listed, needed, workgroups", |_s| 5;
+    isects_sorted: u32, "counts: intersections sorted", |_s| 1;
     failed: u32, "counts: not finite", |_s| 1;
     status: Status, "status", |_s| 1;
 }
 
-impl Buffers {
-    pub fn by_depth(&self) -> Pairs {
-        Pairs { keys: self.depth_keys, payload: self.slots }
+const OVERLAY: &str = "intersections: gradients, over keys and loss planes";
+
+/// Bytes used in turn: to sort, then by the loss, then for the gradients of intersections. What a step needs after its
+/// stage is not here.
+pub struct Overlay {
+    /// While sorting.
+    pub depth_keys: Buf<u32>,
+    pub isect_keys: Buf<u32>,
+    spare: Pairs,
+    /// In the loss: filtered moments (5 planes) and SSIM slopes (3).
+    pub filtered: Buf<f32>,
+    pub slopes: Buf<f32>,
+    /// In the backward pass.
+    pub isect_gradients: Buf<f32>,
+}
+
+/// Words of `n` and the gap to where the next buffer may start.
+fn aligned(n: usize) -> usize {
+    n.next_multiple_of(ALIGN as usize / size_of::<u32>())
+}
+
+impl Overlay {
+    /// Keys of Gaussians and of intersections are not needed at the same time, so they are the same.
+    fn keys(shape: &Shape) -> usize {
+        (shape.splats as usize + 1).max(shape.intersections as usize)
     }
 
-    pub fn by_tile(&self) -> Pairs {
-        Pairs { keys: self.isect_keys, payload: self.isects }
+    fn words(shape: &Shape) -> usize {
+        let planes = aligned(5 * shape.pixels()) + 3 * shape.pixels();
+        let gradients = shape.slot_words() * shape.intersections as usize;
+        planes.max(gradients).max(3 * aligned(Overlay::keys(shape)))
+    }
+
+    fn new(gpu: &mut Gpu, shape: &Shape) -> Result<Overlay, Fault> {
+        let all = gpu.alloc::<u32>(OVERLAY, Overlay::words(shape))?;
+        let (keys, pixels) = (Overlay::keys(shape), shape.pixels());
+        let nth = |i: usize| all.part(i * aligned(keys), keys);
+        Ok(Overlay {
+            depth_keys: nth(0).part(0, shape.splats as usize + 1),
+            isect_keys: nth(0).part(0, shape.intersections as usize),
+            spare: Pairs { keys: nth(1), payload: nth(2) },
+            filtered: all.part(0, 5 * pixels).cast(),
+            slopes: all.part(aligned(5 * pixels), 3 * pixels).cast(),
+            isect_gradients: all.part(0, shape.slot_words() * shape.intersections as usize).cast(),
+        })
+    }
+
+    /// What to sort `keys` from and to, so that after `passes` the payload is in `into`.
+    pub fn pairs(&self, keys: Buf<u32>, into: Buf<u32>, passes: u32) -> (Pairs, Pairs) {
+        let (from, to) = match passes % 2 {
+            0 => (into, self.spare.payload),
+            _ => (self.spare.payload, into),
+        };
+        (Pairs { keys, payload: from }, Pairs { keys: self.spare.keys, payload: to })
     }
 }
 

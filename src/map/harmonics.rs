@@ -86,7 +86,7 @@ impl Harmonics {
             tile_offsets: b.tile_offsets.read(),
             splats: b.splats.read(),
             steps: b.steps.read(),
-            isect_gradients: b.isect_gradients.cast().read_write(),
+            isect_gradients: b.over.isect_gradients.cast().read_write(),
             coefficients: self.coefficients.read_write(),
             coefficient_moments: self.moments.read_write(),
         };

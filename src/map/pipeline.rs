@@ -2,7 +2,7 @@
 //! goes on through the loss and back to the parameters.
 //!
 //! ```text
-//! project -> scan -> compact -> sort by depth            Gaussians -> visible, front to back
+//! project -> sort by depth                               Gaussians -> visible, front to back
 //! count_tiles -> scan -> emit_tiles -> sort by tile -> tile_ranges -> raster_forward
 //! ssim_rows -> ssim_columns -> loss_rows -> loss_columns  picture -> gradient by pixel
 //! raster_backward -> project_backward (Adam) -> summary   -> gradient by intersection -> Gaussian
@@ -26,8 +26,8 @@ use crate::gpu::{Caps, Gpu, GpuError, Kernel, KernelDef, Recorder, Threads};
 use crate::mem::Footprint;
 use stipple_drivers::{Exit, Fault};
 
-/// Bits of a depth key: DEPTH_BITS of compact.comp.
-const DEPTH_BITS: u32 = 22;
+/// Bits of a depth key: depth_key.glsl.
+const DEPTH_BITS: u32 = 16;
 /// What the raster blends beside the colour: shade.glsl.
 const EXPECTED_DEPTH: u32 = 1;
 const INVERSE_DEPTH: u32 = 2;
@@ -42,7 +42,6 @@ struct Raster {
 
 pub(super) struct Kernels {
     project: ByLens<project::K>,
-    compact: Kernel<compact::K>,
     count_tiles: Kernel<count_tiles::K>,
     emit_tiles: Kernel<emit_tiles::K>,
     tile_ranges: Kernel<tile_ranges::K>,
@@ -140,7 +139,6 @@ impl Pipeline {
                 pinhole: gpu.kernel::<project::K>(project::Spec { lanes, fisheye: false })?,
                 fisheye: gpu.kernel::<project::K>(project::Spec { lanes, fisheye: true })?,
             },
-            compact: plain::<compact::K>(gpu)?,
             count_tiles: gpu.kernel::<count_tiles::K>(count_tiles::Spec { lanes })?,
             emit_tiles: gpu.kernel::<emit_tiles::K>(emit_tiles::Spec { lanes })?,
             tile_ranges: plain::<tile_ranges::K>(gpu)?,
@@ -168,7 +166,6 @@ impl Pipeline {
             importance: plain::<importance::K>(gpu)?,
             move_block: plain::<move_block::K>(gpu)?,
         };
-        let sortable = shape.splats.max(shape.intersections) as usize;
         let mut p = Pipeline {
             shape,
             lanes,
@@ -176,7 +173,7 @@ impl Pipeline {
             b: Buffers::new(gpu, &shape)?,
             harmonics: (shape.colour_extra() > 0).then(|| Harmonics::new(gpu, &shape)).transpose()?,
             scan: Scan::new(gpu)?,
-            sorter: Sorter::new(gpu, sortable)?,
+            sorter: Sorter::new(gpu)?,
             high_water: 0,
             blocks: Vec::with_capacity(shape.keyframes as usize),
             valid_pixels: 0,
@@ -307,29 +304,15 @@ impl Pipeline {
             project::Bind {
                 splats: b.splats.read(),
                 projected_out: b.projected.write(),
-                visible: b.visible.write(),
+                keys: b.over.depth_keys.write(),
                 failed: b.failed.read_write(),
             },
             project::Push { camera: camera(view), size, splats: n },
             per_slot,
         );
-        self.scan.record(rec, b.visible.part(0, n as usize + 1));
-        rec.dispatch(
-            &k.compact,
-            compact::Bind {
-                projected_in: b.projected.read(),
-                visible_offsets: b.visible.read(),
-                keys: b.depth_keys.write(),
-                slots: b.slots.write(),
-                visible_count: b.visible_count.write(),
-            },
-            compact::Push { splats: n },
-            per_slot,
-        );
-        let sorted = self.sorter.record(rec, b.by_depth(), b.visible_count, DEPTH_BITS);
-        // The sorter's own buffers are needed again for the tiles.
-        rec.copy(sorted.payload, b.ranked, n as usize);
-
+        let slots = b.over.depth_keys.part(0, n as usize + 1);
+        let (from, to) = b.over.pairs(slots, b.ranked, self.sorter.passes(DEPTH_BITS));
+        self.sorter.record(rec, (from, to), self.scan.unlimited(), b.visible_count, DEPTH_BITS);
         rec.dispatch(
             &k.count_tiles,
             count_tiles::Bind {
@@ -349,8 +332,7 @@ impl Pipeline {
                 slots: b.ranked.read(),
                 projected_in: b.projected.read(),
                 tile_offsets: b.tile_offsets.read(),
-                keys: b.isect_keys.write(),
-                intersections: b.isects.write(),
+                keys: b.over.isect_keys.write(),
                 owners: b.owners.write(),
                 isect_count: b.isect_count.write(),
             },
@@ -361,12 +343,14 @@ impl Pipeline {
             h.record_colours(rec, b, view, n);
         }
         let tiles = self.tiles(view);
-        let sorted = self.sorter.record(rec, b.by_tile(), b.isect_count.part(0, 1), u32::BITS - tiles.leading_zeros());
+        let bits = u32::BITS - tiles.leading_zeros();
+        let pairs = b.over.pairs(b.over.isect_keys, b.isects, self.sorter.passes(bits));
+        let sorted = self.sorter.record(rec, pairs, b.isect_count.part(0, 1), b.isects_sorted, bits);
         rec.fill(b.ranges, 0);
         rec.dispatch_indirect(
             &k.tile_ranges,
             tile_ranges::Bind { isect_count: b.isect_count.read(), keys: sorted.keys.read(), ranges: b.ranges.write() },
-            tile_ranges::Push { tiles },
+            tile_ranges::Push { tiles: tiles + 1 },
             b.isect_count,
             2,
         );
@@ -398,7 +382,7 @@ impl Pipeline {
                 grey: b.rendered.read(),
                 targets: b.targets.read(),
                 mask: b.mask.read(),
-                filtered: b.filtered.write(),
+                filtered: b.over.filtered.write(),
             },
             ssim_rows::Push { size, target },
             rows,
@@ -406,9 +390,9 @@ impl Pipeline {
         rec.dispatch(
             &k.ssim_columns,
             ssim_columns::Bind {
-                filtered: b.filtered.read(),
+                filtered: b.over.filtered.read(),
                 mask: b.mask.read(),
-                slopes: b.slopes.write(),
+                slopes: b.over.slopes.write(),
                 ssim_sums: b.ssim_sums.write(),
             },
             ssim_columns::Push { size },
@@ -416,14 +400,14 @@ impl Pipeline {
         );
         rec.dispatch(
             &k.loss_rows,
-            loss_rows::Bind { slopes: b.slopes.read(), filtered: b.filtered.write() },
+            loss_rows::Bind { slopes: b.over.slopes.read(), filtered: b.over.filtered.write() },
             loss_rows::Push { size },
             rows,
         );
         rec.dispatch(
             &k.loss_columns,
             loss_columns::Bind {
-                filtered: b.filtered.read(),
+                filtered: b.over.filtered.read(),
                 grey: b.rendered.read(),
                 targets: b.targets.read(),
                 mask: b.mask.read(),
@@ -461,10 +445,10 @@ impl Pipeline {
                 tints: b.tints.read(),
                 rendered: b.rendered.read(),
                 pixel_gradient: b.pixel_gradient.read(),
-                isect_gradients: b.isect_gradients.write(),
+                isect_gradients: b.over.isect_gradients.write(),
             },
             raster_backward::Push { size },
-            Threads::d1(self.tiles(view) * self.lanes),
+            Threads::d1((self.tiles(view) + 1) * self.lanes),
         );
         if let Some(h) = &self.harmonics {
             h.record_update(rec, b, view, self.high_water, rates);
@@ -475,7 +459,7 @@ impl Pipeline {
                 visible_count: b.visible_count.read(),
                 slots: b.ranked.read(),
                 tile_offsets: b.tile_offsets.read(),
-                isect_gradients: b.isect_gradients.cast().read(),
+                isect_gradients: b.over.isect_gradients.cast().read(),
                 splats: b.splats.read_write(),
                 moments_in_out: b.moments.read_write(),
                 steps: b.steps.read_write(),

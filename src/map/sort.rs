@@ -1,25 +1,40 @@
 //! Radix sort and prefix sum on the GPU: stable, deterministic, the element count stays on the device.
 //!
-//! A pass is count, scan, scatter (`shaders-glsl/sort`): least significant digit first, no look-back between
+//! A pass is count and scatter (`shaders-glsl/sort`): least significant digit first, no look-back between
 //! workgroups, no subgroup operations. The number of workgroups is fixed at boot and each walks its share,
-//! so nothing is sized by a count that only the device knows; groups without keys return at once.
+//! so nothing is sized by a count that only the device knows; groups without keys return at once. The first
+//! pass also leaves out what is not to be sorted, which compacts a list for nothing.
 
 use crate::gpu::kernels::{radix_count, radix_scatter, scan_apply, scan_reduce};
 use crate::gpu::{Buf, Gpu, Kernel, Recorder, Threads};
 use crate::mem::Footprint;
 use stipple_drivers::Fault;
 
-/// Words of the digit table: digits x workgroups, however they are split.
-const TABLE_LEN: usize = 1 << 18;
-/// A CPU runs few big workgroups best, and a wide digit saves it whole passes over memory.
-const CPU: (u32, u32) = (11, 16);
-/// A GPU hides latency with many workgroups, and 2 KiB of shared memory let many be resident.
-const GPU: (u32, u32) = (8, 1024);
+/// How a pass is cut.
+#[derive(Clone, Copy)]
+struct Cut {
+    digit_bits: u32,
+    groups: u32,
+    keys_min: u32,
+    /// Invocations of a scatter workgroup, which are the keys it ranks at a time.
+    lanes: u32,
+}
+
+/// A CPU reads memory dear. Every group reads the whole table, so there are few (at most this many, two a core), and a
+/// wide digit saves whole passes.
+const CPU: Cut = Cut { digit_bits: 11, groups: 32, keys_min: 1024, lanes: 32 };
+/// A GPU hides latency with many workgroups. 8 KiB of shared memory let many be resident.
+const GPU: Cut = Cut { digit_bits: 8, groups: 256, keys_min: 512, lanes: 256 };
+/// Words of the digit table: digits x workgroups.
+const TABLE_LEN: usize = 1 << 16;
 /// Most blocks of a scan: their sums are scanned by one workgroup.
 const SCAN_BLOCKS_MAX: u32 = 256;
 const SCAN_BLOCKS_CPU: u32 = 16;
+/// A key that the first pass leaves out.
+pub const NONE: u32 = u32::MAX;
 
-const _: () = assert!((CPU.1 << CPU.0) as usize <= TABLE_LEN && (GPU.1 << GPU.0) as usize <= TABLE_LEN);
+const _: () = assert!((CPU.groups << CPU.digit_bits) as usize <= TABLE_LEN);
+const _: () = assert!((GPU.groups << GPU.digit_bits) as usize <= TABLE_LEN);
 
 /// Exclusive prefix sum in place, modulo 2^32.
 pub struct Scan {
@@ -50,6 +65,11 @@ impl Scan {
         Ok(scan)
     }
 
+    /// A count that is more than any.
+    pub fn unlimited(&self) -> Buf<u32> {
+        self.unlimited
+    }
+
     /// Scans the whole buffer.
     pub fn record(&self, rec: &mut Recorder, data: Buf<u32>) {
         self.record_counted(rec, data, self.unlimited);
@@ -66,16 +86,12 @@ impl Scan {
     }
 }
 
-/// Sorts up to `capacity` (key, payload) pairs by the low bits of the key.
+/// Sorts (key, payload) pairs by the low bits of the key.
 pub struct Sorter {
     count: Kernel<radix_count::K>,
     scatter: Kernel<radix_scatter::K>,
-    scan: Scan,
-    spare: Pairs,
     table: Buf<u32>,
-    table_len: Buf<u32>,
-    digit_bits: u32,
-    groups: u32,
+    cut: Cut,
 }
 
 /// Keys and payloads, index by index.
@@ -86,56 +102,72 @@ pub struct Pairs {
 }
 
 impl Sorter {
-    pub fn footprint(capacity: usize) -> Footprint {
-        let mut f = Scan::footprint();
-        f.gpu("sort: spare pairs", 2 * capacity * size_of::<u32>());
-        f.gpu("sort: digit table", (TABLE_LEN + 1) * size_of::<u32>());
+    pub fn footprint() -> Footprint {
+        let mut f = Footprint::default();
+        f.gpu("sort: digit table", TABLE_LEN * size_of::<u32>());
         f
     }
 
-    pub fn new(gpu: &mut Gpu, capacity: usize) -> Result<Sorter, Fault> {
-        let (digit_bits, groups) = if is_cpu(gpu) { CPU } else { GPU };
+    pub fn new(gpu: &mut Gpu) -> Result<Sorter, Fault> {
+        let cores = std::thread::available_parallelism().map_or(1, |n| n.get() as u32);
+        let cpu = Cut { groups: (2 * cores).min(CPU.groups), ..CPU };
+        let cut = if is_cpu(gpu) { cpu } else { GPU };
+        let digits_max = 1 << cut.digit_bits;
         Ok(Sorter {
-            count: gpu.kernel::<radix_count::K>(radix_count::Spec { digits_max: 1 << digit_bits })?,
-            scatter: gpu.kernel::<radix_scatter::K>(radix_scatter::Spec { digits_max: 1 << digit_bits })?,
-            scan: Scan::new(gpu)?,
-            spare: Pairs {
-                keys: gpu.alloc("sort: spare keys", capacity)?,
-                payload: gpu.alloc("sort: spare payload", capacity)?,
-            },
+            count: gpu.kernel::<radix_count::K>(radix_count::Spec { digits_max })?,
+            scatter: gpu.kernel::<radix_scatter::K>(radix_scatter::Spec { digits_max, lanes: cut.lanes })?,
             table: gpu.alloc("sort: digit table", TABLE_LEN)?,
-            table_len: gpu.alloc("sort: digit table length", 1)?,
-            digit_bits,
-            groups,
+            cut,
         })
     }
 
-    /// Sorts the first `count[0]` pairs by the low `bits` of their keys, and answers where they are then: in
-    /// `pairs` after an even number of passes, else in the sorter's own buffers until its next use. Bits of
-    /// the key above `bits` travel along and are not compared. More than the capacity is not looked at.
-    pub fn record(&self, rec: &mut Recorder, pairs: Pairs, count: Buf<u32>, bits: u32) -> Pairs {
-        let passes = bits.div_ceil(self.digit_bits);
-        let (mut from, mut to) = (pairs, self.spare);
+    pub fn passes(&self, bits: u32) -> u32 {
+        bits.div_ceil(self.cut.digit_bits)
+    }
+
+    /// Sorts the keys `from.keys[..count[0]]` that are not `NONE` by their low `bits`; the payload of a key is its
+    /// index. Answers where they are then: in `to` after an odd number of passes, else in `from`, whose contents are
+    /// lost either way. How many were sorted goes to `sorted`. More than the capacity is not looked at.
+    pub fn record(
+        &self,
+        rec: &mut Recorder,
+        (from, to): (Pairs, Pairs),
+        count: Buf<u32>,
+        sorted: Buf<u32>,
+        bits: u32,
+    ) -> Pairs {
+        let passes = self.passes(bits);
+        let (mut from, mut to) = (from, to);
         for pass in 0..passes {
             let (shift, end) = (bits * pass / passes, bits * (pass + 1) / passes);
-            self.pass(rec, from, to, count, shift, 1 << (end - shift));
+            let counted = if pass == 0 { count } else { sorted };
+            let push = radix_count::Push {
+                capacity: from.keys.len().min(from.payload.len()).min(to.keys.len()) as u32,
+                groups_max: self.cut.groups,
+                keys_min: self.cut.keys_min,
+                round: self.cut.lanes,
+                shift,
+                digits: 1 << (end - shift),
+                first: u32::from(pass == 0),
+            };
+            self.pass(rec, from, to, counted, sorted, push);
             (from, to) = (to, from);
         }
         from
     }
 
-    fn pass(&self, rec: &mut Recorder, from: Pairs, to: Pairs, count: Buf<u32>, shift: u32, digits: u32) {
-        let capacity = from.keys.len().min(from.payload.len()).min(to.keys.len()) as u32;
-        let groups_max = self.groups;
-        let seen = radix_count::Bind {
-            keys: from.keys.read(),
-            count: count.read(),
-            table: self.table.write(),
-            table_len: self.table_len.write(),
-        };
-        let push = radix_count::Push { capacity, groups_max, shift, digits };
-        rec.dispatch(&self.count, seen, push, Threads::groups(groups_max, 1, 1));
-        self.scan.record_counted(rec, self.table, self.table_len);
+    fn pass(
+        &self,
+        rec: &mut Recorder,
+        from: Pairs,
+        to: Pairs,
+        count: Buf<u32>,
+        sorted: Buf<u32>,
+        push: radix_count::Push,
+    ) {
+        let threads = Threads::groups(self.cut.groups, 1, 1);
+        let seen = radix_count::Bind { keys: from.keys.read(), count: count.read(), table: self.table.write() };
+        rec.dispatch(&self.count, seen, push, threads);
         let moved = radix_scatter::Bind {
             keys_in: from.keys.read(),
             payload_in: from.payload.read(),
@@ -143,9 +175,9 @@ impl Sorter {
             table: self.table.read(),
             keys_out: to.keys.write(),
             payload_out: to.payload.write(),
+            sorted_count: sorted.write(),
         };
-        let push = radix_scatter::Push { capacity, groups_max, shift, digits };
-        rec.dispatch(&self.scatter, moved, push, Threads::groups(groups_max, 1, 1));
+        rec.dispatch(&self.scatter, moved, bytemuck::cast(push), threads);
     }
 }
 

@@ -106,7 +106,7 @@ fn importance_is_the_mean_of_what_the_opacity_gradient_says() {
         gpu.download(p.buffers().ranked, 0, &mut ranks).unwrap();
         gpu.download(p.buffers().visible_count, 0, &mut seen).unwrap();
         let mut gradients = vec![0f32; 8 * offsets[seen[0] as usize] as usize];
-        gpu.download(p.buffers().isect_gradients, 0, &mut gradients).unwrap();
+        gpu.download(p.buffers().over.isect_gradients, 0, &mut gradients).unwrap();
         for r in 0..seen[0] as usize {
             let tiles = offsets[r] as usize..offsets[r + 1] as usize;
             if !tiles.is_empty() {

@@ -105,7 +105,7 @@ impl Rig {
             })
             .collect();
         let tints: Vec<[f32; 2]> = splats.iter().map(|s| [s[8] as f32, s[9] as f32]).collect();
-        let ranges = self.upload(&(0..tiles).map(|t| [t * n, (t + 1) * n]).collect::<Vec<_>>());
+        let ranges = self.upload(&(0..tiles).map(|t| [t * n, (t + 1) * n]).chain([[0, 0]]).collect::<Vec<_>>());
         let intersections = self.upload(&(0..tiles * n).collect::<Vec<_>>());
         let owners = self.upload(&(0..tiles * n).map(|e| e % n).collect::<Vec<_>>());
         let (records, tints) = (self.upload(&records), self.upload(&tints));

@@ -2,15 +2,15 @@
 
 use stipple::config::GpuConfig;
 use stipple::gpu::{Buf, Gpu};
-use stipple::map::sort::{Pairs, Scan, Sorter};
+use stipple::map::sort::{Pairs, Scan, Sorter, NONE};
 
 const CAPACITY: usize = 40_000;
 
-/// Twin of `Sorter::record`: a stable sort of the first `count` pairs by the low `bits`.
+/// Twin of `Sorter::record`: a stable sort of the first `count` keys that are not NONE by the low `bits`.
 fn sorted(keys: &[u32], count: usize, bits: u32) -> (Vec<u32>, Vec<u32>) {
     let n = count.min(keys.len());
     let mask = u32::MAX >> (32 - bits);
-    let mut order: Vec<u32> = (0..n as u32).collect();
+    let mut order: Vec<u32> = (0..n as u32).filter(|&i| keys[i as usize] != NONE).collect();
     order.sort_by_key(|&i| keys[i as usize] & mask);
     (order.iter().map(|&i| keys[i as usize]).collect(), order)
 }
@@ -42,32 +42,35 @@ struct Rig {
     sorter: Sorter,
     scan: Scan,
     pairs: Pairs,
+    spare: Pairs,
     count: Buf<u32>,
+    sorted: Buf<u32>,
 }
 
 impl Rig {
     fn new(capacity: usize) -> Rig {
-        let bytes = Sorter::footprint(capacity).gpu_total() + (capacity as u64) * 8 + (1 << 20);
+        let bytes = Sorter::footprint().gpu_total() + (capacity as u64) * 16 + (1 << 20);
         let mut gpu = Gpu::open(&GpuConfig::default(), bytes).expect("a Vulkan device");
-        let sorter = Sorter::new(&mut gpu, capacity).unwrap();
+        let sorter = Sorter::new(&mut gpu).unwrap();
         let scan = Scan::new(&mut gpu).unwrap();
-        let pairs =
-            Pairs { keys: gpu.alloc("keys", capacity).unwrap(), payload: gpu.alloc("payload", capacity).unwrap() };
-        let count = gpu.alloc("count", 1).unwrap();
-        Rig { gpu, sorter, scan, pairs, count }
+        let mut pairs =
+            || Pairs { keys: gpu.alloc("keys", capacity).unwrap(), payload: gpu.alloc("payload", capacity).unwrap() };
+        let (pairs, spare) = (pairs(), pairs());
+        let (count, sorted) = (gpu.alloc("count", 1).unwrap(), gpu.alloc("sorted", 1).unwrap());
+        Rig { gpu, sorter, scan, pairs, spare, count, sorted }
     }
 
-    /// Sorts `keys[..count]` with their indices as payload; milliseconds on the device beside it.
+    /// Sorts `keys[..count]`, with their indices; milliseconds on the device beside it.
     fn sort(&mut self, keys: &[u32], count: u32, bits: u32) -> (Vec<u32>, Vec<u32>, f64) {
-        let index: Vec<u32> = (0..keys.len() as u32).collect();
         self.gpu.upload(self.pairs.keys, 0, keys).unwrap();
-        self.gpu.upload(self.pairs.payload, 0, &index).unwrap();
         self.gpu.upload(self.count, 0, &[count]).unwrap();
         let mut rec = self.gpu.record();
-        let at = self.sorter.record(&mut rec, self.pairs, self.count, bits);
+        let at = self.sorter.record(&mut rec, (self.pairs, self.spare), self.count, self.sorted, bits);
         self.gpu.submit(rec).unwrap();
         let ms = self.gpu.last_submit_ms();
-        let n = (count as usize).min(keys.len());
+        let mut n = [0];
+        self.gpu.download(self.sorted, 0, &mut n).unwrap();
+        let n = n[0] as usize;
         let (mut k, mut p) = (vec![0; n], vec![0; n]);
         self.gpu.download(at.keys, 0, &mut k).unwrap();
         self.gpu.download(at.payload, 0, &mut p).unwrap();
@@ -113,6 +116,14 @@ fn count_on_the_device_bounds_the_sort() {
     let mut rest = vec![0; CAPACITY - 5000];
     rig.gpu.download(rig.pairs.keys, 5000, &mut rest).unwrap();
     assert_eq!(rest, keys[5000..], "pairs past the count are left alone");
+}
+
+#[test]
+fn keys_left_out_make_the_sorted_list_shorter() {
+    let mut rig = Rig::new(CAPACITY);
+    let keys: Vec<u32> = noise(7, CAPACITY).iter().map(|k| if k % 3 == 0 { NONE } else { k >> 16 }).collect();
+    rig.check("some", &keys, CAPACITY as u32, 16);
+    rig.check("all", &[NONE; 5000], 5000, 16);
 }
 
 #[test]

@@ -6,6 +6,7 @@ use super::project::Projected;
 pub const ALPHA_MIN: f64 = 1.0 / 255.0;
 const ALPHA_MAX: f64 = 0.99;
 const TRANSMITTANCE_MIN: f64 = 1e-4;
+const NEAR: f32 = 0.05;
 
 /// A Gaussian on the image, and a gradient by it, in the order of a gradient slot: centre x, y (integer = pixel
 /// centre); conic a, b, c; opacity; grey or red; inverse depth; green, blue.
@@ -72,8 +73,9 @@ struct Seen {
 
 fn order(splats: &[Option<Flat>]) -> Vec<usize> {
     let mut order: Vec<usize> = (0..splats.len()).filter(|i| splats[*i].is_some()).collect();
-    // Depths are compared as the kernels see them.
-    order.sort_by_key(|i| splats[*i].as_ref().map(|p| (1.0 / p[INVERSE_DEPTH]) as f32).map(f32::to_bits));
+    // Depths are compared as the kernels see them: depth_key.glsl.
+    let bits = |z: f64| (z as f32).max(NEAR).to_bits() - NEAR.to_bits();
+    order.sort_by_key(|i| splats[*i].as_ref().map(|p| bits(1.0 / p[INVERSE_DEPTH]) >> 11));
     order
 }
 
