@@ -121,7 +121,9 @@ fn fly(seed: u64, segments: &[(Kind, usize)]) -> Option<f64> {
     let mut noise = Noise(seed);
     let mut vio = Vio::new(&world.rig, &VioConfig::default());
     let mut tracks = Tracks::default();
-    let (mut sample, mut sent, mut refused, mut newest) = (0, 0u64, 0u64, Nanos::MIN);
+    let (mut sample, mut sent, mut refused) = (0, 0u64, 0u64);
+    let (mut newest, mut leapt) = (None::<Nanos>, None::<Nanos>);
+    let far = |from: Nanos, to: Nanos| i128::from(to.0) - i128::from(from.0) > 5_000_000_000;
     let kinds = segments.iter().flat_map(|(kind, n)| std::iter::repeat_n(*kind, *n));
     let mut error = None;
     for (frame, kind) in kinds.chain(std::iter::repeat_n(Kind::Good, GOOD)).enumerate() {
@@ -129,8 +131,15 @@ fn fly(seed: u64, segments: &[(Kind, usize)]) -> Option<f64> {
         while (sample as f64) / RATE_HZ < t + 1.0 / RATE_HZ {
             let mut s = world.imu(sample as f64 / RATE_HZ);
             spoil_sample(kind, &mut s, &mut noise);
-            if s.is_finite() && s.t > newest {
-                newest = s.t;
+            // Newer than the last; a leap of five seconds is believed when the next sample agrees.
+            let follows = s.is_finite() && newest.is_none_or(|n| s.t > n);
+            let confirmed = leapt.is_some_and(|to| s.t > to && !far(to, s.t));
+            let leaps = follows && newest.is_some_and(|n| far(n, s.t)) && !confirmed;
+            if follows {
+                leapt = leaps.then_some(s.t);
+            }
+            if follows && !leaps {
+                newest = Some(s.t);
             } else {
                 refused += 1;
             }
