@@ -18,6 +18,14 @@ float filtered(float v[REACH], uint k) {
     return sum;
 }
 
+/// What is compared with the observed level b: an image that is white or black tells no more than that a is beyond.
+/// The slope is by a.
+float censored(float a, float b, out float slope) {
+    const float shown = b >= 1.0 ? min(a, 1.0) : b <= 0.0 ? max(a, 0.0) : a;
+    slope = shown == a ? 1.0 : 0.0;
+    return shown;
+}
+
 /// Bytes a row of a stored 8-bit image takes: whole words, so that a run of 8 is two of them.
 uint byte_stride(uint width) {
     return (width + 3) & ~3u;

@@ -18,3 +18,7 @@ struct Projected {
     vec4 centre_conic;  // x, y, px; conic a, b of σ = ½(a dx² + c dy²) + b dx dy
     vec4 conic_shade;   // conic c; opacity; grey level or red; depth, m
 };
+
+// Colours are trained within 0 and this: the map is in one keyframe's exposure, and what another shows as white may be
+// brighter than white there.
+const float COLOUR_MAX = 8.0;

@@ -3,10 +3,11 @@
 // in   visible_count, slots (by depth), tile_offsets, splats, steps (before this one)
 // out  coefficients, coefficient_moments (first, second); isect_gradients: of each Gaussian's first slot, words 8 to 10
 //      become the gradient by its position through the direction it is seen in
-// A step whose gradient is not finite is not taken; project_backward counts it.
+// A step whose gradient is not finite is not taken; project_backward counts it. Without LEARN none is.
 #version 450
 #extension GL_GOOGLE_include_directive : require
 layout(local_size_x = 64) in;
+layout(constant_id = 7) const bool LEARN = true;
 
 #include "../common/types.glsl"
 #include "../common/finite.glsl"
@@ -35,6 +36,9 @@ const float BETA2 = 0.999;
 const float EPSILON = 1e-15;
 
 float descend(uint at, float g, float rate, vec2 debias) {
+    if (!LEARN) {
+        return coefficients[at];
+    }
     const vec2 old = coefficient_moments[at];
     const vec2 m = vec2(BETA1 * old.x + (1.0 - BETA1) * g, BETA2 * old.y + (1.0 - BETA2) * g * g);
     const float c = coefficients[at], next = c - rate * m.x * debias.x / (sqrt(m.y * debias.y) + EPSILON);
@@ -68,7 +72,7 @@ void main() {
     const vec2 debias = 1.0 / (1.0 - exp2(float(step) * log2(vec2(BETA1, BETA2))));
     for (uint channel = 1; channel < CHANNELS; ++channel) {
         const uint at = base + channel - 1;
-        coefficients[at] = clamp(descend(at, v[channel], push.rate_colour, debias), 0.0, 1.0);
+        coefficients[at] = clamp(descend(at, v[channel], push.rate_colour, debias), 0.0, COLOUR_MAX);
     }
     if (DEGREE > 0) {
         const vec3 away = splats[slot].mean_opacity.xyz - push.eye.xyz;

@@ -1,10 +1,12 @@
-// Last pass of the loss (1 - λ)|x - y| + λ(1 - SSIM), mean over valid pixels: its gradient by the rendered image.
+// Last pass of the loss (1 - λ)|x - y| + λ(1 - SSIM), mean over valid pixels, of x = gain · rendered + offset: its
+// gradient by the rendered image and, where EXPOSURE is set, by gain and offset.
 // in   filtered_planes (slopes filtered along rows), grey (rendered), targets, mask
-// out  grey_gradient, zero where masked; l1_sums[group]
+// out  grey_gradient, zero where masked; loss_sums[group]: |x - y|, gradient by gain, by offset, 0
 #version 450
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
 layout(local_size_x = 64) in;
+layout(constant_id = 0) const bool EXPOSURE = false;
 
 #include "../common/index.glsl"
 #include "../common/ssim.glsl"
@@ -13,6 +15,7 @@ layout(local_size_x = 64) in;
 layout(push_constant) uniform Push {
     uvec2 size;
     uint target;       // word offset of the keyframe
+    float exposure[2]; // gain, offset of the keyframe
     float l1_weight;   // (1 - λ) / valid pixels
     float ssim_weight; // λ / valid pixels
 } push;
@@ -22,9 +25,9 @@ layout(set = 0, binding = 1, std430) readonly buffer Grey { float grey[]; };
 layout(set = 0, binding = 2, std430) readonly buffer Targets { uint targets[]; };
 layout(set = 0, binding = 3, std430) readonly buffer Mask { uint mask[]; };
 layout(set = 0, binding = 4, std430) writeonly buffer GreyGradient { float grey_gradient[]; };
-layout(set = 0, binding = 5, std430) writeonly buffer L1Sums { float l1_sums[]; };
+layout(set = 0, binding = 5, std430) writeonly buffer LossSums { vec4 loss_sums[]; };
 
-float column_run(uint x, uint y0) {
+vec3 column_run(uint x, uint y0) {
     const uint plane = push.size.x * push.size.y;
     float slope[3][RUN];
     [[unroll]] for (uint q = 0; q < 3; ++q) {
@@ -39,17 +42,20 @@ float column_run(uint x, uint y0) {
         }
     }
     const uint stride = byte_stride(push.size.x);
-    float sum = 0.0;
+    vec3 sum = vec3(0.0);
     [[unroll]] for (uint k = 0; k < RUN; ++k) {
         const uint y = y0 + k;
         if (y < push.size.y) {
             const uint at = y * push.size.x + x, byte = y * stride + x;
             const bool valid = ((mask[byte / 4] >> (8 * (byte % 4))) & 255u) != 0;
-            const float a = grey[at];
+            const float rendered = grey[at];
             const float b = float((targets[push.target + byte / 4] >> (8 * (byte % 4))) & 255u) / 255.0;
+            float gate;
+            const float a = censored(push.exposure[0] * rendered + push.exposure[1], b, gate);
             const float d_ssim = slope[0][k] + 2.0 * a * slope[1][k] + b * slope[2][k];
-            grey_gradient[at] = valid ? push.l1_weight * sign(a - b) - push.ssim_weight * d_ssim : 0.0;
-            sum += valid ? abs(a - b) : 0.0;
+            const float v = valid ? gate * (push.l1_weight * sign(a - b) - push.ssim_weight * d_ssim) : 0.0;
+            grey_gradient[at] = push.exposure[0] * v;
+            sum += vec3(valid ? abs(a - b) : 0.0, v * rendered, v);
         }
     }
     return sum;
@@ -59,9 +65,12 @@ void main() {
     const uint at = thread_index();
     const uint runs = (push.size.y + RUN - 1) / RUN;
     // All threads stay for the sum.
-    const float s = at < push.size.x * runs ? column_run(at % push.size.x, at / push.size.x * RUN) : 0.0;
-    const float total = sum64(s);
+    const vec3 s = at < push.size.x * runs ? column_run(at % push.size.x, at / push.size.x * RUN) : vec3(0.0);
+    vec4 total = vec4(sum64(s.x), vec3(0.0));
+    if (EXPOSURE) {
+        total.yz = vec2(sum64(s.y), sum64(s.z));
+    }
     if (gl_LocalInvocationID.x == 0) {
-        l1_sums[group_index()] = total;
+        loss_sums[group_index()] = total;
     }
 }

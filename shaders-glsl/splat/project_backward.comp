@@ -3,13 +3,15 @@
 // in   visible_count, slots (by depth), tile_offsets, isect_gradients (slots of raster_backward)
 // out  splats, moments, steps (count and importance of this Gaussian, see worth.glsl); sums[8 group + ..]: gradient by a small
 //      translation (3) and rotation (3) of the camera frame applied to points, count of refused gradients, 0
-// A step whose gradient is not finite is not taken, and counted.
+// A step whose gradient is not finite is not taken, and counted. Without LEARN no step is taken and the map
+// stays as it is to the bit: only the sums are written.
 #version 450
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
 layout(local_size_x = 64) in;
 layout(constant_id = 2) const uint CHANNELS = 1;
 layout(constant_id = 3) const uint DEGREE = 0;  // of the harmonics
+layout(constant_id = 7) const bool LEARN = true;
 
 #include "../common/types.glsl"
 #include "../common/camera.glsl"
@@ -108,13 +110,16 @@ float[7] update(uint rank) {
     const vec3 shift = DEGREE > 0 ? g.cam + from_world * v_direction : g.cam;
     pose = float[7](shift.x, shift.y, shift.z, turn.x, turn.y, turn.z, 0.0);
 
+    if (!LEARN) {
+        return pose;
+    }
     const uint state = after_step(steps[slot], worth);
     const vec2 debias = 1.0 / (1.0 - exp2(float(steps_of(state)) * log2(vec2(BETA1, BETA2))));
     Moments a = moments[slot];
     s.mean_opacity -= adam(a.m[0], a.v[0], d0, vec4(vec3(push.rate_position), push.rate_opacity), debias);
     s.scale_colour -= adam(a.m[1], a.v[1], d1, vec4(vec3(push.rate_scale), push.rate_colour), debias);
     s.quat -= adam(a.m[2], a.v[2], g.quat, vec4(push.rate_rotation), debias);
-    s.scale_colour.w = clamp(s.scale_colour.w, 0.0, 1.0);
+    s.scale_colour.w = clamp(s.scale_colour.w, 0.0, COLOUR_MAX);
     s.scale_colour.xyz = clamp(s.scale_colour.xyz, LOG_SCALE_MIN, LOG_SCALE_MAX);
     s.quat /= max(length(s.quat), 1e-3);
     // A square beyond f32 would leave a moment that never comes down.

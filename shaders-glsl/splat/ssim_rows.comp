@@ -1,5 +1,6 @@
 // First pass of SSIM: filters both images, their squares and their product along rows.
-// in   grey (rendered), targets (8 bit, four to a word), mask (8 bit, zero = ignore)
+// in   grey (rendered, put into the keyframe's exposure here), targets (8 bit, four to a word),
+//      mask (8 bit, zero = ignore)
 // out  filtered_planes: of E[x], E[y], E[x²], E[y²], E[xy]
 #version 450
 #extension GL_GOOGLE_include_directive : require
@@ -11,7 +12,8 @@ layout(local_size_x = 64) in;
 
 layout(push_constant) uniform Push {
     uvec2 size;
-    uint target;  // word offset of the keyframe
+    uint target;        // word offset of the keyframe
+    float exposure[2];  // gain, offset of the keyframe
 } push;
 
 layout(set = 0, binding = 0, std430) readonly buffer Grey { float grey[]; };
@@ -40,8 +42,10 @@ void main() {
             if (k >= 0 && k < int(REACH)) {
                 const bool valid = ((m >> (8 * byte)) & 255u) != 0;
                 const uint x = min(uint(max(word, 0)) * 4 + byte, push.size.x - 1);
-                a[k] = valid ? grey[y * push.size.x + x] : 0.0;
+                const float level = push.exposure[0] * grey[y * push.size.x + x] + push.exposure[1];
                 b[k] = valid ? float((t >> (8 * byte)) & 255u) / 255.0 : 0.0;
+                float slope;
+                a[k] = valid ? censored(level, b[k], slope) : 0.0;
             }
         }
     }

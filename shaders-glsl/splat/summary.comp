@@ -1,5 +1,5 @@
 // Gathers what a step reports into the one thing the host reads: one workgroup, fixed order of sums.
-// in   visible_count, isect_count, failed, ssim_sums, l1_sums, sums (of project_backward)
+// in   visible_count, isect_count, failed, ssim_sums, loss_sums, sums (of project_backward)
 // out  status
 #version 450
 #extension GL_GOOGLE_include_directive : require
@@ -17,7 +17,7 @@ struct Status {
     float gradients_refused;
     float unused0;
     float pose[6];
-    float unused1[2];
+    float exposure[2];       // gradient by gain, offset
 };
 
 layout(push_constant) uniform Push {
@@ -29,26 +29,28 @@ layout(set = 0, binding = 0, std430) readonly buffer VisibleCount { uint visible
 layout(set = 0, binding = 1, std430) readonly buffer IsectCount { uint isect_count[]; };
 layout(set = 0, binding = 2, std430) readonly buffer Failed { uint failed[]; };
 layout(set = 0, binding = 3, std430) readonly buffer SsimSums { float ssim_sums[]; };
-layout(set = 0, binding = 4, std430) readonly buffer L1Sums { float l1_sums[]; };
+layout(set = 0, binding = 4, std430) readonly buffer LossSums { vec4 loss_sums[]; };
 layout(set = 0, binding = 5, std430) readonly buffer Sums { float sums[]; };
 layout(set = 0, binding = 6, std430) writeonly buffer StatusOut { Status status[]; };
 
 void main() {
     const uint i = gl_LocalInvocationID.x;
-    float s = 0.0, l = 0.0, q = 0.0;
+    float s = 0.0, q = 0.0;
+    vec3 l = vec3(0.0);
     for (uint k = i; k < push.image_groups; k += 64) {
         s += ssim_sums[k];
-        l += l1_sums[k];
+        l += loss_sums[k].xyz;
     }
     s = sum64(s);
-    l = sum64(l);
+    l = vec3(sum64(l.x), sum64(l.y), sum64(l.z));
     if (i == 0) {
         status[0].visible = visible_count[0];
         status[0].intersections = isect_count[0];
         status[0].intersections_needed = isect_count[1];
         status[0].not_finite = failed[0];
-        status[0].l1_sum = l;
+        status[0].l1_sum = l.x;
         status[0].ssim_sum = s;
+        status[0].exposure = float[2](l.y, l.z);
     }
     for (uint term = 0; term < 7; ++term) {
         q = 0.0;

@@ -126,7 +126,7 @@ buffers! {
     rendered: f32, "pixels: colour, transmittance, depth", |s| s.rendered_planes() * s.pixels();
     pixel_gradient: f32, "pixels: gradient", |s| s.gradient_planes() * s.pixels();
     ssim_sums: f32, "pixels: SSIM by workgroup", |s| image_groups(s.width, s.height) as usize;
-    l1_sums: f32, "pixels: L1 by workgroup", |s| image_groups(s.width, s.height) as usize;
+    loss_sums: [f32; 4], "pixels: L1 and exposure gradient by workgroup", |s| image_groups(s.width, s.height) as usize;
     mask: u32, "keyframes: mask", |s| s.image_words();
     targets: u32, "keyframes: images", |s| s.image_words() * s.keyframes as usize;
     visible_count: u32, "counts: visible", |_s| 1;

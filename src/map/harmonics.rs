@@ -17,6 +17,8 @@ const RATE_PART: f32 = 1.0 / 20.0;
 pub struct Harmonics {
     colours: Kernel<harmonics::K>,
     backward: Kernel<harmonics_backward::K>,
+    /// The same, leaving the coefficients as they are.
+    backward_still: Kernel<harmonics_backward::K>,
     insert: Kernel<harmonics_insert::K>,
     /// Where colours depend on the direction.
     turn: Option<Kernel<harmonics_turn::K>>,
@@ -47,7 +49,8 @@ impl Harmonics {
         let n = shape.splats as usize * shape.colour_extra();
         Ok(Harmonics {
             colours: gpu.kernel(harmonics::Spec { channels, degree })?,
-            backward: gpu.kernel(harmonics_backward::Spec { channels, degree })?,
+            backward: gpu.kernel(harmonics_backward::Spec { channels, degree, learn: true })?,
+            backward_still: gpu.kernel(harmonics_backward::Spec { channels, degree, learn: false })?,
             insert: gpu.kernel(harmonics_insert::Spec { channels, degree })?,
             turn: (degree > 0).then(|| gpu.kernel(harmonics_turn::Spec { channels, degree })).transpose()?,
             coefficients: gpu.alloc("splats: colour beyond the first level", n)?,
@@ -71,14 +74,14 @@ impl Harmonics {
         rec.dispatch(&self.colours, bind, harmonics::Push { eye: eye(view) }, Threads::d1(splats));
     }
 
-    /// Between the raster's backward pass and the projection's.
+    /// Between the raster's backward pass and the projection's; without rates nothing is trained.
     pub(super) fn record_update(
         &self,
         rec: &mut Recorder,
         b: &Buffers,
         view: &View,
         splats: u32,
-        rates: &LearningRates,
+        rates: Option<&LearningRates>,
     ) {
         let bind = harmonics_backward::Bind {
             visible_count: b.visible_count.read(),
@@ -90,13 +93,15 @@ impl Harmonics {
             coefficients: self.coefficients.read_write(),
             coefficient_moments: self.moments.read_write(),
         };
+        let colour = rates.map_or(0.0, |r| r.colour);
         let push = harmonics_backward::Push {
             eye: eye(view),
             capacity: self.capacity,
-            rate_colour: rates.colour,
-            rate_harmonics: RATE_PART * rates.colour,
+            rate_colour: colour,
+            rate_harmonics: RATE_PART * colour,
         };
-        rec.dispatch(&self.backward, bind, push, Threads::d1(splats));
+        let kernel = if rates.is_some() { &self.backward } else { &self.backward_still };
+        rec.dispatch(kernel, bind, push, Threads::d1(splats));
     }
 
     /// Of arrivals, ahead of `record_insert`.

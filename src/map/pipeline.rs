@@ -19,7 +19,7 @@ use super::harmonics::Harmonics;
 pub use super::pool::{PruneRule, SplatInit};
 use super::sort::{Pairs, Scan, Sorter};
 use super::view::{camera, pose_gradient, size, stats};
-pub use super::view::{Fisheye, LearningRates, Rendered, Stats, StepStats, View, Weights};
+pub use super::view::{Exposure, Fisheye, Goal, LearningRates, Rendered, Stats, StepStats, View, Weights};
 use crate::gpu::kernels::types::{Splat, Status};
 use crate::gpu::kernels::*;
 use crate::gpu::{Caps, Gpu, GpuError, Kernel, KernelDef, Recorder, Threads};
@@ -53,7 +53,11 @@ pub(super) struct Kernels {
     ssim_columns: Kernel<ssim_columns::K>,
     loss_rows: Kernel<loss_rows::K>,
     loss_columns: Kernel<loss_columns::K>,
+    /// The same, with the gradient by the exposure.
+    loss_columns_exposure: Kernel<loss_columns::K>,
     project_backward: ByLens<project_backward::K>,
+    /// The same, leaving the map as it is.
+    project_backward_still: ByLens<project_backward::K>,
     summary: Kernel<summary::K>,
     pub(super) insert: Kernel<insert::K>,
     pub(super) prune: Kernel<prune::K>,
@@ -132,8 +136,7 @@ impl Pipeline {
             let what = format!("{shape:?} has a zero, neither 1 nor 3 channels, or harmonics past degree 3");
             return Err(Fault::new(Exit::Config, "map", what, "raise the board's [budget]"));
         }
-        let (channels, degree) = (shape.channels, shape.sh_degree);
-        let backward = |fisheye| project_backward::Spec { channels, degree, fisheye };
+        let channels = shape.channels;
         let k = Kernels {
             project: ByLens {
                 pinhole: gpu.kernel::<project::K>(project::Spec { lanes, fisheye: false })?,
@@ -155,10 +158,9 @@ impl Pipeline {
             ssim_columns: plain::<ssim_columns::K>(gpu)?,
             loss_rows: plain::<loss_rows::K>(gpu)?,
             loss_columns: plain::<loss_columns::K>(gpu)?,
-            project_backward: ByLens {
-                pinhole: gpu.kernel::<project_backward::K>(backward(false))?,
-                fisheye: gpu.kernel::<project_backward::K>(backward(true))?,
-            },
+            loss_columns_exposure: gpu.kernel::<loss_columns::K>(loss_columns::Spec { exposure: true })?,
+            project_backward: project_backward_of(gpu, &shape, true)?,
+            project_backward_still: project_backward_of(gpu, &shape, false)?,
             summary: plain::<summary::K>(gpu)?,
             insert: plain::<insert::K>(gpu)?,
             prune: plain::<prune::K>(gpu)?,
@@ -216,24 +218,46 @@ impl Pipeline {
         Ok(stats(&status))
     }
 
-    /// One step on keyframe `slot`. The view must have the pipeline's shape.
+    /// One step on a keyframe, or its slot. The view must have the pipeline's shape.
     pub fn train(
         &mut self,
         gpu: &mut Gpu,
         view: &View,
-        slot: u32,
+        goal: impl Into<Goal>,
         rates: &LearningRates,
+        weights: &Weights,
+    ) -> Result<StepStats, GpuError> {
+        self.pass(gpu, view, goal.into(), Some(rates), weights)
+    }
+
+    /// What `train` would answer; the map, Adam's moments included, stays as it is to the bit.
+    pub fn look(
+        &mut self,
+        gpu: &mut Gpu,
+        view: &View,
+        goal: impl Into<Goal>,
+        weights: &Weights,
+    ) -> Result<StepStats, GpuError> {
+        self.pass(gpu, view, goal.into(), None, weights)
+    }
+
+    fn pass(
+        &mut self,
+        gpu: &mut Gpu,
+        view: &View,
+        goal: Goal,
+        rates: Option<&LearningRates>,
         weights: &Weights,
     ) -> Result<StepStats, GpuError> {
         let (w, h) = (self.shape.width, self.shape.height);
         assert!(
-            (view.camera.width, view.camera.height) == (w as usize, h as usize) && slot < self.shape.keyframes,
+            (view.camera.width, view.camera.height) == (w as usize, h as usize) && goal.slot < self.shape.keyframes,
             "training views are of the shape the pipeline was made with"
         );
         let mut rec = gpu.record();
         let raster = self.raster(false);
         let by_tile = self.record_picture(&mut rec, view, &raster.forward);
-        self.record_loss(&mut rec, slot, weights);
+        self.record_loss(&mut rec, &goal, weights);
         self.record_update(&mut rec, view, &raster.backward, by_tile, rates, weights);
         self.record_summary(&mut rec, image_groups(w, h), self.high_water.div_ceil(GROUP));
         gpu.submit(rec)?;
@@ -248,6 +272,7 @@ impl Pipeline {
             ssim,
             gradients_rejected: s.gradients_refused as u32,
             pose_gradient: pose_gradient(view, &s.pose),
+            exposure_gradient: s.exposure.map(f64::from),
         })
     }
 
@@ -265,7 +290,7 @@ impl Pipeline {
         let mut rec = gpu.record();
         let raster = self.raster(true);
         let by_tile = self.record_picture(&mut rec, view, &raster.forward);
-        self.record_update(&mut rec, view, &raster.backward, by_tile, rates, weights);
+        self.record_update(&mut rec, view, &raster.backward, by_tile, Some(rates), weights);
         self.record_summary(&mut rec, 0, self.high_water.div_ceil(GROUP));
         gpu.submit(rec)?;
         let s = self.status(gpu)?;
@@ -370,10 +395,11 @@ impl Pipeline {
         sorted
     }
 
-    fn record_loss(&self, rec: &mut Recorder, slot: u32, weights: &Weights) {
+    fn record_loss(&self, rec: &mut Recorder, goal: &Goal, weights: &Weights) {
         let (k, b) = (&self.k, &self.b);
         let (w, h) = (self.shape.width, self.shape.height);
-        let (size, target) = ([w, h], slot * self.shape.image_words() as u32);
+        let (size, target, exposure) =
+            ([w, h], goal.slot * self.shape.image_words() as u32, goal.exposure.unwrap_or_default().words());
         let (rows, columns) = (Threads::d1(w.div_ceil(RUN) * h), Threads::d1(w * h.div_ceil(RUN)));
         let valid = self.valid_pixels.max(1) as f32;
         rec.dispatch(
@@ -384,7 +410,7 @@ impl Pipeline {
                 mask: b.mask.read(),
                 filtered: b.over.filtered.write(),
             },
-            ssim_rows::Push { size, target },
+            ssim_rows::Push { size, target, exposure },
             rows,
         );
         rec.dispatch(
@@ -405,18 +431,19 @@ impl Pipeline {
             rows,
         );
         rec.dispatch(
-            &k.loss_columns,
+            if goal.exposure.is_some() { &k.loss_columns_exposure } else { &k.loss_columns },
             loss_columns::Bind {
                 filtered: b.over.filtered.read(),
                 grey: b.rendered.read(),
                 targets: b.targets.read(),
                 mask: b.mask.read(),
                 grey_gradient: b.pixel_gradient.write(),
-                l1_sums: b.l1_sums.write(),
+                loss_sums: b.loss_sums.write(),
             },
             loss_columns::Push {
                 size,
                 target,
+                exposure,
                 l1_weight: (1.0 - weights.ssim) / valid,
                 ssim_weight: weights.ssim / valid,
             },
@@ -430,7 +457,7 @@ impl Pipeline {
         view: &View,
         raster_backward: &Kernel<raster_backward::K>,
         by_tile: Pairs,
-        rates: &LearningRates,
+        rates: Option<&LearningRates>,
         weights: &Weights,
     ) {
         let (k, b) = (&self.k, &self.b);
@@ -453,8 +480,10 @@ impl Pipeline {
         if let Some(h) = &self.harmonics {
             h.record_update(rec, b, view, self.high_water, rates);
         }
+        let update = if rates.is_some() { &k.project_backward } else { &k.project_backward_still };
+        let rates = rates.copied().unwrap_or_default();
         rec.dispatch(
-            k.project_backward.of(view),
+            update.of(view),
             project_backward::Bind {
                 visible_count: b.visible_count.read(),
                 slots: b.ranked.read(),
@@ -492,7 +521,7 @@ impl Pipeline {
                 isect_count: b.isect_count.read(),
                 failed: b.failed.read(),
                 ssim_sums: b.ssim_sums.read(),
-                l1_sums: b.l1_sums.read(),
+                loss_sums: b.loss_sums.read(),
                 sums: b.pose_sums.read(),
                 status_out: b.status.write(),
             },
@@ -527,6 +556,12 @@ pub fn raster_variant(caps: &Caps) -> (u32, &'static str) {
 /// Words the host moves at once: an image, the flags of all slots, or slots of arrivals.
 fn words_max(shape: &Shape) -> usize {
     shape.image_words().max(shape.splats as usize + 1).max(ARRIVALS)
+}
+
+fn project_backward_of(gpu: &mut Gpu, shape: &Shape, learn: bool) -> Result<ByLens<project_backward::K>, Fault> {
+    let (channels, degree) = (shape.channels, shape.sh_degree);
+    let mut of = |fisheye| gpu.kernel(project_backward::Spec { channels, degree, fisheye, learn });
+    Ok(ByLens { pinhole: of(false)?, fisheye: of(true)? })
 }
 
 fn plain<K: KernelDef>(gpu: &mut Gpu) -> Result<Kernel<K>, Fault>

@@ -50,8 +50,51 @@ impl Fisheye {
     }
 }
 
-/// Adam step sizes: m, ln m, quaternion, logit, grey.
+/// How a keyframe was exposed: what it shows of the map's grey level x is gain · x + offset.
 #[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Exposure {
+    pub gain: f64,
+    pub offset: f64,
+}
+
+impl Default for Exposure {
+    fn default() -> Exposure {
+        Exposure { gain: 1.0, offset: 0.0 }
+    }
+}
+
+impl Exposure {
+    pub fn observed(self, grey: f64) -> f64 {
+        self.gain * grey + self.offset
+    }
+
+    /// The map's grey level behind an observed one.
+    pub fn inverse(self, observed: f64) -> f64 {
+        (observed - self.offset) / self.gain
+    }
+
+    pub(super) fn words(self) -> [f32; 2] {
+        [self.gain as f32, self.offset as f32]
+    }
+}
+
+/// What a step compares the rendering with.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Goal {
+    /// Of the keyframe's image.
+    pub slot: u32,
+    /// `None` compares the rendering as it is, and gives no gradient by the exposure.
+    pub exposure: Option<Exposure>,
+}
+
+impl From<u32> for Goal {
+    fn from(slot: u32) -> Goal {
+        Goal { slot, exposure: None }
+    }
+}
+
+/// Adam step sizes: m, ln m, quaternion, logit, grey.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct LearningRates {
     pub position: f32,
     pub scale: f32,
@@ -112,6 +155,8 @@ pub struct StepStats {
     pub gradients_rejected: u32,
     /// By [p, θ] of world_from_cam: p additive in world, rotation perturbed on the right.
     pub pose_gradient: [f64; 6],
+    /// By [gain, offset]; zero where the goal has no exposure.
+    pub exposure_gradient: [f64; 2],
 }
 
 pub(super) fn size(view: &View) -> [u32; 2] {

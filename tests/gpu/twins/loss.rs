@@ -1,5 +1,5 @@
 //! Twin of the four loss kernels: (1 - λ)|x - y| + λ(1 - SSIM), mean over valid pixels, with the two-dimensional
-//! window written out.
+//! window written out. Where the target is white or black, what lies beyond it is not compared.
 
 pub struct Loss {
     pub l1: f64,
@@ -37,6 +37,13 @@ fn window(i: usize, width: usize, height: usize) -> Vec<(usize, f64)> {
 pub fn loss(x: &[f64], y: &[f64], mask: &[u8], width: usize, height: usize, ssim_weight: f64) -> Loss {
     let n = width * height;
     let valid = mask.iter().filter(|m| **m != 0).count().max(1) as f64;
+    let shown = |i: usize| match y[i] {
+        b if b >= 1.0 => x[i].min(1.0),
+        b if b <= 0.0 => x[i].max(0.0),
+        _ => x[i],
+    };
+    let gate: Vec<f64> = (0..n).map(|i| if shown(i) == x[i] { 1.0 } else { 0.0 }).collect();
+    let x = &(0..n).map(shown).collect::<Vec<f64>>();
     let masked = |v: &[f64], i: usize| if mask[i] != 0 { v[i] } else { 0.0 };
     let mut out = Loss { l1: 0.0, ssim: 0.0, gradient: vec![0.0; n] };
     for i in (0..n).filter(|i| mask[*i] != 0) {
@@ -63,5 +70,23 @@ pub fn loss(x: &[f64], y: &[f64], mask: &[u8], width: usize, height: usize, ssim
             out.gradient[j] -= ssim_weight / valid * s * d;
         }
     }
+    out.gradient.iter_mut().zip(gate).for_each(|(v, gate)| *v *= gate);
     out
+}
+
+/// As `loss`, of gain · x + offset; beside it the gradient by gain and offset.
+pub fn exposed(
+    x: &[f64],
+    y: &[f64],
+    mask: &[u8],
+    (width, height): (usize, usize),
+    ssim_weight: f64,
+    [gain, offset]: [f64; 2],
+) -> (Loss, [f64; 2]) {
+    let shown: Vec<f64> = x.iter().map(|x| gain * x + offset).collect();
+    let mut out = loss(&shown, y, mask, width, height, ssim_weight);
+    let by_gain = out.gradient.iter().zip(x).map(|(v, x)| v * x).sum();
+    let by_offset = out.gradient.iter().sum();
+    out.gradient.iter_mut().for_each(|v| *v *= gain);
+    (out, [by_gain, by_offset])
 }
