@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use std::time::{Duration, Instant};
 use stipple::config::Board;
 use stipple::gpu::Gpu;
+use stipple::map::pipeline::Exposure;
 use stipple::map::{Did, Keyframe, Mapper, Offer, Panel, PoseCorrection};
 use stipple::mem::{heap_after_seal, seal_thread, CountingAllocator};
 use stipple::output::panel::{panel, View};
@@ -137,6 +138,76 @@ fn corrections_reach_waiting_and_stored_keyframes_and_their_gaussians() {
     mapper.correct(&PoseCorrection { id: 77, world_from_body: far });
     train(&mut mapper, 1);
     assert_eq!(mapper.counters().blocks_moved.get(), 1);
+}
+
+#[test]
+fn exposure_is_found_in_the_gauge_of_the_first_keyframe() {
+    let (calibration, mut keyframes) = flight(8);
+    let gains = [1.0, 0.8, 0.6, 0.7, 0.8, 1.0, 1.2, 1.0];
+    for (k, gain) in keyframes.iter_mut().zip(gains) {
+        k.images.iter_mut().for_each(|i| i.pixels.iter_mut().for_each(|p| *p = (f64::from(*p) * gain) as u8));
+    }
+    let run = |exposure: &str| {
+        let mut mapper = open(&calibration, &board(&["map.refine_pose=false", exposure]));
+        for k in &keyframes {
+            mapper.offer(k);
+            train(&mut mapper, 30);
+        }
+        (mapper.evaluate().unwrap(), mapper)
+    };
+    let (without, _) = run("map.refine_exposure=false");
+    let (with, mapper) = run("map.refine_exposure=true");
+    println!("{without:?}\n{with:?}");
+    assert!(with.psnr_db.unwrap() > without.psnr_db.unwrap() + 2.0);
+    assert!(with.psnr_heldout_db.unwrap() > without.psnr_heldout_db.unwrap() + 1.0);
+    let of = |k: usize| mapper.keyframe(k).refined.exposure;
+    assert_eq!(of(0), Exposure::default());
+    // Those that see what the first sees; farther on, errors add up from one to the next.
+    for k in [1, 2] {
+        let mid_grey = of(k).observed(0.5) / 0.5;
+        assert!((mid_grey / gains[k] - 1.0).abs() < 0.12, "keyframe {k}: {:?} for {}", of(k), gains[k]);
+    }
+}
+
+#[test]
+fn corrections_compose_with_what_the_mapper_found() {
+    let (calibration, mut keyframes) = flight(3);
+    let truth = keyframes[1].world_from_body;
+    keyframes[1].world_from_body.p += glam::DVec3::new(0.02, -0.02, 0.01);
+    let mut mapper = open(&calibration, &board(&["map.lr_pose=1e-3"]));
+    for k in &keyframes {
+        mapper.offer(k);
+        train(&mut mapper, 60);
+    }
+    assert_eq!(mapper.keyframe(0).refined.body_from_refined, Pose::IDENTITY);
+    let (given, found) = (mapper.keyframe(1).given, mapper.keyframe(1).refined.body_from_refined);
+    assert_eq!(given, keyframes[1].world_from_body);
+    let off = |pose: Pose| (pose.p - truth.p).length();
+    assert!(off(given * found) < 0.7 * off(given), "{} of {}", off(given * found), off(given));
+    let corrected = Pose { p: given.p + glam::DVec3::Z, ..given };
+    mapper.correct(&PoseCorrection { id: 1, world_from_body: corrected });
+    assert_eq!(mapper.keyframe(1).world_from_refined(), corrected * found);
+}
+
+#[test]
+fn evaluation_leaves_no_trace() {
+    let (calibration, keyframes) = flight(4);
+    let run = |looks: bool| {
+        let mut mapper = open(&calibration, &board(&[]));
+        for k in &keyframes {
+            mapper.offer(k);
+            train(&mut mapper, 10);
+            if looks {
+                mapper.evaluate().unwrap();
+                mapper.sample(1.0).unwrap();
+                mapper.panels(2).unwrap();
+            }
+        }
+        train(&mut mapper, 10);
+        let found: Vec<_> = (0..4).map(|k| mapper.keyframe(k).world_from_refined()).collect();
+        (mapper.splats().unwrap(), found)
+    };
+    assert!(run(true) == run(false));
 }
 
 #[test]

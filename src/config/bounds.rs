@@ -94,6 +94,7 @@ pub(super) const BOUNDS: &[(&str, Bound)] = &[
     ("map.lr_opacity", Positive),
     ("map.lr_colour", Positive),
     ("map.lr_pose", Within(0.0, 0.1)),
+    ("map.lr_exposure", Within(0.0, 0.1)),
     ("map.curve_period_s", Positive),
     ("map.seed", Within(0.0, u64::MAX as f64)),
     ("gpu.submission_max_ms", Positive),

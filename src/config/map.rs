@@ -32,8 +32,12 @@ pub struct MapConfig {
     pub lr_rotation: f64,
     pub lr_opacity: f64,
     pub lr_colour: f64,
-    /// Of keyframe poses, m and rad; 0 leaves them as given.
+    /// Whether the mapper corrects the poses of its keyframes for itself; of a step, m and rad.
+    pub refine_pose: bool,
     pub lr_pose: f64,
+    /// Whether it finds gain and offset of each keyframe; of a step, ln gain and grey.
+    pub refine_exposure: bool,
+    pub lr_exposure: f64,
     /// Seconds between samples of the error-against-time curve.
     pub curve_period_s: f64,
     pub seed: u64,
@@ -58,7 +62,10 @@ impl Default for MapConfig {
             lr_rotation: 1e-2,
             lr_opacity: 5e-2,
             lr_colour: 1e-2,
-            lr_pose: 0.0,
+            refine_pose: true,
+            lr_pose: 2e-4,
+            refine_exposure: true,
+            lr_exposure: 1e-2,
             curve_period_s: 5.0,
             seed: 1,
         }

@@ -151,6 +151,8 @@ fn map_figures(report: &mut Report, q: &Evaluation) {
     report.ssim = q.ssim;
     report.psnr_heldout_db = q.psnr_heldout_db;
     report.ssim_heldout = q.ssim_heldout;
+    report.psnr_heldout_fitted_db = q.psnr_heldout_fitted_db;
+    report.ssim_heldout_fitted = q.ssim_heldout_fitted;
     report.psnr_heldout_aligned_db = q.psnr_heldout_aligned_db;
 }
 
@@ -235,7 +237,7 @@ pub fn seven_lines(r: &Report, out: &OutputDir) -> String {
          tracking    {} frames ({} dropped), {} a frame, {} at the 99th percentile\n\
          odometry    {} frames/s on {} threads, {} of CPU a frame, {}, quality {}, hash {}\n\
          map         {} keyframes, {} anchors, {} Gaussians, {} iterations of {}\n\
-         quality     {} PSNR, {} SSIM; held out {} ({} with the pose refined)\n\
+         quality     {} PSNR, {} SSIM; held out {} ({} with the exposure fitted, {} with the pose too)\n\
          memory      GPU {}, resident {}, {} heap allocations after the seal\n\
          report      {}",
         or_dash(r.ate_rmse_m, 4, "m"),
@@ -259,6 +261,7 @@ pub fn seven_lines(r: &Report, out: &OutputDir) -> String {
         or_dash(r.psnr_db, 2, "dB"),
         r.ssim.map_or_else(|| "-".to_string(), |v| format!("{v:.3}")),
         or_dash(r.psnr_heldout_db, 2, "dB"),
+        or_dash(r.psnr_heldout_fitted_db, 2, "dB"),
         or_dash(r.psnr_heldout_aligned_db, 2, "dB"),
         bytes(r.gpu_bytes),
         bytes(r.rss_peak_bytes),

@@ -8,6 +8,7 @@
 
 use super::occupancy::{Cell, Occupancy};
 use super::schedule::Rng;
+use super::view::Exposure;
 use crate::counters::Counters;
 use crate::mem::Footprint;
 use crate::stereo::{DepthMap, Pinhole};
@@ -21,7 +22,7 @@ pub struct Seed {
     /// Standard deviation, m.
     pub sigma_m: f64,
     pub opacity: f64,
-    /// 0..=1
+    /// In the exposure of the map, 0 or more.
     pub grey: f64,
 }
 
@@ -41,7 +42,7 @@ const FOREGROUND: f32 = 1.25;
 const SEED_ALPHA: f32 = 0.5;
 
 /// A pixel rendered this far from what was seen takes seeds even in an occupied cell.
-const SEED_ERROR: f32 = 0.1;
+const SEED_ERROR: f64 = 0.1;
 /// Part of the free pool that a whole uncovered view may take: there is always room for the next.
 const ROOM_SHARE: usize = 8;
 
@@ -53,6 +54,8 @@ pub struct View<'a> {
     /// Rendered before the anchor was added.
     pub alpha: &'a [f32],
     pub grey: &'a [f32],
+    /// Of the image; renderings and seeds are in the map's.
+    pub exposure: Exposure,
     pub camera: Pinhole,
     pub world_from_cam: Pose,
     pub anchor: u32,
@@ -150,7 +153,8 @@ impl Seeder {
         let z = f64::from(if matched { view.depth.metres[i] } else { self.filled[i] });
         let p_cam = DVec3::new((x as f64 - c.cx) / c.fx, (y as f64 - c.cy) / c.fy, 1.0) * z;
         let p_world = view.world_from_cam.transform(p_cam);
-        let error = (view.grey[i] - f32::from(view.image.pixels[i]) / 255.0).abs();
+        let grey = view.exposure.inverse(f64::from(view.image.pixels[i]) / 255.0);
+        let error = (f64::from(view.grey[i]) - grey).abs();
         match self.occupancy.claim(p_world, view.anchor) {
             Cell::Held if view.alpha[i] >= SEED_ALPHA && error < SEED_ERROR => return counters.seeds_occupied.add(1),
             Cell::Full => counters.occupancy_full.add(1),
@@ -161,7 +165,7 @@ impl Seeder {
             p_world,
             sigma_m: SPREAD * spacing_px * z / c.fx,
             opacity: if matched { OPACITY_MATCHED } else { OPACITY_FILLED },
-            grey: f64::from(view.image.pixels[i]) / 255.0,
+            grey: grey.max(0.0),
         });
     }
 
@@ -260,6 +264,7 @@ mod tests {
             depth,
             alpha: &[alpha; W * H],
             grey: &[0.0; W * H],
+            exposure: Exposure::default(),
             camera: camera(),
             world_from_cam: Pose::IDENTITY,
             anchor,
@@ -324,6 +329,7 @@ mod tests {
             depth: &depth,
             alpha: &[0.0; W * H],
             grey: &[0.0; W * H],
+            exposure: Exposure::default(),
             camera: camera(),
             world_from_cam: Pose::IDENTITY,
             anchor: 1,

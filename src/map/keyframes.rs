@@ -1,7 +1,8 @@
 //! Keyframes: the plain data that crosses the border, the queue of those not yet looked at, and the store of
 //! rectified images the map is trained and judged on. Everything is sized at boot; full is a value.
 
-use super::pose::PoseAdam;
+use super::refine::Refinement;
+use super::view::Exposure;
 use crate::mem::Footprint;
 use stipple_drivers::{Image, Nanos, Pose};
 
@@ -118,16 +119,21 @@ impl Queue {
 pub struct Stored {
     pub id: u64,
     pub t: Nanos,
-    /// Where it is drawn from: `given`, refined.
-    pub world_from_body: Pose,
     /// By odometry, with its corrections.
     pub given: Pose,
     /// `given` when its Gaussians were last put in place; of an anchor.
     pub placed: Pose,
     pub held_out: bool,
     pub anchor: bool,
-    /// Of its refinement on the image.
-    pub adam: PoseAdam,
+    /// What the mapper found out beside it.
+    pub refined: Refinement,
+}
+
+impl Stored {
+    /// Odometry's pose with the mapper's own correction.
+    pub fn world_from_refined(&self) -> Pose {
+        self.given * self.refined.body_from_refined
+    }
 }
 
 /// Rectified left images at mapping resolution, and what is known of each.
@@ -171,16 +177,11 @@ impl Store {
         let image = self.images.get_mut(index)?;
         draw(image);
         let &Keyframe { id, t, world_from_body, held_out, .. } = keyframe;
-        self.entries.push(Stored {
-            id,
-            t,
-            world_from_body,
-            given: world_from_body,
-            placed: world_from_body,
-            held_out,
-            anchor: false,
-            adam: PoseAdam::default(),
-        });
+        let mut refined = Refinement::default();
+        // Cameras change their exposure slowly: the last one's is the best guess.
+        refined.exposure = self.training.last().map_or(refined.exposure, |&k| self.get(k as usize).refined.exposure);
+        let (given, placed) = (world_from_body, world_from_body);
+        self.entries.push(Stored { id, t, given, placed, held_out, anchor: false, refined });
         if !held_out {
             self.training.push(index as u32);
         }
@@ -203,6 +204,23 @@ impl Store {
         self.entries.iter()
     }
 
+    /// Of a keyframe that is trained on, its own; of one held out, what those beside it in time make likely.
+    pub fn exposure(&self, index: usize) -> Exposure {
+        let of = |k: &u32| (self.get(*k as usize).t, self.get(*k as usize).refined.exposure);
+        let at = self.training.partition_point(|k| (*k as usize) < index);
+        let after = self.training.get(at).map(of);
+        let before = at.checked_sub(1).map(|k| of(&self.training[k]));
+        match (before, after) {
+            _ if !self.get(index).held_out => self.get(index).refined.exposure,
+            (Some((t0, a)), Some((t1, b))) if t1 > t0 => {
+                let part = ((self.get(index).t - t0).secs() / (t1 - t0).secs()).clamp(0.0, 1.0);
+                let between = |a: f64, b: f64| a + part * (b - a);
+                Exposure { gain: between(a.gain, b.gain), offset: between(a.offset, b.offset) }
+            }
+            (one, other) => one.or(other).map_or(Exposure::default(), |(_, e)| e),
+        }
+    }
+
     /// Indices of keyframes that may be trained on.
     pub fn training(&self) -> &[u32] {
         &self.training
@@ -218,7 +236,6 @@ impl Store {
         // The newest are corrected most.
         let found = self.entries.iter_mut().rev().find(|e| e.id == correction.id);
         let Some(e) = found.filter(|_| to.p.is_finite() && to.q.is_finite()) else { return false };
-        e.world_from_body = to * e.given.inverse() * e.world_from_body;
         e.given = to;
         true
     }

@@ -15,8 +15,8 @@ pub mod keyframes;
 pub mod occupancy;
 pub mod pipeline;
 pub mod pool;
-mod pose;
 pub mod quality;
+pub mod refine;
 pub mod schedule;
 pub mod sort;
 pub mod view;
@@ -223,6 +223,7 @@ impl Mapper {
         let view = self.view(index);
         self.pipeline.render(&mut self.gpu, &view, &mut self.rendered)?;
         let bare = uncovered(&self.rendered.alpha, self.stereo.valid_mask(), self.config.covered_alpha);
+        self.expose(index);
         let room = self.room();
         if bare <= self.config.anchor_uncovered_min || room == 0 {
             return Ok(Did::Stored);
@@ -243,6 +244,7 @@ impl Mapper {
             depth: &self.depth,
             alpha: &self.rendered.alpha,
             grey: &self.rendered.grey,
+            exposure: self.store.exposure(index),
             camera: view.camera,
             world_from_cam: view.world_from_cam,
             anchor: index as u32,
@@ -265,22 +267,17 @@ impl Mapper {
         let Some(index) = self.schedule.next(self.store.training()) else { return Ok(None) };
         let view = self.view(index);
         let (rates, weights) = (self.rates(), self.weights());
-        let done = self.pipeline.train(&mut self.gpu, &view, index as u32, &rates, &weights)?;
+        let goal = self.goal(index);
+        let done = self.pipeline.train(&mut self.gpu, &view, goal, &rates, &weights)?;
         self.iterations += 1;
         self.counters.intersections_overflow.add(u64::from(done.stats.overflow > 0));
         self.counters.gradients_rejected.add(u64::from(done.gradients_rejected));
-        if self.config.lr_pose > 0.0 && index as u32 != self.store.training()[0] {
-            let rect_from_body = self.stereo.camera().body_from_rect.inverse();
-            let mut world_from_cam = view.world_from_cam;
-            let entry = self.store.get_mut(index);
-            entry.adam.step(&mut world_from_cam, &done.pose_gradient, self.config.lr_pose);
-            entry.world_from_body = world_from_cam * rect_from_body;
-        }
+        self.refine(index, &view, &done);
         Ok(Some(done.loss))
     }
 
     fn view(&self, index: usize) -> View {
-        self.view_from(self.store.get(index).world_from_body)
+        self.view_from(self.store.get(index).world_from_refined())
     }
 
     fn view_from(&self, world_from_body: Pose) -> View {
@@ -289,10 +286,13 @@ impl Mapper {
     }
 
     /// Smaller as the steps a keyframe has had grow: large ones find the picture, small ones settle it.
-    fn rates(&self) -> LearningRates {
-        let c = &self.config;
+    fn rate_part(&self) -> f64 {
         let steps = self.iterations as f64 / self.store.len().max(1) as f64;
-        let part = f64::max(RATE_PART_MIN, 1.0 / (1.0 + steps / STEPS_HALVING));
+        f64::max(RATE_PART_MIN, 1.0 / (1.0 + steps / STEPS_HALVING))
+    }
+
+    fn rates(&self) -> LearningRates {
+        let (c, part) = (&self.config, self.rate_part());
         LearningRates {
             position: (part * c.lr_position * self.scene_depth_m) as f32,
             scale: (part * c.lr_scale) as f32,
@@ -315,6 +315,11 @@ impl Mapper {
         let mut out = Vec::with_capacity(self.pipeline.count());
         self.pipeline.download(&mut self.gpu, &mut out)?;
         Ok(out)
+    }
+
+    /// A keyframe as stored, in the order they came.
+    pub fn keyframe(&self, index: usize) -> &keyframes::Stored {
+        self.store.get(index)
     }
 
     pub fn splat_count(&self) -> usize {

@@ -1,14 +1,15 @@
 //! How good the map is: PSNR and SSIM of rendered keyframes, and pictures of some of them.
 //!
-//! Held-out keyframes are scored at the pose they came with, and once more with that pose refined on the image
-//! alone (the map stands still): the difference is the pose's share of the error.
+//! A keyframe is compared in its exposure: the one refined beside the map, or, held out, the one between its
+//! neighbours in time; nothing of a held-out image goes into its figures. Held-out keyframes are scored twice more,
+//! to tell the error's shares: with gain and offset fitted to the image, and with the pose refined on it too.
+//! Looking changes nothing: a run goes on from an evaluation as if there had been none.
 
 use super::evaluate::{mse, psnr_db, Ssim};
-use super::pipeline::{LearningRates, Weights};
-use super::pose::PoseAdam;
+use super::pipeline::{Exposure, Goal};
+use super::refine::{fitted_exposure, Refinement};
 use super::Mapper;
 use crate::gpu::GpuError;
-use stipple_drivers::Pose;
 
 /// A cheap probe on a few views, through the run.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -27,6 +28,10 @@ pub struct Evaluation {
     pub ssim: Option<f64>,
     pub psnr_heldout_db: Option<f64>,
     pub ssim_heldout: Option<f64>,
+    /// With gain and offset of each held-out view fitted by least squares over its valid pixels.
+    pub psnr_heldout_fitted_db: Option<f64>,
+    pub ssim_heldout_fitted: Option<f64>,
+    /// With its pose refined on the image as well.
     pub psnr_heldout_aligned_db: Option<f64>,
 }
 
@@ -55,7 +60,7 @@ const ALIGN_RATE: f64 = 2e-3;
 const ALIGN_DECAY: f64 = 0.93;
 
 /// Sums of one kind of keyframes.
-#[derive(Default)]
+#[derive(Clone, Copy, Default)]
 struct Mean {
     sum: f64,
     n: u32,
@@ -94,31 +99,44 @@ impl Mapper {
         })
     }
 
-    /// Scores every keyframe. Allocates. Aligning held-out views disturbs Adam's moments, so this ends a run.
+    /// Scores every keyframe. Allocates.
     pub fn evaluate(&mut self) -> Result<Evaluation, GpuError> {
         let camera = self.stereo.camera().pinhole;
         let mut ssim_of = Ssim::new(camera.width, camera.height);
-        let (mut psnr, mut ssim) = ([Mean::default(), Mean::default()], [Mean::default(), Mean::default()]);
-        let mut aligned = Mean::default();
+        let mut means: [[Mean; 2]; 4] = Default::default();
+        let [training, held_out, fitted, aligned] = &mut means;
         for i in 0..self.store.len() {
-            let held_out = self.store.get(i).held_out;
-            psnr[usize::from(held_out)].add(self.score(i)?);
             let observed = self.observed(i);
-            let s = ssim_of.mean(&observed, &self.rendered.grey, self.stereo.valid_mask());
-            ssim[usize::from(held_out)].add(s);
+            let mut add = |mapper: &Mapper, [psnr, ssim]: &mut [Mean; 2]| {
+                let (shown, valid) = (&mapper.rendered.grey, mapper.stereo.valid_mask());
+                psnr.add(mse(&observed, shown, valid).map(psnr_db));
+                ssim.add(ssim_of.mean(&observed, shown, valid));
+            };
+            self.score(i)?;
+            if !self.store.get(i).held_out {
+                add(self, training);
+                continue;
+            }
+            add(self, held_out);
+            self.fit(&observed);
+            add(self, fitted);
+            let given = self.store.get(i).refined;
+            self.store.get_mut(i).refined = self.aligned(i, &observed)?;
+            let scored = self.score(i);
+            self.store.get_mut(i).refined = given;
+            scored?;
+            self.fit(&observed);
+            add(self, aligned);
         }
-        for i in (0..self.store.len()).filter(|&i| self.store.get(i).held_out).collect::<Vec<_>>() {
-            let given = self.store.get(i).world_from_body;
-            self.store.get_mut(i).world_from_body = self.aligned(i)?;
-            aligned.add(self.score(i)?);
-            self.store.get_mut(i).world_from_body = given;
-        }
+        let [[psnr, ssim], [psnr_heldout, ssim_heldout], [psnr_fitted, ssim_fitted], [psnr_aligned, _]] = means;
         Ok(Evaluation {
-            psnr_db: psnr[0].get(),
-            ssim: ssim[0].get(),
-            psnr_heldout_db: psnr[1].get(),
-            ssim_heldout: ssim[1].get(),
-            psnr_heldout_aligned_db: aligned.get(),
+            psnr_db: psnr.get(),
+            ssim: ssim.get(),
+            psnr_heldout_db: psnr_heldout.get(),
+            ssim_heldout: ssim_heldout.get(),
+            psnr_heldout_fitted_db: psnr_fitted.get(),
+            ssim_heldout_fitted: ssim_fitted.get(),
+            psnr_heldout_aligned_db: psnr_aligned.get(),
         })
     }
 
@@ -150,33 +168,49 @@ impl Mapper {
         Ok(panels)
     }
 
-    /// Renders a keyframe into `self.rendered` and compares; `None` where nothing is valid.
+    /// Renders a keyframe into `self.rendered`, in its exposure, and compares; `None` where nothing is valid.
     fn score(&mut self, index: usize) -> Result<Option<f64>, GpuError> {
         let view = self.view(index);
         self.pipeline.render(&mut self.gpu, &view, &mut self.rendered)?;
+        self.show(self.store.exposure(index));
         Ok(mse(&self.observed(index), &self.rendered.grey, self.stereo.valid_mask()).map(psnr_db))
+    }
+
+    /// Puts the rendering into another exposure.
+    fn show(&mut self, exposure: Exposure) {
+        self.rendered.grey.iter_mut().for_each(|x| *x = exposure.observed(f64::from(*x)) as f32);
+    }
+
+    /// Puts the rendering into the exposure that fits an image best.
+    fn fit(&mut self, observed: &[f32]) {
+        self.show(fitted_exposure(observed, &self.rendered.grey, self.stereo.valid_mask()));
     }
 
     fn observed(&self, index: usize) -> Vec<f32> {
         self.store.image(index).pixels.iter().map(|p| f32::from(*p) / 255.0).collect()
     }
 
-    /// The pose of a keyframe from which the map looks most like its image; the map stands still.
-    fn aligned(&mut self, index: usize) -> Result<Pose, GpuError> {
-        let still = LearningRates { position: 0.0, scale: 0.0, rotation: 0.0, opacity: 0.0, colour: 0.0 };
-        let weights = Weights { ssim: self.config.ssim_weight as f32, ..Weights::default() };
-        let rect_from_body = self.stereo.camera().body_from_rect.inverse();
-        let mut view = self.view(index);
-        let mut adam = PoseAdam::default();
-        let (mut best, mut best_loss) = (view.world_from_cam, f64::INFINITY);
+    /// The refinement of a keyframe from which the map, standing still, looks most like its image.
+    fn aligned(&mut self, index: usize, observed: &[f32]) -> Result<Refinement, GpuError> {
+        let weights = self.weights();
+        let camera = self.stereo.camera();
+        let given = self.store.get(index).given;
+        let view = self.view(index);
+        self.pipeline.render(&mut self.gpu, &view, &mut self.rendered)?;
+        let exposure = fitted_exposure(observed, &self.rendered.grey, self.stereo.valid_mask());
+        let goal = Goal { slot: index as u32, exposure: Some(exposure) };
+        let mut refined = Refinement::default();
+        let (mut best, mut best_loss) = (refined, f64::INFINITY);
         for k in 0..ALIGN_STEPS {
-            let done = self.pipeline.train(&mut self.gpu, &view, index as u32, &still, &weights)?;
+            let view = self.view_from(given * refined.body_from_refined);
+            let done = self.pipeline.look(&mut self.gpu, &view, goal, &weights)?;
             if done.loss < best_loss {
-                (best, best_loss) = (view.world_from_cam, done.loss);
+                (best, best_loss) = (refined, done.loss);
             }
-            adam.step(&mut view.world_from_cam, &done.pose_gradient, ALIGN_RATE * ALIGN_DECAY.powi(k));
+            let rate = ALIGN_RATE * ALIGN_DECAY.powi(k);
+            refined.step_pose(&done.pose_gradient, &view.world_from_cam, &camera.body_from_rect, rate);
         }
-        Ok(best * rect_from_body)
+        Ok(best)
     }
 }
 
