@@ -41,7 +41,7 @@ fn flight(count: usize) -> (Calibration, Vec<Keyframe>) {
     let apart = (scenario.rate_hz / 2.0) as usize;
     let mut keyframe = |k: usize| {
         sim.render(k * apart, &mut frames);
-        let images = [frames.images[0].clone(), frames.images[1].clone()];
+        let images = frames.images.clone();
         let world_from_body = sim.truth_at(frames.t).pose;
         Keyframe { id: k as u64, t: frames.t, world_from_body, images, held_out: k % 4 == 3 }
     };
@@ -240,7 +240,7 @@ fn play(mapper: &mut Mapper, recording: &Recording, keyframes: usize, steps: u32
     for (i, frame) in recording.frames.iter().enumerate().take(keyframes) {
         let Some(world_from_body) = pose_at(&recording.truth, frame.t, Span(50_000_000)) else { continue };
         reader.read(i, &mut frames).unwrap();
-        let images = [frames.images[0].clone(), frames.images[1].clone()];
+        let images = frames.images.clone();
         mapper.offer(&Keyframe { id, t: frame.t, world_from_body, images, held_out: id % 8 == 7 });
         id += 1;
         train(mapper, steps);
@@ -266,6 +266,55 @@ fn write_png(dir: &std::path::Path, p: &Panel) {
     let view = View { width: *width, height: *height, observed, rendered, depth, valid, psnr_db: *psnr_db };
     let file = std::fs::File::create(dir.join(format!("{}.png", p.name))).unwrap();
     panel(&view).write_png(&mut std::io::BufWriter::new(file)).unwrap();
+}
+
+#[test]
+fn both_cameras_of_a_pair_train_one_map() {
+    let (calibration, keyframes) = flight(4);
+    let mut mapper = open(&calibration, &board(&["map.cameras=2", "map.sh_degree=1"]));
+    for k in &keyframes {
+        mapper.offer(k);
+        train(&mut mapper, 30);
+    }
+    let q = mapper.evaluate().unwrap();
+    println!("{q:?}");
+    assert_eq!((mapper.keyframe_count(), mapper.images()), (4, 2));
+    let [left, right, others @ ..] = q.psnr_heldout_by_camera_db;
+    assert!(left.unwrap() > 15.0 && right.unwrap() > 15.0, "{q:?}");
+    assert_eq!(others, [None; 2]);
+    let (colours, form) = mapper.colours().unwrap();
+    assert_eq!(colours.len(), form.extra() * mapper.splat_count());
+    assert!(colours.iter().any(|c| *c != 0.0));
+}
+
+#[test]
+fn fisheye_images_of_other_lenses_are_refused_at_boot() {
+    let (calibration, _) = flight(1);
+    let board = board(&["map.projection=fisheye"]);
+    let stereo = Stereo::new(&calibration, &board.stereo, 1).unwrap();
+    let bytes = Mapper::footprint(&calibration, &board).gpu_total();
+    let said = Mapper::new(Gpu::open(&board.gpu, bytes).unwrap(), stereo, &board).err().unwrap().to_string();
+    assert!(said.contains("map.projection") && said.contains("Kannala-Brandt"), "{said}");
+}
+
+#[test]
+#[cfg_attr(not(recordings), ignore = "no recordings")]
+fn recorded_fisheye_images_become_a_map_as_they_are() {
+    let Some(path) = recording("tumvi_room1_fisheye_16") else {
+        return println!("ignored: recorded_fisheye_images_become_a_map_as_they_are: no recordings");
+    };
+    let recording = Recording::open(&path, &OpenOptions::default()).unwrap();
+    for cameras in ["map.cameras=1", "map.cameras=2"] {
+        let mut mapper = open(&recording.calibration, &board(&["map.scale=4", "map.projection=fisheye", cameras]));
+        play(&mut mapper, &recording, 12, 25);
+        let q = mapper.evaluate().unwrap();
+        println!("{cameras}: {q:?}");
+        if let Some(dir) = std::env::var_os("OUT").map(PathBuf::from) {
+            mapper.panels(3).unwrap().iter().for_each(|p| write_png(&dir, p));
+        }
+        assert!(q.psnr_db.unwrap() > 18.0, "{q:?}");
+        assert!(q.psnr_heldout_by_camera_db[0].unwrap() > 16.0, "{q:?}");
+    }
 }
 
 /// An experiment; settings from the environment: SET="map.x=1 ..", KEYFRAMES, STEPS, OUT.

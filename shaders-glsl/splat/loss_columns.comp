@@ -14,7 +14,9 @@ layout(constant_id = 0) const bool EXPOSURE = false;
 
 layout(push_constant) uniform Push {
     uvec2 size;
-    uint target;       // word offset of the keyframe
+    uint target;       // word offset of the keyframe's plane
+    uint plane;        // where the rendered one and its gradient begin, px
+    uint group;        // where its sums begin
     float exposure[2]; // gain, offset of the keyframe
     float l1_weight;   // (1 - λ) / valid pixels
     float ssim_weight; // λ / valid pixels
@@ -48,13 +50,13 @@ vec3 column_run(uint x, uint y0) {
         if (y < push.size.y) {
             const uint at = y * push.size.x + x, byte = y * stride + x;
             const bool valid = ((mask[byte / 4] >> (8 * (byte % 4))) & 255u) != 0;
-            const float rendered = grey[at];
+            const float rendered = grey[push.plane + at];
             const float b = float((targets[push.target + byte / 4] >> (8 * (byte % 4))) & 255u) / 255.0;
             float gate;
             const float a = censored(push.exposure[0] * rendered + push.exposure[1], b, gate);
             const float d_ssim = slope[0][k] + 2.0 * a * slope[1][k] + b * slope[2][k];
             const float v = valid ? gate * (push.l1_weight * sign(a - b) - push.ssim_weight * d_ssim) : 0.0;
-            grey_gradient[at] = push.exposure[0] * v;
+            grey_gradient[push.plane + at] = push.exposure[0] * v;
             sum += vec3(valid ? abs(a - b) : 0.0, v * rendered, v);
         }
     }
@@ -71,6 +73,6 @@ void main() {
         total.yz = vec2(sum64(s.y), sum64(s.z));
     }
     if (gl_LocalInvocationID.x == 0) {
-        loss_sums[group_index()] = total;
+        loss_sums[push.group + group_index()] = total;
     }
 }

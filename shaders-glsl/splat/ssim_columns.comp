@@ -12,6 +12,7 @@ layout(local_size_x = 64) in;
 
 layout(push_constant) uniform Push {
     uvec2 size;
+    uint group;  // where this plane's sums begin
 } push;
 
 layout(set = 0, binding = 0, std430) readonly buffer Filtered { float filtered_planes[]; };
@@ -64,6 +65,6 @@ void main() {
     const float s = at < push.size.x * runs ? column_run(at % push.size.x, at / push.size.x * RUN) : 0.0;
     const float total = sum64(s);
     if (gl_LocalInvocationID.x == 0) {
-        ssim_sums[group_index()] = total;
+        ssim_sums[push.group + group_index()] = total;
     }
 }

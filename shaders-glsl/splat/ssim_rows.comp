@@ -12,7 +12,8 @@ layout(local_size_x = 64) in;
 
 layout(push_constant) uniform Push {
     uvec2 size;
-    uint target;        // word offset of the keyframe
+    uint target;        // word offset of the keyframe's plane
+    uint plane;         // where the rendered one begins, px
     float exposure[2];  // gain, offset of the keyframe
 } push;
 
@@ -42,7 +43,7 @@ void main() {
             if (k >= 0 && k < int(REACH)) {
                 const bool valid = ((m >> (8 * byte)) & 255u) != 0;
                 const uint x = min(uint(max(word, 0)) * 4 + byte, push.size.x - 1);
-                const float level = push.exposure[0] * grey[y * push.size.x + x] + push.exposure[1];
+                const float level = push.exposure[0] * grey[push.plane + y * push.size.x + x] + push.exposure[1];
                 b[k] = valid ? float((t >> (8 * byte)) & 255u) / 255.0 : 0.0;
                 float slope;
                 a[k] = valid ? censored(level, b[k], slope) : 0.0;

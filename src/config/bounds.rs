@@ -1,6 +1,6 @@
 //! What every number of a board file may be.
 
-use crate::limits::{KEYFRAMES, STATES};
+use crate::limits::{CAMERAS_MAX, KEYFRAMES, STATES};
 use Bound::{Positive, PowerOfTwo, Stepped, Within};
 
 /// What a number of a board file may be.
@@ -79,6 +79,8 @@ pub(super) const BOUNDS: &[(&str, Bound)] = &[
     ("stereo.depth_min_m", Positive),
     ("stereo.depth_max_m", Positive),
     ("map.scale", PowerOfTwo(1.0, 4.0)),
+    ("map.cameras", Within(1.0, CAMERAS_MAX as f64)),
+    ("map.sh_degree", Within(0.0, 3.0)),
     ("map.anchor_uncovered_min", Within(0.0, 1.0)),
     ("map.covered_alpha", Within(0.0, 1.0)),
     ("map.occupancy_cell_m", Positive),

@@ -2,12 +2,27 @@
 
 use serde::{Deserialize, Serialize};
 
+/// What the map is trained on.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Projection {
+    /// Views without distortion, of cameras 0 and 1.
+    Rectified,
+    /// Raw images of Kannala-Brandt lenses.
+    Fisheye,
+}
+
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct MapConfig {
     pub enabled: bool,
     /// Mapping resolution divisor: 1, 2 or 4.
     pub scale: u32,
+    /// How many of the rig's cameras train; rectified views are two at most.
+    pub cameras: u32,
+    pub projection: Projection,
+    /// Of the spherical harmonics of a colour: 0 is the same from everywhere.
+    pub sh_degree: u32,
     /// A keyframe becomes an anchor when more than this fraction of its valid view is uncovered
     /// (rendered alpha under `covered_alpha`).
     pub anchor_uncovered_min: f64,
@@ -48,6 +63,9 @@ impl Default for MapConfig {
         MapConfig {
             enabled: true,
             scale: 1,
+            cameras: 1,
+            projection: Projection::Rectified,
+            sh_degree: 0,
             anchor_uncovered_min: 0.05,
             covered_alpha: 0.05,
             occupancy_cell_m: 0.1,

@@ -9,7 +9,7 @@ mod bounds;
 mod map;
 
 use bounds::BOUNDS;
-pub use map::MapConfig;
+pub use map::{MapConfig, Projection};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 use stipple_drivers::{Exit, Fault};

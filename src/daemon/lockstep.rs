@@ -31,7 +31,7 @@ pub fn lockstep(
 ) -> Played {
     let counters = Counters::default();
     let gauges = Gauges::default();
-    let queue = mapping.is_some().then(|| KeyframeQueue::new(&input.calibration));
+    let queue = mapping.as_ref().map(|m| KeyframeQueue::new(&input.calibration, m.mapper.images()));
     let mut keyframes = Keyframes::new(options.holdout);
     let mut warnings = std::mem::take(&mut input.warnings);
     let total = input.frames_within(options.duration_s);

@@ -124,7 +124,7 @@ pub const KEYFRAME_SLOTS: usize = 8;
 const CORRECTION_SLOTS: usize = 64;
 
 impl KeyframeQueue {
-    pub fn new(calibration: &Calibration) -> KeyframeQueue {
+    pub fn new(calibration: &Calibration, images: usize) -> KeyframeQueue {
         let q = KeyframeQueue {
             spare: ArrayQueue::new(KEYFRAME_SLOTS),
             offered: ArrayQueue::new(KEYFRAME_SLOTS),
@@ -135,7 +135,7 @@ impl KeyframeQueue {
                 let c = &calibration.cameras[i].camera;
                 Image::new(c.width, c.height)
             };
-            let _ = q.spare.push(Box::new(Keyframe::with_images([shape(0), shape(1)])));
+            let _ = q.spare.push(Box::new(Keyframe::with_images((0..images).map(shape).collect::<Vec<_>>())));
         }
         q
     }

@@ -5,7 +5,8 @@ use super::play::frame_slots;
 use super::tracking::Slot;
 use crate::config::Board;
 use crate::frontend::Frontend;
-use crate::map::Mapper;
+use crate::limits::CAMERAS_MAX;
+use crate::map::{eyes, Mapper};
 use crate::mem::Footprint;
 use crate::stereo::Stereo;
 use crate::vio::Vio;
@@ -14,27 +15,29 @@ use stipple_drivers::{Calibration, Camera, Exit, Fault, ImuCalibration, Lens, Po
 /// Everything a run with this rig takes, without the operating system's and the drivers' own.
 pub fn footprint(calibration: &Calibration, board: &Board) -> Footprint {
     let pixels: usize = calibration.cameras.iter().map(|c| c.camera.width * c.camera.height).sum();
-    let pair: usize = calibration.cameras.iter().take(2).map(|c| c.camera.width * c.camera.height).sum();
     let mut f = Footprint::default();
     f.host("queues: frames", frame_slots(board.frontend.threads) * (pixels + Slot::BYTES));
     f.extend(Frontend::footprint(calibration, &board.frontend));
     f.extend(Vio::footprint());
     if board.map.enabled {
-        f.host("queues: keyframes", KEYFRAME_SLOTS * pair);
+        let images = eyes::images(calibration.cameras.len(), &board.map);
+        let keyframe: usize = calibration.cameras.iter().take(images).map(|c| c.camera.width * c.camera.height).sum();
+        f.host("queues: keyframes", KEYFRAME_SLOTS * keyframe);
         f.extend(Stereo::footprint(calibration, &board.stereo, board.map.scale));
         f.extend(Mapper::footprint(calibration, board));
     }
     f
 }
 
-/// The largest rig a board accepts: a stereo pair of its widest image.
+/// The largest rig a board accepts: its widest image from a stereo pair, or from every camera its map trains on.
 pub fn largest_rig(board: &Board) -> Calibration {
     let (width, height) = (board.budget.image_width_max as usize, board.budget.image_height_max as usize);
     let f = width as f64 * 0.6;
     let lens = Lens::Radtan { k1: 0.0, k2: 0.0, p1: 0.0, p2: 0.0 };
     let camera = Camera { width, height, fx: f, fy: f, cx: width as f64 / 2.0, cy: height as f64 / 2.0, lens };
     let at = |x: f64| RigCamera::new(camera, Pose { p: glam::DVec3::new(x, 0.0, 0.0), ..Pose::IDENTITY });
-    Calibration { cameras: vec![at(0.0), at(0.1)], imu: ImuCalibration::CONSUMER }
+    let cameras = eyes::count(CAMERAS_MAX, &board.map).max(2);
+    Calibration { cameras: (0..cameras).map(|i| at(0.1 * i as f64)).collect(), imu: ImuCalibration::CONSUMER }
 }
 
 /// Refuses a rig whose images or bytes exceed the board's budget.

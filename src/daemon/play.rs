@@ -174,7 +174,7 @@ fn recorded(
         spare: ArrayQueue::new(slots),
         newest: ArrayQueue::new(1),
         imu: ArrayQueue::new(IMU_SLOTS),
-        keyframes: mapping.is_some().then(|| KeyframeQueue::new(&input.calibration)),
+        keyframes: mapping.as_ref().map(|m| KeyframeQueue::new(&input.calibration, m.mapper.images())),
         counters: Counters::default(),
         gauges: Gauges::default(),
         source_done: AtomicBool::new(false),

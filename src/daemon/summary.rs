@@ -61,10 +61,10 @@ pub fn conclude(title: Title, mut played: Played, out: &OutputDir) -> Result<Rep
         report.kernels.sort_by(|a, b| b.total_ms.total_cmp(&a.total_ms));
         if m.failure.is_none() {
             match measure(&mut m.mapper) {
-                Ok((quality, drawn, splats)) => {
+                Ok((quality, drawn, (splats, rest))) => {
                     map_figures(&mut report, &quality);
                     panels = drawn;
-                    out.write("map.ply", |w| ply::write_ply(w, splats.into_iter()))?;
+                    out.write("map.ply", |w| ply::write_coloured_ply(w, splats.into_iter(), &rest))?;
                 }
                 Err(e) => m.failure = Some(e),
             }
@@ -156,20 +156,25 @@ fn map_figures(report: &mut Report, q: &Evaluation) {
     report.psnr_heldout_aligned_db = q.psnr_heldout_aligned_db;
 }
 
-type Measured = (Evaluation, Vec<Panel>, Vec<ply::SplatRecord>);
+type Measured = (Evaluation, Vec<Panel>, Drawn);
+
+/// The map as a file has it: records, and what of their colours depends on the direction.
+type Drawn = (Vec<ply::SplatRecord>, Vec<f32>);
 
 fn measure(mapper: &mut Mapper) -> Result<Measured, String> {
     let quality = mapper.evaluate().map_err(|e| e.to_string())?;
     let panels = mapper.panels(PANELS).map_err(|e| e.to_string())?;
     let splats = mapper.splats().map_err(|e| e.to_string())?;
-    let record = |s: &crate::map::SplatInit| ply::SplatRecord {
-        mean: s.mean,
-        log_scale: s.log_scale,
-        quat_xyzw: s.quat_xyzw,
-        opacity_logit: s.opacity_logit,
-        colour: [s.colour; 3],
+    let (extra, form) = mapper.colours().map_err(|e| e.to_string())?;
+    let mut rest = Vec::new();
+    let record = |(i, s): (usize, &crate::map::SplatInit)| {
+        let (colour, directional) = form.rgb(s.colour, &extra[i * form.extra()..][..form.extra()]);
+        rest.extend(directional);
+        let (mean, log_scale, quat_xyzw, opacity_logit) = (s.mean, s.log_scale, s.quat_xyzw, s.opacity_logit);
+        ply::SplatRecord { mean, log_scale, quat_xyzw, opacity_logit, colour }
     };
-    Ok((quality, panels, splats.iter().map(record).collect()))
+    let records = splats.iter().enumerate().map(record).collect();
+    Ok((quality, panels, (records, rest)))
 }
 
 fn write_files(

@@ -21,6 +21,8 @@ pub struct Shape {
     pub channels: u32,
     /// Of the spherical harmonics of a colour: 0 to 3.
     pub sh_degree: u32,
+    /// Cameras that train, each with a mask.
+    pub cameras: u32,
     /// Whether steps may train on inverse depth: two more planes of gradients.
     pub inverse_depth: bool,
 }
@@ -44,6 +46,11 @@ impl Shape {
     /// Words of one stored 8-bit image; rows are padded to whole words.
     pub fn image_words(&self) -> usize {
         self.width.div_ceil(4) as usize * self.height as usize
+    }
+
+    /// Words from one camera's mask to the next: where a buffer may be bound.
+    pub fn mask_stride(&self) -> usize {
+        self.image_words().next_multiple_of(ALIGN as usize / size_of::<u32>())
     }
 
     /// Colour, transmittance, depth or its inverse: planes of raster_forward.
@@ -125,10 +132,10 @@ buffers! {
     ranges: [u32; 2], "tiles: ranges", |s| s.tiles_max() + 1;
     rendered: f32, "pixels: colour, transmittance, depth", |s| s.rendered_planes() * s.pixels();
     pixel_gradient: f32, "pixels: gradient", |s| s.gradient_planes() * s.pixels();
-    ssim_sums: f32, "pixels: SSIM by workgroup", |s| image_groups(s.width, s.height) as usize;
-    loss_sums: [f32; 4], "pixels: L1 and exposure gradient by workgroup", |s| image_groups(s.width, s.height) as usize;
-    mask: u32, "keyframes: mask", |s| s.image_words();
-    targets: u32, "keyframes: images", |s| s.image_words() * s.keyframes as usize;
+    ssim_sums: f32, "pixels: SSIM by workgroup", |s| s.channels as usize * image_groups(s.width, s.height) as usize;
+    loss_sums: [f32; 4], "pixels: L1 and exposure gradient by workgroup", |s| s.channels as usize * image_groups(s.width, s.height) as usize;
+    mask: u32, "keyframes: masks", |s| s.cameras as usize * s.mask_stride();
+    targets: u32, "keyframes: images", |s| s.image_words() * (s.channels * s.keyframes) as usize;
     visible_count: u32, "counts: visible", |_s| 1;
     isect_count: u32, "counts: intersections listed, needed, workgroups", |_s| 5;
     isects_sorted: u32, "counts: intersections sorted", |_s| 1;

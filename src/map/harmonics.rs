@@ -142,3 +142,41 @@ fn eye(view: &View) -> [f32; 4] {
     let p = view.world_from_cam.p.as_vec3();
     [p.x, p.y, p.z, 0.0]
 }
+
+/// Of a colour: how many channels, and to which degree it depends on the direction.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Form {
+    pub channels: usize,
+    pub degree: usize,
+}
+
+impl Form {
+    /// Coefficients beyond the level in a Gaussian's record.
+    pub fn extra(self) -> usize {
+        self.channels * (self.degree + 1).pow(2) - 1
+    }
+
+    /// A Gaussian's constants, and what depends on the direction as files have it: all of red, of green, of blue.
+    pub fn rgb(self, level: f32, extra: &[f32]) -> ([f32; 3], impl Iterator<Item = f32> + '_) {
+        let last = self.channels - 1;
+        let constant = std::array::from_fn(|c| if c.min(last) == 0 { level } else { extra[c - 1] });
+        let of = move |c: usize| (0..self.degree * (self.degree + 2)).map(move |k| (k, c.min(last)));
+        (constant, (0..3).flat_map(of).map(move |(k, c)| extra[last + k * self.channels + c]))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn files_have_a_colour_channel_by_channel() {
+        let extra: Vec<f32> = (1..12).map(|k| k as f32).collect();
+        let (constant, rest) = Form { channels: 3, degree: 1 }.rgb(0.5, &extra);
+        assert_eq!(constant, [0.5, 1.0, 2.0]);
+        assert_eq!(rest.collect::<Vec<_>>(), [3.0, 6.0, 9.0, 4.0, 7.0, 10.0, 5.0, 8.0, 11.0]);
+        let (constant, rest) = Form { channels: 1, degree: 1 }.rgb(0.5, &extra[..3]);
+        assert_eq!(constant, [0.5; 3]);
+        assert_eq!(rest.collect::<Vec<_>>(), [1.0, 2.0, 3.0, 1.0, 2.0, 3.0, 1.0, 2.0, 3.0]);
+    }
+}

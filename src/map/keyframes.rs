@@ -6,22 +6,22 @@ use super::view::Exposure;
 use crate::mem::Footprint;
 use stipple_drivers::{Image, Nanos, Pose};
 
-/// A raw stereo pair and where the body was, mid-exposure.
+/// Raw images of one instant and where the body was, mid-exposure.
 #[derive(Clone, Debug, Default)]
 pub struct Keyframe {
     pub id: u64,
     pub t: Nanos,
     pub world_from_body: Pose,
-    /// Left, right; as the cameras gave them.
-    pub images: [Image; 2],
+    /// As the cameras gave them: left, right, and further ones that train.
+    pub images: Vec<Image>,
     /// Never trained on, only evaluated.
     pub held_out: bool,
 }
 
 impl Keyframe {
     /// Pre-shaped, so that filling it allocates nothing.
-    pub fn with_images(images: [Image; 2]) -> Keyframe {
-        Keyframe { images, ..Keyframe::default() }
+    pub fn with_images(images: impl Into<Vec<Image>>) -> Keyframe {
+        Keyframe { images: images.into(), ..Keyframe::default() }
     }
 
     /// Allocates nothing as long as the images fit what was allocated for them.
@@ -62,16 +62,16 @@ pub struct Queue {
 pub const QUEUE_LEN: usize = 4;
 
 impl Queue {
-    pub fn footprint(pixels_max: usize) -> Footprint {
+    pub fn footprint(pixels_max: usize, images: usize) -> Footprint {
         let mut f = Footprint::default();
-        f.host("map: keyframes waiting", QUEUE_LEN * 2 * pixels_max);
+        f.host("map: keyframes waiting", QUEUE_LEN * images * pixels_max);
         f
     }
 
-    /// `pixels_max` is the largest image the board accepts.
-    pub fn new(pixels_max: usize) -> Queue {
-        let image = || Image { pixels: Vec::with_capacity(pixels_max), ..Image::default() };
-        let slots = (0..QUEUE_LEN).map(|_| Keyframe::with_images([image(), image()])).collect();
+    /// `pixels_max` is the largest image the board accepts, `images` how many a keyframe has.
+    pub fn new(pixels_max: usize, images: usize) -> Queue {
+        let image = |_| Image { pixels: Vec::with_capacity(pixels_max), ..Image::default() };
+        let slots = (0..QUEUE_LEN).map(|_| Keyframe::with_images((0..images).map(image).collect::<Vec<_>>())).collect();
         Queue { slots, pixels_max, first: 0, len: 0 }
     }
 
@@ -84,7 +84,11 @@ impl Queue {
     }
 
     pub fn push(&mut self, keyframe: &Keyframe) -> Offer {
-        if self.is_full() || keyframe.images.iter().any(|i| i.pixels.len() > self.pixels_max) {
+        let images = self.slots[0].images.len();
+        if self.is_full()
+            || keyframe.images.len() < images
+            || keyframe.images.iter().any(|i| i.pixels.len() > self.pixels_max)
+        {
             return Offer::Full;
         }
         self.slots[(self.first + self.len) % QUEUE_LEN].copy_from(keyframe);
@@ -114,7 +118,7 @@ impl Queue {
     }
 }
 
-/// A keyframe in the store.
+/// One camera's image of a keyframe in the store.
 #[derive(Clone, Copy, Debug)]
 pub struct Stored {
     pub id: u64,
@@ -136,8 +140,10 @@ impl Stored {
     }
 }
 
-/// Rectified left images at mapping resolution, and what is known of each.
+/// The images the map trains on, at mapping resolution, and what is known of each. A keyframe has one of every camera
+/// that trains, side by side; what is known of the body is in the first of them.
 pub struct Store {
+    cameras: usize,
     entries: Vec<Stored>,
     images: Vec<Image>,
     training: Vec<u32>,
@@ -151,8 +157,10 @@ impl Store {
         f
     }
 
-    pub fn new(capacity: usize, width: usize, height: usize) -> Store {
+    /// `capacity` is of images.
+    pub fn new(capacity: usize, cameras: usize, width: usize, height: usize) -> Store {
         Store {
+            cameras,
             entries: Vec::with_capacity(capacity),
             images: (0..capacity).map(|_| Image::new(width, height)).collect(),
             training: Vec::with_capacity(capacity),
@@ -167,11 +175,27 @@ impl Store {
         self.entries.is_empty()
     }
 
+    /// Whether a keyframe would find no room for all its images.
     pub fn is_full(&self) -> bool {
-        self.entries.len() == self.images.len()
+        self.entries.len() + self.cameras > self.images.len()
     }
 
-    /// Takes a keyframe whose image `draw` makes; `None` when the store is full.
+    /// Of an image, which camera's it is.
+    pub fn camera(&self, index: usize) -> usize {
+        index % self.cameras
+    }
+
+    /// The first image of the same keyframe.
+    pub fn first(&self, index: usize) -> usize {
+        index - self.camera(index)
+    }
+
+    /// Where the body was when an image was taken: odometry's pose with the mapper's own correction.
+    pub fn world_from_body(&self, index: usize) -> Pose {
+        self.get(self.first(index)).world_from_refined()
+    }
+
+    /// Takes the next camera of a keyframe, whose image `draw` makes; `None` when the store is full.
     pub fn add(&mut self, keyframe: &Keyframe, draw: impl FnOnce(&mut Image)) -> Option<usize> {
         let index = self.entries.len();
         let image = self.images.get_mut(index)?;
@@ -179,7 +203,8 @@ impl Store {
         let &Keyframe { id, t, world_from_body, held_out, .. } = keyframe;
         let mut refined = Refinement::default();
         // Cameras change their exposure slowly: the last one's is the best guess.
-        refined.exposure = self.training.last().map_or(refined.exposure, |&k| self.get(k as usize).refined.exposure);
+        let last = self.training.iter().rev().find(|k| self.camera(**k as usize) == self.camera(index));
+        refined.exposure = last.map_or(refined.exposure, |&k| self.get(k as usize).refined.exposure);
         let (given, placed) = (world_from_body, world_from_body);
         self.entries.push(Stored { id, t, given, placed, held_out, anchor: false, refined });
         if !held_out {
@@ -208,8 +233,9 @@ impl Store {
     pub fn exposure(&self, index: usize) -> Exposure {
         let of = |k: &u32| (self.get(*k as usize).t, self.get(*k as usize).refined.exposure);
         let at = self.training.partition_point(|k| (*k as usize) < index);
-        let after = self.training.get(at).map(of);
-        let before = at.checked_sub(1).map(|k| of(&self.training[k]));
+        let same = |k: &&u32| self.camera(**k as usize) == self.camera(index);
+        let after = self.training[at..].iter().find(same).map(of);
+        let before = self.training[..at].iter().rev().find(same).map(of);
         match (before, after) {
             _ if !self.get(index).held_out => self.get(index).refined.exposure,
             (Some((t0, a)), Some((t1, b))) if t1 > t0 => {
@@ -234,7 +260,7 @@ impl Store {
     pub fn correct(&mut self, correction: &PoseCorrection) -> bool {
         let to = correction.world_from_body;
         // The newest are corrected most.
-        let found = self.entries.iter_mut().rev().find(|e| e.id == correction.id);
+        let found = self.entries.iter_mut().step_by(self.cameras).rev().find(|e| e.id == correction.id);
         let Some(e) = found.filter(|_| to.p.is_finite() && to.q.is_finite()) else { return false };
         e.given = to;
         true
@@ -269,7 +295,7 @@ mod tests {
 
     #[test]
     fn full_queue_rejects_newest_and_keeps_order() {
-        let mut q = Queue::new(12);
+        let mut q = Queue::new(12, 2);
         for id in 1..=4 {
             assert_eq!(q.push(&keyframe(id, false)), Offer::Accepted);
         }
@@ -288,17 +314,35 @@ mod tests {
 
     #[test]
     fn images_beyond_the_budget_are_refused() {
-        assert_eq!(Queue::new(11).push(&keyframe(1, false)), Offer::Full);
+        assert_eq!(Queue::new(11, 2).push(&keyframe(1, false)), Offer::Full);
     }
 
     #[test]
     fn held_out_keyframes_are_stored_but_not_for_training() {
-        let mut s = Store::new(3, 2, 2);
+        let mut s = Store::new(3, 1, 2, 2);
         for id in 0..3 {
             assert_eq!(s.add(&keyframe(id, id == 1), |i| i.pixels.fill(9)), Some(id as usize));
         }
         assert_eq!(s.add(&keyframe(3, false), |_| {}), None);
         assert_eq!(s.training(), [0, 2]);
         assert_eq!((s.len(), s.image(1).pixels[3]), (3, 9));
+    }
+
+    #[test]
+    fn images_of_one_keyframe_share_its_pose_and_not_their_exposure() {
+        let mut s = Store::new(5, 2, 2, 2);
+        for id in 0..2 {
+            assert!(!s.is_full());
+            for camera in 0..2 {
+                let index = s.add(&keyframe(id, false), |_| {}).expect("room for five");
+                assert_eq!((s.camera(index), s.first(index)), (camera, 2 * id as usize));
+            }
+        }
+        assert!(s.is_full(), "one image more is no keyframe");
+        assert!(s.correct(&PoseCorrection { id: 1, world_from_body: Pose { p: DVec3::X, ..Pose::IDENTITY } }));
+        assert_eq!([1, 2, 3].map(|i| s.world_from_body(i).p), [DVec3::ZERO, DVec3::X, DVec3::X]);
+        s.get_mut(1).refined.exposure.gain = 2.0;
+        assert_eq!(s.add(&keyframe(2, false), |_| {}), Some(4));
+        assert_eq!([0, 1, 4].map(|i| s.exposure(i).gain), [1.0, 2.0, 1.0]);
     }
 }

@@ -10,6 +10,7 @@ pub mod anchors;
 pub mod blocks;
 pub mod buffers;
 pub mod evaluate;
+pub mod eyes;
 pub mod harmonics;
 pub mod keyframes;
 pub mod occupancy;
@@ -21,18 +22,20 @@ pub mod schedule;
 pub mod sort;
 pub mod view;
 
-use crate::config::{Board, MapConfig};
+use crate::config::{Board, MapConfig, Projection};
 use crate::counters::Counters;
 use crate::gpu::{Gpu, GpuError, Timing};
 use crate::mem::{unsealed, Footprint};
 use crate::stereo::{DepthMap, Stereo};
 use anchors::{uncovered, Seed, Seeder};
+use eyes::Eye;
 use keyframes::{Queue, Store};
 use pipeline::{LearningRates, Pipeline, Rendered, Shape, View, Weights};
 use schedule::Schedule;
 use std::time::Instant;
-use stipple_drivers::{Calibration, Fault, Pose};
+use stipple_drivers::{Calibration, Fault, Image};
 
+pub use harmonics::Form;
 pub use keyframes::{Keyframe, Offer, PoseCorrection};
 pub use pipeline::SplatInit;
 pub use quality::{CurvePoint, Evaluation, Panel};
@@ -72,6 +75,10 @@ pub struct Mapper {
     config: MapConfig,
     queue: Queue,
     store: Store,
+    /// The cameras that train.
+    eyes: Vec<Eye>,
+    /// The newest keyframe's left image without distortion, where that is not what trains.
+    seeded_from: Option<Image>,
     seeder: Seeder,
     schedule: Schedule,
     /// Depth of the newest anchor, m.
@@ -98,13 +105,15 @@ impl Mapper {
         let camera = &calibration.cameras[0].camera;
         let scale = board.map.scale as usize;
         let (width, height) = (camera.width / scale, camera.height / scale);
-        let shape = shape(board, width, height);
-        let (pixels, keyframes) = (width * height, shape.keyframes as usize);
+        let cameras = calibration.cameras.len();
+        let shape = shape(board, eyes::count(cameras, &board.map), width, height);
+        let (pixels, images) = (width * height, shape.keyframes as usize);
         let seeds_max = board.map.seeds_per_anchor as usize;
         let mut f = Pipeline::footprint(&shape);
         f.gpu("alignment", Pipeline::arena_bytes(&shape).saturating_sub(f.gpu_total()) as usize);
-        f.extend(Queue::footprint(raw_pixels_max(board)));
-        f.extend(Store::footprint(keyframes, pixels));
+        f.extend(Queue::footprint(raw_pixels_max(board), eyes::images(cameras, &board.map)));
+        f.extend(Store::footprint(images, pixels));
+        f.extend(eyes::footprint(calibration, &board.map, pixels));
         f.extend(Seeder::footprint(pixels, seeds_max, board.map.occupancy_cells));
         f.host("map: rendering and depth", pixels * 4 * size_of::<f32>());
         f.host("map: arrivals", seeds_max * size_of::<SplatInit>());
@@ -115,21 +124,26 @@ impl Mapper {
     pub fn new(mut gpu: Gpu, stereo: Stereo, board: &Board) -> Result<Mapper, Fault> {
         let camera = stereo.camera().pinhole;
         let (width, height) = (camera.width, camera.height);
-        let shape = shape(board, width, height);
-        let mut pipeline = Pipeline::new(&mut gpu, shape)?;
-        pipeline.set_mask(&mut gpu, stereo.valid_mask())?;
         let config = board.map.clone();
+        let eyes = eyes::eyes(&stereo, &config)?;
+        let shape = shape(board, eyes.len(), width, height);
+        let mut pipeline = Pipeline::new(&mut gpu, shape)?;
+        for (i, eye) in eyes.iter().enumerate() {
+            pipeline.set_mask_of(&mut gpu, i, &eye.valid)?;
+        }
         let seeds_max = config.seeds_per_anchor as usize;
         let blank = || vec![0.0; width * height];
         Ok(Mapper {
             gpu,
             pipeline,
-            queue: Queue::new(raw_pixels_max(board)),
-            store: Store::new(shape.keyframes as usize, width, height),
+            queue: Queue::new(raw_pixels_max(board), eyes::images(stereo.rig().len(), &config)),
+            store: Store::new(shape.keyframes as usize, eyes.len(), width, height),
+            seeded_from: (config.projection == Projection::Fisheye).then(|| Image::new(width, height)),
+            eyes,
             seeder: Seeder::new(width, height, seeds_max, config.occupancy_cell_m, config.occupancy_cells),
             schedule: Schedule::new(config.seed),
             depth: DepthMap::new(width, height),
-            rendered: Rendered { width, height, grey: blank(), alpha: blank(), depth: blank() },
+            rendered: Rendered { width, height, grey: blank(), tints: Vec::new(), alpha: blank(), depth: blank() },
             arrivals: Vec::with_capacity(seeds_max),
             scene_depth_m: SCENE_DEPTH_M,
             iterations: 0,
@@ -147,6 +161,11 @@ impl Mapper {
             self.counters.keyframes_rejected.add(1);
         }
         offer
+    }
+
+    /// Of a keyframe: what an offer must have.
+    pub fn images(&self) -> usize {
+        eyes::images(self.stereo.rig().len(), &self.config)
     }
 
     /// Whether an offer now would be accepted.
@@ -203,24 +222,31 @@ impl Mapper {
 
     /// Stores the oldest waiting keyframe, and makes it an anchor when the map does not cover its view.
     fn take_in(&mut self) -> Result<Did, GpuError> {
-        let index = {
-            let Some(keyframe) = self.queue.front() else { return Ok(Did::Idle) };
-            let left = &keyframe.images[0];
-            self.store.add(keyframe, |image| self.stereo.rectify(left, image))
-        };
-        let Some(index) = index else {
+        let Some(keyframe) = self.queue.front() else { return Ok(Did::Idle) };
+        if self.store.is_full() {
             self.counters.keyframe_store_full.add(1);
             self.queue.pop();
             return Ok(Did::Dropped);
-        };
-        self.pipeline.set_keyframe(&mut self.gpu, index as u32, &self.store.image(index).pixels)?;
+        }
+        let index = self.store.len();
+        for (i, (eye, raw)) in self.eyes.iter().zip(&keyframe.images).enumerate() {
+            self.store.add(keyframe, |image| eyes::draw(i, eye, &mut self.stereo, raw, image));
+            let image = self.store.image(index + i);
+            self.pipeline.set_keyframe(&mut self.gpu, (index + i) as u32, &image.pixels)?;
+        }
+        if let Some(image) = &mut self.seeded_from {
+            self.stereo.rectify(&keyframe.images[0], image);
+        }
         let did = if self.store.get(index).held_out { Did::Stored } else { self.cover(index)? };
         self.queue.pop();
         Ok(did)
     }
 
     fn cover(&mut self, index: usize) -> Result<Did, GpuError> {
-        let view = self.view(index);
+        // Seeds come of the rectified pair, whatever the lens of what trains.
+        let rect = self.stereo.camera();
+        let world_from_cam = self.store.world_from_body(index) * rect.body_from_rect;
+        let view = View { world_from_cam, camera: rect.pinhole, fisheye: None };
         self.pipeline.render(&mut self.gpu, &view, &mut self.rendered)?;
         let bare = uncovered(&self.rendered.alpha, self.stereo.valid_mask(), self.config.covered_alpha);
         self.expose(index);
@@ -229,7 +255,7 @@ impl Mapper {
             return Ok(Did::Stored);
         }
         let Some(keyframe) = self.queue.front() else { return Ok(Did::Stored) };
-        let [left, right] = &keyframe.images;
+        let [left, right, ..] = &keyframe.images[..] else { return Ok(Did::Stored) };
         // A pair that cannot be matched gives no depth, and no anchor; the keyframe is still trained on.
         if unsealed(|| self.stereo.depth(left, right, &mut self.depth)).is_err() {
             self.counters.depth_failures.add(1);
@@ -239,7 +265,7 @@ impl Mapper {
             self.scene_depth_m = median_depth(&self.depth.metres).unwrap_or(SCENE_DEPTH_M);
         }
         let seen = anchors::View {
-            image: self.store.image(index),
+            image: self.seeded_from.as_ref().unwrap_or_else(|| self.store.image(index)),
             valid: self.stereo.valid_mask(),
             depth: &self.depth,
             alpha: &self.rendered.alpha,
@@ -277,12 +303,17 @@ impl Mapper {
     }
 
     fn view(&self, index: usize) -> View {
-        self.view_from(self.store.get(index).world_from_refined())
+        self.eye(index).view(self.store.world_from_body(index))
     }
 
-    fn view_from(&self, world_from_body: Pose) -> View {
-        let camera = self.stereo.camera();
-        View { world_from_cam: world_from_body * camera.body_from_rect, camera: camera.pinhole, fisheye: None }
+    /// The camera of a stored image.
+    fn eye(&self, index: usize) -> &Eye {
+        &self.eyes[self.store.camera(index)]
+    }
+
+    /// What the rendering of a new keyframe's rectified left view shows.
+    fn seen_from(&self, index: usize) -> &Image {
+        self.seeded_from.as_ref().unwrap_or_else(|| self.store.image(index))
     }
 
     /// Smaller as the steps a keyframe has had grow: large ones find the picture, small ones settle it.
@@ -317,9 +348,18 @@ impl Mapper {
         Ok(out)
     }
 
+    /// Of the Gaussians that `splats` gives, in its order: what their colours are beyond the level in their record, and
+    /// in what form. Allocates.
+    pub fn colours(&mut self) -> Result<(Vec<f32>, Form), GpuError> {
+        let mut out = Vec::new();
+        self.pipeline.download_colours(&mut self.gpu, &mut out)?;
+        let shape = self.pipeline.shape();
+        Ok((out, Form { channels: shape.channels as usize, degree: shape.sh_degree as usize }))
+    }
+
     /// A keyframe as stored, in the order they came.
     pub fn keyframe(&self, index: usize) -> &keyframes::Stored {
-        self.store.get(index)
+        self.store.get(index * self.eyes.len())
     }
 
     pub fn splat_count(&self) -> usize {
@@ -331,7 +371,7 @@ impl Mapper {
     }
 
     pub fn keyframe_count(&self) -> usize {
-        self.store.len()
+        self.store.len() / self.eyes.len()
     }
 
     pub fn iterations(&self) -> u64 {
@@ -359,16 +399,17 @@ impl Mapper {
     }
 }
 
-fn shape(board: &Board, width: usize, height: usize) -> Shape {
+fn shape(board: &Board, cameras: usize, width: usize, height: usize) -> Shape {
     let b = &board.budget;
     Shape {
         width: width as u32,
         height: height as u32,
         splats: b.splats,
         intersections: b.intersections,
-        keyframes: b.keyframes,
+        keyframes: b.keyframes * cameras as u32,
         channels: 1,
-        sh_degree: 0,
+        sh_degree: board.map.sh_degree,
+        cameras: cameras as u32,
         inverse_depth: false,
     }
 }

@@ -23,6 +23,7 @@ pub use super::view::{Exposure, Fisheye, Goal, LearningRates, Rendered, Stats, S
 use crate::gpu::kernels::types::{Splat, Status};
 use crate::gpu::kernels::*;
 use crate::gpu::{Caps, Gpu, GpuError, Kernel, KernelDef, Recorder, Threads};
+use crate::limits::CAMERAS_MAX;
 use crate::mem::Footprint;
 use stipple_drivers::{Exit, Fault};
 
@@ -94,7 +95,8 @@ pub struct Pipeline {
     /// Slots below this are in use.
     pub(super) high_water: u32,
     pub(super) blocks: Vec<Block>,
-    pub(super) valid_pixels: u32,
+    /// By camera.
+    pub(super) valid_pixels: [u32; CAMERAS_MAX],
     /// Host side of images, slots and pool transfers.
     pub(super) words: Vec<u32>,
     pub(super) pool: Vec<Splat>,
@@ -132,8 +134,11 @@ impl Pipeline {
             || shape.keyframes == 0
             || !matches!(shape.channels, 1 | 3)
             || shape.sh_degree > 3
+            || !(1..=CAMERAS_MAX as u32).contains(&shape.cameras)
         {
-            let what = format!("{shape:?} has a zero, neither 1 nor 3 channels, or harmonics past degree 3");
+            let what = format!(
+                "{shape:?} has a zero, neither 1 nor 3 channels, harmonics past degree 3, or no or too many cameras"
+            );
             return Err(Fault::new(Exit::Config, "map", what, "raise the board's [budget]"));
         }
         let channels = shape.channels;
@@ -178,12 +183,14 @@ impl Pipeline {
             sorter: Sorter::new(gpu)?,
             high_water: 0,
             blocks: Vec::with_capacity(shape.keyframes as usize),
-            valid_pixels: 0,
+            valid_pixels: [0; CAMERAS_MAX],
             words: Vec::with_capacity(words_max(&shape)),
             pool: Vec::with_capacity(shape.splats as usize),
         };
         let all = vec![255; shape.pixels()];
-        p.set_mask(gpu, &all).map_err(Fault::from)?;
+        for camera in 0..shape.cameras as usize {
+            p.set_mask_of(gpu, camera, &all).map_err(Fault::from)?;
+        }
         Ok(p)
     }
 
@@ -210,8 +217,9 @@ impl Pipeline {
         let n = view.camera.width * view.camera.height;
         (out.width, out.height) = (view.camera.width, view.camera.height);
         let light = self.shape.channels as usize;
-        for (plane, pixels) in [(0, &mut out.grey), (light, &mut out.alpha), (light + 1, &mut out.depth)] {
-            pixels.resize(n, 0.0);
+        let planes = [(0, 1, &mut out.grey), (1, light - 1, &mut out.tints), (light, 1, &mut out.alpha)];
+        for (plane, count, pixels) in planes.into_iter().chain([(light + 1, 1, &mut out.depth)]) {
+            pixels.resize(count * n, 0.0);
             gpu.download(self.b.rendered, plane * n, pixels)?;
         }
         out.alpha.iter_mut().for_each(|t| *t = 1.0 - *t);
@@ -259,10 +267,10 @@ impl Pipeline {
         let by_tile = self.record_picture(&mut rec, view, &raster.forward);
         self.record_loss(&mut rec, &goal, weights);
         self.record_update(&mut rec, view, &raster.backward, by_tile, rates, weights);
-        self.record_summary(&mut rec, image_groups(w, h), self.high_water.div_ceil(GROUP));
+        self.record_summary(&mut rec, self.shape.channels * image_groups(w, h), self.high_water.div_ceil(GROUP));
         gpu.submit(rec)?;
         let s = self.status(gpu)?;
-        let valid = f64::from(self.valid_pixels.max(1));
+        let valid = f64::from(self.valid_pixels[goal.camera as usize].max(1) * self.shape.channels);
         let (l1, ssim) = (f64::from(s.l1_sum) / valid, f64::from(s.ssim_sum) / valid);
         let lambda = f64::from(weights.ssim);
         Ok(StepStats {
@@ -395,33 +403,45 @@ impl Pipeline {
         sorted
     }
 
+    /// Channel by channel: each is an image of its own.
     fn record_loss(&self, rec: &mut Recorder, goal: &Goal, weights: &Weights) {
+        for channel in 0..self.shape.channels {
+            self.record_loss_of(rec, goal, weights, channel);
+        }
+    }
+
+    fn record_loss_of(&self, rec: &mut Recorder, goal: &Goal, weights: &Weights, channel: u32) {
         let (k, b) = (&self.k, &self.b);
         let (w, h) = (self.shape.width, self.shape.height);
-        let (size, target, exposure) =
-            ([w, h], goal.slot * self.shape.image_words() as u32, goal.exposure.unwrap_or_default().words());
+        let (size, target, exposure) = (
+            [w, h],
+            (goal.slot * self.shape.channels + channel) * self.shape.image_words() as u32,
+            goal.exposure.unwrap_or_default().words(),
+        );
         let (rows, columns) = (Threads::d1(w.div_ceil(RUN) * h), Threads::d1(w * h.div_ceil(RUN)));
-        let valid = self.valid_pixels.max(1) as f32;
+        let mask = b.mask.part(goal.camera as usize * self.shape.mask_stride(), self.shape.image_words());
+        let (plane, group) = (channel * w * h, channel * image_groups(w, h));
+        let valid = (self.valid_pixels[goal.camera as usize].max(1) * self.shape.channels) as f32;
         rec.dispatch(
             &k.ssim_rows,
             ssim_rows::Bind {
                 grey: b.rendered.read(),
                 targets: b.targets.read(),
-                mask: b.mask.read(),
+                mask: mask.read(),
                 filtered: b.over.filtered.write(),
             },
-            ssim_rows::Push { size, target, exposure },
+            ssim_rows::Push { size, target, plane, exposure },
             rows,
         );
         rec.dispatch(
             &k.ssim_columns,
             ssim_columns::Bind {
                 filtered: b.over.filtered.read(),
-                mask: b.mask.read(),
+                mask: mask.read(),
                 slopes: b.over.slopes.write(),
                 ssim_sums: b.ssim_sums.write(),
             },
-            ssim_columns::Push { size },
+            ssim_columns::Push { size, group },
             columns,
         );
         rec.dispatch(
@@ -436,13 +456,15 @@ impl Pipeline {
                 filtered: b.over.filtered.read(),
                 grey: b.rendered.read(),
                 targets: b.targets.read(),
-                mask: b.mask.read(),
+                mask: mask.read(),
                 grey_gradient: b.pixel_gradient.write(),
                 loss_sums: b.loss_sums.write(),
             },
             loss_columns::Push {
                 size,
                 target,
+                plane,
+                group,
                 exposure,
                 l1_weight: (1.0 - weights.ssim) / valid,
                 ssim_weight: weights.ssim / valid,

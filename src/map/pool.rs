@@ -44,17 +44,27 @@ impl Pipeline {
         self.high_water as usize
     }
 
-    /// Stores the image that keyframe `slot` is trained on, row-major, stride = width.
-    pub fn set_keyframe(&mut self, gpu: &mut Gpu, slot: u32, grey: &[u8]) -> Result<(), GpuError> {
-        self.pack(grey);
-        gpu.upload(self.b.targets, slot as usize * self.shape.image_words(), &self.words)
+    /// Stores the image that keyframe `slot` is trained on: a plane for each channel, row-major, stride = width.
+    pub fn set_keyframe(&mut self, gpu: &mut Gpu, slot: u32, planes: &[u8]) -> Result<(), GpuError> {
+        let channels = self.shape.channels as usize;
+        assert_eq!(planes.len(), channels * self.shape.pixels(), "images are of the shape the pipeline was made with");
+        for (channel, plane) in planes.chunks_exact(self.shape.pixels()).enumerate() {
+            self.pack(plane);
+            let at = (slot as usize * channels + channel) * self.shape.image_words();
+            gpu.upload(self.b.targets, at, &self.words)?;
+        }
+        Ok(())
     }
 
-    /// Pixels that count, of every keyframe: zero is ignored.
+    /// Pixels that count, of every keyframe of the first camera: zero is ignored.
     pub fn set_mask(&mut self, gpu: &mut Gpu, mask: &[u8]) -> Result<(), GpuError> {
-        self.valid_pixels = mask.iter().filter(|m| **m != 0).count() as u32;
+        self.set_mask_of(gpu, 0, mask)
+    }
+
+    pub fn set_mask_of(&mut self, gpu: &mut Gpu, camera: usize, mask: &[u8]) -> Result<(), GpuError> {
+        self.valid_pixels[camera] = mask.iter().filter(|m| **m != 0).count() as u32;
         self.pack(mask);
-        gpu.upload(self.b.mask, 0, &self.words)
+        gpu.upload(self.b.mask, camera * self.shape.mask_stride(), &self.words)
     }
 
     fn pack(&mut self, image: &[u8]) {

@@ -10,6 +10,7 @@ use super::pipeline::{Exposure, Goal};
 use super::refine::{fitted_exposure, Refinement};
 use super::Mapper;
 use crate::gpu::GpuError;
+use crate::limits::CAMERAS_MAX;
 
 /// A cheap probe on a few views, through the run.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -33,6 +34,8 @@ pub struct Evaluation {
     pub ssim_heldout_fitted: Option<f64>,
     /// With its pose refined on the image as well.
     pub psnr_heldout_aligned_db: Option<f64>,
+    /// Held out, of each camera that trains.
+    pub psnr_heldout_by_camera_db: [Option<f64>; CAMERAS_MAX],
 }
 
 /// A keyframe and its rendering, row-major at mapping resolution.
@@ -85,7 +88,7 @@ impl Mapper {
         let mut means = [Mean::default(), Mean::default()];
         for (held_out, mean) in means.iter_mut().enumerate() {
             let of_kind: Vec<usize> =
-                (0..self.store.len()).filter(|&i| self.store.get(i).held_out == (held_out == 1)).collect();
+                self.firsts().filter(|&i| self.store.get(i).held_out == (held_out == 1)).collect();
             for i in spread(&of_kind, PROBED) {
                 mean.add(self.score(i)?);
             }
@@ -105,27 +108,30 @@ impl Mapper {
         let mut ssim_of = Ssim::new(camera.width, camera.height);
         let mut means: [[Mean; 2]; 4] = Default::default();
         let [training, held_out, fitted, aligned] = &mut means;
+        let mut by_camera = [Mean::default(); CAMERAS_MAX];
         for i in 0..self.store.len() {
             let observed = self.observed(i);
             let mut add = |mapper: &Mapper, [psnr, ssim]: &mut [Mean; 2]| {
-                let (shown, valid) = (&mapper.rendered.grey, mapper.stereo.valid_mask());
+                let (shown, valid) = (&mapper.rendered.grey, &mapper.eye(i).valid);
                 psnr.add(mse(&observed, shown, valid).map(psnr_db));
                 ssim.add(ssim_of.mean(&observed, shown, valid));
             };
-            self.score(i)?;
+            let scored = self.score(i)?;
             if !self.store.get(i).held_out {
                 add(self, training);
                 continue;
             }
+            by_camera[self.store.camera(i)].add(scored);
             add(self, held_out);
-            self.fit(&observed);
+            self.fit(i, &observed);
             add(self, fitted);
-            let given = self.store.get(i).refined;
-            self.store.get_mut(i).refined = self.aligned(i, &observed)?;
+            let first = self.store.first(i);
+            let given = self.store.get(first).refined;
+            self.store.get_mut(first).refined = self.aligned(i, &observed)?;
             let scored = self.score(i);
-            self.store.get_mut(i).refined = given;
+            self.store.get_mut(first).refined = given;
             scored?;
-            self.fit(&observed);
+            self.fit(i, &observed);
             add(self, aligned);
         }
         let [[psnr, ssim], [psnr_heldout, ssim_heldout], [psnr_fitted, ssim_fitted], [psnr_aligned, _]] = means;
@@ -137,16 +143,17 @@ impl Mapper {
             psnr_heldout_fitted_db: psnr_fitted.get(),
             ssim_heldout_fitted: ssim_fitted.get(),
             psnr_heldout_aligned_db: psnr_aligned.get(),
+            psnr_heldout_by_camera_db: by_camera.map(|m| m.get()),
         })
     }
 
     /// Pictures of `count` keyframes spread over the run. Allocates.
     pub fn panels(&mut self, count: usize) -> Result<Vec<Panel>, GpuError> {
-        let all: Vec<usize> = (0..self.store.len()).collect();
+        let all: Vec<usize> = self.firsts().collect();
         let mut panels = Vec::with_capacity(count);
         for i in spread(&all, count) {
             let psnr_db = self.score(i)?;
-            let (observed, valid) = (self.store.image(i).pixels.clone(), self.stereo.valid_mask().to_vec());
+            let (observed, valid) = (self.store.image(i).pixels.clone(), self.eye(i).valid.clone());
             let r = &self.rendered;
             let error = |k: usize| match valid[k] {
                 0 => 0.0,
@@ -173,7 +180,12 @@ impl Mapper {
         let view = self.view(index);
         self.pipeline.render(&mut self.gpu, &view, &mut self.rendered)?;
         self.show(self.store.exposure(index));
-        Ok(mse(&self.observed(index), &self.rendered.grey, self.stereo.valid_mask()).map(psnr_db))
+        Ok(mse(&self.observed(index), &self.rendered.grey, &self.eye(index).valid).map(psnr_db))
+    }
+
+    /// The first camera's images.
+    fn firsts(&self) -> impl Iterator<Item = usize> {
+        (0..self.store.len()).step_by(self.eyes.len())
     }
 
     /// Puts the rendering into another exposure.
@@ -182,8 +194,8 @@ impl Mapper {
     }
 
     /// Puts the rendering into the exposure that fits an image best.
-    fn fit(&mut self, observed: &[f32]) {
-        self.show(fitted_exposure(observed, &self.rendered.grey, self.stereo.valid_mask()));
+    fn fit(&mut self, index: usize, observed: &[f32]) {
+        self.show(fitted_exposure(observed, &self.rendered.grey, &self.eye(index).valid));
     }
 
     fn observed(&self, index: usize) -> Vec<f32> {
@@ -193,22 +205,22 @@ impl Mapper {
     /// The refinement of a keyframe from which the map, standing still, looks most like its image.
     fn aligned(&mut self, index: usize, observed: &[f32]) -> Result<Refinement, GpuError> {
         let weights = self.weights();
-        let camera = self.stereo.camera();
-        let given = self.store.get(index).given;
+        let eye = self.eye(index);
+        let (body_from_cam, given) = (eye.body_from_cam, self.store.get(self.store.first(index)).given);
         let view = self.view(index);
         self.pipeline.render(&mut self.gpu, &view, &mut self.rendered)?;
-        let exposure = fitted_exposure(observed, &self.rendered.grey, self.stereo.valid_mask());
-        let goal = Goal { slot: index as u32, exposure: Some(exposure) };
+        let exposure = fitted_exposure(observed, &self.rendered.grey, &self.eye(index).valid);
+        let goal = Goal { exposure: Some(exposure), ..self.goal(index) };
         let mut refined = Refinement::default();
         let (mut best, mut best_loss) = (refined, f64::INFINITY);
         for k in 0..ALIGN_STEPS {
-            let view = self.view_from(given * refined.body_from_refined);
+            let view = self.eye(index).view(given * refined.body_from_refined);
             let done = self.pipeline.look(&mut self.gpu, &view, goal, &weights)?;
             if done.loss < best_loss {
                 (best, best_loss) = (refined, done.loss);
             }
             let rate = ALIGN_RATE * ALIGN_DECAY.powi(k);
-            refined.step_pose(&done.pose_gradient, &view.world_from_cam, &camera.body_from_rect, rate);
+            refined.step_pose(&done.pose_gradient, &view.world_from_cam, &body_from_cam, rate);
         }
         Ok(best)
     }

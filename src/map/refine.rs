@@ -95,22 +95,22 @@ impl Refinement {
 impl Mapper {
     pub(super) fn goal(&self, index: usize) -> Goal {
         let exposure = self.config.refine_exposure.then(|| self.store.exposure(index));
-        Goal { slot: index as u32, exposure }
+        Goal { slot: index as u32, camera: self.store.camera(index) as u32, exposure }
     }
 
-    /// After a training step on a keyframe: one of its pose and of its exposure. The first keyframe's stay.
+    /// After a training step on an image: one of its keyframe's pose and of its exposure. The first keyframe's pose and
+    /// its first image's exposure stay.
     pub(super) fn refine(&mut self, index: usize, view: &View, done: &StepStats) {
-        if self.store.training().first() == Some(&(index as u32)) {
-            return;
-        }
-        let part = self.rate_part();
-        let refined = &mut self.store.get_mut(index).refined;
-        if self.config.refine_pose {
-            let body_from_cam = self.stereo.camera().body_from_rect;
+        let gauge = self.store.training().first().map(|first| *first as usize);
+        let (first, part) = (self.store.first(index), self.rate_part());
+        if self.config.refine_pose && gauge != Some(first) {
+            let body_from_cam = self.eyes[self.store.camera(index)].body_from_cam;
             let rate = part * self.config.lr_pose;
+            let refined = &mut self.store.get_mut(first).refined;
             refined.step_pose(&done.pose_gradient, &view.world_from_cam, &body_from_cam, rate);
         }
-        if self.config.refine_exposure {
+        if self.config.refine_exposure && gauge != Some(index) {
+            let refined = &mut self.store.get_mut(index).refined;
             refined.step_exposure(&done.exposure_gradient, part * self.config.lr_exposure);
         }
     }
@@ -123,7 +123,7 @@ impl Mapper {
         }
         let (valid, r) = (self.stereo.valid_mask(), &self.rendered);
         let (mut seen, mut n, mut observed, mut rendered) = (0u32, 0u32, 0.0, 0.0);
-        for (i, pixel) in self.store.image(index).pixels.iter().enumerate().filter(|(i, _)| valid[*i] != 0) {
+        for (i, pixel) in self.seen_from(index).pixels.iter().enumerate().filter(|(i, _)| valid[*i] != 0) {
             n += 1;
             if r.alpha[i] > SHOWN_ALPHA {
                 seen += 1;

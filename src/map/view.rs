@@ -83,13 +83,15 @@ impl Exposure {
 pub struct Goal {
     /// Of the keyframe's image.
     pub slot: u32,
+    /// Whose mask holds.
+    pub camera: u32,
     /// `None` compares the rendering as it is, and gives no gradient by the exposure.
     pub exposure: Option<Exposure>,
 }
 
 impl From<u32> for Goal {
     fn from(slot: u32) -> Goal {
-        Goal { slot, exposure: None }
+        Goal { slot, camera: 0, exposure: None }
     }
 }
 
@@ -129,7 +131,10 @@ impl Default for Weights {
 pub struct Rendered {
     pub width: usize,
     pub height: usize,
+    /// Grey or red.
     pub grey: Vec<f32>,
+    /// Green, then blue; none of a grey map.
+    pub tints: Vec<f32>,
     pub alpha: Vec<f32>,
     /// Expected depth, m; zero where nothing was hit.
     pub depth: Vec<f32>,

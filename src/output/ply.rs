@@ -1,5 +1,5 @@
 //! The map as a binary little-endian PLY in the layout of the 3DGS reference implementation
-//! (Kerbl et al., SIGGRAPH 2023), degree 0, which SuperSplat, gsplat and Brush open.
+//! (Kerbl et al., SIGGRAPH 2023), which SuperSplat, gsplat and Brush open.
 //!
 //! Scales are logarithms, opacity is a logit, the quaternion is wxyz, colour is the coefficient of
 //! the constant spherical harmonic. Normals are written as zeros because readers expect the columns.
@@ -32,15 +32,34 @@ impl SplatRecord {
     }
 }
 
+/// Columns before those of `f_rest`.
+const BEFORE_REST: usize = 9;
+
 /// The header states the number of splats, so the iterator must know its length.
 pub fn write_ply(out: &mut impl Write, splats: impl ExactSizeIterator<Item = SplatRecord>) -> io::Result<()> {
+    write_coloured_ply(out, splats, &[])
+}
+
+/// As `write_ply`, with what of the colours depends on the direction: for each splat alike many coefficients, channel
+/// by channel, of the harmonics from degree 1.
+pub fn write_coloured_ply(
+    out: &mut impl Write,
+    splats: impl ExactSizeIterator<Item = SplatRecord>,
+    rest: &[f32],
+) -> io::Result<()> {
+    let each = rest.len() / splats.len().max(1);
     writeln!(out, "ply\nformat binary_little_endian 1.0\nelement vertex {}", splats.len())?;
-    for name in PROPERTIES {
+    for (i, name) in PROPERTIES.iter().enumerate() {
+        if i == BEFORE_REST {
+            (0..each).try_for_each(|k| writeln!(out, "property float f_rest_{k}"))?;
+        }
         writeln!(out, "property float {name}")?;
     }
     writeln!(out, "end_header")?;
-    for splat in splats {
-        for value in splat.row() {
+    for (i, splat) in splats.enumerate() {
+        let row = splat.row();
+        let (before, after) = row.split_at(BEFORE_REST);
+        for value in before.iter().chain(&rest[i * each..][..each]).chain(after) {
             out.write_all(&value.to_le_bytes())?;
         }
     }
@@ -118,6 +137,22 @@ mod tests {
         let column = |i: usize| f32::from_le_bytes(row[4 * i..4 * i + 4].try_into().unwrap());
         assert_eq!(column(13), 0.927, "the scalar part of the quaternion comes first");
         assert_eq!(column(7), 0.0, "mid grey is coefficient zero");
+    }
+
+    #[test]
+    fn what_depends_on_the_direction_stands_between_colour_and_opacity() {
+        let mut bytes = Vec::new();
+        let rest: Vec<f32> = (0..27).map(|k| k as f32).collect();
+        write_coloured_ply(&mut bytes, splats().into_iter(), &rest).unwrap();
+        let text = String::from_utf8_lossy(&bytes);
+        let names: Vec<&str> = text.lines().filter_map(|l| l.strip_prefix("property float ")).collect();
+        assert_eq!(
+            (names.len(), names[8], names[9], names[17], names[18]),
+            (26, "f_dc_2", "f_rest_0", "f_rest_8", "opacity")
+        );
+        let row = &bytes[bytes.len() - 26 * 4..];
+        let column = |i: usize| f32::from_le_bytes(row[4 * i..4 * i + 4].try_into().unwrap());
+        assert_eq!((column(9), column(17), column(18)), (18.0, 26.0, 1.0));
     }
 
     #[test]

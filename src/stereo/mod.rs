@@ -11,7 +11,7 @@ use crate::config::{StereoConfig, StereoMethod};
 use crate::mem::Footprint;
 use bm::BlockMatcher;
 use rectify::{box_average, Rectification, Remap};
-use stipple_drivers::{Calibration, Fault, Image, Pose};
+use stipple_drivers::{Calibration, Fault, Image, Pose, RigCamera};
 
 /// An undistorted camera: px = (fx x/z + cx, fy y/z + cy), integer = pixel centre.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -72,6 +72,7 @@ pub struct Stereo {
     disparity: Vec<i16>,
     valid: Vec<u8>,
     depth_range_m: [f64; 2],
+    rig: Vec<RigCamera>,
 }
 
 impl Stereo {
@@ -106,6 +107,7 @@ impl Stereo {
             disparity: vec![0; width * height],
             valid,
             depth_range_m: [config.depth_min_m, config.depth_max_m],
+            rig: calibration.cameras.clone(),
         })
     }
 
@@ -119,10 +121,30 @@ impl Stereo {
         &self.valid
     }
 
+    /// As `valid_mask`, of either side: 0 left, 1 right.
+    pub fn valid_of(&self, side: usize) -> Vec<u8> {
+        self.maps[side].valid_blocks(self.divisor)
+    }
+
+    /// Every camera of the rig, as calibrated.
+    pub fn rig(&self) -> &[RigCamera] {
+        &self.rig
+    }
+
+    /// Raw pixels across one at mapping resolution.
+    pub fn divisor(&self) -> usize {
+        self.divisor
+    }
+
     /// The left image without distortion, at mapping resolution. `out` is pre-shaped.
     pub fn rectify(&mut self, raw_left: &Image, out: &mut Image) {
-        self.maps[0].apply(raw_left, &mut self.rectified[0]);
-        box_average(&self.rectified[0], self.divisor, out);
+        self.rectify_of(0, raw_left, out);
+    }
+
+    /// As `rectify`, of either side.
+    pub fn rectify_of(&mut self, side: usize, raw: &Image, out: &mut Image) {
+        self.maps[side].apply(raw, &mut self.rectified[side]);
+        box_average(&self.rectified[side], self.divisor, out);
     }
 
     /// Depth at mapping resolution. `out` is pre-shaped. Answers how many pixels have depth.
@@ -171,7 +193,7 @@ impl Stereo {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use stipple_drivers::{Camera, ImuCalibration, Lens, RigCamera};
+    use stipple_drivers::{Camera, ImuCalibration, Lens};
 
     fn rig(lens: Lens, f: f64) -> Calibration {
         let camera = Camera { width: 320, height: 240, fx: f, fy: f, cx: 160.3, cy: 118.9, lens };

@@ -8,7 +8,7 @@ use super::twins::raster::Planes;
 use glam::{DQuat, DVec3};
 use stipple::gpu::kernels::types::Moments;
 use stipple::gpu::{Gpu, GpuOptions};
-use stipple::map::pipeline::{Pipeline, PruneRule, Shape, SplatInit, View, Weights};
+use stipple::map::pipeline::{Pipeline, PruneRule, Shape, SplatInit, StepStats, View, Weights};
 use stipple_drivers::Pose;
 
 const W: usize = 33;
@@ -176,6 +176,38 @@ fn what_is_left_after_pruning_keeps_its_colour() {
     p.download_colours(&mut gpu, &mut colours).unwrap();
     let kept: Vec<f64> = extra.iter().enumerate().filter(|(i, _)| i % 3 != 0).flat_map(|(_, e)| e.clone()).collect();
     assert_eq!(wide(&colours), kept);
+}
+
+#[test]
+fn a_map_learns_a_coloured_picture() {
+    const STEPS: usize = 120;
+    let v = view(W, H);
+    let planes: Vec<u8> = (0..3 * W * H)
+        .map(|i| {
+            let (x, y, c) = ((i % W) as f64, (i / W % H) as f64, (i / W / H) as f64);
+            (127.0 + 90.0 * (0.3 * x + c).sin() * (0.25 * y - 2.0 * c).cos()) as u8
+        })
+        .collect();
+    let (mut gpu, mut p) = open(in_colour(&v, 400, 3, 1));
+    p.append(&mut gpu, &scene(400, &v, 8)).unwrap();
+    p.set_keyframe(&mut gpu, 0, &planes).unwrap();
+    let out = super::splat::render(&mut gpu, &mut p, &v);
+    // A channel is an image of its own: the loss is the mean of the three.
+    let shown = [&out.grey[..], &out.tints[..W * H], &out.tints[W * H..]];
+    let mut l1 = 0.0;
+    for (c, shown) in shown.iter().enumerate() {
+        let goal: Vec<f64> = planes[c * W * H..][..W * H].iter().map(|g| f64::from(*g) / 255.0).collect();
+        l1 += super::twins::loss::loss(&wide(shown), &goal, &[255; W * H], W, H, 0.2).l1 / 3.0;
+    }
+    let losses: Vec<StepStats> =
+        (0..STEPS).map(|_| p.train(&mut gpu, &v, 0, &super::splat::FAST, &PLAIN).unwrap()).collect();
+    assert!((losses[0].l1 - l1).abs() < 1e-5, "{} against {l1}", losses[0].l1);
+    assert!(losses[STEPS - 1].loss < 0.4 * losses[0].loss, "{} -> {}", losses[0].loss, losses[STEPS - 1].loss);
+    let out = super::splat::render(&mut gpu, &mut p, &v);
+    for (c, shown) in [&out.grey[..], &out.tints[..W * H], &out.tints[W * H..]].into_iter().enumerate() {
+        let db = super::splat::psnr(shown, &planes[c * W * H..][..W * H]);
+        assert!(db > 20.0, "channel {c}: {db:.1} dB");
+    }
 }
 
 #[test]

@@ -58,6 +58,7 @@ fn held_out_views_by_regulariser() {
         keyframes: TRAINED as u32,
         channels: 1,
         sh_degree: 0,
+        cameras: 1,
         inverse_depth: false,
     };
     let mut gpu = Gpu::open(&GpuConfig::default(), Pipeline::arena_bytes(&s)).unwrap();

@@ -48,6 +48,7 @@ fn a_training_step() {
         keyframes: 1,
         channels: 1,
         sh_degree: 0,
+        cameras: 1,
         inverse_depth: false,
     };
     let mut gpu = Gpu::open(&GpuConfig::default(), Pipeline::arena_bytes(&shape)).unwrap();

@@ -72,7 +72,17 @@ pub fn mask(width: usize, height: usize) -> Vec<u8> {
 
 pub fn shape(v: &View, splats: u32, intersections: u32) -> Shape {
     let (width, height) = (v.camera.width as u32, v.camera.height as u32);
-    Shape { width, height, splats, intersections, keyframes: 2, channels: 1, sh_degree: 0, inverse_depth: true }
+    Shape {
+        width,
+        height,
+        splats,
+        intersections,
+        keyframes: 2,
+        channels: 1,
+        sh_degree: 0,
+        cameras: 1,
+        inverse_depth: true,
+    }
 }
 
 pub fn open(shape: Shape) -> (Gpu, Pipeline) {
