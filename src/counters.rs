@@ -49,6 +49,16 @@ counters! {
     seeds_occupied,
     /// Occupancy cells that found no room in the hash table.
     occupancy_full,
+    /// Gaussians removed for being faint, huge or not finite.
+    splats_pruned,
+    /// Gaussians removed from a full pool for being the least important.
+    splats_evicted,
+    /// Gaussians added where an anchor's picture was wrong.
+    splats_densified,
+    /// Anchors whose view was covered, but badly.
+    anchors_for_error,
+    /// Densifications that did not pay, after which less was added.
+    growth_refused,
     /// Anchors whose Gaussians were moved after a correction.
     blocks_moved,
     /// Steps whose (Gaussian, tile) list overflowed.

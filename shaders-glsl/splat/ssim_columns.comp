@@ -1,10 +1,12 @@
 // Second pass of SSIM: filters along columns, evaluates SSIM, and writes its derivatives by E[x], E[x²], E[xy].
 // in   filtered_planes (moments filtered along rows), mask
-// out  slopes: planes of dS/dE[x], dS/dE[x²], dS/dE[xy], zero where masked; ssim_sums[group] of S over valid pixels
+// out  slopes: planes of dS/dE[x], dS/dE[x²], dS/dE[xy], zero where masked; ssim_sums[group] of S over valid pixels;
+//      with MAP one plane of S itself instead, one where masked
 #version 450
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
 layout(local_size_x = 64) in;
+layout(constant_id = 0) const uint MAP = 0;
 
 #include "../common/index.glsl"
 #include "../common/ssim.glsl"
@@ -47,7 +49,11 @@ float column_run(uint x, uint y0) {
         const float b2 = max(e[2][k] - mx * mx, 0.0) + max(e[3][k] - my * my, 0.0) + C2;
         const float inv = 1.0 / (b1 * b2);
         const float s = a1 * a2 * inv;
-        if (y < push.size.y) {
+        if (MAP != 0) {
+            if (y < push.size.y) {
+                slopes[y * push.size.x + x] = valid ? s : 1.0;
+            }
+        } else if (y < push.size.y) {
             const uint at = y * push.size.x + x;
             slopes[at] = valid ? 2.0 * (my * (a2 - a1) * inv - mx * s / b1 + mx * s / b2) : 0.0;
             slopes[plane + at] = valid ? -s / b2 : 0.0;

@@ -6,7 +6,7 @@
 //! the inverse depth of the nearest matches left, right, above and below is carried over, the background
 //! preferred; such seeds start large and faint so that others overrule them.
 
-use super::occupancy::{Cell, Occupancy};
+use super::occupancy::{FULL, HELD};
 use super::schedule::Rng;
 use super::view::Exposure;
 use crate::counters::Counters;
@@ -27,9 +27,9 @@ pub struct Seed {
 }
 
 /// σ over the spacing of seeds: neighbours meet at about 0.6 of their peak.
-const SPREAD: f64 = 0.5;
+pub(super) const SPREAD: f64 = 0.5;
 /// Spacing of seeds, px.
-const SPACING_PX: [f64; 2] = [1.0, 12.0];
+pub(super) const SPACING_PX: [f64; 2] = [1.0, 12.0];
 const OPACITY_MATCHED: f64 = 0.7;
 const OPACITY_FILLED: f64 = 0.5;
 /// Density of a filled pixel over that of a matched one: bare walls need few Gaussians.
@@ -43,8 +43,6 @@ const SEED_ALPHA: f32 = 0.5;
 
 /// A pixel rendered this far from what was seen takes seeds even in an occupied cell.
 const SEED_ERROR: f64 = 0.1;
-/// Part of the free pool that a whole uncovered view may take: there is always room for the next.
-const ROOM_SHARE: usize = 8;
 
 /// What an anchor sees.
 pub struct View<'a> {
@@ -56,9 +54,19 @@ pub struct View<'a> {
     pub grey: &'a [f32],
     /// Of the image; renderings and seeds are in the map's.
     pub exposure: Exposure,
+    /// m; zero where nothing was hit.
+    pub rendered_depth: &'a [f32],
     pub camera: Pinhole,
     pub world_from_cam: Pose,
-    pub anchor: u32,
+}
+
+impl View<'_> {
+    /// A pixel's point at depth `z`, in the world.
+    pub(super) fn point(&self, x: usize, y: usize, z: f64) -> DVec3 {
+        let c = self.camera;
+        let p_cam = DVec3::new((x as f64 - c.cx) / c.fx, (y as f64 - c.cy) / c.fy, 1.0) * z;
+        self.world_from_cam.transform(p_cam)
+    }
 }
 
 /// Fraction of valid pixels whose rendered alpha is below `covered_alpha`.
@@ -75,47 +83,80 @@ pub fn uncovered(alpha: &[f32], valid: &[u8], covered_alpha: f64) -> f64 {
 
 /// Picks seeds; owns the scratch it needs.
 pub struct Seeder {
-    occupancy: Occupancy,
     filled: Vec<f32>,
-    density: Vec<f32>,
+    /// Seeds wanted a pixel.
+    pub(super) density: Vec<f32>,
     /// Index of the nearest matched pixel left, right, above, below; `NONE` without.
     nearest: [Vec<u32>; 4],
     /// Error carried to the row being walked and to the next, one pixel of margin on each side.
     carried: [Vec<f32>; 2],
-    seeds: Vec<Seed>,
-    seeds_max: usize,
+    pub(super) seeds: Vec<Seed>,
+    /// Where each seed is, and whether it is wanted even in an occupied cell.
+    points: Vec<[f32; 4]>,
+    pub(super) seeds_max: usize,
 }
 
 const NONE: u32 = u32::MAX;
 
 impl Seeder {
-    pub fn footprint(pixels: usize, seeds_max: usize, cells: u32) -> Footprint {
-        let mut f = Occupancy::footprint(cells);
+    pub fn footprint(pixels: usize, seeds_max: usize) -> Footprint {
+        let mut f = Footprint::default();
         f.host("map: seeding scratch", pixels * 6 * size_of::<f32>());
-        f.host("map: seeds", seeds_max * size_of::<Seed>());
+        f.host("map: seeds", seeds_max * (size_of::<Seed>() + size_of::<[f32; 4]>()));
         f
     }
 
-    pub fn new(width: usize, height: usize, seeds_max: usize, cell_m: f64, cells: u32) -> Seeder {
+    pub fn new(width: usize, height: usize, seeds_max: usize) -> Seeder {
         let n = width * height;
         Seeder {
-            occupancy: Occupancy::new(cell_m, cells),
             filled: vec![0.0; n],
             density: vec![0.0; n],
             nearest: std::array::from_fn(|_| vec![NONE; n]),
             carried: std::array::from_fn(|_| vec![0.0; width + 2]),
             seeds: Vec::with_capacity(seeds_max),
+            points: Vec::with_capacity(seeds_max),
             seeds_max,
         }
     }
 
-    /// Seeds for at most `room` Gaussians. Pixels an earlier anchor's Gaussians already show are left alone.
-    pub fn seed(&mut self, view: &View, room: usize, counters: &Counters) -> &[Seed] {
+    /// Picks seeds as dense as `whole` for a view, and answers where they are; `settle` says which of them stay.
+    pub fn seed(&mut self, view: &View, whole: usize, counters: &Counters) -> &[[f32; 4]] {
         self.fill(&view.depth.metres, view.depth.width);
-        self.set_density(view, self.seeds_max.min(room.div_ceil(ROOM_SHARE)));
+        self.set_density(view, self.seeds_max.min(whole));
+        self.points.clear();
+        self.pick(view, self.seeds_max, counters, |seeder, x, y| seeder.put(view, x, y));
+        &self.points
+    }
+
+    /// Of the picked, at most `room`: those whose cell no earlier anchor holds, or that the rendering lacks.
+    pub fn settle(&mut self, answers: &[u32], room: usize, counters: &Counters) -> &[Seed] {
+        let mut kept = 0;
+        for i in 0..self.seeds.len() {
+            let lacking = self.points[i][3] != 0.0;
+            counters.occupancy_full.add(u64::from(answers[i] == FULL));
+            if answers[i] == HELD && !lacking {
+                counters.seeds_occupied.add(1);
+            } else if kept == room {
+                counters.splats_full.add(1);
+            } else {
+                self.seeds[kept] = self.seeds[i];
+                kept += 1;
+            }
+        }
+        self.seeds.truncate(kept);
+        &self.seeds
+    }
+
+    /// Calls `put` for pixels picked as `density` says, as long as there are fewer than `room` seeds.
+    pub(super) fn pick(
+        &mut self,
+        view: &View,
+        room: usize,
+        counters: &Counters,
+        mut put: impl FnMut(&mut Seeder, usize, usize),
+    ) {
         self.seeds.clear();
         let (w, h) = (view.image.width, view.image.height);
-        let room = room.min(self.seeds_max);
         // The first row inherits what a row above would have left, else a sparse pattern starts late.
         let mut rng = Rng::new(1);
         self.carried[0].fill_with(|| rng.below(1024) as f32 / 1024.0 - 0.5);
@@ -136,30 +177,25 @@ impl Seeder {
                     if self.seeds.len() == room {
                         counters.splats_full.add(1);
                     } else {
-                        self.put(view, x, y, counters);
+                        put(self, x, y);
                     }
                 }
             }
             self.carried.swap(0, 1);
             self.carried[1].fill(0.0);
         }
-        &self.seeds
     }
 
-    fn put(&mut self, view: &View, x: usize, y: usize, counters: &Counters) {
+    fn put(&mut self, view: &View, x: usize, y: usize) {
         let i = y * view.image.width + x;
         let c = view.camera;
         let matched = view.depth.metres[i] > 0.0;
         let z = f64::from(if matched { view.depth.metres[i] } else { self.filled[i] });
-        let p_cam = DVec3::new((x as f64 - c.cx) / c.fx, (y as f64 - c.cy) / c.fy, 1.0) * z;
-        let p_world = view.world_from_cam.transform(p_cam);
+        let p_world = view.point(x, y, z);
         let grey = view.exposure.inverse(f64::from(view.image.pixels[i]) / 255.0);
-        let error = (f64::from(view.grey[i]) - grey).abs();
-        match self.occupancy.claim(p_world, view.anchor) {
-            Cell::Held if view.alpha[i] >= SEED_ALPHA && error < SEED_ERROR => return counters.seeds_occupied.add(1),
-            Cell::Full => counters.occupancy_full.add(1),
-            _ => {}
-        }
+        let lacking = view.alpha[i] < SEED_ALPHA || (f64::from(view.grey[i]) - grey).abs() >= SEED_ERROR;
+        let [px, py, pz] = p_world.as_vec3().to_array();
+        self.points.push([px, py, pz, f32::from(u8::from(lacking))]);
         let spacing_px = (1.0 / f64::from(self.density[i])).sqrt().clamp(SPACING_PX[0], SPACING_PX[1]);
         self.seeds.push(Seed {
             p_world,
@@ -247,17 +283,19 @@ fn carried_depth(metres: &[f32], width: usize, i: usize, around: [u32; 4]) -> f3
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
+    use super::super::occupancy::CLAIMED;
     use super::*;
 
-    const W: usize = 64;
-    const H: usize = 48;
+    pub const W: usize = 64;
+    pub const H: usize = 48;
 
-    fn camera() -> Pinhole {
+    pub fn camera() -> Pinhole {
         Pinhole { width: W, height: H, fx: 50.0, fy: 50.0, cx: 31.5, cy: 23.5 }
     }
 
-    fn seed(seeder: &mut Seeder, image: &Image, depth: &DepthMap, alpha: f32, anchor: u32) -> Vec<Seed> {
+    /// With every cell held as `answer` says.
+    fn seed(seeder: &mut Seeder, image: &Image, depth: &DepthMap, alpha: f32, answer: u32) -> Vec<Seed> {
         let view = View {
             image,
             valid: &[1; W * H],
@@ -265,14 +303,15 @@ mod tests {
             alpha: &[alpha; W * H],
             grey: &[0.0; W * H],
             exposure: Exposure::default(),
+            rendered_depth: &[0.0; W * H],
             camera: camera(),
             world_from_cam: Pose::IDENTITY,
-            anchor,
         };
-        seeder.seed(&view, usize::MAX, &Counters::default()).to_vec()
+        let n = seeder.seed(&view, usize::MAX, &Counters::default()).len();
+        seeder.settle(&vec![answer; n], usize::MAX, &Counters::default()).to_vec()
     }
 
-    fn flat(z: f32) -> DepthMap {
+    pub fn flat(z: f32) -> DepthMap {
         DepthMap { width: W, height: H, metres: vec![z; W * H] }
     }
 
@@ -284,8 +323,8 @@ mod tests {
 
     #[test]
     fn flat_view_is_seeded_evenly_and_within_budget() {
-        let mut s = Seeder::new(W, H, 300, 0.1, 4096);
-        let seeds = seed(&mut s, &Image::new(W, H), &flat(2.0), 0.0, 1);
+        let mut s = Seeder::new(W, H, 300);
+        let seeds = seed(&mut s, &Image::new(W, H), &flat(2.0), 0.0, CLAIMED);
         assert!((270..=300).contains(&seeds.len()), "{}", seeds.len());
         // Every 16x16 block gets its share.
         let mut blocks = [0; 12];
@@ -303,24 +342,27 @@ mod tests {
         for (i, p) in image.pixels.iter_mut().enumerate() {
             *p = if i % W >= W / 2 && (i % W / 2) % 2 == 0 { 200 } else { 60 };
         }
-        let seeds = seed(&mut Seeder::new(W, H, 300, 0.1, 4096), &image, &flat(2.0), 0.0, 1);
+        let seeds = seed(&mut Seeder::new(W, H, 300), &image, &flat(2.0), 0.0, CLAIMED);
         let right = seeds.iter().filter(|k| k.p_world.x > 0.1).count();
         assert!(right > 3 * (seeds.len() - right), "{right} of {}", seeds.len());
     }
 
     #[test]
     fn occupied_cells_take_no_seed_unless_bare() {
-        let mut s = Seeder::new(W, H, 300, 0.1, 4096);
+        let mut s = Seeder::new(W, H, 300);
         let image = Image::new(W, H);
-        let first = seed(&mut s, &image, &flat(2.0), 0.0, 1).len();
-        // One cell in a dozen may have been missed by the first picks.
-        assert!(seed(&mut s, &image, &flat(2.0), 1.0, 2).len() < first / 8);
-        assert_eq!(seed(&mut s, &image, &flat(2.0), 0.0, 3).len(), first);
+        let first = seed(&mut s, &image, &flat(2.0), 0.0, CLAIMED).len();
+        assert_eq!(seed(&mut s, &image, &flat(2.0), 1.0, HELD).len(), 0);
+        assert_eq!(seed(&mut s, &image, &flat(2.0), 1.0, FULL).len(), first);
+        assert_eq!(seed(&mut s, &image, &flat(2.0), 0.0, HELD).len(), first);
+        let mut wrong = Image::new(W, H);
+        wrong.pixels.fill(200);
+        assert_eq!(seed(&mut s, &wrong, &flat(2.0), 1.0, HELD).len(), first);
     }
 
     #[test]
     fn room_is_never_exceeded() {
-        let mut s = Seeder::new(W, H, 300, 0.1, 4096);
+        let mut s = Seeder::new(W, H, 300);
         let counters = Counters::default();
         let (image, depth) = (Image::new(W, H), flat(1.0));
         let view = View {
@@ -330,16 +372,14 @@ mod tests {
             alpha: &[0.0; W * H],
             grey: &[0.0; W * H],
             exposure: Exposure::default(),
+            rendered_depth: &[0.0; W * H],
             camera: camera(),
             world_from_cam: Pose::IDENTITY,
-            anchor: 1,
         };
-        assert!(s.seed(&view, 40, &counters).len() <= 40 / ROOM_SHARE);
-        let mut room = 1000;
-        for _ in 0..20 {
-            room -= s.seed(&view, room, &counters).len();
-        }
-        assert!((20..200).contains(&room), "{room}");
+        let n = s.seed(&view, 40, &counters).len();
+        assert!((25..=40).contains(&n));
+        assert_eq!((s.settle(&vec![0; n], 25, &counters).len(), counters.splats_full.get()), (25, n as u64 - 25));
+        assert!(s.seed(&view, 1 << 20, &counters).len() <= 300);
     }
 
     #[test]
@@ -354,7 +394,7 @@ mod tests {
                 };
             }
         }
-        let mut s = Seeder::new(W, H, 300, 0.1, 4096);
+        let mut s = Seeder::new(W, H, 300);
         s.fill(&depth.metres, W);
         assert!((s.filled[10 * W + 22] - 3.0).abs() < 1e-5);
         assert_eq!(s.filled[10 * W + 5], 1.0);

@@ -41,6 +41,11 @@ impl Pipeline {
         }
     }
 
+    /// The anchor that what is appended belongs to.
+    pub fn newest(&self) -> Option<u32> {
+        self.blocks.last().map(|b| b.anchor)
+    }
+
     /// The slots of an anchor's Gaussians; empty where it has none.
     pub fn block(&self, anchor: u32) -> Range<u32> {
         match self.blocks.iter().position(|b| b.anchor == anchor) {

@@ -129,6 +129,9 @@ pub struct Stored {
     pub placed: Pose,
     pub held_out: bool,
     pub anchor: bool,
+    /// Of its last training step, and which step of the mapper that was; 0: never.
+    pub loss: f64,
+    pub trained_at: u64,
     /// What the mapper found out beside it.
     pub refined: Refinement,
 }
@@ -206,7 +209,7 @@ impl Store {
         let last = self.training.iter().rev().find(|k| self.camera(**k as usize) == self.camera(index));
         refined.exposure = last.map_or(refined.exposure, |&k| self.get(k as usize).refined.exposure);
         let (given, placed) = (world_from_body, world_from_body);
-        self.entries.push(Stored { id, t, given, placed, held_out, anchor: false, refined });
+        self.entries.push(Stored { id, t, given, placed, held_out, anchor: false, loss: 0.0, trained_at: 0, refined });
         if !held_out {
             self.training.push(index as u32);
         }

@@ -1,18 +1,21 @@
 //! The mapper: keyframes in, a map of Gaussians out, a bounded amount of work at a time.
 //!
 //! `step` looks at waiting keyframes first. One whose view the map does not cover becomes an anchor: stereo
-//! depth, seeds, then a burst of training steps on it alone. Otherwise single training steps go to keyframes
-//! drawn uniformly at random (the map sees its past as often as its present, so it does not forget).
+//! depth, seeds, then a burst of training steps on it alone (`lifecycle`). Otherwise single training steps go to
+//! keyframes drawn uniformly at random (the map sees its past as often as its present, so it does not forget).
 //! Held-out keyframes are stored, never trained on, never anchors. Read `pipeline` for what a step does on
 //! the GPU.
 
 pub mod anchors;
 pub mod blocks;
+pub mod budget;
 pub mod buffers;
+pub mod densify;
 pub mod evaluate;
 pub mod eyes;
 pub mod harmonics;
 pub mod keyframes;
+mod lifecycle;
 pub mod occupancy;
 pub mod pipeline;
 pub mod pool;
@@ -25,11 +28,14 @@ pub mod view;
 use crate::config::{Board, MapConfig, Projection};
 use crate::counters::Counters;
 use crate::gpu::{Gpu, GpuError, Timing};
-use crate::mem::{unsealed, Footprint};
+use crate::mem::Footprint;
 use crate::stereo::{DepthMap, Stereo};
-use anchors::{uncovered, Seed, Seeder};
+use anchors::{Seed, Seeder};
+use budget::Growth;
 use eyes::Eye;
 use keyframes::{Queue, Store};
+use lifecycle::Added;
+use occupancy::Occupancy;
 use pipeline::{LearningRates, Pipeline, Rendered, Shape, View, Weights};
 use schedule::Schedule;
 use std::time::Instant;
@@ -80,11 +86,18 @@ pub struct Mapper {
     /// The newest keyframe's left image without distortion, where that is not what trains.
     seeded_from: Option<Image>,
     seeder: Seeder,
+    occupancy: Occupancy,
+    /// Of the occupancy, by seed.
+    answers: Vec<u32>,
     schedule: Schedule,
     /// Depth of the newest anchor, m.
     depth: DepthMap,
     rendered: Rendered,
     arrivals: Vec<SplatInit>,
+    /// SSIM of the newest anchor by pixel.
+    similarity: Vec<f32>,
+    growth: Growth,
+    added: Added,
     /// Median depth of the first anchor, m: what a position step is measured in.
     scene_depth_m: f64,
     iterations: u64,
@@ -108,15 +121,16 @@ impl Mapper {
         let cameras = calibration.cameras.len();
         let shape = shape(board, eyes::count(cameras, &board.map), width, height);
         let (pixels, images) = (width * height, shape.keyframes as usize);
-        let seeds_max = board.map.seeds_per_anchor as usize;
+        let seeds_max = seeds_max(&board.map);
         let mut f = Pipeline::footprint(&shape);
         f.gpu("alignment", Pipeline::arena_bytes(&shape).saturating_sub(f.gpu_total()) as usize);
         f.extend(Queue::footprint(raw_pixels_max(board), eyes::images(cameras, &board.map)));
         f.extend(Store::footprint(images, pixels));
         f.extend(eyes::footprint(calibration, &board.map, pixels));
-        f.extend(Seeder::footprint(pixels, seeds_max, board.map.occupancy_cells));
-        f.host("map: rendering and depth", pixels * 4 * size_of::<f32>());
-        f.host("map: arrivals", seeds_max * size_of::<SplatInit>());
+        f.extend(Seeder::footprint(pixels, seeds_max));
+        f.extend(Occupancy::footprint(board.map.occupancy_cells));
+        f.host("map: rendering, depth and similarity", pixels * 5 * size_of::<f32>());
+        f.host("map: arrivals", seeds_max * (size_of::<SplatInit>() + size_of::<u32>()));
         f
     }
 
@@ -131,7 +145,8 @@ impl Mapper {
         for (i, eye) in eyes.iter().enumerate() {
             pipeline.set_mask_of(&mut gpu, i, &eye.valid)?;
         }
-        let seeds_max = config.seeds_per_anchor as usize;
+        let seeds_max = seeds_max(&config);
+        let occupancy = Occupancy::new(&mut gpu, config.occupancy_cell_m, config.occupancy_cells)?;
         let blank = || vec![0.0; width * height];
         Ok(Mapper {
             gpu,
@@ -140,11 +155,16 @@ impl Mapper {
             store: Store::new(shape.keyframes as usize, eyes.len(), width, height),
             seeded_from: (config.projection == Projection::Fisheye).then(|| Image::new(width, height)),
             eyes,
-            seeder: Seeder::new(width, height, seeds_max, config.occupancy_cell_m, config.occupancy_cells),
+            seeder: Seeder::new(width, height, seeds_max),
+            occupancy,
+            answers: Vec::with_capacity(seeds_max),
             schedule: Schedule::new(config.seed),
             depth: DepthMap::new(width, height),
             rendered: Rendered { width, height, grey: blank(), tints: Vec::new(), alpha: blank(), depth: blank() },
             arrivals: Vec::with_capacity(seeds_max),
+            similarity: blank(),
+            growth: Growth::default(),
+            added: Added::default(),
             scene_depth_m: SCENE_DEPTH_M,
             iterations: 0,
             counters: Counters::default(),
@@ -220,71 +240,6 @@ impl Mapper {
         Ok(report)
     }
 
-    /// Stores the oldest waiting keyframe, and makes it an anchor when the map does not cover its view.
-    fn take_in(&mut self) -> Result<Did, GpuError> {
-        let Some(keyframe) = self.queue.front() else { return Ok(Did::Idle) };
-        if self.store.is_full() {
-            self.counters.keyframe_store_full.add(1);
-            self.queue.pop();
-            return Ok(Did::Dropped);
-        }
-        let index = self.store.len();
-        for (i, (eye, raw)) in self.eyes.iter().zip(&keyframe.images).enumerate() {
-            self.store.add(keyframe, |image| eyes::draw(i, eye, &mut self.stereo, raw, image));
-            let image = self.store.image(index + i);
-            self.pipeline.set_keyframe(&mut self.gpu, (index + i) as u32, &image.pixels)?;
-        }
-        if let Some(image) = &mut self.seeded_from {
-            self.stereo.rectify(&keyframe.images[0], image);
-        }
-        let did = if self.store.get(index).held_out { Did::Stored } else { self.cover(index)? };
-        self.queue.pop();
-        Ok(did)
-    }
-
-    fn cover(&mut self, index: usize) -> Result<Did, GpuError> {
-        // Seeds come of the rectified pair, whatever the lens of what trains.
-        let rect = self.stereo.camera();
-        let world_from_cam = self.store.world_from_body(index) * rect.body_from_rect;
-        let view = View { world_from_cam, camera: rect.pinhole, fisheye: None };
-        self.pipeline.render(&mut self.gpu, &view, &mut self.rendered)?;
-        let bare = uncovered(&self.rendered.alpha, self.stereo.valid_mask(), self.config.covered_alpha);
-        self.expose(index);
-        let room = self.room();
-        if bare <= self.config.anchor_uncovered_min || room == 0 {
-            return Ok(Did::Stored);
-        }
-        let Some(keyframe) = self.queue.front() else { return Ok(Did::Stored) };
-        let [left, right, ..] = &keyframe.images[..] else { return Ok(Did::Stored) };
-        // A pair that cannot be matched gives no depth, and no anchor; the keyframe is still trained on.
-        if unsealed(|| self.stereo.depth(left, right, &mut self.depth)).is_err() {
-            self.counters.depth_failures.add(1);
-            return Ok(Did::Stored);
-        }
-        if self.store.anchors() == 0 {
-            self.scene_depth_m = median_depth(&self.depth.metres).unwrap_or(SCENE_DEPTH_M);
-        }
-        let seen = anchors::View {
-            image: self.seeded_from.as_ref().unwrap_or_else(|| self.store.image(index)),
-            valid: self.stereo.valid_mask(),
-            depth: &self.depth,
-            alpha: &self.rendered.alpha,
-            grey: &self.rendered.grey,
-            exposure: self.store.exposure(index),
-            camera: view.camera,
-            world_from_cam: view.world_from_cam,
-            anchor: index as u32,
-        };
-        self.pipeline.open_block(index as u32);
-        self.arrivals.clear();
-        self.arrivals.extend(self.seeder.seed(&seen, room, &self.counters).iter().map(gaussian));
-        let seeded = self.pipeline.append(&mut self.gpu, &self.arrivals)? as u32;
-        let entry = self.store.get_mut(index);
-        (entry.anchor, entry.placed) = (true, entry.given);
-        self.schedule.start_burst(index, self.config.burst_iterations);
-        Ok(Did::Anchor { seeded })
-    }
-
     /// One training step; its loss, or `None` when there is nothing to train.
     fn train(&mut self) -> Result<Option<f64>, GpuError> {
         if self.pipeline.count() == 0 {
@@ -299,6 +254,7 @@ impl Mapper {
         self.counters.intersections_overflow.add(u64::from(done.stats.overflow > 0));
         self.counters.gradients_rejected.add(u64::from(done.gradients_rejected));
         self.refine(index, &view, &done);
+        self.after_step(index, &done)?;
         Ok(Some(done.loss))
     }
 
@@ -323,7 +279,8 @@ impl Mapper {
     }
 
     fn rates(&self) -> LearningRates {
-        let (c, part) = (&self.config, self.rate_part());
+        let c = &self.config;
+        let part = self.rate_part() * if self.schedule.in_burst() { c.burst_rate } else { 1.0 };
         LearningRates {
             position: (part * c.lr_position * self.scene_depth_m) as f32,
             scale: (part * c.lr_scale) as f32,
@@ -412,6 +369,11 @@ fn shape(board: &Board, cameras: usize, width: usize, height: usize) -> Shape {
         cameras: cameras as u32,
         inverse_depth: false,
     }
+}
+
+/// Gaussians that may arrive at once.
+fn seeds_max(config: &MapConfig) -> usize {
+    config.seeds_per_anchor.max(config.densify_max) as usize
 }
 
 fn raw_pixels_max(board: &Board) -> usize {

@@ -1,92 +1,81 @@
-//! Which cells of space already hold Gaussians, and of which anchor: a hash table of fixed size.
+//! Which cells of space already hold Gaussians, and of which anchor: a hash table of fixed size on the GPU.
 //!
-//! Open addressing with a bounded probe. A full neighbourhood is a value (`Full`), never a growth: the cost
-//! is a duplicate seed, so a lost cell is counted and forgotten.
+//! A cell has two places and is found in either (`occupy.comp`). No probing: what is found does not depend on the order
+//! of claims, so a map can be repeated to the bit. Where both places are other cells' nothing is claimed; the cost is a
+//! duplicate seed, so that is counted and forgotten. A Gaussian that is moved or evicted leaves its cell claimed: seeds
+//! go to occupied cells too where the rendering lacks them.
 
+use crate::gpu::kernels::occupy;
+use crate::gpu::{Buf, Gpu, GpuError, Kernel, Threads, ALIGN};
 use crate::mem::Footprint;
-use glam::DVec3;
+use stipple_drivers::Fault;
 
-/// Longest walk from a cell's place in the table.
-const PROBES: usize = 32;
-/// Bits of one cell coordinate: ±100 km of 0.1 m cells.
-const BITS: u32 = 21;
+/// Points that travel to the GPU at a time.
+const POINTS: usize = 4096;
 
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Cell {
-    /// Nobody was there; it is this anchor's now.
-    Taken,
-    /// This anchor took it before.
-    Own,
-    /// An earlier anchor holds it.
-    Held,
-    /// The table has no room for it.
-    Full,
-}
+/// What `claim` answers of a point.
+pub const CLAIMED: u32 = 0;
+pub const HELD: u32 = 1;
+pub const FULL: u32 = 2;
 
 pub struct Occupancy {
-    /// Cell key and anchor; key 0 is free.
-    table: Vec<(u64, u32)>,
-    per_metre: f64,
+    kernel: Kernel<occupy::K>,
+    cells: Buf<u32>,
+    points: Buf<[f32; 4]>,
+    held: Buf<u32>,
+    per_metre: f32,
 }
 
 impl Occupancy {
     pub fn footprint(cells: u32) -> Footprint {
         let mut f = Footprint::default();
-        f.host("map: occupancy grid", cells as usize * size_of::<(u64, u32)>());
+        f.gpu("map: occupancy grid", cells as usize * size_of::<u32>());
+        f.gpu("map: points to place", POINTS * (size_of::<[f32; 4]>() + size_of::<u32>()) + 3 * ALIGN as usize);
         f
     }
 
     /// `cells` is a power of two.
-    pub fn new(cell_m: f64, cells: u32) -> Occupancy {
+    pub fn new(gpu: &mut Gpu, cell_m: f64, cells: u32) -> Result<Occupancy, Fault> {
         debug_assert!(cells.is_power_of_two());
-        Occupancy { table: vec![(0, 0); cells as usize], per_metre: 1.0 / cell_m }
+        let o = Occupancy {
+            kernel: gpu.kernel::<occupy::K>(occupy::Spec::default())?,
+            cells: gpu.alloc("map: occupancy grid", cells as usize)?,
+            points: gpu.alloc("map: points to place", POINTS)?,
+            held: gpu.alloc("map: points placed", POINTS)?,
+            per_metre: (1.0 / cell_m) as f32,
+        };
+        let mut rec = gpu.record();
+        rec.fill(o.cells, u32::MAX);
+        gpu.submit(rec).map_err(Fault::from)?;
+        Ok(o)
     }
 
-    /// Claims the cell around `p_world` for `anchor`.
-    pub fn claim(&mut self, p_world: DVec3, anchor: u32) -> Cell {
-        let key = self.key(p_world);
-        let mask = self.table.len() - 1;
-        let start = (key.wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 32) as usize;
-        for i in start..start + PROBES {
-            let slot = &mut self.table[i & mask];
-            if slot.0 == 0 {
-                *slot = (key, anchor);
-                return Cell::Taken;
-            }
-            if slot.0 == key {
-                return if slot.1 == anchor { Cell::Own } else { Cell::Held };
-            }
+    /// Claims the cells around `points` for `anchor`, the latest there is; one answer a point.
+    pub fn claim(
+        &mut self,
+        gpu: &mut Gpu,
+        anchor: u32,
+        points: &[[f32; 4]],
+        answers: &mut Vec<u32>,
+    ) -> Result<(), GpuError> {
+        answers.clear();
+        answers.resize(points.len(), CLAIMED);
+        for (points, answers) in points.chunks(POINTS).zip(answers.chunks_mut(POINTS)) {
+            gpu.upload(self.points, 0, points)?;
+            let mut rec = gpu.record();
+            let bind =
+                occupy::Bind { points: self.points.read(), cells: self.cells.read_write(), held: self.held.write() };
+            let n = points.len() as u32;
+            let push = occupy::Push { points: n, anchor, per_metre: self.per_metre, mask: self.cells.len() as u32 - 1 };
+            rec.dispatch(&self.kernel, bind, push, Threads::d1(n));
+            gpu.submit(rec)?;
+            gpu.download(self.held, 0, answers)?;
         }
-        Cell::Full
+        Ok(())
     }
 
-    fn key(&self, p: DVec3) -> u64 {
-        const MASK: i64 = (1 << BITS) - 1;
-        let axis = |v: f64| ((v * self.per_metre).floor() as i64 & MASK) as u64;
-        1 << 63 | axis(p.x) << (2 * BITS) | axis(p.y) << BITS | axis(p.z)
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn cell_belongs_to_the_first_anchor() {
-        let mut grid = Occupancy::new(0.1, 1024);
-        let p = DVec3::new(-0.01, 2.05, 1.0);
-        assert_eq!(grid.claim(p, 1), Cell::Taken);
-        assert_eq!(grid.claim(p - DVec3::X * 0.05, 1), Cell::Own);
-        assert_eq!(grid.claim(p, 2), Cell::Held);
-        assert_eq!(grid.claim(-p, 2), Cell::Taken);
-    }
-
-    #[test]
-    fn full_table_is_a_value() {
-        let mut grid = Occupancy::new(1.0, 64);
-        let claims: Vec<Cell> = (0..200).map(|i| grid.claim(DVec3::new(f64::from(i), 0.0, 0.0), 1)).collect();
-        assert!(claims.iter().filter(|c| **c == Cell::Taken).count() <= 64);
-        assert!(claims.contains(&Cell::Full));
-        assert_eq!(grid.claim(DVec3::ZERO, 2), Cell::Held);
+    /// What is in the table, for tests.
+    pub fn cells(&self) -> Buf<u32> {
+        self.cells
     }
 }

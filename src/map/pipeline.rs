@@ -50,8 +50,9 @@ pub(super) struct Kernels {
     /// Of shapes that train on inverse depth.
     raster_depth: Option<Raster>,
     raster_picture: Kernel<raster_forward::K>,
-    ssim_rows: Kernel<ssim_rows::K>,
+    pub(super) ssim_rows: Kernel<ssim_rows::K>,
     ssim_columns: Kernel<ssim_columns::K>,
+    pub(super) ssim_map: Kernel<ssim_columns::K>,
     loss_rows: Kernel<loss_rows::K>,
     loss_columns: Kernel<loss_columns::K>,
     /// The same, with the gradient by the exposure.
@@ -160,7 +161,8 @@ impl Pipeline {
                 variant,
             )?,
             ssim_rows: plain::<ssim_rows::K>(gpu)?,
-            ssim_columns: plain::<ssim_columns::K>(gpu)?,
+            ssim_columns: gpu.kernel::<ssim_columns::K>(ssim_columns::Spec { map: 0 })?,
+            ssim_map: gpu.kernel::<ssim_columns::K>(ssim_columns::Spec { map: 1 })?,
             loss_rows: plain::<loss_rows::K>(gpu)?,
             loss_columns: plain::<loss_columns::K>(gpu)?,
             loss_columns_exposure: gpu.kernel::<loss_columns::K>(loss_columns::Spec { exposure: true })?,

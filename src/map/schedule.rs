@@ -21,33 +21,93 @@ impl Rng {
     }
 }
 
-/// The order of training steps: a new anchor's burst first, then uniform draws.
+/// What the last step ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Ended {
+    Nothing,
+    /// The burst of this anchor.
+    Burst(usize),
+    /// The convergence interval of this anchor.
+    Convergence(usize),
+}
+
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Phase {
+    Uniform,
+    Burst { anchor: usize, left: u32 },
+    Convergence { anchor: usize, left: u32, best: f64, stale: u32 },
+}
+
+/// A loss is falling while it gets this much below its best in `PATIENCE` steps.
+const FALLS: f64 = 0.01;
+const PATIENCE: u32 = 5;
+
+/// The order of training steps: a new anchor's burst first, then its convergence interval, then uniform draws.
 pub struct Schedule {
     rng: Rng,
-    burst: Option<(usize, u32)>,
+    phase: Phase,
 }
 
 impl Schedule {
     pub fn new(seed: u64) -> Schedule {
-        Schedule { rng: Rng::new(seed), burst: None }
+        Schedule { rng: Rng::new(seed), phase: Phase::Uniform }
     }
 
     /// The next `steps` go to keyframe `anchor` alone.
     pub fn start_burst(&mut self, anchor: usize, steps: u32) {
-        self.burst = (steps > 0).then_some((anchor, steps));
+        self.phase = if steps > 0 { Phase::Burst { anchor, left: steps } } else { Phase::Uniform };
+    }
+
+    /// Steps go to `anchor` until its loss stops falling, at most `steps`.
+    pub fn start_convergence(&mut self, anchor: usize, steps: u32) {
+        let start = Phase::Convergence { anchor, left: steps, best: f64::INFINITY, stale: 0 };
+        self.phase = if steps > 0 { start } else { Phase::Uniform };
     }
 
     pub fn in_burst(&self) -> bool {
-        self.burst.is_some()
+        matches!(self.phase, Phase::Burst { .. })
+    }
+
+    pub fn on_anchor(&self) -> bool {
+        self.phase != Phase::Uniform
     }
 
     /// The keyframe of the next step out of `training`, or `None` when there is none.
     pub fn next(&mut self, training: &[u32]) -> Option<usize> {
-        if let Some((anchor, left)) = self.burst {
-            self.burst = (left > 1).then_some((anchor, left - 1));
-            return Some(anchor);
+        match self.phase {
+            Phase::Burst { anchor, .. } | Phase::Convergence { anchor, .. } => Some(anchor),
+            Phase::Uniform => (!training.is_empty()).then(|| training[self.rng.below(training.len())] as usize),
         }
-        (!training.is_empty()).then(|| training[self.rng.below(training.len())] as usize)
+    }
+
+    /// The loss of the step that `next` asked for.
+    pub fn took(&mut self, loss: f64) -> Ended {
+        match &mut self.phase {
+            Phase::Uniform => Ended::Nothing,
+            Phase::Burst { anchor, left } => {
+                let anchor = *anchor;
+                *left -= 1;
+                if *left > 0 {
+                    return Ended::Nothing;
+                }
+                self.phase = Phase::Uniform;
+                Ended::Burst(anchor)
+            }
+            Phase::Convergence { anchor, left, best, stale } => {
+                let anchor = *anchor;
+                *left -= 1;
+                if loss < *best * (1.0 - FALLS) {
+                    (*best, *stale) = (loss, 0);
+                } else {
+                    *stale += 1;
+                }
+                if *left > 0 && *stale < PATIENCE {
+                    return Ended::Nothing;
+                }
+                self.phase = Phase::Uniform;
+                Ended::Convergence(anchor)
+            }
+        }
     }
 }
 
@@ -75,7 +135,25 @@ mod tests {
     fn burst_trains_the_new_anchor_alone() {
         let mut s = Schedule::new(1);
         s.start_burst(42, 3);
-        assert_eq!([s.next(&[]), s.next(&[5]), s.next(&[5]), s.next(&[5])], [Some(42), Some(42), Some(42), Some(5)]);
+        for ended in [Ended::Nothing, Ended::Nothing, Ended::Burst(42)] {
+            assert_eq!((s.next(&[5]), s.took(1.0)), (Some(42), ended));
+        }
+        assert_eq!((s.next(&[5]), s.took(1.0)), (Some(5), Ended::Nothing));
         assert_eq!(s.next(&[]), None);
+        s.start_burst(42, 0);
+        assert!(!s.in_burst());
+    }
+
+    #[test]
+    fn convergence_ends_when_the_loss_stops_falling_or_time_is_up() {
+        let taken = |max, loss: fn(u32) -> f64| {
+            let mut s = Schedule::new(1);
+            s.start_convergence(3, max);
+            (1..=1000).find(|&k| s.next(&[]).is_some() && s.took(loss(k)) == Ended::Convergence(3))
+        };
+        // Halves every step for ten steps, then stays.
+        assert_eq!(taken(100, |k| f64::from(k.min(10)).exp2().recip()), Some(10 + PATIENCE));
+        assert_eq!(taken(20, |k| 1.0 / f64::from(k * k)), Some(20));
+        assert_eq!(taken(100, |_| f64::NAN), Some(PATIENCE));
     }
 }

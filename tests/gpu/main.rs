@@ -5,6 +5,7 @@ mod exposure;
 mod fisheye;
 mod harmonics;
 mod held_out;
+mod occupancy;
 mod pool;
 mod raster;
 mod sort;

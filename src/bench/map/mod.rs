@@ -41,11 +41,22 @@ const fn variant(name: &'static str, about: &'static str, set: &'static [&'stati
 }
 
 /// The lines of the cap sweep; the first is the default.
-const LINES: [Variant; 1] = [variant("default", "the board's own settings", &[])];
+const LINES: [Variant; 2] = [
+    variant("default", "the board's own settings", &[]),
+    variant(
+        "as published",
+        "seeds and densifies up to the cap, never evicts; a raised burst and a convergence interval",
+        &["map.evict=false", "map.growth_stops=false", "map.burst_rate=2", "map.converge_iterations_max=50"],
+    ),
+];
 
 /// What the map is without, or with, one part. The first row of the table is the default.
-const ABLATIONS: [Variant; 3] = [
+const ABLATIONS: [Variant; 7] = [
     variant("no burst", "a new anchor waits for its turn", &["map.burst_iterations=0"]),
+    variant("no densification", "seeds on bare depth only", &["map.densify_max=0"]),
+    variant("no eviction", "a full pool takes no more", &["map.evict=false"]),
+    variant("convergence", "an anchor is trained on alone until it settles", &["map.converge_iterations_max=50"]),
+    variant("wrong anchors", "covered but badly rendered views are densified", &["map.anchor_error_min=0.04"]),
     variant("no SSIM", "L1 alone", &["map.ssim_weight=0"]),
     variant("pose", "keyframe poses refined on the images", &["map.lr_pose=1e-4"]),
 ];

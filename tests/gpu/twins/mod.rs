@@ -3,6 +3,7 @@
 pub mod dual;
 pub mod harmonics;
 pub mod loss;
+pub mod occupancy;
 pub mod pool;
 pub mod project;
 pub mod raster;

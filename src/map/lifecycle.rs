@@ -1,0 +1,236 @@
+//! What becomes of a keyframe: stored to be trained on with the rest (the pool), or made an anchor.
+//!
+//! ```text
+//! rendered -> covered and right ------------------------------------> pool
+//!          -> bare: seeds on the stereo depth ---> burst -> densified -> until its loss stops falling -> pool
+//!          -> covered and wrong: no seeds ------->
+//! ```
+//!
+//! An anchor opens a block of the pool; what its seeds and its densification need and is not free is taken from the
+//! least important, if the board lets (`budget`).
+
+use super::anchors::{self, uncovered};
+use super::budget::{by_training, threshold, Cost};
+use super::densify::mean;
+use super::eyes;
+use super::pipeline::{PruneRule, StepStats, View};
+use super::schedule::Ended;
+use super::{gaussian, median_depth, Did, Mapper, SCENE_DEPTH_M};
+use crate::gpu::GpuError;
+use crate::mem::unsealed;
+
+/// What anchor `$index` sees of the last rendering; fields are borrowed one by one, so that the seeder is still free.
+macro_rules! seen {
+    ($mapper:ident, $index:ident) => {
+        anchors::View {
+            image: $mapper.seeded_from.as_ref().unwrap_or_else(|| $mapper.store.image($index)),
+            valid: $mapper.stereo.valid_mask(),
+            depth: &$mapper.depth,
+            alpha: &$mapper.rendered.alpha,
+            grey: &$mapper.rendered.grey,
+            exposure: $mapper.store.exposure($index),
+            rendered_depth: &$mapper.rendered.depth,
+            camera: $mapper.stereo.camera().pinhole,
+            world_from_cam: $mapper.rectified($index).world_from_cam,
+        }
+    };
+}
+
+/// Steps on an anchor after which what it was given must show.
+const STEPS_OF_PROOF: u32 = 10;
+/// Fewer steps than this and a Gaussian's importance is not known.
+const STEPS_JUDGED: u32 = 30;
+/// Part of the pool that one anchor may evict.
+const EVICTED_MAX: usize = 16;
+/// Part of what is free that a whole uncovered view may take, so that there is always room for the next; and part of
+/// the pool where others are evicted for it.
+const FREE_SHARE: usize = 8;
+const POOL_SHARE: usize = 16;
+
+/// What densification did, until it is known whether it paid.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Added {
+    splats: usize,
+    /// Loss at the start of the burst and at its end, and which step of the mapper that was.
+    first: f64,
+    loss: f64,
+    at: u64,
+}
+
+impl Mapper {
+    /// Stores the oldest waiting keyframe, and makes it an anchor when the map does not show its view, or not well.
+    pub(super) fn take_in(&mut self) -> Result<Did, GpuError> {
+        let Some(keyframe) = self.queue.front() else { return Ok(Did::Idle) };
+        if self.store.is_full() {
+            self.counters.keyframe_store_full.add(1);
+            self.queue.pop();
+            return Ok(Did::Dropped);
+        }
+        let index = self.store.len();
+        for (i, (eye, raw)) in self.eyes.iter().zip(&keyframe.images).enumerate() {
+            self.store.add(keyframe, |image| eyes::draw(i, eye, &mut self.stereo, raw, image));
+            let image = self.store.image(index + i);
+            self.pipeline.set_keyframe(&mut self.gpu, (index + i) as u32, &image.pixels)?;
+        }
+        if let Some(image) = &mut self.seeded_from {
+            self.stereo.rectify(&keyframe.images[0], image);
+        }
+        let did = if self.store.get(index).held_out { Did::Stored } else { self.cover(index)? };
+        self.queue.pop();
+        Ok(did)
+    }
+
+    /// Seeds come of the rectified pair, whatever the lens of what trains.
+    fn rectified(&self, index: usize) -> View {
+        let rect = self.stereo.camera();
+        let world_from_cam = self.store.world_from_body(index) * rect.body_from_rect;
+        View { world_from_cam, camera: rect.pinhole, fisheye: None }
+    }
+
+    fn cover(&mut self, index: usize) -> Result<Did, GpuError> {
+        let view = self.rectified(index);
+        self.pipeline.render(&mut self.gpu, &view, &mut self.rendered)?;
+        self.expose(index);
+        let valid = self.stereo.valid_mask();
+        let uncovered = uncovered(&self.rendered.alpha, valid, self.config.covered_alpha);
+        let bare = uncovered > self.config.anchor_uncovered_min;
+        let wrong = !bare && self.error(index) > self.config.anchor_error_min;
+        if !(bare || wrong) {
+            return Ok(Did::Stored);
+        }
+        let Some(keyframe) = self.queue.front() else { return Ok(Did::Stored) };
+        let [left, right, ..] = &keyframe.images[..] else { return Ok(Did::Stored) };
+        // A pair that cannot be matched gives no depth, and no anchor; the keyframe is still trained on.
+        if unsealed(|| self.stereo.depth(left, right, &mut self.depth)).is_err() {
+            self.counters.depth_failures.add(1);
+            return Ok(Did::Stored);
+        }
+        if self.store.anchors() == 0 {
+            self.scene_depth_m = median_depth(&self.depth.metres).unwrap_or(SCENE_DEPTH_M);
+        }
+        let whole = self.growth.allowed(self.seeds_of_a_view());
+        let wanted = if bare { (uncovered * whole as f64).ceil() as usize } else { 0 };
+        let room = self.make_room(wanted)?;
+        if room == 0 && !self.config.evict {
+            return Ok(Did::Stored);
+        }
+        self.pipeline.open_block(index as u32);
+        self.arrivals.clear();
+        if bare {
+            let points = self.seeder.seed(&seen!(self, index), whole, &self.counters);
+            let anchor = (index / self.eyes.len()) as u32;
+            self.occupancy.claim(&mut self.gpu, anchor, points, &mut self.answers)?;
+            let seeds = self.seeder.settle(&self.answers, room, &self.counters);
+            self.arrivals.extend(seeds.iter().map(gaussian));
+        } else {
+            self.counters.anchors_for_error.add(1);
+        }
+        let seeded = self.pipeline.append(&mut self.gpu, &self.arrivals)? as u32;
+        let entry = self.store.get_mut(index);
+        (entry.anchor, entry.placed) = (true, entry.given);
+        self.added = Added::default();
+        self.schedule.start_burst(index, self.config.burst_iterations);
+        Ok(Did::Anchor { seeded })
+    }
+
+    /// Mean |rendered - seen| over what is covered.
+    fn error(&self, index: usize) -> f64 {
+        let (seen, valid) = (&self.seen_from(index).pixels, self.stereo.valid_mask());
+        let exposure = self.store.exposure(index);
+        let (mut sum, mut n) = (0.0, 0u32);
+        for i in (0..seen.len()).filter(|&i| valid[i] != 0) {
+            if f64::from(self.rendered.alpha[i]) >= self.config.covered_alpha {
+                let seen = exposure.inverse(f64::from(seen[i]) / 255.0);
+                sum += (f64::from(self.rendered.grey[i]) - seen).abs();
+                n += 1;
+            }
+        }
+        sum / f64::from(n.max(1))
+    }
+
+    /// Seeds for a view that is all bare.
+    fn seeds_of_a_view(&self) -> usize {
+        let pool = self.pipeline.shape().splats as usize;
+        let share = if self.config.evict { pool / POOL_SHARE } else { self.room().div_ceil(FREE_SHARE) };
+        share.min(self.config.seeds_per_anchor as usize)
+    }
+
+    /// Removes what is faint, huge or not finite, and where that leaves less room than wanted, the least important.
+    /// Answers the room there is then.
+    fn make_room(&mut self, wanted: usize) -> Result<usize, GpuError> {
+        let mut rule = PruneRule { steps_min: STEPS_JUDGED, ..PruneRule::default() };
+        let mut evicted = 0;
+        if self.config.evict && self.room() < wanted {
+            let bins = self.pipeline.importance(&mut self.gpu, STEPS_JUDGED)?;
+            let most = self.pipeline.shape().splats as usize / EVICTED_MAX;
+            (rule.importance_min, evicted) = threshold(&bins, wanted - self.room(), most);
+        }
+        let removed = self.pipeline.prune(&mut self.gpu, &rule)?;
+        self.counters.splats_evicted.add(evicted.min(removed) as u64);
+        self.counters.splats_pruned.add(removed.saturating_sub(evicted) as u64);
+        Ok(self.room())
+    }
+
+    /// What follows from a step: the next phase of an anchor, and what growth is measured by.
+    pub(super) fn after_step(&mut self, index: usize, done: &StepStats) -> Result<(), GpuError> {
+        let entry = self.store.get_mut(index);
+        let (loss, at) = (entry.loss, entry.trained_at);
+        (entry.loss, entry.trained_at) = (done.loss, self.iterations);
+        let steps = self.iterations - at;
+        if at == 0 && self.schedule.in_burst() {
+            self.added.first = done.loss;
+        }
+        if at > 0 && !self.schedule.on_anchor() {
+            self.growth.observe(loss - done.loss, steps);
+        }
+        match self.schedule.took(done.loss) {
+            Ended::Nothing => {}
+            Ended::Burst(anchor) => {
+                self.added.splats = self.densify(anchor)?;
+                (self.added.loss, self.added.at) = (done.loss, self.iterations);
+                let steps = if self.config.growth_stops { STEPS_OF_PROOF } else { 0 };
+                self.schedule.start_convergence(anchor, steps.max(self.config.converge_iterations_max));
+            }
+            Ended::Convergence(_) if self.config.growth_stops && self.added.splats > 0 => self.judge(done),
+            Ended::Convergence(_) => {}
+        }
+        Ok(())
+    }
+
+    /// Whether what was added to the newest anchor paid for itself.
+    fn judge(&mut self, done: &StepStats) {
+        let a = self.added;
+        let by_training = by_training(a.first - a.loss, self.config.burst_iterations, self.iterations - a.at);
+        let cost = Cost {
+            pixels: self.pipeline.shape().pixels(),
+            pairs: done.stats.intersections,
+            splats: self.pipeline.count(),
+        };
+        let price = self.growth.price(&cost, self.iterations);
+        if !self.growth.judge(a.loss - done.loss - by_training, a.splats, self.store.training().len(), price) {
+            self.counters.growth_refused.add(1);
+        }
+    }
+
+    /// Adds Gaussians where the newest anchor's picture is least like its image; how many. None to fisheye images:
+    /// their pixels are not those of the depth.
+    fn densify(&mut self, index: usize) -> Result<usize, GpuError> {
+        let other_lens = self.seeded_from.is_some();
+        if self.config.densify_max == 0 || other_lens || self.pipeline.newest() != Some(index as u32) {
+            return Ok(0);
+        }
+        let view = self.view(index);
+        self.pipeline.render(&mut self.gpu, &view, &mut self.rendered)?;
+        let goal = self.goal(index);
+        self.pipeline.similarity(&mut self.gpu, goal, &mut self.similarity)?;
+        let lacking = 0.5 * (1.0 - mean(&self.similarity, self.stereo.valid_mask()));
+        let wanted = self.growth.allowed((f64::from(self.config.densify_max) * lacking) as usize);
+        let wanted = wanted.min(self.make_room(wanted)?);
+        let seeds = self.seeder.densify(&seen!(self, index), &self.similarity, wanted, &self.counters);
+        self.arrivals.clear();
+        self.arrivals.extend(seeds.iter().map(gaussian));
+        let added = self.pipeline.append(&mut self.gpu, &self.arrivals)?;
+        self.counters.splats_densified.add(added as u64);
+        Ok(added)
+    }
+}
