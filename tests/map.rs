@@ -211,6 +211,24 @@ fn evaluation_leaves_no_trace() {
 }
 
 #[test]
+fn full_pool_gives_its_least_valuable_for_a_new_view() {
+    let (calibration, keyframes) = flight(8);
+    let run = |evict: &str| {
+        let mut mapper = open(&calibration, &board(&["budget.splats=800", evict]));
+        let mut most = 0;
+        for k in &keyframes {
+            mapper.offer(k);
+            train(&mut mapper, 60);
+            most = most.max(mapper.splat_count());
+        }
+        assert!(most <= 800, "{most}");
+        (mapper.counters().splats_evicted.get(), mapper.counters().splats_densified.get())
+    };
+    let (kept, evicting) = (run("map.evict=false"), run("map.evict=true"));
+    assert!(kept.0 == 0 && evicting.0 > 0 && evicting.1 > kept.1, "{kept:?} {evicting:?}");
+}
+
+#[test]
 fn steps_allocate_nothing() {
     let (calibration, keyframes) = flight(3);
     let mut mapper = open(&calibration, &board(&[]));
