@@ -145,6 +145,26 @@ enum Bench {
         #[arg(long = "set", value_name = "SECTION.KEY=VALUE")]
         set: Vec<String>,
     },
+    /// What a training step costs by kernel, against what the device could do
+    Kernels {
+        #[arg(long, value_name = "DIR")]
+        out: PathBuf,
+        /// Substring of the Vulkan device's name
+        #[arg(long, value_name = "NAME")]
+        device: Option<String>,
+        /// Also on Gaussians seeded from the stereo depth of this recording, at full resolution
+        #[arg(long, value_name = "FOLDER")]
+        recording: Option<PathBuf>,
+        /// One small case
+        #[arg(long)]
+        quick: bool,
+        /// Without subgroups: what every device runs
+        #[arg(long)]
+        baseline: bool,
+        /// Pixels a lane of the raster shades: 2, 4 or 8
+        #[arg(long, value_name = "N", value_parser = clap::builder::PossibleValuesParser::new(["2", "4", "8"]))]
+        column: Option<String>,
+    },
     /// Errors beside what the covariance claims, and beside the quality
     Consistency {
         #[arg(long, value_name = "DIR")]
@@ -184,6 +204,10 @@ fn run(command: Command) -> Result<(), Fault> {
         }
         Command::Bench { what: Bench::Consistency { out, flights } } => {
             bench::consistency::consistency(flights as usize, &out)
+        }
+        Command::Bench { what: Bench::Kernels { out, device, recording, quick, baseline, column } } => {
+            let column = column.and_then(|n| n.parse().ok());
+            bench::kernels::kernels(&bench::kernels::Options { device, recording, quick, baseline, column }, &out)
         }
         Command::Bench { what: Bench::Stability { out, seeds } } => bench::stability::stability(seeds, &out),
     }

@@ -64,3 +64,29 @@ fn quick_map_bench_gives_every_run_the_same_time_and_draws_it() {
     let html = std::fs::read_to_string(out.join("map.html")).unwrap();
     assert!(html.contains("<svg") && html.contains("class=\"default\"") && !html.contains("NaN"));
 }
+
+#[test]
+fn quick_kernel_bench_times_every_kernel_of_a_step() {
+    let dir = tempfile::tempdir().unwrap();
+    let out = dir.path().join("out");
+    let o = Command::new(env!("CARGO_BIN_EXE_stipple"))
+        .args(["bench", "kernels", "--quick", "--out", out.to_str().unwrap()])
+        .output()
+        .unwrap();
+    let said = String::from_utf8_lossy(&o.stderr).into_owned() + &String::from_utf8_lossy(&o.stdout);
+    assert!(o.status.success(), "{said}");
+
+    let json: serde_json::Value = serde_json::from_slice(&std::fs::read(out.join("kernels.json")).unwrap()).unwrap();
+    assert!(json["copy_bytes_per_s"].as_f64().unwrap() > 0.0 && json["fma_flops_per_s"].as_f64().unwrap() > 0.0);
+    let case = &json["cases"][0];
+    assert!(case["steps_per_s"].as_f64().unwrap() > 0.0 && case["visible"].as_f64().unwrap() > 1900.0);
+    let kernels = case["kernels"].as_array().unwrap();
+    for name in ["project", "radix_scatter", "raster_forward", "raster_backward", "ssim_rows", "project_backward"] {
+        let is_it = |k: &&serde_json::Value| k["name"].as_str().unwrap().starts_with(name);
+        let k = kernels.iter().find(is_it).unwrap_or_else(|| panic!("{name} is missing: {kernels:?}"));
+        assert!(k["ms"].as_f64().unwrap() > 0.0 && k["bytes"].as_f64().unwrap() > 0.0, "{k}");
+    }
+    let html = std::fs::read_to_string(out.join("kernels.html")).unwrap();
+    assert!(html.contains("<svg") && !html.contains("NaN"));
+    assert!(std::fs::read_to_string(out.join("kernels.csv")).unwrap().lines().count() > kernels.len());
+}

@@ -28,3 +28,23 @@ fn byte_tables_are_as_reviewed() {
     }
     assert!(boards >= 4);
 }
+
+/// What a small drone's GPU is asked for at most: 100 k grey Gaussians, EuRoC's images, 64 keyframes.
+const DRONE: [&str; 5] = [
+    "budget.splats=100000",
+    "budget.keyframes=64",
+    "budget.image_width_max=752",
+    "budget.image_height_max=480",
+    "budget.intersections=1500000",
+];
+
+#[test]
+fn a_hundred_thousand_gaussians_take_at_most_128_mib_of_the_gpu() {
+    let board = Path::new(env!("CARGO_MANIFEST_DIR")).join("board-configs/x86-igpu.toml");
+    let mut check = Command::new(env!("CARGO_BIN_EXE_stipple"));
+    check.arg("check").arg(board).args(DRONE.iter().flat_map(|s| ["--set", s]));
+    let table = String::from_utf8(check.output().unwrap().stdout).unwrap();
+    let total = table.lines().find(|l| l.contains("gpu  total")).unwrap();
+    let bytes: u64 = total.split_whitespace().next().unwrap().parse().unwrap();
+    assert!(bytes <= 128 << 20, "{table}");
+}

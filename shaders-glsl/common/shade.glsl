@@ -9,7 +9,7 @@ const uint EXPECTED_DEPTH = 1;  // m
 const uint INVERSE_DEPTH = 2;   // 1/m
 const float LOG2_E = 1.4426950408889634;
 
-/// Top pixel of this lane's column of COLUMN pixels.
+/// Top pixel of this lane's column.
 uvec2 column_of(uint tile, uvec2 size) {
     const uint across = tile_grid(size).x;
     const uvec2 corner = uvec2(tile % across, tile / across) * uvec2(TILE_W, TILE_H);

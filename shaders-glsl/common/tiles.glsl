@@ -2,10 +2,10 @@
 // of the ellipse within the row's strip is found in closed form: every tile listed is touched, none
 // is missed (SnugBox/AccuTile of Speedy-Splat, 2024).
 //
-// A tile is as wide as a subgroup (at most 16 px) and every lane shades a column of 8 pixels.
+// A tile is as wide as a subgroup (at most 16 px) and every lane shades a column of COLUMN pixels.
 
 layout(constant_id = 0) const uint LANES = 32;
-const uint COLUMN = 8;
+layout(constant_id = 6) const uint COLUMN = 8;
 const uint TILE_W = LANES < 16 ? LANES : 16;
 const uint TILE_H = LANES * COLUMN / TILE_W;
 

@@ -1,5 +1,6 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
+#extension GL_EXT_control_flow_attributes : require
 // Downsweep of one radix pass: every key and its payload go to their place, stably ordered by digit.
 // In:  keys_in, payload_in, count, table (of radix_count). Out: keys_out, payload_out; sorted_count[0] (first pass).
 //
@@ -56,10 +57,14 @@ void find_places(uint lane, uint group, uint groups) {
     uint shares = max(1u, LANES / digits);
     for (uint i = lane; i < digits * shares; i += LANES) {
         uint digit = i & (digits - 1u), before = 0u, all = 0u;
-        for (uint g = i / digits; g < groups; g += shares) {
-            uint n = table[g * digits + digit];
-            all += n;
-            before += g < group ? n : 0u;
+        // Several reads under way at once: one after another they would take longer than the rest.
+        for (uint g0 = i / digits; g0 < groups; g0 += ROWS * shares) {
+            [[unroll]] for (uint k = 0u; k < ROWS; ++k) {
+                uint g = g0 + k * shares;
+                uint n = g < groups ? table[g * digits + digit] : 0u;
+                all += n;
+                before += g < group ? n : 0u;
+            }
         }
         atomicAdd(next[digit], before);
         atomicAdd(peers_of[digit], all);

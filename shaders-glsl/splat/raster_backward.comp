@@ -42,6 +42,12 @@ layout(set = 0, binding = 5, std430) readonly buffer Rendered { float rendered[]
 layout(set = 0, binding = 6, std430) readonly buffer PixelGradient { float pixel_gradient[]; };
 layout(set = 0, binding = 7, std430) writeonly buffer IsectGradients { float isect_gradients[]; };
 
+Batch fetch(uint at) {
+    const uint isect = intersections[at];
+    const uint slot = owners[isect];
+    return batch_of(projected[slot], CHANNELS == 3 ? tints[slot] : vec2(0.0), isect);
+}
+
 void main() {
     const uint tile = tile_index();
     const uvec2 grid = tile_grid(push.size);
@@ -71,10 +77,12 @@ void main() {
     }
     const uvec2 range = ranges[tile];
     uint base = range.x;
+    Batch coming = fetch(min(base + lane(), max(range.y, 1) - 1));
     for (; base < range.y; base += LANES) {
-        const uint isect = intersections[min(base + lane(), range.y - 1)];
-        const uint slot = owners[isect];
-        batch_put(batch_of(projected[slot], CHANNELS == 3 ? tints[slot] : vec2(0.0), isect));
+        batch_put(coming);
+        if (base + LANES < range.y) {
+            coming = fetch(min(base + LANES + lane(), range.y - 1));
+        }
         const uint n = min(LANES, range.y - base);
         for (uint j = 0; j < n; ++j) {
             const Batch b = batch_get(j);

@@ -1,4 +1,4 @@
-// Blends the Gaussians of each tile front to back: one column of 8 pixels a lane.
+// Blends the Gaussians of each tile front to back: one column of pixels a lane.
 // in   ranges, intersections (by tile, then depth), owners, projected; tints (green, blue) with three CHANNELS
 // out  rendered, in planes: the colour's CHANNELS; transmittance; and by DEPTH
 //      0 nothing   1 expected depth Σ w z / Σ w, m   2 accumulated inverse depth Σ w / z, 1/m
@@ -34,6 +34,11 @@ layout(set = 0, binding = 3, std430) readonly buffer ProjectedIn { Projected pro
 layout(set = 0, binding = 4, std430) readonly buffer Tints { vec2 tints[]; };
 layout(set = 0, binding = 5, std430) writeonly buffer Rendered { float rendered[]; };
 
+Batch fetch(uint at) {
+    const uint slot = owners[intersections[at]];
+    return batch_of(projected[slot], CHANNELS == 3 ? tints[slot] : vec2(0.0), 0);
+}
+
 void main() {
     const uint tile = tile_index();
     const uvec2 grid = tile_grid(push.size);
@@ -51,9 +56,13 @@ void main() {
         z[k] = 0.0;
     }
     const uvec2 range = ranges[tile];
+    // The next batch is on its way while this one is drawn.
+    Batch coming = fetch(min(range.x + lane(), max(range.y, 1) - 1));
     for (uint base = range.x; base < range.y; base += LANES) {
-        const uint slot = owners[intersections[min(base + lane(), range.y - 1)]];
-        batch_put(batch_of(projected[slot], CHANNELS == 3 ? tints[slot] : vec2(0.0), 0));
+        batch_put(coming);
+        if (base + LANES < range.y) {
+            coming = fetch(min(base + LANES + lane(), range.y - 1));
+        }
         const uint n = min(LANES, range.y - base);
         for (uint j = 0; j < n; ++j) {
             const Column s = column_terms(batch_get(j), top);

@@ -1,6 +1,6 @@
 //! `stipple bench`: what the estimator's parameters cost and what they buy (`odometry`), what becomes of it
-//! when something goes wrong (`stability`), whether it is as good as it says (`consistency`), and what a map is
-//! worth at equal time (`map`).
+//! when something goes wrong (`stability`), whether it is as good as it says (`consistency`), what a map is
+//! worth at equal time (`map`), and what a training step costs by kernel (`kernels`).
 //!
 //! `odometry` flies every input with the defaults and with one parameter at a time moved away
 //! from them, frontend and estimator on the calling thread, in lockstep, without a mapper. It
@@ -10,6 +10,7 @@
 pub mod consistency;
 pub mod flight;
 mod inputs;
+pub mod kernels;
 pub mod map;
 mod measure;
 mod page;

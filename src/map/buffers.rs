@@ -35,7 +35,7 @@ pub const RUN: u32 = 8;
 pub const GROUP: u32 = 64;
 /// Bins of importance.comp.
 pub const IMPORTANCE_BINS: usize = 256;
-/// Narrowest tile, px: what the narrowest subgroup makes of it.
+/// Side of the smallest tile, px: 8 lanes with columns of 8, or 32 with columns of 2.
 const TILE_MIN: u32 = 8;
 
 impl Shape {
@@ -87,7 +87,8 @@ impl Shape {
     }
 
     fn tiles_max(&self) -> usize {
-        self.width.div_ceil(TILE_MIN) as usize * self.height.div_ceil(TILE_MIN) as usize
+        // Half as wide and twice as high is as much, but for a ragged edge.
+        (self.width.div_ceil(TILE_MIN) + 1) as usize * self.height.div_ceil(TILE_MIN) as usize
     }
 }
 

@@ -23,6 +23,7 @@ pub mod quality;
 pub mod refine;
 pub mod schedule;
 pub mod sort;
+pub mod tiling;
 pub mod view;
 
 use crate::config::{Board, MapConfig, Projection};

@@ -8,9 +8,9 @@
 //! raster_backward -> project_backward (Adam) -> summary   -> gradient by intersection -> Gaussian
 //! ```
 //!
-//! Counts stay on the GPU: every dispatch is sized by capacity and ends early. A submission
-//! ends by bringing 64 bytes to the host. Sums have one order, so that a step is the same in every run (3D Gaussian splatting: Kerbl et al. 2023;
-//! one gradient slot per intersection instead of atomics).
+//! Counts stay on the GPU: every dispatch is sized by capacity and ends early. A submission ends by bringing
+//! 64 bytes to the host. Sums have one order, so that a step is the same in every run (3D Gaussian splatting:
+//! Kerbl et al. 2023; one gradient slot per intersection instead of atomics).
 
 use super::blocks::Block;
 pub use super::buffers::Shape;
@@ -18,11 +18,12 @@ use super::buffers::{image_groups, Buffers, ARRIVALS, GROUP, RUN};
 use super::harmonics::Harmonics;
 pub use super::pool::{PruneRule, SplatInit};
 use super::sort::{Pairs, Scan, Sorter};
+pub use super::tiling::Tiling;
 use super::view::{camera, pose_gradient, size, stats};
 pub use super::view::{Exposure, Fisheye, Goal, LearningRates, Rendered, Stats, StepStats, View, Weights};
 use crate::gpu::kernels::types::{Splat, Status};
 use crate::gpu::kernels::*;
-use crate::gpu::{Caps, Gpu, GpuError, Kernel, KernelDef, Recorder, Threads};
+use crate::gpu::{Gpu, GpuError, Kernel, KernelDef, Recorder, Threads};
 use crate::limits::CAMERAS_MAX;
 use crate::mem::Footprint;
 use stipple_drivers::{Exit, Fault};
@@ -32,8 +33,6 @@ const DEPTH_BITS: u32 = 16;
 /// What the raster blends beside the colour: shade.glsl.
 const EXPECTED_DEPTH: u32 = 1;
 const INVERSE_DEPTH: u32 = 2;
-/// Pixels of a lane's column: COLUMN of tiles.glsl.
-const COLUMN: u32 = 8;
 
 /// The raster both ways; what is blended beside the colour is compiled in.
 struct Raster {
@@ -85,8 +84,7 @@ impl<K> ByLens<K> {
 
 pub struct Pipeline {
     pub(super) shape: Shape,
-    /// Invocations that shade a tile in step.
-    lanes: u32,
+    tiling: Tiling,
     pub(super) k: Kernels,
     pub(super) b: Buffers,
     /// Where a colour is more than one grey level.
@@ -122,12 +120,13 @@ impl Pipeline {
     }
 
     pub fn new(gpu: &mut Gpu, shape: Shape) -> Result<Pipeline, Fault> {
-        let (lanes, variant) = raster_variant(gpu.caps());
-        Pipeline::with_lanes(gpu, shape, lanes, variant)
+        let tiling = Tiling::of(gpu.caps());
+        Pipeline::with_tiling(gpu, shape, tiling)
     }
 
-    /// As `new`, with the raster variant chosen: `("", 32)` is the baseline that every device runs.
-    pub fn with_lanes(gpu: &mut Gpu, shape: Shape, lanes: u32, variant: &str) -> Result<Pipeline, Fault> {
+    /// As `new`, with the raster chosen.
+    pub fn with_tiling(gpu: &mut Gpu, shape: Shape, tiling: Tiling) -> Result<Pipeline, Fault> {
+        let Tiling { lanes, column, variant } = tiling;
         if shape.width == 0
             || shape.height == 0
             || shape.splats == 0
@@ -145,19 +144,16 @@ impl Pipeline {
         let channels = shape.channels;
         let k = Kernels {
             project: ByLens {
-                pinhole: gpu.kernel::<project::K>(project::Spec { lanes, fisheye: false })?,
-                fisheye: gpu.kernel::<project::K>(project::Spec { lanes, fisheye: true })?,
+                pinhole: gpu.kernel::<project::K>(project::Spec { lanes, column, fisheye: false })?,
+                fisheye: gpu.kernel::<project::K>(project::Spec { lanes, column, fisheye: true })?,
             },
-            count_tiles: gpu.kernel::<count_tiles::K>(count_tiles::Spec { lanes })?,
-            emit_tiles: gpu.kernel::<emit_tiles::K>(emit_tiles::Spec { lanes })?,
+            count_tiles: gpu.kernel::<count_tiles::K>(count_tiles::Spec { lanes, column })?,
+            emit_tiles: gpu.kernel::<emit_tiles::K>(emit_tiles::Spec { lanes, column })?,
             tile_ranges: plain::<tile_ranges::K>(gpu)?,
-            raster: Raster::new(gpu, lanes, variant, 0, &shape)?,
-            raster_depth: shape
-                .inverse_depth
-                .then(|| Raster::new(gpu, lanes, variant, INVERSE_DEPTH, &shape))
-                .transpose()?,
+            raster: Raster::new(gpu, tiling, 0, &shape)?,
+            raster_depth: shape.inverse_depth.then(|| Raster::new(gpu, tiling, INVERSE_DEPTH, &shape)).transpose()?,
             raster_picture: gpu.kernel_variant::<raster_forward::K>(
-                raster_forward::Spec { lanes, depth: EXPECTED_DEPTH, channels },
+                raster_forward::Spec { lanes, column, depth: EXPECTED_DEPTH, channels },
                 variant,
             )?,
             ssim_rows: plain::<ssim_rows::K>(gpu)?,
@@ -177,7 +173,7 @@ impl Pipeline {
         };
         let mut p = Pipeline {
             shape,
-            lanes,
+            tiling,
             k,
             b: Buffers::new(gpu, &shape)?,
             harmonics: (shape.colour_extra() > 0).then(|| Harmonics::new(gpu, &shape)).transpose()?,
@@ -325,7 +321,7 @@ impl Pipeline {
     }
 
     fn tiles(&self, view: &View) -> u32 {
-        let (tw, th) = (self.lanes.min(16), COLUMN * self.lanes / self.lanes.min(16));
+        let [tw, th] = self.tiling.tile();
         (view.camera.width as u32).div_ceil(tw) * (view.camera.height as u32).div_ceil(th)
     }
 
@@ -400,7 +396,7 @@ impl Pipeline {
                 rendered: b.rendered.write(),
             },
             raster_forward::Push { size },
-            Threads::d1(tiles * self.lanes),
+            Threads::d1(tiles * self.tiling.lanes),
         );
         sorted
     }
@@ -499,7 +495,7 @@ impl Pipeline {
                 isect_gradients: b.over.isect_gradients.write(),
             },
             raster_backward::Push { size },
-            Threads::d1((self.tiles(view) + 1) * self.lanes),
+            Threads::d1((self.tiles(view) + 1) * self.tiling.lanes),
         );
         if let Some(h) = &self.harmonics {
             h.record_update(rec, b, view, self.high_water, rates);
@@ -557,23 +553,13 @@ impl Pipeline {
 }
 
 impl Raster {
-    fn new(gpu: &mut Gpu, lanes: u32, variant: &str, depth: u32, shape: &Shape) -> Result<Raster, Fault> {
+    fn new(gpu: &mut Gpu, tiling: Tiling, depth: u32, shape: &Shape) -> Result<Raster, Fault> {
+        let Tiling { lanes, column, variant } = tiling;
         let (channels, degree) = (shape.channels, shape.sh_degree);
         Ok(Raster {
-            forward: gpu.kernel_variant(raster_forward::Spec { lanes, depth, channels }, variant)?,
-            backward: gpu.kernel_variant(raster_backward::Spec { lanes, depth, channels, degree }, variant)?,
+            forward: gpu.kernel_variant(raster_forward::Spec { lanes, column, depth, channels }, variant)?,
+            backward: gpu.kernel_variant(raster_backward::Spec { lanes, column, depth, channels, degree }, variant)?,
         })
-    }
-}
-
-/// How many lanes shade a tile on this device, and by which variant of the raster.
-pub fn raster_variant(caps: &Caps) -> (u32, &'static str) {
-    // Intel's compiler picks a width per kernel, narrower than the one it reports.
-    let fixed_width = !caps.name.contains("Intel");
-    let sub = caps.subgroup.vote && caps.subgroup.shuffle && fixed_width;
-    match caps.subgroup_size {
-        n @ (8 | 16 | 32 | 64) if sub => (n.min(32), "subgroup"),
-        _ => (32, ""),
     }
 }
 

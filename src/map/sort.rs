@@ -24,7 +24,7 @@ struct Cut {
 /// wide digit saves whole passes.
 const CPU: Cut = Cut { digit_bits: 11, groups: 32, keys_min: 1024, lanes: 32 };
 /// A GPU hides latency with many workgroups. 8 KiB of shared memory let many be resident.
-const GPU: Cut = Cut { digit_bits: 8, groups: 256, keys_min: 512, lanes: 256 };
+const GPU: Cut = Cut { digit_bits: 8, groups: 256, keys_min: 1024, lanes: 256 };
 /// Words of the digit table: digits x workgroups.
 const TABLE_LEN: usize = 1 << 16;
 /// Most blocks of a scan: their sums are scanned by one workgroup.

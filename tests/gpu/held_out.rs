@@ -3,7 +3,6 @@
 
 use super::splat::{psnr, render, write_png, Rng};
 use glam::{DQuat, DVec3};
-use stipple::config::GpuConfig;
 use stipple::gpu::Gpu;
 use stipple::map::pipeline::{LearningRates, Pipeline, Shape, SplatInit, View, Weights};
 use stipple::stereo::Pinhole;
@@ -61,7 +60,7 @@ fn held_out_views_by_regulariser() {
         cameras: 1,
         inverse_depth: false,
     };
-    let mut gpu = Gpu::open(&GpuConfig::default(), Pipeline::arena_bytes(&s)).unwrap();
+    let mut gpu = Gpu::open(&crate::config(), Pipeline::arena_bytes(&s)).unwrap();
     let mut p = Pipeline::new(&mut gpu, s).unwrap();
     let training: Vec<View> =
         (0..TRAINED).map(|i| view(-0.5 + 0.2 * i as f64, 0.1 * (i % 3) as f64, 0.04 * (i % 2) as f64)).collect();

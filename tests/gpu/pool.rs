@@ -3,7 +3,6 @@
 use super::splat::{open, render, scene, shape, target, train, view, Rng};
 use super::twins::pool::{self, Moved};
 use glam::{DQuat, DVec3, DVec4, Vec4};
-use stipple::config::GpuConfig;
 use stipple::gpu::kernels::types::{Moments, Splat};
 use stipple::gpu::{Gpu, GpuOptions};
 use stipple::map::blocks::importance_of_bin;
@@ -188,7 +187,7 @@ fn training_goes_on_after_a_move_as_if_nothing_happened() {
 fn the_validation_layer_is_silent_about_the_pool() {
     let v = view(33, 21);
     let s = shape(&v, 64, 4096);
-    let opened = Gpu::open_with(&GpuConfig::default(), Pipeline::arena_bytes(&s), GpuOptions { validation: true });
+    let opened = Gpu::open_with(&crate::config(), Pipeline::arena_bytes(&s), GpuOptions { validation: true });
     let mut gpu = match opened {
         Ok(gpu) => gpu,
         Err(fault) => return println!("ignored: the_validation_layer_is_silent_about_the_pool: {fault}"),

@@ -5,10 +5,9 @@ use super::splat::{mask, open_with, scene, shape, view, worst, Rng, STILL};
 use super::twins::project::{parameters, Parameters};
 use super::twins::raster::{backward, forward, Flat, Planes};
 use super::twins::{descend, project_all};
-use stipple::config::GpuConfig;
 use stipple::gpu::kernels::{raster_backward, raster_forward, types::Projected};
 use stipple::gpu::{Buf, Gpu, Threads};
-use stipple::map::pipeline::{raster_variant, SplatInit, View, Weights};
+use stipple::map::pipeline::{SplatInit, Tiling, View, Weights};
 
 const W: usize = 37;
 const H: usize = 21;
@@ -77,8 +76,7 @@ fn raster_twin_agrees_with_finite_differences() {
 /// One run of both kernels over lists in which every tile has every Gaussian.
 struct Rig {
     gpu: Gpu,
-    lanes: u32,
-    variant: &'static str,
+    tiling: Tiling,
 }
 
 impl Rig {
@@ -89,13 +87,13 @@ impl Rig {
     }
 
     fn tiles(&self) -> u32 {
-        let width = self.lanes.min(16);
-        (W as u32).div_ceil(width) * (H as u32).div_ceil(8 * self.lanes / width)
+        let [width, height] = self.tiling.tile();
+        (W as u32).div_ceil(width) * (H as u32).div_ceil(height)
     }
 
     /// What was rendered, and the gradient by each Gaussian in the words of its slot.
     fn run(&mut self, splats: &[Flat], v: &Planes, channels: u32, depth: u32) -> (Vec<f32>, Vec<Vec<f64>>) {
-        let (lanes, variant, tiles, n) = (self.lanes, self.variant, self.tiles(), splats.len() as u32);
+        let (Tiling { lanes, column, variant }, tiles, n) = (self.tiling, self.tiles(), splats.len() as u32);
         let slot_words = if channels == 3 { 12 } else { 8 };
         let records: Vec<Projected> = splats
             .iter()
@@ -113,9 +111,9 @@ impl Rig {
         let rendered = self.upload(&vec![0f32; (channels as usize + 2) * W * H]);
         let gradients = self.upload(&vec![f32::NAN; tiles as usize * splats.len() * slot_words]);
 
-        let spec = raster_forward::Spec { lanes, depth, channels };
+        let spec = raster_forward::Spec { lanes, column, depth, channels };
         let forward = self.gpu.kernel_variant::<raster_forward::K>(spec, variant).unwrap();
-        let spec = raster_backward::Spec { lanes, depth, channels, degree: 0 };
+        let spec = raster_backward::Spec { lanes, column, depth, channels, degree: 0 };
         let backward = self.gpu.kernel_variant::<raster_backward::K>(spec, variant).unwrap();
         let size = [W as u32, H as u32];
         let mut rec = self.gpu.record();
@@ -155,12 +153,12 @@ impl Rig {
 }
 
 fn rigs() -> Vec<Rig> {
-    let open = |baseline| {
-        let gpu = Gpu::open(&GpuConfig::default(), 8 << 20).unwrap();
-        let (lanes, variant) = if baseline { (32, "") } else { raster_variant(gpu.caps()) };
-        Rig { gpu, lanes, variant }
+    let open = |baseline, column| {
+        let gpu = Gpu::open(&crate::config(), 8 << 20).unwrap();
+        let tiling = if baseline { Tiling::BASELINE } else { Tiling::of(gpu.caps()) };
+        Rig { gpu, tiling: Tiling { column, ..tiling } }
     };
-    vec![open(true), open(false)]
+    vec![open(true, 8), open(true, 4), open(false, 8), open(false, 4), open(false, 2)]
 }
 
 fn close(got: impl IntoIterator<Item = f32>, want: &[f64], tolerance: f64, what: &str) {
@@ -177,7 +175,7 @@ fn both_rasters_agree_with_their_twin_in_grey_and_colour_with_and_without_depth(
     assert!(twin.margin > 1e-6, "a decision is too close to compare: {}", twin.margin);
     for mut rig in rigs() {
         for (channels, depth) in [(1, 0), (1, INVERSE_DEPTH), (3, 0), (3, INVERSE_DEPTH)] {
-            let case = format!("{} lanes {:?}, {channels} channels, depth {depth}", rig.lanes, rig.variant);
+            let case = format!("{:?}, {channels} channels, depth {depth}", rig.tiling);
             let v = planes(channels as usize, depth != 0, 6);
             let want = backward(&some, W, H, &v);
             let (picture, got) = rig.run(&splats, &v, channels, depth);

@@ -1,6 +1,5 @@
 //! Radix sort and prefix sum against their CPU twins, bit for bit.
 
-use stipple::config::GpuConfig;
 use stipple::gpu::{Buf, Gpu};
 use stipple::map::sort::{Pairs, Scan, Sorter, NONE};
 
@@ -50,7 +49,7 @@ struct Rig {
 impl Rig {
     fn new(capacity: usize) -> Rig {
         let bytes = Sorter::footprint().gpu_total() + (capacity as u64) * 16 + (1 << 20);
-        let mut gpu = Gpu::open(&GpuConfig::default(), bytes).expect("a Vulkan device");
+        let mut gpu = Gpu::open(&crate::config(), bytes).expect("a Vulkan device");
         let sorter = Sorter::new(&mut gpu).unwrap();
         let scan = Scan::new(&mut gpu).unwrap();
         let mut pairs =

@@ -6,7 +6,7 @@ use glam::{DQuat, DVec3};
 use stipple::config::GpuConfig;
 use stipple::gpu::{Gpu, GpuOptions};
 use stipple::map::pipeline::{
-    LearningRates, Pipeline, PruneRule, Rendered, Shape, SplatInit, StepStats, View, Weights,
+    LearningRates, Pipeline, PruneRule, Rendered, Shape, SplatInit, StepStats, Tiling, View, Weights,
 };
 use stipple::stereo::Pinhole;
 use stipple_drivers::Pose;
@@ -91,7 +91,8 @@ pub fn open(shape: Shape) -> (Gpu, Pipeline) {
 
 /// With or without what only some devices have.
 pub fn open_with(shape: Shape, baseline: bool) -> (Gpu, Pipeline) {
-    let config = GpuConfig { subgroups: !baseline, ..GpuConfig::default() };
+    let config = crate::config();
+    let config = GpuConfig { subgroups: config.subgroups && !baseline, ..config };
     let mut gpu = Gpu::open(&config, Pipeline::arena_bytes(&shape)).unwrap();
     let p = Pipeline::new(&mut gpu, shape).unwrap();
     (gpu, p)
@@ -154,13 +155,13 @@ pub fn compare_differences(v: &View, splats: &[SplatInit]) {
 }
 
 /// Everything a step leaves behind, beside what its twin says.
-pub fn compare_step(v: &View, splats: &[SplatInit], lanes: Option<(u32, &str)>) {
+pub fn compare_step(v: &View, splats: &[SplatInit], tiling: Option<Tiling>) {
     let (w, h) = (v.camera.width, v.camera.height);
     let n = splats.len();
     let s = shape(v, n as u32, 1 << 16);
-    let mut gpu = Gpu::open(&GpuConfig::default(), Pipeline::arena_bytes(&s)).unwrap();
-    let mut p = match lanes {
-        Some((lanes, variant)) => Pipeline::with_lanes(&mut gpu, s, lanes, variant).unwrap(),
+    let mut gpu = Gpu::open(&crate::config(), Pipeline::arena_bytes(&s)).unwrap();
+    let mut p = match tiling {
+        Some(tiling) => Pipeline::with_tiling(&mut gpu, s, tiling).unwrap(),
         None => Pipeline::new(&mut gpu, s).unwrap(),
     };
     assert_eq!(p.append(&mut gpu, splats).unwrap(), n);
@@ -241,7 +242,7 @@ fn every_stage_agrees_with_its_twin() {
 #[test]
 fn the_baseline_without_subgroups_agrees_with_its_twin() {
     let v = view(33, 21);
-    compare_step(&v, &scene(40, &v, 1), Some((32, "")));
+    compare_step(&v, &scene(40, &v, 1), Some(Tiling::BASELINE));
 }
 
 #[test]
@@ -420,7 +421,7 @@ pub fn write_png(name: &str, picture: &[f32], goal: &[u8], width: usize, height:
 fn the_validation_layer_is_silent() {
     let v = view(33, 21);
     let s = shape(&v, 64, 4096);
-    let opened = Gpu::open_with(&GpuConfig::default(), Pipeline::arena_bytes(&s), GpuOptions { validation: true });
+    let opened = Gpu::open_with(&crate::config(), Pipeline::arena_bytes(&s), GpuOptions { validation: true });
     let mut gpu = match opened {
         Ok(gpu) => gpu,
         Err(fault) => return println!("ignored: the_validation_layer_is_silent: {fault}"),

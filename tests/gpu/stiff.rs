@@ -172,7 +172,8 @@ fn black_and_saturated_images_are_learnt() {
     for level in [0, 255] {
         let goal = vec![level; 33 * 21];
         let map = survives(&v, &scene(100, &v, 3), &goal, 150);
-        assert!(map.iter().all(|s| (0.0..=1.0).contains(&s.colour)));
+        // COLOUR_MAX of project_backward: a keyframe's exposure may darken it again.
+        assert!(map.iter().all(|s| (0.0..=8.0).contains(&s.colour)));
     }
 }
 
