@@ -31,8 +31,8 @@ Ellipse ellipse_of(Projected g, uvec2 size) {
     e.t = 2.0 * log(g.conic_shade.y / ALPHA_MIN) * 1.001 + 0.001;
     e.det = max(e.conic.x * e.conic.z - e.conic.y * e.conic.y, 1e-12);
     const float extent = sqrt(e.t * e.conic.x / e.det);
-    const float top = clamp(e.centre.y - extent, -1.0, float(size.y) + 1.0);
-    const float bottom = clamp(e.centre.y + extent, -1.0, float(size.y) + 1.0);
+    const float top = clamp(e.centre.y - extent, -1.0, float(size.y + TILE_H));
+    const float bottom = clamp(e.centre.y + extent, -1.0, float(size.y + TILE_H));
     // pixel centres of row r of tiles: r·H + ½ .. (r+1)·H - ½
     e.rows.x = max(0, int(ceil((top - float(TILE_H) + 0.5) / float(TILE_H))));
     e.rows.y = min(int(tile_grid(size).y) - 1, int(floor((bottom - 0.5) / float(TILE_H))));
@@ -53,8 +53,8 @@ ivec2 columns_of(Ellipse e, int row, uvec2 size) {
     const float v1 = clamp(y_right, y0, y1), v0 = clamp(-y_right, y0, y1);
     const float d1 = sqrt(max(0.0, b * b * v1 * v1 - a * (c * v1 * v1 - e.t)));
     const float d0 = sqrt(max(0.0, b * b * v0 * v0 - a * (c * v0 * v0 - e.t)));
-    const float right = clamp(e.centre.x + (-b * v1 + d1) / a, -1.0, float(size.x) + 1.0);
-    const float left = clamp(e.centre.x + (-b * v0 - d0) / a, -1.0, float(size.x) + 1.0);
+    const float right = clamp(e.centre.x + (-b * v1 + d1) / a, -1.0, float(size.x + TILE_W));
+    const float left = clamp(e.centre.x + (-b * v0 - d0) / a, -1.0, float(size.x + TILE_W));
     return ivec2(max(0, int(ceil((left - float(TILE_W) + 0.5) / float(TILE_W)))),
                  min(int(tile_grid(size).x) - 1, int(floor((right - 0.5) / float(TILE_W)))));
 }

@@ -146,7 +146,8 @@ fn a_turned_block_looks_from_a_turned_camera_as_it_did() {
     let before = view(W, H);
     let splats = scene(60, &before, 3);
     for form in [(1, 3), (3, 1), (3, 2), (3, 3)] {
-        let (mut gpu, mut p) = coloured(&before, &splats, &coefficients(60, form.0, form.1), form);
+        let extra = coefficients(60, form.0, form.1);
+        let (mut gpu, mut p) = coloured(&before, &splats, &extra, form);
         let planes = |gpu: &mut Gpu, p: &mut Pipeline, v: &View| {
             let mut planes = vec![0f32; form.0 * W * H];
             super::splat::render(gpu, p, v);
@@ -156,6 +157,13 @@ fn a_turned_block_looks_from_a_turned_camera_as_it_did() {
         let seen = planes(&mut gpu, &mut p, &before);
         let by = Pose::new(DQuat::from_scaled_axis(DVec3::new(0.7, -1.1, 0.4)), DVec3::new(0.3, -0.2, 0.5));
         p.move_blocks(&mut gpu, [(0, by)].into_iter()).unwrap();
+        let mut turned = Vec::new();
+        p.download_colours(&mut gpu, &mut turned).unwrap();
+        let (stride, first) = (form.0, form.0 - 1);
+        let channel: Vec<f64> = extra[0][first..].iter().step_by(stride).copied().collect();
+        let got: Vec<f64> = wide(&turned[first..extra[0].len()]).into_iter().step_by(stride).collect();
+        let want = harmonics::harmonics_turn(&channel, by.q, form.1);
+        assert!(got.iter().zip(&want).all(|(g, w)| (g - w).abs() < 2e-3), "{form:?}: {got:?} against {want:?}");
         let after = View { world_from_cam: by * before.world_from_cam, ..before };
         let moved = planes(&mut gpu, &mut p, &after);
         let worst = seen.iter().zip(&moved).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);

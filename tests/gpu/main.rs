@@ -11,6 +11,7 @@ mod raster;
 mod sort;
 mod splat;
 mod stiff;
+mod tiles;
 mod twins;
 
 use stipple::config::GpuConfig;

@@ -5,7 +5,7 @@ use stipple::map::sort::{Pairs, Scan, Sorter, NONE};
 
 const CAPACITY: usize = 40_000;
 
-/// Twin of `Sorter::record`: a stable sort of the first `count` keys that are not NONE by the low `bits`.
+/// Twin of `Sorter::record`, passes of radix_count.comp and radix_scatter.comp: a stable sort of the first `count` keys that are not NONE by the low `bits`.
 fn sorted(keys: &[u32], count: usize, bits: u32) -> (Vec<u32>, Vec<u32>) {
     let n = count.min(keys.len());
     let mask = u32::MAX >> (32 - bits);
@@ -14,7 +14,7 @@ fn sorted(keys: &[u32], count: usize, bits: u32) -> (Vec<u32>, Vec<u32>) {
     (order.iter().map(|&i| keys[i as usize]).collect(), order)
 }
 
-/// Twin of `Scan::record_counted`.
+/// Twin of `Scan::record_counted`, scan_reduce.comp and scan_apply.comp.
 fn scanned(data: &[u32], count: usize) -> Vec<u32> {
     let mut sum = 0u32;
     let mut out = data.to_vec();

@@ -1,5 +1,4 @@
 //! Twin of harmonics.comp and harmonics_backward.comp: colours by the definition of real spherical harmonics.
-//! harmonics_turn.comp has none: what it must do is that a turned map looks turned.
 
 use super::project::Parameters;
 use super::raster::{self, Planes};
@@ -135,4 +134,22 @@ pub fn grey_agrees(splats: &[Parameters], view: &View, v: &Planes) -> bool {
     let none = vec![Vec::new(); splats.len()];
     let coloured = step(splats, &none, view, &[0.0; 6], v, (1, 0));
     plain.0.iter().flatten().zip(coloured.splats.iter().flatten()).all(|(a, b)| (a - b).abs() < 1e-12)
+}
+
+/// Twin of harmonics_turn.comp: one channel's coefficients after their Gaussian was turned, each the integral over the
+/// sphere of the turned colour times its function, by the midpoint rule.
+pub fn harmonics_turn(c: &[f64], by: glam::DQuat, degree: usize) -> Vec<f64> {
+    const N: usize = 60;
+    let mut out = vec![0.0; c.len()];
+    for i in 0..2 * N {
+        for j in 0..N {
+            let phi = std::f64::consts::PI * (i as f64 + 0.5) / N as f64;
+            let theta = std::f64::consts::PI * (j as f64 + 0.5) / N as f64;
+            let d = DVec3::new(theta.sin() * phi.cos(), theta.sin() * phi.sin(), theta.cos());
+            let area = theta.sin() * (std::f64::consts::PI / N as f64).powi(2);
+            let seen: f64 = c.iter().zip(basis(by.conjugate() * d, degree)).map(|(c, y)| c * y).sum();
+            out.iter_mut().zip(basis(d, degree)).for_each(|(o, y)| *o += area * seen * y);
+        }
+    }
+    out
 }
