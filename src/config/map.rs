@@ -18,10 +18,12 @@ pub struct MapConfig {
     pub enabled: bool,
     /// Mapping resolution divisor: 1, 2 or 4.
     pub scale: u32,
-    /// How many of the rig's cameras train; rectified views are two at most.
+    /// How many of the rig's cameras train; rectified views are two at most. Held out, EuRoC V1_01's left view after
+    /// 12 000 steps: 22.0 dB trained on it alone, 21.9 dB on both, for 92 MB more.
     pub cameras: u32,
     pub projection: Projection,
-    /// Of the spherical harmonics of a colour: 0 is the same from everywhere.
+    /// Of the spherical harmonics of a colour: 0 is the same from everywhere. After as many steps there: degree 0 22.03 dB
+    /// held out (27.65 in training), degree 1 22.12 (27.93) for 7 % of a step's time and 50 MB, degree 2 22.07 (28.03).
     pub sh_degree: u32,
     /// A keyframe becomes an anchor when more than this fraction of its valid view is uncovered
     /// (rendered alpha under `covered_alpha`).

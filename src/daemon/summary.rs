@@ -154,6 +154,7 @@ fn map_figures(report: &mut Report, q: &Evaluation) {
     report.psnr_heldout_fitted_db = q.psnr_heldout_fitted_db;
     report.ssim_heldout_fitted = q.ssim_heldout_fitted;
     report.psnr_heldout_aligned_db = q.psnr_heldout_aligned_db;
+    report.psnr_heldout_by_camera_db = q.psnr_heldout_by_camera_db.to_vec();
 }
 
 type Measured = (Evaluation, Vec<Panel>, Drawn);

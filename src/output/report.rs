@@ -64,6 +64,8 @@ pub struct Report {
     pub ssim_heldout_fitted: Option<f64>,
     /// With its pose refined on its image alone as well.
     pub psnr_heldout_aligned_db: Option<f64>,
+    /// Held out, of each camera that trains.
+    pub psnr_heldout_by_camera_db: Vec<Option<f64>>,
     pub splats: Option<u64>,
     pub iterations: Option<u64>,
     pub iteration_ms_p50: Option<f64>,
