@@ -47,13 +47,13 @@ fn projected(e: &Ellipse) -> Projected {
 fn lists_of_tiles_equal_their_twins() {
     let all = ellipses(400);
     let n = all.len() as u32;
-    for lanes in [8, 32] {
-        let tile = [lanes.min(16) as usize, (8 * lanes / lanes.min(16)) as usize];
+    for (lanes, column) in [(8, 8), (32, 8), (32, 4)] {
+        let tile = [lanes.min(16) as usize, (column * lanes / lanes.min(16)) as usize];
         let grid = Grid { width: SIZE[0] as usize, height: SIZE[1] as usize, tile };
         let tiles = grid.columns() * grid.rows();
         let mut gpu = Gpu::open(&GpuConfig::default(), 16 << 20).unwrap();
-        let count_kernel = gpu.kernel::<count_tiles::K>(count_tiles::Spec { lanes }).unwrap();
-        let emit_kernel = gpu.kernel::<emit_tiles::K>(emit_tiles::Spec { lanes }).unwrap();
+        let count_kernel = gpu.kernel::<count_tiles::K>(count_tiles::Spec { lanes, column }).unwrap();
+        let emit_kernel = gpu.kernel::<emit_tiles::K>(emit_tiles::Spec { lanes, column }).unwrap();
         let ranges_kernel = gpu.kernel::<tile_ranges::K>(Default::default()).unwrap();
         let visible_count = upload(&mut gpu, &[n]);
         let slots: Vec<u32> = (0..n).rev().collect();
