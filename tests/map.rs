@@ -279,6 +279,34 @@ fn recorded_room_becomes_a_map() {
     assert!(quality.psnr_heldout_db.unwrap() > 13.0, "{quality:?}");
 }
 
+/// The map that steps on a recording's keyframes leave, bit by bit.
+fn same_twice(keyframes: usize, steps: u32, at_least: u64) {
+    let Some(path) = recording("euroc_V1_01_easy_keyframes") else {
+        return println!("ignored: same_twice: no recordings");
+    };
+    let recording = Recording::open(&path, &OpenOptions::default()).unwrap();
+    let run = || {
+        let mut mapper = open(&recording.calibration, &board(&["map.scale=4"]));
+        play(&mut mapper, &recording, keyframes, steps);
+        assert!(mapper.iterations() >= at_least && mapper.splat_count() > 1000);
+        mapper.splats().unwrap()
+    };
+    let words = |map: &[stipple::map::SplatInit]| bytemuck::cast_slice::<_, u32>(map).to_vec();
+    assert!(words(&run()) == words(&run()), "two runs differ");
+}
+
+#[test]
+#[cfg_attr(not(recordings), ignore = "no recordings")]
+fn a_recorded_room_maps_to_the_same_bits_twice() {
+    same_twice(4, 15, 60);
+}
+
+#[test]
+#[ignore = "the long form: 500 steps"]
+fn a_recorded_room_maps_to_the_same_bits_twice_over_500_steps() {
+    same_twice(14, 36, 500);
+}
+
 fn write_png(dir: &std::path::Path, p: &Panel) {
     let Panel { width, height, observed, rendered, depth, valid, psnr_db, .. } = p;
     let view = View { width: *width, height: *height, observed, rendered, depth, valid, psnr_db: *psnr_db };
