@@ -151,7 +151,7 @@ impl Default for VioConfig {
             gyro_bias_sigma: 0.1,
             outlier_px: 3.0,
             gyro_noise_scale: 2.0,
-            accel_noise_scale: 4.0,
+            accel_noise_scale: 8.0,
             zero_velocity: true,
             preintegration: Scheme::Midpoint,
             estimate_time_offset: false,
