@@ -63,6 +63,8 @@ counters! {
     blocks_moved,
     /// Steps whose (Gaussian, tile) list overflowed.
     intersections_overflow,
+    /// Gaussians left out of a step because a parameter was not finite.
+    splats_not_finite,
     /// Gaussians skipped by the optimiser because a gradient was not finite.
     gradients_rejected,
     /// GPU submissions that failed.

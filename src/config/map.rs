@@ -22,6 +22,8 @@ pub struct MapConfig {
     /// 12 000 steps: 22.0 dB trained on it alone, 21.9 dB on both, for 92 MB more.
     pub cameras: u32,
     pub projection: Projection,
+    /// Refused so far: every source of images hands out grey. The kernels and the map's file have colour.
+    pub colour: bool,
     /// Of the spherical harmonics of a colour: 0 is the same from everywhere. After as many steps there: degree 0 22.03 dB
     /// held out (27.65 in training), degree 1 22.12 (27.93) for 7 % of a step's time and 50 MB, degree 2 22.07 (28.03).
     pub sh_degree: u32,
@@ -86,6 +88,7 @@ impl Default for MapConfig {
             scale: 1,
             cameras: 1,
             projection: Projection::Rectified,
+            colour: false,
             sh_degree: 0,
             anchor_uncovered_min: 0.05,
             covered_alpha: 0.05,

@@ -9,7 +9,7 @@ use crate::stereo::Stereo;
 use crossbeam_queue::ArrayQueue;
 use std::sync::atomic::Ordering::Relaxed;
 use std::time::{Duration, Instant};
-use stipple_drivers::{host, Calibration, Fault, Frames, Image};
+use stipple_drivers::{host, Calibration, Exit, Fault, Frames, Image};
 
 /// Time handed to the mapper at once; between slices it looks at its queues.
 pub const SLICE: Duration = Duration::from_millis(50);
@@ -36,6 +36,10 @@ impl Mapping {
     /// Opens the device on a thread of low priority: the threads of a CPU device inherit it, so
     /// that odometry is served first.
     pub fn open(calibration: &Calibration, board: &Board) -> Result<Mapping, Fault> {
+        if board.map.colour {
+            let what = "true, but cameras and recordings are read as 8-bit grey, which odometry tracks";
+            return Err(Fault::new(Exit::Config, "map.colour", what, "set map.colour = false"));
+        }
         let build = || {
             host::lower_priority();
             let stereo = Stereo::new(calibration, &board.stereo, board.map.scale)?;

@@ -253,6 +253,7 @@ impl Mapper {
         let done = self.pipeline.train(&mut self.gpu, &view, goal, &rates, &weights)?;
         self.iterations += 1;
         self.counters.intersections_overflow.add(u64::from(done.stats.overflow > 0));
+        self.counters.splats_not_finite.add(u64::from(done.stats.failed));
         self.counters.gradients_rejected.add(u64::from(done.gradients_rejected));
         self.refine(index, &view, &done);
         self.after_step(index, &done)?;
