@@ -11,8 +11,8 @@ use crate::mem::Footprint;
 use stipple_drivers::Fault;
 
 /// How a pass is cut.
-#[derive(Clone, Copy)]
-struct Cut {
+#[derive(Clone, Copy, Debug)]
+pub struct Cut {
     digit_bits: u32,
     groups: u32,
     keys_min: u32,
@@ -22,9 +22,9 @@ struct Cut {
 
 /// A CPU reads memory dear. Every group reads the whole table, so there are few (at most this many, two a core), and a
 /// wide digit saves whole passes.
-const CPU: Cut = Cut { digit_bits: 11, groups: 32, keys_min: 1024, lanes: 32 };
+pub const CPU: Cut = Cut { digit_bits: 11, groups: 32, keys_min: 1024, lanes: 32 };
 /// A GPU hides latency with many workgroups. 8 KiB of shared memory let many be resident.
-const GPU: Cut = Cut { digit_bits: 8, groups: 256, keys_min: 1024, lanes: 256 };
+pub const GPU: Cut = Cut { digit_bits: 8, groups: 256, keys_min: 1024, lanes: 256 };
 /// Words of the digit table: digits x workgroups.
 const TABLE_LEN: usize = 1 << 16;
 /// Most blocks of a scan: their sums are scanned by one workgroup.
@@ -111,7 +111,11 @@ impl Sorter {
     pub fn new(gpu: &mut Gpu) -> Result<Sorter, Fault> {
         let cores = std::thread::available_parallelism().map_or(1, |n| n.get() as u32);
         let cpu = Cut { groups: (2 * cores).min(CPU.groups), ..CPU };
-        let cut = if is_cpu(gpu) { cpu } else { GPU };
+        Sorter::with_cut(gpu, if is_cpu(gpu) { cpu } else { GPU })
+    }
+
+    /// As `new`, with the other kind of device's cut: both must give the same.
+    pub fn with_cut(gpu: &mut Gpu, cut: Cut) -> Result<Sorter, Fault> {
         let digits_max = 1 << cut.digit_bits;
         Ok(Sorter {
             count: gpu.kernel::<radix_count::K>(radix_count::Spec { digits_max })?,

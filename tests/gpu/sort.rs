@@ -1,7 +1,7 @@
 //! Radix sort and prefix sum against their CPU twins, bit for bit.
 
 use stipple::gpu::{Buf, Gpu};
-use stipple::map::sort::{Pairs, Scan, Sorter, NONE};
+use stipple::map::sort::{Cut, Pairs, Scan, Sorter, CPU, GPU, NONE};
 
 const CAPACITY: usize = 40_000;
 
@@ -48,9 +48,17 @@ struct Rig {
 
 impl Rig {
     fn new(capacity: usize) -> Rig {
+        Rig::cut(capacity, None)
+    }
+
+    fn cut(capacity: usize, cut: Option<Cut>) -> Rig {
         let bytes = Sorter::footprint().gpu_total() + (capacity as u64) * 16 + (1 << 20);
         let mut gpu = Gpu::open(&crate::config(), bytes).expect("a Vulkan device");
-        let sorter = Sorter::new(&mut gpu).unwrap();
+        let sorter = match cut {
+            Some(cut) => Sorter::with_cut(&mut gpu, cut),
+            None => Sorter::new(&mut gpu),
+        };
+        let sorter = sorter.unwrap();
         let scan = Scan::new(&mut gpu).unwrap();
         let mut pairs =
             || Pairs { keys: gpu.alloc("keys", capacity).unwrap(), payload: gpu.alloc("payload", capacity).unwrap() };
@@ -84,8 +92,12 @@ impl Rig {
 }
 
 #[test]
-fn sort_is_stable_and_equals_its_twin() {
-    let mut rig = Rig::new(CAPACITY);
+fn sort_is_stable_and_equals_its_twin_as_cut_for_either_kind_of_device() {
+    [CPU, GPU].into_iter().for_each(sort_equals_its_twin);
+}
+
+fn sort_equals_its_twin(cut: Cut) {
+    let mut rig = Rig::cut(CAPACITY, Some(cut));
     for count in [0, 1, 31, 32, 33, 255, 256, 257, 1023, 1024, 1025, 10_000, CAPACITY] {
         let keys = noise(count as u32 + 1, count);
         for bits in [1, 8, 11, 12, 16, 22, 31, 32] {
