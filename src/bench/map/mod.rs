@@ -51,14 +51,17 @@ const LINES: [Variant; 2] = [
 ];
 
 /// What the map is without, or with, one part. The first row of the table is the default.
-const ABLATIONS: [Variant; 7] = [
+const ABLATIONS: [Variant; 10] = [
     variant("no burst", "a new anchor waits for its turn", &["map.burst_iterations=0"]),
     variant("no densification", "seeds on bare depth only", &["map.densify_max=0"]),
     variant("no eviction", "a full pool takes no more", &["map.evict=false"]),
     variant("convergence", "an anchor is trained on alone until it settles", &["map.converge_iterations_max=50"]),
     variant("wrong anchors", "covered but badly rendered views are densified", &["map.anchor_error_min=0.04"]),
     variant("no SSIM", "L1 alone", &["map.ssim_weight=0"]),
-    variant("pose", "keyframe poses refined on the images", &["map.lr_pose=1e-4"]),
+    variant("no pose", "keyframe poses as given", &["map.refine_pose=false"]),
+    variant("no exposure", "one exposure for all keyframes", &["map.refine_exposure=false"]),
+    variant("neither", "neither pose nor exposure refined", &["map.refine_pose=false", "map.refine_exposure=false"]),
+    variant("growth stops", "adds less when the last did not pay", &["map.growth_stops=true"]),
 ];
 
 pub struct Options {
