@@ -151,6 +151,7 @@ fn map_figures(report: &mut Report, q: &Evaluation) {
     report.ssim = q.ssim;
     report.psnr_heldout_db = q.psnr_heldout_db;
     report.ssim_heldout = q.ssim_heldout;
+    report.psnr_heldout_between_db = q.psnr_heldout_between_db;
     report.psnr_heldout_fitted_db = q.psnr_heldout_fitted_db;
     report.ssim_heldout_fitted = q.ssim_heldout_fitted;
     report.psnr_heldout_aligned_db = q.psnr_heldout_aligned_db;

@@ -1,5 +1,6 @@
 //! What the splat kernels keep in the arena, sized once by `Shape`.
 
+use super::depth::{depth_words, DEPTHS_MAX};
 use super::sort::{Pairs, Scan, Sorter};
 use crate::gpu::kernels::types::{Moments, Projected, Splat, Status};
 use crate::gpu::{Buf, Gpu, ALIGN};
@@ -53,6 +54,11 @@ impl Shape {
         self.image_words().next_multiple_of(ALIGN as usize / size_of::<u32>())
     }
 
+    /// Words the host moves at once: an image, the flags of all slots, or slots of arrivals.
+    pub(super) fn words_max(&self) -> usize {
+        self.image_words().max(self.splats as usize + 1).max(ARRIVALS)
+    }
+
     /// Colour, transmittance, depth or its inverse: planes of raster_forward.
     fn rendered_planes(&self) -> usize {
         self.channels as usize + 2
@@ -61,6 +67,15 @@ impl Shape {
     /// By colour; by inverse depth and transmittance: planes of raster_backward.
     fn gradient_planes(&self) -> usize {
         self.channels as usize + if self.inverse_depth { 2 } else { 0 }
+    }
+
+    /// Anchors whose depth is kept.
+    pub fn depths(&self) -> u32 {
+        if self.inverse_depth {
+            self.keyframes.min(DEPTHS_MAX)
+        } else {
+            0
+        }
     }
 
     /// Coefficients of a colour beyond the level in a Gaussian's record: EXTRA of harmonics.glsl.
@@ -137,6 +152,7 @@ buffers! {
     loss_sums: [f32; 4], "pixels: L1 and exposure gradient by workgroup", |s| s.channels as usize * image_groups(s.width, s.height) as usize;
     mask: u32, "keyframes: masks", |s| s.cameras as usize * s.mask_stride();
     targets: u32, "keyframes: images", |s| s.image_words() * (s.channels * s.keyframes) as usize;
+    anchor_depths: u32, "keyframes: depths of anchors", |s| (depth_words(s.width, s.height) * s.depths() as usize).max(1);
     visible_count: u32, "counts: visible", |_s| 1;
     isect_count: u32, "counts: intersections listed, needed, workgroups", |_s| 5;
     isects_sorted: u32, "counts: intersections sorted", |_s| 1;

@@ -132,6 +132,8 @@ pub struct Stored {
     /// Of its last training step, and which step of the mapper that was; 0: never.
     pub loss: f64,
     pub trained_at: u64,
+    /// Where its stereo depth is kept, of an anchor.
+    pub depth: Option<u32>,
     /// What the mapper found out beside it.
     pub refined: Refinement,
 }
@@ -209,7 +211,18 @@ impl Store {
         let last = self.training.iter().rev().find(|k| self.camera(**k as usize) == self.camera(index));
         refined.exposure = last.map_or(refined.exposure, |&k| self.get(k as usize).refined.exposure);
         let (given, placed) = (world_from_body, world_from_body);
-        self.entries.push(Stored { id, t, given, placed, held_out, anchor: false, loss: 0.0, trained_at: 0, refined });
+        self.entries.push(Stored {
+            id,
+            t,
+            given,
+            placed,
+            held_out,
+            anchor: false,
+            depth: None,
+            loss: 0.0,
+            trained_at: 0,
+            refined,
+        });
         if !held_out {
             self.training.push(index as u32);
         }
@@ -234,25 +247,52 @@ impl Store {
 
     /// Of a keyframe that is trained on, its own; of one held out, what those beside it in time make likely.
     pub fn exposure(&self, index: usize) -> Exposure {
-        let of = |k: &u32| (self.get(*k as usize).t, self.get(*k as usize).refined.exposure);
+        let e = self.get(index);
+        if e.held_out {
+            self.between(index).exposure
+        } else {
+            e.refined.exposure
+        }
+    }
+
+    /// An image's exposure and its keyframe's correction, which all its images share.
+    fn refined(&self, index: usize) -> Refinement {
+        let mut refined = self.get(index).refined;
+        refined.body_from_refined = self.get(self.first(index)).refined.body_from_refined;
+        refined
+    }
+
+    /// What the keyframes trained on before and after one were refined by, at its time.
+    pub fn between(&self, index: usize) -> Refinement {
+        let t = self.get(index).t;
         let at = self.training.partition_point(|k| (*k as usize) < index);
         let same = |k: &&u32| self.camera(**k as usize) == self.camera(index);
+        let of = |k: &u32| (self.get(*k as usize).t, self.refined(*k as usize));
         let after = self.training[at..].iter().find(same).map(of);
         let before = self.training[..at].iter().rev().find(same).map(of);
         match (before, after) {
-            _ if !self.get(index).held_out => self.get(index).refined.exposure,
             (Some((t0, a)), Some((t1, b))) if t1 > t0 => {
-                let part = ((self.get(index).t - t0).secs() / (t1 - t0).secs()).clamp(0.0, 1.0);
-                let between = |a: f64, b: f64| a + part * (b - a);
-                Exposure { gain: between(a.gain, b.gain), offset: between(a.offset, b.offset) }
+                a.towards(&b, ((t - t0).secs() / (t1 - t0).secs()).clamp(0.0, 1.0))
             }
-            (one, other) => one.or(other).map_or(Exposure::default(), |(_, e)| e),
+            (one, other) => one.or(other).map_or_else(Refinement::default, |(_, refined)| refined),
         }
     }
 
     /// Indices of keyframes that may be trained on.
     pub fn training(&self) -> &[u32] {
         &self.training
+    }
+
+    /// A place for a new anchor's depth among `places`: the oldest's when all are taken.
+    pub fn keep_depth(&mut self, index: usize, places: u32) -> u32 {
+        let kept = self.entries.iter().filter(|e| e.depth.is_some()).count() as u32;
+        let mut place = kept;
+        if kept >= places {
+            let oldest = self.entries.iter_mut().find_map(|e| e.depth.take());
+            place = oldest.unwrap_or(0);
+        }
+        self.entries[index].depth = Some(place);
+        place
     }
 
     pub fn anchors(&self) -> usize {

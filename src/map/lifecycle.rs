@@ -128,6 +128,7 @@ impl Mapper {
         let seeded = self.pipeline.append(&mut self.gpu, &self.arrivals)? as u32;
         let entry = self.store.get_mut(index);
         (entry.anchor, entry.placed) = (true, entry.given);
+        self.keep_depth(index)?;
         self.added = Added::default();
         self.schedule.start_burst(index, self.config.burst_iterations);
         Ok(Did::Anchor { seeded })

@@ -11,6 +11,7 @@ pub mod blocks;
 pub mod budget;
 pub mod buffers;
 pub mod densify;
+pub mod depth;
 pub mod evaluate;
 pub mod eyes;
 pub mod harmonics;
@@ -109,10 +110,6 @@ pub struct Mapper {
 
 /// Of a scene nothing is known of yet, m.
 const SCENE_DEPTH_M: f64 = 3.0;
-
-/// Steps a keyframe after which the learning rates are halved, and what is always left of them.
-const STEPS_HALVING: f64 = 50.0;
-const RATE_PART_MIN: f64 = 0.1;
 
 impl Mapper {
     pub fn footprint(calibration: &Calibration, board: &Board) -> Footprint {
@@ -277,7 +274,7 @@ impl Mapper {
     /// Smaller as the steps a keyframe has had grow: large ones find the picture, small ones settle it.
     fn rate_part(&self) -> f64 {
         let steps = self.iterations as f64 / self.store.len().max(1) as f64;
-        f64::max(RATE_PART_MIN, 1.0 / (1.0 + steps / STEPS_HALVING))
+        f64::max(self.config.lr_part_min, 1.0 / (1.0 + steps / self.config.lr_halving_steps))
     }
 
     fn rates(&self) -> LearningRates {
@@ -293,7 +290,15 @@ impl Mapper {
     }
 
     fn weights(&self) -> Weights {
-        Weights { ssim: self.config.ssim_weight as f32, ..Weights::default() }
+        let c = &self.config;
+        Weights {
+            ssim: c.ssim_weight as f32,
+            depth: c.depth_weight as f32,
+            needle: c.needle_weight as f32,
+            scale: c.scale_weight as f32,
+            scale_soft_m: c.scale_soft_m as f32,
+            opacity: c.opacity_weight as f32,
+        }
     }
 
     fn room(&self) -> usize {
@@ -369,7 +374,7 @@ fn shape(board: &Board, cameras: usize, width: usize, height: usize) -> Shape {
         channels: 1,
         sh_degree: board.map.sh_degree,
         cameras: cameras as u32,
-        inverse_depth: false,
+        inverse_depth: board.map.depth_weight > 0.0,
     }
 }
 

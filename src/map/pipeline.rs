@@ -4,7 +4,7 @@
 //! ```text
 //! project -> sort by depth                               Gaussians -> visible, front to back
 //! count_tiles -> scan -> emit_tiles -> sort by tile -> tile_ranges -> raster_forward
-//! ssim_rows -> ssim_columns -> loss_rows -> loss_columns  picture -> gradient by pixel
+//! ssim_rows -> ssim_columns -> loss_rows -> loss_columns (-> loss_depth)  picture -> gradient by pixel
 //! raster_backward -> project_backward (Adam) -> summary   -> gradient by intersection -> Gaussian
 //! ```
 //!
@@ -14,7 +14,7 @@
 
 use super::blocks::Block;
 pub use super::buffers::Shape;
-use super::buffers::{image_groups, Buffers, ARRIVALS, GROUP, RUN};
+use super::buffers::{image_groups, Buffers, GROUP, RUN};
 use super::harmonics::Harmonics;
 pub use super::pool::{PruneRule, SplatInit};
 use super::sort::{Pairs, Scan, Sorter};
@@ -49,6 +49,7 @@ pub(super) struct Kernels {
     /// Of shapes that train on inverse depth.
     raster_depth: Option<Raster>,
     raster_picture: Kernel<raster_forward::K>,
+    pub(super) loss_depth: Kernel<loss_depth::K>,
     pub(super) ssim_rows: Kernel<ssim_rows::K>,
     ssim_columns: Kernel<ssim_columns::K>,
     pub(super) ssim_map: Kernel<ssim_columns::K>,
@@ -107,7 +108,7 @@ impl Pipeline {
         f.extend(Harmonics::footprint(shape));
         let n = shape.splats as usize;
         f.host("pipeline: blocks", shape.keyframes as usize * size_of::<Block>());
-        f.host("pipeline: transfers", words_max(shape) * size_of::<u32>() + n * size_of::<Splat>());
+        f.host("pipeline: transfers", shape.words_max() * size_of::<u32>() + n * size_of::<Splat>());
         f
     }
 
@@ -156,6 +157,7 @@ impl Pipeline {
                 raster_forward::Spec { lanes, column, depth: EXPECTED_DEPTH, channels },
                 variant,
             )?,
+            loss_depth: gpu.kernel(loss_depth::Spec { channels })?,
             ssim_rows: plain::<ssim_rows::K>(gpu)?,
             ssim_columns: gpu.kernel::<ssim_columns::K>(ssim_columns::Spec { map: 0 })?,
             ssim_map: gpu.kernel::<ssim_columns::K>(ssim_columns::Spec { map: 1 })?,
@@ -182,7 +184,7 @@ impl Pipeline {
             high_water: 0,
             blocks: Vec::with_capacity(shape.keyframes as usize),
             valid_pixels: [0; CAMERAS_MAX],
-            words: Vec::with_capacity(words_max(&shape)),
+            words: Vec::with_capacity(shape.words_max()),
             pool: Vec::with_capacity(shape.splats as usize),
         };
         let all = vec![255; shape.pixels()];
@@ -261,9 +263,13 @@ impl Pipeline {
             "training views are of the shape the pipeline was made with"
         );
         let mut rec = gpu.record();
-        let raster = self.raster(false);
+        let depth = goal.depth.filter(|_| self.shape.inverse_depth && weights.depth > 0.0);
+        let raster = self.raster(depth.is_some());
         let by_tile = self.record_picture(&mut rec, view, &raster.forward);
         self.record_loss(&mut rec, &goal, weights);
+        if let Some(anchor) = depth {
+            self.record_loss_depth(&mut rec, &goal, anchor, weights);
+        }
         self.record_update(&mut rec, view, &raster.backward, by_tile, rates, weights);
         self.record_summary(&mut rec, self.shape.channels * image_groups(w, h), self.high_water.div_ceil(GROUP));
         gpu.submit(rec)?;
@@ -561,11 +567,6 @@ impl Raster {
             backward: gpu.kernel_variant(raster_backward::Spec { lanes, column, depth, channels, degree }, variant)?,
         })
     }
-}
-
-/// Words the host moves at once: an image, the flags of all slots, or slots of arrivals.
-fn words_max(shape: &Shape) -> usize {
-    shape.image_words().max(shape.splats as usize + 1).max(ARRIVALS)
 }
 
 fn project_backward_of(gpu: &mut Gpu, shape: &Shape, learn: bool) -> Result<ByLens<project_backward::K>, Fault> {

@@ -1,8 +1,10 @@
 //! How good the map is: PSNR and SSIM of rendered keyframes, and pictures of some of them.
 //!
 //! A keyframe is compared in its exposure: the one refined beside the map, or, held out, the one between its
-//! neighbours in time; nothing of a held-out image goes into its figures. Held-out keyframes are scored twice more,
-//! to tell the error's shares: with gain and offset fitted to the image, and with the pose refined on it too.
+//! neighbours in time, and at the pose it came with; nothing of a held-out image goes into these figures, nor into the
+//! next: at that pose with the correction between its neighbours, where a picture of the map would be taken from.
+//! Held-out keyframes are scored twice more, to tell the error's shares: with gain and offset fitted to the image, and
+//! with the pose refined on it too.
 //! Looking changes nothing: a run goes on from an evaluation as if there had been none.
 
 use super::evaluate::{mse, psnr_db, Ssim};
@@ -29,6 +31,8 @@ pub struct Evaluation {
     pub ssim: Option<f64>,
     pub psnr_heldout_db: Option<f64>,
     pub ssim_heldout: Option<f64>,
+    /// With the pose correction between its neighbours in time.
+    pub psnr_heldout_between_db: Option<f64>,
     /// With gain and offset of each held-out view fitted by least squares over its valid pixels.
     pub psnr_heldout_fitted_db: Option<f64>,
     pub ssim_heldout_fitted: Option<f64>,
@@ -106,8 +110,8 @@ impl Mapper {
     pub fn evaluate(&mut self) -> Result<Evaluation, GpuError> {
         let camera = self.stereo.camera().pinhole;
         let mut ssim_of = Ssim::new(camera.width, camera.height);
-        let mut means: [[Mean; 2]; 4] = Default::default();
-        let [training, held_out, fitted, aligned] = &mut means;
+        let mut means: [[Mean; 2]; 5] = Default::default();
+        let [training, held_out, between, fitted, aligned] = &mut means;
         let mut by_camera = [Mean::default(); CAMERAS_MAX];
         for i in 0..self.store.len() {
             let observed = self.observed(i);
@@ -125,21 +129,21 @@ impl Mapper {
             add(self, held_out);
             self.fit(i, &observed);
             add(self, fitted);
-            let first = self.store.first(i);
-            let given = self.store.get(first).refined;
-            self.store.get_mut(first).refined = self.aligned(i, &observed)?;
-            let scored = self.score(i);
-            self.store.get_mut(first).refined = given;
-            scored?;
+            self.score_at(i, self.store.between(i))?;
+            add(self, between);
+            let aligned_by = self.aligned(i, &observed)?;
+            self.score_at(i, aligned_by)?;
             self.fit(i, &observed);
             add(self, aligned);
         }
-        let [[psnr, ssim], [psnr_heldout, ssim_heldout], [psnr_fitted, ssim_fitted], [psnr_aligned, _]] = means;
+        let [[psnr, ssim], [psnr_heldout, ssim_heldout], [psnr_between, _], [psnr_fitted, ssim_fitted], [psnr_aligned, _]] =
+            means;
         Ok(Evaluation {
             psnr_db: psnr.get(),
             ssim: ssim.get(),
             psnr_heldout_db: psnr_heldout.get(),
             ssim_heldout: ssim_heldout.get(),
+            psnr_heldout_between_db: psnr_between.get(),
             psnr_heldout_fitted_db: psnr_fitted.get(),
             ssim_heldout_fitted: ssim_fitted.get(),
             psnr_heldout_aligned_db: psnr_aligned.get(),
@@ -188,6 +192,15 @@ impl Mapper {
         (0..self.store.len()).step_by(self.eyes.len())
     }
 
+    /// As `score`, with another refinement of the keyframe for the moment.
+    fn score_at(&mut self, index: usize, refined: Refinement) -> Result<(), GpuError> {
+        let first = self.store.first(index);
+        let own = std::mem::replace(&mut self.store.get_mut(first).refined, refined);
+        let scored = self.score(index);
+        self.store.get_mut(first).refined = own;
+        scored.map(|_| ())
+    }
+
     /// Puts the rendering into another exposure.
     fn show(&mut self, exposure: Exposure) {
         self.rendered.grey.iter_mut().for_each(|x| *x = exposure.observed(f64::from(*x)) as f32);
@@ -210,7 +223,7 @@ impl Mapper {
         let view = self.view(index);
         self.pipeline.render(&mut self.gpu, &view, &mut self.rendered)?;
         let exposure = fitted_exposure(observed, &self.rendered.grey, &self.eye(index).valid);
-        let goal = Goal { exposure: Some(exposure), ..self.goal(index) };
+        let goal = Goal { exposure: Some(exposure), depth: None, ..self.goal(index) };
         let mut refined = Refinement::default();
         let (mut best, mut best_loss) = (refined, f64::INFINITY);
         for k in 0..ALIGN_STEPS {

@@ -71,6 +71,18 @@ pub struct Refinement {
 }
 
 impl Refinement {
+    /// `part` of the way to another's; without moments.
+    pub fn towards(&self, other: &Refinement, part: f64) -> Refinement {
+        let (a, b) = (self.body_from_refined, other.body_from_refined);
+        let (e, f) = (self.exposure, other.exposure);
+        let between = |a: f64, b: f64| a + part * (b - a);
+        Refinement {
+            body_from_refined: Pose::new(a.q.slerp(b.q, part), a.p.lerp(b.p, part)),
+            exposure: Exposure { gain: between(e.gain, f.gain), offset: between(e.offset, f.offset) },
+            ..Refinement::default()
+        }
+    }
+
     /// One step down `gradient`, by [p, θ] of `world_from_cam` (p additive in the world, rotation perturbed on the
     /// right); metres and radians move alike, at most about `rate` each.
     pub fn step_pose(&mut self, gradient: &[f64; 6], world_from_cam: &Pose, body_from_cam: &Pose, rate: f64) {
@@ -95,7 +107,8 @@ impl Refinement {
 impl Mapper {
     pub(super) fn goal(&self, index: usize) -> Goal {
         let exposure = self.config.refine_exposure.then(|| self.store.exposure(index));
-        Goal { slot: index as u32, camera: self.store.camera(index) as u32, exposure }
+        let (camera, depth) = (self.store.camera(index) as u32, self.store.get(index).depth);
+        Goal { slot: index as u32, camera, exposure, depth }
     }
 
     /// After a training step on an image: one of its keyframe's pose and of its exposure. The first keyframe's pose and

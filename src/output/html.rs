@@ -95,9 +95,10 @@ fn tables(report: &Report) -> String {
         ("Quality, lowest", n(report.quality_min.map(u64::from)), "of 100"),
         ("Frames of quality under 50", f(report.quality_under_50.map(|v| 100.0 * v), 1), "%"),
     ];
-    let map: [Row; 10] = [
+    let map: [Row; 11] = [
         ("PSNR, training views", f(report.psnr_db, 2), "dB"),
         ("PSNR, held-out views", f(report.psnr_heldout_db, 2), "dB"),
+        ("PSNR, held-out, pose between neighbours", f(report.psnr_heldout_between_db, 2), "dB"),
         ("PSNR, held-out, exposure fitted", f(report.psnr_heldout_fitted_db, 2), "dB"),
         ("PSNR, held-out, pose refined too", f(report.psnr_heldout_aligned_db, 2), "dB"),
         ("SSIM, training views", f(report.ssim, 3), ""),

@@ -59,6 +59,8 @@ pub struct Report {
     pub ssim: Option<f64>,
     pub psnr_heldout_db: Option<f64>,
     pub ssim_heldout: Option<f64>,
+    /// With the pose correction of the map's own keyframes between which each was taken.
+    pub psnr_heldout_between_db: Option<f64>,
     /// With gain and offset of each held-out view fitted to its image.
     pub psnr_heldout_fitted_db: Option<f64>,
     pub ssim_heldout_fitted: Option<f64>,
@@ -148,7 +150,7 @@ mod tests {
     const KEYS: &str =
         "frames keyframes anchors frames_dropped ate_rmse_m rte_1s_m rpe_deg tracking_fps tracking_ms_p50 \
         tracking_ms_p99 tracking_threads tracking_cpu_ms frontend_ms_p50 frontend_ms_p99 estimator_ms_p50 \
-        estimator_ms_p99 psnr_db ssim psnr_heldout_db ssim_heldout psnr_heldout_fitted_db ssim_heldout_fitted psnr_heldout_aligned_db splats iterations \
+        estimator_ms_p99 psnr_db ssim psnr_heldout_db ssim_heldout psnr_heldout_between_db psnr_heldout_fitted_db ssim_heldout_fitted psnr_heldout_aligned_db splats iterations \
         iteration_ms_p50 gpu_bytes estimator_bytes quality_min quality_p50 quality_under_50 rss_peak_bytes heap_after_seal wall_s device vio_hash dataset board pace scale \
         time_offset_s time_offset_sigma_s gyro_scale gyro_scale_sigma accel_scale accel_scale_sigma";
 

@@ -195,7 +195,7 @@ pub fn compare_step(v: &View, splats: &[SplatInit], tiling: Option<Tiling>) {
     assert!(worst(wide(&picture.depth), twin.rendered.depth.iter().copied()) < 1e-3 + 4.0 * flip);
 
     // loss
-    let weights = Weights { ssim: SSIM, needle: 0.0, scale: 0.0, scale_soft_m: 1.0, opacity: 0.0 };
+    let weights = Weights { ssim: SSIM, depth: 0.0, needle: 0.0, scale: 0.0, scale_soft_m: 1.0, opacity: 0.0 };
     let step = p.train(&mut gpu, v, 1, &STILL, &weights).unwrap();
     let mut gradient = vec![0f32; w * h];
     gpu.download(p.buffers().pixel_gradient, 0, &mut gradient).unwrap();
