@@ -211,6 +211,19 @@ fn evaluation_leaves_no_trace() {
 }
 
 #[test]
+fn mapper_rests_once_its_views_are_learnt() {
+    let (calibration, keyframes) = flight(3);
+    let mut mapper = open(&calibration, &board(&["map.steps_per_keyframe_max=15", "map.burst_iterations=4"]));
+    for (k, keyframe) in keyframes.iter().enumerate() {
+        assert_eq!(mapper.offer(keyframe), Offer::Accepted);
+        train(&mut mapper, 1000);
+        let most = 15 * (k as u64 + 1);
+        assert!((most..most + 5).contains(&mapper.iterations()), "{} steps", mapper.iterations());
+        assert_eq!(mapper.step(Instant::now()).unwrap().did, Did::Idle);
+    }
+}
+
+#[test]
 fn full_pool_gives_its_least_valuable_for_a_new_view() {
     let (calibration, keyframes) = flight(8);
     let run = |evict: &str| {

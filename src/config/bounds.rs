@@ -92,6 +92,7 @@ pub(super) const BOUNDS: &[(&str, Bound)] = &[
     ("map.burst_rate", Within(0.01, 100.0)),
     ("map.densify_max", Within(0.0, 16_384.0)),
     ("map.converge_iterations_max", Within(0.0, 10_000.0)),
+    ("map.steps_per_keyframe_max", Within(0.0, 1_000_000.0)),
     ("map.lockstep_iterations", Within(0.0, 1000.0)),
     ("map.ssim_weight", Within(0.0, 1.0)),
     ("map.depth_weight", Within(0.0, 100.0)),

@@ -240,7 +240,7 @@ impl Mapper {
 
     /// One training step; its loss, or `None` when there is nothing to train.
     fn train(&mut self) -> Result<Option<f64>, GpuError> {
-        if self.pipeline.count() == 0 {
+        if self.pipeline.count() == 0 || (self.trained_enough() && !self.schedule.in_burst()) {
             return Ok(None);
         }
         let Some(index) = self.schedule.next(self.store.training()) else { return Ok(None) };
@@ -255,6 +255,12 @@ impl Mapper {
         self.refine(index, &view, &done);
         self.after_step(index, &done)?;
         Ok(Some(done.loss))
+    }
+
+    /// Steps past this only teach the map the few views it has, and what they do not show looks covered to the next.
+    fn trained_enough(&self) -> bool {
+        let most = u64::from(self.config.steps_per_keyframe_max);
+        most > 0 && self.iterations >= most * self.store.training().len() as u64
     }
 
     fn view(&self, index: usize) -> View {
