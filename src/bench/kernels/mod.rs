@@ -25,6 +25,8 @@ const COUNTS: [usize; 4] = [10_000, 50_000, 200_000, 500_000];
 /// What the other axis is held at.
 const SIZE: (usize, usize) = (752, 480);
 const COUNT: usize = 50_000;
+/// Counts and size that trainers on a CPU are quoted at.
+const SMALL: ([usize; 2], (usize, usize)) = ([6_000, 30_000], (320, 240));
 /// Seeds of a recorded scene: what the published system keeps of V1_01.
 const RECORDED: usize = 52_000;
 /// Time a case is trained for, twice, s, and its steps.
@@ -74,10 +76,10 @@ struct Bench {
     device: String,
     tiling: Tiling,
     peaks: Peaks,
-    /// By N at `SIZE`, by resolution at `COUNT`, and the recorded scene.
+    /// By N at `SIZE`, by resolution at `COUNT`; `SMALL`, and the recorded scene.
     by_count: Vec<Case>,
     by_size: Vec<Case>,
-    recorded: Vec<Case>,
+    single: Vec<Case>,
 }
 
 /// `stipple bench kernels`
@@ -97,7 +99,7 @@ pub fn kernels(options: &Options, out: &Path) -> Result<(), Fault> {
     eprintln!("{device}: copies {:.1} GB/s, {:.1} GFLOP/s", peaks.bytes_per_s * 1e-9, peaks.flops_per_s * 1e-9);
     let run = |scene: &Scene| measure(&config, scene, tiling, &peaks, options.quick);
     let wall = |n: usize, (w, h): (usize, usize)| run(&Scene::wall(w, h, n));
-    let mut bench = Bench { device, tiling, peaks, by_count: vec![], by_size: vec![], recorded: vec![] };
+    let mut bench = Bench { device, tiling, peaks, by_count: vec![], by_size: vec![], single: vec![] };
     if options.quick {
         bench.by_count.push(wall(2_000, (160, 120))?);
     } else {
@@ -107,9 +109,12 @@ pub fn kernels(options: &Options, out: &Path) -> Result<(), Fault> {
         for size in SIZES {
             bench.by_size.push(wall(COUNT, size)?);
         }
+        for n in SMALL.0 {
+            bench.single.push(wall(n, SMALL.1)?);
+        }
     }
     if let Some(folder) = &options.recording {
-        bench.recorded.push(run(&Scene::recorded(folder, RECORDED)?)?);
+        bench.single.push(run(&Scene::recorded(folder, RECORDED)?)?);
     }
     out.write("kernels.csv", |w| page::csv(w, &bench))?;
     out.write("kernels.json", |w| page::json(w, &bench))?;

@@ -7,7 +7,7 @@ use serde_json::{json, Value};
 use std::io::{self, Write};
 
 fn cases(bench: &Bench) -> impl Iterator<Item = &Case> {
-    bench.by_count.iter().chain(&bench.by_size).chain(&bench.recorded)
+    bench.by_count.iter().chain(&bench.by_size).chain(&bench.single)
 }
 
 impl Cost {

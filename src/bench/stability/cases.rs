@@ -187,7 +187,7 @@ fn inertial(plan: fn() -> Plan, long: fn() -> Plan) -> Vec<Case> {
         case("gyro saturated", Plan { warp: clip_gyro, config: |c| c.gyro_max = GYRO_RANGE, ..plan() }).says(Health::IMU_SATURATED),
         case("accelerometer saturated", Plan { warp: clip_accel, config: |c| c.accel_max = ACCEL_RANGE, ..plan() }).says(Health::IMU_SATURATED),
         case("imu samples not finite or late", Plan { warp: poison, ..plan() }).says(Health::IMU_REJECTED),
-        case("accelerometer 8 m/s2 wrong 2 s", Plan { warp: lean, ..long() }).fault(AT, AT + 40).says(Health::DIVERGED_RESET | Health::VISION_DISAGREES).expect(Reset, 0.008, 3.0),
+        case("accelerometer 8 m/s2 wrong 2 s", Plan { warp: lean, ..long() }).fault(AT, AT + 40).says(Health::DIVERGED_RESET | Health::VISION_DISAGREES).expect(Reset, 0.012, 3.0),
     ]
 }
 
@@ -200,7 +200,7 @@ fn seeing(plan: fn() -> Plan, long: fn() -> Plan) -> Vec<Case> {
         case("tracks scattered 1 s", Plan { spoil: |i, t| if (AT..AT + 20).contains(&i) { scatter(i, t) }, ..plan() }).fault(AT, AT + 20).says(Health::VISION_DISAGREES).expect(Survived, 0.01, 0.03),
         // It may start again while tracks still lie, and is then off by a velocity it says it does not know.
         case("tracks scattered 4 s", Plan { spoil: |i, t| if (AT..AT + 80).contains(&i) { scatter(i, t) }, ..long() }).fault(AT, AT + 80).says(Health::VISION_DISAGREES | Health::UNSEEN_RESET).expect(Reset, 0.1, 0.5),
-        case("tracks scattered for good", Plan { spoil: |i, t| if i >= AT { scatter(0, t) }, ..long() }).fault(AT, EVER).says(Health::VISION_DISAGREES | Health::UNSEEN_RESET).expect(Reset, 2.0, 0.2),
+        case("tracks scattered for good", Plan { spoil: |i, t| if i >= AT { scatter(0, t) }, ..long() }).fault(AT, EVER).says(Health::VISION_DISAGREES | Health::UNSEEN_RESET).expect(Reset, 3.0, 0.2),
     ]
 }
 
