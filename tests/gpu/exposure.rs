@@ -76,12 +76,13 @@ fn exposed_loss_agrees_with_its_twin() {
     let error = worst(step.exposure_gradient, by_exposure);
     assert!(error < 1e-3 * by_exposure[1].abs().max(by_exposure[0].abs()), "{step:?} against {by_exposure:?}");
 
-    // Without one the image is compared as it is; (1, 0) is the same to the bit.
+    // Without one the image is compared as it is; (1, 0) is the same, but for how a device rounds 1 a + 0.
     let plain = p.train(&mut gpu, &v, 1, &STILL, &weights).unwrap();
     assert_eq!(plain.exposure_gradient, [0.0; 2]);
     assert!((plain.l1 - loss(&picture, &y, &seen, w, h, SSIM).l1).abs() < 1e-5);
     let neutral = Goal { slot: 1, camera: 0, exposure: Some(Exposure::default()), depth: None };
-    assert_eq!(p.train(&mut gpu, &v, neutral, &STILL, &weights).unwrap().loss, plain.loss);
+    let neutral = p.train(&mut gpu, &v, neutral, &STILL, &weights).unwrap();
+    assert!((neutral.loss - plain.loss).abs() < 1e-6, "{} against {}", neutral.loss, plain.loss);
 }
 
 /// Everything training moves.

@@ -6,9 +6,9 @@ use glam::{DQuat, DVec3};
 use stipple::config::GpuConfig;
 use stipple::gpu::{Gpu, GpuOptions};
 use stipple::map::pipeline::{
-    LearningRates, Pipeline, PruneRule, Rendered, Shape, SplatInit, StepStats, Tiling, View, Weights,
+    Exposure, Goal, LearningRates, Pipeline, PruneRule, Rendered, Shape, SplatInit, StepStats, Tiling, View, Weights,
 };
-use stipple::stereo::Pinhole;
+use stipple::stereo::{DepthMap, Pinhole};
 use stipple_drivers::Pose;
 
 pub const STILL: LearningRates = LearningRates { position: 0.0, scale: 0.0, rotation: 0.0, opacity: 0.0, colour: 0.0 };
@@ -431,6 +431,10 @@ fn the_validation_layer_is_silent() {
     p.set_keyframe(&mut gpu, 0, &target(33, 21)).unwrap();
     train(&mut gpu, &mut p, &v, 2);
     p.descend(&mut gpu, &v, &[1.0; 3 * 33 * 21], &FAST, &Weights::default()).unwrap();
+    let known = DepthMap { width: 33, height: 21, metres: vec![2.0; 33 * 21] };
+    p.set_depth(&mut gpu, 0, &known, 0.02).unwrap();
+    let goal = Goal { slot: 0, camera: 0, exposure: Some(Exposure { gain: 1.2, offset: 0.1 }), depth: Some(0) };
+    p.train(&mut gpu, &v, goal, &FAST, &Weights { depth: 0.1, ..Weights::default() }).unwrap();
     render(&mut gpu, &mut p, &v);
     p.prune(&mut gpu, &PruneRule::default()).unwrap();
     assert_eq!(gpu.validation_messages(), Vec::<String>::new());
