@@ -51,13 +51,16 @@ const LINES: [Variant; 2] = [
 ];
 
 /// What the map is without, or with, one part. The first row of the table is the default.
-const ABLATIONS: [Variant; 10] = [
+const ABLATIONS: [Variant; 13] = [
     variant("no burst", "a new anchor waits for its turn", &["map.burst_iterations=0"]),
     variant("no densification", "seeds on bare depth only", &["map.densify_max=0"]),
     variant("no eviction", "a full pool takes no more", &["map.evict=false"]),
     variant("convergence", "an anchor is trained on alone until it settles", &["map.converge_iterations_max=50"]),
     variant("wrong anchors", "covered but badly rendered views are densified", &["map.anchor_error_min=0.04"]),
     variant("no SSIM", "L1 alone", &["map.ssim_weight=0"]),
+    variant("no needle loss", "axes of any ratio", &["map.needle_weight=0"]),
+    variant("no scale loss", "axes of any length", &["map.scale_weight=0"]),
+    variant("depth loss", "anchors are drawn to their stereo depth", &["map.depth_weight=0.1"]),
     variant("no pose", "keyframe poses as given", &["map.refine_pose=false"]),
     variant("no exposure", "one exposure for all keyframes", &["map.refine_exposure=false"]),
     variant("neither", "neither pose nor exposure refined", &["map.refine_pose=false", "map.refine_exposure=false"]),
@@ -130,10 +133,11 @@ pub fn map(
     let ablations = &ABLATIONS[..if options.quick { 1 } else { ABLATIONS.len() }];
     for ablation in std::iter::once(&LINES[0]).chain(ablations) {
         sweep.ablations.push(measure("ablation", *ablation, ablated)?);
+        // After each: whoever ends a run of many minutes early keeps what there is.
+        out_dir.write("map.csv", |w| tables::csv(w, &sweep))?;
+        out_dir.write("map.json", |w| tables::json(w, &sweep))?;
+        out_dir.write("map.html", |w| page::write(w, &sweep))?;
     }
-    out_dir.write("map.csv", |w| tables::csv(w, &sweep))?;
-    out_dir.write("map.json", |w| tables::json(w, &sweep))?;
-    out_dir.write("map.html", |w| page::write(w, &sweep))?;
     println!("{}\n{}", tables::conclusion(&sweep), out_dir.file("map.html").display());
     Ok(())
 }
