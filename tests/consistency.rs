@@ -21,8 +21,8 @@ fn defaults_claim_less_than_they_know() {
 
 #[test]
 fn error_falls_as_quality_rises() {
-    let bins = by_quality(&stability::flights(1), &[20, 65, 100]);
-    assert_eq!(bins.len(), 3);
+    let bins = by_quality(&stability::flights(1), &[10, 20, 65, 100]);
+    assert_eq!(bins.len(), 4);
     for pair in bins.windows(2) {
         let [a, b] = pair else { continue };
         eprintln!("{a:?}");
@@ -30,6 +30,6 @@ fn error_falls_as_quality_rises() {
         // Noise of the mean: a tenth.
         assert!(a.drift > 0.9 * b.drift, "drift: {a:?} {b:?}");
     }
-    // What quality 20 and 65 claim, m/s.
-    assert!(bins[1].velocity < 0.2 && bins[2].velocity < 0.027, "{bins:?}");
+    // What quality 10, 20 and 65 claim, m/s.
+    assert!(bins[1].velocity < 0.45 && bins[2].velocity < 0.2 && bins[3].velocity < 0.027, "{bins:?}");
 }
