@@ -102,9 +102,9 @@ fn glslang(file: &Path, define: &str, spv: &Path) -> Result<(), String> {
     ))
 }
 
-/// Block matching from Debian's OpenCV; see src/stereo/bm.rs.
+/// Matching from Debian's OpenCV; see src/stereo/opencv.rs.
 fn opencv_shim() {
-    let shim = "src/stereo/bm_opencv.cpp";
+    let shim = "src/stereo/opencv.cpp";
     println!("cargo:rerun-if-changed={shim}");
     if std::env::var_os("CARGO_FEATURE_OPENCV").is_none() {
         return;
@@ -114,7 +114,7 @@ fn opencv_shim() {
         headers.join("opencv2/calib3d.hpp").exists(),
         "OpenCV's calib3d headers are missing: apt-get install libopencv-calib3d-dev, or build with --no-default-features"
     );
-    cc::Build::new().cpp(true).std("c++17").opt_level(2).include(headers).file(shim).compile("stipple_bm_opencv");
+    cc::Build::new().cpp(true).std("c++17").opt_level(2).include(headers).file(shim).compile("stipple_opencv");
     println!("cargo:rustc-link-lib=opencv_calib3d");
     println!("cargo:rustc-link-lib=opencv_core");
 }

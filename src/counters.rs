@@ -43,6 +43,8 @@ counters! {
     keyframe_store_full,
     /// Anchors not made because their pair could not be matched.
     depth_failures,
+    /// Anchors not made because their pair showed no depth: an eye is covered, or nothing has detail.
+    depth_absent,
     /// Seeds that did not fit into the pool.
     splats_full,
     /// Seeds refused because their cell was occupied.

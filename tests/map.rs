@@ -26,9 +26,11 @@ fn board(overrides: &[&str]) -> Board {
 }
 
 fn open(calibration: &Calibration, board: &Board) -> Mapper {
-    let stereo = Stereo::new(calibration, &board.stereo, board.map.scale).unwrap();
-    let bytes = Mapper::footprint(calibration, board).gpu_total();
-    Mapper::new(Gpu::open(&board.gpu, bytes).unwrap(), stereo, board).unwrap()
+    let bytes = Mapper::footprint(calibration, board).gpu_total()
+        + Stereo::footprint(calibration, &board.stereo, board.map.scale).gpu_total();
+    let mut gpu = Gpu::open(&board.gpu, bytes).unwrap();
+    let stereo = Stereo::new(calibration, &board.stereo, board.map.scale, Some(&mut gpu)).unwrap();
+    Mapper::new(gpu, stereo, board).unwrap()
 }
 
 /// `count` keyframes of a simulated flight, half a second apart, at 188 x 120 px; every fourth is held out.
@@ -350,7 +352,7 @@ fn both_cameras_of_a_pair_train_one_map() {
 fn fisheye_images_of_other_lenses_are_refused_at_boot() {
     let (calibration, _) = flight(1);
     let board = board(&["map.projection=fisheye"]);
-    let stereo = Stereo::new(&calibration, &board.stereo, 1).unwrap();
+    let stereo = Stereo::new(&calibration, &board.stereo, 1, None).unwrap();
     let bytes = Mapper::footprint(&calibration, &board).gpu_total();
     let said = Mapper::new(Gpu::open(&board.gpu, bytes).unwrap(), stereo, &board).err().unwrap().to_string();
     assert!(said.contains("map.projection") && said.contains("Kannala-Brandt"), "{said}");

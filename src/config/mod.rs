@@ -181,16 +181,37 @@ pub enum Scheme {
 pub enum StereoMethod {
     /// OpenCV block matching.
     Bm,
+    /// OpenCV semi-global block matching.
+    Sgbm,
+    /// Semi-global matching of census transforms on the GPU.
+    Sgm,
+    /// A network of the user's, run by ONNX Runtime.
+    Onnx,
+}
+
+impl StereoMethod {
+    /// As a board file writes it.
+    pub fn name(self) -> &'static str {
+        match self {
+            StereoMethod::Bm => "bm",
+            StereoMethod::Sgbm => "sgbm",
+            StereoMethod::Sgm => "sgm",
+            StereoMethod::Onnx => "onnx",
+        }
+    }
 }
 
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct StereoConfig {
     pub method: StereoMethod,
+    /// Smooth the disparities of `sgm` along the picture's edges by weighted least squares, which also fills holes.
+    pub wls: bool,
     /// Disparity range at full resolution, px, a multiple of 16.
     pub disparities: u32,
-    /// Matching window, px, odd.
+    /// Matching window of `bm` and of `sgbm`, px, odd.
     pub block_px: u32,
+    pub sgbm_block_px: u32,
     /// Best match must beat the second by this, percent.
     pub uniqueness_percent: u32,
     /// Depths used for seeding, m.
@@ -202,8 +223,10 @@ impl Default for StereoConfig {
     fn default() -> Self {
         StereoConfig {
             method: StereoMethod::Bm,
+            wls: true,
             disparities: 96,
             block_px: 11,
+            sgbm_block_px: 5,
             uniqueness_percent: 10,
             depth_min_m: 0.3,
             depth_max_m: 20.0,

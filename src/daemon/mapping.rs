@@ -42,9 +42,10 @@ impl Mapping {
         }
         let build = || {
             host::lower_priority();
-            let stereo = Stereo::new(calibration, &board.stereo, board.map.scale)?;
-            let bytes = Mapper::footprint(calibration, board).gpu_total();
-            let gpu = Gpu::open(&board.gpu, bytes)?;
+            let bytes = Mapper::footprint(calibration, board).gpu_total()
+                + Stereo::footprint(calibration, &board.stereo, board.map.scale).gpu_total();
+            let mut gpu = Gpu::open(&board.gpu, bytes)?;
+            let stereo = Stereo::new(calibration, &board.stereo, board.map.scale, Some(&mut gpu))?;
             Mapper::new(gpu, stereo, board)
         };
         let mapper = std::thread::scope(|s| s.spawn(build).join().expect("boot faults are values, not panics"))?;

@@ -312,7 +312,7 @@ pub(super) mod tests {
     }
 
     pub fn flat(z: f32) -> DepthMap {
-        DepthMap { width: W, height: H, metres: vec![z; W * H] }
+        DepthMap::of(W, H, vec![z; W * H])
     }
 
     #[test]

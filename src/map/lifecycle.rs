@@ -36,6 +36,8 @@ macro_rules! seen {
     };
 }
 
+/// Part of a view that must have depth to seed from; the rest is continued from it.
+const DEPTH_MIN: f64 = 0.01;
 /// Steps on an anchor after which what it was given must show.
 const STEPS_OF_PROOF: u32 = 10;
 /// Fewer steps than this and a Gaussian's importance is not known.
@@ -101,8 +103,12 @@ impl Mapper {
         let Some(keyframe) = self.queue.front() else { return Ok(Did::Stored) };
         let [left, right, ..] = &keyframe.images[..] else { return Ok(Did::Stored) };
         // A pair that cannot be matched gives no depth, and no anchor; the keyframe is still trained on.
-        if unsealed(|| self.stereo.depth(left, right, &mut self.depth)).is_err() {
+        let Ok(found) = unsealed(|| self.stereo.depth(Some(&mut self.gpu), left, right, &mut self.depth)) else {
             self.counters.depth_failures.add(1);
+            return Ok(Did::Stored);
+        };
+        if (found as f64) < DEPTH_MIN * self.depth.metres.len() as f64 {
+            self.counters.depth_absent.add(1);
             return Ok(Did::Stored);
         }
         if self.store.anchors() == 0 {

@@ -1,15 +1,19 @@
-//! Stereo: a raw pair in, a rectified left image and a depth map at mapping resolution out.
+//! Stereo: a raw pair in, a rectified left image and a depth map at mapping resolution out, by the
+//! method that the board file names (`method`).
 //!
 //! `Stereo` owns the maps made at boot and every buffer it works in. Rectification runs at full
 //! resolution (matching needs it) and the mapping resolution is a box average of it, so that a
 //! mapping pixel is the mean of the light that fell on it. Depth is asked for anchors only.
 
-pub mod bm;
+pub mod confidence;
+pub mod method;
+pub mod opencv;
 pub mod rectify;
 
-use crate::config::{StereoConfig, StereoMethod};
+use crate::config::StereoConfig;
+use crate::gpu::Gpu;
 use crate::mem::Footprint;
-use bm::BlockMatcher;
+pub use method::{Disparity, Method};
 use rectify::{box_average, Rectification, Remap};
 use stipple_drivers::{Calibration, Fault, Image, Pose, RigCamera};
 
@@ -53,11 +57,18 @@ pub struct DepthMap {
     pub width: usize,
     pub height: usize,
     pub metres: Vec<f32>,
+    /// Standard deviation; of no meaning where the depth is unknown.
+    pub sigma_m: Vec<f32>,
 }
 
 impl DepthMap {
     pub fn new(width: usize, height: usize) -> DepthMap {
-        DepthMap { width, height, metres: vec![0.0; width * height] }
+        DepthMap::of(width, height, vec![0.0; width * height])
+    }
+
+    /// Of depths without error.
+    pub fn of(width: usize, height: usize, metres: Vec<f32>) -> DepthMap {
+        DepthMap { width, height, sigma_m: vec![0.0; metres.len()], metres }
     }
 }
 
@@ -67,9 +78,8 @@ pub struct Stereo {
     divisor: usize,
     maps: [Remap; 2],
     rectified: [Image; 2],
-    matcher: BlockMatcher,
-    /// Disparity at full resolution in 1/16 px, negative where unknown.
-    disparity: Vec<i16>,
+    method: Method,
+    disparity: Disparity,
     valid: Vec<u8>,
     depth_range_m: [f64; 2],
     rig: Vec<RigCamera>,
@@ -82,14 +92,19 @@ impl Stereo {
         let mut f = Footprint::default();
         f.host("stereo: rectification maps", 2 * px * size_of::<rectify::Tap>());
         f.host("stereo: rectified pair", 2 * px);
-        f.host("stereo: disparity", px * size_of::<i16>());
+        f.host("stereo: disparity and its deviation", 2 * px * size_of::<f32>());
         f.host("stereo: valid mask", px / (divisor * divisor) as usize);
-        f.host("stereo: OpenCV block matching (estimate)", BlockMatcher::bytes(camera.width, camera.height, config));
+        f.extend(Method::footprint(camera.width, camera.height, config));
         f
     }
 
-    pub fn new(calibration: &Calibration, config: &StereoConfig, divisor: u32) -> Result<Stereo, Fault> {
-        let StereoMethod::Bm = config.method;
+    /// `gpu` is for the methods that run there; its arena must hold the footprint.
+    pub fn new(
+        calibration: &Calibration,
+        config: &StereoConfig,
+        divisor: u32,
+        gpu: Option<&mut Gpu>,
+    ) -> Result<Stereo, Fault> {
         let r = Rectification::new(calibration)?;
         let full = r.camera;
         let divisor = divisor as usize;
@@ -103,8 +118,8 @@ impl Stereo {
             divisor,
             maps,
             rectified: [Image::new(width, height), Image::new(width, height)],
-            matcher: BlockMatcher::new(width, height, config)?,
-            disparity: vec![0; width * height],
+            method: Method::new(width, height, config, gpu)?,
+            disparity: Disparity::new(width, height),
             valid,
             depth_range_m: [config.depth_min_m, config.depth_max_m],
             rig: calibration.cameras.clone(),
@@ -147,11 +162,23 @@ impl Stereo {
         box_average(&self.rectified[side], self.divisor, out);
     }
 
-    /// Depth at mapping resolution. `out` is pre-shaped. Answers how many pixels have depth.
-    pub fn depth(&mut self, raw_left: &Image, raw_right: &Image, out: &mut DepthMap) -> Result<usize, Fault> {
+    /// Depth at mapping resolution. `out` is pre-shaped, `gpu` the one given to `new`. Answers how many pixels have
+    /// depth; none when an eye sees nothing.
+    pub fn depth(
+        &mut self,
+        gpu: Option<&mut Gpu>,
+        raw_left: &Image,
+        raw_right: &Image,
+        out: &mut DepthMap,
+    ) -> Result<usize, Fault> {
         self.maps[0].apply(raw_left, &mut self.rectified[0]);
         self.maps[1].apply(raw_right, &mut self.rectified[1]);
-        self.matcher.compute(&self.rectified[0], &self.rectified[1], &mut self.disparity)?;
+        let [left, right] = &self.rectified;
+        if is_blind(left) || is_blind(right) {
+            self.disparity.forget();
+        } else {
+            self.method.compute(gpu, left, right, &mut self.disparity)?;
+        }
         Ok(self.disparity_to_depth(out))
     }
 
@@ -160,39 +187,55 @@ impl Stereo {
     fn disparity_to_depth(&self, out: &mut DepthMap) -> usize {
         const BLOCK_MAX: usize = 16; // divisor 4
         let (w, s) = (self.full.pinhole.width, self.divisor);
-        let fb = self.full.pinhole.fx * self.full.baseline_m * f64::from(bm::SUBPIXEL);
+        let fb = self.full.pinhole.fx * self.full.baseline_m;
         let mut found = 0;
         for y in 0..out.height {
             for x in 0..out.width {
-                let mut block = [0i16; BLOCK_MAX];
+                let mut block = [(0.0f32, 0.0f32); BLOCK_MAX];
                 let mut n = 0;
                 for row in 0..s {
-                    for &d in &self.disparity[(y * s + row) * w + x * s..][..s] {
-                        if d > 0 {
-                            block[n] = d;
+                    let at = (y * s + row) * w + x * s;
+                    for (&d, &sigma) in self.disparity.px[at..][..s].iter().zip(&self.disparity.sigma_px[at..][..s]) {
+                        if d > 0.0 {
+                            block[n] = (d, sigma);
                             n += 1;
                         }
                     }
                 }
-                let mut depth = 0.0;
+                let (mut depth, mut deviation) = (0.0, 0.0);
                 if 2 * n >= s * s && n > 0 && self.valid[y * out.width + x] != 0 {
-                    block[..n].sort_unstable();
-                    let z = fb / f64::from(block[n / 2]);
+                    block[..n].sort_unstable_by(|a, b| a.0.total_cmp(&b.0));
+                    let (d, sigma) = (f64::from(block[n / 2].0), f64::from(block[n / 2].1));
+                    let z = fb / d;
                     if (self.depth_range_m[0]..=self.depth_range_m[1]).contains(&z) {
-                        depth = z as f32;
+                        // Neighbours err alike: the median of a block is no better than one of them.
+                        (depth, deviation) = (z as f32, (z * sigma / d) as f32);
                         found += 1;
                     }
                 }
                 out.metres[y * out.width + x] = depth;
+                out.sigma_m[y * out.width + x] = deviation;
             }
         }
         found
     }
 }
 
+/// Whether an image holds nothing to match: a covered or dead camera still shows noise of a level or two, and
+/// methods that fill in what they do not see would answer a surface for it.
+fn is_blind(image: &Image) -> bool {
+    /// Standard deviation of the grey levels.
+    const NOTHING: f64 = 3.0;
+    let seen = || image.pixels.iter().filter(|p| **p != 0).map(|p| f64::from(*p));
+    let n = seen().count().max(1) as f64;
+    let mean = seen().sum::<f64>() / n;
+    seen().map(|p| (p - mean).powi(2)).sum::<f64>() / n < NOTHING * NOTHING
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::config::StereoMethod;
     use stipple_drivers::{Camera, ImuCalibration, Lens};
 
     fn rig(lens: Lens, f: f64) -> Calibration {
@@ -225,10 +268,10 @@ mod tests {
         };
         let (left, right) = (draw(&rig.cameras[0]), draw(&rig.cameras[1]));
         for divisor in [1, 2] {
-            let mut stereo = Stereo::new(&rig, &StereoConfig::default(), divisor).expect("a sound rig");
+            let mut stereo = Stereo::new(&rig, &StereoConfig::default(), divisor, None).expect("a sound rig");
             let camera = stereo.camera();
             let mut depth = DepthMap::new(camera.pinhole.width, camera.pinhole.height);
-            let found = stereo.depth(&left, &right, &mut depth).expect("matching runs");
+            let found = stereo.depth(None, &left, &right, &mut depth).expect("matching runs");
             assert!(found * 2 > depth.metres.len(), "{found} of {}", depth.metres.len());
             let mut worst = vec![];
             for y in 0..depth.height {
@@ -244,6 +287,27 @@ mod tests {
             worst.sort_by(f64::total_cmp);
             assert!(worst[worst.len() / 2] < 0.02, "median error {} m", worst[worst.len() / 2]);
             assert!(worst[worst.len() * 95 / 100] < 0.1, "95 % error {} m", worst[worst.len() * 95 / 100]);
+        }
+    }
+
+    #[cfg(feature = "opencv")]
+    #[test]
+    fn every_opencv_method_gives_depth_and_a_blind_eye_none() {
+        let rig = rig(Lens::Radtan { k1: 0.0, k2: 0.0, p1: 0.0, p2: 0.0 }, 200.0);
+        let mut left = Image::new(320, 240);
+        let level = |i: usize| 40 + (i % 320 * 7 + i / 320 * 13 + (i % 320) * (i / 320) % 31) % 170;
+        left.pixels.iter_mut().enumerate().for_each(|(i, p)| *p = level(i) as u8);
+        let mut noise = Image::new(320, 240);
+        noise.pixels.iter_mut().enumerate().for_each(|(i, p)| *p = (level(i) % 4) as u8);
+        for method in [StereoMethod::Bm, StereoMethod::Sgbm] {
+            let config = StereoConfig { method, depth_max_m: 1e4, ..StereoConfig::default() };
+            let mut stereo = Stereo::new(&rig, &config, 1, None).expect("a sound rig");
+            let mut depth = DepthMap::new(320, 240);
+            for dark in [Image::new(320, 240), noise.clone()] {
+                assert_eq!(stereo.depth(None, &left, &dark, &mut depth).expect("no fault"), 0, "{method:?}");
+                assert_eq!(stereo.depth(None, &dark, &left, &mut depth).expect("no fault"), 0, "{method:?}");
+            }
+            assert!(depth.metres.iter().all(|z| *z == 0.0));
         }
     }
 

@@ -42,7 +42,7 @@ fn depth_loss_agrees_with_its_twin() {
             1 if i / w % 2 == 0 => 2.0,
             _ => 0.0,
         };
-        let stored = DepthMap { width: w, height: h, metres: (0..w * h).map(metres).collect() };
+        let stored = DepthMap::of(w, h, (0..w * h).map(metres).collect());
         p.set_depth(&mut gpu, 1, &stored, 0.02).unwrap();
         let step = p.train(&mut gpu, &v, goal(1), &STILL, &weights(WEIGHT)).unwrap();
         assert!(step.stats.visible > 30);
@@ -88,7 +88,7 @@ fn training_on_depth_draws_the_map_to_it() {
         let (mut gpu, mut p) = open(shape(&v, 256, 1 << 16));
         p.append(&mut gpu, &scene(256, &v, 4)).unwrap();
         p.set_keyframe(&mut gpu, 0, &vec![128; w * h]).unwrap();
-        let flat = DepthMap { width: w, height: h, metres: vec![2.0; w * h] };
+        let flat = DepthMap::of(w, h, vec![2.0; w * h]);
         p.set_depth(&mut gpu, 0, &flat, 0.02).unwrap();
         for _ in 0..60 {
             p.train(&mut gpu, &v, goal(0), &rates, &weights(weight)).unwrap();

@@ -431,7 +431,7 @@ fn the_validation_layer_is_silent() {
     p.set_keyframe(&mut gpu, 0, &target(33, 21)).unwrap();
     train(&mut gpu, &mut p, &v, 2);
     p.descend(&mut gpu, &v, &[1.0; 3 * 33 * 21], &FAST, &Weights::default()).unwrap();
-    let known = DepthMap { width: 33, height: 21, metres: vec![2.0; 33 * 21] };
+    let known = DepthMap::of(33, 21, vec![2.0; 33 * 21]);
     p.set_depth(&mut gpu, 0, &known, 0.02).unwrap();
     let goal = Goal { slot: 0, camera: 0, exposure: Some(Exposure { gain: 1.2, offset: 0.1 }), depth: Some(0) };
     p.train(&mut gpu, &v, goal, &FAST, &Weights { depth: 0.1, ..Weights::default() }).unwrap();

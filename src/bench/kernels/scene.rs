@@ -69,7 +69,7 @@ impl Scene {
     pub fn recorded(folder: &Path, n: usize) -> Result<Scene, Fault> {
         const TRIED: usize = 8;
         let recording = Recording::open(folder, &OpenOptions::default())?;
-        let mut stereo = Stereo::new(&recording.calibration, &StereoConfig::default(), 1)?;
+        let mut stereo = Stereo::new(&recording.calibration, &StereoConfig::default(), 1, None)?;
         let camera = stereo.camera().pinhole;
         let (mut frames, mut reader) = (Frames::for_rig(&recording.calibration), recording.reader());
         let mut depth = DepthMap::new(camera.width, camera.height);
@@ -79,7 +79,7 @@ impl Scene {
             if read.is_err() || frames.images.len() < 2 {
                 continue;
             }
-            let found = stereo.depth(&frames.images[0], &frames.images[1], &mut depth)?;
+            let found = stereo.depth(None, &frames.images[0], &frames.images[1], &mut depth)?;
             if best.as_ref().is_none_or(|b| found > b.0) {
                 let mut image = Image::new(camera.width, camera.height);
                 stereo.rectify(&frames.images[0], &mut image);

@@ -1,0 +1,92 @@
+//! The one door to stereo matching: a rectified pair in, disparity and its standard deviation out, by
+//! the method that the board file names.
+//!
+//! | method | where | what it says of its confidence |
+//! |---|---|---|
+//! | `bm`, `sgbm` | CPU, OpenCV | `confidence`, from the picture's detail and the neighbours' agreement |
+//! | `sgm` | GPU | its own |
+//! | `onnx` | CPU, a network of the user's | as the first |
+
+use super::confidence::Confidence;
+use super::opencv::OpenCv;
+use crate::config::{StereoConfig, StereoMethod};
+use crate::gpu::Gpu;
+use crate::mem::Footprint;
+use stipple_drivers::{Exit, Fault, Image};
+
+/// Of each pixel of the rectified left image: x_left - x_right, px, negative where unknown, and its standard deviation.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Disparity {
+    pub width: usize,
+    pub height: usize,
+    pub px: Vec<f32>,
+    /// Of no meaning where the disparity is unknown.
+    pub sigma_px: Vec<f32>,
+}
+
+impl Disparity {
+    pub fn new(width: usize, height: usize) -> Disparity {
+        Disparity { width, height, px: vec![-1.0; width * height], sigma_px: vec![0.0; width * height] }
+    }
+
+    pub fn forget(&mut self) {
+        self.px.fill(-1.0);
+    }
+}
+
+pub enum Method {
+    OpenCv(OpenCv, Confidence),
+}
+
+impl Method {
+    /// Host and GPU memory of the method that `config` names, for images of this size.
+    pub fn footprint(width: usize, height: usize, config: &StereoConfig) -> Footprint {
+        let mut f = Footprint::default();
+        match config.method {
+            StereoMethod::Bm | StereoMethod::Sgbm => {
+                f.extend(OpenCv::footprint(width, height, config));
+                f.extend(Confidence::footprint(width));
+            }
+            StereoMethod::Sgm | StereoMethod::Onnx => {}
+        }
+        f
+    }
+
+    /// `gpu` is for the methods that run there; its arena must hold the footprint.
+    pub fn new(width: usize, height: usize, config: &StereoConfig, _gpu: Option<&mut Gpu>) -> Result<Method, Fault> {
+        match config.method {
+            StereoMethod::Bm | StereoMethod::Sgbm => {
+                Ok(Method::OpenCv(OpenCv::new(width, height, config)?, Confidence::new(width, config)))
+            }
+            StereoMethod::Sgm | StereoMethod::Onnx => {
+                let what = format!("`{}` is not built yet", config.method.name());
+                Err(Fault::new(Exit::Config, "stereo.method", what, "use `bm` or `sgbm`"))
+            }
+        }
+    }
+
+    /// All three of the shape given to `new`, and `gpu` the one.
+    pub fn compute(
+        &mut self,
+        _gpu: Option<&mut Gpu>,
+        left: &Image,
+        right: &Image,
+        out: &mut Disparity,
+    ) -> Result<(), Fault> {
+        match self {
+            Method::OpenCv(matcher, confidence) => {
+                matcher.compute(left, right, &mut out.px)?;
+                confidence.estimate(left, out);
+                Ok(())
+            }
+        }
+    }
+}
+
+/// Why `bm` and `sgbm` are refused by a program without OpenCV.
+#[cfg_attr(feature = "opencv", allow(dead_code))]
+pub fn refused_without_opencv(method: StereoMethod) -> Fault {
+    let what = format!("`{}` is OpenCV's and this program was built without the cargo feature `opencv`", method.name());
+    let fix = "set stereo.method = \"sgm\", or build with the feature (on by default; needs libopencv-calib3d-dev)";
+    Fault::new(Exit::Config, "stereo.method", what, fix)
+}

@@ -1,0 +1,149 @@
+//! Block matching (`cv::StereoBM`, Konolige) and semi-global block matching (`cv::StereoSGBM`,
+//! Hirschmüller) by Debian's OpenCV behind a C++ shim of four functions: no OpenCV type crosses it,
+//! exceptions end in it. Built with the feature `opencv`; without it both are refused at boot.
+#![allow(unsafe_code)]
+
+use crate::config::{StereoConfig, StereoMethod};
+use crate::mem::Footprint;
+use stipple_drivers::{Fault, Image};
+
+/// OpenCV's disparities are in 1/16 px.
+const SUBPIXEL: f32 = 16.0;
+
+pub struct OpenCv {
+    #[cfg(feature = "opencv")]
+    handle: std::ptr::NonNull<std::ffi::c_void>,
+    width: usize,
+    height: usize,
+    /// 1/16 px, negative where unknown.
+    fixed: Vec<i16>,
+}
+
+impl OpenCv {
+    /// Ours, and OpenCV's own working buffers. BM: two prefiltered images with borders, sums over the disparity range
+    /// for each of its row strips, the cost image of the left-right check. SGBM: rows of costs and of path costs.
+    pub fn footprint(width: usize, height: usize, config: &StereoConfig) -> Footprint {
+        let (disparities, block) = (config.disparities as usize, config.block_px as usize);
+        let padded = (width + disparities) * height;
+        let mut f = Footprint::default();
+        f.host("stereo: disparity of OpenCV", width * height * size_of::<i16>());
+        if config.method == StereoMethod::Sgbm {
+            // 16-bit costs: sums of a window's rows, their total, four path costs of this row and the last.
+            let rows = config.sgbm_block_px as usize + 2 + 1 + 2 * 4 + 1;
+            f.host("stereo: OpenCV semi-global matching (estimate)", 10 * padded + 2 * rows * width * disparities);
+        } else {
+            let strip = (disparities + 2) * 4 * (height + block + 2);
+            f.host("stereo: OpenCV block matching (estimate)", 8 * padded + 4 * strip);
+        }
+        f
+    }
+}
+
+#[cfg(feature = "opencv")]
+mod ffi {
+    use std::ffi::{c_int, c_void};
+    extern "C" {
+        pub fn stipple_bm_new(
+            width: c_int,
+            height: c_int,
+            disparities: c_int,
+            block: c_int,
+            uniqueness: c_int,
+        ) -> *mut c_void;
+        pub fn stipple_sgbm_new(
+            width: c_int,
+            height: c_int,
+            disparities: c_int,
+            block: c_int,
+            uniqueness: c_int,
+            p1: c_int,
+            p2: c_int,
+        ) -> *mut c_void;
+        pub fn stipple_matcher_free(handle: *mut c_void);
+        pub fn stipple_matcher_compute(
+            handle: *mut c_void,
+            left: *const u8,
+            right: *const u8,
+            disparity: *mut i16,
+        ) -> c_int;
+    }
+}
+
+#[cfg(feature = "opencv")]
+impl OpenCv {
+    /// `config.method` says which of the two.
+    pub fn new(width: usize, height: usize, config: &StereoConfig) -> Result<OpenCv, Fault> {
+        use stipple_drivers::Exit;
+        let int = |v: u32| v as std::ffi::c_int;
+        let (w, h) = (width as std::ffi::c_int, height as std::ffi::c_int);
+        let (disparities, uniqueness) = (int(config.disparities), int(config.uniqueness_percent));
+        // SAFETY: plain integers in; the answer is null or a handle owned by `self` until `drop`.
+        let handle = unsafe {
+            if config.method == StereoMethod::Sgbm {
+                // What changes by one disparity and by more costs, as OpenCV's samples choose it.
+                let block = int(config.sgbm_block_px);
+                let area = block * block;
+                ffi::stipple_sgbm_new(w, h, disparities, block, uniqueness, 8 * area, 32 * area)
+            } else {
+                ffi::stipple_bm_new(w, h, disparities, int(config.block_px), uniqueness)
+            }
+        };
+        let handle = std::ptr::NonNull::new(handle).ok_or_else(|| {
+            let what = "OpenCV refuses these matching settings";
+            Fault::new(Exit::Config, "stereo", what, "see stereo.* in the board file")
+        })?;
+        Ok(OpenCv { handle, width, height, fixed: vec![0; width * height] })
+    }
+
+    /// Disparity of the left image, px, negative where unknown.
+    pub fn compute(&mut self, left: &Image, right: &Image, disparity_px: &mut [f32]) -> Result<(), Fault> {
+        use stipple_drivers::Exit;
+        let px = self.width * self.height;
+        assert!(
+            left.pixels.len() == px && right.pixels.len() == px && disparity_px.len() == px,
+            "buffers of this matcher's shape"
+        );
+        // SAFETY: the three buffers hold width * height items (asserted, and by construction) and outlive the call.
+        let rc = unsafe {
+            ffi::stipple_matcher_compute(
+                self.handle.as_ptr(),
+                left.pixels.as_ptr(),
+                right.pixels.as_ptr(),
+                self.fixed.as_mut_ptr(),
+            )
+        };
+        if rc != 0 {
+            let what = "OpenCV's matching failed";
+            return Err(Fault::new(Exit::Software, "stereo", what, "report this with the images"));
+        }
+        for (to, from) in disparity_px.iter_mut().zip(&self.fixed) {
+            *to = if *from > 0 { f32::from(*from) / SUBPIXEL } else { -1.0 };
+        }
+        Ok(())
+    }
+}
+
+#[cfg(feature = "opencv")]
+impl Drop for OpenCv {
+    fn drop(&mut self) {
+        // SAFETY: `handle` came from one of the two `new` and is freed once.
+        unsafe { ffi::stipple_matcher_free(self.handle.as_ptr()) }
+    }
+}
+
+// SAFETY: the handle is used by one thread at a time (`&mut self`); cv::StereoMatcher has no thread affinity.
+#[cfg(feature = "opencv")]
+unsafe impl Send for OpenCv {}
+
+#[cfg(not(feature = "opencv"))]
+impl OpenCv {
+    pub fn new(_width: usize, _height: usize, config: &StereoConfig) -> Result<OpenCv, Fault> {
+        Err(super::method::refused_without_opencv(config.method))
+    }
+
+    pub fn compute(&mut self, _left: &Image, _right: &Image, disparity_px: &mut [f32]) -> Result<(), Fault> {
+        assert!(self.fixed.len() == self.width * self.height, "none is ever made");
+        disparity_px.fill(-1.0);
+        Ok(())
+    }
+}
