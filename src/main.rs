@@ -4,6 +4,7 @@ use clap::{Parser, Subcommand};
 use std::path::PathBuf;
 use std::process::ExitCode;
 use stipple::bench;
+use stipple::config::Board;
 use stipple::daemon::{self, Pace};
 use stipple::mem::CountingAllocator;
 use stipple_drivers::{Exit, Fault};
@@ -165,6 +166,23 @@ enum Bench {
         #[arg(long, value_name = "N", value_parser = clap::builder::PossibleValuesParser::new(["2", "4", "8"]))]
         column: Option<String>,
     },
+    /// Disparity of every method against truth: Middlebury, simulated flights, hard cases, time
+    Stereo {
+        #[arg(long, value_name = "DIR")]
+        out: PathBuf,
+        /// Folder of recordings; otherwise $STIPPLE_RECORDINGS, otherwise ../shared/data
+        #[arg(long, value_name = "FOLDER")]
+        recordings: Option<PathBuf>,
+        /// Board file whose [stereo] and [gpu] to use; the methods' own defaults without it
+        #[arg(long, value_name = "FILE")]
+        board: Option<PathBuf>,
+        /// Override a key of the board file
+        #[arg(long = "set", value_name = "SECTION.KEY=VALUE", requires = "board")]
+        set: Vec<String>,
+        /// Two hard cases
+        #[arg(long)]
+        quick: bool,
+    },
     /// Errors beside what the covariance claims, and beside the quality
     Consistency {
         #[arg(long, value_name = "DIR")]
@@ -208,6 +226,10 @@ fn run(command: Command) -> Result<(), Fault> {
         Command::Bench { what: Bench::Kernels { out, device, recording, quick, baseline, column } } => {
             let column = column.and_then(|n| n.parse().ok());
             bench::kernels::kernels(&bench::kernels::Options { device, recording, quick, baseline, column }, &out)
+        }
+        Command::Bench { what: Bench::Stereo { out, recordings, board, set, quick } } => {
+            let board = board.map(|path| Board::load(&path, &set)).transpose()?;
+            bench::stereo::stereo(&bench::stereo::Options { recordings, board, quick }, &out)
         }
         Command::Bench { what: Bench::Stability { out, seeds } } => bench::stability::stability(seeds, &out),
     }

@@ -90,3 +90,32 @@ fn quick_kernel_bench_times_every_kernel_of_a_step() {
     assert!(html.contains("<svg") && !html.contains("NaN"));
     assert!(std::fs::read_to_string(out.join("kernels.csv")).unwrap().lines().count() > kernels.len());
 }
+
+#[test]
+fn quick_stereo_bench_writes_a_row_a_method_and_a_picture_of_each() {
+    let dir = tempfile::tempdir().unwrap();
+    let out = dir.path().join("out");
+    let o = Command::new(env!("CARGO_BIN_EXE_stipple"))
+        .args(["bench", "stereo", "--quick", "--out", out.to_str().unwrap()])
+        .output()
+        .unwrap();
+    let said = String::from_utf8_lossy(&o.stderr).into_owned() + &String::from_utf8_lossy(&o.stdout);
+    assert!(o.status.success(), "{said}");
+
+    let rows: serde_json::Value = serde_json::from_slice(&std::fs::read(out.join("stereo.json")).unwrap()).unwrap();
+    let rows = rows.as_array().unwrap();
+    let row = |set: &str, method: &str| rows.iter().find(|r| r["set"] == set && r["method"] == method);
+    let methods: Vec<&str> =
+        ["bm", "sgbm", "sgm", "sgm_wls"].into_iter().filter(|m| !said.contains(&format!("{m} is left out"))).collect();
+    assert!(!methods.is_empty(), "{said}");
+    for method in methods {
+        let box_ = row("hard_occlusion", method).unwrap();
+        let figure = |name: &str| box_[name].as_f64().unwrap();
+        assert!(figure("bad1") < 0.1 && figure("density") > 0.8 && figure("mean_px") < 1.0, "{box_}");
+        assert!(figure("ms") > 0.0 && figure("bytes") > 0.0 && !box_["device"].as_str().unwrap().is_empty());
+        assert_eq!(row("hard_black_eye", method).unwrap()["density"], 0.0);
+        assert!(out.join(format!("pictures/hard_occlusion-{method}.png")).is_file());
+    }
+    let html = std::fs::read_to_string(out.join("stereo.html")).unwrap();
+    assert!(html.contains("data:image/png") && !html.contains(">NaN") && !html.contains("NaN,"));
+}

@@ -18,7 +18,7 @@ const EDGES: [(&str, &[&str]); 6] = [
     ("bench", &["frontend", "vio", "stereo", "gpu", "map", "output"]),
 ];
 /// Where `unsafe` may stand: the GPU, the allocator, the OpenCV shim, system calls of drivers.
-const UNSAFE: [&str; 4] = ["src/gpu/", "src/mem.rs", "src/stereo/opencv.rs", "drivers/src/"];
+const UNSAFE: [&str; 5] = ["src/gpu/", "src/mem.rs", "src/stereo/opencv.rs", "src/stereo/ximgproc.rs", "drivers/src/"];
 const RUST_LINES_MAX: usize = 600;
 const KERNEL_LINES_MAX: usize = 250;
 /// Lines between a safety comment and the end of what it explains.

@@ -75,7 +75,8 @@ pub fn all(recordings: Option<&Path>) -> Result<Vec<Input>, Fault> {
     Ok(inputs)
 }
 
-fn folder(recordings: Option<&Path>) -> Result<PathBuf, Fault> {
+/// Of recordings.
+pub fn folder(recordings: Option<&Path>) -> Result<PathBuf, Fault> {
     match recordings {
         Some(folder) if folder.is_dir() => Ok(folder.to_path_buf()),
         Some(folder) => Err(Fault::new(
@@ -111,7 +112,7 @@ impl Input {
 }
 
 /// Leaves `seconds` of a recorded path, from `start_s` after its beginning.
-fn cut(scenario: &mut Scenario, start_s: f64, seconds: f64) {
+pub fn cut(scenario: &mut Scenario, start_s: f64, seconds: f64) {
     let sim::Flight::Recorded(recording) = &mut scenario.path else { return };
     let Some(first) = recording.poses.first().map(|p| p.t + Span::from_secs(start_s)) else { return };
     let last = first + Span::from_secs(seconds);

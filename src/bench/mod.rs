@@ -1,6 +1,7 @@
 //! `stipple bench`: what the estimator's parameters cost and what they buy (`odometry`), what becomes of it
 //! when something goes wrong (`stability`), whether it is as good as it says (`consistency`), what a map is
-//! worth at equal time (`map`), and what a training step costs by kernel (`kernels`).
+//! worth at equal time (`map`), what a training step costs by kernel (`kernels`), and how good the methods of stereo
+//! are (`stereo`).
 //!
 //! `odometry` flies every input with the defaults and with one parameter at a time moved away
 //! from them, frontend and estimator on the calling thread, in lockstep, without a mapper. It
@@ -16,6 +17,7 @@ mod measure;
 mod page;
 mod settings;
 pub mod stability;
+pub mod stereo;
 mod tables;
 pub mod world;
 

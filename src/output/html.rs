@@ -280,11 +280,16 @@ fn pictures(out: &mut impl io::Write, pictures: &[(String, Picture)]) -> io::Res
     write!(out, "<section><h2>Renders</h2><p class=\"note\">Observed, rendered, absolute error, depth.</p>")?;
     for index in spread_indices(pictures.len(), PICTURES_MAX) {
         let (caption, picture) = &pictures[index];
-        let mut bytes = Vec::new();
-        picture.shrunk(PICTURE_WIDTH_MAX).write_png(&mut bytes)?;
-        write!(out, "<figure class=\"wide\"><img alt=\"{0}\" src=\"data:image/png;base64,{1}\"><figcaption>{0}</figcaption></figure>", escape(caption), base64(&bytes))?;
+        figure(out, caption, &picture.shrunk(PICTURE_WIDTH_MAX))?;
     }
     write!(out, "</section>")
+}
+
+/// A picture as wide as the page, within it.
+pub fn figure(out: &mut impl io::Write, caption: &str, picture: &Picture) -> io::Result<()> {
+    let mut bytes = Vec::new();
+    picture.write_png(&mut bytes)?;
+    write!(out, "<figure class=\"wide\"><img alt=\"{0}\" src=\"data:image/png;base64,{1}\"><figcaption>{0}</figcaption></figure>", escape(caption), base64(&bytes))
 }
 
 /// At most `count` indices of `len`, evenly spread, ends included.

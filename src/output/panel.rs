@@ -10,7 +10,8 @@ use std::io::{self, Write};
 /// Error drawn at full brightness, of a grey range 0..1.
 const ERROR_FULL: f32 = 0.25;
 const GAP_PX: usize = 4;
-const MISSING: [u8; 3] = [48, 48, 48];
+/// Of pixels without a value.
+pub const MISSING: [u8; 3] = [48, 48, 48];
 const INK: [u8; 3] = [235, 235, 235];
 /// Panel width at which labels are drawn one font pixel to one image pixel.
 const LABEL_WIDTH_PX: usize = 220;
@@ -167,6 +168,16 @@ fn depth_range(depth: &[f32]) -> (f32, f32) {
     let near = percentile(&seen, 0.02).unwrap_or(1.0) as f32;
     let far = percentile(&seen, 0.98).unwrap_or(10.0) as f32;
     (near, far.max(1.01 * near))
+}
+
+/// Near (0) to far (1).
+pub fn depth_colour(s: f32) -> [u8; 3] {
+    ramp(&DEPTH_RAMP, s)
+}
+
+/// None (0) to full (1).
+pub fn error_colour(s: f32) -> [u8; 3] {
+    ramp(&ERROR_RAMP, s)
 }
 
 /// Colour at `s` of 0..1 along evenly spaced anchors.

@@ -29,7 +29,7 @@ impl Disparity {
         Disparity { width, height, px: vec![-1.0; width * height], sigma_px: vec![0.0; width * height] }
     }
 
-    pub fn forget(&mut self) {
+    fn forget(&mut self) {
         self.px.fill(-1.0);
     }
 }
@@ -65,7 +65,7 @@ impl Method {
         }
     }
 
-    /// All three of the shape given to `new`, and `gpu` the one.
+    /// All three of the shape given to `new`, and `gpu` the one. Nothing is known when an eye sees nothing.
     pub fn compute(
         &mut self,
         _gpu: Option<&mut Gpu>,
@@ -73,6 +73,10 @@ impl Method {
         right: &Image,
         out: &mut Disparity,
     ) -> Result<(), Fault> {
+        if is_blind(left) || is_blind(right) {
+            out.forget();
+            return Ok(());
+        }
         match self {
             Method::OpenCv(matcher, confidence) => {
                 matcher.compute(left, right, &mut out.px)?;
@@ -81,6 +85,17 @@ impl Method {
             }
         }
     }
+}
+
+/// Whether an image holds nothing to match: a covered or dead camera still shows noise of a level or two, and
+/// methods that fill in what they do not see would answer a surface for it.
+fn is_blind(image: &Image) -> bool {
+    /// Standard deviation of the grey levels.
+    const NOTHING: f64 = 3.0;
+    let seen = || image.pixels.iter().filter(|p| **p != 0).map(|p| f64::from(*p));
+    let n = seen().count().max(1) as f64;
+    let mean = seen().sum::<f64>() / n;
+    seen().map(|p| (p - mean).powi(2)).sum::<f64>() / n < NOTHING * NOTHING
 }
 
 /// Why `bm` and `sgbm` are refused by a program without OpenCV.

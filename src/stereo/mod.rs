@@ -9,6 +9,8 @@ pub mod confidence;
 pub mod method;
 pub mod opencv;
 pub mod rectify;
+#[cfg(feature = "ximgproc")]
+pub mod ximgproc;
 
 use crate::config::StereoConfig;
 use crate::gpu::Gpu;
@@ -174,11 +176,7 @@ impl Stereo {
         self.maps[0].apply(raw_left, &mut self.rectified[0]);
         self.maps[1].apply(raw_right, &mut self.rectified[1]);
         let [left, right] = &self.rectified;
-        if is_blind(left) || is_blind(right) {
-            self.disparity.forget();
-        } else {
-            self.method.compute(gpu, left, right, &mut self.disparity)?;
-        }
+        self.method.compute(gpu, left, right, &mut self.disparity)?;
         Ok(self.disparity_to_depth(out))
     }
 
@@ -219,17 +217,6 @@ impl Stereo {
         }
         found
     }
-}
-
-/// Whether an image holds nothing to match: a covered or dead camera still shows noise of a level or two, and
-/// methods that fill in what they do not see would answer a surface for it.
-fn is_blind(image: &Image) -> bool {
-    /// Standard deviation of the grey levels.
-    const NOTHING: f64 = 3.0;
-    let seen = || image.pixels.iter().filter(|p| **p != 0).map(|p| f64::from(*p));
-    let n = seen().count().max(1) as f64;
-    let mean = seen().sum::<f64>() / n;
-    seen().map(|p| (p - mean).powi(2)).sum::<f64>() / n < NOTHING * NOTHING
 }
 
 #[cfg(test)]

@@ -1,0 +1,258 @@
+//! `stipple bench stereo`: every method of disparity on pairs whose truth is known.
+//!
+//! Sets are Middlebury's cones and teddy, simulated flights (also by range of depth), pairs for time alone, and
+//! the hard cases. `score` states the protocol. Leaves `stereo.json` (a list, a row a set and method),
+//! `stereo.html` and `pictures/`.
+
+mod methods;
+mod page;
+mod pictures;
+pub mod scenes;
+pub mod score;
+pub mod sets;
+
+use super::inputs;
+use crate::config::Board;
+use crate::output::metrics::percentile;
+use crate::output::panel::Picture;
+use crate::output::{atomically, OutputDir};
+use crate::stereo::Disparity;
+pub use methods::{Base, Runner, NAMES};
+use score::Score;
+use serde_json::{json, Value};
+use sets::Set;
+use std::path::{Path, PathBuf};
+use stipple_drivers::sim::Scenario;
+use stipple_drivers::Fault;
+
+/// Depths that simulated flights are judged by, m.
+const RANGES_M: [f64; 6] = [0.5, 1.0, 2.0, 4.0, 8.0, 20.0];
+/// Frames of each simulated flight.
+const FRAMES: usize = 8;
+/// Flown by a real vehicle through a room around its path, up to 20 m deep; where in it to begin, s.
+const LONG_FLIGHT: (&str, f64, f64) = ("euroc_text/MH_04_difficult/state_groundtruth_estimate0.csv", 16.0, 40.0);
+/// Pairs for time alone: disparities at 752x480, and how often.
+const TIMED: [u32; 2] = [64, 128];
+const REPEATS: usize = 5;
+/// What a quick run looks at.
+const QUICK: [&str; 2] = ["hard_occlusion", "hard_black_eye"];
+
+pub struct Options {
+    /// Folder of recordings; otherwise that of `$STIPPLE_RECORDINGS`, otherwise one beside the project.
+    pub recordings: Option<PathBuf>,
+    /// Its `[stereo]` and `[gpu]`, but for method and range of disparities.
+    pub board: Option<Board>,
+    /// Two hard cases.
+    pub quick: bool,
+}
+
+/// A method on a set.
+pub struct Row {
+    pub set: String,
+    pub method: &'static str,
+    pub score: Score,
+    /// Median wall time of a pair.
+    pub ms: f64,
+    pub bytes: u64,
+    pub device: String,
+    /// Whether the method states deviations.
+    pub deviation: bool,
+}
+
+#[derive(Default)]
+pub struct Bench {
+    /// Name and what it is.
+    pub sets: Vec<(String, String)>,
+    pub rows: Vec<Row>,
+    pub pictures: Vec<(String, Picture)>,
+    /// Methods that are not to be had here, and why.
+    pub left_out: Vec<(&'static str, String)>,
+}
+
+/// `stipple bench stereo`
+pub fn stereo(options: &Options, out: &Path) -> Result<(), Fault> {
+    let out = OutputDir::create(out)?;
+    let sets = match options.quick {
+        true => scenes::hard().into_iter().filter(|s| QUICK.contains(&s.name.as_str())).collect(),
+        false => all_sets(options.recordings.as_deref())?,
+    };
+    let bench = measure(&sets, &Base::of(options.board.as_ref()))?;
+    out.replace_folder("pictures", |dir| {
+        bench.pictures.iter().try_for_each(|(name, p)| atomically(&dir.join(format!("{name}.png")), |w| p.write_png(w)))
+    })?;
+    out.write("stereo.html", |w| page::write(w, &bench))?;
+    out.write("stereo.json", |w| {
+        let rows: Vec<Value> = bench.rows.iter().map(Row::json).collect();
+        serde_json::to_writer_pretty(&mut *w, &rows)?;
+        std::io::Write::write_all(w, b"\n")
+    })?;
+    println!("{}", out.file("stereo.html").display());
+    Ok(())
+}
+
+fn all_sets(recordings: Option<&Path>) -> Result<Vec<Set>, Fault> {
+    let folder = inputs::folder(recordings)?;
+    let mut sets = sets::middlebury(&folder)?;
+    if sets.is_empty() {
+        eprintln!("no Middlebury pairs in {}", folder.display());
+    }
+    let named = |name| Scenario::named(name).expect("a scenario of the simulator");
+    let mut flights = vec![named("demo"), named("aggressive")];
+    let (path, from_s, seconds) = LONG_FLIGHT;
+    let path = folder.join(path);
+    if path.is_file() {
+        let mut long = Scenario::from_euroc(&path, None)?;
+        inputs::cut(&mut long, from_s, seconds);
+        flights.push(long);
+    }
+    for flight in flights {
+        let frames = (flight.duration.secs().min(seconds) * flight.rate_hz) as usize;
+        sets.push(sets::simulated(flight, frames / FRAMES, FRAMES)?);
+    }
+    sets.extend(scenes::hard());
+    Ok(sets)
+}
+
+/// One method and size at a time, so that one matcher's memory and device are open at once.
+pub fn measure(sets: &[Set], base: &Base) -> Result<Bench, Fault> {
+    let mut bench =
+        Bench { sets: sets.iter().map(|s| (s.name.clone(), s.about.clone())).collect(), ..Bench::default() };
+    for method in NAMES {
+        let mut ranges = [Score::default(); RANGES_M.len() - 1];
+        let mut of_range: Option<Row> = None;
+        let mut done = vec![false; sets.len()];
+        while let Some(next) = done.iter().position(|d| !d) {
+            let shape = |s: &Set| (s.size(), s.disparities);
+            let alike: Vec<usize> = (next..sets.len()).filter(|&i| shape(&sets[i]) == shape(&sets[next])).collect();
+            alike.iter().for_each(|&i| done[i] = true);
+            let mut runner = match Runner::new(method, base, sets[next].size(), sets[next].disparities) {
+                Ok(runner) => runner,
+                Err(fault) => {
+                    eprintln!("{method} is left out: {fault}");
+                    bench.left_out.push((method, fault.to_string()));
+                    break;
+                }
+            };
+            for i in alike {
+                let row = judge(&sets[i], method, &mut runner, &mut ranges, &mut bench.pictures)?;
+                eprintln!("{}", row.line());
+                if sets[i].name.starts_with("sim_") {
+                    of_range = Some(Row { set: String::new(), ..row.like() });
+                }
+                bench.rows.push(row);
+            }
+            if sets[next].name.starts_with("sim_") {
+                for disparities in TIMED {
+                    let row = time(&sets[next], method, base, disparities)?;
+                    eprintln!("{}", row.line());
+                    bench.rows.push(row);
+                }
+            }
+        }
+        if let Some(row) = of_range {
+            for (k, score) in ranges.into_iter().enumerate() {
+                let set = format!("sim {} to {} m", RANGES_M[k], RANGES_M[k + 1]);
+                bench.rows.push(Row { set, score, ..row.like() });
+            }
+        }
+    }
+    Ok(bench)
+}
+
+/// A method on every pair of a set, after one to warm up.
+fn judge(
+    set: &Set,
+    method: &'static str,
+    runner: &mut Runner,
+    ranges: &mut [Score],
+    pictures: &mut Vec<(String, Picture)>,
+) -> Result<Row, Fault> {
+    let (w, h) = set.size();
+    let mut found = Disparity::new(w, h);
+    let mut score = Score::default();
+    let mut ms = vec![];
+    let fb = set.focal_baseline.unwrap_or(0.0);
+    runner.run(&set.pairs[0].left, &set.pairs[0].right, &mut found)?;
+    for (k, pair) in set.pairs.iter().enumerate() {
+        ms.push(runner.run(&pair.left, &pair.right, &mut found)?);
+        score.add(pair, &found, [0.0, f64::INFINITY], fb);
+        if set.name.starts_with("sim_") {
+            for (range, ends) in ranges.iter_mut().zip(RANGES_M.windows(2)) {
+                range.add(pair, &found, [fb / ends[1], fb / ends[0]], fb);
+            }
+        }
+        if k == 0 {
+            let picture = pictures::picture(pair, &found, runner.has_deviation());
+            pictures.push((format!("{}-{method}", set.name), picture));
+        }
+    }
+    Ok(Row {
+        set: set.name.clone(),
+        method,
+        score,
+        ms: percentile(&ms, 0.5).unwrap_or(0.0),
+        bytes: runner.bytes,
+        device: runner.device.clone(),
+        deviation: runner.has_deviation(),
+    })
+}
+
+/// The first pair of a set again and again, with another range of disparities.
+fn time(set: &Set, method: &'static str, base: &Base, disparities: u32) -> Result<Row, Fault> {
+    let mut runner = Runner::new(method, base, set.size(), disparities)?;
+    let (w, h) = set.size();
+    let (pair, mut found) = (&set.pairs[0], Disparity::new(w, h));
+    runner.run(&pair.left, &pair.right, &mut found)?;
+    let runs = (0..REPEATS).map(|_| runner.run(&pair.left, &pair.right, &mut found));
+    let ms = runs.collect::<Result<Vec<f64>, Fault>>()?;
+    let mut score = Score::default();
+    score.add(pair, &found, [0.0, f64::INFINITY], set.focal_baseline.unwrap_or(0.0));
+    Ok(Row {
+        set: format!("time {w}x{h}, {disparities} disparities"),
+        method,
+        score,
+        ms: percentile(&ms, 0.5).unwrap_or(0.0),
+        bytes: runner.bytes,
+        device: runner.device.clone(),
+        deviation: runner.has_deviation(),
+    })
+}
+
+impl Row {
+    /// Another set's, of the same method and device.
+    fn like(&self) -> Row {
+        Row { set: String::new(), device: self.device.clone(), ..*self }
+    }
+
+    fn line(&self) -> String {
+        let percent = |v: Option<f64>| v.map_or("-".to_string(), |v| format!("{:.2} %", 100.0 * v));
+        let s = &self.score.all;
+        format!(
+            "{:<28} {:<9} bad1 {:>8} bad2 {:>8} mean {:>6.3} px density {:>8} {:>8.1} ms  residual variance {:.2}",
+            self.set,
+            self.method,
+            percent(s.bad1()),
+            percent(s.bad2()),
+            s.mean_px().unwrap_or(f64::NAN),
+            percent(s.density()),
+            self.ms,
+            self.score.visible.residual_variance().unwrap_or(f64::NAN)
+        )
+    }
+
+    fn json(&self) -> Value {
+        let (all, seen) = (&self.score.all, &self.score.visible);
+        let stated = |v: Option<f64>| v.filter(|_| self.deviation);
+        json!({
+            "set": self.set, "method": self.method,
+            "bad1": all.bad1(), "bad2": all.bad2(), "mean_px": all.mean_px(), "density": all.density(),
+            "ms": self.ms, "bytes": self.bytes, "device": self.device,
+            "pixels": all.pixels(),
+            "visible": seen.json(),
+            "mean_depth_error_m": seen.mean_m().filter(|_| self.set.starts_with("sim")),
+            "residual_variance": stated(seen.residual_variance()),
+            "within_a_deviation": stated(seen.within_a_deviation()),
+            "gross": seen.gross(),
+        })
+    }
+}
