@@ -13,7 +13,7 @@ use stipple::stereo::Stereo;
 use stipple_drivers::replay::{OpenOptions, Recording};
 use stipple_drivers::sim::{Scenario, Sim};
 use stipple_drivers::types::pose_at;
-use stipple_drivers::{Calibration, Frames, Pose, Span};
+use stipple_drivers::{Calibration, Camera, Frames, Lens, Pose, Span};
 
 #[global_allocator]
 static ALLOCATOR: CountingAllocator = CountingAllocator;
@@ -49,6 +49,64 @@ fn flight(count: usize) -> (Calibration, Vec<Keyframe>) {
     };
     let keyframes = (0..count).map(&mut keyframe).collect();
     (calibration, keyframes)
+}
+
+/// The same flight through TUM-VI's lenses, 512 px wide, with the truth of how far the left one sees.
+fn fisheye_flight(count: usize) -> (Calibration, Vec<Keyframe>, Vec<Vec<f32>>) {
+    let mut scenario = Scenario::named("demo").unwrap();
+    scenario.image_divisor = 1;
+    let lens = Lens::KannalaBrandt { k: [0.0034, 0.0007, -0.0020, 0.0002] };
+    let camera = Camera { width: 512, height: 512, fx: 190.0, fy: 190.0, cx: 254.5, cy: 256.5, lens };
+    scenario.calibration.cameras.iter_mut().for_each(|c| c.camera = camera);
+    let mut sim = Sim::new(&scenario).unwrap();
+    let calibration = sim.calibration().clone();
+    let mut frames = Frames::for_rig(&calibration);
+    let (mut keyframes, mut distances) = (vec![], vec![]);
+    for k in 0..count {
+        let frame = 40 + 10 * k;
+        sim.render(frame, &mut frames);
+        let (images, world_from_body) = (frames.images.clone(), sim.truth_at(frames.t).pose);
+        keyframes.push(Keyframe { id: k as u64, t: frames.t, world_from_body, images, held_out: false });
+        let mut depth = vec![0.0; 512 * 512];
+        sim.depth(frame, 0, &mut depth);
+        let along = |i: usize| {
+            let ray = camera.unproject(glam::DVec2::new((i % 512) as f64, (i / 512) as f64));
+            ray.map_or(0.0, |ray| depth[i] / ray.z as f32)
+        };
+        distances.push((0..512 * 512).map(along).collect());
+    }
+    (calibration, keyframes, distances)
+}
+
+#[test]
+fn fisheye_anchors_are_densified_and_drawn_to_their_depth() {
+    let (calibration, keyframes, distances) = fisheye_flight(4);
+    let run = |densify: u32, depth: f64| {
+        let (densify, depth) = (format!("map.densify_max={densify}"), format!("map.depth_weight={depth}"));
+        let settings = ["map.scale=4", "map.projection=fisheye", "map.seeds_per_anchor=1500", &densify, &depth];
+        let mut mapper = open(&calibration, &board(&settings));
+        for k in &keyframes {
+            mapper.offer(k);
+            train(&mut mapper, 60);
+        }
+        // Of inverse distance, 1/m, within 45 degrees of the axis.
+        let (mut sum, mut n) = (0.0, 0);
+        for (panel, truth) in mapper.panels(4).unwrap().iter().zip(&distances) {
+            for (x, y) in (14..114).flat_map(|y| (14..114).map(move |x| (x, y))) {
+                let seen = f64::from(panel.depth[y * 128 + x]);
+                if (x as f64 - 63.5).hypot(y as f64 - 63.5) < 37.0 && seen > 0.0 {
+                    sum += (1.0 / seen - 1.0 / f64::from(truth[(4 * y + 2) * 512 + 4 * x + 2])).abs();
+                    n += 1;
+                }
+            }
+        }
+        let densified = mapper.counters().splats_densified.get();
+        (mapper.evaluate().unwrap().psnr_db.unwrap(), densified, sum / f64::from(n))
+    };
+    let (seeded, densified, drawn) = (run(0, 0.0), run(4096, 0.0), run(0, 1.0));
+    println!("seeded {seeded:?} densified {densified:?} drawn {drawn:?}");
+    assert!(seeded.1 == 0 && densified.1 > 200 && densified.0 > seeded.0 + 0.1, "{seeded:?} {densified:?}");
+    assert!(drawn.2 < 0.9 * seeded.2, "{seeded:?} {drawn:?} /m");
 }
 
 /// One thing at a time until `steps` training steps are taken.

@@ -1,5 +1,6 @@
 // Inverse-depth L1 on an anchor's view: one thread a pixel.
 //   L = weight Σ c |D / A - d|,   D = Σ α T / z and A = Σ α T of the raster
+// z is along the axis; of a fisheye it is the distance along the ray, and so is d (see eyes.rs).
 // D / A, the expected inverse depth of what was hit, is compared, not D: a pixel that is half covered at the right depth
 // is right, and filling it in is the picture's business; against D alone the cheapest way to a farther depth would be a
 // fainter Gaussian. In inverse depth an error is one of disparity, which is what stereo measures, at any range. Where

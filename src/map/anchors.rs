@@ -8,12 +8,12 @@
 
 use super::occupancy::{FULL, HELD};
 use super::schedule::Rng;
-use super::view::Exposure;
+use super::view::{Exposure, View};
 use crate::counters::Counters;
 use crate::mem::Footprint;
-use crate::stereo::{DepthMap, Pinhole};
+use crate::stereo::DepthMap;
 use glam::DVec3;
-use stipple_drivers::{Image, Pose};
+use stipple_drivers::Image;
 
 /// A Gaussian to be: isotropic, at a pixel's depth.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -45,9 +45,10 @@ const SEED_ALPHA: f32 = 0.5;
 const SEED_ERROR: f64 = 0.1;
 
 /// What an anchor sees.
-pub struct View<'a> {
+pub struct Seen<'a> {
     pub image: &'a Image,
     pub valid: &'a [u8],
+    /// As the raster counts it.
     pub depth: &'a DepthMap,
     /// Rendered before the anchor was added.
     pub alpha: &'a [f32],
@@ -56,17 +57,7 @@ pub struct View<'a> {
     pub exposure: Exposure,
     /// m; zero where nothing was hit.
     pub rendered_depth: &'a [f32],
-    pub camera: Pinhole,
-    pub world_from_cam: Pose,
-}
-
-impl View<'_> {
-    /// A pixel's point at depth `z`, in the world.
-    pub(super) fn point(&self, x: usize, y: usize, z: f64) -> DVec3 {
-        let c = self.camera;
-        let p_cam = DVec3::new((x as f64 - c.cx) / c.fx, (y as f64 - c.cy) / c.fy, 1.0) * z;
-        self.world_from_cam.transform(p_cam)
-    }
+    pub from: View,
 }
 
 /// Fraction of valid pixels whose rendered alpha is below `covered_alpha`.
@@ -120,11 +111,11 @@ impl Seeder {
     }
 
     /// Picks seeds as dense as `whole` for a view, and answers where they are; `settle` says which of them stay.
-    pub fn seed(&mut self, view: &View, whole: usize, counters: &Counters) -> &[[f32; 4]] {
-        self.fill(&view.depth.metres, view.depth.width);
-        self.set_density(view, self.seeds_max.min(whole));
+    pub fn seed(&mut self, seen: &Seen, whole: usize, counters: &Counters) -> &[[f32; 4]] {
+        self.fill(&seen.depth.metres, seen.depth.width);
+        self.set_density(seen, self.seeds_max.min(whole));
         self.points.clear();
-        self.pick(view, self.seeds_max, counters, |seeder, x, y| seeder.put(view, x, y));
+        self.pick(seen, self.seeds_max, counters, |seeder, x, y| seeder.put(seen, x, y));
         &self.points
     }
 
@@ -150,13 +141,13 @@ impl Seeder {
     /// Calls `put` for pixels picked as `density` says, as long as there are fewer than `room` seeds.
     pub(super) fn pick(
         &mut self,
-        view: &View,
+        seen: &Seen,
         room: usize,
         counters: &Counters,
         mut put: impl FnMut(&mut Seeder, usize, usize),
     ) {
         self.seeds.clear();
-        let (w, h) = (view.image.width, view.image.height);
+        let (w, h) = (seen.image.width, seen.image.height);
         // The first row inherits what a row above would have left, else a sparse pattern starts late.
         let mut rng = Rng::new(1);
         self.carried[0].fill_with(|| rng.below(1024) as f32 / 1024.0 - 0.5);
@@ -186,14 +177,14 @@ impl Seeder {
         }
     }
 
-    fn put(&mut self, view: &View, x: usize, y: usize) {
-        let i = y * view.image.width + x;
-        let c = view.camera;
-        let matched = view.depth.metres[i] > 0.0;
-        let z = f64::from(if matched { view.depth.metres[i] } else { self.filled[i] });
-        let p_world = view.point(x, y, z);
-        let grey = view.exposure.inverse(f64::from(view.image.pixels[i]) / 255.0);
-        let lacking = view.alpha[i] < SEED_ALPHA || (f64::from(view.grey[i]) - grey).abs() >= SEED_ERROR;
+    fn put(&mut self, seen: &Seen, x: usize, y: usize) {
+        let i = y * seen.image.width + x;
+        let c = seen.from.camera;
+        let matched = seen.depth.metres[i] > 0.0;
+        let z = f64::from(if matched { seen.depth.metres[i] } else { self.filled[i] });
+        let Some(p_world) = seen.from.point(x, y, z) else { return };
+        let grey = seen.exposure.inverse(f64::from(seen.image.pixels[i]) / 255.0);
+        let lacking = seen.alpha[i] < SEED_ALPHA || (f64::from(seen.grey[i]) - grey).abs() >= SEED_ERROR;
         let [px, py, pz] = p_world.as_vec3().to_array();
         self.points.push([px, py, pz, f32::from(u8::from(lacking))]);
         let spacing_px = (1.0 / f64::from(self.density[i])).sqrt().clamp(SPACING_PX[0], SPACING_PX[1]);
@@ -206,20 +197,20 @@ impl Seeder {
     }
 
     /// Seeds a pixel, so that a whole uncovered view gets `seeds` of them.
-    fn set_density(&mut self, view: &View, seeds: usize) {
-        let (w, h) = (view.image.width, view.image.height);
-        let px = |x: usize, y: usize| f64::from(view.image.pixels[y * w + x]);
+    fn set_density(&mut self, seen: &Seen, seeds: usize) {
+        let (w, h) = (seen.image.width, seen.image.height);
+        let px = |x: usize, y: usize| f64::from(seen.image.pixels[y * w + x]);
         let mut sum = 0.0;
         for y in 0..h {
             for x in 0..w {
                 let i = y * w + x;
                 let mut weight = 0.0;
-                if view.valid[i] != 0 && self.filled[i] > 0.0 {
+                if seen.valid[i] != 0 && self.filled[i] > 0.0 {
                     let (x0, x1) = (x.saturating_sub(1), (x + 1).min(w - 1));
                     let (y0, y1) = (y.saturating_sub(1), (y + 1).min(h - 1));
                     let gradient = 0.5 * (px(x1, y) - px(x0, y)).hypot(px(x, y1) - px(x, y0));
                     weight = 1.0 + gradient / GRADIENT_DOUBLES;
-                    if view.depth.metres[i] <= 0.0 {
+                    if seen.depth.metres[i] <= 0.0 {
                         weight *= DENSITY_FILLED;
                     }
                     sum += weight;
@@ -286,17 +277,20 @@ fn carried_depth(metres: &[f32], width: usize, i: usize, around: [u32; 4]) -> f3
 pub(super) mod tests {
     use super::super::occupancy::CLAIMED;
     use super::*;
+    use crate::stereo::Pinhole;
+    use stipple_drivers::Pose;
 
     pub const W: usize = 64;
     pub const H: usize = 48;
 
-    pub fn camera() -> Pinhole {
-        Pinhole { width: W, height: H, fx: 50.0, fy: 50.0, cx: 31.5, cy: 23.5 }
+    pub fn from() -> View {
+        let camera = Pinhole { width: W, height: H, fx: 50.0, fy: 50.0, cx: 31.5, cy: 23.5 };
+        View { world_from_cam: Pose::IDENTITY, camera, fisheye: None }
     }
 
     /// With every cell held as `answer` says.
     fn seed(seeder: &mut Seeder, image: &Image, depth: &DepthMap, alpha: f32, answer: u32) -> Vec<Seed> {
-        let view = View {
+        let seen = Seen {
             image,
             valid: &[1; W * H],
             depth,
@@ -304,10 +298,9 @@ pub(super) mod tests {
             grey: &[0.0; W * H],
             exposure: Exposure::default(),
             rendered_depth: &[0.0; W * H],
-            camera: camera(),
-            world_from_cam: Pose::IDENTITY,
+            from: from(),
         };
-        let n = seeder.seed(&view, usize::MAX, &Counters::default()).len();
+        let n = seeder.seed(&seen, usize::MAX, &Counters::default()).len();
         seeder.settle(&vec![answer; n], usize::MAX, &Counters::default()).to_vec()
     }
 
@@ -365,7 +358,7 @@ pub(super) mod tests {
         let mut s = Seeder::new(W, H, 300);
         let counters = Counters::default();
         let (image, depth) = (Image::new(W, H), flat(1.0));
-        let view = View {
+        let seen = Seen {
             image: &image,
             valid: &[1; W * H],
             depth: &depth,
@@ -373,13 +366,12 @@ pub(super) mod tests {
             grey: &[0.0; W * H],
             exposure: Exposure::default(),
             rendered_depth: &[0.0; W * H],
-            camera: camera(),
-            world_from_cam: Pose::IDENTITY,
+            from: from(),
         };
-        let n = s.seed(&view, 300, &counters).len();
+        let n = s.seed(&seen, 300, &counters).len();
         assert!((270..=300).contains(&n), "{n}");
         assert_eq!((s.settle(&vec![0; n], 25, &counters).len(), counters.splats_full.get()), (25, n as u64 - 25));
-        assert!(s.seed(&view, 1 << 20, &counters).len() <= 300);
+        assert!(s.seed(&seen, 1 << 20, &counters).len() <= 300);
     }
 
     #[test]

@@ -2,9 +2,11 @@
 //!
 //! As published: `MAX · (1 − mean SSIM) / 2` pixels, drawn with weight 1 − SSIM (here by error diffusion, which draws the
 //! same density without clumps), at the depth of the stereo pair where it is valid and of the rendering elsewhere, as wide
-//! as the distance to the nearest of the other newcomers.
+//! as the distance to the nearest of the other newcomers. A fisheye's rim, which no pair sees, gets none until it is
+//! rendered: depth carried over to it from the nearest matches hid what was to come (12 simulated keyframes at 60 steps:
+//! training 22.30 dB in place of 23.43; without densification 22.82).
 
-use super::anchors::{Seed, Seeder, View, SPACING_PX, SPREAD};
+use super::anchors::{Seed, Seeder, Seen, SPACING_PX, SPREAD};
 use super::buffers::RUN;
 use super::pipeline::{Goal, Pipeline};
 use crate::counters::Counters;
@@ -63,26 +65,27 @@ impl Pipeline {
 
 impl Seeder {
     /// At most `wanted` Gaussians, where `similarity` is low and there is a depth.
-    pub fn densify(&mut self, view: &View, similarity: &[f32], wanted: usize, counters: &Counters) -> &[Seed] {
+    pub fn densify(&mut self, seen: &Seen, similarity: &[f32], wanted: usize, counters: &Counters) -> &[Seed] {
         let wanted = wanted.min(self.seeds_max);
         let mut sum = 0.0;
         for i in 0..similarity.len() {
-            let has_depth = view.depth.metres[i] > 0.0 || rendered_depth(view, i).is_some();
-            let weight = if view.valid[i] != 0 && has_depth { (1.0 - similarity[i]).max(0.0) } else { 0.0 };
+            let has_depth = seen.depth.metres[i] > 0.0 || rendered_depth(seen, i).is_some();
+            let weight = if seen.valid[i] != 0 && has_depth { (1.0 - similarity[i]).max(0.0) } else { 0.0 };
             self.density[i] = weight;
             sum += f64::from(weight);
         }
         let scale = (wanted as f64 / sum.max(1e-9)) as f32;
         self.density.iter_mut().for_each(|d| *d = (*d * scale).min(1.0));
-        self.pick(view, wanted, counters, |seeder, x, y| {
-            let i = y * view.image.width + x;
-            let matched = view.depth.metres[i] > 0.0;
-            let z = f64::from(if matched { view.depth.metres[i] } else { rendered_depth(view, i).unwrap_or_default() });
+        self.pick(seen, wanted, counters, |seeder, x, y| {
+            let i = y * seen.image.width + x;
+            let matched = seen.depth.metres[i] > 0.0;
+            let z = f64::from(if matched { seen.depth.metres[i] } else { rendered_depth(seen, i).unwrap_or_default() });
+            let Some(p_world) = seen.from.point(x, y, z) else { return };
             seeder.seeds.push(Seed {
-                p_world: view.point(x, y, z),
-                sigma_m: z / view.camera.fx,
+                p_world,
+                sigma_m: z / seen.from.camera.fx,
                 opacity: if matched { OPACITY_MATCHED } else { OPACITY_RENDERED },
-                grey: view.exposure.inverse(f64::from(view.image.pixels[i]) / 255.0).max(0.0),
+                grey: seen.exposure.inverse(f64::from(seen.image.pixels[i]) / 255.0).max(0.0),
             });
         });
         widen(&mut self.seeds);
@@ -90,8 +93,8 @@ impl Seeder {
     }
 }
 
-fn rendered_depth(view: &View, i: usize) -> Option<f32> {
-    (view.alpha[i] >= DEPTH_ALPHA && view.rendered_depth[i] > 0.0).then(|| view.rendered_depth[i])
+fn rendered_depth(seen: &Seen, i: usize) -> Option<f32> {
+    (seen.alpha[i] >= DEPTH_ALPHA && seen.rendered_depth[i] > 0.0).then(|| seen.rendered_depth[i])
 }
 
 /// From a pixel's width to that of the mean distance to the nearest others, within the spacing of seeds.
@@ -116,10 +119,10 @@ fn widen(seeds: &mut [Seed]) {
 
 #[cfg(test)]
 mod tests {
-    use super::super::anchors::tests::{camera, flat, H, W};
+    use super::super::anchors::tests::{flat, from, H, W};
     use super::super::view::Exposure;
     use super::*;
-    use stipple_drivers::{Image, Pose};
+    use stipple_drivers::Image;
 
     #[test]
     fn newcomers_go_where_the_picture_is_wrong_and_to_the_depth_there_is() {
@@ -129,7 +132,7 @@ mod tests {
         let alpha: Vec<f32> = (0..W * H).map(|i| if i % W < W / 4 { 0.1 } else { 0.9 }).collect();
         // Right half wrong.
         let similarity: Vec<f32> = (0..W * H).map(|i| if i % W < W / 2 { 1.0 } else { 0.2 }).collect();
-        let view = View {
+        let seen = Seen {
             image: &image,
             valid: &[1; W * H],
             depth: &depth,
@@ -137,11 +140,10 @@ mod tests {
             grey: &[0.0; W * H],
             exposure: Exposure::default(),
             rendered_depth: &[3.0; W * H],
-            camera: camera(),
-            world_from_cam: Pose::IDENTITY,
+            from: from(),
         };
         let mut s = Seeder::new(W, H, 500);
-        let seeds = s.densify(&view, &similarity, 200, &Counters::default()).to_vec();
+        let seeds = s.densify(&seen, &similarity, 200, &Counters::default()).to_vec();
         assert!((180..=200).contains(&seeds.len()), "{}", seeds.len());
         assert!(seeds.iter().all(|k| k.p_world.x > -0.05));
         assert!(seeds.iter().all(|k| (k.p_world.z - 2.0).abs() < 1e-6 || (k.p_world.z - 3.0).abs() < 1e-6));
@@ -149,6 +151,6 @@ mod tests {
         let px = |k: &Seed| k.sigma_m / k.p_world.z * 50.0;
         let mean = seeds.iter().map(px).sum::<f64>() / seeds.len() as f64;
         assert!((0.3 * 2.8..0.7 * 2.8).contains(&mean), "{mean}");
-        assert!(s.densify(&view, &[1.0; W * H], 200, &Counters::default()).is_empty());
+        assert!(s.densify(&seen, &[1.0; W * H], 200, &Counters::default()).is_empty());
     }
 }

@@ -81,15 +81,17 @@ impl Pipeline {
 }
 
 impl Mapper {
-    /// Keeps the depth just matched for an anchor, where it is trained on: it is the rectified view's, not a fisheye's.
+    /// Keeps the depth just matched for an anchor, where it is trained on; of a fisheye along the rays, as its raster
+    /// renders it.
     pub(super) fn keep_depth(&mut self, index: usize) -> Result<(), GpuError> {
-        if !self.pipeline.shape().inverse_depth || self.eyes[0].fisheye.is_some() {
+        if !self.pipeline.shape().inverse_depth {
             return Ok(());
         }
         let place = self.store.keep_depth(index, self.pipeline.depths_max());
         let camera = self.stereo.camera();
         let one_px = 1.0 / (camera.pinhole.fx * camera.baseline_m);
-        self.pipeline.set_depth(&mut self.gpu, place, &self.depth, one_px)
+        let depth = self.pair.as_ref().map_or(&self.depth, |pair| &pair.distance);
+        self.pipeline.set_depth(&mut self.gpu, place, depth, one_px)
     }
 }
 

@@ -19,19 +19,19 @@ use super::{gaussian, median_depth, Did, Mapper, SCENE_DEPTH_M};
 use crate::gpu::GpuError;
 use crate::mem::unsealed;
 
-/// What anchor `$index` sees of the last rendering; fields are borrowed one by one, so that the seeder is still free.
+/// What anchor `$index` sees of the last rendering, which was `$from` there; fields are borrowed one by one, so that the
+/// seeder is still free.
 macro_rules! seen {
-    ($mapper:ident, $index:ident) => {
-        anchors::View {
-            image: $mapper.seeded_from.as_ref().unwrap_or_else(|| $mapper.store.image($index)),
-            valid: $mapper.stereo.valid_mask(),
-            depth: &$mapper.depth,
+    ($mapper:ident, $index:ident, $from:expr, $image:expr, $valid:expr, $depth:expr) => {
+        anchors::Seen {
+            image: $image,
+            valid: $valid,
+            depth: $depth,
             alpha: &$mapper.rendered.alpha,
             grey: &$mapper.rendered.grey,
             exposure: $mapper.store.exposure($index),
             rendered_depth: &$mapper.rendered.depth,
-            camera: $mapper.stereo.camera().pinhole,
-            world_from_cam: $mapper.rectified($index).world_from_cam,
+            from: $from,
         }
     };
 }
@@ -74,8 +74,8 @@ impl Mapper {
             let image = self.store.image(index + i);
             self.pipeline.set_keyframe(&mut self.gpu, (index + i) as u32, &image.pixels)?;
         }
-        if let Some(image) = &mut self.seeded_from {
-            self.stereo.rectify(&keyframe.images[0], image);
+        if let Some(pair) = &mut self.pair {
+            self.stereo.rectify(&keyframe.images[0], &mut pair.image);
         }
         let did = if self.store.get(index).held_out { Did::Stored } else { self.cover(index)? };
         self.queue.pop();
@@ -111,6 +111,9 @@ impl Mapper {
             self.counters.depth_absent.add(1);
             return Ok(Did::Stored);
         }
+        if let Some(pair) = &mut self.pair {
+            pair.bend(&self.depth, &view.camera);
+        }
         if self.store.anchors() == 0 {
             self.scene_depth_m = median_depth(&self.depth.metres).unwrap_or(SCENE_DEPTH_M);
         }
@@ -123,7 +126,9 @@ impl Mapper {
         self.pipeline.open_block(index as u32);
         self.arrivals.clear();
         if bare {
-            let points = self.seeder.seed(&seen!(self, index), whole, &self.counters);
+            let image = self.pair.as_ref().map_or_else(|| self.store.image(index), |pair| &pair.image);
+            let seen = seen!(self, index, view, image, self.stereo.valid_mask(), &self.depth);
+            let points = self.seeder.seed(&seen, whole, &self.counters);
             let anchor = (index / self.eyes.len()) as u32;
             self.occupancy.claim(&mut self.gpu, anchor, points, &mut self.answers)?;
             let seeds = self.seeder.settle(&self.answers, room, &self.counters);
@@ -219,21 +224,21 @@ impl Mapper {
         }
     }
 
-    /// Adds Gaussians where the newest anchor's picture is least like its image; how many. None to fisheye images:
-    /// their pixels are not those of the depth.
+    /// Adds Gaussians where the newest anchor's picture is least like its image, through the lens that trains; how many.
     fn densify(&mut self, index: usize) -> Result<usize, GpuError> {
-        let other_lens = self.seeded_from.is_some();
-        if self.config.densify_max == 0 || other_lens || self.pipeline.newest() != Some(index as u32) {
+        if self.config.densify_max == 0 || self.pipeline.newest() != Some(index as u32) {
             return Ok(0);
         }
         let view = self.view(index);
         self.pipeline.render(&mut self.gpu, &view, &mut self.rendered)?;
         let goal = self.goal(index);
         self.pipeline.similarity(&mut self.gpu, goal, &mut self.similarity)?;
-        let lacking = 0.5 * (1.0 - mean(&self.similarity, self.stereo.valid_mask()));
+        let lacking = 0.5 * (1.0 - mean(&self.similarity, &self.eye(index).valid));
         let wanted = self.growth.allowed((f64::from(self.config.densify_max) * lacking) as usize);
         let wanted = wanted.min(self.make_room(wanted)?);
-        let seeds = self.seeder.densify(&seen!(self, index), &self.similarity, wanted, &self.counters);
+        let depth = self.pair.as_ref().map_or(&self.depth, |pair| &pair.distance);
+        let seen = seen!(self, index, view, self.store.image(index), &self.eyes[0].valid, depth);
+        let seeds = self.seeder.densify(&seen, &self.similarity, wanted, &self.counters);
         self.arrivals.clear();
         self.arrivals.extend(seeds.iter().map(gaussian));
         let added = self.pipeline.append(&mut self.gpu, &self.arrivals)?;

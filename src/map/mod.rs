@@ -27,14 +27,14 @@ pub mod sort;
 pub mod tiling;
 pub mod view;
 
-use crate::config::{Board, MapConfig, Projection};
+use crate::config::{Board, MapConfig};
 use crate::counters::Counters;
 use crate::gpu::{Gpu, GpuError, Timing};
 use crate::mem::Footprint;
 use crate::stereo::{DepthMap, Stereo};
 use anchors::{Seed, Seeder};
 use budget::Growth;
-use eyes::Eye;
+use eyes::{Eye, Pair};
 use keyframes::{Queue, Store};
 use lifecycle::Added;
 use occupancy::Occupancy;
@@ -85,8 +85,8 @@ pub struct Mapper {
     store: Store,
     /// The cameras that train.
     eyes: Vec<Eye>,
-    /// The newest keyframe's left image without distortion, where that is not what trains.
-    seeded_from: Option<Image>,
+    /// The newest keyframe without distortion, where that is not what trains.
+    pair: Option<Pair>,
     seeder: Seeder,
     occupancy: Occupancy,
     /// Of the occupancy, by seed.
@@ -151,7 +151,7 @@ impl Mapper {
             pipeline,
             queue: Queue::new(raw_pixels_max(board), eyes::images(stereo.rig().len(), &config)),
             store: Store::new(shape.keyframes as usize, eyes.len(), width, height),
-            seeded_from: (config.projection == Projection::Fisheye).then(|| Image::new(width, height)),
+            pair: Pair::new(&stereo, &eyes[0]),
             eyes,
             seeder: Seeder::new(width, height, seeds_max),
             occupancy,
@@ -274,7 +274,7 @@ impl Mapper {
 
     /// What the rendering of a new keyframe's rectified left view shows.
     fn seen_from(&self, index: usize) -> &Image {
-        self.seeded_from.as_ref().unwrap_or_else(|| self.store.image(index))
+        self.pair.as_ref().map_or_else(|| self.store.image(index), |pair| &pair.image)
     }
 
     /// Smaller as the steps a keyframe has had grow: large ones find the picture, small ones settle it.

@@ -1,9 +1,9 @@
 //! What goes into a rendering or a training step and what comes out of it, and how it crosses to the kernels.
 
-use crate::gpu::kernels::types::{Camera, Status};
+use crate::gpu::kernels::types::{Camera as CameraWords, Status};
 use crate::stereo::Pinhole;
-use glam::DVec3;
-use stipple_drivers::Pose;
+use glam::{DVec2, DVec3};
+use stipple_drivers::{Camera, Lens, Pose};
 
 /// A camera where it is looked from.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -12,6 +12,23 @@ pub struct View {
     pub camera: Pinhole,
     /// The lens that bends what `camera` would see; a pinhole without.
     pub fisheye: Option<Fisheye>,
+}
+
+impl View {
+    /// In the world, what a pixel shows at `depth` as the raster counts it: along the axis, of a fisheye along the ray.
+    /// `None` outside the lens' domain.
+    pub fn point(&self, x: usize, y: usize, depth: f64) -> Option<DVec3> {
+        let (c, x, y) = (&self.camera, x as f64, y as f64);
+        let p_cam = match self.fisheye {
+            None => DVec3::new((x - c.cx) / c.fx, (y - c.cy) / c.fy, 1.0),
+            Some(Fisheye { k, .. }) => {
+                let lens = Lens::KannalaBrandt { k };
+                let Pinhole { width, height, fx, fy, cx, cy } = *c;
+                Camera { width, height, fx, fy, cx, cy, lens }.unproject(DVec2::new(x, y))?
+            }
+        };
+        Some(self.world_from_cam.transform(p_cam * depth))
+    }
 }
 
 /// A Kannala-Brandt lens, as far as its image is seen.
@@ -172,11 +189,11 @@ pub(super) fn size(view: &View) -> [u32; 2] {
     [view.camera.width as u32, view.camera.height as u32]
 }
 
-pub(super) fn camera(view: &View) -> Camera {
+pub(super) fn camera(view: &View) -> CameraWords {
     let cam_from_world = view.world_from_cam.inverse();
     let (q, t, c) = (cam_from_world.q.as_quat(), cam_from_world.p.as_vec3(), &view.camera);
     let (k, theta_max) = view.fisheye.map_or(([0.0; 4], 0.0), |f| (f.k, f.theta_max));
-    Camera {
+    CameraWords {
         turn: q.to_array(),
         shift: [t.x, t.y, t.z, theta_max as f32],
         focal_centre: [c.fx, c.fy, c.cx, c.cy].map(|v| v as f32),
