@@ -161,15 +161,17 @@ impl Pipelines {
         Ok(Kernel { index: index as u32, local, name: variant.name, of: PhantomData })
     }
 
-    /// Forgets all sets when fewer than `commands` are left. Call only while the device is idle.
-    pub fn reserve_sets(&mut self, commands: usize) -> Result<(), GpuError> {
-        if self.sets.len() + commands > SETS_MAX {
-            self.sets.clear();
-            // SAFETY: no submission that uses these sets is in flight.
-            unsafe { self.device.raw.reset_descriptor_pool(self.pool, vk::DescriptorPoolResetFlags::empty()) }
-                .map_err(GpuError::of("vkResetDescriptorPool"))?;
-        }
-        Ok(())
+    /// Whether fewer than `commands` sets are left: `forget_sets` makes room.
+    pub fn must_forget_sets(&self, commands: usize) -> bool {
+        self.sets.len() + commands > SETS_MAX
+    }
+
+    /// Call only while the device is idle.
+    pub fn forget_sets(&mut self) -> Result<(), GpuError> {
+        self.sets.clear();
+        // SAFETY: no submission that uses these sets is in flight.
+        unsafe { self.device.raw.reset_descriptor_pool(self.pool, vk::DescriptorPoolResetFlags::empty()) }
+            .map_err(GpuError::of("vkResetDescriptorPool"))
     }
 
     pub fn set(

@@ -14,6 +14,16 @@ use stipple_drivers::{Exit, Fault};
 pub const ALIGN: u64 = 256;
 /// Host side of every transfer; longer ones go in pieces.
 pub const STAGING_BYTES: usize = 4 << 20;
+/// Places at the end of staging that stay as they are until the next report to the same place, and their size.
+pub const REPORTS: usize = 2;
+pub const REPORT_BYTES: usize = 256;
+/// What is left of it for transfers.
+pub(super) const TRANSFER_BYTES: usize = STAGING_BYTES - REPORTS * REPORT_BYTES;
+
+/// Of a report in staging.
+pub(super) fn report_offset(place: usize) -> u64 {
+    (TRANSFER_BYTES + place * REPORT_BYTES) as u64
+}
 
 /// `len` elements of `T` in the arena.
 pub struct Buf<T> {
@@ -278,14 +288,16 @@ impl Staging {
         self.backed.buffer
     }
 
-    /// The staging bytes; valid to touch only while no transfer is in flight.
-    pub fn bytes(&self) -> &[u8] {
-        // SAFETY: STAGING_BYTES are mapped and coherent, and callers have waited for the last transfer.
-        unsafe { std::slice::from_raw_parts(self.mapped.as_ptr(), STAGING_BYTES) }
+    /// Some of the staging bytes; valid to touch only while nothing in flight writes them.
+    pub fn bytes(&self, at: usize, len: usize) -> &[u8] {
+        assert!(at <= STAGING_BYTES && len <= STAGING_BYTES - at);
+        // SAFETY: STAGING_BYTES are mapped and coherent, and callers have waited for what writes these.
+        unsafe { std::slice::from_raw_parts(self.mapped.as_ptr().add(at), len) }
     }
 
+    /// What transfers go through.
     pub fn bytes_mut(&mut self) -> &mut [u8] {
         // SAFETY: as for `bytes`; the exclusive borrow is the host's only view.
-        unsafe { std::slice::from_raw_parts_mut(self.mapped.as_ptr(), STAGING_BYTES) }
+        unsafe { std::slice::from_raw_parts_mut(self.mapped.as_ptr(), TRANSFER_BYTES) }
     }
 }

@@ -44,16 +44,16 @@ mod tests;
 
 pub use device::{Caps, DeviceKind, Subgroup};
 pub use kernel::{Access, Kernel, KernelDef, Reflected, Variant, BUFFERS_MAX, PUSH_MAX, SPECS_MAX};
-pub use memory::{Buf, Range, Read, ReadWrite, Write, ALIGN, STAGING_BYTES};
+pub use memory::{Buf, Range, Read, ReadWrite, Write, ALIGN, REPORTS, REPORT_BYTES, STAGING_BYTES};
 pub use record::{Recorder, Threads, COMMANDS_MAX, GROUPS_MAX};
-pub use submit::Timing;
+pub use submit::{Ticket, Timing};
 
 use crate::config::GpuConfig;
 use crate::mem::Footprint;
 use ash::vk;
 use device::Device;
 use kernel::Pipelines;
-use memory::{Arena, Staging};
+use memory::{report_offset, Arena, Staging, TRANSFER_BYTES};
 use std::fmt;
 use std::sync::Arc;
 use stipple_drivers::{Exit, Fault};
@@ -121,7 +121,6 @@ pub struct Gpu {
     arena: Arena,
     /// The recording's memory while nobody records.
     spare: Option<Recorder>,
-    in_flight: Option<Recorder>,
     lost: bool,
     device: Arc<Device>,
 }
@@ -148,7 +147,6 @@ impl Gpu {
             staging,
             arena: Arena::new(&device, arena_bytes)?,
             spare: Some(Recorder::new()),
-            in_flight: None,
             lost: false,
             device,
         };
@@ -190,32 +188,36 @@ impl Gpu {
 
     /// Runs a recording and waits for it.
     pub fn submit(&mut self, rec: Recorder) -> Result<(), GpuError> {
-        self.submit_nowait(rec)?;
-        self.wait()
+        let ticket = self.start(rec)?;
+        self.finish(ticket)
     }
 
-    /// Starts a recording, after waiting for the one before.
-    pub fn submit_nowait(&mut self, rec: Recorder) -> Result<(), GpuError> {
-        let started = self.wait().and_then(|()| match rec.error {
+    /// Starts a recording; the one before may still be running. What is recorded sees all that was started before it.
+    pub fn start(&mut self, rec: Recorder) -> Result<Ticket, GpuError> {
+        let started = match rec.error {
+            _ if self.lost => Err(GpuError::Lost),
             Some(e) => Err(e),
-            None if rec.is_empty() => Ok(false),
-            None => self.submitter.start(&rec, &mut self.pipelines, &self.arena).map(|()| true),
-        });
-        match started {
-            Ok(true) => self.in_flight = Some(rec),
-            _ => self.put_back(rec),
-        }
-        self.note(started).map(|_| ())
+            None => self.submitter.start(&rec, &mut self.pipelines, &self.arena),
+        };
+        self.put_back(rec);
+        self.note(started)
     }
 
-    /// Waits for what is in flight, if anything.
+    /// Waits for a recording, and so for all before it.
+    pub fn finish(&mut self, ticket: Ticket) -> Result<(), GpuError> {
+        if self.lost {
+            return Err(GpuError::Lost);
+        }
+        let done = self.submitter.finish(ticket);
+        self.note(done)
+    }
+
+    /// Waits for all that was started.
     pub fn wait(&mut self) -> Result<(), GpuError> {
         if self.lost {
             return Err(GpuError::Lost);
         }
-        let Some(rec) = self.in_flight.take() else { return Ok(()) };
-        let done = self.submitter.finish(&rec, &mut self.pipelines, &self.arena);
-        self.put_back(rec);
+        let done = self.submitter.finish_all();
         self.note(done)
     }
 
@@ -224,7 +226,7 @@ impl Gpu {
         self.wait()?;
         let start = checked(&buf, at, items.len())?;
         let mut done = 0;
-        for piece in bytemuck::cast_slice::<T, u8>(items).chunks(STAGING_BYTES) {
+        for piece in bytemuck::cast_slice::<T, u8>(items).chunks(TRANSFER_BYTES) {
             self.staging.bytes_mut()[..piece.len()].copy_from_slice(piece);
             let size = piece.len() as u64;
             let region = vk::BufferCopy { src_offset: 0, dst_offset: start + done, size };
@@ -240,29 +242,39 @@ impl Gpu {
         self.wait()?;
         let start = checked(&buf, at, items.len())?;
         let mut done = 0;
-        for piece in bytemuck::cast_slice_mut::<T, u8>(items).chunks_mut(STAGING_BYTES) {
+        for piece in bytemuck::cast_slice_mut::<T, u8>(items).chunks_mut(TRANSFER_BYTES) {
             let size = piece.len() as u64;
             let region = vk::BufferCopy { src_offset: start + done, dst_offset: 0, size };
             let moved = self.submitter.transfer(self.arena.buffer(), self.staging.buffer(), region);
             self.note(moved)?;
-            piece.copy_from_slice(&self.staging.bytes()[..piece.len()]);
+            piece.copy_from_slice(self.staging.bytes(0, piece.len()));
             done += size;
         }
         Ok(())
     }
 
-    /// What the last submission's `Recorder::read_back` brought, until the next transfer.
+    /// What the last `Recorder::read_back` brought, until the next transfer. Waits for all that was started.
     pub fn read_back<T: bytemuck::Pod>(&mut self, items: &mut [T]) -> Result<(), GpuError> {
         self.wait()?;
+        self.copy_out(0, TRANSFER_BYTES, items)
+    }
+
+    /// What a recording's `Recorder::report` brought to `place`. Waits for that recording alone.
+    pub fn report<T: bytemuck::Pod>(&mut self, ticket: Ticket, place: usize, items: &mut [T]) -> Result<(), GpuError> {
+        self.finish(ticket)?;
+        self.copy_out(report_offset(place.min(REPORTS - 1)) as usize, REPORT_BYTES, items)
+    }
+
+    fn copy_out<T: bytemuck::Pod>(&self, at: usize, of: usize, items: &mut [T]) -> Result<(), GpuError> {
         let bytes = bytemuck::cast_slice_mut::<T, u8>(items);
-        let of = STAGING_BYTES;
-        let read =
-            self.staging.bytes().get(..bytes.len()).ok_or(GpuError::OutOfRange { at: 0, len: bytes.len(), of })?;
-        bytes.copy_from_slice(read);
+        if bytes.len() > of {
+            return Err(GpuError::OutOfRange { at: 0, len: bytes.len(), of });
+        }
+        bytes.copy_from_slice(self.staging.bytes(at, bytes.len()));
         Ok(())
     }
 
-    /// Time on the device of the last submission, ms; without timestamps, until the host saw its end.
+    /// Time on the device of the last recording waited for, ms; without timestamps, until the host saw its end.
     pub fn last_submit_ms(&self) -> f64 {
         self.submitter.last_ms
     }
@@ -273,12 +285,10 @@ impl Gpu {
         &self.submitter.timings
     }
 
-    /// Whether each command is timed, as it is after boot, or only whole submissions: a timestamp drains the
-    /// device, which costs lavapipe 50 µs a command.
-    pub fn time_commands(&mut self, each: bool) -> Result<(), GpuError> {
-        self.wait()?;
-        self.submitter.each = each;
-        Ok(())
+    /// Times every command of one recording in `recordings`, as every one is after boot, or with zero only whole
+    /// submissions: a timestamp drains the device, which costs lavapipe 50 µs a command.
+    pub fn time_commands(&mut self, recordings: u64) {
+        self.submitter.timed_in = recordings;
     }
 
     /// Submissions so far; a recording that takes longer than `submission_max_ms` is several.

@@ -6,7 +6,7 @@
 //! there is.
 
 use super::kernel::{Access, Kernel, KernelDef, BUFFERS_MAX, PUSH_MAX};
-use super::memory::{Buf, Range, STAGING_BYTES};
+use super::memory::{Buf, Range, REPORTS, REPORT_BYTES, TRANSFER_BYTES};
 use super::GpuError;
 
 /// Commands of one recording.
@@ -63,7 +63,7 @@ pub(super) enum Work {
     Indirect { kernel: u32, ranges: [Range; BUFFERS_MAX], push: [u8; PUSH_MAX], at: u64 },
     Fill { range: Range, value: u32 },
     Copy { from: Range, to: Range },
-    ReadBack { from: Range },
+    ReadBack { from: Range, report: Option<usize> },
 }
 
 #[derive(Clone, Copy)]
@@ -162,13 +162,23 @@ impl Recorder {
 
     /// Brings `buf` to the host within this submission: `Gpu::read_back` has it afterwards. One a recording.
     pub fn read_back<T>(&mut self, buf: Buf<T>) {
+        self.bring(buf, None, TRANSFER_BYTES);
+    }
+
+    /// As `read_back`, to a place of its own below `REPORTS`, where it stays until the next report to it:
+    /// `Gpu::report` has it.
+    pub fn report<T>(&mut self, buf: Buf<T>, place: usize) {
+        self.bring(buf, Some(place), if place < REPORTS { REPORT_BYTES } else { 0 });
+    }
+
+    fn bring<T>(&mut self, buf: Buf<T>, report: Option<usize>, most: usize) {
         let from = buf.range();
-        if buf.bytes() > STAGING_BYTES as u64 || self.reads_back {
+        if buf.bytes() > most as u64 || self.reads_back {
             return self.fail(GpuError::Binding { kernel: "read back", start: from.start, end: from.end });
         }
         self.reads_back = true;
         if from.start < from.end {
-            self.push(Work::ReadBack { from }, std::iter::once((from, Access::Read)));
+            self.push(Work::ReadBack { from, report }, std::iter::once((from, Access::Read)));
         }
     }
 

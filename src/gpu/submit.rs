@@ -1,11 +1,13 @@
 //! Turns recordings into command buffers, runs them, and reads how long each command took.
 //!
-//! One submission is in flight at a time: the recording's own barriers order what is inside it, a fence
-//! orders the host. Command buffers, fence and queries are made once.
+//! Up to `SLOTS` submissions are under way at once: while the device runs one, the host encodes the next, so that the
+//! device goes from one to the other without waiting for the host. Each command buffer begins with a barrier against
+//! all that was submitted before, so they run as if one after another; a fence each tells the host. A recording that
+//! takes long is cut into parts, each a submission. Command buffers, fences and queries are made once.
 
 use super::device::{boot, Device};
 use super::kernel::Pipelines;
-use super::memory::{Arena, Range};
+use super::memory::{report_offset, Arena, Range};
 use super::record::{Command, Recorder, Work, COMMANDS_MAX};
 use super::GpuError;
 use ash::vk;
@@ -13,6 +15,8 @@ use std::sync::Arc;
 use std::time::Instant;
 use stipple_drivers::Fault;
 
+/// Submissions under way at once: one runs, one waits. A third would only make answers older.
+const SLOTS: usize = 2;
 /// Far above any submission the budget allows, on the slowest CPU device: past it the device hangs.
 const HUNG_NS: u64 = 60_000_000_000;
 const STAMPS: usize = COMMANDS_MAX + 1;
@@ -31,53 +35,79 @@ const FILL: usize = 0;
 const COPY: usize = 1;
 const READ_BACK: usize = 2;
 
-pub(super) struct Submitter {
-    device: Arc<Device>,
-    pool: vk::CommandPool,
+/// A recording that was started: the number of its last part.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Ticket(u64);
+
+/// What one submission needs of its own.
+struct Slot {
     commands: vk::CommandBuffer,
     fence: vk::Fence,
     queries: vk::QueryPool,
+    started: Instant,
+    /// Of each command, its row of `Submitter::timings`; empty where only the whole is timed.
+    rows: Vec<usize>,
+    /// Commands of the recording that this is the last part of; zero of the other parts.
+    ends: usize,
+}
+
+pub(super) struct Submitter {
+    device: Arc<Device>,
+    pool: vk::CommandPool,
+    /// Part n is in slot n % SLOTS.
+    slots: [Slot; SLOTS],
+    /// Parts started, and those of them waited for.
+    started: u64,
+    ended: u64,
     /// Where read-backs go.
     staging: vk::Buffer,
     stamps: Vec<u64>,
     pub timings: Vec<Timing>,
     /// Row of each kernel, by index.
     rows: Vec<usize>,
-    started: Instant,
+    /// When the host last saw a part end.
+    seen: Instant,
     /// Of the last whole recording.
     pub last_ms: f64,
     /// Of a command of it, on average.
     mean_ms: f64,
-    /// Of the parts of the recording in flight that have ended.
+    /// Of the parts that have ended of the recording whose parts are ending.
     total_ms: f64,
-    /// Commands in flight, or last in flight.
-    part: std::ops::Range<usize>,
     submission_max_ms: f64,
     pub submissions: u64,
-    /// Time every command, or only the whole.
-    pub each: bool,
+    recordings: u64,
+    /// Every command of one recording in so many is timed; zero: of none.
+    pub timed_in: u64,
 }
 
 impl Submitter {
     pub fn new(device: &Arc<Device>, staging: vk::Buffer, submission_max_ms: f64) -> Result<Submitter, Fault> {
-        let mut s = Submitter {
-            device: device.clone(),
-            pool: vk::CommandPool::null(),
+        let slot = || Slot {
             commands: vk::CommandBuffer::null(),
             fence: vk::Fence::null(),
             queries: vk::QueryPool::null(),
+            started: Instant::now(),
+            rows: Vec::with_capacity(COMMANDS_MAX),
+            ends: 0,
+        };
+        let mut s = Submitter {
+            device: device.clone(),
+            pool: vk::CommandPool::null(),
+            slots: std::array::from_fn(|_| slot()),
+            started: 0,
+            ended: 0,
             staging,
             stamps: vec![0; STAMPS],
             timings: Vec::new(),
             rows: Vec::new(),
-            started: Instant::now(),
+            seen: Instant::now(),
             last_ms: 0.0,
             mean_ms: 0.0,
             total_ms: 0.0,
-            part: 0..0,
             submission_max_ms,
             submissions: 0,
-            each: true,
+            recordings: 0,
+            timed_in: 1,
         };
         s.row("fill");
         s.row("copy");
@@ -90,12 +120,15 @@ impl Submitter {
                 .flags(vk::CommandPoolCreateFlags::RESET_COMMAND_BUFFER);
             s.pool = raw.create_command_pool(&info, None).map_err(boot("vkCreateCommandPool"))?;
             let info = vk::CommandBufferAllocateInfo::default().command_pool(s.pool).command_buffer_count(1);
-            s.commands = raw.allocate_command_buffers(&info).map_err(boot("vkAllocateCommandBuffers"))?[0];
-            s.fence = raw.create_fence(&vk::FenceCreateInfo::default(), None).map_err(boot("vkCreateFence"))?;
-            if device.caps.timestamp_bits > 0 {
-                let info =
-                    vk::QueryPoolCreateInfo::default().query_type(vk::QueryType::TIMESTAMP).query_count(STAMPS as u32);
-                s.queries = raw.create_query_pool(&info, None).map_err(boot("vkCreateQueryPool"))?;
+            for slot in &mut s.slots {
+                slot.commands = raw.allocate_command_buffers(&info).map_err(boot("vkAllocateCommandBuffers"))?[0];
+                slot.fence = raw.create_fence(&vk::FenceCreateInfo::default(), None).map_err(boot("vkCreateFence"))?;
+                if device.caps.timestamp_bits > 0 {
+                    let info = vk::QueryPoolCreateInfo::default()
+                        .query_type(vk::QueryType::TIMESTAMP)
+                        .query_count(STAMPS as u32);
+                    slot.queries = raw.create_query_pool(&info, None).map_err(boot("vkCreateQueryPool"))?;
+                }
             }
         }
         Ok(s)
@@ -112,34 +145,79 @@ impl Submitter {
         self.timings.len() - 1
     }
 
-    /// Encodes a recording and starts its first part; `finish` goes on with the others.
-    pub fn start(&mut self, rec: &Recorder, pipelines: &mut Pipelines, arena: &Arena) -> Result<(), GpuError> {
-        pipelines.reserve_sets(rec.commands.len())?;
-        self.total_ms = 0.0;
-        self.part = 0..0;
-        self.start_part(rec, pipelines, arena)
+    /// Encodes a recording and starts it, part after part, waiting for the oldest where all slots are taken.
+    pub fn start(&mut self, rec: &Recorder, pipelines: &mut Pipelines, arena: &Arena) -> Result<Ticket, GpuError> {
+        if pipelines.must_forget_sets(rec.commands.len()) {
+            self.finish_all()?;
+            pipelines.forget_sets()?;
+        }
+        let each = self.timed_in > 0 && self.recordings % self.timed_in == 0;
+        self.recordings += 1;
+        let all = rec.commands.len();
+        let mut from = 0;
+        while from < all {
+            let to = self.cut(rec, from);
+            let slot = self.free_slot()?;
+            self.slots[slot].ends = if to == all { all } else { 0 };
+            self.begin(slot)?;
+            if let Err(e) = self.encode_part(&rec.commands[from..to], slot, each, pipelines, arena) {
+                // SAFETY: recording, not in flight: back to where the next `begin` expects it.
+                unsafe {
+                    self.device
+                        .raw
+                        .reset_command_buffer(self.slots[slot].commands, vk::CommandBufferResetFlags::empty())
+                }
+                .map_err(GpuError::of("vkResetCommandBuffer"))?;
+                return Err(e);
+            }
+            self.end(slot)?;
+            self.submissions += 1;
+            from = to;
+        }
+        Ok(Ticket(self.started))
     }
 
-    /// Starts what follows the last part.
-    fn start_part(&mut self, rec: &Recorder, pipelines: &mut Pipelines, arena: &Arena) -> Result<(), GpuError> {
-        self.part = self.part.end..self.cut(rec, self.part.end);
-        self.begin()?;
-        if let Err(e) = self.encode_part(rec, pipelines, arena) {
-            // SAFETY: recording, not in flight: back to where the next `begin` expects it.
-            unsafe { self.device.raw.reset_command_buffer(self.commands, vk::CommandBufferResetFlags::empty()) }
-                .map_err(GpuError::of("vkResetCommandBuffer"))?;
-            return Err(e);
+    /// Of the next part; its submission, if any, has ended.
+    fn free_slot(&mut self) -> Result<usize, GpuError> {
+        if self.started - self.ended == SLOTS as u64 {
+            self.end_oldest()?;
         }
-        self.submissions += 1;
-        self.end()
+        Ok((self.started % SLOTS as u64) as usize)
+    }
+
+    /// Waits for a recording, and so for all before it.
+    pub fn finish(&mut self, ticket: Ticket) -> Result<(), GpuError> {
+        while self.ended < ticket.0 {
+            self.end_oldest()?;
+        }
+        Ok(())
+    }
+
+    pub fn finish_all(&mut self) -> Result<(), GpuError> {
+        self.finish(Ticket(self.started))
+    }
+
+    /// Waits for the oldest part under way and adds its times to the table.
+    fn end_oldest(&mut self) -> Result<(), GpuError> {
+        let slot = (self.ended % SLOTS as u64) as usize;
+        self.wait(slot)?;
+        self.ended += 1;
+        self.read_stamps(slot)?;
+        if self.slots[slot].ends > 0 {
+            self.last_ms = self.total_ms;
+            self.mean_ms = self.total_ms / self.slots[slot].ends as f64;
+            self.total_ms = 0.0;
+        }
+        Ok(())
     }
 
     /// Where the part that begins at `from` ends: integrated GPUs reset on long submissions, so a part is
-    /// what took `submission_max_ms` when its commands last ran, and at least one command.
+    /// what took `submission_max_ms` when its commands were last timed, and at least one command.
     fn cut(&self, rec: &Recorder, from: usize) -> usize {
         let mut ms = 0.0;
         let fitting = rec.commands[from..].iter().take_while(|command| {
-            ms += if self.each { self.timings[self.row_of(command)].last_ms } else { self.mean_ms };
+            let t = &self.timings[self.row_of(command)];
+            ms += if self.timed_in > 0 && t.count > 0 { t.last_ms } else { self.mean_ms };
             ms <= self.submission_max_ms
         });
         from + fitting.count().max(1)
@@ -154,47 +232,61 @@ impl Submitter {
         }
     }
 
-    fn encode_part(&self, rec: &Recorder, pipelines: &mut Pipelines, arena: &Arena) -> Result<(), GpuError> {
-        let timed = self.queries != vk::QueryPool::null();
-        let stamp = |i: usize| {
-            // SAFETY: recording; the pool has a query for each command and one more, reset just below.
-            unsafe {
-                let stage = vk::PipelineStageFlags::BOTTOM_OF_PIPE;
-                self.device.raw.cmd_write_timestamp(self.commands, stage, self.queries, i as u32);
-            }
-        };
-        if timed {
+    fn encode_part(
+        &mut self,
+        commands: &[Command],
+        slot: usize,
+        each: bool,
+        pipelines: &mut Pipelines,
+        arena: &Arena,
+    ) -> Result<(), GpuError> {
+        let each = each && self.has_stamps();
+        self.slots[slot].rows.clear();
+        if self.has_stamps() {
+            let queries = self.slots[slot].queries;
+            let stamps = if each { commands.len() as u32 + 1 } else { 2 };
             // SAFETY: recording; no submission that uses the queries is in flight.
-            unsafe {
-                self.device.raw.cmd_reset_query_pool(self.commands, self.queries, 0, self.stamped() as u32 + 1);
-            }
-            stamp(0);
+            unsafe { self.device.raw.cmd_reset_query_pool(self.slots[slot].commands, queries, 0, stamps) };
+            self.stamp(slot, 0);
         }
-        for (i, command) in rec.commands[self.part.clone()].iter().enumerate() {
-            self.encode(command, pipelines, arena)?;
-            if timed && self.each {
-                stamp(i + 1);
+        for (i, command) in commands.iter().enumerate() {
+            self.encode(command, self.slots[slot].commands, pipelines, arena)?;
+            if each {
+                self.stamp(slot, i + 1);
+                let row = self.row_of(command);
+                self.slots[slot].rows.push(row);
             }
         }
-        if timed && !self.each {
-            stamp(1);
+        if self.has_stamps() && !each {
+            self.stamp(slot, 1);
         }
         Ok(())
     }
 
-    /// Timestamps of the part beside its first.
-    fn stamped(&self) -> usize {
-        if self.each {
-            self.part.len()
-        } else {
-            1
+    fn has_stamps(&self) -> bool {
+        self.slots[0].queries != vk::QueryPool::null()
+    }
+
+    /// A timestamp when all before has ended.
+    fn stamp(&self, slot: usize, i: usize) {
+        let Slot { commands, queries, .. } = self.slots[slot];
+        // SAFETY: recording; the pool has a query for each command and one more, reset when the part began.
+        unsafe {
+            let stage = vk::PipelineStageFlags::BOTTOM_OF_PIPE;
+            self.device.raw.cmd_write_timestamp(commands, stage, queries, i as u32);
         }
     }
 
-    fn encode(&self, command: &Command, pipelines: &mut Pipelines, arena: &Arena) -> Result<(), GpuError> {
-        let (raw, cb) = (&self.device.raw, self.commands);
+    fn encode(
+        &self,
+        command: &Command,
+        cb: vk::CommandBuffer,
+        pipelines: &mut Pipelines,
+        arena: &Arena,
+    ) -> Result<(), GpuError> {
+        let raw = &self.device.raw;
         if command.barrier_before {
-            self.barrier();
+            self.barrier(cb);
         }
         if let Work::Dispatch { kernel, ranges, push, .. } | Work::Indirect { kernel, ranges, push, .. } = &command.work
         {
@@ -219,7 +311,7 @@ impl Submitter {
             Work::Indirect { at, .. } => inside("indirect", Range { start: at, end: at + 12 })?,
             Work::Fill { range, .. } => inside("fill", range)?,
             Work::Copy { from, to } => inside("copy", from).and(inside("copy", to))?,
-            Work::ReadBack { from } => inside("read back", from)?,
+            Work::ReadBack { from, .. } => inside("read back", from)?,
         }
         let arena = arena.buffer();
         // SAFETY: recording; ranges lie in the arena, and the recorder checked their alignment.
@@ -235,52 +327,35 @@ impl Submitter {
                         [vk::BufferCopy { src_offset: from.start, dst_offset: to.start, size: from.end - from.start }];
                     raw.cmd_copy_buffer(cb, arena, arena, &region);
                 }
-                Work::ReadBack { from } => {
-                    let region =
-                        [vk::BufferCopy { src_offset: from.start, dst_offset: 0, size: from.end - from.start }];
+                Work::ReadBack { from, report } => {
+                    let dst_offset = report.map_or(0, report_offset);
+                    let region = [vk::BufferCopy { src_offset: from.start, dst_offset, size: from.end - from.start }];
                     raw.cmd_copy_buffer(cb, arena, self.staging, &region);
-                    self.barrier_to_host();
+                    self.barrier_to_host(cb);
                 }
             }
         }
         Ok(())
     }
 
-    /// Waits for what `start` started, part after part, and adds its times to the table.
-    pub fn finish(&mut self, rec: &Recorder, pipelines: &mut Pipelines, arena: &Arena) -> Result<(), GpuError> {
-        loop {
-            self.wait()?;
-            self.read_stamps(rec)?;
-            if self.part.end == rec.commands.len() {
-                break;
-            }
-            self.start_part(rec, pipelines, arena)?;
-        }
-        self.last_ms = self.total_ms;
-        self.mean_ms = self.total_ms / rec.commands.len().max(1) as f64;
-        Ok(())
-    }
-
-    fn read_stamps(&mut self, rec: &Recorder) -> Result<(), GpuError> {
-        if self.queries == vk::QueryPool::null() {
-            self.total_ms += self.started.elapsed().as_secs_f64() * 1e3;
+    fn read_stamps(&mut self, slot: usize) -> Result<(), GpuError> {
+        let Slot { queries, started, ref rows, .. } = self.slots[slot];
+        let before = std::mem::replace(&mut self.seen, Instant::now());
+        if !self.has_stamps() {
+            self.total_ms += self.seen.duration_since(started.max(before)).as_secs_f64() * 1e3;
             return Ok(());
         }
-        let last = self.stamped();
+        let last = rows.len().max(1);
         let stamps = &mut self.stamps[..last + 1];
         let flags = vk::QueryResultFlags::TYPE_64 | vk::QueryResultFlags::WAIT;
         // SAFETY: these queries were reset and written by the submission that has just ended.
-        unsafe { self.device.raw.get_query_pool_results(self.queries, 0, stamps, flags) }
+        unsafe { self.device.raw.get_query_pool_results(queries, 0, stamps, flags) }
             .map_err(GpuError::of("vkGetQueryPoolResults"))?;
         let caps = &self.device.caps;
         let (mask, period_ms) = (u64::MAX >> (64 - caps.timestamp_bits.min(64)), caps.timestamp_period_ns * 1e-6);
         let ms = |a: u64, b: u64| (b.wrapping_sub(a) & mask) as f64 * period_ms;
         self.total_ms += ms(self.stamps[0], self.stamps[last]);
-        if !self.each {
-            return Ok(());
-        }
-        for (i, command) in rec.commands[self.part.clone()].iter().enumerate() {
-            let row = self.row_of(command);
+        for (i, &row) in rows.iter().enumerate() {
             let t = &mut self.timings[row];
             t.last_ms = ms(self.stamps[i], self.stamps[i + 1]);
             t.total_ms += t.last_ms;
@@ -289,25 +364,30 @@ impl Submitter {
         Ok(())
     }
 
-    /// One copy between staging and the arena, waited for.
+    /// One copy between staging and the arena, waited for as all before it.
     pub fn transfer(&mut self, from: vk::Buffer, to: vk::Buffer, region: vk::BufferCopy) -> Result<(), GpuError> {
-        self.begin()?;
+        self.finish_all()?;
+        let slot = self.free_slot()?;
+        self.begin(slot)?;
+        let cb = self.slots[slot].commands;
         // SAFETY: recording; the caller keeps the region inside both buffers.
-        unsafe { self.device.raw.cmd_copy_buffer(self.commands, from, to, &[region]) };
-        self.barrier_to_host();
-        self.end()?;
-        self.wait()
+        unsafe { self.device.raw.cmd_copy_buffer(cb, from, to, &[region]) };
+        self.barrier_to_host(cb);
+        self.end(slot)?;
+        self.wait(slot)?;
+        self.ended += 1;
+        Ok(())
     }
 
     /// What was copied is visible to the host after the fence.
-    fn barrier_to_host(&self) {
+    fn barrier_to_host(&self, cb: vk::CommandBuffer) {
         let barrier = [vk::MemoryBarrier::default()
             .src_access_mask(vk::AccessFlags::TRANSFER_WRITE)
             .dst_access_mask(vk::AccessFlags::HOST_READ)];
         // SAFETY: recording.
         unsafe {
             self.device.raw.cmd_pipeline_barrier(
-                self.commands,
+                cb,
                 vk::PipelineStageFlags::TRANSFER,
                 vk::PipelineStageFlags::HOST,
                 vk::DependencyFlags::empty(),
@@ -318,37 +398,42 @@ impl Submitter {
         }
     }
 
-    fn begin(&mut self) -> Result<(), GpuError> {
+    fn begin(&self, slot: usize) -> Result<(), GpuError> {
+        let cb = self.slots[slot].commands;
         let info = vk::CommandBufferBeginInfo::default().flags(vk::CommandBufferUsageFlags::ONE_TIME_SUBMIT);
-        // SAFETY: the command buffer is not in flight, since every start is waited for; beginning resets it.
-        unsafe { self.device.raw.begin_command_buffer(self.commands, &info) }
-            .map_err(GpuError::of("vkBeginCommandBuffer"))?;
-        // The fence made earlier submissions available; this makes them visible to this one.
-        self.barrier();
+        // SAFETY: the command buffer is not in flight, since a slot is only used again after its end; beginning resets
+        // it.
+        unsafe { self.device.raw.begin_command_buffer(cb, &info) }.map_err(GpuError::of("vkBeginCommandBuffer"))?;
+        // Against all earlier submissions, ended or not.
+        self.barrier(cb);
         Ok(())
     }
 
-    fn end(&mut self) -> Result<(), GpuError> {
-        self.started = Instant::now();
-        let buffers = [self.commands];
+    fn end(&mut self, slot: usize) -> Result<(), GpuError> {
+        let s = &mut self.slots[slot];
+        s.started = Instant::now();
+        let buffers = [s.commands];
         let submit = [vk::SubmitInfo::default().command_buffers(&buffers)];
         // SAFETY: recording has begun; the fence is unsignalled, and the queue is used by this thread alone.
         unsafe {
-            self.device.raw.end_command_buffer(self.commands).map_err(GpuError::of("vkEndCommandBuffer"))?;
-            self.device.raw.queue_submit(self.device.queue, &submit, self.fence).map_err(GpuError::of("vkQueueSubmit"))
+            self.device.raw.end_command_buffer(s.commands).map_err(GpuError::of("vkEndCommandBuffer"))?;
+            self.device.raw.queue_submit(self.device.queue, &submit, s.fence).map_err(GpuError::of("vkQueueSubmit"))?;
         }
+        self.started += 1;
+        Ok(())
     }
 
-    fn wait(&mut self) -> Result<(), GpuError> {
+    fn wait(&self, slot: usize) -> Result<(), GpuError> {
+        let fence = [self.slots[slot].fence];
         // SAFETY: the fence was given to a submission.
         unsafe {
-            self.device.raw.wait_for_fences(&[self.fence], true, HUNG_NS).map_err(GpuError::of("vkWaitForFences"))?;
-            self.device.raw.reset_fences(&[self.fence]).map_err(GpuError::of("vkResetFences"))
+            self.device.raw.wait_for_fences(&fence, true, HUNG_NS).map_err(GpuError::of("vkWaitForFences"))?;
+            self.device.raw.reset_fences(&fence).map_err(GpuError::of("vkResetFences"))
         }
     }
 
     /// Everything before is done and visible to everything after: kernels, copies, indirect arguments.
-    fn barrier(&self) {
+    fn barrier(&self, cb: vk::CommandBuffer) {
         let stages = vk::PipelineStageFlags::COMPUTE_SHADER
             | vk::PipelineStageFlags::TRANSFER
             | vk::PipelineStageFlags::DRAW_INDIRECT;
@@ -363,15 +448,7 @@ impl Submitter {
             )];
         // SAFETY: recording.
         unsafe {
-            self.device.raw.cmd_pipeline_barrier(
-                self.commands,
-                stages,
-                stages,
-                vk::DependencyFlags::empty(),
-                &barrier,
-                &[],
-                &[],
-            );
+            self.device.raw.cmd_pipeline_barrier(cb, stages, stages, vk::DependencyFlags::empty(), &barrier, &[], &[]);
         }
     }
 }
@@ -380,8 +457,10 @@ impl Drop for Submitter {
     fn drop(&mut self) {
         // SAFETY: `Gpu` waits for the device before its fields are dropped; null handles are ignored.
         unsafe {
-            self.device.raw.destroy_query_pool(self.queries, None);
-            self.device.raw.destroy_fence(self.fence, None);
+            for slot in &self.slots {
+                self.device.raw.destroy_query_pool(slot.queries, None);
+                self.device.raw.destroy_fence(slot.fence, None);
+            }
             self.device.raw.destroy_command_pool(self.pool, None);
         }
     }

@@ -62,6 +62,7 @@ pub struct Added {
 impl Mapper {
     /// Stores the oldest waiting keyframe, and makes it an anchor when the map does not show its view, or not well.
     pub(super) fn take_in(&mut self) -> Result<Did, GpuError> {
+        self.settle()?;
         let Some(keyframe) = self.queue.front() else { return Ok(Did::Idle) };
         if self.store.is_full() {
             self.counters.keyframe_store_full.add(1);
@@ -183,12 +184,12 @@ impl Mapper {
         Ok(self.room())
     }
 
-    /// What follows from a step: the next phase of an anchor, and what growth is measured by.
-    pub(super) fn after_step(&mut self, index: usize, done: &StepStats) -> Result<(), GpuError> {
+    /// What follows from step `number`, on image `index`: the next phase of an anchor, and what growth is measured by.
+    pub(super) fn after_step(&mut self, number: u64, index: usize, done: &StepStats) -> Result<(), GpuError> {
         let entry = self.store.get_mut(index);
         let (loss, at) = (entry.loss, entry.trained_at);
-        (entry.loss, entry.trained_at) = (done.loss, self.iterations);
-        let steps = self.iterations - at;
+        (entry.loss, entry.trained_at) = (done.loss, number);
+        let steps = number - at;
         if at == 0 && self.schedule.in_burst() {
             self.added.first = done.loss;
         }
@@ -199,26 +200,26 @@ impl Mapper {
             Ended::Nothing => {}
             Ended::Burst(anchor) => {
                 self.added.splats = self.densify(anchor)?;
-                (self.added.loss, self.added.at) = (done.loss, self.iterations);
+                (self.added.loss, self.added.at) = (done.loss, number);
                 let steps = if self.config.growth_stops { STEPS_OF_PROOF } else { 0 };
                 self.schedule.start_convergence(anchor, steps.max(self.config.converge_iterations_max));
             }
-            Ended::Convergence(_) if self.config.growth_stops && self.added.splats > 0 => self.judge(done),
+            Ended::Convergence(_) if self.config.growth_stops && self.added.splats > 0 => self.judge(number, done),
             Ended::Convergence(_) => {}
         }
         Ok(())
     }
 
     /// Whether what was added to the newest anchor paid for itself.
-    fn judge(&mut self, done: &StepStats) {
+    fn judge(&mut self, number: u64, done: &StepStats) {
         let a = self.added;
-        let by_training = by_training(a.first - a.loss, self.config.burst_iterations, self.iterations - a.at);
+        let by_training = by_training(a.first - a.loss, self.config.burst_iterations, number - a.at);
         let cost = Cost {
             pixels: self.pipeline.shape().pixels(),
             pairs: done.stats.intersections,
             splats: self.pipeline.count(),
         };
-        let price = self.growth.price(&cost, self.iterations);
+        let price = self.growth.price(&cost, number);
         if !self.growth.judge(a.loss - done.loss - by_training, a.splats, self.store.training().len(), price) {
             self.counters.growth_refused.add(1);
         }

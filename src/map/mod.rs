@@ -5,6 +5,10 @@
 //! keyframes drawn uniformly at random (the map sees its past as often as its present, so it does not forget).
 //! Held-out keyframes are stored, never trained on, never anchors. Read `pipeline` for what a step does on
 //! the GPU.
+//!
+//! A step is started before the one before it is finished, so that the device never waits for the host. What a step
+//! says of its keyframe's pose and exposure is therefore taken in exactly one step late, whenever the device ends it,
+//! and before anything else is done with the map: the same seed and keyframes give the same map to the bit.
 
 pub mod anchors;
 pub mod blocks;
@@ -24,6 +28,7 @@ pub mod quality;
 pub mod refine;
 pub mod schedule;
 pub mod sort;
+pub mod step;
 pub mod tiling;
 pub mod view;
 
@@ -41,6 +46,7 @@ use occupancy::Occupancy;
 use pipeline::{LearningRates, Pipeline, Rendered, Shape, View, Weights};
 use schedule::Schedule;
 use std::time::Instant;
+use step::Step;
 use stipple_drivers::{Calibration, Fault, Image};
 
 pub use harmonics::Form;
@@ -72,9 +78,21 @@ pub struct StepReport {
     pub ms: f64,
     /// Training steps taken.
     pub iterations: u32,
-    /// Of the last training step.
+    /// Of the last training step that has ended.
     pub loss: f64,
 }
+
+/// A training step that was started and not looked at yet.
+struct UnderWay {
+    /// Steps so far, this one included.
+    number: u64,
+    /// Of the image it is on.
+    index: usize,
+    step: Step,
+}
+
+/// Commands are timed one by one in one recording of so many: each timestamp drains the device.
+const TIMED_IN: u64 = 32;
 
 pub struct Mapper {
     gpu: Gpu,
@@ -102,7 +120,11 @@ pub struct Mapper {
     added: Added,
     /// Median depth of the first anchor, m: what a position step is measured in.
     scene_depth_m: f64,
+    /// Started.
     iterations: u64,
+    under_way: Option<UnderWay>,
+    /// Of the last training step that has ended.
+    loss: f64,
     counters: Counters,
     /// Corrections came since anchors were last put in place.
     corrected: bool,
@@ -146,6 +168,7 @@ impl Mapper {
         let seeds_max = seeds_max(&config);
         let occupancy = Occupancy::new(&mut gpu, config.occupancy_cell_m, config.occupancy_cells)?;
         let blank = || vec![0.0; width * height];
+        gpu.time_commands(TIMED_IN);
         Ok(Mapper {
             gpu,
             pipeline,
@@ -165,6 +188,8 @@ impl Mapper {
             added: Added::default(),
             scene_depth_m: SCENE_DEPTH_M,
             iterations: 0,
+            under_way: None,
+            loss: 0.0,
             counters: Counters::default(),
             corrected: false,
             stereo,
@@ -199,6 +224,7 @@ impl Mapper {
 
     /// Puts the Gaussians of corrected anchors where their anchors are now.
     fn follow(&mut self) -> Result<(), GpuError> {
+        self.settle()?;
         let (mut moved, tolerance) = (0, self.config.move_tolerance);
         let displaced = self.store.displaced(tolerance).inspect(|_| moved += 1);
         self.pipeline.move_blocks(&mut self.gpu, displaced)?;
@@ -224,11 +250,10 @@ impl Mapper {
                     break;
                 }
             } else {
-                let burst = self.schedule.in_burst();
-                let Some(loss) = self.train()? else { break };
-                report.did = if burst { Did::Burst } else { Did::Train };
+                let Some(did) = self.train()? else { break };
+                report.did = did;
                 report.iterations += 1;
-                report.loss = loss;
+                report.loss = self.loss;
             }
             if Instant::now() >= deadline {
                 break;
@@ -238,23 +263,44 @@ impl Mapper {
         Ok(report)
     }
 
-    /// One training step; its loss, or `None` when there is nothing to train.
-    fn train(&mut self) -> Result<Option<f64>, GpuError> {
-        if self.pipeline.count() == 0 || (self.trained_enough() && !self.schedule.in_burst()) {
-            return Ok(None);
+    /// Starts a training step, then finishes the one before it; `None` when there is nothing to train.
+    fn train(&mut self) -> Result<Option<Did>, GpuError> {
+        if self.schedule.must_wait() {
+            self.settle()?;
         }
-        let Some(index) = self.schedule.next(self.store.training()) else { return Ok(None) };
+        let burst = self.schedule.in_burst();
+        let idle = self.pipeline.count() == 0 || (self.trained_enough() && !burst);
+        let next = if idle { None } else { self.schedule.next(self.store.training()) };
+        let Some(index) = next else {
+            self.settle()?;
+            return Ok(None);
+        };
         let view = self.view(index);
         let (rates, weights) = (self.rates(), self.weights());
         let goal = self.goal(index);
-        let done = self.pipeline.train(&mut self.gpu, &view, goal, &rates, &weights)?;
+        let step = self.pipeline.start(&mut self.gpu, &view, goal, &rates, &weights)?;
         self.iterations += 1;
+        let before = self.under_way.replace(UnderWay { number: self.iterations, index, step });
+        self.take(before)?;
+        Ok(Some(if burst { Did::Burst } else { Did::Train }))
+    }
+
+    /// Finishes the step under way, if any: before anything but training is done with the map.
+    fn settle(&mut self) -> Result<(), GpuError> {
+        let last = self.under_way.take();
+        self.take(last)
+    }
+
+    /// Waits for a step and takes in what it says.
+    fn take(&mut self, step: Option<UnderWay>) -> Result<(), GpuError> {
+        let Some(UnderWay { number, index, step }) = step else { return Ok(()) };
+        let done = self.pipeline.finish(&mut self.gpu, &step)?;
+        self.loss = done.loss;
         self.counters.intersections_overflow.add(u64::from(done.stats.overflow > 0));
         self.counters.splats_not_finite.add(u64::from(done.stats.failed));
         self.counters.gradients_rejected.add(u64::from(done.gradients_rejected));
-        self.refine(index, &view, &done);
-        self.after_step(index, &done)?;
-        Ok(Some(done.loss))
+        self.refine(index, &step.view, &done);
+        self.after_step(number, index, &done)
     }
 
     /// Steps past this only teach the map the few views it has, and what they do not show looks covered to the next.

@@ -9,7 +9,8 @@
 //! ```
 //!
 //! Counts stay on the GPU: every dispatch is sized by capacity and ends early. A submission ends by bringing
-//! 64 bytes to the host. Sums have one order, so that a step is the same in every run (3D Gaussian splatting:
+//! 64 bytes to the host. While a step runs the next may be started (`start`, `finish`), so that the device need not
+//! wait for the host. Sums have one order, so that a step is the same in every run (3D Gaussian splatting:
 //! Kerbl et al. 2023; one gradient slot per intersection instead of atomics).
 
 use super::blocks::Block;
@@ -19,7 +20,7 @@ use super::harmonics::Harmonics;
 pub use super::pool::{PruneRule, SplatInit};
 use super::sort::{Pairs, Scan, Sorter};
 pub use super::tiling::Tiling;
-use super::view::{camera, pose_gradient, size, stats};
+use super::view::{camera, size, stats};
 pub use super::view::{Exposure, Fisheye, Goal, LearningRates, Rendered, Stats, StepStats, View, Weights};
 use crate::gpu::kernels::types::{Splat, Status};
 use crate::gpu::kernels::*;
@@ -35,9 +36,9 @@ const EXPECTED_DEPTH: u32 = 1;
 const INVERSE_DEPTH: u32 = 2;
 
 /// The raster both ways; what is blended beside the colour is compiled in.
-struct Raster {
-    forward: Kernel<raster_forward::K>,
-    backward: Kernel<raster_backward::K>,
+pub(super) struct Raster {
+    pub(super) forward: Kernel<raster_forward::K>,
+    pub(super) backward: Kernel<raster_backward::K>,
 }
 
 pub(super) struct Kernels {
@@ -95,6 +96,7 @@ pub struct Pipeline {
     /// Slots below this are in use.
     pub(super) high_water: u32,
     pub(super) blocks: Vec<Block>,
+    pub(super) steps_started: usize,
     /// By camera.
     pub(super) valid_pixels: [u32; CAMERAS_MAX],
     /// Host side of images, slots and pool transfers.
@@ -183,6 +185,7 @@ impl Pipeline {
             sorter: Sorter::new(gpu)?,
             high_water: 0,
             blocks: Vec::with_capacity(shape.keyframes as usize),
+            steps_started: 0,
             valid_pixels: [0; CAMERAS_MAX],
             words: Vec::with_capacity(shape.words_max()),
             pool: Vec::with_capacity(shape.splats as usize),
@@ -212,6 +215,7 @@ impl Pipeline {
         let mut rec = gpu.record();
         self.record_picture(&mut rec, view, &self.k.raster_picture);
         self.record_summary(&mut rec, 0, 0);
+        rec.read_back(self.b.status);
         gpu.submit(rec)?;
         let status = self.status(gpu)?;
         let n = view.camera.width * view.camera.height;
@@ -226,101 +230,37 @@ impl Pipeline {
         Ok(stats(&status))
     }
 
-    /// One step on a keyframe, or its slot. The view must have the pipeline's shape.
-    pub fn train(
-        &mut self,
-        gpu: &mut Gpu,
+    pub(super) fn record_step(
+        &self,
+        rec: &mut Recorder,
         view: &View,
-        goal: impl Into<Goal>,
-        rates: &LearningRates,
-        weights: &Weights,
-    ) -> Result<StepStats, GpuError> {
-        self.pass(gpu, view, goal.into(), Some(rates), weights)
-    }
-
-    /// What `train` would answer; the map, Adam's moments included, stays as it is to the bit.
-    pub fn look(
-        &mut self,
-        gpu: &mut Gpu,
-        view: &View,
-        goal: impl Into<Goal>,
-        weights: &Weights,
-    ) -> Result<StepStats, GpuError> {
-        self.pass(gpu, view, goal.into(), None, weights)
-    }
-
-    fn pass(
-        &mut self,
-        gpu: &mut Gpu,
-        view: &View,
-        goal: Goal,
+        goal: &Goal,
         rates: Option<&LearningRates>,
         weights: &Weights,
-    ) -> Result<StepStats, GpuError> {
+    ) {
         let (w, h) = (self.shape.width, self.shape.height);
         assert!(
             (view.camera.width, view.camera.height) == (w as usize, h as usize) && goal.slot < self.shape.keyframes,
             "training views are of the shape the pipeline was made with"
         );
-        let mut rec = gpu.record();
         let depth = goal.depth.filter(|_| self.shape.inverse_depth && weights.depth > 0.0);
         let raster = self.raster(depth.is_some());
-        let by_tile = self.record_picture(&mut rec, view, &raster.forward);
-        self.record_loss(&mut rec, &goal, weights);
+        let by_tile = self.record_picture(rec, view, &raster.forward);
+        self.record_loss(rec, goal, weights);
         if let Some(anchor) = depth {
-            self.record_loss_depth(&mut rec, &goal, anchor, weights);
+            self.record_loss_depth(rec, goal, anchor, weights);
         }
-        self.record_update(&mut rec, view, &raster.backward, by_tile, rates, weights);
-        self.record_summary(&mut rec, self.shape.channels * image_groups(w, h), self.high_water.div_ceil(GROUP));
-        gpu.submit(rec)?;
-        let s = self.status(gpu)?;
-        let valid = f64::from(self.valid_pixels[goal.camera as usize].max(1) * self.shape.channels);
-        let (l1, ssim) = (f64::from(s.l1_sum) / valid, f64::from(s.ssim_sum) / valid);
-        let lambda = f64::from(weights.ssim);
-        Ok(StepStats {
-            stats: stats(&s),
-            loss: (1.0 - lambda) * l1 + lambda * (1.0 - ssim),
-            l1,
-            ssim,
-            gradients_rejected: s.gradients_refused as u32,
-            pose_gradient: pose_gradient(view, &s.pose),
-            exposure_gradient: s.exposure.map(f64::from),
-        })
-    }
-
-    /// One step down a gradient by pixel that the caller gives in place of a loss: planes by colour, and, of a
-    /// shape with inverse depth, by accumulated inverse depth and by transmittance.
-    pub fn descend(
-        &mut self,
-        gpu: &mut Gpu,
-        view: &View,
-        pixel_gradient: &[f32],
-        rates: &LearningRates,
-        weights: &Weights,
-    ) -> Result<StepStats, GpuError> {
-        gpu.upload(self.b.pixel_gradient, 0, pixel_gradient)?;
-        let mut rec = gpu.record();
-        let raster = self.raster(true);
-        let by_tile = self.record_picture(&mut rec, view, &raster.forward);
-        self.record_update(&mut rec, view, &raster.backward, by_tile, Some(rates), weights);
-        self.record_summary(&mut rec, 0, self.high_water.div_ceil(GROUP));
-        gpu.submit(rec)?;
-        let s = self.status(gpu)?;
-        Ok(StepStats {
-            stats: stats(&s),
-            gradients_rejected: s.gradients_refused as u32,
-            pose_gradient: pose_gradient(view, &s.pose),
-            ..StepStats::default()
-        })
+        self.record_update(rec, view, &raster.backward, by_tile, rates, weights);
+        self.record_summary(rec, self.shape.channels * image_groups(w, h), self.high_water.div_ceil(GROUP));
     }
 
     /// With inverse depth where it is wanted and the shape has it.
-    fn raster(&self, inverse_depth: bool) -> &Raster {
+    pub(super) fn raster(&self, inverse_depth: bool) -> &Raster {
         self.k.raster_depth.as_ref().filter(|_| inverse_depth).unwrap_or(&self.k.raster)
     }
 
     /// What the last summary said.
-    fn status(&self, gpu: &mut Gpu) -> Result<Status, GpuError> {
+    pub(super) fn status(&self, gpu: &mut Gpu) -> Result<Status, GpuError> {
         let mut s = [Status::default()];
         gpu.read_back(&mut s)?;
         Ok(s[0])
@@ -331,7 +271,7 @@ impl Pipeline {
         (view.camera.width as u32).div_ceil(tw) * (view.camera.height as u32).div_ceil(th)
     }
 
-    fn record_picture(&self, rec: &mut Recorder, view: &View, raster: &Kernel<raster_forward::K>) -> Pairs {
+    pub(super) fn record_picture(&self, rec: &mut Recorder, view: &View, raster: &Kernel<raster_forward::K>) -> Pairs {
         let (k, b, n) = (&self.k, &self.b, self.high_water);
         let size = size(view);
         let per_slot = Threads::d1(n + 1);
@@ -477,7 +417,7 @@ impl Pipeline {
         );
     }
 
-    fn record_update(
+    pub(super) fn record_update(
         &self,
         rec: &mut Recorder,
         view: &View,
@@ -538,7 +478,7 @@ impl Pipeline {
         );
     }
 
-    fn record_summary(&self, rec: &mut Recorder, image_groups: u32, splat_groups: u32) {
+    pub(super) fn record_summary(&self, rec: &mut Recorder, image_groups: u32, splat_groups: u32) {
         let b = &self.b;
         rec.dispatch(
             &self.k.summary,
@@ -554,7 +494,6 @@ impl Pipeline {
             summary::Push { image_groups, splat_groups },
             Threads::groups(1, 1, 1),
         );
-        rec.read_back(b.status);
     }
 }
 

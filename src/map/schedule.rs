@@ -34,15 +34,16 @@ pub enum Ended {
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Phase {
     Uniform,
-    Burst { anchor: usize, left: u32 },
-    Convergence { anchor: usize, left: u32, best: f64, stale: u32 },
+    Burst { anchor: usize, asked: u32, left: u32 },
+    Convergence { anchor: usize, asked: u32, left: u32, best: f64, stale: u32 },
 }
 
 /// A loss is falling while it gets this much below its best in `PATIENCE` steps.
 const FALLS: f64 = 0.01;
 const PATIENCE: u32 = 5;
 
-/// The order of training steps: a new anchor's burst first, then its convergence interval, then uniform draws.
+/// The order of training steps: a new anchor's burst first, then its convergence interval, then uniform draws. A step may
+/// be asked for before the one asked for last was taken; what is asked for after the end of a phase must wait for it.
 pub struct Schedule {
     rng: Rng,
     phase: Phase,
@@ -55,12 +56,12 @@ impl Schedule {
 
     /// The next `steps` go to keyframe `anchor` alone.
     pub fn start_burst(&mut self, anchor: usize, steps: u32) {
-        self.phase = if steps > 0 { Phase::Burst { anchor, left: steps } } else { Phase::Uniform };
+        self.phase = if steps > 0 { Phase::Burst { anchor, asked: 0, left: steps } } else { Phase::Uniform };
     }
 
     /// Steps go to `anchor` until its loss stops falling, at most `steps`.
     pub fn start_convergence(&mut self, anchor: usize, steps: u32) {
-        let start = Phase::Convergence { anchor, left: steps, best: f64::INFINITY, stale: 0 };
+        let start = Phase::Convergence { anchor, asked: 0, left: steps, best: f64::INFINITY, stale: 0 };
         self.phase = if steps > 0 { start } else { Phase::Uniform };
     }
 
@@ -72,30 +73,42 @@ impl Schedule {
         self.phase != Phase::Uniform
     }
 
+    /// Whether all steps of a phase are asked for: how they went decides which is next.
+    pub fn must_wait(&self) -> bool {
+        match self.phase {
+            Phase::Burst { asked, left, .. } | Phase::Convergence { asked, left, .. } => asked >= left,
+            Phase::Uniform => false,
+        }
+    }
+
     /// The keyframe of the next step out of `training`, or `None` when there is none.
     pub fn next(&mut self, training: &[u32]) -> Option<usize> {
-        match self.phase {
-            Phase::Burst { anchor, .. } | Phase::Convergence { anchor, .. } => Some(anchor),
+        match &mut self.phase {
+            Phase::Burst { anchor, asked, .. } | Phase::Convergence { anchor, asked, .. } => {
+                *asked += 1;
+                Some(*anchor)
+            }
             Phase::Uniform => (!training.is_empty()).then(|| training[self.rng.below(training.len())] as usize),
         }
     }
 
-    /// The loss of the step that `next` asked for.
+    /// The loss of the oldest step that `next` asked for and that was not taken yet. One that ends a convergence interval
+    /// early leaves the next, asked for already, to the uniform draws.
     pub fn took(&mut self, loss: f64) -> Ended {
         match &mut self.phase {
             Phase::Uniform => Ended::Nothing,
-            Phase::Burst { anchor, left } => {
+            Phase::Burst { anchor, asked, left } => {
                 let anchor = *anchor;
-                *left -= 1;
+                (*asked, *left) = (asked.saturating_sub(1), *left - 1);
                 if *left > 0 {
                     return Ended::Nothing;
                 }
                 self.phase = Phase::Uniform;
                 Ended::Burst(anchor)
             }
-            Phase::Convergence { anchor, left, best, stale } => {
+            Phase::Convergence { anchor, asked, left, best, stale } => {
                 let anchor = *anchor;
-                *left -= 1;
+                (*asked, *left) = (asked.saturating_sub(1), *left - 1);
                 if loss < *best * (1.0 - FALLS) {
                     (*best, *stale) = (loss, 0);
                 } else {
@@ -141,7 +154,27 @@ mod tests {
         assert_eq!((s.next(&[5]), s.took(1.0)), (Some(5), Ended::Nothing));
         assert_eq!(s.next(&[]), None);
         s.start_burst(42, 0);
-        assert!(!s.in_burst());
+        assert!(!s.in_burst() && !s.must_wait());
+    }
+
+    #[test]
+    fn steps_asked_for_ahead_count_and_the_end_is_waited_for() {
+        let mut s = Schedule::new(1);
+        s.start_burst(42, 2);
+        assert_eq!((s.next(&[5]), s.must_wait()), (Some(42), false));
+        assert_eq!((s.next(&[5]), s.must_wait()), (Some(42), true));
+        assert_eq!((s.took(1.0), s.must_wait()), (Ended::Nothing, true));
+        assert_eq!((s.took(1.0), s.must_wait()), (Ended::Burst(42), false));
+        s.start_convergence(42, 10);
+        for _ in 0..PATIENCE {
+            assert_eq!((s.next(&[5]), s.must_wait()), (Some(42), false));
+            assert_eq!((s.next(&[5]), s.must_wait()), (Some(42), false));
+            if s.took(f64::NAN) == Ended::Convergence(42) {
+                break;
+            }
+            s.took(f64::NAN);
+        }
+        assert_eq!((s.took(1.0), s.next(&[5])), (Ended::Nothing, Some(5)));
     }
 
     #[test]

@@ -13,7 +13,9 @@ mod reflect;
 
 use stipple::config::GpuConfig;
 use stipple::gpu::kernels::{self, args, axpy, group_sum, layouts, types};
-use stipple::gpu::{Buf, Gpu, GpuError, GpuOptions, Kernel, Recorder, Threads, ALIGN, COMMANDS_MAX, STAGING_BYTES};
+use stipple::gpu::{
+    Buf, Gpu, GpuError, GpuOptions, Kernel, Recorder, Threads, ALIGN, COMMANDS_MAX, REPORTS, STAGING_BYTES,
+};
 use stipple::mem;
 use stipple_drivers::Exit;
 
@@ -396,14 +398,37 @@ fn submission_without_waiting_is_waited_for_by_what_follows() {
     for _ in 0..5 {
         let mut rec = gpu.record();
         axpy(&mut rec, &k, x, y, 1.0);
-        gpu.submit_nowait(rec).unwrap();
+        gpu.start(rec).unwrap();
     }
     assert_eq!(read(&mut gpu, y), [5.0; 1000]);
     gpu.wait().unwrap();
     let mut rec = gpu.record();
     axpy(&mut rec, &k, x, y, 1.0);
-    gpu.submit_nowait(rec).unwrap();
+    gpu.start(rec).unwrap();
     // Dropped with work in flight.
+}
+
+#[test]
+fn reports_stay_until_the_next_to_their_place() {
+    let mut gpu = open(1 << 20);
+    let x = floats(&mut gpu, "x", &[1.0; 64]);
+    let y = gpu.alloc::<f32>("y", 64).unwrap();
+    let k = gpu.kernel::<axpy::K>(axpy::Spec::default()).unwrap();
+    let start = |gpu: &mut Gpu, place: usize| {
+        let mut rec = gpu.record();
+        axpy(&mut rec, &k, x, y, 1.0);
+        rec.report(y.part(0, 4), place);
+        gpu.start(rec)
+    };
+    let tickets: Vec<_> = (0..5).map(|i| start(&mut gpu, i % REPORTS).unwrap()).collect();
+    let mut seen = [0f32; 4];
+    gpu.report(tickets[4], 0, &mut seen).unwrap();
+    assert_eq!(seen, [5.0; 4]);
+    assert!(read(&mut gpu, y).iter().all(|&v| v == 5.0));
+    gpu.report(tickets[3], 1, &mut seen).unwrap();
+    assert_eq!(seen, [4.0; 4]);
+    assert!(matches!(start(&mut gpu, REPORTS), Err(GpuError::Binding { .. })));
+    assert!(matches!(gpu.report(tickets[4], 0, &mut [0u32; 100]), Err(GpuError::OutOfRange { .. })));
 }
 
 #[test]
@@ -430,6 +455,12 @@ fn steady_state_allocates_nothing() {
                 0,
             );
             gpu.submit(rec).unwrap();
+            for place in 0..REPORTS {
+                let mut rec = gpu.record();
+                axpy(&mut rec, &k, x, y, 1.0);
+                rec.report(y.part(0, 4), place);
+                gpu.start(rec).unwrap();
+            }
             gpu.upload(x, 0, &items).unwrap();
             gpu.download(y, 0, &mut items).unwrap();
         }

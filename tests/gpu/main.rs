@@ -10,6 +10,7 @@ mod occupancy;
 mod pool;
 mod raster;
 mod sort;
+mod speed;
 mod splat;
 mod stiff;
 mod tiles;

@@ -48,7 +48,7 @@ fn timings_name_every_command_and_add_up() {
     }
     assert!(gpu.last_submit_ms() > 0.0 && gpu.last_submit_ms() <= wall_ms);
     let rows = gpu.timings().to_vec();
-    gpu.time_commands(false).unwrap();
+    gpu.time_commands(0);
     let mut rec = gpu.record();
     (0..3).for_each(|_| axpy(&mut rec, &k, x, y, 1.0));
     gpu.submit(rec).unwrap();
@@ -64,7 +64,7 @@ fn overhead_of_submissions_and_transfers() {
     let k = gpu.kernel::<axpy::K>(axpy::Spec::default()).unwrap();
     println!("{}: {:?}", gpu.caps().name, gpu.caps());
     for (commands, each) in [(1, true), (10, true), (100, true), (1000, true), (1000, false)] {
-        gpu.time_commands(each).unwrap();
+        gpu.time_commands(u64::from(each));
         let mut record_ms = 0.0;
         let submit = median_ms(51, || {
             let start = Instant::now();
