@@ -119,3 +119,17 @@ fn quick_stereo_bench_writes_a_row_a_method_and_a_picture_of_each() {
     let html = std::fs::read_to_string(out.join("stereo.html")).unwrap();
     assert!(html.contains("data:image/png") && !html.contains(">NaN") && !html.contains("NaN,"));
 }
+
+#[test]
+fn kernels_of_a_recording_that_is_not_there_fail_before_the_sweep() {
+    let dir = tempfile::tempdir().unwrap();
+    let out = dir.path().join("out");
+    let o = Command::new(env!("CARGO_BIN_EXE_stipple"))
+        .args(["bench", "kernels", "--recording", "no/such/folder", "--out", out.to_str().unwrap()])
+        .output()
+        .unwrap();
+    let said = String::from_utf8_lossy(&o.stderr);
+    assert!(!o.status.success() && said.contains("no/such/folder"), "{said}");
+    assert_eq!(said.trim().lines().count(), 1, "{said}");
+    assert!(!out.exists());
+}

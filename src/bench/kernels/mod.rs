@@ -84,6 +84,8 @@ struct Bench {
 
 /// `stipple bench kernels`
 pub fn kernels(options: &Options, out: &Path) -> Result<(), Fault> {
+    // First, so that a wrong folder is told before the sweep.
+    let recorded = options.recording.as_deref().map(|folder| Scene::recorded(folder, RECORDED)).transpose()?;
     let out = OutputDir::create(out)?;
     let config = GpuConfig {
         device: options.device.clone().unwrap_or_default(),
@@ -113,8 +115,8 @@ pub fn kernels(options: &Options, out: &Path) -> Result<(), Fault> {
             bench.single.push(wall(n, SMALL.1)?);
         }
     }
-    if let Some(folder) = &options.recording {
-        bench.single.push(run(&Scene::recorded(folder, RECORDED)?)?);
+    if let Some(scene) = &recorded {
+        bench.single.push(run(scene)?);
     }
     out.write("kernels.csv", |w| page::csv(w, &bench))?;
     out.write("kernels.json", |w| page::json(w, &bench))?;
