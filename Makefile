@@ -14,14 +14,25 @@ PACKAGES := g++ glslang-tools libopencv-calib3d-dev libvulkan1 mesa-vulkan-drive
 
 OUT ?= out/demo
 
-.PHONY: demo test soak bench-odometry lint deps
+.PHONY: demo test test-onnx soak bench-odometry lint deps
 
 demo: deps
 	cargo build --release --locked
 	target/release/stipple demo --board board-configs/lavapipe.toml --out $(OUT)
 
 test: deps
+	cargo check --locked --no-default-features --all-targets
 	cargo test --workspace --locked --no-fail-fast
+	@$(MAKE) --no-print-directory test-onnx
+
+# The tests that ONNX Runtime must be there for. Debian 12 does not package it; pip has it.
+test-onnx:
+	@lib=$${STIPPLE_ONNXRUNTIME:-$$(ls target/onnxruntime/onnxruntime/capi/libonnxruntime.so.* 2>/dev/null | head -1)}; \
+	if [ -z "$$lib" ]; then \
+	  python3 -m pip install --quiet --no-deps --target target/onnxruntime onnxruntime 2>/dev/null; \
+	  lib=$$(ls target/onnxruntime/onnxruntime/capi/libonnxruntime.so.* 2>/dev/null | head -1); fi; \
+	if [ -n "$$lib" ]; then STIPPLE_ONNXRUNTIME=$$(realpath $$lib) cargo test --locked --test onnx -- --ignored; \
+	else echo "left out: the tests of tests/onnx.rs that need ONNX Runtime, which pip could not fetch"; fi
 
 # A minute of garbage for the tracker and the estimator.
 soak: deps

@@ -7,9 +7,11 @@
 
 mod bounds;
 mod map;
+mod network;
 
 use bounds::BOUNDS;
 pub use map::{MapConfig, Projection};
+pub use network::{Fit, NetworkConfig};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 use stipple_drivers::{Exit, Fault};
@@ -217,6 +219,8 @@ pub struct StereoConfig {
     /// Depths used for seeding, m.
     pub depth_min_m: f64,
     pub depth_max_m: f64,
+    /// Of `onnx`.
+    pub network: NetworkConfig,
 }
 
 impl Default for StereoConfig {
@@ -230,6 +234,7 @@ impl Default for StereoConfig {
             uniqueness_percent: 10,
             depth_min_m: 0.3,
             depth_max_m: 20.0,
+            network: NetworkConfig::default(),
         }
     }
 }
@@ -327,6 +332,12 @@ impl Board {
                 "rig.rolling_shutter",
                 "needs rig.readout_s: without the time of a readout every image would bend",
             ),
+            (
+                self.stereo.network.normalises(),
+                "stereo.network.deviation",
+                "must be three positive numbers, stereo.network.mean three finite ones",
+            ),
+            (self.stereo.network.channels != 2, "stereo.network.channels", "must be 1 or 3"),
             (self.stereo.depth_max_m > self.stereo.depth_min_m, "stereo.depth_max_m", "must exceed stereo.depth_min_m"),
             (
                 self.budget.intersections >= self.budget.splats,

@@ -8,6 +8,7 @@
 //! | `onnx` | CPU, a network of the user's | as the first |
 
 use super::confidence::Confidence;
+use super::onnx::Network;
 use super::opencv::OpenCv;
 use crate::config::{StereoConfig, StereoMethod};
 use crate::gpu::Gpu;
@@ -36,6 +37,7 @@ impl Disparity {
 
 pub enum Method {
     OpenCv(OpenCv, Confidence),
+    Onnx(Box<Network>, Confidence),
 }
 
 impl Method {
@@ -47,7 +49,11 @@ impl Method {
                 f.extend(OpenCv::footprint(width, height, config));
                 f.extend(Confidence::footprint(width));
             }
-            StereoMethod::Sgm | StereoMethod::Onnx => {}
+            StereoMethod::Onnx => {
+                f.extend(Network::footprint(width, height, &config.network));
+                f.extend(Confidence::footprint(width));
+            }
+            StereoMethod::Sgm => {}
         }
         f
     }
@@ -58,7 +64,11 @@ impl Method {
             StereoMethod::Bm | StereoMethod::Sgbm => {
                 Ok(Method::OpenCv(OpenCv::new(width, height, config)?, Confidence::new(width, config)))
             }
-            StereoMethod::Sgm | StereoMethod::Onnx => {
+            StereoMethod::Onnx => {
+                let network = Network::new(width, height, &config.network)?;
+                Ok(Method::Onnx(Box::new(network), Confidence::new(width, config)))
+            }
+            StereoMethod::Sgm => {
                 let what = format!("`{}` is not built yet", config.method.name());
                 Err(Fault::new(Exit::Config, "stereo.method", what, "use `bm` or `sgbm`"))
             }
@@ -80,6 +90,11 @@ impl Method {
         match self {
             Method::OpenCv(matcher, confidence) => {
                 matcher.compute(left, right, &mut out.px)?;
+                confidence.estimate(left, out);
+                Ok(())
+            }
+            Method::Onnx(network, confidence) => {
+                network.compute(left, right, out)?;
                 confidence.estimate(left, out);
                 Ok(())
             }

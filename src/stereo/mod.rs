@@ -7,6 +7,7 @@
 
 pub mod confidence;
 pub mod method;
+pub mod onnx;
 pub mod opencv;
 pub mod rectify;
 #[cfg(feature = "ximgproc")]
@@ -222,6 +223,7 @@ impl Stereo {
 #[cfg(test)]
 mod tests {
     use super::*;
+    #[cfg(feature = "opencv")]
     use crate::config::StereoMethod;
     use stipple_drivers::{Camera, ImuCalibration, Lens};
 

@@ -8,6 +8,7 @@ use crate::mem::Footprint;
 use stipple_drivers::{Fault, Image};
 
 /// OpenCV's disparities are in 1/16 px.
+#[cfg(feature = "opencv")]
 const SUBPIXEL: f32 = 16.0;
 
 pub struct OpenCv {
