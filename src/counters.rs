@@ -49,7 +49,7 @@ counters! {
     splats_full,
     /// Seeds refused because their cell was occupied.
     seeds_occupied,
-    /// Occupancy cells that found no room in the hash table.
+    /// Seeds of which the hash table could not say whether their cell is held.
     occupancy_full,
     /// Gaussians removed for being faint, huge or not finite.
     splats_pruned,

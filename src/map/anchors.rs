@@ -6,7 +6,7 @@
 //! the inverse depth of the nearest matches left, right, above and below is carried over, the background
 //! preferred; such seeds start large and faint so that others overrule them.
 
-use super::occupancy::{FULL, HELD};
+use super::occupancy::{HELD, UNKNOWN};
 use super::schedule::Rng;
 use super::view::{Exposure, View};
 use crate::counters::Counters;
@@ -119,12 +119,12 @@ impl Seeder {
         &self.points
     }
 
-    /// Of the picked, at most `room`: those whose cell no earlier anchor holds, or that the rendering lacks.
+    /// Of the picked, at most `room`: those whose cell holds nothing yet, or that the rendering lacks.
     pub fn settle(&mut self, answers: &[u32], room: usize, counters: &Counters) -> &[Seed] {
         let mut kept = 0;
         for i in 0..self.seeds.len() {
             let lacking = self.points[i][3] != 0.0;
-            counters.occupancy_full.add(u64::from(answers[i] == FULL));
+            counters.occupancy_full.add(u64::from(answers[i] == UNKNOWN));
             if answers[i] == HELD && !lacking {
                 counters.seeds_occupied.add(1);
             } else if kept == room {
@@ -275,7 +275,7 @@ fn carried_depth(metres: &[f32], width: usize, i: usize, around: [u32; 4]) -> f3
 
 #[cfg(test)]
 pub(super) mod tests {
-    use super::super::occupancy::CLAIMED;
+    use super::super::occupancy::FREE;
     use super::*;
     use crate::stereo::Pinhole;
     use stipple_drivers::Pose;
@@ -317,7 +317,7 @@ pub(super) mod tests {
     #[test]
     fn flat_view_is_seeded_evenly_and_within_budget() {
         let mut s = Seeder::new(W, H, 300);
-        let seeds = seed(&mut s, &Image::new(W, H), &flat(2.0), 0.0, CLAIMED);
+        let seeds = seed(&mut s, &Image::new(W, H), &flat(2.0), 0.0, FREE);
         assert!((270..=300).contains(&seeds.len()), "{}", seeds.len());
         // Every 16x16 block gets its share.
         let mut blocks = [0; 12];
@@ -335,7 +335,7 @@ pub(super) mod tests {
         for (i, p) in image.pixels.iter_mut().enumerate() {
             *p = if i % W >= W / 2 && (i % W / 2) % 2 == 0 { 200 } else { 60 };
         }
-        let seeds = seed(&mut Seeder::new(W, H, 300), &image, &flat(2.0), 0.0, CLAIMED);
+        let seeds = seed(&mut Seeder::new(W, H, 300), &image, &flat(2.0), 0.0, FREE);
         let right = seeds.iter().filter(|k| k.p_world.x > 0.1).count();
         assert!(right > 3 * (seeds.len() - right), "{right} of {}", seeds.len());
     }
@@ -344,9 +344,9 @@ pub(super) mod tests {
     fn occupied_cells_take_no_seed_unless_bare() {
         let mut s = Seeder::new(W, H, 300);
         let image = Image::new(W, H);
-        let first = seed(&mut s, &image, &flat(2.0), 0.0, CLAIMED).len();
+        let first = seed(&mut s, &image, &flat(2.0), 0.0, FREE).len();
         assert_eq!(seed(&mut s, &image, &flat(2.0), 1.0, HELD).len(), 0);
-        assert_eq!(seed(&mut s, &image, &flat(2.0), 1.0, FULL).len(), first);
+        assert_eq!(seed(&mut s, &image, &flat(2.0), 1.0, UNKNOWN).len(), first);
         assert_eq!(seed(&mut s, &image, &flat(2.0), 0.0, HELD).len(), first);
         let mut wrong = Image::new(W, H);
         wrong.pixels.fill(200);

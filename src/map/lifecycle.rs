@@ -130,8 +130,7 @@ impl Mapper {
             let image = self.pair.as_ref().map_or_else(|| self.store.image(index), |pair| &pair.image);
             let seen = seen!(self, index, view, image, self.stereo.valid_mask(), &self.depth);
             let points = self.seeder.seed(&seen, whole, &self.counters);
-            let anchor = (index / self.eyes.len()) as u32;
-            self.occupancy.claim(&mut self.gpu, anchor, points, &mut self.answers)?;
+            self.occupancy.look(&mut self.gpu, &self.pipeline, points, &mut self.answers)?;
             let seeds = self.seeder.settle(&self.answers, room, &self.counters);
             self.arrivals.extend(seeds.iter().map(gaussian));
         } else {

@@ -1,4 +1,6 @@
-//! Twin of occupy.comp.
+//! Twin of occupy.comp and occupied.comp.
+
+pub const FREE: u32 = u32::MAX;
 
 pub fn mixed(h: u32) -> u32 {
     let h = (h ^ (h >> 16)).wrapping_mul(0x85eb_ca6b);
@@ -6,23 +8,30 @@ pub fn mixed(h: u32) -> u32 {
     h ^ (h >> 16)
 }
 
-/// Claims one after the other; answers what each found.
-pub fn claim(cells: &mut [u32], anchor: u32, per_metre: f32, points: &[[f32; 4]]) -> Vec<u32> {
+/// A cell's two places among `n`, and its tag.
+fn cell(p: &[f32], per_metre: f32, n: usize) -> ([usize; 2], u32) {
+    let c = |k: usize| (p[k] * per_metre).floor() as i32 as u32;
+    let key = mixed(c(0) ^ mixed(c(1) ^ mixed(c(2).wrapping_add(1))));
+    let places = [key, mixed(key.wrapping_add(1))].map(|h| h as usize & (n - 1));
+    (places, mixed(key.wrapping_add(2)).min(FREE - 1))
+}
+
+/// Puts in one after the other.
+pub fn occupy(cells: &mut [u32], per_metre: f32, means: &[[f32; 3]]) {
+    for p in means.iter().filter(|p| p.iter().all(|v| v.is_finite())) {
+        let (places, tag) = cell(p, per_metre, cells.len());
+        places.iter().for_each(|p| cells[*p] = cells[*p].min(tag));
+    }
+}
+
+pub fn occupied(cells: &[u32], per_metre: f32, points: &[[f32; 4]]) -> Vec<u32> {
     let answer = |p: &[f32; 4]| {
-        let c = |k: usize| (p[k] * per_metre).floor() as i32 as u32;
-        let key = mixed(c(0) ^ mixed(c(1) ^ mixed(c(2).wrapping_add(1))));
-        let places = [key, mixed(key.wrapping_add(1))].map(|h| h as usize & (cells.len() - 1));
-        let tag = mixed(key.wrapping_add(2)) >> 12;
-        let earlier = places.map(|p| cells[p]).into_iter().filter(|e| e >> 20 < anchor);
-        let (n, taken) = earlier.fold((0, false), |(n, taken), e| (n + 1, taken || e & 0xf_ffff == tag));
-        if taken {
-            return 1;
-        }
-        places.iter().for_each(|p| cells[*p] = cells[*p].min(anchor << 20 | tag));
-        if n == 2 {
-            2
-        } else {
-            0
+        let (places, tag) = cell(p, per_metre, cells.len());
+        let found = places.map(|p| cells[p]);
+        match (found.contains(&tag), found.contains(&FREE)) {
+            (true, _) => 1,
+            (false, true) => 0,
+            (false, false) => 2,
         }
     };
     points.iter().map(answer).collect()
