@@ -83,9 +83,13 @@ enum Command {
         #[command(flatten)]
         defects: daemon::Defects,
     },
-    /// Print a board's byte table; refuse what does not fit
+    /// Print a board's byte table; refuse what does not fit. Of a recording, say how well its rectified rows agree
     Check {
-        board: PathBuf,
+        #[arg(required_unless_present = "dataset")]
+        board: Option<PathBuf>,
+        /// Recording to look at, as for replay
+        #[arg(long, value_name = "DIR")]
+        dataset: Option<PathBuf>,
         /// Override a key of the board file
         #[arg(long = "set", value_name = "SECTION.KEY=VALUE")]
         set: Vec<String>,
@@ -212,7 +216,10 @@ fn run(command: Command) -> Result<(), Fault> {
         Command::Sim { scenario, out, truth, imu, duration, seed, rig, defects } => {
             daemon::simulate(&daemon::Simulate { scenario, truth, imu, duration_s: duration, seed, rig, defects }, &out)
         }
-        Command::Check { board, set } => daemon::check(&board, &set),
+        Command::Check { board, dataset, set } => {
+            let board = board.map(|path| daemon::check(&path, &set)).transpose()?;
+            dataset.map_or(Ok(()), |dataset| daemon::check_dataset(&dataset, board.as_ref()))
+        }
         Command::Bench { what: Bench::Odometry { out, recordings, seconds, quick, defaults } } => {
             bench::odometry(&bench::Options { recordings, seconds, quick, defaults }, &out)
         }

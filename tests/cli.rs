@@ -303,3 +303,36 @@ fn wrong_usage_is_exit_64() {
     assert_eq!(stipple(&["replay"]).status.code(), Some(USAGE));
     assert_eq!(stipple(&["sim", "nonesuch", "--out", "/nonexistent/x"]).status.code(), Some(USAGE));
 }
+
+/// The figure that `check --dataset` gives: how much lower camera 1 sees points, px.
+fn rows_lower(data: &Path) -> (String, f64) {
+    let o = stipple(&["check", "--dataset", data.to_str().unwrap()]);
+    assert!(o.status.success(), "{}", text(&o));
+    let said = text(&o);
+    let after = said.split("sees points ").nth(1).unwrap_or_else(|| panic!("{said}"));
+    let rows = after.split(' ').next().unwrap().parse().unwrap();
+    (said, rows)
+}
+
+#[test]
+fn check_of_a_recording_detects_a_row_of_vertical_misalignment() {
+    let dir = tempfile::tempdir().unwrap();
+    let data = flight(dir.path(), "0.4");
+    let (said, rows) = rows_lower(&data);
+    assert!(rows.abs() < 0.1 && said.contains("ok"), "{said}");
+    // The principal point of camera 1 stated a pixel too low.
+    let file = data.join("mav0/cam1/sensor.yaml");
+    let whole = fs::read_to_string(&file).unwrap();
+    let moved = |l: &str| match l.strip_prefix("intrinsics: [").and_then(|l| l.strip_suffix(']')) {
+        Some(list) => {
+            let mut k: Vec<f64> = list.split(',').map(|v| v.trim().parse().unwrap()).collect();
+            k[3] += 1.0;
+            format!("intrinsics: {k:?}")
+        }
+        None => l.to_string(),
+    };
+    fs::write(&file, whole.lines().map(moved).collect::<Vec<_>>().join("\n")).unwrap();
+    let (said, rows) = rows_lower(&data);
+    // In rectified pixels, which are a little larger or smaller than raw ones.
+    assert!((rows + 1.0).abs() < 0.25 && said.contains("warn"), "{said}");
+}

@@ -16,6 +16,7 @@
 //! fail, counted), pose corrections. Tracking waits for nobody. Shutdown: source ends, tracking drains
 //! and ends, mapping ends with the run's time.
 
+mod dataset;
 mod input;
 mod lockstep;
 mod mapping;
@@ -26,6 +27,7 @@ mod progress;
 mod summary;
 mod tracking;
 
+pub use dataset::check_dataset;
 pub use play::Pace;
 
 use crate::bench::map::Job;
@@ -260,13 +262,13 @@ fn unknown_scenario(name: &str) -> Fault {
     Fault::new(Exit::Usage, name, "is not a scenario", format!("choose one of {known}, or `euroc` with --truth"))
 }
 
-/// `stipple check`
-pub fn check(path: &Path, set: &[String]) -> Result<(), Fault> {
+/// `stipple check`; answers the board.
+pub fn check(path: &Path, set: &[String]) -> Result<Board, Fault> {
     let board = Board::load(path, set)?;
     let rig = memory::largest_rig(&board);
     let footprint = memory::footprint(&rig, &board);
     memory::print(&footprint);
     memory::admit(&path.display().to_string(), &rig, &board)?;
     println!("{:>12}       fits memory_max_mib = {}", "", board.memory_max_mib);
-    Ok(())
+    Ok(board)
 }

@@ -5,6 +5,7 @@
 //! resolution (matching needs it) and the mapping resolution is a box average of it, so that a
 //! mapping pixel is the mean of the light that fell on it. Depth is asked for anchors only.
 
+pub mod alignment;
 pub mod confidence;
 pub mod method;
 pub mod onnx;

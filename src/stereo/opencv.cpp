@@ -1,5 +1,5 @@
-// cv::StereoBM and cv::StereoSGBM behind four C functions. Buffers belong to the caller; nothing
-// throws across.
+// cv::StereoBM and cv::StereoSGBM behind four C functions, and one that our rectification is tested
+// against. Buffers belong to the caller; nothing throws across.
 //
 // Both answer nothing for the columns left of their disparity range, an eighth of the view. The
 // images are therefore matched with that many black columns put before them: what is far away in
@@ -65,6 +65,24 @@ extern "C" int stipple_matcher_compute(void* handle, const unsigned char* left, 
     wrap(right).copyTo(m->right(view));
     m->method->compute(m->left, m->right, m->disparity);
     m->disparity(view).copyTo(cv::Mat(m->height, m->width, CV_16SC1, disparity));
+    return 0;
+} catch (...) {
+    return 1;
+}
+
+// OpenCV's own map of rectification, in raw pixels. `k` and `rectified` are fx fy cx cy; `turn` is
+// rect_from_cam, row by row.
+extern "C" int stipple_rectification_map(int fisheye, const double* k, const double* distortion, const double* turn,
+                                         const double* rectified, int width, int height, float* x, float* y) try {
+    const auto matrix = [](const double* f) { return cv::Matx33d(f[0], 0, f[2], 0, f[1], f[3], 0, 0, 1); };
+    const cv::Vec4d d(distortion[0], distortion[1], distortion[2], distortion[3]);
+    const cv::Matx33d r(turn);
+    const cv::Size size(width, height);
+    cv::Mat map_x(size, CV_32FC1, x), map_y(size, CV_32FC1, y);
+    if (fisheye)
+        cv::fisheye::initUndistortRectifyMap(matrix(k), d, r, matrix(rectified), size, CV_32FC1, map_x, map_y);
+    else
+        cv::initUndistortRectifyMap(matrix(k), d, r, matrix(rectified), size, CV_32FC1, map_x, map_y);
     return 0;
 } catch (...) {
     return 1;

@@ -183,3 +183,103 @@ pub fn box_average(image: &Image, divisor: usize, out: &mut Image) {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use stipple_drivers::{Camera, ImuCalibration, Lens};
+
+    /// A pair a little askew, as calibrations have it.
+    fn rig(camera: Camera) -> Calibration {
+        let turned = DQuat::from_euler(glam::EulerRot::XYZ, 0.012, -0.02, 0.015);
+        let right = Pose::new(turned, DVec3::new(0.11, 0.003, -0.002));
+        Calibration {
+            cameras: vec![RigCamera::new(camera, Pose::IDENTITY), RigCamera::new(camera, right)],
+            imu: ImuCalibration::CONSUMER,
+        }
+    }
+
+    /// The largest distance between where our map takes a pixel from and where `reference` says, px, and of how many.
+    fn worst(
+        rig: &Calibration,
+        reference: impl Fn(&Rectification, &RigCamera, usize) -> Option<DVec2>,
+    ) -> (f64, usize) {
+        let r = Rectification::new(rig).expect("a sound rig");
+        let (mut worst, mut n) = (0f64, 0);
+        for camera in &rig.cameras {
+            let map = r.map(camera);
+            for (i, tap) in map.taps.iter().enumerate().filter(|(_, t)| t.index != OUTSIDE) {
+                let at = |corner: usize, weight: u16| corner as f64 + f64::from(weight) / f64::from(1 << WEIGHT_BITS);
+                let (x, y) = (tap.index as usize % map.source_width, tap.index as usize / map.source_width);
+                let ours = DVec2::new(at(x, tap.wx), at(y, tap.wy));
+                if let Some(theirs) = reference(&r, camera, i) {
+                    worst = worst.max(ours.distance(theirs));
+                    n += 1;
+                }
+            }
+        }
+        (worst, n)
+    }
+
+    #[cfg(feature = "opencv")]
+    fn against_opencv(camera: Camera, fisheye: bool, distortion: [f64; 4]) {
+        let rig = rig(camera);
+        let k = [camera.fx, camera.fy, camera.cx, camera.cy];
+        let r = Rectification::new(&rig).expect("a sound rig");
+        let p = r.camera.pinhole;
+        let maps: Vec<Vec<[f32; 2]>> = rig
+            .cameras
+            .iter()
+            .map(|c| {
+                let turn =
+                    DMat3::from_quat(r.body_from_rect.conjugate() * c.body_from_cam.q).transpose().to_cols_array();
+                let rectified = [p.fx, p.fy, p.cx, p.cy];
+                super::super::opencv::rectification_map(fisheye, k, distortion, turn, rectified, [p.width, p.height])
+            })
+            .collect();
+        let (worst, n) = worst(&rig, |_, c, i| {
+            let side = usize::from(c.body_from_cam != Pose::IDENTITY);
+            let [x, y] = maps[side][i];
+            Some(DVec2::new(f64::from(x), f64::from(y)))
+        });
+        assert!(worst < 0.05 && n > p.width * p.height, "{worst} px of {n}");
+    }
+
+    #[cfg(feature = "opencv")]
+    #[test]
+    fn maps_of_brown_lenses_are_those_of_opencv() {
+        let (k1, k2, p1, p2) = (-0.28340811, 0.07395907, 0.00019359, 1.76187114e-5);
+        let lens = Lens::Radtan { k1, k2, p1, p2 };
+        let camera = Camera { width: 752, height: 480, fx: 458.654, fy: 457.296, cx: 367.215, cy: 248.375, lens };
+        against_opencv(camera, false, [k1, k2, p1, p2]);
+    }
+
+    #[cfg(feature = "opencv")]
+    #[test]
+    fn maps_of_fisheyes_are_those_of_opencv() {
+        let k = [0.0101710798924, -0.0108164400299, 0.0059427817694, -0.0016622846678];
+        let lens = Lens::KannalaBrandt { k };
+        let camera = Camera { width: 512, height: 512, fx: 190.4, fy: 190.4, cx: 254.9, cy: 256.9, lens };
+        against_opencv(camera, true, k);
+    }
+
+    /// OpenCV has no such lens; equations 40 to 45 of Usenko et al. as they are printed.
+    #[test]
+    fn maps_of_double_spheres_are_those_of_the_paper() {
+        let (xi, alpha) = (-0.2409573942178872, 0.566996899163044);
+        let lens = Lens::DoubleSphere { xi, alpha };
+        let camera = Camera { width: 752, height: 480, fx: 349.756, fy: 348.724, cx: 365.894, cy: 249.329, lens };
+        let rig = rig(camera);
+        let (worst, n) = worst(&rig, |r, c, i| {
+            let p = r.camera.pinhole;
+            let (x, y) = ((i % p.width) as f64, (i / p.width) as f64);
+            let ray = DVec3::new((x - p.cx) / p.fx, (y - p.cy) / p.fy, 1.0);
+            let q = c.body_from_cam.q.conjugate() * (r.body_from_rect * ray);
+            let d1 = q.length();
+            let d2 = (q.x * q.x + q.y * q.y + (xi * d1 + q.z).powi(2)).sqrt();
+            let depth = alpha * d2 + (1.0 - alpha) * (xi * d1 + q.z);
+            Some(DVec2::new(camera.fx * q.x / depth + camera.cx, camera.fy * q.y / depth + camera.cy))
+        });
+        assert!(worst < 0.05 && n > 752 * 480, "{worst} px of {n}");
+    }
+}
