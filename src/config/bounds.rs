@@ -76,6 +76,8 @@ pub(super) const BOUNDS: &[(&str, Bound)] = &[
     ("stereo.disparities", Stepped(16.0, 512.0, 16.0, 0.0)),
     ("stereo.block_px", Stepped(5.0, 51.0, 2.0, 1.0)),
     ("stereo.sgbm_block_px", Stepped(1.0, 21.0, 2.0, 1.0)),
+    ("stereo.sgm_paths", PowerOfTwo(4.0, 8.0)),
+    ("stereo.sgm_uniqueness_percent", Within(0.0, 50.0)),
     ("stereo.uniqueness_percent", Within(0.0, 100.0)),
     ("stereo.depth_min_m", Positive),
     ("stereo.depth_max_m", Positive),

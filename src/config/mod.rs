@@ -214,8 +214,12 @@ pub struct StereoConfig {
     /// Matching window of `bm` and of `sgbm`, px, odd.
     pub block_px: u32,
     pub sgbm_block_px: u32,
-    /// Best match must beat the second by this, percent.
+    /// Best match of `bm` and of `sgbm` must beat the second by this, percent.
     pub uniqueness_percent: u32,
+    /// Directions in which `sgm` sums costs: 4 or 8.
+    pub sgm_paths: u32,
+    /// As `uniqueness_percent`, of `sgm`.
+    pub sgm_uniqueness_percent: u32,
     /// Depths used for seeding, m.
     pub depth_min_m: f64,
     pub depth_max_m: f64,
@@ -232,6 +236,8 @@ impl Default for StereoConfig {
             block_px: 11,
             sgbm_block_px: 5,
             uniqueness_percent: 10,
+            sgm_paths: 8,
+            sgm_uniqueness_percent: 10,
             depth_min_m: 0.3,
             depth_max_m: 20.0,
             network: NetworkConfig::default(),

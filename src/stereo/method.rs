@@ -10,6 +10,8 @@
 use super::confidence::Confidence;
 use super::onnx::Network;
 use super::opencv::OpenCv;
+use super::sgm::{self, Sgm};
+use super::wls::Wls;
 use crate::config::{StereoConfig, StereoMethod};
 use crate::gpu::Gpu;
 use crate::mem::Footprint;
@@ -38,6 +40,7 @@ impl Disparity {
 pub enum Method {
     OpenCv(OpenCv, Confidence),
     Onnx(Box<Network>, Confidence),
+    Sgm(Box<Sgm>),
 }
 
 impl Method {
@@ -53,13 +56,13 @@ impl Method {
                 f.extend(Network::footprint(width, height, &config.network));
                 f.extend(Confidence::footprint(width));
             }
-            StereoMethod::Sgm => {}
+            StereoMethod::Sgm => f.extend(Sgm::footprint(&sgm::Shape::of(width, height, config))),
         }
         f
     }
 
     /// `gpu` is for the methods that run there; its arena must hold the footprint.
-    pub fn new(width: usize, height: usize, config: &StereoConfig, _gpu: Option<&mut Gpu>) -> Result<Method, Fault> {
+    pub fn new(width: usize, height: usize, config: &StereoConfig, gpu: Option<&mut Gpu>) -> Result<Method, Fault> {
         match config.method {
             StereoMethod::Bm | StereoMethod::Sgbm => {
                 Ok(Method::OpenCv(OpenCv::new(width, height, config)?, Confidence::new(width, config)))
@@ -69,16 +72,24 @@ impl Method {
                 Ok(Method::Onnx(Box::new(network), Confidence::new(width, config)))
             }
             StereoMethod::Sgm => {
-                let what = format!("`{}` is not built yet", config.method.name());
-                Err(Fault::new(Exit::Config, "stereo.method", what, "use `bm` or `sgbm`"))
+                let gpu = gpu.ok_or_else(|| without_gpu(config.method))?;
+                Ok(Method::Sgm(Box::new(Sgm::new(gpu, sgm::Shape::of(width, height, config))?)))
             }
+        }
+    }
+
+    /// What may be further off than this is filled in, not seen: no depth, px.
+    pub fn sigma_max_px(&self) -> f32 {
+        match self {
+            Method::Sgm(_) => Wls::SIGMA_MAX_PX,
+            Method::OpenCv(..) | Method::Onnx(..) => f32::INFINITY,
         }
     }
 
     /// All three of the shape given to `new`, and `gpu` the one. Nothing is known when an eye sees nothing.
     pub fn compute(
         &mut self,
-        _gpu: Option<&mut Gpu>,
+        gpu: Option<&mut Gpu>,
         left: &Image,
         right: &Image,
         out: &mut Disparity,
@@ -98,6 +109,10 @@ impl Method {
                 confidence.estimate(left, out);
                 Ok(())
             }
+            Method::Sgm(sgm) => {
+                let gpu = gpu.ok_or_else(|| without_gpu(StereoMethod::Sgm))?;
+                Ok(sgm.compute(gpu, left, right, &mut out.px, &mut out.sigma_px)?)
+            }
         }
     }
 }
@@ -111,6 +126,11 @@ fn is_blind(image: &Image) -> bool {
     let n = seen().count().max(1) as f64;
     let mean = seen().sum::<f64>() / n;
     seen().map(|p| (p - mean).powi(2)).sum::<f64>() / n < NOTHING * NOTHING
+}
+
+fn without_gpu(method: StereoMethod) -> Fault {
+    let what = format!("`{}` runs on the GPU and none is open here", method.name());
+    Fault::new(Exit::Config, "stereo.method", what, "use `bm` or `sgbm`")
 }
 
 /// Why `bm` and `sgbm` are refused by a program without OpenCV.

@@ -11,6 +11,8 @@ pub mod method;
 pub mod onnx;
 pub mod opencv;
 pub mod rectify;
+pub mod sgm;
+pub mod wls;
 #[cfg(feature = "ximgproc")]
 pub mod ximgproc;
 
@@ -188,6 +190,7 @@ impl Stereo {
         const BLOCK_MAX: usize = 16; // divisor 4
         let (w, s) = (self.full.pinhole.width, self.divisor);
         let fb = self.full.pinhole.fx * self.full.baseline_m;
+        let sigma_max = self.method.sigma_max_px();
         let mut found = 0;
         for y in 0..out.height {
             for x in 0..out.width {
@@ -196,7 +199,7 @@ impl Stereo {
                 for row in 0..s {
                     let at = (y * s + row) * w + x * s;
                     for (&d, &sigma) in self.disparity.px[at..][..s].iter().zip(&self.disparity.sigma_px[at..][..s]) {
-                        if d > 0.0 {
+                        if d > 0.0 && sigma <= sigma_max {
                             block[n] = (d, sigma);
                             n += 1;
                         }

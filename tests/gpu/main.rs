@@ -12,6 +12,8 @@ mod raster;
 mod sort;
 mod speed;
 mod splat;
+mod stereo;
+mod stereo_scenes;
 mod stiff;
 mod tiles;
 mod twins;

@@ -7,6 +7,7 @@ pub mod occupancy;
 pub mod pool;
 pub mod project;
 pub mod raster;
+pub mod stereo;
 pub mod tiles;
 
 use project::{Parameters, Projected};

@@ -1,0 +1,179 @@
+//! Semi-global matching and its filter: each stage against its twin, and that a result can be repeated to the bit.
+
+use super::stereo_scenes::{draw, Scene};
+use super::twins::stereo::{self as twin, Grey, Penalties};
+use stipple::config::GpuConfig;
+use stipple::gpu::{Gpu, GpuOptions};
+use stipple::stereo::sgm::{self, Sgm, Shape};
+use stipple::stereo::wls::Wls;
+use stipple_drivers::Image;
+
+pub fn shape(width: usize, height: usize, disparities: u32) -> Shape {
+    Shape { width, height, disparities, paths: 8, uniqueness_percent: 10, wls: true }
+}
+
+pub fn open(shape: Shape) -> (Gpu, Sgm) {
+    let mut gpu = Gpu::open(&GpuConfig::default(), Sgm::footprint(&shape).gpu_total()).unwrap();
+    let sgm = Sgm::new(&mut gpu, shape).unwrap();
+    (gpu, sgm)
+}
+
+pub fn run(gpu: &mut Gpu, sgm: &mut Sgm, left: &Image, right: &Image) -> (Vec<f32>, Vec<f32>) {
+    let mut out = (vec![0.0; left.pixels.len()], vec![0.0; left.pixels.len()]);
+    sgm.compute(gpu, left, right, &mut out.0, &mut out.1).unwrap();
+    out
+}
+
+fn grey(image: &Image) -> Grey {
+    Grey { width: image.width, height: image.height, pixels: image.pixels.clone() }
+}
+
+const PENALTIES: Penalties =
+    Penalties { outside: sgm::OUTSIDE, p1: sgm::P1, p2: sgm::P2, p2_slope: sgm::P2_SLOPE, p2_min: sgm::P2_MIN };
+
+#[test]
+fn sums_and_matches_agree_with_their_twins() {
+    // Odd sizes; disparities whose lanes do not divide a workgroup, fill one, and are more than the picture is wide.
+    for (w, h, disparities, paths) in [(53, 37, 48, 8), (40, 21, 16, 4), (61, 19, 128, 8), (36, 40, 256, 4)] {
+        let (left, right) = draw(&Scene::steps(w, h), 5);
+        let s = Shape { paths, ..shape(w, h, disparities) };
+        let (mut gpu, mut sgm) = open(s);
+        sgm.load(&mut gpu, &left, &right).unwrap();
+        let mut rec = gpu.record();
+        sgm.record_sums(&mut rec);
+        gpu.submit(rec).unwrap();
+        let d = disparities as usize;
+        let mut packed = vec![0u32; w * h * d / 2];
+        gpu.download(sgm.buffers().sums.cast(), 0, &mut packed).unwrap();
+        let sums: Vec<u32> = packed.iter().flat_map(|v| [v & 0xffff, v >> 16]).collect();
+        let strings = [&left, &right].map(|i| twin::census(&grey(i)));
+        let mut expected = vec![0; w * h * d];
+        for step in sgm::DIRECTIONS.iter().take(paths as usize) {
+            let l = twin::aggregate(&grey(&left), [&strings[0], &strings[1]], d, *step, PENALTIES);
+            expected.iter_mut().zip(l).for_each(|(sum, l)| *sum += l);
+        }
+        assert!(sums == expected, "{w}x{h}, {disparities} disparities, {paths} paths");
+        let mut rec = gpu.record();
+        sgm.record_matches(&mut rec);
+        gpu.submit(rec).unwrap();
+        let (mut in_right, mut disparity) = (vec![0u32; w * h], vec![0f32; w * h]);
+        gpu.download(sgm.buffers().right, 0, &mut in_right).unwrap();
+        gpu.download(sgm.buffers().disparity, 0, &mut disparity).unwrap();
+        assert_eq!(in_right, twin::match_right(&sums, w, d));
+        let mut expected = twin::match_left(&sums, &in_right, w, d, 100 - s.uniqueness_percent, sgm::DISAGREE);
+        let limits = [sgm::CHANCE, sgm::REPEAT_FIT, sgm::REPEAT_ALIKE, sgm::REPEAT_WALL];
+        for (i, found) in expected.iter_mut().enumerate().filter(|(_, found)| **found >= 0.0) {
+            if !twin::verify([&strings[0], &strings[1]], [w, h], d, i, *found, limits) {
+                *found = -1.0;
+            }
+        }
+        for (i, (a, b)) in disparity.iter().zip(&expected).enumerate() {
+            assert!((f64::from(*a) - b).abs() < 1e-4, "pixel {i}: {a} and {b}");
+        }
+        let known = disparity.iter().filter(|d| **d >= 0.0).count();
+        assert!(known * 4 > w * h, "{known} of {} known", w * h);
+    }
+}
+
+#[test]
+fn speckles_are_the_small_regions() {
+    let (w, h) = (67, 45);
+    let mut r = super::splat::Rng(3);
+    // Blotches of few levels, with holes: regions of all sizes, rings and combs among them.
+    let disparity: Vec<f32> = (0..w * h)
+        .map(|i| match ((i % w) / 9 + (i / w) / 7) % 3 {
+            _ if r.uniform(0.0, 1.0) < 0.1 => -1.0,
+            0 => 4.0 + r.uniform(0.0, 3.0) as f32,
+            k => 9.0 + k as f32 + r.uniform(0.0, 0.9) as f32,
+        })
+        .collect();
+    let (mut gpu, sgm) = open(shape(w, h, 16));
+    let own: Vec<u32> = (0..(w * h) as u32).collect();
+    gpu.upload(sgm.buffers().labels, 0, &own).unwrap();
+    gpu.upload(sgm.buffers().disparity, 0, &disparity).unwrap();
+    let mut rec = gpu.record();
+    sgm.record_speckles(&mut rec);
+    gpu.submit(rec).unwrap();
+    let (mut labels, mut areas, mut kept) = (vec![0; w * h], vec![0; w * h], vec![0f32; w * h]);
+    gpu.download(sgm.buffers().labels, 0, &mut labels).unwrap();
+    gpu.download(sgm.buffers().areas, 0, &mut areas).unwrap();
+    gpu.download(sgm.buffers().disparity, 0, &mut kept).unwrap();
+    assert_eq!(labels, twin::speckle_join(&disparity, w, sgm::SPECKLE_CLOSE));
+    assert_eq!(areas, twin::speckle_count(&disparity, &labels));
+    let mut expected = disparity.clone();
+    twin::speckle_drop(&mut expected, &labels, &areas, sgm::SPECKLE_AREA);
+    assert_eq!(kept, expected);
+    let dropped = kept.iter().zip(&disparity).filter(|(a, b)| a != b).count();
+    assert!(dropped > 100 && kept.iter().any(|d| *d >= 0.0), "{dropped} dropped");
+}
+
+#[test]
+fn filter_agrees_with_its_twin() {
+    let (w, h) = (45, 31);
+    let (left, right) = draw(&Scene::steps(w, h), 9);
+    let (mut gpu, mut sgm) = open(shape(w, h, 16));
+    sgm.load(&mut gpu, &left, &right).unwrap();
+    let mut r = super::splat::Rng(8);
+    let mut disparity: Vec<f32> = (0..w * h).map(|i| 3.0 + (i % w) as f32 * 0.2).collect();
+    disparity.iter_mut().for_each(|d| *d = if r.uniform(0.0, 1.0) < 0.4 { -1.0 } else { *d });
+    disparity[5 * w..6 * w].fill(-1.0);
+    gpu.upload(sgm.buffers().disparity, 0, &disparity).unwrap();
+    let mut rec = gpu.record();
+    sgm.record_filter(&mut rec);
+    gpu.submit(rec).unwrap();
+    let (mut found, mut deviation) = (vec![0f32; w * h], vec![0f32; w * h]);
+    gpu.download(sgm.buffers().disparity, 0, &mut found).unwrap();
+    gpu.download(sgm.buffers().deviation, 0, &mut deviation).unwrap();
+    let mut data = twin::fill_rows(&disparity, w, f64::from(Wls::FILL), f64::from(Wls::FILL_REACH));
+    data = twin::median(&data, w);
+    for pass in 0..Wls::PASSES {
+        for columns in [false, true] {
+            let lambda = f64::from(Wls::lambda(pass));
+            twin::smooth_lines(&grey(&left), &mut data, columns, lambda, f64::from(Wls::SIGMA));
+        }
+    }
+    for (i, d) in data.iter().enumerate() {
+        let limits = [Wls::WEIGHT_MIN, Wls::MATCHED, Wls::FILLED, Wls::FILL].map(f64::from);
+        let [a, b] = twin::settle(*d, limits);
+        assert!((f64::from(found[i]) - a).abs() < 1e-3, "pixel {i}: {} and {a}", found[i]);
+        assert!((f64::from(deviation[i]) - b).abs() < 1e-3 * (1.0 + b), "pixel {i}: {} and {b}", deviation[i]);
+    }
+}
+
+#[test]
+fn depth_of_a_pair_is_the_same_to_the_bit() {
+    let (left, right) = draw(&Scene::steps(150, 90), 1);
+    let (mut gpu, mut sgm) = open(shape(150, 90, 32));
+    let once = run(&mut gpu, &mut sgm, &left, &right);
+    // Another pair in between leaves nothing behind.
+    run(&mut gpu, &mut sgm, &right, &left);
+    assert!(once == run(&mut gpu, &mut sgm, &left, &right));
+}
+
+#[test]
+fn sums_do_not_depend_on_the_workgroup() {
+    let (left, right) = draw(&Scene::steps(150, 90), 1);
+    let s = shape(150, 90, 48);
+    let found = [8, 32, 256].map(|group| {
+        let mut gpu = Gpu::open(&GpuConfig::default(), Sgm::footprint(&s).gpu_total()).unwrap();
+        let mut sgm = Sgm::with_group(&mut gpu, s, group).unwrap();
+        let found = run(&mut gpu, &mut sgm, &left, &right);
+        println!("group {group}: {:?}", gpu.timings().iter().find(|t| t.name == "aggregate"));
+        found
+    });
+    assert!(found[0] == found[1] && found[1] == found[2]);
+}
+
+#[test]
+fn the_validation_layer_is_silent_about_matching() {
+    let s = shape(64, 48, 32);
+    let options = GpuOptions { validation: true };
+    let mut gpu = match Gpu::open_with(&GpuConfig::default(), Sgm::footprint(&s).gpu_total(), options) {
+        Ok(gpu) => gpu,
+        Err(fault) => return println!("ignored: the_validation_layer_is_silent_about_matching: {fault}"),
+    };
+    let mut sgm = Sgm::new(&mut gpu, s).unwrap();
+    let (left, right) = draw(&Scene::steps(64, 48), 1);
+    run(&mut gpu, &mut sgm, &left, &right);
+    assert_eq!(gpu.validation_messages(), Vec::<String>::new());
+}
