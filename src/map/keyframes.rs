@@ -278,6 +278,15 @@ impl Store {
         }
     }
 
+    /// After the exposure of one image that is trained on moved: all of them move back by its share, so that their mean
+    /// stays.
+    pub fn balance_exposure(&mut self, moved: [f64; 2]) {
+        let share = moved.map(|x| -x / self.training.len().max(1) as f64);
+        for k in &self.training {
+            self.entries[*k as usize].refined.shift_exposure(share);
+        }
+    }
+
     /// Indices of keyframes that may be trained on.
     pub fn training(&self) -> &[u32] {
         &self.training
