@@ -5,7 +5,6 @@ use std::path::PathBuf;
 use std::time::{Duration, Instant};
 use stipple::config::Board;
 use stipple::gpu::Gpu;
-use stipple::map::pipeline::Exposure;
 use stipple::map::{Did, Keyframe, Mapper, Offer, Panel, PoseCorrection};
 use stipple::mem::{heap_after_seal, seal_thread, CountingAllocator};
 use stipple::output::panel::{panel, View};
@@ -83,7 +82,9 @@ fn fisheye_anchors_are_densified_and_drawn_to_their_depth() {
     let (calibration, keyframes, distances) = fisheye_flight(4);
     let run = |densify: u32, depth: f64| {
         let (densify, depth) = (format!("map.densify_max={densify}"), format!("map.depth_weight={depth}"));
-        let settings = ["map.scale=4", "map.projection=fisheye", "map.seeds_per_anchor=1500", &densify, &depth];
+        // By alpha alone, or seeds come where densification would put its own; poses and exposures are true as they are.
+        let mut settings = vec!["map.scale=4", "map.projection=fisheye", "map.seeds_per_anchor=1500", &densify, &depth];
+        settings.extend(["map.wrong_error=1", "map.refine_pose=false", "map.refine_exposure=false"]);
         let mut mapper = open(&calibration, &board(&settings));
         for k in &keyframes {
             mapper.offer(k);
@@ -201,7 +202,7 @@ fn corrections_reach_waiting_and_stored_keyframes_and_their_gaussians() {
 }
 
 #[test]
-fn exposure_is_found_in_the_gauge_of_the_first_keyframe() {
+fn exposure_is_found_but_for_what_all_share() {
     let (calibration, mut keyframes) = flight(8);
     let gains = [1.0, 0.8, 0.6, 0.7, 0.8, 1.0, 1.2, 1.0];
     for (k, gain) in keyframes.iter_mut().zip(gains) {
@@ -220,12 +221,11 @@ fn exposure_is_found_in_the_gauge_of_the_first_keyframe() {
     println!("{without:?}\n{with:?}");
     assert!(with.psnr_db.unwrap() > without.psnr_db.unwrap() + 2.0);
     assert!(with.psnr_heldout_db.unwrap() > without.psnr_heldout_db.unwrap() + 1.0);
-    let of = |k: usize| mapper.keyframe(k).refined.exposure;
-    assert_eq!(of(0), Exposure::default());
     // Those that see what the first sees; farther on, errors add up from one to the next.
+    let mid_grey = |k: usize| mapper.keyframe(k).refined.exposure.observed(0.5);
     for k in [1, 2] {
-        let mid_grey = of(k).observed(0.5) / 0.5;
-        assert!((mid_grey / gains[k] - 1.0).abs() < 0.12, "keyframe {k}: {:?} for {}", of(k), gains[k]);
+        let found = mid_grey(k) / mid_grey(0);
+        assert!((found / gains[k] - 1.0).abs() < 0.12, "keyframe {k}: {found} for {}", gains[k]);
     }
 }
 
@@ -239,11 +239,15 @@ fn corrections_compose_with_what_the_mapper_found() {
         mapper.offer(k);
         train(&mut mapper, 60);
     }
-    assert_eq!(mapper.keyframe(0).refined.body_from_refined, Pose::IDENTITY);
     let (given, found) = (mapper.keyframe(1).given, mapper.keyframe(1).refined.body_from_refined);
     assert_eq!(given, keyframes[1].world_from_body);
-    let off = |pose: Pose| (pose.p - truth.p).length();
-    assert!(off(given * found) < 0.7 * off(given), "{} of {}", off(given * found), off(given));
+    // Of the two, which is where is for neither to say; how far apart they are is in the pictures.
+    let first = mapper.keyframe(0);
+    let apart = |a: Pose, b: Pose| (a.inverse() * b).p;
+    let truly = apart(first.given, truth);
+    let off = |a: Pose, b: Pose| (apart(a, b) - truly).length();
+    let (was, is) = (off(first.given, given), off(first.world_from_refined(), given * found));
+    assert!(is < 0.7 * was, "{is} of {was}");
     let corrected = Pose { p: given.p + glam::DVec3::Z, ..given };
     mapper.correct(&PoseCorrection { id: 1, world_from_body: corrected });
     assert_eq!(mapper.keyframe(1).world_from_refined(), corrected * found);

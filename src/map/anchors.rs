@@ -60,16 +60,30 @@ pub struct Seen<'a> {
     pub from: View,
 }
 
-/// Fraction of valid pixels whose rendered alpha is below `covered_alpha`.
-pub fn uncovered(alpha: &[f32], valid: &[u8], covered_alpha: f64) -> f64 {
-    let (mut bare, mut n) = (0u32, 0u32);
-    for (a, v) in alpha.iter().zip(valid) {
-        if *v != 0 {
+/// Fractions of a view's valid pixels that the map does not reconstruct.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Missing {
+    /// Rendered alpha below `covered_alpha`.
+    pub bare: f64,
+    /// Covered, and rendered farther than `error` from what is seen, in the exposure of the map.
+    pub wrong: f64,
+}
+
+impl Missing {
+    pub fn of(view: &Seen, covered_alpha: f64, error: f64) -> Missing {
+        let (mut bare, mut wrong, mut n) = (0u32, 0u32, 0u32);
+        for i in (0..view.valid.len()).filter(|&i| view.valid[i] != 0) {
             n += 1;
-            bare += u32::from(f64::from(*a) < covered_alpha);
+            if f64::from(view.alpha[i]) < covered_alpha {
+                bare += 1;
+            } else {
+                let seen = view.exposure.inverse(f64::from(view.image.pixels[i]) / 255.0);
+                wrong += u32::from((f64::from(view.grey[i]) - seen).abs() > error);
+            }
         }
+        let part = |k: u32| f64::from(k) / f64::from(n.max(1));
+        Missing { bare: part(bare), wrong: part(wrong) }
     }
-    f64::from(bare) / f64::from(n.max(1))
 }
 
 /// Picks seeds; owns the scratch it needs.
@@ -288,19 +302,23 @@ pub(super) mod tests {
         View { world_from_cam: Pose::IDENTITY, camera, fisheye: None }
     }
 
-    /// With every cell held as `answer` says.
-    fn seed(seeder: &mut Seeder, image: &Image, depth: &DepthMap, alpha: f32, answer: u32) -> Vec<Seed> {
-        let seen = Seen {
+    /// Rendered black by a map that is `alpha` opaque.
+    fn seen<'a>(image: &'a Image, depth: &'a DepthMap, alpha: &'a [f32]) -> Seen<'a> {
+        Seen {
             image,
             valid: &[1; W * H],
             depth,
-            alpha: &[alpha; W * H],
+            alpha,
             grey: &[0.0; W * H],
             exposure: Exposure::default(),
             rendered_depth: &[0.0; W * H],
             from: from(),
-        };
-        let n = seeder.seed(&seen, usize::MAX, &Counters::default()).len();
+        }
+    }
+
+    /// With every cell held as `answer` says.
+    fn seed(seeder: &mut Seeder, image: &Image, depth: &DepthMap, alpha: f32, answer: u32) -> Vec<Seed> {
+        let n = seeder.seed(&seen(image, depth, &[alpha; W * H]), usize::MAX, &Counters::default()).len();
         seeder.settle(&vec![answer; n], usize::MAX, &Counters::default()).to_vec()
     }
 
@@ -309,9 +327,20 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn uncovered_counts_valid_pixels_only() {
-        assert_eq!(uncovered(&[0.0, 0.9, 0.0, 0.04], &[1, 1, 0, 1], 0.05), 2.0 / 3.0);
-        assert_eq!(uncovered(&[0.0], &[0], 0.05), 0.0);
+    fn missing_is_what_is_bare_and_what_is_wrong_of_the_valid() {
+        let (mut image, depth, mut alpha) = (Image::new(W, H), flat(1.0), [0.9; W * H]);
+        image.pixels[..W * H / 4].fill(100);
+        alpha[W * H / 8..W * H / 2].fill(0.01);
+        let v = seen(&image, &depth, &alpha);
+        assert_eq!(Missing::of(&v, 0.05, 0.25), Missing { bare: 3.0 / 8.0, wrong: 1.0 / 8.0 });
+        assert_eq!(Missing::of(&v, 0.05, 0.5).wrong, 0.0);
+        // At half the gain what is seen as 100 would be 200.
+        let dim = Seen { exposure: Exposure { gain: 0.5, offset: 0.0 }, ..v };
+        assert_eq!(Missing::of(&dim, 0.05, 0.5).wrong, 1.0 / 8.0);
+        let mut half = [1; W * H];
+        half[..W * H / 2].fill(0);
+        assert_eq!(Missing::of(&Seen { valid: &half, ..dim }, 0.05, 0.25), Missing { bare: 0.0, wrong: 0.0 });
+        assert_eq!(Missing::of(&Seen { valid: &[0; W * H], ..dim }, 0.05, 0.25), Missing { bare: 0.0, wrong: 0.0 });
     }
 
     #[test]

@@ -2,14 +2,13 @@
 //!
 //! ```text
 //! rendered -> covered and right ------------------------------------> pool
-//!          -> bare: seeds on the stereo depth ---> burst -> densified -> until its loss stops falling -> pool
-//!          -> covered and wrong: no seeds ------->
+//!          -> bare or wrong: seeds on its depth --> burst -> densified -> until its loss stops falling -> pool
 //! ```
 //!
 //! An anchor opens a block of the pool; what its seeds and its densification need and is not free is taken from the
 //! least important, if the board lets (`budget`).
 
-use super::anchors::{self, uncovered};
+use super::anchors::{self, Missing};
 use super::budget::{by_training, threshold, Cost};
 use super::densify::mean;
 use super::eyes;
@@ -92,13 +91,20 @@ impl Mapper {
 
     fn cover(&mut self, index: usize) -> Result<Did, GpuError> {
         let view = self.rectified(index);
+        if self.pair.is_some() {
+            // Without distortion, what lies beyond a fisheye's rim is drawn across the picture: it tells no exposure.
+            let own = self.view(index);
+            self.pipeline.render(&mut self.gpu, &own, &mut self.rendered)?;
+            self.expose(index);
+        }
         self.pipeline.render(&mut self.gpu, &view, &mut self.rendered)?;
-        self.expose(index);
-        let valid = self.stereo.valid_mask();
-        let uncovered = uncovered(&self.rendered.alpha, valid, self.config.covered_alpha);
-        let bare = uncovered > self.config.anchor_uncovered_min;
-        let wrong = !bare && self.error(index) > self.config.anchor_error_min;
-        if !(bare || wrong) {
+        if self.pair.is_none() {
+            self.expose(index);
+        }
+        let image = self.pair.as_ref().map_or_else(|| self.store.image(index), |pair| &pair.image);
+        let seen = seen!(self, index, view, image, self.stereo.valid_mask(), &self.depth);
+        let Missing { bare, wrong } = Missing::of(&seen, self.config.covered_alpha, self.config.wrong_error);
+        if bare + wrong <= self.config.anchor_missing_min {
             return Ok(Did::Stored);
         }
         let Some(keyframe) = self.queue.front() else { return Ok(Did::Stored) };
@@ -119,23 +125,20 @@ impl Mapper {
             self.scene_depth_m = median_depth(&self.depth.metres).unwrap_or(SCENE_DEPTH_M);
         }
         let whole = self.growth.allowed(self.seeds_of_a_view());
-        let wanted = if bare { (uncovered * whole as f64).ceil() as usize } else { 0 };
+        let wanted = ((bare + wrong) * whole as f64).ceil() as usize;
         let room = self.make_room(wanted)?;
         if room == 0 && !self.config.evict {
             return Ok(Did::Stored);
         }
         self.pipeline.open_block(index as u32);
+        let image = self.pair.as_ref().map_or_else(|| self.store.image(index), |pair| &pair.image);
+        let seen = seen!(self, index, view, image, self.stereo.valid_mask(), &self.depth);
+        let points = self.seeder.seed(&seen, whole, &self.counters);
+        self.occupancy.look(&mut self.gpu, &self.pipeline, points, &mut self.answers)?;
+        let seeds = self.seeder.settle(&self.answers, room, &self.counters);
         self.arrivals.clear();
-        if bare {
-            let image = self.pair.as_ref().map_or_else(|| self.store.image(index), |pair| &pair.image);
-            let seen = seen!(self, index, view, image, self.stereo.valid_mask(), &self.depth);
-            let points = self.seeder.seed(&seen, whole, &self.counters);
-            self.occupancy.look(&mut self.gpu, &self.pipeline, points, &mut self.answers)?;
-            let seeds = self.seeder.settle(&self.answers, room, &self.counters);
-            self.arrivals.extend(seeds.iter().map(gaussian));
-        } else {
-            self.counters.anchors_for_error.add(1);
-        }
+        self.arrivals.extend(seeds.iter().map(gaussian));
+        self.counters.anchors_for_error.add(u64::from(bare <= self.config.anchor_missing_min));
         let seeded = self.pipeline.append(&mut self.gpu, &self.arrivals)? as u32;
         let entry = self.store.get_mut(index);
         (entry.anchor, entry.placed) = (true, entry.given);
@@ -143,21 +146,6 @@ impl Mapper {
         self.added = Added::default();
         self.schedule.start_burst(index, self.config.burst_iterations);
         Ok(Did::Anchor { seeded })
-    }
-
-    /// Mean |rendered - seen| over what is covered.
-    fn error(&self, index: usize) -> f64 {
-        let (seen, valid) = (&self.seen_from(index).pixels, self.stereo.valid_mask());
-        let exposure = self.store.exposure(index);
-        let (mut sum, mut n) = (0.0, 0u32);
-        for i in (0..seen.len()).filter(|&i| valid[i] != 0) {
-            if f64::from(self.rendered.alpha[i]) >= self.config.covered_alpha {
-                let seen = exposure.inverse(f64::from(seen[i]) / 255.0);
-                sum += (f64::from(self.rendered.grey[i]) - seen).abs();
-                n += 1;
-            }
-        }
-        sum / f64::from(n.max(1))
     }
 
     /// Seeds for a view that is all bare.

@@ -47,7 +47,7 @@ use pipeline::{LearningRates, Pipeline, Rendered, Shape, View, Weights};
 use schedule::Schedule;
 use std::time::Instant;
 use step::Step;
-use stipple_drivers::{Calibration, Fault, Image};
+use stipple_drivers::{Calibration, Fault};
 
 pub use harmonics::Form;
 pub use keyframes::{Keyframe, Offer, PoseCorrection};
@@ -316,11 +316,6 @@ impl Mapper {
     /// The camera of a stored image.
     fn eye(&self, index: usize) -> &Eye {
         &self.eyes[self.store.camera(index)]
-    }
-
-    /// What the rendering of a new keyframe's rectified left view shows.
-    fn seen_from(&self, index: usize) -> &Image {
-        self.pair.as_ref().map_or_else(|| self.store.image(index), |pair| &pair.image)
     }
 
     /// Smaller as the steps a keyframe has had grow: large ones find the picture, small ones settle it.
