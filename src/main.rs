@@ -7,6 +7,7 @@ use stipple::bench;
 use stipple::config::Board;
 use stipple::daemon::{self, Pace};
 use stipple::mem::CountingAllocator;
+use stipple::output::OutputDir;
 use stipple_drivers::{Exit, Fault};
 
 #[global_allocator]
@@ -172,16 +173,24 @@ enum Bench {
     },
     /// Disparity of every method against truth: Middlebury, simulated flights, hard cases, time
     Stereo {
+        /// Recording of which each method makes a map, too
+        dataset: Option<PathBuf>,
         #[arg(long, value_name = "DIR")]
         out: PathBuf,
         /// Folder of recordings; otherwise $STIPPLE_RECORDINGS, otherwise ../shared/data
         #[arg(long, value_name = "FOLDER")]
         recordings: Option<PathBuf>,
-        /// Board file whose [stereo] and [gpu] to use; the methods' own defaults without it
+        /// Board file whose [stereo] and [gpu] to use, and of the map the rest; the methods' own defaults without it
         #[arg(long, value_name = "FILE")]
         board: Option<PathBuf>,
+        /// Of the map: skip odometry, as for replay
+        #[arg(long, value_name = "CSV", requires = "dataset")]
+        poses: Option<PathBuf>,
+        /// Of mapping, with each method
+        #[arg(long, value_name = "S", value_parser = seconds, requires = "dataset")]
+        seconds: Option<f64>,
         /// Override a key of the board file
-        #[arg(long = "set", value_name = "SECTION.KEY=VALUE", requires = "board")]
+        #[arg(long = "set", value_name = "SECTION.KEY=VALUE")]
         set: Vec<String>,
         /// Two hard cases
         #[arg(long)]
@@ -234,9 +243,13 @@ fn run(command: Command) -> Result<(), Fault> {
             let column = column.and_then(|n| n.parse().ok());
             bench::kernels::kernels(&bench::kernels::Options { device, recording, quick, baseline, column }, &out)
         }
-        Command::Bench { what: Bench::Stereo { out, recordings, board, set, quick } } => {
-            let board = board.map(|path| Board::load(&path, &set)).transpose()?;
-            bench::stereo::stereo(&bench::stereo::Options { recordings, board, quick }, &out)
+        Command::Bench { what: Bench::Stereo { dataset, out, recordings, board, poses, seconds, set, quick } } => {
+            let loaded = board.as_deref().map(|path| Board::load(path, &set)).transpose()?;
+            let options = bench::stereo::Options { recordings, board: loaded, quick, seconds };
+            let maps = dataset.is_some();
+            let what = daemon::Benched { dataset, board, poses, set };
+            let run = |job: &bench::map::Job, dir: &OutputDir| daemon::benched(&what, job, dir);
+            bench::stereo::stereo(&options, &out, maps.then_some(&run as bench::stereo::MapRun))
         }
         Command::Bench { what: Bench::Stability { out, seeds } } => bench::stability::stability(seeds, &out),
     }

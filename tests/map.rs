@@ -504,3 +504,17 @@ fn v1_01_quality() {
         }
     }
 }
+
+/// A covered eye gives no depth: the keyframe is kept to train on, no anchor is made of it, and it is counted.
+#[test]
+fn a_black_eye_makes_no_anchor_and_is_counted() {
+    let (calibration, mut keyframes) = flight(2);
+    keyframes[0].images[1].pixels.fill(0);
+    let mut mapper = open(&calibration, &board(&[]));
+    mapper.offer(&keyframes[0]);
+    assert_eq!(mapper.step(Instant::now()).unwrap().did, Did::Stored);
+    assert_eq!((mapper.counters().depth_absent.get(), mapper.splat_count()), (1, 0));
+    mapper.offer(&keyframes[1]);
+    assert!(matches!(mapper.step(Instant::now()).unwrap().did, Did::Anchor { seeded } if seeded > 0));
+    assert_eq!(mapper.counters().depth_absent.get(), 1);
+}

@@ -1,9 +1,10 @@
 //! `stipple bench stereo`: every method of disparity on pairs whose truth is known.
 //!
 //! Sets are Middlebury's cones and teddy, simulated flights (also by range of depth), pairs for time alone, and
-//! the hard cases. `score` states the protocol. Leaves `stereo.json` (a list, a row a set and method),
-//! `stereo.html` and `pictures/`.
+//! the hard cases. `score` states the protocol. Given a recording, each method also makes a map of it (`effect`).
+//! Leaves `stereo.json` (a list, a row a set and method), `stereo.html`, `pictures/`, and of maps `stereo-map.json`.
 
+pub mod effect;
 mod methods;
 mod page;
 mod pictures;
@@ -12,11 +13,14 @@ pub mod score;
 pub mod sets;
 
 use super::inputs;
+use super::map::Job;
 use crate::config::Board;
 use crate::output::metrics::percentile;
 use crate::output::panel::Picture;
+use crate::output::report::Report;
 use crate::output::{atomically, OutputDir};
 use crate::stereo::Disparity;
+use effect::Effect;
 pub use methods::{Base, Runner, NAMES};
 use score::Score;
 use serde_json::{json, Value};
@@ -44,7 +48,12 @@ pub struct Options {
     pub board: Option<Board>,
     /// Two hard cases.
     pub quick: bool,
+    /// Of mapping, with each method.
+    pub seconds: Option<f64>,
 }
+
+/// Of mapping when not stated, s.
+const MAPPING_S: f64 = 60.0;
 
 /// A method on a set.
 pub struct Row {
@@ -67,16 +76,24 @@ pub struct Bench {
     pub pictures: Vec<(String, Picture)>,
     /// Methods that are not to be had here, and why.
     pub left_out: Vec<(&'static str, String)>,
+    pub maps: Vec<Effect>,
 }
 
-/// `stipple bench stereo`
-pub fn stereo(options: &Options, out: &Path) -> Result<(), Fault> {
+/// Maps a recording, as `bench map` does.
+pub type MapRun<'a> = &'a dyn Fn(&Job, &OutputDir) -> Result<Report, Fault>;
+
+/// `stipple bench stereo`; `map` is there when maps are to be made.
+pub fn stereo(options: &Options, out: &Path, map: Option<MapRun>) -> Result<(), Fault> {
     let out = OutputDir::create(out)?;
     let sets = match options.quick {
         true => scenes::hard().into_iter().filter(|s| QUICK.contains(&s.name.as_str())).collect(),
         false => all_sets(options.recordings.as_deref())?,
     };
-    let bench = measure(&sets, &Base::of(options.board.as_ref()))?;
+    let mut bench = measure(&sets, &Base::of(options.board.as_ref()))?;
+    if let Some(run) = map {
+        bench.maps = effect::map(options.seconds.unwrap_or(MAPPING_S), &out, run)?;
+        out.write("stereo-map.json", |w| effect::write_json(w, &bench.maps))?;
+    }
     out.replace_folder("pictures", |dir| {
         bench.pictures.iter().try_for_each(|(name, p)| atomically(&dir.join(format!("{name}.png")), |w| p.write_png(w)))
     })?;

@@ -1,6 +1,7 @@
 //! `stereo.html`: tables, charts and pictures of every set, in one file that needs nothing else.
 
 use super::super::page::{foot, head, section, table};
+use super::effect::{Effect, AT_S};
 use super::{Bench, Row, NAMES, RANGES_M};
 use crate::output::chart::{bars, escape, Chart, Series};
 use crate::output::html::figure;
@@ -36,6 +37,10 @@ pub fn write(out: &mut impl Write, bench: &Bench) -> io::Result<()> {
         by_range(bench, "Errors above 1 px by range", "share", |r| r.score.visible.bad1()),
     ];
     section(out, "Simulated flights", &range)?;
+    if !bench.maps.is_empty() {
+        section(out, "Effect on the map", &[map_curves(bench)])?;
+        out.write_all(maps(bench).as_bytes())?;
+    }
     let charts: Vec<_> = of("time").iter().map(|set| times(bench, set)).collect();
     section(out, "Time", &charts)?;
     for set in &names {
@@ -82,6 +87,36 @@ fn by_range(bench: &Bench, title: &str, y: &str, get: fn(&Row) -> Option<f64>) -
         points: line(name),
     });
     Chart { title, x: "depth, m", y, series: series.collect(), from_zero: true, ..Chart::default() }.svg()
+}
+
+fn map_curves(bench: &Bench) -> Option<String> {
+    let series = bench.maps.iter().zip([4u8, 2, 1]).map(|(e, ink)| {
+        let points = e.report.curve.iter().filter_map(|c| Some((c.t_s, c.psnr_db?))).collect();
+        Series { name: e.method, ink, dots: true, points }
+    });
+    let title = "Training PSNR of a probe against mapping time, by method of depth";
+    Chart { title, x: "mapping, s", y: "PSNR, dB", series: series.collect(), ..Chart::default() }.svg()
+}
+
+fn maps(bench: &Bench) -> String {
+    let head =
+        ["method", "at 10 s, dB", "at 30 s, dB", "at the end, dB", "held out, dB", "SSIM", "anchors", "Gaussians"];
+    let number = |v: Option<f64>, digits: usize| v.map_or("\u{2013}".into(), |v| format!("{v:.digits$}"));
+    let cells = |e: &Effect| {
+        let r = &e.report;
+        vec![
+            e.method.to_string(),
+            number(e.psnr_at(AT_S[0]), 2),
+            number(e.psnr_at(AT_S[1]), 2),
+            number(r.psnr_db, 2),
+            number(r.psnr_heldout_db, 2),
+            number(r.ssim, 3),
+            r.anchors.unwrap_or(0).to_string(),
+            r.splats.unwrap_or(0).to_string(),
+        ]
+    };
+    let marked: Vec<_> = bench.maps.iter().map(|e| (e.method == "sgm_wls", cells(e))).collect();
+    table("The map by method of depth", &head, &marked)
 }
 
 fn rows(bench: &Bench, set: &str, about: &str) -> String {
