@@ -3,7 +3,12 @@
 //! Up to `SLOTS` submissions are under way at once: while the device runs one, the host encodes the next, so that the
 //! device goes from one to the other without waiting for the host. Each command buffer begins with a barrier against
 //! all that was submitted before, so they run as if one after another; a fence each tells the host. A recording that
-//! takes long is cut into parts, each a submission. Command buffers, fences and queries are made once.
+//! takes long is cut into parts, each a submission.
+//!
+//! Command buffers, fences and queries are made once; what a command buffer holds is encoded anew for each part, since
+//! cameras, targets and rates are push constants. Kept encodings would gain nothing: to record, encode and submit a step
+//! takes 0.08 ms on the host of an NVIDIA H200, behind the 0.39 ms of the step before it, and a step of 0.23 ms has the
+//! same 0.02 ms from its end to the beginning of the next as one of 0.97 (`bench kernels`: wall less device).
 
 use super::device::{boot, Device};
 use super::kernel::Pipelines;

@@ -68,7 +68,12 @@ struct Case {
     /// On the device and on the clock, no command timed.
     device_ms: f64,
     wall_ms: f64,
+    /// On the host, to record, encode and submit, while the step before runs.
+    host_ms: f64,
     arena_bytes: u64,
+    /// Gaussians listed for a tile that has any, and for the one that has most.
+    list_mean: f64,
+    list_longest: u32,
     kernels: Vec<Cost>,
 }
 
@@ -164,10 +169,12 @@ fn measure(config: &GpuConfig, scene: &Scene, tiling: Tiling, peaks: &Peaks, qui
     let timings: Vec<_> = gpu.timings().to_vec();
     gpu.time_commands(0);
     // As the mapper trains: a step is started before the one before it is finished.
-    let (start, mut device_ms) = (Instant::now(), 0.0);
+    let (start, mut device_ms, mut host_ms) = (Instant::now(), 0.0, 0.0);
     let mut under_way = None;
     for i in 0..=steps {
+        let begun = Instant::now();
         let next = (i < steps).then(|| p.start(&mut gpu, &scene.view, 0, &RATES, &Weights::default())).transpose()?;
+        host_ms += begun.elapsed().as_secs_f64() * 1e3;
         if let Some(step) = std::mem::replace(&mut under_way, next) {
             last = p.finish(&mut gpu, &step)?;
             device_ms += gpu.last_submit_ms();
@@ -193,23 +200,39 @@ fn measure(config: &GpuConfig, scene: &Scene, tiling: Tiling, peaks: &Peaks, qui
         })
         .collect();
     kernels.sort_by(|a, b| b.ms.total_cmp(&a.ms));
+    let (list_mean, list_longest) = lists(&mut gpu, &p)?;
     let case = Case {
         name: scene.name.clone(),
         counts,
         timed_ms: timed_ms * per,
         device_ms: device_ms * per,
         wall_ms: wall_ms * per,
+        host_ms: host_ms * per,
         arena_bytes: gpu.arena_used(),
+        list_mean,
+        list_longest,
         kernels,
     };
     eprintln!(
-        "{:<32} {:>8} intersections: {:.3} ms of device a step, {:.1} steps/s",
+        "{:<32} {:>8} intersections, {:.0} to {} a tile: {:.3} ms of device a step, {:.1} steps/s",
         case.name,
         last.stats.intersections,
+        case.list_mean,
+        case.list_longest,
         case.device_ms,
         case.steps_per_s()
     );
     Ok(case)
+}
+
+/// Mean and largest length of the lists of tiles, of those that have one.
+fn lists(gpu: &mut Gpu, p: &Pipeline) -> Result<(f64, u32), Fault> {
+    let ranges = p.buffers().ranges;
+    let mut all = vec![[0u32; 2]; ranges.len()];
+    gpu.download(ranges, 0, &mut all).map_err(Fault::from)?;
+    let lengths: Vec<u32> = all.iter().map(|[from, to]| to - from).filter(|n| *n > 0).collect();
+    let sum: f64 = lengths.iter().map(|n| f64::from(*n)).sum();
+    Ok((sum / lengths.len().max(1) as f64, lengths.into_iter().max().unwrap_or(0)))
 }
 
 impl Case {

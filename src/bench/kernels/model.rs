@@ -108,6 +108,8 @@ impl Counts {
             "ssim_columns" => (33.0 * p, 150.0 * p),
             "loss_rows" => (24.0 * p, 66.0 * p),
             "loss_columns" => (22.0 * p, 80.0 * p),
+            // Where all Gaussians are small.
+            "sum_chunks" => (0.5 * i, 0.0),
             "project_backward" => (32.0 * i + (8.0 + 2.0 * 148.0) * v, 600.0 * v + 8.0 * i),
             _ => (0.0, 0.0),
         }

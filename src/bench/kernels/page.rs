@@ -40,8 +40,9 @@ pub fn json(out: &mut impl Write, bench: &Bench) -> io::Result<()> {
         json!({
             "name": c.name, "splats": c.counts.splats, "visible": c.counts.visible,
             "intersections": c.counts.intersections, "pixels": c.counts.pixels,
-            "device_ms_commands_timed": c.timed_ms, "device_ms": c.device_ms, "wall_ms": c.wall_ms,
+            "device_ms_commands_timed": c.timed_ms, "device_ms": c.device_ms, "wall_ms": c.wall_ms, "host_ms": c.host_ms,
             "steps_per_s": c.steps_per_s(), "gpu_bytes": c.arena_bytes,
+            "list_mean": c.list_mean, "list_longest": c.list_longest,
             "kernels": c.kernels.iter().map(kernel).collect::<Vec<Value>>(),
         })
     };
