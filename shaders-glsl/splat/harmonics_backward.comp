@@ -14,6 +14,7 @@ layout(constant_id = 7) const bool LEARN = true;
 #include "../common/worth.glsl"
 #include "../common/harmonics.glsl"
 #include "../common/index.glsl"
+#include "../common/chunks.glsl"
 
 layout(push_constant) uniform Push {
     vec4 eye;  // world, m
@@ -56,7 +57,7 @@ void main() {
     }
     const uint begin = tile_offsets[rank], end = min(tile_offsets[rank + 1], push.capacity);
     float v[3] = float[3](0.0, 0.0, 0.0);
-    for (uint i = begin; i < end; ++i) {
+    for (uint i = begin; i < end; i += slots_at(i, end)) {
         v[0] += isect_gradients[3 * i + 1].z;
         if (CHANNELS == 3) {
             const vec2 tint = isect_gradients[3 * i + 2].xy;

@@ -1,6 +1,7 @@
 // Sums each visible Gaussian's intersection gradients in fixed order, carries them back to its parameters
 // and to the camera pose, adds the regularisers, and takes one Adam step: one thread a rank.
-// in   visible_count, slots (by depth), tile_offsets, isect_gradients (slots of raster_backward)
+// in   visible_count, slots (by depth), tile_offsets, isect_gradients (slots of raster_backward, chunks
+//      summed by sum_chunks)
 // out  splats, moments, steps (count and importance of this Gaussian, see worth.glsl); sums[8 group + ..]: gradient by a small
 //      translation (3) and rotation (3) of the camera frame applied to points, count of refused gradients, 0
 // A step whose gradient is not finite is not taken, and counted. Without LEARN no step is taken and the map
@@ -18,6 +19,7 @@ layout(constant_id = 7) const bool LEARN = true;
 #include "../common/backward.glsl"
 #include "../common/index.glsl"
 #include "../common/worth.glsl"
+#include "../common/chunks.glsl"
 
 layout(push_constant) uniform Push {
     Camera camera;
@@ -79,10 +81,12 @@ float[7] update(uint rank) {
     vec4 v0 = vec4(0.0), v1 = vec4(0.0);
     // Visibility x opacity x gradient, tile by tile: to first order, what the loss would change without it.
     float worth = 0.0;
-    for (uint i = begin; i < end; ++i) {
+    for (uint i = begin, n; i < end; i += n) {
+        n = slots_at(i, end);
+        const vec4 second = isect_gradients[SLOT_QUADS * i + 1];
         v0 += isect_gradients[SLOT_QUADS * i];
-        v1 += isect_gradients[SLOT_QUADS * i + 1];
-        worth += abs(isect_gradients[SLOT_QUADS * i + 1].y);
+        v1 += second;
+        worth += n == 1 ? abs(second[WORTH - 4]) : isect_gradients[SLOT_QUADS * (i + 1)].x;
     }
     if (begin >= end) {
         return pose;

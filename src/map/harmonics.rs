@@ -44,13 +44,13 @@ impl Harmonics {
         f
     }
 
-    pub fn new(gpu: &mut Gpu, shape: &Shape) -> Result<Harmonics, Fault> {
+    pub fn new(gpu: &mut Gpu, shape: &Shape, chunk: u32) -> Result<Harmonics, Fault> {
         let (channels, degree) = (shape.channels, shape.sh_degree);
         let n = shape.splats as usize * shape.colour_extra();
         Ok(Harmonics {
             colours: gpu.kernel(harmonics::Spec { channels, degree })?,
-            backward: gpu.kernel(harmonics_backward::Spec { channels, degree, learn: true })?,
-            backward_still: gpu.kernel(harmonics_backward::Spec { channels, degree, learn: false })?,
+            backward: gpu.kernel(harmonics_backward::Spec { channels, degree, learn: true, chunk })?,
+            backward_still: gpu.kernel(harmonics_backward::Spec { channels, degree, learn: false, chunk })?,
             insert: gpu.kernel(harmonics_insert::Spec { channels, degree })?,
             turn: (degree > 0).then(|| gpu.kernel(harmonics_turn::Spec { channels, degree })).transpose()?,
             coefficients: gpu.alloc("splats: colour beyond the first level", n)?,

@@ -5,7 +5,7 @@
 //! project -> sort by depth                               Gaussians -> visible, front to back
 //! count_tiles -> scan -> emit_tiles -> sort by tile -> tile_ranges -> raster_forward
 //! ssim_rows -> ssim_columns -> loss_rows -> loss_columns (-> loss_depth)  picture -> gradient by pixel
-//! raster_backward -> project_backward (Adam) -> summary   -> gradient by intersection -> Gaussian
+//! raster_backward -> sum_chunks -> project_backward (Adam) -> summary   gradient by intersection -> Gaussian
 //! ```
 //!
 //! Counts stay on the GPU: every dispatch is sized by capacity and ends early. A submission ends by bringing
@@ -58,6 +58,8 @@ pub(super) struct Kernels {
     loss_columns: Kernel<loss_columns::K>,
     /// The same, with the gradient by the exposure.
     loss_columns_exposure: Kernel<loss_columns::K>,
+    /// Where it pays.
+    sum_chunks: Option<Kernel<sum_chunks::K>>,
     project_backward: ByLens<project_backward::K>,
     /// The same, leaving the map as it is.
     project_backward_still: ByLens<project_backward::K>,
@@ -129,7 +131,7 @@ impl Pipeline {
 
     /// As `new`, with the raster chosen.
     pub fn with_tiling(gpu: &mut Gpu, shape: Shape, tiling: Tiling) -> Result<Pipeline, Fault> {
-        let Tiling { lanes, column, variant } = tiling;
+        let Tiling { lanes, column, variant, .. } = tiling;
         if shape.width == 0
             || shape.height == 0
             || shape.splats == 0
@@ -166,8 +168,11 @@ impl Pipeline {
             loss_rows: plain::<loss_rows::K>(gpu)?,
             loss_columns: plain::<loss_columns::K>(gpu)?,
             loss_columns_exposure: gpu.kernel::<loss_columns::K>(loss_columns::Spec { exposure: true })?,
-            project_backward: project_backward_of(gpu, &shape, true)?,
-            project_backward_still: project_backward_of(gpu, &shape, false)?,
+            sum_chunks: (tiling.chunk > 1)
+                .then(|| gpu.kernel(sum_chunks::Spec { channels, degree: shape.sh_degree, chunk: tiling.chunk }))
+                .transpose()?,
+            project_backward: project_backward_of(gpu, &shape, tiling, true)?,
+            project_backward_still: project_backward_of(gpu, &shape, tiling, false)?,
             summary: plain::<summary::K>(gpu)?,
             insert: plain::<insert::K>(gpu)?,
             prune: plain::<prune::K>(gpu)?,
@@ -180,7 +185,7 @@ impl Pipeline {
             tiling,
             k,
             b: Buffers::new(gpu, &shape)?,
-            harmonics: (shape.colour_extra() > 0).then(|| Harmonics::new(gpu, &shape)).transpose()?,
+            harmonics: (shape.colour_extra() > 0).then(|| Harmonics::new(gpu, &shape, tiling.chunk)).transpose()?,
             scan: Scan::new(gpu)?,
             sorter: Sorter::new(gpu)?,
             high_water: 0,
@@ -443,6 +448,14 @@ impl Pipeline {
             raster_backward::Push { size },
             Threads::d1((self.tiles(view) + 1) * self.tiling.lanes),
         );
+        if let Some(sum_chunks) = &k.sum_chunks {
+            let slots = sum_chunks::Bind {
+                isect_count: b.isect_count.read(),
+                owners: b.owners.read(),
+                isect_gradients: b.over.isect_gradients.read_write(),
+            };
+            rec.dispatch_indirect(sum_chunks, slots, (), b.isect_count, 2);
+        }
         if let Some(h) = &self.harmonics {
             h.record_update(rec, b, view, self.high_water, rates);
         }
@@ -499,7 +512,7 @@ impl Pipeline {
 
 impl Raster {
     fn new(gpu: &mut Gpu, tiling: Tiling, depth: u32, shape: &Shape) -> Result<Raster, Fault> {
-        let Tiling { lanes, column, variant } = tiling;
+        let Tiling { lanes, column, variant, .. } = tiling;
         let (channels, degree) = (shape.channels, shape.sh_degree);
         Ok(Raster {
             forward: gpu.kernel_variant(raster_forward::Spec { lanes, column, depth, channels }, variant)?,
@@ -508,9 +521,14 @@ impl Raster {
     }
 }
 
-fn project_backward_of(gpu: &mut Gpu, shape: &Shape, learn: bool) -> Result<ByLens<project_backward::K>, Fault> {
+fn project_backward_of(
+    gpu: &mut Gpu,
+    shape: &Shape,
+    tiling: Tiling,
+    learn: bool,
+) -> Result<ByLens<project_backward::K>, Fault> {
     let (channels, degree) = (shape.channels, shape.sh_degree);
-    let mut of = |fisheye| gpu.kernel(project_backward::Spec { channels, degree, fisheye, learn });
+    let mut of = |fisheye| gpu.kernel(project_backward::Spec { channels, degree, chunk: tiling.chunk, fisheye, learn });
     Ok(ByLens { pinhole: of(false)?, fisheye: of(true)? })
 }
 

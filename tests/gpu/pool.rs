@@ -1,12 +1,13 @@
 //! The pool's kernels against their twins, and what must hold of blocks: order, rigid moves, who is removed.
 
 use super::splat::{open, render, scene, shape, target, train, view, Rng};
+use super::twins::chunks;
 use super::twins::pool::{self, Moved};
 use glam::{DQuat, DVec3, DVec4, Vec4};
 use stipple::gpu::kernels::types::{Moments, Splat};
 use stipple::gpu::{Gpu, GpuOptions};
 use stipple::map::blocks::importance_of_bin;
-use stipple::map::pipeline::{Pipeline, PruneRule, SplatInit, View};
+use stipple::map::pipeline::{Pipeline, PruneRule, SplatInit, Tiling, View};
 use stipple_drivers::Pose;
 
 const KEEP_ALL: PruneRule = PruneRule { opacity_min: 1e-9, scale_max_m: 1e3, importance_min: 0.0, steps_min: 0 };
@@ -109,7 +110,7 @@ fn importance_is_the_mean_of_what_the_opacity_gradient_says() {
         for r in 0..seen[0] as usize {
             let tiles = offsets[r] as usize..offsets[r + 1] as usize;
             if !tiles.is_empty() {
-                let worth = tiles.map(|i| f64::from(gradients[8 * i + 5].abs())).sum();
+                let worth = chunks::worth(&gradients, 8, tiles, Tiling::of(gpu.caps()).chunk as usize);
                 let state = &mut expected[ranks[r] as usize];
                 *state = pool::after_step(*state, worth);
             }

@@ -93,7 +93,7 @@ impl Rig {
 
     /// What was rendered, and the gradient by each Gaussian in the words of its slot.
     fn run(&mut self, splats: &[Flat], v: &Planes, channels: u32, depth: u32) -> (Vec<f32>, Vec<Vec<f64>>) {
-        let (Tiling { lanes, column, variant }, tiles, n) = (self.tiling, self.tiles(), splats.len() as u32);
+        let (Tiling { lanes, column, variant, .. }, tiles, n) = (self.tiling, self.tiles(), splats.len() as u32);
         let slot_words = if channels == 3 { 12 } else { 8 };
         let records: Vec<Projected> = splats
             .iter()

@@ -1,8 +1,11 @@
-//! What makes steps fast must not show in the map: steps started ahead.
+//! What makes steps fast must not show in the map: steps started ahead, sums in chunks.
 
-use super::splat::{open, scene, shape, target, train, view, FAST};
+use super::splat::{open, scene, shape, target, train, view, Rng, FAST};
+use super::twins::chunks;
+use stipple::gpu::kernels::{sum_chunks, types::Moments};
 use stipple::gpu::{Gpu, GpuOptions};
-use stipple::map::pipeline::{Pipeline, Rendered, SplatInit, StepStats, Weights};
+use stipple::map::pipeline::{Pipeline, Rendered, Shape, SplatInit, StepStats, Tiling, Weights};
+use stipple::map::tiling::CHUNK_GPU;
 
 /// The map, to the bit.
 fn map(gpu: &mut Gpu, p: &mut Pipeline) -> Vec<u32> {
@@ -45,4 +48,93 @@ fn steps_started_ahead_leave_the_same_map_and_answers_to_the_bit() {
     assert_eq!(answers, ahead);
     assert!(waited_for == map(&mut gpu, &mut p));
     assert_eq!(gpu.validation_messages(), Vec::<String>::new());
+}
+
+#[test]
+fn sums_of_chunks_equal_their_twin_and_nothing_else_changes() {
+    const CAPACITY: usize = 3000;
+    let mut r = Rng(5);
+    // Runs from one slot to hundreds, as a near wall and far clutter have them.
+    let mut owners: Vec<u32> = Vec::new();
+    for owner in 0.. {
+        let run = 10f64.powf(r.uniform(0.0, 2.5)) as usize;
+        owners.extend(std::iter::repeat_n(owner, run));
+        if owners.len() >= CAPACITY {
+            break;
+        }
+    }
+    owners.truncate(CAPACITY);
+    for (channels, degree, words) in [(1, 0, 8), (3, 0, 12), (1, 2, 12)] {
+        for count in [0, 15, 16, 2048, CAPACITY - 7] {
+            let before: Vec<f32> = (0..CAPACITY * words).map(|_| r.uniform(-1.0, 1.5) as f32).collect();
+            let mut gpu = Gpu::open(&crate::config(), 1 << 20).unwrap();
+            let groups = (count as u32).div_ceil(64);
+            let isect_count = gpu.alloc::<u32>("count", 5).unwrap();
+            gpu.upload(isect_count, 0, &[count as u32, count as u32, groups, 1, 1]).unwrap();
+            let on_gpu = gpu.alloc::<u32>("owners", CAPACITY).unwrap();
+            gpu.upload(on_gpu, 0, &owners).unwrap();
+            let slots = gpu.alloc::<f32>("slots", before.len()).unwrap();
+            gpu.upload(slots, 0, &before).unwrap();
+            let k = gpu.kernel::<sum_chunks::K>(sum_chunks::Spec { channels, degree, chunk: CHUNK_GPU }).unwrap();
+            let mut rec = gpu.record();
+            let bind = sum_chunks::Bind {
+                isect_count: isect_count.read(),
+                owners: on_gpu.read(),
+                isect_gradients: slots.read_write(),
+            };
+            rec.dispatch_indirect(&k, bind, (), isect_count, 2);
+            gpu.submit(rec).unwrap();
+            let mut got = before.clone();
+            gpu.download(slots, 0, &mut got).unwrap();
+
+            let mut wanted: Vec<f64> = before.iter().map(|v| f64::from(*v)).collect();
+            chunks::sum_chunks(&owners[..count], &mut wanted, words);
+            let (mut summed, mut kept) = (0, 0);
+            for ((got, wanted), before) in got.iter().zip(&wanted).zip(&before) {
+                if *wanted == f64::from(*before) {
+                    assert_eq!(got, before);
+                    kept += 1;
+                } else {
+                    assert!((f64::from(*got) - wanted).abs() < 1e-5, "{got} against {wanted}");
+                    summed += 1;
+                }
+            }
+            assert!(kept > 0 && (summed > 0) == (count > 500), "{summed} of {count}");
+        }
+    }
+}
+
+#[test]
+fn gradients_summed_in_chunks_are_those_summed_one_by_one() {
+    let v = view(65, 47);
+    for (channels, sh_degree) in [(1, 0), (3, 2)] {
+        let s = Shape { channels, sh_degree, ..shape(&v, 128, 1 << 14) };
+        let of = |chunk: u32| {
+            let mut gpu = Gpu::open(&crate::config(), Pipeline::arena_bytes(&s)).unwrap();
+            let tiling = Tiling { chunk, ..Tiling::of(gpu.caps()) };
+            let mut p = Pipeline::with_tiling(&mut gpu, s, tiling).unwrap();
+            let mut all = scene(128, &v, 9);
+            // So near that they cover every tile.
+            all.iter_mut().step_by(5).for_each(|s| s.log_scale = [0.3; 3]);
+            p.append(&mut gpu, &all).unwrap();
+            let picture = target(65, 47).repeat(channels as usize);
+            p.set_keyframe(&mut gpu, 0, &picture).unwrap();
+            let step = train(&mut gpu, &mut p, &v, 1)[0];
+            let mut moments = vec![Moments::default(); 128];
+            gpu.download(p.buffers().moments, 0, &mut moments).unwrap();
+            let mut states = vec![0u32; 128];
+            gpu.download(p.buffers().steps, 0, &mut states).unwrap();
+            let first: Vec<f32> = moments.iter().flat_map(|m| m.m.into_iter().flatten()).collect();
+            (step, first, states)
+        };
+        let ((one, a, states), (chunked, b, chunked_states)) = (of(1), of(CHUNK_GPU));
+        assert!(one.stats.intersections > 20 * CHUNK_GPU && one.stats == chunked.stats);
+        assert!((one.loss - chunked.loss).abs() == 0.0);
+        let most = a.iter().fold(0f32, |m, v| m.max(v.abs()));
+        let worst = a.iter().zip(&b).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+        assert!(most > 0.0 && worst < 1e-5 * most, "{worst} of {most}");
+        // Importance may round to the neighbour of 8 bits.
+        let near = |(a, b): (&u32, &u32)| (a & 0xffff) == (b & 0xffff) && (a >> 16).abs_diff(b >> 16) <= 1;
+        assert!(states.iter().zip(&chunked_states).all(near));
+    }
 }

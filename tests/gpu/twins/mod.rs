@@ -1,5 +1,6 @@
 //! f64 references of the kernels, by stage, for scenes of a few dozen Gaussians.
 
+pub mod chunks;
 pub mod dual;
 pub mod harmonics;
 pub mod loss;
