@@ -8,8 +8,8 @@
 //! raster_backward -> sum_chunks -> project_backward (Adam) -> summary   gradient by intersection -> Gaussian
 //! ```
 //!
-//! Counts stay on the GPU: every dispatch is sized by capacity and ends early. A submission ends by bringing
-//! 64 bytes to the host. While a step runs the next may be started (`start`, `finish`), so that the device need not
+//! Counts stay on the GPU: a dispatch over Gaussians is sized by those alive, never by the pool's capacity, and ends
+//! early past those visible; one over intersections is indirect. A submission ends by bringing 64 bytes to the host. While a step runs the next may be started (`start`, `finish`), so that the device need not
 //! wait for the host. Sums have one order, so that a step is the same in every run (3D Gaussian splatting:
 //! Kerbl et al. 2023; one gradient slot per intersection instead of atomics).
 
