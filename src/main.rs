@@ -81,6 +81,9 @@ enum Command {
         /// Cameras: mono, stereo, opposed, four
         #[arg(long, value_name = "NAME")]
         rig: Option<String>,
+        /// Images as RGB; grey otherwise
+        #[arg(long)]
+        colour: bool,
         #[command(flatten)]
         defects: daemon::Defects,
     },
@@ -222,8 +225,9 @@ fn run(command: Command) -> Result<(), Fault> {
             daemon::replay(&dataset, &board, &out, &set, &options)
         }
         Command::Demo { board, out, set } => daemon::demo(board.as_deref(), &out, &set),
-        Command::Sim { scenario, out, truth, imu, duration, seed, rig, defects } => {
-            daemon::simulate(&daemon::Simulate { scenario, truth, imu, duration_s: duration, seed, rig, defects }, &out)
+        Command::Sim { scenario, out, truth, imu, duration, seed, rig, colour, defects } => {
+            let options = daemon::Simulate { scenario, truth, imu, duration_s: duration, seed, rig, colour, defects };
+            daemon::simulate(&options, &out)
         }
         Command::Check { board, dataset, set } => {
             let board = board.map(|path| daemon::check(&path, &set)).transpose()?;

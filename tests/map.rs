@@ -44,7 +44,7 @@ fn flight(count: usize) -> (Calibration, Vec<Keyframe>) {
         sim.render(k * apart, &mut frames);
         let images = frames.images.clone();
         let world_from_body = sim.truth_at(frames.t).pose;
-        Keyframe { id: k as u64, t: frames.t, world_from_body, images, held_out: k % 4 == 3 }
+        Keyframe { id: k as u64, t: frames.t, world_from_body, images, colours: vec![], held_out: k % 4 == 3 }
     };
     let keyframes = (0..count).map(&mut keyframe).collect();
     (calibration, keyframes)
@@ -65,7 +65,14 @@ fn fisheye_flight(count: usize) -> (Calibration, Vec<Keyframe>, Vec<Vec<f32>>) {
         let frame = 40 + 10 * k;
         sim.render(frame, &mut frames);
         let (images, world_from_body) = (frames.images.clone(), sim.truth_at(frames.t).pose);
-        keyframes.push(Keyframe { id: k as u64, t: frames.t, world_from_body, images, held_out: false });
+        keyframes.push(Keyframe {
+            id: k as u64,
+            t: frames.t,
+            world_from_body,
+            images,
+            colours: vec![],
+            held_out: false,
+        });
         let mut depth = vec![0.0; 512 * 512];
         sim.depth(frame, 0, &mut depth);
         let along = |i: usize| {
@@ -336,7 +343,7 @@ fn play(mapper: &mut Mapper, recording: &Recording, keyframes: usize, steps: u32
         let Some(world_from_body) = pose_at(&recording.truth, frame.t, Span(50_000_000)) else { continue };
         reader.read(i, &mut frames).unwrap();
         let images = frames.images.clone();
-        mapper.offer(&Keyframe { id, t: frame.t, world_from_body, images, held_out: id % 8 == 7 });
+        mapper.offer(&Keyframe { id, t: frame.t, world_from_body, images, colours: vec![], held_out: id % 8 == 7 });
         id += 1;
         train(mapper, steps);
     }

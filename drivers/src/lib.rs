@@ -16,4 +16,4 @@ pub mod types;
 pub use calibration::{Calibration, ImuCalibration, ImuCorrection, RigCamera};
 pub use camera::{Camera, Lens};
 pub use fault::{Exit, Fault};
-pub use types::{Frames, Image, ImuSample, Nanos, Pose, Span, TimedPose};
+pub use types::{Colour, Frames, Image, ImuSample, Nanos, Pose, Span, TimedPose};

@@ -87,18 +87,36 @@ impl Image {
     }
 }
 
+/// Red, green and blue of an image.
+pub type Colour = [Image; 3];
+
+/// ITU-R BT.601, the weights of JPEG's own luma.
+pub fn luma(r: u8, g: u8, b: u8) -> u8 {
+    ((77 * u32::from(r) + 150 * u32::from(g) + 29 * u32::from(b) + 128) >> 8) as u8
+}
+
 /// Images of all cameras of a rig at one mid-exposure instant; `images[camera]`.
 #[derive(Clone, Debug, Default)]
 pub struct Frames {
     pub t: Nanos,
     pub images: Vec<Image>,
+    /// Of the first cameras, where colour is asked for; `images` are then their luma, which is all that tracking and
+    /// stereo read.
+    pub colours: Vec<Colour>,
 }
 
 impl Frames {
     /// Pre-shaped for a rig, so that reading into it allocates nothing.
     pub fn for_rig(calibration: &crate::Calibration) -> Frames {
         let shape = |c: &crate::RigCamera| Image::new(c.camera.width, c.camera.height);
-        Frames { t: Nanos(0), images: calibration.cameras.iter().map(shape).collect() }
+        Frames { t: Nanos(0), images: calibration.cameras.iter().map(shape).collect(), colours: Vec::new() }
+    }
+
+    /// The first `cameras` of the rig in colour too.
+    pub fn in_colour(calibration: &crate::Calibration, cameras: usize) -> Frames {
+        let mut frames = Frames::for_rig(calibration);
+        frames.colours = frames.images.iter().take(cameras).map(|i| std::array::from_fn(|_| i.clone())).collect();
+        frames
     }
 }
 

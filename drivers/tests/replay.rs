@@ -444,6 +444,46 @@ fn every_png_format_becomes_grey() {
 }
 
 #[test]
+fn colour_is_given_beside_the_same_grey() {
+    use png::{BitDepth::*, ColorType::*};
+    let rgb: Vec<u8> = grey().iter().flat_map(|g| [*g, 255 - *g, g.wrapping_mul(3)]).collect();
+    let f = Folder::new();
+    f.write(&format!("cam0/data/{T0}.png"), &png(Rgb, Eight, W, H, &rgb));
+    let r = f.open().unwrap();
+    let (mut plain, mut coloured) = (Frames::for_rig(&r.calibration), Frames::in_colour(&r.calibration, 2));
+    let mut reader = r.reader();
+    reader.read(0, &mut plain).unwrap();
+    reader.read(0, &mut coloured).unwrap();
+    assert_eq!(plain.images, coloured.images, "tracking sees the same");
+    for (c, plane) in coloured.colours[0].iter().enumerate() {
+        assert!(plane.pixels.iter().eq(rgb.iter().skip(c).step_by(3)), "channel {c}");
+    }
+    // A grey file's channels are equal.
+    coloured.colours[1].iter().for_each(|plane| assert_eq!(*plane, coloured.images[1]));
+    assert!(reader.has_colour(1) && !reader.has_colour(2) && reader.has_colour(0));
+}
+
+/// The left half of halves.jpg is (200, 80, 40), the right half (30, 90, 210).
+#[test]
+fn a_colour_jpeg_gives_its_colours_and_its_own_luma() {
+    let f = Folder::new();
+    f.write(&format!("cam0/data/{T0}.png"), include_bytes!("folder/halves.jpg"));
+    let r = f.open().unwrap();
+    let (mut plain, mut coloured) = (Frames::for_rig(&r.calibration), Frames::in_colour(&r.calibration, 1));
+    let mut reader = r.reader();
+    reader.read(0, &mut plain).unwrap();
+    reader.read(0, &mut coloured).unwrap();
+    assert_eq!(plain.images, coloured.images, "tracking sees the same");
+    for (c, plane) in coloured.colours[0].iter().enumerate() {
+        for i in 0..W * H {
+            let expected = if i % W < W / 2 { [200, 80, 40][c] } else { [30, 90, 210][c] };
+            assert!(plane.pixels[i].abs_diff(expected) < 6, "pixel {i}, channel {c}: {}", plane.pixels[i]);
+        }
+    }
+    assert!(reader.has_colour(1));
+}
+
+#[test]
 fn spoilt_images_are_counted_and_name_their_row() {
     let good = png(png::ColorType::Grayscale, png::BitDepth::Eight, W, H, &grey());
     let small = png(png::ColorType::Grayscale, png::BitDepth::Eight, W, H - 1, &grey()[W..]);

@@ -31,11 +31,20 @@ impl Source {
             Source::Rendered(frames) => {
                 let from = &frames[index];
                 out.t = from.t;
-                for (to, from) in out.images.iter_mut().zip(&from.images) {
+                let colours = out.colours.iter_mut().flatten().zip(from.colours.iter().flatten());
+                for (to, from) in out.images.iter_mut().zip(&from.images).chain(colours) {
                     to.copy_from(from);
                 }
                 Ok(())
             }
+        }
+    }
+
+    /// Whether the first `cameras` are in colour.
+    pub fn has_colour(&self, cameras: usize) -> bool {
+        match self {
+            Source::Recording(reader) => reader.has_colour(cameras),
+            Source::Rendered(frames) => frames.iter().all(|f| f.colours.len() >= cameras),
         }
     }
 
@@ -79,13 +88,18 @@ impl Input {
         })
     }
 
-    /// Renders every frame before the flight starts, so that rendering takes nothing from it.
-    pub fn rendered(scenario: &Scenario, mut progress: impl FnMut(usize, usize)) -> Result<Input, Fault> {
+    /// Renders every frame before the flight starts, so that rendering takes nothing from it; the first `colours` cameras in
+    /// colour.
+    pub fn rendered(
+        scenario: &Scenario,
+        colours: usize,
+        mut progress: impl FnMut(usize, usize),
+    ) -> Result<Input, Fault> {
         let mut sim = Sim::new(scenario)?;
         let count = sim.frame_count();
         let mut frames = Vec::with_capacity(count);
         for i in 0..count {
-            let mut f = Frames::for_rig(sim.calibration());
+            let mut f = Frames::in_colour(sim.calibration(), colours);
             sim.render(i, &mut f);
             frames.push(f);
             progress(i + 1, count);

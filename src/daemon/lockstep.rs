@@ -7,7 +7,7 @@
 //! frames that tracking gives back, in their order, while tracking goes on.
 
 use super::input::Input;
-use super::mapping::{KeyframeQueue, Mapping, SLICE};
+use super::mapping::{Mapping, SLICE};
 use super::pipeline::{Bell, Ends, Pipeline};
 use super::play::{drain, Keyframes, Play, Played};
 use super::progress::{Gauges, Progress};
@@ -31,11 +31,12 @@ pub fn lockstep(
 ) -> Played {
     let counters = Counters::default();
     let gauges = Gauges::default();
-    let queue = mapping.as_ref().map(|m| KeyframeQueue::new(&input.calibration, m.mapper.images()));
+    let queue = mapping.as_ref().map(|m| m.queue(&input.calibration));
+    let colours = mapping.as_ref().map_or(0, |m| m.mapper.colours_offered());
     let mut keyframes = Keyframes::new(options.holdout);
     let mut warnings = std::mem::take(&mut input.warnings);
     let total = input.frames_within(options.duration_s);
-    let mut slots: Vec<Box<Slot>> = (0..BATCH.min(total)).map(|_| Slot::for_rig(&input.calibration)).collect();
+    let mut slots: Vec<Box<Slot>> = (0..BATCH.min(total)).map(|_| Slot::for_rig(&input.calibration, colours)).collect();
     let (waiting, done) = (ArrayQueue::new(BATCH), ArrayQueue::new(BATCH));
     let (over, ended, bell, pipeline) =
         (AtomicBool::new(false), AtomicBool::new(false), Bell::default(), Pipeline::new());

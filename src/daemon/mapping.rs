@@ -9,7 +9,7 @@ use crate::stereo::Stereo;
 use crossbeam_queue::ArrayQueue;
 use std::sync::atomic::Ordering::Relaxed;
 use std::time::{Duration, Instant};
-use stipple_drivers::{host, Calibration, Exit, Fault, Frames, Image};
+use stipple_drivers::{host, Calibration, Fault, Frames, Image};
 
 /// Time handed to the mapper at once; between slices it looks at its queues.
 pub const SLICE: Duration = Duration::from_millis(50);
@@ -36,10 +36,6 @@ impl Mapping {
     /// Opens the device on a thread of low priority: the threads of a CPU device inherit it, so
     /// that odometry is served first.
     pub fn open(calibration: &Calibration, board: &Board) -> Result<Mapping, Fault> {
-        if board.map.colour {
-            let what = "true, but cameras and recordings are read as 8-bit grey, which odometry tracks";
-            return Err(Fault::new(Exit::Config, "map.colour", what, "set map.colour = false"));
-        }
         let build = || {
             host::lower_priority();
             let bytes = Mapper::footprint(calibration, board).gpu_total()
@@ -60,6 +56,11 @@ impl Mapping {
             period_s: board.map.curve_period_s,
             next_curve_s: board.map.curve_period_s,
         })
+    }
+
+    /// For the keyframes that the mapper wants.
+    pub fn queue(&self, calibration: &Calibration) -> KeyframeQueue {
+        KeyframeQueue::new(calibration, self.mapper.images(), self.mapper.colours_offered())
     }
 
     /// One slice of work. Answers false when there was nothing to do.
@@ -129,7 +130,8 @@ pub const KEYFRAME_SLOTS: usize = 8;
 const CORRECTION_SLOTS: usize = 64;
 
 impl KeyframeQueue {
-    pub fn new(calibration: &Calibration, images: usize) -> KeyframeQueue {
+    /// For keyframes of so many images, the first `colours` of them in colour.
+    pub fn new(calibration: &Calibration, images: usize, colours: usize) -> KeyframeQueue {
         let q = KeyframeQueue {
             spare: ArrayQueue::new(KEYFRAME_SLOTS),
             offered: ArrayQueue::new(KEYFRAME_SLOTS),
@@ -140,7 +142,9 @@ impl KeyframeQueue {
                 let c = &calibration.cameras[i].camera;
                 Image::new(c.width, c.height)
             };
-            let _ = q.spare.push(Box::new(Keyframe::with_images((0..images).map(shape).collect::<Vec<_>>())));
+            let colours = (0..colours).map(|i| std::array::from_fn(|_| shape(i))).collect();
+            let images = (0..images).map(shape).collect();
+            let _ = q.spare.push(Box::new(Keyframe { images, colours, ..Keyframe::default() }));
         }
         q
     }
@@ -149,7 +153,8 @@ impl KeyframeQueue {
     pub fn offer(&self, frames: &Frames, fill: impl FnOnce(&mut Keyframe)) -> bool {
         let Some(mut slot) = self.spare.pop() else { return false };
         slot.t = frames.t;
-        for (to, from) in slot.images.iter_mut().zip(&frames.images) {
+        let colours = slot.colours.iter_mut().flatten().zip(frames.colours.iter().flatten());
+        for (to, from) in slot.images.iter_mut().zip(&frames.images).chain(colours) {
             to.copy_from(from);
         }
         fill(&mut slot);

@@ -15,18 +15,25 @@ use stipple_drivers::{Calibration, Camera, Exit, Fault, ImuCalibration, Lens, Po
 /// Everything a run with this rig takes, without the operating system's and the drivers' own.
 pub fn footprint(calibration: &Calibration, board: &Board) -> Footprint {
     let pixels: usize = calibration.cameras.iter().map(|c| c.camera.width * c.camera.height).sum();
+    let coloured: usize = colours(calibration, board).iter().map(|c| 3 * c.camera.width * c.camera.height).sum();
     let mut f = Footprint::default();
-    f.host("queues: frames", frame_slots(board.frontend.threads) * (pixels + Slot::BYTES));
+    f.host("queues: frames", frame_slots(board.frontend.threads) * (pixels + coloured + Slot::BYTES));
     f.extend(Frontend::footprint(calibration, &board.frontend));
     f.extend(Vio::footprint());
     if board.map.enabled {
         let images = eyes::images(calibration.cameras.len(), &board.map);
         let keyframe: usize = calibration.cameras.iter().take(images).map(|c| c.camera.width * c.camera.height).sum();
-        f.host("queues: keyframes", KEYFRAME_SLOTS * keyframe);
+        f.host("queues: keyframes", KEYFRAME_SLOTS * (keyframe + coloured));
         f.extend(Stereo::footprint(calibration, &board.stereo, board.map.scale));
         f.extend(Mapper::footprint(calibration, board));
     }
     f
+}
+
+/// The cameras that are read in colour.
+pub fn colours<'a>(calibration: &'a Calibration, board: &Board) -> &'a [RigCamera] {
+    let n = if board.map.enabled { eyes::colours(calibration.cameras.len(), &board.map) } else { 0 };
+    &calibration.cameras[..n]
 }
 
 /// The largest rig a board accepts: its widest image from a stereo pair, or from every camera its map trains on.

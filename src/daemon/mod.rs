@@ -39,7 +39,7 @@ use mapping::Mapping;
 use play::{play, Play};
 use std::path::{Path, PathBuf};
 use stipple_drivers::replay::read_trajectory;
-use stipple_drivers::sim::{rig_named, write_euroc, Scenario, Sim, RIGS};
+use stipple_drivers::sim::{rig_named, write_euroc, write_euroc_colour, Scenario, Sim, RIGS};
 use stipple_drivers::{Exit, Fault, Span};
 use tracking::{OdometryRun, Tracking};
 
@@ -78,7 +78,7 @@ pub fn demo(board: Option<&Path>, out: &Path, set: &[String]) -> Result<(), Faul
     };
     let out = OutputDir::create(out)?;
     let scenario = Scenario::named("demo").expect("the demo's scenario is compiled in");
-    let input = Input::rendered(&scenario, rendering_progress)?;
+    let input = Input::rendered(&scenario, memory::colours(&scenario.calibration, &board).len(), rendering_progress)?;
     let options = Replay {
         pace: Pace::Recorded,
         poses: None,
@@ -117,7 +117,8 @@ pub fn benched(what: &Benched, job: &Job, out: &OutputDir) -> Result<Report, Fau
             if job.quick {
                 scenario.duration = scenario.duration.min(Span::from_secs(QUICK_FLIGHT_S));
             }
-            (Input::rendered(&scenario, |_, _| {})?, "the simulated flight".into())
+            let colours = memory::colours(&scenario.calibration, &board).len();
+            (Input::rendered(&scenario, colours, |_, _| {})?, "the simulated flight".into())
         }
     };
     let (poses, mapping_s) = (what.poses.clone(), Some(job.seconds));
@@ -133,6 +134,11 @@ fn rendering_progress(done: usize, of: usize) {
 
 fn run(mut input: Input, place: &str, board: &Board, out: &OutputDir, options: &Replay) -> Result<Report, Fault> {
     memory::admit(place, &input.calibration, board)?;
+    let colours = memory::colours(&input.calibration, board).len();
+    if !input.source.has_colour(colours) {
+        let what = format!("map.colour = true, but the images of {place} are grey");
+        return Err(Fault::new(Exit::Config, "map.colour", what, "set map.colour = false"));
+    }
     let frames = input.frames_within(options.duration_s);
     let tracking = match &options.poses {
         Some(path) => Tracking::Table(read_trajectory(path)?),
@@ -178,6 +184,7 @@ pub struct Simulate {
     pub duration_s: Option<f64>,
     pub seed: Option<u64>,
     pub rig: Option<String>,
+    pub colour: bool,
     pub defects: Defects,
 }
 
@@ -252,7 +259,8 @@ pub fn simulate(options: &Simulate, out: &Path) -> Result<(), Fault> {
     }
     options.defects.spoil(&mut scenario)?;
     let mut sim = Sim::new(&scenario)?;
-    write_euroc(&mut sim, out, rendering_progress)?;
+    let write = if options.colour { write_euroc_colour } else { write_euroc };
+    write(&mut sim, out, rendering_progress)?;
     println!("{}", out.display());
     Ok(())
 }

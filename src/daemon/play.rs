@@ -169,12 +169,13 @@ fn recorded(
     progress: &mut Progress,
 ) -> Played {
     let slots = frame_slots(tracking.threads());
+    let colours = mapping.as_ref().map_or(0, |m| m.mapper.colours_offered());
     let shared = Shared {
         start: Instant::now(),
         spare: ArrayQueue::new(slots),
         newest: ArrayQueue::new(1),
         imu: ArrayQueue::new(IMU_SLOTS),
-        keyframes: mapping.as_ref().map(|m| KeyframeQueue::new(&input.calibration, m.mapper.images())),
+        keyframes: mapping.as_ref().map(|m| m.queue(&input.calibration)),
         counters: Counters::default(),
         gauges: Gauges::default(),
         source_done: AtomicBool::new(false),
@@ -182,7 +183,7 @@ fn recorded(
         mapping_done: AtomicBool::new(mapping.is_none()),
     };
     for _ in 0..slots {
-        let _ = shared.spare.push(Slot::for_rig(&input.calibration));
+        let _ = shared.spare.push(Slot::for_rig(&input.calibration, colours));
     }
     let total = input.frames_within(options.duration_s);
     let Input { imu, stamps, mut source, warnings, .. } = input;

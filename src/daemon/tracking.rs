@@ -44,9 +44,10 @@ pub struct Slot {
 }
 
 impl Slot {
-    pub fn for_rig(calibration: &Calibration) -> Box<Slot> {
+    /// The first `colours` cameras in colour.
+    pub fn for_rig(calibration: &Calibration, colours: usize) -> Box<Slot> {
         Box::new(Slot {
-            frames: Frames::for_rig(calibration),
+            frames: Frames::in_colour(calibration, colours),
             imu: List::default(),
             tracks: Tracks::default(),
             tracked: None,

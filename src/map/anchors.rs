@@ -7,9 +7,11 @@
 //! preferred; such seeds start large and faint so that others overrule them.
 
 use super::occupancy::{HELD, UNKNOWN};
+use super::pipeline::{Pipeline, SplatInit};
 use super::schedule::Rng;
 use super::view::{Exposure, View};
 use crate::counters::Counters;
+use crate::gpu::{Gpu, GpuError};
 use crate::mem::Footprint;
 use crate::stereo::DepthMap;
 use glam::DVec3;
@@ -22,8 +24,8 @@ pub struct Seed {
     /// Standard deviation, m.
     pub sigma_m: f64,
     pub opacity: f64,
-    /// In the exposure of the map, 0 or more.
-    pub grey: f64,
+    /// That it is the colour of.
+    pub pixel: u32,
 }
 
 /// σ over the spacing of seeds: neighbours meet at about 0.6 of their peak.
@@ -46,18 +48,78 @@ const SEED_ERROR: f64 = 0.1;
 
 /// What an anchor sees.
 pub struct Seen<'a> {
-    pub image: &'a Image,
+    /// Grey, or red, green and blue.
+    pub planes: &'a [Image],
     pub valid: &'a [u8],
     /// As the raster counts it.
     pub depth: &'a DepthMap,
     /// Rendered before the anchor was added.
     pub alpha: &'a [f32],
     pub grey: &'a [f32],
+    /// Green and blue, of colour.
+    pub tints: &'a [f32],
     /// Of the image; renderings and seeds are in the map's.
     pub exposure: Exposure,
     /// m; zero where nothing was hit.
     pub rendered_depth: &'a [f32],
     pub from: View,
+}
+
+impl Seen<'_> {
+    pub fn width(&self) -> usize {
+        self.planes[0].width
+    }
+
+    /// Mean over the channels of |rendered - seen| at a pixel, in the map's exposure.
+    pub fn error(&self, i: usize) -> f64 {
+        let of = |(channel, plane): (usize, &Image)| {
+            let rendered = if channel == 0 { self.grey[i] } else { self.tints[(channel - 1) * self.grey.len() + i] };
+            (f64::from(rendered) - self.exposure.inverse(f64::from(plane.pixels[i]) / 255.0)).abs()
+        };
+        self.planes.iter().enumerate().map(of).sum::<f64>() / self.planes.len() as f64
+    }
+}
+
+/// Seeds as Gaussians on their way to the pool.
+pub struct Arrivals {
+    splats: Vec<SplatInit>,
+    /// Green and blue of each; none of a grey map.
+    tints: Vec<[f32; 2]>,
+}
+
+impl Arrivals {
+    pub fn new(seeds_max: usize, channels: usize) -> Arrivals {
+        Arrivals { splats: Vec::with_capacity(seeds_max), tints: Vec::with_capacity((channels - 1) / 2 * seeds_max) }
+    }
+
+    pub fn clear(&mut self) {
+        self.splats.clear();
+        self.tints.clear();
+    }
+
+    /// Seeds get the colours of their pixels, in the exposure of the map.
+    pub fn take(&mut self, seeds: &[Seed], planes: &[Image], exposure: Exposure) {
+        self.clear();
+        for seed in seeds {
+            let level =
+                |plane: &Image| exposure.inverse(f64::from(plane.pixels[seed.pixel as usize]) / 255.0).max(0.0) as f32;
+            self.splats.push(SplatInit {
+                mean: seed.p_world.as_vec3().to_array(),
+                log_scale: [seed.sigma_m.ln() as f32; 3],
+                quat_xyzw: [0.0, 0.0, 0.0, 1.0],
+                opacity_logit: (seed.opacity / (1.0 - seed.opacity)).ln() as f32,
+                colour: level(&planes[0]),
+            });
+            if let [_, green, blue] = planes {
+                self.tints.push([level(green), level(blue)]);
+            }
+        }
+    }
+
+    /// How many the pool took.
+    pub fn append(&self, gpu: &mut Gpu, pipeline: &mut Pipeline) -> Result<usize, GpuError> {
+        pipeline.append_tinted(gpu, &self.splats, &self.tints)
+    }
 }
 
 /// Fractions of a view's valid pixels that the map does not reconstruct.
@@ -77,8 +139,7 @@ impl Missing {
             if f64::from(view.alpha[i]) < covered_alpha {
                 bare += 1;
             } else {
-                let seen = view.exposure.inverse(f64::from(view.image.pixels[i]) / 255.0);
-                wrong += u32::from((f64::from(view.grey[i]) - seen).abs() > error);
+                wrong += u32::from(view.error(i) > error);
             }
         }
         let part = |k: u32| f64::from(k) / f64::from(n.max(1));
@@ -161,7 +222,7 @@ impl Seeder {
         mut put: impl FnMut(&mut Seeder, usize, usize),
     ) {
         self.seeds.clear();
-        let (w, h) = (seen.image.width, seen.image.height);
+        let (w, h) = (seen.width(), seen.planes[0].height);
         // The first row inherits what a row above would have left, else a sparse pattern starts late.
         let mut rng = Rng::new(1);
         self.carried[0].fill_with(|| rng.below(1024) as f32 / 1024.0 - 0.5);
@@ -192,13 +253,12 @@ impl Seeder {
     }
 
     fn put(&mut self, seen: &Seen, x: usize, y: usize) {
-        let i = y * seen.image.width + x;
+        let i = y * seen.width() + x;
         let c = seen.from.camera;
         let matched = seen.depth.metres[i] > 0.0;
         let z = f64::from(if matched { seen.depth.metres[i] } else { self.filled[i] });
         let Some(p_world) = seen.from.point(x, y, z) else { return };
-        let grey = seen.exposure.inverse(f64::from(seen.image.pixels[i]) / 255.0);
-        let lacking = seen.alpha[i] < SEED_ALPHA || (f64::from(seen.grey[i]) - grey).abs() >= SEED_ERROR;
+        let lacking = seen.alpha[i] < SEED_ALPHA || seen.error(i) >= SEED_ERROR;
         let [px, py, pz] = p_world.as_vec3().to_array();
         self.points.push([px, py, pz, f32::from(u8::from(lacking))]);
         let spacing_px = (1.0 / f64::from(self.density[i])).sqrt().clamp(SPACING_PX[0], SPACING_PX[1]);
@@ -206,14 +266,17 @@ impl Seeder {
             p_world,
             sigma_m: SPREAD * spacing_px * z / c.fx,
             opacity: if matched { OPACITY_MATCHED } else { OPACITY_FILLED },
-            grey: grey.max(0.0),
+            pixel: i as u32,
         });
     }
 
     /// Seeds a pixel, so that a whole uncovered view gets `seeds` of them.
     fn set_density(&mut self, seen: &Seen, seeds: usize) {
-        let (w, h) = (seen.image.width, seen.image.height);
-        let px = |x: usize, y: usize| f64::from(seen.image.pixels[y * w + x]);
+        let (w, h) = (seen.width(), seen.planes[0].height);
+        let px = |x: usize, y: usize| {
+            let sum = seen.planes.iter().map(|p| f64::from(p.pixels[y * w + x])).sum::<f64>();
+            sum / seen.planes.len() as f64
+        };
         let mut sum = 0.0;
         for y in 0..h {
             for x in 0..w {
@@ -305,11 +368,12 @@ pub(super) mod tests {
     /// Rendered black by a map that is `alpha` opaque.
     fn seen<'a>(image: &'a Image, depth: &'a DepthMap, alpha: &'a [f32]) -> Seen<'a> {
         Seen {
-            image,
+            planes: std::slice::from_ref(image),
             valid: &[1; W * H],
             depth,
             alpha,
             grey: &[0.0; W * H],
+            tints: &[],
             exposure: Exposure::default(),
             rendered_depth: &[0.0; W * H],
             from: from(),
@@ -388,11 +452,12 @@ pub(super) mod tests {
         let counters = Counters::default();
         let (image, depth) = (Image::new(W, H), flat(1.0));
         let seen = Seen {
-            image: &image,
+            planes: std::slice::from_ref(&image),
             valid: &[1; W * H],
             depth: &depth,
             alpha: &[0.0; W * H],
             grey: &[0.0; W * H],
+            tints: &[],
             exposure: Exposure::default(),
             rendered_depth: &[0.0; W * H],
             from: from(),

@@ -29,11 +29,25 @@ pub fn mean(map: &[f32], valid: &[u8]) -> f64 {
 }
 
 impl Pipeline {
-    /// SSIM by pixel of what was rendered last against a keyframe, of its first channel; one where masked.
+    /// SSIM by pixel of what was rendered last against a keyframe, mean of its channels; one where masked. `map` has room for
+    /// them all.
     pub fn similarity(&mut self, gpu: &mut Gpu, goal: Goal, map: &mut Vec<f32>) -> Result<(), GpuError> {
+        let (n, channels) = (self.shape.pixels(), self.shape.channels);
+        map.resize(n * channels as usize, 1.0);
+        for (channel, plane) in map.chunks_exact_mut(n).enumerate() {
+            self.similarity_of(gpu, &goal, channel as u32, plane)?;
+        }
+        if channels > 1 {
+            (0..n).for_each(|i| map[i] = map[i..].iter().step_by(n).sum::<f32>() / channels as f32);
+            map.truncate(n);
+        }
+        Ok(())
+    }
+
+    fn similarity_of(&mut self, gpu: &mut Gpu, goal: &Goal, channel: u32, map: &mut [f32]) -> Result<(), GpuError> {
         let (w, h) = (self.shape.width, self.shape.height);
         let (b, size) = (&self.b, [w, h]);
-        let target = goal.slot * self.shape.channels * self.shape.image_words() as u32;
+        let target = (goal.slot * self.shape.channels + channel) * self.shape.image_words() as u32;
         let mask = b.mask.part(goal.camera as usize * self.shape.mask_stride(), self.shape.image_words());
         let exposure = goal.exposure.unwrap_or_default().words();
         let mut rec = gpu.record();
@@ -46,7 +60,7 @@ impl Pipeline {
         rec.dispatch(
             &self.k.ssim_rows,
             rows,
-            ssim_rows::Push { size, target, plane: 0, exposure },
+            ssim_rows::Push { size, target, plane: channel * w * h, exposure },
             Threads::d1(w.div_ceil(RUN) * h),
         );
         let columns = ssim_columns::Bind {
@@ -58,7 +72,6 @@ impl Pipeline {
         let threads = Threads::d1(w * h.div_ceil(RUN));
         rec.dispatch(&self.k.ssim_map, columns, ssim_columns::Push { size, group: 0 }, threads);
         gpu.submit(rec)?;
-        map.resize(self.shape.pixels(), 1.0);
         gpu.download(self.b.over.slopes, 0, map)
     }
 }
@@ -77,7 +90,7 @@ impl Seeder {
         let scale = (wanted as f64 / sum.max(1e-9)) as f32;
         self.density.iter_mut().for_each(|d| *d = (*d * scale).min(1.0));
         self.pick(seen, wanted, counters, |seeder, x, y| {
-            let i = y * seen.image.width + x;
+            let i = y * seen.width() + x;
             let matched = seen.depth.metres[i] > 0.0;
             let z = f64::from(if matched { seen.depth.metres[i] } else { rendered_depth(seen, i).unwrap_or_default() });
             let Some(p_world) = seen.from.point(x, y, z) else { return };
@@ -85,7 +98,7 @@ impl Seeder {
                 p_world,
                 sigma_m: z / seen.from.camera.fx,
                 opacity: if matched { OPACITY_MATCHED } else { OPACITY_RENDERED },
-                grey: seen.exposure.inverse(f64::from(seen.image.pixels[i]) / 255.0).max(0.0),
+                pixel: i as u32,
             });
         });
         widen(&mut self.seeds);
@@ -133,11 +146,12 @@ mod tests {
         // Right half wrong.
         let similarity: Vec<f32> = (0..W * H).map(|i| if i % W < W / 2 { 1.0 } else { 0.2 }).collect();
         let seen = Seen {
-            image: &image,
+            planes: std::slice::from_ref(&image),
             valid: &[1; W * H],
             depth: &depth,
             alpha: &alpha,
             grey: &[0.0; W * H],
+            tints: &[],
             exposure: Exposure::default(),
             rendered_depth: &[3.0; W * H],
             from: from(),

@@ -1,6 +1,6 @@
 //! PSNR and SSIM as the Gaussian splatting literature computes them, over the valid pixels of a view.
 //!
-//! Images are grey in 0..=1, row-major. PSNR is that of one image's mean squared error; figures of a set
+//! Images are grey in 0..=1, row-major, or in colour plane by plane; `valid` is of one plane. PSNR is that of one image's mean squared error; figures of a set
 //! are means over its images. SSIM (Wang et al., IEEE TIP 2004) has an 11x11 Gaussian window, σ 1.5 px,
 //! zero-padded, the dynamic range 1; invalid pixels are zero in both images, as the padding is.
 
@@ -13,11 +13,11 @@ const C2: f64 = 9e-4;
 /// What two equal images score: 1e-10 is below what 8 bits resolve by orders.
 const MSE_MIN: f64 = 1e-10;
 
-/// Mean squared error over valid pixels; `None` if there are none.
+/// Mean squared error over valid pixels of all planes; `None` if there are none.
 pub fn mse(observed: &[f32], rendered: &[f32], valid: &[u8]) -> Option<f64> {
     let (mut sum, mut n) = (0.0, 0u32);
-    for i in 0..valid.len() {
-        if valid[i] != 0 {
+    for i in 0..observed.len() {
+        if valid[i % valid.len()] != 0 {
             let e = f64::from(observed[i]) - f64::from(rendered[i].clamp(0.0, 1.0));
             sum += e * e;
             n += 1;
@@ -55,13 +55,15 @@ impl Ssim {
         Ssim { width, height, moments: std::array::from_fn(|_| vec![0.0; n]), rows: vec![0.0; n] }
     }
 
-    /// Mean over valid pixels; `None` if there are none.
+    /// Mean over valid pixels of all planes; `None` if there are none.
     pub fn mean(&mut self, observed: &[f32], rendered: &[f32], valid: &[u8]) -> Option<f64> {
         let (mut sum, mut n) = (0.0, 0u32);
-        self.each(observed, rendered, valid, |_, s| {
-            sum += s;
-            n += 1;
-        });
+        for (observed, rendered) in observed.chunks_exact(valid.len()).zip(rendered.chunks_exact(valid.len())) {
+            self.each(observed, rendered, valid, |_, s| {
+                sum += s;
+                n += 1;
+            });
+        }
         (n > 0).then(|| sum / f64::from(n))
     }
 

@@ -3,6 +3,7 @@
 //! `rectified`: the left view of the pair, then the right one, as pinholes. `fisheye`: each raw Kannala-Brandt image
 //! as it is, with its own intrinsics; the pair is then rectified only for its depth (`Pair`). All have one size.
 
+use super::keyframes::Keyframe;
 use super::view::{Fisheye, View};
 use crate::config::{MapConfig, Projection};
 use crate::mem::Footprint;
@@ -41,18 +42,36 @@ pub fn images(cameras: usize, config: &MapConfig) -> usize {
     count(cameras, config).max(2)
 }
 
+/// Of the images that train, how many in colour.
+pub fn colours(cameras: usize, config: &MapConfig) -> usize {
+    if config.colour {
+        count(cameras, config)
+    } else {
+        0
+    }
+}
+
+/// Of a colour, whichever camera's.
+pub fn channels(config: &MapConfig) -> usize {
+    if config.colour {
+        3
+    } else {
+        1
+    }
+}
+
 pub fn footprint(calibration: &Calibration, config: &MapConfig, pixels: usize) -> Footprint {
     let n = count(calibration.cameras.len(), config);
     let mut f = Footprint::default();
     f.host("map: masks of the cameras", n * pixels);
     if config.projection == Projection::Fisheye {
-        f.host("map: rectified image to seed from", pixels);
+        f.host("map: rectified image to seed from", channels(config) * pixels);
         f.host("map: depth as the fisheye sees it", pixels * (size_of::<u32>() + 2 * size_of::<f32>()));
     }
     f
 }
 
-/// The rectified pair beside a fisheye map: the image that seeds take their grey from, and its depth as the left lens
+/// The rectified pair beside a fisheye map: the image that seeds take their colour from, and its depth as the left lens
 /// sees it.
 ///
 /// Both views have one centre, so the ray of a raw pixel meets the rectified view in one place, and that pixel's depth is
@@ -60,7 +79,8 @@ pub fn footprint(calibration: &Calibration, config: &MapConfig, pixels: usize) -
 /// It is a distance along the ray, as the fisheye's raster counts it, since z shrinks towards 90 degrees and changes sign
 /// beyond. Beyond the rectified view (50 degrees off its axis) there is none.
 pub struct Pair {
-    pub image: Image,
+    /// Grey, or red, green and blue.
+    pub planes: Vec<Image>,
     pub distance: DepthMap,
     /// By raw pixel at mapping resolution: the rectified one, or `NONE`.
     rectified: Vec<u32>,
@@ -70,7 +90,7 @@ const NONE: u32 = u32::MAX;
 
 impl Pair {
     /// `None` where the rectified view itself trains.
-    pub fn new(stereo: &Stereo, left: &Eye) -> Option<Pair> {
+    pub fn new(stereo: &Stereo, left: &Eye, channels: usize) -> Option<Pair> {
         left.fisheye?;
         let rect = stereo.camera();
         let Pinhole { width, height, fx, fy, cx, cy } = rect.pinhole;
@@ -83,7 +103,7 @@ impl Pair {
             inside.then(|| (y as usize * width + x as usize) as u32)
         };
         Some(Pair {
-            image: Image::new(width, height),
+            planes: vec![Image::new(width, height); channels],
             distance: DepthMap::new(width, height),
             rectified: (0..width * height).map(|i| of(i).unwrap_or(NONE)).collect(),
         })
@@ -136,6 +156,11 @@ fn bent(i: usize, c: &RigCamera, mapping: &Pinhole, divisor: usize) -> Result<Ey
     Ok(Eye { camera, fisheye: Some(Fisheye::new(k, &camera)), body_from_cam: c.body_from_cam, valid })
 }
 
+/// One plane of what camera `i` saw, raw.
+pub fn raw(keyframe: &Keyframe, i: usize, channel: usize) -> &Image {
+    keyframe.colours.get(i).map_or(&keyframe.images[i], |colour| &colour[channel])
+}
+
 /// The image of camera `i` that trains, from its raw one.
 pub fn draw(i: usize, eye: &Eye, stereo: &mut Stereo, raw: &Image, out: &mut Image) {
     match eye.fisheye {
@@ -180,7 +205,7 @@ mod tests {
         };
         let (w, h) = (rect.pinhole.width, rect.pinhole.height);
         let metres = (0..w * h).map(|i| floor(i % w, i / w)).collect();
-        let mut pair = Pair::new(&stereo, &eye).expect("a fisheye trains");
+        let mut pair = Pair::new(&stereo, &eye, 1).expect("a fisheye trains");
         pair.bend(&DepthMap::of(w, h, metres), &rect.pinhole);
         let raw = eye.view(Pose::IDENTITY);
         let (mut seen, mut worst) = (0, 0.0f64);

@@ -4,7 +4,7 @@
 use super::refine::Refinement;
 use super::view::Exposure;
 use crate::mem::Footprint;
-use stipple_drivers::{Image, Nanos, Pose};
+use stipple_drivers::{Colour, Image, Nanos, Pose};
 
 /// Raw images of one instant and where the body was, mid-exposure.
 #[derive(Clone, Debug, Default)]
@@ -14,6 +14,8 @@ pub struct Keyframe {
     pub world_from_body: Pose,
     /// As the cameras gave them: left, right, and further ones that train.
     pub images: Vec<Image>,
+    /// Of those that train on colour.
+    pub colours: Vec<Colour>,
     /// Never trained on, only evaluated.
     pub held_out: bool,
 }
@@ -28,7 +30,8 @@ impl Keyframe {
     fn copy_from(&mut self, other: &Keyframe) {
         (self.id, self.t, self.world_from_body, self.held_out) =
             (other.id, other.t, other.world_from_body, other.held_out);
-        for (to, from) in self.images.iter_mut().zip(&other.images) {
+        let colours = self.colours.iter_mut().flatten().zip(other.colours.iter().flatten());
+        for (to, from) in self.images.iter_mut().zip(&other.images).chain(colours) {
             (to.width, to.height) = (from.width, from.height);
             to.pixels.clear();
             to.pixels.extend_from_slice(&from.pixels);
@@ -62,16 +65,21 @@ pub struct Queue {
 pub const QUEUE_LEN: usize = 4;
 
 impl Queue {
-    pub fn footprint(pixels_max: usize, images: usize) -> Footprint {
+    pub fn footprint(pixels_max: usize, images: usize, colours: usize) -> Footprint {
         let mut f = Footprint::default();
-        f.host("map: keyframes waiting", QUEUE_LEN * images * pixels_max);
+        f.host("map: keyframes waiting", QUEUE_LEN * (images + 3 * colours) * pixels_max);
         f
     }
 
-    /// `pixels_max` is the largest image the board accepts, `images` how many a keyframe has.
-    pub fn new(pixels_max: usize, images: usize) -> Queue {
+    /// `pixels_max` is the largest image the board accepts, `images` how many a keyframe has, `colours` how many of them in
+    /// colour.
+    pub fn new(pixels_max: usize, images: usize, colours: usize) -> Queue {
         let image = |_| Image { pixels: Vec::with_capacity(pixels_max), ..Image::default() };
-        let slots = (0..QUEUE_LEN).map(|_| Keyframe::with_images((0..images).map(image).collect::<Vec<_>>())).collect();
+        let slot = |_| {
+            let colours = (0..colours).map(|_| std::array::from_fn(image)).collect();
+            Keyframe { colours, ..Keyframe::with_images((0..images).map(image).collect::<Vec<_>>()) }
+        };
+        let slots = (0..QUEUE_LEN).map(slot).collect();
         Queue { slots, pixels_max, first: 0, len: 0 }
     }
 
@@ -84,9 +92,10 @@ impl Queue {
     }
 
     pub fn push(&mut self, keyframe: &Keyframe) -> Offer {
-        let images = self.slots[0].images.len();
+        let Keyframe { images, colours, .. } = &self.slots[0];
         if self.is_full()
-            || keyframe.images.len() < images
+            || keyframe.images.len() < images.len()
+            || keyframe.colours.len() < colours.len()
             || keyframe.images.iter().any(|i| i.pixels.len() > self.pixels_max)
         {
             return Offer::Full;
@@ -149,25 +158,28 @@ impl Stored {
 /// that trains, side by side; what is known of the body is in the first of them.
 pub struct Store {
     cameras: usize,
+    /// Of an image: grey, or red, green and blue.
+    channels: usize,
     entries: Vec<Stored>,
-    images: Vec<Image>,
+    planes: Vec<Image>,
     training: Vec<u32>,
 }
 
 impl Store {
-    pub fn footprint(capacity: usize, pixels: usize) -> Footprint {
+    pub fn footprint(capacity: usize, channels: usize, pixels: usize) -> Footprint {
         let mut f = Footprint::default();
-        f.host("map: keyframe images", capacity * pixels);
-        f.host("map: keyframes", capacity * (size_of::<Stored>() + size_of::<Image>() + size_of::<u32>()));
+        f.host("map: keyframe images", capacity * channels * pixels);
+        f.host("map: keyframes", capacity * (size_of::<Stored>() + channels * size_of::<Image>() + size_of::<u32>()));
         f
     }
 
     /// `capacity` is of images.
-    pub fn new(capacity: usize, cameras: usize, width: usize, height: usize) -> Store {
+    pub fn new(capacity: usize, cameras: usize, channels: usize, width: usize, height: usize) -> Store {
         Store {
             cameras,
+            channels,
             entries: Vec::with_capacity(capacity),
-            images: (0..capacity).map(|_| Image::new(width, height)).collect(),
+            planes: (0..capacity * channels).map(|_| Image::new(width, height)).collect(),
             training: Vec::with_capacity(capacity),
         }
     }
@@ -182,7 +194,7 @@ impl Store {
 
     /// Whether a keyframe would find no room for all its images.
     pub fn is_full(&self) -> bool {
-        self.entries.len() + self.cameras > self.images.len()
+        (self.entries.len() + self.cameras) * self.channels > self.planes.len()
     }
 
     /// Of an image, which camera's it is.
@@ -200,11 +212,11 @@ impl Store {
         self.get(self.first(index)).world_from_refined()
     }
 
-    /// Takes the next camera of a keyframe, whose image `draw` makes; `None` when the store is full.
-    pub fn add(&mut self, keyframe: &Keyframe, draw: impl FnOnce(&mut Image)) -> Option<usize> {
+    /// Takes the next camera of a keyframe, whose planes `draw` makes one by one; `None` when the store is full.
+    pub fn add(&mut self, keyframe: &Keyframe, mut draw: impl FnMut(usize, &mut Image)) -> Option<usize> {
         let index = self.entries.len();
-        let image = self.images.get_mut(index)?;
-        draw(image);
+        let planes = self.planes.get_mut(index * self.channels..(index + 1) * self.channels)?;
+        planes.iter_mut().enumerate().for_each(|(channel, plane)| draw(channel, plane));
         let &Keyframe { id, t, world_from_body, held_out, .. } = keyframe;
         let mut refined = Refinement::default();
         // Cameras change their exposure slowly: the last one's is the best guess.
@@ -237,8 +249,9 @@ impl Store {
         &mut self.entries[index]
     }
 
-    pub fn image(&self, index: usize) -> &Image {
-        &self.images[index]
+    /// Grey, or red, green and blue.
+    pub fn planes(&self, index: usize) -> &[Image] {
+        &self.planes[index * self.channels..][..self.channels]
     }
 
     pub fn iter(&self) -> impl Iterator<Item = &Stored> {
@@ -347,7 +360,7 @@ mod tests {
 
     #[test]
     fn full_queue_rejects_newest_and_keeps_order() {
-        let mut q = Queue::new(12, 2);
+        let mut q = Queue::new(12, 2, 0);
         for id in 1..=4 {
             assert_eq!(q.push(&keyframe(id, false)), Offer::Accepted);
         }
@@ -366,27 +379,27 @@ mod tests {
 
     #[test]
     fn images_beyond_the_budget_are_refused() {
-        assert_eq!(Queue::new(11, 2).push(&keyframe(1, false)), Offer::Full);
+        assert_eq!(Queue::new(11, 2, 0).push(&keyframe(1, false)), Offer::Full);
     }
 
     #[test]
     fn held_out_keyframes_are_stored_but_not_for_training() {
-        let mut s = Store::new(3, 1, 2, 2);
+        let mut s = Store::new(3, 1, 1, 2, 2);
         for id in 0..3 {
-            assert_eq!(s.add(&keyframe(id, id == 1), |i| i.pixels.fill(9)), Some(id as usize));
+            assert_eq!(s.add(&keyframe(id, id == 1), |_, i| i.pixels.fill(9)), Some(id as usize));
         }
-        assert_eq!(s.add(&keyframe(3, false), |_| {}), None);
+        assert_eq!(s.add(&keyframe(3, false), |_, _| {}), None);
         assert_eq!(s.training(), [0, 2]);
-        assert_eq!((s.len(), s.image(1).pixels[3]), (3, 9));
+        assert_eq!((s.len(), s.planes(1)[0].pixels[3]), (3, 9));
     }
 
     #[test]
     fn images_of_one_keyframe_share_its_pose_and_not_their_exposure() {
-        let mut s = Store::new(5, 2, 2, 2);
+        let mut s = Store::new(5, 2, 1, 2, 2);
         for id in 0..2 {
             assert!(!s.is_full());
             for camera in 0..2 {
-                let index = s.add(&keyframe(id, false), |_| {}).expect("room for five");
+                let index = s.add(&keyframe(id, false), |_, _| {}).expect("room for five");
                 assert_eq!((s.camera(index), s.first(index)), (camera, 2 * id as usize));
             }
         }
@@ -394,7 +407,7 @@ mod tests {
         assert!(s.correct(&PoseCorrection { id: 1, world_from_body: Pose { p: DVec3::X, ..Pose::IDENTITY } }));
         assert_eq!([1, 2, 3].map(|i| s.world_from_body(i).p), [DVec3::ZERO, DVec3::X, DVec3::X]);
         s.get_mut(1).refined.exposure.gain = 2.0;
-        assert_eq!(s.add(&keyframe(2, false), |_| {}), Some(4));
+        assert_eq!(s.add(&keyframe(2, false), |_, _| {}), Some(4));
         assert_eq!([0, 1, 4].map(|i| s.exposure(i).gain), [1.0, 2.0, 1.0]);
     }
 }

@@ -14,20 +14,21 @@ use super::densify::mean;
 use super::eyes;
 use super::pipeline::{PruneRule, StepStats, View};
 use super::schedule::Ended;
-use super::{gaussian, median_depth, Did, Mapper, SCENE_DEPTH_M};
+use super::{median_depth, Did, Mapper, SCENE_DEPTH_M};
 use crate::gpu::GpuError;
 use crate::mem::unsealed;
 
 /// What anchor `$index` sees of the last rendering, which was `$from` there; fields are borrowed one by one, so that the
 /// seeder is still free.
 macro_rules! seen {
-    ($mapper:ident, $index:ident, $from:expr, $image:expr, $valid:expr, $depth:expr) => {
+    ($mapper:ident, $index:ident, $from:expr, $planes:expr, $valid:expr, $depth:expr) => {
         anchors::Seen {
-            image: $image,
+            planes: $planes,
             valid: $valid,
             depth: $depth,
             alpha: &$mapper.rendered.alpha,
             grey: &$mapper.rendered.grey,
+            tints: &$mapper.rendered.tints,
             exposure: $mapper.store.exposure($index),
             rendered_depth: &$mapper.rendered.depth,
             from: $from,
@@ -69,13 +70,18 @@ impl Mapper {
             return Ok(Did::Dropped);
         }
         let index = self.store.len();
-        for (i, (eye, raw)) in self.eyes.iter().zip(&keyframe.images).enumerate() {
-            self.store.add(keyframe, |image| eyes::draw(i, eye, &mut self.stereo, raw, image));
-            let image = self.store.image(index + i);
-            self.pipeline.set_keyframe(&mut self.gpu, (index + i) as u32, &image.pixels)?;
+        for (i, eye) in self.eyes.iter().enumerate() {
+            self.store.add(keyframe, |channel, plane| {
+                eyes::draw(i, eye, &mut self.stereo, eyes::raw(keyframe, i, channel), plane);
+            });
+            for (channel, plane) in self.store.planes(index + i).iter().enumerate() {
+                self.pipeline.set_plane(&mut self.gpu, (index + i) as u32, channel, &plane.pixels)?;
+            }
         }
         if let Some(pair) = &mut self.pair {
-            self.stereo.rectify(&keyframe.images[0], &mut pair.image);
+            for (channel, plane) in pair.planes.iter_mut().enumerate() {
+                self.stereo.rectify(eyes::raw(keyframe, 0, channel), plane);
+            }
         }
         let did = if self.store.get(index).held_out { Did::Stored } else { self.cover(index)? };
         self.queue.pop();
@@ -101,8 +107,8 @@ impl Mapper {
         if self.pair.is_none() {
             self.expose(index);
         }
-        let image = self.pair.as_ref().map_or_else(|| self.store.image(index), |pair| &pair.image);
-        let seen = seen!(self, index, view, image, self.stereo.valid_mask(), &self.depth);
+        let planes = self.pair.as_ref().map_or_else(|| self.store.planes(index), |pair| &pair.planes);
+        let seen = seen!(self, index, view, planes, self.stereo.valid_mask(), &self.depth);
         let Missing { bare, wrong } = Missing::of(&seen, self.config.covered_alpha, self.config.wrong_error);
         if bare + wrong <= self.config.anchor_missing_min {
             return Ok(Did::Stored);
@@ -131,15 +137,14 @@ impl Mapper {
             return Ok(Did::Stored);
         }
         self.pipeline.open_block(index as u32);
-        let image = self.pair.as_ref().map_or_else(|| self.store.image(index), |pair| &pair.image);
-        let seen = seen!(self, index, view, image, self.stereo.valid_mask(), &self.depth);
+        let planes = self.pair.as_ref().map_or_else(|| self.store.planes(index), |pair| &pair.planes);
+        let seen = seen!(self, index, view, planes, self.stereo.valid_mask(), &self.depth);
         let points = self.seeder.seed(&seen, whole, &self.counters);
         self.occupancy.look(&mut self.gpu, &self.pipeline, points, &mut self.answers)?;
         let seeds = self.seeder.settle(&self.answers, room, &self.counters);
-        self.arrivals.clear();
-        self.arrivals.extend(seeds.iter().map(gaussian));
+        self.arrivals.take(seeds, planes, self.store.exposure(index));
         self.counters.anchors_for_error.add(u64::from(bare <= self.config.anchor_missing_min));
-        let seeded = self.pipeline.append(&mut self.gpu, &self.arrivals)? as u32;
+        let seeded = self.arrivals.append(&mut self.gpu, &mut self.pipeline)? as u32;
         let entry = self.store.get_mut(index);
         (entry.anchor, entry.placed) = (true, entry.given);
         self.keep_depth(index)?;
@@ -225,11 +230,11 @@ impl Mapper {
         let wanted = self.growth.allowed((f64::from(self.config.densify_max) * lacking) as usize);
         let wanted = wanted.min(self.make_room(wanted)?);
         let depth = self.pair.as_ref().map_or(&self.depth, |pair| &pair.distance);
-        let seen = seen!(self, index, view, self.store.image(index), &self.eyes[0].valid, depth);
+        let planes = self.store.planes(index);
+        let seen = seen!(self, index, view, planes, &self.eyes[0].valid, depth);
         let seeds = self.seeder.densify(&seen, &self.similarity, wanted, &self.counters);
-        self.arrivals.clear();
-        self.arrivals.extend(seeds.iter().map(gaussian));
-        let added = self.pipeline.append(&mut self.gpu, &self.arrivals)?;
+        self.arrivals.take(seeds, planes, self.store.exposure(index));
+        let added = self.arrivals.append(&mut self.gpu, &mut self.pipeline)?;
         self.counters.splats_densified.add(added as u64);
         Ok(added)
     }

@@ -37,7 +37,7 @@ use crate::counters::Counters;
 use crate::gpu::{Gpu, GpuError, Timing};
 use crate::mem::Footprint;
 use crate::stereo::{DepthMap, Stereo};
-use anchors::{Seed, Seeder};
+use anchors::{Arrivals, Seeder};
 use budget::Growth;
 use eyes::{Eye, Pair};
 use keyframes::{Queue, Store};
@@ -113,7 +113,7 @@ pub struct Mapper {
     /// Depth of the newest anchor, m.
     depth: DepthMap,
     rendered: Rendered,
-    arrivals: Vec<SplatInit>,
+    arrivals: Arrivals,
     /// SSIM of the newest anchor by pixel.
     similarity: Vec<f32>,
     growth: Growth,
@@ -144,13 +144,15 @@ impl Mapper {
         let seeds_max = seeds_max(&board.map);
         let mut f = Pipeline::footprint(&shape);
         f.gpu("alignment", Pipeline::arena_bytes(&shape).saturating_sub(f.gpu_total()) as usize);
-        f.extend(Queue::footprint(raw_pixels_max(board), eyes::images(cameras, &board.map)));
-        f.extend(Store::footprint(images, pixels));
+        let colours = eyes::colours(cameras, &board.map);
+        f.extend(Queue::footprint(raw_pixels_max(board), eyes::images(cameras, &board.map), colours));
+        f.extend(Store::footprint(images, shape.channels as usize, pixels));
         f.extend(eyes::footprint(calibration, &board.map, pixels));
         f.extend(Seeder::footprint(pixels, seeds_max));
         f.extend(Occupancy::footprint(board.map.occupancy_cells));
-        f.host("map: rendering, depth and similarity", pixels * 5 * size_of::<f32>());
-        f.host("map: arrivals", seeds_max * (size_of::<SplatInit>() + size_of::<u32>()));
+        let tints = shape.channels as usize - 1;
+        f.host("map: rendering, depth and similarity", pixels * (5 + 2 * tints) * size_of::<f32>());
+        f.host("map: arrivals", seeds_max * (size_of::<SplatInit>() + (1 + tints) * size_of::<u32>()));
         f
     }
 
@@ -167,23 +169,30 @@ impl Mapper {
         }
         let seeds_max = seeds_max(&config);
         let occupancy = Occupancy::new(&mut gpu, config.occupancy_cell_m, config.occupancy_cells)?;
+        let (rig, channels) = (stereo.rig().len(), shape.channels as usize);
         let blank = || vec![0.0; width * height];
+        // Of so many pixels, with room for more in colour.
+        let tinted = |pixels: usize| {
+            let mut planes = Vec::with_capacity(pixels + (channels - 1) * width * height);
+            planes.resize(pixels, 0.0);
+            planes
+        };
         gpu.time_commands(TIMED_IN);
         Ok(Mapper {
             gpu,
             pipeline,
-            queue: Queue::new(raw_pixels_max(board), eyes::images(stereo.rig().len(), &config)),
-            store: Store::new(shape.keyframes as usize, eyes.len(), width, height),
-            pair: Pair::new(&stereo, &eyes[0]),
+            queue: Queue::new(raw_pixels_max(board), eyes::images(rig, &config), eyes::colours(rig, &config)),
+            store: Store::new(shape.keyframes as usize, eyes.len(), channels, width, height),
+            pair: Pair::new(&stereo, &eyes[0], channels),
             eyes,
             seeder: Seeder::new(width, height, seeds_max),
             occupancy,
             answers: Vec::with_capacity(seeds_max),
             schedule: Schedule::new(config.seed),
             depth: DepthMap::new(width, height),
-            rendered: Rendered { width, height, grey: blank(), tints: Vec::new(), alpha: blank(), depth: blank() },
-            arrivals: Vec::with_capacity(seeds_max),
-            similarity: blank(),
+            rendered: Rendered { width, height, grey: blank(), tints: tinted(0), alpha: blank(), depth: blank() },
+            arrivals: Arrivals::new(seeds_max, channels),
+            similarity: tinted(width * height),
             growth: Growth::default(),
             added: Added::default(),
             scene_depth_m: SCENE_DEPTH_M,
@@ -209,6 +218,11 @@ impl Mapper {
     /// Of a keyframe: what an offer must have.
     pub fn images(&self) -> usize {
         eyes::images(self.stereo.rig().len(), &self.config)
+    }
+
+    /// How many of them in colour.
+    pub fn colours_offered(&self) -> usize {
+        eyes::colours(self.stereo.rig().len(), &self.config)
     }
 
     /// Whether an offer now would be accepted.
@@ -418,7 +432,7 @@ fn shape(board: &Board, cameras: usize, width: usize, height: usize) -> Shape {
         splats: b.splats,
         intersections: b.intersections,
         keyframes: b.keyframes * cameras as u32,
-        channels: 1,
+        channels: eyes::channels(&board.map) as u32,
         sh_degree: board.map.sh_degree,
         cameras: cameras as u32,
         inverse_depth: board.map.depth_weight > 0.0,
@@ -432,17 +446,6 @@ fn seeds_max(config: &MapConfig) -> usize {
 
 fn raw_pixels_max(board: &Board) -> usize {
     board.budget.image_width_max as usize * board.budget.image_height_max as usize
-}
-
-fn gaussian(seed: &Seed) -> SplatInit {
-    let log_sigma = seed.sigma_m.ln() as f32;
-    SplatInit {
-        mean: seed.p_world.as_vec3().to_array(),
-        log_scale: [log_sigma; 3],
-        quat_xyzw: [0.0, 0.0, 0.0, 1.0],
-        opacity_logit: (seed.opacity / (1.0 - seed.opacity)).ln() as f32,
-        colour: seed.grey as f32,
-    }
 }
 
 /// Median of the pixels that have depth, by counting them in 256 bins of 1/depth; allocates nothing.

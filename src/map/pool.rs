@@ -48,12 +48,15 @@ impl Pipeline {
     pub fn set_keyframe(&mut self, gpu: &mut Gpu, slot: u32, planes: &[u8]) -> Result<(), GpuError> {
         let channels = self.shape.channels as usize;
         assert_eq!(planes.len(), channels * self.shape.pixels(), "images are of the shape the pipeline was made with");
-        for (channel, plane) in planes.chunks_exact(self.shape.pixels()).enumerate() {
-            self.pack(plane);
-            let at = (slot as usize * channels + channel) * self.shape.image_words();
-            gpu.upload(self.b.targets, at, &self.words)?;
-        }
-        Ok(())
+        let mut planes = planes.chunks_exact(self.shape.pixels()).enumerate();
+        planes.try_for_each(|(channel, plane)| self.set_plane(gpu, slot, channel, plane))
+    }
+
+    /// One channel of it.
+    pub fn set_plane(&mut self, gpu: &mut Gpu, slot: u32, channel: usize, plane: &[u8]) -> Result<(), GpuError> {
+        self.pack(plane);
+        let at = (slot as usize * self.shape.channels as usize + channel) * self.shape.image_words();
+        gpu.upload(self.b.targets, at, &self.words)
     }
 
     /// Pixels that count, of every keyframe of the first camera: zero is ignored.

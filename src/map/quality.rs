@@ -48,10 +48,9 @@ pub struct Panel {
     pub name: String,
     pub width: usize,
     pub height: usize,
+    /// Grey, or three channels interleaved.
     pub observed: Vec<u8>,
     pub rendered: Vec<f32>,
-    /// |observed - rendered|, 0 where not compared.
-    pub error: Vec<f32>,
     /// m, 0 where there is none.
     pub depth: Vec<f32>,
     /// Zero where not compared.
@@ -116,9 +115,9 @@ impl Mapper {
         for i in 0..self.store.len() {
             let observed = self.observed(i);
             let mut add = |mapper: &Mapper, [psnr, ssim]: &mut [Mean; 2]| {
-                let (shown, valid) = (&mapper.rendered.grey, &mapper.eye(i).valid);
-                psnr.add(mse(&observed, shown, valid).map(psnr_db));
-                ssim.add(ssim_of.mean(&observed, shown, valid));
+                let (shown, valid) = (mapper.shown(), &mapper.eye(i).valid);
+                psnr.add(mse(&observed, &shown, valid).map(psnr_db));
+                ssim.add(ssim_of.mean(&observed, &shown, valid));
             };
             let scored = self.score(i)?;
             if !self.store.get(i).held_out {
@@ -157,19 +156,17 @@ impl Mapper {
         let mut panels = Vec::with_capacity(count);
         for i in spread(&all, count) {
             let psnr_db = self.score(i)?;
-            let (observed, valid) = (self.store.image(i).pixels.clone(), self.eye(i).valid.clone());
-            let r = &self.rendered;
-            let error = |k: usize| match valid[k] {
-                0 => 0.0,
-                _ => (f32::from(observed[k]) / 255.0 - r.grey[k].clamp(0.0, 1.0)).abs(),
-            };
+            let valid = self.eye(i).valid.clone();
+            let (planes, shown, r) = (self.store.planes(i), self.shown(), &self.rendered);
+            let n = valid.len();
+            let observed = (0..n).flat_map(|k| planes.iter().map(move |p| p.pixels[k])).collect();
+            let rendered = (0..n).flat_map(|k| shown[k..].iter().step_by(n).copied()).collect();
             let kind = if self.store.get(i).held_out { "_heldout" } else { "" };
             panels.push(Panel {
                 name: format!("{:04}{kind}", self.store.get(i).id),
                 width: r.width,
                 height: r.height,
-                error: (0..valid.len()).map(error).collect(),
-                rendered: r.grey.clone(),
+                rendered,
                 depth: r.depth.clone(),
                 observed,
                 valid,
@@ -184,7 +181,7 @@ impl Mapper {
         let view = self.view(index);
         self.pipeline.render(&mut self.gpu, &view, &mut self.rendered)?;
         self.show(self.store.exposure(index));
-        Ok(mse(&self.observed(index), &self.rendered.grey, &self.eye(index).valid).map(psnr_db))
+        Ok(mse(&self.observed(index), &self.shown(), &self.eye(index).valid).map(psnr_db))
     }
 
     /// The first camera's images.
@@ -203,16 +200,23 @@ impl Mapper {
 
     /// Puts the rendering into another exposure.
     fn show(&mut self, exposure: Exposure) {
-        self.rendered.grey.iter_mut().for_each(|x| *x = exposure.observed(f64::from(*x)) as f32);
+        let planes = self.rendered.grey.iter_mut().chain(&mut self.rendered.tints);
+        planes.for_each(|x| *x = exposure.observed(f64::from(*x)) as f32);
     }
 
     /// Puts the rendering into the exposure that fits an image best.
     fn fit(&mut self, index: usize, observed: &[f32]) {
-        self.show(fitted_exposure(observed, &self.rendered.grey, &self.eye(index).valid));
+        self.show(fitted_exposure(observed, &self.shown(), &self.eye(index).valid));
     }
 
+    /// Plane by plane.
     fn observed(&self, index: usize) -> Vec<f32> {
-        self.store.image(index).pixels.iter().map(|p| f32::from(*p) / 255.0).collect()
+        self.store.planes(index).iter().flat_map(|p| &p.pixels).map(|p| f32::from(*p) / 255.0).collect()
+    }
+
+    /// The last rendering plane by plane.
+    fn shown(&self) -> Vec<f32> {
+        [&self.rendered.grey[..], &self.rendered.tints].concat()
     }
 
     /// The refinement of a keyframe from which the map, standing still, looks most like its image.
@@ -222,7 +226,7 @@ impl Mapper {
         let (body_from_cam, given) = (eye.body_from_cam, self.store.get(self.store.first(index)).given);
         let view = self.view(index);
         self.pipeline.render(&mut self.gpu, &view, &mut self.rendered)?;
-        let exposure = fitted_exposure(observed, &self.rendered.grey, &self.eye(index).valid);
+        let exposure = fitted_exposure(observed, &self.shown(), &self.eye(index).valid);
         let goal = Goal { exposure: Some(exposure), depth: None, ..self.goal(index) };
         let mut refined = Refinement::default();
         let (mut best, mut best_loss) = (refined, f64::INFINITY);

@@ -157,12 +157,15 @@ impl Mapper {
         }
         let (valid, r) = (&self.eye(index).valid, &self.rendered);
         let (mut seen, mut n, mut observed, mut rendered) = (0u32, 0u32, 0.0, 0.0);
-        for (i, pixel) in self.store.image(index).pixels.iter().enumerate().filter(|(i, _)| valid[*i] != 0) {
+        let planes = self.store.planes(index);
+        for i in (0..valid.len()).filter(|&i| valid[i] != 0) {
             n += 1;
             if r.alpha[i] > SHOWN_ALPHA {
                 seen += 1;
-                observed += f64::from(*pixel) / 255.0;
-                rendered += f64::from(r.grey[i] / r.alpha[i]);
+                let channels = planes.len() as f64;
+                observed += planes.iter().map(|p| f64::from(p.pixels[i])).sum::<f64>() / (255.0 * channels);
+                let tints: f32 = r.tints.iter().skip(i).step_by(r.grey.len()).sum();
+                rendered += f64::from((r.grey[i] + tints) / r.alpha[i]) / channels;
             }
         }
         let e = &mut self.store.get_mut(index).refined.exposure;
@@ -185,10 +188,10 @@ fn three(v: &[f64], at: usize) -> DVec3 {
 }
 
 /// The exposure that takes a rendering closest to an image, in closed form: linear least squares of gain and offset
-/// over the valid pixels. A flat or empty rendering gets the offset alone.
+/// over the valid pixels of all planes. A flat or empty rendering gets the offset alone.
 pub fn fitted_exposure(observed: &[f32], rendered: &[f32], valid: &[u8]) -> Exposure {
     let (mut n, mut sx, mut sy, mut sxx, mut sxy) = (0.0, 0.0, 0.0, 0.0, 0.0);
-    for i in (0..valid.len()).filter(|&i| valid[i] != 0) {
+    for i in (0..observed.len()).filter(|&i| valid[i % valid.len()] != 0) {
         let (x, y) = (f64::from(rendered[i]), f64::from(observed[i]));
         (n, sx, sy, sxx, sxy) = (n + 1.0, sx + x, sy + y, sxx + x * x, sxy + x * y);
     }

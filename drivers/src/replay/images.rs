@@ -1,10 +1,11 @@
 //! Decoding of one frame's images to 8-bit grey: PNG of 8 or 16 bits (the high byte is taken:
 //! recordings use the full range), grey, palette or colour; JPEG, grey or colour. Decoding is strict, so that
-//! half an image is a fault and not a half-grey picture.
+//! half an image is a fault and not a half-grey picture. Of cameras whose colour is asked for, red, green and blue are
+//! given beside the same grey; a grey file has them equal.
 
 use super::findings::{self, Findings, ReplayCounters};
 use super::pairing::{FrameFiles, ImageFile};
-use crate::types::{Frames, Image};
+use crate::types::{luma, Colour, Frames, Image};
 use std::fmt;
 use std::io::{Cursor, Read};
 use zune_jpeg::zune_core::bytestream::ZCursor;
@@ -59,15 +60,23 @@ impl Reader {
         &self.findings.warnings
     }
 
-    /// Fills `out`, which is shaped by `Frames::for_rig`. After a fault its pixels are unspecified.
+    /// Whether the images of the first `cameras` have colour, by the first that can be read of each.
+    pub fn has_colour(&self, cameras: usize) -> bool {
+        let coloured = |k: usize| self.frames.iter().find_map(|f| is_coloured(f.images.get(k)?)).unwrap_or(false);
+        (0..cameras).all(coloured)
+    }
+
+    /// Fills `out`, which is shaped by `Frames::for_rig` or `in_colour`. After a fault its pixels are unspecified.
     ///
     /// Panics where `index` is not that of a frame or `out` has not one image a camera.
     pub fn read(&mut self, index: usize, out: &mut Frames) -> Result<(), FrameFault> {
         let frame = &self.frames[index];
         assert_eq!(frame.images.len(), out.images.len(), "Frames::for_rig gives one image a camera");
         out.t = frame.t;
+        let mut colours = out.colours.iter_mut();
         for (file, image) in frame.images.iter().zip(&mut out.images) {
-            let Err((kind, what)) = read_image(file, &mut self.file, &mut self.decoded, image) else { continue };
+            let read = read_image(file, &mut self.file, &mut self.decoded, image, colours.next());
+            let Err((kind, what)) = read else { continue };
             let counter: fn(&mut ReplayCounters) -> &mut u64 = match kind {
                 FrameFaultKind::Missing => |c| &mut c.images_missing,
                 FrameFaultKind::Undecodable => |c| &mut c.images_undecodable,
@@ -83,17 +92,39 @@ impl Reader {
 
 type Why = (FrameFaultKind, String);
 
-fn read_image(file: &ImageFile, bytes: &mut Vec<u8>, decoded: &mut Vec<u8>, out: &mut Image) -> Result<(), Why> {
+fn read_image(
+    file: &ImageFile,
+    bytes: &mut Vec<u8>,
+    decoded: &mut Vec<u8>,
+    out: &mut Image,
+    colour: Option<&mut Colour>,
+) -> Result<(), Why> {
     let missing = |e: std::io::Error| (FrameFaultKind::Missing, format!("cannot read: {e}"));
     bytes.clear();
     std::fs::File::open(&file.path).and_then(|mut f| f.read_to_end(bytes)).map_err(missing)?;
     if bytes.starts_with(b"\x89PNG") {
-        read_png(bytes, decoded, out)
+        read_png(bytes, decoded, out, colour)
     } else if bytes.starts_with(b"\xff\xd8") {
-        read_jpeg(bytes, out)
+        match colour {
+            None => read_jpeg(bytes, out),
+            Some(colour) => read_jpeg_colour(bytes, decoded, out, colour),
+        }
     } else {
         Err(undecodable("neither PNG nor JPEG"))
     }
+}
+
+/// `None` where the header cannot be read.
+fn is_coloured(file: &ImageFile) -> Option<bool> {
+    let bytes = std::fs::read(&file.path).ok()?;
+    if bytes.starts_with(b"\x89PNG") {
+        let mut decoder = png::Decoder::new(Cursor::new(&bytes));
+        decoder.set_transformations(png::Transformations::EXPAND);
+        return Some(decoder.read_info().ok()?.output_color_type().0.samples() >= 3);
+    }
+    let mut decoder = JpegDecoder::new(ZCursor::new(&bytes));
+    decoder.decode_headers().ok()?;
+    Some(decoder.info()?.components >= 3)
 }
 
 fn undecodable(e: impl fmt::Display) -> Why {
@@ -109,35 +140,66 @@ fn check_size(width: usize, height: usize, out: &Image) -> Result<(), Why> {
     Err((FrameFaultKind::WrongSize, what))
 }
 
-fn read_png(bytes: &[u8], decoded: &mut Vec<u8>, out: &mut Image) -> Result<(), Why> {
+fn read_png(bytes: &[u8], decoded: &mut Vec<u8>, out: &mut Image, colour: Option<&mut Colour>) -> Result<(), Why> {
     let mut decoder = png::Decoder::new(Cursor::new(bytes));
     decoder.set_transformations(png::Transformations::EXPAND | png::Transformations::STRIP_16);
     let mut reader = decoder.read_info().map_err(undecodable)?;
     check_size(reader.info().width as usize, reader.info().height as usize, out)?;
-    let (colour, _) = reader.output_color_type();
-    if colour == png::ColorType::Grayscale {
+    let channels = reader.output_color_type().0.samples();
+    if channels == 1 {
         reader.next_frame(&mut out.pixels).map_err(undecodable)?;
     } else {
-        let channels = colour.samples();
         decoded.resize(out.pixels.len() * channels, 0);
         reader.next_frame(decoded).map_err(undecodable)?;
         for (grey, px) in out.pixels.iter_mut().zip(decoded.chunks_exact(channels)) {
             *grey = if channels < 3 { px[0] } else { luma(px[0], px[1], px[2]) };
         }
     }
+    if let Some(planes) = colour {
+        for (c, plane) in planes.iter_mut().enumerate() {
+            if channels < 3 {
+                plane.copy_from(out);
+            } else {
+                let of_channel = decoded.chunks_exact(channels).map(|px| px[c]);
+                plane.pixels.iter_mut().zip(of_channel).for_each(|(to, from)| *to = from);
+            }
+        }
+    }
     reader.finish().map_err(undecodable)
 }
 
-/// ITU-R BT.601, the weights of JPEG's own luma.
-fn luma(r: u8, g: u8, b: u8) -> u8 {
-    ((77 * u32::from(r) + 150 * u32::from(g) + 29 * u32::from(b) + 128) >> 8) as u8
-}
-
-fn read_jpeg(bytes: &[u8], out: &mut Image) -> Result<(), Why> {
-    let options = DecoderOptions::default().set_strict_mode(true).jpeg_set_out_colorspace(ColorSpace::Luma);
+/// The file's headers, and the decoder that goes on to give `space`.
+fn jpeg_decoder<'a>(bytes: &'a [u8], space: ColorSpace, out: &Image) -> Result<JpegDecoder<ZCursor<&'a [u8]>>, Why> {
+    let options = DecoderOptions::default().set_strict_mode(true).jpeg_set_out_colorspace(space);
     let mut decoder = JpegDecoder::new_with_options(ZCursor::new(bytes), options);
     decoder.decode_headers().map_err(undecodable)?;
     let (width, height) = decoder.dimensions().ok_or_else(|| undecodable("no size"))?;
     check_size(width, height, out)?;
-    decoder.decode_into(&mut out.pixels).map_err(undecodable)
+    Ok(decoder)
+}
+
+fn read_jpeg(bytes: &[u8], out: &mut Image) -> Result<(), Why> {
+    jpeg_decoder(bytes, ColorSpace::Luma, out)?.decode_into(&mut out.pixels).map_err(undecodable)
+}
+
+/// The grey is the file's own luma, as it is without colour.
+fn read_jpeg_colour(bytes: &[u8], decoded: &mut Vec<u8>, out: &mut Image, colour: &mut Colour) -> Result<(), Why> {
+    let mut decoder = jpeg_decoder(bytes, ColorSpace::YCbCr, out)?;
+    if decoder.info().is_some_and(|i| i.components < 3) {
+        read_jpeg(bytes, out)?;
+        colour.iter_mut().for_each(|plane| plane.copy_from(out));
+        return Ok(());
+    }
+    decoded.resize(3 * out.pixels.len(), 0);
+    decoder.decode_into(decoded).map_err(undecodable)?;
+    let [red, green, blue] = colour;
+    for (i, px) in decoded.chunks_exact(3).enumerate() {
+        // JFIF: full range, BT.601.
+        let (y, cb, cr) = (f32::from(px[0]), f32::from(px[1]) - 128.0, f32::from(px[2]) - 128.0);
+        out.pixels[i] = px[0];
+        red.pixels[i] = (y + 1.402 * cr).round() as u8;
+        green.pixels[i] = (y - 0.344_136 * cb - 0.714_136 * cr).round() as u8;
+        blue.pixels[i] = (y + 1.772 * cb).round() as u8;
+    }
+    Ok(())
 }

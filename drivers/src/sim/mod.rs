@@ -22,11 +22,11 @@ mod write;
 pub use imu::{Bias, ImuErrors, GRAVITY};
 pub use render::Sensor;
 pub use scenario::{euroc_rig, rig_named, CameraErrors, Flight, Light, Recording, Scenario, RIGS};
-pub use write::write_euroc;
+pub use write::{write_euroc, write_euroc_colour};
 
 use crate::calibration::Calibration;
 use crate::fault::{Exit, Fault};
-use crate::types::{Frames, ImuSample, Nanos, Pose, Span, TimedPose};
+use crate::types::{luma, Frames, ImuSample, Nanos, Pose, Span, TimedPose};
 use glam::{DVec3, Vec3};
 use render::{Exposure, Lens, Row, Rows, Scratch, View};
 use room::Room;
@@ -185,7 +185,7 @@ impl Sim {
         self.room.clearance(p_world.as_vec3()) as f64
     }
 
-    /// Images of all cameras at frame `i` into `out`, which must be shaped for the rig.
+    /// Images of all cameras at frame `i` into `out`, which must be shaped for the rig; in colour as far as it has colours.
     pub fn render(&mut self, i: usize, out: &mut Frames) {
         let t = self.stamps[i];
         out.t = self.stamp(i);
@@ -193,12 +193,23 @@ impl Sim {
             // streams of different images are unrelated, whatever the order of rendering
             let run = texture::hash(self.seed as i32, (self.seed >> 32) as i32, 0x5354_5250);
             let stream = texture::hash(i as i32, camera as i32, run);
-            let exposure = Exposure { sensor: self.sensor, stream };
             self.expose(t, camera);
-            let rows = Rows(&self.rows);
-            render::cast(&self.room, &self.lenses[camera], rows, &mut self.scratch);
+            let (rows, lens) = (Rows(&self.rows), &self.lenses[camera]);
+            render::cast(&self.room, lens, rows, &mut self.scratch);
             let pixels = &mut out.images[camera].pixels;
-            render::shade(&self.room, &self.lenses[camera], rows, &exposure, &mut self.scratch, pixels);
+            let Some(planes) = out.colours.get_mut(camera) else {
+                let exposure = Exposure { sensor: self.sensor, stream, channel: None };
+                render::shade(&self.room, lens, rows, &exposure, &mut self.scratch, pixels);
+                continue;
+            };
+            for (c, plane) in planes.iter_mut().enumerate() {
+                let stream = texture::hash(c as i32, 0, stream);
+                let exposure = Exposure { sensor: self.sensor, stream, channel: Some(c) };
+                render::shade(&self.room, lens, rows, &exposure, &mut self.scratch, &mut plane.pixels);
+            }
+            let [red, green, blue] = planes;
+            let rgb = red.pixels.iter().zip(&green.pixels).zip(&blue.pixels);
+            pixels.iter_mut().zip(rgb).for_each(|(grey, ((r, g), b))| *grey = luma(*r, *g, *b));
         }
     }
 

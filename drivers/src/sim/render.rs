@@ -103,6 +103,8 @@ pub struct Exposure {
     pub sensor: Sensor,
     /// Differs for every image of a run.
     pub stream: u32,
+    /// Of a colour image, which of red, green and blue this is.
+    pub channel: Option<usize>,
 }
 
 /// A solid as seen from a view: for the tile tests.
@@ -272,11 +274,12 @@ pub fn shade(room: &Room, lens: &Lens, views: Rows, exposure: &Exposure, scratch
                                 lists.tile(lens, views, tx, ty);
                                 listed = true;
                             }
-                            edge_radiance(room, lens, view, &lists.tile, x, y)
+                            edge_radiance(room, lens, view, &lists.tile, (x, y), exposure.channel)
                         } else if hits[i].face == NOTHING {
                             0.0
                         } else {
-                            radiance(room, view, view.turn * lens.bearings[i], hits[i], lens.pixel_angle[i])
+                            let d = view.turn * lens.bearings[i];
+                            radiance(room, view, d, hits[i], lens.pixel_angle[i], exposure.channel)
                         };
                         out[i - first_row * lens.width] =
                             develop(light * gain, offset, lens.bearings[i].z, i, exposure);
@@ -308,7 +311,7 @@ pub fn meter(room: &Room, lens: &Lens, view: View) -> f32 {
             if lens.pixel_angle[i] > 0.0 {
                 let d = view.turn * lens.bearings[i];
                 let (distance, face) = room.nearest(view.origin, d);
-                sum += radiance(room, view, d, Hit { distance, face }, lens.pixel_angle[i] * STEP as f32);
+                sum += radiance(room, view, d, Hit { distance, face }, lens.pixel_angle[i] * STEP as f32, None);
                 n += 1.0;
             }
         }
@@ -386,9 +389,9 @@ fn is_edge(hits: &[Hit], lens: &Lens, x: usize, y: usize) -> bool {
     differs && !outside
 }
 
-/// Light leaving a surface towards the camera.
+/// Light leaving a surface towards the camera; of all colours, or of one.
 #[inline]
-fn radiance(room: &Room, view: View, d: Vec3, hit: Hit, angle: f32) -> f32 {
+fn radiance(room: &Room, view: View, d: Vec3, hit: Hit, angle: f32, channel: Option<usize>) -> f32 {
     let face = &room.faces[hit.face as usize];
     let place = face.place(view.origin + d * hit.distance);
     // a ray turned by `angle` slides by angle·distance·|u - n (u·d)/(n·d)| along u
@@ -399,12 +402,20 @@ fn radiance(room: &Room, view: View, d: Vec3, hit: Hit, angle: f32) -> f32 {
     };
     let footprint = Vec2::new(slide(place.u), slide(place.v)) * (angle * hit.distance);
     let spot = Spot { at: place.at, footprint, size: face.size };
-    texture::albedo(face.material, face.seed, spot) * room.light_map.at(hit.face as usize, place.at)
+    let light = texture::albedo(face.material, face.seed, spot) * room.light_map.at(hit.face as usize, place.at);
+    channel.map_or(light, |c| light * texture::tint(face.material, face.seed)[c])
 }
 
 /// A pixel that several faces share: its rays are gathered by face, and each face is shaded once
 /// where its rays meet it on average.
-fn edge_radiance(room: &Room, lens: &Lens, view: View, list: &[Seen], x: usize, y: usize) -> f32 {
+fn edge_radiance(
+    room: &Room,
+    lens: &Lens,
+    view: View,
+    list: &[Seen],
+    (x, y): (usize, usize),
+    channel: Option<usize>,
+) -> f32 {
     const RAYS: usize = EDGE * EDGE;
     let angle = lens.pixel_angle[y * lens.width + x];
     let (du, dv) = lens.slopes(x, y);
@@ -425,7 +436,7 @@ fn edge_radiance(room: &Room, lens: &Lens, view: View, list: &[Seen], x: usize, 
         let distance = sum.length() / n;
         let hit = Hit { distance, face: *face };
         let share = n / RAYS as f32;
-        light += share * radiance(room, view, *sum / (distance * n), hit, angle * share.sqrt());
+        light += share * radiance(room, view, *sum / (distance * n), hit, angle * share.sqrt(), channel);
     }
     light
 }

@@ -57,6 +57,27 @@ pub fn albedo(material: Material, seed: u32, s: Spot) -> f32 {
     value.clamp(0.02, 0.95)
 }
 
+/// Red, green and blue of a surface over its grey; their luma is one.
+pub fn tint(material: Material, seed: u32) -> [f32; 3] {
+    let [r, g, b] = match material {
+        Material::Plaster => [1.0, 0.9, 0.75],
+        Material::Brick => [1.3, 0.75, 0.6],
+        Material::Concrete => [0.9, 1.0, 1.1],
+        Material::Parquet | Material::Crate => [1.3, 0.95, 0.5],
+        Material::CeilingTile | Material::Marble => [0.95, 1.0, 1.0],
+        Material::Books | Material::Rug => [1.4, 0.7, 0.8],
+        Material::Poster | Material::Print => [0.6, 0.9, 1.5],
+        Material::Plaid => [0.7, 1.2, 0.8],
+        Material::Drawers => [0.8, 0.9, 1.3],
+        Material::Leaves => [0.6, 1.3, 0.5],
+    };
+    // Two walls of one material are not of one paint.
+    let vary = |v: f32, c: i32| v * (0.8 + 0.4 * cell(c, 0, seed));
+    let [r, g, b] = [vary(r, 0), vary(g, 1), vary(b, 2)];
+    let luma = 0.299 * r + 0.587 * g + 0.114 * b;
+    [r / luma, g / luma, b / luma]
+}
+
 /// Counter-based hash of a lattice point (xxHash-like avalanche).
 #[inline]
 pub fn hash(x: i32, y: i32, seed: u32) -> u32 {

@@ -16,13 +16,25 @@ use std::path::Path;
 /// Writes all frames; `progress` is told (frames written, frames in all). `dir` must not exist or
 /// be empty; nothing is left behind on failure.
 pub fn write_euroc(sim: &mut Sim, dir: &Path, progress: impl FnMut(usize, usize)) -> Result<(), Fault> {
+    let frames = Frames::for_rig(sim.calibration());
+    write_shaped(sim, dir, frames, progress)
+}
+
+/// As `write_euroc`, with images in colour.
+pub fn write_euroc_colour(sim: &mut Sim, dir: &Path, progress: impl FnMut(usize, usize)) -> Result<(), Fault> {
+    let frames = Frames::in_colour(sim.calibration(), sim.calibration().cameras.len());
+    write_shaped(sim, dir, frames, progress)
+}
+
+/// Images are made and written as `frames` is shaped.
+fn write_shaped(sim: &mut Sim, dir: &Path, frames: Frames, progress: impl FnMut(usize, usize)) -> Result<(), Fault> {
     if fs::read_dir(dir).is_ok_and(|mut d| d.next().is_some()) || dir.is_file() {
         let fix = "remove it or choose another folder";
         return Err(Fault::new(Exit::CantCreate, dir.display().to_string(), "exists and is not an empty folder", fix));
     }
     let name = dir.file_name().map_or_else(|| "out".into(), |n| n.to_string_lossy().into_owned());
     let partial = dir.with_file_name(format!(".{name}.partial-{}", std::process::id()));
-    let written = write_all(sim, &partial.join("mav0"), progress)
+    let written = write_all(sim, &partial.join("mav0"), frames, progress)
         .and_then(|()| fs::rename(&partial, dir).map_err(|e| cannot(dir, &e.to_string())));
     if written.is_err() {
         // best effort: the first error is the one to report
@@ -31,7 +43,7 @@ pub fn write_euroc(sim: &mut Sim, dir: &Path, progress: impl FnMut(usize, usize)
     written
 }
 
-fn write_all(sim: &mut Sim, mav: &Path, progress: impl FnMut(usize, usize)) -> Result<(), Fault> {
+fn write_all(sim: &mut Sim, mav: &Path, frames: Frames, progress: impl FnMut(usize, usize)) -> Result<(), Fault> {
     let rig = sim.calibration().clone();
     for (k, camera) in rig.cameras.iter().enumerate() {
         let folder = mav.join(format!("cam{k}"));
@@ -55,11 +67,15 @@ fn write_all(sim: &mut Sim, mav: &Path, progress: impl FnMut(usize, usize)) -> R
     put(&truth.join("sensor.yaml"), &about)?;
     put(&truth.join("data.csv"), &truth_table(sim))?;
     put(&mav.join("body.yaml"), "comment: Stipple simulator\n")?;
-    write_images(sim, mav, progress)
+    write_images(sim, mav, frames, progress)
 }
 
-fn write_images(sim: &mut Sim, mav: &Path, mut progress: impl FnMut(usize, usize)) -> Result<(), Fault> {
-    let mut frames = Frames::for_rig(sim.calibration());
+fn write_images(
+    sim: &mut Sim,
+    mav: &Path,
+    mut frames: Frames,
+    mut progress: impl FnMut(usize, usize),
+) -> Result<(), Fault> {
     let (width, height) = (frames.images[0].width, frames.images[0].height);
     let mut depth = vec![0.0; width * height];
     let mut millimetres = vec![0u8; 2 * width * height];
@@ -69,23 +85,36 @@ fn write_images(sim: &mut Sim, mav: &Path, mut progress: impl FnMut(usize, usize
         let name = |camera: usize| format!("{}.png", sim.calibration().cameras[camera].from_imu_clock(frames.t).0);
         for (k, image) in frames.images.iter().enumerate() {
             let path = mav.join(format!("cam{k}")).join("data").join(name(k));
-            write_png(&path, image.width, image.height, png::BitDepth::Eight, &image.pixels)?;
+            let size = (image.width, image.height);
+            match frames.colours.get(k) {
+                None => write_png(&path, size, (png::ColorType::Grayscale, png::BitDepth::Eight), &image.pixels)?,
+                Some([r, g, b]) => {
+                    let rgb: Vec<u8> =
+                        (0..image.pixels.len()).flat_map(|i| [r.pixels[i], g.pixels[i], b.pixels[i]]).collect();
+                    write_png(&path, size, (png::ColorType::Rgb, png::BitDepth::Eight), &rgb)?;
+                }
+            }
         }
         let path = mav.join("depth0").join("data").join(name(0));
         sim.depth(i, 0, &mut depth);
         for (out, z) in millimetres.chunks_exact_mut(2).zip(&depth) {
             out.copy_from_slice(&((z * 1000.0).round().min(65535.0) as u16).to_be_bytes());
         }
-        write_png(&path, width, height, png::BitDepth::Sixteen, &millimetres)?;
+        write_png(&path, (width, height), (png::ColorType::Grayscale, png::BitDepth::Sixteen), &millimetres)?;
         progress(i + 1, count);
     }
     Ok(())
 }
 
-fn write_png(path: &Path, width: usize, height: usize, depth: png::BitDepth, data: &[u8]) -> Result<(), Fault> {
+fn write_png(
+    path: &Path,
+    (width, height): (usize, usize),
+    (colour, depth): (png::ColorType, png::BitDepth),
+    data: &[u8],
+) -> Result<(), Fault> {
     let file = fs::File::create(path).map_err(|e| cannot(path, &e.to_string()))?;
     let mut encoder = png::Encoder::new(std::io::BufWriter::new(file), width as u32, height as u32);
-    encoder.set_color(png::ColorType::Grayscale);
+    encoder.set_color(colour);
     encoder.set_depth(depth);
     encoder.set_compression(png::Compression::Fast);
     let mut writer = encoder.write_header().map_err(|e| cannot(path, &e.to_string()))?;
