@@ -38,13 +38,18 @@ const DRONE: [&str; 5] = [
     "budget.intersections=1500000",
 ];
 
-#[test]
-fn a_hundred_thousand_gaussians_take_at_most_128_mib_of_the_gpu() {
+fn gpu_bytes(more: &[&str]) -> u64 {
     let board = Path::new(env!("CARGO_MANIFEST_DIR")).join("board-configs/x86-igpu.toml");
     let mut check = Command::new(env!("CARGO_BIN_EXE_stipple"));
-    check.arg("check").arg(board).args(DRONE.iter().flat_map(|s| ["--set", s]));
+    check.arg("check").arg(board).args(DRONE.iter().chain(more).flat_map(|s| ["--set", s]));
     let table = String::from_utf8(check.output().unwrap().stdout).unwrap();
     let total = table.lines().find(|l| l.contains("gpu  total")).unwrap();
-    let bytes: u64 = total.split_whitespace().next().unwrap().parse().unwrap();
-    assert!(bytes <= 128 << 20, "{table}");
+    total.split_whitespace().next().unwrap().parse().unwrap()
+}
+
+#[test]
+fn a_hundred_thousand_gaussians_take_at_most_128_mib_of_the_gpu_with_the_depth_loss_or_without() {
+    let (without, with) = (gpu_bytes(&[]), gpu_bytes(&["map.depth_weight=0.1"]));
+    assert!(without < with && with <= 128 << 20, "{without} and {with} B");
+    assert!(gpu_bytes(&["map.colour=true"]) > without, "colour is counted");
 }
