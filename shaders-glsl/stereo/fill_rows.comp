@@ -1,6 +1,7 @@
 // Makes the data of the filter: each pixel's disparity with its weight. What is unknown takes the lesser of the nearest
 // disparities to its left and right with a smaller weight: what one eye does not see is behind what hides it, and left of
-// the first match nothing but the right is known. Further away than any hidden strip is wide the weight falls to a trace.
+// the first match nothing but the right is known. Where both are alike, more likely nothing could be matched, and their
+// surface goes on. Further away than any hidden strip is wide the weight falls to a trace.
 // One thread a row.
 // in   disparity
 // out  data: (weight * disparity, weight)
@@ -11,7 +12,9 @@ const float TRACE = 0.01;
 
 layout(push_constant) uniform Push {
     uvec2 size;
-    float weight;  // of a filled pixel, against 1
+    float weight;  // of a pixel filled in between disparities that are alike, against 1
+    float hidden;  // of another
+    float alike;   // px
     float reach;   // up to here the weight is whole, at twice as far a trace, px
 } push;
 
@@ -40,7 +43,8 @@ void main() {
         } else {
             const bool is_left = left.x >= 0.0 && (nearest.x < 0.0 || left.x <= nearest.x);
             const vec2 from = is_left ? left : nearest;
-            const float weight = push.weight * clamp(2.0 - abs(from.y - float(x)) / push.reach, TRACE, 1.0);
+            const bool between = left.x >= 0.0 && nearest.x >= 0.0 && abs(left.x - nearest.x) <= push.alike;
+            const float weight = (between ? push.weight : push.hidden) * clamp(2.0 - abs(from.y - float(x)) / push.reach, TRACE, 1.0);
             data[row + x] = from.x >= 0.0 ? weight * vec2(from.x, 1.0) : vec2(0.0);
         }
     }

@@ -10,6 +10,7 @@
 use super::confidence::Confidence;
 use super::onnx::Network;
 use super::opencv::OpenCv;
+use super::rectify_gpu::Rectifier;
 use super::sgm::{self, Sgm};
 use super::wls::Wls;
 use crate::config::{StereoConfig, StereoMethod};
@@ -115,6 +116,21 @@ impl Method {
             }
         }
     }
+}
+
+/// As `Method::compute`, of a raw pair, by the method that rectifies too.
+pub fn compute_raw(
+    sgm: &mut Sgm,
+    rectifier: &mut Rectifier,
+    gpu: &mut Gpu,
+    [left, right]: [&Image; 2],
+    out: &mut Disparity,
+) -> Result<(), Fault> {
+    if is_blind(left) || is_blind(right) {
+        out.forget();
+        return Ok(());
+    }
+    Ok(sgm.compute_raw(gpu, rectifier, [left, right], &mut out.px, &mut out.sigma_px)?)
 }
 
 /// Whether an image holds nothing to match: a covered or dead camera still shows noise of a level or two, and

@@ -11,16 +11,18 @@ pub mod method;
 pub mod onnx;
 pub mod opencv;
 pub mod rectify;
+pub mod rectify_gpu;
 pub mod sgm;
 pub mod wls;
 #[cfg(feature = "ximgproc")]
 pub mod ximgproc;
 
-use crate::config::StereoConfig;
+use crate::config::{StereoConfig, StereoMethod};
 use crate::gpu::Gpu;
 use crate::mem::Footprint;
 pub use method::{Disparity, Method};
 use rectify::{box_average, Rectification, Remap};
+use rectify_gpu::Rectifier;
 use stipple_drivers::{Calibration, Fault, Image, Pose, RigCamera};
 
 /// An undistorted camera: px = (fx x/z + cx, fy y/z + cy), integer = pixel centre.
@@ -84,6 +86,8 @@ pub struct Stereo {
     divisor: usize,
     maps: [Remap; 2],
     rectified: [Image; 2],
+    /// Of the method that runs on the GPU.
+    rectifier: Option<Rectifier>,
     method: Method,
     disparity: Disparity,
     valid: Vec<u8>,
@@ -100,6 +104,9 @@ impl Stereo {
         f.host("stereo: rectified pair", 2 * px);
         f.host("stereo: disparity and its deviation", 2 * px * size_of::<f32>());
         f.host("stereo: valid mask", px / (divisor * divisor) as usize);
+        if rectifies_on_gpu(calibration, config) {
+            f.extend(Rectifier::footprint(camera.width, camera.height));
+        }
         f.extend(Method::footprint(camera.width, camera.height, config));
         f
     }
@@ -109,7 +116,7 @@ impl Stereo {
         calibration: &Calibration,
         config: &StereoConfig,
         divisor: u32,
-        gpu: Option<&mut Gpu>,
+        mut gpu: Option<&mut Gpu>,
     ) -> Result<Stereo, Fault> {
         let r = Rectification::new(calibration)?;
         let full = r.camera;
@@ -118,12 +125,17 @@ impl Stereo {
         let maps = [r.map(&calibration.cameras[0]), r.map(&calibration.cameras[1])];
         let mapping = RectifiedCamera { pinhole: full.pinhole.divided(divisor), ..full };
         let valid = maps[0].valid_blocks(divisor);
+        let rectifier = match &mut gpu {
+            Some(gpu) if rectifies_on_gpu(calibration, config) => Some(Rectifier::new(gpu, width, height, &maps)?),
+            _ => None,
+        };
         Ok(Stereo {
             full,
             mapping,
             divisor,
             maps,
             rectified: [Image::new(width, height), Image::new(width, height)],
+            rectifier,
             method: Method::new(width, height, config, gpu)?,
             disparity: Disparity::new(width, height),
             valid,
@@ -177,10 +189,17 @@ impl Stereo {
         raw_right: &Image,
         out: &mut DepthMap,
     ) -> Result<usize, Fault> {
-        self.maps[0].apply(raw_left, &mut self.rectified[0]);
-        self.maps[1].apply(raw_right, &mut self.rectified[1]);
-        let [left, right] = &self.rectified;
-        self.method.compute(gpu, left, right, &mut self.disparity)?;
+        match (&mut self.method, &mut self.rectifier, gpu) {
+            (Method::Sgm(sgm), Some(rectifier), Some(gpu)) => {
+                method::compute_raw(sgm, rectifier, gpu, [raw_left, raw_right], &mut self.disparity)?;
+            }
+            (method, _, gpu) => {
+                self.maps[0].apply(raw_left, &mut self.rectified[0]);
+                self.maps[1].apply(raw_right, &mut self.rectified[1]);
+                let [left, right] = &self.rectified;
+                method.compute(gpu, left, right, &mut self.disparity)?;
+            }
+        }
         Ok(self.disparity_to_depth(out))
     }
 
@@ -222,6 +241,13 @@ impl Stereo {
         }
         found
     }
+}
+
+/// Where the matcher runs on the GPU and both raw images have the rectified one's size.
+fn rectifies_on_gpu(calibration: &Calibration, config: &StereoConfig) -> bool {
+    let [left, right, ..] = &calibration.cameras[..] else { return false };
+    let size = |c: &RigCamera| (c.camera.width, c.camera.height);
+    config.method == StereoMethod::Sgm && size(left) == size(right)
 }
 
 #[cfg(test)]

@@ -150,6 +150,18 @@ impl Remap {
         }
     }
 
+    /// As a kernel takes it, for raw rows of `stride` bytes: the source's place in bytes, all ones where there is none, and
+    /// the weights to the right and down.
+    pub fn taps(&self, stride: usize) -> Vec<[u32; 2]> {
+        let place =
+            |index: u32| (index as usize / self.source_width * stride + index as usize % self.source_width) as u32;
+        let one = |t: &Tap| match t.index {
+            OUTSIDE => [OUTSIDE, 0],
+            index => [place(index), u32::from(t.wx) | u32::from(t.wy) << 16],
+        };
+        self.taps.iter().map(one).collect()
+    }
+
     /// 1 for each `divisor` x `divisor` block that has a source everywhere.
     pub fn valid_blocks(&self, divisor: usize) -> Vec<u8> {
         let (w, h) = (self.width / divisor, self.height / divisor);

@@ -11,6 +11,7 @@
 //! read they are free, and what the filter needs lies where they were.
 //! All until the filter is integers, and no sum depends on the order of threads: the result is the same in every run.
 
+use super::rectify_gpu::{pack, Rectifier};
 use super::wls::Wls;
 use crate::config::StereoConfig;
 use crate::gpu::kernels::{
@@ -207,7 +208,32 @@ impl Sgm {
         deviation: &mut [f32],
     ) -> Result<(), GpuError> {
         self.load(gpu, left, right)?;
+        let rec = gpu.record();
+        self.finish(gpu, rec, disparity, deviation)
+    }
+
+    /// As `compute`, of a raw pair.
+    pub fn compute_raw(
+        &mut self,
+        gpu: &mut Gpu,
+        rectifier: &mut Rectifier,
+        [left, right]: [&Image; 2],
+        disparity: &mut [f32],
+        deviation: &mut [f32],
+    ) -> Result<(), GpuError> {
+        rectifier.load(gpu, left, right)?;
         let mut rec = gpu.record();
+        rectifier.record(&mut rec, self.b.images);
+        self.finish(gpu, rec, disparity, deviation)
+    }
+
+    fn finish(
+        &self,
+        gpu: &mut Gpu,
+        mut rec: Recorder,
+        disparity: &mut [f32],
+        deviation: &mut [f32],
+    ) -> Result<(), GpuError> {
         self.record_sums(&mut rec);
         self.record_matches(&mut rec);
         self.record_speckles(&mut rec);
@@ -219,13 +245,7 @@ impl Sgm {
 
     /// Copies the rectified pair to the GPU.
     pub fn load(&mut self, gpu: &mut Gpu, left: &Image, right: &Image) -> Result<(), GpuError> {
-        let (width, stride) = (self.shape.width, self.shape.width.next_multiple_of(4));
-        for (image, bytes) in [left, right].into_iter().zip(self.bytes.chunks_mut(self.shape.image_bytes())) {
-            debug_assert_eq!((image.width, image.height), (width, self.shape.height));
-            for (from, to) in image.pixels.chunks(width).zip(bytes.chunks_mut(stride)) {
-                to[..width].copy_from_slice(from);
-            }
-        }
+        pack(left, right, &mut self.bytes);
         gpu.upload(self.b.images.cast(), 0, &self.bytes)
     }
 

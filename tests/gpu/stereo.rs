@@ -1,12 +1,14 @@
 //! Semi-global matching and its filter: each stage against its twin, and that a result can be repeated to the bit.
 
 use super::stereo_scenes::{draw, Scene};
-use super::twins::stereo::{self as twin, Grey, Penalties};
+use super::twins::stereo::{self as twin, Grey, Penalties, Variance};
 use stipple::config::GpuConfig;
 use stipple::gpu::{Gpu, GpuOptions};
+use stipple::stereo::rectify::Rectification;
+use stipple::stereo::rectify_gpu::Rectifier;
 use stipple::stereo::sgm::{self, Sgm, Shape};
 use stipple::stereo::wls::Wls;
-use stipple_drivers::Image;
+use stipple_drivers::{Calibration, Camera, Image, ImuCalibration, Lens, Pose, RigCamera};
 
 pub fn shape(width: usize, height: usize, disparities: u32) -> Shape {
     Shape { width, height, disparities, paths: 8, uniqueness_percent: 10, wls: true }
@@ -124,7 +126,8 @@ fn filter_agrees_with_its_twin() {
     let (mut found, mut deviation) = (vec![0f32; w * h], vec![0f32; w * h]);
     gpu.download(sgm.buffers().disparity, 0, &mut found).unwrap();
     gpu.download(sgm.buffers().deviation, 0, &mut deviation).unwrap();
-    let mut data = twin::fill_rows(&disparity, w, f64::from(Wls::FILL), f64::from(Wls::FILL_REACH));
+    let mut data =
+        twin::fill_rows(&disparity, w, [Wls::FILL, Wls::HIDDEN, Wls::ALIKE_PX, Wls::FILL_REACH].map(f64::from));
     data = twin::median(&data, w);
     for pass in 0..Wls::PASSES {
         for columns in [false, true] {
@@ -132,11 +135,62 @@ fn filter_agrees_with_its_twin() {
             twin::smooth_lines(&grey(&left), &mut data, columns, lambda, f64::from(Wls::SIGMA));
         }
     }
-    for (i, d) in data.iter().enumerate() {
-        let limits = [Wls::WEIGHT_MIN, Wls::MATCHED, Wls::FILLED, Wls::FILL].map(f64::from);
-        let [a, b] = twin::settle(*d, limits);
+    let variance = Variance {
+        weight_min: f64::from(Wls::WEIGHT_MIN),
+        fill: f64::from(Wls::FILL),
+        least: f64::from(Wls::LEAST),
+        spread: f64::from(Wls::SPREAD),
+        faint: f64::from(Wls::FAINT),
+        missing: f64::from(Wls::MISSING),
+    };
+    for i in 0..w * h {
+        let [a, b] = twin::settle(&grey(&left), &data, i, &variance);
         assert!((f64::from(found[i]) - a).abs() < 1e-3, "pixel {i}: {} and {a}", found[i]);
         assert!((f64::from(deviation[i]) - b).abs() < 1e-3 * (1.0 + b), "pixel {i}: {} and {b}", deviation[i]);
+    }
+}
+
+#[test]
+fn raw_pairs_are_rectified_as_on_the_cpu() {
+    let lenses = [
+        Lens::Radtan { k1: -0.28, k2: 0.07, p1: 2e-4, p2: 2e-5 },
+        Lens::KannalaBrandt { k: [0.01, -0.01, 0.005, -0.001] },
+    ];
+    // Rows of whole words, and others.
+    for (lens, w) in lenses.into_iter().zip([120, 131]) {
+        let h = 83;
+        let (cx, cy) = (0.5 * w as f64 + 1.3, 0.5 * h as f64 - 0.7);
+        let camera = Camera { width: w, height: h, fx: 70.0, fy: 71.0, cx, cy, lens };
+        let right = Pose::new(glam::DQuat::from_rotation_z(0.02), glam::DVec3::new(0.1, 0.003, -0.002));
+        let rig = Calibration {
+            cameras: vec![RigCamera::new(camera, Pose::IDENTITY), RigCamera::new(camera, right)],
+            imu: ImuCalibration::CONSUMER,
+        };
+        let rectification = Rectification::new(&rig).unwrap();
+        let maps = [0, 1].map(|i| rectification.map(&rig.cameras[i]));
+        let (left, right) = draw(&Scene::steps(w, h), 6);
+        let stride = w.next_multiple_of(4);
+        let mut gpu = Gpu::open(&GpuConfig::default(), Rectifier::footprint(w, h).gpu_total() + (1 << 16)).unwrap();
+        let mut rectifier = Rectifier::new(&mut gpu, w, h, &maps).unwrap();
+        let images = gpu.alloc::<u32>("images", 2 * stride * h / 4).unwrap();
+        rectifier.load(&mut gpu, &left, &right).unwrap();
+        let mut rec = gpu.record();
+        rectifier.record(&mut rec, images);
+        gpu.submit(rec).unwrap();
+        let mut found = vec![0u8; 2 * stride * h];
+        gpu.download(images.cast(), 0, &mut found).unwrap();
+        for (side, raw) in [&left, &right].into_iter().enumerate() {
+            let mut expected = Image::new(w, h);
+            maps[side].apply(raw, &mut expected);
+            assert!(expected.pixels.iter().filter(|p| **p > 0).count() * 2 > w * h);
+            let mut padded = vec![0; stride * (h + 1)];
+            (0..h).for_each(|y| padded[y * stride..][..w].copy_from_slice(&raw.pixels[y * w..][..w]));
+            for (i, tap) in maps[side].taps(stride).into_iter().enumerate() {
+                let here = found[(side * h + i / w) * stride + i % w];
+                assert_eq!(here, expected.pixels[i], "side {side}, pixel {i}");
+                assert_eq!(here, twin::rectify(&padded, stride, tap), "side {side}, pixel {i}");
+            }
+        }
     }
 }
 

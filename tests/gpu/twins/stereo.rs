@@ -182,8 +182,19 @@ pub fn verify(
     own <= chance && (own > fit || !(repeats(-1) || repeats(1)))
 }
 
-/// Twin of fill_rows.comp: weighted disparities and weights.
-pub fn fill_rows(disparity: &[f32], width: usize, weight: f64, reach: f64) -> Vec<[f64; 2]> {
+/// Twin of rectify.comp, for rows of `stride` bytes: a pixel by its tap.
+pub fn rectify(raw: &[u8], stride: usize, [at, weights]: [u32; 2]) -> u8 {
+    if at == u32::MAX {
+        return 0;
+    }
+    let (at, wx, wy) = (at as usize, f64::from(weights & 0xffff) / 128.0, f64::from(weights >> 16) / 128.0);
+    let row = |i: usize| f64::from(raw[i]) * (1.0 - wx) + f64::from(raw[i + 1]) * wx;
+    (row(at) * (1.0 - wy) + row(at + stride) * wy + 0.5).floor() as u8
+}
+
+/// Twin of fill_rows.comp: weighted disparities and weights. Of a pixel filled in between disparities that are alike, of
+/// another, alike, and the reach.
+pub fn fill_rows(disparity: &[f32], width: usize, [fill, hidden, alike, reach]: [f64; 4]) -> Vec<[f64; 2]> {
     let mut data = Vec::new();
     for row in disparity.chunks(width) {
         let known: Vec<usize> = (0..width).filter(|x| row[*x] >= 0.0).collect();
@@ -191,9 +202,10 @@ pub fn fill_rows(disparity: &[f32], width: usize, weight: f64, reach: f64) -> Ve
             let left = known.iter().rev().find(|k| **k <= x);
             let right = known.iter().find(|k| **k >= x);
             let from = left.into_iter().chain(right).min_by(|a, b| row[**a].total_cmp(&row[**b]));
+            let between = left.zip(right).is_some_and(|(a, b)| f64::from((row[*a] - row[*b]).abs()) <= alike);
             data.push(from.map_or([0.0; 2], |k| {
                 let far = (2.0 - k.abs_diff(x) as f64 / reach).clamp(0.01, 1.0);
-                let weight = if *k == x { 1.0 } else { weight * far };
+                let weight = if *k == x { 1.0 } else { far * if between { fill } else { hidden } };
                 [weight * f64::from(row[*k]), weight]
             }));
         }
@@ -259,10 +271,34 @@ pub fn smooth_lines(image: &Grey, data: &mut [[f64; 2]], columns: bool, lambda: 
     }
 }
 
-/// Twin of settle.comp: disparity and its deviation. Limits are the least weight, the variances of matched and, added, of
-/// filled pixels, and the weight of the last.
-pub fn settle(data: [f64; 2], limits: [f64; 4]) -> [f64; 2] {
-    let ([sum, weight], [weight_min, matched, filled, fill]) = (data, limits);
-    let more = filled * (1.0 - weight).max(0.0) * (fill / weight.max(weight_min)).max(1.0);
-    [if weight >= weight_min { sum / weight } else { -1.0 }, (matched + more).sqrt()]
+/// Constants of settle.comp.
+pub struct Variance {
+    pub weight_min: f64,
+    pub fill: f64,
+    pub least: f64,
+    pub spread: f64,
+    pub faint: f64,
+    pub missing: f64,
+}
+
+/// Twin of settle.comp: disparity and its deviation.
+pub fn settle(image: &Grey, data: &[[f64; 2]], at: usize, c: &Variance) -> [f64; 2] {
+    let (w, h) = (image.width as i64, image.height as i64);
+    let (x, y) = (at as i64 % w, at as i64 / w);
+    let [sum, weight] = data[at];
+    if weight < c.weight_min {
+        return [-1.0, 0.0];
+    }
+    let found = sum / weight;
+    let around: Vec<(i64, i64)> = (-2..=2).flat_map(|v| (-2..=2).map(move |u| (u, v))).collect();
+    let inside = |(u, v): (i64, i64)| ((x + u).clamp(0, w - 1), (y + v).clamp(0, h - 1));
+    let of = |at: (i64, i64)| data[(at.1 * w + at.0) as usize];
+    let slope = |at: (i64, i64)| 0.5 * (f64::from(image.at(at.0 + 1, at.1)) - f64::from(image.at(at.0 - 1, at.1)));
+    let slopes = around.iter().map(|p| slope(inside(*p)).powi(2)).sum::<f64>() / 25.0;
+    let weights = around.iter().map(|p| of(inside(*p))[1].min(1.0)).sum::<f64>() / 25.0;
+    let beside = around.iter().filter(|(u, v)| u.abs() <= 1 && v.abs() <= 1).map(|p| of(inside(*p)));
+    let off = beside.filter(|d| d[1] >= c.weight_min).map(|d| (d[0] / d[1] - found).abs().min(3.0));
+    let spread = off.fold(0.0, f64::max);
+    let missing = c.missing * (1.0 - weights).max(0.0) * (c.fill / weight).max(1.0);
+    [found, (c.least + c.spread * spread * spread + c.faint / (1.0 + slopes) + missing).sqrt()]
 }
