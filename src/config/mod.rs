@@ -230,7 +230,8 @@ pub struct StereoConfig {
 impl Default for StereoConfig {
     fn default() -> Self {
         StereoConfig {
-            method: StereoMethod::Bm,
+            // What this program has: the other needs OpenCV.
+            method: if cfg!(feature = "opencv") { StereoMethod::Bm } else { StereoMethod::Sgm },
             wls: true,
             disparities: 96,
             block_px: 11,

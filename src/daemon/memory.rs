@@ -8,7 +8,7 @@ use crate::frontend::Frontend;
 use crate::limits::CAMERAS_MAX;
 use crate::map::{eyes, Mapper};
 use crate::mem::Footprint;
-use crate::stereo::Stereo;
+use crate::stereo::{Method, Stereo};
 use crate::vio::Vio;
 use stipple_drivers::{Calibration, Camera, Exit, Fault, ImuCalibration, Lens, Pose, RigCamera};
 
@@ -47,7 +47,7 @@ pub fn largest_rig(board: &Board) -> Calibration {
     Calibration { cameras: (0..cameras).map(|i| at(0.1 * i as f64)).collect(), imu: ImuCalibration::CONSUMER }
 }
 
-/// Refuses a rig whose images or bytes exceed the board's budget.
+/// Refuses a method of stereo that this program has not, and a rig whose images or bytes exceed the board's budget.
 pub fn admit(place: &str, calibration: &Calibration, board: &Board) -> Result<Footprint, Fault> {
     let (w, h) = (board.budget.image_width_max as usize, board.budget.image_height_max as usize);
     for (i, c) in calibration.cameras.iter().enumerate() {
@@ -56,6 +56,9 @@ pub fn admit(place: &str, calibration: &Calibration, board: &Board) -> Result<Fo
                 format!("camera {i} is {}x{} px, the board's budget is {w}x{h}", c.camera.width, c.camera.height);
             return Err(Fault::new(Exit::Config, place, what, "raise budget.image_width_max and image_height_max"));
         }
+    }
+    if board.map.enabled {
+        Method::admit(&board.stereo)?;
     }
     let f = footprint(calibration, board);
     let max = board.memory_max_mib << 20;

@@ -62,6 +62,16 @@ impl Method {
         f
     }
 
+    /// Whether this program has the method.
+    pub fn admit(config: &StereoConfig) -> Result<(), Fault> {
+        match config.method {
+            StereoMethod::Bm | StereoMethod::Sgbm if !cfg!(feature = "opencv") => {
+                Err(refused_without_opencv(config.method))
+            }
+            _ => Ok(()),
+        }
+    }
+
     /// `gpu` is for the methods that run there; its arena must hold the footprint.
     pub fn new(width: usize, height: usize, config: &StereoConfig, gpu: Option<&mut Gpu>) -> Result<Method, Fault> {
         match config.method {
@@ -150,9 +160,21 @@ fn without_gpu(method: StereoMethod) -> Fault {
 }
 
 /// Why `bm` and `sgbm` are refused by a program without OpenCV.
-#[cfg_attr(feature = "opencv", allow(dead_code))]
 pub fn refused_without_opencv(method: StereoMethod) -> Fault {
     let what = format!("`{}` is OpenCV's and this program was built without the cargo feature `opencv`", method.name());
     let fix = "set stereo.method = \"sgm\", or build with the feature (on by default; needs libopencv-calib3d-dev)";
     Fault::new(Exit::Config, "stereo.method", what, fix)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_program_without_opencv_says_so_and_what_to_use() {
+        let said = refused_without_opencv(StereoMethod::Sgbm).to_string();
+        assert!(said.contains("`sgbm`") && said.contains("feature `opencv`") && said.contains("\"sgm\""), "{said}");
+        let named = |method| Method::admit(&StereoConfig { method, ..StereoConfig::default() }).is_ok();
+        assert_eq!((named(StereoMethod::Bm), named(StereoMethod::Sgm)), (cfg!(feature = "opencv"), true));
+    }
 }
