@@ -1,13 +1,14 @@
 //! Semi-global matching and its filter: each stage against its twin, and that a result can be repeated to the bit.
 
-use super::stereo_scenes::{draw, Scene};
+use super::stereo_scenes::{draw, Scene, Texture};
 use super::twins::stereo::{self as twin, Grey, Penalties, Variance};
-use stipple::config::GpuConfig;
+use stipple::config::{GpuConfig, StereoConfig, StereoMethod};
 use stipple::gpu::{Gpu, GpuOptions};
 use stipple::stereo::rectify::Rectification;
 use stipple::stereo::rectify_gpu::Rectifier;
 use stipple::stereo::sgm::{self, Sgm, Shape};
 use stipple::stereo::wls::Wls;
+use stipple::stereo::{DepthMap, Stereo};
 use stipple_drivers::{Calibration, Camera, Image, ImuCalibration, Lens, Pose, RigCamera};
 
 pub fn shape(width: usize, height: usize, disparities: u32) -> Shape {
@@ -192,6 +193,52 @@ fn raw_pairs_are_rectified_as_on_the_cpu() {
             }
         }
     }
+}
+
+#[test]
+fn a_wall_seen_through_two_lenses_has_its_depth() {
+    let (w, h, wall_m) = (200, 140, 2.0);
+    let lens = Lens::Radtan { k1: -0.2, k2: 0.05, p1: 1e-4, p2: -1e-4 };
+    let camera = Camera { width: w, height: h, fx: 130.0, fy: 130.0, cx: 100.3, cy: 68.9, lens };
+    let right = Pose::new(glam::DQuat::from_rotation_y(0.01), glam::DVec3::new(0.1, 0.002, -0.001));
+    let rig = Calibration {
+        cameras: vec![RigCamera::new(camera, Pose::IDENTITY), RigCamera::new(camera, right)],
+        imu: ImuCalibration::CONSUMER,
+    };
+    let paint = Scene::of(w, h, [0.0; 3], Texture::Rough);
+    let draw = |c: &RigCamera| {
+        let mut image = Image::new(w, h);
+        for (i, px) in image.pixels.iter_mut().enumerate() {
+            let ray = c.camera.unproject(glam::DVec2::new((i % w) as f64, (i / w) as f64)).unwrap();
+            let d = c.body_from_cam.q * ray;
+            let p = c.body_from_cam.p + d * ((wall_m - c.body_from_cam.p.z) / d.z);
+            *px = paint.seen(0, p.x * 80.0, p.y * 80.0).0 as u8;
+        }
+        image
+    };
+    let images = [draw(&rig.cameras[0]), draw(&rig.cameras[1])];
+    let config = StereoConfig { method: StereoMethod::Sgm, disparities: 32, ..StereoConfig::default() };
+    let bytes = Stereo::footprint(&rig, &config, 2).gpu_total();
+    let mut gpu = Gpu::open(&GpuConfig::default(), bytes).unwrap();
+    let mut stereo = Stereo::new(&rig, &config, 2, Some(&mut gpu)).unwrap();
+    let camera = stereo.camera();
+    let mut depth = DepthMap::new(camera.pinhole.width, camera.pinhole.height);
+    let found = stereo.depth(Some(&mut gpu), &images[0], &images[1], &mut depth).unwrap();
+    assert!(found * 10 > depth.metres.len() * 8, "{found} of {}", depth.metres.len());
+    let mut off: Vec<f64> = Vec::new();
+    for (i, z) in depth.metres.iter().enumerate().filter(|(_, z)| **z > 0.0) {
+        let (x, y) = ((i % depth.width) as f64, (i / depth.width) as f64);
+        let p = camera.pinhole;
+        let ray = glam::DVec3::new((x - p.cx) / p.fx, (y - p.cy) / p.fy, 1.0);
+        off.push((camera.body_from_rect.transform(ray * f64::from(*z)).z - wall_m).abs());
+    }
+    off.sort_by(f64::total_cmp);
+    // A tenth of a pixel of about 6.5 is 3 cm.
+    assert!(off[off.len() / 2] < 0.03, "median error {} m", off[off.len() / 2]);
+    assert!(off[off.len() * 95 / 100] < 0.15, "95 % error {} m", off[off.len() * 95 / 100]);
+    // One eye covered: no depth.
+    let found = stereo.depth(Some(&mut gpu), &images[0], &Image::new(w, h), &mut depth).unwrap();
+    assert_eq!((found, depth.metres.iter().filter(|z| **z > 0.0).count()), (0, 0));
 }
 
 #[test]

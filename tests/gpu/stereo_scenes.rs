@@ -55,7 +55,7 @@ impl Scene {
     }
 
     /// Grey level and left position of what side 0 or 1 sees at (x, y).
-    fn seen(&self, side: usize, x: f64, y: f64) -> (f64, f64, f64) {
+    pub fn seen(&self, side: usize, x: f64, y: f64) -> (f64, f64, f64) {
         let mut front = (0.0, x, 0.0);
         for (k, layer) in self.layers.iter().enumerate() {
             let [a, b, c] = layer.plane;
