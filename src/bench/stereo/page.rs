@@ -7,6 +7,9 @@ use crate::output::chart::{bars, escape, Chart, Series};
 use crate::output::html::figure;
 use std::io::{self, Write};
 
+/// Widest picture within the page, px; those in `pictures/` are larger.
+const WIDTH_MAX: usize = 1200;
+
 const PROTOCOL: &str = "A pixel counts if its truth is known; in the columns of visible pixels, if the right eye sees it too. Density is the share of counting pixels that have a disparity. A pixel without one is not bad, but lowers the density: bad 1, bad 2 (error above 1 and 2 px) and the mean absolute error are over counting pixels that have one. The same for every method. Residual variance: of error over stated deviation, visible pixels with an error of at most 3 px; 1 is calibrated, and what is beyond is given as gross. Time is wall time of one pair, matching and deviation, rectification not included; the median over the set's pairs. Bytes are those of the method's row in the byte table; of OpenCV's own buffers an estimate, of its filter none.";
 
 pub fn write(out: &mut impl Write, bench: &Bench) -> io::Result<()> {
@@ -48,7 +51,7 @@ pub fn write(out: &mut impl Write, bench: &Bench) -> io::Result<()> {
         out.write_all(rows(bench, set, about).as_bytes())?;
         for (name, picture) in bench.pictures.iter().filter(|(n, _)| n.rsplit_once('-').is_some_and(|n| n.0 == *set)) {
             let caption = format!("{name}: left eye, truth, disparity, error (to 4 px), deviation (to 2 px)");
-            figure(out, &caption, picture)?;
+            figure(out, &caption, &picture.shrunk(WIDTH_MAX))?;
         }
     }
     foot(out)
