@@ -97,6 +97,7 @@ pub(super) const BOUNDS: &[(&str, Bound)] = &[
     ("map.seeds_per_anchor", Within(1.0, 1_000_000.0)),
     ("map.burst_iterations", Within(0.0, 10_000.0)),
     ("map.wrong_error", Within(0.0, 1.0)),
+    ("map.wrong_after_steps", Within(0.0, 1_000_000.0)),
     ("map.burst_rate", Within(0.01, 100.0)),
     ("map.densify_max", Within(0.0, 16_384.0)),
     ("map.converge_iterations_max", Within(0.0, 10_000.0)),

@@ -122,6 +122,8 @@ pub struct Mapper {
     scene_depth_m: f64,
     /// Started.
     iterations: u64,
+    /// What that was when the last anchor came.
+    anchored_at: u64,
     under_way: Option<UnderWay>,
     /// Of the last training step that has ended.
     loss: f64,
@@ -197,6 +199,7 @@ impl Mapper {
             added: Added::default(),
             scene_depth_m: SCENE_DEPTH_M,
             iterations: 0,
+            anchored_at: 0,
             under_way: None,
             loss: 0.0,
             counters: Counters::default(),
