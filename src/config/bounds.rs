@@ -94,6 +94,7 @@ pub(super) const BOUNDS: &[(&str, Bound)] = &[
     ("map.occupancy_cell_m", Positive),
     ("map.occupancy_cells", PowerOfTwo(1024.0, 16_777_216.0)),
     ("map.move_tolerance", Within(0.0, 1000.0)),
+    ("map.seeds_per_step", Within(0.0, 1_000_000.0)),
     ("map.seeds_per_anchor", Within(1.0, 1_000_000.0)),
     ("map.burst_iterations", Within(0.0, 10_000.0)),
     ("map.wrong_error", Within(0.0, 1.0)),

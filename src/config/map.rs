@@ -52,6 +52,12 @@ pub struct MapConfig {
     pub move_tolerance: f64,
     /// Gaussians an anchor may seed.
     pub seeds_per_anchor: u32,
+    /// Gaussians it may seed, and then add by densification, for every training step that keyframes got so far on average;
+    /// 0: no limit. `bench map` of V1_01 on lavapipe, scale 4, 12 s, caps of 20, 52, 100 and 200 k: without it 21.86, 19.31,
+    /// 17.06 and 17.55 dB; at 100 23.07, 22.28, 21.31 and 22.76; at 50 23.32, 22.94 and 22.73. Off all the same: V1_01 in
+    /// recorded pace at scale 2 was as good with it until the flight's last seconds, full of keyframes, and then ended at
+    /// 19.3 (50) and 19.6 dB (100) instead of 23.1, one run each, for a reason not understood.
+    pub seeds_per_step: u32,
     /// Steps on a new anchor alone before uniform sampling resumes.
     pub burst_iterations: u32,
     /// Learning rates of such a step over those of others.
@@ -124,6 +130,7 @@ impl Default for MapConfig {
             occupancy_cells: 1 << 18,
             move_tolerance: 0.02,
             seeds_per_anchor: 8192,
+            seeds_per_step: 0,
             burst_iterations: 20,
             burst_rate: 1.0,
             densify_max: 4096,

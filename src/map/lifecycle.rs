@@ -46,6 +46,8 @@ const DEPTH_MIN: f64 = 0.01;
 const STEPS_OF_PROOF: u32 = 10;
 /// Fewer steps than this and a Gaussian's importance is not known.
 const STEPS_JUDGED: u32 = 30;
+/// Steps a keyframe that the first anchor counts on, before any is known.
+const STEPS_ASSUMED: usize = 8;
 /// Part of the pool that one anchor may evict.
 const EVICTED_MAX: usize = 16;
 /// Part of what is free that a whole uncovered view may take, so that there is always room for the next; and part of
@@ -164,7 +166,17 @@ impl Mapper {
     fn seeds_of_a_view(&self) -> usize {
         let pool = self.pipeline.shape().splats as usize;
         let share = if self.config.evict { pool / POOL_SHARE } else { self.room().div_ceil(FREE_SHARE) };
-        share.min(self.config.seeds_per_anchor as usize)
+        share.min(self.config.seeds_per_anchor as usize).min(self.affordable())
+    }
+
+    /// Gaussians that an anchor may add at the steps a keyframe gets here: more than are trained cost every later step
+    /// its time and give nothing back.
+    fn affordable(&self) -> usize {
+        let steps = self.iterations / self.store.training().len().max(1) as u64;
+        match self.config.seeds_per_step as usize {
+            0 => usize::MAX,
+            limit => limit * (steps as usize).max(STEPS_ASSUMED),
+        }
     }
 
     /// Removes what is faint, huge or not finite, and where that leaves less room than wanted, the least important.
@@ -234,7 +246,8 @@ impl Mapper {
         let goal = self.goal(index);
         self.pipeline.similarity(&mut self.gpu, goal, &mut self.similarity)?;
         let lacking = 0.5 * (1.0 - mean(&self.similarity, &self.eye(index).valid));
-        let wanted = self.growth.allowed((f64::from(self.config.densify_max) * lacking) as usize);
+        let wanted = (f64::from(self.config.densify_max) * lacking) as usize;
+        let wanted = self.growth.allowed(wanted.min(self.affordable()));
         let wanted = wanted.min(self.make_room(wanted)?);
         let depth = self.pair.as_ref().map_or(&self.depth, |pair| &pair.distance);
         let planes = self.store.planes(index);
