@@ -8,6 +8,7 @@ use stipple::config::Board;
 use stipple::daemon::{self, Pace};
 use stipple::mem::CountingAllocator;
 use stipple::output::OutputDir;
+use stipple_drivers::replay::{OpenOptions, Recording};
 use stipple_drivers::{Exit, Fault};
 
 #[global_allocator]
@@ -250,6 +251,8 @@ fn run(command: Command) -> Result<(), Fault> {
         Command::Bench { what: Bench::Stereo { dataset, out, recordings, board, poses, seconds, set, quick } } => {
             let loaded = board.as_deref().map(|path| Board::load(path, &set)).transpose()?;
             let options = bench::stereo::Options { recordings, board: loaded, quick, seconds };
+            // A wrong folder is told now, not after the minutes that come before the maps.
+            dataset.as_deref().map(|path| Recording::open(path, &OpenOptions::default())).transpose()?;
             let maps = dataset.is_some();
             let what = daemon::Benched { dataset, board, poses, set };
             let run = |job: &bench::map::Job, dir: &OutputDir| daemon::benched(&what, job, dir);

@@ -448,7 +448,7 @@ fn colour_is_given_beside_the_same_grey() {
     use png::{BitDepth::*, ColorType::*};
     let rgb: Vec<u8> = grey().iter().flat_map(|g| [*g, 255 - *g, g.wrapping_mul(3)]).collect();
     let f = Folder::new();
-    f.write(&format!("cam0/data/{T0}.png"), &png(Rgb, Eight, W, H, &rgb));
+    f.write(&format!("cam0/data/{T0}.png"), png(Rgb, Eight, W, H, &rgb));
     let r = f.open().unwrap();
     let (mut plain, mut coloured) = (Frames::for_rig(&r.calibration), Frames::in_colour(&r.calibration, 2));
     let mut reader = r.reader();
