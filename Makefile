@@ -12,9 +12,15 @@
 #   vulkan-validationlayers  the tests run the pipeline under the Khronos validation layer
 PACKAGES := g++ glslang-tools libopencv-calib3d-dev libvulkan1 mesa-vulkan-drivers vulkan-validationlayers
 
+# What `make hil` needs besides: a machine to emulate, and the headers of the kernel it boots.
+#   qemu-system-x86 busybox-static cpio kmod xz-utils  the machine and its first file system
+#   linux-headers-amd64    builds the modules that Debian does not (tests/hil/prepare.sh)
+#   gpiod i2c-tools v4l-utils  what a failing test is looked into with
+HIL_PACKAGES := busybox-static cpio gpiod i2c-tools kmod linux-headers-amd64 qemu-system-x86 v4l-utils xz-utils
+
 OUT ?= out/demo
 
-.PHONY: demo test test-onnx soak bench-odometry lint deps
+.PHONY: demo test hil test-onnx soak bench-odometry lint deps
 
 demo: deps
 	cargo build --release --locked
@@ -24,6 +30,12 @@ test: deps
 	cargo check --locked --no-default-features --all-targets
 	cargo test --workspace --locked --no-fail-fast
 	@$(MAKE) --no-print-directory test-onnx
+
+# The drivers on the real V4L2, USB, I2C, SPI, IIO and GPIO of Debian's kernel, emulated: minutes. TESTS="uvc" runs some.
+hil:
+	@$(MAKE) --no-print-directory deps PACKAGES="$(PACKAGES) $(HIL_PACKAGES)"
+	tests/hil/prepare.sh
+	tests/hil/run $(TESTS)
 
 # The tests that ONNX Runtime must be there for. Debian 12 does not package it; pip has it.
 test-onnx:
