@@ -3,14 +3,17 @@
 //! This crate builds and tests without Vulkan or OpenCV. It owns the plain data that crosses from
 //! sensors to estimators (`Nanos`, `ImuSample`, `Image`, `Frames`, `Pose`, `Calibration`, `Fault`),
 //! the camera models (calibration is a property of the sensor, and the simulator renders with the
-//! same models the estimator inverts), the reader of recordings and the simulator.
+//! same models the estimator inverts), what a run reads sensors through (`source`), the reader of recordings and
+//! the simulator.
 
 pub mod calibration;
 pub mod camera;
 pub mod fault;
 pub mod host;
+pub mod paced;
 pub mod replay;
 pub mod sim;
+pub mod source;
 pub mod types;
 
 pub use calibration::{Calibration, ImuCalibration, ImuCorrection, RigCamera};

@@ -112,6 +112,15 @@ impl Frames {
         Frames { t: Nanos(0), images: calibration.cameras.iter().map(shape).collect(), colours: Vec::new() }
     }
 
+    /// Copies frames of the same shape; allocates nothing.
+    pub fn copy_from(&mut self, other: &Frames) {
+        self.t = other.t;
+        let colours = self.colours.iter_mut().flatten().zip(other.colours.iter().flatten());
+        for (to, from) in self.images.iter_mut().zip(&other.images).chain(colours) {
+            to.copy_from(from);
+        }
+    }
+
     /// The first `cameras` of the rig in colour too.
     pub fn in_colour(calibration: &crate::Calibration, cameras: usize) -> Frames {
         let mut frames = Frames::for_rig(calibration);

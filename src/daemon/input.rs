@@ -2,7 +2,8 @@
 
 use crate::config::{ReplayConfig, RigConfig};
 use std::path::{Path, PathBuf};
-use stipple_drivers::replay::{FrameFault, OpenOptions, Reader, Recording};
+use stipple_drivers::paced::Images;
+use stipple_drivers::replay::{OpenOptions, Recording};
 use stipple_drivers::sim::{Scenario, Sim};
 use stipple_drivers::{Calibration, Fault, Frames, ImuSample, Nanos, Span, TimedPose};
 
@@ -15,53 +16,7 @@ pub struct Input {
     pub truth: Vec<TimedPose>,
     pub warnings: Vec<String>,
     pub counters: Vec<(&'static str, u64)>,
-    pub source: Source,
-}
-
-pub enum Source {
-    Recording(Reader),
-    Rendered(Vec<Frames>),
-}
-
-impl Source {
-    /// Reads frame `index` into pre-shaped `out`; one that cannot be read is kept among `warnings`.
-    pub fn read(&mut self, index: usize, out: &mut Frames) -> Result<(), FrameFault> {
-        match self {
-            Source::Recording(reader) => reader.read(index, out),
-            Source::Rendered(frames) => {
-                let from = &frames[index];
-                out.t = from.t;
-                let colours = out.colours.iter_mut().flatten().zip(from.colours.iter().flatten());
-                for (to, from) in out.images.iter_mut().zip(&from.images).chain(colours) {
-                    to.copy_from(from);
-                }
-                Ok(())
-            }
-        }
-    }
-
-    /// Whether the first `cameras` are in colour.
-    pub fn has_colour(&self, cameras: usize) -> bool {
-        match self {
-            Source::Recording(reader) => reader.has_colour(cameras),
-            Source::Rendered(frames) => frames.iter().all(|f| f.colours.len() >= cameras),
-        }
-    }
-
-    pub fn warnings(&self) -> &[String] {
-        match self {
-            Source::Recording(reader) => reader.warnings(),
-            Source::Rendered(_) => &[],
-        }
-    }
-
-    /// What reading met: counters by name.
-    pub fn counters(&self) -> Vec<(&'static str, u64)> {
-        match self {
-            Source::Recording(reader) => reader.counters().list(),
-            Source::Rendered(_) => vec![],
-        }
-    }
+    pub source: Images,
 }
 
 impl Input {
@@ -84,7 +39,7 @@ impl Input {
             imu: r.imu,
             truth: r.truth,
             warnings: r.warnings,
-            source: Source::Recording(reader),
+            source: Images::Recording(reader),
         })
     }
 
@@ -112,7 +67,7 @@ impl Input {
             truth: sim.truth(),
             warnings: vec![],
             counters: vec![],
-            source: Source::Rendered(frames),
+            source: Images::Rendered(frames),
         })
     }
 

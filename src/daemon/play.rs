@@ -4,7 +4,7 @@
 //! the estimator is behind, the newest frame waits for it and replaces the one that waited before,
 //! which is counted. `lockstep`: a stated number of mapper steps a frame; the same input, the same map.
 
-use super::input::{Input, Source};
+use super::input::Input;
 use super::lockstep::lockstep;
 use super::mapping::{KeyframeQueue, Mapping, SLICE};
 use super::pipeline::{Bell, Ends, Pipeline};
@@ -16,6 +16,7 @@ use crate::mem::{seal_thread, unsealed};
 use crossbeam_queue::ArrayQueue;
 use std::sync::atomic::{AtomicBool, Ordering, Ordering::Relaxed};
 use std::time::{Duration, Instant};
+use stipple_drivers::paced::Images;
 use stipple_drivers::{ImuSample, Nanos, Pose};
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
@@ -238,7 +239,7 @@ fn newest(s: &Shared) -> Option<Box<Slot>> {
 }
 
 /// Thread `source`, in the place of the sensors: decodes ahead, delivers at the recorded time.
-fn feed(s: &Shared, tracking: &Bell, source: &mut Source, stamps: &[Nanos], imu: &[ImuSample]) {
+fn feed(s: &Shared, tracking: &Bell, source: &mut Images, stamps: &[Nanos], imu: &[ImuSample]) {
     let mut imu = imu.iter().copied();
     for (i, &t) in stamps.iter().enumerate() {
         let Some(mut slot) = s.spare.pop() else {

@@ -1,0 +1,214 @@
+//! A recording, or a flight rendered into memory, as a pair of sources: delivered at its recorded time by the
+//! monotonic clock. What is late is delivered at once and in order, as by a device with a queue.
+
+use crate::replay::{FrameFault, Reader};
+use crate::source::{FrameSource, ImuBatch, ImuReading, ImuSource, SourceFault, Wait};
+use crate::types::{Frames, ImuSample, Nanos, Span};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+/// Images of a recording on disk, or rendered.
+pub enum Images {
+    Recording(Reader),
+    Rendered(Vec<Frames>),
+}
+
+impl Images {
+    /// Reads frame `index` into pre-shaped `out`; one that cannot be read is kept among `warnings`.
+    pub fn read(&mut self, index: usize, out: &mut Frames) -> Result<(), FrameFault> {
+        match self {
+            Images::Recording(reader) => reader.read(index, out),
+            Images::Rendered(frames) => {
+                out.copy_from(&frames[index]);
+                Ok(())
+            }
+        }
+    }
+
+    /// Whether the first `cameras` are in colour.
+    pub fn has_colour(&self, cameras: usize) -> bool {
+        match self {
+            Images::Recording(reader) => reader.has_colour(cameras),
+            Images::Rendered(frames) => frames.iter().all(|f| f.colours.len() >= cameras),
+        }
+    }
+
+    pub fn warnings(&self) -> &[String] {
+        match self {
+            Images::Recording(reader) => reader.warnings(),
+            Images::Rendered(_) => &[],
+        }
+    }
+
+    /// What reading met: counters by name.
+    pub fn counters(&self) -> Vec<(&'static str, u64)> {
+        match self {
+            Images::Recording(reader) => reader.counters().list(),
+            Images::Rendered(_) => vec![],
+        }
+    }
+}
+
+/// When what was recorded at an instant is due. Both sources of a recording are given the same.
+#[derive(Clone, Copy, Debug)]
+pub struct Pace {
+    first: Nanos,
+    start: Instant,
+    /// Seconds of the recording a second.
+    speed: f64,
+}
+
+impl Pace {
+    /// What was recorded at `first` is due now.
+    pub fn starting(first: Nanos) -> Pace {
+        Pace::at_speed(first, 1.0)
+    }
+
+    /// So many times as fast as it was recorded.
+    pub fn at_speed(first: Nanos, speed: f64) -> Pace {
+        Pace { first, start: Instant::now(), speed }
+    }
+
+    fn due(&self, t: Nanos) -> Instant {
+        self.start + Duration::from_secs_f64(((t - self.first).secs() / self.speed).max(0.0))
+    }
+
+    /// Sleeps until `t` is due; false where that is after `limit`, until which it slept then.
+    fn wait(&self, t: Nanos, limit: Instant) -> bool {
+        let due = self.due(t);
+        std::thread::sleep(due.min(limit).saturating_duration_since(Instant::now()));
+        due <= limit
+    }
+}
+
+fn after(timeout: Span) -> Instant {
+    Instant::now() + Duration::from_nanos(timeout.0.max(0) as u64)
+}
+
+pub struct PacedFrames {
+    images: Images,
+    stamps: Vec<Nanos>,
+    pace: Pace,
+    next: usize,
+    unreadable: u64,
+}
+
+impl PacedFrames {
+    /// Frame i of `images` bears stamp i; those beyond the stamps are not played.
+    pub fn new(images: Images, stamps: Vec<Nanos>, pace: Pace) -> PacedFrames {
+        PacedFrames { images, stamps, pace, next: 0, unreadable: 0 }
+    }
+}
+
+impl FrameSource for PacedFrames {
+    /// Decodes ahead of the frame's time, so that decoding does not make it late.
+    fn next(&mut self, timeout: Span, frames: &mut Frames) -> Result<Wait, SourceFault> {
+        let limit = after(timeout);
+        loop {
+            let Some(&t) = self.stamps.get(self.next) else { return Ok(Wait::Ended) };
+            if self.pace.due(t) > limit {
+                self.pace.wait(t, limit);
+                return Ok(Wait::TimedOut);
+            }
+            let read = self.images.read(self.next, frames);
+            self.next += 1;
+            self.pace.wait(t, limit);
+            match read {
+                Ok(()) => return Ok(Wait::Got),
+                Err(_) => self.unreadable += 1,
+            }
+        }
+    }
+
+    fn counters(&self) -> Vec<(&'static str, u64)> {
+        let mut list = self.images.counters();
+        list.push(("frames_unreadable", self.unreadable));
+        list
+    }
+
+    fn warnings(&self) -> &[String] {
+        self.images.warnings()
+    }
+}
+
+pub struct PacedImu {
+    samples: Arc<[ImuSample]>,
+    pace: Pace,
+    next: usize,
+}
+
+impl PacedImu {
+    pub fn new(samples: Arc<[ImuSample]>, pace: Pace) -> PacedImu {
+        PacedImu { samples, pace, next: 0 }
+    }
+}
+
+impl ImuSource for PacedImu {
+    fn next(&mut self, timeout: Span, batch: &mut ImuBatch) -> Result<Wait, SourceFault> {
+        batch.clear();
+        let Some(first) = self.samples.get(self.next) else { return Ok(Wait::Ended) };
+        if !self.pace.wait(first.t, after(timeout)) {
+            return Ok(Wait::TimedOut);
+        }
+        let now = Instant::now();
+        while let Some(&sample) = self.samples.get(self.next).filter(|s| self.pace.due(s.t) <= now) {
+            if batch.push(ImuReading { sample, ..ImuReading::default() }).is_err() {
+                break;
+            }
+            self.next += 1;
+        }
+        Ok(Wait::Got)
+    }
+
+    fn counters(&self) -> Vec<(&'static str, u64)> {
+        vec![]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+    use crate::types::Image;
+
+    const MS: i64 = 1_000_000;
+
+    fn frames(n: i64) -> (Images, Vec<Nanos>) {
+        let frame = |i: i64| Frames { t: Nanos(i * 20 * MS), images: vec![Image::new(2, 2)], colours: vec![] };
+        (Images::Rendered((0..n).map(frame).collect()), (0..n).map(|i| Nanos(i * 20 * MS)).collect())
+    }
+
+    #[test]
+    fn frames_come_in_order_not_before_their_time_and_end() {
+        let (images, stamps) = frames(4);
+        let pace = Pace::starting(stamps[0]);
+        let mut source = PacedFrames::new(images, stamps, pace);
+        let mut out = Frames { images: vec![Image::new(2, 2)], ..Frames::default() };
+        let (mut seen, mut waits) = (vec![], 0);
+        loop {
+            match source.next(Span(7 * MS), &mut out).unwrap() {
+                Wait::Got => {
+                    assert!(Instant::now() >= pace.due(out.t));
+                    seen.push(out.t.0 / MS);
+                }
+                Wait::TimedOut => waits += 1,
+                Wait::Ended => break,
+            }
+        }
+        assert_eq!(seen, [0, 20, 40, 60]);
+        assert!(waits >= 3, "{waits}");
+    }
+
+    #[test]
+    fn every_sample_comes_once_however_late_it_is_asked_for() {
+        let sample = |i: i64| ImuSample { t: Nanos(i * MS), ..ImuSample::default() };
+        let samples: Arc<[ImuSample]> = (0..1000).map(sample).collect();
+        let mut source = PacedImu::new(samples, Pace::at_speed(Nanos(0), 1e3));
+        std::thread::sleep(Duration::from_millis(2));
+        let (mut batch, mut seen) = (ImuBatch::new(), vec![]);
+        while source.next(Span(MS), &mut batch).unwrap() != Wait::Ended {
+            seen.extend(batch.iter().map(|r| r.sample.t.0 / MS));
+        }
+        assert_eq!(seen, (0..1000).collect::<Vec<_>>());
+    }
+}

@@ -1,0 +1,172 @@
+//! Sensors as a run reads them: a camera rig and an inertial unit, each on a thread of its own.
+//!
+//! Hardware and recordings (`paced`) are sources alike, and the fault injector (`inject`) wraps either. Stamps of
+//! frames are mid-exposure; they and those of inertial samples are `CLOCK_MONOTONIC` of the host, or a recording's
+//! clock. The caller lends the buffers, which are shaped once: a source allocates nothing after it was opened,
+//! save to say a fault.
+//!
+//! A cable that comes loose is no end: `next` answers `Lost` for as long as the device is gone, looks for it
+//! again on every call, and goes on with `Got` when it is back.
+
+use crate::types::{Frames, ImuSample, Span};
+use crate::Fault;
+use std::fmt;
+
+/// A rig of cameras.
+pub trait FrameSource: Send {
+    /// Waits for the next frame, `timeout` at most, and fills `frames`, which is shaped by `Frames::for_rig` or
+    /// `in_colour`. Unless it answers `Got` its pixels are unspecified.
+    fn next(&mut self, timeout: Span, frames: &mut Frames) -> Result<Wait, SourceFault>;
+
+    /// What was met so far, by name.
+    fn counters(&self) -> Vec<(&'static str, u64)>;
+
+    /// The first few of what was met, a line each.
+    fn warnings(&self) -> &[String] {
+        &[]
+    }
+}
+
+/// An inertial unit.
+pub trait ImuSource: Send {
+    /// Waits for samples, `timeout` at most, and fills `batch` with them in the order of their stamps; it is empty
+    /// unless the answer is `Got`.
+    fn next(&mut self, timeout: Span, batch: &mut ImuBatch) -> Result<Wait, SourceFault>;
+
+    /// What was met so far, by name.
+    fn counters(&self) -> Vec<(&'static str, u64)>;
+}
+
+/// What waiting for a source came to.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Wait {
+    Got,
+    TimedOut,
+    /// Nothing more comes: a recording is over.
+    Ended,
+}
+
+/// Why a source gives nothing. The fault says which device, what happened to it and what to do.
+#[derive(Clone, Debug, PartialEq)]
+pub enum SourceFault {
+    /// Unplugged or silent. Later calls look for it again, and wait out their timeout before they answer this anew.
+    Lost(Fault),
+    /// Calling again is of no use.
+    Broken(Fault),
+}
+
+impl SourceFault {
+    pub fn fault(&self) -> &Fault {
+        match self {
+            SourceFault::Lost(fault) | SourceFault::Broken(fault) => fault,
+        }
+    }
+}
+
+impl fmt::Display for SourceFault {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let verb = if matches!(self, SourceFault::Lost(_)) { "lost" } else { "broken" };
+        write!(f, "{verb}: {}", self.fault())
+    }
+}
+
+impl std::error::Error for SourceFault {}
+
+/// An inertial sample with what its source knows beside it.
+#[derive(Clone, Copy, Debug, PartialEq, Default)]
+pub struct ImuReading {
+    pub sample: ImuSample,
+    pub temperature_c: Option<f32>,
+    /// An axis stands at the end of its range.
+    pub saturated: bool,
+}
+
+/// Samples of one call: more than the largest FIFO of the units we drive holds (LSM6DSOX: 219), fewer than a tenth
+/// of what a run queues.
+pub const IMU_BATCH: usize = 256;
+
+/// Readings in place, oldest first.
+#[derive(Clone, Debug)]
+pub struct ImuBatch {
+    readings: [ImuReading; IMU_BATCH],
+    len: usize,
+}
+
+impl ImuBatch {
+    pub fn new() -> ImuBatch {
+        ImuBatch { readings: [ImuReading::default(); IMU_BATCH], len: 0 }
+    }
+
+    pub fn clear(&mut self) {
+        self.len = 0;
+    }
+
+    pub fn is_full(&self) -> bool {
+        self.len == IMU_BATCH
+    }
+
+    /// A full batch gives the reading back.
+    pub fn push(&mut self, reading: ImuReading) -> Result<(), ImuReading> {
+        if self.is_full() {
+            return Err(reading);
+        }
+        self.readings[self.len] = reading;
+        self.len += 1;
+        Ok(())
+    }
+
+    /// Keeps the readings for which `keep` is true, in order.
+    pub fn retain(&mut self, mut keep: impl FnMut(&ImuReading) -> bool) {
+        let mut kept = 0;
+        for i in 0..self.len {
+            if keep(&self.readings[i]) {
+                self.readings[kept] = self.readings[i];
+                kept += 1;
+            }
+        }
+        self.len = kept;
+    }
+}
+
+impl Default for ImuBatch {
+    fn default() -> Self {
+        ImuBatch::new()
+    }
+}
+
+impl std::ops::Deref for ImuBatch {
+    type Target = [ImuReading];
+    fn deref(&self) -> &[ImuReading] {
+        &self.readings[..self.len]
+    }
+}
+
+impl std::ops::DerefMut for ImuBatch {
+    fn deref_mut(&mut self) -> &mut [ImuReading] {
+        &mut self.readings[..self.len]
+    }
+}
+
+impl<S: FrameSource + ?Sized> FrameSource for Box<S> {
+    fn next(&mut self, timeout: Span, frames: &mut Frames) -> Result<Wait, SourceFault> {
+        (**self).next(timeout, frames)
+    }
+
+    fn counters(&self) -> Vec<(&'static str, u64)> {
+        (**self).counters()
+    }
+
+    fn warnings(&self) -> &[String] {
+        (**self).warnings()
+    }
+}
+
+impl<S: ImuSource + ?Sized> ImuSource for Box<S> {
+    fn next(&mut self, timeout: Span, batch: &mut ImuBatch) -> Result<Wait, SourceFault> {
+        (**self).next(timeout, batch)
+    }
+
+    fn counters(&self) -> Vec<(&'static str, u64)> {
+        (**self).counters()
+    }
+}
