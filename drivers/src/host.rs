@@ -10,3 +10,11 @@ pub fn lower_priority() {
         libc::setpriority(libc::PRIO_PROCESS, 0, NICE);
     }
 }
+
+/// CLOCK_MONOTONIC, in which drivers stamp frames and edges.
+pub fn monotonic() -> crate::Nanos {
+    let mut t = libc::timespec { tv_sec: 0, tv_nsec: 0 };
+    // SAFETY: `t` outlives the call; the clock exists on every Linux.
+    unsafe { libc::clock_gettime(libc::CLOCK_MONOTONIC, &mut t) };
+    crate::Nanos(t.tv_sec * 1_000_000_000 + t.tv_nsec)
+}
