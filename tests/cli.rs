@@ -225,6 +225,21 @@ fn budget_that_does_not_fit_is_refused() {
 }
 
 #[test]
+fn a_network_without_its_model_is_refused_by_check_as_at_boot() {
+    let dir = tempfile::tempdir().unwrap();
+    let (data, out) = (flight(dir.path(), "0.3"), dir.path().join("out"));
+    let absent: &[&str] = &["--set", "stereo.network.model=no/such.onnx"];
+    for (more, said) in [(&[] as &[&str], "names no file"), (absent, "no/such.onnx")] {
+        let set = [&["--set", "stereo.method=onnx"], more].concat();
+        let checked = stipple(&[&["check", BOARD], &set[..]].concat());
+        refused(&checked, CONFIG, &["stereo.network.model", said, "name an ONNX file"], &out);
+        let booted = replay(&data, &out, &set);
+        let fault = |o: &Output| text(o).lines().find(|l| l.starts_with("stipple: ")).map(str::to_string).unwrap();
+        assert_eq!(fault(&booted), fault(&checked));
+    }
+}
+
+#[test]
 fn every_board_fits_its_own_limit() {
     for entry in fs::read_dir(root().join("board-configs")).unwrap() {
         let path = entry.unwrap().path();

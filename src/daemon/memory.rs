@@ -58,7 +58,8 @@ pub fn admit(place: &str, calibration: &Calibration, board: &Board) -> Result<Fo
         }
     }
     if board.map.enabled {
-        Method::admit(&board.stereo)?;
+        let left = &calibration.cameras[0].camera;
+        Method::admit(left.width, left.height, &board.stereo)?;
     }
     let f = footprint(calibration, board);
     let max = board.memory_max_mib << 20;

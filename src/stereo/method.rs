@@ -62,12 +62,13 @@ impl Method {
         f
     }
 
-    /// Whether this program has the method.
-    pub fn admit(config: &StereoConfig) -> Result<(), Fault> {
+    /// Whether this program has the method, for images of this size, and its files are there.
+    pub fn admit(width: usize, height: usize, config: &StereoConfig) -> Result<(), Fault> {
         match config.method {
             StereoMethod::Bm | StereoMethod::Sgbm if !cfg!(feature = "opencv") => {
                 Err(refused_without_opencv(config.method))
             }
+            StereoMethod::Onnx => Network::admit(width, height, &config.network),
             _ => Ok(()),
         }
     }
@@ -174,7 +175,7 @@ mod tests {
     fn a_program_without_opencv_says_so_and_what_to_use() {
         let said = refused_without_opencv(StereoMethod::Sgbm).to_string();
         assert!(said.contains("`sgbm`") && said.contains("feature `opencv`") && said.contains("\"sgm\""), "{said}");
-        let named = |method| Method::admit(&StereoConfig { method, ..StereoConfig::default() }).is_ok();
+        let named = |method| Method::admit(8, 8, &StereoConfig { method, ..StereoConfig::default() }).is_ok();
         assert_eq!((named(StereoMethod::Bm), named(StereoMethod::Sgm)), (cfg!(feature = "opencv"), true));
     }
 }

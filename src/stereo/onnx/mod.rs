@@ -31,6 +31,10 @@ fn inner(width: usize, height: usize, config: &NetworkConfig) -> [usize; 2] {
     [or(config.width, width), or(config.height, height)]
 }
 
+fn bad(key: &str, what: String, fix: &str) -> Fault {
+    Fault::new(Exit::Config, format!("stereo.network.{key}"), what, fix)
+}
+
 impl Network {
     /// Ours; what the runtime takes for weights and activations is its own and not known before.
     pub fn footprint(width: usize, height: usize, config: &NetworkConfig) -> Footprint {
@@ -41,10 +45,8 @@ impl Network {
         f
     }
 
-    /// Loads runtime and model, and runs it once, so that what is wrong with either is said at boot.
-    pub fn new(width: usize, height: usize, config: &NetworkConfig) -> Result<Network, Fault> {
-        let bad =
-            |key: &str, what: String, fix: &str| Fault::new(Exit::Config, format!("stereo.network.{key}"), what, fix);
+    /// What can be said of a board without the runtime: a model is named and there, and its size holds the images.
+    pub fn admit(width: usize, height: usize, config: &NetworkConfig) -> Result<(), Fault> {
         if config.model.is_empty() {
             return Err(bad("model", "names no file, and stereo.method is `onnx`".into(), "name an ONNX file"));
         }
@@ -56,6 +58,13 @@ impl Network {
             let what = format!("{w}x{h} is smaller than the images, {width}x{height}");
             return Err(bad("width", what, "set stereo.network.fit = \"scale\", or a larger size"));
         }
+        Ok(())
+    }
+
+    /// Loads runtime and model, and runs it once, so that what is wrong with either is said at boot.
+    pub fn new(width: usize, height: usize, config: &NetworkConfig) -> Result<Network, Fault> {
+        Network::admit(width, height, config)?;
+        let [w, h] = inner(width, height, config);
         let names = [config.left.as_str(), &config.right, &config.disparity];
         let shape = [1, config.channels as usize, h, w];
         let session = Session::open(&config.runtime, &config.model, names, shape, config.threads);
