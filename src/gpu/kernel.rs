@@ -93,6 +93,8 @@ pub(super) struct Pipeline {
     pub raw: vk::Pipeline,
     pub layout: vk::PipelineLayout,
     pub push_bytes: usize,
+    /// Whether a dispatch may be several, of a part of its workgroups each.
+    pub in_pieces: bool,
     set_layout: vk::DescriptorSetLayout,
     module: vk::ShaderModule,
     bindings: &'static [(u32, Access)],
@@ -127,7 +129,12 @@ impl Pipelines {
     }
 
     /// Makes the pipeline of variant `define`, or of the fastest the device has.
-    pub fn make<K: KernelDef>(&mut self, spec: &K::Spec, define: Option<&str>) -> Result<Kernel<K>, Fault> {
+    pub fn make<K: KernelDef>(
+        &mut self,
+        spec: &K::Spec,
+        define: Option<&str>,
+        in_pieces: bool,
+    ) -> Result<Kernel<K>, Fault> {
         let refuse =
             |what: String| Fault::new(Exit::Unavailable, format!("kernel {}", K::NAME), what, "use another device");
         let caps = &self.device.caps;
@@ -152,6 +159,7 @@ impl Pipelines {
             raw: vk::Pipeline::null(),
             layout: vk::PipelineLayout::null(),
             push_bytes: size_of::<K::Push>(),
+            in_pieces,
             set_layout: vk::DescriptorSetLayout::null(),
             module: vk::ShaderModule::null(),
             bindings: K::BINDINGS,
@@ -269,7 +277,11 @@ impl Pipeline {
                 .module(self.module)
                 .name(c"main")
                 .specialization_info(&specialisation);
-            let info = [vk::ComputePipelineCreateInfo::default().stage(stage).layout(self.layout)];
+            let flags = match self.in_pieces {
+                true => vk::PipelineCreateFlags::DISPATCH_BASE,
+                false => vk::PipelineCreateFlags::empty(),
+            };
+            let info = [vk::ComputePipelineCreateInfo::default().flags(flags).stage(stage).layout(self.layout)];
             let made = device
                 .raw
                 .create_compute_pipelines(vk::PipelineCache::null(), &info, None)

@@ -37,6 +37,7 @@ mod device;
 mod kernel;
 pub mod kernels;
 mod memory;
+mod pieces;
 mod record;
 mod submit;
 #[cfg(test)]
@@ -167,16 +168,27 @@ impl Gpu {
 
     /// Makes a pipeline, of the fastest variant of the kernel that the device has.
     pub fn kernel<K: KernelDef>(&mut self, spec: K::Spec) -> Result<Kernel<K>, Fault> {
-        self.make(&spec, None)
+        self.make(&spec, None, false)
+    }
+
+    /// As `kernel`, of one that may take long: a dispatch that would pass `submission_max_ms` is several. Its workgroups
+    /// must not ask how many there are, but for the width of a wrapped row (`Threads::d1`).
+    pub fn kernel_in_pieces<K: KernelDef>(&mut self, spec: K::Spec) -> Result<Kernel<K>, Fault> {
+        self.make(&spec, None, true)
     }
 
     /// Makes a pipeline of one variant: `""` is the baseline.
     pub fn kernel_variant<K: KernelDef>(&mut self, spec: K::Spec, variant: &str) -> Result<Kernel<K>, Fault> {
-        self.make(&spec, Some(variant))
+        self.make(&spec, Some(variant), false)
     }
 
-    fn make<K: KernelDef>(&mut self, spec: &K::Spec, variant: Option<&str>) -> Result<Kernel<K>, Fault> {
-        let kernel = self.pipelines.make::<K>(spec, variant)?;
+    fn make<K: KernelDef>(
+        &mut self,
+        spec: &K::Spec,
+        variant: Option<&str>,
+        in_pieces: bool,
+    ) -> Result<Kernel<K>, Fault> {
+        let kernel = self.pipelines.make::<K>(spec, variant, in_pieces)?;
         self.submitter.add_kernel(kernel.name());
         Ok(kernel)
     }
@@ -294,6 +306,11 @@ impl Gpu {
     /// Submissions so far; a recording that takes longer than `submission_max_ms` is several.
     pub fn submissions(&self) -> u64 {
         self.submitter.submissions
+    }
+
+    /// Of all submissions so far, ms on the device.
+    pub fn longest_submission_ms(&self) -> f64 {
+        self.submitter.longest_ms
     }
 
     pub fn arena_bytes(&self) -> u64 {

@@ -3,7 +3,7 @@
 //! Up to `SLOTS` submissions are under way at once: while the device runs one, the host encodes the next, so that the
 //! device goes from one to the other without waiting for the host. Each command buffer begins with a barrier against
 //! all that was submitted before, so they run as if one after another; a fence each tells the host. A recording that
-//! takes long is cut into parts, each a submission.
+//! takes long is cut into parts, each a submission; so is a long dispatch of a kernel made for it (`pieces`).
 //!
 //! Command buffers, fences and queries are made once; what a command buffer holds is encoded anew for each part, since
 //! cameras, targets and rates are push constants. Kept encodings would gain nothing: to record, encode and submit a step
@@ -13,6 +13,7 @@
 use super::device::{boot, Device};
 use super::kernel::Pipelines;
 use super::memory::{report_offset, Arena, Range};
+use super::pieces::{axis, Pace};
 use super::record::{Command, Recorder, Work, COMMANDS_MAX};
 use super::GpuError;
 use ash::vk;
@@ -50,10 +51,29 @@ struct Slot {
     fence: vk::Fence,
     queries: vk::QueryPool,
     started: Instant,
-    /// Of each command, its row of `Submitter::timings`; empty where only the whole is timed.
-    rows: Vec<usize>,
+    /// What each command is to `Submitter::timings`; empty where only the whole is timed.
+    timed: Vec<Timed>,
+    /// Whether the times are for the table; otherwise for the pace alone.
+    each: bool,
     /// Commands of the recording that this is the last part of; zero of the other parts.
     ends: usize,
+}
+
+/// A command whose time is taken: its row, and the workgroups of a direct dispatch.
+#[derive(Clone, Copy)]
+struct Timed {
+    row: usize,
+    groups: u32,
+    /// Whether it is the first piece of its command, and the last.
+    begins: bool,
+    ends: bool,
+}
+
+/// What one submission holds: commands, or the slabs of workgroups `slabs` of one.
+struct Part {
+    from: usize,
+    to: usize,
+    slabs: Option<std::ops::Range<u32>>,
 }
 
 pub(super) struct Submitter {
@@ -70,6 +90,8 @@ pub(super) struct Submitter {
     pub timings: Vec<Timing>,
     /// Row of each kernel, by index.
     rows: Vec<usize>,
+    /// Of each row.
+    paces: Vec<Pace>,
     /// When the host last saw a part end.
     seen: Instant,
     /// Of the last whole recording.
@@ -80,6 +102,8 @@ pub(super) struct Submitter {
     total_ms: f64,
     submission_max_ms: f64,
     pub submissions: u64,
+    /// Of all parts so far.
+    pub longest_ms: f64,
     recordings: u64,
     /// Every command of one recording in so many is timed; zero: of none.
     pub timed_in: u64,
@@ -92,7 +116,8 @@ impl Submitter {
             fence: vk::Fence::null(),
             queries: vk::QueryPool::null(),
             started: Instant::now(),
-            rows: Vec::with_capacity(COMMANDS_MAX),
+            timed: Vec::with_capacity(COMMANDS_MAX),
+            each: false,
             ends: 0,
         };
         let mut s = Submitter {
@@ -105,12 +130,14 @@ impl Submitter {
             stamps: vec![0; STAMPS],
             timings: Vec::new(),
             rows: Vec::new(),
+            paces: Vec::new(),
             seen: Instant::now(),
             last_ms: 0.0,
             mean_ms: 0.0,
             total_ms: 0.0,
             submission_max_ms,
             submissions: 0,
+            longest_ms: 0.0,
             recordings: 0,
             timed_in: 1,
         };
@@ -147,6 +174,7 @@ impl Submitter {
 
     fn row(&mut self, name: &'static str) -> usize {
         self.timings.push(Timing { name, count: 0, total_ms: 0.0, last_ms: 0.0 });
+        self.paces.push(Pace::default());
         self.timings.len() - 1
     }
 
@@ -159,13 +187,18 @@ impl Submitter {
         let each = self.timed_in > 0 && self.recordings % self.timed_in == 0;
         self.recordings += 1;
         let all = rec.commands.len();
-        let mut from = 0;
+        // The next command, and how many slabs of it are done.
+        let (mut from, mut done) = (0, 0);
         while from < all {
-            let to = self.cut(rec, from);
+            let part = self.cut(rec, from, done, pipelines)?;
+            (from, done) = match &part.slabs {
+                Some(slabs) if part.to == part.from => (from, slabs.end),
+                _ => (part.to, 0),
+            };
             let slot = self.free_slot()?;
-            self.slots[slot].ends = if to == all { all } else { 0 };
+            self.slots[slot].ends = if from == all { all } else { 0 };
             self.begin(slot)?;
-            if let Err(e) = self.encode_part(&rec.commands[from..to], slot, each, pipelines, arena) {
+            if let Err(e) = self.encode_part(rec, &part, slot, each, pipelines, arena) {
                 // SAFETY: recording, not in flight: back to where the next `begin` expects it.
                 unsafe {
                     self.device
@@ -177,7 +210,6 @@ impl Submitter {
             }
             self.end(slot)?;
             self.submissions += 1;
-            from = to;
         }
         Ok(Ticket(self.started))
     }
@@ -216,16 +248,34 @@ impl Submitter {
         Ok(())
     }
 
-    /// Where the part that begins at `from` ends: integrated GPUs reset on long submissions, so a part is
-    /// what took `submission_max_ms` when its commands were last timed, and at least one command.
-    fn cut(&self, rec: &Recorder, from: usize) -> usize {
+    /// The part that begins with command `from`, `done` of whose slabs were in the part before. Integrated GPUs reset on
+    /// long submissions, so a part is what took `submission_max_ms` when its commands were last timed; one command at
+    /// least, or a piece of one that may be cut.
+    fn cut(&mut self, rec: &Recorder, from: usize, done: u32, pipelines: &Pipelines) -> Result<Part, GpuError> {
+        let max_ms = self.submission_max_ms;
+        if let Some(groups) = divisible(&rec.commands[from], pipelines) {
+            let row = self.row_of(&rec.commands[from]);
+            let all = groups[axis(groups)];
+            let slab = groups.iter().product::<u32>() / all;
+            if done > 0 || self.paces[row].estimate(all * slab) > max_ms {
+                // The pace of what is under way counts.
+                self.finish_all()?;
+                let end = done + self.paces[row].piece(all - done, slab, max_ms);
+                return Ok(Part { from, to: from + usize::from(end == all), slabs: Some(done..end) });
+            }
+        }
         let mut ms = 0.0;
         let fitting = rec.commands[from..].iter().take_while(|command| {
-            let t = &self.timings[self.row_of(command)];
-            ms += if self.timed_in > 0 && t.count > 0 { t.last_ms } else { self.mean_ms };
-            ms <= self.submission_max_ms
+            let row = self.row_of(command);
+            let t = &self.timings[row];
+            ms += match divisible(command, pipelines) {
+                Some(groups) => self.paces[row].estimate(groups.iter().product()),
+                None if self.timed_in > 0 && t.count > 0 => t.last_ms,
+                None => self.mean_ms,
+            };
+            ms <= max_ms
         });
-        from + fitting.count().max(1)
+        Ok(Part { from, to: from + fitting.count().max(1), slabs: None })
     }
 
     fn row_of(&self, command: &Command) -> usize {
@@ -239,30 +289,38 @@ impl Submitter {
 
     fn encode_part(
         &mut self,
-        commands: &[Command],
+        rec: &Recorder,
+        part: &Part,
         slot: usize,
         each: bool,
         pipelines: &mut Pipelines,
         arena: &Arena,
     ) -> Result<(), GpuError> {
+        let commands = &rec.commands[part.from..part.to.max(part.from + 1)];
         let each = each && self.has_stamps();
-        self.slots[slot].rows.clear();
+        // Two stamps are what a lone command needs.
+        let timed = each || commands.len() == 1;
+        self.slots[slot].timed.clear();
+        self.slots[slot].each = each;
         if self.has_stamps() {
             let queries = self.slots[slot].queries;
-            let stamps = if each { commands.len() as u32 + 1 } else { 2 };
+            let stamps = if timed { commands.len() as u32 + 1 } else { 2 };
             // SAFETY: recording; no submission that uses the queries is in flight.
             unsafe { self.device.raw.cmd_reset_query_pool(self.slots[slot].commands, queries, 0, stamps) };
             self.stamp(slot, 0);
         }
         for (i, command) in commands.iter().enumerate() {
-            self.encode(command, self.slots[slot].commands, pipelines, arena)?;
-            if each {
-                self.stamp(slot, i + 1);
+            let groups = self.encode(command, part.slabs.as_ref(), self.slots[slot].commands, pipelines, arena)?;
+            if timed {
                 let row = self.row_of(command);
-                self.slots[slot].rows.push(row);
+                let begins = part.slabs.as_ref().is_none_or(|slabs| slabs.start == 0);
+                self.slots[slot].timed.push(Timed { row, groups, begins, ends: part.to > part.from });
+                if self.has_stamps() {
+                    self.stamp(slot, i + 1);
+                }
             }
         }
-        if self.has_stamps() && !each {
+        if self.has_stamps() && !timed {
             self.stamp(slot, 1);
         }
         Ok(())
@@ -282,13 +340,15 @@ impl Submitter {
         }
     }
 
+    /// A command, or the slabs of its workgroups that are asked for. Answers how many workgroups of a direct dispatch.
     fn encode(
         &self,
         command: &Command,
+        slabs: Option<&std::ops::Range<u32>>,
         cb: vk::CommandBuffer,
         pipelines: &mut Pipelines,
         arena: &Arena,
-    ) -> Result<(), GpuError> {
+    ) -> Result<u32, GpuError> {
         let raw = &self.device.raw;
         if command.barrier_before {
             self.barrier(cb);
@@ -319,10 +379,24 @@ impl Submitter {
             Work::ReadBack { from, .. } => inside("read back", from)?,
         }
         let arena = arena.buffer();
-        // SAFETY: recording; ranges lie in the arena, and the recorder checked their alignment.
+        let mut dispatched = 0;
+        // SAFETY: recording; ranges lie in the arena, and the recorder checked their alignment. Slabs are of kernels whose
+        // pipeline may begin anywhere.
         unsafe {
             match command.work {
-                Work::Dispatch { groups: [x, y, z], .. } => raw.cmd_dispatch(cb, x, y, z),
+                Work::Dispatch { mut groups, .. } => {
+                    let mut first = [0; 3];
+                    if let Some(slabs) = slabs {
+                        let axis = axis(groups);
+                        (first[axis], groups[axis]) = (slabs.start, slabs.end - slabs.start);
+                    }
+                    let ([a, b, c], [x, y, z]) = (first, groups);
+                    match first {
+                        [0, 0, 0] => raw.cmd_dispatch(cb, x, y, z),
+                        _ => raw.cmd_dispatch_base(cb, a, b, c, x, y, z),
+                    }
+                    dispatched = x * y * z;
+                }
                 Work::Indirect { at, .. } => raw.cmd_dispatch_indirect(cb, arena, at),
                 Work::Fill { range, value } => {
                     raw.cmd_fill_buffer(cb, arena, range.start, range.end - range.start, value);
@@ -340,17 +414,20 @@ impl Submitter {
                 }
             }
         }
-        Ok(())
+        Ok(dispatched)
     }
 
     fn read_stamps(&mut self, slot: usize) -> Result<(), GpuError> {
-        let Slot { queries, started, ref rows, .. } = self.slots[slot];
+        let Slot { queries, started, ref timed, each, .. } = self.slots[slot];
         let before = std::mem::replace(&mut self.seen, Instant::now());
         if !self.has_stamps() {
-            self.total_ms += self.seen.duration_since(started.max(before)).as_secs_f64() * 1e3;
+            let ms = self.seen.duration_since(started.max(before)).as_secs_f64() * 1e3;
+            self.total_ms += ms;
+            self.longest_ms = self.longest_ms.max(ms);
+            timed.iter().for_each(|t| self.paces[t.row].note(t.groups, ms));
             return Ok(());
         }
-        let last = rows.len().max(1);
+        let last = timed.len().max(1);
         let stamps = &mut self.stamps[..last + 1];
         let flags = vk::QueryResultFlags::TYPE_64 | vk::QueryResultFlags::WAIT;
         // SAFETY: these queries were reset and written by the submission that has just ended.
@@ -359,12 +436,18 @@ impl Submitter {
         let caps = &self.device.caps;
         let (mask, period_ms) = (u64::MAX >> (64 - caps.timestamp_bits.min(64)), caps.timestamp_period_ns * 1e-6);
         let ms = |a: u64, b: u64| (b.wrapping_sub(a) & mask) as f64 * period_ms;
-        self.total_ms += ms(self.stamps[0], self.stamps[last]);
-        for (i, &row) in rows.iter().enumerate() {
-            let t = &mut self.timings[row];
-            t.last_ms = ms(self.stamps[i], self.stamps[i + 1]);
-            t.total_ms += t.last_ms;
-            t.count += 1;
+        let whole = ms(self.stamps[0], self.stamps[last]);
+        self.total_ms += whole;
+        self.longest_ms = self.longest_ms.max(whole);
+        for (i, timed) in timed.iter().enumerate() {
+            let ms = ms(self.stamps[i], self.stamps[i + 1]);
+            self.paces[timed.row].note(timed.groups, ms);
+            if each {
+                let t = &mut self.timings[timed.row];
+                t.last_ms = if timed.begins { ms } else { t.last_ms + ms };
+                t.total_ms += ms;
+                t.count += u64::from(timed.ends);
+            }
         }
         Ok(())
     }
@@ -455,6 +538,14 @@ impl Submitter {
         unsafe {
             self.device.raw.cmd_pipeline_barrier(cb, stages, stages, vk::DependencyFlags::empty(), &barrier, &[], &[]);
         }
+    }
+}
+
+/// Workgroups of a command that may be cut.
+fn divisible(command: &Command, pipelines: &Pipelines) -> Option<[u32; 3]> {
+    match command.work {
+        Work::Dispatch { kernel, groups, .. } => pipelines.get(kernel).in_pieces.then_some(groups),
+        _ => None,
     }
 }
 

@@ -32,7 +32,7 @@ impl Rectifier {
 
     pub fn new(gpu: &mut Gpu, width: usize, height: usize, maps: &[Remap; 2]) -> Result<Rectifier, Fault> {
         let r = Rectifier {
-            kernel: gpu.kernel(rectify::Spec::default())?,
+            kernel: gpu.kernel_in_pieces(rectify::Spec::default())?,
             raw: gpu.alloc("stereo: raw pair", image_bytes(width, height) / 2)?,
             taps: gpu.alloc("stereo: rectification maps on the GPU", 2 * width * height)?,
             size: [width as u32, height as u32],

@@ -165,14 +165,14 @@ impl Sgm {
         let sums: Buf<u32> = gpu.alloc("sgm: sums", plane * shape.disparities as usize / 2)?;
         Ok(Sgm {
             k: Kernels {
-                census: gpu.kernel(census::Spec::default())?,
-                aggregate: gpu.kernel(aggregate::Spec { width: paths * lanes, lanes })?,
-                match_right: gpu.kernel(match_right::Spec::default())?,
-                match_left: gpu.kernel(match_left::Spec::default())?,
-                verify: gpu.kernel(verify::Spec::default())?,
-                speckle_join: gpu.kernel(speckle_join::Spec::default())?,
-                speckle_count: gpu.kernel(speckle_count::Spec::default())?,
-                speckle_drop: gpu.kernel(speckle_drop::Spec::default())?,
+                census: gpu.kernel_in_pieces(census::Spec::default())?,
+                aggregate: gpu.kernel_in_pieces(aggregate::Spec { width: paths * lanes, lanes })?,
+                match_right: gpu.kernel_in_pieces(match_right::Spec::default())?,
+                match_left: gpu.kernel_in_pieces(match_left::Spec::default())?,
+                verify: gpu.kernel_in_pieces(verify::Spec::default())?,
+                speckle_join: gpu.kernel_in_pieces(speckle_join::Spec::default())?,
+                speckle_count: gpu.kernel_in_pieces(speckle_count::Spec::default())?,
+                speckle_drop: gpu.kernel_in_pieces(speckle_drop::Spec::default())?,
             },
             b: Buffers {
                 images,

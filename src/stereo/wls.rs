@@ -40,10 +40,10 @@ impl Wls {
 
     pub fn new(gpu: &mut Gpu) -> Result<Wls, Fault> {
         Ok(Wls {
-            fill_rows: gpu.kernel(fill_rows::Spec::default())?,
-            median: gpu.kernel(median::Spec::default())?,
-            smooth_lines: gpu.kernel(smooth_lines::Spec::default())?,
-            settle: gpu.kernel(settle::Spec::default())?,
+            fill_rows: gpu.kernel_in_pieces(fill_rows::Spec::default())?,
+            median: gpu.kernel_in_pieces(median::Spec::default())?,
+            smooth_lines: gpu.kernel_in_pieces(smooth_lines::Spec::default())?,
+            settle: gpu.kernel_in_pieces(settle::Spec::default())?,
         })
     }
 

@@ -266,10 +266,37 @@ fn sums_do_not_depend_on_the_workgroup() {
 }
 
 #[test]
+fn depth_in_pieces_of_any_length_is_the_same_to_the_bit() {
+    let (left, right) = draw(&Scene::steps(150, 90), 1);
+    let s = shape(150, 90, 48);
+    let [whole, short, shortest] = [1e6, 2.0, 1e-6].map(|submission_max_ms| {
+        let config = GpuConfig { submission_max_ms, ..GpuConfig::default() };
+        let mut gpu = Gpu::open(&config, Sgm::footprint(&s).gpu_total()).unwrap();
+        let mut sgm = Sgm::new(&mut gpu, s).unwrap();
+        let found = [(); 2].map(|()| {
+            let before = gpu.submissions();
+            let found = run(&mut gpu, &mut sgm, &left, &right);
+            (found, gpu.submissions() - before)
+        });
+        println!("{submission_max_ms} ms: {} submissions, the longest {} ms", found[1].1, gpu.longest_submission_ms());
+        found
+    });
+    // A kernel's first dispatch begins small; then all is one submission, or as many as it takes.
+    assert!(whole[0].1 > 10 && whole[1].1 == 1, "{} {}", whole[0].1, whole[1].1);
+    let paths = 2 * 90 + 6 * 150;
+    assert!(shortest[1].1 > paths / 4 && short[1].1 < shortest[1].1, "{} {}", short[1].1, shortest[1].1);
+    for (found, _) in whole[1..].iter().chain(&short).chain(&shortest) {
+        assert!(*found == whole[0].0);
+    }
+}
+
+#[test]
 fn the_validation_layer_is_silent_about_matching() {
     let s = shape(64, 48, 32);
     let options = GpuOptions { validation: true };
-    let mut gpu = match Gpu::open_with(&GpuConfig::default(), Sgm::footprint(&s).gpu_total(), options) {
+    // Short enough that long dispatches are cut.
+    let config = GpuConfig { submission_max_ms: 0.1, ..GpuConfig::default() };
+    let mut gpu = match Gpu::open_with(&config, Sgm::footprint(&s).gpu_total(), options) {
         Ok(gpu) => gpu,
         Err(fault) => return println!("ignored: the_validation_layer_is_silent_about_matching: {fault}"),
     };
