@@ -10,6 +10,7 @@ pub mod calibration;
 pub mod camera;
 pub mod fault;
 pub mod host;
+pub mod inject;
 pub mod paced;
 pub mod replay;
 pub mod sim;

@@ -124,4 +124,5 @@ pub(super) const BOUNDS: &[(&str, Bound)] = &[
     ("gpu.submission_max_ms", Positive),
     ("replay.pair_tolerance_s", Within(0.0, 1.0)),
     ("replay.imu_hole_s", Positive),
+    ("inject.seed", Within(0.0, u64::MAX as f64)),
 ];

@@ -6,10 +6,12 @@
 //! the same rules as the file.
 
 mod bounds;
+mod inject;
 mod map;
 mod network;
 
 use bounds::BOUNDS;
+pub use inject::InjectConfig;
 pub use map::{MapConfig, Projection};
 pub use network::{Fit, NetworkConfig};
 use serde::{Deserialize, Serialize};
@@ -37,6 +39,8 @@ pub struct Board {
     pub gpu: GpuConfig,
     #[serde(default)]
     pub replay: ReplayConfig,
+    #[serde(default)]
+    pub inject: InjectConfig,
 }
 
 /// Capacities bought at boot. Every one is a hard limit; full is counted, never grown.
@@ -352,6 +356,7 @@ impl Board {
                 "must not be less than budget.splats: a Gaussian in view covers at least one tile",
             ),
         ];
+        self.inject.check()?;
         match among.iter().find(|(holds, _, _)| !holds) {
             Some((_, key, rule)) => Err((key, format!("{key} {rule}"))),
             None => Ok(()),
