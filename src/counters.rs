@@ -23,8 +23,36 @@ counters! {
     frames_without_pose,
     /// Frames that could not be read.
     frames_unreadable,
+    /// Frames that never came, by the intervals of their stamps.
+    frames_missing,
+    /// Frames refused: stamped no later than the last.
+    frames_not_newer,
+    /// Frames refused: stamped more than a second ahead of their arrival.
+    frames_leapt,
+    /// Frames refused: a camera gave the picture before once more.
+    frames_frozen,
+    /// Frames of which a camera saw nothing: covered, or its light out.
+    frames_blank,
+    /// Frames tracked though no inertial sample at their stamp came in time.
+    frames_without_imu,
+    /// Times the cameras were lost, and times they fell silent; how long they were away altogether, ms.
+    camera_lost,
+    camera_silent,
+    camera_away_ms,
     /// Inertial samples that did not fit between two frames.
     imu_overflow,
+    /// As of the frames.
+    imu_missing,
+    imu_not_newer,
+    imu_leapt,
+    /// Samples of a unit that repeats itself: three and more alike to the last bit.
+    imu_frozen,
+    /// Samples with an axis at the end of its range, as the source says.
+    imu_saturated,
+    /// As of the cameras.
+    imu_lost,
+    imu_silent,
+    imu_away_ms,
     /// Inertial samples refused: not finite, or not newer than the last.
     imu_rejected,
     /// Tracks beyond TRACKS.

@@ -51,6 +51,22 @@ enum Command {
         #[arg(long = "set", value_name = "SECTION.KEY=VALUE")]
         set: Vec<String>,
     },
+    /// Run the board's sensors until stopped (SIGINT, SIGTERM); leaves what a replay leaves
+    Run {
+        /// Board file, see board-configs/
+        board: PathBuf,
+        #[arg(long, value_name = "DIR", default_value = "out/run")]
+        out: PathBuf,
+        /// Stop after this time
+        #[arg(long, value_name = "S", value_parser = seconds)]
+        duration: Option<f64>,
+        /// A recording in the place of the sensors, as for replay, at its pace
+        #[arg(long, value_name = "DIR")]
+        dataset: Option<PathBuf>,
+        /// Override a key of the board file
+        #[arg(long = "set", value_name = "SECTION.KEY=VALUE")]
+        set: Vec<String>,
+    },
     /// Fly through a simulated room and map it; needs no data
     Demo {
         /// Board file; without it the one for Vulkan on the CPU
@@ -224,6 +240,9 @@ fn run(command: Command) -> Result<(), Fault> {
             let options =
                 daemon::Replay { pace, poses, holdout: holdout.unwrap_or(0), duration_s: duration, mapping_s: None };
             daemon::replay(&dataset, &board, &out, &set, &options)
+        }
+        Command::Run { board, out, duration, dataset, set } => {
+            daemon::run_sensors(&board, &out, &set, &daemon::Run { dataset, duration_s: duration })
         }
         Command::Demo { board, out, set } => daemon::demo(board.as_deref(), &out, &set),
         Command::Sim { scenario, out, truth, imu, duration, seed, rig, colour, defects } => {

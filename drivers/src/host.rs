@@ -1,6 +1,8 @@
 //! The few things asked of the operating system.
 #![allow(unsafe_code)]
 
+use std::sync::atomic::{AtomicBool, Ordering};
+
 /// Makes the calling thread yield to others (nice 10). Threads it starts from then on inherit it:
 /// a Vulkan device opened by such a thread renders on the CPU, where it does, behind odometry.
 pub fn lower_priority() {
@@ -17,4 +19,26 @@ pub fn monotonic() -> crate::Nanos {
     // SAFETY: `t` outlives the call; the clock exists on every Linux.
     unsafe { libc::clock_gettime(libc::CLOCK_MONOTONIC, &mut t) };
     crate::Nanos(t.tv_sec * 1_000_000_000 + t.tv_nsec)
+}
+
+static STOP: AtomicBool = AtomicBool::new(false);
+
+extern "C" fn ask_to_stop(_signal: libc::c_int) {
+    STOP.store(true, Ordering::Relaxed);
+}
+
+/// From the first call on SIGINT and SIGTERM set this flag and end nothing; the second of a kind ends the program as
+/// it would have without.
+pub fn stop_asked_for() -> &'static AtomicBool {
+    // SAFETY: the handler does nothing but store to an atomic, which a signal may do. The struct is plain integers, for
+    // which zero is valid.
+    unsafe {
+        let mut action: libc::sigaction = std::mem::zeroed();
+        action.sa_sigaction = ask_to_stop as extern "C" fn(libc::c_int) as usize;
+        action.sa_flags = libc::SA_RESETHAND | libc::SA_RESTART;
+        for signal in [libc::SIGINT, libc::SIGTERM] {
+            libc::sigaction(signal, &action, std::ptr::null_mut());
+        }
+    }
+    &STOP
 }

@@ -85,6 +85,9 @@ fn after(timeout: Span) -> Instant {
     Instant::now() + Duration::from_nanos(timeout.0.max(0) as u64)
 }
 
+/// The counter of frames whose images could not be read.
+pub const FRAMES_UNREADABLE: &str = "frames_unreadable";
+
 pub struct PacedFrames {
     images: Images,
     stamps: Vec<Nanos>,
@@ -122,7 +125,7 @@ impl FrameSource for PacedFrames {
 
     fn counters(&self) -> Vec<(&'static str, u64)> {
         let mut list = self.images.counters();
-        list.push(("frames_unreadable", self.unreadable));
+        list.push((FRAMES_UNREADABLE, self.unreadable));
         list
     }
 

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use stipple_drivers::paced::Images;
 use stipple_drivers::replay::{OpenOptions, Recording};
 use stipple_drivers::sim::{Scenario, Sim};
-use stipple_drivers::{Calibration, Fault, Frames, ImuSample, Nanos, Span, TimedPose};
+use stipple_drivers::{Calibration, Exit, Fault, Frames, ImuSample, Nanos, Span, TimedPose};
 
 pub struct Input {
     pub name: String,
@@ -69,6 +69,15 @@ impl Input {
             counters: vec![],
             source: Images::Rendered(frames),
         })
+    }
+
+    /// Refuses grey images where colour is asked for of the first `cameras`.
+    pub fn needs_colour(&self, cameras: usize, place: &str) -> Result<(), Fault> {
+        if self.source.has_colour(cameras) {
+            return Ok(());
+        }
+        let what = format!("map.colour = true, but the images of {place} are grey");
+        Err(Fault::new(Exit::Config, "map.colour", what, "set map.colour = false"))
     }
 
     /// Frames whose stamp is less than `duration_s` after the first.

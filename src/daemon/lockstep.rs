@@ -90,7 +90,17 @@ pub fn lockstep(
     let wall_s = start.elapsed().as_secs_f64();
     warnings.extend_from_slice(input.source.warnings());
     let source = input.source.counters();
-    Played { tracking, mapping, counters, frames: total, keyframes: keyframes.count, wall_s, warnings, source }
+    Played {
+        tracking,
+        mapping,
+        counters,
+        frames: total,
+        keyframes: keyframes.count,
+        wall_s,
+        warnings,
+        source,
+        broken: None,
+    }
 }
 
 fn steps(m: &mut Mapping, n: u64, start: Instant, gauges: &Gauges) {

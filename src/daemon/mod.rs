@@ -3,31 +3,36 @@
 //! | thread | work | heap |
 //! |---|---|---|
 //! | main | boot, progress, report | free |
-//! | source | stands for the sensors: decodes files, delivers frames and inertial samples when they are due | free |
+//! | camera | waits for frames, or decodes files and delivers them when they are due | free |
+//! | imu | waits for inertial samples | free |
 //! | tracking | front end and back end in turns; offers keyframes | sealed |
 //! | or frontend | follows points (`frontend.threads = 2`) | sealed |
 //! | and estimator | estimates, one frame behind at most; offers keyframes | sealed |
 //! | mapping | rectification, depth, training; low priority, as are the CPU device's own threads | sealed; OpenCV and the driver allocate behind it |
 //!
-//! In lockstep pace the main thread is source and mapping too.
+//! In lockstep pace the main thread is both sensors and mapping too.
 //!
 //! Queues between them: frames (newest wins, the rest are counted as dropped), inertial samples
 //! (never dropped), tracks (two frames: the front end waits for the back end), keyframes (an offer may
-//! fail, counted), pose corrections. Tracking waits for nobody. Shutdown: source ends, tracking drains
-//! and ends, mapping ends with the run's time.
+//! fail, counted), pose corrections. Tracking waits for nobody, save a moment for the samples up to a frame. Shutdown:
+//! the cameras end, tracking drains and ends, mapping ends with the run's time.
 
 mod dataset;
 mod input;
+mod live;
 mod lockstep;
 mod mapping;
 mod memory;
 mod pipeline;
 mod play;
 mod progress;
+mod sensors;
 mod summary;
 mod tracking;
+mod watch;
 
 pub use dataset::check_dataset;
+pub use live::{run as run_sensors, Run};
 pub use play::Pace;
 
 use crate::bench::map::Job;
@@ -134,11 +139,7 @@ fn rendering_progress(done: usize, of: usize) {
 
 fn run(mut input: Input, place: &str, board: &Board, out: &OutputDir, options: &Replay) -> Result<Report, Fault> {
     memory::admit(place, &input.calibration, board)?;
-    let colours = memory::colours(&input.calibration, board).len();
-    if !input.source.has_colour(colours) {
-        let what = format!("map.colour = true, but the images of {place} are grey");
-        return Err(Fault::new(Exit::Config, "map.colour", what, "set map.colour = false"));
-    }
+    input.needs_colour(memory::colours(&input.calibration, board).len(), place)?;
     let frames = input.frames_within(options.duration_s);
     let tracking = match &options.poses {
         Some(path) => Tracking::Table(read_trajectory(path)?),
@@ -163,6 +164,7 @@ fn run(mut input: Input, place: &str, board: &Board, out: &OutputDir, options: &
         holdout: options.holdout,
         duration_s: options.duration_s,
         lockstep_iterations: board.map.lockstep_iterations,
+        inject: board.inject.clone(),
         mapping_s: options.mapping_s,
     };
     let played = play(input, tracking, mapping, &options);

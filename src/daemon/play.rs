@@ -1,23 +1,24 @@
 //! Plays an input through tracking and mapping, in one of two paces.
 //!
-//! `recorded`, here: frames arrive when they were recorded; what is not done in time is not done. While
-//! the estimator is behind, the newest frame waits for it and replaces the one that waited before,
-//! which is counted. `lockstep`: a stated number of mapper steps a frame; the same input, the same map.
+//! `recorded`, here, and the sensors of a board alike: frames arrive when they do; what is not done in time is
+//! not done. While the estimator is behind, the newest frame waits for it and replaces the one that waited
+//! before, which is counted. `lockstep`: a stated number of mapper steps a frame; the same input, the same map.
 
 use super::input::Input;
 use super::lockstep::lockstep;
 use super::mapping::{KeyframeQueue, Mapping, SLICE};
-use super::pipeline::{Bell, Ends, Pipeline};
+use super::pipeline::{Ends, Pipeline};
 use super::progress::{Gauges, Progress};
+use super::sensors::{self, Inbox, Sensors};
 use super::tracking::{Slot, Tracking};
+use crate::config::InjectConfig;
 use crate::counters::Counters;
 use crate::map::{Keyframe, PoseCorrection};
 use crate::mem::{seal_thread, unsealed};
-use crossbeam_queue::ArrayQueue;
 use std::sync::atomic::{AtomicBool, Ordering, Ordering::Relaxed};
 use std::time::{Duration, Instant};
-use stipple_drivers::paced::Images;
-use stipple_drivers::{ImuSample, Nanos, Pose};
+use stipple_drivers::paced::FRAMES_UNREADABLE;
+use stipple_drivers::{Calibration, Fault, Frames, Nanos, Pose};
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 pub enum Pace {
@@ -34,6 +35,8 @@ pub struct Play {
     /// Ends the run after this time of the recording; past its end the mapper goes on alone.
     pub duration_s: Option<f64>,
     pub lockstep_iterations: u32,
+    /// At recorded pace: what goes wrong with the sensors.
+    pub inject: InjectConfig,
     /// In lockstep: instead of iterations, an equal part of these seconds of mapping a frame.
     pub mapping_s: Option<f64>,
 }
@@ -46,8 +49,10 @@ pub struct Played {
     pub keyframes: u64,
     pub wall_s: f64,
     pub warnings: Vec<String>,
-    /// Counters of the source.
+    /// Counters of the sources.
     pub source: Vec<(&'static str, u64)>,
+    /// The source that broke, if one did.
+    pub broken: Option<Fault>,
 }
 
 /// Keyframes the estimator may still move: the newest ones, by stamp.
@@ -120,7 +125,7 @@ impl Keyframes {
 
 pub fn play(input: Input, tracking: Tracking, mapping: Option<Mapping>, options: &Play) -> Played {
     let length_s = options.duration_s.unwrap_or_else(|| input.length_s());
-    let mut progress = Progress::new(length_s);
+    let mut progress = Progress::new(Some(length_s));
     let played = match options.pace {
         Pace::Recorded => recorded(input, tracking, mapping, options, &mut progress),
         Pace::Lockstep => lockstep(input, tracking, mapping, options, &mut progress),
@@ -143,16 +148,13 @@ pub fn frame_slots(threads: u32) -> usize {
     3 + threads as usize
 }
 
-/// Two seconds of a 1 kHz unit.
-const IMU_SLOTS: usize = 2048;
+/// What the mapper sleeps when it has nothing to do.
 const POLL: Duration = Duration::from_micros(500);
 
-/// What the threads of a recorded-pace run share. Slots go round: spare -> newest -> tracking -> spare.
+/// What the threads of a run in real time share.
 struct Shared {
     start: Instant,
-    spare: ArrayQueue<Box<Slot>>,
-    newest: ArrayQueue<Box<Slot>>,
-    imu: ArrayQueue<ImuSample>,
+    inbox: Inbox,
     /// `None` without a mapper.
     keyframes: Option<KeyframeQueue>,
     counters: Counters,
@@ -162,125 +164,117 @@ struct Shared {
     mapping_done: AtomicBool,
 }
 
+/// A run in real time ends when its cameras do, or is asked to by the flag: `stop`.
+pub struct Realtime<'a> {
+    pub holdout: u32,
+    /// The mapper goes on until then.
+    pub duration_s: Option<f64>,
+    /// The sensors are stopped then.
+    pub sensors_s: Option<f64>,
+    pub stop: &'a AtomicBool,
+}
+
 fn recorded(
     input: Input,
-    mut tracking: Tracking,
+    tracking: Tracking,
     mapping: Option<Mapping>,
     options: &Play,
     progress: &mut Progress,
 ) -> Played {
-    let slots = frame_slots(tracking.threads());
+    let total = input.frames_within(options.duration_s);
+    let Input { imu, mut stamps, source, mut warnings, calibration, .. } = input;
+    stamps.truncate(total);
+    let shape = || Frames::in_colour(&calibration, mapping.as_ref().map_or(0, |m| m.mapper.colours_offered()));
+    let sensors = Sensors::of_recording(source, stamps, imu, &options.inject, shape);
+    let run = Realtime {
+        holdout: options.holdout,
+        duration_s: options.duration_s,
+        sensors_s: None,
+        stop: &AtomicBool::new(false),
+    };
+    let mut played = realtime(sensors, &calibration, tracking, mapping, &run, progress);
+    warnings.append(&mut played.warnings);
+    Played { warnings, ..played }
+}
+
+/// Runs sensors through tracking and mapping.
+pub fn realtime(
+    mut sensors: Sensors,
+    calibration: &Calibration,
+    mut tracking: Tracking,
+    mapping: Option<Mapping>,
+    run: &Realtime,
+    progress: &mut Progress,
+) -> Played {
     let colours = mapping.as_ref().map_or(0, |m| m.mapper.colours_offered());
     let shared = Shared {
         start: Instant::now(),
-        spare: ArrayQueue::new(slots),
-        newest: ArrayQueue::new(1),
-        imu: ArrayQueue::new(IMU_SLOTS),
-        keyframes: mapping.as_ref().map(|m| m.queue(&input.calibration)),
+        inbox: Inbox::new(frame_slots(tracking.threads()), calibration, colours),
+        keyframes: mapping.as_ref().map(|m| m.queue(calibration)),
         counters: Counters::default(),
         gauges: Gauges::default(),
         source_done: AtomicBool::new(false),
         tracking_done: AtomicBool::new(false),
         mapping_done: AtomicBool::new(mapping.is_none()),
     };
-    for _ in 0..slots {
-        let _ = shared.spare.push(Slot::for_rig(&input.calibration, colours));
-    }
-    let total = input.frames_within(options.duration_s);
-    let Input { imu, stamps, mut source, warnings, .. } = input;
     let (s, pipeline) = (&shared, Pipeline::new());
-    let mut keyframes = Keyframes::new(options.holdout);
-    let (mapping, source) = std::thread::scope(|scope| {
+    let mut keyframes = Keyframes::new(run.holdout);
+    let mapping = std::thread::scope(|scope| {
         let (bell, counted) = (&pipeline.taker, &mut keyframes);
-        let source_thread = scope.spawn(move || {
+        let Sensors { frames, imu } = &mut sensors;
+        scope.spawn(move || {
             let _ended = Ends(&s.source_done, Some(bell));
-            feed(s, bell, &mut source, &stamps[..total], &imu);
-            source
+            sensors::camera(&s.inbox, frames, bell, &s.counters, &s.gauges);
         });
+        scope.spawn(move || sensors::inertial(&s.inbox, imu, bell, &s.source_done, &s.counters));
         let give = move |slot: Box<Slot>| {
             counted.pass_on(&slot, s.keyframes.as_ref(), &s.counters);
             s.gauges.frames.fetch_add(1, Relaxed);
             s.gauges.keyframes.store(counted.count, Relaxed);
-            let _ = s.spare.push(slot);
+            let _ = s.inbox.spare.push(slot);
         };
+        let mut held = None;
+        let take = move || s.inbox.take(&mut held, &s.source_done, &s.counters);
         let ended = Ends(&s.tracking_done, None);
-        pipeline.start(scope, &mut tracking, &s.source_done, &s.counters, || newest(s), give, ended);
-        let mapping_thread = mapping.map(|m| scope.spawn(move || map(s, m, options.duration_s)));
+        pipeline.start(scope, &mut tracking, &s.source_done, &s.counters, take, give, ended);
+        let mapping_thread = mapping.map(|m| scope.spawn(move || map(s, m, run)));
         while !(s.tracking_done.load(Relaxed) && s.mapping_done.load(Relaxed)) {
+            let over = run.sensors_s.is_some_and(|limit| s.start.elapsed().as_secs_f64() >= limit);
+            s.inbox.stop.fetch_or(over || run.stop.load(Relaxed), Relaxed);
+            while let Some(line) = s.inbox.notices.pop() {
+                progress.say(&line);
+            }
             progress.show(&s.gauges);
             std::thread::sleep(Duration::from_millis(50));
         }
-        let died = "threads of a run answer with values, not panics";
-        (mapping_thread.map(|t| t.join().expect(died)), source_thread.join().expect(died))
+        mapping_thread.map(|t| t.join().expect("threads of a run answer with values, not panics"))
     });
+    let mut source = [sensors.frames.counters(), sensors.imu.counters()].concat();
+    source
+        .iter()
+        .filter(|(name, _)| *name == FRAMES_UNREADABLE)
+        .for_each(|(_, n)| s.counters.frames_unreadable.add(*n));
+    source.retain(|(name, _)| *name != FRAMES_UNREADABLE);
+    let arrived = s.inbox.arrived.load(Relaxed) + s.counters.frames_unreadable.get();
     Played {
         tracking,
         mapping,
-        frames: total,
+        frames: arrived as usize,
         keyframes: keyframes.count,
         wall_s: shared.start.elapsed().as_secs_f64(),
-        warnings: [&warnings[..], source.warnings()].concat(),
+        warnings: sensors.frames.warnings().to_vec(),
         counters: shared.counters,
-        source: source.counters(),
-    }
-}
-
-/// The newest frame, with the samples that have come up to the first at or past it.
-fn newest(s: &Shared) -> Option<Box<Slot>> {
-    let mut slot = s.newest.pop()?;
-    slot.imu.clear();
-    while let Some(sample) = s.imu.pop() {
-        slot.push_imu(sample, &s.counters);
-        if sample.t >= slot.frames.t {
-            break;
-        }
-    }
-    Some(slot)
-}
-
-/// Thread `source`, in the place of the sensors: decodes ahead, delivers at the recorded time.
-fn feed(s: &Shared, tracking: &Bell, source: &mut Images, stamps: &[Nanos], imu: &[ImuSample]) {
-    let mut imu = imu.iter().copied();
-    for (i, &t) in stamps.iter().enumerate() {
-        let Some(mut slot) = s.spare.pop() else {
-            // Every buffer is in use: tracking is behind, this one is lost.
-            s.counters.frames_overwritten.add(1);
-            continue;
-        };
-        let read = source.read(i, &mut slot.frames);
-        let due = s.start + Duration::from_nanos((t - stamps[0]).0.max(0) as u64);
-        std::thread::sleep(due.saturating_duration_since(Instant::now()));
-        // One sample past the frame, to interpolate at its stamp.
-        for sample in imu.by_ref() {
-            if s.imu.push(sample).is_err() {
-                s.counters.imu_overflow.add(1);
-            }
-            if sample.t >= t {
-                break;
-            }
-        }
-        match read {
-            Ok(()) => {
-                if let Some(old) = s.newest.force_push(slot) {
-                    s.counters.frames_overwritten.add(1);
-                    let _ = s.spare.push(old);
-                }
-            }
-            Err(_) => {
-                s.counters.frames_unreadable.add(1);
-                let _ = s.spare.push(slot);
-            }
-        }
-        tracking.ring();
-        s.gauges.played_ms.store(((t - stamps[0]).secs() * 1e3) as u64, Relaxed);
+        source,
+        broken: shared.inbox.broken.pop(),
     }
 }
 
 /// Thread `mapping`: keyframes first, then single steps, until the run's time is over.
-fn map(s: &Shared, mut mapping: Mapping, duration_s: Option<f64>) -> Mapping {
+fn map(s: &Shared, mut mapping: Mapping, run: &Realtime) -> Mapping {
     stipple_drivers::host::lower_priority();
     seal_thread();
-    let over = |tracked: bool| match duration_s {
+    let over = |tracked: bool| match run.duration_s {
+        _ if run.stop.load(Relaxed) => tracked,
         Some(d) => tracked && s.start.elapsed().as_secs_f64() >= d,
         None => tracked,
     };

@@ -21,18 +21,20 @@ pub struct Gauges {
 
 pub struct Progress {
     bar: Option<ProgressBar>,
-    total_ms: u64,
+    /// `None`: until it is stopped.
+    total_ms: Option<u64>,
     next_line: Instant,
 }
 
 const LINE_PERIOD: Duration = Duration::from_secs(1);
 
 impl Progress {
-    pub fn new(total_s: f64) -> Progress {
-        let total_ms = (total_s.max(0.0) * 1e3) as u64;
+    pub fn new(total_s: Option<f64>) -> Progress {
+        let total_ms = total_s.map(|s| (s.max(0.0) * 1e3) as u64);
         let bar = std::io::stderr().is_terminal().then(|| {
-            let bar = ProgressBar::new(total_ms);
-            let style = ProgressStyle::with_template("{bar:30} {percent:>3}% {elapsed} {msg}");
+            let bar = total_ms.map_or_else(ProgressBar::new_spinner, ProgressBar::new);
+            let drawn = if total_ms.is_some() { "{bar:30} {percent:>3}%" } else { "{spinner}" };
+            let style = ProgressStyle::with_template(&format!("{drawn} {{elapsed}} {{msg}}"));
             bar.set_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()));
             bar
         });
@@ -41,7 +43,7 @@ impl Progress {
 
     /// Cheap to call often: draws at most once a second without a terminal.
     pub fn show(&mut self, g: &Gauges) {
-        let played = g.played_ms.load(Relaxed).min(self.total_ms);
+        let played = g.played_ms.load(Relaxed).min(self.total_ms.unwrap_or(u64::MAX));
         match &self.bar {
             Some(bar) => {
                 bar.set_position(played);
@@ -49,9 +51,18 @@ impl Progress {
             }
             None if Instant::now() >= self.next_line => {
                 self.next_line += LINE_PERIOD;
-                eprintln!("{:.1} of {:.1} s: {}", played as f64 * 1e-3, self.total_ms as f64 * 1e-3, line(g));
+                let of = self.total_ms.map_or(String::new(), |ms| format!(" of {:.1}", ms as f64 * 1e-3));
+                eprintln!("{:.1}{of} s: {}", played as f64 * 1e-3, line(g));
             }
             None => {}
+        }
+    }
+
+    /// A line that stays.
+    pub fn say(&self, text: &str) {
+        match &self.bar {
+            Some(bar) => bar.println(format!("stipple: {text}")),
+            None => eprintln!("stipple: {text}"),
         }
     }
 

@@ -99,7 +99,9 @@ fn counted(played: &Played, opened: &[(&'static str, u64)]) -> Vec<(&'static str
 
 /// Fills in the tracking figures; answers the trajectory.
 fn track_figures(report: &mut Report, played: &Played) -> Vec<TimedPose> {
-    let dropped = played.counters.frames_overwritten.get() + played.counters.frames_unreadable.get();
+    let c = &played.counters;
+    let lost = [&c.frames_overwritten, &c.frames_unreadable, &c.frames_not_newer, &c.frames_leapt, &c.frames_frozen];
+    let dropped = lost.iter().map(|counter| counter.get()).sum();
     report.frames_dropped = Some(dropped);
     report.frames = Some((played.frames as u64).saturating_sub(dropped));
     let run = match &played.tracking {

@@ -1,0 +1,91 @@
+//! `stipple run`: the sensors of a board, or a recording in their place, through tracking and mapping until it is
+//! stopped. What it leaves behind is what a replay leaves behind.
+
+use super::input::Input;
+use super::mapping::Mapping;
+use super::play::{realtime, Realtime};
+use super::progress::Progress;
+use super::sensors::Sensors;
+use super::tracking::{OdometryRun, Tracking};
+use super::{memory, summary};
+use crate::config::Board;
+use crate::output::OutputDir;
+use std::path::{Path, PathBuf};
+use stipple_drivers::{host, Calibration, Exit, Fault, Frames, TimedPose};
+
+pub struct Run {
+    /// Takes the place of the sensors, at its recorded pace.
+    pub dataset: Option<PathBuf>,
+    pub duration_s: Option<f64>,
+}
+
+/// What a run reads.
+struct Rig {
+    name: String,
+    place: String,
+    calibration: Calibration,
+    sensors: Sensors,
+    truth: Vec<TimedPose>,
+    opened: Vec<(&'static str, u64)>,
+    warnings: Vec<String>,
+    /// At most.
+    frames: usize,
+    length_s: Option<f64>,
+}
+
+/// `stipple run`
+pub fn run(path: &Path, out: &Path, set: &[String], options: &Run) -> Result<(), Fault> {
+    let board = Board::load(path, set)?;
+    let rig = match &options.dataset {
+        Some(dataset) => recorded(dataset, &board, options)?,
+        None => return Err(no_sensors(path)),
+    };
+    memory::admit(&rig.place, &rig.calibration, &board)?;
+    let out = OutputDir::create(out)?;
+    let tracking = Tracking::Odometry(Box::new(OdometryRun::new(&rig.calibration, &board, rig.frames)?));
+    let mapping = if board.map.enabled { Some(Mapping::open(&rig.calibration, &board)?) } else { None };
+    for warning in &rig.warnings {
+        eprintln!("stipple: warning: {warning}");
+    }
+    let title = summary::Title {
+        dataset: rig.name,
+        board: board.name.clone(),
+        pace: "live".into(),
+        scale: board.map.scale,
+        truth: rig.truth,
+        opened: rig.opened,
+    };
+    let mut progress = Progress::new(rig.length_s);
+    let realtime_options =
+        Realtime { holdout: 0, duration_s: None, sensors_s: options.duration_s, stop: host::stop_asked_for() };
+    let mut played = realtime(rig.sensors, &rig.calibration, tracking, mapping, &realtime_options, &mut progress);
+    progress.finish();
+    for warning in &played.warnings {
+        eprintln!("stipple: warning: {warning}");
+    }
+    played.warnings = [rig.warnings, played.warnings].concat();
+    let broken = played.broken.take();
+    let report = summary::conclude(title, played, &out)?;
+    println!("{}", summary::seven_lines(&report, &out));
+    broken.map_or(Ok(()), Err)
+}
+
+fn recorded(dataset: &Path, board: &Board, options: &Run) -> Result<Rig, Fault> {
+    let input = Input::recording(dataset, &board.replay, &board.rig)?;
+    let place = dataset.display().to_string();
+    let colours = memory::colours(&input.calibration, board).len();
+    input.needs_colour(colours, &place)?;
+    let (frames, length_s) = (input.frames_within(options.duration_s), input.length_s());
+    let Input { name, calibration, imu, mut stamps, truth, warnings, counters, source } = input;
+    stamps.truncate(frames);
+    let shape = || Frames::in_colour(&calibration, colours);
+    let sensors = Sensors::of_recording(source, stamps, imu, &board.inject, shape);
+    let length_s = Some(options.duration_s.map_or(length_s, |s| s.min(length_s)));
+    Ok(Rig { name, place, calibration, sensors, truth, opened: counters, warnings, frames, length_s })
+}
+
+fn no_sensors(board: &Path) -> Fault {
+    let what = "names no sensors";
+    let fix = "write [camera] and [imu], or pass --dataset to run on a recording";
+    Fault::new(Exit::Config, board.display().to_string(), what, fix)
+}

@@ -1,0 +1,290 @@
+//! The two threads that read the sensors, and what they share with tracking.
+//!
+//! Each waits for its source, holds what comes to `watch`, and delivers: frames to a mailbox where the newest replaces the
+//! one that waits, samples to a queue. A source that is lost or silent is said in one line when it goes and one when
+//! it is back, counted, and asked on; nothing is restarted. A broken one ends the run.
+//!
+//! A frame is tracked when a sample at or past its stamp has come, or when none did in time: `SAMPLE_WAIT`.
+
+use super::pipeline::Bell;
+use super::progress::Gauges;
+use super::tracking::Slot;
+use super::watch::{FrameWatch, ImuWatch};
+use crate::config::InjectConfig;
+use crate::counters::{Counter, Counters};
+use crossbeam_queue::ArrayQueue;
+use std::sync::atomic::{AtomicBool, AtomicI64, AtomicU64, Ordering::Relaxed};
+use std::time::{Duration, Instant};
+use stipple_drivers::inject::{FaultyFrames, FaultyImu};
+use stipple_drivers::paced::{Images, Pace, PacedFrames, PacedImu};
+use stipple_drivers::source::{FrameSource, ImuBatch, ImuSource, SourceFault, Wait};
+use stipple_drivers::{Calibration, Fault, Frames, ImuSample, Nanos, Span};
+
+/// A pair of sources.
+pub struct Sensors {
+    pub frames: Box<dyn FrameSource>,
+    pub imu: Box<dyn ImuSource>,
+}
+
+impl Sensors {
+    /// A recording at its pace, with what `inject` does to it; `shape` makes frames of the rig's shape.
+    pub fn of_recording(
+        images: Images,
+        stamps: Vec<Nanos>,
+        samples: Vec<ImuSample>,
+        inject: &InjectConfig,
+        shape: impl Fn() -> Frames,
+    ) -> Sensors {
+        let pace = Pace::starting(stamps.first().copied().unwrap_or_default());
+        let frames = PacedFrames::new(images, stamps, pace);
+        Sensors { frames: Box::new(frames), imu: Box::new(PacedImu::new(samples.into(), pace)) }.spoilt(inject, shape)
+    }
+
+    /// With the faults a board asks for; as they were where it asks for none.
+    pub fn spoilt(self, inject: &InjectConfig, shape: impl Fn() -> Frames) -> Sensors {
+        let Sensors { mut frames, mut imu } = self;
+        if !inject.camera.is_empty() {
+            frames = Box::new(FaultyFrames::new(frames, &inject.camera, inject.seed, shape()));
+        }
+        if !inject.imu.is_empty() {
+            imu = Box::new(FaultyImu::new(imu, &inject.imu, inject.seed));
+        }
+        Sensors { frames, imu }
+    }
+}
+
+/// How long a source may wait before it looks up: what ends a run or says a loss is at most so late.
+const PATIENCE: Span = Span(100_000_000);
+/// Without a sample at a frame's stamp for so long it is tracked without: more than a FIFO of 10 samples at 200 Hz holds
+/// back.
+const SAMPLE_WAIT: Duration = Duration::from_millis(100);
+/// A source that gives nothing for so long is silent: ten frames at 20 Hz.
+const SILENT_AFTER: Duration = Duration::from_millis(500);
+/// Of one sensor, at most a line each.
+const LINE_PERIOD: Duration = Duration::from_secs(1);
+const POLL: Duration = Duration::from_micros(500);
+/// Two seconds of a 1 kHz unit.
+const IMU_SLOTS: usize = 2048;
+const NOTICES: usize = 8;
+
+/// Where frames and samples wait for tracking. Slots go round: spare -> newest -> tracking -> spare.
+pub struct Inbox {
+    pub spare: ArrayQueue<Box<Slot>>,
+    newest: ArrayQueue<Box<Slot>>,
+    imu: ArrayQueue<ImuSample>,
+    /// Stamp of the newest sample.
+    imu_until: AtomicI64,
+    /// The unit is lost, silent, or its recording over: nobody waits for it.
+    imu_away: AtomicBool,
+    /// Frames that arrived.
+    pub arrived: AtomicU64,
+    /// Asks both threads to end.
+    pub stop: AtomicBool,
+    /// Lines to be printed, and what ended the run.
+    pub notices: ArrayQueue<String>,
+    pub broken: ArrayQueue<Fault>,
+}
+
+impl Inbox {
+    pub fn new(slots: usize, calibration: &Calibration, colours: usize) -> Inbox {
+        let inbox = Inbox {
+            spare: ArrayQueue::new(slots),
+            newest: ArrayQueue::new(1),
+            imu: ArrayQueue::new(IMU_SLOTS),
+            imu_until: AtomicI64::new(i64::MIN),
+            imu_away: AtomicBool::new(false),
+            arrived: AtomicU64::new(0),
+            stop: AtomicBool::new(false),
+            notices: ArrayQueue::new(NOTICES),
+            broken: ArrayQueue::new(2),
+        };
+        for _ in 0..slots {
+            let _ = inbox.spare.push(Slot::for_rig(calibration, colours));
+        }
+        inbox
+    }
+
+    /// The frame to track next with the samples up to the first at or past it, or `None` while one of them is to
+    /// come; `held` is the frame that waits.
+    pub fn take(&self, held: &mut Option<Held>, over: &AtomicBool, counters: &Counters) -> Option<Box<Slot>> {
+        if held.is_none() {
+            let mut slot = self.newest.pop()?;
+            slot.imu.clear();
+            *held = Some(Held { slot, since: Instant::now() });
+        }
+        let Held { slot, since } = held.as_mut().expect("filled above");
+        // Read first, so that what was queued before it was set is still taken.
+        let away = self.imu_away.load(Relaxed) || over.load(Relaxed);
+        let mut reached = false;
+        while let Some(sample) = self.imu.pop() {
+            slot.push_imu(sample, counters);
+            reached = sample.t >= slot.frames.t;
+            if reached {
+                break;
+            }
+        }
+        if !reached && !away && since.elapsed() < SAMPLE_WAIT {
+            return None;
+        }
+        counters.frames_without_imu.add(u64::from(!reached));
+        held.take().map(|h| h.slot)
+    }
+}
+
+/// A frame that waits for its samples.
+pub struct Held {
+    slot: Box<Slot>,
+    since: Instant,
+}
+
+/// Whether a sensor answers, and what is said of it.
+struct Presence<'a> {
+    name: &'static str,
+    heard: Instant,
+    away: bool,
+    lost: &'a Counter,
+    silent: &'a Counter,
+    away_ms: &'a Counter,
+    notices: &'a ArrayQueue<String>,
+    said: Option<Instant>,
+    /// The last loss was said, so its end is, too.
+    told: bool,
+}
+
+impl Presence<'_> {
+    fn goes(&mut self, counter: &Counter, what: impl FnOnce() -> String) {
+        self.away = true;
+        counter.add(1);
+        self.told = self.said.is_none_or(|t| t.elapsed() >= LINE_PERIOD);
+        if self.told {
+            self.said = Some(Instant::now());
+            let _ = self.notices.push(format!("{} {}", self.name, what()));
+        }
+    }
+
+    /// What `next` answered, but for `Broken`; whether the sensor is away.
+    fn hears(&mut self, answer: &Result<Wait, SourceFault>) -> bool {
+        match answer {
+            Ok(Wait::Got) => {
+                let gone = self.heard.elapsed();
+                self.heard = Instant::now();
+                if std::mem::take(&mut self.away) {
+                    self.away_ms.add(gone.as_millis() as u64);
+                    if self.told {
+                        let line = format!("{} is back after {:.1} s", self.name, gone.as_secs_f64());
+                        let _ = self.notices.push(line);
+                    }
+                }
+            }
+            Err(SourceFault::Lost(fault)) if !self.away => self.goes(self.lost, || format!("lost: {fault}")),
+            Ok(Wait::TimedOut) if !self.away && self.heard.elapsed() >= SILENT_AFTER => {
+                self.goes(self.silent, || format!("is silent for {:.1} s", SILENT_AFTER.as_secs_f64()));
+            }
+            _ => {}
+        }
+        self.away
+    }
+}
+
+/// Thread `camera`. Ends with its source, or when asked.
+pub fn camera(inbox: &Inbox, source: &mut dyn FrameSource, tracking: &Bell, c: &Counters, gauges: &Gauges) {
+    let Some(mut slot) = inbox.spare.pop() else { return };
+    let mut watch = FrameWatch::new(&slot.frames);
+    let mut presence = Presence {
+        name: "camera",
+        heard: Instant::now(),
+        away: false,
+        lost: &c.camera_lost,
+        silent: &c.camera_silent,
+        away_ms: &c.camera_away_ms,
+        notices: &inbox.notices,
+        said: None,
+        told: false,
+    };
+    let mut span = None;
+    while !inbox.stop.load(Relaxed) {
+        let answer = source.next(PATIENCE, &mut slot.frames);
+        if presence.hears(&answer) && answer.is_err() {
+            watch.stamps.forget();
+        }
+        match answer {
+            Ok(Wait::Got) => {}
+            Ok(Wait::TimedOut) | Err(SourceFault::Lost(_)) => continue,
+            Ok(Wait::Ended) => break,
+            Err(SourceFault::Broken(fault)) => {
+                let _ = inbox.broken.push(fault);
+                break;
+            }
+        }
+        inbox.arrived.fetch_add(1, Relaxed);
+        if !watch.admits(&slot.frames, Instant::now(), c) {
+            continue;
+        }
+        let t = slot.frames.t;
+        let (first, _) = *span.get_or_insert((t, t));
+        span = Some((first, t));
+        gauges.played_ms.store(((t - first).secs() * 1e3).max(0.0) as u64, Relaxed);
+        let replaced = inbox.newest.force_push(slot);
+        c.frames_overwritten.add(u64::from(replaced.is_some()));
+        tracking.ring();
+        slot = match replaced.or_else(|| inbox.spare.pop()) {
+            Some(slot) => slot,
+            // Slots are as many as frames can be under way; one is about to come back.
+            None => loop {
+                std::thread::sleep(POLL);
+                if let Some(slot) = inbox.spare.pop() {
+                    break slot;
+                }
+            },
+        };
+    }
+    let Some((_, last)) = span else { return };
+    let limit = Instant::now() + SAMPLE_WAIT;
+    let reached = || inbox.imu_until.load(Relaxed) >= last.0 || inbox.imu_away.load(Relaxed);
+    while !reached() && Instant::now() < limit {
+        std::thread::sleep(POLL);
+    }
+}
+
+/// Thread `imu`. Ends with its source or with the cameras.
+pub fn inertial(inbox: &Inbox, source: &mut dyn ImuSource, tracking: &Bell, over: &AtomicBool, c: &Counters) {
+    let (mut batch, mut watch) = (ImuBatch::new(), ImuWatch::new());
+    let mut presence = Presence {
+        name: "inertial unit",
+        heard: Instant::now(),
+        away: false,
+        lost: &c.imu_lost,
+        silent: &c.imu_silent,
+        away_ms: &c.imu_away_ms,
+        notices: &inbox.notices,
+        said: None,
+        told: false,
+    };
+    while !over.load(Relaxed) {
+        let answer = source.next(PATIENCE, &mut batch);
+        let away = presence.hears(&answer);
+        inbox.imu_away.store(away, Relaxed);
+        match answer {
+            Ok(Wait::Got) => {}
+            Ok(Wait::TimedOut) => continue,
+            Err(SourceFault::Lost(_)) => {
+                watch.stamps.forget();
+                continue;
+            }
+            Ok(Wait::Ended) => break,
+            Err(SourceFault::Broken(fault)) => {
+                let _ = inbox.broken.push(fault);
+                inbox.stop.store(true, Relaxed);
+                break;
+            }
+        }
+        let now = Instant::now();
+        for reading in batch.iter().filter(|r| watch.admits(r, now, c)) {
+            // Never refused: while no frame comes the oldest make room.
+            c.imu_overflow.add(u64::from(inbox.imu.force_push(reading.sample).is_some()));
+            inbox.imu_until.store(reading.sample.t.0, Relaxed);
+        }
+        tracking.ring();
+    }
+    inbox.imu_away.store(true, Relaxed);
+}

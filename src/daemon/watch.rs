@@ -1,0 +1,216 @@
+//! What a sensor is held to before anyone believes it: stamps that grow and do not leap, pictures and readings
+//! that change, none missing. Every check counts; only what would mislead the estimator is refused.
+//!
+//! A stamp ahead of its arrival by more than `LEAP` is refused, and so is one that is not newer than the last; if that
+//! is all that comes for `RELEARN`, the sensor's clock has changed for good and is believed from then on.
+
+use crate::counters::{Counter, Counters};
+use std::time::{Duration, Instant};
+use stipple_drivers::source::ImuReading;
+use stipple_drivers::{Frames, Image, ImuSample, Nanos};
+
+/// Further than a queue of frames can be behind.
+const LEAP: Duration = Duration::from_secs(1);
+const RELEARN: Duration = Duration::from_secs(2);
+/// Intervals of whose median the period is made.
+const INTERVALS: usize = 15;
+/// One pixel in so many tells two pictures apart: noise changes half of them.
+const LOOKED_AT: usize = 61;
+/// Grey levels between the darkest and the brightest pixel of a covered eye.
+const BLANK_LEVELS: u8 = 6;
+/// So many readings in a row, all six axes alike to the last bit, no working unit gives.
+const FROZEN_AFTER: u32 = 3;
+
+/// Stamps of one sensor.
+pub struct Stamps {
+    last: Option<(Nanos, Instant)>,
+    /// Since when nothing was believed.
+    refusing: Option<Instant>,
+    intervals: [i64; INTERVALS],
+    count: usize,
+}
+
+/// Where what is wrong with stamps is counted.
+pub struct StampCounters<'a> {
+    pub missing: &'a Counter,
+    pub not_newer: &'a Counter,
+    pub leapt: &'a Counter,
+}
+
+impl Stamps {
+    pub fn new() -> Stamps {
+        Stamps { last: None, refusing: None, intervals: [0; INTERVALS], count: 0 }
+    }
+
+    /// After a loss its clock may be another.
+    pub fn forget(&mut self) {
+        self.last = None;
+        self.refusing = None;
+    }
+
+    /// Median of the last intervals, ns.
+    pub fn period(&self) -> Option<i64> {
+        let mut sorted = self.intervals;
+        sorted.sort_unstable();
+        (self.count >= INTERVALS).then(|| sorted[INTERVALS / 2])
+    }
+
+    /// Whether a sample with this stamp, which arrived at `now`, is believed.
+    pub fn admits(&mut self, t: Nanos, now: Instant, counters: &StampCounters) -> bool {
+        if let Some((last, at)) = self.last {
+            let elapsed = (now - at).as_nanos() as i64;
+            let not_newer = t <= last;
+            if not_newer || (t - last).0 > elapsed + LEAP.as_nanos() as i64 {
+                let since = *self.refusing.get_or_insert(now);
+                if now - since < RELEARN {
+                    if not_newer { counters.not_newer } else { counters.leapt }.add(1);
+                    return false;
+                }
+            } else {
+                self.follow((t - last).0, counters);
+            }
+        }
+        self.refusing = None;
+        self.last = Some((t, now));
+        true
+    }
+
+    fn follow(&mut self, interval: i64, counters: &StampCounters) {
+        if let Some(period) = self.period().filter(|p| interval > p + p / 2) {
+            counters.missing.add(((interval + period / 2) / period - 1).max(0) as u64);
+        }
+        self.intervals[self.count % INTERVALS] = interval;
+        self.count += 1;
+    }
+}
+
+/// Frames of a rig.
+pub struct FrameWatch {
+    pub stamps: Stamps,
+    /// Pixels of the last frame, every `LOOKED_AT`th.
+    looks: Vec<Vec<u8>>,
+}
+
+impl FrameWatch {
+    pub fn new(shape: &Frames) -> FrameWatch {
+        let look = |image: &Image| vec![0; image.pixels.len().div_ceil(LOOKED_AT)];
+        FrameWatch { stamps: Stamps::new(), looks: shape.images.iter().map(look).collect() }
+    }
+
+    pub fn admits(&mut self, frames: &Frames, now: Instant, c: &Counters) -> bool {
+        let counters =
+            StampCounters { missing: &c.frames_missing, not_newer: &c.frames_not_newer, leapt: &c.frames_leapt };
+        if !self.stamps.admits(frames.t, now, &counters) {
+            return false;
+        }
+        let (mut frozen, mut blank) = (false, false);
+        for (image, look) in frames.images.iter().zip(&mut self.looks) {
+            let (mut same, mut low, mut high) = (true, u8::MAX, 0);
+            for (px, kept) in image.pixels.iter().step_by(LOOKED_AT).zip(look) {
+                same &= px == kept;
+                (low, high) = (low.min(*px), high.max(*px));
+                *kept = *px;
+            }
+            let dull = high.saturating_sub(low) < BLANK_LEVELS;
+            blank |= dull;
+            // Black twice is the dark, not a camera that hangs.
+            frozen |= same && !dull;
+        }
+        c.frames_blank.add(u64::from(blank));
+        c.frames_frozen.add(u64::from(frozen));
+        !frozen
+    }
+}
+
+/// Readings of an inertial unit.
+pub struct ImuWatch {
+    pub stamps: Stamps,
+    last: Option<ImuSample>,
+    repeated: u32,
+}
+
+impl ImuWatch {
+    pub fn new() -> ImuWatch {
+        ImuWatch { stamps: Stamps::new(), last: None, repeated: 0 }
+    }
+
+    pub fn admits(&mut self, reading: &ImuReading, now: Instant, c: &Counters) -> bool {
+        let counters = StampCounters { missing: &c.imu_missing, not_newer: &c.imu_not_newer, leapt: &c.imu_leapt };
+        let sample = reading.sample;
+        if !self.stamps.admits(sample.t, now, &counters) {
+            return false;
+        }
+        c.imu_saturated.add(u64::from(reading.saturated));
+        let same = |s: ImuSample| s.gyro_body == sample.gyro_body && s.accel_body == sample.accel_body;
+        self.repeated = if self.last.is_some_and(same) { self.repeated + 1 } else { 0 };
+        self.last = Some(sample);
+        if self.repeated >= FROZEN_AFTER {
+            c.imu_frozen.add(if self.repeated == FROZEN_AFTER { u64::from(FROZEN_AFTER) } else { 1 });
+        }
+        self.repeated < FROZEN_AFTER
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const MS: i64 = 1_000_000;
+
+    /// Stamps (ms) that arrive every 20 ms: those believed, and counts of missing, not newer, leapt.
+    fn believed(stamps: &[i64]) -> (Vec<i64>, [u64; 3]) {
+        let (mut watch, start) = (Stamps::new(), Instant::now());
+        let [missing, not_newer, leapt] = [Counter::default(), Counter::default(), Counter::default()];
+        let counters = StampCounters { missing: &missing, not_newer: &not_newer, leapt: &leapt };
+        let arrives = |i: usize| start + Duration::from_millis(20 * i as u64);
+        let list = stamps.iter().enumerate();
+        let kept = list.filter(|(i, t)| watch.admits(Nanos(**t * MS), arrives(*i), &counters)).map(|(_, t)| *t);
+        (kept.collect(), [missing.get(), not_newer.get(), leapt.get()])
+    }
+
+    #[test]
+    fn leaps_and_repetitions_are_refused_and_what_lacks_is_counted() {
+        let mut stamps: Vec<i64> = (0..40).map(|i| 20 * i).collect();
+        (stamps[20], stamps[25], stamps[30]) = (5000, 480, 200);
+        let (kept, counts) = believed(&stamps);
+        assert_eq!((kept.len(), counts), (37, [3, 2, 1]));
+        let skipping: Vec<i64> = (0..60).filter(|i| !(30..34).contains(i)).map(|i| 20 * i).collect();
+        assert_eq!(believed(&skipping).1, [4, 0, 0]);
+    }
+
+    #[test]
+    fn a_clock_that_changed_for_good_is_believed() {
+        let stamps: Vec<i64> = (0..300).map(|i| 20 * i + if i < 50 { 0 } else { 100_000 }).collect();
+        let (kept, [_, _, leapt]) = believed(&stamps);
+        assert_eq!((kept.len() as u64 + leapt, leapt), (300, 100));
+    }
+
+    #[test]
+    fn a_unit_that_hangs_is_refused_and_one_repetition_is_not() {
+        let (mut watch, c, start) = (ImuWatch::new(), Counters::default(), Instant::now());
+        let values = [1, 2, 2, 3, 4, 4, 4, 4, 4, 5];
+        let admitted = values.iter().enumerate().filter(|(i, v)| {
+            let gyro_body = glam::DVec3::splat(f64::from(**v));
+            let sample = ImuSample { t: Nanos(*i as i64 * MS), gyro_body, ..ImuSample::default() };
+            watch.admits(&ImuReading { sample, ..ImuReading::default() }, start, &c)
+        });
+        assert_eq!((admitted.count(), c.imu_frozen.get()), (8, 4));
+    }
+
+    #[test]
+    fn a_hanging_camera_is_refused_and_a_covered_one_is_not() {
+        let picture = |seed: u8| Image {
+            pixels: (0..6400).map(|i| (i as u8).wrapping_mul(seed)).collect(),
+            ..Image::new(80, 80)
+        };
+        let c = Counters::default();
+        let mut watch = FrameWatch::new(&Frames { images: vec![Image::new(80, 80)], ..Frames::default() });
+        let (start, black) = (Instant::now(), Image::new(80, 80));
+        let pictures = [picture(3), picture(5), picture(5), black.clone(), black, picture(7)];
+        let admitted = pictures.into_iter().enumerate().map(|(i, image)| {
+            watch.admits(&Frames { t: Nanos(i as i64 * MS), images: vec![image], colours: vec![] }, start, &c)
+        });
+        assert_eq!(admitted.collect::<Vec<_>>(), [true, true, false, true, true, true]);
+        assert_eq!((c.frames_frozen.get(), c.frames_blank.get()), (1, 2));
+    }
+}

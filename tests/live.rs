@@ -1,0 +1,157 @@
+//! `stipple run` on a recording in the place of sensors: it ends as a replay ends, stops when asked, and outlives what
+//! `[inject]` does to it, with every fault that was injected counted by what detected it.
+#![allow(clippy::unwrap_used)]
+
+use serde_json::Value;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output, Stdio};
+use std::time::{Duration, Instant};
+
+const BOARD: &str = "board-configs/lavapipe.toml";
+
+fn stipple() -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_stipple"));
+    command.current_dir(env!("CARGO_MANIFEST_DIR"));
+    command
+}
+
+fn text(o: &Output) -> String {
+    String::from_utf8_lossy(&o.stderr).into_owned() + &String::from_utf8_lossy(&o.stdout)
+}
+
+fn flight(dir: &Path, seconds: &str) -> PathBuf {
+    let out = dir.join("flight");
+    let args = ["sim", "demo", "--duration", seconds, "--out", out.to_str().unwrap()];
+    let o = stipple().args(args).output().unwrap();
+    assert!(o.status.success(), "{}", text(&o));
+    out
+}
+
+fn run(dataset: &Path, out: &Path, board: &str) -> Command {
+    let mut command = stipple();
+    command.args(["run", board, "--dataset", dataset.to_str().unwrap(), "--out", out.to_str().unwrap()]);
+    command.args(["--set", "map.enabled=false"]);
+    command
+}
+
+fn report(out: &Path) -> Value {
+    serde_json::from_slice(&fs::read(out.join("report.json")).unwrap()).unwrap()
+}
+
+fn count(report: &Value, name: &str) -> u64 {
+    report[format!("count_{name}")].as_u64().unwrap_or(0)
+}
+
+/// A board with rules of faults.
+fn board_with(dir: &Path, rules: &str) -> String {
+    let board = dir.join("board.toml");
+    let plain = fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join(BOARD)).unwrap();
+    fs::write(&board, format!("{plain}\n[inject]\nseed = 1\n{rules}")).unwrap();
+    board.to_str().unwrap().to_string()
+}
+
+#[test]
+fn a_run_on_a_recording_leaves_what_a_replay_leaves() {
+    let dir = tempfile::tempdir().unwrap();
+    let (data, out) = (flight(dir.path(), "4"), dir.path().join("out"));
+    let o = run(&data, &out, BOARD).output().unwrap();
+    assert!(o.status.success(), "{}", text(&o));
+    let r = report(&out);
+    assert!(out.join("trajectory.tum").exists() && out.join("report.html").exists());
+    assert_eq!((&r["pace"], &r["heap_after_seal"]), (&"live".into(), &0.into()), "{}", text(&o));
+    assert!(r["frames"].as_u64().unwrap() > 40 && r["ate_rmse_m"].as_f64().unwrap() < 0.02, "{}", text(&o));
+    let quiet =
+        ["camera_lost", "camera_silent", "imu_lost", "frames_missing", "frames_leapt", "imu_missing", "imu_frozen"];
+    quiet.iter().for_each(|name| assert_eq!(count(&r, name), 0, "{name}: {}", text(&o)));
+}
+
+#[test]
+fn a_run_asked_to_stop_ends_with_its_files_written() {
+    let dir = tempfile::tempdir().unwrap();
+    let (data, out) = (flight(dir.path(), "8"), dir.path().join("out"));
+    let begun = Instant::now();
+    let child = run(&data, &out, BOARD).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    std::thread::sleep(Duration::from_secs(3));
+    let told = Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap();
+    assert!(told.success());
+    let o = child.wait_with_output().unwrap();
+    assert!(o.status.success() && begun.elapsed() < Duration::from_secs(7), "{}", text(&o));
+    let frames = report(&out)["frames"].as_u64().unwrap();
+    assert!((10..100).contains(&frames), "{frames}");
+}
+
+#[test]
+fn a_board_without_sensors_is_told_what_to_write() {
+    let dir = tempfile::tempdir().unwrap();
+    let o = stipple().args(["run", BOARD, "--out", dir.path().join("out").to_str().unwrap()]).output().unwrap();
+    assert_eq!(o.status.code(), Some(78));
+    assert!(text(&o).contains("[camera]") && text(&o).contains("--dataset"), "{}", text(&o));
+}
+
+/// Two cables out, a stuck and a leaping camera: said, counted, outlived.
+#[test]
+fn sensors_that_fail_are_said_counted_and_taken_back() {
+    const RULES: &str = "
+        [[inject.camera]]
+        fault = \"drop\"
+        start_s = 1.5
+        end_s = 1.7
+        [[inject.camera]]
+        fault = \"unplug\"
+        start_s = 2.2
+        end_s = 3.0
+        [[inject.camera]]
+        fault = \"freeze\"
+        start_s = 3.5
+        end_s = 3.7
+        [[inject.camera]]
+        fault = \"stamp_jump\"
+        by_s = 60.0
+        start_s = 4.0
+        end_s = 4.2
+        [[inject.camera]]
+        fault = \"duplicate\"
+        start_s = 4.5
+        end_s = 4.7
+        [[inject.imu]]
+        fault = \"freeze\"
+        start_s = 4.8
+        end_s = 4.9
+        [[inject.imu]]
+        fault = \"unplug\"
+        start_s = 5.0
+        end_s = 5.5
+    ";
+    let dir = tempfile::tempdir().unwrap();
+    let (data, out) = (flight(dir.path(), "7"), dir.path().join("out"));
+    let o = run(&data, &out, &board_with(dir.path(), RULES)).output().unwrap();
+    let (r, said) = (report(&out), text(&o));
+    assert!(o.status.success(), "{said}");
+    let same = |injected: &[&str], detected: &[&str]| {
+        let sum = |names: &[&str]| names.iter().map(|n| count(&r, n)).sum::<u64>();
+        assert!(sum(injected) > 0, "{injected:?}: {said}");
+        assert_eq!(sum(injected), sum(detected), "{injected:?}, {detected:?}: {said}");
+    };
+    same(&["injected_camera_unplugs"], &["camera_lost"]);
+    same(&["injected_imu_unplugs"], &["imu_lost"]);
+    same(&["injected_frames_frozen"], &["frames_frozen"]);
+    same(&["injected_frames_jumped"], &["frames_leapt"]);
+    same(&["injected_frames_duplicated"], &["frames_not_newer"]);
+    same(&["injected_imu_frozen"], &["imu_frozen"]);
+    // After a loss nobody knows how many frames there were; leaps are gaps among those believed.
+    same(&["injected_frames_dropped", "injected_frames_jumped"], &["frames_missing"]);
+    for words in ["camera lost", "camera is back after", "inertial unit lost", "inertial unit is back after"] {
+        assert!(said.contains(words), "{words}: {said}");
+    }
+    assert!(r["ate_rmse_m"].as_f64().unwrap() < 0.1, "{said}");
+}
+
+#[test]
+fn a_senseless_rule_is_named() {
+    let dir = tempfile::tempdir().unwrap();
+    let board = board_with(dir.path(), "[[inject.imu]]\nfault = \"blackout\"\n");
+    let o = stipple().args(["check", &board]).output().unwrap();
+    assert_eq!(o.status.code(), Some(78));
+    assert!(text(&o).contains("inject.imu, rule 1") && text(&o).contains("no light"), "{}", text(&o));
+}
