@@ -88,6 +88,24 @@ fn values_that_contradict_each_other_are_named() {
 }
 
 #[test]
+fn cameras_are_named_by_what_does_not_change() {
+    let camera = |more: &str| parse(&format!("{BOARD}[camera]\n{more}\n"), &[]);
+    let board = camera(
+        "devices = [\"serial:01\", \"bus:usb-1\"]\nformat = \"y10p\"\nstamp = \"frame-end\"\n\
+        [camera.controls]\ngain = 16\ntrigger_mode = -1",
+    );
+    let camera_of = board.unwrap().camera;
+    assert_eq!((camera_of.devices.len(), camera_of.controls["trigger_mode"]), (2, -1));
+    let wrong = camera("rate_hz = 30\ndevices = [\"path:/dev/video0\"]");
+    refused(wrong, Exit::Config, &["test.toml:15", "camera.devices", "/dev/video0", "by-path"]);
+    refused(camera("devices = [\"0001\"]"), Exit::Config, &["test.toml:14", "names no camera"]);
+    refused(camera("format = \"rgb\""), Exit::Config, &["test.toml:14", "rgb", "yuyv"]);
+    refused(camera("pair_tolerance_s = 0.03"), Exit::Config, &["test.toml:14", "half a period"]);
+    refused(camera("buffers = 2"), Exit::Config, &["test.toml:14", "3 to 32"]);
+    refused(camera("gain = 2"), Exit::Config, &["test.toml:14", "gain"]);
+}
+
+#[test]
 fn overrides_reach_nested_keys_strings_numbers_and_booleans() {
     let set = [
         "name=other",

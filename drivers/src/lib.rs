@@ -16,6 +16,11 @@ pub mod replay;
 pub mod sim;
 pub mod source;
 pub mod types;
+pub mod v4l2;
+
+#[cfg(test)]
+#[path = "../../tests/hil/jpeg.rs"]
+mod jpeg;
 
 pub use calibration::{Calibration, ImuCalibration, ImuCorrection, RigCamera};
 pub use camera::{Camera, Lens};

@@ -125,4 +125,15 @@ pub(super) const BOUNDS: &[(&str, Bound)] = &[
     ("replay.pair_tolerance_s", Within(0.0, 1.0)),
     ("replay.imu_hole_s", Positive),
     ("inject.seed", Within(0.0, u64::MAX as f64)),
+    ("camera.width_px", Within(0.0, 4096.0)),
+    ("camera.height_px", Within(0.0, 4096.0)),
+    ("camera.rate_hz", Within(0.1, 1000.0)),
+    ("camera.exposure_us", Within(0.0, 1_000_000.0)),
+    // A line of a sensor takes 5 to 60 us.
+    ("camera.exposure_line_us", Within(0.0, 1000.0)),
+    ("camera.transfer_s", Within(0.0, 0.5)),
+    ("camera.pair_tolerance_s", Within(0.0, 1.0)),
+    // Three: one to fill, one that waits, one that is read; 32 is the kernel's most.
+    ("camera.buffers", Within(3.0, 32.0)),
+    ("camera.silent_s", Within(0.05, 3600.0)),
 ];

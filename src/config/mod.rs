@@ -6,11 +6,13 @@
 //! the same rules as the file.
 
 mod bounds;
+mod camera;
 mod inject;
 mod map;
 mod network;
 
 use bounds::BOUNDS;
+pub use camera::CameraConfig;
 pub use inject::InjectConfig;
 pub use map::{MapConfig, Projection};
 pub use network::{Fit, NetworkConfig};
@@ -41,6 +43,8 @@ pub struct Board {
     pub replay: ReplayConfig,
     #[serde(default)]
     pub inject: InjectConfig,
+    #[serde(default)]
+    pub camera: CameraConfig,
 }
 
 /// Capacities bought at boot. Every one is a hard limit; full is counted, never grown.
@@ -331,6 +335,9 @@ impl Board {
             if !bound.holds(number) {
                 return Err((key, format!("{key} = {value} must be {bound}")));
             }
+        }
+        if let Some(wrong) = self.camera.wrong() {
+            return Err(wrong);
         }
         let among: &[(bool, &'static str, &str)] = &[
             (

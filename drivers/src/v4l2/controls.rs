@@ -1,0 +1,156 @@
+//! Controls of a camera: exposure in time, everything else under the name that `v4l2-ctl --list-ctrls` gives it. Values
+//! are checked against what the camera states, and a name it does not have is refused with those it has.
+
+use super::fault::refused;
+use super::kernel::{Kernel, Request};
+use super::uapi::*;
+use super::Settings;
+use crate::types::Span;
+use crate::{Exit, Fault};
+use std::io;
+
+/// Of `CID_EXPOSURE_ABSOLUTE`.
+const EXPOSURE_UNIT: Span = Span(100_000);
+/// More than any camera has; a driver whose list never ends is left.
+const CONTROLS_MAX: usize = 512;
+
+pub(super) struct Controls<'a> {
+    kernel: &'a dyn Kernel,
+    fd: i32,
+    /// Of the camera, in messages.
+    name: &'a str,
+    known: Vec<QueryControl>,
+}
+
+impl<'a> Controls<'a> {
+    pub(super) fn list(kernel: &'a dyn Kernel, fd: i32, name: &'a str) -> Result<Controls<'a>, Fault> {
+        let mut known: Vec<QueryControl> = Vec::new();
+        let mut last = 0;
+        while known.len() < CONTROLS_MAX {
+            let mut control = QueryControl { id: last | NEXT_CONTROL, ..QueryControl::ZERO };
+            match kernel.ioctl(fd, Request::QueryControl(&mut control)) {
+                Ok(()) if control.id <= last => break,
+                Ok(()) => {
+                    last = control.id;
+                    known.push(control);
+                }
+                // The end of the list; or a driver without controls.
+                Err(e) if matches!(e.raw_os_error(), Some(libc::EINVAL | libc::ENOTTY)) => break,
+                Err(e) => return Err(refused(name, "list its controls", "VIDIOC_QUERY_EXT_CTRL", &e)),
+            }
+        }
+        known.retain(|c| c.flags & CONTROL_DISABLED == 0 && is_number(c.kind));
+        Ok(Controls { kernel, fd, name, known })
+    }
+
+    /// Sets what the settings ask for; the exposure that results, zero where the camera does not say.
+    pub(super) fn apply(&self, settings: &Settings) -> Result<Span, Fault> {
+        // First, as a camera that exposes by itself refuses an exposure.
+        for (name, value) in &settings.controls {
+            let key = format!("camera.controls.{name}");
+            let control = self.known.iter().find(|c| label(c) == *name).ok_or_else(|| self.unknown(&key, name))?;
+            self.set(&key, control, *value)?;
+        }
+        let absolute = self.known.iter().find(|c| c.id == CID_EXPOSURE_ABSOLUTE);
+        let lines = self.known.iter().find(|c| c.id == CID_EXPOSURE && settings.exposure_line.0 > 0);
+        let (control, unit) = match (absolute, lines) {
+            (Some(control), _) => (control, EXPOSURE_UNIT),
+            (None, Some(control)) => (control, settings.exposure_line),
+            (None, None) if settings.exposure.0 == 0 => return Ok(Span(0)),
+            (None, None) => {
+                let fix =
+                    "state camera.exposure_line_us where it has `exposure` in lines, or leave camera.exposure_us out";
+                return Err(self.wrong(format!("cannot set an exposure in time; it has {}", self.names()), fix));
+            }
+        };
+        if settings.exposure.0 > 0 {
+            if let Some(auto) = self.known.iter().find(|c| c.id == CID_EXPOSURE_AUTO) {
+                self.set("camera.exposure_us", auto, EXPOSURE_MANUAL)?;
+            }
+            let value = (settings.exposure.0 + unit.0 / 2) / unit.0;
+            self.set("camera.exposure_us", control, value)?;
+        }
+        Ok(Span(self.get(control)?.saturating_mul(unit.0)))
+    }
+
+    fn set(&self, key: &str, control: &QueryControl, value: i64) -> Result<(), Fault> {
+        let name = label(control);
+        let (least, most, step) = (control.minimum, control.maximum, control.step.max(1));
+        let off_step = (i128::from(value) - i128::from(least)) % i128::from(step) != 0;
+        if value < least || value > most || off_step {
+            let what = format!("{key}: `{name}` = {value} is not among {least} to {most} in steps of {step}");
+            return Err(self.wrong(what, "change it in the board file"));
+        }
+        if control.flags & CONTROL_READ_ONLY != 0 {
+            return Err(self.wrong(format!("{key}: `{name}` can only be read"), "leave it out of the board file"));
+        }
+        let purpose = format!("set `{name}` to {value} ({key})");
+        let mut asked = ExtControl { id: control.id, size: 0, reserved: 0, value };
+        match self.kernel.ioctl(self.fd, Request::SetExtControl(&mut asked)) {
+            Err(e) if is_older(&e, control) => {
+                let mut asked = Control { id: control.id, value: value as i32 };
+                let answer = self.kernel.ioctl(self.fd, Request::SetControl(&mut asked));
+                answer.map_err(|e| refused(self.name, &purpose, "VIDIOC_S_CTRL", &e))
+            }
+            answer => answer.map_err(|e| refused(self.name, &purpose, "VIDIOC_S_EXT_CTRLS", &e)),
+        }
+    }
+
+    fn get(&self, control: &QueryControl) -> Result<i64, Fault> {
+        let purpose = format!("read `{}`", label(control));
+        let mut asked = ExtControl { id: control.id, ..ExtControl::default() };
+        match self.kernel.ioctl(self.fd, Request::GetExtControl(&mut asked)) {
+            Err(e) if is_older(&e, control) => {
+                let mut asked = Control { id: control.id, value: 0 };
+                let answer = self.kernel.ioctl(self.fd, Request::GetControl(&mut asked));
+                answer.map_err(|e| refused(self.name, &purpose, "VIDIOC_G_CTRL", &e))?;
+                Ok(i64::from(asked.value))
+            }
+            Err(e) => Err(refused(self.name, &purpose, "VIDIOC_G_EXT_CTRLS", &e)),
+            // Only the low half is written where a control has 32 bits.
+            Ok(()) if control.kind != CONTROL_INTEGER64 => Ok(i64::from(asked.value as i32)),
+            Ok(()) => Ok(asked.value),
+        }
+    }
+
+    fn unknown(&self, key: &str, name: &str) -> Fault {
+        self.wrong(format!("{key}: it has no control `{name}`; it has {}", self.names()), "change it in the board file")
+    }
+
+    fn names(&self) -> String {
+        if self.known.is_empty() {
+            return "none".to_string();
+        }
+        let range = |c: &QueryControl| format!("{} ({} to {})", label(c), c.minimum, c.maximum);
+        self.known.iter().map(range).collect::<Vec<_>>().join(", ")
+    }
+
+    fn wrong(&self, what: String, fix: &str) -> Fault {
+        Fault::new(Exit::Config, self.name, what, fix)
+    }
+}
+
+/// A driver from before extended controls, which has the control of 32 bits all the same.
+fn is_older(e: &io::Error, control: &QueryControl) -> bool {
+    e.raw_os_error() == Some(libc::ENOTTY) && control.kind != CONTROL_INTEGER64
+}
+
+fn is_number(kind: u32) -> bool {
+    let numbers =
+        [CONTROL_INTEGER, CONTROL_BOOLEAN, CONTROL_MENU, CONTROL_INTEGER64, CONTROL_BITMASK, CONTROL_INTEGER_MENU];
+    numbers.contains(&kind)
+}
+
+/// As v4l2-ctl writes names: lower case, anything else than letters and digits as one underscore.
+fn label(control: &QueryControl) -> String {
+    let mut label = String::new();
+    for c in super::find::text(&control.name).chars() {
+        if c.is_ascii_alphanumeric() {
+            label.push(c.to_ascii_lowercase());
+        } else if !label.is_empty() && !label.ends_with('_') {
+            label.push('_');
+        }
+    }
+    label.truncate(label.trim_end_matches('_').len());
+    label
+}

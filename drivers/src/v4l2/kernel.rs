@@ -1,0 +1,221 @@
+//! The system calls a camera needs, and nothing that decides. `Linux` makes them; tests answer them with a kernel of
+//! their own, so that each one fails once with each error it can give.
+#![allow(unsafe_code)]
+
+use super::uapi::*;
+use crate::types::{Nanos, Span};
+use std::ffi::CString;
+use std::io;
+use std::os::unix::ffi::OsStrExt;
+use std::path::{Path, PathBuf};
+
+/// One ioctl with its argument.
+pub(super) enum Request<'a> {
+    QueryCap(&'a mut Capability),
+    EnumFormat(&'a mut FormatDescription),
+    EnumSize(&'a mut FrameSize),
+    EnumInterval(&'a mut FrameInterval),
+    SetFormat(&'a mut FormatSingle),
+    SetFormatMulti(&'a mut FormatMulti),
+    SetParm(&'a mut StreamParm),
+    Buy(&'a mut RequestBuffers),
+    /// The planes are the kernel's to fill where the buffer is of a multi-planar queue.
+    QueryBuffer(&'a mut Buffer, &'a mut [Plane; PLANES_MAX]),
+    Export(&'a mut ExportBuffer),
+    Queue(&'a mut Buffer, &'a mut [Plane; PLANES_MAX]),
+    Dequeue(&'a mut Buffer, &'a mut [Plane; PLANES_MAX]),
+    StreamOn(u32),
+    StreamOff(u32),
+    QueryControl(&'a mut QueryControl),
+    SetExtControl(&'a mut ExtControl),
+    GetExtControl(&'a mut ExtControl),
+    SetControl(&'a mut Control),
+    GetControl(&'a mut Control),
+}
+
+impl Request<'_> {
+    /// As the documentation has it.
+    pub(super) fn name(&self) -> &'static str {
+        match self {
+            Request::QueryCap(_) => "VIDIOC_QUERYCAP",
+            Request::EnumFormat(_) => "VIDIOC_ENUM_FMT",
+            Request::EnumSize(_) => "VIDIOC_ENUM_FRAMESIZES",
+            Request::EnumInterval(_) => "VIDIOC_ENUM_FRAMEINTERVALS",
+            Request::SetFormat(_) | Request::SetFormatMulti(_) => "VIDIOC_S_FMT",
+            Request::SetParm(_) => "VIDIOC_S_PARM",
+            Request::Buy(_) => "VIDIOC_REQBUFS",
+            Request::QueryBuffer(..) => "VIDIOC_QUERYBUF",
+            Request::Export(_) => "VIDIOC_EXPBUF",
+            Request::Queue(..) => "VIDIOC_QBUF",
+            Request::Dequeue(..) => "VIDIOC_DQBUF",
+            Request::StreamOn(_) => "VIDIOC_STREAMON",
+            Request::StreamOff(_) => "VIDIOC_STREAMOFF",
+            Request::QueryControl(_) => "VIDIOC_QUERY_EXT_CTRL",
+            Request::SetExtControl(_) => "VIDIOC_S_EXT_CTRLS",
+            Request::GetExtControl(_) => "VIDIOC_G_EXT_CTRLS",
+            Request::SetControl(_) => "VIDIOC_S_CTRL",
+            Request::GetControl(_) => "VIDIOC_G_CTRL",
+        }
+    }
+}
+
+/// A video node of this machine.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct Listed {
+    pub path: PathBuf,
+    /// Of the USB device behind it.
+    pub serial: Option<String>,
+}
+
+/// What poll said of one descriptor.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(super) struct Ready {
+    pub readable: bool,
+    /// POLLERR or POLLHUP: not streaming, or gone.
+    pub error: bool,
+}
+
+pub(super) trait Kernel: Send + Sync {
+    fn nodes(&self) -> io::Result<Vec<Listed>>;
+    fn open(&self, path: &Path) -> io::Result<i32>;
+    fn close(&self, fd: i32);
+    fn ioctl(&self, fd: i32, request: Request) -> io::Result<()>;
+    /// Maps a buffer for reading.
+    fn map(&self, fd: i32, offset: i64, length: usize) -> io::Result<*const u8>;
+    /// # Safety
+    /// `at` and `length` are of one `map`, and nobody reads there any more.
+    unsafe fn unmap(&self, at: *const u8, length: usize);
+    /// Waits until one of `fds` is ready. None at all: sleeps.
+    fn poll(&self, fds: &[i32], ready: &mut [Ready], timeout: Span) -> io::Result<()>;
+    /// CLOCK_MONOTONIC.
+    fn now(&self) -> Nanos;
+}
+
+/// Cameras that one call of `poll` waits for at most.
+pub(super) const NODES_MAX: usize = 4;
+
+pub(super) struct Linux;
+
+impl Kernel for Linux {
+    fn nodes(&self) -> io::Result<Vec<Listed>> {
+        const CLASS: &str = "/sys/class/video4linux";
+        let mut nodes = Vec::new();
+        let entries = match std::fs::read_dir(CLASS) {
+            // Without a driver that makes one there is no such folder.
+            Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(nodes),
+            entries => entries?,
+        };
+        for entry in entries.flatten() {
+            if entry.file_name().as_bytes().starts_with(b"video") {
+                // `device` is the USB interface; the serial number is of the device that has it.
+                let serial = std::fs::read_to_string(entry.path().join("device/../serial")).ok();
+                let path = Path::new("/dev").join(entry.file_name());
+                nodes.push(Listed { path, serial: serial.map(|s| s.trim().to_string()) });
+            }
+        }
+        nodes.sort_by(|a, b| a.path.cmp(&b.path));
+        Ok(nodes)
+    }
+
+    fn open(&self, path: &Path) -> io::Result<i32> {
+        let path = CString::new(path.as_os_str().as_bytes())?;
+        // SAFETY: the path is a string that ends with zero and lives during the call.
+        let fd = unsafe { libc::open(path.as_ptr(), libc::O_RDWR | libc::O_NONBLOCK | libc::O_CLOEXEC) };
+        checked(fd).map(|()| fd)
+    }
+
+    fn close(&self, fd: i32) {
+        // SAFETY: closes what `open` gave; the caller forgets it.
+        unsafe { libc::close(fd) };
+    }
+
+    fn ioctl(&self, fd: i32, request: Request) -> io::Result<()> {
+        fn call<T>(fd: i32, number: u32, argument: &mut T) -> io::Result<()> {
+            loop {
+                // SAFETY: `number` was made from the size of `T` (asserted in uapi), which the kernel reads and writes;
+                // addresses inside it (planes, controls) are those of arguments that outlive the call.
+                let answer = checked(unsafe { libc::ioctl(fd, libc::c_ulong::from(number) as _, argument as *mut T) });
+                match answer {
+                    Err(e) if e.raw_os_error() == Some(libc::EINTR) => continue,
+                    answer => return answer,
+                }
+            }
+        }
+        fn with_planes(fd: i32, number: u32, buffer: &mut Buffer, planes: &mut [Plane; PLANES_MAX]) -> io::Result<()> {
+            if buffer.kind == CAPTURE_MULTI {
+                buffer.place = planes.as_mut_ptr() as u64;
+                buffer.length = PLANES_MAX as u32;
+            }
+            call(fd, number, buffer)
+        }
+        fn one_control(fd: i32, number: u32, control: &mut ExtControl) -> io::Result<()> {
+            let controls = control as *mut ExtControl as u64;
+            call(fd, number, &mut ExtControls { count: 1, controls, ..ExtControls::default() })
+        }
+        match request {
+            Request::QueryCap(a) => call(fd, QUERYCAP, a),
+            Request::EnumFormat(a) => call(fd, ENUM_FMT, a),
+            Request::EnumSize(a) => call(fd, ENUM_FRAMESIZES, a),
+            Request::EnumInterval(a) => call(fd, ENUM_FRAMEINTERVALS, a),
+            Request::SetFormat(a) => call(fd, S_FMT, a),
+            Request::SetFormatMulti(a) => call(fd, S_FMT, a),
+            Request::SetParm(a) => call(fd, S_PARM, a),
+            Request::Buy(a) => call(fd, REQBUFS, a),
+            Request::QueryBuffer(a, planes) => with_planes(fd, QUERYBUF, a, planes),
+            Request::Export(a) => call(fd, EXPBUF, a),
+            Request::Queue(a, planes) => with_planes(fd, QBUF, a, planes),
+            Request::Dequeue(a, planes) => with_planes(fd, DQBUF, a, planes),
+            Request::StreamOn(mut kind) => call(fd, STREAMON, &mut kind),
+            Request::StreamOff(mut kind) => call(fd, STREAMOFF, &mut kind),
+            Request::QueryControl(a) => call(fd, QUERY_EXT_CTRL, a),
+            Request::SetExtControl(a) => one_control(fd, S_EXT_CTRLS, a),
+            Request::GetExtControl(a) => one_control(fd, G_EXT_CTRLS, a),
+            Request::SetControl(a) => call(fd, S_CTRL, a),
+            Request::GetControl(a) => call(fd, G_CTRL, a),
+        }
+    }
+
+    fn map(&self, fd: i32, offset: i64, length: usize) -> io::Result<*const u8> {
+        // SAFETY: a new mapping where the kernel likes; nothing of ours is replaced.
+        let at = unsafe { libc::mmap(std::ptr::null_mut(), length, libc::PROT_READ, libc::MAP_SHARED, fd, offset) };
+        if at == libc::MAP_FAILED {
+            return Err(io::Error::last_os_error());
+        }
+        Ok(at.cast())
+    }
+
+    unsafe fn unmap(&self, at: *const u8, length: usize) {
+        // SAFETY: by the contract of this function.
+        unsafe { libc::munmap(at.cast_mut().cast(), length) };
+    }
+
+    fn poll(&self, fds: &[i32], ready: &mut [Ready], timeout: Span) -> io::Result<()> {
+        let mut polled = [libc::pollfd { fd: -1, events: libc::POLLIN, revents: 0 }; NODES_MAX];
+        polled.iter_mut().zip(fds).for_each(|(p, fd)| p.fd = *fd);
+        let timeout = timeout.0.max(0);
+        let timeout = libc::timespec { tv_sec: timeout / 1_000_000_000, tv_nsec: timeout % 1_000_000_000 };
+        // SAFETY: `polled` has NODES_MAX entries and outlives the call; a negative descriptor is passed over.
+        let answer = unsafe { libc::ppoll(polled.as_mut_ptr(), NODES_MAX as libc::nfds_t, &timeout, std::ptr::null()) };
+        match checked(answer) {
+            // A signal is not ready; the caller asks again for what is left of its time.
+            Err(e) if e.raw_os_error() == Some(libc::EINTR) => {}
+            answer => answer?,
+        }
+        for (ready, p) in ready.iter_mut().zip(&polled) {
+            let error = p.revents & (libc::POLLERR | libc::POLLHUP | libc::POLLNVAL) != 0;
+            *ready = Ready { readable: p.revents & libc::POLLIN != 0, error };
+        }
+        Ok(())
+    }
+
+    fn now(&self) -> Nanos {
+        crate::host::monotonic()
+    }
+}
+
+fn checked(answer: i32) -> io::Result<()> {
+    if answer < 0 {
+        return Err(io::Error::last_os_error());
+    }
+    Ok(())
+}

@@ -1,0 +1,319 @@
+//! A picture as a camera's driver gives it, to 8-bit grey: the only copy between the kernel's buffer and the tracker.
+//! Of deeper pixels the high bits are kept; of colour the luma the camera made.
+
+use crate::types::Image;
+use serde::{Deserialize, Serialize};
+use zune_jpeg::zune_core::bytestream::ZCursor;
+use zune_jpeg::zune_core::{colorspace::ColorSpace, options::DecoderOptions};
+use zune_jpeg::JpegDecoder;
+
+/// Formats that can be read, in the order in which one is taken where the board names none: the cheapest to unpack
+/// first, and those that lose detail last.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Format {
+    Grey,
+    /// Ten, twelve and sixteen bits in the low end of two bytes, the low one first.
+    Y10,
+    Y12,
+    Y16,
+    /// MIPI: four pixels in five bytes, two in three; the high bits have a byte each, the low ones share the last.
+    Y10p,
+    Y12p,
+    /// A plane of luma; the chroma after it, or in a plane of its own, is not read.
+    Nv12,
+    Yuyv,
+    Mjpeg,
+}
+
+impl Format {
+    pub const ALL: [Format; 9] = [
+        Format::Grey,
+        Format::Y10,
+        Format::Y12,
+        Format::Y16,
+        Format::Y10p,
+        Format::Y12p,
+        Format::Nv12,
+        Format::Yuyv,
+        Format::Mjpeg,
+    ];
+
+    /// The codes under which drivers offer it.
+    fn codes(self) -> &'static [&'static [u8; 4]] {
+        match self {
+            Format::Grey => &[b"GREY"],
+            Format::Y10 => &[b"Y10 "],
+            Format::Y12 => &[b"Y12 "],
+            Format::Y16 => &[b"Y16 "],
+            Format::Y10p => &[b"Y10P"],
+            Format::Y12p => &[b"Y12P"],
+            Format::Nv12 => &[b"NV12", b"NM12"],
+            Format::Yuyv => &[b"YUYV"],
+            Format::Mjpeg => &[b"MJPG", b"JPEG"],
+        }
+    }
+
+    pub(super) fn is(self, fourcc: u32) -> bool {
+        self.codes().contains(&&fourcc.to_le_bytes())
+    }
+
+    /// As a board file writes it.
+    pub fn name(self) -> &'static str {
+        match self {
+            Format::Grey => "grey",
+            Format::Y10 => "y10",
+            Format::Y12 => "y12",
+            Format::Y16 => "y16",
+            Format::Y10p => "y10p",
+            Format::Y12p => "y12p",
+            Format::Nv12 => "nv12",
+            Format::Yuyv => "yuyv",
+            Format::Mjpeg => "mjpeg",
+        }
+    }
+
+    /// Bytes from a row's start to the end of its pixel `width - 1`. 0 of a compressed picture.
+    pub(super) fn row_bytes(self, width: usize) -> usize {
+        match self {
+            Format::Grey | Format::Nv12 => width,
+            Format::Y10 | Format::Y12 | Format::Y16 => 2 * width,
+            // The byte of the low bits follows the last whole group; a broken group's is not needed.
+            Format::Y10p => width + width.saturating_sub(1) / 4,
+            Format::Y12p => width + width.saturating_sub(1) / 2,
+            Format::Yuyv => (2 * width).saturating_sub(1),
+            Format::Mjpeg => 0,
+        }
+    }
+}
+
+/// Where the pixels of one camera lie in a picture of a node: of a pair side by side, its half.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Part {
+    /// First column.
+    pub x: usize,
+    /// Size of the whole picture; of a part, `image` says it.
+    pub width: usize,
+    pub height: usize,
+    /// Bytes from row to row.
+    pub stride: usize,
+}
+
+#[derive(Clone, Debug, PartialEq)]
+pub(super) enum Unreadable {
+    /// The driver says that it wrote fewer bytes than the picture has.
+    Short {
+        needed: usize,
+        got: usize,
+    },
+    Undecodable(String),
+}
+
+impl std::fmt::Display for Unreadable {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Unreadable::Short { needed, got } => write!(f, "{got} bytes of {needed}"),
+            Unreadable::Undecodable(why) => write!(f, "cannot decode: {why}"),
+        }
+    }
+}
+
+/// Bytes that pictures of these rows take at least, the padding after the last row not counted; a compressed one says itself.
+pub(super) fn least_bytes(format: Format, part: Part) -> usize {
+    if format == Format::Mjpeg {
+        return 0;
+    }
+    part.height.saturating_sub(1) * part.stride + format.row_bytes(part.width)
+}
+
+/// Writes the part of a picture that is as large as `out`. `scratch` is used by compressed pictures with several parts.
+///
+/// Panics where the part's columns do not lie in the picture, which `Node::open` has checked.
+pub(super) fn to_grey(
+    format: Format,
+    bytes: &[u8],
+    part: Part,
+    scratch: &mut Vec<u8>,
+    out: &mut Image,
+) -> Result<(), Unreadable> {
+    assert!(part.x + out.width <= part.width && out.height == part.height, "checked when the node was opened");
+    if format == Format::Mjpeg {
+        return decode(bytes, part, scratch, out);
+    }
+    let needed = least_bytes(format, part);
+    if bytes.len() < needed {
+        return Err(Unreadable::Short { needed, got: bytes.len() });
+    }
+    if out.width == 0 {
+        return Ok(());
+    }
+    let row_bytes = format.row_bytes(part.width);
+    let rows = (0..part.height).map(|y| &bytes[y * part.stride..y * part.stride + row_bytes]);
+    for (row, to) in rows.zip(out.pixels.chunks_exact_mut(out.width)) {
+        unpack_row(format, row, part.x, to);
+    }
+    Ok(())
+}
+
+/// Pixels `x`.. of a row.
+fn unpack_row(format: Format, row: &[u8], x: usize, to: &mut [u8]) {
+    match format {
+        Format::Grey | Format::Nv12 => to.copy_from_slice(&row[x..x + to.len()]),
+        // A camera that sets bits above its depth would wrap; it is clamped to white instead.
+        Format::Y10 => words(&row[2 * x..], to, |v| (v >> 2).min(255) as u8),
+        Format::Y12 => words(&row[2 * x..], to, |v| (v >> 4).min(255) as u8),
+        Format::Y16 => words(&row[2 * x..], to, |v| (v >> 8) as u8),
+        Format::Y10p => to.iter_mut().enumerate().for_each(|(i, p)| *p = row[(x + i) + (x + i) / 4]),
+        Format::Y12p => to.iter_mut().enumerate().for_each(|(i, p)| *p = row[(x + i) + (x + i) / 2]),
+        Format::Yuyv => to.iter_mut().zip(row[2 * x..].iter().step_by(2)).for_each(|(p, y)| *p = *y),
+        Format::Mjpeg => {}
+    }
+}
+
+fn words(row: &[u8], to: &mut [u8], narrow: impl Fn(u16) -> u8) {
+    to.iter_mut().zip(row.chunks_exact(2)).for_each(|(p, w)| *p = narrow(u16::from_le_bytes([w[0], w[1]])));
+}
+
+/// Strict, so that half a picture is an error and not a picture whose rest is grey. The decoder forgives a last row that
+/// is cut; the marker at the end tells, which nothing inside coded pixels looks like. Padding may follow it.
+fn decode(bytes: &[u8], part: Part, scratch: &mut Vec<u8>, out: &mut Image) -> Result<(), Unreadable> {
+    let undecodable = |e: &dyn std::fmt::Display| Unreadable::Undecodable(e.to_string());
+    if !bytes.windows(2).rev().any(|w| w == [0xff, 0xd9]) {
+        return Err(undecodable(&"it is cut: there is no marker of its end"));
+    }
+    let options = DecoderOptions::default().set_strict_mode(true).jpeg_set_out_colorspace(ColorSpace::Luma);
+    let mut decoder = JpegDecoder::new_with_options(ZCursor::new(bytes), options);
+    decoder.decode_headers().map_err(|e| undecodable(&e))?;
+    let size = decoder.dimensions().ok_or_else(|| undecodable(&"no size"))?;
+    if size != (part.width, part.height) {
+        return Err(undecodable(&format!("is {}x{}, not {}x{}", size.0, size.1, part.width, part.height)));
+    }
+    if part.width == out.width {
+        return decoder.decode_into(&mut out.pixels).map_err(|e| undecodable(&e));
+    }
+    scratch.resize(part.width * part.height, 0);
+    decoder.decode_into(scratch).map_err(|e| undecodable(&e))?;
+    let rows = scratch.chunks_exact(part.width).zip(out.pixels.chunks_exact_mut(out.width));
+    rows.for_each(|(row, to)| to.copy_from_slice(&row[part.x..part.x + to.len()]));
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+    use proptest::prelude::*;
+
+    /// A picture packed in `format`, of which `to_grey` must give `grey` back; low bits and padding are `noise`.
+    fn pack(format: Format, grey: &[u8], width: usize, stride: usize, noise: u8) -> Vec<u8> {
+        let height = grey.len() / width;
+        let mut bytes = vec![noise; stride * height];
+        for (y, row) in grey.chunks_exact(width).enumerate() {
+            for (x, g) in row.iter().enumerate() {
+                let at = y * stride;
+                let word =
+                    |bytes: &mut [u8], v: u16| bytes[at + 2 * x..at + 2 * x + 2].copy_from_slice(&v.to_le_bytes());
+                let (g16, n16) = (u16::from(*g), u16::from(noise));
+                match format {
+                    Format::Grey | Format::Nv12 => bytes[at + x] = *g,
+                    Format::Y10 => word(&mut bytes, g16 << 2 | n16 & 3),
+                    Format::Y12 => word(&mut bytes, g16 << 4 | n16 & 15),
+                    Format::Y16 => word(&mut bytes, g16 << 8 | n16),
+                    Format::Y10p => bytes[at + x / 4 * 5 + x % 4] = *g,
+                    Format::Y12p => bytes[at + x / 2 * 3 + x % 2] = *g,
+                    Format::Yuyv => bytes[at + 2 * x] = *g,
+                    Format::Mjpeg => unreachable!("encoded by `flat_jpeg`"),
+                }
+            }
+        }
+        bytes
+    }
+
+    fn whole(width: usize, height: usize, stride: usize) -> Part {
+        Part { x: 0, width, height, stride }
+    }
+
+    proptest! {
+        #[test]
+        fn high_bits_of_every_pixel_arrive_and_low_bits_and_padding_do_not(
+            which in 0usize..8,
+            width in 1usize..41,
+            height in 1usize..9,
+            padding in 0usize..23,
+            noise: u8,
+            seed: u32,
+            split in 0usize..41,
+        ) {
+            let format = Format::ALL[which];
+            let grey: Vec<u8> = (0..width * height).map(|i| ((i as u32 + 1).wrapping_mul(seed | 1) >> 13) as u8).collect();
+            // Whole groups of packed pixels, as MIPI has them.
+            let stride = format.row_bytes(width.next_multiple_of(4)) + 2 + padding;
+            let bytes = pack(format, &grey, width, stride, noise);
+            let mut out = Image::new(width, height);
+            to_grey(format, &bytes, whole(width, height, stride), &mut Vec::new(), &mut out).unwrap();
+            prop_assert_eq!(&out.pixels, &grey);
+            // A part of it: columns from `split` on.
+            let x = split % width;
+            let mut half = Image::new(width - x, height);
+            to_grey(format, &bytes, Part { x, width, height, stride }, &mut Vec::new(), &mut half).unwrap();
+            for y in 0..height {
+                prop_assert_eq!(&half.pixels[y * (width - x)..(y + 1) * (width - x)], &grey[y * width + x..(y + 1) * width]);
+            }
+            // The last row needs no padding, and one byte less is refused and read nowhere.
+            let needed = least_bytes(format, whole(width, height, stride));
+            prop_assert!(to_grey(format, &bytes[..needed], whole(width, height, stride), &mut Vec::new(), &mut out).is_ok());
+            let short = to_grey(format, &bytes[..needed - 1], whole(width, height, stride), &mut Vec::new(), &mut out);
+            prop_assert_eq!(short, Err(Unreadable::Short { needed, got: needed - 1 }));
+        }
+
+        #[test]
+        fn bytes_that_are_no_picture_are_an_error_and_no_panic(bytes in prop::collection::vec(any::<u8>(), 0..300)) {
+            let mut out = Image::new(8, 8);
+            let mut jpeg = vec![0xff, 0xd8, 0xff];
+            jpeg.extend(bytes);
+            prop_assert!(to_grey(Format::Mjpeg, &jpeg, whole(8, 8, 0), &mut Vec::new(), &mut out).is_err());
+        }
+    }
+
+    #[test]
+    fn pixels_brighter_than_their_depth_are_white() {
+        let mut out = Image::new(1, 1);
+        for format in [Format::Y10, Format::Y12] {
+            to_grey(format, &[0xff, 0xff], whole(1, 1, 2), &mut Vec::new(), &mut out).unwrap();
+            assert_eq!(out.pixels, [255]);
+        }
+    }
+
+    #[test]
+    fn a_picture_without_pixels_is_no_panic() {
+        for format in Format::ALL.into_iter().filter(|f| *f != Format::Mjpeg) {
+            let mut out = Image::new(0, 3);
+            to_grey(format, &[], whole(0, 3, 0), &mut Vec::new(), &mut out).unwrap();
+        }
+    }
+
+    #[test]
+    fn jpeg_is_decoded_whole_in_halves_and_never_by_half() {
+        let (width, height) = (32, 16);
+        let blocks: Vec<u8> = (0..8).map(|i| 16 + 24 * i).collect();
+        let jpeg = crate::jpeg::flat(width, height, &blocks);
+        let mut out = Image::new(width, height);
+        let mut scratch = Vec::new();
+        to_grey(Format::Mjpeg, &jpeg, whole(width, height, 0), &mut scratch, &mut out).unwrap();
+        for (i, p) in out.pixels.iter().enumerate() {
+            let block = (i / width) / 8 * (width / 8) + (i % width) / 8;
+            assert!(p.abs_diff(blocks[block]) <= 1, "pixel {i} is {p}, not {}", blocks[block]);
+        }
+        assert!(scratch.is_empty(), "a whole picture is decoded in place");
+        let mut half = Image::new(16, height);
+        to_grey(Format::Mjpeg, &jpeg, Part { x: 16, width, height, stride: 0 }, &mut scratch, &mut half).unwrap();
+        assert_eq!(half.at(0, 0), out.at(16, 0));
+        assert_eq!(half.at(15, 15), out.at(31, 15));
+        for cut in 0..jpeg.len() - 2 {
+            let truncated = to_grey(Format::Mjpeg, &jpeg[..cut], whole(width, height, 0), &mut scratch, &mut out);
+            assert!(matches!(truncated, Err(Unreadable::Undecodable(_))), "cut at {cut} of {}", jpeg.len());
+        }
+        let wrong = to_grey(Format::Mjpeg, &jpeg, whole(16, 16, 0), &mut scratch, &mut Image::new(16, 16));
+        assert!(matches!(&wrong, Err(Unreadable::Undecodable(why)) if why.contains("32x16")), "{wrong:?}");
+    }
+}
