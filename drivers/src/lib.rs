@@ -8,10 +8,12 @@
 
 pub mod calibration;
 pub mod camera;
+pub mod euroc;
 pub mod fault;
 pub mod host;
 pub mod inject;
 pub mod paced;
+pub mod record;
 pub mod replay;
 pub mod sim;
 pub mod source;

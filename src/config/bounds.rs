@@ -136,4 +136,5 @@ pub(super) const BOUNDS: &[(&str, Bound)] = &[
     // Three: one to fill, one that waits, one that is read; 32 is the kernel's most.
     ("camera.buffers", Within(3.0, 32.0)),
     ("camera.silent_s", Within(0.05, 3600.0)),
+    ("record.ring_frames", Within(1.0, 4096.0)),
 ];

@@ -10,12 +10,14 @@ mod camera;
 mod inject;
 mod map;
 mod network;
+mod record;
 
 use bounds::BOUNDS;
 pub use camera::CameraConfig;
 pub use inject::InjectConfig;
 pub use map::{MapConfig, Projection};
 pub use network::{Fit, NetworkConfig};
+pub use record::RecordConfig;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 use stipple_drivers::{Exit, Fault};
@@ -45,6 +47,8 @@ pub struct Board {
     pub inject: InjectConfig,
     #[serde(default)]
     pub camera: CameraConfig,
+    #[serde(default)]
+    pub record: RecordConfig,
 }
 
 /// Capacities bought at boot. Every one is a hard limit; full is counted, never grown.

@@ -115,7 +115,8 @@ fn euroc(mav0: &Path, stated: Option<Span>, findings: &mut Findings) -> Result<C
         let file = Document::read(&path)?;
         let camera = yaml_camera(&file, "", "distortion_coefficients")?;
         let readout = readout(&file, "", &camera, stated)?;
-        cameras.push(RigCamera { readout, ..RigCamera::new(camera, file.transform("/T_BS/data")?) });
+        let time_offset = time_offset(&file, "")?;
+        cameras.push(RigCamera { time_offset, readout, ..RigCamera::new(camera, file.transform("/T_BS/data")?) });
     }
     let imu = yaml_imu(&sensor_yaml(mav0, "imu0"), "rate_hz", findings)?;
     Ok(Calibration { cameras, imu })
@@ -134,14 +135,18 @@ fn kalibr(file: &Document, stated: Option<Span>, findings: &mut Findings) -> Res
             }
             _ => file.transform(&own)?.inverse(),
         };
-        let shift = format!("{at}/timeshift_cam_imu");
-        let time_offset = if file.has(&shift) { Span::from_secs(file.number(&shift)?) } else { Span(0) };
+        let time_offset = time_offset(file, &at)?;
         let camera = yaml_camera(file, &at, "distortion_coeffs")?;
         let readout = readout(file, &at, &camera, stated)?;
         cameras.push(RigCamera { camera, body_from_cam, time_offset, readout });
     }
     let imu = yaml_imu(&file.path.with_file_name("imu_config.yaml"), "update_rate", findings)?;
     Ok(Calibration { cameras, imu })
+}
+
+fn time_offset(file: &Document, at: &str) -> Result<Span, Fault> {
+    let shift = format!("{at}/timeshift_cam_imu");
+    Ok(if file.has(&shift) { Span::from_secs(file.number(&shift)?) } else { Span(0) })
 }
 
 /// From the first row to the last, as the file says.

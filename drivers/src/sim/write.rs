@@ -5,10 +5,9 @@
 
 use super::Sim;
 use crate::calibration::RigCamera;
-use crate::camera::Lens;
+use crate::euroc::{camera_yaml, commas, imu_yaml, transform_yaml, IMAGE_COLUMNS, IMU_COLUMNS};
 use crate::fault::{Exit, Fault};
 use crate::types::{Frames, Pose};
-use glam::{DMat3, DVec3};
 use std::fmt::Write as _;
 use std::fs;
 use std::path::Path;
@@ -48,7 +47,7 @@ fn write_all(sim: &mut Sim, mav: &Path, frames: Frames, progress: impl FnMut(usi
     for (k, camera) in rig.cameras.iter().enumerate() {
         let folder = mav.join(format!("cam{k}"));
         make_dir(&folder.join("data"))?;
-        put(&folder.join("sensor.yaml"), &camera_yaml(camera, k, frame_rate(sim)))?;
+        put(&folder.join("sensor.yaml"), &camera_yaml(camera, &format!("simulated cam{k}"), frame_rate(sim)))?;
         put(&folder.join("data.csv"), &image_table(sim, camera))?;
     }
     make_dir(&mav.join("depth0").join("data"))?;
@@ -59,7 +58,7 @@ fn write_all(sim: &mut Sim, mav: &Path, frames: Frames, progress: impl FnMut(usi
     );
     put(&mav.join("depth0").join("sensor.yaml"), &about)?;
     make_dir(&mav.join("imu0"))?;
-    put(&mav.join("imu0").join("sensor.yaml"), &imu_yaml(sim))?;
+    put(&mav.join("imu0").join("sensor.yaml"), &imu_yaml(&rig.imu, "simulated"))?;
     put(&mav.join("imu0").join("data.csv"), &imu_table(sim))?;
     let truth = mav.join("state_groundtruth_estimate0");
     make_dir(&truth)?;
@@ -132,7 +131,7 @@ fn frame_rate(sim: &Sim) -> f64 {
 
 /// By the camera's own clock.
 fn image_table(sim: &Sim, camera: &RigCamera) -> String {
-    let mut s = "#timestamp [ns],filename\n".to_string();
+    let mut s = IMAGE_COLUMNS.to_string();
     for i in 0..sim.frame_count() {
         let t = camera.from_imu_clock(sim.stamp(i)).0;
         line(&mut s, format_args!("{t},{t}.png"));
@@ -141,9 +140,7 @@ fn image_table(sim: &Sim, camera: &RigCamera) -> String {
 }
 
 fn imu_table(sim: &Sim) -> String {
-    let mut s = "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],\
-                 a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]\n"
-        .to_string();
+    let mut s = IMU_COLUMNS.to_string();
     for m in sim.imu() {
         line(&mut s, format_args!("{},{},{}", m.t.0, commas(m.gyro_body), commas(m.accel_body)));
     }
@@ -164,65 +161,6 @@ fn truth_table(sim: &Sim) -> String {
         line(&mut s, format_args!("{},{p},{q},{v},{},{}", m.t.0, commas(x.gyro_bias), commas(x.accel_bias)));
     }
     s
-}
-
-fn camera_yaml(c: &RigCamera, k: usize, rate_hz: f64) -> String {
-    let m = &c.camera;
-    let pinhole = format!("[{}, {}, {}, {}]", m.fx, m.fy, m.cx, m.cy);
-    let (model, intrinsics, distortion, coefficients) = match m.lens {
-        Lens::Radtan { k1, k2, p1, p2 } => {
-            ("pinhole", pinhole, "radial-tangential", format!("[{k1}, {k2}, {p1}, {p2}]"))
-        }
-        Lens::Rational { k: [k1, k2, k3, k4, k5, k6], p1, p2, .. } => {
-            let k = format!("[{k1}, {k2}, {p1}, {p2}, {k3}, {k4}, {k5}, {k6}]");
-            ("pinhole", pinhole, "rational_polynomial", k)
-        }
-        Lens::KannalaBrandt { k: [a, b, c, d] } => ("pinhole", pinhole, "equidistant", format!("[{a}, {b}, {c}, {d}]")),
-        Lens::DoubleSphere { xi, alpha } => {
-            let intrinsics = format!("[{xi}, {alpha}, {}, {}, {}, {}]", m.fx, m.fy, m.cx, m.cy);
-            ("ds", intrinsics, "none", "[]".to_string())
-        }
-    };
-    let readout = match c.readout.0 {
-        0 => String::new(),
-        _ => format!("readout_time: {}\n", c.readout.secs()),
-    };
-    format!(
-        "sensor_type: camera\ncomment: simulated cam{k}\n{}rate_hz: {rate_hz}\nresolution: [{}, {}]\n\
-         camera_model: {model}\nintrinsics: {intrinsics}\ndistortion_model: {distortion}\n\
-         distortion_coefficients: {coefficients}\n{readout}",
-        transform_yaml(&c.body_from_cam),
-        m.width,
-        m.height
-    )
-}
-
-fn imu_yaml(sim: &Sim) -> String {
-    let m = sim.calibration().imu;
-    format!(
-        "sensor_type: imu\ncomment: simulated\n{}rate_hz: {}\ngyroscope_noise_density: {:e}\n\
-         gyroscope_random_walk: {:e}\naccelerometer_noise_density: {:e}\naccelerometer_random_walk: {:e}\n",
-        transform_yaml(&Pose::IDENTITY),
-        m.rate_hz,
-        m.gyro_noise,
-        m.gyro_walk,
-        m.accel_noise,
-        m.accel_walk
-    )
-}
-
-fn transform_yaml(body_from_sensor: &Pose) -> String {
-    let r = DMat3::from_quat(body_from_sensor.q);
-    let mut s = "T_BS:\n  cols: 4\n  rows: 4\n  data: [".to_string();
-    for i in 0..3 {
-        let (a, p) = (r.row(i), body_from_sensor.p[i]);
-        s += &format!("{:.15}, {:.15}, {:.15}, {:.15},\n         ", a.x, a.y, a.z, p);
-    }
-    s + "0.0, 0.0, 0.0, 1.0]\n"
-}
-
-fn commas(v: DVec3) -> String {
-    format!("{:.9},{:.9},{:.9}", v.x, v.y, v.z)
 }
 
 fn line(s: &mut String, row: std::fmt::Arguments<'_>) {

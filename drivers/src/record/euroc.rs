@@ -1,0 +1,165 @@
+//! A recording as an EuRoC ASL folder.
+//!
+//! An image is written under a hidden name and renamed, and its row is appended when the images of all cameras are
+//! there. Rows go out in one write, and one that the disk cuts short is cut off again. Stamps are the cameras' own;
+//! samples are corrected by the calibration already, as everything downstream of a source is.
+
+use super::Sink;
+use crate::calibration::RigCamera;
+use crate::euroc::{camera_yaml, imu_row, imu_yaml, png, IMAGE_COLUMNS, IMU_COLUMNS};
+use crate::source::ImuReading;
+use crate::types::Frames;
+use crate::Calibration;
+use std::fs::{self, File, OpenOptions};
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
+
+/// Samples a write; a frame writes out what waits, too.
+const ROWS: usize = 20;
+/// Rows kept while the disk is full, bytes: five seconds of a 1 kHz unit.
+const ROWS_BYTES_MAX: usize = 1 << 19;
+
+/// A csv that ends in whole rows.
+struct Rows {
+    file: File,
+    good: u64,
+    waiting: Vec<u8>,
+    count: usize,
+}
+
+impl Rows {
+    fn create(path: &Path, columns: &str) -> io::Result<Rows> {
+        let file = OpenOptions::new().append(true).create_new(true).open(path)?;
+        let mut rows = Rows { file, good: 0, waiting: columns.into(), count: 0 };
+        rows.flush()?;
+        Ok(rows)
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        if let Err(e) = self.file.write_all(&self.waiting) {
+            self.file.set_len(self.good)?;
+            return Err(e);
+        }
+        self.good += self.waiting.len() as u64;
+        self.waiting.clear();
+        self.count = 0;
+        Ok(())
+    }
+
+    /// Appends one row, or leaves the file as it was.
+    fn append(&mut self, row: std::fmt::Arguments<'_>) -> io::Result<()> {
+        self.waiting.clear();
+        self.waiting.write_fmt(row)?;
+        self.flush()
+    }
+
+    /// Takes the last `append` back.
+    fn cut(&mut self, good: u64) -> io::Result<()> {
+        self.good = good;
+        self.file.set_len(good)
+    }
+}
+
+struct CameraFolder {
+    camera: RigCamera,
+    data: PathBuf,
+    rows: Rows,
+}
+
+pub struct EurocSink {
+    cameras: Vec<CameraFolder>,
+    imu: Rows,
+    encoded: Vec<u8>,
+}
+
+impl EurocSink {
+    pub fn create(dir: &Path, calibration: &Calibration) -> io::Result<EurocSink> {
+        let mav = dir.join("mav0");
+        let mut cameras = Vec::new();
+        for (k, camera) in calibration.cameras.iter().enumerate() {
+            let folder = mav.join(format!("cam{k}"));
+            let data = folder.join("data");
+            fs::create_dir_all(&data)?;
+            // The rate is in the stamps.
+            fs::write(folder.join("sensor.yaml"), camera_yaml(camera, &format!("recorded cam{k}"), 0.0))?;
+            let rows = Rows::create(&folder.join("data.csv"), IMAGE_COLUMNS)?;
+            cameras.push(CameraFolder { camera: *camera, data, rows });
+        }
+        let folder = mav.join("imu0");
+        fs::create_dir_all(&folder)?;
+        fs::write(folder.join("sensor.yaml"), imu_yaml(&calibration.imu, "recorded, corrected"))?;
+        let imu = Rows::create(&folder.join("data.csv"), IMU_COLUMNS)?;
+        Ok(EurocSink { cameras, imu, encoded: Vec::new() })
+    }
+
+    fn images(&mut self, frames: &Frames) -> io::Result<()> {
+        for (k, (folder, image)) in self.cameras.iter().zip(&frames.images).enumerate() {
+            let (partial, path) = names(folder, frames);
+            self.encoded.clear();
+            png(&mut self.encoded, image, frames.colours.get(k)).map_err(io::Error::other)?;
+            let written = fs::write(&partial, &self.encoded).and_then(|()| fs::rename(&partial, &path));
+            if written.is_err() {
+                // Gives the disk back what half an image took.
+                let _ = fs::remove_file(&partial);
+                return written;
+            }
+        }
+        Ok(())
+    }
+
+    fn list(&mut self, frames: &Frames) -> io::Result<()> {
+        for k in 0..self.cameras.len() {
+            let folder = &mut self.cameras[k];
+            let t = folder.camera.from_imu_clock(frames.t).0;
+            let before = folder.rows.good;
+            if let Err(e) = folder.rows.append(format_args!("{t},{t}.png\n")) {
+                // A frame is listed for every camera or for none.
+                let row = e.to_string();
+                for other in &mut self.cameras[..k] {
+                    let length = format!("{t},{t}.png\n").len() as u64;
+                    other.rows.cut(other.rows.good - length)?;
+                }
+                debug_assert!(self.cameras[k].rows.good == before);
+                return Err(io::Error::new(e.kind(), row));
+            }
+        }
+        Ok(())
+    }
+}
+
+/// The hidden name of an image, and its own.
+fn names(folder: &CameraFolder, frames: &Frames) -> (PathBuf, PathBuf) {
+    let t = folder.camera.from_imu_clock(frames.t).0;
+    (folder.data.join(format!(".{t}.partial")), folder.data.join(format!("{t}.png")))
+}
+
+impl Sink for EurocSink {
+    fn frames(&mut self, frames: &Frames) -> io::Result<()> {
+        self.imu.flush()?;
+        let written = self.images(frames).and_then(|()| self.list(frames));
+        if written.is_err() {
+            for folder in &self.cameras {
+                let _ = fs::remove_file(names(folder, frames).1);
+            }
+        }
+        written
+    }
+
+    fn imu(&mut self, reading: &ImuReading) -> io::Result<()> {
+        if self.imu.waiting.len() > ROWS_BYTES_MAX {
+            self.imu.flush()?;
+        }
+        imu_row(&mut self.imu.waiting, &reading.sample)?;
+        self.imu.count += 1;
+        if self.imu.count >= ROWS {
+            self.imu.count = 0;
+            // What did not fit waits; it counts as failed only when it is given up.
+            let _ = self.imu.flush();
+        }
+        Ok(())
+    }
+
+    fn finish(&mut self) -> io::Result<()> {
+        self.imu.flush()
+    }
+}

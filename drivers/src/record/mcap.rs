@@ -1,0 +1,237 @@
+//! A recording as MCAP: ROS 2 messages in CDR, which Foxglove and `ros2 bag` read. Images are PNG inside
+//! `sensor_msgs/msg/CompressedImage`, lossless at half the bytes of raw ones; calibration is attached as the
+//! sensor.yaml of EuRoC.
+//!
+//! A chunk holds one frame and the samples before it, and is written at once when the frame is complete. What a kill or a
+//! full disk cuts off is at most the last; after a failure the next frame begins another file.
+
+use super::Sink;
+use crate::calibration::RigCamera;
+use crate::euroc::{camera_yaml, imu_yaml, png};
+use crate::source::ImuReading;
+use crate::types::{Frames, Nanos};
+use crate::Calibration;
+use ::mcap::records::MessageHeader;
+use ::mcap::{Attachment, McapError, WriteOptions, Writer};
+use std::borrow::Cow;
+use std::collections::BTreeMap;
+use std::fs::{File, OpenOptions};
+use std::io;
+use std::path::{Path, PathBuf};
+
+const HEADER: &str = "\
+================================================================================
+MSG: std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id
+================================================================================
+MSG: builtin_interfaces/Time
+int32 sec
+uint32 nanosec
+";
+const IMAGE: &str = "std_msgs/Header header\nstring format\nuint8[] data\n";
+const IMU: &str = "\
+std_msgs/Header header
+geometry_msgs/Quaternion orientation
+float64[9] orientation_covariance
+geometry_msgs/Vector3 angular_velocity
+float64[9] angular_velocity_covariance
+geometry_msgs/Vector3 linear_acceleration
+float64[9] linear_acceleration_covariance
+================================================================================
+MSG: geometry_msgs/Quaternion
+float64 x
+float64 y
+float64 z
+float64 w
+================================================================================
+MSG: geometry_msgs/Vector3
+float64 x
+float64 y
+float64 z
+";
+
+pub struct McapSink {
+    dir: PathBuf,
+    calibration: Calibration,
+    /// `None` after a failure.
+    file: Option<Open>,
+    files: u32,
+    sequence: u32,
+    encoded: Vec<u8>,
+    message: Vec<u8>,
+}
+
+struct Open {
+    writer: Writer<File>,
+    path: PathBuf,
+    /// Up to where the file is whole.
+    good: u64,
+    images: Vec<u16>,
+    imu: u16,
+}
+
+fn failed(e: McapError) -> io::Error {
+    match e {
+        McapError::Io(e) => e,
+        other => io::Error::other(other),
+    }
+}
+
+impl McapSink {
+    pub fn create(dir: &Path, calibration: &Calibration) -> io::Result<McapSink> {
+        let mut sink = McapSink {
+            dir: dir.to_path_buf(),
+            calibration: calibration.clone(),
+            file: None,
+            files: 0,
+            sequence: 0,
+            encoded: Vec::new(),
+            message: Vec::new(),
+        };
+        sink.file = Some(sink.begin().map_err(failed)?);
+        Ok(sink)
+    }
+
+    fn begin(&mut self) -> Result<Open, McapError> {
+        let path = self.dir.join(format!("recording-{:03}.mcap", self.files));
+        let file = OpenOptions::new().write(true).create_new(true).open(&path)?;
+        self.files += 1;
+        let options = WriteOptions::new().profile("ros2").library("stipple").compression(None).disable_seeking(true);
+        let mut writer = options.create(file)?;
+        let none = BTreeMap::new();
+        let image =
+            writer.add_schema("sensor_msgs/msg/CompressedImage", "ros2msg", format!("{IMAGE}{HEADER}").as_bytes())?;
+        let imu = writer.add_schema("sensor_msgs/msg/Imu", "ros2msg", format!("{IMU}{HEADER}").as_bytes())?;
+        let mut images = Vec::new();
+        for (k, camera) in self.calibration.cameras.iter().enumerate() {
+            images.push(writer.add_channel(image, &format!("/cam{k}/image"), "cdr", &none)?);
+            attach(&mut writer, &format!("cam{k}"), camera_yaml(camera, &format!("recorded cam{k}"), 0.0))?;
+        }
+        let imu = writer.add_channel(imu, "/imu0", "cdr", &none)?;
+        attach(&mut writer, "imu0", imu_yaml(&self.calibration.imu, "recorded, corrected"))?;
+        writer.flush()?;
+        let good = std::fs::metadata(&path)?.len();
+        Ok(Open { writer, path, good, images, imu })
+    }
+
+    fn write(&mut self, channel: impl Fn(&Open) -> u16, t: Nanos, sequence: u32) -> Result<(), McapError> {
+        if self.file.is_none() {
+            self.file = Some(self.begin()?);
+        }
+        let file = self.file.as_mut().expect("opened above");
+        let t = t.0.max(0) as u64;
+        let header = MessageHeader { channel_id: channel(file), sequence, log_time: t, publish_time: t };
+        file.writer.write_to_known_channel(&header, &self.message)
+    }
+
+    fn all(&mut self, frames: &Frames) -> Result<(), McapError> {
+        self.sequence += 1;
+        for (k, image) in frames.images.iter().enumerate() {
+            let camera: RigCamera = self.calibration.cameras[k];
+            self.encoded.clear();
+            png(&mut self.encoded, image, frames.colours.get(k)).map_err(io::Error::other)?;
+            let t = camera.from_imu_clock(frames.t);
+            let mut cdr = Cdr::new(&mut self.message);
+            cdr.header(t, &format!("cam{k}"));
+            cdr.text("png");
+            cdr.bytes(&self.encoded);
+            self.write(|file| file.images[k], t, self.sequence)?;
+        }
+        let file = self.file.as_mut().expect("a message was written to it");
+        file.writer.flush()?;
+        file.good = std::fs::metadata(&file.path)?.len();
+        Ok(())
+    }
+
+    /// Leaves the file whole up to its last good chunk.
+    fn give_up(&mut self) {
+        if let Some(Open { writer, good, .. }) = self.file.take() {
+            let file = writer.into_inner();
+            // A disk that refuses this leaves a cut chunk, which readers pass over.
+            let _ = file.set_len(good);
+        }
+    }
+}
+
+fn attach(writer: &mut Writer<File>, sensor: &str, yaml: String) -> Result<(), McapError> {
+    let (name, media_type) = (format!("{sensor}/sensor.yaml"), "application/yaml".to_string());
+    writer.attach(&Attachment { log_time: 0, create_time: 0, name, media_type, data: Cow::Owned(yaml.into_bytes()) })
+}
+
+impl Sink for McapSink {
+    fn frames(&mut self, frames: &Frames) -> io::Result<()> {
+        let written = self.all(frames);
+        if written.is_err() {
+            self.give_up();
+        }
+        written.map_err(failed)
+    }
+
+    fn imu(&mut self, reading: &ImuReading) -> io::Result<()> {
+        let s = &reading.sample;
+        let mut cdr = Cdr::new(&mut self.message);
+        cdr.header(s.t, "imu0");
+        // No orientation is measured, which ROS says by -1; the rest of the covariances is not known: 0.
+        cdr.floats(&[0.0, 0.0, 0.0, 1.0, -1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]);
+        for v in [s.gyro_body, s.accel_body] {
+            cdr.floats(&v.to_array());
+            cdr.floats(&[0.0; 9]);
+        }
+        let written = self.write(|file| file.imu, s.t, 0);
+        if written.is_err() {
+            self.give_up();
+        }
+        written.map_err(failed)
+    }
+
+    fn finish(&mut self) -> io::Result<()> {
+        match self.file.take() {
+            Some(mut file) => file.writer.finish().map(|_| ()).map_err(failed),
+            None => Ok(()),
+        }
+    }
+}
+
+/// Little-endian CDR: every number is aligned to its size, counted from the end of the four bytes at the start.
+struct Cdr<'a>(&'a mut Vec<u8>);
+
+impl Cdr<'_> {
+    fn new(out: &mut Vec<u8>) -> Cdr<'_> {
+        out.clear();
+        out.extend([0, 1, 0, 0]);
+        Cdr(out)
+    }
+
+    fn align(&mut self, to: usize) {
+        let at = self.0.len() - 4;
+        self.0.resize(4 + at.next_multiple_of(to), 0);
+    }
+
+    fn word(&mut self, v: u32) {
+        self.align(4);
+        self.0.extend(v.to_le_bytes());
+    }
+
+    fn header(&mut self, t: Nanos, frame_id: &str) {
+        self.word(t.0.div_euclid(1_000_000_000) as u32);
+        self.word(t.0.rem_euclid(1_000_000_000) as u32);
+        self.text(frame_id);
+    }
+
+    fn text(&mut self, text: &str) {
+        self.word(text.len() as u32 + 1);
+        self.0.extend(text.as_bytes());
+        self.0.push(0);
+    }
+
+    fn bytes(&mut self, bytes: &[u8]) {
+        self.word(bytes.len() as u32);
+        self.0.extend(bytes);
+    }
+
+    fn floats(&mut self, values: &[f64]) {
+        self.align(8);
+        values.iter().for_each(|v| self.0.extend(v.to_le_bytes()));
+    }
+}

@@ -1,0 +1,232 @@
+//! Records what sources give, as it comes, while a run goes on.
+//!
+//! A tap sits on each source and copies what passes into a ring of fixed size; a thread of low priority writes it. A
+//! full ring drops, and counts, and the source never waits. What was written stays readable whatever happens: an
+//! image appears whole or not at all and is listed after it appeared, a chunk of MCAP is complete or is cut
+//! off at its start. A disk that is full costs what comes until it has room again, and nothing before.
+
+mod euroc;
+mod mcap;
+
+pub use euroc::EurocSink;
+pub use mcap::McapSink;
+
+use crate::source::{FrameSource, ImuBatch, ImuReading, ImuSource, SourceFault, Wait};
+use crate::types::{Frames, Span};
+use crate::{host, Calibration, Exit, Fault};
+use std::io;
+use std::path::Path;
+use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
+use std::sync::mpsc::{Receiver, SyncSender};
+use std::sync::{mpsc, Arc};
+use std::thread::JoinHandle;
+
+/// Where a recording goes. What fails leaves what was written before as it was.
+pub trait Sink: Send {
+    fn frames(&mut self, frames: &Frames) -> io::Result<()>;
+    fn imu(&mut self, reading: &ImuReading) -> io::Result<()>;
+    /// Nothing more comes.
+    fn finish(&mut self) -> io::Result<()>;
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Format {
+    /// EuRoC ASL: a folder of PNG and csv, which `stipple replay` plays.
+    Euroc,
+    /// MCAP with ROS 2 messages, which Foxglove opens.
+    Mcap,
+}
+
+/// Samples that wait for the writer beside the frames: eight seconds of a 1 kHz unit.
+const IMU_SLOTS: usize = 8192;
+
+#[derive(Default)]
+struct Counts {
+    frames: AtomicU64,
+    frames_dropped: AtomicU64,
+    frames_failed: AtomicU64,
+    imu: AtomicU64,
+    imu_dropped: AtomicU64,
+    imu_failed: AtomicU64,
+}
+
+enum Item {
+    Frames(Box<Frames>),
+    Imu(ImuReading),
+}
+
+/// A recording under way.
+pub struct Recorder {
+    counts: Arc<Counts>,
+    thread: JoinHandle<Option<String>>,
+}
+
+/// What a recording came to.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Recorded {
+    pub counters: Vec<(&'static str, u64)>,
+    /// The first failure to write, if there was one.
+    pub failure: Option<String>,
+}
+
+/// Taps on the two sources; the recording ends when both are gone.
+pub struct Taps {
+    frames: FrameTap,
+    imu: ImuTap,
+}
+
+struct FrameTap {
+    spare: Receiver<Box<Frames>>,
+    items: SyncSender<Item>,
+    counts: Arc<Counts>,
+}
+
+struct ImuTap {
+    items: SyncSender<Item>,
+    counts: Arc<Counts>,
+}
+
+impl Taps {
+    pub fn on<F: FrameSource, I: ImuSource>(self, frames: F, imu: I) -> (TappedFrames<F>, TappedImu<I>) {
+        (TappedFrames { source: frames, tap: self.frames }, TappedImu { source: imu, tap: self.imu })
+    }
+}
+
+/// Makes `dir` ready for a recording; it must not hold one.
+pub fn open(dir: &Path, format: Format, calibration: &Calibration) -> Result<Box<dyn Sink>, Fault> {
+    let fault = |e: io::Error| {
+        let fix = "choose a folder that can be written to and has room";
+        Fault::new(Exit::CantCreate, dir.display().to_string(), format!("cannot be recorded to: {e}"), fix)
+    };
+    if dir.is_file() || std::fs::read_dir(dir).is_ok_and(|mut d| d.next().is_some()) {
+        let what = "exists and is not an empty folder";
+        return Err(Fault::new(Exit::CantCreate, dir.display().to_string(), what, "choose another folder"));
+    }
+    std::fs::create_dir_all(dir).map_err(fault)?;
+    Ok(match format {
+        Format::Euroc => Box::new(EurocSink::create(dir, calibration).map_err(fault)?),
+        Format::Mcap => Box::new(McapSink::create(dir, calibration).map_err(fault)?),
+    })
+}
+
+/// Starts the writer, with room for so many frames of this shape.
+pub fn start(mut sink: Box<dyn Sink>, shape: &Frames, slots: usize) -> (Recorder, Taps) {
+    let (items, waiting) = mpsc::sync_channel(slots + IMU_SLOTS);
+    let (give_back, spare) = mpsc::sync_channel(slots);
+    for _ in 0..slots {
+        let _ = give_back.send(Box::new(shape.clone()));
+    }
+    let counts = Arc::new(Counts::default());
+    let c = counts.clone();
+    let thread = std::thread::spawn(move || {
+        host::lower_priority();
+        let mut failure: Option<String> = None;
+        let mut fails = |counter: &AtomicU64, e: io::Error| {
+            counter.fetch_add(1, Relaxed);
+            failure.get_or_insert_with(|| e.to_string());
+        };
+        while let Ok(item) = waiting.recv() {
+            match item {
+                Item::Frames(frames) => {
+                    match sink.frames(&frames) {
+                        Ok(()) => drop(c.frames.fetch_add(1, Relaxed)),
+                        Err(e) => fails(&c.frames_failed, e),
+                    }
+                    let _ = give_back.send(frames);
+                }
+                Item::Imu(reading) => match sink.imu(&reading) {
+                    Ok(()) => drop(c.imu.fetch_add(1, Relaxed)),
+                    Err(e) => fails(&c.imu_failed, e),
+                },
+            }
+        }
+        if let Err(e) = sink.finish() {
+            failure.get_or_insert_with(|| e.to_string());
+        }
+        failure
+    });
+    let frames = FrameTap { spare, items: items.clone(), counts: counts.clone() };
+    let imu = ImuTap { items, counts: counts.clone() };
+    (Recorder { counts, thread }, Taps { frames, imu })
+}
+
+impl Recorder {
+    /// Waits until all that was taken is written; the taps must be gone.
+    pub fn finish(self) -> Recorded {
+        let failure = self.thread.join().unwrap_or_else(|_| Some("the writer ended early".into()));
+        let c = &self.counts;
+        let counters = [
+            ("record_frames_written", &c.frames),
+            ("record_frames_dropped", &c.frames_dropped),
+            ("record_frames_failed", &c.frames_failed),
+            ("record_imu_written", &c.imu),
+            ("record_imu_dropped", &c.imu_dropped),
+            ("record_imu_failed", &c.imu_failed),
+        ];
+        Recorded { counters: counters.map(|(name, n)| (name, n.load(Relaxed))).to_vec(), failure }
+    }
+}
+
+impl FrameTap {
+    fn take(&mut self, frames: &Frames) {
+        let Ok(mut slot) = self.spare.try_recv() else {
+            self.counts.frames_dropped.fetch_add(1, Relaxed);
+            return;
+        };
+        slot.copy_from(frames);
+        // The queue has room for every slot and as many samples as are let in beside them.
+        let _ = self.items.try_send(Item::Frames(slot));
+    }
+}
+
+impl ImuTap {
+    fn take(&mut self, reading: &ImuReading) {
+        if self.items.try_send(Item::Imu(*reading)).is_err() {
+            self.counts.imu_dropped.fetch_add(1, Relaxed);
+        }
+    }
+}
+
+pub struct TappedFrames<S> {
+    source: S,
+    tap: FrameTap,
+}
+
+impl<S: FrameSource> FrameSource for TappedFrames<S> {
+    fn next(&mut self, timeout: Span, frames: &mut Frames) -> Result<Wait, SourceFault> {
+        let wait = self.source.next(timeout, frames)?;
+        if wait == Wait::Got {
+            self.tap.take(frames);
+        }
+        Ok(wait)
+    }
+
+    fn counters(&self) -> Vec<(&'static str, u64)> {
+        self.source.counters()
+    }
+
+    fn warnings(&self) -> &[String] {
+        self.source.warnings()
+    }
+}
+
+pub struct TappedImu<S> {
+    source: S,
+    tap: ImuTap,
+}
+
+impl<S: ImuSource> ImuSource for TappedImu<S> {
+    fn next(&mut self, timeout: Span, batch: &mut ImuBatch) -> Result<Wait, SourceFault> {
+        let wait = self.source.next(timeout, batch)?;
+        batch.iter().for_each(|reading| self.tap.take(reading));
+        Ok(wait)
+    }
+
+    fn counters(&self) -> Vec<(&'static str, u64)> {
+        self.source.counters()
+    }
+}
+
+#[cfg(test)]
+mod tests;

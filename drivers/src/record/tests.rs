@@ -1,0 +1,173 @@
+//! Recordings under a slow and under a full disk.
+#![cfg(test)]
+#![allow(clippy::unwrap_used)]
+
+use super::*;
+use crate::paced::{Images, Pace, PacedFrames, PacedImu};
+use crate::replay::{OpenOptions, Recording};
+use crate::sim::euroc_rig;
+use crate::types::{ImuSample, Nanos};
+use glam::DVec3;
+use std::path::PathBuf;
+use std::process::Command;
+use std::time::{Duration, Instant};
+
+const MS: i64 = 1_000_000;
+
+/// A rig of small cameras.
+fn rig() -> Calibration {
+    let mut rig = euroc_rig();
+    for c in &mut rig.cameras {
+        (c.camera.width, c.camera.height) = (160, 120);
+    }
+    rig
+}
+
+/// Frame i, 50 ms after the last, noisy enough to resist compression.
+fn frame(i: usize) -> Frames {
+    let mut frames = Frames::for_rig(&rig());
+    frames.t = Nanos((i as i64 + 1) * 50 * MS);
+    let mut state = i as u32 + 1;
+    for px in frames.images.iter_mut().flat_map(|image| &mut image.pixels) {
+        state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+        *px = (state >> 24) as u8;
+    }
+    frames
+}
+
+fn sources(frames: usize) -> (PacedFrames, PacedImu) {
+    let images: Vec<Frames> = (0..frames).map(frame).collect();
+    let stamps: Vec<Nanos> = images.iter().map(|f| f.t).collect();
+    let sample = |i: i64| ImuSample { t: Nanos(i * 5 * MS), gyro_body: DVec3::splat(i as f64), ..ImuSample::default() };
+    let pace = Pace::at_speed(Nanos(0), 10.0);
+    let samples: Vec<ImuSample> = (0..frames as i64 * 10 + 20).map(sample).collect();
+    (PacedFrames::new(Images::Rendered(images), stamps, pace), PacedImu::new(samples.into(), pace))
+}
+
+/// Plays `frames` frames through taps into `sink`; the longest call of the camera beyond its pace, and what came of it.
+fn record(sink: Box<dyn Sink>, frames: usize, slots: usize) -> (Duration, Recorded) {
+    let shape = frame(0);
+    let (recorder, taps) = start(sink, &shape, slots);
+    let (camera, unit) = sources(frames);
+    let (mut camera, mut unit) = taps.on(camera, unit);
+    let mut slowest = Duration::ZERO;
+    std::thread::scope(|s| {
+        s.spawn(move || {
+            let mut batch = ImuBatch::new();
+            while unit.next(Span(100 * MS), &mut batch).unwrap() != Wait::Ended {}
+        });
+        let mut out = shape;
+        loop {
+            let begun = Instant::now();
+            if camera.next(Span(100 * MS), &mut out).unwrap() == Wait::Ended {
+                break;
+            }
+            slowest = slowest.max(begun.elapsed());
+        }
+        drop(camera);
+    });
+    (slowest, recorder.finish())
+}
+
+fn count(r: &Recorded, name: &str) -> u64 {
+    r.counters.iter().find(|(n, _)| *n == name).unwrap().1
+}
+
+#[test]
+fn a_recording_reads_back_bit_for_bit() {
+    let dir = tempfile::tempdir().unwrap();
+    let out = dir.path().join("r");
+    let (_, r) = record(open(&out, Format::Euroc, &rig()).unwrap(), 20, 32);
+    assert_eq!((count(&r, "record_frames_written"), r.failure.as_deref()), (20, None));
+    let back = Recording::open(&out, &OpenOptions::default()).unwrap();
+    assert_eq!((back.frames.len(), back.imu.len(), back.warnings.len()), (20, 220, 0), "{:?}", back.warnings);
+    let (mut reader, mut frames) = (back.reader(), Frames::for_rig(&rig()));
+    for i in 0..20 {
+        reader.read(i, &mut frames).unwrap();
+        let truth = frame(i);
+        assert!(frames.t == truth.t && frames.images == truth.images, "{i}");
+    }
+    assert!(back.imu.iter().enumerate().all(|(i, s)| s.gyro_body.x == i as f64));
+    assert!(back.calibration.cameras.iter().zip(&rig().cameras).all(|(a, b)| a.camera == b.camera));
+}
+
+/// Takes 30 ms a frame where one comes every 5 ms.
+struct SlowDisk(Vec<Nanos>);
+
+impl Sink for SlowDisk {
+    fn frames(&mut self, frames: &Frames) -> io::Result<()> {
+        std::thread::sleep(Duration::from_millis(30));
+        self.0.push(frames.t);
+        Ok(())
+    }
+    fn imu(&mut self, _: &ImuReading) -> io::Result<()> {
+        Ok(())
+    }
+    fn finish(&mut self) -> io::Result<()> {
+        assert!(self.0.windows(2).all(|w| w[0] < w[1]), "in order");
+        Ok(())
+    }
+}
+
+#[test]
+fn a_slow_disk_costs_frames_of_the_recording_and_no_time_of_the_source() {
+    let (slowest, r) = record(Box::new(SlowDisk(vec![])), 100, 4);
+    let (written, dropped) = (count(&r, "record_frames_written"), count(&r, "record_frames_dropped"));
+    assert_eq!((written + dropped, r.failure), (100, None));
+    assert!(dropped > 40 && written >= 10, "{written} written, {dropped} dropped");
+    // Frames come every 5 ms; the rest is what a loaded machine takes.
+    assert!(slowest < Duration::from_millis(30 * 4), "{slowest:?}");
+}
+
+/// A disk of two megabytes; `None` where mounting is not allowed.
+struct SmallDisk(PathBuf);
+
+impl SmallDisk {
+    fn mount(at: &Path) -> Option<SmallDisk> {
+        let mount = Command::new("mount").args(["-t", "tmpfs", "-o", "size=2m", "tmpfs"]).arg(at).output();
+        mount.is_ok_and(|o| o.status.success()).then(|| SmallDisk(at.to_path_buf()))
+    }
+}
+
+impl Drop for SmallDisk {
+    fn drop(&mut self) {
+        let _ = Command::new("umount").arg(&self.0).status();
+    }
+}
+
+#[test]
+fn a_full_disk_leaves_every_frame_before_it_readable() {
+    let dir = tempfile::tempdir().unwrap();
+    let Some(disk) = SmallDisk::mount(dir.path()) else {
+        eprintln!("skipped: mounting a small disk is not allowed here");
+        return;
+    };
+    let out = disk.0.join("r");
+    // 38 KiB a frame: full after some fifty.
+    let (_, r) = record(open(&out, Format::Euroc, &rig()).unwrap(), 80, 100);
+    let (written, failed) = (count(&r, "record_frames_written"), count(&r, "record_frames_failed"));
+    assert!(written > 20 && failed > 10 && written + failed == 80, "{r:?}");
+    assert!(r.failure.clone().unwrap().contains("space"), "{r:?}");
+    let back = Recording::open(&out, &OpenOptions::default()).unwrap();
+    assert_eq!((back.frames.len() as u64, back.warnings.len()), (written, 0), "{:?}", back.warnings);
+    let (mut reader, mut frames) = (back.reader(), Frames::for_rig(&rig()));
+    assert!((0..back.frames.len()).all(|i| reader.read(i, &mut frames).is_ok()));
+}
+
+#[test]
+fn a_full_disk_leaves_every_whole_chunk_of_mcap_readable() {
+    let dir = tempfile::tempdir().unwrap();
+    let Some(disk) = SmallDisk::mount(dir.path()) else {
+        eprintln!("skipped: mounting a small disk is not allowed here");
+        return;
+    };
+    let out = disk.0.join("r");
+    let (_, r) = record(open(&out, Format::Mcap, &rig()).unwrap(), 80, 100);
+    let (written, failed) = (count(&r, "record_frames_written"), count(&r, "record_frames_failed"));
+    assert!(written > 20 && failed > 10 && written + failed == 80, "{r:?}");
+    let file = std::fs::read(out.join("recording-000.mcap")).unwrap();
+    let ignore_end = ::mcap::read::Options::IgnoreEndMagic.into();
+    let messages = ::mcap::MessageStream::new_with_options(&file, ignore_end).unwrap().map_while(Result::ok);
+    let images = messages.filter(|m| m.channel.topic == "/cam1/image").count() as u64;
+    assert_eq!(images, written);
+}
