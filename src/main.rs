@@ -8,6 +8,7 @@ use stipple::config::Board;
 use stipple::daemon::{self, Pace};
 use stipple::mem::CountingAllocator;
 use stipple::output::OutputDir;
+use stipple_drivers::record::Format;
 use stipple_drivers::replay::{OpenOptions, Recording};
 use stipple_drivers::{Exit, Fault};
 
@@ -57,6 +58,27 @@ enum Command {
         board: PathBuf,
         #[arg(long, value_name = "DIR", default_value = "out/run")]
         out: PathBuf,
+        /// Stop after this time
+        #[arg(long, value_name = "S", value_parser = seconds)]
+        duration: Option<f64>,
+        /// A recording in the place of the sensors, as for replay, at its pace
+        #[arg(long, value_name = "DIR")]
+        dataset: Option<PathBuf>,
+        /// Record what the sensors give as EuRoC ASL, too
+        #[arg(long, value_name = "DIR")]
+        record: Option<PathBuf>,
+        /// Override a key of the board file
+        #[arg(long = "set", value_name = "SECTION.KEY=VALUE")]
+        set: Vec<String>,
+    },
+    /// Record the board's sensors until stopped (SIGINT, SIGTERM)
+    Record {
+        /// Board file, see board-configs/
+        board: PathBuf,
+        #[arg(long, value_name = "DIR")]
+        out: PathBuf,
+        #[arg(long, value_enum, default_value = "euroc")]
+        format: RecordFormat,
         /// Stop after this time
         #[arg(long, value_name = "S", value_parser = seconds)]
         duration: Option<f64>,
@@ -120,6 +142,14 @@ enum Command {
         #[command(subcommand)]
         what: Bench,
     },
+}
+
+#[derive(Clone, Copy, clap::ValueEnum)]
+enum RecordFormat {
+    /// EuRoC ASL, which `stipple replay` plays
+    Euroc,
+    /// MCAP with ROS 2 messages, which Foxglove opens
+    Mcap,
 }
 
 #[derive(Subcommand)]
@@ -216,6 +246,14 @@ enum Bench {
         #[arg(long)]
         quick: bool,
     },
+    /// Sensors that fail, in real time: which counter sees each fault, and what it costs; three minutes
+    Faults {
+        #[arg(long, value_name = "DIR")]
+        out: PathBuf,
+        /// The unplugged sensors only
+        #[arg(long)]
+        quick: bool,
+    },
     /// Errors beside what the covariance claims, and beside the quality
     Consistency {
         #[arg(long, value_name = "DIR")]
@@ -241,8 +279,16 @@ fn run(command: Command) -> Result<(), Fault> {
                 daemon::Replay { pace, poses, holdout: holdout.unwrap_or(0), duration_s: duration, mapping_s: None };
             daemon::replay(&dataset, &board, &out, &set, &options)
         }
-        Command::Run { board, out, duration, dataset, set } => {
-            daemon::run_sensors(&board, &out, &set, &daemon::Run { dataset, duration_s: duration })
+        Command::Run { board, out, duration, dataset, record, set } => {
+            daemon::run_sensors(&board, &out, &set, &daemon::Run { dataset, duration_s: duration, record })
+        }
+        Command::Record { board, out, format, duration, dataset, set } => {
+            let format = match format {
+                RecordFormat::Euroc => Format::Euroc,
+                RecordFormat::Mcap => Format::Mcap,
+            };
+            let options = daemon::Run { dataset, duration_s: duration, record: None };
+            daemon::record(&board, &out, format, &set, &options)
         }
         Command::Demo { board, out, set } => daemon::demo(board.as_deref(), &out, &set),
         Command::Sim { scenario, out, truth, imu, duration, seed, rig, colour, defects } => {
@@ -277,6 +323,7 @@ fn run(command: Command) -> Result<(), Fault> {
             let run = |job: &bench::map::Job, dir: &OutputDir| daemon::benched(&what, job, dir);
             bench::stereo::stereo(&options, &out, maps.then_some(&run as bench::stereo::MapRun))
         }
+        Command::Bench { what: Bench::Faults { out, quick } } => daemon::faults(&out, quick),
         Command::Bench { what: Bench::Stability { out, seeds } } => bench::stability::stability(seeds, &out),
     }
 }

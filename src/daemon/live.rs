@@ -7,39 +7,47 @@ use super::play::{realtime, Realtime};
 use super::progress::Progress;
 use super::sensors::Sensors;
 use super::tracking::{OdometryRun, Tracking};
-use super::{memory, summary};
-use crate::config::Board;
+use super::{memory, record, summary};
+use crate::config::{Board, InjectConfig};
 use crate::output::OutputDir;
 use std::path::{Path, PathBuf};
+use stipple_drivers::record::Format;
 use stipple_drivers::{host, Calibration, Exit, Fault, Frames, TimedPose};
 
 pub struct Run {
     /// Takes the place of the sensors, at its recorded pace.
     pub dataset: Option<PathBuf>,
     pub duration_s: Option<f64>,
+    /// Records there what the sensors give, as EuRoC.
+    pub record: Option<PathBuf>,
 }
 
 /// What a run reads.
-struct Rig {
-    name: String,
-    place: String,
-    calibration: Calibration,
-    sensors: Sensors,
-    truth: Vec<TimedPose>,
-    opened: Vec<(&'static str, u64)>,
-    warnings: Vec<String>,
+pub struct Rig {
+    pub name: String,
+    pub place: String,
+    pub calibration: Calibration,
+    pub sensors: Sensors,
+    pub truth: Vec<TimedPose>,
+    pub opened: Vec<(&'static str, u64)>,
+    pub warnings: Vec<String>,
     /// At most.
-    frames: usize,
-    length_s: Option<f64>,
+    pub frames: usize,
+    pub length_s: Option<f64>,
+}
+
+/// The sensors of a board, or the recording in their place.
+pub fn rig_of(path: &Path, board: &Board, options: &Run) -> Result<Rig, Fault> {
+    match &options.dataset {
+        Some(dataset) => recorded(dataset, board, options),
+        None => Err(no_sensors(path)),
+    }
 }
 
 /// `stipple run`
 pub fn run(path: &Path, out: &Path, set: &[String], options: &Run) -> Result<(), Fault> {
     let board = Board::load(path, set)?;
-    let rig = match &options.dataset {
-        Some(dataset) => recorded(dataset, &board, options)?,
-        None => return Err(no_sensors(path)),
-    };
+    let mut rig = rig_of(path, &board, options)?;
     memory::admit(&rig.place, &rig.calibration, &board)?;
     let out = OutputDir::create(out)?;
     let tracking = Tracking::Odometry(Box::new(OdometryRun::new(&rig.calibration, &board, rig.frames)?));
@@ -47,6 +55,18 @@ pub fn run(path: &Path, out: &Path, set: &[String], options: &Run) -> Result<(),
     for warning in &rig.warnings {
         eprintln!("stipple: warning: {warning}");
     }
+    let recorder = match &options.record {
+        Some(dir) => {
+            let sink = stipple_drivers::record::open(dir, Format::Euroc, &rig.calibration)?;
+            let shape = Frames::in_colour(&rig.calibration, memory::colours(&rig.calibration, &board).len());
+            let (recorder, taps) = stipple_drivers::record::start(sink, &shape, board.record.ring_frames as usize);
+            rig.sensors = record::tapped(rig.sensors, taps);
+            Some((recorder, dir))
+        }
+        None => None,
+    };
+    let shape = || Frames::in_colour(&rig.calibration, memory::colours(&rig.calibration, &board).len());
+    let sensors = rig.sensors.spoilt(&board.inject, shape);
     let title = summary::Title {
         dataset: rig.name,
         board: board.name.clone(),
@@ -58,15 +78,20 @@ pub fn run(path: &Path, out: &Path, set: &[String], options: &Run) -> Result<(),
     let mut progress = Progress::new(rig.length_s);
     let realtime_options =
         Realtime { holdout: 0, duration_s: None, sensors_s: options.duration_s, stop: host::stop_asked_for() };
-    let mut played = realtime(rig.sensors, &rig.calibration, tracking, mapping, &realtime_options, &mut progress);
+    let mut played = realtime(sensors, &rig.calibration, tracking, mapping, &realtime_options, &mut progress);
     progress.finish();
     for warning in &played.warnings {
         eprintln!("stipple: warning: {warning}");
     }
     played.warnings = [rig.warnings, played.warnings].concat();
     let broken = played.broken.take();
+    let recorded = recorder.map(|(recorder, dir)| (recorder.finish(), dir));
+    if let Some((recorded, _)) = &recorded {
+        played.source.extend(&recorded.counters);
+    }
     let report = summary::conclude(title, played, &out)?;
     println!("{}", summary::seven_lines(&report, &out));
+    recorded.map_or(Ok(()), |(recorded, dir)| record::whole(&recorded, dir))?;
     broken.map_or(Ok(()), Err)
 }
 
@@ -79,7 +104,7 @@ fn recorded(dataset: &Path, board: &Board, options: &Run) -> Result<Rig, Fault> 
     let Input { name, calibration, imu, mut stamps, truth, warnings, counters, source } = input;
     stamps.truncate(frames);
     let shape = || Frames::in_colour(&calibration, colours);
-    let sensors = Sensors::of_recording(source, stamps, imu, &board.inject, shape);
+    let sensors = Sensors::of_recording(source, stamps, imu, &InjectConfig::default(), shape);
     let length_s = Some(options.duration_s.map_or(length_s, |s| s.min(length_s)));
     Ok(Rig { name, place, calibration, sensors, truth, opened: counters, warnings, frames, length_s })
 }

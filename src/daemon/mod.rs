@@ -9,6 +9,7 @@
 //! | or frontend | follows points (`frontend.threads = 2`) | sealed |
 //! | and estimator | estimates, one frame behind at most; offers keyframes | sealed |
 //! | mapping | rectification, depth, training; low priority, as are the CPU device's own threads | sealed; OpenCV and the driver allocate behind it |
+//! | writer | writes what is recorded, if anything is; low priority | free |
 //!
 //! In lockstep pace the main thread is both sensors and mapping too.
 //!
@@ -18,6 +19,7 @@
 //! the cameras end, tracking drains and ends, mapping ends with the run's time.
 
 mod dataset;
+mod faults;
 mod input;
 mod live;
 mod lockstep;
@@ -26,14 +28,17 @@ mod memory;
 mod pipeline;
 mod play;
 mod progress;
+mod record;
 mod sensors;
 mod summary;
 mod tracking;
 mod watch;
 
 pub use dataset::check_dataset;
+pub use faults::faults;
 pub use live::{run as run_sensors, Run};
 pub use play::Pace;
+pub use record::record;
 
 use crate::bench::map::Job;
 use crate::config::Board;

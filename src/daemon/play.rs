@@ -249,12 +249,15 @@ pub fn realtime(
         }
         mapping_thread.map(|t| t.join().expect("threads of a run answer with values, not panics"))
     });
+    let warnings = sensors.frames.warnings().to_vec();
     let mut source = [sensors.frames.counters(), sensors.imu.counters()].concat();
     source
         .iter()
         .filter(|(name, _)| *name == FRAMES_UNREADABLE)
         .for_each(|(_, n)| s.counters.frames_unreadable.add(*n));
     source.retain(|(name, _)| *name != FRAMES_UNREADABLE);
+    // A recording ends when its taps are gone.
+    drop(sensors);
     let arrived = s.inbox.arrived.load(Relaxed) + s.counters.frames_unreadable.get();
     Played {
         tracking,
@@ -262,7 +265,7 @@ pub fn realtime(
         frames: arrived as usize,
         keyframes: keyframes.count,
         wall_s: shared.start.elapsed().as_secs_f64(),
-        warnings: sensors.frames.warnings().to_vec(),
+        warnings,
         counters: shared.counters,
         source,
         broken: shared.inbox.broken.pop(),

@@ -23,7 +23,8 @@ pub struct Progress {
     bar: Option<ProgressBar>,
     /// `None`: until it is stopped.
     total_ms: Option<u64>,
-    next_line: Instant,
+    /// `None`: never.
+    next_line: Option<Instant>,
 }
 
 const LINE_PERIOD: Duration = Duration::from_secs(1);
@@ -38,7 +39,12 @@ impl Progress {
             bar.set_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()));
             bar
         });
-        Progress { bar, total_ms, next_line: Instant::now() + LINE_PERIOD }
+        Progress { bar, total_ms, next_line: Some(Instant::now() + LINE_PERIOD) }
+    }
+
+    /// Shows nothing.
+    pub fn silent() -> Progress {
+        Progress { bar: None, total_ms: None, next_line: None }
     }
 
     /// Cheap to call often: draws at most once a second without a terminal.
@@ -49,8 +55,8 @@ impl Progress {
                 bar.set_position(played);
                 bar.set_message(line(g));
             }
-            None if Instant::now() >= self.next_line => {
-                self.next_line += LINE_PERIOD;
+            None if self.next_line.is_some_and(|due| Instant::now() >= due) => {
+                self.next_line = self.next_line.map(|due| due + LINE_PERIOD);
                 let of = self.total_ms.map_or(String::new(), |ms| format!(" of {:.1}", ms as f64 * 1e-3));
                 eprintln!("{:.1}{of} s: {}", played as f64 * 1e-3, line(g));
             }
@@ -62,7 +68,8 @@ impl Progress {
     pub fn say(&self, text: &str) {
         match &self.bar {
             Some(bar) => bar.println(format!("stipple: {text}")),
-            None => eprintln!("stipple: {text}"),
+            None if self.next_line.is_some() => eprintln!("stipple: {text}"),
+            None => {}
         }
     }
 

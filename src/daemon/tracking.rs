@@ -12,6 +12,7 @@ use crate::counters::Counters;
 use crate::frontend::{Frontend, Prediction, Tracks};
 use crate::limits::IMU_BETWEEN_FRAMES;
 use crate::mem::List;
+use crate::vio::health::Health;
 use crate::vio::predict::Predictor;
 use crate::vio::rig::RigEstimate;
 use crate::vio::samples::ImuRing;
@@ -120,6 +121,8 @@ pub struct Back {
     /// Wall time of each frame, ms, and of all of them, s.
     pub ms: Vec<f64>,
     pub busy_s: f64,
+    /// Of every frame, odometry or not.
+    pub health: Vec<(Nanos, Health)>,
     /// From when the front end took a frame until its pose was there, ms.
     pub frame_ms: Vec<(Nanos, f64)>,
     pub cpu_s: Option<f64>,
@@ -151,6 +154,7 @@ impl Back {
         let secs = begun.elapsed().as_secs_f64();
         self.busy_s += secs;
         keep(&mut self.ms, secs * 1e3);
+        keep(&mut self.health, (slot.frames.t, update.health));
         keep(&mut self.frame_ms, (slot.frames.t, slot.begun.elapsed().as_secs_f64() * 1e3));
     }
 
@@ -186,6 +190,7 @@ impl OdometryRun {
                 trajectory: Vec::with_capacity(frames),
                 ms: Vec::with_capacity(frames),
                 busy_s: 0.0,
+                health: Vec::with_capacity(frames),
                 frame_ms: Vec::with_capacity(frames),
                 cpu_s: None,
             },
