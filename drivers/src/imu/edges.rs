@@ -1,0 +1,194 @@
+//! Data-ready edges, and which sample each belongs to.
+//!
+//! A unit raises its line once a sample, so in the long run there are as many edges as samples, and they are paired
+//! in order. The exceptions are told by their counts: the last edge may be of a sample that came after the FIFO was
+//! counted (it waits for the next read), and edges are lost when the kernel's queue of 16 overflows or an interrupt is
+//! masked. Then the newest sample takes the last edge, if that is younger than a period, its forerunners those whole
+//! periods before it, and what has no edge is stamped by the line (`timeline`).
+
+use crate::types::{Nanos, Span};
+
+/// Where edges come from: a GPIO line, or a simulated one.
+pub trait Edges: Send {
+    /// Waits until an edge is there, `timeout` at most; false where none came.
+    fn wait(&mut self, timeout: Span) -> Result<bool, EdgeFault>;
+    /// Takes the edges that are there; those that do not fit are counted and gone.
+    fn drain(&mut self, into: &mut EdgeQueue) -> Result<(), EdgeFault>;
+    fn reopen(&mut self) -> Result<(), EdgeFault>;
+}
+
+/// The line cannot be read (errno).
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct EdgeFault(pub i32);
+
+/// More than any FIFO's samples between two reads.
+const EDGES: usize = 256;
+
+/// Edges that no sample has been found for, oldest first.
+#[derive(Clone, Debug)]
+pub struct EdgeQueue {
+    stamps: [Nanos; EDGES],
+    len: usize,
+    /// Edges that did not fit, were not newer than the last, or were stamped by another clock than ours.
+    pub refused: u64,
+    /// Edges without a sample, and samples without an edge.
+    pub unmatched: u64,
+}
+
+/// An edge further than this from now was not stamped by `CLOCK_MONOTONIC`, as kernels before 5.7 do not.
+const FOREIGN: Span = Span(10_000_000_000);
+
+impl EdgeQueue {
+    pub fn new() -> EdgeQueue {
+        EdgeQueue { stamps: [Nanos(0); EDGES], len: 0, refused: 0, unmatched: 0 }
+    }
+
+    pub fn len(&self) -> usize {
+        self.len
+    }
+
+    pub fn is_empty(&self) -> bool {
+        self.len == 0
+    }
+
+    pub fn clear(&mut self) {
+        self.len = 0;
+    }
+
+    pub fn push(&mut self, t: Nanos, now: Nanos) {
+        let foreign = (now - t).0.saturating_abs() > FOREIGN.0;
+        let old = self.as_slice().last().is_some_and(|last| t <= *last);
+        if foreign || old || self.len == EDGES {
+            self.refused += 1;
+            return;
+        }
+        self.stamps[self.len] = t;
+        self.len += 1;
+    }
+
+    pub fn as_slice(&self) -> &[Nanos] {
+        &self.stamps[..self.len]
+    }
+
+    /// Finds the edges of the `n` samples of a read that began at `before`: `of[i]` is that of sample i. Uses up the
+    /// edges, save one that is of the next sample.
+    pub fn pair(&mut self, n: usize, before: Nanos, period: Span, of: &mut Vec<Option<Nanos>>) {
+        of.clear();
+        of.resize(n, None);
+        let latest = self.as_slice().last().copied();
+        let surplus = usize::from(self.len == n + 1 && latest > Some(before - Span(period.0 / 2)));
+        let edges = self.len - surplus;
+        if edges == n {
+            of.iter_mut().zip(&self.stamps).for_each(|(of, t)| *of = Some(*t));
+        } else {
+            self.unmatched += edges.abs_diff(n) as u64;
+            // An edge older than most of a period is not of the newest sample: its own is among the lost.
+            let young = |t: &Nanos| (before - *t).0 < period.0 - period.0 / 5;
+            if let Some(latest) = latest.filter(young) {
+                for t in self.as_slice().iter().rev() {
+                    let periods = ((latest - *t).0 as f64 / period.0.max(1) as f64).round() as usize;
+                    let sample = n.checked_sub(1 + periods).and_then(|i| of.get_mut(i));
+                    sample.into_iter().for_each(|of| *of = of.or(Some(*t)));
+                }
+            }
+        }
+        self.stamps[0] = self.stamps[edges.min(EDGES - 1)];
+        self.len = surplus;
+    }
+}
+
+impl Default for EdgeQueue {
+    fn default() -> Self {
+        EdgeQueue::new()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    const PERIOD: Span = Span(100);
+
+    fn queue(stamps: &[i64]) -> EdgeQueue {
+        let mut queue = EdgeQueue::new();
+        stamps.iter().for_each(|t| queue.push(Nanos(*t), Nanos(*t)));
+        queue
+    }
+
+    fn paired(queue: &mut EdgeQueue, n: usize, before: i64) -> Vec<Option<i64>> {
+        let mut of = vec![];
+        queue.pair(n, Nanos(before), PERIOD, &mut of);
+        of.iter().map(|t| t.map(|t| t.0)).collect()
+    }
+
+    #[test]
+    fn as_many_edges_as_samples_are_paired_in_order_however_uneven() {
+        let mut q = queue(&[100, 201, 450]);
+        assert_eq!(paired(&mut q, 3, 470), [Some(100), Some(201), Some(450)]);
+        assert!(q.is_empty() && q.unmatched == 0);
+    }
+
+    #[test]
+    fn an_edge_that_came_while_the_samples_were_counted_waits_for_the_next_read() {
+        let mut q = queue(&[100, 200, 300]);
+        assert_eq!(paired(&mut q, 2, 299), [Some(100), Some(200)]);
+        assert_eq!(q.as_slice(), [Nanos(300)]);
+        q.push(Nanos(400), Nanos(400));
+        assert_eq!(paired(&mut q, 2, 420), [Some(300), Some(400)]);
+        assert_eq!(q.unmatched, 0);
+    }
+
+    #[test]
+    fn lost_edges_leave_their_samples_to_the_line() {
+        let mut q = queue(&[200, 300]);
+        assert_eq!(paired(&mut q, 3, 320), [None, Some(200), Some(300)]);
+        assert_eq!(q.unmatched, 1);
+        let mut q = queue(&[101, 300]);
+        assert_eq!(paired(&mut q, 3, 320), [Some(101), None, Some(300)]);
+        // The edge of the newest sample is lost: which of the others belongs to which is not known.
+        let mut q = queue(&[100, 200]);
+        assert_eq!(paired(&mut q, 3, 320), [None; 3]);
+        assert!(q.is_empty());
+        assert_eq!(paired(&mut queue(&[]), 2, 320), [None; 2]);
+    }
+
+    #[test]
+    fn more_edges_than_samples_are_counted() {
+        let mut q = queue(&[100, 200, 300, 400]);
+        assert_eq!(paired(&mut q, 2, 420), [Some(300), Some(400)]);
+        assert_eq!(q.unmatched, 2);
+        let mut q = queue(&[100]);
+        assert_eq!(paired(&mut q, 0, 420), []);
+        assert_eq!((q.unmatched, q.len()), (1, 0), "an old edge without a sample is not kept");
+    }
+
+    #[test]
+    fn edges_of_another_clock_and_out_of_order_are_refused() {
+        let mut q = queue(&[100]);
+        q.push(Nanos(100), Nanos(100));
+        q.push(Nanos(1_700_000_000_000_000_000), Nanos(200));
+        q.push(Nanos(i64::MIN), Nanos(200));
+        assert_eq!((q.len(), q.refused), (1, 3));
+        for t in 0..300 {
+            q.push(Nanos(1000 + t), Nanos(1000));
+        }
+        assert_eq!((q.len(), q.refused), (EDGES, 3 + 300 + 1 - EDGES as u64));
+    }
+
+    proptest! {
+        #[test]
+        fn pairs_are_in_order_and_no_edge_is_given_twice(
+            stamps in proptest::collection::vec(0i64..30_000, 0..300), n in 0usize..300, before in 0i64..40_000,
+        ) {
+            let mut stamps = stamps;
+            stamps.sort_unstable();
+            let mut q = queue(&stamps);
+            let of = paired(&mut q, n, before);
+            prop_assert_eq!(of.len(), n);
+            let given: Vec<i64> = of.into_iter().flatten().chain(q.as_slice().iter().map(|t| t.0)).collect();
+            prop_assert!(given.windows(2).all(|w| w[0] < w[1]));
+            prop_assert!(q.len() <= 1);
+        }
+    }
+}

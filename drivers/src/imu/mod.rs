@@ -1,0 +1,3 @@
+//! Inertial units.
+
+pub mod edges;
