@@ -1,3 +1,169 @@
-//! Inertial units.
+//! Inertial units, driven by their registers over I2C or SPI.
+//!
+//! ```text
+//! bus -> die: FIFO burst -> frames -> unit: stamp, scale, flags -> [merge of two dies] -> register: ImuSource
+//!              edges, timeline ----------^          chips: tables of all of the above
+//! ```
+//!
+//! Stamps are `CLOCK_MONOTONIC` of the instant at which a sample was ready: that of the kernel's event where a
+//! data-ready line is wired, else estimated from the moments of reading (`timeline`: within 0.2 ms of the truth at
+//! 200 Hz, and the sensor's rate within 10 ppm). The delay of the unit's own low-pass filter, some milliseconds, is
+//! part of the time offset between camera and inertial unit that calibration states or odometry estimates.
 
+pub mod bus;
+pub mod chips;
+pub mod counters;
+mod die;
 pub mod edges;
+mod frames;
+mod merge;
+mod register;
+mod self_test;
+#[cfg(test)]
+mod simulated;
+#[cfg(test)]
+mod tests;
+pub mod timeline;
+mod unit;
+
+pub use counters::ImuCounters;
+pub use register::{Limits, RegisterImu};
+pub use timeline::ClockReport;
+
+use crate::gpio::DataReady;
+use crate::types::{Nanos, Span};
+use crate::{Exit, Fault};
+use bus::{Bus, BusFault, I2c, Spi};
+use chips::Chip;
+use die::Die;
+use std::path::PathBuf;
+use unit::Unit;
+
+/// Where a die is wired.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Wiring {
+    /// An adapter (a path, or the name its driver gives it) and an address.
+    I2c {
+        adapter: String,
+        address: u16,
+    },
+    Spi {
+        path: String,
+        hz: u32,
+        mode: u8,
+    },
+}
+
+/// A unit that we drive by its registers.
+#[derive(Clone, Debug, PartialEq)]
+pub struct RegisterOptions {
+    pub chip: String,
+    /// Of each die of the chip; the one with the gyro first.
+    pub wiring: Vec<Wiring>,
+    /// The nearest there is within 10 % is taken.
+    pub rate_hz: f64,
+    /// The smallest there is that holds them is taken.
+    pub accel_range_g: f64,
+    pub gyro_range_dps: f64,
+    pub self_test: bool,
+    /// The BMI270's configuration file.
+    pub configuration: PathBuf,
+    /// Equal values in a row that are no coincidence; 0: never.
+    pub frozen_samples: u32,
+    pub limits: Limits,
+}
+
+impl RegisterOptions {
+    /// Opens the buses, tests the unit where that is asked for, and starts it.
+    pub fn open(&self, data_ready: Option<DataReady>) -> Result<RegisterImu<Box<dyn Bus>, DataReady>, Fault> {
+        let chip = Chip::named(&self.chip)?;
+        if self.wiring.len() != chip.dies.len() {
+            let what = format!("{} has {} dies, {} are wired", chip.name, chip.dies.len(), self.wiring.len());
+            return Err(Fault::new(Exit::Config, "imu", what, "say where each is: imu.address, imu.accel_address"));
+        }
+        let buses = chip.dies.iter().zip(&self.wiring).map(|(die, wiring)| wiring.open(die.spi_dummy));
+        self.start(buses.collect::<Result<_, _>>()?, data_ready)
+    }
+
+    /// With the buses of the dies.
+    pub fn start<B: Bus, E: edges::Edges>(&self, buses: Vec<B>, edges: Option<E>) -> Result<RegisterImu<B, E>, Fault> {
+        let chip = Chip::named(&self.chip)?;
+        let place = self.wiring.first().map_or(self.chip.clone(), |w| format!("{} at {w}", self.chip));
+        let upload = self.read_configuration()?;
+        let mut units = Vec::new();
+        for ((die, bus), wiring) in chip.dies.iter().zip(buses).zip(&self.wiring) {
+            let (mut setting, rate_hz) = die.setting(self.rate_hz, self.accel_range_g, self.gyro_range_dps)?;
+            setting.spi = matches!(wiring, Wiring::Spi { .. });
+            setting.data_ready = edges.is_some() && die.gyro.is_some();
+            let mut die = Die::new(bus, die, &setting, upload.clone());
+            if self.self_test {
+                self_test::self_test(&mut die)
+                    .map_err(|trouble| register::cannot_start(&place, die.chip.name, trouble))?;
+            }
+            units.push(Unit::new(die, &setting, rate_hz, self.frozen_samples));
+        }
+        RegisterImu::start(place, units, edges, self.limits)
+    }
+
+    fn read_configuration(&self) -> Result<Vec<u8>, Fault> {
+        /// "Device initialisation" of the BMI270: no more fits its memory.
+        const BYTES_MAX: usize = 8192;
+        if self.configuration.as_os_str().is_empty() {
+            return Ok(Vec::new());
+        }
+        let place = self.configuration.display().to_string();
+        let fix = "imu.configuration names the bytes of bmi270_config_file, as they are sent";
+        let bytes = std::fs::read(&self.configuration)
+            .map_err(|e| Fault::new(Exit::NoInput, &place, format!("cannot be read: {e}"), fix))?;
+        if bytes.is_empty() || bytes.len() > BYTES_MAX || bytes.len() % 2 != 0 {
+            let what = format!("{} bytes, not an even number up to {BYTES_MAX}", bytes.len());
+            return Err(Fault::new(Exit::Config, place, what, fix));
+        }
+        Ok(bytes)
+    }
+}
+
+impl Wiring {
+    fn open(&self, spi_dummy: usize) -> Result<Box<dyn Bus>, Fault> {
+        Ok(match self {
+            Wiring::I2c { adapter, address } => Box::new(I2c::open(adapter, *address)?),
+            Wiring::Spi { path, hz, mode } => Box::new(Spi::open(path, *hz, *mode, spi_dummy)?),
+        })
+    }
+}
+
+impl std::fmt::Display for Wiring {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Wiring::I2c { adapter, address } => write!(f, "{adapter} {address:#04x}"),
+            Wiring::Spi { path, .. } => write!(f, "{path}"),
+        }
+    }
+}
+
+impl Bus for Box<dyn Bus> {
+    fn read(&mut self, register: u8, into: &mut [u8]) -> Result<(), BusFault> {
+        (**self).read(register, into)
+    }
+
+    fn write(&mut self, register: u8, bytes: &[u8]) -> Result<(), BusFault> {
+        (**self).write(register, bytes)
+    }
+
+    fn reopen(&mut self) -> Result<(), BusFault> {
+        (**self).reopen()
+    }
+
+    fn now(&self) -> Nanos {
+        (**self).now()
+    }
+
+    fn sleep(&mut self, span: Span) {
+        (**self).sleep(span);
+    }
+}
+
+/// Sleeps for a span; not at all where it is negative.
+fn pause(span: Span) {
+    std::thread::sleep(std::time::Duration::from_nanos(span.0.max(0) as u64));
+}

@@ -1,0 +1,244 @@
+//! Bosch: BMI088 (two dies in one package) and BMI270. Words are little-endian; the FIFO frames carry headers, save
+//! those of the BMI088's gyro.
+
+use super::Step::{Expect, Touch, Upload, WaitUs, Write};
+use super::*;
+
+/// Data sheet BST-BMI088-DS001, register map of the gyroscope: a die with address, FIFO and clock of its own.
+pub const BMI088_GYRO: Die = Die {
+    name: "BMI088 gyro",
+    // GYRO_CHIP_ID.
+    who: 0x00,
+    who_answers: &[0x0F],
+    bank_select: None,
+    spi_dummy: 0,
+    accel: None,
+    gyro: Some(Sense {
+        // GYRO_RANGE.
+        ranges: &[
+            (125.0, 4, 125.0 / 32768.0),
+            (250.0, 3, 250.0 / 32768.0),
+            (500.0, 2, 500.0 / 32768.0),
+            (1000.0, 1, 1000.0 / 32768.0),
+            (2000.0, 0, 2000.0 / 32768.0),
+        ],
+        data: 0x02,
+        big_endian: false,
+    }),
+    // GYRO_BANDWIDTH: with the wider band where there are two.
+    rates: Rates::Listed(&[(100.0, 7), (200.0, 6), (400.0, 3), (1000.0, 2), (2000.0, 1)]),
+    temperature: Temperature { from: TemperatureFrom::Nowhere, c_per_lsb: 0.0, c_at_zero: 0.0 },
+    fifo: Fifo {
+        // FIFO_STATUS: frames in bits 6:0; 100 frames deep ("FIFO", gyroscope).
+        count: 0x0E,
+        count_bytes: 1,
+        count_big_endian: false,
+        count_mask: 0x7F,
+        unit: 6,
+        data: 0x3F,
+        capacity: 600,
+        full: 600,
+        layout: Layout::Plain { len: 6, accel: None, gyro: Some(0), temperature: None, big_endian: false },
+        // FIFO_CONFIG_1: writing the mode clears it, and the overrun flag.
+        reset: &[Write(0x3E, 0x80)],
+    },
+    // GYRO_SOFTRESET: 30 ms.
+    reset: &[Write(0x14, 0xB6), WaitUs(35_000)],
+    configure: configure_bmi088_gyro,
+    // GYRO_SELF_TEST: BIST trigger, ready and failed.
+    cross_axis: None,
+    self_test: SelfTest::Asked { register: 0x3C, trigger: 0x01, ready: 0x02, failed: 0x04 },
+};
+
+fn configure_bmi088_gyro(s: &Setting) -> Vec<Step> {
+    vec![
+        Write(0x0F, s.gyro),
+        Write(0x10, s.rate),
+        // INT3_INT4_IO_CONF, INT3_INT4_IO_MAP and GYRO_INT_CTRL: data ready on INT3, push-pull, active high.
+        Write(0x16, 0x01),
+        Write(0x18, if s.data_ready { 0x01 } else { 0x00 }),
+        Write(0x15, if s.data_ready { 0x80 } else { 0x00 }),
+        WaitUs(30_000),
+        // FIFO_CONFIG_0 and FIFO_CONFIG_1: no watermark; a stream.
+        Write(0x3D, 0x00),
+        Write(0x3E, 0x80),
+    ]
+}
+
+/// Data sheet BST-BMI088-DS001, register map of the accelerometer.
+pub const BMI088_ACCEL: Die = Die {
+    name: "BMI088 accelerometer",
+    // ACC_CHIP_ID.
+    who: 0x00,
+    who_answers: &[0x1E],
+    bank_select: None,
+    // "SPI interface of accelerometer part": the byte after the address of a read is of no meaning.
+    spi_dummy: 1,
+    accel: Some(Sense {
+        // ACC_RANGE, and the formula at RATE_X to Z of "ACC data": 2^(range + 1) * 1.5 g.
+        ranges: &[
+            (3.0, 0, 3.0 / 32768.0),
+            (6.0, 1, 6.0 / 32768.0),
+            (12.0, 2, 12.0 / 32768.0),
+            (24.0, 3, 24.0 / 32768.0),
+        ],
+        data: 0x12,
+        big_endian: false,
+    }),
+    gyro: None,
+    // ACC_CONF, acc_odr.
+    rates: Rates::Listed(&[
+        (12.5, 5),
+        (25.0, 6),
+        (50.0, 7),
+        (100.0, 8),
+        (200.0, 9),
+        (400.0, 10),
+        (800.0, 11),
+        (1600.0, 12),
+    ]),
+    // TEMP_MSB and TEMP_LSB: 0.125 °C a step from 23 °C.
+    temperature: Temperature { from: TemperatureFrom::Eleven(0x22), c_per_lsb: 0.125, c_at_zero: 23.0 },
+    fifo: Fifo {
+        // FIFO_LENGTH_0 and 1; 1 KiB ("FIFO", accelerometer).
+        count: 0x24,
+        count_bytes: 2,
+        count_big_endian: false,
+        count_mask: 0x3FFF,
+        unit: 1,
+        data: 0x26,
+        capacity: 1024,
+        full: 1024 - 7 + 1,
+        layout: Layout::Bosch { config: 1 },
+        // ACC_SOFTRESET: 0xB0 clears the FIFO.
+        reset: &[Write(0x7E, 0xB0)],
+    },
+    // ACC_SOFTRESET, then "Power on and sensor initialisation": a read turns the interface to SPI, then active mode and the sensor on.
+    reset: &[
+        Write(0x7E, 0xB6),
+        WaitUs(2000),
+        Touch(0x00),
+        Write(0x7C, 0x00),
+        WaitUs(500),
+        Write(0x7D, 0x04),
+        WaitUs(50_000),
+    ],
+    configure: configure_bmi088_accel,
+    cross_axis: None,
+    self_test: SelfTest::Push(&[Push {
+        of: Which::Accel,
+        // "Self-test: accelerometer": 24 g, 1600 Hz; positive less negative: 1, 1 and 0.5 g at least.
+        prepare: &[Write(0x41, 0x03), Write(0x40, 0xA7), WaitUs(3000)],
+        on: &[Write(0x6D, 0x0D), WaitUs(55_000)],
+        off: &[Write(0x6D, 0x09), WaitUs(55_000)],
+        per_lsb: 24.0 / 32768.0,
+        within: [(1.0, f64::INFINITY), (1.0, f64::INFINITY), (0.5, f64::INFINITY)],
+    }]),
+};
+
+fn configure_bmi088_accel(s: &Setting) -> Vec<Step> {
+    vec![
+        Write(0x6D, 0x00),
+        // ACC_CONF: normal filter.
+        Write(0x40, 0xA0 | s.rate),
+        Write(0x41, s.accel),
+        WaitUs(2000),
+        // FIFO_CONFIG_0 and 1: a stream of accelerometer frames; both registers have bits that must be one.
+        Write(0x48, 0x02),
+        Write(0x49, 0x50),
+        Write(0x7E, 0xB0),
+    ]
+}
+
+/// Data sheet BST-BMI270-DS000, register description.
+pub const BMI270: Die = Die {
+    name: "BMI270",
+    // CHIP_ID.
+    who: 0x00,
+    who_answers: &[0x24],
+    bank_select: None,
+    // "SPI interface": a dummy byte follows the address of a read.
+    spi_dummy: 1,
+    accel: Some(Sense {
+        // ACC_RANGE.
+        ranges: &[(2.0, 0, 2.0 / 32768.0), (4.0, 1, 4.0 / 32768.0), (8.0, 2, 8.0 / 32768.0), (16.0, 3, 16.0 / 32768.0)],
+        data: 0x0C,
+        big_endian: false,
+    }),
+    gyro: Some(Sense {
+        // GYR_RANGE.
+        ranges: &[
+            (125.0, 4, 125.0 / 32768.0),
+            (250.0, 3, 250.0 / 32768.0),
+            (500.0, 2, 500.0 / 32768.0),
+            (1000.0, 1, 1000.0 / 32768.0),
+            (2000.0, 0, 2000.0 / 32768.0),
+        ],
+        data: 0x12,
+        big_endian: false,
+    }),
+    // ACC_CONF and GYR_CONF, odr, of both.
+    rates: Rates::Listed(&[(25.0, 6), (50.0, 7), (100.0, 8), (200.0, 9), (400.0, 10), (800.0, 11), (1600.0, 12)]),
+    // TEMPERATURE_0 and 1: 1/512 K a step from 23 °C.
+    temperature: Temperature { from: TemperatureFrom::Word(0x22), c_per_lsb: 1.0 / 512.0, c_at_zero: 23.0 },
+    fifo: Fifo {
+        // FIFO_LENGTH_0 and 1; 2 KiB ("FIFO").
+        count: 0x24,
+        count_bytes: 2,
+        count_big_endian: false,
+        count_mask: 0x3FFF,
+        unit: 1,
+        data: 0x26,
+        capacity: 2048,
+        full: 2048 - 13 + 1,
+        layout: Layout::Bosch { config: 4 },
+        // CMD: fifo_flush.
+        reset: &[Write(0x7E, 0xB0)],
+    },
+    // CMD: soft reset; a read turns the interface to SPI; then "Device initialisation": the configuration
+    // file, without which it measures nothing.
+    reset: &[
+        Write(0x7E, 0xB6),
+        WaitUs(2000),
+        Touch(0x00),
+        WaitUs(500),
+        Write(0x7C, 0x00),
+        WaitUs(500),
+        Upload,
+        Expect(0x21, 0x0F, 0x01, 150),
+    ],
+    configure: configure_bmi270,
+    // GYR_CAS, factor_zx.
+    cross_axis: Some(0x3C),
+    self_test: SelfTest::Push(&[Push {
+        of: Which::Accel,
+        // "Accelerometer self-test": 16 g, 1600 Hz, high amplitude; positive less negative: 16, 15 and 10 g at least.
+        prepare: &[Write(0x7D, 0x04), Write(0x41, 0x03), Write(0x40, 0xAC), WaitUs(3000)],
+        on: &[Write(0x6D, 0x0D), WaitUs(55_000)],
+        off: &[Write(0x6D, 0x09), WaitUs(55_000)],
+        per_lsb: 16.0 / 32768.0,
+        within: [(16.0, f64::INFINITY), (15.0, f64::INFINITY), (10.0, f64::INFINITY)],
+    }]),
+};
+
+fn configure_bmi270(s: &Setting) -> Vec<Step> {
+    vec![
+        Write(0x6D, 0x00),
+        // ACC_CONF and GYR_CONF: normal filters, for performance rather than power.
+        Write(0x40, 0xA0 | s.rate),
+        Write(0x41, s.accel),
+        Write(0x42, 0xE0 | s.rate),
+        Write(0x43, s.gyro),
+        // PWR_CTRL: accelerometer, gyro and temperature on; the gyro's start-up time is 45 ms.
+        Write(0x7D, 0x0E),
+        WaitUs(60_000),
+        // INT1_IO_CTRL and INT_MAP_DATA: data ready on INT1, push-pull, active high.
+        Write(0x53, 0x0A),
+        Write(0x58, if s.data_ready { 0x04 } else { 0x00 }),
+        // FIFO_DOWNS, FIFO_CONFIG_0 and 1: filtered data; no time frames; headers, accelerometer and gyro.
+        Write(0x45, 0x88),
+        Write(0x48, 0x00),
+        Write(0x49, 0xD0),
+        Write(0x7E, 0xB0),
+    ]
+}

@@ -1,0 +1,99 @@
+//! ST: LSM6DSOX. Words are little-endian; the FIFO gives words of a tag and three values, one a sensor.
+
+use super::Step::{WaitUs, Write};
+use super::*;
+
+/// Data sheet DS12814 and application note AN5272.
+pub const LSM6DSOX: Die = Die {
+    name: "LSM6DSOX",
+    // WHO_AM_I.
+    who: 0x0F,
+    who_answers: &[0x6C],
+    bank_select: None,
+    spi_dummy: 0,
+    accel: Some(Sense {
+        // CTRL1_XL and "Mechanical characteristics": codes out of order.
+        ranges: &[(2.0, 0, 0.061e-3), (4.0, 2, 0.122e-3), (8.0, 3, 0.244e-3), (16.0, 1, 0.488e-3)],
+        data: 0x28,
+        big_endian: false,
+    }),
+    gyro: Some(Sense {
+        // CTRL2_G and "Mechanical characteristics": a step is 8.75 m°/s and its doubles, not a power of two of full scale.
+        ranges: &[(250.0, 0, 8.75e-3), (500.0, 1, 17.5e-3), (1000.0, 2, 35e-3), (2000.0, 3, 70e-3)],
+        data: 0x22,
+        big_endian: false,
+    }),
+    // CTRL1_XL and CTRL2_G, ODR, of both.
+    rates: Rates::Listed(&[
+        (12.5, 1),
+        (26.0, 2),
+        (52.0, 3),
+        (104.0, 4),
+        (208.0, 5),
+        (417.0, 6),
+        (833.0, 7),
+        (1667.0, 8),
+        (3333.0, 9),
+    ]),
+    // "Temperature sensor characteristics": 256 steps a degree from 25 °C.
+    temperature: Temperature { from: TemperatureFrom::Frames, c_per_lsb: 1.0 / 256.0, c_at_zero: 25.0 },
+    fifo: Fifo {
+        // FIFO_STATUS1 and 2: words in the low ten bits; 3 KiB of six bytes each ("FIFO").
+        count: 0x3A,
+        count_bytes: 2,
+        count_big_endian: false,
+        count_mask: 0x03FF,
+        unit: 7,
+        data: 0x78,
+        capacity: 512 * 7,
+        full: 510 * 7,
+        layout: Layout::Tagged,
+        // FIFO_CTRL4: bypass empties it; then a stream with temperature at 1.6 Hz.
+        reset: &[Write(0x0A, 0x00), Write(0x0A, 0x16)],
+    },
+    // CTRL3_C: SW_RESET.
+    reset: &[Write(0x12, 0x01), WaitUs(10_000)],
+    configure: configure_lsm6dsox,
+    cross_axis: None,
+    self_test: SelfTest::Push(&[
+        // AN5272, "Accelerometer self-test": ±4 g, 52 Hz, 50 to 1700 mg.
+        Push {
+            of: Which::Accel,
+            prepare: &[Write(0x12, 0x44), Write(0x10, 0x38), WaitUs(100_000)],
+            on: &[Write(0x14, 0x01), WaitUs(100_000)],
+            off: &[Write(0x14, 0x00), WaitUs(100_000)],
+            per_lsb: 0.122e-3,
+            within: [(0.05, 1.7); 3],
+        },
+        // AN5272, "Gyroscope self-test": ±2000 °/s, 208 Hz, 150 to 700 °/s.
+        Push {
+            of: Which::Gyro,
+            prepare: &[Write(0x11, 0x5C), WaitUs(100_000)],
+            on: &[Write(0x14, 0x04), WaitUs(100_000)],
+            off: &[Write(0x14, 0x00), WaitUs(100_000)],
+            per_lsb: 70e-3,
+            within: [(150.0, 700.0); 3],
+        },
+    ]),
+};
+
+fn configure_lsm6dsox(s: &Setting) -> Vec<Step> {
+    vec![
+        // CTRL3_C: block update, address increment. CTRL9_XL: no I3C. CTRL4_C: by SPI no I2C.
+        Write(0x12, 0x44),
+        Write(0x18, 0xE2),
+        Write(0x13, if s.spi { 0x04 } else { 0x00 }),
+        Write(0x10, s.rate << 4 | s.accel << 2),
+        Write(0x11, s.rate << 4 | s.gyro << 2),
+        // COUNTER_BDR_REG1: data ready as pulses of 75 µs, as nobody reads the data registers. INT1_CTRL:
+        // of the gyro, on INT1.
+        Write(0x0B, 0x80),
+        Write(0x0D, if s.data_ready { 0x02 } else { 0x00 }),
+        // The gyro's turn-on time is 35 ms.
+        WaitUs(80_000),
+        // FIFO_CTRL3: both into the FIFO at their rate.
+        Write(0x09, s.rate << 4 | s.rate),
+        Write(0x0A, 0x00),
+        Write(0x0A, 0x16),
+    ]
+}

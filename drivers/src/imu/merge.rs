@@ -1,0 +1,157 @@
+//! Gyro and accelerometer of two dies, or of two kernel devices, into one stream: each gyro sample with the
+//! accelerometer brought to its time on the line between its neighbours. It waits for the later neighbour, one
+//! sample, and does not bridge holes.
+
+use crate::source::{ImuBatch, ImuReading, IMU_BATCH};
+use crate::types::{ImuSample, Nanos, Span};
+use glam::DVec3;
+use std::collections::VecDeque;
+
+/// A sample of a unit, or of half of one; SI.
+#[derive(Clone, Copy, Debug, PartialEq, Default)]
+pub struct Reading {
+    pub t: Nanos,
+    pub gyro: Option<DVec3>,
+    pub accel: Option<DVec3>,
+    pub temperature_c: Option<f32>,
+    pub saturated: bool,
+}
+
+#[derive(Clone, Debug)]
+pub struct Merge {
+    gyro: VecDeque<Reading>,
+    accel: VecDeque<Reading>,
+    /// Longest distance between neighbours to interpolate across.
+    hole: Span,
+    temperature_c: Option<f32>,
+    /// Gyro samples that were dropped for having no accelerometer beside them.
+    pub unpaired: u64,
+}
+
+impl Merge {
+    pub fn new(accel_period: Span) -> Merge {
+        // Three periods: a sample lost here and there is no hole.
+        let hole = Span(accel_period.0.saturating_mul(3));
+        let queue = || VecDeque::with_capacity(IMU_BATCH);
+        Merge { gyro: queue(), accel: queue(), hole, temperature_c: None, unpaired: 0 }
+    }
+
+    pub fn clear(&mut self) {
+        self.unpaired += self.gyro.len() as u64;
+        self.gyro.clear();
+        self.accel.clear();
+    }
+
+    /// Takes what one of the two gave. Full queues drop their oldest: a gyro sample then was unpaired.
+    pub fn push(&mut self, reading: Reading) {
+        self.temperature_c = reading.temperature_c.or(self.temperature_c);
+        let queue = if reading.gyro.is_some() { &mut self.gyro } else { &mut self.accel };
+        if queue.len() == IMU_BATCH {
+            queue.pop_front();
+            self.unpaired += u64::from(reading.gyro.is_some());
+        }
+        queue.push_back(reading);
+    }
+
+    pub fn drain(&mut self, batch: &mut ImuBatch) {
+        while !batch.is_full() {
+            let Some(gyro) = self.gyro.front().copied() else { return };
+            // The older neighbour: the last accelerometer sample not after it.
+            while self.accel.get(1).is_some_and(|next| next.t <= gyro.t) {
+                self.accel.pop_front();
+            }
+            let older = self.accel.front().filter(|a| a.t <= gyro.t);
+            let paired = match (older, self.accel.get(1), self.accel.front()) {
+                (Some(a), _, _) if a.t == gyro.t => between(a, a, gyro),
+                (Some(a), Some(b), _) if b.t - a.t <= self.hole => between(a, b, gyro),
+                // The later neighbour may still come.
+                (Some(a), None, _) if gyro.t - a.t <= self.hole => return,
+                (None, _, None) => return,
+                // Before the first, in a hole, or after one that ended.
+                (Some(_), None, _) => return,
+                _ => None,
+            };
+            self.gyro.pop_front();
+            match paired {
+                Some(mut reading) => {
+                    reading.temperature_c = reading.temperature_c.or(self.temperature_c);
+                    let pushed = batch.push(reading);
+                    debug_assert!(pushed.is_ok(), "there was room");
+                }
+                None => self.unpaired += 1,
+            }
+        }
+    }
+}
+
+fn between(a: &Reading, b: &Reading, gyro: Reading) -> Option<ImuReading> {
+    let length = (b.t - a.t).secs();
+    let s = if length > 0.0 { (gyro.t - a.t).secs() / length } else { 0.0 };
+    let sample = ImuSample { t: gyro.t, gyro_body: gyro.gyro?, accel_body: a.accel?.lerp(b.accel?, s) };
+    let saturated = gyro.saturated || a.saturated || b.saturated;
+    Some(ImuReading { sample, temperature_c: gyro.temperature_c, saturated })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    const PERIOD: Span = Span(10);
+
+    fn gyro(t: i64) -> Reading {
+        Reading { t: Nanos(t), gyro: Some(DVec3::splat(t as f64)), ..Reading::default() }
+    }
+
+    fn accel(t: i64) -> Reading {
+        Reading { t: Nanos(t), accel: Some(DVec3::splat(2.0 * t as f64)), ..Reading::default() }
+    }
+
+    fn drained(merge: &mut Merge) -> Vec<(i64, f64)> {
+        let mut batch = ImuBatch::new();
+        merge.drain(&mut batch);
+        batch.iter().map(|r| (r.sample.t.0, r.sample.accel_body.x.round())).collect()
+    }
+
+    #[test]
+    fn the_accelerometer_is_brought_to_the_gyros_time() {
+        let mut merge = Merge::new(PERIOD);
+        [accel(0), gyro(3), gyro(10), accel(10), gyro(14)].into_iter().for_each(|r| merge.push(r));
+        assert_eq!(drained(&mut merge), [(3, 6.0), (10, 20.0)]);
+        assert_eq!(drained(&mut merge), [], "the later neighbour of 14 has not come");
+        merge.push(Reading { saturated: true, temperature_c: Some(30.0), ..accel(20) });
+        let mut batch = ImuBatch::new();
+        merge.drain(&mut batch);
+        assert!(batch.len() == 1 && batch[0].saturated && batch[0].temperature_c == Some(30.0));
+        assert!((batch[0].sample.accel_body.x - 28.0).abs() < 1e-12);
+    }
+
+    #[test]
+    fn holes_are_not_bridged() {
+        let mut merge = Merge::new(PERIOD);
+        [gyro(-5), accel(0), gyro(3), gyro(50), accel(100), accel(110), gyro(105)]
+            .into_iter()
+            .for_each(|r| merge.push(r));
+        assert_eq!(drained(&mut merge), [(105, 210.0)]);
+        assert_eq!(merge.unpaired, 3);
+    }
+
+    proptest! {
+        #[test]
+        fn nothing_is_given_twice_or_out_of_order(steps in proptest::collection::vec((any::<bool>(), 1i64..40), 0..900)) {
+            let mut merge = Merge::new(PERIOD);
+            let (mut t, mut seen, mut gyros) = ([0, 0], vec![], 0);
+            for (of_gyro, dt) in steps {
+                t[usize::from(of_gyro)] += dt;
+                merge.push(if of_gyro { gyro(t[1]) } else { accel(t[0]) });
+                gyros += u64::from(of_gyro);
+                seen.extend(drained(&mut merge));
+            }
+            for (t, a) in &seen {
+                prop_assert!((a - 2.0 * *t as f64).abs() < 0.5, "a line is interpolated exactly");
+            }
+            prop_assert!(seen.windows(2).all(|w| w[0].0 < w[1].0));
+            prop_assert_eq!(seen.len() as u64 + merge.unpaired + merge.gyro.len() as u64, gyros);
+        }
+    }
+}
