@@ -1,4 +1,4 @@
-//! Inertial units, driven by their registers over I2C or SPI.
+//! Inertial units: by their registers over I2C or SPI (`register`), or through the kernel's driver (`iio`).
 //!
 //! ```text
 //! bus -> die: FIFO burst -> frames -> unit: stamp, scale, flags -> [merge of two dies] -> register: ImuSource
@@ -16,6 +16,10 @@ pub mod counters;
 mod die;
 pub mod edges;
 mod frames;
+pub mod iio;
+mod iio_scan;
+#[cfg(test)]
+mod iio_tests;
 mod merge;
 mod register;
 mod self_test;
@@ -27,10 +31,12 @@ pub mod timeline;
 mod unit;
 
 pub use counters::ImuCounters;
+pub use iio::{IioImu, IioOptions};
 pub use register::{Limits, RegisterImu};
 pub use timeline::ClockReport;
 
 use crate::gpio::DataReady;
+use crate::source::{ImuBatch, ImuSource, SourceFault, Wait};
 use crate::types::{Nanos, Span};
 use crate::{Exit, Fault};
 use bus::{Bus, BusFault, I2c, Spi};
@@ -38,6 +44,55 @@ use chips::Chip;
 use die::Die;
 use std::path::PathBuf;
 use unit::Unit;
+
+/// A unit and how it is read.
+#[derive(Clone, Debug, PartialEq)]
+pub enum ImuOptions {
+    Register(RegisterOptions),
+    Iio(IioOptions),
+}
+
+/// The inertial unit of a live run.
+pub enum HardwareImu {
+    Register(Box<RegisterImu<Box<dyn Bus>, DataReady>>),
+    Iio(Box<IioImu>),
+}
+
+impl ImuOptions {
+    /// With the line on which a unit that we drive says that a sample is ready, where that is wired.
+    pub fn open(&self, data_ready: Option<DataReady>) -> Result<HardwareImu, Fault> {
+        Ok(match self {
+            ImuOptions::Register(options) => HardwareImu::Register(Box::new(options.open(data_ready)?)),
+            ImuOptions::Iio(options) => HardwareImu::Iio(Box::new(IioImu::open(options)?)),
+        })
+    }
+}
+
+impl HardwareImu {
+    /// The sensor's clock against the host's.
+    pub fn clock(&self) -> ClockReport {
+        match self {
+            HardwareImu::Register(imu) => imu.clock(),
+            HardwareImu::Iio(imu) => imu.clock(),
+        }
+    }
+}
+
+impl ImuSource for HardwareImu {
+    fn next(&mut self, timeout: Span, batch: &mut ImuBatch) -> Result<Wait, SourceFault> {
+        match self {
+            HardwareImu::Register(imu) => imu.next(timeout, batch),
+            HardwareImu::Iio(imu) => imu.next(timeout, batch),
+        }
+    }
+
+    fn counters(&self) -> Vec<(&'static str, u64)> {
+        match self {
+            HardwareImu::Register(imu) => imu.counters(),
+            HardwareImu::Iio(imu) => imu.counters(),
+        }
+    }
+}
 
 /// Where a die is wired.
 #[derive(Clone, Debug, PartialEq)]

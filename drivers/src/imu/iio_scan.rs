@@ -1,0 +1,232 @@
+//! A scan of a kernel IIO buffer: which channels stand where in it, and what they are in SI.
+//!
+//! The kernel packs the enabled channels in the order of their index, each aligned to its own storage. A channel's
+//! type reads `be:s16/16>>0`: byte order, sign, bits that count, bits that are stored, repeats, and shift.
+
+use super::merge::Reading;
+use crate::types::Nanos;
+use glam::DVec3;
+
+/// What a channel's `_type` says.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Kind {
+    pub big_endian: bool,
+    pub signed: bool,
+    pub bits: u32,
+    /// Bytes of one value.
+    pub storage: usize,
+    pub repeat: usize,
+    pub shift: u32,
+}
+
+impl Kind {
+    pub fn parse(text: &str) -> Option<Kind> {
+        let (order, rest) = text.trim().split_once(':')?;
+        let big_endian = match order {
+            "be" => true,
+            "le" => false,
+            _ => return None,
+        };
+        let signed = match rest.get(..1)? {
+            "s" => true,
+            "u" => false,
+            _ => return None,
+        };
+        let (bits, rest) = rest[1..].split_once('/')?;
+        let (stored, shift) = rest.split_once(">>")?;
+        let (stored, repeat) = match stored.split_once('X') {
+            Some((stored, repeat)) => (stored, repeat.parse().ok()?),
+            None => (stored, 1),
+        };
+        let (bits, stored, shift): (u32, u32, u32) = (bits.parse().ok()?, stored.parse().ok()?, shift.parse().ok()?);
+        let fits = (1..=64).contains(&bits) && [8, 16, 32, 64].contains(&stored) && bits.checked_add(shift)? <= stored;
+        let storage = stored as usize / 8;
+        (fits && (1..=4).contains(&repeat)).then_some(Kind { big_endian, signed, bits, storage, repeat, shift })
+    }
+
+    /// The value in the first `storage` bytes.
+    pub fn value(self, bytes: &[u8]) -> i64 {
+        let mut word = [0u8; 8];
+        for (i, byte) in bytes[..self.storage].iter().enumerate() {
+            word[if self.big_endian { self.storage - 1 - i } else { i }] = *byte;
+        }
+        let unused = 64 - self.bits;
+        let value = u64::from_le_bytes(word) >> self.shift << unused;
+        if self.signed {
+            value as i64 >> unused
+        } else {
+            (value >> unused) as i64
+        }
+    }
+
+    /// Whether a value stands at an end of what its bits can say.
+    fn saturated(self, value: i64) -> bool {
+        let full = 1i64.checked_shl(self.bits - u32::from(self.signed)).unwrap_or(i64::MAX);
+        let least = if self.signed { -full } else { 0 };
+        self.bits < 63 && (value >= full - 1 || value <= least)
+    }
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Channel {
+    Accel(usize),
+    Gyro(usize),
+    Temperature,
+    Stamp,
+    /// Enabled, but of no use to us.
+    Other,
+}
+
+/// Names of `scan_elements`, without `in_` and `_en`.
+pub fn channel(name: &str) -> Channel {
+    const KNOWN: [(&str, Channel); 8] = [
+        ("accel_x", Channel::Accel(0)),
+        ("accel_y", Channel::Accel(1)),
+        ("accel_z", Channel::Accel(2)),
+        ("anglvel_x", Channel::Gyro(0)),
+        ("anglvel_y", Channel::Gyro(1)),
+        ("anglvel_z", Channel::Gyro(2)),
+        ("temp", Channel::Temperature),
+        ("timestamp", Channel::Stamp),
+    ];
+    KNOWN.iter().find(|(known, _)| *known == name).map_or(Channel::Other, |(_, channel)| *channel)
+}
+
+/// A channel as its files describe it; the value is (raw + offset) * scale in the kernel's units.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Element {
+    pub channel: Channel,
+    pub index: u32,
+    pub kind: Kind,
+    pub offset: f64,
+    pub scale: f64,
+}
+
+/// The elements of a scan with the byte at which each stands.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Scan {
+    elements: Vec<(usize, Element)>,
+    pub bytes: usize,
+}
+
+impl Scan {
+    pub fn new(mut elements: Vec<Element>) -> Scan {
+        elements.sort_by_key(|e| e.index);
+        let mut at = 0usize;
+        let mut largest = 1;
+        let mut placed = Vec::new();
+        for element in elements {
+            let size = element.kind.storage * element.kind.repeat;
+            at = at.next_multiple_of(size);
+            placed.push((at, element));
+            at += size;
+            largest = largest.max(size);
+        }
+        Scan { elements: placed, bytes: at.next_multiple_of(largest) }
+    }
+
+    pub fn has(&self, channel: Channel) -> bool {
+        self.elements.iter().any(|(_, e)| e.channel == channel)
+    }
+
+    pub fn has_all(&self, axis: fn(usize) -> Channel) -> bool {
+        (0..3).all(|i| self.has(axis(i)))
+    }
+
+    /// One scan, its stamp where it has one, and its axes' raw values for those who look whether they move.
+    pub fn reading(&self, bytes: &[u8], raw: &mut [i64; 6]) -> (Reading, Option<Nanos>) {
+        let (mut accel, mut gyro) = ([0.0; 3], [0.0; 3]);
+        let mut reading = Reading::default();
+        let mut stamp = None;
+        for (at, element) in &self.elements {
+            let value = element.kind.value(&bytes[*at..]);
+            let si = (value as f64 + element.offset) * element.scale;
+            match element.channel {
+                Channel::Accel(i) => (accel[i], raw[i]) = (si, value),
+                Channel::Gyro(i) => (gyro[i], raw[3 + i]) = (si, value),
+                // The kernel's unit is 1/1000 °C.
+                Channel::Temperature => reading.temperature_c = Some((si * 1e-3) as f32),
+                Channel::Stamp => stamp = Some(Nanos(value)),
+                Channel::Other => {}
+            }
+            let axis = matches!(element.channel, Channel::Accel(_) | Channel::Gyro(_));
+            reading.saturated |= axis && element.kind.saturated(value);
+        }
+        reading.accel = self.has_all(Channel::Accel).then_some(DVec3::from(accel));
+        reading.gyro = self.has_all(Channel::Gyro).then_some(DVec3::from(gyro));
+        (reading, stamp)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+    use proptest::prelude::*;
+
+    #[test]
+    fn types_are_read_as_the_kernel_writes_them() {
+        let kind = Kind::parse("be:s16/16>>0\n").unwrap();
+        assert_eq!(kind, Kind { big_endian: true, signed: true, bits: 16, storage: 2, repeat: 1, shift: 0 });
+        assert_eq!(kind.value(&[0xFF, 0xFE, 9]), -2);
+        let kind = Kind::parse("le:s12/16>>4").unwrap();
+        assert_eq!((kind.value(&[0x0F, 0x80]), kind.value(&[0xF0, 0x7F])), (-2048, 2047));
+        assert!(kind.saturated(2047) && kind.saturated(-2048) && !kind.saturated(-2047));
+        let kind = Kind::parse("le:u24/32>>8").unwrap();
+        assert_eq!(kind.value(&[9, 1, 0, 0x80]), 0x80_0001);
+        let kind = Kind::parse("le:s64/64>>0").unwrap();
+        assert_eq!(kind.value(&i64::MIN.to_le_bytes()), i64::MIN);
+        assert_eq!(Kind::parse("be:s16/16X2>>0").unwrap().repeat, 2);
+    }
+
+    #[test]
+    fn types_that_cannot_be_are_none() {
+        for text in [
+            "",
+            "be",
+            "xe:s16/16>>0",
+            "be:f16/16>>0",
+            "be:s17/16>>0",
+            "be:s16/24>>0",
+            "be:s16/16>>1",
+            "le:s0/8>>0",
+            "le:s16/16X9>>0",
+            "le:s16/16>>-1",
+            "le:s4294967295/64>>4294967295",
+        ] {
+            assert_eq!(Kind::parse(text), None, "{text}");
+        }
+    }
+
+    fn element(channel: Channel, index: u32, kind: &str, offset: f64, scale: f64) -> Element {
+        Element { channel, index, kind: Kind::parse(kind).unwrap(), offset, scale }
+    }
+
+    #[test]
+    fn channels_are_aligned_to_their_storage_in_the_order_of_their_index() {
+        let axes = (0..3).map(|i| element(Channel::Accel(i), i as u32, "be:s16/16>>0", 0.0, 0.5));
+        let stamp = element(Channel::Stamp, 9, "le:s64/64>>0", 0.0, 1.0);
+        let temperature = element(Channel::Temperature, 3, "be:s16/16>>0", 7011.0, 2.995);
+        let scan = Scan::new(std::iter::once(stamp).chain(axes).chain([temperature]).collect());
+        assert_eq!(scan.bytes, 16);
+        let mut bytes = [0, 1, 0xFF, 0xFE, 0x7F, 0xFF, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0];
+        bytes[8..].copy_from_slice(&123_456_789i64.to_le_bytes());
+        let mut raw = [0; 6];
+        let (reading, t) = scan.reading(&bytes, &mut raw);
+        assert_eq!((reading.accel, reading.gyro), (Some(DVec3::new(0.5, -1.0, 16383.5)), None));
+        assert_eq!((t, reading.saturated, raw), (Some(Nanos(123_456_789)), true, [1, -2, 32767, 0, 0, 0]));
+        assert!((reading.temperature_c.unwrap() - 20.998).abs() < 1e-3);
+        let odd = Scan::new(vec![element(Channel::Other, 0, "le:u8/8>>0", 0.0, 1.0), stamp]);
+        assert_eq!((odd.bytes, odd.elements[1].0), (16, 8));
+    }
+
+    proptest! {
+        #[test]
+        fn any_type_and_bytes_are_read_or_refused(text in "[bl]e:[su][0-9]{1,3}/[0-9]{1,3}(X[0-9])?>>[0-9]{1,2}", bytes: [u8; 8]) {
+            if let Some(kind) = Kind::parse(&text) {
+                let value = kind.value(&bytes);
+                prop_assert!(kind.bits == 64 || value.unsigned_abs() < 1 << kind.bits);
+            }
+        }
+    }
+}
