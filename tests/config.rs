@@ -4,6 +4,8 @@
 
 use std::path::Path;
 use stipple::config::{Board, StereoMethod};
+use stipple_drivers::gpio::Edge;
+use stipple_drivers::imu::ImuOptions;
 use stipple_drivers::{Exit, Fault};
 
 const BOARD: &str = r#"name = "test"
@@ -138,6 +140,34 @@ fn overrides_obey_the_rules_of_the_file() {
 #[test]
 fn an_override_cannot_hide_an_error_of_the_file() {
     refused(parse(&format!("{BOARD}scales = 3\n"), &["map.scale=1"]), Exit::Config, &["test.toml:13", "scales"]);
+}
+
+#[test]
+fn an_inertial_unit_is_described_whole_or_refused() {
+    let with = |lines: &str| parse(&format!("{BOARD}[imu]\n{lines}"), &[]);
+    assert!(parse(BOARD, &[]).unwrap().imu.options().is_none());
+    let board = with("chip = \"icm-42688-p\"\nspi = \"/dev/spidev0.0\"\nrate_hz = 500\n").unwrap();
+    let Some(ImuOptions::Register(options)) = board.imu.options() else { panic!("it is driven by its registers") };
+    assert_eq!((options.rate_hz, options.wiring.len()), (500.0, 1));
+    let board = with("chip = \"bmi088\"\ni2c = \"/dev/i2c-1\"\n").unwrap();
+    let Some(ImuOptions::Register(options)) = board.imu.options() else { panic!("it is driven by its registers") };
+    let wired: Vec<String> = options.wiring.iter().map(|w| w.to_string()).collect();
+    assert_eq!(wired, ["/dev/i2c-1 0x68", "/dev/i2c-1 0x18"]);
+    refused(with("chip = \"bno055\"\n"), Exit::Config, &["test.toml:14", "bno055", "lsm6dsox"]);
+    refused(with("chip = \"mpu-6500\"\n"), Exit::Config, &["imu.i2c", "imu.spi"]);
+    refused(with("chip = \"bmi270\"\ni2c = \"a\"\n"), Exit::Config, &["imu.configuration", "bmi270_config_file"]);
+    refused(with("chip = \"bmi088\"\nspi = \"a\"\n"), Exit::Config, &["imu.accel_spi"]);
+    refused(with("chip = \"iio\"\n"), Exit::Config, &["imu.device"]);
+    let line = "[gpio.data_ready]\nchip = \"tegra-gpio\"\nline = \"PQ.05\"\n";
+    refused(with(&format!("chip = \"iio\"\ndevice = \"d\"\n{line}")), Exit::Config, &["test.toml:17", "kernel"]);
+    refused(
+        parse(&format!("{BOARD}[gpio.led]\nline = \"3\"\n"), &[]),
+        Exit::Config,
+        &["test.toml:14", "gpio.led.line", "chip"],
+    );
+    refused(with("chip = \"iio\"\nwatermark = 17\n"), Exit::Config, &["test.toml:15", "1 to 16"]);
+    let (name, edge) = parse(&format!("{BOARD}{line}"), &[]).unwrap().gpio.data_ready().unwrap();
+    assert_eq!((name.to_string().as_str(), edge), ("tegra-gpio line PQ.05", Edge::Rising));
 }
 
 #[test]

@@ -7,6 +7,7 @@
 
 mod bounds;
 mod camera;
+mod imu;
 mod inject;
 mod map;
 mod network;
@@ -14,6 +15,7 @@ mod record;
 
 use bounds::BOUNDS;
 pub use camera::CameraConfig;
+pub use imu::{GpioConfig, ImuConfig};
 pub use inject::InjectConfig;
 pub use map::{MapConfig, Projection};
 pub use network::{Fit, NetworkConfig};
@@ -49,6 +51,10 @@ pub struct Board {
     pub camera: CameraConfig,
     #[serde(default)]
     pub record: RecordConfig,
+    #[serde(default)]
+    pub imu: ImuConfig,
+    #[serde(default)]
+    pub gpio: GpioConfig,
 }
 
 /// Capacities bought at boot. Every one is a hard limit; full is counted, never grown.
@@ -368,10 +374,10 @@ impl Board {
             ),
         ];
         self.inject.check()?;
-        match among.iter().find(|(holds, _, _)| !holds) {
-            Some((_, key, rule)) => Err((key, format!("{key} {rule}"))),
-            None => Ok(()),
+        if let Some((_, key, rule)) = among.iter().find(|(holds, _, _)| !holds) {
+            return Err((key, format!("{key} {rule}")));
         }
+        self.gpio.wrong().or_else(|| self.imu.wrong(&self.gpio)).map_or(Ok(()), Err)
     }
 }
 
