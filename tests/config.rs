@@ -102,7 +102,8 @@ fn cameras_are_named_by_what_does_not_change() {
     refused(wrong, Exit::Config, &["test.toml:15", "camera.devices", "/dev/video0", "by-path"]);
     refused(camera("devices = [\"0001\"]"), Exit::Config, &["test.toml:14", "names no camera"]);
     refused(camera("format = \"rgb\""), Exit::Config, &["test.toml:14", "rgb", "yuyv"]);
-    refused(camera("pair_tolerance_s = 0.03"), Exit::Config, &["test.toml:14", "half a period"]);
+    let loose = camera("devices = [\"serial:1\", \"serial:2\"]\npair_tolerance_s = 0.03");
+    refused(loose, Exit::Config, &["test.toml:15", "half a period"]);
     refused(camera("buffers = 2"), Exit::Config, &["test.toml:14", "3 to 32"]);
     refused(camera("gain = 2"), Exit::Config, &["test.toml:14", "gain"]);
 }

@@ -478,7 +478,7 @@ fn check(settings: &Settings, cameras: &[RigCamera]) -> Result<(), Fault> {
     if !(rate > 0.0 && rate.is_finite()) {
         return wrong(format!("camera.rate_hz = {rate} is no rate"), "state the cameras' rate");
     }
-    if settings.pair_tolerance.secs() * rate >= 0.5 {
+    if devices > 1 && settings.pair_tolerance.secs() * rate >= 0.5 {
         let what = format!("camera.pair_tolerance_s is half a period at {rate} Hz or more: any two frames would pair");
         return wrong(what, "lower it");
     }

@@ -1,11 +1,12 @@
 //! What a camera offers: formats, sizes, rates, as a list to choose from and as a line to read.
 
 use super::kernel::{Kernel, Request};
+use super::pixels::Format;
 use super::uapi::*;
 use std::io;
 
-/// Entries of one list; a driver whose list never ends is left.
-const ENTRIES_MAX: u32 = 64;
+/// Entries of one list; a driver whose list never ends is left. The kernel's own virtual camera has 93 formats.
+const ENTRIES_MAX: u32 = 256;
 
 pub(super) struct Offer {
     pub fourcc: u32,
@@ -63,16 +64,17 @@ fn ended(call: &'static str, answer: io::Result<()>) -> Result<bool, Refusal> {
     }
 }
 
-/// "GREY 752x480 at 20, 10 Hz; YUYV 640x480 at 30 Hz". It is read after something else was refused, so what cannot be
+/// "GREY 752x480 at 20, 10 Hz; YUYV 640x480 at 30 Hz; H264": sizes of what we can read. It is written after something else was refused, so what cannot be
 /// asked is left out.
 pub(super) fn text(kernel: &dyn Kernel, fd: i32, offers: &[Offer]) -> String {
     let mut entries = Vec::new();
     for offer in offers {
         let name = code_text(offer.fourcc);
-        if offer.sizes.is_empty() {
+        let readable = Format::ALL.iter().any(|f| f.is(offer.fourcc));
+        if offer.sizes.is_empty() || !readable {
             entries.push(name.clone());
         }
-        for s in &offer.sizes {
+        for s in offer.sizes.iter().filter(|_| readable) {
             let e = s.extent;
             if s.kind == SIZE_DISCRETE {
                 let rates = rates(kernel, fd, offer.fourcc, e[0], e[1]);

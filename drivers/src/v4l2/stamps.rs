@@ -58,8 +58,9 @@ pub(super) enum Stamp {
 
 /// Longest a frame lies in the driver's queue before it is taken: whoever stops reading for longer gets them dropped.
 const WAITED_MAX: Span = Span(10_000_000_000);
-/// A stamp may be ahead of our clock by this: microseconds are rounded, and some drivers' clocks are estimates.
-const AHEAD_MAX: Span = Span(2_000_000);
+/// A stamp may be ahead of our clock by this: some drivers estimate it, and vivid stamps a frame's end when it starts it.
+/// Stamps of another clock are off by more.
+const AHEAD_MAX: Span = Span(100_000_000);
 
 pub(super) fn stamp_of(flags: u32, seconds: i64, microseconds: i64, now: Nanos) -> Stamp {
     match flags & uapi::STAMP_MASK {

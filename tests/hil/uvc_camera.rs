@@ -1,0 +1,326 @@
+//! A USB camera that is a program: UVC 1.0 over a bulk endpoint, plugged through USB/IP into the `vhci_hcd` of the machine
+//! it runs on, so that the kernel's own uvcvideo driver makes a video node of it. For the virtual machine of `run-vm.sh`.
+//!
+//! hil-uvc-camera PORT SERIAL FORMAT WIDTH HEIGHT FPS [FRAMES [START_NS]]
+//!
+//! PORT is one of the hub's eight. Pictures are `pattern::packed`; or of FRAMES, a file of raw ones in FORMAT, once, the
+//! first at START_NS of CLOCK_MONOTONIC. Picture `k` is exposed at `k` periods of that clock, hence cameras started
+//! apart see together. What the machine is too slow to send in a quarter of its period is not sent, as a camera does.
+//!
+//! Lines on the standard input: `skip N` (send nothing for N pictures), `corrupt N` (with the error bit), `short N` (end
+//! after half), `silent N` (as skip, and said so), `unplug`. Lines on the standard output: `sent K`, `not sent K`.
+
+#[path = "jpeg.rs"]
+mod jpeg;
+#[allow(dead_code)] // the tests ask for the pictures back
+#[path = "pattern.rs"]
+mod pattern;
+
+use std::collections::VecDeque;
+use std::io::{BufRead, Read, Write};
+use std::os::fd::AsRawFd;
+use std::os::unix::net::UnixStream;
+use std::sync::{Arc, Condvar, Mutex};
+use std::time::Duration;
+
+/// Bytes of a bulk transfer: header of 2, then the picture's.
+const PAYLOAD: usize = 16384;
+const HIGH_SPEED: u32 = 3;
+
+struct Camera {
+    serial: String,
+    format: String,
+    width: usize,
+    height: usize,
+    period: i64,
+}
+
+/// What the host asked for and has not been answered.
+#[derive(Default)]
+struct Bus {
+    /// Sequence number and length of each transfer that waits for a payload.
+    waiting: VecDeque<(u32, usize)>,
+    streaming: bool,
+}
+
+#[derive(Default)]
+struct Orders {
+    skip: u32,
+    corrupt: u32,
+    short: u32,
+}
+
+type Shared<T> = Arc<(Mutex<T>, Condvar)>;
+
+fn main() {
+    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    let usage = "hil-uvc-camera PORT SERIAL FORMAT WIDTH HEIGHT FPS [FRAMES [START_NS]]";
+    let number = |i: usize| arguments.get(i).and_then(|a| a.parse::<f64>().ok()).expect(usage);
+    let (width, height) = (number(3) as usize, number(4) as usize);
+    let (serial, format) = (arguments[1].clone(), arguments[2].clone());
+    let camera = Camera { serial, format, width, height, period: (1e9 / number(5)) as i64 };
+    let frames = arguments.get(6).map(|path| std::fs::read(path).expect("the file of frames"));
+    let start = arguments.get(7).map_or(0, |ns| ns.parse().expect("START_NS"));
+    let socket = plug(number(0) as u32);
+    let bus: Shared<Bus> = Arc::default();
+    let orders: Arc<Mutex<Orders>> = Arc::default();
+    let answers = Arc::new(Mutex::new(socket.try_clone().expect("a second descriptor")));
+    {
+        let (bus, answers, descriptors) = (bus.clone(), answers.clone(), Descriptors::of(&camera));
+        std::thread::spawn(move || serve(socket, &bus, &answers, &descriptors));
+    }
+    {
+        let orders = orders.clone();
+        std::thread::spawn(move || {
+            std::io::stdin().lock().lines().map_while(Result::ok).for_each(|l| obey(&l, &orders))
+        });
+    }
+    expose(&camera, frames.as_deref(), start, &bus, &orders, &answers);
+}
+
+/// The other end of the pair is the host controller's.
+fn plug(port: u32) -> UnixStream {
+    let (ours, theirs) = UnixStream::pair().expect("a pair of sockets");
+    let attach = "/sys/devices/platform/vhci_hcd.0/attach";
+    let line = format!("{port} {} {} {HIGH_SPEED}", theirs.as_raw_fd(), 1 << 16 | (port + 2));
+    std::fs::write(attach, line).expect("modprobe vhci-hcd first; PORT is free");
+    ours
+}
+
+fn obey(line: &str, orders: &Mutex<Orders>) {
+    let (order, count) = line.split_once(' ').unwrap_or((line, "1"));
+    let count: u32 = count.parse().expect("a count");
+    let mut orders = orders.lock().expect("no thread panics with it");
+    match order {
+        "skip" | "silent" => orders.skip += count,
+        "corrupt" => orders.corrupt += count,
+        "short" => orders.short += count,
+        "unplug" => std::process::exit(0),
+        _ => panic!("unknown order {line}"),
+    }
+}
+
+/// Sends pictures as they are due, while the host streams.
+fn expose(
+    camera: &Camera,
+    frames: Option<&[u8]>,
+    start: i64,
+    bus: &Shared<Bus>,
+    orders: &Mutex<Orders>,
+    answers: &Mutex<UnixStream>,
+) {
+    let now = || stipple_drivers::host::monotonic().0 - start;
+    let (mut last, mut fid) = (-1, 0u8);
+    loop {
+        drop(bus.1.wait_while(bus.0.lock().expect("whole"), |b| !b.streaming).expect("whole"));
+        let k = (now() / camera.period).max(last + 1);
+        std::thread::sleep(Duration::from_nanos((k * camera.period - now()).max(0) as u64));
+        let picture = match frames {
+            None => pattern::packed(&camera.format, k as u32, camera.width, camera.height),
+            Some(frames) => {
+                let size = Descriptors::picture_bytes(camera);
+                let Some(picture) = frames.get(k as usize * size..(k as usize + 1) * size) else { return park() };
+                picture.to_vec()
+            }
+        };
+        last = k;
+        let (skip, corrupt, short) = {
+            let mut o = orders.lock().expect("whole");
+            let now = (o.skip > 0, o.corrupt > 0, o.short > 0);
+            *o = Orders {
+                skip: o.skip.saturating_sub(1),
+                corrupt: o.corrupt.saturating_sub(1),
+                short: o.short.saturating_sub(1),
+            };
+            now
+        };
+        let late = now() - k * camera.period > camera.period / 4;
+        if skip || late {
+            println!("not sent {k}");
+            continue;
+        }
+        fid ^= 1;
+        let end = if short { picture.len() / 2 } else { picture.len() };
+        if send(&picture[..end], fid | if corrupt { 0x40 } else { 0 }, bus, answers) {
+            println!("sent {k}");
+        }
+    }
+}
+
+/// A camera whose recording is over stays plugged.
+fn park() {
+    loop {
+        std::thread::park();
+    }
+}
+
+/// A picture, payload by payload as the host has room; false where it stopped to stream.
+fn send(picture: &[u8], flags: u8, bus: &Shared<Bus>, answers: &Mutex<UnixStream>) -> bool {
+    const END_OF_HEADER: u8 = 0x80;
+    const END_OF_FRAME: u8 = 0x02;
+    let mut at = 0;
+    while at < picture.len() {
+        let mut b =
+            bus.1.wait_while(bus.0.lock().expect("whole"), |b| b.streaming && b.waiting.is_empty()).expect("whole");
+        if !b.streaming {
+            return false;
+        }
+        let (sequence, room) = b.waiting.pop_front().expect("waited for");
+        let size = (picture.len() - at).min(room.min(PAYLOAD) - 2);
+        let last = if at + size == picture.len() { END_OF_FRAME } else { 0 };
+        let payload = [&[2, END_OF_HEADER | flags | last], &picture[at..at + size]].concat();
+        at += size;
+        // Under the lock, so that a transfer that the host takes back is not answered after that.
+        answer(answers, RET_SUBMIT, sequence, 0, payload.len(), &payload);
+        drop(b);
+    }
+    true
+}
+
+const CMD_UNLINK: u32 = 2;
+const RET_SUBMIT: u32 = 3;
+const RET_UNLINK: u32 = 4;
+const BULK_ENDPOINT: u32 = 1;
+const ECONNRESET: i32 = 104;
+const EPIPE: i32 = 32;
+
+/// USB/IP: 48 bytes of head in network order, then what was read. `moved` bytes went either way.
+fn answer(to: &Mutex<UnixStream>, command: u32, sequence: u32, status: i32, moved: usize, data: &[u8]) {
+    let mut head = [0u8; 48];
+    let words = [(0, command), (1, sequence), (5, status as u32), (6, moved as u32)];
+    words.iter().for_each(|(i, w)| head[4 * i..4 * i + 4].copy_from_slice(&w.to_be_bytes()));
+    let sent = to.lock().expect("whole").write_all(&[&head, data].concat());
+    sent.unwrap_or_else(|_| std::process::exit(0));
+}
+
+/// Reads what the host asks until it lets go.
+fn serve(mut socket: UnixStream, bus: &Shared<Bus>, answers: &Mutex<UnixStream>, descriptors: &Descriptors) {
+    let mut head = [0u8; 48];
+    while socket.read_exact(&mut head).is_ok() {
+        let word = |i: usize| u32::from_be_bytes(head[4 * i..4 * i + 4].try_into().expect("four bytes"));
+        let (command, sequence, to_host, endpoint) = (word(0), word(1), word(3) == 1, word(4));
+        if command == CMD_UNLINK {
+            let mut b = bus.0.lock().expect("whole");
+            let before = b.waiting.len();
+            b.waiting.retain(|w| w.0 != word(5));
+            let status = if b.waiting.len() < before { -ECONNRESET } else { 0 };
+            answer(answers, RET_UNLINK, sequence, status, 0, &[]);
+            continue;
+        }
+        let length = word(6) as usize;
+        if !to_host {
+            let mut written = vec![0; length];
+            socket.read_exact(&mut written).expect("what it says it sends");
+        }
+        if endpoint == BULK_ENDPOINT {
+            bus.0.lock().expect("whole").waiting.push_back((sequence, length));
+            bus.1.notify_all();
+            continue;
+        }
+        let setup: [u8; 8] = head[40..48].try_into().expect("eight bytes");
+        match descriptors.control(setup, bus) {
+            None => answer(answers, RET_SUBMIT, sequence, -EPIPE, 0, &[]),
+            Some(_) if !to_host => answer(answers, RET_SUBMIT, sequence, 0, length, &[]),
+            Some(data) => {
+                let data = &data[..data.len().min(length)];
+                answer(answers, RET_SUBMIT, sequence, 0, data.len(), data);
+            }
+        }
+    }
+    std::process::exit(0);
+}
+
+/// What the camera says of itself (USB Video Class 1.0, and USB 2.0 chapter 9).
+struct Descriptors {
+    device: Vec<u8>,
+    configuration: Vec<u8>,
+    probe: Vec<u8>,
+    strings: [String; 3],
+}
+
+impl Descriptors {
+    fn picture_bytes(camera: &Camera) -> usize {
+        let bits = pattern::FORMATS.iter().find(|f| f.0 == camera.format).map_or(8, |f| usize::from(f.2));
+        // Compressed ones never reach this.
+        camera.width * camera.height * if bits == 0 { 16 } else { bits } / 8
+    }
+
+    fn of(camera: &Camera) -> Descriptors {
+        let (_, code, bits) = pattern::FORMATS.iter().find(|f| f.0 == camera.format).expect("one of pattern::FORMATS");
+        let size = Self::picture_bytes(camera) as u32;
+        let interval = (camera.period / 100) as u32;
+        let [w, h] = [camera.width, camera.height].map(|v| (v as u16).to_le_bytes());
+        let (long, guid) = (u32::to_le_bytes, b"\0\0\x10\0\x80\0\0\xaa\0\x38\x9b\x71");
+        let rate = long((u64::from(size) * 8 * 1_000_000_000 / camera.period as u64) as u32);
+        let compressed = *bits == 0;
+        let format: Vec<u8> = if compressed {
+            vec![11, 0x24, 6, 1, 1, 0, 1, 0, 0, 0, 0]
+        } else {
+            [&[27, 0x24, 4, 1, 1][..], &code[..], guid, &[*bits, 1, 0, 0, 0, 0]].concat()
+        };
+        let frame_head = [30, 0x24, if compressed { 7 } else { 5 }, 1, 0];
+        let frame =
+            [&frame_head[..], &w, &h, &rate, &rate, &long(size), &long(interval), &[1], &long(interval)].concat();
+        let colour = [6, 0x24, 0x0d, 1, 1, 4];
+        let stream_length = ((14 + format.len() + frame.len() + colour.len()) as u16).to_le_bytes();
+        let mut configuration = [
+            // Configuration, association, control interface with camera terminal and output.
+            &[9, 2, 0, 0, 2, 1, 0, 0x80, 250][..],
+            &[8, 0x0b, 0, 2, 0x0e, 3, 0, 2],
+            &[9, 4, 0, 0, 0, 0x0e, 1, 0, 2],
+            &[13, 0x24, 1, 0, 1, 40, 0, 0x00, 0x6c, 0xdc, 0x02, 1, 1],
+            &[18, 0x24, 2, 1, 1, 2, 0, 0, 0, 0, 0, 0, 0, 0, 3, 0, 0, 0],
+            &[9, 0x24, 3, 2, 1, 1, 0, 1, 0],
+            // Streaming interface, its one format and size, its bulk endpoint.
+            &[9, 4, 1, 0, 1, 0x0e, 2, 0, 0],
+            &[14, 0x24, 1, 1, stream_length[0], stream_length[1], 0x81, 0, 2, 0, 0, 0, 1, 0],
+            &format,
+            &frame,
+            &colour,
+            &[7, 5, 0x81, 2, 0, 2, 0],
+        ]
+        .concat();
+        let total = (configuration.len() as u16).to_le_bytes();
+        configuration[2..4].copy_from_slice(&total);
+        let probe = [&[1, 0, 1, 1][..], &long(interval), &[0; 10], &long(size), &long(PAYLOAD as u32)].concat();
+        let device = vec![18, 1, 0, 2, 0xef, 2, 1, 64, 0x09, 0x12, 1, 0, 0, 1, 1, 2, 3, 1];
+        let strings = ["Stipple".to_string(), format!("HIL {}", camera.serial), camera.serial.clone()];
+        Descriptors { device, configuration, probe, strings }
+    }
+
+    /// What a control transfer is answered; none: it is not understood.
+    fn control(&self, setup: [u8; 8], bus: &Shared<Bus>) -> Option<Vec<u8>> {
+        const GET_DESCRIPTOR: (u8, u8) = (0x80, 6);
+        const PROBE: u8 = 1;
+        const COMMIT: u8 = 2;
+        let [kind, request, low, high, ..] = setup;
+        let stream = |on: bool| {
+            bus.0.lock().expect("whole").streaming = on;
+            bus.1.notify_all();
+            Some(vec![])
+        };
+        match (kind, request) {
+            GET_DESCRIPTOR => match high {
+                1 => Some(self.device.clone()),
+                2 => Some(self.configuration.clone()),
+                3 if low == 0 => Some(vec![4, 3, 9, 4]),
+                3 => self.strings.get(usize::from(low) - 1).map(|s| {
+                    let text: Vec<u8> = s.encode_utf16().flat_map(u16::to_le_bytes).collect();
+                    [&[text.len() as u8 + 2, 3], &text[..]].concat()
+                }),
+                _ => None,
+            },
+            // The host stopped: it clears the halt of the endpoint.
+            (0x02, 1) => stream(false),
+            (0x00..=0x02, _) => Some(vec![]),
+            (0x80..=0x82, 0) => Some(vec![0, 0]),
+            // GET_INFO, GET_LEN, and the one setting there is.
+            (0xa1, 0x86) => Some(vec![3]),
+            (0xa1, 0x85) => Some(vec![self.probe.len() as u8, 0]),
+            (0xa1, _) if high == PROBE || high == COMMIT => Some(self.probe.clone()),
+            (0x21, 1) if high == COMMIT => stream(true),
+            (0x21, 1) => Some(vec![]),
+            _ => None,
+        }
+    }
+}
