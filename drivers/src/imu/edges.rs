@@ -2,9 +2,9 @@
 //!
 //! A unit raises its line once a sample, so in the long run there are as many edges as samples, and they are paired
 //! in order. The exceptions are told by their counts: the last edge may be of a sample that came after the FIFO was
-//! counted (it waits for the next read), and edges are lost when the kernel's queue of 16 overflows or an interrupt is
-//! masked. Then the newest sample takes the last edge, if that is younger than a period, its forerunners those whole
-//! periods before it, and what has no edge is stamped by the line (`timeline`).
+//! counted (it waits for the next read), and edges are lost when the kernel's queue of 16 overflows, or come late when
+//! the thread that queues them does. Then they are paired by their age, so that no slip outlives a read, and what has
+//! no edge is stamped by the line (`timeline`).
 
 use crate::types::{Nanos, Span};
 
@@ -76,24 +76,32 @@ impl EdgeQueue {
         of.clear();
         of.resize(n, None);
         let latest = self.as_slice().last().copied();
-        let surplus = usize::from(self.len == n + 1 && latest > Some(before - Span(period.0 / 2)));
+        let late = before - Span(period.0 / 10);
+        let surplus = usize::from(self.len == n + 1 && latest > Some(late));
         let edges = self.len - surplus;
         if edges == n {
             of.iter_mut().zip(&self.stamps).for_each(|(of, t)| *of = Some(*t));
         } else {
             self.unmatched += edges.abs_diff(n) as u64;
-            // An edge older than most of a period is not of the newest sample: its own is among the lost.
-            let young = |t: &Nanos| (before - *t).0 < period.0 - period.0 / 5;
-            if let Some(latest) = latest.filter(young) {
-                for t in self.as_slice().iter().rev() {
-                    let periods = ((latest - *t).0 as f64 / period.0.max(1) as f64).round() as usize;
-                    let sample = n.checked_sub(1 + periods).and_then(|i| of.get_mut(i));
-                    sample.into_iter().for_each(|of| *of = of.or(Some(*t)));
-                }
-            }
+            self.pair_by_age(n, before, period, of);
         }
         self.stamps[0] = self.stamps[edges.min(EDGES - 1)];
         self.len = surplus;
+    }
+}
+
+impl EdgeQueue {
+    /// The newest sample was taken less than a period before the read, so the last edge is its own if it is as young;
+    /// an older one is of a sample as many periods before. The others follow from their distance to it.
+    fn pair_by_age(&self, n: usize, before: Nanos, period: Span, of: &mut [Option<Nanos>]) {
+        let Some(latest) = self.as_slice().last() else { return };
+        let periods = |span: Span, round: f64| ((span.0.max(0) as f64 / period.0.max(1) as f64) + round) as usize;
+        // A tenth for what the period and the moment of the count are not known to.
+        let back = periods(before - *latest, 0.1);
+        for t in self.as_slice().iter().rev() {
+            let sample = n.checked_sub(1 + back + periods(*latest - *t, 0.5)).and_then(|i| of.get_mut(i));
+            sample.into_iter().for_each(|of| *of = of.or(Some(*t)));
+        }
     }
 }
 
@@ -146,9 +154,12 @@ mod tests {
         assert_eq!(q.unmatched, 1);
         let mut q = queue(&[101, 300]);
         assert_eq!(paired(&mut q, 3, 320), [Some(101), None, Some(300)]);
-        // The edge of the newest sample is lost: which of the others belongs to which is not known.
+        // The edge of the newest sample is late; when it comes it is of no sample of the next read.
         let mut q = queue(&[100, 200]);
-        assert_eq!(paired(&mut q, 3, 320), [None; 3]);
+        assert_eq!(paired(&mut q, 3, 320), [Some(100), Some(200), None]);
+        [300, 400, 500].into_iter().for_each(|t| q.push(Nanos(t), Nanos(t)));
+        assert_eq!(paired(&mut q, 2, 550), [Some(400), Some(500)]);
+        assert_eq!(q.unmatched, 2);
         assert!(q.is_empty());
         assert_eq!(paired(&mut queue(&[]), 2, 320), [None; 2]);
     }
