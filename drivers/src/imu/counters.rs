@@ -51,7 +51,8 @@ counters! {
     imu_restarts_failed,
     /// Times that the sensor's clock had to be found anew.
     imu_clock_slips,
-    /// Stamps of the kernel that were not newer than the last; their samples were dropped.
+    /// Stamps of the kernel that were not newer than the last, or of the future: their samples were put near their
+    /// neighbours.
     imu_stamps_refused,
     /// Edges of another clock, or out of order; edges without a sample and samples without an edge; failures to read
     /// edges.

@@ -43,6 +43,10 @@ pub struct IioOptions {
 const BUFFER_SCANS: u32 = 1024;
 /// Scans of one read.
 const READ_SCANS: usize = 64;
+/// A stamp so much later than its read is of another clock, or guessed.
+const AHEAD: Span = Span(1_000_000);
+/// The first sample is no older than what the kernel keeps.
+const FIRST_AGE_MAX: Span = Span(10_000_000_000);
 const BACKOFF: Span = Span(100_000_000);
 const SILENT_PERIODS: i64 = 20;
 const SILENT_MIN: Span = Span(500_000_000);
@@ -113,7 +117,13 @@ impl Device {
     fn open(options: &IioOptions, wanted: &str) -> Result<Device, Fault> {
         let folder = find(options, wanted)?;
         let set = |file: &str, value: &str| write(&folder.join(file), value);
-        // A buffer that another program left running cannot be set up.
+        // First of all: the kernel lets one read, and what another reads must be left as it is.
+        let node = options.dev.join(folder.file_name().unwrap_or_default());
+        let file = OpenOptions::new().read(true).custom_flags(libc::O_NONBLOCK).open(&node).map_err(|e| {
+            let fix = "let the user read it (udev rule), and end what else reads it";
+            Fault::new(Exit::Unavailable, node.display().to_string(), e.to_string(), fix)
+        })?;
+        // A buffer that was left running cannot be set up.
         set("buffer/enable", "0")?;
         let scan = Scan::new(enable_channels(&folder)?);
         if scan.elements_of_interest() == 0 {
@@ -127,11 +137,6 @@ impl Device {
         set_rate(&folder, options.rate_hz)?;
         set("buffer/length", &BUFFER_SCANS.to_string())?;
         set("buffer/watermark", &options.watermark.to_string())?;
-        let node = options.dev.join(folder.file_name().unwrap_or_default());
-        let file = OpenOptions::new().read(true).custom_flags(libc::O_NONBLOCK).open(&node).map_err(|e| {
-            let fix = "let the user read it (udev rule), and end what else reads it";
-            Fault::new(Exit::Unavailable, node.display().to_string(), e.to_string(), fix)
-        })?;
         if !set("buffer/enable", "1")? {
             let fix = "its driver needs an interrupt, or set imu.trigger";
             return Err(Fault::new(Exit::Unavailable, &options.device, "it has no buffer", fix));
@@ -286,13 +291,12 @@ impl Stream {
             let before = *raw;
             let (mut reading, stamp) = scan.reading(bytes, raw);
             *repeats = if *raw == before { repeats.saturating_add(1) } else { 0 };
-            let t = stamp.unwrap_or(now);
-            // Of the future, or of another clock.
-            if last.is_some_and(|last| t <= last) || t > now + Span(1_000_000) {
+            let told = stamp.unwrap_or(now);
+            let t = in_order(told, *last, now, line.period());
+            if t != told {
                 met.imu_stamps_refused += 1;
-                return;
-            }
-            if !line.advance(1, t, t, Some(t)) {
+                line.lose();
+            } else if !line.advance(1, t, t, Some(t)) {
                 met.imu_clock_slips += 1;
             }
             let periods = last.map_or(1.0, |last| (t - last).0 as f64 / line.period().0 as f64);
@@ -313,6 +317,14 @@ impl Stream {
         }
         Ok(scans)
     }
+}
+
+/// A stamp, or where it cannot be one a place near its neighbours: a sample is worth more than its stamp. Some of the
+/// kernel's drivers guess the period, and run ahead of the clock or back.
+fn in_order(told: Nanos, last: Option<Nanos>, now: Nanos, period: Span) -> Nanos {
+    let Some(last) = last else { return told.min(now).max(now - FIRST_AGE_MAX) };
+    let t = if told > now + AHEAD { now.min(last + period) } else { told };
+    t.max(last + Span(1000))
 }
 
 pub struct IioImu {
