@@ -5,27 +5,17 @@ use std::path::Path;
 use std::process::Command;
 use std::time::Instant;
 use stipple::config::Board;
-use stipple::gpu::Gpu;
 use stipple::map::{Did, Keyframe, Mapper, Offer, Panel};
-use stipple::stereo::Stereo;
 use stipple_drivers::replay::{OpenOptions, Recording};
 use stipple_drivers::sim::{write_euroc_colour, Scenario, Sim};
 use stipple_drivers::types::pose_at;
-use stipple_drivers::{Calibration, Frames, Span};
+use stipple_drivers::{Frames, Span};
 
 const BOARD: &str = "name = \"test\"\nmemory_max_mib = 2048\n[budget]\nsplats = 20000\nintersections = 400000\n\
                      keyframes = 16\nimage_width_max = 1024\nimage_height_max = 1024\n";
 
 fn board(overrides: &[&str]) -> Board {
     Board::parse("tests/colour.rs", BOARD, &overrides.iter().map(|s| s.to_string()).collect::<Vec<_>>()).unwrap()
-}
-
-fn open(calibration: &Calibration, board: &Board) -> Mapper {
-    let bytes = Mapper::footprint(calibration, board).gpu_total()
-        + Stereo::footprint(calibration, &board.stereo, board.map.scale).gpu_total();
-    let mut gpu = Gpu::open(&board.gpu, bytes).unwrap();
-    let stereo = Stereo::new(calibration, &board.stereo, board.map.scale, Some(&mut gpu)).unwrap();
-    Mapper::new(gpu, stereo, board).unwrap()
 }
 
 /// Five frames a second and a second of the demo after its start at rest, at 188 x 120 px.
@@ -54,7 +44,7 @@ fn a_colour_recording_becomes_a_map_in_its_colours() {
     written(&path);
     let recording = Recording::open(&path, &OpenOptions::default()).unwrap();
     let board = board(&["map.colour=true"]);
-    let mut mapper = open(&recording.calibration, &board);
+    let mut mapper = Mapper::open(&recording.calibration, &board).unwrap();
     let mut frames = Frames::in_colour(&recording.calibration, mapper.colours_offered());
     let mut reader = recording.reader();
     assert!(reader.has_colour(2));

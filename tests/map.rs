@@ -24,14 +24,6 @@ fn board(overrides: &[&str]) -> Board {
     Board::parse("tests/map.rs", text, &overrides).unwrap()
 }
 
-fn open(calibration: &Calibration, board: &Board) -> Mapper {
-    let bytes = Mapper::footprint(calibration, board).gpu_total()
-        + Stereo::footprint(calibration, &board.stereo, board.map.scale).gpu_total();
-    let mut gpu = Gpu::open(&board.gpu, bytes).unwrap();
-    let stereo = Stereo::new(calibration, &board.stereo, board.map.scale, Some(&mut gpu)).unwrap();
-    Mapper::new(gpu, stereo, board).unwrap()
-}
-
 /// `count` keyframes of a simulated flight, half a second apart, at 188 x 120 px; every fourth is held out.
 fn flight(count: usize) -> (Calibration, Vec<Keyframe>) {
     let mut scenario = Scenario::named("demo").unwrap();
@@ -92,7 +84,7 @@ fn fisheye_anchors_are_densified_and_drawn_to_their_depth() {
         // By alpha alone, or seeds come where densification would put its own; poses and exposures are true as they are.
         let mut settings = vec!["map.scale=4", "map.projection=fisheye", "map.seeds_per_anchor=1500", &densify, &depth];
         settings.extend(["map.wrong_error=1", "map.refine_pose=false", "map.refine_exposure=false"]);
-        let mut mapper = open(&calibration, &board(&settings));
+        let mut mapper = Mapper::open(&calibration, &board(&settings)).unwrap();
         for k in &keyframes {
             mapper.offer(k);
             train(&mut mapper, 60);
@@ -134,7 +126,7 @@ fn train(mapper: &mut Mapper, steps: u32) {
 fn flight_becomes_a_map_that_held_out_views_confirm() {
     let (calibration, keyframes) = flight(8);
     let run = || {
-        let mut mapper = open(&calibration, &board(&[]));
+        let mut mapper = Mapper::open(&calibration, &board(&[])).unwrap();
         for k in &keyframes {
             assert_eq!(mapper.offer(k), Offer::Accepted);
             train(&mut mapper, 20);
@@ -158,7 +150,7 @@ fn flight_becomes_a_map_that_held_out_views_confirm() {
 fn held_out_views_are_never_anchors_and_never_trained_on() {
     let (calibration, mut keyframes) = flight(2);
     keyframes.iter_mut().for_each(|k| k.held_out = true);
-    let mut mapper = open(&calibration, &board(&[]));
+    let mut mapper = Mapper::open(&calibration, &board(&[])).unwrap();
     for k in &keyframes {
         mapper.offer(k);
         assert_eq!(mapper.step(Instant::now()).unwrap().did, Did::Stored);
@@ -172,7 +164,7 @@ fn held_out_views_are_never_anchors_and_never_trained_on() {
 fn full_store_queue_and_pool_are_counted_values() {
     let (calibration, keyframes) = flight(6);
     let tight = ["budget.keyframes=2", "budget.splats=256"];
-    let mut mapper = open(&calibration, &board(&tight));
+    let mut mapper = Mapper::open(&calibration, &board(&tight)).unwrap();
     let offers: Vec<Offer> = keyframes.iter().map(|k| mapper.offer(k)).collect();
     assert_eq!(offers[3..], [Offer::Accepted, Offer::Full, Offer::Full]);
     train(&mut mapper, 10);
@@ -185,7 +177,7 @@ fn full_store_queue_and_pool_are_counted_values() {
 #[test]
 fn corrections_reach_waiting_and_stored_keyframes_and_their_gaussians() {
     let (calibration, keyframes) = flight(2);
-    let mut mapper = open(&calibration, &board(&[]));
+    let mut mapper = Mapper::open(&calibration, &board(&[])).unwrap();
     mapper.offer(&keyframes[0]);
     let truth = keyframes[0].world_from_body;
     let far = Pose { p: truth.p + glam::DVec3::X * 100.0, ..truth };
@@ -216,7 +208,7 @@ fn exposure_is_found_but_for_what_all_share() {
         k.images.iter_mut().for_each(|i| i.pixels.iter_mut().for_each(|p| *p = (f64::from(*p) * gain) as u8));
     }
     let run = |exposure: &str| {
-        let mut mapper = open(&calibration, &board(&["map.refine_pose=false", exposure]));
+        let mut mapper = Mapper::open(&calibration, &board(&["map.refine_pose=false", exposure])).unwrap();
         for k in &keyframes {
             mapper.offer(k);
             train(&mut mapper, 30);
@@ -241,7 +233,7 @@ fn corrections_compose_with_what_the_mapper_found() {
     let (calibration, mut keyframes) = flight(3);
     let truth = keyframes[1].world_from_body;
     keyframes[1].world_from_body.p += glam::DVec3::new(0.02, -0.02, 0.01);
-    let mut mapper = open(&calibration, &board(&["map.lr_pose=1e-3"]));
+    let mut mapper = Mapper::open(&calibration, &board(&["map.lr_pose=1e-3"])).unwrap();
     for k in &keyframes {
         mapper.offer(k);
         train(&mut mapper, 60);
@@ -264,7 +256,7 @@ fn corrections_compose_with_what_the_mapper_found() {
 fn evaluation_leaves_no_trace() {
     let (calibration, keyframes) = flight(4);
     let run = |looks: bool| {
-        let mut mapper = open(&calibration, &board(&[]));
+        let mut mapper = Mapper::open(&calibration, &board(&[])).unwrap();
         for k in &keyframes {
             mapper.offer(k);
             train(&mut mapper, 10);
@@ -284,7 +276,8 @@ fn evaluation_leaves_no_trace() {
 #[test]
 fn mapper_rests_once_its_views_are_learnt() {
     let (calibration, keyframes) = flight(3);
-    let mut mapper = open(&calibration, &board(&["map.steps_per_keyframe_max=15", "map.burst_iterations=4"]));
+    let mut mapper =
+        Mapper::open(&calibration, &board(&["map.steps_per_keyframe_max=15", "map.burst_iterations=4"])).unwrap();
     for (k, keyframe) in keyframes.iter().enumerate() {
         assert_eq!(mapper.offer(keyframe), Offer::Accepted);
         train(&mut mapper, 1000);
@@ -298,7 +291,7 @@ fn mapper_rests_once_its_views_are_learnt() {
 fn full_pool_gives_its_least_valuable_for_a_new_view() {
     let (calibration, keyframes) = flight(8);
     let run = |evict: &str| {
-        let mut mapper = open(&calibration, &board(&["budget.splats=800", evict]));
+        let mut mapper = Mapper::open(&calibration, &board(&["budget.splats=800", evict])).unwrap();
         let mut most = 0;
         for k in &keyframes {
             mapper.offer(k);
@@ -315,7 +308,7 @@ fn full_pool_gives_its_least_valuable_for_a_new_view() {
 #[test]
 fn steps_allocate_nothing() {
     let (calibration, keyframes) = flight(3);
-    let mut mapper = open(&calibration, &board(&[]));
+    let mut mapper = Mapper::open(&calibration, &board(&[])).unwrap();
     let sealed = std::thread::spawn(move || {
         seal_thread();
         for k in &keyframes {
@@ -356,7 +349,7 @@ fn recorded_room_becomes_a_map() {
         return println!("ignored: recorded_room_becomes_a_map: no recordings");
     };
     let recording = Recording::open(&path, &OpenOptions::default()).unwrap();
-    let mut mapper = open(&recording.calibration, &board(&["map.scale=4"]));
+    let mut mapper = Mapper::open(&recording.calibration, &board(&["map.scale=4"])).unwrap();
     play(&mut mapper, &recording, 12, 25);
     let quality = mapper.evaluate().unwrap();
     assert!(quality.psnr_db.unwrap() > 18.0, "{quality:?}");
@@ -370,7 +363,7 @@ fn same_twice(keyframes: usize, steps: u32, at_least: u64) {
     };
     let recording = Recording::open(&path, &OpenOptions::default()).unwrap();
     let run = || {
-        let mut mapper = open(&recording.calibration, &board(&["map.scale=4"]));
+        let mut mapper = Mapper::open(&recording.calibration, &board(&["map.scale=4"])).unwrap();
         play(&mut mapper, &recording, keyframes, steps);
         assert!(mapper.iterations() >= at_least && mapper.splat_count() > 1000);
         mapper.splats().unwrap()
@@ -401,7 +394,7 @@ fn write_png(dir: &std::path::Path, p: &Panel) {
 #[test]
 fn both_cameras_of_a_pair_train_one_map() {
     let (calibration, keyframes) = flight(4);
-    let mut mapper = open(&calibration, &board(&["map.cameras=2", "map.sh_degree=1"]));
+    let mut mapper = Mapper::open(&calibration, &board(&["map.cameras=2", "map.sh_degree=1"])).unwrap();
     for k in &keyframes {
         mapper.offer(k);
         train(&mut mapper, 30);
@@ -435,7 +428,8 @@ fn recorded_fisheye_images_become_a_map_as_they_are() {
     };
     let recording = Recording::open(&path, &OpenOptions::default()).unwrap();
     for cameras in ["map.cameras=1", "map.cameras=2"] {
-        let mut mapper = open(&recording.calibration, &board(&["map.scale=4", "map.projection=fisheye", cameras]));
+        let mut mapper =
+            Mapper::open(&recording.calibration, &board(&["map.scale=4", "map.projection=fisheye", cameras])).unwrap();
         play(&mut mapper, &recording, 12, 25);
         let q = mapper.evaluate().unwrap();
         println!("{cameras}: {q:?}");
@@ -461,7 +455,7 @@ fn v1_01_quality() {
     overrides.extend(set.split_whitespace());
     let recording = Recording::open(&path, &OpenOptions::default()).unwrap();
     let board = board(&overrides);
-    let mut mapper = open(&recording.calibration, &board);
+    let mut mapper = Mapper::open(&recording.calibration, &board).unwrap();
     println!("{}", mapper.device());
     let start = Instant::now();
     play(&mut mapper, &recording, env("KEYFRAMES", 1000), env("STEPS", 20) as u32);
@@ -517,7 +511,7 @@ fn v1_01_quality() {
 fn a_black_eye_makes_no_anchor_and_is_counted() {
     let (calibration, mut keyframes) = flight(2);
     keyframes[0].images[1].pixels.fill(0);
-    let mut mapper = open(&calibration, &board(&[]));
+    let mut mapper = Mapper::open(&calibration, &board(&[])).unwrap();
     mapper.offer(&keyframes[0]);
     assert_eq!(mapper.step(Instant::now()).unwrap().did, Did::Stored);
     assert_eq!((mapper.counters().depth_absent.get(), mapper.splat_count()), (1, 0));

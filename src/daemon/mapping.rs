@@ -2,10 +2,9 @@
 
 use super::progress::Gauges;
 use crate::config::Board;
-use crate::gpu::{Gpu, GpuError};
+use crate::gpu::GpuError;
 use crate::map::{CurvePoint, Did, Keyframe, Mapper, PoseCorrection};
 use crate::mem::unsealed;
-use crate::stereo::Stereo;
 use crossbeam_queue::ArrayQueue;
 use std::sync::atomic::Ordering::Relaxed;
 use std::time::{Duration, Instant};
@@ -38,11 +37,7 @@ impl Mapping {
     pub fn open(calibration: &Calibration, board: &Board) -> Result<Mapping, Fault> {
         let build = || {
             host::lower_priority();
-            let bytes = Mapper::footprint(calibration, board).gpu_total()
-                + Stereo::footprint(calibration, &board.stereo, board.map.scale).gpu_total();
-            let mut gpu = Gpu::open(&board.gpu, bytes)?;
-            let stereo = Stereo::new(calibration, &board.stereo, board.map.scale, Some(&mut gpu))?;
-            Mapper::new(gpu, stereo, board)
+            Mapper::open(calibration, board)
         };
         let mapper = std::thread::scope(|s| s.spawn(build).join().expect("boot faults are values, not panics"))?;
         Ok(Mapping {

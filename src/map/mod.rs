@@ -158,6 +158,15 @@ impl Mapper {
         f
     }
 
+    /// On a device of its own, with depth by the board's method.
+    pub fn open(calibration: &Calibration, board: &Board) -> Result<Mapper, Fault> {
+        let bytes = Mapper::footprint(calibration, board).gpu_total()
+            + Stereo::footprint(calibration, &board.stereo, board.map.scale).gpu_total();
+        let mut gpu = Gpu::open(&board.gpu, bytes)?;
+        let stereo = Stereo::new(calibration, &board.stereo, board.map.scale, Some(&mut gpu))?;
+        Mapper::new(gpu, stereo, board)
+    }
+
     /// The arena of `gpu` must hold `footprint(..).gpu_total()`.
     pub fn new(mut gpu: Gpu, stereo: Stereo, board: &Board) -> Result<Mapper, Fault> {
         let camera = stereo.camera().pinhole;
