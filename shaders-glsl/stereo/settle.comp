@@ -1,5 +1,5 @@
-// What the filter found, with its standard deviation. A disparity is the less sure, the further its neighbours are from it,
-// the less the picture shows around it, and the less there was matched. One thread a pixel.
+// What the filter found, with its standard deviation. A disparity is the less sure, the further the window is from a plane,
+// the less the picture shows in it, and the less there was matched. One thread a pixel.
 // in   images (left), data: (weight * disparity, weight), filtered
 // out  disparity, px, negative where there is no weight; deviation, px
 #version 450
@@ -15,7 +15,8 @@ layout(push_constant) uniform Push {
     float fill;     // weight of what is filled in from near by; with less the variance grows
     // Parts of the variance, px²:
     float least;
-    float spread;   // by (distance of the neighbours, at most 3 px)²
+    float bent;     // by the squared distance from a plane
+    float bent_far; // by the same over the disparity, px: far off a border is a small step, as wrong as a large one near by
     float faint;    // by 1 / (1 + squared slope of grey levels)
     float missing;  // by what there is less than whole weight
 } push;
@@ -27,7 +28,7 @@ layout(set = 0, binding = 3, std430) writeonly buffer Deviation { float deviatio
 
 const int AROUND = 2;
 const float WINDOW = float((2 * AROUND + 1) * (2 * AROUND + 1));
-const float SPREAD_MAX = 3.0;
+const float BENT_MAX = 25.0;
 
 float level(ivec2 at) {
     const uvec2 p = uvec2(clamp(at, ivec2(0), ivec2(push.size) - 1));
@@ -47,7 +48,11 @@ void main() {
     }
     const ivec2 at = ivec2(i % push.size.x, i / push.size.x);
     const float found = d.x / d.y;
-    float weights = 0.0, slopes = 0.0, spread = 0.0;
+    float weights = 0.0, slopes = 0.0;
+    // Of places u, v and distances from what was found: how many, and the sums of a plane's least squares.
+    float n = 0.0;
+    vec3 sums = vec3(0.0), squares = vec3(0.0);
+    vec2 products = vec2(0.0);
     for (int v = -AROUND; v <= AROUND; ++v) {
         for (int u = -AROUND; u <= AROUND; ++u) {
             const ivec2 p = clamp(at + ivec2(u, v), ivec2(0), ivec2(push.size) - 1);
@@ -55,12 +60,20 @@ void main() {
             weights += min(other.y, 1.0);
             const float slope = 0.5 * (level(p + ivec2(1, 0)) - level(p - ivec2(1, 0)));
             slopes += slope * slope;
-            if (abs(u) <= 1 && abs(v) <= 1 && other.y >= push.weight_min) {
-                spread = max(spread, min(abs(other.x / other.y - found), SPREAD_MAX));
+            if (other.y >= push.weight_min) {
+                const vec3 here = vec3(u, v, other.x / other.y - found);
+                n += 1.0;
+                sums += here;
+                squares += here * here;
+                products += here.xy * here.z;
             }
         }
     }
+    const vec3 mean = sums / n, variance = max(squares / n - mean * mean, vec3(0.0));
+    const vec2 slope = products / n - mean.xy * mean.z;
+    const vec2 explained = slope * slope / max(variance.xy, vec2(1e-3));
+    const float bent = clamp(variance.z - explained.x - explained.y, 0.0, BENT_MAX);
     disparity[i] = found;
-    deviation[i] = sqrt(push.least + push.spread * spread * spread + push.faint / (1.0 + slopes / WINDOW)
-        + push.missing * max(1.0 - weights / WINDOW, 0.0) * max(push.fill / d.y, 1.0));
+    deviation[i] = sqrt(push.least + (push.bent + push.bent_far / max(found, 1.0)) * bent
+        + push.faint / (1.0 + slopes / WINDOW) + push.missing * max(1.0 - weights / WINDOW, 0.0) * max(push.fill / d.y, 1.0));
 }

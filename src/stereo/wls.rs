@@ -29,14 +29,15 @@ impl Wls {
     pub const FILL_REACH: f32 = 64.0;
     /// Less weight than this is no disparity. Far from all matches the weight is small and the variance large.
     pub const WEIGHT_MIN: f32 = 1e-12;
-    /// Parts of the variance, px², fitted on four pairs each of the simulated flights `demo` and `aggressive`, whose
-    /// residuals then have a variance of 1.17 and 0.80 (without the filter 1.20 and 0.84).
-    pub const LEAST: f32 = 0.004;
-    pub const SPREAD: f32 = 0.64;
-    pub const FAINT: f32 = 0.233;
-    pub const MISSING: f32 = 0.194;
+    /// Parts of the variance, px², of greatest likelihood on the fitting flights of `bench::stereo::flights`, with and
+    /// without the filter.
+    pub const LEAST: f32 = 0.0004;
+    pub const BENT: f32 = 5.4;
+    pub const BENT_FAR: f32 = 9.1;
+    pub const FAINT: f32 = 0.217;
+    pub const MISSING: f32 = 0.137;
     /// No depth beyond: what is filled in over a hidden strip has 0.8, what is further from all matches more.
-    pub const SIGMA_MAX_PX: f32 = 1.5;
+    pub const SIGMA_MAX_PX: f32 = 1.25;
 
     pub fn new(gpu: &mut Gpu) -> Result<Wls, Fault> {
         Ok(Wls {
@@ -94,7 +95,8 @@ impl Wls {
                 weight_min: Wls::WEIGHT_MIN,
                 fill: Wls::FILL,
                 least: Wls::LEAST,
-                spread: Wls::SPREAD,
+                bent: Wls::BENT,
+                bent_far: Wls::BENT_FAR,
                 faint: Wls::FAINT,
                 missing: Wls::MISSING,
             },

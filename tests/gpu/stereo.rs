@@ -140,7 +140,8 @@ fn filter_agrees_with_its_twin() {
         weight_min: f64::from(Wls::WEIGHT_MIN),
         fill: f64::from(Wls::FILL),
         least: f64::from(Wls::LEAST),
-        spread: f64::from(Wls::SPREAD),
+        bent: f64::from(Wls::BENT),
+        bent_far: f64::from(Wls::BENT_FAR),
         faint: f64::from(Wls::FAINT),
         missing: f64::from(Wls::MISSING),
     };

@@ -1,10 +1,11 @@
 //! `stipple bench stereo`: every method of disparity on pairs whose truth is known.
 //!
 //! Sets are Middlebury's cones and teddy, simulated flights (also by range of depth), pairs for time alone, and
-//! the hard cases. `score` states the protocol. Given a recording, each method also makes a map of it (`effect`).
+//! the hard cases. `score` states the protocol, `flights` which flights were fitted and which are reported. Given a recording, each method also makes a map of it (`effect`).
 //! Leaves `stereo.json` (a list, a row a set and method), `stereo.html`, `pictures/`, and of maps `stereo-map.json`.
 
 pub mod effect;
+mod flights;
 mod methods;
 mod page;
 mod pictures;
@@ -26,15 +27,10 @@ use score::Score;
 use serde_json::{json, Value};
 use sets::Set;
 use std::path::{Path, PathBuf};
-use stipple_drivers::sim::Scenario;
 use stipple_drivers::Fault;
 
 /// Depths that simulated flights are judged by, m.
 const RANGES_M: [f64; 6] = [0.5, 1.0, 2.0, 4.0, 8.0, 20.0];
-/// Frames of each simulated flight: as many as a software rasteriser matches in minutes.
-const FRAMES: usize = 4;
-/// Flown by a real vehicle through a room around its path, up to 20 m deep; where in it to begin, s.
-const LONG_FLIGHT: (&str, f64, f64) = ("euroc_text/MH_04_difficult/state_groundtruth_estimate0.csv", 16.0, 40.0);
 /// Pairs for time alone: disparities at 752x480, how often, and when fewer will do, ms.
 const TIMED: [u32; 2] = [64, 128];
 const REPEATS: usize = 5;
@@ -49,6 +45,8 @@ pub struct Options {
     pub board: Option<Board>,
     /// Two hard cases.
     pub quick: bool,
+    /// The flights that deviations were fitted to and nothing else, in place of those that are reported.
+    pub fitted: bool,
     /// Of mapping, with each method.
     pub seconds: Option<f64>,
 }
@@ -86,9 +84,10 @@ pub type MapRun<'a> = &'a dyn Fn(&Job, &OutputDir) -> Result<Report, Fault>;
 /// `stipple bench stereo`; `map` is there when maps are to be made.
 pub fn stereo(options: &Options, out: &Path, map: Option<MapRun>) -> Result<(), Fault> {
     let out = OutputDir::create(out)?;
-    let sets = match options.quick {
-        true => scenes::hard().into_iter().filter(|s| QUICK.contains(&s.name.as_str())).collect(),
-        false => all_sets(options.recordings.as_deref())?,
+    let sets = match (options.quick, options.fitted) {
+        (true, _) => scenes::hard().into_iter().filter(|s| QUICK.contains(&s.name.as_str())).collect(),
+        (false, true) => flights::sets(&inputs::folder(options.recordings.as_deref())?, true)?,
+        (false, false) => all_sets(options.recordings.as_deref())?,
     };
     let keep = |bench: &Bench| {
         out.write("stereo.json", |w| {
@@ -116,19 +115,7 @@ fn all_sets(recordings: Option<&Path>) -> Result<Vec<Set>, Fault> {
     if sets.is_empty() {
         eprintln!("no Middlebury pairs in {}", folder.display());
     }
-    let named = |name| Scenario::named(name).expect("a scenario of the simulator");
-    let mut flights = vec![named("demo"), named("aggressive")];
-    let (path, from_s, seconds) = LONG_FLIGHT;
-    let path = folder.join(path);
-    if path.is_file() {
-        let mut long = Scenario::from_euroc(&path, None)?;
-        inputs::cut(&mut long, from_s, seconds);
-        flights.push(long);
-    }
-    for flight in flights {
-        let frames = (flight.duration.secs().min(seconds) * flight.rate_hz) as usize;
-        sets.push(sets::simulated(flight, frames / FRAMES, FRAMES)?);
-    }
+    sets.extend(flights::sets(&folder, false)?);
     sets.extend(scenes::hard());
     Ok(sets)
 }
@@ -173,7 +160,9 @@ fn measure(sets: &[Set], base: &Base, keep: &dyn Fn(&Bench) -> Result<(), Fault>
         if let Some(row) = of_range {
             for (k, score) in ranges.into_iter().enumerate() {
                 let set = format!("sim {} to {} m", RANGES_M[k], RANGES_M[k + 1]);
-                bench.rows.push(Row { set, score, ..row.like() });
+                let row = Row { set, score, ..row.like() };
+                eprintln!("{}", row.line());
+                bench.rows.push(row);
             }
         }
         keep(&bench)?;
@@ -210,15 +199,7 @@ fn judge(
             pictures.push((format!("{}-{method}", set.name), picture));
         }
     }
-    Ok(Row {
-        set: set.name.clone(),
-        method,
-        score,
-        ms: percentile(&ms, 0.5).unwrap_or(0.0),
-        bytes: runner.bytes,
-        device: runner.device.clone(),
-        deviation: runner.has_deviation(),
-    })
+    Ok(Row::of(set.name.clone(), method, score, &ms, runner))
 }
 
 /// The first pair of a set again and again, with another range of disparities.
@@ -233,18 +214,17 @@ fn time(set: &Set, method: &'static str, base: &Base, disparities: u32) -> Resul
     }
     let mut score = Score::default();
     score.add(pair, &found, [0.0, f64::INFINITY], set.focal_baseline.unwrap_or(0.0));
-    Ok(Row {
-        set: format!("time {w}x{h}, {disparities} disparities"),
-        method,
-        score,
-        ms: percentile(&ms, 0.5).unwrap_or(0.0),
-        bytes: runner.bytes,
-        device: runner.device.clone(),
-        deviation: runner.has_deviation(),
-    })
+    Ok(Row::of(format!("time {w}x{h}, {disparities} disparities"), method, score, &ms, &runner))
 }
 
 impl Row {
+    /// `ms` of each pair.
+    fn of(set: String, method: &'static str, score: Score, ms: &[f64], runner: &Runner) -> Row {
+        let ms = percentile(ms, 0.5).unwrap_or(0.0);
+        let (bytes, device, deviation) = (runner.bytes, runner.device.clone(), runner.has_deviation());
+        Row { set, method, score, ms, bytes, device, deviation }
+    }
+
     /// Another set's, of the same method and device.
     fn like(&self) -> Row {
         Row { set: String::new(), device: self.device.clone(), ..*self }
@@ -252,9 +232,11 @@ impl Row {
 
     fn line(&self) -> String {
         let percent = |v: Option<f64>| v.map_or("-".to_string(), |v| format!("{:.2} %", 100.0 * v));
-        let s = &self.score.all;
+        let (s, seen) = (&self.score.all, &self.score.visible);
+        let stated = seen.residual_variance().filter(|_| self.deviation);
         format!(
-            "{:<28} {:<9} bad1 {:>8} bad2 {:>8} mean {:>6.3} px density {:>8} {:>8.1} ms  residual variance {:.2}",
+            "{:<28} {:<9} bad1 {:>8} bad2 {:>8} mean {:>6.3} px density {:>8} {:>8.1} ms  residual variance {} of {} px, \
+             {} gross",
             self.set,
             self.method,
             percent(s.bad1()),
@@ -262,7 +244,9 @@ impl Row {
             s.mean_px().unwrap_or(f64::NAN),
             percent(s.density()),
             self.ms,
-            self.score.visible.residual_variance().unwrap_or(f64::NAN)
+            stated.map_or("-".to_string(), |v| format!("{v:.2}")),
+            seen.judged(),
+            percent(seen.gross()),
         )
     }
 
@@ -278,6 +262,7 @@ impl Row {
             "mean_depth_error_m": seen.mean_m().filter(|_| self.set.starts_with("sim")),
             "residual_variance": stated(seen.residual_variance()),
             "within_a_deviation": stated(seen.within_a_deviation()),
+            "judged": seen.judged(),
             "gross": seen.gross(),
         })
     }

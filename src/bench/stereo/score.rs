@@ -5,7 +5,10 @@
 //! - an unknown pixel is not bad, but lowers the density: `bad1`, `bad2` (error above 1 and 2 px) and `mean_px`
 //!   (mean absolute error) are over counting pixels that have a disparity;
 //! - `residual_variance` is that of error / stated deviation over visible pixels whose error is at most
-//!   `GROSS_PX`; what is beyond is a wrong match, which no deviation of a right one describes, and its share is given.
+//!   `GROSS_PX`, `judged` of them; what is beyond is a wrong match, which no deviation of a right one describes. Such errors
+//!   are as long as the range of disparities allows, so a few in a thousand would alone make the variance any number; their
+//!   share is given as `gross` (0.0 to 0.7 % on simulated flights). Who uses a deviation must bear them by other means: a
+//!   map's loss that is linear beyond a deviation or two, or a gate. What is filled in for hidden pixels is not judged.
 
 use super::sets::Pair;
 use crate::stereo::Disparity;
@@ -79,14 +82,18 @@ impl Tally {
         (self.known > 0).then(|| self.error_m / self.known as f64)
     }
 
+    /// Pixels of the residual variance.
+    pub fn judged(&self) -> u64 {
+        self.known - self.gross
+    }
+
     pub fn residual_variance(&self) -> Option<f64> {
-        let n = self.known - self.gross;
-        (n > 0).then(|| self.residual2 / n as f64)
+        (self.judged() > 0).then(|| self.residual2 / self.judged() as f64)
     }
 
     /// 0.68 of normal errors.
     pub fn within_a_deviation(&self) -> Option<f64> {
-        Tally::share(self.within, self.known - self.gross)
+        Tally::share(self.within, self.judged())
     }
 
     pub fn gross(&self) -> Option<f64> {

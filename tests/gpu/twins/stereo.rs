@@ -276,7 +276,8 @@ pub struct Variance {
     pub weight_min: f64,
     pub fill: f64,
     pub least: f64,
-    pub spread: f64,
+    pub bent: f64,
+    pub bent_far: f64,
     pub faint: f64,
     pub missing: f64,
 }
@@ -296,9 +297,15 @@ pub fn settle(image: &Grey, data: &[[f64; 2]], at: usize, c: &Variance) -> [f64;
     let slope = |at: (i64, i64)| 0.5 * (f64::from(image.at(at.0 + 1, at.1)) - f64::from(image.at(at.0 - 1, at.1)));
     let slopes = around.iter().map(|p| slope(inside(*p)).powi(2)).sum::<f64>() / 25.0;
     let weights = around.iter().map(|p| of(inside(*p))[1].min(1.0)).sum::<f64>() / 25.0;
-    let beside = around.iter().filter(|(u, v)| u.abs() <= 1 && v.abs() <= 1).map(|p| of(inside(*p)));
-    let off = beside.filter(|d| d[1] >= c.weight_min).map(|d| (d[0] / d[1] - found).abs().min(3.0));
-    let spread = off.fold(0.0, f64::max);
+    let known = around.iter().filter(|p| of(inside(**p))[1] >= c.weight_min);
+    let places: Vec<[f64; 3]> =
+        known.map(|p| [p.0 as f64, p.1 as f64, of(inside(*p))[0] / of(inside(*p))[1] - found]).collect();
+    let mean = |f: &dyn Fn(&[f64; 3]) -> f64| places.iter().map(f).sum::<f64>() / places.len() as f64;
+    let middle = [0, 1, 2].map(|k| mean(&|p| p[k]));
+    let covariance = |a: usize, b: usize| mean(&|p| (p[a] - middle[a]) * (p[b] - middle[b]));
+    let explained = |a: usize| covariance(a, 2).powi(2) / covariance(a, a).max(1e-3);
+    let bent = (covariance(2, 2) - explained(0) - explained(1)).clamp(0.0, 25.0);
+    let steps = (c.bent + c.bent_far / found.max(1.0)) * bent;
     let missing = c.missing * (1.0 - weights).max(0.0) * (c.fill / weight).max(1.0);
-    [found, (c.least + c.spread * spread * spread + c.faint / (1.0 + slopes) + missing).sqrt()]
+    [found, (c.least + steps + c.faint / (1.0 + slopes) + missing).sqrt()]
 }
