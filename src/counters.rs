@@ -45,7 +45,7 @@ counters! {
     imu_missing,
     imu_not_newer,
     imu_leapt,
-    /// Samples of a unit that repeats itself: three and more alike to the last bit.
+    /// Samples of a unit that repeats itself: twenty and more alike to the last bit.
     imu_frozen,
     /// Samples with an axis at the end of its range, as the source says.
     imu_saturated,

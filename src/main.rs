@@ -89,6 +89,23 @@ enum Command {
         #[arg(long = "set", value_name = "SECTION.KEY=VALUE")]
         set: Vec<String>,
     },
+    /// Look at a board's sensors and say of each part ok, warn or fail, and what to do
+    Doctor {
+        /// Board file, see board-configs/
+        board: PathBuf,
+        /// How long to look; 15 s where nothing is said
+        #[arg(long, value_name = "S", value_parser = seconds)]
+        duration: Option<f64>,
+        /// A recording in the place of the sensors, as for replay, at its pace
+        #[arg(long, value_name = "DIR")]
+        dataset: Option<PathBuf>,
+        /// Where runs and recordings will go, whose disk is asked for its room
+        #[arg(long, value_name = "DIR", default_value = "out")]
+        out: PathBuf,
+        /// Override a key of the board file
+        #[arg(long = "set", value_name = "SECTION.KEY=VALUE")]
+        set: Vec<String>,
+    },
     /// Fly through a simulated room and map it; needs no data
     Demo {
         /// Board file; without it the one for Vulkan on the CPU
@@ -292,6 +309,9 @@ fn run(command: Command) -> Result<(), Fault> {
             };
             let options = daemon::Run { dataset, duration_s: duration, record: None };
             daemon::record(&board, &out, format, &set, &options)
+        }
+        Command::Doctor { board, duration, dataset, out, set } => {
+            daemon::doctor(&board, &out, &set, &daemon::Run { dataset, duration_s: duration, record: None })
         }
         Command::Demo { board, out, set } => daemon::demo(board.as_deref(), &out, &set),
         Command::Sim { scenario, out, truth, imu, duration, seed, rig, colour, defects } => {

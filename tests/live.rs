@@ -86,7 +86,9 @@ fn a_board_without_sensors_is_told_what_to_write() {
     let dir = tempfile::tempdir().unwrap();
     let o = stipple().args(["run", BOARD, "--out", dir.path().join("out").to_str().unwrap()]).output().unwrap();
     assert_eq!(o.status.code(), Some(78));
-    assert!(text(&o).contains("[camera]") && text(&o).contains("--dataset"), "{}", text(&o));
+    for words in ["[camera] devices", "[imu] chip", "[rig] calibration", "--dataset"] {
+        assert!(text(&o).contains(words), "{words}: {}", text(&o));
+    }
 }
 
 /// Two cables out, a stuck and a leaping camera: said, counted, outlived.
@@ -116,7 +118,7 @@ fn sensors_that_fail_are_said_counted_and_taken_back() {
         end_s = 4.7
         [[inject.imu]]
         fault = \"freeze\"
-        start_s = 4.8
+        start_s = 4.7
         end_s = 4.9
         [[inject.imu]]
         fault = \"unplug\"

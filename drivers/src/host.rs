@@ -42,3 +42,21 @@ pub fn stop_asked_for() -> &'static AtomicBool {
     }
     &STOP
 }
+
+/// What can be written below `at`, bytes.
+pub fn disk_free(at: &std::path::Path) -> Option<u64> {
+    let path = std::ffi::CString::new(at.as_os_str().as_encoded_bytes()).ok()?;
+    // SAFETY: plain integers, for which zero is valid; `path` and `s` outlive the call.
+    let (asked, s) = unsafe {
+        let mut s: libc::statvfs = std::mem::zeroed();
+        (libc::statvfs(path.as_ptr(), &mut s), s)
+    };
+    (asked == 0).then(|| s.f_bavail * s.f_frsize)
+}
+
+/// Memory that can be had without swapping, bytes.
+pub fn memory_available() -> Option<u64> {
+    let text = std::fs::read_to_string("/proc/meminfo").ok()?;
+    let line = text.lines().find_map(|l| l.strip_prefix("MemAvailable:"))?;
+    Some(line.split_whitespace().next()?.parse::<u64>().ok()? * 1024)
+}

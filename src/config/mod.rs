@@ -80,6 +80,9 @@ pub struct RigConfig {
     pub rolling_shutter: bool,
     /// First row to last, s; 0: as the calibration says.
     pub readout_s: f64,
+    /// Calibration of the board's own sensors, from the board file's folder: Kalibr camchain.yaml with imu_config.yaml
+    /// beside it, Basalt json, or the mav0 of a recording.
+    pub calibration: String,
 }
 
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

@@ -1,16 +1,18 @@
 //! `stipple check --dataset`: what a recording says of its own calibration.
 
-use crate::config::{Board, ReplayConfig, StereoConfig};
+use super::doctor::rotation::{compare, Comparison, Turning};
+use super::doctor::{signals, Check};
+use crate::config::{Board, FrontendConfig, ReplayConfig, StereoConfig};
 use crate::stereo::alignment::Alignment;
 use crate::stereo::rectify::Rectification;
 use std::path::Path;
-use stipple_drivers::replay::{OpenOptions, Recording};
-use stipple_drivers::{Fault, Frames, Image, Span};
+use stipple_drivers::replay::{OpenOptions, Reader, Recording};
+use stipple_drivers::{Fault, Frames, Image, Nanos, Span};
 
 /// Frames looked at, evenly over the recording.
 const LOOKED_AT: usize = 8;
 /// Half of what costs `bm` a third more error and 2 % of its pixels (hard_misaligned in `stipple bench stereo`).
-const ROWS_MAX_PX: f64 = 0.5;
+pub const ROWS_MAX_PX: f64 = 0.5;
 
 /// Says how far the rows of cameras 0 and 1 disagree after rectification.
 pub fn check_dataset(dataset: &Path, board: Option<&Board>) -> Result<(), Fault> {
@@ -38,6 +40,8 @@ pub fn check_dataset(dataset: &Path, board: Option<&Board>) -> Result<(), Fault>
         }
     }
     println!("{:<6} {} stereo frames, {read} looked at", "", recording.frames.len());
+    let frontend = board.map_or_else(FrontendConfig::default, |b| b.frontend.clone());
+    let turned = turned(&recording, &mut reader, &mut frames, &frontend)?;
     let corners = alignment.rows.len();
     match alignment.summary() {
         None => println!("{:<6} vertical disparity: only {corners} corners match, too few to say", "warn"),
@@ -50,5 +54,38 @@ pub fn check_dataset(dataset: &Path, board: Option<&Board>) -> Result<(), Fault>
             }
         }
     }
+    signals::turning(turned.as_ref()).iter().for_each(Check::print);
     Ok(())
+}
+
+/// Frames in order that are followed, from where the gyro turns most.
+const FOLLOWED: usize = 300;
+
+/// The rotation of camera 0 against the gyro's.
+fn turned(
+    recording: &Recording,
+    reader: &mut Reader,
+    frames: &mut Frames,
+    config: &FrontendConfig,
+) -> Result<Option<Comparison>, Fault> {
+    let rate = |t: Nanos| {
+        let at = recording.imu.partition_point(|s| s.t < t);
+        recording.imu.get(at).map_or(0.0, |s| s.gyro_body.length())
+    };
+    let rates: Vec<f64> = recording.frames.iter().map(|f| rate(f.t)).collect();
+    let n = FOLLOWED.min(rates.len());
+    let (mut first, mut most, mut sum) = (0, f64::MIN, rates[..n].iter().sum::<f64>());
+    for from in 0..=rates.len() - n {
+        if sum > most {
+            (first, most) = (from, sum);
+        }
+        sum += rates.get(from + n).copied().unwrap_or(0.0) - rates[from];
+    }
+    let mut turning = Turning::new(&recording.calibration, config)?;
+    for i in first..first + n {
+        if reader.read(i, frames).is_ok() {
+            turning.add(frames);
+        }
+    }
+    Ok(compare(&turning.rates, &recording.imu, recording.calibration.cameras[0].body_from_cam.q))
 }

@@ -7,12 +7,12 @@ use super::play::{realtime, Realtime};
 use super::progress::Progress;
 use super::sensors::Sensors;
 use super::tracking::{OdometryRun, Tracking};
-use super::{memory, record, summary};
+use super::{hardware, memory, record, summary};
 use crate::config::{Board, InjectConfig};
 use crate::output::OutputDir;
 use std::path::{Path, PathBuf};
 use stipple_drivers::record::Format;
-use stipple_drivers::{host, Calibration, Exit, Fault, Frames, TimedPose};
+use stipple_drivers::{host, Calibration, Fault, Frames, TimedPose};
 
 pub struct Run {
     /// Takes the place of the sensors, at its recorded pace.
@@ -34,13 +34,15 @@ pub struct Rig {
     /// At most.
     pub frames: usize,
     pub length_s: Option<f64>,
+    /// Frames a second, where they were asked for.
+    pub expected_hz: Option<f64>,
 }
 
 /// The sensors of a board, or the recording in their place.
 pub fn rig_of(path: &Path, board: &Board, options: &Run) -> Result<Rig, Fault> {
     match &options.dataset {
         Some(dataset) => recorded(dataset, board, options),
-        None => Err(no_sensors(path)),
+        None => hardware(path, board, options),
     }
 }
 
@@ -106,11 +108,37 @@ fn recorded(dataset: &Path, board: &Board, options: &Run) -> Result<Rig, Fault> 
     let shape = || Frames::in_colour(&calibration, colours);
     let sensors = Sensors::of_recording(source, stamps, imu, &InjectConfig::default(), shape);
     let length_s = Some(options.duration_s.map_or(length_s, |s| s.min(length_s)));
-    Ok(Rig { name, place, calibration, sensors, truth, opened: counters, warnings, frames, length_s })
+    Ok(Rig {
+        name,
+        place,
+        calibration,
+        sensors,
+        truth,
+        opened: counters,
+        warnings,
+        frames,
+        length_s,
+        expected_hz: None,
+    })
 }
 
-fn no_sensors(board: &Path) -> Fault {
-    let what = "names no sensors";
-    let fix = "write [camera] and [imu], or pass --dataset to run on a recording";
-    Fault::new(Exit::Config, board.display().to_string(), what, fix)
+/// Poses kept for the trajectory of a run without an end: half an hour at 30 Hz, 15 MiB. The run goes on past it.
+const POSES_KEPT: usize = 1 << 16;
+
+fn hardware(path: &Path, board: &Board, options: &Run) -> Result<Rig, Fault> {
+    let (calibration, sensors) = hardware::open(path, board)?;
+    // A rate that the camera made a little higher is no reason to lose the end.
+    let asked = options.duration_s.map_or(f64::INFINITY, |s| 1.2 * s * board.camera.rate_hz + 100.0);
+    Ok(Rig {
+        name: board.name.clone(),
+        place: path.display().to_string(),
+        calibration,
+        sensors,
+        truth: vec![],
+        opened: vec![],
+        warnings: vec![],
+        frames: POSES_KEPT.min(asked as usize),
+        length_s: options.duration_s,
+        expected_hz: Some(board.camera.rate_hz),
+    })
 }

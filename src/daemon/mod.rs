@@ -9,6 +9,7 @@
 //! | or frontend | follows points (`frontend.threads = 2`) | sealed |
 //! | and estimator | estimates, one frame behind at most; offers keyframes | sealed |
 //! | mapping | rectification, depth, training; low priority, as are the CPU device's own threads | sealed; OpenCV and the driver allocate behind it |
+//! | trigger | starts the cameras' exposures, where a line is wired for it | free |
 //! | writer | writes what is recorded, if anything is; low priority | free |
 //!
 //! In lockstep pace the main thread is both sensors and mapping too.
@@ -19,7 +20,9 @@
 //! the cameras end, tracking drains and ends, mapping ends with the run's time.
 
 mod dataset;
+mod doctor;
 mod faults;
+mod hardware;
 mod input;
 mod live;
 mod lockstep;
@@ -35,6 +38,7 @@ mod tracking;
 mod watch;
 
 pub use dataset::check_dataset;
+pub use doctor::doctor;
 pub use faults::faults;
 pub use live::{run as run_sensors, Run};
 pub use play::Pace;

@@ -1,0 +1,121 @@
+//! `stipple doctor` and `stipple check --dataset` on recordings in the place of sensors: a whole one passes, and one with an
+//! axis of the gyro turned round, a clock that is off, or its cameras exchanged is told so.
+#![allow(clippy::unwrap_used)]
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+const BOARD: &str = "board-configs/lavapipe.toml";
+const UNAVAILABLE: i32 = 69;
+
+fn stipple(args: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_stipple")).args(args).current_dir(env!("CARGO_MANIFEST_DIR")).output().unwrap()
+}
+
+fn text(o: &Output) -> String {
+    String::from_utf8_lossy(&o.stderr).into_owned() + &String::from_utf8_lossy(&o.stdout)
+}
+
+fn flight(dir: &Path, more: &[&str]) -> PathBuf {
+    let out = dir.join("flight");
+    let args = [&["sim", "demo", "--duration", "7", "--out", out.to_str().unwrap()], more].concat();
+    let o = stipple(&args);
+    assert!(o.status.success(), "{}", text(&o));
+    out
+}
+
+fn doctor(data: &Path) -> Output {
+    stipple(&["doctor", BOARD, "--dataset", data.to_str().unwrap(), "--set", "map.enabled=false"])
+}
+
+fn check(data: &Path) -> String {
+    let o = stipple(&["check", "--dataset", data.to_str().unwrap()]);
+    assert!(o.status.success(), "{}", text(&o));
+    text(&o)
+}
+
+/// The line that speaks of `what` and its verdict.
+fn verdict<'a>(said: &'a str, what: &str) -> (&'a str, &'a str) {
+    let line = said.lines().find(|l| l.contains(what)).unwrap_or_else(|| panic!("{what}: {said}"));
+    (line.split_whitespace().next().unwrap(), line)
+}
+
+/// Every sample's gyro and force along y the other way round.
+fn turn_y_round(data: &Path) {
+    let file = data.join("mav0/imu0/data.csv");
+    let turned = |line: &str| {
+        let mut fields: Vec<String> = line.split(',').map(str::to_string).collect();
+        for y in [2, 5] {
+            let value: f64 = fields[y].parse().unwrap();
+            fields[y] = format!("{}", -value);
+        }
+        fields.join(",")
+    };
+    let rows = fs::read_to_string(&file).unwrap();
+    let rows: Vec<String> = rows.lines().map(|l| if l.starts_with('#') { l.into() } else { turned(l) }).collect();
+    fs::write(&file, rows.join("\n")).unwrap();
+}
+
+#[test]
+fn a_whole_recording_passes_every_check() {
+    let dir = tempfile::tempdir().unwrap();
+    let data = flight(dir.path(), &[]);
+    let (said, o) = (check(&data), doctor(&data));
+    for words in ["time offset", "axes", "extrinsics", "vertical disparity"] {
+        assert_eq!(verdict(&said, words).0, "ok", "{said}");
+    }
+    let said = text(&o);
+    assert!(o.status.success() && !said.contains("fail"), "{said}");
+    let all =
+        ["camera rate", "inertial rate", "left and right", "camera 0: mean", "camera 1: mean", "stereo", "gravity"];
+    let more =
+        ["gyro noise", "accelerometer noise", "saturation", "time offset", "axes", "extrinsics", "memory", "disk"];
+    for words in all.iter().chain(&more).filter(|w| **w != "disk") {
+        assert_eq!(verdict(&said, words).0, "ok", "{words}: {said}");
+    }
+}
+
+#[test]
+fn an_axis_turned_round_is_named() {
+    let dir = tempfile::tempdir().unwrap();
+    let data = flight(dir.path(), &[]);
+    turn_y_round(&data);
+    let said = check(&data);
+    let (verdict, line) = verdict(&said, "axes");
+    assert!(verdict == "fail" && line.contains("gyro's y axis has the wrong sign"), "{said}");
+}
+
+#[test]
+fn a_clock_twenty_milliseconds_off_is_measured() {
+    let dir = tempfile::tempdir().unwrap();
+    let data = flight(dir.path(), &["--time-offset", "0.02"]);
+    let said = check(&data);
+    let (verdict, line) = verdict(&said, "time offset");
+    let ms: f64 = line.split("clock is ").nth(1).unwrap().split(' ').next().unwrap().parse().unwrap();
+    assert!(verdict == "fail" && (ms - 20.0).abs() < 2.5, "{said}");
+}
+
+#[test]
+fn cameras_exchanged_are_told_and_the_doctor_says_no() {
+    let dir = tempfile::tempdir().unwrap();
+    let data = flight(dir.path(), &[]);
+    let mav = data.join("mav0");
+    for name in ["data", "data.csv"] {
+        fs::rename(mav.join("cam0").join(name), mav.join("other")).unwrap();
+        fs::rename(mav.join("cam1").join(name), mav.join("cam0").join(name)).unwrap();
+        fs::rename(mav.join("other"), mav.join("cam1").join(name)).unwrap();
+    }
+    let o = doctor(&data);
+    let said = text(&o);
+    assert_eq!(o.status.code(), Some(UNAVAILABLE), "{said}");
+    let (verdict, line) = verdict(&said, "stereo:");
+    assert!(verdict == "fail" && line.contains("swapped"), "{said}");
+}
+
+#[test]
+fn a_board_without_sensors_is_told_what_to_write() {
+    let o = stipple(&["doctor", BOARD, "--set", "map.enabled=false"]);
+    assert_eq!(o.status.code(), Some(UNAVAILABLE), "{}", text(&o));
+    assert!(verdict(&text(&o), "sensors").0 == "fail" && text(&o).contains("[camera]"), "{}", text(&o));
+}
