@@ -355,46 +355,6 @@ fn uvc_a_silent_camera_is_opened_again_and_what_is_not_there_is_refused() {
     assert!(line(Settings { exposure: Span(MS), ..asked }).contains("exposure"));
 }
 
-#[test]
-#[ignore = "needs uvcvideo: make hil"]
-fn uvc_cost_of_a_frame() {
-    const FPS: u32 = 4;
-    let (w, h) = (752, 480);
-    for format in ["grey", "y12", "yuyv", "mjpeg"] {
-        let _camera = Uvc::plug(0, "C1", format, w, h, FPS);
-        let calibration = rig_of(1, w, h);
-        let mut rig = open(&settings(&["serial:C1"], w, h, FPS), &calibration);
-        let mut frames = Frames::for_rig(&calibration);
-        (0..3).for_each(|_| next(&mut rig, &mut frames, no_loss));
-        // The machine's processor is taken away from it at times, and its clock runs on: the least is nearest the truth.
-        let (from, mut to) = (vec![1u8; w * h], vec![0u8; w * h]);
-        let copy = least_us(|| {
-            to.copy_from_slice(std::hint::black_box(&from));
-            std::hint::black_box(&to);
-        });
-        let least = least_us(|| next(&mut rig, &mut frames, no_loss));
-        println!("a frame of {format} {w}x{h}: {least:.0} us of this thread; a copy of as many bytes {copy:.0} us");
-    }
-}
-
-/// Processor time of this thread.
-fn thread_cpu_us() -> f64 {
-    let mut t = libc::timespec { tv_sec: 0, tv_nsec: 0 };
-    // SAFETY: `t` outlives the call.
-    unsafe { libc::clock_gettime(libc::CLOCK_THREAD_CPUTIME_ID, &mut t) };
-    t.tv_sec as f64 * 1e6 + t.tv_nsec as f64 * 1e-3
-}
-
-/// The least that a call takes of this thread.
-fn least_us(mut work: impl FnMut()) -> f64 {
-    let mut once = |_| {
-        let before = thread_cpu_us();
-        work();
-        thread_cpu_us() - before
-    };
-    (0..16).map(&mut once).fold(f64::INFINITY, f64::min)
-}
-
 /// vivid's first node of the multi-planar API.
 fn vivid(format: Format) -> Settings {
     let mut s = settings(&["bus:platform:vivid-000"], 640, 360, 10);

@@ -435,9 +435,7 @@ impl Rig {
             if remaining.0 <= 0 && !any {
                 return Ok(false);
             }
-            if !any {
-                self.wait(remaining)?;
-            }
+            self.wait(remaining)?;
         }
     }
 }
