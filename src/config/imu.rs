@@ -162,7 +162,7 @@ pub struct GpioConfig {
 }
 
 /// The line on which an inertial unit that we drive says that a sample is ready; of a unit with two dies the gyro's.
-/// Without it samples are stamped by the times of reading, 0.2 ms worse.
+/// Without it samples are stamped by the times of reading: within 0.2 ms on a bus that is served in time.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct DataReadyConfig {
@@ -196,7 +196,7 @@ impl Default for TriggerConfig {
     }
 }
 
-/// A light that is on while odometry is well.
+/// A light that is on while frames are tracked.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct LedConfig {

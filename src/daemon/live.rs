@@ -77,7 +77,7 @@ pub fn run(path: &Path, out: &Path, set: &[String], options: &Run) -> Result<(),
         truth: rig.truth,
         opened: rig.opened,
     };
-    let mut progress = Progress::new(rig.length_s);
+    let mut progress = Progress::new(rig.length_s).lit(board.gpio.led())?;
     let realtime_options =
         Realtime { holdout: 0, duration_s: None, sensors_s: options.duration_s, stop: host::stop_asked_for() };
     let mut played = realtime(sensors, &rig.calibration, tracking, mapping, &realtime_options, &mut progress);
