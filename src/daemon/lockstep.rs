@@ -16,7 +16,7 @@ use crate::counters::Counters;
 use crossbeam_queue::ArrayQueue;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::time::{Duration, Instant};
-use stipple_drivers::ImuSample;
+use stipple_drivers::{ImuSample, Span};
 
 /// Frames in memory at once: 24 MiB of two 752x480 cameras. What the threads of tracking lose at its ends is
 /// one stage of one frame in so many.
@@ -41,6 +41,7 @@ pub fn lockstep(
     let (over, ended, bell, pipeline) =
         (AtomicBool::new(false), AtomicBool::new(false), Bell::default(), Pipeline::new());
     let start = Instant::now();
+    let mut iterated = 0;
     std::thread::scope(|scope| {
         let (taken, given, rung) = (&waiting, &done, &bell);
         let give = move |slot| {
@@ -61,14 +62,28 @@ pub fn lockstep(
                 keyframes.pass_on(&slot, queue.as_ref(), &counters);
                 gauges.frames.fetch_add(1, Relaxed);
                 gauges.keyframes.store(keyframes.count, Relaxed);
-                gauges.played_ms.store(((slot.frames.t - input.stamps[0]).secs() * 1e3) as u64, Relaxed);
+                let slot_t = slot.frames.t;
+                gauges.played_ms.store(((slot_t - input.stamps[0]).secs() * 1e3) as u64, Relaxed);
                 slots.push(slot);
                 if let (Some(m), Some(queue)) = (&mut mapping, &queue) {
-                    drain(queue, m);
+                    // A device so slow has done what was due before this frame came.
+                    let ahead = options.lockstep_iterations_per_s > 0.0;
+                    if !ahead {
+                        drain(queue, m);
+                    }
                     let played = gauges.frames.load(Relaxed) as f64 / total as f64;
                     match options.mapping_s {
                         Some(s) => work_until(m, s * played, &gauges),
-                        None => steps(m, u64::from(options.lockstep_iterations), start, &gauges),
+                        None => {
+                            let due = options.steps_due(gauges.frames.load(Relaxed), slot_t - input.stamps[0]);
+                            let t_s =
+                                if ahead { (slot_t - input.stamps[0]).secs() } else { start.elapsed().as_secs_f64() };
+                            steps(m, due - iterated, t_s, &gauges);
+                            iterated = due;
+                        }
+                    }
+                    if ahead {
+                        drain(queue, m);
                     }
                 }
                 progress.show(&gauges);
@@ -80,7 +95,7 @@ pub fn lockstep(
             Some(s) => work_until(m, s, &gauges),
             None => {
                 for _ in 0..extra_iterations(&input, total, options) {
-                    steps(m, 1, start, &gauges);
+                    steps(m, 1, start.elapsed().as_secs_f64(), &gauges);
                     progress.show(&gauges);
                 }
             }
@@ -103,11 +118,11 @@ pub fn lockstep(
     }
 }
 
-fn steps(m: &mut Mapping, n: u64, start: Instant, gauges: &Gauges) {
+fn steps(m: &mut Mapping, n: u64, t_s: f64, gauges: &Gauges) {
     for _ in 0..n {
         m.step(Instant::now(), gauges);
     }
-    m.sample_if_due(start.elapsed().as_secs_f64(), gauges);
+    m.sample_if_due(t_s, gauges);
 }
 
 /// Maps until `busy_s` seconds of it are done; what is left over by a map that has nothing to do stays for later frames.
@@ -166,7 +181,7 @@ fn extra_iterations(input: &Input, total: usize, options: &Play) -> u64 {
     match options.duration_s {
         Some(s) if s > length_s && total > 1 && length_s > 0.0 => {
             let frames = (s - length_s) * (total - 1) as f64 / length_s;
-            frames as u64 * u64::from(options.lockstep_iterations)
+            options.steps_due(frames as u64, Span::from_secs(s - length_s))
         }
         _ => 0,
     }

@@ -173,6 +173,7 @@ fn run(mut input: Input, place: &str, board: &Board, out: &OutputDir, options: &
         holdout: options.holdout,
         duration_s: options.duration_s,
         lockstep_iterations: board.map.lockstep_iterations,
+        lockstep_iterations_per_s: board.map.lockstep_iterations_per_s,
         inject: board.inject.clone(),
         mapping_s: options.mapping_s,
     };

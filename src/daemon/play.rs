@@ -18,7 +18,7 @@ use crate::mem::{seal_thread, unsealed};
 use std::sync::atomic::{AtomicBool, Ordering, Ordering::Relaxed};
 use std::time::{Duration, Instant};
 use stipple_drivers::paced::FRAMES_UNREADABLE;
-use stipple_drivers::{Calibration, Fault, Frames, Nanos, Pose};
+use stipple_drivers::{Calibration, Fault, Frames, Nanos, Pose, Span};
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 pub enum Pace {
@@ -34,11 +34,23 @@ pub struct Play {
     pub holdout: u32,
     /// Ends the run after this time of the recording; past its end the mapper goes on alone.
     pub duration_s: Option<f64>,
+    /// In lockstep: mapper iterations a frame, or where not zero, a second of the recording.
     pub lockstep_iterations: u32,
+    pub lockstep_iterations_per_s: f64,
     /// At recorded pace: what goes wrong with the sensors.
     pub inject: InjectConfig,
     /// In lockstep: instead of iterations, an equal part of these seconds of mapping a frame.
     pub mapping_s: Option<f64>,
+}
+
+impl Play {
+    /// Mapper iterations due in lockstep after so many frames that span so much time.
+    pub fn steps_due(&self, frames: u64, since_first: Span) -> u64 {
+        match self.lockstep_iterations_per_s {
+            rate if rate > 0.0 => (rate * since_first.secs().max(0.0)) as u64,
+            _ => frames * u64::from(self.lockstep_iterations),
+        }
+    }
 }
 
 pub struct Played {
