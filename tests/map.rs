@@ -81,9 +81,15 @@ fn fisheye_anchors_are_densified_and_drawn_to_their_depth() {
     let (calibration, keyframes, distances) = fisheye_flight(4);
     let run = |densify: u32, depth: f64| {
         let (densify, depth) = (format!("map.densify_max={densify}"), format!("map.depth_weight={depth}"));
-        // By alpha alone, or seeds come where densification would put its own; poses and exposures are true as they are.
+        // By alpha alone, or seeds come where densification would put its own, and as many as are asked for; poses and
+        // exposures are true as they are.
         let mut settings = vec!["map.scale=4", "map.projection=fisheye", "map.seeds_per_anchor=1500", &densify, &depth];
-        settings.extend(["map.wrong_error=1", "map.refine_pose=false", "map.refine_exposure=false"]);
+        settings.extend([
+            "map.wrong_error=1",
+            "map.seeds_per_step=0",
+            "map.refine_pose=false",
+            "map.refine_exposure=false",
+        ]);
         let mut mapper = Mapper::open(&calibration, &board(&settings)).unwrap();
         for k in &keyframes {
             mapper.offer(k);

@@ -38,10 +38,8 @@ pub struct MapConfig {
     /// 22.18. On lavapipe at 40 steps a keyframe, 16 k: 26.28 and 22.26, 26.49 and 22.88, 26.17 and 22.89.
     pub wrong_error: f64,
     /// A view that is only wrong becomes an anchor when this many steps were taken since the last one: seeds nothing trains
-    /// are a loss. V1_01 on lavapipe, scale 4, 16 k, at 12 steps a keyframe: by alpha alone 23.91 dB and 21.79 held out; with
-    /// wrong views after 0 steps 21.78 and 20.89, 30: 22.96 and 21.39, 80: 23.14 and 21.16, 200: 23.90 and 21.96; at 40
-    /// steps a keyframe 26.28 and 22.26 by alpha alone, 26.73 and 23.08, 40: 26.63 and 23.23, 80: 27.20 and 23.37, 160:
-    /// 26.15 and 22.53.
+    /// are a loss. V1_01 at 28 steps a second (scale 2, 60 k): after 80 steps 23.24 dB and 21.01 held out, 200: 24.43 and
+    /// 20.79, 400: 23.78 and 20.20; at 150 steps a keyframe (52 k): 30.19 and 23.25, 29.96 and 23.31, 29.96 and 23.24.
     pub wrong_after_steps: u32,
     /// Occupancy grid cell, m, and its capacity (cells).
     pub occupancy_cell_m: f64,
@@ -53,12 +51,12 @@ pub struct MapConfig {
     /// Gaussians an anchor may seed.
     pub seeds_per_anchor: u32,
     /// Gaussians it may seed, and then add by densification, for every training step that keyframes got so far on average;
-    /// 0: no limit. `bench map` of V1_01 on lavapipe, scale 4, 12 s, caps of 20, 52, 100 and 200 k: without it 21.86, 19.31,
-    /// 17.06 and 17.55 dB; at 100 23.07, 22.28, 21.31 and 22.76; at 50 23.32, 22.94 and 22.73. Off all the same: V1_01 in
-    /// recorded pace at scale 2 was as good with it until the flight's last seconds, full of keyframes, and then ended at
-    /// 19.3 (50) and 19.6 dB (100) instead of 23.1, one run each, for a reason not understood.
+    /// 0: no limit. More make every later step dearer and are not trained themselves. V1_01 at 28 steps a second (scale 2, a
+    /// pool of 60 k): 24.43 dB and 20.79 held out without, 24.64 and 21.29 at 50 with three quarters of the Gaussians, 23.98
+    /// and 20.95 at 25 with half; every seventh and ninth view held out instead: 25.03 and 20.42, 24.72 and 21.04 without,
+    /// 24.98 and 20.22, 25.02 and 20.92 at 50.
     pub seeds_per_step: u32,
-    /// Steps on a new anchor alone before uniform sampling resumes.
+    /// Steps for a new anchor, every other on its view, before uniform sampling resumes.
     pub burst_iterations: u32,
     /// Learning rates of such a step over those of others.
     pub burst_rate: f64,
@@ -127,12 +125,12 @@ impl Default for MapConfig {
             anchor_missing_min: 0.05,
             covered_alpha: 0.05,
             wrong_error: 0.25,
-            wrong_after_steps: 80,
+            wrong_after_steps: 200,
             occupancy_cell_m: 0.1,
             occupancy_cells: 1 << 18,
             move_tolerance: 0.02,
             seeds_per_anchor: 8192,
-            seeds_per_step: 0,
+            seeds_per_step: 50,
             burst_iterations: 20,
             burst_rate: 1.0,
             densify_max: 4096,
