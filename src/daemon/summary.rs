@@ -8,7 +8,7 @@ use crate::mem;
 use crate::output::html::{write_html, Evidence};
 use crate::output::metrics::{percentile, trajectory_error, TrajectoryError};
 use crate::output::panel::{panel, Picture, View};
-use crate::output::report::{CurvePoint, ExtrinsicsFound, KernelTime, Report};
+use crate::output::report::{seconds_to, CurvePoint, ExtrinsicsFound, KernelTime, Report, GOOD_DB};
 use crate::output::{atomically, ply, process, trajectory, OutputDir};
 use crate::vio::rig::RigEstimate;
 use stipple_drivers::{Fault, Nanos, TimedPose};
@@ -57,6 +57,7 @@ pub fn conclude(title: Title, mut played: Played, out: &OutputDir) -> Result<Rep
         report.gpu_bytes = Some(m.mapper.gpu_bytes());
         report.device = Some(m.mapper.device().to_string());
         report.curve = m.curve.iter().map(curve_point).collect();
+        report.seconds_to_25_db = seconds_to(&report.curve, GOOD_DB);
         report.kernels = m.mapper.kernel_times().into_iter().map(kernel_time).collect();
         report.kernels.sort_by(|a, b| b.total_ms.total_cmp(&a.total_ms));
         if m.failure.is_none() {

@@ -6,7 +6,7 @@
 use super::chart::{bars, escape, histogram, Chart, Series};
 use super::metrics::{percentile, TrajectoryError};
 use super::panel::Picture;
-use super::report::{KernelTime, Report};
+use super::report::{KernelTime, Report, GOOD_DB};
 use glam::DVec3;
 use std::fmt::Write;
 use std::io;
@@ -95,7 +95,7 @@ fn tables(report: &Report) -> String {
         ("Quality, lowest", n(report.quality_min.map(u64::from)), "of 100"),
         ("Frames of quality under 50", f(report.quality_under_50.map(|v| 100.0 * v), 1), "%"),
     ];
-    let map: [Row; 11] = [
+    let map: [Row; 12] = [
         ("PSNR, training views", f(report.psnr_db, 2), "dB"),
         ("PSNR, held-out views", f(report.psnr_heldout_db, 2), "dB"),
         ("PSNR, held-out, pose between neighbours", f(report.psnr_heldout_between_db, 2), "dB"),
@@ -107,6 +107,7 @@ fn tables(report: &Report) -> String {
         ("Gaussians", n(report.splats), ""),
         ("Iterations", n(report.iterations), ""),
         ("Iteration time, median", f(report.iteration_ms_p50, 1), "ms"),
+        ("Time until training views stay at 25 dB", f(report.seconds_to_25_db, 0), "s"),
     ];
     let cost: [Row; 7] = [
         ("Run time", f(report.wall_s, 1), "s"),
@@ -178,6 +179,7 @@ fn mapping(report: &Report) -> [Option<String>; 4] {
             line("training views", 1, of(&|i| curve[i].psnr_db)),
             line("held-out views", 2, of(&|i| curve[i].psnr_heldout_db)),
         ],
+        levels: report.seconds_to_25_db.map(|_| ("25 dB", GOOD_DB)).into_iter().collect(),
         ..Chart::default()
     };
     let count = |title, value: &dyn Fn(usize) -> f64| Chart {

@@ -71,6 +71,8 @@ pub struct Report {
     pub splats: Option<u64>,
     pub iterations: Option<u64>,
     pub iteration_ms_p50: Option<f64>,
+    /// Run time from which on no probe of the curve was under `GOOD_DB`.
+    pub seconds_to_25_db: Option<f64>,
 
     pub gpu_bytes: Option<u64>,
     /// Tracker and estimator, whole.
@@ -120,6 +122,15 @@ pub struct KernelTime {
 
 const COUNT: &str = "count_";
 
+/// What the published method reaches on EuRoC's V1_01 when the flight is over; dB on training views.
+pub const GOOD_DB: f64 = 25.0;
+
+/// The first point of the curve from which on training views stay at `db`; `None` where they end below it.
+pub fn seconds_to(curve: &[CurvePoint], db: f64) -> Option<f64> {
+    let good = curve.iter().rev().take_while(|c| c.psnr_db.is_none_or(|p| p >= db));
+    good.filter(|c| c.psnr_db.is_some()).last().map(|c| c.t_s)
+}
+
 impl Report {
     pub fn set_counters(&mut self, counters: &[(&str, u64)]) {
         self.counts = counters.iter().map(|(name, n)| (format!("{COUNT}{name}"), *n)).collect();
@@ -151,7 +162,7 @@ mod tests {
         "frames keyframes anchors frames_dropped ate_rmse_m rte_1s_m rpe_deg tracking_fps tracking_ms_p50 \
         tracking_ms_p99 tracking_threads tracking_cpu_ms frontend_ms_p50 frontend_ms_p99 estimator_ms_p50 \
         estimator_ms_p99 psnr_db ssim psnr_heldout_db ssim_heldout psnr_heldout_between_db psnr_heldout_fitted_db ssim_heldout_fitted psnr_heldout_aligned_db splats iterations \
-        iteration_ms_p50 gpu_bytes estimator_bytes quality_min quality_p50 quality_under_50 rss_peak_bytes heap_after_seal wall_s device vio_hash dataset board pace scale \
+        iteration_ms_p50 seconds_to_25_db gpu_bytes estimator_bytes quality_min quality_p50 quality_under_50 rss_peak_bytes heap_after_seal wall_s device vio_hash dataset board pace scale \
         time_offset_s time_offset_sigma_s gyro_scale gyro_scale_sigma accel_scale accel_scale_sigma";
 
     #[test]
@@ -191,6 +202,21 @@ mod tests {
         assert_eq!(nested.count(), 0);
         assert_eq!(serde_json::from_slice::<Report>(&bytes).unwrap(), report);
         assert_eq!(report.counted().collect::<Vec<_>>(), [("outliers", 7), ("health_imu_gap_frames", 3)]);
+    }
+
+    #[test]
+    fn time_to_25_db_is_the_last_time_it_was_reached() {
+        let curve = |points: &[(f64, Option<f64>)]| -> Option<f64> {
+            let of = |&(t_s, psnr_db): &(f64, Option<f64>)| CurvePoint { t_s, psnr_db, ..CurvePoint::default() };
+            seconds_to(&points.iter().map(of).collect::<Vec<_>>(), GOOD_DB)
+        };
+        assert_eq!(
+            curve(&[(0.0, None), (5.0, Some(26.0)), (10.0, Some(24.0)), (15.0, Some(25.0)), (20.0, Some(30.0))]),
+            Some(15.0)
+        );
+        assert_eq!(curve(&[(5.0, Some(26.0)), (10.0, None)]), Some(5.0));
+        assert_eq!(curve(&[(5.0, Some(26.0)), (10.0, Some(24.9))]), None);
+        assert_eq!(curve(&[]), None);
     }
 
     #[test]
