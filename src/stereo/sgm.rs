@@ -9,6 +9,11 @@
 //!
 //! There is no volume of costs: the eight passes over the one volume of sums count Hamming distances anew. When the sums are
 //! read they are free, and what the filter needs lies where they were.
+//! Where the picture shows little but noise, a census finds noise: on simulated flights 19 to 26 % of what both eyes see is left
+//! unknown, and 60 to 77 % of what is bad by 1 px after the filter was filled in there, three in five of it where the
+//! picture's slope is under two grey levels. OpenCV's block matching and filter, which weigh differences by their size, are
+//! right at four of five of all these bad ones, and so have fewer bad pixels on nine of ten flights, though not on cones and teddy.
+//!
 //! All until the filter is integers, and no sum depends on the order of threads: the result is the same in every run.
 
 use super::rectify_gpu::{pack, Rectifier};

@@ -7,8 +7,8 @@
 //! - `residual_variance` is that of error / stated deviation over visible pixels whose error is at most
 //!   `GROSS_PX`, `judged` of them; what is beyond is a wrong match, which no deviation of a right one describes. Such errors
 //!   are as long as the range of disparities allows, so a few in a thousand would alone make the variance any number; their
-//!   share is given as `gross` (0.0 to 0.7 % on simulated flights). Who uses a deviation must bear them by other means: a
-//!   map's loss that is linear beyond a deviation or two, or a gate. What is filled in for hidden pixels is not judged.
+//!   share is given as `gross` (at most 0.5 % in any range of the simulated flights). Who uses a deviation must bear them
+//!   by other means: a loss that is linear beyond a deviation or two, or a gate.
 
 use super::sets::Pair;
 use crate::stereo::Disparity;
