@@ -177,6 +177,15 @@ fn missing_file_is_named() {
 }
 
 #[test]
+fn the_example_of_sensors_fits_a_board() {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("board-configs");
+    let sensors = std::fs::read_to_string(folder.join("sensors.example")).unwrap();
+    let board = parse(&format!("{BOARD}{sensors}"), &[]).unwrap();
+    assert_eq!((board.camera.devices.len(), board.camera.controls["gain"]), (2, 16));
+    assert_eq!(parse(&toml::to_string(&board).unwrap(), &[]).unwrap(), board);
+}
+
+#[test]
 fn written_and_read_again_a_board_is_the_same() {
     let board = parse(BOARD, &[]).unwrap();
     assert_eq!(parse(&toml::to_string(&board).unwrap(), &[]).unwrap(), board);
