@@ -37,7 +37,9 @@ fn check(data: &Path) -> String {
 
 /// The line that speaks of `what` and its verdict.
 fn verdict<'a>(said: &'a str, what: &str) -> (&'a str, &'a str) {
-    let line = said.lines().find(|l| l.contains(what)).unwrap_or_else(|| panic!("{what}: {said}"));
+    let first = |l: &str| l.split_whitespace().next().map(str::to_string).unwrap_or_default();
+    let judges = |l: &&str| ["ok", "warn", "fail"].contains(&first(l).as_str());
+    let line = said.lines().filter(judges).find(|l| l.contains(what)).unwrap_or_else(|| panic!("{what}: {said}"));
     (line.split_whitespace().next().unwrap(), line)
 }
 
