@@ -126,7 +126,8 @@ pub fn panel(view: &View) -> Picture {
     picture.paste(column(1), top, w, (0..w * h).map(|i| rendered(view, i).map(byte)));
     let error = |i: usize| {
         let (a, b) = (observed(view, i), rendered(view, i));
-        let mean = (0..3).map(|c| (a[c] - b[c]).abs()).sum::<f32>() / 3.0;
+        // As PSNR counts it: a window brighter than the image can be is no error.
+        let mean = (0..3).map(|c| (a[c] - b[c].clamp(0.0, 1.0)).abs()).sum::<f32>() / 3.0;
         if compared(i) {
             ramp(&ERROR_RAMP, mean / ERROR_FULL)
         } else {
