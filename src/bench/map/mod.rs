@@ -25,6 +25,8 @@ const ABLATED_CAP: u32 = 52_000;
 const INTERSECTIONS: u32 = 15;
 /// At least, whatever the cap.
 const INTERSECTIONS_MIN: u32 = 300_000;
+/// Points of each run's curve.
+const PROBES: f64 = 20.0;
 /// The caps are what is limited here.
 const MEMORY_MAX_MIB: u32 = 8192;
 
@@ -45,16 +47,24 @@ const LINES: [Variant; 2] = [
     variant("default", "the board's own settings", &[]),
     variant(
         "as published",
-        "seeds and densifies up to the cap, never evicts; a raised burst and a convergence interval",
-        &["map.evict=false", "map.growth_stops=false", "map.burst_rate=2", "map.converge_iterations_max=50"],
+        "anchors by alpha; seeds and densifies up to the cap, never evicts; a raised burst and a convergence interval",
+        &[
+            "map.evict=false",
+            "map.growth_stops=false",
+            "map.seeds_per_step=0",
+            "map.wrong_error=1",
+            "map.burst_rate=2",
+            "map.converge_iterations_max=50",
+        ],
     ),
 ];
 
 /// What the map is without, or with, one part. The first row of the table is the default.
-const ABLATIONS: [Variant; 13] = [
+const ABLATIONS: [Variant; 14] = [
     variant("no burst", "a new anchor waits for its turn", &["map.burst_iterations=0"]),
     variant("no densification", "seeds on bare depth only", &["map.densify_max=0"]),
     variant("no eviction", "a full pool takes no more", &["map.evict=false"]),
+    variant("any seeds", "as many as the pool has room for, whatever the steps", &["map.seeds_per_step=0"]),
     variant("convergence", "an anchor is trained on alone until it settles", &["map.converge_iterations_max=50"]),
     variant("anchors by alpha", "covered but wrong views are not anchors", &["map.wrong_error=1"]),
     variant("no SSIM", "L1 alone", &["map.ssim_weight=0"]),
@@ -107,7 +117,7 @@ pub fn map(
     let start = Instant::now();
     let measure = |folder: &str, variant: Variant, cap: u32| -> Result<Row, Fault> {
         let name = format!("{folder}-{}-{cap}", variant.name.replace(' ', "-"));
-        let set = assignments(&variant, cap);
+        let set = assignments(&variant, cap, seconds);
         let dir = OutputDir::create(&out.join("runs").join(name))?;
         let report = run(&Job { set: &set, seconds, quick: options.quick }, &dir)?;
         let db = |v: Option<f64>| v.map_or("-".into(), |v| format!("{v:.2} dB"));
@@ -142,12 +152,13 @@ pub fn map(
     Ok(())
 }
 
-fn assignments(variant: &Variant, cap: u32) -> Vec<String> {
+fn assignments(variant: &Variant, cap: u32, seconds: f64) -> Vec<String> {
     let intersections = (INTERSECTIONS * cap).max(INTERSECTIONS_MIN);
     let shape = [
         format!("memory_max_mib={MEMORY_MAX_MIB}"),
         format!("budget.intersections={intersections}"),
         format!("budget.splats={cap}"),
+        format!("map.curve_period_s={}", seconds / PROBES),
     ];
     shape.into_iter().chain(variant.set.iter().map(|s| s.to_string())).collect()
 }
@@ -171,11 +182,11 @@ mod tests {
                 .expect("variants stay within the bounds")
         };
         for cap in CAPS.iter().chain(&QUICK_CAPS) {
-            assert_eq!(board(&assignments(&LINES[0], *cap)).budget.splats, *cap);
+            assert_eq!(board(&assignments(&LINES[0], *cap, 1.0)).budget.splats, *cap);
         }
-        let default = board(&assignments(&LINES[0], ABLATED_CAP));
+        let default = board(&assignments(&LINES[0], ABLATED_CAP, 1.0));
         for v in LINES[1..].iter().chain(&ABLATIONS) {
-            assert_ne!(board(&assignments(v, ABLATED_CAP)), default, "{}", v.name);
+            assert_ne!(board(&assignments(v, ABLATED_CAP, 1.0)), default, "{}", v.name);
         }
     }
 }
