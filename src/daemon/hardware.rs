@@ -45,6 +45,8 @@ pub fn open(path: &Path, board: &Board) -> Result<(Calibration, Sensors), Fault>
 fn calibration(path: &Path, board: &Board) -> Result<Calibration, Fault> {
     let folder = path.parent().unwrap_or(Path::new(""));
     let mut calibration = read_calibration(&folder.join(&board.rig.calibration))?;
+    // Noise densities are the unit's; how often it is read here is the board's word.
+    calibration.imu.rate_hz = board.imu.rate_hz;
     if board.rig.readout_s > 0.0 {
         calibration.cameras.iter_mut().for_each(|c| c.readout = Span::from_secs(board.rig.readout_s));
     }
