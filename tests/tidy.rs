@@ -335,7 +335,7 @@ fn nothing_is_left_for_later_and_no_machine_is_named() {
     none(offences);
 }
 
-/// Whether an absolute path begins with `prefix`; "tests/../work/" is not one.
+/// Whether an absolute path begins with `prefix`; where it stands within a relative one it does not count.
 fn names_path(line: &str, prefix: &str) -> bool {
     line.match_indices(prefix).any(|(at, _)| !line[..at].ends_with(|c: char| c.is_alphanumeric() || "._-}".contains(c)))
 }

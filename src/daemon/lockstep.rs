@@ -41,7 +41,8 @@ pub fn lockstep(
     let (over, ended, bell, pipeline) =
         (AtomicBool::new(false), AtomicBool::new(false), Bell::default(), Pipeline::new());
     let start = Instant::now();
-    let mut iterated = 0;
+    let ahead = options.mapping_s.is_none() && options.lockstep_iterations_per_s > 0.0;
+    let (mut iterated, mut played_s) = (0, 0.0);
     std::thread::scope(|scope| {
         let (taken, given, rung) = (&waiting, &done, &bell);
         let give = move |slot| {
@@ -62,12 +63,12 @@ pub fn lockstep(
                 keyframes.pass_on(&slot, queue.as_ref(), &counters);
                 gauges.frames.fetch_add(1, Relaxed);
                 gauges.keyframes.store(keyframes.count, Relaxed);
-                let slot_t = slot.frames.t;
-                gauges.played_ms.store(((slot_t - input.stamps[0]).secs() * 1e3) as u64, Relaxed);
+                let since_first = slot.frames.t - input.stamps[0];
+                played_s = since_first.secs();
+                gauges.played_ms.store((played_s * 1e3) as u64, Relaxed);
                 slots.push(slot);
                 if let (Some(m), Some(queue)) = (&mut mapping, &queue) {
                     // A device so slow has done what was due before this frame came.
-                    let ahead = options.lockstep_iterations_per_s > 0.0;
                     if !ahead {
                         drain(queue, m);
                     }
@@ -75,10 +76,9 @@ pub fn lockstep(
                     match options.mapping_s {
                         Some(s) => work_until(m, s * played, &gauges),
                         None => {
-                            let due = options.steps_due(gauges.frames.load(Relaxed), slot_t - input.stamps[0]);
-                            let t_s =
-                                if ahead { (slot_t - input.stamps[0]).secs() } else { start.elapsed().as_secs_f64() };
-                            steps(m, due - iterated, t_s, &gauges);
+                            let due = options.steps_due(gauges.frames.load(Relaxed), since_first);
+                            let t_s = if ahead { played_s } else { start.elapsed().as_secs_f64() };
+                            steps(m, due.saturating_sub(iterated), t_s, &gauges);
                             iterated = due;
                         }
                     }
@@ -95,12 +95,16 @@ pub fn lockstep(
             Some(s) => work_until(m, s, &gauges),
             None => {
                 for _ in 0..extra_iterations(&input, total, options) {
-                    steps(m, 1, start.elapsed().as_secs_f64(), &gauges);
+                    if ahead {
+                        played_s += 1.0 / options.lockstep_iterations_per_s;
+                    }
+                    steps(m, 1, if ahead { played_s } else { start.elapsed().as_secs_f64() }, &gauges);
                     progress.show(&gauges);
                 }
             }
         }
-        m.sample(options.mapping_s.unwrap_or_else(|| start.elapsed().as_secs_f64()), &gauges);
+        let end_s = if ahead { played_s } else { start.elapsed().as_secs_f64() };
+        m.sample(options.mapping_s.unwrap_or(end_s), &gauges);
     }
     let wall_s = start.elapsed().as_secs_f64();
     warnings.extend_from_slice(input.source.warnings());
