@@ -2,31 +2,14 @@
 //! `[inject]` does to it, with every fault that was injected counted by what detected it.
 #![allow(clippy::unwrap_used)]
 
+mod program;
+
+use program::{flight, stipple, text, BOARD};
 use serde_json::Value;
 use std::fs;
-use std::path::{Path, PathBuf};
-use std::process::{Command, Output, Stdio};
+use std::path::Path;
+use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
-
-const BOARD: &str = "board-configs/lavapipe.toml";
-
-fn stipple() -> Command {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_stipple"));
-    command.current_dir(env!("CARGO_MANIFEST_DIR"));
-    command
-}
-
-fn text(o: &Output) -> String {
-    String::from_utf8_lossy(&o.stderr).into_owned() + &String::from_utf8_lossy(&o.stdout)
-}
-
-fn flight(dir: &Path, seconds: &str) -> PathBuf {
-    let out = dir.join("flight");
-    let args = ["sim", "demo", "--duration", seconds, "--out", out.to_str().unwrap()];
-    let o = stipple().args(args).output().unwrap();
-    assert!(o.status.success(), "{}", text(&o));
-    out
-}
 
 fn run(dataset: &Path, out: &Path, board: &str) -> Command {
     let mut command = stipple();

@@ -1,0 +1,24 @@
+//! The program as a user starts it, for the tests of what it does with sensors.
+
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+pub const BOARD: &str = "board-configs/lavapipe.toml";
+
+pub fn stipple() -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_stipple"));
+    command.current_dir(env!("CARGO_MANIFEST_DIR"));
+    command
+}
+
+pub fn text(o: &Output) -> String {
+    String::from_utf8_lossy(&o.stderr).into_owned() + &String::from_utf8_lossy(&o.stdout)
+}
+
+pub fn flight(dir: &Path, seconds: &str) -> PathBuf {
+    let out = dir.join("flight");
+    let args = ["sim", "demo", "--duration", seconds, "--out", out.to_str().unwrap()];
+    let o = stipple().args(args).output().unwrap();
+    assert!(o.status.success(), "{}", text(&o));
+    out
+}
