@@ -49,6 +49,11 @@ mod c {
     pub const EVENT_RISING: c_int = 5;
     pub const ACTIVE_LOW: c_int = 4;
 
+    /// In tests every call of it can be made to fail.
+    #[cfg(test)]
+    pub use super::simulated::*;
+
+    #[cfg(not(test))]
     #[link(name = "gpiod")]
     extern "C" {
         pub fn gpiod_chip_open_lookup(descr: *const c_char) -> *mut Chip;
@@ -320,25 +325,174 @@ fn next_due(due: Nanos, period: Span, now: Nanos) -> (Nanos, u64) {
     (due + Span(period.0.saturating_mul(late + 1)), late as u64)
 }
 
+/// libgpiod on a machine with one chip, of which the named call fails as it is told. The real one: drivers/tests/gpio.rs
+/// and, on the kernel's own simulated chip, tests/hil.
+#[cfg(test)]
+mod simulated {
+    use super::c::{Chip, Event, Line, Request};
+    use super::*;
+    use std::cell::{Cell, RefCell};
+    use std::ptr::{null_mut, NonNull};
+
+    thread_local! {
+        /// Which call fails, with which error.
+        pub static FAILS: Cell<(&'static str, i32)> = const { Cell::new(("", 0)) };
+        pub static OPEN: Cell<usize> = const { Cell::new(0) };
+        pub static LEVELS: RefCell<Vec<c_int>> = const { RefCell::new(Vec::new()) };
+        /// Stamps, ns, of edges that are waiting.
+        pub static WAITING: RefCell<Vec<i64>> = const { RefCell::new(Vec::new()) };
+    }
+
+    fn fails(call: &str) -> bool {
+        let (struck, errno) = FAILS.get();
+        // SAFETY: the errno of this thread.
+        unsafe { *libc::__errno_location() = errno };
+        struck == call
+    }
+
+    fn answer(call: &str, good: c_int) -> c_int {
+        if fails(call) {
+            -1
+        } else {
+            good
+        }
+    }
+
+    fn pointer<T>(call: &str) -> *mut T {
+        if fails(call) {
+            null_mut()
+        } else {
+            NonNull::dangling().as_ptr()
+        }
+    }
+
+    pub unsafe fn gpiod_chip_open_lookup(_: *const c_char) -> *mut Chip {
+        let chip: *mut Chip = pointer("open");
+        OPEN.set(OPEN.get() + usize::from(!chip.is_null()));
+        chip
+    }
+
+    pub unsafe fn gpiod_chip_close(_: *mut Chip) {
+        OPEN.set(OPEN.get() - 1);
+    }
+
+    pub unsafe fn gpiod_chip_get_line(_: *mut Chip, _: c_uint) -> *mut Line {
+        pointer("get line")
+    }
+
+    pub unsafe fn gpiod_chip_find_line(_: *mut Chip, _: *const c_char) -> *mut Line {
+        pointer("find line")
+    }
+
+    pub unsafe fn gpiod_line_request(_: *mut Line, _: *const Request, level: c_int) -> c_int {
+        LEVELS.with_borrow_mut(|l| l.push(level));
+        answer("request", 0)
+    }
+
+    pub unsafe fn gpiod_line_get_value(_: *mut Line) -> c_int {
+        answer("get", LEVELS.with_borrow(|l| l.last().copied().unwrap_or(0)))
+    }
+
+    pub unsafe fn gpiod_line_set_value(_: *mut Line, level: c_int) -> c_int {
+        // The one that lets go can fail by itself.
+        let done = answer(if level == 0 { "clear" } else { "set" }, 0);
+        if done == 0 {
+            LEVELS.with_borrow_mut(|l| l.push(level));
+        }
+        done
+    }
+
+    pub unsafe fn gpiod_line_event_wait(_: *mut Line, _: *const libc::timespec) -> c_int {
+        answer("wait", c_int::from(WAITING.with_borrow(|w| !w.is_empty())))
+    }
+
+    pub unsafe fn gpiod_line_event_read_multiple(_: *mut Line, events: *mut Event, count: c_uint) -> c_int {
+        let n = WAITING.with_borrow_mut(|w| {
+            let n = w.len().min(count as usize);
+            for (i, t) in w.drain(..n).enumerate() {
+                let t = libc::timespec { tv_sec: t / 1_000_000_000, tv_nsec: t % 1_000_000_000 };
+                // SAFETY: the caller has room for `count` events.
+                unsafe { events.add(i).write(Event { t, kind: 1 }) };
+            }
+            n
+        });
+        answer("read", n as c_int)
+    }
+}
+
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used)]
+    use super::simulated::{FAILS, LEVELS, OPEN, WAITING};
     use super::*;
+
+    const ERRNOS: [i32; 8] =
+        [libc::EACCES, libc::EBUSY, libc::EINVAL, libc::EIO, libc::ENODEV, libc::ENOENT, libc::ENOTTY, libc::EPERM];
 
     fn line(chip: &str, line: &str) -> LineName {
         LineName { chip: chip.into(), line: line.into() }
     }
 
     #[test]
-    fn what_is_no_chip_is_refused_with_what_to_do() {
-        let fault = DataReady::open(&line("no-such-chip", "0"), Edge::Rising).map(|_| ()).unwrap_err();
-        assert!(
-            fault.to_string().contains("no-such-chip line 0") && fault.to_string().contains("gpiodetect"),
-            "{fault}"
-        );
-        let fault = Output::open(&line("/dev/null", "3"), true).map(|_| ()).unwrap_err();
-        assert_eq!(fault.exit, Exit::Unavailable);
+    fn every_error_of_every_call_of_opening_is_said_and_leaves_nothing_open() {
+        for errno in ERRNOS {
+            for (call, name) in [("open", "3"), ("get line", "3"), ("find line", "LED"), ("request", "3")] {
+                FAILS.set((call, errno));
+                let (input, output) =
+                    (DataReady::open(&line("chip", name), Edge::Falling), Output::open(&line("chip", name), true));
+                for fault in [input.map(|_| ()).unwrap_err(), output.map(|_| ()).unwrap_err()] {
+                    let said = if call.ends_with("line") { libc::ENOENT } else { errno };
+                    assert!(fault.to_string().contains(&std::io::Error::from_raw_os_error(said).to_string()));
+                    assert!(fault.place == format!("GPIO chip line {name}") && !fault.fix.is_empty(), "{fault}");
+                }
+                assert_eq!(OPEN.get(), 0, "{call}");
+            }
+        }
         assert!(Output::open(&line("a\0b", "3"), false).is_err(), "a name with a zero byte");
+    }
+
+    #[test]
+    fn every_error_of_an_input_is_a_value_and_a_signal_is_none() {
+        let mut input = DataReady::open(&line("chip", "3"), Edge::Rising).unwrap();
+        let mut queue = EdgeQueue::new();
+        for errno in ERRNOS {
+            FAILS.set(("wait", errno));
+            assert_eq!((input.wait(Span(1)), input.drain(&mut queue)), (Err(EdgeFault(errno)), Err(EdgeFault(errno))));
+            WAITING.with_borrow_mut(|w| *w = vec![monotonic().0]);
+            FAILS.set(("read", errno));
+            assert_eq!(input.drain(&mut queue), Err(EdgeFault(errno)));
+            FAILS.set(("request", errno));
+            assert_eq!(input.reopen(), Err(EdgeFault(errno)));
+            assert_eq!((input.wait(Span(0)), OPEN.get()), (Err(EdgeFault(libc::ENODEV)), 0));
+            FAILS.set(("", 0));
+            assert_eq!((input.reopen(), OPEN.get()), (Ok(()), 1));
+        }
+        FAILS.set(("wait", libc::EINTR));
+        assert_eq!(input.wait(Span(1)), Ok(false));
+        FAILS.set(("", 0));
+        // More than one read takes.
+        WAITING.with_borrow_mut(|w| *w = (0..EVENTS as i64 + 3).map(|i| monotonic().0 - 1000 + i).collect());
+        assert_eq!((input.drain(&mut queue), queue.len(), input.wait(Span(0))), (Ok(()), EVENTS + 3, Ok(false)));
+    }
+
+    #[test]
+    fn every_error_of_an_output_is_said_and_the_next_pulse_is_tried() {
+        let mut trigger = Trigger::new(Output::open(&line("chip", "3"), false).unwrap(), Span(1000), 1000.0);
+        for errno in ERRNOS {
+            for call in ["set", "clear"] {
+                FAILS.set((call, errno));
+                let said = trigger.pulse().unwrap_err().to_string();
+                assert!(said.starts_with("GPIO chip line 3"), "{said}");
+            }
+            FAILS.set(("get", errno));
+            assert!(trigger.line.get().is_err());
+            FAILS.set(("", 0));
+            trigger.wait();
+            assert!(trigger.pulse().is_ok_and(|fired| fired.within >= Span(0)) && trigger.line.get() == Ok(false));
+            assert!(LEVELS.with_borrow(|l| l.ends_with(&[1, 0])), "high, then low");
+        }
+        drop(trigger);
+        assert_eq!(OPEN.get(), 0);
     }
 
     #[test]
@@ -348,14 +502,6 @@ mod tests {
         assert!(fix(libc::EACCES).contains("udev"));
         assert!(fix(libc::ENOTTY).contains("can do this"));
         assert!(fix(libc::ENOENT).contains("gpioinfo list"));
-    }
-
-    #[test]
-    fn a_line_that_is_gone_is_a_value_and_is_looked_for_again() {
-        let mut gone = DataReady { line: None, name: line("no-such-chip", "0"), edge: Edge::Falling };
-        assert_eq!(gone.wait(Span(0)), Err(EdgeFault(libc::ENODEV)));
-        assert_eq!(gone.drain(&mut EdgeQueue::new()), Err(EdgeFault(libc::ENODEV)));
-        assert!(gone.reopen().is_err());
     }
 
     #[test]

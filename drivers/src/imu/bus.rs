@@ -9,7 +9,7 @@ use crate::host::monotonic;
 use crate::types::{Nanos, Span};
 use crate::{Exit, Fault};
 use std::fs::{File, OpenOptions};
-use std::os::fd::AsRawFd;
+use std::os::fd::{AsRawFd, RawFd};
 use std::path::{Path, PathBuf};
 
 /// Why a transfer failed.
@@ -90,6 +90,17 @@ pub(super) fn cannot_open(place: &str, fault: BusFault) -> Fault {
     Fault::new(Exit::Unavailable, place, fault.to_string(), fix)
 }
 
+/// The one system call of both buses: descriptor, number, argument. Tests put theirs in its place, so that each number
+/// fails with each error.
+type Ioctl = unsafe fn(RawFd, libc::c_ulong, *mut libc::c_void) -> libc::c_int;
+
+/// # Safety
+/// `argument` points to what the kernel reads and writes under this number.
+unsafe fn ioctl(fd: RawFd, number: libc::c_ulong, argument: *mut libc::c_void) -> libc::c_int {
+    // SAFETY: by the contract of this function.
+    unsafe { libc::ioctl(fd, number as _, argument) }
+}
+
 #[repr(C)]
 struct I2cMessage {
     address: u16,
@@ -116,20 +127,25 @@ pub struct I2c {
     place: String,
     address: u16,
     file: File,
+    ioctl: Ioctl,
 }
 
 impl I2c {
     pub fn open(place: &str, address: u16) -> Result<I2c, Fault> {
-        let file = I2c::file(place).map_err(|e| cannot_open(place, e))?;
-        Ok(I2c { place: place.into(), address, file })
+        I2c::open_in(place, address, ioctl)
     }
 
-    fn file(place: &str) -> Result<File, BusFault> {
+    fn open_in(place: &str, address: u16, ioctl: Ioctl) -> Result<I2c, Fault> {
+        let file = I2c::file(place, ioctl).map_err(|e| cannot_open(place, e))?;
+        Ok(I2c { place: place.into(), address, file, ioctl })
+    }
+
+    fn file(place: &str, ioctl: Ioctl) -> Result<File, BusFault> {
         let path = adapter(place, Path::new("/sys/class/i2c-dev")).ok_or(BusFault::Gone)?;
         let file = open_device(&path)?;
         let mut functions: libc::c_ulong = 0;
         // SAFETY: I2C_FUNCS writes one unsigned long to the pointer, which outlives the call.
-        let done = unsafe { libc::ioctl(file.as_raw_fd(), I2C_FUNCS as _, &mut functions) };
+        let done = unsafe { ioctl(file.as_raw_fd(), I2C_FUNCS, (&raw mut functions).cast()) };
         if done < 0 {
             return Err(BusFault::last());
         }
@@ -144,7 +160,7 @@ impl I2c {
     fn transfer(&self, messages: &mut [I2cMessage]) -> Result<(), BusFault> {
         let mut transfer = I2cTransfer { messages: messages.as_mut_ptr(), count: messages.len() as u32 };
         // SAFETY: every message points to `len` bytes that its caller borrows for the call, the list to `count` of them.
-        let done = unsafe { libc::ioctl(self.file.as_raw_fd(), I2C_RDWR as _, &mut transfer) };
+        let done = unsafe { (self.ioctl)(self.file.as_raw_fd(), I2C_RDWR, (&raw mut transfer).cast()) };
         completed(done, messages.len())
     }
 }
@@ -190,7 +206,7 @@ impl Bus for I2c {
     }
 
     fn reopen(&mut self) -> Result<(), BusFault> {
-        self.file = I2c::file(&self.place)?;
+        self.file = I2c::file(&self.place, self.ioctl)?;
         Ok(())
     }
 
@@ -238,25 +254,30 @@ pub struct Spi {
     /// Bytes that the chip sends between address and data of a read.
     dummy: usize,
     file: File,
+    ioctl: Ioctl,
     tx: Box<[u8; TRANSFER_MAX]>,
     rx: Box<[u8; TRANSFER_MAX]>,
 }
 
 impl Spi {
     pub fn open(path: &str, hz: u32, mode: u8, dummy: usize) -> Result<Spi, Fault> {
-        let file = Spi::file(Path::new(path), hz, mode).map_err(|e| cannot_open(path, e))?;
-        let [tx, rx] = [0, 0].map(|zero| Box::new([zero; TRANSFER_MAX]));
-        Ok(Spi { path: path.into(), hz, mode, dummy, file, tx, rx })
+        Spi::open_in(path, hz, mode, dummy, ioctl)
     }
 
-    fn file(path: &Path, hz: u32, mode: u8) -> Result<File, BusFault> {
+    fn open_in(path: &str, hz: u32, mode: u8, dummy: usize, ioctl: Ioctl) -> Result<Spi, Fault> {
+        let file = Spi::file(Path::new(path), hz, mode, ioctl).map_err(|e| cannot_open(path, e))?;
+        let [tx, rx] = [0, 0].map(|zero| Box::new([zero; TRANSFER_MAX]));
+        Ok(Spi { path: path.into(), hz, mode, dummy, file, ioctl, tx, rx })
+    }
+
+    fn file(path: &Path, mut hz: u32, mut mode: u8, ioctl: Ioctl) -> Result<File, BusFault> {
         let file = open_device(path)?;
-        let (fd, bits) = (file.as_raw_fd(), 8u8);
+        let (fd, mut bits) = (file.as_raw_fd(), 8u8);
         // SAFETY: each of the three reads as many bytes from its pointer as its number encodes; all outlive the calls.
         let failed = unsafe {
-            libc::ioctl(fd, SPI_IOC_WR_MODE as _, &mode) < 0
-                || libc::ioctl(fd, SPI_IOC_WR_BITS as _, &bits) < 0
-                || libc::ioctl(fd, SPI_IOC_WR_HZ as _, &hz) < 0
+            ioctl(fd, SPI_IOC_WR_MODE, (&raw mut mode).cast()) < 0
+                || ioctl(fd, SPI_IOC_WR_BITS, (&raw mut bits).cast()) < 0
+                || ioctl(fd, SPI_IOC_WR_HZ, (&raw mut hz).cast()) < 0
         };
         if failed {
             Err(BusFault::last())
@@ -267,7 +288,7 @@ impl Spi {
 
     /// Sends the first `len` bytes of `tx` and fills as many of `rx`.
     fn transfer(&mut self, len: usize) -> Result<(), BusFault> {
-        let transfer = SpiTransfer {
+        let mut transfer = SpiTransfer {
             tx: self.tx.as_ptr() as u64,
             rx: self.rx.as_mut_ptr() as u64,
             len: len as u32,
@@ -276,7 +297,7 @@ impl Spi {
             ..SpiTransfer::default()
         };
         // SAFETY: both buffers hold TRANSFER_MAX bytes, of which the callers ask for no more, and outlive the call.
-        let done = unsafe { libc::ioctl(self.file.as_raw_fd(), SPI_IOC_MESSAGE_1 as _, &transfer) };
+        let done = unsafe { (self.ioctl)(self.file.as_raw_fd(), SPI_IOC_MESSAGE_1, (&raw mut transfer).cast()) };
         completed(done, len)
     }
 }
@@ -300,7 +321,7 @@ impl Bus for Spi {
     }
 
     fn reopen(&mut self) -> Result<(), BusFault> {
-        self.file = Spi::file(&self.path, self.hz, self.mode)?;
+        self.file = Spi::file(&self.path, self.hz, self.mode, self.ioctl)?;
         Ok(())
     }
 
@@ -317,6 +338,7 @@ impl Bus for Spi {
 mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
+    use std::cell::Cell;
 
     #[test]
     fn every_errno_of_a_transfer_is_told_apart() {
@@ -354,23 +376,115 @@ mod tests {
         assert_eq!(fault.exit, Exit::Unavailable);
     }
 
+    /// What the next call under a number answers: an errno, or fewer messages or bytes than were asked for.
+    #[derive(Clone, Copy)]
+    enum Answer {
+        Errno(i32),
+        Short,
+    }
+
+    thread_local! {
+        static ANSWER: Cell<Option<(libc::c_ulong, Answer)>> = const { Cell::new(None) };
+        static FUNCTIONS: Cell<libc::c_ulong> = const { Cell::new(I2C_FUNC_I2C) };
+    }
+
+    /// An adapter and a controller on which everything goes well, save what `ANSWER` says.
+    unsafe fn simulated(_: RawFd, number: libc::c_ulong, argument: *mut libc::c_void) -> libc::c_int {
+        let all = match number {
+            // SAFETY: the argument is what this number takes, here and below.
+            I2C_RDWR => unsafe { (*argument.cast::<I2cTransfer>()).count as i32 },
+            SPI_IOC_MESSAGE_1 => unsafe { (*argument.cast::<SpiTransfer>()).len as i32 },
+            I2C_FUNCS => unsafe {
+                *argument.cast::<libc::c_ulong>() = FUNCTIONS.get();
+                0
+            },
+            _ => 0,
+        };
+        match ANSWER.get().filter(|(struck, _)| *struck == number) {
+            None => all,
+            Some((_, Answer::Short)) => all - 1,
+            Some((_, Answer::Errno(errno))) => {
+                // SAFETY: the errno of this thread.
+                unsafe { *libc::__errno_location() = errno };
+                -1
+            }
+        }
+    }
+
+    /// What the kernel's documentation of both buses names, and what adapters return besides.
+    const ERRNOS: [i32; 14] = [
+        libc::EAGAIN,
+        libc::EBADMSG,
+        libc::EBUSY,
+        libc::EFAULT,
+        libc::EINVAL,
+        libc::EIO,
+        libc::EMSGSIZE,
+        libc::ENODEV,
+        libc::ENOMEM,
+        libc::ENOTTY,
+        libc::ENXIO,
+        libc::EREMOTEIO,
+        libc::ESHUTDOWN,
+        libc::ETIMEDOUT,
+    ];
+
     #[test]
-    fn ioctls_on_what_is_no_bus_are_refused_not_short() {
-        let file = || File::options().read(true).write(true).open("/dev/null").unwrap();
-        let mut i2c = I2c { place: "/dev/null".into(), address: 0x68, file: file() };
-        let refused = Err(BusFault::Refused(libc::ENOTTY));
-        assert_eq!(i2c.read(0, &mut [0; 2]), refused);
-        assert_eq!(i2c.write(0, &[1]), refused);
-        assert_eq!(i2c.reopen(), refused);
-        assert_eq!(i2c.write(0, &[0; WRITE_MAX + 1]), Err(BusFault::Refused(libc::EMSGSIZE)));
-        let [tx, rx] = [0, 0].map(|zero| Box::new([zero; TRANSFER_MAX]));
-        let mut spi = Spi { path: "/dev/null".into(), hz: 1, mode: 0, dummy: 1, file: file(), tx, rx };
-        assert_eq!(spi.read(0, &mut [0; 2]), refused);
-        assert_eq!(spi.write(0, &[1]), refused);
-        assert_eq!(spi.reopen(), refused);
+    fn every_error_of_every_call_comes_back_as_a_value() {
+        let i2c = || I2c::open_in("/dev/null", 0x68, simulated);
+        let spi = || Spi::open_in("/dev/null", 1_000_000, 3, 1, simulated);
+        let (mut adapter, mut controller) = (i2c().unwrap(), spi().unwrap());
+        let mut four = [0; 4];
+        assert_eq!((adapter.read(0, &mut four), adapter.write(0, &four), adapter.reopen()), (Ok(()), Ok(()), Ok(())));
+        assert_eq!((controller.read(0, &mut four), controller.write(0, &four)), (Ok(()), Ok(())));
+        for errno in ERRNOS {
+            let fault = Err(BusFault::of(errno));
+            let strike = |number| ANSWER.set(Some((number, Answer::Errno(errno))));
+            let boots = |answer: Result<(), Fault>| {
+                let line = answer.unwrap_err().to_string();
+                assert!(line.starts_with("/dev/null: ") && line.contains(&BusFault::of(errno).to_string()), "{line}");
+            };
+            strike(I2C_FUNCS);
+            boots(i2c().map(|_| ()));
+            assert_eq!(adapter.reopen(), fault);
+            strike(I2C_RDWR);
+            assert_eq!((adapter.read(0, &mut four), adapter.write(0, &four)), (fault, fault));
+            for setting in [SPI_IOC_WR_MODE, SPI_IOC_WR_BITS, SPI_IOC_WR_HZ] {
+                strike(setting);
+                boots(spi().map(|_| ()));
+                assert_eq!(controller.reopen(), fault);
+            }
+            strike(SPI_IOC_MESSAGE_1);
+            assert_eq!((controller.read(0, &mut four), controller.write(0, &four)), (fault, fault));
+        }
+        ANSWER.set(Some((I2C_RDWR, Answer::Short)));
+        assert_eq!((adapter.read(0, &mut four), adapter.write(0, &four)), (Err(BusFault::Short), Err(BusFault::Short)));
+        ANSWER.set(Some((SPI_IOC_MESSAGE_1, Answer::Short)));
+        assert_eq!(controller.read(0, &mut four), Err(BusFault::Short));
+        // An adapter of SMBus alone.
+        ANSWER.set(None);
+        FUNCTIONS.set(0x0eff_0008);
+        let line = i2c().map(|_| ()).unwrap_err().to_string();
+        assert!(line.contains("plain I2C"), "{line}");
+    }
+
+    #[test]
+    fn transfers_too_long_are_refused_before_they_are_made() {
+        let mut i2c = I2c::open_in("/dev/null", 0x68, simulated).unwrap();
+        let mut spi = Spi::open_in("/dev/null", 1, 0, 1, simulated).unwrap();
+        let refused = Err(BusFault::Refused(libc::EMSGSIZE));
+        assert_eq!(i2c.write(0, &[0; WRITE_MAX + 1]), refused);
+        assert_eq!(i2c.read(0, &mut vec![0; 1 << 16]), refused);
         let mut long = [0; TRANSFER_MAX];
-        assert_eq!(spi.read(0, &mut long), Err(BusFault::Refused(libc::EMSGSIZE)), "the address needs room too");
-        assert_eq!(spi.write(0, &long), Err(BusFault::Refused(libc::EMSGSIZE)));
+        assert_eq!(spi.read(0, &mut long), refused, "the address needs room too");
+        assert_eq!(spi.write(0, &long), refused);
+    }
+
+    #[test]
+    fn who_may_not_open_it_is_told_to_ask_for_the_group() {
+        for errno in [libc::EACCES, libc::EPERM] {
+            assert!(cannot_open("/dev/i2c-1", BusFault::of(errno)).fix.contains("udev"));
+        }
     }
 
     #[test]

@@ -65,15 +65,17 @@ fn write(path: &Path, value: &str) -> Result<bool, Fault> {
     match opened.and_then(|mut file| file.write_all(value.as_bytes())) {
         Ok(()) => Ok(true),
         Err(e) if e.kind() == ErrorKind::NotFound => Ok(false),
-        Err(e) => {
-            let fix = if e.kind() == ErrorKind::PermissionDenied {
-                "let the user write it (udev rule, or group iio)"
-            } else {
-                "the kernel's driver refuses this value: see the files ending in _available beside it"
-            };
-            Err(Fault::new(Exit::Unavailable, path.display().to_string(), format!("`{value}`: {e}"), fix))
-        }
+        Err(e) => Err(refused(path, value, &e)),
     }
+}
+
+pub(super) fn refused(path: &Path, value: &str, e: &std::io::Error) -> Fault {
+    let fix = match e.kind() {
+        ErrorKind::PermissionDenied => "let the user write it (udev rule, or group iio)",
+        ErrorKind::ResourceBusy => "end what else reads the device (`fuser /dev/iio:device*`)",
+        _ => "the kernel's driver refuses this value: see the files ending in _available beside it",
+    };
+    Fault::new(Exit::Unavailable, path.display().to_string(), format!("`{value}`: {e}"), fix)
 }
 
 /// Folder of the device that a board file names.

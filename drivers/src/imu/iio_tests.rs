@@ -255,12 +255,53 @@ fn what_cannot_be_read_is_refused_with_what_to_do() {
     kernel.device(0, "mpu6500", &["accel", "anglvel"]);
     let line = refused(&kernel.options("bmi160"));
     assert!(line.contains("mpu6500"), "{line}");
-    // A driver that refuses a setting, as /dev/full refuses every write.
-    let rate = kernel.folder(0).join("sampling_frequency");
-    std::fs::remove_file(&rate).unwrap();
-    std::os::unix::fs::symlink("/dev/full", &rate).unwrap();
-    let line = refused(&kernel.options("mpu6500"));
-    assert!(line.contains("sampling_frequency") && line.contains("_available"), "{line}");
+}
+
+/// A driver that refuses a setting, as /dev/full refuses every write.
+#[test]
+fn every_setting_that_is_refused_is_named() {
+    let settings = [
+        "buffer/enable",
+        "scan_elements/in_accel_x_en",
+        "scan_elements/in_magn_x_en",
+        "current_timestamp_clock",
+        "trigger/current_trigger",
+        "sampling_frequency",
+        "in_anglvel_sampling_frequency",
+        "in_accel_sampling_frequency",
+        "buffer/length",
+        "buffer/watermark",
+    ];
+    for setting in settings {
+        let kernel = Kernel::new();
+        kernel.device(0, "mpu6500", &["accel", "anglvel"]);
+        let file = kernel.folder(0).join(setting);
+        let _ = std::fs::remove_file(&file);
+        std::os::unix::fs::symlink("/dev/full", &file).unwrap();
+        let line = refused(&IioOptions { trigger: "timer".into(), ..kernel.options("mpu6500") });
+        assert!(line.contains(setting) && line.contains("_available"), "{line}");
+    }
+    let fix = |errno| super::iio::refused(Path::new("f"), "1", &std::io::Error::from_raw_os_error(errno)).fix;
+    assert!(fix(libc::EACCES).contains("udev") && fix(libc::EBUSY).contains("fuser"));
+    assert!(fix(libc::EINVAL).contains("_available"));
+}
+
+/// Nodes that can be opened and not read: what reading answers closes the device, is counted, and it is looked for again.
+#[test]
+fn every_error_of_reading_is_a_loss_that_says_which() {
+    let cases = [("/proc/self/mem", "input/output error"), ("/tmp", "Is a directory"), ("/dev/null", "not there")];
+    for (node, said) in cases {
+        let kernel = Kernel::new();
+        kernel.device(0, "mpu6500", &["accel", "anglvel"]);
+        std::fs::remove_file(kernel.node(0)).unwrap();
+        std::os::unix::fs::symlink(node, kernel.node(0)).unwrap();
+        let mut imu = IioImu::open(&kernel.options("mpu6500")).unwrap();
+        let (wait, samples) = next(&mut imu);
+        let lost = wait.unwrap_err().to_string();
+        assert!(samples.is_empty() && lost.starts_with("lost: ") && lost.contains(said), "{node}: {lost}");
+        let c = imu.seen();
+        assert_eq!(c.imu_bus_errors + c.imu_gone, 1, "{node}: {c:?}");
+    }
 }
 
 #[test]

@@ -219,3 +219,83 @@ fn checked(answer: i32) -> io::Result<()> {
     }
     Ok(())
 }
+
+/// The real calls on what is no camera: whatever the kernel answers comes back as a value. On cameras: tests/hil.
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+
+    fn errno<T>(answer: io::Result<T>) -> Option<i32> {
+        answer.err().and_then(|e| e.raw_os_error())
+    }
+
+    #[test]
+    fn every_request_is_refused_by_what_is_no_camera() {
+        assert_eq!(errno(Linux.open(Path::new("/dev/no-such-camera"))), Some(libc::ENOENT));
+        assert_eq!(Linux.open(Path::new("a\0b")).unwrap_err().kind(), io::ErrorKind::InvalidInput);
+        let fd = Linux.open(Path::new("/dev/null")).unwrap();
+        let (mut buffer, mut planes) = (Buffer::default(), [Plane::default(); PLANES_MAX]);
+        let mut multi = Buffer { kind: CAPTURE_MULTI, ..Buffer::default() };
+        let mut control = ExtControl { id: 1, ..ExtControl::default() };
+        let requests = [
+            Request::QueryCap(&mut Capability::default()),
+            Request::EnumFormat(&mut FormatDescription::default()),
+            Request::EnumSize(&mut FrameSize::default()),
+            Request::EnumInterval(&mut FrameInterval::default()),
+            Request::SetFormat(&mut { FormatSingle::ZERO }),
+            Request::SetFormatMulti(&mut { FormatMulti::ZERO }),
+            Request::SetParm(&mut { StreamParm::ZERO }),
+            Request::Buy(&mut RequestBuffers::default()),
+            Request::Export(&mut ExportBuffer::default()),
+            Request::StreamOn(CAPTURE),
+            Request::StreamOff(CAPTURE),
+            Request::QueryControl(&mut { QueryControl::ZERO }),
+            Request::SetControl(&mut Control::default()),
+            Request::GetControl(&mut Control::default()),
+        ];
+        for request in requests {
+            let name = request.name();
+            assert_eq!(errno(Linux.ioctl(fd, request)), Some(libc::ENOTTY), "{name}");
+        }
+        let refused = |request: Request<'_>| assert_eq!(errno(Linux.ioctl(fd, request)), Some(libc::ENOTTY));
+        refused(Request::SetExtControl(&mut control));
+        refused(Request::GetExtControl(&mut control));
+        for b in [&mut buffer, &mut multi] {
+            refused(Request::QueryBuffer(b, &mut planes));
+            refused(Request::Queue(b, &mut planes));
+            refused(Request::Dequeue(b, &mut planes));
+        }
+        assert_eq!((multi.place, multi.length), (planes.as_ptr() as u64, PLANES_MAX as u32), "where its planes are");
+        assert!(errno(Linux.map(fd, 0, 4096)).is_some());
+        Linux.close(fd);
+        assert_eq!(errno(Linux.ioctl(-1, Request::StreamOn(CAPTURE))), Some(libc::EBADF));
+    }
+
+    #[test]
+    fn a_descriptor_that_is_none_hangs_up_and_a_signal_is_no_error() {
+        let mut ready = [Ready::default(); 1];
+        Linux.poll(&[1 << 20], &mut ready, Span(0)).unwrap();
+        assert_eq!(ready, [Ready { readable: false, error: true }]);
+        extern "C" fn heard(_: libc::c_int) {}
+        // SAFETY: the handler does nothing; a struct of integers may be zero; the thread is alive while it is signalled.
+        let took = unsafe {
+            let mut action: libc::sigaction = std::mem::zeroed();
+            action.sa_sigaction = heard as extern "C" fn(libc::c_int) as usize;
+            libc::sigaction(libc::SIGUSR1, &action, std::ptr::null_mut());
+            let (told, tells) = std::sync::mpsc::channel();
+            let waits = std::thread::spawn(move || {
+                told.send(libc::pthread_self()).unwrap();
+                let begun = Linux.now();
+                Linux.poll(&[], &mut [], Span(20_000_000_000)).map(|()| Linux.now() - begun)
+            });
+            let thread = tells.recv().unwrap();
+            while !waits.is_finished() {
+                std::thread::sleep(std::time::Duration::from_millis(20));
+                libc::pthread_kill(thread, libc::SIGUSR1);
+            }
+            waits.join().unwrap().unwrap()
+        };
+        assert!(took < Span(10_000_000_000), "it came back early, to be asked again: {took:?}");
+    }
+}

@@ -162,6 +162,37 @@ fn while_streaming_every_error_of_every_call_is_survived_and_counted() {
 }
 
 #[test]
+fn a_wait_that_fails_while_a_camera_is_away_ends_the_source() {
+    let machine = pair_of_cameras();
+    let (mut rig, mut frames) = opened(&machine);
+    machine.state().cams[0].present = false;
+    assert!(matches!(rig.next(Span(MS), &mut frames), Err(SourceFault::Lost(_))));
+    machine.fail("poll", libc::ENOMEM, 0, 1);
+    let broken = rig.next(Span(MS), &mut frames).unwrap_err();
+    assert!(matches!(&broken, SourceFault::Broken(f) if f.to_string().contains("poll")), "{broken}");
+}
+
+#[test]
+fn a_driver_that_only_hangs_up_or_misnames_its_buffers_is_a_loss() {
+    let machine = pair_of_cameras();
+    let (mut rig, mut frames) = opened(&machine);
+    machine.state().cams[1].hangs = true;
+    let lost = (0..20).find_map(|_| rig.next(Span(MS), &mut frames).err()).expect("it is no endless wait").to_string();
+    assert!(lost.contains("/dev/video1") && lost.contains("poll reports an error"), "{lost}");
+    machine.state().cams[1].hangs = false;
+    (0..2).for_each(|camera| machine.shoot(camera, 1..400, |_, _| {}));
+    take(&mut rig, &mut frames, 5);
+    machine.state().cams[0].misnames = Some(99);
+    let lost =
+        (0..9).find_map(|_| rig.next(Span(100 * MS), &mut frames).err()).expect("buffer 99 is not read").to_string();
+    assert!(lost.contains("/dev/video0") && lost.contains("a buffer that there is not"), "{lost}");
+    machine.state().cams[0].misnames = None;
+    take(&mut rig, &mut frames, 5);
+    drop(rig);
+    assert!(machine.has_everything_back());
+}
+
+#[test]
 fn errors_that_do_not_end_are_a_loss_and_no_endless_loop() {
     let machine = pair_of_cameras();
     let (mut rig, mut frames) = opened(&machine);

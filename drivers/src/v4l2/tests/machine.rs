@@ -41,6 +41,10 @@ pub struct Cam {
     pub adjust: fn(&mut (u32, u32, u32)),
     pub buffer_bytes: usize,
     pub buffers_given: u32,
+    /// poll reports an error and no call says which.
+    pub hangs: bool,
+    /// Every buffer is given under this number.
+    pub misnames: Option<u32>,
     pub shots: VecDeque<Shot>,
     buffers: Vec<Vec<u8>>,
     queued: VecDeque<u32>,
@@ -91,6 +95,8 @@ impl Cam {
             adjust: |_| {},
             buffer_bytes: 64,
             buffers_given: 4,
+            hangs: false,
+            misnames: None,
             shots: VecDeque::new(),
             buffers: Vec::new(),
             queued: VecDeque::new(),
@@ -251,7 +257,7 @@ impl Kernel for Machine {
         for (c, ready) in cams.iter().zip(ready) {
             let c = &mut s.cams[*c];
             c.run(now);
-            *ready = Ready { readable: !c.done.is_empty(), error: !c.present };
+            *ready = Ready { readable: !c.done.is_empty(), error: !c.present || c.hangs };
         }
         Ok(())
     }
@@ -321,7 +327,7 @@ fn answer(c: &mut Cam, request: Request) -> io::Result<()> {
         }
         Request::Dequeue(a, planes) => {
             let Some((index, shot)) = c.done.pop_front() else { return refuse(libc::EAGAIN) };
-            (a.index, a.sequence, a.flags) = (index, shot.sequence, shot.flags);
+            (a.index, a.sequence, a.flags) = (c.misnames.unwrap_or(index), shot.sequence, shot.flags);
             (a.stamp_s, a.stamp_us) = (shot.stamp / 1_000_000_000, shot.stamp % 1_000_000_000 / 1000);
             a.bytes_used = shot.bytes.len() as u32;
             (planes[0].bytes_used, planes[0].data_offset) = (a.bytes_used, shot.data_offset as u32);
