@@ -182,6 +182,27 @@ impl Plan {
         self.unplugged = unplugged;
     }
 
+    /// Asks until something of what the source gave is left, or `timeout` is over. `ask` waits that long at most, spoils what
+    /// came, and says whether any of it is delivered.
+    fn pass(
+        &mut self,
+        timeout: Span,
+        mut ask: impl FnMut(&mut Plan, Span) -> Result<(Wait, bool), SourceFault>,
+    ) -> Result<Wait, SourceFault> {
+        let limit = Instant::now() + Duration::from_nanos(timeout.0.max(0) as u64);
+        loop {
+            let was_unplugged = self.unplugged;
+            match ask(self, Span(limit.saturating_duration_since(Instant::now()).as_nanos() as i64))? {
+                (Wait::Got, true) => return Ok(Wait::Got),
+                (Wait::Got, _) if self.unplugged && !was_unplugged => return Err(self.lost()),
+                (Wait::Got, _) if Instant::now() < limit => {}
+                (Wait::Ended, _) => return Ok(Wait::Ended),
+                _ if self.unplugged => return Err(self.lost()),
+                _ => return Ok(Wait::TimedOut),
+            }
+        }
+    }
+
     fn lost(&self) -> SourceFault {
         let what = "unplugged by [inject]";
         SourceFault::Lost(Fault::new(Exit::Unavailable, self.place, what, "it comes back as the rule says"))
@@ -200,17 +221,17 @@ fn sleep(secs: f64) {
     std::thread::sleep(Duration::from_secs_f64(secs.max(0.0)));
 }
 
-fn until(limit: Instant) -> Span {
-    Span(limit.saturating_duration_since(Instant::now()).as_nanos() as i64)
-}
-
 /// A rig that fails.
 pub struct FaultyFrames<S> {
     source: S,
     plan: Plan,
-    /// What was delivered last, for who freezes or comes twice.
-    kept: Frames,
-    keeps: bool,
+    last: LastFrames,
+}
+
+/// What was delivered last, for who freezes or comes twice.
+struct LastFrames {
+    frames: Frames,
+    kept: bool,
     again: bool,
 }
 
@@ -218,21 +239,23 @@ impl<S: FrameSource> FaultyFrames<S> {
     /// `shape` is that of the frames it will be lent.
     pub fn new(source: S, rules: &[Rule], seed: u64, shape: Frames) -> FaultyFrames<S> {
         let plan = Plan::new(rules, seed, "camera");
-        let keeps = plan.has(Kind::Freeze) || plan.has(Kind::Duplicate);
-        FaultyFrames { source, plan, kept: shape, keeps, again: false }
+        let kept = plan.has(Kind::Freeze) || plan.has(Kind::Duplicate);
+        FaultyFrames { source, plan, last: LastFrames { frames: shape, kept, again: false } }
     }
+}
 
+impl LastFrames {
     /// Whether the frame is delivered.
-    fn spoil(&mut self, frames: &mut Frames) -> bool {
+    fn spoil(&mut self, plan: &mut Plan, frames: &mut Frames) -> bool {
         let (mut delivered, mut frozen, mut late_s) = (true, false, 0.0);
-        let (kept, again) = (&self.kept, &mut self.again);
-        self.plan.strike(frames.t, |kind, by_s, rng| match kind {
+        let (last, again) = (&self.frames, &mut self.again);
+        plan.strike(frames.t, |kind, by_s, rng| match kind {
             Kind::Drop | Kind::Gap | Kind::Unplug => delivered = false,
             Kind::Delay => late_s += by_s,
             Kind::Duplicate => *again = true,
             Kind::Freeze => {
                 let t = frames.t;
-                frames.copy_from(kept);
+                frames.copy_from(last);
                 frames.t = t;
                 frozen = true;
             }
@@ -248,10 +271,10 @@ impl<S: FrameSource> FaultyFrames<S> {
             }
             Kind::StampJump => frames.t = frames.t + Span::from_secs(by_s),
         });
-        if delivered && self.keeps && !frozen {
-            self.kept.copy_from(frames);
+        if delivered && self.kept && !frozen {
+            self.frames.copy_from(frames);
         }
-        self.kept.t = frames.t;
+        self.frames.t = frames.t;
         sleep(late_s);
         delivered
     }
@@ -259,22 +282,15 @@ impl<S: FrameSource> FaultyFrames<S> {
 
 impl<S: FrameSource> FrameSource for FaultyFrames<S> {
     fn next(&mut self, timeout: Span, frames: &mut Frames) -> Result<Wait, SourceFault> {
-        if std::mem::take(&mut self.again) {
-            frames.copy_from(&self.kept);
+        let FaultyFrames { source, plan, last } = self;
+        if std::mem::take(&mut last.again) {
+            frames.copy_from(&last.frames);
             return Ok(Wait::Got);
         }
-        let limit = Instant::now() + Duration::from_nanos(timeout.0.max(0) as u64);
-        loop {
-            let was_unplugged = self.plan.unplugged;
-            match self.source.next(until(limit), frames)? {
-                Wait::Got if self.spoil(frames) => return Ok(Wait::Got),
-                Wait::Got if self.plan.unplugged && !was_unplugged => return Err(self.plan.lost()),
-                Wait::Got if Instant::now() < limit => {}
-                Wait::Ended => return Ok(Wait::Ended),
-                _ if self.plan.unplugged => return Err(self.plan.lost()),
-                _ => return Ok(Wait::TimedOut),
-            }
-        }
+        plan.pass(timeout, |plan, left| {
+            let wait = source.next(left, frames)?;
+            Ok((wait, wait == Wait::Got && last.spoil(plan, frames)))
+        })
     }
 
     fn counters(&self) -> Vec<(&'static str, u64)> {
@@ -304,35 +320,36 @@ impl<S: ImuSource> FaultyImu<S> {
         // Another stream than the cameras'.
         FaultyImu { source, plan: Plan::new(rules, seed ^ 0x494D_5500, "imu"), last: ImuReading::default() }
     }
+}
 
-    fn spoil(&mut self, batch: &mut ImuBatch) {
-        let mut spoilt = ImuBatch::new();
-        let mut late_s: f64 = 0.0;
-        for reading in batch.iter() {
-            let (mut out, mut delivered, mut twice, last) = (*reading, true, false, self.last);
-            self.plan.strike(reading.sample.t, |kind, by_s, rng| match kind {
-                Kind::Drop | Kind::Gap | Kind::Unplug => delivered = false,
-                Kind::Delay => late_s = late_s.max(by_s),
-                Kind::Duplicate => twice = true,
-                Kind::Freeze => {
-                    let t = out.sample.t;
-                    out = last;
-                    out.sample.t = t;
-                }
-                Kind::BitFlip => flip(&mut out, rng),
-                // Refused where rules are read: a unit has no light.
-                Kind::Blackout => {}
-                Kind::StampJump => out.sample.t = out.sample.t + Span::from_secs(by_s),
-            });
-            for _ in 0..if delivered { 1 + u32::from(twice) } else { 0 } {
-                // A FIFO that full is not doubled; what is in it is delivered.
-                let _ = spoilt.push(out);
-                self.last = out;
+/// Leaves in `batch` what is delivered of it; `last` is the reading before.
+fn spoil(batch: &mut ImuBatch, last: &mut ImuReading, plan: &mut Plan) {
+    let mut spoilt = ImuBatch::new();
+    let mut late_s: f64 = 0.0;
+    for reading in batch.iter() {
+        let (mut out, mut delivered, mut twice) = (*reading, true, false);
+        plan.strike(reading.sample.t, |kind, by_s, rng| match kind {
+            Kind::Drop | Kind::Gap | Kind::Unplug => delivered = false,
+            Kind::Delay => late_s = late_s.max(by_s),
+            Kind::Duplicate => twice = true,
+            Kind::Freeze => {
+                let t = out.sample.t;
+                out = *last;
+                out.sample.t = t;
             }
+            Kind::BitFlip => flip(&mut out, rng),
+            // Refused where rules are read: a unit has no light.
+            Kind::Blackout => {}
+            Kind::StampJump => out.sample.t = out.sample.t + Span::from_secs(by_s),
+        });
+        for _ in 0..if delivered { 1 + u32::from(twice) } else { 0 } {
+            // A FIFO that full is not doubled; what is in it is delivered.
+            let _ = spoilt.push(out);
+            *last = out;
         }
-        *batch = spoilt;
-        sleep(late_s);
     }
+    *batch = spoilt;
+    sleep(late_s);
 }
 
 fn flip(reading: &mut ImuReading, rng: &mut ChaCha8Rng) {
@@ -351,20 +368,12 @@ fn flip(reading: &mut ImuReading, rng: &mut ChaCha8Rng) {
 
 impl<S: ImuSource> ImuSource for FaultyImu<S> {
     fn next(&mut self, timeout: Span, batch: &mut ImuBatch) -> Result<Wait, SourceFault> {
-        let limit = Instant::now() + Duration::from_nanos(timeout.0.max(0) as u64);
-        loop {
-            let was_unplugged = self.plan.unplugged;
-            let wait = self.source.next(until(limit), batch)?;
-            self.spoil(batch);
-            match wait {
-                Wait::Got if !batch.is_empty() => return Ok(Wait::Got),
-                Wait::Got if self.plan.unplugged && !was_unplugged => return Err(self.plan.lost()),
-                Wait::Got if Instant::now() < limit => {}
-                Wait::Ended => return Ok(Wait::Ended),
-                _ if self.plan.unplugged => return Err(self.plan.lost()),
-                _ => return Ok(Wait::TimedOut),
-            }
-        }
+        let FaultyImu { source, plan, last } = self;
+        plan.pass(timeout, |plan, left| {
+            let wait = source.next(left, batch)?;
+            spoil(batch, last, plan);
+            Ok((wait, !batch.is_empty()))
+        })
     }
 
     fn counters(&self) -> Vec<(&'static str, u64)> {
