@@ -13,6 +13,39 @@ pub fn lower_priority() {
     }
 }
 
+/// CPU time, s: of the program, and of the kernel on its behalf. The kernel knows the sum exactly and divides it by what it
+/// met at its ticks, so the parts are worth something after a second or more.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct CpuTime {
+    pub user_s: f64,
+    pub kernel_s: f64,
+}
+
+impl CpuTime {
+    pub fn total_s(self) -> f64 {
+        self.user_s + self.kernel_s
+    }
+}
+
+impl std::ops::Sub for CpuTime {
+    type Output = CpuTime;
+    fn sub(self, other: CpuTime) -> CpuTime {
+        CpuTime { user_s: self.user_s - other.user_s, kernel_s: self.kernel_s - other.kernel_s }
+    }
+}
+
+/// Of the calling thread so far.
+pub fn thread_cpu() -> CpuTime {
+    // SAFETY: a struct of integers may be zero, and outlives the call; the calling thread can always be asked for.
+    let used = unsafe {
+        let mut used: libc::rusage = std::mem::zeroed();
+        libc::getrusage(libc::RUSAGE_THREAD, &mut used);
+        used
+    };
+    let secs = |t: libc::timeval| t.tv_sec as f64 + t.tv_usec as f64 * 1e-6;
+    CpuTime { user_s: secs(used.ru_utime), kernel_s: secs(used.ru_stime) }
+}
+
 /// CLOCK_MONOTONIC, in which drivers stamp frames and edges.
 pub fn monotonic() -> crate::Nanos {
     let mut t = libc::timespec { tv_sec: 0, tv_nsec: 0 };

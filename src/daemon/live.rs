@@ -86,6 +86,7 @@ pub fn run(path: &Path, out: &Path, set: &[String], options: &Run) -> Result<(),
         eprintln!("stipple: warning: {warning}");
     }
     played.warnings = [rig.warnings, played.warnings].concat();
+    let cameras = played.capture.and_then(|c| c.line(&played.source));
     let broken = played.broken.take();
     let recorded = recorder.map(|(recorder, dir)| (recorder.finish(), dir));
     if let Some((recorded, _)) = &recorded {
@@ -93,6 +94,7 @@ pub fn run(path: &Path, out: &Path, set: &[String], options: &Run) -> Result<(),
     }
     let report = summary::conclude(title, played, &out)?;
     println!("{}", summary::seven_lines(&report, &out));
+    cameras.into_iter().for_each(|line| println!("cameras     {line}"));
     recorded.map_or(Ok(()), |(recorded, dir)| record::whole(&recorded, dir))?;
     broken.map_or(Ok(()), Err)
 }

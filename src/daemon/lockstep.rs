@@ -118,6 +118,7 @@ pub fn lockstep(
         wall_s,
         warnings,
         source,
+        capture: None,
         broken: None,
     }
 }

@@ -9,7 +9,7 @@ use super::lockstep::lockstep;
 use super::mapping::{KeyframeQueue, Mapping, SLICE};
 use super::pipeline::{Ends, Pipeline};
 use super::progress::{Gauges, Progress};
-use super::sensors::{self, Inbox, Sensors};
+use super::sensors::{self, Capture, Inbox, Sensors};
 use super::tracking::{Slot, Tracking};
 use crate::config::InjectConfig;
 use crate::counters::Counters;
@@ -63,6 +63,8 @@ pub struct Played {
     pub warnings: Vec<String>,
     /// Counters of the sources.
     pub source: Vec<(&'static str, u64)>,
+    /// In real time.
+    pub capture: Option<Capture>,
     /// The source that broke, if one did.
     pub broken: Option<Fault>,
 }
@@ -280,6 +282,7 @@ pub fn realtime(
         warnings,
         counters: shared.counters,
         source,
+        capture: shared.inbox.capture.get().copied(),
         broken: shared.inbox.broken.pop(),
     }
 }

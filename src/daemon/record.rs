@@ -12,6 +12,7 @@ use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::time::{Duration, Instant};
 use stipple_drivers::record::{self, Format, Recorded};
+use stipple_drivers::source::FrameSource;
 use stipple_drivers::{host, Exit, Fault, Frames};
 
 /// Slots that the cameras go round with when nobody tracks.
@@ -48,6 +49,8 @@ pub fn record(path: &Path, out: &Path, format: Format, set: &[String], options: 
         }
     });
     progress.finish();
+    let line = inbox.capture.get().and_then(|c| c.line(&frames.counters()));
+    line.into_iter().for_each(|line| println!("cameras     {line}"));
     drop((frames, imu));
     let recorded = recorder.finish();
     for (name, n) in counters.list().iter().chain(&recorded.counters) {

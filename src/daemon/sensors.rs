@@ -14,7 +14,9 @@ use crate::config::InjectConfig;
 use crate::counters::{Counter, Counters};
 use crossbeam_queue::ArrayQueue;
 use std::sync::atomic::{AtomicBool, AtomicI64, AtomicU64, Ordering::Relaxed};
+use std::sync::OnceLock;
 use std::time::{Duration, Instant};
+use stipple_drivers::host::{thread_cpu, CpuTime};
 use stipple_drivers::inject::{FaultyFrames, FaultyImu};
 use stipple_drivers::paced::{Images, Pace, PacedFrames, PacedImu};
 use stipple_drivers::source::{FrameSource, ImuBatch, ImuSource, SourceFault, Wait};
@@ -78,6 +80,8 @@ pub struct Inbox {
     imu_away: AtomicBool,
     /// Frames that arrived.
     pub arrived: AtomicU64,
+    /// Known when the thread `camera` has ended.
+    pub capture: OnceLock<Capture>,
     /// Asks both threads to end.
     pub stop: AtomicBool,
     /// Lines to be printed, and what ended the run.
@@ -94,6 +98,7 @@ impl Inbox {
             imu_until: AtomicI64::new(i64::MIN),
             imu_away: AtomicBool::new(false),
             arrived: AtomicU64::new(0),
+            capture: OnceLock::new(),
             stop: AtomicBool::new(false),
             notices: ArrayQueue::new(NOTICES),
             broken: ArrayQueue::new(2),
@@ -128,6 +133,49 @@ impl Inbox {
         }
         counters.frames_without_imu.add(u64::from(!reached));
         held.take().map(|h| h.slot)
+    }
+}
+
+/// What the thread `camera` took to read frames: waiting in the kernel, copying, decoding, and looking whether they are
+/// believed. What the kernel does in interrupts and in threads of its own is not in it.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Capture {
+    pub frames: u64,
+    /// Of the images of one frame.
+    pub frame_bytes: usize,
+    pub cpu: CpuTime,
+}
+
+impl Capture {
+    /// CPU time a frame, ms: all of it, and the kernel's part.
+    pub fn ms_a_frame(&self) -> Option<(f64, f64)> {
+        let ms = |s: f64| 1e3 * s / self.frames as f64;
+        (self.frames > 0).then(|| (ms(self.cpu.total_s()), ms(self.cpu.kernel_s)))
+    }
+
+    /// How often each byte was copied on its way from the kernel's buffer, where the source counts that.
+    pub fn copies(&self, source: &[(&'static str, u64)]) -> Option<f64> {
+        let copied = source.iter().find(|(name, n)| *name == "camera_bytes_copied" && *n > 0)?.1;
+        let bytes = self.frames as f64 * self.frame_bytes as f64;
+        (bytes > 0.0).then(|| copied as f64 / bytes)
+    }
+
+    /// For a person to read.
+    pub fn line(&self, source: &[(&'static str, u64)]) -> Option<String> {
+        let (ms, kernel) = self.ms_a_frame()?;
+        let copies = self.copies(source).map_or(String::new(), |n| format!(", {n:.2} copies of each byte"));
+        Some(format!("{ms:.2} ms of CPU a frame to read it, {kernel:.2} of them in the kernel{copies}"))
+    }
+}
+
+/// Says at the end of its thread what that took.
+struct Metered<'a>(&'a Inbox, CpuTime, usize);
+
+impl Drop for Metered<'_> {
+    fn drop(&mut self) {
+        let Metered(inbox, from, frame_bytes) = self;
+        let (frames, cpu) = (inbox.arrived.load(Relaxed), thread_cpu() - *from);
+        let _ = inbox.capture.set(Capture { frames, frame_bytes: *frame_bytes, cpu });
     }
 }
 
@@ -190,6 +238,7 @@ impl Presence<'_> {
 pub fn camera(inbox: &Inbox, source: &mut dyn FrameSource, tracking: &Bell, c: &Counters, gauges: &Gauges) {
     let Some(mut slot) = inbox.spare.pop() else { return };
     let mut watch = FrameWatch::new(&slot.frames);
+    let _metered = Metered(inbox, thread_cpu(), slot.frames.images.iter().map(|i| i.pixels.len()).sum());
     let mut presence = Presence {
         name: "camera",
         heard: Instant::now(),
@@ -287,4 +336,53 @@ pub fn inertial(inbox: &Inbox, source: &mut dyn ImuSource, tracking: &Bell, over
         tracking.ring();
     }
     inbox.imu_away.store(true, Relaxed);
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+    use std::sync::Mutex;
+    use stipple_drivers::sim::euroc_rig;
+    use stipple_drivers::types::{Image, Nanos};
+
+    /// A camera that says where it wrote the images of its last frame, and gives one at a time.
+    struct Writes<'a>(&'a Mutex<Vec<usize>>, i64);
+
+    fn places(images: &[Image]) -> Vec<usize> {
+        images.iter().map(|i| i.pixels.as_ptr() as usize).collect()
+    }
+
+    impl FrameSource for Writes<'_> {
+        fn next(&mut self, _: Span, frames: &mut Frames) -> Result<Wait, SourceFault> {
+            if self.1 == 3 {
+                return Ok(Wait::Ended);
+            }
+            self.1 += 1;
+            frames.t = Nanos(self.1 * 50_000_000);
+            frames.images.iter_mut().for_each(|i| i.pixels[..99].fill(self.1 as u8 * 40));
+            *self.0.lock().unwrap() = places(&frames.images);
+            Ok(Wait::Got)
+        }
+
+        fn counters(&self) -> Vec<(&'static str, u64)> {
+            vec![("camera_bytes_copied", 3 * 2 * 752 * 480)]
+        }
+    }
+
+    #[test]
+    fn the_tracker_gets_the_image_where_the_camera_wrote_it() {
+        let (inbox, written) = (Inbox::new(4, &euroc_rig(), 0), Mutex::new(vec![]));
+        let (bell, counters, gauges) = (Bell::default(), Counters::default(), Gauges::default());
+        inbox.imu_away.store(true, Relaxed);
+        let mut source = Writes(&written, 0);
+        camera(&inbox, &mut source, &bell, &counters, &gauges);
+        let slot = inbox.take(&mut None, &AtomicBool::new(true), &counters).unwrap();
+        assert_eq!((slot.frames.t, counters.frames_overwritten.get()), (Nanos(150_000_000), 2));
+        assert_eq!(places(&slot.frames.images), *written.lock().unwrap(), "handed on, not copied");
+        let capture = inbox.capture.get().unwrap();
+        assert_eq!((capture.frames, capture.frame_bytes), (3, 2 * 752 * 480));
+        assert_eq!(capture.copies(&source.counters()), Some(1.0));
+        assert!(capture.ms_a_frame().is_some_and(|(all, kernel)| all >= kernel && kernel >= 0.0));
+    }
 }

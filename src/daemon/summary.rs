@@ -76,6 +76,10 @@ pub fn conclude(title: Title, mut played: Played, out: &OutputDir) -> Result<Rep
             played.warnings.push(warning);
         }
     }
+    if let Some(capture) = &played.capture {
+        (report.camera_cpu_ms, report.camera_kernel_ms) = capture.ms_a_frame().unzip();
+        report.camera_copies = capture.copies(&played.source);
+    }
     report.rss_peak_bytes = process::rss_peak_bytes();
     report.set_counters(&counted(&played, &title.opened));
     if let Tracking::Odometry(run) = &played.tracking {

@@ -31,6 +31,10 @@ pub struct Report {
     pub tracking_fps: Option<f64>,
     /// CPU time of all its threads, a frame.
     pub tracking_cpu_ms: Option<f64>,
+    /// CPU time of the thread that reads the cameras, a frame, the kernel's part of it, and copies of each byte on the way.
+    pub camera_cpu_ms: Option<f64>,
+    pub camera_kernel_ms: Option<f64>,
+    pub camera_copies: Option<f64>,
     /// Wall time from taking a frame to its pose, and in each half.
     pub tracking_ms_p50: Option<f64>,
     pub tracking_ms_p99: Option<f64>,
@@ -163,7 +167,7 @@ mod tests {
         tracking_ms_p99 tracking_threads tracking_cpu_ms frontend_ms_p50 frontend_ms_p99 estimator_ms_p50 \
         estimator_ms_p99 psnr_db ssim psnr_heldout_db ssim_heldout psnr_heldout_between_db psnr_heldout_fitted_db ssim_heldout_fitted psnr_heldout_aligned_db splats iterations \
         iteration_ms_p50 seconds_to_25_db gpu_bytes estimator_bytes quality_min quality_p50 quality_under_50 rss_peak_bytes heap_after_seal wall_s device vio_hash dataset board pace scale \
-        time_offset_s time_offset_sigma_s gyro_scale gyro_scale_sigma accel_scale accel_scale_sigma";
+        camera_cpu_ms camera_kernel_ms camera_copies time_offset_s time_offset_sigma_s gyro_scale gyro_scale_sigma accel_scale accel_scale_sigma";
 
     #[test]
     fn unmeasured_figures_are_null_and_present() {

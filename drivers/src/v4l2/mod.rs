@@ -96,6 +96,8 @@ counters! {
     camera_frames,
     /// Calls that waited in vain.
     camera_timeouts,
+    /// Bytes written from the kernel's buffers into images: of grey pictures once each pixel.
+    camera_bytes_copied,
     /// Images missing before one that came, by its number and by its stamp.
     camera_missed_by_sequence,
     camera_missed_by_stamp,
@@ -378,7 +380,9 @@ impl Rig {
             let stream = &self.streams[camera / parts];
             let part = Part { x: camera % parts * image.width, ..stream.node.part };
             let bytes = stream.node.bytes(&stream.held[0].filled);
-            let Err(why) = to_grey(stream.node.format, bytes, part, &mut self.scratch, image) else { continue };
+            let copied = to_grey(stream.node.format, bytes, part, &mut self.scratch, image);
+            self.counters.camera_bytes_copied += image.pixels.len() as u64;
+            let Err(why) = copied else { continue };
             match why {
                 Unreadable::Short { .. } => self.counters.camera_images_short += 1,
                 Unreadable::Undecodable(_) => self.counters.camera_images_undecodable += 1,
@@ -391,6 +395,7 @@ impl Rig {
         // A grey camera's colours are equal.
         for (colour, image) in frames.colours.iter_mut().zip(&frames.images) {
             colour.iter_mut().for_each(|plane| plane.copy_from(image));
+            self.counters.camera_bytes_copied += 3 * image.pixels.len() as u64;
         }
         frames.t = t;
         self.last = t;

@@ -9,7 +9,7 @@ pub mod signals;
 use super::live::{rig_of, Rig, Run};
 use super::pipeline::{Bell, Ends};
 use super::progress::Gauges;
-use super::sensors::{self, Inbox};
+use super::sensors::{self, Capture, Inbox};
 use crate::config::Board;
 use crate::counters::Counters;
 use crate::stereo::alignment::Alignment;
@@ -77,6 +77,7 @@ struct Seen {
     pairs: Pairs,
     counters: Counters,
     source: Vec<(&'static str, u64)>,
+    capture: Option<Capture>,
     notices: Vec<String>,
     broken: Option<Fault>,
 }
@@ -186,6 +187,7 @@ fn sensed(rig: Rig, board: &Board, look_s: f64) -> Result<Vec<Check>, Fault> {
     let imu: Vec<Nanos> = seen.samples.iter().map(|s| s.t).collect();
     checks.push(signals::rate("inertial rate", &imu, seen.counters.imu_missing.get(), Some(calibration.imu.rate_hz)));
     checks.push(skew(&seen));
+    checks.extend(seen.capture.and_then(|c| capture(&c, &seen)));
     checks.extend(seen.light.iter().enumerate().map(|(camera, light)| light.check(camera)));
     checks.push(seen.pairs.check(board));
     checks.extend(signals::inertia(&seen.samples, &calibration));
@@ -193,6 +195,21 @@ fn sensed(rig: Rig, board: &Board, look_s: f64) -> Result<Vec<Check>, Fault> {
     let found = compare(&seen.turning.rates, &seen.samples, calibration.cameras[0].body_from_cam.q);
     checks.extend(signals::turning(found.as_ref()));
     Ok(checks)
+}
+
+/// More of a core than this to read the cameras is more than odometry takes itself.
+const CAPTURE_SHARE_MAX: f64 = 0.25;
+
+fn capture(capture: &Capture, seen: &Seen) -> Option<Check> {
+    let what = format!("capture: {}", capture.line(&seen.source)?);
+    let look_s = (*seen.frames.last()? - *seen.frames.first()?).secs();
+    if capture.cpu.total_s() > CAPTURE_SHARE_MAX * look_s {
+        return Some(Check::warn(
+            what,
+            "let the camera send grey, not mjpeg (camera.format), or fewer or smaller frames",
+        ));
+    }
+    Some(Check::ok(what))
 }
 
 /// Images without a partner within the tolerance, as the source counts them.
@@ -221,6 +238,7 @@ fn look(rig: Rig, board: &Board, look_s: f64) -> Result<Seen, Fault> {
         },
         counters: Counters::default(),
         source: rig.opened,
+        capture: None,
         notices: vec![],
         broken: None,
     };
@@ -254,6 +272,7 @@ fn look(rig: Rig, board: &Board, look_s: f64) -> Result<Seen, Fault> {
     });
     seen.source.extend(sensors.frames.counters());
     seen.broken = inbox.broken.pop();
+    seen.capture = inbox.capture.get().copied();
     seen.counters = counters;
     Ok(seen)
 }

@@ -14,7 +14,8 @@ fn pairs_come_whole_in_order_and_stamped() {
         assert_eq!(rig.next(Span(100 * MS), &mut frames), Ok(Wait::Got));
         assert_is(&frames, k);
     }
-    assert_eq!(counted(&rig), [("camera_frames", 39)]);
+    let copied = (39 * 2 * WIDTH * HEIGHT) as u64;
+    assert_eq!(counted(&rig), [("camera_frames", 39), ("camera_bytes_copied", copied)], "each pixel is copied once");
     assert!(rig.warnings().is_empty());
     // A pair costs each camera a buffer taken and given back; four are queued at the start. Of eight asked for, six are in vain.
     let calls = |name: &str| machine.state().calls[name];
@@ -248,7 +249,7 @@ fn compressed_frames_are_decoded_and_a_cut_one_costs_itself() {
         });
     }
     take(&mut rig, &mut frames, 9);
-    assert_eq!(counted(&rig), [("camera_frames", 9), ("camera_images_undecodable", 1)]);
+    assert_eq!((count(&rig, "camera_frames"), count(&rig, "camera_images_undecodable")), (9, 1));
     assert!(frames.images[1].at(15, 7).abs_diff(200) <= 1);
     assert!(rig.warnings()[0].contains("/dev/video0") && rig.warnings()[0].contains("decode"), "{:?}", rig.warnings());
 }
