@@ -196,6 +196,11 @@ impl Recorder {
         self.commands.iter().filter(|c| c.barrier_before).count()
     }
 
+    /// Commands that it still has room for.
+    pub fn room(&self) -> usize {
+        COMMANDS_MAX - self.commands.len()
+    }
+
     /// The first error is kept, and `Gpu::submit` returns it.
     fn fail(&mut self, error: GpuError) {
         self.error.get_or_insert(error);

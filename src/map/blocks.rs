@@ -17,6 +17,9 @@ pub struct Block {
     pub first: u32,
 }
 
+/// Of its Gaussians, and of their colours.
+const COMMANDS_OF_A_MOVE: usize = 2;
+
 /// How many Gaussians have which importance: quarter octaves from 2^-63.
 pub type Bins = [u32; IMPORTANCE_BINS];
 
@@ -131,10 +134,14 @@ impl Pipeline {
         Ok(bins)
     }
 
-    /// Moves each anchor's Gaussians: x' = by x, all in one submission.
+    /// Moves each anchor's Gaussians: x' = by x, as many anchors in a submission as it has room for.
     pub fn move_blocks(&mut self, gpu: &mut Gpu, moves: impl Iterator<Item = (u32, Pose)>) -> Result<(), GpuError> {
         let mut rec = gpu.record();
         for (anchor, by) in moves {
+            if rec.room() < COMMANDS_OF_A_MOVE {
+                gpu.submit(rec)?;
+                rec = gpu.record();
+            }
             let slots = self.block(anchor);
             let (r, t) = (by.rotation().transpose(), by.p);
             let row = |i: usize| [r.col(i).x as f32, r.col(i).y as f32, r.col(i).z as f32, t[i] as f32];

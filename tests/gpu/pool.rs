@@ -3,7 +3,7 @@
 use super::splat::{open, render, scene, shape, target, train, view, Rng};
 use super::twins::chunks;
 use super::twins::pool::{self, Moved};
-use glam::{DQuat, DVec3, DVec4, Vec4};
+use glam::{DQuat, DVec3, DVec4, Vec3, Vec4};
 use stipple::gpu::kernels::types::{Moments, Splat};
 use stipple::gpu::{Gpu, GpuOptions};
 use stipple::map::blocks::importance_of_bin;
@@ -204,4 +204,18 @@ fn the_validation_layer_is_silent_about_the_pool() {
     assert_eq!(gpu.validation_messages(), Vec::<String>::new());
     let mut one = [Splat::default()];
     gpu.download(p.buffers().splats, 0, &mut one).unwrap();
+}
+
+#[test]
+fn a_loop_that_moves_thousands_of_anchors_fits() {
+    let v = view(32, 32);
+    let (mut gpu, mut p) = trained(&v, 30);
+    let before = splats(&mut gpu, &mut p);
+    let there = Pose { p: DVec3::X, ..Pose::IDENTITY };
+    let and_back = [(4, there), (4, there.inverse())];
+    p.move_blocks(&mut gpu, and_back.into_iter().cycle().take(3000)).unwrap();
+    for (now, then) in splats(&mut gpu, &mut p).iter().zip(&before) {
+        let (now, then) = (DVec3::from(Vec3::from(now.mean)), DVec3::from(Vec3::from(then.mean)));
+        assert!(now.distance(then) < 1e-3, "{now} {then}");
+    }
 }
