@@ -9,10 +9,10 @@
 //!
 //! There is no volume of costs: the eight passes over the one volume of sums count Hamming distances anew. When the sums are
 //! read they are free, and what the filter needs lies where they were.
-//! Where the picture shows little but noise, a census finds noise: on simulated flights 19 to 26 % of what both eyes see is left
-//! unknown, and 60 to 77 % of what is bad by 1 px after the filter was filled in there, three in five of it where the
-//! picture's slope is under two grey levels. OpenCV's block matching and filter, which weigh differences by their size, are
-//! right at four of five of all these bad ones, and so have fewer bad pixels on nine of ten flights, though not on cones and teddy.
+//! Where the picture shows little but noise, a census finds noise: about a fifth of what both eyes see of simulated flights is
+//! left unknown, and most of what is bad by 1 px after the filter was filled in there. OpenCV's semi-global block matching
+//! weighs differences by their size, and with its filter has fewer bad pixels on seven of ten flights (2.6 %, here 2.9),
+//! though not on cones and teddy.
 //!
 //! All until the filter is integers, and no sum depends on the order of threads: the result is the same in every run.
 
@@ -34,21 +34,22 @@ const GROUP_CPU: u32 = 8;
 /// Cost of a match outside the right image, of 32: a little below that of a wrong match, so that what is there continues
 /// what is seen beside it.
 pub const OUTSIDE: u32 = 8;
-/// Penalties of the smoothness term, in Hamming distance. With `P2` at 60, 12 at least and falling by 1 a grey level, 3.6 and
-/// 4.7 % of the matches in cones and teddy are bad by 1 px, not 2.9 and 4.4; and of poles 4 px wide 30 % is found, not 61.
-pub const P1: u32 = 8;
-pub const P2: u32 = 50;
-pub const P2_MIN: u32 = 10;
+/// Penalties of the smoothness term, in Hamming distance. At 8, 50 and 10 at least, 2.9 % of simulated flights, 9.4 and
+/// 11.7 % of cones and teddy are bad by 1 px after the filter, not 2.6, 9.4 and 11.6; and 68 % of poles up to 6 px wide is
+/// found, not 66.
+pub const P1: u32 = 11;
+pub const P2: u32 = 60;
+pub const P2_MIN: u32 = 12;
 /// What a grey level of difference takes off `P2`.
 pub const P2_SLOPE: u32 = 2;
 /// Left and right may differ by this, px.
 pub const DISAGREE: u32 = 1;
-/// Sums of 9 Hamming distances, 144 by chance: the most a match may have, the most of one that is asked whether it repeats,
-/// and how much more a repetition may have and what lies between must. Of stripes under 0.5 % stays, in islands; cones and
-/// teddy lose 1 and 3 %, an eighth of it wrong.
-pub const CHANCE: u32 = 126;
+/// Sums of 9 Hamming distances, 144 by chance and less by a blank wall: the most a match may have, the most of one that is
+/// asked whether it repeats, and how much more a repetition may have and what lies between must. Of stripes under 0.5 % stays,
+/// in islands; at 126 a blank right eye is matched in 2 % of the left.
+pub const CHANCE: u32 = 108;
 pub const REPEAT_FIT: u32 = 54;
-pub const REPEAT_ALIKE: u32 = 4;
+pub const REPEAT_ALIKE: u32 = 6;
 pub const REPEAT_WALL: u32 = 54;
 /// Neighbours this close are of one surface, px; surfaces of fewer pixels are none. At 100 of poles
 /// 4 px wide 19 % is found, not 43; at 20 both pairs have 0.1 % more wrong.

@@ -28,7 +28,7 @@ impl Wls {
     /// How far from what is matched, px.
     pub const FILL_REACH: f32 = 64.0;
     /// Less weight than this is no disparity. Far from all matches the weight is small and the variance large.
-    pub const WEIGHT_MIN: f32 = 1e-12;
+    pub const WEIGHT_MIN: f32 = 1e-30;
     /// Parts of the variance, px², of greatest likelihood on the fitting flights of `bench::stereo::flights`, with and
     /// without the filter.
     pub const LEAST: f32 = 0.0004;

@@ -29,12 +29,15 @@ pub fn census(image: &Grey) -> Vec<u32> {
     let mut strings = Vec::new();
     for y in 0..image.height as i64 {
         for x in 0..image.width as i64 {
-            let disc =
-                |(u, v): &(i64, i64)| *v == 0 && *u != 0 || v.abs() == 3 && *u == 0 || (1..=2).contains(&v.abs());
-            let corner = |(u, v): &(i64, i64)| u.abs() == 3 && v.abs() == 2;
-            let around = (-3..=3).flat_map(|v| (-3..=3).map(move |u| (u, v))).filter(|at| disc(at) && !corner(at));
-            let bit = |(u, v)| u32::from(image.at(x + u, y + v) < image.at(x, y));
-            strings.push(around.enumerate().map(|(n, at)| bit(at) << n).sum());
+            let around = (-3..=3)
+                .flat_map(|v| (-3..=3).map(move |u: i64| (u, v)))
+                .filter(|(u, v): &(i64, i64)| [u.abs(), v.abs()] == [2, 2] || (u * v == 0 && u + v != 0));
+            let two = |(u, v)| match i16::from(image.at(x + u, y + v)) - i16::from(image.at(x, y)) {
+                ..0 => 1,
+                0..=1 => 0,
+                2.. => 2u32,
+            };
+            strings.push(around.enumerate().map(|(n, at)| two(at) << (2 * n)).sum());
         }
     }
     strings
