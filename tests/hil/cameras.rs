@@ -7,10 +7,10 @@
 
 mod jpeg;
 mod pattern;
+mod plugged;
 
-use std::io::{BufRead, BufReader, Write};
-use std::process::{Child, ChildStdin, Command, Stdio};
-use std::sync::{Arc, Mutex};
+use plugged::Uvc;
+use std::process::Command;
 use std::time::{Duration, Instant};
 use stipple_drivers::source::{FrameSource, SourceFault, Wait};
 use stipple_drivers::v4l2::{Format, Rig, Select, Settings, StampPoint};
@@ -19,51 +19,6 @@ use stipple_drivers::{Calibration, Camera, Fault, Frames, ImuCalibration, Lens, 
 const MS: i64 = 1_000_000;
 /// Waits of the tests: a slow machine takes its time, and a broken one does not come back.
 const PATIENCE: Duration = Duration::from_secs(20);
-
-/// A camera that runs beside the test; dropped, it is unplugged.
-struct Uvc {
-    process: Child,
-    orders: ChildStdin,
-    sent: Arc<Mutex<Vec<u32>>>,
-}
-
-impl Uvc {
-    fn plug(port: u32, serial: &str, format: &str, width: usize, height: usize, fps: u32) -> Uvc {
-        let program = std::env::var("HIL_UVC_CAMERA").expect("set by uvc.sh");
-        let arguments =
-            [port.to_string(), serial.into(), format.into(), width.to_string(), height.to_string(), fps.to_string()];
-        let mut command = Command::new(program);
-        let mut process = command.args(arguments).stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().unwrap();
-        let (orders, output) = (process.stdin.take().unwrap(), process.stdout.take().unwrap());
-        let sent: Arc<Mutex<Vec<u32>>> = Arc::default();
-        let log = sent.clone();
-        std::thread::spawn(move || {
-            for line in BufReader::new(output).lines().map_while(Result::ok) {
-                if let Some(k) = line.strip_prefix("sent ") {
-                    log.lock().unwrap().push(k.parse().unwrap());
-                }
-            }
-        });
-        Uvc { process, orders, sent }
-    }
-
-    fn order(&mut self, order: &str) {
-        writeln!(self.orders, "{order}").unwrap();
-    }
-
-    /// Pictures it did not send between two that it sent.
-    fn unsent(&self, from: u32, to: u32) -> u64 {
-        let sent = self.sent.lock().unwrap();
-        u64::from(to - from + 1) - sent.iter().filter(|k| (from..=to).contains(*k)).count() as u64
-    }
-}
-
-impl Drop for Uvc {
-    fn drop(&mut self) {
-        let _ = self.process.kill();
-        let _ = self.process.wait();
-    }
-}
 
 fn settings(devices: &[&str], width: usize, height: usize, fps: u32) -> Settings {
     Settings {

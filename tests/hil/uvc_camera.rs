@@ -1,14 +1,16 @@
 //! A USB camera that is a program: UVC 1.0 over a bulk endpoint, plugged through USB/IP into the `vhci_hcd` of the machine
 //! it runs on, so that the kernel's own uvcvideo driver makes a video node of it. For the virtual machine of `run-vm.sh`.
 //!
-//! hil-uvc-camera PORT SERIAL FORMAT WIDTH HEIGHT FPS [FRAMES [START_NS]]
+//! hil-uvc-camera PORT SERIAL FORMAT WIDTH HEIGHT FPS [FRAMES INSTANTS]
 //!
-//! PORT is one of the hub's eight. Pictures are `pattern::packed`; or of FRAMES, a file of raw ones in FORMAT, once, the
-//! first at START_NS of CLOCK_MONOTONIC. Picture `k` is exposed at `k` periods of that clock, hence cameras started
-//! apart see together. What the machine is too slow to send in a quarter of its period is not sent, as a camera does.
+//! PORT is one of the hub's eight. Pictures are `pattern::packed`, and picture `k` is exposed at `k` periods of
+//! CLOCK_MONOTONIC, hence cameras started apart see together; or those of FRAMES, a file of raw ones in FORMAT, once, so
+//! many ns after the instant that `play` names as the lines of INSTANTS say. What the machine is too slow to send in a
+//! quarter of a period is not sent, as a camera does.
 //!
 //! Lines on the standard input: `skip N` (send nothing for N pictures), `corrupt N` (with the error bit), `short N` (end
-//! after half), `silent N` (as skip, and said so), `unplug`. Lines on the standard output: `sent K`, `not sent K`.
+//! after half), `silent N` (as skip, and said so), `play NS`, `unplug`. Lines on the standard output: `streaming`, `sent
+//! K`, `not sent K`.
 
 #[path = "jpeg.rs"]
 mod jpeg;
@@ -35,6 +37,12 @@ struct Camera {
     period: i64,
 }
 
+/// Pictures and when each is exposed.
+struct Film {
+    frames: Vec<u8>,
+    instants: Vec<i64>,
+}
+
 /// What the host asked for and has not been answered.
 #[derive(Default)]
 struct Bus {
@@ -48,22 +56,27 @@ struct Orders {
     skip: u32,
     corrupt: u32,
     short: u32,
+    /// When the first picture of a file is exposed.
+    play: Option<i64>,
 }
 
 type Shared<T> = Arc<(Mutex<T>, Condvar)>;
 
 fn main() {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
-    let usage = "hil-uvc-camera PORT SERIAL FORMAT WIDTH HEIGHT FPS [FRAMES [START_NS]]";
+    let usage = "hil-uvc-camera PORT SERIAL FORMAT WIDTH HEIGHT FPS [FRAMES INSTANTS]";
     let number = |i: usize| arguments.get(i).and_then(|a| a.parse::<f64>().ok()).expect(usage);
     let (width, height) = (number(3) as usize, number(4) as usize);
     let (serial, format) = (arguments[1].clone(), arguments[2].clone());
     let camera = Camera { serial, format, width, height, period: (1e9 / number(5)) as i64 };
-    let frames = arguments.get(6).map(|path| std::fs::read(path).expect("the file of frames"));
-    let start = arguments.get(7).map_or(0, |ns| ns.parse().expect("START_NS"));
+    let film = arguments.get(6).zip(arguments.get(7)).map(|(frames, instants)| {
+        let list = std::fs::read_to_string(instants).expect("the file of instants");
+        let instants = list.lines().map(|l| l.parse().expect("ns")).collect();
+        Film { frames: std::fs::read(frames).expect("the file of frames"), instants }
+    });
     let socket = plug(number(0) as u32);
     let bus: Shared<Bus> = Arc::default();
-    let orders: Arc<Mutex<Orders>> = Arc::default();
+    let orders: Shared<Orders> = Arc::default();
     let answers = Arc::new(Mutex::new(socket.try_clone().expect("a second descriptor")));
     {
         let (bus, answers, descriptors) = (bus.clone(), answers.clone(), Descriptors::of(&camera));
@@ -75,7 +88,7 @@ fn main() {
             std::io::stdin().lock().lines().map_while(Result::ok).for_each(|l| obey(&l, &orders))
         });
     }
-    expose(&camera, frames.as_deref(), start, &bus, &orders, &answers);
+    expose(&camera, film.as_ref(), &bus, &orders, &answers);
 }
 
 /// The other end of the pair is the host controller's.
@@ -87,54 +100,61 @@ fn plug(port: u32) -> UnixStream {
     ours
 }
 
-fn obey(line: &str, orders: &Mutex<Orders>) {
-    let (order, count) = line.split_once(' ').unwrap_or((line, "1"));
-    let count: u32 = count.parse().expect("a count");
-    let mut orders = orders.lock().expect("no thread panics with it");
+fn obey(line: &str, shared: &Shared<Orders>) {
+    let (order, number) = line.split_once(' ').unwrap_or((line, "1"));
+    let number: i64 = number.parse().expect("a number");
+    let mut orders = shared.0.lock().expect("no thread panics with it");
     match order {
-        "skip" | "silent" => orders.skip += count,
-        "corrupt" => orders.corrupt += count,
-        "short" => orders.short += count,
+        "skip" | "silent" => orders.skip += number as u32,
+        "corrupt" => orders.corrupt += number as u32,
+        "short" => orders.short += number as u32,
+        "play" => orders.play = Some(number),
         "unplug" => std::process::exit(0),
         _ => panic!("unknown order {line}"),
     }
+    shared.1.notify_all();
 }
 
 /// Sends pictures as they are due, while the host streams.
 fn expose(
     camera: &Camera,
-    frames: Option<&[u8]>,
-    start: i64,
+    film: Option<&Film>,
     bus: &Shared<Bus>,
-    orders: &Mutex<Orders>,
+    orders: &Shared<Orders>,
     answers: &Mutex<UnixStream>,
 ) {
+    let told = || {
+        let orders = orders.1.wait_while(orders.0.lock().expect("whole"), |o| o.play.is_none()).expect("whole");
+        orders.play.expect("waited for")
+    };
+    let start = film.map_or(0, |_| told());
     let now = || stipple_drivers::host::monotonic().0 - start;
     let (mut last, mut fid) = (-1, 0u8);
     loop {
         drop(bus.1.wait_while(bus.0.lock().expect("whole"), |b| !b.streaming).expect("whole"));
-        let k = (now() / camera.period).max(last + 1);
-        std::thread::sleep(Duration::from_nanos((k * camera.period - now()).max(0) as u64));
-        let picture = match frames {
+        let newest = film.map_or(now() / camera.period, |f| f.instants.partition_point(|t| *t <= now()) as i64 - 1);
+        let k = newest.max(last + 1);
+        let due = film.map_or(Some(k * camera.period), |f| f.instants.get(k as usize).copied());
+        let Some(due) = due else { return park() };
+        std::thread::sleep(Duration::from_nanos((due - now()).max(0) as u64));
+        let size = Descriptors::picture_bytes(camera);
+        let picture = match film {
             None => pattern::packed(&camera.format, k as u32, camera.width, camera.height),
-            Some(frames) => {
-                let size = Descriptors::picture_bytes(camera);
-                let Some(picture) = frames.get(k as usize * size..(k as usize + 1) * size) else { return park() };
-                picture.to_vec()
-            }
+            Some(film) => film.frames[k as usize * size..][..size].to_vec(),
         };
         last = k;
         let (skip, corrupt, short) = {
-            let mut o = orders.lock().expect("whole");
+            let mut o = orders.0.lock().expect("whole");
             let now = (o.skip > 0, o.corrupt > 0, o.short > 0);
             *o = Orders {
                 skip: o.skip.saturating_sub(1),
                 corrupt: o.corrupt.saturating_sub(1),
                 short: o.short.saturating_sub(1),
+                ..*o
             };
             now
         };
-        let late = now() - k * camera.period > camera.period / 4;
+        let late = now() - due > camera.period / 4;
         if skip || late {
             println!("not sent {k}");
             continue;
@@ -295,6 +315,7 @@ impl Descriptors {
         const COMMIT: u8 = 2;
         let [kind, request, low, high, ..] = setup;
         let stream = |on: bool| {
+            on.then(|| println!("streaming"));
             bus.0.lock().expect("whole").streaming = on;
             bus.1.notify_all();
             Some(vec![])
