@@ -2,19 +2,8 @@
 # imu.sh TEST: GPIO, I2C, SPI and IIO as Debian's kernel has them: lines of gpio-sim, and hil-imu first for our register
 # driver, then with the stock inv_mpu6050 on it.
 set -euo pipefail
-modprobe -a gpio-sim i2c-dev spidev inv-mpu6050-i2c
-mountpoint -q /sys/kernel/config || mount -t configfs none /sys/kernel/config
-
-# Lines of a chip "hil-gpio": 3 is the unit's data ready, 5 triggers cameras, 6 has no name.
-sim=/sys/kernel/config/gpio-sim/hil
-mkdir -p $sim/bank0/line3 $sim/bank0/line5
-echo 8 >$sim/bank0/num_lines
-echo imu-ready >$sim/bank0/line3/name
-echo camera-trigger >$sim/bank0/line5/name
-echo hil-gpio >$sim/bank0/label
-echo 1 >$sim/live
-HIL_LINES=/sys/devices/platform/$(cat $sim/dev_name)/$(cat $sim/bank0/chip_name)
-export HIL_LINES
+modprobe -a i2c-dev spidev inv-mpu6050-i2c
+. "${0%/*}/lines.sh"
 
 passes() { "$test" --ignored --test-threads=1 --nocapture "$@"; }
 test=$1 status=0
