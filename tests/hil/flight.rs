@@ -1,0 +1,403 @@
+//! The whole program on the kernel's own subsystems: a recording is played through two UVC cameras and through an MPU-6500
+//! on I2C with a data-ready line, and `stipple run` flies it. For the virtual machine: `make hil TESTS=flight`.
+//!
+//! Physics cannot be slowed down for a slow machine, so the machine's time is: its clock counts the instructions that it
+//! executes, one a nanosecond, and stands still while the host is busy with something else (`run-vm.sh -i`). To what runs
+//! there the recording plays at its own pace.
+//!
+//! The trajectory must be that of a replay of the same pictures and samples from a folder, which bear the instants at which
+//! they were due; what the run saw bears those that the kernel stamped. No alignment: a pose is compared with the pose of
+//! the same picture.
+#![allow(clippy::unwrap_used)]
+
+mod plugged;
+#[path = "../program/mod.rs"]
+#[allow(dead_code)] // its recording is of the simulator
+mod program;
+mod unit;
+
+use plugged::Uvc;
+use program::text;
+use serde_json::Value;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+use std::time::{Duration, Instant};
+use stipple_drivers::host::monotonic;
+use stipple_drivers::record::{self, Format};
+use stipple_drivers::replay::{OpenOptions, Recording};
+use stipple_drivers::source::ImuReading;
+use stipple_drivers::{Frames, Image, Nanos, Span};
+use unit::{counts, Feed};
+
+const MS: i64 = 1_000_000;
+const FPS: u32 = 20;
+/// From when the cameras stream until the recording starts: the program has its threads by then.
+const BEFORE: Span = Span(200 * MS);
+/// From the last picture until the program is stopped: less than a silence.
+const AFTER: Span = Span(250 * MS);
+/// Inertial samples of the recording on either side of its pictures.
+const AROUND: Span = Span(100 * MS);
+const PATIENCE: Duration = Duration::from_secs(60);
+
+fn environment(name: &str) -> PathBuf {
+    PathBuf::from(std::env::var_os(name).unwrap_or_else(|| panic!("{name} is set by tests/hil/run")))
+}
+
+/// What the devices can give of a recording: pictures of a quarter of the pixels, samples in steps of the unit. Not in the
+/// machine, where decoding it takes minutes.
+#[test]
+#[ignore = "make hil"]
+fn prepare() {
+    let (from, to) = (environment("HIL_RECORDING"), environment("HIL_FLIGHT"));
+    let recording = Recording::open(&from, &OpenOptions::default()).unwrap();
+    let (mut reader, mut calibration) = (recording.reader(), recording.calibration.clone());
+    let halved = calibration.cameras[0].camera.width > 400;
+    for c in calibration.cameras.iter_mut().map(|c| &mut c.camera).filter(|_| halved) {
+        // Pixel centres are integers.
+        (c.width, c.height, c.fx, c.fy) = (c.width / 2, c.height / 2, c.fx / 2.0, c.fy / 2.0);
+        (c.cx, c.cy) = ((c.cx + 0.5) / 2.0 - 0.5, (c.cy + 0.5) / 2.0 - 0.5);
+    }
+    let _ = fs::remove_dir_all(&to);
+    let mut sink = record::open(&to, Format::Euroc, &calibration).unwrap();
+    let (mut whole, mut raw) = (Frames::for_rig(&recording.calibration), [vec![], vec![]]);
+    for i in 0..recording.frames.len() {
+        reader.read(i, &mut whole).unwrap();
+        let images: Vec<Image> = whole.images.iter().map(|i| if halved { half(i) } else { i.clone() }).collect();
+        raw.iter_mut().zip(&images).for_each(|(raw, image)| raw.extend(&image.pixels));
+        sink.frames(&Frames { t: whole.t, images, colours: vec![] }).unwrap();
+    }
+    let (first, last) = (recording.frames[0].t, whole.t);
+    let instants: String = recording.frames.iter().map(|f| format!("{}\n", (f.t - first).0)).collect();
+    fs::write(to.join("instants"), instants).unwrap();
+    for sample in recording.imu.iter().filter(|s| (first - AROUND..=last + AROUND).contains(&s.t)) {
+        let sample = unit::sample(sample.t, counts(sample));
+        sink.imu(&ImuReading { sample, ..ImuReading::default() }).unwrap();
+    }
+    sink.finish().unwrap();
+    raw.iter().enumerate().for_each(|(k, raw)| fs::write(to.join(format!("cam{k}.grey")), raw).unwrap());
+}
+
+fn half(image: &Image) -> Image {
+    let mut out = Image::new(image.width / 2, image.height / 2);
+    for y in 0..out.height {
+        for x in 0..out.width {
+            let four = [(0, 0), (1, 0), (0, 1), (1, 1)].map(|(i, j)| u32::from(image.at(2 * x + i, 2 * y + j)));
+            out.pixels[y * out.width + x] = ((four.iter().sum::<u32>() + 2) / 4) as u8;
+        }
+    }
+    out
+}
+
+/// Both cameras and the unit.
+struct Devices {
+    flight: PathBuf,
+    size: (usize, usize),
+    /// From the recording's first sample to its first picture, and from there to each.
+    lead: Span,
+    stamps: Vec<Span>,
+    cameras: [Uvc; 2],
+    feed: Feed,
+    /// Ports of the hub that were used.
+    ports: u32,
+    /// When the first picture was exposed.
+    start: Nanos,
+}
+
+const SERIALS: [&str; 2] = ["FLIGHT-L", "FLIGHT-R"];
+
+fn camera(flight: &Path, k: usize, port: u32, size: (usize, usize)) -> Uvc {
+    Uvc::playing(port, SERIALS[k], size, FPS, [&flight.join(format!("cam{k}.grey")), &flight.join("instants")])
+}
+
+impl Devices {
+    fn plug() -> Devices {
+        let flight = environment("HIL_FLIGHT");
+        let recording = Recording::open(&flight, &OpenOptions::default()).unwrap();
+        let c = recording.calibration.cameras[0].camera;
+        let size = (c.width, c.height);
+        let first = recording.frames[0].t;
+        let (lead, stamps) = (first - recording.imu[0].t, recording.frames.iter().map(|f| f.t - first).collect());
+        let cameras = [camera(&flight, 0, 0, size), camera(&flight, 1, 1, size)];
+        wait_for("both nodes", || SERIALS.into_iter().all(is_found));
+        let feed = Feed::start(recording.imu.iter().map(counts).collect());
+        Devices { flight, size, lead, stamps, cameras, feed, ports: 2, start: Nanos(0) }
+    }
+
+    /// Plays the recording as soon as a program reads the cameras.
+    fn play(&mut self) {
+        wait_for("a program that reads the cameras", || self.cameras.iter().all(Uvc::is_streaming));
+        self.start = self.feed.play_after(monotonic() + BEFORE) + self.lead;
+        let order = format!("play {}", self.start.0);
+        self.cameras.iter_mut().for_each(|c| c.order(&order));
+    }
+
+    /// When picture `k` is exposed.
+    fn exposed(&self, k: usize) -> Nanos {
+        self.start + self.stamps[k]
+    }
+
+    fn end(&self) -> Nanos {
+        self.exposed(self.stamps.len() - 1)
+    }
+
+    /// The picture of a stamp: the last one exposed.
+    fn picture(&self, t: Nanos) -> usize {
+        self.stamps.partition_point(|s| self.start + *s <= t).saturating_sub(1)
+    }
+
+    /// Pulls a camera's plug and puts it into another port.
+    fn replug(&mut self, k: usize, away: Span) {
+        self.cameras[k].order("unplug");
+        wait_until(monotonic() + away);
+        self.cameras[k] = camera(&self.flight, k, self.ports, self.size);
+        self.cameras[k].order(&format!("play {}", self.start.0));
+        self.ports += 1;
+    }
+
+    /// A board file of them.
+    fn board(&self, dir: &Path) -> PathBuf {
+        let plain = fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join(program::BOARD)).unwrap();
+        let path = dir.join("board.toml");
+        let [left, right] = SERIALS;
+        let text = format!(
+            "{plain}
+            [rig]
+            calibration = \"{}/mav0\"
+            [camera]
+            devices = [\"serial:{left}\", \"serial:{right}\"]
+            rate_hz = {FPS}.0
+            stamp = \"frame-start\"
+            pair_tolerance_s = 0.02
+            [imu]
+            chip = \"mpu-6500\"
+            i2c = \"hil-imu i2c\"
+            rate_hz = {}.0
+            [gpio.data_ready]
+            chip = \"hil-gpio\"
+            line = \"imu-ready\"
+            [record]
+            # All of them: PNG is slow here, and written when there is time.
+            ring_frames = 250
+            ",
+            self.flight.display(),
+            unit::RATE_HZ,
+        );
+        fs::write(&path, text).unwrap();
+        path
+    }
+
+    /// What was given, as a recording that bears the instants at which it was due.
+    fn given(&self, dir: &Path) -> PathBuf {
+        let given = dir.join("given");
+        for k in 0..2 {
+            let (from, to) = (self.flight.join(format!("mav0/cam{k}")), given.join(format!("mav0/cam{k}")));
+            fs::create_dir_all(&to).unwrap();
+            fs::copy(from.join("sensor.yaml"), to.join("sensor.yaml")).unwrap();
+            std::os::unix::fs::symlink(from.join("data"), to.join("data")).unwrap();
+            let list = fs::read_to_string(from.join("data.csv")).unwrap();
+            let rows = list.lines().skip(1).map(|l| l.split_once(',').unwrap().1).zip(&self.stamps);
+            let rows: String = rows.map(|(name, t)| format!("{},{name}\n", (self.start + *t).0)).collect();
+            fs::write(to.join("data.csv"), format!("#t,name\n{rows}")).unwrap();
+        }
+        let (from, to) = (self.flight.join("mav0/imu0"), given.join("mav0/imu0"));
+        fs::create_dir_all(&to).unwrap();
+        fs::copy(from.join("sensor.yaml"), to.join("sensor.yaml")).unwrap();
+        fs::write(to.join("data.csv"), self.feed.csv()).unwrap();
+        given
+    }
+}
+
+/// The program, at the priority of a program: what plays the devices goes before it, as hardware does.
+fn stipple(arguments: &[&str]) -> Command {
+    let mut command = Command::new("chrt");
+    command.args(["--other", "0", env!("CARGO_BIN_EXE_stipple")]).args(arguments);
+    command
+}
+
+fn report(out: &Path) -> Value {
+    serde_json::from_slice(&fs::read(out.join("report.json")).unwrap()).unwrap()
+}
+
+fn count(report: &Value, name: &str) -> u64 {
+    report[format!("count_{name}")].as_u64().unwrap_or(0)
+}
+
+/// Counters that are not zero.
+fn counted(report: &Value) -> String {
+    let all = report.as_object().unwrap().iter().filter(|(k, v)| k.starts_with("count_") && v.as_u64() != Some(0));
+    all.map(|(k, v)| format!("{} {v}", &k[6..])).collect::<Vec<_>>().join(", ")
+}
+
+/// Stamps and positions of a trajectory.
+fn trajectory(out: &Path) -> Vec<(Nanos, [f64; 3])> {
+    let text = fs::read_to_string(out.join("trajectory.tum")).unwrap();
+    let row = |line: &str| {
+        let v: Vec<&str> = line.split_whitespace().collect();
+        let (s, ns) = v[0].split_once('.').unwrap();
+        let t = s.parse::<i64>().unwrap() * 1000 * MS + format!("{ns:0<9}")[..9].parse::<i64>().unwrap();
+        (Nanos(t), [1, 2, 3].map(|i| v[i].parse().unwrap()))
+    };
+    text.lines().filter(|l| !l.starts_with('#')).map(row).collect()
+}
+
+/// How far apart the poses of the same pictures are, m: how many there are, root mean square, largest.
+fn apart(devices: &Devices, one: &Path, other: &Path) -> (usize, f64, f64) {
+    let [one, other] = [one, other].map(trajectory);
+    let (mut n, mut sum, mut worst) = (0, 0.0, 0f64);
+    for (t, p) in &one {
+        let Some((_, q)) = other.iter().find(|(u, _)| devices.picture(*u) == devices.picture(*t)) else { continue };
+        let d2: f64 = (0..3).map(|i| (p[i] - q[i]).powi(2)).sum();
+        (n, sum, worst) = (n + 1, sum + d2, worst.max(d2.sqrt()));
+    }
+    (n, (sum / n.max(1) as f64).sqrt(), worst)
+}
+
+fn wait_for(what: &str, there: impl Fn() -> bool) {
+    let begun = Instant::now();
+    while !there() {
+        assert!(begun.elapsed() < PATIENCE, "waited for {what}");
+        std::thread::sleep(Duration::from_millis(10));
+    }
+}
+
+/// The kernel has made its node.
+fn is_found(serial: &str) -> bool {
+    let nodes = fs::read_dir("/sys/class/video4linux").into_iter().flatten().flatten();
+    nodes.filter_map(|n| fs::read_to_string(n.path().join("name")).ok()).any(|name| name.contains(serial))
+}
+
+fn wait_until(t: Nanos) {
+    std::thread::sleep(Duration::from_nanos((t - monotonic()).0.max(0) as u64));
+}
+
+fn median_and_worst(mut late: Vec<i64>) -> String {
+    late.sort_unstable();
+    let us = |i: usize| late[i] / 1000;
+    format!("median {} us, {} to {} us", us(late.len() / 2), us(0), us(late.len() - 1))
+}
+
+/// `stipple run` through the whole recording, stopped by SIGTERM; `during` is called once it plays.
+fn fly(devices: &mut Devices, dir: &Path, more: &[&str], during: impl FnOnce(&mut Devices)) {
+    let [board, out, kept] = [devices.board(dir), dir.join("out"), dir.join("kept")].map(|p| p.display().to_string());
+    let mut run = stipple(&[&["run", &board, "--out", &out, "--record", &kept], more].concat()).spawn().unwrap();
+    devices.play();
+    during(devices);
+    wait_until(devices.end() + AFTER);
+    assert!(Command::new("kill").args(["-TERM", &run.id().to_string()]).status().unwrap().success());
+    assert!(run.wait().unwrap().success());
+}
+
+/// From a folder, as given and as seen.
+fn replayed(dir: &Path, board: &Path, name: &str) -> PathBuf {
+    let (from, out) = (dir.join(name), dir.join(format!("{name}-out")));
+    let [from, board, to] = [&from, board, &out].map(|p| p.to_str().unwrap());
+    let more = ["--pace", "lockstep", "--set", "map.enabled=false"];
+    let o = stipple(&[&["replay", from, "--board", board, "--out", to], &more[..]].concat()).output().unwrap();
+    assert!(o.status.success(), "{}", text(&o));
+    out
+}
+
+#[test]
+#[ignore = "needs the machine of tests/hil/flight.sh"]
+fn flight_through_the_kernel_is_the_flight_from_a_folder() {
+    let dir = tempfile::tempdir().unwrap();
+    let (mut devices, dir) = (Devices::plug(), dir.path());
+    fly(&mut devices, dir, &["--set", "map.enabled=false"], |_| {});
+    let out = dir.join("out");
+    let r = report(&out);
+    println!("{}", counted(&r));
+
+    // Every picture that both cameras sent was tracked or counted.
+    let [left, right] = [0, 1].map(|k| devices.cameras[k].sent());
+    let pairs = left.iter().filter(|k| right.contains(k)).count() as u64;
+    let frames = r["frames"].as_u64().unwrap();
+    let lost = r["frames_dropped"].as_u64().unwrap() + count(&r, "camera_images_unpaired");
+    println!("{} and {} pictures sent, {pairs} pairs: {frames} tracked, {lost} counted", left.len(), right.len());
+    assert_eq!((frames + lost, count(&r, "camera_frames")), (pairs, pairs));
+    assert!(frames * 10 >= 9 * devices.stamps.len() as u64, "the machine is fast enough for nine in ten");
+
+    // Every sample that was given while the recording played arrived, once, in order.
+    let kept = Recording::open(&dir.join("kept"), &OpenOptions::default()).unwrap();
+    let during = |t: Nanos| (devices.start..devices.end()).contains(&t);
+    let arrived: Vec<_> = kept.imu.iter().filter(|s| during(s.t)).collect();
+    let late = devices.feed.late(&arrived).expect("what arrived is what was given, without a gap");
+    println!("{} samples arrived, stamp less due: {}", late.len(), median_and_worst(late));
+    let late = kept.frames.iter().map(|f| (f.t - devices.exposed(devices.picture(f.t))).0).collect();
+    println!("{} frames were kept, stamp less exposure: {}", kept.frames.len(), median_and_worst(late));
+
+    let board = dir.join("board.toml");
+    devices.given(dir);
+    let [given, seen] = ["given", "kept"].map(|name| replayed(dir, &board, name));
+    let (n, rms, worst) = apart(&devices, &out, &given);
+    println!("{n} poses against the replay of what was given: {:.2} mm rms, {:.2} mm at most", rms * 1e3, worst * 1e3);
+    let (_, rms_seen, worst_seen) = apart(&devices, &out, &seen);
+    println!(
+        "against the replay of what it recorded: {:.4} mm rms, {:.4} mm at most",
+        rms_seen * 1e3,
+        worst_seen * 1e3
+    );
+    assert!(n as u64 + count(&r, "frames_without_odometry") == frames && n * 10 >= frames as usize * 9);
+    assert!(worst < 0.01 && worst_seen < 0.01);
+    assert_eq!((&r["heap_after_seal"], &r["pace"]), (&0.into(), &"live".into()));
+    let quiet = ["camera_lost", "camera_silent", "imu_lost", "imu_silent", "imu_missing", "imu_frozen", "imu_overflow"];
+    quiet.iter().for_each(|name| assert_eq!(count(&r, name), 0, "{name}"));
+}
+
+#[test]
+#[ignore = "needs the machine of tests/hil/flight.sh"]
+fn flight_goes_on_after_a_plug_was_pulled() {
+    let dir = tempfile::tempdir().unwrap();
+    let (mut devices, dir) = (Devices::plug(), dir.path());
+    let pulled = devices.stamps.len() / 2;
+    fly(&mut devices, dir, &["--set", "map.enabled=false"], |devices| {
+        wait_until(devices.exposed(pulled));
+        devices.replug(1, Span(1000 * MS));
+    });
+    let r = report(&dir.join("out"));
+    println!("{}", counted(&r));
+    for name in ["camera_lost", "camera_losses", "camera_returns"] {
+        assert_eq!(count(&r, name), 1, "{name}");
+    }
+    assert!((1000..4000).contains(&count(&r, "camera_away_ms")));
+    assert_eq!((&r["heap_after_seal"], count(&r, "imu_missing")), (&0.into(), 0));
+    devices.given(dir);
+    let given = replayed(dir, &dir.join("board.toml"), "given");
+    let (n, rms, worst) = apart(&devices, &dir.join("out"), &given);
+    println!("{n} poses against the replay of what was given: {:.2} mm rms, {:.2} mm at most", rms * 1e3, worst * 1e3);
+    assert!(worst < 0.1);
+    let last = devices.picture(trajectory(&dir.join("out")).last().unwrap().0);
+    assert_eq!(last + 1, devices.stamps.len(), "the last picture has a pose");
+}
+
+#[test]
+#[ignore = "needs the machine of tests/hil/flight.sh"]
+fn flight_is_found_healthy_and_recorded_as_it_was_given() {
+    let dir = tempfile::tempdir().unwrap();
+    let (mut devices, dir) = (Devices::plug(), dir.path());
+    let [board, out, kept] = [devices.board(dir), dir.join("out"), dir.join("kept")].map(|p| p.display().to_string());
+    let mut doctor = stipple(&["doctor", &board, "--duration", "5", "--out", &out]);
+    let doctor = doctor.stdout(Stdio::piped()).spawn().unwrap();
+    devices.play();
+    let output = doctor.wait_with_output().unwrap();
+    let said = text(&output);
+    println!("{said}");
+    assert!(output.status.success() && !said.lines().any(|l| l.starts_with("fail")));
+    for line in ["camera rate: 20.0 Hz", "inertial rate: 200.0 Hz", "left and right: 0 images without a partner"] {
+        assert!(said.lines().any(|l| l.starts_with("ok") && l.contains(line)), "{line}");
+    }
+    // The recording plays on.
+    assert!(stipple(&["record", &board, "--out", &kept, "--duration", "3"]).status().unwrap().success());
+    let kept = Recording::open(Path::new(&kept), &OpenOptions::default()).unwrap();
+    let film = [0, 1].map(|k| fs::read(devices.flight.join(format!("cam{k}.grey"))).unwrap());
+    let (mut reader, mut frames) = (kept.reader(), Frames::for_rig(&kept.calibration));
+    for i in 0..kept.frames.len() {
+        reader.read(i, &mut frames).unwrap();
+        let at = devices.picture(frames.t) * devices.size.0 * devices.size.1;
+        let same = |(image, film): (&Image, &Vec<u8>)| film[at..].starts_with(&image.pixels);
+        assert!(frames.images.iter().zip(&film).all(same), "frame {i}");
+    }
+    let late = devices.feed.late(&Vec::from_iter(&kept.imu)).expect("what was recorded is what was given");
+    println!("{} frames and {} samples recorded, each as it was given", kept.frames.len(), late.len());
+    assert!(kept.frames.len() >= 40 && late.len() >= 400);
+}

@@ -1,0 +1,10 @@
+#!/bin/bash
+# flight.sh TEST: cameras over USB/IP and an inertial unit on I2C, played by TEST, under `stipple`. What plays a device goes
+# before programs, as hardware does.
+set -euo pipefail
+modprobe -a vhci-hcd uvcvideo i2c-dev hil-imu
+. "${0%/*}/lines.sh"
+export HIL_UVC_CAMERA=${1%/*}/hil-uvc-camera HIL_FLIGHT=${1%/*}/../flight RUST_BACKTRACE=0
+chrt --fifo 50 "$1" --ignored --test-threads 1 --nocapture flight_ && status=0 || status=1
+[ $status = 0 ] || dmesg | grep -iE 'uvc|vhci|usb 1|BUG|WARNING' | tail -20
+exit $status
