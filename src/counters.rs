@@ -39,6 +39,9 @@ counters! {
     camera_lost,
     camera_silent,
     camera_away_ms,
+    /// Times that one camera was lost while the others went on, and how long it was away, ms.
+    eye_lost,
+    eye_away_ms,
     /// Inertial samples that did not fit between two frames.
     imu_overflow,
     /// As of the frames.
@@ -65,6 +68,8 @@ counters! {
     solver_failures,
     /// Keyframes offered while every slot was taken.
     keyframes_rejected,
+    /// Keyframes not offered to the map, since a camera saw nothing.
+    keyframes_blank,
     /// Pose corrections that found their queue full.
     corrections_full,
     /// Keyframes dropped because the mapper's store was full.

@@ -96,6 +96,9 @@ pub struct Rule {
     /// Of `delay` and `stamp_jump`, s.
     #[serde(default)]
     pub by_s: f64,
+    /// Of `blackout` and `unplug`: this camera alone, while the others go on.
+    #[serde(default)]
+    pub camera: Option<usize>,
 }
 
 fn forever() -> f64 {
@@ -109,7 +112,7 @@ fn always() -> f64 {
 impl Rule {
     /// Strikes everything in `[start_s, end_s)`.
     pub fn within(fault: Kind, start_s: f64, end_s: f64) -> Rule {
-        Rule { fault, start_s, end_s, probability: 1.0, length_s: 0.0, by_s: 0.0 }
+        Rule { fault, start_s, end_s, probability: 1.0, length_s: 0.0, by_s: 0.0, camera: None }
     }
 
     /// What is wrong with it.
@@ -123,10 +126,16 @@ impl Rule {
             _ if !(self.length_s >= 0.0 && self.length_s.is_finite()) => Err("length_s must not be negative"),
             _ if needs_by && !(self.by_s.is_finite() && self.by_s != 0.0) => Err("this fault needs by_s, in seconds"),
             _ if self.fault == Kind::Delay && self.by_s < 0.0 => Err("a delay is not negative"),
+            _ if self.camera.is_some() && !matches!(self.fault, Kind::Blackout | Kind::Unplug) => {
+                Err("only blackout and unplug strike one camera alone")
+            }
             _ => Ok(()),
         }
     }
 }
+
+/// What is said of who is, and what to do.
+const UNPLUGGED: (&str, &str) = ("unplugged by [inject]", "it comes back as the rule says");
 
 /// Rules under way.
 struct Plan {
@@ -136,6 +145,8 @@ struct Plan {
     counts: [u64; Kind::ALL.len()],
     unplugs: u64,
     unplugged: bool,
+    /// A camera is, and the others are not.
+    away: Option<Fault>,
     place: &'static str,
 }
 
@@ -148,6 +159,7 @@ impl Plan {
             counts: [0; Kind::ALL.len()],
             unplugs: 0,
             unplugged: false,
+            away: None,
             place,
         }
     }
@@ -156,11 +168,11 @@ impl Plan {
         self.rules.iter().any(|(r, _)| r.fault == kind)
     }
 
-    /// Counts, and calls `act` with the parameter of each fault that strikes at `t`. A fault that withholds strikes alone.
-    fn strike(&mut self, t: Nanos, mut act: impl FnMut(Kind, f64, &mut ChaCha8Rng)) {
+    /// Counts, and calls `act` with each rule that strikes at `t`. A fault that withholds strikes alone.
+    fn strike(&mut self, t: Nanos, mut act: impl FnMut(&Rule, &mut ChaCha8Rng)) {
         let first = *self.first.get_or_insert(t);
         let at_s = (t - first).secs();
-        let mut unplugged = false;
+        let (mut unplugged, mut one) = (false, None);
         for (rule, until) in &mut self.rules {
             let lasts = until.is_some_and(|end| t < end);
             let within = at_s >= rule.start_s && at_s < rule.end_s;
@@ -172,14 +184,21 @@ impl Plan {
                 *until = Some(t + Span::from_secs(rule.length_s));
             }
             self.counts[rule.fault as usize] += 1;
-            act(rule.fault, rule.by_s, &mut self.rng);
-            if rule.fault.withholds() {
+            act(rule, &mut self.rng);
+            if let (Kind::Unplug, Some(camera)) = (rule.fault, rule.camera) {
+                one = Some(camera);
+            } else if rule.fault.withholds() {
                 unplugged = rule.fault == Kind::Unplug;
                 break;
             }
         }
-        self.unplugs += u64::from(unplugged && !self.unplugged);
+        let was = self.unplugged || self.away.is_some();
+        self.unplugs += u64::from((unplugged || one.is_some()) && !was);
         self.unplugged = unplugged;
+        if self.away.is_some() != one.is_some() {
+            let fault = |c| Fault::new(Exit::Unavailable, format!("camera {c}"), UNPLUGGED.0, UNPLUGGED.1);
+            self.away = one.map(fault);
+        }
     }
 
     /// Asks until something of what the source gave is left, or `timeout` is over. `ask` waits that long at most, spoils what
@@ -204,8 +223,7 @@ impl Plan {
     }
 
     fn lost(&self) -> SourceFault {
-        let what = "unplugged by [inject]";
-        SourceFault::Lost(Fault::new(Exit::Unavailable, self.place, what, "it comes back as the rule says"))
+        SourceFault::Lost(Fault::new(Exit::Unavailable, self.place, UNPLUGGED.0, UNPLUGGED.1))
     }
 
     fn counters(&self, names: &[&'static str; Kind::ALL.len()], unplugs: &'static str) -> Vec<(&'static str, u64)> {
@@ -249,9 +267,14 @@ impl LastFrames {
     fn spoil(&mut self, plan: &mut Plan, frames: &mut Frames) -> bool {
         let (mut delivered, mut frozen, mut late_s) = (true, false, 0.0);
         let (last, again) = (&self.frames, &mut self.again);
-        plan.strike(frames.t, |kind, by_s, rng| match kind {
+        plan.strike(frames.t, |rule, rng| match rule.fault {
+            Kind::Unplug | Kind::Blackout if rule.camera.is_some() => {
+                let camera = rule.camera.unwrap_or_default();
+                let colours = frames.colours.get_mut(camera).into_iter().flatten();
+                frames.images.get_mut(camera).into_iter().chain(colours).for_each(|image| image.pixels.fill(0));
+            }
             Kind::Drop | Kind::Gap | Kind::Unplug => delivered = false,
-            Kind::Delay => late_s += by_s,
+            Kind::Delay => late_s += rule.by_s,
             Kind::Duplicate => *again = true,
             Kind::Freeze => {
                 let t = frames.t;
@@ -269,7 +292,7 @@ impl LastFrames {
                 let planes = frames.images.iter_mut().chain(frames.colours.iter_mut().flatten());
                 planes.for_each(|image| image.pixels.fill(0));
             }
-            Kind::StampJump => frames.t = frames.t + Span::from_secs(by_s),
+            Kind::StampJump => frames.t = frames.t + Span::from_secs(rule.by_s),
         });
         if delivered && self.kept && !frozen {
             self.frames.copy_from(frames);
@@ -291,6 +314,10 @@ impl<S: FrameSource> FrameSource for FaultyFrames<S> {
             let wait = source.next(left, frames)?;
             Ok((wait, wait == Wait::Got && last.spoil(plan, frames)))
         })
+    }
+
+    fn away(&self) -> Option<&Fault> {
+        self.plan.away.as_ref().or_else(|| self.source.away())
     }
 
     fn counters(&self) -> Vec<(&'static str, u64)> {
@@ -328,9 +355,9 @@ fn spoil(batch: &mut ImuBatch, last: &mut ImuReading, plan: &mut Plan) {
     let mut late_s: f64 = 0.0;
     for reading in batch.iter() {
         let (mut out, mut delivered, mut twice) = (*reading, true, false);
-        plan.strike(reading.sample.t, |kind, by_s, rng| match kind {
+        plan.strike(reading.sample.t, |rule, rng| match rule.fault {
             Kind::Drop | Kind::Gap | Kind::Unplug => delivered = false,
-            Kind::Delay => late_s = late_s.max(by_s),
+            Kind::Delay => late_s = late_s.max(rule.by_s),
             Kind::Duplicate => twice = true,
             Kind::Freeze => {
                 let t = out.sample.t;
@@ -340,7 +367,7 @@ fn spoil(batch: &mut ImuBatch, last: &mut ImuReading, plan: &mut Plan) {
             Kind::BitFlip => flip(&mut out, rng),
             // Refused where rules are read: a unit has no light.
             Kind::Blackout => {}
-            Kind::StampJump => out.sample.t = out.sample.t + Span::from_secs(by_s),
+            Kind::StampJump => out.sample.t = out.sample.t + Span::from_secs(rule.by_s),
         });
         for _ in 0..if delivered { 1 + u32::from(twice) } else { 0 } {
             // A FIFO that full is not doubled; what is in it is delivered.
@@ -454,6 +481,21 @@ mod tests {
         assert_eq!(count(&counters, "injected_camera_unplugs"), 1);
         assert!(lost >= 2, "said at once, and again while it lasts: {lost}");
         assert_eq!(seen.len() as i64, FRAMES - 5 - 20 + 2);
+    }
+
+    #[test]
+    fn one_camera_alone_is_black_and_away_while_its_rule_lasts() {
+        let rule = Rule { camera: Some(0), ..Rule::within(Kind::Unplug, 0.2, 0.4) };
+        let (mut source, mut frames) = (camera(&[rule]), shape());
+        let mut black = 0;
+        while source.next(Span(20 * MS), &mut frames).unwrap() != Wait::Ended {
+            let is_black = frames.images[0].pixels == [0; 16];
+            assert_eq!(source.away().is_some(), is_black);
+            black += usize::from(is_black);
+        }
+        let counters = source.counters();
+        assert_eq!((black, count(&counters, "injected_camera_unplugs")), (10, 1), "{counters:?}");
+        assert!(Rule { fault: Kind::Drop, ..rule }.check().is_err());
     }
 
     #[test]

@@ -18,6 +18,11 @@ pub trait FrameSource: Send {
     /// `in_colour`. Unless it answers `Got` its pixels are unspecified.
     fn next(&mut self, timeout: Span, frames: &mut Frames) -> Result<Wait, SourceFault>;
 
+    /// Why one camera of the rig is away while the others go on: its images are black meanwhile.
+    fn away(&self) -> Option<&Fault> {
+        None
+    }
+
     /// What was met so far, by name.
     fn counters(&self) -> Vec<(&'static str, u64)>;
 
@@ -150,6 +155,10 @@ impl std::ops::DerefMut for ImuBatch {
 impl<S: FrameSource + ?Sized> FrameSource for Box<S> {
     fn next(&mut self, timeout: Span, frames: &mut Frames) -> Result<Wait, SourceFault> {
         (**self).next(timeout, frames)
+    }
+
+    fn away(&self) -> Option<&Fault> {
+        (**self).away()
     }
 
     fn counters(&self) -> Vec<(&'static str, u64)> {

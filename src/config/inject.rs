@@ -18,8 +18,9 @@ impl InjectConfig {
     pub(super) fn check(&self) -> Result<(), (&'static str, String)> {
         for (key, rules) in [("inject.camera", &self.camera), ("inject.imu", &self.imu)] {
             for (i, rule) in rules.iter().enumerate() {
-                let blind = key == "inject.imu" && rule.fault == Kind::Blackout;
-                let checked = if blind { Err("an inertial unit has no light to go out") } else { rule.check() };
+                let blind = key == "inject.imu" && (rule.fault == Kind::Blackout || rule.camera.is_some());
+                let checked =
+                    if blind { Err("an inertial unit has no light to go out, and no cameras") } else { rule.check() };
                 checked.map_err(|what| (key, format!("{key}, rule {}: {what}", i + 1)))?;
             }
         }

@@ -113,6 +113,10 @@ impl<S: FrameSource> FrameSource for Triggered<S> {
         self.source.next(timeout, frames)
     }
 
+    fn away(&self) -> Option<&Fault> {
+        self.source.away()
+    }
+
     fn counters(&self) -> Vec<(&'static str, u64)> {
         let mut list = self.source.counters();
         list.push(("trigger_failures", self.pulses.failed.load(Relaxed)));

@@ -121,6 +121,10 @@ impl Keyframes {
             self.count += 1;
             return;
         };
+        if slot.blank {
+            counters.keyframes_blank.add(1);
+            return;
+        }
         let id = self.count;
         if queue.offer(&slot.frames, |keyframe| self.fill(keyframe, tracked.world_from_body)) {
             self.recent.add(slot.frames.t, id);

@@ -186,6 +186,7 @@ pub struct Held {
 }
 
 /// Whether a sensor answers, and what is said of it.
+#[derive(Clone, Copy)]
 struct Presence<'a> {
     name: &'static str,
     heard: Instant,
@@ -250,11 +251,15 @@ pub fn camera(inbox: &Inbox, source: &mut dyn FrameSource, tracking: &Bell, c: &
         said: None,
         told: false,
     };
+    let mut eye = Presence { name: "one camera", lost: &c.eye_lost, away_ms: &c.eye_away_ms, ..presence };
     let mut span = None;
     while !inbox.stop.load(Relaxed) {
         let answer = source.next(PATIENCE, &mut slot.frames);
         if presence.hears(&answer) && answer.is_err() {
             watch.stamps.forget();
+        }
+        if answer == Ok(Wait::Got) {
+            eye.hears(&source.away().map_or(Ok(Wait::Got), |fault| Err(SourceFault::Lost(fault.clone()))));
         }
         match answer {
             Ok(Wait::Got) => {}
@@ -269,6 +274,7 @@ pub fn camera(inbox: &Inbox, source: &mut dyn FrameSource, tracking: &Bell, c: &
         if !watch.admits(&slot.frames, Instant::now(), c) {
             continue;
         }
+        slot.blank = watch.blank;
         let t = slot.frames.t;
         let (first, _) = *span.get_or_insert((t, t));
         span = Some((first, t));

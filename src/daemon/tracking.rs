@@ -37,6 +37,8 @@ pub struct Tracked {
 /// was made of them.
 pub struct Slot {
     pub frames: Frames,
+    /// A camera saw nothing, as far as anybody looked: nothing to train a map on.
+    pub blank: bool,
     pub imu: List<ImuSample, IMU_BETWEEN_FRAMES>,
     pub tracks: Tracks,
     pub tracked: Option<Tracked>,
@@ -49,6 +51,7 @@ impl Slot {
     pub fn for_rig(calibration: &Calibration, colours: usize) -> Box<Slot> {
         Box::new(Slot {
             frames: Frames::in_colour(calibration, colours),
+            blank: false,
             imu: List::default(),
             tracks: Tracks::default(),
             tracked: None,

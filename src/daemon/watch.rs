@@ -90,12 +90,14 @@ pub struct FrameWatch {
     pub stamps: Stamps,
     /// Pixels of the last frame, every `LOOKED_AT`th.
     looks: Vec<Vec<u8>>,
+    /// A camera saw nothing in it.
+    pub blank: bool,
 }
 
 impl FrameWatch {
     pub fn new(shape: &Frames) -> FrameWatch {
         let look = |image: &Image| vec![0; image.pixels.len().div_ceil(LOOKED_AT)];
-        FrameWatch { stamps: Stamps::new(), looks: shape.images.iter().map(look).collect() }
+        FrameWatch { stamps: Stamps::new(), looks: shape.images.iter().map(look).collect(), blank: false }
     }
 
     pub fn admits(&mut self, frames: &Frames, now: Instant, c: &Counters) -> bool {
@@ -117,6 +119,7 @@ impl FrameWatch {
             // Black twice is the dark, not a camera that hangs.
             frozen |= same && !dull;
         }
+        self.blank = blank;
         c.frames_blank.add(u64::from(blank));
         c.frames_frozen.add(u64::from(frozen));
         !frozen

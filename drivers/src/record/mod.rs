@@ -202,6 +202,10 @@ impl<S: FrameSource> FrameSource for TappedFrames<S> {
         Ok(wait)
     }
 
+    fn away(&self) -> Option<&Fault> {
+        self.source.away()
+    }
+
     fn counters(&self) -> Vec<(&'static str, u64)> {
         self.source.counters()
     }

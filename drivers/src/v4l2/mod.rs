@@ -7,8 +7,9 @@
 //!
 //! Stamps are the driver's, brought to the middle of the exposure of the first row (`stamps::Timing`) and then to the
 //! calibration's clock and middle row, as recordings' are. A frame is Got when every camera has one within the tolerance;
-//! what has no partner is counted and its buffer given back at once. A camera that is unplugged or silent is `Lost`:
-//! all of them are closed and, from the next call on, looked for by name and opened again, with growing pauses.
+//! what has no partner is counted and its buffer given back at once. A camera that is unplugged or silent is closed and,
+//! from the next call on, looked for by its name and opened again, with growing pauses. Meanwhile, and from the fifth period
+//! of a silence on, the others go on without it: its image is black, and `away` says why. The rig is `Lost` when none is left.
 //!
 //! Nothing is allocated between opening and losing a camera, except by the JPEG decoder and to word a warning.
 
@@ -75,6 +76,8 @@ const RETRY_MIN: Span = Span(100_000_000);
 const RETRY_MAX: Span = Span(2_000_000_000);
 /// Errors in a row after which a camera is opened again.
 const ERRORS_MAX: u32 = 8;
+/// Periods after which a camera that gives nothing is not waited for: a quarter of a second at 20 Hz.
+const AWAY_PERIODS: i64 = 5;
 /// Warnings kept.
 const WARNINGS_MAX: usize = 32;
 
@@ -101,6 +104,8 @@ counters! {
     /// Images missing before one that came, by its number and by its stamp.
     camera_missed_by_sequence,
     camera_missed_by_stamp,
+    /// Black images in the place of a lost camera's.
+    camera_images_absent,
     /// Images without a partner within the tolerance.
     camera_images_unpaired,
     /// Images that the driver marked as damaged.
@@ -122,7 +127,7 @@ counters! {
     camera_losses,
     /// Of these, because it fell silent.
     camera_silences,
-    /// Times that all cameras were there again.
+    /// Times that one was there again.
     camera_returns,
 }
 
@@ -138,8 +143,10 @@ struct Stream {
     held: VecDeque<Held>,
     timing: Timing,
     gaps: Gaps,
-    /// When it last gave anything.
+    /// When it last gave anything, or was opened.
     heard: Nanos,
+    /// When it last gave an image. None: nobody goes on without it until it has.
+    spoke: Option<Nanos>,
     errors: u32,
 }
 
@@ -154,9 +161,9 @@ pub struct Rig {
     kernel: Arc<dyn Kernel>,
     settings: Settings,
     cameras: Vec<RigCamera>,
-    /// Empty while lost.
-    streams: Vec<Stream>,
-    lost: Option<Lost>,
+    /// One a device, `None` while it is closed. `lost` says why, until it has given an image again.
+    streams: Vec<Option<Stream>>,
+    lost: Vec<Option<Lost>>,
     last: Nanos,
     scratch: Vec<u8>,
     counters: CameraCounters,
@@ -175,8 +182,12 @@ impl Rig {
         let (streams, scratch) = (Vec::new(), Vec::new());
         let (counters, warnings) = (CameraCounters::default(), Vec::with_capacity(WARNINGS_MAX));
         let last = Nanos::MIN;
-        let mut rig = Rig { kernel, settings, cameras, streams, lost: None, last, scratch, counters, warnings };
-        rig.streams = rig.open_streams()?;
+        let lost = settings.devices.iter().map(|_| None).collect();
+        let mut rig = Rig { kernel, settings, cameras, streams, lost, last, scratch, counters, warnings };
+        for select in &rig.settings.devices {
+            let stream = rig.open_stream(select, None)?;
+            rig.streams.push(Some(stream));
+        }
         Ok(rig)
     }
 
@@ -193,12 +204,12 @@ impl Rig {
                 part.height
             )
         };
-        self.streams.iter().map(line).collect()
+        self.streams.iter().flatten().map(line).collect()
     }
 
     /// Descriptors of a camera's buffers, where `Settings::export` asks for them: for whoever imports them.
     pub fn exported(&self, camera: usize) -> impl Iterator<Item = BorrowedFd<'_>> {
-        self.streams.get(camera).into_iter().flat_map(|s| s.node.exported().map(|fd| fd.as_fd()))
+        self.streams.get(camera).into_iter().flatten().flat_map(|s| s.node.exported().map(|fd| fd.as_fd()))
     }
 
     /// Pictures side by side in each node's.
@@ -206,17 +217,12 @@ impl Rig {
         self.cameras.len() / self.settings.devices.len()
     }
 
-    fn open_streams(&self) -> Result<Vec<Stream>, Fault> {
-        let mut streams = Vec::with_capacity(self.settings.devices.len());
-        for select in &self.settings.devices {
-            let path = find::find(&*self.kernel, select)?;
-            let node = Node::open(self.kernel.clone(), &path, self.parts(), &self.settings)?;
-            let timing =
-                Timing { point: self.settings.stamp, exposure: node.exposure, transfer: self.settings.transfer };
-            let held = VecDeque::with_capacity(node.held_max());
-            streams.push(Stream { node, held, timing, gaps: Gaps::default(), heard: self.kernel.now(), errors: 0 });
-        }
-        Ok(streams)
+    fn open_stream(&self, select: &Select, spoke: Option<Nanos>) -> Result<Stream, Fault> {
+        let path = find::find(&*self.kernel, select)?;
+        let node = Node::open(self.kernel.clone(), &path, self.parts(), &self.settings)?;
+        let timing = Timing { point: self.settings.stamp, exposure: node.exposure, transfer: self.settings.transfer };
+        let held = VecDeque::with_capacity(node.held_max());
+        Ok(Stream { node, held, timing, gaps: Gaps::default(), heard: self.kernel.now(), spoke, errors: 0 })
     }
 
     fn warn(&mut self, line: impl FnOnce() -> String) {
@@ -225,72 +231,80 @@ impl Rig {
         }
     }
 
-    fn lose(&mut self, fault: Fault) {
-        self.counters.camera_losses += 1;
-        self.warn(|| fault.to_string());
-        self.streams.clear();
-        self.lost = Some(Lost { fault, retry_at: self.kernel.now() + RETRY_MIN, pause: RETRY_MIN });
+    fn lose(&mut self, index: usize, fault: Fault) {
+        let (now, before) = (self.kernel.now(), self.lost[index].as_ref().map(|l| l.pause));
+        if before.is_none() {
+            self.counters.camera_losses += 1;
+            self.warn(|| fault.to_string());
+        }
+        self.streams[index] = None;
+        let pause = before.map_or(RETRY_MIN, |p| Span((2 * p.0).min(RETRY_MAX.0)));
+        self.lost[index] = Some(Lost { fault, retry_at: now + pause, pause });
     }
 
-    /// Tries to open everything again until `deadline`.
-    fn come_back(&mut self, deadline: Nanos) -> Result<(), SourceFault> {
-        while let Some(mut lost) = self.lost.take() {
-            if self.kernel.now() >= lost.retry_at {
-                match self.open_streams() {
-                    Ok(streams) => {
-                        self.streams = streams;
-                        self.counters.camera_returns += 1;
-                        return Ok(());
-                    }
-                    Err(fault) => {
-                        lost.fault = fault;
-                        lost.pause = Span((2 * lost.pause.0).min(RETRY_MAX.0));
-                        lost.retry_at = self.kernel.now() + lost.pause;
-                    }
+    /// Tries to open again what is lost, each camera when its pause is over.
+    fn come_back(&mut self) {
+        for index in 0..self.lost.len() {
+            let due = self.lost[index].as_ref().is_some_and(|l| l.retry_at <= self.kernel.now());
+            if due && self.streams[index].is_none() {
+                match self.open_stream(&self.settings.devices[index], Some(Nanos::MIN)) {
+                    Ok(stream) => self.streams[index] = Some(stream),
+                    Err(fault) => self.lose(index, fault),
                 }
             }
-            let (now, until) = (self.kernel.now(), lost.retry_at.min(deadline));
-            let over = deadline <= now || lost.retry_at >= deadline;
-            let fault = lost.fault.clone();
-            self.lost = Some(lost);
-            if until > now {
-                let slept = self.kernel.poll(&[], &mut [], until - now);
-                slept.map_err(|e| SourceFault::Broken(fault::refused("cameras", "wait", "poll", &e)))?;
-            }
-            if over {
-                return Err(SourceFault::Lost(fault));
-            }
         }
-        Ok(())
+    }
+
+    /// Until the next camera is looked for.
+    fn until_retry(&self) -> Option<Span> {
+        let closed = self.lost.iter().zip(&self.streams).filter(|(_, s)| s.is_none());
+        closed.filter_map(|(l, _)| Some(l.as_ref()?.retry_at - self.kernel.now())).min()
+    }
+
+    /// What is said of a rig without a camera.
+    fn all_lost(&self) -> Option<Fault> {
+        let none = self.streams.iter().all(Option::is_none);
+        self.lost.iter().flatten().next().filter(|_| none).map(|l| l.fault.clone())
     }
 
     /// Takes everything that lies ready; whether there was anything.
-    fn drain(&mut self) -> Result<bool, Fault> {
+    fn drain(&mut self) -> bool {
         let mut any = false;
         for index in 0..self.streams.len() {
-            loop {
-                let stream = &mut self.streams[index];
-                match stream.node.take().map_err(|f| stopped(&stream.node, f))? {
-                    Taken::Nothing => break,
-                    Taken::Corrupt => {
-                        stream.heard = self.kernel.now();
-                        self.counters.camera_images_corrupt += 1;
+            match self.drain_one(index) {
+                Ok(some) => any |= some,
+                Err(fault) => self.lose(index, fault),
+            }
+        }
+        any
+    }
+
+    fn drain_one(&mut self, index: usize) -> Result<bool, Fault> {
+        let mut any = false;
+        while let Some(stream) = &mut self.streams[index] {
+            match stream.node.take().map_err(|f| stopped(&stream.node, f))? {
+                Taken::Nothing => break,
+                Taken::Corrupt => {
+                    stream.heard = self.kernel.now();
+                    self.counters.camera_images_corrupt += 1;
+                }
+                Taken::Failed(error) => {
+                    self.counters.camera_io_errors += 1;
+                    stream.errors += 1;
+                    if stream.errors >= ERRORS_MAX {
+                        return Err(stopped(&stream.node, Failure { call: "VIDIOC_DQBUF", error }));
                     }
-                    Taken::Failed(error) => {
-                        self.counters.camera_io_errors += 1;
-                        stream.errors += 1;
-                        if stream.errors >= ERRORS_MAX {
-                            return Err(stopped(&stream.node, Failure { call: "VIDIOC_DQBUF", error }));
-                        }
+                    break;
+                }
+                Taken::Filled(filled) => {
+                    let (now, camera, counters) = (self.kernel.now(), &self.cameras[index], &mut self.counters);
+                    stream.hold(filled, now, camera, counters)?;
+                    // Back is who gives an image, not who can be opened.
+                    counters.camera_returns += u64::from(self.lost[index].take().is_some());
+                    any = true;
+                    // Enough to decide with; the driver keeps the rest in order.
+                    if stream.is_full() {
                         break;
-                    }
-                    Taken::Filled(filled) => {
-                        self.hold(index, filled)?;
-                        any = true;
-                        // Enough to decide with; the driver keeps the rest in order.
-                        if self.streams[index].is_full() {
-                            break;
-                        }
                     }
                 }
             }
@@ -298,70 +312,35 @@ impl Rig {
         Ok(any)
     }
 
-    /// Keeps an image until its partners come, or gives its buffer back at once.
-    fn hold(&mut self, index: usize, filled: Filled) -> Result<(), Fault> {
-        let now = self.kernel.now();
-        let (stream, counters) = (&mut self.streams[index], &mut self.counters);
-        stream.heard = now;
-        stream.errors = 0;
-        let stamp = match stamp_of(filled.flags, filled.stamp_s, filled.stamp_us, now) {
-            Stamp::Monotonic(t) => Some(stream.timing.mid_exposure(t, filled.flags)),
-            Stamp::Implausible => {
-                counters.camera_stamps_implausible += 1;
-                None
-            }
-            // Now is after the last row, by as long as we were not running.
-            Stamp::Unknown => {
-                counters.camera_stamps_unknown += 1;
-                Some(Timing { point: StampPoint::FrameEnd, ..stream.timing }.mid_exposure(now, 0))
-            }
-            Stamp::Copied => {
-                counters.camera_stamps_copied += 1;
-                Some(Timing { point: StampPoint::FrameEnd, ..stream.timing }.mid_exposure(now, 0))
-            }
-        };
-        let order = stamp.map(|t| (t, stream.gaps.see(filled.sequence, t, stream.node.period)));
-        match order {
-            Some((t, Order::Next { missed_by_sequence, missed_by_stamp })) => {
-                counters.camera_missed_by_sequence += missed_by_sequence;
-                counters.camera_missed_by_stamp += missed_by_stamp;
-                let t = self.cameras[index].to_imu_clock(t);
-                stream.held.push_back(Held { filled, t });
-                return Ok(());
-            }
-            Some((_, Order::NotNewer)) => counters.camera_stamps_not_newer += 1,
-            None => {}
-        }
-        stream.node.give_back(filled).map_err(|f| stopped(&stream.node, f))
-    }
-
     /// Gives back the oldest image held of a camera.
-    fn give_back(&mut self, index: usize) -> Result<(), Fault> {
-        let stream = &mut self.streams[index];
-        let Some(held) = stream.held.pop_front() else { return Ok(()) };
-        stream.node.give_back(held.filled).map_err(|f| stopped(&stream.node, f))
+    fn give_back(&mut self, index: usize) {
+        if let Some(Err(fault)) = self.streams[index].as_mut().map(Stream::give_back) {
+            self.lose(index, fault);
+        }
     }
 
-    /// Writes the oldest frame that all cameras have; whether there is one.
-    fn deliver(&mut self, frames: &mut Frames) -> Result<bool, Fault> {
+    /// Writes the oldest frame that all cameras have that are there; whether there is one.
+    fn deliver(&mut self, frames: &mut Frames) -> bool {
         loop {
-            let (mut heads, mut full) = ([None; NODES_MAX], [false; NODES_MAX]);
-            for (i, s) in self.streams.iter().enumerate() {
-                heads[i] = s.held.front().map(|h| h.t);
-                full[i] = s.is_full();
+            let (mut heads, mut full, mut of, mut n) = ([None; NODES_MAX], [false; NODES_MAX], [0; NODES_MAX], 0);
+            let now = self.kernel.now();
+            let there = |(i, s): (usize, &'_ Option<Stream>)| s.as_ref().filter(|s| !s.is_away(now)).map(|_| i);
+            for index in self.streams.iter().enumerate().filter_map(there) {
+                let Some(s) = &self.streams[index] else { continue };
+                (heads[n], full[n], of[n]) = (s.held.front().map(|h| h.t), s.is_full(), index);
+                n += 1;
             }
-            let n = self.streams.len();
             match pair(&heads[..n], &full[..n], self.settings.pair_tolerance) {
-                Pairing::Wait => return Ok(false),
-                Pairing::Drop(index) => {
+                Pairing::Wait => return false,
+                Pairing::Drop(i) => {
                     self.counters.camera_images_unpaired += 1;
-                    self.give_back(index)?;
+                    self.give_back(of[i]);
                 }
                 Pairing::Together => {
                     let written = self.write(frames);
-                    (0..n).try_for_each(|index| self.give_back(index))?;
+                    of[..n].iter().for_each(|index| self.give_back(*index));
                     if written {
-                        return Ok(true);
+                        return true;
                     }
                 }
             }
@@ -370,16 +349,22 @@ impl Rig {
 
     /// Copies the oldest image of every camera; whether they make a frame.
     fn write(&mut self, frames: &mut Frames) -> bool {
-        let t = self.streams[0].held[0].t;
+        let first = self.streams.iter().flatten().find_map(|s| s.held.front());
+        let t = first.expect("called when all that are there have one").t;
         if t <= self.last {
             self.counters.camera_stamps_not_newer += 1;
             return false;
         }
         let parts = self.parts();
         for (camera, image) in frames.images.iter_mut().enumerate() {
-            let stream = &self.streams[camera / parts];
+            let of = self.streams[camera / parts].as_ref();
+            let Some((stream, held)) = of.and_then(|s| Some((s, s.held.front()?))) else {
+                image.pixels.fill(0);
+                self.counters.camera_images_absent += 1;
+                continue;
+            };
             let part = Part { x: camera % parts * image.width, ..stream.node.part };
-            let bytes = stream.node.bytes(&stream.held[0].filled);
+            let bytes = stream.node.bytes(&held.filled);
             let copied = to_grey(stream.node.format, bytes, part, &mut self.scratch, image);
             self.counters.camera_bytes_copied += image.pixels.len() as u64;
             let Err(why) = copied else { continue };
@@ -405,42 +390,47 @@ impl Rig {
 
     /// Waits until a camera has something, or for `remaining`.
     fn wait(&mut self, remaining: Span) -> Result<(), Fault> {
-        let (mut fds, mut ready) = ([0; NODES_MAX], [Ready::default(); NODES_MAX]);
-        fds.iter_mut().zip(&self.streams).for_each(|(fd, s)| *fd = s.node.fd);
-        let n = self.streams.len();
+        let (mut fds, mut ready) = ([-1; NODES_MAX], [Ready::default(); NODES_MAX]);
+        fds.iter_mut().zip(self.streams.iter().flatten()).for_each(|(fd, s)| *fd = s.node.fd);
+        let n = self.streams.iter().flatten().count();
+        let remaining = self.until_retry().map_or(remaining, |retry| retry.min(remaining));
         let polled = self.kernel.poll(&fds[..n], &mut ready[..n], remaining);
         polled.map_err(|e| fault::refused("cameras", "wait for a frame", "poll", &e))?;
-        // What an error means is said by the next call that takes a buffer; one that says nothing is answered here.
-        let now = self.kernel.now();
-        for (stream, ready) in self.streams.iter_mut().zip(&ready) {
-            if ready.error && !ready.readable {
-                stream.errors += 1;
-                if stream.errors >= ERRORS_MAX {
-                    let what = "poll reports an error and no frame";
-                    return Err(Fault::new(Exit::Io, &stream.node.name, what, "`dmesg` says more"));
-                }
-            }
-            if !ready.readable && now - stream.heard > self.settings.silent {
-                self.counters.camera_silences += 1;
-                let what = format!("gave nothing for {:.1} s", (now - stream.heard).secs());
-                let fix = "check its cable, its trigger, and camera.silent_s if it is meant to pause";
-                return Err(Fault::new(Exit::Io, &stream.node.name, what, fix));
+        let (now, mut ready) = (self.kernel.now(), ready.into_iter());
+        for index in 0..self.streams.len() {
+            let Some(stream) = &mut self.streams[index] else { continue };
+            if let Err(fault) = stream.heeds(ready.next().unwrap_or_default(), now, self.settings.silent) {
+                let silent = now - stream.heard > self.settings.silent;
+                self.counters.camera_silences += u64::from(silent && self.lost[index].is_none());
+                self.lose(index, fault);
             }
         }
         Ok(())
     }
 
-    fn next_frame(&mut self, deadline: Nanos, frames: &mut Frames) -> Result<bool, Fault> {
+    /// False where the time is over. That no camera is left is said at once when it comes to that, and after the time while
+    /// it stays so.
+    fn next_frame(&mut self, deadline: Nanos, frames: &mut Frames) -> Result<bool, SourceFault> {
+        let was_lost = self.all_lost().is_some();
         loop {
-            let any = self.drain()?;
-            if self.deliver(frames)? {
+            self.come_back();
+            let any = self.drain();
+            if self.deliver(frames) {
                 return Ok(true);
             }
-            let remaining = deadline - self.kernel.now();
-            if remaining.0 <= 0 && !any {
-                return Ok(false);
+            let (remaining, lost) = (deadline - self.kernel.now(), self.all_lost());
+            let over = remaining.0 <= 0 && !any;
+            match (lost.clone(), over) {
+                (Some(fault), over) if over || !was_lost => return Err(SourceFault::Lost(fault)),
+                (None, true) => return Ok(false),
+                _ => {}
             }
-            self.wait(remaining)?;
+            match self.wait(remaining) {
+                Ok(()) => {}
+                // The wait was a sleep, and one that cannot be had would make a loop.
+                Err(fault) if lost.is_some() => return Err(SourceFault::Broken(fault)),
+                Err(fault) => (0..self.streams.len()).for_each(|index| self.lose(index, fault.clone())),
+            }
         }
     }
 }
@@ -448,6 +438,75 @@ impl Rig {
 impl Stream {
     fn is_full(&self) -> bool {
         self.held.len() >= self.node.held_max()
+    }
+
+    /// The others go on without it.
+    fn is_away(&self, now: Nanos) -> bool {
+        let patience = Span(self.node.period.0.saturating_mul(AWAY_PERIODS));
+        self.held.is_empty() && self.spoke.is_some_and(|t| now - t > patience)
+    }
+
+    /// What poll said. What an error means is said by the next call that takes a buffer; one that says nothing is answered
+    /// here.
+    fn heeds(&mut self, ready: Ready, now: Nanos, silent: Span) -> Result<(), Fault> {
+        if ready.error && !ready.readable {
+            self.errors += 1;
+            if self.errors >= ERRORS_MAX {
+                let what = "poll reports an error and no frame";
+                return Err(Fault::new(Exit::Io, &self.node.name, what, "`dmesg` says more"));
+            }
+        }
+        if !ready.readable && now - self.heard > silent {
+            let what = format!("gave nothing for {:.1} s", (now - self.heard).secs());
+            let fix = "check its cable, its trigger, and camera.silent_s if it is meant to pause";
+            return Err(Fault::new(Exit::Io, &self.node.name, what, fix));
+        }
+        Ok(())
+    }
+
+    /// Keeps an image until its partners come, or gives its buffer back at once.
+    fn hold(
+        &mut self,
+        filled: Filled,
+        now: Nanos,
+        camera: &RigCamera,
+        counters: &mut CameraCounters,
+    ) -> Result<(), Fault> {
+        (self.heard, self.spoke, self.errors) = (now, Some(now), 0);
+        let arrived = Timing { point: StampPoint::FrameEnd, ..self.timing }.mid_exposure(now, 0);
+        let stamp = match stamp_of(filled.flags, filled.stamp_s, filled.stamp_us, now) {
+            Stamp::Monotonic(t) => Some(self.timing.mid_exposure(t, filled.flags)),
+            Stamp::Implausible => {
+                counters.camera_stamps_implausible += 1;
+                None
+            }
+            // Now is after the last row, by as long as we were not running.
+            Stamp::Unknown => {
+                counters.camera_stamps_unknown += 1;
+                Some(arrived)
+            }
+            Stamp::Copied => {
+                counters.camera_stamps_copied += 1;
+                Some(arrived)
+            }
+        };
+        match stamp.map(|t| (t, self.gaps.see(filled.sequence, t, self.node.period))) {
+            Some((t, Order::Next { missed_by_sequence, missed_by_stamp })) => {
+                counters.camera_missed_by_sequence += missed_by_sequence;
+                counters.camera_missed_by_stamp += missed_by_stamp;
+                self.held.push_back(Held { filled, t: camera.to_imu_clock(t) });
+                return Ok(());
+            }
+            Some((_, Order::NotNewer)) => counters.camera_stamps_not_newer += 1,
+            None => {}
+        }
+        self.node.give_back(filled).map_err(|f| stopped(&self.node, f))
+    }
+
+    /// Gives back the oldest image held.
+    fn give_back(&mut self) -> Result<(), Fault> {
+        let Some(held) = self.held.pop_front() else { return Ok(()) };
+        self.node.give_back(held.filled).map_err(|f| stopped(&self.node, f))
     }
 }
 
@@ -497,18 +556,15 @@ impl FrameSource for Rig {
             return Err(SourceFault::Broken(Fault::new(Exit::Software, "cameras", what, "use Frames::for_rig")));
         }
         let deadline = self.kernel.now() + timeout;
-        self.come_back(deadline)?;
-        match self.next_frame(deadline, frames) {
-            Ok(true) => Ok(Wait::Got),
-            Ok(false) => {
-                self.counters.camera_timeouts += 1;
-                Ok(Wait::TimedOut)
-            }
-            Err(fault) => {
-                self.lose(fault.clone());
-                Err(SourceFault::Lost(fault))
-            }
+        if self.next_frame(deadline, frames)? {
+            return Ok(Wait::Got);
         }
+        self.counters.camera_timeouts += 1;
+        Ok(Wait::TimedOut)
+    }
+
+    fn away(&self) -> Option<&Fault> {
+        self.lost.iter().flatten().next().map(|l| &l.fault)
     }
 
     fn counters(&self) -> Vec<(&'static str, u64)> {

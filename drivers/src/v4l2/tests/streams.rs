@@ -87,7 +87,12 @@ fn whatever_is_dropped_its_buffer_comes_back() {
             }
         });
         machine.shoot(1, 1..103, |_, _| {});
-        take(&mut rig, &mut frames, 2);
+        take(&mut rig, &mut frames, 1);
+        assert_is(&frames, 1);
+        // One that gives nothing whole for long is gone on without.
+        while frames.t.0 < BOOT + 102 * PERIOD - MS {
+            let _ = rig.next(Span(100 * MS), &mut frames);
+        }
         assert_is(&frames, 102);
         assert_eq!(count(&rig, counter), if counter.ends_with("unpaired") { 200 } else { 100 }, "{counter}");
         assert_eq!(machine.state().cams.iter().map(|c| c.dropped).sum::<usize>(), 0, "{counter}: buffers ran out");
@@ -144,32 +149,35 @@ fn a_reader_that_pauses_gets_old_frames_in_order_and_the_loss_is_counted() {
     assert_eq!((count(&rig, "camera_missed_by_sequence"), lost), (2 * 16, 2 * 16));
 }
 
+/// The left picture is black, the right one is picture `k`.
+fn assert_is_alone(frames: &Frames, k: u32) {
+    assert_eq!(frames.t, Nanos(BOOT + i64::from(k) * PERIOD - MS));
+    assert!(frames.images[0].pixels.iter().all(|p| *p == 0));
+    assert!((0..WIDTH * HEIGHT).all(|i| frames.images[1].pixels[i] == machine::pixel(1, k, i)));
+}
+
 #[test]
-fn an_unplugged_camera_is_lost_and_comes_back_by_itself_under_another_number() {
+fn without_one_camera_the_other_goes_on_and_it_comes_back_by_itself_under_another_number() {
     let machine = pair_of_cameras();
     let (mut rig, mut frames) = opened(&machine);
     (0..2).for_each(|camera| machine.shoot(camera, 1..200, |_, _| {}));
     take(&mut rig, &mut frames, 10);
     machine.state().cams[0].present = false;
-    let mut lost = Vec::new();
-    for _ in 0..10 {
-        match rig.next(Span(100 * MS), &mut frames) {
-            Err(SourceFault::Lost(fault)) => lost.push(fault.to_string()),
-            // A pair that lay ready.
-            Ok(Wait::Got) => assert!(lost.is_empty()),
-            other => panic!("{other:?}"),
-        }
+    for k in 11..40 {
+        assert_eq!(rig.next(Span(100 * MS), &mut frames), Ok(Wait::Got), "no frame is missed");
+        assert_is_alone(&frames, k);
+        let away = rig.away().expect("it is gone").to_string();
+        let words = if k < 12 { ["/dev/video0", "unplugged"] } else { ["serial:0000", "serial:0001)"] };
+        assert!(k == 12 || words.iter().all(|w| away.contains(w)) && away.contains("cable"), "{k}: {away}");
     }
-    assert!(lost[0].contains("/dev/video0") && lost[0].contains("unplugged"), "{}", lost[0]);
-    let now = lost.last().unwrap();
-    assert!(now.contains("serial:0000") && now.contains("serial:0001)") && now.contains("cable"), "{now}");
     {
         let mut s = machine.state();
         s.cams[0].present = true;
         s.cams[0].path = "/dev/video7".into();
     }
-    let other = take(&mut rig, &mut frames, 20);
-    assert!(other.len() < 25, "it comes back within its longest pause: {}", other.len());
+    take(&mut rig, &mut frames, 60);
+    assert!(rig.away().is_none(), "it comes back within its longest pause");
+    assert_is(&frames, 99);
     assert_eq!((count(&rig, "camera_losses"), count(&rig, "camera_returns")), (1, 1));
     assert_eq!(count(&rig, "camera_missed_by_stamp"), 0, "a loss is no gap");
     drop(rig);
@@ -177,19 +185,56 @@ fn an_unplugged_camera_is_lost_and_comes_back_by_itself_under_another_number() {
 }
 
 #[test]
+fn without_any_camera_the_rig_is_lost_at_once_and_comes_back_by_itself() {
+    let machine = pair_of_cameras();
+    let (mut rig, mut frames) = opened(&machine);
+    (0..2).for_each(|camera| machine.shoot(camera, 1..200, |_, _| {}));
+    take(&mut rig, &mut frames, 10);
+    machine.state().cams.iter_mut().for_each(|c| c.present = false);
+    let before = machine.state().now;
+    for i in 0..10 {
+        let lost = rig.next(Span(100 * MS), &mut frames).unwrap_err().to_string();
+        assert!(lost.starts_with("lost: ") && lost.contains("cable"), "{lost}");
+        assert_eq!(machine.state().now - before, i * 100 * MS, "said at once, then each timeout is waited out");
+    }
+    machine.state().cams.iter_mut().for_each(|c| c.present = true);
+    let other = take(&mut rig, &mut frames, 20);
+    assert!(other.len() < 25, "it comes back within its longest pause: {}", other.len());
+    assert_eq!((count(&rig, "camera_losses"), count(&rig, "camera_returns")), (2, 2));
+}
+
+#[test]
 fn a_silent_camera_is_opened_again_and_its_partner_does_not_starve() {
     let machine = pair_of_cameras();
     let (mut rig, mut frames) = opened(&machine);
-    machine.shoot(0, 1..200, |_, _| {});
-    machine.shoot(1, 1..11, |_, _| {});
-    machine.shoot(1, 80..200, |_, _| {});
+    machine.shoot(1, 1..200, |_, _| {});
+    machine.shoot(0, 1..11, |_, _| {});
+    machine.shoot(0, 80..200, |_, _| {});
     take(&mut rig, &mut frames, 10);
-    let other = take(&mut rig, &mut frames, 100);
-    let lost: Vec<String> = other.iter().filter_map(|o| o.clone().err()).map(|e| e.to_string()).collect();
-    assert!(lost[0].contains("video1") && lost[0].contains("gave nothing for 2"), "{}", lost[0]);
+    // Five periods are waited; then it goes on alone, with the image that came last.
+    take(&mut rig, &mut frames, 1);
+    let first = ((frames.t.0 + MS - BOOT) / PERIOD) as u32;
+    assert!((15..18).contains(&first), "{first}");
+    assert_is_alone(&frames, first);
+    assert!(rig.away().is_none(), "only silent yet");
+    take(&mut rig, &mut frames, 40);
+    let lost = rig.away().expect("it was opened again and gives nothing").to_string();
+    assert!(lost.contains("video0") && lost.contains("gave nothing for 2"), "{lost}");
+    take(&mut rig, &mut frames, 60);
+    assert_is(&frames, ((frames.t.0 + MS - BOOT) / PERIOD) as u32);
     assert_eq!((count(&rig, "camera_silences"), count(&rig, "camera_returns")), (1, 1));
-    assert_eq!(machine.state().cams[0].dropped, 0, "the left camera's buffers came back while the right was silent");
-    assert!(count(&rig, "camera_images_unpaired") > 30);
+    assert_eq!(machine.state().cams[1].dropped, 0, "its buffers came back while the other was silent");
+}
+
+#[test]
+fn at_boot_nobody_goes_on_before_every_camera_has_given_an_image() {
+    let machine = pair_of_cameras();
+    let (mut rig, mut frames) = opened(&machine);
+    machine.shoot(0, 1..100, |_, _| {});
+    machine.shoot(1, 30..100, |_, _| {});
+    take(&mut rig, &mut frames, 1);
+    assert_is(&frames, 30);
+    assert_eq!(count(&rig, "camera_images_absent"), 0);
 }
 
 #[test]
