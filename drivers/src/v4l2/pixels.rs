@@ -354,6 +354,24 @@ mod tests {
         }
     }
 
+    /// Every bit of a compressed picture turned over, one at a time: half are refused, the rest are another picture, and
+    /// none is a panic. Of grey pictures no bit can be told.
+    #[test]
+    fn a_bit_that_flipped_in_a_compressed_picture_is_refused_or_harmless() {
+        let blocks: Vec<u8> = (0..32).map(|i| 8 * i).collect();
+        let jpeg = crate::jpeg::flat(64, 32, &blocks);
+        let mut out = Image::new(64, 32);
+        let mut refused = 0;
+        for bit in 0..8 * jpeg.len() {
+            let mut flipped = jpeg.clone();
+            flipped[bit / 8] ^= 1 << (bit % 8);
+            refused +=
+                usize::from(to_grey(Format::Mjpeg, &flipped, whole(64, 32, 0), &mut Vec::new(), &mut out).is_err());
+        }
+        println!("{refused} of {} bits are seen", 8 * jpeg.len());
+        assert!(4 * refused > 8 * jpeg.len(), "{refused} of {}", 8 * jpeg.len());
+    }
+
     #[test]
     fn jpeg_is_decoded_whole_in_halves_and_never_by_half() {
         let (width, height) = (32, 16);
