@@ -274,6 +274,16 @@ enum Bench {
         #[arg(long)]
         quick: bool,
     },
+    /// Odometry's time a frame with recording and without, in turns in real time, and what the recorder keeps up with
+    Record {
+        /// As for replay; without it a simulated flight at 752x480
+        dataset: Option<PathBuf>,
+        #[arg(long, value_name = "DIR")]
+        out: PathBuf,
+        /// Of each kind
+        #[arg(long, value_name = "N", default_value = "3", value_parser = clap::value_parser!(u64).range(1..=100))]
+        passes: u64,
+    },
     /// Errors beside what the covariance claims, and beside the quality
     Consistency {
         #[arg(long, value_name = "DIR")]
@@ -347,6 +357,9 @@ fn run(command: Command) -> Result<(), Fault> {
             let what = daemon::Benched { dataset, board, poses, set };
             let run = |job: &bench::map::Job, dir: &OutputDir| daemon::benched(&what, job, dir);
             bench::stereo::stereo(&options, &out, maps.then_some(&run as bench::stereo::MapRun))
+        }
+        Command::Bench { what: Bench::Record { dataset, out, passes } } => {
+            daemon::bench_record(dataset.as_deref(), passes as usize, &out)
         }
         Command::Bench { what: Bench::Faults { out, quick } } => daemon::faults(&out, quick),
         Command::Bench { what: Bench::Stability { out, seeds } } => bench::stability::stability(seeds, &out),

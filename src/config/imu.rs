@@ -196,7 +196,7 @@ impl Default for TriggerConfig {
     }
 }
 
-/// A light that is on while frames are tracked.
+/// A light: flashes at boot, is on while frames are tracked, blinks while they are not, flashes thrice on a fault.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct LedConfig {

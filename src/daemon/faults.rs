@@ -171,7 +171,7 @@ pub fn faults(out: &Path, quick: bool) -> Result<(), Fault> {
     let set = ["map.enabled=false".to_string()];
     let board = Board::parse("board-configs/lavapipe.toml", super::DEMO_BOARD, &set)?;
     let flight = Flight::render(board)?;
-    memory::admit("the simulated flight", flight.sim.calibration(), &flight.board)?;
+    memory::admit("the simulated flight", flight.sim.calibration(), &flight.board, false)?;
     let plain = flight.fly(None)?;
     let mut rows = Vec::new();
     let mut cases = cases();

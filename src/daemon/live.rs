@@ -2,6 +2,7 @@
 //! stopped. What it leaves behind is what a replay leaves behind.
 
 use super::input::Input;
+use super::light::Light;
 use super::mapping::Mapping;
 use super::play::{realtime, Realtime};
 use super::progress::Progress;
@@ -49,8 +50,9 @@ pub fn rig_of(path: &Path, board: &Board, options: &Run) -> Result<Rig, Fault> {
 /// `stipple run`
 pub fn run(path: &Path, out: &Path, set: &[String], options: &Run) -> Result<(), Fault> {
     let board = Board::load(path, set)?;
+    let light = Light::open(board.gpio.led())?;
     let mut rig = rig_of(path, &board, options)?;
-    memory::admit(&rig.place, &rig.calibration, &board)?;
+    memory::admit(&rig.place, &rig.calibration, &board, options.record.is_some())?;
     let out = OutputDir::create(out)?;
     let tracking = Tracking::Odometry(Box::new(OdometryRun::new(&rig.calibration, &board, rig.frames)?));
     let mapping = if board.map.enabled { Some(Mapping::open(&rig.calibration, &board)?) } else { None };
@@ -77,7 +79,7 @@ pub fn run(path: &Path, out: &Path, set: &[String], options: &Run) -> Result<(),
         truth: rig.truth,
         opened: rig.opened,
     };
-    let mut progress = Progress::new(rig.length_s).lit(board.gpio.led())?;
+    let mut progress = Progress::new(rig.length_s).lit(light);
     let realtime_options =
         Realtime { holdout: 0, duration_s: None, sensors_s: options.duration_s, stop: host::stop_asked_for() };
     let mut played = realtime(sensors, &rig.calibration, tracking, mapping, &realtime_options, &mut progress);
@@ -96,7 +98,9 @@ pub fn run(path: &Path, out: &Path, set: &[String], options: &Run) -> Result<(),
     println!("{}", summary::seven_lines(&report, &out));
     cameras.into_iter().for_each(|line| println!("cameras     {line}"));
     recorded.map_or(Ok(()), |(recorded, dir)| record::whole(&recorded, dir))?;
-    broken.map_or(Ok(()), Err)
+    broken.map_or(Ok(()), Err)?;
+    progress.ended_well();
+    Ok(())
 }
 
 fn recorded(dataset: &Path, board: &Board, options: &Run) -> Result<Rig, Fault> {

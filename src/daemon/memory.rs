@@ -10,10 +10,12 @@ use crate::map::{eyes, Mapper};
 use crate::mem::Footprint;
 use crate::stereo::{Method, Stereo};
 use crate::vio::Vio;
+use stipple_drivers::record::ring_bytes;
 use stipple_drivers::{Calibration, Camera, Exit, Fault, ImuCalibration, Lens, Pose, RigCamera};
 
-/// Everything a run with this rig takes, without the operating system's and the drivers' own.
-pub fn footprint(calibration: &Calibration, board: &Board) -> Footprint {
+/// Everything a run with this rig takes, without the operating system's and the drivers' own; with the ring of a recording
+/// where it `records`.
+pub fn footprint(calibration: &Calibration, board: &Board, records: bool) -> Footprint {
     let pixels: usize = calibration.cameras.iter().map(|c| c.camera.width * c.camera.height).sum();
     let coloured: usize = colours(calibration, board).iter().map(|c| 3 * c.camera.width * c.camera.height).sum();
     let mut f = Footprint::default();
@@ -26,6 +28,9 @@ pub fn footprint(calibration: &Calibration, board: &Board) -> Footprint {
         f.host("queues: keyframes", KEYFRAME_SLOTS * (keyframe + coloured));
         f.extend(Stereo::footprint(calibration, &board.stereo, board.map.scale));
         f.extend(Mapper::footprint(calibration, board));
+    }
+    if records {
+        f.host("queues: recording", ring_bytes(pixels + coloured, board.record.ring_frames as usize));
     }
     f
 }
@@ -48,7 +53,7 @@ pub fn largest_rig(board: &Board) -> Calibration {
 }
 
 /// Refuses a method of stereo that this program has not, and a rig whose images or bytes exceed the board's budget.
-pub fn admit(place: &str, calibration: &Calibration, board: &Board) -> Result<Footprint, Fault> {
+pub fn admit(place: &str, calibration: &Calibration, board: &Board, records: bool) -> Result<Footprint, Fault> {
     let (w, h) = (board.budget.image_width_max as usize, board.budget.image_height_max as usize);
     for (i, c) in calibration.cameras.iter().enumerate() {
         if c.camera.width > w || c.camera.height > h {
@@ -61,7 +66,7 @@ pub fn admit(place: &str, calibration: &Calibration, board: &Board) -> Result<Fo
         let left = &calibration.cameras[0].camera;
         Method::admit(left.width, left.height, &board.stereo)?;
     }
-    let f = footprint(calibration, board);
+    let f = footprint(calibration, board, records);
     let max = board.memory_max_mib << 20;
     if f.total() > max {
         let largest = f.rows.iter().max_by_key(|r| r.bytes).map_or("", |r| r.name);

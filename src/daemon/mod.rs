@@ -10,6 +10,7 @@
 //! | and estimator | estimates, one frame behind at most; offers keyframes | sealed |
 //! | mapping | rectification, depth, training; low priority, as are the CPU device's own threads | sealed; OpenCV and the driver allocate behind it |
 //! | trigger | starts the cameras' exposures, where a line is wired for it | free |
+//! | light | shows the state of a run, where a line is wired for it | free |
 //! | writer | writes what is recorded, if anything is; low priority | free |
 //!
 //! In lockstep pace the main thread is both sensors and mapping too.
@@ -24,6 +25,7 @@ mod doctor;
 mod faults;
 mod hardware;
 mod input;
+mod light;
 mod live;
 mod lockstep;
 mod mapping;
@@ -32,6 +34,7 @@ mod pipeline;
 mod play;
 mod progress;
 mod record;
+mod recording;
 mod sensors;
 mod summary;
 mod tracking;
@@ -43,6 +46,7 @@ pub use faults::faults;
 pub use live::{run as run_sensors, Run};
 pub use play::Pace;
 pub use record::record;
+pub use recording::bench_record;
 
 use crate::bench::map::Job;
 use crate::config::Board;
@@ -147,7 +151,7 @@ fn rendering_progress(done: usize, of: usize) {
 }
 
 fn run(mut input: Input, place: &str, board: &Board, out: &OutputDir, options: &Replay) -> Result<Report, Fault> {
-    memory::admit(place, &input.calibration, board)?;
+    memory::admit(place, &input.calibration, board, false)?;
     input.needs_colour(memory::colours(&input.calibration, board).len(), place)?;
     let frames = input.frames_within(options.duration_s);
     let tracking = match &options.poses {
@@ -286,9 +290,9 @@ fn unknown_scenario(name: &str) -> Fault {
 pub fn check(path: &Path, set: &[String]) -> Result<Board, Fault> {
     let board = Board::load(path, set)?;
     let rig = memory::largest_rig(&board);
-    let footprint = memory::footprint(&rig, &board);
+    let footprint = memory::footprint(&rig, &board, true);
     memory::print(&footprint);
-    memory::admit(&path.display().to_string(), &rig, &board)?;
+    memory::admit(&path.display().to_string(), &rig, &board, true)?;
     println!("{:>12}       fits memory_max_mib = {}", "", board.memory_max_mib);
     Ok(board)
 }

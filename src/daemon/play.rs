@@ -248,6 +248,7 @@ pub fn realtime(
         let give = move |slot: Box<Slot>| {
             counted.pass_on(&slot, s.keyframes.as_ref(), &s.counters);
             s.gauges.frames.fetch_add(1, Relaxed);
+            s.gauges.posed.fetch_add(u64::from(slot.tracked.is_some()), Relaxed);
             s.gauges.keyframes.store(counted.count, Relaxed);
             let _ = s.inbox.spare.push(slot);
         };
@@ -259,6 +260,7 @@ pub fn realtime(
         while !(s.tracking_done.load(Relaxed) && s.mapping_done.load(Relaxed)) {
             let over = run.sensors_s.is_some_and(|limit| s.start.elapsed().as_secs_f64() >= limit);
             s.inbox.stop.fetch_or(over || run.stop.load(Relaxed), Relaxed);
+            s.gauges.broke.fetch_or(!s.inbox.broken.is_empty(), Relaxed);
             while let Some(line) = s.inbox.notices.pop() {
                 progress.say(&line);
             }
@@ -308,6 +310,7 @@ fn map(s: &Shared, mut mapping: Mapping, run: &Realtime) -> Mapping {
         let worked = mapping.step(Instant::now() + SLICE, &s.gauges);
         let t_s = s.start.elapsed().as_secs_f64();
         mapping.sample_if_due(t_s, &s.gauges);
+        s.gauges.broke.fetch_or(mapping.failure.is_some(), Relaxed);
         if tracked {
             // Nothing is played any more; the run's own time is what progresses.
             s.gauges.played_ms.fetch_max((t_s * 1e3) as u64, Relaxed);

@@ -1,16 +1,19 @@
 //! What is seen while a run goes on: a bar on a terminal, one line a second otherwise, and a light where one is wired.
 
+use super::light::Light;
 use indicatif::{ProgressBar, ProgressStyle};
 use std::io::IsTerminal;
-use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
 use std::time::{Duration, Instant};
-use stipple_drivers::gpio::{LineName, Output};
-use stipple_drivers::Fault;
 
 /// Written by the threads of a run, read by whoever shows it.
 #[derive(Default)]
 pub struct Gauges {
     pub frames: AtomicU64,
+    /// Of these, with a pose; where nobody tracks, all.
+    pub posed: AtomicU64,
+    /// The map failed, or a sensor broke.
+    pub broke: AtomicBool,
     pub keyframes: AtomicU64,
     pub anchors: AtomicU64,
     pub splats: AtomicU64,
@@ -28,48 +31,6 @@ pub struct Progress {
     /// `None`: never.
     next_line: Option<Instant>,
     light: Option<Light>,
-}
-
-/// On while frames are tracked.
-struct Light {
-    line: Output,
-    pulse: Pulse,
-    on: bool,
-}
-
-/// Whether a count still grows.
-struct Pulse {
-    count: u64,
-    grew: Instant,
-}
-
-/// Ten frames at 20 Hz.
-const PULSE_LOST: Duration = Duration::from_millis(500);
-
-impl Pulse {
-    fn beats(&mut self, count: u64, now: Instant) -> bool {
-        if count != self.count {
-            (self.count, self.grew) = (count, now);
-        }
-        count > 0 && now.saturating_duration_since(self.grew) < PULSE_LOST
-    }
-}
-
-impl Light {
-    /// One that fails is not worth a run.
-    fn show(&mut self, frames: u64) {
-        let on = self.pulse.beats(frames, Instant::now());
-        if on != self.on {
-            self.on = on;
-            let _ = self.line.set(on);
-        }
-    }
-}
-
-impl Drop for Light {
-    fn drop(&mut self) {
-        let _ = self.line.set(false);
-    }
 }
 
 const LINE_PERIOD: Duration = Duration::from_secs(1);
@@ -92,19 +53,21 @@ impl Progress {
         Progress { bar: None, total_ms: None, next_line: None, light: None }
     }
 
-    /// With the light that a board has: its line, and whether low is active.
-    pub fn lit(mut self, led: Option<(LineName, bool)>) -> Result<Progress, Fault> {
-        if let Some((name, active_low)) = led {
-            let line = Output::open(&name, active_low)?;
-            self.light = Some(Light { line, pulse: Pulse { count: 0, grew: Instant::now() }, on: false });
-        }
-        Ok(self)
+    /// With the light of a board that has one.
+    pub fn lit(mut self, light: Option<Light>) -> Progress {
+        self.light = light;
+        self
+    }
+
+    /// What ran ended as it was asked to.
+    pub fn ended_well(&mut self) {
+        self.light.iter_mut().for_each(Light::ended_well);
     }
 
     /// Cheap to call often: draws at most once a second without a terminal.
     pub fn show(&mut self, g: &Gauges) {
         if let Some(light) = &mut self.light {
-            light.show(g.frames.load(Relaxed));
+            light.show(g.posed.load(Relaxed), g.broke.load(Relaxed), Instant::now());
         }
         let played = g.played_ms.load(Relaxed).min(self.total_ms.unwrap_or(u64::MAX));
         match &self.bar {
@@ -148,19 +111,4 @@ fn line(g: &Gauges) -> String {
         g.splats.load(Relaxed),
         g.iterations.load(Relaxed),
     )
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_light_is_on_while_frames_come_and_goes_out_after() {
-        let start = Instant::now();
-        let at = |ms: u64| start + Duration::from_millis(ms);
-        let mut pulse = Pulse { count: 0, grew: start };
-        assert!(!pulse.beats(0, at(10)), "nothing has come");
-        assert!(pulse.beats(1, at(900)) && pulse.beats(1, at(1300)));
-        assert!(!pulse.beats(1, at(1500)) && pulse.beats(2, at(1600)));
-    }
 }

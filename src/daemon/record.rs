@@ -2,6 +2,7 @@
 //!
 //! The threads are those of a run, with nobody at the mailbox, so that a loss is said and counted as in a run.
 
+use super::light::Light;
 use super::live::{rig_of, Run};
 use super::pipeline::Bell;
 use super::progress::{Gauges, Progress};
@@ -23,6 +24,7 @@ const OF_TRACKING: [&str; 3] = ["frames_overwritten", "imu_overflow", "frames_wi
 /// `stipple record`
 pub fn record(path: &Path, out: &Path, format: Format, set: &[String], options: &Run) -> Result<(), Fault> {
     let board = Board::load(path, set)?;
+    let light = Light::open(board.gpio.led())?;
     let rig = rig_of(path, &board, options)?;
     let shape = Frames::for_rig(&rig.calibration);
     let sink = record::open(out, format, &rig.calibration)?;
@@ -30,7 +32,7 @@ pub fn record(path: &Path, out: &Path, format: Format, set: &[String], options: 
     let (mut frames, mut imu) = taps.on(rig.sensors.frames, rig.sensors.imu);
     let (inbox, bell, over) = (Inbox::new(SLOTS, &rig.calibration, 0), Bell::default(), AtomicBool::new(false));
     let (counters, gauges, begun) = (Counters::default(), Gauges::default(), Instant::now());
-    let (stop, mut progress) = (host::stop_asked_for(), Progress::new(rig.length_s));
+    let (stop, mut progress) = (host::stop_asked_for(), Progress::new(rig.length_s).lit(light));
     std::thread::scope(|scope| {
         let camera = scope.spawn(|| {
             sensors::camera(&inbox, &mut frames, &bell, &counters, &gauges);
@@ -43,7 +45,8 @@ pub fn record(path: &Path, out: &Path, format: Format, set: &[String], options: 
             while let Some(line) = inbox.notices.pop() {
                 progress.say(&line);
             }
-            gauges.frames.store(inbox.arrived.load(Relaxed), Relaxed);
+            let arrived = inbox.arrived.load(Relaxed);
+            [&gauges.frames, &gauges.posed].into_iter().for_each(|gauge| gauge.store(arrived, Relaxed));
             progress.show(&gauges);
             std::thread::sleep(Duration::from_millis(20));
         }
@@ -60,7 +63,9 @@ pub fn record(path: &Path, out: &Path, format: Format, set: &[String], options: 
     }
     println!("{}", out.display());
     whole(&recorded, out)?;
-    inbox.broken.pop().map_or(Ok(()), Err)
+    inbox.broken.pop().map_or(Ok(()), Err)?;
+    progress.ended_well();
+    Ok(())
 }
 
 /// A recording that lacks something is not passed over in silence.

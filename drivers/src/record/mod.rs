@@ -41,9 +41,19 @@ pub enum Format {
 /// Samples that wait for the writer beside the frames: eight seconds of a 1 kHz unit.
 const IMU_SLOTS: usize = 8192;
 
+/// Bytes of the ring between sources and writer, with frames of so many bytes.
+pub fn ring_bytes(frame_bytes: usize, slots: usize) -> usize {
+    slots * frame_bytes + (slots + IMU_SLOTS) * size_of::<Item>()
+}
+
 #[derive(Default)]
 struct Counts {
     frames: AtomicU64,
+    /// Frames in the ring, and most there ever were.
+    waiting: AtomicU64,
+    waiting_most: AtomicU64,
+    /// CPU time of the writer, us.
+    cpu_us: AtomicU64,
     frames_dropped: AtomicU64,
     frames_failed: AtomicU64,
     imu: AtomicU64,
@@ -134,6 +144,7 @@ pub fn start(mut sink: Box<dyn Sink>, shape: &Frames, slots: usize) -> (Recorder
                         Err(e) => fails(&c.frames_failed, e),
                     }
                     let _ = give_back.send(frames);
+                    c.waiting.fetch_sub(1, Relaxed);
                 }
                 Item::Imu(reading) => match sink.imu(&reading) {
                     Ok(()) => drop(c.imu.fetch_add(1, Relaxed)),
@@ -144,6 +155,7 @@ pub fn start(mut sink: Box<dyn Sink>, shape: &Frames, slots: usize) -> (Recorder
         if let Err(e) = sink.finish() {
             failure.get_or_insert_with(|| e.to_string());
         }
+        c.cpu_us.store((1e6 * host::thread_cpu().total_s()) as u64, Relaxed);
         failure
     });
     let frames = FrameTap { spare, items: items.clone(), counts: counts.clone() };
@@ -160,6 +172,8 @@ impl Recorder {
             ("record_frames_written", &c.frames),
             ("record_frames_dropped", &c.frames_dropped),
             ("record_frames_failed", &c.frames_failed),
+            ("record_ring_most", &c.waiting_most),
+            ("record_cpu_us", &c.cpu_us),
             ("record_imu_written", &c.imu),
             ("record_imu_dropped", &c.imu_dropped),
             ("record_imu_failed", &c.imu_failed),
@@ -175,6 +189,8 @@ impl FrameTap {
             return;
         };
         slot.copy_from(frames);
+        let waiting = self.counts.waiting.fetch_add(1, Relaxed) + 1;
+        self.counts.waiting_most.fetch_max(waiting, Relaxed);
         // The queue has room for every slot and as many samples as are let in beside them.
         let _ = self.items.try_send(Item::Frames(slot));
     }

@@ -60,7 +60,7 @@ pub fn vulkan(board: &Board) -> Vec<Check> {
 pub fn memory_ceiling(calibration: Option<&Calibration>, board: &Board) -> Check {
     let largest = memory::largest_rig(board);
     let rig = calibration.unwrap_or(&largest);
-    let table = match memory::admit("this rig", rig, board) {
+    let table = match memory::admit("this rig", rig, board, true) {
         Ok(table) => table,
         Err(fault) => return Check::fail(format!("memory: {}", fault.what), fault.fix),
     };
