@@ -25,7 +25,7 @@ pub enum Kind {
     Duplicate,
     /// What was measured before, under a new stamp.
     Freeze,
-    /// One bit of one pixel of every image, or of one axis of a 16-bit unit.
+    /// One bit, or `bits`, of every image, or one of one axis of a 16-bit unit.
     BitFlip,
     /// Black images.
     Blackout,
@@ -99,6 +99,13 @@ pub struct Rule {
     /// Of `blackout` and `unplug`: this camera alone, while the others go on.
     #[serde(default)]
     pub camera: Option<usize>,
+    /// Of `bit_flip`, in each image.
+    #[serde(default = "one")]
+    pub bits: u32,
+}
+
+fn one() -> u32 {
+    1
 }
 
 fn forever() -> f64 {
@@ -112,7 +119,7 @@ fn always() -> f64 {
 impl Rule {
     /// Strikes everything in `[start_s, end_s)`.
     pub fn within(fault: Kind, start_s: f64, end_s: f64) -> Rule {
-        Rule { fault, start_s, end_s, probability: 1.0, length_s: 0.0, by_s: 0.0, camera: None }
+        Rule { fault, start_s, end_s, probability: 1.0, length_s: 0.0, by_s: 0.0, camera: None, bits: 1 }
     }
 
     /// What is wrong with it.
@@ -284,8 +291,10 @@ impl LastFrames {
             }
             Kind::BitFlip => {
                 for image in &mut frames.images {
-                    let at = rng.random_range(0..image.pixels.len());
-                    image.pixels[at] ^= 1 << rng.random_range(0..8);
+                    for _ in 0..rule.bits {
+                        let at = rng.random_range(0..image.pixels.len());
+                        image.pixels[at] ^= 1 << rng.random_range(0..8);
+                    }
                 }
             }
             Kind::Blackout => {

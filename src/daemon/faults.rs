@@ -18,15 +18,20 @@ use std::sync::atomic::AtomicBool;
 use stipple_drivers::inject::{Kind, Rule};
 use stipple_drivers::paced::Images;
 use stipple_drivers::sim::{Scenario, Sim};
+use stipple_drivers::types::pose_at;
 use stipple_drivers::{Fault, Frames, Nanos, Span, TimedPose};
 
-/// Of the flight; all faults strike at `STRIKES_S`, when it has been under way for three seconds.
+/// Of the flight; all faults strike at `STRIKES_S`, when it has been under way for three seconds, and at least four seconds
+/// follow each.
 const FLIGHT_S: f64 = 8.0;
+const AFTER_S: f64 = 4.0;
 const STRIKES_S: f64 = 4.0;
+/// Between true poses, which are as many as frames.
+const TRUTH_HOLE: Span = Span(100_000_000);
 /// Frames in order after which odometry is itself again: a quarter of a second.
 const HEALTHY_FRAMES: usize = 5;
 /// What tells a fault.
-const DETECTORS: [&str; 20] = [
+const DETECTORS: [&str; 21] = [
     "frames_missing",
     "frames_not_newer",
     "frames_leapt",
@@ -36,6 +41,7 @@ const DETECTORS: [&str; 20] = [
     "frames_overwritten",
     "camera_lost",
     "camera_silent",
+    "eye_lost",
     "imu_missing",
     "imu_not_newer",
     "imu_leapt",
@@ -54,12 +60,19 @@ struct Case {
     /// Strikes the unit, not the cameras.
     inertial: bool,
     rule: Rule,
+    /// What is written where no counter sees it.
+    unseen: &'static str,
 }
 
 fn cases() -> Vec<Case> {
     let lasting = |fault, secs: f64| Rule::within(fault, STRIKES_S, STRIKES_S + secs);
-    let camera = |name, rule| Case { name, inertial: false, rule };
-    let unit = |name, rule| Case { name, inertial: true, rule };
+    let camera = |name, rule| Case { name, inertial: false, rule, unseen: "-" };
+    let unit = |name, rule| Case { name, inertial: true, rule, unseen: "-" };
+    let flipped = |name, bits| Case {
+        unseen: "nothing: no sum guards a grey picture",
+        ..camera(name, Rule { bits, ..lasting(Kind::BitFlip, 0.5) })
+    };
+    let eye = |rule: Rule, camera| Rule { camera: Some(camera), ..rule };
     let some = |rule: Rule| Rule { probability: 0.2, ..rule };
     let by = |rule: Rule, by_s: f64| Rule { by_s, ..rule };
     vec![
@@ -67,13 +80,18 @@ fn cases() -> Vec<Case> {
         camera("frames: 0.1 s late, 0.5 s", by(lasting(Kind::Delay, 0.5), 0.1)),
         camera("frames: each twice, 0.5 s", lasting(Kind::Duplicate, 0.5)),
         camera("frames: frozen, 0.5 s", lasting(Kind::Freeze, 0.5)),
-        camera("frames: a bit flipped in each, 0.5 s", lasting(Kind::BitFlip, 0.5)),
+        flipped("frames: a bit flipped in each image, 0.5 s", 1),
+        flipped("frames: 1000 bits flipped in each image, 0.5 s", 1000),
         camera("frames: black, 0.5 s", lasting(Kind::Blackout, 0.5)),
         camera("frames: none, 1 s", lasting(Kind::Gap, 1.0)),
         camera("frames: stamps 60 s ahead, 0.2 s", by(lasting(Kind::StampJump, 0.2), 60.0)),
         camera("frames: stamps 60 s back, 0.2 s", by(lasting(Kind::StampJump, 0.2), -60.0)),
-        camera("camera unplugged, 1 s", lasting(Kind::Unplug, 1.0)),
-        camera("camera unplugged, 3 s", lasting(Kind::Unplug, 3.0)),
+        camera("left camera unplugged, 2 s", eye(lasting(Kind::Unplug, 2.0), 0)),
+        camera("right camera unplugged, 2 s", eye(lasting(Kind::Unplug, 2.0), 1)),
+        camera("both unplugged, 0.5 s", lasting(Kind::Unplug, 0.5)),
+        camera("both unplugged, 1 s", lasting(Kind::Unplug, 1.0)),
+        camera("both unplugged, 2 s", lasting(Kind::Unplug, 2.0)),
+        camera("both unplugged, 5 s", lasting(Kind::Unplug, 5.0)),
         unit("samples: one in five dropped, 2 s", some(lasting(Kind::Drop, 2.0))),
         unit("samples: 0.05 s late, 0.5 s", by(lasting(Kind::Delay, 0.5), 0.05)),
         unit("samples: each twice, 0.5 s", lasting(Kind::Duplicate, 0.5)),
@@ -105,12 +123,14 @@ struct Outcome {
     ate_m: Option<f64>,
     /// Of what came after the fault, aligned by itself.
     after_m: Option<f64>,
+    /// Error of the motion from the last pose before the fault to the first after it.
+    jump_m: Option<f64>,
 }
 
 impl Flight {
     fn render(board: Board) -> Result<Flight, Fault> {
         let mut scenario = Scenario::named("demo").expect("the demo's scenario is compiled in");
-        scenario.duration = Span::from_secs(FLIGHT_S);
+        scenario.duration = Span::from_secs(cases().iter().map(flight_s).fold(FLIGHT_S, f64::max));
         let mut sim = Sim::new(&scenario)?;
         let mut frames = Vec::new();
         for i in 0..sim.frame_count() {
@@ -128,7 +148,10 @@ impl Flight {
             if case.inertial { &mut inject.imu } else { &mut inject.camera }.push(case.rule);
         }
         let calibration = self.sim.calibration();
-        let stamps: Vec<Nanos> = self.frames.iter().map(|f| f.t).collect();
+        let mut stamps: Vec<Nanos> = self.frames.iter().map(|f| f.t).collect();
+        let end = stamps[0] + Span::from_secs(case.map_or(FLIGHT_S, flight_s));
+        stamps.truncate(stamps.partition_point(|t| *t < end));
+        let flown = stamps.len();
         let (first, images) = (stamps[0], Images::Rendered(self.frames.clone()));
         let shape = || Frames::for_rig(calibration);
         let sensors = Sensors::of_recording(images, stamps, self.sim.imu().to_vec(), &inject, shape);
@@ -137,10 +160,10 @@ impl Flight {
         let mut silent = Progress::silent();
         let played = realtime(sensors, calibration, Tracking::Odometry(Box::new(run)), None, &options, &mut silent);
         let end_s = case.map_or(STRIKES_S, |c| c.rule.end_s);
-        Ok(self.judge(&played, first + Span::from_secs(STRIKES_S), first + Span::from_secs(end_s)))
+        Ok(self.judge(&played, flown, first + Span::from_secs(STRIKES_S), first + Span::from_secs(end_s)))
     }
 
-    fn judge(&self, played: &Played, strikes: Nanos, ends: Nanos) -> Outcome {
+    fn judge(&self, played: &Played, flown: usize, strikes: Nanos, ends: Nanos) -> Outcome {
         let Tracking::Odometry(run) = &played.tracking else { unreachable!("flown by odometry") };
         let trajectory: Vec<TimedPose> =
             run.back.trajectory.iter().map(|o| TimedPose { t: o.t, pose: o.world_from_body }).collect();
@@ -156,13 +179,24 @@ impl Flight {
         Outcome {
             injected: all.iter().filter(|(name, _)| is_injected(name)).copied().collect(),
             detected: all.iter().filter(|(name, n)| *n > 0 && DETECTORS.contains(name)).copied().collect(),
-            lost: self.frames.len() - trajectory.len().min(self.frames.len()),
+            lost: flown - trajectory.len().min(flown),
             recovered_s: recovered.map(|i| (tail[i].0 - ends).secs()),
             health: health.iter().filter(|(t, _)| *t >= strikes).fold(Health::default(), |sum, (_, h)| sum | *h),
             ate_m: ate(&trajectory),
             after_m: ate(&after),
+            jump_m: trajectory.iter().rfind(|p| p.t < strikes).zip(after.first()).and_then(|(a, b)| self.jump(a, b)),
         }
     }
+
+    fn jump(&self, a: &TimedPose, b: &TimedPose) -> Option<f64> {
+        let truth = |t: Nanos| pose_at(&self.truth, t, TRUTH_HOLE);
+        let truly = truth(a.t)?.inverse() * truth(b.t)?;
+        Some((truly.inverse() * (a.pose.inverse() * b.pose)).p.length())
+    }
+}
+
+fn flight_s(case: &Case) -> f64 {
+    FLIGHT_S.max(case.rule.end_s + AFTER_S)
 }
 
 /// `stipple bench faults`; `quick` flies the first fault of each sensor only.
@@ -176,17 +210,17 @@ pub fn faults(out: &Path, quick: bool) -> Result<(), Fault> {
     let mut rows = Vec::new();
     let mut cases = cases();
     if quick {
-        cases.retain(|c| c.rule.fault == Kind::Unplug);
+        cases.retain(|c| c.rule.fault == Kind::Unplug && c.rule.end_s < STRIKES_S + 2.0);
     }
     for case in &cases {
         let outcome = flight.fly(Some(case))?;
         eprintln!("{}", case.name);
-        rows.push((case.name, outcome));
+        rows.push((case, outcome));
     }
     let table = table(&plain, &rows);
     println!("{table}");
     out.write("faults.md", |w| writeln!(w, "{table}"))?;
-    let list: Vec<Value> = rows.iter().map(|(name, o)| json_row(name, o)).collect();
+    let list: Vec<Value> = rows.iter().map(|(case, o)| json_row(case.name, o)).collect();
     let whole = json!({ "without": json_row("none", &plain), "faults": list });
     out.write("faults.json", |w| {
         serde_json::to_writer_pretty(&mut *w, &whole)?;
@@ -207,32 +241,42 @@ fn json_row(name: &str, o: &Outcome) -> Value {
         "health": o.health.reasons().collect::<Vec<_>>(),
         "ate_m": o.ate_m,
         "ate_after_m": o.after_m,
+        "jump_m": o.jump_m,
     })
 }
 
 /// What a fault raised above what the flight without one counts.
-fn table(plain: &Outcome, rows: &[(&str, Outcome)]) -> String {
+fn table(plain: &Outcome, rows: &[(&Case, Outcome)]) -> String {
     let mm = |v: Option<f64>| v.map_or("-".into(), |v| format!("{:.1}", 1e3 * v));
     let before = |name: &str| plain.detected.iter().find(|(n, _)| *n == name).map_or(0, |(_, v)| *v);
-    let listed = |list: Vec<String>| if list.is_empty() { "-".into() } else { list.join(", ") };
+    let listed = |list: Vec<String>, none: &str| if list.is_empty() { none.into() } else { list.join(", ") };
     let mut text =
-        "| fault | injected | seen by | frames lost | itself again after s | said | ATE mm | after it mm |\n\
-                    |---|---|---|---|---|---|---|---|\n"
+        "| fault | injected | seen by | frames lost | itself again after s | said | ATE mm | after it mm | jump mm |\n\
+                    |---|---|---|---|---|---|---|---|---|\n"
             .to_string();
-    let _ = writeln!(text, "| none | - | - | {} | - | - | {} | {} |", plain.lost, mm(plain.ate_m), mm(plain.after_m));
-    for (name, o) in rows {
+    let _ = writeln!(
+        text,
+        "| none | - | - | {} | - | - | {} | {} | {} |",
+        plain.lost,
+        mm(plain.ate_m),
+        mm(plain.after_m),
+        mm(plain.jump_m)
+    );
+    for (case, o) in rows {
         let seen = o.detected.iter().filter(|(n, v)| *v > before(n)).map(|(n, v)| format!("{n} {}", v - before(n)));
         let said = Health(o.health.0 & !Health::NORMAL.0);
         let _ = writeln!(
             text,
-            "| {name} | {} | {} | {} | {} | {} | {} | {} |",
-            listed(o.injected.iter().map(|(_, v)| v.to_string()).collect()),
-            listed(seen.collect()),
+            "| {} | {} | {} | {} | {} | {} | {} | {} | {} |",
+            case.name,
+            listed(o.injected.iter().map(|(_, v)| v.to_string()).collect(), "-"),
+            listed(seen.collect(), case.unseen),
             o.lost.saturating_sub(plain.lost),
             o.recovered_s.map_or("never".into(), |s| format!("{s:.2}")),
-            listed(said.reasons().map(str::to_string).collect()),
+            listed(said.reasons().map(str::to_string).collect(), "-"),
             mm(o.ate_m),
             mm(o.after_m),
+            mm(o.jump_m),
         );
     }
     text.trim_end().to_string()
