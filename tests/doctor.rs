@@ -69,8 +69,16 @@ fn a_whole_recording_passes_every_check() {
     }
     let said = text(&o);
     assert!(o.status.success() && !said.contains("fail"), "{said}");
-    let all =
-        ["camera rate", "inertial rate", "left and right", "camera 0: mean", "camera 1: mean", "stereo", "gravity"];
+    let all = [
+        "camera rate",
+        "inertial rate",
+        "left and right",
+        "capture",
+        "camera 0: mean",
+        "camera 1: mean",
+        "stereo",
+        "gravity",
+    ];
     let more =
         ["gyro noise", "accelerometer noise", "saturation", "time offset", "axes", "extrinsics", "memory", "disk"];
     for words in all.iter().chain(&more).filter(|w| **w != "disk") {
@@ -120,4 +128,30 @@ fn a_board_without_sensors_is_told_what_to_write() {
     let o = stipple(&["doctor", BOARD, "--set", "map.enabled=false"]);
     assert_eq!(o.status.code(), Some(UNAVAILABLE), "{}", text(&o));
     assert!(verdict(&text(&o), "sensors").0 == "fail" && text(&o).contains("[camera]"), "{}", text(&o));
+}
+
+#[test]
+fn each_part_of_a_board_is_looked_for_where_one_is_not_there() {
+    let dir = tempfile::tempdir().unwrap();
+    let data = flight(dir.path(), &[]);
+    let board = dir.path().join("board.toml");
+    let plain = fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join(BOARD)).unwrap();
+    let sensors = format!(
+        "[rig]\ncalibration = \"{}\"\n[camera]\ndevices = [\"serial:L\", \"serial:R\"]\n\
+         [imu]\nchip = \"mpu-6500\"\ni2c = \"/dev/no-such-bus\"\n\
+         [gpio.led]\nchip = \"no-such-chip\"\nline = \"3\"\n",
+        data.join("mav0").display()
+    );
+    fs::write(&board, format!("{plain}\n{sensors}")).unwrap();
+    let o = stipple(&["doctor", board.to_str().unwrap(), "--set", "map.enabled=false"]);
+    let said = text(&o);
+    assert_eq!(o.status.code(), Some(UNAVAILABLE), "{said}");
+    assert_eq!(verdict(&said, "calibration: 2 cameras").0, "ok");
+    for (part, what) in
+        [("cameras", "serial:L"), ("inertial unit", "/dev/no-such-bus"), ("status light", "no-such-chip")]
+    {
+        let (verdict, line) = verdict(&said, &format!("{part}: "));
+        assert!(verdict == "fail" && line.contains(what), "{said}");
+    }
+    assert!(said.contains("3 checks failed"), "{said}");
 }

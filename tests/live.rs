@@ -133,6 +133,27 @@ fn sensors_that_fail_are_said_counted_and_taken_back() {
 }
 
 #[test]
+fn a_run_goes_on_with_one_camera_and_says_which_is_gone() {
+    const RULES: &str = "
+        [[inject.camera]]
+        fault = \"unplug\"
+        camera = 1
+        start_s = 2.0
+        end_s = 4.0
+    ";
+    let dir = tempfile::tempdir().unwrap();
+    let (data, out) = (flight(dir.path(), "6"), dir.path().join("out"));
+    let o = run(&data, &out, &board_with(dir.path(), RULES)).output().unwrap();
+    let (r, said) = (report(&out), text(&o));
+    assert!(o.status.success(), "{said}");
+    assert_eq!((count(&r, "eye_lost"), count(&r, "camera_lost"), count(&r, "resets")), (1, 0, 0), "{said}");
+    assert!((1500..3000).contains(&count(&r, "eye_away_ms")) && count(&r, "frames_blank") > 20, "{said}");
+    assert!(said.contains("one camera lost: camera 1") && said.contains("one camera is back after"), "{said}");
+    assert!(said.contains("ms of CPU a frame to read it") && r["camera_cpu_ms"].as_f64().unwrap() > 0.0, "{said}");
+    assert!(r["ate_rmse_m"].as_f64().unwrap() < 0.03, "{said}");
+}
+
+#[test]
 fn a_senseless_rule_is_named() {
     let dir = tempfile::tempdir().unwrap();
     let board = board_with(dir.path(), "[[inject.imu]]\nfault = \"blackout\"\n");

@@ -66,6 +66,9 @@ impl CameraConfig {
         if let Some(why) = self.devices.iter().find_map(|d| Select::parse(d).err()) {
             return Some(("camera.devices", format!("camera.devices: {why}")));
         }
+        if let Some(twice) = self.devices.iter().enumerate().find(|(i, d)| self.devices[..*i].contains(d)) {
+            return Some(("camera.devices", format!("camera.devices names {} twice: name each camera once", twice.1)));
+        }
         if self.devices.len() > 1 && self.pair_tolerance_s * self.rate_hz >= 0.5 {
             let why = "camera.pair_tolerance_s must be less than half a period of camera.rate_hz";
             return Some(("camera.pair_tolerance_s", format!("{why}: any two images would pair")));

@@ -310,7 +310,7 @@ impl Board {
                 Exit::NoInput,
                 &place,
                 format!("cannot read the board file: {e}"),
-                "pass --board with a file of board-configs/",
+                "name one, such as those of board-configs/",
             )
         })?;
         Board::parse(&place, &text, overrides)

@@ -41,10 +41,40 @@ pub fn open(path: &Path, board: &Board) -> Result<(Calibration, Sensors), Fault>
     Ok((calibration, Sensors { frames, imu: Box::new(imu) }))
 }
 
+/// What each part of a board comes to by itself, where they cannot all be opened: its name, and what was found or is wrong.
+pub fn parts(path: &Path, board: &Board) -> Vec<(&'static str, Result<String, Fault>)> {
+    let mut parts = vec![];
+    let calibration = calibration(path, board);
+    let cameras = calibration.as_ref().map_err(Fault::clone).and_then(|calibration| {
+        let rig = v4l2::Rig::open(board.camera.settings(calibration)?, calibration)?;
+        Ok(rig.describe().join("; "))
+    });
+    let count = |c: &Calibration| format!("{} cameras", c.cameras.len());
+    parts.push(("calibration", calibration.as_ref().map(count).map_err(Fault::clone)));
+    if calibration.is_ok() {
+        parts.push(("cameras", cameras));
+    }
+    let none = || Fault::new(Exit::Config, "[imu]", "names no chip", "write imu.chip and where it is wired");
+    let data_ready = board.gpio.data_ready().map(|(line, edge)| DataReady::open(&line, edge)).transpose();
+    if board.gpio.data_ready().is_some() {
+        parts.push(("data-ready line", data_ready.as_ref().map(|_| "opened".into()).map_err(Fault::clone)));
+    }
+    let opened = board.imu.options().ok_or_else(none).and_then(|o| o.open(data_ready.ok().flatten()));
+    parts.push(("inertial unit", opened.map(|_| format!("{} answers", board.imu.chip))));
+    let outputs =
+        [("trigger line", board.gpio.trigger().map(|(line, low, _)| (line, low))), ("status light", board.gpio.led())];
+    for (name, (line, active_low)) in outputs.into_iter().filter_map(|(name, o)| Some((name, o?))) {
+        parts.push((name, Output::open(&line, active_low).map(|_| "opened".into())));
+    }
+    parts
+}
+
 /// A relative path is one from the board file's folder.
 fn calibration(path: &Path, board: &Board) -> Result<Calibration, Fault> {
     let folder = path.parent().unwrap_or(Path::new(""));
-    let mut calibration = read_calibration(&folder.join(&board.rig.calibration))?;
+    let fix = "set rig.calibration to a folder with cam0/sensor.yaml, Kalibr's camchain.yaml, or Basalt's json";
+    let unread = |f: Fault| if f.exit == Exit::NoInput { Fault { fix: fix.into(), ..f } } else { f };
+    let mut calibration = read_calibration(&folder.join(&board.rig.calibration)).map_err(unread)?;
     // Noise densities are the unit's; how often it is read here is the board's word.
     calibration.imu.rate_hz = board.imu.rate_hz;
     if board.rig.readout_s > 0.0 {

@@ -6,6 +6,7 @@ pub mod machine;
 pub mod rotation;
 pub mod signals;
 
+use super::hardware;
 use super::live::{rig_of, Rig, Run};
 use super::pipeline::{Bell, Ends};
 use super::progress::Gauges;
@@ -157,10 +158,20 @@ pub fn doctor(path: &Path, out: &Path, set: &[String], options: &Run) -> Result<
         }
         Err(fault) => {
             let memory = machine::memory_ceiling(None, &board);
-            let sensors = Check::fail(format!("sensors: {}: {}", fault.place, fault.what), fault.fix);
-            memory.print();
-            sensors.print();
-            vec![memory, sensors]
+            let mut list = vec![memory];
+            let named = !board.camera.devices.is_empty() && !board.rig.calibration.is_empty();
+            if options.dataset.is_none() && named {
+                // One part fails; the others may be well, and are said too.
+                list.extend(hardware::parts(path, &board).into_iter().map(|(name, found)| match found {
+                    Ok(what) => Check::ok(format!("{name}: {what}")),
+                    Err(fault) => Check::fail(format!("{name}: {}: {}", fault.place, fault.what), fault.fix),
+                }));
+            }
+            if list.iter().all(|c| c.verdict != Verdict::Fail) {
+                list.push(Check::fail(format!("sensors: {}: {}", fault.place, fault.what), fault.fix));
+            }
+            list.iter().for_each(Check::print);
+            list
         }
     };
     let failed = checks.iter().chain(&sensed).filter(|c| c.verdict == Verdict::Fail).count();
