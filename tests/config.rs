@@ -173,7 +173,7 @@ fn an_inertial_unit_is_described_whole_or_refused() {
 
 #[test]
 fn missing_file_is_named() {
-    refused(Board::load(Path::new("no/such.toml"), &[]), Exit::NoInput, &["no/such.toml", "--board"]);
+    refused(Board::load(Path::new("no/such.toml"), &[]), Exit::NoInput, &["no/such.toml", "board-configs/"]);
 }
 
 #[test]

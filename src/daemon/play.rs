@@ -246,10 +246,12 @@ pub fn realtime(
         });
         scope.spawn(move || sensors::inertial(&s.inbox, imu, bell, &s.source_done, &s.counters));
         let give = move |slot: Box<Slot>| {
-            counted.pass_on(&slot, s.keyframes.as_ref(), &s.counters);
-            s.gauges.frames.fetch_add(1, Relaxed);
-            s.gauges.posed.fetch_add(u64::from(slot.tracked.is_some()), Relaxed);
-            s.gauges.keyframes.store(counted.count, Relaxed);
+            if !slot.frameless {
+                counted.pass_on(&slot, s.keyframes.as_ref(), &s.counters);
+                s.gauges.frames.fetch_add(1, Relaxed);
+                s.gauges.posed.fetch_add(u64::from(slot.tracked.is_some()), Relaxed);
+                s.gauges.keyframes.store(counted.count, Relaxed);
+            }
             let _ = s.inbox.spare.push(slot);
         };
         let mut held = None;

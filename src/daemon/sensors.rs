@@ -12,6 +12,7 @@ use super::tracking::Slot;
 use super::watch::{FrameWatch, ImuWatch};
 use crate::config::InjectConfig;
 use crate::counters::{Counter, Counters};
+use crate::limits::IMU_BETWEEN_FRAMES;
 use crossbeam_queue::ArrayQueue;
 use std::sync::atomic::{AtomicBool, AtomicI64, AtomicU64, Ordering::Relaxed};
 use std::sync::OnceLock;
@@ -67,6 +68,8 @@ const LINE_PERIOD: Duration = Duration::from_secs(1);
 const POLL: Duration = Duration::from_micros(500);
 /// Two seconds of a 1 kHz unit.
 const IMU_SLOTS: usize = 2048;
+/// Samples that wait for no frame any more: half of what fits before one, a second and a quarter at 200 Hz.
+const SAMPLES_ALONE: usize = IMU_BETWEEN_FRAMES / 2;
 const NOTICES: usize = 8;
 
 /// Where frames and samples wait for tracking. Slots go round: spare -> newest -> tracking -> spare.
@@ -113,8 +116,9 @@ impl Inbox {
     /// come; `held` is the frame that waits.
     pub fn take(&self, held: &mut Option<Held>, over: &AtomicBool, counters: &Counters) -> Option<Box<Slot>> {
         if held.is_none() {
-            let mut slot = self.newest.pop()?;
+            let Some(mut slot) = self.newest.pop() else { return self.take_samples(counters) };
             slot.imu.clear();
+            slot.frameless = false;
             *held = Some(Held { slot, since: Instant::now() });
         }
         let Held { slot, since } = held.as_mut().expect("filled above");
@@ -133,6 +137,21 @@ impl Inbox {
         }
         counters.frames_without_imu.add(u64::from(!reached));
         held.take().map(|h| h.slot)
+    }
+
+    /// Without a frame: samples alone, once there are as many as one slot takes well. Inertia carries the estimate over the
+    /// gap, and each that is missing costs metres.
+    fn take_samples(&self, counters: &Counters) -> Option<Box<Slot>> {
+        if self.imu.len() < SAMPLES_ALONE {
+            return None;
+        }
+        let mut slot = self.spare.pop()?;
+        slot.imu.clear();
+        slot.frameless = true;
+        for _ in 0..SAMPLES_ALONE {
+            self.imu.pop().into_iter().for_each(|sample| slot.push_imu(sample, counters));
+        }
+        Some(slot)
     }
 }
 
@@ -390,5 +409,21 @@ mod tests {
         assert_eq!((capture.frames, capture.frame_bytes), (3, 2 * 752 * 480));
         assert_eq!(capture.copies(&source.counters()), Some(1.0));
         assert!(capture.ms_a_frame().is_some_and(|(all, kernel)| all >= kernel && kernel >= 0.0));
+    }
+
+    #[test]
+    fn while_no_frame_comes_samples_reach_the_estimator_all_the_same() {
+        let (inbox, counters, over) = (Inbox::new(4, &euroc_rig(), 0), Counters::default(), AtomicBool::new(false));
+        let mut taken = vec![];
+        for i in 0..3 * IMU_BETWEEN_FRAMES as i64 {
+            inbox.imu.force_push(ImuSample { t: Nanos(i), ..ImuSample::default() });
+            if let Some(slot) = inbox.take(&mut None, &over, &counters) {
+                assert!(slot.frameless);
+                taken.extend(slot.imu.iter().map(|s| s.t.0));
+                let _ = inbox.spare.push(slot);
+            }
+        }
+        assert_eq!(taken, (0..3 * IMU_BETWEEN_FRAMES as i64).collect::<Vec<_>>());
+        assert_eq!(counters.imu_overflow.get(), 0);
     }
 }

@@ -37,6 +37,8 @@ pub struct Tracked {
 /// was made of them.
 pub struct Slot {
     pub frames: Frames,
+    /// Only samples are in it: no frame came for so long that they would not fit before the next.
+    pub frameless: bool,
     /// A camera saw nothing, as far as anybody looked: nothing to train a map on.
     pub blank: bool,
     pub imu: List<ImuSample, IMU_BETWEEN_FRAMES>,
@@ -51,6 +53,7 @@ impl Slot {
     pub fn for_rig(calibration: &Calibration, colours: usize) -> Box<Slot> {
         Box::new(Slot {
             frames: Frames::in_colour(calibration, colours),
+            frameless: false,
             blank: false,
             imu: List::default(),
             tracks: Tracks::default(),
@@ -106,6 +109,9 @@ impl Front {
                 self.imu.push(*sample);
             }
         }
+        if slot.frameless {
+            return;
+        }
         let t = slot.frames.t;
         let prediction = Prediction { prev_from_now: self.last.map(|prev| predictor.motion(&self.imu, prev, t)) };
         self.last = Some(t);
@@ -145,6 +151,10 @@ impl Back {
     pub fn estimate(&mut self, slot: &mut Slot) {
         let begun = Instant::now();
         slot.imu.iter().for_each(|s| self.vio.on_imu(*s));
+        slot.tracked = None;
+        if slot.frameless {
+            return;
+        }
         let update = self.vio.on_tracks(&slot.tracks);
         slot.tracked = update.odometry.map(|o| Tracked {
             world_from_body: o.world_from_body,
@@ -220,6 +230,10 @@ impl OdometryRun {
 
 /// The pose of a frame from a table: every frame is a keyframe.
 pub fn look_up(poses: &[TimedPose], slot: &mut Slot, counters: &Counters) {
+    if slot.frameless {
+        slot.tracked = None;
+        return;
+    }
     let pose = pose_at(poses, slot.frames.t, POSE_HOLE);
     counters.frames_without_pose.add(u64::from(pose.is_none()));
     slot.tracked =

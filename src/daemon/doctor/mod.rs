@@ -270,7 +270,9 @@ fn look(rig: Rig, board: &Board, look_s: f64) -> Result<Seen, Fault> {
             match inbox.take(&mut held, &over, &counters) {
                 Some(slot) => {
                     seen.samples.extend(slot.imu.iter());
-                    take(&mut seen, &calibration, &slot.frames, board.stereo.disparities as usize);
+                    if !slot.frameless {
+                        take(&mut seen, &calibration, &slot.frames, board.stereo.disparities as usize);
+                    }
                     let _ = inbox.spare.push(slot);
                 }
                 None if ended => break,
