@@ -206,7 +206,9 @@ impl<S: Real> Estimator<S> {
         self.trust.fold(s.t, &self.imu, &self.noise);
         let needed_from = self.window.newest().map(|n| self.window.frame(n).t);
         if let (Some(old), Some(t)) = (overwritten, needed_from) {
-            self.stats.imu_overflow += (old.t > t) as u64;
+            // Over a longer gap it is given up, and what was folded in by then is not needed.
+            let lost = old.t > t && (s.t - t).secs() <= FRAME_GAP_MAX;
+            self.stats.imu_overflow += lost as u64;
         }
     }
 

@@ -12,6 +12,7 @@ mod plugged;
 use plugged::Uvc;
 use std::process::Command;
 use std::time::{Duration, Instant};
+use stipple_drivers::host::{thread_cpu, CpuTime};
 use stipple_drivers::source::{FrameSource, SourceFault, Wait};
 use stipple_drivers::v4l2::{Format, Rig, Select, Settings, StampPoint};
 use stipple_drivers::{Calibration, Camera, Fault, Frames, ImuCalibration, Lens, Pose, RigCamera, Span};
@@ -132,8 +133,12 @@ fn uvc_pairs_are_exact_and_what_a_camera_skipped_is_counted_exactly() {
     println!("{}", rig.describe().join("\n"));
     let mut frames = Frames::for_rig(&calibration);
     let (mut numbers, mut last) = (Vec::new(), stipple_drivers::Nanos(0));
+    let mut cost = CpuTime::default();
     while numbers.len() < 60 {
+        let before = thread_cpu();
         next(&mut rig, &mut frames, no_loss);
+        let spent = thread_cpu() - before;
+        cost = CpuTime { user_s: cost.user_s + spent.user_s, kernel_s: cost.kernel_s + spent.kernel_s };
         let k = number("grey", &frames, FPS);
         assert!(frames.t > last && numbers.last().is_none_or(|l| *l < k));
         (numbers, last) = ([numbers, vec![k]].concat(), frames.t);
@@ -148,6 +153,10 @@ fn uvc_pairs_are_exact_and_what_a_camera_skipped_is_counted_exactly() {
     let unsent = left.unsent(first, end) + right.unsent(first, end);
     let missed = count(&rig, "camera_missed_by_stamp");
     println!("60 pairs of {first} to {end}; {unsent} images not sent, {missed} missed by stamp; {:?}", counted(&rig));
+    let ms = |s: f64| 1e3 * s / 60.0;
+    println!("a pair: {:.3} ms of emulated CPU, {:.3} of them in the kernel", ms(cost.total_s()), ms(cost.kernel_s));
+    let (copied, given) = (count(&rig, "camera_bytes_copied"), count(&rig, "camera_frames"));
+    assert_eq!(copied, given * 2 * (w * h) as u64, "each pixel is copied once from the kernel's buffer");
     assert!(unsent >= 5, "5 were skipped on order");
     assert_eq!(missed, unsent, "what the cameras say they did not send");
     assert_eq!(count(&rig, "camera_missed_by_sequence"), 0, "numbers are contiguous over what was never sent");
