@@ -93,7 +93,10 @@ fn cases() -> Vec<Case> {
         camera("both unplugged, 2 s", lasting(Kind::Unplug, 2.0)),
         camera("both unplugged, 5 s", lasting(Kind::Unplug, 5.0)),
         unit("samples: one in five dropped, 2 s", some(lasting(Kind::Drop, 2.0))),
-        unit("samples: 0.05 s late, 0.5 s", by(lasting(Kind::Delay, 0.5), 0.05)),
+        Case {
+            unseen: "nothing: they are waited for",
+            ..unit("samples: 0.05 s late, 0.5 s", by(lasting(Kind::Delay, 0.5), 0.05))
+        },
         unit("samples: each twice, 0.5 s", lasting(Kind::Duplicate, 0.5)),
         unit("samples: frozen, 0.2 s", lasting(Kind::Freeze, 0.2)),
         unit("samples: one in five with a bit flipped, 0.5 s", some(lasting(Kind::BitFlip, 0.5))),

@@ -8,8 +8,9 @@
 //! Stamps are the driver's, brought to the middle of the exposure of the first row (`stamps::Timing`) and then to the
 //! calibration's clock and middle row, as recordings' are. A frame is Got when every camera has one within the tolerance;
 //! what has no partner is counted and its buffer given back at once. A camera that is unplugged or silent is closed and,
-//! from the next call on, looked for by its name and opened again, with growing pauses. Meanwhile, and from the fifth period
-//! of a silence on, the others go on without it: its image is black, and `away` says why. The rig is `Lost` when none is left.
+//! from the next call on, looked for by its name and opened again, with growing pauses. Meanwhile, and from a
+//! quarter of such a silence on, the others go on without it: its image is black, and `away` says why. The rig is `Lost` when
+//! none is left.
 //!
 //! Nothing is allocated between opening and losing a camera, except by the JPEG decoder and to word a warning.
 
@@ -76,8 +77,10 @@ const RETRY_MIN: Span = Span(100_000_000);
 const RETRY_MAX: Span = Span(2_000_000_000);
 /// Errors in a row after which a camera is opened again.
 const ERRORS_MAX: u32 = 8;
-/// Periods after which a camera that gives nothing is not waited for: a quarter of a second at 20 Hz.
+/// A camera that gives nothing is not waited for after so many periods, and this part of the silence after which it is
+/// opened again: half a second by default, a quarter of what odometry bridges.
 const AWAY_PERIODS: i64 = 5;
+const AWAY_PART: i64 = 4;
 /// Warnings kept.
 const WARNINGS_MAX: usize = 32;
 
@@ -323,8 +326,8 @@ impl Rig {
     fn deliver(&mut self, frames: &mut Frames) -> bool {
         loop {
             let (mut heads, mut full, mut of, mut n) = ([None; NODES_MAX], [false; NODES_MAX], [0; NODES_MAX], 0);
-            let now = self.kernel.now();
-            let there = |(i, s): (usize, &'_ Option<Stream>)| s.as_ref().filter(|s| !s.is_away(now)).map(|_| i);
+            let (now, silent) = (self.kernel.now(), self.settings.silent);
+            let there = |(i, s): (usize, &'_ Option<Stream>)| s.as_ref().filter(|s| !s.is_away(now, silent)).map(|_| i);
             for index in self.streams.iter().enumerate().filter_map(there) {
                 let Some(s) = &self.streams[index] else { continue };
                 (heads[n], full[n], of[n]) = (s.held.front().map(|h| h.t), s.is_full(), index);
@@ -441,8 +444,8 @@ impl Stream {
     }
 
     /// The others go on without it.
-    fn is_away(&self, now: Nanos) -> bool {
-        let patience = Span(self.node.period.0.saturating_mul(AWAY_PERIODS));
+    fn is_away(&self, now: Nanos, silent: Span) -> bool {
+        let patience = Span(self.node.period.0.saturating_mul(AWAY_PERIODS).max(silent.0 / AWAY_PART));
         self.held.is_empty() && self.spoke.is_some_and(|t| now - t > patience)
     }
 
