@@ -5,9 +5,9 @@
 //! executes, one a nanosecond, and stands still while the host is busy with something else (`run-vm.sh -i`). To what runs
 //! there the recording plays at its own pace.
 //!
-//! The trajectory must be that of a replay of the same pictures and samples from a folder, which bear the instants at which
-//! they were due; what the run saw bears those that the kernel stamped. No alignment: a pose is compared with the pose of
-//! the same picture.
+//! The trajectory must be that of a replay from a folder: to a millimetre of what the run recorded itself, and within a
+//! centimetre (rms) of the same pictures and samples with the instants at which they were due, where what the run saw bears
+//! those that the kernel stamped. No alignment: a pose is compared with the pose of the same picture.
 #![allow(clippy::unwrap_used)]
 
 mod plugged;
@@ -38,6 +38,10 @@ const BEFORE: Span = Span(200 * MS);
 const AFTER: Span = Span(250 * MS);
 /// Inertial samples of the recording on either side of its pictures.
 const AROUND: Span = Span(100 * MS);
+/// Of a replay of what was given, m. Machine Hall's last seconds magnify whatever differs: a replay whose pictures bear
+/// stamps 1 us later is 1.5 mm rms and 5.3 mm at most from the one that does not, and 165 us are 2.4 mm and 7.4 mm.
+const RMS_MAX: f64 = 0.005;
+const WORST_MAX: f64 = 0.015;
 const PATIENCE: Duration = Duration::from_secs(60);
 
 fn environment(name: &str) -> PathBuf {
@@ -338,7 +342,7 @@ fn flight_through_the_kernel_is_the_flight_from_a_folder() {
         worst_seen * 1e3
     );
     assert!(n as u64 + count(&r, "frames_without_odometry") == frames && n * 10 >= frames as usize * 9);
-    assert!(worst < 0.01 && worst_seen < 0.01);
+    assert!(rms < RMS_MAX && worst < WORST_MAX && worst_seen < 0.001);
     assert_eq!((&r["heap_after_seal"], &r["pace"]), (&0.into(), &"live".into()));
     let quiet = ["camera_lost", "camera_silent", "imu_lost", "imu_silent", "imu_missing", "imu_frozen", "imu_overflow"];
     quiet.iter().for_each(|name| assert_eq!(count(&r, name), 0, "{name}"));
@@ -356,10 +360,11 @@ fn flight_goes_on_after_a_plug_was_pulled() {
     });
     let r = report(&dir.join("out"));
     println!("{}", counted(&r));
-    for name in ["camera_lost", "camera_losses", "camera_returns"] {
-        assert_eq!(count(&r, name), 1, "{name}");
+    // The other camera flies on meanwhile.
+    for (name, n) in [("eye_lost", 1), ("camera_losses", 1), ("camera_returns", 1), ("camera_lost", 0)] {
+        assert_eq!(count(&r, name), n, "{name}");
     }
-    assert!((1000..4000).contains(&count(&r, "camera_away_ms")));
+    assert!((1000..4000).contains(&count(&r, "eye_away_ms")));
     assert_eq!((&r["heap_after_seal"], count(&r, "imu_missing")), (&0.into(), 0));
     devices.given(dir);
     let given = replayed(dir, &dir.join("board.toml"), "given");
