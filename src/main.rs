@@ -262,9 +262,9 @@ enum Bench {
         /// Two hard cases
         #[arg(long)]
         quick: bool,
-        /// Only the simulated flights that deviations were fitted to, which are otherwise left out
+        /// Fit the methods' deviations to flights that are otherwise left out, print them, and judge them on the others
         #[arg(long, conflicts_with_all = ["quick", "dataset"])]
-        fitted: bool,
+        fit: bool,
     },
     /// Sensors that fail, in real time: which counter sees each fault, and what it costs; three minutes
     Faults {
@@ -346,11 +346,9 @@ fn run(command: Command) -> Result<(), Fault> {
             let column = column.and_then(|n| n.parse().ok());
             bench::kernels::kernels(&bench::kernels::Options { device, recording, quick, baseline, column }, &out)
         }
-        Command::Bench {
-            what: Bench::Stereo { dataset, out, recordings, board, poses, seconds, set, quick, fitted },
-        } => {
+        Command::Bench { what: Bench::Stereo { dataset, out, recordings, board, poses, seconds, set, quick, fit } } => {
             let loaded = board.as_deref().map(|path| Board::load(path, &set)).transpose()?;
-            let options = bench::stereo::Options { recordings, board: loaded, quick, fitted, seconds };
+            let options = bench::stereo::Options { recordings, board: loaded, quick, fit, seconds };
             // A wrong folder is told now, not after the minutes that come before the maps.
             dataset.as_deref().map(|path| Recording::open(path, &OpenOptions::default())).transpose()?;
             let maps = dataset.is_some();

@@ -136,14 +136,15 @@ fn filter_agrees_with_its_twin() {
             twin::smooth_lines(&grey(&left), &mut data, columns, lambda, f64::from(Wls::SIGMA));
         }
     }
+    let own = stipple::stereo::wls::Variance::FILTERED;
     let variance = Variance {
         weight_min: f64::from(Wls::WEIGHT_MIN),
         fill: f64::from(Wls::FILL),
-        least: f64::from(Wls::LEAST),
-        bent: f64::from(Wls::BENT),
-        bent_far: f64::from(Wls::BENT_FAR),
-        faint: f64::from(Wls::FAINT),
-        missing: f64::from(Wls::MISSING),
+        least: f64::from(own.least),
+        bent: f64::from(own.bent),
+        bent_far: f64::from(own.bent_far),
+        faint: f64::from(own.faint),
+        missing: f64::from(own.missing),
     };
     for i in 0..w * h {
         let [a, b] = twin::settle(&grey(&left), &data, i, &variance);

@@ -1,21 +1,28 @@
 //! Simulated flights that methods are judged on: the ones that deviations were fitted to, and others to report.
 //!
-//! Every flight has a room of its own, furnished by its seed, and no path is in both lists: MH_04's are of its two halves.
-//! Invented flights stay in a room of 8 m; MH_04's room is up to 20 m deep, the only one with depths beyond 8 m.
+//! Every flight has a room of its own, furnished by its seed, and no path is in both lists, though halves of one are: fitted
+//! to the first half of `aggressive` and reported on the second, and so with recorded ones. Invented flights stay in a room of 8 m; MH_04's room is up to 20 m deep, the only one with depths beyond 8 m.
+//! Of each the frames that see most within a metre are added, of which evenly chosen ones see next to nothing.
 
 use super::super::inputs;
 use super::sets::{self, Set};
 use std::path::Path;
-use stipple_drivers::sim::Scenario;
+use stipple_drivers::sim::{self, Scenario};
 use stipple_drivers::Fault;
 
-/// Of each flight, evenly: as many as a software rasteriser matches in minutes.
-const FRAMES: usize = 4;
-/// Of a recorded path, s.
+/// Frames of a flight: evenly chosen, and those nearest to something.
+#[derive(Clone, Copy)]
+pub struct Frames {
+    pub even: usize,
+    pub near: usize,
+}
+
+/// Flown from `from_s` on, s: of a recorded path, and of an invented one.
 const SECONDS: f64 = 40.0;
+const INVENTED_SECONDS: f64 = 6.0;
 
 struct Flown {
-    /// A scenario of the simulator, or a recorded path and where in it to begin, s.
+    /// A scenario of the simulator or a recorded path, and where in it to begin, s.
     path: &'static str,
     from_s: f64,
     seed: u64,
@@ -25,29 +32,36 @@ const fn flown(path: &'static str, from_s: f64, seed: u64) -> Flown {
     Flown { path, from_s, seed }
 }
 
-const FITTED: [Flown; 5] = [
+const FITTED: [Flown; 9] = [
     flown("demo", 0.0, 1),
+    flown("demo", 4.0, 2),
     flown("aggressive", 0.0, 1),
-    flown("demo", 0.0, 2),
     flown("aggressive", 0.0, 2),
+    flown("aggressive", 0.0, 3),
     flown("MH_04_difficult", 16.0, 1),
+    flown("MH_04_difficult", 16.0, 2),
+    flown("V1_02_medium", 48.0, 1),
+    flown("V2_02_medium", 60.0, 1),
 ];
-const REPORTED: [Flown; 5] = [
-    flown("circle", 0.0, 11),
-    flown("hover", 0.0, 12),
-    flown("MH_04_difficult", 56.0, 15),
-    flown("V1_02_medium", 10.0, 16),
-    flown("V2_02_medium", 10.0, 17),
+const REPORTED: [Flown; 8] = [
+    flown("circle", 0.0, 51),
+    flown("hover", 2.0, 52),
+    flown("aggressive", 6.0, 53),
+    flown("aggressive", 6.0, 54),
+    flown("MH_04_difficult", 56.0, 55),
+    flown("MH_04_difficult", 56.0, 56),
+    flown("V1_02_medium", 8.0, 57),
+    flown("V2_02_medium", 10.0, 58),
 ];
 
 /// Those whose paths are in the folder of recordings; invented ones in any case.
-pub fn sets(folder: &Path, fitted: bool) -> Result<Vec<Set>, Fault> {
-    let flights = if fitted { &FITTED } else { &REPORTED };
-    flights.iter().filter_map(|f| f.set(folder).transpose()).collect()
+pub fn sets(folder: &Path, fitted: bool, frames: Frames) -> Result<Vec<Set>, Fault> {
+    let flights: &[Flown] = if fitted { &FITTED } else { &REPORTED };
+    flights.iter().filter_map(|f| f.set(folder, frames).transpose()).collect()
 }
 
 impl Flown {
-    fn set(&self, folder: &Path) -> Result<Option<Set>, Fault> {
+    fn set(&self, folder: &Path, count: Frames) -> Result<Option<Set>, Fault> {
         let recorded = folder.join("euroc_text").join(self.path).join("state_groundtruth_estimate0.csv");
         let mut scenario = match Scenario::named(self.path) {
             Some(scenario) => scenario,
@@ -57,10 +71,17 @@ impl Flown {
             }
             None => Scenario::from_euroc(&recorded, None)?,
         };
-        inputs::cut(&mut scenario, self.from_s, SECONDS);
+        let span = match scenario.path {
+            sim::Flight::Recorded(_) => {
+                inputs::cut(&mut scenario, self.from_s, SECONDS);
+                0.0..SECONDS
+            }
+            _ => self.from_s..self.from_s + INVENTED_SECONDS,
+        };
         scenario.seed = self.seed;
         scenario.name = format!("{}, seed {}", self.path, self.seed);
-        let frames = (scenario.duration.secs().min(SECONDS) * scenario.rate_hz) as usize;
-        sets::simulated(scenario, frames / FRAMES, FRAMES).map(Some)
+        let frame = |t: f64| (t * scenario.rate_hz) as usize;
+        let frames = frame(span.start)..frame(span.end.min(scenario.duration.secs()));
+        sets::simulated(scenario, frames, count.even, count.near).map(Some)
     }
 }

@@ -74,6 +74,24 @@ impl Runner {
         Ok(start.elapsed().as_secs_f64() * 1e3)
     }
 
+    /// Names of the parts of its variance, none of a method that states none.
+    pub fn parts(&self) -> &'static [&'static str] {
+        match &self.how {
+            How::Door(method) => method.parts(),
+            #[cfg(feature = "ximgproc")]
+            How::SgbmWls(_) => &[],
+        }
+    }
+
+    /// The deviations of what was run last by one part of the variance alone.
+    pub fn restate(&mut self, left: &Image, only: usize, out: &mut Disparity) -> Result<(), Fault> {
+        match &mut self.how {
+            How::Door(method) => method.restate(self.gpu.as_mut(), left, only, out),
+            #[cfg(feature = "ximgproc")]
+            How::SgbmWls(_) => Ok(()),
+        }
+    }
+
     /// Whether it says how far its disparities may be off.
     pub fn has_deviation(&self) -> bool {
         matches!(self.how, How::Door(_))

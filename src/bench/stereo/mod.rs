@@ -5,6 +5,7 @@
 //! Leaves `stereo.json` (a list, a row a set and method), `stereo.html`, `pictures/`, and of maps `stereo-map.json`.
 
 pub mod effect;
+mod fit;
 mod flights;
 mod methods;
 mod page;
@@ -31,6 +32,8 @@ use stipple_drivers::Fault;
 
 /// Depths that simulated flights are judged by, m.
 const RANGES_M: [f64; 6] = [0.5, 1.0, 2.0, 4.0, 8.0, 20.0];
+/// Of each flight: as many as a software rasteriser matches in minutes.
+const FRAMES: flights::Frames = flights::Frames { even: 3, near: 1 };
 /// Pairs for time alone: disparities at 752x480, how often, and when fewer will do, ms.
 const TIMED: [u32; 2] = [64, 128];
 const REPEATS: usize = 5;
@@ -45,8 +48,8 @@ pub struct Options {
     pub board: Option<Board>,
     /// Two hard cases.
     pub quick: bool,
-    /// The flights that deviations were fitted to and nothing else, in place of those that are reported.
-    pub fitted: bool,
+    /// Fit deviations anew, and nothing else.
+    pub fit: bool,
     /// Of mapping, with each method.
     pub seconds: Option<f64>,
 }
@@ -84,10 +87,14 @@ pub type MapRun<'a> = &'a dyn Fn(&Job, &OutputDir) -> Result<Report, Fault>;
 /// `stipple bench stereo`; `map` is there when maps are to be made.
 pub fn stereo(options: &Options, out: &Path, map: Option<MapRun>) -> Result<(), Fault> {
     let out = OutputDir::create(out)?;
-    let sets = match (options.quick, options.fitted) {
-        (true, _) => scenes::hard().into_iter().filter(|s| QUICK.contains(&s.name.as_str())).collect(),
-        (false, true) => flights::sets(&inputs::folder(options.recordings.as_deref())?, true)?,
-        (false, false) => all_sets(options.recordings.as_deref())?,
+    if options.fit {
+        let folder = inputs::folder(options.recordings.as_deref())?;
+        let sets = [flights::sets(&folder, true, fit::FRAMES)?, flights::sets(&folder, false, fit::FRAMES)?];
+        return fit::fit(&sets, &Base::of(options.board.as_ref()), &out);
+    }
+    let sets = match options.quick {
+        true => scenes::hard().into_iter().filter(|s| QUICK.contains(&s.name.as_str())).collect(),
+        false => all_sets(options.recordings.as_deref())?,
     };
     let keep = |bench: &Bench| {
         out.write("stereo.json", |w| {
@@ -115,7 +122,7 @@ fn all_sets(recordings: Option<&Path>) -> Result<Vec<Set>, Fault> {
     if sets.is_empty() {
         eprintln!("no Middlebury pairs in {}", folder.display());
     }
-    sets.extend(flights::sets(&folder, false)?);
+    sets.extend(flights::sets(&folder, false, FRAMES)?);
     sets.extend(scenes::hard());
     Ok(sets)
 }

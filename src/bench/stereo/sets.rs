@@ -4,6 +4,7 @@
 //! a run. Truth comes from two more cameras of the same rig, which are the rectified ones.
 
 use crate::stereo::rectify::Rectification;
+use std::ops::Range;
 use std::path::Path;
 use stipple_drivers::sim::{Scenario, Sim};
 use stipple_drivers::{Camera, Exit, Fault, Frames, Image, Lens, Pose, RigCamera};
@@ -124,8 +125,24 @@ fn pgm(path: &Path) -> Result<Image, Fault> {
     Ok(Image { width, height, pixels })
 }
 
-/// Frames of a flight in steps of `every`, `count` of them, through a run's rectification.
-pub fn simulated(mut scenario: Scenario, every: usize, count: usize) -> Result<Set, Fault> {
+/// Range that is called near, m, and how many frames of a flight are looked at for it.
+const NEAR_M: Range<f32> = 0.5..1.0;
+const LOOKED_AT: usize = 48;
+
+/// The `count` of these frames in which most is near, if anything is.
+fn nearest(sim: &mut Sim, frames: Range<usize>, count: usize, depth: &mut [f32]) -> Vec<usize> {
+    let mut found: Vec<(usize, usize)> = vec![];
+    for i in frames.clone().step_by((frames.len() / LOOKED_AT).max(1)) {
+        sim.depth(i, 2, depth);
+        found.push((depth.iter().filter(|z| NEAR_M.contains(z)).count(), i));
+    }
+    found.sort_unstable_by(|a, b| b.cmp(a));
+    found.into_iter().filter(|(near, _)| *near > 0).take(count).map(|(_, i)| i).collect()
+}
+
+/// Frames of a flight through a run's rectification: of `frames` the middles of `even` equal parts, and the `near` that see
+/// most of what is near.
+pub fn simulated(mut scenario: Scenario, frames: Range<usize>, even: usize, near: usize) -> Result<Set, Fault> {
     scenario.image_divisor = 1;
     let rectification = Rectification::new(&scenario.calibration)?;
     let rect = rectification.camera;
@@ -139,18 +156,20 @@ pub fn simulated(mut scenario: Scenario, every: usize, count: usize) -> Result<S
     }
     let focal_baseline = p.fx * rect.baseline_m;
     let mut sim = Sim::new(&scenario)?;
-    let mut frames = Frames::for_rig(sim.calibration());
+    let mut images = Frames::for_rig(sim.calibration());
     let (mut left_z, mut right_z) = (vec![0.0; p.width * p.height], vec![0.0; p.width * p.height]);
     let disparity = |z: &f32| if *z > 0.0 { (focal_baseline / f64::from(*z)) as f32 } else { -1.0 };
     let mut pairs = vec![];
-    let frames_flown = sim.frame_count();
-    for i in (0..count).map(|k| k * every).take_while(|i| *i < frames_flown) {
-        sim.render(i, &mut frames);
+    let flown = frames.start..frames.end.min(sim.frame_count());
+    let mut chosen: Vec<usize> = (0..even).map(|k| flown.start + flown.len() * (2 * k + 1) / (2 * even)).collect();
+    chosen.extend(nearest(&mut sim, flown, near, &mut left_z));
+    for i in chosen {
+        sim.render(i, &mut images);
         sim.depth(i, 2, &mut left_z);
         sim.depth(i, 3, &mut right_z);
         let rectified = [0, 1].map(|eye: usize| {
             let mut image = Image::new(p.width, p.height);
-            maps[eye].apply(&frames.images[eye], &mut image);
+            maps[eye].apply(&images.images[eye], &mut image);
             image
         });
         let [left, right] = rectified;
