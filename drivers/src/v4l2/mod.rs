@@ -167,6 +167,8 @@ pub struct Rig {
     /// One a device, `None` while it is closed. `lost` says why, until it has given an image again.
     streams: Vec<Option<Stream>>,
     lost: Vec<Option<Lost>>,
+    /// That none is left was said.
+    told: bool,
     last: Nanos,
     scratch: Vec<u8>,
     counters: CameraCounters,
@@ -186,7 +188,8 @@ impl Rig {
         let (counters, warnings) = (CameraCounters::default(), Vec::with_capacity(WARNINGS_MAX));
         let last = Nanos::MIN;
         let lost = settings.devices.iter().map(|_| None).collect();
-        let mut rig = Rig { kernel, settings, cameras, streams, lost, last, scratch, counters, warnings };
+        let told = false;
+        let mut rig = Rig { kernel, settings, cameras, streams, lost, told, last, scratch, counters, warnings };
         for select in &rig.settings.devices {
             let stream = rig.open_stream(select, None)?;
             rig.streams.push(Some(stream));
@@ -414,7 +417,6 @@ impl Rig {
     /// False where the time is over. That no camera is left is said at once when it comes to that, and after the time while
     /// it stays so.
     fn next_frame(&mut self, deadline: Nanos, frames: &mut Frames) -> Result<bool, SourceFault> {
-        let was_lost = self.all_lost().is_some();
         loop {
             self.come_back();
             let any = self.drain();
@@ -423,8 +425,12 @@ impl Rig {
             }
             let (remaining, lost) = (deadline - self.kernel.now(), self.all_lost());
             let over = remaining.0 <= 0 && !any;
+            self.told &= lost.is_some();
             match (lost.clone(), over) {
-                (Some(fault), over) if over || !was_lost => return Err(SourceFault::Lost(fault)),
+                (Some(fault), over) if over || !self.told => {
+                    self.told = true;
+                    return Err(SourceFault::Lost(fault));
+                }
                 (None, true) => return Ok(false),
                 _ => {}
             }
