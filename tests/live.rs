@@ -4,7 +4,7 @@
 
 mod program;
 
-use program::{flight, stipple, text, BOARD};
+use program::{flight, signal, stipple, text, BOARD};
 use serde_json::Value;
 use std::fs;
 use std::path::Path;
@@ -56,8 +56,7 @@ fn a_run_asked_to_stop_ends_with_its_files_written() {
     let begun = Instant::now();
     let child = run(&data, &out, BOARD).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
     std::thread::sleep(Duration::from_secs(3));
-    let told = Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap();
-    assert!(told.success());
+    signal(&child, "INT");
     let o = child.wait_with_output().unwrap();
     assert!(o.status.success() && begun.elapsed() < Duration::from_secs(7), "{}", text(&o));
     let frames = report(&out)["frames"].as_u64().unwrap();

@@ -17,7 +17,7 @@ mod program;
 mod unit;
 
 use plugged::Uvc;
-use program::text;
+use program::{signal, text};
 use serde_json::Value;
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -288,7 +288,7 @@ fn fly(devices: &mut Devices, dir: &Path, more: &[&str], during: impl FnOnce(&mu
     devices.play();
     during(devices);
     wait_until(devices.end() + AFTER);
-    assert!(Command::new("kill").args(["-TERM", &run.id().to_string()]).status().unwrap().success());
+    signal(&run, "TERM");
     assert!(run.wait().unwrap().success());
 }
 

@@ -1,7 +1,7 @@
 //! The program as a user starts it, for the tests of what it does with sensors.
 
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output};
+use std::process::{Child, Command, Output};
 
 pub const BOARD: &str = "board-configs/lavapipe.toml";
 
@@ -13,6 +13,13 @@ pub fn stipple() -> Command {
 
 pub fn text(o: &Output) -> String {
     String::from_utf8_lossy(&o.stderr).into_owned() + &String::from_utf8_lossy(&o.stdout)
+}
+
+/// Asks it to stop: with `kill` of the shell, since Debian's own is in a package that not every machine has.
+#[allow(dead_code)] // not every binary of tests does
+pub fn signal(child: &Child, name: &str) {
+    let told = Command::new("sh").args(["-c", &format!("kill -{name} {}", child.id())]).status().unwrap();
+    assert!(told.success());
 }
 
 pub fn flight(dir: &Path, seconds: &str) -> PathBuf {
