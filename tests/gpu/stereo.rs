@@ -136,7 +136,7 @@ fn filter_agrees_with_its_twin() {
             twin::smooth_lines(&grey(&left), &mut data, columns, lambda, f64::from(Wls::SIGMA));
         }
     }
-    let own = stipple::stereo::wls::Variance::FILTERED;
+    let own = stipple::stereo::wls::Variance::FITTED;
     let variance = Variance {
         weight_min: f64::from(Wls::WEIGHT_MIN),
         fill: f64::from(Wls::FILL),
