@@ -5,6 +5,7 @@
 use glam::{DQuat, DVec2, DVec3};
 use std::collections::BTreeMap;
 use std::path::PathBuf;
+use std::sync::Arc;
 use stipple::config::FrontendConfig;
 use stipple::frontend::{Frontend, Prediction, Stats, Tracks};
 use stipple::limits::TRACKS;
@@ -67,12 +68,12 @@ fn pairs(t: &Tracks) -> Vec<([f32; 2], [f32; 2])> {
 fn points_move_as_the_wall_does_in_both_cameras() {
     let calibration = rig(320, 240);
     let mut frontend = Frontend::new(&calibration, &FrontendConfig::default()).unwrap();
-    let mut frames = Frames::for_rig(&calibration);
+    let mut frames = Arc::new(Frames::for_rig(&calibration));
     let distance = 2.0;
     let mut first = BTreeMap::new();
     for k in 0..12 {
         let moved = [0.006 * k as f64, -0.004 * k as f64];
-        see(&calibration, moved, distance, 0.0, &mut frames);
+        see(&calibration, moved, distance, 0.0, Arc::make_mut(&mut frames));
         let tracks = frontend.track(&frames, &Prediction::default());
         for (a, b) in pairs(tracks) {
             assert!(
@@ -95,11 +96,11 @@ fn points_move_as_the_wall_does_in_both_cameras() {
 fn what_is_covered_is_dropped() {
     let calibration = rig(480, 360);
     let mut frontend = Frontend::new(&calibration, &FrontendConfig::default()).unwrap();
-    let mut frames = Frames::for_rig(&calibration);
-    see(&calibration, [0.0; 2], 2.0, 0.0, &mut frames);
+    let mut frames = Arc::new(Frames::for_rig(&calibration));
+    see(&calibration, [0.0; 2], 2.0, 0.0, Arc::make_mut(&mut frames));
     let covered = |px: [f32; 2]| (60.0..260.0).contains(&px[0]) && (60.0..180.0).contains(&px[1]);
     let before = frontend.track(&frames, &Prediction::default()).clone();
-    for image in &mut frames.images {
+    for image in &mut Arc::make_mut(&mut frames).images {
         for v in 50..190 {
             for u in 50..270 {
                 image.pixels[v * 480 + u] = wall(900.0 - u as f64, 700.0 + v as f64) as u8;
@@ -117,8 +118,8 @@ fn what_is_covered_is_dropped() {
 #[test]
 fn a_slipped_second_image_matches_nothing() {
     let calibration = rig(320, 240);
-    let mut frames = Frames::for_rig(&calibration);
-    see(&calibration, [0.0; 2], 2.0, 5.0, &mut frames);
+    let mut frames = Arc::new(Frames::for_rig(&calibration));
+    see(&calibration, [0.0; 2], 2.0, 5.0, Arc::make_mut(&mut frames));
     let mut frontend = Frontend::new(&calibration, &FrontendConfig::default()).unwrap();
     let tracks = frontend.track(&frames, &Prediction::default());
     assert!(tracks.cameras[0].len() >= 12 && tracks.cameras[1].is_empty(), "{}", tracks.cameras[1].len());
@@ -127,11 +128,11 @@ fn a_slipped_second_image_matches_nothing() {
 #[test]
 fn a_slip_between_frames_is_caught_by_the_epipolar_gate() {
     let calibration = rig(320, 240);
-    let mut frames = Frames::for_rig(&calibration);
+    let mut frames = Arc::new(Frames::for_rig(&calibration));
     let mut frontend = Frontend::new(&calibration, &FrontendConfig::default()).unwrap();
-    see(&calibration, [0.0; 2], 2.0, 0.0, &mut frames);
+    see(&calibration, [0.0; 2], 2.0, 0.0, Arc::make_mut(&mut frames));
     let matched = pairs(frontend.track(&frames, &Prediction::default())).len();
-    see(&calibration, [0.0; 2], 2.0, 4.0, &mut frames);
+    see(&calibration, [0.0; 2], 2.0, 4.0, Arc::make_mut(&mut frames));
     let left = pairs(frontend.track(&frames, &Prediction::default())).len();
     assert!(matched >= 15 && left == 0, "{matched} -> {left}");
     assert!(frontend.stats().epipolar_rejected as usize >= matched / 2, "{:?}", frontend.stats());
@@ -141,8 +142,8 @@ fn a_slip_between_frames_is_caught_by_the_epipolar_gate() {
 fn a_near_wall_is_matched_without_a_guess() {
     // 55 px of disparity where the first guess says 7.5
     let calibration = rig(480, 240);
-    let mut frames = Frames::for_rig(&calibration);
-    see(&calibration, [0.0; 2], 0.55, 0.0, &mut frames);
+    let mut frames = Arc::new(Frames::for_rig(&calibration));
+    see(&calibration, [0.0; 2], 0.55, 0.0, Arc::make_mut(&mut frames));
     let mut frontend = Frontend::new(&calibration, &FrontendConfig::default()).unwrap();
     let tracks = frontend.track(&frames, &Prediction::default());
     let right = pairs(tracks).iter().filter(|(a, b)| (a[0] - b[0] - 54.55).abs() < 0.3).count();
@@ -152,8 +153,8 @@ fn a_near_wall_is_matched_without_a_guess() {
 #[test]
 fn more_corners_than_room_are_counted_and_never_stored() {
     let calibration = rig(640, 480);
-    let mut frames = Frames::for_rig(&calibration);
-    see(&calibration, [0.0; 2], 2.0, 0.0, &mut frames);
+    let mut frames = Arc::new(Frames::for_rig(&calibration));
+    see(&calibration, [0.0; 2], 2.0, 0.0, Arc::make_mut(&mut frames));
     let config = FrontendConfig { grid_px: 16, ..FrontendConfig::default() };
     let mut frontend = Frontend::new(&calibration, &config).unwrap();
     for _ in 0..3 {
@@ -165,13 +166,25 @@ fn more_corners_than_room_are_counted_and_never_stored() {
 }
 
 #[test]
+fn a_frame_is_shared_until_the_next_is_tracked() {
+    let calibration = rig(320, 240);
+    let mut frontend = Frontend::new(&calibration, &FrontendConfig::default()).unwrap();
+    let frames = [0, 1, 2].map(|_| Arc::new(Frames::for_rig(&calibration)));
+    for (k, frame) in frames.iter().enumerate() {
+        frontend.track(frame, &Prediction::default());
+        let held: Vec<bool> = frames.iter().map(|f| Arc::strong_count(f) > 1).collect();
+        assert_eq!(held, [0, 1, 2].map(|i| i == k), "frame {k}");
+    }
+}
+
+#[test]
 fn tracking_is_deterministic_and_allocates_nothing() {
     let calibration = rig(320, 240);
-    let sequence: Vec<Frames> = (0..6)
+    let sequence: Vec<Arc<Frames>> = (0..6)
         .map(|k| {
-            let mut frames = Frames::for_rig(&calibration);
-            see(&calibration, [0.02 * k as f64, 0.0], 2.0, if k == 3 { 4.0 } else { 0.0 }, &mut frames);
-            frames.t = Nanos(k);
+            let mut frames = Arc::new(Frames::for_rig(&calibration));
+            see(&calibration, [0.02 * k as f64, 0.0], 2.0, if k == 3 { 4.0 } else { 0.0 }, Arc::make_mut(&mut frames));
+            Arc::make_mut(&mut frames).t = Nanos(k);
             frames
         })
         .collect();
@@ -206,10 +219,10 @@ fn fly(rig: &str) -> (Calibration, Vec<(Tracks, Pose)>) {
     let (calibration, truth) = (sim.calibration().clone(), sim.truth());
     let config = FrontendConfig { grid_px: 40, ..FrontendConfig::default() };
     let mut frontend = Frontend::new(&calibration, &config).unwrap();
-    let mut frames = Frames::for_rig(&calibration);
+    let mut frames = Arc::new(Frames::for_rig(&calibration));
     let (mut flown, mut last) = (Vec::new(), None::<Pose>);
     for i in 20..32 {
-        sim.render(i, &mut frames);
+        sim.render(i, Arc::make_mut(&mut frames));
         let pose = pose_at(&truth, frames.t, Span::from_secs(0.1)).unwrap();
         let prev_from_now = last.map(|l| l.inverse() * pose);
         last = Some(pose);
@@ -280,11 +293,11 @@ fn what_two_cameras_see_is_one_point_and_what_one_sees_is_its_own() {
 #[test]
 fn a_camera_whose_partner_is_covered_finds_its_own_points() {
     let calibration = rig(320, 240);
-    let mut frames = Frames::for_rig(&calibration);
+    let mut frames = Arc::new(Frames::for_rig(&calibration));
     let mut frontend = Frontend::new(&calibration, &FrontendConfig::default()).unwrap();
     for k in 0..3 {
-        see(&calibration, [0.004 * k as f64, 0.0], 2.0, 0.0, &mut frames);
-        frames.images[0].pixels.fill(12);
+        see(&calibration, [0.004 * k as f64, 0.0], 2.0, 0.0, Arc::make_mut(&mut frames));
+        Arc::make_mut(&mut frames).images[0].pixels.fill(12);
         let tracks = frontend.track(&frames, &Prediction::default());
         assert!(
             tracks.cameras[0].is_empty() && tracks.cameras[1].len() >= 15,
@@ -293,7 +306,7 @@ fn a_camera_whose_partner_is_covered_finds_its_own_points() {
         );
     }
     // uncovered: the same points are found in it, not new ones
-    see(&calibration, [0.012, 0.0], 2.0, 0.0, &mut frames);
+    see(&calibration, [0.012, 0.0], 2.0, 0.0, Arc::make_mut(&mut frames));
     let tracks = frontend.track(&frames, &Prediction::default());
     assert!(shared(tracks, 0, 1) >= 12, "{}", shared(tracks, 0, 1));
 }
@@ -304,10 +317,10 @@ fn a_camera_with_an_image_of_another_size_sees_nothing_that_frame() {
     let cut = |pixels: usize| Image { pixels: vec![0; pixels], ..Image::new(320, 240) };
     for wrong in [Image::new(160, 240), Image::new(240, 320), Image::new(640, 480), Image::default(), cut(7)] {
         let mut frontend = Frontend::new(&calibration, &FrontendConfig::default()).unwrap();
-        let mut frames = Frames::for_rig(&calibration);
-        see(&calibration, [0.0; 2], 2.0, 0.0, &mut frames);
+        let mut frames = Arc::new(Frames::for_rig(&calibration));
+        see(&calibration, [0.0; 2], 2.0, 0.0, Arc::make_mut(&mut frames));
         let before = frontend.track(&frames, &Prediction::default()).clone();
-        let good = std::mem::replace(&mut frames.images[1], wrong);
+        let good = std::mem::replace(&mut Arc::make_mut(&mut frames).images[1], wrong);
         let lost = frontend.stats().lost;
         let blind = frontend.track(&frames, &Prediction::default()).clone();
         assert_eq!((frontend.stats().images_refused, blind.cameras[1].len()), (1, 0));
@@ -315,7 +328,7 @@ fn a_camera_with_an_image_of_another_size_sees_nothing_that_frame() {
         // nothing moved, and the other camera did not notice
         let kept = blind.cameras[0].iter().filter(|a| before.cameras[0].iter().any(|b| a.id == b.id)).count();
         assert_eq!(kept, before.cameras[0].len());
-        frames.images[1] = good;
+        Arc::make_mut(&mut frames).images[1] = good;
         let after = frontend.track(&frames, &Prediction::default());
         assert!(10 * shared(after, 0, 1) >= 9 * shared(&before, 0, 1), "{}", shared(after, 0, 1));
     }
@@ -325,12 +338,12 @@ fn a_camera_with_an_image_of_another_size_sees_nothing_that_frame() {
 fn missing_images_blind_their_cameras_and_spare_ones_are_ignored() {
     let calibration = rig(320, 240);
     let mut frontend = Frontend::new(&calibration, &FrontendConfig::default()).unwrap();
-    let mut frames = Frames::for_rig(&calibration);
-    see(&calibration, [0.0; 2], 2.0, 0.0, &mut frames);
+    let mut frames = Arc::new(Frames::for_rig(&calibration));
+    see(&calibration, [0.0; 2], 2.0, 0.0, Arc::make_mut(&mut frames));
     let images = frames.images.clone();
     let mut refused = 0;
     for (count, new) in [(0, 2), (2, 0), (1, 1), (2, 0), (0, 2), (3, 1), (0, 2), (2, 0)] {
-        frames.images = images.iter().cycle().take(count).cloned().collect();
+        Arc::make_mut(&mut frames).images = images.iter().cycle().take(count).cloned().collect();
         refused += new;
         let tracks = frontend.track(&frames, &Prediction::default());
         for camera in 0..2 {
@@ -373,11 +386,11 @@ struct Run {
 
 fn replay(recording: &Recording, config: &FrontendConfig) -> Run {
     let mut reader = recording.reader();
-    let mut frames = Frames::for_rig(&recording.calibration);
+    let mut frames = Arc::new(Frames::for_rig(&recording.calibration));
     let mut frontend = Frontend::new(&recording.calibration, config).unwrap();
     let (mut tracks, mut truth, mut last) = (Vec::new(), Vec::new(), None);
     for i in 0..recording.frames.len() {
-        reader.read(i, &mut frames).unwrap();
+        reader.read(i, Arc::make_mut(&mut frames)).unwrap();
         let prev_from_now = last.map(|t| Pose::new(turn(recording, t, frames.t), DVec3::ZERO));
         last = Some(frames.t);
         tracks.push(frontend.track(&frames, &Prediction { prev_from_now }).clone());

@@ -4,7 +4,7 @@
 #![allow(clippy::unwrap_used)]
 
 use glam::{DMat3, DQuat, DVec3};
-use std::sync::OnceLock;
+use std::sync::{Arc, OnceLock};
 use stipple::bench::world::{Noise, Path, World, FRAME_SECS, RATE_HZ};
 use stipple::config::{FrontendConfig, VioConfig};
 use stipple::frontend::{Frontend, Prediction, Tracks};
@@ -16,7 +16,7 @@ use stipple_drivers::{Calibration, Frames, ImuSample, Pose, Span, TimedPose};
 
 struct Flight {
     calibration: Calibration,
-    frames: Vec<Frames>,
+    frames: Vec<Arc<Frames>>,
     imu: Vec<ImuSample>,
     truth: Vec<TimedPose>,
 }
@@ -40,7 +40,7 @@ fn render(scenario: &Scenario) -> Flight {
     let frame = |i: usize| {
         let mut frames = Frames::for_rig(sim.calibration());
         sim.render(i, &mut frames);
-        frames
+        Arc::new(frames)
     };
     let frames = (0..count).map(frame).collect();
     Flight { calibration: sim.calibration().clone(), frames, imu: sim.imu().to_vec(), truth: sim.truth() }

@@ -6,6 +6,7 @@
 use glam::DVec3;
 use proptest::prelude::*;
 use proptest::test_runner::{Config, TestRunner};
+use std::sync::Arc;
 use stipple::bench::world::{Noise, Path, World, FRAME_SECS, RATE_HZ};
 use stipple::config::{FrontendConfig, VioConfig};
 use stipple::frontend::{Frontend, Prediction, Track, Tracks};
@@ -193,10 +194,11 @@ fn tracker(frames: usize) {
     let rig = euroc_rig();
     let mut frontend = Frontend::new(&rig, &FrontendConfig::default()).unwrap();
     let whole = Frames::for_rig(&rig);
-    let mut images = whole.clone();
+    let mut shown = Arc::new(whole.clone());
     let mut noise = Noise(5);
     let mut refused = 0;
     for i in 0..frames {
+        let images = Arc::make_mut(&mut shown);
         images.images.clone_from(&whole.images);
         images.t = Nanos(i as i64 * 50_000_000);
         let mode = noise.bits() % 4;
@@ -214,7 +216,7 @@ fn tracker(frames: usize) {
         refused += spoil_images(&mut images.images, &mut noise);
         let wild = [0.01, 1.0, 1e6, f64::NAN][noise.bits() as usize % 4];
         let prev_from_now = Some(Pose { q: glam::DQuat::from_scaled_axis(noise.vector()), p: noise.vector() * wild });
-        let tracks = frontend.track(&images, &Prediction { prev_from_now });
+        let tracks = frontend.track(&shown, &Prediction { prev_from_now });
         for (camera, list) in rig.cameras.iter().zip(&tracks.cameras) {
             let inside = |t: &Track| {
                 let [x, y] = t.px.map(f64::from);

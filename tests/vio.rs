@@ -5,6 +5,7 @@
 
 use glam::DVec3;
 use std::path::PathBuf;
+use std::sync::Arc;
 use stipple::bench::world::{Path, World, FRAME_SECS, RATE_HZ};
 use stipple::config::{FrontendConfig, VioConfig};
 use stipple::frontend::{Frontend, Prediction, Tracks};
@@ -142,13 +143,13 @@ fn follow(
 ) -> (Run, [f64; 2]) {
     let mut frontend = Frontend::new(rig, &FrontendConfig::default()).unwrap();
     let mut vio = Vio::new(rig, &VioConfig::default());
-    let mut frames = Frames::for_rig(rig);
+    let mut frames = Arc::new(Frames::for_rig(rig));
     let mut estimated = Vec::new();
     let mut secs = [0.0; 2];
     let mut imu = imu.iter().peekable();
     let period = Span::from_secs(1.0 / rig.imu.rate_hz);
     for i in 0..count {
-        read(i, &mut frames);
+        read(i, Arc::make_mut(&mut frames));
         while let Some(s) = imu.next_if(|s| s.t <= frames.t + period) {
             vio.on_imu(*s);
         }

@@ -2,6 +2,7 @@
 //! recorded flights, each with a simulated and with its real inertial unit.
 
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use stipple_drivers::replay::{OpenOptions, Recording};
 use stipple_drivers::sim::{self, rig_named, Scenario, Sim};
 use stipple_drivers::{Calibration, Exit, Fault, Frames, ImuSample, Span, TimedPose};
@@ -33,7 +34,7 @@ enum Source {
 pub struct Flight {
     pub calibration: Calibration,
     pub imu: Vec<ImuSample>,
-    pub frames: Vec<Frames>,
+    pub frames: Vec<Arc<Frames>>,
     pub truth: Vec<TimedPose>,
 }
 
@@ -128,7 +129,7 @@ fn rendered(mut scenario: Scenario, seconds: f64) -> Result<Flight, Fault> {
     let frames = (0..sim.frame_count()).map(|i| {
         let mut frames = Frames::for_rig(sim.calibration());
         sim.render(i, &mut frames);
-        frames
+        Arc::new(frames)
     });
     let frames = frames.collect();
     Ok(Flight { calibration: sim.calibration().clone(), imu: sim.imu().to_vec(), frames, truth: sim.truth() })
@@ -144,7 +145,7 @@ fn read(path: &Path, seconds: f64) -> Result<Flight, Fault> {
         }
         let mut images = Frames::for_rig(&recording.calibration);
         match reader.read(i, &mut images) {
-            Ok(()) => frames.push(images),
+            Ok(()) => frames.push(Arc::new(images)),
             Err(fault) => eprintln!("left out: {fault}"),
         }
     }

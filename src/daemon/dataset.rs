@@ -6,6 +6,7 @@ use crate::config::{Board, FrontendConfig, ReplayConfig, StereoConfig};
 use crate::stereo::alignment::Alignment;
 use crate::stereo::rectify::Rectification;
 use std::path::Path;
+use std::sync::Arc;
 use stipple_drivers::replay::{OpenOptions, Reader, Recording};
 use stipple_drivers::{Fault, Frames, Image, Nanos, Span};
 
@@ -48,7 +49,7 @@ pub fn check_dataset(dataset: &Path, board: Option<&Board>) -> Result<(), Fault>
     }
     println!("{:<6} {} stereo frames, {read} looked at", "", recording.frames.len());
     let frontend = board.map_or_else(FrontendConfig::default, |b| b.frontend.clone());
-    let turned = turned(&recording, &mut reader, &mut frames, &frontend)?;
+    let turned = turned(&recording, &mut reader, &frontend)?;
     let corners = alignment.rows.len();
     match alignment.summary() {
         None => println!("{:<6} vertical disparity: only {corners} corners match, too few to say", "warn"),
@@ -69,12 +70,7 @@ pub fn check_dataset(dataset: &Path, board: Option<&Board>) -> Result<(), Fault>
 const FOLLOWED: usize = 300;
 
 /// The rotation of camera 0 against the gyro's.
-fn turned(
-    recording: &Recording,
-    reader: &mut Reader,
-    frames: &mut Frames,
-    config: &FrontendConfig,
-) -> Result<Option<Comparison>, Fault> {
+fn turned(recording: &Recording, reader: &mut Reader, config: &FrontendConfig) -> Result<Option<Comparison>, Fault> {
     let rate = |t: Nanos| {
         let at = recording.imu.partition_point(|s| s.t < t);
         recording.imu.get(at).map_or(0.0, |s| s.gyro_body.length())
@@ -89,9 +85,10 @@ fn turned(
         sum += rates.get(from + n).copied().unwrap_or(0.0) - rates[from];
     }
     let mut turning = Turning::new(&recording.calibration, config)?;
+    let mut frames = Arc::new(Frames::for_rig(&recording.calibration));
     for i in first..first + n {
-        if reader.read(i, frames).is_ok() {
-            turning.add(frames);
+        if reader.read(i, Arc::make_mut(&mut frames)).is_ok() {
+            turning.add(&frames);
         }
     }
     Ok(compare(&turning.rates, &recording.imu, recording.calibration.cameras[0].body_from_cam.q))

@@ -18,9 +18,11 @@ use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::time::{Duration, Instant};
 use stipple_drivers::{ImuSample, Span};
 
-/// Frames in memory at once: 24 MiB of two 752x480 cameras. What the threads of tracking lose at its ends is
+/// Frames decoded at once: 24 MiB of two 752x480 cameras. What the threads of tracking lose at its ends is
 /// one stage of one frame in so many.
 const BATCH: usize = 32;
+/// And the one before the batch, from which points are followed.
+const SLOTS: usize = BATCH + 1;
 
 pub fn lockstep(
     mut input: Input,
@@ -36,8 +38,9 @@ pub fn lockstep(
     let mut keyframes = Keyframes::new(options.holdout);
     let mut warnings = std::mem::take(&mut input.warnings);
     let total = input.frames_within(options.duration_s);
-    let mut slots: Vec<Box<Slot>> = (0..BATCH.min(total)).map(|_| Slot::for_rig(&input.calibration, colours)).collect();
-    let (waiting, done) = (ArrayQueue::new(BATCH), ArrayQueue::new(BATCH));
+    let mut slots: Vec<Box<Slot>> =
+        (0..SLOTS.min(total + 1)).map(|_| Slot::for_rig(&input.calibration, colours)).collect();
+    let (waiting, done) = (ArrayQueue::new(SLOTS), ArrayQueue::new(SLOTS));
     let (over, ended, bell, pipeline) =
         (AtomicBool::new(false), AtomicBool::new(false), Bell::default(), Pipeline::new());
     let start = Instant::now();
@@ -147,8 +150,8 @@ struct Reading {
     samples: usize,
 }
 
-/// Decodes frames until every slot is full or the input ends, hands them over together, and answers
-/// how many. A frame that cannot be read leaves its samples to the next.
+/// Decodes frames into every slot but the last, or until the input ends, hands them over together, and answers
+/// how many. Slots come back in order: the last is the one the front end still looks at. A frame that cannot be read leaves its samples to the next.
 fn read_batch(
     input: &mut Input,
     total: usize,
@@ -158,7 +161,8 @@ fn read_batch(
     counters: &Counters,
 ) -> usize {
     let mut sent = 0;
-    for slot in slots.iter_mut() {
+    let writable = slots.len() - 1;
+    for slot in &mut slots[..writable] {
         slot.imu.clear();
         let mut read = false;
         while reading.next < total && !read {
@@ -169,7 +173,8 @@ fn read_batch(
             let upto = samples.iter().position(|s| s.t >= input.stamps[i]).map_or(samples.len(), |at| at + 1);
             samples[..upto].iter().for_each(|s| slot.push_imu(*s, counters));
             reading.samples += upto;
-            read = input.source.read(i, &mut slot.frames).is_ok();
+            let frames = slot.writable().expect("it is not the last that came back");
+            read = input.source.read(i, frames).is_ok();
             counters.frames_unreadable.add(u64::from(!read));
         }
         sent += usize::from(read);

@@ -160,10 +160,10 @@ pub fn drain(queue: &KeyframeQueue, mapping: &mut Mapping) {
     }
 }
 
-/// One being decoded, one waiting, one in hand while they change places, and one in tracking for each
-/// of its threads.
+/// One being decoded, one waiting, one in hand while they change places, one in tracking for each of its
+/// threads, and the last one, from which points are followed.
 pub fn frame_slots(threads: u32) -> usize {
-    3 + threads as usize
+    4 + threads as usize
 }
 
 /// What the mapper sleeps when it has nothing to do.

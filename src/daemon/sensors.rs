@@ -153,6 +153,18 @@ impl Inbox {
         }
         Some(slot)
     }
+
+    /// A spare slot to read a frame into: not the one the front end still looks at.
+    fn writable(&self) -> Option<Box<Slot>> {
+        for _ in 0..self.spare.len() {
+            let mut slot = self.spare.pop()?;
+            if slot.writable().is_some() {
+                return Some(slot);
+            }
+            let _ = self.spare.push(slot);
+        }
+        None
+    }
 }
 
 /// What the thread `camera` took to read frames: waiting in the kernel, copying, decoding, and looking whether they are
@@ -256,7 +268,7 @@ impl Presence<'_> {
 
 /// Thread `camera`. Ends with its source, or when asked.
 pub fn camera(inbox: &Inbox, source: &mut dyn FrameSource, tracking: &Bell, c: &Counters, gauges: &Gauges) {
-    let Some(mut slot) = inbox.spare.pop() else { return };
+    let Some(mut slot) = inbox.writable() else { return };
     let mut watch = FrameWatch::new(&slot.frames);
     let _metered = Metered(inbox, thread_cpu(), slot.frames.images.iter().map(|i| i.pixels.len()).sum());
     let mut presence = Presence {
@@ -273,7 +285,8 @@ pub fn camera(inbox: &Inbox, source: &mut dyn FrameSource, tracking: &Bell, c: &
     let mut eye = Presence { name: "one camera", lost: &c.eye_lost, away_ms: &c.eye_away_ms, ..presence };
     let mut span = None;
     while !inbox.stop.load(Relaxed) {
-        let answer = source.next(PATIENCE, &mut slot.frames);
+        let frames = slot.writable().expect("it was taken as such, and nobody else has it");
+        let answer = source.next(PATIENCE, frames);
         if presence.hears(&answer) && answer.is_err() {
             watch.stamps.forget();
         }
@@ -301,12 +314,12 @@ pub fn camera(inbox: &Inbox, source: &mut dyn FrameSource, tracking: &Bell, c: &
         let replaced = inbox.newest.force_push(slot);
         c.frames_overwritten.add(u64::from(replaced.is_some()));
         tracking.ring();
-        slot = match replaced.or_else(|| inbox.spare.pop()) {
+        slot = match replaced.or_else(|| inbox.writable()) {
             Some(slot) => slot,
             // Slots are as many as frames can be under way; one is about to come back.
             None => loop {
                 std::thread::sleep(POLL);
-                if let Some(slot) = inbox.spare.pop() {
+                if let Some(slot) = inbox.writable() {
                     break slot;
                 }
             },
@@ -367,7 +380,7 @@ pub fn inertial(inbox: &Inbox, source: &mut dyn ImuSource, tracking: &Bell, over
 mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
-    use std::sync::Mutex;
+    use std::sync::{Arc, Mutex};
     use stipple_drivers::sim::euroc_rig;
     use stipple_drivers::types::{Image, Nanos};
 
@@ -409,6 +422,19 @@ mod tests {
         assert_eq!((capture.frames, capture.frame_bytes), (3, 2 * 752 * 480));
         assert_eq!(capture.copies(&source.counters()), Some(1.0));
         assert!(capture.ms_a_frame().is_some_and(|(all, kernel)| all >= kernel && kernel >= 0.0));
+    }
+
+    #[test]
+    fn a_slot_the_front_end_looks_at_is_not_written_into() {
+        let inbox = Inbox::new(3, &euroc_rig(), 0);
+        let looked_at = inbox.spare.pop().unwrap();
+        let front_end = looked_at.frames.clone();
+        let _ = inbox.spare.push(looked_at);
+        let taken = [inbox.writable(), inbox.writable()].map(Option::unwrap);
+        assert!(taken.iter().all(|slot| !Arc::ptr_eq(&slot.frames, &front_end)));
+        assert!(inbox.writable().is_none(), "it has to wait");
+        drop(front_end);
+        assert!(inbox.writable().is_some());
     }
 
     #[test]

@@ -18,6 +18,7 @@ use crate::vio::rig::RigEstimate;
 use crate::vio::samples::ImuRing;
 use crate::vio::window::FRAMES;
 use crate::vio::{Odometry, Tally, Vio};
+use std::sync::Arc;
 use std::time::Instant;
 use stipple_drivers::types::pose_at;
 use stipple_drivers::{Calibration, Fault, Frames, ImuSample, Nanos, Pose, Span, TimedPose};
@@ -36,7 +37,8 @@ pub struct Tracked {
 /// What travels through tracking and back: a frame, the samples since the one before it, and what
 /// was made of them.
 pub struct Slot {
-    pub frames: Frames,
+    /// Shared with the front end until it has tracked the frame after this.
+    pub frames: Arc<Frames>,
     /// Only samples are in it: no frame came for so long that they would not fit before the next.
     pub frameless: bool,
     /// A camera saw nothing, as far as anybody looked: nothing to train a map on.
@@ -52,7 +54,7 @@ impl Slot {
     /// The first `colours` cameras in colour.
     pub fn for_rig(calibration: &Calibration, colours: usize) -> Box<Slot> {
         Box::new(Slot {
-            frames: Frames::in_colour(calibration, colours),
+            frames: Arc::new(Frames::in_colour(calibration, colours)),
             frameless: false,
             blank: false,
             imu: List::default(),
@@ -60,6 +62,11 @@ impl Slot {
             tracked: None,
             begun: Instant::now(),
         })
+    }
+
+    /// To write the next frame into; `None` while the front end still looks at this one.
+    pub fn writable(&mut self) -> Option<&mut Frames> {
+        Arc::get_mut(&mut self.frames)
     }
 
     /// Without its images.

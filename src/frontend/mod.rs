@@ -28,9 +28,10 @@ use crate::limits::{CAMERAS_MAX, PYRAMID_LEVELS, TRACKS};
 use crate::mem::{Footprint, List};
 use detect::Detector;
 use patch::{align_stack, take_stack, Stack, Template, Warp, STEP_MIN};
-use pyramid::Pyramid;
+use pyramid::{Levels, Pyramid, Seen};
 use rig::Rig;
-use stipple_drivers::{Calibration, Exit, Fault, Frames, Image, Nanos, Pose};
+use std::sync::Arc;
+use stipple_drivers::{Calibration, Exit, Fault, Frames, Nanos, Pose};
 
 /// A point tracked in one camera. The same `id` in two cameras is the same point in space.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -151,9 +152,9 @@ pub struct Frontend {
     iterations: usize,
     recovered_max_px: f32,
     spacing_px: f32,
-    now: Vec<Pyramid>,
-    before: Vec<Pyramid>,
-    /// Cameras whose image was taken; the pyramids of the others hold an old one and are not looked at.
+    now: Seen,
+    before: Seen,
+    /// Cameras whose image was taken; the pyramids of the others are of an old one and are not looked at.
     seeing: [bool; CAMERAS_MAX],
     detectors: Vec<Detector>,
     /// Ascending id.
@@ -180,7 +181,6 @@ impl Frontend {
             let what = format!("the tracker takes 1 to {CAMERAS_MAX} cameras of at least {least} px a side");
             return Err(Fault::new(Exit::Config, "calibration", what, "use a calibration of this rig"));
         }
-        let pyramids = || calibration.cameras.iter().map(|c| Pyramid::new(c.camera.width, c.camera.height)).collect();
         let rig = Rig::new(calibration, config.epipolar_max);
         Ok(Frontend {
             detectors: (0..n).map(|camera| detector(calibration, &rig, camera, config)).collect(),
@@ -188,8 +188,8 @@ impl Frontend {
             iterations: config.iterations as usize,
             recovered_max_px: config.recovered_max_px as f32,
             spacing_px: SPACING * config.grid_px as f32,
-            now: pyramids(),
-            before: pyramids(),
+            now: Seen::nothing_yet(calibration),
+            before: Seen::nothing_yet(calibration),
             seeing: [false; CAMERAS_MAX],
             points: Vec::with_capacity(n * TRACKS),
             patches: (0..n).map(|_| vec![Patch::default(); TRACKS]).collect(),
@@ -219,17 +219,19 @@ impl Frontend {
         &self.stats
     }
 
-    /// Follows all points into the new images, replaces what was lost.
-    pub fn track(&mut self, frames: &Frames, prediction: &Prediction) -> &Tracks {
+    /// Follows all points into the new images, replaces what was lost. The frame is shared until the next is tracked:
+    /// until then nobody writes into it.
+    pub fn track(&mut self, frames: &Arc<Frames>, prediction: &Prediction) -> &Tracks {
         std::mem::swap(&mut self.now, &mut self.before);
+        self.now.frames = frames.clone();
         self.stats.frames += 1;
-        self.look(&frames.images);
+        self.look();
         let median = self.median_inverse_depth();
         self.follow(prediction, median);
         let median = self.median_inverse_depth();
         self.find_missing(0, median);
         self.drop_unseen();
-        for camera in 0..self.now.len() {
+        for camera in 0..self.cameras() {
             let first_new = self.points.len();
             if self.seeing[camera] {
                 self.detect(camera);
@@ -237,19 +239,22 @@ impl Frontend {
             self.find_missing(first_new, median);
         }
         self.publish(frames.t);
+        // Who wrote the frame before may have it back.
+        self.before.frames = frames.clone();
         &self.tracks
     }
 
     /// Takes the images that are of their camera's size; the cameras of the others lose all their views.
-    fn look(&mut self, images: &[Image]) {
-        let cameras = self.now.len();
-        self.stats.images_refused += images.len().saturating_sub(cameras) as u64;
-        for camera in 0..cameras {
-            let pyramid = &mut self.now[camera];
-            let image = images.get(camera).filter(|image| pyramid.fits(image));
+    fn look(&mut self) {
+        let Seen { frames, pyramids } = &mut self.now;
+        self.stats.images_refused += frames.images.len().saturating_sub(pyramids.len()) as u64;
+        for (camera, pyramid) in pyramids.iter_mut().enumerate() {
+            let image = frames.images.get(camera).filter(|image| pyramid.fits(image));
             self.seeing[camera] = image.is_some();
-            if let Some(image) = image {
-                pyramid.build(image);
+            image.into_iter().for_each(|image| pyramid.build(image));
+        }
+        for camera in 0..self.cameras() {
+            if self.seeing[camera] {
                 continue;
             }
             self.stats.images_refused += 1;
@@ -258,6 +263,10 @@ impl Frontend {
                 self.lose(i, camera);
             }
         }
+    }
+
+    fn cameras(&self) -> usize {
+        self.patches.len()
     }
 
     fn median_inverse_depth(&mut self) -> f64 {
@@ -271,7 +280,7 @@ impl Frontend {
     }
 
     fn follow(&mut self, prediction: &Prediction, median: f64) {
-        for camera in 0..self.now.len() {
+        for camera in 0..self.cameras() {
             let motion = prediction.prev_from_now.map(|m| self.rig.motion(camera, &m));
             for i in 0..self.points.len() {
                 let point = self.points[i];
@@ -313,7 +322,7 @@ impl Frontend {
             let Some(first) = self.points[i].first() else { continue };
             let px = self.points[i].views[first].expect("it is seen there");
             if is_near(&self.points[..i], first, px, self.spacing_px) {
-                (0..self.now.len()).for_each(|camera| self.lose(i, camera));
+                (0..self.cameras()).for_each(|camera| self.lose(i, camera));
                 self.stats.crowded += 1;
             }
         }
@@ -328,21 +337,21 @@ impl Frontend {
         start: Warp,
         coarsest: usize,
     ) -> Option<[f32; 2]> {
-        let search = Search { from: &self.before[camera], to: &self.now[camera], px, start, coarsest };
+        let search = Search { from: self.before.levels(camera), to: self.now.levels(camera), px, start, coarsest };
         let patch = &mut self.patches[camera][slot];
         let mut stack = &patch.last[..];
         if coarsest >= FINE_LEVELS {
             self.source[..FINE_LEVELS].copy_from_slice(stack);
-            take_stack(&mut self.source, search.from, px, FINE_LEVELS..coarsest + 1);
+            take_stack(&mut self.source, &search.from, px, FINE_LEVELS..coarsest + 1);
             stack = &self.source;
         }
-        let (found, left) = align_stack(stack, search.to, start, coarsest, self.iterations, STEP_MIN)?;
+        let (found, left) = align_stack(stack, &search.to, start, coarsest, self.iterations, STEP_MIN)?;
         if left > UNEXPLAINED_MAX {
             return None;
         }
         let mut anchored = found;
         anchored.turn(patch.turn[0], patch.turn[1]);
-        let anchor_left = patch.anchor.align(&search.to.levels[0], &mut anchored, self.iterations, STEP_MIN);
+        let anchor_left = patch.anchor.align(search.to[0], &mut anchored, self.iterations, STEP_MIN);
         let held = anchor_left.is_some_and(|l| l < ANCHOR_LEFT_MAX * left)
             && distance(anchored.px(), found.px()) < ANCHOR_PULL_MAX_PX;
         let placed = if held { anchored.px() } else { found.px() };
@@ -364,7 +373,7 @@ impl Frontend {
         let Some(first) = self.points[i].first() else { return };
         let Some(f) = views[first].and_then(|px| self.rig.bearing(first, px)) else { return };
         let (mut sum, mut weights) = (0.0, 0.0);
-        for camera in first + 1..self.now.len() {
+        for camera in first + 1..self.cameras() {
             let Some(px) = views[camera] else { continue };
             let seen = self.rig.bearing(camera, px).and_then(|g| self.rig.triangulate(first, camera, f, g));
             match seen {
@@ -388,7 +397,7 @@ impl Frontend {
         for i in first..self.points.len() {
             let views = self.points[i].views;
             let Some(from) = self.points[i].first() else { continue };
-            for to in 0..self.now.len() {
+            for to in 0..self.cameras() {
                 if views[to].is_none() && self.seeing[to] {
                     self.find_view(i, from, to, median);
                 }
@@ -421,7 +430,7 @@ impl Frontend {
         let relative = self.rig.between(from, to);
         let q = point.inverse_depth.unwrap_or(median);
         self.source[..FINE_LEVELS].copy_from_slice(&self.patches[from][point.slots[from]].last);
-        take_stack(&mut self.source, &self.now[from], px, FINE_LEVELS..PYRAMID_LEVELS);
+        take_stack(&mut self.source, &self.now.levels(from), px, FINE_LEVELS..PYRAMID_LEVELS);
         let guess = self.rig.transfer(from, to, &relative, px, q);
         if let Some(found) = guess.and_then(|g| self.match_view(slot, from, to, px, g, PYRAMID_LEVELS - 1)) {
             return Some(found);
@@ -435,12 +444,13 @@ impl Frontend {
         if !template.usable() {
             return None;
         }
+        let image = self.now.levels(to)[SEARCH_LEVEL];
         let mut best = [(f32::MAX, Warp::default()); SEARCH_TRIES];
         for k in 0..SEARCH_STEPS {
             let q = SEARCH_INVERSE_DEPTH_MAX * k as f64 / (SEARCH_STEPS - 1) as f64;
             let Some(warp) = self.rig.transfer(from, to, &relative, px, q) else { continue };
             let small = warp.at_level(SEARCH_LEVEL);
-            let Some(left) = template.unexplained(&self.now[to].levels[SEARCH_LEVEL], &small) else { continue };
+            let Some(left) = template.unexplained(image, &small) else { continue };
             let at = best.partition_point(|b| b.0 <= left);
             if at < SEARCH_TRIES {
                 best[at..].rotate_right(1);
@@ -461,12 +471,12 @@ impl Frontend {
         start: Warp,
         coarsest: usize,
     ) -> Option<[f32; 2]> {
-        let (warp, left) = align_stack(&self.source, &self.now[to], start, coarsest, self.iterations, STEP_MIN)?;
+        let (warp, left) = align_stack(&self.source, &self.now.levels(to), start, coarsest, self.iterations, STEP_MIN)?;
         let (f, g) = (self.rig.bearing(from, px)?, self.rig.bearing(to, warp.px())?);
         if left > UNEXPLAINED_MATCH_MAX || self.rig.triangulate(from, to, f, g).is_none() {
             return None;
         }
-        let search = Search { from: &self.now[from], to: &self.now[to], px, start, coarsest };
+        let search = Search { from: self.now.levels(from), to: self.now.levels(to), px, start, coarsest };
         if !search.returns(&mut self.scratch, warp, warp.px(), self.iterations, self.recovered_max_px) {
             return None;
         }
@@ -487,11 +497,11 @@ impl Frontend {
         let others = (0..camera).filter(|c| seen[*c] >= GIVES_MIN).fold(0, |bits, c| bits | 1 << c);
         let points = self.points.iter().filter_map(|p| p.views[camera]);
         let room = self.free[camera].len().min(self.points.capacity() - self.points.len());
-        let (corners, excess) = self.detectors[camera].detect(&self.now[camera].levels[0], points, others, room);
+        let (corners, excess) = self.detectors[camera].detect(self.now.levels(camera)[0], points, others, room);
         self.stats.full += excess as u64;
         for corner in corners {
             let px = [corner.x as f32, corner.y as f32];
-            take_stack(&mut self.scratch, &self.now[camera], px, 0..FINE_LEVELS);
+            take_stack(&mut self.scratch, &self.now.levels(camera), px, 0..FINE_LEVELS);
             let sharp = self.scratch[0].usable() && self.scratch[0].sigma_px() < SIGMA_MAX_PX;
             let known = self.rig.bearing(camera, px).is_some();
             if !sharp || !known || is_near(&self.points, camera, px, self.spacing_px) {
@@ -529,8 +539,8 @@ impl Frontend {
 
 /// A patch at `px` of one image looked for around `start` in another.
 struct Search<'a> {
-    from: &'a Pyramid,
-    to: &'a Pyramid,
+    from: Levels<'a>,
+    to: Levels<'a>,
     px: [f32; 2],
     start: Warp,
     coarsest: usize,
@@ -547,18 +557,18 @@ impl Search<'_> {
         iterations: usize,
         recovered_max_px: f32,
     ) -> bool {
-        let image = &self.to.levels[0];
+        let image = self.to[0];
         let [right, bottom] = [image.width, image.height].map(|n| (n - 1) as f32 - MARGIN_PX);
         if !(placed[0] >= MARGIN_PX && placed[1] >= MARGIN_PX && placed[0] <= right && placed[1] <= bottom) {
             return false;
         }
-        take_stack(stack, self.to, placed, 0..FINE_LEVELS.max(self.coarsest + 1));
+        take_stack(stack, &self.to, placed, 0..FINE_LEVELS.max(self.coarsest + 1));
         // What the anchor moved here, it moves there.
         let (dx, dy) = (placed[0] - found.x, placed[1] - found.y);
         let origin = [self.px[0] + found.c * dx + found.s * dy, self.px[1] + found.c * dy - found.s * dx];
         let (x, y) = (found.x + origin[0] - self.start.x, found.y + origin[1] - self.start.y);
         let back = Warp { x, y, c: found.c, s: -found.s };
-        align_stack(&stack[..], self.from, back, self.coarsest, iterations, STEP_MIN_CHECK)
+        align_stack(&stack[..], &self.from, back, self.coarsest, iterations, STEP_MIN_CHECK)
             .is_some_and(|(recovered, _)| distance(recovered.px(), origin) <= recovered_max_px)
     }
 }

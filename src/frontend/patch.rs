@@ -16,7 +16,7 @@
 //! go, and where the residual vanishes is left to the values, which are not rounded.
 
 use super::pattern::{gradients, pixels_around, values, ALL, DX, DY, FRACTION, N, RUNS};
-use super::pyramid::Pyramid;
+use super::pyramid::Levels;
 use crate::limits::PYRAMID_LEVELS;
 use stipple_drivers::Image;
 
@@ -234,11 +234,11 @@ impl Template {
 /// Templates of all levels at one point.
 pub type Stack = [Template; PYRAMID_LEVELS];
 
-/// Takes some of the levels: `levels` of the stack.
-pub fn take_stack(stack: &mut Stack, pyramid: &Pyramid, px: [f32; 2], levels: std::ops::Range<usize>) {
+/// Takes some of the levels: `levels` of both.
+pub fn take_stack(stack: &mut Stack, from: &Levels, px: [f32; 2], levels: std::ops::Range<usize>) {
     for (l, t) in stack.iter_mut().enumerate().take(levels.end).skip(levels.start) {
         let k = 1.0 / (1 << l) as f32;
-        t.take(&pyramid.levels[l], px[0] * k, px[1] * k);
+        t.take(from[l], px[0] * k, px[1] * k);
     }
 }
 
@@ -246,7 +246,7 @@ pub fn take_stack(stack: &mut Stack, pyramid: &Pyramid, px: [f32; 2], levels: st
 /// leaves the guess to the next; the last must succeed.
 pub fn align_stack(
     stack: &[Template],
-    pyramid: &Pyramid,
+    to: &Levels,
     start: Warp,
     coarsest: usize,
     iterations: usize,
@@ -255,11 +255,11 @@ pub fn align_stack(
     let mut warp = start;
     for l in (1..=coarsest).rev() {
         let mut w = warp.at_level(l);
-        if stack[l].usable() && stack[l].align(&pyramid.levels[l], &mut w, iterations, STEP_MIN_COARSE).is_some() {
+        if stack[l].usable() && stack[l].align(to[l], &mut w, iterations, STEP_MIN_COARSE).is_some() {
             warp = w.at_full(l);
         }
     }
-    let left = stack[0].usable().then(|| stack[0].align(&pyramid.levels[0], &mut warp, 2 * iterations, step_min))??;
+    let left = stack[0].usable().then(|| stack[0].align(to[0], &mut warp, 2 * iterations, step_min))??;
     Some((warp, left))
 }
 
@@ -401,6 +401,7 @@ fn bilinear(q: &[u8], stride: usize, fx: f32, fy: f32) -> f32 {
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used)]
+    use super::super::pyramid::Pyramid;
     use super::*;
 
     /// Smooth in every direction at every level: wavelengths of 9 to 60 px.
@@ -412,7 +413,7 @@ mod tests {
     }
 
     /// The image in which the patch at (60, 50) appears at `place`, turned by `angle`, `gain` times as bright.
-    fn moved(place: [f64; 2], angle: f64, gain: f64) -> Pyramid {
+    fn moved(place: [f64; 2], angle: f64, gain: f64) -> (Image, Pyramid) {
         let mut image = Image::new(128, 104);
         let (s, c) = angle.sin_cos();
         for v in 0..image.height {
@@ -424,14 +425,18 @@ mod tests {
         }
         let mut pyramid = Pyramid::new(image.width, image.height);
         pyramid.build(&image);
-        pyramid
+        (image, pyramid)
+    }
+
+    fn levels((image, pyramid): &(Image, Pyramid)) -> Levels<'_> {
+        pyramid.over(image)
     }
 
     fn follow(place: [f64; 2], angle: f64, gain: f64) -> (Warp, f32) {
         let mut stack = Stack::default();
-        take_stack(&mut stack, &moved([60.0, 50.0], 0.0, 1.0), [60.0, 50.0], 0..PYRAMID_LEVELS);
+        take_stack(&mut stack, &levels(&moved([60.0, 50.0], 0.0, 1.0)), [60.0, 50.0], 0..PYRAMID_LEVELS);
         let target = moved(place, angle, gain);
-        align_stack(&stack, &target, Warp::upright([60.0, 50.0]), PYRAMID_LEVELS - 1, 5, STEP_MIN).unwrap()
+        align_stack(&stack, &levels(&target), Warp::upright([60.0, 50.0]), PYRAMID_LEVELS - 1, 5, STEP_MIN).unwrap()
     }
 
     #[test]
@@ -460,11 +465,12 @@ mod tests {
     fn a_patch_cut_by_the_border_still_aligns() {
         let (a, b) = (moved([60.0, 50.0], 0.0, 1.0), moved([60.4, 50.3], 0.0, 1.0));
         let mut stack = Stack::default();
-        take_stack(&mut stack, &a, [2.0, 30.0], 0..PYRAMID_LEVELS);
+        let b = levels(&b);
+        take_stack(&mut stack, &levels(&a), [2.0, 30.0], 0..PYRAMID_LEVELS);
         let (warp, _) = align_stack(&stack, &b, Warp::upright([2.0, 30.0]), PYRAMID_LEVELS - 1, 5, STEP_MIN).unwrap();
         assert!((warp.x - 2.4).hypot(warp.y - 30.3) < 0.1, "{warp:?}");
-        assert!(stack[0].unexplained(&b.levels[0], &Warp::upright([-1.0, 30.0])).is_none());
-        assert!(stack[0].unexplained(&b.levels[0], &Warp::upright([f32::NAN, 30.0])).is_none());
+        assert!(stack[0].unexplained(b[0], &Warp::upright([-1.0, 30.0])).is_none());
+        assert!(stack[0].unexplained(b[0], &Warp::upright([f32::NAN, 30.0])).is_none());
     }
 
     #[test]

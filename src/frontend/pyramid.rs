@@ -3,15 +3,24 @@
 //!
 //! Levels are 8-bit: smoothing lowers the noise far more than rounding (0.29 grey) adds, and
 //! sixteen bits would double what the tracker pulls through the cache.
+//!
+//! The finest level is the image itself, where its camera wrote it: a pyramid owns those above it.
 
 use crate::limits::PYRAMID_LEVELS;
-use stipple_drivers::Image;
+use std::sync::Arc;
+use stipple_drivers::{Calibration, Frames, Image, RigCamera};
 
 pub struct Pyramid {
-    pub levels: [Image; PYRAMID_LEVELS],
+    /// Width and height of the image.
+    size: (usize, usize),
+    /// Levels 1 and up.
+    above: [Image; PYRAMID_LEVELS - 1],
     /// Sums down a column, with two reflected entries on either side and one to make the last pair.
     columns: Vec<u16>,
 }
+
+/// All levels of an image, the image first.
+pub type Levels<'a> = [&'a Image; PYRAMID_LEVELS];
 
 /// Width or height of each level.
 pub fn sizes(full: usize) -> [usize; PYRAMID_LEVELS] {
@@ -25,27 +34,51 @@ pub fn sizes(full: usize) -> [usize; PYRAMID_LEVELS] {
 impl Pyramid {
     pub fn new(width: usize, height: usize) -> Pyramid {
         let (w, h) = (sizes(width), sizes(height));
-        Pyramid { levels: std::array::from_fn(|l| Image::new(w[l], h[l])), columns: vec![0; width + 5] }
+        let above = std::array::from_fn(|l| Image::new(w[l + 1], h[l + 1]));
+        Pyramid { size: (width, height), above, columns: vec![0; width + 5] }
     }
 
     pub fn bytes(width: usize, height: usize) -> usize {
         let (w, h) = (sizes(width), sizes(height));
-        (0..PYRAMID_LEVELS).map(|l| w[l] * h[l]).sum::<usize>() + 2 * (width + 5)
+        (1..PYRAMID_LEVELS).map(|l| w[l] * h[l]).sum::<usize>() + 2 * (width + 5)
     }
 
     /// Whether an image has the size given at construction, and all its pixels.
     pub fn fits(&self, image: &Image) -> bool {
-        let full = &self.levels[0];
-        (image.width, image.height, image.pixels.len()) == (full.width, full.height, full.pixels.len())
+        let (width, height) = self.size;
+        (image.width, image.height, image.pixels.len()) == (width, height, width * height)
     }
 
-    /// Fills all levels from an image that fits.
+    /// Fills the levels above an image that fits.
     pub fn build(&mut self, image: &Image) {
-        self.levels[0].copy_from(image);
-        for l in 1..PYRAMID_LEVELS {
-            let (below, above) = self.levels.split_at_mut(l);
-            halve(&below[l - 1], &mut above[0], &mut self.columns);
+        let mut below = image;
+        for level in &mut self.above {
+            halve(below, level, &mut self.columns);
+            below = level;
         }
+    }
+
+    /// With the image it was built from.
+    pub fn over<'a>(&'a self, image: &'a Image) -> Levels<'a> {
+        std::array::from_fn(|l| if l == 0 { image } else { &self.above[l - 1] })
+    }
+}
+
+/// A frame and what was made of it: the images are shared, not copied.
+pub struct Seen {
+    pub frames: Arc<Frames>,
+    pub pyramids: Vec<Pyramid>,
+}
+
+impl Seen {
+    pub fn nothing_yet(calibration: &Calibration) -> Seen {
+        let pyramid = |c: &RigCamera| Pyramid::new(c.camera.width, c.camera.height);
+        Seen { frames: Arc::default(), pyramids: calibration.cameras.iter().map(pyramid).collect() }
+    }
+
+    /// Of a camera that saw something.
+    pub fn levels(&self, camera: usize) -> Levels<'_> {
+        self.pyramids[camera].over(&self.frames.images[camera])
     }
 }
 
@@ -117,8 +150,10 @@ mod tests {
             }
             let mut pyramid = Pyramid::new(w, h);
             pyramid.build(&image);
+            let levels = pyramid.over(&image);
+            prop_assert!(std::ptr::eq(levels[0], &image), "shared, not copied");
             for l in 1..PYRAMID_LEVELS {
-                prop_assert_eq!(&pyramid.levels[l], &naive(&pyramid.levels[l - 1]));
+                prop_assert_eq!(levels[l], &naive(levels[l - 1]));
             }
         }
     }

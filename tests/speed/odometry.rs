@@ -9,6 +9,7 @@ use criterion::{BatchSize, Bencher, BenchmarkGroup, Criterion};
 use std::hint::black_box;
 use std::path::{Path, PathBuf};
 use std::process::Command;
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 use stipple::config::{FrontendConfig, VioConfig};
 use stipple::frontend::detect::Detector;
@@ -34,7 +35,7 @@ struct Flight {
     name: &'static str,
     calibration: Calibration,
     imu: Vec<ImuSample>,
-    frames: Vec<Frames>,
+    frames: Vec<Arc<Frames>>,
     predicted: Vec<Option<Pose>>,
     tracks: Vec<Tracks>,
 }
@@ -49,7 +50,7 @@ fn deliver<'a>(vio: &mut Vio, imu: &mut impl Iterator<Item = &'a ImuSample>, fra
     }
 }
 
-fn prepare(name: &'static str, calibration: Calibration, imu: Vec<ImuSample>, frames: Vec<Frames>) -> Flight {
+fn prepare(name: &'static str, calibration: Calibration, imu: Vec<ImuSample>, frames: Vec<Arc<Frames>>) -> Flight {
     let mut frontend = Frontend::new(&calibration, &FrontendConfig::default()).unwrap();
     let mut vio = Vio::new(&calibration, &VioConfig::default());
     let (mut predicted, mut tracks) = (Vec::new(), Vec::new());
@@ -71,7 +72,7 @@ fn simulated() -> Flight {
     let render = |i| {
         let mut frames = Frames::for_rig(&calibration);
         sim.render(i, &mut frames);
-        frames
+        Arc::new(frames)
     };
     let frames = (0..FRAMES).map(render).collect();
     let imu = sim.imu().to_vec();
@@ -90,7 +91,7 @@ fn recorded() -> Option<Flight> {
     let read = |i| {
         let mut frames = Frames::for_rig(&recording.calibration);
         reader.read(i, &mut frames).unwrap();
-        frames
+        Arc::new(frames)
     };
     let frames = (0..FRAMES.min(recording.frames.len())).map(read).collect();
     Some(prepare("MH_01", recording.calibration, recording.imu, frames))
@@ -116,6 +117,7 @@ fn tracker_stages(c: &mut Criterion, flight: &Flight) {
     });
     let points: Vec<[f32; 2]> = flight.tracks[FRAMES_BEFORE].cameras[0].iter().map(|t| t.px).collect();
     let (old, new) = (pyramid(before, 0), pyramid(now, 0));
+    let (old, new) = (old.over(&before.images[0]), new.over(&now.images[0]));
     let mut stack = Stack::default();
     let mut next = points.iter().cycle();
     group.bench_function("patch, taken at all levels", |b| {

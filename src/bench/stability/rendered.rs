@@ -7,6 +7,7 @@ use crate::config::{FrontendConfig, VioConfig};
 use crate::frontend::{Frontend, Prediction};
 use crate::vio::health::Health;
 use crate::vio::Vio;
+use std::sync::Arc;
 use stipple_drivers::types::pose_at;
 use stipple_drivers::{Fault, Frames, Span, TimedPose};
 
@@ -92,11 +93,11 @@ fn lit(from: &Frames, frame: usize, light: fn(usize, usize) -> Light, out: &mut 
 fn fly(flight: &Flight, light: fn(usize, usize) -> Light) -> Result<(Vec<Record>, Vio), Fault> {
     let mut frontend = Frontend::new(&flight.calibration, &FrontendConfig::default())?;
     let mut vio = Vio::new(&flight.calibration, &VioConfig::default());
-    let mut frames = Frames::for_rig(&flight.calibration);
+    let mut frames = Arc::new(Frames::for_rig(&flight.calibration));
     let mut samples = flight.imu.iter();
     let mut records = Vec::new();
     for (i, original) in flight.frames.iter().enumerate() {
-        lit(original, i, light, &mut frames);
+        lit(original, i, light, Arc::make_mut(&mut frames));
         for sample in samples.by_ref() {
             vio.on_imu(*sample);
             if sample.t >= frames.t {

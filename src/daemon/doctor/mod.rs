@@ -19,6 +19,7 @@ use rotation::{compare, Turning};
 use signals::Light;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 use stipple_drivers::{host, Calibration, Exit, Fault, Frames, Image, ImuSample, Nanos};
 
@@ -91,7 +92,7 @@ struct Pairs {
 }
 
 impl Pairs {
-    fn add(&mut self, calibration: &Calibration, frames: &Frames, disparities: usize) {
+    fn add(&mut self, calibration: &Calibration, frames: &Arc<Frames>, disparities: usize) {
         let Ok(rectification) = &self.rectification else { return };
         let p = rectification.camera.pinhole;
         let view = |i: usize, image: usize| {
@@ -290,7 +291,7 @@ fn look(rig: Rig, board: &Board, look_s: f64) -> Result<Seen, Fault> {
     Ok(seen)
 }
 
-fn take(seen: &mut Seen, calibration: &Calibration, frames: &Frames, disparities: usize) {
+fn take(seen: &mut Seen, calibration: &Calibration, frames: &Arc<Frames>, disparities: usize) {
     if seen.frames.len() % PAIR_EVERY == 0 {
         seen.pairs.add(calibration, frames, disparities);
         seen.light.iter_mut().enumerate().for_each(|(camera, light)| light.add(frames, camera));

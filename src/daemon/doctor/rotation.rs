@@ -12,6 +12,7 @@ use crate::config::FrontendConfig;
 use crate::frontend::{Frontend, Prediction, Track};
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use nalgebra::{Matrix3, Matrix6, Vector6};
+use std::sync::Arc;
 use stipple_drivers::{Calibration, Fault, Frames, ImuSample, Nanos, Pose, RigCamera};
 
 /// Fewer points tell no motion.
@@ -54,7 +55,7 @@ impl Turning {
         Ok(Turning { frontend, calibration: calibration.clone(), last: None, points: Vec::new(), rates: Vec::new() })
     }
 
-    pub fn add(&mut self, frames: &Frames) {
+    pub fn add(&mut self, frames: &Arc<Frames>) {
         let tracks = self.frontend.track(frames, &Prediction::default());
         let c = &self.calibration.cameras;
         let seen: &[Track] = &tracks.cameras[0];
