@@ -26,6 +26,8 @@ mod self_test;
 #[cfg(test)]
 mod simulated;
 #[cfg(test)]
+mod simulated_chips;
+#[cfg(test)]
 mod tests;
 pub mod timeline;
 mod unit;

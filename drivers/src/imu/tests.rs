@@ -5,7 +5,8 @@ use super::bus::BusFault;
 use super::chips::CHIPS;
 use super::counters::ImuCounters;
 use super::register::{Limits, RegisterImu};
-use super::simulated::{model, SimBus, SimEdges};
+use super::simulated::{SimBus, SimEdges};
+use super::simulated_chips::model;
 use super::unit::GRAVITY;
 use super::{RegisterOptions, Wiring};
 use crate::source::{ImuBatch, ImuReading, ImuSource, SourceFault, Wait};
@@ -373,14 +374,26 @@ fn self_tests_pass_a_whole_unit_and_name_the_axis_that_fails() {
     for chip in CHIPS {
         let file = configuration();
         let options = RegisterOptions { self_test: true, configuration: file.path().into(), ..options(chip.name) };
-        let start = |push: f64| {
+        let start = |push: [f64; 2], code: u8| {
             let buses = buses(chip.name);
-            buses.iter().for_each(|b| b.world().push = push);
+            buses.iter().for_each(|b| (b.world().push, b.world().code) = (push, code));
             options.start::<_, SimEdges>(buses, None).map(|_| ())
         };
-        start(1.0).unwrap_or_else(|fault| panic!("{}: {fault}", chip.name));
-        let fault = start(0.02).unwrap_err().to_string();
-        assert!(fault.contains("self-test of") && fault.contains("keep the board still"), "{}: {fault}", chip.name);
+        let passes = |push, code| start(push, code).unwrap_or_else(|fault| panic!("{}: {fault}", chip.name));
+        let fails = |push, code, which: &str| {
+            let fault = start(push, code).unwrap_err().to_string();
+            let said = fault.contains(&format!("self-test of {which}")) && fault.contains("keep the board still");
+            assert!(said, "{}: {fault}", chip.name);
+        };
+        passes([1.0; 2], 60);
+        fails([0.02, 1.0], 60, "accelerometer");
+        fails([1.0, 0.02], 60, "gyro");
+        // Of a die that the factory left no codes, the push alone must do: 288 mg and 72 °/s do, 1.4 g and 36 °/s do not.
+        if chip.name.starts_with("mpu") || chip.name.starts_with("icm") {
+            passes([1.0, 2.0], 0);
+            fails([5.0, 2.0], 0, "accelerometer");
+            fails([1.0, 1.0], 0, "gyro");
+        }
     }
 }
 

@@ -47,7 +47,15 @@ pub const BMI088_GYRO: Die = Die {
     configure: configure_bmi088_gyro,
     // GYRO_SELF_TEST: BIST trigger, ready and failed.
     cross_axis: None,
-    self_test: SelfTest::Asked { register: 0x3C, trigger: 0x01, ready: 0x02, failed: 0x04 },
+    self_tests: &[SelfTest::Asked(Asked {
+        of: Which::Gyro,
+        prepare: &[],
+        trigger: (0x3C, 0x01),
+        answer: 0x3C,
+        done: 0x02,
+        verdict: 0x04,
+        good: 0x00,
+    })],
 };
 
 fn configure_bmi088_gyro(s: &Setting) -> Vec<Step> {
@@ -125,7 +133,7 @@ pub const BMI088_ACCEL: Die = Die {
     ],
     configure: configure_bmi088_accel,
     cross_axis: None,
-    self_test: SelfTest::Push(&[Push {
+    self_tests: &[SelfTest::Push(Push {
         of: Which::Accel,
         // "Self-test: accelerometer": 24 g, 1600 Hz; positive less negative: 1, 1 and 0.5 g at least.
         prepare: &[Write(0x41, 0x03), Write(0x40, 0xA7), WaitUs(3000)],
@@ -133,7 +141,7 @@ pub const BMI088_ACCEL: Die = Die {
         off: &[Write(0x6D, 0x09), WaitUs(55_000)],
         per_lsb: 24.0 / 32768.0,
         within: [(1.0, f64::INFINITY), (1.0, f64::INFINITY), (0.5, f64::INFINITY)],
-    }]),
+    })],
 };
 
 fn configure_bmi088_accel(s: &Setting) -> Vec<Step> {
@@ -210,15 +218,28 @@ pub const BMI270: Die = Die {
     configure: configure_bmi270,
     // GYR_CAS, factor_zx.
     cross_axis: Some(0x3C),
-    self_test: SelfTest::Push(&[Push {
-        of: Which::Accel,
-        // "Accelerometer self-test": 16 g, 1600 Hz, high amplitude; positive less negative: 16, 15 and 10 g at least.
-        prepare: &[Write(0x7D, 0x04), Write(0x41, 0x03), Write(0x40, 0xAC), WaitUs(3000)],
-        on: &[Write(0x6D, 0x0D), WaitUs(55_000)],
-        off: &[Write(0x6D, 0x09), WaitUs(55_000)],
-        per_lsb: 16.0 / 32768.0,
-        within: [(16.0, f64::INFINITY), (15.0, f64::INFINITY), (10.0, f64::INFINITY)],
-    }]),
+    self_tests: &[
+        SelfTest::Push(Push {
+            of: Which::Accel,
+            // "Accelerometer self-test": 16 g, 1600 Hz, high amplitude; positive less negative: 16, 15 and 10 g at least.
+            prepare: &[Write(0x7D, 0x04), Write(0x41, 0x03), Write(0x40, 0xAC), WaitUs(3000)],
+            on: &[Write(0x6D, 0x0D), WaitUs(55_000)],
+            off: &[Write(0x6D, 0x09), WaitUs(55_000)],
+            per_lsb: 16.0 / 32768.0,
+            within: [(16.0, f64::INFINITY), (15.0, f64::INFINITY), (10.0, f64::INFINITY)],
+        }),
+        // "Gyroscope self-test": the accelerometer alone is on, CMD's g_trigger starts it, GYR_SELF_TEST_AXES says that
+        // it is done and which axes are well.
+        SelfTest::Asked(Asked {
+            of: Which::Gyro,
+            prepare: &[Write(0x6D, 0x00), WaitUs(55_000)],
+            trigger: (0x7E, 0x02),
+            answer: 0x6E,
+            done: 0x01,
+            verdict: 0x0E,
+            good: 0x0E,
+        }),
+    ],
 };
 
 fn configure_bmi270(s: &Setting) -> Vec<Step> {

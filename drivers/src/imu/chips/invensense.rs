@@ -5,7 +5,7 @@ use super::Step::{Set, Touch, WaitUs, Write};
 use super::*;
 
 /// Ranges of all of them, with the codes of the MPUs (register map RM-MPU-9250A-00, GYRO_CONFIG and
-/// ACCEL_CONFIG) and the ICM-20948. /// A step is full scale over 2^15.
+/// ACCEL_CONFIG) and the ICM-20948. A step is full scale over 2^15.
 const ACCEL_RANGES: &[(f64, u8, f64)] =
     &[(2.0, 0, 2.0 / 32768.0), (4.0, 1, 4.0 / 32768.0), (8.0, 2, 8.0 / 32768.0), (16.0, 3, 16.0 / 32768.0)];
 const GYRO_RANGES: &[(f64, u8, f64)] = &[
@@ -17,6 +17,10 @@ const GYRO_RANGES: &[(f64, u8, f64)] = &[
 
 /// Register map, TEMP_OUT, with the sensitivity of product specification PS-MPU-9250A-01: (raw - 0) / 333.87 + 21.
 const DEGREES: Temperature = Temperature { from: TemperatureFrom::Frames, c_per_lsb: 1.0 / 333.87, c_at_zero: 21.0 };
+
+/// Steps of the push where the factory left no codes (Criteria B of the same note): 60 °/s at ±250, 225 to 675 mg at ±2 g.
+const GYRO_PUSH: (f64, f64) = (60.0 * 32768.0 / 250.0, f64::INFINITY);
+const ACCEL_PUSH: (f64, f64) = (0.225 * 16384.0, 0.675 * 16384.0);
 
 /// What the MPUs and the ICM-20948 frame: accelerometer, then by register order temperature or gyro.
 const MPU_FRAME: Layout =
@@ -63,7 +67,7 @@ pub const MPU_6500: Die = Die {
     reset: &[Write(0x6B, 0x80), WaitUs(100_000), Write(0x6B, 0x01), WaitUs(1000)],
     configure: configure_mpu,
     cross_axis: None,
-    self_test: SelfTest::Factory { tests: MPU_TESTS, settle_us: 25_000 },
+    self_tests: MPU_TESTS,
 };
 
 fn configure_mpu(s: &Setting) -> Vec<Step> {
@@ -94,8 +98,8 @@ fn configure_mpu(s: &Setting) -> Vec<Step> {
 }
 
 /// Application note "MPU-Hardware Offset Registers and self-test" (AN-MPU-9250A-03): ±250 °/s and ±2 g, filters at 2.
-const MPU_TESTS: &[FactoryTest] = &[
-    FactoryTest {
+const MPU_TESTS: &[SelfTest] = &[
+    SelfTest::Factory(FactoryTest {
         of: Which::Gyro,
         prepare: &[Write(0x19, 0), Write(0x1A, 2), Write(0x1D, 2), Write(0x1B, 0), Write(0x1C, 0)],
         on: &[Write(0x1B, 0xE0)],
@@ -103,8 +107,10 @@ const MPU_TESTS: &[FactoryTest] = &[
         codes: [0x00, 0x01, 0x02],
         base: 2620.0,
         ratio: (0.5, f64::INFINITY),
-    },
-    FactoryTest {
+        uncoded: GYRO_PUSH,
+        settle_us: 25_000,
+    }),
+    SelfTest::Factory(FactoryTest {
         of: Which::Accel,
         prepare: &[],
         on: &[Write(0x1C, 0xE0)],
@@ -112,7 +118,9 @@ const MPU_TESTS: &[FactoryTest] = &[
         codes: [0x0D, 0x0E, 0x0F],
         base: 2620.0,
         ratio: (0.5, 1.5),
-    },
+        uncoded: ACCEL_PUSH,
+        settle_us: 25_000,
+    }),
 ];
 
 /// Data sheet DS-000189. The motion processor inside is not used.
@@ -148,7 +156,7 @@ pub const ICM_20948: Die = Die {
     reset: &[Write(banked(0, 0x06), 0x80), WaitUs(100_000), Write(banked(0, 0x06), 0x01), WaitUs(20_000)],
     configure: configure_icm_20948,
     cross_axis: None,
-    self_test: SelfTest::Factory { tests: ICM_20948_TESTS, settle_us: 40_000 },
+    self_tests: ICM_20948_TESTS,
 };
 
 fn configure_icm_20948(s: &Setting) -> Vec<Step> {
@@ -183,8 +191,8 @@ fn configure_icm_20948(s: &Setting) -> Vec<Step> {
 }
 
 /// SELF_TEST_X_GYRO to Z_ACCEL (codes), GYRO_CONFIG_2 and ACCEL_CONFIG_2 (switches); the procedure is that of the MPUs.
-const ICM_20948_TESTS: &[FactoryTest] = &[
-    FactoryTest {
+const ICM_20948_TESTS: &[SelfTest] = &[
+    SelfTest::Factory(FactoryTest {
         of: Which::Gyro,
         prepare: &[
             Write(banked(0, 0x07), 0x00),
@@ -198,8 +206,10 @@ const ICM_20948_TESTS: &[FactoryTest] = &[
         codes: [banked(1, 0x02), banked(1, 0x03), banked(1, 0x04)],
         base: 2620.0,
         ratio: (0.5, f64::INFINITY),
-    },
-    FactoryTest {
+        uncoded: GYRO_PUSH,
+        settle_us: 40_000,
+    }),
+    SelfTest::Factory(FactoryTest {
         of: Which::Accel,
         prepare: &[],
         on: &[Write(banked(2, 0x15), 0x1C)],
@@ -207,7 +217,9 @@ const ICM_20948_TESTS: &[FactoryTest] = &[
         codes: [banked(1, 0x0E), banked(1, 0x0F), banked(1, 0x10)],
         base: 2620.0,
         ratio: (0.5, 1.5),
-    },
+        uncoded: ACCEL_PUSH,
+        settle_us: 40_000,
+    }),
 ];
 
 /// Data sheet DS-000347, register descriptions.
@@ -258,7 +270,7 @@ pub const ICM_42688_P: Die = Die {
     reset: &[Write(banked(0, 0x11), 0x01), WaitUs(2000), Touch(banked(0, 0x75))],
     configure: configure_icm_42688_p,
     cross_axis: None,
-    self_test: SelfTest::Factory { tests: ICM_42688_P_TESTS, settle_us: 200_000 },
+    self_tests: ICM_42688_P_TESTS,
 };
 
 fn configure_icm_42688_p(s: &Setting) -> Vec<Step> {
@@ -285,8 +297,8 @@ fn configure_icm_42688_p(s: &Setting) -> Vec<Step> {
 }
 
 /// SELF_TEST_CONFIG; codes XG_ST_DATA of bank 1 and XA_ST_DATA of bank 2; at ±250 °/s and ±2 g, 1 kHz.
-const ICM_42688_P_TESTS: &[FactoryTest] = &[
-    FactoryTest {
+const ICM_42688_P_TESTS: &[SelfTest] = &[
+    SelfTest::Factory(FactoryTest {
         of: Which::Gyro,
         prepare: &[Write(banked(0, 0x4F), 0x66), Write(banked(0, 0x50), 0x66), Write(banked(0, 0x4E), 0x0F)],
         on: &[Write(banked(0, 0x70), 0x07)],
@@ -294,8 +306,10 @@ const ICM_42688_P_TESTS: &[FactoryTest] = &[
         codes: [banked(1, 0x5F), banked(1, 0x60), banked(1, 0x61)],
         base: 2620.0,
         ratio: (0.5, f64::INFINITY),
-    },
-    FactoryTest {
+        uncoded: GYRO_PUSH,
+        settle_us: 200_000,
+    }),
+    SelfTest::Factory(FactoryTest {
         of: Which::Accel,
         prepare: &[],
         on: &[Write(banked(0, 0x70), 0x78)],
@@ -303,5 +317,8 @@ const ICM_42688_P_TESTS: &[FactoryTest] = &[
         codes: [banked(2, 0x3B), banked(2, 0x3C), banked(2, 0x3D)],
         base: 2620.0,
         ratio: (0.5, 1.5),
-    },
+        // 50 to 1200 mg.
+        uncoded: (0.05 * 16384.0, 1.2 * 16384.0),
+        settle_us: 200_000,
+    }),
 ];

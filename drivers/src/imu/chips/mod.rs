@@ -1,6 +1,8 @@
 //! The inertial units we drive by their registers, as tables: what answers to WHO_AM_I, what each range and rate is
 //! called, where the data stand, how the FIFO frames them, and how the unit tests itself. Every fact is from the
-//! data sheet whose name stands beside it, with the register or the title of the section it is under; all that runs is in `die`, `frames` and `self_test`.
+//! data sheet whose name stands beside it, with the register or the title of the section it is under. "Checked
+//! against" names the open drivers that were read beside it, and what fewer than two of them bear out. No table has met
+//! its chip yet. All that runs is in `die`, `frames` and `self_test`.
 //!
 //! A unit is one die with both sensors, or two with one each (BMI088), which run on clocks of their own.
 
@@ -45,7 +47,7 @@ pub struct Die {
     pub configure: fn(&Setting) -> Vec<Step>,
     /// How much of the gyro's z is in its x, in 1/512, seven bits (BMI270).
     pub cross_axis: Option<Reg>,
-    pub self_test: SelfTest,
+    pub self_tests: &'static [SelfTest],
 }
 
 /// One of the two sensors of a die.
@@ -162,22 +164,13 @@ pub enum Step {
 }
 
 pub enum SelfTest {
-    None,
-    /// Sensors are pushed by a known force: the newest sample with `on` less that with `off`, in g or °/s at a range,
+    /// A sensor is pushed by a known force: the newest sample with `on` less that with `off`, in g or °/s at a range,
     /// is to be within.
-    Push(&'static [Push]),
+    Push(Push),
     /// As InvenSense does it: the push, as a part of what it was at the factory.
-    Factory {
-        tests: &'static [FactoryTest],
-        settle_us: u32,
-    },
-    /// The die decides (BMI088 gyro): trigger, then the ready bit, then the bit that says it failed.
-    Asked {
-        register: Reg,
-        trigger: u8,
-        ready: u8,
-        failed: u8,
-    },
+    Factory(FactoryTest),
+    /// The die decides (Bosch's gyros).
+    Asked(Asked),
 }
 
 pub struct Push {
@@ -200,6 +193,21 @@ pub struct FactoryTest {
     pub base: f64,
     /// Push over that of the factory.
     pub ratio: (f64, f64),
+    /// Steps of the push of a die of which the factory left no codes.
+    pub uncoded: (f64, f64),
+    pub settle_us: u32,
+}
+
+pub struct Asked {
+    pub of: Which,
+    pub prepare: &'static [Step],
+    /// Written to start it.
+    pub trigger: (Reg, u8),
+    /// Where it answers: this bit once it is done, and then, of these bits, those that mean that all is well.
+    pub answer: Reg,
+    pub done: u8,
+    pub verdict: u8,
+    pub good: u8,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

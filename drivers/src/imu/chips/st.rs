@@ -55,26 +55,26 @@ pub const LSM6DSOX: Die = Die {
     reset: &[Write(0x12, 0x01), WaitUs(10_000)],
     configure: configure_lsm6dsox,
     cross_axis: None,
-    self_test: SelfTest::Push(&[
+    self_tests: &[
         // AN5272, "Accelerometer self-test": ±4 g, 52 Hz, 50 to 1700 mg.
-        Push {
+        SelfTest::Push(Push {
             of: Which::Accel,
             prepare: &[Write(0x12, 0x44), Write(0x10, 0x38), WaitUs(100_000)],
             on: &[Write(0x14, 0x01), WaitUs(100_000)],
             off: &[Write(0x14, 0x00), WaitUs(100_000)],
             per_lsb: 0.122e-3,
             within: [(0.05, 1.7); 3],
-        },
+        }),
         // AN5272, "Gyroscope self-test": ±2000 °/s, 208 Hz, 150 to 700 °/s.
-        Push {
+        SelfTest::Push(Push {
             of: Which::Gyro,
             prepare: &[Write(0x11, 0x5C), WaitUs(100_000)],
             on: &[Write(0x14, 0x04), WaitUs(100_000)],
             off: &[Write(0x14, 0x00), WaitUs(100_000)],
             per_lsb: 70e-3,
             within: [(150.0, 700.0); 3],
-        },
-    ]),
+        }),
+    ],
 };
 
 fn configure_lsm6dsox(s: &Setting) -> Vec<Step> {
