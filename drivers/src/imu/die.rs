@@ -218,7 +218,7 @@ impl<B: Bus> Die<B> {
         if bytes > fifo.capacity {
             return Err(Trouble::Garbage(bytes));
         }
-        if bytes >= fifo.full {
+        if bytes >= fifo.full || words & fifo.overrun != 0 {
             self.clear()?;
             return Err(Trouble::Overflow);
         }
@@ -258,20 +258,20 @@ impl<B: Bus> Die<B> {
     /// What has to be asked for apart from the FIFO.
     pub fn temperature(&mut self) -> Result<Option<f32>, BusFault> {
         let mut word = [0; 2];
-        let raw = match self.chip.temperature.from {
+        let (word, shift) = match self.chip.temperature.from {
             TemperatureFrom::Nowhere | TemperatureFrom::Frames => return Ok(None),
             TemperatureFrom::Word(register) => {
                 self.read_into(register, &mut word)?;
-                i16::from_le_bytes(word)
+                (i16::from_le_bytes(word), 0)
             }
             TemperatureFrom::Eleven(register) => {
                 self.read_into(register, &mut word)?;
                 // Two's complement of eleven bits.
-                i16::from_be_bytes(word) >> 5
+                (i16::from_be_bytes(word), 5)
             }
         };
         // Both of Bosch's say so of a temperature that is not known yet.
-        Ok((raw != i16::MIN).then(|| self.celsius(raw)))
+        Ok((word != i16::MIN).then(|| self.celsius(word >> shift)))
     }
 
     pub fn celsius(&self, raw: i16) -> f32 {

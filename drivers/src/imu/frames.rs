@@ -58,12 +58,21 @@ impl Parser {
     pub fn parse(&mut self, bytes: &[u8], out: &mut Vec<Raw>) -> Parsed {
         match self.layout {
             Layout::Plain { len, accel, gyro, temperature, big_endian } => {
-                out.extend(bytes.chunks_exact(len).map(|frame| Raw {
-                    accel: accel.map(|at| triple(frame, at, big_endian)),
-                    gyro: gyro.map(|at| triple(frame, at, big_endian)),
-                    temperature: temperature.map(|at| word(frame, at, big_endian)),
-                }));
-                Parsed::default()
+                let mut parsed = Parsed::default();
+                for frame in bytes.chunks_exact(len) {
+                    let raw = Raw {
+                        accel: accel.map(|at| triple(frame, at, big_endian)),
+                        gyro: gyro.map(|at| triple(frame, at, big_endian)),
+                        temperature: temperature.map(|at| word(frame, at, big_endian)),
+                    };
+                    // What ArduPilot met in the FIFO of the BMI088's gyro, and no motion gives.
+                    if raw.gyro == Some([i16::MIN; 3]) {
+                        parsed.invalid += 1;
+                    } else {
+                        out.push(raw);
+                    }
+                }
+                parsed
             }
             Layout::Packet3 => packets(bytes, out),
             Layout::Bosch { config } => bosch(bytes, config, out),
@@ -200,7 +209,9 @@ mod tests {
         };
         assert_eq!(parse(layout("icm-20948", 0), &bytes).0, [icm]);
         let gyro = Raw { gyro: Some([-2, 0x0403, i16::MIN]), ..Raw::default() };
-        assert_eq!(parse(layout("bmi088", 0), &[0xFE, 0xFF, 3, 4, 0, 0x80]).0, [gyro]);
+        let bytes = [0, 0x80, 0, 0x80, 0, 0x80, 0xFE, 0xFF, 3, 4, 0, 0x80];
+        let (out, parsed) = parse(layout("bmi088", 0), &bytes);
+        assert_eq!((out, parsed), (vec![gyro], Parsed { skipped: 0, invalid: 1 }), "nothing measures that");
     }
 
     #[test]

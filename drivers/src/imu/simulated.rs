@@ -41,6 +41,9 @@ pub struct Model {
     pub codes: [(u8, u8); 2],
 }
 
+const MS: i64 = 1_000_000;
+/// ACC_PWR_CONF of the BMI088's accelerometer after a reset.
+const SUSPENDED: u8 = 3;
 /// The factory's code in the simulated chips, and the push it stands for.
 const CODE: u8 = 60;
 pub const PUSH: f64 = 4713.0;
@@ -89,6 +92,8 @@ pub struct World {
     pub upload: Vec<u8>,
     /// Its factor of cross-axis sensitivity.
     pub cross: u8,
+    /// The BMI088's accelerometer hears no write before then.
+    deaf_until: i64,
 }
 
 #[derive(Clone)]
@@ -122,6 +127,7 @@ impl World {
             stall: 0,
             upload: vec![],
             cross: 0,
+            deaf_until: 0,
         }
     }
 
@@ -218,12 +224,21 @@ impl World {
         }
         if self.bank == 0 && (address, value) == self.model.reset {
             self.registers = [[0; 256]; 8];
-            if self.model.who.1 == 0x24 {
-                self.registers[0][0x3C] = self.cross;
+            match self.model.who.1 {
+                0x24 => self.registers[0][0x3C] = self.cross,
+                0x1E => (self.registers[0][0x7C], self.deaf_until) = (SUSPENDED, self.now + MS),
+                _ => {}
             }
             (self.browned, self.next) = (false, None);
             self.fifo.clear();
             return;
+        }
+        if self.model.who.1 == 0x1E {
+            if self.now < self.deaf_until {
+                return;
+            }
+            // A write in suspend mode takes it a millisecond.
+            self.deaf_until = if self.registers[0][0x7C] == SUSPENDED { self.now + MS } else { 0 };
         }
         let mut value = value;
         // The tests that the gyros of the BMI088 and the BMI270 make of themselves, and the latter's start.

@@ -136,7 +136,7 @@ pub fn model(name: &str, die: usize) -> Model {
         ("bmi088", 0) => Model {
             who: (0x00, 0x0F),
             reset: (0x14, 0xB6),
-            on: |r| r[0][0x3E] == 0x80,
+            on: |r| r[0][0x3E] == 0x40,
             rate_hz: |r| [2000.0, 2000.0, 1000.0, 400.0, 200.0, 100.0, 200.0, 100.0][usize::from(r[0][0x10])],
             per_dps: |r| pick(r[0][0x0F], &[2000.0, 1000.0, 500.0, 250.0, 125.0]),
             clears: |_, a, _| a == 0x3E,
@@ -144,7 +144,8 @@ pub fn model(name: &str, die: usize) -> Model {
             data: 0x3F,
             capacity: 600,
             layout: Layout::Plain { len: 6, accel: None, gyro: Some(0), temperature: None, big_endian: false },
-            counted: |n| [(n / 6) as u8, 0],
+            // With its flag of an overrun.
+            counted: |n| [(n / 6) as u8 | if n == 600 { 0x80 } else { 0 }, 0],
             newest: [0; 2],
             codes: [(7, 0); 2],
             ..base

@@ -105,6 +105,8 @@ pub struct Fifo {
     pub count_bytes: usize,
     pub count_big_endian: bool,
     pub count_mask: u16,
+    /// Bits beside the count that say that samples were lost; 0: none do.
+    pub overrun: u16,
     /// Bytes that one count stands for.
     pub unit: usize,
     pub data: Reg,

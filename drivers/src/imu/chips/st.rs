@@ -43,6 +43,7 @@ pub const LSM6DSOX: Die = Die {
         count_bytes: 2,
         count_big_endian: false,
         count_mask: 0x03FF,
+        overrun: 0,
         unit: 7,
         data: 0x78,
         capacity: 512 * 7,
