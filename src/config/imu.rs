@@ -37,7 +37,7 @@ pub struct ImuConfig {
     pub watermark: u32,
     /// Test the unit when it is opened, which takes up to two seconds and wants the board to stand still.
     pub self_test: bool,
-    /// The BMI270's configuration file, which Bosch's licence keeps out of this program.
+    /// A file of the 8192 bytes that the BMI270 needs at each start: Bosch's program for it, and no part of this one.
     pub configuration: String,
     /// Transfers that may fail in a row before the unit is set up anew.
     pub failures_max: u32,
@@ -100,8 +100,8 @@ impl ImuConfig {
                     (
                         name != "bmi270" || !self.configuration.is_empty(),
                         "imu.configuration",
-                        "must name the file with the bytes of bmi270_config_file, from Bosch's BMI270 driver, whose \
-                         licence keeps it out of this program",
+                        "must name a file of the 8192 bytes of bmi270_config_file, from Bosch's BMI270_SensorAPI, without \
+                         which it measures nothing",
                     ),
                 ],
             },

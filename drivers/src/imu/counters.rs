@@ -79,7 +79,9 @@ impl ImuCounters {
             Trouble::Silent => &mut self.imu_silences,
             Trouble::Stranger(_) => &mut self.imu_strangers,
             // Of a restart, which is counted itself.
-            Trouble::Stuck(..) | Trouble::NoConfiguration | Trouble::SelfTest(..) => return,
+            Trouble::Stuck(..) | Trouble::NoConfiguration | Trouble::BadConfiguration(_) | Trouble::SelfTest(..) => {
+                return
+            }
         };
         *counter += 1;
     }

@@ -23,6 +23,8 @@ pub enum Trouble {
     /// It filled up: samples are lost, and it was cleared.
     Overflow,
     NoConfiguration,
+    /// The BMI270 does not run its configuration file: its INTERNAL_STATUS.
+    BadConfiguration(u8),
     /// An axis answered its self-test with this, which is out of bounds.
     SelfTest(&'static str, f64),
 }
@@ -44,6 +46,9 @@ impl std::fmt::Display for Trouble {
             Trouble::Garbage(bytes) => write!(f, "its FIFO claims to hold {bytes} bytes"),
             Trouble::Overflow => write!(f, "its FIFO overflowed"),
             Trouble::NoConfiguration => write!(f, "it needs its configuration file"),
+            Trouble::BadConfiguration(status) => {
+                write!(f, "it does not run its configuration file: INTERNAL_STATUS is {status:#04x}")
+            }
             Trouble::SelfTest(axis, value) => write!(f, "self-test of {axis} answers {value:.2}"),
         }
     }
@@ -125,7 +130,6 @@ impl<B: Bus> Die<B> {
                 let _ = self.read_byte(register);
                 Ok(())
             }
-            Step::Expect(register, mask, value, ms) => self.expect(register, mask, value, ms),
             Step::Upload => self.upload(),
         }
     }
@@ -141,11 +145,12 @@ impl<B: Bus> Die<B> {
     }
 
     /// BMI270, "Device initialisation": INIT_CTRL off, the file through INIT_DATA in chunks whose word number stands
-    /// in INIT_ADDR_0 and 1, INIT_CTRL on.
+    /// in INIT_ADDR_0 and 1, INIT_CTRL on, and within 150 ms it says whether it runs.
     fn upload(&mut self) -> Result<(), Trouble> {
         const INIT_CTRL: Reg = 0x59;
         const INIT_ADDR_0: u8 = 0x5B;
         const INIT_DATA: u8 = 0x5E;
+        const INTERNAL_STATUS: Reg = 0x21;
         if self.upload.is_empty() {
             return Err(Trouble::NoConfiguration);
         }
@@ -156,7 +161,10 @@ impl<B: Bus> Die<B> {
             self.bus.write(INIT_DATA, chunk)?;
         }
         self.write(INIT_CTRL, 1)?;
-        Ok(())
+        self.expect(INTERNAL_STATUS, 0x0F, 0x01, 150).map_err(|trouble| match trouble {
+            Trouble::Stuck(_, status) => Trouble::BadConfiguration(status),
+            trouble => trouble,
+        })
     }
 
     /// Resets it and asks who it is.

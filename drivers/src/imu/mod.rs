@@ -163,17 +163,19 @@ impl RegisterOptions {
     }
 
     fn read_configuration(&self) -> Result<Vec<u8>, Fault> {
-        /// "Device initialisation" of the BMI270: no more fits its memory.
-        const BYTES_MAX: usize = 8192;
+        /// "Device initialisation" of the BMI270. Its smaller files are of other variants, whose FIFO is longer and whose
+        /// cross-axis factor stands elsewhere.
+        const BYTES: usize = 8192;
         if self.configuration.as_os_str().is_empty() {
             return Ok(Vec::new());
         }
         let place = self.configuration.display().to_string();
-        let fix = "imu.configuration names the bytes of bmi270_config_file, as they are sent";
+        let fix =
+            "imu.configuration names the bytes of bmi270_config_file of Bosch's BMI270_SensorAPI, as they are sent";
         let bytes = std::fs::read(&self.configuration)
             .map_err(|e| Fault::new(Exit::NoInput, &place, format!("cannot be read: {e}"), fix))?;
-        if bytes.is_empty() || bytes.len() > BYTES_MAX || bytes.len() % 2 != 0 {
-            let what = format!("{} bytes, not an even number up to {BYTES_MAX}", bytes.len());
+        if bytes.len() != BYTES {
+            let what = format!("{} bytes, not {BYTES}", bytes.len());
             return Err(Fault::new(Exit::Config, place, what, fix));
         }
         Ok(bytes)

@@ -329,8 +329,12 @@ pub(super) fn cannot_start(place: &str, die: &str, trouble: Trouble) -> Fault {
         Trouble::Bus(BusFault::Nack) => "check wiring, supply and imu.address (i2cdetect shows what answers)",
         Trouble::Stranger(_) => "set imu.chip to what is there, or check imu.spi_mode and the chip select",
         Trouble::NoConfiguration => {
-            "set imu.configuration to the file with the 8192 bytes of bmi270_config_file, from Bosch's BMI270 driver: \
-             its licence keeps it out of this program"
+            "set imu.configuration to a file of the 8192 bytes of bmi270_config_file, from Bosch's BMI270_SensorAPI: it \
+             is Bosch's program, and no part of this one"
+        }
+        Trouble::BadConfiguration(_) => {
+            "check that imu.configuration holds bmi270_config_file as it stands in Bosch's BMI270_SensorAPI, then the \
+             wiring"
         }
         Trouble::SelfTest(..) => {
             "keep the board still while it starts, or set imu.self_test = false and expect bad data"

@@ -90,8 +90,9 @@ pub struct World {
     pub stall: i64,
     /// What the BMI270 was sent.
     pub upload: Vec<u8>,
-    /// Its factor of cross-axis sensitivity.
+    /// Its factor of cross-axis sensitivity, and what it makes of its configuration.
     pub cross: u8,
+    pub configured: u8,
     /// The BMI088's accelerometer hears no write before then.
     deaf_until: i64,
 }
@@ -127,6 +128,7 @@ impl World {
             stall: 0,
             upload: vec![],
             cross: 0,
+            configured: 1,
             deaf_until: 0,
         }
     }
@@ -247,7 +249,9 @@ impl World {
             (0x24, 0x7E, 2) if self.registers[0][0x7D] == 4 => {
                 self.registers[0][0x6E] = if self.push[1] > 0.5 { 0x0F } else { 0x0B };
             }
-            (0x24, 0x59, 1) => self.registers[0][0x21] = u8::from(self.upload.len() == 8192),
+            (0x24, 0x59, 1) => {
+                self.registers[0][0x21] = if self.upload.len() == 8192 { self.configured } else { 2 };
+            }
             _ => {}
         }
         if (self.model.clears)(self.bank, address, value) {

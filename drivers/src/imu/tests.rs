@@ -437,11 +437,21 @@ fn the_bmi270_asks_for_its_configuration_and_gets_it_whole() {
     let rig = Rig::new("bmi270");
     let file = configuration();
     assert_eq!(rig.buses[0].world().upload, std::fs::read(file.path()).unwrap());
-    let odd = RegisterOptions { configuration: "/dev/null".into(), ..options("bmi270") };
-    let fault = odd.start::<_, SimEdges>(buses("bmi270"), None).map(|_| ()).unwrap_err().to_string();
-    assert!(fault.contains("0 bytes"), "{fault}");
-    let none = RegisterOptions { configuration: "no/such/file".into(), ..options("bmi270") };
-    assert!(none.start::<_, SimEdges>(buses("bmi270"), None).is_err());
+    let with = |path: &std::path::Path, buses| {
+        let options = RegisterOptions { configuration: path.into(), ..options("bmi270") };
+        options.start::<_, SimEdges>(buses, None).map(|_| ()).unwrap_err().to_string()
+    };
+    // That of another variant, or half a file.
+    let short = tempfile::NamedTempFile::new().unwrap();
+    short.as_file().write_all(&[7; 328]).unwrap();
+    for (path, said) in [(short.path(), "328 bytes, not 8192"), ("no/such/file".as_ref(), "cannot be read")] {
+        let fault = with(path, buses("bmi270"));
+        assert!(fault.contains(said) && fault.contains("bmi270_config_file"), "{fault}");
+    }
+    let refuses = buses("bmi270");
+    refuses[0].world().configured = 2;
+    let fault = with(file.path(), refuses);
+    assert!(fault.contains("INTERNAL_STATUS is 0x02") && fault.contains("imu.configuration"), "{fault}");
 }
 
 #[test]

@@ -159,9 +159,7 @@ pub enum Step {
     WaitUs(u32),
     /// A read whose answer does not matter: it wakes the interface up.
     Touch(Reg),
-    /// Until the register's masked value is that, as long as that many milliseconds.
-    Expect(Reg, u8, u8, u32),
-    /// The BMI270's configuration file.
+    /// The BMI270's configuration file, until it runs.
     Upload,
 }
 
