@@ -117,9 +117,9 @@ impl<B: Bus> Die<B> {
     fn step(&mut self, step: Step) -> Result<(), Trouble> {
         match step {
             Step::Write(register, value) => Ok(self.write(register, value)?),
-            Step::Set(register, bits) => {
+            Step::Change(register, clear, set) => {
                 let value = self.read_byte(register)?;
-                Ok(self.write(register, value | bits)?)
+                Ok(self.write(register, value & !clear | set)?)
             }
             Step::WaitUs(us) => {
                 self.bus.sleep(Span(i64::from(us) * 1000));

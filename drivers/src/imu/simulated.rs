@@ -95,6 +95,8 @@ pub struct World {
     pub configured: u8,
     /// The BMI088's accelerometer hears no write before then.
     deaf_until: i64,
+    /// The next count of the ICM-42688-P is 0, whatever there is.
+    uncounted: bool,
 }
 
 #[derive(Clone)]
@@ -130,6 +132,7 @@ impl World {
             cross: 0,
             configured: 1,
             deaf_until: 0,
+            uncounted: false,
         }
     }
 
@@ -229,6 +232,7 @@ impl World {
             match self.model.who.1 {
                 0x24 => self.registers[0][0x3C] = self.cross,
                 0x1E => (self.registers[0][0x7C], self.deaf_until) = (SUSPENDED, self.now + MS),
+                0x47 => self.registers[0][0x4D] = 0x91,
                 _ => {}
             }
             (self.browned, self.next) = (false, None);
@@ -256,6 +260,7 @@ impl World {
         }
         if (self.model.clears)(self.bank, address, value) {
             self.fifo.clear();
+            self.uncounted = self.model.who.1 == 0x47;
         }
         self.registers[usize::from(self.bank)][usize::from(address)] = value;
     }
@@ -325,6 +330,9 @@ impl Bus for SimBus {
         world.transfer()?;
         world.refresh();
         let data = world.bank == 0 && register == world.model.data;
+        if register == world.model.count && std::mem::take(&mut world.uncounted) {
+            world.registers[0][usize::from(register)..][..2].fill(0);
+        }
         for (i, byte) in into.iter_mut().enumerate() {
             *byte = world.byte(if data { register } else { register.wrapping_add(i as u8) });
         }

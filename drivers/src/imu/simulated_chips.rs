@@ -62,7 +62,8 @@ pub fn model(name: &str, die: usize) -> Model {
             who: (0x75, 0x47),
             bank: Some((0x76, 0)),
             reset: (0x11, 0x01),
-            on: |r| r[0][0x16] == 0x40 && r[0][0x5F] == 0x07 && r[0][0x4E] == 0x0F,
+            // INTF_CONFIG1 is 0x91 after a reset, of which the adaptive full scale is to be off.
+            on: |r| r[0][0x16] == 0x40 && r[0][0x5F] == 0x07 && r[0][0x4E] == 0x0F && r[0][0x4D] == 0x51,
             rate_hz: |r| match (r[0][0x4F] & 15, r[0][0x50] & 15) {
                 (7, 7) => 200.0,
                 (6, 6) => 1000.0,

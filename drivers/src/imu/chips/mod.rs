@@ -154,8 +154,8 @@ pub struct Setting {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Step {
     Write(Reg, u8),
-    /// Sets bits, keeps the others.
-    Set(Reg, u8),
+    /// Clears bits, then sets others, and keeps the rest.
+    Change(Reg, u8, u8),
     WaitUs(u32),
     /// A read whose answer does not matter: it wakes the interface up.
     Touch(Reg),
