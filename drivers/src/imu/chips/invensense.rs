@@ -18,6 +18,10 @@ const GYRO_RANGES: &[(f64, u8, f64)] = &[
 /// Register map, TEMP_OUT, with the sensitivity of product specification PS-MPU-9250A-01: (raw - 0) / 333.87 + 21.
 const DEGREES: Temperature = Temperature { from: TemperatureFrom::Frames, c_per_lsb: 1.0 / 333.87, c_at_zero: 21.0 };
 
+/// From here on the old FIFOs of 512 bytes are taken for full: of more than 32 frames ArduPilot met corrupt ones at their
+/// end, and Linux leaves three frames for those that come while it reads.
+const MPU_FULL: usize = 33 * 14;
+
 /// Steps of the push where the factory left no codes (Criteria B of the same note): 60 °/s at ±250, 225 to 675 mg at ±2 g.
 const GYRO_PUSH: (f64, f64) = (60.0 * 32768.0 / 250.0, f64::INFINITY);
 const ACCEL_PUSH: (f64, f64) = (0.225 * 16384.0, 0.675 * 16384.0);
@@ -28,6 +32,7 @@ const MPU_FRAME: Layout =
 const ICM_20948_FRAME: Layout =
     Layout::Plain { len: 14, accel: Some(0), gyro: Some(6), temperature: Some(12), big_endian: true };
 
+/// Checked against Linux's inv_mpu6050, ArduPilot and PX4; its registers are those of the MPU-6500.
 pub const MPU_9250: Die = Die {
     name: "MPU-9250",
     // Register map, WHO_AM_I: 0x71; its sister MPU-9255 answers 0x73.
@@ -36,6 +41,7 @@ pub const MPU_9250: Die = Die {
     ..MPU_6500
 };
 
+/// Checked against Linux's inv_mpu6050 (which in the test's machine drives the same simulated chip), ArduPilot and PX4.
 pub const MPU_6500: Die = Die {
     name: "MPU-6500",
     // Register map RM-MPU-6500A-00, WHO_AM_I.
@@ -58,10 +64,9 @@ pub const MPU_6500: Die = Die {
         unit: 1,
         data: 0x74,
         capacity: 512,
-        full: 512 - 14 + 1,
+        full: MPU_FULL,
         layout: MPU_FRAME,
-        // USER_CTRL: FIFO_RST, which clears itself.
-        reset: &[Change(0x6A, 0x00, 0x04)],
+        reset: MPU_FIFO_RESET,
     },
     // PWR_MGMT_1: H_RESET; at most 100 ms to the first register access (product specification, "Start-up time for
     // register read/write"); then the best clock there is.
@@ -71,6 +76,11 @@ pub const MPU_6500: Die = Die {
     self_tests: MPU_TESTS,
 };
 
+/// FIFO_EN: temperature, gyro, accelerometer. USER_CTRL: FIFO_EN, and FIFO_RST, which clears itself. As Linux and ArduPilot
+/// have it, nothing is written to the FIFO meanwhile: half a frame in it would shift all that follow.
+const MPU_FIFO_RESET: &[Step] =
+    &[Write(0x23, 0x00), Change(0x6A, 0x40, 0x04), Change(0x6A, 0x00, 0x40), Write(0x23, 0xF8)];
+
 fn configure_mpu(s: &Setting) -> Vec<Step> {
     // CONFIG and ACCEL_CONFIG 2, DLPF_CFG and A_DLPFCFG: the band next below half the rate, 41, 92 or 184 Hz.
     let band = match 1000.0 / (1.0 + f64::from(s.rate)) {
@@ -78,8 +88,9 @@ fn configure_mpu(s: &Setting) -> Vec<Step> {
         hz if hz <= 250.0 => 2,
         _ => 1,
     };
-    let user = 0x40 | if s.spi { 0x10 } else { 0x00 };
-    vec![
+    let mut steps = vec![
+        // USER_CTRL: by SPI the I2C interface off.
+        Write(0x6A, if s.spi { 0x10 } else { 0x00 }),
         Write(0x6C, 0x00),
         Write(0x19, s.rate),
         // CONFIG, FIFO_MODE: when full it takes no more, so that what is in it keeps its framing.
@@ -90,12 +101,11 @@ fn configure_mpu(s: &Setting) -> Vec<Step> {
         // INT_PIN_CFG and INT_ENABLE: active high, a pulse of 50 µs, raw data ready.
         Write(0x37, 0x10),
         Write(0x38, u8::from(s.data_ready)),
-        // The gyro's start-up time is 35 ms.
-        WaitUs(50_000),
-        // FIFO_EN: temperature, gyro, accelerometer.
-        Write(0x23, 0xF8),
-        Write(0x6A, user | 0x04),
-    ]
+        // The gyro's start-up time is 35 ms; Linux waits 70.
+        WaitUs(70_000),
+    ];
+    steps.extend(MPU_FIFO_RESET);
+    steps
 }
 
 /// Application note "MPU-Hardware Offset Registers and self-test" (AN-MPU-9250A-03): ±250 °/s and ±2 g, filters at 2.
