@@ -135,6 +135,8 @@ const MPU_TESTS: &[SelfTest] = &[
 ];
 
 /// Data sheet DS-000189. The motion processor inside is not used.
+///
+/// Checked against ArduPilot, PX4 and Zephyr's icm20948; the self-test against InvenSense's drivers.
 pub const ICM_20948: Die = Die {
     name: "ICM-20948",
     // WHO_AM_I.
@@ -159,10 +161,9 @@ pub const ICM_20948: Die = Die {
         unit: 1,
         data: banked(0, 0x72),
         capacity: 512,
-        full: 512 - 14 + 1,
+        full: MPU_FULL,
         layout: ICM_20948_FRAME,
-        // FIFO_RST: assert and release.
-        reset: &[Write(banked(0, 0x68), 0x1F), Write(banked(0, 0x68), 0x00)],
+        reset: ICM_20948_FIFO_RESET,
     },
     // PWR_MGMT_1: DEVICE_RESET, then awake on the best clock.
     reset: &[Write(banked(0, 0x06), 0x80), WaitUs(100_000), Write(banked(0, 0x06), 0x01), WaitUs(20_000)],
@@ -171,6 +172,17 @@ pub const ICM_20948: Die = Die {
     self_tests: ICM_20948_TESTS,
 };
 
+/// FIFO_EN_2: accelerometer, gyro, temperature. USER_CTRL: FIFO_EN. FIFO_RST: assert and release. As ArduPilot has it,
+/// nothing is written to the FIFO meanwhile.
+const ICM_20948_FIFO_RESET: &[Step] = &[
+    Write(banked(0, 0x67), 0x00),
+    Change(banked(0, 0x03), 0x40, 0x00),
+    Write(banked(0, 0x68), 0x1F),
+    Write(banked(0, 0x68), 0x00),
+    Change(banked(0, 0x03), 0x00, 0x40),
+    Write(banked(0, 0x67), 0x1F),
+];
+
 fn configure_icm_20948(s: &Setting) -> Vec<Step> {
     // GYRO_CONFIG_1 and ACCEL_CONFIG: bands of 51, 120 or 152 Hz (gyro), 50, 111 or 246 Hz (accelerometer).
     let band = match 1125.0 / (1.0 + f64::from(s.rate)) {
@@ -178,10 +190,10 @@ fn configure_icm_20948(s: &Setting) -> Vec<Step> {
         hz if hz <= 250.0 => 2,
         _ => 1,
     };
-    vec![
+    let mut steps = vec![
         Write(banked(0, 0x07), 0x00),
-        // USER_CTRL: FIFO on, and by SPI the I2C interface off.
-        Write(banked(0, 0x03), 0x40 | if s.spi { 0x10 } else { 0x00 }),
+        // USER_CTRL: by SPI the I2C interface off.
+        Write(banked(0, 0x03), if s.spi { 0x10 } else { 0x00 }),
         Write(banked(2, 0x00), s.rate),
         Write(banked(2, 0x01), band << 3 | s.gyro << 1 | 1),
         // ODR_ALIGN_EN: both sensors start their samples together.
@@ -192,14 +204,13 @@ fn configure_icm_20948(s: &Setting) -> Vec<Step> {
         // INT_PIN_CFG and INT_ENABLE_1: active high, a pulse, raw data ready.
         Write(banked(0, 0x0F), 0x10),
         Write(banked(0, 0x11), u8::from(s.data_ready)),
-        // The gyro's start-up time is 35 ms.
-        WaitUs(50_000),
-        // FIFO_MODE and FIFO_EN_2: takes no more when full; accelerometer, gyro, temperature.
+        // The gyro's start-up time is 35 ms; Linux waits 70.
+        WaitUs(70_000),
+        // FIFO_MODE: takes no more when full.
         Write(banked(0, 0x69), 0x1F),
-        Write(banked(0, 0x67), 0x1F),
-        Write(banked(0, 0x68), 0x1F),
-        Write(banked(0, 0x68), 0x00),
-    ]
+    ];
+    steps.extend(ICM_20948_FIFO_RESET);
+    steps
 }
 
 /// SELF_TEST_X_GYRO to Z_ACCEL (codes), GYRO_CONFIG_2 and ACCEL_CONFIG_2 (switches); the procedure is that of the MPUs.
