@@ -100,7 +100,7 @@ pub fn model(name: &str, die: usize) -> Model {
             counted: |n| {
                 let words = n / 7;
                 // Watermark and overrun flags stand in the bits above the count.
-                [words as u8, (words >> 8) as u8 | 0x80]
+                [words as u8, (words >> 8) as u8 | if words == 512 { 0xC8 } else { 0x80 }]
             },
             temperature: 1664,
             newest: [0x28, 0x22],

@@ -307,7 +307,7 @@ fn a_stalled_host_overflows_the_fifo_which_is_counted_and_cleared() {
 
 #[test]
 fn a_fifo_that_says_it_lost_samples_is_cleared_however_little_is_in_it() {
-    for (chip, count) in [("bmi088", [0x83, 0])] {
+    for (chip, count) in [("bmi088", [0x83, 0]), ("lsm6dsox", [4, 0x48]), ("lsm6dsox", [4, 0x08])] {
         let mut rig = Rig::new(chip);
         rig.run(500);
         rig.buses[0].world().counts.push_back(count);

@@ -4,6 +4,9 @@ use super::Step::{WaitUs, Write};
 use super::*;
 
 /// Data sheet DS12814 and application note AN5272.
+///
+/// Checked against ST's lsm6dsox-pid with its self-test example and Linux's st_lsm6dsx. Of ST alone: the flags of an
+/// overrun, the temperature in the FIFO and the self-tests; of the data sheet alone: the length of the data-ready pulse.
 pub const LSM6DSOX: Die = Die {
     name: "LSM6DSOX",
     // WHO_AM_I.
@@ -43,7 +46,8 @@ pub const LSM6DSOX: Die = Die {
         count_bytes: 2,
         count_big_endian: false,
         count_mask: 0x03FF,
-        overrun: 0,
+        // FIFO_STATUS2: FIFO_OVR_IA, and FIFO_OVR_LATCHED, which reading it clears.
+        overrun: 0x4800,
         unit: 7,
         data: 0x78,
         capacity: 512 * 7,
@@ -52,8 +56,8 @@ pub const LSM6DSOX: Die = Die {
         // FIFO_CTRL4: bypass empties it; then a stream with temperature at 1.6 Hz.
         reset: &[Write(0x0A, 0x00), Write(0x0A, 0x16)],
     },
-    // CTRL3_C: SW_RESET.
-    reset: &[Write(0x12, 0x01), WaitUs(10_000)],
+    // CTRL3_C: SW_RESET; the 50 ms are Linux's.
+    reset: &[Write(0x12, 0x01), WaitUs(50_000)],
     configure: configure_lsm6dsox,
     cross_axis: None,
     self_tests: &[
@@ -90,8 +94,8 @@ fn configure_lsm6dsox(s: &Setting) -> Vec<Step> {
         // of the gyro, on INT1.
         Write(0x0B, 0x80),
         Write(0x0D, if s.data_ready { 0x02 } else { 0x00 }),
-        // The gyro's turn-on time is 35 ms.
-        WaitUs(80_000),
+        // The gyro's turn-on time: ST's own examples give it 100 ms.
+        WaitUs(100_000),
         // FIFO_CTRL3: both into the FIFO at their rate.
         Write(0x09, s.rate << 4 | s.rate),
         Write(0x0A, 0x00),
