@@ -3,13 +3,20 @@
 
 use std::sync::atomic::{AtomicBool, Ordering};
 
-/// Makes the calling thread yield to others (nice 10). Threads it starts from then on inherit it:
+/// Work that may wait, in the order in which it is served after reading the sensors and odometry: the nice value of its
+/// threads. What is not recorded in time is lost, what is not mapped in time comes later.
+#[derive(Clone, Copy, Debug)]
+pub enum Waits {
+    Recording = 5,
+    Mapping = 10,
+}
+
+/// Makes the calling thread yield to others. Threads it starts from then on inherit it:
 /// a Vulkan device opened by such a thread renders on the CPU, where it does, behind odometry.
-pub fn lower_priority() {
-    const NICE: i32 = 10;
+pub fn lower_priority(waits: Waits) {
     // SAFETY: plain integers; `0` means the calling thread. Failing leaves the priority as it was.
     unsafe {
-        libc::setpriority(libc::PRIO_PROCESS, 0, NICE);
+        libc::setpriority(libc::PRIO_PROCESS, 0, waits as i32);
     }
 }
 

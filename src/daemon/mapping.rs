@@ -36,7 +36,7 @@ impl Mapping {
     /// that odometry is served first.
     pub fn open(calibration: &Calibration, board: &Board) -> Result<Mapping, Fault> {
         let build = || {
-            host::lower_priority();
+            host::lower_priority(host::Waits::Mapping);
             Mapper::open(calibration, board)
         };
         let mapper = std::thread::scope(|s| s.spawn(build).join().expect("boot faults are values, not panics"))?;

@@ -18,7 +18,7 @@ use crate::mem::{seal_thread, unsealed};
 use std::sync::atomic::{AtomicBool, Ordering, Ordering::Relaxed};
 use std::time::{Duration, Instant};
 use stipple_drivers::paced::FRAMES_UNREADABLE;
-use stipple_drivers::{Calibration, Fault, Frames, Nanos, Pose, Span};
+use stipple_drivers::{host, Calibration, Fault, Frames, Nanos, Pose, Span};
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 pub enum Pace {
@@ -297,7 +297,7 @@ pub fn realtime(
 
 /// Thread `mapping`: keyframes first, then single steps, until the run's time is over.
 fn map(s: &Shared, mut mapping: Mapping, run: &Realtime) -> Mapping {
-    stipple_drivers::host::lower_priority();
+    host::lower_priority(host::Waits::Mapping);
     seal_thread();
     let over = |tracked: bool| match run.duration_s {
         _ if run.stop.load(Relaxed) => tracked,

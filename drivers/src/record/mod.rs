@@ -130,7 +130,7 @@ pub fn start(mut sink: Box<dyn Sink>, shape: &Frames, slots: usize) -> (Recorder
     let counts = Arc::new(Counts::default());
     let c = counts.clone();
     let thread = std::thread::spawn(move || {
-        host::lower_priority();
+        host::lower_priority(host::Waits::Recording);
         let mut failure: Option<String> = None;
         let mut fails = |counter: &AtomicU64, e: io::Error| {
             counter.fetch_add(1, Relaxed);
