@@ -49,9 +49,12 @@ mod c {
     pub const EVENT_RISING: c_int = 5;
     pub const ACTIVE_LOW: c_int = 4;
 
-    /// In tests every call of it can be made to fail.
+    /// In tests every call can be made to fail.
     #[cfg(test)]
     pub use super::simulated::*;
+
+    #[cfg(not(test))]
+    pub use libc::clock_nanosleep;
 
     #[cfg(not(test))]
     #[link(name = "gpiod")]
@@ -300,7 +303,7 @@ impl Trigger {
     pub fn wait(&mut self) {
         let due = libc::timespec { tv_sec: self.due.0 / 1_000_000_000, tv_nsec: self.due.0 % 1_000_000_000 };
         // SAFETY: the instant outlives the call; the remaining time is not asked for.
-        while unsafe { libc::clock_nanosleep(libc::CLOCK_MONOTONIC, libc::TIMER_ABSTIME, &due, std::ptr::null_mut()) }
+        while unsafe { c::clock_nanosleep(libc::CLOCK_MONOTONIC, libc::TIMER_ABSTIME, &due, std::ptr::null_mut()) }
             == libc::EINTR
         {}
         let missed;
@@ -341,6 +344,8 @@ mod simulated {
         pub static LEVELS: RefCell<Vec<c_int>> = const { RefCell::new(Vec::new()) };
         /// Stamps, ns, of edges that are waiting.
         pub static WAITING: RefCell<Vec<i64>> = const { RefCell::new(Vec::new()) };
+        /// Signals that are to come while it sleeps.
+        pub static SIGNALS: Cell<u32> = const { Cell::new(0) };
     }
 
     fn fails(call: &str) -> bool {
@@ -363,6 +368,22 @@ mod simulated {
             null_mut()
         } else {
             NonNull::dangling().as_ptr()
+        }
+    }
+
+    pub unsafe fn clock_nanosleep(
+        clock: libc::clockid_t,
+        flags: c_int,
+        due: *const libc::timespec,
+        left: *mut libc::timespec,
+    ) -> c_int {
+        match SIGNALS.get() {
+            // SAFETY: as the caller has it.
+            0 => unsafe { libc::clock_nanosleep(clock, flags, due, left) },
+            n => {
+                SIGNALS.set(n - 1);
+                libc::EINTR
+            }
         }
     }
 
@@ -423,7 +444,7 @@ mod simulated {
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used)]
-    use super::simulated::{FAILS, LEVELS, OPEN, WAITING};
+    use super::simulated::{FAILS, LEVELS, OPEN, SIGNALS, WAITING};
     use super::*;
 
     const ERRNOS: [i32; 8] =
@@ -493,6 +514,15 @@ mod tests {
         }
         drop(trigger);
         assert_eq!(OPEN.get(), 0);
+    }
+
+    #[test]
+    fn a_signal_does_not_bring_a_pulse_forward() {
+        let mut trigger = Trigger::new(Output::open(&line("chip", "3"), false).unwrap(), Span(1000), 50.0);
+        let due = trigger.due;
+        SIGNALS.set(3);
+        trigger.wait();
+        assert!(SIGNALS.get() == 0 && monotonic() >= due);
     }
 
     #[test]

@@ -100,3 +100,16 @@ pub fn memory_available() -> Option<u64> {
     let line = text.lines().find_map(|l| l.strip_prefix("MemAvailable:"))?;
     Some(line.split_whitespace().next()?.parse::<u64>().ok()? * 1024)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::path::Path;
+
+    #[test]
+    fn what_the_system_does_not_know_is_none() {
+        assert!(disk_free(Path::new("/tmp")).is_some_and(|bytes| bytes > 0));
+        assert_eq!([disk_free(Path::new("/no/such/folder")), disk_free(Path::new("/tmp\0"))], [None; 2]);
+        assert!(memory_available().is_some_and(|bytes| bytes > 0));
+    }
+}

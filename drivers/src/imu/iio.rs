@@ -18,10 +18,16 @@ use crate::source::{ImuBatch, ImuReading, ImuSource, SourceFault, Wait};
 use crate::types::{ImuSample, Nanos, Span};
 use crate::{Exit, Fault};
 use std::fs::{File, OpenOptions};
-use std::io::{ErrorKind, Read, Write};
+use std::io::{ErrorKind, Write};
 use std::os::fd::AsRawFd;
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
+
+/// In tests each of these calls can be made to fail.
+#[cfg(test)]
+use super::iio_tests::{poll, read};
+#[cfg(not(test))]
+use libc::{poll, read};
 
 #[derive(Clone, Debug, PartialEq)]
 pub struct IioOptions {
@@ -149,18 +155,14 @@ impl Device {
 
     /// Waits for scans; false where none came.
     fn wait(&self, timeout: Span) -> Result<bool, i32> {
-        let mut poll = libc::pollfd { fd: self.file.as_raw_fd(), events: libc::POLLIN, revents: 0 };
+        let mut asked = libc::pollfd { fd: self.file.as_raw_fd(), events: libc::POLLIN, revents: 0 };
         let ms = (timeout.0.max(0) as u64).div_ceil(1_000_000).min(i32::MAX as u64) as i32;
         // SAFETY: one entry, which outlives the call.
-        let ready = unsafe { libc::poll(&mut poll, 1, ms) };
-        match ready {
+        match unsafe { poll(&mut asked, 1, ms) } {
             0 => Ok(false),
-            1 if poll.revents & libc::POLLIN != 0 => Ok(true),
+            1 if asked.revents & libc::POLLIN != 0 => Ok(true),
             1 => Err(libc::ENODEV),
-            _ => match std::io::Error::last_os_error().raw_os_error() {
-                Some(libc::EINTR) => Ok(false),
-                errno => Err(errno.unwrap_or(libc::EIO)),
-            },
+            _ => failed(false),
         }
     }
 
@@ -169,12 +171,10 @@ impl Device {
         let kept = self.held.len();
         let room = self.scan.bytes * READ_SCANS;
         self.held.resize(kept + room, 0);
-        let read = self.file.read(&mut self.held[kept..]);
-        let n = match read {
-            Ok(0) => Err(libc::ENODEV),
-            Ok(n) => Ok(n),
-            Err(e) if matches!(e.kind(), ErrorKind::WouldBlock | ErrorKind::Interrupted) => Ok(0),
-            Err(e) => Err(e.raw_os_error().unwrap_or(libc::EIO)),
+        // SAFETY: `held` has room for that many bytes from there on, and outlives the call.
+        let n = match unsafe { read(self.file.as_raw_fd(), self.held[kept..].as_mut_ptr().cast(), room) } {
+            0 => Err(libc::ENODEV),
+            n => usize::try_from(n).or_else(|_| failed(0)),
         };
         self.held.truncate(kept + *n.as_ref().unwrap_or(&0));
         n?;
@@ -184,6 +184,14 @@ impl Device {
         self.held.drain(..whole);
         counters.imu_short_transfers += u64::from(!self.held.is_empty());
         Ok(scans)
+    }
+}
+
+/// What a call that failed answers: a signal, or nothing to read after all, is no fault.
+fn failed<T>(nothing: T) -> Result<T, i32> {
+    match std::io::Error::last_os_error().raw_os_error() {
+        Some(libc::EINTR | libc::EAGAIN) => Ok(nothing),
+        errno => Err(errno.unwrap_or(libc::EIO)),
     }
 }
 

@@ -2,16 +2,50 @@
 #![cfg(test)]
 #![allow(clippy::unwrap_used, unsafe_code)]
 
+use super::bus::BusFault;
 use super::iio::{IioImu, IioOptions};
 use super::unit::GRAVITY;
 use crate::host::monotonic;
 use crate::source::{ImuBatch, ImuReading, ImuSource, SourceFault, Wait};
 use crate::types::{Nanos, Span};
+use std::cell::Cell;
 use std::fs::{create_dir_all, read_to_string, File, OpenOptions};
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
 const MS: i64 = 1_000_000;
+
+thread_local! {
+    /// Which system call fails, with which error.
+    static STRUCK: Cell<(&'static str, i32)> = const { Cell::new(("", 0)) };
+}
+
+fn struck(call: &str) -> bool {
+    let (which, errno) = STRUCK.get();
+    if which == call {
+        // SAFETY: the errno of this thread.
+        unsafe { *libc::__errno_location() = errno };
+    }
+    which == call
+}
+
+pub unsafe fn poll(fds: *mut libc::pollfd, count: libc::nfds_t, ms: libc::c_int) -> libc::c_int {
+    if struck("poll") {
+        -1
+    } else {
+        // SAFETY: as the caller has it.
+        unsafe { libc::poll(fds, count, ms) }
+    }
+}
+
+pub unsafe fn read(fd: libc::c_int, into: *mut libc::c_void, count: usize) -> isize {
+    if struck("read") {
+        -1
+    } else {
+        // SAFETY: as the caller has it.
+        unsafe { libc::read(fd, into, count) }
+    }
+}
 
 struct Kernel {
     root: tempfile::TempDir,
@@ -301,6 +335,37 @@ fn every_error_of_reading_is_a_loss_that_says_which() {
         assert!(samples.is_empty() && lost.starts_with("lost: ") && lost.contains(said), "{node}: {lost}");
         let c = imu.seen();
         assert_eq!(c.imu_bus_errors + c.imu_gone, 1, "{node}: {c:?}");
+    }
+}
+
+#[test]
+fn every_error_of_every_call_is_a_loss_that_is_come_back_from_and_a_signal_is_none() {
+    let of_poll = [libc::EFAULT, libc::EINVAL, libc::ENOMEM].map(|errno| ("poll", errno));
+    let of_read = [libc::EBADF, libc::EBUSY, libc::EFAULT, libc::EINVAL, libc::EIO, libc::ENODEV, libc::ENOMEM];
+    let none = [("poll", libc::EINTR), ("read", libc::EINTR), ("read", libc::EAGAIN)];
+    let faults = of_poll.into_iter().chain(of_read.map(|errno| ("read", errno)));
+    for (call, errno, lost) in faults.map(|(c, e)| (c, e, true)).chain(none.map(|(c, e)| (c, e, false))) {
+        let kernel = Kernel::new();
+        kernel.device(0, "mpu6500", &["accel", "anglvel"]);
+        let mut imu = IioImu::open(&kernel.options("mpu6500")).unwrap();
+        let mut writer = kernel.writer(0);
+        writer.write_all(&scan(&[1, 2, 3, 4, 5, 6], 0, monotonic())).unwrap();
+        STRUCK.set((call, errno));
+        let (wait, samples) = next(&mut imu);
+        STRUCK.set(("", 0));
+        let said = BusFault::of(errno).to_string();
+        match wait {
+            Ok(wait) => assert!(!lost && wait == Wait::TimedOut, "{call} {errno}"),
+            Err(fault) => assert!(lost && fault.to_string().contains(&said), "{call} {errno}: {fault}"),
+        }
+        let c = imu.seen();
+        let counted = c.imu_bus_busy + c.imu_bus_errors + c.imu_gone;
+        assert!(samples.is_empty() && counted == u64::from(lost), "{call} {errno}: {c:?}");
+        let until = monotonic() + Span(2000 * MS);
+        while next(&mut imu).0 != Ok(Wait::Got) {
+            assert!(monotonic() < until, "{call} {errno}: {:?}", imu.seen());
+        }
+        assert_eq!(imu.seen().imu_restarts, u64::from(lost), "{call} {errno}");
     }
 }
 
