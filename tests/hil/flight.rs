@@ -2,11 +2,11 @@
 //! on I2C with a data-ready line, and `stipple run` flies it. For the virtual machine: `make hil TESTS=flight`.
 //!
 //! Physics cannot be slowed down for a slow machine, so the machine's time is: its clock counts the instructions that it
-//! executes, one a nanosecond, and stands still while the host is busy with something else (`run-vm.sh -i`). To what runs
-//! there the recording plays at its own pace.
+//! executes, eight a nanosecond, and stands still while the host is busy with something else (`run-vm.sh -i -w 8`). To what
+//! runs there the recording plays at its own pace.
 //!
 //! The trajectory must be that of a replay from a folder: to a millimetre of what the run recorded itself, and within a
-//! centimetre (rms) of the same pictures and samples with the instants at which they were due, where what the run saw bears
+//! centimetre of the same pictures and samples with the instants at which they were due, where what the run saw bears
 //! those that the kernel stamped. No alignment: a pose is compared with the pose of the same picture.
 #![allow(clippy::unwrap_used)]
 
@@ -38,10 +38,12 @@ const BEFORE: Span = Span(200 * MS);
 const AFTER: Span = Span(250 * MS);
 /// Inertial samples of the recording on either side of its pictures.
 const AROUND: Span = Span(100 * MS);
-/// Of a replay of what was given, m. Machine Hall's last seconds magnify whatever differs: a replay whose pictures bear
-/// stamps 1 us later is 1.5 mm rms and 5.3 mm at most from the one that does not, and 165 us are 2.4 mm and 7.4 mm.
+/// Of a replay of what was given, m. What differs is stamps, and what they decide: with two dozen landmarks in view at this
+/// size, a track more or less through the innovation gate moves a pose by its stated deviation, 4 mm. Of replays whose
+/// pictures bear stamps 0.1 us (deviation) off the median is 5.3 mm at most and the worst of 25 is 7.2 mm; 165 us off all of
+/// them, 5.4 and 7.4 mm; 7 us off the inertial ones 2 mm.
 const RMS_MAX: f64 = 0.005;
-const WORST_MAX: f64 = 0.015;
+const WORST_MAX: f64 = 0.01;
 const PATIENCE: Duration = Duration::from_secs(60);
 
 fn environment(name: &str) -> PathBuf {
@@ -157,6 +159,29 @@ impl Devices {
         self.cameras[k] = camera(&self.flight, k, self.ports, self.size);
         self.cameras[k].order(&format!("play {}", self.start.0));
         self.ports += 1;
+    }
+
+    /// Every sample that was given while the recording played arrived, once, in order; answers what was recorded.
+    fn samples_are_whole(&self, dir: &Path) -> Recording {
+        let kept = Recording::open(&dir.join("kept"), &OpenOptions::default()).unwrap();
+        let during = |t: Nanos| (self.start..self.end()).contains(&t);
+        let arrived: Vec<_> = kept.imu.iter().filter(|s| during(s.t)).collect();
+        println!("samples given after they were due by {}", median_and_worst(self.feed.slow(self.start)));
+        let late = self.feed.late(&arrived).expect("what arrived is what was given, without a gap");
+        println!("{} samples arrived, stamp less due: {}", late.len(), median_and_worst(late));
+        kept
+    }
+
+    /// Every picture that both cameras sent was tracked or counted, most were tracked; answers how many.
+    fn pairs_are_tracked(&self, r: &Value) -> u64 {
+        let [left, right] = [0, 1].map(|k| self.cameras[k].sent());
+        let pairs = left.iter().filter(|k| right.contains(k)).count() as u64;
+        let frames = r["frames"].as_u64().unwrap();
+        let lost = r["frames_dropped"].as_u64().unwrap() + count(r, "camera_images_unpaired");
+        println!("{} and {} pictures sent, {pairs} pairs: {frames} tracked, {lost} counted", left.len(), right.len());
+        assert_eq!((frames + lost, count(r, "camera_frames")), (pairs, pairs));
+        assert!(frames * 10 >= 9 * self.stamps.len() as u64, "the machine is fast enough for nine in ten");
+        frames
     }
 
     /// A board file of them.
@@ -312,21 +337,8 @@ fn flight_through_the_kernel_is_the_flight_from_a_folder() {
     let r = report(&out);
     println!("{}", counted(&r));
 
-    // Every picture that both cameras sent was tracked or counted.
-    let [left, right] = [0, 1].map(|k| devices.cameras[k].sent());
-    let pairs = left.iter().filter(|k| right.contains(k)).count() as u64;
-    let frames = r["frames"].as_u64().unwrap();
-    let lost = r["frames_dropped"].as_u64().unwrap() + count(&r, "camera_images_unpaired");
-    println!("{} and {} pictures sent, {pairs} pairs: {frames} tracked, {lost} counted", left.len(), right.len());
-    assert_eq!((frames + lost, count(&r, "camera_frames")), (pairs, pairs));
-    assert!(frames * 10 >= 9 * devices.stamps.len() as u64, "the machine is fast enough for nine in ten");
-
-    // Every sample that was given while the recording played arrived, once, in order.
-    let kept = Recording::open(&dir.join("kept"), &OpenOptions::default()).unwrap();
-    let during = |t: Nanos| (devices.start..devices.end()).contains(&t);
-    let arrived: Vec<_> = kept.imu.iter().filter(|s| during(s.t)).collect();
-    let late = devices.feed.late(&arrived).expect("what arrived is what was given, without a gap");
-    println!("{} samples arrived, stamp less due: {}", late.len(), median_and_worst(late));
+    let frames = devices.pairs_are_tracked(&r);
+    let kept = devices.samples_are_whole(dir);
     let late = kept.frames.iter().map(|f| (f.t - devices.exposed(devices.picture(f.t))).0).collect();
     println!("{} frames were kept, stamp less exposure: {}", kept.frames.len(), median_and_worst(late));
 
@@ -366,8 +378,9 @@ fn flight_goes_on_after_a_plug_was_pulled() {
     }
     assert!((1000..4000).contains(&count(&r, "eye_away_ms")));
     assert_eq!(r["heap_after_seal"], 0);
-    // Files that the kernel reads for the new node cost this machine time, and so may cost a sample: counted, then.
-    assert_eq!(count(&r, "imu_missing"), count(&r, "imu_samples_missing"));
+    devices.samples_are_whole(dir);
+    let lost = ["imu_missing", "imu_samples_missing", "imu_edges_unmatched", "imu_edges_refused", "imu_clock_slips"];
+    lost.iter().for_each(|name| assert_eq!(count(&r, name), 0, "{name}"));
     devices.given(dir);
     let given = replayed(dir, &dir.join("board.toml"), "given");
     let (n, rms, worst) = apart(&devices, &dir.join("out"), &given);

@@ -8,6 +8,8 @@
 #   -s CPUS      processors (default 1: under emulation wake-ups across processors are some 15 times slower)
 #   -i           time is work: the machine's clock counts its instructions, one a nanosecond, and leaps over idleness, so
 #                that what runs there meets its times however slow the host is; one processor
+#   -w N         with -i: N instructions a nanosecond, by a kernel that is told that its counter of cycles runs N times as
+#                fast: a machine N times as fast to what runs there, in N times the wall time of what keeps it busy
 #   -S           boot systemd of the shared root as PID 1; CMD then runs as a unit
 #   -o FOLDER    mounted read-write at /out in the guest, $OUT there (default: a temporary folder)
 #   -A "ARGS"    more of the kernel's command line
@@ -18,10 +20,10 @@
 set -euo pipefail
 here=$(dirname "$(realpath "$0")")
 HIL=${HIL:-$(realpath "$here/../..")/target/hil}
-accel=${HIL_ACCEL:-tcg} memory=2048 cpus=1 seconds=300 out= counted=0 systemd=0 qemu_more= append_more=
-usage() { sed -n 2,17p "$0"; exit 2; }
-while getopts t:m:s:iSo:A:q: option; do case $option in
-  t) seconds=$OPTARG;; m) memory=$OPTARG;; s) cpus=$OPTARG;; i) counted=1;; S) systemd=1;;
+accel=${HIL_ACCEL:-tcg} memory=2048 cpus=1 seconds=300 out= counted=0 work=1 systemd=0 qemu_more= append_more=
+usage() { sed -n 2,19p "$0"; exit 2; }
+while getopts t:m:s:iw:So:A:q: option; do case $option in
+  t) seconds=$OPTARG;; m) memory=$OPTARG;; s) cpus=$OPTARG;; i) counted=1;; w) work=$OPTARG;; S) systemd=1;;
   o) out=$OPTARG;; A) append_more=$OPTARG;; q) qemu_more=$OPTARG;; *) usage;; esac; done
 shift $((OPTIND-1)); [ $# -gt 0 ] || usage
 kernel=$HIL/kernel
@@ -144,6 +146,7 @@ EOF2
 
 [ "$accel" != auto ] || { accel=tcg; [ -w /dev/kvm ] && grep -qwE 'vmx|svm' /proc/cpuinfo && accel=kvm; }
 [ $counted = 0 ] || accel=tcg,thread=single qemu_more="-icount shift=0,sleep=off $qemu_more"
+[ "$work" = 1 ] || append_more="tsc_early_khz=${work}000000 tsc=reliable $append_more"
 case $accel in kvm*) cpu=host;; *) cpu=max,-erms,-fsrm; [ "$accel" != tcg ] || accel=tcg,thread=multi;; esac
 # Emulation takes whole cores: machines wait for each other.
 exec 8>"${HIL_LOCK:-$HIL/vm.lock}"; flock 8

@@ -20,6 +20,9 @@ const GYRO: f64 = 2000.0 / 32768.0 * std::f64::consts::PI / 180.0;
 /// Of accelerometer and gyro, in the order of the registers.
 pub type Counts = [i16; 6];
 
+/// Samples that were given, and when.
+type Given = Vec<(Counts, Nanos)>;
+
 pub fn counts(s: &ImuSample) -> Counts {
     let [a, g] = [s.accel_body / ACCEL, s.gyro_body / GYRO].map(|v| v.to_array().map(|v| v.round() as i16));
     [a[0], a[1], a[2], g[0], g[1], g[2]]
@@ -35,14 +38,14 @@ pub struct Feed {
     /// Sample `n` is due `n` periods after it.
     first: Nanos,
     begins: Arc<AtomicUsize>,
-    given: Arc<Mutex<Vec<Counts>>>,
+    given: Arc<Mutex<Given>>,
     stop: Arc<AtomicBool>,
     thread: Option<JoinHandle<()>>,
 }
 
 impl Feed {
     pub fn start(recorded: Vec<Counts>) -> Feed {
-        let (begins, given, stop): (Arc<AtomicUsize>, Arc<Mutex<Vec<Counts>>>, Arc<AtomicBool>) = Default::default();
+        let (begins, given, stop): (Arc<AtomicUsize>, Arc<Mutex<Given>>, Arc<AtomicBool>) = Default::default();
         let lines = std::env::var("HIL_LINES").expect("set by lines.sh");
         let open = |path: &Path| OpenOptions::new().write(true).open(path).unwrap();
         let registers = open(Path::new("/sys/kernel/debug/hil-imu/regs"));
@@ -56,7 +59,7 @@ impl Feed {
                     return;
                 }
                 let counts = recorded[n0.load(Relaxed).abs_diff(n) % recorded.len()];
-                list.lock().unwrap().push(counts);
+                list.lock().unwrap().push((counts, monotonic()));
                 give(&registers, &ready, counts);
             }
         });
@@ -77,7 +80,7 @@ impl Feed {
     /// All that was given, as an EuRoC table.
     pub fn csv(&self) -> String {
         let mut text = "#t,gyro,accel\n".to_string();
-        for (n, c) in self.given.lock().unwrap().iter().enumerate() {
+        for (n, (c, _)) in self.given.lock().unwrap().iter().enumerate() {
             let (t, s) = (self.due(n), sample(self.due(n), *c));
             let (g, a) = (s.gyro_body, s.accel_body);
             writeln!(text, "{},{:.9},{:.9},{:.9},{:.9},{:.9},{:.9}", t.0, g.x, g.y, g.z, a.x, a.y, a.z).unwrap();
@@ -85,9 +88,17 @@ impl Feed {
         text
     }
 
+    /// How much later than due each was given from `t` on, ns: none of a real unit, and of this one what the kernel held
+    /// its processor for.
+    pub fn slow(&self, t: Nanos) -> Vec<i64> {
+        let given = self.given.lock().unwrap();
+        given.iter().enumerate().filter(|(_, g)| g.1 > t).map(|(n, g)| (g.1 - self.due(n)).0).collect()
+    }
+
     /// How much later than due each was stamped, ns; none where they are not what was given one after the other.
     pub fn late(&self, arrived: &[&ImuSample]) -> Option<Vec<i64>> {
-        let (seen, given): (Vec<Counts>, _) = (arrived.iter().map(|s| counts(s)).collect(), self.given.lock().unwrap());
+        let seen: Vec<Counts> = arrived.iter().map(|s| counts(s)).collect();
+        let given: Vec<Counts> = self.given.lock().unwrap().iter().map(|g| g.0).collect();
         let at = given.windows(seen.len()).position(|w| w == seen)?;
         Some(arrived.iter().enumerate().map(|(i, s)| (s.t - self.due(at + i)).0).collect())
     }
