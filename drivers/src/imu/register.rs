@@ -68,6 +68,8 @@ pub struct RegisterImu<B: Bus, E: Edges> {
     reads: u64,
     /// When each unit gave its last sample, or was started.
     heard: [Nanos; 2],
+    /// Nothing was read since the start.
+    fresh: bool,
     counters: ImuCounters,
 }
 
@@ -97,6 +99,7 @@ impl<B: Bus, E: Edges> RegisterImu<B, E> {
             due: Nanos(0),
             reads: 0,
             heard: [Nanos(0); 2],
+            fresh: true,
             counters: ImuCounters::default(),
         };
         imu.started();
@@ -137,7 +140,7 @@ impl<B: Bus, E: Edges> RegisterImu<B, E> {
         self.queue.clear();
         self.merge.iter_mut().for_each(Merge::clear);
         let now = self.now();
-        (self.failures, self.due, self.heard) = (0, now, [now; 2]);
+        (self.failures, self.due, self.heard, self.fresh) = (0, now, [now; 2], true);
         self.schedule();
     }
 
@@ -207,6 +210,11 @@ impl<B: Bus, E: Edges> RegisterImu<B, E> {
 
     fn collect(&mut self, batch: &mut ImuBatch) {
         let with_edges = self.has_edges();
+        // What piled up while the rest of the program started was for nobody, and silence counts from here.
+        let fresh = std::mem::take(&mut self.fresh);
+        if fresh {
+            self.heard = [self.now(); 2];
+        }
         let mut worst = None;
         for (i, unit) in self.units.iter_mut().enumerate() {
             let edges = (i == 0 && with_edges).then_some(&mut self.queue);
@@ -223,6 +231,7 @@ impl<B: Bus, E: Edges> RegisterImu<B, E> {
                         self.failures = 0;
                     }
                 }
+                Err(Trouble::Overflow) if fresh => {}
                 Err(trouble) => worst = Some(trouble),
             }
         }

@@ -306,6 +306,18 @@ fn a_stalled_host_overflows_the_fifo_which_is_counted_and_cleared() {
 }
 
 #[test]
+fn what_piled_up_before_the_first_read_is_no_overflow() {
+    for chip in CHIPS {
+        let mut rig = Rig::new(chip.name);
+        rig.buses[0].world().stall = 2000 * MS;
+        rig.run(3500);
+        let c = rig.counted();
+        assert_eq!((c.imu_fifo_overflows, c.imu_gaps, c.imu_restarts), (0, 0, 0), "{}: {c:?}", chip.name);
+        assert!(rig.seen.len() > 250, "{}: {}", chip.name, rig.seen.len());
+    }
+}
+
+#[test]
 fn a_fifo_that_says_it_lost_samples_is_cleared_however_little_is_in_it() {
     for (chip, count) in [("bmi088", [0x83, 0]), ("lsm6dsox", [4, 0x48]), ("lsm6dsox", [4, 0x08])] {
         let mut rig = Rig::new(chip);
