@@ -1,6 +1,7 @@
 //! `stipple check --dataset`: what a recording says of its own calibration.
 
-use super::doctor::rotation::{compare, Comparison, Turning};
+use super::doctor::agreement::{agreement, Agreement};
+use super::doctor::rotation::Turning;
 use super::doctor::{signals, Check};
 use crate::config::{Board, FrontendConfig, ReplayConfig, StereoConfig};
 use crate::stereo::alignment::Alignment;
@@ -70,7 +71,7 @@ pub fn check_dataset(dataset: &Path, board: Option<&Board>) -> Result<(), Fault>
 const FOLLOWED: usize = 300;
 
 /// The rotation of camera 0 against the gyro's.
-fn turned(recording: &Recording, reader: &mut Reader, config: &FrontendConfig) -> Result<Option<Comparison>, Fault> {
+fn turned(recording: &Recording, reader: &mut Reader, config: &FrontendConfig) -> Result<Option<Agreement>, Fault> {
     let rate = |t: Nanos| {
         let at = recording.imu.partition_point(|s| s.t < t);
         recording.imu.get(at).map_or(0.0, |s| s.gyro_body.length())
@@ -91,5 +92,5 @@ fn turned(recording: &Recording, reader: &mut Reader, config: &FrontendConfig) -
             turning.add(&frames);
         }
     }
-    Ok(compare(&turning.rates, &recording.imu, recording.calibration.cameras[0].body_from_cam.q))
+    Ok(agreement(&turning.turns, &recording.imu, recording.calibration.cameras[0].body_from_cam.q))
 }

@@ -2,7 +2,9 @@
 //!
 //! What it asks of the user is to hold the rig still for two seconds and then to turn it about all three axes.
 
+pub mod agreement;
 pub mod machine;
+pub mod motion;
 pub mod rotation;
 pub mod signals;
 
@@ -15,7 +17,8 @@ use crate::config::Board;
 use crate::counters::Counters;
 use crate::stereo::alignment::Alignment;
 use crate::stereo::rectify::Rectification;
-use rotation::{compare, Turning};
+use agreement::agreement;
+use rotation::Turning;
 use signals::Light;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
@@ -204,7 +207,7 @@ fn sensed(rig: Rig, board: &Board, look_s: f64) -> Result<Vec<Check>, Fault> {
     checks.push(seen.pairs.check(board));
     checks.extend(signals::inertia(&seen.samples, &calibration));
     checks.push(signals::saturation(&seen.samples, seen.counters.imu_saturated.get(), board));
-    let found = compare(&seen.turning.rates, &seen.samples, calibration.cameras[0].body_from_cam.q);
+    let found = agreement(&seen.turning.turns, &seen.samples, calibration.cameras[0].body_from_cam.q);
     checks.extend(signals::turning(found.as_ref()));
     Ok(checks)
 }
