@@ -58,6 +58,8 @@ counters! {
     imu_away_ms,
     /// Inertial samples refused: not finite, or not newer than the last.
     imu_rejected,
+    /// Inertial samples of which one axis was no motion (a flipped bit), and was put between its neighbours.
+    imu_repaired,
     /// Tracks beyond TRACKS.
     tracks_full,
     /// Landmarks beyond LANDMARKS.

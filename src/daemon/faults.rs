@@ -31,7 +31,7 @@ const TRUTH_HOLE: Span = Span(100_000_000);
 /// Frames in order after which odometry is itself again: a quarter of a second.
 const HEALTHY_FRAMES: usize = 5;
 /// What tells a fault.
-const DETECTORS: [&str; 21] = [
+const DETECTORS: [&str; 22] = [
     "frames_missing",
     "frames_not_newer",
     "frames_leapt",
@@ -52,6 +52,7 @@ const DETECTORS: [&str; 21] = [
     "imu_overflow",
     "imu_gaps",
     "imu_rejected",
+    "imu_repaired",
     "resets",
 ];
 

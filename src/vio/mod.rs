@@ -23,6 +23,7 @@ pub mod samples;
 pub mod shutter;
 pub mod sight;
 pub mod solve;
+pub mod spikes;
 pub mod stages;
 mod stats;
 mod trust;
@@ -203,6 +204,9 @@ impl<S: Real> Estimator<S> {
         self.stats.imu_saturated += (clipped.0 || clipped.1) as u64;
         self.pending.set(Health::IMU_SATURATED, clipped.0 || clipped.1);
         let overwritten = self.imu.push(s);
+        let repaired = self.imu.repair(&self.noise);
+        self.stats.imu_repaired += u64::from(repaired);
+        self.pending.set(Health::IMU_REJECTED, repaired);
         self.trust.fold(s.t, &self.imu, &self.noise);
         let needed_from = self.window.newest().map(|n| self.window.frame(n).t);
         if let (Some(old), Some(t)) = (overwritten, needed_from) {

@@ -3,6 +3,7 @@
 //! Samples are interpolated at the ends of what is integrated; outside the samples the nearest is held.
 
 use super::preintegration::{Increment, Noise};
+use super::spikes::Spikes;
 use crate::limits::IMU_BETWEEN_FRAMES;
 use glam::DVec3;
 use stipple_drivers::{ImuSample, Nanos, Span};
@@ -36,11 +37,13 @@ pub struct ImuRing {
     /// Samples ever pushed.
     count: usize,
     leap: Leap,
+    spikes: Spikes,
 }
 
 impl ImuRing {
     pub fn new() -> ImuRing {
-        ImuRing { samples: vec![ImuSample::default(); IMU_BETWEEN_FRAMES], count: 0, leap: Leap::default() }
+        let samples = vec![ImuSample::default(); IMU_BETWEEN_FRAMES];
+        ImuRing { samples, count: 0, leap: Leap::default(), spikes: Spikes::default() }
     }
 
     pub const BYTES: usize = IMU_BETWEEN_FRAMES * size_of::<ImuSample>();
@@ -62,6 +65,20 @@ impl ImuRing {
         self.samples[at] = s;
         self.count += 1;
         old
+    }
+
+    /// Judges the sample before the newest; answers whether it was repaired. What was integrated up to it before stays.
+    pub fn repair(&mut self, noise: &Noise) -> bool {
+        if self.len() < 3 {
+            return false;
+        }
+        let [before, now, after] = [3, 2, 1].map(|back| (self.count - back) % IMU_BETWEEN_FRAMES);
+        let [a, b, c] = [before, now, after].map(|at| &self.samples[at]);
+        let repaired = self.spikes.repaired(a, b, c, noise);
+        if let Some(s) = repaired {
+            self.samples[now] = s;
+        }
+        repaired.is_some()
     }
 
     fn len(&self) -> usize {

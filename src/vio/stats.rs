@@ -8,6 +8,8 @@ pub struct Stats {
     pub frames: u64,
     pub keyframes: u64,
     pub imu_rejected: u64,
+    /// Samples of which one axis could not be motion, and was put between its neighbours.
+    pub imu_repaired: u64,
     pub imu_overflow: u64,
     /// Samples at the end of the sensor's range.
     pub imu_saturated: u64,
@@ -43,9 +45,10 @@ pub struct Stats {
 
 impl Stats {
     /// What was dropped, refused or went wrong, by name.
-    pub fn counters(&self) -> [(&'static str, u64); 19] {
+    pub fn counters(&self) -> [(&'static str, u64); 20] {
         [
             ("imu_rejected", self.imu_rejected),
+            ("imu_repaired", self.imu_repaired),
             ("imu_overflow", self.imu_overflow),
             ("imu_saturated", self.imu_saturated),
             ("imu_gaps", self.imu_gaps),
