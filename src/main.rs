@@ -373,6 +373,10 @@ fn main() -> ExitCode {
             return if e.use_stderr() { ExitCode::from(Exit::Usage as u8) } else { ExitCode::SUCCESS };
         }
     };
+    // What these say is all that they do: who stops reading, as `head` does, has read enough.
+    if matches!(cli.command, Command::Check { .. } | Command::Doctor { .. }) {
+        stipple_drivers::host::end_when_unread();
+    }
     match run(cli.command) {
         Ok(()) => ExitCode::SUCCESS,
         Err(fault) => {

@@ -4,7 +4,7 @@
 
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output};
+use std::process::{Command, Output, Stdio};
 
 const BOARD: &str = "board-configs/lavapipe.toml";
 const UNAVAILABLE: i32 = 69;
@@ -156,4 +156,24 @@ fn each_part_of_a_board_is_looked_for_where_one_is_not_there() {
         assert!(verdict == "fail" && line.contains(what), "{said}");
     }
     assert!(said.contains("3 checks failed"), "{said}");
+}
+
+#[test]
+fn what_is_missing_of_a_recording_is_said_and_whoever_reads_may_stop() {
+    let dir = tempfile::tempdir().unwrap();
+    let data = flight(dir.path(), &[]);
+    let images: Vec<PathBuf> = fs::read_dir(data.join("mav0/cam1/data")).unwrap().map(|e| e.unwrap().path()).collect();
+    images.iter().step_by(2).for_each(|image| fs::remove_file(image).unwrap());
+    let said = check(&data);
+    assert!(said.contains("looked at cannot be read") && said.contains("images_missing"), "{said}");
+    assert_eq!(said.matches("first: ").count(), 1, "{said}");
+    let mut child = Command::new(env!("CARGO_BIN_EXE_stipple"))
+        .args(["check", "--dataset", data.to_str().unwrap()])
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    drop(child.stdout.take());
+    let o = child.wait_with_output().unwrap();
+    assert_eq!(String::from_utf8_lossy(&o.stderr), "", "{:?}", o.status);
 }

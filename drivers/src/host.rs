@@ -61,6 +61,14 @@ pub fn monotonic() -> crate::Nanos {
     crate::Nanos(t.tv_sec * 1_000_000_000 + t.tv_nsec)
 }
 
+/// From now on a write that nobody reads any more ends the program quietly, as it does others; Rust would panic.
+pub fn end_when_unread() {
+    // SAFETY: sets the signal's own default action; no handler of ours is involved.
+    unsafe {
+        libc::signal(libc::SIGPIPE, libc::SIG_DFL);
+    }
+}
+
 static STOP: AtomicBool = AtomicBool::new(false);
 
 extern "C" fn ask_to_stop(_signal: libc::c_int) {

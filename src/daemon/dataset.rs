@@ -39,18 +39,28 @@ pub fn check_dataset(dataset: &Path, board: Option<&Board>) -> Result<(), Fault>
     let (mut frames, mut reader) = (Frames::for_rig(&recording.calibration), recording.reader());
     let mut pair = [Image::new(p.width, p.height), Image::new(p.width, p.height)];
     let mut alignment = Alignment::default();
-    let mut read = 0;
-    for k in 0..LOOKED_AT.min(recording.frames.len()) {
-        let index = (2 * k + 1) * recording.frames.len() / (2 * LOOKED_AT.min(recording.frames.len()));
+    let (mut read, looked_at) = (0, LOOKED_AT.min(recording.frames.len()));
+    for k in 0..looked_at {
+        let index = (2 * k + 1) * recording.frames.len() / (2 * looked_at);
         if reader.read(index, &mut frames).is_ok() {
             (0..2).for_each(|i| maps[i].apply(&frames.images[i], &mut pair[i]));
             alignment.add(&pair[0], &pair[1], stereo.disparities as usize);
             read += 1;
         }
     }
-    println!("{:<6} {} stereo frames, {read} looked at", "", recording.frames.len());
+    println!("{:<6} {} stereo frames, {looked_at} looked at", "", recording.frames.len());
     let frontend = board.map_or_else(FrontendConfig::default, |b| b.frontend.clone());
     let turned = turned(&recording, &mut reader, &frontend)?;
+    if read < looked_at {
+        println!("{:<6} images: {} of the {looked_at} looked at cannot be read", "warn", looked_at - read);
+    }
+    for (name, n) in [recording.counters.list(), reader.counters().list()].concat().into_iter().filter(|(_, n)| *n > 0)
+    {
+        println!("{:<6} {name} {n}", "warn");
+    }
+    for said in [recording.warnings.first(), reader.warnings().first()].into_iter().flatten() {
+        println!("       first: {said}");
+    }
     let corners = alignment.rows.len();
     match alignment.summary() {
         None => println!("{:<6} vertical disparity: only {corners} corners match, too few to say", "warn"),
