@@ -160,3 +160,13 @@ fn a_senseless_rule_is_named() {
     assert_eq!(o.status.code(), Some(78));
     assert!(text(&o).contains("inject.imu, rule 1") && text(&o).contains("no light"), "{}", text(&o));
 }
+
+#[test]
+fn a_flight_goes_on_when_nobody_reads_what_it_says() {
+    let dir = tempfile::tempdir().unwrap();
+    let (data, out) = (flight(dir.path(), "4"), dir.path().join("out"));
+    let mut child = run(&data, &out, BOARD).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    drop((child.stdout.take(), child.stderr.take()));
+    assert!(child.wait().unwrap().success());
+    assert!(out.join("report.json").is_file());
+}

@@ -1,6 +1,7 @@
 //! The sensors that a board file names: cameras through V4L2, an inertial unit on its bus or through the kernel, and the
 //! line that triggers the cameras.
 
+use super::progress::tell;
 use super::sensors::Sensors;
 use crate::config::Board;
 use std::path::Path;
@@ -30,7 +31,7 @@ pub fn open(path: &Path, board: &Board) -> Result<(Calibration, Sensors), Fault>
     let data_ready = board.gpio.data_ready().map(|(line, edge)| DataReady::open(&line, edge)).transpose()?;
     let imu = CorrectedImu { source: options.open(data_ready)?, correction: calibration.imu.correction };
     let rig = v4l2::Rig::open(board.camera.settings(&calibration)?, &calibration)?;
-    rig.describe().iter().for_each(|line| eprintln!("stipple: {line}"));
+    rig.describe().iter().for_each(|line| tell(format_args!("stipple: {line}")));
     let frames: Box<dyn FrameSource> = match board.gpio.trigger() {
         None => Box::new(rig),
         Some((line, active_low, pulse)) => {

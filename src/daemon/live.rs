@@ -5,7 +5,7 @@ use super::input::Input;
 use super::light::Light;
 use super::mapping::Mapping;
 use super::play::{realtime, Realtime};
-use super::progress::Progress;
+use super::progress::{print, tell, Progress};
 use super::sensors::Sensors;
 use super::tracking::{OdometryRun, Tracking};
 use super::{hardware, memory, record, summary};
@@ -57,7 +57,7 @@ pub fn run(path: &Path, out: &Path, set: &[String], options: &Run) -> Result<(),
     let tracking = Tracking::Odometry(Box::new(OdometryRun::new(&rig.calibration, &board, rig.frames)?));
     let mapping = if board.map.enabled { Some(Mapping::open(&rig.calibration, &board)?) } else { None };
     for warning in &rig.warnings {
-        eprintln!("stipple: warning: {warning}");
+        tell(format_args!("stipple: warning: {warning}"));
     }
     let recorder = match &options.record {
         Some(dir) => {
@@ -85,7 +85,7 @@ pub fn run(path: &Path, out: &Path, set: &[String], options: &Run) -> Result<(),
     let mut played = realtime(sensors, &rig.calibration, tracking, mapping, &realtime_options, &mut progress);
     progress.finish();
     for warning in &played.warnings {
-        eprintln!("stipple: warning: {warning}");
+        tell(format_args!("stipple: warning: {warning}"));
     }
     played.warnings = [rig.warnings, played.warnings].concat();
     let cameras = played.capture.and_then(|c| c.line(&played.source));
@@ -95,8 +95,8 @@ pub fn run(path: &Path, out: &Path, set: &[String], options: &Run) -> Result<(),
         played.source.extend(&recorded.counters);
     }
     let report = summary::conclude(title, played, &out)?;
-    println!("{}", summary::seven_lines(&report, &out));
-    cameras.into_iter().for_each(|line| println!("cameras     {line}"));
+    print(summary::seven_lines(&report, &out));
+    cameras.into_iter().for_each(|line| print(format_args!("cameras     {line}")));
     recorded.map_or(Ok(()), |(recorded, dir)| record::whole(&recorded, dir))?;
     broken.map_or(Ok(()), Err)?;
     progress.ended_well();

@@ -55,6 +55,7 @@ use crate::output::OutputDir;
 use input::Input;
 use mapping::Mapping;
 use play::{play, Play};
+use progress::{print, tell};
 use std::path::{Path, PathBuf};
 use stipple_drivers::replay::read_trajectory;
 use stipple_drivers::sim::{rig_named, write_euroc, write_euroc_colour, Scenario, Sim, RIGS};
@@ -76,7 +77,7 @@ pub fn replay(dataset: &Path, board: &Path, out: &Path, set: &[String], options:
     let input = Input::recording(dataset, &board.replay, &board.rig)?;
     let out = OutputDir::create(out)?;
     let report = run(input, &dataset.display().to_string(), &board, &out, options)?;
-    println!("{}", summary::seven_lines(&report, &out));
+    print(summary::seven_lines(&report, &out));
     Ok(())
 }
 
@@ -105,7 +106,7 @@ pub fn demo(board: Option<&Path>, out: &Path, set: &[String]) -> Result<(), Faul
         mapping_s: None,
     };
     let report = run(input, "the simulated flight", &board, &out, &options)?;
-    println!("{}", summary::seven_lines(&report, &out));
+    print(summary::seven_lines(&report, &out));
     Ok(())
 }
 
@@ -160,7 +161,7 @@ fn run(mut input: Input, place: &str, board: &Board, out: &OutputDir, options: &
     };
     let mapping = if board.map.enabled { Some(Mapping::open(&input.calibration, board)?) } else { None };
     for warning in &input.warnings {
-        eprintln!("stipple: warning: {warning}");
+        tell(format_args!("stipple: warning: {warning}"));
     }
     let title = summary::Title {
         dataset: input.name.clone(),
@@ -183,7 +184,7 @@ fn run(mut input: Input, place: &str, board: &Board, out: &OutputDir, options: &
     };
     let played = play(input, tracking, mapping, &options);
     for warning in &played.warnings[opened..] {
-        eprintln!("stipple: warning: {warning}");
+        tell(format_args!("stipple: warning: {warning}"));
     }
     if played.counters.frames_unreadable.get() == asked {
         let first = played.warnings.get(opened).map_or("", String::as_str);

@@ -2,7 +2,8 @@
 
 use super::light::Light;
 use indicatif::{ProgressBar, ProgressStyle};
-use std::io::IsTerminal;
+use std::fmt;
+use std::io::{self, IsTerminal, Write as _};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
 use std::time::{Duration, Instant};
 
@@ -38,7 +39,7 @@ const LINE_PERIOD: Duration = Duration::from_secs(1);
 impl Progress {
     pub fn new(total_s: Option<f64>) -> Progress {
         let total_ms = total_s.map(|s| (s.max(0.0) * 1e3) as u64);
-        let bar = std::io::stderr().is_terminal().then(|| {
+        let bar = io::stderr().is_terminal().then(|| {
             let bar = total_ms.map_or_else(ProgressBar::new_spinner, ProgressBar::new);
             let drawn = if total_ms.is_some() { "{bar:30} {percent:>3}%" } else { "{spinner}" };
             let style = ProgressStyle::with_template(&format!("{drawn} {{elapsed}} {{msg}}"));
@@ -78,7 +79,7 @@ impl Progress {
             None if self.next_line.is_some_and(|due| Instant::now() >= due) => {
                 self.next_line = self.next_line.map(|due| due + LINE_PERIOD);
                 let of = self.total_ms.map_or(String::new(), |ms| format!(" of {:.1}", ms as f64 * 1e-3));
-                eprintln!("{:.1}{of} s: {}", played as f64 * 1e-3, line(g));
+                tell(format_args!("{:.1}{of} s: {}", played as f64 * 1e-3, line(g)));
             }
             None => {}
         }
@@ -88,7 +89,7 @@ impl Progress {
     pub fn say(&self, text: &str) {
         match &self.bar {
             Some(bar) => bar.println(format!("stipple: {text}")),
-            None if self.next_line.is_some() => eprintln!("stipple: {text}"),
+            None if self.next_line.is_some() => tell(format_args!("stipple: {text}")),
             None => {}
         }
     }
@@ -111,4 +112,14 @@ fn line(g: &Gauges) -> String {
         g.splats.load(Relaxed),
         g.iterations.load(Relaxed),
     )
+}
+
+/// A line of a run to standard error. That nobody reads it any more is no reason to end a flight.
+pub fn tell(line: fmt::Arguments) {
+    let _ = writeln!(io::stderr(), "{line}");
+}
+
+/// What a run came to, to standard output; likewise.
+pub fn print(line: impl fmt::Display) {
+    let _ = writeln!(io::stdout(), "{line}");
 }

@@ -5,7 +5,7 @@
 use super::light::Light;
 use super::live::{rig_of, Run};
 use super::pipeline::Bell;
-use super::progress::{Gauges, Progress};
+use super::progress::{print, Gauges, Progress};
 use super::sensors::{self, Inbox, Sensors};
 use crate::config::Board;
 use crate::counters::Counters;
@@ -53,15 +53,15 @@ pub fn record(path: &Path, out: &Path, format: Format, set: &[String], options: 
     });
     progress.finish();
     let line = inbox.capture.get().and_then(|c| c.line(&frames.counters()));
-    line.into_iter().for_each(|line| println!("cameras     {line}"));
+    line.into_iter().for_each(|line| print(format_args!("cameras     {line}")));
     drop((frames, imu));
     let recorded = recorder.finish();
     for (name, n) in counters.list().iter().chain(&recorded.counters) {
         if *n > 0 && !OF_TRACKING.contains(name) {
-            println!("{n:>10}  {name}");
+            print(format_args!("{n:>10}  {name}"));
         }
     }
-    println!("{}", out.display());
+    print(out.display());
     whole(&recorded, out)?;
     inbox.broken.pop().map_or(Ok(()), Err)?;
     progress.ended_well();
