@@ -151,7 +151,8 @@ struct Reading {
 }
 
 /// Decodes frames into every slot but the last, or until the input ends, hands them over together, and answers
-/// how many. Slots come back in order: the last is the one the front end still looks at. A frame that cannot be read leaves its samples to the next.
+/// how many. Slots come back in order: the last is the one the front end still looks at. A frame that cannot be read
+/// leaves its samples to the next.
 fn read_batch(
     input: &mut Input,
     total: usize,
