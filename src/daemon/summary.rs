@@ -175,10 +175,14 @@ fn measure(mapper: &mut Mapper) -> Result<Measured, String> {
     let panels = mapper.panels(PANELS).map_err(|e| e.to_string())?;
     let splats = mapper.splats().map_err(|e| e.to_string())?;
     let (extra, form) = mapper.colours().map_err(|e| e.to_string())?;
+    let exposure = mapper.median_exposure();
+    // Viewers show colours between 0 and 1; some clamp each Gaussian's.
+    let exposed = |colour: f32| exposure.observed(f64::from(colour)) as f32;
     let mut rest = Vec::new();
     let record = |(i, s): (usize, &crate::map::SplatInit)| {
         let (colour, directional) = form.rgb(s.colour, &extra[i * form.extra()..][..form.extra()]);
-        rest.extend(directional);
+        let colour = colour.map(exposed);
+        rest.extend(directional.into_iter().map(|c| exposure.gain as f32 * c));
         let (mean, log_scale, quat_xyzw, opacity_logit) = (s.mean, s.log_scale, s.quat_xyzw, s.opacity_logit);
         ply::SplatRecord { mean, log_scale, quat_xyzw, opacity_logit, colour }
     };

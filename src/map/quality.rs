@@ -9,7 +9,7 @@
 
 use super::evaluate::{mse, psnr_db, Ssim};
 use super::pipeline::{Exposure, Goal};
-use super::refine::{fitted_exposure, Refinement};
+use super::refine::{fitted_exposure, median_exposure, Refinement};
 use super::Mapper;
 use crate::gpu::GpuError;
 use crate::limits::CAMERAS_MAX;
@@ -174,6 +174,13 @@ impl Mapper {
             });
         }
         Ok(panels)
+    }
+
+    /// The exposure of the median training view: what takes the map's colours, whose gauge is none of a camera's, to what
+    /// most images show.
+    pub fn median_exposure(&self) -> Exposure {
+        let exposures: Vec<Exposure> = self.store.training().iter().map(|i| self.store.exposure(*i as usize)).collect();
+        median_exposure(&exposures).unwrap_or_default()
     }
 
     /// Renders a keyframe into `self.rendered`, in its exposure, and compares; `None` where nothing is valid.

@@ -187,11 +187,16 @@ fn three(v: &[f64], at: usize) -> DVec3 {
     DVec3::new(v[at], v[at + 1], v[at + 2])
 }
 
+/// Grey levels between which a camera's pixel is neither black nor saturated: beyond them a rendering may rightly be
+/// darker or brighter than the image, so they say nothing of the exposure.
+const UNSATURATED: std::ops::Range<f32> = 0.02..0.98;
+
 /// The exposure that takes a rendering closest to an image, in closed form: linear least squares of gain and offset
-/// over the valid pixels of all planes. A flat or empty rendering gets the offset alone.
+/// over the valid pixels of all planes that the camera did not saturate. A flat or empty rendering gets the offset alone.
 pub fn fitted_exposure(observed: &[f32], rendered: &[f32], valid: &[u8]) -> Exposure {
     let (mut n, mut sx, mut sy, mut sxx, mut sxy) = (0.0, 0.0, 0.0, 0.0, 0.0);
-    for i in (0..observed.len()).filter(|&i| valid[i % valid.len()] != 0) {
+    let tells = |i: &usize| valid[i % valid.len()] != 0 && UNSATURATED.contains(&observed[*i]);
+    for i in (0..observed.len()).filter(tells) {
         let (x, y) = (f64::from(rendered[i]), f64::from(observed[i]));
         (n, sx, sy, sxx, sxy) = (n + 1.0, sx + x, sy + y, sxx + x * x, sxy + x * y);
     }
@@ -201,6 +206,15 @@ pub fn fitted_exposure(observed: &[f32], rendered: &[f32], valid: &[u8]) -> Expo
     let variance = sxx - sx * sx / n;
     let gain = if variance > 1e-9 * n { (sxy - sx * sy / n) / variance } else { 1.0 };
     Exposure { gain, offset: (sy - gain * sx) / n }
+}
+
+/// The one of these exposures that is nearest to all of them: the least sum of distances by ln gain and by the level of
+/// mid-grey (the medoid). `None` of none.
+pub fn median_exposure(exposures: &[Exposure]) -> Option<Exposure> {
+    let all: Vec<[f64; 2]> = exposures.iter().map(levels).collect();
+    let distance = |a: &[f64; 2]| all.iter().map(|b| (a[0] - b[0]).hypot(a[1] - b[1])).sum::<f64>();
+    let nearest = (0..all.len()).min_by(|i, j| distance(&all[*i]).total_cmp(&distance(&all[*j])))?;
+    Some(exposures[nearest])
 }
 
 #[cfg(test)]
@@ -286,6 +300,22 @@ mod tests {
         r.step_pose(&[f64::NAN, 0.0, 0.0, 0.0, 0.0, 0.0], &Pose::IDENTITY, &Pose::IDENTITY, 0.1);
         r.step_exposure(&[0.0, f64::INFINITY], 0.1);
         assert_eq!((r.body_from_refined, r.exposure), (Pose::IDENTITY, Exposure::default()));
+    }
+
+    #[test]
+    fn median_exposure_is_one_of_them_and_no_outlier() {
+        let of = |gain: f64| Exposure { gain, offset: 0.0 };
+        assert_eq!(median_exposure(&[of(1.0), of(8.0), of(1.1), of(0.2), of(1.2)]), Some(of(1.1)));
+        assert_eq!(median_exposure(&[]), None);
+    }
+
+    #[test]
+    fn saturated_pixels_do_not_tell_the_exposure() {
+        // The map is rightly brighter than white where a camera saturated.
+        let rendered: Vec<f32> = (0..100).map(|i| 0.02 * i as f32).collect();
+        let observed: Vec<f32> = rendered.iter().map(|x| (0.8 * x + 0.1).clamp(0.0, 1.0)).collect();
+        let e = fitted_exposure(&observed, &rendered, &[1; 100]);
+        assert!((e.gain - 0.8).abs() < 1e-5 && (e.offset - 0.1).abs() < 1e-5, "{e:?}");
     }
 
     #[test]
