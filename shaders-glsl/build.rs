@@ -13,10 +13,14 @@ mod reflect;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
+/// Kernels that measure a device, for `stipple-bench` alone.
+const INSTRUMENTS: &str = "tests/bench/kernels";
+
 fn main() {
     opencv_shim();
     drivers_build::recordings("../shared/data");
     println!("cargo:rerun-if-changed=shaders-glsl");
+    println!("cargo:rerun-if-changed={INSTRUMENTS}");
     if let Err(errors) = kernels() {
         for e in errors {
             eprintln!("error: {e}");
@@ -29,7 +33,10 @@ fn kernels() -> Result<(), Vec<String>> {
     let one = |e: String| vec![e];
     let out = PathBuf::from(std::env::var_os("OUT_DIR").ok_or_else(|| one("cargo sets OUT_DIR".into()))?);
     let mut files = Vec::new();
-    find(Path::new("shaders-glsl"), &mut files).map_err(|e| one(format!("shaders-glsl: {e}")))?;
+    let instruments = std::env::var_os("CARGO_FEATURE_INSTRUMENTS").is_some();
+    for folder in std::iter::once("shaders-glsl").chain(instruments.then_some(INSTRUMENTS)) {
+        find(Path::new(folder), &mut files).map_err(|e| one(format!("{folder}: {e}")))?;
+    }
     files.sort();
     let mut errors = Vec::new();
     let mut sources: Vec<emit::Source> = Vec::new();

@@ -12,9 +12,15 @@
 //! Allowed edges, checked by `tests/tidy.rs`: `math`, `mem`, `limits`, `config` and `counters` are seen by
 //! all; `frontend` and `vio` see the vocabulary of `stipple-drivers`; `vio` also sees `frontend`'s
 //! `Tracks`; `stereo` and `map` see `gpu`; `map` sees `stereo`; `vio` never sees `gpu`; `map` never sees
-//! `frontend`; `bench` sees all but `daemon`; nobody sees `daemon`.
+//! `frontend`; nobody sees `daemon`.
 
-pub mod bench;
+// The world of points for unit tests (tests/bench/world.rs) names this crate as integration tests do.
+#[cfg(test)]
+extern crate self as stipple;
+#[cfg(test)]
+#[path = "../tests/bench/world.rs"]
+pub mod world;
+
 pub mod config;
 pub mod counters;
 pub mod daemon;

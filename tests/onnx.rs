@@ -7,10 +7,14 @@
 //! `STIPPLE_ONNXRUNTIME=.../libonnxruntime.so cargo test --test onnx -- --ignored`.
 #![allow(clippy::unwrap_used)]
 
-use stipple::bench::world::Noise;
+#[allow(dead_code)] // each test takes of it what it needs
+#[path = "bench/world.rs"]
+mod world;
+
 use stipple::config::{NetworkConfig, StereoConfig, StereoMethod};
 use stipple::stereo::{Disparity, Method};
 use stipple_drivers::Image;
+use world::Noise;
 
 const W: usize = 96;
 const H: usize = 48;

@@ -104,21 +104,3 @@ fn a_run_that_records_plays_back_as_it_flew() {
     let again = stipple().args(["record", BOARD, "--dataset", &arg(&data), "--out", &arg(&kept)]).output().unwrap();
     assert_eq!(again.status.code(), Some(73), "a recording is not written over: {}", text(&again));
 }
-
-#[test]
-fn recording_is_measured_against_a_flight_without() {
-    let dir = tempfile::tempdir().unwrap();
-    let (data, out) = (flight(dir.path(), "1.5"), dir.path().join("bench"));
-    let o = stipple()
-        .args(["bench", "record", data.to_str().unwrap(), "--passes", "1", "--out", out.to_str().unwrap()])
-        .output()
-        .unwrap();
-    assert!(o.status.success() && text(&o).contains("with recording over that without"), "{}", text(&o));
-    let rows: serde_json::Value = serde_json::from_slice(&fs::read(out.join("record.json")).unwrap()).unwrap();
-    assert_eq!((&rows[0]["records"], &rows[1]["records"]), (&false.into(), &true.into()));
-    let recorded = &rows[1]["recorded"];
-    let frames =
-        recorded["record_frames_written"].as_u64().unwrap() + recorded["record_frames_dropped"].as_u64().unwrap();
-    assert!(frames >= 29 && recorded["record_ring_most"].as_u64().unwrap() >= 1, "{rows}");
-    assert!(!out.join("recording-1").exists(), "what was measured is not kept");
-}

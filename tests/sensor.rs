@@ -3,9 +3,12 @@
 //! one to four cameras. Errors are against truth after the best rigid alignment.
 #![allow(clippy::unwrap_used)]
 
+#[allow(dead_code)] // each test takes of it what it needs
+#[path = "bench/world.rs"]
+mod world;
+
 use glam::{DMat3, DQuat, DVec3};
 use std::sync::{Arc, OnceLock};
-use stipple::bench::world::{Noise, Path, World, FRAME_SECS, RATE_HZ};
 use stipple::config::{FrontendConfig, VioConfig};
 use stipple::frontend::{Frontend, Prediction, Tracks};
 use stipple::output::metrics::trajectory_error;
@@ -13,6 +16,7 @@ use stipple::vio::rig::RigEstimate;
 use stipple::vio::Vio;
 use stipple_drivers::sim::{rig_named, Scenario, Sim};
 use stipple_drivers::{Calibration, Frames, ImuSample, Pose, Span, TimedPose};
+use world::{Noise, Path, World, FRAME_SECS, RATE_HZ};
 
 struct Flight {
     calibration: Calibration,

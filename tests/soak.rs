@@ -3,16 +3,20 @@
 //! minute of it in `make soak`. The cases are drawn by proptest from a fixed seed.
 #![allow(clippy::unwrap_used)]
 
+#[allow(dead_code)] // each test takes of it what it needs
+#[path = "bench/world.rs"]
+mod world;
+
 use glam::DVec3;
 use proptest::prelude::*;
 use proptest::test_runner::{Config, TestRunner};
 use std::sync::Arc;
-use stipple::bench::world::{Noise, Path, World, FRAME_SECS, RATE_HZ};
 use stipple::config::{FrontendConfig, VioConfig};
 use stipple::frontend::{Frontend, Prediction, Track, Tracks};
 use stipple::vio::{Update, Vio};
 use stipple_drivers::sim::euroc_rig;
 use stipple_drivers::{Frames, Image, ImuSample, Nanos, Pose};
+use world::{Noise, Path, World, FRAME_SECS, RATE_HZ};
 
 /// Frames of good data at the end: a divergence noticed, a start, and time to settle.
 const GOOD: usize = 100;

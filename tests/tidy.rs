@@ -9,13 +9,12 @@ use std::path::{Path, PathBuf};
 const COMMON: [&str; 5] = ["math", "mem", "limits", "config", "counters"];
 /// What else a module may see. `daemon` sees everything and is seen by nobody; a module that is
 /// not here sees only the common ones.
-const EDGES: [(&str, &[&str]); 6] = [
+const EDGES: [(&str, &[&str]); 5] = [
     ("vio", &["frontend"]),
     ("loops", &["vio"]),
     ("stereo", &["gpu"]),
     ("map", &["gpu", "stereo"]),
     ("output", &["map", "vio"]),
-    ("bench", &["frontend", "vio", "stereo", "gpu", "map", "output"]),
 ];
 /// Where `unsafe` may stand: the GPU, the allocator, the shims of OpenCV and ONNX Runtime, system calls of drivers.
 const UNSAFE: [&str; 6] = [

@@ -3,10 +3,13 @@
 //! rigid alignment.
 #![allow(clippy::unwrap_used)]
 
+#[allow(dead_code)] // each test takes of it what it needs
+#[path = "bench/world.rs"]
+mod world;
+
 use glam::DVec3;
 use std::path::PathBuf;
 use std::sync::Arc;
-use stipple::bench::world::{Path, World, FRAME_SECS, RATE_HZ};
 use stipple::config::{FrontendConfig, VioConfig};
 use stipple::frontend::{Frontend, Prediction, Tracks};
 use stipple::mem::{heap_after_seal, seal_thread, unsealed, CountingAllocator};
@@ -15,6 +18,7 @@ use stipple::vio::Vio;
 use stipple_drivers::replay::{OpenOptions, Recording};
 use stipple_drivers::sim::{Scenario, Sim};
 use stipple_drivers::{Calibration, Frames, ImuSample, Span, TimedPose};
+use world::{Path, World, FRAME_SECS, RATE_HZ};
 
 #[global_allocator]
 static ALLOCATOR: CountingAllocator = CountingAllocator;

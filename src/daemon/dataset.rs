@@ -13,7 +13,7 @@ use stipple_drivers::{Fault, Frames, Image, Nanos, Span};
 
 /// Frames looked at, evenly over the recording.
 const LOOKED_AT: usize = 8;
-/// Half of what costs `bm` a third more error and 2 % of its pixels (hard_misaligned in `stipple bench stereo`).
+/// Half of what costs `bm` a third more error and 2 % of its pixels (hard_misaligned in `stipple-bench stereo`).
 pub const ROWS_MAX_PX: f64 = 0.5;
 
 /// Says how far the rows of cameras 0 and 1 disagree after rectification.

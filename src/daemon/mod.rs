@@ -22,7 +22,6 @@
 
 mod dataset;
 mod doctor;
-mod faults;
 mod hardware;
 mod input;
 mod light;
@@ -34,7 +33,6 @@ mod pipeline;
 mod play;
 mod progress;
 mod record;
-mod recording;
 mod sensors;
 mod summary;
 mod tracking;
@@ -42,13 +40,23 @@ mod watch;
 
 pub use dataset::check_dataset;
 pub use doctor::doctor;
-pub use faults::faults;
 pub use live::{run as run_sensors, Run};
 pub use play::Pace;
 pub use record::record;
-pub use recording::bench_record;
 
-use crate::bench::map::Job;
+/// What `stipple-bench` starts besides.
+#[cfg(feature = "instruments")]
+#[doc(hidden)]
+pub mod instruments {
+    pub use super::input::Input;
+    pub use super::memory::{admit, colours};
+    pub use super::play::{realtime, Played, Realtime};
+    pub use super::progress::Progress;
+    pub use super::record::tapped;
+    pub use super::sensors::Sensors;
+    pub use super::tracking::{OdometryRun, Tracking};
+}
+
 use crate::config::Board;
 use crate::output::report::Report;
 use crate::output::OutputDir;
@@ -110,48 +118,14 @@ pub fn demo(board: Option<&Path>, out: &Path, set: &[String]) -> Result<(), Faul
     Ok(())
 }
 
-/// What `stipple bench map` plays; without a dataset the demo's flight.
-pub struct Benched {
-    pub dataset: Option<PathBuf>,
-    pub board: Option<PathBuf>,
-    pub poses: Option<PathBuf>,
-    pub set: Vec<String>,
-}
-
-/// Seconds of the demo's flight that a quick run of the bench plays.
-const QUICK_FLIGHT_S: f64 = 3.0;
-
-/// One run of `stipple bench map`: lockstep by time, every eighth keyframe held out.
-pub fn benched(what: &Benched, job: &Job, out: &OutputDir) -> Result<Report, Fault> {
-    let demo_scale = what.dataset.is_none().then(|| DEMO_SCALE.to_string());
-    let set: Vec<String> = demo_scale.iter().chain(&what.set).chain(job.set).cloned().collect();
-    let board = match &what.board {
-        Some(path) => Board::load(path, &set)?,
-        None => Board::parse("board-configs/lavapipe.toml", DEMO_BOARD, &set)?,
-    };
-    let (input, place) = match &what.dataset {
-        Some(path) => (Input::recording(path, &board.replay, &board.rig)?, path.display().to_string()),
-        None => {
-            let mut scenario = Scenario::named("demo").expect("the demo's scenario is compiled in");
-            if job.quick {
-                scenario.duration = scenario.duration.min(Span::from_secs(QUICK_FLIGHT_S));
-            }
-            let colours = memory::colours(&scenario.calibration, &board).len();
-            (Input::rendered(&scenario, colours, |_, _| {})?, "the simulated flight".into())
-        }
-    };
-    let (poses, mapping_s) = (what.poses.clone(), Some(job.seconds));
-    let options = Replay { pace: Pace::Lockstep, poses, holdout: DEMO_HOLDOUT, duration_s: None, mapping_s };
-    run(input, &place, &board, out, &options)
-}
-
 fn rendering_progress(done: usize, of: usize) {
     if done % 50 == 0 || done == of {
         eprintln!("rendering the flight: {done} of {of} frames");
     }
 }
 
-fn run(mut input: Input, place: &str, board: &Board, out: &OutputDir, options: &Replay) -> Result<Report, Fault> {
+/// Plays an input; leaves its files in `out`.
+pub fn run(mut input: Input, place: &str, board: &Board, out: &OutputDir, options: &Replay) -> Result<Report, Fault> {
     memory::admit(place, &input.calibration, board, false)?;
     input.needs_colour(memory::colours(&input.calibration, board).len(), place)?;
     let frames = input.frames_within(options.duration_s);

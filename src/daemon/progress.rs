@@ -50,6 +50,7 @@ impl Progress {
     }
 
     /// Shows nothing.
+    #[cfg(feature = "instruments")]
     pub fn silent() -> Progress {
         Progress { bar: None, total_ms: None, next_line: None, light: None }
     }

@@ -8,7 +8,7 @@
 //! Command buffers, fences and queries are made once; what a command buffer holds is encoded anew for each part, since
 //! cameras, targets and rates are push constants. Kept encodings would gain nothing: to record, encode and submit a step
 //! takes 0.08 ms on the host of an NVIDIA H200, behind the 0.39 ms of the step before it, and a step of 0.23 ms has the
-//! same 0.02 ms from its end to the beginning of the next as one of 0.97 (`bench kernels`: wall less device).
+//! same 0.02 ms from its end to the beginning of the next as one of 0.97 (`stipple-bench kernels`: wall less device).
 
 use super::device::{boot, Device};
 use super::kernel::Pipelines;

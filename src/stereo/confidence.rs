@@ -28,7 +28,7 @@ struct Fit {
     missing: f64,
 }
 
-/// Of greatest likelihood by `bench stereo --fit`.
+/// Of greatest likelihood by `stipple-bench stereo --fit`.
 const BM: Fit = Fit { floor: 2.5e-4, noise: 1.99, off: 1.318, bent: 2.20, bent_far: 1.40, missing: 0.180 };
 const SGBM: Fit = Fit { floor: 8.14e-3, noise: 20.6, off: 0.904, bent: 2.19, bent_far: 1.30, missing: 0.606 };
 

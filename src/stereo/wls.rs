@@ -30,7 +30,7 @@ impl Variance {
     pub const PARTS: [&str; 5] = ["least", "bent", "bent_far", "faint", "missing"];
     /// With the filter and without: of greatest likelihood on an earlier set of flights, by one bit a pixel of census. Errors
     /// of flights it has not seen have 0.90 to 1.20 of it without the filter, 0.97 to 1.31 with, by range. Of what
-    /// `bench stereo --fit` finds now they have 0.69 to 1.40; more of what is filled in would pass `SIGMA_MAX_PX` by that.
+    /// `stipple-bench stereo --fit` finds now they have 0.69 to 1.40; more of what is filled in would pass `SIGMA_MAX_PX` by that.
     pub const FITTED: Variance = Variance { least: 0.0004, bent: 5.4, bent_far: 9.1, faint: 0.217, missing: 0.137 };
 
     /// In the order of `PARTS`.

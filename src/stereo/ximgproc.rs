@@ -1,5 +1,5 @@
 //! OpenCV's semi-global matching with its own weighted-least-squares filter (`cv::ximgproc`): what ours is
-//! measured against in `stipple bench stereo`, and no method of the program. Feature `ximgproc`.
+//! measured against in `stipple-bench stereo`, and no method of the program. Feature `ximgproc`.
 #![allow(unsafe_code)]
 
 use super::Disparity;

@@ -94,7 +94,7 @@ const SIGMA_V_HALF: f64 = 0.05;
 /// 0 to 100: `100 min(1, landmarks / 40) / (1 + σ_v / 0.05 m/s)`, with σ_v² the trace of the velocity's
 /// covariance. The velocity's and not the position's, because odometry's position error only ever grows;
 /// σ_v is by how much it may grow each second: 5 mm at 91, 5 cm at 50, half a metre at 9. Zero without a
-/// covariance. Measured by `stipple bench consistency` over flights gone wrong, the mean error of the velocity
+/// covariance. Measured by `stipple-bench consistency` over flights gone wrong, the mean error of the velocity
 /// is 1.2 m/s up to 10, 0.16 m/s up to 20, 0.03 m/s up to 65 and 0.01 m/s above: what is claimed, or a third of
 /// it. A fault that has not shown yet is in no quality.
 pub fn quality(covariance: Option<&[[f64; 15]; 15]>, landmarks: usize) -> u8 {

@@ -37,8 +37,8 @@ impl Predictor {
 mod tests {
     use super::super::Vio;
     use super::*;
-    use crate::bench::world::{calibration, rate_and_force, Path};
     use crate::config::VioConfig;
+    use crate::world::{calibration, rate_and_force, Path};
     use stipple_drivers::ImuSample;
 
     fn at(t: f64) -> Nanos {

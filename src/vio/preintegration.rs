@@ -313,7 +313,7 @@ mod tests {
     use super::super::residuals::Motion;
     use super::super::samples::ImuRing;
     use super::*;
-    use crate::bench::world;
+    use crate::world;
     use stipple_drivers::{ImuSample, Nanos, Pose};
 
     const NOISE: Noise = Noise {

@@ -6,7 +6,7 @@
 //!
 //! It takes little to be wrong in a new way here, so it is bounded: one in eight samples, eight at once, and none at the end of its
 //! range, which has a meaning of its own (`Noise::between`). Bits below what stands out cost millimetres, those above did cost
-//! centimetres and decimetres: `stipple bench faults`.
+//! centimetres and decimetres: `stipple-bench faults`.
 
 use super::preintegration::Noise;
 use stipple_drivers::ImuSample;
@@ -99,8 +99,8 @@ impl Spikes {
 mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
-    use crate::bench::world::{calibration, Noise as Random};
     use crate::config::VioConfig;
+    use crate::world::{calibration, Noise as Random};
     use glam::DVec3;
     use stipple_drivers::Nanos;
 

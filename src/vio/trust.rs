@@ -272,8 +272,8 @@ impl Carried {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::bench::world::{Path, World, RATE_HZ};
     use crate::config::VioConfig;
+    use crate::world::{Path, World, RATE_HZ};
 
     #[test]
     fn origin_turns_and_shifts_what_is_seen_from_it() {

@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output};
 
+#[allow(dead_code)] // not every binary of tests does
 pub const BOARD: &str = "board-configs/lavapipe.toml";
 
 pub fn stipple() -> Command {

@@ -383,7 +383,7 @@ pub fn median(values: &[f64]) -> f64 {
 mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
-    use crate::bench::world::stream;
+    use crate::world::stream;
 
     const BIAS: DVec3 = DVec3::new(0.02, -0.01, 0.03);
     const SECONDS: f64 = 7.0;

@@ -213,7 +213,7 @@ pub fn motion(seen: &[Views], second_from_first: Option<&Pose>) -> Option<(Pose,
 mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
-    use crate::bench::world::stream;
+    use crate::world::stream;
 
     const SECOND: Pose = Pose { q: DQuat::IDENTITY, p: DVec3::new(-0.11, 0.0, 0.0) };
 

@@ -1,0 +1,336 @@
+//! `stipple-bench consistency`: are the errors as large as the covariance says, and does quality mean
+//! something.
+//!
+//! Consistency: normalised estimation error squared (NEES, eᵀ P⁻¹ e) of all fifteen errors over seeded
+//! flights of a world made as the estimator is told, mean over flights at each instant, beside its 95 %
+//! bounds (χ² of 15 N dimensions over N; Bar-Shalom et al. 2001, 5.4). The world of the estimate is tied to
+//! the truth by position and yaw of the first estimate, so position errors are relative to the start.
+//!
+//! Reliability: every frame of the flights of the stability table, by its quality, beside the error of its
+//! velocity and the error of its motion over the next second.
+
+use crate::flight::{errors, estimate_from_truth, fly, from_rest, Plan, Record};
+use crate::odometry::page;
+use crate::stability;
+use nalgebra::{Matrix3, Vector3};
+use std::io::{self, Write};
+use std::path::PathBuf;
+use stipple::config::VioConfig;
+use stipple::output::chart::{Chart, Series};
+use stipple::output::metrics::percentile;
+use stipple::output::OutputDir;
+use stipple::vio::residuals::{Mat15, Vec15};
+use stipple_drivers::Fault;
+
+const DIM: f64 = 15.0;
+/// Two-sided 95 % of a normal distribution.
+const Z: f64 = 1.96;
+/// Standard deviations of the biases with which a flight starts, rad/s and m/s²: EuRoC's unit. The estimator is
+/// told the same where it is told the truth.
+const BIASES: (f64, f64) = (0.02, 0.05);
+/// One second, in frames.
+const SECOND: usize = 20;
+/// Upper ends of the bins of quality.
+const BINS: [u8; 9] = [2, 10, 20, 35, 50, 65, 75, 85, 100];
+
+/// The world's own noise.
+fn told(c: &mut VioConfig) {
+    (c.gyro_noise_scale, c.accel_noise_scale) = (1.0, 1.0);
+    c.observation_sigma_px = crate::world::SIGMA_PX;
+    (c.gyro_bias_sigma, c.accel_bias_sigma) = BIASES;
+}
+
+/// NEES of many flights.
+#[derive(Clone, Debug, Default)]
+pub struct Consistency {
+    pub flights: usize,
+    /// Mean over the flights, by time since the start, s.
+    pub over_time: Vec<(f64, f64)>,
+    pub mean: f64,
+    /// Of position, rotation, velocity, gyro and accelerometer bias: three dimensions each.
+    pub blocks: [f64; 5],
+    /// 95 % of the means at one instant lie between these.
+    pub bounds: (f64, f64),
+    /// Share of the instants that do.
+    pub within: f64,
+    /// Estimates without a covariance that is symmetric and positive definite.
+    pub undetermined: usize,
+}
+
+/// χ² of `k` dimensions at `z` standard deviations of a normal (Wilson and Hilferty 1931).
+fn chi_square(k: f64, z: f64) -> f64 {
+    let v = 2.0 / (9.0 * k);
+    k * (1.0 - v + z * v.sqrt()).powi(3)
+}
+
+fn consistency_of(config: fn(&mut VioConfig), flights: usize) -> Consistency {
+    let plan = Plan { pose: from_rest, biases: Some(BIASES), config, ..Plan::default() };
+    let mut sums: Vec<(f64, usize)> = vec![(0.0, 0); plan.frames];
+    let (mut blocks, mut n, mut undetermined) = ([0.0; 5], 0, 0);
+    for seed in 0..flights as u64 {
+        let mut to_estimate = None;
+        let mut start = None;
+        fly(&plan, seed, |seen| {
+            let Some(o) = seen.update.odometry else { return };
+            undetermined += 1;
+            let Some(c) = seen.vio.covariance() else { return };
+            let moved = *to_estimate.get_or_insert_with(|| estimate_from_truth(&o.world_from_body, &seen.truth.pose));
+            let Some(e) = errors(seen, &moved) else { return };
+            let first = *start.get_or_insert(seen.frame);
+            let vector = Vec15::from_fn(|i, _| e[i / 3][i % 3]);
+            let covariance = Mat15::from_fn(|i, j| c[i][j]);
+            if (covariance - covariance.transpose()).norm() > 1e-9 * covariance.norm() {
+                return;
+            }
+            let Some(factor) = covariance.cholesky() else { return };
+            undetermined -= 1;
+            let at = &mut sums[seen.frame - first];
+            (at.0, at.1, n) = (at.0 + vector.dot(&factor.solve(&vector)), at.1 + 1, n + 1);
+            for (b, sum) in blocks.iter_mut().enumerate() {
+                let block = Matrix3::from_fn(|i, j| c[3 * b + i][3 * b + j]);
+                let e = Vector3::new(e[b].x, e[b].y, e[b].z);
+                *sum += block.cholesky().map_or(0.0, |f| e.dot(&f.solve(&e)));
+            }
+        });
+    }
+    let seconds = |i: usize| i as f64 / SECOND as f64;
+    let whole = sums.iter().enumerate().filter(|(_, s)| s.1 == flights);
+    let over_time: Vec<(f64, f64)> = whole.map(|(i, s)| (seconds(i), s.0 / s.1 as f64)).collect();
+    let bound = |z: f64| chi_square(DIM * flights as f64, z) / flights as f64;
+    let bounds = (bound(-Z), bound(Z));
+    let inside = over_time.iter().filter(|(_, v)| (bounds.0..=bounds.1).contains(v)).count();
+    Consistency {
+        flights,
+        mean: sums.iter().map(|s| s.0).sum::<f64>() / f64::from(n.max(1)),
+        blocks: blocks.map(|b| b / f64::from(n.max(1))),
+        bounds,
+        within: inside as f64 / over_time.len().max(1) as f64,
+        undetermined,
+        over_time,
+    }
+}
+
+/// The estimator told the world's own noise.
+pub fn told_the_truth(flights: usize) -> Consistency {
+    consistency_of(told, flights)
+}
+
+/// With the default settings, which claim less than they know.
+pub fn at_the_defaults(flights: usize) -> Consistency {
+    consistency_of(|_| {}, flights)
+}
+
+/// What frames of a quality turned out to be.
+#[derive(Clone, Copy, Debug)]
+pub struct Bin {
+    /// Both ends belong to it.
+    pub from: u8,
+    pub to: u8,
+    pub frames: usize,
+    /// Error of the velocity in the body's frame, m/s.
+    pub velocity: f64,
+    pub velocity_p90: f64,
+    /// Error of the motion over the next second, m: mean, median, 90 %.
+    pub drift: f64,
+    pub drift_p50: f64,
+    pub drift_p90: f64,
+}
+
+fn drift(a: &Record, b: &Record) -> Option<f64> {
+    let moved = a.estimate?.pose.inverse() * b.estimate?.pose;
+    let truly = a.truth.pose.inverse() * b.truth.pose;
+    Some((truly.inverse() * moved).p.length())
+}
+
+/// The reliability diagram of flights.
+pub fn reliability(flights: &[Vec<Record>]) -> Vec<Bin> {
+    by_quality(flights, &BINS)
+}
+
+/// The same with bins of one's own, by their upper ends.
+pub fn by_quality(flights: &[Vec<Record>], ends: &[u8]) -> Vec<Bin> {
+    // Quality, velocity error, drift.
+    let mut seen: Vec<(u8, f64, f64)> = Vec::new();
+    for records in flights {
+        for (i, r) in records.iter().enumerate() {
+            let later = records[i..].iter().find(|l| l.frame == r.frame + SECOND);
+            if let (Some(v), Some(d)) = (r.velocity_error, later.and_then(|l| drift(r, l))) {
+                seen.push((r.quality, v, d));
+            }
+        }
+    }
+    let mut from = 0;
+    let mut bins = Vec::new();
+    for &to in ends {
+        let of = |f: &dyn Fn(&(u8, f64, f64)) -> f64| -> Vec<f64> {
+            seen.iter().filter(|s| (from..=to).contains(&s.0)).map(f).collect()
+        };
+        let (v, d) = (of(&|s| s.1), of(&|s| s.2));
+        let mean = |x: &[f64]| x.iter().sum::<f64>() / x.len() as f64;
+        let rank = |x: &[f64], p: f64| percentile(x, p).unwrap_or(f64::NAN);
+        if !v.is_empty() {
+            let (velocity, velocity_p90) = (mean(&v), rank(&v, 0.9));
+            let (drift, drift_p50, drift_p90) = (mean(&d), rank(&d, 0.5), rank(&d, 0.9));
+            bins.push(Bin { from, to, frames: v.len(), velocity, velocity_p90, drift, drift_p50, drift_p90 });
+        }
+        from = to + 1;
+    }
+    bins
+}
+
+fn write_csv(out: &mut impl Write, told: &Consistency, defaults: &Consistency) -> io::Result<()> {
+    writeln!(out, "t_s,nees_told,nees_defaults,bound_low,bound_high")?;
+    for ((t, a), (_, b)) in told.over_time.iter().zip(&defaults.over_time) {
+        writeln!(out, "{t:.2},{a:.4},{b:.4},{:.4},{:.4}", told.bounds.0, told.bounds.1)?;
+    }
+    Ok(())
+}
+
+fn write_bins(out: &mut impl Write, bins: &[Bin]) -> io::Result<()> {
+    writeln!(
+        out,
+        "quality_from,quality_to,frames,velocity_error_mean,velocity_error_p90,drift_1s_mean,drift_1s_p50,drift_1s_p90"
+    )?;
+    for b in bins {
+        write!(out, "{},{},{},{:.6},{:.6},", b.from, b.to, b.frames, b.velocity, b.velocity_p90)?;
+        writeln!(out, "{:.6},{:.6},{:.6}", b.drift, b.drift_p50, b.drift_p90)?;
+    }
+    Ok(())
+}
+
+/// What a run says of consistency, in a line.
+pub fn said(name: &str, c: &Consistency) -> String {
+    let [p, th, v, bg, ba] = c.blocks;
+    format!(
+        "NEES {name}: {:.2} of 15 over {} flights, 95 % bounds {:.2} to {:.2}, {:.0} % of the instants within; of 3 each: position {p:.2}, rotation {th:.2}, velocity {v:.2}, gyro bias {bg:.2}, accelerometer bias {ba:.2}; {} without a covariance",
+        c.mean, c.flights, c.bounds.0, c.bounds.1, 100.0 * c.within, c.undetermined
+    )
+}
+
+fn write_page(out: &mut impl Write, told: &Consistency, defaults: &Consistency, bins: &[Bin]) -> io::Result<()> {
+    let frames: usize = bins.iter().map(|b| b.frames).sum();
+    let what = format!("{} seeded flights of 8 s from rest; {frames} frames of flights gone wrong", told.flights);
+    page::head(out, "Odometry: consistency and quality", &what)?;
+    let (a, b) = (said("told the world's own noise", told), said("at the defaults", defaults));
+    write!(out, "<p class=\"note\">{a}.</p><p class=\"note\">{b}: they claim less than they know, on purpose.</p>")?;
+    let nees = Chart {
+        title: "NEES of 15 errors, mean over the flights",
+        x: "time since the start, s",
+        y: "NEES",
+        series: vec![
+            Series::line("told the world's noise", 1, told.over_time.clone()),
+            Series::line("defaults", 2, defaults.over_time.clone()),
+        ],
+        levels: vec![("2.5 %", told.bounds.0), ("97.5 %", told.bounds.1)],
+        from_zero: true,
+        ..Chart::default()
+    };
+    page::section(out, "Consistency", &[nees.svg()])?;
+    let middle = |b: &Bin| f64::from(b.from + b.to) / 2.0;
+    // Errors span four decades: drawn by their logarithm.
+    let by = |f: &dyn Fn(&Bin) -> f64| -> Vec<(f64, f64)> {
+        bins.iter().map(|b| (middle(b), f(b).max(1e-5).log10())).collect()
+    };
+    let dots = |name, ink, points| Series { name, ink, dots: true, points };
+    // What the formula of `quality` claims, in full view of enough landmarks.
+    let claimed: Vec<(f64, f64)> =
+        (1..100).map(|q| (f64::from(q), (0.05 * (100.0 / f64::from(q) - 1.0)).log10())).collect();
+    let chart = |title, y, mean, high| Chart {
+        title,
+        x: "quality",
+        y,
+        series: vec![dots("mean", 1, mean), dots("90 %", 2, high), dots("claimed", 3, claimed.clone())],
+        ..Chart::default()
+    };
+    let drift = chart("Error of the motion over the next second", "log10 m", by(&|b| b.drift), by(&|b| b.drift_p90));
+    let velocity = chart("Error of the velocity", "log10 m/s", by(&|b| b.velocity), by(&|b| b.velocity_p90));
+    page::section(out, "Quality against actual error", &[drift.svg(), velocity.svg()])?;
+    let head =
+        ["quality", "frames", "velocity error, mm/s: mean", "90 %", "drift over 1 s, mm: mean", "median", "90 %"];
+    let mm = |v: f64| format!("{:.1}", 1e3 * v);
+    let row = |b: &Bin| {
+        let range = format!("{} to {}", b.from, b.to);
+        let errors = [b.velocity, b.velocity_p90, b.drift, b.drift_p50, b.drift_p90].map(mm);
+        (false, [vec![range, b.frames.to_string()], errors.to_vec()].concat())
+    };
+    let rows: Vec<_> = bins.iter().map(row).collect();
+    out.write_all(page::table("By quality", &head, &rows).as_bytes())?;
+    page::foot(out)
+}
+
+/// Errors beside what the covariance claims, and beside the quality
+#[derive(clap::Args)]
+pub struct Args {
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+    /// Seeded flights
+    #[arg(long, value_name = "N", default_value = "50", value_parser = clap::value_parser!(u64).range(2..=10_000))]
+    flights: u64,
+}
+
+pub fn run(args: &Args) -> Result<(), Fault> {
+    let (out, flights) = (OutputDir::create(&args.out)?, args.flights as usize);
+    let (told, defaults) = (told_the_truth(flights), at_the_defaults(flights));
+    println!("{}\n{}", said("told the world's own noise", &told), said("at the defaults", &defaults));
+    let seeds = (flights as u64).div_ceil(10);
+    let bins = reliability(&(1..=seeds).flat_map(stability::flights).collect::<Vec<_>>());
+    for b in &bins {
+        println!(
+            "quality {:3} to {:3}: {:6} frames, velocity error {:8.1} mm/s, drift over 1 s {:8.1} mm (90 %: {:8.1})",
+            b.from,
+            b.to,
+            b.frames,
+            1e3 * b.velocity,
+            1e3 * b.drift,
+            1e3 * b.drift_p90
+        );
+    }
+    out.write("consistency.csv", |w| write_csv(w, &told, &defaults))?;
+    out.write("reliability.csv", |w| write_bins(w, &bins))?;
+    out.write("consistency.html", |w| write_page(w, &told, &defaults, &bins))?;
+    println!("{}", out.file("consistency.html").display());
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn bounds_are_those_of_tables() {
+        // χ² of 10 dimensions: 3.247 and 20.483; of 100: 74.22 and 129.56.
+        for (k, low, high) in [(10.0, 3.247, 20.483), (100.0, 74.22, 129.56)] {
+            assert!((chi_square(k, -Z) - low).abs() < 0.01 * low && (chi_square(k, Z) - high).abs() < 0.01 * high);
+        }
+    }
+
+    #[test]
+    fn errors_are_as_large_as_the_covariance_of_an_estimator_told_the_truth() {
+        let told = told_the_truth(16);
+        eprintln!("{}", said("told the world's own noise", &told));
+        assert_eq!(told.undetermined, 0, "every covariance is symmetric and positive definite");
+        assert!((told.bounds.0..=told.bounds.1).contains(&told.mean), "{} is outside {:?}", told.mean, told.bounds);
+    }
+
+    #[test]
+    fn defaults_claim_less_than_they_know() {
+        let defaults = at_the_defaults(4);
+        eprintln!("{}", said("at the defaults", &defaults));
+        assert!(defaults.undetermined == 0 && (1.0..defaults.bounds.0).contains(&defaults.mean));
+    }
+
+    #[test]
+    fn error_falls_as_quality_rises() {
+        let bins = by_quality(&stability::flights(1), &[10, 20, 65, 100]);
+        assert_eq!(bins.len(), 4);
+        for pair in bins.windows(2) {
+            let [a, b] = pair else { continue };
+            eprintln!("{a:?}");
+            assert!(a.velocity > b.velocity, "velocity: {a:?} {b:?}");
+            // Noise of the mean: a tenth.
+            assert!(a.drift > 0.9 * b.drift, "drift: {a:?} {b:?}");
+        }
+        // What quality 10, 20 and 65 claim, m/s.
+        assert!(bins[1].velocity < 0.45 && bins[2].velocity < 0.2 && bins[3].velocity < 0.027, "{bins:?}");
+    }
+}

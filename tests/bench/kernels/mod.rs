@@ -1,0 +1,250 @@
+//! `stipple-bench kernels`: what a training step costs by kernel, and how far that is from what the device could do.
+//!
+//! Cases are a wavy wall of N Gaussians seen whole, at several N and resolutions, and, given a recording, Gaussians
+//! seeded from its stereo depth. Each case trains twice: with every command timed, for the shares, and untimed, for
+//! steps a second. A kernel's roofline is the longer of its bytes at the device's copy bandwidth and its operations at
+//! its multiply-add peak; both are measured by kernels of ours just before (`model`). Leaves `kernels.csv`,
+//! `kernels.json` and `kernels.html`.
+
+mod model;
+mod page;
+mod scene;
+
+use model::{Counts, Peaks};
+use scene::Scene;
+use std::path::PathBuf;
+use std::time::Instant;
+use stipple::config::GpuConfig;
+use stipple::gpu::Gpu;
+use stipple::map::pipeline::{LearningRates, Pipeline, Shape, StepStats, Tiling, Weights};
+use stipple::output::OutputDir;
+use stipple_drivers::Fault;
+
+const SIZES: [(usize, usize); 4] = [(320, 240), (376, 240), (752, 480), (1280, 720)];
+const COUNTS: [usize; 4] = [10_000, 50_000, 200_000, 500_000];
+/// What the other axis is held at.
+const SIZE: (usize, usize) = (752, 480);
+const COUNT: usize = 50_000;
+/// Counts and size that trainers on a CPU are quoted at.
+const SMALL: ([usize; 2], (usize, usize)) = ([6_000, 30_000], (320, 240));
+/// Seeds of a recorded scene: what the published system keeps of V1_01.
+const RECORDED: usize = 52_000;
+/// Time a case is trained for, twice, s, and its steps.
+const SECONDS: f64 = 1.0;
+const STEPS: (usize, usize) = (3, 300);
+/// The most (Gaussian, tile) pairs a binding of 128 MiB has gradients for.
+const INTERSECTIONS_MAX: usize = 4 << 20;
+/// Large enough that every Gaussian moves, small enough that the picture stays what it was.
+const RATES: LearningRates = LearningRates { position: 1e-4, scale: 1e-3, rotation: 1e-3, opacity: 1e-3, colour: 1e-3 };
+
+/// What a training step costs by kernel, against what the device could do
+#[derive(clap::Args)]
+pub struct Args {
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+    /// Substring of the Vulkan device's name
+    #[arg(long, value_name = "NAME")]
+    device: Option<String>,
+    /// Also on Gaussians seeded from the stereo depth of this recording, at full resolution
+    #[arg(long, value_name = "FOLDER")]
+    recording: Option<PathBuf>,
+    /// One small case
+    #[arg(long)]
+    quick: bool,
+    /// Without subgroups: what every device runs
+    #[arg(long)]
+    baseline: bool,
+    /// Pixels a lane of the raster shades: 2, 4 or 8
+    #[arg(long, value_name = "N", value_parser = clap::builder::PossibleValuesParser::new(["2", "4", "8"]))]
+    column: Option<String>,
+}
+
+/// One kernel of a case, a step.
+struct Cost {
+    name: &'static str,
+    calls: f64,
+    ms: f64,
+    bytes: f64,
+    flops: f64,
+    roof_ms: f64,
+}
+
+struct Case {
+    name: String,
+    counts: Counts,
+    /// On the device, every command timed: the sum of `kernels`.
+    timed_ms: f64,
+    /// On the device and on the clock, no command timed.
+    device_ms: f64,
+    wall_ms: f64,
+    /// On the host, to record, encode and submit, while the step before runs.
+    host_ms: f64,
+    arena_bytes: u64,
+    /// Gaussians listed for a tile that has any, and for the one that has most.
+    list_mean: f64,
+    list_longest: u32,
+    kernels: Vec<Cost>,
+}
+
+struct Bench {
+    device: String,
+    tiling: Tiling,
+    peaks: Peaks,
+    /// By N at `SIZE`, by resolution at `COUNT`; `SMALL`, and the recorded scene.
+    by_count: Vec<Case>,
+    by_size: Vec<Case>,
+    single: Vec<Case>,
+}
+
+pub fn run(options: &Args) -> Result<(), Fault> {
+    // First, so that a wrong folder is told before the sweep.
+    let recorded = options.recording.as_deref().map(|folder| Scene::recorded(folder, RECORDED)).transpose()?;
+    let out = OutputDir::create(&options.out)?;
+    let config = GpuConfig {
+        device: options.device.clone().unwrap_or_default(),
+        subgroups: !options.baseline,
+        ..GpuConfig::default()
+    };
+    let mut gpu = Gpu::open(&config, model::arena_bytes(options.quick))?;
+    let peaks = model::measure(&mut gpu, options.quick)?;
+    let mut tiling = Tiling::of(gpu.caps());
+    tiling.column = options.column.as_ref().and_then(|n| n.parse().ok()).unwrap_or(tiling.column);
+    let device = gpu.caps().name.clone();
+    drop(gpu);
+    eprintln!("{device}: copies {:.1} GB/s, {:.1} GFLOP/s", peaks.bytes_per_s * 1e-9, peaks.flops_per_s * 1e-9);
+    let run = |scene: &Scene| measure(&config, scene, tiling, &peaks, options.quick);
+    let wall = |n: usize, (w, h): (usize, usize)| run(&Scene::wall(w, h, n));
+    let mut bench = Bench { device, tiling, peaks, by_count: vec![], by_size: vec![], single: vec![] };
+    if options.quick {
+        bench.by_count.push(wall(2_000, (160, 120))?);
+    } else {
+        for n in COUNTS {
+            bench.by_count.push(wall(n, SIZE)?);
+        }
+        for size in SIZES {
+            bench.by_size.push(wall(COUNT, size)?);
+        }
+        for n in SMALL.0 {
+            bench.single.push(wall(n, SMALL.1)?);
+        }
+    }
+    if let Some(scene) = &recorded {
+        bench.single.push(run(scene)?);
+    }
+    out.write("kernels.csv", |w| page::csv(w, &bench))?;
+    out.write("kernels.json", |w| page::json(w, &bench))?;
+    out.write("kernels.html", |w| page::html(w, &bench))?;
+    println!("{}", out.file("kernels.html").display());
+    Ok(())
+}
+
+fn measure(config: &GpuConfig, scene: &Scene, tiling: Tiling, peaks: &Peaks, quick: bool) -> Result<Case, Fault> {
+    let n = scene.splats.len();
+    let camera = &scene.view.camera;
+    let shape = Shape {
+        width: camera.width as u32,
+        height: camera.height as u32,
+        splats: n as u32,
+        intersections: (16 * n + 200_000).min(INTERSECTIONS_MAX) as u32,
+        keyframes: 1,
+        cameras: 1,
+        channels: 1,
+        sh_degree: 0,
+        inverse_depth: false,
+    };
+    let mut gpu = Gpu::open(config, Pipeline::arena_bytes(&shape))?;
+    let mut p = Pipeline::with_tiling(&mut gpu, shape, tiling)?;
+    p.append(&mut gpu, &scene.splats)?;
+    p.set_keyframe(&mut gpu, 0, &scene.image)?;
+    p.set_mask(&mut gpu, &scene.mask)?;
+    let mut last = StepStats::default();
+    let mut step = |gpu: &mut Gpu| -> Result<f64, Fault> {
+        last = p.train(gpu, &scene.view, 0, &RATES, &Weights::default())?;
+        Ok(gpu.last_submit_ms())
+    };
+    let first = Instant::now();
+    step(&mut gpu)?;
+    step(&mut gpu)?;
+    let steps = match quick {
+        true => STEPS.0,
+        false => ((2.0 * SECONDS / first.elapsed().as_secs_f64()) as usize).clamp(STEPS.0, STEPS.1),
+    };
+    let before: Vec<(u64, f64)> = gpu.timings().iter().map(|t| (t.count, t.total_ms)).collect();
+    let mut timed_ms = 0.0;
+    for _ in 0..steps {
+        timed_ms += step(&mut gpu)?;
+    }
+    let timings: Vec<_> = gpu.timings().to_vec();
+    gpu.time_commands(0);
+    // As the mapper trains: a step is started before the one before it is finished.
+    let (start, mut device_ms, mut host_ms) = (Instant::now(), 0.0, 0.0);
+    let mut under_way = None;
+    for i in 0..=steps {
+        let begun = Instant::now();
+        let next = (i < steps).then(|| p.start(&mut gpu, &scene.view, 0, &RATES, &Weights::default())).transpose()?;
+        host_ms += begun.elapsed().as_secs_f64() * 1e3;
+        if let Some(step) = std::mem::replace(&mut under_way, next) {
+            last = p.finish(&mut gpu, &step)?;
+            device_ms += gpu.last_submit_ms();
+        }
+    }
+    let (wall_ms, per) = (start.elapsed().as_secs_f64() * 1e3, 1.0 / steps as f64);
+    let counts = Counts {
+        splats: n as f64,
+        visible: f64::from(last.stats.visible),
+        intersections: f64::from(last.stats.intersections),
+        pixels: (camera.width * camera.height) as f64,
+        tile_pixels: tiling.tile().iter().map(|n| f64::from(*n)).product(),
+    };
+    let mut kernels: Vec<Cost> = timings
+        .iter()
+        .zip(&before)
+        .filter(|(t, before)| t.count > before.0)
+        .map(|(t, before)| {
+            let calls = (t.count - before.0) as f64 * per;
+            let (bytes, flops) = counts.model(t.name, calls);
+            let ms = (t.total_ms - before.1) * per;
+            Cost { name: t.name, calls, ms, bytes, flops, roof_ms: peaks.ms(bytes, flops) }
+        })
+        .collect();
+    kernels.sort_by(|a, b| b.ms.total_cmp(&a.ms));
+    let (list_mean, list_longest) = lists(&mut gpu, &p)?;
+    let case = Case {
+        name: scene.name.clone(),
+        counts,
+        timed_ms: timed_ms * per,
+        device_ms: device_ms * per,
+        wall_ms: wall_ms * per,
+        host_ms: host_ms * per,
+        arena_bytes: gpu.arena_used(),
+        list_mean,
+        list_longest,
+        kernels,
+    };
+    eprintln!(
+        "{:<32} {:>8} intersections, {:.0} to {} a tile: {:.3} ms of device a step, {:.1} steps/s",
+        case.name,
+        last.stats.intersections,
+        case.list_mean,
+        case.list_longest,
+        case.device_ms,
+        case.steps_per_s()
+    );
+    Ok(case)
+}
+
+/// Mean and largest length of the lists of tiles, of those that have one.
+fn lists(gpu: &mut Gpu, p: &Pipeline) -> Result<(f64, u32), Fault> {
+    let ranges = p.buffers().ranges;
+    let mut all = vec![[0u32; 2]; ranges.len()];
+    gpu.download(ranges, 0, &mut all).map_err(Fault::from)?;
+    let lengths: Vec<u32> = all.iter().map(|[from, to]| to - from).filter(|n| *n > 0).collect();
+    let sum: f64 = lengths.iter().map(|n| f64::from(*n)).sum();
+    Ok((sum / lengths.len().max(1) as f64, lengths.into_iter().max().unwrap_or(0)))
+}
+
+impl Case {
+    fn steps_per_s(&self) -> f64 {
+        1e3 / self.wall_ms
+    }
+}

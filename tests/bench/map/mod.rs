@@ -1,0 +1,200 @@
+//! `stipple-bench map`: what a map is worth at equal time, against the cap of Gaussians and without parts of the method.
+//!
+//! Every run plays the same input through the daemon with the same seconds of mapping, spread evenly over its frames
+//! (lockstep by time: what a step costs is part of what is measured, so figures repeat only as well as the clock
+//! does). Each leaves its own report in a folder of DIR; beside them `map.csv`, `map.json` and `map.html`.
+
+mod page;
+mod tables;
+
+use crate::run::{Job, Source};
+use std::path::PathBuf;
+use std::time::Instant;
+use stipple::output::report::Report;
+use stipple::output::OutputDir;
+use stipple_drivers::Fault;
+
+/// Seconds of mapping a run when not stated.
+const SECONDS: f64 = 30.0;
+const QUICK_SECONDS: f64 = 1.5;
+/// Caps of the pool, Gaussians.
+const CAPS: [u32; 4] = [20_000, 52_000, 100_000, 200_000];
+const QUICK_CAPS: [u32; 2] = [1_500, 3_000];
+/// What the ablations run at: the published system's count on V1_01.
+const ABLATED_CAP: u32 = 52_000;
+/// (Gaussian, tile) pairs bought a Gaussian of the cap: twice what views of V1_01 list of 52 k.
+const INTERSECTIONS: u32 = 15;
+/// At least, whatever the cap.
+const INTERSECTIONS_MIN: u32 = 300_000;
+/// Points of each run's curve.
+const PROBES: f64 = 20.0;
+/// The caps are what is limited here.
+const MEMORY_MAX_MIB: u32 = 8192;
+
+/// A method, by what it sets differently from the board.
+#[derive(Clone, Copy, Debug)]
+pub struct Variant {
+    pub name: &'static str,
+    pub about: &'static str,
+    pub set: &'static [&'static str],
+}
+
+const fn variant(name: &'static str, about: &'static str, set: &'static [&'static str]) -> Variant {
+    Variant { name, about, set }
+}
+
+/// The lines of the cap sweep; the first is the default.
+const LINES: [Variant; 2] = [
+    variant("default", "the board's own settings", &[]),
+    variant(
+        "as published",
+        "anchors by alpha; seeds and densifies up to the cap, never evicts; a raised burst and a convergence interval",
+        &[
+            "map.evict=false",
+            "map.growth_stops=false",
+            "map.seeds_per_step=0",
+            "map.wrong_error=1",
+            "map.burst_rate=2",
+            "map.converge_iterations_max=50",
+        ],
+    ),
+];
+
+/// What the map is without, or with, one part. The first row of the table is the default.
+const ABLATIONS: [Variant; 14] = [
+    variant("no burst", "a new anchor waits for its turn", &["map.burst_iterations=0"]),
+    variant("no densification", "seeds on bare depth only", &["map.densify_max=0"]),
+    variant("no eviction", "a full pool takes no more", &["map.evict=false"]),
+    variant("any seeds", "as many as the pool has room for, whatever the steps", &["map.seeds_per_step=0"]),
+    variant("convergence", "an anchor is trained on alone until it settles", &["map.converge_iterations_max=50"]),
+    variant("anchors by alpha", "covered but wrong views are not anchors", &["map.wrong_error=1"]),
+    variant("no SSIM", "L1 alone", &["map.ssim_weight=0"]),
+    variant("no needle loss", "axes of any ratio", &["map.needle_weight=0"]),
+    variant("no scale loss", "axes of any length", &["map.scale_weight=0"]),
+    variant("depth loss", "anchors are drawn to their stereo depth", &["map.depth_weight=0.1"]),
+    variant("no pose", "keyframe poses as given", &["map.refine_pose=false"]),
+    variant("no exposure", "one exposure for all keyframes", &["map.refine_exposure=false"]),
+    variant("neither", "neither pose nor exposure refined", &["map.refine_pose=false", "map.refine_exposure=false"]),
+    variant("growth stops", "adds less when the last did not pay", &["map.growth_stops=true"]),
+];
+
+/// Quality of the map at equal time: against the cap of Gaussians, and without parts of the method
+#[derive(clap::Args)]
+pub struct Args {
+    /// As for replay; without it the simulated flight of the demo
+    dataset: Option<PathBuf>,
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+    /// Board file; without it the one for Vulkan on the CPU
+    #[arg(long, value_name = "FILE")]
+    board: Option<PathBuf>,
+    /// Skip odometry, as for replay
+    #[arg(long, value_name = "CSV")]
+    poses: Option<PathBuf>,
+    /// Of mapping, each run
+    #[arg(long, value_name = "S", value_parser = crate::seconds)]
+    seconds: Option<f64>,
+    /// Two small caps and one ablation
+    #[arg(long)]
+    quick: bool,
+    /// Override a key of the board file in every run
+    #[arg(long = "set", value_name = "SECTION.KEY=VALUE")]
+    set: Vec<String>,
+}
+
+/// What a run was and what came of it.
+struct Row {
+    variant: Variant,
+    cap: u32,
+    report: Report,
+}
+
+struct Sweep {
+    seconds: f64,
+    /// The cap sweep, by line and cap.
+    caps: Vec<Row>,
+    /// The default, then each ablation.
+    ablations: Vec<Row>,
+}
+
+pub fn run(options: &Args) -> Result<(), Fault> {
+    let out_dir = OutputDir::create(&options.out)?;
+    let Args { dataset, board, poses, set, .. } = options;
+    let source = Source { dataset: dataset.clone(), board: board.clone(), poses: poses.clone(), set: set.clone() };
+    let seconds = options.seconds.unwrap_or(if options.quick { QUICK_SECONDS } else { SECONDS });
+    let start = Instant::now();
+    let measure = |folder: &str, variant: Variant, cap: u32| -> Result<Row, Fault> {
+        let name = format!("{folder}-{}-{cap}", variant.name.replace(' ', "-"));
+        let set = assignments(&variant, cap, seconds);
+        let dir = OutputDir::create(&options.out.join("runs").join(name))?;
+        let report = source.play(&Job { set: &set, seconds, quick: options.quick }, &dir)?;
+        let db = |v: Option<f64>| v.map_or("-".into(), |v| format!("{v:.2} dB"));
+        eprintln!(
+            "{:6.1} s  {:<24} cap {cap:>6}: {} Gaussians, {} steps, {} training, {} held out",
+            start.elapsed().as_secs_f64(),
+            variant.name,
+            report.splats.unwrap_or(0),
+            report.iterations.unwrap_or(0),
+            db(report.psnr_db),
+            db(report.psnr_heldout_db)
+        );
+        Ok(Row { variant, cap, report })
+    };
+    let mut sweep = Sweep { seconds, caps: vec![], ablations: vec![] };
+    let (caps, ablated): (&[u32], u32) =
+        if options.quick { (&QUICK_CAPS, QUICK_CAPS[1]) } else { (&CAPS, ABLATED_CAP) };
+    for line in LINES {
+        for cap in caps {
+            sweep.caps.push(measure("cap", line, *cap)?);
+        }
+    }
+    let ablations = &ABLATIONS[..if options.quick { 1 } else { ABLATIONS.len() }];
+    for ablation in std::iter::once(&LINES[0]).chain(ablations) {
+        sweep.ablations.push(measure("ablation", *ablation, ablated)?);
+        // After each: whoever ends a run of many minutes early keeps what there is.
+        out_dir.write("map.csv", |w| tables::csv(w, &sweep))?;
+        out_dir.write("map.json", |w| tables::json(w, &sweep))?;
+        out_dir.write("map.html", |w| page::write(w, &sweep))?;
+    }
+    println!("{}\n{}", tables::conclusion(&sweep), out_dir.file("map.html").display());
+    Ok(())
+}
+
+fn assignments(variant: &Variant, cap: u32, seconds: f64) -> Vec<String> {
+    let intersections = (INTERSECTIONS * cap).max(INTERSECTIONS_MIN);
+    let shape = [
+        format!("memory_max_mib={MEMORY_MAX_MIB}"),
+        format!("budget.intersections={intersections}"),
+        format!("budget.splats={cap}"),
+        format!("map.curve_period_s={}", seconds / PROBES),
+    ];
+    shape.into_iter().chain(variant.set.iter().map(|s| s.to_string())).collect()
+}
+
+impl Row {
+    /// Of a training step, seeding and evaluation of coverage included, ms.
+    fn step_ms(&self, seconds: f64) -> Option<f64> {
+        self.report.iterations.filter(|n| *n > 0).map(|n| 1e3 * seconds / n as f64)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use stipple::config::Board;
+
+    #[test]
+    fn every_variant_is_within_the_bounds_and_not_the_default() {
+        let board = |set: &[String]| {
+            Board::parse("lavapipe.toml", include_str!("../../../board-configs/lavapipe.toml"), set)
+                .expect("variants stay within the bounds")
+        };
+        for cap in CAPS.iter().chain(&QUICK_CAPS) {
+            assert_eq!(board(&assignments(&LINES[0], *cap, 1.0)).budget.splats, *cap);
+        }
+        let default = board(&assignments(&LINES[0], ABLATED_CAP, 1.0));
+        for v in LINES[1..].iter().chain(&ABLATIONS) {
+            assert_ne!(board(&assignments(v, ABLATED_CAP, 1.0)), default, "{}", v.name);
+        }
+    }
+}

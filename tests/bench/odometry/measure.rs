@@ -1,0 +1,94 @@
+//! One flight with one setting: error against its truth, and the time of each stage.
+
+use super::settings::Setting;
+use crate::inputs::Flight;
+use std::time::Instant;
+use stipple::config::Board;
+use stipple::frontend::{Frontend, Prediction};
+use stipple::math::real::Real;
+use stipple::output::metrics::{percentile, trajectory_error};
+use stipple::output::process::thread_cpu_secs;
+use stipple::vio::{Estimator, Scalar};
+use stipple_drivers::{Fault, TimedPose};
+
+/// What is not measured is `None`: no error without a trajectory.
+#[derive(Clone, Debug, Default)]
+pub struct Figures {
+    pub ate_m: Option<f64>,
+    pub rte_1s_m: Option<f64>,
+    pub rpe_deg: Option<f64>,
+    /// Wall time of a frame in each stage, ms.
+    pub frontend_ms_p50: f64,
+    pub frontend_ms_p99: f64,
+    pub estimator_ms_p50: f64,
+    pub estimator_ms_p99: f64,
+    /// CPU time of the thread, inertial samples included: what other programs take is not in it.
+    pub cpu_ms_per_frame: f64,
+    /// By the wall clock.
+    pub fps_one_thread: f64,
+    /// Frames that gave a pose.
+    pub tracked: usize,
+    pub keyframes: u64,
+    pub resets: u64,
+    /// Solver iterations a frame.
+    pub iterations_per_frame: f64,
+    pub hash: u64,
+}
+
+pub fn measure(flight: &Flight, setting: &Setting) -> Result<Figures, Fault> {
+    if setting.single {
+        measure_in::<f32>(flight, &setting.board)
+    } else {
+        measure_in::<Scalar>(flight, &setting.board)
+    }
+}
+
+fn measure_in<S: Real>(flight: &Flight, board: &Board) -> Result<Figures, Fault> {
+    let mut frontend = Frontend::new(&flight.calibration, &board.frontend)?;
+    let mut vio = Estimator::<S>::new(&flight.calibration, &board.vio);
+    let n = flight.frames.len();
+    let mut trajectory: Vec<TimedPose> = Vec::with_capacity(n);
+    let (mut frontend_ms, mut estimator_ms) = (Vec::with_capacity(n), Vec::with_capacity(n));
+    let mut samples = flight.imu.iter();
+    let (start, cpu) = (Instant::now(), thread_cpu_secs());
+    for frames in &flight.frames {
+        // Up to the first sample at or past the frame, as `stipple replay` in lockstep.
+        for sample in samples.by_ref() {
+            vio.on_imu(*sample);
+            if sample.t >= frames.t {
+                break;
+            }
+        }
+        let begun = Instant::now();
+        let prediction = Prediction { prev_from_now: vio.predict_motion(frames.t) };
+        let tracks = frontend.track(frames, &prediction);
+        let tracked = Instant::now();
+        let update = vio.on_tracks(tracks);
+        estimator_ms.push(tracked.elapsed().as_secs_f64() * 1e3);
+        frontend_ms.push((tracked - begun).as_secs_f64() * 1e3);
+        if let Some(o) = update.odometry {
+            trajectory.push(TimedPose { t: o.t, pose: o.world_from_body });
+        }
+    }
+    let wall = start.elapsed().as_secs_f64();
+    let cpu = thread_cpu_secs().zip(cpu).map_or(wall, |(end, start)| end - start);
+    let error = trajectory_error(&trajectory, &flight.truth);
+    let (of, stats) = (n.max(1) as f64, vio.stats());
+    let rank = |ms: &[f64], p: f64| percentile(ms, p).unwrap_or(0.0);
+    Ok(Figures {
+        ate_m: error.as_ref().map(|e| e.ate_rmse_m),
+        rte_1s_m: error.as_ref().and_then(|e| e.rte_1s_m),
+        rpe_deg: error.as_ref().and_then(|e| e.rpe_deg),
+        frontend_ms_p50: rank(&frontend_ms, 0.5),
+        frontend_ms_p99: rank(&frontend_ms, 0.99),
+        estimator_ms_p50: rank(&estimator_ms, 0.5),
+        estimator_ms_p99: rank(&estimator_ms, 0.99),
+        cpu_ms_per_frame: cpu * 1e3 / of,
+        fps_one_thread: n as f64 / wall.max(1e-9),
+        tracked: trajectory.len(),
+        keyframes: stats.keyframes,
+        resets: stats.resets,
+        iterations_per_frame: stats.iterations as f64 / of,
+        hash: vio.hash(),
+    })
+}

@@ -1,0 +1,71 @@
+//! Runs of the whole program, in this process: a recording or the demo's flight through odometry and map in lockstep.
+
+use std::path::PathBuf;
+use stipple::config::Board;
+use stipple::daemon::instruments::{colours, Input};
+use stipple::daemon::{run, Pace, Replay};
+use stipple::output::report::Report;
+use stipple::output::OutputDir;
+use stipple_drivers::sim::Scenario;
+use stipple_drivers::{Fault, Span};
+
+/// The board of the benches that are given none: Vulkan on the CPU, the estimator at the method's defaults.
+pub const BOARD_NAME: &str = "board-configs/lavapipe.toml";
+const BOARD: &str = include_str!("../../board-configs/lavapipe.toml");
+/// The demo's cameras are small already.
+const DEMO_SCALE: &str = "map.scale=1";
+/// Every so many keyframes one is held out.
+const HOLDOUT: u32 = 8;
+/// Seconds of the demo's flight that a quick run plays.
+const QUICK_FLIGHT_S: f64 = 3.0;
+
+pub fn default_board(set: &[String]) -> Result<Board, Fault> {
+    Board::parse(BOARD_NAME, BOARD, set)
+}
+
+/// What every run of a bench plays.
+pub struct Source {
+    /// As for replay; without it the simulated flight of the demo.
+    pub dataset: Option<PathBuf>,
+    pub board: Option<PathBuf>,
+    /// Table of poses in place of odometry.
+    pub poses: Option<PathBuf>,
+    /// `--set` of every run.
+    pub set: Vec<String>,
+}
+
+/// One run to make.
+pub struct Job<'a> {
+    /// Overrides the board and the source's own; the last wins.
+    pub set: &'a [String],
+    /// Time of mapping, spread evenly over the frames, s.
+    pub seconds: f64,
+    /// A small input will do.
+    pub quick: bool,
+}
+
+impl Source {
+    /// Plays the job in lockstep, every eighth keyframe held out; leaves the run's files in `out`.
+    pub fn play(&self, job: &Job, out: &OutputDir) -> Result<Report, Fault> {
+        let demo_scale = self.dataset.is_none().then(|| DEMO_SCALE.to_string());
+        let set: Vec<String> = demo_scale.iter().chain(&self.set).chain(job.set).cloned().collect();
+        let board = match &self.board {
+            Some(path) => Board::load(path, &set)?,
+            None => default_board(&set)?,
+        };
+        let (input, place) = match &self.dataset {
+            Some(path) => (Input::recording(path, &board.replay, &board.rig)?, path.display().to_string()),
+            None => {
+                let mut scenario = Scenario::named("demo").expect("the demo's scenario is compiled in");
+                if job.quick {
+                    scenario.duration = scenario.duration.min(Span::from_secs(QUICK_FLIGHT_S));
+                }
+                let cameras = colours(&scenario.calibration, &board).len();
+                (Input::rendered(&scenario, cameras, |_, _| {})?, "the simulated flight".into())
+            }
+        };
+        let (poses, mapping_s) = (self.poses.clone(), Some(job.seconds));
+        let options = Replay { pace: Pace::Lockstep, poses, holdout: HOLDOUT, duration_s: None, mapping_s };
+        run(input, &place, &board, out, &options)
+    }
+}

@@ -1,0 +1,261 @@
+//! `stipple-bench stability`: one row for each thing that goes wrong on a flight.
+//!
+//! A row says what became of the estimator (survived within stated bounds; detected, when it was wrong
+//! and said so; reset, and by what reason; missed, when it was wrong and silent), the error of the part of the
+//! flight before and of the part after the fault, each aligned on its own, and the jump from one to the
+//! other. Made-up tracks (`cases`) and rendered images with their light changed (`rendered`). The same
+//! rows are asserted by `tests`.
+
+mod cases;
+mod rendered;
+mod tables;
+#[cfg(test)]
+mod tests;
+
+use crate::flight::{record, Plan, Record};
+use std::path::PathBuf;
+use stipple::output::metrics::trajectory_error;
+use stipple::output::OutputDir;
+use stipple::vio::health::Health;
+use stipple::vio::{Stats, Vio};
+use stipple_drivers::{Fault, TimedPose};
+
+/// A quality this low says that the estimate is not to be relied on.
+const QUALITY_LOW: u8 = 20;
+/// An estimate that is wrong is detected when this share of its frames say so.
+const SAID_SHARE: f64 = 0.9;
+/// Frames into a fault that lasts for which the jump is taken.
+const JUMP_FRAMES: usize = 20;
+
+/// In the order of how bad it is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Verdict {
+    Survived,
+    /// Wrong, and says so.
+    Detected,
+    /// Noticed, given up, started again.
+    Reset,
+    /// Wrong and silent.
+    Missed,
+}
+
+impl Verdict {
+    pub fn name(self) -> &'static str {
+        match self {
+            Verdict::Survived => "survived",
+            Verdict::Detected => "detected",
+            Verdict::Reset => "reset",
+            Verdict::Missed => "MISSED",
+        }
+    }
+}
+
+/// How far off a flight may be, m: ATE before and after the fault, and the step across it.
+#[derive(Clone, Copy, Debug)]
+pub struct Limits {
+    pub before: f64,
+    pub after: f64,
+    pub jump: f64,
+}
+
+impl Default for Limits {
+    fn default() -> Limits {
+        Limits { before: 0.006, after: 0.006, jump: 0.008 }
+    }
+}
+
+#[derive(Clone)]
+struct Case {
+    name: &'static str,
+    plan: Plan,
+    /// Frames from which and before which the fault lasts; `None` when it is the whole flight.
+    fault: Option<(usize, usize)>,
+    expect: Verdict,
+    limits: Limits,
+    /// Bits that must be set on some frame.
+    health: Health,
+}
+
+/// What became of a case: the worst over the seeds flown.
+#[derive(Clone, Debug)]
+pub struct Row {
+    pub name: &'static str,
+    pub expect: Verdict,
+    pub limits: Limits,
+    pub says: Health,
+    /// The fault does not end.
+    pub lasts: bool,
+    pub verdict: Verdict,
+    /// ATE, m.
+    pub before: Option<f64>,
+    pub after: Option<f64>,
+    /// Error of the motion across the fault, m.
+    pub jump: Option<f64>,
+    /// Distance of the restart's position from the truth in its covariance.
+    pub restart_sigmas: Option<f64>,
+    pub stats: Stats,
+    /// Bits set once it had started.
+    pub health: Health,
+    /// Median before the fault (of all, without one), and the lowest after the start.
+    pub quality: u8,
+    pub quality_lowest: u8,
+}
+
+impl Row {
+    /// What is wrong with it, if anything is.
+    pub fn complaint(&self) -> Option<String> {
+        let over = |v: Option<f64>, max: f64| v.is_some_and(|v| v > max);
+        // A fault that lasts may end the next start too.
+        let resets = match (self.expect, self.lasts) {
+            (Verdict::Reset, true) => 1..=3,
+            (Verdict::Reset, false) => 1..=1,
+            _ => 0..=0,
+        };
+        let (name, said) = (self.name, self.health.reasons().collect::<Vec<_>>().join(" "));
+        if self.verdict != self.expect {
+            return Some(format!("{name}: {}, not {}", self.verdict.name(), self.expect.name()));
+        }
+        if !self.health.has(self.says) {
+            return Some(format!("{name}: says only {said}"));
+        }
+        if !resets.contains(&self.stats.resets) {
+            return Some(format!("{name}: {} resets, not {resets:?}", self.stats.resets));
+        }
+        let detected = self.expect == Verdict::Detected;
+        let far = over(self.before, self.limits.before)
+            || !detected && (over(self.after, self.limits.after) || over(self.jump, self.limits.jump));
+        far.then(|| format!("{name}: before {:?}, after {:?}, jump {:?} m", self.before, self.after, self.jump))
+    }
+
+    fn worst(self, other: Row) -> Row {
+        let max = |a: Option<f64>, b: Option<f64>| a.into_iter().chain(b).reduce(f64::max);
+        let stats = if other.stats.resets > self.stats.resets { other.stats } else { self.stats };
+        Row {
+            verdict: self.verdict.max(other.verdict),
+            before: max(self.before, other.before),
+            after: max(self.after, other.after),
+            jump: max(self.jump, other.jump),
+            restart_sigmas: max(self.restart_sigmas, other.restart_sigmas),
+            // Bits that every flight showed.
+            health: Health(self.health.0 & other.health.0),
+            quality: self.quality.min(other.quality),
+            quality_lowest: self.quality_lowest.min(other.quality_lowest),
+            stats,
+            ..self
+        }
+    }
+}
+
+fn ate(part: &[&Record]) -> Option<f64> {
+    let estimated: Vec<TimedPose> = part.iter().filter_map(|r| r.estimate).collect();
+    let truth: Vec<TimedPose> = part.iter().map(|r| r.truth).collect();
+    trajectory_error(&estimated, &truth).map(|e| e.ate_rmse_m)
+}
+
+/// Error of the estimated motion from one record to another, m.
+fn jump(a: &Record, b: &Record) -> Option<f64> {
+    let moved = a.estimate?.pose.inverse() * b.estimate?.pose;
+    let truly = a.truth.pose.inverse() * b.truth.pose;
+    Some((truly.inverse() * moved).p.length())
+}
+
+/// A flight as a row. `None`: the fault is the whole flight.
+fn judge(case: &Case, records: &[Record], vio: &Vio) -> Row {
+    let fault = case.fault;
+    let (from, to) = fault.unwrap_or((0, 0));
+    let lasts = to == usize::MAX;
+    let before: Vec<&Record> = records.iter().filter(|r| r.frame < from).collect();
+    let after: Vec<&Record> = records.iter().filter(|r| r.frame >= if lasts { from } else { to }).collect();
+    let first_after = if lasts { from + JUMP_FRAMES } else { to };
+    let started: Vec<&Record> = records.iter().skip_while(|r| r.estimate.is_none()).collect();
+    let last = before.iter().rev().find(|r| r.estimate.is_some());
+    let next = records.iter().find(|r| r.frame >= first_after && r.estimate.is_some());
+    let restart =
+        records.windows(2).filter(|w| w[0].estimate.is_none() && w[0].resets > 0).find(|w| w[1].estimate.is_some());
+    let mut health = Health::default();
+    started.iter().for_each(|r| health.set(r.health, true));
+    let mut of: Vec<u8> = if fault.is_some() { &before } else { &started }
+        .iter()
+        .filter(|r| r.estimate.is_some())
+        .map(|r| r.quality)
+        .collect();
+    of.sort_unstable();
+    let mut row = Row {
+        name: case.name,
+        expect: case.expect,
+        limits: case.limits,
+        says: case.health,
+        lasts,
+        verdict: Verdict::Survived,
+        before: ate(&before),
+        after: ate(&after),
+        jump: last.zip(next).filter(|_| fault.is_some()).and_then(|(a, b)| jump(a, b)),
+        restart_sigmas: restart.and_then(|w| w[1].position_sigmas),
+        stats: *vio.stats(),
+        health,
+        quality: of.get(of.len() / 2).copied().unwrap_or(0),
+        quality_lowest: started.iter().map(|r| r.quality).min().unwrap_or(0),
+    };
+    let far = |v: Option<f64>, max: f64| v.is_none_or(|v| v > max);
+    let wrong = far(row.after, row.limits.after) || row.jump.is_some_and(|j| j > row.limits.jump);
+    let says = |r: &&&Record| r.health.0 & !Health::NORMAL.0 != 0 || r.quality <= QUALITY_LOW;
+    let estimates = || after.iter().filter(|r| r.estimate.is_some());
+    let said = estimates().filter(says).count() as f64 >= SAID_SHARE * estimates().count() as f64;
+    row.verdict = match (row.stats.resets > 0, wrong, said) {
+        (true, ..) => Verdict::Reset,
+        (_, false, _) => Verdict::Survived,
+        (_, true, true) => Verdict::Detected,
+        (_, true, false) => Verdict::Missed,
+    };
+    row
+}
+
+fn worst_of(rows: impl Iterator<Item = Row>) -> Option<Row> {
+    rows.reduce(Row::worst)
+}
+
+/// Every case, flown with each seed.
+pub fn rows(seeds: &[u64]) -> Result<Vec<Row>, Fault> {
+    let mut rows = Vec::new();
+    for case in cases::all() {
+        rows.extend(worst_of(seeds.iter().map(|seed| {
+            let (records, vio) = record(&case.plan, *seed);
+            judge(&case, &records, &vio)
+        })));
+    }
+    rows.extend(rendered::rows()?);
+    Ok(rows)
+}
+
+/// Every case on made-up tracks, frame by frame.
+pub fn flights(seed: u64) -> Vec<Vec<Record>> {
+    cases::all().iter().map(|case| record(&case.plan, seed).0).collect()
+}
+
+/// As a table for a terminal.
+pub fn print(rows: &[Row]) -> String {
+    tables::text(rows)
+}
+
+/// What becomes of the estimator when something goes wrong: one row a case
+#[derive(clap::Args)]
+pub struct Args {
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+    /// Flights of each case; the worst is shown
+    #[arg(long, value_name = "N", default_value = "5", value_parser = clap::value_parser!(u64).range(1..=1000))]
+    seeds: u64,
+}
+
+pub fn run(args: &Args) -> Result<(), Fault> {
+    let out = OutputDir::create(&args.out)?;
+    let seeds: Vec<u64> = (1..=args.seeds).collect();
+    let rows = rows(&seeds)?;
+    out.write("stability.csv", |w| tables::csv(w, &rows))?;
+    out.write("stability.json", |w| tables::json(w, &rows))?;
+    out.write("stability.html", |w| tables::html(w, &rows, seeds.len()))?;
+    println!("{}", print(&rows));
+    rows.iter().filter_map(Row::complaint).for_each(|c| println!("not as expected: {c}"));
+    println!("{}", out.file("stability.html").display());
+    Ok(())
+}

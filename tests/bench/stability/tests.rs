@@ -1,0 +1,107 @@
+//! What goes wrong on a flight: the estimator survives it within a stated error, or notices and starts
+//! again. The rows are those of `stipple bench stability`, here on fewer flights;
+//! `cargo test --bin stipple-bench stability -- --nocapture` prints them.
+#![allow(clippy::unwrap_used)]
+
+use super::{cases, print, rows, Verdict};
+use crate::flight::{record, Plan, Record};
+use crate::world::Noise;
+use glam::{DQuat, DVec3};
+use stipple::config::VioConfig;
+use stipple::output::metrics::trajectory_error;
+use stipple::vio::Stats;
+use stipple_drivers::{ImuSample, Pose, TimedPose};
+
+struct Run {
+    ate: f64,
+    /// Distance of the estimate from its first, at the end.
+    travelled: f64,
+    stats: Stats,
+}
+
+fn run(plan: &Plan) -> Run {
+    let (records, vio) = record(plan, 7);
+    let estimated: Vec<TimedPose> = records.iter().filter_map(|r| r.estimate).collect();
+    let truth: Vec<TimedPose> = records.iter().map(|r| r.truth).collect();
+    let (first, last) = (estimated[0].pose.p, estimated[estimated.len() - 1].pose.p);
+    let ate = trajectory_error(&estimated, &truth).unwrap().ate_rmse_m;
+    Run { ate, travelled: first.distance(last), stats: *vio.stats() }
+}
+
+fn resting(_: f64) -> Pose {
+    Pose::new(DQuat::from_rotation_z(0.3), DVec3::new(0.2, -0.1, 0.3))
+}
+
+#[test]
+fn zero_velocity_update_stops_the_creep_of_a_resting_rig() {
+    let held = run(&Plan { pose: resting, ..Plan::default() });
+    let free = run(&Plan { pose: resting, config: |c| c.zero_velocity = false, ..Plan::default() });
+    let updates = [held.stats, free.stats].map(|s| s.zero_velocity_updates);
+    let moved = (held.travelled, free.travelled);
+    eprintln!("at rest 8 s: {updates:?} updates, moved {moved:.5?} m, ATE {:.5} and {:.5} m", held.ate, free.ate);
+    assert!(updates[0] > 140 && updates[1] == 0);
+    assert!(held.travelled < 0.002 && held.ate <= free.ate);
+}
+
+#[test]
+fn flight_is_never_taken_for_rest() {
+    assert_eq!(run(&Plan::default()).stats.zero_velocity_updates, 0);
+}
+
+/// A gyro of 0.3 rad/s and an accelerometer of 1.07 g: this flight leaves both.
+fn clip(s: &mut ImuSample, _: &mut Noise) {
+    s.gyro_body = s.gyro_body.clamp(DVec3::splat(-0.3), DVec3::splat(0.3));
+    s.accel_body = s.accel_body.clamp(DVec3::splat(-10.5), DVec3::splat(10.5));
+}
+
+#[test]
+fn clipped_samples_harm_less_when_the_range_is_known() {
+    let known = |c: &mut VioConfig| (c.gyro_max, c.accel_max) = (0.3, 10.5);
+    let told = run(&Plan { config: known, warp: clip, ..Plan::default() });
+    let untold = run(&Plan { warp: clip, ..Plan::default() });
+    let (n, resets) = (told.stats.imu_saturated, untold.stats.resets);
+    eprintln!("{n} clipped samples: ATE {:.4} m; range not known {:.4} m, {resets} resets", told.ate, untold.ate);
+    assert!(n > 100 && untold.stats.imu_saturated == 0);
+    assert!(told.ate < 0.03 && told.ate < 0.7 * untold.ate && told.stats.resets == 0);
+}
+
+#[test]
+fn flights_gone_wrong_are_survived_or_noticed() {
+    let rows = rows(&[1]).unwrap();
+    eprintln!("{}", print(&rows));
+    let complaints: Vec<String> = rows.iter().filter_map(|r| r.complaint()).collect();
+    assert!(complaints.is_empty(), "{complaints:#?}");
+}
+
+/// Frames flown after a fault that ended, where only the restart matters.
+const RESTART_FRAMES: usize = 40;
+
+/// The cases that end in one reset and go on, for a closer look at how; until two seconds after the fault.
+fn recovering(seed: u64) -> Vec<(&'static str, Vec<Record>, Stats)> {
+    let mut flown = Vec::new();
+    for mut case in cases::all() {
+        let Some((_, to)) = case.fault.filter(|f| case.expect == Verdict::Reset && f.1 != usize::MAX) else { continue };
+        case.plan.frames = to + RESTART_FRAMES;
+        let (records, vio) = record(&case.plan, seed);
+        flown.push((case.name, records, *vio.stats()));
+    }
+    flown
+}
+
+/// Distance in its covariance that one error of three dimensions in four hundred exceeds: χ²₃, 99.73 %.
+const THREE_SIGMA: f64 = 3.76;
+
+/// Whatever ended the estimate: one reset is counted, the restart stands where the covariance says, and so
+/// does every frame after it.
+#[test]
+fn restart_goes_on_from_the_trusted_pose_with_honest_covariance() {
+    for (name, records, stats) in (0..20).flat_map(|seed| recovering(100 + seed)) {
+        assert_eq!(stats.resets, 1, "{name}: {stats:?}");
+        let after: Vec<_> = records.iter().skip_while(|r| r.resets == 0).filter(|r| r.estimate.is_some()).collect();
+        assert!(after.len() > 10, "{name}: {} frames after the restart", after.len());
+        for r in [after[0], after[after.len() - 1]] {
+            let sigmas = r.position_sigmas.unwrap();
+            assert!(sigmas < THREE_SIGMA, "{name}, frame {}: {sigmas:.1} sigma from the truth", r.frame);
+        }
+    }
+}

@@ -1,0 +1,86 @@
+//! `stipple-bench`: the instruments. Each subcommand measures one thing and leaves tables and charts in the folder of `--out`.
+//!
+//! This program is no part of the product: it is built with the feature `instruments`, which opens to it what the library
+//! keeps to itself. What each bench measures, how long it takes and what it found: README.md beside this file.
+
+mod consistency;
+mod faults;
+mod flight;
+mod inputs;
+mod kernels;
+mod map;
+mod odometry;
+mod record;
+mod run;
+mod stability;
+mod stereo;
+#[allow(dead_code)] // the tests take more of it
+mod world;
+
+use clap::{Parser, Subcommand};
+use std::process::ExitCode;
+use stipple::mem::CountingAllocator;
+use stipple_drivers::{Exit, Fault};
+
+#[global_allocator]
+static ALLOCATOR: CountingAllocator = CountingAllocator;
+
+/// Measures what Stipple's parameters cost and what they buy
+#[derive(Parser)]
+#[command(version)]
+struct Cli {
+    #[command(subcommand)]
+    bench: Bench,
+}
+
+#[derive(Subcommand)]
+enum Bench {
+    Odometry(odometry::Args),
+    Stability(stability::Args),
+    Consistency(consistency::Args),
+    Map(map::Args),
+    Kernels(kernels::Args),
+    Stereo(stereo::Args),
+    Faults(faults::Args),
+    Record(record::Args),
+}
+
+fn run(bench: &Bench) -> Result<(), Fault> {
+    match bench {
+        Bench::Odometry(args) => odometry::run(args),
+        Bench::Stability(args) => stability::run(args),
+        Bench::Consistency(args) => consistency::run(args),
+        Bench::Map(args) => map::run(args),
+        Bench::Kernels(args) => kernels::run(args),
+        Bench::Stereo(args) => stereo::run(args),
+        Bench::Faults(args) => faults::run(args),
+        Bench::Record(args) => record::run(args),
+    }
+}
+
+fn main() -> ExitCode {
+    // Who stops reading, as `head` does, has read enough.
+    stipple_drivers::host::end_when_unread();
+    let cli = match Cli::try_parse() {
+        Ok(cli) => cli,
+        Err(e) => {
+            let _ = e.print();
+            return if e.use_stderr() { ExitCode::from(Exit::Usage as u8) } else { ExitCode::SUCCESS };
+        }
+    };
+    match run(&cli.bench) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(fault) => {
+            eprintln!("stipple-bench: {fault}");
+            ExitCode::from(fault.exit as u8)
+        }
+    }
+}
+
+/// A positive number of seconds, for clap.
+fn seconds(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(s) if s.is_finite() && s > 0.0 => Ok(s),
+        _ => Err("a positive number of seconds".into()),
+    }
+}

@@ -1,0 +1,144 @@
+//! `stipple-bench .. --quick` leaves figures that can be read and drawn.
+#![allow(clippy::unwrap_used)]
+
+mod program;
+
+use program::{flight, text};
+use std::fs;
+use std::path::Path;
+use std::process::{Command, Output};
+
+fn stipple_bench(args: &[&str], out: &Path) -> Output {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_stipple-bench"));
+    command.args(args).args(["--out", out.to_str().unwrap()]).output().unwrap()
+}
+
+/// Answers what it said.
+fn bench(args: &[&str], out: &Path) -> String {
+    let o = stipple_bench(args, out);
+    assert!(o.status.success(), "{}", text(&o));
+    text(&o)
+}
+
+#[test]
+fn quick_sweep_writes_finite_figures_and_marks_the_default() {
+    let dir = tempfile::tempdir().unwrap();
+    let out = dir.path().join("out");
+    bench(&["odometry", "--quick"], &out);
+
+    let csv = fs::read_to_string(out.join("odometry.csv")).unwrap();
+    let mut lines = csv.lines().map(|l| l.split(',').collect::<Vec<_>>());
+    let head = lines.next().unwrap();
+    let rows: Vec<_> = lines.collect();
+    assert_eq!(
+        rows.iter().map(|r| &r[..2]).collect::<Vec<_>>(),
+        [["demo", "default"], ["demo", "vio.iterations_max=3"]]
+    );
+    for row in &rows {
+        assert_eq!(row.len(), head.len());
+        for (name, field) in head.iter().zip(row).skip(2).filter(|(name, _)| **name != "hash") {
+            assert!(field.parse::<f64>().is_ok_and(f64::is_finite), "{name} is `{field}`");
+        }
+    }
+    let ate = head.iter().position(|name| *name == "ate_m").unwrap();
+    assert!(rows[0][ate].parse::<f64>().unwrap() < 0.2, "{csv}");
+
+    let json: serde_json::Value = serde_json::from_slice(&fs::read(out.join("odometry.json")).unwrap()).unwrap();
+    assert!(json["knee"].is_string() && json["rows"][0]["default"] == true && json["rows"][1]["default"] == false);
+    let html = fs::read_to_string(out.join("odometry.html")).unwrap();
+    assert!(html.contains("<svg") && html.contains("class=\"default\"") && !html.contains("NaN"));
+}
+
+#[test]
+fn quick_map_bench_gives_every_run_the_same_time_and_draws_it() {
+    let dir = tempfile::tempdir().unwrap();
+    let out = dir.path().join("out");
+    bench(&["map", "--quick", "--set", "map.scale=4"], &out);
+
+    let csv = fs::read_to_string(out.join("map.csv")).unwrap();
+    let rows: Vec<Vec<&str>> = csv.lines().map(|l| l.split(',').collect()).collect();
+    let column = |name: &str| rows[0].iter().position(|n| *n == name).unwrap();
+    assert!(rows.len() >= 5, "{csv}");
+    for row in &rows[1..] {
+        let of = |name: &str| row[column(name)].parse::<f64>().unwrap();
+        assert!(of("psnr_db").is_finite() && of("splats") <= of("cap") && of("splats") > 0.0, "{csv}");
+        // Time over steps times steps: the same for every run.
+        let spent = of("step_ms") * of("iterations");
+        assert!((spent - 1500.0).abs() < 15.0, "{csv}");
+    }
+    let json: serde_json::Value = serde_json::from_slice(&fs::read(out.join("map.json")).unwrap()).unwrap();
+    assert_eq!(json["mapping_s"], 1.5);
+    let html = fs::read_to_string(out.join("map.html")).unwrap();
+    assert!(html.contains("<svg") && html.contains("class=\"default\"") && !html.contains("NaN"));
+}
+
+#[test]
+fn quick_kernel_bench_times_every_kernel_of_a_step() {
+    let dir = tempfile::tempdir().unwrap();
+    let out = dir.path().join("out");
+    bench(&["kernels", "--quick"], &out);
+
+    let json: serde_json::Value = serde_json::from_slice(&fs::read(out.join("kernels.json")).unwrap()).unwrap();
+    assert!(json["copy_bytes_per_s"].as_f64().unwrap() > 0.0 && json["fma_flops_per_s"].as_f64().unwrap() > 0.0);
+    let case = &json["cases"][0];
+    assert!(case["steps_per_s"].as_f64().unwrap() > 0.0 && case["visible"].as_f64().unwrap() > 1900.0);
+    let kernels = case["kernels"].as_array().unwrap();
+    for name in ["project", "radix_scatter", "raster_forward", "raster_backward", "ssim_rows", "project_backward"] {
+        let is_it = |k: &&serde_json::Value| k["name"].as_str().unwrap().starts_with(name);
+        let k = kernels.iter().find(is_it).unwrap_or_else(|| panic!("{name} is missing: {kernels:?}"));
+        assert!(k["ms"].as_f64().unwrap() > 0.0 && k["bytes"].as_f64().unwrap() > 0.0, "{k}");
+    }
+    let html = fs::read_to_string(out.join("kernels.html")).unwrap();
+    assert!(html.contains("<svg") && !html.contains("NaN"));
+    assert!(fs::read_to_string(out.join("kernels.csv")).unwrap().lines().count() > kernels.len());
+}
+
+#[test]
+fn quick_stereo_bench_writes_a_row_a_method_and_a_picture_of_each() {
+    let dir = tempfile::tempdir().unwrap();
+    let out = dir.path().join("out");
+    let said = bench(&["stereo", "--quick"], &out);
+
+    let rows: serde_json::Value = serde_json::from_slice(&fs::read(out.join("stereo.json")).unwrap()).unwrap();
+    let rows = rows.as_array().unwrap();
+    let row = |set: &str, method: &str| rows.iter().find(|r| r["set"] == set && r["method"] == method);
+    let methods: Vec<&str> =
+        ["bm", "sgbm", "sgm", "sgm_wls"].into_iter().filter(|m| !said.contains(&format!("{m} is left out"))).collect();
+    assert!(!methods.is_empty(), "{said}");
+    for method in methods {
+        let box_ = row("hard_occlusion", method).unwrap();
+        let figure = |name: &str| box_[name].as_f64().unwrap();
+        assert!(figure("bad1") < 0.1 && figure("density") > 0.8 && figure("mean_px") < 1.0, "{box_}");
+        assert!(figure("ms") > 0.0 && figure("bytes") > 0.0 && !box_["device"].as_str().unwrap().is_empty());
+        assert_eq!(row("hard_black_eye", method).unwrap()["density"], 0.0);
+        assert!(out.join(format!("pictures/hard_occlusion-{method}.png")).is_file());
+    }
+    let html = fs::read_to_string(out.join("stereo.html")).unwrap();
+    assert!(html.contains("data:image/png") && !html.contains(">NaN") && !html.contains("NaN,"));
+}
+
+#[test]
+fn kernels_of_a_recording_that_is_not_there_fail_before_the_sweep() {
+    let dir = tempfile::tempdir().unwrap();
+    let out = dir.path().join("out");
+    let o = stipple_bench(&["kernels", "--recording", "no/such/folder"], &out);
+    let said = String::from_utf8_lossy(&o.stderr);
+    assert!(!o.status.success() && said.contains("no/such/folder"), "{said}");
+    assert_eq!(said.trim().lines().count(), 1, "{said}");
+    assert!(!out.exists());
+}
+
+#[test]
+fn recording_is_measured_against_a_flight_without() {
+    let dir = tempfile::tempdir().unwrap();
+    let (data, out) = (flight(dir.path(), "1.5"), dir.path().join("bench"));
+    let said = bench(&["record", data.to_str().unwrap(), "--passes", "1"], &out);
+    assert!(said.contains("with recording over that without"), "{said}");
+    let rows: serde_json::Value = serde_json::from_slice(&fs::read(out.join("record.json")).unwrap()).unwrap();
+    assert_eq!((&rows[0]["records"], &rows[1]["records"]), (&false.into(), &true.into()));
+    let recorded = &rows[1]["recorded"];
+    let frames =
+        recorded["record_frames_written"].as_u64().unwrap() + recorded["record_frames_dropped"].as_u64().unwrap();
+    assert!(frames >= 29 && recorded["record_ring_most"].as_u64().unwrap() >= 1, "{rows}");
+    assert!(!out.join("recording-1").exists(), "what was measured is not kept");
+}
