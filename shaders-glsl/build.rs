@@ -122,21 +122,6 @@ fn opencv_shim() {
         "OpenCV's calib3d headers are missing: apt-get install libopencv-calib3d-dev, or build with --no-default-features"
     );
     cc::Build::new().cpp(true).std("c++17").opt_level(2).include(headers).file(shim).compile("stipple_opencv");
-    if std::env::var_os("CARGO_FEATURE_XIMGPROC").is_some() {
-        ximgproc_shim(headers);
-    }
     println!("cargo:rustc-link-lib=opencv_calib3d");
     println!("cargo:rustc-link-lib=opencv_core");
-}
-
-/// OpenCV's filter of disparities, to compare with; see src/stereo/ximgproc.rs.
-fn ximgproc_shim(headers: &Path) {
-    let shim = "src/stereo/ximgproc.cpp";
-    println!("cargo:rerun-if-changed={shim}");
-    assert!(
-        headers.join("opencv2/ximgproc.hpp").exists(),
-        "OpenCV's ximgproc headers are missing: apt-get install libopencv-contrib-dev, or leave --features ximgproc out"
-    );
-    cc::Build::new().cpp(true).std("c++17").opt_level(2).include(headers).file(shim).compile("stipple_ximgproc");
-    println!("cargo:rustc-link-lib=opencv_ximgproc");
 }

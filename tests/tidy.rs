@@ -17,14 +17,8 @@ const EDGES: [(&str, &[&str]); 5] = [
     ("output", &["map", "vio"]),
 ];
 /// Where `unsafe` may stand: the GPU, the allocator, the shims of OpenCV and ONNX Runtime, system calls of drivers.
-const UNSAFE: [&str; 6] = [
-    "src/gpu/",
-    "src/mem.rs",
-    "src/stereo/opencv.rs",
-    "src/stereo/ximgproc.rs",
-    "src/stereo/onnx/runtime.rs",
-    "drivers/src/",
-];
+const UNSAFE: [&str; 5] =
+    ["src/gpu/", "src/mem.rs", "src/stereo/opencv.rs", "src/stereo/onnx/runtime.rs", "drivers/src/"];
 const RUST_LINES_MAX: usize = 600;
 const KERNEL_LINES_MAX: usize = 250;
 /// Lines between a safety comment and the end of what it explains.

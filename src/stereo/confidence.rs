@@ -28,7 +28,7 @@ struct Fit {
     missing: f64,
 }
 
-/// Of greatest likelihood by `stipple-bench stereo --fit`.
+/// Factors of greatest likelihood on simulated flights: errors are as large as they say on others (tests/bench/README.md).
 const BM: Fit = Fit { floor: 2.5e-4, noise: 1.99, off: 1.318, bent: 2.20, bent_far: 1.40, missing: 0.180 };
 const SGBM: Fit = Fit { floor: 8.14e-3, noise: 20.6, off: 0.904, bent: 2.19, bent_far: 1.30, missing: 0.606 };
 
@@ -57,9 +57,6 @@ struct Sums {
 }
 
 impl Confidence {
-    /// Of the variance, in the order of `Fit`.
-    pub const PARTS: [&str; 6] = ["floor", "noise", "off", "bent", "bent_far", "missing"];
-
     pub fn footprint(width: usize) -> Footprint {
         let mut f = Footprint::default();
         f.host("stereo: sums of the confidence", width * size_of::<Sums>());
@@ -73,17 +70,8 @@ impl Confidence {
 
     /// Fills in the standard deviations of what is known.
     pub fn estimate(&mut self, left: &Image, out: &mut Disparity) {
-        self.estimate_by(self.fit, left, out);
-    }
-
-    /// The same by other factors of `PARTS` than the method's own.
-    pub fn restate(&mut self, left: &Image, parts: [f64; 6], out: &mut Disparity) {
-        let [floor, noise, off, bent, bent_far, missing] = parts;
-        self.estimate_by(Fit { floor, noise, off, bent, bent_far, missing }, left, out);
-    }
-
-    fn estimate_by(&mut self, fit: Fit, left: &Image, out: &mut Disparity) {
         let (w, h) = (out.width, out.height);
+        let fit = self.fit;
         self.columns.fill(Sums::default());
         for y in 0..h + HALF {
             for (x, column) in self.columns.iter_mut().enumerate() {

@@ -12,7 +12,7 @@ use super::onnx::Network;
 use super::opencv::OpenCv;
 use super::rectify_gpu::Rectifier;
 use super::sgm::{self, Sgm};
-use super::wls::{Variance, Wls};
+use super::wls::Wls;
 use crate::config::{StereoConfig, StereoMethod};
 use crate::gpu::Gpu;
 use crate::mem::Footprint;
@@ -95,35 +95,6 @@ impl Method {
         match self {
             Method::Sgm(_) => Wls::SIGMA_MAX_PX,
             Method::OpenCv(..) | Method::Onnx(..) => f32::INFINITY,
-        }
-    }
-
-    /// Names of the parts that a variance is the weighted sum of.
-    pub fn parts(&self) -> &'static [&'static str] {
-        match self {
-            Method::Sgm(_) => &Variance::PARTS,
-            Method::OpenCv(..) | Method::Onnx(..) => &Confidence::PARTS,
-        }
-    }
-
-    /// The deviations of the pair computed last if part `only` were all of the variance, with a factor of one.
-    pub fn restate(
-        &mut self,
-        gpu: Option<&mut Gpu>,
-        left: &Image,
-        only: usize,
-        out: &mut Disparity,
-    ) -> Result<(), Fault> {
-        match self {
-            Method::OpenCv(_, confidence) | Method::Onnx(_, confidence) => {
-                confidence.restate(left, std::array::from_fn(|k| f64::from(u8::from(k == only))), out);
-                Ok(())
-            }
-            Method::Sgm(sgm) => {
-                let gpu = gpu.ok_or_else(|| without_gpu(StereoMethod::Sgm))?;
-                let variance = Variance::of(std::array::from_fn(|k| f32::from(u8::from(k == only))));
-                Ok(sgm.restate(gpu, variance, &mut out.sigma_px)?)
-            }
         }
     }
 

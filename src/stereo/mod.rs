@@ -14,8 +14,6 @@ pub mod rectify;
 pub mod rectify_gpu;
 pub mod sgm;
 pub mod wls;
-#[cfg(feature = "ximgproc")]
-pub mod ximgproc;
 
 use crate::config::{StereoConfig, StereoMethod};
 use crate::gpu::Gpu;

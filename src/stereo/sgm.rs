@@ -17,7 +17,7 @@
 //! All until the filter is integers, and no sum depends on the order of threads: the result is the same in every run.
 
 use super::rectify_gpu::{pack, Rectifier};
-use super::wls::{Variance, Wls};
+use super::wls::Wls;
 use crate::config::StereoConfig;
 use crate::gpu::kernels::{
     aggregate, census, match_left, match_right, speckle_count, speckle_drop, speckle_join, verify,
@@ -338,13 +338,5 @@ impl Sgm {
     /// Fills and smooths where the shape says so, and settles the deviations.
     pub fn record_filter(&self, rec: &mut Recorder) {
         self.wls.record(rec, &self.b, self.shape.size(), self.shape.wls);
-    }
-
-    /// The deviations of the pair computed last, by another variance than the filter's own.
-    pub fn restate(&self, gpu: &mut Gpu, variance: Variance, deviation: &mut [f32]) -> Result<(), GpuError> {
-        let mut rec = gpu.record();
-        self.wls.record_settle(&mut rec, &self.b, self.shape.size(), variance);
-        gpu.submit(rec)?;
-        gpu.download(self.b.deviation, 0, deviation)
     }
 }

@@ -27,17 +27,10 @@ pub struct Variance {
 }
 
 impl Variance {
-    pub const PARTS: [&str; 5] = ["least", "bent", "bent_far", "faint", "missing"];
-    /// With the filter and without: of greatest likelihood on an earlier set of flights, by one bit a pixel of census. Errors
-    /// of flights it has not seen have 0.90 to 1.20 of it without the filter, 0.97 to 1.31 with, by range. Of what
-    /// `stipple-bench stereo --fit` finds now they have 0.69 to 1.40; more of what is filled in would pass `SIGMA_MAX_PX` by that.
+    /// Factors of greatest likelihood on simulated flights, with the filter and without. Errors of other flights have 0.90 to
+    /// 1.20 of it without the filter and 0.97 to 1.31 with, by range of depth. Factors fitted to more flights did worse: 0.69 to
+    /// 1.40, and more of what is filled in would pass `SIGMA_MAX_PX`.
     pub const FITTED: Variance = Variance { least: 0.0004, bent: 5.4, bent_far: 9.1, faint: 0.217, missing: 0.137 };
-
-    /// In the order of `PARTS`.
-    pub fn of(parts: [f32; 5]) -> Variance {
-        let [least, bent, bent_far, faint, missing] = parts;
-        Variance { least, bent, bent_far, faint, missing }
-    }
 }
 
 impl Wls {
@@ -101,13 +94,7 @@ impl Wls {
                 );
             }
         }
-        self.record_settle(rec, b, size, Variance::FITTED);
-    }
-
-    /// The last stage alone, which may be repeated with another variance.
-    pub fn record_settle(&self, rec: &mut Recorder, b: &Buffers, size: [u32; 2], variance: Variance) {
-        let [width, height] = size;
-        let Variance { least, bent, bent_far, faint, missing } = variance;
+        let Variance { least, bent, bent_far, faint, missing } = Variance::FITTED;
         rec.dispatch(
             &self.settle,
             settle::Bind {

@@ -1,8 +1,8 @@
-//! Simulated flights that methods are judged on: the ones that deviations were fitted to, and others to report.
+//! Simulated flights that methods are judged on.
 //!
-//! Every flight has a room of its own, furnished by its seed, and no path is in both lists, though halves of one are: fitted
-//! to the first half of `aggressive` and reported on the second, and so with recorded ones. Invented flights stay in a room of 8 m; MH_04's room is up to 20 m deep, the only one with depths beyond 8 m.
-//! Of each the frames that see most within a metre are added, of which evenly chosen ones see next to nothing.
+//! The factors of the methods' deviations were fitted to other flights: seeds 1 to 3, which furnish other rooms, and other halves
+//! of these paths. Invented flights stay in a room of 8 m; MH_04's room is up to 20 m deep, the only one with depths beyond
+//! 8 m. The frames that see most within a metre are added, since evenly chosen ones see next to nothing there.
 
 use super::sets::{self, Set};
 use crate::inputs;
@@ -10,13 +10,9 @@ use std::path::Path;
 use stipple_drivers::sim::{self, Scenario};
 use stipple_drivers::Fault;
 
-/// Frames of a flight: evenly chosen, and those nearest to something.
-#[derive(Clone, Copy)]
-pub struct Frames {
-    pub even: usize,
-    pub near: usize,
-}
-
+/// Frames of a flight: evenly chosen ones, and those nearest to something; as many as a software rasteriser matches in minutes.
+const EVEN: usize = 3;
+const NEAR: usize = 1;
 /// Flown from `from_s` on, s: of a recorded path, and of an invented one.
 const SECONDS: f64 = 40.0;
 const INVENTED_SECONDS: f64 = 6.0;
@@ -32,18 +28,7 @@ const fn flown(path: &'static str, from_s: f64, seed: u64) -> Flown {
     Flown { path, from_s, seed }
 }
 
-const FITTED: [Flown; 9] = [
-    flown("demo", 0.0, 1),
-    flown("demo", 4.0, 2),
-    flown("aggressive", 0.0, 1),
-    flown("aggressive", 0.0, 2),
-    flown("aggressive", 0.0, 3),
-    flown("MH_04_difficult", 16.0, 1),
-    flown("MH_04_difficult", 16.0, 2),
-    flown("V1_02_medium", 48.0, 1),
-    flown("V2_02_medium", 60.0, 1),
-];
-const REPORTED: [Flown; 8] = [
+const FLIGHTS: [Flown; 8] = [
     flown("circle", 0.0, 51),
     flown("hover", 2.0, 52),
     flown("aggressive", 6.0, 53),
@@ -55,13 +40,12 @@ const REPORTED: [Flown; 8] = [
 ];
 
 /// Those whose paths are in the folder of recordings; invented ones in any case.
-pub fn sets(folder: &Path, fitted: bool, frames: Frames) -> Result<Vec<Set>, Fault> {
-    let flights: &[Flown] = if fitted { &FITTED } else { &REPORTED };
-    flights.iter().filter_map(|f| f.set(folder, frames).transpose()).collect()
+pub fn sets(folder: &Path) -> Result<Vec<Set>, Fault> {
+    FLIGHTS.iter().filter_map(|f| f.set(folder).transpose()).collect()
 }
 
 impl Flown {
-    fn set(&self, folder: &Path, count: Frames) -> Result<Option<Set>, Fault> {
+    fn set(&self, folder: &Path) -> Result<Option<Set>, Fault> {
         let recorded = folder.join("euroc_text").join(self.path).join("state_groundtruth_estimate0.csv");
         let mut scenario = match Scenario::named(self.path) {
             Some(scenario) => scenario,
@@ -82,6 +66,6 @@ impl Flown {
         scenario.name = format!("{}, seed {}", self.path, self.seed);
         let frame = |t: f64| (t * scenario.rate_hz) as usize;
         let frames = frame(span.start)..frame(span.end.min(scenario.duration.secs()));
-        sets::simulated(scenario, frames, count.even, count.near).map(Some)
+        sets::simulated(scenario, frames, EVEN, NEAR).map(Some)
     }
 }

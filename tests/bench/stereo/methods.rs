@@ -1,4 +1,4 @@
-//! What is measured: the methods of the door, and OpenCV's own filter beside them.
+//! What is measured: every method of disparity that a board can name.
 
 use std::time::Instant;
 use stipple::config::{Board, GpuConfig, StereoConfig, StereoMethod};
@@ -6,21 +6,14 @@ use stipple::gpu::Gpu;
 use stipple::stereo::{Disparity, Method};
 use stipple_drivers::{Fault, Image};
 
-pub const NAMES: [&str; 6] = ["bm", "sgbm", "sgbm_wls", "sgm", "sgm_wls", "onnx"];
+pub const NAMES: [&str; 5] = ["bm", "sgbm", "sgm", "sgm_wls", "onnx"];
 
 /// A method for pairs of one size.
 pub struct Runner {
-    how: How,
+    method: Method,
     gpu: Option<Gpu>,
     pub bytes: u64,
     pub device: String,
-}
-
-enum How {
-    Door(Box<Method>),
-    /// Of so many disparities.
-    #[cfg(feature = "ximgproc")]
-    SgbmWls(u32),
 }
 
 /// What the board says of stereo and the GPU, but for method and range.
@@ -42,7 +35,6 @@ impl Runner {
     /// `name` of `NAMES`; a fault says why a method is not to be had here.
     pub fn new(name: &str, base: &Base, (width, height): (usize, usize), disparities: u32) -> Result<Runner, Fault> {
         let (method, wls) = match name {
-            "sgbm_wls" => return sgbm_wls(disparities),
             "bm" => (StereoMethod::Bm, false),
             "sgbm" => (StereoMethod::Sgbm, false),
             "sgm" => (StereoMethod::Sgm, false),
@@ -55,63 +47,17 @@ impl Runner {
             0 => None,
             bytes => Some(Gpu::open(&base.gpu, bytes)?),
         };
-        let how = How::Door(Box::new(Method::new(width, height, &config, gpu.as_mut())?));
+        let method = Method::new(width, height, &config, gpu.as_mut())?;
         let device = gpu.as_ref().map_or_else(cpu, |g| g.caps().name.clone());
-        Ok(Runner { how, gpu, bytes: footprint.total(), device })
+        Ok(Runner { method, gpu, bytes: footprint.total(), device })
     }
 
     /// Wall time, ms.
     pub fn run(&mut self, left: &Image, right: &Image, out: &mut Disparity) -> Result<f64, Fault> {
         let start = Instant::now();
-        match &mut self.how {
-            How::Door(method) => method.compute(self.gpu.as_mut(), left, right, out)?,
-            #[cfg(feature = "ximgproc")]
-            How::SgbmWls(disparities) => {
-                stipple::stereo::ximgproc::sgbm_wls(*disparities, left, right, out)?;
-                out.sigma_px.fill(f32::INFINITY);
-            }
-        }
+        self.method.compute(self.gpu.as_mut(), left, right, out)?;
         Ok(start.elapsed().as_secs_f64() * 1e3)
     }
-
-    /// Names of the parts of its variance, none of a method that states none.
-    pub fn parts(&self) -> &'static [&'static str] {
-        match &self.how {
-            How::Door(method) => method.parts(),
-            #[cfg(feature = "ximgproc")]
-            How::SgbmWls(_) => &[],
-        }
-    }
-
-    /// The deviations of what was run last by one part of the variance alone.
-    pub fn restate(&mut self, left: &Image, only: usize, out: &mut Disparity) -> Result<(), Fault> {
-        match &mut self.how {
-            How::Door(method) => method.restate(self.gpu.as_mut(), left, only, out),
-            #[cfg(feature = "ximgproc")]
-            How::SgbmWls(_) => Ok(()),
-        }
-    }
-
-    /// Whether it says how far its disparities may be off.
-    pub fn has_deviation(&self) -> bool {
-        matches!(self.how, How::Door(_))
-    }
-}
-
-#[cfg(feature = "ximgproc")]
-fn sgbm_wls(disparities: u32) -> Result<Runner, Fault> {
-    Ok(Runner { how: How::SgbmWls(disparities), gpu: None, bytes: 0, device: cpu() })
-}
-
-#[cfg(not(feature = "ximgproc"))]
-fn sgbm_wls(_disparities: u32) -> Result<Runner, Fault> {
-    let what = "OpenCV's filter is there for comparison only, and this program was built without it";
-    Err(Fault::new(
-        stipple_drivers::Exit::Config,
-        "sgbm_wls",
-        what,
-        "build with --features ximgproc (needs libopencv-contrib-dev)",
-    ))
 }
 
 /// The processor by its own name, and its threads.

@@ -1,11 +1,10 @@
 //! `stipple-bench stereo`: every method of disparity on pairs whose truth is known.
 //!
 //! Sets are Middlebury's cones and teddy, simulated flights (also by range of depth), pairs for time alone, and
-//! the hard cases. `score` states the protocol, `flights` which flights were fitted and which are reported. Given a recording, each method also makes a map of it (`effect`).
+//! the hard cases. `score` states the protocol, `flights` what is flown. Given a recording, each method also makes a map of it (`effect`).
 //! Leaves `stereo.json` (a list, a row a set and method), `stereo.html`, `pictures/`, and of maps `stereo-map.json`.
 
 mod effect;
-mod fit;
 mod flights;
 mod methods;
 mod page;
@@ -34,8 +33,6 @@ use stipple_drivers::Fault;
 
 /// Depths that simulated flights are judged by, m.
 const RANGES_M: [f64; 6] = [0.5, 1.0, 2.0, 4.0, 8.0, 20.0];
-/// Of each flight: as many as a software rasteriser matches in minutes.
-const FRAMES: flights::Frames = flights::Frames { even: 3, near: 1 };
 /// Pairs for time alone: disparities at 752x480, how often, and when fewer will do, ms.
 const TIMED: [u32; 2] = [64, 128];
 const REPEATS: usize = 5;
@@ -68,9 +65,6 @@ pub struct Args {
     /// Two hard cases
     #[arg(long)]
     quick: bool,
-    /// Fit the methods' deviations to flights that are otherwise left out, print them, and judge them on the others
-    #[arg(long, conflicts_with_all = ["quick", "dataset"])]
-    fit: bool,
 }
 
 /// Of mapping when not stated, s.
@@ -85,8 +79,6 @@ pub struct Row {
     pub ms: f64,
     pub bytes: u64,
     pub device: String,
-    /// Whether the method states deviations.
-    pub deviation: bool,
 }
 
 #[derive(Default)]
@@ -106,11 +98,6 @@ pub fn run(options: &Args) -> Result<(), Fault> {
     // A wrong folder is told now, not after the minutes that come before the maps.
     dataset.as_deref().map(|path| Recording::open(path, &OpenOptions::default())).transpose()?;
     let out = OutputDir::create(&options.out)?;
-    if options.fit {
-        let folder = inputs::folder(options.recordings.as_deref())?;
-        let sets = [flights::sets(&folder, true, fit::FRAMES)?, flights::sets(&folder, false, fit::FRAMES)?];
-        return fit::fit(&sets, &Base::of(loaded.as_ref()), &out);
-    }
     let sets = match options.quick {
         true => scenes::hard().into_iter().filter(|s| QUICK.contains(&s.name.as_str())).collect(),
         false => all_sets(options.recordings.as_deref())?,
@@ -142,7 +129,7 @@ fn all_sets(recordings: Option<&Path>) -> Result<Vec<Set>, Fault> {
     if sets.is_empty() {
         eprintln!("no Middlebury pairs in {}", folder.display());
     }
-    sets.extend(flights::sets(&folder, false, FRAMES)?);
+    sets.extend(flights::sets(&folder)?);
     sets.extend(scenes::hard());
     Ok(sets)
 }
@@ -222,7 +209,7 @@ fn judge(
             }
         }
         if k == 0 {
-            let picture = pictures::picture(pair, &found, runner.has_deviation());
+            let picture = pictures::picture(pair, &found);
             pictures.push((format!("{}-{method}", set.name), picture));
         }
     }
@@ -248,8 +235,7 @@ impl Row {
     /// `ms` of each pair.
     fn of(set: String, method: &'static str, score: Score, ms: &[f64], runner: &Runner) -> Row {
         let ms = percentile(ms, 0.5).unwrap_or(0.0);
-        let (bytes, device, deviation) = (runner.bytes, runner.device.clone(), runner.has_deviation());
-        Row { set, method, score, ms, bytes, device, deviation }
+        Row { set, method, score, ms, bytes: runner.bytes, device: runner.device.clone() }
     }
 
     /// Another set's, of the same method and device.
@@ -260,7 +246,6 @@ impl Row {
     fn line(&self) -> String {
         let percent = |v: Option<f64>| v.map_or("-".to_string(), |v| format!("{:.2} %", 100.0 * v));
         let (s, seen) = (&self.score.all, &self.score.visible);
-        let stated = seen.residual_variance().filter(|_| self.deviation);
         format!(
             "{:<28} {:<9} bad1 {:>8} bad2 {:>8} mean {:>6.3} px density {:>8} {:>8.1} ms  residual variance {} of {} px, \
              {} gross",
@@ -271,7 +256,7 @@ impl Row {
             s.mean_px().unwrap_or(f64::NAN),
             percent(s.density()),
             self.ms,
-            stated.map_or("-".to_string(), |v| format!("{v:.2}")),
+            seen.residual_variance().map_or("-".to_string(), |v| format!("{v:.2}")),
             seen.judged(),
             percent(seen.gross()),
         )
@@ -279,7 +264,6 @@ impl Row {
 
     fn json(&self) -> Value {
         let (all, seen) = (&self.score.all, &self.score.visible);
-        let stated = |v: Option<f64>| v.filter(|_| self.deviation);
         json!({
             "set": self.set, "method": self.method,
             "bad1": all.bad1(), "bad2": all.bad2(), "mean_px": all.mean_px(), "density": all.density(),
@@ -287,8 +271,8 @@ impl Row {
             "pixels": all.pixels(),
             "visible": seen.json(),
             "mean_depth_error_m": seen.mean_m().filter(|_| self.set.starts_with("sim")),
-            "residual_variance": stated(seen.residual_variance()),
-            "within_a_deviation": stated(seen.within_a_deviation()),
+            "residual_variance": seen.residual_variance(),
+            "within_a_deviation": seen.within_a_deviation(),
             "judged": seen.judged(),
             "gross": seen.gross(),
         })

@@ -14,7 +14,7 @@ const GAP_PX: usize = 4;
 /// Widest picture of one eye in the report.
 const WIDTH_MAX: usize = 384;
 
-pub fn picture(pair: &Pair, found: &Disparity, with_deviation: bool) -> Picture {
+pub fn picture(pair: &Pair, found: &Disparity) -> Picture {
     let (w, h) = (found.width, found.height);
     let known = || pair.truth.iter().copied().filter(|d| *d >= 0.0);
     let (near, far) = (known().fold(1.0, f32::max), known().fold(f32::INFINITY, f32::min).min(1e6));
@@ -23,7 +23,7 @@ pub fn picture(pair: &Pair, found: &Disparity, with_deviation: bool) -> Picture 
         false => MISSING,
     };
     let both = |i: usize| found.px[i] >= 0.0 && pair.truth[i] >= 0.0;
-    let deviation = |i: usize| match found.px[i] >= 0.0 && with_deviation {
+    let deviation = |i: usize| match found.px[i] >= 0.0 {
         true => error_colour(found.sigma_px[i] / SIGMA_FULL),
         false => MISSING,
     };
