@@ -5,14 +5,14 @@
 //! from a board file.
 //!
 //! ```text
-//! frames -> Mailbox(newest) -> frontend -Tracks-> vio -Keyframe(try)-> map.step(deadline)
-//! imu    -> Ring ----------------------------------^                   map -> report, map.ply
+//! frames -> mailbox(newest) -> frontend -Tracks-> vio -Keyframe(offer)-> map.step(deadline)
+//! imu    -> queue -----------------------------------^                   map -> report, map.ply
 //! ```
 //!
 //! Allowed edges, checked by `tests/tidy.rs`: `math`, `mem`, `limits`, `config` and `counters` are seen by
 //! all; `frontend` and `vio` see the vocabulary of `stipple-drivers`; `vio` also sees `frontend`'s
 //! `Tracks`; `stereo` and `map` see `gpu`; `map` sees `stereo`; `vio` never sees `gpu`; `map` never sees
-//! `frontend`; nobody sees `daemon`.
+//! `frontend`; `run` sees all of these, `commands` see `run`, and nobody sees `commands`.
 
 // The world of points for unit tests (tests/bench/world.rs) names this crate as integration tests do.
 #[cfg(test)]
@@ -21,9 +21,9 @@ extern crate self as stipple;
 #[path = "../tests/bench/world.rs"]
 pub mod world;
 
+pub mod commands;
 pub mod config;
 pub mod counters;
-pub mod daemon;
 pub mod frontend;
 pub mod gpu;
 pub mod limits;
@@ -31,5 +31,6 @@ pub mod map;
 pub mod math;
 pub mod mem;
 pub mod output;
+pub mod run;
 pub mod stereo;
 pub mod vio;

@@ -213,13 +213,13 @@ fn unknown_key_of_a_board_is_named_with_its_line() {
     let dir = tempfile::tempdir().unwrap();
     let board = dir.path().join("board.toml");
     fs::write(&board, format!("spats = 3\n{}", fs::read_to_string(root().join(BOARD)).unwrap())).unwrap();
-    let o = stipple(&["check", board.to_str().unwrap()]);
+    let o = stipple(&["check", "--board", board.to_str().unwrap()]);
     refused(&o, CONFIG, &["board.toml:1", "spats"], &dir.path().join("none"));
 }
 
 #[test]
 fn budget_that_does_not_fit_is_refused() {
-    let o = stipple(&["check", BOARD, "--set", "memory_max_mib=20"]);
+    let o = stipple(&["check", "--board", BOARD, "--set", "memory_max_mib=20"]);
     assert_eq!(o.status.code(), Some(CONFIG), "{}", text(&o));
     assert!(text(&o).contains("memory_max_mib") && text(&o).contains("MiB"), "{}", text(&o));
 }
@@ -231,7 +231,7 @@ fn a_network_without_its_model_is_refused_by_check_as_at_boot() {
     let absent: &[&str] = &["--set", "stereo.network.model=no/such.onnx"];
     for (more, said) in [(&[] as &[&str], "names no file"), (absent, "no/such.onnx")] {
         let set = [&["--set", "stereo.method=onnx"], more].concat();
-        let checked = stipple(&[&["check", BOARD], &set[..]].concat());
+        let checked = stipple(&[&["check", "--board", BOARD], &set[..]].concat());
         refused(&checked, CONFIG, &["stereo.network.model", said, "name an ONNX file"], &out);
         let booted = replay(&data, &out, &set);
         let fault = |o: &Output| text(o).lines().find(|l| l.starts_with("stipple: ")).map(str::to_string).unwrap();
@@ -244,7 +244,7 @@ fn every_board_fits_its_own_limit() {
     for entry in fs::read_dir(root().join("board-configs")).unwrap() {
         let path = entry.unwrap().path();
         if path.extension().is_some_and(|e| e == "toml") {
-            let o = stipple(&["check", path.to_str().unwrap()]);
+            let o = stipple(&["check", "--board", path.to_str().unwrap()]);
             assert!(o.status.success(), "{}: {}", path.display(), text(&o));
         }
     }
@@ -321,7 +321,7 @@ fn wrong_usage_is_exit_64() {
 
 /// The figure that `check --dataset` gives: how much lower camera 1 sees points, px.
 fn rows_lower(data: &Path) -> (String, f64) {
-    let o = stipple(&["check", "--dataset", data.to_str().unwrap()]);
+    let o = stipple(&["calib-check", data.to_str().unwrap()]);
     assert!(o.status.success(), "{}", text(&o));
     let said = text(&o);
     let after = said.split("sees points ").nth(1).unwrap_or_else(|| panic!("{said}"));

@@ -1,4 +1,4 @@
-//! `stipple doctor` and `stipple check --dataset` on recordings in the place of sensors: a whole one passes, and one with an
+//! `stipple doctor` and `stipple calib-check` on recordings in the place of sensors: a whole one passes, and one with an
 //! axis of the gyro turned round, a clock that is off, or its cameras exchanged is told so.
 #![allow(clippy::unwrap_used)]
 
@@ -8,6 +8,7 @@ use std::process::{Command, Output, Stdio};
 
 const BOARD: &str = "board-configs/lavapipe.toml";
 const UNAVAILABLE: i32 = 69;
+const CONFIG: i32 = 78;
 
 fn stipple(args: &[&str]) -> Output {
     Command::new(env!("CARGO_BIN_EXE_stipple")).args(args).current_dir(env!("CARGO_MANIFEST_DIR")).output().unwrap()
@@ -26,13 +27,16 @@ fn flight(dir: &Path, more: &[&str]) -> PathBuf {
 }
 
 fn doctor(data: &Path) -> Output {
-    stipple(&["doctor", BOARD, "--dataset", data.to_str().unwrap(), "--set", "map.enabled=false"])
+    stipple(&["doctor", "--board", BOARD, "--dataset", data.to_str().unwrap(), "--set", "map.enabled=false"])
 }
 
+/// What `calib-check` prints; it exits with an error where a check failed, and only there.
 fn check(data: &Path) -> String {
-    let o = stipple(&["check", "--dataset", data.to_str().unwrap()]);
-    assert!(o.status.success(), "{}", text(&o));
-    text(&o)
+    let o = stipple(&["calib-check", data.to_str().unwrap()]);
+    let said = text(&o);
+    let failed = said.lines().any(|l| l.starts_with("fail"));
+    assert_eq!(o.status.code(), Some(if failed { CONFIG } else { 0 }), "{said}");
+    said
 }
 
 /// The line that speaks of `what` and its verdict.
@@ -127,7 +131,7 @@ fn cameras_exchanged_are_told_and_the_doctor_says_no() {
 
 #[test]
 fn a_board_without_sensors_is_told_what_to_write() {
-    let o = stipple(&["doctor", BOARD, "--set", "map.enabled=false"]);
+    let o = stipple(&["doctor", "--board", BOARD, "--set", "map.enabled=false"]);
     assert_eq!(o.status.code(), Some(UNAVAILABLE), "{}", text(&o));
     assert!(verdict(&text(&o), "sensors").0 == "fail" && text(&o).contains("[camera]"), "{}", text(&o));
 }
@@ -145,7 +149,7 @@ fn each_part_of_a_board_is_looked_for_where_one_is_not_there() {
         data.join("mav0").display()
     );
     fs::write(&board, format!("{plain}\n{sensors}")).unwrap();
-    let o = stipple(&["doctor", board.to_str().unwrap(), "--set", "map.enabled=false"]);
+    let o = stipple(&["doctor", "--board", board.to_str().unwrap(), "--set", "map.enabled=false"]);
     let said = text(&o);
     assert_eq!(o.status.code(), Some(UNAVAILABLE), "{said}");
     assert_eq!(verdict(&said, "calibration: 2 cameras").0, "ok");
@@ -165,10 +169,10 @@ fn what_is_missing_of_a_recording_is_said_and_whoever_reads_may_stop() {
     let images: Vec<PathBuf> = fs::read_dir(data.join("mav0/cam1/data")).unwrap().map(|e| e.unwrap().path()).collect();
     images.iter().step_by(2).for_each(|image| fs::remove_file(image).unwrap());
     let said = check(&data);
-    assert!(said.contains("looked at cannot be read") && said.contains("images_missing"), "{said}");
-    assert_eq!(said.matches("first: ").count(), 1, "{said}");
+    assert!(said.contains("pairs cannot be read") && said.contains("images_missing"), "{said}");
+    assert_eq!(said.matches("the first: ").count(), 1, "the first image that is missing: {said}");
     let mut child = Command::new(env!("CARGO_BIN_EXE_stipple"))
-        .args(["check", "--dataset", data.to_str().unwrap()])
+        .args(["calib-check", data.to_str().unwrap()])
         .stdout(Stdio::piped())
         .stderr(Stdio::piped())
         .spawn()

@@ -14,7 +14,7 @@ fn byte_tables_are_as_reviewed() {
         if board.extension().is_none_or(|e| e != "toml") {
             continue;
         }
-        let o = Command::new(env!("CARGO_BIN_EXE_stipple")).arg("check").arg(&board).output().unwrap();
+        let o = Command::new(env!("CARGO_BIN_EXE_stipple")).arg("check").arg("--board").arg(&board).output().unwrap();
         assert!(o.status.success(), "{}", String::from_utf8_lossy(&o.stderr));
         let table = String::from_utf8(o.stdout).unwrap();
         let name = board.file_stem().unwrap().to_str().unwrap();
@@ -41,7 +41,7 @@ const DRONE: [&str; 5] = [
 fn gpu_bytes(more: &[&str]) -> u64 {
     let board = Path::new(env!("CARGO_MANIFEST_DIR")).join("board-configs/x86-igpu.toml");
     let mut check = Command::new(env!("CARGO_BIN_EXE_stipple"));
-    check.arg("check").arg(board).args(DRONE.iter().chain(more).flat_map(|s| ["--set", s]));
+    check.arg("check").arg("--board").arg(board).args(DRONE.iter().chain(more).flat_map(|s| ["--set", s]));
     let table = String::from_utf8(check.output().unwrap().stdout).unwrap();
     let total = table.lines().find(|l| l.contains("gpu  total")).unwrap();
     total.split_whitespace().next().unwrap().parse().unwrap()

@@ -13,7 +13,7 @@ use std::time::{Duration, Instant};
 
 fn run(dataset: &Path, out: &Path, board: &str) -> Command {
     let mut command = stipple();
-    command.args(["run", board, "--dataset", dataset.to_str().unwrap(), "--out", out.to_str().unwrap()]);
+    command.args(["run", "--board", board, "--dataset", dataset.to_str().unwrap(), "--out", out.to_str().unwrap()]);
     command.args(["--set", "map.enabled=false"]);
     command
 }
@@ -42,7 +42,7 @@ fn a_run_on_a_recording_leaves_what_a_replay_leaves() {
     assert!(o.status.success(), "{}", text(&o));
     let r = report(&out);
     assert!(out.join("trajectory.tum").exists() && out.join("report.html").exists());
-    assert_eq!((&r["pace"], &r["heap_after_seal"]), (&"live".into(), &0.into()), "{}", text(&o));
+    assert_eq!((&r["pace"], &r["heap_after_seal"]), (&"recorded".into(), &0.into()), "{}", text(&o));
     assert!(r["frames"].as_u64().unwrap() > 40 && r["ate_rmse_m"].as_f64().unwrap() < 0.02, "{}", text(&o));
     let quiet =
         ["camera_lost", "camera_silent", "imu_lost", "frames_missing", "frames_leapt", "imu_missing", "imu_frozen"];
@@ -66,7 +66,8 @@ fn a_run_asked_to_stop_ends_with_its_files_written() {
 #[test]
 fn a_board_without_sensors_is_told_what_to_write() {
     let dir = tempfile::tempdir().unwrap();
-    let o = stipple().args(["run", BOARD, "--out", dir.path().join("out").to_str().unwrap()]).output().unwrap();
+    let o =
+        stipple().args(["run", "--board", BOARD, "--out", dir.path().join("out").to_str().unwrap()]).output().unwrap();
     assert_eq!(o.status.code(), Some(78));
     for words in ["[camera] devices", "[imu] chip", "[rig] calibration", "--dataset"] {
         assert!(text(&o).contains(words), "{words}: {}", text(&o));
@@ -156,7 +157,7 @@ fn a_run_goes_on_with_one_camera_and_says_which_is_gone() {
 fn a_senseless_rule_is_named() {
     let dir = tempfile::tempdir().unwrap();
     let board = board_with(dir.path(), "[[inject.imu]]\nfault = \"blackout\"\n");
-    let o = stipple().args(["check", &board]).output().unwrap();
+    let o = stipple().args(["check", "--board", &board]).output().unwrap();
     assert_eq!(o.status.code(), Some(78));
     assert!(text(&o).contains("inject.imu, rule 1") && text(&o).contains("no light"), "{}", text(&o));
 }

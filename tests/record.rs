@@ -14,7 +14,7 @@ use stipple_drivers::Frames;
 
 fn recording(dataset: &Path, out: &Path, format: &str) -> Child {
     let mut command = stipple();
-    command.args(["record", BOARD, "--dataset", dataset.to_str().unwrap(), "--out", out.to_str().unwrap()]);
+    command.args(["record", "--board", BOARD, "--dataset", dataset.to_str().unwrap(), "--out", out.to_str().unwrap()]);
     command.args(["--format", format]).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap()
 }
 
@@ -91,7 +91,7 @@ fn a_run_that_records_plays_back_as_it_flew() {
     let (data, out, kept) = (flight(dir.path(), "3"), dir.path().join("out"), dir.path().join("kept"));
     let arg = |path: &Path| path.to_str().unwrap().to_string();
     let o = stipple()
-        .args(["run", BOARD, "--dataset", &arg(&data), "--out", &arg(&out), "--record", &arg(&kept)])
+        .args(["run", "--board", BOARD, "--dataset", &arg(&data), "--out", &arg(&out), "--record", &arg(&kept)])
         .args(["--set", "map.enabled=false"])
         .output()
         .unwrap();
@@ -101,6 +101,7 @@ fn a_run_that_records_plays_back_as_it_flew() {
     let (back, truth) = (frames_of(&kept), frames_of(&data));
     assert_eq!((back.len(), report["count_record_frames_written"].as_u64()), (truth.len(), Some(truth.len() as u64)));
     assert!(back.iter().zip(&truth).all(|(a, b)| a.t == b.t && a.images == b.images));
-    let again = stipple().args(["record", BOARD, "--dataset", &arg(&data), "--out", &arg(&kept)]).output().unwrap();
+    let again =
+        stipple().args(["record", "--board", BOARD, "--dataset", &arg(&data), "--out", &arg(&kept)]).output().unwrap();
     assert_eq!(again.status.code(), Some(73), "a recording is not written over: {}", text(&again));
 }

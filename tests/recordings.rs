@@ -92,16 +92,7 @@ fn gives_the_same_bits(data: &Path) -> Run {
         assert!(run.number("tracking_ms_p50") >= run.number("estimator_ms_p50"));
     }
     let mapped = stipple(
-        &[
-            "replay",
-            data.to_str().unwrap(),
-            "--pace",
-            "lockstep",
-            "--set",
-            "map.lockstep_iterations=1",
-            "--set",
-            "map.burst_iterations=0",
-        ],
+        &["replay", data.to_str().unwrap(), "--pace", "lockstep", "--steps", "1", "--set", "map.burst_iterations=0"],
         false,
     );
     assert_eq!(mapped.report["vio_hash"], first.report["vio_hash"], "the mapper changes nothing");
@@ -166,8 +157,8 @@ fn vicon_room_reaches_twenty_decibels_from_its_true_poses() {
             "8",
             "--pace",
             "lockstep",
-            "--set",
-            "map.lockstep_iterations=15",
+            "--steps",
+            "15",
         ],
         false,
     );

@@ -103,8 +103,6 @@ pub(super) const BOUNDS: &[(&str, Bound)] = &[
     ("map.densify_max", Within(0.0, 16_384.0)),
     ("map.converge_iterations_max", Within(0.0, 10_000.0)),
     ("map.steps_per_keyframe_max", Within(0.0, 1_000_000.0)),
-    ("map.lockstep_iterations", Within(0.0, 1000.0)),
-    ("map.lockstep_iterations_per_s", Within(0.0, 100_000.0)),
     ("map.ssim_weight", Within(0.0, 1.0)),
     ("map.depth_weight", Within(0.0, 100.0)),
     ("map.needle_weight", Within(0.0, 100.0)),

@@ -77,10 +77,6 @@ pub struct MapConfig {
     /// 0: no end. V1_01 on an H200: 2100 a keyframe 26.84 dB and 20.87 held out, the first views learnt by heart; 500 28.20
     /// and 22.47; 300 28.68 and 22.59 (all with coverage by alpha alone).
     pub steps_per_keyframe_max: u32,
-    /// Mapper iterations a frame in lockstep pace.
-    pub lockstep_iterations: u32,
-    /// Where not zero, iterations a second of the recording instead: a device that slow, with the same result every time.
-    pub lockstep_iterations_per_s: f64,
     /// Weight of 1 - SSIM beside L1.
     pub ssim_weight: f64,
     /// Of the inverse-depth error, 1/m, on the views of anchors, against their stereo depth.
@@ -138,8 +134,6 @@ impl Default for MapConfig {
             evict: true,
             growth_stops: false,
             steps_per_keyframe_max: 300,
-            lockstep_iterations: 2,
-            lockstep_iterations_per_s: 0.0,
             ssim_weight: 0.2,
             // The figures of the weights and of refinement: V1_01 at full resolution with lr_pose = 2e-4, 30 000 steps on an
             // H200; PSNR of training and held-out views, dB; where it says so, MH_01, 8 300 steps.

@@ -8,9 +8,12 @@ use std::io::Write as _;
 use std::path::PathBuf;
 use std::sync::atomic::AtomicBool;
 use stipple::config::{Board, InjectConfig};
-use stipple::daemon::instruments::{admit, realtime, OdometryRun, Played, Progress, Realtime, Sensors, Tracking};
 use stipple::output::metrics::trajectory_error;
 use stipple::output::OutputDir;
+use stipple::run::sensors::Recorded;
+use stipple::run::status::Status;
+use stipple::run::tracking::{OdometryRun, Tracker};
+use stipple::run::{fly_in_real_time, memory, Flown, Realtime};
 use stipple::vio::health::Health;
 use stipple_drivers::inject::{Kind, Rule};
 use stipple_drivers::paced::Images;
@@ -155,17 +158,18 @@ impl Flight {
         let flown = stamps.len();
         let (first, images) = (stamps[0], Images::Rendered(self.frames.clone()));
         let shape = || Frames::for_rig(calibration);
-        let sensors = Sensors::of_recording(images, stamps, self.sim.imu().to_vec(), &inject, shape);
+        let sensors = Recorded { images, stamps, imu: self.sim.imu().to_vec() }.paced().with_faults(&inject, shape);
         let run = OdometryRun::new(calibration, &self.board, self.frames.len())?;
-        let options = Realtime { holdout: 0, duration_s: None, sensors_s: None, stop: &AtomicBool::new(false) };
-        let mut silent = Progress::silent();
-        let played = realtime(sensors, calibration, Tracking::Odometry(Box::new(run)), None, &options, &mut silent);
+        let options = Realtime { holdout: 0, until_s: None, sensors_s: None, stop: &AtomicBool::new(false) };
+        let mut silent = Status::silent();
+        let tracker = Tracker::Odometry(Box::new(run));
+        let played = fly_in_real_time(sensors, calibration, tracker, None, &options, &mut silent);
         let end_s = case.map_or(STRIKES_S, |c| c.rule.end_s);
         Ok(self.judge(&played, flown, first + Span::from_secs(STRIKES_S), first + Span::from_secs(end_s)))
     }
 
-    fn judge(&self, played: &Played, flown: usize, strikes: Nanos, ends: Nanos) -> Outcome {
-        let Tracking::Odometry(run) = &played.tracking else { unreachable!("flown by odometry") };
+    fn judge(&self, played: &Flown, flown: usize, strikes: Nanos, ends: Nanos) -> Outcome {
+        let run = played.tracker.odometry().expect("flown by odometry");
         let trajectory: Vec<TimedPose> =
             run.back.trajectory.iter().map(|o| TimedPose { t: o.t, pose: o.world_from_body }).collect();
         let after: Vec<TimedPose> = trajectory.iter().filter(|p| p.t >= ends).copied().collect();
@@ -175,7 +179,7 @@ impl Flight {
         let tail: Vec<_> = health.iter().filter(|(t, _)| *t >= ends).collect();
         let itself = |i: &usize| tail[*i..].iter().take(HEALTHY_FRAMES).all(|(_, h)| well(*h));
         let recovered = (0..tail.len().saturating_sub(HEALTHY_FRAMES)).find(itself);
-        let all = [played.counters.list(), played.source.clone(), played.tracking.counters()].concat();
+        let all = [played.counters.list(), played.source.clone(), played.tracker.counters()].concat();
         let is_injected = |name: &str| name.starts_with("injected_");
         Outcome {
             injected: all.iter().filter(|(name, _)| is_injected(name)).copied().collect(),
@@ -214,7 +218,7 @@ pub fn run(args: &Args) -> Result<(), Fault> {
     let out = OutputDir::create(&args.out)?;
     let board = default_board(&["map.enabled=false".to_string()])?;
     let flight = Flight::render(board)?;
-    admit("the simulated flight", flight.sim.calibration(), &flight.board, false)?;
+    memory::check_fits("the simulated flight", flight.sim.calibration(), &flight.board, false)?;
     let plain = flight.fly(None)?;
     let mut rows = Vec::new();
     let mut cases = cases();

@@ -7,16 +7,17 @@ use std::fmt::Write as _;
 use std::io::Write as _;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
-use stipple::config::{Board, InjectConfig};
-use stipple::daemon::instruments::{
-    admit, realtime, tapped, Input, OdometryRun, Progress, Realtime, Sensors, Tracking,
-};
+use stipple::config::Board;
 use stipple::output::metrics::percentile;
 use stipple::output::OutputDir;
+use stipple::run::recorder::Recording;
+use stipple::run::sensors::{Input, Recorded, Source};
+use stipple::run::status::Status;
+use stipple::run::tracking::{OdometryRun, Tracker};
+use stipple::run::{fly_in_real_time, memory, Realtime};
 use stipple_drivers::paced::Images;
-use stipple_drivers::record::{self, Format};
 use stipple_drivers::sim::Scenario;
-use stipple_drivers::{Fault, Frames, Span};
+use stipple_drivers::{Calibration, Fault, Frames, ImuSample, Span};
 
 /// Of the simulated flight, s.
 const FLIGHT_S: f64 = 8.0;
@@ -32,48 +33,60 @@ struct Pass {
     recorded: Vec<(&'static str, u64)>,
 }
 
-/// Every image decoded before, as a camera has it.
-fn decoded(mut input: Input) -> Input {
-    let read = |i: usize| {
-        let mut frames = Frames::for_rig(&input.calibration);
-        input.source.read(i, &mut frames).is_ok().then_some(frames)
-    };
-    let frames: Vec<Frames> = (0..input.stamps.len()).filter_map(read).collect();
-    input.stamps = frames.iter().map(|f| f.t).collect();
-    input.source = Images::Rendered(frames);
-    input
+/// A flight with every image decoded before, as a camera has it.
+struct Flight {
+    name: String,
+    calibration: Calibration,
+    frames: Vec<Frames>,
+    imu: Vec<ImuSample>,
 }
 
-fn fly(input: &Input, board: &Board, into: Option<&Path>) -> Result<Pass, Fault> {
-    let Images::Rendered(frames) = &input.source else { unreachable!("decoded before") };
-    let (calibration, shape) = (&input.calibration, || Frames::for_rig(&input.calibration));
-    let mut sensors = Sensors::of_recording(
-        Images::Rendered(frames.clone()),
-        input.stamps.clone(),
-        input.imu.clone(),
-        &InjectConfig::default(),
-        shape,
-    );
-    let mut recorder = None;
-    if let Some(dir) = into {
-        let sink = record::open(dir, Format::Euroc, calibration)?;
-        let (started, taps) = record::start(sink, &shape(), board.record.ring_frames as usize);
-        sensors = tapped(sensors, taps);
-        recorder = Some(started);
+impl Flight {
+    fn of(input: Input) -> Flight {
+        let (calibration, name) = (input.calibration, input.name);
+        let Source::Recorded(Recorded { mut images, stamps, imu }) = input.source else {
+            unreachable!("a recording, or a rendered flight")
+        };
+        let read = |i: usize| {
+            let mut frames = Frames::for_rig(&calibration);
+            images.read(i, &mut frames).is_ok().then_some(frames)
+        };
+        let frames = (0..stamps.len()).filter_map(read).collect();
+        Flight { name, calibration, frames, imu }
     }
-    let tracking = Tracking::Odometry(Box::new(OdometryRun::new(calibration, board, frames.len())?));
-    let options = Realtime { holdout: 0, duration_s: None, sensors_s: None, stop: &AtomicBool::new(false) };
-    let played = realtime(sensors, calibration, tracking, None, &options, &mut Progress::silent());
-    let Tracking::Odometry(run) = &played.tracking else { unreachable!("flown by odometry") };
-    let ms: Vec<f64> = run.back.frame_ms.iter().map(|(_, ms)| *ms).collect();
-    Ok(Pass {
-        records: into.is_some(),
-        tracked: ms.len(),
-        overwritten: played.counters.frames_overwritten.get(),
-        ms_p50: percentile(&ms, 0.5).unwrap_or(f64::NAN),
-        ms_p99: percentile(&ms, 0.99).unwrap_or(f64::NAN),
-        recorded: recorder.map_or(vec![], |r| r.finish().counters),
-    })
+
+    fn length_s(&self) -> f64 {
+        match (self.frames.first(), self.frames.last()) {
+            (Some(a), Some(b)) => (b.t - a.t).secs(),
+            _ => 0.0,
+        }
+    }
+
+    fn fly(&self, board: &Board, into: Option<&Path>) -> Result<Pass, Fault> {
+        let recorded = Recorded {
+            images: Images::Rendered(self.frames.clone()),
+            stamps: self.frames.iter().map(|f| f.t).collect(),
+            imu: self.imu.clone(),
+        };
+        let shape = Frames::for_rig(&self.calibration);
+        let (sensors, recording) = Recording::start(into, recorded.paced(), &self.calibration, board, &shape)?;
+        let tracker = Tracker::Odometry(Box::new(OdometryRun::new(&self.calibration, board, self.frames.len())?));
+        let options = Realtime { holdout: 0, until_s: None, sensors_s: None, stop: &AtomicBool::new(false) };
+        let flown = fly_in_real_time(sensors, &self.calibration, tracker, None, &options, &mut Status::silent());
+        let run = flown.tracker.odometry().expect("flown by odometry");
+        let ms: Vec<f64> = run.back.frame_ms.iter().map(|(_, ms)| *ms).collect();
+        let mut recorded = vec![];
+        // What it lacks is among the counters.
+        recording.map(|r| r.finish(&mut recorded));
+        Ok(Pass {
+            records: into.is_some(),
+            tracked: ms.len(),
+            overwritten: flown.counters.frames_overwritten.get(),
+            ms_p50: percentile(&ms, 0.5).unwrap_or(f64::NAN),
+            ms_p99: percentile(&ms, 0.99).unwrap_or(f64::NAN),
+            recorded,
+        })
+    }
 }
 
 /// Odometry's time a frame with recording and without, in turns in real time, and what the recorder keeps up with
@@ -92,24 +105,25 @@ pub fn run(args: &Args) -> Result<(), Fault> {
     let (out, passes) = (OutputDir::create(&args.out)?, args.passes);
     let board = default_board(&["map.enabled=false".to_string()])?;
     let input = match &args.dataset {
-        Some(path) => decoded(Input::recording(path, &board.replay, &board.rig)?),
+        Some(path) => Input::recording(path, &board)?,
         None => {
             let mut scenario = Scenario::named("demo").expect("the demo's scenario is compiled in");
             (scenario.image_divisor, scenario.duration) = (1, Span::from_secs(FLIGHT_S));
             Input::rendered(&scenario, 0, |_, _| {})?
         }
     };
-    admit(&input.name, &input.calibration, &board, true)?;
+    memory::check_fits(&input.name, &input.calibration, &board, true)?;
+    let flight = Flight::of(input);
     let mut list = vec![];
     for pass in 0..2 * passes {
         let dir = out.file(&format!("recording-{pass}"));
         let records = pass % 2 == 1;
-        list.push(fly(&input, &board, records.then_some(dir.as_path()))?);
+        list.push(flight.fly(&board, records.then_some(dir.as_path()))?);
         eprintln!("pass {} of {}", pass + 1, 2 * passes);
         // It was measured, not wanted.
         let _ = std::fs::remove_dir_all(&dir);
     }
-    let table = table(&input, &board, &list);
+    let table = table(&flight, &board, &list);
     println!("{table}");
     out.write("record.md", |w| writeln!(w, "{table}"))?;
     let rows: Vec<Value> = list.iter().map(json_row).collect();
@@ -131,19 +145,19 @@ fn json_row(p: &Pass) -> Value {
     })
 }
 
-fn table(input: &Input, board: &Board, list: &[Pass]) -> String {
-    let c = &input.calibration.cameras[0].camera;
-    let (n, s) = (input.stamps.len(), input.length_s());
+fn table(flight: &Flight, board: &Board, list: &[Pass]) -> String {
+    let c = &flight.calibration.cameras[0].camera;
+    let (n, s) = (flight.frames.len(), flight.length_s());
     let mut text = format!(
         "{}: {} cameras of {}x{} at {:.1} Hz, {:.0} inertial samples a second, ring of {} frames\n\n\
          | recording | tracked | overwritten | a frame, median; 99 % ms | written | dropped | ring at most | writer, ms of CPU a frame |\n\
          |---|---|---|---|---|---|---|---|\n",
-        input.name,
-        input.calibration.cameras.len(),
+        flight.name,
+        flight.calibration.cameras.len(),
         c.width,
         c.height,
         (n.max(2) - 1) as f64 / s,
-        input.imu.len() as f64 / s,
+        flight.imu.len() as f64 / s,
         board.record.ring_frames,
     );
     for p in list {

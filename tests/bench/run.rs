@@ -2,10 +2,10 @@
 
 use std::path::PathBuf;
 use stipple::config::Board;
-use stipple::daemon::instruments::{colours, Input};
-use stipple::daemon::{run, Pace, Replay};
 use stipple::output::report::Report;
 use stipple::output::OutputDir;
+use stipple::run::sensors::Input;
+use stipple::run::{fly, memory, Options, Pace, Steps};
 use stipple_drivers::sim::Scenario;
 use stipple_drivers::{Fault, Span};
 
@@ -53,19 +53,18 @@ impl Source {
             Some(path) => Board::load(path, &set)?,
             None => default_board(&set)?,
         };
-        let (input, place) = match &self.dataset {
-            Some(path) => (Input::recording(path, &board.replay, &board.rig)?, path.display().to_string()),
+        let input = match &self.dataset {
+            Some(path) => Input::recording(path, &board)?,
             None => {
                 let mut scenario = Scenario::named("demo").expect("the demo's scenario is compiled in");
                 if job.quick {
                     scenario.duration = scenario.duration.min(Span::from_secs(QUICK_FLIGHT_S));
                 }
-                let cameras = colours(&scenario.calibration, &board).len();
-                (Input::rendered(&scenario, cameras, |_, _| {})?, "the simulated flight".into())
+                Input::rendered(&scenario, memory::colours(&scenario.calibration, &board).len(), |_, _| {})?
             }
         };
-        let (poses, mapping_s) = (self.poses.clone(), Some(job.seconds));
-        let options = Replay { pace: Pace::Lockstep, poses, holdout: HOLDOUT, duration_s: None, mapping_s };
-        run(input, &place, &board, out, &options)
+        let pace = Pace::Lockstep(Steps::EqualTime(job.seconds));
+        let options = Options { pace, poses: self.poses.clone(), holdout: HOLDOUT, ..Options::default() };
+        Ok(fly(input, &board, out, &options, None)?.report)
     }
 }

@@ -310,7 +310,8 @@ fn median_and_worst(mut late: Vec<i64>) -> String {
 /// `stipple run` through the whole recording, stopped by SIGTERM; `during` is called once it plays.
 fn fly(devices: &mut Devices, dir: &Path, more: &[&str], during: impl FnOnce(&mut Devices)) {
     let [board, out, kept] = [devices.board(dir), dir.join("out"), dir.join("kept")].map(|p| p.display().to_string());
-    let mut run = stipple(&[&["run", &board, "--out", &out, "--record", &kept], more].concat()).spawn().unwrap();
+    let mut run =
+        stipple(&[&["run", "--board", &board, "--out", &out, "--record", &kept], more].concat()).spawn().unwrap();
     devices.play();
     during(devices);
     wait_until(devices.end() + AFTER);
@@ -420,7 +421,7 @@ fn flight_is_found_healthy_and_recorded_as_it_was_given() {
     let dir = tempfile::tempdir().unwrap();
     let (mut devices, dir) = (Devices::plug(), dir.path());
     let [board, out, kept] = [devices.board(dir), dir.join("out"), dir.join("kept")].map(|p| p.display().to_string());
-    let mut doctor = stipple(&["doctor", &board, "--duration", "5", "--out", &out]);
+    let mut doctor = stipple(&["doctor", "--board", &board, "--duration", "5", "--out", &out]);
     let doctor = doctor.stdout(Stdio::piped()).spawn().unwrap();
     devices.play();
     let output = doctor.wait_with_output().unwrap();
@@ -431,7 +432,7 @@ fn flight_is_found_healthy_and_recorded_as_it_was_given() {
         assert!(said.lines().any(|l| l.starts_with("ok") && l.contains(line)), "{line}");
     }
     // The recording plays on.
-    assert!(stipple(&["record", &board, "--out", &kept, "--duration", "3"]).status().unwrap().success());
+    assert!(stipple(&["record", "--board", &board, "--out", &kept, "--duration", "3"]).status().unwrap().success());
     let kept = Recording::open(Path::new(&kept), &OpenOptions::default()).unwrap();
     let film = [0, 1].map(|k| fs::read(devices.flight.join(format!("cam{k}.grey"))).unwrap());
     let (mut reader, mut frames) = (kept.reader(), Frames::for_rig(&kept.calibration));

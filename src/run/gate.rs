@@ -1,7 +1,8 @@
-//! What a sensor is held to before anyone believes it: stamps that grow and do not leap, pictures and readings
-//! that change, none missing. Every check counts; only what would mislead the estimator is refused.
+//! The gate that every frame and inertial sample passes once, before anybody uses it: stamps must grow and not jump,
+//! pictures and readings must change, and what is missing is counted. Every check counts; only what would mislead the
+//! estimator is refused.
 //!
-//! A stamp ahead of its arrival by more than `LEAP` is refused, and so is one that is not newer than the last; if that
+//! A stamp ahead of its arrival by more than `JUMP_MAX` is refused, and so is one that is not newer than the last. If that
 //! is all that comes for `RELEARN`, the sensor's clock has changed for good and is believed from then on.
 
 use crate::counters::{Counter, Counters};
@@ -9,8 +10,8 @@ use std::time::{Duration, Instant};
 use stipple_drivers::source::ImuReading;
 use stipple_drivers::{Frames, Image, ImuSample, Nanos};
 
-/// Further than a queue of frames can be behind.
-const LEAP: Duration = Duration::from_secs(1);
+/// Largest step of a stamp beyond the time that passed: further than a queue of frames can be behind.
+const JUMP_MAX: Duration = Duration::from_secs(1);
 const RELEARN: Duration = Duration::from_secs(2);
 /// Intervals of whose median the period is made.
 const INTERVALS: usize = 15;
@@ -22,7 +23,8 @@ const BLANK_LEVELS: u8 = 6;
 /// step repeats itself one time in five, and this often in a row never.
 const FROZEN_AFTER: u32 = 20;
 
-/// Stamps of one sensor.
+/// The stamps of one sensor.
+#[derive(Default)]
 pub struct Stamps {
     last: Option<(Nanos, Instant)>,
     /// Since when nothing was believed.
@@ -35,14 +37,10 @@ pub struct Stamps {
 pub struct StampCounters<'a> {
     pub missing: &'a Counter,
     pub not_newer: &'a Counter,
-    pub leapt: &'a Counter,
+    pub jumped: &'a Counter,
 }
 
 impl Stamps {
-    pub fn new() -> Stamps {
-        Stamps { last: None, refusing: None, intervals: [0; INTERVALS], count: 0 }
-    }
-
     /// After a loss its clock may be another.
     pub fn forget(&mut self) {
         self.last = None;
@@ -57,14 +55,14 @@ impl Stamps {
     }
 
     /// Whether a sample with this stamp, which arrived at `now`, is believed.
-    pub fn admits(&mut self, t: Nanos, now: Instant, counters: &StampCounters) -> bool {
+    pub fn admit(&mut self, t: Nanos, now: Instant, counters: &StampCounters) -> bool {
         if let Some((last, at)) = self.last {
             let elapsed = (now - at).as_nanos() as i64;
             let not_newer = t <= last;
-            if not_newer || (t - last).0 > elapsed + LEAP.as_nanos() as i64 {
+            if not_newer || (t - last).0 > elapsed + JUMP_MAX.as_nanos() as i64 {
                 let since = *self.refusing.get_or_insert(now);
                 if now - since < RELEARN {
-                    if not_newer { counters.not_newer } else { counters.leapt }.add(1);
+                    if not_newer { counters.not_newer } else { counters.jumped }.add(1);
                     return false;
                 }
             } else {
@@ -85,8 +83,8 @@ impl Stamps {
     }
 }
 
-/// Frames of a rig.
-pub struct FrameWatch {
+/// The frames of a rig.
+pub struct FrameGate {
     pub stamps: Stamps,
     /// Pixels of the last frame, every `LOOKED_AT`th.
     looks: Vec<Vec<u8>>,
@@ -94,16 +92,16 @@ pub struct FrameWatch {
     pub blank: bool,
 }
 
-impl FrameWatch {
-    pub fn new(shape: &Frames) -> FrameWatch {
+impl FrameGate {
+    pub fn new(shape: &Frames) -> FrameGate {
         let look = |image: &Image| vec![0; image.pixels.len().div_ceil(LOOKED_AT)];
-        FrameWatch { stamps: Stamps::new(), looks: shape.images.iter().map(look).collect(), blank: false }
+        FrameGate { stamps: Stamps::default(), looks: shape.images.iter().map(look).collect(), blank: false }
     }
 
-    pub fn admits(&mut self, frames: &Frames, now: Instant, c: &Counters) -> bool {
+    pub fn admit(&mut self, frames: &Frames, now: Instant, c: &Counters) -> bool {
         let counters =
-            StampCounters { missing: &c.frames_missing, not_newer: &c.frames_not_newer, leapt: &c.frames_leapt };
-        if !self.stamps.admits(frames.t, now, &counters) {
+            StampCounters { missing: &c.frames_missing, not_newer: &c.frames_not_newer, jumped: &c.frames_leapt };
+        if !self.stamps.admit(frames.t, now, &counters) {
             return false;
         }
         let (mut frozen, mut blank) = (false, false);
@@ -126,22 +124,19 @@ impl FrameWatch {
     }
 }
 
-/// Readings of an inertial unit.
-pub struct ImuWatch {
+/// The readings of an inertial unit.
+#[derive(Default)]
+pub struct ImuGate {
     pub stamps: Stamps,
     last: Option<ImuSample>,
     repeated: u32,
 }
 
-impl ImuWatch {
-    pub fn new() -> ImuWatch {
-        ImuWatch { stamps: Stamps::new(), last: None, repeated: 0 }
-    }
-
-    pub fn admits(&mut self, reading: &ImuReading, now: Instant, c: &Counters) -> bool {
-        let counters = StampCounters { missing: &c.imu_missing, not_newer: &c.imu_not_newer, leapt: &c.imu_leapt };
+impl ImuGate {
+    pub fn admit(&mut self, reading: &ImuReading, now: Instant, c: &Counters) -> bool {
+        let counters = StampCounters { missing: &c.imu_missing, not_newer: &c.imu_not_newer, jumped: &c.imu_leapt };
         let sample = reading.sample;
-        if !self.stamps.admits(sample.t, now, &counters) {
+        if !self.stamps.admit(sample.t, now, &counters) {
             return false;
         }
         c.imu_saturated.add(u64::from(reading.saturated));
@@ -161,19 +156,19 @@ mod tests {
 
     const MS: i64 = 1_000_000;
 
-    /// Stamps (ms) that arrive every 20 ms: those believed, and counts of missing, not newer, leapt.
+    /// Stamps (ms) that arrive every 20 ms: those believed, and counts of missing, not newer, jumped.
     fn believed(stamps: &[i64]) -> (Vec<i64>, [u64; 3]) {
-        let (mut watch, start) = (Stamps::new(), Instant::now());
-        let [missing, not_newer, leapt] = [Counter::default(), Counter::default(), Counter::default()];
-        let counters = StampCounters { missing: &missing, not_newer: &not_newer, leapt: &leapt };
+        let (mut gate, start) = (Stamps::default(), Instant::now());
+        let [missing, not_newer, jumped] = [Counter::default(), Counter::default(), Counter::default()];
+        let counters = StampCounters { missing: &missing, not_newer: &not_newer, jumped: &jumped };
         let arrives = |i: usize| start + Duration::from_millis(20 * i as u64);
         let list = stamps.iter().enumerate();
-        let kept = list.filter(|(i, t)| watch.admits(Nanos(**t * MS), arrives(*i), &counters)).map(|(_, t)| *t);
-        (kept.collect(), [missing.get(), not_newer.get(), leapt.get()])
+        let kept = list.filter(|(i, t)| gate.admit(Nanos(**t * MS), arrives(*i), &counters)).map(|(_, t)| *t);
+        (kept.collect(), [missing.get(), not_newer.get(), jumped.get()])
     }
 
     #[test]
-    fn leaps_and_repetitions_are_refused_and_what_lacks_is_counted() {
+    fn jumps_and_repetitions_are_refused_and_what_lacks_is_counted() {
         let mut stamps: Vec<i64> = (0..40).map(|i| 20 * i).collect();
         (stamps[20], stamps[25], stamps[30]) = (5000, 480, 200);
         let (kept, counts) = believed(&stamps);
@@ -185,18 +180,18 @@ mod tests {
     #[test]
     fn a_clock_that_changed_for_good_is_believed() {
         let stamps: Vec<i64> = (0..300).map(|i| 20 * i + if i < 50 { 0 } else { 100_000 }).collect();
-        let (kept, [_, _, leapt]) = believed(&stamps);
-        assert_eq!((kept.len() as u64 + leapt, leapt), (300, 100));
+        let (kept, [_, _, jumped]) = believed(&stamps);
+        assert_eq!((kept.len() as u64 + jumped, jumped), (300, 100));
     }
 
     #[test]
     fn a_unit_that_hangs_is_refused_and_one_repetition_is_not() {
-        let (mut watch, c, start) = (ImuWatch::new(), Counters::default(), Instant::now());
+        let (mut gate, c, start) = (ImuGate::default(), Counters::default(), Instant::now());
         let values = (0..100).map(|i: i32| if (50..75).contains(&i) { 50 } else { i / 2 });
         let admitted = values.enumerate().filter(|(i, v)| {
             let gyro_body = glam::DVec3::splat(f64::from(*v));
             let sample = ImuSample { t: Nanos(*i as i64 * MS), gyro_body, ..ImuSample::default() };
-            watch.admits(&ImuReading { sample, ..ImuReading::default() }, start, &c)
+            gate.admit(&ImuReading { sample, ..ImuReading::default() }, start, &c)
         });
         assert_eq!((admitted.count(), c.imu_frozen.get()), (100 - 5, 24));
     }
@@ -208,11 +203,11 @@ mod tests {
             ..Image::new(80, 80)
         };
         let c = Counters::default();
-        let mut watch = FrameWatch::new(&Frames { images: vec![Image::new(80, 80)], ..Frames::default() });
+        let mut gate = FrameGate::new(&Frames { images: vec![Image::new(80, 80)], ..Frames::default() });
         let (start, black) = (Instant::now(), Image::new(80, 80));
         let pictures = [picture(3), picture(5), picture(5), black.clone(), black, picture(7)];
         let admitted = pictures.into_iter().enumerate().map(|(i, image)| {
-            watch.admits(&Frames { t: Nanos(i as i64 * MS), images: vec![image], colours: vec![] }, start, &c)
+            gate.admit(&Frames { t: Nanos(i as i64 * MS), images: vec![image], colours: vec![] }, start, &c)
         });
         assert_eq!(admitted.collect::<Vec<_>>(), [true, true, false, true, true, true]);
         assert_eq!((c.frames_frozen.get(), c.frames_blank.get()), (1, 2));

@@ -1,16 +1,15 @@
-//! The two threads that read the sensors, and what they share with tracking.
+//! Where frames and samples wait for tracking, and the two threads that put them there.
 //!
-//! Each waits for its source, holds what comes to `watch`, and delivers: frames to a mailbox where the newest replaces the
-//! one that waits, samples to a queue. A source that is lost or silent is said in one line when it goes and one when
-//! it is back, counted, and asked on; nothing is restarted. A broken one ends the run.
+//! Each thread waits for its source, has the gate judge what comes, and delivers: frames to a mailbox of one, where the
+//! newest replaces the one that waits; samples to a queue. A source that is lost or silent is reported in one line when
+//! it goes and one when it is back, counted, and asked again; nothing is restarted. A broken one ends the run.
 //!
-//! A frame is tracked when a sample at or past its stamp has come, or when none did in time: `SAMPLE_WAIT`.
+//! A frame is tracked when a sample at or past its stamp has come, or when none did within `SAMPLE_WAIT`.
 
-use super::pipeline::Bell;
-use super::progress::Gauges;
-use super::tracking::Slot;
-use super::watch::{FrameWatch, ImuWatch};
-use crate::config::InjectConfig;
+use super::gate::{FrameGate, ImuGate};
+use super::status::Gauges;
+use super::tracking::FramePacket;
+use super::waker::Waker;
 use crate::counters::{Counter, Counters};
 use crate::limits::IMU_BETWEEN_FRAMES;
 use crossbeam_queue::ArrayQueue;
@@ -18,84 +17,49 @@ use std::sync::atomic::{AtomicBool, AtomicI64, AtomicU64, Ordering::Relaxed};
 use std::sync::OnceLock;
 use std::time::{Duration, Instant};
 use stipple_drivers::host::{thread_cpu, CpuTime};
-use stipple_drivers::inject::{FaultyFrames, FaultyImu};
-use stipple_drivers::paced::{Images, Pace, PacedFrames, PacedImu};
 use stipple_drivers::source::{FrameSource, ImuBatch, ImuSource, SourceFault, Wait};
-use stipple_drivers::{Calibration, Fault, Frames, ImuSample, Nanos, Span};
+use stipple_drivers::{Calibration, Fault, ImuSample, Span};
 
-/// A pair of sources.
-pub struct Sensors {
-    pub frames: Box<dyn FrameSource>,
-    pub imu: Box<dyn ImuSource>,
-}
-
-impl Sensors {
-    /// A recording at its pace, with what `inject` does to it; `shape` makes frames of the rig's shape.
-    pub fn of_recording(
-        images: Images,
-        stamps: Vec<Nanos>,
-        samples: Vec<ImuSample>,
-        inject: &InjectConfig,
-        shape: impl Fn() -> Frames,
-    ) -> Sensors {
-        let pace = Pace::starting(stamps.first().copied().unwrap_or_default());
-        let frames = PacedFrames::new(images, stamps, pace);
-        Sensors { frames: Box::new(frames), imu: Box::new(PacedImu::new(samples.into(), pace)) }.spoilt(inject, shape)
-    }
-
-    /// With the faults a board asks for; as they were where it asks for none.
-    pub fn spoilt(self, inject: &InjectConfig, shape: impl Fn() -> Frames) -> Sensors {
-        let Sensors { mut frames, mut imu } = self;
-        if !inject.camera.is_empty() {
-            frames = Box::new(FaultyFrames::new(frames, &inject.camera, inject.seed, shape()));
-        }
-        if !inject.imu.is_empty() {
-            imu = Box::new(FaultyImu::new(imu, &inject.imu, inject.seed));
-        }
-        Sensors { frames, imu }
-    }
-}
-
-/// How long a source may wait before it looks up: what ends a run or says a loss is at most so late.
+/// Longest wait for a source: what ends a run or reports a loss is at most so late.
 const PATIENCE: Span = Span(100_000_000);
-/// Without a sample at a frame's stamp for so long it is tracked without: more than a FIFO of 10 samples at 200 Hz holds
-/// back.
+/// Longest wait of a frame for a sample at its stamp: more than a FIFO of 10 samples at 200 Hz holds back.
 const SAMPLE_WAIT: Duration = Duration::from_millis(100);
 /// A source that gives nothing for so long is silent: ten frames at 20 Hz.
 const SILENT_AFTER: Duration = Duration::from_millis(500);
-/// Of one sensor, at most a line each.
-const LINE_PERIOD: Duration = Duration::from_secs(1);
+/// Least time between two reports of one sensor.
+const REPORT_PERIOD: Duration = Duration::from_secs(1);
 const POLL: Duration = Duration::from_micros(500);
-/// Two seconds of a 1 kHz unit.
+/// Samples that wait: two seconds of a 1 kHz unit.
 const IMU_SLOTS: usize = 2048;
-/// Samples that wait for no frame any more: half of what fits before one, a second and a quarter at 200 Hz.
+/// Samples that go without a frame: half of what fits before one, a second and a quarter at 200 Hz.
 const SAMPLES_ALONE: usize = IMU_BETWEEN_FRAMES / 2;
 const NOTICES: usize = 8;
 
-/// Where frames and samples wait for tracking. Slots go round: spare -> newest -> tracking -> spare.
-pub struct Inbox {
-    pub spare: ArrayQueue<Box<Slot>>,
-    newest: ArrayQueue<Box<Slot>>,
+/// Where frames and samples wait for tracking. Packets go round: spare -> newest -> tracking -> spare.
+pub struct Mailbox {
+    pub spare: ArrayQueue<Box<FramePacket>>,
+    newest: ArrayQueue<Box<FramePacket>>,
     imu: ArrayQueue<ImuSample>,
-    /// Stamp of the newest sample.
+    /// Stamp of the newest sample, ns.
     imu_until: AtomicI64,
     /// The unit is lost, silent, or its recording over: nobody waits for it.
     imu_away: AtomicBool,
     /// Frames that arrived.
     pub arrived: AtomicU64,
-    /// Known when the thread `camera` has ended.
+    /// Cost of reading the cameras, known when the thread `camera` has ended.
     pub capture: OnceLock<Capture>,
     /// Asks both threads to end.
     pub stop: AtomicBool,
-    /// Lines to be printed, and what ended the run.
+    /// Lines to be printed.
     pub notices: ArrayQueue<String>,
+    /// What ended the run.
     pub broken: ArrayQueue<Fault>,
 }
 
-impl Inbox {
-    pub fn new(slots: usize, calibration: &Calibration, colours: usize) -> Inbox {
-        let inbox = Inbox {
-            spare: ArrayQueue::new(slots),
+impl Mailbox {
+    pub fn new(packets: usize, calibration: &Calibration, colours: usize) -> Mailbox {
+        let mailbox = Mailbox {
+            spare: ArrayQueue::new(packets),
             newest: ArrayQueue::new(1),
             imu: ArrayQueue::new(IMU_SLOTS),
             imu_until: AtomicI64::new(i64::MIN),
@@ -106,28 +70,28 @@ impl Inbox {
             notices: ArrayQueue::new(NOTICES),
             broken: ArrayQueue::new(2),
         };
-        for _ in 0..slots {
-            let _ = inbox.spare.push(Slot::for_rig(calibration, colours));
+        for _ in 0..packets {
+            let _ = mailbox.spare.push(FramePacket::for_rig(calibration, colours));
         }
-        inbox
+        mailbox
     }
 
     /// The frame to track next with the samples up to the first at or past it, or `None` while one of them is to
     /// come; `held` is the frame that waits.
-    pub fn take(&self, held: &mut Option<Held>, over: &AtomicBool, counters: &Counters) -> Option<Box<Slot>> {
+    pub fn take(&self, held: &mut Option<Held>, over: &AtomicBool, counters: &Counters) -> Option<Box<FramePacket>> {
         if held.is_none() {
-            let Some(mut slot) = self.newest.pop() else { return self.take_samples(counters) };
-            slot.imu.clear();
-            slot.frameless = false;
-            *held = Some(Held { slot, since: Instant::now() });
+            let Some(mut packet) = self.newest.pop() else { return self.take_samples(counters) };
+            packet.imu.clear();
+            packet.imu_only = false;
+            *held = Some(Held { packet, since: Instant::now() });
         }
-        let Held { slot, since } = held.as_mut().expect("filled above");
+        let Held { packet, since } = held.as_mut().expect("filled above");
         // Read first, so that what was queued before it was set is still taken.
         let away = self.imu_away.load(Relaxed) || over.load(Relaxed);
         let mut reached = false;
         while let Some(sample) = self.imu.pop() {
-            slot.push_imu(sample, counters);
-            reached = sample.t >= slot.frames.t;
+            packet.push_imu(sample, counters);
+            reached = sample.t >= packet.frames.t;
             if reached {
                 break;
             }
@@ -136,32 +100,32 @@ impl Inbox {
             return None;
         }
         counters.frames_without_imu.add(u64::from(!reached));
-        held.take().map(|h| h.slot)
+        held.take().map(|h| h.packet)
     }
 
-    /// Without a frame: samples alone, once there are as many as one slot takes well. Inertia carries the estimate over the
+    /// Without a frame: samples alone, once there are as many as one packet takes well. Inertia carries the estimate over the
     /// gap, and each that is missing costs metres.
-    fn take_samples(&self, counters: &Counters) -> Option<Box<Slot>> {
+    fn take_samples(&self, counters: &Counters) -> Option<Box<FramePacket>> {
         if self.imu.len() < SAMPLES_ALONE {
             return None;
         }
-        let mut slot = self.spare.pop()?;
-        slot.imu.clear();
-        slot.frameless = true;
+        let mut packet = self.spare.pop()?;
+        packet.imu.clear();
+        packet.imu_only = true;
         for _ in 0..SAMPLES_ALONE {
-            self.imu.pop().into_iter().for_each(|sample| slot.push_imu(sample, counters));
+            self.imu.pop().into_iter().for_each(|sample| packet.push_imu(sample, counters));
         }
-        Some(slot)
+        Some(packet)
     }
 
-    /// A spare slot to read a frame into: not the one the front end still looks at.
-    fn writable(&self) -> Option<Box<Slot>> {
+    /// A spare packet to read a frame into: not the one the front end still looks at.
+    fn writable(&self) -> Option<Box<FramePacket>> {
         for _ in 0..self.spare.len() {
-            let mut slot = self.spare.pop()?;
-            if slot.writable().is_some() {
-                return Some(slot);
+            let mut packet = self.spare.pop()?;
+            if packet.writable().is_some() {
+                return Some(packet);
             }
-            let _ = self.spare.push(slot);
+            let _ = self.spare.push(packet);
         }
         None
     }
@@ -200,25 +164,25 @@ impl Capture {
 }
 
 /// Says at the end of its thread what that took.
-struct Metered<'a>(&'a Inbox, CpuTime, usize);
+struct Metered<'a>(&'a Mailbox, CpuTime, usize);
 
 impl Drop for Metered<'_> {
     fn drop(&mut self) {
-        let Metered(inbox, from, frame_bytes) = self;
-        let (frames, cpu) = (inbox.arrived.load(Relaxed), thread_cpu() - *from);
-        let _ = inbox.capture.set(Capture { frames, frame_bytes: *frame_bytes, cpu });
+        let Metered(mailbox, from, frame_bytes) = self;
+        let (frames, cpu) = (mailbox.arrived.load(Relaxed), thread_cpu() - *from);
+        let _ = mailbox.capture.set(Capture { frames, frame_bytes: *frame_bytes, cpu });
     }
 }
 
 /// A frame that waits for its samples.
 pub struct Held {
-    slot: Box<Slot>,
+    packet: Box<FramePacket>,
     since: Instant,
 }
 
 /// Whether a sensor answers, and what is said of it.
 #[derive(Clone, Copy)]
-struct Presence<'a> {
+struct Liveness<'a> {
     name: &'static str,
     heard: Instant,
     away: bool,
@@ -231,11 +195,11 @@ struct Presence<'a> {
     told: bool,
 }
 
-impl Presence<'_> {
-    fn goes(&mut self, counter: &Counter, what: impl FnOnce() -> String) {
+impl Liveness<'_> {
+    fn lose(&mut self, counter: &Counter, what: impl FnOnce() -> String) {
         self.away = true;
         counter.add(1);
-        self.told = self.said.is_none_or(|t| t.elapsed() >= LINE_PERIOD);
+        self.told = self.said.is_none_or(|t| t.elapsed() >= REPORT_PERIOD);
         if self.told {
             self.said = Some(Instant::now());
             let _ = self.notices.push(format!("{} {}", self.name, what()));
@@ -243,7 +207,7 @@ impl Presence<'_> {
     }
 
     /// What `next` answered, but for `Broken`; whether the sensor is away.
-    fn hears(&mut self, answer: &Result<Wait, SourceFault>) -> bool {
+    fn update(&mut self, answer: &Result<Wait, SourceFault>) -> bool {
         match answer {
             Ok(Wait::Got) => {
                 let gone = self.heard.elapsed();
@@ -256,9 +220,9 @@ impl Presence<'_> {
                     }
                 }
             }
-            Err(SourceFault::Lost(fault)) if !self.away => self.goes(self.lost, || format!("lost: {fault}")),
+            Err(SourceFault::Lost(fault)) if !self.away => self.lose(self.lost, || format!("lost: {fault}")),
             Ok(Wait::TimedOut) if !self.away && self.heard.elapsed() >= SILENT_AFTER => {
-                self.goes(self.silent, || format!("is silent for {:.1} s", SILENT_AFTER.as_secs_f64()));
+                self.lose(self.silent, || format!("is silent for {:.1} s", SILENT_AFTER.as_secs_f64()));
             }
             _ => {}
         }
@@ -267,113 +231,113 @@ impl Presence<'_> {
 }
 
 /// Thread `camera`. Ends with its source, or when asked.
-pub fn camera(inbox: &Inbox, source: &mut dyn FrameSource, tracking: &Bell, c: &Counters, gauges: &Gauges) {
-    let Some(mut slot) = inbox.writable() else { return };
-    let mut watch = FrameWatch::new(&slot.frames);
-    let _metered = Metered(inbox, thread_cpu(), slot.frames.images.iter().map(|i| i.pixels.len()).sum());
-    let mut presence = Presence {
+pub fn camera(mailbox: &Mailbox, source: &mut dyn FrameSource, tracking: &Waker, c: &Counters, gauges: &Gauges) {
+    let Some(mut packet) = mailbox.writable() else { return };
+    let mut gate = FrameGate::new(&packet.frames);
+    let _metered = Metered(mailbox, thread_cpu(), packet.frames.images.iter().map(|i| i.pixels.len()).sum());
+    let mut liveness = Liveness {
         name: "camera",
         heard: Instant::now(),
         away: false,
         lost: &c.camera_lost,
         silent: &c.camera_silent,
         away_ms: &c.camera_away_ms,
-        notices: &inbox.notices,
+        notices: &mailbox.notices,
         said: None,
         told: false,
     };
-    let mut eye = Presence { name: "one camera", lost: &c.eye_lost, away_ms: &c.eye_away_ms, ..presence };
+    let mut eye = Liveness { name: "one camera", lost: &c.eye_lost, away_ms: &c.eye_away_ms, ..liveness };
     let mut span = None;
-    while !inbox.stop.load(Relaxed) {
-        let frames = slot.writable().expect("it was taken as such, and nobody else has it");
+    while !mailbox.stop.load(Relaxed) {
+        let frames = packet.writable().expect("it was taken as such, and nobody else has it");
         let answer = source.next(PATIENCE, frames);
-        if presence.hears(&answer) && answer.is_err() {
-            watch.stamps.forget();
+        if liveness.update(&answer) && answer.is_err() {
+            gate.stamps.forget();
         }
         if answer == Ok(Wait::Got) {
-            eye.hears(&source.away().map_or(Ok(Wait::Got), |fault| Err(SourceFault::Lost(fault.clone()))));
+            eye.update(&source.away().map_or(Ok(Wait::Got), |fault| Err(SourceFault::Lost(fault.clone()))));
         }
         match answer {
             Ok(Wait::Got) => {}
             Ok(Wait::TimedOut) | Err(SourceFault::Lost(_)) => continue,
             Ok(Wait::Ended) => break,
             Err(SourceFault::Broken(fault)) => {
-                let _ = inbox.broken.push(fault);
+                let _ = mailbox.broken.push(fault);
                 break;
             }
         }
-        inbox.arrived.fetch_add(1, Relaxed);
-        if !watch.admits(&slot.frames, Instant::now(), c) {
+        mailbox.arrived.fetch_add(1, Relaxed);
+        if !gate.admit(&packet.frames, Instant::now(), c) {
             continue;
         }
-        slot.blank = watch.blank;
-        let t = slot.frames.t;
+        packet.blank = gate.blank;
+        let t = packet.frames.t;
         let (first, _) = *span.get_or_insert((t, t));
         span = Some((first, t));
         gauges.played_ms.store(((t - first).secs() * 1e3).max(0.0) as u64, Relaxed);
-        let replaced = inbox.newest.force_push(slot);
+        let replaced = mailbox.newest.force_push(packet);
         c.frames_overwritten.add(u64::from(replaced.is_some()));
-        tracking.ring();
-        slot = match replaced.or_else(|| inbox.writable()) {
-            Some(slot) => slot,
-            // Slots are as many as frames can be under way; one is about to come back.
+        tracking.wake();
+        packet = match replaced.or_else(|| mailbox.writable()) {
+            Some(packet) => packet,
+            // FramePackets are as many as frames can be under way; one is about to come back.
             None => loop {
                 std::thread::sleep(POLL);
-                if let Some(slot) = inbox.writable() {
-                    break slot;
+                if let Some(packet) = mailbox.writable() {
+                    break packet;
                 }
             },
         };
     }
     let Some((_, last)) = span else { return };
     let limit = Instant::now() + SAMPLE_WAIT;
-    let reached = || inbox.imu_until.load(Relaxed) >= last.0 || inbox.imu_away.load(Relaxed);
+    let reached = || mailbox.imu_until.load(Relaxed) >= last.0 || mailbox.imu_away.load(Relaxed);
     while !reached() && Instant::now() < limit {
         std::thread::sleep(POLL);
     }
 }
 
 /// Thread `imu`. Ends with its source or with the cameras.
-pub fn inertial(inbox: &Inbox, source: &mut dyn ImuSource, tracking: &Bell, over: &AtomicBool, c: &Counters) {
-    let (mut batch, mut watch) = (ImuBatch::new(), ImuWatch::new());
-    let mut presence = Presence {
+pub fn inertial(mailbox: &Mailbox, source: &mut dyn ImuSource, tracking: &Waker, over: &AtomicBool, c: &Counters) {
+    let (mut batch, mut gate) = (ImuBatch::new(), ImuGate::default());
+    let mut liveness = Liveness {
         name: "inertial unit",
         heard: Instant::now(),
         away: false,
         lost: &c.imu_lost,
         silent: &c.imu_silent,
         away_ms: &c.imu_away_ms,
-        notices: &inbox.notices,
+        notices: &mailbox.notices,
         said: None,
         told: false,
     };
     while !over.load(Relaxed) {
         let answer = source.next(PATIENCE, &mut batch);
-        let away = presence.hears(&answer);
-        inbox.imu_away.store(away, Relaxed);
+        let away = liveness.update(&answer);
+        mailbox.imu_away.store(away, Relaxed);
         match answer {
             Ok(Wait::Got) => {}
             Ok(Wait::TimedOut) => continue,
             Err(SourceFault::Lost(_)) => {
-                watch.stamps.forget();
+                gate.stamps.forget();
                 continue;
             }
             Ok(Wait::Ended) => break,
             Err(SourceFault::Broken(fault)) => {
-                let _ = inbox.broken.push(fault);
-                inbox.stop.store(true, Relaxed);
+                let _ = mailbox.broken.push(fault);
+                mailbox.stop.store(true, Relaxed);
                 break;
             }
         }
         let now = Instant::now();
-        for reading in batch.iter().filter(|r| watch.admits(r, now, c)) {
+        for reading in batch.iter().filter(|r| gate.admit(r, now, c)) {
             // Never refused: while no frame comes the oldest make room.
-            c.imu_overflow.add(u64::from(inbox.imu.force_push(reading.sample).is_some()));
-            inbox.imu_until.store(reading.sample.t.0, Relaxed);
+            c.imu_overflow.add(u64::from(mailbox.imu.force_push(reading.sample).is_some()));
+            mailbox.imu_until.store(reading.sample.t.0, Relaxed);
         }
-        tracking.ring();
+        tracking.wake();
     }
-    inbox.imu_away.store(true, Relaxed);
+    mailbox.imu_away.store(true, Relaxed);
 }
 
 #[cfg(test)]
@@ -383,6 +347,7 @@ mod tests {
     use std::sync::{Arc, Mutex};
     use stipple_drivers::sim::euroc_rig;
     use stipple_drivers::types::{Image, Nanos};
+    use stipple_drivers::Frames;
 
     /// A camera that says where it wrote the images of its last frame, and gives one at a time.
     struct Writes<'a>(&'a Mutex<Vec<usize>>, i64);
@@ -410,43 +375,43 @@ mod tests {
 
     #[test]
     fn the_tracker_gets_the_image_where_the_camera_wrote_it() {
-        let (inbox, written) = (Inbox::new(4, &euroc_rig(), 0), Mutex::new(vec![]));
-        let (bell, counters, gauges) = (Bell::default(), Counters::default(), Gauges::default());
-        inbox.imu_away.store(true, Relaxed);
+        let (mailbox, written) = (Mailbox::new(4, &euroc_rig(), 0), Mutex::new(vec![]));
+        let (bell, counters, gauges) = (Waker::default(), Counters::default(), Gauges::default());
+        mailbox.imu_away.store(true, Relaxed);
         let mut source = Writes(&written, 0);
-        camera(&inbox, &mut source, &bell, &counters, &gauges);
-        let slot = inbox.take(&mut None, &AtomicBool::new(true), &counters).unwrap();
-        assert_eq!((slot.frames.t, counters.frames_overwritten.get()), (Nanos(150_000_000), 2));
-        assert_eq!(places(&slot.frames.images), *written.lock().unwrap(), "handed on, not copied");
-        let capture = inbox.capture.get().unwrap();
+        camera(&mailbox, &mut source, &bell, &counters, &gauges);
+        let packet = mailbox.take(&mut None, &AtomicBool::new(true), &counters).unwrap();
+        assert_eq!((packet.frames.t, counters.frames_overwritten.get()), (Nanos(150_000_000), 2));
+        assert_eq!(places(&packet.frames.images), *written.lock().unwrap(), "handed on, not copied");
+        let capture = mailbox.capture.get().unwrap();
         assert_eq!((capture.frames, capture.frame_bytes), (3, 2 * 752 * 480));
         assert_eq!(capture.copies(&source.counters()), Some(1.0));
         assert!(capture.ms_a_frame().is_some_and(|(all, kernel)| all >= kernel && kernel >= 0.0));
     }
 
     #[test]
-    fn a_slot_the_front_end_looks_at_is_not_written_into() {
-        let inbox = Inbox::new(3, &euroc_rig(), 0);
-        let looked_at = inbox.spare.pop().unwrap();
+    fn a_packet_the_front_end_looks_at_is_not_written_into() {
+        let mailbox = Mailbox::new(3, &euroc_rig(), 0);
+        let looked_at = mailbox.spare.pop().unwrap();
         let front_end = looked_at.frames.clone();
-        let _ = inbox.spare.push(looked_at);
-        let taken = [inbox.writable(), inbox.writable()].map(Option::unwrap);
-        assert!(taken.iter().all(|slot| !Arc::ptr_eq(&slot.frames, &front_end)));
-        assert!(inbox.writable().is_none(), "it has to wait");
+        let _ = mailbox.spare.push(looked_at);
+        let taken = [mailbox.writable(), mailbox.writable()].map(Option::unwrap);
+        assert!(taken.iter().all(|packet| !Arc::ptr_eq(&packet.frames, &front_end)));
+        assert!(mailbox.writable().is_none(), "it has to wait");
         drop(front_end);
-        assert!(inbox.writable().is_some());
+        assert!(mailbox.writable().is_some());
     }
 
     #[test]
     fn while_no_frame_comes_samples_reach_the_estimator_all_the_same() {
-        let (inbox, counters, over) = (Inbox::new(4, &euroc_rig(), 0), Counters::default(), AtomicBool::new(false));
+        let (mailbox, counters, over) = (Mailbox::new(4, &euroc_rig(), 0), Counters::default(), AtomicBool::new(false));
         let mut taken = vec![];
         for i in 0..3 * IMU_BETWEEN_FRAMES as i64 {
-            inbox.imu.force_push(ImuSample { t: Nanos(i), ..ImuSample::default() });
-            if let Some(slot) = inbox.take(&mut None, &over, &counters) {
-                assert!(slot.frameless);
-                taken.extend(slot.imu.iter().map(|s| s.t.0));
-                let _ = inbox.spare.push(slot);
+            mailbox.imu.force_push(ImuSample { t: Nanos(i), ..ImuSample::default() });
+            if let Some(packet) = mailbox.take(&mut None, &over, &counters) {
+                assert!(packet.imu_only);
+                taken.extend(packet.imu.iter().map(|s| s.t.0));
+                let _ = mailbox.spare.push(packet);
             }
         }
         assert_eq!(taken, (0..3 * IMU_BETWEEN_FRAMES as i64).collect::<Vec<_>>());

@@ -1,6 +1,6 @@
-//! What is seen while a run goes on: a bar on a terminal, one line a second otherwise, and a light where one is wired.
+//! What a run shows while it goes on: a bar on a terminal, one line a second otherwise, and a status LED where one is wired.
 
-use super::light::Light;
+use super::status_led::StatusLed;
 use indicatif::{ProgressBar, ProgressStyle};
 use std::fmt;
 use std::io::{self, IsTerminal, Write as _};
@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 #[derive(Default)]
 pub struct Gauges {
     pub frames: AtomicU64,
-    /// Of these, with a pose; where nobody tracks, all.
+    /// Frames with a pose; where nobody tracks, all.
     pub posed: AtomicU64,
     /// The map failed, or a sensor broke.
     pub broke: AtomicBool,
@@ -25,19 +25,19 @@ pub struct Gauges {
     pub played_ms: AtomicU64,
 }
 
-pub struct Progress {
+pub struct Status {
     bar: Option<ProgressBar>,
     /// `None`: until it is stopped.
     total_ms: Option<u64>,
     /// `None`: never.
     next_line: Option<Instant>,
-    light: Option<Light>,
+    led: Option<StatusLed>,
 }
 
 const LINE_PERIOD: Duration = Duration::from_secs(1);
 
-impl Progress {
-    pub fn new(total_s: Option<f64>) -> Progress {
+impl Status {
+    pub fn new(total_s: Option<f64>) -> Status {
         let total_ms = total_s.map(|s| (s.max(0.0) * 1e3) as u64);
         let bar = io::stderr().is_terminal().then(|| {
             let bar = total_ms.map_or_else(ProgressBar::new_spinner, ProgressBar::new);
@@ -46,30 +46,29 @@ impl Progress {
             bar.set_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()));
             bar
         });
-        Progress { bar, total_ms, next_line: Some(Instant::now() + LINE_PERIOD), light: None }
+        Status { bar, total_ms, next_line: Some(Instant::now() + LINE_PERIOD), led: None }
     }
 
     /// Shows nothing.
-    #[cfg(feature = "instruments")]
-    pub fn silent() -> Progress {
-        Progress { bar: None, total_ms: None, next_line: None, light: None }
+    pub fn silent() -> Status {
+        Status { bar: None, total_ms: None, next_line: None, led: None }
     }
 
-    /// With the light of a board that has one.
-    pub fn lit(mut self, light: Option<Light>) -> Progress {
-        self.light = light;
+    /// Shows it on the LED of a board that has one, too.
+    pub fn with_led(mut self, led: Option<StatusLed>) -> Status {
+        self.led = led;
         self
     }
 
-    /// What ran ended as it was asked to.
+    /// The run ended as it was asked to: the LED shows no fault.
     pub fn ended_well(&mut self) {
-        self.light.iter_mut().for_each(Light::ended_well);
+        self.led.iter_mut().for_each(StatusLed::ended_well);
     }
 
     /// Cheap to call often: draws at most once a second without a terminal.
     pub fn show(&mut self, g: &Gauges) {
-        if let Some(light) = &mut self.light {
-            light.show(g.posed.load(Relaxed), g.broke.load(Relaxed), Instant::now());
+        if let Some(led) = &mut self.led {
+            led.show(g.posed.load(Relaxed), g.broke.load(Relaxed), Instant::now());
         }
         let played = g.played_ms.load(Relaxed).min(self.total_ms.unwrap_or(u64::MAX));
         match &self.bar {
@@ -80,17 +79,17 @@ impl Progress {
             None if self.next_line.is_some_and(|due| Instant::now() >= due) => {
                 self.next_line = self.next_line.map(|due| due + LINE_PERIOD);
                 let of = self.total_ms.map_or(String::new(), |ms| format!(" of {:.1}", ms as f64 * 1e-3));
-                tell(format_args!("{:.1}{of} s: {}", played as f64 * 1e-3, line(g)));
+                print_err(format_args!("{:.1}{of} s: {}", played as f64 * 1e-3, line(g)));
             }
             None => {}
         }
     }
 
-    /// A line that stays.
+    /// Prints a line that stays.
     pub fn say(&self, text: &str) {
         match &self.bar {
             Some(bar) => bar.println(format!("stipple: {text}")),
-            None if self.next_line.is_some() => tell(format_args!("stipple: {text}")),
+            None if self.next_line.is_some() => print_err(format_args!("stipple: {text}")),
             None => {}
         }
     }
@@ -115,12 +114,12 @@ fn line(g: &Gauges) -> String {
     )
 }
 
-/// A line of a run to standard error. That nobody reads it any more is no reason to end a flight.
-pub fn tell(line: fmt::Arguments) {
+/// Prints a line to standard error; a closed one is no reason to end a flight.
+pub fn print_err(line: fmt::Arguments) {
     let _ = writeln!(io::stderr(), "{line}");
 }
 
-/// What a run came to, to standard output; likewise.
-pub fn print(line: impl fmt::Display) {
+/// Prints a line of the result to standard output; a closed one likewise.
+pub fn print_out(line: impl fmt::Display) {
     let _ = writeln!(io::stdout(), "{line}");
 }

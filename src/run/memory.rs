@@ -1,8 +1,8 @@
 //! The byte table: everything a board buys at boot, summed before anything is bought.
 
 use super::mapping::KEYFRAME_SLOTS;
-use super::play::frame_slots;
-use super::tracking::Slot;
+use super::packets;
+use super::tracking::FramePacket;
 use crate::config::Board;
 use crate::frontend::Frontend;
 use crate::limits::CAMERAS_MAX;
@@ -19,7 +19,7 @@ pub fn footprint(calibration: &Calibration, board: &Board, records: bool) -> Foo
     let pixels: usize = calibration.cameras.iter().map(|c| c.camera.width * c.camera.height).sum();
     let coloured: usize = colours(calibration, board).iter().map(|c| 3 * c.camera.width * c.camera.height).sum();
     let mut f = Footprint::default();
-    f.host("queues: frames", frame_slots(board.frontend.threads) * (pixels + coloured + Slot::BYTES));
+    f.host("queues: frames", packets(board.frontend.threads) * (pixels + coloured + FramePacket::BYTES));
     f.extend(Frontend::footprint(calibration, &board.frontend));
     f.extend(Vio::footprint());
     if board.map.enabled {
@@ -53,7 +53,7 @@ pub fn largest_rig(board: &Board) -> Calibration {
 }
 
 /// Refuses a method of stereo that this program has not, and a rig whose images or bytes exceed the board's budget.
-pub fn admit(place: &str, calibration: &Calibration, board: &Board, records: bool) -> Result<Footprint, Fault> {
+pub fn check_fits(place: &str, calibration: &Calibration, board: &Board, records: bool) -> Result<Footprint, Fault> {
     let (w, h) = (board.budget.image_width_max as usize, board.budget.image_height_max as usize);
     for (i, c) in calibration.cameras.iter().enumerate() {
         if c.camera.width > w || c.camera.height > h {

@@ -8,27 +8,37 @@ pub mod motion;
 pub mod rotation;
 pub mod signals;
 
-use super::hardware;
-use super::live::{rig_of, Rig, Run};
-use super::pipeline::{Bell, Ends};
-use super::progress::Gauges;
-use super::sensors::{self, Capture, Inbox};
+use super::{open_input, seconds, BoardArgs};
 use crate::config::Board;
-use crate::counters::Counters;
+use crate::run::mailbox::Capture;
+use crate::run::sensors::{self, Input, Source};
+use crate::run::status::{print_err, Status};
+use crate::run::tracking::FramePacket;
+use crate::run::{observe, Flown};
 use crate::stereo::alignment::Alignment;
 use crate::stereo::rectify::Rectification;
 use agreement::agreement;
 use rotation::Turning;
 use signals::Light;
-use std::path::Path;
-use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
-use std::sync::Arc;
-use std::time::{Duration, Instant};
-use stipple_drivers::{host, Calibration, Exit, Fault, Frames, Image, ImuSample, Nanos};
+use std::path::PathBuf;
+use std::sync::{Arc, Mutex, PoisonError};
+use stipple_drivers::{Calibration, Exit, Fault, Frames, Image, ImuSample, Nanos};
 
-/// How long sensors are looked at by default, s.
-pub const LOOK_S: f64 = 15.0;
-const SLOTS: usize = 6;
+#[derive(clap::Args)]
+pub struct Args {
+    #[command(flatten)]
+    board: BoardArgs,
+    /// Time to read the sensors
+    #[arg(long, value_name = "S", default_value = "15", value_parser = seconds)]
+    duration: f64,
+    /// Play this recording in place of the sensors, at its pace
+    #[arg(long, value_name = "DIR")]
+    dataset: Option<PathBuf>,
+    /// Folder that runs and recordings will go to; its disk must have room
+    #[arg(long, value_name = "DIR", default_value = "out")]
+    out: PathBuf,
+}
+
 /// Stereo pairs matched, one in so many frames.
 const PAIR_EVERY: usize = 25;
 
@@ -73,18 +83,15 @@ impl Check {
     }
 }
 
-/// What the sensors gave while they were looked at.
+/// What the sensors gave.
 struct Seen {
+    calibration: Calibration,
+    disparities: usize,
     frames: Vec<Nanos>,
     samples: Vec<ImuSample>,
     light: Vec<Light>,
     turning: Turning,
     pairs: Pairs,
-    counters: Counters,
-    source: Vec<(&'static str, u64)>,
-    capture: Option<Capture>,
-    notices: Vec<String>,
-    broken: Option<Fault>,
 }
 
 /// Matches of the left image in the right one, and the other way round: of swapped cameras only the other way has any.
@@ -131,7 +138,7 @@ impl Pairs {
                 format!("stereo: only {n} corners match"),
                 "look at something with detail, a metre away or more",
             ),
-            Some((rows, _)) if rows.abs() > super::dataset::ROWS_MAX_PX => Check::warn(
+            Some((rows, _)) if rows.abs() > super::calib_check::ROWS_MAX_PX => Check::warn(
                 format!("stereo: camera 1 sees points {rows:+.2} px lower after rectification"),
                 "stereo matches rows: calibrate the extrinsics and principal points anew",
             ),
@@ -143,30 +150,29 @@ impl Pairs {
     }
 }
 
-/// `stipple doctor`
-pub fn doctor(path: &Path, out: &Path, set: &[String], options: &Run) -> Result<(), Fault> {
-    let board = Board::load(path, set)?;
+pub fn doctor(args: &Args) -> Result<(), Fault> {
+    let board = args.board.load()?;
     let mut checks = machine::vulkan(&board);
-    checks.push(machine::disk(out));
+    checks.push(machine::disk(&args.out));
     checks.iter().for_each(Check::print);
-    let look_s = options.duration_s.unwrap_or(LOOK_S);
-    let run = Run { duration_s: Some(look_s), dataset: options.dataset.clone(), record: None };
-    let sensed = match rig_of(path, &board, &run) {
-        Ok(rig) => {
-            let memory = machine::memory_ceiling(Some(&rig.calibration), &board);
+    let sensed = match open_input(args.dataset.as_deref(), &args.board, &board) {
+        Ok(input) => {
+            let memory = machine::memory_ceiling(Some(&input.calibration), &board);
             memory.print();
-            eprintln!("hold the rig still for two seconds, then turn it about all three axes ({look_s:.0} s)");
-            let sensed = [vec![memory], sensed(rig, &board, look_s)?].concat();
+            let look_s = args.duration;
+            print_err(format_args!(
+                "hold the rig still for two seconds, then turn it about all three axes ({look_s:.0} s)"
+            ));
+            let sensed = [vec![memory], sensed(input, &board, look_s)?].concat();
             sensed[1..].iter().for_each(Check::print);
             sensed
         }
         Err(fault) => {
-            let memory = machine::memory_ceiling(None, &board);
-            let mut list = vec![memory];
+            let mut list = vec![machine::memory_ceiling(None, &board)];
             let named = !board.camera.devices.is_empty() && !board.rig.calibration.is_empty();
-            if options.dataset.is_none() && named {
-                // One part fails; the others may be well, and are said too.
-                list.extend(hardware::parts(path, &board).into_iter().map(|(name, found)| match found {
+            if args.dataset.is_none() && named {
+                // One part fails; the others may be well, and are judged too.
+                list.extend(sensors::parts(args.board.path(), &board).into_iter().map(|(name, found)| match found {
                     Ok(what) => Check::ok(format!("{name}: {what}")),
                     Err(fault) => Check::fail(format!("{name}: {}: {}", fault.place, fault.what), fault.fix),
                 }));
@@ -178,35 +184,48 @@ pub fn doctor(path: &Path, out: &Path, set: &[String], options: &Run) -> Result<
             list
         }
     };
-    let failed = checks.iter().chain(&sensed).filter(|c| c.verdict == Verdict::Fail).count();
-    match failed {
+    all_passed(Exit::Unavailable, args.board.path(), checks.iter().chain(&sensed))
+}
+
+/// An error where a check failed.
+pub fn all_passed<'a>(
+    exit: Exit,
+    place: &std::path::Path,
+    checks: impl Iterator<Item = &'a Check>,
+) -> Result<(), Fault> {
+    match checks.filter(|c| c.verdict == Verdict::Fail).count() {
         0 => Ok(()),
         n => {
             let what = format!("{n} check{} failed", if n == 1 { "" } else { "s" });
-            Err(Fault::new(Exit::Unavailable, path.display().to_string(), what, "see the lines above"))
+            Err(Fault::new(exit, place.display().to_string(), what, "see the lines above"))
         }
     }
 }
 
-fn sensed(rig: Rig, board: &Board, look_s: f64) -> Result<Vec<Check>, Fault> {
-    let (calibration, expected_hz) = (rig.calibration.clone(), rig.expected_hz);
-    let seen = look(rig, board, look_s)?;
+fn sensed(input: Input, board: &Board, look_s: f64) -> Result<Vec<Check>, Fault> {
+    let rate_hz = match input.source {
+        Source::Live { rate_hz, .. } => Some(rate_hz),
+        Source::Recorded(_) => None,
+    };
+    let (seen, flown) = look(input, board, look_s)?;
+    let (seen, calibration) = (&seen, &seen.calibration);
     let mut checks = vec![];
-    if let Some(fault) = &seen.broken {
+    if let Some(fault) = &flown.broken {
         checks.push(Check::fail(format!("{}: {}", fault.place, fault.what), fault.fix.clone()));
     }
-    for line in &seen.notices {
+    for line in &flown.notices {
         checks.push(Check::warn(line.clone(), "check plug and cable"));
     }
-    checks.push(signals::rate("camera rate", &seen.frames, seen.counters.frames_missing.get(), expected_hz));
+    let c = &flown.counters;
+    checks.push(signals::rate("camera rate", &seen.frames, c.frames_missing.get(), rate_hz));
     let imu: Vec<Nanos> = seen.samples.iter().map(|s| s.t).collect();
-    checks.push(signals::rate("inertial rate", &imu, seen.counters.imu_missing.get(), Some(calibration.imu.rate_hz)));
-    checks.push(skew(&seen));
-    checks.extend(seen.capture.and_then(|c| capture(&c, &seen)));
+    checks.push(signals::rate("inertial rate", &imu, c.imu_missing.get(), Some(calibration.imu.rate_hz)));
+    checks.push(skew(seen, &flown));
+    checks.extend(flown.capture.and_then(|c| capture(&c, seen, &flown)));
     checks.extend(seen.light.iter().enumerate().map(|(camera, light)| light.check(camera)));
     checks.push(seen.pairs.check(board));
-    checks.extend(signals::inertia(&seen.samples, &calibration));
-    checks.push(signals::saturation(&seen.samples, seen.counters.imu_saturated.get(), board));
+    checks.extend(signals::inertia(&seen.samples, calibration));
+    checks.push(signals::saturation(&seen.samples, c.imu_saturated.get(), board));
     let found = agreement(&seen.turning.turns, &seen.samples, calibration.cameras[0].body_from_cam.q);
     checks.extend(signals::turning(found.as_ref()));
     Ok(checks)
@@ -215,21 +234,19 @@ fn sensed(rig: Rig, board: &Board, look_s: f64) -> Result<Vec<Check>, Fault> {
 /// More of a core than this to read the cameras is more than odometry takes itself.
 const CAPTURE_SHARE_MAX: f64 = 0.25;
 
-fn capture(capture: &Capture, seen: &Seen) -> Option<Check> {
-    let what = format!("capture: {}", capture.line(&seen.source)?);
+fn capture(capture: &Capture, seen: &Seen, flown: &Flown) -> Option<Check> {
+    let what = format!("capture: {}", capture.line(&flown.source)?);
     let look_s = (*seen.frames.last()? - *seen.frames.first()?).secs();
     if capture.cpu.total_s() > CAPTURE_SHARE_MAX * look_s {
-        return Some(Check::warn(
-            what,
-            "let the camera send grey, not mjpeg (camera.format), or fewer or smaller frames",
-        ));
+        let fix = "let the camera send grey, not mjpeg (camera.format), or fewer or smaller frames";
+        return Some(Check::warn(what, fix));
     }
     Some(Check::ok(what))
 }
 
 /// Images without a partner within the tolerance, as the source counts them.
-fn skew(seen: &Seen) -> Check {
-    let unpaired: u64 = seen.source.iter().filter(|(name, _)| name.ends_with("images_unpaired")).map(|(_, n)| n).sum();
+fn skew(seen: &Seen, flown: &Flown) -> Check {
+    let unpaired: u64 = flown.source.iter().filter(|(name, _)| name.ends_with("images_unpaired")).map(|(_, n)| n).sum();
     let what = format!("left and right: {unpaired} images without a partner in {} frames", seen.frames.len());
     match unpaired {
         0 => Check::ok(what),
@@ -238,10 +255,11 @@ fn skew(seen: &Seen) -> Check {
     }
 }
 
-/// Reads the sensors with the threads of a run and looks at what comes.
-fn look(rig: Rig, board: &Board, look_s: f64) -> Result<Seen, Fault> {
-    let (calibration, mut sensors) = (rig.calibration, rig.sensors);
-    let mut seen = Seen {
+/// Reads the sensors for a while.
+fn look(input: Input, board: &Board, look_s: f64) -> Result<(Seen, Flown), Fault> {
+    let calibration = input.calibration.clone();
+    let seen = Arc::new(Mutex::new(Seen {
+        disparities: board.stereo.disparities as usize,
         frames: vec![],
         samples: vec![],
         light: vec![Light::new(); calibration.cameras.len()],
@@ -251,54 +269,30 @@ fn look(rig: Rig, board: &Board, look_s: f64) -> Result<Seen, Fault> {
             straight: Alignment::default(),
             swapped: Alignment::default(),
         },
-        counters: Counters::default(),
-        source: rig.opened,
-        capture: None,
-        notices: vec![],
-        broken: None,
-    };
-    let (inbox, bell, counters) = (Inbox::new(SLOTS, &calibration, 0), Bell::default(), Counters::default());
-    let (over, gauges, begun) = (AtomicBool::new(false), Gauges::default(), Instant::now());
-    let stop = host::stop_asked_for();
-    std::thread::scope(|scope| {
-        scope.spawn(|| {
-            let _ended = Ends(&over, Some(&bell));
-            sensors::camera(&inbox, &mut sensors.frames, &bell, &counters, &gauges);
-        });
-        scope.spawn(|| sensors::inertial(&inbox, &mut sensors.imu, &bell, &over, &counters));
-        let mut held = None;
-        loop {
-            let ended = over.load(Relaxed);
-            let late = begun.elapsed().as_secs_f64() >= look_s;
-            inbox.stop.fetch_or(late || stop.load(Relaxed), Relaxed);
-            match inbox.take(&mut held, &over, &counters) {
-                Some(slot) => {
-                    seen.samples.extend(slot.imu.iter());
-                    if !slot.frameless {
-                        take(&mut seen, &calibration, &slot.frames, board.stereo.disparities as usize);
-                    }
-                    let _ = inbox.spare.push(slot);
-                }
-                None if ended => break,
-                None => std::thread::sleep(Duration::from_millis(1)),
-            }
-            while let Some(line) = inbox.notices.pop() {
-                seen.notices.push(line);
-            }
-        }
-    });
-    seen.source.extend(sensors.frames.counters());
-    seen.broken = inbox.broken.pop();
-    seen.capture = inbox.capture.get().copied();
-    seen.counters = counters;
-    Ok(seen)
+        calibration,
+    }));
+    let shared = seen.clone();
+    let observer = move |packet: &FramePacket| shared.lock().unwrap_or_else(PoisonError::into_inner).add(packet);
+    let (mut flown, _) = observe(input, board, Some(look_s), None, Box::new(observer), &mut Status::silent())?;
+    // The observer's own handle goes with its tracker.
+    flown.tracker = crate::run::tracking::Tracker::Table(vec![]);
+    let seen =
+        Arc::into_inner(seen).expect("the observer is gone").into_inner().unwrap_or_else(PoisonError::into_inner);
+    Ok((seen, flown))
 }
 
-fn take(seen: &mut Seen, calibration: &Calibration, frames: &Arc<Frames>, disparities: usize) {
-    if seen.frames.len() % PAIR_EVERY == 0 {
-        seen.pairs.add(calibration, frames, disparities);
-        seen.light.iter_mut().enumerate().for_each(|(camera, light)| light.add(frames, camera));
+impl Seen {
+    fn add(&mut self, packet: &FramePacket) {
+        self.samples.extend(packet.imu.iter());
+        if packet.imu_only {
+            return;
+        }
+        let frames = &packet.frames;
+        if self.frames.len() % PAIR_EVERY == 0 {
+            self.pairs.add(&self.calibration, frames, self.disparities);
+            self.light.iter_mut().enumerate().for_each(|(camera, light)| light.add(frames, camera));
+        }
+        self.frames.push(frames.t);
+        self.turning.add(frames);
     }
-    seen.frames.push(frames.t);
-    seen.turning.add(frames);
 }

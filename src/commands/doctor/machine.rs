@@ -1,10 +1,10 @@
 //! The computer: Vulkan, memory, disk.
 
-use super::super::memory::{self, mib};
 use super::Check;
 use crate::config::Board;
 use crate::gpu::kernels::ALL;
 use crate::gpu::{DeviceKind, Gpu};
+use crate::run::memory::{self, mib};
 use std::path::Path;
 use stipple_drivers::{host, Calibration};
 
@@ -60,7 +60,7 @@ pub fn vulkan(board: &Board) -> Vec<Check> {
 pub fn memory_ceiling(calibration: Option<&Calibration>, board: &Board) -> Check {
     let largest = memory::largest_rig(board);
     let rig = calibration.unwrap_or(&largest);
-    let table = match memory::admit("this rig", rig, board, true) {
+    let table = match memory::check_fits("this rig", rig, board, true) {
         Ok(table) => table,
         Err(fault) => return Check::fail(format!("memory: {}", fault.what), fault.fix),
     };

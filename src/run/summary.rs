@@ -1,8 +1,8 @@
-//! What a finished run says: the report, the files of DIR, seven lines.
+//! What a finished flight leaves: the report, the files of DIR, seven lines of text.
 
 use super::memory::mib;
-use super::play::Played;
-use super::tracking::Tracking;
+use super::tracking::Tracker;
+use super::Flown;
 use crate::map::{Evaluation, Mapper, Panel};
 use crate::mem;
 use crate::output::html::{write_html, Evidence};
@@ -16,40 +16,40 @@ use stipple_drivers::{Fault, Nanos, TimedPose};
 /// Keyframes drawn into DIR/renders.
 const PANELS: usize = 12;
 
-/// What was run, as the report names it.
+/// What was flown, as the report names it.
 pub struct Title {
     pub dataset: String,
     pub board: String,
-    pub pace: String,
+    pub pace: &'static str,
     pub scale: u32,
     pub truth: Vec<TimedPose>,
     /// Counters of opening the recording.
     pub opened: Vec<(&'static str, u64)>,
 }
 
-/// Measures a finished run, writes DIR, and answers the report.
-pub fn conclude(title: Title, mut played: Played, out: &OutputDir) -> Result<Report, Fault> {
+/// Measures a finished flight, writes DIR, and answers the report.
+pub fn conclude(title: Title, mut flown: Flown, out: &OutputDir) -> Result<Report, Fault> {
     let heap = mem::heap_after_seal();
     let mut report = Report {
         dataset: Some(title.dataset),
         board: Some(title.board),
-        pace: Some(title.pace),
+        pace: Some(title.pace.into()),
         scale: Some(title.scale),
-        keyframes: Some(played.keyframes),
-        wall_s: Some(played.wall_s),
+        keyframes: Some(flown.keyframes),
+        wall_s: Some(flown.wall_s),
         heap_after_seal: Some(heap),
-        warnings: played.warnings.len() as u64,
+        warnings: flown.warnings.len() as u64,
         ..Report::default()
     };
-    let estimated = track_figures(&mut report, &played);
-    let error = trajectory_error(&estimated, &title.truth).filter(|_| matches!(played.tracking, Tracking::Odometry(_)));
+    let estimated = track_figures(&mut report, &flown);
+    let error = trajectory_error(&estimated, &title.truth).filter(|_| flown.tracker.odometry().is_some());
     if let Some(e) = &error {
         report.ate_rmse_m = Some(e.ate_rmse_m);
         report.rte_1s_m = e.rte_1s_m;
         report.rpe_deg = e.rpe_deg;
     }
     let mut panels = vec![];
-    if let Some(m) = &mut played.mapping {
+    if let Some(m) = &mut flown.mapping {
         report.anchors = Some(m.anchors);
         report.iterations = Some(m.iterations);
         report.iteration_ms_p50 = percentile(&m.iteration_ms.iter().map(|v| f64::from(*v)).collect::<Vec<_>>(), 0.5);
@@ -73,27 +73,27 @@ pub fn conclude(title: Title, mut played: Played, out: &OutputDir) -> Result<Rep
         if let Some(why) = &m.failure {
             let warning = format!("the map is incomplete: {why}");
             eprintln!("stipple: warning: {warning}");
-            played.warnings.push(warning);
+            flown.warnings.push(warning);
         }
     }
-    if let Some(capture) = &played.capture {
+    if let Some(capture) = &flown.capture {
         (report.camera_cpu_ms, report.camera_kernel_ms) = capture.ms_a_frame().unzip();
-        report.camera_copies = capture.copies(&played.source);
+        report.camera_copies = capture.copies(&flown.source);
     }
     report.rss_peak_bytes = process::rss_peak_bytes();
-    report.set_counters(&counted(&played, &title.opened));
-    if let Tracking::Odometry(run) = &played.tracking {
+    report.set_counters(&counted(&flown, &title.opened));
+    if let Some(run) = flown.tracker.odometry() {
         report.set_health(run.back.tally().health());
     }
-    write_files(&report, &played, &estimated, &title.truth, error.as_ref(), &panels, out)?;
+    write_files(&report, &flown, &estimated, &title.truth, error.as_ref(), &panels, out)?;
     Ok(report)
 }
 
 /// Every counter of a run, each under one name.
-fn counted(played: &Played, opened: &[(&'static str, u64)]) -> Vec<(&'static str, u64)> {
-    let mut all = played.counters.list();
-    let mapper = played.mapping.as_ref().map(|m| m.mapper.counters().list()).unwrap_or_default();
-    for (name, n) in opened.iter().chain(&played.source).chain(&played.tracking.counters()).chain(&mapper) {
+fn counted(flown: &Flown, opened: &[(&'static str, u64)]) -> Vec<(&'static str, u64)> {
+    let mut all = flown.counters.list();
+    let mapper = flown.mapping.as_ref().map(|m| m.mapper.counters().list()).unwrap_or_default();
+    for (name, n) in opened.iter().chain(&flown.source).chain(&flown.tracker.counters()).chain(&mapper) {
         match all.iter_mut().find(|(known, _)| *known == *name) {
             Some((_, sum)) => *sum += n,
             None => all.push((name, *n)),
@@ -103,15 +103,16 @@ fn counted(played: &Played, opened: &[(&'static str, u64)]) -> Vec<(&'static str
 }
 
 /// Fills in the tracking figures; answers the trajectory.
-fn track_figures(report: &mut Report, played: &Played) -> Vec<TimedPose> {
-    let c = &played.counters;
+fn track_figures(report: &mut Report, flown: &Flown) -> Vec<TimedPose> {
+    let c = &flown.counters;
     let lost = [&c.frames_overwritten, &c.frames_unreadable, &c.frames_not_newer, &c.frames_leapt, &c.frames_frozen];
     let dropped = lost.iter().map(|counter| counter.get()).sum();
     report.frames_dropped = Some(dropped);
-    report.frames = Some((played.frames as u64).saturating_sub(dropped));
-    let run = match &played.tracking {
-        Tracking::Table(poses) => return poses.clone(),
-        Tracking::Odometry(run) => run,
+    report.frames = Some((flown.frames as u64).saturating_sub(dropped));
+    let run = match &flown.tracker {
+        Tracker::Table(poses) => return poses.clone(),
+        Tracker::Observer(_) => return vec![],
+        Tracker::Odometry(run) => run,
     };
     let ms: Vec<f64> = run.back.frame_ms.iter().map(|(_, ms)| *ms).collect();
     report.tracking_threads = Some(run.threads);
@@ -123,13 +124,13 @@ fn track_figures(report: &mut Report, played: &Played) -> Vec<TimedPose> {
     report.frontend_ms_p99 = percentile(&run.front.ms, 0.99);
     report.estimator_ms_p50 = percentile(&run.back.ms, 0.5);
     report.estimator_ms_p99 = percentile(&run.back.ms, 0.99);
-    played.tracking.rig().into_iter().for_each(|rig| rig_figures(report, &rig));
+    flown.tracker.rig().into_iter().for_each(|rig| rig_figures(report, &rig));
     report.estimator_bytes = Some(run.bytes);
     if let Some((least, median, under)) = run.back.tally().quality() {
         (report.quality_min, report.quality_p50) = (Some(least.into()), Some(median.into()));
         report.quality_under_50 = Some(under);
     }
-    report.vio_hash = played.tracking.hash().map(|h| format!("{h:016x}"));
+    report.vio_hash = flown.tracker.hash().map(|h| format!("{h:016x}"));
     run.back.trajectory.iter().map(|o| TimedPose { t: o.t, pose: o.world_from_body }).collect()
 }
 
@@ -192,7 +193,7 @@ fn measure(mapper: &mut Mapper) -> Result<Measured, String> {
 
 fn write_files(
     report: &Report,
-    played: &Played,
+    flown: &Flown,
     estimated: &[TimedPose],
     truth: &[TimedPose],
     error: Option<&TrajectoryError>,
@@ -206,12 +207,9 @@ fn write_files(
             pictures.iter().try_for_each(|(name, p)| atomically(&dir.join(format!("{name}.png")), |w| p.write_png(w)))
         })?;
     }
-    let tracking_ms: &[(Nanos, f64)] = match &played.tracking {
-        Tracking::Odometry(run) => &run.back.frame_ms,
-        Tracking::Table(_) => &[],
-    };
+    let tracking_ms: &[(Nanos, f64)] = flown.tracker.odometry().map_or(&[], |run| &run.back.frame_ms);
     let shown: Vec<(String, Picture)> = pictures.iter().map(|(n, p)| (n.clone(), p.shrunk(1600))).collect();
-    let evidence = Evidence { estimated, truth, error, tracking_ms, pictures: &shown, warnings: &played.warnings };
+    let evidence = Evidence { estimated, truth, error, tracking_ms, pictures: &shown, warnings: &flown.warnings };
     out.write("report.html", |w| write_html(w, report, &evidence))?;
     // Last: whoever finds report.json finds everything it speaks of.
     out.write("report.json", |w| report.write_json(w))
@@ -243,7 +241,7 @@ fn kernel_time(k: crate::gpu::Timing) -> KernelTime {
     KernelTime { name: k.name.to_string(), dispatches: k.count, total_ms: k.total_ms }
 }
 
-/// Six lines a person reads.
+/// Seven lines of figures for a person to read.
 pub fn seven_lines(r: &Report, out: &OutputDir) -> String {
     let or_dash = |v: Option<f64>, digits: usize, unit: &str| {
         v.map_or_else(|| "-".to_string(), |v| format!("{v:.digits$} {unit}"))

@@ -1,17 +1,21 @@
-//! The mapping side of a run: keyframes in, a map and its error against run time out.
+//! The mapping side of a flight: keyframes in, a map and its error against run time out.
 
-use super::progress::Gauges;
+use super::status::Gauges;
+use super::tracking::FramePacket;
 use crate::config::Board;
+use crate::counters::Counters;
 use crate::gpu::GpuError;
 use crate::map::{CurvePoint, Did, Keyframe, Mapper, PoseCorrection};
-use crate::mem::unsealed;
+use crate::mem::{seal_thread, unsealed};
 use crossbeam_queue::ArrayQueue;
 use std::sync::atomic::Ordering::Relaxed;
 use std::time::{Duration, Instant};
-use stipple_drivers::{host, Calibration, Fault, Frames, Image};
+use stipple_drivers::{host, Calibration, Fault, Frames, Image, Nanos, Pose};
 
 /// Time handed to the mapper at once; between slices it looks at its queues.
 pub const SLICE: Duration = Duration::from_millis(50);
+/// Pause of a mapper with nothing to do.
+const IDLE: Duration = Duration::from_micros(500);
 /// Iterations whose time is kept for the median.
 const ITERATION_TIMES: usize = 1 << 16;
 /// Samples of error against run time.
@@ -53,7 +57,7 @@ impl Mapping {
         })
     }
 
-    /// For the keyframes that the mapper wants.
+    /// A queue shaped for the keyframes that the mapper wants.
     pub fn queue(&self, calibration: &Calibration) -> KeyframeQueue {
         KeyframeQueue::new(calibration, self.mapper.images(), self.mapper.colours_offered())
     }
@@ -118,14 +122,14 @@ pub struct KeyframeQueue {
     pub corrections: ArrayQueue<PoseCorrection>,
 }
 
-/// Keyframes between tracking and the mapper's own queue: what comes while an anchor is being made.
+/// Keyframes between tracking and the mapper's own queue: as many as come while an anchor is being made.
 pub const KEYFRAME_SLOTS: usize = 8;
 
-/// Four windows of poses.
+/// Pose corrections that wait: those of four windows.
 const CORRECTION_SLOTS: usize = 64;
 
 impl KeyframeQueue {
-    /// For keyframes of so many images, the first `colours` of them in colour.
+    /// Shaped for keyframes of so many images, the first `colours` of them in colour.
     pub fn new(calibration: &Calibration, images: usize, colours: usize) -> KeyframeQueue {
         let q = KeyframeQueue {
             spare: ArrayQueue::new(KEYFRAME_SLOTS),
@@ -165,4 +169,120 @@ impl KeyframeQueue {
         let _ = self.spare.push(slot);
         Some(r)
     }
+}
+
+/// Keyframes the estimator may still move: the newest ones, by stamp.
+struct Recent {
+    entries: [(Nanos, u64); Recent::LEN],
+    next: usize,
+}
+
+impl Recent {
+    /// More than a window holds.
+    const LEN: usize = 32;
+
+    fn new() -> Recent {
+        Recent { entries: [(Nanos::MIN, 0); Recent::LEN], next: 0 }
+    }
+
+    fn add(&mut self, t: Nanos, id: u64) {
+        self.entries[self.next % Recent::LEN] = (t, id);
+        self.next += 1;
+    }
+
+    fn find(&self, t: Nanos) -> Option<u64> {
+        self.entries.iter().find(|e| e.0 == t).map(|e| e.1)
+    }
+}
+
+/// Numbers keyframes, chooses the held-out ones, and hands them to the mapper where there is one.
+pub struct Keyframes {
+    /// Every Nth keyframe is held out; 0: none.
+    holdout: u32,
+    /// Keyframes accepted by the mapper's queue; without a mapper, all.
+    pub count: u64,
+    recent: Recent,
+}
+
+impl Keyframes {
+    pub fn new(holdout: u32) -> Keyframes {
+        Keyframes { holdout, count: 0, recent: Recent::new() }
+    }
+
+    fn fill(&mut self, slot: &mut Keyframe, world_from_body: Pose) {
+        slot.id = self.count;
+        slot.world_from_body = world_from_body;
+        let n = u64::from(self.holdout);
+        slot.held_out = n > 0 && self.count % n == n - 1;
+        self.count += 1;
+    }
+
+    /// Hands a tracked frame on: a keyframe to the mapper, and the window's newer poses with it.
+    pub fn pass_on(&mut self, packet: &FramePacket, queue: Option<&KeyframeQueue>, counters: &Counters) {
+        let Some(tracked) = packet.tracked.as_ref().filter(|t| t.keyframe) else { return };
+        let Some(queue) = queue else {
+            self.count += 1;
+            return;
+        };
+        if packet.blank {
+            counters.keyframes_blank.add(1);
+            return;
+        }
+        let id = self.count;
+        if queue.offer(&packet.frames, |keyframe| self.fill(keyframe, tracked.world_from_body)) {
+            self.recent.add(packet.frames.t, id);
+        } else {
+            counters.keyframes_rejected.add(1);
+        }
+        for (t, world_from_body) in tracked.corrections.iter() {
+            if let Some(id) = self.recent.find(*t).filter(|found| *found != id) {
+                if queue.corrections.push(PoseCorrection { id, world_from_body: *world_from_body }).is_err() {
+                    counters.corrections_full.add(1);
+                }
+            }
+        }
+    }
+}
+
+/// Hands waiting keyframes and corrections to the mapper while it has room.
+pub fn drain(queue: &KeyframeQueue, mapping: &mut Mapping) {
+    let mapper = &mut mapping.mapper;
+    while mapper.has_room() && queue.take(|keyframe| mapper.offer(keyframe)).is_some() {}
+    while let Some(correction) = queue.corrections.pop() {
+        mapper.correct(&correction);
+    }
+}
+
+/// Thread `mapping`: keyframes first, then single steps, until tracking has ended and `over` answers true; `over` is
+/// given the seconds since `start`.
+pub fn map(
+    mut mapping: Mapping,
+    queue: &KeyframeQueue,
+    gauges: &Gauges,
+    start: Instant,
+    tracked: impl Fn() -> bool,
+    over: impl Fn(f64) -> bool,
+) -> Mapping {
+    host::lower_priority(host::Waits::Mapping);
+    seal_thread();
+    loop {
+        let tracked = tracked();
+        drain(queue, &mut mapping);
+        let worked = mapping.step(Instant::now() + SLICE, gauges);
+        let t_s = start.elapsed().as_secs_f64();
+        mapping.sample_if_due(t_s, gauges);
+        gauges.broke.fetch_or(mapping.failure.is_some(), Relaxed);
+        if tracked {
+            // Nothing is played any more; the run's own time is what progresses.
+            gauges.played_ms.fetch_max((t_s * 1e3) as u64, Relaxed);
+            if over(t_s) || mapping.failure.is_some() {
+                break;
+            }
+        }
+        if !worked {
+            std::thread::sleep(IDLE);
+        }
+    }
+    unsealed(|| mapping.sample(start.elapsed().as_secs_f64(), gauges));
+    mapping
 }

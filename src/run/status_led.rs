@@ -1,6 +1,6 @@
-//! The status light of a board: what the daemon is about, for who stands beside it without a screen.
+//! The status LED of a board: the state of a run for somebody who stands beside it without a screen.
 //!
-//! | state | light |
+//! | state | LED |
 //! |---|---|
 //! | boot: no frame has a pose yet | a short flash a second |
 //! | tracking | on |
@@ -31,7 +31,7 @@ const LOST_AFTER: Duration = Duration::from_millis(500);
 const FAULT_SHOWN: Duration = Duration::from_secs(2);
 
 impl State {
-    /// Whether the light is on `at` after some second began.
+    /// Whether the LED is on at this time after some second began.
     fn is_on(self, at: Duration) -> bool {
         let ms = at.as_millis() % 1000;
         match self {
@@ -43,8 +43,8 @@ impl State {
     }
 }
 
-/// Thread `light`: blinks until it is dropped. Unless the run `ended_well` it shows a fault then.
-pub struct Light {
+/// Thread `led`: blinks until it is dropped; then shows a fault unless the run `ended_well`.
+pub struct StatusLed {
     state: Arc<AtomicU8>,
     stop: Arc<AtomicBool>,
     thread: Option<JoinHandle<()>>,
@@ -53,16 +53,16 @@ pub struct Light {
     posed: (u64, Instant),
 }
 
-impl Light {
-    /// On the line of a board, and whether low is active; without a line there is no light.
-    pub fn open(led: Option<(LineName, bool)>) -> Result<Option<Light>, Fault> {
+impl StatusLed {
+    /// On the line of a board, and whether low is active; without a line there is no LED.
+    pub fn open(led: Option<(LineName, bool)>) -> Result<Option<StatusLed>, Fault> {
         let Some((name, active_low)) = led else { return Ok(None) };
         let mut line = Output::open(&name, active_low)?;
-        // A light that fails is not worth a run.
-        Ok(Some(Light::start(move |on| drop(line.set(on)))))
+        // An LED that fails is not worth a run.
+        Ok(Some(StatusLed::start(move |on| drop(line.set(on)))))
     }
 
-    fn start(mut set: impl FnMut(bool) + Send + 'static) -> Light {
+    fn start(mut set: impl FnMut(bool) + Send + 'static) -> StatusLed {
         let (state, stop) = (Arc::new(AtomicU8::new(State::Boot as u8)), Arc::new(AtomicBool::new(false)));
         let (shown, asked, begun) = (state.clone(), stop.clone(), Instant::now());
         let thread = std::thread::spawn(move || {
@@ -77,7 +77,7 @@ impl Light {
             }
             set(false);
         });
-        Light { state, stop, thread: Some(thread), well: false, posed: (0, begun) }
+        StatusLed { state, stop, thread: Some(thread), well: false, posed: (0, begun) }
     }
 
     /// Frames that have a pose so far, and whether something broke.
@@ -99,7 +99,7 @@ impl Light {
     }
 }
 
-impl Drop for Light {
+impl Drop for StatusLed {
     fn drop(&mut self) {
         if !self.well {
             self.state.store(State::Fault as u8, Relaxed);
@@ -130,30 +130,30 @@ mod tests {
 
     #[test]
     fn the_state_follows_the_poses() {
-        let mut light = Light::start(|_| {});
+        let mut led = StatusLed::start(|_| {});
         let start = Instant::now();
         let mut after = |posed, broke, ms| {
-            light.show(posed, broke, start + Duration::from_millis(ms));
-            STATES[usize::from(light.state.load(Relaxed))]
+            led.show(posed, broke, start + Duration::from_millis(ms));
+            STATES[usize::from(led.state.load(Relaxed))]
         };
         assert_eq!(after(0, false, 5000), State::Boot);
         assert_eq!((after(1, false, 9000), after(1, false, 9400)), (State::Tracking, State::Tracking));
         assert_eq!((after(1, false, 9600), after(2, false, 9700)), (State::Lost, State::Tracking));
         assert_eq!(after(3, true, 9750), State::Fault);
-        light.ended_well();
+        led.ended_well();
     }
 
-    /// What a line was set to while a light was shown `posed` frames and dropped.
+    /// What a line was set to while an LED was shown `posed` frames and dropped.
     fn levels(posed: u64, well: bool) -> Vec<bool> {
         let set = Arc::new(Mutex::new(vec![]));
         let line = set.clone();
-        let mut light = Light::start(move |on| line.lock().unwrap().push(on));
-        light.show(posed, false, Instant::now());
+        let mut led = StatusLed::start(move |on| line.lock().unwrap().push(on));
+        led.show(posed, false, Instant::now());
         std::thread::sleep(Duration::from_millis(300));
         if well {
-            light.ended_well();
+            led.ended_well();
         }
-        drop(light);
+        drop(led);
         let levels = set.lock().unwrap().clone();
         levels
     }

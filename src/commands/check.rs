@@ -1,0 +1,20 @@
+//! `stipple check`: the memory table of a board.
+
+use super::BoardArgs;
+use crate::run::memory;
+use stipple_drivers::Fault;
+
+#[derive(clap::Args)]
+pub struct Args {
+    #[command(flatten)]
+    board: BoardArgs,
+}
+
+pub fn check(args: &Args) -> Result<(), Fault> {
+    let board = args.board.load()?;
+    let rig = memory::largest_rig(&board);
+    memory::print(&memory::footprint(&rig, &board, true));
+    memory::check_fits(&args.board.path().display().to_string(), &rig, &board, true)?;
+    println!("{:>12}       fits memory_max_mib = {}", "", board.memory_max_mib);
+    Ok(())
+}

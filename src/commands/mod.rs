@@ -1,0 +1,145 @@
+//! The commands of `stipple`, one file each: their arguments, and what they print.
+
+mod calib_check;
+mod check;
+mod demo;
+mod doctor;
+mod record;
+mod replay;
+mod run;
+mod sim;
+
+use crate::config::Board;
+use crate::output::OutputDir;
+use crate::run::sensors::Input;
+use crate::run::status::print_out;
+use crate::run::summary::seven_lines;
+use crate::run::Outcome;
+use clap::{Args, Parser, Subcommand};
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use stipple_drivers::{Exit, Fault};
+
+/// Stereo-inertial odometry and a live 3D Gaussian map, in fixed memory
+#[derive(Parser)]
+#[command(version)]
+struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    /// Fly with the board's sensors until stopped (SIGINT, SIGTERM): trajectory, map, renders and report go to DIR
+    Run(run::Args),
+    /// Play a recording: trajectory, map, renders and report go to DIR
+    Replay(replay::Args),
+    /// Record the board's sensors until stopped (SIGINT, SIGTERM)
+    Record(record::Args),
+    /// Fly through a simulated room and map it; needs no data
+    Demo(demo::Args),
+    /// Write a simulated flight as an EuRoC folder with ground truth
+    Sim(sim::Args),
+    /// Print the memory table of a board; refuse a board that does not fit
+    Check(check::Args),
+    /// Judge the calibration of a recording: rectified rows, clock offset, gyro axes and bias, camera attitude
+    CalibCheck(calib_check::Args),
+    /// Judge each part of a board and its live sensors, and say what to do
+    Doctor(doctor::Args),
+}
+
+/// Runs the command of the command line.
+pub fn main() -> ExitCode {
+    let cli = match Cli::try_parse() {
+        Ok(cli) => cli,
+        Err(e) => {
+            // Printing may fail on a closed pipe; the exit code still says what happened.
+            let _ = e.print();
+            return if e.use_stderr() { ExitCode::from(Exit::Usage as u8) } else { ExitCode::SUCCESS };
+        }
+    };
+    // What these print is all that they do: a reader that stops, as `head` does, has read enough.
+    if matches!(cli.command, Command::Check(_) | Command::CalibCheck(_) | Command::Doctor(_)) {
+        stipple_drivers::host::end_when_unread();
+    }
+    let done = match cli.command {
+        Command::Run(args) => run::run(&args),
+        Command::Replay(args) => replay::replay(&args),
+        Command::Record(args) => record::record(&args),
+        Command::Demo(args) => demo::demo(&args),
+        Command::Sim(args) => sim::sim(&args),
+        Command::Check(args) => check::check(&args),
+        Command::CalibCheck(args) => calib_check::calib_check(&args),
+        Command::Doctor(args) => doctor::doctor(&args),
+    };
+    match done {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(fault) => {
+            crate::run::status::print_err(format_args!("stipple: {fault}"));
+            ExitCode::from(fault.exit as u8)
+        }
+    }
+}
+
+/// The board that every command reads alike.
+#[derive(Args, Clone, Debug, Default)]
+pub struct BoardArgs {
+    /// Board file, see board-configs/; without it the built-in one for Vulkan on the CPU
+    #[arg(long, value_name = "FILE")]
+    pub board: Option<PathBuf>,
+    /// Set a key of the board file to another value
+    #[arg(long = "set", value_name = "SECTION.KEY=VALUE")]
+    pub set: Vec<String>,
+}
+
+/// The board without a board file.
+const BUILT_IN: &str = include_str!("../../board-configs/lavapipe.toml");
+
+impl BoardArgs {
+    pub fn load(&self) -> Result<Board, Fault> {
+        self.load_with(&[])
+    }
+
+    /// With keys that `--set` may override again.
+    pub fn load_with(&self, set: &[String]) -> Result<Board, Fault> {
+        let set = [set, &self.set].concat();
+        match &self.board {
+            Some(path) => Board::load(path, &set),
+            None => Board::parse("the built-in board", BUILT_IN, &set),
+        }
+    }
+
+    /// The file, for errors and for what lies beside it.
+    fn path(&self) -> &Path {
+        self.board.as_deref().unwrap_or(Path::new("the built-in board"))
+    }
+}
+
+/// The board's sensors, or a recording in their place.
+fn open_input(dataset: Option<&Path>, args: &BoardArgs, board: &Board) -> Result<Input, Fault> {
+    match dataset {
+        Some(dataset) => Input::recording(dataset, board),
+        None => Input::live(args.path(), board),
+    }
+}
+
+/// Prints what a flight came to.
+fn finish(outcome: Outcome, out: &OutputDir) -> Result<(), Fault> {
+    print_out(seven_lines(&outcome.report, out));
+    outcome.capture.into_iter().for_each(|line| print_out(format_args!("cameras     {line}")));
+    outcome.fault.map_or(Ok(()), Err)
+}
+
+/// Parses a positive number of seconds.
+fn seconds(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(s) if s.is_finite() && s > 0.0 => Ok(s),
+        _ => Err("a positive number of seconds".into()),
+    }
+}
+
+fn rendering_progress(done: usize, of: usize) {
+    if done % 50 == 0 || done == of {
+        crate::run::status::print_err(format_args!("rendering the flight: {done} of {of} frames"));
+    }
+}

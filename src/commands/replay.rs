@@ -1,0 +1,66 @@
+//! `stipple replay`: a recording through tracking and mapping.
+
+use super::{finish, seconds, BoardArgs};
+use crate::output::OutputDir;
+use crate::run::sensors::Input;
+use crate::run::{fly, Options, Pace, Steps};
+use std::path::PathBuf;
+use stipple_drivers::Fault;
+
+#[derive(clap::Args)]
+pub struct Args {
+    /// EuRoC ASL folder (holding mav0) of one to four cameras, or TUM-VI with a Kalibr camchain.yaml
+    dataset: PathBuf,
+    #[command(flatten)]
+    board: BoardArgs,
+    /// Folder for trajectory, map, renders and report
+    #[arg(long, value_name = "DIR", default_value = "out/replay")]
+    out: PathBuf,
+    #[arg(long, value_enum, default_value = "recorded")]
+    pace: PaceName,
+    /// Mapping steps a frame in lockstep
+    #[arg(long, value_name = "N", default_value = "2", value_parser = clap::value_parser!(u32).range(..=1000))]
+    steps: u32,
+    /// Mapping steps a second of the recording in lockstep, instead: plays a device that slow
+    #[arg(long, value_name = "N", value_parser = seconds, conflicts_with = "steps")]
+    steps_per_s: Option<f64>,
+    /// Skip odometry: poses from this table (EuRoC or TUM csv); every frame it covers is a keyframe
+    #[arg(long, value_name = "CSV")]
+    poses: Option<PathBuf>,
+    /// Never train on every Nth keyframe, only evaluate it
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(2..))]
+    holdout: Option<u32>,
+    /// End after this time of the recording; past its end the mapper goes on alone
+    #[arg(long, value_name = "S", value_parser = seconds)]
+    duration: Option<f64>,
+    /// Mapping resolution divisor: 1, 2 or 4 (short for --set map.scale=N)
+    #[arg(long, value_name = "N", value_parser = ["1", "2", "4"])]
+    scale: Option<String>,
+}
+
+#[derive(Clone, Copy, Debug, clap::ValueEnum)]
+enum PaceName {
+    /// Frames arrive at their recorded time; what is not done in time is not done
+    Recorded,
+    /// Deterministic: a stated number of mapping steps a frame
+    Lockstep,
+}
+
+pub fn replay(args: &Args) -> Result<(), Fault> {
+    let scale: Vec<String> = args.scale.iter().map(|s| format!("map.scale={s}")).collect();
+    let board = args.board.load_with(&scale)?;
+    let input = Input::recording(&args.dataset, &board)?;
+    let out = OutputDir::create(&args.out)?;
+    let steps = args.steps_per_s.map_or(Steps::PerFrame(args.steps), Steps::PerSecond);
+    let options = Options {
+        pace: match args.pace {
+            PaceName::Recorded => Pace::Recorded,
+            PaceName::Lockstep => Pace::Lockstep(steps),
+        },
+        poses: args.poses.clone(),
+        holdout: args.holdout.unwrap_or(0),
+        duration_s: args.duration,
+        record: None,
+    };
+    finish(fly(input, &board, &out, &options, None)?, &out)
+}

@@ -1,0 +1,35 @@
+//! `stipple run`: the board's sensors through tracking and mapping, until it is stopped.
+
+use super::{finish, open_input, seconds, BoardArgs};
+use crate::output::OutputDir;
+use crate::run::status_led::StatusLed;
+use crate::run::{fly, Options};
+use std::path::PathBuf;
+use stipple_drivers::Fault;
+
+#[derive(clap::Args)]
+pub struct Args {
+    #[command(flatten)]
+    board: BoardArgs,
+    /// Folder for trajectory, map, renders and report
+    #[arg(long, value_name = "DIR", default_value = "out/run")]
+    out: PathBuf,
+    /// Stop after this time
+    #[arg(long, value_name = "S", value_parser = seconds)]
+    duration: Option<f64>,
+    /// Play this recording in place of the sensors, at its pace
+    #[arg(long, value_name = "DIR")]
+    dataset: Option<PathBuf>,
+    /// Record the samples to this folder too, as EuRoC
+    #[arg(long, value_name = "DIR")]
+    record: Option<PathBuf>,
+}
+
+pub fn run(args: &Args) -> Result<(), Fault> {
+    let board = args.board.load()?;
+    let led = StatusLed::open(board.gpio.led())?;
+    let input = open_input(args.dataset.as_deref(), &args.board, &board)?;
+    let out = OutputDir::create(&args.out)?;
+    let options = Options { duration_s: args.duration, record: args.record.clone(), ..Options::default() };
+    finish(fly(input, &board, &out, &options, led)?, &out)
+}

@@ -1,0 +1,232 @@
+//! The deterministic pace: every frame is tracked, and mapping gets a stated number of steps. For comparisons at equal
+//! time mapping gets an equal part of a stated time a frame instead; then only tracking is deterministic.
+//!
+//! Frames are decoded a batch at a time into memory and tracked when the batch is there, so decoding is in no figure and
+//! takes no core from tracking; reading a recording into memory whole would do the same, but a flight of minutes does not
+//! fit. This thread decodes, then runs the mapper on the frames that tracking gives back, in their order, while tracking
+//! goes on.
+
+use super::mapping::{drain, Keyframes, Mapping, SLICE};
+use super::sensors::Recorded;
+use super::status::{Gauges, Status};
+use super::tracking::{FramePacket, Inlet, Link, Tracker};
+use super::waker::{SetOnDrop, Waker};
+use super::{spawn_tracking, Flown, Options, Steps};
+use crate::counters::Counters;
+use crossbeam_queue::ArrayQueue;
+use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
+use std::time::{Duration, Instant};
+use stipple_drivers::{host, Calibration, ImuSample, Span};
+
+/// Frames decoded at once: 24 MiB of two 752x480 cameras. What the threads of tracking lose at its ends is one stage of one
+/// frame in so many.
+const BATCH: usize = 32;
+/// And the one before the batch, from which points are followed.
+const PACKETS: usize = BATCH + 1;
+
+/// Spends the mapping steps of a flight, or its seconds.
+struct Budget {
+    steps: Steps,
+    /// Frames of the flight.
+    total: usize,
+    spent: u64,
+    start: Instant,
+}
+
+impl Budget {
+    /// Steps due after so many frames that span so much time.
+    fn due(&self, frames: u64, since_first: Span) -> u64 {
+        match self.steps {
+            Steps::PerFrame(n) => frames * u64::from(n),
+            Steps::PerSecond(rate) => (rate * since_first.secs().max(0.0)) as u64,
+            Steps::EqualTime(_) => 0,
+        }
+    }
+
+    /// Whether steps are due before a frame is seen: a device so slow has done them before it came.
+    fn ahead(&self) -> bool {
+        matches!(self.steps, Steps::PerSecond(_))
+    }
+
+    /// The run time that a curve shows: of the device that is played, or of this one.
+    fn run_s(&self, played_s: f64) -> f64 {
+        if self.ahead() {
+            played_s
+        } else {
+            self.start.elapsed().as_secs_f64()
+        }
+    }
+
+    /// Spends what is due after `frames` frames, the last `since_first` after the first.
+    fn spend(&mut self, m: &mut Mapping, frames: u64, since_first: Span, gauges: &Gauges) {
+        if let Steps::EqualTime(seconds) = self.steps {
+            map_until(m, seconds * frames as f64 / self.total as f64, gauges);
+            return;
+        }
+        let due = self.due(frames, since_first);
+        for _ in 0..due.saturating_sub(self.spent) {
+            m.step(Instant::now(), gauges);
+        }
+        self.spent = due;
+        m.sample_if_due(self.run_s(since_first.secs()), gauges);
+    }
+
+    /// Spends what is due past the end of a recording of `length_s`, until `duration_s`, at its frame rate.
+    fn spend_rest(
+        &self,
+        m: &mut Mapping,
+        length_s: f64,
+        duration_s: Option<f64>,
+        gauges: &Gauges,
+        status: &mut Status,
+    ) {
+        let end_s = match (self.steps, duration_s) {
+            (Steps::EqualTime(seconds), _) => {
+                map_until(m, seconds, gauges);
+                seconds
+            }
+            (_, Some(s)) if s > length_s && self.total > 1 && length_s > 0.0 => {
+                let frames = (s - length_s) * (self.total - 1) as f64 / length_s;
+                let (mut played_s, steps) = (length_s, self.due(frames as u64, Span::from_secs(s - length_s)));
+                for _ in 0..steps {
+                    played_s += (s - length_s) / steps as f64;
+                    m.step(Instant::now(), gauges);
+                    m.sample_if_due(self.run_s(played_s), gauges);
+                    status.show(gauges);
+                }
+                self.run_s(played_s)
+            }
+            _ => self.run_s(length_s),
+        };
+        m.sample(end_s, gauges);
+    }
+}
+
+pub fn fly(
+    recorded: Recorded,
+    calibration: &Calibration,
+    mut tracker: Tracker,
+    mut mapping: Option<Mapping>,
+    options: &Options,
+    steps: Steps,
+    status: &mut Status,
+) -> Flown {
+    let (counters, gauges) = (Counters::default(), Gauges::default());
+    let queue = mapping.as_ref().map(|m| m.queue(calibration));
+    let colours = mapping.as_ref().map_or(0, |m| m.mapper.colours_offered());
+    let mut keyframes = Keyframes::new(options.holdout);
+    let (total, length_s) = (recorded.stamps.len(), recorded.length_s());
+    let mut packets: Vec<Box<FramePacket>> =
+        (0..PACKETS.min(total + 1)).map(|_| FramePacket::for_rig(calibration, colours)).collect();
+    let (waiting, done) = (ArrayQueue::new(PACKETS), ArrayQueue::new(PACKETS));
+    let (over, ended) = (AtomicBool::new(false), AtomicBool::new(false));
+    let (waker, link, stop) = (Waker::default(), Link::default(), host::stop_asked_for());
+    let mut budget = Budget { steps, total, spent: 0, start: Instant::now() };
+    let mut reading = Reading { recorded, next: 0, samples: 0 };
+    std::thread::scope(|scope| {
+        let (taken, given, woken) = (&waiting, &done, &waker);
+        let give = move |packet| {
+            // As many places as packets.
+            let _ = given.push(packet);
+            woken.wake();
+        };
+        let inlet = Inlet { take: || taken.pop(), over: &over };
+        spawn_tracking(scope, &link, &mut tracker, inlet, &counters, give, SetOnDrop(&ended, Some(woken)));
+        let _over = SetOnDrop(&over, Some(&link.taker));
+        while reading.next < total && !stop.load(Relaxed) {
+            let mut sent = reading.batch(&mut packets, &waiting, &counters);
+            link.taker.wake();
+            while sent > 0 {
+                let Some(packet) = waker.wait(&ended, || done.pop()) else { return };
+                sent -= 1;
+                keyframes.pass_on(&packet, queue.as_ref(), &counters);
+                let frames = gauges.frames.fetch_add(1, Relaxed) + 1;
+                gauges.keyframes.store(keyframes.count, Relaxed);
+                let since_first = packet.frames.t - reading.recorded.stamps[0];
+                gauges.played_ms.store((since_first.secs() * 1e3) as u64, Relaxed);
+                packets.push(packet);
+                if let (Some(m), Some(queue)) = (&mut mapping, &queue) {
+                    if !budget.ahead() {
+                        drain(queue, m);
+                    }
+                    budget.spend(m, frames, since_first, &gauges);
+                    if budget.ahead() {
+                        drain(queue, m);
+                    }
+                }
+                status.show(&gauges);
+            }
+        }
+    });
+    if let Some(m) = &mut mapping {
+        budget.spend_rest(m, length_s, options.duration_s, &gauges, status);
+    }
+    Flown {
+        tracker,
+        mapping,
+        counters,
+        frames: reading.next,
+        keyframes: keyframes.count,
+        wall_s: budget.start.elapsed().as_secs_f64(),
+        warnings: reading.recorded.images.warnings().to_vec(),
+        source: reading.recorded.images.counters(),
+        capture: None,
+        broken: None,
+        notices: vec![],
+    }
+}
+
+/// Maps until `busy_s` seconds of it are done; what a map with nothing to do leaves stays for later frames.
+fn map_until(m: &mut Mapping, busy_s: f64, gauges: &Gauges) {
+    while m.busy_s < busy_s {
+        let left = Duration::from_secs_f64(busy_s - m.busy_s).min(SLICE);
+        if !m.step(Instant::now() + left, gauges) {
+            break;
+        }
+        m.sample_if_due(m.busy_s, gauges);
+    }
+}
+
+/// A recording, and how far it has been read.
+struct Reading {
+    recorded: Recorded,
+    next: usize,
+    samples: usize,
+}
+
+impl Reading {
+    /// Decodes frames into every packet but the last, or until the recording ends, hands them over together, and answers
+    /// how many. Packets come back in order: the last is the one the front end still reads. A frame that cannot be read
+    /// leaves its samples to the next.
+    fn batch(
+        &mut self,
+        packets: &mut Vec<Box<FramePacket>>,
+        waiting: &ArrayQueue<Box<FramePacket>>,
+        counters: &Counters,
+    ) -> usize {
+        let Recorded { images, stamps, imu } = &mut self.recorded;
+        let mut sent = 0;
+        let writable = packets.len() - 1;
+        for packet in &mut packets[..writable] {
+            packet.imu.clear();
+            let mut read = false;
+            while self.next < stamps.len() && !read {
+                let i = self.next;
+                self.next += 1;
+                // One sample past the frame, to interpolate at its stamp.
+                let samples: &[ImuSample] = &imu[self.samples..];
+                let upto = samples.iter().position(|s| s.t >= stamps[i]).map_or(samples.len(), |at| at + 1);
+                samples[..upto].iter().for_each(|s| packet.push_imu(*s, counters));
+                self.samples += upto;
+                let frames = packet.writable().expect("it is not the last that came back");
+                read = images.read(i, frames).is_ok();
+                counters.frames_unreadable.add(u64::from(!read));
+            }
+            sent += usize::from(read);
+        }
+        for packet in packets.drain(..sent) {
+            let _ = waiting.push(packet);
+        }
+        sent
+    }
+}

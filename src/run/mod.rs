@@ -1,0 +1,409 @@
+//! One flight, live or replayed: the only place that starts its threads.
+//!
+//! ```text
+//! camera -> gate -> mailbox(newest) -> frontend -> estimator -> keyframes -> mapping -> report, map.ply
+//! imu ----> gate -> queue -----------------^
+//! ```
+//!
+//! | thread | work | heap |
+//! |---|---|---|
+//! | main | opens everything, shows status, reports | free |
+//! | camera | waits for frames, or decodes files and delivers them when they are due | free |
+//! | imu | waits for inertial samples | free |
+//! | tracking | front end and back end in turns; offers keyframes | sealed |
+//! | or frontend | follows points (`frontend.threads = 2`) | sealed |
+//! | and estimator | estimates, one frame behind at most; offers keyframes | sealed |
+//! | mapping | rectification, depth, training; low priority, as are the CPU device's own threads | sealed; OpenCV and the driver allocate behind it |
+//! | trigger (`sensors`) | starts the cameras' exposures, where a line is wired for it | free |
+//! | led (`status_led`) | shows the state of a run, where a line is wired for it | free |
+//! | writer (the recorder's) | writes what is recorded, if anything is; low priority | free |
+//!
+//! In lockstep the main thread is sensors and mapping too.
+//!
+//! Queues between them: frames (the newest wins, the rest are counted as dropped), inertial samples (never dropped),
+//! tracks (two frames: the front end waits for the back end), keyframes (an offer may fail, counted), pose corrections.
+//! Tracking waits for nobody, but for the samples up to a frame. Shutdown: the cameras end, tracking drains and ends,
+//! mapping ends with the run's time.
+
+pub mod gate;
+mod lockstep;
+pub mod mailbox;
+pub mod mapping;
+pub mod memory;
+pub mod recorder;
+pub mod sensors;
+pub mod status;
+pub mod status_led;
+pub mod summary;
+pub mod tracking;
+pub mod waker;
+
+use crate::config::Board;
+use crate::counters::Counters;
+use crate::output::report::Report;
+use crate::output::OutputDir;
+use mailbox::{Capture, Mailbox};
+use mapping::{KeyframeQueue, Keyframes, Mapping};
+use recorder::Recording;
+use sensors::{Input, Sensors, Source};
+use status::{print_err, Gauges, Status};
+use status_led::StatusLed;
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicBool, Ordering, Ordering::Relaxed};
+use std::thread::{Builder, Scope, ScopedJoinHandle};
+use std::time::{Duration, Instant};
+use stipple_drivers::paced::FRAMES_UNREADABLE;
+use stipple_drivers::replay::read_trajectory;
+use stipple_drivers::{host, Calibration, Exit, Fault, Frames};
+use tracking::{FramePacket, Inlet, Link, OdometryRun, Tracker};
+
+/// How frames arrive and mapping steps are spent.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Pace {
+    /// Frames arrive at their time; what is not done in time is not done.
+    Recorded,
+    /// Deterministic: every frame is tracked, and mapping takes a stated number of steps.
+    Lockstep(Steps),
+}
+
+/// Mapping steps of a flight in lockstep.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Steps {
+    PerFrame(u32),
+    /// Steps a second of the recording: plays a device that slow.
+    PerSecond(f64),
+    /// Seconds of mapping, spread evenly over the frames. Only tracking is deterministic then.
+    EqualTime(f64),
+}
+
+#[derive(Clone, Debug)]
+pub struct Options {
+    pub pace: Pace,
+    /// Table of poses in place of odometry.
+    pub poses: Option<PathBuf>,
+    /// Every Nth keyframe is evaluated and never trained on; 0: none.
+    pub holdout: u32,
+    /// Live sensors are stopped after this time. A recording ends there; past its end the mapper goes on alone.
+    pub duration_s: Option<f64>,
+    /// Folder that the samples are recorded to, too.
+    pub record: Option<PathBuf>,
+}
+
+impl Default for Options {
+    fn default() -> Options {
+        Options { pace: Pace::Recorded, poses: None, holdout: 0, duration_s: None, record: None }
+    }
+}
+
+/// What a flight left, beside its files.
+pub struct Outcome {
+    pub report: Report,
+    /// Cost of reading the cameras, in words.
+    pub capture: Option<String>,
+    /// What went wrong though the files were written: a sensor broke, or a recording lacks something.
+    pub fault: Option<Fault>,
+}
+
+/// A flight that has ended, before it is evaluated.
+pub struct Flown {
+    pub tracker: Tracker,
+    pub mapping: Option<Mapping>,
+    pub counters: Counters,
+    pub frames: usize,
+    pub keyframes: u64,
+    pub wall_s: f64,
+    pub warnings: Vec<String>,
+    /// Counters of the sources.
+    pub source: Vec<(&'static str, u64)>,
+    /// Cost of reading the cameras; none in lockstep.
+    pub capture: Option<Capture>,
+    /// The fault of the source that broke, if one did.
+    pub broken: Option<Fault>,
+    /// Lines about sensors lost and found again.
+    pub notices: Vec<String>,
+}
+
+/// Poses kept for the trajectory of a run without an end: half an hour at 30 Hz, 15 MiB. The run goes on past it.
+const POSES_KEPT: usize = 1 << 16;
+
+/// Flies `input` on `board` and writes what it leaves to `out`.
+pub fn fly(
+    mut input: Input,
+    board: &Board,
+    out: &OutputDir,
+    options: &Options,
+    led: Option<StatusLed>,
+) -> Result<Outcome, Fault> {
+    memory::check_fits(&input.place, &input.calibration, board, options.record.is_some())?;
+    let colours = memory::colours(&input.calibration, board).len();
+    input.needs_colour(colours)?;
+    let frames = match &mut input.source {
+        Source::Recorded(r) => {
+            r.cut(options.duration_s);
+            r.stamps.len()
+        }
+        // A rate that the camera made a little higher is no reason to lose the end.
+        Source::Live { rate_hz, .. } => {
+            POSES_KEPT.min(options.duration_s.map_or(f64::INFINITY, |s| 1.2 * s * *rate_hz + 100.0) as usize)
+        }
+    };
+    let tracker = match &options.poses {
+        Some(path) => Tracker::Table(read_trajectory(path)?),
+        None => Tracker::Odometry(Box::new(OdometryRun::new(&input.calibration, board, frames)?)),
+    };
+    let mapping = if board.map.enabled { Some(Mapping::open(&input.calibration, board)?) } else { None };
+    input.warnings.iter().for_each(|warning| print_err(format_args!("stipple: warning: {warning}")));
+    let title = summary::Title {
+        dataset: input.name,
+        board: board.name.clone(),
+        pace: match (&options.pace, &input.source) {
+            (Pace::Lockstep(_), _) => "lockstep",
+            (Pace::Recorded, Source::Recorded(_)) => "recorded",
+            (Pace::Recorded, Source::Live { .. }) => "live",
+        },
+        scale: board.map.scale,
+        truth: input.truth,
+        opened: input.opened,
+    };
+    let length_s = match &input.source {
+        Source::Live { .. } => None,
+        Source::Recorded(r) => Some(r.length_s()),
+    };
+    let mut status = Status::new(options.duration_s.or(length_s)).with_led(led);
+    let (calibration, live) = (&input.calibration, length_s.is_none());
+    let (mut flown, recording) = match (input.source, options.pace) {
+        (Source::Recorded(recorded), Pace::Lockstep(steps)) => {
+            (lockstep::fly(recorded, calibration, tracker, mapping, options, steps, &mut status), None)
+        }
+        (source, _) => {
+            let shape = || Frames::in_colour(calibration, colours);
+            let sensors = match source {
+                Source::Recorded(recorded) => recorded.paced(),
+                Source::Live { sensors, .. } => sensors,
+            };
+            let (sensors, recording) =
+                Recording::start(options.record.as_deref(), sensors, calibration, board, &shape())?;
+            let sensors = sensors.with_faults(&board.inject, shape);
+            let realtime = Realtime {
+                holdout: options.holdout,
+                until_s: options.duration_s,
+                sensors_s: options.duration_s.filter(|_| live),
+                stop: host::stop_asked_for(),
+            };
+            (fly_in_real_time(sensors, calibration, tracker, mapping, &realtime, &mut status), recording)
+        }
+    };
+    status.finish();
+    flown.warnings.iter().for_each(|warning| print_err(format_args!("stipple: warning: {warning}")));
+    if !live && flown.counters.frames_unreadable.get() == frames as u64 {
+        let first = flown.warnings.first().map_or("", String::as_str);
+        let what = format!("none of its {frames} frames can be read, the first: {first}");
+        return Err(Fault::new(Exit::Data, input.place, what, "check that the recording is complete"));
+    }
+    flown.warnings.splice(..0, input.warnings);
+    let capture = flown.capture.and_then(|c| c.line(&flown.source));
+    let broken = flown.broken.take();
+    let recorded = recording.map(|r| r.finish(&mut flown.source));
+    let report = summary::conclude(title, flown, out)?;
+    let fault = recorded.and_then(Result::err).or(broken);
+    if fault.is_none() {
+        status.ended_well();
+    }
+    Ok(Outcome { report, capture, fault })
+}
+
+/// Reads `input` at its own pace with the threads of a flight, shows every packet to `observer`, and makes nothing of it.
+pub fn observe(
+    input: Input,
+    board: &Board,
+    duration_s: Option<f64>,
+    record: Option<(&std::path::Path, stipple_drivers::record::Format)>,
+    observer: Box<dyn FnMut(&FramePacket) + Send>,
+    status: &mut Status,
+) -> Result<(Flown, Result<(), Fault>), Fault> {
+    let calibration = &input.calibration;
+    let live = matches!(input.source, Source::Live { .. });
+    let sensors = match input.source {
+        Source::Live { sensors, .. } => sensors,
+        Source::Recorded(mut recorded) => {
+            recorded.cut(duration_s);
+            recorded.paced()
+        }
+    };
+    let shape = Frames::for_rig(calibration);
+    let (sensors, recording) = match record {
+        Some((dir, format)) => Recording::of(dir, format, sensors, calibration, board, &shape)?,
+        None => (sensors, None),
+    };
+    let realtime =
+        Realtime { holdout: 0, until_s: None, sensors_s: duration_s.filter(|_| live), stop: host::stop_asked_for() };
+    let mut flown = fly_in_real_time(sensors, calibration, Tracker::Observer(observer), None, &realtime, status);
+    status.finish();
+    flown.source.splice(..0, input.opened);
+    let recorded = recording.map_or(Ok(()), |r| r.finish(&mut flown.source));
+    Ok((flown, recorded))
+}
+
+/// Packets that go round: one being read, one waiting, one in hand while they change places, one in tracking for each of
+/// its threads, and the last one, from which points are followed.
+pub fn packets(threads: u32) -> usize {
+    4 + threads as usize
+}
+
+/// What the threads of a flight in real time share.
+struct Shared {
+    start: Instant,
+    mailbox: Mailbox,
+    counters: Counters,
+    gauges: Gauges,
+    source_done: AtomicBool,
+    tracking_done: AtomicBool,
+}
+
+/// When a flight in real time ends; its cameras' end ends it, too.
+pub struct Realtime<'a> {
+    pub holdout: u32,
+    /// The mapper goes on until then.
+    pub until_s: Option<f64>,
+    /// The sensors are stopped then.
+    pub sensors_s: Option<f64>,
+    pub stop: &'a AtomicBool,
+}
+
+/// Period of the main thread's look at the others.
+const STATUS_PERIOD: Duration = Duration::from_millis(20);
+
+/// Runs sensors through tracking and mapping.
+pub fn fly_in_real_time(
+    mut sensors: Sensors,
+    calibration: &Calibration,
+    mut tracker: Tracker,
+    mapping: Option<Mapping>,
+    run: &Realtime,
+    status: &mut Status,
+) -> Flown {
+    let colours = mapping.as_ref().map_or(0, |m| m.mapper.colours_offered());
+    let shared = Shared {
+        start: Instant::now(),
+        mailbox: Mailbox::new(packets(tracker.threads()), calibration, colours),
+        counters: Counters::default(),
+        gauges: Gauges::default(),
+        source_done: AtomicBool::new(false),
+        tracking_done: AtomicBool::new(false),
+    };
+    let queue: Option<KeyframeQueue> = mapping.as_ref().map(|m| m.queue(calibration));
+    let (s, link, queue) = (&shared, &Link::default(), queue.as_ref());
+    let (mut keyframes, mut notices) = (Keyframes::new(run.holdout), vec![]);
+    let mapping = std::thread::scope(|scope| {
+        let (taker, keyframes) = (&link.taker, &mut keyframes);
+        let Sensors { frames, imu } = &mut sensors;
+        spawn(scope, "camera", move || {
+            let _ended = waker::SetOnDrop(&s.source_done, Some(taker));
+            mailbox::camera(&s.mailbox, frames, taker, &s.counters, &s.gauges);
+        });
+        spawn(scope, "imu", move || mailbox::inertial(&s.mailbox, imu, taker, &s.source_done, &s.counters));
+        let observes = matches!(tracker, Tracker::Observer(_));
+        let give = move |packet: Box<FramePacket>| {
+            if !packet.imu_only {
+                keyframes.pass_on(&packet, queue, &s.counters);
+                s.gauges.frames.fetch_add(1, Relaxed);
+                s.gauges.posed.fetch_add(u64::from(observes || packet.tracked.is_some()), Relaxed);
+                s.gauges.keyframes.store(keyframes.count, Relaxed);
+            }
+            let _ = s.mailbox.spare.push(packet);
+        };
+        let mut held = None;
+        let take = move || s.mailbox.take(&mut held, &s.source_done, &s.counters);
+        let ended = waker::SetOnDrop(&s.tracking_done, None);
+        spawn_tracking(scope, link, &mut tracker, Inlet { take, over: &s.source_done }, &s.counters, give, ended);
+        let mapping_thread = mapping.zip(queue).map(|(mapping, queue)| {
+            let tracked = || s.tracking_done.load(Ordering::Acquire);
+            let over = |t_s: f64| run.stop.load(Relaxed) || run.until_s.is_none_or(|until| t_s >= until);
+            spawn(scope, "mapping", move || mapping::map(mapping, queue, &s.gauges, s.start, tracked, over))
+        });
+        let mapping_done = || mapping_thread.as_ref().is_none_or(|t| t.is_finished());
+        while !(s.tracking_done.load(Relaxed) && mapping_done()) {
+            let over = run.sensors_s.is_some_and(|limit| s.start.elapsed().as_secs_f64() >= limit);
+            s.mailbox.stop.fetch_or(over || run.stop.load(Relaxed), Relaxed);
+            s.gauges.broke.fetch_or(!s.mailbox.broken.is_empty(), Relaxed);
+            while let Some(line) = s.mailbox.notices.pop() {
+                status.say(&line);
+                notices.push(line);
+            }
+            status.show(&s.gauges);
+            std::thread::sleep(STATUS_PERIOD);
+        }
+        mapping_thread.map(|t| t.join().expect("threads of a run answer with values, not panics"))
+    });
+    let warnings = sensors.frames.warnings().to_vec();
+    let mut source = [sensors.frames.counters(), sensors.imu.counters()].concat();
+    source
+        .iter()
+        .filter(|(name, _)| *name == FRAMES_UNREADABLE)
+        .for_each(|(_, n)| s.counters.frames_unreadable.add(*n));
+    source.retain(|(name, _)| *name != FRAMES_UNREADABLE);
+    // A recording ends when its taps are gone.
+    drop(sensors);
+    let arrived = s.mailbox.arrived.load(Relaxed) + s.counters.frames_unreadable.get();
+    Flown {
+        tracker,
+        mapping,
+        frames: arrived as usize,
+        keyframes: keyframes.count,
+        wall_s: shared.start.elapsed().as_secs_f64(),
+        warnings,
+        counters: shared.counters,
+        source,
+        capture: shared.mailbox.capture.get().copied(),
+        broken: shared.mailbox.broken.pop(),
+        notices,
+    }
+}
+
+/// Starts a named thread of a flight.
+fn spawn<'scope, T: Send + 'scope>(
+    scope: &'scope Scope<'scope, '_>,
+    name: &str,
+    work: impl FnOnce() -> T + Send + 'scope,
+) -> ScopedJoinHandle<'scope, T> {
+    Builder::new().name(name.into()).spawn_scoped(scope, work).expect("the system starts the few threads of a flight")
+}
+
+/// Starts the threads of tracking. `give` gets each packet back, in order, on the last of them, and `ended` is dropped at
+/// its end.
+fn spawn_tracking<'scope, 'env>(
+    scope: &'scope Scope<'scope, 'env>,
+    link: &'env Link,
+    tracker: &'env mut Tracker,
+    inlet: Inlet<'scope, impl FnMut() -> Option<Box<FramePacket>> + Send + 'scope>,
+    counters: &'env Counters,
+    give: impl FnMut(Box<FramePacket>) + Send + 'scope,
+    ended: impl Send + 'scope,
+) {
+    match tracker {
+        Tracker::Table(poses) => spawn(scope, "tracking", move || {
+            let _ended = ended;
+            tracking::by_table(link, inlet, poses, counters, give);
+        }),
+        Tracker::Observer(observer) => spawn(scope, "tracking", move || {
+            let _ended = ended;
+            tracking::observe(link, inlet, observer, give);
+        }),
+        Tracker::Odometry(run) => {
+            let OdometryRun { front, back, threads, .. } = run.as_mut();
+            if *threads == 1 {
+                spawn(scope, "tracking", move || {
+                    let _ended = ended;
+                    tracking::in_turns(link, inlet, front, back, give);
+                })
+            } else {
+                let start = back.predictor();
+                spawn(scope, "frontend", move || tracking::follow_points(link, inlet, front, start));
+                spawn(scope, "estimator", move || {
+                    let _ended = ended;
+                    tracking::estimate(link, back, give);
+                })
+            }
+        }
+    };
+}

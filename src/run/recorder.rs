@@ -1,0 +1,55 @@
+//! Recording beside a flight: taps on its sensors, and a writer behind a ring of fixed size.
+
+use super::sensors::Sensors;
+use crate::config::Board;
+use std::path::{Path, PathBuf};
+use stipple_drivers::record::{self, Format, Recorder};
+use stipple_drivers::{Calibration, Exit, Fault, Frames};
+
+/// A recording under way.
+pub struct Recording {
+    recorder: Recorder,
+    dir: PathBuf,
+}
+
+impl Recording {
+    /// Records what `sensors` give to `dir` as EuRoC, if there is a `dir`.
+    pub fn start(
+        dir: Option<&Path>,
+        sensors: Sensors,
+        calibration: &Calibration,
+        board: &Board,
+        shape: &Frames,
+    ) -> Result<(Sensors, Option<Recording>), Fault> {
+        match dir {
+            Some(dir) => Recording::of(dir, Format::Euroc, sensors, calibration, board, shape),
+            None => Ok((sensors, None)),
+        }
+    }
+
+    /// Records what `sensors` give, in frames of this shape, to `dir`, which must not hold anything.
+    pub fn of(
+        dir: &Path,
+        format: Format,
+        sensors: Sensors,
+        calibration: &Calibration,
+        board: &Board,
+        shape: &Frames,
+    ) -> Result<(Sensors, Option<Recording>), Fault> {
+        let sink = record::open(dir, format, calibration)?;
+        let (recorder, taps) = record::start(sink, shape, board.record.ring_frames as usize);
+        let (frames, imu) = taps.on(sensors.frames, sensors.imu);
+        let sensors = Sensors { frames: Box::new(frames), imu: Box::new(imu) };
+        Ok((sensors, Some(Recording { recorder, dir: dir.into() })))
+    }
+
+    /// Waits until everything is written and adds its counters; the sensors must be gone. An incomplete recording is an
+    /// error.
+    pub fn finish(self, counters: &mut Vec<(&'static str, u64)>) -> Result<(), Fault> {
+        let recorded = self.recorder.finish();
+        counters.extend(&recorded.counters);
+        let Some(why) = &recorded.failure else { return Ok(()) };
+        let what = format!("the recording lacks what could not be written: {why}");
+        Err(Fault::new(Exit::Io, self.dir.display().to_string(), what, "check the free space of the disk"))
+    }
+}

@@ -1,0 +1,327 @@
+//! What a flight reads: the sensors that a board file names, a recording, or a flight rendered by the simulator. All three
+//! become one `Input`, so that everything behind it is wired once.
+
+use super::status::print_err;
+use crate::config::{Board, InjectConfig};
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
+use std::sync::Arc;
+use std::thread::JoinHandle;
+use stipple_drivers::gpio::{DataReady, Output, Trigger};
+use stipple_drivers::inject::{FaultyFrames, FaultyImu};
+use stipple_drivers::paced::{Images, Pace, PacedFrames, PacedImu};
+use stipple_drivers::replay::{read_calibration, OpenOptions, Recording};
+use stipple_drivers::sim::{Scenario, Sim};
+use stipple_drivers::source::{FrameSource, ImuBatch, ImuSource, SourceFault, Wait};
+use stipple_drivers::{v4l2, Calibration, Exit, Fault, Frames, ImuCorrection, ImuSample, Nanos, Span, TimedPose};
+
+/// What a flight reads, opened.
+pub struct Input {
+    pub name: String,
+    /// The file or folder it comes from, for errors.
+    pub place: String,
+    pub calibration: Calibration,
+    /// world_from_body; empty where there is none.
+    pub truth: Vec<TimedPose>,
+    pub warnings: Vec<String>,
+    /// Counters of opening it.
+    pub opened: Vec<(&'static str, u64)>,
+    pub source: Source,
+}
+
+pub enum Source {
+    /// The board's own sensors, and the frame rate they were asked for, Hz.
+    Live {
+        sensors: Sensors,
+        rate_hz: f64,
+    },
+    Recorded(Recorded),
+}
+
+/// A recording, or a flight rendered into memory.
+pub struct Recorded {
+    pub images: Images,
+    /// One of each frame.
+    pub stamps: Vec<Nanos>,
+    pub imu: Vec<ImuSample>,
+}
+
+/// A rig of cameras and an inertial unit.
+pub struct Sensors {
+    pub frames: Box<dyn FrameSource>,
+    pub imu: Box<dyn ImuSource>,
+}
+
+/// Opens a recording with what the board says of its rig.
+pub fn open_recording(dataset: &Path, board: &Board) -> Result<Recording, Fault> {
+    let (config, rig) = (&board.replay, &board.rig);
+    let options = OpenOptions {
+        pair_tolerance: Span::from_secs(config.pair_tolerance_s),
+        imu_hole: Span::from_secs(config.imu_hole_s),
+        calibration: (!config.calibration.is_empty()).then(|| PathBuf::from(&config.calibration)),
+        readout: (rig.readout_s > 0.0).then(|| Span::from_secs(rig.readout_s)),
+    };
+    Recording::open(dataset, &options)
+}
+
+impl Input {
+    pub fn recording(dataset: &Path, board: &Board) -> Result<Input, Fault> {
+        let r = open_recording(dataset, board)?;
+        let images = Images::Recording(r.reader());
+        let place = dataset.display().to_string();
+        Ok(Input {
+            name: dataset.file_name().map_or_else(|| place.clone(), |n| n.to_string_lossy().into_owned()),
+            place,
+            calibration: r.calibration,
+            truth: r.truth,
+            warnings: r.warnings,
+            opened: r.counters.list(),
+            source: Source::Recorded(Recorded { images, stamps: r.frames.iter().map(|f| f.t).collect(), imu: r.imu }),
+        })
+    }
+
+    /// Renders every frame before the flight starts, so that rendering takes nothing from it; the first `colours` cameras
+    /// in colour.
+    pub fn rendered(
+        scenario: &Scenario,
+        colours: usize,
+        mut progress: impl FnMut(usize, usize),
+    ) -> Result<Input, Fault> {
+        let mut sim = Sim::new(scenario)?;
+        let count = sim.frame_count();
+        let mut frames = Vec::with_capacity(count);
+        for i in 0..count {
+            let mut f = Frames::in_colour(sim.calibration(), colours);
+            sim.render(i, &mut f);
+            frames.push(f);
+            progress(i + 1, count);
+        }
+        let stamps = frames.iter().map(|f| f.t).collect();
+        Ok(Input {
+            name: format!("simulated flight `{}`", scenario.name),
+            place: "the simulated flight".into(),
+            calibration: sim.calibration().clone(),
+            truth: sim.truth(),
+            warnings: vec![],
+            opened: vec![],
+            source: Source::Recorded(Recorded { images: Images::Rendered(frames), stamps, imu: sim.imu().to_vec() }),
+        })
+    }
+
+    /// Opens the sensors that a board file names.
+    pub fn live(path: &Path, board: &Board) -> Result<Input, Fault> {
+        let (calibration, sensors) = open(path, board)?;
+        Ok(Input {
+            name: board.name.clone(),
+            place: path.display().to_string(),
+            calibration,
+            truth: vec![],
+            warnings: vec![],
+            opened: vec![],
+            source: Source::Live { sensors, rate_hz: board.camera.rate_hz },
+        })
+    }
+
+    /// Refuses grey images where the first `cameras` are asked for in colour.
+    pub fn needs_colour(&self, cameras: usize) -> Result<(), Fault> {
+        match &self.source {
+            Source::Recorded(r) if !r.images.has_colour(cameras) => {
+                let what = format!("map.colour = true, but the images of {} are grey", self.place);
+                Err(Fault::new(Exit::Config, "map.colour", what, "set map.colour = false"))
+            }
+            _ => Ok(()),
+        }
+    }
+
+    /// Seconds it lasts; `None` of live sensors.
+    pub fn length_s(&self) -> Option<f64> {
+        match &self.source {
+            Source::Live { .. } => None,
+            Source::Recorded(r) => Some(r.length_s()),
+        }
+    }
+}
+
+impl Recorded {
+    /// Seconds from the first frame to the last.
+    pub fn length_s(&self) -> f64 {
+        match (self.stamps.first(), self.stamps.last()) {
+            (Some(a), Some(b)) => (*b - *a).secs(),
+            _ => 0.0,
+        }
+    }
+
+    /// Leaves the frames whose stamp is less than `duration_s` after the first.
+    pub fn cut(&mut self, duration_s: Option<f64>) {
+        if let (Some(s), Some(&first)) = (duration_s, self.stamps.first()) {
+            self.stamps.truncate(self.stamps.partition_point(|t| (*t - first).secs() < s));
+        }
+    }
+
+    /// Plays it at its recorded pace.
+    pub fn paced(self) -> Sensors {
+        let pace = Pace::starting(self.stamps.first().copied().unwrap_or_default());
+        Sensors {
+            frames: Box::new(PacedFrames::new(self.images, self.stamps, pace)),
+            imu: Box::new(PacedImu::new(self.imu.into(), pace)),
+        }
+    }
+}
+
+impl Sensors {
+    /// Adds the faults that a board asks for; `shape` makes frames of the rig's shape.
+    pub fn with_faults(self, inject: &InjectConfig, shape: impl Fn() -> Frames) -> Sensors {
+        let Sensors { mut frames, mut imu } = self;
+        if !inject.camera.is_empty() {
+            frames = Box::new(FaultyFrames::new(frames, &inject.camera, inject.seed, shape()));
+        }
+        if !inject.imu.is_empty() {
+            imu = Box::new(FaultyImu::new(imu, &inject.imu, inject.seed));
+        }
+        Sensors { frames, imu }
+    }
+}
+
+fn open(path: &Path, board: &Board) -> Result<(Calibration, Sensors), Fault> {
+    let parts = [
+        ("[camera] devices", board.camera.devices.is_empty()),
+        ("[imu] chip", board.imu.options().is_none()),
+        ("[rig] calibration", board.rig.calibration.is_empty()),
+    ];
+    let missing: Vec<&str> = parts.iter().filter(|(_, is)| *is).map(|(name, _)| *name).collect();
+    let (Some(options), true) = (board.imu.options(), missing.is_empty()) else {
+        let what = format!("does not say {}", missing.join(", "));
+        let fix = "write what is missing, or pass --dataset to run on a recording";
+        return Err(Fault::new(Exit::Config, path.display().to_string(), what, fix));
+    };
+    let calibration = calibration(path, board)?;
+    let data_ready = board.gpio.data_ready().map(|(line, edge)| DataReady::open(&line, edge)).transpose()?;
+    let imu = CorrectedImu { source: options.open(data_ready)?, correction: calibration.imu.correction };
+    let rig = v4l2::Rig::open(board.camera.settings(&calibration)?, &calibration)?;
+    rig.describe().iter().for_each(|line| print_err(format_args!("stipple: {line}")));
+    let frames: Box<dyn FrameSource> = match board.gpio.trigger() {
+        None => Box::new(rig),
+        Some((line, active_low, pulse)) => {
+            let trigger = Trigger::new(Output::open(&line, active_low)?, pulse, board.camera.rate_hz);
+            Box::new(Triggered { source: rig, pulses: Pulses::start(trigger) })
+        }
+    };
+    Ok((calibration, Sensors { frames, imu: Box::new(imu) }))
+}
+
+/// Opens each part of a board by itself, where not all can be opened: its name, and what was found or is wrong.
+pub fn parts(path: &Path, board: &Board) -> Vec<(&'static str, Result<String, Fault>)> {
+    let mut parts = vec![];
+    let calibration = calibration(path, board);
+    let cameras = calibration.as_ref().map_err(Fault::clone).and_then(|calibration| {
+        let rig = v4l2::Rig::open(board.camera.settings(calibration)?, calibration)?;
+        Ok(rig.describe().join("; "))
+    });
+    let count = |c: &Calibration| format!("{} cameras", c.cameras.len());
+    parts.push(("calibration", calibration.as_ref().map(count).map_err(Fault::clone)));
+    if calibration.is_ok() {
+        parts.push(("cameras", cameras));
+    }
+    let none = || Fault::new(Exit::Config, "[imu]", "names no chip", "write imu.chip and where it is wired");
+    let data_ready = board.gpio.data_ready().map(|(line, edge)| DataReady::open(&line, edge)).transpose();
+    if board.gpio.data_ready().is_some() {
+        parts.push(("data-ready line", data_ready.as_ref().map(|_| "opened".into()).map_err(Fault::clone)));
+    }
+    let opened = board.imu.options().ok_or_else(none).and_then(|o| o.open(data_ready.ok().flatten()));
+    parts.push(("inertial unit", opened.map(|_| format!("{} answers", board.imu.chip))));
+    let outputs =
+        [("trigger line", board.gpio.trigger().map(|(line, low, _)| (line, low))), ("status light", board.gpio.led())];
+    for (name, (line, active_low)) in outputs.into_iter().filter_map(|(name, o)| Some((name, o?))) {
+        parts.push((name, Output::open(&line, active_low).map(|_| "opened".into())));
+    }
+    parts
+}
+
+/// Reads the board's calibration; a relative path starts at the board file's folder.
+fn calibration(path: &Path, board: &Board) -> Result<Calibration, Fault> {
+    let folder = path.parent().unwrap_or(Path::new(""));
+    let fix = "set rig.calibration to a folder with cam0/sensor.yaml, Kalibr's camchain.yaml, or Basalt's json";
+    let unread = |f: Fault| if f.exit == Exit::NoInput { Fault { fix: fix.into(), ..f } } else { f };
+    let mut calibration = read_calibration(&folder.join(&board.rig.calibration)).map_err(unread)?;
+    // Noise densities are the unit's; how often it is read here is the board's word.
+    calibration.imu.rate_hz = board.imu.rate_hz;
+    if board.rig.readout_s > 0.0 {
+        calibration.cameras.iter_mut().for_each(|c| c.readout = Span::from_secs(board.rig.readout_s));
+    }
+    Ok(calibration)
+}
+
+/// An inertial unit whose readings are corrected by its calibration, as those of recordings are.
+struct CorrectedImu<S> {
+    source: S,
+    correction: ImuCorrection,
+}
+
+impl<S: ImuSource> ImuSource for CorrectedImu<S> {
+    fn next(&mut self, timeout: Span, batch: &mut ImuBatch) -> Result<Wait, SourceFault> {
+        let wait = self.source.next(timeout, batch)?;
+        batch.iter_mut().for_each(|reading| reading.sample = self.correction.apply(&reading.sample));
+        Ok(wait)
+    }
+
+    fn counters(&self) -> Vec<(&'static str, u64)> {
+        self.source.counters()
+    }
+}
+
+/// Thread `trigger`: starts exposures until it is dropped.
+struct Pulses {
+    stop: Arc<AtomicBool>,
+    failed: Arc<AtomicU64>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl Pulses {
+    fn start(mut trigger: Trigger) -> Pulses {
+        let (stop, failed) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicU64::new(0)));
+        let (asked, count) = (stop.clone(), failed.clone());
+        let thread = std::thread::spawn(move || {
+            while !asked.load(Relaxed) {
+                trigger.wait();
+                count.fetch_add(u64::from(trigger.pulse().is_err()), Relaxed);
+            }
+        });
+        Pulses { stop, failed, thread: Some(thread) }
+    }
+}
+
+impl Drop for Pulses {
+    fn drop(&mut self) {
+        self.stop.store(true, Relaxed);
+        if let Some(thread) = self.thread.take() {
+            // It ends after the pulse under way.
+            let _ = thread.join();
+        }
+    }
+}
+
+/// Cameras whose exposures we start.
+struct Triggered<S> {
+    source: S,
+    pulses: Pulses,
+}
+
+impl<S: FrameSource> FrameSource for Triggered<S> {
+    fn next(&mut self, timeout: Span, frames: &mut Frames) -> Result<Wait, SourceFault> {
+        self.source.next(timeout, frames)
+    }
+
+    fn away(&self) -> Option<&Fault> {
+        self.source.away()
+    }
+
+    fn counters(&self) -> Vec<(&'static str, u64)> {
+        let mut list = self.source.counters();
+        list.push(("trigger_failures", self.pulses.failed.load(Relaxed)));
+        list
+    }
+
+    fn warnings(&self) -> &[String] {
+        self.source.warnings()
+    }
+}

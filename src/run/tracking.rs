@@ -1,0 +1,437 @@
+//! The tracking side of a flight: frames with their inertial samples in, poses and keyframes out.
+//!
+//! ```text
+//! next() -> front end -tracked-> back end -> give()      packets
+//!               ^---predictors----'                      one a frame
+//! ```
+//!
+//! The two halves of odometry share one thread in turns or have a thread each. The front end follows points, the back end
+//! estimates. All that passes between them travels in a `FramePacket`, besides the `Predictor` that the back end gives
+//! back. The front end begins frame k when the predictor of frame k-2 has come, and predicts from that even where the state
+//! after k-1 is known: so neither queue can fill, and poses are the same bit for bit on one thread and on two.
+//!
+//! With `--poses` the poses come from a table, odometry is skipped, and every frame is a keyframe.
+
+use super::waker::{SetOnDrop, Waker};
+use crate::config::Board;
+use crate::counters::Counters;
+use crate::frontend::{Frontend, Prediction, Tracks};
+use crate::limits::IMU_BETWEEN_FRAMES;
+use crate::mem::{seal_thread, List};
+use crate::output::process::thread_cpu_secs;
+use crate::vio::health::Health;
+use crate::vio::predict::Predictor;
+use crate::vio::rig::RigEstimate;
+use crate::vio::samples::ImuRing;
+use crate::vio::window::FRAMES;
+use crate::vio::{Odometry, Tally, Vio};
+use crossbeam_queue::ArrayQueue;
+use std::sync::atomic::AtomicBool;
+use std::sync::Arc;
+use std::time::Instant;
+use stipple_drivers::types::pose_at;
+use stipple_drivers::{Calibration, Fault, Frames, ImuSample, Nanos, Pose, Span, TimedPose};
+
+/// Largest gap in a table of poses that is interpolated across.
+const POSE_GAP_MAX: Span = Span(100_000_000);
+/// Packets between the two halves: the one whose points are followed and the one being estimated.
+const BETWEEN_HALVES: usize = 2;
+
+/// A pose and what it means for the map.
+pub struct Tracked {
+    pub world_from_body: Pose,
+    pub keyframe: bool,
+    /// Newest poses of all keyframes still being optimised; filled beside a keyframe.
+    pub corrections: List<(Nanos, Pose), FRAMES>,
+}
+
+/// One frame on its way through tracking: its images, the inertial samples since the frame before, and the result.
+pub struct FramePacket {
+    /// Shared with the front end until it has tracked the frame after this.
+    pub frames: Arc<Frames>,
+    /// Holds samples alone: no frame came for so long that they would not fit before the next.
+    pub imu_only: bool,
+    /// A camera saw nothing: no view to train a map on.
+    pub blank: bool,
+    pub imu: List<ImuSample, IMU_BETWEEN_FRAMES>,
+    pub tracks: Tracks,
+    pub tracked: Option<Tracked>,
+    /// When the front end took it.
+    begun: Instant,
+}
+
+impl FramePacket {
+    /// Shaped for a rig; the first `colours` cameras in colour.
+    pub fn for_rig(calibration: &Calibration, colours: usize) -> Box<FramePacket> {
+        Box::new(FramePacket {
+            frames: Arc::new(Frames::in_colour(calibration, colours)),
+            imu_only: false,
+            blank: false,
+            imu: List::default(),
+            tracks: Tracks::default(),
+            tracked: None,
+            begun: Instant::now(),
+        })
+    }
+
+    /// The buffers for the next frame; `None` while the front end still reads this one.
+    pub fn writable(&mut self) -> Option<&mut Frames> {
+        Arc::get_mut(&mut self.frames)
+    }
+
+    /// Size without images, bytes.
+    pub const BYTES: usize = size_of::<FramePacket>();
+
+    /// Adds a sample; a full list drops its oldest, which is counted.
+    pub fn push_imu(&mut self, sample: ImuSample, counters: &Counters) {
+        if self.imu.push(sample).is_err() {
+            counters.imu_overflow.add(1);
+            self.imu.rotate_left(1);
+            self.imu[IMU_BETWEEN_FRAMES - 1] = sample;
+        }
+    }
+}
+
+/// What makes poses of frames.
+pub enum Tracker {
+    Odometry(Box<OdometryRun>),
+    /// Poses looked up by stamp.
+    Table(Vec<TimedPose>),
+    /// No poses: each packet is shown to this and given back.
+    Observer(Box<dyn FnMut(&FramePacket) + Send>),
+}
+
+pub struct OdometryRun {
+    pub front: Front,
+    pub back: Back,
+    /// 1 or 2.
+    pub threads: u32,
+    /// Size of front end and estimator together.
+    pub bytes: u64,
+}
+
+/// The half that follows points.
+pub struct Front {
+    frontend: Frontend,
+    imu: ImuRing,
+    last: Option<Nanos>,
+    /// Wall time of each frame, ms.
+    pub ms: Vec<f64>,
+    /// Wall time of all frames, with what was waited for the back end, s.
+    pub busy_s: f64,
+    /// CPU time of the thread, s; that of both halves where they share one.
+    pub cpu_s: Option<f64>,
+}
+
+impl Front {
+    pub fn track(&mut self, packet: &mut FramePacket, predictor: &Predictor) {
+        packet.begun = Instant::now();
+        for sample in packet.imu.iter() {
+            if self.imu.admits(sample) {
+                self.imu.push(*sample);
+            }
+        }
+        if packet.imu_only {
+            return;
+        }
+        let t = packet.frames.t;
+        let prediction = Prediction { prev_from_now: self.last.map(|prev| predictor.motion(&self.imu, prev, t)) };
+        self.last = Some(t);
+        packet.tracks.clone_from(self.frontend.track(&packet.frames, &prediction));
+        let secs = packet.begun.elapsed().as_secs_f64();
+        self.busy_s += secs;
+        keep(&mut self.ms, secs * 1e3);
+    }
+}
+
+/// The half that estimates. Its lists have room for every frame, bought at the start.
+pub struct Back {
+    vio: Vio,
+    pub trajectory: Vec<Odometry>,
+    /// Wall time of each frame, ms.
+    pub ms: Vec<f64>,
+    /// Wall time of all frames, s.
+    pub busy_s: f64,
+    /// Health of every frame, with a pose or without.
+    pub health: Vec<(Nanos, Health)>,
+    /// Time from when the front end took a frame until its pose was there, ms.
+    pub frame_ms: Vec<(Nanos, f64)>,
+    pub cpu_s: Option<f64>,
+}
+
+impl Back {
+    /// Counts of frames by health and quality.
+    pub fn tally(&self) -> &Tally {
+        self.vio.tally()
+    }
+
+    pub fn predictor(&self) -> Predictor {
+        self.vio.predictor()
+    }
+
+    /// Fills in `packet.tracked`.
+    pub fn estimate(&mut self, packet: &mut FramePacket) {
+        let begun = Instant::now();
+        packet.imu.iter().for_each(|s| self.vio.on_imu(*s));
+        packet.tracked = None;
+        if packet.imu_only {
+            return;
+        }
+        let update = self.vio.on_tracks(&packet.tracks);
+        packet.tracked = update.odometry.map(|o| Tracked {
+            world_from_body: o.world_from_body,
+            keyframe: update.keyframe,
+            corrections: if update.keyframe { self.keyframe_poses() } else { List::default() },
+        });
+        if let Some(odometry) = update.odometry {
+            keep(&mut self.trajectory, odometry);
+        }
+        let secs = begun.elapsed().as_secs_f64();
+        self.busy_s += secs;
+        keep(&mut self.ms, secs * 1e3);
+        keep(&mut self.health, (packet.frames.t, update.health));
+        keep(&mut self.frame_ms, (packet.frames.t, packet.begun.elapsed().as_secs_f64() * 1e3));
+    }
+
+    fn keyframe_poses(&self) -> List<(Nanos, Pose), FRAMES> {
+        let mut list = List::default();
+        for (t, pose, _) in self.vio.window().filter(|(_, _, keyframe)| *keyframe) {
+            list.push((t, pose)).expect("a window has at most FRAMES frames");
+        }
+        list
+    }
+}
+
+/// Appends where there is room; nothing grows during a flight.
+fn keep<T>(list: &mut Vec<T>, item: T) {
+    if list.len() < list.capacity() {
+        list.push(item);
+    }
+}
+
+impl OdometryRun {
+    pub fn new(calibration: &Calibration, board: &Board, frames: usize) -> Result<OdometryRun, Fault> {
+        Ok(OdometryRun {
+            front: Front {
+                frontend: Frontend::new(calibration, &board.frontend)?,
+                imu: ImuRing::new(),
+                last: None,
+                ms: Vec::with_capacity(frames),
+                busy_s: 0.0,
+                cpu_s: None,
+            },
+            back: Back {
+                vio: Vio::new(calibration, &board.vio),
+                trajectory: Vec::with_capacity(frames),
+                ms: Vec::with_capacity(frames),
+                busy_s: 0.0,
+                health: Vec::with_capacity(frames),
+                frame_ms: Vec::with_capacity(frames),
+                cpu_s: None,
+            },
+            threads: board.frontend.threads,
+            bytes: Frontend::footprint(calibration, &board.frontend).total() + Vio::footprint().total(),
+        })
+    }
+
+    /// Frames a second while there are frames to track: over the time in which the busier thread was
+    /// not waiting for one.
+    pub fn fps(&self) -> Option<f64> {
+        let (front, back) = (self.front.busy_s, self.back.busy_s);
+        let busy = if self.threads == 1 { front + back } else { front.max(back) };
+        (busy > 0.0).then(|| self.back.ms.len() as f64 / busy)
+    }
+
+    /// CPU time of all threads of tracking, ms a frame.
+    pub fn cpu_ms(&self) -> Option<f64> {
+        let total = self.front.cpu_s? + if self.threads == 1 { 0.0 } else { self.back.cpu_s? };
+        let frames = self.back.ms.len();
+        (frames > 0).then(|| 1e3 * total / frames as f64)
+    }
+}
+
+impl Tracker {
+    /// Threads it takes, 1 or 2.
+    pub fn threads(&self) -> u32 {
+        self.odometry().map_or(1, |run| run.threads)
+    }
+
+    pub fn odometry(&self) -> Option<&OdometryRun> {
+        match self {
+            Tracker::Odometry(run) => Some(run),
+            Tracker::Table(_) | Tracker::Observer(_) => None,
+        }
+    }
+
+    /// What was estimated of the rig, where the board asks for it.
+    pub fn rig(&self) -> Option<RigEstimate> {
+        self.odometry()?.back.vio.rig()
+    }
+
+    /// Hash over the bits of all keyframe poses.
+    pub fn hash(&self) -> Option<u64> {
+        Some(self.odometry()?.back.vio.hash())
+    }
+
+    pub fn counters(&self) -> Vec<(&'static str, u64)> {
+        let Some(run) = self.odometry() else { return vec![] };
+        let f = run.front.frontend.stats();
+        // The first frames of a run that starts in motion, and those after a reset.
+        let without = run.back.frame_ms.len().saturating_sub(run.back.trajectory.len());
+        let mut list = vec![
+            ("tracks_created", f.created),
+            ("tracks_lost", f.lost),
+            ("tracks_matched", f.matched),
+            ("tracks_epipolar_rejected", f.epipolar_rejected),
+            ("tracks_crowded", f.crowded),
+            ("tracks_full", f.full),
+            // `images_wrong_size` is the reader's.
+            ("frontend_images_refused", f.images_refused),
+            ("frames_without_odometry", without as u64),
+        ];
+        list.extend(run.back.vio.stats().counters());
+        list
+    }
+}
+
+/// Fills in the pose of a packet from a table: every frame is a keyframe.
+fn look_up(poses: &[TimedPose], packet: &mut FramePacket, counters: &Counters) {
+    packet.tracked = None;
+    if packet.imu_only {
+        return;
+    }
+    let pose = pose_at(poses, packet.frames.t, POSE_GAP_MAX);
+    counters.frames_without_pose.add(u64::from(pose.is_none()));
+    packet.tracked =
+        pose.map(|world_from_body| Tracked { world_from_body, keyframe: true, corrections: List::default() });
+}
+
+/// What the threads of tracking share.
+pub struct Link {
+    tracked: ArrayQueue<Box<FramePacket>>,
+    predictors: ArrayQueue<Predictor>,
+    /// Wakes the thread that takes packets.
+    pub taker: Waker,
+    back: Waker,
+    front_done: AtomicBool,
+    back_done: AtomicBool,
+}
+
+impl Default for Link {
+    fn default() -> Link {
+        Link {
+            tracked: ArrayQueue::new(BETWEEN_HALVES),
+            predictors: ArrayQueue::new(BETWEEN_HALVES),
+            taker: Waker::default(),
+            back: Waker::default(),
+            front_done: AtomicBool::new(false),
+            back_done: AtomicBool::new(false),
+        }
+    }
+}
+
+/// Where the thread that takes packets gets them, and when there are no more.
+pub struct Inlet<'a, T: FnMut() -> Option<Box<FramePacket>>> {
+    pub take: T,
+    pub over: &'a AtomicBool,
+}
+
+impl<T: FnMut() -> Option<Box<FramePacket>>> Inlet<'_, T> {
+    fn next(&mut self, link: &Link) -> Option<Box<FramePacket>> {
+        link.taker.wait(self.over, &mut self.take)
+    }
+}
+
+/// Thread `tracking` with a table of poses.
+pub fn by_table(
+    link: &Link,
+    mut inlet: Inlet<impl FnMut() -> Option<Box<FramePacket>>>,
+    poses: &[TimedPose],
+    counters: &Counters,
+    mut give: impl FnMut(Box<FramePacket>),
+) {
+    seal();
+    while let Some(mut packet) = inlet.next(link) {
+        look_up(poses, &mut packet, counters);
+        give(packet);
+    }
+}
+
+/// Thread `tracking` that only shows packets to somebody.
+pub fn observe(
+    link: &Link,
+    mut inlet: Inlet<impl FnMut() -> Option<Box<FramePacket>>>,
+    observer: &mut dyn FnMut(&FramePacket),
+    mut give: impl FnMut(Box<FramePacket>),
+) {
+    while let Some(packet) = inlet.next(link) {
+        observer(&packet);
+        give(packet);
+    }
+}
+
+/// Thread `tracking` where both halves share it.
+pub fn in_turns(
+    link: &Link,
+    mut inlet: Inlet<impl FnMut() -> Option<Box<FramePacket>>>,
+    front: &mut Front,
+    back: &mut Back,
+    mut give: impl FnMut(Box<FramePacket>),
+) {
+    seal();
+    let start = back.predictor();
+    let (mut predictor, mut next) = (start, start);
+    while let Some(mut packet) = inlet.next(link) {
+        front.track(&mut packet, &predictor);
+        back.estimate(&mut packet);
+        (predictor, next) = (next, back.predictor());
+        give(packet);
+    }
+    front.cpu_s = thread_cpu_secs();
+}
+
+/// Thread `frontend`, where each half has its own; `start` predicts the first frames.
+pub fn follow_points(
+    link: &Link,
+    mut inlet: Inlet<impl FnMut() -> Option<Box<FramePacket>>>,
+    front: &mut Front,
+    start: Predictor,
+) {
+    let _ended = SetOnDrop(&link.front_done, Some(&link.back));
+    seal();
+    let (mut predictor, mut frames) = (start, 0u64);
+    loop {
+        if frames >= BETWEEN_HALVES as u64 {
+            let begun = Instant::now();
+            let Some(newer) = link.taker.wait(&link.back_done, || link.predictors.pop()) else { break };
+            front.busy_s += begun.elapsed().as_secs_f64();
+            predictor = newer;
+        }
+        let Some(mut packet) = inlet.next(link) else { break };
+        front.track(&mut packet, &predictor);
+        frames += 1;
+        // There is room: the back end has finished all but the last.
+        let _ = link.tracked.push(packet);
+        link.back.wake();
+    }
+    front.cpu_s = thread_cpu_secs();
+}
+
+/// Thread `estimator`.
+pub fn estimate(link: &Link, back: &mut Back, mut give: impl FnMut(Box<FramePacket>)) {
+    let _ended = SetOnDrop(&link.back_done, Some(&link.taker));
+    seal();
+    while let Some(mut packet) = link.back.wait(&link.front_done, || link.tracked.pop()) {
+        back.estimate(&mut packet);
+        let _ = link.predictors.push(back.predictor());
+        link.taker.wake();
+        give(packet);
+    }
+    back.cpu_s = thread_cpu_secs();
+}
+
+/// From here on the thread allocates nothing; what asking for its own handle allocates comes first.
+fn seal() {
+    let _ = std::thread::current();
+    seal_thread();
+}
