@@ -1,8 +1,9 @@
 //! Fixed memory: fixed-capacity lists, the byte table, and the seal.
 //!
-//! After construction every thread of ours calls `seal_thread`; from then on a heap allocation on
-//! it is counted (`heap_after_seal`) in release and aborts in tests that ask for it. OpenCV and the
-//! Vulkan driver allocate behind us, inside `unsealed` sections named for them.
+//! The byte table is made by construction: a part is built once, and what the allocator gave it is its row, so no size is
+//! stated twice. After construction every thread of ours calls `seal_thread`; from then on a heap allocation on it is
+//! counted (`heap_after_seal`), and tests ask that none was. OpenCV and the Vulkan driver allocate behind us, inside
+//! `unsealed` sections named for them. Both need `CountingAllocator` as the program's global allocator.
 #![allow(unsafe_code)]
 
 use std::alloc::{GlobalAlloc, Layout, System};
@@ -76,6 +77,15 @@ pub struct Row {
 }
 
 impl Footprint {
+    /// Builds a part, and adds the bytes it takes: its own size and the heap it holds when it is built. What is built is
+    /// the caller's, to drop or to build on.
+    pub fn build<T>(&mut self, name: &'static str, build: impl FnOnce() -> T) -> T {
+        let before = HEAP.get();
+        let part = build();
+        self.host(name, size_of::<T>() + (HEAP.get() - before).max(0) as usize);
+        part
+    }
+
     pub fn host(&mut self, name: &'static str, bytes: usize) {
         self.rows.push(Row { name, bytes: bytes as u64, gpu: false });
     }
@@ -99,6 +109,8 @@ impl Footprint {
 
 thread_local! {
     static SEALED: Cell<bool> = const { Cell::new(false) };
+    /// Bytes this thread took from the heap less those it gave back.
+    static HEAP: Cell<i64> = const { Cell::new(0) };
 }
 
 static HEAP_AFTER_SEAL: AtomicU64 = AtomicU64::new(0);
@@ -124,34 +136,41 @@ pub fn heap_after_seal() -> u64 {
 /// The system allocator, counting what sealed threads ask of it.
 pub struct CountingAllocator;
 
-fn count() {
-    // try_with: a thread being torn down has no flag any more, and is not ours to judge.
+/// Counts an allocation, and `bytes` more that the thread holds.
+fn count(bytes: i64) {
+    // try_with: a thread being torn down has no counters any more, and is not ours to judge.
     if SEALED.try_with(Cell::get).unwrap_or(false) {
         HEAP_AFTER_SEAL.fetch_add(1, Ordering::Relaxed);
     }
+    hold(bytes);
+}
+
+fn hold(bytes: i64) {
+    let _ = HEAP.try_with(|heap| heap.set(heap.get() + bytes));
 }
 
 // SAFETY: every call is passed to the system allocator unchanged; counting touches no heap.
 unsafe impl GlobalAlloc for CountingAllocator {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        count();
+        count(layout.size() as i64);
         // SAFETY: the caller's contract is the system allocator's.
         unsafe { System.alloc(layout) }
     }
 
     unsafe fn dealloc(&self, ptr: *mut u8, layout: Layout) {
+        hold(-(layout.size() as i64));
         // SAFETY: as above; `ptr` came from `System`.
         unsafe { System.dealloc(ptr, layout) }
     }
 
     unsafe fn alloc_zeroed(&self, layout: Layout) -> *mut u8 {
-        count();
+        count(layout.size() as i64);
         // SAFETY: as above.
         unsafe { System.alloc_zeroed(layout) }
     }
 
     unsafe fn realloc(&self, ptr: *mut u8, layout: Layout, new_size: usize) -> *mut u8 {
-        count();
+        count(new_size as i64 - layout.size() as i64);
         // SAFETY: as above.
         unsafe { System.realloc(ptr, layout, new_size) }
     }
