@@ -25,7 +25,7 @@ use std::path::{Path, PathBuf};
 
 /// In tests each of these calls can be made to fail.
 #[cfg(test)]
-use super::iio_tests::{poll, read};
+use super::tests::iio::{poll, read};
 #[cfg(not(test))]
 use libc::{poll, read};
 

@@ -18,15 +18,9 @@ pub mod edges;
 mod frames;
 pub mod iio;
 mod iio_scan;
-#[cfg(test)]
-mod iio_tests;
 mod merge;
 mod register;
 mod self_test;
-#[cfg(test)]
-mod simulated;
-#[cfg(test)]
-mod simulated_chips;
 #[cfg(test)]
 mod tests;
 pub mod timeline;

@@ -2,10 +2,10 @@
 #![cfg(test)]
 #![allow(clippy::unwrap_used, unsafe_code)]
 
-use super::bus::BusFault;
-use super::iio::{IioImu, IioOptions};
-use super::unit::GRAVITY;
 use crate::host::monotonic;
+use crate::imu::bus::BusFault;
+use crate::imu::iio::{IioImu, IioOptions};
+use crate::imu::unit::GRAVITY;
 use crate::source::{ImuBatch, ImuReading, ImuSource, SourceFault, Wait};
 use crate::types::{Nanos, Span};
 use std::cell::Cell;
@@ -315,7 +315,7 @@ fn every_setting_that_is_refused_is_named() {
         let line = refused(&IioOptions { trigger: "timer".into(), ..kernel.options("mpu6500") });
         assert!(line.contains(setting) && line.contains("_available"), "{line}");
     }
-    let fix = |errno| super::iio::refused(Path::new("f"), "1", &std::io::Error::from_raw_os_error(errno)).fix;
+    let fix = |errno| crate::imu::iio::refused(Path::new("f"), "1", &std::io::Error::from_raw_os_error(errno)).fix;
     assert!(fix(libc::EACCES).contains("udev") && fix(libc::EBUSY).contains("fuser"));
     assert!(fix(libc::EINVAL).contains("_available"));
 }

@@ -2,10 +2,10 @@
 //! driver's tables, with a sensor clock of its own that runs off the host's, and every fault a bus can have.
 #![cfg(test)]
 
-use super::bus::{Bus, BusFault};
-use super::chips::Layout;
-use super::edges::{EdgeFault, EdgeQueue, Edges};
-use super::frames::Raw;
+use crate::imu::bus::{Bus, BusFault};
+use crate::imu::chips::Layout;
+use crate::imu::edges::{EdgeFault, EdgeQueue, Edges};
+use crate::imu::frames::Raw;
 use crate::types::{Nanos, Span};
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, MutexGuard};

@@ -1,8 +1,8 @@
 //! How each chip behaves, as its data sheet has it, told apart from the driver's tables.
 #![cfg(test)]
 
-use super::chips::Layout;
 use super::simulated::{Model, PUSH};
+use crate::imu::chips::Layout;
 
 fn big(n: usize) -> [u8; 2] {
     (n as u16).to_be_bytes()

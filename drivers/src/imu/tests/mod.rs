@@ -1,16 +1,21 @@
 //! Each chip's driver against the simulated register file: values, stamps, and every fault.
+#![cfg(test)]
 #![allow(clippy::unwrap_used)]
+
+mod chips;
+pub mod iio;
+mod simulated;
 
 use super::bus::BusFault;
 use super::chips::CHIPS;
 use super::counters::ImuCounters;
 use super::register::{Limits, RegisterImu};
-use super::simulated::{SimBus, SimEdges};
-use super::simulated_chips::model;
 use super::unit::GRAVITY;
 use super::{RegisterOptions, Wiring};
 use crate::source::{ImuBatch, ImuReading, ImuSource, SourceFault, Wait};
 use crate::types::Span;
+use chips::model;
+use simulated::{SimBus, SimEdges};
 use std::io::Write;
 
 const MS: i64 = 1_000_000;
