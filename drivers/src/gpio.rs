@@ -475,7 +475,7 @@ mod tests {
     #[test]
     fn every_error_of_an_input_is_a_value_and_a_signal_is_none() {
         let mut input = DataReady::open(&line("chip", "3"), Edge::Rising).unwrap();
-        let mut queue = EdgeQueue::new();
+        let mut queue = EdgeQueue::default();
         for errno in ERRNOS {
             FAILS.set(("wait", errno));
             assert_eq!((input.wait(Span(1)), input.drain(&mut queue)), (Err(EdgeFault(errno)), Err(EdgeFault(errno))));
@@ -493,7 +493,10 @@ mod tests {
         FAILS.set(("", 0));
         // More than one read takes.
         WAITING.with_borrow_mut(|w| *w = (0..EVENTS as i64 + 3).map(|i| monotonic().0 - 1000 + i).collect());
-        assert_eq!((input.drain(&mut queue), queue.len(), input.wait(Span(0))), (Ok(()), EVENTS + 3, Ok(false)));
+        assert_eq!(
+            (input.drain(&mut queue), queue.stamps().len(), input.wait(Span(0))),
+            (Ok(()), EVENTS + 3, Ok(false))
+        );
     }
 
     #[test]

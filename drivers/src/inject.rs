@@ -360,7 +360,7 @@ impl<S: ImuSource> FaultyImu<S> {
 
 /// Leaves in `batch` what is delivered of it; `last` is the reading before.
 fn spoil(batch: &mut ImuBatch, last: &mut ImuReading, plan: &mut Plan) {
-    let mut spoilt = ImuBatch::new();
+    let mut spoilt = ImuBatch::default();
     let mut late_s: f64 = 0.0;
     for reading in batch.iter() {
         let (mut out, mut delivered, mut twice) = (*reading, true, false);
@@ -536,7 +536,7 @@ mod tests {
             Rule::within(Kind::Unplug, 1.2, 1.6),
         ];
         let mut source = FaultyImu::new(PacedImu::new(samples, Pace::at_speed(Nanos(0), 10.0)), &rules, 3);
-        let (mut batch, mut seen, mut lost) = (ImuBatch::new(), vec![], 0);
+        let (mut batch, mut seen, mut lost) = (ImuBatch::default(), vec![], 0);
         loop {
             match source.next(Span(10 * MS), &mut batch) {
                 Ok(Wait::Got) => seen.extend(batch.iter().map(|r| r.sample)),

@@ -208,7 +208,7 @@ mod tests {
         let samples: Arc<[ImuSample]> = (0..1000).map(sample).collect();
         let mut source = PacedImu::new(samples, Pace::at_speed(Nanos(0), 1e3));
         std::thread::sleep(Duration::from_millis(2));
-        let (mut batch, mut seen) = (ImuBatch::new(), vec![]);
+        let (mut batch, mut seen) = (ImuBatch::default(), vec![]);
         while source.next(Span(MS), &mut batch).unwrap() != Wait::Ended {
             seen.extend(batch.iter().map(|r| r.sample.t.0 / MS));
         }

@@ -9,7 +9,7 @@
 //! again on every call, and goes on with `Got` when it is back.
 
 use crate::types::{Frames, ImuSample, Span};
-use crate::Fault;
+use crate::{Fault, List};
 use std::fmt;
 
 /// A rig of cameras.
@@ -90,67 +90,8 @@ pub struct ImuReading {
 /// of what a run queues.
 pub const IMU_BATCH: usize = 256;
 
-/// Readings in place, oldest first.
-#[derive(Clone, Debug)]
-pub struct ImuBatch {
-    readings: [ImuReading; IMU_BATCH],
-    len: usize,
-}
-
-impl ImuBatch {
-    pub fn new() -> ImuBatch {
-        ImuBatch { readings: [ImuReading::default(); IMU_BATCH], len: 0 }
-    }
-
-    pub fn clear(&mut self) {
-        self.len = 0;
-    }
-
-    pub fn is_full(&self) -> bool {
-        self.len == IMU_BATCH
-    }
-
-    /// A full batch gives the reading back.
-    pub fn push(&mut self, reading: ImuReading) -> Result<(), ImuReading> {
-        if self.is_full() {
-            return Err(reading);
-        }
-        self.readings[self.len] = reading;
-        self.len += 1;
-        Ok(())
-    }
-
-    /// Keeps the readings for which `keep` is true, in order.
-    pub fn retain(&mut self, mut keep: impl FnMut(&ImuReading) -> bool) {
-        let mut kept = 0;
-        for i in 0..self.len {
-            if keep(&self.readings[i]) {
-                self.readings[kept] = self.readings[i];
-                kept += 1;
-            }
-        }
-        self.len = kept;
-    }
-}
-
-impl Default for ImuBatch {
-    fn default() -> Self {
-        ImuBatch::new()
-    }
-}
-
-impl std::ops::Deref for ImuBatch {
-    type Target = [ImuReading];
-    fn deref(&self) -> &[ImuReading] {
-        &self.readings[..self.len]
-    }
-}
-
-impl std::ops::DerefMut for ImuBatch {
-    fn deref_mut(&mut self) -> &mut [ImuReading] {
-        &mut self.readings[..self.len]
-    }
-}
+/// Readings of one call, oldest first.
+pub type ImuBatch = List<ImuReading, IMU_BATCH>;
 
 impl<S: FrameSource + ?Sized> FrameSource for Box<S> {
     fn next(&mut self, timeout: Span, frames: &mut Frames) -> Result<Wait, SourceFault> {

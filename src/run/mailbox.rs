@@ -299,7 +299,7 @@ pub fn camera(mailbox: &Mailbox, source: &mut dyn FrameSource, tracking: &Waker,
 
 /// Thread `imu`. Ends with its source or with the cameras.
 pub fn inertial(mailbox: &Mailbox, source: &mut dyn ImuSource, tracking: &Waker, over: &AtomicBool, c: &Counters) {
-    let (mut batch, mut gate) = (ImuBatch::new(), ImuGate::default());
+    let (mut batch, mut gate) = (ImuBatch::default(), ImuGate::default());
     let mut liveness = Liveness {
         name: "inertial unit",
         heard: Instant::now(),

@@ -111,7 +111,7 @@ struct Seen {
 /// Reads until there are so many more, a minute at most.
 fn read(imu: &mut HardwareImu, n: usize, seen: &mut Seen) {
     let (until, wanted) = (monotonic() + Span(60_000 * MS), seen.readings.len() + n);
-    let mut batch = ImuBatch::new();
+    let mut batch = ImuBatch::default();
     while seen.readings.len() < wanted && monotonic() < until {
         match imu.next(Span(100 * MS), &mut batch) {
             Ok(Wait::Got) => seen.readings.extend(batch.iter()),
@@ -270,7 +270,7 @@ mod registers {
             let c = counters(&imu);
             assert_eq!((c.imu_nacks + c.imu_bus_errors, c.imu_restarts), (3, 1), "{c:?}");
             set("gone", 1);
-            let mut batch = ImuBatch::new();
+            let mut batch = ImuBatch::default();
             let lost = (0..40).find_map(|_| imu.next(Span(100 * MS), &mut batch).err());
             let Some(SourceFault::Lost(fault)) = lost else { panic!("{lost:?}") };
             assert!(fault.to_string().contains("not there"), "{fault}");
@@ -386,7 +386,7 @@ mod lines {
             pull(&ready, !up);
             let mut line = DataReady::open(&line("imu-ready"), edge).unwrap();
             assert_eq!(line.wait(Span(0)), Ok(false));
-            let mut queue = EdgeQueue::new();
+            let mut queue = EdgeQueue::default();
             for _ in 0..100 {
                 let before = monotonic();
                 pull(&ready, up);
@@ -394,7 +394,7 @@ mod lines {
                 pull(&ready, !up);
                 assert_eq!(line.wait(Span(1000 * MS)), Ok(true));
                 line.drain(&mut queue).unwrap();
-                let [t] = queue.as_slice() else { panic!("{:?}", queue.as_slice()) };
+                let [t] = queue.stamps() else { panic!("{:?}", queue.stamps()) };
                 assert!((before..=after + SERVED).contains(t), "{t:?} of {before:?} to {after:?}");
                 queue.clear();
             }
@@ -404,8 +404,8 @@ mod lines {
                 pull(&ready, !up);
             }
             line.drain(&mut queue).unwrap();
-            assert!((16..=40).contains(&queue.len()), "{}", queue.len());
-            println!("{} of 40 edges in the kernel's queue", queue.len());
+            assert!((16..=40).contains(&queue.stamps().len()), "{}", queue.stamps().len());
+            println!("{} of 40 edges in the kernel's queue", queue.stamps().len());
         }
     }
 

@@ -7,6 +7,7 @@
 //! no edge is stamped by the line (`timeline`).
 
 use crate::types::{Nanos, Span};
+use crate::List;
 
 /// Where edges come from: a GPIO line, or a simulated one.
 pub trait Edges: Send {
@@ -24,11 +25,10 @@ pub struct EdgeFault(pub i32);
 /// More than any FIFO's samples between two reads.
 const EDGES: usize = 256;
 
-/// Edges that no sample has been found for, oldest first.
-#[derive(Clone, Debug)]
+/// Stamps of edges that no sample has been found for, oldest first.
+#[derive(Clone, Debug, Default)]
 pub struct EdgeQueue {
-    stamps: [Nanos; EDGES],
-    len: usize,
+    stamps: List<Nanos, EDGES>,
     /// Edges that did not fit, were not newer than the last, or were stamped by another clock than ours.
     pub refused: u64,
     /// Edges without a sample, and samples without an edge.
@@ -39,35 +39,21 @@ pub struct EdgeQueue {
 const FOREIGN: Span = Span(10_000_000_000);
 
 impl EdgeQueue {
-    pub fn new() -> EdgeQueue {
-        EdgeQueue { stamps: [Nanos(0); EDGES], len: 0, refused: 0, unmatched: 0 }
-    }
-
-    pub fn len(&self) -> usize {
-        self.len
-    }
-
-    pub fn is_empty(&self) -> bool {
-        self.len == 0
+    /// The stamps, oldest first.
+    pub fn stamps(&self) -> &[Nanos] {
+        &self.stamps
     }
 
     pub fn clear(&mut self) {
-        self.len = 0;
+        self.stamps.clear();
     }
 
     pub fn push(&mut self, t: Nanos, now: Nanos) {
         let foreign = (now - t).0.saturating_abs() > FOREIGN.0;
-        let old = self.as_slice().last().is_some_and(|last| t <= *last);
-        if foreign || old || self.len == EDGES {
+        let old = self.stamps.last().is_some_and(|last| t <= *last);
+        if foreign || old || self.stamps.push(t).is_err() {
             self.refused += 1;
-            return;
         }
-        self.stamps[self.len] = t;
-        self.len += 1;
-    }
-
-    pub fn as_slice(&self) -> &[Nanos] {
-        &self.stamps[..self.len]
     }
 
     /// Finds the edges of the `n` samples of a read that began at `before`: `of[i]` is that of sample i. Uses up the
@@ -75,39 +61,30 @@ impl EdgeQueue {
     pub fn pair(&mut self, n: usize, before: Nanos, period: Span, of: &mut Vec<Option<Nanos>>) {
         of.clear();
         of.resize(n, None);
-        let latest = self.as_slice().last().copied();
+        let latest = self.stamps.last().copied();
         let late = before - Span(period.0 / 10);
-        let surplus = usize::from(self.len == n + 1 && latest > Some(late));
-        let edges = self.len - surplus;
+        let surplus = latest.filter(|t| self.stamps.len() == n + 1 && *t > late);
+        let edges = self.stamps.len() - usize::from(surplus.is_some());
         if edges == n {
-            of.iter_mut().zip(&self.stamps).for_each(|(of, t)| *of = Some(*t));
+            of.iter_mut().zip(self.stamps.iter()).for_each(|(of, t)| *of = Some(*t));
         } else {
             self.unmatched += edges.abs_diff(n) as u64;
             self.pair_by_age(n, before, period, of);
         }
-        self.stamps[0] = self.stamps[edges.min(EDGES - 1)];
-        self.len = surplus;
+        self.stamps.retain(|t| Some(*t) == surplus);
     }
-}
 
-impl EdgeQueue {
     /// The newest sample was taken less than a period before the read, so the last edge is its own if it is as young;
     /// an older one is of a sample as many periods before. The others follow from their distance to it.
     fn pair_by_age(&self, n: usize, before: Nanos, period: Span, of: &mut [Option<Nanos>]) {
-        let Some(latest) = self.as_slice().last() else { return };
+        let Some(latest) = self.stamps.last() else { return };
         let periods = |span: Span, round: f64| ((span.0.max(0) as f64 / period.0.max(1) as f64) + round) as usize;
         // A tenth for what the period and the moment of the count are not known to.
         let back = periods(before - *latest, 0.1);
-        for t in self.as_slice().iter().rev() {
+        for t in self.stamps.iter().rev() {
             let sample = n.checked_sub(1 + back + periods(*latest - *t, 0.5)).and_then(|i| of.get_mut(i));
             sample.into_iter().for_each(|of| *of = of.or(Some(*t)));
         }
-    }
-}
-
-impl Default for EdgeQueue {
-    fn default() -> Self {
-        EdgeQueue::new()
     }
 }
 
@@ -119,7 +96,7 @@ mod tests {
     const PERIOD: Span = Span(100);
 
     fn queue(stamps: &[i64]) -> EdgeQueue {
-        let mut queue = EdgeQueue::new();
+        let mut queue = EdgeQueue::default();
         stamps.iter().for_each(|t| queue.push(Nanos(*t), Nanos(*t)));
         queue
     }
@@ -134,14 +111,14 @@ mod tests {
     fn as_many_edges_as_samples_are_paired_in_order_however_uneven() {
         let mut q = queue(&[100, 201, 450]);
         assert_eq!(paired(&mut q, 3, 470), [Some(100), Some(201), Some(450)]);
-        assert!(q.is_empty() && q.unmatched == 0);
+        assert!(q.stamps().is_empty() && q.unmatched == 0);
     }
 
     #[test]
     fn an_edge_that_came_while_the_samples_were_counted_waits_for_the_next_read() {
         let mut q = queue(&[100, 200, 300]);
         assert_eq!(paired(&mut q, 2, 299), [Some(100), Some(200)]);
-        assert_eq!(q.as_slice(), [Nanos(300)]);
+        assert_eq!(q.stamps(), [Nanos(300)]);
         q.push(Nanos(400), Nanos(400));
         assert_eq!(paired(&mut q, 2, 420), [Some(300), Some(400)]);
         assert_eq!(q.unmatched, 0);
@@ -160,7 +137,7 @@ mod tests {
         [300, 400, 500].into_iter().for_each(|t| q.push(Nanos(t), Nanos(t)));
         assert_eq!(paired(&mut q, 2, 550), [Some(400), Some(500)]);
         assert_eq!(q.unmatched, 2);
-        assert!(q.is_empty());
+        assert!(q.stamps().is_empty());
         assert_eq!(paired(&mut queue(&[]), 2, 320), [None; 2]);
     }
 
@@ -171,7 +148,7 @@ mod tests {
         assert_eq!(q.unmatched, 2);
         let mut q = queue(&[100]);
         assert_eq!(paired(&mut q, 0, 420), []);
-        assert_eq!((q.unmatched, q.len()), (1, 0), "an old edge without a sample is not kept");
+        assert_eq!((q.unmatched, q.stamps().len()), (1, 0), "an old edge without a sample is not kept");
     }
 
     #[test]
@@ -180,11 +157,11 @@ mod tests {
         q.push(Nanos(100), Nanos(100));
         q.push(Nanos(1_700_000_000_000_000_000), Nanos(200));
         q.push(Nanos(i64::MIN), Nanos(200));
-        assert_eq!((q.len(), q.refused), (1, 3));
+        assert_eq!((q.stamps().len(), q.refused), (1, 3));
         for t in 0..300 {
             q.push(Nanos(1000 + t), Nanos(1000));
         }
-        assert_eq!((q.len(), q.refused), (EDGES, 3 + 300 + 1 - EDGES as u64));
+        assert_eq!((q.stamps().len(), q.refused), (EDGES, 3 + 300 + 1 - EDGES as u64));
     }
 
     proptest! {
@@ -197,9 +174,9 @@ mod tests {
             let mut q = queue(&stamps);
             let of = paired(&mut q, n, before);
             prop_assert_eq!(of.len(), n);
-            let given: Vec<i64> = of.into_iter().flatten().chain(q.as_slice().iter().map(|t| t.0)).collect();
+            let given: Vec<i64> = of.into_iter().flatten().chain(q.stamps().iter().map(|t| t.0)).collect();
             prop_assert!(given.windows(2).all(|w| w[0] < w[1]));
-            prop_assert!(q.len() <= 1);
+            prop_assert!(q.stamps().len() <= 1);
         }
     }
 }

@@ -108,7 +108,7 @@ mod tests {
     }
 
     fn drained(merge: &mut Merge) -> Vec<(i64, f64)> {
-        let mut batch = ImuBatch::new();
+        let mut batch = ImuBatch::default();
         merge.drain(&mut batch);
         batch.iter().map(|r| (r.sample.t.0, r.sample.accel_body.x.round())).collect()
     }
@@ -120,7 +120,7 @@ mod tests {
         assert_eq!(drained(&mut merge), [(3, 6.0), (10, 20.0)]);
         assert_eq!(drained(&mut merge), [], "the later neighbour of 14 has not come");
         merge.push(Reading { saturated: true, temperature_c: Some(30.0), ..accel(20) });
-        let mut batch = ImuBatch::new();
+        let mut batch = ImuBatch::default();
         merge.drain(&mut batch);
         assert!(batch.len() == 1 && batch[0].saturated && batch[0].temperature_c == Some(30.0));
         assert!((batch[0].sample.accel_body.x - 28.0).abs() < 1e-12);

@@ -90,7 +90,7 @@ impl<B: Bus, E: Edges> RegisterImu<B, E> {
             units,
             edges,
             edges_from: Nanos::MIN,
-            queue: EdgeQueue::new(),
+            queue: EdgeQueue::default(),
             merge,
             limits,
             state: State::Running,
@@ -180,7 +180,7 @@ impl<B: Bus, E: Edges> RegisterImu<B, E> {
                 return true;
             }
             let now = self.now();
-            if self.queue.len() >= self.limits.watermark as usize || now >= late {
+            if self.queue.stamps().len() >= self.limits.watermark as usize || now >= late {
                 return true;
             }
             if now >= limit {

@@ -53,7 +53,7 @@ fn record(sink: Box<dyn Sink>, frames: usize, slots: usize) -> (Duration, Record
     let mut slowest = Duration::ZERO;
     std::thread::scope(|s| {
         s.spawn(move || {
-            let mut batch = ImuBatch::new();
+            let mut batch = ImuBatch::default();
             while unit.next(Span(100 * MS), &mut batch).unwrap() != Wait::Ended {}
         });
         let mut out = shape;

@@ -143,7 +143,7 @@ fn scan(axes: &[i16], temperature: i16, t: Nanos) -> Vec<u8> {
 }
 
 fn next(imu: &mut IioImu) -> (Result<Wait, SourceFault>, Vec<ImuReading>) {
-    let mut batch = ImuBatch::new();
+    let mut batch = ImuBatch::default();
     let wait = imu.next(Span(30 * MS), &mut batch);
     (wait, batch.to_vec())
 }

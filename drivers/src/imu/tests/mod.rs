@@ -81,7 +81,7 @@ impl Rig {
     /// Calls `next` for so long of the simulated clock.
     fn run(&mut self, span_ms: i64) {
         let until = self.buses[0].instant() + span_ms * MS;
-        let mut batch = ImuBatch::new();
+        let mut batch = ImuBatch::default();
         while self.buses[0].instant() < until {
             let from = self.buses[0].instant();
             match self.imu.next(Span(50 * MS), &mut batch) {
