@@ -8,8 +8,8 @@
 mod world;
 
 use stipple::config::{StereoConfig, StereoMethod};
-use stipple::output::process::rss_peak_bytes;
 use stipple::stereo::{Disparity, Method};
+use stipple_drivers::host::rss_peak_bytes;
 use stipple_drivers::Image;
 use world::Noise;
 

@@ -1,27 +1,21 @@
-//! The few things asked of the operating system.
+//! What the program asks of the operating system: priority, clocks, signals, memory and disk.
 #![allow(unsafe_code)]
 
+use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-/// Work that may wait, in the order in which it is served after reading the sensors and odometry: the nice value of its
-/// threads. What is not recorded in time is lost, what is not mapped in time comes later.
-#[derive(Clone, Copy, Debug)]
-pub enum Waits {
-    Recording = 5,
-    Mapping = 10,
-}
-
-/// Makes the calling thread yield to others. Threads it starts from then on inherit it:
-/// a Vulkan device opened by such a thread renders on the CPU, where it does, behind odometry.
-pub fn lower_priority(waits: Waits) {
+/// Raises the calling thread's nice value to `nice` (0 to 19): others are served before it. Threads that it starts from
+/// then on inherit the value, those of a Vulkan driver that renders on the CPU included.
+pub fn lower_priority(nice: i32) {
     // SAFETY: plain integers; `0` means the calling thread. Failing leaves the priority as it was.
     unsafe {
-        libc::setpriority(libc::PRIO_PROCESS, 0, waits as i32);
+        libc::setpriority(libc::PRIO_PROCESS, 0, nice);
     }
 }
 
-/// CPU time, s: of the program, and of the kernel on its behalf. The kernel knows the sum exactly and divides it by what it
-/// met at its ticks, so the parts are worth something after a second or more.
+/// CPU time, s, of the program's own code and of the kernel on its behalf. Their sum is exact, as of the thread's last
+/// timer tick or switch; how it splits is estimated from what the kernel met at its ticks, so the parts mean something
+/// after a second or more.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct CpuTime {
     pub user_s: f64,
@@ -29,6 +23,7 @@ pub struct CpuTime {
 }
 
 impl CpuTime {
+    /// CPU time in all, s.
     pub fn total_s(self) -> f64 {
         self.user_s + self.kernel_s
     }
@@ -41,7 +36,7 @@ impl std::ops::Sub for CpuTime {
     }
 }
 
-/// Of the calling thread so far.
+/// CPU time that the calling thread has used so far. Allocates nothing.
 pub fn thread_cpu() -> CpuTime {
     // SAFETY: a struct of integers may be zero, and outlives the call; the calling thread can always be asked for.
     let used = unsafe {
@@ -53,7 +48,7 @@ pub fn thread_cpu() -> CpuTime {
     CpuTime { user_s: secs(used.ru_utime), kernel_s: secs(used.ru_stime) }
 }
 
-/// CLOCK_MONOTONIC, in which drivers stamp frames and edges.
+/// Now by `CLOCK_MONOTONIC`, in which the kernel stamps frames, edges and inertial samples.
 pub fn monotonic() -> crate::Nanos {
     let mut t = libc::timespec { tv_sec: 0, tv_nsec: 0 };
     // SAFETY: `t` outlives the call; the clock exists on every Linux.
@@ -61,7 +56,7 @@ pub fn monotonic() -> crate::Nanos {
     crate::Nanos(t.tv_sec * 1_000_000_000 + t.tv_nsec)
 }
 
-/// From now on a write that nobody reads any more ends the program quietly, as it does others; Rust would panic.
+/// Makes a write to a closed pipe end the program quietly, as it ends others (`| head`); Rust's default is a panic.
 pub fn end_when_unread() {
     // SAFETY: sets the signal's own default action; no handler of ours is involved.
     unsafe {
@@ -75,8 +70,8 @@ extern "C" fn ask_to_stop(_signal: libc::c_int) {
     STOP.store(true, Ordering::Relaxed);
 }
 
-/// From the first call on SIGINT and SIGTERM set this flag and end nothing; the second of a kind ends the program as
-/// it would have without.
+/// The flag that SIGINT and SIGTERM set, from the first call on, instead of ending the program. The second signal of a
+/// kind ends it as it would have without.
 pub fn stop_asked_for() -> &'static AtomicBool {
     // SAFETY: the handler does nothing but store to an atomic, which a signal may do. The struct is plain integers, for
     // which zero is valid.
@@ -91,8 +86,8 @@ pub fn stop_asked_for() -> &'static AtomicBool {
     &STOP
 }
 
-/// What can be written below `at`, bytes.
-pub fn disk_free(at: &std::path::Path) -> Option<u64> {
+/// Bytes that can still be written below the folder `at`; `None` where there is no such folder.
+pub fn disk_free(at: &Path) -> Option<u64> {
     let path = std::ffi::CString::new(at.as_os_str().as_encoded_bytes()).ok()?;
     // SAFETY: plain integers, for which zero is valid; `path` and `s` outlive the call.
     let (asked, s) = unsafe {
@@ -102,22 +97,52 @@ pub fn disk_free(at: &std::path::Path) -> Option<u64> {
     (asked == 0).then(|| s.f_bavail * s.f_frsize)
 }
 
-/// Memory that can be had without swapping, bytes.
+/// Memory that can be had without swapping, bytes; `None` where /proc is absent.
 pub fn memory_available() -> Option<u64> {
-    let text = std::fs::read_to_string("/proc/meminfo").ok()?;
-    let line = text.lines().find_map(|l| l.strip_prefix("MemAvailable:"))?;
-    Some(line.split_whitespace().next()?.parse::<u64>().ok()? * 1024)
+    proc_bytes("/proc/meminfo", "MemAvailable:")
+}
+
+/// Largest resident set of this process so far, bytes; `None` where /proc is absent.
+pub fn rss_peak_bytes() -> Option<u64> {
+    proc_bytes("/proc/self/status", "VmHWM:")
+}
+
+/// A value that a file of /proc gives in KiB, in bytes.
+fn proc_bytes(file: &str, key: &str) -> Option<u64> {
+    let text = std::fs::read_to_string(file).ok()?;
+    let kib = text.lines().find_map(|line| line.strip_prefix(key))?.split_whitespace().next()?;
+    Some(kib.parse::<u64>().ok()? * 1024)
 }
 
 #[cfg(test)]
 mod tests {
+    #![allow(clippy::unwrap_used)]
     use super::*;
-    use std::path::Path;
+    use std::time::{Duration, Instant};
 
     #[test]
     fn what_the_system_does_not_know_is_none() {
         assert!(disk_free(Path::new("/tmp")).is_some_and(|bytes| bytes > 0));
         assert_eq!([disk_free(Path::new("/no/such/folder")), disk_free(Path::new("/tmp\0"))], [None; 2]);
         assert!(memory_available().is_some_and(|bytes| bytes > 0));
+    }
+
+    #[test]
+    fn peak_resident_set_grows_with_touched_memory() {
+        let before = rss_peak_bytes().unwrap();
+        let touched = std::hint::black_box(vec![1u8; 64 << 20]);
+        let after = rss_peak_bytes().unwrap();
+        assert!(after >= before && after >= touched.len() as u64, "{before} {after}");
+    }
+
+    #[test]
+    fn sleeping_costs_no_cpu_time_and_spinning_does() {
+        let start = thread_cpu();
+        std::thread::sleep(Duration::from_millis(60));
+        let slept = (thread_cpu() - start).total_s();
+        while (thread_cpu() - start).total_s() < 0.05 {
+            std::hint::black_box(Instant::now());
+        }
+        assert!(slept < 0.04, "{slept}");
     }
 }

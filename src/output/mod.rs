@@ -10,7 +10,6 @@ pub mod html;
 pub mod metrics;
 pub mod panel;
 pub mod ply;
-pub mod process;
 pub mod report;
 pub mod trajectory;
 

@@ -12,6 +12,8 @@ use std::sync::atomic::Ordering::Relaxed;
 use std::time::{Duration, Instant};
 use stipple_drivers::{host, Calibration, Fault, Frames, Image, Nanos, Pose};
 
+/// Nice value of the threads that map: after the sensors, odometry and recording. What is not mapped in time comes later.
+pub const NICE: i32 = 10;
 /// Time handed to the mapper at once; between slices it looks at its queues.
 pub const SLICE: Duration = Duration::from_millis(50);
 /// Pause of a mapper with nothing to do.
@@ -40,7 +42,7 @@ impl Mapping {
     /// that odometry is served first.
     pub fn open(calibration: &Calibration, board: &Board) -> Result<Mapping, Fault> {
         let build = || {
-            host::lower_priority(host::Waits::Mapping);
+            host::lower_priority(NICE);
             Mapper::open(calibration, board)
         };
         let mapper = std::thread::scope(|s| s.spawn(build).join().expect("boot faults are values, not panics"))?;
@@ -263,7 +265,7 @@ pub fn map(
     tracked: impl Fn() -> bool,
     over: impl Fn(f64) -> bool,
 ) -> Mapping {
-    host::lower_priority(host::Waits::Mapping);
+    host::lower_priority(NICE);
     seal_thread();
     loop {
         let tracked = tracked();

@@ -9,9 +9,9 @@ use crate::output::html::{write_html, Evidence};
 use crate::output::metrics::{percentile, trajectory_error, TrajectoryError};
 use crate::output::panel::{panel, Picture, View};
 use crate::output::report::{seconds_to, CurvePoint, ExtrinsicsFound, KernelTime, Report, GOOD_DB};
-use crate::output::{atomically, ply, process, trajectory, OutputDir};
+use crate::output::{atomically, ply, trajectory, OutputDir};
 use crate::vio::rig::RigEstimate;
-use stipple_drivers::{Fault, Nanos, TimedPose};
+use stipple_drivers::{host, Fault, Nanos, TimedPose};
 
 /// Keyframes drawn into DIR/renders.
 const PANELS: usize = 12;
@@ -80,7 +80,7 @@ pub fn conclude(title: Title, mut flown: Flown, out: &OutputDir) -> Result<Repor
         (report.camera_cpu_ms, report.camera_kernel_ms) = capture.ms_a_frame().unzip();
         report.camera_copies = capture.copies(&flown.source);
     }
-    report.rss_peak_bytes = process::rss_peak_bytes();
+    report.rss_peak_bytes = host::rss_peak_bytes();
     report.set_counters(&counted(&flown, &title.opened));
     if let Some(run) = flown.tracker.odometry() {
         report.set_health(run.back.tally().health());

@@ -18,7 +18,6 @@ use crate::counters::Counters;
 use crate::frontend::{Frontend, Prediction, Tracks};
 use crate::limits::IMU_BETWEEN_FRAMES;
 use crate::mem::{seal_thread, List};
-use crate::output::process::thread_cpu_secs;
 use crate::vio::health::Health;
 use crate::vio::predict::Predictor;
 use crate::vio::rig::RigEstimate;
@@ -29,6 +28,7 @@ use crossbeam_queue::ArrayQueue;
 use std::sync::atomic::AtomicBool;
 use std::sync::Arc;
 use std::time::Instant;
+use stipple_drivers::host::thread_cpu;
 use stipple_drivers::types::pose_at;
 use stipple_drivers::{Calibration, Fault, Frames, ImuSample, Nanos, Pose, Span, TimedPose};
 
@@ -387,7 +387,7 @@ pub fn in_turns(
         (predictor, next) = (next, back.predictor());
         give(packet);
     }
-    front.cpu_s = thread_cpu_secs();
+    front.cpu_s = Some(thread_cpu().total_s());
 }
 
 /// Thread `frontend`, where each half has its own; `start` predicts the first frames.
@@ -414,7 +414,7 @@ pub fn follow_points(
         let _ = link.tracked.push(packet);
         link.back.wake();
     }
-    front.cpu_s = thread_cpu_secs();
+    front.cpu_s = Some(thread_cpu().total_s());
 }
 
 /// Thread `estimator`.
@@ -427,7 +427,7 @@ pub fn estimate(link: &Link, back: &mut Back, mut give: impl FnMut(Box<FramePack
         link.taker.wake();
         give(packet);
     }
-    back.cpu_s = thread_cpu_secs();
+    back.cpu_s = Some(thread_cpu().total_s());
 }
 
 /// From here on the thread allocates nothing; what asking for its own handle allocates comes first.

@@ -38,6 +38,8 @@ pub enum Format {
     Mcap,
 }
 
+/// Nice value of the writer's thread: after the sensors and odometry, before a map. What is not written in time is lost.
+const NICE: i32 = 5;
 /// Samples that wait for the writer beside the frames: eight seconds of a 1 kHz unit.
 const IMU_SLOTS: usize = 8192;
 
@@ -130,7 +132,7 @@ pub fn start(mut sink: Box<dyn Sink>, shape: &Frames, slots: usize) -> (Recorder
     let counts = Arc::new(Counts::default());
     let c = counts.clone();
     let thread = std::thread::spawn(move || {
-        host::lower_priority(host::Waits::Recording);
+        host::lower_priority(NICE);
         let mut failure: Option<String> = None;
         let mut fails = |counter: &AtomicU64, e: io::Error| {
             counter.fetch_add(1, Relaxed);

@@ -7,8 +7,8 @@ use stipple::config::Board;
 use stipple::frontend::{Frontend, Prediction};
 use stipple::math::real::Real;
 use stipple::output::metrics::{percentile, trajectory_error};
-use stipple::output::process::thread_cpu_secs;
 use stipple::vio::{Estimator, Scalar};
+use stipple_drivers::host::thread_cpu;
 use stipple_drivers::{Fault, TimedPose};
 
 /// What is not measured is `None`: no error without a trajectory.
@@ -50,7 +50,7 @@ fn measure_in<S: Real>(flight: &Flight, board: &Board) -> Result<Figures, Fault>
     let mut trajectory: Vec<TimedPose> = Vec::with_capacity(n);
     let (mut frontend_ms, mut estimator_ms) = (Vec::with_capacity(n), Vec::with_capacity(n));
     let mut samples = flight.imu.iter();
-    let (start, cpu) = (Instant::now(), thread_cpu_secs());
+    let (start, cpu) = (Instant::now(), thread_cpu());
     for frames in &flight.frames {
         // Up to the first sample at or past the frame, as `stipple replay` in lockstep.
         for sample in samples.by_ref() {
@@ -71,7 +71,7 @@ fn measure_in<S: Real>(flight: &Flight, board: &Board) -> Result<Figures, Fault>
         }
     }
     let wall = start.elapsed().as_secs_f64();
-    let cpu = thread_cpu_secs().zip(cpu).map_or(wall, |(end, start)| end - start);
+    let cpu = (thread_cpu() - cpu).total_s();
     let error = trajectory_error(&trajectory, &flight.truth);
     let (of, stats) = (n.max(1) as f64, vio.stats());
     let rank = |ms: &[f64], p: f64| percentile(ms, p).unwrap_or(0.0);
