@@ -1,22 +1,10 @@
 //! Every drop, reject, overflow and fault has a counter and a name. Counters never wrap and never
 //! allocate; the report lists those that are not zero.
 
-use std::sync::atomic::{AtomicU64, Ordering};
+pub use stipple_drivers::counters::Counter;
 
-macro_rules! counters {
-    ($($(#[doc = $doc:literal])* $name:ident),+ $(,)?) => {
-        #[derive(Debug, Default)]
-        pub struct Counters { $($(#[doc = $doc])* pub $name: Counter),+ }
-        impl Counters {
-            /// Name and value of each, in declaration order.
-            pub fn list(&self) -> Vec<(&'static str, u64)> {
-                vec![$((stringify!($name), self.$name.get())),+]
-            }
-        }
-    };
-}
-
-counters! {
+stipple_drivers::counters! {
+    pub struct Counters of Counter, read by Counter::get;
     /// Frames replaced in the mailbox before the tracker took them.
     frames_overwritten,
     /// Frames whose stamp the table of poses does not cover.
@@ -106,17 +94,4 @@ counters! {
     gradients_rejected,
     /// GPU submissions that failed.
     gpu_failures,
-}
-
-#[derive(Debug, Default)]
-pub struct Counter(AtomicU64);
-
-impl Counter {
-    pub fn add(&self, n: u64) {
-        self.0.fetch_add(n, Ordering::Relaxed);
-    }
-
-    pub fn get(&self) -> u64 {
-        self.0.load(Ordering::Relaxed)
-    }
 }

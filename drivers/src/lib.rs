@@ -8,6 +8,7 @@
 
 pub mod calibration;
 pub mod camera;
+pub mod counters;
 pub mod euroc;
 pub mod fault;
 pub mod gpio;

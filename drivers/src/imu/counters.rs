@@ -3,20 +3,9 @@
 use super::bus::BusFault;
 use super::die::Trouble;
 
-macro_rules! counters {
-    ($($(#[doc = $doc:literal])* $name:ident),+ $(,)?) => {
-        #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-        pub struct ImuCounters { $($(#[doc = $doc])* pub $name: u64),+ }
-        impl ImuCounters {
-            /// Name and value of each, in declaration order.
-            pub fn list(&self) -> Vec<(&'static str, u64)> {
-                vec![$((stringify!($name), self.$name)),+]
-            }
-        }
-    };
-}
-
-counters! {
+crate::counters! {
+    #[derive(Clone, Copy, PartialEq, Eq)]
+    pub struct ImuCounters of u64, read by u64::clone;
     /// Transfers that nobody acknowledged.
     imu_nacks,
     /// Transfers that ended before all was said, and reads that held no whole sample.

@@ -11,9 +11,10 @@ mod mcap;
 pub use euroc::EurocSink;
 pub use mcap::McapSink;
 
+use crate::counters::Counter;
 use crate::source::{FrameSource, ImuBatch, ImuReading, ImuSource, SourceFault, Wait};
 use crate::types::{Frames, Span};
-use crate::{host, Calibration, Exit, Fault};
+use crate::{counters, host, Calibration, Exit, Fault};
 use std::io;
 use std::path::Path;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
@@ -48,19 +49,20 @@ pub fn ring_bytes(frame_bytes: usize, slots: usize) -> usize {
     slots * frame_bytes + (slots + IMU_SLOTS) * size_of::<Item>()
 }
 
-#[derive(Default)]
-struct Counts {
-    frames: AtomicU64,
-    /// Frames in the ring, and most there ever were.
-    waiting: AtomicU64,
-    waiting_most: AtomicU64,
+counters! {
+    struct Counts of Counter, read by Counter::get;
+    /// Frames written, frames dropped for a full ring, and frames whose writing failed.
+    record_frames_written,
+    record_frames_dropped,
+    record_frames_failed,
+    /// Most frames that waited in the ring.
+    record_ring_most,
     /// CPU time of the writer, us.
-    cpu_us: AtomicU64,
-    frames_dropped: AtomicU64,
-    frames_failed: AtomicU64,
-    imu: AtomicU64,
-    imu_dropped: AtomicU64,
-    imu_failed: AtomicU64,
+    record_cpu_us,
+    /// Inertial samples written, dropped for a full ring, and failed.
+    record_imu_written,
+    record_imu_dropped,
+    record_imu_failed,
 }
 
 enum Item {
@@ -92,6 +94,8 @@ struct FrameTap {
     spare: Receiver<Box<Frames>>,
     items: SyncSender<Item>,
     counts: Arc<Counts>,
+    /// Frames in the ring.
+    waiting: Arc<AtomicU64>,
 }
 
 struct ImuTap {
@@ -129,38 +133,35 @@ pub fn start(mut sink: Box<dyn Sink>, shape: &Frames, slots: usize) -> (Recorder
     for _ in 0..slots {
         let _ = give_back.send(Box::new(shape.clone()));
     }
-    let counts = Arc::new(Counts::default());
-    let c = counts.clone();
+    let (counts, in_ring) = (Arc::new(Counts::default()), Arc::new(AtomicU64::new(0)));
+    let (c, taken) = (counts.clone(), in_ring.clone());
     let thread = std::thread::spawn(move || {
         host::lower_priority(NICE);
         let mut failure: Option<String> = None;
-        let mut fails = |counter: &AtomicU64, e: io::Error| {
-            counter.fetch_add(1, Relaxed);
-            failure.get_or_insert_with(|| e.to_string());
+        let mut count = |done: io::Result<()>, good: &Counter, bad: &Counter| match done {
+            Ok(()) => good.add(1),
+            Err(e) => {
+                bad.add(1);
+                failure.get_or_insert_with(|| e.to_string());
+            }
         };
         while let Ok(item) = waiting.recv() {
             match item {
                 Item::Frames(frames) => {
-                    match sink.frames(&frames) {
-                        Ok(()) => drop(c.frames.fetch_add(1, Relaxed)),
-                        Err(e) => fails(&c.frames_failed, e),
-                    }
+                    count(sink.frames(&frames), &c.record_frames_written, &c.record_frames_failed);
                     let _ = give_back.send(frames);
-                    c.waiting.fetch_sub(1, Relaxed);
+                    taken.fetch_sub(1, Relaxed);
                 }
-                Item::Imu(reading) => match sink.imu(&reading) {
-                    Ok(()) => drop(c.imu.fetch_add(1, Relaxed)),
-                    Err(e) => fails(&c.imu_failed, e),
-                },
+                Item::Imu(reading) => count(sink.imu(&reading), &c.record_imu_written, &c.record_imu_failed),
             }
         }
         if let Err(e) = sink.finish() {
             failure.get_or_insert_with(|| e.to_string());
         }
-        c.cpu_us.store((1e6 * host::thread_cpu().total_s()) as u64, Relaxed);
+        c.record_cpu_us.add((1e6 * host::thread_cpu().total_s()) as u64);
         failure
     });
-    let frames = FrameTap { spare, items: items.clone(), counts: counts.clone() };
+    let frames = FrameTap { spare, items: items.clone(), counts: counts.clone(), waiting: in_ring };
     let imu = ImuTap { items, counts: counts.clone() };
     (Recorder { counts, thread }, Taps { frames, imu })
 }
@@ -169,30 +170,18 @@ impl Recorder {
     /// Waits until all that was taken is written; the taps must be gone.
     pub fn finish(self) -> Recorded {
         let failure = self.thread.join().unwrap_or_else(|_| Some("the writer ended early".into()));
-        let c = &self.counts;
-        let counters = [
-            ("record_frames_written", &c.frames),
-            ("record_frames_dropped", &c.frames_dropped),
-            ("record_frames_failed", &c.frames_failed),
-            ("record_ring_most", &c.waiting_most),
-            ("record_cpu_us", &c.cpu_us),
-            ("record_imu_written", &c.imu),
-            ("record_imu_dropped", &c.imu_dropped),
-            ("record_imu_failed", &c.imu_failed),
-        ];
-        Recorded { counters: counters.map(|(name, n)| (name, n.load(Relaxed))).to_vec(), failure }
+        Recorded { counters: self.counts.list(), failure }
     }
 }
 
 impl FrameTap {
     fn take(&mut self, frames: &Frames) {
         let Ok(mut slot) = self.spare.try_recv() else {
-            self.counts.frames_dropped.fetch_add(1, Relaxed);
+            self.counts.record_frames_dropped.add(1);
             return;
         };
         slot.copy_from(frames);
-        let waiting = self.counts.waiting.fetch_add(1, Relaxed) + 1;
-        self.counts.waiting_most.fetch_max(waiting, Relaxed);
+        self.counts.record_ring_most.raise(self.waiting.fetch_add(1, Relaxed) + 1);
         // The queue has room for every slot and as many samples as are let in beside them.
         let _ = self.items.try_send(Item::Frames(slot));
     }
@@ -201,7 +190,7 @@ impl FrameTap {
 impl ImuTap {
     fn take(&mut self, reading: &ImuReading) {
         if self.items.try_send(Item::Imu(*reading)).is_err() {
-            self.counts.imu_dropped.fetch_add(1, Relaxed);
+            self.counts.record_imu_dropped.add(1);
         }
     }
 }

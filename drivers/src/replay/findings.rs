@@ -6,26 +6,10 @@ use std::path::Path;
 /// Warnings printed of one kind; the rest are only counted.
 pub const WARNINGS_OF_A_KIND: u64 = 20;
 
-macro_rules! counters {
-    ($($(#[doc = $doc:literal])* $name:ident),+ $(,)?) => {
-        /// Faults of a recording, by kind.
-        #[derive(Clone, Debug, Default, PartialEq, Eq)]
-        pub struct ReplayCounters { $($(#[doc = $doc])* pub $name: u64),+ }
-        impl ReplayCounters {
-            /// Name and value of each, in declaration order.
-            pub fn list(&self) -> Vec<(&'static str, u64)> {
-                vec![$((stringify!($name), self.$name)),+]
-            }
-
-            /// Adds the counts of another (those of a `Reader` to those of its `Recording`).
-            pub fn add(&mut self, other: &ReplayCounters) {
-                $(self.$name += other.$name;)+
-            }
-        }
-    };
-}
-
-counters! {
+crate::counters! {
+    /// Faults of a recording, by kind.
+    #[derive(Clone, PartialEq, Eq)]
+    pub struct ReplayCounters of u64, read by u64::clone;
     /// Rows of a csv that could not be read: letters, missing or additional fields.
     rows_malformed,
     /// Rows with the stamp of another row of the same table.

@@ -84,20 +84,10 @@ const AWAY_PART: i64 = 4;
 /// Warnings kept.
 const WARNINGS_MAX: usize = 32;
 
-macro_rules! counters {
-    ($($(#[doc = $doc:literal])* $name:ident),+ $(,)?) => {
-        /// What cameras met, since they were opened first.
-        #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-        pub struct CameraCounters { $($(#[doc = $doc])* pub $name: u64),+ }
-        impl CameraCounters {
-            pub fn list(&self) -> Vec<(&'static str, u64)> {
-                vec![$((stringify!($name), self.$name)),+]
-            }
-        }
-    };
-}
-
-counters! {
+crate::counters! {
+    /// What cameras met, since they were opened first.
+    #[derive(Clone, Copy, PartialEq, Eq)]
+    pub struct CameraCounters of u64, read by u64::clone;
     /// Frames given: one image of every camera.
     camera_frames,
     /// Calls that waited in vain.
