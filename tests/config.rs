@@ -6,7 +6,7 @@ use std::path::Path;
 use stipple::config::{Board, StereoMethod};
 use stipple_drivers::gpio::Edge;
 use stipple_drivers::imu::ImuOptions;
-use stipple_drivers::{Exit, Fault};
+use stipple_drivers::{Fault, FaultKind};
 
 const BOARD: &str = r#"name = "test"
 memory_max_mib = 256
@@ -27,11 +27,11 @@ fn parse(text: &str, overrides: &[&str]) -> Result<Board, Fault> {
     Board::parse("test.toml", text, &overrides)
 }
 
-/// The fault must be one line, exit with the code, and contain every part.
-fn refused(result: Result<Board, Fault>, exit: Exit, parts: &[&str]) {
+/// The fault must be one line, of that kind, and contain every part.
+fn refused(result: Result<Board, Fault>, kind: FaultKind, parts: &[&str]) {
     let fault = result.expect_err("must be refused");
     let line = fault.to_string();
-    assert_eq!(fault.exit, exit, "{line}");
+    assert_eq!(fault.kind, kind, "{line}");
     assert!(!line.contains('\n') && !fault.fix.is_empty(), "{line}");
     for part in parts {
         assert!(line.contains(part), "`{part}` is not in `{line}`");
@@ -42,51 +42,63 @@ fn refused(result: Result<Board, Fault>, exit: Exit, parts: &[&str]) {
 fn unknown_key_is_named_with_its_line() {
     refused(
         parse(&BOARD.replace("keyframes", "keyframs"), &[]),
-        Exit::Config,
+        FaultKind::Config,
         &["test.toml:7", "keyframs", "keyframes"],
     );
-    refused(parse(&format!("{BOARD}colour = 3\n"), &[]), Exit::Config, &["test.toml:13", "colour"]);
-    refused(parse(&format!("{BOARD}[maps]\n"), &[]), Exit::Config, &["test.toml:13", "maps"]);
+    refused(parse(&format!("{BOARD}colour = 3\n"), &[]), FaultKind::Config, &["test.toml:13", "colour"]);
+    refused(parse(&format!("{BOARD}[maps]\n"), &[]), FaultKind::Config, &["test.toml:13", "maps"]);
 }
 
 #[test]
 fn missing_key_and_broken_syntax_are_named() {
-    refused(parse(&BOARD.replace("splats = 10000\n", ""), &[]), Exit::Config, &["test.toml", "missing", "splats"]);
-    refused(parse(&BOARD.replace("= 40", "= = 40"), &[]), Exit::Config, &["test.toml:7"]);
-    refused(parse("", &[]), Exit::Config, &["test.toml", "name"]);
+    refused(parse(&BOARD.replace("splats = 10000\n", ""), &[]), FaultKind::Config, &["test.toml", "missing", "splats"]);
+    refused(parse(&BOARD.replace("= 40", "= = 40"), &[]), FaultKind::Config, &["test.toml:7"]);
+    refused(parse("", &[]), FaultKind::Config, &["test.toml", "name"]);
 }
 
 #[test]
 fn value_of_the_wrong_type_is_named_with_its_line() {
-    refused(parse(&BOARD.replace("= 40", "= \"forty\""), &[]), Exit::Config, &["test.toml:7", "keyframes", "forty"]);
-    refused(parse(&BOARD.replace("= 40", "= -40"), &[]), Exit::Config, &["test.toml:7", "-40"]);
+    refused(
+        parse(&BOARD.replace("= 40", "= \"forty\""), &[]),
+        FaultKind::Config,
+        &["test.toml:7", "keyframes", "forty"],
+    );
+    refused(parse(&BOARD.replace("= 40", "= -40"), &[]), FaultKind::Config, &["test.toml:7", "-40"]);
 }
 
 #[test]
 fn value_out_of_bounds_is_named_with_its_line_and_its_bound() {
     refused(
         parse(&BOARD.replace("= 10000\n", "= 10\n"), &[]),
-        Exit::Config,
+        FaultKind::Config,
         &["test.toml:5", "budget.splats = 10", "256"],
     );
-    refused(parse(&BOARD.replace("scale = 2", "scale = 3"), &[]), Exit::Config, &["test.toml:12", "map.scale = 3"]);
+    refused(
+        parse(&BOARD.replace("scale = 2", "scale = 3"), &[]),
+        FaultKind::Config,
+        &["test.toml:12", "map.scale = 3"],
+    );
     let text = format!("{BOARD}[stereo]\nblock_px = 10\n");
-    refused(parse(&text, &[]), Exit::Config, &["test.toml:14", "stereo.block_px = 10", "odd"]);
+    refused(parse(&text, &[]), FaultKind::Config, &["test.toml:14", "stereo.block_px = 10", "odd"]);
     let text = format!("{BOARD}[vio]\nhuber_px = nan\n");
-    refused(parse(&text, &[]), Exit::Config, &["test.toml:14", "vio.huber_px", "positive"]);
+    refused(parse(&text, &[]), FaultKind::Config, &["test.toml:14", "vio.huber_px", "positive"]);
 }
 
 #[test]
 fn values_that_contradict_each_other_are_named() {
     let text = format!("{BOARD}[stereo]\ndepth_min_m = 3.0\ndepth_max_m = 2.0\n");
-    refused(parse(&text, &[]), Exit::Config, &["test.toml:15", "stereo.depth_max_m", "depth_min_m"]);
-    refused(parse(BOARD, &["budget.intersections=5000"]), Exit::Config, &["--set budget.intersections=5000", "splats"]);
+    refused(parse(&text, &[]), FaultKind::Config, &["test.toml:15", "stereo.depth_max_m", "depth_min_m"]);
+    refused(
+        parse(BOARD, &["budget.intersections=5000"]),
+        FaultKind::Config,
+        &["--set budget.intersections=5000", "splats"],
+    );
     let rolling = parse(BOARD, &["rig.rolling_shutter=true"]);
-    refused(rolling, Exit::Config, &["--set rig.rolling_shutter=true", "readout_s"]);
+    refused(rolling, FaultKind::Config, &["--set rig.rolling_shutter=true", "readout_s"]);
     assert!(parse(BOARD, &["rig.readout_s=0.02", "rig.rolling_shutter=true"]).is_ok());
     // The key at fault may be a default that the file does not write.
     let text = format!("{BOARD}[frontend]\nfast_threshold_min = 90\n");
-    refused(parse(&text, &[]), Exit::Config, &["test.toml", "default", "fast_threshold"]);
+    refused(parse(&text, &[]), FaultKind::Config, &["test.toml", "default", "fast_threshold"]);
 }
 
 #[test]
@@ -99,13 +111,13 @@ fn cameras_are_named_by_what_does_not_change() {
     let camera_of = board.unwrap().camera;
     assert_eq!((camera_of.devices.len(), camera_of.controls["trigger_mode"]), (2, -1));
     let wrong = camera("rate_hz = 30\ndevices = [\"path:/dev/video0\"]");
-    refused(wrong, Exit::Config, &["test.toml:15", "camera.devices", "/dev/video0", "by-path"]);
-    refused(camera("devices = [\"0001\"]"), Exit::Config, &["test.toml:14", "names no camera"]);
-    refused(camera("format = \"rgb\""), Exit::Config, &["test.toml:14", "rgb", "yuyv"]);
+    refused(wrong, FaultKind::Config, &["test.toml:15", "camera.devices", "/dev/video0", "by-path"]);
+    refused(camera("devices = [\"0001\"]"), FaultKind::Config, &["test.toml:14", "names no camera"]);
+    refused(camera("format = \"rgb\""), FaultKind::Config, &["test.toml:14", "rgb", "yuyv"]);
     let loose = camera("devices = [\"serial:1\", \"serial:2\"]\npair_tolerance_s = 0.03");
-    refused(loose, Exit::Config, &["test.toml:15", "half a period"]);
-    refused(camera("buffers = 2"), Exit::Config, &["test.toml:14", "3 to 32"]);
-    refused(camera("gain = 2"), Exit::Config, &["test.toml:14", "gain"]);
+    refused(loose, FaultKind::Config, &["test.toml:15", "half a period"]);
+    refused(camera("buffers = 2"), FaultKind::Config, &["test.toml:14", "3 to 32"]);
+    refused(camera("gain = 2"), FaultKind::Config, &["test.toml:14", "gain"]);
 }
 
 #[test]
@@ -128,19 +140,19 @@ fn overrides_reach_nested_keys_strings_numbers_and_booleans() {
 
 #[test]
 fn overrides_obey_the_rules_of_the_file() {
-    refused(parse(BOARD, &["map.scale=4", "map.scales=1"]), Exit::Config, &["--set map.scales=1", "scales"]);
-    refused(parse(BOARD, &["nothing.here=1"]), Exit::Config, &["nothing"]);
-    refused(parse(BOARD, &["map.scale=three"]), Exit::Config, &["--set map.scale=three", "three"]);
-    refused(parse(BOARD, &["budget.splats=1"]), Exit::Config, &["--set budget.splats=1", "256"]);
-    refused(parse(BOARD, &["map.scale"]), Exit::Usage, &["--set map.scale", "'='"]);
-    refused(parse(BOARD, &["=1"]), Exit::Usage, &["--set =1", "key"]);
-    refused(parse(BOARD, &["name.x=1"]), Exit::Usage, &["`name` is a value"]);
-    refused(parse(BOARD, &["map.scale=1\nname = 2"]), Exit::Usage, &["not one value"]);
+    refused(parse(BOARD, &["map.scale=4", "map.scales=1"]), FaultKind::Config, &["--set map.scales=1", "scales"]);
+    refused(parse(BOARD, &["nothing.here=1"]), FaultKind::Config, &["nothing"]);
+    refused(parse(BOARD, &["map.scale=three"]), FaultKind::Config, &["--set map.scale=three", "three"]);
+    refused(parse(BOARD, &["budget.splats=1"]), FaultKind::Config, &["--set budget.splats=1", "256"]);
+    refused(parse(BOARD, &["map.scale"]), FaultKind::Usage, &["--set map.scale", "'='"]);
+    refused(parse(BOARD, &["=1"]), FaultKind::Usage, &["--set =1", "key"]);
+    refused(parse(BOARD, &["name.x=1"]), FaultKind::Usage, &["`name` is a value"]);
+    refused(parse(BOARD, &["map.scale=1\nname = 2"]), FaultKind::Usage, &["not one value"]);
 }
 
 #[test]
 fn an_override_cannot_hide_an_error_of_the_file() {
-    refused(parse(&format!("{BOARD}scales = 3\n"), &["map.scale=1"]), Exit::Config, &["test.toml:13", "scales"]);
+    refused(parse(&format!("{BOARD}scales = 3\n"), &["map.scale=1"]), FaultKind::Config, &["test.toml:13", "scales"]);
 }
 
 #[test]
@@ -154,26 +166,26 @@ fn an_inertial_unit_is_described_whole_or_refused() {
     let Some(ImuOptions::Register(options)) = board.imu.options() else { panic!("it is driven by its registers") };
     let wired: Vec<String> = options.wiring.iter().map(|w| w.to_string()).collect();
     assert_eq!(wired, ["/dev/i2c-1 0x68", "/dev/i2c-1 0x18"]);
-    refused(with("chip = \"bno055\"\n"), Exit::Config, &["test.toml:14", "bno055", "lsm6dsox"]);
-    refused(with("chip = \"mpu-6500\"\n"), Exit::Config, &["imu.i2c", "imu.spi"]);
-    refused(with("chip = \"bmi270\"\ni2c = \"a\"\n"), Exit::Config, &["imu.configuration", "bmi270_config_file"]);
-    refused(with("chip = \"bmi088\"\nspi = \"a\"\n"), Exit::Config, &["imu.accel_spi"]);
-    refused(with("chip = \"iio\"\n"), Exit::Config, &["imu.device"]);
+    refused(with("chip = \"bno055\"\n"), FaultKind::Config, &["test.toml:14", "bno055", "lsm6dsox"]);
+    refused(with("chip = \"mpu-6500\"\n"), FaultKind::Config, &["imu.i2c", "imu.spi"]);
+    refused(with("chip = \"bmi270\"\ni2c = \"a\"\n"), FaultKind::Config, &["imu.configuration", "bmi270_config_file"]);
+    refused(with("chip = \"bmi088\"\nspi = \"a\"\n"), FaultKind::Config, &["imu.accel_spi"]);
+    refused(with("chip = \"iio\"\n"), FaultKind::Config, &["imu.device"]);
     let line = "[gpio.data_ready]\nchip = \"tegra-gpio\"\nline = \"PQ.05\"\n";
-    refused(with(&format!("chip = \"iio\"\ndevice = \"d\"\n{line}")), Exit::Config, &["test.toml:17", "kernel"]);
+    refused(with(&format!("chip = \"iio\"\ndevice = \"d\"\n{line}")), FaultKind::Config, &["test.toml:17", "kernel"]);
     refused(
         parse(&format!("{BOARD}[gpio.led]\nline = \"3\"\n"), &[]),
-        Exit::Config,
+        FaultKind::Config,
         &["test.toml:14", "gpio.led.line", "chip"],
     );
-    refused(with("chip = \"iio\"\nwatermark = 17\n"), Exit::Config, &["test.toml:15", "1 to 16"]);
+    refused(with("chip = \"iio\"\nwatermark = 17\n"), FaultKind::Config, &["test.toml:15", "1 to 16"]);
     let (name, edge) = parse(&format!("{BOARD}{line}"), &[]).unwrap().gpio.data_ready().unwrap();
     assert_eq!((name.to_string().as_str(), edge), ("tegra-gpio line PQ.05", Edge::Rising));
 }
 
 #[test]
 fn missing_file_is_named() {
-    refused(Board::load(Path::new("no/such.toml"), &[]), Exit::NoInput, &["no/such.toml", "board-configs/"]);
+    refused(Board::load(Path::new("no/such.toml"), &[]), FaultKind::NoInput, &["no/such.toml", "board-configs/"]);
 }
 
 #[test]

@@ -1,45 +1,49 @@
-//! The one error type of boot and of input: what is wrong, where, why, and what to do.
-//! It prints as one line and carries the sysexits code the program ends with.
+//! The one error type of boot and of input: what is wrong, where, why, and what to do. It prints as one line.
 
 use std::fmt;
 use std::path::Path;
 
-/// Exit codes of `sysexits.h`.
+/// What sort of thing went wrong, for whoever must decide what to do about it (a program: its exit code).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-#[repr(u8)]
-pub enum Exit {
-    Usage = 64,
+pub enum FaultKind {
+    /// The program was asked for something that it does not do.
+    Usage,
     /// Input data is malformed.
-    Data = 65,
+    Data,
     /// An input file or folder does not exist or cannot be read.
-    NoInput = 66,
-    /// A needed service or device is missing (no Vulkan device).
-    Unavailable = 69,
-    Software = 70,
+    NoInput,
+    /// A device, or a service of the system, is missing or refuses.
+    Unavailable,
+    /// A mistake of the program itself.
+    Internal,
     /// An output cannot be created.
-    CantCreate = 73,
-    Io = 74,
+    NoOutput,
+    /// Reading or writing failed on the way.
+    Io,
     /// A board or calibration file is wrong.
-    Config = 78,
+    Config,
 }
 
+/// An error with its place, its cause and its remedy.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Fault {
-    pub exit: Exit,
-    /// File, file:line, or key.
+    pub kind: FaultKind,
+    /// File, file:line, key of a board file, or device.
     pub place: String,
+    /// What is wrong there, and why.
     pub what: String,
-    /// What to do about it.
+    /// What to do about it; empty where nothing can be said.
     pub fix: String,
 }
 
 impl Fault {
-    pub fn new(exit: Exit, place: impl Into<String>, what: impl Into<String>, fix: impl Into<String>) -> Fault {
-        Fault { exit, place: place.into(), what: what.into(), fix: fix.into() }
+    pub fn new(kind: FaultKind, place: impl Into<String>, what: impl Into<String>, fix: impl Into<String>) -> Fault {
+        Fault { kind, place: place.into(), what: what.into(), fix: fix.into() }
     }
 
-    pub fn at(exit: Exit, path: &Path, line: usize, what: impl Into<String>, fix: impl Into<String>) -> Fault {
-        Fault::new(exit, format!("{}:{line}", path.display()), what, fix)
+    /// A fault of one line of a file.
+    pub fn at(kind: FaultKind, path: &Path, line: usize, what: impl Into<String>, fix: impl Into<String>) -> Fault {
+        Fault::new(kind, format!("{}:{line}", path.display()), what, fix)
     }
 }
 

@@ -11,7 +11,7 @@
 use crate::host::monotonic;
 use crate::imu::edges::{EdgeFault, EdgeQueue, Edges};
 use crate::types::{Nanos, Span};
-use crate::{Exit, Fault};
+use crate::{Fault, FaultKind};
 use serde::{Deserialize, Serialize};
 use std::ffi::{c_char, c_int, c_uint, CString};
 
@@ -181,7 +181,7 @@ fn cannot_open(name: &LineName, errno: i32) -> Fault {
         _ => "gpiodetect and gpioinfo list chips and lines",
     };
     let what = format!("cannot be used: {}", std::io::Error::from_raw_os_error(errno));
-    Fault::new(Exit::Unavailable, format!("GPIO {name}"), what, fix)
+    Fault::new(FaultKind::Unavailable, format!("GPIO {name}"), what, fix)
 }
 
 /// An input whose edges mean that a sample is ready.

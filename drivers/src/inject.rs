@@ -7,7 +7,7 @@
 
 use crate::source::{FrameSource, ImuBatch, ImuReading, ImuSource, SourceFault, Wait};
 use crate::types::{Frames, Nanos, Span};
-use crate::{Exit, Fault};
+use crate::{Fault, FaultKind};
 use glam::DVec3;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -203,7 +203,7 @@ impl Plan {
         self.unplugs += u64::from((unplugged || one.is_some()) && !was);
         self.unplugged = unplugged;
         if self.away.is_some() != one.is_some() {
-            let fault = |c| Fault::new(Exit::Unavailable, format!("camera {c}"), UNPLUGGED.0, UNPLUGGED.1);
+            let fault = |c| Fault::new(FaultKind::Unavailable, format!("camera {c}"), UNPLUGGED.0, UNPLUGGED.1);
             self.away = one.map(fault);
         }
     }
@@ -230,7 +230,7 @@ impl Plan {
     }
 
     fn lost(&self) -> SourceFault {
-        SourceFault::Lost(Fault::new(Exit::Unavailable, self.place, UNPLUGGED.0, UNPLUGGED.1))
+        SourceFault::Lost(Fault::new(FaultKind::Unavailable, self.place, UNPLUGGED.0, UNPLUGGED.1))
     }
 
     fn counters(&self, names: &[&'static str; Kind::ALL.len()], unplugs: &'static str) -> Vec<(&'static str, u64)> {

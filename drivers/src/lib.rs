@@ -30,6 +30,6 @@ mod jpeg;
 
 pub use calibration::{Calibration, ImuCalibration, ImuCorrection, RigCamera};
 pub use camera::{Camera, Lens};
-pub use fault::{Exit, Fault};
+pub use fault::{Fault, FaultKind};
 pub use list::List;
 pub use types::{Colour, Frames, Image, ImuSample, Nanos, Pose, Span, TimedPose};

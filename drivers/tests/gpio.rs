@@ -2,7 +2,7 @@
 #![allow(clippy::unwrap_used)]
 
 use stipple_drivers::gpio::{DataReady, Edge, LineName, Output};
-use stipple_drivers::Exit;
+use stipple_drivers::FaultKind;
 
 #[test]
 fn what_is_no_chip_is_refused_with_what_to_do() {
@@ -10,5 +10,5 @@ fn what_is_no_chip_is_refused_with_what_to_do() {
     let fault = DataReady::open(&line("no-such-chip"), Edge::Rising).map(|_| ()).unwrap_err();
     assert!(fault.to_string().contains("no-such-chip line 3") && fault.to_string().contains("gpiodetect"), "{fault}");
     let fault = Output::open(&line("/dev/null"), true).map(|_| ()).unwrap_err();
-    assert_eq!(fault.exit, Exit::Unavailable);
+    assert_eq!(fault.kind, FaultKind::Unavailable);
 }

@@ -9,7 +9,7 @@ use proptest::test_runner::RngSeed;
 use std::fs;
 use std::path::Path;
 use stipple_drivers::replay::*;
-use stipple_drivers::{Exit, Frames, Lens, Nanos, Span};
+use stipple_drivers::{FaultKind, Frames, Lens, Nanos, Span};
 
 #[test]
 fn generated_folder_is_clean() {
@@ -68,7 +68,7 @@ fn closest_of_two_candidates_is_paired() {
 fn cameras_that_never_meet_are_refused() {
     let f = Folder::new();
     f.write("cam1/data.csv", "1,a.png\n2,b.png\n");
-    f.refused(Exit::Data, "mav0", "no image has a partner");
+    f.refused(FaultKind::Data, "mav0", "no image has a partner");
 }
 
 #[test]
@@ -147,17 +147,17 @@ fn warnings_of_one_kind_are_capped_and_counting_goes_on() {
 #[test]
 fn useless_folders_are_refused() {
     let o = OpenOptions::default();
-    assert_eq!(Recording::open(Path::new("/no/such/folder"), &o).unwrap_err().exit, Exit::NoInput);
+    assert_eq!(Recording::open(Path::new("/no/such/folder"), &o).unwrap_err().kind, FaultKind::NoInput);
     let empty = tempfile::tempdir().unwrap();
-    assert_eq!(Recording::open(empty.path(), &o).unwrap_err().exit, Exit::NoInput);
+    assert_eq!(Recording::open(empty.path(), &o).unwrap_err().kind, FaultKind::NoInput);
     for name in ["cam0/data.csv", "cam1/data.csv", "imu0/data.csv", "cam1/sensor.yaml"] {
         let f = Folder::new();
         fs::remove_file(f.path(name)).unwrap();
-        f.refused(Exit::NoInput, name, "cannot read");
+        f.refused(FaultKind::NoInput, name, "cannot read");
     }
     let f = Folder::new();
     fs::remove_file(f.path("cam0/sensor.yaml")).unwrap();
-    f.refused(Exit::NoInput, "mav0", "no calibration");
+    f.refused(FaultKind::NoInput, "mav0", "no calibration");
 }
 
 #[test]
@@ -166,15 +166,15 @@ fn tables_of_another_kind_are_refused() {
         for content in ["", "#timestamp\n", "\n\n", "letters,and,more\nletters,and,more\n"] {
             let f = Folder::new();
             f.write(name, content);
-            f.refused(Exit::Data, name, if content.contains("letters") { "letters" } else { "holds no rows" });
+            f.refused(FaultKind::Data, name, if content.contains("letters") { "letters" } else { "holds no rows" });
         }
     }
     let f = Folder::new();
     fs::copy(f.path("state_groundtruth_estimate0/data.csv"), f.path("imu0/data.csv")).unwrap();
-    f.refused(Exit::Data, "imu0/data.csv:2", "gyro x y z");
+    f.refused(FaultKind::Data, "imu0/data.csv:2", "gyro x y z");
     let f = Folder::new();
     fs::copy(f.path("imu0/data.csv"), f.path("cam1/data.csv")).unwrap();
-    f.refused(Exit::Data, "cam1/data.csv:2", "file name");
+    f.refused(FaultKind::Data, "cam1/data.csv:2", "file name");
 }
 
 #[test]
@@ -183,12 +183,12 @@ fn wrong_calibrations_are_refused_by_key_and_line() {
     for key in keys {
         let f = Folder::new();
         f.replace("cam1/sensor.yaml", &format!("{key}:"), "other:");
-        f.refused(Exit::Config, "cam1/sensor.yaml", key);
+        f.refused(FaultKind::Config, "cam1/sensor.yaml", key);
     }
     for key in IMU.lines().filter_map(|l| l.split_once(':')).map(|(k, _)| k) {
         let f = Folder::new();
         f.replace("imu0/sensor.yaml", key, "other");
-        f.refused(Exit::Config, "imu0/sensor.yaml", key);
+        f.refused(FaultKind::Config, "imu0/sensor.yaml", key);
     }
     let cases = [
         ("data: [1.0,", "data: [1.002,", ":6", "orthonormal"),
@@ -207,7 +207,7 @@ fn wrong_calibrations_are_refused_by_key_and_line() {
     for (from, to, place, word) in cases {
         let f = Folder::new();
         f.replace("cam1/sensor.yaml", from, to);
-        f.refused(Exit::Config, place, word);
+        f.refused(FaultKind::Config, place, word);
     }
 }
 
@@ -260,17 +260,17 @@ fn a_frame_that_lacks_one_of_four_images_is_left_out_and_counted() {
 fn too_many_cameras_and_gaps_among_them_are_refused() {
     let f = Folder::new();
     f.write("cam4/sensor.yaml", CAMERA.replace("BASELINE", "0.5"));
-    let fault = f.refused(Exit::Data, "mav0", "4 cameras at most");
+    let fault = f.refused(FaultKind::Data, "mav0", "4 cameras at most");
     assert!(fault.fix.contains("cam4"), "{fault}");
     f.remove_camera(4);
     f.add_camera(3, 0.3);
-    f.refused(Exit::NoInput, "cam2/sensor.yaml", "cannot read");
+    f.refused(FaultKind::NoInput, "cam2/sensor.yaml", "cannot read");
     f.add_camera(2, 0.3);
-    f.refused(Exit::Config, "mav0", "cameras 2 and 3");
+    f.refused(FaultKind::Config, "mav0", "cameras 2 and 3");
     f.replace("cam2/sensor.yaml", "0.3", "0.2");
     f.open().unwrap();
     fs::remove_file(f.path("cam2/data.csv")).unwrap();
-    f.refused(Exit::NoInput, "cam2/data.csv", "cannot read");
+    f.refused(FaultKind::NoInput, "cam2/data.csv", "cannot read");
 }
 
 #[test]
@@ -283,12 +283,12 @@ fn a_calibration_of_another_number_of_cameras_is_refused() {
     for (cameras, said) in [(1, "holds 2 cameras, the calibration has 1 camera"), (3, "has 3 cameras")] {
         f.write("../chain.yaml", camchain(cameras));
         let fault = with("../chain.yaml").unwrap_err();
-        assert!(fault.exit == Exit::Config && fault.what.contains(said), "{fault}");
+        assert!(fault.kind == FaultKind::Config && fault.what.contains(said), "{fault}");
         assert!(fault.fix.contains("replay.calibration"), "{fault}");
     }
     f.write("../chain.yaml", camchain(5));
     let fault = with("../chain.yaml").unwrap_err();
-    assert!(fault.exit == Exit::Config && fault.what.contains("4 cameras at most"), "{fault}");
+    assert!(fault.kind == FaultKind::Config && fault.what.contains("4 cameras at most"), "{fault}");
     f.write("../chain.yaml", camchain(2));
     assert_eq!(with("../chain.yaml").unwrap().calibration.cameras.len(), 2);
 }
@@ -320,10 +320,10 @@ fn kalibr_chain_is_read_and_may_give_steps_between_cameras() {
     assert!((c[0].body_from_cam.p.x - 0.1).abs() < 1e-12 && (c[1].body_from_cam.p.x - 0.2).abs() < 1e-12);
     assert_eq!(c[1].camera.lens, Lens::DoubleSphere { xi: -0.2, alpha: 0.57 });
     f.write("../camchain.yaml", chain.replace("cam1:", "cam2:"));
-    f.refused(Exit::Config, "camchain.yaml", "cam1");
+    f.refused(FaultKind::Config, "camchain.yaml", "cam1");
     // named from outside, as with replay.calibration
     let o = OpenOptions { calibration: Some(f.path("../camchain.yaml")), ..OpenOptions::default() };
-    assert_eq!(Recording::open(f.0.path(), &o).unwrap_err().exit, Exit::Config);
+    assert_eq!(Recording::open(f.0.path(), &o).unwrap_err().kind, FaultKind::Config);
 }
 
 #[test]
@@ -336,7 +336,7 @@ fn a_rolling_shutter_needs_its_readout_time() {
         }
     };
     state("shutter: rolling");
-    let fault = f.refused(Exit::Config, "cam0/sensor.yaml:10", "rolling");
+    let fault = f.refused(FaultKind::Config, "cam0/sensor.yaml:10", "rolling");
     assert!(fault.fix.contains("rig.readout_s"), "{fault}");
     let stated = OpenOptions { readout: Some(Span::from_secs(0.016)), ..OpenOptions::default() };
     let r = Recording::open(f.0.path(), &stated).unwrap();
@@ -354,7 +354,7 @@ fn a_rolling_shutter_needs_its_readout_time() {
         [("shutter: slow", "global or rolling"), ("readout_time: -0.01", "readout"), ("line_delay: 1.0", "readout")]
     {
         state(line);
-        f.refused(Exit::Config, "cam0/sensor.yaml:10", word);
+        f.refused(FaultKind::Config, "cam0/sensor.yaml:10", word);
     }
 }
 
@@ -386,7 +386,7 @@ fn basalt_axes_and_time_offset_reach_the_samples_and_the_stamps() {
     close(b.accel_body.z, s.z + 0.03 * s.x + 0.05 * s.y + 0.06 * s.z - 0.3);
     f.write("basalt.json", json.replace("0.04,0.05,0.06]", "0.04,0.05,-1.0]"));
     let fault = Recording::open(f.0.path(), &o).unwrap_err();
-    assert!(fault.exit == Exit::Config && fault.what.contains("calib_accel_bias"), "{fault}");
+    assert!(fault.kind == FaultKind::Config && fault.what.contains("calib_accel_bias"), "{fault}");
     let axes = r.calibration.imu.correction;
     assert!((axes.undo(&b).gyro_body - w).length() < 1e-12 && (axes.undo(&b).accel_body - s).length() < 1e-12);
 }
@@ -399,17 +399,17 @@ fn trajectory_formats_agree() {
     let euroc = read_trajectory(&f.path("a.csv")).unwrap();
     assert_eq!(euroc, read_trajectory(&f.path("a.txt")).unwrap());
     assert_eq!((euroc[0].t.0, euroc[0].pose.q.w), (1403636584763555584, 0.5));
-    for (bad, exit, place) in [
-        ("1,0,0,0,1,0,0,0\n2,0,0,0,9,0,0,0\n", Exit::Data, "a.csv:2"),
-        ("1,0,0,0,1,0,0,0\n1,0,0,0,1,0,0,0\n", Exit::Data, "a.csv:2"),
-        ("1,0,0,0,1,0,0\n", Exit::Data, "a.csv:1"),
-        ("", Exit::Data, "a.csv"),
+    for (bad, kind, place) in [
+        ("1,0,0,0,1,0,0,0\n2,0,0,0,9,0,0,0\n", FaultKind::Data, "a.csv:2"),
+        ("1,0,0,0,1,0,0,0\n1,0,0,0,1,0,0,0\n", FaultKind::Data, "a.csv:2"),
+        ("1,0,0,0,1,0,0\n", FaultKind::Data, "a.csv:1"),
+        ("", FaultKind::Data, "a.csv"),
     ] {
         f.write("a.csv", bad);
         let fault = read_trajectory(&f.path("a.csv")).unwrap_err();
-        assert!(fault.exit == exit && fault.place.ends_with(place), "{fault}");
+        assert!(fault.kind == kind && fault.place.ends_with(place), "{fault}");
     }
-    assert_eq!(read_trajectory(&f.path("none.csv")).unwrap_err().exit, Exit::NoInput);
+    assert_eq!(read_trajectory(&f.path("none.csv")).unwrap_err().kind, FaultKind::NoInput);
 }
 
 /// Replaces the first image of camera 1 and reads the first pair.

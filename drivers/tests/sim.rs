@@ -7,7 +7,7 @@ use glam::{DMat3, DQuat, DVec2, DVec3};
 use std::path::PathBuf;
 use stipple_drivers::replay::{OpenOptions, Recording};
 use stipple_drivers::sim::{rig_named, write_euroc, Flight, Scenario, Sim, GRAVITY, RIGS};
-use stipple_drivers::{Camera, Exit, Frames, ImuCalibration, Lens, Nanos, Pose, Span};
+use stipple_drivers::{Camera, FaultKind, Frames, ImuCalibration, Lens, Nanos, Pose, Span};
 
 fn quiet(name: &str) -> Scenario {
     let mut s = Scenario::named(name).unwrap();
@@ -344,7 +344,7 @@ fn a_written_run_is_whole_and_can_be_flown_again() {
     sim.render(16, &mut made);
     assert!(shown.t == made.t && shown.images == made.images);
     let refused = write_euroc(&mut sim, &dir, |_, _| {}).unwrap_err();
-    assert_eq!(refused.exit, Exit::CantCreate);
+    assert_eq!(refused.kind, FaultKind::NoOutput);
 }
 
 fn sim_frames(secs: f64) -> usize {
@@ -359,7 +359,7 @@ fn a_failed_write_leaves_nothing_behind() {
     let scenario = Scenario { duration: Span::from_secs(0.6), image_divisor: 4, ..Scenario::named("static").unwrap() };
     let mut sim = Sim::new(&scenario).unwrap();
     for dir in [blocked.clone(), blocked.join("below")] {
-        assert_eq!(write_euroc(&mut sim, &dir, |_, _| {}).unwrap_err().exit, Exit::CantCreate);
+        assert_eq!(write_euroc(&mut sim, &dir, |_, _| {}).unwrap_err().kind, FaultKind::NoOutput);
     }
     assert_eq!(std::fs::read_dir(parent.path()).unwrap().count(), 1);
 }
@@ -378,15 +378,15 @@ fn wrong_csv_is_refused_by_line() {
     ] {
         std::fs::write(&path, text).unwrap();
         let fault = Scenario::from_euroc(&path, None).unwrap_err();
-        assert_eq!(fault.exit, Exit::Data);
+        assert_eq!(fault.kind, FaultKind::Data);
         let said = fault.to_string();
         assert!(said.contains(&format!("truth.csv:{line}")) && said.contains(word), "{said}");
     }
     let missing = Scenario::from_euroc(&parent.path().join("none.csv"), None).unwrap_err();
-    assert_eq!(missing.exit, Exit::NoInput);
+    assert_eq!(missing.kind, FaultKind::NoInput);
     std::fs::write(&path, row("1") + &row("2")).unwrap();
     let short = Sim::new(&Scenario::from_euroc(&path, None).unwrap()).map(|_| ()).unwrap_err();
-    assert_eq!(short.exit, Exit::Data);
+    assert_eq!(short.kind, FaultKind::Data);
 }
 
 #[test]

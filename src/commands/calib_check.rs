@@ -11,7 +11,7 @@ use crate::stereo::rectify::Rectification;
 use std::path::PathBuf;
 use std::sync::Arc;
 use stipple_drivers::replay::{Reader, Recording};
-use stipple_drivers::{Exit, Fault, Frames, Image, Nanos};
+use stipple_drivers::{Fault, FaultKind, Frames, Image, Nanos};
 
 #[derive(clap::Args)]
 pub struct Args {
@@ -41,7 +41,7 @@ pub fn calib_check(args: &Args) -> Result<(), Fault> {
         checks.push(Check::warn(format!("recording: {name} {n}"), first.take().unwrap_or_default()));
     }
     checks.iter().for_each(Check::print);
-    all_passed(Exit::Config, &args.dataset, checks.iter())
+    all_passed(FaultKind::Config, &args.dataset, checks.iter())
 }
 
 /// How far the rows of cameras 0 and 1 disagree after rectification.

@@ -18,7 +18,7 @@ use crate::run::Outcome;
 use clap::{Args, Parser, Subcommand};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
-use stipple_drivers::{Exit, Fault};
+use stipple_drivers::{Fault, FaultKind};
 
 /// Stereo-inertial odometry and a live 3D Gaussian map, in fixed memory
 #[derive(Parser)]
@@ -55,7 +55,7 @@ pub fn main() -> ExitCode {
         Err(e) => {
             // Printing may fail on a closed pipe; the exit code still says what happened.
             let _ = e.print();
-            return if e.use_stderr() { ExitCode::from(Exit::Usage as u8) } else { ExitCode::SUCCESS };
+            return if e.use_stderr() { exit_code(FaultKind::Usage) } else { ExitCode::SUCCESS };
         }
     };
     // What these print is all that they do: a reader that stops, as `head` does, has read enough.
@@ -76,9 +76,23 @@ pub fn main() -> ExitCode {
         Ok(()) => ExitCode::SUCCESS,
         Err(fault) => {
             crate::run::status::print_err(format_args!("stipple: {fault}"));
-            ExitCode::from(fault.exit as u8)
+            exit_code(fault.kind)
         }
     }
+}
+
+/// The exit code of `sysexits.h` for each kind of fault.
+pub fn exit_code(kind: FaultKind) -> ExitCode {
+    ExitCode::from(match kind {
+        FaultKind::Usage => 64,
+        FaultKind::Data => 65,
+        FaultKind::NoInput => 66,
+        FaultKind::Unavailable => 69,
+        FaultKind::Internal => 70,
+        FaultKind::NoOutput => 73,
+        FaultKind::Io => 74,
+        FaultKind::Config => 78,
+    })
 }
 
 /// The board that every command reads alike.

@@ -3,7 +3,7 @@
 use super::{rendering_progress, seconds};
 use std::path::PathBuf;
 use stipple_drivers::sim::{rig_named, write_euroc, write_euroc_colour, Scenario, Sim, RIGS};
-use stipple_drivers::{Exit, Fault, Span};
+use stipple_drivers::{Fault, FaultKind, Span};
 
 #[derive(clap::Args)]
 pub struct Args {
@@ -66,7 +66,7 @@ impl Defects {
         for (name, value, range) in within {
             if !range.contains(&value) {
                 let what = format!("is {value}, must be {} to {}", range.start(), range.end());
-                return Err(Fault::new(Exit::Usage, name, what, "choose a value in that range"));
+                return Err(Fault::new(FaultKind::Usage, name, what, "choose a value in that range"));
             }
         }
         scenario.camera_errors.time_offset = Span::from_secs(self.time_offset);
@@ -85,7 +85,7 @@ pub fn sim(args: &Args) -> Result<(), Fault> {
         (None, name) => Scenario::named(name).ok_or_else(|| unknown_scenario(name))?,
         (Some(_), name) => {
             let fix = "use the scenario `euroc` with --truth";
-            return Err(Fault::new(Exit::Usage, name, "does not fly a given trajectory", fix));
+            return Err(Fault::new(FaultKind::Usage, name, "does not fly a given trajectory", fix));
         }
     };
     if let Some(s) = args.duration {
@@ -95,7 +95,7 @@ pub fn sim(args: &Args) -> Result<(), Fault> {
         scenario.seed = seed;
     }
     if let Some(name) = &args.rig {
-        let known = || Fault::new(Exit::Usage, name, "is not a rig", format!("choose one of {}", RIGS.join(", ")));
+        let known = || Fault::new(FaultKind::Usage, name, "is not a rig", format!("choose one of {}", RIGS.join(", ")));
         scenario.calibration = rig_named(name).ok_or_else(known)?;
     }
     args.defects.apply(&mut scenario)?;
@@ -108,5 +108,5 @@ pub fn sim(args: &Args) -> Result<(), Fault> {
 
 fn unknown_scenario(name: &str) -> Fault {
     let known = Scenario::names().collect::<Vec<_>>().join(", ");
-    Fault::new(Exit::Usage, name, "is not a scenario", format!("choose one of {known}, or `euroc` with --truth"))
+    Fault::new(FaultKind::Usage, name, "is not a scenario", format!("choose one of {known}, or `euroc` with --truth"))
 }

@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use stipple_drivers::v4l2::{Format, Select, Settings, StampPoint};
-use stipple_drivers::{Calibration, Exit, Fault, Span};
+use stipple_drivers::{Calibration, Fault, FaultKind, Span};
 
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -78,7 +78,7 @@ impl CameraConfig {
 
     /// For the cameras of a calibration.
     pub fn settings(&self, calibration: &Calibration) -> Result<Settings, Fault> {
-        let fault = |what: String, fix: &str| Fault::new(Exit::Config, "camera.devices", what, fix);
+        let fault = |what: String, fix: &str| Fault::new(FaultKind::Config, "camera.devices", what, fix);
         if self.devices.is_empty() {
             let fix = "write [camera] with devices = [\"serial:..\", ..] and rate_hz (`v4l2-ctl --list-devices`)";
             return Err(fault("the board file names no camera".to_string(), fix));

@@ -22,7 +22,7 @@ pub use network::{Fit, NetworkConfig};
 pub use record::RecordConfig;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
-use stipple_drivers::{Exit, Fault};
+use stipple_drivers::{Fault, FaultKind};
 
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -307,7 +307,7 @@ impl Board {
         let place = path.display().to_string();
         let text = std::fs::read_to_string(path).map_err(|e| {
             Fault::new(
-                Exit::NoInput,
+                FaultKind::NoInput,
                 &place,
                 format!("cannot read the board file: {e}"),
                 "name one, such as those of board-configs/",
@@ -334,7 +334,7 @@ impl Board {
                 (None, Some(line)) => format!("{place}:{line}"),
                 (None, None) => format!("{place} (default)"),
             };
-            Fault::new(Exit::Config, at, what, format!("change {key}"))
+            Fault::new(FaultKind::Config, at, what, format!("change {key}"))
         })?;
         Ok(board)
     }
@@ -412,7 +412,7 @@ fn in_file(place: &str, text: &str, e: &toml::de::Error) -> Fault {
     let at = line.map_or(place.to_string(), |l| format!("{place}:{l}"));
     let written = line.and_then(|l| text.lines().nth(l - 1)).map_or(String::new(), |l| format!(" (`{}`)", l.trim()));
     let what = e.message().replace('\n', " ");
-    Fault::new(Exit::Config, at, format!("{what}{written}"), "board-configs/ shows every section")
+    Fault::new(FaultKind::Config, at, format!("{what}{written}"), "board-configs/ shows every section")
 }
 
 /// An override as part of a one-line message.
@@ -422,7 +422,7 @@ fn shown(assignment: &str) -> String {
 
 fn in_override(assignment: &str, what: &str) -> Fault {
     Fault::new(
-        Exit::Config,
+        FaultKind::Config,
         shown(assignment),
         what.replace('\n', " "),
         "write section.key=value with a key of board-configs/",
@@ -431,7 +431,7 @@ fn in_override(assignment: &str, what: &str) -> Fault {
 
 /// Applies one `a.b=value`; the value is TOML, and a bare word is a string.
 fn set(table: &mut toml::Table, assignment: &str) -> Result<(), Fault> {
-    let wrong = |what: &str| Fault::new(Exit::Usage, shown(assignment), what, "write --set section.key=value");
+    let wrong = |what: &str| Fault::new(FaultKind::Usage, shown(assignment), what, "write --set section.key=value");
     let (key, value) = assignment.split_once('=').ok_or_else(|| wrong("there is no '='"))?;
     let parsed: toml::Table = toml::from_str(&format!("v = {value}"))
         .or_else(|_| toml::from_str(&format!("v = {value:?}")))

@@ -31,7 +31,7 @@ use patch::{align_stack, take_stack, Stack, Template, Warp, STEP_MIN};
 use pyramid::{Levels, Pyramid, Seen};
 use rig::Rig;
 use std::sync::Arc;
-use stipple_drivers::{Calibration, Exit, Fault, Frames, Nanos, Pose};
+use stipple_drivers::{Calibration, Fault, FaultKind, Frames, Nanos, Pose};
 
 /// A point tracked in one camera. The same `id` in two cameras is the same point in space.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -179,7 +179,7 @@ impl Frontend {
         let small = calibration.cameras.iter().any(|c| c.camera.width < least || c.camera.height < least);
         if n == 0 || n > CAMERAS_MAX || small {
             let what = format!("the tracker takes 1 to {CAMERAS_MAX} cameras of at least {least} px a side");
-            return Err(Fault::new(Exit::Config, "calibration", what, "use a calibration of this rig"));
+            return Err(Fault::new(FaultKind::Config, "calibration", what, "use a calibration of this rig"));
         }
         let rig = Rig::new(calibration, config.epipolar_max);
         Ok(Frontend {

@@ -8,7 +8,7 @@ use crate::config::GpuConfig;
 use ash::vk;
 use std::ffi::{c_void, CStr, CString};
 use std::sync::Mutex;
-use stipple_drivers::{Exit, Fault};
+use stipple_drivers::{Fault, FaultKind};
 
 const VALIDATION_LAYER: &CStr = c"VK_LAYER_KHRONOS_validation";
 /// Validation messages kept; the rest are only counted out by the log of the layer itself.
@@ -118,7 +118,7 @@ pub struct Device {
 
 pub(super) fn unavailable(what: impl Into<String>) -> Fault {
     Fault::new(
-        Exit::Unavailable,
+        FaultKind::Unavailable,
         "vulkan",
         what,
         "apt-get install mesa-vulkan-drivers (a CPU device and the integrated ones) or the vendor's driver; vulkaninfo lists devices",
@@ -231,7 +231,7 @@ fn instance(entry: &ash::Entry, validation: bool) -> Result<(ash::Instance, bool
     let has_layer = layers.iter().any(|l| l.layer_name_as_c_str() == Ok(VALIDATION_LAYER));
     if validation && !has_layer {
         return Err(Fault::new(
-            Exit::Unavailable,
+            FaultKind::Unavailable,
             "vulkan",
             "validation was asked for and its layer is not installed",
             "apt-get install vulkan-validationlayers, or unset STIPPLE_VALIDATION",
@@ -311,7 +311,7 @@ fn choose(instance: &ash::Instance, config: &GpuConfig) -> Result<Choice, Fault>
         .min_by_key(|c| c.2.kind)
         .ok_or_else(|| {
             Fault::new(
-                Exit::Unavailable,
+                FaultKind::Unavailable,
                 "gpu.device",
                 format!("no Vulkan device has \"{}\" in its name", config.device),
                 format!("devices here: {}", names.join(", ")),

@@ -11,7 +11,7 @@ use ash::vk;
 use std::collections::HashMap;
 use std::marker::PhantomData;
 use std::sync::Arc;
-use stipple_drivers::{Exit, Fault};
+use stipple_drivers::{Fault, FaultKind};
 
 /// Storage buffers and specialisation constants of one kernel; the build refuses more.
 pub const BUFFERS_MAX: usize = 8;
@@ -135,8 +135,9 @@ impl Pipelines {
         define: Option<&str>,
         in_pieces: bool,
     ) -> Result<Kernel<K>, Fault> {
-        let refuse =
-            |what: String| Fault::new(Exit::Unavailable, format!("kernel {}", K::NAME), what, "use another device");
+        let refuse = |what: String| {
+            Fault::new(FaultKind::Unavailable, format!("kernel {}", K::NAME), what, "use another device")
+        };
         let caps = &self.device.caps;
         let runs = |v: &&Variant| v.capabilities.iter().all(|&c| caps.allows(c));
         let variant = match define {
@@ -236,7 +237,7 @@ impl Pipeline {
         words: &[u32; SPECS_MAX],
     ) -> Result<(), Fault> {
         let code = ash::util::read_spv(&mut std::io::Cursor::new(variant.spirv))
-            .map_err(|e| Fault::new(Exit::Software, variant.name, format!("bad SPIR-V: {e}"), "build again"))?;
+            .map_err(|e| Fault::new(FaultKind::Internal, variant.name, format!("bad SPIR-V: {e}"), "build again"))?;
         let bindings: Vec<_> = self
             .bindings
             .iter()

@@ -8,7 +8,7 @@ use crate::mem::Footprint;
 use ash::vk;
 use std::marker::PhantomData;
 use std::sync::Arc;
-use stipple_drivers::{Exit, Fault};
+use stipple_drivers::{Fault, FaultKind};
 
 /// Every buffer starts here: the largest `minStorageBufferOffsetAlignment` Vulkan allows.
 pub const ALIGN: u64 = 256;
@@ -156,7 +156,7 @@ impl Backed {
         unsafe {
             backed.memory = device.raw.allocate_memory(&info, None).map_err(|r| {
                 Fault::new(
-                    Exit::Unavailable,
+                    FaultKind::Unavailable,
                     "gpu arena",
                     format!("{} has no {} MiB for the {name}: {r}", device.caps.name, bytes >> 20),
                     "lower the board's [budget]",
@@ -191,7 +191,7 @@ impl Arena {
         let bytes = bytes.next_multiple_of(ALIGN).max(ALIGN);
         if bytes > device.caps.allocation_max_bytes {
             return Err(Fault::new(
-                Exit::Config,
+                FaultKind::Config,
                 "gpu arena",
                 format!(
                     "{} MiB asked for; {} allocates at most {} MiB at once",
@@ -216,7 +216,7 @@ impl Arena {
     pub fn alloc<T: bytemuck::Pod>(&mut self, name: &'static str, len: usize) -> Result<Buf<T>, Fault> {
         let refuse = |what: String| {
             let fix = format!("change the [budget] entry that sizes `{name}`");
-            Fault::new(Exit::Config, format!("gpu arena: {name}"), what, fix)
+            Fault::new(FaultKind::Config, format!("gpu arena: {name}"), what, fix)
         };
         let bytes = (len as u64)
             .checked_mul(size_of::<T>() as u64)

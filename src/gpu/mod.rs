@@ -57,7 +57,7 @@ use kernel::Pipelines;
 use memory::{report_offset, Arena, Staging, TRANSFER_BYTES};
 use std::fmt;
 use std::sync::Arc;
-use stipple_drivers::{Exit, Fault};
+use stipple_drivers::{Fault, FaultKind};
 use submit::Submitter;
 
 /// What can go wrong after boot. Plain data: making one allocates nothing.
@@ -103,7 +103,7 @@ impl std::error::Error for GpuError {}
 
 impl From<GpuError> for Fault {
     fn from(e: GpuError) -> Fault {
-        Fault::new(Exit::Unavailable, "gpu", e.to_string(), "see the counters of the report and the kernel log")
+        Fault::new(FaultKind::Unavailable, "gpu", e.to_string(), "see the counters of the report and the kernel log")
     }
 }
 

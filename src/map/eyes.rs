@@ -10,7 +10,7 @@ use crate::mem::Footprint;
 use crate::stereo::rectify::box_average;
 use crate::stereo::{DepthMap, Pinhole, Stereo};
 use glam::{DVec2, DVec3};
-use stipple_drivers::{Calibration, Exit, Fault, Image, Lens, Pose, RigCamera};
+use stipple_drivers::{Calibration, Fault, FaultKind, Image, Lens, Pose, RigCamera};
 
 /// One camera that trains.
 #[derive(Clone, Debug)]
@@ -136,7 +136,8 @@ pub fn eyes(stereo: &Stereo, config: &MapConfig) -> Result<Vec<Eye>, Fault> {
 }
 
 fn bent(i: usize, c: &RigCamera, mapping: &Pinhole, divisor: usize) -> Result<Eye, Fault> {
-    let bad = |what: String| Fault::new(Exit::Config, "map.projection", what, "set map.projection = \"rectified\"");
+    let bad =
+        |what: String| Fault::new(FaultKind::Config, "map.projection", what, "set map.projection = \"rectified\"");
     let Lens::KannalaBrandt { k } = c.camera.lens else {
         return Err(bad(format!("\"fisheye\" needs Kannala-Brandt lenses, camera {i} has {:?}", c.camera.lens)));
     };

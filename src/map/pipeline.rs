@@ -27,7 +27,7 @@ use crate::gpu::kernels::*;
 use crate::gpu::{Gpu, GpuError, Kernel, KernelDef, Recorder, Threads};
 use crate::limits::CAMERAS_MAX;
 use crate::mem::Footprint;
-use stipple_drivers::{Exit, Fault};
+use stipple_drivers::{Fault, FaultKind};
 
 /// Bits of a depth key: depth_key.glsl.
 const DEPTH_BITS: u32 = 16;
@@ -144,7 +144,7 @@ impl Pipeline {
             let what = format!(
                 "{shape:?} has a zero, neither 1 nor 3 channels, harmonics past degree 3, or no or too many cameras"
             );
-            return Err(Fault::new(Exit::Config, "map", what, "raise the board's [budget]"));
+            return Err(Fault::new(FaultKind::Config, "map", what, "raise the board's [budget]"));
         }
         let channels = shape.channels;
         let k = Kernels {

@@ -16,7 +16,7 @@ pub mod trajectory;
 use std::fs::{self, File};
 use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
-use stipple_drivers::{Exit, Fault};
+use stipple_drivers::{Fault, FaultKind};
 
 /// Writes `path` through `write`, all or nothing.
 pub fn atomically<R>(path: &Path, write: impl FnOnce(&mut BufWriter<File>) -> io::Result<R>) -> Result<R, Fault> {
@@ -93,7 +93,7 @@ fn partial_name(path: &Path) -> PathBuf {
 
 fn cannot_create(path: &Path, e: &io::Error) -> Fault {
     Fault::new(
-        Exit::CantCreate,
+        FaultKind::NoOutput,
         path.display().to_string(),
         format!("cannot be created: {e}"),
         "choose an --out folder that can be written to",
@@ -102,7 +102,7 @@ fn cannot_create(path: &Path, e: &io::Error) -> Fault {
 
 fn cannot_write(path: &Path, e: &io::Error) -> Fault {
     Fault::new(
-        Exit::Io,
+        FaultKind::Io,
         path.display().to_string(),
         format!("cannot be written: {e}"),
         "check the free space of the disk",
@@ -131,7 +131,7 @@ mod tests {
                 Err::<(), _>(io::Error::other("disk full"))
             })
             .unwrap_err();
-        assert_eq!(fault.exit, Exit::Io);
+        assert_eq!(fault.kind, FaultKind::Io);
         assert!(fault.to_string().contains("a.txt") && fault.to_string().contains("disk full"), "{fault}");
         assert_eq!(fs::read(dir.path().join("a.txt")).unwrap(), b"old");
         assert_eq!(names(dir.path()), ["a.txt"]);
@@ -142,7 +142,7 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         fs::write(dir.path().join("file"), b"").unwrap();
         let fault = OutputDir::create(&dir.path().join("file/out")).unwrap_err();
-        assert_eq!(fault.exit, Exit::CantCreate);
+        assert_eq!(fault.kind, FaultKind::NoOutput);
         assert!(fault.place.contains("file/out"), "{fault}");
     }
 
@@ -154,7 +154,7 @@ mod tests {
         out.replace_folder("renders", fill("1.png")).unwrap();
         out.replace_folder("renders", fill("2.png")).unwrap();
         let failed = out.replace_folder("renders", |_| {
-            Err::<(), _>(Fault::new(Exit::Io, "renders/3.png", "cannot be written", ""))
+            Err::<(), _>(Fault::new(FaultKind::Io, "renders/3.png", "cannot be written", ""))
         });
         assert!(failed.is_err());
         assert_eq!(names(dir.path()), ["renders"]);

@@ -11,7 +11,7 @@ use crate::mem::Footprint;
 use crate::stereo::{Method, Stereo};
 use crate::vio::Vio;
 use stipple_drivers::record::ring_bytes;
-use stipple_drivers::{Calibration, Camera, Exit, Fault, ImuCalibration, Lens, Pose, RigCamera};
+use stipple_drivers::{Calibration, Camera, Fault, FaultKind, ImuCalibration, Lens, Pose, RigCamera};
 
 /// Everything a run with this rig takes, without the operating system's and the drivers' own; with the ring of a recording
 /// where it `records`.
@@ -59,7 +59,12 @@ pub fn check_fits(place: &str, calibration: &Calibration, board: &Board, records
         if c.camera.width > w || c.camera.height > h {
             let what =
                 format!("camera {i} is {}x{} px, the board's budget is {w}x{h}", c.camera.width, c.camera.height);
-            return Err(Fault::new(Exit::Config, place, what, "raise budget.image_width_max and image_height_max"));
+            return Err(Fault::new(
+                FaultKind::Config,
+                place,
+                what,
+                "raise budget.image_width_max and image_height_max",
+            ));
         }
     }
     if board.map.enabled {
@@ -72,7 +77,7 @@ pub fn check_fits(place: &str, calibration: &Calibration, board: &Board, records
         let largest = f.rows.iter().max_by_key(|r| r.bytes).map_or("", |r| r.name);
         let what = format!("needs {:.1} MiB, memory_max_mib is {}", mib(f.total()), board.memory_max_mib);
         let fix = format!("raise memory_max_mib or shrink [budget]; the largest part is `{largest}`");
-        return Err(Fault::new(Exit::Config, place, what, fix));
+        return Err(Fault::new(FaultKind::Config, place, what, fix));
     }
     Ok(f)
 }

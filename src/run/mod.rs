@@ -54,7 +54,7 @@ use std::thread::{Builder, Scope, ScopedJoinHandle};
 use std::time::{Duration, Instant};
 use stipple_drivers::paced::FRAMES_UNREADABLE;
 use stipple_drivers::replay::read_trajectory;
-use stipple_drivers::{host, Calibration, Exit, Fault, Frames};
+use stipple_drivers::{host, Calibration, Fault, FaultKind, Frames};
 use tracking::{FramePacket, Inlet, Link, OdometryRun, Tracker};
 
 /// How frames arrive and mapping steps are spent.
@@ -198,7 +198,7 @@ pub fn fly(
     if !live && flown.counters.frames_unreadable.get() == frames as u64 {
         let first = flown.warnings.first().map_or("", String::as_str);
         let what = format!("none of its {frames} frames can be read, the first: {first}");
-        return Err(Fault::new(Exit::Data, input.place, what, "check that the recording is complete"));
+        return Err(Fault::new(FaultKind::Data, input.place, what, "check that the recording is complete"));
     }
     flown.warnings.splice(..0, input.warnings);
     let capture = flown.capture.and_then(|c| c.line(&flown.source));

@@ -4,7 +4,7 @@ use super::sensors::Sensors;
 use crate::config::Board;
 use std::path::{Path, PathBuf};
 use stipple_drivers::record::{self, Format, Recorder};
-use stipple_drivers::{Calibration, Exit, Fault, Frames};
+use stipple_drivers::{Calibration, Fault, FaultKind, Frames};
 
 /// A recording under way.
 pub struct Recording {
@@ -50,6 +50,6 @@ impl Recording {
         counters.extend(&recorded.counters);
         let Some(why) = &recorded.failure else { return Ok(()) };
         let what = format!("the recording lacks what could not be written: {why}");
-        Err(Fault::new(Exit::Io, self.dir.display().to_string(), what, "check the free space of the disk"))
+        Err(Fault::new(FaultKind::Io, self.dir.display().to_string(), what, "check the free space of the disk"))
     }
 }

@@ -13,7 +13,7 @@ use stipple_drivers::paced::{Images, Pace, PacedFrames, PacedImu};
 use stipple_drivers::replay::{read_calibration, OpenOptions, Recording};
 use stipple_drivers::sim::{Scenario, Sim};
 use stipple_drivers::source::{FrameSource, ImuBatch, ImuSource, SourceFault, Wait};
-use stipple_drivers::{v4l2, Calibration, Exit, Fault, Frames, ImuCorrection, ImuSample, Nanos, Span, TimedPose};
+use stipple_drivers::{v4l2, Calibration, Fault, FaultKind, Frames, ImuCorrection, ImuSample, Nanos, Span, TimedPose};
 
 /// What a flight reads, opened.
 pub struct Input {
@@ -127,7 +127,7 @@ impl Input {
         match &self.source {
             Source::Recorded(r) if !r.images.has_colour(cameras) => {
                 let what = format!("map.colour = true, but the images of {} are grey", self.place);
-                Err(Fault::new(Exit::Config, "map.colour", what, "set map.colour = false"))
+                Err(Fault::new(FaultKind::Config, "map.colour", what, "set map.colour = false"))
             }
             _ => Ok(()),
         }
@@ -192,7 +192,7 @@ fn open(path: &Path, board: &Board) -> Result<(Calibration, Sensors), Fault> {
     let (Some(options), true) = (board.imu.options(), missing.is_empty()) else {
         let what = format!("does not say {}", missing.join(", "));
         let fix = "write what is missing, or pass --dataset to run on a recording";
-        return Err(Fault::new(Exit::Config, path.display().to_string(), what, fix));
+        return Err(Fault::new(FaultKind::Config, path.display().to_string(), what, fix));
     };
     let calibration = calibration(path, board)?;
     let data_ready = board.gpio.data_ready().map(|(line, edge)| DataReady::open(&line, edge)).transpose()?;
@@ -222,7 +222,7 @@ pub fn parts(path: &Path, board: &Board) -> Vec<(&'static str, Result<String, Fa
     if calibration.is_ok() {
         parts.push(("cameras", cameras));
     }
-    let none = || Fault::new(Exit::Config, "[imu]", "names no chip", "write imu.chip and where it is wired");
+    let none = || Fault::new(FaultKind::Config, "[imu]", "names no chip", "write imu.chip and where it is wired");
     let data_ready = board.gpio.data_ready().map(|(line, edge)| DataReady::open(&line, edge)).transpose();
     if board.gpio.data_ready().is_some() {
         parts.push(("data-ready line", data_ready.as_ref().map(|_| "opened".into()).map_err(Fault::clone)));
@@ -241,7 +241,7 @@ pub fn parts(path: &Path, board: &Board) -> Vec<(&'static str, Result<String, Fa
 fn calibration(path: &Path, board: &Board) -> Result<Calibration, Fault> {
     let folder = path.parent().unwrap_or(Path::new(""));
     let fix = "set rig.calibration to a folder with cam0/sensor.yaml, Kalibr's camchain.yaml, or Basalt's json";
-    let unread = |f: Fault| if f.exit == Exit::NoInput { Fault { fix: fix.into(), ..f } } else { f };
+    let unread = |f: Fault| if f.kind == FaultKind::NoInput { Fault { fix: fix.into(), ..f } } else { f };
     let mut calibration = read_calibration(&folder.join(&board.rig.calibration)).map_err(unread)?;
     // Noise densities are the unit's; how often it is read here is the board's word.
     calibration.imu.rate_hz = board.imu.rate_hz;

@@ -16,7 +16,7 @@ use super::wls::Wls;
 use crate::config::{StereoConfig, StereoMethod};
 use crate::gpu::Gpu;
 use crate::mem::Footprint;
-use stipple_drivers::{Exit, Fault, Image};
+use stipple_drivers::{Fault, FaultKind, Image};
 
 /// Of each pixel of the rectified left image: x_left - x_right, px, negative where unknown, and its standard deviation.
 #[derive(Clone, Debug, PartialEq)]
@@ -157,14 +157,14 @@ fn is_blind(image: &Image) -> bool {
 
 fn without_gpu(method: StereoMethod) -> Fault {
     let what = format!("`{}` runs on the GPU and none is open here", method.name());
-    Fault::new(Exit::Config, "stereo.method", what, "use `bm` or `sgbm`")
+    Fault::new(FaultKind::Config, "stereo.method", what, "use `bm` or `sgbm`")
 }
 
 /// Why `bm` and `sgbm` are refused by a program without OpenCV.
 pub fn refused_without_opencv(method: StereoMethod) -> Fault {
     let what = format!("`{}` is OpenCV's and this program was built without the cargo feature `opencv`", method.name());
     let fix = "set stereo.method = \"sgm\", or build with the feature (on by default; needs libopencv-calib3d-dev)";
-    Fault::new(Exit::Config, "stereo.method", what, fix)
+    Fault::new(FaultKind::Config, "stereo.method", what, fix)
 }
 
 #[cfg(test)]

@@ -116,7 +116,7 @@ pub fn rectification_map(
 impl OpenCv {
     /// `config.method` says which of the two.
     pub fn new(width: usize, height: usize, config: &StereoConfig) -> Result<OpenCv, Fault> {
-        use stipple_drivers::Exit;
+        use stipple_drivers::FaultKind;
         let int = |v: u32| v as std::ffi::c_int;
         let (w, h) = (width as std::ffi::c_int, height as std::ffi::c_int);
         let (disparities, uniqueness) = (int(config.disparities), int(config.uniqueness_percent));
@@ -133,14 +133,14 @@ impl OpenCv {
         };
         let handle = std::ptr::NonNull::new(handle).ok_or_else(|| {
             let what = "OpenCV refuses these matching settings";
-            Fault::new(Exit::Config, "stereo", what, "see stereo.* in the board file")
+            Fault::new(FaultKind::Config, "stereo", what, "see stereo.* in the board file")
         })?;
         Ok(OpenCv { handle, width, height, fixed: vec![0; width * height] })
     }
 
     /// Disparity of the left image, px, negative where unknown.
     pub fn compute(&mut self, left: &Image, right: &Image, disparity_px: &mut [f32]) -> Result<(), Fault> {
-        use stipple_drivers::Exit;
+        use stipple_drivers::FaultKind;
         let px = self.width * self.height;
         assert!(
             left.pixels.len() == px && right.pixels.len() == px && disparity_px.len() == px,
@@ -157,7 +157,7 @@ impl OpenCv {
         };
         if rc != 0 {
             let what = "OpenCV's matching failed";
-            return Err(Fault::new(Exit::Software, "stereo", what, "report this with the images"));
+            return Err(Fault::new(FaultKind::Internal, "stereo", what, "report this with the images"));
         }
         for (to, from) in disparity_px.iter_mut().zip(&self.fixed) {
             *to = if *from > 0 { f32::from(*from) / SUBPIXEL } else { -1.0 };

@@ -8,7 +8,7 @@
 
 use super::{Pinhole, RectifiedCamera};
 use glam::{DMat3, DQuat, DVec2, DVec3};
-use stipple_drivers::{Calibration, Exit, Fault, Image, Pose, RigCamera};
+use stipple_drivers::{Calibration, Fault, FaultKind, Image, Pose, RigCamera};
 
 /// tan of the widest half angle of a rectified view (60°, 1.73; 50° keeps fisheye pixels under 2.4x stretch).
 const TAN_MAX: f64 = 1.2;
@@ -27,7 +27,7 @@ impl Rectification {
     pub fn new(calibration: &Calibration) -> Result<Rectification, Fault> {
         let bad = |what: &str| {
             Fault::new(
-                Exit::Config,
+                FaultKind::Config,
                 "calibration",
                 what,
                 "a map needs cameras 0 and 1 side by side, looking the same way; without a map: --set map.enabled=false",

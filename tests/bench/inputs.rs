@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use stipple_drivers::replay::{OpenOptions, Recording};
 use stipple_drivers::sim::{self, rig_named, Scenario, Sim};
-use stipple_drivers::{Calibration, Exit, Fault, Frames, ImuSample, Span, TimedPose};
+use stipple_drivers::{Calibration, Fault, FaultKind, Frames, ImuSample, Span, TimedPose};
 
 /// Name, scenario and rig: two cameras, or one, whose window says less and needs more iterations.
 const NAMED: [(&str, &str, Option<&str>); 3] =
@@ -81,7 +81,7 @@ pub fn folder(recordings: Option<&Path>) -> Result<PathBuf, Fault> {
     match recordings {
         Some(folder) if folder.is_dir() => Ok(folder.to_path_buf()),
         Some(folder) => Err(Fault::new(
-            Exit::NoInput,
+            FaultKind::NoInput,
             folder.display().to_string(),
             "no such folder",
             "name the folder of recordings, or leave --recordings out",

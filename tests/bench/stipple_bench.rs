@@ -19,8 +19,9 @@ mod world;
 
 use clap::{Parser, Subcommand};
 use std::process::ExitCode;
+use stipple::commands::exit_code;
 use stipple::mem::CountingAllocator;
-use stipple_drivers::{Exit, Fault};
+use stipple_drivers::{Fault, FaultKind};
 
 #[global_allocator]
 static ALLOCATOR: CountingAllocator = CountingAllocator;
@@ -65,14 +66,14 @@ fn main() -> ExitCode {
         Ok(cli) => cli,
         Err(e) => {
             let _ = e.print();
-            return if e.use_stderr() { ExitCode::from(Exit::Usage as u8) } else { ExitCode::SUCCESS };
+            return if e.use_stderr() { exit_code(FaultKind::Usage) } else { ExitCode::SUCCESS };
         }
     };
     match run(&cli.bench) {
         Ok(()) => ExitCode::SUCCESS,
         Err(fault) => {
             eprintln!("stipple-bench: {fault}");
-            ExitCode::from(fault.exit as u8)
+            exit_code(fault.kind)
         }
     }
 }

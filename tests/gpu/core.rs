@@ -17,7 +17,7 @@ use stipple::gpu::{
     Buf, Gpu, GpuError, GpuOptions, Kernel, Recorder, Threads, ALIGN, COMMANDS_MAX, REPORTS, STAGING_BYTES,
 };
 use stipple::mem;
-use stipple_drivers::Exit;
+use stipple_drivers::FaultKind;
 
 #[global_allocator]
 static ALLOCATOR: mem::CountingAllocator = mem::CountingAllocator;
@@ -295,8 +295,8 @@ fn variants_agree_and_are_taken_by_the_device() {
     let mut plain = Gpu::open(&config, 1 << 16).unwrap();
     assert_eq!(plain.kernel::<group_sum::K>(group_sum::Spec {}).unwrap().name(), "group_sum");
     assert_eq!(
-        plain.kernel_variant::<group_sum::K>(group_sum::Spec {}, "subgroup").map(|_| ()).unwrap_err().exit,
-        Exit::Unavailable
+        plain.kernel_variant::<group_sum::K>(group_sum::Spec {}, "subgroup").map(|_| ()).unwrap_err().kind,
+        FaultKind::Unavailable
     );
 }
 
@@ -307,7 +307,7 @@ fn full_arena_is_a_fault_that_names_the_buffer() {
     gpu.alloc::<[f32; 4]>("two", 17).unwrap();
     assert_eq!((gpu.arena_used(), gpu.arena_bytes()), (3 * ALIGN, 4 * ALIGN));
     let fault = gpu.alloc::<u32>("splats", 65).unwrap_err();
-    assert_eq!(fault.exit, Exit::Config);
+    assert_eq!(fault.kind, FaultKind::Config);
     assert!(fault.to_string().contains("splats") && fault.to_string().contains("[budget]"), "{fault}");
     gpu.alloc::<u32>("fits", 64).unwrap();
     assert!(gpu.alloc::<u32>("nothing", 0).is_err());
@@ -475,7 +475,7 @@ fn steady_state_allocates_nothing() {
 fn absent_device_is_a_fault_that_lists_what_there_is() {
     let config = GpuConfig { device: "no such GPU".into(), ..Default::default() };
     let fault = Gpu::open(&config, 1 << 16).map(|_| ()).unwrap_err();
-    assert_eq!((fault.exit, fault.place.as_str()), (Exit::Unavailable, "gpu.device"));
+    assert_eq!((fault.kind, fault.place.as_str()), (FaultKind::Unavailable, "gpu.device"));
     let name = Gpu::open(&GpuConfig::default(), 1 << 16).unwrap().caps().name.clone();
     assert!(fault.fix.contains(&name), "{fault}");
     let by_name = GpuConfig { device: name[1..5].to_uppercase(), ..Default::default() };

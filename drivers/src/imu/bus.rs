@@ -7,7 +7,7 @@
 
 use crate::host::monotonic;
 use crate::types::{Nanos, Span};
-use crate::{Exit, Fault};
+use crate::{Fault, FaultKind};
 use std::fs::{File, OpenOptions};
 use std::os::fd::{AsRawFd, RawFd};
 use std::path::{Path, PathBuf};
@@ -87,7 +87,7 @@ pub(super) fn cannot_open(place: &str, fault: BusFault) -> Fault {
         BusFault::Refused(_) => "name an adapter that speaks plain I2C, or a spidev node",
         _ => "check the wiring, the device tree and that i2c-dev or spidev is loaded",
     };
-    Fault::new(Exit::Unavailable, place, fault.to_string(), fix)
+    Fault::new(FaultKind::Unavailable, place, fault.to_string(), fix)
 }
 
 /// The one system call of both buses: descriptor, number, argument. Tests put theirs in its place, so that each number
@@ -373,7 +373,7 @@ mod tests {
         assert!(fault.to_string().contains("spidev node"), "{fault}");
         let fault = I2c::open("/dev/no-such-adapter", 0x68).map(|_| ()).unwrap_err();
         assert!(fault.to_string().contains("wiring"), "{fault}");
-        assert_eq!(fault.exit, Exit::Unavailable);
+        assert_eq!(fault.kind, FaultKind::Unavailable);
     }
 
     /// What the next call under a number answers: an errno, or fewer messages or bytes than were asked for.

@@ -16,7 +16,7 @@ use super::unit::GAP;
 use crate::host::monotonic;
 use crate::source::{ImuBatch, ImuReading, ImuSource, SourceFault, Wait};
 use crate::types::{ImuSample, Nanos, Span};
-use crate::{Exit, Fault};
+use crate::{Fault, FaultKind};
 use std::fs::{File, OpenOptions};
 use std::io::{ErrorKind, Write};
 use std::os::fd::AsRawFd;
@@ -81,7 +81,7 @@ pub(super) fn refused(path: &Path, value: &str, e: &std::io::Error) -> Fault {
         ErrorKind::ResourceBusy => "end what else reads the device (`fuser /dev/iio:device*`)",
         _ => "the kernel's driver refuses this value: see the files ending in _available beside it",
     };
-    Fault::new(Exit::Unavailable, path.display().to_string(), format!("`{value}`: {e}"), fix)
+    Fault::new(FaultKind::Unavailable, path.display().to_string(), format!("`{value}`: {e}"), fix)
 }
 
 /// Folder of the device that a board file names.
@@ -103,11 +103,11 @@ fn find(options: &IioOptions, wanted: &str) -> Result<PathBuf, Fault> {
                 "name one with a buffer: {}",
                 Some(list()).filter(|l| !l.is_empty()).unwrap_or("there is none".into())
             );
-            Err(Fault::new(Exit::Unavailable, "imu.device", format!("there is no IIO device `{wanted}`"), fix))
+            Err(Fault::new(FaultKind::Unavailable, "imu.device", format!("there is no IIO device `{wanted}`"), fix))
         }
         _ => {
             let what = format!("{} IIO devices are called `{wanted}`", found.len());
-            Err(Fault::new(Exit::Config, "imu.device", what, "name one by its place, such as i2c-1/1-0068"))
+            Err(Fault::new(FaultKind::Config, "imu.device", what, "name one by its place, such as i2c-1/1-0068"))
         }
     }
 }
@@ -129,14 +129,14 @@ impl Device {
         let node = options.dev.join(folder.file_name().unwrap_or_default());
         let file = OpenOptions::new().read(true).custom_flags(libc::O_NONBLOCK).open(&node).map_err(|e| {
             let fix = "let the user read it (udev rule), and end what else reads it";
-            Fault::new(Exit::Unavailable, node.display().to_string(), e.to_string(), fix)
+            Fault::new(FaultKind::Unavailable, node.display().to_string(), e.to_string(), fix)
         })?;
         // A buffer that was left running cannot be set up.
         set("buffer/enable", "0")?;
         let scan = Scan::new(enable_channels(&folder)?);
         if scan.elements_of_interest() == 0 {
             let fix = "name a device with three axes of acceleration or angular velocity";
-            return Err(Fault::new(Exit::Config, &options.device, "it has no such channels", fix));
+            return Err(Fault::new(FaultKind::Config, &options.device, "it has no such channels", fix));
         }
         set("current_timestamp_clock", "monotonic")?;
         if !options.trigger.is_empty() {
@@ -147,7 +147,7 @@ impl Device {
         set("buffer/watermark", &options.watermark.to_string())?;
         if !set("buffer/enable", "1")? {
             let fix = "its driver needs an interrupt, or set imu.trigger";
-            return Err(Fault::new(Exit::Unavailable, &options.device, "it has no buffer", fix));
+            return Err(Fault::new(FaultKind::Unavailable, &options.device, "it has no buffer", fix));
         }
         let held = Vec::with_capacity(scan.bytes * (READ_SCANS + 1));
         Ok(Device { folder, file, scan, held })
@@ -235,7 +235,12 @@ fn enable_channels(folder: &Path) -> Result<Vec<Element>, Fault> {
         };
         elements.push(described().ok_or_else(|| {
             let place = scan.join(format!("in_{name}_type")).display().to_string();
-            Fault::new(Exit::Unavailable, place, "does not say how the channel is stored", "another driver is needed")
+            Fault::new(
+                FaultKind::Unavailable,
+                place,
+                "does not say how the channel is stored",
+                "another driver is needed",
+            )
         })?);
     }
     Ok(elements)
@@ -260,7 +265,12 @@ fn set_rate(folder: &Path, hz: f64) -> Result<(), Fault> {
         let Some(now) = read_number(&path) else { continue };
         if (now / hz - 1.0).abs() > 0.1 {
             let fix = format!("set imu.rate_hz to one that it has ({offered})");
-            return Err(Fault::new(Exit::Config, "imu.rate_hz", format!("the driver runs at {now} Hz, not {hz}"), fix));
+            return Err(Fault::new(
+                FaultKind::Config,
+                "imu.rate_hz",
+                format!("the driver runs at {now} Hz, not {hz}"),
+                fix,
+            ));
         }
     }
     Ok(())
@@ -357,7 +367,7 @@ impl IioImu {
         if !has(Channel::Accel) || !has(Channel::Gyro) || !gyro_first {
             let what = "the IIO devices do not give three axes of both gyro and accelerometer";
             let fix = "imu.device names the gyro, imu.accel_device the accelerometer where that is another device";
-            return Err(Fault::new(Exit::Config, "imu.device", what, fix));
+            return Err(Fault::new(FaultKind::Config, "imu.device", what, fix));
         }
         let merge = streams.get(1).map(|accel| Merge::new(accel.line.period()));
         let counters = ImuCounters::default();
@@ -445,7 +455,7 @@ impl IioImu {
     fn fault(&self, why: Trouble) -> SourceFault {
         let fix = "check cable, supply and the kernel's log; it is looked for again and again";
         let what = format!("the inertial unit is lost: {why}");
-        SourceFault::Lost(Fault::new(Exit::Unavailable, format!("IIO {}", self.options.device), what, fix))
+        SourceFault::Lost(Fault::new(FaultKind::Unavailable, format!("IIO {}", self.options.device), what, fix))
     }
 }
 

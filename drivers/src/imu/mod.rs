@@ -34,7 +34,7 @@ pub use timeline::ClockReport;
 use crate::gpio::DataReady;
 use crate::source::{ImuBatch, ImuSource, SourceFault, Wait};
 use crate::types::{Nanos, Span};
-use crate::{Exit, Fault};
+use crate::{Fault, FaultKind};
 use bus::{Bus, BusFault, I2c, Spi};
 use chips::Chip;
 use die::Die;
@@ -130,7 +130,12 @@ impl RegisterOptions {
         let chip = Chip::named(&self.chip)?;
         if self.wiring.len() != chip.dies.len() {
             let what = format!("{} has {} dies, {} are wired", chip.name, chip.dies.len(), self.wiring.len());
-            return Err(Fault::new(Exit::Config, "imu", what, "say where each is: imu.address, imu.accel_address"));
+            return Err(Fault::new(
+                FaultKind::Config,
+                "imu",
+                what,
+                "say where each is: imu.address, imu.accel_address",
+            ));
         }
         let buses = chip.dies.iter().zip(&self.wiring).map(|(die, wiring)| wiring.open(die.spi_dummy));
         self.start(buses.collect::<Result<_, _>>()?, data_ready)
@@ -167,10 +172,10 @@ impl RegisterOptions {
         let fix =
             "imu.configuration names the bytes of bmi270_config_file of Bosch's BMI270_SensorAPI, as they are sent";
         let bytes = std::fs::read(&self.configuration)
-            .map_err(|e| Fault::new(Exit::NoInput, &place, format!("cannot be read: {e}"), fix))?;
+            .map_err(|e| Fault::new(FaultKind::NoInput, &place, format!("cannot be read: {e}"), fix))?;
         if bytes.len() != BYTES {
             let what = format!("{} bytes, not {BYTES}", bytes.len());
-            return Err(Fault::new(Exit::Config, place, what, fix));
+            return Err(Fault::new(FaultKind::Config, place, what, fix));
         }
         Ok(bytes)
     }

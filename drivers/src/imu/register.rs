@@ -19,7 +19,7 @@ use super::timeline::ClockReport;
 use super::unit::Unit;
 use crate::source::{ImuBatch, ImuReading, ImuSource, SourceFault, Wait};
 use crate::types::{ImuSample, Nanos, Span};
-use crate::{Exit, Fault};
+use crate::{Fault, FaultKind};
 
 /// Pauses between attempts to find a lost unit.
 const BACKOFF: Span = Span(20_000_000);
@@ -320,7 +320,12 @@ impl<B: Bus, E: Edges> RegisterImu<B, E> {
             State::Running => String::new(),
         };
         let fix = "check cable and supply; it is looked for again and again";
-        SourceFault::Lost(Fault::new(Exit::Unavailable, &self.place, format!("the inertial unit is lost: {why}"), fix))
+        SourceFault::Lost(Fault::new(
+            FaultKind::Unavailable,
+            &self.place,
+            format!("the inertial unit is lost: {why}"),
+            fix,
+        ))
     }
 }
 
@@ -350,7 +355,7 @@ pub(super) fn cannot_start(place: &str, die: &str, trouble: Trouble) -> Fault {
         }
         _ => "check wiring and supply, then power the unit off and on",
     };
-    Fault::new(Exit::Unavailable, place, format!("the {die} does not start: {trouble}"), fix)
+    Fault::new(FaultKind::Unavailable, place, format!("the {die} does not start: {trouble}"), fix)
 }
 
 impl<B: Bus, E: Edges> ImuSource for RegisterImu<B, E> {

@@ -14,7 +14,7 @@ pub use mcap::McapSink;
 use crate::counters::Counter;
 use crate::source::{FrameSource, ImuBatch, ImuReading, ImuSource, SourceFault, Wait};
 use crate::types::{Frames, Span};
-use crate::{counters, host, Calibration, Exit, Fault};
+use crate::{counters, host, Calibration, Fault, FaultKind};
 use std::io;
 use std::path::Path;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
@@ -113,11 +113,11 @@ impl Taps {
 pub fn open(dir: &Path, format: Format, calibration: &Calibration) -> Result<Box<dyn Sink>, Fault> {
     let fault = |e: io::Error| {
         let fix = "choose a folder that can be written to and has room";
-        Fault::new(Exit::CantCreate, dir.display().to_string(), format!("cannot be recorded to: {e}"), fix)
+        Fault::new(FaultKind::NoOutput, dir.display().to_string(), format!("cannot be recorded to: {e}"), fix)
     };
     if dir.is_file() || std::fs::read_dir(dir).is_ok_and(|mut d| d.next().is_some()) {
         let what = "exists and is not an empty folder";
-        return Err(Fault::new(Exit::CantCreate, dir.display().to_string(), what, "choose another folder"));
+        return Err(Fault::new(FaultKind::NoOutput, dir.display().to_string(), what, "choose another folder"));
     }
     std::fs::create_dir_all(dir).map_err(fault)?;
     Ok(match format {

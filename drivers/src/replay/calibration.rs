@@ -13,7 +13,7 @@ use super::findings::Findings;
 use crate::calibration::{Calibration, ImuCalibration, ImuCorrection, RigCamera};
 use crate::camera::{Camera, Lens};
 use crate::types::{Pose, Span};
-use crate::{Exit, Fault};
+use crate::{Fault, FaultKind};
 use glam::{DMat3, DQuat, DVec3};
 use std::path::{Path, PathBuf};
 
@@ -60,7 +60,7 @@ pub fn read(path: &Path, readout: Option<Span>, findings: &mut Findings) -> Resu
         None => Ok(calibration),
         Some((i, j)) => {
             let what = format!("cameras {i} and {j} see the same from the same place (zero baseline): no depth");
-            Err(Fault::new(Exit::Config, path.display().to_string(), what, "correct their extrinsics"))
+            Err(Fault::new(FaultKind::Config, path.display().to_string(), what, "correct their extrinsics"))
         }
     }
 }
@@ -99,7 +99,7 @@ pub fn of_recording(
         None => {
             let fix = "add it, or name one with replay.calibration";
             let what = "no calibration: neither cam0/sensor.yaml in it nor camchain.yaml beside it";
-            Err(Fault::new(Exit::NoInput, mav0.display().to_string(), what, fix))
+            Err(Fault::new(FaultKind::NoInput, mav0.display().to_string(), what, fix))
         }
     }
 }

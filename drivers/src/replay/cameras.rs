@@ -1,7 +1,7 @@
 //! How many cameras a recording or a calibration has: cam0, cam1 and so on without a gap, at most
 //! `CAMERAS_MAX`. A gap is found when the missing one is read, so that its file or key is named.
 
-use crate::{Exit, Fault};
+use crate::{Fault, FaultKind};
 use std::path::Path;
 
 /// Cameras of one rig at most; as many as the estimator takes.
@@ -21,14 +21,14 @@ fn number(name: &str) -> Option<usize> {
 /// The folders of cameras in `mav0`; one at least, as a recording without any lacks cam0.
 pub fn recorded(mav0: &Path) -> Result<usize, Fault> {
     let entries = std::fs::read_dir(mav0).map_err(|e| {
-        Fault::new(Exit::NoInput, mav0.display().to_string(), format!("cannot read: {e}"), "check the path")
+        Fault::new(FaultKind::NoInput, mav0.display().to_string(), format!("cannot read: {e}"), "check the path")
     })?;
     let folders = entries.flatten().filter(|e| e.path().is_dir());
     let names: Vec<String> = folders.map(|e| e.file_name().to_string_lossy().into_owned()).collect();
     let count = count(names.iter().map(String::as_str)).max(1);
     if count > CAMERAS_MAX {
         let fix = format!("move the folders from cam{CAMERAS_MAX} on elsewhere");
-        return Err(Fault::new(Exit::Data, mav0.display().to_string(), too_many(count), fix));
+        return Err(Fault::new(FaultKind::Data, mav0.display().to_string(), too_many(count), fix));
     }
     Ok(count)
 }

@@ -25,7 +25,7 @@ pub use pairing::{FrameFiles, ImageFile};
 pub use trajectory::read_trajectory;
 
 use crate::types::{ImuSample, Nanos, Span, TimedPose};
-use crate::{Calibration, Exit, Fault};
+use crate::{Calibration, Fault, FaultKind};
 use findings::Findings;
 use glam::DVec3;
 use std::path::{Path, PathBuf};
@@ -97,7 +97,7 @@ impl Recording {
 fn layout(dataset: &Path) -> Result<(PathBuf, PathBuf), Fault> {
     let missing = |what: &str| {
         let fix = "name a folder that holds mav0/ (EuRoC ASL or TUM-VI)";
-        Err(Fault::new(Exit::NoInput, dataset.display().to_string(), what, fix))
+        Err(Fault::new(FaultKind::NoInput, dataset.display().to_string(), what, fix))
     };
     if !dataset.is_dir() {
         return missing("no such folder");
@@ -129,7 +129,7 @@ fn read_imu(path: &Path, hole: Span, findings: &mut Findings) -> Result<Vec<ImuS
     });
     let rows = order::increasing(rows, |s| s.t, path, findings);
     if rows.is_empty() {
-        return Err(Fault::new(Exit::Data, path.display().to_string(), "holds no finite sample", "record again"));
+        return Err(Fault::new(FaultKind::Data, path.display().to_string(), "holds no finite sample", "record again"));
     }
     for pair in rows.windows(2) {
         let gap = pair[1].value.t - pair[0].value.t;

@@ -4,7 +4,7 @@ use super::findings::Findings;
 use super::table::{self, Row};
 use super::{cameras, order};
 use crate::types::{Nanos, Span};
-use crate::{Calibration, Exit, Fault};
+use crate::{Calibration, Fault, FaultKind};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -38,7 +38,7 @@ pub fn image_lists(
     if recorded != calibrated {
         let what = format!("holds {}, the calibration has {}", cameras::named(recorded), cameras::named(calibrated));
         let fix = "take the others out of the one that has more, or name the right calibration with replay.calibration";
-        return Err(Fault::new(Exit::Config, mav0.display().to_string(), what, fix));
+        return Err(Fault::new(FaultKind::Config, mav0.display().to_string(), what, fix));
     }
     let list = |k: usize| list_path(mav0, k);
     let parse = |fields: &[&str]| match fields {
@@ -98,7 +98,7 @@ pub fn into_frames(
     if frames.is_empty() {
         let what = format!("no image has a partner within {:.4} s in every camera", tolerance.secs());
         let fix = "check that the cameras are synchronised, or raise replay.pair_tolerance_s";
-        return Err(Fault::new(Exit::Data, mav0.display().to_string(), what, fix));
+        return Err(Fault::new(FaultKind::Data, mav0.display().to_string(), what, fix));
     }
     Ok(frames)
 }

@@ -2,7 +2,7 @@
 //! spaces and empty lines are tolerated.
 
 use super::findings::Findings;
-use crate::{Exit, Fault};
+use crate::{Fault, FaultKind};
 use std::path::Path;
 
 #[derive(Clone, Debug)]
@@ -15,7 +15,7 @@ pub struct Row<T> {
 pub fn read_bytes(path: &Path) -> Result<Vec<u8>, Fault> {
     std::fs::read(path).map_err(|e| {
         let fix = "check the path and that the recording is complete";
-        Fault::new(Exit::NoInput, path.display().to_string(), format!("cannot read: {e}"), fix)
+        Fault::new(FaultKind::NoInput, path.display().to_string(), format!("cannot read: {e}"), fix)
     })
 }
 
@@ -45,7 +45,7 @@ pub fn read<T>(
             None if names_columns => {}
             None if rows.is_empty() => {
                 let what = format!("expected {columns}, found \"{}\"", excerpt(content));
-                return Err(Fault::at(Exit::Data, path, line, what, "check that this is the right file"));
+                return Err(Fault::at(FaultKind::Data, path, line, what, "check that this is the right file"));
             }
             None => {
                 let what = format!("expected {columns}, found \"{}\": row dropped", excerpt(content));
@@ -55,7 +55,12 @@ pub fn read<T>(
     }
     if rows.is_empty() {
         let what = format!("holds no rows of {columns}");
-        return Err(Fault::new(Exit::Data, path.display().to_string(), what, "check that the recording is complete"));
+        return Err(Fault::new(
+            FaultKind::Data,
+            path.display().to_string(),
+            what,
+            "check that the recording is complete",
+        ));
     }
     Ok(rows)
 }

@@ -4,7 +4,7 @@
 use super::findings::Findings;
 use super::{order, table};
 use crate::types::{Nanos, Pose, TimedPose};
-use crate::{Exit, Fault};
+use crate::{Fault, FaultKind};
 use glam::{DQuat, DVec3};
 use std::path::Path;
 
@@ -18,7 +18,7 @@ pub fn read_trajectory(path: &Path) -> Result<Vec<TimedPose>, Fault> {
         None => Ok(poses),
         Some(warning) => {
             let (place, what) = warning.split_once(": ").unwrap_or((warning, ""));
-            Err(Fault::new(Exit::Data, place, what, "correct or remove the row"))
+            Err(Fault::new(FaultKind::Data, place, what, "correct or remove the row"))
         }
     }
 }

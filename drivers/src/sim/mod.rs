@@ -25,7 +25,7 @@ pub use scenario::{euroc_rig, rig_named, CameraErrors, Flight, Light, Recording,
 pub use write::{write_euroc, write_euroc_colour};
 
 use crate::calibration::Calibration;
-use crate::fault::{Exit, Fault};
+use crate::fault::{Fault, FaultKind};
 use crate::types::{luma, Frames, ImuSample, Nanos, Pose, Span, TimedPose};
 use glam::{DVec3, Vec3};
 use render::{Exposure, Lens, Row, Rows, Scratch, View};
@@ -265,7 +265,7 @@ impl Sim {
 }
 
 fn check(s: &Scenario) -> Result<(), Fault> {
-    let wrong = |what: &str, fix: &str| Err(Fault::new(Exit::Config, format!("scenario {}", s.name), what, fix));
+    let wrong = |what: &str, fix: &str| Err(Fault::new(FaultKind::Config, format!("scenario {}", s.name), what, fix));
     if s.calibration.cameras.is_empty() {
         return wrong("the rig has no camera", "give a calibration with cameras");
     }
@@ -292,7 +292,7 @@ fn motion(scenario: &Scenario, rig: &Calibration) -> Result<(Spline, Nanos, Nano
     };
     let short = || {
         let fix = "give longer files that overlap in time";
-        Fault::new(Exit::Data, format!("scenario {}", scenario.name), "less than half a second to simulate", fix)
+        Fault::new(FaultKind::Data, format!("scenario {}", scenario.name), "less than half a second to simulate", fix)
     };
     let start = r.poses.first().ok_or_else(short)?.t;
     let samples: Vec<(f64, Pose)> = r.poses.iter().map(|p| ((p.t - start).secs(), p.pose)).collect();

@@ -9,7 +9,7 @@
 
 use super::imu::Bias;
 use super::scenario::Recording;
-use crate::fault::{Exit, Fault};
+use crate::fault::{Fault, FaultKind};
 use crate::types::{ImuSample, Nanos, Pose, TimedPose};
 use glam::{DQuat, DVec3};
 use std::path::Path;
@@ -27,7 +27,7 @@ pub fn read(truth: &Path, imu: Option<&Path>) -> Result<Recording, Fault> {
         let q = DQuat::from_xyzw(v[4], v[5], v[6], v[3]);
         if !(0.9..1.1).contains(&q.length()) {
             return Err(Fault::at(
-                Exit::Data,
+                FaultKind::Data,
                 truth,
                 row.line,
                 "the quaternion is not of unit length",
@@ -71,7 +71,7 @@ struct Row {
 /// Rows of a stamp and at least `columns` finite numbers, by increasing stamp; two at least.
 fn rows(path: &Path, columns: usize) -> Result<Vec<Row>, Fault> {
     let open = |e: csv::Error| {
-        Fault::new(Exit::NoInput, path.display().to_string(), e.to_string(), "give a csv in EuRoC's format")
+        Fault::new(FaultKind::NoInput, path.display().to_string(), e.to_string(), "give a csv in EuRoC's format")
     };
     let mut reader = csv::ReaderBuilder::new()
         .has_headers(false)
@@ -84,10 +84,10 @@ fn rows(path: &Path, columns: usize) -> Result<Vec<Row>, Fault> {
     for record in reader.records() {
         let record = record.map_err(|e| {
             let line = e.position().map_or(0, |p| p.line() as usize);
-            Fault::at(Exit::Data, path, line, e.to_string(), "give a csv in EuRoC's format")
+            Fault::at(FaultKind::Data, path, line, e.to_string(), "give a csv in EuRoC's format")
         })?;
         let line = record.position().map_or(0, |p| p.line() as usize);
-        let wrong = |what: String| Fault::at(Exit::Data, path, line, what, "give a csv in EuRoC's format");
+        let wrong = |what: String| Fault::at(FaultKind::Data, path, line, what, "give a csv in EuRoC's format");
         let stamp = record.get(0).unwrap_or_default();
         let t = Nanos(stamp.parse().map_err(|_| wrong(format!("'{stamp}' is not a stamp in nanoseconds")))?);
         let number = |s: &str| {
@@ -104,7 +104,7 @@ fn rows(path: &Path, columns: usize) -> Result<Vec<Row>, Fault> {
     }
     if rows.len() < 2 {
         return Err(Fault::new(
-            Exit::Data,
+            FaultKind::Data,
             path.display().to_string(),
             "has fewer than two rows",
             "give a csv in EuRoC's format",

@@ -6,7 +6,7 @@
 use super::Sim;
 use crate::calibration::RigCamera;
 use crate::euroc::{camera_yaml, commas, imu_yaml, transform_yaml, IMAGE_COLUMNS, IMU_COLUMNS};
-use crate::fault::{Exit, Fault};
+use crate::fault::{Fault, FaultKind};
 use crate::types::{Frames, Pose};
 use std::fmt::Write as _;
 use std::fs;
@@ -29,7 +29,12 @@ pub fn write_euroc_colour(sim: &mut Sim, dir: &Path, progress: impl FnMut(usize,
 fn write_shaped(sim: &mut Sim, dir: &Path, frames: Frames, progress: impl FnMut(usize, usize)) -> Result<(), Fault> {
     if fs::read_dir(dir).is_ok_and(|mut d| d.next().is_some()) || dir.is_file() {
         let fix = "remove it or choose another folder";
-        return Err(Fault::new(Exit::CantCreate, dir.display().to_string(), "exists and is not an empty folder", fix));
+        return Err(Fault::new(
+            FaultKind::NoOutput,
+            dir.display().to_string(),
+            "exists and is not an empty folder",
+            fix,
+        ));
     }
     let name = dir.file_name().map_or_else(|| "out".into(), |n| n.to_string_lossy().into_owned());
     let partial = dir.with_file_name(format!(".{name}.partial-{}", std::process::id()));
@@ -176,5 +181,5 @@ fn put(path: &Path, text: &str) -> Result<(), Fault> {
 }
 
 fn cannot(path: &Path, what: &str) -> Fault {
-    Fault::new(Exit::CantCreate, path.display().to_string(), what, "check that the folder is writable and has room")
+    Fault::new(FaultKind::NoOutput, path.display().to_string(), what, "check that the folder is writable and has room")
 }

@@ -6,7 +6,7 @@ use super::kernel::{Kernel, Request};
 use super::uapi::*;
 use super::Settings;
 use crate::types::Span;
-use crate::{Exit, Fault};
+use crate::{Fault, FaultKind};
 use std::io;
 
 /// Of `CID_EXPOSURE_ABSOLUTE`.
@@ -126,7 +126,7 @@ impl<'a> Controls<'a> {
     }
 
     fn wrong(&self, what: String, fix: &str) -> Fault {
-        Fault::new(Exit::Config, self.name, what, fix)
+        Fault::new(FaultKind::Config, self.name, what, fix)
     }
 }
 

@@ -1,18 +1,18 @@
 //! What a refused system call means for whoever has to mend it.
 
 use super::find::Select;
-use crate::{Exit, Fault};
+use crate::{Fault, FaultKind};
 use std::io;
 
 /// `call` on `place` failed while we wanted to `purpose`.
 pub(super) fn refused(place: &str, purpose: &str, call: &str, e: &io::Error) -> Fault {
-    let (exit, fix) = remedy(e);
-    Fault::new(exit, place, format!("cannot {purpose}: {call}: {e}"), fix)
+    let (kind, fix) = remedy(e);
+    Fault::new(kind, place, format!("cannot {purpose}: {call}: {e}"), fix)
 }
 
 pub(super) fn no_camera(select: &Select, what: String) -> Fault {
     let fix = "check its cable and power, and camera.devices in the board file";
-    Fault::new(Exit::Unavailable, select.to_string(), what, fix)
+    Fault::new(FaultKind::Unavailable, select.to_string(), what, fix)
 }
 
 /// Whether the device behind a descriptor is gone.
@@ -20,28 +20,32 @@ pub(super) fn is_gone(e: &io::Error) -> bool {
     matches!(e.raw_os_error(), Some(libc::ENODEV | libc::ENXIO | libc::ENOENT))
 }
 
-fn remedy(e: &io::Error) -> (Exit, &'static str) {
+fn remedy(e: &io::Error) -> (FaultKind, &'static str) {
     match e.raw_os_error() {
-        _ if is_gone(e) => (Exit::Unavailable, "check its cable and power"),
-        Some(libc::EBUSY) => (Exit::Unavailable, "another program streams from it (`fuser -v /dev/video*`): stop that"),
-        Some(libc::EACCES | libc::EPERM) => {
-            (Exit::Unavailable, "add the user to the group `video` (the units in board-configs/ do)")
+        _ if is_gone(e) => (FaultKind::Unavailable, "check its cable and power"),
+        Some(libc::EBUSY) => {
+            (FaultKind::Unavailable, "another program streams from it (`fuser -v /dev/video*`): stop that")
         }
-        Some(libc::ENOMEM) => (Exit::Unavailable, "the kernel has no memory for its buffers: lower camera.buffers"),
+        Some(libc::EACCES | libc::EPERM) => {
+            (FaultKind::Unavailable, "add the user to the group `video` (the units in board-configs/ do)")
+        }
+        Some(libc::ENOMEM) => {
+            (FaultKind::Unavailable, "the kernel has no memory for its buffers: lower camera.buffers")
+        }
         Some(libc::ENOSPC) => (
-            Exit::Unavailable,
+            FaultKind::Unavailable,
             "the bus has no bandwidth left: put the cameras on controllers of their own, or lower camera.rate_hz",
         ),
         Some(libc::ENOTTY) => {
-            (Exit::Unavailable, "its driver cannot do this: it is no camera, or needs a newer kernel")
+            (FaultKind::Unavailable, "its driver cannot do this: it is no camera, or needs a newer kernel")
         }
         Some(libc::EIO | libc::EPROTO | libc::ETIMEDOUT | libc::EPIPE) => {
-            (Exit::Io, "the camera does not answer: check its cable and power, `dmesg` says more")
+            (FaultKind::Io, "the camera does not answer: check its cable and power, `dmesg` says more")
         }
         Some(libc::EINVAL | libc::ERANGE) => {
-            (Exit::Config, "the camera refuses the value: compare [camera] with `v4l2-ctl --all`")
+            (FaultKind::Config, "the camera refuses the value: compare [camera] with `v4l2-ctl --all`")
         }
-        Some(libc::EMFILE | libc::ENFILE) => (Exit::Unavailable, "raise the limit of open files (`ulimit -n`)"),
-        _ => (Exit::Io, "`dmesg` says more"),
+        Some(libc::EMFILE | libc::ENFILE) => (FaultKind::Unavailable, "raise the limit of open files (`ulimit -n`)"),
+        _ => (FaultKind::Io, "`dmesg` says more"),
     }
 }

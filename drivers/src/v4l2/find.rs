@@ -5,7 +5,7 @@
 use super::fault::{no_camera, refused};
 use super::kernel::{Kernel, Listed, Request};
 use super::uapi::*;
-use crate::{Exit, Fault};
+use crate::{Fault, FaultKind};
 use std::path::{Path, PathBuf};
 
 /// How a board file names a camera.
@@ -103,7 +103,7 @@ pub(super) fn find(kernel: &dyn Kernel, select: &Select) -> Result<PathBuf, Faul
         (several, _) => {
             let list: Vec<String> = several.iter().map(|c| c.to_string()).collect();
             let what = format!("{} nodes fit: {}", several.len(), list.join(", "));
-            Err(Fault::new(Exit::Config, select.to_string(), what, "name one by path:/dev/v4l/by-path/LINK"))
+            Err(Fault::new(FaultKind::Config, select.to_string(), what, "name one by path:/dev/v4l/by-path/LINK"))
         }
     }
 }

@@ -32,7 +32,7 @@ pub use stamps::StampPoint;
 
 use crate::source::{FrameSource, SourceFault, Wait};
 use crate::types::{Frames, Nanos, Span};
-use crate::{Calibration, Exit, Fault, RigCamera};
+use crate::{Calibration, Fault, FaultKind, RigCamera};
 use fault::is_gone;
 use kernel::{Kernel, Linux, Ready, NODES_MAX};
 use node::{Failure, Filled, Node, Taken};
@@ -452,13 +452,13 @@ impl Stream {
             self.errors += 1;
             if self.errors >= ERRORS_MAX {
                 let what = "poll reports an error and no frame";
-                return Err(Fault::new(Exit::Io, &self.node.name, what, "`dmesg` says more"));
+                return Err(Fault::new(FaultKind::Io, &self.node.name, what, "`dmesg` says more"));
             }
         }
         if !ready.readable && now - self.heard > silent {
             let what = format!("gave nothing for {:.1} s", (now - self.heard).secs());
             let fix = "check its cable, its trigger, and camera.silent_s if it is meant to pause";
-            return Err(Fault::new(Exit::Io, &self.node.name, what, fix));
+            return Err(Fault::new(FaultKind::Io, &self.node.name, what, fix));
         }
         Ok(())
     }
@@ -517,7 +517,7 @@ fn stopped(node: &Node, failure: Failure) -> Fault {
 
 /// Settings and calibration must be of the same rig.
 fn check(settings: &Settings, cameras: &[RigCamera]) -> Result<(), Fault> {
-    let wrong = |what: String, fix: &str| Err(Fault::new(Exit::Config, "[camera]", what, fix));
+    let wrong = |what: String, fix: &str| Err(Fault::new(FaultKind::Config, "[camera]", what, fix));
     let (devices, count) = (settings.devices.len(), cameras.len());
     if devices == 0 || count == 0 || count > NODES_MAX || (devices != count && devices != 1) {
         let what = format!("camera.devices names {devices}, the calibration has {count} cameras (at most {NODES_MAX})");
@@ -552,7 +552,7 @@ impl FrameSource for Rig {
             |(image, c): (&crate::Image, &RigCamera)| (image.width, image.height) == (c.camera.width, c.camera.height);
         if frames.images.len() != self.cameras.len() || !frames.images.iter().zip(&self.cameras).all(shaped) {
             let what = "frames are not shaped by the calibration that the cameras were opened with";
-            return Err(SourceFault::Broken(Fault::new(Exit::Software, "cameras", what, "use Frames::for_rig")));
+            return Err(SourceFault::Broken(Fault::new(FaultKind::Internal, "cameras", what, "use Frames::for_rig")));
         }
         let deadline = self.kernel.now() + timeout;
         if self.next_frame(deadline, frames)? {

@@ -12,7 +12,7 @@ use super::pixels::{least_bytes, Format, Part};
 use super::uapi::*;
 use super::Settings;
 use crate::types::Span;
-use crate::{Exit, Fault};
+use crate::{Fault, FaultKind};
 use std::io;
 use std::os::fd::{FromRawFd, OwnedFd};
 use std::path::Path;
@@ -117,7 +117,7 @@ impl Node {
         let single = has & CAP_CAPTURE != 0;
         if has & (CAP_CAPTURE | CAP_CAPTURE_MULTI) == 0 || has & CAP_STREAMING == 0 {
             let what = format!("does not stream video (capabilities {has:#x})");
-            return Err(Fault::new(Exit::Config, &self.name, what, "name another node in camera.devices"));
+            return Err(Fault::new(FaultKind::Config, &self.name, what, "name another node in camera.devices"));
         }
         self.kind = if single { CAPTURE } else { CAPTURE_MULTI };
         Ok(())
@@ -170,14 +170,14 @@ impl Node {
     }
 
     fn at_fault(&self, what: String) -> Fault {
-        Fault::new(Exit::Unavailable, &self.name, what, "its driver is at fault: choose another camera.format")
+        Fault::new(FaultKind::Unavailable, &self.name, what, "its driver is at fault: choose another camera.format")
     }
 
     fn not_offered(&self, asked: &str, offers: &[offer::Offer]) -> Fault {
         let list = offer::text(&*self.kernel, self.fd, offers);
         let what = format!("does not give {asked}; it offers {list}");
         let fix = "change camera.format, camera.rate_hz or the size, which is the calibration's";
-        Fault::new(Exit::Config, &self.name, what, fix)
+        Fault::new(FaultKind::Config, &self.name, what, fix)
     }
 
     /// The period of frames. Drivers without rates of their own are triggered, or set elsewhere: they are believed.
@@ -213,7 +213,7 @@ impl Node {
         if r.count < BUFFERS_MIN {
             let what = format!("the driver gives {} buffers, {BUFFERS_MIN} are needed", r.count);
             return Err(Fault::new(
-                Exit::Unavailable,
+                FaultKind::Unavailable,
                 &self.name,
                 what,
                 "free memory, or choose another camera.format",

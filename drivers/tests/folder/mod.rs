@@ -5,7 +5,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 use stipple_drivers::replay::{OpenOptions, Recording};
-use stipple_drivers::{Exit, Fault};
+use stipple_drivers::{Fault, FaultKind};
 use tempfile::TempDir;
 
 /// A file or folder of the recordings, or `None` (said aloud) where they are not installed.
@@ -133,9 +133,9 @@ impl Folder {
     }
 
     /// Opening fails with this code, naming this place (a file, or file:line) and this word.
-    pub fn refused(&self, exit: Exit, place: &str, word: &str) -> Fault {
+    pub fn refused(&self, kind: FaultKind, place: &str, word: &str) -> Fault {
         let fault = self.open().unwrap_err();
-        assert_eq!(fault.exit, exit, "{fault}");
+        assert_eq!(fault.kind, kind, "{fault}");
         assert!(fault.place.contains(place), "{fault}");
         assert!(fault.what.contains(word), "{fault}");
         assert!(!fault.fix.is_empty() && !fault.to_string().contains('\n'), "{fault}");

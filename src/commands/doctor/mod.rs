@@ -22,7 +22,7 @@ use rotation::Turning;
 use signals::Light;
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
-use stipple_drivers::{Calibration, Exit, Fault, Frames, Image, ImuSample, Nanos};
+use stipple_drivers::{Calibration, Fault, FaultKind, Frames, Image, ImuSample, Nanos};
 
 #[derive(clap::Args)]
 pub struct Args {
@@ -184,12 +184,12 @@ pub fn doctor(args: &Args) -> Result<(), Fault> {
             list
         }
     };
-    all_passed(Exit::Unavailable, args.board.path(), checks.iter().chain(&sensed))
+    all_passed(FaultKind::Unavailable, args.board.path(), checks.iter().chain(&sensed))
 }
 
 /// An error where a check failed.
 pub fn all_passed<'a>(
-    exit: Exit,
+    kind: FaultKind,
     place: &std::path::Path,
     checks: impl Iterator<Item = &'a Check>,
 ) -> Result<(), Fault> {
@@ -197,7 +197,7 @@ pub fn all_passed<'a>(
         0 => Ok(()),
         n => {
             let what = format!("{n} check{} failed", if n == 1 { "" } else { "s" });
-            Err(Fault::new(exit, place.display().to_string(), what, "see the lines above"))
+            Err(Fault::new(kind, place.display().to_string(), what, "see the lines above"))
         }
     }
 }

@@ -10,7 +10,7 @@ use super::Disparity;
 use crate::config::{Fit, NetworkConfig};
 use crate::mem::Footprint;
 use runtime::{Refused, Session};
-use stipple_drivers::{Exit, Fault, Image};
+use stipple_drivers::{Fault, FaultKind, Image};
 
 pub struct Network {
     config: NetworkConfig,
@@ -32,7 +32,7 @@ fn inner(width: usize, height: usize, config: &NetworkConfig) -> [usize; 2] {
 }
 
 fn bad(key: &str, what: String, fix: &str) -> Fault {
-    Fault::new(Exit::Config, format!("stereo.network.{key}"), what, fix)
+    Fault::new(FaultKind::Config, format!("stereo.network.{key}"), what, fix)
 }
 
 impl Network {
@@ -89,7 +89,7 @@ impl Network {
         }
         self.session
             .run(&mut self.output)
-            .map_err(|what| Fault::new(Exit::Software, "stereo.network", what, "report this with the model"))?;
+            .map_err(|what| Fault::new(FaultKind::Internal, "stereo.network", what, "report this with the model"))?;
         let ([w, h], [nw, nh]) = (self.size, self.inner);
         let sign = if self.config.negated { -1.0 } else { 1.0 };
         for y in 0..h {

@@ -7,7 +7,7 @@ use stipple::map::pipeline::{SplatInit, View};
 use stipple::stereo::{DepthMap, Pinhole, Stereo};
 use stipple_drivers::replay::{OpenOptions, Recording};
 use stipple_drivers::types::Image;
-use stipple_drivers::{Exit, Fault, Frames, Pose};
+use stipple_drivers::{Fault, FaultKind, Frames, Pose};
 
 pub struct Scene {
     pub name: String,
@@ -86,7 +86,8 @@ impl Scene {
                 best = Some((found, depth.metres.clone(), image));
             }
         }
-        let none = || Fault::new(Exit::Data, folder.display().to_string(), "no frame with stereo depth", "use another");
+        let none =
+            || Fault::new(FaultKind::Data, folder.display().to_string(), "no frame with stereo depth", "use another");
         let (_, metres, image) = best.ok_or_else(none)?;
         let seen: Vec<usize> = (0..metres.len()).filter(|i| metres[*i] > 0.0).collect();
         let n = n.min(seen.len());

@@ -8,7 +8,7 @@ use serde_json::{json, Value};
 use std::io::{self, Write};
 use stipple::output::report::Report;
 use stipple::output::OutputDir;
-use stipple_drivers::{Exit, Fault};
+use stipple_drivers::{Fault, FaultKind};
 
 /// Methods, and how a board asks for each.
 const METHODS: [(&str, &[&str]); 3] = [
@@ -37,7 +37,7 @@ pub fn map(seconds: f64, out: &OutputDir, source: &Source) -> Result<Vec<Effect>
                 eprintln!("{}", effect.line());
                 maps.push(effect);
             }
-            Err(fault) if fault.exit == Exit::Config => {
+            Err(fault) if fault.kind == FaultKind::Config => {
                 eprintln!("{method} makes no map: {fault}");
                 continue;
             }

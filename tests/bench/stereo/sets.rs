@@ -7,7 +7,7 @@ use std::ops::Range;
 use std::path::Path;
 use stipple::stereo::rectify::Rectification;
 use stipple_drivers::sim::{Scenario, Sim};
-use stipple_drivers::{Camera, Exit, Fault, Frames, Image, Lens, Pose, RigCamera};
+use stipple_drivers::{Camera, Fault, FaultKind, Frames, Image, Lens, Pose, RigCamera};
 
 pub struct Pair {
     pub left: Image,
@@ -79,7 +79,7 @@ fn quarters(stored: &Image) -> Vec<f32> {
 }
 
 fn unreadable(path: &Path, what: impl std::fmt::Display) -> Fault {
-    Fault::new(Exit::Data, path.display().to_string(), format!("cannot read: {what}"), "fetch the file again")
+    Fault::new(FaultKind::Data, path.display().to_string(), format!("cannot read: {what}"), "fetch the file again")
 }
 
 /// Colours by their luma (ITU-R BT.601).

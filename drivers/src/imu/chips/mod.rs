@@ -10,7 +10,7 @@ mod bosch;
 mod invensense;
 mod st;
 
-use crate::{Exit, Fault};
+use crate::{Fault, FaultKind};
 
 /// Register address, its bank in the high byte.
 pub type Reg = u16;
@@ -231,7 +231,7 @@ impl Chip {
         CHIPS.iter().find(|c| c.name == name).ok_or_else(|| {
             let known = CHIPS.iter().map(|c| c.name).collect::<Vec<_>>().join(", ");
             let fix = format!("choose one of {known}, or `iio` for what the kernel drives");
-            Fault::new(Exit::Config, "imu.chip", format!("`{name}` is not driven"), fix)
+            Fault::new(FaultKind::Config, "imu.chip", format!("`{name}` is not driven"), fix)
         })
     }
 }
@@ -248,7 +248,7 @@ impl Die {
         let within = if self.gyro.is_some() { RATE_WITHIN } else { RATE_WITHIN_ALONE };
         if (hz / rate_hz - 1.0).abs() > within {
             let what = format!("the {} has no rate near {rate_hz} Hz", self.name);
-            return Err(Fault::new(Exit::Config, "imu.rate_hz", what, format!("the next is {hz:.1}")));
+            return Err(Fault::new(FaultKind::Config, "imu.rate_hz", what, format!("the next is {hz:.1}")));
         }
         let setting = Setting {
             rate,
@@ -274,7 +274,7 @@ fn range(sense: Option<&Sense>, asked: f64, key: &str, name: &str) -> Result<(f6
     let fitting = sense.ranges.iter().filter(|r| r.0 >= asked).min_by(|a, b| a.0.total_cmp(&b.0));
     fitting.map(|r| (r.0, r.1)).ok_or_else(|| {
         let has = sense.ranges.iter().map(|r| r.0.to_string()).collect::<Vec<_>>().join(", ");
-        Fault::new(Exit::Config, key, format!("the {name} does not reach {asked}"), format!("choose one of {has}"))
+        Fault::new(FaultKind::Config, key, format!("the {name} does not reach {asked}"), format!("choose one of {has}"))
     })
 }
 

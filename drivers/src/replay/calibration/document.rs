@@ -4,7 +4,7 @@
 use super::super::{findings, table};
 use super::rigid;
 use crate::types::Pose;
-use crate::{Exit, Fault};
+use crate::{Fault, FaultKind};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 
@@ -19,7 +19,7 @@ impl Document {
         let bytes = table::read_bytes(path)?;
         let wrong = |line: usize, what: String| {
             let place = findings::place(path, line);
-            Fault::new(Exit::Config, place, what.replace('\n', " "), "correct the calibration file")
+            Fault::new(FaultKind::Config, place, what.replace('\n', " "), "correct the calibration file")
         };
         let mut text = String::from_utf8(bytes).map_err(|_| wrong(0, "is not text".into()))?;
         if text.starts_with('%') {
@@ -69,7 +69,7 @@ impl Document {
     pub fn fault(&self, key: &str, what: &str) -> Fault {
         let name = key.trim_start_matches('/').replace('/', ".");
         let what = if name.is_empty() { what.to_string() } else { format!("{name}: {what}") };
-        Fault::new(Exit::Config, findings::place(&self.path, self.line(key)), what, "correct the calibration file")
+        Fault::new(FaultKind::Config, findings::place(&self.path, self.line(key)), what, "correct the calibration file")
     }
 
     fn get(&self, key: &str) -> Result<&Value, Fault> {
