@@ -116,7 +116,7 @@ fn cameras_are_named_by_what_does_not_change() {
     refused(camera("format = \"rgb\""), FaultKind::Config, &["test.toml:14", "rgb", "yuyv"]);
     let loose = camera("devices = [\"serial:1\", \"serial:2\"]\npair_tolerance_s = 0.03");
     refused(loose, FaultKind::Config, &["test.toml:15", "half a period"]);
-    refused(camera("buffers = 2"), FaultKind::Config, &["test.toml:14", "3 to 32"]);
+    refused(camera("rate_hz = 0"), FaultKind::Config, &["test.toml:14", "0.1 to 1000"]);
     refused(camera("gain = 2"), FaultKind::Config, &["test.toml:14", "gain"]);
 }
 
@@ -178,7 +178,7 @@ fn an_inertial_unit_is_described_whole_or_refused() {
         FaultKind::Config,
         &["test.toml:14", "gpio.led.line", "chip"],
     );
-    refused(with("chip = \"iio\"\nwatermark = 17\n"), FaultKind::Config, &["test.toml:15", "1 to 16"]);
+    refused(with("chip = \"iio\"\nrate_hz = 5\n"), FaultKind::Config, &["test.toml:15", "10 to 4000"]);
     let (name, edge) = parse(&format!("{BOARD}{line}"), &[]).unwrap().gpio.data_ready().unwrap();
     assert_eq!((name.to_string().as_str(), edge), ("tegra-gpio line PQ.05", Edge::Rising));
 }

@@ -132,21 +132,14 @@ pub(super) const BOUNDS: &[(&str, Bound)] = &[
     ("camera.exposure_line_us", Within(0.0, 1000.0)),
     ("camera.transfer_s", Within(0.0, 0.5)),
     ("camera.pair_tolerance_s", Within(0.0, 1.0)),
-    // Three: one to fill, one that waits, one that is read; 32 is the kernel's most.
-    ("camera.buffers", Within(3.0, 32.0)),
-    ("camera.silent_s", Within(0.05, 3600.0)),
     ("record.ring_frames", Within(1.0, 4096.0)),
     // Seven bits, less those that the bus keeps for itself.
     ("imu.i2c_address", Within(3.0, 119.0)),
     ("imu.accel_i2c_address", Within(3.0, 119.0)),
     ("imu.spi_hz", Within(10_000.0, 24_000_000.0)),
-    ("imu.spi_mode", Within(0.0, 3.0)),
     ("imu.rate_hz", Within(10.0, 4000.0)),
     ("imu.accel_range_g", Within(1.0, 64.0)),
     ("imu.gyro_range_dps", Within(50.0, 8000.0)),
-    // The smallest of the FIFOs holds 36 samples: half of it.
-    ("imu.watermark", Within(1.0, 16.0)),
-    ("imu.failures_max", Within(1.0, 1000.0)),
     ("imu.frozen_samples", Within(0.0, 1_000_000.0)),
     ("gpio.trigger.pulse_us", Within(1.0, 100_000.0)),
 ];

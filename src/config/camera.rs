@@ -31,12 +31,6 @@ pub struct CameraConfig {
     pub transfer_s: f64,
     /// Largest stamp difference of the images of one frame. Cameras of one trigger differ by less than a row.
     pub pair_tolerance_s: f64,
-    /// Asked of the kernel for each node. Four bridge a pause of two frames.
-    pub buffers: u32,
-    /// A camera that gave nothing for so long is opened again.
-    pub silent_s: f64,
-    /// Export the kernel's buffers as DMA-BUF.
-    pub export: bool,
 }
 
 impl Default for CameraConfig {
@@ -53,9 +47,6 @@ impl Default for CameraConfig {
             stamp: StampPoint::Driver,
             transfer_s: 0.0,
             pair_tolerance_s: 0.002,
-            buffers: 4,
-            silent_s: 2.0,
-            export: false,
         }
     }
 }
@@ -98,9 +89,6 @@ impl CameraConfig {
             stamp: self.stamp,
             transfer: Span::from_secs(self.transfer_s),
             pair_tolerance: Span::from_secs(self.pair_tolerance_s),
-            buffers: self.buffers,
-            silent: Span::from_secs(self.silent_s),
-            export: self.export,
         })
     }
 }

@@ -4,7 +4,7 @@
 use serde::{Deserialize, Serialize};
 use stipple_drivers::gpio::{Edge, LineName};
 use stipple_drivers::imu::chips::Chip;
-use stipple_drivers::imu::{IioOptions, ImuOptions, Limits, RegisterOptions, Wiring};
+use stipple_drivers::imu::{IioOptions, ImuOptions, RegisterOptions, Wiring};
 use stipple_drivers::Span;
 
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -18,11 +18,10 @@ pub struct ImuConfig {
     pub i2c: String,
     pub i2c_address: u16,
     pub accel_i2c_address: u16,
-    /// Or the spidev node, the gyro's of a unit that has two; clock and mode. MPUs take no more than 1 MHz.
+    /// Or the spidev node, the gyro's of a unit that has two; and the clock. MPUs take no more than 1 MHz.
     pub spi: String,
     pub accel_spi: String,
     pub spi_hz: u32,
-    pub spi_mode: u8,
     /// Of iio: name, label or place of the device, the accelerometer's where that is another, and the trigger of a
     /// device that has no interrupt of its own.
     pub device: String,
@@ -33,14 +32,10 @@ pub struct ImuConfig {
     /// The smallest of the unit's ranges that holds these.
     pub accel_range_g: f64,
     pub gyro_range_dps: f64,
-    /// Samples of one read. Four at 200 Hz are a read every 20 ms: half of what the tracker waits for a frame.
-    pub watermark: u32,
     /// Test the unit when it is opened, which takes up to two seconds and wants the board to stand still.
     pub self_test: bool,
     /// A file of the 8192 bytes that the BMI270 needs at each start: Bosch's program for it, and no part of this one.
     pub configuration: String,
-    /// Transfers that may fail in a row before the unit is set up anew.
-    pub failures_max: u32,
     /// Equal samples in a row that are no coincidence, 0: never. The quietest of the units, at its widest range, has a
     /// noise of a third of a step and more; six axes that stand still for 50 samples do not come by chance.
     pub frozen_samples: u32,
@@ -56,17 +51,14 @@ impl Default for ImuConfig {
             spi: String::new(),
             accel_spi: String::new(),
             spi_hz: 1_000_000,
-            spi_mode: 3,
             device: String::new(),
             accel_device: String::new(),
             trigger: String::new(),
             rate_hz: 200.0,
             accel_range_g: 16.0,
             gyro_range_dps: 2000.0,
-            watermark: 4,
             self_test: false,
             configuration: String::new(),
-            failures_max: 3,
             frozen_samples: 50,
         }
     }
@@ -119,7 +111,6 @@ impl ImuConfig {
                 accel_device: self.accel_device.clone(),
                 trigger: self.trigger.clone(),
                 rate_hz: self.rate_hz,
-                watermark: self.watermark,
                 frozen_samples: self.frozen_samples,
                 sysfs: "/sys/bus/iio/devices".into(),
                 dev: "/dev".into(),
@@ -133,7 +124,6 @@ impl ImuConfig {
                 self_test: self.self_test,
                 configuration: self.configuration.clone().into(),
                 frozen_samples: self.frozen_samples,
-                limits: Limits { watermark: self.watermark, failures_max: self.failures_max },
             })),
         }
     }
@@ -142,7 +132,7 @@ impl ImuConfig {
     fn wiring(&self) -> Vec<Wiring> {
         let dies = Chip::named(&self.chip).map_or(1, |chip| chip.dies.len());
         let i2c = |address: u16| Wiring::I2c { adapter: self.i2c.clone(), address };
-        let spi = |path: &str| Wiring::Spi { path: path.into(), hz: self.spi_hz, mode: self.spi_mode };
+        let spi = |path: &str| Wiring::Spi { path: path.into(), hz: self.spi_hz };
         let mut wired = if self.spi.is_empty() {
             vec![i2c(self.i2c_address), i2c(self.accel_i2c_address)]
         } else {

@@ -14,7 +14,7 @@ use std::time::Duration;
 use stipple_drivers::gpio::{DataReady, Edge, LineName, Output, Trigger};
 use stipple_drivers::host::monotonic;
 use stipple_drivers::imu::edges::{EdgeQueue, Edges};
-use stipple_drivers::imu::{HardwareImu, IioOptions, ImuCounters, ImuOptions, Limits, RegisterOptions, Wiring};
+use stipple_drivers::imu::{HardwareImu, IioOptions, ImuCounters, ImuOptions, RegisterOptions, Wiring};
 use stipple_drivers::source::{ImuBatch, ImuReading, ImuSource, SourceFault, Wait};
 use stipple_drivers::{Nanos, Span};
 
@@ -160,7 +160,6 @@ fn registers_on(wiring: Wiring, edges: bool) -> HardwareImu {
         self_test: false,
         configuration: PathBuf::new(),
         frozen_samples: 50,
-        limits: Limits { watermark: 4, failures_max: 3 },
     };
     ImuOptions::Register(options).open(edges.then(data_ready)).unwrap()
 }
@@ -172,7 +171,7 @@ fn i2c() -> Wiring {
 fn spi() -> Wiring {
     let nodes = std::fs::read_dir("/dev").unwrap().filter_map(Result::ok).map(|e| e.path());
     let path = nodes.filter(|p| p.to_string_lossy().contains("spidev")).max().unwrap();
-    Wiring::Spi { path: path.to_string_lossy().into(), hz: 1_000_000, mode: 3 }
+    Wiring::Spi { path: path.to_string_lossy().into(), hz: 1_000_000 }
 }
 
 const ACCEL: f64 = 8.0 / 32768.0 * 9.80665;
@@ -317,7 +316,6 @@ mod registers {
                 self_test: false,
                 configuration: PathBuf::new(),
                 frozen_samples: 0,
-                limits: Limits { watermark: 4, failures_max: 3 },
             })
         };
         let refused = |chip, address| options(chip, address).open(None).map(|_| ()).unwrap_err().to_string();
@@ -338,7 +336,6 @@ mod kernel {
             accel_device: String::new(),
             trigger: String::new(),
             rate_hz: RATE_HZ,
-            watermark: 2,
             frozen_samples: 50,
             sysfs: "/sys/bus/iio/devices".into(),
             dev: "/dev".into(),

@@ -243,6 +243,8 @@ const SPI_IOC_MESSAGE_1: libc::c_ulong = 0x4020_6b00;
 const SPI_IOC_WR_MODE: libc::c_ulong = 0x4001_6b01;
 const SPI_IOC_WR_BITS: libc::c_ulong = 0x4001_6b03;
 const SPI_IOC_WR_HZ: libc::c_ulong = 0x4004_6b04;
+/// Clock idle high, data taken at its rising edge: every chip of the table takes this mode.
+const SPI_MODE: u8 = 3;
 /// Bit of the address byte that asks for a read; all chips of the table share it.
 const SPI_READ: u8 = 0x80;
 
@@ -250,7 +252,6 @@ const SPI_READ: u8 = 0x80;
 pub struct Spi {
     path: PathBuf,
     hz: u32,
-    mode: u8,
     /// Bytes that the chip sends between address and data of a read.
     dummy: usize,
     file: File,
@@ -260,19 +261,19 @@ pub struct Spi {
 }
 
 impl Spi {
-    pub fn open(path: &str, hz: u32, mode: u8, dummy: usize) -> Result<Spi, Fault> {
-        Spi::open_in(path, hz, mode, dummy, ioctl)
+    pub fn open(path: &str, hz: u32, dummy: usize) -> Result<Spi, Fault> {
+        Spi::open_in(path, hz, dummy, ioctl)
     }
 
-    fn open_in(path: &str, hz: u32, mode: u8, dummy: usize, ioctl: Ioctl) -> Result<Spi, Fault> {
-        let file = Spi::file(Path::new(path), hz, mode, ioctl).map_err(|e| cannot_open(path, e))?;
+    fn open_in(path: &str, hz: u32, dummy: usize, ioctl: Ioctl) -> Result<Spi, Fault> {
+        let file = Spi::file(Path::new(path), hz, ioctl).map_err(|e| cannot_open(path, e))?;
         let [tx, rx] = [0, 0].map(|zero| Box::new([zero; TRANSFER_MAX]));
-        Ok(Spi { path: path.into(), hz, mode, dummy, file, ioctl, tx, rx })
+        Ok(Spi { path: path.into(), hz, dummy, file, ioctl, tx, rx })
     }
 
-    fn file(path: &Path, mut hz: u32, mut mode: u8, ioctl: Ioctl) -> Result<File, BusFault> {
+    fn file(path: &Path, mut hz: u32, ioctl: Ioctl) -> Result<File, BusFault> {
         let file = open_device(path)?;
-        let (fd, mut bits) = (file.as_raw_fd(), 8u8);
+        let (fd, mut mode, mut bits) = (file.as_raw_fd(), SPI_MODE, 8u8);
         // SAFETY: each of the three reads as many bytes from its pointer as its number encodes; all outlive the calls.
         let failed = unsafe {
             ioctl(fd, SPI_IOC_WR_MODE, (&raw mut mode).cast()) < 0
@@ -321,7 +322,7 @@ impl Bus for Spi {
     }
 
     fn reopen(&mut self) -> Result<(), BusFault> {
-        self.file = Spi::file(&self.path, self.hz, self.mode, self.ioctl)?;
+        self.file = Spi::file(&self.path, self.hz, self.ioctl)?;
         Ok(())
     }
 
@@ -369,7 +370,7 @@ mod tests {
     fn what_is_no_bus_is_refused_with_what_to_do() {
         let fault = I2c::open("/dev/null", 0x68).map(|_| ()).unwrap_err();
         assert!(fault.to_string().contains("plain I2C"), "{fault}");
-        let fault = Spi::open("/dev/null", 1_000_000, 0, 0).map(|_| ()).unwrap_err();
+        let fault = Spi::open("/dev/null", 1_000_000, 0).map(|_| ()).unwrap_err();
         assert!(fault.to_string().contains("spidev node"), "{fault}");
         let fault = I2c::open("/dev/no-such-adapter", 0x68).map(|_| ()).unwrap_err();
         assert!(fault.to_string().contains("wiring"), "{fault}");
@@ -432,7 +433,7 @@ mod tests {
     #[test]
     fn every_error_of_every_call_comes_back_as_a_value() {
         let i2c = || I2c::open_in("/dev/null", 0x68, simulated);
-        let spi = || Spi::open_in("/dev/null", 1_000_000, 3, 1, simulated);
+        let spi = || Spi::open_in("/dev/null", 1_000_000, 1, simulated);
         let (mut adapter, mut controller) = (i2c().unwrap(), spi().unwrap());
         let mut four = [0; 4];
         assert_eq!((adapter.read(0, &mut four), adapter.write(0, &four), adapter.reopen()), (Ok(()), Ok(()), Ok(())));
@@ -471,7 +472,7 @@ mod tests {
     #[test]
     fn transfers_too_long_are_refused_before_they_are_made() {
         let mut i2c = I2c::open_in("/dev/null", 0x68, simulated).unwrap();
-        let mut spi = Spi::open_in("/dev/null", 1, 0, 1, simulated).unwrap();
+        let mut spi = Spi::open_in("/dev/null", 1, 1, simulated).unwrap();
         let refused = Err(BusFault::Refused(libc::EMSGSIZE));
         assert_eq!(i2c.write(0, &[0; WRITE_MAX + 1]), refused);
         assert_eq!(i2c.read(0, &mut vec![0; 1 << 16]), refused);

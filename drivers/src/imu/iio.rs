@@ -38,7 +38,6 @@ pub struct IioOptions {
     /// Trigger of a device that has no data-ready interrupt of its own; empty: as the driver set it.
     pub trigger: String,
     pub rate_hz: f64,
-    pub watermark: u32,
     pub frozen_samples: u32,
     /// Where sysfs and the devices are.
     pub sysfs: PathBuf,
@@ -144,7 +143,7 @@ impl Device {
         }
         set_rate(&folder, options.rate_hz)?;
         set("buffer/length", &BUFFER_SCANS.to_string())?;
-        set("buffer/watermark", &options.watermark.to_string())?;
+        set("buffer/watermark", &super::watermark(options.rate_hz).to_string())?;
         if !set("buffer/enable", "1")? {
             let fix = "its driver needs an interrupt, or set imu.trigger";
             return Err(Fault::new(FaultKind::Unavailable, &options.device, "it has no buffer", fix));

@@ -28,7 +28,7 @@ mod unit;
 
 pub use counters::ImuCounters;
 pub use iio::{IioImu, IioOptions};
-pub use register::{Limits, RegisterImu};
+pub use register::RegisterImu;
 pub use timeline::ClockReport;
 
 use crate::gpio::DataReady;
@@ -101,7 +101,6 @@ pub enum Wiring {
     Spi {
         path: String,
         hz: u32,
-        mode: u8,
     },
 }
 
@@ -121,7 +120,6 @@ pub struct RegisterOptions {
     pub configuration: PathBuf,
     /// Equal values in a row that are no coincidence; 0: never.
     pub frozen_samples: u32,
-    pub limits: Limits,
 }
 
 impl RegisterOptions {
@@ -158,7 +156,7 @@ impl RegisterOptions {
             }
             units.push(Unit::new(die, &setting, rate_hz, self.frozen_samples));
         }
-        RegisterImu::start(place, units, edges, self.limits)
+        RegisterImu::start(place, units, edges, watermark(self.rate_hz))
     }
 
     fn read_configuration(&self) -> Result<Vec<u8>, Fault> {
@@ -185,7 +183,7 @@ impl Wiring {
     fn open(&self, spi_dummy: usize) -> Result<Box<dyn Bus>, Fault> {
         Ok(match self {
             Wiring::I2c { adapter, address } => Box::new(I2c::open(adapter, *address)?),
-            Wiring::Spi { path, hz, mode } => Box::new(Spi::open(path, *hz, *mode, spi_dummy)?),
+            Wiring::Spi { path, hz } => Box::new(Spi::open(path, *hz, spi_dummy)?),
         })
     }
 }
@@ -219,6 +217,12 @@ impl Bus for Box<dyn Bus> {
     fn sleep(&mut self, span: Span) {
         (**self).sleep(span);
     }
+}
+
+/// Samples of one read at this rate, Hz: as many as come in 20 ms, half of what the tracker waits for a frame's samples; 16
+/// at most, since the smallest FIFO holds 36.
+fn watermark(rate_hz: f64) -> usize {
+    ((rate_hz * 0.02) as usize).clamp(1, 16)
 }
 
 /// Sleeps for a span; not at all where it is negative.

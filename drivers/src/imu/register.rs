@@ -5,7 +5,7 @@
 //! same phase could not tell where in the period the samples lie, a wandering one narrows it to a few percent
 //! (`timeline`), for half a period more of latency.
 //!
-//! A transfer that fails is tried again at the next read. After `failures_max` in a row, a frozen sensor or silence
+//! A transfer that fails is tried again at the next read. After `FAILURES_MAX` in a row, a frozen sensor or silence
 //! the unit is reset and set up anew; where that fails, or nothing good came of the last time, it is lost, and looked
 //! for with a pause that doubles from `BACKOFF` to `BACKOFF_MAX`. Setting up takes 60 to 250 ms, and a call that does
 //! it outlasts its timeout by that.
@@ -27,19 +27,13 @@ const BACKOFF_MAX: Span = Span(1_000_000_000);
 /// No sample for so many periods, and at least so long: the unit lost its configuration, as after a brown-out.
 const SILENT_PERIODS: i64 = 20;
 const SILENT_MIN: Span = Span(100_000_000);
+/// Transfers that may fail in a row before the unit is set up anew.
+const FAILURES_MAX: u32 = 3;
 /// How long edges may stay away before samples are looked for without them.
 const EDGES_LATE: Span = Span(2_000_000);
 const EDGES_RETRY: Span = Span(1_000_000_000);
 /// The golden ratio's fraction: multiples of it fill the unit interval as evenly as can be.
 const GOLDEN: f64 = 0.618_033_988_749_895;
-
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Limits {
-    /// Samples of one read.
-    pub watermark: u32,
-    /// Transfers that may fail in a row.
-    pub failures_max: u32,
-}
 
 enum State {
     Running,
@@ -58,7 +52,8 @@ pub struct RegisterImu<B: Bus, E: Edges> {
     edges_from: Nanos,
     queue: EdgeQueue,
     merge: Option<Merge>,
-    limits: Limits,
+    /// Samples of one read.
+    watermark: usize,
     state: State,
     failures: u32,
     /// Before the next attempt; doubles until the unit gives samples that differ.
@@ -79,7 +74,7 @@ impl<B: Bus, E: Edges> RegisterImu<B, E> {
         place: String,
         mut units: Vec<Unit<B>>,
         edges: Option<E>,
-        limits: Limits,
+        watermark: usize,
     ) -> Result<RegisterImu<B, E>, Fault> {
         for unit in &mut units {
             unit.start().map_err(|trouble| cannot_start(&place, unit.die.chip.name, trouble))?;
@@ -92,7 +87,7 @@ impl<B: Bus, E: Edges> RegisterImu<B, E> {
             edges_from: Nanos::MIN,
             queue: EdgeQueue::default(),
             merge,
-            limits,
+            watermark,
             state: State::Running,
             failures: 0,
             pause: BACKOFF,
@@ -149,7 +144,7 @@ impl<B: Bus, E: Edges> RegisterImu<B, E> {
     }
 
     fn schedule(&mut self) {
-        let step = Span(self.period().0.saturating_mul(i64::from(self.limits.watermark)));
+        let step = Span(self.period().0.saturating_mul(self.watermark as i64));
         let now = self.now();
         // A read that came late does not make the next ones follow in haste.
         self.due = (self.due + step).max(now + Span(step.0 / 2));
@@ -180,7 +175,7 @@ impl<B: Bus, E: Edges> RegisterImu<B, E> {
                 return true;
             }
             let now = self.now();
-            if self.queue.stamps().len() >= self.limits.watermark as usize || now >= late {
+            if self.queue.stamps().len() >= self.watermark || now >= late {
                 return true;
             }
             if now >= limit {
@@ -259,7 +254,7 @@ impl<B: Bus, E: Edges> RegisterImu<B, E> {
             Trouble::Bus(BusFault::Gone) | Trouble::Frozen(_) | Trouble::Silent => self.restart(trouble),
             _ => {
                 self.failures += 1;
-                if self.failures >= self.limits.failures_max {
+                if self.failures >= FAILURES_MAX {
                     self.restart(trouble);
                 }
             }
@@ -341,7 +336,7 @@ fn push(batch: &mut ImuBatch, reading: Reading) {
 pub(super) fn cannot_start(place: &str, die: &str, trouble: Trouble) -> Fault {
     let fix = match trouble {
         Trouble::Bus(BusFault::Nack) => "check wiring, supply and imu.address (i2cdetect shows what answers)",
-        Trouble::Stranger(_) => "set imu.chip to what is there, or check imu.spi_mode and the chip select",
+        Trouble::Stranger(_) => "set imu.chip to what is there, or check the wiring (by SPI the chip select)",
         Trouble::NoConfiguration => {
             "set imu.configuration to a file of the 8192 bytes of bmi270_config_file, from Bosch's BMI270_SensorAPI: it \
              is Bosch's program, and no part of this one"

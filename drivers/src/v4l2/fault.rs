@@ -30,7 +30,7 @@ fn remedy(e: &io::Error) -> (FaultKind, &'static str) {
             (FaultKind::Unavailable, "add the user to the group `video` (the units in board-configs/ do)")
         }
         Some(libc::ENOMEM) => {
-            (FaultKind::Unavailable, "the kernel has no memory for its buffers: lower camera.buffers")
+            (FaultKind::Unavailable, "the kernel has no memory for its buffers: free some, or lower the cameras' size")
         }
         Some(libc::ENOSPC) => (
             FaultKind::Unavailable,

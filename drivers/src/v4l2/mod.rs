@@ -39,7 +39,6 @@ use node::{Failure, Filled, Node, Taken};
 use pixels::{to_grey, Part, Unreadable};
 use stamps::{pair, stamp_of, Gaps, Order, Pairing, Stamp, Timing};
 use std::collections::VecDeque;
-use std::os::fd::{AsFd, BorrowedFd};
 use std::sync::Arc;
 
 /// What the board file says of the cameras.
@@ -63,12 +62,6 @@ pub struct Settings {
     /// From the end of the first row's exposure until the last row was received.
     pub transfer: Span,
     pub pair_tolerance: Span,
-    /// Asked of each node.
-    pub buffers: u32,
-    /// A camera that gave nothing for so long is opened again.
-    pub silent: Span,
-    /// Export the buffers as DMA-BUF.
-    pub export: bool,
 }
 
 /// First and longest pause between attempts to open a lost camera: a USB device needs some 0.2 s to come up, and an
@@ -77,10 +70,12 @@ const RETRY_MIN: Span = Span(100_000_000);
 const RETRY_MAX: Span = Span(2_000_000_000);
 /// Errors in a row after which a camera is opened again.
 const ERRORS_MAX: u32 = 8;
-/// A camera that gives nothing is not waited for after so many periods, and this part of the silence after which it is
-/// opened again: half a second by default, a quarter of what odometry bridges.
+/// A camera that gave nothing for so long is opened again: a device that hangs is reset by it, and no camera that is meant
+/// to feed odometry pauses for longer.
+const SILENT: Span = Span(2_000_000_000);
+/// The others go on without a camera that gave nothing for so many periods, and so long: a quarter of what odometry bridges.
 const AWAY_PERIODS: i64 = 5;
-const AWAY_PART: i64 = 4;
+const AWAY: Span = Span(500_000_000);
 /// Warnings kept.
 const WARNINGS_MAX: usize = 32;
 
@@ -203,11 +198,6 @@ impl Rig {
         self.streams.iter().flatten().map(line).collect()
     }
 
-    /// Descriptors of a camera's buffers, where `Settings::export` asks for them: for whoever imports them.
-    pub fn exported(&self, camera: usize) -> impl Iterator<Item = BorrowedFd<'_>> {
-        self.streams.get(camera).into_iter().flatten().flat_map(|s| s.node.exported().map(|fd| fd.as_fd()))
-    }
-
     /// Pictures side by side in each node's.
     fn parts(&self) -> usize {
         self.cameras.len() / self.settings.devices.len()
@@ -319,8 +309,8 @@ impl Rig {
     fn deliver(&mut self, frames: &mut Frames) -> bool {
         loop {
             let (mut heads, mut full, mut of, mut n) = ([None; NODES_MAX], [false; NODES_MAX], [0; NODES_MAX], 0);
-            let (now, silent) = (self.kernel.now(), self.settings.silent);
-            let there = |(i, s): (usize, &'_ Option<Stream>)| s.as_ref().filter(|s| !s.is_away(now, silent)).map(|_| i);
+            let now = self.kernel.now();
+            let there = |(i, s): (usize, &'_ Option<Stream>)| s.as_ref().filter(|s| !s.is_away(now)).map(|_| i);
             for index in self.streams.iter().enumerate().filter_map(there) {
                 let Some(s) = &self.streams[index] else { continue };
                 (heads[n], full[n], of[n]) = (s.held.front().map(|h| h.t), s.is_full(), index);
@@ -395,8 +385,8 @@ impl Rig {
         let (now, mut ready) = (self.kernel.now(), ready.into_iter());
         for index in 0..self.streams.len() {
             let Some(stream) = &mut self.streams[index] else { continue };
-            if let Err(fault) = stream.heeds(ready.next().unwrap_or_default(), now, self.settings.silent) {
-                let silent = now - stream.heard > self.settings.silent;
+            if let Err(fault) = stream.heeds(ready.next().unwrap_or_default(), now) {
+                let silent = now - stream.heard > SILENT;
                 self.counters.camera_silences += u64::from(silent && self.lost[index].is_none());
                 self.lose(index, fault);
             }
@@ -440,14 +430,14 @@ impl Stream {
     }
 
     /// The others go on without it.
-    fn is_away(&self, now: Nanos, silent: Span) -> bool {
-        let patience = Span(self.node.period.0.saturating_mul(AWAY_PERIODS).max(silent.0 / AWAY_PART));
+    fn is_away(&self, now: Nanos) -> bool {
+        let patience = Span(self.node.period.0.saturating_mul(AWAY_PERIODS)).max(AWAY);
         self.held.is_empty() && self.spoke.is_some_and(|t| now - t > patience)
     }
 
     /// What poll said. What an error means is said by the next call that takes a buffer; one that says nothing is answered
     /// here.
-    fn heeds(&mut self, ready: Ready, now: Nanos, silent: Span) -> Result<(), Fault> {
+    fn heeds(&mut self, ready: Ready, now: Nanos) -> Result<(), Fault> {
         if ready.error && !ready.readable {
             self.errors += 1;
             if self.errors >= ERRORS_MAX {
@@ -455,9 +445,9 @@ impl Stream {
                 return Err(Fault::new(FaultKind::Io, &self.node.name, what, "`dmesg` says more"));
             }
         }
-        if !ready.readable && now - self.heard > silent {
+        if !ready.readable && now - self.heard > SILENT {
             let what = format!("gave nothing for {:.1} s", (now - self.heard).secs());
-            let fix = "check its cable, its trigger, and camera.silent_s if it is meant to pause";
+            let fix = "check its cable and its trigger";
             return Err(Fault::new(FaultKind::Io, &self.node.name, what, fix));
         }
         Ok(())

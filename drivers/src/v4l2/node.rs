@@ -14,7 +14,6 @@ use super::Settings;
 use crate::types::Span;
 use crate::{Fault, FaultKind};
 use std::io;
-use std::os::fd::{FromRawFd, OwnedFd};
 use std::path::Path;
 use std::sync::Arc;
 
@@ -40,8 +39,6 @@ pub(super) struct Node {
 struct Mapped {
     at: *const u8,
     length: usize,
-    /// The same memory for whoever imports it.
-    exported: Option<OwnedFd>,
 }
 
 // SAFETY: a mapping is memory of the process, not of a thread.
@@ -95,7 +92,7 @@ impl Node {
         let least = node.negotiate(want)?;
         node.period = node.set_rate(want)?;
         node.exposure = Controls::list(&*node.kernel, node.fd, &node.name)?.apply(want)?;
-        node.buy(want, least)?;
+        node.buy(least)?;
         node.start()?;
         Ok(node)
     }
@@ -207,8 +204,8 @@ impl Node {
     }
 
     /// Buffers, mapped and queued. A buffer too small for `least` would be read past its end.
-    fn buy(&mut self, want: &Settings, least: usize) -> Result<(), Fault> {
-        let mut r = RequestBuffers { count: want.buffers, kind: self.kind, memory: MEMORY_MMAP, ..Default::default() };
+    fn buy(&mut self, least: usize) -> Result<(), Fault> {
+        let mut r = RequestBuffers { count: BUFFERS, kind: self.kind, memory: MEMORY_MMAP, ..Default::default() };
         self.ioctl("ask for buffers", Request::Buy(&mut r))?;
         if r.count < BUFFERS_MIN {
             let what = format!("the driver gives {} buffers, {BUFFERS_MIN} are needed", r.count);
@@ -231,20 +228,9 @@ impl Node {
             let offset = i64::from(place as u32);
             let at = self.kernel.map(self.fd, offset, length as usize);
             let at = at.map_err(|e| self.refused("map a buffer", "mmap", e))?;
-            self.buffers.push(Mapped { at, length: length as usize, exported: None });
-            if want.export {
-                let exported = self.export(index)?;
-                self.buffers[index as usize].exported = Some(exported);
-            }
+            self.buffers.push(Mapped { at, length: length as usize });
         }
         Ok(())
-    }
-
-    fn export(&self, index: u32) -> Result<OwnedFd, Fault> {
-        let mut e = ExportBuffer { kind: self.kind, index, flags: libc::O_CLOEXEC as u32, ..Default::default() };
-        self.ioctl("export a buffer (camera.export)", Request::Export(&mut e))?;
-        // SAFETY: the kernel made this descriptor for us just now, and nobody else knows of it.
-        Ok(unsafe { OwnedFd::from_raw_fd(e.fd) })
     }
 
     fn start(&mut self) -> Result<(), Fault> {
@@ -307,14 +293,11 @@ impl Node {
     pub(super) fn held_max(&self) -> usize {
         self.buffers.len().saturating_sub(2).max(1)
     }
-
-    /// Of each buffer, where `Settings::export` asks for it.
-    pub(super) fn exported(&self) -> impl Iterator<Item = &OwnedFd> {
-        self.buffers.iter().filter_map(|b| b.exported.as_ref())
-    }
 }
 
-/// One for the driver to fill, one to wait, one to read.
+/// Buffers that are asked for: four bridge a pause of two frames.
+const BUFFERS: u32 = 4;
+/// Fewest that will do: one for the driver to fill, one to wait, one to read.
 const BUFFERS_MIN: u32 = 3;
 /// VIDEO_MAX_FRAME of the kernel.
 const BUFFERS_MAX: u32 = 32;

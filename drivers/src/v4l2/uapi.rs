@@ -48,7 +48,6 @@ pub const S_FMT: u32 = both::<FormatSingle>(5);
 pub const REQBUFS: u32 = both::<RequestBuffers>(8);
 pub const QUERYBUF: u32 = both::<Buffer>(9);
 pub const QBUF: u32 = both::<Buffer>(15);
-pub const EXPBUF: u32 = both::<ExportBuffer>(16);
 pub const DQBUF: u32 = both::<Buffer>(17);
 pub const STREAMON: u32 = write::<u32>(18);
 pub const STREAMOFF: u32 = write::<u32>(19);
@@ -216,17 +215,6 @@ pub struct Plane {
 
 #[derive(Clone, Copy, Debug, Default)]
 #[repr(C)]
-pub struct ExportBuffer {
-    pub kind: u32,
-    pub index: u32,
-    pub plane: u32,
-    pub flags: u32,
-    pub fd: i32,
-    pub reserved: [u32; 11],
-}
-
-#[derive(Clone, Copy, Debug, Default)]
-#[repr(C)]
 pub struct Control {
     pub id: u32,
     pub value: i32,
@@ -341,14 +329,13 @@ const _: () = {
     assert!(std::mem::offset_of!(Buffer, sequence) == 56);
     assert!(std::mem::offset_of!(Buffer, place) == 64);
     assert!(size_of::<Plane>() == 64);
-    assert!(size_of::<ExportBuffer>() == 64);
     assert!(size_of::<Control>() == 8);
     assert!(size_of::<ExtControl>() == 20);
     assert!(size_of::<ExtControls>() == 32);
     assert!(size_of::<QueryControl>() == 232);
     // What the header's macros give.
     assert!(QUERYCAP == 0x8068_5600 && ENUM_FMT == 0xc040_5602 && S_FMT == 0xc0d0_5605 && REQBUFS == 0xc014_5608);
-    assert!(QUERYBUF == 0xc058_5609 && QBUF == 0xc058_560f && EXPBUF == 0xc040_5610 && DQBUF == 0xc058_5611);
+    assert!(QUERYBUF == 0xc058_5609 && QBUF == 0xc058_560f && DQBUF == 0xc058_5611);
     assert!(STREAMON == 0x4004_5612 && STREAMOFF == 0x4004_5613 && S_PARM == 0xc0cc_5616);
     assert!(G_CTRL == 0xc008_561b && S_CTRL == 0xc008_561c && G_EXT_CTRLS == 0xc020_5647);
     assert!(S_EXT_CTRLS == 0xc020_5648 && ENUM_FRAMESIZES == 0xc02c_564a && ENUM_FRAMEINTERVALS == 0xc034_564b);

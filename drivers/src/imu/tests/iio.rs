@@ -117,7 +117,6 @@ impl Kernel {
             accel_device: String::new(),
             trigger: String::new(),
             rate_hz: 200.0,
-            watermark: 2,
             frozen_samples: 40,
             sysfs: self.root.path().join("sys"),
             dev: self.root.path().join("dev"),

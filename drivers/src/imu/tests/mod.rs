@@ -9,7 +9,7 @@ mod simulated;
 use super::bus::BusFault;
 use super::chips::CHIPS;
 use super::counters::ImuCounters;
-use super::register::{Limits, RegisterImu};
+use super::register::RegisterImu;
 use super::unit::GRAVITY;
 use super::{RegisterOptions, Wiring};
 use crate::source::{ImuBatch, ImuReading, ImuSource, SourceFault, Wait};
@@ -41,7 +41,6 @@ fn options(chip: &str) -> RegisterOptions {
         self_test: false,
         configuration: Default::default(),
         frozen_samples: 50,
-        limits: Limits { watermark: 4, failures_max: 3 },
     }
 }
 

@@ -8,7 +8,6 @@ use super::super::uapi::*;
 use crate::types::{Nanos, Span};
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::io;
-use std::os::fd::IntoRawFd;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, MutexGuard};
 
@@ -320,7 +319,6 @@ fn answer(c: &mut Cam, request: Request) -> io::Result<()> {
                 (planes[0].place, planes[0].length) = (place, c.buffer_bytes as u32);
             }
         }
-        Request::Export(a) => a.fd = std::fs::File::open("/dev/null")?.into_raw_fd(),
         Request::Queue(a, _) => {
             assert!(!c.queued.contains(&a.index), "buffer {} is queued twice", a.index);
             c.queued.push_back(a.index);

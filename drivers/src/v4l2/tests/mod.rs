@@ -26,9 +26,6 @@ fn settings(devices: &[&str]) -> Settings {
         stamp: StampPoint::FrameStart,
         transfer: Span(0),
         pair_tolerance: Span(2 * MS),
-        buffers: 4,
-        silent: Span(2_000 * MS),
-        export: false,
     }
 }
 

@@ -260,10 +260,7 @@ fn a_multi_planar_queue_gives_the_plane_of_luma_after_its_header() {
         c.formats = vec![(*b"NM12", vec![(WIDTH as u32, HEIGHT as u32)])];
     }
     let machine = Machine::new(cams);
-    let mut s = settings(&["serial:0000", "serial:0001"]);
-    s.export = true;
-    let mut rig = open(&machine, s).unwrap();
-    assert_eq!(rig.exported(1).count(), 4);
+    let mut rig = open(&machine, settings(&["serial:0000", "serial:0001"])).unwrap();
     let mut frames = Frames::for_rig(&rig_of(2, WIDTH, HEIGHT));
     for camera in 0..2 {
         machine.shoot(camera, 1..5, |_, s| {
