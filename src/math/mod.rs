@@ -2,5 +2,5 @@
 
 pub mod dense;
 pub mod qr;
-pub mod real;
 pub mod so3;
+mod wide;

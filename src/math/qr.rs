@@ -6,7 +6,7 @@
 //! elimination stands): what rounding left of them is dropped, so that a direction nobody observed
 //! stays unobserved.
 
-use super::real::{Real, Wide};
+use super::wide::Wide;
 
 /// What is left of a column is rounding when it is under this many epsilons of its length before
 /// elimination: a few roundings in each of a hundred reflections.
@@ -18,13 +18,13 @@ const GRAM_ROWS: usize = 4;
 
 /// `[A | b]`, row-major, with capacity bought once.
 #[derive(Clone, Debug)]
-pub struct Rows<S> {
-    a: Vec<S>,
+pub struct Rows {
+    a: Vec<f64>,
     /// The reflection's combination of rows, and its vector.
-    combination: Vec<S>,
-    reflection: Vec<S>,
+    combination: Vec<f64>,
+    reflection: Vec<f64>,
     /// Squared length of each column when elimination began.
-    lengths: Vec<S>,
+    lengths: Vec<f64>,
     rows: usize,
     cols: usize,
     stride: usize,
@@ -35,15 +35,15 @@ const fn padded(n: usize) -> usize {
     n.div_ceil(LANES) * LANES
 }
 
-impl<S: Real> Rows<S> {
+impl Rows {
     /// Room for `rows_max` rows of `cols_max` columns, b included.
-    pub fn new(rows_max: usize, cols_max: usize) -> Rows<S> {
+    pub fn new(rows_max: usize, cols_max: usize) -> Rows {
         let stride = padded(cols_max);
         Rows {
-            a: vec![S::ZERO; rows_max * stride],
-            combination: vec![S::ZERO; stride],
-            reflection: vec![S::ZERO; rows_max],
-            lengths: vec![S::ZERO; stride],
+            a: vec![0.0; rows_max * stride],
+            combination: vec![0.0; stride],
+            reflection: vec![0.0; rows_max],
+            lengths: vec![0.0; stride],
             rows: 0,
             cols: 0,
             stride: 0,
@@ -52,7 +52,7 @@ impl<S: Real> Rows<S> {
     }
 
     pub const fn bytes(rows_max: usize, cols_max: usize) -> usize {
-        ((rows_max + 2) * padded(cols_max) + rows_max) * size_of::<S>()
+        ((rows_max + 2) * padded(cols_max) + rows_max) * size_of::<f64>()
     }
 
     /// Empties, for rows of `cols` columns, b included.
@@ -80,45 +80,49 @@ impl<S: Real> Rows<S> {
 
     /// A new row of zeros.
     #[inline]
-    pub fn push(&mut self) -> &mut [S] {
+    pub fn push(&mut self) -> &mut [f64] {
         debug_assert!(self.rows < self.rows_max);
         let row = &mut self.a[self.rows * self.stride..][..self.stride];
-        row.fill(S::ZERO);
+        row.fill(0.0);
         self.rows += 1;
         &mut row[..self.cols]
     }
 
     #[inline]
-    pub fn row(&self, i: usize) -> &[S] {
+    pub fn row(&self, i: usize) -> &[f64] {
         &self.a[i * self.stride..][..self.cols]
     }
 
     #[inline]
-    pub fn row_mut(&mut self, i: usize) -> &mut [S] {
+    pub fn row_mut(&mut self, i: usize) -> &mut [f64] {
         &mut self.a[i * self.stride..][..self.cols]
     }
 
     /// Eliminates columns `0..n`: afterwards the first `rank` rows are triangular in them, and the others
     /// do not contain them. Answers the rank.
     pub fn eliminate(&mut self, n: usize) -> usize {
-        Eliminate(self, n).wide()
+        self.measure(n);
+        self.reflect(0, n, 0)
     }
 
-    /// The same with the remaining columns, of the rows below the first `rank`, which are dropped with the
-    /// first `n` columns' information. So are rows that speak of no column any more.
-    pub fn marginalise(&mut self, n: usize) {
-        Marginalise(self, n).wide();
+    /// Eliminates columns `0..n` and drops the rows that hold them; makes what is left triangular and drops the
+    /// rows in which no column is left.
+    pub fn marginalize(&mut self, n: usize) {
+        self.measure(self.cols);
+        let rank = self.reflect(0, n, 0);
+        let last = self.reflect(n, self.cols - 1, rank);
+        self.a.copy_within(rank * self.stride..last * self.stride, 0);
+        self.rows = last - rank;
     }
 
     /// As few rows as hold the same information.
-    pub fn triangularise(&mut self) {
-        self.marginalise(0);
+    pub fn triangularize(&mut self) {
+        self.marginalize(0);
     }
 
-    #[inline(always)]
     fn measure(&mut self, columns: usize) {
         let (stride, n) = (self.stride, padded(columns));
-        self.lengths[..n].fill(S::ZERO);
+        self.lengths[..n].fill(0.0);
         for row in self.a[..self.rows * stride].chunks_exact(stride) {
             for (l, x) in self.lengths[..n].iter_mut().zip(row) {
                 *l += *x * *x;
@@ -126,58 +130,14 @@ impl<S: Real> Rows<S> {
         }
     }
 
-    #[inline(always)]
-    fn reflect(&mut self, from: usize, to: usize, mut pivot: usize) -> usize {
-        let stride = self.stride;
-        let least = S::of((RANK_EPSILONS * S::EPSILON).powi(2));
-        for c in from..to {
-            if pivot == self.rows {
-                break;
-            }
-            let v = &mut self.reflection[..self.rows];
-            let mut square = S::ZERO;
-            for i in pivot..self.rows {
-                v[i] = self.a[i * stride + c];
-                square += v[i] * v[i];
-            }
-            // Also false where anything is not finite.
-            if !(square > least * self.lengths[c]) {
-                (pivot..self.rows).for_each(|i| self.a[i * stride + c] = S::ZERO);
-                continue;
-            }
-            let norm = square.sqrt();
-            let x = v[pivot];
-            let (alpha, size) = if x > S::ZERO { (-norm, x) } else { (norm, -x) };
-            v[pivot] = x - alpha;
-            let scale = S::ONE / (norm * (norm + size));
-            // From the lane c is in, so that the loops below stay aligned.
-            let begin = c / LANES * LANES;
-            let w = &mut self.combination[begin..stride];
-            w.fill(S::ZERO);
-            for i in pivot..self.rows {
-                // Rows are sparse before they are mixed.
-                if v[i] != S::ZERO {
-                    let row = &self.a[i * stride + begin..(i + 1) * stride];
-                    w.iter_mut().zip(row).for_each(|(w, x)| *w += v[i] * *x);
-                }
-            }
-            w.iter_mut().for_each(|w| *w *= scale);
-            w[..c - begin].fill(S::ZERO);
-            for i in pivot..self.rows {
-                if v[i] != S::ZERO {
-                    let row = &mut self.a[i * stride + begin..(i + 1) * stride];
-                    row.iter_mut().zip(&*w).for_each(|(x, w)| *x -= v[i] * *w);
-                }
-            }
-            self.a[pivot * stride + c] = alpha;
-            (pivot + 1..self.rows).for_each(|i| self.a[i * stride + c] = S::ZERO);
-            pivot += 1;
-        }
-        pivot
+    /// Householder reflections of columns `from..to`, the first of them to row `pivot`; answers the row after the
+    /// last. A column that depends on earlier ones takes no row.
+    fn reflect(&mut self, from: usize, to: usize, pivot: usize) -> usize {
+        Reflect { rows: self, from, to, pivot }.wide()
     }
 
     /// `[A | b]ᵀ [A | b]` of the rows from `first`, lower triangle, into `out` with the stride it answers.
-    pub fn gram(&self, first: usize, out: &mut [S]) -> usize {
+    pub fn gram(&self, first: usize, out: &mut [f64]) -> usize {
         let stride = self.stride;
         Gram { rows: &self.a[first * stride..self.rows * stride], stride, cols: self.cols, out }.wide();
         stride
@@ -189,49 +149,84 @@ impl<S: Real> Rows<S> {
     }
 }
 
-struct Eliminate<'a, S>(&'a mut Rows<S>, usize);
+struct Reflect<'a> {
+    rows: &'a mut Rows,
+    from: usize,
+    to: usize,
+    pivot: usize,
+}
 
-impl<S: Real> Wide for Eliminate<'_, S> {
+impl Wide for Reflect<'_> {
     type Output = usize;
     #[inline(always)]
     fn run(self) -> usize {
-        self.0.measure(self.1);
-        self.0.reflect(0, self.1, 0)
+        let Reflect { rows, from, to, mut pivot } = self;
+        let stride = rows.stride;
+        let least = (RANK_EPSILONS * f64::EPSILON).powi(2);
+        for c in from..to {
+            if pivot == rows.rows {
+                break;
+            }
+            let v = &mut rows.reflection[..rows.rows];
+            let mut square = 0.0;
+            for i in pivot..rows.rows {
+                v[i] = rows.a[i * stride + c];
+                square += v[i] * v[i];
+            }
+            // Also false where anything is not finite.
+            if !(square > least * rows.lengths[c]) {
+                (pivot..rows.rows).for_each(|i| rows.a[i * stride + c] = 0.0);
+                continue;
+            }
+            let norm = square.sqrt();
+            let x = v[pivot];
+            let (alpha, size) = if x > 0.0 { (-norm, x) } else { (norm, -x) };
+            v[pivot] = x - alpha;
+            let scale = 1.0 / (norm * (norm + size));
+            // From the lane c is in, so that the loops below stay aligned.
+            let begin = c / LANES * LANES;
+            let w = &mut rows.combination[begin..stride];
+            w.fill(0.0);
+            for i in pivot..rows.rows {
+                // Rows are sparse before they are mixed.
+                if v[i] != 0.0 {
+                    let row = &rows.a[i * stride + begin..(i + 1) * stride];
+                    w.iter_mut().zip(row).for_each(|(w, x)| *w += v[i] * *x);
+                }
+            }
+            w.iter_mut().for_each(|w| *w *= scale);
+            w[..c - begin].fill(0.0);
+            for i in pivot..rows.rows {
+                if v[i] != 0.0 {
+                    let row = &mut rows.a[i * stride + begin..(i + 1) * stride];
+                    row.iter_mut().zip(&*w).for_each(|(x, w)| *x -= v[i] * *w);
+                }
+            }
+            rows.a[pivot * stride + c] = alpha;
+            (pivot + 1..rows.rows).for_each(|i| rows.a[i * stride + c] = 0.0);
+            pivot += 1;
+        }
+        pivot
     }
 }
 
-struct Marginalise<'a, S>(&'a mut Rows<S>, usize);
-
-impl<S: Real> Wide for Marginalise<'_, S> {
-    type Output = ();
-    #[inline(always)]
-    fn run(self) {
-        let Marginalise(rows, n) = self;
-        rows.measure(rows.cols);
-        let rank = rows.reflect(0, n, 0);
-        let last = rows.reflect(n, rows.cols - 1, rank);
-        rows.a.copy_within(rank * rows.stride..last * rows.stride, 0);
-        rows.rows = last - rank;
-    }
-}
-
-struct Gram<'a, S> {
-    rows: &'a [S],
+struct Gram<'a> {
+    rows: &'a [f64],
     stride: usize,
     cols: usize,
-    out: &'a mut [S],
+    out: &'a mut [f64],
 }
 
-impl<S: Real> Wide for Gram<'_, S> {
+impl Wide for Gram<'_> {
     type Output = ();
     #[inline(always)]
     fn run(self) {
         for i in (0..self.cols).step_by(GRAM_ROWS) {
             for j in (0..i + GRAM_ROWS).step_by(LANES) {
-                let mut sum = [[S::ZERO; LANES]; GRAM_ROWS];
+                let mut sum = [[0.0; LANES]; GRAM_ROWS];
                 for row in self.rows.chunks_exact(self.stride) {
-                    let right: &[S; LANES] = row[j..j + LANES].try_into().expect("rows are padded to lanes");
-                    let left: &[S; GRAM_ROWS] = row[i..i + GRAM_ROWS].try_into().expect("lanes are whole");
+                    let right: &[f64; LANES] = row[j..j + LANES].try_into().expect("rows are padded to lanes");
+                    let left: &[f64; GRAM_ROWS] = row[i..i + GRAM_ROWS].try_into().expect("lanes are whole");
                     for (sum, x) in sum.iter_mut().zip(left) {
                         for (s, y) in sum.iter_mut().zip(right) {
                             *s += *x * *y;
@@ -250,20 +245,20 @@ impl<S: Real> Wide for Gram<'_, S> {
 mod tests {
     use super::*;
 
-    fn example<S: Real>(rows: usize, cols: usize) -> Rows<S> {
+    fn example(rows: usize, cols: usize) -> Rows {
         let mut a = Rows::new(rows, cols);
         a.clear(cols);
         for r in 0..rows {
             let row = a.push();
-            (0..cols).for_each(|c| row[c] = S::of(((r * 7 + c * 13 + r * c) as f64).sin()));
+            (0..cols).for_each(|c| row[c] = ((r * 7 + c * 13 + r * c) as f64).sin());
         }
         a
     }
 
-    fn gram<S: Real>(a: &Rows<S>, first: usize) -> Vec<Vec<f64>> {
-        let mut out = vec![S::ZERO; Rows::<S>::gram_len(a.cols())];
+    fn gram(a: &Rows, first: usize) -> Vec<Vec<f64>> {
+        let mut out = vec![0.0; Rows::gram_len(a.cols())];
         let stride = a.gram(first, &mut out);
-        (0..a.cols()).map(|i| (0..=i).map(|j| out[i * stride + j].f64()).collect()).collect()
+        (0..a.cols()).map(|i| (0..=i).map(|j| out[i * stride + j]).collect()).collect()
     }
 
     fn close(a: &[Vec<f64>], b: &[Vec<f64>], tolerance: f64) {
@@ -274,21 +269,23 @@ mod tests {
 
     #[test]
     fn product_is_that_of_the_rows() {
-        let a = example::<f64>(11, 13);
+        let a = example(11, 13);
         let dot = |i: usize, j: usize| (0..11).map(|r| a.row(r)[i] * a.row(r)[j]).sum::<f64>();
         let expected: Vec<Vec<f64>> = (0..13).map(|i| (0..=i).map(|j| dot(i, j)).collect()).collect();
         close(&gram(&a, 0), &expected, 1e-13);
     }
 
-    fn keeps_the_product<S: Real>(tolerance: f64) {
-        let a = example::<S>(30, 12);
+    #[test]
+    fn elimination_and_triangularization_keep_the_product() {
+        let tolerance = 1e-12;
+        let a = example(30, 12);
         let mut b = a.clone();
         assert_eq!(b.eliminate(5), 5);
         close(&gram(&a, 0), &gram(&b, 0), tolerance);
-        assert!((0..30).all(|r| (0..5.min(r)).all(|c| b.row(r)[c] == S::ZERO)));
+        assert!((0..30).all(|r| (0..5.min(r)).all(|c| b.row(r)[c] == 0.0)));
         // What no column explains is dropped: all but b's own square stays.
         let mut c = a.clone();
-        c.triangularise();
+        c.triangularize();
         assert_eq!(c.len(), 11);
         let (before, after) = (gram(&a, 0), gram(&c, 0));
         close(&before[..11], &after[..11], tolerance);
@@ -297,32 +294,22 @@ mod tests {
     }
 
     #[test]
-    fn elimination_and_triangularisation_keep_the_product() {
-        keeps_the_product::<f64>(1e-12);
-        keeps_the_product::<f32>(3e-5);
-    }
-
-    fn dependent<S: Real>() -> usize {
+    fn dependent_columns_are_recognised() {
         // The third column is the sum of the first two, the fourth is nobody's.
-        let mut a = example::<S>(40, 8);
+        let mut a = example(40, 8);
         let n = a.stride;
         for r in 0..40 {
             let row = &mut a.a[r * n..][..n];
-            (row[2], row[3]) = (row[0] + row[1], S::ZERO);
+            (row[2], row[3]) = (row[0] + row[1], 0.0);
         }
         let rank = a.eliminate(5);
-        assert!((rank..40).all(|r| a.row(r)[2] == S::ZERO && a.row(r)[3] == S::ZERO));
-        rank
-    }
-
-    #[test]
-    fn dependent_columns_are_recognised_in_both_precisions() {
-        assert_eq!((dependent::<f64>(), dependent::<f32>()), (3, 3));
+        assert!((rank..40).all(|r| a.row(r)[2] == 0.0 && a.row(r)[3] == 0.0));
+        assert_eq!(rank, 3);
     }
 
     #[test]
     fn rows_that_are_not_finite_are_not_made_worse() {
-        let mut a = example::<f64>(6, 4);
+        let mut a = example(6, 4);
         a.a[3] = f64::NAN;
         assert!(a.eliminate(3) <= 3);
     }

@@ -13,9 +13,8 @@ use super::sight::{host_eye, observe, predicted, CameraColumns, Host};
 use super::solve::Model;
 use super::window::{Layout, Window, FRAMES, MOTION_DIM, POSE_DIM};
 use crate::limits::{OBSERVATIONS, RIG_DIM, WINDOW_DIM};
-use crate::math::dense::{Span, System};
+use crate::math::dense::{Columns, System};
 use crate::math::qr::Rows;
-use crate::math::real::Real;
 use crate::mem::List;
 
 /// Columns of a point, first in a landmark's block.
@@ -33,28 +32,28 @@ const ROWS_MAX: usize = 2 * OBSERVATIONS + 1;
 
 /// The rows of one factor; reused for every factor.
 #[derive(Clone, Debug)]
-pub struct Linear<S> {
-    pub rows: Rows<S>,
+pub struct Linear {
+    pub rows: Rows,
     /// Of the layout, ascending; they follow each other in the rows after the point's columns.
-    pub spans: List<Span, SPANS>,
+    pub spans: List<Columns, SPANS>,
     lead: usize,
-    gram: Vec<S>,
+    gram: Vec<f64>,
 }
 
-impl<S: Real> Linear<S> {
-    pub fn new() -> Linear<S> {
+impl Linear {
+    pub fn new() -> Linear {
         Linear {
             rows: Rows::new(ROWS_MAX, COLS_MAX),
             spans: List::default(),
             lead: 0,
-            gram: vec![S::ZERO; Rows::<S>::gram_len(COLS_MAX)],
+            gram: vec![0.0; Rows::gram_len(COLS_MAX)],
         }
     }
 
-    pub const BYTES: usize = Rows::<S>::bytes(ROWS_MAX, COLS_MAX) + Rows::<S>::gram_len(COLS_MAX) * size_of::<S>();
+    pub const BYTES: usize = Rows::bytes(ROWS_MAX, COLS_MAX) + Rows::gram_len(COLS_MAX) * size_of::<f64>();
 
     /// Empties, for rows with `lead` columns of their own before those of `spans`.
-    fn begin(&mut self, lead: usize, spans: impl Iterator<Item = Span>) {
+    fn begin(&mut self, lead: usize, spans: impl Iterator<Item = Columns>) {
         self.spans.clear();
         for span in spans {
             self.spans.push(span).expect("SPANS is the most a factor touches");
@@ -70,15 +69,15 @@ impl<S: Real> Linear<S> {
     }
 
     /// Adds the square of the rows from `first`, the point's columns left out.
-    pub fn add_to(&mut self, first: usize, system: &mut System<S>) {
+    pub fn add_to(&mut self, first: usize, system: &mut System) {
         let stride = self.rows.gram(first, &mut self.gram);
         system.add_gram(&self.gram, stride, self.lead, &self.spans);
     }
 
     /// Appends the rows from `first`, the point's columns left out; makes room when there is none.
-    pub fn append_to(&self, first: usize, stack: &mut Rows<S>) {
+    pub fn append_to(&self, first: usize, stack: &mut Rows) {
         if stack.room() < self.rows.len() - first {
-            stack.triangularise();
+            stack.triangularize();
         }
         for i in first..self.rows.len() {
             let row = self.rows.row(i);
@@ -93,7 +92,7 @@ impl<S: Real> Linear<S> {
     }
 }
 
-impl<S: Real> Default for Linear<S> {
+impl Default for Linear {
     fn default() -> Self {
         Linear::new()
     }
@@ -103,13 +102,7 @@ impl<S: Real> Default for Linear<S> {
 pub const STACK_ROWS: usize = WINDOW_DIM + 4 * ROWS_MAX;
 
 /// A landmark's views in frames of the layout; answers their cost.
-fn view_rows<S: Real>(
-    landmark: &Landmark,
-    window: &Window,
-    model: &Model,
-    layout: &Layout,
-    out: &mut Linear<S>,
-) -> f64 {
+fn view_rows(landmark: &Landmark, window: &Window, model: &Model, layout: &Layout, out: &mut Linear) -> f64 {
     let host = landmark.host as usize;
     let views = landmark.observations.iter().filter(|o| layout.pose(o.slot as usize).is_some());
     let mut touched = [false; FRAMES];
@@ -117,7 +110,7 @@ fn view_rows<S: Real>(
     let others = (0..FRAMES).any(|s| touched[s] && s != host);
     touched[host] = others;
     let frames = (0..FRAMES).filter(|s| touched[*s] && others).filter_map(|s| layout.pose(s));
-    out.begin(POINT_DIM, frames.map(|at| Span { at, len: POSE_DIM }).chain(layout.cameras()));
+    out.begin(POINT_DIM, frames.map(|at| Columns { at, len: POSE_DIM }).chain(layout.cameras()));
     let host_at = layout.pose(host).filter(|_| others).map(|at| out.offset(at));
 
     let mut cost = 0.0;
@@ -137,7 +130,7 @@ fn view_rows<S: Real>(
         for axis in 0..2 {
             let row = out.rows.push();
             let mut put = |at: usize, x: &[f64]| {
-                row[at..].iter_mut().zip(x).for_each(|(to, x)| *to = S::of(x * weight));
+                row[at..].iter_mut().zip(x).for_each(|(to, x)| *to = x * weight);
             };
             put(0, &r.d_point[axis]);
             if let Some((at, len)) = cameras_at {
@@ -149,21 +142,21 @@ fn view_rows<S: Real>(
                 put(target_at, &r.d_target[axis]);
             }
             let last = row.len() - 1;
-            row[last] = S::of(r.px[axis] * weight);
+            row[last] = r.px[axis] * weight;
         }
     }
-    out.rows.push()[POINT_DIM - 1] = S::of(RHO_RIDGE);
+    out.rows.push()[POINT_DIM - 1] = RHO_RIDGE;
     cost
 }
 
 /// The same with its point eliminated: the first `POINT_DIM` rows hold it, the others do not. Answers the cost
 /// of its views, and whether they determine the point; one that they do not says nothing of the frames.
-pub fn landmark_rows<S: Real>(
+pub fn landmark_rows(
     landmark: &Landmark,
     window: &Window,
     model: &Model,
     layout: &Layout,
-    out: &mut Linear<S>,
+    out: &mut Linear,
 ) -> (f64, bool) {
     let cost = view_rows(landmark, window, model, layout, out);
     (cost, out.rows.eliminate(POINT_DIM) == POINT_DIM)
@@ -172,23 +165,23 @@ pub fn landmark_rows<S: Real>(
 /// Rows before elimination, `[point | all columns of the layout | r]`, for tests; `None` where `landmark_rows`
 /// would say nothing.
 #[cfg(test)]
-pub fn raw_landmark_rows<S: Real>(
+pub fn raw_landmark_rows(
     landmark: &Landmark,
     window: &Window,
     model: &Model,
     layout: &Layout,
-    out: &mut Linear<S>,
+    out: &mut Linear,
 ) -> Option<Vec<Vec<f64>>> {
     view_rows(landmark, window, model, layout, out);
     let mut full = Vec::new();
     for i in 0..out.rows.len() {
         let (row, mut wide, mut j) = (out.rows.row(i), vec![0.0; POINT_DIM + layout.dim + 1], POINT_DIM);
-        (0..POINT_DIM).for_each(|k| wide[k] = row[k].f64());
+        (0..POINT_DIM).for_each(|k| wide[k] = row[k]);
         for s in out.spans.iter() {
-            (0..s.len).for_each(|k| wide[POINT_DIM + s.at + k] = row[j + k].f64());
+            (0..s.len).for_each(|k| wide[POINT_DIM + s.at + k] = row[j + k]);
             j += s.len;
         }
-        wide[POINT_DIM + layout.dim] = row[j].f64();
+        wide[POINT_DIM + layout.dim] = row[j];
         full.push(wide);
     }
     (out.rows.eliminate(POINT_DIM) == POINT_DIM).then_some(full)
@@ -206,7 +199,7 @@ pub fn inertial_residual_at(window: &Window, from: usize, slot: usize) -> Vec15 
 }
 
 /// The inertial factor between two states; answers its cost.
-pub fn inertial_rows<S: Real>(window: &Window, from: usize, slot: usize, layout: &Layout, out: &mut Linear<S>) -> f64 {
+pub fn inertial_rows(window: &Window, from: usize, slot: usize, layout: &Layout, out: &mut Linear) -> f64 {
     let (a, b) = (window.frame(from), window.frame(slot));
     let rig = &window.rig;
     let r = inertial_residual_at(window, from, slot);
@@ -226,25 +219,25 @@ pub fn inertial_rows<S: Real>(window: &Window, from: usize, slot: usize, layout:
         for (at, j) in at.iter().zip([&ja, &jb]) {
             for (part, columns) in at.iter().zip([0..POSE_DIM, POSE_DIM..POSE_DIM + MOTION_DIM]) {
                 let Some(part) = part else { continue };
-                columns.enumerate().for_each(|(k, c)| row[part + k] = S::of(j[(i, c)]));
+                columns.enumerate().for_each(|(k, c)| row[part + k] = j[(i, c)]);
             }
         }
         if let Some((at, j)) = &scale {
-            (0..SCALE_DIM).for_each(|k| row[at + k] = S::of(j[(i, k)]));
+            (0..SCALE_DIM).for_each(|k| row[at + k] = j[(i, k)]);
         }
-        row[row.len() - 1] = S::of(r[i]);
+        row[row.len() - 1] = r[i];
     }
     0.5 * r.norm_squared()
 }
 
 /// The factor of a frame at rest, `None` when it is not; answers its cost. It is linear, so it has no
 /// linearisation point to keep.
-pub fn rest_rows<S: Real>(window: &Window, slot: usize, layout: &Layout, out: &mut Linear<S>) -> Option<f64> {
+pub fn rest_rows(window: &Window, slot: usize, layout: &Layout, out: &mut Linear) -> Option<f64> {
     let (r, [_, motion]) = (rest_residual(window.frame(slot))?, layout.state(slot));
     out.begin(0, motion.into_iter());
     for (i, (r, weight)) in r.into_iter().zip(REST_WEIGHTS).enumerate() {
         let row = out.rows.push();
-        (row[i], row[MOTION_DIM]) = (S::of(weight), S::of(r));
+        (row[i], row[MOTION_DIM]) = (weight, r);
     }
     Some(0.5 * r.iter().map(|r| r * r).sum::<f64>())
 }

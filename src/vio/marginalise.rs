@@ -5,7 +5,7 @@
 //! goes. The factors that leave with them (the old prior, the inertial factor, finished landmarks,
 //! landmarks of the removed keyframe) are stacked as rows, leaving columns first, and a
 //! rank-revealing QR takes those columns out. What stays is a square root: its rows times a
-//! direction are zero where nothing was observed, and single precision holds it (Demmel et al.,
+//! direction are zero where nothing was observed (Demmel et al.,
 //! ICCV 2021). The state after the leaving one is the boundary: nothing newer is linearised.
 
 use super::landmarks::{Landmark, Landmarks};
@@ -15,9 +15,8 @@ use super::rig::{RigSigma, RigState};
 use super::solve::Model;
 use super::window::{Layout, Window, FRAMES, MOTION_DIM, POSE_DIM};
 use crate::limits::{RIG_DIM, WINDOW_DIM};
-use crate::math::dense::{Span, System};
+use crate::math::dense::{Columns, System};
 use crate::math::qr::Rows;
-use crate::math::real::Real;
 use crate::mem::List;
 
 /// A keyframe of which fewer than this fraction of landmarks is still seen goes first.
@@ -44,25 +43,25 @@ type Blocks = List<Block, { 2 * FRAMES }>;
 
 /// `½ ‖J δ + r‖²` on the errors δ of what is anchored.
 #[derive(Clone, Debug)]
-pub struct Prior<S> {
-    rows: Rows<S>,
+pub struct Prior {
+    rows: Rows,
     /// JᵀJ, which every linearisation adds; its last row is r's and changes.
-    gram: Vec<S>,
+    gram: Vec<f64>,
     stride: usize,
     blocks: Blocks,
 }
 
-impl<S: Real> Prior<S> {
-    pub fn new() -> Prior<S> {
+impl Prior {
+    pub fn new() -> Prior {
         let cols = WINDOW_DIM + 1;
-        let gram = vec![S::ZERO; Rows::<S>::gram_len(cols)];
+        let gram = vec![0.0; Rows::gram_len(cols)];
         let mut rows = Rows::new(cols, cols);
         rows.clear(1);
         Prior { rows, gram, stride: 0, blocks: List::default() }
     }
 
     pub const BYTES: usize =
-        Rows::<S>::bytes(WINDOW_DIM + 1, WINDOW_DIM + 1) + Rows::<S>::gram_len(WINDOW_DIM + 1) * size_of::<S>();
+        Rows::bytes(WINDOW_DIM + 1, WINDOW_DIM + 1) + Rows::gram_len(WINDOW_DIM + 1) * size_of::<f64>();
 
     pub fn clear(&mut self) {
         self.blocks.clear();
@@ -83,7 +82,7 @@ impl<S: Real> Prior<S> {
         }
         self.rows.clear(15 + cameras + imu + 1);
         let r = motion.pose.rotation();
-        let mut diagonal = |i: usize, s: f64| self.rows.push()[i] = S::of(1.0 / s);
+        let mut diagonal = |i: usize, s: f64| self.rows.push()[i] = 1.0 / s;
         for i in 0..3 {
             diagonal(i, sigma.p);
             diagonal(6 + i, sigma.v);
@@ -95,7 +94,7 @@ impl<S: Real> Prior<S> {
         }
         for (axis, s) in [sigma.tilt, sigma.tilt, sigma.yaw].into_iter().enumerate() {
             let row = self.rows.push();
-            (0..3).for_each(|i| row[3 + i] = S::of(r.col(i)[axis] / s));
+            (0..3).for_each(|i| row[3 + i] = r.col(i)[axis] / s);
         }
         self.stride = self.rows.gram(0, &mut self.gram);
     }
@@ -109,7 +108,7 @@ impl<S: Real> Prior<S> {
         }
     }
 
-    fn place(block: Block, layout: &Layout) -> Span {
+    fn place(block: Block, layout: &Layout) -> Columns {
         let place = match block {
             Block::Pose(s) => layout.state(s as usize)[0],
             Block::Motion(s) => layout.state(s as usize)[1],
@@ -134,7 +133,7 @@ impl<S: Real> Prior<S> {
         }
         (0..self.rows.len()).map(move |i| {
             let row = self.rows.row(i);
-            ((0..at).map(|c| row[c].f64() * d[c]).sum::<f64>(), row[at].f64())
+            ((0..at).map(|c| row[c] * d[c]).sum::<f64>(), row[at])
         })
     }
 
@@ -152,7 +151,7 @@ impl<S: Real> Prior<S> {
         self.residuals(window, |b, out| Self::delta(window, b, out)).map(|(jd, r)| 0.5 * (jd + r) * (jd + r)).sum()
     }
 
-    fn spans(&self, layout: &Layout) -> List<Span, { 2 * FRAMES }> {
+    fn spans(&self, layout: &Layout) -> List<Columns, { 2 * FRAMES }> {
         let mut spans = List::default();
         for b in self.blocks.iter() {
             let _ = spans.push(Self::place(*b, layout));
@@ -161,14 +160,14 @@ impl<S: Real> Prior<S> {
     }
 
     /// Adds the square of the prior; answers its cost.
-    pub fn add_to(&mut self, window: &Window, layout: &Layout, system: &mut System<S>) -> f64 {
+    pub fn add_to(&mut self, window: &Window, layout: &Layout, system: &mut System) -> f64 {
         let mut cost = 0.0;
-        let mut b = [S::ZERO; WINDOW_DIM];
+        let mut b = [0.0; WINDOW_DIM];
         let n = self.rows.cols() - 1;
         for (i, (jd, r)) in self.residuals(window, |b, out| Self::delta(window, b, out)).enumerate() {
             let e = jd + r;
             cost += 0.5 * e * e;
-            b[..n].iter_mut().zip(self.rows.row(i)).for_each(|(b, j)| *b += *j * S::of(e));
+            b[..n].iter_mut().zip(self.rows.row(i)).for_each(|(b, j)| *b += *j * e);
         }
         self.gram[n * self.stride..][..n].copy_from_slice(&b[..n]);
         let spans = self.spans(layout);
@@ -177,7 +176,7 @@ impl<S: Real> Prior<S> {
     }
 
     /// Stacks the prior's rows at the estimate.
-    fn append_to(&self, window: &Window, layout: &Layout, stack: &mut Rows<S>) {
+    fn append_to(&self, window: &Window, layout: &Layout, stack: &mut Rows) {
         let spans = self.spans(layout);
         for (i, (jd, r)) in self.residuals(window, |b, out| Self::delta(window, b, out)).enumerate() {
             let (row, out) = (self.rows.row(i), stack.push());
@@ -186,12 +185,12 @@ impl<S: Real> Prior<S> {
                 out[s.at..s.at + s.len].copy_from_slice(&row[at..at + s.len]);
                 at += s.len;
             }
-            out[out.len() - 1] = S::of(jd + r);
+            out[out.len() - 1] = jd + r;
         }
     }
 
     /// Takes what is left of a stack, whose first columns have left, as the new prior, re-based to the anchors.
-    fn take(&mut self, stack: &Rows<S>, left: usize, blocks: Blocks, window: &Window) {
+    fn take(&mut self, stack: &Rows, left: usize, blocks: Blocks, window: &Window) {
         self.blocks = blocks;
         let n = stack.cols() - left;
         self.rows.clear(n);
@@ -202,7 +201,7 @@ impl<S: Real> Prior<S> {
         let moved = self.residuals(window, |b, out| Self::delta(window, b, out));
         shift.iter_mut().zip(moved).for_each(|(to, (jd, _))| *to = jd);
         for (i, shift) in shift[..self.rows.len()].iter().enumerate() {
-            self.rows.row_mut(i)[n - 1] -= S::of(*shift);
+            self.rows.row_mut(i)[n - 1] -= *shift;
         }
         self.stride = self.rows.gram(0, &mut self.gram);
     }
@@ -218,7 +217,7 @@ impl<S: Real> Prior<S> {
     }
 }
 
-impl<S: Real> Default for Prior<S> {
+impl Default for Prior {
     fn default() -> Self {
         Prior::new()
     }
@@ -279,24 +278,24 @@ fn least_useful(window: &Window, landmarks: &Landmarks, newest: usize) -> Option
 
 /// Rows and a factor's block, bought once.
 #[derive(Clone, Debug)]
-pub struct Marginaliser<S> {
-    stack: Rows<S>,
+pub struct Marginaliser {
+    stack: Rows,
 }
 
-impl<S: Real> Marginaliser<S> {
-    pub fn new() -> Marginaliser<S> {
+impl Marginaliser {
+    pub fn new() -> Marginaliser {
         Marginaliser { stack: Rows::new(STACK_ROWS, WINDOW_DIM + 1) }
     }
 
-    pub const BYTES: usize = Rows::<S>::bytes(STACK_ROWS, WINDOW_DIM + 1);
+    pub const BYTES: usize = Rows::bytes(STACK_ROWS, WINDOW_DIM + 1);
 
     /// Shrinks the window back to its resting size.
     pub fn shrink(
         &mut self,
         window: &mut Window,
         landmarks: &mut Landmarks,
-        prior: &mut Prior<S>,
-        linear: &mut Linear<S>,
+        prior: &mut Prior,
+        linear: &mut Linear,
         model: &Model,
     ) {
         let mut states = window.states();
@@ -348,7 +347,7 @@ impl<S: Real> Marginaliser<S> {
         }
         landmarks.retain(|l| !finished(l));
 
-        stack.marginalise(leaving);
+        stack.marginalize(leaving);
         for b in blocks.iter() {
             match b {
                 Block::Pose(s) | Block::Motion(s) => window.frame_mut(*s as usize).fix_anchor(),
@@ -370,7 +369,7 @@ impl<S: Real> Marginaliser<S> {
     }
 }
 
-impl<S: Real> Default for Marginaliser<S> {
+impl Default for Marginaliser {
     fn default() -> Self {
         Marginaliser::new()
     }

@@ -32,7 +32,6 @@ pub mod window;
 use crate::config::VioConfig;
 use crate::frontend::Tracks;
 use crate::limits::{CAMERAS_MAX, RIG_DIM, STATES};
-use crate::math::real::Real;
 use crate::mem::Footprint;
 use gate::{gate, predicted_covariance};
 use glam::DVec3;
@@ -94,15 +93,8 @@ pub struct Update {
     pub quality: u8,
 }
 
-/// The scalar of the linear algebra. Single precision ends at the same place and takes a tenth less time, but
-/// the sum of its rows cannot hold a drift of decimetres beside views of a tenth of a millimetre: after 50 s
-/// the position's stated deviation is a tenth too small, and stops growing soon after.
-pub type Scalar = f64;
-/// The estimator as it is built.
-pub type Vio = Estimator<Scalar>;
-
 #[derive(Clone, Debug)]
-pub struct Estimator<S: Real = Scalar> {
+pub struct Vio {
     model: Model,
     config: VioConfig,
     noise: Noise,
@@ -111,9 +103,9 @@ pub struct Estimator<S: Real = Scalar> {
     /// What was seen in each slot of the window.
     tracks: Vec<Tracks>,
     landmarks: Landmarks,
-    prior: Prior<S>,
-    solver: Solver<S>,
-    marginaliser: Marginaliser<S>,
+    prior: Prior,
+    solver: Solver,
+    marginaliser: Marginaliser,
     aligner: Aligner,
     /// What is known of the rig at a start, and now, in the order of its columns.
     rig_sigma: RigSigma,
@@ -139,15 +131,15 @@ pub struct Estimator<S: Real = Scalar> {
     hash: u64,
 }
 
-impl<S: Real> Estimator<S> {
-    pub fn new(calibration: &Calibration, config: &VioConfig) -> Estimator<S> {
+impl Vio {
+    pub fn new(calibration: &Calibration, config: &VioConfig) -> Vio {
         let eyes: Vec<Eye> = calibration.cameras.iter().take(CAMERAS_MAX).map(Eye::from).collect();
         let poses: Vec<Pose> = calibration.cameras.iter().take(CAMERAS_MAX).map(|c| c.body_from_cam).collect();
         let rig = RigState::new(&eyes, &poses, Parts::new(config));
         let rig_sigma = RigSigma::new(config);
         let rig_deviations = rig.sigmas(&rig_sigma);
         let noise = Noise::new(&calibration.imu, config);
-        Estimator {
+        Vio {
             model: Model::new(eyes, config),
             config: config.clone(),
             noise,
@@ -184,8 +176,8 @@ impl<S: Real> Estimator<S> {
         f.host("vio: inertial ring", ImuRing::BYTES);
         f.host("vio: window", Window::BYTES + FRAMES * size_of::<Tracks>());
         f.host("vio: landmarks", Landmarks::BYTES);
-        f.host("vio: solver", Solver::<S>::BYTES);
-        f.host("vio: prior and marginalisation", Prior::<S>::BYTES + Marginaliser::<S>::BYTES);
+        f.host("vio: solver", Solver::BYTES);
+        f.host("vio: prior and marginalisation", Prior::BYTES + Marginaliser::BYTES);
         f.host("vio: initialisation", Aligner::BYTES);
         f
     }

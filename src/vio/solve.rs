@@ -14,8 +14,7 @@ use super::rest::rest_cost;
 use super::window::{Layout, Window, FRAMES, POSE_DIM};
 use crate::config::VioConfig;
 use crate::limits::{LANDMARKS, RIG_DIM, WINDOW_DIM};
-use crate::math::dense::{Span, System};
-use crate::math::real::Real;
+use crate::math::dense::{Columns, System};
 use crate::mem::List;
 use glam::DVec2;
 
@@ -61,33 +60,33 @@ impl Model {
 
 /// The three rows that hold a landmark's point: `R d + W dx + g = 0` gives its step d.
 #[derive(Clone, Copy, Debug)]
-struct Own<S> {
+struct Own {
     /// Upper triangle.
-    r: [[S; POINT_DIM]; POINT_DIM],
-    w: [[S; LOCAL_DIM]; POINT_DIM],
-    g: [S; POINT_DIM],
+    r: [[f64; POINT_DIM]; POINT_DIM],
+    w: [[f64; LOCAL_DIM]; POINT_DIM],
+    g: [f64; POINT_DIM],
     saved: Point,
 }
 
 #[derive(Clone, Debug)]
-struct Eliminated<S> {
-    own: Own<S>,
-    spans: List<Span, SPANS>,
+struct Eliminated {
+    own: Own,
+    spans: List<Columns, SPANS>,
     determined: bool,
 }
 
-impl<S: Real> Eliminated<S> {
-    fn empty() -> Eliminated<S> {
+impl Eliminated {
+    fn empty() -> Eliminated {
         let own = Own {
-            r: [[S::ZERO; POINT_DIM]; POINT_DIM],
-            w: [[S::ZERO; LOCAL_DIM]; POINT_DIM],
-            g: [S::ZERO; POINT_DIM],
+            r: [[0.0; POINT_DIM]; POINT_DIM],
+            w: [[0.0; LOCAL_DIM]; POINT_DIM],
+            g: [0.0; POINT_DIM],
             saved: Point { s: DVec2::ZERO, rho: 0.0 },
         };
         Eliminated { own, spans: List::default(), determined: false }
     }
 
-    fn take(&mut self, linear: &Linear<S>, point: Point, determined: bool) {
+    fn take(&mut self, linear: &Linear, point: Point, determined: bool) {
         self.own.saved = point;
         self.determined = determined;
         if !determined {
@@ -106,7 +105,7 @@ impl<S: Real> Eliminated<S> {
     /// Decrease of the cost by the point's own step.
     fn decrease(&self) -> f64 {
         if self.determined {
-            0.5 * self.own.g.iter().map(|g| g.f64() * g.f64()).sum::<f64>()
+            0.5 * self.own.g.iter().map(|g| g * g).sum::<f64>()
         } else {
             0.0
         }
@@ -115,7 +114,7 @@ impl<S: Real> Eliminated<S> {
     /// Of the inverse distance, the frames taken as known; infinite when nothing determines it.
     fn rho_sigma(&self) -> f32 {
         if self.determined {
-            (1.0 / self.own.r[POINT_DIM - 1][POINT_DIM - 1].f64().abs()) as f32
+            (1.0 / self.own.r[POINT_DIM - 1][POINT_DIM - 1].abs()) as f32
         } else {
             f32::INFINITY
         }
@@ -125,13 +124,13 @@ impl<S: Real> Eliminated<S> {
         let mut d = [0.0; POINT_DIM];
         if self.determined {
             for i in (0..POINT_DIM).rev() {
-                let mut sum = self.own.g[i].f64();
+                let mut sum = self.own.g[i];
                 let mut w = self.own.w[i].iter();
                 for s in self.spans.iter() {
-                    sum += w.by_ref().zip(&dx[s.at..s.at + s.len]).map(|(w, x)| w.f64() * x).sum::<f64>();
+                    sum += w.by_ref().zip(&dx[s.at..s.at + s.len]).map(|(w, x)| w * x).sum::<f64>();
                 }
-                (i + 1..POINT_DIM).for_each(|j| sum += self.own.r[i][j].f64() * d[j]);
-                d[i] = -sum / self.own.r[i][i].f64();
+                (i + 1..POINT_DIM).for_each(|j| sum += self.own.r[i][j] * d[j]);
+                d[i] = -sum / self.own.r[i][i];
             }
         }
         d
@@ -140,11 +139,11 @@ impl<S: Real> Eliminated<S> {
 
 /// Buffers of the solver, bought once.
 #[derive(Clone, Debug)]
-pub struct Solver<S> {
-    system: System<S>,
-    factor: System<S>,
-    pub linear: Linear<S>,
-    eliminated: Vec<Eliminated<S>>,
+pub struct Solver {
+    system: System,
+    factor: System,
+    pub linear: Linear,
+    eliminated: Vec<Eliminated>,
     dx: Vec<f64>,
 }
 
@@ -157,7 +156,7 @@ pub struct Outcome {
     pub cost: f64,
 }
 
-pub(super) fn cost_of<S: Real>(window: &Window, landmarks: &Landmarks, prior: &Prior<S>, model: &Model) -> f64 {
+pub(super) fn cost_of(window: &Window, landmarks: &Landmarks, prior: &Prior, model: &Model) -> f64 {
     let mut cost = prior.cost(window);
     let mut before = None;
     for slot in window.states() {
@@ -170,8 +169,8 @@ pub(super) fn cost_of<S: Real>(window: &Window, landmarks: &Landmarks, prior: &P
     cost + cost_of_views(&landmarks.pool, window, model)
 }
 
-impl<S: Real> Solver<S> {
-    pub fn new() -> Solver<S> {
+impl Solver {
+    pub fn new() -> Solver {
         Solver {
             system: System::new(WINDOW_DIM),
             factor: System::new(WINDOW_DIM),
@@ -181,16 +180,16 @@ impl<S: Real> Solver<S> {
         }
     }
 
-    pub const BYTES: usize = LANDMARKS * size_of::<Eliminated<S>>()
-        + 2 * System::<S>::bytes(WINDOW_DIM)
-        + Linear::<S>::BYTES
+    pub const BYTES: usize = LANDMARKS * size_of::<Eliminated>()
+        + 2 * System::bytes(WINDOW_DIM)
+        + Linear::BYTES
         + WINDOW_DIM * size_of::<f64>();
 
     pub(super) fn linearise(
         &mut self,
         window: &Window,
         landmarks: &Landmarks,
-        prior: &mut Prior<S>,
+        prior: &mut Prior,
         model: &Model,
         layout: &Layout,
     ) -> f64 {
@@ -227,7 +226,7 @@ impl<S: Real> Solver<S> {
         self.system.solve_damped(damping, &mut self.factor, &mut self.dx);
         let mut decrease = 0.0;
         for (i, x) in self.dx[..n].iter().enumerate() {
-            decrease += 0.5 * (damping(self.system.at(i, i).f64()) * x * x - x * self.system.b[i].f64());
+            decrease += 0.5 * (damping(self.system.at(i, i)) * x * x - x * self.system.b[i]);
         }
         decrease += self.eliminated[..landmarks].iter().map(Eliminated::decrease).sum::<f64>();
         (decrease.is_finite() && self.dx[..n].iter().all(|x| x.is_finite())).then_some(decrease)
@@ -248,7 +247,7 @@ impl<S: Real> Solver<S> {
         &mut self,
         window: &Window,
         landmarks: &Landmarks,
-        prior: &mut Prior<S>,
+        prior: &mut Prior,
         model: &Model,
     ) -> [[f64; 15]; FRAMES] {
         let layout = Layout::of(window);
@@ -270,7 +269,7 @@ impl<S: Real> Solver<S> {
         let first = self.system.dim.checked_sub(15)?;
         self.factor.copy_from(&self.system);
         self.factor.eliminate(first);
-        let information = Mat15::from_fn(|i, j| self.factor.at(first + i, first + j).f64());
+        let information = Mat15::from_fn(|i, j| self.factor.at(first + i, first + j));
         let covariance = information.cholesky()?.inverse();
         covariance.iter().all(|x| x.is_finite()).then(|| covariance.into())
     }
@@ -286,7 +285,7 @@ impl<S: Real> Solver<S> {
         &mut self,
         window: &mut Window,
         landmarks: &mut Landmarks,
-        prior: &mut Prior<S>,
+        prior: &mut Prior,
         model: &Model,
     ) -> Outcome {
         let layout = Layout::of(window);
@@ -332,7 +331,7 @@ impl<S: Real> Solver<S> {
     }
 }
 
-impl<S: Real> Default for Solver<S> {
+impl Default for Solver {
     fn default() -> Self {
         Solver::new()
     }

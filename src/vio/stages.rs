@@ -7,14 +7,13 @@ use super::linear::landmark_rows;
 use super::preintegration::Increment;
 use super::solve::{cost_of, Outcome, LAMBDA_START};
 use super::window::Layout;
-use super::{Estimator, Scalar};
+use super::Vio;
 use crate::frontend::Tracks;
-use crate::math::real::Real;
 
 /// A copy of an estimator, stopped when a frame has entered its window.
 #[derive(Clone, Debug)]
-pub struct Stages<S: Real = Scalar> {
-    vio: Estimator<S>,
+pub struct Stages {
+    vio: Vio,
     layout: Layout,
     /// Slots of the frame and of the one before it.
     slot: usize,
@@ -33,9 +32,9 @@ pub struct Extent {
     pub columns: usize,
 }
 
-impl<S: Real> Stages<S> {
+impl Stages {
     /// Lets the frame in. `None` while the estimator is not running.
-    pub fn new(vio: &Estimator<S>, tracks: &Tracks) -> Option<Stages<S>> {
+    pub fn new(vio: &Vio, tracks: &Tracks) -> Option<Stages> {
         let before = vio.window.newest().filter(|_| vio.running)?;
         let mut vio = vio.clone();
         let (slot, connected, unconnected) = vio.enter(before, tracks);
@@ -99,7 +98,7 @@ impl<S: Real> Stages<S> {
 
     /// Brings the window back to its resting size; answers how many keyframes left it.
     pub fn marginalise(&mut self) -> usize {
-        let keyframes = |vio: &Estimator<S>| vio.window().filter(|(_, _, keyframe)| *keyframe).count();
+        let keyframes = |vio: &Vio| vio.window().filter(|(_, _, keyframe)| *keyframe).count();
         let before = keyframes(&self.vio);
         self.vio.shrink();
         before - keyframes(&self.vio)

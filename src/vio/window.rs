@@ -10,7 +10,7 @@ use super::residuals::{Body, InertialWeight, Motion};
 use super::rig::RigState;
 use super::shutter::Twist;
 use crate::limits::{KEYFRAMES, STATES};
-use crate::math::dense::Span;
+use crate::math::dense::Columns;
 use crate::mem::List;
 use glam::DVec3;
 use stipple_drivers::Nanos;
@@ -202,7 +202,7 @@ impl Window {
             }
             self.frames[slot].step(&d);
         }
-        let part = |span: Option<Span>| span.map_or(&[][..], |s| &dx[s.at..s.at + s.len]);
+        let part = |span: Option<Columns>| span.map_or(&[][..], |s| &dx[s.at..s.at + s.len]);
         if layout.cameras.is_some() || layout.imu.is_some() {
             self.rig.step(part(layout.cameras), part(layout.imu));
         }
@@ -216,8 +216,8 @@ const ABSENT: usize = usize::MAX;
 pub struct Layout {
     pose: [usize; FRAMES],
     motion: [usize; FRAMES],
-    cameras: Option<Span>,
-    imu: Option<Span>,
+    cameras: Option<Columns>,
+    imu: Option<Columns>,
     pub dim: usize,
 }
 
@@ -257,7 +257,7 @@ impl Layout {
     /// What is estimated of the rig, if anything.
     pub fn add_rig(&mut self, rig: &RigState) {
         let mut add = |len: usize| {
-            let span = Span { at: self.dim, len };
+            let span = Columns { at: self.dim, len };
             self.dim += len;
             (len > 0).then_some(span)
         };
@@ -265,18 +265,21 @@ impl Layout {
     }
 
     /// Columns of the rig that views touch.
-    pub fn cameras(&self) -> Option<Span> {
+    pub fn cameras(&self) -> Option<Columns> {
         self.cameras
     }
 
     /// Columns of the rig that inertial factors touch.
-    pub fn imu(&self) -> Option<Span> {
+    pub fn imu(&self) -> Option<Columns> {
         self.imu
     }
 
     /// Pose, then velocity and biases.
-    pub fn state(&self, slot: usize) -> [Option<Span>; 2] {
-        [self.pose(slot).map(|at| Span { at, len: POSE_DIM }), self.motion(slot).map(|at| Span { at, len: MOTION_DIM })]
+    pub fn state(&self, slot: usize) -> [Option<Columns>; 2] {
+        [
+            self.pose(slot).map(|at| Columns { at, len: POSE_DIM }),
+            self.motion(slot).map(|at| Columns { at, len: MOTION_DIM }),
+        ]
     }
 
     #[inline]

@@ -3,11 +3,9 @@
 use super::settings::Setting;
 use crate::inputs::Flight;
 use std::time::Instant;
-use stipple::config::Board;
 use stipple::frontend::{Frontend, Prediction};
-use stipple::math::real::Real;
 use stipple::output::metrics::{percentile, trajectory_error};
-use stipple::vio::{Estimator, Scalar};
+use stipple::vio::Vio;
 use stipple_drivers::host::thread_cpu;
 use stipple_drivers::{Fault, TimedPose};
 
@@ -36,16 +34,9 @@ pub struct Figures {
 }
 
 pub fn measure(flight: &Flight, setting: &Setting) -> Result<Figures, Fault> {
-    if setting.single {
-        measure_in::<f32>(flight, &setting.board)
-    } else {
-        measure_in::<Scalar>(flight, &setting.board)
-    }
-}
-
-fn measure_in<S: Real>(flight: &Flight, board: &Board) -> Result<Figures, Fault> {
+    let board = &setting.board;
     let mut frontend = Frontend::new(&flight.calibration, &board.frontend)?;
-    let mut vio = Estimator::<S>::new(&flight.calibration, &board.vio);
+    let mut vio = Vio::new(&flight.calibration, &board.vio);
     let n = flight.frames.len();
     let mut trajectory: Vec<TimedPose> = Vec::with_capacity(n);
     let (mut frontend_ms, mut estimator_ms) = (Vec::with_capacity(n), Vec::with_capacity(n));

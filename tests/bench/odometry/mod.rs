@@ -45,7 +45,7 @@ pub struct Args {
     /// One small flight, two settings
     #[arg(long)]
     quick: bool,
-    /// The default settings only, in both precisions: a row a flight
+    /// The default settings only: a row a flight
     #[arg(long, conflicts_with = "quick")]
     defaults: bool,
 }

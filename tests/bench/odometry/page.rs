@@ -99,7 +99,6 @@ fn defaults(sweep: &Sweep) -> String {
         "input",
         "frames",
         "ATE, cm",
-        "ATE in f32, cm",
         "RTE 1 s, cm",
         "RPE, \u{b0}",
         "frontend, ms: median / 99 %",
@@ -112,7 +111,6 @@ fn defaults(sweep: &Sweep) -> String {
         "knee",
     ];
     let pair = |a: f64, b: f64| format!("{a:.2} / {b:.2}");
-    let single = sweep.settings.iter().position(|s| s.single);
     let row = |i: usize| {
         let f: &Figures = sweep.row(i, 0);
         let knee = knee(&sweep.points_of(i)).map_or("\u{2013}".into(), |s| sweep.settings[s].name.clone());
@@ -120,7 +118,6 @@ fn defaults(sweep: &Sweep) -> String {
             sweep.inputs[i].name.clone(),
             format!("{} of {}", f.tracked, sweep.inputs[i].frames),
             number(f.ate_m.map(|m| m * CM), 2),
-            number(single.and_then(|s| sweep.row(i, s).ate_m).map(|m| m * CM), 2),
             number(f.rte_1s_m.map(|m| m * CM), 2),
             number(f.rpe_deg, 3),
             pair(f.frontend_ms_p50, f.frontend_ms_p99),

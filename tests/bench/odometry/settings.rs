@@ -2,8 +2,6 @@
 //! few whole shapes. A setting is a list of `--set` assignments, so any of them can be replayed.
 
 use stipple::config::Board;
-use stipple::math::real::Real;
-use stipple::vio::Scalar;
 
 /// A board that leaves the estimator at the method's defaults.
 const BOARD: &str = include_str!("../../../board-configs/lavapipe.toml");
@@ -32,9 +30,6 @@ const SHAPES: [Named; 4] = [
 /// Rules of inertial integration, by rising order.
 const SCHEMES: [Named; 2] = [("euler", &["vio.preintegration=euler"]), ("rk4", &["vio.preintegration=rk4"])];
 pub const SHAPE: &str = "shape";
-/// The other scalar of the estimator's linear algebra, which no board chooses.
-const SCALAR: &str = "scalar";
-const SINGLE: &str = "scalar f32";
 const SCHEME: &str = "preintegration";
 /// A name and its assignments.
 type Named = (&'static str, &'static [&'static str]);
@@ -47,8 +42,6 @@ pub struct Setting {
     pub name: String,
     pub set: Vec<String>,
     pub board: Board,
-    /// Linear algebra in f32 and not in `vio::Scalar`.
-    pub single: bool,
 }
 
 /// A curve of the plots: settings by index, along the parameter.
@@ -61,7 +54,7 @@ pub struct Curve {
 
 fn setting(name: String, set: Vec<String>) -> Setting {
     let board = Board::parse("board-configs/lavapipe.toml", BOARD, &set).expect("the sweep stays within the bounds");
-    Setting { name, set, board, single: false }
+    Setting { name, set, board }
 }
 
 fn assigned(key: &str, value: f64) -> Setting {
@@ -80,17 +73,12 @@ pub fn all() -> Vec<Setting> {
     for (family, members, _) in FAMILIES {
         all.extend(members.iter().map(|(name, set)| setting(format!("{family} {name}"), owned(set))));
     }
-    all.push(single());
     all
 }
 
-fn single() -> Setting {
-    Setting { single: true, ..setting(SINGLE.into(), vec![]) }
-}
-
-/// The default in both precisions.
+/// The default alone.
 pub fn defaults() -> Vec<Setting> {
-    vec![setting(DEFAULT.into(), vec![]), single()]
+    vec![setting(DEFAULT.into(), vec![])]
 }
 
 /// The default and one cheaper setting.
@@ -117,8 +105,6 @@ pub fn curves(settings: &[Setting]) -> Vec<Curve> {
         points.insert(points.len().min(below_default), (DEFAULT.into(), 0));
         curves.push(curve(family, points));
     }
-    let scalars = [find(SINGLE).map(|i| ("f32".to_string(), i)), Some((Scalar::NAME.to_string(), 0))];
-    curves.push(curve(SCALAR, scalars.into_iter().flatten().collect()));
     curves.retain(|c| c.settings.len() > 1);
     curves
 }
@@ -147,7 +133,7 @@ mod tests {
         assert!(settings[0].set.is_empty() && curves.iter().all(|c| c.settings.contains(&0)));
         for (i, s) in settings.iter().enumerate().skip(1) {
             assert!(curves.iter().any(|c| c.settings.contains(&i)), "{} is on no curve", s.name);
-            assert!(s.single || s.board != settings[0].board, "{} is the default", s.name);
+            assert!(s.board != settings[0].board, "{} is the default", s.name);
         }
     }
 }
