@@ -143,8 +143,6 @@ pub struct VioConfig {
     pub accel_noise_scale: f64,
     /// Hold velocity and gyro bias when nothing moves.
     pub zero_velocity: bool,
-    /// How inertial samples are summed.
-    pub preintegration: Scheme,
     /// Refine while flying: the cameras' time offset, where they sit, the scale of the inertial unit's axes; and
     /// how well each is known before. Extrinsics wrong by an angle need `frontend.epipolar_max` above it.
     pub estimate_time_offset: bool,
@@ -176,7 +174,6 @@ impl Default for VioConfig {
             gyro_noise_scale: 2.0,
             accel_noise_scale: 8.0,
             zero_velocity: true,
-            preintegration: Scheme::Midpoint,
             estimate_time_offset: false,
             estimate_extrinsics: false,
             estimate_imu_scale: false,
@@ -188,15 +185,6 @@ impl Default for VioConfig {
             accel_max: 156.9,
         }
     }
-}
-
-/// Rules of inertial integration; see `vio::preintegration`.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Scheme {
-    Euler,
-    Midpoint,
-    Rk4,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]

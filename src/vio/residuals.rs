@@ -4,7 +4,8 @@
 //! `rho`. Its point, scaled by `rho`, is `b(s)`, so points at infinity are ordinary:
 //! `x_w = R_h (R_c b + rho t_c) + rho p_h`, `x_t = R_tᵀ (x_w - rho p_t)`; projection ignores the scale.
 
-use super::preintegration::{block, Increment, Mat9, GRAVITY};
+use super::preintegration::{Increment, Mat9, GRAVITY};
+use crate::math::block::{block, put};
 use crate::math::so3;
 use glam::{DMat3, DVec2, DVec3};
 use nalgebra::SMatrix;
@@ -245,14 +246,7 @@ pub fn inertial_jacobians(inc: &Increment, w: &InertialWeight, a: &Motion, b: &M
     let jr_inv = so3::right_jacobian_inverse(r_q);
     let mut ja = Mat15::zeros();
     let mut jb = Mat15::zeros();
-    let mut set = |m: usize, row: usize, col: usize, x: DMat3| {
-        let target = if m == 0 { &mut ja } else { &mut jb };
-        for c in 0..3 {
-            for r in 0..3 {
-                target[(row + r, col + c)] = x.col(c)[r];
-            }
-        }
-    };
+    let mut set = |m: usize, row: usize, col: usize, x: DMat3| put([&mut ja, &mut jb][m], row, col, x);
     set(0, 0, 0, -r_to_a);
     set(0, 0, 3, so3::hat(to_a * (b.pose.p - a.pose.p - a.v * dt - GRAVITY * (0.5 * dt * dt))));
     set(0, 0, 6, r_to_a * -dt);
@@ -295,13 +289,13 @@ pub fn scale_jacobian(
     let (of_gyro, of_accel) = (&inc.d_gyro_scale, &inc.d_accel_scale);
     // The rotation is q Exp(D s) Exp(D_bg db): what s adds is carried through the second, then to r_q.
     let shift = so3::exp(inc.d_q_bg() * (a.bg - inc.bg)).conjugate();
-    let turn = block(of_gyro, 3) * gyro + block(of_accel, 3) * accel;
+    let turn = block(of_gyro, 3, 0) * gyro + block(of_accel, 3, 0) * accel;
     let carry =
         -so3::right_jacobian_inverse(r_q) * DMat3::from_quat(so3::exp(-r_q) * shift) * so3::right_jacobian(turn);
     let mut plain = SMatrix::<f64, 9, 6>::zeros();
     for (col, d) in [(0, of_gyro), (3, of_accel)] {
-        for (row, m) in [(0, -block(d, 0)), (3, carry * block(d, 3)), (6, -block(d, 6))] {
-            (0..9).for_each(|i| plain[(row + i % 3, col + i / 3)] = m.col(i / 3)[i % 3]);
+        for (row, m) in [(0, -block(d, 0, 0)), (3, carry * block(d, 3, 0)), (6, -block(d, 6, 0))] {
+            put(&mut plain, row, col, m);
         }
     }
     let mut out = SMatrix::<f64, 15, 6>::zeros();
@@ -324,7 +318,6 @@ mod tests {
     #![allow(clippy::unwrap_used)]
     use super::super::preintegration::Noise;
     use super::*;
-    use crate::config::Scheme;
     use glam::DQuat;
     use stipple_drivers::Lens;
 
@@ -425,7 +418,6 @@ mod tests {
             period: 0.005,
             gyro_max: 35.0,
             accel_max: 160.0,
-            scheme: Scheme::Midpoint,
             scale: true,
         };
         let mut inc = Increment::new(DVec3::new(0.005, 0.0, -0.01), DVec3::new(0.05, -0.05, 0.1));

@@ -13,6 +13,7 @@ use super::marginalise::Sigma;
 use super::preintegration::{Increment, Noise};
 use super::residuals::{Mat15, Motion};
 use super::samples::ImuRing;
+use crate::math::block::put;
 use crate::math::so3;
 use glam::{DMat3, DQuat, DVec3};
 use nalgebra::SMatrix;
@@ -176,14 +177,6 @@ fn in_world_of(pose: &Pose, start: &Motion) -> Motion {
     Motion { pose: Pose::new(twist * start.pose.q, pose.p), v: twist * start.v, ..*start }
 }
 
-fn put(m: &mut Mat15, row: usize, col: usize, x: DMat3) {
-    for c in 0..3 {
-        for r in 0..3 {
-            m[(row + r, col + c)] = x.col(c)[r];
-        }
-    }
-}
-
 /// Derivative of the motion after an increment to the motion before it.
 fn transition(from: &Motion, inc: &Increment) -> Mat15 {
     let (dp, dq, dv) = inc.corrected(from.bg, from.ba);
@@ -213,12 +206,8 @@ impl Carried {
         // Increment errors are in the first body frame, but for the rotation's, which is on the right.
         let r = from.pose.rotation();
         let mut turn = SMatrix::<f64, 9, 9>::identity();
-        for c in 0..3 {
-            for row in 0..3 {
-                turn[(row, c)] = r.col(c)[row];
-                turn[(6 + row, 6 + c)] = r.col(c)[row];
-            }
-        }
+        put(&mut turn, 0, 0, r);
+        put(&mut turn, 6, 6, r);
         let added = turn * inc.covariance * turn.transpose();
         for i in 0..9 {
             for j in 0..9 {

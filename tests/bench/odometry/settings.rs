@@ -27,14 +27,11 @@ const SHAPES: [Named; 4] = [
     ("larger", &["frontend.grid_px=40", "frontend.iterations=7", "vio.iterations_max=10"]),
     ("largest", &["frontend.grid_px=30", "frontend.iterations=10", "vio.iterations_max=12"]),
 ];
-/// Rules of inertial integration, by rising order.
-const SCHEMES: [Named; 2] = [("euler", &["vio.preintegration=euler"]), ("rk4", &["vio.preintegration=rk4"])];
 pub const SHAPE: &str = "shape";
-const SCHEME: &str = "preintegration";
 /// A name and its assignments.
 type Named = (&'static str, &'static [&'static str]);
 /// Families of named settings, and where the defaults stand in each.
-const FAMILIES: [(&str, &[Named], usize); 2] = [(SHAPE, &SHAPES, 1), (SCHEME, &SCHEMES, 1)];
+const FAMILIES: [(&str, &[Named], usize); 1] = [(SHAPE, &SHAPES, 1)];
 pub const DEFAULT: &str = "default";
 
 pub struct Setting {
