@@ -562,3 +562,5 @@ const _: () = assert!(FRAMES > STATES + 1 && FRAMES <= u8::MAX as usize);
 
 #[cfg(test)]
 mod tests;
+#[cfg(test)]
+use crate::world;

@@ -35,10 +35,10 @@ impl Predictor {
 
 #[cfg(test)]
 mod tests {
+    use super::super::world::{calibration, rate_and_force, Path};
     use super::super::Vio;
     use super::*;
     use crate::config::VioConfig;
-    use crate::world::{calibration, rate_and_force, Path};
     use stipple_drivers::ImuSample;
 
     fn at(t: f64) -> Nanos {

@@ -231,8 +231,8 @@ mod tests {
     #![allow(clippy::unwrap_used)]
     use super::super::residuals::Motion;
     use super::super::samples::ImuRing;
+    use super::super::world;
     use super::*;
-    use crate::world;
     use stipple_drivers::{ImuSample, Nanos, Pose};
 
     const NOISE: Noise = Noise {

@@ -98,9 +98,9 @@ impl Spikes {
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used)]
+    use super::super::world::{calibration, Noise as Random};
     use super::*;
     use crate::config::VioConfig;
-    use crate::world::{calibration, Noise as Random};
     use glam::DVec3;
     use stipple_drivers::Nanos;
 

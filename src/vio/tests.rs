@@ -1,8 +1,8 @@
 //! The estimator on the made-up world, where its insides are seen.
 
+use super::world::{self, Path, World, FRAME_SECS, RATE_HZ};
 use super::*;
 use crate::math::dense::System;
-use crate::world::{self, Path, World, FRAME_SECS, RATE_HZ};
 use marginalise::Sigma;
 use stipple_drivers::Span;
 use window::Layout;

@@ -260,9 +260,9 @@ impl Carried {
 
 #[cfg(test)]
 mod tests {
+    use super::super::world::{Path, World, RATE_HZ};
     use super::*;
     use crate::config::VioConfig;
-    use crate::world::{Path, World, RATE_HZ};
 
     #[test]
     fn origin_turns_and_shifts_what_is_seen_from_it() {
