@@ -1,7 +1,7 @@
 //! The points of the window: a fixed pool, found by track id; triangulation; outliers.
 
-use super::residuals::{Body, Eye, Point};
-use super::sight::{host_eye, placed, predicted};
+use super::projection::{host_cam, placed, predicted};
+use super::residuals::{CameraModel, Point, Transform};
 use super::window::{Window, FRAMES};
 use crate::frontend::{Track, Tracks};
 use crate::limits::{CAMERAS_MAX, LANDMARKS, OBSERVATIONS};
@@ -51,7 +51,7 @@ pub struct Landmarks {
 struct View {
     observation: Observation,
     /// World-from-camera.
-    camera: Body,
+    camera: Transform,
     bearing: DVec3,
 }
 
@@ -133,7 +133,7 @@ impl Landmarks {
             |_| true,
             |l, o| {
                 let ok =
-                    predicted(l, &host_eye(l, window), o, window).is_some_and(|px| (px - o.px()).length() <= px_max);
+                    predicted(l, &host_cam(l, window), o, window).is_some_and(|px| (px - o.px()).length() <= px_max);
                 dropped += !ok as usize;
                 ok
             },
@@ -148,7 +148,7 @@ impl Landmarks {
         slot: usize,
         window: &Window,
         tracks: &[Tracks],
-        eyes: &[Eye],
+        cameras: &[CameraModel],
         baseline_min: f64,
         px_max: f64,
     ) -> (usize, usize) {
@@ -160,7 +160,7 @@ impl Landmarks {
                     continue;
                 }
                 let host = (slot, camera);
-                let Some(landmark) = triangulate_one(track, host, window, tracks, eyes, baseline_min, px_max) else {
+                let Some(landmark) = triangulate_one(track, host, window, tracks, cameras, baseline_min, px_max) else {
                     continue;
                 };
                 if self.pool.len() == LANDMARKS {
@@ -189,10 +189,10 @@ pub fn find_track(list: &[Track], id: u64) -> Option<&Track> {
     list.binary_search_by_key(&id, |t| t.id).ok().map(|i| &list[i])
 }
 
-fn camera_in_world(o: &Observation, window: &Window) -> Body {
-    let (body, eye) =
+fn camera_in_world(o: &Observation, window: &Window) -> Transform {
+    let (body, camera_model) =
         (&window.frame(o.slot as usize).body, placed(o.camera as usize, o.px[1], o.slot as usize, window));
-    Body { r: body.r * eye.r, p: body.r * eye.p + body.p }
+    Transform { r: body.r * camera_model.r, p: body.r * camera_model.p + body.p }
 }
 
 fn views_of(
@@ -200,18 +200,18 @@ fn views_of(
     (slot, host_camera): (usize, usize),
     window: &Window,
     tracks: &[Tracks],
-    eyes: &[Eye],
+    cameras: &[CameraModel],
 ) -> ([Option<View>; FRAMES * CAMERAS_MAX], usize) {
     let mut views = [const { None }; FRAMES * CAMERAS_MAX];
     let mut n = 0;
     for s in window.slots() {
-        for (camera, eye) in eyes.iter().enumerate() {
+        for (camera, camera_model) in cameras.iter().enumerate() {
             if s == slot && camera == host_camera {
                 continue;
             }
             let Some(seen) = find_track(&tracks[s].cameras[camera], track.id) else { continue };
             let observation = Observation { slot: s as u8, camera: camera as u8, px: seen.px };
-            let Some(bearing) = eye.camera.unproject(observation.px()) else { continue };
+            let Some(bearing) = camera_model.camera.unproject(observation.px()) else { continue };
             views[n] = Some(View { observation, camera: camera_in_world(&observation, window), bearing });
             n += 1;
         }
@@ -226,14 +226,14 @@ fn triangulate_one(
     (slot, host_camera): (usize, usize),
     window: &Window,
     tracks: &[Tracks],
-    eyes: &[Eye],
+    cameras: &[CameraModel],
     baseline_min: f64,
     px_max: f64,
 ) -> Option<Landmark> {
     let host_view = Observation { slot: slot as u8, camera: host_camera as u8, px: track.px };
-    let bearing = eyes[host_camera].camera.unproject(host_view.px())?;
+    let bearing = cameras[host_camera].camera.unproject(host_view.px())?;
     let host = camera_in_world(&host_view, window);
-    let (views, n) = views_of(track, (slot, host_camera), window, tracks, eyes);
+    let (views, n) = views_of(track, (slot, host_camera), window, tracks, cameras);
     let (mut num, mut den) = (0.0, 0.0);
     for v in views[..n].iter().flatten() {
         let to_view = v.camera.r.transpose();
@@ -261,7 +261,7 @@ fn triangulate_one(
         ..Landmark::default()
     };
     let _ = landmark.observations.push(host_view);
-    let sits = host_eye(&landmark, window);
+    let sits = host_cam(&landmark, window);
     for v in views[..n].iter().flatten() {
         let o = v.observation;
         let seen = predicted(&landmark, &sits, &o, window);

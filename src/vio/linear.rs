@@ -6,12 +6,12 @@
 //! estimate, Jacobians at the linearisation points, those to the rig's columns too.
 
 use super::landmarks::Landmark;
+use super::projection::{host_cam, observe, predicted, CameraColumns, Host};
 use super::residuals::{huber, inertial_jacobians, inertial_residual, scale_jacobian, Vec15};
-use super::rest::{rest_residual, REST_WEIGHTS};
 use super::rig::SCALE_DIM;
-use super::sight::{host_eye, observe, predicted, CameraColumns, Host};
 use super::solve::Model;
 use super::window::{Layout, Window, FRAMES, MOTION_DIM, POSE_DIM};
+use super::zero_velocity::{rest_residual, REST_WEIGHTS};
 use crate::limits::{OBSERVATIONS, RIG_DIM, WINDOW_DIM};
 use crate::math::dense::{Columns, System};
 use crate::math::qr::Rows;
@@ -116,10 +116,10 @@ fn view_rows(landmark: &Landmark, window: &Window, model: &Model, layout: &Layou
     let mut cost = 0.0;
     let inv_sigma = 1.0 / model.sigma_px;
     let cameras_at = layout.cameras().map(|s| (out.offset(s.at), s.len));
-    let host_eye = Host::of(landmark, window);
+    let host_cam = Host::of(landmark, window);
     let mut columns: CameraColumns = [[0.0; RIG_DIM - SCALE_DIM]; 2];
     for o in views {
-        let Some(r) = observe(landmark, &host_eye, o, window, &mut columns) else {
+        let Some(r) = observe(landmark, &host_cam, o, window, &mut columns) else {
             cost += huber(LOST_PX * inv_sigma, model.huber_px * inv_sigma).1;
             continue;
         };
@@ -203,8 +203,8 @@ pub fn inertial_rows(window: &Window, from: usize, slot: usize, layout: &Layout,
     let (a, b) = (window.frame(from), window.frame(slot));
     let rig = &window.rig;
     let r = inertial_residual_at(window, from, slot);
-    let (before, after) = (a.motion_jacobian(), b.motion_jacobian());
-    let (gyro, accel) = (rig.linearised().gyro_scale, rig.linearised().accel_scale);
+    let (before, after) = (a.motion_linearized(), b.motion_linearized());
+    let (gyro, accel) = (rig.linearized().gyro_scale, rig.linearized().accel_scale);
     let (ja, jb) = if rig.parts.imu_scale {
         inertial_jacobians(&b.increment.rescaled(gyro, accel), &b.weight, before, after)
     } else {
@@ -248,9 +248,9 @@ pub fn cost_of_views(landmarks: &[Landmark], window: &Window, model: &Model) -> 
     let lost = huber(LOST_PX * inv_sigma, model.huber_px * inv_sigma).1;
     let mut cost = 0.0;
     for l in landmarks {
-        let host_eye = host_eye(l, window);
+        let host_cam = host_cam(l, window);
         for o in l.observations.iter() {
-            cost += match predicted(l, &host_eye, o, window) {
+            cost += match predicted(l, &host_cam, o, window) {
                 Some(px) => huber((px - o.px()).length() * inv_sigma, model.huber_px * inv_sigma).1,
                 None => lost,
             };

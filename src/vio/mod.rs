@@ -10,24 +10,24 @@
 
 pub mod gate;
 pub mod health;
-pub mod init;
+pub mod initialization;
 pub mod landmarks;
 pub mod linear;
-pub mod marginalise;
+pub mod marginalization;
 pub mod predict;
 pub mod preintegration;
+pub mod projection;
+mod recovery;
 pub mod residuals;
-pub mod rest;
 pub mod rig;
 pub mod samples;
 pub mod shutter;
-pub mod sight;
 pub mod solve;
 pub mod spikes;
 pub mod stages;
 mod stats;
-mod trust;
 pub mod window;
+pub mod zero_velocity;
 
 use crate::config::VioConfig;
 use crate::frontend::Tracks;
@@ -36,19 +36,19 @@ use crate::mem::Footprint;
 use gate::{gate, predicted_covariance};
 use glam::DVec3;
 use health::{quality, sigma_v, Evidence, Health, Reset, Watch, SIGMA_V_UNOBSERVED};
-use init::{Aligner, RESECTION_MIN};
+use initialization::{Initializer, RESECTION_MIN};
 use landmarks::{Landmark, Landmarks};
 use linear::inertial_residual_at;
-use marginalise::{Marginaliser, Prior};
+use marginalization::{Marginalizer, Prior};
 use predict::Predictor;
 use preintegration::{Increment, Noise};
-use residuals::{Eye, InertialWeight, Motion};
+use recovery::{Origin, Recovery};
+use residuals::{CameraModel, InertialWeight, Motion};
 use rig::{Parts, RigEstimate, RigSigma, RigState};
 use samples::{ImuRing, Leap};
 use solve::{Model, Outcome, Solver};
 pub use stats::{Stats, Tally};
 use stipple_drivers::{Calibration, ImuSample, Nanos, Pose};
-use trust::{Origin, Trust};
 use window::{Frame, Window, FRAMES};
 
 /// With fewer landmarks in view than this a keyframe is declared at once.
@@ -105,8 +105,8 @@ pub struct Vio {
     landmarks: Landmarks,
     prior: Prior,
     solver: Solver,
-    marginaliser: Marginaliser,
-    aligner: Aligner,
+    marginalizer: Marginalizer,
+    initializer: Initializer,
     /// What is known of the rig at a start, and now, in the order of its columns.
     rig_sigma: RigSigma,
     rig_deviations: [f64; RIG_DIM],
@@ -118,7 +118,7 @@ pub struct Vio {
     last: Option<Nanos>,
     leap: Leap,
     /// Where a restart goes on, and why there is one.
-    trust: Trust,
+    trust: Recovery,
     origin: Origin,
     reset_by: Reset,
     watch: Watch,
@@ -133,14 +133,14 @@ pub struct Vio {
 
 impl Vio {
     pub fn new(calibration: &Calibration, config: &VioConfig) -> Vio {
-        let eyes: Vec<Eye> = calibration.cameras.iter().take(CAMERAS_MAX).map(Eye::from).collect();
+        let cameras: Vec<CameraModel> = calibration.cameras.iter().take(CAMERAS_MAX).map(CameraModel::from).collect();
         let poses: Vec<Pose> = calibration.cameras.iter().take(CAMERAS_MAX).map(|c| c.body_from_cam).collect();
-        let rig = RigState::new(&eyes, &poses, Parts::new(config));
+        let rig = RigState::new(&cameras, &poses, Parts::new(config));
         let rig_sigma = RigSigma::new(config);
         let rig_deviations = rig.sigmas(&rig_sigma);
         let noise = Noise::new(&calibration.imu, config);
         Vio {
-            model: Model::new(eyes, config),
+            model: Model::new(cameras, config),
             config: config.clone(),
             noise,
             imu: ImuRing::new(),
@@ -149,8 +149,8 @@ impl Vio {
             landmarks: Landmarks::new(),
             prior: Prior::new(),
             solver: Solver::new(),
-            marginaliser: Marginaliser::new(),
-            aligner: Aligner::new(),
+            marginalizer: Marginalizer::new(),
+            initializer: Initializer::new(),
             rig_sigma,
             rig_deviations,
             running: false,
@@ -158,7 +158,7 @@ impl Vio {
             before: Predictor { noise, state: None },
             last: None,
             leap: Leap::default(),
-            trust: Trust::default(),
+            trust: Recovery::default(),
             origin: Origin::default(),
             reset_by: Reset::Asked,
             watch: Watch::default(),
@@ -177,8 +177,8 @@ impl Vio {
         f.host("vio: window", Window::BYTES + FRAMES * size_of::<Tracks>());
         f.host("vio: landmarks", Landmarks::BYTES);
         f.host("vio: solver", Solver::BYTES);
-        f.host("vio: prior and marginalisation", Prior::BYTES + Marginaliser::BYTES);
-        f.host("vio: initialisation", Aligner::BYTES);
+        f.host("vio: prior and marginalisation", Prior::BYTES + Marginalizer::BYTES);
+        f.host("vio: initialisation", Initializer::BYTES);
         f
     }
 
@@ -222,7 +222,7 @@ impl Vio {
         let mut given_up = None;
         if self.running && last.is_some_and(|t| (tracks.t - t).secs() > FRAME_GAP_MAX) {
             given_up = Some(Reset::FrameGap);
-            self.give_up(Reset::FrameGap);
+            self.reset_for(Reset::FrameGap);
         }
         let tried = if self.running { self.advance(tracks) } else { Ok(self.try_start(tracks)) };
         let mut update = match tried {
@@ -230,7 +230,7 @@ impl Vio {
             failed => {
                 let why = failed.err().unwrap_or(Reset::State);
                 given_up = Some(why);
-                self.give_up(why);
+                self.reset_for(why);
                 Update::default()
             }
         };
@@ -244,7 +244,7 @@ impl Vio {
                 let f = self.window.frame(n);
                 self.trust.add(f.t, &f.now, c);
             }
-            _ => self.trust.doubt(),
+            _ => self.trust.invalidate(),
         }
         update
     }
@@ -254,7 +254,7 @@ impl Vio {
         let mut clean = tracks.clone();
         for (camera, list) in clean.cameras.iter_mut().enumerate() {
             let before = list.len();
-            let (known, mut last) = (camera < self.model.eyes.len(), None);
+            let (known, mut last) = (camera < self.model.cameras.len(), None);
             list.retain(|t| {
                 let ok = known && t.px.iter().all(|x| x.abs() < PX_MAX) && last.is_none_or(|id| t.id > id);
                 last = if ok { Some(t.id) } else { last };
@@ -267,7 +267,7 @@ impl Vio {
 
     fn health_of(&mut self, tracks: &Tracks, update: &Update) -> Health {
         let mut h = std::mem::take(&mut self.pending) | self.watch.bits();
-        let seen = tracks.cameras[..self.model.eyes.len()].iter().map(|c| c.len());
+        let seen = tracks.cameras[..self.model.cameras.len()].iter().map(|c| c.len());
         let (least, most) = seen.fold((usize::MAX, 0), |(a, b), n| (a.min(n), b.max(n)));
         let held = self.imu.newest().is_none_or(|n| self.noise.is_gap((tracks.t - n.t).secs()));
         let unobserved = self.covariance.as_ref().is_none_or(|c| !(sigma_v(c) < SIGMA_V_UNOBSERVED));
@@ -288,11 +288,11 @@ impl Vio {
         if tracks.cameras[0].len() < RESECTION_MIN {
             return Update::default();
         }
-        let Some(start) = self.aligner.add(tracks, &self.imu, &self.noise, &self.model, &self.config) else {
+        let Some(start) = self.initializer.add(tracks, &self.imu, &self.noise, &self.model, &self.config) else {
             return Update::default();
         };
-        let Some(mut start) = self.trust.go_on(&start, self.reset_by, tracks.t, &self.imu, &self.noise) else {
-            self.aligner.clear();
+        let Some(mut start) = self.trust.resume(&start, self.reset_by, tracks.t, &self.imu, &self.noise) else {
+            self.initializer.clear();
             return Update::default();
         };
         self.origin = Origin::split(&mut start);
@@ -300,9 +300,9 @@ impl Vio {
         let mut frame = Frame::first(tracks.t, motion);
         frame.rate = self.imu.rate_at(tracks.t);
         frame.hold_twist();
-        frame.fix_anchor();
+        frame.fix_linearization_point();
         let Some(slot) = self.window.push(frame) else { return Update::default() };
-        self.window.rig.fix_anchor();
+        self.window.rig.fix_linearization_point();
         self.rig_deviations = self.window.rig.sigmas(&self.rig_sigma);
         self.prior.start(slot, &motion, &sigma, (&self.window.rig, &self.rig_sigma));
         self.covariance = Some(self.origin.add_to(sigma.covariance(&motion), &motion));
@@ -332,7 +332,7 @@ impl Vio {
         self.gate(slot);
 
         if self.config.zero_velocity {
-            self.rests = rest::hold(slot, &mut self.window, &self.tracks, &self.imu);
+            self.rests = zero_velocity::hold(slot, &mut self.window, &self.tracks, &self.imu);
             self.stats.zero_velocity_updates += self.rests as u64;
         }
         let (connected, unconnected) = self.landmarks.attach(slot, &self.tracks[slot]);
@@ -356,7 +356,7 @@ impl Vio {
             self.make_keyframe(slot);
         }
 
-        let outcome = self.solver.optimise(&mut self.window, &mut self.landmarks, &mut self.prior, &self.model);
+        let outcome = self.solver.optimize(&mut self.window, &mut self.landmarks, &mut self.prior, &self.model);
         self.stats.solver_failures += outcome.failures as u64;
         self.stats.iterations += outcome.iterations as u64;
         let now = &self.window.frame(slot).now;
@@ -378,7 +378,7 @@ impl Vio {
             return Err(why);
         }
         let update = self.output(slot, keyframe, connected, outcome);
-        self.shrink();
+        self.marginalize();
         Ok(update)
     }
 
@@ -394,9 +394,9 @@ impl Vio {
         self.stats.gates_opened += passed.open as u64;
     }
 
-    fn shrink(&mut self) {
+    fn marginalize(&mut self) {
         let (window, landmarks, linear) = (&mut self.window, &mut self.landmarks, &mut self.solver.linear);
-        self.marginaliser.shrink(window, landmarks, &mut self.prior, linear, &self.model);
+        self.marginalizer.marginalize(window, landmarks, &mut self.prior, linear, &self.model);
     }
 
     fn scaled(&self, inc: &Increment) -> Increment {
@@ -408,9 +408,10 @@ impl Vio {
     fn outlier_px(&self, slot: usize) -> f64 {
         let rig = &self.window.rig;
         let known = &self.rig_deviations;
-        let focal = self.model.eyes.iter().fold(0.0f64, |f, e| f.max(e.camera.fx));
+        let focal = self.model.cameras.iter().fold(0.0f64, |f, e| f.max(e.camera.fx));
         let time = if rig.parts.time_offset { known[0] * self.window.frame(slot).twist.w.length() } else { 0.0 };
-        let thetas = (0..self.model.eyes.len()).filter_map(|c| rig.eye_column(c)).flat_map(|at| at + 3..at + 6);
+        let thetas =
+            (0..self.model.cameras.len()).filter_map(|c| rig.extrinsic_column(c)).flat_map(|at| at + 3..at + 6);
         let turn = thetas.fold(0.0f64, |m, i| m.max(known[i]));
         self.config.outlier_px + RIG_SIGMAS * focal * (time + turn)
     }
@@ -436,7 +437,7 @@ impl Vio {
             slot,
             &self.window,
             &self.tracks,
-            self.window.rig.eyes(),
+            self.window.rig.cameras(),
             self.config.triangulation_baseline_min_m,
             self.outlier_px(slot),
         );
@@ -473,15 +474,15 @@ impl Vio {
 
     /// Forgets everything but the inertial samples and where it was, and initialises again.
     pub fn reset(&mut self) {
-        self.give_up(Reset::Asked);
+        self.reset_for(Reset::Asked);
     }
 
-    fn give_up(&mut self, why: Reset) {
+    fn reset_for(&mut self, why: Reset) {
         self.reset_by = why;
         self.window.clear();
         self.landmarks.clear();
         self.prior.clear();
-        self.aligner.clear();
+        self.initializer.clear();
         (self.running, self.rests) = (false, false);
         self.watch = Watch::default();
         self.covariance = None;

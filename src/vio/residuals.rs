@@ -13,33 +13,33 @@ use stipple_drivers::{Camera, Pose, RigCamera};
 
 /// A rotation matrix and a position: what many residuals of one frame share.
 #[derive(Clone, Copy, Debug, Default)]
-pub struct Body {
+pub struct Transform {
     pub r: DMat3,
     pub p: DVec3,
 }
 
-impl From<&Pose> for Body {
-    fn from(pose: &Pose) -> Body {
-        Body { r: pose.rotation(), p: pose.p }
+impl From<&Pose> for Transform {
+    fn from(pose: &Pose) -> Transform {
+        Transform { r: pose.rotation(), p: pose.p }
     }
 }
 
 /// A camera and where it sits on the body.
 #[derive(Clone, Copy, Debug)]
-pub struct Eye {
+pub struct CameraModel {
     pub camera: Camera,
-    pub body_from_cam: Body,
+    pub body_from_cam: Transform,
     /// First row to last, s; zero is a global shutter.
     pub readout: f64,
 }
 
-impl From<&RigCamera> for Eye {
-    fn from(c: &RigCamera) -> Eye {
-        Eye { camera: c.camera, body_from_cam: Body::from(&c.body_from_cam), readout: c.readout.secs() }
+impl From<&RigCamera> for CameraModel {
+    fn from(c: &RigCamera) -> CameraModel {
+        CameraModel { camera: c.camera, body_from_cam: Transform::from(&c.body_from_cam), readout: c.readout.secs() }
     }
 }
 
-impl Eye {
+impl CameraModel {
     /// When a row is exposed, after the stamp, which is the middle row's, s.
     pub fn row_delay(&self, row: f64) -> f64 {
         self.readout * (row / (self.camera.height - 1).max(1) as f64 - 0.5)
@@ -84,38 +84,50 @@ pub struct Reprojection {
     pub d_point: [[f64; 3]; 2],
 }
 
-/// Pixel at which `eye` on `target` sees the point of `host_eye` on `host`.
-pub fn predict(point: &Point, host_eye: &Body, host: &Body, eye: &Eye, target: &Body) -> Option<DVec2> {
-    let x_host = host_eye.r * point.bearing() + host_eye.p * point.rho;
+/// Pixel at which `camera_model` on `target` sees the point of `host_eye` on `host`.
+pub fn predict(
+    point: &Point,
+    host_cam: &Transform,
+    host: &Transform,
+    camera_model: &CameraModel,
+    target: &Transform,
+) -> Option<DVec2> {
+    let x_host = host_cam.r * point.bearing() + host_cam.p * point.rho;
     let x_rel = host.r * x_host + (host.p - target.p) * point.rho;
     let x_target = target.r.transpose() * x_rel;
-    let x_cam = eye.body_from_cam.r.transpose() * (x_target - eye.body_from_cam.p * point.rho);
-    eye.camera.project(x_cam)
+    let x_cam = camera_model.body_from_cam.r.transpose() * (x_target - camera_model.body_from_cam.p * point.rho);
+    camera_model.camera.project(x_cam)
 }
 
 /// Derivatives to [p, θ] of the cameras on the body, host's and target's.
 #[derive(Clone, Copy, Debug, Default)]
-pub struct EyeDerivatives {
+pub struct ExtrinsicDerivatives {
     pub host: [[f64; 6]; 2],
     pub target: [[f64; 6]; 2],
 }
 
 #[inline]
-pub fn reproject(point: &Point, host_eye: &Body, host: &Body, eye: &Eye, target: &Body) -> Option<Reprojection> {
-    trace(point, host_eye, host, eye, target, |_, _| {})
+pub fn reproject(
+    point: &Point,
+    host_cam: &Transform,
+    host: &Transform,
+    camera_model: &CameraModel,
+    target: &Transform,
+) -> Option<Reprojection> {
+    trace(point, host_cam, host, camera_model, target, |_, _| {})
 }
 
 /// The same, with derivatives to where the cameras sit.
-pub fn reproject_with_eyes(
+pub fn reproject_with_extrinsics(
     point: &Point,
-    host_eye: &Body,
-    host: &Body,
-    eye: &Eye,
-    target: &Body,
-) -> Option<(Reprojection, EyeDerivatives)> {
-    let mut d = EyeDerivatives::default();
+    host_cam: &Transform,
+    host: &Transform,
+    camera_model: &CameraModel,
+    target: &Transform,
+) -> Option<(Reprojection, ExtrinsicDerivatives)> {
+    let mut d = ExtrinsicDerivatives::default();
     let bearing = point.bearing();
-    let r = trace(point, host_eye, host, eye, target, |k, g| {
+    let r = trace(point, host_cam, host, camera_model, target, |k, g| {
         let (th_host, th_target) = (bearing.cross(g.point), g.cam.cross(g.x_cam));
         let (p_host, p_target) = (g.host * point.rho, g.target * -point.rho);
         d.host[k] = [p_host.x, p_host.y, p_host.z, th_host.x, th_host.y, th_host.z];
@@ -136,33 +148,33 @@ struct Gradient {
 #[inline(always)]
 fn trace(
     point: &Point,
-    host_eye: &Body,
-    host: &Body,
-    eye: &Eye,
-    target: &Body,
+    host_cam: &Transform,
+    host: &Transform,
+    camera_model: &CameraModel,
+    target: &Transform,
     mut each: impl FnMut(usize, &Gradient),
 ) -> Option<Reprojection> {
     let rho = point.rho;
-    let x_host = host_eye.r * point.bearing() + host_eye.p * rho;
+    let x_host = host_cam.r * point.bearing() + host_cam.p * rho;
     let x_rel = host.r * x_host + (host.p - target.p) * rho;
     let x_target = target.r.transpose() * x_rel;
-    let x_cam = eye.body_from_cam.r.transpose() * (x_target - eye.body_from_cam.p * rho);
-    let (px, d_px) = eye.camera.project_with_jacobian(x_cam)?;
+    let x_cam = camera_model.body_from_cam.r.transpose() * (x_target - camera_model.body_from_cam.p * rho);
+    let (px, d_px) = camera_model.camera.project_with_jacobian(x_cam)?;
     let d_bearing = point.d_bearing();
-    let d_rho_rel = host.r * host_eye.p + host.p - target.p;
+    let d_rho_rel = host.r * host_cam.p + host.p - target.p;
     let mut out = Reprojection { px, ..Reprojection::default() };
     for k in 0..2 {
         let g_cam = DVec3::from_array(d_px[k]);
-        let g_target = eye.body_from_cam.r * g_cam;
+        let g_target = camera_model.body_from_cam.r * g_cam;
         let g_world = target.r * g_target;
         let g_host = host.r.transpose() * g_world;
-        let g_point = host_eye.r.transpose() * g_host;
+        let g_point = host_cam.r.transpose() * g_host;
         let p = g_world * rho;
         let th_host = x_host.cross(g_host);
         let th_target = g_target.cross(x_target);
         out.d_host[k] = [p.x, p.y, p.z, th_host.x, th_host.y, th_host.z];
         out.d_target[k] = [-p.x, -p.y, -p.z, th_target.x, th_target.y, th_target.z];
-        let d_rho = g_world.dot(d_rho_rel) - g_target.dot(eye.body_from_cam.p);
+        let d_rho = g_world.dot(d_rho_rel) - g_target.dot(camera_model.body_from_cam.p);
         out.d_point[k] = [g_point.dot(d_bearing[0]), g_point.dot(d_bearing[1]), d_rho];
         each(k, &Gradient { x_cam, cam: g_cam, target: g_target, host: g_host, point: g_point });
     }
@@ -343,38 +355,50 @@ mod tests {
         }
     }
 
-    fn eyes() -> Vec<Eye> {
+    fn cameras() -> Vec<CameraModel> {
         let lenses = [
             Lens::Radtan { k1: -0.28, k2: 0.07, p1: 2e-4, p2: 2e-5 },
             Lens::KannalaBrandt { k: [0.01, -0.005, 0.003, -0.001] },
             Lens::DoubleSphere { xi: -0.2, alpha: 0.6 },
         ];
-        let eye = |lens| Eye {
+        let camera_model = |lens| CameraModel {
             camera: Camera { width: 752, height: 480, fx: 458.0, fy: 457.0, cx: 367.0, cy: 248.0, lens },
-            body_from_cam: Body::from(&Pose::new(
+            body_from_cam: Transform::from(&Pose::new(
                 DQuat::from_scaled_axis(DVec3::new(0.1, 0.2, -0.3)),
                 DVec3::new(0.05, 0.1, -0.02),
             )),
             readout: 0.0,
         };
-        lenses.into_iter().map(eye).collect()
+        lenses.into_iter().map(camera_model).collect()
     }
 
     #[test]
     fn reprojection_jacobians_match_differences_to_host_target_and_point() {
         let (host, target) = (motion(1.0), motion(1.3));
-        for eye in eyes() {
+        for camera_model in cameras() {
             for point in [
                 Point::new(DVec3::new(0.1, -0.2, 1.0).normalize(), 0.4),
                 Point::new(DVec3::new(-0.3, 0.1, 1.0).normalize(), 0.0),
                 Point::new(DVec3::new(0.4, 0.3, 1.0).normalize(), 1.5),
             ] {
                 let f = |point: &Point, host: &Motion, target: &Motion| {
-                    predict(point, &eye.body_from_cam, &Body::from(&host.pose), &eye, &Body::from(&target.pose))
-                        .unwrap()
+                    predict(
+                        point,
+                        &camera_model.body_from_cam,
+                        &Transform::from(&host.pose),
+                        &camera_model,
+                        &Transform::from(&target.pose),
+                    )
+                    .unwrap()
                 };
-                let r = reproject(&point, &eye.body_from_cam, &Body::from(&host.pose), &eye, &Body::from(&target.pose))
-                    .unwrap();
+                let r = reproject(
+                    &point,
+                    &camera_model.body_from_cam,
+                    &Transform::from(&host.pose),
+                    &camera_model,
+                    &Transform::from(&target.pose),
+                )
+                .unwrap();
                 assert!((r.px - f(&point, &host, &target)).length() < 1e-12);
                 for i in 0..6 {
                     let d_host = (f(&point, &moved(&host, i, H), &target) - f(&point, &moved(&host, i, -H), &target))

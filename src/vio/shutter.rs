@@ -7,7 +7,7 @@
 //! and turning or shifting the world changes no residual: position and yaw stay unobservable. The twist
 //! is held through an optimisation, and for good once its frame is anchored.
 
-use super::residuals::{Body, EyeDerivatives};
+use super::residuals::{ExtrinsicDerivatives, Transform};
 use crate::math::so3;
 use glam::{DMat3, DVec3};
 
@@ -20,19 +20,19 @@ pub struct Twist {
 
 /// Where a camera sits τ after the stamp, and how that depends on τ and on where it sits at the stamp.
 #[derive(Clone, Copy, Debug)]
-pub struct Shifted {
-    pub body_from_cam: Body,
+pub struct DelayedCamera {
+    pub body_from_cam: Transform,
     turn: DMat3,
     /// Derivatives of [p, θ] to τ.
     d_p: DVec3,
     d_theta: DVec3,
 }
 
-impl Shifted {
-    pub fn new(body_from_cam: &Body, twist: &Twist, tau: f64) -> Shifted {
+impl DelayedCamera {
+    pub fn new(body_from_cam: &Transform, twist: &Twist, tau: f64) -> DelayedCamera {
         let turn = so3::exp_matrix(twist.w * tau);
-        Shifted {
-            body_from_cam: Body { r: turn * body_from_cam.r, p: turn * body_from_cam.p + twist.v * tau },
+        DelayedCamera {
+            body_from_cam: Transform { r: turn * body_from_cam.r, p: turn * body_from_cam.p + twist.v * tau },
             turn,
             d_p: turn * twist.w.cross(body_from_cam.p) + twist.v,
             d_theta: body_from_cam.r.transpose() * twist.w,
@@ -49,7 +49,7 @@ impl Shifted {
 
 /// Derivatives to both cameras where they sit at the stamp; answers those to the time offset, which delays
 /// both views alike.
-pub fn carry_back(d: &mut EyeDerivatives, host: &Shifted, target: &Shifted) -> [f64; 2] {
+pub fn carry_back(d: &mut ExtrinsicDerivatives, host: &DelayedCamera, target: &DelayedCamera) -> [f64; 2] {
     std::array::from_fn(|k| {
         let (of_host, of_target) = (host.carry_back(&d.host[k]), target.carry_back(&d.target[k]));
         (d.host[k], d.target[k]) = (of_host.0, of_target.0);
@@ -60,7 +60,7 @@ pub fn carry_back(d: &mut EyeDerivatives, host: &Shifted, target: &Shifted) -> [
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used)]
-    use super::super::residuals::{predict, reproject_with_eyes, Eye, Point};
+    use super::super::residuals::{predict, reproject_with_extrinsics, CameraModel, Point};
     use super::*;
     use glam::{DQuat, DVec2};
     use stipple_drivers::{Camera, Lens, Pose};
@@ -95,9 +95,9 @@ mod tests {
     const ROWS: [f64; 2] = [-0.007, 0.009];
 
     fn scene() -> Scene {
-        let mut host_eye = pose(0.3);
-        host_eye.p = DVec3::new(0.05, 0.1, -0.02);
-        Scene { poses: [pose(1.0), pose(1.2), host_eye, pose(0.25)], time_offset: 0.004 }
+        let mut host_cam = pose(0.3);
+        host_cam.p = DVec3::new(0.05, 0.1, -0.02);
+        Scene { poses: [pose(1.0), pose(1.2), host_cam, pose(0.25)], time_offset: 0.004 }
     }
 
     fn camera() -> Camera {
@@ -105,14 +105,15 @@ mod tests {
         Camera { width: 752, height: 480, fx: 458.0, fy: 457.0, cx: 367.0, cy: 248.0, lens }
     }
 
-    fn shifted(s: &Scene) -> [Shifted; 2] {
-        [0, 1].map(|k| Shifted::new(&Body::from(&s.poses[2 + k]), &TWISTS[k], s.time_offset + ROWS[k]))
+    fn shifted(s: &Scene) -> [DelayedCamera; 2] {
+        [0, 1].map(|k| DelayedCamera::new(&Transform::from(&s.poses[2 + k]), &TWISTS[k], s.time_offset + ROWS[k]))
     }
 
     fn pixel(point: &Point, s: &Scene) -> DVec2 {
         let [host, target] = shifted(s);
-        let eye = Eye { camera: camera(), body_from_cam: target.body_from_cam, readout: 0.0 };
-        predict(point, &host.body_from_cam, &Body::from(&s.poses[0]), &eye, &Body::from(&s.poses[1])).unwrap()
+        let camera_model = CameraModel { camera: camera(), body_from_cam: target.body_from_cam, readout: 0.0 };
+        predict(point, &host.body_from_cam, &Transform::from(&s.poses[0]), &camera_model, &Transform::from(&s.poses[1]))
+            .unwrap()
     }
 
     #[test]
@@ -124,9 +125,9 @@ mod tests {
             Point::new(DVec3::new(0.2, 0.3, 1.0).normalize(), 1.5),
         ] {
             let [host, target] = shifted(&s);
-            let eye = Eye { camera: camera(), body_from_cam: target.body_from_cam, readout: 0.0 };
-            let (a, b) = (Body::from(&s.poses[0]), Body::from(&s.poses[1]));
-            let (r, mut d) = reproject_with_eyes(&point, &host.body_from_cam, &a, &eye, &b).unwrap();
+            let camera_model = CameraModel { camera: camera(), body_from_cam: target.body_from_cam, readout: 0.0 };
+            let (a, b) = (Transform::from(&s.poses[0]), Transform::from(&s.poses[1]));
+            let (r, mut d) = reproject_with_extrinsics(&point, &host.body_from_cam, &a, &camera_model, &b).unwrap();
             let d_time = carry_back(&mut d, &host, &target);
             assert!((r.px - pixel(&point, &s)).length() < 1e-12);
             let close = |analytic: f64, numeric: f64, what: &str| {
@@ -157,7 +158,7 @@ mod tests {
     #[test]
     fn a_shifted_camera_is_where_the_body_takes_it() {
         let (s, tau) = (scene(), 0.01);
-        let shifted = Shifted::new(&Body::from(&s.poses[2]), &TWISTS[0], tau);
+        let shifted = DelayedCamera::new(&Transform::from(&s.poses[2]), &TWISTS[0], tau);
         let body = s.poses[0];
         let later = Pose::new(body.q * so3::exp(TWISTS[0].w * tau), body.p + body.q * TWISTS[0].v * tau);
         let expected = later * s.poses[2];

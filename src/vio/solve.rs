@@ -8,10 +8,10 @@ use super::landmarks::Landmarks;
 use super::linear::{
     cost_of_views, inertial_residual_at, inertial_rows, landmark_rows, rest_rows, Linear, POINT_DIM, SPANS,
 };
-use super::marginalise::Prior;
-use super::residuals::{Eye, Mat15, Point};
-use super::rest::rest_cost;
+use super::marginalization::Prior;
+use super::residuals::{CameraModel, Mat15, Point};
 use super::window::{Layout, Window, FRAMES, POSE_DIM};
+use super::zero_velocity::rest_cost;
 use crate::config::VioConfig;
 use crate::limits::{LANDMARKS, RIG_DIM, WINDOW_DIM};
 use crate::math::dense::{Columns, System};
@@ -36,7 +36,7 @@ const LOCAL_DIM: usize = POSE_DIM * FRAMES + RIG_DIM;
 /// Everything constant about the rig, the weights and the shape.
 #[derive(Clone, Debug)]
 pub struct Model {
-    pub eyes: Vec<Eye>,
+    pub cameras: Vec<CameraModel>,
     pub sigma_px: f64,
     pub huber_px: f64,
     pub iterations_max: u32,
@@ -46,9 +46,9 @@ pub struct Model {
 }
 
 impl Model {
-    pub fn new(eyes: Vec<Eye>, config: &VioConfig) -> Model {
+    pub fn new(cameras: Vec<CameraModel>, config: &VioConfig) -> Model {
         Model {
-            eyes,
+            cameras,
             sigma_px: config.observation_sigma_px,
             huber_px: config.huber_px,
             iterations_max: config.iterations_max,
@@ -185,7 +185,7 @@ impl Solver {
         + Linear::BYTES
         + WINDOW_DIM * size_of::<f64>();
 
-    pub(super) fn linearise(
+    pub(super) fn linearize(
         &mut self,
         window: &Window,
         landmarks: &Landmarks,
@@ -251,7 +251,7 @@ impl Solver {
         model: &Model,
     ) -> [[f64; 15]; FRAMES] {
         let layout = Layout::of(window);
-        self.linearise(window, landmarks, prior, model, &layout);
+        self.linearize(window, landmarks, prior, model, &layout);
         self.system.solve_damped(|_| 0.0, &mut self.factor, &mut self.dx);
         let mut steps = [[0.0; 15]; FRAMES];
         for slot in window.slots() {
@@ -281,7 +281,7 @@ impl Solver {
         self.system.deviations(&mut self.factor, &mut out[..n]);
     }
 
-    pub fn optimise(
+    pub fn optimize(
         &mut self,
         window: &mut Window,
         landmarks: &mut Landmarks,
@@ -290,7 +290,7 @@ impl Solver {
     ) -> Outcome {
         let layout = Layout::of(window);
         let (mut lambda, mut growth) = (LAMBDA_START, 2.0);
-        let mut cost = self.linearise(window, landmarks, prior, model, &layout);
+        let mut cost = self.linearize(window, landmarks, prior, model, &layout);
         let mut outcome = Outcome { cost_before: cost, ..Outcome::default() };
         while outcome.iterations < model.iterations_max && lambda <= LAMBDA_MAX {
             outcome.iterations += 1;
@@ -311,7 +311,7 @@ impl Solver {
                 if done || outcome.iterations == model.iterations_max {
                     break;
                 }
-                self.linearise(window, landmarks, prior, model, &layout);
+                self.linearize(window, landmarks, prior, model, &layout);
             } else {
                 window.restore();
                 for (l, e) in landmarks.pool.iter_mut().zip(&self.eliminated) {

@@ -70,9 +70,9 @@ impl Stages {
     }
 
     /// All factors summed; answers the cost.
-    pub fn linearise(&mut self) -> f64 {
+    pub fn linearize(&mut self) -> f64 {
         let vio = &mut self.vio;
-        vio.solver.linearise(&vio.window, &vio.landmarks, &mut vio.prior, &vio.model, &self.layout)
+        vio.solver.linearize(&vio.window, &vio.landmarks, &mut vio.prior, &vio.model, &self.layout)
     }
 
     /// The damped step of what `linearise` summed; answers the decrease it predicts.
@@ -86,9 +86,9 @@ impl Stages {
     }
 
     /// All iterations.
-    pub fn optimise(&mut self) -> Outcome {
+    pub fn optimize(&mut self) -> Outcome {
         let vio = &mut self.vio;
-        vio.solver.optimise(&mut vio.window, &mut vio.landmarks, &mut vio.prior, &vio.model)
+        vio.solver.optimize(&mut vio.window, &mut vio.landmarks, &mut vio.prior, &vio.model)
     }
 
     /// Of the newest state, from what `linearise` summed.
@@ -97,10 +97,10 @@ impl Stages {
     }
 
     /// Brings the window back to its resting size; answers how many keyframes left it.
-    pub fn marginalise(&mut self) -> usize {
+    pub fn marginalize(&mut self) -> usize {
         let keyframes = |vio: &Vio| vio.window().filter(|(_, _, keyframe)| *keyframe).count();
         let before = keyframes(&self.vio);
-        self.vio.shrink();
+        self.vio.marginalize();
         before - keyframes(&self.vio)
     }
 }

@@ -3,7 +3,7 @@
 use super::world::{self, Path, World, FRAME_SECS, RATE_HZ};
 use super::*;
 use crate::math::dense::System;
-use marginalise::Sigma;
+use marginalization::Sigma;
 use stipple_drivers::Span;
 use window::Layout;
 
@@ -26,7 +26,7 @@ fn run(vio: &mut Vio, frames: std::ops::Range<usize>, world: &mut World) {
 
 /// The direction in which the whole window moves (or turns about the world's axis).
 fn gauge(vio: &Vio, shift: DVec3, turn: DVec3, slot: usize) -> [f64; 15] {
-    let m = vio.window.frame(slot).motion_jacobian();
+    let m = vio.window.frame(slot).motion_linearized();
     let (p, th, v) = (shift + turn.cross(m.pose.p), m.pose.q.conjugate() * turn, turn.cross(m.v));
     let mut d = [0.0; 15];
     (0..3).for_each(|i| (d[i], d[3 + i], d[6 + i]) = (p[i], th[i], v[i]));
@@ -51,7 +51,7 @@ fn energies(frames: usize, config: &VioConfig, readout: Span) -> ([f64; 4], f64)
     // The first state is still in the window; with its position and yaw its velocity is left free too,
     // which as a vector of the world would tell yaw.
     let first = vio.window.slots().next().expect("a running window has frames");
-    let motion = vio.window.frame(first).anchor;
+    let motion = vio.window.frame(first).linearization_point;
     let sigma = Sigma { p: 1e9, yaw: 1e9, tilt: 0.05, v: 1e9, bg: 0.02, ba: 0.3 };
     vio.prior.start(first, &motion, &sigma, (&vio.window.rig, &vio.rig_sigma));
     run(&mut vio, 12..frames, &mut world);
@@ -92,7 +92,7 @@ fn prior_learns_no_more_when_the_rig_is_estimated_and_rows_roll() {
 /// A window in which only inertial factors and finished landmarks act between the frames that leave and
 /// those that stay, so that before and after marginalisation it holds the same quadratic on what stays.
 /// The newest is pushed off by `push` in every error.
-fn ready_to_shrink(push: f64) -> Vio {
+fn ready_to_marginalize(push: f64) -> Vio {
     let mut world = World::new(Path { rest: -1.0 });
     let mut vio = Vio::new(&world.rig, &VioConfig::default());
     run(&mut vio, 0..40, &mut world);
@@ -119,9 +119,9 @@ fn newton(vio: &mut Vio) -> [[f64; 15]; FRAMES] {
 
 #[test]
 fn marginalising_keeps_the_step_of_what_stays() {
-    let mut vio = ready_to_shrink(0.01);
+    let mut vio = ready_to_marginalize(0.01);
     let before = newton(&mut vio);
-    vio.shrink();
+    vio.marginalize();
     let after = newton(&mut vio);
     for slot in vio.window.states() {
         for i in 0..15 {

@@ -6,7 +6,7 @@
 //! keeps position and yaw unobservable as they are.
 
 use super::preintegration::{Increment, Mat9};
-use super::residuals::{Body, InertialWeight, Motion};
+use super::residuals::{InertialWeight, Motion, Transform};
 use super::rig::RigState;
 use super::shutter::Twist;
 use crate::limits::{KEYFRAMES, STATES};
@@ -27,8 +27,8 @@ pub struct Frame {
     pub keyframe: bool,
     /// Velocity and biases are still estimated.
     pub moving: bool,
-    pub anchored: bool,
-    pub anchor: Motion,
+    pub is_linearized: bool,
+    pub linearization_point: Motion,
     /// Error since the anchor, [p, θ, v, bg, ba].
     pub delta: [f64; 15],
     /// From the frame before, when that one is moving.
@@ -41,9 +41,9 @@ pub struct Frame {
     pub rest: Option<DVec3>,
     /// Landmarks it hosted when it became a keyframe.
     pub hosted: usize,
-    pub body: Body,
+    pub body: Transform,
     /// Where Jacobians are taken: the anchor, or now.
-    pub body_jacobian: Body,
+    pub body_linearized: Transform,
 }
 
 impl Frame {
@@ -53,8 +53,8 @@ impl Frame {
             now,
             keyframe: false,
             moving: true,
-            anchored: false,
-            anchor: now,
+            is_linearized: false,
+            linearization_point: now,
             delta: [0.0; 15],
             increment: Increment::new(now.bg, now.ba),
             weight: InertialWeight { increment: Mat9::zeros(), bg: 0.0, ba: 0.0 },
@@ -62,47 +62,48 @@ impl Frame {
             twist: Twist::default(),
             rest: None,
             hosted: 0,
-            body: Body::default(),
-            body_jacobian: Body::default(),
+            body: Transform::default(),
+            body_linearized: Transform::default(),
         };
         f.refresh();
         f
     }
 
     pub fn refresh(&mut self) {
-        self.body = Body::from(&self.now.pose);
-        self.body_jacobian = if self.anchored { Body::from(&self.anchor.pose) } else { self.body };
+        self.body = Transform::from(&self.now.pose);
+        self.body_linearized =
+            if self.is_linearized { Transform::from(&self.linearization_point.pose) } else { self.body };
     }
 
     /// Takes the twist of the estimate; an anchored frame has its own for good.
     pub fn hold_twist(&mut self) {
-        if !self.anchored {
+        if !self.is_linearized {
             let to_body = self.now.pose.q.conjugate();
             self.twist = Twist { v: to_body * self.now.v, w: self.rate - self.now.bg };
         }
     }
 
     /// Motion at which Jacobians are taken.
-    pub fn motion_jacobian(&self) -> &Motion {
-        if self.anchored {
-            &self.anchor
+    pub fn motion_linearized(&self) -> &Motion {
+        if self.is_linearized {
+            &self.linearization_point
         } else {
             &self.now
         }
     }
 
-    pub fn fix_anchor(&mut self) {
-        if !self.anchored {
-            (self.anchored, self.anchor, self.delta) = (true, self.now, [0.0; 15]);
+    pub fn fix_linearization_point(&mut self) {
+        if !self.is_linearized {
+            (self.is_linearized, self.linearization_point, self.delta) = (true, self.now, [0.0; 15]);
             self.refresh();
         }
     }
 
     /// Moves by an error: an anchored frame accumulates it in the tangent space of its anchor.
     pub fn step(&mut self, d: &[f64; 15]) {
-        if self.anchored {
+        if self.is_linearized {
             (0..15).for_each(|i| self.delta[i] += d[i]);
-            self.now = self.anchor.plus(&self.delta);
+            self.now = self.linearization_point.plus(&self.delta);
         } else {
             self.now = self.now.plus(d);
         }

@@ -156,8 +156,8 @@ fn windows(flight: &Flight) -> [Option<Stages>; 4] {
         if stages.keyframe {
             stages.triangulate();
         }
-        stages.optimise();
-        let left = stages.clone().marginalise();
+        stages.optimize();
+        let left = stages.clone().marginalize();
         found[2 + left.min(1)] = Some(stages);
     }
     found
@@ -168,24 +168,24 @@ fn estimator_stages(c: &mut Criterion, flight: &Flight) {
     let [plain, keyframe, state_leaves, keyframe_leaves] = windows(flight);
     let mut group = c.benchmark_group(flight.name);
     if let Some(mut s) = plain {
-        let (Extent { frames, landmarks, views, columns }, n) = (s.extent(), s.clone().optimise().iterations);
+        let (Extent { frames, landmarks, views, columns }, n) = (s.extent(), s.clone().optimize().iterations);
         let of = format!("{landmarks} landmarks in {views} views, {columns} columns, {n} iterations");
         println!("{}: a window of {frames} frames, {of}", flight.name);
         group.bench_function("preintegration, a frame interval", |b| b.iter(|| black_box(s.preintegrate())));
         group.bench_function("landmark rows and their elimination", |b| b.iter(|| black_box(s.eliminate())));
-        group.bench_function("linearisation, all factors summed", |b| b.iter(|| black_box(s.linearise())));
+        group.bench_function("linearisation, all factors summed", |b| b.iter(|| black_box(s.linearize())));
         group.bench_function("damped solve", |b| b.iter(|| black_box(s.solve())));
         group.bench_function("covariance of the newest state", |b| b.iter(|| black_box(s.covariance())));
         group.bench_function("cost", |b| b.iter(|| black_box(s.cost())));
-        group.bench_function("all iterations", |b| on_copies(b, &s, Stages::optimise));
+        group.bench_function("all iterations", |b| on_copies(b, &s, Stages::optimize));
     }
     let mut apart = |name, stages: Option<Stages>, stage: fn(&mut Stages) -> usize| match stages {
         Some(s) => drop(group.bench_function(name, |b| on_copies(b, &s, stage))),
         None => println!("{}: {name}: no such frame", flight.name),
     };
     apart("triangulation of a keyframe", keyframe, Stages::triangulate);
-    apart("marginalisation, a state leaves", state_leaves, Stages::marginalise);
-    apart("marginalisation, a keyframe too", keyframe_leaves, Stages::marginalise);
+    apart("marginalisation, a state leaves", state_leaves, Stages::marginalize);
+    apart("marginalisation, a keyframe too", keyframe_leaves, Stages::marginalize);
     group.finish();
 }
 

@@ -9,9 +9,9 @@
 //! force, the velocity is unknown and said to be, and the window must find it.
 
 use super::landmarks::find_track;
-use super::marginalise::Sigma;
+use super::marginalization::Sigma;
 use super::preintegration::{Increment, Noise, GRAVITY};
-use super::residuals::{huber, reproject, Body, Motion, Point};
+use super::residuals::{huber, reproject, Motion, Point, Transform};
 use super::samples::ImuRing;
 use super::solve::Model;
 use crate::config::VioConfig;
@@ -86,16 +86,16 @@ struct Step {
 }
 
 #[derive(Clone, Debug)]
-pub struct Aligner {
+pub struct Initializer {
     sightings: Vec<Sighting>,
     steps: Vec<Step>,
     attempts: u32,
     refusals: u32,
 }
 
-impl Aligner {
-    pub fn new() -> Aligner {
-        Aligner {
+impl Initializer {
+    pub fn new() -> Initializer {
+        Initializer {
             sightings: Vec::with_capacity(TRACKS),
             steps: Vec::with_capacity(ALIGN_FRAMES_MAX),
             attempts: 0,
@@ -199,9 +199,9 @@ impl Aligner {
     }
 }
 
-impl Default for Aligner {
+impl Default for Initializer {
     fn default() -> Self {
-        Aligner::new()
+        Initializer::new()
     }
 }
 
@@ -212,15 +212,15 @@ fn sigma(config: &VioConfig, tilt: f64, v: f64, bg: f64) -> Sigma {
 /// A point from the stereo views of one frame, in its camera 0, and the relative deviation of its inverse
 /// distance; `None` when that is not significant.
 fn stereo_point(id: u64, px: DVec2, tracks: &Tracks, model: &Model, config: &VioConfig) -> Option<(Point, f64)> {
-    let eyes = &model.eyes;
-    let bearing = eyes[0].camera.unproject(px)?;
-    let host = &eyes[0].body_from_cam;
+    let cameras = &model.cameras;
+    let bearing = cameras[0].camera.unproject(px)?;
+    let host = &cameras[0].body_from_cam;
     let (mut num, mut den) = (0.0, 0.0);
-    for (camera, eye) in eyes.iter().enumerate().skip(1) {
+    for (camera, camera_model) in cameras.iter().enumerate().skip(1) {
         let Some(seen) = find_track(&tracks.cameras[camera], id) else { continue };
-        let to_view = eye.body_from_cam.r.transpose();
-        let offset = host.p - eye.body_from_cam.p;
-        let view = eye.camera.unproject(DVec2::new(seen.px[0] as f64, seen.px[1] as f64))?;
+        let to_view = camera_model.body_from_cam.r.transpose();
+        let offset = host.p - camera_model.body_from_cam.p;
+        let view = camera_model.camera.unproject(DVec2::new(seen.px[0] as f64, seen.px[1] as f64))?;
         if offset.length() < config.triangulation_baseline_min_m {
             continue;
         }
@@ -229,7 +229,7 @@ fn stereo_point(id: u64, px: DVec2, tracks: &Tracks, model: &Model, config: &Vio
         den += b.length_squared();
     }
     // Two views, each with the noise of a pixel.
-    let sigma = std::f64::consts::SQRT_2 * model.sigma_px / (eyes[0].camera.fx * den.sqrt());
+    let sigma = std::f64::consts::SQRT_2 * model.sigma_px / (cameras[0].camera.fx * den.sqrt());
     let rho = num / den;
     (rho > DEPTH_SIGNIFICANT * sigma).then(|| (Point::new(bearing, rho), sigma / rho))
 }
@@ -237,19 +237,19 @@ fn stereo_point(id: u64, px: DVec2, tracks: &Tracks, model: &Model, config: &Vio
 /// The body's pose from the reference's points, and the deviation of its position along the worst axis:
 /// Gauss-Newton with Huber on all cameras' views.
 fn resect(sightings: &[Sighting], tracks: &Tracks, model: &Model, guess: Pose) -> Option<(Pose, f64)> {
-    let reference = Body { r: DMat3::IDENTITY, p: DVec3::ZERO };
+    let reference = Transform { r: DMat3::IDENTITY, p: DVec3::ZERO };
     let mut pose = guess;
     let (mut inliers, mut sigma) = (0, 0.0);
     for iteration in 0..RESECTION_ITERATIONS {
-        let body = Body::from(&pose);
+        let body = Transform::from(&pose);
         let mut h = SMatrix::<f64, 6, 6>::identity() * 1e-6;
         let mut b = SVector::<f64, 6>::zeros();
         inliers = 0;
         for s in sightings {
             let Some((point, _)) = &s.point else { continue };
-            for (camera, eye) in model.eyes.iter().enumerate() {
+            for (camera, camera_model) in model.cameras.iter().enumerate() {
                 let Some(seen) = find_track(&tracks.cameras[camera], s.id) else { continue };
-                let Some(r) = reproject(point, &model.eyes[0].body_from_cam, &reference, eye, &body) else {
+                let Some(r) = reproject(point, &model.cameras[0].body_from_cam, &reference, camera_model, &body) else {
                     continue;
                 };
                 let e = r.px - DVec2::new(seen.px[0] as f64, seen.px[1] as f64);

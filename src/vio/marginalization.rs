@@ -278,19 +278,19 @@ fn least_useful(window: &Window, landmarks: &Landmarks, newest: usize) -> Option
 
 /// Rows and a factor's block, bought once.
 #[derive(Clone, Debug)]
-pub struct Marginaliser {
+pub struct Marginalizer {
     stack: Rows,
 }
 
-impl Marginaliser {
-    pub fn new() -> Marginaliser {
-        Marginaliser { stack: Rows::new(STACK_ROWS, WINDOW_DIM + 1) }
+impl Marginalizer {
+    pub fn new() -> Marginalizer {
+        Marginalizer { stack: Rows::new(STACK_ROWS, WINDOW_DIM + 1) }
     }
 
     pub const BYTES: usize = Rows::bytes(STACK_ROWS, WINDOW_DIM + 1);
 
     /// Shrinks the window back to its resting size.
-    pub fn shrink(
+    pub fn marginalize(
         &mut self,
         window: &mut Window,
         landmarks: &mut Landmarks,
@@ -350,8 +350,8 @@ impl Marginaliser {
         stack.marginalize(leaving);
         for b in blocks.iter() {
             match b {
-                Block::Pose(s) | Block::Motion(s) => window.frame_mut(*s as usize).fix_anchor(),
-                Block::Rig(_) => window.rig.fix_anchor(),
+                Block::Pose(s) | Block::Motion(s) => window.frame_mut(*s as usize).fix_linearization_point(),
+                Block::Rig(_) => window.rig.fix_linearization_point(),
             }
         }
         prior.take(stack, leaving, blocks, window);
@@ -369,9 +369,9 @@ impl Marginaliser {
     }
 }
 
-impl Default for Marginaliser {
+impl Default for Marginalizer {
     fn default() -> Self {
-        Marginaliser::new()
+        Marginalizer::new()
     }
 }
 

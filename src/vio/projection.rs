@@ -6,57 +6,62 @@
 //! estimate, Jacobians at the linearisation points.
 
 use super::landmarks::{Landmark, Observation};
-use super::residuals::{predict, reproject, reproject_with_eyes, Body, Eye, Reprojection};
-use super::rig::{EYE_DIM, TIME_DIM};
-use super::shutter::{carry_back, Shifted};
+use super::residuals::{predict, reproject, reproject_with_extrinsics, CameraModel, Reprojection, Transform};
+use super::rig::{EXTRINSIC_DIM, TIME_DIM};
+use super::shutter::{carry_back, DelayedCamera};
 use super::window::Window;
 use crate::limits::CAMERAS_MAX;
 use glam::DVec2;
 
 /// Derivatives of a view to the rig's columns that cameras touch; the first `camera_dim` are meant.
-pub type CameraColumns = [[f64; TIME_DIM + EYE_DIM * CAMERAS_MAX]; 2];
+pub type CameraColumns = [[f64; TIME_DIM + EXTRINSIC_DIM * CAMERAS_MAX]; 2];
 
-fn shifted(eye: &Eye, time_offset: f64, row: f32, slot: usize, window: &Window) -> Shifted {
-    Shifted::new(&eye.body_from_cam, &window.frame(slot).twist, time_offset + eye.row_delay(row.into()))
+fn shifted(camera_model: &CameraModel, time_offset: f64, row: f32, slot: usize, window: &Window) -> DelayedCamera {
+    DelayedCamera::new(
+        &camera_model.body_from_cam,
+        &window.frame(slot).twist,
+        time_offset + camera_model.row_delay(row.into()),
+    )
 }
 
 /// Where a camera sits when it takes a row of the frame in `slot`.
-pub fn placed(camera: usize, row: f32, slot: usize, window: &Window) -> Body {
-    let eye = &window.rig.eyes()[camera];
+pub fn placed(camera: usize, row: f32, slot: usize, window: &Window) -> Transform {
+    let camera_model = &window.rig.cameras()[camera];
     if window.rig.is_plain() {
-        return eye.body_from_cam;
+        return camera_model.body_from_cam;
     }
-    shifted(eye, window.rig.now.time_offset, row, slot, window).body_from_cam
+    shifted(camera_model, window.rig.now.time_offset, row, slot, window).body_from_cam
 }
 
 /// Where the camera sits that a landmark is hosted in, for all its views.
-pub fn host_eye(l: &Landmark, window: &Window) -> Body {
+pub fn host_cam(l: &Landmark, window: &Window) -> Transform {
     placed(l.host_camera as usize, l.host_row, l.host as usize, window)
 }
 
 /// Pixel at which the observation should be.
-pub fn predicted(l: &Landmark, host_eye: &Body, o: &Observation, window: &Window) -> Option<DVec2> {
-    let eye = &window.rig.eyes()[o.camera as usize];
+pub fn predicted(l: &Landmark, host_cam: &Transform, o: &Observation, window: &Window) -> Option<DVec2> {
+    let camera_model = &window.rig.cameras()[o.camera as usize];
     let (host, target) = (&window.frame(l.host as usize).body, &window.frame(o.slot as usize).body);
     if window.rig.is_plain() {
-        return predict(&l.point, host_eye, host, eye, target);
+        return predict(&l.point, host_cam, host, camera_model, target);
     }
-    let eye = Eye { body_from_cam: placed(o.camera as usize, o.px[1], o.slot as usize, window), ..*eye };
-    predict(&l.point, host_eye, host, &eye, target)
+    let camera_model =
+        CameraModel { body_from_cam: placed(o.camera as usize, o.px[1], o.slot as usize, window), ..*camera_model };
+    predict(&l.point, host_cam, host, &camera_model, target)
 }
 
 /// The host's camera at the estimate, and at the linearisation point where that has to be carried.
 pub struct Host {
-    now: Body,
-    fixed: Option<Shifted>,
+    now: Transform,
+    fixed: Option<DelayedCamera>,
 }
 
 impl Host {
     pub fn of(l: &Landmark, window: &Window) -> Host {
         let (rig, slot) = (&window.rig, l.host as usize);
-        let eye = &rig.eyes_jacobian()[l.host_camera as usize];
-        let fixed = || shifted(eye, rig.linearised().time_offset, l.host_row, slot, window);
-        Host { now: host_eye(l, window), fixed: (!rig.is_plain()).then(fixed) }
+        let camera_model = &rig.cameras_linearized()[l.host_camera as usize];
+        let fixed = || shifted(camera_model, rig.linearized().time_offset, l.host_row, slot, window);
+        Host { now: host_cam(l, window), fixed: (!rig.is_plain()).then(fixed) }
     }
 }
 
@@ -71,11 +76,17 @@ pub fn observe(
     let rig = &window.rig;
     let (h, t) = (window.frame(l.host as usize), window.frame(o.slot as usize));
     let (host_camera, camera) = (l.host_camera as usize, o.camera as usize);
-    let (host_eye, eye) = (&rig.eyes_jacobian()[host_camera], &rig.eyes_jacobian()[camera]);
+    let (host_cam, camera_model) = (&rig.cameras_linearized()[host_camera], &rig.cameras_linearized()[camera]);
     let mut r = if let Some(host) = &host.fixed {
-        let target = shifted(eye, rig.linearised().time_offset, o.px[1], o.slot as usize, window);
-        let eye = Eye { body_from_cam: target.body_from_cam, ..*eye };
-        let (r, mut d) = reproject_with_eyes(&l.point, &host.body_from_cam, &h.body_jacobian, &eye, &t.body_jacobian)?;
+        let target = shifted(camera_model, rig.linearized().time_offset, o.px[1], o.slot as usize, window);
+        let camera_model = CameraModel { body_from_cam: target.body_from_cam, ..*camera_model };
+        let (r, mut d) = reproject_with_extrinsics(
+            &l.point,
+            &host.body_from_cam,
+            &h.body_linearized,
+            &camera_model,
+            &t.body_linearized,
+        )?;
         let d_time = carry_back(&mut d, host, &target);
         for (k, row) in columns.iter_mut().enumerate() {
             row.fill(0.0);
@@ -83,16 +94,16 @@ pub fn observe(
                 row[0] = d_time[k];
             }
             for (camera, d) in [(host_camera, &d.host[k]), (camera, &d.target[k])] {
-                if let Some(at) = rig.eye_column(camera) {
+                if let Some(at) = rig.extrinsic_column(camera) {
                     row[at..].iter_mut().zip(d).for_each(|(sum, d)| *sum += d);
                 }
             }
         }
         r
     } else {
-        reproject(&l.point, &host_eye.body_from_cam, &h.body_jacobian, eye, &t.body_jacobian)?
+        reproject(&l.point, &host_cam.body_from_cam, &h.body_linearized, camera_model, &t.body_linearized)?
     };
-    if h.anchored || t.anchored || rig.anchored {
+    if h.is_linearized || t.is_linearized || rig.is_linearized {
         r.px = predicted(l, &host.now, o, window)?;
     }
     r.px -= o.px();

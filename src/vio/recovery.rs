@@ -8,8 +8,8 @@
 //! restart that finds another one, for some seconds, is refused, for its accelerometer lies.
 
 use super::health::Reset;
-use super::init::{Start, GAUGE_SIGMA};
-use super::marginalise::Sigma;
+use super::initialization::{Start, GAUGE_SIGMA};
+use super::marginalization::Sigma;
 use super::preintegration::{Increment, Noise};
 use super::residuals::{Mat15, Motion};
 use super::samples::ImuRing;
@@ -38,11 +38,11 @@ const TILT_GATE: f64 = 13.8;
 const VOUCHING_V: f64 = 0.3;
 
 #[derive(Clone, Copy, Debug, Default)]
-pub struct Trust {
-    newest: Option<Trusted>,
+pub struct Recovery {
+    newest: Option<TrustedState>,
     /// Waits for `LAG`, then is the confirmed one.
-    candidate: Option<Trusted>,
-    confirmed: Option<Trusted>,
+    candidate: Option<TrustedState>,
+    confirmed: Option<TrustedState>,
 }
 
 /// What a restart does not know of where it is in the world of before: position and yaw, which no sensor
@@ -82,27 +82,27 @@ impl Origin {
 }
 
 #[derive(Clone, Copy, Debug)]
-struct Trusted {
+struct TrustedState {
     t: Nanos,
     pose: Pose,
     speed: f64,
     sigma_p: f64,
     sigma_yaw: f64,
-    carried: Carried,
+    carried: DeadReckoning,
 }
 
 /// A motion and its covariance, errors [p, θ, v, bg, ba].
 #[derive(Clone, Copy, Debug)]
-struct Carried {
+struct DeadReckoning {
     t: Nanos,
     motion: Motion,
     covariance: Mat15,
 }
 
-impl Trust {
+impl Recovery {
     /// An estimate nothing speaks against.
     pub fn add(&mut self, t: Nanos, motion: &Motion, covariance: &[[f64; 15]; 15]) {
-        let newest = Trusted::at(t, motion, covariance);
+        let newest = TrustedState::at(t, motion, covariance);
         match &self.candidate {
             Some(c) if (t - c.t).secs() < LAG => {}
             waited => (self.confirmed, self.candidate) = (waited.or(self.confirmed), Some(newest)),
@@ -111,7 +111,7 @@ impl Trust {
     }
 
     /// Something speaks against the newest estimate.
-    pub fn doubt(&mut self) {
+    pub fn invalidate(&mut self) {
         self.candidate = None;
     }
 
@@ -127,23 +127,23 @@ impl Trust {
 
     /// A restart at `t` in the world of before: position and yaw as trusted, the rest of `start`. `None` while
     /// the start cannot be true.
-    pub fn go_on(&mut self, start: &Start, why: Reset, t: Nanos, imu: &ImuRing, noise: &Noise) -> Option<Start> {
+    pub fn resume(&mut self, start: &Start, why: Reset, t: Nanos, imu: &ImuRing, noise: &Noise) -> Option<Start> {
         let suspect = matches!(why, Reset::Disagreement | Reset::State);
         let from = if suspect { self.confirmed } else { self.newest.or(self.confirmed) };
         self.candidate = None;
-        from.map_or(Some(*start), |mut from| from.go_on(start, suspect, t, imu, noise))
+        from.map_or(Some(*start), |mut from| from.resume(start, suspect, t, imu, noise))
     }
 }
 
-impl Trusted {
-    fn at(t: Nanos, motion: &Motion, covariance: &[[f64; 15]; 15]) -> Trusted {
+impl TrustedState {
+    fn at(t: Nanos, motion: &Motion, covariance: &[[f64; 15]; 15]) -> TrustedState {
         let covariance = Mat15::from_fn(|i, j| covariance[i][j]);
-        let carried = Carried { t, motion: *motion, covariance };
+        let carried = DeadReckoning { t, motion: *motion, covariance };
         let (sigma_p, sigma_yaw) = (carried.sigma(0), carried.about_world_axis(DVec3::Z));
-        Trusted { t, pose: motion.pose, speed: motion.v.length(), sigma_p, sigma_yaw, carried }
+        TrustedState { t, pose: motion.pose, speed: motion.v.length(), sigma_p, sigma_yaw, carried }
     }
 
-    fn go_on(&mut self, start: &Start, suspect: bool, t: Nanos, imu: &ImuRing, noise: &Noise) -> Option<Start> {
+    fn resume(&mut self, start: &Start, suspect: bool, t: Nanos, imu: &ImuRing, noise: &Noise) -> Option<Start> {
         self.carried.advance(t, imu, noise);
         let away = (t - self.t).secs();
         let mut sigma = start.sigma;
@@ -194,7 +194,7 @@ fn transition(from: &Motion, inc: &Increment) -> Mat15 {
     f
 }
 
-impl Carried {
+impl DeadReckoning {
     fn advance(&mut self, t: Nanos, imu: &ImuRing, noise: &Noise) {
         if t <= self.t {
             return;

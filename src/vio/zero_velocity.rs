@@ -7,7 +7,7 @@
 //! shakes as it does in flight (EuRoC V1_01: 1.5 m/s², 0.1 rad/s), so quiet it is not: then nothing may
 //! have moved against the oldest frame of the window, which a hovering rig leaves behind.
 
-use super::init::{REST_ACCEL, REST_GYRO, REST_PX};
+use super::initialization::{REST_ACCEL, REST_GYRO, REST_PX};
 use super::landmarks::find_track;
 use super::samples::ImuRing;
 use super::window::{Frame, Window};
