@@ -3,7 +3,7 @@
 #![allow(clippy::unwrap_used)]
 
 use std::path::Path;
-use stipple::config::{Board, StereoMethod};
+use stipple::config::{keys, Board, StereoMethod};
 use stipple_drivers::gpio::Edge;
 use stipple_drivers::imu::ImuOptions;
 use stipple_drivers::{Fault, FaultKind};
@@ -78,10 +78,10 @@ fn value_out_of_bounds_is_named_with_its_line_and_its_bound() {
         FaultKind::Config,
         &["test.toml:12", "map.scale = 3"],
     );
-    let text = format!("{BOARD}[stereo]\nblock_px = 10\n");
-    refused(parse(&text, &[]), FaultKind::Config, &["test.toml:14", "stereo.block_px = 10", "odd"]);
-    let text = format!("{BOARD}[vio]\nhuber_px = nan\n");
-    refused(parse(&text, &[]), FaultKind::Config, &["test.toml:14", "vio.huber_px", "positive"]);
+    let text = format!("{BOARD}[stereo]\ndisparities = 40\n");
+    refused(parse(&text, &[]), FaultKind::Config, &["test.toml:14", "stereo.disparities = 40", "a multiple of 16"]);
+    let text = format!("{BOARD}[vio]\ngyro_noise_scale = nan\n");
+    refused(parse(&text, &[]), FaultKind::Config, &["test.toml:14", "vio.gyro_noise_scale", "positive"]);
 }
 
 #[test]
@@ -93,12 +93,9 @@ fn values_that_contradict_each_other_are_named() {
         FaultKind::Config,
         &["--set budget.intersections=5000", "splats"],
     );
-    let rolling = parse(BOARD, &["rig.rolling_shutter=true"]);
-    refused(rolling, FaultKind::Config, &["--set rig.rolling_shutter=true", "readout_s"]);
-    assert!(parse(BOARD, &["rig.readout_s=0.02", "rig.rolling_shutter=true"]).is_ok());
     // The key at fault may be a default that the file does not write.
-    let text = format!("{BOARD}[frontend]\nfast_threshold_min = 90\n");
-    refused(parse(&text, &[]), FaultKind::Config, &["test.toml", "default", "fast_threshold"]);
+    let text = format!("{BOARD}[stereo]\ndepth_min_m = 30.0\n");
+    refused(parse(&text, &[]), FaultKind::Config, &["test.toml", "default", "depth_max_m"]);
 }
 
 #[test]
@@ -127,14 +124,14 @@ fn overrides_reach_nested_keys_strings_numbers_and_booleans() {
         "map.scale=4",
         "map.enabled=false",
         "gpu.device=llvmpipe (LLVM",
-        "vio.huber_px=2",
+        "vio.gyro_noise_scale=3",
         "stereo.method=bm",
     ];
     let board = parse(BOARD, &set).unwrap();
     assert_eq!((board.name.as_str(), board.map.scale, board.map.enabled), ("other", 4, false));
-    assert_eq!((board.gpu.device.as_str(), board.vio.huber_px), ("llvmpipe (LLVM", 2.0));
+    assert_eq!((board.gpu.device.as_str(), board.vio.gyro_noise_scale), ("llvmpipe (LLVM", 3.0));
     assert_eq!(board.stereo.method, StereoMethod::Bm);
-    assert_eq!(parse(BOARD, &["replay.calibration=\"a b.yaml\""]).unwrap().replay.calibration, "a b.yaml");
+    assert_eq!(parse(BOARD, &["rig.calibration=\"a b.yaml\""]).unwrap().rig.calibration, "a b.yaml");
     assert_eq!(parse(BOARD, &["map.scale=4", "map.scale=1"]).unwrap().map.scale, 1, "the last one counts");
 }
 
@@ -159,28 +156,35 @@ fn an_override_cannot_hide_an_error_of_the_file() {
 fn an_inertial_unit_is_described_whole_or_refused() {
     let with = |lines: &str| parse(&format!("{BOARD}[imu]\n{lines}"), &[]);
     assert!(parse(BOARD, &[]).unwrap().imu.options().is_none());
-    let board = with("chip = \"icm-42688-p\"\nspi = \"/dev/spidev0.0\"\nrate_hz = 500\n").unwrap();
+    let board = with("chip = \"icm-42688-p\"\ndevice = \"/dev/spidev0.0\"\nrate_hz = 500\n").unwrap();
     let Some(ImuOptions::Register(options)) = board.imu.options() else { panic!("it is driven by its registers") };
     assert_eq!((options.rate_hz, options.wiring.len()), (500.0, 1));
-    let board = with("chip = \"bmi088\"\ni2c = \"/dev/i2c-1\"\n").unwrap();
+    let board = with("chip = \"bmi088\"\ndevice = \"/dev/i2c-1\"\n").unwrap();
     let Some(ImuOptions::Register(options)) = board.imu.options() else { panic!("it is driven by its registers") };
     let wired: Vec<String> = options.wiring.iter().map(|w| w.to_string()).collect();
     assert_eq!(wired, ["/dev/i2c-1 0x68", "/dev/i2c-1 0x18"]);
     refused(with("chip = \"bno055\"\n"), FaultKind::Config, &["test.toml:14", "bno055", "lsm6dsox"]);
-    refused(with("chip = \"mpu-6500\"\n"), FaultKind::Config, &["imu.i2c", "imu.spi"]);
-    refused(with("chip = \"bmi270\"\ni2c = \"a\"\n"), FaultKind::Config, &["imu.configuration", "bmi270_config_file"]);
-    refused(with("chip = \"bmi088\"\nspi = \"a\"\n"), FaultKind::Config, &["imu.accel_spi"]);
+    refused(with("chip = \"mpu-6500\"\n"), FaultKind::Config, &["imu.device", "spidev"]);
+    refused(
+        with("chip = \"bmi270\"\ndevice = \"a\"\n"),
+        FaultKind::Config,
+        &["imu.configuration", "bmi270_config_file"],
+    );
+    refused(with("chip = \"bmi088\"\ndevice = \"/dev/spidev0.0\"\n"), FaultKind::Config, &["imu.accel_device"]);
     refused(with("chip = \"iio\"\n"), FaultKind::Config, &["imu.device"]);
-    let line = "[gpio.data_ready]\nchip = \"tegra-gpio\"\nline = \"PQ.05\"\n";
+    let line = "[gpio]\ndata_ready = \"tegra-gpio:PQ.05\"\n";
     refused(with(&format!("chip = \"iio\"\ndevice = \"d\"\n{line}")), FaultKind::Config, &["test.toml:17", "kernel"]);
     refused(
-        parse(&format!("{BOARD}[gpio.led]\nline = \"3\"\n"), &[]),
+        parse(&format!("{BOARD}[gpio]\nled = \"3\"\n"), &[]),
         FaultKind::Config,
-        &["test.toml:14", "gpio.led.line", "chip"],
+        &["test.toml:14", "gpio.led", "CHIP:LINE"],
     );
     refused(with("chip = \"iio\"\nrate_hz = 5\n"), FaultKind::Config, &["test.toml:15", "10 to 4000"]);
     let (name, edge) = parse(&format!("{BOARD}{line}"), &[]).unwrap().gpio.data_ready().unwrap();
     assert_eq!((name.to_string().as_str(), edge), ("tegra-gpio line PQ.05", Edge::Rising));
+    let (_, edge) =
+        parse(&format!("{BOARD}[gpio]\ndata_ready = \"!tegra-gpio:7\"\n"), &[]).unwrap().gpio.data_ready().unwrap();
+    assert_eq!(edge, Edge::Falling);
 }
 
 #[test]
@@ -189,12 +193,68 @@ fn missing_file_is_named() {
 }
 
 #[test]
-fn the_example_of_sensors_fits_a_board() {
-    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("board-configs");
-    let sensors = std::fs::read_to_string(folder.join("sensors.example")).unwrap();
-    let board = parse(&format!("{BOARD}{sensors}"), &[]).unwrap();
+fn the_example_with_sensors_is_whole() {
+    let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("board-configs/drone-pi5.toml");
+    let board = Board::load(&file, &[]).unwrap();
     assert_eq!((board.camera.devices.len(), board.camera.controls["gain"]), (2, 16));
+    assert!(board.imu.options().is_some() && board.gpio.data_ready().is_some() && board.gpio.led().is_some());
     assert_eq!(parse(&toml::to_string(&board).unwrap(), &[]).unwrap(), board);
+}
+
+/// Between these lines of board-configs/README.md stands what `STIPPLE_BLESS=1 cargo test --test config` writes.
+const BEGIN: &str = "<!-- keys -->";
+const END: &str = "<!-- end of keys -->";
+
+/// The table of every key, by section.
+fn keys_page() -> String {
+    let board = toml::Table::try_from(parse(BOARD, &[]).unwrap()).unwrap();
+    let units = [
+        ("_s", "s"),
+        ("_us", "µs"),
+        ("_ms", "ms"),
+        ("_hz", "Hz"),
+        ("_px", "px"),
+        ("_m", "m"),
+        ("_mib", "MiB"),
+        ("_g", "g"),
+        ("_dps", "°/s"),
+        ("image_width_max", "px"),
+        ("image_height_max", "px"),
+        ("disparities", "px"),
+        ("fast_threshold_min", "grey levels"),
+    ];
+    let (mut page, mut last) = (String::new(), None);
+    for key in keys() {
+        let (section, name) = key.name.rsplit_once('.').unwrap_or(("", key.name));
+        if last != Some(section) {
+            let title = if section.is_empty() { "At the top".to_string() } else { format!("`[{section}]`") };
+            page += &format!("\n## {title}\n\n| key | unit | default | bounds | meaning, and when to change it |\n|---|---|---|---|---|\n");
+            last = Some(section);
+        }
+        let unit = units.iter().find(|(suffix, _)| name.ends_with(suffix)).map_or("", |(_, unit)| unit);
+        let required = section.is_empty() || section == "budget";
+        let value = key
+            .name
+            .split('.')
+            .fold(Some(&toml::Value::Table(board.clone())).cloned(), |at, part| at?.get(part).cloned());
+        let default = if required { "required".into() } else { format!("`{}`", value.unwrap()) };
+        page += &format!("| `{name}` | {unit} | {default} | {} |{} |\n", key.bound, key.doc.replace('|', "\\|"));
+    }
+    page
+}
+
+#[test]
+fn the_page_of_keys_is_up_to_date_and_there_are_few() {
+    let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("board-configs/README.md");
+    let text = std::fs::read_to_string(&file).unwrap();
+    let (before, rest) = text.split_once(BEGIN).unwrap();
+    let (page, after) = rest.split_once(END).unwrap();
+    if std::env::var_os("STIPPLE_BLESS").is_some() {
+        std::fs::write(&file, format!("{before}{BEGIN}\n{}\n{END}{after}", keys_page())).unwrap();
+        return;
+    }
+    assert_eq!(page.trim(), keys_page().trim(), "STIPPLE_BLESS=1 cargo test --test config writes it anew");
+    assert!(keys().count() <= 70, "{} keys", keys().count());
 }
 
 #[test]
@@ -216,5 +276,5 @@ fn shipped_boards_load_and_are_named_after_their_file() {
         }
     }
     seen.sort();
-    assert_eq!(seen, ["jetson-orin-nano", "lavapipe", "raspberry-pi-5", "x86-igpu"]);
+    assert_eq!(seen, ["drone-pi5", "jetson-orin-nano", "lavapipe", "raspberry-pi-5", "x86-igpu"]);
 }

@@ -144,8 +144,8 @@ fn each_part_of_a_board_is_looked_for_where_one_is_not_there() {
     let plain = fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join(BOARD)).unwrap();
     let sensors = format!(
         "[rig]\ncalibration = \"{}\"\n[camera]\ndevices = [\"serial:L\", \"serial:R\"]\n\
-         [imu]\nchip = \"mpu-6500\"\ni2c = \"/dev/no-such-bus\"\n\
-         [gpio.led]\nchip = \"no-such-chip\"\nline = \"3\"\n",
+         [imu]\nchip = \"mpu-6500\"\ndevice = \"/dev/no-such-bus\"\n\
+         [gpio]\nled = \"no-such-chip:3\"\n",
         data.join("mav0").display()
     );
     fs::write(&board, format!("{plain}\n{sensors}")).unwrap();

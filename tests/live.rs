@@ -1,5 +1,5 @@
 //! `stipple run` on a recording in the place of sensors: it ends as a replay ends, stops when asked, and outlives what
-//! `[inject]` does to it, with every fault that was injected counted by what detected it.
+//! `--inject` does to it, with every fault that was injected counted by what detected it.
 #![allow(clippy::unwrap_used)]
 
 mod program;
@@ -26,12 +26,13 @@ fn count(report: &Value, name: &str) -> u64 {
     report[format!("count_{name}")].as_u64().unwrap_or(0)
 }
 
-/// A board with rules of faults.
-fn board_with(dir: &Path, rules: &str) -> String {
-    let board = dir.join("board.toml");
-    let plain = fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join(BOARD)).unwrap();
-    fs::write(&board, format!("{plain}\n[inject]\nseed = 1\n{rules}")).unwrap();
-    board.to_str().unwrap().to_string()
+/// A run with these faults injected.
+fn run_with(dataset: &Path, out: &Path, rules: &str) -> Command {
+    let file = dataset.with_file_name("inject.toml");
+    fs::write(&file, format!("seed = 1\n{rules}")).unwrap();
+    let mut command = run(dataset, out, BOARD);
+    command.args(["--inject", file.to_str().unwrap()]);
+    command
 }
 
 #[test]
@@ -78,39 +79,39 @@ fn a_board_without_sensors_is_told_what_to_write() {
 #[test]
 fn sensors_that_fail_are_said_counted_and_taken_back() {
     const RULES: &str = "
-        [[inject.camera]]
+        [[camera]]
         fault = \"drop\"
         start_s = 1.5
         end_s = 1.7
-        [[inject.camera]]
+        [[camera]]
         fault = \"unplug\"
         start_s = 2.2
         end_s = 3.0
-        [[inject.camera]]
+        [[camera]]
         fault = \"freeze\"
         start_s = 3.5
         end_s = 3.7
-        [[inject.camera]]
+        [[camera]]
         fault = \"stamp_jump\"
         by_s = 60.0
         start_s = 4.0
         end_s = 4.2
-        [[inject.camera]]
+        [[camera]]
         fault = \"duplicate\"
         start_s = 4.5
         end_s = 4.7
-        [[inject.imu]]
+        [[imu]]
         fault = \"freeze\"
         start_s = 4.7
         end_s = 4.9
-        [[inject.imu]]
+        [[imu]]
         fault = \"unplug\"
         start_s = 5.0
         end_s = 5.5
     ";
     let dir = tempfile::tempdir().unwrap();
     let (data, out) = (flight(dir.path(), "7"), dir.path().join("out"));
-    let o = run(&data, &out, &board_with(dir.path(), RULES)).output().unwrap();
+    let o = run_with(&data, &out, RULES).output().unwrap();
     let (r, said) = (report(&out), text(&o));
     assert!(o.status.success(), "{said}");
     let same = |injected: &[&str], detected: &[&str]| {
@@ -135,7 +136,7 @@ fn sensors_that_fail_are_said_counted_and_taken_back() {
 #[test]
 fn a_run_goes_on_with_one_camera_and_says_which_is_gone() {
     const RULES: &str = "
-        [[inject.camera]]
+        [[camera]]
         fault = \"unplug\"
         camera = 1
         start_s = 2.0
@@ -143,7 +144,7 @@ fn a_run_goes_on_with_one_camera_and_says_which_is_gone() {
     ";
     let dir = tempfile::tempdir().unwrap();
     let (data, out) = (flight(dir.path(), "6"), dir.path().join("out"));
-    let o = run(&data, &out, &board_with(dir.path(), RULES)).output().unwrap();
+    let o = run_with(&data, &out, RULES).output().unwrap();
     let (r, said) = (report(&out), text(&o));
     assert!(o.status.success(), "{said}");
     assert_eq!((count(&r, "eye_lost"), count(&r, "camera_lost"), count(&r, "resets")), (1, 0, 0), "{said}");
@@ -156,10 +157,10 @@ fn a_run_goes_on_with_one_camera_and_says_which_is_gone() {
 #[test]
 fn a_senseless_rule_is_named() {
     let dir = tempfile::tempdir().unwrap();
-    let board = board_with(dir.path(), "[[inject.imu]]\nfault = \"blackout\"\n");
-    let o = stipple().args(["check", "--board", &board]).output().unwrap();
+    let (data, out) = (flight(dir.path(), "0.3"), dir.path().join("out"));
+    let o = run_with(&data, &out, "[[imu]]\nfault = \"blackout\"\n").output().unwrap();
     assert_eq!(o.status.code(), Some(78));
-    assert!(text(&o).contains("inject.imu, rule 1") && text(&o).contains("no light"), "{}", text(&o));
+    assert!(text(&o).contains("inject.toml: imu, rule 1") && text(&o).contains("no light"), "{}", text(&o));
 }
 
 #[test]

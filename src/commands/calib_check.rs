@@ -19,6 +19,9 @@ pub struct Args {
     dataset: PathBuf,
     #[command(flatten)]
     board: BoardArgs,
+    /// Calibration in place of the recording's own: Kalibr's camchain.yaml or Basalt's json
+    #[arg(long, value_name = "FILE")]
+    calibration: Option<PathBuf>,
 }
 
 /// Stereo pairs that are matched, evenly over the recording.
@@ -28,7 +31,7 @@ pub const ROWS_MAX_PX: f64 = 0.5;
 
 pub fn calib_check(args: &Args) -> Result<(), Fault> {
     let board = args.board.load()?;
-    let recording = open_recording(&args.dataset, &board)?;
+    let recording = open_recording(&args.dataset, args.calibration.as_deref(), &board)?;
     let mut reader = recording.reader();
     let cameras = recording.calibration.cameras.len();
     println!("{:<6} {} frames of {cameras} camera{}", "", recording.frames.len(), if cameras == 1 { "" } else { "s" });

@@ -132,7 +132,7 @@ impl BoardArgs {
 /// The board's sensors, or a recording in their place.
 fn open_input(dataset: Option<&Path>, args: &BoardArgs, board: &Board) -> Result<Input, Fault> {
     match dataset {
-        Some(dataset) => Input::recording(dataset, board),
+        Some(dataset) => Input::recording(dataset, None, board),
         None => Input::live(args.path(), board),
     }
 }

@@ -1,6 +1,7 @@
 //! `stipple replay`: a recording through tracking and mapping.
 
 use super::{finish, seconds, BoardArgs};
+use crate::config::InjectConfig;
 use crate::output::OutputDir;
 use crate::run::sensors::Input;
 use crate::run::{fly, Options, Pace, Steps};
@@ -24,6 +25,12 @@ pub struct Args {
     /// Mapping steps a second of the recording in lockstep, instead: plays a device that slow
     #[arg(long, value_name = "N", value_parser = seconds, conflicts_with = "steps")]
     steps_per_s: Option<f64>,
+    /// Calibration in place of the recording's own: Kalibr's camchain.yaml or Basalt's json
+    #[arg(long, value_name = "FILE")]
+    calibration: Option<PathBuf>,
+    /// Faults to inject into the sensors at recorded pace: a TOML file of [[camera]] and [[imu]] rules
+    #[arg(long, value_name = "FILE")]
+    inject: Option<PathBuf>,
     /// Skip odometry: poses from this table (EuRoC or TUM csv); every frame it covers is a keyframe
     #[arg(long, value_name = "CSV")]
     poses: Option<PathBuf>,
@@ -49,7 +56,7 @@ enum PaceName {
 pub fn replay(args: &Args) -> Result<(), Fault> {
     let scale: Vec<String> = args.scale.iter().map(|s| format!("map.scale={s}")).collect();
     let board = args.board.load_with(&scale)?;
-    let input = Input::recording(&args.dataset, &board)?;
+    let input = Input::recording(&args.dataset, args.calibration.as_deref(), &board)?;
     let out = OutputDir::create(&args.out)?;
     let steps = args.steps_per_s.map_or(Steps::PerFrame(args.steps), Steps::PerSecond);
     let options = Options {
@@ -61,6 +68,7 @@ pub fn replay(args: &Args) -> Result<(), Fault> {
         holdout: args.holdout.unwrap_or(0),
         duration_s: args.duration,
         record: None,
+        inject: args.inject.as_deref().map(InjectConfig::load).transpose()?.unwrap_or_default(),
     };
     finish(fly(input, &board, &out, &options, None)?, &out)
 }

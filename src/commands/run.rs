@@ -1,6 +1,7 @@
 //! `stipple run`: the board's sensors through tracking and mapping, until it is stopped.
 
 use super::{finish, open_input, seconds, BoardArgs};
+use crate::config::InjectConfig;
 use crate::output::OutputDir;
 use crate::run::status_led::StatusLed;
 use crate::run::{fly, Options};
@@ -20,6 +21,9 @@ pub struct Args {
     /// Play this recording in place of the sensors, at its pace
     #[arg(long, value_name = "DIR")]
     dataset: Option<PathBuf>,
+    /// Faults to inject into the recording: a TOML file of [[camera]] and [[imu]] rules
+    #[arg(long, value_name = "FILE", requires = "dataset")]
+    inject: Option<PathBuf>,
     /// Record the samples to this folder too, as EuRoC
     #[arg(long, value_name = "DIR")]
     record: Option<PathBuf>,
@@ -30,6 +34,8 @@ pub fn run(args: &Args) -> Result<(), Fault> {
     let led = StatusLed::open(board.gpio.led())?;
     let input = open_input(args.dataset.as_deref(), &args.board, &board)?;
     let out = OutputDir::create(&args.out)?;
-    let options = Options { duration_s: args.duration, record: args.record.clone(), ..Options::default() };
+    let inject = args.inject.as_deref().map(InjectConfig::load).transpose()?.unwrap_or_default();
+    let (duration_s, record) = (args.duration, args.record.clone());
+    let options = Options { duration_s, record, inject, ..Options::default() };
     finish(fly(input, &board, &out, &options, led)?, &out)
 }

@@ -1,27 +1,44 @@
-//! `[inject]`: what goes wrong with the sensors on purpose, so that a board's answer to it can be seen.
+//! Faults injected into the sensors of a replayed recording on purpose, so that the answer to them can be seen: the TOML
+//! file of `--inject`.
 
 use serde::{Deserialize, Serialize};
+use std::path::Path;
 use stipple_drivers::inject::{Kind, Rule};
+use stipple_drivers::{Fault, FaultKind};
 
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct InjectConfig {
     /// The same seed strikes the same frames and samples.
     pub seed: u64,
-    /// `[[inject.camera]]` and `[[inject.imu]]`, a fault each.
+    /// `[[camera]]`, a fault each.
     pub camera: Vec<Rule>,
+    /// `[[imu]]`, a fault each.
     pub imu: Vec<Rule>,
 }
 
 impl InjectConfig {
-    /// The first rule that makes no sense.
-    pub(super) fn check(&self) -> Result<(), (&'static str, String)> {
-        for (key, rules) in [("inject.camera", &self.camera), ("inject.imu", &self.imu)] {
+    /// Reads a file of rules; an error names the first one that makes no sense.
+    pub fn load(path: &Path) -> Result<InjectConfig, Fault> {
+        let place = path.display().to_string();
+        let fix = "write seed = 1 and [[camera]] or [[imu]] with fault, start_s and end_s";
+        let text = std::fs::read_to_string(path).map_err(|e| {
+            Fault::new(FaultKind::NoInput, &place, format!("cannot read the rules of faults: {e}"), fix)
+        })?;
+        let config: InjectConfig = toml::from_str(&text)
+            .map_err(|e| Fault::new(FaultKind::Config, &place, e.message().replace('\n', " "), fix))?;
+        config.check().map_err(|what| Fault::new(FaultKind::Config, &place, what, fix))?;
+        Ok(config)
+    }
+
+    /// Refuses rules that make no sense.
+    fn check(&self) -> Result<(), String> {
+        for (key, rules) in [("camera", &self.camera), ("imu", &self.imu)] {
             for (i, rule) in rules.iter().enumerate() {
-                let blind = key == "inject.imu" && (rule.fault == Kind::Blackout || rule.camera.is_some());
+                let blind = key == "imu" && (rule.fault == Kind::Blackout || rule.camera.is_some());
                 let checked =
                     if blind { Err("an inertial unit has no light to go out, and no cameras") } else { rule.check() };
-                checked.map_err(|what| (key, format!("{key}, rule {}: {what}", i + 1)))?;
+                checked.map_err(|what| format!("{key}, rule {}: {what}", i + 1))?;
             }
         }
         Ok(())

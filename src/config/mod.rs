@@ -1,25 +1,23 @@
-//! Board files: strict TOML (unknown keys are refused), units in every name, one `validate`.
+//! Board files: strict TOML (unknown keys are refused), units in every name, each key declared once (`section`).
 //!
-//! A board file states what the board is (`name`, `memory_max_mib`), its `[budget]`, and where it
-//! departs from the defaults of the method (`[frontend]`, `[vio]`, `[stereo]`, `[map]`, `[gpu]`).
-//! `--set section.key=value` edits the parsed table before it is checked, so an override obeys
-//! the same rules as the file.
+//! A board file states what the board is (`name`, `memory_max_mib`), its `[budget]`, its sensors, and where it departs from
+//! the defaults of the method. `--set section.key=value` edits the parsed table before it is checked, so an override obeys the
+//! same rules as the file. board-configs/README.md lists every key; tests/config.rs writes it.
 
-mod bounds;
-mod camera;
-mod imu;
 mod inject;
-mod map;
-mod network;
-mod record;
+mod method;
+mod section;
+mod sensors;
 
-use bounds::BOUNDS;
-pub use camera::CameraConfig;
-pub use imu::{GpioConfig, ImuConfig};
 pub use inject::InjectConfig;
-pub use map::{MapConfig, Projection};
-pub use network::{Fit, NetworkConfig};
-pub use record::RecordConfig;
+pub use method::{
+    Fit, FrontendConfig, GpuConfig, MapConfig, NetworkConfig, Projection, StereoConfig, StereoMethod, VioConfig,
+};
+pub use section::{Bound, Key};
+pub use sensors::{CameraConfig, GpioConfig, ImuConfig, RecordConfig, RigConfig};
+
+use section::section;
+use sensors::Wrong;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 use stipple_drivers::{Fault, FaultKind};
@@ -28,11 +26,18 @@ use stipple_drivers::{Fault, FaultKind};
 #[serde(deny_unknown_fields)]
 pub struct Board {
     pub name: String,
-    /// Refuse to start when the byte table exceeds this, MiB.
     pub memory_max_mib: u64,
     pub budget: Budget,
     #[serde(default)]
     pub rig: RigConfig,
+    #[serde(default)]
+    pub camera: CameraConfig,
+    #[serde(default)]
+    pub imu: ImuConfig,
+    #[serde(default)]
+    pub gpio: GpioConfig,
+    #[serde(default)]
+    pub record: RecordConfig,
     #[serde(default)]
     pub frontend: FrontendConfig,
     #[serde(default)]
@@ -43,250 +48,52 @@ pub struct Board {
     pub map: MapConfig,
     #[serde(default)]
     pub gpu: GpuConfig,
-    #[serde(default)]
-    pub replay: ReplayConfig,
-    #[serde(default)]
-    pub inject: InjectConfig,
-    #[serde(default)]
-    pub camera: CameraConfig,
-    #[serde(default)]
-    pub record: RecordConfig,
-    #[serde(default)]
-    pub imu: ImuConfig,
-    #[serde(default)]
-    pub gpio: GpioConfig,
 }
 
-/// Capacities bought at boot. Every one is a hard limit; full is counted, never grown.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Budget {
-    /// Gaussians in the pool.
-    pub splats: u32,
-    /// (Gaussian, tile) pairs of one view; the farthest are dropped past it.
-    pub intersections: u32,
-    /// Keyframes the mapper keeps to train and evaluate on.
-    pub keyframes: u32,
-    /// Widest camera image the board accepts, px.
-    pub image_width_max: u32,
-    pub image_height_max: u32,
+/// The keys above all sections.
+const TOP: &[Key] = &[
+    Key { name: "name", doc: " Name of the board, for the report.", bound: Bound::Any },
+    Key {
+        name: "memory_max_mib",
+        doc: " The board is refused when its memory table exceeds this. Set it to what the other programs of the board leave.",
+        bound: Bound::Within(16.0, 1_048_576.0),
+    },
+];
+
+section! {
+    /// Capacities bought at boot. Every one is a hard limit; what is full is counted, never grown.
+    Budget, "budget.", required;
+    /// Gaussians in the pool: 192 bytes each on the GPU. As many as the GPU trains at a few steps a frame.
+    splats: u32, Bound::Within(256.0, 4_000_000.0);
+    /// (Gaussian, tile) pairs of one view, 40 bytes each; the farthest are dropped past it. 13 to 25 for each Gaussian.
+    intersections: u32, Bound::Within(1024.0, 64_000_000.0);
+    /// Keyframes that the mapper keeps to train and evaluate on. One comes a second, so this is the length of a flight.
+    keyframes: u32, Bound::Within(2.0, 4096.0);
+    /// Widest camera image that the board accepts.
+    image_width_max: u32, Bound::Within(64.0, 4096.0);
+    /// Highest camera image that the board accepts.
+    image_height_max: u32, Bound::Within(64.0, 4096.0);
 }
 
-/// What the board knows of its sensors and their calibration does not say.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct RigConfig {
-    /// The cameras have a rolling shutter.
-    pub rolling_shutter: bool,
-    /// First row to last, s; 0: as the calibration says.
-    pub readout_s: f64,
-    /// Calibration of the board's own sensors, from the board file's folder: Kalibr camchain.yaml with imu_config.yaml
-    /// beside it, Basalt json, or the mav0 of a recording.
-    pub calibration: String,
-}
-
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct FrontendConfig {
-    /// 1: tracker and estimator take turns; 2: a thread each, the same poses bit for bit.
-    pub threads: u32,
-    /// Detection cell, one point per cell, px.
-    pub grid_px: u32,
-    /// FAST thresholds, grey levels: halved from the first down to the second.
-    pub fast_threshold: u32,
-    pub fast_threshold_min: u32,
-    /// Inverse-compositional iterations a level.
-    pub iterations: u32,
-    /// Forward-backward distance accepted, px.
-    pub recovered_max_px: f64,
-    /// |f1ᵀ E f0| accepted between unit bearings.
-    pub epipolar_max: f64,
-}
-
-impl Default for FrontendConfig {
-    fn default() -> Self {
-        FrontendConfig {
-            threads: 2,
-            grid_px: 60,
-            fast_threshold: 40,
-            fast_threshold_min: 5,
-            iterations: 3,
-            recovered_max_px: 0.2,
-            epipolar_max: 0.005,
-        }
-    }
-}
-
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct VioConfig {
-    /// Observation standard deviation and Huber width, px.
-    pub observation_sigma_px: f64,
-    pub huber_px: f64,
-    pub iterations_max: u32,
-    /// Newest frames kept with velocity and biases, and older ones kept as poses.
-    pub states: u32,
-    pub keyframes: u32,
-    /// New keyframe when fewer than this fraction of points are landmarks, and not sooner than
-    /// `keyframe_gap_min` frames.
-    pub keyframe_connected_min: f64,
-    pub keyframe_gap_min: u32,
-    /// Baseline that triangulates, m.
-    pub triangulation_baseline_min_m: f64,
-    /// Prior standard deviations at the start: accelerometer bias m/s², gyro bias rad/s.
-    pub accel_bias_sigma: f64,
-    pub gyro_bias_sigma: f64,
-    /// Observations further than this from their prediction after optimisation are dropped, px.
-    pub outlier_px: f64,
-    /// Factors on the calibration's noise densities, for vibration and scale errors it does not state.
-    pub gyro_noise_scale: f64,
-    pub accel_noise_scale: f64,
-    /// Hold velocity and gyro bias when nothing moves.
-    pub zero_velocity: bool,
-    /// Refine while flying: the cameras' time offset, where they sit, the scale of the inertial unit's axes; and
-    /// how well each is known before. Extrinsics wrong by an angle need `frontend.epipolar_max` above it.
-    pub estimate_time_offset: bool,
-    pub estimate_extrinsics: bool,
-    pub estimate_imu_scale: bool,
-    pub time_offset_sigma_s: f64,
-    pub extrinsics_sigma_m: f64,
-    pub extrinsics_sigma_rad: f64,
-    pub imu_scale_sigma: f64,
-    /// Ends of the sensors' ranges, rad/s and m/s²: samples there are clipped and weigh little.
-    pub gyro_max: f64,
-    pub accel_max: f64,
-}
-
-impl Default for VioConfig {
-    fn default() -> Self {
-        VioConfig {
-            observation_sigma_px: 0.5,
-            huber_px: 1.0,
-            iterations_max: 7,
-            states: 3,
-            keyframes: 7,
-            keyframe_connected_min: 0.7,
-            keyframe_gap_min: 5,
-            triangulation_baseline_min_m: 0.05,
-            accel_bias_sigma: 0.3,
-            gyro_bias_sigma: 0.1,
-            outlier_px: 3.0,
-            gyro_noise_scale: 2.0,
-            accel_noise_scale: 8.0,
-            zero_velocity: true,
-            estimate_time_offset: false,
-            estimate_extrinsics: false,
-            estimate_imu_scale: false,
-            time_offset_sigma_s: 0.01,
-            extrinsics_sigma_m: 0.01,
-            extrinsics_sigma_rad: 0.02,
-            imu_scale_sigma: 0.02,
-            gyro_max: 34.9,
-            accel_max: 156.9,
-        }
-    }
-}
-
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum StereoMethod {
-    /// OpenCV block matching.
-    Bm,
-    /// OpenCV semi-global block matching.
-    Sgbm,
-    /// Semi-global matching of census transforms on the GPU.
-    Sgm,
-    /// A network of the user's, run by ONNX Runtime.
-    Onnx,
-}
-
-impl StereoMethod {
-    /// As a board file writes it.
-    pub fn name(self) -> &'static str {
-        match self {
-            StereoMethod::Bm => "bm",
-            StereoMethod::Sgbm => "sgbm",
-            StereoMethod::Sgm => "sgm",
-            StereoMethod::Onnx => "onnx",
-        }
-    }
-}
-
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct StereoConfig {
-    pub method: StereoMethod,
-    /// Smooth the disparities of `sgm` along the picture's edges by weighted least squares, which also fills holes.
-    pub wls: bool,
-    /// Disparity range at full resolution, px, a multiple of 16.
-    pub disparities: u32,
-    /// Matching window of `bm` and of `sgbm`, px, odd.
-    pub block_px: u32,
-    pub sgbm_block_px: u32,
-    /// Best match of `bm` and of `sgbm` must beat the second by this, percent.
-    pub uniqueness_percent: u32,
-    /// Directions in which `sgm` sums costs: 4 or 8.
-    pub sgm_paths: u32,
-    /// As `uniqueness_percent`, of `sgm`.
-    pub sgm_uniqueness_percent: u32,
-    /// Depths used for seeding, m.
-    pub depth_min_m: f64,
-    pub depth_max_m: f64,
-    /// Of `onnx`.
-    pub network: NetworkConfig,
-}
-
-impl Default for StereoConfig {
-    fn default() -> Self {
-        StereoConfig {
-            // What this program has: the other needs OpenCV.
-            method: if cfg!(feature = "opencv") { StereoMethod::Bm } else { StereoMethod::Sgm },
-            wls: true,
-            disparities: 96,
-            block_px: 11,
-            sgbm_block_px: 5,
-            uniqueness_percent: 10,
-            sgm_paths: 8,
-            sgm_uniqueness_percent: 10,
-            depth_min_m: 0.3,
-            depth_max_m: 20.0,
-            network: NetworkConfig::default(),
-        }
-    }
-}
-
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct GpuConfig {
-    /// Substring of the Vulkan device name; empty takes the first discrete, else integrated, else CPU device.
-    pub device: String,
-    /// Time one submission may take; integrated GPUs reset on long ones, ms.
-    pub submission_max_ms: f64,
-    /// Use subgroup arithmetic where the device has it.
-    pub subgroups: bool,
-}
-
-impl Default for GpuConfig {
-    fn default() -> Self {
-        GpuConfig { device: String::new(), submission_max_ms: 20.0, subgroups: true }
-    }
-}
-
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct ReplayConfig {
-    /// Largest stamp difference of the images of one frame, s.
-    pub pair_tolerance_s: f64,
-    /// Gap between inertial samples that counts as a hole, s.
-    pub imu_hole_s: f64,
-    /// Calibration used instead of the recording's own (Kalibr yaml or Basalt json); empty: the recording's.
-    pub calibration: String,
-}
-
-impl Default for ReplayConfig {
-    fn default() -> Self {
-        ReplayConfig { pair_tolerance_s: 0.002, imu_hole_s: 0.02, calibration: String::new() }
-    }
+/// Every key of a board file, section by section.
+pub fn keys() -> impl Iterator<Item = &'static Key> {
+    let sections = [
+        TOP,
+        Budget::KEYS,
+        RigConfig::KEYS,
+        CameraConfig::KEYS,
+        ImuConfig::KEYS,
+        GpioConfig::KEYS,
+        RecordConfig::KEYS,
+        FrontendConfig::KEYS,
+        VioConfig::KEYS,
+        StereoConfig::KEYS,
+        NetworkConfig::KEYS,
+        MapConfig::KEYS,
+        GpuConfig::KEYS,
+    ];
+    // A key that is a section of its own has its keys listed.
+    sections.into_iter().flatten().filter(|key| key.name != "stereo.network")
 }
 
 impl Board {
@@ -304,16 +111,25 @@ impl Board {
         Board::parse(&place, &text, overrides)
     }
 
+    /// Parses the text of a board file, `place` in errors, applies overrides, validates.
     pub fn parse(place: &str, text: &str, overrides: &[String]) -> Result<Board, Fault> {
         // Checked as written first, so that an error names the line of the file.
         let mut board: Board = toml::from_str(text).map_err(|e| in_file(place, text, &e))?;
-        if !overrides.is_empty() {
-            let mut table: toml::Table = toml::from_str(text).map_err(|e| in_file(place, text, &e))?;
-            for assignment in overrides {
-                set(&mut table, assignment)?;
-                // After each, so that the one that is wrong is the one that is named.
-                board = Board::deserialize(table.clone()).map_err(|e| in_override(assignment, e.message()))?;
+        let mut table: toml::Table = toml::from_str(text).map_err(|e| in_file(place, text, &e))?;
+        let mut constants = vec![];
+        for assignment in overrides {
+            let (key, value) = parse_assignment(assignment)?;
+            if board.tune(key, &value) {
+                constants.push((key, value));
+                continue;
             }
+            set(&mut table, assignment, key, value)?;
+            // After each, so that the one that is wrong is the one that is named.
+            board = Board::deserialize(table.clone()).map_err(|e| in_override(assignment, e.message()))?;
+        }
+        // Deserializing anew has put them back.
+        for (key, value) in &constants {
+            board.tune(key, value);
         }
         board.validate().map_err(|(key, what)| {
             let set_by = overrides.iter().rev().find(|o| o.split('=').next().is_some_and(|k| k.trim() == key));
@@ -324,39 +140,46 @@ impl Board {
             };
             Fault::new(FaultKind::Config, at, what, format!("change {key}"))
         })?;
+        board.vio.gyro_max = board.imu.gyro_range_dps.to_radians();
+        board.vio.accel_max = board.imu.accel_range_g * G;
         Ok(board)
     }
 
-    /// The first key that is out of bounds, and what is wrong with it.
-    fn validate(&self) -> Result<(), (&'static str, String)> {
+    /// Sets a constant of the method, for instruments; false where the key is none.
+    #[cfg(feature = "instruments")]
+    fn tune(&mut self, key: &str, value: &toml::Value) -> bool {
+        match key.split_once('.') {
+            Some(("frontend", name)) => self.frontend.tune(name, value),
+            Some(("vio", name)) => self.vio.tune(name, value),
+            Some(("stereo", name)) if name.starts_with("network.") => self.stereo.network.tune(&name[8..], value),
+            Some(("stereo", name)) => self.stereo.tune(name, value),
+            Some(("map", name)) => self.map.tune(name, value),
+            Some(("gpu", name)) => self.gpu.tune(name, value),
+            _ => false,
+        }
+    }
+
+    #[cfg(not(feature = "instruments"))]
+    fn tune(&mut self, _: &str, _: &toml::Value) -> bool {
+        false
+    }
+
+    /// The first key that is out of bounds or contradicts another, and what is wrong with it.
+    fn validate(&self) -> Result<(), Wrong> {
         let table = toml::Table::try_from(self).expect("a board is a table of numbers, strings and booleans");
-        for (key, bound) in BOUNDS {
-            let value = lookup(&table, key).expect("BOUNDS names keys of the board");
+        for Key { name, bound, .. } in keys() {
+            let value = lookup(&table, name).expect("every key is a field of the board");
             let number = value.as_float().or(value.as_integer().map(|i| i as f64)).unwrap_or(f64::NAN);
             if !bound.holds(number) {
-                return Err((key, format!("{key} = {value} must be {bound}")));
+                return Err((name, format!("{name} = {value} must be {bound}")));
             }
         }
-        if let Some(wrong) = self.camera.wrong() {
-            return Err(wrong);
-        }
-        let among: &[(bool, &'static str, &str)] = &[
-            (
-                self.frontend.fast_threshold >= self.frontend.fast_threshold_min,
-                "frontend.fast_threshold",
-                "must not be less than frontend.fast_threshold_min",
-            ),
-            (
-                self.rig.readout_s > 0.0 || !self.rig.rolling_shutter,
-                "rig.rolling_shutter",
-                "needs rig.readout_s: without the time of a readout every image would bend",
-            ),
+        let rules = [
             (
                 self.stereo.network.normalises(),
                 "stereo.network.deviation",
                 "must be three positive numbers, stereo.network.mean three finite ones",
             ),
-            (self.stereo.network.channels != 2, "stereo.network.channels", "must be 1 or 3"),
             (self.stereo.depth_max_m > self.stereo.depth_min_m, "stereo.depth_max_m", "must exceed stereo.depth_min_m"),
             (
                 self.budget.intersections >= self.budget.splats,
@@ -364,13 +187,15 @@ impl Board {
                 "must not be less than budget.splats: a Gaussian in view covers at least one tile",
             ),
         ];
-        self.inject.check()?;
-        if let Some((_, key, rule)) = among.iter().find(|(holds, _, _)| !holds) {
-            return Err((key, format!("{key} {rule}")));
-        }
-        self.gpio.wrong().or_else(|| self.imu.wrong(&self.gpio)).map_or(Ok(()), Err)
+        let broken =
+            rules.into_iter().find(|(holds, _, _)| !holds).map(|(_, key, rule)| (key, format!("{key} {rule}")));
+        let wrong = broken.or_else(|| self.camera.wrong()).or_else(|| self.gpio.wrong());
+        wrong.or_else(|| self.imu.wrong(&self.gpio)).map_or(Ok(()), Err)
     }
 }
+
+/// Standard gravity, m/s².
+const G: f64 = 9.80665;
 
 fn lookup<'a>(table: &'a toml::Table, key: &str) -> Option<&'a toml::Value> {
     match key.split_once('.') {
@@ -417,8 +242,8 @@ fn in_override(assignment: &str, what: &str) -> Fault {
     )
 }
 
-/// Applies one `a.b=value`; the value is TOML, and a bare word is a string.
-fn set(table: &mut toml::Table, assignment: &str) -> Result<(), Fault> {
+/// The key and the value of one `a.b=value`; the value is TOML, and a bare word is a string.
+fn parse_assignment(assignment: &str) -> Result<(&str, toml::Value), Fault> {
     let wrong = |what: &str| Fault::new(FaultKind::Usage, shown(assignment), what, "write --set section.key=value");
     let (key, value) = assignment.split_once('=').ok_or_else(|| wrong("there is no '='"))?;
     let parsed: toml::Table = toml::from_str(&format!("v = {value}"))
@@ -426,8 +251,14 @@ fn set(table: &mut toml::Table, assignment: &str) -> Result<(), Fault> {
         .map_err(|_| wrong("the value is not TOML"))?;
     // A line break could smuggle in a second key.
     let value = parsed.get("v").filter(|_| parsed.len() == 1).ok_or_else(|| wrong("the value is not one value"))?;
+    Ok((key.trim(), value.clone()))
+}
+
+/// Puts the value of an assignment into the table of a board.
+fn set(table: &mut toml::Table, assignment: &str, key: &str, value: toml::Value) -> Result<(), Fault> {
+    let wrong = |what: &str| Fault::new(FaultKind::Usage, shown(assignment), what, "write --set section.key=value");
     let mut at = table;
-    let mut parts: Vec<&str> = key.trim().split('.').collect();
+    let mut parts: Vec<&str> = key.split('.').collect();
     let last = parts.pop().filter(|k| !k.is_empty()).ok_or_else(|| wrong("there is no key before '='"))?;
     for part in parts {
         at = at
@@ -436,48 +267,57 @@ fn set(table: &mut toml::Table, assignment: &str) -> Result<(), Fault> {
             .as_table_mut()
             .ok_or_else(|| wrong(&format!("`{part}` is a value, not a section")))?;
     }
-    at.insert(last.to_string(), value.clone());
+    at.insert(last.to_string(), value);
     Ok(())
 }
 
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used)]
-    use super::bounds::Bound::{PowerOfTwo, Stepped};
     use super::*;
     use std::collections::BTreeSet;
 
     const MINIMAL: &str = "name = \"t\"\nmemory_max_mib = 64\n[budget]\nsplats = 1000\nintersections = 10000\n\
         keyframes = 8\nimage_width_max = 752\nimage_height_max = 480\n";
 
-    /// Dotted names of every number in a table.
-    fn numbers(table: &toml::Table, prefix: &str, into: &mut BTreeSet<String>) {
+    /// Dotted names of every key in a table, and whether it is a number.
+    fn names(table: &toml::Table, prefix: &str, into: &mut BTreeSet<(String, bool)>) {
         for (key, value) in table {
             match value {
-                toml::Value::Table(t) => numbers(t, &format!("{prefix}{key}."), into),
-                v if v.is_integer() || v.is_float() => drop(into.insert(format!("{prefix}{key}"))),
-                _ => {}
+                toml::Value::Table(t) if key != "controls" => names(t, &format!("{prefix}{key}."), into),
+                v => drop(into.insert((format!("{prefix}{key}"), v.is_integer() || v.is_float()))),
             }
         }
     }
 
     #[test]
-    fn every_number_has_a_bound_and_every_bound_a_number() {
+    fn every_key_is_declared_once_and_every_number_has_a_bound() {
         let board = Board::parse("t.toml", MINIMAL, &[]).unwrap();
-        let mut keys = BTreeSet::new();
-        numbers(&toml::Table::try_from(&board).unwrap(), "", &mut keys);
-        let bounded: BTreeSet<String> = BOUNDS.iter().map(|b| b.0.to_string()).collect();
-        assert_eq!(keys, bounded);
+        let mut written = BTreeSet::new();
+        names(&toml::Table::try_from(&board).unwrap(), "", &mut written);
+        let declared: Vec<(String, bool)> =
+            keys().map(|k| (k.name.to_string(), !matches!(k.bound, Bound::Any))).collect();
+        assert_eq!(declared.iter().cloned().collect::<BTreeSet<_>>(), written);
+        assert_eq!(declared.len(), written.len());
     }
 
     #[test]
     fn bounds_say_what_they_are_and_refuse_what_is_not_a_number() {
-        for (_, bound) in BOUNDS {
+        for bound in keys().map(|k| k.bound).filter(|b| !matches!(b, Bound::Any)) {
             assert!(!bound.holds(f64::NAN) && !bound.holds(f64::INFINITY) && !bound.holds(-1.0), "{bound}");
         }
-        assert!(Stepped(5.0, 51.0, 2.0, 1.0).holds(11.0) && !Stepped(5.0, 51.0, 2.0, 1.0).holds(12.0));
-        assert!(PowerOfTwo(1.0, 4.0).holds(2.0) && !PowerOfTwo(1.0, 4.0).holds(3.0));
-        assert_eq!(Stepped(16.0, 512.0, 16.0, 0.0).to_string(), "a multiple of 16, 16 to 512");
+        assert!(Bound::Multiple(16.0, 512.0, 16.0).holds(32.0) && !Bound::Multiple(16.0, 512.0, 16.0).holds(40.0));
+        assert!(Bound::PowerOfTwo(1.0, 4.0).holds(2.0) && !Bound::PowerOfTwo(1.0, 4.0).holds(3.0));
+        assert_eq!(Bound::Multiple(16.0, 512.0, 16.0).to_string(), "a multiple of 16, 16 to 512");
+    }
+
+    #[test]
+    fn constants_are_set_by_name_for_instruments_and_survive_later_overrides() {
+        let set = ["vio.huber_px=2".to_string(), "map.scale=4".to_string()];
+        let board = Board::parse("t.toml", MINIMAL, &set).unwrap();
+        assert_eq!((board.vio.huber_px, board.map.scale), (2.0, 4));
+        let file = format!("{MINIMAL}[vio]\nhuber_px = 2.0\n");
+        assert!(Board::parse("t.toml", &file, &[]).is_err(), "no board file sets a constant of the method");
     }
 
     #[test]

@@ -186,7 +186,7 @@ impl Frontend {
             detectors: (0..n).map(|camera| detector(calibration, &rig, camera, config)).collect(),
             rig,
             iterations: config.iterations as usize,
-            recovered_max_px: config.recovered_max_px as f32,
+            recovered_max_px: config.forward_backward_max_px as f32,
             spacing_px: SPACING * config.grid_px as f32,
             now: Seen::nothing_yet(calibration),
             before: Seen::nothing_yet(calibration),

@@ -38,7 +38,7 @@ pub mod summary;
 pub mod tracking;
 pub mod waker;
 
-use crate::config::Board;
+use crate::config::{Board, InjectConfig};
 use crate::counters::Counters;
 use crate::output::report::Report;
 use crate::output::OutputDir;
@@ -87,11 +87,20 @@ pub struct Options {
     pub duration_s: Option<f64>,
     /// Folder that the samples are recorded to, too.
     pub record: Option<PathBuf>,
+    /// Faults added to the sensors of a recording.
+    pub inject: InjectConfig,
 }
 
 impl Default for Options {
     fn default() -> Options {
-        Options { pace: Pace::Recorded, poses: None, holdout: 0, duration_s: None, record: None }
+        Options {
+            pace: Pace::Recorded,
+            poses: None,
+            holdout: 0,
+            duration_s: None,
+            record: None,
+            inject: InjectConfig::default(),
+        }
     }
 }
 
@@ -183,7 +192,7 @@ pub fn fly(
             };
             let (sensors, recording) =
                 Recording::start(options.record.as_deref(), sensors, calibration, board, &shape())?;
-            let sensors = sensors.with_faults(&board.inject, shape);
+            let sensors = sensors.with_faults(&options.inject, shape);
             let realtime = Realtime {
                 holdout: options.holdout,
                 until_s: options.duration_s,

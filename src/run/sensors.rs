@@ -3,7 +3,7 @@
 
 use super::status::print_err;
 use crate::config::{Board, InjectConfig};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
 use std::sync::Arc;
 use std::thread::JoinHandle;
@@ -52,21 +52,21 @@ pub struct Sensors {
     pub imu: Box<dyn ImuSource>,
 }
 
-/// Opens a recording with what the board says of its rig.
-pub fn open_recording(dataset: &Path, board: &Board) -> Result<Recording, Fault> {
-    let (config, rig) = (&board.replay, &board.rig);
+/// Opens a recording with what the board says of its rig, and another calibration than its own where one is given.
+pub fn open_recording(dataset: &Path, calibration: Option<&Path>, board: &Board) -> Result<Recording, Fault> {
     let options = OpenOptions {
-        pair_tolerance: Span::from_secs(config.pair_tolerance_s),
-        imu_hole: Span::from_secs(config.imu_hole_s),
-        calibration: (!config.calibration.is_empty()).then(|| PathBuf::from(&config.calibration)),
-        readout: (rig.readout_s > 0.0).then(|| Span::from_secs(rig.readout_s)),
+        pair_tolerance: Span::from_secs(board.camera.pair_tolerance_s),
+        calibration: calibration.map(Path::to_path_buf),
+        readout: (board.rig.readout_s > 0.0).then(|| Span::from_secs(board.rig.readout_s)),
+        ..OpenOptions::default()
     };
     Recording::open(dataset, &options)
 }
 
 impl Input {
-    pub fn recording(dataset: &Path, board: &Board) -> Result<Input, Fault> {
-        let r = open_recording(dataset, board)?;
+    /// A recording, with another calibration than its own where one is given.
+    pub fn recording(dataset: &Path, calibration: Option<&Path>, board: &Board) -> Result<Input, Fault> {
+        let r = open_recording(dataset, calibration, board)?;
         let images = Images::Recording(r.reader());
         let place = dataset.display().to_string();
         Ok(Input {
@@ -169,7 +169,7 @@ impl Recorded {
 }
 
 impl Sensors {
-    /// Adds the faults that a board asks for; `shape` makes frames of the rig's shape.
+    /// Adds faults to what the sensors give; `shape` makes frames of the rig's shape.
     pub fn with_faults(self, inject: &InjectConfig, shape: impl Fn() -> Frames) -> Sensors {
         let Sensors { mut frames, mut imu } = self;
         if !inject.camera.is_empty() {

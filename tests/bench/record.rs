@@ -105,7 +105,7 @@ pub fn run(args: &Args) -> Result<(), Fault> {
     let (out, passes) = (OutputDir::create(&args.out)?, args.passes);
     let board = default_board(&["map.enabled=false".to_string()])?;
     let input = match &args.dataset {
-        Some(path) => Input::recording(path, &board)?,
+        Some(path) => Input::recording(path, None, &board)?,
         None => {
             let mut scenario = Scenario::named("demo").expect("the demo's scenario is compiled in");
             (scenario.image_divisor, scenario.duration) = (1, Span::from_secs(FLIGHT_S));

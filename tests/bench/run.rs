@@ -54,7 +54,7 @@ impl Source {
             None => default_board(&set)?,
         };
         let input = match &self.dataset {
-            Some(path) => Input::recording(path, &board)?,
+            Some(path) => Input::recording(path, None, &board)?,
             None => {
                 let mut scenario = Scenario::named("demo").expect("the demo's scenario is compiled in");
                 if job.quick {

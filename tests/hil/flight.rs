@@ -201,11 +201,10 @@ impl Devices {
             pair_tolerance_s = 0.02
             [imu]
             chip = \"mpu-6500\"
-            i2c = \"hil-imu i2c\"
+            device = \"hil-imu i2c\"
             rate_hz = {}.0
-            [gpio.data_ready]
-            chip = \"hil-gpio\"
-            line = \"imu-ready\"
+            [gpio]
+            data_ready = \"hil-gpio:imu-ready\"
             [record]
             # All of them: PNG is slow here, and written when there is time.
             ring_frames = 250
