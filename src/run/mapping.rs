@@ -45,7 +45,7 @@ impl Mapping {
             host::lower_priority(NICE);
             Mapper::open(calibration, board)
         };
-        let mapper = std::thread::scope(|s| s.spawn(build).join().expect("boot faults are values, not panics"))?;
+        let mapper = super::apart("mapping", build)?;
         Ok(Mapping {
             mapper,
             curve: Vec::with_capacity(CURVE_POINTS),

@@ -14,8 +14,8 @@
 //! | or frontend | follows points (`frontend.threads = 2`) | sealed |
 //! | and estimator | estimates, one frame behind at most; offers keyframes | sealed |
 //! | mapping | rectification, depth, training; low priority, as are the CPU device's own threads | sealed; OpenCV and the driver allocate behind it |
-//! | trigger (`sensors`) | starts the cameras' exposures, where a line is wired for it | free |
-//! | led (`status_led`) | shows the state of a run, where a line is wired for it | free |
+//! | trigger | starts the cameras' exposures, where a line is wired for it | free |
+//! | led | shows the state of a run, where a line is wired for it | free |
 //! | writer (the recorder's) | writes what is recorded, if anything is; low priority | free |
 //!
 //! In lockstep the main thread is sensors and mapping too.
@@ -50,7 +50,7 @@ use status::{print_err, Gauges, Status};
 use status_led::StatusLed;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering, Ordering::Relaxed};
-use std::thread::{Builder, Scope, ScopedJoinHandle};
+use std::thread::{Builder, JoinHandle, Scope, ScopedJoinHandle};
 use std::time::{Duration, Instant};
 use stipple_drivers::paced::FRAMES_UNREADABLE;
 use stipple_drivers::replay::read_trajectory;
@@ -369,13 +369,25 @@ pub fn fly_in_real_time(
     }
 }
 
+/// Starts a named thread that ends by itself or is asked to.
+fn start<T: Send + 'static>(name: &str, work: impl FnOnce() -> T + Send + 'static) -> JoinHandle<T> {
+    Builder::new().name(name.into()).spawn(work).expect(FEW_THREADS)
+}
+
+/// Does work on a named thread of its own and waits for it.
+fn apart<T: Send>(name: &str, work: impl FnOnce() -> T + Send) -> T {
+    std::thread::scope(|scope| spawn(scope, name, work).join().expect("boot faults are values, not panics"))
+}
+
+const FEW_THREADS: &str = "the system starts the few threads of a flight";
+
 /// Starts a named thread of a flight.
 fn spawn<'scope, T: Send + 'scope>(
     scope: &'scope Scope<'scope, '_>,
     name: &str,
     work: impl FnOnce() -> T + Send + 'scope,
 ) -> ScopedJoinHandle<'scope, T> {
-    Builder::new().name(name.into()).spawn_scoped(scope, work).expect("the system starts the few threads of a flight")
+    Builder::new().name(name.into()).spawn_scoped(scope, work).expect(FEW_THREADS)
 }
 
 /// Starts the threads of tracking. `give` gets each packet back, in order, on the last of them, and `ended` is dropped at

@@ -280,7 +280,7 @@ impl Pulses {
     fn start(mut trigger: Trigger) -> Pulses {
         let (stop, failed) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicU64::new(0)));
         let (asked, count) = (stop.clone(), failed.clone());
-        let thread = std::thread::spawn(move || {
+        let thread = super::start("trigger", move || {
             while !asked.load(Relaxed) {
                 trigger.wait();
                 count.fetch_add(u64::from(trigger.pulse().is_err()), Relaxed);

@@ -65,7 +65,7 @@ impl StatusLed {
     fn start(mut set: impl FnMut(bool) + Send + 'static) -> StatusLed {
         let (state, stop) = (Arc::new(AtomicU8::new(State::Boot as u8)), Arc::new(AtomicBool::new(false)));
         let (shown, asked, begun) = (state.clone(), stop.clone(), Instant::now());
-        let thread = std::thread::spawn(move || {
+        let thread = super::start("led", move || {
             let mut was = false;
             while !asked.load(Relaxed) {
                 let on = STATES[usize::from(shown.load(Relaxed))].is_on(begun.elapsed());
