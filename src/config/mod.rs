@@ -159,6 +159,20 @@ impl Board {
         }
     }
 
+    /// The value of a key of the board, or of a constant of the method.
+    #[cfg(feature = "instruments")]
+    pub fn value(&self, key: &str) -> Option<toml::Value> {
+        let table = toml::Table::try_from(self).ok()?;
+        lookup(&table, key).cloned().or_else(|| match key.split_once('.')? {
+            ("frontend", name) => self.frontend.constant(name),
+            ("vio", name) => self.vio.constant(name),
+            ("stereo", name) => self.stereo.constant(name).or_else(|| self.stereo.network.constant(name)),
+            ("map", name) => self.map.constant(name),
+            ("gpu", name) => self.gpu.constant(name),
+            _ => None,
+        })
+    }
+
     #[cfg(not(feature = "instruments"))]
     fn tune(&mut self, _: &str, _: &toml::Value) -> bool {
         false

@@ -83,6 +83,15 @@ macro_rules! section {
                     _ => false,
                 }
             }
+
+            /// The value of a constant of the method.
+            #[cfg(feature = "instruments")]
+            pub(super) fn constant(&self, name: &str) -> Option<toml::Value> {
+                match name {
+                    $(stringify!($constant) => toml::Value::try_from(self.$constant.clone()).ok(),)+
+                    _ => None,
+                }
+            }
         })?
         section!(@keys $name, $prefix; $($(#[doc = $doc])+ $key $(, $bound)?;)+);
     };

@@ -28,6 +28,10 @@ impl<'a> Series<'a> {
     pub fn line(name: &'a str, ink: u8, points: Vec<(f64, f64)>) -> Series<'a> {
         Series { name, ink, dots: false, points }
     }
+
+    pub fn dots(name: &'a str, ink: u8, points: Vec<(f64, f64)>) -> Series<'a> {
+        Series { name, ink, dots: true, points }
+    }
 }
 
 #[derive(Clone, Debug, Default)]

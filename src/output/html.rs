@@ -36,25 +36,30 @@ pub struct Evidence<'a> {
 pub fn write_html(out: &mut impl io::Write, report: &Report, evidence: &Evidence) -> io::Result<()> {
     let dataset = report.dataset.as_deref().unwrap_or("run");
     let name = dataset.trim_end_matches('/').rsplit('/').next().unwrap_or(dataset);
-    write!(out, "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\">")?;
-    write!(out, "<meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">")?;
-    write!(out, "<title>{} \u{2013} Stipple</title><style>{STYLE}</style></head><body><main>", escape(name))?;
-    write!(
-        out,
-        "<header><p class=\"over\">Stipple</p><h1>{}</h1><p class=\"what\">{}</p></header>",
-        escape(name),
-        subtitle(report)
-    )?;
+    head(out, &escape(name), &subtitle(report), "")?;
     out.write_all(tables(report).as_bytes())?;
     section(out, "Mapping", &mapping(report))?;
     section(out, "Trajectory", &trajectory(evidence))?;
     section(out, "Tracking time", &tracking_time(evidence.tracking_ms))?;
     pictures(out, evidence.pictures)?;
     out.write_all(events(report, evidence.warnings).as_bytes())?;
+    foot(out)
+}
+
+/// Opens a page: title and the line below it in HTML, and style on top of `STYLE`.
+pub fn head(out: &mut impl io::Write, title: &str, what: &str, style: &str) -> io::Result<()> {
+    write!(out, "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\">")?;
+    write!(out, "<meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">")?;
+    write!(out, "<title>{title} \u{2013} Stipple</title><style>{STYLE}{style}</style></head><body><main>")?;
+    write!(out, "<header><p class=\"over\">Stipple</p><h1>{title}</h1><p class=\"what\">{what}</p></header>")
+}
+
+pub fn foot(out: &mut impl io::Write) -> io::Result<()> {
     writeln!(out, "</main></body></html>")
 }
 
-fn section(out: &mut impl io::Write, title: &str, charts: &[Option<String>]) -> io::Result<()> {
+/// Charts below a title; nothing where no chart has a point.
+pub fn section(out: &mut impl io::Write, title: &str, charts: &[Option<String>]) -> io::Result<()> {
     if charts.iter().all(Option::is_none) {
         return Ok(());
     }
@@ -362,7 +367,7 @@ fn base64(bytes: &[u8]) -> String {
     text
 }
 
-const STYLE: &str = include_str!("report.css");
+pub const STYLE: &str = include_str!("report.css");
 
 #[cfg(test)]
 mod tests {

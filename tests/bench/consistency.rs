@@ -10,10 +10,10 @@
 //! velocity and the error of its motion over the next second.
 
 use crate::flight::{errors, estimate_from_truth, fly, from_rest, Plan, Record};
-use crate::odometry::page;
+use crate::page::{count, millimetres, number, percent, text, Page, Part, Table};
 use crate::stability;
+use crate::table;
 use nalgebra::{Matrix3, Vector3};
-use std::io::{self, Write};
 use std::path::PathBuf;
 use stipple::config::VioConfig;
 use stipple::output::chart::{Chart, Series};
@@ -178,41 +178,50 @@ pub fn by_quality(flights: &[Vec<Record>], ends: &[u8]) -> Vec<Bin> {
     bins
 }
 
-fn write_csv(out: &mut impl Write, told: &Consistency, defaults: &Consistency) -> io::Result<()> {
-    writeln!(out, "t_s,nees_told,nees_defaults,bound_low,bound_high")?;
-    for ((t, a), (_, b)) in told.over_time.iter().zip(&defaults.over_time) {
-        writeln!(out, "{t:.2},{a:.4},{b:.4},{:.4},{:.4}", told.bounds.0, told.bounds.1)?;
-    }
-    Ok(())
+/// What a run says of consistency: an estimator told the world's own noise, and one at the defaults.
+pub fn summary(told: &Consistency, defaults: &Consistency) -> Table {
+    let rows = [("told the world's own noise", told), ("at the defaults", defaults)];
+
+    table!("consistency", "NEES", rows, |r| false, [
+        text("estimator") => r.0,
+        count("flights") => r.1.flights,
+        number("NEES of 15", "", 2) => r.1.mean,
+        number("lower bound", "", 2) => r.1.bounds.0,
+        number("upper bound", "", 2) => r.1.bounds.1,
+        percent("instants within", 0) => r.1.within,
+        number("position of 3", "", 2) => r.1.blocks[0],
+        number("rotation of 3", "", 2) => r.1.blocks[1],
+        number("velocity of 3", "", 2) => r.1.blocks[2],
+        number("gyro bias of 3", "", 2) => r.1.blocks[3],
+        number("accelerometer bias of 3", "", 2) => r.1.blocks[4],
+        count("without covariance") => r.1.undetermined,
+    ])
 }
 
-fn write_bins(out: &mut impl Write, bins: &[Bin]) -> io::Result<()> {
-    writeln!(
-        out,
-        "quality_from,quality_to,frames,velocity_error_mean,velocity_error_p90,drift_1s_mean,drift_1s_p50,drift_1s_p90"
-    )?;
-    for b in bins {
-        write!(out, "{},{},{},{:.6},{:.6},", b.from, b.to, b.frames, b.velocity, b.velocity_p90)?;
-        writeln!(out, "{:.6},{:.6},{:.6}", b.drift, b.drift_p50, b.drift_p90)?;
-    }
-    Ok(())
+fn by_instant(told: &Consistency, defaults: &Consistency) -> Table {
+    let rows = told.over_time.iter().zip(&defaults.over_time);
+    table!("nees", "NEES by instant", rows, |r| false, [
+        number("time", "s", 2) => r.0.0,
+        number("NEES told", "", 4) => r.0.1,
+        number("NEES at the defaults", "", 4) => r.1.1,
+    ])
 }
 
-/// What a run says of consistency, in a line.
-pub fn said(name: &str, c: &Consistency) -> String {
-    let [p, th, v, bg, ba] = c.blocks;
-    format!(
-        "NEES {name}: {:.2} of 15 over {} flights, 95 % bounds {:.2} to {:.2}, {:.0} % of the instants within; of 3 each: position {p:.2}, rotation {th:.2}, velocity {v:.2}, gyro bias {bg:.2}, accelerometer bias {ba:.2}; {} without a covariance",
-        c.mean, c.flights, c.bounds.0, c.bounds.1, 100.0 * c.within, c.undetermined
-    )
+pub fn diagram(bins: &[Bin]) -> Table {
+    table!("reliability", "By quality", bins, |b| false, [
+        count("quality from") => b.from,
+        count("quality to") => b.to,
+        count("frames") => b.frames,
+        number("velocity error", "mm/s", 1) => 1e3 * b.velocity,
+        number("velocity error 90 %", "mm/s", 1) => 1e3 * b.velocity_p90,
+        millimetres("drift over 1 s", 1) => b.drift,
+        millimetres("drift median", 1) => b.drift_p50,
+        millimetres("drift 90 %", 1) => b.drift_p90,
+    ])
 }
 
-fn write_page(out: &mut impl Write, told: &Consistency, defaults: &Consistency, bins: &[Bin]) -> io::Result<()> {
+fn page(told: &Consistency, defaults: &Consistency, bins: &[Bin]) -> Page {
     let frames: usize = bins.iter().map(|b| b.frames).sum();
-    let what = format!("{} seeded flights of 8 s from rest; {frames} frames of flights gone wrong", told.flights);
-    page::head(out, "Odometry: consistency and quality", &what)?;
-    let (a, b) = (said("told the world's own noise", told), said("at the defaults", defaults));
-    write!(out, "<p class=\"note\">{a}.</p><p class=\"note\">{b}: they claim less than they know, on purpose.</p>")?;
     let nees = Chart {
         title: "NEES of 15 errors, mean over the flights",
         x: "time since the start, s",
@@ -225,42 +234,44 @@ fn write_page(out: &mut impl Write, told: &Consistency, defaults: &Consistency, 
         from_zero: true,
         ..Chart::default()
     };
-    page::section(out, "Consistency", &[nees.svg()])?;
     let middle = |b: &Bin| f64::from(b.from + b.to) / 2.0;
     // Errors span four decades: drawn by their logarithm.
     let by = |f: &dyn Fn(&Bin) -> f64| -> Vec<(f64, f64)> {
         bins.iter().map(|b| (middle(b), f(b).max(1e-5).log10())).collect()
     };
-    let dots = |name, ink, points| Series { name, ink, dots: true, points };
     // What the formula of `quality` claims, in full view of enough landmarks.
     let claimed: Vec<(f64, f64)> =
         (1..100).map(|q| (f64::from(q), (0.05 * (100.0 / f64::from(q) - 1.0)).log10())).collect();
-    let chart = |title, y, mean, high| Chart {
-        title,
-        x: "quality",
-        y,
-        series: vec![dots("mean", 1, mean), dots("90 %", 2, high), dots("claimed", 3, claimed.clone())],
-        ..Chart::default()
+    let chart = |title, y, mean, high| {
+        let series = vec![
+            Series::dots("mean", 1, mean),
+            Series::dots("90 %", 2, high),
+            Series::dots("claimed", 3, claimed.clone()),
+        ];
+        Chart { title, x: "quality", y, series, ..Chart::default() }.svg()
     };
     let drift = chart("Error of the motion over the next second", "log10 m", by(&|b| b.drift), by(&|b| b.drift_p90));
     let velocity = chart("Error of the velocity", "log10 m/s", by(&|b| b.velocity), by(&|b| b.velocity_p90));
-    page::section(out, "Quality against actual error", &[drift.svg(), velocity.svg()])?;
-    let head =
-        ["quality", "frames", "velocity error, mm/s: mean", "90 %", "drift over 1 s, mm: mean", "median", "90 %"];
-    let mm = |v: f64| format!("{:.1}", 1e3 * v);
-    let row = |b: &Bin| {
-        let range = format!("{} to {}", b.from, b.to);
-        let errors = [b.velocity, b.velocity_p90, b.drift, b.drift_p50, b.drift_p90].map(mm);
-        (false, [vec![range, b.frames.to_string()], errors.to_vec()].concat())
-    };
-    let rows: Vec<_> = bins.iter().map(row).collect();
-    out.write_all(page::table("By quality", &head, &rows).as_bytes())?;
-    page::foot(out)
+    Page {
+        name: "consistency",
+        title: "Odometry: consistency and quality",
+        what: format!("{} seeded flights of 8 s from rest; {frames} frames of flights gone wrong", told.flights),
+        facts: vec![],
+        parts: vec![
+            Part::Note("At the defaults the estimator claims less than it knows, on purpose.".into()),
+            Part::Charts("Consistency", vec![nees.svg()]),
+            Part::Table(summary(told, defaults)),
+            Part::Charts("Quality against actual error", vec![drift, velocity]),
+            Part::Table(diagram(bins)),
+            Part::Table(by_instant(told, defaults)),
+        ],
+    }
 }
 
 /// Errors beside what the covariance claims, and beside the quality
 #[derive(clap::Args)]
 pub struct Args {
+    /// Folder for the results
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
     /// Seeded flights
@@ -271,24 +282,11 @@ pub struct Args {
 pub fn run(args: &Args) -> Result<(), Fault> {
     let (out, flights) = (OutputDir::create(&args.out)?, args.flights as usize);
     let (told, defaults) = (told_the_truth(flights), at_the_defaults(flights));
-    println!("{}\n{}", said("told the world's own noise", &told), said("at the defaults", &defaults));
     let seeds = (flights as u64).div_ceil(10);
     let bins = reliability(&(1..=seeds).flat_map(stability::flights).collect::<Vec<_>>());
-    for b in &bins {
-        println!(
-            "quality {:3} to {:3}: {:6} frames, velocity error {:8.1} mm/s, drift over 1 s {:8.1} mm (90 %: {:8.1})",
-            b.from,
-            b.to,
-            b.frames,
-            1e3 * b.velocity,
-            1e3 * b.drift,
-            1e3 * b.drift_p90
-        );
-    }
-    out.write("consistency.csv", |w| write_csv(w, &told, &defaults))?;
-    out.write("reliability.csv", |w| write_bins(w, &bins))?;
-    out.write("consistency.html", |w| write_page(w, &told, &defaults, &bins))?;
-    println!("{}", out.file("consistency.html").display());
+    page(&told, &defaults, &bins).write(&out)?;
+    println!("{}\n\n{}", summary(&told, &defaults).text(), diagram(&bins).text());
+    println!("\n{}", out.file("consistency.html").display());
     Ok(())
 }
 
@@ -307,7 +305,7 @@ mod tests {
     #[test]
     fn errors_are_as_large_as_the_covariance_of_an_estimator_told_the_truth() {
         let told = told_the_truth(16);
-        eprintln!("{}", said("told the world's own noise", &told));
+        eprintln!("{told:?}");
         assert_eq!(told.undetermined, 0, "every covariance is symmetric and positive definite");
         assert!((told.bounds.0..=told.bounds.1).contains(&told.mean), "{} is outside {:?}", told.mean, told.bounds);
     }
@@ -315,7 +313,7 @@ mod tests {
     #[test]
     fn defaults_claim_less_than_they_know() {
         let defaults = at_the_defaults(4);
-        eprintln!("{}", said("at the defaults", &defaults));
+        eprintln!("{defaults:?}");
         assert!(defaults.undetermined == 0 && (1.0..defaults.bounds.0).contains(&defaults.mean));
     }
 

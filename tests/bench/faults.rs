@@ -1,10 +1,11 @@
 //! `stipple-bench faults`: a simulated flight in real time through the fault injector and the live path, once for each
-//! fault: which counter saw it, how long odometry took to be itself again, what it cost.
+//! fault: which counter saw it, how long odometry took to be itself again, what it cost. A fault that its counter misses, or
+//! that costs more than a drone can bear, ends the bench with an error.
 
+use crate::missed;
+use crate::page::{count, millimetres, number, text, Page, Part, Table};
 use crate::run::default_board;
-use serde_json::{json, Value};
-use std::fmt::Write as _;
-use std::io::Write as _;
+use crate::table;
 use std::path::PathBuf;
 use std::sync::atomic::AtomicBool;
 use stipple::config::{Board, InjectConfig};
@@ -56,55 +57,93 @@ const DETECTORS: [&str; 22] = [
     "resets",
 ];
 
+/// What a drone that holds its place within 0.1 m needs of odometry whatever fails: no jump beyond that, and odometry back
+/// within a second, in which a velocity that is wrong by 0.1 m/s has carried it as far.
+const JUMP_MAX_M: f64 = 0.1;
+const RECOVERED_MAX_S: f64 = 1.0;
+/// While no camera sees anything the drone cannot hold its place; the jump may be this share of what it flies meanwhile.
+const BLIND_SHARE: f64 = 0.05;
+const SPEED: f64 = 2.0;
+
 struct Case {
     name: &'static str,
     /// Strikes the unit, not the cameras.
     inertial: bool,
     rule: Rule,
-    /// What is written where no counter sees it.
+    /// Counters that must see the fault: one each time it is injected, others at least once. Empty where nothing can.
+    each: &'static str,
+    once: &'static [&'static str],
+    /// Why no counter sees it, where none does.
     unseen: &'static str,
 }
 
+#[rustfmt::skip]
 fn cases() -> Vec<Case> {
     let lasting = |fault, secs: f64| Rule::within(fault, STRIKES_S, STRIKES_S + secs);
-    let camera = |name, rule| Case { name, inertial: false, rule, unseen: "-" };
-    let unit = |name, rule| Case { name, inertial: true, rule, unseen: "-" };
-    let flipped = |name, bits| Case {
-        unseen: "nothing: no sum guards a grey picture",
-        ..camera(name, Rule { bits, ..lasting(Kind::BitFlip, 0.5) })
+    let case = |name: &'static str, rule, each, once| {
+        let inertial = name.starts_with("samples") || name.starts_with("unit");
+        Case { name, inertial, rule, each, once, unseen: "-" }
     };
+    let unseen = |unseen, name, rule| Case { unseen, ..case(name, rule, "", &[]) };
+    let grey = "nothing: no sum guards a grey picture";
     let eye = |rule: Rule, camera| Rule { camera: Some(camera), ..rule };
     let some = |rule: Rule| Rule { probability: 0.2, ..rule };
     let by = |rule: Rule, by_s: f64| Rule { by_s, ..rule };
+    use Kind::*;
     vec![
-        camera("frames: one in five dropped, 2 s", some(lasting(Kind::Drop, 2.0))),
-        camera("frames: 0.1 s late, 0.5 s", by(lasting(Kind::Delay, 0.5), 0.1)),
-        camera("frames: each twice, 0.5 s", lasting(Kind::Duplicate, 0.5)),
-        camera("frames: frozen, 0.5 s", lasting(Kind::Freeze, 0.5)),
-        flipped("frames: a bit flipped in each image, 0.5 s", 1),
-        flipped("frames: 1000 bits flipped in each image, 0.5 s", 1000),
-        camera("frames: black, 0.5 s", lasting(Kind::Blackout, 0.5)),
-        camera("frames: none, 1 s", lasting(Kind::Gap, 1.0)),
-        camera("frames: stamps 60 s ahead, 0.2 s", by(lasting(Kind::StampJump, 0.2), 60.0)),
-        camera("frames: stamps 60 s back, 0.2 s", by(lasting(Kind::StampJump, 0.2), -60.0)),
-        camera("left camera unplugged, 2 s", eye(lasting(Kind::Unplug, 2.0), 0)),
-        camera("right camera unplugged, 2 s", eye(lasting(Kind::Unplug, 2.0), 1)),
-        camera("both unplugged, 0.5 s", lasting(Kind::Unplug, 0.5)),
-        camera("both unplugged, 1 s", lasting(Kind::Unplug, 1.0)),
-        camera("both unplugged, 2 s", lasting(Kind::Unplug, 2.0)),
-        camera("both unplugged, 5 s", lasting(Kind::Unplug, 5.0)),
-        unit("samples: one in five dropped, 2 s", some(lasting(Kind::Drop, 2.0))),
-        Case {
-            unseen: "nothing: they are waited for",
-            ..unit("samples: 0.05 s late, 0.5 s", by(lasting(Kind::Delay, 0.5), 0.05))
-        },
-        unit("samples: each twice, 0.5 s", lasting(Kind::Duplicate, 0.5)),
-        unit("samples: frozen, 0.2 s", lasting(Kind::Freeze, 0.2)),
-        unit("samples: one in five with a bit flipped, 0.5 s", some(lasting(Kind::BitFlip, 0.5))),
-        unit("samples: none, 0.5 s", lasting(Kind::Gap, 0.5)),
-        unit("samples: stamps 60 s ahead, 0.1 s", by(lasting(Kind::StampJump, 0.1), 60.0)),
-        unit("unit unplugged, 1 s", lasting(Kind::Unplug, 1.0)),
+        case("frames: one in five dropped, 2 s", some(lasting(Drop, 2.0)), "frames_missing", &[]),
+        case("frames: 0.1 s late, 0.5 s", by(lasting(Delay, 0.5), 0.1), "", &["frames_overwritten"]),
+        case("frames: each twice, 0.5 s", lasting(Duplicate, 0.5), "frames_not_newer", &[]),
+        case("frames: frozen, 0.5 s", lasting(Freeze, 0.5), "frames_frozen", &[]),
+        unseen(grey, "frames: a bit flipped in each image, 0.5 s", Rule { bits: 1, ..lasting(BitFlip, 0.5) }),
+        unseen(grey, "frames: 1000 bits flipped in each image, 0.5 s", Rule { bits: 1000, ..lasting(BitFlip, 0.5) }),
+        case("frames: black, 0.5 s", lasting(Blackout, 0.5), "frames_blank", &[]),
+        case("frames: none, 1 s", lasting(Gap, 1.0), "frames_missing", &["camera_silent"]),
+        case("frames: stamps 60 s ahead, 0.2 s", by(lasting(StampJump, 0.2), 60.0), "frames_leapt", &[]),
+        case("frames: stamps 60 s back, 0.2 s", by(lasting(StampJump, 0.2), -60.0), "frames_not_newer", &[]),
+        case("left camera unplugged, 2 s", eye(lasting(Unplug, 2.0), 0), "frames_blank", &["eye_lost"]),
+        case("right camera unplugged, 2 s", eye(lasting(Unplug, 2.0), 1), "frames_blank", &["eye_lost"]),
+        case("both unplugged, 0.5 s", lasting(Unplug, 0.5), "", &["camera_lost"]),
+        case("both unplugged, 1 s", lasting(Unplug, 1.0), "", &["camera_lost"]),
+        case("both unplugged, 2 s", lasting(Unplug, 2.0), "", &["camera_lost", "resets"]),
+        case("both unplugged, 5 s", lasting(Unplug, 5.0), "", &["camera_lost", "resets"]),
+        case("samples: one in five dropped, 2 s", some(lasting(Drop, 2.0)), "imu_missing", &[]),
+        unseen("nothing: they are waited for", "samples: 0.05 s late, 0.5 s", by(lasting(Delay, 0.5), 0.05)),
+        case("samples: each twice, 0.5 s", lasting(Duplicate, 0.5), "imu_not_newer", &[]),
+        case("samples: frozen, 0.2 s", lasting(Freeze, 0.2), "imu_frozen", &[]),
+        case("samples: one in five with a bit flipped, 0.5 s", some(lasting(BitFlip, 0.5)), "", &["imu_repaired"]),
+        case("samples: none, 0.5 s", lasting(Gap, 0.5), "imu_missing", &["imu_silent"]),
+        case("samples: stamps 60 s ahead, 0.1 s", by(lasting(StampJump, 0.1), 60.0), "imu_leapt", &[]),
+        case("unit unplugged, 1 s", lasting(Unplug, 1.0), "", &["imu_lost"]),
     ]
+}
+
+impl Case {
+    fn jump_max_m(&self) -> f64 {
+        let dark = matches!(self.rule.fault, Kind::Unplug | Kind::Gap | Kind::Blackout);
+        let blind = dark && !self.inertial && self.rule.camera.is_none();
+        let flown = if blind { SPEED * (self.rule.end_s - STRIKES_S) } else { 0.0 };
+        JUMP_MAX_M.max(BLIND_SHARE * flown)
+    }
+
+    /// What is wrong with a flight, beside one without a fault.
+    fn complaint(&self, o: &Outcome, plain: &Outcome) -> Option<String> {
+        let risen = |name: &str| o.count(name) - plain.count(name).min(o.count(name));
+        let wrong = if o.injected == 0 {
+            "was not injected".into()
+        } else if !self.each.is_empty() && risen(self.each) < o.injected {
+            format!("{} saw {} of {}", self.each, risen(self.each), o.injected)
+        } else if let Some(blind) = self.once.iter().find(|name| risen(name) == 0) {
+            format!("{blind} did not see it")
+        } else if o.recovered_s.is_none_or(|s| s > RECOVERED_MAX_S) {
+            format!("itself again after {:?} s, not within {RECOVERED_MAX_S}", o.recovered_s)
+        } else if o.jump_m.is_none_or(|m| m > self.jump_max_m()) {
+            format!("jumps by {:?} m, not within {}", o.jump_m, self.jump_max_m())
+        } else {
+            return None;
+        };
+        Some(format!("{}: {wrong}", self.name))
+    }
 }
 
 /// The flight, rendered once.
@@ -117,7 +156,8 @@ struct Flight {
 
 /// One flight and what became of it.
 struct Outcome {
-    injected: Vec<(&'static str, u64)>,
+    /// Frames or samples that the fault struck.
+    injected: u64,
     detected: Vec<(&'static str, u64)>,
     /// Frames of the flight without a pose.
     lost: usize,
@@ -129,6 +169,12 @@ struct Outcome {
     after_m: Option<f64>,
     /// Error of the motion from the last pose before the fault to the first after it.
     jump_m: Option<f64>,
+}
+
+impl Outcome {
+    fn count(&self, name: &str) -> u64 {
+        self.detected.iter().find(|(n, _)| *n == name).map_or(0, |(_, v)| *v)
+    }
 }
 
 impl Flight {
@@ -180,9 +226,10 @@ impl Flight {
         let itself = |i: &usize| tail[*i..].iter().take(HEALTHY_FRAMES).all(|(_, h)| well(*h));
         let recovered = (0..tail.len().saturating_sub(HEALTHY_FRAMES)).find(itself);
         let all = [played.counters.list(), played.source.clone(), played.tracker.counters()].concat();
-        let is_injected = |name: &str| name.starts_with("injected_");
+        // Beside the frames without a camera, how often it went.
+        let is_injected = |name: &str| name.starts_with("injected_") && !name.ends_with("_unplugs");
         Outcome {
-            injected: all.iter().filter(|(name, _)| is_injected(name)).copied().collect(),
+            injected: all.iter().filter(|(name, _)| is_injected(name)).map(|(_, n)| n).sum(),
             detected: all.iter().filter(|(name, n)| *n > 0 && DETECTORS.contains(name)).copied().collect(),
             lost: flown - trajectory.len().min(flown),
             recovered_s: recovered.map(|i| (tail[i].0 - ends).secs()),
@@ -204,93 +251,107 @@ fn flight_s(case: &Case) -> f64 {
     FLIGHT_S.max(case.rule.end_s + AFTER_S)
 }
 
-/// Sensors that fail, in real time: which counter sees each fault, and what it costs; three minutes
+/// Sensors that fail, in real time: which counter sees each fault, and what it costs; four minutes
 #[derive(clap::Args)]
 pub struct Args {
+    /// Folder for the results
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
-    /// The unplugged sensors only
+    /// Three faults: a camera, both cameras and the inertial unit unplugged
     #[arg(long)]
     quick: bool,
 }
+
+const QUICK: [&str; 3] = ["right camera unplugged, 2 s", "both unplugged, 0.5 s", "unit unplugged, 1 s"];
 
 pub fn run(args: &Args) -> Result<(), Fault> {
     let out = OutputDir::create(&args.out)?;
     let board = default_board(&["map.enabled=false".to_string()])?;
     let flight = Flight::render(board)?;
     memory::check_fits("the simulated flight", flight.sim.calibration(), &flight.board, false)?;
-    let plain = flight.fly(None)?;
-    let mut rows = Vec::new();
-    let mut cases = cases();
-    if args.quick {
-        cases.retain(|c| c.rule.fault == Kind::Unplug && c.rule.end_s < STRIKES_S + 2.0);
-    }
+    let cases: Vec<Case> = cases().into_iter().filter(|c| !args.quick || QUICK.contains(&c.name)).collect();
+    let mut flights = vec![(None, flight.fly(None)?)];
     for case in &cases {
-        let outcome = flight.fly(Some(case))?;
         eprintln!("{}", case.name);
-        rows.push((case, outcome));
+        flights.push((Some(case), flight.fly(Some(case))?));
     }
-    let table = table(&plain, &rows);
-    println!("{table}");
-    out.write("faults.md", |w| writeln!(w, "{table}"))?;
-    let list: Vec<Value> = rows.iter().map(|(case, o)| json_row(case.name, o)).collect();
-    let whole = json!({ "without": json_row("none", &plain), "faults": list });
-    out.write("faults.json", |w| {
-        serde_json::to_writer_pretty(&mut *w, &whole)?;
-        writeln!(w)
-    })
+    let complaint = |(case, o): &(Option<&Case>, Outcome)| case.and_then(|case| case.complaint(o, &flights[0].1));
+    let complaints: Vec<String> = flights.iter().filter_map(complaint).collect();
+    let title = "Faults of sensors";
+    let what = format!("a simulated flight of {FLIGHT_S} s in real time through the fault injector, a row a fault");
+    let parts = vec![Part::Note(NOTE.into()), Part::Table(table(&flights))];
+    Page { name: "faults", title, what, facts: vec![], parts }.finish(&out)?;
+    missed("faults", &complaints)
 }
 
-fn json_row(name: &str, o: &Outcome) -> Value {
-    let counted = |list: &[(&'static str, u64)]| {
-        list.iter().map(|(n, v)| (n.to_string(), json!(v))).collect::<serde_json::Map<_, _>>()
-    };
-    json!({
-        "fault": name,
-        "injected": counted(&o.injected),
-        "detected": counted(&o.detected),
-        "frames_lost": o.lost,
-        "recovered_s": o.recovered_s,
-        "health": o.health.reasons().collect::<Vec<_>>(),
-        "ate_m": o.ate_m,
-        "ate_after_m": o.after_m,
-        "jump_m": o.jump_m,
-    })
+const NOTE: &str = "Seen by: counters that rose above those of the flight without a fault. Itself again: from the end of the fault until five frames in order say nothing but what is normal, a second at most. Jump: error of the motion across the fault. Bold: not as it has to be.";
+
+/// The first flight is the one without a fault.
+fn table(flights: &[(Option<&Case>, Outcome)]) -> Table {
+    let plain = &flights[0].1;
+    let missed = |r: &(Option<&Case>, Outcome)| r.0.is_some_and(|case| case.complaint(&r.1, plain).is_some());
+    table!("faults", "Faults", flights, |r| missed(r), [
+        text("fault") => r.0.map_or("none", |c| c.name),
+        count("injected") => r.1.injected,
+        text("seen by") => seen_by(r.0, &r.1, plain),
+        count("frames lost") => r.0.map_or(r.1.lost, |_| r.1.lost.saturating_sub(plain.lost)),
+        number("itself again after", "s", 2) => r.1.recovered_s,
+        text("said") => Health(r.1.health.0 & !Health::NORMAL.0).reasons().collect::<Vec<_>>().join(", "),
+        millimetres("ATE", 1) => r.1.ate_m,
+        millimetres("ATE after it", 1) => r.1.after_m,
+        millimetres("jump", 1) => r.1.jump_m,
+        millimetres("jump at most", 0) => r.0.map(Case::jump_max_m),
+    ])
 }
 
-/// What a fault raised above what the flight without one counts.
-fn table(plain: &Outcome, rows: &[(&Case, Outcome)]) -> String {
-    let mm = |v: Option<f64>| v.map_or("-".into(), |v| format!("{:.1}", 1e3 * v));
-    let before = |name: &str| plain.detected.iter().find(|(n, _)| *n == name).map_or(0, |(_, v)| *v);
-    let listed = |list: Vec<String>, none: &str| if list.is_empty() { none.into() } else { list.join(", ") };
-    let mut text =
-        "| fault | injected | seen by | frames lost | itself again after s | said | ATE mm | after it mm | jump mm |\n\
-                    |---|---|---|---|---|---|---|---|---|\n"
-            .to_string();
-    let _ = writeln!(
-        text,
-        "| none | - | - | {} | - | - | {} | {} | {} |",
-        plain.lost,
-        mm(plain.ate_m),
-        mm(plain.after_m),
-        mm(plain.jump_m)
-    );
-    for (case, o) in rows {
-        let seen = o.detected.iter().filter(|(n, v)| *v > before(n)).map(|(n, v)| format!("{n} {}", v - before(n)));
-        let said = Health(o.health.0 & !Health::NORMAL.0);
-        let _ = writeln!(
-            text,
-            "| {} | {} | {} | {} | {} | {} | {} | {} | {} |",
-            case.name,
-            listed(o.injected.iter().map(|(_, v)| v.to_string()).collect(), "-"),
-            listed(seen.collect(), case.unseen),
-            o.lost.saturating_sub(plain.lost),
-            o.recovered_s.map_or("never".into(), |s| format!("{s:.2}")),
-            listed(said.reasons().map(str::to_string).collect(), "-"),
-            mm(o.ate_m),
-            mm(o.after_m),
-            mm(o.jump_m),
-        );
+/// Counters that rose above those of the flight without a fault.
+fn seen_by(case: Option<&Case>, o: &Outcome, plain: &Outcome) -> String {
+    let risen = o.detected.iter().map(|(n, v)| (n, v - plain.count(n).min(*v))).filter(|(_, v)| *v > 0);
+    match risen.map(|(n, v)| format!("{n} {v}")).collect::<Vec<_>>() {
+        none if none.is_empty() => case.map_or("-", |c| c.unseen).to_string(),
+        seen => seen.join(", "),
     }
-    text.trim_end().to_string()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn outcome(detected: Vec<(&'static str, u64)>) -> Outcome {
+        Outcome {
+            injected: 3,
+            detected,
+            lost: 0,
+            recovered_s: Some(0.1),
+            health: Health::default(),
+            ate_m: None,
+            after_m: None,
+            jump_m: Some(0.05),
+        }
+    }
+
+    #[test]
+    fn a_fault_that_is_not_seen_or_costs_too_much_is_complained_of() {
+        let case = &cases()[0];
+        let plain = outcome(vec![("frames_missing", 2)]);
+        let said = |o: &Outcome| case.complaint(o, &plain).unwrap_or_default();
+        assert_eq!(said(&outcome(vec![("frames_missing", 5)])), "");
+        assert!(said(&outcome(vec![("frames_missing", 4)])).contains("saw 2 of 3"));
+        assert!(said(&outcome(vec![])).contains("saw 0 of 3"));
+        assert!(said(&Outcome { recovered_s: None, ..outcome(vec![("frames_missing", 5)]) }).contains("itself again"));
+        assert!(said(&Outcome { jump_m: Some(0.11), ..outcome(vec![("frames_missing", 5)]) }).contains("jumps"));
+        assert!(said(&Outcome { injected: 0, ..outcome(vec![]) }).contains("not injected"));
+    }
+
+    #[test]
+    fn every_fault_is_expected_somewhere_and_counted_by_a_counter_that_is_looked_at() {
+        for case in cases() {
+            let looked_at = |name: &&str| name.is_empty() || DETECTORS.contains(name);
+            assert!(looked_at(&case.each) && case.once.iter().all(looked_at), "{}", case.name);
+            assert_eq!(case.each.is_empty() && case.once.is_empty(), case.unseen != "-", "{}", case.name);
+        }
+        assert!(QUICK.iter().all(|name| cases().iter().any(|c| c.name == *name)));
+        let blind = |name: &str| cases().iter().find(|c| c.name == name).map(Case::jump_max_m);
+        assert_eq!((blind("both unplugged, 5 s"), blind("left camera unplugged, 2 s")), (Some(0.5), Some(0.1)));
+    }
 }

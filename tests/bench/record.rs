@@ -1,10 +1,9 @@
 //! `stipple-bench record`: what recording takes from odometry. One flight in real time, from memory, with a recorder and
 //! without in turns, in one process, so that the machine is the same for both.
 
+use crate::page::{count, number, text, Page, Part, Table};
 use crate::run::default_board;
-use serde_json::{json, Value};
-use std::fmt::Write as _;
-use std::io::Write as _;
+use crate::table;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 use stipple::config::Board;
@@ -94,6 +93,7 @@ impl Flight {
 pub struct Args {
     /// As for replay; without it a simulated flight at 752x480
     dataset: Option<PathBuf>,
+    /// Folder for the results
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
     /// Of each kind
@@ -123,72 +123,56 @@ pub fn run(args: &Args) -> Result<(), Fault> {
         // It was measured, not wanted.
         let _ = std::fs::remove_dir_all(&dir);
     }
-    let table = table(&flight, &board, &list);
-    println!("{table}");
-    out.write("record.md", |w| writeln!(w, "{table}"))?;
-    let rows: Vec<Value> = list.iter().map(json_row).collect();
-    out.write("record.json", |w| {
-        serde_json::to_writer_pretty(&mut *w, &rows)?;
-        writeln!(w)
-    })
-}
-
-fn json_row(p: &Pass) -> Value {
-    let recorded: serde_json::Map<_, _> = p.recorded.iter().map(|(n, v)| (n.to_string(), json!(v))).collect();
-    json!({
-        "records": p.records,
-        "frames_tracked": p.tracked,
-        "frames_overwritten": p.overwritten,
-        "ms_p50": p.ms_p50,
-        "ms_p99": p.ms_p99,
-        "recorded": recorded,
-    })
-}
-
-fn table(flight: &Flight, board: &Board, list: &[Pass]) -> String {
     let c = &flight.calibration.cameras[0].camera;
     let (n, s) = (flight.frames.len(), flight.length_s());
-    let mut text = format!(
-        "{}: {} cameras of {}x{} at {:.1} Hz, {:.0} inertial samples a second, ring of {} frames\n\n\
-         | recording | tracked | overwritten | a frame, median; 99 % ms | written | dropped | ring at most | writer, ms of CPU a frame |\n\
-         |---|---|---|---|---|---|---|---|\n",
-        flight.name,
-        flight.calibration.cameras.len(),
-        c.width,
-        c.height,
-        (n.max(2) - 1) as f64 / s,
-        flight.imu.len() as f64 / s,
-        board.record.ring_frames,
-    );
-    for p in list {
-        let count = |name: &str| p.recorded.iter().find(|(n, _)| *n == name).map(|(_, v)| *v);
-        let or_dash = |v: Option<u64>| v.map_or("-".into(), |v| v.to_string());
-        let written = count("record_frames_written");
-        let cpu = count("record_cpu_us").zip(written).map(|(us, n)| us as f64 * 1e-3 / n.max(1) as f64);
-        let _ = writeln!(
-            text,
-            "| {} | {} | {} | {:.2}; {:.2} | {} | {} | {} | {} |",
-            if p.records { "on" } else { "off" },
-            p.tracked,
-            p.overwritten,
-            p.ms_p50,
-            p.ms_p99,
-            or_dash(written),
-            or_dash(count("record_frames_dropped")),
-            or_dash(count("record_ring_most")),
-            cpu.map_or("-".into(), |ms| format!("{ms:.1}")),
-        );
+    let page = Page {
+        name: "record",
+        title: "Recording beside odometry",
+        what: format!(
+            "{}: {} cameras of {}x{} at {:.1} Hz, {:.0} inertial samples a second, ring of {} frames",
+            flight.name,
+            flight.calibration.cameras.len(),
+            c.width,
+            c.height,
+            (n.max(2) - 1) as f64 / s,
+            flight.imu.len() as f64 / s,
+            board.record.ring_frames,
+        ),
+        facts: vec![],
+        parts: vec![Part::Note(ratio(&list)), Part::Table(table(&list))],
+    };
+    println!("{}\n\n{}\n", page.what, ratio(&list));
+    page.finish(&out)
+}
+
+fn table(list: &[Pass]) -> Table {
+    fn recorded(p: &Pass, name: &str) -> Option<u64> {
+        p.recorded.iter().find(|(n, _)| *n == name).map(|(_, v)| *v)
     }
+    let written = |p: &Pass| recorded(p, "record_frames_written");
+    let cpu = |p: &Pass| recorded(p, "record_cpu_us").zip(written(p)).map(|(us, n)| us as f64 * 1e-3 / n.max(1) as f64);
+    table!("record", "Passes", list, |p| false, [
+        text("recording") => if p.records { "on" } else { "off" },
+        count("tracked") => p.tracked,
+        count("overwritten") => p.overwritten,
+        number("a frame", "ms", 2) => p.ms_p50,
+        number("a frame 99 %", "ms", 2) => p.ms_p99,
+        count("written") => written(p),
+        count("dropped") => recorded(p, "record_frames_dropped"),
+        count("ring at most") => recorded(p, "record_ring_most"),
+        number("writer CPU a frame", "ms", 1) => cpu(p),
+    ])
+}
+
+fn ratio(list: &[Pass]) -> String {
     let median = |records: bool, of: fn(&Pass) -> f64| {
         let values: Vec<f64> = list.iter().filter(|p| p.records == records).map(of).collect();
         percentile(&values, 0.5).unwrap_or(f64::NAN)
     };
     let ratio = |of: fn(&Pass) -> f64| median(true, of) / median(false, of);
-    let _ = write!(
-        text,
-        "\nodometry's time a frame with recording over that without, medians of the passes: {:.2} (median), {:.2} (99 %)",
+    format!(
+        "odometry's time a frame with recording over that without, medians of the passes: {:.2} (median), {:.2} (99 %)",
         ratio(|p| p.ms_p50),
         ratio(|p| p.ms_p99)
-    );
-    text
+    )
 }

@@ -10,6 +10,7 @@ mod inputs;
 mod kernels;
 mod map;
 mod odometry;
+mod page;
 mod record;
 mod run;
 mod stability;
@@ -83,5 +84,16 @@ fn seconds(text: &str) -> Result<f64, String> {
     match text.parse::<f64>() {
         Ok(s) if s.is_finite() && s > 0.0 => Ok(s),
         _ => Err("a positive number of seconds".into()),
+    }
+}
+
+/// Says what is not as it has to be, and ends the bench with it.
+fn missed(bench: &str, complaints: &[String]) -> Result<(), Fault> {
+    complaints.iter().for_each(|c| eprintln!("not as expected: {c}"));
+    match complaints.len() {
+        0 => Ok(()),
+        n => {
+            Err(Fault::new(FaultKind::Internal, bench, format!("{n} cases are not as expected"), "see the lines above"))
+        }
     }
 }

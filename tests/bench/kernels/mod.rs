@@ -3,20 +3,22 @@
 //! Cases are a wavy wall of N Gaussians seen whole, at several N and resolutions, and, given a recording, Gaussians
 //! seeded from its stereo depth. Each case trains twice: with every command timed, for the shares, and untimed, for
 //! steps a second. A kernel's roofline is the longer of its bytes at the device's copy bandwidth and its operations at
-//! its multiply-add peak; both are measured by kernels of ours just before (`model`). Leaves `kernels.csv`,
-//! `kernels.json` and `kernels.html`.
+//! its multiply-add peak; both are measured by kernels of ours just before (`model`).
 
 mod model;
-mod page;
 mod scene;
 
+use crate::page::{count, mebibytes, number, percent, text, Page, Part, Table};
+use crate::table;
 use model::{Counts, Peaks};
 use scene::Scene;
+use serde_json::json;
 use std::path::PathBuf;
 use std::time::Instant;
 use stipple::config::GpuConfig;
 use stipple::gpu::Gpu;
 use stipple::map::pipeline::{LearningRates, Pipeline, Shape, StepStats, Tiling, Weights};
+use stipple::output::chart::{bars, Chart, Series};
 use stipple::output::OutputDir;
 use stipple_drivers::Fault;
 
@@ -40,6 +42,7 @@ const RATES: LearningRates = LearningRates { position: 1e-4, scale: 1e-3, rotati
 /// What a training step costs by kernel, against what the device could do
 #[derive(clap::Args)]
 pub struct Args {
+    /// Folder for the results
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
     /// Substring of the Vulkan device's name
@@ -131,10 +134,8 @@ pub fn run(options: &Args) -> Result<(), Fault> {
     if let Some(scene) = &recorded {
         bench.single.push(run(scene)?);
     }
-    out.write("kernels.csv", |w| page::csv(w, &bench))?;
-    out.write("kernels.json", |w| page::json(w, &bench))?;
-    out.write("kernels.html", |w| page::html(w, &bench))?;
-    println!("{}", out.file("kernels.html").display());
+    page(&bench).write(&out)?;
+    println!("{}\n\n{}", cases_table(&bench).text(), out.file("kernels.html").display());
     Ok(())
 }
 
@@ -247,4 +248,95 @@ impl Case {
     fn steps_per_s(&self) -> f64 {
         1e3 / self.wall_ms
     }
+}
+
+impl Bench {
+    fn cases(&self) -> impl Iterator<Item = &Case> {
+        self.by_count.iter().chain(&self.by_size).chain(&self.single)
+    }
+}
+
+const NOTE: &str = "A kernel's roofline is the longer of its bytes, each buffer once, at the rate of copies and its operations at the rate of multiply-adds; the rasters' operations count every pixel of a tile against every Gaussian listed, though opaque pixels end early. Kernel times hold the wait for the command before.";
+
+fn page(bench: &Bench) -> Page {
+    let ([w, h], tiling, peaks) = (bench.tiling.tile(), &bench.tiling, &bench.peaks);
+    let rates = [("copies, GB/s", peaks.bytes_per_s), ("multiply-adds, GFLOP/s", peaks.flops_per_s)];
+    let measured = rates.map(|(name, rate)| format!("{name}: {:.0}", rate * 1e-9)).join("; ");
+    Page {
+        name: "kernels",
+        title: "Kernels: cost of a training step",
+        what: format!("{}; tiles of {w}x{h} pixels, {} lanes each", bench.device, tiling.lanes),
+        facts: vec![
+            ("device", json!(bench.device)),
+            ("raster", json!({ "lanes": tiling.lanes, "column": tiling.column, "variant": tiling.variant })),
+            ("copy_bytes_per_s", json!(peaks.bytes_per_s)),
+            ("fma_flops_per_s", json!(peaks.flops_per_s)),
+        ],
+        parts: vec![
+            Part::Note(format!("Measured here: {measured}. {NOTE}")),
+            Part::Charts(
+                "How the cost grows",
+                vec![growth(&bench.by_count, "Gaussians"), growth(&bench.by_size, "pixels")],
+            ),
+            Part::Table(cases_table(bench)),
+            Part::Charts("Where the time goes", bench.cases().map(share).collect()),
+            Part::Table(kernels_table(bench)),
+        ],
+    }
+}
+
+fn cases_table(bench: &Bench) -> Table {
+    table!("cases", "Cases", bench.cases(), |c| false, [
+        text("case") => c.name.as_str(),
+        count("Gaussians") => c.counts.splats,
+        count("visible") => c.counts.visible,
+        count("intersections") => c.counts.intersections,
+        count("pixels") => c.counts.pixels,
+        count("list mean") => c.list_mean,
+        count("list longest") => c.list_longest,
+        number("device, every command timed", "ms", 3) => c.timed_ms,
+        number("device", "ms", 3) => c.device_ms,
+        number("wall", "ms", 3) => c.wall_ms,
+        number("host", "ms", 3) => c.host_ms,
+        number("throughput", "steps/s", 1) => c.steps_per_s(),
+        mebibytes("GPU memory") => c.arena_bytes,
+    ])
+}
+
+fn kernels_table(bench: &Bench) -> Table {
+    let rows = bench.cases().flat_map(|c| c.kernels.iter().map(move |k| (c, k)));
+    // None where nothing is counted.
+    let reached = |k: &Cost| (k.roof_ms > 0.0 && k.ms > 0.0).then(|| k.roof_ms / k.ms);
+    table!("kernels", "Kernels", rows, |r| false, [
+        text("case") => r.0.name.as_str(),
+        text("kernel") => r.1.name,
+        count("calls") => r.1.calls,
+        number("time", "ms", 4) => r.1.ms,
+        number("moved", "bytes", 0) => r.1.bytes,
+        count("operations") => r.1.flops,
+        number("roofline", "ms", 4) => r.1.roof_ms,
+        percent("reached", 0) => reached(r.1),
+    ])
+}
+
+fn growth(cases: &[Case], x: &str) -> Option<String> {
+    let along = |c: &Case| if x == "pixels" { c.counts.pixels } else { c.counts.splats };
+    let of = |get: &dyn Fn(&Case) -> f64| cases.iter().map(|c| (along(c), get(c))).collect::<Vec<_>>();
+    let part = |names: &'static [&'static str]| {
+        of(&|c| c.kernels.iter().filter(|k| names.iter().any(|n| k.name.starts_with(n))).map(|k| k.ms).sum())
+    };
+    let series = vec![
+        Series::dots("step, wall", 1, of(&|c| c.wall_ms)),
+        Series::dots("step, device", 2, of(&|c| c.device_ms)),
+        Series::dots("rasters", 3, part(&["raster_"])),
+        Series::dots("sort", 4, part(&["radix_", "scan_"])),
+    ];
+    let title = format!("A training step against {x}");
+    Chart { title: &title, x, y: "ms", series, from_zero: true, ..Chart::default() }.svg()
+}
+
+fn share(case: &Case) -> Option<String> {
+    let total = case.kernels.iter().map(|k| k.ms).sum::<f64>().max(f64::MIN_POSITIVE);
+    let row = |k: &Cost| (k.name.to_string(), k.ms, format!("{:.3} ms, {:.0} %", k.ms, 100.0 * k.ms / total));
+    bars(&case.name, "ms a step", &case.kernels.iter().map(row).collect::<Vec<_>>())
 }

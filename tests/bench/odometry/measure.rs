@@ -1,8 +1,8 @@
 //! One flight with one setting: error against its truth, and the time of each stage.
 
-use super::settings::Setting;
 use crate::inputs::Flight;
 use std::time::Instant;
+use stipple::config::Board;
 use stipple::frontend::{Frontend, Prediction};
 use stipple::output::metrics::{percentile, trajectory_error};
 use stipple::vio::Vio;
@@ -33,8 +33,7 @@ pub struct Figures {
     pub hash: u64,
 }
 
-pub fn measure(flight: &Flight, setting: &Setting) -> Result<Figures, Fault> {
-    let board = &setting.board;
+pub fn measure(flight: &Flight, board: &Board) -> Result<Figures, Fault> {
     let mut frontend = Frontend::new(&flight.calibration, &board.frontend)?;
     let mut vio = Vio::new(&flight.calibration, &board.vio);
     let n = flight.frames.len();

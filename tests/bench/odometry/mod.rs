@@ -1,27 +1,25 @@
-//! `stipple bench`: what the estimator's parameters cost and what they buy (`odometry`), what becomes of it
-//! when something goes wrong (`stability`), whether it is as good as it says (`consistency`), what a map is
-//! worth at equal time (`map`), what a training step costs by kernel (`kernels`), and how good the methods of stereo
-//! are (`stereo`).
+//! `stipple-bench odometry`: error against run time of tracker and estimator.
 //!
-//! `odometry` flies every input with the defaults and with one parameter at a time moved away
-//! from them, frontend and estimator on the calling thread, in lockstep, without a mapper. It
-//! leaves `odometry.csv` (a row an input and setting), `odometry.json`, `odometry.html` and
-//! `odometry.svg` (error against run time). Each input is rendered or read into memory once and dropped before the next.
+//! Every input is flown with the defaults and with one parameter at a time moved away from them, tracker and
+//! estimator on the calling thread, in lockstep, without a mapper. Besides the page with its tables it leaves `odometry.svg` (error
+//! against run time). Each input is rendered or read into memory once and dropped before the next.
 
+mod charts;
 mod measure;
-pub mod page;
 mod settings;
-mod tables;
 
 use crate::inputs::{self, Flight, Input};
+use crate::page::{count, millimetres, number, text, Page, Part, Table};
+use crate::table;
 use measure::{measure, Figures};
-use settings::Setting;
+use serde_json::json;
+use settings::{curves, Setting, DEFAULT};
 use std::path::PathBuf;
 use std::time::Instant;
 use stipple::output::OutputDir;
 use stipple_drivers::Fault;
 
-/// Seconds of each input when not stated, and at most: an input is in memory whole, 14 MB a second.
+/// Length of each input when not stated, and at most, s: an input is in memory whole, 14 MB a second.
 const SECONDS: f64 = 12.0;
 const SECONDS_MAX: f64 = 40.0;
 /// The quick run ends while its flight is still near its start.
@@ -34,6 +32,7 @@ const AS_FAST: f64 = 1.1;
 /// Error against run time of frontend and estimator over flights and settings
 #[derive(clap::Args)]
 pub struct Args {
+    /// Folder for the results
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
     /// Folder of recordings; otherwise $STIPPLE_RECORDINGS, otherwise ../shared/data
@@ -74,28 +73,26 @@ struct Overall {
     cpu_ms_per_frame: f64,
 }
 
-pub struct Sweep {
+struct Sweep {
     inputs: Vec<Flown>,
     settings: Vec<Setting>,
     rows: Vec<Row>,
 }
 
-pub fn run(options: &Args) -> Result<(), Fault> {
-    let out = OutputDir::create(&options.out)?;
-    let (inputs, settings, seconds) = match options.quick {
-        true => (inputs::quick(), settings::quick(), options.seconds.unwrap_or(QUICK_SECONDS)),
+pub fn run(args: &Args) -> Result<(), Fault> {
+    let out = OutputDir::create(&args.out)?;
+    let (inputs, settings, seconds) = match args.quick {
+        true => (inputs::quick(), settings::quick(), args.seconds.unwrap_or(QUICK_SECONDS)),
         false => (
-            inputs::all(options.recordings.as_deref())?,
-            if options.defaults { settings::defaults() } else { settings::all() },
-            options.seconds.unwrap_or(SECONDS).min(SECONDS_MAX),
+            inputs::all(args.recordings.as_deref())?,
+            if args.defaults { settings::default() } else { settings::all() },
+            args.seconds.unwrap_or(SECONDS).min(SECONDS_MAX),
         ),
     };
     let sweep = fly(&inputs, settings, seconds)?;
-    out.write("odometry.csv", |w| tables::csv(w, &sweep))?;
-    out.write("odometry.json", |w| tables::json(w, &sweep))?;
-    out.write("odometry.html", |w| page::write(w, &sweep))?;
-    out.write("odometry.svg", |w| page::picture(w, &sweep))?;
-    println!("{}\n{}", tables::conclusion(&sweep), out.file("odometry.html").display());
+    page(&sweep).write(&out)?;
+    out.write("odometry.svg", |w| charts::picture(w, &sweep))?;
+    println!("{}\n{}", conclusion(&sweep), out.file("odometry.html").display());
     Ok(())
 }
 
@@ -107,7 +104,7 @@ fn fly(inputs: &[Input], settings: Vec<Setting>, seconds: f64) -> Result<Sweep, 
         let frames = flight.frames.len();
         sweep.inputs.push(Flown { name: input.name.clone(), about: input.about.clone(), frames });
         for (s, setting) in sweep.settings.iter().enumerate() {
-            let figures = measure(&flight, setting)?;
+            let figures = measure(&flight, &setting.board)?;
             let ate = figures.ate_m.map_or("none".to_string(), |m| format!("{m:.4} m"));
             eprintln!(
                 "{:6.1} s  {} of {}  {:<30} {:<32} ATE {ate}, {:.2} ms a frame",
@@ -161,6 +158,102 @@ fn knee(points: &[Option<(f64, f64)>]) -> Option<usize> {
     let candidates = points.iter().enumerate().filter_map(|(i, p)| p.filter(near).map(|p| (i, p.0)));
     let (fastest, ms) = candidates.clone().min_by(|a, b| a.1.total_cmp(&b.1))?;
     Some(candidates.take(1).find(|(i, t)| *i == 0 && *t <= AS_FAST * ms).map_or(fastest, |c| c.0))
+}
+
+/// Where the default and the knee are.
+fn conclusion(sweep: &Sweep) -> String {
+    let said = |s: usize| {
+        let figures = sweep.overall(s).map(|o| {
+            format!(
+                "ATE {:.4} m (geometric mean; worst {:.4} m), {:.2} ms of CPU a frame",
+                o.ate_m, o.ate_worst_m, o.cpu_ms_per_frame
+            )
+        });
+        figures.unwrap_or("no trajectory on some input".into())
+    };
+    let default = format!("default: {}", said(0));
+    match knee(&sweep.points()) {
+        Some(0) => format!("{default}. It is the knee: none that is as good (15 %) is faster (10 %)."),
+        Some(s) => format!(
+            "{default}. Knee, the fastest within 15 % of the best error: {}: {}.",
+            sweep.settings[s].name,
+            said(s)
+        ),
+        None => default,
+    }
+}
+
+fn page(sweep: &Sweep) -> Page {
+    let frames: usize = sweep.inputs.iter().map(|i| i.frames).sum();
+    let (inputs, settings) = (sweep.inputs.len(), sweep.settings.len());
+    let points = sweep.points();
+    let along = curves(&sweep.settings).iter().map(|c| charts::parameter(c, &points)).collect();
+    let each = (0..inputs).map(|i| charts::front(&sweep.inputs[i].name, &sweep.points_of(i), sweep)).collect();
+    let about = sweep.inputs.iter().map(|i| format!("{}: {}.", i.name, i.about)).collect::<Vec<_>>().join(" ");
+    let note = format!(
+        "ATE is after rigid alignment. Stages are wall time, so their 99th percentile holds what else the machine did. Errors above {} times the default's are drawn at that height. Run times repeat to a few per cent, and the error of one flight moves by tens of per cent between settings that differ in nothing that matters: read the curves over all inputs first.",
+        charts::CUT
+    );
+    Page {
+        name: "odometry",
+        title: "Odometry: error against run time",
+        what: format!(
+            "{inputs} inputs, {frames} frames, {settings} settings; frontend and estimator on one thread, no mapper"
+        ),
+        facts: vec![("knee", json!(knee(&points).map(|s| &sweep.settings[s].name)))],
+        parts: vec![
+            Part::Note(conclusion(sweep)),
+            Part::Note(note),
+            Part::Charts("All settings, all inputs", vec![charts::front("all inputs", &points, sweep)]),
+            Part::Charts("One parameter at a time, all inputs", along),
+            Part::Charts("All settings on each input", each),
+            Part::Table(overall(sweep)),
+            Part::Table(figures(sweep)),
+            Part::Note(about),
+        ],
+    }
+}
+
+/// Settings over all inputs, fastest first.
+fn overall(sweep: &Sweep) -> Table {
+    let knee = knee(&sweep.points());
+    let mut order: Vec<usize> = (0..sweep.settings.len()).collect();
+    let time = |s: &usize| sweep.overall(*s).map_or(f64::INFINITY, |o| o.cpu_ms_per_frame);
+    order.sort_by(|a, b| time(a).total_cmp(&time(b)));
+    let marks = |s: usize| [(s == 0).then_some(DEFAULT), (knee == Some(s)).then_some("knee")];
+    table!("settings", "All settings over all inputs", order, |s| s == 0, [
+        text("setting") => sweep.settings[s].name.as_str(),
+        text("set") => sweep.settings[s].set.join(" "),
+        millimetres("ATE geometric mean", 3) => sweep.overall(s).map(|o| o.ate_m),
+        millimetres("ATE worst", 3) => sweep.overall(s).map(|o| o.ate_worst_m),
+        number("CPU a frame", "ms", 2) => sweep.overall(s).map(|o| o.cpu_ms_per_frame),
+        text("mark") => marks(s).into_iter().flatten().collect::<Vec<_>>().join(" and "),
+    ])
+}
+
+/// Every input at every setting; the default first.
+fn figures(sweep: &Sweep) -> Table {
+    let mut rows: Vec<&Row> = sweep.rows.iter().collect();
+    rows.sort_by_key(|r| r.setting);
+    table!("odometry", "Each input at each setting", rows, |r| r.setting == 0, [
+        text("input") => sweep.inputs[r.input].name.as_str(),
+        text("setting") => sweep.settings[r.setting].name.as_str(),
+        millimetres("ATE", 3) => r.figures.ate_m,
+        millimetres("RTE 1 s", 3) => r.figures.rte_1s_m,
+        number("RPE", "deg", 3) => r.figures.rpe_deg,
+        number("frontend", "ms", 2) => r.figures.frontend_ms_p50,
+        number("frontend 99 %", "ms", 2) => r.figures.frontend_ms_p99,
+        number("estimator", "ms", 2) => r.figures.estimator_ms_p50,
+        number("estimator 99 %", "ms", 2) => r.figures.estimator_ms_p99,
+        number("CPU a frame", "ms", 3) => r.figures.cpu_ms_per_frame,
+        number("one thread", "frames/s", 1) => r.figures.fps_one_thread,
+        number("iterations a frame", "", 1) => r.figures.iterations_per_frame,
+        count("frames") => sweep.inputs[r.input].frames,
+        count("frames with pose") => r.figures.tracked,
+        count("keyframes") => r.figures.keyframes,
+        count("resets") => r.figures.resets,
+        text("hash") => format!("{:016x}", r.figures.hash),
+    ])
 }
 
 #[cfg(test)]

@@ -1,10 +1,8 @@
 //! The settings a sweep visits: the defaults, one parameter at a time moved away from them, and a
 //! few whole shapes. A setting is a list of `--set` assignments, so any of them can be replayed.
 
+use crate::run::default_board;
 use stipple::config::Board;
-
-/// A board that leaves the estimator at the method's defaults.
-const BOARD: &str = include_str!("../../../board-configs/lavapipe.toml");
 
 /// Parameter and values; the default joins them where it is not among them.
 const PARAMETERS: [(&str, &[f64]); 10] = [
@@ -27,15 +25,14 @@ const SHAPES: [Named; 4] = [
     ("larger", &["frontend.grid_px=40", "frontend.iterations=7", "vio.iterations_max=10"]),
     ("largest", &["frontend.grid_px=30", "frontend.iterations=10", "vio.iterations_max=12"]),
 ];
-pub const SHAPE: &str = "shape";
 /// A name and its assignments.
 type Named = (&'static str, &'static [&'static str]);
-/// Families of named settings, and where the defaults stand in each.
-const FAMILIES: [(&str, &[Named], usize); 1] = [(SHAPE, &SHAPES, 1)];
+/// Where the defaults stand among the shapes.
+const DEFAULT_SHAPE: usize = 1;
 pub const DEFAULT: &str = "default";
 
 pub struct Setting {
-    /// `default`, an assignment, or a family and the name of a member.
+    /// `default`, an assignment, or `shape` and its name.
     pub name: String,
     pub set: Vec<String>,
     pub board: Board,
@@ -50,7 +47,7 @@ pub struct Curve {
 }
 
 fn setting(name: String, set: Vec<String>) -> Setting {
-    let board = Board::parse("board-configs/lavapipe.toml", BOARD, &set).expect("the sweep stays within the bounds");
+    let board = default_board(&set).expect("the sweep stays within the bounds");
     Setting { name, set, board }
 }
 
@@ -67,14 +64,12 @@ pub fn all() -> Vec<Setting> {
         all.extend(values.iter().filter(|v| **v != default).map(|v| assigned(key, *v)));
     }
     let owned = |set: &[&str]| set.iter().map(|s| s.to_string()).collect();
-    for (family, members, _) in FAMILIES {
-        all.extend(members.iter().map(|(name, set)| setting(format!("{family} {name}"), owned(set))));
-    }
+    all.extend(SHAPES.iter().map(|(name, set)| setting(format!("shape {name}"), owned(set))));
     all
 }
 
 /// The default alone.
-pub fn defaults() -> Vec<Setting> {
+pub fn default() -> Vec<Setting> {
     vec![setting(DEFAULT.into(), vec![])]
 }
 
@@ -96,12 +91,10 @@ pub fn curves(settings: &[Setting]) -> Vec<Curve> {
         let found: Vec<(String, usize)> = visited.iter().filter_map(|v| Some((v.to_string(), at(v)?))).collect();
         curves.push(curve(key, found));
     }
-    for (family, members, below_default) in FAMILIES {
-        let found = |name: &str| Some((name.to_string(), find(&format!("{family} {name}"))?));
-        let mut points: Vec<(String, usize)> = members.iter().filter_map(|(name, _)| found(name)).collect();
-        points.insert(points.len().min(below_default), (DEFAULT.into(), 0));
-        curves.push(curve(family, points));
-    }
+    let shape = |(name, _): &Named| Some((name.to_string(), find(&format!("shape {name}"))?));
+    let mut shapes: Vec<(String, usize)> = SHAPES.iter().filter_map(shape).collect();
+    shapes.insert(shapes.len().min(DEFAULT_SHAPE), (DEFAULT.into(), 0));
+    curves.push(curve("shape", shapes));
     curves.retain(|c| c.settings.len() > 1);
     curves
 }
@@ -113,9 +106,7 @@ fn curve(name: &'static str, points: Vec<(String, usize)>) -> Curve {
 
 /// The value a board gives a parameter of the sweep.
 fn value_of(board: &Board, key: &str) -> f64 {
-    let table = toml::Table::try_from(board).expect("a board is a table");
-    let (section, name) = key.split_once('.').expect("keys are section.name");
-    let value = table.get(section).and_then(|s| s.get(name)).expect("the sweep names keys of the board");
+    let value = board.value(key).expect("the sweep names keys of the board and constants of the method");
     value.as_float().or(value.as_integer().map(|i| i as f64)).expect("swept parameters are numbers")
 }
 

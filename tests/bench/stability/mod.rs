@@ -8,11 +8,13 @@
 
 mod cases;
 mod rendered;
-mod tables;
 #[cfg(test)]
 mod tests;
 
 use crate::flight::{record, Plan, Record};
+use crate::missed;
+use crate::page::{count, millimetres, number, text, Page, Part, Table};
+use crate::table;
 use std::path::PathBuf;
 use stipple::output::metrics::trajectory_error;
 use stipple::output::OutputDir;
@@ -232,14 +234,36 @@ pub fn flights(seed: u64) -> Vec<Vec<Record>> {
     cases::all().iter().map(|case| record(&case.plan, seed).0).collect()
 }
 
-/// As a table for a terminal.
-pub fn print(rows: &[Row]) -> String {
-    tables::text(rows)
+const NOTE: &str = "Errors are of the part of the flight before and of the part after the fault, each aligned on its own (ATE), and of the motion across it (jump). Survived: within the stated bounds, without a reset. Detected: wrong, and health or quality say so. Restart: distance of its position from the truth in its own covariance (3 dimensions). Bold: not as expected.";
+
+pub fn table(rows: &[Row]) -> Table {
+    table!("stability", "Cases", rows, |r| r.complaint().is_some(), [
+        text("case") => r.name,
+        text("verdict") => r.verdict.name(),
+        text("expected") => r.expect.name(),
+        millimetres("before", 1) => r.before,
+        millimetres("after", 1) => r.after,
+        millimetres("jump", 1) => r.jump,
+        number("restart", "sigma", 1) => r.restart_sigmas,
+        count("quality") => r.quality,
+        count("lowest quality") => r.quality_lowest,
+        text("said") => r.health.reasons().collect::<Vec<_>>().join(" "),
+    ])
+}
+
+/// What the estimator counted in each case.
+fn counters(rows: &[Row]) -> Table {
+    let names = rows.first().map_or(vec![], |r| r.stats.counters().iter().map(|c| count(c.0)).collect());
+    Table::new("counters", "Counters", rows, &[vec![text("case")], names].concat(), |r| {
+        let counts = r.stats.counters().into_iter().map(|c| c.1.into());
+        (false, std::iter::once(r.name.into()).chain(counts).collect())
+    })
 }
 
 /// What becomes of the estimator when something goes wrong: one row a case
 #[derive(clap::Args)]
 pub struct Args {
+    /// Folder for the results
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
     /// Flights of each case; the worst is shown
@@ -251,11 +275,17 @@ pub fn run(args: &Args) -> Result<(), Fault> {
     let out = OutputDir::create(&args.out)?;
     let seeds: Vec<u64> = (1..=args.seeds).collect();
     let rows = rows(&seeds)?;
-    out.write("stability.csv", |w| tables::csv(w, &rows))?;
-    out.write("stability.json", |w| tables::json(w, &rows))?;
-    out.write("stability.html", |w| tables::html(w, &rows, seeds.len()))?;
-    println!("{}", print(&rows));
-    rows.iter().filter_map(Row::complaint).for_each(|c| println!("not as expected: {c}"));
+    let shown = table(&rows);
+    println!("{}", shown.text());
+    let page = Page {
+        name: "stability",
+        title: "Odometry: stability",
+        what: format!("{} cases; made-up tracks are the worst of {} seeded flights each", rows.len(), seeds.len()),
+        facts: vec![],
+        parts: vec![Part::Note(NOTE.into()), Part::Table(shown), Part::Table(counters(&rows))],
+    };
+    page.write(&out)?;
     println!("{}", out.file("stability.html").display());
-    Ok(())
+    let complaints: Vec<String> = rows.iter().filter_map(Row::complaint).collect();
+    missed("stability", &complaints)
 }

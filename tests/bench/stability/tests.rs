@@ -3,7 +3,7 @@
 //! `cargo test --bin stipple-bench stability -- --nocapture` prints them.
 #![allow(clippy::unwrap_used)]
 
-use super::{cases, print, rows, Verdict};
+use super::{cases, rows, table, Verdict};
 use crate::flight::{record, Plan, Record};
 use crate::world::Noise;
 use glam::{DQuat, DVec3};
@@ -68,7 +68,7 @@ fn clipped_samples_harm_less_when_the_range_is_known() {
 #[test]
 fn flights_gone_wrong_are_survived_or_noticed() {
     let rows = rows(&[1]).unwrap();
-    eprintln!("{}", print(&rows));
+    eprintln!("{}", table(&rows).text());
     let complaints: Vec<String> = rows.iter().filter_map(|r| r.complaint()).collect();
     assert!(complaints.is_empty(), "{complaints:#?}");
 }

@@ -4,8 +4,6 @@
 //! its time counts as mapping.
 
 use crate::run::{Job, Source};
-use serde_json::{json, Value};
-use std::io::{self, Write};
 use stipple::output::report::Report;
 use stipple::output::OutputDir;
 use stipple_drivers::{Fault, FaultKind};
@@ -63,18 +61,4 @@ impl Effect {
             self.method
         )
     }
-}
-
-/// `stereo-map.json`
-pub fn write_json(out: &mut impl Write, maps: &[Effect]) -> io::Result<()> {
-    let row = |e: &Effect| {
-        let r = &e.report;
-        json!({
-            "method": e.method, "dataset": r.dataset, "device": r.device, "scale": r.scale,
-            "psnr_10s_db": e.psnr_at(AT_S[0]), "psnr_30s_db": e.psnr_at(AT_S[1]), "psnr_db": r.psnr_db, "ssim": r.ssim,
-            "psnr_heldout_db": r.psnr_heldout_db, "anchors": r.anchors, "splats": r.splats, "iterations": r.iterations,
-        })
-    };
-    serde_json::to_writer_pretty(&mut *out, &maps.iter().map(row).collect::<Vec<Value>>())?;
-    writeln!(out)
 }

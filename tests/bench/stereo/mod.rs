@@ -2,7 +2,7 @@
 //!
 //! Sets are Middlebury's cones and teddy, simulated flights (also by range of depth), pairs for time alone, and
 //! the hard cases. `score` states the protocol, `flights` what is flown. Given a recording, each method also makes a map of it (`effect`).
-//! Leaves `stereo.json` (a list, a row a set and method), `stereo.html`, `pictures/`, and of maps `stereo-map.json`.
+//! Besides the page it leaves `pictures/`.
 
 mod effect;
 mod flights;
@@ -20,7 +20,6 @@ use crate::run::Source;
 use effect::Effect;
 pub use methods::{Base, Runner, NAMES};
 use score::Score;
-use serde_json::{json, Value};
 use sets::Set;
 use std::path::{Path, PathBuf};
 use stipple::config::Board;
@@ -45,6 +44,7 @@ const QUICK: [&str; 2] = ["hard_occlusion", "hard_black_eye"];
 pub struct Args {
     /// Recording of which each method makes a map, too
     dataset: Option<PathBuf>,
+    /// Folder for the results
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
     /// Folder of recordings; otherwise $STIPPLE_RECORDINGS, otherwise ../shared/data
@@ -102,25 +102,17 @@ pub fn run(options: &Args) -> Result<(), Fault> {
         true => scenes::hard().into_iter().filter(|s| QUICK.contains(&s.name.as_str())).collect(),
         false => all_sets(options.recordings.as_deref())?,
     };
-    let keep = |bench: &Bench| {
-        out.write("stereo.json", |w| {
-            let rows: Vec<Value> = bench.rows.iter().map(Row::json).collect();
-            serde_json::to_writer_pretty(&mut *w, &rows)?;
-            std::io::Write::write_all(w, b"\n")
-        })
-    };
+    // After each method: whoever ends a run of many minutes early keeps what there is.
+    let keep = |bench: &Bench| page::page(bench).write(&out);
     let mut bench = measure(&sets, &Base::of(loaded.as_ref()), &keep)?;
     if dataset.is_some() {
         let source = Source { dataset: dataset.clone(), board: board.clone(), poses: poses.clone(), set: set.clone() };
         bench.maps = effect::map(options.seconds.unwrap_or(MAPPING_S), &out, &source)?;
-        out.write("stereo-map.json", |w| effect::write_json(w, &bench.maps))?;
     }
     out.replace_folder("pictures", |dir| {
         bench.pictures.iter().try_for_each(|(name, p)| atomically(&dir.join(format!("{name}.png")), |w| p.write_png(w)))
     })?;
-    out.write("stereo.html", |w| page::write(w, &bench))?;
-    println!("{}", out.file("stereo.html").display());
-    Ok(())
+    page::page(&bench).finish(&out)
 }
 
 fn all_sets(recordings: Option<&Path>) -> Result<Vec<Set>, Fault> {
@@ -260,21 +252,5 @@ impl Row {
             seen.judged(),
             percent(seen.gross()),
         )
-    }
-
-    fn json(&self) -> Value {
-        let (all, seen) = (&self.score.all, &self.score.visible);
-        json!({
-            "set": self.set, "method": self.method,
-            "bad1": all.bad1(), "bad2": all.bad2(), "mean_px": all.mean_px(), "density": all.density(),
-            "ms": self.ms, "bytes": self.bytes, "device": self.device,
-            "pixels": all.pixels(),
-            "visible": seen.json(),
-            "mean_depth_error_m": seen.mean_m().filter(|_| self.set.starts_with("sim")),
-            "residual_variance": seen.residual_variance(),
-            "within_a_deviation": seen.within_a_deviation(),
-            "judged": seen.judged(),
-            "gross": seen.gross(),
-        })
     }
 }

@@ -11,7 +11,6 @@
 //!   by other means: a loss that is linear beyond a deviation or two, or a gate.
 
 use super::sets::Pair;
-use serde_json::{json, Value};
 use stipple::stereo::Disparity;
 
 /// Errors beyond are wrong matches, px.
@@ -98,11 +97,6 @@ impl Tally {
 
     pub fn gross(&self) -> Option<f64> {
         Tally::share(self.gross, self.known)
-    }
-
-    pub fn json(&self) -> Value {
-        json!({ "bad1": self.bad1(), "bad2": self.bad2(), "mean_px": self.mean_px(), "density": self.density(),
-                "pixels": self.pixels() })
     }
 }
 
