@@ -110,17 +110,17 @@ struct Sweep {
     ablations: Vec<Row>,
 }
 
-pub fn run(options: &Args) -> Result<(), Fault> {
-    let out_dir = OutputDir::create(&options.out)?;
-    let Args { dataset, board, poses, set, .. } = options;
+pub fn run(args: &Args) -> Result<(), Fault> {
+    let out_dir = OutputDir::create(&args.out)?;
+    let Args { dataset, board, poses, set, .. } = args;
     let source = Source { dataset: dataset.clone(), board: board.clone(), poses: poses.clone(), set: set.clone() };
-    let seconds = options.seconds.unwrap_or(if options.quick { QUICK_SECONDS } else { SECONDS });
+    let seconds = args.seconds.unwrap_or(if args.quick { QUICK_SECONDS } else { SECONDS });
     let start = Instant::now();
     let measure = |folder: &str, variant: Variant, cap: u32| -> Result<Row, Fault> {
         let name = format!("{folder}-{}-{cap}", variant.name.replace(' ', "-"));
         let set = assignments(&variant, cap, seconds);
-        let dir = OutputDir::create(&options.out.join("runs").join(name))?;
-        let report = source.play(&Job { set: &set, seconds, quick: options.quick }, &dir)?;
+        let dir = OutputDir::create(&args.out.join("runs").join(name))?;
+        let report = source.play(&Job { set: &set, seconds, quick: args.quick }, &dir)?;
         let db = |v: Option<f64>| v.map_or("-".into(), |v| format!("{v:.2} dB"));
         eprintln!(
             "{:6.1} s  {:<24} cap {cap:>6}: {} Gaussians, {} steps, {} training, {} held out",
@@ -134,14 +134,13 @@ pub fn run(options: &Args) -> Result<(), Fault> {
         Ok(Row { variant, cap, report })
     };
     let mut sweep = Sweep { seconds, caps: vec![], ablations: vec![] };
-    let (caps, ablated): (&[u32], u32) =
-        if options.quick { (&QUICK_CAPS, QUICK_CAPS[1]) } else { (&CAPS, ABLATED_CAP) };
+    let (caps, ablated): (&[u32], u32) = if args.quick { (&QUICK_CAPS, QUICK_CAPS[1]) } else { (&CAPS, ABLATED_CAP) };
     for line in LINES {
         for cap in caps {
             sweep.caps.push(measure("cap", line, *cap)?);
         }
     }
-    let ablations = &ABLATIONS[..if options.quick { 1 } else { ABLATIONS.len() }];
+    let ablations = &ABLATIONS[..if args.quick { 1 } else { ABLATIONS.len() }];
     for ablation in std::iter::once(&LINES[0]).chain(ablations) {
         sweep.ablations.push(measure("ablation", *ablation, ablated)?);
         // After each: whoever ends a run of many minutes early keeps what there is.

@@ -15,7 +15,7 @@ use scene::Scene;
 use serde_json::json;
 use std::path::PathBuf;
 use std::time::Instant;
-use stipple::config::GpuConfig;
+use stipple::config::{GpuConfig, StereoConfig};
 use stipple::gpu::Gpu;
 use stipple::map::pipeline::{LearningRates, Pipeline, Shape, StepStats, Tiling, Weights};
 use stipple::output::chart::{bars, Chart, Series};
@@ -99,26 +99,27 @@ struct Bench {
     single: Vec<Case>,
 }
 
-pub fn run(options: &Args) -> Result<(), Fault> {
-    // First, so that a wrong folder is told before the sweep.
-    let recorded = options.recording.as_deref().map(|folder| Scene::recorded(folder, RECORDED)).transpose()?;
-    let out = OutputDir::create(&options.out)?;
+pub fn run(args: &Args) -> Result<(), Fault> {
     let config = GpuConfig {
-        device: options.device.clone().unwrap_or_default(),
-        subgroups: !options.baseline,
+        device: args.device.clone().unwrap_or_default(),
+        subgroups: !args.baseline,
         ..GpuConfig::default()
     };
-    let mut gpu = Gpu::open(&config, model::arena_bytes(options.quick))?;
-    let peaks = model::measure(&mut gpu, options.quick)?;
+    // First, so that a wrong folder is told before the sweep.
+    let seeded = |folder: &PathBuf| Scene::recorded(folder, RECORDED, &StereoConfig::default(), &config);
+    let recorded = args.recording.as_ref().map(seeded).transpose()?;
+    let out = OutputDir::create(&args.out)?;
+    let mut gpu = Gpu::open(&config, model::arena_bytes(args.quick))?;
+    let peaks = model::measure(&mut gpu, args.quick)?;
     let mut tiling = Tiling::of(gpu.caps());
-    tiling.column = options.column.as_ref().and_then(|n| n.parse().ok()).unwrap_or(tiling.column);
+    tiling.column = args.column.as_ref().and_then(|n| n.parse().ok()).unwrap_or(tiling.column);
     let device = gpu.caps().name.clone();
     drop(gpu);
     eprintln!("{device}: copies {:.1} GB/s, {:.1} GFLOP/s", peaks.bytes_per_s * 1e-9, peaks.flops_per_s * 1e-9);
-    let run = |scene: &Scene| measure(&config, scene, tiling, &peaks, options.quick);
+    let run = |scene: &Scene| measure(&config, scene, tiling, &peaks, args.quick);
     let wall = |n: usize, (w, h): (usize, usize)| run(&Scene::wall(w, h, n));
     let mut bench = Bench { device, tiling, peaks, by_count: vec![], by_size: vec![], single: vec![] };
-    if options.quick {
+    if args.quick {
         bench.by_count.push(wall(2_000, (160, 120))?);
     } else {
         for n in COUNTS {

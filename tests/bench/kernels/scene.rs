@@ -2,7 +2,8 @@
 
 use glam::DVec3;
 use std::path::Path;
-use stipple::config::StereoConfig;
+use stipple::config::{GpuConfig, StereoConfig};
+use stipple::gpu::Gpu;
 use stipple::map::pipeline::{SplatInit, View};
 use stipple::stereo::{DepthMap, Pinhole, Stereo};
 use stipple_drivers::replay::{OpenOptions, Recording};
@@ -66,10 +67,14 @@ impl Scene {
 
     /// `n` Gaussians at the stereo depth of the frame with the densest depth among a few of a recording, evenly over
     /// the pixels that have one, as wide as their share of the image.
-    pub fn recorded(folder: &Path, n: usize) -> Result<Scene, Fault> {
+    pub fn recorded(folder: &Path, n: usize, config: &StereoConfig, device: &GpuConfig) -> Result<Scene, Fault> {
         const TRIED: usize = 8;
         let recording = Recording::open(folder, &OpenOptions::default())?;
-        let mut stereo = Stereo::new(&recording.calibration, &StereoConfig::default(), 1, None)?;
+        let mut gpu = match Stereo::footprint(&recording.calibration, config, 1).gpu_total() {
+            0 => None,
+            bytes => Some(Gpu::open(device, bytes)?),
+        };
+        let mut stereo = Stereo::new(&recording.calibration, config, 1, gpu.as_mut())?;
         let camera = stereo.camera().pinhole;
         let (mut frames, mut reader) = (Frames::for_rig(&recording.calibration), recording.reader());
         let mut depth = DepthMap::new(camera.width, camera.height);
@@ -79,7 +84,7 @@ impl Scene {
             if read.is_err() || frames.images.len() < 2 {
                 continue;
             }
-            let found = stereo.depth(None, &frames.images[0], &frames.images[1], &mut depth)?;
+            let found = stereo.depth(gpu.as_mut(), &frames.images[0], &frames.images[1], &mut depth)?;
             if best.as_ref().is_none_or(|b| found > b.0) {
                 let mut image = Image::new(camera.width, camera.height);
                 stereo.rectify(&frames.images[0], &mut image);
@@ -116,5 +121,26 @@ impl Scene {
             mask: stereo.valid_mask().to_vec(),
             image: image.pixels,
         })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+    use stipple::config::StereoMethod;
+    use stipple_drivers::sim::{write_euroc, Scenario, Sim};
+    use stipple_drivers::Span;
+
+    /// What a build without OpenCV has.
+    #[test]
+    fn a_scene_is_seeded_from_depth_that_the_gpu_matches() {
+        let mut scenario = Scenario::named("demo").unwrap();
+        (scenario.image_divisor, scenario.duration) = (4, Span::from_secs(1.0));
+        let dir = tempfile::tempdir().unwrap();
+        write_euroc(&mut Sim::new(&scenario).unwrap(), dir.path(), |_, _| {}).unwrap();
+        let config = StereoConfig { method: StereoMethod::Sgm, disparities: 32, ..StereoConfig::default() };
+        let scene = Scene::recorded(dir.path(), 2000, &config, &GpuConfig::default()).unwrap();
+        assert_eq!((scene.splats.len(), scene.image.len()), (2000, 188 * 120));
     }
 }

@@ -92,22 +92,22 @@ pub struct Bench {
     pub maps: Vec<Effect>,
 }
 
-pub fn run(options: &Args) -> Result<(), Fault> {
-    let Args { dataset, board, poses, set, .. } = options;
+pub fn run(args: &Args) -> Result<(), Fault> {
+    let Args { dataset, board, poses, set, .. } = args;
     let loaded = board.as_deref().map(|path| Board::load(path, set)).transpose()?;
     // A wrong folder is told now, not after the minutes that come before the maps.
     dataset.as_deref().map(|path| Recording::open(path, &OpenOptions::default())).transpose()?;
-    let out = OutputDir::create(&options.out)?;
-    let sets = match options.quick {
+    let out = OutputDir::create(&args.out)?;
+    let sets = match args.quick {
         true => scenes::hard().into_iter().filter(|s| QUICK.contains(&s.name.as_str())).collect(),
-        false => all_sets(options.recordings.as_deref())?,
+        false => all_sets(args.recordings.as_deref())?,
     };
     // After each method: whoever ends a run of many minutes early keeps what there is.
     let keep = |bench: &Bench| page::page(bench).write(&out);
     let mut bench = measure(&sets, &Base::of(loaded.as_ref()), &keep)?;
     if dataset.is_some() {
         let source = Source { dataset: dataset.clone(), board: board.clone(), poses: poses.clone(), set: set.clone() };
-        bench.maps = effect::map(options.seconds.unwrap_or(MAPPING_S), &out, &source)?;
+        bench.maps = effect::map(args.seconds.unwrap_or(MAPPING_S), &out, &source)?;
     }
     out.replace_folder("pictures", |dir| {
         bench.pictures.iter().try_for_each(|(name, p)| atomically(&dir.join(format!("{name}.png")), |w| p.write_png(w)))
