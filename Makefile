@@ -53,7 +53,7 @@ soak: deps
 
 # Times of each stage of tracker and estimator, and frames a second on one thread and on two; a minute and a half.
 bench-odometry: deps
-	cargo bench --locked --bench odometry
+	cargo run --release --locked --features instruments --bin stipple-bench -- stages --out out/stages
 
 lint:
 	cargo fmt --all --check

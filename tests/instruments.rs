@@ -54,6 +54,19 @@ fn quick_sweep_writes_finite_figures_and_marks_the_default() {
 }
 
 #[test]
+fn quick_stages_time_every_stage_of_tracker_and_estimator() {
+    let dir = tempfile::tempdir().unwrap();
+    bench(&["stages", "--quick"], dir.path());
+    let json = json(&dir.path().join("stages.json"));
+    let rows = json["stages"].as_array().unwrap();
+    let timed = |stage: &str| rows.iter().any(|r| r["stage"] == stage && r["median_us"].as_f64().unwrap() > 0.0);
+    for stage in ["pyramid, one image", "linearisation, all factors summed", "tracker, a frame", "estimator, a frame"] {
+        assert!(timed(stage), "{stage}: {json}");
+    }
+    assert!(rows.len() >= 16, "{json}");
+}
+
+#[test]
 fn quick_map_bench_gives_every_run_the_same_time_and_draws_it() {
     let dir = tempfile::tempdir().unwrap();
     let out = dir.path().join("out");

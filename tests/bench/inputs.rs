@@ -10,7 +10,7 @@ use stipple_drivers::{Calibration, Fault, FaultKind, Frames, ImuSample, Span, Ti
 /// Name, scenario and rig: two cameras, or one, whose window says less and needs more iterations.
 const NAMED: [(&str, &str, Option<&str>); 3] =
     [("demo", "demo", None), ("aggressive", "aggressive", None), ("demo, one camera", "demo", Some("mono"))];
-const RECORDING: &str = "euroc_MH_01_easy_11s";
+pub const RECORDING: &str = "euroc_MH_01_easy_11s";
 /// Recorded flights and where in them to begin, s: at rest, just before taking off.
 const RECORDED: [(&str, f64); 3] = [("MH_04_difficult", 16.0), ("V1_02_medium", 1.0), ("V2_02_medium", 0.0)];
 const RECORDED_FOLDER: &str = "euroc_text";
@@ -123,7 +123,8 @@ pub fn cut(scenario: &mut Scenario, start_s: f64, seconds: f64) {
     }
 }
 
-fn rendered(mut scenario: Scenario, seconds: f64) -> Result<Flight, Fault> {
+/// The first `seconds` of a simulated flight.
+pub fn rendered(mut scenario: Scenario, seconds: f64) -> Result<Flight, Fault> {
     scenario.duration = scenario.duration.min(Span::from_secs(seconds));
     let mut sim = Sim::new(&scenario)?;
     let frames = (0..sim.frame_count()).map(|i| {
@@ -135,7 +136,8 @@ fn rendered(mut scenario: Scenario, seconds: f64) -> Result<Flight, Fault> {
     Ok(Flight { calibration: sim.calibration().clone(), imu: sim.imu().to_vec(), frames, truth: sim.truth() })
 }
 
-fn read(path: &Path, seconds: f64) -> Result<Flight, Fault> {
+/// The first `seconds` of a recording; what cannot be read is left out and said.
+pub fn read(path: &Path, seconds: f64) -> Result<Flight, Fault> {
     let recording = Recording::open(path, &OpenOptions::default())?;
     let mut reader = recording.reader();
     let mut frames = Vec::new();

@@ -14,6 +14,7 @@ mod page;
 mod record;
 mod run;
 mod stability;
+mod stages;
 mod stereo;
 #[allow(dead_code)] // the tests take more of it
 mod world;
@@ -38,6 +39,7 @@ struct Cli {
 #[derive(Subcommand)]
 enum Bench {
     Odometry(odometry::Args),
+    Stages(stages::Args),
     Stability(stability::Args),
     Consistency(consistency::Args),
     Map(map::Args),
@@ -50,6 +52,7 @@ enum Bench {
 fn run(bench: &Bench) -> Result<(), Fault> {
     match bench {
         Bench::Odometry(args) => odometry::run(args),
+        Bench::Stages(args) => stages::run(args),
         Bench::Stability(args) => stability::run(args),
         Bench::Consistency(args) => consistency::run(args),
         Bench::Map(args) => map::run(args),
