@@ -26,6 +26,14 @@ use stipple_drivers::{Fault, TimedPose};
 const QUALITY_LOW: u8 = 20;
 /// An estimate that is wrong is detected when this share of its frames say so.
 const SAID_SHARE: f64 = 0.9;
+/// An estimate can be relied on when this many frames in order warn of nothing, a quarter of a second, and who does follows what
+/// stands for longer than a tenth.
+const CLEAN_FRAMES: usize = 5;
+const FOLLOWED_FRAMES: usize = 3;
+/// An estimate that is further off must say so: a drone that holds its place within 0.1 m would leave it, m.
+const UNANNOUNCED_MAX: f64 = 0.1;
+/// Distance in its covariance that one restart in four hundred exceeds: χ² of three dimensions, 99.73 %.
+const THREE_SIGMA: f64 = 3.76;
 /// Frames into a fault that lasts for which the jump is taken.
 const JUMP_FRAMES: usize = 20;
 
@@ -93,6 +101,8 @@ pub struct Row {
     pub after: Option<f64>,
     /// Error of the motion across the fault, m.
     pub jump: Option<f64>,
+    /// The largest error of the motion that no health bit and no low quality warned of, m; of flights on which something fails.
+    pub unannounced: Option<f64>,
     /// Distance of the restart's position from the truth in its covariance.
     pub restart_sigmas: Option<f64>,
     pub stats: Stats,
@@ -123,6 +133,12 @@ impl Row {
         if !resets.contains(&self.stats.resets) {
             return Some(format!("{name}: {} resets, not {resets:?}", self.stats.resets));
         }
+        if let Some(m) = self.unannounced.filter(|m| *m > UNANNOUNCED_MAX) {
+            return Some(format!("{name}: {m:.3} m off, and says nothing"));
+        }
+        if let Some(sigmas) = self.restart_sigmas.filter(|s| *s > THREE_SIGMA) {
+            return Some(format!("{name}: starts again {sigmas:.1} sigma from the truth"));
+        }
         let detected = self.expect == Verdict::Detected;
         let far = over(self.before, self.limits.before)
             || !detected && (over(self.after, self.limits.after) || over(self.jump, self.limits.jump));
@@ -137,6 +153,7 @@ impl Row {
             before: max(self.before, other.before),
             after: max(self.after, other.after),
             jump: max(self.jump, other.jump),
+            unannounced: max(self.unannounced, other.unannounced),
             restart_sigmas: max(self.restart_sigmas, other.restart_sigmas),
             // Bits that every flight showed.
             health: Health(self.health.0 & other.health.0),
@@ -159,6 +176,32 @@ fn jump(a: &Record, b: &Record) -> Option<f64> {
     let moved = a.estimate?.pose.inverse() * b.estimate?.pose;
     let truly = a.truth.pose.inverse() * b.truth.pose;
     Some((truly.inverse() * moved).p.length())
+}
+
+/// Whether a record says that it is not to be relied on.
+fn warns(r: &Record) -> bool {
+    r.health.0 & !Health::NORMAL.0 != 0 || r.quality <= QUALITY_LOW
+}
+
+/// The largest error of the motion that stands for `FOLLOWED_FRAMES` in an estimate which can be relied on, m: from the last
+/// pose before frame `from`, and after a reset from the first pose after it, since a reset says that nothing before it counts.
+fn unannounced(records: &[Record], from: usize) -> f64 {
+    let mut reference: Option<&Record> = None;
+    let (mut clean, mut errors, mut most) = (0, vec![], 0.0);
+    for r in records {
+        clean = if warns(r) || r.estimate.is_none() { 0 } else { clean + 1 };
+        let since = reference.filter(|since| since.resets == r.resets && r.frame >= from);
+        if since.is_none() {
+            reference = r.estimate.and(Some(r));
+        }
+        match since.and_then(|since| jump(since, r)).filter(|_| clean >= CLEAN_FRAMES) {
+            Some(error) => errors.push(error),
+            None => errors.clear(),
+        }
+        let standing = errors.iter().rev().take(FOLLOWED_FRAMES).copied().fold(f64::INFINITY, f64::min);
+        most = if errors.len() >= FOLLOWED_FRAMES { standing.max(most) } else { most };
+    }
+    most
 }
 
 /// A flight as a row. `None`: the fault is the whole flight.
@@ -192,6 +235,7 @@ fn judge(case: &Case, records: &[Record], vio: &Vio) -> Row {
         before: ate(&before),
         after: ate(&after),
         jump: last.zip(next).filter(|_| fault.is_some()).and_then(|(a, b)| jump(a, b)),
+        unannounced: fault.map(|_| unannounced(records, from)),
         restart_sigmas: restart.and_then(|w| w[1].position_sigmas),
         stats: *vio.stats(),
         health,
@@ -200,9 +244,8 @@ fn judge(case: &Case, records: &[Record], vio: &Vio) -> Row {
     };
     let far = |v: Option<f64>, max: f64| v.is_none_or(|v| v > max);
     let wrong = far(row.after, row.limits.after) || row.jump.is_some_and(|j| j > row.limits.jump);
-    let says = |r: &&&Record| r.health.0 & !Health::NORMAL.0 != 0 || r.quality <= QUALITY_LOW;
     let estimates = || after.iter().filter(|r| r.estimate.is_some());
-    let said = estimates().filter(says).count() as f64 >= SAID_SHARE * estimates().count() as f64;
+    let said = estimates().filter(|r| warns(r)).count() as f64 >= SAID_SHARE * estimates().count() as f64;
     row.verdict = match (row.stats.resets > 0, wrong, said) {
         (true, ..) => Verdict::Reset,
         (_, false, _) => Verdict::Survived,
@@ -234,7 +277,7 @@ pub fn flights(seed: u64) -> Vec<Vec<Record>> {
     cases::all().iter().map(|case| record(&case.plan, seed).0).collect()
 }
 
-const NOTE: &str = "Errors are of the part of the flight before and of the part after the fault, each aligned on its own (ATE), and of the motion across it (jump). Survived: within the stated bounds, without a reset. Detected: wrong, and health or quality say so. Restart: distance of its position from the truth in its own covariance (3 dimensions). Bold: not as expected.";
+const NOTE: &str = "Errors are of the part of the flight before and of the part after the fault, each aligned on its own (ATE), and of the motion across it (jump). Survived: within the stated bounds, without a reset. Detected: wrong, and health or quality say so. Unannounced: the largest error of the motion since before the fault, or since the reset, that stands for more than a tenth of a second while nothing warns of it; 100 mm at most, which a drone that holds its place can bear. Restart: distance of its position from the truth in its own covariance (3 dimensions). Bold: not as expected.";
 
 pub fn table(rows: &[Row]) -> Table {
     table!("stability", "Cases", rows, |r| r.complaint().is_some(), [
@@ -244,6 +287,7 @@ pub fn table(rows: &[Row]) -> Table {
         millimetres("before", 1) => r.before,
         millimetres("after", 1) => r.after,
         millimetres("jump", 1) => r.jump,
+        millimetres("unannounced", 1) => r.unannounced,
         number("restart", "sigma", 1) => r.restart_sigmas,
         count("quality") => r.quality,
         count("lowest quality") => r.quality_lowest,

@@ -3,14 +3,15 @@
 //! `cargo test --bin stipple-bench stability -- --nocapture` prints them.
 #![allow(clippy::unwrap_used)]
 
-use super::{cases, rows, table, Verdict};
+use super::{cases, rows, table, unannounced, Verdict, THREE_SIGMA};
 use crate::flight::{record, Plan, Record};
 use crate::world::Noise;
 use glam::{DQuat, DVec3};
 use stipple::config::VioConfig;
 use stipple::output::metrics::trajectory_error;
+use stipple::vio::health::Health;
 use stipple::vio::Stats;
-use stipple_drivers::{ImuSample, Pose, TimedPose};
+use stipple_drivers::{ImuSample, Nanos, Pose, TimedPose};
 
 struct Run {
     ate: f64,
@@ -88,9 +89,6 @@ fn recovering(seed: u64) -> Vec<(&'static str, Vec<Record>, Stats)> {
     flown
 }
 
-/// Distance in its covariance that one error of three dimensions in four hundred exceeds: χ²₃, 99.73 %.
-const THREE_SIGMA: f64 = 3.76;
-
 /// Whatever ended the estimate: one reset is counted, the restart stands where the covariance says, and so
 /// does every frame after it.
 #[test]
@@ -104,4 +102,23 @@ fn restart_goes_on_from_the_trusted_pose_with_honest_covariance() {
             assert!(sigmas < THREE_SIGMA, "{name}, frame {}: {sigmas:.1} sigma from the truth", r.frame);
         }
     }
+}
+
+/// Half a metre to the side from frame 10 on; `warned` frames of it say so.
+fn shifted(warned: std::ops::Range<usize>) -> f64 {
+    let record = |frame: usize| {
+        let (t, truth) = (Nanos(frame as i64 * 50_000_000), Pose::IDENTITY);
+        let off = Pose { p: DVec3::X * if frame < 10 { 0.0 } else { 0.5 }, ..truth };
+        let health = if warned.contains(&frame) { Health::VISION_DISAGREES } else { Health::default() };
+        let (truth, estimate) = (TimedPose { t, pose: truth }, Some(TimedPose { t, pose: off }));
+        Record { frame, truth, estimate, health, quality: 80, resets: 0, position_sigmas: None, velocity_error: None }
+    };
+    unannounced(&(0..30).map(record).collect::<Vec<_>>(), 10)
+}
+
+#[test]
+fn an_error_counts_unless_it_is_said_within_a_tenth_of_a_second_and_for_as_long_as_it_lasts() {
+    assert_eq!([shifted(0..0), shifted(13..30), shifted(12..30), shifted(10..20)], [0.5, 0.5, 0.0, 0.5]);
+    // Four clean frames between warnings are not enough to rely on it.
+    assert_eq!(shifted(10..26), 0.0);
 }
