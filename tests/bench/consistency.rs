@@ -302,19 +302,27 @@ mod tests {
         }
     }
 
+    /// Errors that are larger than stated in one block must not hide behind smaller ones in another.
     #[test]
     fn errors_are_as_large_as_the_covariance_of_an_estimator_told_the_truth() {
-        let told = told_the_truth(16);
-        eprintln!("{told:?}");
+        let flights = 16;
+        let told = told_the_truth(flights);
+        eprintln!("mean {} in {:?}, blocks {:?}", told.mean, told.bounds, told.blocks);
         assert_eq!(told.undetermined, 0, "every covariance is symmetric and positive definite");
         assert!((told.bounds.0..=told.bounds.1).contains(&told.mean), "{} is outside {:?}", told.mean, told.bounds);
+        // Errors of one flight are alike at all its instants, so that flights are what there is of them.
+        let bound = |z: f64| chi_square(3.0 * flights as f64, z) / flights as f64;
+        assert!(told.blocks.iter().all(|b| (bound(-Z)..=bound(Z)).contains(b)), "{:?}", told.blocks);
     }
 
+    /// Who fuses the estimate gates it by its deviations: none may be smaller than the errors are, and none more than
+    /// four times as large, or what should be refused passes.
     #[test]
     fn defaults_claim_less_than_they_know() {
         let defaults = at_the_defaults(4);
-        eprintln!("{defaults:?}");
+        eprintln!("mean {}, blocks {:?}", defaults.mean, defaults.blocks);
         assert!(defaults.undetermined == 0 && (1.0..defaults.bounds.0).contains(&defaults.mean));
+        assert!(defaults.blocks.iter().all(|b| (3.0 / 16.0..3.0).contains(b)), "{:?}", defaults.blocks);
     }
 
     #[test]
