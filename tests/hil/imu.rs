@@ -14,7 +14,7 @@ use std::time::Duration;
 use stipple_drivers::gpio::{DataReady, Edge, LineName, Output, Trigger};
 use stipple_drivers::host::monotonic;
 use stipple_drivers::imu::edges::{EdgeQueue, Edges};
-use stipple_drivers::imu::{HardwareImu, IioOptions, ImuCounters, ImuOptions, RegisterOptions, Wiring};
+use stipple_drivers::imu::{HardwareImu, IioOptions, ImuOptions, RegisterOptions, Wiring};
 use stipple_drivers::source::{ImuBatch, ImuReading, ImuSource, SourceFault, Wait};
 use stipple_drivers::{Nanos, Span};
 
@@ -120,14 +120,7 @@ fn read(imu: &mut HardwareImu, n: usize, seen: &mut Seen) {
             Err(fault) => panic!("{fault}"),
         }
     }
-    assert!(seen.readings.len() >= wanted, "{} of {wanted}: {:?}", seen.readings.len(), counters(imu));
-}
-
-fn counters(imu: &HardwareImu) -> ImuCounters {
-    match imu {
-        HardwareImu::Register(imu) => imu.seen(),
-        HardwareImu::Iio(imu) => imu.seen(),
-    }
+    assert!(seen.readings.len() >= wanted, "{} of {wanted}: {:?}", seen.readings.len(), imu.counts());
 }
 
 /// The numbers of the samples: every value of each must be right, stamps must grow.
@@ -198,7 +191,7 @@ mod registers {
         let mut imu = registers_on(wiring, true);
         let mut seen = empty();
         read(&mut imu, 400, &mut seen);
-        let (numbers, c) = (numbers(&seen, ACCEL, GYRO), counters(&imu));
+        let (numbers, c) = (numbers(&seen, ACCEL, GYRO), imu.counts());
         let right = stamped(&seen, &feed, &numbers);
         println!("{} samples, {right} stamped by their edge, {c:?}", numbers.len());
         assert_eq!((missing(&numbers), c.imu_fifo_overflows, c.imu_restarts), (0, 0, 0));
@@ -251,7 +244,7 @@ mod registers {
             set(file, 2);
             read(&mut imu, 60, &mut seen);
         }
-        let c = counters(&imu);
+        let c = imu.counts();
         assert_eq!((c.imu_nacks, c.imu_short_transfers, c.imu_bus_errors), (2, 2, 2), "{c:?}");
         assert_eq!((c.imu_restarts, missing(&numbers(&seen, ACCEL, GYRO))), (0, 0), "{c:?}");
     }
@@ -266,7 +259,7 @@ mod registers {
             read(&mut imu, 60, &mut seen);
             set("fail", 3);
             read(&mut imu, 60, &mut seen);
-            let c = counters(&imu);
+            let c = imu.counts();
             assert_eq!((c.imu_nacks + c.imu_bus_errors, c.imu_restarts), (3, 1), "{c:?}");
             set("gone", 1);
             let mut batch = ImuBatch::default();
@@ -276,7 +269,7 @@ mod registers {
             set("gone", 0);
             let back = monotonic();
             read(&mut imu, 60, &mut seen);
-            let c = counters(&imu);
+            let c = imu.counts();
             let first = seen.readings.iter().find(|r| r.sample.t > back).unwrap();
             println!("back after {} ms, {c:?}", (first.sample.t - back).0 / MS);
             assert!(c.imu_gone >= 1 && c.imu_restarts == 2 && c.imu_gaps >= 2, "{c:?}");
@@ -296,7 +289,7 @@ mod registers {
         std::thread::sleep(Duration::from_millis(800));
         let lost: u32 = read_to_string(debug("lost")).unwrap().trim().parse().unwrap();
         read(&mut imu, 100, &mut seen);
-        let (numbers, c) = (numbers(&seen, ACCEL, GYRO), counters(&imu));
+        let (numbers, c) = (numbers(&seen, ACCEL, GYRO), imu.counts());
         println!("{} refused by the FIFO, {} missing, {c:?}", lost - lost_before, missing(&numbers));
         assert!(lost > lost_before && c.imu_fifo_overflows >= 1 && c.imu_restarts == 0, "{c:?}");
         assert!(c.imu_gaps >= 1 && c.imu_samples_missing > 30, "{c:?}");
@@ -351,7 +344,7 @@ mod kernel {
         };
         let scales = ["in_accel_scale", "in_anglvel_scale"].map(number);
         let numbers = numbers(&seen, scales[0], scales[1]);
-        let c = counters(&imu);
+        let c = imu.counts();
         let mut off: Vec<i64> =
             seen.readings.iter().zip(&numbers).map(|(r, i)| (r.sample.t - feed.between(*i).0).0.abs() / 1000).collect();
         off.sort_unstable();
@@ -368,7 +361,7 @@ mod kernel {
         let fault = ImuOptions::Iio(options).open(None).map(|_| ()).unwrap_err();
         assert!(fault.to_string().contains("end what else reads it"), "{fault}");
         read(&mut imu, 100, &mut seen);
-        assert_eq!((missing(&super::numbers(&seen, scales[0], scales[1])), counters(&imu).imu_restarts), (0, 0));
+        assert_eq!((missing(&super::numbers(&seen, scales[0], scales[1])), imu.counts().imu_restarts), (0, 0));
     }
 }
 

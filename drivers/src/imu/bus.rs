@@ -1,8 +1,8 @@
-//! Register access over I2C (`i2c-dev`) and SPI (`spidev`): one ioctl a transfer, every failure a value.
+//! Register access over I2C (`i2c-dev`) and SPI (`spidev`): one ioctl for each transfer, every failure a value.
 //!
-//! A read is one transaction with a repeated start (`I2C_RDWR`) or one full-duplex transfer (`SPI_IOC_MESSAGE`), so
-//! that nobody can speak between address and data. The chips' drivers see the trait alone; it also carries the clock
-//! they run by, so that the tests put a simulated register file with a clock of its own behind it.
+//! A read is one transaction with a repeated start (`I2C_RDWR`) or one full-duplex transfer (`SPI_IOC_MESSAGE`), so that
+//! nobody can speak between address and data. The driver of a die sees the trait alone. The trait carries the clock too,
+//! so that tests put a simulated register file with a clock of its own behind it.
 #![allow(unsafe_code)]
 
 use crate::host::monotonic;
@@ -12,10 +12,26 @@ use std::fs::{File, OpenOptions};
 use std::os::fd::{AsRawFd, RawFd};
 use std::path::{Path, PathBuf};
 
+/// A die behind its bus, and the clock that its driver runs by.
+pub trait Bus: Send {
+    /// Reads consecutive registers, or a FIFO, from `register` on.
+    fn read(&mut self, register: u8, into: &mut [u8]) -> Result<(), BusFault>;
+    /// Writes consecutive registers from `register` on, `WRITE_MAX` bytes at most.
+    fn write(&mut self, register: u8, bytes: &[u8]) -> Result<(), BusFault>;
+    /// Opens the device again after it was gone.
+    fn reopen(&mut self) -> Result<(), BusFault>;
+    fn now(&self) -> Nanos {
+        monotonic()
+    }
+    fn sleep(&mut self, span: Span) {
+        super::pause(span);
+    }
+}
+
 /// Why a transfer failed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum BusFault {
-    /// Nobody answered at the address.
+    /// No device acknowledged the address.
     Nack,
     /// Fewer bytes or messages than asked for.
     Short,
@@ -47,8 +63,8 @@ impl BusFault {
 impl std::fmt::Display for BusFault {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self {
-            BusFault::Nack => write!(f, "nobody answers at its address"),
-            BusFault::Short => write!(f, "a transfer ended short"),
+            BusFault::Nack => write!(f, "no device answers at its address"),
+            BusFault::Short => write!(f, "a transfer ended early"),
             BusFault::Busy => write!(f, "the bus is held by others"),
             BusFault::Io => write!(f, "input/output error on the bus"),
             BusFault::Gone => write!(f, "the bus is not there"),
@@ -57,20 +73,10 @@ impl std::fmt::Display for BusFault {
     }
 }
 
-/// A die behind its bus, and the clock its driver runs by.
-pub trait Bus: Send {
-    fn read(&mut self, register: u8, into: &mut [u8]) -> Result<(), BusFault>;
-    fn write(&mut self, register: u8, bytes: &[u8]) -> Result<(), BusFault>;
-    /// Opens the device again after it was gone.
-    fn reopen(&mut self) -> Result<(), BusFault>;
-    fn now(&self) -> Nanos;
-    fn sleep(&mut self, span: Span);
-}
-
-/// Bytes of the largest transfer: spidev's default `bufsiz`. Every FIFO we burst is smaller.
+/// Bytes of the largest transfer: spidev's default `bufsiz`. Every FIFO that is read in one burst is smaller.
 pub const TRANSFER_MAX: usize = 4096;
 
-/// Data bytes that one write may carry; the largest are chunks of the BMI270's configuration.
+/// Data bytes of the largest write; chunks of the BMI270's configuration are the largest there are.
 pub const WRITE_MAX: usize = 64;
 
 fn open_device(path: &Path) -> Result<File, BusFault> {
@@ -79,7 +85,7 @@ fn open_device(path: &Path) -> Result<File, BusFault> {
 }
 
 /// The boot error of a device that cannot be opened.
-pub(super) fn cannot_open(place: &str, fault: BusFault) -> Fault {
+fn cannot_open(place: &str, fault: BusFault) -> Fault {
     let fix = match fault {
         BusFault::Refused(libc::EACCES | libc::EPERM) => {
             "let the user read and write it (udev rule, or group i2c or spi)"
@@ -115,15 +121,15 @@ struct I2cTransfer {
     count: u32,
 }
 
-// Of <linux/i2c-dev.h> and <linux/i2c.h>.
+// From <linux/i2c-dev.h> and <linux/i2c.h>.
 const I2C_RDWR: libc::c_ulong = 0x0707;
 const I2C_FUNCS: libc::c_ulong = 0x0705;
 const I2C_FUNC_I2C: libc::c_ulong = 1;
 const I2C_M_RD: u16 = 1;
 
-/// One address on an I2C adapter.
+/// A die at one address of an I2C adapter.
 pub struct I2c {
-    /// `/dev/i2c-1`, a link of udev's to it, or the adapter's name.
+    /// `/dev/i2c-1`, a link to it, or the adapter's name.
     place: String,
     address: u16,
     file: File,
@@ -131,6 +137,7 @@ pub struct I2c {
 }
 
 impl I2c {
+    /// Opens the adapter `place` (a path, or its driver's name for it); nothing is sent yet.
     pub fn open(place: &str, address: u16) -> Result<I2c, Fault> {
         I2c::open_in(place, address, ioctl)
     }
@@ -165,7 +172,7 @@ impl I2c {
     }
 }
 
-/// What `I2C_RDWR` answered: the messages that went through.
+/// Whether all that was asked for went through: messages by I2C, bytes by SPI.
 fn completed(done: i32, asked: usize) -> Result<(), BusFault> {
     match done {
         _ if done < 0 => Err(BusFault::last()),
@@ -174,7 +181,8 @@ fn completed(done: i32, asked: usize) -> Result<(), BusFault> {
     }
 }
 
-/// The device file of an adapter: a path, or the name that its driver gives it (numbers change with the order of probing).
+/// The device file of an adapter that is named by its path, or by the name its driver gives it: numbers change with the
+/// order in which drivers are probed.
 fn adapter(place: &str, class: &Path) -> Option<PathBuf> {
     if place.starts_with('/') {
         return Some(place.into());
@@ -209,14 +217,6 @@ impl Bus for I2c {
         self.file = I2c::file(&self.place, self.ioctl)?;
         Ok(())
     }
-
-    fn now(&self) -> Nanos {
-        monotonic()
-    }
-
-    fn sleep(&mut self, span: Span) {
-        super::pause(span);
-    }
 }
 
 /// `struct spi_ioc_transfer` of <linux/spi/spidev.h>.
@@ -238,21 +238,21 @@ struct SpiTransfer {
 
 const _: () = assert!(size_of::<SpiTransfer>() == 32);
 
-// Of <linux/spi/spidev.h>: _IOW('k', 0, 32 bytes), _IOW('k', 1, u8), _IOW('k', 3, u8), _IOW('k', 4, u32).
+// From <linux/spi/spidev.h>: _IOW('k', 0, 32 bytes), _IOW('k', 1, u8), _IOW('k', 3, u8), _IOW('k', 4, u32).
 const SPI_IOC_MESSAGE_1: libc::c_ulong = 0x4020_6b00;
 const SPI_IOC_WR_MODE: libc::c_ulong = 0x4001_6b01;
 const SPI_IOC_WR_BITS: libc::c_ulong = 0x4001_6b03;
 const SPI_IOC_WR_HZ: libc::c_ulong = 0x4004_6b04;
-/// Clock idle high, data taken at its rising edge: every chip of the table takes this mode.
+/// Clock idle high, data taken at its rising edge: a mode that every chip of the table takes.
 const SPI_MODE: u8 = 3;
-/// Bit of the address byte that asks for a read; all chips of the table share it.
+/// Bit of the address byte that makes it a read, on every chip of the table.
 const SPI_READ: u8 = 0x80;
 
-/// One chip select of an SPI controller.
+/// A die at one chip select of an SPI controller.
 pub struct Spi {
     path: PathBuf,
     hz: u32,
-    /// Bytes that the chip sends between address and data of a read.
+    /// Bytes between address and data of a read.
     dummy: usize,
     file: File,
     ioctl: Ioctl,
@@ -261,6 +261,7 @@ pub struct Spi {
 }
 
 impl Spi {
+    /// Opens a spidev node with a clock of `hz`; `dummy` bytes stand between address and data of a read.
     pub fn open(path: &str, hz: u32, dummy: usize) -> Result<Spi, Fault> {
         Spi::open_in(path, hz, dummy, ioctl)
     }
@@ -324,14 +325,6 @@ impl Bus for Spi {
     fn reopen(&mut self) -> Result<(), BusFault> {
         self.file = Spi::file(&self.path, self.hz, self.ioctl)?;
         Ok(())
-    }
-
-    fn now(&self) -> Nanos {
-        monotonic()
-    }
-
-    fn sleep(&mut self, span: Span) {
-        super::pause(span);
     }
 }
 

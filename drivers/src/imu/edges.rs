@@ -1,31 +1,35 @@
 //! Data-ready edges, and which sample each belongs to.
 //!
-//! A unit raises its line once a sample, so in the long run there are as many edges as samples, and they are paired
-//! in order. The exceptions are told by their counts: the last edge may be of a sample that came after the FIFO was
-//! counted (it waits for the next read), and edges are lost when the kernel's queue of 16 overflows, or come late when
-//! the thread that queues them does. Then they are paired by their age, so that no slip outlives a read, and what has
-//! no edge is stamped by the line (`timeline`).
+//! A unit raises its line once for each sample, so in the long run there are as many edges as samples, and they are paired
+//! in order. Two exceptions are told by the counts: the last edge may belong to a sample that came after the FIFO was
+//! counted (it waits for the next read), and edges are lost when the kernel's queue of 16 overflows, or come late when the
+//! thread that queues them does. Then they are paired by their age, so that no slip outlives a read, and a sample without
+//! an edge is stamped by the estimated line (`timeline`).
 
 use crate::types::{Nanos, Span};
 use crate::List;
 
-/// Where edges come from: a GPIO line, or a simulated one.
+/// A source of edges: a GPIO line, or a simulated one.
 pub trait Edges: Send {
     /// Waits until an edge is there, `timeout` at most; false where none came.
     fn wait(&mut self, timeout: Span) -> Result<bool, EdgeFault>;
-    /// Takes the edges that are there; those that do not fit are counted and gone.
+    /// Moves the edges that are there into the queue; those that do not fit are counted and lost.
     fn drain(&mut self, into: &mut EdgeQueue) -> Result<(), EdgeFault>;
+    /// Opens the line again after a fault.
     fn reopen(&mut self) -> Result<(), EdgeFault>;
 }
 
-/// The line cannot be read (errno).
+/// The line cannot be read: the errno.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct EdgeFault(pub i32);
 
-/// More than any FIFO's samples between two reads.
+/// Edges that can wait: more than any FIFO's samples between two reads.
 const EDGES: usize = 256;
 
-/// Stamps of edges that no sample has been found for, oldest first.
+/// An edge further than this from now was not stamped by `CLOCK_MONOTONIC`; kernels before 5.7 do not.
+const FOREIGN: Span = Span(10_000_000_000);
+
+/// Stamps of edges that no sample was found for yet, oldest first.
 #[derive(Clone, Debug, Default)]
 pub struct EdgeQueue {
     stamps: List<Nanos, EDGES>,
@@ -34,9 +38,6 @@ pub struct EdgeQueue {
     /// Edges without a sample, and samples without an edge.
     pub unmatched: u64,
 }
-
-/// An edge further than this from now was not stamped by `CLOCK_MONOTONIC`, as kernels before 5.7 do not.
-const FOREIGN: Span = Span(10_000_000_000);
 
 impl EdgeQueue {
     /// The stamps, oldest first.
@@ -48,6 +49,7 @@ impl EdgeQueue {
         self.stamps.clear();
     }
 
+    /// Appends an edge of instant `t`, or counts it as refused.
     pub fn push(&mut self, t: Nanos, now: Nanos) {
         let foreign = (now - t).0.saturating_abs() > FOREIGN.0;
         let old = self.stamps.last().is_some_and(|last| t <= *last);
@@ -56,14 +58,14 @@ impl EdgeQueue {
         }
     }
 
-    /// Finds the edges of the `n` samples of a read that began at `before`: `of[i]` is that of sample i. Uses up the
-    /// edges, save one that is of the next sample.
+    /// Finds the edges of the `n` samples of a read that began at `before`: `of[i]` becomes that of sample i. All edges are
+    /// used up, but for one that belongs to the next sample.
     pub fn pair(&mut self, n: usize, before: Nanos, period: Span, of: &mut Vec<Option<Nanos>>) {
         of.clear();
         of.resize(n, None);
-        let latest = self.stamps.last().copied();
+        // One edge more than samples, which came about when they were counted or after.
         let late = before - Span(period.0 / 10);
-        let surplus = latest.filter(|t| self.stamps.len() == n + 1 && *t > late);
+        let surplus = self.stamps.last().copied().filter(|t| self.stamps.len() == n + 1 && *t > late);
         let edges = self.stamps.len() - usize::from(surplus.is_some());
         if edges == n {
             of.iter_mut().zip(self.stamps.iter()).for_each(|(of, t)| *of = Some(*t));
@@ -74,12 +76,12 @@ impl EdgeQueue {
         self.stamps.retain(|t| Some(*t) == surplus);
     }
 
-    /// The newest sample was taken less than a period before the read, so the last edge is its own if it is as young;
-    /// an older one is of a sample as many periods before. The others follow from their distance to it.
+    /// The newest sample was taken less than a period before the read, so the last edge is its own if it is as young; an
+    /// older one belongs to a sample as many periods before. The others follow from their distance to it.
     fn pair_by_age(&self, n: usize, before: Nanos, period: Span, of: &mut [Option<Nanos>]) {
         let Some(latest) = self.stamps.last() else { return };
         let periods = |span: Span, round: f64| ((span.0.max(0) as f64 / period.0.max(1) as f64) + round) as usize;
-        // A tenth for what the period and the moment of the count are not known to.
+        // A tenth for the errors of the period and of the moment of the count.
         let back = periods(before - *latest, 0.1);
         for t in self.stamps.iter().rev() {
             let sample = n.checked_sub(1 + back + periods(*latest - *t, 0.5)).and_then(|i| of.get_mut(i));

@@ -1,11 +1,11 @@
-//! Bytes of a FIFO into samples.
+//! Bytes of a FIFO into samples, counts as the die gives them.
 //!
-//! Whatever the bytes are, this ends, gives no more samples than they can hold, and says what it could not read. A
-//! frame that is cut off at the end is left out: those FIFOs that frame give it again.
+//! Whatever the bytes are, parsing ends, gives no more samples than they can hold, and says what it could not read. A
+//! frame that is cut off at the end is left out: the FIFOs that frame their samples give it again.
 
 use super::chips::Layout;
 
-/// One sample as the die counts it. A die with one sensor fills one of the two.
+/// One sample, in counts. A die with one sensor fills one of the two.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Default)]
 pub struct Raw {
     pub accel: Option<[i16; 3]>,
@@ -18,15 +18,16 @@ pub struct Raw {
 pub struct Parsed {
     /// Samples that the die says it dropped before these.
     pub skipped: usize,
-    /// Frames that were marked invalid, or whose header means nothing: the rest of the burst is left out.
+    /// Frames that were marked invalid or have an unknown header; what follows an unknown header is left out.
     pub invalid: usize,
 }
 
-/// Reads bursts; keeps what one leaves to the next.
+/// Parses bursts, and keeps what one burst leaves to the next.
 #[derive(Clone, Debug)]
 pub struct Parser {
     layout: Layout,
-    /// Half a sample of tagged words: their slot's number, and what was seen of it.
+    big_endian: bool,
+    /// Half a sample of tagged words: the number of its time slot, and the sensor that was there.
     half: Option<(u8, Raw)>,
     temperature: Option<i16>,
 }
@@ -40,32 +41,33 @@ fn word(bytes: &[u8], at: usize, big_endian: bool) -> i16 {
     }
 }
 
+/// Three words from byte `at` on.
 pub fn triple(bytes: &[u8], at: usize, big_endian: bool) -> [i16; 3] {
     [0, 2, 4].map(|i| word(bytes, at + i, big_endian))
 }
 
 impl Parser {
-    pub fn new(layout: Layout) -> Parser {
-        Parser { layout, half: None, temperature: None }
+    pub fn new(layout: Layout, big_endian: bool) -> Parser {
+        Parser { layout, big_endian, half: None, temperature: None }
     }
 
-    /// The FIFO was cleared.
+    /// Forgets what the last burst left: the FIFO was cleared.
     pub fn reset(&mut self) {
         (self.half, self.temperature) = (None, None);
     }
 
-    /// Appends the samples of a burst.
+    /// Appends the samples of a burst to `out`.
     pub fn parse(&mut self, bytes: &[u8], out: &mut Vec<Raw>) -> Parsed {
         match self.layout {
-            Layout::Plain { len, accel, gyro, temperature, big_endian } => {
+            Layout::Plain { len, accel, gyro, temperature } => {
                 let mut parsed = Parsed::default();
                 for frame in bytes.chunks_exact(len) {
                     let raw = Raw {
-                        accel: accel.map(|at| triple(frame, at, big_endian)),
-                        gyro: gyro.map(|at| triple(frame, at, big_endian)),
-                        temperature: temperature.map(|at| word(frame, at, big_endian)),
+                        accel: accel.map(|at| triple(frame, at, self.big_endian)),
+                        gyro: gyro.map(|at| triple(frame, at, self.big_endian)),
+                        temperature: temperature.map(|at| word(frame, at, self.big_endian)),
                     };
-                    // What ArduPilot met in the FIFO of the BMI088's gyro, and no motion gives.
+                    // Seen by ArduPilot in the FIFO of the BMI088's gyro; no motion gives it.
                     if raw.gyro == Some([i16::MIN; 3]) {
                         parsed.invalid += 1;
                     } else {
@@ -80,7 +82,7 @@ impl Parser {
         }
     }
 
-    /// LSM6DSOX, "FIFO_DATA_OUT_TAG": sensor in bits 7:3, number of the time slot in 2:1.
+    /// Words of the LSM6DSOX, "FIFO_DATA_OUT_TAG": sensor in bits 7:3, number of the time slot in 2:1.
     fn tagged(&mut self, bytes: &[u8], out: &mut Vec<Raw>) -> Parsed {
         const GYRO: u8 = 0x01;
         const ACCEL: u8 = 0x02;
@@ -95,7 +97,7 @@ impl Parser {
             if tag != GYRO && tag != ACCEL {
                 continue;
             }
-            // A slot that ends with one sensor missing was hurt by an overflow.
+            // A slot that ends with one sensor missing lost it in an overflow.
             let stale = self.half.take_if(|(of, _)| *of != slot);
             parsed.skipped += usize::from(stale.is_some());
             let (_, sample) = self.half.get_or_insert((slot, Raw::default()));
@@ -113,11 +115,12 @@ impl Parser {
     }
 }
 
-/// ICM-42688-P, "FIFO packet structure", packet 3: header bits 7 (empty), 6 (accelerometer), 5 (gyro), 4 (20 bits).
+/// Packets of the ICM-42688-P, "FIFO packet structure", packet 3: header bits 7 (empty), 6 (accelerometer), 5 (gyro), 4 (20
+/// bits).
 fn packets(bytes: &[u8], out: &mut Vec<Raw>) -> Parsed {
     const BOTH: u8 = 0x60;
     const KIND: u8 = 0xF0;
-    /// "FIFO header": what a sensor gives that has no sample yet.
+    /// "FIFO header": the value of a sensor that has no sample yet.
     const NONE_YET: i16 = i16::MIN;
     let mut parsed = Parsed::default();
     for packet in bytes.chunks_exact(16) {
@@ -132,7 +135,7 @@ fn packets(bytes: &[u8], out: &mut Vec<Raw>) -> Parsed {
     parsed
 }
 
-/// "FIFO frames": kind in bits 7:6 of the header, what it holds in 5:2, interrupt tags in 1:0.
+/// Frames of Bosch's FIFOs, "FIFO frames": kind in bits 7:6 of the header, content in 5:2, interrupt tags in 1:0.
 fn bosch(bytes: &[u8], config: usize, out: &mut Vec<Raw>) -> Parsed {
     const ACCEL: u8 = 0x84;
     const GYRO: u8 = 0x88;
@@ -183,13 +186,14 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    fn layout(name: &str, die: usize) -> Layout {
-        Chip::named(name).expect("driven").dies[die].fifo.layout
+    fn parser(name: &str, die: usize) -> Parser {
+        let spec = &Chip::named(name).expect("driven").dies[die];
+        Parser::new(spec.fifo.layout, spec.big_endian)
     }
 
-    fn parse(layout: Layout, bytes: &[u8]) -> (Vec<Raw>, Parsed) {
+    fn parse(mut parser: Parser, bytes: &[u8]) -> (Vec<Raw>, Parsed) {
         let mut out = vec![];
-        let parsed = Parser::new(layout).parse(bytes, &mut out);
+        let parsed = parser.parse(bytes, &mut out);
         (out, parsed)
     }
 
@@ -201,16 +205,16 @@ mod tests {
             temperature: Some(0x0708),
             gyro: Some([0x090A, 0x0B0C, 0x0D0E]),
         };
-        assert_eq!(parse(layout("mpu-6500", 0), &bytes), (vec![mpu], Parsed::default()), "the cut frame is left out");
+        assert_eq!(parse(parser("mpu-6500", 0), &bytes), (vec![mpu], Parsed::default()), "the cut frame is left out");
         let icm = Raw {
             accel: Some([0x0102, 0x0304, 0x0506]),
             gyro: Some([0x0708, 0x090A, 0x0B0C]),
             temperature: Some(0x0D0E),
         };
-        assert_eq!(parse(layout("icm-20948", 0), &bytes).0, [icm]);
+        assert_eq!(parse(parser("icm-20948", 0), &bytes).0, [icm]);
         let gyro = Raw { gyro: Some([-2, 0x0403, i16::MIN]), ..Raw::default() };
         let bytes = [0, 0x80, 0, 0x80, 0, 0x80, 0xFE, 0xFF, 3, 4, 0, 0x80];
-        let (out, parsed) = parse(layout("bmi088", 0), &bytes);
+        let (out, parsed) = parse(parser("bmi088", 0), &bytes);
         assert_eq!((out, parsed), (vec![gyro], Parsed { skipped: 0, invalid: 1 }), "nothing measures that");
     }
 
@@ -223,25 +227,25 @@ mod tests {
         let empty = [0x80, 0, 0];
         let bytes = [&accel[..], &time, &[0x48, 7], &skip, &dropped, &[0x87], &accel[1..], &empty].concat();
         let sample = Raw { accel: Some([1, 2, -1]), ..Raw::default() };
-        let (out, parsed) = parse(layout("bmi088", 1), &bytes);
+        let (out, parsed) = parse(parser("bmi088", 1), &bytes);
         assert_eq!((out, parsed), (vec![sample; 2], Parsed { skipped: 5, invalid: 0 }), "tags in bits 1:0 are no part");
         let both = [0x8C, 1, 0, 2, 0, 3, 0, 4, 0, 5, 0, 6, 0];
         let bytes = [&[0x48, 7, 7, 7, 7][..], &both, &both[..9]].concat();
         let sample = Raw { gyro: Some([1, 2, 3]), accel: Some([4, 5, 6]), temperature: None };
-        assert_eq!(parse(layout("bmi270", 0), &bytes), (vec![sample], Parsed::default()));
+        assert_eq!(parse(parser("bmi270", 0), &bytes), (vec![sample], Parsed::default()));
         let bytes = [&both[..], &[0x00], &both].concat();
-        assert_eq!(parse(layout("bmi270", 0), &bytes), (vec![sample], Parsed { skipped: 0, invalid: 1 }));
+        assert_eq!(parse(parser("bmi270", 0), &bytes), (vec![sample], Parsed { skipped: 0, invalid: 1 }));
     }
 
     #[test]
     fn packets_of_a_sensor_that_has_not_started_are_left_out() {
         let mut packet = [0x68, 0, 1, 0, 2, 0, 3, 0, 4, 0, 5, 0xFF, 0xFA, 0xF6, 0, 0];
         let sample = Raw { accel: Some([1, 2, 3]), gyro: Some([4, 5, -6]), temperature: Some(-10) };
-        assert_eq!(parse(layout("icm-42688-p", 0), &packet).0, [sample]);
+        assert_eq!(parse(parser("icm-42688-p", 0), &packet).0, [sample]);
         packet[1..7].copy_from_slice(&[0x80, 0, 0x80, 0, 0x80, 0]);
-        assert_eq!(parse(layout("icm-42688-p", 0), &packet), (vec![], Parsed { skipped: 0, invalid: 1 }));
+        assert_eq!(parse(parser("icm-42688-p", 0), &packet), (vec![], Parsed { skipped: 0, invalid: 1 }));
         packet[0] = 0x80;
-        assert_eq!(parse(layout("icm-42688-p", 0), &packet).1.invalid, 1);
+        assert_eq!(parse(parser("icm-42688-p", 0), &packet).1.invalid, 1);
     }
 
     fn tagged(tag: u8, slot: u8, values: [i16; 3]) -> Vec<u8> {
@@ -250,7 +254,7 @@ mod tests {
 
     #[test]
     fn tagged_words_are_joined_by_their_slot_across_bursts() {
-        let mut parser = Parser::new(Layout::Tagged);
+        let mut parser = parser("lsm6dsox", 0);
         let mut out = vec![];
         let words =
             [tagged(1, 0, [1, 2, 3]), tagged(2, 0, [4, 5, 6]), tagged(3, 0, [-512, 0, 0]), tagged(2, 1, [7; 3])];
@@ -264,7 +268,7 @@ mod tests {
     #[test]
     fn half_a_slot_is_counted() {
         let words = [tagged(1, 0, [1; 3]), tagged(1, 1, [2; 3]), tagged(2, 1, [3; 3]), tagged(7, 1, [0; 3])].concat();
-        let (out, parsed) = parse(Layout::Tagged, &words);
+        let (out, parsed) = parse(parser("lsm6dsox", 0), &words);
         assert_eq!((out.len(), parsed), (1, Parsed { skipped: 1, invalid: 0 }));
     }
 
@@ -272,7 +276,7 @@ mod tests {
         #[test]
         fn any_bytes_end_in_no_more_samples_than_fit(bytes in proptest::collection::vec(any::<u8>(), 0..3000)) {
             for die in CHIPS.iter().flat_map(|c| c.dies) {
-                let (out, _) = parse(die.fifo.layout, &bytes);
+                let (out, _) = parse(Parser::new(die.fifo.layout, die.big_endian), &bytes);
                 prop_assert!(out.len() <= bytes.len() / die.fifo.layout.frame());
             }
         }

@@ -1,13 +1,14 @@
-//! A scan of a kernel IIO buffer: which channels stand where in it, and what they are in SI.
+//! A scan of a kernel IIO buffer: which channels stand where in it, and their values in SI units.
 //!
-//! The kernel packs the enabled channels in the order of their index, each aligned to its own storage. A channel's
-//! type reads `be:s16/16>>0`: byte order, sign, bits that count, bits that are stored, repeats, and shift.
+//! The kernel packs the enabled channels in the order of their index, each aligned to its own storage. A channel's type
+//! reads `be:s16/16>>0`: byte order, sign, bits that count, bits that are stored, repeats, and shift (kernel.org, "Industrial
+//! I/O", buffers).
 
 use super::merge::Reading;
 use crate::types::Nanos;
 use glam::DVec3;
 
-/// What a channel's `_type` says.
+/// How a channel is stored, as its `_type` says.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Kind {
     pub big_endian: bool,
@@ -20,6 +21,7 @@ pub struct Kind {
 }
 
 impl Kind {
+    /// `None` where the text is no type, or one that does not fit its storage.
     pub fn parse(text: &str) -> Option<Kind> {
         let (order, rest) = text.trim().split_once(':')?;
         let big_endian = match order {
@@ -44,7 +46,7 @@ impl Kind {
         (fits && (1..=4).contains(&repeat)).then_some(Kind { big_endian, signed, bits, storage, repeat, shift })
     }
 
-    /// The value in the first `storage` bytes.
+    /// The value that the first `storage` bytes hold.
     pub fn value(self, bytes: &[u8]) -> i64 {
         let mut word = [0u8; 8];
         for (i, byte) in bytes[..self.storage].iter().enumerate() {
@@ -59,7 +61,7 @@ impl Kind {
         }
     }
 
-    /// Whether a value stands at an end of what its bits can say.
+    /// Whether a value is the least or largest that its bits can hold.
     fn saturated(self, value: i64) -> bool {
         let full = 1i64.checked_shl(self.bits - u32::from(self.signed)).unwrap_or(i64::MAX);
         let least = if self.signed { -full } else { 0 };
@@ -67,17 +69,18 @@ impl Kind {
     }
 }
 
+/// A channel: an axis by its number, or another value.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Channel {
     Accel(usize),
     Gyro(usize),
     Temperature,
     Stamp,
-    /// Enabled, but of no use to us.
+    /// Enabled, but of no use here.
     Other,
 }
 
-/// Names of `scan_elements`, without `in_` and `_en`.
+/// The channel of a name in `scan_elements`, without `in_` and `_en`.
 pub fn channel(name: &str) -> Channel {
     const KNOWN: [(&str, Channel); 8] = [
         ("accel_x", Channel::Accel(0)),
@@ -92,7 +95,7 @@ pub fn channel(name: &str) -> Channel {
     KNOWN.iter().find(|(known, _)| *known == name).map_or(Channel::Other, |(_, channel)| *channel)
 }
 
-/// A channel as its files describe it; the value is (raw + offset) * scale in the kernel's units.
+/// A channel as its files describe it; its value is (raw + offset) * scale in the kernel's units (rad/s, m/s², m°C, ns).
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Element {
     pub channel: Channel,
@@ -106,6 +109,7 @@ pub struct Element {
 #[derive(Clone, Debug, PartialEq)]
 pub struct Scan {
     elements: Vec<(usize, Element)>,
+    /// Bytes of one scan.
     pub bytes: usize,
 }
 
@@ -125,15 +129,12 @@ impl Scan {
         Scan { elements: placed, bytes: at.next_multiple_of(largest) }
     }
 
-    pub fn has(&self, channel: Channel) -> bool {
-        self.elements.iter().any(|(_, e)| e.channel == channel)
-    }
-
+    /// Whether it holds all three axes of a sensor.
     pub fn has_all(&self, axis: fn(usize) -> Channel) -> bool {
-        (0..3).all(|i| self.has(axis(i)))
+        (0..3).all(|i| self.elements.iter().any(|(_, e)| e.channel == axis(i)))
     }
 
-    /// One scan, its stamp where it has one, and its axes' raw values for those who look whether they move.
+    /// The reading of one scan, and its stamp where it has one; `raw` becomes the axes' raw values, accelerometer first.
     pub fn reading(&self, bytes: &[u8], raw: &mut [i64; 6]) -> (Reading, Option<Nanos>) {
         let (mut accel, mut gyro) = ([0.0; 3], [0.0; 3]);
         let mut reading = Reading::default();
@@ -144,7 +145,6 @@ impl Scan {
             match element.channel {
                 Channel::Accel(i) => (accel[i], raw[i]) = (si, value),
                 Channel::Gyro(i) => (gyro[i], raw[3 + i]) = (si, value),
-                // The kernel's unit is 1/1000 °C.
                 Channel::Temperature => reading.temperature_c = Some((si * 1e-3) as f32),
                 Channel::Stamp => stamp = Some(Nanos(value)),
                 Channel::Other => {}

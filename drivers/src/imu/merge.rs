@@ -1,13 +1,13 @@
-//! Gyro and accelerometer of two dies, or of two kernel devices, into one stream: each gyro sample with the
-//! accelerometer brought to its time on the line between its neighbours. It waits for the later neighbour, one
-//! sample, and does not bridge holes.
+//! Gyro and accelerometer of two dies, or of two kernel devices, joined into one stream: each gyro sample with the
+//! accelerometer interpolated to its time between the two neighbours. It waits for the later neighbour, which is one
+//! sample, and does not bridge gaps.
 
 use crate::source::{ImuBatch, ImuReading, IMU_BATCH};
 use crate::types::{ImuSample, Nanos, Span};
 use glam::DVec3;
 use std::collections::VecDeque;
 
-/// A sample of a unit, or of half of one; SI.
+/// A sample of a unit, or of half of one: rad/s, m/s².
 #[derive(Clone, Copy, Debug, PartialEq, Default)]
 pub struct Reading {
     pub t: Nanos,
@@ -17,6 +17,26 @@ pub struct Reading {
     pub saturated: bool,
 }
 
+impl Reading {
+    /// The sample, where both sensors are there.
+    fn whole(self) -> Option<ImuReading> {
+        let sample = ImuSample { t: self.t, gyro_body: self.gyro?, accel_body: self.accel? };
+        Some(ImuReading { sample, temperature_c: self.temperature_c, saturated: self.saturated })
+    }
+}
+
+/// Passes a reading on: of a whole unit into the batch, of half a unit into its merge.
+pub fn pass(merge: &mut Option<Merge>, batch: &mut ImuBatch, reading: Reading) {
+    match merge {
+        Some(merge) => merge.push(reading),
+        None => {
+            let pushed = reading.whole().map_or(Ok(()), |whole| batch.push(whole));
+            debug_assert!(pushed.is_ok(), "a batch holds more than one read");
+        }
+    }
+}
+
+/// The halves that wait for each other.
 #[derive(Clone, Debug)]
 pub struct Merge {
     gyro: VecDeque<Reading>,
@@ -24,7 +44,7 @@ pub struct Merge {
     /// Longest distance between neighbours to interpolate across.
     hole: Span,
     temperature_c: Option<f32>,
-    /// Gyro samples that were dropped for having no accelerometer beside them.
+    /// Gyro samples that were dropped because no accelerometer samples were beside them.
     pub unpaired: u64,
 }
 
@@ -42,7 +62,7 @@ impl Merge {
         self.accel.clear();
     }
 
-    /// Takes what one of the two gave. Full queues drop their oldest: a gyro sample then was unpaired.
+    /// Takes a reading of either half. A full queue drops its oldest: a gyro sample then was unpaired.
     pub fn push(&mut self, reading: Reading) {
         self.temperature_c = reading.temperature_c.or(self.temperature_c);
         let queue = if reading.gyro.is_some() { &mut self.gyro } else { &mut self.accel };
@@ -53,6 +73,7 @@ impl Merge {
         queue.push_back(reading);
     }
 
+    /// Moves what can be joined into the batch, as far as there is room.
     pub fn drain(&mut self, batch: &mut ImuBatch) {
         while !batch.is_full() {
             let Some(gyro) = self.gyro.front().copied() else { return };
@@ -61,18 +82,16 @@ impl Merge {
                 self.accel.pop_front();
             }
             let older = self.accel.front().filter(|a| a.t <= gyro.t);
-            let paired = match (older, self.accel.get(1), self.accel.front()) {
-                (Some(a), _, _) if a.t == gyro.t => between(a, a, gyro),
-                (Some(a), Some(b), _) if b.t - a.t <= self.hole => between(a, b, gyro),
+            let joined = match (older, self.accel.get(1), self.accel.front()) {
+                (Some(a), _, _) if a.t == gyro.t => join(a, a, gyro),
+                (Some(a), Some(b), _) if b.t - a.t <= self.hole => join(a, b, gyro),
                 // The later neighbour may still come.
-                (Some(a), None, _) if gyro.t - a.t <= self.hole => return,
-                (None, _, None) => return,
-                // Before the first, in a hole, or after one that ended.
-                (Some(_), None, _) => return,
+                (Some(_), None, _) | (None, _, None) => return,
+                // Before the first, or in a hole.
                 _ => None,
             };
             self.gyro.pop_front();
-            match paired {
+            match joined {
                 Some(mut reading) => {
                     reading.temperature_c = reading.temperature_c.or(self.temperature_c);
                     let pushed = batch.push(reading);
@@ -84,12 +103,12 @@ impl Merge {
     }
 }
 
-fn between(a: &Reading, b: &Reading, gyro: Reading) -> Option<ImuReading> {
+/// The gyro's sample with the accelerometer on the line from `a` to `b`.
+fn join(a: &Reading, b: &Reading, gyro: Reading) -> Option<ImuReading> {
     let length = (b.t - a.t).secs();
     let s = if length > 0.0 { (gyro.t - a.t).secs() / length } else { 0.0 };
-    let sample = ImuSample { t: gyro.t, gyro_body: gyro.gyro?, accel_body: a.accel?.lerp(b.accel?, s) };
-    let saturated = gyro.saturated || a.saturated || b.saturated;
-    Some(ImuReading { sample, temperature_c: gyro.temperature_c, saturated })
+    let accel = Some(a.accel?.lerp(b.accel?, s));
+    Reading { accel, saturated: gyro.saturated || a.saturated || b.saturated, ..gyro }.whole()
 }
 
 #[cfg(test)]

@@ -1,27 +1,27 @@
-//! An inertial unit driven by its registers: waits, reads, and comes back.
+//! An inertial unit that is driven by its registers: waits, reads, and restarts what failed.
 //!
-//! With a data-ready line it wakes on edges and reads once `watermark` are there; without one it reads by the clock.
-//! Then the moment of reading wanders over a whole period (a golden-ratio sequence): a read that always fell at the
-//! same phase could not tell where in the period the samples lie, a wandering one narrows it to a few percent
+//! With a data-ready line it wakes on edges and reads once `watermark` samples are there; without one it reads by the
+//! clock. Then the moment of reading wanders over a whole period (a golden-ratio sequence): a read that always fell at the
+//! same phase could not tell where in the period the samples lie; a wandering one narrows it to a few percent
 //! (`timeline`), for half a period more of latency.
 //!
-//! A transfer that fails is tried again at the next read. After `FAILURES_MAX` in a row, a frozen sensor or silence
-//! the unit is reset and set up anew; where that fails, or nothing good came of the last time, it is lost, and looked
-//! for with a pause that doubles from `BACKOFF` to `BACKOFF_MAX`. Setting up takes 60 to 250 ms, and a call that does
-//! it outlasts its timeout by that.
+//! A transfer that fails is tried again at the next read. After `FAILURES_MAX` in a row, after a frozen sensor or silence,
+//! the unit is reset and set up anew. Where that fails, or where nothing good came since the last time, it is lost, and
+//! looked for with a pause that doubles from `BACKOFF` to `BACKOFF_MAX`. Setting a unit up takes 60 to 250 ms, and a call
+//! that does it outlasts its timeout by that.
 
-use super::bus::{Bus, BusFault};
+use super::bus::BusFault;
 use super::counters::ImuCounters;
-use super::die::Trouble;
-use super::edges::{EdgeQueue, Edges};
-use super::merge::{Merge, Reading};
+use super::edges::{EdgeFault, EdgeQueue, Edges};
+use super::error::ImuError;
+use super::merge::{pass, Merge};
 use super::timeline::ClockReport;
 use super::unit::Unit;
-use crate::source::{ImuBatch, ImuReading, ImuSource, SourceFault, Wait};
-use crate::types::{ImuSample, Nanos, Span};
-use crate::{Fault, FaultKind};
+use crate::source::{ImuBatch, ImuSource, SourceFault, Wait};
+use crate::types::{Nanos, Span};
+use crate::Fault;
 
-/// Pauses between attempts to find a lost unit.
+/// First and longest pause between attempts to find a lost unit.
 const BACKOFF: Span = Span(20_000_000);
 const BACKOFF_MAX: Span = Span(1_000_000_000);
 /// No sample for so many periods, and at least so long: the unit lost its configuration, as after a brown-out.
@@ -29,7 +29,7 @@ const SILENT_PERIODS: i64 = 20;
 const SILENT_MIN: Span = Span(100_000_000);
 /// Transfers that may fail in a row before the unit is set up anew.
 const FAILURES_MAX: u32 = 3;
-/// How long edges may stay away before samples are looked for without them.
+/// How long edges may stay away before samples are looked for without them, and how long a line that failed is left alone.
 const EDGES_LATE: Span = Span(2_000_000);
 const EDGES_RETRY: Span = Span(1_000_000_000);
 /// The golden ratio's fraction: multiples of it fill the unit interval as evenly as can be.
@@ -37,18 +37,20 @@ const GOLDEN: f64 = 0.618_033_988_749_895;
 
 enum State {
     Running,
-    /// When it is looked for again, and why.
+    /// When it is looked for again, and why it is lost.
     Lost {
         retry: Nanos,
-        why: Trouble,
+        why: ImuError,
     },
 }
 
-pub struct RegisterImu<B: Bus, E: Edges> {
+/// A unit of one or two dies, and its data-ready line.
+pub struct RegisterImu {
     place: String,
     /// One, or gyro and accelerometer.
-    units: Vec<Unit<B>>,
-    edges: Option<E>,
+    units: Vec<Unit>,
+    edges: Option<Box<dyn Edges>>,
+    /// When a line that failed is used again.
     edges_from: Nanos,
     queue: EdgeQueue,
     merge: Option<Merge>,
@@ -56,9 +58,9 @@ pub struct RegisterImu<B: Bus, E: Edges> {
     watermark: usize,
     state: State,
     failures: u32,
-    /// Before the next attempt; doubles until the unit gives samples that differ.
+    /// Before the next attempt to find it; doubles until the unit gives samples that differ.
     pause: Span,
-    /// When the unit is read next, before it wanders; and how often it was.
+    /// When the unit is read next, before the moment wanders; and how often it was read.
     due: Nanos,
     reads: u64,
     /// When each unit gave its last sample, or was started.
@@ -68,16 +70,16 @@ pub struct RegisterImu<B: Bus, E: Edges> {
     counters: ImuCounters,
 }
 
-impl<B: Bus, E: Edges> RegisterImu<B, E> {
-    /// Starts the dies; the one with the gyro first.
-    pub fn start(
+impl RegisterImu {
+    /// Starts the dies, of which the first has the gyro. `place` is named in faults.
+    pub(super) fn start(
         place: String,
-        mut units: Vec<Unit<B>>,
-        edges: Option<E>,
+        mut units: Vec<Unit>,
+        edges: Option<Box<dyn Edges>>,
         watermark: usize,
-    ) -> Result<RegisterImu<B, E>, Fault> {
+    ) -> Result<RegisterImu, Fault> {
         for unit in &mut units {
-            unit.start().map_err(|trouble| cannot_start(&place, unit.die.chip.name, trouble))?;
+            unit.start().map_err(|error| error.at_start(&place, unit.die.spec.name))?;
         }
         let merge = units.get(1).map(|accel| Merge::new(accel.line.period()));
         let mut imu = RegisterImu {
@@ -97,16 +99,17 @@ impl<B: Bus, E: Edges> RegisterImu<B, E> {
             fresh: true,
             counters: ImuCounters::default(),
         };
-        imu.started();
+        imu.begin();
         Ok(imu)
     }
 
-    /// The sensor's clock, of the die whose samples set the time.
+    /// The clock of the die whose samples set the time.
     pub fn clock(&self) -> ClockReport {
         self.units[0].line.report()
     }
 
-    pub fn seen(&self) -> ImuCounters {
+    /// The counters so far.
+    pub fn counts(&self) -> ImuCounters {
         ImuCounters {
             imu_edges_refused: self.queue.refused,
             imu_edges_unmatched: self.queue.unmatched,
@@ -127,8 +130,8 @@ impl<B: Bus, E: Edges> RegisterImu<B, E> {
         }
     }
 
-    /// Edges of before a start are of no sample that will come.
-    fn started(&mut self) {
+    /// Begins to read a unit that was just started: edges from before belong to no sample that will come.
+    fn begin(&mut self) {
         if let Some(edges) = &mut self.edges {
             let _ = edges.drain(&mut self.queue);
         }
@@ -170,8 +173,8 @@ impl<B: Bus, E: Edges> RegisterImu<B, E> {
         }
         let late = self.due + self.period() + EDGES_LATE;
         loop {
-            if let Err(fault) = self.take_edges(late.min(limit)) {
-                self.edge_fault(fault);
+            if let Err(EdgeFault(_)) = self.take_edges(late.min(limit)) {
+                self.leave_edges();
                 return true;
             }
             let now = self.now();
@@ -184,7 +187,7 @@ impl<B: Bus, E: Edges> RegisterImu<B, E> {
         }
     }
 
-    fn take_edges(&mut self, until: Nanos) -> Result<(), super::edges::EdgeFault> {
+    fn take_edges(&mut self, until: Nanos) -> Result<(), EdgeFault> {
         let span = until - self.now();
         let Some(edges) = &mut self.edges else { return Ok(()) };
         if edges.wait(span.max(Span(0)))? {
@@ -193,19 +196,19 @@ impl<B: Bus, E: Edges> RegisterImu<B, E> {
         Ok(())
     }
 
-    /// Samples are stamped by the line until the edges are back.
-    fn edge_fault(&mut self, _: super::edges::EdgeFault) {
+    /// Leaves a line that failed alone for a while: samples are stamped by the estimated line until it is back.
+    fn leave_edges(&mut self) {
         self.counters.imu_edge_faults += 1;
         self.queue.clear();
         self.edges_from = self.now() + EDGES_RETRY;
-        if let Some(Err(_)) = self.edges.as_mut().map(Edges::reopen) {
+        if let Some(Err(_)) = self.edges.as_mut().map(|edges| edges.reopen()) {
             self.counters.imu_edge_faults += 1;
         }
     }
 
     fn collect(&mut self, batch: &mut ImuBatch) {
         let with_edges = self.has_edges();
-        // What piled up while the rest of the program started was for nobody, and silence counts from here.
+        // What piled up while the rest of the program started is of no use, and silence counts from here.
         let fresh = std::mem::take(&mut self.fresh);
         if fresh {
             self.heard = [self.now(); 2];
@@ -214,11 +217,7 @@ impl<B: Bus, E: Edges> RegisterImu<B, E> {
         for (i, unit) in self.units.iter_mut().enumerate() {
             let edges = (i == 0 && with_edges).then_some(&mut self.queue);
             let merge = &mut self.merge;
-            let give = |reading: Reading| match merge {
-                Some(merge) => merge.push(reading),
-                None => push(batch, reading),
-            };
-            match unit.collect(edges, &mut self.counters, give) {
+            match unit.collect(edges, &mut self.counters, |reading| pass(merge, batch, reading)) {
                 Ok(0) => {}
                 Ok(_) => {
                     self.heard[i] = unit.die.bus.now();
@@ -226,17 +225,17 @@ impl<B: Bus, E: Edges> RegisterImu<B, E> {
                         self.failures = 0;
                     }
                 }
-                Err(Trouble::Overflow) if fresh => {}
-                Err(trouble) => worst = Some(trouble),
+                Err(ImuError::Overflow) if fresh => {}
+                Err(error) => worst = Some(error),
             }
         }
         if let Some(merge) = &mut self.merge {
             merge.drain(batch);
         }
-        if let Some(trouble) = worst {
-            self.met(trouble);
+        if let Some(error) = worst {
+            self.handle(error);
         } else if self.is_silent() {
-            self.met(Trouble::Silent);
+            self.handle(ImuError::Silent);
         }
     }
 
@@ -246,38 +245,38 @@ impl<B: Bus, E: Edges> RegisterImu<B, E> {
         self.heard[..self.units.len()].iter().any(|heard| now - *heard > allowed)
     }
 
-    fn met(&mut self, trouble: Trouble) {
-        self.counters.count(&trouble);
-        match trouble {
+    fn handle(&mut self, error: ImuError) {
+        self.counters.count(&error);
+        match error {
             // Cleared already.
-            Trouble::Overflow => {}
-            Trouble::Bus(BusFault::Gone) | Trouble::Frozen(_) | Trouble::Silent => self.restart(trouble),
+            ImuError::Overflow => {}
+            ImuError::Bus(BusFault::Gone) | ImuError::Frozen(_) | ImuError::Silent => self.restart(error),
             _ => {
                 self.failures += 1;
                 if self.failures >= FAILURES_MAX {
-                    self.restart(trouble);
+                    self.restart(error);
                 }
             }
         }
     }
 
-    /// At once where it was well since the last time, else after a pause.
-    fn restart(&mut self, why: Trouble) {
-        let alive = self.units.iter().all(Unit::is_alive);
+    /// Sets the unit up at once where it was well since the last time, else after a pause.
+    fn restart(&mut self, why: ImuError) {
+        let alive = self.units.iter_mut().all(Unit::is_alive);
         if alive {
             self.pause = BACKOFF;
         }
-        if !alive || !self.set_up(why == Trouble::Bus(BusFault::Gone)) {
+        if !alive || !self.set_up(why == ImuError::Bus(BusFault::Gone)) {
             self.lose(why);
         }
     }
 
-    fn lose(&mut self, why: Trouble) {
+    fn lose(&mut self, why: ImuError) {
         self.state = State::Lost { retry: self.now() + self.pause, why };
         self.pause = Span((self.pause.0 * 2).min(BACKOFF_MAX.0));
     }
 
-    /// Resets the unit and sets it up.
+    /// Resets the unit and sets it up; whether that went well.
     fn set_up(&mut self, reopen: bool) -> bool {
         let outcome = self.units.iter_mut().try_for_each(|unit| {
             if reopen {
@@ -285,19 +284,19 @@ impl<B: Bus, E: Edges> RegisterImu<B, E> {
             }
             unit.start()
         });
-        if let Err(trouble) = outcome {
+        if let Err(error) = outcome {
             self.counters.imu_restarts_failed += 1;
-            self.counters.count(&trouble);
+            self.counters.count(&error);
             return false;
         }
         self.counters.imu_restarts += 1;
-        self.started();
+        self.begin();
         self.state = State::Running;
         true
     }
 
-    /// Looks for a lost unit, at its time; waits for that until `limit`.
-    fn look(&mut self, limit: Nanos) -> Result<(), SourceFault> {
+    /// Looks for a lost unit when it is time to, and waits for that until `limit`.
+    fn look_for_lost(&mut self, limit: Nanos) -> Result<(), SourceFault> {
         let State::Lost { retry, why } = self.state else { return Ok(()) };
         self.sleep_until(retry.min(limit));
         if self.now() >= retry {
@@ -306,59 +305,16 @@ impl<B: Bus, E: Edges> RegisterImu<B, E> {
             }
             self.lose(why);
         }
-        Err(self.lost())
-    }
-
-    fn lost(&self) -> SourceFault {
-        let why = match &self.state {
-            State::Lost { why, .. } => why.to_string(),
-            State::Running => String::new(),
-        };
-        let fix = "check cable and supply; it is looked for again and again";
-        SourceFault::Lost(Fault::new(
-            FaultKind::Unavailable,
-            &self.place,
-            format!("the inertial unit is lost: {why}"),
-            fix,
-        ))
+        Err(why.lost(&self.place))
     }
 }
 
-fn push(batch: &mut ImuBatch, reading: Reading) {
-    if let (Some(gyro_body), Some(accel_body)) = (reading.gyro, reading.accel) {
-        let sample = ImuSample { t: reading.t, gyro_body, accel_body };
-        let pushed =
-            batch.push(ImuReading { sample, temperature_c: reading.temperature_c, saturated: reading.saturated });
-        debug_assert!(pushed.is_ok(), "a batch holds more than any FIFO");
-    }
-}
-
-pub(super) fn cannot_start(place: &str, die: &str, trouble: Trouble) -> Fault {
-    let fix = match trouble {
-        Trouble::Bus(BusFault::Nack) => "check wiring, supply and imu.address (i2cdetect shows what answers)",
-        Trouble::Stranger(_) => "set imu.chip to what is there, or check the wiring (by SPI the chip select)",
-        Trouble::NoConfiguration => {
-            "set imu.configuration to a file of the 8192 bytes of bmi270_config_file, from Bosch's BMI270_SensorAPI: it \
-             is Bosch's program, and no part of this one"
-        }
-        Trouble::BadConfiguration(_) => {
-            "check that imu.configuration holds bmi270_config_file as it stands in Bosch's BMI270_SensorAPI, then the \
-             wiring"
-        }
-        Trouble::SelfTest(..) => {
-            "keep the board still while it starts, or set imu.self_test = false and expect bad data"
-        }
-        _ => "check wiring and supply, then power the unit off and on",
-    };
-    Fault::new(FaultKind::Unavailable, place, format!("the {die} does not start: {trouble}"), fix)
-}
-
-impl<B: Bus, E: Edges> ImuSource for RegisterImu<B, E> {
+impl ImuSource for RegisterImu {
     fn next(&mut self, timeout: Span, batch: &mut ImuBatch) -> Result<Wait, SourceFault> {
         batch.clear();
         let limit = self.now() + timeout.max(Span(0));
         loop {
-            self.look(limit)?;
+            self.look_for_lost(limit)?;
             if !self.wait(limit) {
                 return Ok(Wait::TimedOut);
             }
@@ -367,8 +323,8 @@ impl<B: Bus, E: Edges> ImuSource for RegisterImu<B, E> {
             if !batch.is_empty() {
                 return Ok(Wait::Got);
             }
-            if matches!(self.state, State::Lost { .. }) {
-                return Err(self.lost());
+            if let State::Lost { why, .. } = self.state {
+                return Err(why.lost(&self.place));
             }
             if self.now() >= limit {
                 return Ok(Wait::TimedOut);
@@ -377,6 +333,6 @@ impl<B: Bus, E: Edges> ImuSource for RegisterImu<B, E> {
     }
 
     fn counters(&self) -> Vec<(&'static str, u64)> {
-        self.seen().list()
+        self.counts().list()
     }
 }

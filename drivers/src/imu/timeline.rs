@@ -1,12 +1,12 @@
-//! When samples were taken, by the host's clock: the sample period and phase of a free-running sensor, estimated.
+//! When samples were taken, by the host's clock: an estimate of the period and phase of a free-running sensor.
 //!
-//! A read of n samples between two instants says that the newest was taken less than a period before the first and
-//! not after the second. A Kalman filter of (stamp of the newest sample, period) takes the middle of that interval
-//! as a measurement as uncertain as the interval is wide, and is then clamped into it: the interval is a fact. A
-//! data-ready edge is a measurement of `EDGE_SIGMA`. A late read makes its interval wider and so weighs less.
+//! A read of n samples between two instants says that the newest was taken less than a period before the first instant and
+//! not after the second. A Kalman filter of (stamp of the newest sample, period) takes the middle of that interval as a
+//! measurement whose deviation is that of the interval, and is then clamped into it: the interval is a fact. A data-ready
+//! edge is a measurement of deviation `EDGE_SIGMA`. A late read makes its interval wider and so weighs less.
 //!
-//! Two promises hold for whatever comes in: stamps grow strictly, and none is later than the read that brought the
-//! sample, unless the one before was already.
+//! Two promises hold whatever comes in: stamps grow strictly, and none is later than the read that brought the sample,
+//! unless the stamp before was already.
 
 use crate::types::{Nanos, Span};
 
@@ -14,37 +14,41 @@ use crate::types::{Nanos, Span};
 const EDGE_SIGMA: f64 = 20e3;
 /// MEMS oscillators are trimmed to a few percent; the filter starts from this uncertainty of the period.
 const PERIOD_SIGMA: f64 = 0.03;
-/// And the period is believed within these multiples of the nominal one (LSM6DSOX: ±15 % over temperature).
+/// The period is kept within these multiples of the nominal one (LSM6DSOX: ±15 % over temperature).
 const PERIOD_WITHIN: (f64, f64) = (0.7, 1.4);
-/// Random walk of the period, parts a root second: a degree a minute at 30 ppm/K is half of it.
+/// Random walk of the period, relative, per root second: a degree a minute at 30 ppm/K is half of it.
 const WANDER: f64 = 1e-6;
 /// Jitter of the sensor's own clock from sample to sample, ns.
 const JITTER: f64 = 1e3;
-/// Periods by which a read may disagree with the prediction before the line is started anew.
+/// Periods by which a read may disagree with the prediction before the estimate starts anew.
 const SLIP_PERIODS: f64 = 3.0;
-/// And by which it may leave what a read allows before samples must have been lost.
+/// Periods by which the prediction may leave the interval of a read before samples must have been lost.
 const SLIP_MIN: f64 = 0.1;
 
-/// What the estimator knows of the sensor's clock.
+/// The estimate of a sensor's clock.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ClockReport {
+    /// Sample rate by the host's clock.
     pub rate_hz: f64,
-    /// Of the sensor's clock over the host's, against the nominal rate: positive runs fast.
+    /// Deviation of that from the nominal rate: a positive one runs fast.
     pub drift_ppm: f64,
+    /// Standard deviation of the drift.
     pub sigma_ppm: f64,
 }
 
+/// The line on which the samples lie: sample number to instant. Durations are in ns.
 #[derive(Clone, Debug)]
 pub struct Timeline {
     nominal: f64,
-    /// Whole nanoseconds that `newest` is relative to: a double cannot hold both.
+    /// Instant that `newest` is relative to: a double cannot hold both.
     anchor: i64,
+    /// The newest sample.
     newest: f64,
     period: f64,
     /// Variances of `newest` and `period`, and their covariance.
     var: [f64; 3],
     started: bool,
-    /// The stamp given last.
+    /// The stamp that was given last.
     last: Option<i64>,
 }
 
@@ -55,16 +59,17 @@ impl Timeline {
         Timeline { nominal, anchor: 0, newest: 0.0, period: nominal, var, started: false, last: None }
     }
 
+    /// The period, as estimated so far.
     pub fn period(&self) -> Span {
         Span(self.period.round() as i64)
     }
 
-    /// Forgets the phase, not the period: the sensor was reset.
-    pub fn lose(&mut self) {
+    /// Forgets the phase and keeps the period: the sensor was reset.
+    pub fn forget_phase(&mut self) {
         self.started = false;
     }
 
-    /// A read between two instants brought `n` samples; where an edge told when the newest was ready, `edge`.
+    /// Takes a read between two instants that brought `n` samples; `edge` is when the newest was ready, where an edge told.
     /// False where the line had slipped and starts anew.
     pub fn advance(&mut self, n: usize, before: Nanos, after: Nanos, edge: Option<Nanos>) -> bool {
         let after = after.max(before);
@@ -95,8 +100,8 @@ impl Timeline {
         true
     }
 
-    /// Into the interval. A line that leaves it a little is wrong in its period as the covariances say; one that
-    /// leaves it far has lost a sample, or got one twice, of which the period knows nothing.
+    /// Clamps the newest sample into the interval. A line that leaves it a little is wrong in its period as the covariances
+    /// say; one that leaves it far has lost a sample, or got one twice, which says nothing about the period.
     fn clamp(&mut self, high: f64) {
         let outside = self.newest.clamp(-self.period, high) - self.newest;
         if outside.abs() > SLIP_MIN * self.period + 4.0 * self.var[0].sqrt() {
@@ -143,8 +148,8 @@ impl Timeline {
         self.var = [(1.0 - gain_x) * x, (p - gain_p * c).max(0.0), (1.0 - gain_x) * c];
     }
 
-    /// Stamp of the sample that is `back` before the newest of the last read; `edge` where one was seen of it.
-    /// Samples are to be asked for in their order.
+    /// The stamp of the sample that is `back` before the newest of the last read; `edge` is its own edge, where there is one.
+    /// Stamps must be asked for in the order of the samples.
     pub fn stamp(&mut self, back: usize, after: Nanos, edge: Option<Nanos>) -> Nanos {
         let on_line = self.anchor.saturating_add((self.newest - back as f64 * self.period).round() as i64);
         let t = edge.map_or(on_line, |t| t.0).min(after.0);
@@ -153,6 +158,7 @@ impl Timeline {
         Nanos(t)
     }
 
+    /// The estimate so far.
     pub fn report(&self) -> ClockReport {
         ClockReport {
             rate_hz: 1e9 / self.period,
@@ -299,7 +305,7 @@ mod tests {
             let (mut now, mut last) = (0i64, None);
             for event in events {
                 match event {
-                    Event::Lose => line.lose(),
+                    Event::Lose => line.forget_phase(),
                     Event::Jump(t) => now = t,
                     Event::Read { n, pause, width, edge } => {
                         let before = now.saturating_add(pause);

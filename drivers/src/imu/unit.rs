@@ -1,10 +1,10 @@
-//! A die's bursts into readings: stamped, in SI, with what is wrong with them.
+//! One die as a stream: its bursts become readings that are stamped, in SI units, and flagged where something is wrong.
 
-use super::bus::Bus;
-use super::chips::{self, TemperatureFrom};
+use super::chips::{Range, SensorSpec, Setting, TemperatureSource};
 use super::counters::ImuCounters;
-use super::die::{Die, Trouble};
+use super::die::Die;
 use super::edges::EdgeQueue;
+use super::error::ImuError;
 use super::frames::Raw;
 use super::merge::Reading;
 use super::timeline::Timeline;
@@ -12,16 +12,14 @@ use crate::source::IMU_BATCH;
 use crate::types::{Nanos, Span};
 use glam::DVec3;
 
-/// Standard gravity, m/s² a g.
+/// Standard gravity, m/s² per g.
 pub const GRAVITY: f64 = 9.80665;
-/// How often a temperature that does not ride in the frames is asked for.
+/// How often a temperature that is not in the frames is read.
 const TEMPERATURE_EVERY: Span = Span(1_000_000_000);
-/// Counts this near the end of 16 bits, or of the range where that ends before, are clipped: 0.2 %.
+/// Counts this near, by ratio, to the end of 16 bits, or of the range where that ends before, are clipped.
 const SATURATED: f64 = 0.998;
-/// Between samples further apart than this many periods some are missing.
-pub const GAP: f64 = 1.5;
 
-/// Counts of one sensor into SI, and whether they move.
+/// One sensor: counts into SI units, and whether they move.
 struct Axes {
     name: &'static str,
     si_per_lsb: f64,
@@ -33,16 +31,17 @@ struct Axes {
 }
 
 impl Axes {
-    fn new(name: &'static str, si: f64, (full, per_lsb): (f64, f64)) -> Axes {
-        let saturated_from = SATURATED * (full / per_lsb).min(f64::from(i16::MAX));
-        Axes { name, si_per_lsb: per_lsb * si, saturated_from, last: None, repeats: 0, moved: false }
+    /// `si` is the sensor's unit in SI units.
+    fn new(name: &'static str, si: f64, range: &Range) -> Axes {
+        let saturated_from = SATURATED * (range.full_scale / range.per_lsb).min(f64::from(i16::MAX));
+        Axes { name, si_per_lsb: range.per_lsb * si, saturated_from, last: None, repeats: 0, moved: false }
     }
 
     fn forget(&mut self) {
         (self.last, self.repeats, self.moved) = (None, 0, false);
     }
 
-    fn take(&mut self, raw: [i16; 3], saturated: &mut bool) -> DVec3 {
+    fn convert(&mut self, raw: [i16; 3], saturated: &mut bool) -> DVec3 {
         let again = self.last == Some(raw);
         self.moved |= self.last.is_some() && !again;
         self.repeats = if again { self.repeats.saturating_add(1) } else { 0 };
@@ -53,12 +52,13 @@ impl Axes {
     }
 }
 
-pub struct Unit<B: Bus> {
-    pub die: Die<B>,
+/// A die, its clock and its sensors.
+pub struct Unit {
+    pub die: Die,
     pub line: Timeline,
     accel: Option<Axes>,
     gyro: Option<Axes>,
-    /// Values in a row that are the same to the bit and no coincidence; 0: never.
+    /// Samples in a row that are the same to the bit and no coincidence; 0: never.
     frozen_samples: u32,
     raws: Vec<Raw>,
     edges: Vec<Option<Nanos>>,
@@ -67,17 +67,17 @@ pub struct Unit<B: Bus> {
     temperature_due: Nanos,
 }
 
-impl<B: Bus> Unit<B> {
-    pub fn new(die: Die<B>, setting: &chips::Setting, rate_hz: f64, frozen_samples: u32) -> Unit<B> {
-        let axes = |name, si, sense: &Option<chips::Sense>, code| {
-            sense.as_ref().map(|sense: &chips::Sense| Axes::new(name, si, sense.range(code)))
+impl Unit {
+    pub fn new(die: Die, setting: &Setting, rate_hz: f64, frozen_samples: u32) -> Unit {
+        let axes = |name, si, sensor: &Option<SensorSpec>, code| {
+            sensor.as_ref().map(|sensor: &SensorSpec| Axes::new(name, si, sensor.range(code)))
         };
         Unit {
-            accel: axes("accelerometer", GRAVITY, &die.chip.accel, setting.accel),
-            gyro: axes("gyro", 1f64.to_radians(), &die.chip.gyro, setting.gyro),
+            accel: axes("accelerometer", GRAVITY, &die.spec.accel, setting.accel),
+            gyro: axes("gyro", 1f64.to_radians(), &die.spec.gyro, setting.gyro),
             line: Timeline::new(Span::from_secs(1.0 / rate_hz)),
             frozen_samples,
-            raws: Vec::with_capacity(die.chip.fifo.capacity / die.chip.fifo.layout.frame() + 1),
+            raws: Vec::with_capacity(die.spec.fifo.capacity / die.spec.fifo.layout.frame() + 1),
             edges: Vec::with_capacity(2 * IMU_BATCH),
             last: None,
             temperature_c: None,
@@ -86,40 +86,46 @@ impl<B: Bus> Unit<B> {
         }
     }
 
-    pub fn start(&mut self) -> Result<(), Trouble> {
+    /// Resets the die and sets it up.
+    pub fn start(&mut self) -> Result<(), ImuError> {
         self.die.start()?;
-        self.line.lose();
-        [&mut self.accel, &mut self.gyro].into_iter().flatten().for_each(Axes::forget);
+        self.line.forget_phase();
+        self.sensors().for_each(Axes::forget);
         Ok(())
     }
 
-    /// Whether every sensor has given two values that differ since the start.
-    pub fn is_alive(&self) -> bool {
-        [&self.accel, &self.gyro].into_iter().flatten().all(|a| a.moved)
+    fn sensors(&mut self) -> impl Iterator<Item = &mut Axes> {
+        [&mut self.accel, &mut self.gyro].into_iter().flatten()
     }
 
-    /// Reads what there is; answers how many samples. Where edges are given they stamp the samples.
+    /// Whether every sensor has given two values that differ since the start.
+    pub fn is_alive(&mut self) -> bool {
+        self.sensors().all(|a| a.moved)
+    }
+
+    /// Reads what the FIFO holds, hands it to `give`, and answers how many samples that were. Where edges are given they
+    /// stamp the samples.
     pub fn collect(
         &mut self,
         edges: Option<&mut EdgeQueue>,
         counters: &mut ImuCounters,
         mut give: impl FnMut(Reading),
-    ) -> Result<usize, Trouble> {
+    ) -> Result<usize, ImuError> {
         self.raws.clear();
         let burst = match self.die.burst(&mut self.raws) {
             Ok(burst) => burst,
-            Err(trouble) => {
-                if trouble == Trouble::Overflow {
-                    self.line.lose();
+            Err(error) => {
+                if error == ImuError::Overflow {
+                    self.line.forget_phase();
                     edges.into_iter().for_each(EdgeQueue::clear);
                 }
-                return Err(trouble);
+                return Err(error);
             }
         };
         counters.imu_samples_skipped += burst.parsed.skipped as u64;
         counters.imu_frames_invalid += burst.parsed.invalid as u64;
         if burst.parsed.skipped > 0 {
-            self.line.lose();
+            self.line.forget_phase();
         }
         let n = self.raws.len();
         self.edges.clear();
@@ -133,53 +139,44 @@ impl<B: Bus> Unit<B> {
         }
         for i in 0..n {
             let t = self.line.stamp(n - 1 - i, burst.after, self.edges[i]);
-            self.count_gap(t, counters);
+            counters.count_gap(self.last, t, self.line.period());
+            self.last = Some(t);
             let reading = self.reading(t, self.raws[i]);
             counters.imu_saturated += u64::from(reading.saturated);
             give(reading);
         }
         if n > 0 {
-            self.ask_temperature(burst.after, counters);
+            self.read_temperature(burst.after, counters);
             self.check_frozen()?;
         }
         Ok(n)
     }
 
-    fn count_gap(&mut self, t: Nanos, counters: &mut ImuCounters) {
-        let period = self.line.period().0 as f64;
-        let periods = self.last.map_or(1.0, |last| (t - last).0 as f64 / period);
-        if periods > GAP {
-            counters.imu_gaps += 1;
-            counters.imu_samples_missing += (periods.round() - 1.0).max(1.0) as u64;
-        }
-        self.last = Some(t);
-    }
-
     fn reading(&mut self, t: Nanos, raw: Raw) -> Reading {
         let mut saturated = false;
-        let gyro = self.gyro.as_mut().zip(raw.gyro).map(|(axes, raw)| axes.take(raw, &mut saturated));
-        let accel = self.accel.as_mut().zip(raw.accel).map(|(axes, raw)| axes.take(raw, &mut saturated));
+        let gyro = self.gyro.as_mut().zip(raw.gyro).map(|(axes, raw)| axes.convert(raw, &mut saturated));
+        let accel = self.accel.as_mut().zip(raw.accel).map(|(axes, raw)| axes.convert(raw, &mut saturated));
         let temperature_c = raw.temperature.map(|raw| self.die.celsius(raw)).or(self.temperature_c);
         Reading { t, gyro, accel, temperature_c, saturated }
     }
 
-    /// The samples are worth more than their temperature: a failure is counted and forgotten.
-    fn ask_temperature(&mut self, now: Nanos, counters: &mut ImuCounters) {
-        let from = &self.die.chip.temperature.from;
-        if matches!(from, TemperatureFrom::Nowhere | TemperatureFrom::Frames) || now < self.temperature_due {
+    /// Reads the temperature when it is due. A failure is counted and costs no samples.
+    fn read_temperature(&mut self, now: Nanos, counters: &mut ImuCounters) {
+        let from = &self.die.spec.temperature.from;
+        if matches!(from, TemperatureSource::Nowhere | TemperatureSource::Frames) || now < self.temperature_due {
             return;
         }
         self.temperature_due = now + TEMPERATURE_EVERY;
         match self.die.temperature() {
             Ok(known) => self.temperature_c = known,
-            Err(fault) => counters.count(&Trouble::Bus(fault)),
+            Err(fault) => counters.count(&ImuError::Bus(fault)),
         }
     }
 
-    fn check_frozen(&self) -> Result<(), Trouble> {
-        let too_long = |a: &&Axes| self.frozen_samples > 0 && a.repeats + 1 >= self.frozen_samples;
-        match [&self.accel, &self.gyro].into_iter().flatten().find(too_long) {
-            Some(axes) => Err(Trouble::Frozen(axes.name)),
+    fn check_frozen(&mut self) -> Result<(), ImuError> {
+        let limit = self.frozen_samples;
+        match self.sensors().find(|a| limit > 0 && a.repeats + 1 >= limit) {
+            Some(axes) => Err(ImuError::Frozen(axes.name)),
             None => Ok(()),
         }
     }

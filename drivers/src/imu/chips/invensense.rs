@@ -1,39 +1,45 @@
-//! InvenSense (TDK): MPU-9250 and MPU-6500, ICM-20948, ICM-42688-P. Words are big-endian, the FIFO drops or overwrites
-//! bytes when it is full.
+//! InvenSense (TDK): MPU-9250 and MPU-6500, ICM-20948, ICM-42688-P. Words are big-endian; a full FIFO drops or overwrites
+//! bytes.
 
 use super::Step::{Change, Touch, WaitUs, Write};
 use super::*;
 
-/// Ranges of all of them, with the codes of the MPUs (register map RM-MPU-9250A-00, GYRO_CONFIG and
-/// ACCEL_CONFIG) and the ICM-20948. A step is full scale over 2^15.
-const ACCEL_RANGES: &[(f64, u8, f64)] =
-    &[(2.0, 0, 2.0 / 32768.0), (4.0, 1, 4.0 / 32768.0), (8.0, 2, 8.0 / 32768.0), (16.0, 3, 16.0 / 32768.0)];
-const GYRO_RANGES: &[(f64, u8, f64)] = &[
-    (250.0, 0, 250.0 / 32768.0),
-    (500.0, 1, 500.0 / 32768.0),
-    (1000.0, 2, 1000.0 / 32768.0),
-    (2000.0, 3, 2000.0 / 32768.0),
-];
+/// Gyro ranges of the MPUs (register map RM-MPU-9250A-00, GYRO_CONFIG) and the ICM-20948.
+const GYRO_250_TO_2000: &[Range] = &[range(250.0, 0), range(500.0, 1), range(1000.0, 2), range(2000.0, 3)];
 
-/// Register map, TEMP_OUT, with the sensitivity of product specification PS-MPU-9250A-01: (raw - 0) / 333.87 + 21.
-const DEGREES: Temperature = Temperature { from: TemperatureFrom::Frames, c_per_lsb: 1.0 / 333.87, c_at_zero: 21.0 };
+/// TEMP_OUT of the MPUs and the ICM-20948 (register map, and PS-MPU-9250A-01 for the sensitivity): raw / 333.87 + 21.
+const DEGREES: Temperature = Temperature { from: TemperatureSource::Frames, c_per_lsb: 1.0 / 333.87, c_at_zero: 21.0 };
 
-/// From here on the old FIFOs of 512 bytes are taken for full: of more than 32 frames ArduPilot met corrupt ones at their
-/// end, and Linux leaves three frames for those that come while it reads.
-const MPU_FULL: usize = 33 * 14;
+/// The FIFO of 512 bytes of the MPUs and the ICM-20948 (product specification, "FIFO"). It counts as full from 33 frames
+/// on: beyond 32 ArduPilot met corrupt frames, and Linux leaves three frames for those that come while it reads.
+const fn fifo_512(count: Reg, data: Reg, layout: Layout, reset: &'static [Step]) -> Fifo {
+    Fifo {
+        count,
+        count_bytes: 2,
+        count_mask: 0x1FFF,
+        overrun: 0,
+        unit: 1,
+        data,
+        capacity: 512,
+        full: 33 * 14,
+        layout,
+        reset,
+    }
+}
 
-/// Steps of the push where the factory left no codes (Criteria B of the same note): 60 °/s at ±250, 225 to 675 mg at ±2 g.
-const GYRO_PUSH: (f64, f64) = (60.0 * 32768.0 / 250.0, f64::INFINITY);
-const ACCEL_PUSH: (f64, f64) = (0.225 * 16384.0, 0.675 * 16384.0);
+/// Answers to the self-test, in steps, of a die without factory codes (Criteria B of AN-MPU-9250A-03): 60 °/s at ±250 °/s,
+/// 225 to 675 mg at ±2 g.
+const GYRO_UNCODED: (f64, f64) = (60.0 * 32768.0 / 250.0, f64::INFINITY);
+const ACCEL_UNCODED: (f64, f64) = (0.225 * 16384.0, 0.675 * 16384.0);
 
-/// What the MPUs and the ICM-20948 frame: accelerometer, then by register order temperature or gyro.
-const MPU_FRAME: Layout =
-    Layout::Plain { len: 14, accel: Some(0), temperature: Some(6), gyro: Some(8), big_endian: true };
-const ICM_20948_FRAME: Layout =
-    Layout::Plain { len: 14, accel: Some(0), gyro: Some(6), temperature: Some(12), big_endian: true };
+/// Frames of the MPUs and of the ICM-20948: in the order of their registers.
+const MPU_FRAME: Layout = Layout::Plain { len: 14, accel: Some(0), temperature: Some(6), gyro: Some(8) };
+const ICM_20948_FRAME: Layout = Layout::Plain { len: 14, accel: Some(0), gyro: Some(6), temperature: Some(12) };
 
-/// Checked against Linux's inv_mpu6050, ArduPilot and PX4; its registers are those of the MPU-6500.
-pub const MPU_9250: Die = Die {
+/// MPU-9250, whose registers are those of the MPU-6500.
+///
+/// Checked against Linux's inv_mpu6050, ArduPilot and PX4.
+pub const MPU_9250: DieSpec = DieSpec {
     name: "MPU-9250",
     // Register map, WHO_AM_I: 0x71; its sister MPU-9255 answers 0x73.
     who: 0x75,
@@ -41,33 +47,24 @@ pub const MPU_9250: Die = Die {
     ..MPU_6500
 };
 
-/// Checked against Linux's inv_mpu6050 (which in the test's machine drives the same simulated chip), ArduPilot and PX4.
-pub const MPU_6500: Die = Die {
+/// MPU-6500.
+///
+/// Checked against Linux's inv_mpu6050 (which drives the same simulated chip in tests/hil), ArduPilot and PX4.
+pub const MPU_6500: DieSpec = DieSpec {
     name: "MPU-6500",
     // Register map RM-MPU-6500A-00, WHO_AM_I.
     who: 0x75,
     who_answers: &[0x70],
     bank_select: None,
     spi_dummy: 0,
-    accel: Some(Sense { ranges: ACCEL_RANGES, data: 0x3B, big_endian: true }),
-    gyro: Some(Sense { ranges: GYRO_RANGES, data: 0x43, big_endian: true }),
+    big_endian: true,
+    accel: Some(SensorSpec { ranges: ACCEL_2_TO_16, data: 0x3B }),
+    gyro: Some(SensorSpec { ranges: GYRO_250_TO_2000, data: 0x43 }),
     // Register map, SMPLRT_DIV: 1 kHz / (1 + SMPLRT_DIV) while the low-pass filter is on.
     rates: Rates::Divided { base_hz: 1000.0, code_max: 255 },
     temperature: DEGREES,
-    fifo: Fifo {
-        // Register map, FIFO_COUNTH and L; 512 bytes (product specification, "FIFO").
-        count: 0x72,
-        count_bytes: 2,
-        count_big_endian: true,
-        count_mask: 0x1FFF,
-        overrun: 0,
-        unit: 1,
-        data: 0x74,
-        capacity: 512,
-        full: MPU_FULL,
-        layout: MPU_FRAME,
-        reset: MPU_FIFO_RESET,
-    },
+    // Register map, FIFO_COUNTH and FIFO_R_W.
+    fifo: fifo_512(0x72, 0x74, MPU_FRAME, MPU_FIFO_RESET),
     // PWR_MGMT_1: H_RESET; at most 100 ms to the first register access (product specification, "Start-up time for
     // register read/write"); then the best clock there is.
     reset: &[Write(0x6B, 0x80), WaitUs(100_000), Write(0x6B, 0x01), WaitUs(1000)],
@@ -76,19 +73,24 @@ pub const MPU_6500: Die = Die {
     self_tests: MPU_TESTS,
 };
 
-/// FIFO_EN: temperature, gyro, accelerometer. USER_CTRL: FIFO_EN, and FIFO_RST, which clears itself. As Linux and ArduPilot
-/// have it, nothing is written to the FIFO meanwhile: half a frame in it would shift all that follow.
+/// FIFO_EN: temperature, gyro, accelerometer. USER_CTRL: FIFO_EN, and FIFO_RST, which clears itself. As in Linux and
+/// ArduPilot, nothing goes into the FIFO meanwhile: half a frame in it would shift all that follow.
 const MPU_FIFO_RESET: &[Step] =
     &[Write(0x23, 0x00), Change(0x6A, 0x40, 0x04), Change(0x6A, 0x00, 0x40), Write(0x23, 0xF8)];
 
-fn configure_mpu(s: &Setting) -> Vec<Step> {
-    // CONFIG and ACCEL_CONFIG 2, DLPF_CFG and A_DLPFCFG: the band next below half the rate, 41, 92 or 184 Hz.
-    let band = match 1000.0 / (1.0 + f64::from(s.rate)) {
+/// Code of the low-pass filter whose band is next below half the rate `base_hz / (1 + code)`.
+fn band(base_hz: f64, code: u8) -> u8 {
+    match base_hz / (1.0 + f64::from(code)) {
         hz if hz <= 120.0 => 3,
         hz if hz <= 250.0 => 2,
         _ => 1,
-    };
-    let mut steps = vec![
+    }
+}
+
+fn configure_mpu(s: &Setting) -> Vec<Step> {
+    // CONFIG and ACCEL_CONFIG 2, DLPF_CFG and A_DLPFCFG: 41, 92 or 184 Hz.
+    let band = band(1000.0, s.rate);
+    vec![
         // USER_CTRL: by SPI the I2C interface off.
         Write(0x6A, if s.spi { 0x10 } else { 0x00 }),
         Write(0x6C, 0x00),
@@ -103,41 +105,37 @@ fn configure_mpu(s: &Setting) -> Vec<Step> {
         Write(0x38, u8::from(s.data_ready)),
         // The gyro's start-up time is 35 ms; Linux waits 70.
         WaitUs(70_000),
-    ];
-    steps.extend(MPU_FIFO_RESET);
-    steps
+    ]
 }
 
 /// Application note "MPU-Hardware Offset Registers and self-test" (AN-MPU-9250A-03): ±250 °/s and ±2 g, filters at 2.
 const MPU_TESTS: &[SelfTest] = &[
     SelfTest::Factory(FactoryTest {
-        of: Which::Gyro,
+        sensor: Sensor::Gyro,
         prepare: &[Write(0x19, 0), Write(0x1A, 2), Write(0x1D, 2), Write(0x1B, 0), Write(0x1C, 0)],
         on: &[Write(0x1B, 0xE0)],
         off: &[Write(0x1B, 0x00)],
         codes: [0x00, 0x01, 0x02],
-        base: 2620.0,
         ratio: (0.5, f64::INFINITY),
-        uncoded: GYRO_PUSH,
+        uncoded: GYRO_UNCODED,
         settle_us: 25_000,
     }),
     SelfTest::Factory(FactoryTest {
-        of: Which::Accel,
+        sensor: Sensor::Accel,
         prepare: &[],
         on: &[Write(0x1C, 0xE0)],
         off: &[Write(0x1C, 0x00)],
         codes: [0x0D, 0x0E, 0x0F],
-        base: 2620.0,
         ratio: (0.5, 1.5),
-        uncoded: ACCEL_PUSH,
+        uncoded: ACCEL_UNCODED,
         settle_us: 25_000,
     }),
 ];
 
-/// Data sheet DS-000189. The motion processor inside is not used.
+/// ICM-20948. Data sheet DS-000189. The motion processor inside is not used.
 ///
 /// Checked against ArduPilot, PX4 and Zephyr's icm20948; the self-test against InvenSense's drivers.
-pub const ICM_20948: Die = Die {
+pub const ICM_20948: DieSpec = DieSpec {
     name: "ICM-20948",
     // WHO_AM_I.
     who: banked(0, 0x00),
@@ -145,26 +143,14 @@ pub const ICM_20948: Die = Die {
     // REG_BANK_SEL, bits 5:4, in every bank.
     bank_select: Some((0x7F, 4)),
     spi_dummy: 0,
-    accel: Some(Sense { ranges: ACCEL_RANGES, data: banked(0, 0x2D), big_endian: true }),
-    gyro: Some(Sense { ranges: GYRO_RANGES, data: banked(0, 0x33), big_endian: true }),
+    big_endian: true,
+    accel: Some(SensorSpec { ranges: ACCEL_2_TO_16, data: banked(0, 0x2D) }),
+    gyro: Some(SensorSpec { ranges: GYRO_250_TO_2000, data: banked(0, 0x33) }),
     // GYRO_SMPLRT_DIV and ACCEL_SMPLRT_DIV: 1125 Hz / (1 + divider) for both while both run.
     rates: Rates::Divided { base_hz: 1125.0, code_max: 255 },
-    // TEMP_OUT: as the MPUs.
     temperature: DEGREES,
-    fifo: Fifo {
-        // FIFO_COUNTH and L; 512 bytes.
-        count: banked(0, 0x70),
-        count_bytes: 2,
-        count_big_endian: true,
-        count_mask: 0x1FFF,
-        overrun: 0,
-        unit: 1,
-        data: banked(0, 0x72),
-        capacity: 512,
-        full: MPU_FULL,
-        layout: ICM_20948_FRAME,
-        reset: ICM_20948_FIFO_RESET,
-    },
+    // FIFO_COUNTH and FIFO_R_W.
+    fifo: fifo_512(banked(0, 0x70), banked(0, 0x72), ICM_20948_FRAME, ICM_20948_FIFO_RESET),
     // PWR_MGMT_1: DEVICE_RESET, then awake on the best clock.
     reset: &[Write(banked(0, 0x06), 0x80), WaitUs(100_000), Write(banked(0, 0x06), 0x01), WaitUs(20_000)],
     configure: configure_icm_20948,
@@ -172,8 +158,8 @@ pub const ICM_20948: Die = Die {
     self_tests: ICM_20948_TESTS,
 };
 
-/// FIFO_EN_2: accelerometer, gyro, temperature. USER_CTRL: FIFO_EN. FIFO_RST: assert and release. As ArduPilot has it,
-/// nothing is written to the FIFO meanwhile.
+/// FIFO_EN_2: accelerometer, gyro, temperature. USER_CTRL: FIFO_EN. FIFO_RST: assert and release. As in ArduPilot, nothing
+/// goes into the FIFO meanwhile.
 const ICM_20948_FIFO_RESET: &[Step] = &[
     Write(banked(0, 0x67), 0x00),
     Change(banked(0, 0x03), 0x40, 0x00),
@@ -185,12 +171,8 @@ const ICM_20948_FIFO_RESET: &[Step] = &[
 
 fn configure_icm_20948(s: &Setting) -> Vec<Step> {
     // GYRO_CONFIG_1 and ACCEL_CONFIG: bands of 51, 120 or 152 Hz (gyro), 50, 111 or 246 Hz (accelerometer).
-    let band = match 1125.0 / (1.0 + f64::from(s.rate)) {
-        hz if hz <= 120.0 => 3,
-        hz if hz <= 250.0 => 2,
-        _ => 1,
-    };
-    let mut steps = vec![
+    let band = band(1125.0, s.rate);
+    vec![
         Write(banked(0, 0x07), 0x00),
         // USER_CTRL: by SPI the I2C interface off.
         Write(banked(0, 0x03), if s.spi { 0x10 } else { 0x00 }),
@@ -208,15 +190,13 @@ fn configure_icm_20948(s: &Setting) -> Vec<Step> {
         WaitUs(70_000),
         // FIFO_MODE: takes no more when full.
         Write(banked(0, 0x69), 0x1F),
-    ];
-    steps.extend(ICM_20948_FIFO_RESET);
-    steps
+    ]
 }
 
 /// SELF_TEST_X_GYRO to Z_ACCEL (codes), GYRO_CONFIG_2 and ACCEL_CONFIG_2 (switches); the procedure is that of the MPUs.
 const ICM_20948_TESTS: &[SelfTest] = &[
     SelfTest::Factory(FactoryTest {
-        of: Which::Gyro,
+        sensor: Sensor::Gyro,
         prepare: &[
             Write(banked(0, 0x07), 0x00),
             Write(banked(2, 0x00), 0x0A),
@@ -227,29 +207,27 @@ const ICM_20948_TESTS: &[SelfTest] = &[
         on: &[Write(banked(2, 0x02), 0x38)],
         off: &[Write(banked(2, 0x02), 0x00)],
         codes: [banked(1, 0x02), banked(1, 0x03), banked(1, 0x04)],
-        base: 2620.0,
         ratio: (0.5, f64::INFINITY),
-        uncoded: GYRO_PUSH,
+        uncoded: GYRO_UNCODED,
         settle_us: 40_000,
     }),
     SelfTest::Factory(FactoryTest {
-        of: Which::Accel,
+        sensor: Sensor::Accel,
         prepare: &[],
         on: &[Write(banked(2, 0x15), 0x1C)],
         off: &[Write(banked(2, 0x15), 0x00)],
         codes: [banked(1, 0x0E), banked(1, 0x0F), banked(1, 0x10)],
-        base: 2620.0,
         ratio: (0.5, 1.5),
-        uncoded: ACCEL_PUSH,
+        uncoded: ACCEL_UNCODED,
         settle_us: 40_000,
     }),
 ];
 
-/// Data sheet DS-000347, register descriptions.
+/// ICM-42688-P. Data sheet DS-000347, register descriptions.
 ///
 /// Checked against Linux's inv_icm42600, Zephyr's icm4268x, ArduPilot, PX4 and Betaflight; the self-test against InvenSense's
-/// drivers. No data sheet has the bits of INTF_CONFIG1, nor the count that is 0 at first (Linux).
-pub const ICM_42688_P: Die = Die {
+/// drivers. The bits of INTF_CONFIG1, and that the first count is 0 (Linux), are in no data sheet.
+pub const ICM_42688_P: DieSpec = DieSpec {
     name: "ICM-42688-P",
     // WHO_AM_I.
     who: banked(0, 0x75),
@@ -257,32 +235,21 @@ pub const ICM_42688_P: Die = Die {
     // REG_BANK_SEL, bits 2:0.
     bank_select: Some((0x76, 0)),
     spi_dummy: 0,
-    accel: Some(Sense {
+    big_endian: true,
+    accel: Some(SensorSpec {
         // ACCEL_CONFIG0.
-        ranges: &[(2.0, 3, 2.0 / 32768.0), (4.0, 2, 4.0 / 32768.0), (8.0, 1, 8.0 / 32768.0), (16.0, 0, 16.0 / 32768.0)],
+        ranges: &[range(2.0, 3), range(4.0, 2), range(8.0, 1), range(16.0, 0)],
         data: banked(0, 0x1F),
-        big_endian: true,
     }),
-    gyro: Some(Sense {
-        // GYRO_CONFIG0.
-        ranges: &[
-            (125.0, 4, 125.0 / 32768.0),
-            (250.0, 3, 250.0 / 32768.0),
-            (500.0, 2, 500.0 / 32768.0),
-            (1000.0, 1, 1000.0 / 32768.0),
-            (2000.0, 0, 2000.0 / 32768.0),
-        ],
-        data: banked(0, 0x25),
-        big_endian: true,
-    }),
+    // GYRO_CONFIG0.
+    gyro: Some(SensorSpec { ranges: GYRO_125_TO_2000, data: banked(0, 0x25) }),
     rates: Rates::Listed(&[(25.0, 10), (50.0, 9), (100.0, 8), (200.0, 7), (500.0, 15), (1000.0, 6), (2000.0, 5)]),
     // "FIFO", packet 3: the byte of the FIFO / 2.07 + 25.
-    temperature: Temperature { from: TemperatureFrom::Frames, c_per_lsb: 1.0 / 2.07, c_at_zero: 25.0 },
+    temperature: Temperature { from: TemperatureSource::Frames, c_per_lsb: 1.0 / 2.07, c_at_zero: 25.0 },
     fifo: Fifo {
         // FIFO_COUNTH and L; 2 KiB ("FIFO"), and what the read path holds.
         count: banked(0, 0x2E),
         count_bytes: 2,
-        count_big_endian: true,
         count_mask: 0xFFFF,
         overrun: 0,
         unit: 1,
@@ -299,11 +266,11 @@ pub const ICM_42688_P: Die = Die {
     self_tests: ICM_42688_P_TESTS,
 };
 
-/// SIGNAL_PATH_RESET: FIFO_FLUSH. The first count after it is always 0, whatever there is.
+/// SIGNAL_PATH_RESET: FIFO_FLUSH. The first count after it is always 0, whatever the FIFO holds.
 const ICM_42688_P_FIFO_RESET: &[Step] = &[Write(banked(0, 0x4B), 0x02), WaitUs(100), Touch(banked(0, 0x2E))];
 
 fn configure_icm_42688_p(s: &Setting) -> Vec<Step> {
-    let mut steps = vec![
+    vec![
         // INT_CONFIG and INT_CONFIG1: a pulse, push-pull, active high; INT_ASYNC_RESET off, as its text
         // demands for the pins to work.
         Write(banked(0, 0x14), 0x03),
@@ -323,31 +290,27 @@ fn configure_icm_42688_p(s: &Setting) -> Vec<Step> {
         // FIFO_CONFIG1: temperature, gyro, accelerometer. FIFO_CONFIG: a stream.
         Write(banked(0, 0x5F), 0x07),
         Write(banked(0, 0x16), 0x40),
-    ];
-    steps.extend(ICM_42688_P_FIFO_RESET);
-    steps
+    ]
 }
 
 /// SELF_TEST_CONFIG; codes XG_ST_DATA of bank 1 and XA_ST_DATA of bank 2; at ±250 °/s and ±2 g, 1 kHz.
 const ICM_42688_P_TESTS: &[SelfTest] = &[
     SelfTest::Factory(FactoryTest {
-        of: Which::Gyro,
+        sensor: Sensor::Gyro,
         prepare: &[Write(banked(0, 0x4F), 0x66), Write(banked(0, 0x50), 0x66), Write(banked(0, 0x4E), 0x0F)],
         on: &[Write(banked(0, 0x70), 0x07)],
         off: &[Write(banked(0, 0x70), 0x00)],
         codes: [banked(1, 0x5F), banked(1, 0x60), banked(1, 0x61)],
-        base: 2620.0,
         ratio: (0.5, f64::INFINITY),
-        uncoded: GYRO_PUSH,
+        uncoded: GYRO_UNCODED,
         settle_us: 200_000,
     }),
     SelfTest::Factory(FactoryTest {
-        of: Which::Accel,
+        sensor: Sensor::Accel,
         prepare: &[],
         on: &[Write(banked(0, 0x70), 0x78)],
         off: &[Write(banked(0, 0x70), 0x00)],
         codes: [banked(2, 0x3B), banked(2, 0x3C), banked(2, 0x3D)],
-        base: 2620.0,
         ratio: (0.5, 1.5),
         // 50 to 1200 mg.
         uncoded: (0.05 * 16384.0, 1.2 * 16384.0),

@@ -1,10 +1,11 @@
-//! The inertial units we drive by their registers, as tables: what answers to WHO_AM_I, what each range and rate is
-//! called, where the data stand, how the FIFO frames them, and how the unit tests itself. Every fact is from the
-//! data sheet whose name stands beside it, with the register or the title of the section it is under. "Checked
-//! against" names the open drivers that were read beside it, and what fewer than two of them bear out. No table has met
-//! its chip yet. All that runs is in `die`, `frames` and `self_test`.
+//! The inertial units that are driven by their registers, as tables: what answers to WHO_AM_I, the codes of ranges and
+//! rates, where the data stand, how the FIFO frames them, and how the unit tests itself. Every fact is from the data sheet
+//! named beside it, with the register or the title of the section. "Checked against" names the open drivers that were
+//! compared with the table, and which facts fewer than two of them confirm. No table has met its chip yet.
 //!
-//! A unit is one die with both sensors, or two with one each (BMI088), which run on clocks of their own.
+//! Input is what a board file asks for (chip, rate, ranges), output a `DieSpec` with the codes that set it. A unit is one
+//! die with both sensors, or two dies with one each (BMI088), which run on clocks of their own. All that talks to a die is
+//! in `die`, `frames` and `self_test`; a table holds no code but the list of writes that configures its chip.
 
 mod bosch;
 mod invensense;
@@ -12,7 +13,37 @@ mod st;
 
 use crate::{Fault, FaultKind};
 
-/// Register address, its bank in the high byte.
+/// The units that are driven, by the names that board files use.
+pub const CHIPS: &[Chip] = &[
+    Chip { name: "bmi088", dies: &[bosch::BMI088_GYRO, bosch::BMI088_ACCEL] },
+    Chip { name: "bmi270", dies: &[bosch::BMI270] },
+    Chip { name: "icm-42688-p", dies: &[invensense::ICM_42688_P] },
+    Chip { name: "icm-20948", dies: &[invensense::ICM_20948] },
+    Chip { name: "lsm6dsox", dies: &[st::LSM6DSOX] },
+    Chip { name: "mpu-9250", dies: &[invensense::MPU_9250] },
+    Chip { name: "mpu-6500", dies: &[invensense::MPU_6500] },
+];
+
+/// An inertial unit.
+pub struct Chip {
+    /// The name in board files.
+    pub name: &'static str,
+    /// One or two; the one with the gyro first, whose samples set the times of both.
+    pub dies: &'static [DieSpec],
+}
+
+impl Chip {
+    /// The unit of a name; a fault lists those that there are.
+    pub fn named(name: &str) -> Result<&'static Chip, Fault> {
+        CHIPS.iter().find(|c| c.name == name).ok_or_else(|| {
+            let known = CHIPS.iter().map(|c| c.name).collect::<Vec<_>>().join(", ");
+            let fix = format!("choose one of {known}, or `iio` for a unit that the kernel drives");
+            Fault::new(FaultKind::Config, "imu.chip", format!("`{name}` is not driven"), fix)
+        })
+    }
+}
+
+/// A register's address, its bank in the high byte.
 pub type Reg = u16;
 
 /// Register `address` of a bank.
@@ -20,59 +51,80 @@ pub const fn banked(bank: u8, address: u8) -> Reg {
     (bank as Reg) << 8 | address as Reg
 }
 
-pub struct Chip {
-    /// As a board file writes it.
+/// What there is to know of one die.
+pub struct DieSpec {
     pub name: &'static str,
-    /// The one with the gyro first: its samples set the time of the pair.
-    pub dies: &'static [Die],
-}
-
-pub struct Die {
-    pub name: &'static str,
-    /// WHO_AM_I, and what it may answer.
+    /// WHO_AM_I, and its possible answers.
     pub who: Reg,
     pub who_answers: &'static [u8],
-    /// Where the bank is chosen, and by how much the bank's number is shifted.
+    /// The register that selects a bank, and the shift of the bank's number in it.
     pub bank_select: Option<(u8, u32)>,
     /// Bytes between address and data of a read by SPI.
     pub spi_dummy: usize,
-    pub accel: Option<Sense>,
-    pub gyro: Option<Sense>,
+    /// Byte order of all words.
+    pub big_endian: bool,
+    pub accel: Option<SensorSpec>,
+    pub gyro: Option<SensorSpec>,
     pub rates: Rates,
     pub temperature: Temperature,
     pub fifo: Fifo,
-    /// Brings it from power-on into a known idle state; WHO_AM_I is read after.
+    /// Steps from any state to a known idle one; WHO_AM_I is read after them.
     pub reset: &'static [Step],
-    /// From there to sampling into the FIFO.
+    /// Steps from there to sampling into the FIFO.
     pub configure: fn(&Setting) -> Vec<Step>,
-    /// How much of the gyro's z is in its x, in 1/512, seven bits (BMI270).
+    /// The part of the gyro's z that is in its x, in 1/512, seven bits (BMI270).
     pub cross_axis: Option<Reg>,
     pub self_tests: &'static [SelfTest],
 }
 
 /// One of the two sensors of a die.
-pub struct Sense {
-    /// g or °/s at full scale, the register's code, and g or °/s of one step.
-    pub ranges: &'static [(f64, u8, f64)],
-    /// Three words from here: the newest sample.
+pub struct SensorSpec {
+    /// In rising order.
+    pub ranges: &'static [Range],
+    /// Where the newest sample stands: three words.
     pub data: Reg,
-    pub big_endian: bool,
 }
 
+/// A range of a sensor: full scale, its code, and the size of a step. Accelerometers in g, gyros in °/s.
+pub struct Range {
+    pub full_scale: f64,
+    pub code: u8,
+    pub per_lsb: f64,
+}
+
+/// A range whose full scale is 2^15 steps.
+const fn range(full_scale: f64, code: u8) -> Range {
+    Range { full_scale, code, per_lsb: full_scale / 32768.0 }
+}
+
+/// Ranges that several units share.
+const ACCEL_2_TO_16: &[Range] = &[range(2.0, 0), range(4.0, 1), range(8.0, 2), range(16.0, 3)];
+const GYRO_125_TO_2000: &[Range] =
+    &[range(125.0, 4), range(250.0, 3), range(500.0, 2), range(1000.0, 1), range(2000.0, 0)];
+
+impl SensorSpec {
+    /// The range of a code that came from this table.
+    pub fn range(&self, code: u8) -> &Range {
+        self.ranges.iter().find(|r| r.code == code).expect("codes of ranges come from the table")
+    }
+}
+
+/// Sample rates, Hz.
 pub enum Rates {
-    /// Hz and the register's code.
+    /// Each rate with its code.
     Listed(&'static [(f64, u8)]),
-    /// base / (1 + code).
+    /// `base_hz / (1 + code)`.
     Divided { base_hz: f64, code_max: u8 },
 }
 
 impl Rates {
-    /// The rate next to the one asked for, and its code.
+    /// The rate nearest to `hz`, by ratio, and its code.
     pub fn nearest(&self, hz: f64) -> (f64, u8) {
         match *self {
             Rates::Listed(rates) => {
-                let by_ratio = |a: &&(f64, u8), b: &&(f64, u8)| (a.0 / hz).ln().abs().total_cmp(&(b.0 / hz).ln().abs());
-                *rates.iter().min_by(by_ratio).expect("tables are not empty")
+                let distance = |rate: &&(f64, u8)| (rate.0 / hz).ln().abs();
+                let nearest = rates.iter().min_by(|a, b| distance(a).total_cmp(&distance(b)));
+                *nearest.expect("tables are not empty")
             }
             Rates::Divided { base_hz, code_max } => {
                 let code = (base_hz / hz - 1.0).round().clamp(0.0, f64::from(code_max));
@@ -82,50 +134,54 @@ impl Rates {
     }
 }
 
-/// Where the temperature comes from: °C = raw * scale + offset.
+/// The temperature of a die: °C = raw * c_per_lsb + c_at_zero.
 pub struct Temperature {
-    pub from: TemperatureFrom,
+    pub from: TemperatureSource,
     pub c_per_lsb: f64,
     pub c_at_zero: f64,
 }
 
-pub enum TemperatureFrom {
+/// Where a die's temperature stands.
+pub enum TemperatureSource {
     Nowhere,
-    /// It rides in the frames of the FIFO.
+    /// In the frames of the FIFO.
     Frames,
-    /// Two bytes, low first.
+    /// In a word of its own.
     Word(Reg),
-    /// 11 bits, high byte first, low bits on top of the second (BMI088).
-    Eleven(Reg),
+    /// In 11 bits, high byte first, the low bits on top of the second (BMI088).
+    ElevenBits(Reg),
 }
 
+/// A die's FIFO.
 pub struct Fifo {
-    /// Two bytes (one where `count_bytes` is 1), then masked.
+    /// Where the count stands: a word (a byte where `count_bytes` is 1), masked by `count_mask`.
     pub count: Reg,
     pub count_bytes: usize,
-    pub count_big_endian: bool,
     pub count_mask: u16,
     /// Bits beside the count that say that samples were lost; 0: none do.
     pub overrun: u16,
     /// Bytes that one count stands for.
     pub unit: usize,
     pub data: Reg,
+    /// Bytes.
     pub capacity: usize,
-    /// Bytes from which on the next sample is refused or overwrites the oldest: what it holds is of no use.
+    /// Bytes from which on the next sample is refused or overwrites the oldest: the content is of no use then.
     pub full: usize,
     pub layout: Layout,
+    /// Steps that empty it.
     pub reset: &'static [Step],
 }
 
+/// How a FIFO frames its samples.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Layout {
-    /// Frames of one length; bytes at which each triple, and the temperature's word, begin.
-    Plain { len: usize, accel: Option<usize>, gyro: Option<usize>, temperature: Option<usize>, big_endian: bool },
-    /// ICM-42688-P, packet 3: a header, both triples, a byte of temperature, a time.
+    /// Frames of one length; byte at which each triple, and the temperature's word, begins.
+    Plain { len: usize, accel: Option<usize>, gyro: Option<usize>, temperature: Option<usize> },
+    /// Packet 3 of the ICM-42688-P: a header, both triples, a byte of temperature, a time.
     Packet3,
-    /// A header a frame; `config` bytes follow one that says the configuration changed.
+    /// Frames with a header each; `config` bytes follow the one that says that the configuration changed.
     Bosch { config: usize },
-    /// Seven bytes a word: a tag, then three values.
+    /// Seven bytes for each sensor: a tag, then three values.
     Tagged,
 }
 
@@ -140,142 +196,119 @@ impl Layout {
     }
 }
 
-/// What a die is told to do, in its own codes.
+/// How a die is to be set, in its own codes.
 #[derive(Clone, Copy, Debug)]
 pub struct Setting {
     pub rate: u8,
     pub accel: u8,
     pub gyro: u8,
+    /// It is wired by SPI: its I2C interface is turned off.
     pub spi: bool,
     /// Drive the data-ready line.
     pub data_ready: bool,
 }
 
+/// One access to a die's registers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Step {
     Write(Reg, u8),
-    /// Clears bits, then sets others, and keeps the rest.
+    /// Clears the first bits, then sets the second, and keeps the rest.
     Change(Reg, u8, u8),
     WaitUs(u32),
     /// A read whose answer does not matter: it wakes the interface up.
     Touch(Reg),
-    /// The BMI270's configuration file, until it runs.
+    /// Sends the BMI270's configuration file and waits until it runs.
     Upload,
 }
 
+/// A test that a die makes of one of its sensors while the board stands still.
 pub enum SelfTest {
-    /// A sensor is pushed by a known force: the newest sample with `on` less that with `off`, in g or °/s at a range,
-    /// is to be within.
-    Push(Push),
-    /// As InvenSense does it: the push, as a part of what it was at the factory.
+    /// The proof mass is deflected by a known force, and the answer must lie within stated limits.
+    Excitation(ExcitationTest),
+    /// The same, and the answer is compared with that at the factory (InvenSense).
     Factory(FactoryTest),
-    /// The die decides (Bosch's gyros).
-    Asked(Asked),
+    /// The die tests itself and says whether all is well (Bosch's gyros).
+    BuiltIn(BuiltInTest),
 }
 
-pub struct Push {
-    pub of: Which,
+/// The newest sample with the force on less that with it off, in g or °/s, must lie `within` on each axis.
+pub struct ExcitationTest {
+    pub sensor: Sensor,
     pub prepare: &'static [Step],
     pub on: &'static [Step],
     pub off: &'static [Step],
+    /// Size of a step at the range that `prepare` sets.
     pub per_lsb: f64,
     /// Least and largest answer of each axis.
     pub within: [(f64, f64); 3],
 }
 
+/// The answer, in steps, is compared with the factory's, which was `FACTORY_BASE * 1.01^(code - 1)` steps.
 pub struct FactoryTest {
-    pub of: Which,
+    pub sensor: Sensor,
     pub prepare: &'static [Step],
     pub on: &'static [Step],
     pub off: &'static [Step],
-    /// Codes of the three axes: the push at the factory was `base * 1.01^(code - 1)` steps.
+    /// Codes of the three axes.
     pub codes: [Reg; 3],
-    pub base: f64,
-    /// Push over that of the factory.
+    /// Answer over that at the factory.
     pub ratio: (f64, f64),
-    /// Steps of the push of a die of which the factory left no codes.
+    /// Answer, steps, of a die of which the factory left no codes.
     pub uncoded: (f64, f64),
     pub settle_us: u32,
 }
 
-pub struct Asked {
-    pub of: Which,
+/// The die is triggered and answers in a register.
+pub struct BuiltInTest {
+    pub sensor: Sensor,
     pub prepare: &'static [Step],
-    /// Written to start it.
+    /// Register and value that start it.
     pub trigger: (Reg, u8),
-    /// Where it answers: this bit once it is done, and then, of these bits, those that mean that all is well.
     pub answer: Reg,
+    /// Bit of the answer that says that it is done.
     pub done: u8,
+    /// Bits of the answer that say how it went, and their value if all is well.
     pub verdict: u8,
     pub good: u8,
 }
 
+/// Which of a die's sensors.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Which {
+pub enum Sensor {
     Accel,
     Gyro,
 }
 
-pub const CHIPS: &[Chip] = &[
-    Chip { name: "bmi088", dies: &[bosch::BMI088_GYRO, bosch::BMI088_ACCEL] },
-    Chip { name: "bmi270", dies: &[bosch::BMI270] },
-    Chip { name: "icm-42688-p", dies: &[invensense::ICM_42688_P] },
-    Chip { name: "icm-20948", dies: &[invensense::ICM_20948] },
-    Chip { name: "lsm6dsox", dies: &[st::LSM6DSOX] },
-    Chip { name: "mpu-9250", dies: &[invensense::MPU_9250] },
-    Chip { name: "mpu-6500", dies: &[invensense::MPU_6500] },
-];
-
-impl Chip {
-    pub fn named(name: &str) -> Result<&'static Chip, Fault> {
-        CHIPS.iter().find(|c| c.name == name).ok_or_else(|| {
-            let known = CHIPS.iter().map(|c| c.name).collect::<Vec<_>>().join(", ");
-            let fix = format!("choose one of {known}, or `iio` for what the kernel drives");
-            Fault::new(FaultKind::Config, "imu.chip", format!("`{name}` is not driven"), fix)
-        })
-    }
-}
-
-/// How far the nearest rate may be from the one asked for; of an accelerometer whose samples are brought to the gyro's
-/// times anyway, more.
+/// How far, by ratio, the nearest rate may be from the one asked for; an accelerometer's of its own, whose samples are
+/// brought to the gyro's times anyway, may be further.
 const RATE_WITHIN: f64 = 0.1;
 const RATE_WITHIN_ALONE: f64 = 0.25;
 
-impl Die {
-    /// Codes for what is asked for: the rate nearest to `rate_hz`, the smallest ranges that hold what is asked for.
+impl DieSpec {
+    /// The setting nearest to what is asked for, and its rate, Hz: the nearest rate, and the smallest ranges that hold
+    /// `accel_g` and `gyro_dps`.
     pub fn setting(&self, rate_hz: f64, accel_g: f64, gyro_dps: f64) -> Result<(Setting, f64), Fault> {
         let (hz, rate) = self.rates.nearest(rate_hz);
         let within = if self.gyro.is_some() { RATE_WITHIN } else { RATE_WITHIN_ALONE };
         if (hz / rate_hz - 1.0).abs() > within {
             let what = format!("the {} has no rate near {rate_hz} Hz", self.name);
-            return Err(Fault::new(FaultKind::Config, "imu.rate_hz", what, format!("the next is {hz:.1}")));
+            return Err(Fault::new(FaultKind::Config, "imu.rate_hz", what, format!("the nearest is {hz:.1}")));
         }
-        let setting = Setting {
-            rate,
-            accel: range(self.accel.as_ref(), accel_g, "imu.accel_range_g", self.name)?.1,
-            gyro: range(self.gyro.as_ref(), gyro_dps, "imu.gyro_range_dps", self.name)?.1,
-            spi: false,
-            data_ready: false,
-        };
-        Ok((setting, hz))
+        let accel = self.smallest_range(&self.accel, accel_g, "imu.accel_range_g")?;
+        let gyro = self.smallest_range(&self.gyro, gyro_dps, "imu.gyro_range_dps")?;
+        Ok((Setting { rate, accel, gyro, spi: false, data_ready: false }, hz))
     }
-}
 
-impl Sense {
-    pub fn range(&self, code: u8) -> (f64, f64) {
-        let found = self.ranges.iter().find(|r| r.1 == code);
-        let (full, _, per_lsb) = *found.expect("codes of ranges come from the table");
-        (full, per_lsb)
+    /// The code of the smallest range that holds what is asked for; 0 where there is no such sensor.
+    fn smallest_range(&self, sensor: &Option<SensorSpec>, asked: f64, key: &str) -> Result<u8, Fault> {
+        let Some(sensor) = sensor else { return Ok(0) };
+        let smallest = sensor.ranges.iter().find(|r| r.full_scale >= asked);
+        smallest.map(|r| r.code).ok_or_else(|| {
+            let has = sensor.ranges.iter().map(|r| r.full_scale.to_string()).collect::<Vec<_>>().join(", ");
+            let what = format!("the {} does not reach {asked}", self.name);
+            Fault::new(FaultKind::Config, key, what, format!("choose one of {has}"))
+        })
     }
-}
-
-fn range(sense: Option<&Sense>, asked: f64, key: &str, name: &str) -> Result<(f64, u8), Fault> {
-    let Some(sense) = sense else { return Ok((0.0, 0)) };
-    let fitting = sense.ranges.iter().filter(|r| r.0 >= asked).min_by(|a, b| a.0.total_cmp(&b.0));
-    fitting.map(|r| (r.0, r.1)).ok_or_else(|| {
-        let has = sense.ranges.iter().map(|r| r.0.to_string()).collect::<Vec<_>>().join(", ");
-        Fault::new(FaultKind::Config, key, format!("the {name} does not reach {asked}"), format!("choose one of {has}"))
-    })
 }
 
 #[cfg(test)]
@@ -286,7 +319,7 @@ mod tests {
     #[test]
     fn every_chip_has_both_sensors_the_gyro_first() {
         for chip in CHIPS {
-            let both = |f: fn(&Die) -> bool| chip.dies.iter().filter(|d| f(d)).count();
+            let both = |f: fn(&DieSpec) -> bool| chip.dies.iter().filter(|d| f(d)).count();
             assert_eq!((both(|d| d.accel.is_some()), both(|d| d.gyro.is_some())), (1, 1), "{}", chip.name);
             assert!(chip.dies[0].gyro.is_some(), "{}", chip.name);
         }
@@ -295,12 +328,13 @@ mod tests {
     #[test]
     fn tables_are_in_order_and_their_codes_are_distinct() {
         for die in CHIPS.iter().flat_map(|c| c.dies) {
-            for sense in [&die.accel, &die.gyro].into_iter().flatten() {
-                for (i, a) in sense.ranges.iter().enumerate() {
+            for sensor in [&die.accel, &die.gyro].into_iter().flatten() {
+                for (i, a) in sensor.ranges.iter().enumerate() {
                     // A step times 2^15 is full scale, or a little more.
-                    let part = a.2 * 32768.0 / a.0;
+                    let part = a.per_lsb * 32768.0 / a.full_scale;
                     assert!((0.99..1.15).contains(&part), "{}: {part}", die.name);
-                    assert!(sense.ranges[..i].iter().all(|b| b.0 < a.0 && b.1 != a.1), "{}", die.name);
+                    let before = &sensor.ranges[..i];
+                    assert!(before.iter().all(|b| b.full_scale < a.full_scale && b.code != a.code), "{}", die.name);
                 }
             }
             assert!(die.fifo.full <= die.fifo.capacity && die.fifo.capacity < super::super::bus::TRANSFER_MAX);
@@ -313,11 +347,11 @@ mod tests {
         assert_eq!(die.setting(200.0, 8.0, 1000.0).unwrap().1, 200.0);
         assert!((die.setting(210.0, 8.0, 1000.0).unwrap().1 - 200.0).abs() < 1e-9);
         let (setting, _) = die.setting(200.0, 5.0, 600.0).unwrap();
-        assert_eq!(die.accel.as_ref().unwrap().range(setting.accel).0, 8.0);
-        assert_eq!(die.gyro.as_ref().unwrap().range(setting.gyro).0, 1000.0);
+        assert_eq!(die.accel.as_ref().unwrap().range(setting.accel).full_scale, 8.0);
+        assert_eq!(die.gyro.as_ref().unwrap().range(setting.gyro).full_scale, 1000.0);
         let bmi088 = &Chip::named("bmi088").unwrap().dies[1];
         let (setting, _) = bmi088.setting(400.0, 16.0, 1000.0).unwrap();
-        assert_eq!(bmi088.accel.as_ref().unwrap().range(setting.accel).0, 24.0);
+        assert_eq!(bmi088.accel.as_ref().unwrap().range(setting.accel).full_scale, 24.0);
     }
 
     #[test]

@@ -1,30 +1,39 @@
-//! ST: LSM6DSOX. Words are little-endian; the FIFO gives words of a tag and three values, one a sensor.
+//! ST: LSM6DSOX. Words are little-endian; the FIFO gives a tag and three values for each sensor.
 
 use super::Step::{WaitUs, Write};
 use super::*;
 
-/// Data sheet DS12814 and application note AN5272.
+/// LSM6DSOX. Data sheet DS12814 and application note AN5272.
 ///
-/// Checked against ST's lsm6dsox-pid with its self-test example and Linux's st_lsm6dsx. Of ST alone: the flags of an
-/// overrun, the temperature in the FIFO and the self-tests; of the data sheet alone: the length of the data-ready pulse.
-pub const LSM6DSOX: Die = Die {
+/// Checked against ST's lsm6dsox-pid with its self-test example and Linux's st_lsm6dsx. ST's alone confirms the flags of an
+/// overrun, the temperature in the FIFO and the self-tests; the length of the data-ready pulse is in the data sheet alone.
+pub const LSM6DSOX: DieSpec = DieSpec {
     name: "LSM6DSOX",
     // WHO_AM_I.
     who: 0x0F,
     who_answers: &[0x6C],
     bank_select: None,
     spi_dummy: 0,
-    accel: Some(Sense {
+    big_endian: false,
+    accel: Some(SensorSpec {
         // CTRL1_XL and "Mechanical characteristics": codes out of order.
-        ranges: &[(2.0, 0, 0.061e-3), (4.0, 2, 0.122e-3), (8.0, 3, 0.244e-3), (16.0, 1, 0.488e-3)],
+        ranges: &[
+            Range { full_scale: 2.0, code: 0, per_lsb: 0.061e-3 },
+            Range { full_scale: 4.0, code: 2, per_lsb: 0.122e-3 },
+            Range { full_scale: 8.0, code: 3, per_lsb: 0.244e-3 },
+            Range { full_scale: 16.0, code: 1, per_lsb: 0.488e-3 },
+        ],
         data: 0x28,
-        big_endian: false,
     }),
-    gyro: Some(Sense {
-        // CTRL2_G and "Mechanical characteristics": a step is 8.75 m°/s and its doubles, not a power of two of full scale.
-        ranges: &[(250.0, 0, 8.75e-3), (500.0, 1, 17.5e-3), (1000.0, 2, 35e-3), (2000.0, 3, 70e-3)],
+    gyro: Some(SensorSpec {
+        // CTRL2_G and "Mechanical characteristics": full scale is less than 2^15 steps.
+        ranges: &[
+            Range { full_scale: 250.0, code: 0, per_lsb: 8.75e-3 },
+            Range { full_scale: 500.0, code: 1, per_lsb: 17.5e-3 },
+            Range { full_scale: 1000.0, code: 2, per_lsb: 35e-3 },
+            Range { full_scale: 2000.0, code: 3, per_lsb: 70e-3 },
+        ],
         data: 0x22,
-        big_endian: false,
     }),
     // CTRL1_XL and CTRL2_G, ODR, of both.
     rates: Rates::Listed(&[
@@ -39,12 +48,11 @@ pub const LSM6DSOX: Die = Die {
         (3333.0, 9),
     ]),
     // "Temperature sensor characteristics": 256 steps a degree from 25 °C.
-    temperature: Temperature { from: TemperatureFrom::Frames, c_per_lsb: 1.0 / 256.0, c_at_zero: 25.0 },
+    temperature: Temperature { from: TemperatureSource::Frames, c_per_lsb: 1.0 / 256.0, c_at_zero: 25.0 },
     fifo: Fifo {
         // FIFO_STATUS1 and 2: words in the low ten bits; 3 KiB of six bytes each ("FIFO").
         count: 0x3A,
         count_bytes: 2,
-        count_big_endian: false,
         count_mask: 0x03FF,
         // FIFO_STATUS2: FIFO_OVR_IA, and FIFO_OVR_LATCHED, which reading it clears.
         overrun: 0x4800,
@@ -62,8 +70,8 @@ pub const LSM6DSOX: Die = Die {
     cross_axis: None,
     self_tests: &[
         // AN5272, "Accelerometer self-test": ±4 g, 52 Hz, 50 to 1700 mg.
-        SelfTest::Push(Push {
-            of: Which::Accel,
+        SelfTest::Excitation(ExcitationTest {
+            sensor: Sensor::Accel,
             prepare: &[Write(0x12, 0x44), Write(0x10, 0x38), WaitUs(100_000)],
             on: &[Write(0x14, 0x01), WaitUs(100_000)],
             off: &[Write(0x14, 0x00), WaitUs(100_000)],
@@ -71,8 +79,8 @@ pub const LSM6DSOX: Die = Die {
             within: [(0.05, 1.7); 3],
         }),
         // AN5272, "Gyroscope self-test": ±2000 °/s, 208 Hz, 150 to 700 °/s.
-        SelfTest::Push(Push {
-            of: Which::Gyro,
+        SelfTest::Excitation(ExcitationTest {
+            sensor: Sensor::Gyro,
             prepare: &[Write(0x11, 0x5C), WaitUs(100_000)],
             on: &[Write(0x14, 0x04), WaitUs(100_000)],
             off: &[Write(0x14, 0x00), WaitUs(100_000)],
@@ -90,15 +98,13 @@ fn configure_lsm6dsox(s: &Setting) -> Vec<Step> {
         Write(0x13, if s.spi { 0x04 } else { 0x00 }),
         Write(0x10, s.rate << 4 | s.accel << 2),
         Write(0x11, s.rate << 4 | s.gyro << 2),
-        // COUNTER_BDR_REG1: data ready as pulses of 75 µs, as nobody reads the data registers. INT1_CTRL:
-        // of the gyro, on INT1.
+        // COUNTER_BDR_REG1: data ready as pulses of 75 µs, as nobody reads the data registers. INT1_CTRL: the gyro's,
+        // on INT1.
         Write(0x0B, 0x80),
         Write(0x0D, if s.data_ready { 0x02 } else { 0x00 }),
         // The gyro's turn-on time: ST's own examples give it 100 ms.
         WaitUs(100_000),
         // FIFO_CTRL3: both into the FIFO at their rate.
         Write(0x09, s.rate << 4 | s.rate),
-        Write(0x0A, 0x00),
-        Write(0x0A, 0x16),
     ]
 }

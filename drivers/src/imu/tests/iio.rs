@@ -177,7 +177,7 @@ fn scans_of_one_device_are_read_to_the_bit() {
         assert!((sample.accel_body.z / GRAVITY - 1.0).abs() < 1e-3 && reading.saturated);
         assert!((reading.temperature_c.unwrap() - 12.009).abs() < 1e-3);
     }
-    let counted = imu.seen();
+    let counted = imu.counts();
     assert_eq!((counted.imu_short_transfers, counted.imu_saturated, counted.imu_gaps), (1, 5, 0));
 }
 
@@ -219,7 +219,7 @@ fn stamps_that_jump_are_mended_and_gaps_counted() {
     let seen = next(&mut imu).1;
     let kept: Vec<i64> = seen.iter().map(|r| (r.sample.t.0 - t) / 1000).collect();
     assert_eq!(kept, [0, 5000, 5001, 5002, 10_002, 10_003, 50_000, 50_001, 55_000], "no sample is dropped");
-    let counted = imu.seen();
+    let counted = imu.counts();
     assert_eq!((counted.imu_stamps_refused, counted.imu_gaps), (5, 1));
 }
 
@@ -247,8 +247,8 @@ fn a_device_that_goes_is_lost_and_found_under_another_number() {
         }
         seen.extend(next(&mut imu).1);
     }
-    assert!(seen.len() > 20, "{} {:?}", seen.len(), imu.seen());
-    let counted = imu.seen();
+    assert!(seen.len() > 20, "{} {:?}", seen.len(), imu.counts());
+    let counted = imu.counts();
     assert!(counted.imu_gone == 1 && counted.imu_restarts == 1, "{counted:?}");
 }
 
@@ -264,13 +264,13 @@ fn equal_scans_and_silence_close_and_reopen_the_device() {
     }
     let (wait, seen) = next(&mut imu);
     assert_eq!((wait, seen.len()), (Ok(Wait::Got), 45));
-    assert_eq!(imu.seen().imu_frozen, 1);
+    assert_eq!(imu.counts().imu_frozen, 1);
     assert_eq!(kernel.set(0, "buffer/enable"), "0", "closed");
     let until = monotonic() + Span(1200 * MS);
-    while monotonic() < until && imu.seen().imu_silences == 0 {
+    while monotonic() < until && imu.counts().imu_silences == 0 {
         let _ = next(&mut imu);
     }
-    assert!(imu.seen().imu_restarts >= 1 && imu.seen().imu_silences == 1, "{:?}", imu.seen());
+    assert!(imu.counts().imu_restarts >= 1 && imu.counts().imu_silences == 1, "{:?}", imu.counts());
 }
 
 /// The error of opening, in one line.
@@ -332,7 +332,7 @@ fn every_error_of_reading_is_a_loss_that_says_which() {
         let (wait, samples) = next(&mut imu);
         let lost = wait.unwrap_err().to_string();
         assert!(samples.is_empty() && lost.starts_with("lost: ") && lost.contains(said), "{node}: {lost}");
-        let c = imu.seen();
+        let c = imu.counts();
         assert_eq!(c.imu_bus_errors + c.imu_gone, 1, "{node}: {c:?}");
     }
 }
@@ -357,14 +357,14 @@ fn every_error_of_every_call_is_a_loss_that_is_come_back_from_and_a_signal_is_no
             Ok(wait) => assert!(!lost && wait == Wait::TimedOut, "{call} {errno}"),
             Err(fault) => assert!(lost && fault.to_string().contains(&said), "{call} {errno}: {fault}"),
         }
-        let c = imu.seen();
+        let c = imu.counts();
         let counted = c.imu_bus_busy + c.imu_bus_errors + c.imu_gone;
         assert!(samples.is_empty() && counted == u64::from(lost), "{call} {errno}: {c:?}");
         let until = monotonic() + Span(2000 * MS);
         while next(&mut imu).0 != Ok(Wait::Got) {
-            assert!(monotonic() < until, "{call} {errno}: {:?}", imu.seen());
+            assert!(monotonic() < until, "{call} {errno}: {:?}", imu.counts());
         }
-        assert_eq!(imu.seen().imu_restarts, u64::from(lost), "{call} {errno}");
+        assert_eq!(imu.counts().imu_restarts, u64::from(lost), "{call} {errno}");
     }
 }
 

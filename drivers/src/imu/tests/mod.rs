@@ -6,12 +6,12 @@ mod chips;
 pub mod iio;
 mod simulated;
 
-use super::bus::BusFault;
+use super::bus::{Bus, BusFault};
 use super::chips::CHIPS;
 use super::counters::ImuCounters;
-use super::register::RegisterImu;
+use super::edges::Edges;
 use super::unit::GRAVITY;
-use super::{RegisterOptions, Wiring};
+use super::{RegisterImu, RegisterOptions, Wiring};
 use crate::source::{ImuBatch, ImuReading, ImuSource, SourceFault, Wait};
 use crate::types::Span;
 use chips::model;
@@ -20,10 +20,8 @@ use std::io::Write;
 
 const MS: i64 = 1_000_000;
 
-type Imu = RegisterImu<SimBus, SimEdges>;
-
 struct Rig {
-    imu: Imu,
+    imu: RegisterImu,
     buses: Vec<SimBus>,
     seen: Vec<ImuReading>,
     lost: Vec<String>,
@@ -51,6 +49,10 @@ fn buses(chip: &str) -> Vec<SimBus> {
     std::iter::once(first).chain(second).collect()
 }
 
+fn boxed(buses: &[SimBus]) -> Vec<Box<dyn Bus>> {
+    buses.iter().map(|bus| Box::new(bus.clone()) as Box<dyn Bus>).collect()
+}
+
 /// Eight KiB that stand for the BMI270's configuration.
 fn configuration() -> tempfile::NamedTempFile {
     let mut file = tempfile::NamedTempFile::new().unwrap();
@@ -73,7 +75,7 @@ impl Rig {
     fn with(chip: &str, buses: Vec<SimBus>, edges: Option<SimEdges>) -> Rig {
         let file = configuration();
         let options = RegisterOptions { configuration: file.path().into(), ..options(chip) };
-        let imu = options.start(buses.clone(), edges).unwrap();
+        let imu = options.start(boxed(&buses), edges.map(|e| Box::new(e) as Box<dyn Edges>)).unwrap();
         Rig { imu, buses, seen: vec![], lost: vec![] }
     }
 
@@ -102,7 +104,7 @@ impl Rig {
     }
 
     fn counted(&self) -> ImuCounters {
-        self.imu.seen()
+        self.imu.counts()
     }
 
     /// Largest error of a stamp after the first `skip` samples, ns; every sample must be one of the sensor's.
@@ -409,7 +411,7 @@ fn self_tests_pass_a_whole_unit_and_name_the_axis_that_fails() {
         let start = |push: [f64; 2], code: u8| {
             let buses = buses(chip.name);
             buses.iter().for_each(|b| (b.world().push, b.world().code) = (push, code));
-            options.start::<_, SimEdges>(buses, None).map(|_| ())
+            options.start(boxed(&buses), None).map(|_| ())
         };
         let passes = |push, code| start(push, code).unwrap_or_else(|fault| panic!("{}: {fault}", chip.name));
         let fails = |push, code, which: &str| {
@@ -434,28 +436,28 @@ fn what_is_not_there_or_another_chip_does_not_start() {
     let start = |chip: &str, other: &str| {
         let file = configuration();
         let options = RegisterOptions { configuration: file.path().into(), ..options(chip) };
-        options.start::<_, SimEdges>(vec![SimBus::new(model(other, 0))], None).map(|_| ())
+        options.start(boxed(&[SimBus::new(model(other, 0))]), None).map(|_| ())
     };
     assert!(start("mpu-9250", "mpu-9250").is_ok());
     let fault = start("mpu-9250", "icm-42688-p").unwrap_err().to_string();
     assert!(fault.contains("WHO_AM_I answers 0x47") && fault.contains("imu.chip"), "{fault}");
     let bus = SimBus::new(model("mpu-9250", 0));
     bus.world().faults.extend([BusFault::Nack; 9]);
-    let fault = options("mpu-9250").start::<_, SimEdges>(vec![bus.clone()], None).map(|_| ()).unwrap_err();
+    let fault = options("mpu-9250").start(boxed(std::slice::from_ref(&bus)), None).map(|_| ()).unwrap_err();
     assert!(fault.to_string().contains("imu.address"), "{fault}");
     assert_eq!(bus.world().registers[0][0x6B], 0, "nothing was written to what may be another chip");
 }
 
 #[test]
 fn the_bmi270_asks_for_its_configuration_and_gets_it_whole() {
-    let fault = options("bmi270").start::<_, SimEdges>(buses("bmi270"), None).map(|_| ()).unwrap_err().to_string();
+    let fault = options("bmi270").start(boxed(&buses("bmi270")), None).map(|_| ()).unwrap_err().to_string();
     assert!(fault.contains("bmi270_config_file") && fault.contains("imu.configuration"), "{fault}");
     let rig = Rig::new("bmi270");
     let file = configuration();
     assert_eq!(rig.buses[0].world().upload, std::fs::read(file.path()).unwrap());
-    let with = |path: &std::path::Path, buses| {
+    let with = |path: &std::path::Path, buses: Vec<SimBus>| {
         let options = RegisterOptions { configuration: path.into(), ..options("bmi270") };
-        options.start::<_, SimEdges>(buses, None).map(|_| ()).unwrap_err().to_string()
+        options.start(boxed(&buses), None).map(|_| ()).unwrap_err().to_string()
     };
     // That of another variant, or half a file.
     let short = tempfile::NamedTempFile::new().unwrap();

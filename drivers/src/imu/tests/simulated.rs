@@ -275,7 +275,7 @@ fn encode(layout: Layout, i: u64, raw: &Raw) -> Vec<u8> {
     let (accel, gyro) = (raw.accel.unwrap_or_default(), raw.gyro.unwrap_or_default());
     let t = raw.temperature.unwrap_or_default();
     match layout {
-        Layout::Plain { len: 6, big_endian, .. } => words(gyro, big_endian).to_vec(),
+        Layout::Plain { len: 6, .. } => words(gyro, false).to_vec(),
         Layout::Plain { temperature: Some(6), .. } => {
             [&words(accel, true)[..], &t.to_be_bytes(), &words(gyro, true)].concat()
         }
