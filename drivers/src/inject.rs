@@ -1,12 +1,12 @@
-//! Faults on purpose: wraps a source, and makes it drop, delay, duplicate, freeze, flip bits, go dark, fall silent,
-//! leap in time or come unplugged.
+//! Faults on purpose: wraps a source and drops, delays, duplicates, freezes or falsifies what passes, or falls silent, or is
+//! unplugged.
 //!
-//! Rules come from a board's `[inject]` or from a test. Each names a fault and when it strikes: in a window of the
-//! source's own time, with a probability, or both; by a seed, so the same frames are struck every time. Counters
-//! say exactly what was done, so that what was detected can be held against it.
+//! Rules come from a board's `[inject]` or from a test. Each names a fault and when it strikes: in a window of the source's
+//! own time, with a probability, or both. The randomness is seeded, so the same frames are struck every time. Counters say
+//! exactly what was done, so that what was detected can be compared with it.
 
 use crate::source::{FrameSource, ImuBatch, ImuReading, ImuSource, SourceFault, Wait};
-use crate::types::{Frames, Nanos, Span};
+use crate::types::{Frames, Image, Nanos, Span};
 use crate::{Fault, FaultKind};
 use glam::DVec3;
 use rand::{Rng, SeedableRng};
@@ -14,6 +14,10 @@ use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 use std::time::{Duration, Instant};
 
+#[cfg(test)]
+mod tests;
+
+/// A fault of a frame or of an inertial sample.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Kind {
@@ -23,83 +27,56 @@ pub enum Kind {
     Delay,
     /// Delivered twice.
     Duplicate,
-    /// What was measured before, under a new stamp.
+    /// The measurement before, under a new stamp.
     Freeze,
-    /// One bit, or `bits`, of every image, or one of one axis of a 16-bit unit.
+    /// One bit, or `bits`, of every image; of a sample one bit of one axis, as of a 16-bit unit.
     BitFlip,
     /// Black images.
     Blackout,
     /// Silence.
     Gap,
-    /// A stamp `by_s` off.
+    /// A stamp that is `by_s` off.
     StampJump,
     /// Lost, as with the cable out.
     Unplug,
 }
 
-impl Kind {
-    pub const ALL: [Kind; 9] = [
-        Kind::Drop,
-        Kind::Delay,
-        Kind::Duplicate,
-        Kind::Freeze,
-        Kind::BitFlip,
-        Kind::Blackout,
-        Kind::Gap,
-        Kind::StampJump,
-        Kind::Unplug,
-    ];
-    const FRAMES: [&'static str; 9] = [
-        "injected_frames_dropped",
-        "injected_frames_delayed",
-        "injected_frames_duplicated",
-        "injected_frames_frozen",
-        "injected_frames_flipped",
-        "injected_frames_blacked_out",
-        "injected_frames_silenced",
-        "injected_frames_jumped",
-        "injected_frames_unplugged",
-    ];
-    const IMU: [&'static str; 9] = [
-        "injected_imu_dropped",
-        "injected_imu_delayed",
-        "injected_imu_duplicated",
-        "injected_imu_frozen",
-        "injected_imu_flipped",
-        "injected_imu_blacked_out",
-        "injected_imu_silenced",
-        "injected_imu_jumped",
-        "injected_imu_unplugged",
-    ];
-
-    fn withholds(self) -> bool {
-        matches!(self, Kind::Drop | Kind::Gap | Kind::Unplug)
-    }
-}
+/// Counters of each kind, of frames and of inertial samples.
+const COUNTERS: [[&str; 2]; 9] = [
+    ["injected_frames_dropped", "injected_imu_dropped"],
+    ["injected_frames_delayed", "injected_imu_delayed"],
+    ["injected_frames_duplicated", "injected_imu_duplicated"],
+    ["injected_frames_frozen", "injected_imu_frozen"],
+    ["injected_frames_flipped", "injected_imu_flipped"],
+    ["injected_frames_blacked_out", "injected_imu_blacked_out"],
+    ["injected_frames_silenced", "injected_imu_silenced"],
+    ["injected_frames_jumped", "injected_imu_jumped"],
+    ["injected_frames_unplugged", "injected_imu_unplugged"],
+];
 
 /// A fault, and when it strikes.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Rule {
     pub fault: Kind,
-    /// From when until when, after the source's first stamp, s.
+    /// The window in which it strikes, after the source's first stamp, s.
     #[serde(default)]
     pub start_s: f64,
     #[serde(default = "forever")]
     pub end_s: f64,
-    /// Of each frame or sample in the window.
+    /// Probability with which each frame or sample in the window is struck.
     #[serde(default = "always")]
     pub probability: f64,
     /// How long it lasts once it strikes, s; 0: for the one frame or sample.
     #[serde(default)]
     pub length_s: f64,
-    /// Of `delay` and `stamp_jump`, s.
+    /// How late `delay` delivers, and how far off `stamp_jump` stamps, s.
     #[serde(default)]
     pub by_s: f64,
-    /// Of `blackout` and `unplug`: this camera alone, while the others go on.
+    /// `blackout` and `unplug`: this camera alone, while the others go on.
     #[serde(default)]
     pub camera: Option<usize>,
-    /// Of `bit_flip`, in each image.
+    /// `bit_flip`: bits in each image.
     #[serde(default = "one")]
     pub bits: u32,
 }
@@ -117,12 +94,12 @@ fn always() -> f64 {
 }
 
 impl Rule {
-    /// Strikes everything in `[start_s, end_s)`.
+    /// A rule that strikes everything in `[start_s, end_s)`.
     pub fn within(fault: Kind, start_s: f64, end_s: f64) -> Rule {
         Rule { fault, start_s, end_s, probability: 1.0, length_s: 0.0, by_s: 0.0, camera: None, bits: 1 }
     }
 
-    /// What is wrong with it.
+    /// Refuses a rule that makes no sense, with the reason.
     pub fn check(&self) -> Result<(), &'static str> {
         let needs_by = matches!(self.fault, Kind::Delay | Kind::StampJump);
         match self {
@@ -141,18 +118,17 @@ impl Rule {
     }
 }
 
-/// What is said of who is, and what to do.
-const UNPLUGGED: (&str, &str) = ("unplugged by [inject]", "it comes back as the rule says");
-
-/// Rules under way.
+/// The rules of one source, and what they did so far.
 struct Plan {
+    /// Each rule, and until when it lasts once it struck.
     rules: Vec<(Rule, Option<Nanos>)>,
     rng: ChaCha8Rng,
+    /// The source's first stamp.
     first: Option<Nanos>,
-    counts: [u64; Kind::ALL.len()],
+    counts: [u64; COUNTERS.len()],
     unplugs: u64,
     unplugged: bool,
-    /// A camera is, and the others are not.
+    /// One camera is unplugged, and the others are not.
     away: Option<Fault>,
     place: &'static str,
 }
@@ -163,7 +139,7 @@ impl Plan {
             rules: rules.iter().map(|r| (*r, None)).collect(),
             rng: ChaCha8Rng::seed_from_u64(seed),
             first: None,
-            counts: [0; Kind::ALL.len()],
+            counts: [0; COUNTERS.len()],
             unplugs: 0,
             unplugged: false,
             away: None,
@@ -175,7 +151,7 @@ impl Plan {
         self.rules.iter().any(|(r, _)| r.fault == kind)
     }
 
-    /// Counts, and calls `act` with each rule that strikes at `t`. A fault that withholds strikes alone.
+    /// Counts, and calls `act` with, each rule that strikes at `t`. After one that withholds no other strikes.
     fn strike(&mut self, t: Nanos, mut act: impl FnMut(&Rule, &mut ChaCha8Rng)) {
         let first = *self.first.get_or_insert(t);
         let at_s = (t - first).secs();
@@ -192,76 +168,84 @@ impl Plan {
             }
             self.counts[rule.fault as usize] += 1;
             act(rule, &mut self.rng);
-            if let (Kind::Unplug, Some(camera)) = (rule.fault, rule.camera) {
-                one = Some(camera);
-            } else if rule.fault.withholds() {
-                unplugged = rule.fault == Kind::Unplug;
-                break;
+            match (rule.fault, rule.camera) {
+                (Kind::Unplug, Some(camera)) => one = Some(camera),
+                (Kind::Drop | Kind::Gap | Kind::Unplug, _) => {
+                    unplugged = rule.fault == Kind::Unplug;
+                    break;
+                }
+                _ => {}
             }
         }
-        let was = self.unplugged || self.away.is_some();
-        self.unplugs += u64::from((unplugged || one.is_some()) && !was);
+        let before = self.unplugged || self.away.is_some();
+        self.unplugs += u64::from((unplugged || one.is_some()) && !before);
         self.unplugged = unplugged;
         if self.away.is_some() != one.is_some() {
-            let fault = |c| Fault::new(FaultKind::Unavailable, format!("camera {c}"), UNPLUGGED.0, UNPLUGGED.1);
-            self.away = one.map(fault);
+            self.away = one.map(|camera| unplugged_at(&format!("camera {camera}")));
         }
     }
 
-    /// Asks until something of what the source gave is left, or `timeout` is over. `ask` waits that long at most, spoils what
-    /// came, and says whether any of it is delivered.
-    fn pass(
+    /// Reads until something is left to deliver, or `timeout` is over. `read` waits for the source, as long as it is told at
+    /// most, strikes what came, and says whether any of it is delivered.
+    fn read(
         &mut self,
         timeout: Span,
-        mut ask: impl FnMut(&mut Plan, Span) -> Result<(Wait, bool), SourceFault>,
+        mut read: impl FnMut(&mut Plan, Span) -> Result<(Wait, bool), SourceFault>,
     ) -> Result<Wait, SourceFault> {
         let limit = Instant::now() + Duration::from_nanos(timeout.0.max(0) as u64);
+        let lost = |plan: &Plan| Err(SourceFault::Lost(unplugged_at(plan.place)));
         loop {
             let was_unplugged = self.unplugged;
-            match ask(self, Span(limit.saturating_duration_since(Instant::now()).as_nanos() as i64))? {
+            match read(self, Span(limit.saturating_duration_since(Instant::now()).as_nanos() as i64))? {
                 (Wait::Got, true) => return Ok(Wait::Got),
-                (Wait::Got, _) if self.unplugged && !was_unplugged => return Err(self.lost()),
+                (Wait::Got, _) if self.unplugged && !was_unplugged => return lost(self),
                 (Wait::Got, _) if Instant::now() < limit => {}
                 (Wait::Ended, _) => return Ok(Wait::Ended),
-                _ if self.unplugged => return Err(self.lost()),
+                _ if self.unplugged => return lost(self),
                 _ => return Ok(Wait::TimedOut),
             }
         }
     }
 
-    fn lost(&self) -> SourceFault {
-        SourceFault::Lost(Fault::new(FaultKind::Unavailable, self.place, UNPLUGGED.0, UNPLUGGED.1))
+    /// The source's counters with those of the faults that were injected; `column` is that of `COUNTERS`.
+    fn counters(
+        &self,
+        mut source: Vec<(&'static str, u64)>,
+        column: usize,
+        unplugs: &'static str,
+    ) -> Vec<(&'static str, u64)> {
+        let injected = COUNTERS.iter().map(|names| names[column]).zip(self.counts);
+        source.extend(injected.chain([(unplugs, self.unplugs)]).filter(|(_, n)| *n > 0));
+        source
     }
+}
 
-    fn counters(&self, names: &[&'static str; Kind::ALL.len()], unplugs: &'static str) -> Vec<(&'static str, u64)> {
-        let mut list: Vec<_> = names.iter().copied().zip(self.counts).filter(|(_, n)| *n > 0).collect();
-        if self.unplugs > 0 {
-            list.push((unplugs, self.unplugs));
-        }
-        list
-    }
+fn unplugged_at(place: &str) -> Fault {
+    Fault::new(FaultKind::Unavailable, place, "unplugged by [inject]", "it comes back as the rule says")
 }
 
 fn sleep(secs: f64) {
     std::thread::sleep(Duration::from_secs_f64(secs.max(0.0)));
 }
 
-/// A rig that fails.
+/// A rig of cameras that fails as its rules say.
 pub struct FaultyFrames<S> {
     source: S,
     plan: Plan,
     last: LastFrames,
 }
 
-/// What was delivered last, for who freezes or comes twice.
+/// The frames that were delivered last, for those that freeze or come twice.
 struct LastFrames {
     frames: Frames,
+    /// A rule needs them.
     kept: bool,
+    /// They are delivered once more.
     again: bool,
 }
 
 impl<S: FrameSource> FaultyFrames<S> {
-    /// `shape` is that of the frames it will be lent.
+    /// `shape` has the shape of the frames that `next` will fill.
     pub fn new(source: S, rules: &[Rule], seed: u64, shape: Frames) -> FaultyFrames<S> {
         let plan = Plan::new(rules, seed, "camera");
         let kept = plan.has(Kind::Freeze) || plan.has(Kind::Duplicate);
@@ -269,27 +253,30 @@ impl<S: FrameSource> FaultyFrames<S> {
     }
 }
 
+fn blacken<'a>(images: impl Iterator<Item = &'a mut Image>) {
+    images.for_each(|image| image.pixels.fill(0));
+}
+
 impl LastFrames {
-    /// Whether the frame is delivered.
-    fn spoil(&mut self, plan: &mut Plan, frames: &mut Frames) -> bool {
+    /// Whether the frame, with its faults, is delivered.
+    fn inject_faults(&mut self, plan: &mut Plan, frames: &mut Frames) -> bool {
         let (mut delivered, mut frozen, mut late_s) = (true, false, 0.0);
         let (last, again) = (&self.frames, &mut self.again);
-        plan.strike(frames.t, |rule, rng| match rule.fault {
-            Kind::Unplug | Kind::Blackout if rule.camera.is_some() => {
-                let camera = rule.camera.unwrap_or_default();
+        plan.strike(frames.t, |rule, rng| match (rule.fault, rule.camera) {
+            (Kind::Unplug | Kind::Blackout, Some(camera)) => {
                 let colours = frames.colours.get_mut(camera).into_iter().flatten();
-                frames.images.get_mut(camera).into_iter().chain(colours).for_each(|image| image.pixels.fill(0));
+                blacken(frames.images.get_mut(camera).into_iter().chain(colours));
             }
-            Kind::Drop | Kind::Gap | Kind::Unplug => delivered = false,
-            Kind::Delay => late_s += rule.by_s,
-            Kind::Duplicate => *again = true,
-            Kind::Freeze => {
+            (Kind::Drop | Kind::Gap | Kind::Unplug, _) => delivered = false,
+            (Kind::Delay, _) => late_s += rule.by_s,
+            (Kind::Duplicate, _) => *again = true,
+            (Kind::Freeze, _) => {
                 let t = frames.t;
                 frames.copy_from(last);
                 frames.t = t;
                 frozen = true;
             }
-            Kind::BitFlip => {
+            (Kind::BitFlip, _) => {
                 for image in &mut frames.images {
                     for _ in 0..rule.bits {
                         let at = rng.random_range(0..image.pixels.len());
@@ -297,11 +284,8 @@ impl LastFrames {
                     }
                 }
             }
-            Kind::Blackout => {
-                let planes = frames.images.iter_mut().chain(frames.colours.iter_mut().flatten());
-                planes.for_each(|image| image.pixels.fill(0));
-            }
-            Kind::StampJump => frames.t = frames.t + Span::from_secs(rule.by_s),
+            (Kind::Blackout, _) => blacken(frames.images.iter_mut().chain(frames.colours.iter_mut().flatten())),
+            (Kind::StampJump, _) => frames.t = frames.t + Span::from_secs(rule.by_s),
         });
         if delivered && self.kept && !frozen {
             self.frames.copy_from(frames);
@@ -319,10 +303,14 @@ impl<S: FrameSource> FrameSource for FaultyFrames<S> {
             frames.copy_from(&last.frames);
             return Ok(Wait::Got);
         }
-        plan.pass(timeout, |plan, left| {
+        plan.read(timeout, |plan, left| {
             let wait = source.next(left, frames)?;
-            Ok((wait, wait == Wait::Got && last.spoil(plan, frames)))
+            Ok((wait, wait == Wait::Got && last.inject_faults(plan, frames)))
         })
+    }
+
+    fn inner(&self) -> Option<&dyn FrameSource> {
+        Some(&self.source)
     }
 
     fn away(&self) -> Option<&Fault> {
@@ -330,21 +318,15 @@ impl<S: FrameSource> FrameSource for FaultyFrames<S> {
     }
 
     fn counters(&self) -> Vec<(&'static str, u64)> {
-        let mut list = self.source.counters();
-        list.extend(self.plan.counters(&Kind::FRAMES, "injected_camera_unplugs"));
-        list
-    }
-
-    fn warnings(&self) -> &[String] {
-        self.source.warnings()
+        self.plan.counters(self.source.counters(), 0, "injected_camera_unplugs")
     }
 }
 
-/// Ends of the range of the 16-bit registers in which bits flip: 2000 °/s, 16 g.
+/// Ends of the range of the 16-bit registers in which bits flip: 2000 °/s and 16 g, in rad/s and m/s².
 const GYRO_RANGE: f64 = 34.907;
 const ACCEL_RANGE: f64 = 156.91;
 
-/// An inertial unit that fails.
+/// An inertial unit that fails as its rules say.
 pub struct FaultyImu<S> {
     source: S,
     plan: Plan,
@@ -353,38 +335,38 @@ pub struct FaultyImu<S> {
 
 impl<S: ImuSource> FaultyImu<S> {
     pub fn new(source: S, rules: &[Rule], seed: u64) -> FaultyImu<S> {
-        // Another stream than the cameras'.
+        // Another random stream than the cameras'.
         FaultyImu { source, plan: Plan::new(rules, seed ^ 0x494D_5500, "imu"), last: ImuReading::default() }
     }
 }
 
-/// Leaves in `batch` what is delivered of it; `last` is the reading before.
-fn spoil(batch: &mut ImuBatch, last: &mut ImuReading, plan: &mut Plan) {
-    let mut spoilt = ImuBatch::default();
+/// Leaves in `batch` what is delivered, with its faults; `last` is the reading before.
+fn inject_faults(batch: &mut ImuBatch, last: &mut ImuReading, plan: &mut Plan) {
+    let mut delivered = ImuBatch::default();
     let mut late_s: f64 = 0.0;
     for reading in batch.iter() {
-        let (mut out, mut delivered, mut twice) = (*reading, true, false);
+        let (mut out, mut times) = (*reading, 1);
         plan.strike(reading.sample.t, |rule, rng| match rule.fault {
-            Kind::Drop | Kind::Gap | Kind::Unplug => delivered = false,
+            Kind::Drop | Kind::Gap | Kind::Unplug => times = 0,
             Kind::Delay => late_s = late_s.max(rule.by_s),
-            Kind::Duplicate => twice = true,
+            Kind::Duplicate => times = 2,
             Kind::Freeze => {
                 let t = out.sample.t;
                 out = *last;
                 out.sample.t = t;
             }
             Kind::BitFlip => flip(&mut out, rng),
-            // Refused where rules are read: a unit has no light.
+            // Refused where rules are read: a unit sees no light.
             Kind::Blackout => {}
             Kind::StampJump => out.sample.t = out.sample.t + Span::from_secs(rule.by_s),
         });
-        for _ in 0..if delivered { 1 + u32::from(twice) } else { 0 } {
+        for _ in 0..times {
             // A FIFO that full is not doubled; what is in it is delivered.
-            let _ = spoilt.push(out);
+            let _ = delivered.push(out);
             *last = out;
         }
     }
-    *batch = spoilt;
+    *batch = delivered;
     sleep(late_s);
 }
 
@@ -405,164 +387,18 @@ fn flip(reading: &mut ImuReading, rng: &mut ChaCha8Rng) {
 impl<S: ImuSource> ImuSource for FaultyImu<S> {
     fn next(&mut self, timeout: Span, batch: &mut ImuBatch) -> Result<Wait, SourceFault> {
         let FaultyImu { source, plan, last } = self;
-        plan.pass(timeout, |plan, left| {
+        plan.read(timeout, |plan, left| {
             let wait = source.next(left, batch)?;
-            spoil(batch, last, plan);
+            inject_faults(batch, last, plan);
             Ok((wait, !batch.is_empty()))
         })
     }
 
+    fn inner(&self) -> Option<&dyn ImuSource> {
+        Some(&self.source)
+    }
+
     fn counters(&self) -> Vec<(&'static str, u64)> {
-        let mut list = self.source.counters();
-        list.extend(self.plan.counters(&Kind::IMU, "injected_imu_unplugs"));
-        list
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    #![allow(clippy::unwrap_used)]
-    use super::*;
-    use crate::paced::{Images, Pace, PacedFrames, PacedImu};
-    use crate::types::{Image, ImuSample};
-    use std::sync::Arc;
-
-    const MS: i64 = 1_000_000;
-    const FRAMES: i64 = 100;
-
-    fn shape() -> Frames {
-        Frames { images: vec![Image::new(4, 4)], ..Frames::default() }
-    }
-
-    /// Frames of 20 ms whose pixels say their number, ten times as fast.
-    fn camera(rules: &[Rule]) -> FaultyFrames<PacedFrames> {
-        let frame = |i: i64| {
-            let image = Image { pixels: vec![i as u8 + 1; 16], ..Image::new(4, 4) };
-            Frames { t: Nanos(i * 20 * MS), images: vec![image], colours: vec![] }
-        };
-        let frames: Vec<Frames> = (0..FRAMES).map(frame).collect();
-        let stamps: Vec<Nanos> = frames.iter().map(|f| f.t).collect();
-        let source = PacedFrames::new(Images::Rendered(frames), stamps, Pace::at_speed(Nanos(0), 10.0));
-        FaultyFrames::new(source, rules, 7, shape())
-    }
-
-    /// Number by stamp and by pixel of every frame delivered, and how often it was lost.
-    fn seen(source: &mut impl FrameSource) -> (Vec<(i64, u8)>, u32) {
-        let (mut frames, mut seen, mut lost) = (shape(), vec![], 0);
-        loop {
-            match source.next(Span(20 * MS), &mut frames) {
-                Ok(Wait::Got) => seen.push((frames.t.0 / (20 * MS), frames.images[0].pixels[5])),
-                Ok(Wait::TimedOut) => {}
-                Ok(Wait::Ended) => return (seen, lost),
-                Err(SourceFault::Lost(_)) => lost += 1,
-                Err(e) => panic!("{e}"),
-            }
-        }
-    }
-
-    fn count(list: &[(&'static str, u64)], name: &str) -> u64 {
-        list.iter().find(|(n, _)| *n == name).map_or(0, |(_, n)| *n)
-    }
-
-    #[test]
-    fn faults_strike_their_window_and_are_counted_exactly() {
-        let mut source = camera(&[
-            Rule::within(Kind::Drop, 0.1, 0.2),
-            Rule::within(Kind::Freeze, 0.4, 0.6),
-            Rule::within(Kind::Blackout, 0.8, 0.9),
-            Rule { by_s: 2.0, ..Rule::within(Kind::StampJump, 1.0, 1.02) },
-            Rule::within(Kind::Duplicate, 1.2, 1.24),
-            Rule::within(Kind::Unplug, 1.4, 1.8),
-        ]);
-        let (seen, lost) = seen(&mut source);
-        let counters = source.counters();
-        assert_eq!(count(&counters, "injected_frames_dropped"), 5);
-        assert!(!seen.iter().any(|(t, _)| (5..10).contains(t)));
-        assert_eq!(count(&counters, "injected_frames_frozen"), 10);
-        assert!(seen.iter().filter(|(t, _)| (20..30).contains(t)).all(|(_, px)| *px == 20));
-        assert_eq!(count(&counters, "injected_frames_blacked_out"), 5);
-        assert_eq!(seen.iter().filter(|(_, px)| *px == 0).count(), 5);
-        assert_eq!(count(&counters, "injected_frames_jumped"), 1);
-        assert!(seen.contains(&(150, 51)));
-        assert_eq!(count(&counters, "injected_frames_duplicated"), 2);
-        assert_eq!(seen.iter().filter(|(t, _)| *t == 60).count(), 2);
-        assert_eq!(count(&counters, "injected_frames_unplugged"), 20);
-        assert_eq!(count(&counters, "injected_camera_unplugs"), 1);
-        assert!(lost >= 2, "said at once, and again while it lasts: {lost}");
-        assert_eq!(seen.len() as i64, FRAMES - 5 - 20 + 2);
-    }
-
-    #[test]
-    fn one_camera_alone_is_black_and_away_while_its_rule_lasts() {
-        let rule = Rule { camera: Some(0), ..Rule::within(Kind::Unplug, 0.2, 0.4) };
-        let (mut source, mut frames) = (camera(&[rule]), shape());
-        let mut black = 0;
-        while source.next(Span(20 * MS), &mut frames).unwrap() != Wait::Ended {
-            let is_black = frames.images[0].pixels == [0; 16];
-            assert_eq!(source.away().is_some(), is_black);
-            black += usize::from(is_black);
-        }
-        let counters = source.counters();
-        assert_eq!((black, count(&counters, "injected_camera_unplugs")), (10, 1), "{counters:?}");
-        assert!(Rule { fault: Kind::Drop, ..rule }.check().is_err());
-    }
-
-    #[test]
-    fn the_same_seed_strikes_the_same_frames() {
-        let rules = [Rule { probability: 0.2, ..Rule::within(Kind::Drop, 0.0, 2.0) }];
-        let (mut a, mut b) = (camera(&rules), camera(&rules));
-        assert_eq!(seen(&mut a), seen(&mut b));
-        let dropped = count(&a.counters(), "injected_frames_dropped");
-        assert!((8..35).contains(&dropped), "{dropped}");
-    }
-
-    #[test]
-    fn what_strikes_lasts_its_length() {
-        let rules = [Rule { length_s: 0.1, ..Rule::within(Kind::Gap, 0.5, 0.501) }];
-        let mut source = camera(&rules);
-        assert_eq!(seen(&mut source).0.len() as i64, FRAMES - 5);
-    }
-
-    #[test]
-    fn a_unit_fails_as_told() {
-        let sample =
-            |i: i64| ImuSample { t: Nanos(i * 5 * MS), gyro_body: DVec3::splat(i as f64), ..ImuSample::default() };
-        let samples: Arc<[ImuSample]> = (0..400).map(sample).collect();
-        let rules = [
-            Rule::within(Kind::Drop, 0.1, 0.2),
-            Rule::within(Kind::Freeze, 0.4, 0.6),
-            Rule::within(Kind::Duplicate, 0.8, 0.81),
-            Rule::within(Kind::BitFlip, 1.0, 1.01),
-            Rule::within(Kind::Unplug, 1.2, 1.6),
-        ];
-        let mut source = FaultyImu::new(PacedImu::new(samples, Pace::at_speed(Nanos(0), 10.0)), &rules, 3);
-        let (mut batch, mut seen, mut lost) = (ImuBatch::default(), vec![], 0);
-        loop {
-            match source.next(Span(10 * MS), &mut batch) {
-                Ok(Wait::Got) => seen.extend(batch.iter().map(|r| r.sample)),
-                Ok(Wait::TimedOut) => {}
-                Ok(Wait::Ended) => break,
-                Err(_) => lost += 1,
-            }
-        }
-        let c = source.counters();
-        let counted = |name: &str| count(&c, name) as usize;
-        assert_eq!(
-            [counted("injected_imu_dropped"), counted("injected_imu_frozen"), counted("injected_imu_unplugged")],
-            [20, 40, 80]
-        );
-        assert_eq!(seen.iter().filter(|s| s.gyro_body.x == 79.0).count(), 41);
-        assert_eq!(seen.len(), 400 - 20 - 80 + counted("injected_imu_duplicated"));
-        assert!(lost > 0 && counted("injected_imu_duplicated") == 2 && counted("injected_imu_flipped") == 2);
-    }
-
-    #[test]
-    fn senseless_rules_are_named() {
-        let rule = Rule::within(Kind::Drop, 1.0, 2.0);
-        assert!(rule.check().is_ok());
-        assert!(Rule { probability: 1.5, ..rule }.check().is_err());
-        assert!(Rule { end_s: 0.5, ..rule }.check().is_err());
-        assert!(Rule { fault: Kind::Delay, ..rule }.check().is_err());
-        assert!(Rule { fault: Kind::Delay, by_s: -1.0, ..rule }.check().is_err());
+        self.plan.counters(self.source.counters(), 1, "injected_imu_unplugs")
     }
 }

@@ -1,12 +1,12 @@
 //! Sensors as a run reads them: a camera rig and an inertial unit, each on a thread of its own.
 //!
-//! Hardware and recordings (`paced`) are sources alike, and the fault injector (`inject`) wraps either. Stamps of
-//! frames are mid-exposure; they and those of inertial samples are `CLOCK_MONOTONIC` of the host, or a recording's
-//! clock. The caller lends the buffers, which are shaped once: a source allocates nothing after it was opened,
-//! save to say a fault.
+//! Hardware and recordings (`paced`) are sources alike; the fault injector (`inject`) and the recorder (`record`) wrap
+//! either. Stamps of frames are mid-exposure; they and those of inertial samples are `CLOCK_MONOTONIC` of the host, or the
+//! clock of a recording. The caller lends the buffers, which are shaped once: after it was opened a source allocates
+//! nothing, except to word a fault.
 //!
-//! A cable that comes loose is no end: `next` answers `Lost` for as long as the device is gone, looks for it
-//! again on every call, and goes on with `Got` when it is back.
+//! A cable that comes loose ends nothing: `next` answers `Lost` for as long as the device is gone, looks for it again on
+//! every call, and goes on with `Got` when it is back.
 
 use crate::types::{Frames, ImuSample, Span};
 use crate::{Fault, List};
@@ -14,35 +14,49 @@ use std::fmt;
 
 /// A rig of cameras.
 pub trait FrameSource: Send {
-    /// Waits for the next frame, `timeout` at most, and fills `frames`, which is shaped by `Frames::for_rig` or
-    /// `in_colour`. Unless it answers `Got` its pixels are unspecified.
+    /// Waits for the next frame, `timeout` at most, and fills `frames`, which is shaped by `Frames::for_rig` or `in_colour`.
+    /// Unless the answer is `Got`, its pixels are unspecified.
     fn next(&mut self, timeout: Span, frames: &mut Frames) -> Result<Wait, SourceFault>;
 
-    /// Why one camera of the rig is away while the others go on: its images are black meanwhile.
-    fn away(&self) -> Option<&Fault> {
+    /// The source that this one wraps, if it wraps one: it answers what the wrapper leaves out below.
+    fn inner(&self) -> Option<&dyn FrameSource> {
         None
     }
 
-    /// What was met so far, by name.
-    fn counters(&self) -> Vec<(&'static str, u64)>;
+    /// Why one camera of the rig is away while the others go on; its images are black meanwhile.
+    fn away(&self) -> Option<&Fault> {
+        self.inner()?.away()
+    }
 
-    /// The first few of what was met, a line each.
+    /// Counters so far, by name.
+    fn counters(&self) -> Vec<(&'static str, u64)> {
+        self.inner().map_or_else(Vec::new, |source| source.counters())
+    }
+
+    /// The first few things that went wrong, a line each.
     fn warnings(&self) -> &[String] {
-        &[]
+        self.inner().map_or(&[], |source| source.warnings())
     }
 }
 
 /// An inertial unit.
 pub trait ImuSource: Send {
-    /// Waits for samples, `timeout` at most, and fills `batch` with them in the order of their stamps; it is empty
-    /// unless the answer is `Got`.
+    /// Waits for samples, `timeout` at most, and fills `batch` with them in the order of their stamps. It is empty unless the
+    /// answer is `Got`.
     fn next(&mut self, timeout: Span, batch: &mut ImuBatch) -> Result<Wait, SourceFault>;
 
-    /// What was met so far, by name.
-    fn counters(&self) -> Vec<(&'static str, u64)>;
+    /// The source that this one wraps, if it wraps one: it answers what the wrapper leaves out below.
+    fn inner(&self) -> Option<&dyn ImuSource> {
+        None
+    }
+
+    /// Counters so far, by name.
+    fn counters(&self) -> Vec<(&'static str, u64)> {
+        self.inner().map_or_else(Vec::new, |source| source.counters())
+    }
 }
 
-/// What waiting for a source came to.
+/// The outcome of waiting for a source.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Wait {
     Got,
@@ -86,37 +100,29 @@ pub struct ImuReading {
     pub saturated: bool,
 }
 
-/// Samples of one call: more than the largest FIFO of the units we drive holds (LSM6DSOX: 219), fewer than a tenth
-/// of what a run queues.
+/// Samples of one call at most: more than the largest FIFO of the units that are driven holds (LSM6DSOX: 219), fewer than a
+/// tenth of what a run queues.
 pub const IMU_BATCH: usize = 256;
 
-/// Readings of one call, oldest first.
+/// The readings of one call, oldest first.
 pub type ImuBatch = List<ImuReading, IMU_BATCH>;
 
-impl<S: FrameSource + ?Sized> FrameSource for Box<S> {
+impl FrameSource for Box<dyn FrameSource> {
     fn next(&mut self, timeout: Span, frames: &mut Frames) -> Result<Wait, SourceFault> {
         (**self).next(timeout, frames)
     }
 
-    fn away(&self) -> Option<&Fault> {
-        (**self).away()
-    }
-
-    fn counters(&self) -> Vec<(&'static str, u64)> {
-        (**self).counters()
-    }
-
-    fn warnings(&self) -> &[String] {
-        (**self).warnings()
+    fn inner(&self) -> Option<&dyn FrameSource> {
+        Some(&**self)
     }
 }
 
-impl<S: ImuSource + ?Sized> ImuSource for Box<S> {
+impl ImuSource for Box<dyn ImuSource> {
     fn next(&mut self, timeout: Span, batch: &mut ImuBatch) -> Result<Wait, SourceFault> {
         (**self).next(timeout, batch)
     }
 
-    fn counters(&self) -> Vec<(&'static str, u64)> {
-        (**self).counters()
+    fn inner(&self) -> Option<&dyn ImuSource> {
+        Some(&**self)
     }
 }

@@ -264,8 +264,8 @@ impl<S: ImuSource> ImuSource for CorrectedImu<S> {
         Ok(wait)
     }
 
-    fn counters(&self) -> Vec<(&'static str, u64)> {
-        self.source.counters()
+    fn inner(&self) -> Option<&dyn ImuSource> {
+        Some(&self.source)
     }
 }
 
@@ -311,17 +311,13 @@ impl<S: FrameSource> FrameSource for Triggered<S> {
         self.source.next(timeout, frames)
     }
 
-    fn away(&self) -> Option<&Fault> {
-        self.source.away()
+    fn inner(&self) -> Option<&dyn FrameSource> {
+        Some(&self.source)
     }
 
     fn counters(&self) -> Vec<(&'static str, u64)> {
         let mut list = self.source.counters();
         list.push(("trigger_failures", self.pulses.failed.load(Relaxed)));
         list
-    }
-
-    fn warnings(&self) -> &[String] {
-        self.source.warnings()
     }
 }

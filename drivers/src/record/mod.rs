@@ -209,16 +209,8 @@ impl<S: FrameSource> FrameSource for TappedFrames<S> {
         Ok(wait)
     }
 
-    fn away(&self) -> Option<&Fault> {
-        self.source.away()
-    }
-
-    fn counters(&self) -> Vec<(&'static str, u64)> {
-        self.source.counters()
-    }
-
-    fn warnings(&self) -> &[String] {
-        self.source.warnings()
+    fn inner(&self) -> Option<&dyn FrameSource> {
+        Some(&self.source)
     }
 }
 
@@ -234,8 +226,8 @@ impl<S: ImuSource> ImuSource for TappedImu<S> {
         Ok(wait)
     }
 
-    fn counters(&self) -> Vec<(&'static str, u64)> {
-        self.source.counters()
+    fn inner(&self) -> Option<&dyn ImuSource> {
+        Some(&self.source)
     }
 }
 
