@@ -1,5 +1,5 @@
-//! Controls of a camera: exposure in time, everything else under the name that `v4l2-ctl --list-ctrls` gives it. Values
-//! are checked against what the camera states, and a name it does not have is refused with those it has.
+//! Controls of a camera: exposure in time, everything else by the name that `v4l2-ctl --list-ctrls` gives it. Values are
+//! checked against the range that the camera states, and a name it does not have is refused with those it has.
 
 use super::fault::refused;
 use super::kernel::{Kernel, Request};
@@ -7,17 +7,17 @@ use super::uapi::*;
 use super::Settings;
 use crate::types::Span;
 use crate::{Fault, FaultKind};
-use std::io;
 
-/// Of `CID_EXPOSURE_ABSOLUTE`.
+/// Unit of `CID_EXPOSURE_ABSOLUTE`.
 const EXPOSURE_UNIT: Span = Span(100_000);
-/// More than any camera has; a driver whose list never ends is left.
+/// Controls that are listed at most: more than any camera has, for a driver whose list never ends.
 const CONTROLS_MAX: usize = 512;
 
+/// The controls of an open camera.
 pub(super) struct Controls<'a> {
     kernel: &'a dyn Kernel,
     fd: i32,
-    /// Of the camera, in messages.
+    /// The camera's name in messages.
     name: &'a str,
     known: Vec<QueryControl>,
 }
@@ -27,7 +27,7 @@ impl<'a> Controls<'a> {
         let mut known: Vec<QueryControl> = Vec::new();
         let mut last = 0;
         while known.len() < CONTROLS_MAX {
-            let mut control = QueryControl { id: last | NEXT_CONTROL, ..QueryControl::ZERO };
+            let mut control = QueryControl { id: last | NEXT_CONTROL, ..Default::default() };
             match kernel.ioctl(fd, Request::QueryControl(&mut control)) {
                 Ok(()) if control.id <= last => break,
                 Ok(()) => {
@@ -43,9 +43,9 @@ impl<'a> Controls<'a> {
         Ok(Controls { kernel, fd, name, known })
     }
 
-    /// Sets what the settings ask for; the exposure that results, zero where the camera does not say.
+    /// Sets what the settings ask for; answers the exposure that results, zero where the camera does not say.
     pub(super) fn apply(&self, settings: &Settings) -> Result<Span, Fault> {
-        // First, as a camera that exposes by itself refuses an exposure.
+        // First of all: a camera that exposes automatically refuses an exposure.
         for (name, value) in &settings.controls {
             let key = format!("camera.controls.{name}");
             let control = self.known.iter().find(|c| label(c) == *name).ok_or_else(|| self.unknown(&key, name))?;
@@ -86,31 +86,17 @@ impl<'a> Controls<'a> {
         }
         let purpose = format!("set `{name}` to {value} ({key})");
         let mut asked = ExtControl { id: control.id, size: 0, reserved: 0, value };
-        match self.kernel.ioctl(self.fd, Request::SetExtControl(&mut asked)) {
-            Err(e) if is_older(&e, control) => {
-                let mut asked = Control { id: control.id, value: value as i32 };
-                let answer = self.kernel.ioctl(self.fd, Request::SetControl(&mut asked));
-                answer.map_err(|e| refused(self.name, &purpose, "VIDIOC_S_CTRL", &e))
-            }
-            answer => answer.map_err(|e| refused(self.name, &purpose, "VIDIOC_S_EXT_CTRLS", &e)),
-        }
+        let answer = self.kernel.ioctl(self.fd, Request::SetExtControl(&mut asked));
+        answer.map_err(|e| refused(self.name, &purpose, "VIDIOC_S_EXT_CTRLS", &e))
     }
 
     fn get(&self, control: &QueryControl) -> Result<i64, Fault> {
         let purpose = format!("read `{}`", label(control));
         let mut asked = ExtControl { id: control.id, ..ExtControl::default() };
-        match self.kernel.ioctl(self.fd, Request::GetExtControl(&mut asked)) {
-            Err(e) if is_older(&e, control) => {
-                let mut asked = Control { id: control.id, value: 0 };
-                let answer = self.kernel.ioctl(self.fd, Request::GetControl(&mut asked));
-                answer.map_err(|e| refused(self.name, &purpose, "VIDIOC_G_CTRL", &e))?;
-                Ok(i64::from(asked.value))
-            }
-            Err(e) => Err(refused(self.name, &purpose, "VIDIOC_G_EXT_CTRLS", &e)),
-            // Only the low half is written where a control has 32 bits.
-            Ok(()) if control.kind != CONTROL_INTEGER64 => Ok(i64::from(asked.value as i32)),
-            Ok(()) => Ok(asked.value),
-        }
+        let answer = self.kernel.ioctl(self.fd, Request::GetExtControl(&mut asked));
+        answer.map_err(|e| refused(self.name, &purpose, "VIDIOC_G_EXT_CTRLS", &e))?;
+        // Only the low half is written where a control has 32 bits.
+        Ok(if control.kind == CONTROL_INTEGER64 { asked.value } else { i64::from(asked.value as i32) })
     }
 
     fn unknown(&self, key: &str, name: &str) -> Fault {
@@ -130,18 +116,13 @@ impl<'a> Controls<'a> {
     }
 }
 
-/// A driver from before extended controls, which has the control of 32 bits all the same.
-fn is_older(e: &io::Error, control: &QueryControl) -> bool {
-    e.raw_os_error() == Some(libc::ENOTTY) && control.kind != CONTROL_INTEGER64
-}
-
 fn is_number(kind: u32) -> bool {
     let numbers =
         [CONTROL_INTEGER, CONTROL_BOOLEAN, CONTROL_MENU, CONTROL_INTEGER64, CONTROL_BITMASK, CONTROL_INTEGER_MENU];
     numbers.contains(&kind)
 }
 
-/// As v4l2-ctl writes names: lower case, anything else than letters and digits as one underscore.
+/// The name as v4l2-ctl writes it: lower case, anything but letters and digits as one underscore.
 fn label(control: &QueryControl) -> String {
     let mut label = String::new();
     for c in super::find::text(&control.name).chars() {

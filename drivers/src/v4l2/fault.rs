@@ -1,15 +1,16 @@
-//! What a refused system call means for whoever has to mend it.
+//! Faults of system calls: which call failed on which device, and what to do about it.
 
 use super::find::Select;
 use crate::{Fault, FaultKind};
 use std::io;
 
-/// `call` on `place` failed while we wanted to `purpose`.
+/// The fault of a `call` on `place` that failed; `purpose` completes "cannot".
 pub(super) fn refused(place: &str, purpose: &str, call: &str, e: &io::Error) -> Fault {
     let (kind, fix) = remedy(e);
     Fault::new(kind, place, format!("cannot {purpose}: {call}: {e}"), fix)
 }
 
+/// The fault of a camera that is not there.
 pub(super) fn no_camera(select: &Select, what: String) -> Fault {
     let fix = "check its cable and power, and camera.devices in the board file";
     Fault::new(FaultKind::Unavailable, select.to_string(), what, fix)
@@ -34,10 +35,10 @@ fn remedy(e: &io::Error) -> (FaultKind, &'static str) {
         }
         Some(libc::ENOSPC) => (
             FaultKind::Unavailable,
-            "the bus has no bandwidth left: put the cameras on controllers of their own, or lower camera.rate_hz",
+            "the bus has no bandwidth left: put the cameras on separate controllers, or lower camera.rate_hz",
         ),
         Some(libc::ENOTTY) => {
-            (FaultKind::Unavailable, "its driver cannot do this: it is no camera, or needs a newer kernel")
+            (FaultKind::Unavailable, "its driver cannot do this: it is not a camera, or needs a newer kernel")
         }
         Some(libc::EIO | libc::EPROTO | libc::ETIMEDOUT | libc::EPIPE) => {
             (FaultKind::Io, "the camera does not answer: check its cable and power, `dmesg` says more")

@@ -1,6 +1,6 @@
-//! Which node of this machine a camera of the board file is. Numbers of nodes change with the order in which cables are
-//! found, so a camera is named by the serial number of its USB device, by its place on the bus, or by a link that udev
-//! keeps; never by /dev/videoN.
+//! Finds the node of a camera that the board file names. Numbers of nodes change with the order in which devices are found, so
+//! a camera is named by the serial number of its USB device, by its place on the bus, or by a link that udev keeps; never by
+//! /dev/videoN.
 
 use super::fault::{no_camera, refused};
 use super::kernel::{Kernel, Listed, Request};
@@ -8,10 +8,10 @@ use super::uapi::*;
 use crate::{Fault, FaultKind};
 use std::path::{Path, PathBuf};
 
-/// How a board file names a camera.
+/// A camera as a board file names it.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Select {
-    /// `serial:0001`, of the USB device.
+    /// `serial:0001`: the serial number of the USB device.
     Serial(String),
     /// `bus:usb-xhci-hcd.1-2`, as `v4l2-ctl --list-devices` writes it.
     Bus(String),
@@ -20,7 +20,7 @@ pub enum Select {
 }
 
 impl Select {
-    /// What is wrong with `text` is said without its place.
+    /// Parses a name; an error says what is wrong with it.
     pub fn parse(text: &str) -> Result<Select, String> {
         let how = "write serial:NUMBER, bus:INFO or path:/dev/v4l/by-path/LINK (`v4l2-ctl --list-devices` shows them)";
         match text.split_once(':') {
@@ -51,7 +51,7 @@ impl std::fmt::Display for Select {
     }
 }
 
-/// What a node says of itself.
+/// A node that may be the camera.
 #[derive(Clone, Debug)]
 struct Candidate {
     listed: Listed,
@@ -70,7 +70,7 @@ impl std::fmt::Display for Candidate {
     }
 }
 
-/// The node that captures video and fits.
+/// The path of the one node that captures video and has this name.
 pub(super) fn find(kernel: &dyn Kernel, select: &Select) -> Result<PathBuf, Fault> {
     if let Select::Path(path) = select {
         return Ok(path.clone());
@@ -93,7 +93,7 @@ pub(super) fn find(kernel: &dyn Kernel, select: &Select) -> Result<PathBuf, Faul
     let found: Vec<&Candidate> = seen.iter().filter(fits).collect();
     match (found.as_slice(), silent) {
         ([one], _) => Ok(one.listed.path.clone()),
-        // The one that could not be asked may be it.
+        // The node that could not be asked may be the one.
         ([], Some(fault)) => Err(fault),
         ([], None) => {
             let list: Vec<String> = seen.iter().map(Candidate::to_string).collect();
@@ -123,7 +123,7 @@ pub(super) fn cannot_open(path: &Path, e: &std::io::Error) -> Fault {
     refused(&path.display().to_string(), "open the camera", "open", e)
 }
 
-/// Of the node, not of everything that its device can.
+/// The capabilities of the node, not all of its device's.
 pub(super) fn capabilities(c: &Capability) -> u32 {
     if c.capabilities & CAP_DEVICE_CAPS != 0 {
         c.device_caps
@@ -132,7 +132,7 @@ pub(super) fn capabilities(c: &Capability) -> u32 {
     }
 }
 
-/// A string of the kernel's: until the zero.
+/// A string of the kernel's, which ends with a zero byte.
 pub(super) fn text(bytes: &[u8]) -> String {
     let end = bytes.iter().position(|b| *b == 0).unwrap_or(bytes.len());
     String::from_utf8_lossy(&bytes[..end]).into_owned()

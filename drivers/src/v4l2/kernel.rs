@@ -1,5 +1,5 @@
-//! The system calls a camera needs, and nothing that decides. `Linux` makes them; tests answer them with a kernel of
-//! their own, so that each one fails once with each error it can give.
+//! The system calls a camera needs, without any decision. `Linux` makes them; tests answer them with a kernel of their own, so
+//! that each call fails with each error it can give.
 #![allow(unsafe_code)]
 
 use super::uapi::*;
@@ -18,8 +18,8 @@ pub(super) enum Request<'a> {
     SetFormat(&'a mut FormatSingle),
     SetFormatMulti(&'a mut FormatMulti),
     SetParm(&'a mut StreamParm),
-    Buy(&'a mut RequestBuffers),
-    /// The planes are the kernel's to fill where the buffer is of a multi-planar queue.
+    GetBuffers(&'a mut RequestBuffers),
+    /// The kernel fills the planes where the buffer belongs to a multi-planar queue.
     QueryBuffer(&'a mut Buffer, &'a mut [Plane; PLANES_MAX]),
     Queue(&'a mut Buffer, &'a mut [Plane; PLANES_MAX]),
     Dequeue(&'a mut Buffer, &'a mut [Plane; PLANES_MAX]),
@@ -28,12 +28,10 @@ pub(super) enum Request<'a> {
     QueryControl(&'a mut QueryControl),
     SetExtControl(&'a mut ExtControl),
     GetExtControl(&'a mut ExtControl),
-    SetControl(&'a mut Control),
-    GetControl(&'a mut Control),
 }
 
 impl Request<'_> {
-    /// As the documentation has it.
+    /// The name in the documentation.
     pub(super) fn name(&self) -> &'static str {
         match self {
             Request::QueryCap(_) => "VIDIOC_QUERYCAP",
@@ -42,7 +40,7 @@ impl Request<'_> {
             Request::EnumInterval(_) => "VIDIOC_ENUM_FRAMEINTERVALS",
             Request::SetFormat(_) | Request::SetFormatMulti(_) => "VIDIOC_S_FMT",
             Request::SetParm(_) => "VIDIOC_S_PARM",
-            Request::Buy(_) => "VIDIOC_REQBUFS",
+            Request::GetBuffers(_) => "VIDIOC_REQBUFS",
             Request::QueryBuffer(..) => "VIDIOC_QUERYBUF",
             Request::Queue(..) => "VIDIOC_QBUF",
             Request::Dequeue(..) => "VIDIOC_DQBUF",
@@ -51,8 +49,6 @@ impl Request<'_> {
             Request::QueryControl(_) => "VIDIOC_QUERY_EXT_CTRL",
             Request::SetExtControl(_) => "VIDIOC_S_EXT_CTRLS",
             Request::GetExtControl(_) => "VIDIOC_G_EXT_CTRLS",
-            Request::SetControl(_) => "VIDIOC_S_CTRL",
-            Request::GetControl(_) => "VIDIOC_G_CTRL",
         }
     }
 }
@@ -61,11 +57,11 @@ impl Request<'_> {
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Listed {
     pub path: PathBuf,
-    /// Of the USB device behind it.
+    /// Serial number of the USB device behind it.
     pub serial: Option<String>,
 }
 
-/// What poll said of one descriptor.
+/// The answer of poll for one descriptor.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(super) struct Ready {
     pub readable: bool,
@@ -73,7 +69,9 @@ pub(super) struct Ready {
     pub error: bool,
 }
 
+/// System calls: those of Linux, or those of a simulated machine.
 pub(super) trait Kernel: Send + Sync {
+    /// The video nodes of this machine, by path.
     fn nodes(&self) -> io::Result<Vec<Listed>>;
     fn open(&self, path: &Path) -> io::Result<i32>;
     fn close(&self, fd: i32);
@@ -83,15 +81,16 @@ pub(super) trait Kernel: Send + Sync {
     /// # Safety
     /// `at` and `length` are of one `map`, and nobody reads there any more.
     unsafe fn unmap(&self, at: *const u8, length: usize);
-    /// Waits until one of `fds` is ready. None at all: sleeps.
+    /// Waits until one of `fds` is ready, `timeout` at most; without any it sleeps.
     fn poll(&self, fds: &[i32], ready: &mut [Ready], timeout: Span) -> io::Result<()>;
     /// CLOCK_MONOTONIC.
     fn now(&self) -> Nanos;
 }
 
-/// Cameras that one call of `poll` waits for at most.
+/// Most cameras that one call of `poll` waits for.
 pub(super) const NODES_MAX: usize = 4;
 
+/// The kernel of this machine.
 pub(super) struct Linux;
 
 impl Kernel for Linux {
@@ -158,7 +157,7 @@ impl Kernel for Linux {
             Request::SetFormat(a) => call(fd, S_FMT, a),
             Request::SetFormatMulti(a) => call(fd, S_FMT, a),
             Request::SetParm(a) => call(fd, S_PARM, a),
-            Request::Buy(a) => call(fd, REQBUFS, a),
+            Request::GetBuffers(a) => call(fd, REQBUFS, a),
             Request::QueryBuffer(a, planes) => with_planes(fd, QUERYBUF, a, planes),
             Request::Queue(a, planes) => with_planes(fd, QBUF, a, planes),
             Request::Dequeue(a, planes) => with_planes(fd, DQBUF, a, planes),
@@ -167,8 +166,6 @@ impl Kernel for Linux {
             Request::QueryControl(a) => call(fd, QUERY_EXT_CTRL, a),
             Request::SetExtControl(a) => one_control(fd, S_EXT_CTRLS, a),
             Request::GetExtControl(a) => one_control(fd, G_EXT_CTRLS, a),
-            Request::SetControl(a) => call(fd, S_CTRL, a),
-            Request::GetControl(a) => call(fd, G_CTRL, a),
         }
     }
 
@@ -217,7 +214,7 @@ fn checked(answer: i32) -> io::Result<()> {
     Ok(())
 }
 
-/// The real calls on what is no camera: whatever the kernel answers comes back as a value. On cameras: tests/hil.
+/// The real calls on files that are no camera: whatever the kernel answers comes back as a value. On cameras: tests/hil.
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used)]
@@ -240,15 +237,13 @@ mod tests {
             Request::EnumFormat(&mut FormatDescription::default()),
             Request::EnumSize(&mut FrameSize::default()),
             Request::EnumInterval(&mut FrameInterval::default()),
-            Request::SetFormat(&mut { FormatSingle::ZERO }),
-            Request::SetFormatMulti(&mut { FormatMulti::ZERO }),
-            Request::SetParm(&mut { StreamParm::ZERO }),
-            Request::Buy(&mut RequestBuffers::default()),
+            Request::SetFormat(&mut FormatSingle::default()),
+            Request::SetFormatMulti(&mut FormatMulti::default()),
+            Request::SetParm(&mut StreamParm::default()),
+            Request::GetBuffers(&mut RequestBuffers::default()),
             Request::StreamOn(CAPTURE),
             Request::StreamOff(CAPTURE),
-            Request::QueryControl(&mut { QueryControl::ZERO }),
-            Request::SetControl(&mut Control::default()),
-            Request::GetControl(&mut Control::default()),
+            Request::QueryControl(&mut QueryControl::default()),
         ];
         for request in requests {
             let name = request.name();

@@ -1,5 +1,5 @@
-//! One video node, from opening to a stream of buffers: formats are negotiated strictly, as a camera that gives another
-//! size or rate than its calibration was made at is of no use. Dropping a node gives everything back to the kernel.
+//! One video node, from opening to a stream of buffers. Formats are negotiated strictly: a camera that gives another size or
+//! rate than its calibration was made at is of no use. Dropping a node gives everything back to the kernel.
 
 #![allow(unsafe_code)]
 
@@ -17,25 +17,35 @@ use std::io;
 use std::path::Path;
 use std::sync::Arc;
 
-/// Relative error of the rate a camera gives: intervals are whole units of 100 ns.
+/// Largest relative error of the rate a camera gives: intervals are whole units of 100 ns.
 const RATE_TOLERANCE: f64 = 0.01;
 
+/// Buffers that are asked for: four bridge a pause of two frames.
+const BUFFERS: u32 = 4;
+/// Fewest that will do: one for the driver to fill, one to wait, one to read.
+const BUFFERS_MIN: u32 = 3;
+/// VIDEO_MAX_FRAME of the kernel.
+const BUFFERS_MAX: u32 = 32;
+
+/// A node that streams.
 pub(super) struct Node {
     kernel: Arc<dyn Kernel>,
     pub fd: i32,
-    /// In messages: path, and what the camera calls itself.
+    /// Path, and the camera's own name, for messages.
     pub name: String,
+    /// `CAPTURE` or `CAPTURE_MULTI`.
     kind: u32,
     pub format: Format,
     /// The whole picture.
     pub part: Part,
-    /// Of a frame.
+    /// From frame to frame.
     pub period: Span,
-    /// What the camera was asked for, or says it has.
+    /// As the camera says; zero: it does not say.
     pub exposure: Span,
     buffers: Vec<Mapped>,
 }
 
+/// A buffer of the kernel's in our memory.
 struct Mapped {
     at: *const u8,
     length: usize,
@@ -44,17 +54,18 @@ struct Mapped {
 // SAFETY: a mapping is memory of the process, not of a thread.
 unsafe impl Send for Mapped {}
 
-/// What the driver made of the format it was asked for.
+/// The format that the driver made of the one it was asked for.
 struct Set {
     fourcc: u32,
     width: u32,
     height: u32,
-    /// Bytes a row, and of a picture at most.
+    /// Bytes of a row.
     stride: usize,
+    /// Most bytes of a picture.
     bytes: usize,
 }
 
-/// A filled buffer that the kernel does not have. Given back by `Node::give_back`, which takes it.
+/// A filled buffer that we hold, until `Node::give_back` takes it.
 pub(super) struct Filled {
     index: u32,
     start: usize,
@@ -65,11 +76,12 @@ pub(super) struct Filled {
     pub stamp_us: i64,
 }
 
+/// The answer of a node to a request for a filled buffer.
 pub(super) enum Taken {
     Filled(Filled),
-    /// The driver says that its content is damaged; it has the buffer again.
+    /// The driver marked the content as damaged; it has the buffer again.
     Corrupt,
-    /// The driver lost a frame and says so with an error.
+    /// The driver reports a lost frame with an error.
     Failed(io::Error),
     Nothing,
 }
@@ -81,7 +93,7 @@ pub(super) struct Failure {
 }
 
 impl Node {
-    /// `parts`: pictures side by side.
+    /// Opens and starts a node whose pictures have `parts` cameras side by side.
     pub(super) fn open(kernel: Arc<dyn Kernel>, path: &Path, parts: usize, want: &Settings) -> Result<Node, Fault> {
         let fd = kernel.open(path).map_err(|e| cannot_open(path, &e))?;
         let part = Part { x: 0, width: want.width * parts, height: want.height, stride: 0 };
@@ -92,7 +104,7 @@ impl Node {
         let least = node.negotiate(want)?;
         node.period = node.set_rate(want)?;
         node.exposure = Controls::list(&*node.kernel, node.fd, &node.name)?.apply(want)?;
-        node.buy(least)?;
+        node.map_buffers(least)?;
         node.start()?;
         Ok(node)
     }
@@ -120,7 +132,7 @@ impl Node {
         Ok(())
     }
 
-    /// Sets format and size; the bytes that a picture has at least.
+    /// Sets format and size; answers the least bytes of a picture.
     fn negotiate(&mut self, want: &Settings) -> Result<usize, Fault> {
         let offers = offer::list(&*self.kernel, self.fd, self.kind)
             .map_err(|(call, e)| self.refused("list its formats", call, e))?;
@@ -153,13 +165,13 @@ impl Node {
     fn set_format(&self, fourcc: u32) -> Result<Set, Fault> {
         let (width, height) = (self.part.width as u32, self.part.height as u32);
         if self.kind == CAPTURE {
-            let mut f = FormatSingle { width, height, fourcc, ..FormatSingle::ZERO };
+            let mut f = FormatSingle { kind: CAPTURE, width, height, fourcc, field: FIELD_NONE, ..Default::default() };
             self.ioctl("set its format", Request::SetFormat(&mut f))?;
             let (stride, bytes) = (f.bytes_per_line as usize, f.size_image as usize);
             return Ok(Set { fourcc: f.fourcc, width: f.width, height: f.height, stride, bytes });
         }
-        let mut f = FormatMulti { width, height, fourcc, ..FormatMulti::ZERO };
-        f.num_planes = 1;
+        let mut f = FormatMulti { width, height, fourcc, num_planes: 1, ..Default::default() };
+        (f.kind, f.field) = (CAPTURE_MULTI, FIELD_NONE);
         self.ioctl("set its format", Request::SetFormatMulti(&mut f))?;
         // The first plane has the luma, or everything.
         let (stride, bytes) = (f.planes[0].bytes_per_line as usize, f.planes[0].size_image as usize);
@@ -177,14 +189,14 @@ impl Node {
         Fault::new(FaultKind::Config, &self.name, what, fix)
     }
 
-    /// The period of frames. Drivers without rates of their own are triggered, or set elsewhere: they are believed.
+    /// Sets the rate; answers the period of frames. Drivers without rates are triggered, or set elsewhere, and are believed.
     fn set_rate(&self, want: &Settings) -> Result<Span, Fault> {
         let asked = Span::from_secs(1.0 / want.rate_hz);
         let mut p = StreamParm {
             kind: self.kind,
             numerator: 1000,
             denominator: (want.rate_hz * 1000.0).round() as u32,
-            ..StreamParm::ZERO
+            ..Default::default()
         };
         match self.kernel.ioctl(self.fd, Request::SetParm(&mut p)) {
             Err(e) if matches!(e.raw_os_error(), Some(libc::ENOTTY | libc::EINVAL)) => return Ok(asked),
@@ -203,18 +215,14 @@ impl Node {
         Ok(Span::from_secs(period))
     }
 
-    /// Buffers, mapped and queued. A buffer too small for `least` would be read past its end.
-    fn buy(&mut self, least: usize) -> Result<(), Fault> {
+    /// Asks for buffers and maps them. A buffer too small for `least` bytes would be read past its end.
+    fn map_buffers(&mut self, least: usize) -> Result<(), Fault> {
         let mut r = RequestBuffers { count: BUFFERS, kind: self.kind, memory: MEMORY_MMAP, ..Default::default() };
-        self.ioctl("ask for buffers", Request::Buy(&mut r))?;
+        self.ioctl("ask for buffers", Request::GetBuffers(&mut r))?;
         if r.count < BUFFERS_MIN {
             let what = format!("the driver gives {} buffers, {BUFFERS_MIN} are needed", r.count);
-            return Err(Fault::new(
-                FaultKind::Unavailable,
-                &self.name,
-                what,
-                "free memory, or choose another camera.format",
-            ));
+            let fix = "free memory, or choose another camera.format";
+            return Err(Fault::new(FaultKind::Unavailable, &self.name, what, fix));
         }
         for index in 0..r.count.min(BUFFERS_MAX) {
             let (mut b, mut planes) = (self.buffer(index), [Plane::default(); PLANES_MAX]);
@@ -250,7 +258,7 @@ impl Node {
         answer.map_err(|error| Failure { call: "VIDIOC_QBUF", error })
     }
 
-    /// The oldest filled buffer. Does not wait.
+    /// Takes the oldest filled buffer. Does not wait.
     pub(super) fn take(&self) -> Result<Taken, Failure> {
         let (mut b, mut planes) = (self.buffer(0), [Plane::default(); PLANES_MAX]);
         match self.kernel.ioctl(self.fd, Request::Dequeue(&mut b, &mut planes)) {
@@ -277,7 +285,7 @@ impl Node {
         Ok(Taken::Filled(Filled { index, start, bytes, sequence: b.sequence, flags: b.flags, stamp_s, stamp_us }))
     }
 
-    /// What the camera wrote.
+    /// The bytes that the camera wrote.
     pub(super) fn bytes<'a>(&'a self, filled: &'a Filled) -> &'a [u8] {
         let mapped = &self.buffers[filled.index as usize];
         // SAFETY: `start + bytes` is at most the mapping's length (`take`), the mapping lives as long as the node, and the
@@ -289,18 +297,11 @@ impl Node {
         self.queue(filled.index)
     }
 
-    /// Buffers that we may hold while the driver still has two to fill.
+    /// Most buffers that we may hold while the driver still has two to fill.
     pub(super) fn held_max(&self) -> usize {
         self.buffers.len().saturating_sub(2).max(1)
     }
 }
-
-/// Buffers that are asked for: four bridge a pause of two frames.
-const BUFFERS: u32 = 4;
-/// Fewest that will do: one for the driver to fill, one to wait, one to read.
-const BUFFERS_MIN: u32 = 3;
-/// VIDEO_MAX_FRAME of the kernel.
-const BUFFERS_MAX: u32 = 32;
 
 impl Drop for Node {
     /// A device that is gone refuses these; closing the descriptor does the same, so their answers say nothing.
@@ -311,7 +312,7 @@ impl Drop for Node {
             unsafe { self.kernel.unmap(b.at, b.length) };
         }
         let mut none = RequestBuffers { count: 0, kind: self.kind, memory: MEMORY_MMAP, ..Default::default() };
-        let _ = self.kernel.ioctl(self.fd, Request::Buy(&mut none));
+        let _ = self.kernel.ioctl(self.fd, Request::GetBuffers(&mut none));
         self.kernel.close(self.fd);
     }
 }

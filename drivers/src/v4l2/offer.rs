@@ -1,13 +1,14 @@
-//! What a camera offers: formats, sizes, rates, as a list to choose from and as a line to read.
+//! The formats, sizes and rates that a camera offers: as a list to choose from, and as a line to read.
 
 use super::kernel::{Kernel, Request};
 use super::pixels::Format;
 use super::uapi::*;
 use std::io;
 
-/// Entries of one list; a driver whose list never ends is left. The kernel's own virtual camera has 93 formats.
+/// Most entries of one list, for a driver whose list never ends. The kernel's own virtual camera has 93 formats.
 const ENTRIES_MAX: u32 = 256;
 
+/// One format that a camera offers.
 pub(super) struct Offer {
     pub fourcc: u32,
     /// Empty where the driver does not list them: then any may be asked for.
@@ -29,8 +30,10 @@ fn size_has(s: &FrameSize, width: u32, height: u32) -> bool {
     on(width, e[0], e[1], e[2]) && on(height, e[3], e[4], e[5])
 }
 
+/// The call that failed, and its error.
 type Refusal = (&'static str, io::Error);
 
+/// The formats and sizes of a queue of this kind.
 pub(super) fn list(kernel: &dyn Kernel, fd: i32, kind: u32) -> Result<Vec<Offer>, Refusal> {
     let mut offers = Vec::new();
     for index in 0..ENTRIES_MAX {
@@ -55,7 +58,7 @@ pub(super) fn list(kernel: &dyn Kernel, fd: i32, kind: u32) -> Result<Vec<Offer>
     Ok(offers)
 }
 
-/// Whether a list is over, or the driver has none.
+/// Whether a list has ended, or the driver has none.
 fn ended(call: &'static str, answer: io::Result<()>) -> Result<bool, Refusal> {
     match answer {
         Ok(()) => Ok(false),
@@ -64,8 +67,8 @@ fn ended(call: &'static str, answer: io::Result<()>) -> Result<bool, Refusal> {
     }
 }
 
-/// "GREY 752x480 at 20, 10 Hz; YUYV 640x480 at 30 Hz; H264": sizes of what we can read. It is written after something else was refused, so what cannot be
-/// asked is left out.
+/// "GREY 752x480 at 20, 10 Hz; YUYV 640x480 at 30 Hz; H264": sizes and rates of the formats that can be read. It is written
+/// after something else was refused, so whatever the driver does not answer is left out.
 pub(super) fn text(kernel: &dyn Kernel, fd: i32, offers: &[Offer]) -> String {
     let mut entries = Vec::new();
     for offer in offers {
@@ -117,7 +120,7 @@ fn rounded(hz: f64) -> String {
     text.trim_end_matches('0').trim_end_matches('.').to_string()
 }
 
-/// "GREY"; what is no letter is written as a dot.
+/// The text of a format's code, such as "GREY"; what is no letter becomes a dot.
 pub(super) fn code_text(fourcc: u32) -> String {
     let letters = fourcc.to_le_bytes().map(|b| if b.is_ascii_graphic() || b == b' ' { b as char } else { '.' });
     letters.iter().collect::<String>().trim_end().to_string()

@@ -1,5 +1,5 @@
-//! A picture as a camera's driver gives it, to 8-bit grey: the only copy between the kernel's buffer and the tracker.
-//! Of deeper pixels the high bits are kept; of colour the luma the camera made.
+//! A picture as a camera's driver gives it, to 8-bit grey: the only copy between the kernel's buffer and the tracker. Deeper
+//! pixels keep their high bits, colour pictures the camera's own luma.
 
 use crate::types::Image;
 use serde::{Deserialize, Serialize};
@@ -7,8 +7,8 @@ use zune_jpeg::zune_core::bytestream::ZCursor;
 use zune_jpeg::zune_core::{colorspace::ColorSpace, options::DecoderOptions};
 use zune_jpeg::JpegDecoder;
 
-/// Formats that can be read, in the order in which one is taken where the board names none: the cheapest to unpack
-/// first, and those that lose detail last.
+/// Formats that can be read, in the order in which one is chosen where the board names none: the cheapest to unpack first,
+/// and those that lose detail last.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Format {
@@ -39,7 +39,7 @@ impl Format {
         Format::Mjpeg,
     ];
 
-    /// The codes under which drivers offer it.
+    /// The codes by which drivers offer it.
     fn codes(self) -> &'static [&'static [u8; 4]] {
         match self {
             Format::Grey => &[b"GREY"],
@@ -58,7 +58,7 @@ impl Format {
         self.codes().contains(&&fourcc.to_le_bytes())
     }
 
-    /// As a board file writes it.
+    /// The name in board files.
     pub fn name(self) -> &'static str {
         match self {
             Format::Grey => "grey",
@@ -73,12 +73,12 @@ impl Format {
         }
     }
 
-    /// Bytes from a row's start to the end of its pixel `width - 1`. 0 of a compressed picture.
+    /// Bytes from a row's start to the end of its pixel `width - 1`; 0 for compressed pictures.
     pub(super) fn row_bytes(self, width: usize) -> usize {
         match self {
             Format::Grey | Format::Nv12 => width,
             Format::Y10 | Format::Y12 | Format::Y16 => 2 * width,
-            // The byte of the low bits follows the last whole group; a broken group's is not needed.
+            // A byte of low bits follows each whole group; that of a group that is cut is not needed.
             Format::Y10p => width + width.saturating_sub(1) / 4,
             Format::Y12p => width + width.saturating_sub(1) / 2,
             Format::Yuyv => (2 * width).saturating_sub(1),
@@ -87,21 +87,22 @@ impl Format {
     }
 }
 
-/// Where the pixels of one camera lie in a picture of a node: of a pair side by side, its half.
+/// Where the pixels of one camera lie in a node's picture: all of it, or a half of two side by side.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Part {
     /// First column.
     pub x: usize,
-    /// Size of the whole picture; of a part, `image` says it.
+    /// Size of the whole picture; the image that is written gives that of the part.
     pub width: usize,
     pub height: usize,
     /// Bytes from row to row.
     pub stride: usize,
 }
 
+/// Why a picture cannot be read.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) enum Unreadable {
-    /// The driver says that it wrote fewer bytes than the picture has.
+    /// The driver wrote fewer bytes than the picture has.
     Short {
         needed: usize,
         got: usize,
@@ -118,7 +119,7 @@ impl std::fmt::Display for Unreadable {
     }
 }
 
-/// Bytes that pictures of these rows take at least, the padding after the last row not counted; a compressed one says itself.
+/// Least bytes of a picture, without the padding after its last row; 0 for a compressed picture, which states its length.
 pub(super) fn least_bytes(format: Format, part: Part) -> usize {
     if format == Format::Mjpeg {
         return 0;
@@ -126,9 +127,9 @@ pub(super) fn least_bytes(format: Format, part: Part) -> usize {
     part.height.saturating_sub(1) * part.stride + format.row_bytes(part.width)
 }
 
-/// Writes the part of a picture that is as large as `out`. `scratch` is used by compressed pictures with several parts.
+/// Writes a part of a picture, which has the size of `out`. `scratch` is used for compressed pictures with several parts.
 ///
-/// Panics where the part's columns do not lie in the picture, which `Node::open` has checked.
+/// Panics where the part's columns are not in the picture, which `Node::open` has checked.
 pub(super) fn to_grey(
     format: Format,
     bytes: &[u8],
@@ -155,7 +156,7 @@ pub(super) fn to_grey(
     Ok(())
 }
 
-/// Pixels `x`.. of a row.
+/// Unpacks the pixels of a row from column `x` on.
 fn unpack_row(format: Format, row: &[u8], x: usize, to: &mut [u8]) {
     match format {
         Format::Grey | Format::Nv12 => to.copy_from_slice(&row[x..x + to.len()]),
@@ -174,7 +175,7 @@ fn words(row: &[u8], to: &mut [u8], narrow: impl Fn(u16) -> u8) {
     to.iter_mut().zip(row.chunks_exact(2)).for_each(|(p, w)| *p = narrow(u16::from_le_bytes([w[0], w[1]])));
 }
 
-/// Bytes 0, 2, 4 and so on. In blocks of known size, of which compilers make vectors: a fifth of the plain loop's time.
+/// Copies bytes 0, 2, 4 and so on. Blocks of a known size become vector instructions: a fifth of the plain loop's time.
 fn every_other(row: &[u8], to: &mut [u8]) {
     const BLOCK: usize = 16;
     let whole = (row.len() / (2 * BLOCK)).min(to.len() / BLOCK);
@@ -186,7 +187,7 @@ fn every_other(row: &[u8], to: &mut [u8]) {
     (BLOCK * whole..to.len()).for_each(|i| to[i] = row[2 * i]);
 }
 
-/// Groups of `N` bytes, a pixel each, and one of low bits.
+/// Unpacks groups of `N` bytes, a pixel each, that are followed by a byte of low bits.
 fn packed<const N: usize>(row: &[u8], x: usize, to: &mut [u8]) {
     let from = &row[x + x / N..];
     // In whole groups, unless the part starts inside one; the last may lack its low bits.
@@ -197,8 +198,8 @@ fn packed<const N: usize>(row: &[u8], x: usize, to: &mut [u8]) {
     (N * whole..to.len()).for_each(|i| to[i] = row[(x + i) + (x + i) / N]);
 }
 
-/// Strict, so that half a picture is an error and not a picture whose rest is grey. The decoder forgives a last row that
-/// is cut; the marker at the end tells, which nothing inside coded pixels looks like. Padding may follow it.
+/// Decodes a JPEG, strictly: half a picture is an error and not a picture whose rest is grey. The decoder forgives a last row
+/// that is cut, so the marker at the end is looked for, which nothing inside coded pixels looks like. Padding may follow it.
 fn decode(bytes: &[u8], part: Part, scratch: &mut Vec<u8>, out: &mut Image) -> Result<(), Unreadable> {
     let undecodable = |e: &dyn std::fmt::Display| Unreadable::Undecodable(e.to_string());
     if !bytes.windows(2).rev().any(|w| w == [0xff, 0xd9]) {

@@ -1,4 +1,4 @@
-//! When a frame was exposed, which frames are missing before it, and which frames of several cameras belong together:
+//! When a frame was exposed, which frames are missing before it, and which frames of several cameras belong together: all
 //! decided from numbers alone.
 
 use super::kernel::NODES_MAX;
@@ -10,17 +10,17 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum StampPoint {
-    /// As each buffer's flags say: the start of exposure, or the end of the frame.
+    /// What each buffer's flags say: the start of exposure, or the end of the frame.
     Driver,
     ExposureStart,
-    /// The first row is read out: its exposure ended. What CSI receivers call start of frame, and what uvcvideo stamps
-    /// where the camera sends no clock of its own, although it flags the start of exposure.
+    /// The first row is read out: its exposure has ended. CSI receivers call this the start of frame; uvcvideo stamps it where
+    /// the camera sends no clock of its own, although it flags the start of exposure.
     FrameStart,
     /// The last row was received.
     FrameEnd,
 }
 
-/// What one camera's stamps need.
+/// What is needed to make mid-exposure stamps of a driver's.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Timing {
     pub point: StampPoint,
@@ -30,7 +30,7 @@ pub(super) struct Timing {
 }
 
 impl Timing {
-    /// The middle of the first row's exposure.
+    /// The middle of the first row's exposure, from the driver's stamp and flags.
     pub(super) fn mid_exposure(self, stamp: Nanos, flags: u32) -> Nanos {
         let half = Span(self.exposure.0 / 2);
         let of_flags = match flags & uapi::STAMP_SOURCE_MASK {
@@ -45,23 +45,25 @@ impl Timing {
     }
 }
 
-/// What a driver's stamp is worth.
+/// How far a driver's stamp can be believed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Stamp {
     Monotonic(Nanos),
-    /// Of another clock: the driver does not say which, or copied it from elsewhere.
+    /// The driver does not say in which clock it stamps.
     Unknown,
+    /// The driver copied the stamp from elsewhere.
     Copied,
-    /// Says it is monotonic and lies in the future, or further back than a frame can wait.
+    /// It is said to be monotonic, and lies in the future, or further back than a frame can wait.
     Implausible,
 }
 
-/// Longest a frame lies in the driver's queue before it is taken: whoever stops reading for longer gets them dropped.
+/// Longest that a frame waits in the driver's queue: frames of a reader that stops for longer are dropped.
 const WAITED_MAX: Span = Span(10_000_000_000);
 /// A stamp may be ahead of our clock by this: some drivers estimate it, and vivid stamps a frame's end when it starts it.
 /// Stamps of another clock are off by more.
 const AHEAD_MAX: Span = Span(100_000_000);
 
+/// Judges a driver's stamp, in seconds and microseconds, by its flags and the clock.
 pub(super) fn stamp_of(flags: u32, seconds: i64, microseconds: i64, now: Nanos) -> Stamp {
     match flags & uapi::STAMP_MASK {
         uapi::STAMP_MONOTONIC => {
@@ -77,13 +79,14 @@ pub(super) fn stamp_of(flags: u32, seconds: i64, microseconds: i64, now: Nanos) 
     }
 }
 
-/// Frames missing before a frame, told by its number and by its stamp: neither alone sees all. Numbers stay contiguous
-/// over what a USB camera never sent; stamps do not tell two lost frames from a camera that was stopped.
+/// Finds the frames missing before a frame, by its number and by its stamp, as neither sees all: numbers stay contiguous over
+/// frames that a USB camera never sent, and stamps do not tell two lost frames from a camera that was stopped.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(super) struct Gaps {
     last: Option<(u32, Nanos)>,
 }
 
+/// How a frame follows the one before.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Order {
     Next {
@@ -95,7 +98,7 @@ pub(super) enum Order {
 }
 
 impl Gaps {
-    /// `period` is zero where the rate is unknown.
+    /// Takes the next frame; `period` is zero where the rate is unknown.
     pub(super) fn see(&mut self, sequence: u32, t: Nanos, period: Span) -> Order {
         let Some((last_sequence, last_t)) = self.last else {
             self.last = Some((sequence, t));
@@ -105,10 +108,10 @@ impl Gaps {
             return Order::NotNewer;
         }
         self.last = Some((sequence, t));
-        // The number wraps after 2^32 frames. A number that stays or goes back was restarted: nothing can be said.
+        // Numbers wrap after 2^32 frames. One that stays or goes back was restarted and says nothing.
         let ahead = sequence.wrapping_sub(last_sequence);
         let missed_by_sequence = if ahead < 1 << 31 { u64::from(ahead.saturating_sub(1)) } else { 0 };
-        // To the nearest; jitter of up to half a period is none.
+        // Rounded: jitter of up to half a period is no gap.
         let periods = if period.0 > 0 { (t - last_t).0.saturating_add(period.0 / 2) / period.0 } else { 1 };
         Order::Next { missed_by_sequence, missed_by_stamp: periods.max(1) as u64 - 1 }
     }
@@ -119,14 +122,14 @@ impl Gaps {
 pub(super) enum Pairing {
     /// They were exposed together.
     Together,
-    /// This camera's has no partner.
+    /// The frame of this camera has no partner.
     Drop(usize),
     /// A partner may still come.
     Wait,
 }
 
-/// `heads` are the stamps of the oldest frame held of each camera; `full` says of which no more can be held. Stamps of
-/// a camera grow, so the oldest head that is further than the tolerance from the newest can find no partner any more.
+/// Decides about the oldest frame held of each camera: `heads` are their stamps, `full` says which cameras can hold no more.
+/// Stamps of a camera grow, so the oldest head that is further than the tolerance from the newest can find no partner.
 pub(super) fn pair(heads: &[Option<Nanos>], full: &[bool], tolerance: Span) -> Pairing {
     debug_assert!(heads.len() <= NODES_MAX && heads.len() == full.len());
     let stamps = || heads.iter().enumerate().filter_map(|(camera, t)| t.map(|t| (t, camera)));

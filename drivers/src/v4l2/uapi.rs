@@ -1,20 +1,21 @@
-//! What `linux/videodev2.h` says, as far as a camera needs it: structures, ioctl numbers and flags. Sizes and offsets are
-//! those of 64-bit little-endian Linux and are asserted; where the header has a union, the member we use is declared and
-//! the rest is padding. Documentation: kernel.org, "Video for Linux API", by the same names.
+//! The structures, ioctl numbers and flags of `linux/videodev2.h` that a camera needs. Sizes and offsets are those of 64-bit
+//! little-endian Linux and are asserted; where the header has a union, the member that is used is declared and the rest is
+//! padding (arrays in arrays, as `Default` ends at 32 items). Documentation: kernel.org, "Video for Linux API", by the same
+//! names.
 
 /// Capture buffers of one plane and of several (`V4L2_BUF_TYPE_VIDEO_CAPTURE`, `.._MPLANE`).
 pub const CAPTURE: u32 = 1;
 pub const CAPTURE_MULTI: u32 = 9;
 pub const MEMORY_MMAP: u32 = 1;
 pub const FIELD_NONE: u32 = 1;
-/// Planes of a picture at most (`VIDEO_MAX_PLANES`).
+/// Most planes of a picture (`VIDEO_MAX_PLANES`).
 pub const PLANES_MAX: usize = 8;
 
 pub const CAP_CAPTURE: u32 = 0x1;
 pub const CAP_CAPTURE_MULTI: u32 = 0x1000;
 pub const CAP_STREAMING: u32 = 0x0400_0000;
 pub const CAP_DEVICE_CAPS: u32 = 0x8000_0000;
-/// Of `StreamParm::capability`: the driver can be asked for a rate.
+/// Flag of `StreamParm::capability`: the driver can be asked for a rate.
 pub const CAP_TIME_PER_FRAME: u32 = 0x1000;
 
 pub const BUFFER_ERROR: u32 = 0x40;
@@ -39,7 +40,7 @@ pub const CONTROL_INTEGER_MENU: u32 = 9;
 pub const CID_EXPOSURE: u32 = 0x0098_0911;
 pub const CID_EXPOSURE_AUTO: u32 = 0x009a_0901;
 pub const CID_EXPOSURE_ABSOLUTE: u32 = 0x009a_0902;
-/// Value of `CID_EXPOSURE_AUTO`.
+/// Value of `CID_EXPOSURE_AUTO` that lets us set the exposure.
 pub const EXPOSURE_MANUAL: i64 = 1;
 
 pub const QUERYCAP: u32 = read::<Capability>(0);
@@ -52,8 +53,6 @@ pub const DQBUF: u32 = both::<Buffer>(17);
 pub const STREAMON: u32 = write::<u32>(18);
 pub const STREAMOFF: u32 = write::<u32>(19);
 pub const S_PARM: u32 = both::<StreamParm>(22);
-pub const G_CTRL: u32 = both::<Control>(27);
-pub const S_CTRL: u32 = both::<Control>(28);
 pub const G_EXT_CTRLS: u32 = both::<ExtControls>(71);
 pub const S_EXT_CTRLS: u32 = both::<ExtControls>(72);
 pub const ENUM_FRAMESIZES: u32 = both::<FrameSize>(74);
@@ -97,7 +96,7 @@ pub struct FormatDescription {
     pub reserved: [u32; 3],
 }
 
-/// `extent` is width, height where discrete; else least, most and step of the width, then of the height.
+/// `extent` is width and height where discrete; else least, most and step of the width, then of the height.
 #[derive(Clone, Copy, Debug, Default)]
 #[repr(C)]
 pub struct FrameSize {
@@ -122,7 +121,7 @@ pub struct FrameInterval {
 }
 
 /// `v4l2_format` of a single-planar queue.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Default)]
 #[repr(C, align(8))]
 pub struct FormatSingle {
     pub kind: u32,
@@ -133,7 +132,7 @@ pub struct FormatSingle {
     pub field: u32,
     pub bytes_per_line: u32,
     pub size_image: u32,
-    pub rest: [u32; 44],
+    pub rest: [[u32; 11]; 4],
 }
 
 #[derive(Clone, Copy, Debug, Default)]
@@ -145,7 +144,7 @@ pub struct PlaneFormat {
 }
 
 /// `v4l2_format` of a multi-planar queue.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Default)]
 #[repr(C, align(8))]
 pub struct FormatMulti {
     pub kind: u32,
@@ -160,7 +159,7 @@ pub struct FormatMulti {
     pub rest: [u8; 19],
 }
 
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Default)]
 #[repr(C)]
 pub struct StreamParm {
     pub kind: u32,
@@ -169,7 +168,7 @@ pub struct StreamParm {
     /// Seconds a frame.
     pub numerator: u32,
     pub denominator: u32,
-    pub rest: [u32; 46],
+    pub rest: [[u32; 23]; 2],
 }
 
 #[derive(Clone, Copy, Debug, Default)]
@@ -214,19 +213,12 @@ pub struct Plane {
 }
 
 #[derive(Clone, Copy, Debug, Default)]
-#[repr(C)]
-pub struct Control {
-    pub id: u32,
-    pub value: i32,
-}
-
-#[derive(Clone, Copy, Debug, Default)]
 #[repr(C, packed(4))]
 pub struct ExtControl {
     pub id: u32,
     pub size: u32,
     pub reserved: u32,
-    /// The low half where the control is not of 64 bits.
+    /// In the low half where the control has 32 bits.
     pub value: i64,
 }
 
@@ -242,7 +234,7 @@ pub struct ExtControls {
     pub controls: u64,
 }
 
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Default)]
 #[repr(C)]
 pub struct QueryControl {
     pub id: u32,
@@ -260,59 +252,7 @@ pub struct QueryControl {
     pub reserved: [u32; 32],
 }
 
-impl FormatSingle {
-    pub const ZERO: FormatSingle = FormatSingle {
-        kind: CAPTURE,
-        padding: 0,
-        width: 0,
-        height: 0,
-        fourcc: 0,
-        field: FIELD_NONE,
-        bytes_per_line: 0,
-        size_image: 0,
-        rest: [0; 44],
-    };
-}
-
-impl FormatMulti {
-    pub const ZERO: FormatMulti = FormatMulti {
-        kind: CAPTURE_MULTI,
-        padding: 0,
-        width: 0,
-        height: 0,
-        fourcc: 0,
-        field: FIELD_NONE,
-        colorspace: 0,
-        planes: [PlaneFormat { size_image: 0, bytes_per_line: 0, reserved: [0; 6] }; PLANES_MAX],
-        num_planes: 0,
-        rest: [0; 19],
-    };
-}
-
-impl StreamParm {
-    pub const ZERO: StreamParm =
-        StreamParm { kind: CAPTURE, capability: 0, capture_mode: 0, numerator: 0, denominator: 0, rest: [0; 46] };
-}
-
-impl QueryControl {
-    pub const ZERO: QueryControl = QueryControl {
-        id: 0,
-        kind: 0,
-        name: [0; 32],
-        minimum: 0,
-        maximum: 0,
-        step: 0,
-        default: 0,
-        flags: 0,
-        elem_size: 0,
-        elems: 0,
-        nr_of_dims: 0,
-        dims: [0; 4],
-        reserved: [0; 32],
-    };
-}
-
-/// As the header's compiler on 64-bit Linux has it; `place` and `ExtControl::value` take the low half first.
+/// Layouts as a C compiler on 64-bit Linux gives them; `place` and `ExtControl::value` take the low half first.
 const _: () = {
     assert!(cfg!(all(target_pointer_width = "64", target_endian = "little")));
     assert!(size_of::<Capability>() == 104);
@@ -329,7 +269,6 @@ const _: () = {
     assert!(std::mem::offset_of!(Buffer, sequence) == 56);
     assert!(std::mem::offset_of!(Buffer, place) == 64);
     assert!(size_of::<Plane>() == 64);
-    assert!(size_of::<Control>() == 8);
     assert!(size_of::<ExtControl>() == 20);
     assert!(size_of::<ExtControls>() == 32);
     assert!(size_of::<QueryControl>() == 232);
@@ -337,7 +276,7 @@ const _: () = {
     assert!(QUERYCAP == 0x8068_5600 && ENUM_FMT == 0xc040_5602 && S_FMT == 0xc0d0_5605 && REQBUFS == 0xc014_5608);
     assert!(QUERYBUF == 0xc058_5609 && QBUF == 0xc058_560f && DQBUF == 0xc058_5611);
     assert!(STREAMON == 0x4004_5612 && STREAMOFF == 0x4004_5613 && S_PARM == 0xc0cc_5616);
-    assert!(G_CTRL == 0xc008_561b && S_CTRL == 0xc008_561c && G_EXT_CTRLS == 0xc020_5647);
+    assert!(G_EXT_CTRLS == 0xc020_5647);
     assert!(S_EXT_CTRLS == 0xc020_5648 && ENUM_FRAMESIZES == 0xc02c_564a && ENUM_FRAMEINTERVALS == 0xc034_564b);
     assert!(QUERY_EXT_CTRL == 0xc0e8_5667);
 };

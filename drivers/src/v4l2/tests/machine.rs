@@ -271,7 +271,7 @@ fn answer(c: &mut Cam, request: Request) -> io::Result<()> {
         Request::QueryCap(a) => {
             a.capabilities = c.capabilities | CAP_DEVICE_CAPS;
             a.device_caps = c.capabilities;
-            a.card[..4].copy_from_slice(b"eye\0");
+            a.card[..4].copy_from_slice(b"cam\0");
             a.bus_info[..c.bus.len()].copy_from_slice(c.bus.as_bytes());
         }
         Request::EnumFormat(a) => match c.formats.get(a.index as usize) {
@@ -307,7 +307,7 @@ fn answer(c: &mut Cam, request: Request) -> io::Result<()> {
             Some((num, den)) => (a.capability, a.numerator, a.denominator) = (CAP_TIME_PER_FRAME, num, den),
             None => return refuse(libc::ENOTTY),
         },
-        Request::Buy(a) => {
+        Request::GetBuffers(a) => {
             c.forget();
             a.count = a.count.min(c.buffers_given);
             c.buffers = vec![vec![0; c.buffer_bytes]; a.count as usize];
@@ -338,10 +338,8 @@ fn answer(c: &mut Cam, request: Request) -> io::Result<()> {
             *a = *control;
         }
         Request::SetExtControl(a) => set(c, a.id, a.value),
-        Request::SetControl(a) => set(c, a.id, i64::from(a.value)),
         // As the kernel does, only the low half is written.
         Request::GetExtControl(a) => a.value = i64::from(get(c, a.id) as u32),
-        Request::GetControl(a) => a.value = get(c, a.id) as i32,
     }
     Ok(())
 }

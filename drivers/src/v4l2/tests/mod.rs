@@ -8,8 +8,11 @@ mod streams;
 
 use super::uapi::*;
 use super::*;
-use crate::{Camera, ImuCalibration, Lens, Pose};
+use crate::source::{FrameSource, SourceFault, Wait};
+use crate::types::{Frames, Nanos};
+use crate::{Calibration, Camera, ImuCalibration, Lens, Pose};
 use machine::{Cam, Machine, BOOT, HEIGHT, PERIOD, WIDTH};
+use std::sync::Arc;
 
 const MS: i64 = 1_000_000;
 
@@ -82,7 +85,7 @@ fn take(rig: &mut Rig, frames: &mut Frames, pictures: usize) -> Vec<Result<Wait,
 }
 
 fn control(id: u32, name: &str, minimum: i64, maximum: i64, step: u64) -> QueryControl {
-    let mut c = QueryControl { id, kind: CONTROL_INTEGER, minimum, maximum, step, ..QueryControl::ZERO };
+    let mut c = QueryControl { id, kind: CONTROL_INTEGER, minimum, maximum, step, ..Default::default() };
     c.name[..name.len()].copy_from_slice(name.as_bytes());
     c
 }
