@@ -1,10 +1,10 @@
-//! Single lines of GPIO through libgpiod 1.6, which Debian 12 and JetPack 6 ship: a data-ready input whose edges the
-//! kernel stamps, an output that triggers cameras, and one for a status LED. No thread is started here.
+//! Single lines of GPIO through libgpiod 1.6, which Debian 12 and JetPack 6 ship: a data-ready input whose edges the kernel
+//! stamps, an output that triggers cameras, and one for a status LED. No thread is started here.
 //!
-//! A chip is chosen by its label, name or path, a line by its name or offset. Line offsets stay as they are wired;
-//! chip numbers change with the order in which drivers are probed, so a label is the better choice.
+//! A chip is chosen by its label, name or path, a line by its name or offset. Offsets of lines are a matter of wiring; the
+//! numbers of chips change with the order in which drivers are probed, so a label is the better choice.
 //!
-//! The kernel stamps edges with `CLOCK_MONOTONIC` since 5.7, in the interrupt. It queues 16 a line and drops those
+//! The kernel stamps edges with `CLOCK_MONOTONIC` since 5.7, in the interrupt. It queues 16 for each line and drops those
 //! that come when the queue is full; `imu::edges` finds that out by counting.
 #![allow(unsafe_code)]
 
@@ -15,7 +15,10 @@ use crate::{Fault, FaultKind};
 use serde::{Deserialize, Serialize};
 use std::ffi::{c_char, c_int, c_uint, CString};
 
-/// What is used of <gpiod.h>, version 1.
+#[cfg(test)]
+mod tests;
+
+/// The part of <gpiod.h>, version 1, that is used.
 mod c {
     use super::*;
 
@@ -51,7 +54,7 @@ mod c {
 
     /// In tests every call can be made to fail.
     #[cfg(test)]
-    pub use super::simulated::*;
+    pub use super::tests::simulated::*;
 
     #[cfg(not(test))]
     pub use libc::clock_nanosleep;
@@ -64,14 +67,13 @@ mod c {
         pub fn gpiod_chip_get_line(chip: *mut Chip, offset: c_uint) -> *mut Line;
         pub fn gpiod_chip_find_line(chip: *mut Chip, name: *const c_char) -> *mut Line;
         pub fn gpiod_line_request(line: *mut Line, config: *const Request, default: c_int) -> c_int;
-        pub fn gpiod_line_get_value(line: *mut Line) -> c_int;
         pub fn gpiod_line_set_value(line: *mut Line, value: c_int) -> c_int;
         pub fn gpiod_line_event_wait(line: *mut Line, timeout: *const libc::timespec) -> c_int;
         pub fn gpiod_line_event_read_multiple(line: *mut Line, events: *mut Event, count: c_uint) -> c_int;
     }
 }
 
-/// A line, as a board file names it.
+/// A line as a board file names it.
 #[derive(Clone, Debug, PartialEq, Eq, Default)]
 pub struct LineName {
     /// Label, name or path of the chip.
@@ -86,6 +88,7 @@ impl std::fmt::Display for LineName {
     }
 }
 
+/// The edge that means that a sample is ready.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Edge {
@@ -93,9 +96,8 @@ pub enum Edge {
     Falling,
 }
 
-/// A requested line. Closing the chip releases it, and puts an output back to what the hardware makes of it.
+/// A requested line. Dropping it closes its chip, which releases the line and puts an output back to its hardware default.
 struct Line {
-    name: LineName,
     chip: *mut c::Chip,
     line: *mut c::Line,
 }
@@ -112,7 +114,7 @@ fn c_string(text: &str) -> Result<CString, i32> {
 }
 
 impl Line {
-    fn request(name: &LineName, kind: c_int, flags: c_int, value: bool) -> Result<Line, i32> {
+    fn request(name: &LineName, kind: c_int, flags: c_int) -> Result<Line, i32> {
         let (chip_name, line_name) = (c_string(&name.chip)?, c_string(&name.line)?);
         // SAFETY: a string that outlives the call; the result is checked.
         let chip = unsafe { c::gpiod_chip_open_lookup(chip_name.as_ptr()) };
@@ -120,7 +122,7 @@ impl Line {
             return Err(errno());
         }
         // From here on dropping it closes the chip.
-        let mut found = Line { name: name.clone(), chip, line: std::ptr::null_mut() };
+        let mut found = Line { chip, line: std::ptr::null_mut() };
         // SAFETY: the chip is open; strings outlive the calls; a missing line is null.
         found.line = unsafe {
             match name.line.parse() {
@@ -133,35 +135,9 @@ impl Line {
         }
         let request = c::Request { consumer: c"stipple".as_ptr(), request_type: kind, flags };
         // SAFETY: the line belongs to the open chip; the request and its string outlive the call.
-        let done = unsafe { c::gpiod_line_request(found.line, &request, c_int::from(value)) };
-        if done < 0 {
-            Err(errno())
-        } else {
-            Ok(found)
-        }
-    }
-
-    fn open(name: &LineName, kind: c_int, flags: c_int, value: bool) -> Result<Line, Fault> {
-        Line::request(name, kind, flags, value).map_err(|errno| cannot_open(name, errno))
-    }
-
-    fn get(&self) -> Result<bool, i32> {
-        // SAFETY: the line is requested for as long as `self` lives.
-        let value = unsafe { c::gpiod_line_get_value(self.line) };
-        if value < 0 {
-            Err(errno())
-        } else {
-            Ok(value == 1)
-        }
-    }
-
-    fn set(&self, value: bool) -> Result<(), i32> {
-        // SAFETY: as above.
-        let done = unsafe { c::gpiod_line_set_value(self.line, c_int::from(value)) };
-        if done < 0 {
-            Err(errno())
-        } else {
-            Ok(())
+        match unsafe { c::gpiod_line_request(found.line, &request, 0) } {
+            ..0 => Err(errno()),
+            _ => Ok(found),
         }
     }
 }
@@ -173,7 +149,7 @@ impl Drop for Line {
     }
 }
 
-fn cannot_open(name: &LineName, errno: i32) -> Fault {
+fn cannot_use(name: &LineName, errno: i32) -> Fault {
     let fix = match errno {
         libc::EBUSY => "another program or driver holds the line: gpioinfo says which",
         libc::EACCES | libc::EPERM => "let the user open /dev/gpiochip* (udev rule, or group gpio)",
@@ -184,21 +160,22 @@ fn cannot_open(name: &LineName, errno: i32) -> Fault {
     Fault::new(FaultKind::Unavailable, format!("GPIO {name}"), what, fix)
 }
 
-/// An input whose edges mean that a sample is ready.
+/// An input line whose edges say that a sample is ready.
 pub struct DataReady {
-    /// None while it is gone.
+    /// `None` while it is gone.
     line: Option<Line>,
     name: LineName,
     edge: Edge,
 }
 
-/// What the kernel queues of one line.
+/// Edges that the kernel queues for one line.
 const EVENTS: usize = 16;
 
 impl DataReady {
+    /// Requests the line for edges.
     pub fn open(name: &LineName, edge: Edge) -> Result<DataReady, Fault> {
         let mut opened = DataReady { line: None, name: name.clone(), edge };
-        opened.reopen().map_err(|EdgeFault(errno)| cannot_open(name, errno))?;
+        opened.reopen().map_err(|EdgeFault(errno)| cannot_use(name, errno))?;
         Ok(opened)
     }
 
@@ -209,8 +186,7 @@ impl DataReady {
 
 impl Edges for DataReady {
     fn wait(&mut self, timeout: Span) -> Result<bool, EdgeFault> {
-        let ns = timeout.0.max(0);
-        let timeout = libc::timespec { tv_sec: ns / 1_000_000_000, tv_nsec: ns % 1_000_000_000 };
+        let timeout = timespec(timeout.0.max(0));
         // SAFETY: the line is requested for events; the timeout outlives the call.
         match unsafe { c::gpiod_line_event_wait(self.line()?.line, &timeout) } {
             ready @ (0 | 1) => Ok(ready == 1),
@@ -221,9 +197,9 @@ impl Edges for DataReady {
     }
 
     fn drain(&mut self, into: &mut EdgeQueue) -> Result<(), EdgeFault> {
-        // Reading blocks where there is nothing: asked for first.
+        // Reading blocks where there is nothing, so it is asked for first.
         while self.wait(Span(0))? {
-            let mut events = [const { c::Event { t: libc::timespec { tv_sec: 0, tv_nsec: 0 }, kind: 0 } }; EVENTS];
+            let mut events = [const { c::Event { t: timespec(0), kind: 0 } }; EVENTS];
             // SAFETY: the line is requested for events; there is room for as many as are asked for.
             let read =
                 unsafe { c::gpiod_line_event_read_multiple(self.line()?.line, events.as_mut_ptr(), EVENTS as c_uint) };
@@ -242,313 +218,77 @@ impl Edges for DataReady {
         // The line is busy until the old request is gone.
         self.line = None;
         let kind = if self.edge == Edge::Rising { c::EVENT_RISING } else { c::EVENT_FALLING };
-        self.line = Some(Line::request(&self.name, kind, 0, false).map_err(EdgeFault)?);
+        self.line = Some(Line::request(&self.name, kind, 0).map_err(EdgeFault)?);
         Ok(())
     }
 }
 
+/// An instant or a span that is not negative.
+const fn timespec(ns: i64) -> libc::timespec {
+    libc::timespec { tv_sec: ns / 1_000_000_000, tv_nsec: ns % 1_000_000_000 }
+}
+
 /// An output line.
-pub struct Output(Line);
+pub struct Output {
+    line: Line,
+    name: LineName,
+}
 
 impl Output {
-    /// Inactive at first.
+    /// Requests the line, inactive at first.
     pub fn open(name: &LineName, active_low: bool) -> Result<Output, Fault> {
         let flags = if active_low { c::ACTIVE_LOW } else { 0 };
-        Ok(Output(Line::open(name, c::DIRECTION_OUTPUT, flags, false)?))
+        let line = Line::request(name, c::DIRECTION_OUTPUT, flags).map_err(|errno| cannot_use(name, errno))?;
+        Ok(Output { line, name: name.clone() })
     }
 
     pub fn set(&mut self, active: bool) -> Result<(), Fault> {
-        self.0.set(active).map_err(|errno| cannot_open(&self.0.name, errno))
-    }
-
-    /// What the line carries.
-    pub fn get(&self) -> Result<bool, Fault> {
-        self.0.get().map_err(|errno| cannot_open(&self.0.name, errno))
-    }
-}
-
-/// When a pulse began, and by how much that may be wrong: the time that setting the line took.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Fired {
-    pub at: Nanos,
-    pub within: Span,
-}
-
-impl Fired {
-    /// Middle of an exposure that starts with the pulse: the stamp of the frame it takes.
-    pub fn mid_exposure(&self, exposure: Span) -> Nanos {
-        self.at + Span(exposure.0 / 2)
+        // SAFETY: the line is requested for as long as `self` lives.
+        match unsafe { c::gpiod_line_set_value(self.line.line, c_int::from(active)) } {
+            ..0 => Err(cannot_use(&self.name, errno())),
+            _ => Ok(()),
+        }
     }
 }
 
-/// Starts exposures of all cameras wired to one line, at a rate without drift. `wait` and `pulse` are for a thread
-/// that does nothing else, of the highest priority it can get: `loop { trigger.wait(); trigger.pulse()? }`. The
-/// daemon lists it among its threads; nothing here starts one.
+/// Starts the exposures of all cameras that are wired to one line, at a rate without drift. A thread that does nothing else,
+/// of the highest priority it can get, calls `wait` and `pulse` in turns.
 pub struct Trigger {
     line: Output,
     pulse: Span,
     period: Span,
     due: Nanos,
-    /// Periods that were over before their pulse.
-    pub missed: u64,
 }
 
 impl Trigger {
+    /// Pulses of a length, active on `line`, so many a second from now on.
     pub fn new(line: Output, pulse: Span, rate_hz: f64) -> Trigger {
         let period = Span::from_secs(1.0 / rate_hz);
-        Trigger { line, pulse, period, due: monotonic() + period, missed: 0 }
+        Trigger { line, pulse, period, due: monotonic() + period }
     }
 
-    /// Sleeps until the next pulse is due.
-    pub fn wait(&mut self) {
-        let due = libc::timespec { tv_sec: self.due.0 / 1_000_000_000, tv_nsec: self.due.0 % 1_000_000_000 };
+    /// Sleeps until the next pulse is due; answers how many were missed, as their periods are over already.
+    pub fn wait(&mut self) -> u64 {
+        let due = timespec(self.due.0);
         // SAFETY: the instant outlives the call; the remaining time is not asked for.
         while unsafe { c::clock_nanosleep(libc::CLOCK_MONOTONIC, libc::TIMER_ABSTIME, &due, std::ptr::null_mut()) }
             == libc::EINTR
         {}
         let missed;
         (self.due, missed) = next_due(self.due, self.period, monotonic());
-        self.missed += missed;
+        missed
     }
 
-    /// One pulse, now; sleeps for its length.
-    pub fn pulse(&mut self) -> Result<Fired, Fault> {
-        let before = monotonic();
+    /// Gives one pulse now; sleeps for its length.
+    pub fn pulse(&mut self) -> Result<(), Fault> {
         self.line.set(true)?;
-        let within = monotonic() - before;
         std::thread::sleep(std::time::Duration::from_nanos(self.pulse.0.max(0) as u64));
-        self.line.set(false)?;
-        Ok(Fired { at: before + Span(within.0 / 2), within: Span(within.0 / 2) })
+        self.line.set(false)
     }
 }
 
-/// The pulse after one that was due: on the same grid, those that are over left out and counted.
+/// The pulse after one that was due, on the same grid, and how many before it are over already.
 fn next_due(due: Nanos, period: Span, now: Nanos) -> (Nanos, u64) {
     let late = (now - due).0.max(0) / period.0.max(1);
     (due + Span(period.0.saturating_mul(late + 1)), late as u64)
-}
-
-/// libgpiod on a machine with one chip, of which the named call fails as it is told. The real one: drivers/tests/gpio.rs
-/// and, on the kernel's own simulated chip, tests/hil.
-#[cfg(test)]
-mod simulated {
-    use super::c::{Chip, Event, Line, Request};
-    use super::*;
-    use std::cell::{Cell, RefCell};
-    use std::ptr::{null_mut, NonNull};
-
-    thread_local! {
-        /// Which call fails, with which error.
-        pub static FAILS: Cell<(&'static str, i32)> = const { Cell::new(("", 0)) };
-        pub static OPEN: Cell<usize> = const { Cell::new(0) };
-        pub static LEVELS: RefCell<Vec<c_int>> = const { RefCell::new(Vec::new()) };
-        /// Stamps, ns, of edges that are waiting.
-        pub static WAITING: RefCell<Vec<i64>> = const { RefCell::new(Vec::new()) };
-        /// Signals that are to come while it sleeps.
-        pub static SIGNALS: Cell<u32> = const { Cell::new(0) };
-    }
-
-    fn fails(call: &str) -> bool {
-        let (struck, errno) = FAILS.get();
-        // SAFETY: the errno of this thread.
-        unsafe { *libc::__errno_location() = errno };
-        struck == call
-    }
-
-    fn answer(call: &str, good: c_int) -> c_int {
-        if fails(call) {
-            -1
-        } else {
-            good
-        }
-    }
-
-    fn pointer<T>(call: &str) -> *mut T {
-        if fails(call) {
-            null_mut()
-        } else {
-            NonNull::dangling().as_ptr()
-        }
-    }
-
-    pub unsafe fn clock_nanosleep(
-        clock: libc::clockid_t,
-        flags: c_int,
-        due: *const libc::timespec,
-        left: *mut libc::timespec,
-    ) -> c_int {
-        match SIGNALS.get() {
-            // SAFETY: as the caller has it.
-            0 => unsafe { libc::clock_nanosleep(clock, flags, due, left) },
-            n => {
-                SIGNALS.set(n - 1);
-                libc::EINTR
-            }
-        }
-    }
-
-    pub unsafe fn gpiod_chip_open_lookup(_: *const c_char) -> *mut Chip {
-        let chip: *mut Chip = pointer("open");
-        OPEN.set(OPEN.get() + usize::from(!chip.is_null()));
-        chip
-    }
-
-    pub unsafe fn gpiod_chip_close(_: *mut Chip) {
-        OPEN.set(OPEN.get() - 1);
-    }
-
-    pub unsafe fn gpiod_chip_get_line(_: *mut Chip, _: c_uint) -> *mut Line {
-        pointer("get line")
-    }
-
-    pub unsafe fn gpiod_chip_find_line(_: *mut Chip, _: *const c_char) -> *mut Line {
-        pointer("find line")
-    }
-
-    pub unsafe fn gpiod_line_request(_: *mut Line, _: *const Request, level: c_int) -> c_int {
-        LEVELS.with_borrow_mut(|l| l.push(level));
-        answer("request", 0)
-    }
-
-    pub unsafe fn gpiod_line_get_value(_: *mut Line) -> c_int {
-        answer("get", LEVELS.with_borrow(|l| l.last().copied().unwrap_or(0)))
-    }
-
-    pub unsafe fn gpiod_line_set_value(_: *mut Line, level: c_int) -> c_int {
-        // The one that lets go can fail by itself.
-        let done = answer(if level == 0 { "clear" } else { "set" }, 0);
-        if done == 0 {
-            LEVELS.with_borrow_mut(|l| l.push(level));
-        }
-        done
-    }
-
-    pub unsafe fn gpiod_line_event_wait(_: *mut Line, _: *const libc::timespec) -> c_int {
-        answer("wait", c_int::from(WAITING.with_borrow(|w| !w.is_empty())))
-    }
-
-    pub unsafe fn gpiod_line_event_read_multiple(_: *mut Line, events: *mut Event, count: c_uint) -> c_int {
-        let n = WAITING.with_borrow_mut(|w| {
-            let n = w.len().min(count as usize);
-            for (i, t) in w.drain(..n).enumerate() {
-                let t = libc::timespec { tv_sec: t / 1_000_000_000, tv_nsec: t % 1_000_000_000 };
-                // SAFETY: the caller has room for `count` events.
-                unsafe { events.add(i).write(Event { t, kind: 1 }) };
-            }
-            n
-        });
-        answer("read", n as c_int)
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    #![allow(clippy::unwrap_used)]
-    use super::simulated::{FAILS, LEVELS, OPEN, SIGNALS, WAITING};
-    use super::*;
-
-    const ERRNOS: [i32; 8] =
-        [libc::EACCES, libc::EBUSY, libc::EINVAL, libc::EIO, libc::ENODEV, libc::ENOENT, libc::ENOTTY, libc::EPERM];
-
-    fn line(chip: &str, line: &str) -> LineName {
-        LineName { chip: chip.into(), line: line.into() }
-    }
-
-    #[test]
-    fn every_error_of_every_call_of_opening_is_said_and_leaves_nothing_open() {
-        for errno in ERRNOS {
-            for (call, name) in [("open", "3"), ("get line", "3"), ("find line", "LED"), ("request", "3")] {
-                FAILS.set((call, errno));
-                let (input, output) =
-                    (DataReady::open(&line("chip", name), Edge::Falling), Output::open(&line("chip", name), true));
-                for fault in [input.map(|_| ()).unwrap_err(), output.map(|_| ()).unwrap_err()] {
-                    let said = if call.ends_with("line") { libc::ENOENT } else { errno };
-                    assert!(fault.to_string().contains(&std::io::Error::from_raw_os_error(said).to_string()));
-                    assert!(fault.place == format!("GPIO chip line {name}") && !fault.fix.is_empty(), "{fault}");
-                }
-                assert_eq!(OPEN.get(), 0, "{call}");
-            }
-        }
-        assert!(Output::open(&line("a\0b", "3"), false).is_err(), "a name with a zero byte");
-    }
-
-    #[test]
-    fn every_error_of_an_input_is_a_value_and_a_signal_is_none() {
-        let mut input = DataReady::open(&line("chip", "3"), Edge::Rising).unwrap();
-        let mut queue = EdgeQueue::default();
-        for errno in ERRNOS {
-            FAILS.set(("wait", errno));
-            assert_eq!((input.wait(Span(1)), input.drain(&mut queue)), (Err(EdgeFault(errno)), Err(EdgeFault(errno))));
-            WAITING.with_borrow_mut(|w| *w = vec![monotonic().0]);
-            FAILS.set(("read", errno));
-            assert_eq!(input.drain(&mut queue), Err(EdgeFault(errno)));
-            FAILS.set(("request", errno));
-            assert_eq!(input.reopen(), Err(EdgeFault(errno)));
-            assert_eq!((input.wait(Span(0)), OPEN.get()), (Err(EdgeFault(libc::ENODEV)), 0));
-            FAILS.set(("", 0));
-            assert_eq!((input.reopen(), OPEN.get()), (Ok(()), 1));
-        }
-        FAILS.set(("wait", libc::EINTR));
-        assert_eq!(input.wait(Span(1)), Ok(false));
-        FAILS.set(("", 0));
-        // More than one read takes.
-        WAITING.with_borrow_mut(|w| *w = (0..EVENTS as i64 + 3).map(|i| monotonic().0 - 1000 + i).collect());
-        assert_eq!(
-            (input.drain(&mut queue), queue.stamps().len(), input.wait(Span(0))),
-            (Ok(()), EVENTS + 3, Ok(false))
-        );
-    }
-
-    #[test]
-    fn every_error_of_an_output_is_said_and_the_next_pulse_is_tried() {
-        let mut trigger = Trigger::new(Output::open(&line("chip", "3"), false).unwrap(), Span(1000), 1000.0);
-        for errno in ERRNOS {
-            for call in ["set", "clear"] {
-                FAILS.set((call, errno));
-                let said = trigger.pulse().unwrap_err().to_string();
-                assert!(said.starts_with("GPIO chip line 3"), "{said}");
-            }
-            FAILS.set(("get", errno));
-            assert!(trigger.line.get().is_err());
-            FAILS.set(("", 0));
-            trigger.wait();
-            assert!(trigger.pulse().is_ok_and(|fired| fired.within >= Span(0)) && trigger.line.get() == Ok(false));
-            assert!(LEVELS.with_borrow(|l| l.ends_with(&[1, 0])), "high, then low");
-        }
-        drop(trigger);
-        assert_eq!(OPEN.get(), 0);
-    }
-
-    #[test]
-    fn a_signal_does_not_bring_a_pulse_forward() {
-        let mut trigger = Trigger::new(Output::open(&line("chip", "3"), false).unwrap(), Span(1000), 50.0);
-        let due = trigger.due;
-        SIGNALS.set(3);
-        trigger.wait();
-        assert!(SIGNALS.get() == 0 && monotonic() >= due);
-    }
-
-    #[test]
-    fn every_errno_says_what_to_do() {
-        let fix = |errno| cannot_open(&line("chip", "3"), errno).fix;
-        assert!(fix(libc::EBUSY).contains("gpioinfo says which"));
-        assert!(fix(libc::EACCES).contains("udev"));
-        assert!(fix(libc::ENOTTY).contains("can do this"));
-        assert!(fix(libc::ENOENT).contains("gpioinfo list"));
-    }
-
-    #[test]
-    fn pulses_keep_their_grid_however_late_one_is() {
-        let (due, missed) = next_due(Nanos(100), Span(50), Nanos(103));
-        assert_eq!((due, missed), (Nanos(150), 0));
-        let (due, missed) = next_due(Nanos(100), Span(50), Nanos(260));
-        assert_eq!((due, missed), (Nanos(300), 3), "150, 200 and 250 are over");
-        assert_eq!(next_due(Nanos(100), Span(50), Nanos(40)).0, Nanos(150));
-    }
-
-    #[test]
-    fn frames_are_stamped_in_the_middle_of_their_exposure() {
-        let fired = Fired { at: Nanos(1_000), within: Span(5) };
-        assert_eq!(fired.mid_exposure(Span(600)), Nanos(1_300));
-    }
 }

@@ -4,9 +4,10 @@
 use super::status::print_err;
 use crate::config::{Board, InjectConfig};
 use std::path::Path;
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
+use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::sync::Arc;
 use std::thread::JoinHandle;
+use stipple_drivers::counters::Counter;
 use stipple_drivers::gpio::{DataReady, Output, Trigger};
 use stipple_drivers::inject::{FaultyFrames, FaultyImu};
 use stipple_drivers::paced::{Images, Pace, PacedFrames, PacedImu};
@@ -272,21 +273,22 @@ impl<S: ImuSource> ImuSource for CorrectedImu<S> {
 /// Thread `trigger`: starts exposures until it is dropped.
 struct Pulses {
     stop: Arc<AtomicBool>,
-    failed: Arc<AtomicU64>,
+    /// Pulses that failed, and pulses whose period was over before they came.
+    counts: Arc<[Counter; 2]>,
     thread: Option<JoinHandle<()>>,
 }
 
 impl Pulses {
     fn start(mut trigger: Trigger) -> Pulses {
-        let (stop, failed) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicU64::new(0)));
-        let (asked, count) = (stop.clone(), failed.clone());
+        let (stop, counts): (Arc<AtomicBool>, Arc<[Counter; 2]>) = Default::default();
+        let (asked, counted) = (stop.clone(), counts.clone());
         let thread = super::start("trigger", move || {
             while !asked.load(Relaxed) {
-                trigger.wait();
-                count.fetch_add(u64::from(trigger.pulse().is_err()), Relaxed);
+                counted[1].add(trigger.wait());
+                counted[0].add(u64::from(trigger.pulse().is_err()));
             }
         });
-        Pulses { stop, failed, thread: Some(thread) }
+        Pulses { stop, counts, thread: Some(thread) }
     }
 }
 
@@ -317,7 +319,8 @@ impl<S: FrameSource> FrameSource for Triggered<S> {
 
     fn counters(&self) -> Vec<(&'static str, u64)> {
         let mut list = self.source.counters();
-        list.push(("trigger_failures", self.pulses.failed.load(Relaxed)));
+        let [failed, missed] = &*self.pulses.counts;
+        list.extend([("trigger_failures", failed.get()), ("trigger_missed", missed.get())]);
         list
     }
 }

@@ -1,6 +1,7 @@
 //! Each kind of fault: what it does to what passes, and what is counted.
 #![cfg(test)]
 #![allow(clippy::unwrap_used)]
+
 use super::*;
 use crate::paced::{Images, Pace, PacedFrames, PacedImu};
 use crate::types::{Image, ImuSample};
