@@ -1,15 +1,18 @@
-//! The text files of an EuRoC ASL folder, as the simulator and the recorder write them.
+//! The files of an EuRoC ASL folder, as the simulator and the recorder write them: calibration, tables, images.
 
 use crate::calibration::{ImuCalibration, RigCamera};
 use crate::camera::Lens;
-use crate::types::{ImuSample, Pose};
+use crate::types::{Colour, Image, ImuSample, Pose};
 use glam::{DMat3, DVec3};
+use png::{BitDepth, ColorType, EncodingError};
 use std::io::{self, Write};
 
+/// Headlines of the tables of images and of inertial samples.
 pub const IMAGE_COLUMNS: &str = "#timestamp [ns],filename\n";
 pub const IMU_COLUMNS: &str = "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],\
                                a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]\n";
 
+/// The sensor.yaml of a camera.
 pub fn camera_yaml(c: &RigCamera, comment: &str, rate_hz: f64) -> String {
     let m = &c.camera;
     let pinhole = format!("[{}, {}, {}, {}]", m.fx, m.fy, m.cx, m.cy);
@@ -40,6 +43,7 @@ pub fn camera_yaml(c: &RigCamera, comment: &str, rate_hz: f64) -> String {
     )
 }
 
+/// The sensor.yaml of the inertial unit.
 pub fn imu_yaml(m: &ImuCalibration, comment: &str) -> String {
     format!(
         "sensor_type: imu\ncomment: {comment}\n{}rate_hz: {}\ngyroscope_noise_density: {:e}\n\
@@ -53,6 +57,7 @@ pub fn imu_yaml(m: &ImuCalibration, comment: &str) -> String {
     )
 }
 
+/// The key `T_BS` of a sensor.yaml.
 pub fn transform_yaml(body_from_sensor: &Pose) -> String {
     let r = DMat3::from_quat(body_from_sensor.q);
     let mut s = "T_BS:\n  cols: 4\n  rows: 4\n  data: [".to_string();
@@ -63,28 +68,45 @@ pub fn transform_yaml(body_from_sensor: &Pose) -> String {
     s + "0.0, 0.0, 0.0, 1.0]\n"
 }
 
-/// A row of imu0/data.csv.
+/// Writes a row of imu0/data.csv.
 pub fn imu_row(out: &mut impl Write, s: &ImuSample) -> io::Result<()> {
     writeln!(out, "{},{},{}", s.t.0, commas(s.gyro_body), commas(s.accel_body))
 }
 
+/// The three numbers of a row.
 pub fn commas(v: DVec3) -> String {
     format!("{:.9},{:.9},{:.9}", v.x, v.y, v.z)
 }
 
-/// 8-bit grey, or RGB of three planes.
-pub fn png(out: impl Write, image: &crate::Image, colour: Option<&crate::Colour>) -> Result<(), png::EncodingError> {
-    let mut encoder = png::Encoder::new(out, image.width as u32, image.height as u32);
-    encoder.set_color(if colour.is_some() { png::ColorType::Rgb } else { png::ColorType::Grayscale });
-    encoder.set_depth(png::BitDepth::Eight);
-    encoder.set_compression(png::Compression::Fast);
-    let mut writer = encoder.write_header()?;
+/// Writes an image as PNG: 8-bit grey, or RGB of three planes.
+pub fn png(out: impl Write, image: &Image, colour: Option<&Colour>) -> Result<(), EncodingError> {
+    let size = (image.width, image.height);
     match colour {
-        None => writer.write_image_data(&image.pixels)?,
+        None => encode(out, size, ColorType::Grayscale, BitDepth::Eight, &image.pixels),
         Some([r, g, b]) => {
             let rgb: Vec<u8> = (0..image.pixels.len()).flat_map(|i| [r.pixels[i], g.pixels[i], b.pixels[i]]).collect();
-            writer.write_image_data(&rgb)?;
+            encode(out, size, ColorType::Rgb, BitDepth::Eight, &rgb)
         }
     }
+}
+
+/// Writes a 16-bit grey image of big-endian `words` as PNG.
+pub fn png_16(out: impl Write, size: (usize, usize), words: &[u8]) -> Result<(), EncodingError> {
+    encode(out, size, ColorType::Grayscale, BitDepth::Sixteen, words)
+}
+
+fn encode(
+    out: impl Write,
+    (width, height): (usize, usize),
+    colour: ColorType,
+    depth: BitDepth,
+    data: &[u8],
+) -> Result<(), EncodingError> {
+    let mut encoder = png::Encoder::new(out, width as u32, height as u32);
+    encoder.set_color(colour);
+    encoder.set_depth(depth);
+    encoder.set_compression(png::Compression::Fast);
+    let mut writer = encoder.write_header()?;
+    writer.write_image_data(data)?;
     writer.finish()
 }

@@ -266,9 +266,9 @@ fn recorded_flights_stay_in_their_room_and_keep_their_velocity() {
         let clear = sim.truth().iter().map(|s| sim.clearance(s.pose.p)).fold(f64::INFINITY, f64::min);
         assert!(clear > 0.5, "{name}: {clear} m from a surface");
         let (mut dv, mut dw, mut da, mut n) = (0.0, 0.0, 0.0, 0.0);
-        let mut rows = csv::ReaderBuilder::new().has_headers(false).comment(Some(b'#')).from_path(&truth).unwrap();
-        for row in rows.records().step_by(7) {
-            let row = row.unwrap();
+        let text = std::fs::read_to_string(&truth).unwrap();
+        for row in text.lines().filter(|line| !line.starts_with('#')).step_by(7) {
+            let row: Vec<&str> = row.split(',').collect();
             let t = Nanos(row[0].parse().unwrap());
             if t < sim.stamp(0) || t > sim.stamp(sim.frame_count() - 1) {
                 continue;
@@ -371,9 +371,9 @@ fn wrong_csv_is_refused_by_line() {
     let row = |t: &str| format!("{t},0,0,1,1,0,0,0\n");
     for (text, line, word) in [
         (row("1") + &row("x"), 2, "stamp"),
-        (row("1") + "2,0,0,1,1,0,0,zero\n", 2, "number"),
-        ("#head\n".to_string() + &row("5") + &row("5"), 3, "increase"),
-        (row("1") + "2,0,0\n", 2, "columns"),
+        (row("1") + "2,0,0,1,1,0,0,zero\n", 2, "7 or more numbers"),
+        ("#head\n".to_string() + &row("5") + &row("5"), 3, "stamp 5 again"),
+        (row("1") + "2,0,0\n", 2, "7 or more numbers"),
         (row("1") + "2,0,0,1,5,0,0,0\n", 2, "quaternion"),
     ] {
         std::fs::write(&path, text).unwrap();

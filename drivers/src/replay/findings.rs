@@ -1,9 +1,10 @@
-//! What was wrong with a recording: a counter for each kind, and warnings, of which only the first
-//! few of a kind are kept so that a spoilt recording cannot fill memory or the screen.
+//! What was wrong with a recording: a counter for each kind, and warnings, of which only the first few of a kind are kept, so
+//! that a damaged recording cannot fill memory or the screen.
 
+use crate::{Fault, FaultKind};
 use std::path::Path;
 
-/// Warnings printed of one kind; the rest are only counted.
+/// Warnings that are kept of one kind; the rest are only counted.
 pub const WARNINGS_OF_A_KIND: u64 = 20;
 
 crate::counters! {
@@ -34,6 +35,7 @@ crate::counters! {
     calibration_notes,
 }
 
+/// Warnings, each "file:line: what", and counters.
 #[derive(Clone, Debug, Default)]
 pub struct Findings {
     pub warnings: Vec<String>,
@@ -58,8 +60,17 @@ impl Findings {
         let more = if *count == WARNINGS_OF_A_KIND { " (more of this kind are only counted)" } else { "" };
         self.warnings.push(format!("{place}: {what}{more}"));
     }
+
+    /// The first finding as a fault, for files in which nothing may be wrong.
+    pub fn refuse_any(&self) -> Result<(), Fault> {
+        let Some(warning) = self.warnings.first() else { return Ok(()) };
+        let (place, what) = warning.split_once(": ").unwrap_or((warning, ""));
+        let what = what.trim_end_matches(": row dropped");
+        Err(Fault::new(FaultKind::Data, place, what, "correct or remove the row"))
+    }
 }
 
+/// Where a fault is: a file, or its line; line 0 stands for the whole file.
 pub fn place(path: &Path, line: usize) -> String {
     match line {
         0 => path.display().to_string(),

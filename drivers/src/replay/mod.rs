@@ -22,6 +22,7 @@ pub use cameras::CAMERAS_MAX;
 pub use findings::ReplayCounters;
 pub use images::{FrameFault, FrameFaultKind, Reader};
 pub use pairing::{FrameFiles, ImageFile};
+pub(crate) use table::{numbers, read_strictly, Row};
 pub use trajectory::read_trajectory;
 
 use crate::types::{ImuSample, Nanos, Span, TimedPose};
@@ -29,7 +30,6 @@ use crate::{Calibration, Fault, FaultKind};
 use findings::Findings;
 use glam::DVec3;
 use std::path::{Path, PathBuf};
-use table::Row;
 
 #[derive(Clone, Debug, PartialEq)]
 pub struct OpenOptions {

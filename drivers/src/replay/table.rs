@@ -1,14 +1,29 @@
-//! Rows of a csv with their line numbers. `#` lines and one headline without it are not data; CRLF,
-//! spaces and empty lines are tolerated.
+//! Rows of a csv with their line numbers. `#` lines and one headline without it are not data; CRLF, spaces and empty lines
+//! are tolerated.
 
 use super::findings::Findings;
-use crate::{Fault, FaultKind};
+use super::order;
+use crate::{Fault, FaultKind, Nanos};
 use std::path::Path;
 
+/// A row, and the line of the file in which it stands, from 1.
 #[derive(Clone, Debug)]
 pub struct Row<T> {
     pub line: usize,
     pub value: T,
+}
+
+/// Reads a table in which nothing may be wrong: the first row that cannot be read, or is out of order, is a fault.
+pub fn read_strictly<T>(
+    path: &Path,
+    columns: &str,
+    parse: impl Fn(&[&str]) -> Option<T>,
+    stamp: impl Fn(&T) -> Nanos,
+) -> Result<Vec<Row<T>>, Fault> {
+    let mut findings = Findings::default();
+    let rows = order::increasing(read(path, columns, parse, &mut findings)?, stamp, path, &mut findings);
+    findings.refuse_any()?;
+    Ok(rows)
 }
 
 /// Reads a file that must exist.
@@ -19,8 +34,8 @@ pub fn read_bytes(path: &Path) -> Result<Vec<u8>, Fault> {
     })
 }
 
-/// Parses every row. A row that cannot be read is counted and skipped, but if it is the first one
-/// the file is not of the expected kind; `columns` says what that is.
+/// Reads every row. One that cannot be parsed is counted and skipped, but if it is the first, the file is not of the
+/// expected kind, which `columns` names.
 pub fn read<T>(
     path: &Path,
     columns: &str,
@@ -78,6 +93,7 @@ fn excerpt(content: &str) -> String {
     content.chars().take(60).filter(|c| !c.is_control()).collect()
 }
 
+/// The fields as numbers; `None` where one is none.
 pub fn numbers(fields: &[&str]) -> Option<Vec<f64>> {
     fields.iter().map(|f| f.parse().ok()).collect()
 }

@@ -1,28 +1,23 @@
-//! Tables of poses: EuRoC ground truth and TUM-VI mocap (comma separated; ns, p, q wxyz, more
-//! columns ignored) and TUM text (blank separated; seconds, p, q xyzw).
+//! Tables of poses: EuRoC ground truth and TUM-VI mocap (comma separated; ns, p, q wxyz, further columns ignored), and TUM
+//! text (blank separated; seconds, p, q xyzw).
 
 use super::findings::Findings;
 use super::{order, table};
 use crate::types::{Nanos, Pose, TimedPose};
-use crate::{Fault, FaultKind};
+use crate::Fault;
 use glam::{DQuat, DVec3};
 use std::path::Path;
 
 const COLUMNS: &str = "stamp, x y z, unit quaternion (wxyz and ns between commas; xyzw and s between blanks)";
 
-/// Reads a table of poses; nothing may be wrong in it, as a caller has no way to learn of it later.
+/// Reads a table of `world_from_body` poses. Nothing may be wrong in it, as a caller has no way to learn of it later.
 pub fn read_trajectory(path: &Path) -> Result<Vec<TimedPose>, Fault> {
     let mut findings = Findings::default();
     let poses = read(path, &mut findings)?;
-    match findings.warnings.first() {
-        None => Ok(poses),
-        Some(warning) => {
-            let (place, what) = warning.split_once(": ").unwrap_or((warning, ""));
-            Err(Fault::new(FaultKind::Data, place, what, "correct or remove the row"))
-        }
-    }
+    findings.refuse_any().map(|()| poses)
 }
 
+/// Reads a table of poses; rows that are wrong are dropped.
 pub fn read(path: &Path, findings: &mut Findings) -> Result<Vec<TimedPose>, Fault> {
     let is_tum = |text: &[u8]| !text.split(|b| *b == b'\n').any(|l| !l.starts_with(b"#") && l.contains(&b','));
     let tum = is_tum(&table::read_bytes(path)?);
@@ -49,7 +44,7 @@ fn pose(t: Nanos, p: DVec3, q: DQuat) -> Option<TimedPose> {
     ok.then(|| TimedPose { t, pose: Pose::new(q, p) })
 }
 
-/// Exact where a double is not: it resolves only 0.2 µs of seconds since 1970.
+/// A stamp from seconds, digit by digit: a double resolves only 0.2 µs of seconds since 1970.
 fn stamp_from_secs(text: &str) -> Option<Nanos> {
     let digits = |s: &str| s.bytes().all(|b| b.is_ascii_digit());
     let (whole, fraction) = text.split_once('.').unwrap_or((text, ""));

@@ -1,13 +1,15 @@
 //! A room around a path: walls, furniture along them, pieces in the middle, lamps.
 //!
-//! Input is the box of the room, the path that must stay free and a seed. Furniture comes in sets
-//! (a shelf, a table with things on it, a sofa, ...) put side by side along the walls and on a
-//! coarse grid inside; a set that would come nearer to the path than `KEEP_CLEAR` is left out.
+//! Input is the box of the room, the path that must stay free and a seed. Furniture comes in sets (a shelf, a table with
+//! things on it, a sofa, ...) put side by side along the walls and on a coarse grid inside; a set that would come nearer to
+//! the path than `KEEP_CLEAR` is left out.
 
 use super::light::LightMap;
 use super::room::{Light, Room, Shape, Solid};
-use super::texture::Material;
-use glam::{Vec2, Vec3};
+use super::texture::Material::{
+    Books, Brick, Concrete, Crate, Drawers, Leaves, Marble, Parquet, Plaid, Plaster, Poster, Print, Rug,
+};
+use glam::{vec3, Vec2, Vec3};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -37,7 +39,7 @@ struct Stand {
 impl Stand {
     /// A point of the set's frame.
     fn at(&self, x: f32, y: f32, z: f32) -> Vec3 {
-        self.base + Vec3::new(self.cos * x - self.sin * y, self.sin * x + self.cos * y, z)
+        self.base + vec3(self.cos * x - self.sin * y, self.sin * x + self.cos * y, z)
     }
 
     fn turned(&self, angle: f32) -> (f32, f32) {
@@ -50,14 +52,14 @@ impl Set {
     /// Width along the wall, depth, height, m.
     fn extent(self) -> Vec3 {
         match self {
-            Set::Shelf => Vec3::new(1.1, 0.32, 2.02),
-            Set::Cabinet => Vec3::new(0.82, 0.46, 1.5),
-            Set::Table => Vec3::new(1.5, 0.75, 1.15),
-            Set::Sofa => Vec3::new(1.9, 0.85, 0.9),
-            Set::Crates => Vec3::new(1.2, 0.9, 1.25),
-            Set::Plant => Vec3::new(0.7, 0.7, 1.2),
-            Set::Pillar => Vec3::new(0.36, 0.36, 9.0),
-            Set::Column => Vec3::new(0.5, 0.5, 1.3),
+            Set::Shelf => vec3(1.1, 0.32, 2.02),
+            Set::Cabinet => vec3(0.82, 0.46, 1.5),
+            Set::Table => vec3(1.5, 0.75, 1.15),
+            Set::Sofa => vec3(1.9, 0.85, 0.9),
+            Set::Crates => vec3(1.2, 0.9, 1.25),
+            Set::Plant => vec3(0.7, 0.7, 1.2),
+            Set::Pillar => vec3(0.36, 0.36, 9.0),
+            Set::Column => vec3(0.5, 0.5, 1.3),
         }
     }
 }
@@ -65,7 +67,7 @@ impl Set {
 /// Builds, furnishes and lights a room; `path` is sampled densely in world coordinates.
 pub fn furnish(low: Vec3, high: Vec3, path: &[Vec3], seed: u64, threads: usize) -> Room {
     let mut rng = ChaCha8Rng::seed_from_u64(seed ^ 0x526F_6F6D);
-    let walls = [Material::Brick, Material::Concrete, Material::Plaster, Material::Plaster];
+    let walls = [Brick, Concrete, Plaster, Plaster];
     let mut room = Room::empty(low, high, walls, rng.random());
     add_rug(&mut room, &mut rng);
     along_walls(&mut room, path, &mut rng);
@@ -79,9 +81,9 @@ pub fn furnish(low: Vec3, high: Vec3, path: &[Vec3], seed: u64, threads: usize) 
 
 fn add_rug(room: &mut Room, rng: &mut ChaCha8Rng) {
     let mid = (room.low + room.high) * 0.5;
-    let half = Vec3::new(0.24 * (room.high.x - room.low.x), 0.2 * (room.high.y - room.low.y), 0.006);
-    let half = half.min(Vec3::new(2.2, 1.6, 1.0));
-    room.add_block(mid.with_z(room.low.z), half, (1.0, 0.0), Material::Plaid, Material::Rug, rng.random());
+    let half = vec3(0.24 * (room.high.x - room.low.x), 0.2 * (room.high.y - room.low.y), 0.006);
+    let half = half.min(vec3(2.2, 1.6, 1.0));
+    room.add_block(mid.with_z(room.low.z), half, (1.0, 0.0), Plaid, Rug, rng.random());
 }
 
 fn along_walls(room: &mut Room, path: &[Vec3], rng: &mut ChaCha8Rng) {
@@ -148,140 +150,90 @@ fn place(room: &mut Room, set: Set, stand: Stand, path: &[Vec3], rng: &mut ChaCh
     }
     match set {
         Set::Shelf => {
-            let half = Vec3::new(half.x, half.y, half.z);
-            room.add_block(stand.base, half, (stand.cos, stand.sin), Material::Books, Material::Crate, rng.random());
+            room.add_block(stand.base, half, (stand.cos, stand.sin), Books, Crate, rng.random());
         }
         Set::Cabinet => cabinet(room, stand, rng),
         Set::Table => table(room, stand, rng),
         Set::Sofa => sofa(room, stand, rng),
         Set::Crates => crates(room, stand, rng),
         Set::Plant => {
-            room.add_drum(stand.base, 0.19, 0.42, Material::Brick, rng.random());
-            room.add_drum(stand.at(0.0, 0.0, 0.42), 0.03, 0.2, Material::Crate, rng.random());
-            room.add_ball(stand.at(0.0, 0.0, 0.85), 0.33, Material::Leaves, rng.random());
+            room.add_drum(stand.base, 0.19, 0.42, Brick, rng.random());
+            room.add_drum(stand.at(0.0, 0.0, 0.42), 0.03, 0.2, Crate, rng.random());
+            room.add_ball(stand.at(0.0, 0.0, 0.85), 0.33, Leaves, rng.random());
         }
         Set::Pillar => {
             let height = room.high.z - room.low.z;
-            room.add_drum(stand.base, 0.16, height, Material::Marble, rng.random());
+            room.add_drum(stand.base, 0.16, height, Marble, rng.random());
         }
         Set::Column => {
-            room.add_block(
-                stand.base,
-                Vec3::new(0.2, 0.2, 0.45),
-                (stand.cos, stand.sin),
-                Material::Marble,
-                Material::Marble,
-                rng.random(),
-            );
-            room.add_ball(stand.at(0.0, 0.0, 1.08), 0.18, Material::Marble, rng.random());
+            room.add_block(stand.base, vec3(0.2, 0.2, 0.45), (stand.cos, stand.sin), Marble, Marble, rng.random());
+            room.add_ball(stand.at(0.0, 0.0, 1.08), 0.18, Marble, rng.random());
         }
     }
 }
 
 fn cabinet(room: &mut Room, stand: Stand, rng: &mut ChaCha8Rng) {
     let turn = (stand.cos, stand.sin);
-    room.add_block(stand.base, Vec3::new(0.4, 0.22, 0.54), turn, Material::Drawers, Material::Crate, rng.random());
-    room.add_ball(stand.at(-0.2, 0.0, 1.08 + 0.15), 0.15, Material::Marble, rng.random());
+    room.add_block(stand.base, vec3(0.4, 0.22, 0.54), turn, Drawers, Crate, rng.random());
+    room.add_ball(stand.at(-0.2, 0.0, 1.08 + 0.15), 0.15, Marble, rng.random());
     let turn = stand.turned(rng.random_range(-0.5..0.5));
-    room.add_block(
-        stand.at(0.18, 0.0, 1.08),
-        Vec3::new(0.13, 0.1, 0.14),
-        turn,
-        Material::Print,
-        Material::Print,
-        rng.random(),
-    );
+    room.add_block(stand.at(0.18, 0.0, 1.08), vec3(0.13, 0.1, 0.14), turn, Print, Print, rng.random());
 }
 
 fn table(room: &mut Room, stand: Stand, rng: &mut ChaCha8Rng) {
     let turn = (stand.cos, stand.sin);
     const HEIGHT: f32 = 0.72;
     for (x, y) in [(-0.66, -0.3), (0.66, -0.3), (-0.66, 0.3), (0.66, 0.3)] {
-        room.add_block(
-            stand.at(x, y, 0.0),
-            Vec3::new(0.03, 0.03, 0.5 * HEIGHT),
-            turn,
-            Material::Parquet,
-            Material::Parquet,
-            rng.random(),
-        );
+        room.add_block(stand.at(x, y, 0.0), vec3(0.03, 0.03, 0.5 * HEIGHT), turn, Parquet, Parquet, rng.random());
     }
-    room.add_block(
-        stand.at(0.0, 0.0, HEIGHT),
-        Vec3::new(0.74, 0.36, 0.02),
-        turn,
-        Material::Parquet,
-        Material::Parquet,
-        rng.random(),
-    );
+    room.add_block(stand.at(0.0, 0.0, HEIGHT), vec3(0.74, 0.36, 0.02), turn, Parquet, Parquet, rng.random());
     let top = HEIGHT + 0.04;
     for x in [-0.5, -0.1, 0.35] {
         let turn = stand.turned(rng.random_range(-0.6..0.6));
         let y = rng.random_range(-0.12..0.12);
         match rng.random_range(0..4) {
-            0 => room.add_ball(stand.at(x, y, top + 0.12), 0.12, Material::Plaid, rng.random()),
-            1 => room.add_drum(stand.at(x, y, top), 0.08, 0.24, Material::Marble, rng.random()),
-            2 => room.add_block(
-                stand.at(x, y, top),
-                Vec3::new(0.15, 0.11, 0.03),
-                turn,
-                Material::Books,
-                Material::Print,
-                rng.random(),
-            ),
-            _ => room.add_block(
-                stand.at(x, y, top),
-                Vec3::new(0.13, 0.12, 0.15),
-                turn,
-                Material::Print,
-                Material::Poster,
-                rng.random(),
-            ),
+            0 => room.add_ball(stand.at(x, y, top + 0.12), 0.12, Plaid, rng.random()),
+            1 => room.add_drum(stand.at(x, y, top), 0.08, 0.24, Marble, rng.random()),
+            2 => room.add_block(stand.at(x, y, top), vec3(0.15, 0.11, 0.03), turn, Books, Print, rng.random()),
+            _ => room.add_block(stand.at(x, y, top), vec3(0.13, 0.12, 0.15), turn, Print, Poster, rng.random()),
         }
     }
 }
 
 fn sofa(room: &mut Room, stand: Stand, rng: &mut ChaCha8Rng) {
     let turn = (stand.cos, stand.sin);
-    let cloth = Material::Plaid;
+    let cloth = Plaid;
     let seed = rng.random();
-    room.add_block(stand.at(0.0, 0.06, 0.06), Vec3::new(0.72, 0.34, 0.18), turn, cloth, cloth, seed);
-    room.add_block(stand.at(0.0, -0.34, 0.06), Vec3::new(0.72, 0.07, 0.4), turn, cloth, cloth, seed);
-    room.add_block(stand.at(-0.83, 0.0, 0.0), Vec3::new(0.1, 0.41, 0.3), turn, cloth, cloth, seed);
-    room.add_block(stand.at(0.83, 0.0, 0.0), Vec3::new(0.1, 0.41, 0.3), turn, cloth, cloth, seed);
+    room.add_block(stand.at(0.0, 0.06, 0.06), vec3(0.72, 0.34, 0.18), turn, cloth, cloth, seed);
+    room.add_block(stand.at(0.0, -0.34, 0.06), vec3(0.72, 0.07, 0.4), turn, cloth, cloth, seed);
+    room.add_block(stand.at(-0.83, 0.0, 0.0), vec3(0.1, 0.41, 0.3), turn, cloth, cloth, seed);
+    room.add_block(stand.at(0.83, 0.0, 0.0), vec3(0.1, 0.41, 0.3), turn, cloth, cloth, seed);
     for x in [-0.4, 0.35] {
         let turn = stand.turned(rng.random_range(-0.7..0.7));
-        room.add_block(
-            stand.at(x, 0.0, 0.42),
-            Vec3::new(0.17, 0.07, 0.15),
-            turn,
-            Material::Rug,
-            Material::Rug,
-            rng.random(),
-        );
+        room.add_block(stand.at(x, 0.0, 0.42), vec3(0.17, 0.07, 0.15), turn, Rug, Rug, rng.random());
     }
 }
 
 fn crates(room: &mut Room, stand: Stand, rng: &mut ChaCha8Rng) {
     let mut add = |x: f32, y: f32, z: f32, half: Vec3| {
         let turn = stand.turned(rng.random_range(-0.3..0.3));
-        room.add_block(stand.at(x, y, z), half, turn, Material::Crate, Material::Crate, rng.random());
+        room.add_block(stand.at(x, y, z), half, turn, Crate, Crate, rng.random());
     };
     add(-0.3, -0.02, 0.0, Vec3::splat(0.26));
-    add(0.3, 0.04, 0.0, Vec3::new(0.23, 0.25, 0.2));
-    add(-0.2, 0.0, 0.52, Vec3::new(0.2, 0.18, 0.17));
-    add(0.32, 0.02, 0.4, Vec3::new(0.15, 0.15, 0.12));
+    add(0.3, 0.04, 0.0, vec3(0.23, 0.25, 0.2));
+    add(-0.2, 0.0, 0.52, vec3(0.2, 0.18, 0.17));
+    add(0.32, 0.02, 0.4, vec3(0.15, 0.15, 0.12));
 }
 
 /// A framed picture on the wall above `bottom`.
 fn hang_picture(room: &mut Room, at: Vec2, inward: Vec2, bottom: f32, rng: &mut ChaCha8Rng) {
-    let half = Vec3::new(rng.random_range(0.3..0.55), 0.015, rng.random_range(0.24..0.42));
+    let half = vec3(rng.random_range(0.3..0.55), 0.015, rng.random_range(0.24..0.42));
     let z = room.low.z + bottom + 0.12 + rng.random_range(0.0..0.15);
     if z + 2.0 * half.z > room.high.z - 0.1 {
         return;
     }
     let base = (at + inward * half.y).extend(z);
-    room.add_block(base, half, (inward.y, -inward.x), Material::Poster, Material::Crate, rng.random());
+    room.add_block(base, half, (inward.y, -inward.x), Poster, Crate, rng.random());
 }
 
 /// Lamps under the ceiling, one for about every 12 m².

@@ -218,7 +218,6 @@ impl Lens {
 /// Distance and face at every pixel centre, into `scratch.hits`.
 pub fn cast(room: &Room, lens: &Lens, views: Rows, scratch: &mut Scratch) {
     let Scratch { lists, hits } = scratch;
-    let band = band_rows(lens, lists.len()) * lens.width;
     let hits = &mut hits[..lens.width * lens.height];
     let work = |first_row: usize, hits: &mut [Hit], lists: &mut Lists| {
         let rows = hits.len() / lens.width;
@@ -241,23 +240,12 @@ pub fn cast(room: &Room, lens: &Lens, views: Rows, scratch: &mut Scratch) {
             }
         }
     };
-    let (mut bands, mut lists) = (hits.chunks_mut(band).enumerate(), lists.iter_mut());
-    let (first, spare) = (bands.next(), lists.next());
-    std::thread::scope(|scope| {
-        for ((k, hits), list) in bands.zip(lists) {
-            let work = &work;
-            scope.spawn(move || work(k * band / lens.width, hits, list));
-        }
-        if let (Some((_, hits)), Some(list)) = (first, spare) {
-            work(0, hits, list);
-        }
-    });
+    in_bands(lens, hits, lists, work);
 }
 
 /// Grey levels from the hits of the last `cast` of the same rows.
 pub fn shade(room: &Room, lens: &Lens, views: Rows, exposure: &Exposure, scratch: &mut Scratch, out: &mut [u8]) {
     let Scratch { lists, hits } = scratch;
-    let band = band_rows(lens, lists.len()) * lens.width;
     let hits = &hits[..lens.width * lens.height];
     let work = |first_row: usize, out: &mut [u8], lists: &mut Lists| {
         let rows = out.len() / lens.width;
@@ -288,17 +276,7 @@ pub fn shade(room: &Room, lens: &Lens, views: Rows, exposure: &Exposure, scratch
             }
         }
     };
-    let (mut bands, mut lists) = (out.chunks_mut(band).enumerate(), lists.iter_mut());
-    let (first, spare) = (bands.next(), lists.next());
-    std::thread::scope(|scope| {
-        for ((k, out), list) in bands.zip(lists) {
-            let work = &work;
-            scope.spawn(move || work(k * band / lens.width, out, list));
-        }
-        if let (Some((_, out)), Some(list)) = (first, spare) {
-            work(0, out, list);
-        }
-    });
+    in_bands(lens, out, lists, work);
 }
 
 /// Mean radiance of a sparse set of pixels: what an exposure meter sees.
@@ -326,9 +304,25 @@ pub fn depths(lens: &Lens, hits: &[Hit], out: &mut [f32]) {
     }
 }
 
-/// Rows a thread takes: whole tile rows, as equal as can be.
-fn band_rows(lens: &Lens, threads: usize) -> usize {
-    lens.height.div_ceil(TILE).div_ceil(threads) * TILE
+/// Gives each thread a band of an image, whole tile rows, as equal as can be: `work` is told the band's first row.
+fn in_bands<T: Send>(
+    lens: &Lens,
+    pixels: &mut [T],
+    lists: &mut [Lists],
+    work: impl Fn(usize, &mut [T], &mut Lists) + Sync,
+) {
+    let rows = lens.height.div_ceil(TILE).div_ceil(lists.len()) * TILE;
+    let (mut bands, mut lists) = (pixels.chunks_mut(rows * lens.width).enumerate(), lists.iter_mut());
+    let (first, spare) = (bands.next(), lists.next());
+    std::thread::scope(|scope| {
+        for ((k, band), list) in bands.zip(lists) {
+            let work = &work;
+            scope.spawn(move || work(k * rows, band, list));
+        }
+        if let (Some((_, band)), Some(list)) = (first, spare) {
+            work(0, band, list);
+        }
+    });
 }
 
 /// All solids from a view, nearest first.
