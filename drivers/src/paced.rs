@@ -1,7 +1,7 @@
 //! A recording, or a flight rendered into memory, as a pair of sources: delivered at its recorded time by the
 //! monotonic clock. What is late is delivered at once and in order, as by a device with a queue.
 
-use crate::replay::{FrameFault, Reader};
+use crate::replay::{ImageFault, Reader};
 use crate::source::{FrameSource, ImuBatch, ImuReading, ImuSource, SourceFault, Wait};
 use crate::types::{Frames, ImuSample, Nanos, Span};
 use std::sync::Arc;
@@ -15,7 +15,7 @@ pub enum Images {
 
 impl Images {
     /// Reads frame `index` into pre-shaped `out`; one that cannot be read is kept among `warnings`.
-    pub fn read(&mut self, index: usize, out: &mut Frames) -> Result<(), FrameFault> {
+    pub fn read(&mut self, index: usize, out: &mut Frames) -> Result<(), ImageFault> {
         match self {
             Images::Recording(reader) => reader.read(index, out),
             Images::Rendered(frames) => {

@@ -413,7 +413,7 @@ fn trajectory_formats_agree() {
 }
 
 /// Replaces the first image of camera 1 and reads the first pair.
-fn read_with(image: &[u8]) -> (Result<(), FrameFault>, Vec<u8>, ReplayCounters) {
+fn read_with(image: &[u8]) -> (Result<(), ImageFault>, Vec<u8>, Reader) {
     let f = Folder::new();
     f.write(&format!("cam1/data/{T0}.png"), image);
     let r = f.open().unwrap();
@@ -423,7 +423,7 @@ fn read_with(image: &[u8]) -> (Result<(), FrameFault>, Vec<u8>, ReplayCounters) 
     assert_eq!(reader.warnings().len(), usize::from(result.is_err()));
     r.reader().read(1, &mut frames).unwrap();
     let _ = reader.read(0, &mut frames);
-    (result, frames.images.swap_remove(1).pixels, reader.counters().clone())
+    (result, frames.images.swap_remove(1).pixels, reader)
 }
 
 #[test]
@@ -484,30 +484,30 @@ fn a_colour_jpeg_gives_its_colours_and_its_own_luma() {
 }
 
 #[test]
-fn spoilt_images_are_counted_and_name_their_row() {
+fn damaged_images_are_counted_and_name_their_row() {
     let good = png(png::ColorType::Grayscale, png::BitDepth::Eight, W, H, &grey());
     let small = png(png::ColorType::Grayscale, png::BitDepth::Eight, W, H - 1, &grey()[W..]);
-    let cases: [(&[u8], FrameFaultKind); 6] = [
-        (&good[..good.len() / 2], FrameFaultKind::Undecodable),
-        (&good[..good.len() - 4], FrameFaultKind::Undecodable),
-        (&good[..4], FrameFaultKind::Undecodable),
-        (b"", FrameFaultKind::Undecodable),
-        (b"GIF89a", FrameFaultKind::Undecodable),
-        (&small, FrameFaultKind::WrongSize),
+    let cases: [(&[u8], ImageFault); 6] = [
+        (&good[..good.len() / 2], ImageFault::Undecodable),
+        (&good[..good.len() - 4], ImageFault::Undecodable),
+        (&good[..4], ImageFault::Undecodable),
+        (b"", ImageFault::Undecodable),
+        (b"GIF89a", ImageFault::Undecodable),
+        (&small, ImageFault::WrongSize),
     ];
     for (image, kind) in cases {
-        let (result, _, counters) = read_with(image);
-        let fault = result.unwrap_err();
-        assert_eq!(fault.kind, kind, "{fault}");
-        assert!(fault.place.ends_with("cam1/data.csv:2") && fault.what.contains(&format!("{T0}.png")), "{fault}");
-        assert_eq!(counters.images_undecodable + counters.images_wrong_size, 2);
+        let (result, _, reader) = read_with(image);
+        let said = &reader.warnings()[0];
+        assert_eq!(result, Err(kind), "{said}");
+        assert!(said.contains("cam1/data.csv:2: ") && said.contains(&format!("{T0}.png")), "{said}");
+        assert_eq!(reader.counters().images_undecodable + reader.counters().images_wrong_size, 2);
     }
     let f = Folder::new();
     fs::remove_file(f.path(&format!("cam0/data/{T0}.png"))).unwrap();
     let r = f.open().unwrap();
     let mut reader = r.reader();
-    let fault = reader.read(0, &mut Frames::for_rig(&r.calibration)).unwrap_err();
-    assert_eq!((fault.kind, reader.counters().images_missing), (FrameFaultKind::Missing, 1));
+    let read = reader.read(0, &mut Frames::for_rig(&r.calibration));
+    assert_eq!((read, reader.counters().images_missing), (Err(ImageFault::Missing), 1));
 }
 
 proptest! {

@@ -148,7 +148,7 @@ pub fn read(path: &Path, seconds: f64) -> Result<Flight, Fault> {
         let mut images = Frames::for_rig(&recording.calibration);
         match reader.read(i, &mut images) {
             Ok(()) => frames.push(Arc::new(images)),
-            Err(fault) => eprintln!("left out: {fault}"),
+            Err(fault) => eprintln!("left out: frame {i}: {fault:?}"),
         }
     }
     Ok(Flight { calibration: recording.calibration, imu: recording.imu, frames, truth: recording.truth })

@@ -1,12 +1,12 @@
-//! Calibration files: EuRoC sensor.yaml (`T_BS` = body_from_cam), Kalibr camchain.yaml (`T_cam_imu`
-//! = cam_from_body) with imu_config.yaml beside it, Basalt json (`T_imu_cam` = body_from_cam). The body is
-//! the inertial unit. Distortion: none, Brown with four coefficients or eight (rational), Kannala-Brandt,
-//! double sphere; any other model is refused, since a wrong lens looks like noise to an estimator.
+//! Calibration files: EuRoC sensor.yaml (`T_BS` = body_from_cam), Kalibr camchain.yaml (`T_cam_imu` = cam_from_body) with
+//! imu_config.yaml beside it, Basalt json (`T_imu_cam` = body_from_cam). The body is the inertial unit. Distortion: none,
+//! Brown with four coefficients or eight (rational), Kannala-Brandt, double sphere; any other model is refused, since a
+//! wrong lens looks like noise to an estimator.
 //!
-//! Time: `timeshift_cam_imu` and `cam_time_offset_ns` become `RigCamera::time_offset`. A camera of the yaml
-//! files is rolling where it has `readout_time` (s, first row to last), `line_delay` (s a row, as Kalibr's
-//! rolling-shutter calibration prints) or `shutter: rolling`; the last alone is refused unless the
-//! board file states the time, which stands above what the files say.
+//! Time: `timeshift_cam_imu` and `cam_time_offset_ns` become `RigCamera::time_offset`. A camera of the yaml files is rolling
+//! where it has `readout_time` (s, first row to last), `line_delay` (s per row, as Kalibr's rolling-shutter calibration
+//! prints) or `shutter: rolling`; the last alone is refused unless the board file states the time. The board file's time
+//! replaces that of the files.
 
 use super::cameras;
 use super::findings::Findings;
@@ -20,8 +20,8 @@ use std::path::{Path, PathBuf};
 mod document;
 use document::Document;
 
-/// Noise of a consumer MEMS unit (BMI160 with the white noise doubled and the walks times ten, as
-/// TUM-VI recommends for estimators), taken where a recording does not say.
+/// Noise of a consumer MEMS unit (BMI160 with the white noise doubled and the walks times ten, as TUM-VI recommends for
+/// estimators), assumed where a recording does not state it.
 pub const IMU_DEFAULTS: ImuCalibration = ImuCalibration {
     rate_hz: 200.0,
     gyro_noise: 1.6e-4,
@@ -30,7 +30,7 @@ pub const IMU_DEFAULTS: ImuCalibration = ImuCalibration {
     accel_walk: 8.6e-4,
     correction: ImuCorrection::NONE,
 };
-/// A camera of one frame a second does not read out for longer, s.
+/// Longest readout, s: a camera of one frame a second has no longer one.
 const READOUT_MAX: f64 = 1.0;
 
 /// Reads a Kalibr camchain.yaml, a Basalt json, or a EuRoC `mav0` folder.
@@ -38,7 +38,7 @@ pub fn read_calibration(path: &Path) -> Result<Calibration, Fault> {
     read(path, None, &mut Findings::default())
 }
 
-/// `readout` is the board's word on the shutters, which stands above the file's.
+/// Reads a calibration file or folder; `readout` is the readout time that the board file states.
 pub fn read(path: &Path, readout: Option<Span>, findings: &mut Findings) -> Result<Calibration, Fault> {
     let mut calibration = if path.is_dir() {
         euroc(path, readout, findings)?
@@ -59,13 +59,13 @@ pub fn read(path: &Path, readout: Option<Span>, findings: &mut Findings) -> Resu
     match doubled(&calibration.cameras) {
         None => Ok(calibration),
         Some((i, j)) => {
-            let what = format!("cameras {i} and {j} see the same from the same place (zero baseline): no depth");
+            let what = format!("cameras {i} and {j} look the same way from one place (zero baseline): no depth");
             Err(Fault::new(FaultKind::Config, path.display().to_string(), what, "correct their extrinsics"))
         }
     }
 }
 
-/// Two cameras at one place whose axes are less than a right angle apart; back to back they may be.
+/// Two cameras at one place whose axes are less than a right angle apart; back to back is allowed.
 fn doubled(cameras: &[RigCamera]) -> Option<(usize, usize)> {
     let axis = |c: &RigCamera| c.body_from_cam.q * DVec3::Z;
     let same = |a: &RigCamera, b: &RigCamera| {
@@ -75,15 +75,15 @@ fn doubled(cameras: &[RigCamera]) -> Option<(usize, usize)> {
     pairs.into_iter().find(|&(i, j)| same(&cameras[i], &cameras[j]))
 }
 
-/// The number of a file's cameras, where it is one that a rig may have.
-fn admitted(file: &Document, at: &str, count: usize) -> Result<usize, Fault> {
+/// Checks the number of a file's cameras.
+fn checked_count(file: &Document, at: &str, count: usize) -> Result<usize, Fault> {
     match count {
         0..=cameras::CAMERAS_MAX => Ok(count.max(1)),
         _ => Err(Fault { fix: "take the others out of it".to_string(), ..file.fault(at, &cameras::too_many(count)) }),
     }
 }
 
-/// The calibration that a recording carries: sensor.yaml in its folders, else a Kalibr camchain.
+/// Reads the calibration that comes with a recording: sensor.yaml in its folders, else a Kalibr camchain.
 pub fn of_recording(
     home: &Path,
     mav0: &Path,
@@ -124,12 +124,12 @@ fn euroc(mav0: &Path, stated: Option<Span>, findings: &mut Findings) -> Result<C
 
 fn kalibr(file: &Document, stated: Option<Span>, findings: &mut Findings) -> Result<Calibration, Fault> {
     let mut cameras: Vec<RigCamera> = Vec::new();
-    for k in 0..admitted(file, "", cameras::count(file.keys()))? {
+    for k in 0..checked_count(file, "", cameras::count(file.keys()))? {
         let at = format!("/cam{k}");
         let own = format!("{at}/T_cam_imu");
         let chained = format!("{at}/T_cn_cnm1");
         let body_from_cam = match cameras.last() {
-            // camera-only chains give the first camera's pose and the steps between cameras
+            // Camera-only chains give the first camera's pose and the steps between cameras.
             Some(previous) if !file.has(&own) && file.has(&chained) => {
                 previous.body_from_cam * file.transform(&chained)?.inverse()
             }
@@ -149,7 +149,7 @@ fn time_offset(file: &Document, at: &str) -> Result<Span, Fault> {
     Ok(if file.has(&shift) { Span::from_secs(file.number(&shift)?) } else { Span(0) })
 }
 
-/// From the first row to the last, as the file says.
+/// The readout time, first row to last, that the file states.
 fn readout(file: &Document, at: &str, camera: &Camera, stated: Option<Span>) -> Result<Span, Fault> {
     let key = |name: &str| format!("{at}/{name}");
     let (time, line, shutter) = (key("readout_time"), key("line_delay"), key("shutter"));
@@ -162,7 +162,7 @@ fn readout(file: &Document, at: &str, camera: &Camera, stated: Option<Span>) -> 
     } else if file.text(&shutter)? != "rolling" {
         return Err(file.fault(&shutter, "must be global or rolling"));
     } else if stated.is_none() {
-        let mut fault = file.fault(&shutter, "a rolling shutter whose readout time is not stated");
+        let mut fault = file.fault(&shutter, "a rolling shutter without its readout time");
         fault.fix = "state readout_time (s) beside it, or rig.readout_s in the board file".to_string();
         return Err(fault);
     } else {
@@ -174,7 +174,7 @@ fn readout(file: &Document, at: &str, camera: &Camera, stated: Option<Span>) -> 
     }
 }
 
-/// The camera keys that EuRoC and Kalibr share.
+/// Reads the camera keys that EuRoC and Kalibr share.
 fn yaml_camera(file: &Document, at: &str, coefficients: &str) -> Result<Camera, Fault> {
     let key = |name: &str| format!("{at}/{name}");
     let numbers = |name: &str, n: usize| file.numbers(&key(name), n);
@@ -244,7 +244,7 @@ fn basalt(file: &Document) -> Result<Calibration, Fault> {
     let time_offset = Span(if file.has(offset) { file.number(offset)?.round() as i64 } else { 0 });
     let mut cameras = Vec::new();
     let lenses = "/value0/intrinsics";
-    for k in 0..admitted(file, lenses, file.length(lenses))? {
+    for k in 0..checked_count(file, lenses, file.length(lenses))? {
         let (at, pose) = (format!("{lenses}/{k}"), format!("/value0/T_imu_cam/{k}"));
         let size = file.numbers(&format!("/value0/resolution/{k}"), 2)?;
         let number = |name: &str| file.number(&format!("{at}/intrinsics/{name}"));
@@ -284,18 +284,18 @@ fn basalt(file: &Document) -> Result<Calibration, Fault> {
     Ok(Calibration { cameras, imu })
 }
 
-/// A unit whose axes are off by more is not one to fly with, and far below this a matrix stays invertible.
+/// Largest entry of scale and misalignment: a worse unit is not fit to fly, and a matrix stays invertible far beyond this.
 const AXES_MAX: f64 = 0.1;
 
-/// Readings become `(I + S) reading - bias`: the accelerometer's S is lower triangular, the gyro's full, both
-/// by columns after the three numbers of the bias.
+/// Reads the correction `(I + S) reading - bias`: the accelerometer's S is lower triangular, the gyro's full, both by columns
+/// after the three numbers of the bias.
 fn basalt_correction(file: &Document) -> Result<ImuCorrection, Fault> {
     let numbers = |key: &str, n: usize| if file.has(key) { file.numbers(key, n) } else { Ok(vec![0.0; n]) };
     let a = numbers("/value0/calib_accel_bias", 9)?;
     let g = numbers("/value0/calib_gyro_bias", 12)?;
     for (key, values) in [("/value0/calib_accel_bias", &a[3..]), ("/value0/calib_gyro_bias", &g[3..])] {
         if values.iter().any(|v| v.abs() > AXES_MAX) {
-            return Err(file.fault(key, "scale and misalignment of no more than a tenth, one is larger"));
+            return Err(file.fault(key, "an entry of scale or misalignment is larger than a tenth"));
         }
     }
     let columns = |s: [f64; 9]| DMat3::IDENTITY + DMat3::from_cols_array(&s);
@@ -307,15 +307,16 @@ fn basalt_correction(file: &Document) -> Result<ImuCorrection, Fault> {
     })
 }
 
-/// Calibrated rotations are printed rounded; more than this is a mistake.
+/// Largest deviation from a rotation: calibrated ones are printed rounded; more is a mistake.
 const ROTATION_TOLERANCE: f64 = 1e-3;
-/// A size that no camera has would buy buffers of that size.
+/// Largest side of an image, pixels: buffers of this size are allocated.
 const SIDE_MAX: f64 = 16384.0;
 
+/// The camera, if its numbers make sense.
 fn checked(file: &Document, at: &str, size: [f64; 2], f: [f64; 4], lens: Lens) -> Result<Camera, Fault> {
     let wrong = |what: &str| Err(file.fault(at, what));
     if size.iter().any(|s| !(1.0..=SIDE_MAX).contains(s) || s.fract() != 0.0) {
-        // Basalt keeps sizes beside the intrinsics.
+        // Basalt keeps the sizes beside the intrinsics.
         let key =
             if at.contains("intrinsics") { at.replace("intrinsics", "resolution") } else { format!("{at}/resolution") };
         return Err(file.fault(&key, "resolution must be two whole numbers from 1 to 16384"));
@@ -332,7 +333,7 @@ fn checked(file: &Document, at: &str, size: [f64; 2], f: [f64; 4], lens: Lens) -
     let camera = Camera { width: size[0] as usize, height: size[1] as usize, fx, fy, cx, cy, lens };
     match camera.unproject(glam::DVec2::new(cx, cy)).and_then(|b| camera.project(b)) {
         Some(_) => Ok(camera),
-        None => wrong("the lens maps nothing to its own centre: check the distortion"),
+        None => wrong("no direction is seen at the image's centre: check the distortion"),
     }
 }
 
@@ -347,7 +348,8 @@ fn rigid(m: &[f64]) -> Result<Pose, &'static str> {
         return Err("the rotation is not orthonormal (to 1e-3) and right-handed");
     }
     for _ in 0..3 {
-        r = (r + r.transpose().inverse()) * 0.5; // Newton towards the nearest rotation
+        // Newton's iteration towards the nearest rotation.
+        r = (r + r.transpose().inverse()) * 0.5;
     }
     Ok(Pose::new(DQuat::from_mat3(&r), DVec3::new(m[3], m[7], m[11])))
 }

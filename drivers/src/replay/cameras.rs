@@ -1,24 +1,24 @@
-//! How many cameras a recording or a calibration has: cam0, cam1 and so on without a gap, at most
-//! `CAMERAS_MAX`. A gap is found when the missing one is read, so that its file or key is named.
+//! The number of cameras of a recording or a calibration: cam0, cam1 and so on without a gap, at most `CAMERAS_MAX`. A gap is
+//! found when the missing camera is read, so that its file or key is named.
 
 use crate::{Fault, FaultKind};
 use std::path::Path;
 
-/// Cameras of one rig at most; as many as the estimator takes.
+/// Most cameras of one rig: as many as the estimator takes.
 pub const CAMERAS_MAX: usize = 4;
 
-/// One more than the highest number among these names of cameras; others are passed over.
+/// One more than the highest number among these names of cameras; other names are passed over.
 pub fn count<'a>(names: impl Iterator<Item = &'a str>) -> usize {
     names.filter_map(number).map(|k| k.saturating_add(1)).max().unwrap_or(0)
 }
 
-/// Of `cam12`, 12.
+/// The number of a name such as `cam12`.
 fn number(name: &str) -> Option<usize> {
     let digits = name.strip_prefix("cam")?;
     digits.bytes().all(|b| b.is_ascii_digit()).then(|| digits.parse().ok())?
 }
 
-/// The folders of cameras in `mav0`; one at least, as a recording without any lacks cam0.
+/// The number of camera folders in `mav0`; one at least, as a recording without any lacks cam0.
 pub fn recorded(mav0: &Path) -> Result<usize, Fault> {
     let entries = std::fs::read_dir(mav0).map_err(|e| {
         Fault::new(FaultKind::NoInput, mav0.display().to_string(), format!("cannot read: {e}"), "check the path")
@@ -33,11 +33,12 @@ pub fn recorded(mav0: &Path) -> Result<usize, Fault> {
     Ok(count)
 }
 
+/// What is wrong with more cameras than a rig may have.
 pub fn too_many(count: usize) -> String {
     format!("holds cam{}, a rig has {CAMERAS_MAX} cameras at most (cam0 to cam{})", count - 1, CAMERAS_MAX - 1)
 }
 
-/// "1 camera", "4 cameras".
+/// A number of cameras in words: "1 camera", "4 cameras".
 pub fn named(count: usize) -> String {
     format!("{count} camera{}", if count == 1 { "" } else { "s" })
 }

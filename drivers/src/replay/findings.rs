@@ -21,7 +21,7 @@ crate::counters! {
     images_unpaired,
     /// Images listed whose file is missing.
     images_missing,
-    /// Image files that are truncated or otherwise not decodable.
+    /// Image files that are cut off or otherwise cannot be decoded.
     images_undecodable,
     /// Image files whose size differs from the calibration's.
     images_wrong_size,
@@ -31,7 +31,7 @@ crate::counters! {
     imu_not_finite,
     /// Gaps in the inertial stream.
     imu_holes,
-    /// Calibration facts that are missing and taken from defaults, or present and not used.
+    /// Calibration values that are missing and assumed, or present and not used.
     calibration_notes,
 }
 

@@ -1,9 +1,9 @@
-//! Decoding of one frame's images to 8-bit grey: PNG of 8 or 16 bits (the high byte is taken:
-//! recordings use the full range), grey, palette or colour; JPEG, grey or colour. Decoding is strict, so that
-//! half an image is a fault and not a half-grey picture. Of cameras whose colour is asked for, red, green and blue are
-//! given beside the same grey; a grey file has them equal.
+//! Decodes the images of one frame to 8-bit grey: PNG of 8 or 16 bits (the high byte is taken: recordings use the full
+//! range), grey, palette or colour; JPEG, grey or colour. Decoding is strict, so that half an image is a fault and not a
+//! half-grey picture. Where colour is asked for, red, green and blue are given beside the same grey; those of a grey file
+//! are equal.
 
-use super::findings::{self, Findings, ReplayCounters};
+use super::findings::{Findings, ReplayCounters};
 use super::pairing::{FrameFiles, ImageFile};
 use crate::types::{luma, Colour, Frames, Image};
 use std::fmt;
@@ -12,29 +12,15 @@ use zune_jpeg::zune_core::bytestream::ZCursor;
 use zune_jpeg::zune_core::{colorspace::ColorSpace, options::DecoderOptions};
 use zune_jpeg::JpegDecoder;
 
+/// Why one frame has no images; the reader's warnings say which file and what. The recording goes on without the frame.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum FrameFaultKind {
+pub enum ImageFault {
+    /// A file cannot be read.
     Missing,
     Undecodable,
+    /// Its size differs from the calibration's.
     WrongSize,
 }
-
-/// Why one frame has no images. The recording goes on without it.
-#[derive(Clone, Debug, PartialEq)]
-pub struct FrameFault {
-    pub kind: FrameFaultKind,
-    /// csv:line that lists the image.
-    pub place: String,
-    pub what: String,
-}
-
-impl fmt::Display for FrameFault {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{}: {}", self.place, self.what)
-    }
-}
-
-impl std::error::Error for FrameFault {}
 
 /// Decodes the frames of a recording.
 #[derive(Debug, Default)]
@@ -50,7 +36,7 @@ impl Reader {
         Reader { frames, ..Reader::default() }
     }
 
-    /// Faults of the images read so far; add them to the recording's.
+    /// Faults of the images read so far.
     pub fn counters(&self) -> &ReplayCounters {
         &self.findings.counters
     }
@@ -60,7 +46,7 @@ impl Reader {
         &self.findings.warnings
     }
 
-    /// Whether the images of the first `cameras` have colour, by the first that can be read of each.
+    /// Whether the first `cameras` have colour, by the first image of each that can be read.
     pub fn has_colour(&self, cameras: usize) -> bool {
         let coloured = |k: usize| self.frames.iter().find_map(|f| is_coloured(f.images.get(k)?)).unwrap_or(false);
         (0..cameras).all(coloured)
@@ -68,29 +54,29 @@ impl Reader {
 
     /// Fills `out`, which is shaped by `Frames::for_rig` or `in_colour`. After a fault its pixels are unspecified.
     ///
-    /// Panics where `index` is not that of a frame or `out` has not one image a camera.
-    pub fn read(&mut self, index: usize, out: &mut Frames) -> Result<(), FrameFault> {
+    /// Panics where there is no frame `index`, or `out` has another number of images.
+    pub fn read(&mut self, index: usize, out: &mut Frames) -> Result<(), ImageFault> {
         let frame = &self.frames[index];
-        assert_eq!(frame.images.len(), out.images.len(), "Frames::for_rig gives one image a camera");
+        assert_eq!(frame.images.len(), out.images.len(), "Frames::for_rig gives one image for each camera");
         out.t = frame.t;
         let mut colours = out.colours.iter_mut();
         for (file, image) in frame.images.iter().zip(&mut out.images) {
             let read = read_image(file, &mut self.file, &mut self.decoded, image, colours.next());
-            let Err((kind, what)) = read else { continue };
-            let counter: fn(&mut ReplayCounters) -> &mut u64 = match kind {
-                FrameFaultKind::Missing => |c| &mut c.images_missing,
-                FrameFaultKind::Undecodable => |c| &mut c.images_undecodable,
-                FrameFaultKind::WrongSize => |c| &mut c.images_wrong_size,
+            let Err((fault, what)) = read else { continue };
+            let counter: fn(&mut ReplayCounters) -> &mut u64 = match fault {
+                ImageFault::Missing => |c| &mut c.images_missing,
+                ImageFault::Undecodable => |c| &mut c.images_undecodable,
+                ImageFault::WrongSize => |c| &mut c.images_wrong_size,
             };
-            let what = format!("{}: {what}", file.path.display());
-            self.findings.warn(counter, &file.list, file.line, &what);
-            return Err(FrameFault { kind, place: findings::place(&file.list, file.line), what });
+            self.findings.warn(counter, &file.list, file.line, format_args!("{}: {what}", file.path.display()));
+            return Err(fault);
         }
         Ok(())
     }
 }
 
-type Why = (FrameFaultKind, String);
+/// A fault, and what is said of it.
+type Why = (ImageFault, String);
 
 fn read_image(
     file: &ImageFile,
@@ -99,7 +85,7 @@ fn read_image(
     out: &mut Image,
     colour: Option<&mut Colour>,
 ) -> Result<(), Why> {
-    let missing = |e: std::io::Error| (FrameFaultKind::Missing, format!("cannot read: {e}"));
+    let missing = |e: std::io::Error| (ImageFault::Missing, format!("cannot read: {e}"));
     bytes.clear();
     std::fs::File::open(&file.path).and_then(|mut f| f.read_to_end(bytes)).map_err(missing)?;
     if bytes.starts_with(b"\x89PNG") {
@@ -114,7 +100,7 @@ fn read_image(
     }
 }
 
-/// `None` where the header cannot be read.
+/// Whether an image has colour; `None` where its header cannot be read.
 fn is_coloured(file: &ImageFile) -> Option<bool> {
     let bytes = std::fs::read(&file.path).ok()?;
     if bytes.starts_with(b"\x89PNG") {
@@ -128,16 +114,16 @@ fn is_coloured(file: &ImageFile) -> Option<bool> {
 }
 
 fn undecodable(e: impl fmt::Display) -> Why {
-    (FrameFaultKind::Undecodable, format!("cannot decode: {e}"))
+    (ImageFault::Undecodable, format!("cannot decode: {e}"))
 }
 
-/// Before anything is decoded, so that a wrong header cannot ask for more memory than the camera's.
+/// Checks the size before anything is decoded, so that a wrong header cannot ask for more memory than the camera's.
 fn check_size(width: usize, height: usize, out: &Image) -> Result<(), Why> {
     if (width, height) == (out.width, out.height) {
         return Ok(());
     }
     let what = format!("is {width}x{height}, the calibration says {}x{}", out.width, out.height);
-    Err((FrameFaultKind::WrongSize, what))
+    Err((ImageFault::WrongSize, what))
 }
 
 fn read_png(bytes: &[u8], decoded: &mut Vec<u8>, out: &mut Image, colour: Option<&mut Colour>) -> Result<(), Why> {
@@ -168,7 +154,7 @@ fn read_png(bytes: &[u8], decoded: &mut Vec<u8>, out: &mut Image, colour: Option
     reader.finish().map_err(undecodable)
 }
 
-/// The file's headers, and the decoder that goes on to give `space`.
+/// A decoder to the colour space `space`, whose headers are read and checked.
 fn jpeg_decoder<'a>(bytes: &'a [u8], space: ColorSpace, out: &Image) -> Result<JpegDecoder<ZCursor<&'a [u8]>>, Why> {
     let options = DecoderOptions::default().set_strict_mode(true).jpeg_set_out_colorspace(space);
     let mut decoder = JpegDecoder::new_with_options(ZCursor::new(bytes), options);
@@ -182,7 +168,7 @@ fn read_jpeg(bytes: &[u8], out: &mut Image) -> Result<(), Why> {
     jpeg_decoder(bytes, ColorSpace::Luma, out)?.decode_into(&mut out.pixels).map_err(undecodable)
 }
 
-/// The grey is the file's own luma, as it is without colour.
+/// Reads a JPEG in colour; the grey is the file's own luma, as it is without colour.
 fn read_jpeg_colour(bytes: &[u8], decoded: &mut Vec<u8>, out: &mut Image, colour: &mut Colour) -> Result<(), Why> {
     let mut decoder = jpeg_decoder(bytes, ColorSpace::YCbCr, out)?;
     if decoder.info().is_some_and(|i| i.components < 3) {

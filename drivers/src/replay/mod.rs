@@ -1,12 +1,11 @@
-//! Recorded datasets of one to four cameras and an inertial unit: EuRoC ASL (`mav0`, sensor.yaml) and TUM-VI (`mav0` beside a
-//! Kalibr camchain.yaml), images as 8- or 16-bit PNG or JPEG.
+//! Recorded datasets of one to four cameras and an inertial unit: EuRoC ASL (`mav0`, sensor.yaml) and TUM-VI (`mav0` beside
+//! a Kalibr camchain.yaml), images as 8- or 16-bit PNG or JPEG.
 //!
-//! `Recording::open` reads every table and the calibration, makes frames of the images by stamp and checks the
-//! inertial stream against them; a `Reader` decodes the images of one frame at a time. What makes the
-//! whole recording useless (no calibration, an empty table) is a `Fault`; what spoils one row or one
-//! image costs that row or image, a named counter and a warning with file and line. Stamps that do
-//! not grow are dropped so that the most rows stay (`order`), hence one corrupt stamp far in the
-//! future costs itself and not the rest of the recording.
+//! `Recording::open` reads all tables and the calibration, pairs the images by stamp into frames and checks the inertial
+//! stream against them; a `Reader` decodes the images of one frame at a time. A problem that makes the whole recording
+//! useless (no calibration, an empty table) is a `Fault`; one that hurts a row or an image costs that row or image, a named
+//! counter and a warning with file and line. Stamps that do not grow are dropped so that the most rows stay (`order`): one
+//! corrupt stamp far in the future costs itself and not the rest of the recording.
 
 mod calibration;
 mod cameras;
@@ -20,7 +19,7 @@ mod trajectory;
 pub use calibration::read_calibration;
 pub use cameras::CAMERAS_MAX;
 pub use findings::ReplayCounters;
-pub use images::{FrameFault, FrameFaultKind, Reader};
+pub use images::{ImageFault, Reader};
 pub use pairing::{FrameFiles, ImageFile};
 pub(crate) use table::{numbers, read_strictly, Row};
 pub use trajectory::read_trajectory;
@@ -31,6 +30,7 @@ use findings::Findings;
 use glam::DVec3;
 use std::path::{Path, PathBuf};
 
+/// How a recording is read.
 #[derive(Clone, Debug, PartialEq)]
 pub struct OpenOptions {
     /// Largest stamp difference of images of one frame.
@@ -39,7 +39,7 @@ pub struct OpenOptions {
     pub imu_hole: Span,
     /// Calibration used instead of the recording's own; see `read_calibration`.
     pub calibration: Option<PathBuf>,
-    /// First row to last of every camera, where the board states it.
+    /// Readout time of every camera, first row to last, where the board states it.
     pub readout: Option<Span>,
 }
 
@@ -49,9 +49,8 @@ impl Default for OpenOptions {
     }
 }
 
-/// A dataset with every table in memory and every image on disk. All stamps grow strictly. What the
-/// calibration says of time and of the unit's axes is applied: stamps of images are in the inertial
-/// unit's clock, samples are corrected.
+/// A dataset with its tables in memory and its images on disk. All stamps grow strictly. The calibration of time and of the
+/// unit's axes is applied: stamps of images are in the inertial unit's clock, samples are corrected.
 #[derive(Clone, Debug)]
 pub struct Recording {
     pub calibration: Calibration,
@@ -65,7 +64,7 @@ pub struct Recording {
 }
 
 impl Recording {
-    /// `dataset` holds `mav0/` or is it.
+    /// Opens a folder that holds `mav0/`, or `mav0/` itself.
     pub fn open(dataset: &Path, options: &OpenOptions) -> Result<Recording, Fault> {
         let (home, mav0) = layout(dataset)?;
         let mut findings = Findings::default();
@@ -87,7 +86,7 @@ impl Recording {
         Ok(Recording { calibration, imu, frames, truth, warnings, counters })
     }
 
-    /// A decoder of the frames with scratch of its own, for a thread of its own.
+    /// A decoder of the frames, with memory of its own, for one thread.
     pub fn reader(&self) -> Reader {
         Reader::new(self.frames.clone())
     }
@@ -141,7 +140,7 @@ fn read_imu(path: &Path, hole: Span, findings: &mut Findings) -> Result<Vec<ImuS
     Ok(rows.into_iter().map(|r: Row<ImuSample>| r.value).collect())
 }
 
-/// Frames outside the inertial stream stay (mapping with given poses can use them) but are counted.
+/// Counts frames outside the inertial stream; they stay, as mapping with given poses can use them.
 fn check_cover(frames: &[FrameFiles], imu: &[ImuSample], findings: &mut Findings) {
     let (Some(first), Some(last)) = (imu.first(), imu.last()) else { return };
     for frame in frames.iter().filter(|f| f.t < first.t || f.t > last.t) {

@@ -1,13 +1,14 @@
-//! Keeps the longest strictly increasing run of stamps and counts the rest.
+//! Keeps the longest strictly increasing subsequence of stamps and counts the rest.
 //!
-//! Dropping every row that is not newer than the last would let one corrupt stamp in the future
-//! cost all rows after it; the longest increasing subsequence loses the fewest rows instead.
+//! Dropping every row that is not newer than the last would let one corrupt stamp in the future cost all rows after it; the
+//! longest increasing subsequence loses the fewest rows.
 
 use super::findings::Findings;
 use super::table::Row;
 use crate::types::Nanos;
 use std::path::Path;
 
+/// The rows whose stamps grow; the others are counted as duplicated or out of order.
 pub fn increasing<T>(
     rows: Vec<Row<T>>,
     stamp: impl Fn(&T) -> Nanos,
@@ -34,7 +35,8 @@ pub fn increasing<T>(
     out
 }
 
-/// Patience sorting: `ends[n]` is where the best run of length n + 1 ends; `before` links runs.
+/// Marks the longest increasing subsequence by patience sorting: `ends[n]` is where the best run of length n + 1 ends;
+/// `before` links the members of runs.
 fn longest_increasing(stamps: &[Nanos]) -> Vec<bool> {
     let mut ends: Vec<usize> = Vec::new();
     let mut before = vec![usize::MAX; stamps.len()];
@@ -44,7 +46,8 @@ fn longest_increasing(stamps: &[Nanos]) -> Vec<bool> {
         match ends.get_mut(n) {
             None => ends.push(i),
             Some(end) if stamps[*end] > *t => *end = i,
-            Some(_) => {} // the same stamp: the earlier row stays
+            // The same stamp: the earlier row stays.
+            Some(_) => {}
         }
     }
     let mut keep = vec![false; stamps.len()];

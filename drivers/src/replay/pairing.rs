@@ -1,4 +1,4 @@
-//! Image lists of the cameras, and the frames made of them: one image of every camera, taken together.
+//! Image lists of the cameras, and the frames that are made of them: one image of every camera, taken together.
 
 use super::findings::Findings;
 use super::table::{self, Row};
@@ -8,7 +8,7 @@ use crate::{Calibration, Fault, FaultKind};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-/// An image file and where it is listed.
+/// An image file, and the table and line that list it.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ImageFile {
     pub path: PathBuf,
@@ -23,12 +23,13 @@ pub struct FrameFiles {
     pub images: Vec<ImageFile>,
 }
 
+/// A row of an image list; `t` is in the inertial unit's clock once the list was read.
 pub struct ImageRow {
     t: Nanos,
     file: String,
 }
 
-/// The image lists of all cameras, each of which must be calibrated and recorded.
+/// Reads the image lists of all cameras, each of which must be calibrated and recorded.
 pub fn image_lists(
     mav0: &Path,
     calibration: &Calibration,
@@ -58,8 +59,8 @@ fn list_path(mav0: &Path, camera: usize) -> PathBuf {
     mav0.join(format!("cam{camera}/data.csv"))
 }
 
-/// Walks all lists together, oldest first: an image whose partners are all within the tolerance
-/// makes a frame with them, any other is unpaired: a frame that lacks one camera's image is none.
+/// Makes frames of the lists, oldest images first: an image whose partners are all within the tolerance makes a frame with
+/// them; any other is unpaired, as a frame needs an image of every camera.
 pub fn into_frames(
     mav0: &Path,
     lists: &[Vec<Row<ImageRow>>],
@@ -78,7 +79,7 @@ pub fn into_frames(
         let t = stamp(oldest, 0).expect("chosen among those with a stamp");
         let newest = cameras.clone().map(|k| stamp(k, 0).unwrap_or(Nanos(i64::MAX))).max().unwrap_or(t);
         let ended = cameras.clone().any(|k| stamp(k, 0).is_none());
-        // Where the oldest camera's next image is closer to the others, that one is the partner.
+        // Where the oldest camera's next image is closer to the others, it is the partner.
         let next_is_closer = newest > t && stamp(oldest, 1).is_some_and(|n| n <= newest);
         if !ended && newest - t <= tolerance && !next_is_closer {
             let image = |k: usize| {

@@ -1,5 +1,4 @@
-//! A YAML or JSON file as a tree whose faults name the key and the line. Keys are JSON pointers
-//! (`/cam0/intrinsics`).
+//! A YAML or JSON file as a tree; its faults name the key and the line. Keys are JSON pointers (`/cam0/intrinsics`).
 
 use super::super::{findings, table};
 use super::rigid;
@@ -8,6 +7,7 @@ use crate::{Fault, FaultKind};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 
+/// A parsed file, with its text for line numbers.
 pub struct Document {
     pub path: PathBuf,
     text: String,
@@ -23,7 +23,7 @@ impl Document {
         };
         let mut text = String::from_utf8(bytes).map_err(|_| wrong(0, "is not text".into()))?;
         if text.starts_with('%') {
-            // OpenCV writes "%YAML:1.0", which is not YAML; blanked so that lines keep their numbers
+            // OpenCV writes "%YAML:1.0", which is not YAML; blanked, so that lines keep their numbers.
             let end = text.find('\n').unwrap_or(text.len());
             text.replace_range(..end, "");
         }
@@ -45,12 +45,12 @@ impl Document {
         self.root.as_object().into_iter().flat_map(|o| o.keys().map(String::as_str))
     }
 
-    /// Of the list there; 0 where there is none.
+    /// The length of a list; 0 where there is none.
     pub fn length(&self, key: &str) -> usize {
         self.root.pointer(key).and_then(Value::as_array).map_or(0, Vec::len)
     }
 
-    /// Where the key stands, or the deepest part of it that is there; 0 if none is.
+    /// The line of a key, or of the deepest part of it that is there; 0 if none is.
     pub fn line(&self, key: &str) -> usize {
         let mut found = 0;
         for part in key.split('/').filter(|p| !p.is_empty() && p.parse::<usize>().is_err()) {
@@ -66,6 +66,7 @@ impl Document {
         found
     }
 
+    /// A fault of a key.
     pub fn fault(&self, key: &str, what: &str) -> Fault {
         let name = key.trim_start_matches('/').replace('/', ".");
         let what = if name.is_empty() { what.to_string() } else { format!("{name}: {what}") };
@@ -76,14 +77,17 @@ impl Document {
         self.root.pointer(key).ok_or_else(|| self.fault(key, "this key is missing"))
     }
 
+    /// A word.
     pub fn text(&self, key: &str) -> Result<&str, Fault> {
         self.get(key)?.as_str().ok_or_else(|| self.fault(key, "must be a word"))
     }
 
+    /// A finite number; text that is one counts.
     pub fn number(&self, key: &str) -> Result<f64, Fault> {
         finite(self.get(key)?).ok_or_else(|| self.fault(key, "must be a number"))
     }
 
+    /// A number above zero.
     pub fn positive(&self, key: &str) -> Result<f64, Fault> {
         let value = self.number(key)?;
         if value > 0.0 {
@@ -92,22 +96,19 @@ impl Document {
         Err(self.fault(key, "must be positive"))
     }
 
-    /// A list of numbers, or a list of such lists row by row.
-    pub fn all_numbers(&self, key: &str) -> Result<Vec<f64>, Fault> {
+    /// A list of `n` numbers, or of lists that hold so many in all.
+    pub fn numbers(&self, key: &str, n: usize) -> Result<Vec<f64>, Fault> {
         let wrong = || self.fault(key, "must be a list of numbers");
         let items = self.get(key)?.as_array().ok_or_else(wrong)?;
         let flat = items.iter().flat_map(|v| v.as_array().map_or(std::slice::from_ref(v), Vec::as_slice));
-        flat.map(|v| finite(v).ok_or_else(wrong)).collect()
-    }
-
-    pub fn numbers(&self, key: &str, n: usize) -> Result<Vec<f64>, Fault> {
-        let values = self.all_numbers(key)?;
+        let values: Vec<f64> = flat.map(|v| finite(v).ok_or_else(wrong)).collect::<Result<_, _>>()?;
         if values.len() != n {
             return Err(self.fault(key, &format!("must be {n} numbers, found {}", values.len())));
         }
         Ok(values)
     }
 
+    /// A rigid transform, from the 16 numbers of its matrix, row by row.
     pub fn transform(&self, key: &str) -> Result<Pose, Fault> {
         rigid(&self.numbers(key, 16)?).map_err(|what| self.fault(key, what))
     }
