@@ -1,5 +1,5 @@
-//! A recording, or a flight rendered into memory, as a pair of sources: delivered at its recorded time by the
-//! monotonic clock. What is late is delivered at once and in order, as by a device with a queue.
+//! A recording, or a flight rendered into memory, as a pair of sources that deliver at the recorded times. What is late is
+//! delivered at once and in order, as by a device with a queue.
 
 use crate::replay::{ImageFault, Reader};
 use crate::source::{FrameSource, ImuBatch, ImuReading, ImuSource, SourceFault, Wait};
@@ -14,7 +14,7 @@ pub enum Images {
 }
 
 impl Images {
-    /// Reads frame `index` into pre-shaped `out`; one that cannot be read is kept among `warnings`.
+    /// Reads frame `index` into pre-shaped `out`; `warnings` keeps those that cannot be read.
     pub fn read(&mut self, index: usize, out: &mut Frames) -> Result<(), ImageFault> {
         match self {
             Images::Recording(reader) => reader.read(index, out),
@@ -33,6 +33,7 @@ impl Images {
         }
     }
 
+    /// The first faults of each kind, a line each.
     pub fn warnings(&self) -> &[String] {
         match self {
             Images::Recording(reader) => reader.warnings(),
@@ -40,7 +41,7 @@ impl Images {
         }
     }
 
-    /// What reading met: counters by name.
+    /// Counters of faults, by name.
     pub fn counters(&self) -> Vec<(&'static str, u64)> {
         match self {
             Images::Recording(reader) => reader.counters().list(),
@@ -49,22 +50,22 @@ impl Images {
     }
 }
 
-/// When what was recorded at an instant is due. Both sources of a recording are given the same.
+/// The instants at which the parts of a recording are due. Both sources of a recording are given the same.
 #[derive(Clone, Copy, Debug)]
 pub struct Pace {
     first: Nanos,
     start: Instant,
-    /// Seconds of the recording a second.
+    /// Seconds of the recording per second.
     speed: f64,
 }
 
 impl Pace {
-    /// What was recorded at `first` is due now.
+    /// The pace of the recording, `first` of which is due now.
     pub fn starting(first: Nanos) -> Pace {
         Pace::at_speed(first, 1.0)
     }
 
-    /// So many times as fast as it was recorded.
+    /// A pace so many times as fast.
     pub fn at_speed(first: Nanos, speed: f64) -> Pace {
         Pace { first, start: Instant::now(), speed }
     }
@@ -73,7 +74,7 @@ impl Pace {
         self.start + Duration::from_secs_f64(((t - self.first).secs() / self.speed).max(0.0))
     }
 
-    /// Sleeps until `t` is due; false where that is after `limit`, until which it slept then.
+    /// Sleeps until `t` is due, or until `limit`; false where that is before.
     fn wait(&self, t: Nanos, limit: Instant) -> bool {
         let due = self.due(t);
         std::thread::sleep(due.min(limit).saturating_duration_since(Instant::now()));
@@ -85,9 +86,10 @@ fn after(timeout: Span) -> Instant {
     Instant::now() + Duration::from_nanos(timeout.0.max(0) as u64)
 }
 
-/// The counter of frames whose images could not be read.
+/// Name of the counter of frames whose images could not be read.
 pub const FRAMES_UNREADABLE: &str = "frames_unreadable";
 
+/// The cameras of a recording.
 pub struct PacedFrames {
     images: Images,
     stamps: Vec<Nanos>,
@@ -97,7 +99,7 @@ pub struct PacedFrames {
 }
 
 impl PacedFrames {
-    /// Frame i of `images` bears stamp i; those beyond the stamps are not played.
+    /// Frame i of `images` has stamp i; frames beyond the stamps are not played.
     pub fn new(images: Images, stamps: Vec<Nanos>, pace: Pace) -> PacedFrames {
         PacedFrames { images, stamps, pace, next: 0, unreadable: 0 }
     }
@@ -134,6 +136,7 @@ impl FrameSource for PacedFrames {
     }
 }
 
+/// The inertial unit of a recording.
 pub struct PacedImu {
     samples: Arc<[ImuSample]>,
     pace: Pace,
@@ -161,10 +164,6 @@ impl ImuSource for PacedImu {
             self.next += 1;
         }
         Ok(Wait::Got)
-    }
-
-    fn counters(&self) -> Vec<(&'static str, u64)> {
-        vec![]
     }
 }
 

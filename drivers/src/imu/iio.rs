@@ -11,7 +11,7 @@ use super::counters::ImuCounters;
 use super::error::ImuError;
 use super::iio_scan::{channel, Channel, Element, Kind, Scan};
 use super::merge::{pass, Merge, Reading};
-use super::timeline::{ClockReport, Timeline};
+use super::timeline::Timeline;
 use super::{pause, watermark};
 use crate::host::monotonic;
 use crate::source::{ImuBatch, ImuSource, SourceFault, Wait};
@@ -90,16 +90,11 @@ impl IioImu {
         Ok(IioImu { options: options.clone(), streams, merge, lost: None, retry: Nanos::MIN, counters })
     }
 
-    /// The clock of the device whose samples set the time.
-    pub fn clock(&self) -> ClockReport {
-        self.streams[0].line.report()
-    }
-
     /// The counters so far.
     pub fn counts(&self) -> ImuCounters {
         ImuCounters {
             imu_unpaired: self.merge.as_ref().map_or(0, |m| m.unpaired),
-            imu_rate_millihertz: (self.clock().rate_hz * 1e3).round() as u64,
+            imu_rate_millihertz: (self.streams[0].line.report().rate_hz * 1e3).round() as u64,
             ..self.counters
         }
     }

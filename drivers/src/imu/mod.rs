@@ -30,7 +30,6 @@ mod unit;
 pub use counters::ImuCounters;
 pub use iio::{IioImu, IioOptions};
 pub use register::RegisterImu;
-pub use timeline::ClockReport;
 
 use crate::gpio::DataReady;
 use crate::source::{ImuBatch, ImuSource, SourceFault, Wait};
@@ -68,14 +67,6 @@ pub enum HardwareImu {
 }
 
 impl HardwareImu {
-    /// The estimate of the sensor's clock.
-    pub fn clock(&self) -> ClockReport {
-        match self {
-            HardwareImu::Register(imu) => imu.clock(),
-            HardwareImu::Iio(imu) => imu.clock(),
-        }
-    }
-
     /// The counters so far.
     pub fn counts(&self) -> ImuCounters {
         match self {

@@ -15,7 +15,6 @@ use super::counters::ImuCounters;
 use super::edges::{EdgeFault, EdgeQueue, Edges};
 use super::error::ImuError;
 use super::merge::{pass, Merge};
-use super::timeline::ClockReport;
 use super::unit::Unit;
 use crate::source::{ImuBatch, ImuSource, SourceFault, Wait};
 use crate::types::{Nanos, Span};
@@ -48,7 +47,7 @@ enum State {
 pub struct RegisterImu {
     place: String,
     /// One, or gyro and accelerometer.
-    units: Vec<Unit>,
+    pub(super) units: Vec<Unit>,
     edges: Option<Box<dyn Edges>>,
     /// When a line that failed is used again.
     edges_from: Nanos,
@@ -103,18 +102,13 @@ impl RegisterImu {
         Ok(imu)
     }
 
-    /// The clock of the die whose samples set the time.
-    pub fn clock(&self) -> ClockReport {
-        self.units[0].line.report()
-    }
-
     /// The counters so far.
     pub fn counts(&self) -> ImuCounters {
         ImuCounters {
             imu_edges_refused: self.queue.refused,
             imu_edges_unmatched: self.queue.unmatched,
             imu_unpaired: self.merge.as_ref().map_or(0, |m| m.unpaired),
-            imu_rate_millihertz: (self.clock().rate_hz * 1e3).round() as u64,
+            imu_rate_millihertz: (self.units[0].line.report().rate_hz * 1e3).round() as u64,
             ..self.counters
         }
     }

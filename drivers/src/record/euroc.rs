@@ -1,8 +1,8 @@
 //! A recording as an EuRoC ASL folder.
 //!
-//! An image is written under a hidden name and renamed, and its row is appended when the images of all cameras are
-//! there. Rows go out in one write, and one that the disk cuts short is cut off again. Stamps are the cameras' own;
-//! samples are corrected by the calibration already, as everything downstream of a source is.
+//! An image is written under a hidden name and renamed, and its row is appended when the images of all cameras are there.
+//! Rows go out in one write, and one that the disk cuts short is taken back. Stamps are the cameras' own; samples are
+//! corrected by the calibration already, as everything downstream of a source is.
 
 use super::Sink;
 use crate::calibration::RigCamera;
@@ -14,15 +14,17 @@ use std::fs::{self, File, OpenOptions};
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
-/// Samples a write; a frame writes out what waits, too.
+/// Samples of one write; a frame writes out those that wait, too.
 const ROWS: usize = 20;
 /// Rows kept while the disk is full, bytes: five seconds of a 1 kHz unit.
 const ROWS_BYTES_MAX: usize = 1 << 19;
 
-/// A csv that ends in whole rows.
+/// A csv that ends with a whole row.
 struct Rows {
     file: File,
+    /// Bytes of whole rows.
     good: u64,
+    /// Rows that are not written yet, and how many.
     waiting: Vec<u8>,
     count: usize,
 }
@@ -53,7 +55,7 @@ impl Rows {
         self.flush()
     }
 
-    /// Takes the last `append` back.
+    /// Takes rows back, down to so many bytes.
     fn cut(&mut self, good: u64) -> io::Result<()> {
         self.good = good;
         self.file.set_len(good)
@@ -64,8 +66,11 @@ struct CameraFolder {
     camera: RigCamera,
     data: PathBuf,
     rows: Rows,
+    /// Bytes of rows before the frame that is being listed.
+    before: u64,
 }
 
+/// Writes an EuRoC ASL folder.
 pub struct EurocSink {
     cameras: Vec<CameraFolder>,
     imu: Rows,
@@ -73,6 +78,7 @@ pub struct EurocSink {
 }
 
 impl EurocSink {
+    /// Makes the folders and the files of calibration.
     pub fn create(dir: &Path, calibration: &Calibration) -> io::Result<EurocSink> {
         let mav = dir.join("mav0");
         let mut cameras = Vec::new();
@@ -83,7 +89,7 @@ impl EurocSink {
             // The rate is in the stamps.
             fs::write(folder.join("sensor.yaml"), camera_yaml(camera, &format!("recorded cam{k}"), 0.0))?;
             let rows = Rows::create(&folder.join("data.csv"), IMAGE_COLUMNS)?;
-            cameras.push(CameraFolder { camera: *camera, data, rows });
+            cameras.push(CameraFolder { camera: *camera, data, rows, before: 0 });
         }
         let folder = mav.join("imu0");
         fs::create_dir_all(&folder)?;
@@ -107,23 +113,17 @@ impl EurocSink {
         Ok(())
     }
 
+    /// Lists a frame for every camera or for none.
     fn list(&mut self, frames: &Frames) -> io::Result<()> {
-        for k in 0..self.cameras.len() {
-            let folder = &mut self.cameras[k];
+        self.cameras.iter_mut().for_each(|folder| folder.before = folder.rows.good);
+        let listed = self.cameras.iter_mut().try_for_each(|folder| {
             let t = folder.camera.from_imu_clock(frames.t).0;
-            let before = folder.rows.good;
-            if let Err(e) = folder.rows.append(format_args!("{t},{t}.png\n")) {
-                // A frame is listed for every camera or for none.
-                let row = e.to_string();
-                for other in &mut self.cameras[..k] {
-                    let length = format!("{t},{t}.png\n").len() as u64;
-                    other.rows.cut(other.rows.good - length)?;
-                }
-                debug_assert!(self.cameras[k].rows.good == before);
-                return Err(io::Error::new(e.kind(), row));
-            }
+            folder.rows.append(format_args!("{t},{t}.png\n"))
+        });
+        if listed.is_err() {
+            self.cameras.iter_mut().try_for_each(|folder| folder.rows.cut(folder.before))?;
         }
-        Ok(())
+        listed
     }
 }
 

@@ -1,9 +1,9 @@
 //! A recording as MCAP: ROS 2 messages in CDR, which Foxglove and `ros2 bag` read. Images are PNG inside
-//! `sensor_msgs/msg/CompressedImage`, lossless at half the bytes of raw ones; calibration is attached as the
-//! sensor.yaml of EuRoC.
+//! `sensor_msgs/msg/CompressedImage`, lossless at half the bytes of raw ones; the calibration is attached as EuRoC's
+//! sensor.yaml.
 //!
-//! A chunk holds one frame and the samples before it, and is written at once when the frame is complete. What a kill or a
-//! full disk cuts off is at most the last; after a failure the next frame begins another file.
+//! A chunk holds one frame and the samples before it, and is written at once when the frame is complete. A kill or a full
+//! disk cuts off the last chunk at most; after a failure the next frame begins another file.
 
 use super::Sink;
 use crate::calibration::RigCamera;
@@ -51,6 +51,7 @@ float64 y
 float64 z
 ";
 
+/// Writes files recording-000.mcap and so on.
 pub struct McapSink {
     dir: PathBuf,
     calibration: Calibration,
@@ -65,7 +66,7 @@ pub struct McapSink {
 struct Open {
     writer: Writer<File>,
     path: PathBuf,
-    /// Up to where the file is whole.
+    /// Bytes up to the last whole chunk.
     good: u64,
     images: Vec<u16>,
     imu: u16,
@@ -79,6 +80,7 @@ fn failed(e: McapError) -> io::Error {
 }
 
 impl McapSink {
+    /// Begins the first file.
     pub fn create(dir: &Path, calibration: &Calibration) -> io::Result<McapSink> {
         let mut sink = McapSink {
             dir: dir.to_path_buf(),
@@ -144,7 +146,7 @@ impl McapSink {
         Ok(())
     }
 
-    /// Leaves the file whole up to its last good chunk.
+    /// Closes the file after its last whole chunk.
     fn give_up(&mut self) {
         if let Some(Open { writer, good, .. }) = self.file.take() {
             let file = writer.into_inner();
@@ -172,7 +174,7 @@ impl Sink for McapSink {
         let s = &reading.sample;
         let mut cdr = Cdr::new(&mut self.message);
         cdr.header(s.t, "imu0");
-        // No orientation is measured, which ROS says by -1; the rest of the covariances is not known: 0.
+        // No orientation is measured, which ROS marks by -1; the covariances are not known: 0.
         cdr.floats(&[0.0, 0.0, 0.0, 1.0, -1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]);
         for v in [s.gyro_body, s.accel_body] {
             cdr.floats(&v.to_array());
@@ -193,7 +195,7 @@ impl Sink for McapSink {
     }
 }
 
-/// Little-endian CDR: every number is aligned to its size, counted from the end of the four bytes at the start.
+/// Little-endian CDR: every number is aligned to its size, counted from the end of the four-byte header.
 struct Cdr<'a>(&'a mut Vec<u8>);
 
 impl Cdr<'_> {

@@ -1,9 +1,9 @@
-//! Records what sources give, as it comes, while a run goes on.
+//! Records frames and samples as the sources give them, while a run goes on.
 //!
-//! A tap sits on each source and copies what passes into a ring of fixed size; a thread of low priority writes it. A
-//! full ring drops, and counts, and the source never waits. What was written stays readable whatever happens: an
-//! image appears whole or not at all and is listed after it appeared, a chunk of MCAP is complete or is cut
-//! off at its start. A disk that is full costs what comes until it has room again, and nothing before.
+//! A tap on each source copies what passes into a ring of fixed size; a thread of low priority writes it. A full ring drops
+//! and counts, and the source never waits. What was written stays readable whatever happens: an image appears whole or not
+//! at all and is listed after it appeared; a chunk of MCAP is complete or taken back. A full disk loses what comes until it
+//! has room again, and nothing before.
 
 mod euroc;
 mod mcap;
@@ -22,14 +22,17 @@ use std::sync::mpsc::{Receiver, SyncSender};
 use std::sync::{mpsc, Arc};
 use std::thread::JoinHandle;
 
-/// Where a recording goes. What fails leaves what was written before as it was.
+/// A recording's format on disk. A write that fails leaves what was written before as it was.
 pub trait Sink: Send {
+    /// Writes the images of one frame.
     fn frames(&mut self, frames: &Frames) -> io::Result<()>;
+    /// Writes one inertial sample.
     fn imu(&mut self, reading: &ImuReading) -> io::Result<()>;
-    /// Nothing more comes.
+    /// Writes what is left: nothing more comes.
     fn finish(&mut self) -> io::Result<()>;
 }
 
+/// The formats of recordings.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Format {
@@ -41,10 +44,10 @@ pub enum Format {
 
 /// Nice value of the writer's thread: after the sensors and odometry, before a map. What is not written in time is lost.
 const NICE: i32 = 5;
-/// Samples that wait for the writer beside the frames: eight seconds of a 1 kHz unit.
+/// Samples that may wait for the writer: eight seconds of a 1 kHz unit.
 const IMU_SLOTS: usize = 8192;
 
-/// Bytes of the ring between sources and writer, with frames of so many bytes.
+/// Bytes of a ring of `slots` frames of `frame_bytes`, between sources and writer.
 pub fn ring_bytes(frame_bytes: usize, slots: usize) -> usize {
     slots * frame_bytes + (slots + IMU_SLOTS) * size_of::<Item>()
 }
@@ -70,13 +73,13 @@ enum Item {
     Imu(ImuReading),
 }
 
-/// A recording under way.
+/// The writer of a recording.
 pub struct Recorder {
     counts: Arc<Counts>,
     thread: JoinHandle<Option<String>>,
 }
 
-/// What a recording came to.
+/// The outcome of a recording.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Recorded {
     pub counters: Vec<(&'static str, u64)>,
@@ -104,12 +107,13 @@ struct ImuTap {
 }
 
 impl Taps {
+    /// Puts the taps on two sources.
     pub fn on<F: FrameSource, I: ImuSource>(self, frames: F, imu: I) -> (TappedFrames<F>, TappedImu<I>) {
         (TappedFrames { source: frames, tap: self.frames }, TappedImu { source: imu, tap: self.imu })
     }
 }
 
-/// Makes `dir` ready for a recording; it must not hold one.
+/// Makes the folder `dir`, which must not exist or be empty, ready for a recording.
 pub fn open(dir: &Path, format: Format, calibration: &Calibration) -> Result<Box<dyn Sink>, Fault> {
     let fault = |e: io::Error| {
         let fix = "choose a folder that can be written to and has room";
@@ -126,7 +130,7 @@ pub fn open(dir: &Path, format: Format, calibration: &Calibration) -> Result<Box
     })
 }
 
-/// Starts the writer, with room for so many frames of this shape.
+/// Starts the writer, with a ring of `slots` frames of this shape.
 pub fn start(mut sink: Box<dyn Sink>, shape: &Frames, slots: usize) -> (Recorder, Taps) {
     let (items, waiting) = mpsc::sync_channel(slots + IMU_SLOTS);
     let (give_back, spare) = mpsc::sync_channel(slots);
@@ -167,7 +171,7 @@ pub fn start(mut sink: Box<dyn Sink>, shape: &Frames, slots: usize) -> (Recorder
 }
 
 impl Recorder {
-    /// Waits until all that was taken is written; the taps must be gone.
+    /// Waits until everything is written; the taps must be gone.
     pub fn finish(self) -> Recorded {
         let failure = self.thread.join().unwrap_or_else(|_| Some("the writer ended early".into()));
         Recorded { counters: self.counts.list(), failure }
@@ -195,6 +199,7 @@ impl ImuTap {
     }
 }
 
+/// Cameras that are recorded.
 pub struct TappedFrames<S> {
     source: S,
     tap: FrameTap,
@@ -214,6 +219,7 @@ impl<S: FrameSource> FrameSource for TappedFrames<S> {
     }
 }
 
+/// An inertial unit that is recorded.
 pub struct TappedImu<S> {
     source: S,
     tap: ImuTap,

@@ -95,20 +95,15 @@ impl Room {
         let wall = |origin, u, width: f32, k: usize| {
             face(origin, u, z, Vec2::new(width, e.z), walls[k], seed.wrapping_add(k as u32))
         };
+        let flat = Vec2::new(e.x, e.y);
+        let ceiling = Vec3::new(low.x, high.y, high.z);
         let faces = vec![
             wall(corner(low.x, low.y), y, e.y, 0),
             wall(corner(high.x, high.y), -y, e.y, 1),
             wall(corner(high.x, low.y), -x, e.x, 2),
             wall(corner(low.x, high.y), x, e.x, 3),
-            face(corner(low.x, low.y), x, y, Vec2::new(e.x, e.y), Material::Parquet, seed.wrapping_add(4)),
-            face(
-                Vec3::new(low.x, high.y, high.z),
-                x,
-                -y,
-                Vec2::new(e.x, e.y),
-                Material::CeilingTile,
-                seed.wrapping_add(5),
-            ),
+            face(corner(low.x, low.y), x, y, flat, Material::Parquet, seed.wrapping_add(4)),
+            face(ceiling, x, -y, flat, Material::CeilingTile, seed.wrapping_add(5)),
         ];
         Room { low, high, solids: Vec::new(), faces, lights: Vec::new(), light_map: LightMap::default() }
     }

@@ -41,7 +41,7 @@ use kernel::NODES_MAX;
 pub struct Settings {
     /// One for each camera, in the order of the calibration; or one, with the pictures of all side by side.
     pub devices: Vec<Select>,
-    /// `None`: the first of `Format::ALL` that the camera has in its size.
+    /// `None`: the first of the formats, in the order of `Format`, that the camera has in its size.
     pub format: Option<Format>,
     /// Size of one camera's picture, pixels.
     pub width: usize,

@@ -139,8 +139,7 @@ impl Node {
         let (width, height) = (self.part.width as u32, self.part.height as u32);
         let acceptable = |f: &Format| want.format.is_none_or(|w| w == *f);
         let fits = |f: Format| offers.iter().find(|o| f.is(o.fourcc) && o.has(width, height));
-        let Some((format, offered)) = Format::ALL.into_iter().filter(acceptable).find_map(|f| Some((f, fits(f)?)))
-        else {
+        let Some((format, offered)) = Format::all().filter(acceptable).find_map(|f| Some((f, fits(f)?))) else {
             let asked = want.format.map_or("a format that can be read", Format::name);
             return Err(self.not_offered(&format!("{asked} at {width}x{height}"), &offers));
         };

@@ -73,7 +73,7 @@ pub(super) fn text(kernel: &dyn Kernel, fd: i32, offers: &[Offer]) -> String {
     let mut entries = Vec::new();
     for offer in offers {
         let name = code_text(offer.fourcc);
-        let readable = Format::ALL.iter().any(|f| f.is(offer.fourcc));
+        let readable = Format::all().any(|f| f.is(offer.fourcc));
         if offer.sizes.is_empty() || !readable {
             entries.push(name.clone());
         }

@@ -26,51 +26,33 @@ pub enum Format {
     Mjpeg,
 }
 
-impl Format {
-    pub const ALL: [Format; 9] = [
-        Format::Grey,
-        Format::Y10,
-        Format::Y12,
-        Format::Y16,
-        Format::Y10p,
-        Format::Y12p,
-        Format::Nv12,
-        Format::Yuyv,
-        Format::Mjpeg,
-    ];
+/// Each format with its name in board files, and the codes by which drivers offer it.
+const FORMATS: [(Format, &str, &[&[u8; 4]]); 9] = [
+    (Format::Grey, "grey", &[b"GREY"]),
+    (Format::Y10, "y10", &[b"Y10 "]),
+    (Format::Y12, "y12", &[b"Y12 "]),
+    (Format::Y16, "y16", &[b"Y16 "]),
+    (Format::Y10p, "y10p", &[b"Y10P"]),
+    (Format::Y12p, "y12p", &[b"Y12P"]),
+    (Format::Nv12, "nv12", &[b"NV12", b"NM12"]),
+    (Format::Yuyv, "yuyv", &[b"YUYV"]),
+    (Format::Mjpeg, "mjpeg", &[b"MJPG", b"JPEG"]),
+];
 
-    /// The codes by which drivers offer it.
-    fn codes(self) -> &'static [&'static [u8; 4]] {
-        match self {
-            Format::Grey => &[b"GREY"],
-            Format::Y10 => &[b"Y10 "],
-            Format::Y12 => &[b"Y12 "],
-            Format::Y16 => &[b"Y16 "],
-            Format::Y10p => &[b"Y10P"],
-            Format::Y12p => &[b"Y12P"],
-            Format::Nv12 => &[b"NV12", b"NM12"],
-            Format::Yuyv => &[b"YUYV"],
-            Format::Mjpeg => &[b"MJPG", b"JPEG"],
-        }
+impl Format {
+    /// All formats, in the order in which one is chosen.
+    pub(super) fn all() -> impl Iterator<Item = Format> {
+        FORMATS.iter().map(|f| f.0)
     }
 
+    /// Whether a driver's code means this format.
     pub(super) fn is(self, fourcc: u32) -> bool {
-        self.codes().contains(&&fourcc.to_le_bytes())
+        FORMATS[self as usize].2.contains(&&fourcc.to_le_bytes())
     }
 
     /// The name in board files.
     pub fn name(self) -> &'static str {
-        match self {
-            Format::Grey => "grey",
-            Format::Y10 => "y10",
-            Format::Y12 => "y12",
-            Format::Y16 => "y16",
-            Format::Y10p => "y10p",
-            Format::Y12p => "y12p",
-            Format::Nv12 => "nv12",
-            Format::Yuyv => "yuyv",
-            Format::Mjpeg => "mjpeg",
-        }
+        FORMATS[self as usize].1
     }
 
     /// Bytes from a row's start to the end of its pixel `width - 1`; 0 for compressed pictures.
@@ -268,7 +250,7 @@ mod tests {
             seed: u32,
             split in 0usize..41,
         ) {
-            let format = Format::ALL[which];
+            let format = FORMATS[which].0;
             let grey: Vec<u8> = (0..width * height).map(|i| ((i as u32 + 1).wrapping_mul(seed | 1) >> 13) as u8).collect();
             // Whole groups of packed pixels, as MIPI has them.
             let stride = format.row_bytes(width.next_multiple_of(4)) + 2 + padding;
@@ -332,7 +314,7 @@ mod tests {
             std::hint::black_box(&mut out);
         });
         println!("copy of {width}x{height}: {copy:.0} us");
-        for format in Format::ALL {
+        for format in Format::all() {
             let stride = format.row_bytes(width);
             let bytes = match format {
                 Format::Mjpeg => crate::jpeg::flat(width, height, &grey[..width / 8 * height / 8]),
@@ -349,7 +331,7 @@ mod tests {
 
     #[test]
     fn a_picture_without_pixels_is_no_panic() {
-        for format in Format::ALL.into_iter().filter(|f| *f != Format::Mjpeg) {
+        for format in Format::all().filter(|f| *f != Format::Mjpeg) {
             let mut out = Image::new(0, 3);
             to_grey(format, &[], whole(0, 3, 0), &mut Vec::new(), &mut out).unwrap();
         }

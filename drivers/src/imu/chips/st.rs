@@ -3,6 +3,11 @@
 use super::Step::{WaitUs, Write};
 use super::*;
 
+/// A range whose full scale is not 2^15 steps.
+const fn stepped(full_scale: f64, code: u8, per_lsb: f64) -> Range {
+    Range { full_scale, code, per_lsb }
+}
+
 /// LSM6DSOX. Data sheet DS12814 and application note AN5272.
 ///
 /// Checked against ST's lsm6dsox-pid with its self-test example and Linux's st_lsm6dsx. ST's alone confirms the flags of an
@@ -18,20 +23,20 @@ pub const LSM6DSOX: DieSpec = DieSpec {
     accel: Some(SensorSpec {
         // CTRL1_XL and "Mechanical characteristics": codes out of order.
         ranges: &[
-            Range { full_scale: 2.0, code: 0, per_lsb: 0.061e-3 },
-            Range { full_scale: 4.0, code: 2, per_lsb: 0.122e-3 },
-            Range { full_scale: 8.0, code: 3, per_lsb: 0.244e-3 },
-            Range { full_scale: 16.0, code: 1, per_lsb: 0.488e-3 },
+            stepped(2.0, 0, 0.061e-3),
+            stepped(4.0, 2, 0.122e-3),
+            stepped(8.0, 3, 0.244e-3),
+            stepped(16.0, 1, 0.488e-3),
         ],
         data: 0x28,
     }),
     gyro: Some(SensorSpec {
         // CTRL2_G and "Mechanical characteristics": full scale is less than 2^15 steps.
         ranges: &[
-            Range { full_scale: 250.0, code: 0, per_lsb: 8.75e-3 },
-            Range { full_scale: 500.0, code: 1, per_lsb: 17.5e-3 },
-            Range { full_scale: 1000.0, code: 2, per_lsb: 35e-3 },
-            Range { full_scale: 2000.0, code: 3, per_lsb: 70e-3 },
+            stepped(250.0, 0, 8.75e-3),
+            stepped(500.0, 1, 17.5e-3),
+            stepped(1000.0, 2, 35e-3),
+            stepped(2000.0, 3, 70e-3),
         ],
         data: 0x22,
     }),
