@@ -1,31 +1,29 @@
-//! The calibration of a rig: its cameras, where and when they see, and what its inertial unit reads.
+//! The calibration of a rig: lenses, poses and timing of its cameras, noise and axes of its inertial unit.
 //!
-//! Time: `t_imu = t_cam + time_offset` (the sign of Kalibr's `timeshift_cam_imu` and of Basalt's
-//! `cam_time_offset_ns`), where a camera stamps the middle of its first row's exposure. An image's stamp
-//! downstream is that of its *middle* row in the unit's clock: rows are then at most half a readout away,
-//! and whoever models no rolling shutter errs least. `RigCamera::to_imu_clock` makes the one of the other;
-//! `ImuCorrection::apply` turns what the unit reads into what it should have read. A source applies both
-//! before anyone else sees its data (recordings: `replay::Recording::open`, and nowhere else), so
-//! everything downstream is in the unit's clock and along orthogonal axes, and an online estimate of
-//! either is what the calibration left over.
+//! Time: `t_imu = t_cam + time_offset` (the sign of Kalibr's `timeshift_cam_imu` and of Basalt's `cam_time_offset_ns`),
+//! where a camera stamps the middle of its first row's exposure. Downstream, the stamp of an image is that of its *middle*
+//! row in the unit's clock: rows are then at most half a readout away, and code without a model of the rolling shutter errs
+//! least. `RigCamera::to_imu_clock` converts the one into the other; `ImuCorrection::apply` corrects the unit's readings. A
+//! source applies both before anyone else sees its data (recordings: `replay::Recording::open`), so everything downstream
+//! is in the unit's clock and along orthogonal axes, and an online estimate of either is what the calibration left over.
 
 use crate::camera::Camera;
 use crate::types::{ImuSample, Nanos, Pose, Span};
 use glam::{DMat3, DVec3};
 
-/// A camera of the rig, where it sits and when it sees.
+/// A camera of the rig: its lens, its pose and its timing.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RigCamera {
     pub camera: Camera,
     pub body_from_cam: Pose,
-    /// Of the inertial unit's clock over the camera's.
+    /// The inertial unit's clock less the camera's.
     pub time_offset: Span,
     /// From the first row's exposure to the last one's; zero is a global shutter.
     pub readout: Span,
 }
 
 impl RigCamera {
-    /// With a global shutter and the inertial unit's clock.
+    /// A camera with a global shutter in the inertial unit's clock.
     pub fn new(camera: Camera, body_from_cam: Pose) -> RigCamera {
         RigCamera { camera, body_from_cam, time_offset: Span(0), readout: Span(0) }
     }
@@ -35,18 +33,18 @@ impl RigCamera {
         t + self.time_offset + Span(self.readout.0 / 2)
     }
 
-    /// The camera's own stamp of an image of which downstream says `t`.
+    /// The camera's own stamp of an image that is stamped `t` downstream.
     pub fn from_imu_clock(&self, t: Nanos) -> Nanos {
         t - self.time_offset - Span(self.readout.0 / 2)
     }
 
-    /// When a row is exposed, after the image's stamp downstream.
+    /// Exposure of a row after the image's stamp downstream, s.
     pub fn row_delay(&self, row: f64) -> f64 {
         self.readout.secs() * (row / (self.camera.height - 1).max(1) as f64 - 0.5)
     }
 }
 
-/// What a reading lacks: the true rate or force is `scale * reading - bias`.
+/// The correction of a unit's readings: the true rate or force is `scale * reading - bias`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ImuCorrection {
     /// Scale and misalignment of the axes.
@@ -58,6 +56,7 @@ pub struct ImuCorrection {
 }
 
 impl ImuCorrection {
+    /// The correction that changes nothing.
     pub const NONE: ImuCorrection = ImuCorrection {
         gyro_scale: DMat3::IDENTITY,
         accel_scale: DMat3::IDENTITY,
@@ -65,6 +64,7 @@ impl ImuCorrection {
         accel_bias: DVec3::ZERO,
     };
 
+    /// The true sample of a reading.
     pub fn apply(&self, s: &ImuSample) -> ImuSample {
         ImuSample {
             t: s.t,
@@ -73,7 +73,7 @@ impl ImuCorrection {
         }
     }
 
-    /// What the unit reads where the truth is `s`.
+    /// The reading of a true sample.
     pub fn undo(&self, s: &ImuSample) -> ImuSample {
         ImuSample {
             t: s.t,
@@ -83,7 +83,7 @@ impl ImuCorrection {
     }
 }
 
-/// Continuous-time noise densities of the inertial unit, and what its axes need.
+/// Continuous-time noise densities of the inertial unit, and the correction of its axes.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ImuCalibration {
     pub rate_hz: f64,
@@ -110,6 +110,7 @@ impl ImuCalibration {
     };
 }
 
+/// The calibration of a rig; the body frame is that of the inertial unit.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Calibration {
     pub cameras: Vec<RigCamera>,

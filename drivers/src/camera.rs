@@ -1,12 +1,11 @@
 //! Camera models.
 //!
-//! Pinhole with radial-tangential distortion (Brown; OpenCV's order k1 k2 p1 p2), the same with a
-//! rational radial part (OpenCV's eight coefficients), Kannala-Brandt (KB4, "equidistant"), and double
-//! sphere (Usenko et al., 3DV 2018). `project` takes a point in the camera frame (x right, y down, z
-//! forward, metres) to pixels (integer = pixel centre); `unproject` gives the unit bearing. Both answer
-//! `None` outside the model's domain, so a returned value is always finite and invertible. Radtan and
-//! rational: the domain ends where the radius stops growing, else far off-axis points would fold back
-//! into the image.
+//! Pinhole with radial-tangential distortion (Brown; OpenCV's order k1 k2 p1 p2), the same with a rational radial part
+//! (OpenCV's eight coefficients), Kannala-Brandt (KB4, "equidistant"), and double sphere (Usenko et al., 3DV 2018). `project`
+//! takes a point in the camera frame (x right, y down, z forward, metres) to pixels (integer = pixel centre); `unproject`
+//! gives the unit bearing. Both answer `None` outside the model's domain, so a returned value is always finite and
+//! invertible. The domain of radtan and rational lenses ends where the radius stops growing, else points far off the axis
+//! would fold back into the image.
 
 // `!(a > b)` and not `a <= b`: it also refuses NaN.
 #![allow(clippy::neg_cmp_op_on_partial_ord)]
@@ -14,30 +13,20 @@
 use glam::{DVec2, DVec3};
 use std::f64::consts::PI;
 
+/// A distortion model with its coefficients.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Lens {
-    Radtan {
-        k1: f64,
-        k2: f64,
-        p1: f64,
-        p2: f64,
-    },
+    /// Radial factor 1 + k1 u + k2 u², u = r².
+    Radtan { k1: f64, k2: f64, p1: f64, p2: f64 },
     /// Radial factor (1 + k1 u + k2 u² + k3 u³) / (1 + k4 u + k5 u² + k6 u³), u = r²; see `Lens::rational`.
-    Rational {
-        k: [f64; 6],
-        p1: f64,
-        p2: f64,
-        r2_max: f64,
-    },
-    KannalaBrandt {
-        k: [f64; 4],
-    },
-    DoubleSphere {
-        xi: f64,
-        alpha: f64,
-    },
+    Rational { k: [f64; 6], p1: f64, p2: f64, r2_max: f64 },
+    /// Image radius θ + k1 θ³ + k2 θ⁵ + k3 θ⁷ + k4 θ⁹ of the angle θ off the axis.
+    KannalaBrandt { k: [f64; 4] },
+    /// Displacement `xi` of the spheres, and `alpha`, which shifts the projection.
+    DoubleSphere { xi: f64, alpha: f64 },
 }
 
+/// A camera: size, focal lengths and principal point in pixels, and its lens.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Camera {
     pub width: usize,
@@ -53,18 +42,18 @@ pub struct Camera {
 pub type ProjectionJacobian = [[f64; 3]; 2];
 
 const Z_MIN: f64 = 1e-6;
-/// Squared radius 89.4 degrees off axis: as far as a pinhole goes.
+/// Squared radius 89.4 degrees off the axis, the end of a pinhole's domain.
 const R2_UNBOUNDED: f64 = 1e4;
 
 impl Lens {
-    /// The domain ends where the calibration says (`r_max` of x/z, y/z; 0: it does not say), and not
-    /// beyond the place where the radius stops growing, which is found by steps of 0.1 % of it.
+    /// A rational lens. Its domain ends where the calibration says (`r_max` of x/z, y/z; 0: it does not say), but not beyond
+    /// the place where the radius stops growing, which is found in steps of 0.1 %.
     pub fn rational(k: [f64; 6], p1: f64, p2: f64, r_max: f64) -> Lens {
         let end = if r_max > 0.0 { r_max.min(R2_UNBOUNDED.sqrt()) } else { R2_UNBOUNDED.sqrt() };
         let mut r = 1e-3;
         while r < end {
-            let (radial, slope) = rational_radial(r * r, &k);
-            if !(radial > 0.0 && radial + 2.0 * r * r * slope > 0.0) {
+            let (radial, derivative) = rational_radial(r * r, &k);
+            if !(radial > 0.0 && radial + 2.0 * r * r * derivative > 0.0) {
                 break;
             }
             r *= 1.001;
@@ -75,6 +64,7 @@ impl Lens {
 }
 
 impl Camera {
+    /// Whether a pixel is in the image, at least `margin` pixels from its border.
     pub fn contains(&self, px: DVec2, margin: f64) -> bool {
         px.x >= margin
             && px.y >= margin
@@ -82,12 +72,12 @@ impl Camera {
             && px.y <= self.height as f64 - 1.0 - margin
     }
 
-    /// Pixel of a point in the camera frame, m. `None` where the model is not defined.
+    /// The pixel of a point in the camera frame, m. `None` where the model is not defined.
     pub fn project(&self, p_cam: DVec3) -> Option<DVec2> {
         self.project_with_jacobian(p_cam).map(|(px, _)| px)
     }
 
-    /// Pixel and d(px)/d(p_cam).
+    /// The pixel of a point, and d(px)/d(p_cam).
     pub fn project_with_jacobian(&self, p: DVec3) -> Option<(DVec2, ProjectionJacobian)> {
         let (m, dm) = match self.lens {
             Lens::Radtan { k1, k2, p1, p2 } => {
@@ -102,7 +92,7 @@ impl Camera {
         px.is_finite().then_some((px, j))
     }
 
-    /// Unit bearing in the camera frame of a pixel.
+    /// The unit bearing of a pixel in the camera frame. `None` where the model is not defined.
     pub fn unproject(&self, px: DVec2) -> Option<DVec3> {
         let m = DVec2::new((px.x - self.cx) / self.fx, (px.y - self.cy) / self.fy);
         let b = match self.lens {
@@ -118,11 +108,12 @@ impl Camera {
     }
 }
 
+/// A point of the normalised image plane, and its derivative to the point in the camera frame.
 type Normalised = (DVec2, [[f64; 3]; 2]);
 
 /// Squared radius (of x/z, y/z) at which r(1 + k1 r² + k2 r⁴) stops growing.
 fn radtan_r2_max(k1: f64, k2: f64) -> f64 {
-    // d/dr = 1 + 3 k1 u + 5 k2 u², u = r²; its smallest positive root, in the form that stands k2 = 0
+    // d/dr = 1 + 3 k1 u + 5 k2 u², u = r²; its smallest positive root, in the form that allows k2 = 0.
     let root = (9.0 * k1 * k1 - 20.0 * k2).sqrt();
     [2.0 / (-3.0 * k1 + root), 2.0 / (-3.0 * k1 - root)].into_iter().filter(|u| *u > 0.0).fold(R2_UNBOUNDED, f64::min)
 }
@@ -166,25 +157,26 @@ fn brown(p: DVec3, r2_max: f64, radial: impl Fn(f64) -> (f64, f64), p1: f64, p2:
     }
     let (m, d) = brown_distort(a, radial, p1, p2);
     if !(d[0][0] * d[1][1] > d[0][1] * d[1][0]) {
-        return None; // folded here by the tangential part
+        // Folded here by the tangential part.
+        return None;
     }
     let row = |r: [f64; 2]| [r[0] * iz, r[1] * iz, -(r[0] * a.x + r[1] * a.y) * iz];
     Some((m, [row(d[0]), row(d[1])]))
 }
 
-/// Where a function that grows on low..high (given with its slope) reaches `target`: Newton, halving
-/// the bracket where that leaves it. A slope that is not positive counts as beyond.
+/// The place where a function that grows on low..high (given with its derivative) reaches `target`: Newton's method, halving
+/// the bracket where a step leaves it. Where the derivative is not positive counts as beyond.
 fn growing_root(target: f64, mut low: f64, mut high: f64, f: impl Fn(f64) -> (f64, f64)) -> f64 {
     let mut x = target.clamp(low, high);
     for _ in 0..60 {
-        let (value, slope) = f(x);
-        let grows = slope > 0.0;
+        let (value, derivative) = f(x);
+        let grows = derivative > 0.0;
         if grows && value <= target {
             low = x;
         } else {
             high = x;
         }
-        let newton = x - (value - target) / slope;
+        let newton = x - (value - target) / derivative;
         let next = if grows && newton >= low && newton <= high { newton } else { 0.5 * (low + high) };
         let step = next - x;
         x = next;
@@ -198,8 +190,8 @@ fn growing_root(target: f64, mut low: f64, mut high: f64, f: impl Fn(f64) -> (f6
 fn brown_inverse(m: DVec2, r2_max: f64, radial: impl Fn(f64) -> (f64, f64), p1: f64, p2: f64) -> Option<DVec3> {
     // The radial part in one dimension, then Newton in two for the tangential part.
     let radius = |r: f64| {
-        let (factor, slope) = radial(r * r);
-        (r * factor, factor + 2.0 * r * r * slope)
+        let (factor, derivative) = radial(r * r);
+        (r * factor, factor + 2.0 * r * r * derivative)
     };
     let distorted = m.length();
     if !(distorted > 1e-12) {
@@ -254,7 +246,7 @@ fn kannala_brandt(p: DVec3, k: &[f64; 4]) -> Option<Normalised> {
     Some((m, j))
 }
 
-/// d(θ) and its derivative.
+/// The image radius d of an angle θ, and its derivative.
 fn kb_polynomial(th: f64, k: &[f64; 4]) -> (f64, f64) {
     let t2 = th * th;
     let d = th * (1.0 + t2 * (k[0] + t2 * (k[1] + t2 * (k[2] + t2 * k[3]))));
@@ -262,9 +254,8 @@ fn kb_polynomial(th: f64, k: &[f64; 4]) -> (f64, f64) {
     (d, b)
 }
 
-/// Whether d grows all the way from the axis to `th`; past a maximum it may grow again, which is no
-/// longer the same lens. d' as a polynomial in θ² lies above the least of its Bernstein coefficients
-/// on [0, th²].
+/// Whether the image radius d grows all the way from the axis to `th`; past a maximum it may grow again, which is no longer
+/// the same lens. d' as a polynomial in θ² lies above the least of its Bernstein coefficients on [0, th²].
 fn kb_grows(th: f64, k: &[f64; 4]) -> bool {
     let u = th * th;
     let (a1, a2, a3, a4) = (3.0 * k[0] * u, 5.0 * k[1] * u * u, 7.0 * k[2] * u.powi(3), 9.0 * k[3] * u.powi(4));
@@ -272,7 +263,8 @@ fn kb_grows(th: f64, k: &[f64; 4]) -> bool {
     bernstein_positive([1.0, 1.0 + 0.25 * a1, 1.0 + 0.5 * a1 + a2 / 6.0, b3, 1.0 + a1 + a2 + a3 + a4], 10)
 }
 
-/// Exact but for polynomials that touch zero, which `splits` halvings do not tell from negative.
+/// Whether a polynomial, given by its Bernstein coefficients, is positive; one that comes so near to zero that `splits`
+/// halvings do not tell counts as not positive.
 fn bernstein_positive(b: [f64; 5], splits: u32) -> bool {
     if b.iter().all(|c| *c > 0.0) {
         return true;
@@ -280,7 +272,8 @@ fn bernstein_positive(b: [f64; 5], splits: u32) -> bool {
     if !(b[0] > 0.0 && b[4] > 0.0) || splits == 0 {
         return false;
     }
-    let (mut left, mut right) = (b, b); // de Casteljau at one half
+    // De Casteljau's algorithm at one half.
+    let (mut left, mut right) = (b, b);
     for level in 1..5 {
         for i in 0..5 - level {
             right[i] = 0.5 * (right[i] + right[i + 1]);
@@ -330,7 +323,7 @@ fn double_sphere(p: DVec3, xi: f64, alpha: f64) -> Option<Normalised> {
     let n = alpha * d2 + (1.0 - alpha) * z1;
     let inv = 1.0 / n;
     let m = DVec2::new(p.x * inv, p.y * inv);
-    // dn/d(x,y,z)
+    // dn/d(x, y, z).
     let dz1 = DVec3::new(xi * p.x / d1, xi * p.y / d1, xi * p.z / d1 + 1.0);
     let dd2 = DVec3::new(p.x + z1 * dz1.x, p.y + z1 * dz1.y, z1 * dz1.z) / d2;
     let dn = alpha * dd2 + (1.0 - alpha) * dz1;

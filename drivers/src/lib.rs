@@ -1,10 +1,14 @@
-//! Sensors of Stipple and the vocabulary they speak.
+//! Sensors, and the plain data that crosses from them to estimators.
 //!
-//! This crate builds and tests without Vulkan or OpenCV. It owns the plain data that crosses from
-//! sensors to estimators (`Nanos`, `ImuSample`, `Image`, `Frames`, `Pose`, `Calibration`, `Fault`),
-//! the camera models (calibration is a property of the sensor, and the simulator renders with the
-//! same models the estimator inverts), what a run reads sensors through (`source`), the reader of recordings and
-//! the simulator.
+//! - vocabulary: `types` (`Nanos`, `ImuSample`, `Image`, `Frames`, `Pose`), `calibration` and `camera` (the simulator renders
+//!   with the models that the estimator inverts), `fault`, `counters`, `list`
+//! - sources of frames and samples behind two traits (`source`): cameras (`v4l2`), inertial units (`imu`), recordings
+//!   (`replay`, played by `paced`), faults on purpose (`inject`); lines of GPIO (`gpio`)
+//! - written recordings (`record`, `euroc`) and the simulator (`sim`)
+//! - the operating system (`host`)
+//!
+//! It builds and tests without Vulkan or OpenCV and knows nothing of the program: no threads of its own but the recorder's
+//! writer, no configuration file, no exit codes.
 
 pub mod calibration;
 pub mod camera;

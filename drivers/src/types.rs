@@ -1,15 +1,15 @@
-//! Time, samples, images and poses: the plain data every other module is written in.
+//! Time, samples, images and poses: the plain data that every other module uses.
 //!
-//! Instants are `Nanos`, their differences `Span`; seconds appear only through `Span::secs`.
-//! Transforms are named `a_from_b`: `world_from_body * body_from_cam`.
+//! Instants are `Nanos`, their differences `Span`; seconds appear only through `Span::secs`. Transforms are named `a_from_b`:
+//! `world_from_body * body_from_cam`.
 
 use glam::{DMat3, DQuat, DVec3};
 
-/// An instant: nanoseconds of the recording's (or the host's monotonic) clock.
+/// An instant: nanoseconds of a recording's clock, or of the host's monotonic one. Sums and differences saturate.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Default)]
 pub struct Nanos(pub i64);
 
-/// A difference of two instants, nanoseconds.
+/// The difference of two instants, nanoseconds.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Default)]
 pub struct Span(pub i64);
 
@@ -18,10 +18,12 @@ impl Nanos {
 }
 
 impl Span {
+    /// The span in seconds.
     pub fn secs(self) -> f64 {
         self.0 as f64 * 1e-9
     }
 
+    /// The span of so many seconds, to the nearest nanosecond.
     pub fn from_secs(secs: f64) -> Span {
         Span((secs * 1e9).round() as i64)
     }
@@ -48,7 +50,7 @@ impl std::ops::Sub<Span> for Nanos {
     }
 }
 
-/// One inertial sample in the body frame (body = IMU): gyro rad/s, specific force m/s².
+/// One inertial sample in the body frame (body = IMU): angular velocity, rad/s, and specific force, m/s².
 #[derive(Clone, Copy, Debug, PartialEq, Default)]
 pub struct ImuSample {
     pub t: Nanos,
@@ -71,10 +73,12 @@ pub struct Image {
 }
 
 impl Image {
+    /// A black image.
     pub fn new(width: usize, height: usize) -> Image {
         Image { width, height, pixels: vec![0; width * height] }
     }
 
+    /// The pixel of column `x` and row `y`.
     #[inline]
     pub fn at(&self, x: usize, y: usize) -> u8 {
         self.pixels[y * self.width + x]
@@ -87,26 +91,26 @@ impl Image {
     }
 }
 
-/// Red, green and blue of an image.
+/// The red, green and blue plane of an image.
 pub type Colour = [Image; 3];
 
-/// ITU-R BT.601, the weights of JPEG's own luma.
+/// Grey of a colour, by ITU-R BT.601, the weights of JPEG's own luma.
 pub fn luma(r: u8, g: u8, b: u8) -> u8 {
     ((77 * u32::from(r) + 150 * u32::from(g) + 29 * u32::from(b) + 128) >> 8) as u8
 }
 
-/// Images of all cameras of a rig at one mid-exposure instant; `images[camera]`.
+/// The images of all cameras of a rig at one mid-exposure instant `t`: `images[camera]`.
 #[derive(Clone, Debug, Default)]
 pub struct Frames {
     pub t: Nanos,
     pub images: Vec<Image>,
-    /// Of the first cameras, where colour is asked for; `images` are then their luma, which is all that tracking and
+    /// Colours of the first cameras, where they are asked for; `images` are then their luma, which is all that tracking and
     /// stereo read.
     pub colours: Vec<Colour>,
 }
 
 impl Frames {
-    /// Pre-shaped for a rig, so that reading into it allocates nothing.
+    /// Black images in the shape of a rig, so that reading into them allocates nothing.
     pub fn for_rig(calibration: &crate::Calibration) -> Frames {
         let shape = |c: &crate::RigCamera| Image::new(c.camera.width, c.camera.height);
         Frames { t: Nanos(0), images: calibration.cameras.iter().map(shape).collect(), colours: Vec::new() }
@@ -121,7 +125,7 @@ impl Frames {
         }
     }
 
-    /// The first `cameras` of the rig in colour too.
+    /// The same, with colours of the first `cameras`.
     pub fn in_colour(calibration: &crate::Calibration, cameras: usize) -> Frames {
         let mut frames = Frames::for_rig(calibration);
         frames.colours = frames.images.iter().take(cameras).map(|i| std::array::from_fn(|_| i.clone())).collect();
@@ -143,26 +147,31 @@ impl Default for Pose {
 }
 
 impl Pose {
+    /// The transform that changes nothing.
     pub const IDENTITY: Pose = Pose { q: DQuat::IDENTITY, p: DVec3::ZERO };
 
+    /// The transform of a rotation, which is normalised, and a translation, m.
     pub fn new(q: DQuat, p: DVec3) -> Pose {
         Pose { q: q.normalize(), p }
     }
 
+    /// `b_from_a` of `a_from_b`.
     pub fn inverse(&self) -> Pose {
         let q = self.q.conjugate();
         Pose { q, p: -(q * self.p) }
     }
 
+    /// A point of frame b in frame a.
     pub fn transform(&self, p: DVec3) -> DVec3 {
         self.q * p + self.p
     }
 
+    /// The rotation as a matrix.
     pub fn rotation(&self) -> DMat3 {
         DMat3::from_quat(self.q)
     }
 
-    /// Linear in position, spherical in rotation; `s` = 0 gives `self`, 1 gives `other`.
+    /// Interpolates linearly in position and spherically in rotation; `s` = 0 gives `self`, 1 gives `other`.
     pub fn interpolate(&self, other: &Pose, s: f64) -> Pose {
         Pose::new(self.q.slerp(other.q, s), self.p.lerp(other.p, s))
     }
@@ -180,14 +189,14 @@ impl std::ops::Mul for Pose {
     }
 }
 
-/// A pose at an instant (ground truth, trajectories): `world_from_body`.
+/// A pose `world_from_body` at an instant, as in ground truth and trajectories.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct TimedPose {
     pub t: Nanos,
     pub pose: Pose,
 }
 
-/// The pose at `t` from a time-sorted table, or `None` outside it or inside a hole of more than `hole`.
+/// The pose at `t`, interpolated in a time-sorted table; `None` outside it or in a gap longer than `hole`.
 pub fn pose_at(table: &[TimedPose], t: Nanos, hole: Span) -> Option<Pose> {
     let after = table.partition_point(|e| e.t < t);
     if after < table.len() && table[after].t == t {

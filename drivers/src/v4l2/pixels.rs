@@ -282,6 +282,11 @@ mod tests {
     }
 
     #[test]
+    fn each_format_stands_at_its_place_in_the_table() {
+        assert!(FORMATS.iter().enumerate().all(|(i, f)| f.0 as usize == i));
+    }
+
+    #[test]
     fn pixels_brighter_than_their_depth_are_white() {
         let mut out = Image::new(1, 1);
         for format in [Format::Y10, Format::Y12] {
