@@ -13,9 +13,10 @@ use glam::{vec3, Vec2, Vec3};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-/// Nearest a solid may come to the path, m.
+/// Least distance of a solid from the path, m.
 pub const KEEP_CLEAR: f32 = 0.55;
 
+/// A set of furniture.
 #[derive(Clone, Copy, Debug)]
 enum Set {
     Shelf,
@@ -28,7 +29,7 @@ enum Set {
     Column,
 }
 
-/// Where a set stands: centre on the floor, inward direction is +y of its own frame.
+/// The place of a set: its centre on the floor; +y of its own frame points away from the wall.
 #[derive(Clone, Copy)]
 struct Stand {
     base: Vec3,
@@ -89,7 +90,7 @@ fn add_rug(room: &mut Room, rng: &mut ChaCha8Rng) {
 fn along_walls(room: &mut Room, path: &[Vec3], rng: &mut ChaCha8Rng) {
     const ROUND: [Set; 7] = [Set::Shelf, Set::Table, Set::Crates, Set::Cabinet, Set::Sofa, Set::Shelf, Set::Plant];
     let (a, b) = (room.low, room.high);
-    // corner, inward direction: the wall runs to the right of the inward direction's left hand
+    // Corner and inward direction of each wall, which runs to the right of that direction.
     let walls = [
         (Vec2::new(a.x, b.y), Vec2::new(1.0, 0.0)),
         (Vec2::new(b.x, a.y), Vec2::new(-1.0, 0.0)),
@@ -109,7 +110,7 @@ fn along_walls(room: &mut Room, path: &[Vec3], rng: &mut ChaCha8Rng) {
                 break;
             }
             let foot = corner + along * (s + 0.5 * e.x) + inward * (0.5 * e.y + 0.01);
-            // the set's +y is `inward`
+            // The set's +y is `inward`.
             let stand = Stand { base: foot.extend(a.z), cos: inward.y, sin: -inward.x };
             place(room, set, stand, path, rng);
             if e.z < 1.6 {

@@ -1,5 +1,5 @@
-//! An inertial unit carried along a spline: point samples of angular velocity and specific force
-//! Rᵀ(a - g), with white noise, biases that start somewhere and walk, and a range that clips.
+//! An inertial unit carried along a spline: point samples of angular velocity and specific force Rᵀ(a - g), with white
+//! noise, biases that start at random and walk, and a range that clips.
 
 use super::spline::Spline;
 use crate::calibration::{ImuCalibration, ImuCorrection};
@@ -9,9 +9,10 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::StandardNormal;
 
+/// Gravity in the world frame, m/s².
 pub const GRAVITY: DVec3 = DVec3::new(0.0, 0.0, -9.81);
 
-/// What a calibration file does not say of an inertial unit.
+/// Errors of an inertial unit that its calibration file does not state.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ImuErrors {
     /// Standard deviations of the biases at the start: rad/s, m/s².
@@ -20,7 +21,7 @@ pub struct ImuErrors {
     /// Range of an axis: rad/s, m/s².
     pub gyro_max: f64,
     pub accel_max: f64,
-    /// Scales and misalignments that would make the readings right again.
+    /// The correction of scales and misalignments that would make the readings right.
     pub axes: ImuCorrection,
 }
 
@@ -35,7 +36,7 @@ impl ImuErrors {
     };
 }
 
-/// True biases at an instant.
+/// True biases at an instant: rad/s, m/s².
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Bias {
     pub t: Nanos,
@@ -43,7 +44,7 @@ pub struct Bias {
     pub accel: DVec3,
 }
 
-/// Samples of the spline (whose time 0 is `start`) at `stamps`.
+/// Samples of a spline, whose time 0 is `start`, at `stamps`, and the biases in them.
 pub fn simulate(
     spline: &Spline,
     start: Nanos,
@@ -54,7 +55,7 @@ pub fn simulate(
 ) -> (Vec<ImuSample>, Vec<Bias>) {
     let mut rng = ChaCha8Rng::seed_from_u64(seed ^ 0x0049_4D55);
     let mut normal = || DVec3::from_array(std::array::from_fn(|_| rng.sample::<f64, _>(StandardNormal)));
-    // a continuous-time density becomes the deviation of one sample through the root of the rate
+    // A continuous-time density times the root of the rate is the deviation of one sample.
     let root_rate = noise.rate_hz.sqrt();
     let mut gyro = normal() * errors.gyro_bias;
     let mut accel = normal() * errors.accel_bias;

@@ -1,11 +1,12 @@
 //! Baked light: irradiance on a grid of nodes over every face, bilinear between nodes.
 //!
-//! The room does not change, so lamps (Lambert, inverse square, soft shadows) and the ambient term
-//! (occluded in corners and under furniture) are computed once; a pixel then costs one look-up.
+//! The room does not change, so lamps (Lambert, inverse square, soft shadows) and the ambient term (occluded in corners and
+//! under furniture) are computed once; a pixel then costs one look-up.
 
 use super::room::{Face, Light, Room, Solid};
 use glam::{Vec2, Vec3};
 
+/// The irradiance of all faces.
 #[derive(Clone, Debug, Default)]
 pub struct LightMap {
     grids: Vec<Grid>,
@@ -17,24 +18,24 @@ struct Grid {
     first: usize,
     columns: usize,
     rows: usize,
-    /// Nodes a metre along u and v.
+    /// Nodes per metre along u and v.
     density: Vec2,
 }
 
-/// Light of white walls all around, per unit of hemisphere left open.
+/// Ambient light of a point whose whole hemisphere is open.
 const AMBIENT: f32 = 0.6;
-/// Ambient light is blocked by what is nearer than this, m.
+/// Surfaces nearer than this block ambient light, m.
 const AMBIENT_REACH: f32 = 0.9;
 const AMBIENT_RAYS: usize = 24;
 /// Side of the square lamps, m: the width of penumbrae.
 const LAMP: f32 = 0.35;
 /// Keeps the spot above a lamp from outshining the room, m².
 const SOFTEN: f32 = 0.8;
-/// Faint lamps are not worth their shadow rays.
+/// Light below which a lamp is not worth its shadow rays.
 const FAINT: f32 = 0.02;
 
 impl LightMap {
-    /// Nodes every `pitch` metres, no fewer than two a side.
+    /// Computes the light of a room at nodes every `pitch` metres, two a side at least.
     pub fn bake(room: &Room, pitch: f32, threads: usize) -> LightMap {
         let mut grids = Vec::with_capacity(room.faces.len());
         let mut first = 0;
@@ -64,7 +65,7 @@ impl LightMap {
         LightMap { grids, nodes }
     }
 
-    /// Irradiance at a surface coordinate of a face.
+    /// The irradiance at a surface coordinate of a face, m.
     #[inline]
     pub fn at(&self, face: usize, at: Vec2) -> f32 {
         let g = &self.grids[face];
@@ -80,9 +81,9 @@ impl LightMap {
     }
 }
 
-/// `near` is scratch.
+/// The irradiance of one node; `near` is scratch.
 fn irradiance(room: &Room, face: &Face, at: Vec2, near: &mut Vec<Solid>) -> f32 {
-    // nodes on an edge are pulled in, so that they see what the face sees
+    // Nodes on an edge are pulled in, so that they see what the face sees.
     let margin = face.size.min_element() * 0.02;
     let at = at.clamp(Vec2::splat(margin), face.size - margin);
     let (p, n) = face.point(at);
@@ -115,7 +116,7 @@ fn ambient(room: &Room, near: &[Solid], p: Vec3, n: Vec3) -> f32 {
     let (u, v) = n.any_orthonormal_pair();
     let mut open = 0.0;
     for k in 0..AMBIENT_RAYS {
-        // cosine-weighted spiral
+        // A cosine-weighted spiral.
         let r = ((k as f32 + 0.5) / AMBIENT_RAYS as f32).sqrt();
         let (sin, cos) = (k as f32 * 2.399_963).sin_cos();
         let d = u * (r * cos) + v * (r * sin) + n * (1.0 - r * r).sqrt();

@@ -1,12 +1,11 @@
 //! A seeded simulator: a textured room, a rig flying through it, its images and its inertial unit.
 //!
-//! `Scenario` (which rig, which path, which seed) goes in; `Sim` gives stereo images, exact depth,
-//! inertial samples and exact states at any instant, and `write_euroc` puts them on disk in the
-//! EuRoC ASL layout. Geometry is ray-cast analytically through the same camera models the
-//! estimator inverts, so whatever error remains downstream is the estimator's. What is wrong with the
-//! sensors (`CameraErrors`, `ImuErrors`) is in what they give and not in the calibration handed out.
-//! Read in this order: `scenario` (paths), `spline` (motion), `room` and `furnish` (geometry),
-//! `texture` and `light` (appearance), `render` (images), `imu`.
+//! Input is a `Scenario` (rig, path, seed); `Sim` gives images, exact depth, inertial samples and exact states at any
+//! instant, and `write_euroc` writes them in the EuRoC ASL layout. Geometry is ray-cast analytically through the camera
+//! models that the estimator inverts, so any error that remains downstream is the estimator's. Errors of the sensors
+//! (`CameraErrors`, `ImuErrors`) are in their data and not in the calibration that is handed out. Read in this order:
+//! `scenario` (paths), `spline` (motion), `room` and `furnish` (geometry), `texture` and `light` (appearance), `render`
+//! (images), `imu`.
 
 mod furnish;
 pub mod imu;
@@ -34,12 +33,12 @@ use spline::Spline;
 
 /// Stamp at which invented flights start.
 const START: Nanos = Nanos(1_000_000_000);
-/// Knots of an invented flight and of a recorded one, s. The latter resolves vibration up to about
-/// 15 Hz.
+/// Knot spacing of an invented flight and of a recorded one, s. The latter resolves vibration up to about 15 Hz.
 const KNOT: f64 = 0.1;
 const KNOT_RECORDED: f64 = 0.03;
+/// Rounds in which a spline is fitted to a recorded flight.
 const FIT_ROUNDS: usize = 6;
-/// A fit is loose where samples end, s.
+/// Left out at either end of a recorded flight, where the fit is loose, s.
 const FIT_MARGIN: f64 = 0.15;
 /// Room left around a recorded path: sideways, below, above, m.
 const ROOM_SIDE: f64 = 1.7;
@@ -50,7 +49,7 @@ const METER_LEVEL: f32 = 105.0;
 const METER_STRENGTH: f32 = 0.6;
 const METER_PERIOD: f64 = 0.5;
 
-/// Truth at an instant.
+/// The truth at an instant; biases in rad/s and m/s².
 #[derive(Clone, Copy, Debug)]
 pub struct State {
     /// `world_from_body`
@@ -60,11 +59,12 @@ pub struct State {
     pub accel_bias: DVec3,
 }
 
+/// A flight that can be rendered.
 pub struct Sim {
     seed: u64,
     sensor: Sensor,
     light: Light,
-    /// As handed out, and as it is.
+    /// The calibration that is handed out, and the true one.
     calibration: Calibration,
     rig: Calibration,
     time_offset: Span,
@@ -83,12 +83,12 @@ pub struct Sim {
 }
 
 impl Sim {
-    /// Renders with as many threads as the machine has.
+    /// Makes a scenario ready; renders with as many threads as the machine has.
     pub fn new(scenario: &Scenario) -> Result<Sim, Fault> {
         Sim::with_threads(scenario, std::thread::available_parallelism().map_or(1, |n| n.get()))
     }
 
-    /// The images do not depend on `threads`.
+    /// Makes a scenario ready; the images do not depend on `threads`.
     pub fn with_threads(scenario: &Scenario, threads: usize) -> Result<Sim, Fault> {
         check(scenario)?;
         let rig = scenario.rig();
@@ -141,6 +141,7 @@ impl Sim {
         Ok(sim)
     }
 
+    /// The calibration that is handed out.
     pub fn calibration(&self) -> &Calibration {
         &self.calibration
     }
@@ -150,20 +151,22 @@ impl Sim {
         &self.imu
     }
 
+    /// The number of frames.
     pub fn frame_count(&self) -> usize {
         self.stamps.len()
     }
 
-    /// Stamp of frame `i`: mid-exposure of its middle row, by the cameras' clock.
+    /// The stamp of frame `i`: mid-exposure of its middle row, by the cameras' clock.
     pub fn stamp(&self, i: usize) -> Nanos {
         self.stamps[i] - self.time_offset
     }
 
-    /// When frame `i` was taken, by the clock of inertial samples and truth.
+    /// The instant of frame `i` by the clock of inertial samples and truth.
     pub fn taken(&self, i: usize) -> Nanos {
         self.stamps[i]
     }
 
+    /// The truth at an instant by the clock of inertial samples.
     pub fn truth_at(&self, t: Nanos) -> State {
         let m = self.spline.at((t - self.start).secs());
         let bias = imu::bias_at(&self.biases, t);
@@ -185,12 +188,12 @@ impl Sim {
         self.room.clearance(p_world.as_vec3()) as f64
     }
 
-    /// Images of all cameras at frame `i` into `out`, which must be shaped for the rig; in colour as far as it has colours.
+    /// Renders all cameras at frame `i` into `out`, which must have the rig's shape; in colour as far as it has colours.
     pub fn render(&mut self, i: usize, out: &mut Frames) {
         let t = self.stamps[i];
         out.t = self.stamp(i);
         for camera in 0..self.lenses.len() {
-            // streams of different images are unrelated, whatever the order of rendering
+            // Random streams of different images are unrelated, whatever the order of rendering.
             let run = texture::hash(self.seed as i32, (self.seed >> 32) as i32, 0x5354_5250);
             let stream = texture::hash(i as i32, camera as i32, run);
             self.expose(t, camera);
@@ -213,14 +216,14 @@ impl Sim {
         }
     }
 
-    /// Depth (z in the camera frame, m; 0 = none) of frame `i`, row-major, `width * height` values.
+    /// Writes the depth (z in the camera frame, m; 0 = none) of frame `i`, row-major, `width * height` values.
     pub fn depth(&mut self, i: usize, camera: usize, out: &mut [f32]) {
         self.expose(self.stamps[i], camera);
         render::cast(&self.room, &self.lenses[camera], Rows(&self.rows), &mut self.scratch);
         render::depths(&self.lenses[camera], &self.scratch.hits, out);
     }
 
-    /// Views and exposures of a camera's rows, one for all under a global shutter.
+    /// Sets the views and exposures of a camera's rows, one for all under a global shutter.
     fn expose(&mut self, t: Nanos, camera: usize) {
         let c = &self.rig.cameras[camera];
         let (rolls, n) = (c.readout.0 > 0, c.camera.height);
@@ -229,7 +232,7 @@ impl Sim {
         rows.extend((0..if rolls { n } else { 1 }).map(|y| {
             let t = if rolls { t + Span::from_secs(c.row_delay(y as f64)) } else { t };
             let (factor, offset) = self.light.at(t - self.stamps[0]);
-            // two sensors never respond quite alike
+            // Two sensors never respond quite alike.
             let gain = self.gain_at(t) * (1.0 + 0.03 * camera as f32) * factor as f32;
             Row { view: self.view(t, camera), gain, offset: offset as f32 }
         }));
@@ -240,7 +243,7 @@ impl Sim {
         View::new(&(self.truth_at(t).pose * self.rig.cameras[camera].body_from_cam))
     }
 
-    /// What an exposure meter on camera 0 would settle on through the run, smoothed.
+    /// The exposure that a meter on camera 0 would settle on through the run, smoothed.
     fn metered(&self) -> Vec<f32> {
         let n = ((self.last() - self.stamps[0]).secs() / METER_PERIOD).ceil() as usize + 1;
         let at = |k: usize| (self.stamps[0] + Span::from_secs(k as f64 * METER_PERIOD)).min(self.last());
@@ -299,7 +302,7 @@ fn motion(scenario: &Scenario, rig: &Calibration) -> Result<(Spline, Nanos, Nano
     let end = samples[samples.len() - 1].0;
     let (mut first, mut last) = (start + Span::from_secs(FIT_MARGIN), start + Span::from_secs(end - FIT_MARGIN));
     if let Some(imu) = &r.imu {
-        // frames begin on an inertial sample, as on hardware that triggers both
+        // Frames begin on an inertial sample, as on hardware that triggers both.
         first = imu.iter().map(|s| s.t).find(|t| *t >= first).ok_or_else(short)?;
         last = imu.last().map_or(last, |s| s.t.min(last));
     }
@@ -316,7 +319,7 @@ fn sample_path(spline: &Spline, span: std::ops::Range<f64>) -> impl Iterator<Ite
     (0..=n).map(move |k| spline.at(span.start + k as f64 * STEP).pose.p)
 }
 
-/// The box of the room: fixed for invented flights, around the path of a recorded one.
+/// The corners of the room: fixed for invented flights, around the path of a recorded one.
 fn bounds(scenario: &Scenario, spline: &Spline, span: std::ops::Range<f64>) -> (Vec3, Vec3) {
     if !matches!(scenario.path, Flight::Recorded(_)) {
         return (Vec3::new(-4.0, -3.0, 0.0), Vec3::new(4.0, 3.0, 3.5));

@@ -1,14 +1,13 @@
-//! Rays of a camera, what they meet, and what the sensor makes of it.
+//! Images: the rays of a camera, the surfaces that they meet, and the response of the sensor.
 //!
-//! A frame is made in two passes over 16-pixel tiles: `cast` finds distance and face at every pixel
-//! centre; `shade` turns them into grey levels. Textures are filtered to the pixel in closed form,
-//! so one sample does inside a face; pixels whose neighbours see another face cast
-//! `EDGE x EDGE` rays. Per tile only the solids that meet the tile's cone are tried, nearest first.
+//! A frame is made in two passes over 16-pixel tiles: `cast` finds distance and face at every pixel centre; `shade` turns
+//! them into grey levels. Textures are filtered to the pixel in closed form, so one sample is enough inside a face; pixels
+//! whose neighbours see another face cast `EDGE x EDGE` rays. For each tile only the solids that meet the tile's cone are
+//! tried, nearest first.
 //!
-//! Work is split over threads by tile rows and every random number is a hash of (seed, frame,
-//! camera, pixel), so the image does not depend on the number of threads.
-//! There is no motion blur. Under a rolling shutter every row has a view of its own; lists of solids
-//! are those of the middle row of a tile, with a margin for what the rig moves in the others.
+//! Work is split over threads by tile rows, and every random number is a hash of (seed, frame, camera, pixel), so the image
+//! does not depend on the number of threads. There is no motion blur. Under a rolling shutter every row has a view of its
+//! own; lists of solids are those of the middle row of a tile, with a margin for the motion of the rig until the others.
 
 use super::room::{Room, NOTHING};
 use super::texture::{self, Spot};
@@ -16,10 +15,10 @@ use crate::camera::Camera;
 use crate::types::Pose;
 use glam::{DVec2, Quat, Vec2, Vec3};
 
+/// Side of a tile, pixels, and of the grid of rays of an edge pixel.
 const TILE: usize = 16;
 const EDGE: usize = 4;
-/// What a rig moves and turns in half a tile's rows under a rolling shutter, m and rad: 20 m/s and 20 rad/s
-/// at 1 ms.
+/// Motion of a rig in half a tile's rows under a rolling shutter, m and rad: 20 m/s and 20 rad/s for 1 ms.
 const ROLL_MOVE: f32 = 0.02;
 const ROLL_TURN: f32 = 0.02;
 
@@ -34,7 +33,7 @@ pub struct Sensor {
     pub vignette: f64,
 }
 
-/// What a pixel centre sees.
+/// The surface that a pixel centre sees.
 #[derive(Clone, Copy, Debug)]
 pub struct Hit {
     /// Along the unit ray, m.
@@ -73,7 +72,7 @@ impl View {
     }
 }
 
-/// What a row sees and how it is exposed.
+/// The view and the exposure of a row.
 #[derive(Clone, Copy)]
 pub struct Row {
     pub view: View,
@@ -82,7 +81,7 @@ pub struct Row {
     pub offset: f32,
 }
 
-/// Rows of an image, or the one that stands for all under a global shutter.
+/// The rows of an image, or one that stands for all under a global shutter.
 #[derive(Clone, Copy)]
 pub struct Rows<'a>(pub &'a [Row]);
 
@@ -103,11 +102,11 @@ pub struct Exposure {
     pub sensor: Sensor,
     /// Differs for every image of a run.
     pub stream: u32,
-    /// Of a colour image, which of red, green and blue this is.
+    /// Red, green or blue of a colour image.
     pub channel: Option<usize>,
 }
 
-/// A solid as seen from a view: for the tile tests.
+/// A solid as seen from a view, for the tile tests.
 #[derive(Clone, Copy)]
 struct Seen {
     solid: u32,
@@ -118,20 +117,20 @@ struct Seen {
     sin: f32,
 }
 
-/// Reused between frames: nothing here allocates after construction.
+/// Memory that is reused between frames: nothing here allocates after construction.
 pub struct Scratch {
     lists: Vec<Lists>,
     pub hits: Vec<Hit>,
 }
 
-/// One thread's: all solids nearest first, and those of a tile.
+/// The lists of one thread: all solids nearest first, and those of a tile.
 struct Lists {
     seen: Vec<Seen>,
     tile: Vec<Seen>,
 }
 
 impl Lists {
-    /// For the tiles of a row of tiles; under a global shutter the first is that of all.
+    /// Lists the solids for a row of tiles; under a global shutter the first list serves all.
     fn look_around(&mut self, room: &Room, rows: Rows, ty: usize, first: bool) {
         if first || rows.roll() {
             let slack = if rows.roll() { ROLL_MOVE } else { 0.0 };
@@ -166,7 +165,7 @@ impl Lens {
         let mut lens = Lens { width, height, bearings, pixel_angle: vec![0.0; width * height], cones: Vec::new() };
         for i in 0..width * height {
             if lens.bearings[i] != Vec3::ZERO {
-                let (du, dv) = lens.slopes(i % width, i / width);
+                let (du, dv) = lens.gradients(i % width, i / width);
                 lens.pixel_angle[i] = du.cross(dv).length().sqrt();
             }
         }
@@ -185,7 +184,7 @@ impl Lens {
             ys.flat_map(row).filter(|i| self.pixel_angle[*i] > 0.0)
         };
         let axis = rays().map(|i| self.bearings[i]).sum::<Vec3>().normalize_or_zero();
-        // a pixel reaches half its diagonal beyond its centre
+        // A pixel reaches half its diagonal beyond its centre.
         let reach = |i: usize| self.bearings[i].dot(axis).clamp(-1.0, 1.0).acos() + self.pixel_angle[i];
         let (sin, cos) = rays().map(reach).fold(0.0, f32::max).min(std::f32::consts::PI).sin_cos();
         Cone { axis, cos, sin }
@@ -195,12 +194,12 @@ impl Lens {
         self.width.div_ceil(TILE)
     }
 
-    /// Change of the bearing a pixel to the right and a pixel down, from the neighbours.
-    fn slopes(&self, x: usize, y: usize) -> (Vec3, Vec3) {
+    /// The change of the bearing per pixel to the right and down, from the neighbours.
+    fn gradients(&self, x: usize, y: usize) -> (Vec3, Vec3) {
         let at = |x: usize, y: usize| self.bearings[y * self.width + x];
         let here = at(x, y);
-        // at the end of the lens' domain a neighbour is missing and the pixel itself stands in
-        let slope = |low: Vec3, high: Vec3| match (low == Vec3::ZERO, high == Vec3::ZERO) {
+        // At the end of the lens' domain a neighbour is missing and the pixel itself stands in.
+        let gradient = |low: Vec3, high: Vec3| match (low == Vec3::ZERO, high == Vec3::ZERO) {
             (false, false) => (high - low) * 0.5,
             (true, false) => high - here,
             (false, true) => here - low,
@@ -211,11 +210,11 @@ impl Lens {
         let up = near(y > 0, x, y.saturating_sub(1));
         let right = near(x + 1 < self.width, (x + 1).min(self.width - 1), y);
         let down = near(y + 1 < self.height, x, (y + 1).min(self.height - 1));
-        (slope(left, right), slope(up, down))
+        (gradient(left, right), gradient(up, down))
     }
 }
 
-/// Distance and face at every pixel centre, into `scratch.hits`.
+/// Finds distance and face at every pixel centre, into `scratch.hits`.
 pub fn cast(room: &Room, lens: &Lens, views: Rows, scratch: &mut Scratch) {
     let Scratch { lists, hits } = scratch;
     let hits = &mut hits[..lens.width * lens.height];
@@ -243,7 +242,7 @@ pub fn cast(room: &Room, lens: &Lens, views: Rows, scratch: &mut Scratch) {
     in_bands(lens, hits, lists, work);
 }
 
-/// Grey levels from the hits of the last `cast` of the same rows.
+/// Writes grey levels from the hits of the last `cast` of the same rows.
 pub fn shade(room: &Room, lens: &Lens, views: Rows, exposure: &Exposure, scratch: &mut Scratch, out: &mut [u8]) {
     let Scratch { lists, hits } = scratch;
     let hits = &hits[..lens.width * lens.height];
@@ -279,7 +278,7 @@ pub fn shade(room: &Room, lens: &Lens, views: Rows, exposure: &Exposure, scratch
     in_bands(lens, out, lists, work);
 }
 
-/// Mean radiance of a sparse set of pixels: what an exposure meter sees.
+/// The mean radiance of a sparse set of pixels, as an exposure meter sees it.
 pub fn meter(room: &Room, lens: &Lens, view: View) -> f32 {
     const STEP: usize = 24;
     let (mut sum, mut n) = (0.0, 0.0);
@@ -297,7 +296,7 @@ pub fn meter(room: &Room, lens: &Lens, view: View) -> f32 {
     sum / f32::max(n, 1.0)
 }
 
-/// Depth (z in the camera frame, m) of the hits of the last `cast`; 0 where there is none.
+/// Writes the depth (z in the camera frame, m) of the hits of the last `cast`; 0 where there is none.
 pub fn depths(lens: &Lens, hits: &[Hit], out: &mut [f32]) {
     for ((z, hit), b) in out.iter_mut().zip(hits).zip(&lens.bearings) {
         *z = if hit.face == NOTHING { 0.0 } else { (hit.distance * b.z).max(0.0) };
@@ -325,7 +324,7 @@ fn in_bands<T: Send>(
     });
 }
 
-/// All solids from a view, nearest first.
+/// Lists all solids from a view, nearest first.
 fn look_around(room: &Room, view: View, slack: f32, seen: &mut Vec<Seen>) {
     seen.clear();
     for (k, s) in room.solids.iter().enumerate() {
@@ -340,12 +339,12 @@ fn look_around(room: &Room, view: View, slack: f32, seen: &mut Vec<Seen>) {
     seen.sort_unstable_by(|a, b| a.near.total_cmp(&b.near).then(a.solid.cmp(&b.solid)));
 }
 
-/// The solids whose bounding sphere may meet the cone.
+/// Lists the solids whose bounding sphere may meet the cone.
 fn tile_list(seen: &[Seen], cone: &Cone, view: View, slack: f32, list: &mut Vec<Seen>) {
     list.clear();
     let axis = view.turn * cone.axis;
     list.extend(seen.iter().filter(|s| {
-        // angle between the axes against the sum of the half angles, in cosines; the sum may pass π
+        // The angle between the axes against the sum of the half angles, in cosines; the sum may pass π.
         let cos_sum = s.cos * cone.cos - s.sin * cone.sin;
         let sin_sum = s.sin * cone.cos + s.cos * cone.sin;
         s.near <= 0.0 || sin_sum < slack || s.axis.dot(axis) >= cos_sum - 1e-5 - slack
@@ -374,7 +373,7 @@ fn is_edge(hits: &[Hit], lens: &Lens, x: usize, y: usize) -> bool {
         (y + 1 < lens.height).then_some(i + lens.width),
     ];
     let faces = around.into_iter().flatten().map(|j| hits[j].face);
-    // at the end of the lens' domain there are no bearings to interpolate
+    // At the end of the lens' domain there are no bearings to interpolate.
     let (mut differs, mut outside) = (false, face == NOTHING);
     for f in faces {
         differs |= f != face;
@@ -383,15 +382,15 @@ fn is_edge(hits: &[Hit], lens: &Lens, x: usize, y: usize) -> bool {
     differs && !outside
 }
 
-/// Light leaving a surface towards the camera; of all colours, or of one.
+/// The light that leaves a surface towards the camera, of all colours or of one.
 #[inline]
 fn radiance(room: &Room, view: View, d: Vec3, hit: Hit, angle: f32, channel: Option<usize>) -> f32 {
     let face = &room.faces[hit.face as usize];
     let place = face.place(view.origin + d * hit.distance);
-    // a ray turned by `angle` slides by angle·distance·|u - n (u·d)/(n·d)| along u
-    let slope = 1.0 / place.normal.dot(d).abs().max(0.02);
+    // A ray turned by `angle` slides by angle·distance·|u - n (u·d)/(n·d)| along u.
+    let stretch = 1.0 / place.normal.dot(d).abs().max(0.02);
     let slide = |u: Vec3| {
-        let tilt = u.dot(d) * slope;
+        let tilt = u.dot(d) * stretch;
         (u.length_squared() + tilt * tilt).sqrt()
     };
     let footprint = Vec2::new(slide(place.u), slide(place.v)) * (angle * hit.distance);
@@ -400,8 +399,8 @@ fn radiance(room: &Room, view: View, d: Vec3, hit: Hit, angle: f32, channel: Opt
     channel.map_or(light, |c| light * texture::tint(face.material, face.seed)[c])
 }
 
-/// A pixel that several faces share: its rays are gathered by face, and each face is shaded once
-/// where its rays meet it on average.
+/// The light of a pixel that several faces share: its rays are gathered by face, and each face is shaded once, where its rays
+/// meet it on average.
 fn edge_radiance(
     room: &Room,
     lens: &Lens,
@@ -412,7 +411,7 @@ fn edge_radiance(
 ) -> f32 {
     const RAYS: usize = EDGE * EDGE;
     let angle = lens.pixel_angle[y * lens.width + x];
-    let (du, dv) = lens.slopes(x, y);
+    let (du, dv) = lens.gradients(x, y);
     let (du, dv) = (view.turn * du / EDGE as f32, view.turn * dv / EDGE as f32);
     let corner = view.turn * lens.bearings[y * lens.width + x] - (du + dv) * (0.5 * (EDGE - 1) as f32);
     let mut parts = [(NOTHING, 0.0f32, Vec3::ZERO); RAYS];
@@ -435,7 +434,7 @@ fn edge_radiance(
     light
 }
 
-/// Vignette, exposure, shot and read noise, quantisation.
+/// The grey level of a pixel: vignette, exposure, shot and read noise, quantisation.
 #[inline]
 fn develop(light: f32, offset: f32, cos_off_axis: f32, pixel: usize, e: &Exposure) -> u8 {
     let lost = e.sensor.vignette as f32 * 2.0 * (1.0 - cos_off_axis * cos_off_axis);
@@ -444,7 +443,7 @@ fn develop(light: f32, offset: f32, cos_off_axis: f32, pixel: usize, e: &Exposur
     let sigma = (read * read + e.sensor.shot_noise as f32 * level).sqrt();
     let a = texture::hash(pixel as i32, 0, e.stream);
     let b = texture::hash(pixel as i32, 1, e.stream);
-    // the sum of four uniform numbers, scaled to unit variance
+    // The sum of four uniform numbers, scaled to unit variance.
     let sum = (a & 0xFFFF) + (a >> 16) + (b & 0xFFFF) + (b >> 16);
     let normal = (sum as f32 / 65536.0 - 2.0) * 1.732_050_8;
     (level + sigma * normal + 0.5).clamp(0.0, 255.0) as u8

@@ -1,9 +1,9 @@
 //! The room: solids with analytic ray intersection, faces that carry material and light.
 //!
-//! A `Room` is one box seen from inside and solids in it: blocks (boxes turned about z), balls and
-//! drums (upright cylinders). `nearest` answers which face a ray meets first, exactly. Furniture
-//! is in `furnish.rs`, baked light in `light.rs`, surface patterns in `texture.rs`. World frame:
-//! z up, metres, f32 (a metre of room at 1e-7 is finer than any sensor here).
+//! A `Room` is one box seen from inside and solids in it: blocks (boxes turned about z), balls and drums (upright
+//! cylinders). `nearest` finds the face that a ray meets first, exactly. Furniture is in `furnish.rs`, baked light in
+//! `light.rs`, surface patterns in `texture.rs`. World frame: z up, metres, f32 (1e-7 of a metre is finer than any sensor
+//! here).
 
 use super::light::LightMap;
 use super::texture::Material;
@@ -12,6 +12,7 @@ use glam::{Vec2, Vec3};
 /// No face: the ray left the room (only rays outside the lens' domain do).
 pub const NOTHING: u32 = u32::MAX;
 
+/// The shape of a solid, m.
 #[derive(Clone, Copy, Debug)]
 pub enum Shape {
     Block { half: Vec3 },
@@ -19,20 +20,21 @@ pub enum Shape {
     Drum { radius: f32, half_height: f32 },
 }
 
+/// A piece of furniture, or a part of one.
 #[derive(Clone, Copy, Debug)]
 pub struct Solid {
     pub shape: Shape,
     pub centre: Vec3,
-    /// Turn about z.
+    /// Rotation about z.
     pub cos: f32,
     pub sin: f32,
-    /// Its first face; a block has six, a ball one, a drum a side, a top and a bottom.
+    /// Index of its first face; a block has six, a ball one, a drum three: side, top, bottom.
     pub face: u32,
     /// Radius of the bounding sphere.
     pub bound: f32,
 }
 
-/// How a face maps points to surface coordinates.
+/// The map from points of a face to surface coordinates.
 #[derive(Clone, Copy, Debug)]
 pub enum Chart {
     /// `origin` is the corner where u = v = 0.
@@ -51,6 +53,7 @@ pub enum Chart {
     },
 }
 
+/// A surface with its material.
 #[derive(Clone, Copy, Debug)]
 pub struct Face {
     pub chart: Chart,
@@ -60,7 +63,7 @@ pub struct Face {
     pub seed: u32,
 }
 
-/// Surface coordinate, outward normal and tangents at a point.
+/// Surface coordinate, m, outward normal and tangents at a point.
 #[derive(Clone, Copy, Debug)]
 pub struct Place {
     pub at: Vec2,
@@ -69,6 +72,7 @@ pub struct Place {
     pub v: Vec3,
 }
 
+/// A lamp.
 #[derive(Clone, Copy, Debug)]
 pub struct Light {
     pub at: Vec3,
@@ -76,6 +80,7 @@ pub struct Light {
     pub power: f32,
 }
 
+/// A box seen from inside, its furniture and its light.
 pub struct Room {
     pub low: Vec3,
     pub high: Vec3,
@@ -130,6 +135,7 @@ impl Room {
         self.solids.push(Solid { shape: Shape::Block { half }, centre, cos, sin, face: first, bound: half.length() });
     }
 
+    /// Adds a ball.
     pub fn add_ball(&mut self, centre: Vec3, radius: f32, material: Material, seed: u32) {
         let pi = std::f32::consts::PI;
         let size = Vec2::new(2.0 * pi, pi) * radius;
@@ -155,7 +161,7 @@ impl Room {
         self.solids.push(Solid { shape, centre, cos: 1.0, sin: 0.0, face: first, bound });
     }
 
-    /// Where a ray from inside leaves the room.
+    /// The distance at which a ray from inside leaves the room, and the face.
     #[inline]
     pub fn shell(&self, o: Vec3, d: Vec3) -> (f32, u32) {
         let far = |o: f32, d: f32, low: f32, high: f32, face: u32| {
@@ -178,7 +184,7 @@ impl Room {
         }
     }
 
-    /// First surface along a unit ray among all solids: distance and face.
+    /// The first surface along a unit ray: distance and face.
     pub fn nearest(&self, o: Vec3, d: Vec3) -> (f32, u32) {
         let mut best = self.shell(o, d);
         for s in &self.solids {
@@ -212,7 +218,7 @@ fn face(origin: Vec3, u: Vec3, v: Vec3, size: Vec2, material: Material, seed: u3
 }
 
 impl Solid {
-    /// Cheap test against the bounding sphere.
+    /// Whether a ray meets the bounding sphere: a cheap test.
     #[inline]
     fn may_meet(&self, o: Vec3, d: Vec3, reach: f32) -> bool {
         let c = self.centre - o;
@@ -310,6 +316,7 @@ impl Solid {
 }
 
 impl Face {
+    /// The place of a point on the face.
     #[inline]
     pub fn place(&self, p: Vec3) -> Place {
         match self.chart {
@@ -323,7 +330,7 @@ impl Face {
                 let u = Vec3::new(-n.y, n.x, 0.0) / ring;
                 let longitude = n.y.atan2(n.x) + std::f32::consts::PI;
                 let latitude = n.z.clamp(-1.0, 1.0).asin() + std::f32::consts::FRAC_PI_2;
-                // the chart is stretched along u towards the poles
+                // The chart is stretched along u towards the poles.
                 Place { at: Vec2::new(longitude, latitude) * radius, normal: n, u: u / ring, v: n.cross(u) }
             }
             Chart::Drum { base, radius } => {

@@ -1,7 +1,7 @@
 //! What to simulate: a rig, a path and a seed. The same scenario gives the same bytes.
 //!
-//! Named scenarios fly a room of 8 x 6 x 3.5 m and begin with a second at rest. A recorded
-//! scenario takes its path (and, if given, its inertial samples) from csv files in EuRoC's format.
+//! Named scenarios fly in a room of 8 x 6 x 3.5 m and begin with a second at rest. A recorded scenario takes its path (and,
+//! if given, its inertial samples) from csv files in EuRoC's format.
 
 use super::imu::{Bias, ImuErrors};
 use super::recording;
@@ -14,17 +14,18 @@ use glam::{DMat3, DQuat, DVec3};
 use std::f64::consts::TAU;
 use std::path::Path;
 
+/// A flight to simulate.
 #[derive(Clone, Debug)]
 pub struct Scenario {
     pub name: String,
     pub seed: u64,
     /// Length of the run; a recorded path may end sooner.
     pub duration: Span,
-    /// Frames a second.
+    /// Frames per second.
     pub rate_hz: f64,
     /// The rig at full resolution.
     pub calibration: Calibration,
-    /// Images are made this many times smaller a side.
+    /// Images are made this many times smaller on each side.
     pub image_divisor: usize,
     pub sensor: Sensor,
     pub light: Light,
@@ -33,40 +34,40 @@ pub struct Scenario {
     pub path: Flight,
 }
 
-/// What is wrong with the cameras and the calibration handed out does not say. A rolling shutter is no
-/// error: it is `readout` of the calibration's cameras, middle rows at the stamp.
+/// Errors of the cameras that the calibration does not state. A rolling shutter is not one of them: it is the `readout` of
+/// the calibration's cameras, middle rows at the stamp.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct CameraErrors {
-    /// Of the inertial unit's clock over the stamps of images.
+    /// The inertial unit's clock less the stamps of images.
     pub time_offset: Span,
-    /// Camera k is handed out where `body_from_cam * extrinsics[k]` is; beyond the list, where it is.
+    /// Camera k truly stands at `body_from_cam * extrinsics[k]`; beyond the list, where the calibration says.
     pub extrinsics: Vec<Pose>,
 }
 
-/// How exposure departs from what a smooth meter would give.
+/// Deviations of the exposure from that of a smooth meter.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Light {
-    /// From an instant of the run on: factor of the exposure, and grey levels added.
+    /// Steps, each with its instant of the run, the factor of the exposure from then on, and grey levels added.
     pub steps: Vec<(Span, f64, f64)>,
-    /// Lamps: share of the light that comes and goes, and how often a second.
+    /// Flicker of the lamps: share of the light that comes and goes, and its frequency.
     pub flicker: f64,
     pub flicker_hz: f64,
 }
 
 impl Light {
-    /// Factor and grey levels added, `t` after the start.
+    /// The factor, and the grey levels added, `t` after the start.
     pub fn at(&self, t: Span) -> (f64, f64) {
         let (gain, offset) = self.steps.iter().rev().find(|s| s.0 <= t).map_or((1.0, 0.0), |s| (s.1, s.2));
         (gain * (1.0 + self.flicker * (TAU * self.flicker_hz * t.secs()).sin()), offset)
     }
 }
 
-/// Where the body goes.
+/// The path of the body.
 #[derive(Clone, Debug)]
 pub enum Flight {
     /// At rest.
     Static,
-    /// Holds its place as a small multicopter does: 0.2 m, 5°.
+    /// Holding its place as a small multicopter does: 0.2 m, 5°.
     Hover,
     /// Around the room, looking across it.
     Circle,
@@ -77,11 +78,12 @@ pub enum Flight {
     Recorded(Recording),
 }
 
+/// A recorded flight.
 #[derive(Clone, Debug)]
 pub struct Recording {
     /// `world_from_body`, z up.
     pub poses: Vec<TimedPose>,
-    /// Empty where the file does not state them.
+    /// True biases; empty where the file does not state them.
     pub biases: Vec<Bias>,
     /// Real inertial samples; simulated ones when `None`.
     pub imu: Option<Vec<ImuSample>>,
@@ -95,26 +97,29 @@ const NAMED: [(&str, Flight, f64); 5] = [
     ("static", Flight::Static, 5.0),
 ];
 
-/// Rest at the start, then gathering way, s.
+/// Time at rest at the start, and time in which the flight gathers way, s.
 const REST: f64 = 1.2;
 const GATHER: f64 = 1.2;
 
 impl Scenario {
+    /// The names of scenarios.
     pub fn names() -> impl Iterator<Item = &'static str> {
         NAMED.iter().map(|n| n.0)
     }
 
+    /// The scenario of a name.
     pub fn named(name: &str) -> Option<Scenario> {
         let (name, flight, secs) = NAMED.iter().find(|n| n.0 == name)?;
         let mut scenario = Scenario::flying(name, flight.clone(), *secs);
         if matches!(flight, Flight::Demo) {
-            scenario.image_divisor = 2; // maps in minutes on a software rasteriser
+            // Maps in minutes on a software rasteriser.
+            scenario.image_divisor = 2;
         }
         Some(scenario)
     }
 
-    /// The path of a EuRoC `state_groundtruth_estimate0` csv; inertial samples from `imu` (EuRoC
-    /// `imu0` csv) or, without it, simulated along the smoothed path.
+    /// The flight of a EuRoC `state_groundtruth_estimate0` csv, with the inertial samples of `imu` (EuRoC `imu0` csv) or,
+    /// without it, simulated along the smoothed path.
     pub fn from_euroc(truth: &Path, imu: Option<&Path>) -> Result<Scenario, Fault> {
         let recording = recording::read(truth, imu)?;
         let span = |p: &[TimedPose]| p.last().map_or(0.0, |l| (l.t - p[0].t).secs());
@@ -151,7 +156,7 @@ impl Scenario {
 
 fn shrunk(c: &Camera, divisor: usize) -> Camera {
     let s = divisor as f64;
-    // pixel centres are integers, so the corner of the image is at -0.5
+    // Pixel centres are integers, so the corner of the image is at -0.5.
     Camera {
         width: c.width / divisor,
         height: c.height / divisor,
@@ -163,10 +168,11 @@ fn shrunk(c: &Camera, divisor: usize) -> Camera {
     }
 }
 
-/// Rigs by name, of EuRoC's cameras and inertial unit: one camera, two that look the same way, two that
-/// look opposite ways and share nothing, and four (two ahead, one to each side).
+/// Names of rigs made of EuRoC's cameras and inertial unit: one camera, two that look the same way, two that look opposite
+/// ways and share nothing, and four (two ahead, one to each side).
 pub const RIGS: [&str; 4] = ["mono", "stereo", "opposed", "four"];
 
+/// The rig of a name.
 pub fn rig_named(name: &str) -> Option<Calibration> {
     let mut rig = euroc_rig();
     let turned = |c: &RigCamera, yaw: f64, p: DVec3| RigCamera {
@@ -178,7 +184,7 @@ pub fn rig_named(name: &str) -> Option<Calibration> {
         "mono" => rig.cameras.truncate(1),
         "stereo" => {}
         "opposed" => rig.cameras[1] = turned(&right, TAU / 2.0, DVec3::ZERO),
-        // 70°: a few degrees seen by two, as headsets have it
+        // 70°: two cameras share a few degrees, as on headsets.
         "four" => rig.cameras.extend([
             turned(&left, -1.222, DVec3::new(0.0, 0.0, -0.02)),
             turned(&right, 1.222, DVec3::new(0.0, 0.0, -0.02)),
@@ -229,8 +235,8 @@ pub fn euroc_rig() -> Calibration {
 }
 
 impl Flight {
-    /// `world_from_cam0` of an invented flight, `t` seconds from its start. The room is centred on
-    /// the origin with its floor at z = 0. `None` for a recording.
+    /// `world_from_cam0` of an invented flight, `t` seconds from its start. The room is centred on the origin with its floor
+    /// at z = 0. `None` for a recording.
     pub fn look(&self, t: f64) -> Option<Pose> {
         let s = way(t);
         Some(match self {
@@ -248,7 +254,8 @@ impl Flight {
                 look(p, a + TAU / 2.0 + 0.25 * (1.5 * a).sin(), -0.12 + 0.08 * (3.0 * a).sin(), 0.05 * (2.0 * a).sin())
             }
             Flight::Demo => {
-                let a = 0.766 * s; // once round in ten seconds
+                // Once round in ten seconds.
+                let a = 0.766 * s;
                 let p = DVec3::new(1.6 * a.cos(), 1.05 * a.sin(), 1.35 + 0.3 * (2.0 * a).sin());
                 let yaw = a + 0.35 * (2.0 * a).sin();
                 look(p, yaw, -0.12 + 0.14 * (3.0 * a).sin(), 0.08 * (2.5 * a).sin())
@@ -262,7 +269,7 @@ impl Flight {
     }
 }
 
-/// Seconds under way at `t`: at rest, then gathering way smoothly, then as time goes.
+/// Seconds under way at `t`: none at rest, then smoothly more, then as time passes.
 fn way(t: f64) -> f64 {
     let h = ((t - REST) / GATHER).clamp(0.0, 1.0);
     GATHER * (h * h * h - 0.5 * h * h * h * h) + (t - REST - GATHER).max(0.0)

@@ -1,10 +1,9 @@
-//! Uniform cumulative B-spline on R³ x SO(3), order 6: C⁴, so that the specific force and the
-//! angular velocity it implies are smooth and exact.
+//! Uniform cumulative B-spline on R³ x SO(3), order 6: C⁴, so that the specific force and the angular velocity it implies are
+//! smooth and exact.
 //!
-//! Position is an ordinary B-spline; rotation is R(t) = R_i Π Exp(λ_j(u) d_j) with
-//! d_j = Log(R_{i+j-1}⁻¹ R_{i+j}) and λ_j the cumulative basis; the angular velocity follows by
-//! the recursion ω <- Exp(-λ d) ω + λ' d (Sommer et al., CVPR 2020).
-//! Time is seconds from the start of the spline.
+//! Position is an ordinary B-spline; rotation is R(t) = R_i Π Exp(λ_j(u) d_j) with d_j = Log(R_{i+j-1}⁻¹ R_{i+j}) and λ_j the
+//! cumulative basis; the angular velocity follows by the recursion ω <- Exp(-λ d) ω + λ' d (Sommer et al., CVPR 2020). Time is
+//! in seconds from the start of the spline.
 
 use crate::types::Pose;
 use glam::{DQuat, DVec3};
@@ -13,6 +12,7 @@ use glam::{DQuat, DVec3};
 pub const ORDER: usize = 6;
 const DEGREE: usize = ORDER - 1;
 
+/// A motion in time.
 #[derive(Clone, Debug)]
 pub struct Spline {
     /// Knot spacing, s.
@@ -20,7 +20,7 @@ pub struct Spline {
     controls: Vec<Pose>,
 }
 
-/// What the spline says of one instant.
+/// The motion at one instant: m, m/s, m/s², rad/s.
 #[derive(Clone, Copy, Debug)]
 pub struct Motion {
     pub pose: Pose,
@@ -30,16 +30,15 @@ pub struct Motion {
 }
 
 impl Spline {
-    /// Control poses are samples of `path`, so the spline is a slightly smoothed `path` on [0, duration].
+    /// The spline whose control poses are samples of `path`: a slightly smoothed `path` on [0, duration].
     pub fn sampled(duration: f64, knot: f64, path: impl Fn(f64) -> Pose) -> Spline {
         let controls = (0..control_count(duration, knot)).map(|i| path(control_time(i, knot))).collect();
         Spline { knot, controls }
     }
 
-    /// Least-squares-like fit to time-sorted samples (at least one): each round moves every
-    /// control pose by the mean residual of the samples near it. Rounds converge fast for what the
-    /// knots resolve and slowly at their Nyquist rate, so a few rounds follow the motion and leave
-    /// the noise of the samples behind.
+    /// A fit to time-sorted samples (at least one): each round moves every control pose by the mean residual of the samples
+    /// near it. Rounds converge fast for motions that the knots resolve and slowly at their Nyquist rate, so a few rounds
+    /// follow the motion and leave the noise of the samples behind.
     pub fn fit(samples: &[(f64, Pose)], knot: f64, rounds: usize) -> Spline {
         let duration = samples.last().map_or(0.0, |s| s.0);
         let mut spline = Spline::sampled(duration, knot, |t| sample_at(samples, t));
@@ -51,7 +50,8 @@ impl Spline {
                 let at = spline.at(*t).pose;
                 let dp = pose.p - at.p;
                 let dq = log(at.q.conjugate() * pose.q);
-                let x = t / knot + 2.0; // fractional control index, see `control_time`
+                // The fractional control index, see `control_time`.
+                let x = t / knot + 2.0;
                 let i = x.floor() as usize;
                 for (i, w) in [(i, 1.0 - x.fract()), (i + 1, x.fract())] {
                     if let Some(r) = residual.get_mut(i) {
@@ -68,12 +68,12 @@ impl Spline {
         spline
     }
 
-    /// Last instant the spline is defined at, s.
+    /// The last instant at which the spline is defined, s.
     pub fn duration(&self) -> f64 {
         (self.controls.len() - DEGREE) as f64 * self.knot
     }
 
-    /// `t` outside [0, duration] is clamped.
+    /// The motion at `t`, which is clamped to [0, duration].
     pub fn at(&self, t: f64) -> Motion {
         let segments = self.controls.len() - DEGREE;
         let x = (t / self.knot).clamp(0.0, segments as f64);
@@ -109,7 +109,7 @@ fn control_count(duration: f64, knot: f64) -> usize {
     (duration / knot).ceil().max(1.0) as usize + DEGREE
 }
 
-/// Instant at which control pose `i` weighs most.
+/// The instant at which control pose `i` weighs most.
 fn control_time(i: usize, knot: f64) -> f64 {
     (i as f64 - 2.0) * knot
 }
@@ -130,7 +130,7 @@ fn basis(degree: usize, u: f64) -> [f64; ORDER] {
     n
 }
 
-/// Rotation vector of the shorter way round.
+/// The rotation vector, rad, of the shorter way round.
 pub fn log(q: DQuat) -> DVec3 {
     let q = if q.w < 0.0 { -q } else { q };
     let v = q.xyz();

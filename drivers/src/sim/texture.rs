@@ -1,13 +1,13 @@
-//! What surfaces look like: procedural albedo, filtered to the pixel that sees it.
+//! Surfaces: procedural albedo, filtered to the pixel that sees it.
 //!
-//! Input is a surface coordinate in metres and the extent of the pixel there (the footprint);
-//! output is albedo in [0, 1]. There is detail at every scale down to a millimetre, below a pixel
-//! at any distance a camera flies at, so nothing may be point-sampled: piecewise-constant patterns
-//! and lines are averaged over the footprint in closed form, and smooth noise stops adding octaves
-//! when a cell is no wider than the footprint.
+//! Input is a surface coordinate in metres and the extent of the pixel there (the footprint); output is albedo in [0, 1].
+//! There is detail at every scale down to a millimetre, below a pixel at any distance at which a camera flies, so nothing may
+//! be point-sampled: piecewise-constant patterns and lines are averaged over the footprint in closed form, and smooth noise
+//! stops adding octaves when a cell is no wider than the footprint.
 
 use glam::Vec2;
 
+/// The pattern of a surface.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Material {
     Plaster,
@@ -37,6 +37,7 @@ pub struct Spot {
     pub size: Vec2,
 }
 
+/// The albedo of a material at a spot.
 pub fn albedo(material: Material, seed: u32, s: Spot) -> f32 {
     let value = match material {
         Material::Plaster => plaster(s, seed),
@@ -57,7 +58,7 @@ pub fn albedo(material: Material, seed: u32, s: Spot) -> f32 {
     value.clamp(0.02, 0.95)
 }
 
-/// Red, green and blue of a surface over its grey; their luma is one.
+/// The red, green and blue of a surface over its grey; their luma is one.
 pub fn tint(material: Material, seed: u32) -> [f32; 3] {
     let [r, g, b] = match material {
         Material::Plaster => [1.0, 0.9, 0.75],
@@ -71,7 +72,7 @@ pub fn tint(material: Material, seed: u32) -> [f32; 3] {
         Material::Drawers => [0.8, 0.9, 1.3],
         Material::Leaves => [0.6, 1.3, 0.5],
     };
-    // Two walls of one material are not of one paint.
+    // Two walls of one material differ in colour.
     let vary = |v: f32, c: i32| v * (0.8 + 0.4 * cell(c, 0, seed));
     let [r, g, b] = [vary(r, 0), vary(g, 1), vary(b, 2)];
     let luma = 0.299 * r + 0.587 * g + 0.114 * b;
@@ -88,15 +89,15 @@ pub fn hash(x: i32, y: i32, seed: u32) -> u32 {
     h ^ (h >> 15)
 }
 
-/// Random numbers in [0, 1) on a lattice that repeats every `PERIOD` cells: each entry holds the four
-/// corners of a cell, so that interpolated noise costs one load from 64 KiB. Seeds and octaves read
-/// it shifted.
+/// Random numbers in [0, 1) on a lattice that repeats every `PERIOD` cells: each entry holds the four corners of a cell, so
+/// that interpolated noise costs one load from 64 KiB. Seeds and octaves read it shifted.
 const PERIOD: usize = 64;
 static CORNERS: [[f32; 4]; PERIOD * PERIOD] = corners();
 
 const fn corners() -> [[f32; 4]; PERIOD * PERIOD] {
     let mut values = [0.0; PERIOD * PERIOD];
-    let mut state = 0x2545_F491u32; // xorshift32 (Marsaglia)
+    // xorshift32 (Marsaglia).
+    let mut state = 0x2545_F491u32;
     let mut k = 0;
     while k < values.len() {
         state ^= state << 13;
@@ -116,17 +117,18 @@ const fn corners() -> [[f32; 4]; PERIOD * PERIOD] {
     cells
 }
 
-/// Uniform in [0, 1) at a lattice point; does not repeat.
+/// A random number, uniform in [0, 1), of a lattice point; does not repeat.
 #[inline]
 fn cell(x: i32, y: i32, seed: u32) -> f32 {
     (hash(x, y, seed) >> 8) as f32 * (1.0 / 16_777_216.0)
 }
 
-/// The cell `x` is in, as integer and as float; exact below 2²² cells. At an integer it may be the
-/// cell below, whose upper end is the same place.
+/// The cell of `x`, as integer and as float; exact below 2²² cells. At an integer it may be the cell below, whose upper end is
+/// the same place.
 #[inline(always)]
 fn floor(x: f32) -> (i32, f32) {
-    const SHIFT: f32 = 12_582_912.0; // 1.5 * 2²³: the sum's mantissa is the rounded integer
+    /// 1.5 * 2²³: the mantissa of a sum with it is the rounded integer.
+    const SHIFT: f32 = 12_582_912.0;
     let y = (x - 0.5) + SHIFT;
     ((y.to_bits() as i32).wrapping_sub(SHIFT.to_bits() as i32), y - SHIFT)
 }
@@ -175,7 +177,8 @@ fn scattered(s: Spot, pitch: Vec2, share: f32, seed: u32) -> f32 {
 #[inline]
 fn blocks(s: Spot, pitch: Vec2, seed: u32) -> f32 {
     let (x, f) = (s.at / pitch, s.footprint / pitch);
-    let fade = 1.0 / (f.x.max(1.0) * f.y.max(1.0)); // spread of the mean of many cells
+    // The spread of the mean of many cells.
+    let fade = 1.0 / (f.x.max(1.0) * f.y.max(1.0));
     if fade < 0.1 {
         return 0.5;
     }
@@ -192,7 +195,7 @@ fn fbm(s: Spot, coarse: f32, fine: f32, gain: f32, seed: u32) -> f32 {
     fbm_until(s, coarse, fine, gain, seed, f32::NEG_INFINITY)
 }
 
-/// As `fbm`, but stops as soon as no finer octave can lift the sum to `level`.
+/// Smooth noise as `fbm`, which stops as soon as no finer octave can lift the sum to `level`.
 #[inline(always)]
 fn fbm_until(s: Spot, coarse: f32, fine: f32, gain: f32, seed: u32, level: f32) -> f32 {
     let foot = 0.5 * (s.footprint.x + s.footprint.y);
