@@ -178,3 +178,22 @@ fn a_reader_that_stops_reading_ends_the_bench_quietly() {
     assert_eq!(o.status.signal(), Some(libc::SIGPIPE), "{}", text(&o));
     assert!(!text(&o).contains("panicked") && dir.path().join("odometry.html").is_file(), "{}", text(&o));
 }
+
+/// Another reader and renderer than the mapper's sees in map.ply what the report says, as it stands: in the exposure that most
+/// images have.
+#[test]
+fn a_viewer_shows_the_map_as_the_report_scores_it() {
+    let dir = tempfile::tempdir().unwrap();
+    let (data, out, scored) = (flight(dir.path(), "2"), dir.path().join("out"), dir.path().join("ply"));
+    let poses = data.join("mav0/state_groundtruth_estimate0/data.csv");
+    let [from, to, poses] = [&data, &out, &poses].map(|p| p.to_str().unwrap());
+    let args = ["replay", from, "--poses", poses, "--pace", "lockstep", "--steps", "15", "--scale", "1", "--out", to];
+    let o = program::stipple().args(args).output().unwrap();
+    assert!(o.status.success(), "{}", text(&o));
+    let psnr = json(&out.join("report.json"))["psnr_db"].as_f64().unwrap();
+    let said = bench(&["ply", out.join("map.ply").to_str().unwrap(), from, "--poses", poses], &scored);
+    let training = &json(&scored.join("ply.json"))["ply"][0];
+    let [stands, fitted] = ["as_it_stands_db", "exposure_fitted_db"].map(|name| training[name].as_f64().unwrap());
+    // The report scores at refined poses, and gives each view its own exposure: less than a decibel of so short a flight.
+    assert!(psnr > 20.0 && (stands - psnr).abs() < 1.0 && (fitted - psnr).abs() < 1.0, "{psnr}: {said}");
+}

@@ -11,6 +11,7 @@ mod kernels;
 mod map;
 mod odometry;
 mod page;
+mod ply;
 mod record;
 mod run;
 mod stability;
@@ -47,6 +48,7 @@ enum Bench {
     Stereo(stereo::Args),
     Faults(faults::Args),
     Record(record::Args),
+    Ply(ply::Args),
 }
 
 fn run(bench: &Bench) -> Result<(), Fault> {
@@ -60,6 +62,7 @@ fn run(bench: &Bench) -> Result<(), Fault> {
         Bench::Stereo(args) => stereo::run(args),
         Bench::Faults(args) => faults::run(args),
         Bench::Record(args) => record::run(args),
+        Bench::Ply(args) => ply::run(args),
     }
 }
 
