@@ -1,18 +1,41 @@
 //! Stipple: live stereo-inertial odometry and a 3D Gaussian map, in fixed memory, on small GPUs.
 //!
-//! Sensors push time-stamped samples into bounded queues; a sans-IO estimator turns them into
-//! states and keyframes; a mapper spends a fixed GPU budget on them; every byte is bought at boot
-//! from a board file.
+//! Sensors push time-stamped samples into bounded queues; a sans-IO estimator turns them into states and keyframes; a mapper
+//! spends a fixed GPU budget on them; every byte is bought at boot from a board file.
 //!
 //! ```text
 //! frames -> mailbox(newest) -> frontend -Tracks-> vio -Keyframe(offer)-> map.step(deadline)
 //! imu    -> queue -----------------------------------^                   map -> report, map.ply
 //! ```
 //!
-//! Allowed edges, checked by `tests/tidy.rs`: `math`, `mem`, `limits`, `config` and `counters` are seen by
-//! all; `frontend` and `vio` see the vocabulary of `stipple-drivers`; `vio` also sees `frontend`'s
-//! `Tracks`; `stereo` and `map` see `gpu`; `map` sees `stereo`; `vio` never sees `gpu`; `map` never sees
-//! `frontend`; `run` sees all of these, `commands` see `run`, and nobody sees `commands`.
+//! Rooms: `math`, `mem`, `limits`, `config` and `counters` are seen by all. `frontend` and `vio` see the vocabulary of
+//! `stipple-drivers`, `vio` also the frontend's `Tracks`; `stereo` and `map` see `gpu`, `map` also `stereo`; `output` sees what it
+//! writes of `map` and `vio`. `run` sees all of these, `commands` see `run`, and nobody sees `commands`. tests/tidy checks it.
+//!
+//! # Glossary
+//!
+//! | term | meaning |
+//! |---|---|
+//! | anchor | a keyframe that seeded Gaussians: its view was not reconstructed; it owns a contiguous block of them |
+//! | board | a computer with its sensors, as its board file describes it |
+//! | body | the frame of the inertial unit; poses are `world_from_body`, world z up |
+//! | burst | training steps that follow a new anchor, every other on its own view |
+//! | coverage | the part of a view that the map shows, and shows well |
+//! | deviation | standard deviation, wherever an error is stated |
+//! | exposure | gain and offset that take a rendering to what a camera recorded |
+//! | frame | the images of all cameras at one mid-exposure instant |
+//! | held out | a keyframe that is never trained on, only evaluated |
+//! | increment | inertial samples between two frames, integrated (preintegration) |
+//! | keyframe | a frame kept in the estimator's window as a pose, and offered to the map |
+//! | landmark | a point of the estimator: direction and inverse distance in its host keyframe |
+//! | lockstep | a deterministic replay: a stated number of training steps a frame |
+//! | marginalization | taking old frames out of the window; what they knew stays as the prior |
+//! | packet | a frame on its way through tracking, with its inertial samples and results |
+//! | seal | the moment after which our threads allocate nothing |
+//! | seed | a new Gaussian at a pixel of an anchor, at its stereo depth |
+//! | slot | a place in a pool of fixed size |
+//! | step | one training step: a view rendered, compared, and the Gaussians moved |
+//! | track | a point that the frontend follows from frame to frame, by id |
 
 // The world of points for unit tests (tests/bench/world.rs) names this crate as integration tests do.
 #[cfg(test)]
