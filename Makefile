@@ -47,9 +47,10 @@ test-onnx:
 	if [ -n "$$lib" ]; then STIPPLE_ONNXRUNTIME=$$(realpath $$lib) cargo test --locked --test onnx -- --ignored; \
 	else echo "left out: the tests of tests/onnx.rs that need ONNX Runtime, which pip could not fetch"; fi
 
-# A minute of garbage for the tracker and the estimator.
+# A minute of garbage for the tracker and the estimator, then MINUTES of a run whose memory, files and threads are watched.
+MINUTES ?= 5
 soak: deps
-	cargo test --locked --test soak -- --ignored
+	STIPPLE_SOAK_MINUTES=$(MINUTES) cargo test --locked --test soak -- --ignored --nocapture --test-threads 1
 
 # Times of each stage of tracker and estimator, and frames a second on one thread and on two; a minute and a half.
 bench-odometry: deps

@@ -1,6 +1,11 @@
+//! What is only seen after a while.
+//!
 //! Garbage into the estimator and the tracker, mixed with good stretches: what they say stays finite, what
 //! they refuse is counted, nothing panics, and they recover. A few seconds of it in `make test`, a
 //! minute of it in `make soak`. The cases are drawn by proptest from a fixed seed.
+//!
+//! The program itself for minutes, with a map, in `make soak MINUTES=n`: once it has warmed up it takes no more
+//! memory, files and threads. A leak within `LEAK_MAX_PER_HOUR` ends no flight of an hour.
 #![allow(clippy::unwrap_used)]
 
 #[allow(dead_code)] // each test takes of it what it needs
@@ -10,12 +15,14 @@ mod world;
 use glam::DVec3;
 use proptest::prelude::*;
 use proptest::test_runner::{Config, TestRunner};
+use std::process::{Command, Stdio};
 use std::sync::Arc;
+use std::time::{Duration, Instant};
 use stipple::config::{FrontendConfig, VioConfig};
 use stipple::frontend::{Frontend, Prediction, Track, Tracks};
 use stipple::vio::{Update, Vio};
-use stipple_drivers::sim::euroc_rig;
-use stipple_drivers::{Frames, Image, ImuSample, Nanos, Pose};
+use stipple_drivers::sim::{euroc_rig, write_euroc, Scenario, Sim};
+use stipple_drivers::{Frames, Image, ImuSample, Nanos, Pose, Span};
 use world::{Noise, Path, World, FRAME_SECS, RATE_HZ};
 
 /// Frames of good data at the end: a divergence noticed, a start, and time to settle.
@@ -244,4 +251,74 @@ fn garbage_is_refused_and_forgotten() {
 fn garbage_for_a_minute() {
     estimator(90);
     tracker(100);
+}
+
+/// What a flight of an hour can spare, bytes: a sixteenth of the memory of the smallest board.
+const LEAK_MAX_PER_HOUR: f64 = 64.0 * 1024.0 * 1024.0;
+/// What the resident set moves by though nothing is lost: pages bought at boot and touched for the first time, bytes.
+const RSS_SLACK: f64 = 2.0 * 1024.0 * 1024.0;
+/// Images being read when looked at.
+const FILES_SLACK: usize = 2;
+
+/// What the kernel says of a process.
+#[derive(Clone, Copy, Debug)]
+struct Resources {
+    rss_bytes: f64,
+    files: usize,
+    threads: usize,
+}
+
+fn resources(pid: u32) -> Option<Resources> {
+    let status = std::fs::read_to_string(format!("/proc/{pid}/status")).ok()?;
+    let field = |name: &str| status.lines().find_map(|l| l.strip_prefix(name))?.split_whitespace().next()?.parse().ok();
+    let (kib, threads): (usize, usize) = (field("VmRSS:")?, field("Threads:")?);
+    let files = std::fs::read_dir(format!("/proc/{pid}/fd")).ok()?.count();
+    Some(Resources { rss_bytes: 1024.0 * kib as f64, files, threads })
+}
+
+fn most(seen: &[Resources]) -> Resources {
+    let of = |get: fn(&Resources) -> f64| seen.iter().map(get).fold(0.0, f64::max);
+    Resources {
+        rss_bytes: of(|r| r.rss_bytes),
+        files: of(|r| r.files as f64) as usize,
+        threads: of(|r| r.threads as f64) as usize,
+    }
+}
+
+#[test]
+#[ignore = "minutes of it: make soak MINUTES=5"]
+fn a_run_of_minutes_takes_no_more_memory_files_and_threads() {
+    let minutes: f64 = std::env::var("STIPPLE_SOAK_MINUTES").map_or(5.0, |m| m.parse().expect("a number of minutes"));
+    let dir = tempfile::tempdir().unwrap();
+    let (data, out) = (dir.path().join("flight"), dir.path().join("out"));
+    let mut scenario = Scenario::named("demo").unwrap();
+    (scenario.image_divisor, scenario.duration) = (4, Span::from_secs(60.0 * minutes));
+    write_euroc(&mut Sim::new(&scenario).unwrap(), &data, |_, _| {}).unwrap();
+    let mut child = Command::new(env!("CARGO_BIN_EXE_stipple"))
+        .current_dir(env!("CARGO_MANIFEST_DIR"))
+        .args(["run", "board-configs/lavapipe.toml", "--set", "map.scale=1"])
+        .args(["--dataset", data.to_str().unwrap(), "--out", out.to_str().unwrap()])
+        .stdout(Stdio::null())
+        .stderr(Stdio::null())
+        .spawn()
+        .unwrap();
+    // Ends before the flight does: evaluation and report take what they need.
+    let (begun, mut seen) = (Instant::now(), vec![]);
+    while begun.elapsed().as_secs_f64() < 60.0 * minutes - 2.0 {
+        seen.push(resources(child.id()).unwrap_or_else(|| panic!("ended after {:?}", begun.elapsed())));
+        if seen.len() % 15 == 0 {
+            eprintln!("{:.0} s: {:?}", begun.elapsed().as_secs_f64(), seen[seen.len() - 1]);
+        }
+        std::thread::sleep(Duration::from_secs(1));
+    }
+    assert!(child.wait().unwrap().success());
+    let third = seen.len() / 3;
+    let (warm, late) = (most(&seen[third..2 * third]), most(&seen[2 * third..]));
+    eprintln!("middle third {warm:?}, last third {late:?}");
+    let leak = LEAK_MAX_PER_HOUR * minutes / 60.0 / 3.0;
+    assert!(late.rss_bytes <= warm.rss_bytes + leak + RSS_SLACK, "{warm:?} then {late:?}");
+    assert!(late.files <= warm.files + FILES_SLACK && late.threads <= warm.threads, "{warm:?} then {late:?}");
+    let report: serde_json::Value = serde_json::from_slice(&std::fs::read(out.join("report.json")).unwrap()).unwrap();
+    assert_eq!(report["heap_after_seal"], 0);
+    assert!(report["frames"].as_f64().unwrap() > 0.95 * 20.0 * 60.0 * minutes, "{}", report["frames"]);
 }
