@@ -47,7 +47,7 @@ pub struct Consistency {
     /// Mean over the flights, by time since the start, s.
     pub over_time: Vec<(f64, f64)>,
     pub mean: f64,
-    /// Of position, rotation, velocity, gyro and accelerometer bias: three dimensions each.
+    /// NEES of position, rotation, velocity, gyro and accelerometer bias: three dimensions each.
     pub blocks: [f64; 5],
     /// 95 % of the means at one instant lie between these.
     pub bounds: (f64, f64),
@@ -115,12 +115,12 @@ pub fn told_the_truth(flights: usize) -> Consistency {
     consistency_of(told, flights)
 }
 
-/// With the default settings, which claim less than they know.
+/// NEES of the default settings, which claim less than they know.
 pub fn at_the_defaults(flights: usize) -> Consistency {
     consistency_of(|_| {}, flights)
 }
 
-/// What frames of a quality turned out to be.
+/// Errors of the frames within a range of quality.
 #[derive(Clone, Copy, Debug)]
 pub struct Bin {
     /// Both ends belong to it.
@@ -178,7 +178,7 @@ pub fn by_quality(flights: &[Vec<Record>], ends: &[u8]) -> Vec<Bin> {
     bins
 }
 
-/// What a run says of consistency: an estimator told the world's own noise, and one at the defaults.
+/// NEES of two estimators: an estimator told the world's own noise, and one at the defaults.
 pub fn summary(told: &Consistency, defaults: &Consistency) -> Table {
     let rows = [("told the world's own noise", told), ("at the defaults", defaults)];
 

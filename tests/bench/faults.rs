@@ -22,7 +22,7 @@ use stipple_drivers::sim::{Scenario, Sim};
 use stipple_drivers::types::pose_at;
 use stipple_drivers::{Fault, Frames, Nanos, Span, TimedPose};
 
-/// Of the flight; all faults strike at `STRIKES_S`, when it has been under way for three seconds, and at least four seconds
+/// Length of the flight, s; all faults strike at `STRIKES_S`, when it has been under way for three seconds, and at least four seconds
 /// follow each.
 const FLIGHT_S: f64 = 8.0;
 const AFTER_S: f64 = 4.0;
@@ -31,7 +31,7 @@ const STRIKES_S: f64 = 4.0;
 const TRUTH_HOLE: Span = Span(100_000_000);
 /// Frames in order after which odometry is itself again: a quarter of a second.
 const HEALTHY_FRAMES: usize = 5;
-/// What tells a fault.
+/// Counters that tell a fault.
 const DETECTORS: [&str; 22] = [
     "frames_missing",
     "frames_not_newer",
@@ -57,7 +57,7 @@ const DETECTORS: [&str; 22] = [
     "resets",
 ];
 
-/// What a drone that holds its place within 0.1 m needs of odometry whatever fails: no jump beyond that, and odometry back
+/// Bounds for a drone that holds its place within 0.1 m, whatever fails: no jump beyond that, and odometry back
 /// within a second, in which a velocity that is wrong by 0.1 m/s has carried it as far.
 const JUMP_MAX_M: f64 = 0.1;
 const RECOVERED_MAX_S: f64 = 1.0;
@@ -126,7 +126,7 @@ impl Case {
         JUMP_MAX_M.max(BLIND_SHARE * flown)
     }
 
-    /// What is wrong with a flight, beside one without a fault.
+    /// The first thing that is not as it has to be, beside a flight without a fault.
     fn complaint(&self, o: &Outcome, plain: &Outcome) -> Option<String> {
         let risen = |name: &str| o.count(name) - plain.count(name).min(o.count(name));
         let wrong = if o.injected == 0 {
@@ -161,11 +161,11 @@ struct Outcome {
     detected: Vec<(&'static str, u64)>,
     /// Frames of the flight without a pose.
     lost: usize,
-    /// From the end of the fault until odometry was itself again, s.
+    /// Time from the end of the fault until odometry was itself again, s.
     recovered_s: Option<f64>,
     health: Health,
     ate_m: Option<f64>,
-    /// Of what came after the fault, aligned by itself.
+    /// ATE of the part after the fault, aligned by itself, m.
     after_m: Option<f64>,
     /// Error of the motion from the last pose before the fault to the first after it.
     jump_m: Option<f64>,

@@ -12,7 +12,7 @@ pub const BEFORE: f64 = 1.0;
 /// Cameras expose between inertial samples, s after one.
 const OFFSET: f64 = 0.0012;
 
-/// Where a flight goes, what is there to be seen, and what is done to its sensors.
+/// A flight: its path, the points to be seen, and what is done to its sensors.
 #[derive(Clone)]
 pub struct Plan {
     pub pose: fn(f64) -> Pose,
@@ -59,7 +59,7 @@ pub fn frame_time(frame: usize) -> f64 {
     BEFORE + frame as f64 * FRAME_SECS + OFFSET
 }
 
-/// What is true at an instant.
+/// The truth at an instant.
 #[derive(Clone, Copy, Debug)]
 pub struct Truth {
     pub pose: Pose,
@@ -69,7 +69,7 @@ pub struct Truth {
 }
 
 /// A frame as the estimator left it.
-pub struct Seen<'a> {
+pub struct EstimatedFrame<'a> {
     pub frame: usize,
     pub t: Nanos,
     pub truth: Truth,
@@ -78,7 +78,7 @@ pub struct Seen<'a> {
 }
 
 /// Flies a plan; `each` sees every frame that arrived. Same seed, same flight.
-pub fn fly(plan: &Plan, seed: u64, mut each: impl FnMut(&Seen)) -> Vio {
+pub fn fly(plan: &Plan, seed: u64, mut each: impl FnMut(&EstimatedFrame)) -> Vio {
     let mut noise = stream(seed, 1);
     let points = (plan.scene)(&mut noise);
     let mut world = World::seen_from(plan.pose, points, stream(seed, 2));
@@ -114,7 +114,7 @@ pub fn fly(plan: &Plan, seed: u64, mut each: impl FnMut(&Seen)) -> Vio {
             gyro_bias: world.gyro_bias,
             accel_bias: world.accel_bias,
         };
-        each(&Seen { frame, t: tracks.t, truth, update: &update, vio: &vio });
+        each(&EstimatedFrame { frame, t: tracks.t, truth, update: &update, vio: &vio });
     }
     vio
 }
@@ -132,7 +132,7 @@ pub fn estimate_from_truth(estimate: &Pose, truth: &Pose) -> Pose {
 }
 
 /// Errors [p, θ, v, bg, ba] of the newest estimate, `None` without one. `to_estimate` as above.
-pub fn errors(seen: &Seen, to_estimate: &Pose) -> Option<[DVec3; 5]> {
+pub fn errors(seen: &EstimatedFrame, to_estimate: &Pose) -> Option<[DVec3; 5]> {
     let o = seen.update.odometry?;
     let truth = *to_estimate * seen.truth.pose;
     Some([

@@ -47,7 +47,7 @@ pub fn quick() -> Vec<Input> {
     vec![named(NAMED[0])]
 }
 
-/// Those whose files are in the folder of recordings; the simulated flights in any case.
+/// Inputs whose files are in the folder of recordings, and the simulated flights in any case.
 pub fn all(recordings: Option<&Path>) -> Result<Vec<Input>, Fault> {
     let folder = folder(recordings)?;
     let mut inputs: Vec<Input> = NAMED.into_iter().map(named).collect();
@@ -76,7 +76,7 @@ pub fn all(recordings: Option<&Path>) -> Result<Vec<Input>, Fault> {
     Ok(inputs)
 }
 
-/// Of recordings.
+/// The folder of recordings: the one named, otherwise $STIPPLE_RECORDINGS, otherwise one beside the project.
 pub fn folder(recordings: Option<&Path>) -> Result<PathBuf, Fault> {
     match recordings {
         Some(folder) if folder.is_dir() => Ok(folder.to_path_buf()),

@@ -21,7 +21,7 @@ const QUICK_SECONDS: f64 = 1.5;
 /// Caps of the pool, Gaussians.
 const CAPS: [u32; 4] = [20_000, 52_000, 100_000, 200_000];
 const QUICK_CAPS: [u32; 2] = [1_500, 3_000];
-/// What the ablations run at: the published system's count on V1_01.
+/// Cap of the ablations, Gaussians: the published system's count on V1_01.
 const ABLATED_CAP: u32 = 52_000;
 /// (Gaussian, tile) pairs bought a Gaussian of the cap: twice what views of V1_01 list of 52 k.
 const INTERSECTIONS: u32 = 15;
@@ -54,7 +54,7 @@ const LINES: [Variant; 2] = [
     ),
 ];
 
-/// What the map is without, or with, one part. The first row of the table is the default.
+/// The method without, or with, one part. The first row of the table is the default.
 const ABLATIONS: [Variant; 12] = [
     variant("no burst", "a new anchor waits for its turn", &["map.burst_iterations=0"]),
     variant("no densification", "seeds on bare depth only", &["map.densify_max=0"]),
@@ -73,7 +73,7 @@ const ABLATIONS: [Variant; 12] = [
 /// Quality of the map at equal time: against the cap of Gaussians, and without parts of the method
 #[derive(clap::Args)]
 pub struct Args {
-    /// As for replay; without it the simulated flight of the demo
+    /// Recording, as for replay; without it the simulated flight of the demo
     dataset: Option<PathBuf>,
     /// Folder for the results
     #[arg(long, value_name = "DIR")]
@@ -84,7 +84,7 @@ pub struct Args {
     /// Skip odometry, as for replay
     #[arg(long, value_name = "CSV")]
     poses: Option<PathBuf>,
-    /// Of mapping, each run
+    /// Seconds of mapping of each run
     #[arg(long, value_name = "S", value_parser = crate::seconds)]
     seconds: Option<f64>,
     /// Two small caps and one ablation
@@ -95,7 +95,7 @@ pub struct Args {
     set: Vec<String>,
 }
 
-/// What a run was and what came of it.
+/// A run and its report.
 struct Row {
     variant: Variant,
     cap: u32,
@@ -162,7 +162,7 @@ fn assignments(variant: &Variant, cap: u32, seconds: f64) -> Vec<String> {
 }
 
 impl Row {
-    /// Of a training step, seeding and evaluation of coverage included, ms.
+    /// Time of a training step, seeding and evaluation of coverage included, ms.
     fn step_ms(&self, seconds: f64) -> Option<f64> {
         self.report.iterations.filter(|n| *n > 0).map(|n| 1e3 * seconds / n as f64)
     }
@@ -260,7 +260,7 @@ fn over_time(sweep: &Sweep) -> Option<String> {
     Chart { title, x: "mapping, s", y: "PSNR, dB", series: series.collect(), ..Chart::default() }.svg()
 }
 
-/// What raising the cap does to the first line.
+/// One sentence: what raising the cap does to the first line.
 fn conclusion(sweep: &Sweep) -> String {
     let default: Vec<&Row> = sweep.caps.iter().filter(|r| r.variant.name == LINES[0].name).collect();
     let (Some(low), Some(high)) = (default.first(), default.last()) else { return "nothing was run".into() };

@@ -13,7 +13,7 @@ use stipple::output::panel::Picture;
 use stipple::output::OutputDir;
 use stipple_drivers::Fault;
 
-/// On top of the reports' style: series of ink 3 are points without a line, of which only a first dot stays, for the
+/// Style added to that of the reports: series of ink 3 are points without a line, of which only a first dot stays, for the
 /// legend.
 pub const STYLE: &str = ".line.ink3 { stroke-width: 5.2; stroke-dasharray: 0 9999; } .dot.ink3 { fill: var(--ink3); opacity: .6; } \
     .wide-table { overflow-x: auto; } .wide-table td, .wide-table th { padding-left: 10px; font-size: 13.5px; } \
@@ -65,17 +65,17 @@ pub const fn number(name: &'static str, unit: &'static str, digits: usize) -> He
     Head { name, unit, digits, scale: 1.0 }
 }
 
-/// What is measured in metres.
+/// A column of what is measured in metres.
 pub const fn millimetres(name: &'static str, digits: usize) -> Head {
     Head { scale: 1e3, ..number(name, "mm", digits) }
 }
 
-/// What is measured as a share.
+/// A column of what is measured as a share.
 pub const fn percent(name: &'static str, digits: usize) -> Head {
     Head { scale: 100.0, ..number(name, "%", digits) }
 }
 
-/// What is measured in bytes.
+/// A column of what is measured in bytes.
 pub const fn mebibytes(name: &'static str) -> Head {
     Head { scale: 1.0 / 1048576.0, ..number(name, "MiB", 1) }
 }
@@ -183,7 +183,7 @@ impl Table {
         self.rows.iter().map(|(_, cells)| self.heads.iter().zip(cells).map(value).collect::<Map<_, _>>()).collect()
     }
 
-    /// As a table in Markdown.
+    /// The table in Markdown.
     pub fn text(&self) -> String {
         let head: Vec<String> = self.heads.iter().map(Head::text).collect();
         let rows: Vec<Vec<String>> = self.rows.iter().map(|(_, cells)| self.shown(cells, "-").collect()).collect();

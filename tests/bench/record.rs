@@ -18,7 +18,7 @@ use stipple_drivers::paced::Images;
 use stipple_drivers::sim::Scenario;
 use stipple_drivers::{Calibration, Fault, Frames, ImuSample, Span};
 
-/// Of the simulated flight, s.
+/// Length of the simulated flight, s.
 const FLIGHT_S: f64 = 8.0;
 
 /// One pass over the flight.
@@ -26,7 +26,7 @@ struct Pass {
     records: bool,
     tracked: usize,
     overwritten: u64,
-    /// From taking a frame to its pose, ms.
+    /// Time from taking a frame to its pose, ms.
     ms_p50: f64,
     ms_p99: f64,
     recorded: Vec<(&'static str, u64)>,
@@ -91,12 +91,12 @@ impl Flight {
 /// Odometry's time a frame with recording and without, in turns in real time, and what the recorder keeps up with
 #[derive(clap::Args)]
 pub struct Args {
-    /// As for replay; without it a simulated flight at 752x480
+    /// Recording, as for replay; without it a simulated flight at 752x480
     dataset: Option<PathBuf>,
     /// Folder for the results
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
-    /// Of each kind
+    /// Passes with a recorder, and as many without
     #[arg(long, value_name = "N", default_value = "3", value_parser = clap::value_parser!(u64).range(1..=100))]
     passes: u64,
 }

@@ -23,9 +23,9 @@ pub fn default_board(set: &[String]) -> Result<Board, Fault> {
     Board::parse(BOARD_NAME, BOARD, set)
 }
 
-/// What every run of a bench plays.
+/// The input of every run of a bench, and its settings.
 pub struct Source {
-    /// As for replay; without it the simulated flight of the demo.
+    /// Recording, as for replay; without it the simulated flight of the demo.
     pub dataset: Option<PathBuf>,
     pub board: Option<PathBuf>,
     /// Table of poses in place of odometry.

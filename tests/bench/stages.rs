@@ -1,7 +1,7 @@
 //! `stipple-bench stages`: the time of each stage of tracker and estimator and of whole frames of both, on one thread; then
 //! the program's own figures of whole runs on one thread and on two.
 //!
-//! On frames that the simulator renders and, where the recordings are, on MH_01. Calls are timed one by one, and their median
+//! Frames are rendered by the simulator and, where the recordings are, those of MH_01. Calls are timed one by one, and their median
 //! is given: the shortest takes 40 times what reading the clock does.
 
 use crate::inputs;
@@ -34,10 +34,10 @@ const SECONDS: f64 = 8.0;
 const FRAMES_BEFORE: usize = 120;
 /// Length of the simulated flight of the whole runs, s.
 const RUN_S: f64 = 11.0;
-/// What a stage is called for, s, and how often at least.
+/// Time for which a stage is called, s, and how often at least.
 const STAGE_S: f64 = 0.7;
 const CALLS_MIN: usize = 10;
-/// What each is called for in a quick run, which only shows that it runs.
+/// The same in a quick run, which only shows that it runs.
 const QUICK_S: f64 = 0.0;
 
 /// Times of tracker and estimator by stage, and of whole runs; a minute and a half
@@ -59,7 +59,7 @@ struct Timed {
     flight: &'static str,
     stage: String,
     calls: usize,
-    /// Of a call, s.
+    /// Time of a call, s.
     median_s: f64,
     p90_s: f64,
 }

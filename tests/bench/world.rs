@@ -115,7 +115,7 @@ pub struct World {
     next_id: u64,
     noise: Noise,
     walk: Noise,
-    /// As they are now; they walk as the calibration says.
+    /// Present values, rad/s and m/s²; they walk as the calibration says.
     pub gyro_bias: DVec3,
     pub accel_bias: DVec3,
     pose: Box<dyn Fn(f64) -> Pose>,

@@ -16,15 +16,15 @@ use serde_json::json;
 use std::path::PathBuf;
 use std::time::Instant;
 use stipple::config::{GpuConfig, StereoConfig};
-use stipple::gpu::Gpu;
-use stipple::map::pipeline::{LearningRates, Pipeline, Shape, StepStats, Tiling, Weights};
+use stipple::gpu::{Gpu, Timing};
+use stipple::map::pipeline::{LearningRates, Pipeline, Shape, StepStats, Tiling, View, Weights};
 use stipple::output::chart::{bars, Chart, Series};
 use stipple::output::OutputDir;
 use stipple_drivers::Fault;
 
 const SIZES: [(usize, usize); 4] = [(320, 240), (376, 240), (752, 480), (1280, 720)];
 const COUNTS: [usize; 4] = [10_000, 50_000, 200_000, 500_000];
-/// What the other axis is held at.
+/// The axis that is not swept is held at these.
 const SIZE: (usize, usize) = (752, 480);
 const COUNT: usize = 50_000;
 /// Counts and size that trainers on a CPU are quoted at.
@@ -39,7 +39,7 @@ const INTERSECTIONS_MAX: usize = 4 << 20;
 /// Large enough that every Gaussian moves, small enough that the picture stays what it was.
 const RATES: LearningRates = LearningRates { position: 1e-4, scale: 1e-3, rotation: 1e-3, opacity: 1e-3, colour: 1e-3 };
 
-/// What a training step costs by kernel, against what the device could do
+/// Time of a training step by kernel, against what the device could do
 #[derive(clap::Args)]
 pub struct Args {
     /// Folder for the results
@@ -75,12 +75,12 @@ struct Cost {
 struct Case {
     name: String,
     counts: Counts,
-    /// On the device, every command timed: the sum of `kernels`.
+    /// Time on the device with every command timed, ms: the sum of `kernels`.
     timed_ms: f64,
-    /// On the device and on the clock, no command timed.
+    /// Time on the device and on the clock with no command timed, ms.
     device_ms: f64,
     wall_ms: f64,
-    /// On the host, to record, encode and submit, while the step before runs.
+    /// Time of the host to record, encode and submit, while the step before runs, ms.
     host_ms: f64,
     arena_bytes: u64,
     /// Gaussians listed for a tile that has any, and for the one that has most.
@@ -93,7 +93,7 @@ struct Bench {
     device: String,
     tiling: Tiling,
     peaks: Peaks,
-    /// By N at `SIZE`, by resolution at `COUNT`; `SMALL`, and the recorded scene.
+    /// Cases by N at `SIZE`, by resolution at `COUNT`; `SMALL`, and the recorded scene.
     by_count: Vec<Case>,
     by_size: Vec<Case>,
     single: Vec<Case>,
@@ -159,9 +159,8 @@ fn measure(config: &GpuConfig, scene: &Scene, tiling: Tiling, peaks: &Peaks, qui
     p.append(&mut gpu, &scene.splats)?;
     p.set_keyframe(&mut gpu, 0, &scene.image)?;
     p.set_mask(&mut gpu, &scene.mask)?;
-    let mut last = StepStats::default();
     let mut step = |gpu: &mut Gpu| -> Result<f64, Fault> {
-        last = p.train(gpu, &scene.view, 0, &RATES, &Weights::default())?;
+        p.train(gpu, &scene.view, 0, &RATES, &Weights::default())?;
         Ok(gpu.last_submit_ms())
     };
     let first = Instant::now();
@@ -177,20 +176,8 @@ fn measure(config: &GpuConfig, scene: &Scene, tiling: Tiling, peaks: &Peaks, qui
         timed_ms += step(&mut gpu)?;
     }
     let timings: Vec<_> = gpu.timings().to_vec();
-    gpu.time_commands(0);
-    // As the mapper trains: a step is started before the one before it is finished.
-    let (start, mut device_ms, mut host_ms) = (Instant::now(), 0.0, 0.0);
-    let mut under_way = None;
-    for i in 0..=steps {
-        let begun = Instant::now();
-        let next = (i < steps).then(|| p.start(&mut gpu, &scene.view, 0, &RATES, &Weights::default())).transpose()?;
-        host_ms += begun.elapsed().as_secs_f64() * 1e3;
-        if let Some(step) = std::mem::replace(&mut under_way, next) {
-            last = p.finish(&mut gpu, &step)?;
-            device_ms += gpu.last_submit_ms();
-        }
-    }
-    let (wall_ms, per) = (start.elapsed().as_secs_f64() * 1e3, 1.0 / steps as f64);
+    let per = 1.0 / steps as f64;
+    let ([wall_ms, device_ms, host_ms], last) = overlapped(&mut gpu, &mut p, &scene.view, steps)?;
     let counts = Counts {
         splats: n as f64,
         visible: f64::from(last.stats.visible),
@@ -198,22 +185,9 @@ fn measure(config: &GpuConfig, scene: &Scene, tiling: Tiling, peaks: &Peaks, qui
         pixels: (camera.width * camera.height) as f64,
         tile_pixels: tiling.tile().iter().map(|n| f64::from(*n)).product(),
     };
-    let mut kernels: Vec<Cost> = timings
-        .iter()
-        .zip(&before)
-        .filter(|(t, before)| t.count > before.0)
-        .map(|(t, before)| {
-            let calls = (t.count - before.0) as f64 * per;
-            let (bytes, flops) = counts.model(t.name, calls);
-            let ms = (t.total_ms - before.1) * per;
-            Cost { name: t.name, calls, ms, bytes, flops, roof_ms: peaks.ms(bytes, flops) }
-        })
-        .collect();
-    kernels.sort_by(|a, b| b.ms.total_cmp(&a.ms));
     let (list_mean, list_longest) = lists(&mut gpu, &p)?;
     let case = Case {
         name: scene.name.clone(),
-        counts,
         timed_ms: timed_ms * per,
         device_ms: device_ms * per,
         wall_ms: wall_ms * per,
@@ -221,7 +195,8 @@ fn measure(config: &GpuConfig, scene: &Scene, tiling: Tiling, peaks: &Peaks, qui
         arena_bytes: gpu.arena_used(),
         list_mean,
         list_longest,
-        kernels,
+        kernels: costs(&timings, &before, &counts, peaks, per),
+        counts,
     };
     eprintln!(
         "{:<32} {:>8} intersections, {:.0} to {} a tile: {:.3} ms of device a step, {:.1} steps/s",
@@ -233,6 +208,38 @@ fn measure(config: &GpuConfig, scene: &Scene, tiling: Tiling, peaks: &Peaks, qui
         case.steps_per_s()
     );
     Ok(case)
+}
+
+/// Trains as the mapper does, a step started before the one before it is finished, no command timed. Answers the time on the
+/// clock, on the device and on the host, ms.
+fn overlapped(gpu: &mut Gpu, p: &mut Pipeline, view: &View, steps: usize) -> Result<([f64; 3], StepStats), Fault> {
+    gpu.time_commands(0);
+    let (start, mut device_ms, mut host_ms) = (Instant::now(), 0.0, 0.0);
+    let (mut under_way, mut last) = (None, StepStats::default());
+    for i in 0..=steps {
+        let begun = Instant::now();
+        let next = (i < steps).then(|| p.start(gpu, view, 0, &RATES, &Weights::default())).transpose()?;
+        host_ms += begun.elapsed().as_secs_f64() * 1e3;
+        if let Some(step) = std::mem::replace(&mut under_way, next) {
+            last = p.finish(gpu, &step)?;
+            device_ms += gpu.last_submit_ms();
+        }
+    }
+    Ok(([start.elapsed().as_secs_f64() * 1e3, device_ms, host_ms], last))
+}
+
+/// Costs of the kernels that ran, the dearest first: timings less those `before`, `per` step.
+fn costs(timings: &[Timing], before: &[(u64, f64)], counts: &Counts, peaks: &Peaks, per: f64) -> Vec<Cost> {
+    let cost = |(t, before): (&Timing, &(u64, f64))| {
+        let calls = (t.count - before.0) as f64 * per;
+        let (bytes, flops) = counts.model(t.name, calls);
+        let ms = (t.total_ms - before.1) * per;
+        Cost { name: t.name, calls, ms, bytes, flops, roof_ms: peaks.ms(bytes, flops) }
+    };
+    let ran = timings.iter().zip(before).filter(|(t, before)| t.count > before.0);
+    let mut costs: Vec<Cost> = ran.map(cost).collect();
+    costs.sort_by(|a, b| b.ms.total_cmp(&a.ms));
+    costs
 }
 
 /// Mean and largest length of the lists of tiles, of those that have one.

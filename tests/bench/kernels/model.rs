@@ -75,14 +75,14 @@ pub fn measure(gpu: &mut Gpu, quick: bool) -> Result<Peaks, Fault> {
     Ok(Peaks { bytes_per_s: 32.0 * f64::from(n) / copy_s, flops_per_s: flops / fma_s })
 }
 
-/// What a step had to do with.
+/// Sizes of the work of one step.
 #[derive(Clone, Copy, Debug)]
 pub struct Counts {
     pub splats: f64,
     pub visible: f64,
     pub intersections: f64,
     pub pixels: f64,
-    /// Of a tile.
+    /// Pixels of one tile.
     pub tile_pixels: f64,
 }
 

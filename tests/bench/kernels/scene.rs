@@ -1,4 +1,4 @@
-//! What `bench kernels` trains on: a wall of Gaussians, or those that a recording's stereo depth gives.
+//! Scenes that `stipple-bench kernels` trains on: a wall of Gaussians, or those that a recording's stereo depth gives.
 
 use glam::DVec3;
 use std::path::Path;
@@ -18,7 +18,7 @@ pub struct Scene {
     pub mask: Vec<u8>,
 }
 
-/// Of a seed: as the mapper's.
+/// Opacity of a seed, as the mapper's.
 const SEED_OPACITY_LOGIT: f32 = 0.0;
 
 /// SplitMix64 to [0, 1).
@@ -132,7 +132,7 @@ mod tests {
     use stipple_drivers::sim::{write_euroc, Scenario, Sim};
     use stipple_drivers::Span;
 
-    /// What a build without OpenCV has.
+    /// The only method of a build without OpenCV.
     #[test]
     fn a_scene_is_seeded_from_depth_that_the_gpu_matches() {
         let mut scenario = Scenario::named("demo").unwrap();

@@ -9,7 +9,7 @@ use stipple::vio::Vio;
 use stipple_drivers::host::thread_cpu;
 use stipple_drivers::{Fault, TimedPose};
 
-/// What is not measured is `None`: no error without a trajectory.
+/// Figures of one flight; `None` is not measured: no error without a trajectory.
 #[derive(Clone, Debug, Default)]
 pub struct Figures {
     pub ate_m: Option<f64>,
@@ -22,7 +22,7 @@ pub struct Figures {
     pub estimator_ms_p99: f64,
     /// CPU time of the thread, inertial samples included: what other programs take is not in it.
     pub cpu_ms_per_frame: f64,
-    /// By the wall clock.
+    /// Frames a second by the wall clock.
     pub fps_one_thread: f64,
     /// Frames that gave a pose.
     pub tracked: usize,

@@ -56,7 +56,7 @@ struct Row {
     figures: Figures,
 }
 
-/// What is known of an input once its frames are dropped.
+/// Facts of an input that stay when its frames are dropped.
 struct Flown {
     name: String,
     about: String,
@@ -160,7 +160,7 @@ fn knee(points: &[Option<(f64, f64)>]) -> Option<usize> {
     Some(candidates.take(1).find(|(i, t)| *i == 0 && *t <= AS_FAST * ms).map_or(fastest, |c| c.0))
 }
 
-/// Where the default and the knee are.
+/// One sentence: the default and the knee.
 fn conclusion(sweep: &Sweep) -> String {
     let said = |s: usize| {
         let figures = sweep.overall(s).map(|o| {

@@ -27,7 +27,7 @@ const SHAPES: [Named; 4] = [
 ];
 /// A name and its assignments.
 type Named = (&'static str, &'static [&'static str]);
-/// Where the defaults stand among the shapes.
+/// Place of the defaults among the shapes.
 const DEFAULT_SHAPE: usize = 1;
 pub const DEFAULT: &str = "default";
 
@@ -41,7 +41,7 @@ pub struct Setting {
 /// A curve of the plots: settings by index, along the parameter.
 pub struct Curve {
     pub name: &'static str,
-    /// What each point is, for the axis of the reader: a value or a name.
+    /// Value or name of each point.
     pub values: Vec<String>,
     pub settings: Vec<usize>,
 }

@@ -1,4 +1,4 @@
-//! What goes wrong on a flight through the made-up world, a case each: where it flies, what fails and
+//! Faults on a flight through the synthetic world, a case each: where it flies, what fails and
 //! when, what is expected of the estimator, and how far off it may be.
 
 use super::{Case, Limits, Verdict};
@@ -12,8 +12,8 @@ use stipple_drivers::{ImuSample, Nanos, Pose};
 
 /// Frames during which passing faults last; t = 5 s is frame 80.
 const AT: usize = 80;
-/// In the place of a bound, where the estimate cannot help being wrong: that it says so, and that the restart's covariance
-/// holds the truth, is asked of every case.
+/// No bound, where the estimate cannot help being wrong: every case is asked to say so, and that the restart's covariance
+/// holds the truth.
 const SAID: f64 = f64::INFINITY;
 /// Ends with the flight.
 const EVER: usize = usize::MAX;

@@ -26,8 +26,8 @@ use stipple_drivers::{Fault, TimedPose};
 const QUALITY_LOW: u8 = 20;
 /// An estimate that is wrong is detected when this share of its frames say so.
 const SAID_SHARE: f64 = 0.9;
-/// An estimate can be relied on when this many frames in order warn of nothing, a quarter of a second, and who does follows what
-/// stands for longer than a tenth.
+/// Frames in a row that warn of nothing before an estimate can be relied on (a quarter of a second), and frames for which an
+/// error must stand for a controller to follow it (more than a tenth).
 const CLEAN_FRAMES: usize = 5;
 const FOLLOWED_FRAMES: usize = 3;
 /// An estimate that is further off must say so: a drone that holds its place within 0.1 m would leave it, m.
@@ -37,7 +37,7 @@ const THREE_SIGMA: f64 = 3.76;
 /// Frames into a fault that lasts for which the jump is taken.
 const JUMP_FRAMES: usize = 20;
 
-/// In the order of how bad it is.
+/// Outcome of a case, in the order of how bad it is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Verdict {
     Survived,
@@ -86,7 +86,7 @@ struct Case {
     health: Health,
 }
 
-/// What became of a case: the worst over the seeds flown.
+/// Figures of a case: the worst over the seeds flown.
 #[derive(Clone, Debug)]
 pub struct Row {
     pub name: &'static str,
@@ -114,7 +114,7 @@ pub struct Row {
 }
 
 impl Row {
-    /// What is wrong with it, if anything is.
+    /// The first thing that is not as it has to be.
     pub fn complaint(&self) -> Option<String> {
         let over = |v: Option<f64>, max: f64| v.is_some_and(|v| v > max);
         // A fault that lasts may end the next start too.
@@ -295,7 +295,7 @@ pub fn table(rows: &[Row]) -> Table {
     ])
 }
 
-/// What the estimator counted in each case.
+/// The estimator's counters in each case.
 fn counters(rows: &[Row]) -> Table {
     let names = rows.first().map_or(vec![], |r| r.stats.counters().iter().map(|c| count(c.0)).collect());
     Table::new("counters", "Counters", rows, &[vec![text("case")], names].concat(), |r| {
@@ -304,7 +304,7 @@ fn counters(rows: &[Row]) -> Table {
     })
 }
 
-/// What becomes of the estimator when something goes wrong: one row a case
+/// Outcome of everything that may go wrong on a flight: one row a case
 #[derive(clap::Args)]
 pub struct Args {
     /// Folder for the results

@@ -25,7 +25,7 @@ const AS_IS: Light = (1.0, 0.0);
 
 struct Shown {
     name: &'static str,
-    /// By frame and camera.
+    /// Gain and offset by frame and camera.
     light: fn(usize, usize) -> Light,
     expect: Verdict,
     limits: Limits,

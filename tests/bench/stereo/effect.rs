@@ -1,4 +1,4 @@
-//! What the method of depth does to the map: the same recording mapped with each, at equal time of mapping.
+//! Effect of the method of depth on the map: the same recording mapped with each, at equal time of mapping.
 //!
 //! Depth is only asked for at anchors, so a method is paid once an anchor and shows in the first seconds of a map;
 //! its time counts as mapping.

@@ -39,7 +39,7 @@ const FLIGHTS: [Flown; 8] = [
     flown("V2_02_medium", 10.0, 58),
 ];
 
-/// Those whose paths are in the folder of recordings; invented ones in any case.
+/// Flights whose paths are in the folder of recordings; invented ones in any case.
 pub fn sets(folder: &Path) -> Result<Vec<Set>, Fault> {
     FLIGHTS.iter().filter_map(|f| f.set(folder).transpose()).collect()
 }

@@ -1,4 +1,4 @@
-//! What is measured: every method of disparity that a board can name.
+//! The methods of disparity that a board can name, each run on pairs of one size.
 
 use std::time::Instant;
 use stipple::config::{Board, GpuConfig, StereoConfig, StereoMethod};
@@ -16,7 +16,7 @@ pub struct Runner {
     pub device: String,
 }
 
-/// What the board says of stereo and the GPU, but for method and range.
+/// The board's `[stereo]` and `[gpu]`, whose method and range of disparities are replaced.
 pub struct Base {
     pub stereo: StereoConfig,
     pub gpu: GpuConfig,

@@ -36,7 +36,7 @@ const RANGES_M: [f64; 6] = [0.5, 1.0, 2.0, 4.0, 8.0, 20.0];
 const TIMED: [u32; 2] = [64, 128];
 const REPEATS: usize = 5;
 const LONG_MS: f64 = 5000.0;
-/// What a quick run looks at.
+/// The sets of a quick run.
 const QUICK: [&str; 2] = ["hard_occlusion", "hard_black_eye"];
 
 /// Disparity of every method against truth: Middlebury, simulated flights, hard cases, time
@@ -53,10 +53,10 @@ pub struct Args {
     /// Board file whose [stereo] and [gpu] to use, and of the map the rest; the methods' own defaults without it
     #[arg(long, value_name = "FILE")]
     board: Option<PathBuf>,
-    /// Of the map: skip odometry, as for replay
+    /// Skip odometry in the maps, as for replay
     #[arg(long, value_name = "CSV", requires = "dataset")]
     poses: Option<PathBuf>,
-    /// Of mapping, with each method
+    /// Seconds of mapping with each method
     #[arg(long, value_name = "S", value_parser = crate::seconds, requires = "dataset")]
     seconds: Option<f64>,
     /// Override a key of the board file
@@ -67,7 +67,7 @@ pub struct Args {
     quick: bool,
 }
 
-/// Of mapping when not stated, s.
+/// Time of mapping when not stated, s.
 const MAPPING_S: f64 = 60.0;
 
 /// A method on a set.

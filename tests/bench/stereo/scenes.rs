@@ -86,7 +86,7 @@ fn nearest(patches: &[Patch], from: DVec3, ray: DVec3) -> Option<(usize, f64, [f
     met.min_by(|a, b| a.1.total_cmp(&b.1))
 }
 
-/// Of a pixel, fractions included; the image's centre is the axis.
+/// The ray of a pixel, fractions included; the image's centre is the axis.
 fn ray(x: f64, y: f64) -> DVec3 {
     DVec3::new((x - (WIDTH - 1) as f64 / 2.0) / FOCAL_PX, (y - (HEIGHT - 1) as f64 / 2.0) / FOCAL_PX, 1.0)
 }
@@ -122,20 +122,20 @@ fn truth(patches: &[Patch]) -> (Vec<f32>, Vec<bool>) {
     (0..WIDTH * HEIGHT).map(of).unzip()
 }
 
-/// What is done to the right eye.
+/// What is wrong with the right camera.
 #[derive(Clone, Copy)]
-struct Eye {
+struct RightCamera {
     lower_px: f64,
     gain: f64,
 }
 
-const FAIR: Eye = Eye { lower_px: 0.0, gain: 1.0 };
+const FAIR: RightCamera = RightCamera { lower_px: 0.0, gain: 1.0 };
 const GRAIN: Paint = Paint::Grain(0.012);
 
-fn pair(name: &'static str, about: &'static str, patches: &[Patch], eye: Eye) -> Set {
+fn pair(name: &'static str, about: &'static str, patches: &[Patch], camera: RightCamera) -> Set {
     let mut noise = stream(3, 1);
     let left = draw(patches, DVec3::ZERO, 0.0, 0.9, &mut noise);
-    let right = draw(patches, DVec3::X * BASELINE_M, eye.lower_px, 0.9 * eye.gain, &mut noise);
+    let right = draw(patches, DVec3::X * BASELINE_M, camera.lower_px, 0.9 * camera.gain, &mut noise);
     let (truth, visible) = truth(patches);
     Set {
         name: name.to_string(),
@@ -166,7 +166,7 @@ fn floor() -> Patch {
     Patch { corner, u: DVec3::X * 12.0, v: DVec3::Z * 11.0, paint: Paint::Grain(0.02) }
 }
 
-/// By the names that tests and report have for them.
+/// The hard cases, by the names that tests and report have for them.
 pub fn hard() -> Vec<Set> {
     let plain = [Patch::facing([-0.9, 0.9], [-0.55, 0.55], 1.999, Paint::Plain), wall(2.0)];
     // A period of 14 px at 2 m: every disparity has as good a one beside it.
@@ -180,8 +180,13 @@ pub fn hard() -> Vec<Set> {
         pair("hard_slanted", "a floor 0.7 m below, from 1.4 to 12 m", &[floor(), wall(12.0)], FAIR),
         pair("hard_thin", "poles of 1, 2, 3, 4 and 6 px at 1.2 m before a wall at 3 m", &poles(), FAIR),
         pair("hard_occlusion", "a box at 1 m before a wall at 3 m", &box_before_wall(), FAIR),
-        pair("hard_exposure", "half the light in the right eye", &box_before_wall(), Eye { gain: 0.5, ..FAIR }),
-        pair("hard_misaligned", "the right eye's rows 1 px low", &box_before_wall(), Eye { lower_px: 1.0, ..FAIR }),
+        pair("hard_exposure", "half the light in the right eye", &box_before_wall(), RightCamera { gain: 0.5, ..FAIR }),
+        pair(
+            "hard_misaligned",
+            "the right eye's rows 1 px low",
+            &box_before_wall(),
+            RightCamera { lower_px: 1.0, ..FAIR },
+        ),
         dark,
     ]
 }

@@ -100,7 +100,7 @@ impl Tally {
     }
 }
 
-/// Of a method on a set, or on what of it lies within a range of depths.
+/// Score of a method on a set, or on the part of it within a range of depths.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Score {
     pub all: Tally,

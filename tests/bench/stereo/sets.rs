@@ -12,9 +12,9 @@ use stipple_drivers::{Camera, Fault, FaultKind, Frames, Image, Lens, Pose, RigCa
 pub struct Pair {
     pub left: Image,
     pub right: Image,
-    /// Of the left image, px; negative where unknown.
+    /// Disparity of the left image, px; negative where unknown.
     pub truth: Vec<f32>,
-    /// Whether the right eye sees it too.
+    /// The right camera sees it too.
     pub visible: Vec<bool>,
 }
 
@@ -40,7 +40,7 @@ const MIDDLEBURY_DISPARITIES: u32 = 64;
 /// Disparities that differ by more between the eyes are of two surfaces, px.
 const SAME_PX: f32 = 1.0;
 
-/// Those in the folder of recordings.
+/// Middlebury's pairs that are in the folder of recordings.
 pub fn middlebury(folder: &Path) -> Result<Vec<Set>, Fault> {
     let mut sets = vec![];
     for name in MIDDLEBURY {
@@ -63,7 +63,7 @@ pub fn middlebury(folder: &Path) -> Result<Vec<Set>, Fault> {
     Ok(sets)
 }
 
-/// Where the right image's disparity is known and agrees at the place that the left one's points to.
+/// Pixels whose disparity in the right image is known and agrees at the place that the left one's points to.
 fn visible(width: usize, left: &[f32], right: &[f32]) -> Vec<bool> {
     let of = |i: usize| {
         let x = (i % width) as f32 - left[i];

@@ -32,7 +32,7 @@ fn each(name: &str, judge: impl Fn(&str, &Pair, &Disparity, &Score)) {
     }
 }
 
-/// Of visible pixels: bad1, bad2, density.
+/// Shares of visible pixels: bad1, bad2, density.
 fn figures(score: &Score) -> [f64; 3] {
     let s = &score.visible;
     [s.bad1(), s.bad2(), s.density()].map(|v| v.unwrap_or(0.0))
