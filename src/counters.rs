@@ -16,7 +16,7 @@ stipple_drivers::counters! {
     /// Frames refused: stamped no later than the last.
     frames_not_newer,
     /// Frames refused: stamped more than a second ahead of their arrival.
-    frames_leapt,
+    frames_timestamp_jump,
     /// Frames refused: a camera gave the picture before once more.
     frames_frozen,
     /// Frames of which a camera saw nothing: covered, or its light out.
@@ -27,20 +27,21 @@ stipple_drivers::counters! {
     camera_lost,
     camera_silent,
     camera_away_ms,
-    /// Times that one camera was lost while the others went on, and how long it was away, ms.
-    eye_lost,
-    eye_away_ms,
+    /// Times that one camera was lost while the others went on, and how long it was away altogether, ms.
+    one_camera_lost,
+    one_camera_away_ms,
     /// Inertial samples that did not fit between two frames.
     imu_overflow,
-    /// As of the frames.
+    /// Inertial samples that never came, by their stamps; those refused as not newer than the last, and as stamped too far
+    /// ahead of their arrival.
     imu_missing,
     imu_not_newer,
-    imu_leapt,
+    imu_timestamp_jump,
     /// Samples of a unit that repeats itself: twenty and more alike to the last bit.
     imu_frozen,
     /// Samples with an axis at the end of its range, as the source says.
     imu_saturated,
-    /// As of the cameras.
+    /// Times that the inertial unit was lost, and times that it fell silent; how long it was away altogether, ms.
     imu_lost,
     imu_silent,
     imu_away_ms,
@@ -66,7 +67,7 @@ stipple_drivers::counters! {
     keyframe_store_full,
     /// Anchors not made because their pair could not be matched.
     depth_failures,
-    /// Anchors not made because their pair showed no depth: an eye is covered, or nothing has detail.
+    /// Anchors not made because their pair showed no depth: a camera is covered, or nothing has detail.
     depth_absent,
     /// Seeds that did not fit into the pool.
     splats_full,

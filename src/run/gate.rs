@@ -99,8 +99,11 @@ impl FrameGate {
     }
 
     pub fn admit(&mut self, frames: &Frames, now: Instant, c: &Counters) -> bool {
-        let counters =
-            StampCounters { missing: &c.frames_missing, not_newer: &c.frames_not_newer, jumped: &c.frames_leapt };
+        let counters = StampCounters {
+            missing: &c.frames_missing,
+            not_newer: &c.frames_not_newer,
+            jumped: &c.frames_timestamp_jump,
+        };
         if !self.stamps.admit(frames.t, now, &counters) {
             return false;
         }
@@ -134,7 +137,8 @@ pub struct ImuGate {
 
 impl ImuGate {
     pub fn admit(&mut self, reading: &ImuReading, now: Instant, c: &Counters) -> bool {
-        let counters = StampCounters { missing: &c.imu_missing, not_newer: &c.imu_not_newer, jumped: &c.imu_leapt };
+        let counters =
+            StampCounters { missing: &c.imu_missing, not_newer: &c.imu_not_newer, jumped: &c.imu_timestamp_jump };
         let sample = reading.sample;
         if !self.stamps.admit(sample.t, now, &counters) {
             return false;

@@ -246,7 +246,7 @@ pub fn camera(mailbox: &Mailbox, source: &mut dyn FrameSource, tracking: &Waker,
         said: None,
         told: false,
     };
-    let mut eye = Liveness { name: "one camera", lost: &c.eye_lost, away_ms: &c.eye_away_ms, ..liveness };
+    let mut eye = Liveness { name: "one camera", lost: &c.one_camera_lost, away_ms: &c.one_camera_away_ms, ..liveness };
     let mut span = None;
     while !mailbox.stop.load(Relaxed) {
         let frames = packet.writable().expect("it was taken as such, and nobody else has it");

@@ -105,7 +105,8 @@ fn counted(flown: &Flown, opened: &[(&'static str, u64)]) -> Vec<(&'static str, 
 /// Fills in the tracking figures; answers the trajectory.
 fn track_figures(report: &mut Report, flown: &Flown) -> Vec<TimedPose> {
     let c = &flown.counters;
-    let lost = [&c.frames_overwritten, &c.frames_unreadable, &c.frames_not_newer, &c.frames_leapt, &c.frames_frozen];
+    let lost =
+        [&c.frames_overwritten, &c.frames_unreadable, &c.frames_not_newer, &c.frames_timestamp_jump, &c.frames_frozen];
     let dropped = lost.iter().map(|counter| counter.get()).sum();
     report.frames_dropped = Some(dropped);
     report.frames = Some((flown.frames as u64).saturating_sub(dropped));

@@ -35,17 +35,17 @@ const HEALTHY_FRAMES: usize = 5;
 const DETECTORS: [&str; 22] = [
     "frames_missing",
     "frames_not_newer",
-    "frames_leapt",
+    "frames_timestamp_jump",
     "frames_frozen",
     "frames_blank",
     "frames_without_imu",
     "frames_overwritten",
     "camera_lost",
     "camera_silent",
-    "eye_lost",
+    "one_camera_lost",
     "imu_missing",
     "imu_not_newer",
-    "imu_leapt",
+    "imu_timestamp_jump",
     "imu_frozen",
     "imu_saturated",
     "imu_lost",
@@ -86,7 +86,7 @@ fn cases() -> Vec<Case> {
     };
     let unseen = |unseen, name, rule| Case { unseen, ..case(name, rule, "", &[]) };
     let grey = "nothing: no sum guards a grey picture";
-    let eye = |rule: Rule, camera| Rule { camera: Some(camera), ..rule };
+    let one_camera = |rule: Rule, camera| Rule { camera: Some(camera), ..rule };
     let some = |rule: Rule| Rule { probability: 0.2, ..rule };
     let by = |rule: Rule, by_s: f64| Rule { by_s, ..rule };
     use Kind::*;
@@ -99,10 +99,10 @@ fn cases() -> Vec<Case> {
         unseen(grey, "frames: 1000 bits flipped in each image, 0.5 s", Rule { bits: 1000, ..lasting(BitFlip, 0.5) }),
         case("frames: black, 0.5 s", lasting(Blackout, 0.5), "frames_blank", &[]),
         case("frames: none, 1 s", lasting(Gap, 1.0), "frames_missing", &["camera_silent"]),
-        case("frames: stamps 60 s ahead, 0.2 s", by(lasting(StampJump, 0.2), 60.0), "frames_leapt", &[]),
+        case("frames: stamps 60 s ahead, 0.2 s", by(lasting(StampJump, 0.2), 60.0), "frames_timestamp_jump", &[]),
         case("frames: stamps 60 s back, 0.2 s", by(lasting(StampJump, 0.2), -60.0), "frames_not_newer", &[]),
-        case("left camera unplugged, 2 s", eye(lasting(Unplug, 2.0), 0), "frames_blank", &["eye_lost"]),
-        case("right camera unplugged, 2 s", eye(lasting(Unplug, 2.0), 1), "frames_blank", &["eye_lost"]),
+        case("left camera unplugged, 2 s", one_camera(lasting(Unplug, 2.0), 0), "frames_blank", &["one_camera_lost"]),
+        case("right camera unplugged, 2 s", one_camera(lasting(Unplug, 2.0), 1), "frames_blank", &["one_camera_lost"]),
         case("both unplugged, 0.5 s", lasting(Unplug, 0.5), "", &["camera_lost"]),
         case("both unplugged, 1 s", lasting(Unplug, 1.0), "", &["camera_lost"]),
         case("both unplugged, 2 s", lasting(Unplug, 2.0), "", &["camera_lost", "resets"]),
@@ -113,7 +113,7 @@ fn cases() -> Vec<Case> {
         case("samples: frozen, 0.2 s", lasting(Freeze, 0.2), "imu_frozen", &[]),
         case("samples: one in five with a bit flipped, 0.5 s", some(lasting(BitFlip, 0.5)), "", &["imu_repaired"]),
         case("samples: none, 0.5 s", lasting(Gap, 0.5), "imu_missing", &["imu_silent"]),
-        case("samples: stamps 60 s ahead, 0.1 s", by(lasting(StampJump, 0.1), 60.0), "imu_leapt", &[]),
+        case("samples: stamps 60 s ahead, 0.1 s", by(lasting(StampJump, 0.1), 60.0), "imu_timestamp_jump", &[]),
         case("unit unplugged, 1 s", lasting(Unplug, 1.0), "", &["imu_lost"]),
     ]
 }

@@ -44,6 +44,8 @@ const AROUND: Span = Span(100 * MS);
 /// them, 5.4 and 7.4 mm; 7 us off the inertial ones 2 mm. At twice the width and height they are 2.1 and 6.1 mm.
 const RMS_MAX: f64 = 0.005;
 const WORST_MAX: f64 = 0.01;
+/// Of a pose, as odometry states it with two dozen landmarks in view, m.
+const STATED_DEVIATION: f64 = 0.004;
 const PATIENCE: Duration = Duration::from_secs(60);
 
 fn environment(name: &str) -> PathBuf {
@@ -181,8 +183,22 @@ impl Devices {
         let frames = r["frames"].as_u64().unwrap();
         let lost = r["frames_dropped"].as_u64().unwrap() + count(r, "camera_images_unpaired");
         println!("{} and {} pictures sent, {pairs} pairs: {frames} tracked, {lost} counted", left.len(), right.len());
-        assert!(frames * 10 >= 9 * self.stamps.len() as u64, "the machine is fast enough for nine in ten");
+        // One picture in thirty may be lost to a machine that is slow: two in a row, after which the tracker may not find its
+        // points again, then come less than once a flight.
+        assert!(frames * 30 >= 29 * self.stamps.len() as u64, "{frames} of {}", self.stamps.len());
         [pairs, frames, lost]
+    }
+
+    /// PSNR of pictures without any detail, each of its own mean grey, against those of the left camera, dB.
+    fn plain_grey_db(&self) -> f64 {
+        let film = fs::read(self.flight.join("cam0.grey")).unwrap();
+        let variance = |picture: &[u8]| {
+            let n = picture.len() as f64;
+            let mean = picture.iter().map(|p| f64::from(*p)).sum::<f64>() / n;
+            picture.iter().map(|p| (f64::from(*p) - mean).powi(2)).sum::<f64>() / n
+        };
+        let of_all: Vec<f64> = film.chunks_exact(self.size.0 * self.size.1).step_by(20).map(variance).collect();
+        10.0 * (255.0f64.powi(2) * of_all.len() as f64 / of_all.iter().sum::<f64>()).log10()
     }
 
     /// A board file of them.
@@ -355,7 +371,9 @@ fn flight_through_the_kernel_is_the_flight_from_a_folder() {
         rms_seen * 1e3,
         worst_seen * 1e3
     );
-    assert!(n as u64 + count(&r, "frames_without_odometry") == frames && n * 10 >= frames as usize * 9);
+    // A drone waits for its pose before it takes off: a second is enough for that.
+    let without = count(&r, "frames_without_odometry");
+    assert!(n as u64 + without == frames && without <= u64::from(FPS), "{n} of {frames}");
     assert!(rms < RMS_MAX && worst < WORST_MAX && worst_seen < 0.001);
     assert_eq!((&r["heap_after_seal"], &r["pace"]), (&0.into(), &"live".into()));
     let quiet = ["camera_lost", "camera_silent", "imu_lost", "imu_silent", "imu_missing", "imu_frozen", "imu_overflow"];
@@ -372,7 +390,9 @@ fn map_is_trained_on_what_the_cameras_see() {
     println!("{}", counted(&r));
     let trained = ["anchors", "splats", "iterations", "psnr_db"].map(|name| r[name].as_f64().unwrap());
     println!("anchors, Gaussians, steps, dB: {trained:?}");
-    assert!(trained.iter().all(|n| *n > 0.0));
+    // A map that shows the scene: its error is at most half of that of pictures without any detail.
+    let plain = devices.plain_grey_db();
+    assert!(trained.iter().all(|n| *n > 0.0) && trained[3] > plain + 3.0, "{plain} dB without detail");
     assert_eq!(r["heap_after_seal"], 0);
 
     // What comes while the mapper has the one processor may meet no free buffer; the kernel's numbers say so.
@@ -397,10 +417,10 @@ fn flight_goes_on_after_a_plug_was_pulled() {
     let r = report(&dir.join("out"));
     println!("{}", counted(&r));
     // The other camera flies on meanwhile.
-    for (name, n) in [("eye_lost", 1), ("camera_losses", 1), ("camera_returns", 1), ("camera_lost", 0)] {
+    for (name, n) in [("one_camera_lost", 1), ("camera_losses", 1), ("camera_returns", 1), ("camera_lost", 0)] {
         assert_eq!(count(&r, name), n, "{name}");
     }
-    assert!((1000..4000).contains(&count(&r, "eye_away_ms")));
+    assert!((1000..4000).contains(&count(&r, "one_camera_away_ms")));
     assert_eq!(r["heap_after_seal"], 0);
     devices.samples_are_whole(dir);
     let lost = ["imu_missing", "imu_samples_missing", "imu_edges_unmatched", "imu_edges_refused", "imu_clock_slips"];
@@ -409,7 +429,8 @@ fn flight_goes_on_after_a_plug_was_pulled() {
     let given = replayed(dir, &dir.join("board.toml"), "given");
     let (n, rms, worst) = apart(&devices, &dir.join("out"), &given);
     println!("{n} poses against the replay of what was given: {:.2} mm rms, {:.2} mm at most", rms * 1e3, worst * 1e3);
-    assert!(worst < 0.1);
+    // Three times the deviation that odometry states for a pose of this flight: beyond it the poses would contradict that.
+    assert!(worst < 3.0 * STATED_DEVIATION, "{:.2} mm", worst * 1e3);
     let last = devices.picture(trajectory(&dir.join("out")).last().unwrap().0);
     assert_eq!(last + 1, devices.stamps.len(), "the last picture has a pose");
 }
