@@ -503,11 +503,31 @@ fn damaged_images_are_counted_and_name_their_row() {
         assert_eq!(reader.counters().images_undecodable + reader.counters().images_wrong_size, 2);
     }
     let f = Folder::new();
-    fs::remove_file(f.path(&format!("cam0/data/{T0}.png"))).unwrap();
-    let r = f.open().unwrap();
-    let mut reader = r.reader();
-    let read = reader.read(0, &mut Frames::for_rig(&r.calibration));
-    assert_eq!((read, reader.counters().images_missing), (Err(ImageFault::Missing), 1));
+    let path = f.path(&format!("cam0/data/{T0}.png"));
+    let read = |fault| {
+        let r = f.open().unwrap();
+        let mut reader = r.reader();
+        assert_eq!(reader.read(0, &mut Frames::for_rig(&r.calibration)), Err(fault));
+        reader.counters().clone()
+    };
+    fs::remove_file(&path).unwrap();
+    assert_eq!(read(ImageFault::Missing).images_missing, 1);
+    // Neither waited for nor read without end.
+    std::os::unix::fs::symlink("/dev/zero", &path).unwrap();
+    assert_eq!(read(ImageFault::Missing).images_missing, 1);
+    fs::remove_file(&path).unwrap();
+    fs::File::create(&path).unwrap().set_len(1 << 40).unwrap();
+    assert_eq!(read(ImageFault::Undecodable).images_undecodable, 1);
+}
+
+#[test]
+fn images_are_taken_from_the_recording_alone() {
+    for file in ["../../cam1/data/1.png", "/etc/passwd", "a/b.png", ".."] {
+        let f = Folder::new();
+        f.edit("cam0/data.csv", 3, |_| format!("{},{file}", T0 + FRAME));
+        let r = f.open().unwrap();
+        assert_eq!((r.counters.rows_malformed, r.frames.iter().any(|f| f.t.0 == T0 + FRAME)), (1, false), "{file}");
+    }
 }
 
 proptest! {

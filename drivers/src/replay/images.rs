@@ -75,6 +75,9 @@ impl Reader {
     }
 }
 
+/// Largest image file: 16 megapixels of three 16-bit colours, not compressed.
+const FILE_BYTES_MAX: u64 = 96 << 20;
+
 /// A fault, and what is said of it.
 type Why = (ImageFault, String);
 
@@ -85,9 +88,7 @@ fn read_image(
     out: &mut Image,
     colour: Option<&mut Colour>,
 ) -> Result<(), Why> {
-    let missing = |e: std::io::Error| (ImageFault::Missing, format!("cannot read: {e}"));
-    bytes.clear();
-    std::fs::File::open(&file.path).and_then(|mut f| f.read_to_end(bytes)).map_err(missing)?;
+    read_file(file, bytes)?;
     if bytes.starts_with(b"\x89PNG") {
         read_png(bytes, decoded, out, colour)
     } else if bytes.starts_with(b"\xff\xd8") {
@@ -100,9 +101,25 @@ fn read_image(
     }
 }
 
+/// The bytes of a file: of a plain one, as a pipe would wait for ever, and no more than `FILE_BYTES_MAX`.
+fn read_file(file: &ImageFile, bytes: &mut Vec<u8>) -> Result<(), Why> {
+    let missing = |e: std::io::Error| (ImageFault::Missing, format!("cannot read: {e}"));
+    let about = std::fs::metadata(&file.path).map_err(missing)?;
+    if !about.is_file() {
+        return Err((ImageFault::Missing, "is not a plain file".to_string()));
+    }
+    if about.len() > FILE_BYTES_MAX {
+        return Err(undecodable(format_args!("{} bytes, more than any image of a camera", about.len())));
+    }
+    bytes.clear();
+    std::fs::File::open(&file.path).and_then(|f| f.take(FILE_BYTES_MAX).read_to_end(bytes)).map_err(missing)?;
+    Ok(())
+}
+
 /// Whether an image has colour; `None` where its header cannot be read.
 fn is_coloured(file: &ImageFile) -> Option<bool> {
-    let bytes = std::fs::read(&file.path).ok()?;
+    let mut bytes = Vec::new();
+    read_file(file, &mut bytes).ok()?;
     if bytes.starts_with(b"\x89PNG") {
         let mut decoder = png::Decoder::new(Cursor::new(&bytes));
         decoder.set_transformations(png::Transformations::EXPAND);

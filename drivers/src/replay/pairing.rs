@@ -42,8 +42,10 @@ pub fn image_lists(
         return Err(Fault::new(FaultKind::Config, mav0.display().to_string(), what, fix));
     }
     let list = |k: usize| list_path(mav0, k);
+    // A name alone: a path could lead out of the recording.
+    let is_name = |file: &str| Path::new(file).file_name().is_some_and(|name| name == file);
     let parse = |fields: &[&str]| match fields {
-        [t, file] if !file.is_empty() => Some(ImageRow { t: Nanos(t.parse().ok()?), file: file.to_string() }),
+        [t, file] if is_name(file) => Some(ImageRow { t: Nanos(t.parse().ok()?), file: file.to_string() }),
         _ => None,
     };
     let read = |k: usize| {
