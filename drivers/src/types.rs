@@ -134,16 +134,10 @@ impl Frames {
 }
 
 /// A rigid transform `a_from_b`: `p_a = q * p_b + p`. `q` is kept normalised.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Pose {
     pub q: DQuat,
     pub p: DVec3,
-}
-
-impl Default for Pose {
-    fn default() -> Self {
-        Pose::IDENTITY
-    }
 }
 
 impl Pose {

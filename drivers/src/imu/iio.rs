@@ -9,7 +9,7 @@
 use super::bus::BusFault;
 use super::counters::ImuCounters;
 use super::error::ImuError;
-use super::iio_scan::{channel, Channel, Element, Kind, Scan};
+use super::iio_scan::{channel, Channel, Element, Scan, Storage};
 use super::merge::{pass, Merge, Reading};
 use super::timeline::Timeline;
 use super::{pause, watermark};
@@ -385,11 +385,11 @@ fn enable_channels(folder: &Path) -> Result<Vec<Element>, Fault> {
             continue;
         }
         let element = || {
-            let kind = Kind::parse(&read_text(&scan.join(format!("in_{name}_type")))?)?;
+            let storage = Storage::parse(&read_text(&scan.join(format!("in_{name}_type")))?)?;
             let index = read_number(&scan.join(format!("in_{name}_index")))? as u32;
             let offset = attribute(folder, name, "offset").unwrap_or(0.0);
             let scale = attribute(folder, name, "scale").unwrap_or(1.0);
-            Some(Element { channel, index, kind, offset, scale })
+            Some(Element { channel, index, storage, offset, scale })
         };
         elements.push(element().ok_or_else(|| {
             let place = scan.join(format!("in_{name}_type")).display().to_string();

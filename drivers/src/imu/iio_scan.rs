@@ -10,30 +10,23 @@ use glam::DVec3;
 
 /// How a channel is stored, as its `_type` says.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Kind {
+pub struct Storage {
     pub big_endian: bool,
     pub signed: bool,
     pub bits: u32,
     /// Bytes of one value.
-    pub storage: usize,
+    pub bytes: usize,
     pub repeat: usize,
     pub shift: u32,
 }
 
-impl Kind {
+impl Storage {
     /// `None` where the text is no type, or one that does not fit its storage.
-    pub fn parse(text: &str) -> Option<Kind> {
+    pub fn parse(text: &str) -> Option<Storage> {
         let (order, rest) = text.trim().split_once(':')?;
-        let big_endian = match order {
-            "be" => true,
-            "le" => false,
-            _ => return None,
-        };
-        let signed = match rest.get(..1)? {
-            "s" => true,
-            "u" => false,
-            _ => return None,
-        };
+        // Whether it is the second of two words, or none of them.
+        let second = |words: [&str; 2], word: &str| words.iter().position(|w| *w == word).map(|i| i == 1);
+        let (big_endian, signed) = (second(["le", "be"], order)?, second(["u", "s"], rest.get(..1)?)?);
         let (bits, rest) = rest[1..].split_once('/')?;
         let (stored, shift) = rest.split_once(">>")?;
         let (stored, repeat) = match stored.split_once('X') {
@@ -42,15 +35,15 @@ impl Kind {
         };
         let (bits, stored, shift): (u32, u32, u32) = (bits.parse().ok()?, stored.parse().ok()?, shift.parse().ok()?);
         let fits = (1..=64).contains(&bits) && [8, 16, 32, 64].contains(&stored) && bits.checked_add(shift)? <= stored;
-        let storage = stored as usize / 8;
-        (fits && (1..=4).contains(&repeat)).then_some(Kind { big_endian, signed, bits, storage, repeat, shift })
+        let bytes = stored as usize / 8;
+        (fits && (1..=4).contains(&repeat)).then_some(Storage { big_endian, signed, bits, bytes, repeat, shift })
     }
 
-    /// The value that the first `storage` bytes hold.
+    /// The value that the first bytes hold.
     pub fn value(self, bytes: &[u8]) -> i64 {
         let mut word = [0u8; 8];
-        for (i, byte) in bytes[..self.storage].iter().enumerate() {
-            word[if self.big_endian { self.storage - 1 - i } else { i }] = *byte;
+        for (i, byte) in bytes[..self.bytes].iter().enumerate() {
+            word[if self.big_endian { self.bytes - 1 - i } else { i }] = *byte;
         }
         let unused = 64 - self.bits;
         let value = u64::from_le_bytes(word) >> self.shift << unused;
@@ -100,7 +93,7 @@ pub fn channel(name: &str) -> Channel {
 pub struct Element {
     pub channel: Channel,
     pub index: u32,
-    pub kind: Kind,
+    pub storage: Storage,
     pub offset: f64,
     pub scale: f64,
 }
@@ -120,7 +113,7 @@ impl Scan {
         let mut largest = 1;
         let mut placed = Vec::new();
         for element in elements {
-            let size = element.kind.storage * element.kind.repeat;
+            let size = element.storage.bytes * element.storage.repeat;
             at = at.next_multiple_of(size);
             placed.push((at, element));
             at += size;
@@ -140,7 +133,7 @@ impl Scan {
         let mut reading = Reading::default();
         let mut stamp = None;
         for (at, element) in &self.elements {
-            let value = element.kind.value(&bytes[*at..]);
+            let value = element.storage.value(&bytes[*at..]);
             let si = (value as f64 + element.offset) * element.scale;
             match element.channel {
                 Channel::Accel(i) => (accel[i], raw[i]) = (si, value),
@@ -150,7 +143,7 @@ impl Scan {
                 Channel::Other => {}
             }
             let axis = matches!(element.channel, Channel::Accel(_) | Channel::Gyro(_));
-            reading.saturated |= axis && element.kind.saturated(value);
+            reading.saturated |= axis && element.storage.saturated(value);
         }
         reading.accel = self.has_all(Channel::Accel).then_some(DVec3::from(accel));
         reading.gyro = self.has_all(Channel::Gyro).then_some(DVec3::from(gyro));
@@ -166,17 +159,17 @@ mod tests {
 
     #[test]
     fn types_are_read_as_the_kernel_writes_them() {
-        let kind = Kind::parse("be:s16/16>>0\n").unwrap();
-        assert_eq!(kind, Kind { big_endian: true, signed: true, bits: 16, storage: 2, repeat: 1, shift: 0 });
-        assert_eq!(kind.value(&[0xFF, 0xFE, 9]), -2);
-        let kind = Kind::parse("le:s12/16>>4").unwrap();
-        assert_eq!((kind.value(&[0x0F, 0x80]), kind.value(&[0xF0, 0x7F])), (-2048, 2047));
-        assert!(kind.saturated(2047) && kind.saturated(-2048) && !kind.saturated(-2047));
-        let kind = Kind::parse("le:u24/32>>8").unwrap();
-        assert_eq!(kind.value(&[9, 1, 0, 0x80]), 0x80_0001);
-        let kind = Kind::parse("le:s64/64>>0").unwrap();
-        assert_eq!(kind.value(&i64::MIN.to_le_bytes()), i64::MIN);
-        assert_eq!(Kind::parse("be:s16/16X2>>0").unwrap().repeat, 2);
+        let storage = Storage::parse("be:s16/16>>0\n").unwrap();
+        assert_eq!(storage, Storage { big_endian: true, signed: true, bits: 16, bytes: 2, repeat: 1, shift: 0 });
+        assert_eq!(storage.value(&[0xFF, 0xFE, 9]), -2);
+        let storage = Storage::parse("le:s12/16>>4").unwrap();
+        assert_eq!((storage.value(&[0x0F, 0x80]), storage.value(&[0xF0, 0x7F])), (-2048, 2047));
+        assert!(storage.saturated(2047) && storage.saturated(-2048) && !storage.saturated(-2047));
+        let storage = Storage::parse("le:u24/32>>8").unwrap();
+        assert_eq!(storage.value(&[9, 1, 0, 0x80]), 0x80_0001);
+        let storage = Storage::parse("le:s64/64>>0").unwrap();
+        assert_eq!(storage.value(&i64::MIN.to_le_bytes()), i64::MIN);
+        assert_eq!(Storage::parse("be:s16/16X2>>0").unwrap().repeat, 2);
     }
 
     #[test]
@@ -194,12 +187,12 @@ mod tests {
             "le:s16/16>>-1",
             "le:s4294967295/64>>4294967295",
         ] {
-            assert_eq!(Kind::parse(text), None, "{text}");
+            assert_eq!(Storage::parse(text), None, "{text}");
         }
     }
 
-    fn element(channel: Channel, index: u32, kind: &str, offset: f64, scale: f64) -> Element {
-        Element { channel, index, kind: Kind::parse(kind).unwrap(), offset, scale }
+    fn element(channel: Channel, index: u32, storage: &str, offset: f64, scale: f64) -> Element {
+        Element { channel, index, storage: Storage::parse(storage).unwrap(), offset, scale }
     }
 
     #[test]
@@ -223,9 +216,9 @@ mod tests {
     proptest! {
         #[test]
         fn any_type_and_bytes_are_read_or_refused(text in "[bl]e:[su][0-9]{1,3}/[0-9]{1,3}(X[0-9])?>>[0-9]{1,2}", bytes: [u8; 8]) {
-            if let Some(kind) = Kind::parse(&text) {
-                let value = kind.value(&bytes);
-                prop_assert!(kind.bits == 64 || value.unsigned_abs() < 1 << kind.bits);
+            if let Some(storage) = Storage::parse(&text) {
+                let value = storage.value(&bytes);
+                prop_assert!(storage.bits == 64 || value.unsigned_abs() < 1 << storage.bits);
             }
         }
     }
