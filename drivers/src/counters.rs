@@ -8,6 +8,7 @@ use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 pub struct Counter(AtomicU64);
 
 impl Counter {
+    /// Adds to it.
     pub fn add(&self, n: u64) {
         self.0.fetch_add(n, Relaxed);
     }
@@ -17,6 +18,7 @@ impl Counter {
         self.0.fetch_max(n, Relaxed);
     }
 
+    /// Its value.
     pub fn get(&self) -> u64 {
         self.0.load(Relaxed)
     }

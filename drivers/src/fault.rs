@@ -37,6 +37,7 @@ pub struct Fault {
 }
 
 impl Fault {
+    /// A fault at a place; `fix` may be empty.
     pub fn new(kind: FaultKind, place: impl Into<String>, what: impl Into<String>, fix: impl Into<String>) -> Fault {
         Fault { kind, place: place.into(), what: what.into(), fix: fix.into() }
     }

@@ -245,7 +245,7 @@ struct LastFrames {
 }
 
 impl<S: FrameSource> FaultyFrames<S> {
-    /// `shape` has the shape of the frames that `next` will fill.
+    /// Wraps a rig; `shape` has the shape of the frames that `next` will fill.
     pub fn new(source: S, rules: &[Rule], seed: u64, shape: Frames) -> FaultyFrames<S> {
         let plan = Plan::new(rules, seed, "camera");
         let kept = plan.has(Kind::Freeze) || plan.has(Kind::Duplicate);
@@ -334,6 +334,7 @@ pub struct FaultyImu<S> {
 }
 
 impl<S: ImuSource> FaultyImu<S> {
+    /// Wraps a unit; cameras with the same seed are struck independently.
     pub fn new(source: S, rules: &[Rule], seed: u64) -> FaultyImu<S> {
         // Another random stream than the cameras'.
         FaultyImu { source, plan: Plan::new(rules, seed ^ 0x494D_5500, "imu"), last: ImuReading::default() }

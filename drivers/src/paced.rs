@@ -10,6 +10,7 @@ use std::time::{Duration, Instant};
 /// Images of a recording on disk, or rendered.
 pub enum Images {
     Recording(Reader),
+    /// Frames in memory.
     Rendered(Vec<Frames>),
 }
 
@@ -144,6 +145,7 @@ pub struct PacedImu {
 }
 
 impl PacedImu {
+    /// The samples of a recording, in the order of their stamps.
     pub fn new(samples: Arc<[ImuSample]>, pace: Pace) -> PacedImu {
         PacedImu { samples, pace, next: 0 }
     }

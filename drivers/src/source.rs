@@ -59,7 +59,9 @@ pub trait ImuSource: Send {
 /// The outcome of waiting for a source.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Wait {
+    /// The buffer is filled.
     Got,
+    /// Nothing came in time.
     TimedOut,
     /// Nothing more comes: a recording is over.
     Ended,

@@ -14,6 +14,7 @@ pub struct Nanos(pub i64);
 pub struct Span(pub i64);
 
 impl Nanos {
+    /// An instant before all others.
     pub const MIN: Nanos = Nanos(i64::MIN);
 }
 
@@ -137,6 +138,7 @@ impl Frames {
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Pose {
     pub q: DQuat,
+    /// m
     pub p: DVec3,
 }
 

@@ -12,6 +12,7 @@ use std::sync::Arc;
 #[derive(Clone, Debug, PartialEq)]
 pub struct ImageFile {
     pub path: PathBuf,
+    /// The csv that lists it.
     pub list: Arc<Path>,
     pub line: usize,
 }

@@ -12,6 +12,7 @@ use serde::{Deserialize, Serialize};
 pub enum StampPoint {
     /// What each buffer's flags say: the start of exposure, or the end of the frame.
     Driver,
+    /// The exposure of the first row begins.
     ExposureStart,
     /// The first row is read out: its exposure has ended. CSI receivers call this the start of frame; uvcvideo stamps it where
     /// the camera sends no clock of its own, although it flags the start of exposure.
