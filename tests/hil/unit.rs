@@ -13,11 +13,11 @@ use stipple_drivers::{ImuSample, Nanos, Span};
 
 pub const RATE_HZ: u32 = 200;
 const PERIOD: Span = Span(1_000_000_000 / RATE_HZ as i64);
-/// Of one step, at ±16 g and ±2000 °/s.
+/// One step at ±16 g, m/s², and at ±2000 °/s, rad/s.
 const ACCEL: f64 = 16.0 / 32768.0 * 9.80665;
 const GYRO: f64 = 2000.0 / 32768.0 * std::f64::consts::PI / 180.0;
 
-/// Of accelerometer and gyro, in the order of the registers.
+/// Counts of accelerometer and gyro, in the order of the registers.
 pub type Counts = [i16; 6];
 
 /// Samples that were given, and when.

@@ -40,7 +40,7 @@ pub(super) struct Node {
     pub part: Part,
     /// From frame to frame.
     pub period: Span,
-    /// As the camera says; zero: it does not say.
+    /// The camera's exposure; zero: it does not say.
     pub exposure: Span,
     buffers: Vec<Mapped>,
 }

@@ -62,7 +62,7 @@ pub struct World {
     bank: u8,
     pub fifo: VecDeque<u8>,
     now: i64,
-    /// Of the sensor: parts by which it runs fast, next sample and its number.
+    /// The sensor's clock: how much it runs fast, relative; its next sample, and that sample's number.
     pub fast: f64,
     next: Option<f64>,
     pub sampled: u64,

@@ -20,7 +20,7 @@ pub struct Shot {
     pub sequence: u32,
     pub flags: u32,
     pub bytes: Vec<u8>,
-    /// Of a multi-planar queue: where the picture starts.
+    /// Where the picture starts, in a multi-planar queue.
     pub data_offset: usize,
 }
 
