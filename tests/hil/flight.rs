@@ -38,10 +38,11 @@ const BEFORE: Span = Span(200 * MS);
 const AFTER: Span = Span(250 * MS);
 /// Inertial samples of the recording on either side of its pictures.
 const AROUND: Span = Span(100 * MS);
-/// Largest distances from a replay of what was given, m. What differs is stamps, and what they decide: with two dozen landmarks in view at this
-/// size, a track more or less through the innovation gate moves a pose by its stated deviation, 4 mm. Of replays whose
-/// pictures bear stamps 0.1 us (deviation) off the median is 5.3 mm at most and the worst of 25 is 7.2 mm; 165 us off all of
-/// them, 5.4 and 7.4 mm; 7 us off the inertial ones 2 mm. At twice the width and height they are 2.1 and 6.1 mm.
+/// Largest distances from a replay of what was given, m. What differs is stamps, and what they decide: with two dozen
+/// landmarks in view at this size, a track more or less through the innovation gate moves a pose by its stated deviation,
+/// 4 mm. Of replays whose pictures bear stamps 0.1 us (deviation) off the median is 5.3 mm at most and the worst of 25 is
+/// 7.2 mm; 165 us off all of them, 5.4 and 7.4 mm; 7 us off the inertial ones 2 mm. At twice the width and height they are
+/// 2.1 and 6.1 mm.
 const RMS_MAX: f64 = 0.005;
 const WORST_MAX: f64 = 0.01;
 /// Deviation of a pose, as odometry states it with two dozen landmarks in view, m.
