@@ -83,8 +83,6 @@ stipple_drivers::counters! {
     splats_densified,
     /// Anchors whose view was covered, but badly.
     anchors_for_error,
-    /// Densifications that did not pay, after which less was added.
-    growth_refused,
     /// Anchors whose Gaussians were moved after a correction.
     blocks_moved,
     /// Steps whose (Gaussian, tile) list overflowed.

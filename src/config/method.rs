@@ -238,7 +238,6 @@ section! {
     converge_iterations_max: u32 = 0;
     /// A full pool gives its least important Gaussians for new ones.
     evict: bool = true;
-    growth_stops: bool = false;
     /// Weight of 1 - SSIM beside L1.
     ssim_weight: f64 = 0.2;
     depth_weight: f64 = 0.0;

@@ -138,9 +138,6 @@ pub struct Stored {
     pub placed: Pose,
     pub held_out: bool,
     pub anchor: bool,
-    /// Of its last training step, and which step of the mapper that was; 0: never.
-    pub loss: f64,
-    pub trained_at: u64,
     /// Where its stereo depth is kept, of an anchor.
     pub depth: Option<u32>,
     /// What the mapper found out beside it.
@@ -226,18 +223,7 @@ impl Store {
         let last = self.training.iter().rev().find(|k| self.camera(**k as usize) == self.camera(index));
         refined.exposure.gain = last.map_or(1.0, |&k| self.get(k as usize).refined.exposure.gain);
         let (given, placed) = (world_from_body, world_from_body);
-        self.entries.push(Stored {
-            id,
-            t,
-            given,
-            placed,
-            held_out,
-            anchor: false,
-            depth: None,
-            loss: 0.0,
-            trained_at: 0,
-            refined,
-        });
+        self.entries.push(Stored { id, t, given, placed, held_out, anchor: false, depth: None, refined });
         if !held_out {
             self.training.push(index as u32);
         }

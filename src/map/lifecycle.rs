@@ -19,7 +19,7 @@
 //! least important, if the board lets (`budget`).
 
 use super::anchors::{self, Missing};
-use super::budget::{by_training, threshold, Cost};
+use super::budget::threshold;
 use super::densify::mean;
 use super::eyes;
 use super::pipeline::{PruneRule, StepStats, View};
@@ -48,8 +48,6 @@ macro_rules! seen {
 
 /// Part of a view that must have depth to seed from; the rest is continued from it.
 const DEPTH_MIN: f64 = 0.01;
-/// Steps on an anchor after which what it was given must show.
-const STEPS_OF_PROOF: u32 = 10;
 /// Fewer steps than this and a Gaussian's importance is not known.
 const STEPS_JUDGED: u32 = 30;
 /// Steps a keyframe that anchors count on, however few they were so far: the first, which is all there is to see, and others.
@@ -61,16 +59,6 @@ const EVICTED_MAX: usize = 16;
 /// the pool where others are evicted for it.
 const FREE_SHARE: usize = 8;
 const POOL_SHARE: usize = 16;
-
-/// What densification did, until it is known whether it paid.
-#[derive(Clone, Copy, Debug, Default)]
-pub struct Added {
-    splats: usize,
-    /// Loss at the start of the burst and at its end, and which step of the mapper that was.
-    first: f64,
-    loss: f64,
-    at: u64,
-}
 
 impl Mapper {
     /// Stores the oldest waiting keyframe, and makes it an anchor when the map does not show its view, or not well.
@@ -145,7 +133,7 @@ impl Mapper {
         if self.store.anchors() == 0 {
             self.scene_depth_m = median_depth(&self.depth.metres).unwrap_or(SCENE_DEPTH_M);
         }
-        let whole = self.growth.allowed(self.seeds_of_a_view());
+        let whole = self.seeds_of_a_view();
         let wanted = ((bare + wrong) * whole as f64).ceil() as usize;
         let room = self.make_room(wanted)?;
         if room == 0 && !self.config.evict {
@@ -164,7 +152,6 @@ impl Mapper {
         let entry = self.store.get_mut(index);
         (entry.anchor, entry.placed) = (true, entry.given);
         self.keep_depth(index)?;
-        self.added = Added::default();
         self.schedule.start_burst(index, self.config.burst_iterations);
         Ok(Did::Anchor { seeded })
     }
@@ -202,51 +189,19 @@ impl Mapper {
         Ok(self.room())
     }
 
-    /// What follows from step `number`, on image `index`: the next phase of an anchor, and what growth is measured by.
-    pub(super) fn after_step(&mut self, number: u64, index: usize, done: &StepStats) -> Result<(), GpuError> {
-        let entry = self.store.get_mut(index);
-        let (loss, at) = (entry.loss, entry.trained_at);
-        (entry.loss, entry.trained_at) = (done.loss, number);
-        let steps = number - at;
-        if at == 0 && self.schedule.in_burst() && self.pipeline.newest() == Some(index as u32) {
-            self.added.first = done.loss;
-        }
-        if at > 0 && !self.schedule.on_anchor() {
-            self.growth.observe(loss - done.loss, steps);
-        }
-        match self.schedule.took(done.loss) {
-            Ended::Nothing => {}
-            Ended::Burst(anchor) => {
-                self.added.splats = self.densify(anchor)?;
-                (self.added.loss, self.added.at) = (done.loss, number);
-                let steps = if self.config.growth_stops { STEPS_OF_PROOF } else { 0 };
-                self.schedule.start_convergence(anchor, steps.max(self.config.converge_iterations_max));
-            }
-            Ended::Convergence(_) if self.config.growth_stops && self.added.splats > 0 => self.judge(number, done),
-            Ended::Convergence(_) => {}
+    /// What follows from a step: the next phase of an anchor.
+    pub(super) fn after_step(&mut self, done: &StepStats) -> Result<(), GpuError> {
+        if let Ended::Burst(anchor) = self.schedule.took(done.loss) {
+            self.densify(anchor)?;
+            self.schedule.start_convergence(anchor, self.config.converge_iterations_max);
         }
         Ok(())
     }
 
-    /// Whether what was added to the newest anchor paid for itself.
-    fn judge(&mut self, number: u64, done: &StepStats) {
-        let a = self.added;
-        let by_training = by_training(a.first - a.loss, self.config.burst_iterations, number - a.at);
-        let cost = Cost {
-            pixels: self.pipeline.shape().pixels(),
-            pairs: done.stats.intersections,
-            splats: self.pipeline.count(),
-        };
-        let price = self.growth.price(&cost, number);
-        if !self.growth.judge(a.loss - done.loss - by_training, a.splats, self.store.training().len(), price) {
-            self.counters.growth_refused.add(1);
-        }
-    }
-
-    /// Adds Gaussians where the newest anchor's picture is least like its image, through the lens that trains; how many.
-    fn densify(&mut self, index: usize) -> Result<usize, GpuError> {
+    /// Adds Gaussians where the newest anchor's picture is least like its image, through the lens that trains.
+    fn densify(&mut self, index: usize) -> Result<(), GpuError> {
         if self.config.densify_max == 0 || self.pipeline.newest() != Some(index as u32) {
-            return Ok(0);
+            return Ok(());
         }
         let view = self.view(index);
         self.pipeline.render(&mut self.gpu, &view, &mut self.rendered)?;
@@ -254,7 +209,7 @@ impl Mapper {
         self.pipeline.similarity(&mut self.gpu, goal, &mut self.similarity)?;
         let lacking = 0.5 * (1.0 - mean(&self.similarity, &self.eye(index).valid));
         let wanted = (f64::from(self.config.densify_max) * lacking) as usize;
-        let wanted = self.growth.allowed(wanted.min(self.affordable()));
+        let wanted = wanted.min(self.affordable());
         let wanted = wanted.min(self.make_room(wanted)?);
         let depth = self.pair.as_ref().map_or(&self.depth, |pair| &pair.distance);
         let planes = self.store.planes(index);
@@ -263,6 +218,6 @@ impl Mapper {
         self.arrivals.take(seeds, planes, self.store.exposure(index));
         let added = self.arrivals.append(&mut self.gpu, &mut self.pipeline)?;
         self.counters.splats_densified.add(added as u64);
-        Ok(added)
+        Ok(())
     }
 }

@@ -38,10 +38,8 @@ use crate::gpu::{Gpu, GpuError, Timing};
 use crate::mem::Footprint;
 use crate::stereo::{DepthMap, Stereo};
 use anchors::{Arrivals, Seeder};
-use budget::Growth;
 use eyes::{Eye, Pair};
 use keyframes::{Queue, Store};
-use lifecycle::Added;
 use occupancy::Occupancy;
 use pipeline::{LearningRates, Pipeline, Rendered, Shape, View, Weights};
 use schedule::Schedule;
@@ -84,8 +82,6 @@ pub struct StepReport {
 
 /// A training step that was started and not looked at yet.
 struct UnderWay {
-    /// Steps so far, this one included.
-    number: u64,
     /// Of the image it is on.
     index: usize,
     step: Step,
@@ -116,8 +112,6 @@ pub struct Mapper {
     arrivals: Arrivals,
     /// SSIM of the newest anchor by pixel.
     similarity: Vec<f32>,
-    growth: Growth,
-    added: Added,
     /// Median depth of the first anchor, m: what a position step is measured in.
     scene_depth_m: f64,
     /// Started.
@@ -204,8 +198,6 @@ impl Mapper {
             rendered: Rendered { width, height, grey: blank(), tints: tinted(0), alpha: blank(), depth: blank() },
             arrivals: Arrivals::new(seeds_max, channels),
             similarity: tinted(width * height),
-            growth: Growth::default(),
-            added: Added::default(),
             scene_depth_m: SCENE_DEPTH_M,
             iterations: 0,
             anchored_at: 0,
@@ -306,7 +298,7 @@ impl Mapper {
         let goal = self.goal(index);
         let step = self.pipeline.start(&mut self.gpu, &view, goal, &rates, &weights)?;
         self.iterations += 1;
-        let before = self.under_way.replace(UnderWay { number: self.iterations, index, step });
+        let before = self.under_way.replace(UnderWay { index, step });
         self.take(before)?;
         Ok(Some(if burst { Did::Burst } else { Did::Train }))
     }
@@ -319,14 +311,14 @@ impl Mapper {
 
     /// Waits for a step and takes in what it says.
     fn take(&mut self, step: Option<UnderWay>) -> Result<(), GpuError> {
-        let Some(UnderWay { number, index, step }) = step else { return Ok(()) };
+        let Some(UnderWay { index, step }) = step else { return Ok(()) };
         let done = self.pipeline.finish(&mut self.gpu, &step)?;
         self.loss = done.loss;
         self.counters.intersections_overflow.add(u64::from(done.stats.overflow > 0));
         self.counters.splats_not_finite.add(u64::from(done.stats.failed));
         self.counters.gradients_rejected.add(u64::from(done.gradients_rejected));
         self.refine(index, &step.view, &done);
-        self.after_step(number, index, &done)
+        self.after_step(&done)
     }
 
     /// Steps past this only teach the map the few views it has, and what they do not show looks covered to the next.
