@@ -235,7 +235,6 @@ section! {
     burst_rate: f64 = 1.0;
     /// Gaussians added to an anchor after its burst, where none of its picture is right.
     densify_max: u32 = 4096;
-    converge_iterations_max: u32 = 0;
     /// A full pool gives its least important Gaussians for new ones.
     evict: bool = true;
     /// Weight of 1 - SSIM beside L1.

@@ -2,7 +2,7 @@
 //!
 //! ```text
 //! rendered -> covered and right ------------------------------------> pool
-//!          -> bare or wrong: seeds on its depth --> burst -> densified -> until its loss stops falling -> pool
+//!          -> bare or wrong: seeds on its depth --> burst -> densified -> pool
 //! ```
 //!
 //! An anchor costs the other views: its seeds stand before what they see, and are in its exposure. Where the steps to make
@@ -22,8 +22,7 @@ use super::anchors::{self, Missing};
 use super::budget::threshold;
 use super::densify::mean;
 use super::eyes;
-use super::pipeline::{PruneRule, StepStats, View};
-use super::schedule::Ended;
+use super::pipeline::{PruneRule, View};
 use super::{median_depth, Did, Mapper, SCENE_DEPTH_M};
 use crate::gpu::GpuError;
 use crate::mem::unsealed;
@@ -189,17 +188,8 @@ impl Mapper {
         Ok(self.room())
     }
 
-    /// What follows from a step: the next phase of an anchor.
-    pub(super) fn after_step(&mut self, done: &StepStats) -> Result<(), GpuError> {
-        if let Ended::Burst(anchor) = self.schedule.took(done.loss) {
-            self.densify(anchor)?;
-            self.schedule.start_convergence(anchor, self.config.converge_iterations_max);
-        }
-        Ok(())
-    }
-
     /// Adds Gaussians where the newest anchor's picture is least like its image, through the lens that trains.
-    fn densify(&mut self, index: usize) -> Result<(), GpuError> {
+    pub(super) fn densify(&mut self, index: usize) -> Result<(), GpuError> {
         if self.config.densify_max == 0 || self.pipeline.newest() != Some(index as u32) {
             return Ok(());
         }

@@ -318,7 +318,7 @@ impl Mapper {
         self.counters.splats_not_finite.add(u64::from(done.stats.failed));
         self.counters.gradients_rejected.add(u64::from(done.gradients_rejected));
         self.refine(index, &step.view, &done);
-        self.after_step(&done)
+        self.schedule.took().map_or(Ok(()), |anchor| self.densify(anchor))
     }
 
     /// Steps past this only teach the map the few views it has, and what they do not show looks covered to the next.
