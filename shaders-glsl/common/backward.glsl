@@ -45,11 +45,6 @@ vec3 pull_back_fisheye(vec2 focal, vec4 k, Local l, vec2 v_centre, mat3x2 v_v, o
     return bend_gradient(b, l.p, focal * v_centre, v_j);
 }
 
-/// Of the depth by the position.
-vec3 depth_gradient(Local l) {
-    return FISHEYE ? l.p / l.depth : vec3(0.0, 0.0, 1.0);
-}
-
 /// A V_k = adj(C') V_k / det without the cancellation of the product: a needle's own terms are zero exactly.
 mat3x2 whitened(Local l) {
     const mat3x2 v = l.jacobian_axes;

@@ -5,7 +5,7 @@
 
 struct Batch {
     vec4 a;     // centre x, y; conic a, b
-    vec4 b;     // conic c; log2 opacity; grey or red; depth or its inverse
+    vec4 b;     // conic c; log2 opacity; grey or red; depth
     vec2 tint;  // green, blue
     uint slot;  // gradient slot
 };

@@ -4,9 +4,6 @@
 // Beyond the last visible contribution: (1 - ALPHA_MAX)².
 const float TRANSMITTANCE_MIN = 1e-4;
 const float ALPHA_MAX = 0.99;
-// Values of DEPTH: what is accumulated beside the colour.
-const uint EXPECTED_DEPTH = 1;  // m
-const uint INVERSE_DEPTH = 2;   // 1/m
 const float LOG2_E = 1.4426950408889634;
 
 /// Top pixel of this lane's column.
@@ -18,8 +15,7 @@ uvec2 column_of(uint tile, uvec2 size) {
 
 /// What every lane needs of a Gaussian: its record and, in colour, its green and blue.
 Batch batch_of(Projected g, vec2 tint, uint slot) {
-    const float depth = DEPTH == INVERSE_DEPTH ? 1.0 / g.conic_shade.w : g.conic_shade.w;
-    return Batch(g.centre_conic, vec4(g.conic_shade.x, log2(g.conic_shade.y), g.conic_shade.z, depth), tint, slot);
+    return Batch(g.centre_conic, vec4(g.conic_shade.x, log2(g.conic_shade.y), g.conic_shade.zw), tint, slot);
 }
 
 /// A Gaussian as seen by one column: log2 α(y) = peak - y' (slope + curve y'), y' = centre - pixel.

@@ -97,7 +97,6 @@ float[7] update(uint rank) {
     place(push.camera, s, l);
     flatten(push.camera, vec2(push.size), l);
     Gradient g = pull_back(push.camera, l, s.scale_colour.xyz, v0.xy, vec3(v0.zw, v1.x));
-    g.cam -= v1.w / (l.depth * l.depth) * depth_gradient(l);  // by inverse depth
     const float per_splat = 1.0 / float(visible_count[0]);
     const float opacity = sigmoid(s.mean_opacity.w);
     const float v_logit = (1.0 - opacity) * (v1.y + push.weight_opacity * per_splat * opacity);

@@ -1,8 +1,8 @@
 // Replays the blend front to back and writes, for every intersection, the sum over its tile's pixels of
 // the loss gradient: one slot has one writer, so there are no atomics and every run sums in the same order.
-// in   ranges, intersections, owners, projected, tints; rendered (planes of raster_forward); pixel_gradient, in
-//      planes: by the colour's CHANNELS; with DEPTH by accumulated inverse depth and by transmittance
-// out  isect_gradients[SLOT e + ..]: centre x, y; conic a, b, c; α dL/dα; grey or red; inverse depth;
+// in   ranges, intersections, owners, projected, tints; rendered (planes of raster_forward); pixel_gradient, by
+//      the colour's CHANNELS
+// out  isect_gradients[SLOT e + ..]: centre x, y; conic a, b, c; α dL/dα; grey or red; 0;
 //      with three CHANNELS green, blue, 0, 0
 //      α dL/dα = o dL/do where the cap does not bind: project_backward needs it as it is
 // All that is blended enters the loss linearly, so what lies behind Gaussian j matters by one number a pixel:
@@ -17,7 +17,6 @@
 #extension GL_KHR_shader_subgroup_shuffle : require
 #endif
 layout(local_size_x = 32) in;
-layout(constant_id = 1) const uint DEPTH = 0;  // or INVERSE_DEPTH
 layout(constant_id = 2) const uint CHANNELS = 1;
 layout(constant_id = 3) const uint DEGREE = 0;  // of the harmonics, whose backward pass uses the slot's third quad
 
@@ -58,7 +57,7 @@ void main() {
     const vec2 top = vec2(pixel) + 0.5;
     const uint plane = push.size.x * push.size.y;
     vec3 v[COLUMN];  // gradient by colour
-    float t[COLUMN], behind[COLUMN], v_depth[COLUMN];
+    float t[COLUMN], behind[COLUMN];
     [[unroll]] for (uint k = 0; k < COLUMN; ++k) {
         const bool inside = pixel.x < push.size.x && pixel.y + k < push.size.y;
         const uint at = inside ? (pixel.y + k) * push.size.x + pixel.x : 0;
@@ -68,11 +67,6 @@ void main() {
         if (CHANNELS == 3) {
             v[k].yz = vec2(pixel_gradient[plane + at], pixel_gradient[2 * plane + at]);
             behind[k] += v[k].y * rendered[plane + at] + v[k].z * rendered[2 * plane + at];
-        }
-        if (DEPTH != 0) {
-            const uint light = CHANNELS * plane + at, depth = light + plane;
-            v_depth[k] = pixel_gradient[light];
-            behind[k] += v_depth[k] * rendered[depth] + pixel_gradient[depth] * rendered[light];
         }
     }
     const uvec2 range = ranges[tile];
@@ -87,8 +81,8 @@ void main() {
         for (uint j = 0; j < n; ++j) {
             const Batch b = batch_get(j);
             const Column s = column_terms(b, top);
-            // Over the column: moments of v_σ = -α dL/dα, and the gradients by colour and inverse depth.
-            float s0 = 0.0, s1 = 0.0, s2 = 0.0, by_depth = 0.0;
+            // Over the column: moments of v_σ = -α dL/dα, and the gradient by colour.
+            float s0 = 0.0, s1 = 0.0, s2 = 0.0;
             vec3 by_colour = vec3(0.0);
             [[unroll]] for (uint k = 0; k < COLUMN; ++k) {
                 const float dy = s.d.y - float(k);
@@ -104,11 +98,6 @@ void main() {
                     seen += dot(wyz, s.colour.yz);
                     by_colour.yz += wyz;
                 }
-                if (DEPTH != 0) {
-                    const float wd = w * v_depth[k];
-                    seen += wd * s.depth;
-                    by_depth += wd;
-                }
                 behind[k] -= seen;
                 // (1 - α) is at least 0.01 and T > TRANSMITTANCE_MIN before, so w / after is bounded.
                 const float ratio = w > 0.0 ? alpha / (1.0 - alpha) : 0.0;
@@ -120,7 +109,7 @@ void main() {
             }
             const float xs = s.d.x * s0;
             const float sum = sum_of_eight(float[8](s.conic.x * xs + s.conic.y * s1, s.conic.y * xs + s.conic.z * s1,
-                                                    0.5 * s.d.x * xs, s.d.x * s1, 0.5 * s2, -s0, by_colour.x, by_depth));
+                                                    0.5 * s.d.x * xs, s.d.x * s1, 0.5 * s2, -s0, by_colour.x, 0.0));
             if (lane() < 8) {
                 isect_gradients[b.slot * SLOT + lane()] = sum;
             }

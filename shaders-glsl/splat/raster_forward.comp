@@ -1,7 +1,6 @@
 // Blends the Gaussians of each tile front to back: one column of pixels a lane.
 // in   ranges, intersections (by tile, then depth), owners, projected; tints (green, blue) with three CHANNELS
-// out  rendered, in planes: the colour's CHANNELS; transmittance; and by DEPTH
-//      0 nothing   1 expected depth Σ w z / Σ w, m   2 accumulated inverse depth Σ w / z, 1/m
+// out  rendered, in planes: the colour's CHANNELS; transmittance; with DEPTH the expected depth Σ w z / Σ w, m
 // A pixel ends after the contribution that makes it opaque, so that transmittance alone tells, here
 // and in the backward pass, who contributed.
 #version 450
@@ -14,7 +13,7 @@
 #extension GL_KHR_shader_subgroup_shuffle : require
 #endif
 layout(local_size_x = 32) in;
-layout(constant_id = 1) const uint DEPTH = 0;
+layout(constant_id = 1) const bool DEPTH = false;
 layout(constant_id = 2) const uint CHANNELS = 1;
 
 #include "../common/types.glsl"
@@ -72,7 +71,7 @@ void main() {
                 if (CHANNELS == 3) {
                     c[k].yz += w * s.colour.yz;
                 }
-                if (DEPTH != 0) {
+                if (DEPTH) {
                     z[k] += w * s.depth;
                 }
                 t[k] -= w;
@@ -96,9 +95,8 @@ void main() {
                 rendered[2 * plane + at] = c[k].z;
             }
             rendered[CHANNELS * plane + at] = t[k];
-            if (DEPTH != 0) {
-                const float per_alpha = DEPTH == EXPECTED_DEPTH ? 1.0 / max(1.0 - t[k], 1e-6) : 1.0;
-                rendered[(CHANNELS + 1) * plane + at] = z[k] * per_alpha;
+            if (DEPTH) {
+                rendered[(CHANNELS + 1) * plane + at] = z[k] * (1.0 / max(1.0 - t[k], 1e-6));
             }
         }
     }

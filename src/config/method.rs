@@ -239,7 +239,6 @@ section! {
     evict: bool = true;
     /// Weight of 1 - SSIM beside L1.
     ssim_weight: f64 = 0.2;
-    depth_weight: f64 = 0.0;
     /// Weight of the logarithm of the longest axis over three times the second, mean over the visible Gaussians.
     needle_weight: f64 = 0.1;
     /// Weight of the logarithm of the longest axis over `scale_soft_m`, mean over the visible Gaussians.

@@ -1,6 +1,5 @@
 //! What the splat kernels keep in the arena, sized once by `Shape`.
 
-use super::depth::{depth_words, DEPTHS_MAX};
 use super::sort::{Pairs, Scan, Sorter};
 use crate::gpu::kernels::types::{Moments, Projected, Splat, Status};
 use crate::gpu::{Buf, Gpu, ALIGN};
@@ -24,8 +23,6 @@ pub struct Shape {
     pub sh_degree: u32,
     /// Cameras that train, each with a mask.
     pub cameras: u32,
-    /// Whether steps may train on inverse depth: two more planes of gradients.
-    pub inverse_depth: bool,
 }
 
 /// Gaussians that travel to the GPU at a time.
@@ -59,23 +56,9 @@ impl Shape {
         self.image_words().max(self.splats as usize + 1).max(ARRIVALS)
     }
 
-    /// Colour, transmittance, depth or its inverse: planes of raster_forward.
+    /// Colour, transmittance, depth: planes of raster_forward.
     fn rendered_planes(&self) -> usize {
         self.channels as usize + 2
-    }
-
-    /// By colour; by inverse depth and transmittance: planes of raster_backward.
-    fn gradient_planes(&self) -> usize {
-        self.channels as usize + if self.inverse_depth { 2 } else { 0 }
-    }
-
-    /// Anchors whose depth is kept.
-    pub fn depths(&self) -> u32 {
-        if self.inverse_depth {
-            self.keyframes.min(DEPTHS_MAX)
-        } else {
-            0
-        }
     }
 
     /// Coefficients of a colour beyond the level in a Gaussian's record: EXTRA of harmonics.glsl.
@@ -147,12 +130,11 @@ buffers! {
     owners: u32, "intersections: slots", |s| s.intersections as usize;
     ranges: [u32; 2], "tiles: ranges", |s| s.tiles_max() + 1;
     rendered: f32, "pixels: colour, transmittance, depth", |s| s.rendered_planes() * s.pixels();
-    pixel_gradient: f32, "pixels: gradient", |s| s.gradient_planes() * s.pixels();
+    pixel_gradient: f32, "pixels: gradient", |s| s.channels as usize * s.pixels();
     ssim_sums: f32, "pixels: SSIM by workgroup", |s| s.channels as usize * image_groups(s.width, s.height) as usize;
     loss_sums: [f32; 4], "pixels: L1 and exposure gradient by workgroup", |s| s.channels as usize * image_groups(s.width, s.height) as usize;
     mask: u32, "keyframes: masks", |s| s.cameras as usize * s.mask_stride();
     targets: u32, "keyframes: images", |s| s.image_words() * (s.channels * s.keyframes) as usize;
-    anchor_depths: u32, "keyframes: depths of anchors", |s| (depth_words(s.width, s.height) * s.depths() as usize).max(1);
     visible_count: u32, "counts: visible", |_s| 1;
     isect_count: u32, "counts: intersections listed, needed, workgroups", |_s| 5;
     isects_sorted: u32, "counts: intersections sorted", |_s| 1;

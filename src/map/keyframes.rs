@@ -138,8 +138,6 @@ pub struct Stored {
     pub placed: Pose,
     pub held_out: bool,
     pub anchor: bool,
-    /// Where its stereo depth is kept, of an anchor.
-    pub depth: Option<u32>,
     /// What the mapper found out beside it.
     pub refined: Refinement,
 }
@@ -223,7 +221,7 @@ impl Store {
         let last = self.training.iter().rev().find(|k| self.camera(**k as usize) == self.camera(index));
         refined.exposure.gain = last.map_or(1.0, |&k| self.get(k as usize).refined.exposure.gain);
         let (given, placed) = (world_from_body, world_from_body);
-        self.entries.push(Stored { id, t, given, placed, held_out, anchor: false, depth: None, refined });
+        self.entries.push(Stored { id, t, given, placed, held_out, anchor: false, refined });
         if !held_out {
             self.training.push(index as u32);
         }
@@ -292,18 +290,6 @@ impl Store {
     /// Indices of keyframes that may be trained on.
     pub fn training(&self) -> &[u32] {
         &self.training
-    }
-
-    /// A place for a new anchor's depth among `places`: the oldest's when all are taken.
-    pub fn keep_depth(&mut self, index: usize, places: u32) -> u32 {
-        let kept = self.entries.iter().filter(|e| e.depth.is_some()).count() as u32;
-        let mut place = kept;
-        if kept >= places {
-            let oldest = self.entries.iter_mut().find_map(|e| e.depth.take());
-            place = oldest.unwrap_or(0);
-        }
-        self.entries[index].depth = Some(place);
-        place
     }
 
     pub fn anchors(&self) -> usize {

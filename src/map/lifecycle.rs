@@ -150,7 +150,6 @@ impl Mapper {
         let seeded = self.arrivals.append(&mut self.gpu, &mut self.pipeline)? as u32;
         let entry = self.store.get_mut(index);
         (entry.anchor, entry.placed) = (true, entry.given);
-        self.keep_depth(index)?;
         self.schedule.start_burst(index, self.config.burst_iterations);
         Ok(Did::Anchor { seeded })
     }

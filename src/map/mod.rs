@@ -15,7 +15,6 @@ pub mod blocks;
 pub mod budget;
 pub mod buffers;
 pub mod densify;
-pub mod depth;
 pub mod evaluate;
 pub mod eyes;
 pub mod harmonics;
@@ -358,7 +357,6 @@ impl Mapper {
         let c = &self.config;
         Weights {
             ssim: c.ssim_weight as f32,
-            depth: c.depth_weight as f32,
             needle: c.needle_weight as f32,
             scale: c.scale_weight as f32,
             scale_soft_m: c.scale_soft_m as f32,
@@ -439,7 +437,6 @@ fn shape(board: &Board, cameras: usize, width: usize, height: usize) -> Shape {
         channels: eyes::channels(&board.map) as u32,
         sh_degree: board.map.sh_degree,
         cameras: cameras as u32,
-        inverse_depth: board.map.depth_weight > 0.0,
     }
 }
 

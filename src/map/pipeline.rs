@@ -4,7 +4,7 @@
 //! ```text
 //! project -> sort by depth                               Gaussians -> visible, front to back
 //! count_tiles -> scan -> emit_tiles -> sort by tile -> tile_ranges -> raster_forward
-//! ssim_rows -> ssim_columns -> loss_rows -> loss_columns (-> loss_depth)  picture -> gradient by pixel
+//! ssim_rows -> ssim_columns -> loss_rows -> loss_columns  picture -> gradient by pixel
 //! raster_backward -> sum_chunks -> project_backward (Adam) -> summary   gradient by intersection -> Gaussian
 //! ```
 //!
@@ -31,26 +31,16 @@ use stipple_drivers::{Fault, FaultKind};
 
 /// Bits of a depth key: depth_key.glsl.
 const DEPTH_BITS: u32 = 16;
-/// What the raster blends beside the colour: shade.glsl.
-const EXPECTED_DEPTH: u32 = 1;
-const INVERSE_DEPTH: u32 = 2;
-
-/// The raster both ways; what is blended beside the colour is compiled in.
-pub(super) struct Raster {
-    pub(super) forward: Kernel<raster_forward::K>,
-    pub(super) backward: Kernel<raster_backward::K>,
-}
 
 pub(super) struct Kernels {
     project: ByLens<project::K>,
     count_tiles: Kernel<count_tiles::K>,
     emit_tiles: Kernel<emit_tiles::K>,
     tile_ranges: Kernel<tile_ranges::K>,
-    raster: Raster,
-    /// Of shapes that train on inverse depth.
-    raster_depth: Option<Raster>,
+    pub(super) raster_forward: Kernel<raster_forward::K>,
+    /// The same, with depth.
     raster_picture: Kernel<raster_forward::K>,
-    pub(super) loss_depth: Kernel<loss_depth::K>,
+    raster_backward: Kernel<raster_backward::K>,
     pub(super) ssim_rows: Kernel<ssim_rows::K>,
     ssim_columns: Kernel<ssim_columns::K>,
     pub(super) ssim_map: Kernel<ssim_columns::K>,
@@ -147,6 +137,8 @@ impl Pipeline {
             return Err(Fault::new(FaultKind::Config, "map", what, "raise the board's [budget]"));
         }
         let channels = shape.channels;
+        let forward =
+            |gpu: &mut Gpu, depth| gpu.kernel_variant(raster_forward::Spec { lanes, column, depth, channels }, variant);
         let k = Kernels {
             project: ByLens {
                 pinhole: gpu.kernel::<project::K>(project::Spec { lanes, column, fisheye: false })?,
@@ -155,13 +147,10 @@ impl Pipeline {
             count_tiles: gpu.kernel::<count_tiles::K>(count_tiles::Spec { lanes, column })?,
             emit_tiles: gpu.kernel::<emit_tiles::K>(emit_tiles::Spec { lanes, column })?,
             tile_ranges: plain::<tile_ranges::K>(gpu)?,
-            raster: Raster::new(gpu, tiling, 0, &shape)?,
-            raster_depth: shape.inverse_depth.then(|| Raster::new(gpu, tiling, INVERSE_DEPTH, &shape)).transpose()?,
-            raster_picture: gpu.kernel_variant::<raster_forward::K>(
-                raster_forward::Spec { lanes, column, depth: EXPECTED_DEPTH, channels },
-                variant,
-            )?,
-            loss_depth: gpu.kernel(loss_depth::Spec { channels })?,
+            raster_forward: forward(gpu, false)?,
+            raster_picture: forward(gpu, true)?,
+            raster_backward: gpu
+                .kernel_variant(raster_backward::Spec { lanes, column, channels, degree: shape.sh_degree }, variant)?,
             ssim_rows: plain::<ssim_rows::K>(gpu)?,
             ssim_columns: gpu.kernel::<ssim_columns::K>(ssim_columns::Spec { map: 0 })?,
             ssim_map: gpu.kernel::<ssim_columns::K>(ssim_columns::Spec { map: 1 })?,
@@ -248,20 +237,10 @@ impl Pipeline {
             (view.camera.width, view.camera.height) == (w as usize, h as usize) && goal.slot < self.shape.keyframes,
             "training views are of the shape the pipeline was made with"
         );
-        let depth = goal.depth.filter(|_| self.shape.inverse_depth && weights.depth > 0.0);
-        let raster = self.raster(depth.is_some());
-        let by_tile = self.record_picture(rec, view, &raster.forward);
+        let by_tile = self.record_picture(rec, view, &self.k.raster_forward);
         self.record_loss(rec, goal, weights);
-        if let Some(anchor) = depth {
-            self.record_loss_depth(rec, goal, anchor, weights);
-        }
-        self.record_update(rec, view, &raster.backward, by_tile, rates, weights);
+        self.record_update(rec, view, by_tile, rates, weights);
         self.record_summary(rec, self.shape.channels * image_groups(w, h), self.high_water.div_ceil(GROUP));
-    }
-
-    /// With inverse depth where it is wanted and the shape has it.
-    pub(super) fn raster(&self, inverse_depth: bool) -> &Raster {
-        self.k.raster_depth.as_ref().filter(|_| inverse_depth).unwrap_or(&self.k.raster)
     }
 
     /// What the last summary said.
@@ -426,7 +405,6 @@ impl Pipeline {
         &self,
         rec: &mut Recorder,
         view: &View,
-        raster_backward: &Kernel<raster_backward::K>,
         by_tile: Pairs,
         rates: Option<&LearningRates>,
         weights: &Weights,
@@ -434,7 +412,7 @@ impl Pipeline {
         let (k, b) = (&self.k, &self.b);
         let size = size(view);
         rec.dispatch(
-            raster_backward,
+            &k.raster_backward,
             raster_backward::Bind {
                 ranges: b.ranges.read(),
                 intersections: by_tile.payload.read(),
@@ -507,17 +485,6 @@ impl Pipeline {
             summary::Push { image_groups, splat_groups },
             Threads::groups(1, 1, 1),
         );
-    }
-}
-
-impl Raster {
-    fn new(gpu: &mut Gpu, tiling: Tiling, depth: u32, shape: &Shape) -> Result<Raster, Fault> {
-        let Tiling { lanes, column, variant, .. } = tiling;
-        let (channels, degree) = (shape.channels, shape.sh_degree);
-        Ok(Raster {
-            forward: gpu.kernel_variant(raster_forward::Spec { lanes, column, depth, channels }, variant)?,
-            backward: gpu.kernel_variant(raster_backward::Spec { lanes, column, depth, channels, degree }, variant)?,
-        })
     }
 }
 

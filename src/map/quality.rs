@@ -234,7 +234,7 @@ impl Mapper {
         let view = self.view(index);
         self.pipeline.render(&mut self.gpu, &view, &mut self.rendered)?;
         let exposure = fitted_exposure(observed, &self.shown(), &self.eye(index).valid);
-        let goal = Goal { exposure: Some(exposure), depth: None, ..self.goal(index) };
+        let goal = Goal { exposure: Some(exposure), ..self.goal(index) };
         let mut refined = Refinement::default();
         let (mut best, mut best_loss) = (refined, f64::INFINITY);
         for k in 0..ALIGN_STEPS {

@@ -129,8 +129,7 @@ fn of_levels([log_gain, level]: [f64; 2]) -> Exposure {
 impl Mapper {
     pub(super) fn goal(&self, index: usize) -> Goal {
         let exposure = self.config.refine_exposure.then(|| self.store.exposure(index));
-        let (camera, depth) = (self.store.camera(index) as u32, self.store.get(index).depth);
-        Goal { slot: index as u32, camera, exposure, depth }
+        Goal { slot: index as u32, camera: self.store.camera(index) as u32, exposure }
     }
 
     /// After a training step on an image: one of its keyframe's pose and of its exposure.

@@ -99,8 +99,7 @@ impl Pipeline {
         }
     }
 
-    /// One step down a gradient by pixel that the caller gives in place of a loss: planes by colour, and, of a
-    /// shape with inverse depth, by accumulated inverse depth and by transmittance.
+    /// One step down a gradient by pixel that the caller gives in place of a loss: planes by colour.
     pub fn descend(
         &mut self,
         gpu: &mut Gpu,
@@ -111,9 +110,8 @@ impl Pipeline {
     ) -> Result<StepStats, GpuError> {
         gpu.upload(self.b.pixel_gradient, 0, pixel_gradient)?;
         let mut rec = gpu.record();
-        let raster = self.raster(true);
-        let by_tile = self.record_picture(&mut rec, view, &raster.forward);
-        self.record_update(&mut rec, view, &raster.backward, by_tile, Some(rates), weights);
+        let by_tile = self.record_picture(&mut rec, view, &self.k.raster_forward);
+        self.record_update(&mut rec, view, by_tile, Some(rates), weights);
         self.record_summary(&mut rec, 0, self.high_water.div_ceil(GROUP));
         rec.read_back(self.b.status);
         gpu.submit(rec)?;

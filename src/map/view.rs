@@ -104,13 +104,11 @@ pub struct Goal {
     pub camera: u32,
     /// `None` compares the rendering as it is, and gives no gradient by the exposure.
     pub exposure: Option<Exposure>,
-    /// Of an anchor, where its stereo depth is kept; needs a shape with inverse depth.
-    pub depth: Option<u32>,
 }
 
 impl From<u32> for Goal {
     fn from(slot: u32) -> Goal {
-        Goal { slot, camera: 0, exposure: None, depth: None }
+        Goal { slot, camera: 0, exposure: None }
     }
 }
 
@@ -128,8 +126,6 @@ pub struct LearningRates {
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Weights {
     pub ssim: f32,
-    /// On the error of inverse depth, 1/m, mean over the pixels of anchors.
-    pub depth: f32,
     /// On ln(longest axis / second axis) above ln 3.
     pub needle: f32,
     /// On ln(longest axis) above ln(scale_soft_m).
@@ -143,7 +139,7 @@ impl Default for Weights {
     fn default() -> Self {
         // Held-out views of EuRoC V1_01 after 1200 steps, against none of them: +0.41 dB, SSIM 0.687 -> 0.727; ten times
         // as much gains less. An opacity weight gains nothing there and loses 0.2 dB on a synthetic wall.
-        Weights { ssim: 0.2, depth: 0.0, needle: 0.1, scale: 0.1, scale_soft_m: 0.1, opacity: 0.0 }
+        Weights { ssim: 0.2, needle: 0.1, scale: 0.1, scale_soft_m: 0.1, opacity: 0.0 }
     }
 }
 

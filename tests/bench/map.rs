@@ -55,7 +55,7 @@ const LINES: [Variant; 2] = [
 ];
 
 /// The method without, or with, one part. The first row of the table is the default.
-const ABLATIONS: [Variant; 12] = [
+const ABLATIONS: [Variant; 11] = [
     variant("no burst", "a new anchor waits for its turn", &["map.burst_iterations=0"]),
     variant("no densification", "seeds on bare depth only", &["map.densify_max=0"]),
     variant("no eviction", "a full pool takes no more", &["map.evict=false"]),
@@ -64,7 +64,6 @@ const ABLATIONS: [Variant; 12] = [
     variant("no SSIM", "L1 alone", &["map.ssim_weight=0"]),
     variant("no needle loss", "axes of any ratio", &["map.needle_weight=0"]),
     variant("no scale loss", "axes of any length", &["map.scale_weight=0"]),
-    variant("depth loss", "anchors are drawn to their stereo depth", &["map.depth_weight=0.1"]),
     variant("no pose", "keyframe poses as given", &["map.refine_pose=false"]),
     variant("no exposure", "one exposure for all keyframes", &["map.refine_exposure=false"]),
     variant("neither", "neither pose nor exposure refined", &["map.refine_pose=false", "map.refine_exposure=false"]),

@@ -10,7 +10,7 @@ const EXPOSURE: Exposure = Exposure { gain: 1.3, offset: -0.07 };
 const SSIM: f64 = 0.2;
 
 fn goal() -> Goal {
-    Goal { slot: 1, camera: 0, exposure: Some(EXPOSURE), depth: None }
+    Goal { slot: 1, camera: 0, exposure: Some(EXPOSURE) }
 }
 
 fn levels(image: &[u8]) -> Vec<f64> {
@@ -80,7 +80,7 @@ fn exposed_loss_agrees_with_its_twin() {
     let plain = p.train(&mut gpu, &v, 1, &STILL, &weights).unwrap();
     assert_eq!(plain.exposure_gradient, [0.0; 2]);
     assert!((plain.l1 - loss(&picture, &y, &seen, w, h, SSIM).l1).abs() < 1e-5);
-    let neutral = Goal { slot: 1, camera: 0, exposure: Some(Exposure::default()), depth: None };
+    let neutral = Goal { slot: 1, camera: 0, exposure: Some(Exposure::default()) };
     let neutral = p.train(&mut gpu, &v, neutral, &STILL, &weights).unwrap();
     assert!((neutral.loss - plain.loss).abs() < 1e-6, "{} against {}", neutral.loss, plain.loss);
 }

@@ -13,10 +13,10 @@ use stipple_drivers::Pose;
 
 const W: usize = 33;
 const H: usize = 21;
-const PLAIN: Weights = Weights { ssim: 0.2, depth: 0.0, needle: 0.0, scale: 0.0, scale_soft_m: 1.0, opacity: 0.0 };
+const PLAIN: Weights = Weights { ssim: 0.2, needle: 0.0, scale: 0.0, scale_soft_m: 1.0, opacity: 0.0 };
 
 fn in_colour(v: &View, n: u32, channels: u32, sh_degree: u32) -> Shape {
-    Shape { channels, sh_degree, inverse_depth: false, ..shape(v, n, 1 << 16) }
+    Shape { channels, sh_degree, ..shape(v, n, 1 << 16) }
 }
 
 /// A gradient by pixel, in planes by channel.

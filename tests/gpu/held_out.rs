@@ -58,7 +58,6 @@ fn held_out_views_by_regulariser() {
         channels: 1,
         sh_degree: 0,
         cameras: 1,
-        inverse_depth: false,
     };
     let mut gpu = Gpu::open(&crate::config(), Pipeline::arena_bytes(&s)).unwrap();
     let mut p = Pipeline::new(&mut gpu, s).unwrap();
@@ -73,7 +72,7 @@ fn held_out_views_by_regulariser() {
     let goals: Vec<Vec<u8>> = training.iter().map(&mut photograph).collect();
     let truth: Vec<Vec<u8>> = unseen.iter().map(&mut photograph).collect();
 
-    let off = Weights { ssim: 0.2, depth: 0.0, needle: 0.0, scale: 0.0, scale_soft_m: 0.1, opacity: 0.0 };
+    let off = Weights { ssim: 0.2, needle: 0.0, scale: 0.0, scale_soft_m: 0.1, opacity: 0.0 };
     let cases = [
         ("none", off),
         ("needle 0.1", Weights { needle: 0.1, ..off }),

@@ -1,7 +1,6 @@
 //! Kernels against their twins, on whatever Vulkan device there is (lavapipe in CI).
 #![allow(clippy::unwrap_used)]
 
-mod depth;
 mod exposure;
 mod fisheye;
 mod harmonics;

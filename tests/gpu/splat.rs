@@ -8,7 +8,7 @@ use stipple::gpu::{Gpu, GpuOptions};
 use stipple::map::pipeline::{
     Exposure, Goal, LearningRates, Pipeline, PruneRule, Rendered, Shape, SplatInit, StepStats, Tiling, View, Weights,
 };
-use stipple::stereo::{DepthMap, Pinhole};
+use stipple::stereo::Pinhole;
 use stipple_drivers::Pose;
 
 pub const STILL: LearningRates = LearningRates { position: 0.0, scale: 0.0, rotation: 0.0, opacity: 0.0, colour: 0.0 };
@@ -72,17 +72,7 @@ pub fn mask(width: usize, height: usize) -> Vec<u8> {
 
 pub fn shape(v: &View, splats: u32, intersections: u32) -> Shape {
     let (width, height) = (v.camera.width as u32, v.camera.height as u32);
-    Shape {
-        width,
-        height,
-        splats,
-        intersections,
-        keyframes: 2,
-        channels: 1,
-        sh_degree: 0,
-        cameras: 1,
-        inverse_depth: true,
-    }
+    Shape { width, height, splats, intersections, keyframes: 2, channels: 1, sh_degree: 0, cameras: 1 }
 }
 
 pub fn open(shape: Shape) -> (Gpu, Pipeline) {
@@ -189,13 +179,13 @@ pub fn compare_step(v: &View, splats: &[SplatInit], tiling: Option<Tiling>) {
 
     // raster_forward: a decision on the alpha floor may fall either way, which is worth 1/255 of a grey level.
     let flip = if twin.rendered.margin > 1e-5 { 0.0 } else { 1.0 / 255.0 };
-    let alpha = twin.rendered.planes.transmittance.iter().map(|t| 1.0 - t);
+    let alpha = twin.rendered.transmittance.iter().map(|t| 1.0 - t);
     assert!(worst(wide(&picture.grey), twin.rendered.planes.colour[0].iter().copied()) < 1e-5 + flip);
     assert!(worst(wide(&picture.alpha), alpha) < 1e-5 + flip);
     assert!(worst(wide(&picture.depth), twin.rendered.depth.iter().copied()) < 1e-3 + 4.0 * flip);
 
     // loss
-    let weights = Weights { ssim: SSIM, depth: 0.0, needle: 0.0, scale: 0.0, scale_soft_m: 1.0, opacity: 0.0 };
+    let weights = Weights { ssim: SSIM, needle: 0.0, scale: 0.0, scale_soft_m: 1.0, opacity: 0.0 };
     let step = p.train(&mut gpu, v, 1, &STILL, &weights).unwrap();
     let mut gradient = vec![0f32; w * h];
     gpu.download(p.buffers().pixel_gradient, 0, &mut gradient).unwrap();
@@ -430,11 +420,8 @@ fn the_validation_layer_is_silent() {
     p.append(&mut gpu, &scene(64, &v, 1)).unwrap();
     p.set_keyframe(&mut gpu, 0, &target(33, 21)).unwrap();
     train(&mut gpu, &mut p, &v, 2);
-    p.descend(&mut gpu, &v, &[1.0; 3 * 33 * 21], &FAST, &Weights::default()).unwrap();
-    let known = DepthMap::of(33, 21, vec![2.0; 33 * 21]);
-    p.set_depth(&mut gpu, 0, &known, 0.02).unwrap();
-    let goal = Goal { slot: 0, camera: 0, exposure: Some(Exposure { gain: 1.2, offset: 0.1 }), depth: Some(0) };
-    p.train(&mut gpu, &v, goal, &FAST, &Weights { depth: 0.1, ..Weights::default() }).unwrap();
+    let goal = Goal { slot: 0, camera: 0, exposure: Some(Exposure { gain: 1.2, offset: 0.1 }) };
+    p.train(&mut gpu, &v, goal, &FAST, &Weights::default()).unwrap();
     render(&mut gpu, &mut p, &v);
     p.prune(&mut gpu, &PruneRule::default()).unwrap();
     assert_eq!(gpu.validation_messages(), Vec::<String>::new());

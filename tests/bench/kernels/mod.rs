@@ -152,7 +152,6 @@ fn measure(config: &GpuConfig, scene: &Scene, tiling: Tiling, peaks: &Peaks, qui
         cameras: 1,
         channels: 1,
         sh_degree: 0,
-        inverse_depth: false,
     };
     let mut gpu = Gpu::open(config, Pipeline::arena_bytes(&shape))?;
     let mut p = Pipeline::with_tiling(&mut gpu, shape, tiling)?;

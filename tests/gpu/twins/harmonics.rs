@@ -96,9 +96,7 @@ pub fn step(
     let mut by_extra: Vec<Vec<f64>> = extra.iter().map(|e| vec![0.0; e.len()]).collect();
     for (i, p) in projected.iter().enumerate() {
         let Some(p) = p else { continue };
-        let mut g = image[i];
-        g[7] *= -1.0 / (p[7].v * p[7].v);
-        for (g, d) in g.iter().zip(p) {
+        for (g, d) in image[i].iter().zip(p) {
             (0..12).for_each(|k| by_splat[i][k] += g * d.d[k]);
             (0..6).for_each(|k| by_twist[k] += g * d.d[12 + k]);
         }

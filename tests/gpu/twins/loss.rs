@@ -90,15 +90,3 @@ pub fn exposed(
     out.gradient.iter_mut().for_each(|v| *v *= gain);
     (out, [by_gain, by_offset])
 }
-
-/// Twin of loss_depth.comp, a pixel at a time: of accumulated inverse depth and transmittance against a goal that is
-/// trusted so much. The value, and its gradient by the two.
-pub fn depth(accumulated: f64, transmittance: f64, goal: f64, trust: f64, weight: f64) -> (f64, [f64; 2]) {
-    let alpha = 1.0 - transmittance;
-    if alpha < 0.5 {
-        return (0.0, [0.0; 2]);
-    }
-    let error = accumulated / alpha - goal;
-    let slope = weight * trust * error.signum();
-    (weight * trust * error.abs(), [slope / alpha, slope * accumulated / (alpha * alpha)])
-}

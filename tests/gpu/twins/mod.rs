@@ -53,9 +53,7 @@ pub fn descend(projected: &[Option<Projected>], view: &View, v: &raster::Planes)
     let (mut splats, mut twist) = (vec![[0.0; 12]; projected.len()], [0.0; 6]);
     for (i, p) in projected.iter().enumerate() {
         let Some(p) = p else { continue };
-        let mut g = image[i];
-        g[7] *= -1.0 / (p[7].v * p[7].v); // from inverse depth to depth
-        for (v, d) in g.iter().zip(p) {
+        for (v, d) in image[i].iter().zip(p) {
             (0..12).for_each(|k| splats[i][k] += v * d.d[k]);
             (0..6).for_each(|k| twist[k] += v * d.d[12 + k]);
         }

@@ -9,24 +9,22 @@ const TRANSMITTANCE_MIN: f64 = 1e-4;
 const NEAR: f32 = 0.05;
 
 /// A Gaussian on the image, and a gradient by it, in the order of a gradient slot: centre x, y (integer = pixel
-/// centre); conic a, b, c; opacity; grey or red; inverse depth; green, blue.
+/// centre); conic a, b, c; opacity; grey or red; depth; green, blue.
 pub type Flat = [f64; 10];
 
 /// Where the three channels of a colour are; grey has the first.
 const COLOUR: [usize; 3] = [6, 8, 9];
-const INVERSE_DEPTH: usize = 7;
+const DEPTH: usize = 7;
 
-/// What is blended, or a gradient by it, by pixel.
+/// A colour, or a gradient by it, by pixel.
 #[derive(Clone, Default)]
 pub struct Planes {
     pub colour: [Vec<f64>; 3],
-    pub transmittance: Vec<f64>,
-    /// Accumulated, 1/m.
-    pub inverse_depth: Vec<f64>,
 }
 
 pub struct Rendered {
     pub planes: Planes,
+    pub transmittance: Vec<f64>,
     /// Expected, m.
     pub depth: Vec<f64>,
     /// How close any decision (alpha floor, alpha cap, opaque) came to falling the other way, relative.
@@ -36,7 +34,7 @@ pub struct Rendered {
 impl Planes {
     pub fn zeros(n: usize) -> Planes {
         let zeros = || vec![0.0; n];
-        Planes { colour: [zeros(), zeros(), zeros()], transmittance: zeros(), inverse_depth: zeros() }
+        Planes { colour: [zeros(), zeros(), zeros()] }
     }
 
     /// Of grey alone.
@@ -47,7 +45,7 @@ impl Planes {
     }
 
     fn all(&self) -> impl Iterator<Item = &f64> {
-        self.colour.iter().chain([&self.transmittance, &self.inverse_depth]).flatten()
+        self.colour.iter().flatten()
     }
 
     /// The loss that this is the gradient of.
@@ -59,7 +57,7 @@ impl Planes {
 /// A grey Gaussian as `project` leaves it.
 pub fn flat(p: &Projected) -> Flat {
     let v = |i: usize| p[i].v;
-    [v(0), v(1), v(2), v(3), v(4), v(5), v(6), 1.0 / v(7), 0.0, 0.0]
+    [v(0), v(1), v(2), v(3), v(4), v(5), v(6), v(7), 0.0, 0.0]
 }
 
 /// One contribution to a pixel.
@@ -75,7 +73,7 @@ fn order(splats: &[Option<Flat>]) -> Vec<usize> {
     let mut order: Vec<usize> = (0..splats.len()).filter(|i| splats[*i].is_some()).collect();
     // Depths are compared as the kernels see them: depth_key.glsl.
     let bits = |z: f64| (z as f32).max(NEAR).to_bits() - NEAR.to_bits();
-    order.sort_by_key(|i| splats[*i].as_ref().map(|p| bits(1.0 / p[INVERSE_DEPTH]) >> 11));
+    order.sort_by_key(|i| splats[*i].as_ref().map(|p| bits(p[DEPTH]) >> 11));
     order
 }
 
@@ -107,19 +105,16 @@ fn contributions(splats: &[Option<Flat>], order: &[usize], x: usize, y: usize, m
 pub fn forward(splats: &[Option<Flat>], width: usize, height: usize) -> Rendered {
     let order = order(splats);
     let n = width * height;
-    let mut planes = Planes::zeros(n);
-    planes.transmittance.fill(1.0);
-    let mut out = Rendered { planes, depth: vec![0.0; n], margin: 1.0 };
+    let mut out = Rendered { planes: Planes::zeros(n), transmittance: vec![1.0; n], depth: vec![0.0; n], margin: 1.0 };
     for i in 0..n {
         for s in contributions(splats, &order, i % width, i / width, &mut out.margin) {
             let Some(p) = &splats[s.splat] else { continue };
             let w = s.alpha * s.before;
             (0..3).for_each(|c| out.planes.colour[c][i] += w * p[COLOUR[c]]);
-            out.planes.inverse_depth[i] += w * p[INVERSE_DEPTH];
-            out.depth[i] += w / p[INVERSE_DEPTH];
-            out.planes.transmittance[i] = s.before * (1.0 - s.alpha);
+            out.depth[i] += w * p[DEPTH];
+            out.transmittance[i] = s.before * (1.0 - s.alpha);
         }
-        out.depth[i] /= (1.0 - out.planes.transmittance[i]).max(1e-6);
+        out.depth[i] /= (1.0 - out.transmittance[i]).max(1e-6);
     }
     out
 }
@@ -130,11 +125,11 @@ pub fn backward(splats: &[Option<Flat>], width: usize, height: usize, v: &Planes
     let mut out = vec![[0.0; 10]; splats.len()];
     for i in 0..width * height {
         // What one unit of light that gets here is worth: what lies behind, seen through nothing else.
-        let mut behind = v.transmittance[i];
+        let mut behind = 0.0;
         for s in contributions(splats, &order, i % width, i / width, &mut 1.0).iter().rev() {
             let Some(p) = &splats[s.splat] else { continue };
             let g = &mut out[s.splat];
-            let blended = [(6, &v.colour[0]), (8, &v.colour[1]), (9, &v.colour[2]), (7, &v.inverse_depth)];
+            let blended = [(6, &v.colour[0]), (8, &v.colour[1]), (9, &v.colour[2])];
             let worth: f64 = blended.iter().map(|(k, v)| p[*k] * v[i]).sum();
             blended.iter().for_each(|(k, v)| g[*k] += v[i] * s.before * s.alpha);
             let v_alpha = s.before * (worth - behind);
