@@ -68,8 +68,8 @@ fn a_colour_recording_becomes_a_map_in_its_colours() {
         assert!(own.iter().all(|db| *db > 21.0), "{}: {own:?}", p.name);
         assert!(swapped.iter().all(|db| *db < 19.0), "{}: {swapped:?}", p.name);
     }
-    let (extra, form) = mapper.colours().unwrap();
-    assert_eq!((form.channels, extra.len()), (3, 2 * mapper.splat_count()));
+    let splats = mapper.splats().unwrap();
+    assert!(splats.iter().filter(|s| (s.colour[0] - s.colour[2]).abs() > 0.05).count() * 2 > splats.len());
 }
 
 /// The whole program on it: map, renders and report; and what it says of grey images.

@@ -349,7 +349,7 @@ fn same_twice(keyframes: usize, steps: u32, at_least: u64) {
         assert!(mapper.iterations() >= at_least && mapper.splat_count() > 1000);
         mapper.splats().unwrap()
     };
-    let words = |map: &[stipple::map::SplatInit]| bytemuck::cast_slice::<_, u32>(map).to_vec();
+    let words = |map: &[stipple::map::Gaussian]| bytemuck::cast_slice::<_, u32>(map).to_vec();
     assert!(words(&run()) == words(&run()), "two runs differ");
 }
 
@@ -375,7 +375,7 @@ fn write_png(dir: &std::path::Path, p: &Panel) {
 #[test]
 fn both_cameras_of_a_pair_train_one_map() {
     let (calibration, keyframes) = flight(4);
-    let mut mapper = Mapper::open(&calibration, &board(&["map.cameras=2", "map.sh_degree=1"])).unwrap();
+    let mut mapper = Mapper::open(&calibration, &board(&["map.cameras=2"])).unwrap();
     for k in &keyframes {
         mapper.offer(k);
         train(&mut mapper, 30);
@@ -386,9 +386,6 @@ fn both_cameras_of_a_pair_train_one_map() {
     let [left, right, others @ ..] = q.psnr_heldout_by_camera_db;
     assert!(left.unwrap() > 15.0 && right.unwrap() > 15.0, "{q:?}");
     assert_eq!(others, [None; 2]);
-    let (colours, form) = mapper.colours().unwrap();
-    assert_eq!(colours.len(), form.extra() * mapper.splat_count());
-    assert!(colours.iter().any(|c| *c != 0.0));
 }
 
 #[test]

@@ -4,10 +4,11 @@
 
 use glam::{DQuat, DVec3};
 use std::path::{Path, PathBuf};
+use stipple::map::Gaussian;
 use stipple::output::html::{write_html, Evidence};
 use stipple::output::metrics::{percentile, trajectory_error};
 use stipple::output::panel::{panel, Picture, View};
-use stipple::output::ply::{read_ply, write_ply, SplatRecord};
+use stipple::output::ply::{read_ply, write_ply};
 use stipple::output::report::{CurvePoint, KernelTime, Report};
 use stipple::output::trajectory::write_tum;
 use stipple::output::{atomically, OutputDir};
@@ -136,8 +137,8 @@ fn report(tracking: &[f64]) -> Report {
     }
 }
 
-fn splats() -> impl ExactSizeIterator<Item = SplatRecord> {
-    (0..1000u16).map(|i| SplatRecord {
+fn splats() -> impl ExactSizeIterator<Item = Gaussian> {
+    (0..1000u16).map(|i| Gaussian {
         mean: [i as f32 * 0.01, 0.0, 1.0],
         log_scale: [-3.0; 3],
         quat_xyzw: [0.0, 0.0, 0.0, 1.0],

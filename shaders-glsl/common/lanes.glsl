@@ -6,7 +6,7 @@
 struct Batch {
     vec4 a;     // centre x, y; conic a, b
     vec4 b;     // conic c; log2 opacity; grey or red; depth
-    vec2 tint;  // green, blue
+    vec2 chroma;  // green, blue
     uint slot;  // gradient slot
 };
 
@@ -27,8 +27,8 @@ void batch_put(Batch b) {
 }
 
 Batch batch_get(uint i) {
-    const vec2 tint = CHANNELS == 3 ? subgroupShuffle(held.tint, i) : vec2(0.0);
-    return Batch(subgroupShuffle(held.a, i), subgroupShuffle(held.b, i), tint, subgroupShuffle(held.slot, i));
+    const vec2 chroma = CHANNELS == 3 ? subgroupShuffle(held.chroma, i) : vec2(0.0);
+    return Batch(subgroupShuffle(held.a, i), subgroupShuffle(held.b, i), chroma, subgroupShuffle(held.slot, i));
 }
 
 bool all_lanes(bool done) {
@@ -80,7 +80,7 @@ uint tile_index() {
 
 shared vec4 batch_a[32];
 shared vec4 batch_b[32];
-shared vec2 batch_tint[32];
+shared vec2 batch_chroma[32];
 shared uint batch_slot[32];
 shared uint pending;
 shared float terms[8 * 33];
@@ -90,14 +90,14 @@ void batch_put(Batch b) {
     batch_a[lane()] = b.a;
     batch_b[lane()] = b.b;
     if (CHANNELS == 3) {
-        batch_tint[lane()] = b.tint;
+        batch_chroma[lane()] = b.chroma;
     }
     batch_slot[lane()] = b.slot;
     barrier();
 }
 
 Batch batch_get(uint i) {
-    return Batch(batch_a[i], batch_b[i], CHANNELS == 3 ? batch_tint[i] : vec2(0.0), batch_slot[i]);
+    return Batch(batch_a[i], batch_b[i], CHANNELS == 3 ? batch_chroma[i] : vec2(0.0), batch_slot[i]);
 }
 
 bool all_lanes(bool done) {

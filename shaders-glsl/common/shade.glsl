@@ -14,8 +14,8 @@ uvec2 column_of(uint tile, uvec2 size) {
 }
 
 /// What every lane needs of a Gaussian: its record and, in colour, its green and blue.
-Batch batch_of(Projected g, vec2 tint, uint slot) {
-    return Batch(g.centre_conic, vec4(g.conic_shade.x, log2(g.conic_shade.y), g.conic_shade.zw), tint, slot);
+Batch batch_of(Projected g, vec2 chroma, uint slot) {
+    return Batch(g.centre_conic, vec4(g.conic_shade.x, log2(g.conic_shade.y), g.conic_shade.zw), chroma, slot);
 }
 
 /// A Gaussian as seen by one column: log2 α(y) = peak - y' (slope + curve y'), y' = centre - pixel.
@@ -34,7 +34,7 @@ Column column_terms(Batch g, vec2 top) {
     c.peak = g.b.y - 0.5 * LOG2_E * c.conic.x * c.d.x * c.d.x;  // b.y holds log2 opacity
     c.slope = LOG2_E * c.conic.y * c.d.x;
     c.curve = 0.5 * LOG2_E * c.conic.z;
-    c.colour = vec3(g.b.z, g.tint);
+    c.colour = vec3(g.b.z, g.chroma);
     c.depth = g.b.w;
     return c;
 }

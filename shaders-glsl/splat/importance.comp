@@ -1,13 +1,13 @@
 // How many Gaussians have which importance, in bins of a quarter octave: one thread a slot. A threshold is read off the
 // sums; nothing is sorted. Counting commutes: deterministic.
-// in   steps (see worth.glsl)
+// in   steps (see importance.glsl)
 // out  bins[256], zeroed before: those trained long enough to be judged
 #version 450
 #extension GL_GOOGLE_include_directive : require
 layout(local_size_x = 256) in;
 
 #include "../common/index.glsl"
-#include "../common/worth.glsl"
+#include "../common/importance.glsl"
 
 // The bits of an importance of 2^-63, less which a quarter octave is bit 21: 256 bins reach to 2.
 const uint LOWEST = 0x20000000u;

@@ -2,7 +2,7 @@
 // and to the camera pose, adds the regularisers, and takes one Adam step: one thread a rank.
 // in   visible_count, slots (by depth), tile_offsets, isect_gradients (slots of raster_backward, chunks
 //      summed by sum_chunks)
-// out  splats, moments, steps (count and importance of this Gaussian, see worth.glsl); sums[8 group + ..]: gradient by a small
+// out  splats, moments, steps (count and importance of this Gaussian, see importance.glsl); sums[8 group + ..]: gradient by a small
 //      translation (3) and rotation (3) of the camera frame applied to points, count of refused gradients, 0
 // A step whose gradient is not finite is not taken, and counted. Without LEARN no step is taken and the map
 // stays as it is to the bit: only the sums are written.
@@ -11,14 +11,13 @@
 #extension GL_EXT_control_flow_attributes : require
 layout(local_size_x = 64) in;
 layout(constant_id = 2) const uint CHANNELS = 1;
-layout(constant_id = 3) const uint DEGREE = 0;  // of the harmonics
 layout(constant_id = 7) const bool LEARN = true;
 
 #include "../common/types.glsl"
 #include "../common/camera.glsl"
 #include "../common/backward.glsl"
 #include "../common/index.glsl"
-#include "../common/worth.glsl"
+#include "../common/importance.glsl"
 #include "../common/chunks.glsl"
 
 layout(push_constant) uniform Push {
@@ -45,7 +44,7 @@ layout(set = 0, binding = 5, std430) buffer MomentsInOut { Moments moments[]; };
 layout(set = 0, binding = 6, std430) buffer Steps { uint steps[]; };
 layout(set = 0, binding = 7, std430) writeonly buffer Sums { float sums[]; };
 
-const uint SLOT_QUADS = CHANNELS == 3 || DEGREE > 0 ? 3 : 2;
+const uint SLOT_QUADS = CHANNELS == 3 ? 3 : 2;
 const float BETA1 = 0.9;
 const float BETA2 = 0.999;
 const float EPSILON = 1e-15;
@@ -100,18 +99,14 @@ float[7] update(uint rank) {
     const float per_splat = 1.0 / float(visible_count[0]);
     const float opacity = sigmoid(s.mean_opacity.w);
     const float v_logit = (1.0 - opacity) * (v1.y + push.weight_opacity * per_splat * opacity);
-    // The colour sees the position, and where the camera is, by the direction from one to the other.
-    const vec3 v_direction = DEGREE > 0 ? isect_gradients[SLOT_QUADS * begin + 2].xyz : vec3(0.0);
-    const mat3 from_world = cam_from_world(push.camera);
-    const vec4 d0 = vec4(transpose(from_world) * g.cam + v_direction, v_logit);
+    const vec4 d0 = vec4(transpose(cam_from_world(push.camera)) * g.cam, v_logit);
     const vec4 d1 = vec4(g.scale + regularise(s.scale_colour.xyz, per_splat), v1.z);
     if (!(finite(d0) && finite(d1) && finite(g.quat) && finite(vec4(g.turn, 0.0)))) {
         pose[6] = 1.0;
         return pose;
     }
     const vec3 turn = cross(l.p, g.cam) + g.turn;
-    const vec3 shift = DEGREE > 0 ? g.cam + from_world * v_direction : g.cam;
-    pose = float[7](shift.x, shift.y, shift.z, turn.x, turn.y, turn.z, 0.0);
+    pose = float[7](g.cam.x, g.cam.y, g.cam.z, turn.x, turn.y, turn.z, 0.0);
 
     if (!LEARN) {
         return pose;

@@ -1,6 +1,6 @@
 // Marks the Gaussians that stay: one thread a slot. Faint, huge and not finite ones go, and of those trained long enough
 // to be judged the ones below an importance.
-// in   splats, steps (see worth.glsl)
+// in   splats, steps (see importance.glsl)
 // out  kept[slot] (0 or 1) and a zero past the last, so that its prefix sum ends with the total
 #version 450
 #extension GL_GOOGLE_include_directive : require
@@ -9,7 +9,7 @@ layout(local_size_x = 64) in;
 #include "../common/types.glsl"
 #include "../common/finite.glsl"
 #include "../common/index.glsl"
-#include "../common/worth.glsl"
+#include "../common/importance.glsl"
 
 layout(push_constant) uniform Push {
     uint splats;

@@ -1,6 +1,6 @@
 // Replays the blend front to back and writes, for every intersection, the sum over its tile's pixels of
 // the loss gradient: one slot has one writer, so there are no atomics and every run sums in the same order.
-// in   ranges, intersections, owners, projected, tints; rendered (planes of raster_forward); pixel_gradient, by
+// in   ranges, intersections, owners, projected, chroma; rendered (planes of raster_forward); pixel_gradient, by
 //      the colour's CHANNELS
 // out  isect_gradients[SLOT e + ..]: centre x, y; conic a, b, c; α dL/dα; grey or red; 0;
 //      with three CHANNELS green, blue, 0, 0
@@ -18,7 +18,6 @@
 #endif
 layout(local_size_x = 32) in;
 layout(constant_id = 2) const uint CHANNELS = 1;
-layout(constant_id = 3) const uint DEGREE = 0;  // of the harmonics, whose backward pass uses the slot's third quad
 
 #include "../common/types.glsl"
 #include "../common/index.glsl"
@@ -26,7 +25,7 @@ layout(constant_id = 3) const uint DEGREE = 0;  // of the harmonics, whose backw
 #include "../common/lanes.glsl"
 #include "../common/shade.glsl"
 
-const uint SLOT = CHANNELS == 3 || DEGREE > 0 ? 12 : 8;
+const uint SLOT = CHANNELS == 3 ? 12 : 8;
 
 layout(push_constant) uniform Push {
     uvec2 size;
@@ -36,7 +35,7 @@ layout(set = 0, binding = 0, std430) readonly buffer Ranges { uvec2 ranges[]; };
 layout(set = 0, binding = 1, std430) readonly buffer Intersections { uint intersections[]; };
 layout(set = 0, binding = 2, std430) readonly buffer Owners { uint owners[]; };
 layout(set = 0, binding = 3, std430) readonly buffer ProjectedIn { Projected projected[]; };
-layout(set = 0, binding = 4, std430) readonly buffer Tints { vec2 tints[]; };
+layout(set = 0, binding = 4, std430) readonly buffer Chroma { vec2 chroma[]; };
 layout(set = 0, binding = 5, std430) readonly buffer Rendered { float rendered[]; };
 layout(set = 0, binding = 6, std430) readonly buffer PixelGradient { float pixel_gradient[]; };
 layout(set = 0, binding = 7, std430) writeonly buffer IsectGradients { float isect_gradients[]; };
@@ -44,7 +43,7 @@ layout(set = 0, binding = 7, std430) writeonly buffer IsectGradients { float ise
 Batch fetch(uint at) {
     const uint isect = intersections[at];
     const uint slot = owners[isect];
-    return batch_of(projected[slot], CHANNELS == 3 ? tints[slot] : vec2(0.0), isect);
+    return batch_of(projected[slot], CHANNELS == 3 ? chroma[slot] : vec2(0.0), isect);
 }
 
 void main() {
@@ -114,9 +113,9 @@ void main() {
                 isect_gradients[b.slot * SLOT + lane()] = sum;
             }
             if (CHANNELS == 3) {
-                const float tint = sum_of_two(by_colour.y, by_colour.z);
+                const float sum2 = sum_of_two(by_colour.y, by_colour.z);
                 if (lane() < 4) {
-                    isect_gradients[b.slot * SLOT + 8 + lane()] = lane() < 2 ? tint : 0.0;
+                    isect_gradients[b.slot * SLOT + 8 + lane()] = lane() < 2 ? sum2 : 0.0;
                 }
             }
         }

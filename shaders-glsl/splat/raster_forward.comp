@@ -1,5 +1,5 @@
 // Blends the Gaussians of each tile front to back: one column of pixels a lane.
-// in   ranges, intersections (by tile, then depth), owners, projected; tints (green, blue) with three CHANNELS
+// in   ranges, intersections (by tile, then depth), owners, projected; chroma (green, blue) with three CHANNELS
 // out  rendered, in planes: the colour's CHANNELS; transmittance; with DEPTH the expected depth Σ w z / Σ w, m
 // A pixel ends after the contribution that makes it opaque, so that transmittance alone tells, here
 // and in the backward pass, who contributed.
@@ -30,12 +30,12 @@ layout(set = 0, binding = 0, std430) readonly buffer Ranges { uvec2 ranges[]; };
 layout(set = 0, binding = 1, std430) readonly buffer Intersections { uint intersections[]; };
 layout(set = 0, binding = 2, std430) readonly buffer Owners { uint owners[]; };
 layout(set = 0, binding = 3, std430) readonly buffer ProjectedIn { Projected projected[]; };
-layout(set = 0, binding = 4, std430) readonly buffer Tints { vec2 tints[]; };
+layout(set = 0, binding = 4, std430) readonly buffer Chroma { vec2 chroma[]; };
 layout(set = 0, binding = 5, std430) writeonly buffer Rendered { float rendered[]; };
 
 Batch fetch(uint at) {
     const uint slot = owners[intersections[at]];
-    return batch_of(projected[slot], CHANNELS == 3 ? tints[slot] : vec2(0.0), 0);
+    return batch_of(projected[slot], CHANNELS == 3 ? chroma[slot] : vec2(0.0), 0);
 }
 
 void main() {

@@ -9,7 +9,6 @@
 #extension GL_EXT_control_flow_attributes : require
 layout(local_size_x = 64) in;
 layout(constant_id = 2) const uint CHANNELS = 1;
-layout(constant_id = 3) const uint DEGREE = 0;  // of the harmonics
 
 #include "../common/index.glsl"
 #include "../common/chunks.glsl"
@@ -18,7 +17,7 @@ layout(set = 0, binding = 0, std430) readonly buffer IsectCount { uint isect_cou
 layout(set = 0, binding = 1, std430) readonly buffer Owners { uint owners[]; };
 layout(set = 0, binding = 2, std430) buffer IsectGradients { float isect_gradients[]; };
 
-const uint SLOT = CHANNELS == 3 || DEGREE > 0 ? 12 : 8;
+const uint SLOT = CHANNELS == 3 ? 12 : 8;
 
 void main() {
     const uint first = thread_index() / CHUNK * CHUNK, word = thread_index() % CHUNK;

@@ -212,8 +212,6 @@ section! {
     /// map its few views by heart.
     steps_per_keyframe_max: u32 = 300, Bound::Within(0.0, 1_000_000.0);
     tuning
-    /// Harmonics of a colour: 0 is the same from everywhere.
-    sh_degree: u32 = 0;
     /// A keyframe becomes an anchor when more than this fraction of its valid view is not reconstructed: the rendered alpha is
     /// under `covered_alpha`, or the rendering is `wrong_error` off what is seen, of 1.
     anchor_missing_min: f64 = 0.05;

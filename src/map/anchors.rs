@@ -7,11 +7,10 @@
 //! preferred; such seeds start large and faint so that others overrule them.
 
 use super::occupancy::{HELD, UNKNOWN};
-use super::pipeline::{Pipeline, SplatInit};
+use super::pipeline::Gaussian;
 use super::schedule::Rng;
 use super::view::{Exposure, View};
 use crate::counters::Counters;
-use crate::gpu::{Gpu, GpuError};
 use crate::mem::Footprint;
 use crate::stereo::DepthMap;
 use glam::DVec3;
@@ -26,6 +25,21 @@ pub struct Seed {
     pub opacity: f64,
     /// That it is the colour of.
     pub pixel: u32,
+}
+
+impl Seed {
+    /// With the colour of its pixel in the exposure of the map.
+    pub fn gaussian(&self, planes: &[Image], exposure: Exposure) -> Gaussian {
+        let level =
+            |plane: &Image| exposure.inverse(f64::from(plane.pixels[self.pixel as usize]) / 255.0).max(0.0) as f32;
+        Gaussian {
+            mean: self.p_world.as_vec3().to_array(),
+            log_scale: [self.sigma_m.ln() as f32; 3],
+            quat_xyzw: [0.0, 0.0, 0.0, 1.0],
+            opacity_logit: (self.opacity / (1.0 - self.opacity)).ln() as f32,
+            colour: std::array::from_fn(|c| level(&planes[c.min(planes.len() - 1)])),
+        }
+    }
 }
 
 /// σ over the spacing of seeds: neighbours meet at about 0.6 of their peak.
@@ -58,9 +72,7 @@ pub struct Seen<'a> {
     pub depth: &'a DepthMap,
     /// Rendered before the anchor was added.
     pub alpha: &'a [f32],
-    pub grey: &'a [f32],
-    /// Green and blue, of colour.
-    pub tints: &'a [f32],
+    pub colour: &'a [f32],
     /// Of the image; renderings and seeds are in the map's.
     pub exposure: Exposure,
     /// m; zero where nothing was hit.
@@ -76,52 +88,10 @@ impl Seen<'_> {
     /// Mean over the channels of |rendered - seen| at a pixel, in the map's exposure.
     pub fn error(&self, i: usize) -> f64 {
         let of = |(channel, plane): (usize, &Image)| {
-            let rendered = if channel == 0 { self.grey[i] } else { self.tints[(channel - 1) * self.grey.len() + i] };
+            let rendered = self.colour[channel * self.alpha.len() + i];
             (f64::from(rendered) - self.exposure.inverse(f64::from(plane.pixels[i]) / 255.0)).abs()
         };
         self.planes.iter().enumerate().map(of).sum::<f64>() / self.planes.len() as f64
-    }
-}
-
-/// Seeds as Gaussians on their way to the pool.
-pub struct Arrivals {
-    splats: Vec<SplatInit>,
-    /// Green and blue of each; none of a grey map.
-    tints: Vec<[f32; 2]>,
-}
-
-impl Arrivals {
-    pub fn new(seeds_max: usize, channels: usize) -> Arrivals {
-        Arrivals { splats: Vec::with_capacity(seeds_max), tints: Vec::with_capacity((channels - 1) / 2 * seeds_max) }
-    }
-
-    pub fn clear(&mut self) {
-        self.splats.clear();
-        self.tints.clear();
-    }
-
-    /// Seeds get the colours of their pixels, in the exposure of the map.
-    pub fn take(&mut self, seeds: &[Seed], planes: &[Image], exposure: Exposure) {
-        self.clear();
-        for seed in seeds {
-            let level =
-                |plane: &Image| exposure.inverse(f64::from(plane.pixels[seed.pixel as usize]) / 255.0).max(0.0) as f32;
-            self.splats.push(SplatInit {
-                mean: seed.p_world.as_vec3().to_array(),
-                log_scale: [seed.sigma_m.ln() as f32; 3],
-                quat_xyzw: [0.0, 0.0, 0.0, 1.0],
-                opacity_logit: (seed.opacity / (1.0 - seed.opacity)).ln() as f32,
-                colour: level(&planes[0]),
-            });
-            if let [_, green, blue] = planes {
-                self.tints.push([level(green), level(blue)]);
-            }
-        }
-    }
-
-    /// How many the pool took.
-    pub fn append(&self, gpu: &mut Gpu, pipeline: &mut Pipeline) -> Result<usize, GpuError> {
-        pipeline.append_tinted(gpu, &self.splats, &self.tints)
     }
 }
 
@@ -375,8 +345,7 @@ pub(super) mod tests {
             valid: &[1; W * H],
             depth,
             alpha,
-            grey: &[0.0; W * H],
-            tints: &[],
+            colour: &[0.0; W * H],
             exposure: Exposure::default(),
             rendered_depth: &[0.0; W * H],
             from: from(),
@@ -459,8 +428,7 @@ pub(super) mod tests {
             valid: &[1; W * H],
             depth: &depth,
             alpha: &[0.0; W * H],
-            grey: &[0.0; W * H],
-            tints: &[],
+            colour: &[0.0; W * H],
             exposure: Exposure::default(),
             rendered_depth: &[0.0; W * H],
             from: from(),

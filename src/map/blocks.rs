@@ -17,9 +17,6 @@ pub struct Block {
     pub first: u32,
 }
 
-/// Of its Gaussians, and of their colours.
-const COMMANDS_OF_A_MOVE: usize = 2;
-
 /// How many Gaussians have which importance: quarter octaves from 2^-63.
 pub type Bins = [u32; IMPORTANCE_BINS];
 
@@ -79,13 +76,12 @@ impl Pipeline {
         let Some(first) = (0..n).find(|slot| self.words[*slot as usize + 1] == *slot) else { return Ok(0) };
         let mut rec = gpu.record();
         // Every array over the pool that outlives a step.
-        self.record_repack(&mut rec, first, self.b.splats, 1);
-        self.record_repack(&mut rec, first, self.b.moments, 1);
-        self.record_repack(&mut rec, first, self.b.steps, 1);
-        if let Some(h) = &self.harmonics {
-            let each = self.shape.colour_extra();
-            self.record_repack(&mut rec, first, h.coefficients, each);
-            self.record_repack(&mut rec, first, h.moments, each);
+        self.record_repack(&mut rec, first, self.b.splats);
+        self.record_repack(&mut rec, first, self.b.moments);
+        self.record_repack(&mut rec, first, self.b.steps);
+        if self.shape.channels == 3 {
+            self.record_repack(&mut rec, first, self.b.chroma);
+            self.record_repack(&mut rec, first, self.b.chroma_moments);
         }
         gpu.submit(rec)?;
         for block in &mut self.blocks {
@@ -95,10 +91,10 @@ impl Pipeline {
         Ok((n - self.high_water) as usize)
     }
 
-    /// Sets the kept slots from `first` on down to where `kept` says; a slot has `each` elements.
-    fn record_repack<T>(&self, rec: &mut Recorder, first: u32, array: Buf<T>, each: usize) {
+    /// Sets the kept slots from `first` on down to where `kept` says.
+    fn record_repack<T>(&self, rec: &mut Recorder, first: u32, array: Buf<T>) {
         let b = &self.b;
-        let stride = (each * size_of::<T>() / size_of::<u32>()) as u32;
+        let stride = (size_of::<T>() / size_of::<u32>()) as u32;
         // Gradients of intersections live for one step.
         let scratch = b.over.isect_gradients.cast::<u32>();
         let at_once = (scratch.len() as u32 / stride).max(1);
@@ -138,7 +134,7 @@ impl Pipeline {
     pub fn move_blocks(&mut self, gpu: &mut Gpu, moves: impl Iterator<Item = (u32, Pose)>) -> Result<(), GpuError> {
         let mut rec = gpu.record();
         for (anchor, by) in moves {
-            if rec.room() < COMMANDS_OF_A_MOVE {
+            if rec.room() == 0 {
                 gpu.submit(rec)?;
                 rec = gpu.record();
             }
@@ -156,9 +152,6 @@ impl Pipeline {
             let bind =
                 move_block::Bind { splats: self.b.splats.read_write(), moments_in_out: self.b.moments.read_write() };
             rec.dispatch(&self.k.move_block, bind, push, Threads::d1(push.count));
-            if let Some(h) = &self.harmonics {
-                h.record_turn(&mut rec, &by, self.block(anchor));
-            }
         }
         gpu.submit(rec)
     }

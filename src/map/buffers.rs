@@ -19,14 +19,10 @@ pub struct Shape {
     pub keyframes: u32,
     /// Of a Gaussian's colour: 1, grey, or 3.
     pub channels: u32,
-    /// Of the spherical harmonics of a colour: 0 to 3.
-    pub sh_degree: u32,
     /// Cameras that train, each with a mask.
     pub cameras: u32,
 }
 
-/// Gaussians that travel to the GPU at a time.
-pub const ARRIVALS: usize = 4096;
 /// Pixels of a run filtered by one thread of the loss: RUN of ssim.glsl.
 pub const RUN: u32 = 8;
 /// Invocations of a workgroup of every kernel that reduces.
@@ -51,9 +47,9 @@ impl Shape {
         self.image_words().next_multiple_of(ALIGN as usize / size_of::<u32>())
     }
 
-    /// Words the host moves at once: an image, the flags of all slots, or slots of arrivals.
+    /// Words the host moves at once: an image, or the flags of all slots.
     pub(super) fn words_max(&self) -> usize {
-        self.image_words().max(self.splats as usize + 1).max(ARRIVALS)
+        self.image_words().max(self.splats as usize + 1)
     }
 
     /// Colour, transmittance, depth: planes of raster_forward.
@@ -61,26 +57,21 @@ impl Shape {
         self.channels as usize + 2
     }
 
-    /// Coefficients of a colour beyond the level in a Gaussian's record: EXTRA of harmonics.glsl.
-    pub fn colour_extra(&self) -> usize {
-        (self.channels * (self.sh_degree + 1).pow(2)) as usize - 1
-    }
-
     /// Words of an intersection's gradient: SLOT of raster_backward.
     fn slot_words(&self) -> usize {
-        if self.channels == 3 || self.sh_degree > 0 {
+        if self.channels == 3 {
             12
         } else {
             8
         }
     }
 
-    /// Gaussians whose colour needs more than the grey of their record.
-    fn tinted(&self) -> usize {
+    /// Gaussians that have green and blue beside the level in their record.
+    pub(super) fn coloured(&self) -> usize {
         if self.channels == 3 {
             self.splats as usize
         } else {
-            1
+            0
         }
     }
 
@@ -118,14 +109,13 @@ buffers! {
     moments: Moments, "splats: Adam moments", |s| s.splats as usize;
     steps: u32, "splats: Adam steps and importance", |s| s.splats as usize;
     projected: Projected, "splats: projected", |s| s.splats as usize;
-    tints: [f32; 2], "splats: green and blue", |s| s.tinted();
+    chroma: [f32; 2], "splats: green and blue", |s| s.coloured().max(1);
+    chroma_moments: [f32; 4], "splats: Adam moments of green and blue", |s| s.coloured().max(1);
     ranked: u32, "splats: visible slots by depth", |s| s.splats as usize + 1;
     tile_offsets: u32, "splats: tiles touched, then their prefix sum", |s| s.splats as usize + 1;
     pose_sums: f32, "splats: pose gradient by workgroup", |s| 8 * (s.splats.div_ceil(GROUP) as usize);
     kept: u32, "splats: kept, then their prefix sum", |s| s.splats as usize + 1;
     importance_bins: u32, "splats: how many of which importance", |_s| IMPORTANCE_BINS;
-    arrivals: Splat, "splats: arrivals", |_s| ARRIVALS;
-    arrival_slots: u32, "splats: slots of arrivals", |_s| ARRIVALS;
     isects: u32, "intersections: by tile", |s| s.intersections as usize;
     owners: u32, "intersections: slots", |s| s.intersections as usize;
     ranges: [u32; 2], "tiles: ranges", |s| s.tiles_max() + 1;

@@ -36,8 +36,7 @@ macro_rules! seen {
             valid: $valid,
             depth: $depth,
             alpha: &$mapper.rendered.alpha,
-            grey: &$mapper.rendered.grey,
-            tints: &$mapper.rendered.tints,
+            colour: &$mapper.rendered.colour,
             exposure: $mapper.store.exposure($index),
             rendered_depth: &$mapper.rendered.depth,
             from: $from,
@@ -144,10 +143,10 @@ impl Mapper {
         let points = self.seeder.seed(&seen, whole, &self.counters);
         self.occupancy.look(&mut self.gpu, &self.pipeline, points, &mut self.answers)?;
         let seeds = self.seeder.settle(&self.answers, room, &self.counters);
-        self.arrivals.take(seeds, planes, self.store.exposure(index));
+        let splats = seeds.iter().map(|s| s.gaussian(planes, seen.exposure));
+        let seeded = self.pipeline.append(&mut self.gpu, splats)? as u32;
         self.counters.anchors_for_error.add(u64::from(bare <= least));
         self.anchored_at = self.iterations;
-        let seeded = self.arrivals.append(&mut self.gpu, &mut self.pipeline)? as u32;
         let entry = self.store.get_mut(index);
         (entry.anchor, entry.placed) = (true, entry.given);
         self.schedule.start_burst(index, self.config.burst_iterations);
@@ -204,8 +203,8 @@ impl Mapper {
         let planes = self.store.planes(index);
         let seen = seen!(self, index, view, planes, &self.eyes[0].valid, depth);
         let seeds = self.seeder.densify(&seen, &self.similarity, wanted, &self.counters);
-        self.arrivals.take(seeds, planes, self.store.exposure(index));
-        let added = self.arrivals.append(&mut self.gpu, &mut self.pipeline)?;
+        let splats = seeds.iter().map(|s| s.gaussian(planes, seen.exposure));
+        let added = self.pipeline.append(&mut self.gpu, splats)?;
         self.counters.splats_densified.add(added as u64);
         Ok(())
     }

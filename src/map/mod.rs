@@ -17,7 +17,6 @@ pub mod buffers;
 pub mod densify;
 pub mod evaluate;
 pub mod eyes;
-pub mod harmonics;
 pub mod keyframes;
 mod lifecycle;
 pub mod occupancy;
@@ -36,7 +35,7 @@ use crate::counters::Counters;
 use crate::gpu::{Gpu, GpuError, Timing};
 use crate::mem::Footprint;
 use crate::stereo::{DepthMap, Stereo};
-use anchors::{Arrivals, Seeder};
+use anchors::Seeder;
 use eyes::{Eye, Pair};
 use keyframes::{Queue, Store};
 use occupancy::Occupancy;
@@ -46,9 +45,8 @@ use std::time::Instant;
 use step::Step;
 use stipple_drivers::{Calibration, Fault};
 
-pub use harmonics::Form;
 pub use keyframes::{Keyframe, Offer, PoseCorrection};
-pub use pipeline::SplatInit;
+pub use pipeline::Gaussian;
 pub use quality::{CurvePoint, Evaluation, Panel};
 
 /// What a call of `step` did; an anchor ends the call, so none is missed.
@@ -108,8 +106,7 @@ pub struct Mapper {
     /// Depth of the newest anchor, m.
     depth: DepthMap,
     rendered: Rendered,
-    arrivals: Arrivals,
-    /// SSIM of the newest anchor by pixel.
+    /// SSIM of the newest anchor by pixel, with room for more channels.
     similarity: Vec<f32>,
     /// Median depth of the first anchor, m: what a position step is measured in.
     scene_depth_m: f64,
@@ -145,9 +142,9 @@ impl Mapper {
         f.extend(eyes::footprint(calibration, &board.map, pixels));
         f.extend(Seeder::footprint(pixels, seeds_max));
         f.extend(Occupancy::footprint(board.map.occupancy_cells));
-        let tints = shape.channels as usize - 1;
-        f.host("map: rendering, depth and similarity", pixels * (5 + 2 * tints) * size_of::<f32>());
-        f.host("map: arrivals", seeds_max * (size_of::<SplatInit>() + (1 + tints) * size_of::<u32>()));
+        let planes = 3 + 2 * shape.channels as usize;
+        f.host("map: rendering, depth and similarity", pixels * planes * size_of::<f32>());
+        f.host("map: answers of the occupancy", seeds_max * size_of::<u32>());
         f
     }
 
@@ -174,13 +171,7 @@ impl Mapper {
         let seeds_max = seeds_max(&config);
         let occupancy = Occupancy::new(&mut gpu, config.occupancy_cell_m, config.occupancy_cells)?;
         let (rig, channels) = (stereo.rig().len(), shape.channels as usize);
-        let blank = || vec![0.0; width * height];
-        // Of so many pixels, with room for more in colour.
-        let tinted = |pixels: usize| {
-            let mut planes = Vec::with_capacity(pixels + (channels - 1) * width * height);
-            planes.resize(pixels, 0.0);
-            planes
-        };
+        let planes = |n: usize| vec![0.0; n * width * height];
         gpu.time_commands(TIMED_IN);
         Ok(Mapper {
             gpu,
@@ -194,9 +185,8 @@ impl Mapper {
             answers: Vec::with_capacity(seeds_max),
             schedule: Schedule::new(config.seed),
             depth: DepthMap::new(width, height),
-            rendered: Rendered { width, height, grey: blank(), tints: tinted(0), alpha: blank(), depth: blank() },
-            arrivals: Arrivals::new(seeds_max, channels),
-            similarity: tinted(width * height),
+            rendered: Rendered { width, height, colour: planes(channels), alpha: planes(1), depth: planes(1) },
+            similarity: planes(channels),
             scene_depth_m: SCENE_DEPTH_M,
             iterations: 0,
             anchored_at: 0,
@@ -369,19 +359,8 @@ impl Mapper {
     }
 
     /// The Gaussians alive. Allocates.
-    pub fn splats(&mut self) -> Result<Vec<SplatInit>, GpuError> {
-        let mut out = Vec::with_capacity(self.pipeline.count());
-        self.pipeline.download(&mut self.gpu, &mut out)?;
-        Ok(out)
-    }
-
-    /// Of the Gaussians that `splats` gives, in its order: what their colours are beyond the level in their record, and
-    /// in what form. Allocates.
-    pub fn colours(&mut self) -> Result<(Vec<f32>, Form), GpuError> {
-        let mut out = Vec::new();
-        self.pipeline.download_colours(&mut self.gpu, &mut out)?;
-        let shape = self.pipeline.shape();
-        Ok((out, Form { channels: shape.channels as usize, degree: shape.sh_degree as usize }))
+    pub fn splats(&mut self) -> Result<Vec<Gaussian>, GpuError> {
+        self.pipeline.download(&mut self.gpu)
     }
 
     /// A keyframe as stored, in the order they came.
@@ -435,7 +414,6 @@ fn shape(board: &Board, cameras: usize, width: usize, height: usize) -> Shape {
         intersections: b.intersections,
         keyframes: b.keyframes * cameras as u32,
         channels: eyes::channels(&board.map) as u32,
-        sh_degree: board.map.sh_degree,
         cameras: cameras as u32,
     }
 }

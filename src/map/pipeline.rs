@@ -16,8 +16,8 @@
 use super::blocks::Block;
 pub use super::buffers::Shape;
 use super::buffers::{image_groups, Buffers, GROUP, RUN};
-use super::harmonics::Harmonics;
-pub use super::pool::{PruneRule, SplatInit};
+use super::pool::APPENDED_AT_ONCE;
+pub use super::pool::{Gaussian, PruneRule};
 use super::sort::{Pairs, Scan, Sorter};
 pub use super::tiling::Tiling;
 use super::view::{camera, size, stats};
@@ -50,11 +50,12 @@ pub(super) struct Kernels {
     loss_columns_exposure: Kernel<loss_columns::K>,
     /// Where it pays.
     sum_chunks: Option<Kernel<sum_chunks::K>>,
+    /// Of colour maps.
+    chroma_backward: Option<Kernel<chroma_backward::K>>,
     project_backward: ByLens<project_backward::K>,
     /// The same, leaving the map as it is.
     project_backward_still: ByLens<project_backward::K>,
     summary: Kernel<summary::K>,
-    pub(super) insert: Kernel<insert::K>,
     pub(super) prune: Kernel<prune::K>,
     pub(super) repack: Kernel<repack::K>,
     pub(super) importance: Kernel<importance::K>,
@@ -81,8 +82,6 @@ pub struct Pipeline {
     tiling: Tiling,
     pub(super) k: Kernels,
     pub(super) b: Buffers,
-    /// Where a colour is more than one grey level.
-    pub(super) harmonics: Option<Harmonics>,
     pub(super) scan: Scan,
     sorter: Sorter,
     /// Slots below this are in use.
@@ -94,15 +93,14 @@ pub struct Pipeline {
     /// Host side of images, slots and pool transfers.
     pub(super) words: Vec<u32>,
     pub(super) pool: Vec<Splat>,
+    pub(super) chroma: Vec<[f32; 2]>,
 }
 
 impl Pipeline {
     pub fn footprint(shape: &Shape) -> Footprint {
         let mut f = Buffers::footprint(shape);
-        f.extend(Harmonics::footprint(shape));
-        let n = shape.splats as usize;
         f.host("pipeline: blocks", shape.keyframes as usize * size_of::<Block>());
-        f.host("pipeline: transfers", shape.words_max() * size_of::<u32>() + n * size_of::<Splat>());
+        f.host("pipeline: transfers", shape.words_max() * size_of::<u32>() + APPENDED_AT_ONCE * size_of::<Gaussian>());
         f
     }
 
@@ -128,12 +126,9 @@ impl Pipeline {
             || shape.intersections == 0
             || shape.keyframes == 0
             || !matches!(shape.channels, 1 | 3)
-            || shape.sh_degree > 3
             || !(1..=CAMERAS_MAX as u32).contains(&shape.cameras)
         {
-            let what = format!(
-                "{shape:?} has a zero, neither 1 nor 3 channels, harmonics past degree 3, or no or too many cameras"
-            );
+            let what = format!("{shape:?} has a zero, neither 1 nor 3 channels, or no or too many cameras");
             return Err(Fault::new(FaultKind::Config, "map", what, "raise the board's [budget]"));
         }
         let channels = shape.channels;
@@ -149,8 +144,7 @@ impl Pipeline {
             tile_ranges: plain::<tile_ranges::K>(gpu)?,
             raster_forward: forward(gpu, false)?,
             raster_picture: forward(gpu, true)?,
-            raster_backward: gpu
-                .kernel_variant(raster_backward::Spec { lanes, column, channels, degree: shape.sh_degree }, variant)?,
+            raster_backward: gpu.kernel_variant(raster_backward::Spec { lanes, column, channels }, variant)?,
             ssim_rows: plain::<ssim_rows::K>(gpu)?,
             ssim_columns: gpu.kernel::<ssim_columns::K>(ssim_columns::Spec { map: 0 })?,
             ssim_map: gpu.kernel::<ssim_columns::K>(ssim_columns::Spec { map: 1 })?,
@@ -158,12 +152,14 @@ impl Pipeline {
             loss_columns: plain::<loss_columns::K>(gpu)?,
             loss_columns_exposure: gpu.kernel::<loss_columns::K>(loss_columns::Spec { exposure: true })?,
             sum_chunks: (tiling.chunk > 1)
-                .then(|| gpu.kernel(sum_chunks::Spec { channels, degree: shape.sh_degree, chunk: tiling.chunk }))
+                .then(|| gpu.kernel(sum_chunks::Spec { channels, chunk: tiling.chunk }))
+                .transpose()?,
+            chroma_backward: (channels == 3)
+                .then(|| gpu.kernel(chroma_backward::Spec { chunk: tiling.chunk }))
                 .transpose()?,
             project_backward: project_backward_of(gpu, &shape, tiling, true)?,
             project_backward_still: project_backward_of(gpu, &shape, tiling, false)?,
             summary: plain::<summary::K>(gpu)?,
-            insert: plain::<insert::K>(gpu)?,
             prune: plain::<prune::K>(gpu)?,
             repack: plain::<repack::K>(gpu)?,
             importance: plain::<importance::K>(gpu)?,
@@ -174,7 +170,6 @@ impl Pipeline {
             tiling,
             k,
             b: Buffers::new(gpu, &shape)?,
-            harmonics: (shape.colour_extra() > 0).then(|| Harmonics::new(gpu, &shape, tiling.chunk)).transpose()?,
             scan: Scan::new(gpu)?,
             sorter: Sorter::new(gpu)?,
             high_water: 0,
@@ -182,7 +177,8 @@ impl Pipeline {
             steps_started: 0,
             valid_pixels: [0; CAMERAS_MAX],
             words: Vec::with_capacity(shape.words_max()),
-            pool: Vec::with_capacity(shape.splats as usize),
+            pool: Vec::with_capacity(APPENDED_AT_ONCE),
+            chroma: Vec::with_capacity(APPENDED_AT_ONCE),
         };
         let all = vec![255; shape.pixels()];
         for camera in 0..shape.cameras as usize {
@@ -193,10 +189,6 @@ impl Pipeline {
 
     pub fn shape(&self) -> &Shape {
         &self.shape
-    }
-
-    pub fn harmonics(&self) -> Option<&Harmonics> {
-        self.harmonics.as_ref()
     }
 
     /// What is in the arena, for tests of single stages.
@@ -214,9 +206,9 @@ impl Pipeline {
         let status = self.status(gpu)?;
         let n = view.camera.width * view.camera.height;
         (out.width, out.height) = (view.camera.width, view.camera.height);
-        let light = self.shape.channels as usize;
-        let planes = [(0, 1, &mut out.grey), (1, light - 1, &mut out.tints), (light, 1, &mut out.alpha)];
-        for (plane, count, pixels) in planes.into_iter().chain([(light + 1, 1, &mut out.depth)]) {
+        let channels = self.shape.channels as usize;
+        let planes = [(0, channels, &mut out.colour), (channels, 1, &mut out.alpha), (channels + 1, 1, &mut out.depth)];
+        for (plane, count, pixels) in planes {
             pixels.resize(count * n, 0.0);
             gpu.download(self.b.rendered, plane * n, pixels)?;
         }
@@ -300,9 +292,6 @@ impl Pipeline {
             emit_tiles::Push { size, splats: n, capacity: self.shape.intersections },
             per_slot,
         );
-        if let Some(h) = &self.harmonics {
-            h.record_colours(rec, b, view, n);
-        }
         let tiles = self.tiles(view);
         let bits = u32::BITS - tiles.leading_zeros();
         let pairs = b.over.pairs(b.over.isect_keys, b.isects, self.sorter.passes(bits));
@@ -322,7 +311,7 @@ impl Pipeline {
                 intersections: sorted.payload.read(),
                 owners: b.owners.read(),
                 projected_in: b.projected.read(),
-                tints: b.tints.read(),
+                chroma: b.chroma.read(),
                 rendered: b.rendered.write(),
             },
             raster_forward::Push { size },
@@ -418,7 +407,7 @@ impl Pipeline {
                 intersections: by_tile.payload.read(),
                 owners: b.owners.read(),
                 projected_in: b.projected.read(),
-                tints: b.tints.read(),
+                chroma: b.chroma.read(),
                 rendered: b.rendered.read(),
                 pixel_gradient: b.pixel_gradient.read(),
                 isect_gradients: b.over.isect_gradients.write(),
@@ -434,8 +423,18 @@ impl Pipeline {
             };
             rec.dispatch_indirect(sum_chunks, slots, (), b.isect_count, 2);
         }
-        if let Some(h) = &self.harmonics {
-            h.record_update(rec, b, view, self.high_water, rates);
+        if let (Some(chroma_backward), Some(rates)) = (&k.chroma_backward, rates) {
+            let chroma = chroma_backward::Bind {
+                visible_count: b.visible_count.read(),
+                slots: b.ranked.read(),
+                tile_offsets: b.tile_offsets.read(),
+                steps: b.steps.read(),
+                isect_gradients: b.over.isect_gradients.cast().read(),
+                chroma: b.chroma.read_write(),
+                chroma_moments: b.chroma_moments.read_write(),
+            };
+            let push = chroma_backward::Push { capacity: self.shape.intersections, rate: rates.colour };
+            rec.dispatch(chroma_backward, chroma, push, Threads::d1(self.high_water));
         }
         let update = if rates.is_some() { &k.project_backward } else { &k.project_backward_still };
         let rates = rates.copied().unwrap_or_default();
@@ -494,8 +493,8 @@ fn project_backward_of(
     tiling: Tiling,
     learn: bool,
 ) -> Result<ByLens<project_backward::K>, Fault> {
-    let (channels, degree) = (shape.channels, shape.sh_degree);
-    let mut of = |fisheye| gpu.kernel(project_backward::Spec { channels, degree, chunk: tiling.chunk, fisheye, learn });
+    let channels = shape.channels;
+    let mut of = |fisheye| gpu.kernel(project_backward::Spec { channels, chunk: tiling.chunk, fisheye, learn });
     Ok(ByLens { pinhole: of(false)?, fisheye: of(true)? })
 }
 

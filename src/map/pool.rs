@@ -1,16 +1,15 @@
 //! The pool of Gaussians and the stored images, from the host's side: what goes in and what comes out. Slots in use
 //! have no gaps (see `blocks` for how they are closed); the pool never grows.
 
-use super::buffers::ARRIVALS;
 use super::pipeline::Pipeline;
-use crate::gpu::kernels::insert;
 use crate::gpu::kernels::types::Splat;
-use crate::gpu::{Gpu, GpuError, Threads};
+use crate::gpu::{Gpu, GpuError};
+use std::borrow::Borrow;
 
 /// A Gaussian as the host sees it.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Default, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
-pub struct SplatInit {
+pub struct Gaussian {
     /// World, m.
     pub mean: [f32; 3],
     /// ln m
@@ -18,9 +17,29 @@ pub struct SplatInit {
     /// world_from_splat
     pub quat_xyzw: [f32; 4],
     pub opacity_logit: f32,
-    /// Grey or red, linear 0..1.
-    pub colour: f32,
+    /// Red, green and blue, linear 0..1; grey three times.
+    pub colour: [f32; 3],
 }
+
+impl Gaussian {
+    fn packed(&self) -> Splat {
+        let ([x, y, z], [a, b, c]) = (self.mean, self.log_scale);
+        Splat {
+            mean_opacity: [x, y, z, self.opacity_logit],
+            scale_colour: [a, b, c, self.colour[0]],
+            quat: self.quat_xyzw,
+        }
+    }
+
+    fn unpacked(s: &Splat, [green, blue]: [f32; 2]) -> Gaussian {
+        let ([x, y, z, opacity_logit], [a, b, c, first]) = (s.mean_opacity, s.scale_colour);
+        let colour = [first, green, blue];
+        Gaussian { mean: [x, y, z], log_scale: [a, b, c], quat_xyzw: s.quat, opacity_logit, colour }
+    }
+}
+
+/// Gaussians that travel to the GPU at a time.
+pub(super) const APPENDED_AT_ONCE: usize = 4096;
 
 /// What `prune` removes.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -84,50 +103,33 @@ impl Pipeline {
 
     /// Takes Gaussians into the newest block until the pool is full; how many. Those without a rotation are left out:
     /// nothing would ever be drawn of them.
-    pub fn append(&mut self, gpu: &mut Gpu, arrivals: &[SplatInit]) -> Result<usize, GpuError> {
-        self.append_tinted(gpu, arrivals, &[])
-    }
-
-    /// As `append`, with the green and blue of each; where there are none, colours are grey.
-    pub fn append_tinted(
+    pub fn append(
         &mut self,
         gpu: &mut Gpu,
-        arrivals: &[SplatInit],
-        tints: &[[f32; 2]],
+        splats: impl IntoIterator<Item = impl Borrow<Gaussian>>,
     ) -> Result<usize, GpuError> {
-        let room = (self.shape.splats - self.high_water) as usize;
+        let mut splats = splats.into_iter().map(|s| *s.borrow()).filter(|s| s.quat_xyzw != [0.0; 4]).peekable();
         let before = self.count();
-        for (i, chunk) in arrivals[..arrivals.len().min(room)].chunks(ARRIVALS).enumerate() {
-            self.words.clear();
+        while splats.peek().is_some() && self.high_water < self.shape.splats {
+            let at = self.count();
             self.pool.clear();
-            for s in chunk.iter().filter(|s| s.quat_xyzw != [0.0; 4]) {
-                self.pool.push(packed(s));
-                self.words.push(self.high_water);
-                self.high_water += 1;
+            self.chroma.clear();
+            let room = APPENDED_AT_ONCE.min(self.shape.splats as usize - at);
+            for s in splats.by_ref().take(room) {
+                self.pool.push(s.packed());
+                self.chroma.push([s.colour[1], s.colour[2]]);
             }
-            gpu.upload(self.b.arrivals, 0, &self.pool)?;
-            gpu.upload(self.b.arrival_slots, 0, &self.words)?;
-            if let Some(h) = &mut self.harmonics {
-                let of_chunk = tints.get(i * ARRIVALS..).unwrap_or_default();
-                let tint = |(k, s): (usize, &SplatInit)| of_chunk.get(k).copied().unwrap_or([s.colour; 2]);
-                let sound = chunk.iter().enumerate().filter(|(_, s)| s.quat_xyzw != [0.0; 4]);
-                h.take_tints(gpu, sound.map(tint))?;
-            }
-            let b = &self.b;
-            let bind = insert::Bind {
-                arrivals: b.arrivals.read(),
-                arrival_slots: b.arrival_slots.read(),
-                splats: b.splats.write(),
-                moments_out: b.moments.write(),
-                steps: b.steps.write(),
-            };
+            let n = self.pool.len();
+            gpu.upload(self.b.splats, at, &self.pool)?;
             let mut rec = gpu.record();
-            let n = self.words.len() as u32;
-            rec.dispatch(&self.k.insert, bind, insert::Push { arrivals: n }, Threads::d1(n));
-            if let Some(h) = &self.harmonics {
-                h.record_insert(&mut rec, b, n);
+            rec.fill(self.b.moments.part(at, n), 0);
+            rec.fill(self.b.steps.part(at, n), 0);
+            if self.shape.channels == 3 {
+                gpu.upload(self.b.chroma, at, &self.chroma)?;
+                rec.fill(self.b.chroma_moments.part(at, n), 0);
             }
             gpu.submit(rec)?;
+            self.high_water += n as u32;
         }
         Ok(self.count() - before)
     }
@@ -138,33 +140,14 @@ impl Pipeline {
         self.blocks.clear();
     }
 
-    /// The Gaussians alive, in slot order.
-    pub fn download(&mut self, gpu: &mut Gpu, out: &mut Vec<SplatInit>) -> Result<(), GpuError> {
-        self.pool.clear();
-        self.pool.resize(self.high_water as usize, Splat::default());
-        gpu.download(self.b.splats, 0, &mut self.pool)?;
-        out.clear();
-        out.extend(self.pool.iter().map(unpacked));
-        Ok(())
+    /// The Gaussians alive, in slot order. Allocates.
+    pub fn download(&mut self, gpu: &mut Gpu) -> Result<Vec<Gaussian>, GpuError> {
+        let mut splats = vec![Splat::default(); self.count()];
+        gpu.download(self.b.splats, 0, &mut splats)?;
+        let mut chroma: Vec<[f32; 2]> = splats.iter().map(|s| [s.scale_colour[3]; 2]).collect();
+        if self.shape.channels == 3 {
+            gpu.download(self.b.chroma, 0, &mut chroma)?;
+        }
+        Ok(splats.iter().zip(chroma).map(|(s, c)| Gaussian::unpacked(s, c)).collect())
     }
-}
-
-impl Pipeline {
-    /// Of the Gaussians that `download` gives, in its order: the coefficients of their colour beyond the first level.
-    pub fn download_colours(&mut self, gpu: &mut Gpu, out: &mut Vec<f32>) -> Result<(), GpuError> {
-        out.clear();
-        let Some(h) = &self.harmonics else { return Ok(()) };
-        out.resize(self.high_water as usize * self.shape.colour_extra(), 0.0);
-        gpu.download(h.coefficients, 0, out)
-    }
-}
-
-fn packed(s: &SplatInit) -> Splat {
-    let ([x, y, z], [a, b, c]) = (s.mean, s.log_scale);
-    Splat { mean_opacity: [x, y, z, s.opacity_logit], scale_colour: [a, b, c, s.colour], quat: s.quat_xyzw }
-}
-
-fn unpacked(s: &Splat) -> SplatInit {
-    let ([x, y, z, opacity_logit], [a, b, c, colour]) = (s.mean_opacity, s.scale_colour);
-    SplatInit { mean: [x, y, z], log_scale: [a, b, c], quat_xyzw: s.quat, opacity_logit, colour }
 }

@@ -115,9 +115,9 @@ impl Mapper {
         for i in 0..self.store.len() {
             let observed = self.observed(i);
             let mut add = |mapper: &Mapper, [psnr, ssim]: &mut [Mean; 2]| {
-                let (shown, valid) = (mapper.shown(), &mapper.eye(i).valid);
-                psnr.add(mse(&observed, &shown, valid).map(psnr_db));
-                ssim.add(ssim_of.mean(&observed, &shown, valid));
+                let (shown, valid) = (&mapper.rendered.colour, &mapper.eye(i).valid);
+                psnr.add(mse(&observed, shown, valid).map(psnr_db));
+                ssim.add(ssim_of.mean(&observed, shown, valid));
             };
             let scored = self.score(i)?;
             if !self.store.get(i).held_out {
@@ -157,10 +157,10 @@ impl Mapper {
         for i in spread(&all, count) {
             let psnr_db = self.score(i)?;
             let valid = self.eye(i).valid.clone();
-            let (planes, shown, r) = (self.store.planes(i), self.shown(), &self.rendered);
+            let (planes, r) = (self.store.planes(i), &self.rendered);
             let n = valid.len();
             let observed = (0..n).flat_map(|k| planes.iter().map(move |p| p.pixels[k])).collect();
-            let rendered = (0..n).flat_map(|k| shown[k..].iter().step_by(n).copied()).collect();
+            let rendered = (0..n).flat_map(|k| r.colour[k..].iter().step_by(n).copied()).collect();
             let kind = if self.store.get(i).held_out { "_heldout" } else { "" };
             panels.push(Panel {
                 name: format!("{:04}{kind}", self.store.get(i).id),
@@ -188,7 +188,7 @@ impl Mapper {
         let view = self.view(index);
         self.pipeline.render(&mut self.gpu, &view, &mut self.rendered)?;
         self.show(self.store.exposure(index));
-        Ok(mse(&self.observed(index), &self.shown(), &self.eye(index).valid).map(psnr_db))
+        Ok(mse(&self.observed(index), &self.rendered.colour, &self.eye(index).valid).map(psnr_db))
     }
 
     /// The first camera's images.
@@ -207,23 +207,17 @@ impl Mapper {
 
     /// Puts the rendering into another exposure.
     fn show(&mut self, exposure: Exposure) {
-        let planes = self.rendered.grey.iter_mut().chain(&mut self.rendered.tints);
-        planes.for_each(|x| *x = exposure.observed(f64::from(*x)) as f32);
+        self.rendered.colour.iter_mut().for_each(|x| *x = exposure.observed(f64::from(*x)) as f32);
     }
 
     /// Puts the rendering into the exposure that fits an image best.
     fn fit(&mut self, index: usize, observed: &[f32]) {
-        self.show(fitted_exposure(observed, &self.shown(), &self.eye(index).valid));
+        self.show(fitted_exposure(observed, &self.rendered.colour, &self.eye(index).valid));
     }
 
     /// Plane by plane.
     fn observed(&self, index: usize) -> Vec<f32> {
         self.store.planes(index).iter().flat_map(|p| &p.pixels).map(|p| f32::from(*p) / 255.0).collect()
-    }
-
-    /// The last rendering plane by plane.
-    fn shown(&self) -> Vec<f32> {
-        [&self.rendered.grey[..], &self.rendered.tints].concat()
     }
 
     /// The refinement of a keyframe from which the map, standing still, looks most like its image.
@@ -233,7 +227,7 @@ impl Mapper {
         let (body_from_cam, given) = (eye.body_from_cam, self.store.get(self.store.first(index)).given);
         let view = self.view(index);
         self.pipeline.render(&mut self.gpu, &view, &mut self.rendered)?;
-        let exposure = fitted_exposure(observed, &self.shown(), &self.eye(index).valid);
+        let exposure = fitted_exposure(observed, &self.rendered.colour, &self.eye(index).valid);
         let goal = Goal { exposure: Some(exposure), ..self.goal(index) };
         let mut refined = Refinement::default();
         let (mut best, mut best_loss) = (refined, f64::INFINITY);

@@ -163,8 +163,8 @@ impl Mapper {
                 seen += 1;
                 let channels = planes.len() as f64;
                 observed += planes.iter().map(|p| f64::from(p.pixels[i])).sum::<f64>() / (255.0 * channels);
-                let tints: f32 = r.tints.iter().skip(i).step_by(r.grey.len()).sum();
-                rendered += f64::from((r.grey[i] + tints) / r.alpha[i]) / channels;
+                let level: f32 = r.colour[i..].iter().step_by(r.alpha.len()).sum();
+                rendered += f64::from(level / r.alpha[i]) / channels;
             }
         }
         let e = &mut self.store.get_mut(index).refined.exposure;

@@ -148,10 +148,8 @@ impl Default for Weights {
 pub struct Rendered {
     pub width: usize,
     pub height: usize,
-    /// Grey or red.
-    pub grey: Vec<f32>,
-    /// Green, then blue; none of a grey map.
-    pub tints: Vec<f32>,
+    /// Plane by plane: grey, or red, green and blue.
+    pub colour: Vec<f32>,
     pub alpha: Vec<f32>,
     /// Expected depth, m; zero where nothing was hit.
     pub depth: Vec<f32>,

@@ -4,6 +4,7 @@
 //! Scales are logarithms, opacity is a logit, the quaternion is wxyz, colour is the coefficient of
 //! the constant spherical harmonic. Normals are written as zeros because readers expect the columns.
 
+use crate::map::Gaussian;
 use std::io::{self, Write};
 
 /// Y₀₀, the constant spherical harmonic: colour = 0.5 + Y₀₀ f_dc.
@@ -14,67 +15,32 @@ const PROPERTIES: [&str; 17] = [
     "rot_1", "rot_2", "rot_3",
 ];
 
-/// One Gaussian. Lengths in metres, colour 0..1 (grey maps repeat it in the three channels).
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct SplatRecord {
-    pub mean: [f32; 3],
-    pub log_scale: [f32; 3],
-    pub quat_xyzw: [f32; 4],
-    pub opacity_logit: f32,
-    pub colour: [f32; 3],
+fn row(s: &Gaussian) -> [f32; PROPERTIES.len()] {
+    let ([x, y, z], [sx, sy, sz], [qx, qy, qz, qw]) = (s.mean, s.log_scale, s.quat_xyzw);
+    let [r, g, b] = s.colour.map(|c| (c - 0.5) / SH0);
+    [x, y, z, 0.0, 0.0, 0.0, r, g, b, s.opacity_logit, sx, sy, sz, qw, qx, qy, qz]
 }
-
-impl SplatRecord {
-    fn row(&self) -> [f32; PROPERTIES.len()] {
-        let ([x, y, z], [sx, sy, sz], [qx, qy, qz, qw]) = (self.mean, self.log_scale, self.quat_xyzw);
-        let [r, g, b] = self.colour.map(|c| (c - 0.5) / SH0);
-        [x, y, z, 0.0, 0.0, 0.0, r, g, b, self.opacity_logit, sx, sy, sz, qw, qx, qy, qz]
-    }
-}
-
-/// Columns before those of `f_rest`.
-const BEFORE_REST: usize = 9;
 
 /// The header states the number of splats, so the iterator must know its length.
-pub fn write_ply(out: &mut impl Write, splats: impl ExactSizeIterator<Item = SplatRecord>) -> io::Result<()> {
-    write_coloured_ply(out, splats, &[])
-}
-
-/// As `write_ply`, with what of the colours depends on the direction: for each splat alike many coefficients, channel
-/// by channel, of the harmonics from degree 1.
-pub fn write_coloured_ply(
-    out: &mut impl Write,
-    splats: impl ExactSizeIterator<Item = SplatRecord>,
-    rest: &[f32],
-) -> io::Result<()> {
-    let each = rest.len() / splats.len().max(1);
+pub fn write_ply(out: &mut impl Write, splats: impl ExactSizeIterator<Item = Gaussian>) -> io::Result<()> {
     writeln!(out, "ply\nformat binary_little_endian 1.0\nelement vertex {}", splats.len())?;
-    for (i, name) in PROPERTIES.iter().enumerate() {
-        if i == BEFORE_REST {
-            (0..each).try_for_each(|k| writeln!(out, "property float f_rest_{k}"))?;
-        }
-        writeln!(out, "property float {name}")?;
-    }
+    PROPERTIES.iter().try_for_each(|name| writeln!(out, "property float {name}"))?;
     writeln!(out, "end_header")?;
-    for (i, splat) in splats.enumerate() {
-        let row = splat.row();
-        let (before, after) = row.split_at(BEFORE_REST);
-        for value in before.iter().chain(&rest[i * each..][..each]).chain(after) {
-            out.write_all(&value.to_le_bytes())?;
-        }
+    for splat in splats {
+        row(&splat).iter().try_for_each(|value| out.write_all(&value.to_le_bytes()))?;
     }
     Ok(())
 }
 
 /// Reads what `write_ply` wrote; any other layout is an error.
-pub fn read_ply(bytes: &[u8]) -> io::Result<Vec<SplatRecord>> {
+pub fn read_ply(bytes: &[u8]) -> io::Result<Vec<Gaussian>> {
     let wrong = |what: &str| io::Error::new(io::ErrorKind::InvalidData, what.to_string());
     const END: &[u8] = b"end_header\n";
     let body = bytes.windows(END.len()).position(|w| w == END).ok_or_else(|| wrong("no end_header"))? + END.len();
     let header = std::str::from_utf8(&bytes[..body]).map_err(|_| wrong("the header is not text"))?;
     let names: Vec<&str> = header.lines().filter_map(|l| l.strip_prefix("property float ")).collect();
     if !header.starts_with("ply\nformat binary_little_endian 1.0\n") || names != PROPERTIES {
-        return Err(wrong("not a degree-0 map of this program"));
+        return Err(wrong("not a map of this program"));
     }
     let count: Option<usize> = header.lines().find_map(|l| l.strip_prefix("element vertex ")?.parse().ok());
     let row_bytes = 4 * PROPERTIES.len();
@@ -83,7 +49,7 @@ pub fn read_ply(bytes: &[u8]) -> io::Result<Vec<SplatRecord>> {
     }
     let splat = |row: &[u8]| {
         let f = |i: usize| f32::from_le_bytes([row[4 * i], row[4 * i + 1], row[4 * i + 2], row[4 * i + 3]]);
-        SplatRecord {
+        Gaussian {
             mean: [f(0), f(1), f(2)],
             log_scale: [f(10), f(11), f(12)],
             quat_xyzw: [f(14), f(15), f(16), f(13)],
@@ -99,8 +65,8 @@ mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
 
-    fn splats() -> Vec<SplatRecord> {
-        let splat = |i: i32| SplatRecord {
+    fn splats() -> Vec<Gaussian> {
+        let splat = |i: i32| Gaussian {
             mean: [i as f32, -0.5, 2.0],
             log_scale: [-4.0, -3.5, -5.0 + i as f32],
             quat_xyzw: [0.1, 0.2, 0.3, 0.927],
@@ -117,7 +83,7 @@ mod tests {
         let read = read_ply(&bytes).unwrap();
         for (a, b) in read.iter().zip(splats()) {
             let colour = a.colour.iter().zip(b.colour).all(|(x, y)| (x - y).abs() < 1e-6);
-            assert!(colour && SplatRecord { colour: b.colour, ..*a } == b, "{a:?} {b:?}");
+            assert!(colour && Gaussian { colour: b.colour, ..*a } == b, "{a:?} {b:?}");
         }
         assert_eq!(read.len(), 3);
     }
@@ -137,22 +103,6 @@ mod tests {
         let column = |i: usize| f32::from_le_bytes(row[4 * i..4 * i + 4].try_into().unwrap());
         assert_eq!(column(13), 0.927, "the scalar part of the quaternion comes first");
         assert_eq!(column(7), 0.0, "mid grey is coefficient zero");
-    }
-
-    #[test]
-    fn what_depends_on_the_direction_stands_between_colour_and_opacity() {
-        let mut bytes = Vec::new();
-        let rest: Vec<f32> = (0..27).map(|k| k as f32).collect();
-        write_coloured_ply(&mut bytes, splats().into_iter(), &rest).unwrap();
-        let text = String::from_utf8_lossy(&bytes);
-        let names: Vec<&str> = text.lines().filter_map(|l| l.strip_prefix("property float ")).collect();
-        assert_eq!(
-            (names.len(), names[8], names[9], names[17], names[18]),
-            (26, "f_dc_2", "f_rest_0", "f_rest_8", "opacity")
-        );
-        let row = &bytes[bytes.len() - 26 * 4..];
-        let column = |i: usize| f32::from_le_bytes(row[4 * i..4 * i + 4].try_into().unwrap());
-        assert_eq!((column(9), column(17), column(18)), (18.0, 26.0, 1.0));
     }
 
     #[test]

@@ -3,7 +3,8 @@
 use super::memory::mib;
 use super::tracking::Tracker;
 use super::Flown;
-use crate::map::{Evaluation, Mapper, Panel};
+use crate::gpu::GpuError;
+use crate::map::{Evaluation, Gaussian, Mapper, Panel};
 use crate::mem;
 use crate::output::html::{write_html, Evidence};
 use crate::output::metrics::{percentile, trajectory_error, TrajectoryError};
@@ -62,12 +63,12 @@ pub fn conclude(title: Title, mut flown: Flown, out: &OutputDir) -> Result<Repor
         report.kernels.sort_by(|a, b| b.total_ms.total_cmp(&a.total_ms));
         if m.failure.is_none() {
             match measure(&mut m.mapper) {
-                Ok((quality, drawn, (splats, rest))) => {
+                Ok((quality, drawn, splats)) => {
                     map_figures(&mut report, &quality);
                     panels = drawn;
-                    out.write("map.ply", |w| ply::write_coloured_ply(w, splats.into_iter(), &rest))?;
+                    out.write("map.ply", |w| ply::write_ply(w, splats.into_iter()))?;
                 }
-                Err(e) => m.failure = Some(e),
+                Err(e) => m.failure = Some(e.to_string()),
             }
         }
         if let Some(why) = &m.failure {
@@ -167,29 +168,16 @@ fn map_figures(report: &mut Report, q: &Evaluation) {
     report.psnr_heldout_by_camera_db = q.psnr_heldout_by_camera_db.to_vec();
 }
 
-type Measured = (Evaluation, Vec<Panel>, Drawn);
+type Measured = (Evaluation, Vec<Panel>, Vec<Gaussian>);
 
-/// The map as a file has it: records, and what of their colours depends on the direction.
-type Drawn = (Vec<ply::SplatRecord>, Vec<f32>);
-
-fn measure(mapper: &mut Mapper) -> Result<Measured, String> {
-    let quality = mapper.evaluate().map_err(|e| e.to_string())?;
-    let panels = mapper.panels(PANELS).map_err(|e| e.to_string())?;
-    let splats = mapper.splats().map_err(|e| e.to_string())?;
-    let (extra, form) = mapper.colours().map_err(|e| e.to_string())?;
+/// The map's figures, pictures of it, and its Gaussians as viewers show them: in the exposure of most images.
+fn measure(mapper: &mut Mapper) -> Result<Measured, GpuError> {
+    let (quality, panels, mut splats) = (mapper.evaluate()?, mapper.panels(PANELS)?, mapper.splats()?);
     let exposure = mapper.median_exposure();
-    // Viewers show colours between 0 and 1; some clamp each Gaussian's.
-    let exposed = |colour: f32| exposure.observed(f64::from(colour)) as f32;
-    let mut rest = Vec::new();
-    let record = |(i, s): (usize, &crate::map::SplatInit)| {
-        let (colour, directional) = form.rgb(s.colour, &extra[i * form.extra()..][..form.extra()]);
-        let colour = colour.map(exposed);
-        rest.extend(directional.into_iter().map(|c| exposure.gain as f32 * c));
-        let (mean, log_scale, quat_xyzw, opacity_logit) = (s.mean, s.log_scale, s.quat_xyzw, s.opacity_logit);
-        ply::SplatRecord { mean, log_scale, quat_xyzw, opacity_logit, colour }
-    };
-    let records = splats.iter().enumerate().map(record).collect();
-    Ok((quality, panels, (records, rest)))
+    for colour in splats.iter_mut().flat_map(|s| &mut s.colour) {
+        *colour = exposure.observed(f64::from(*colour)) as f32;
+    }
+    Ok((quality, panels, splats))
 }
 
 fn write_files(

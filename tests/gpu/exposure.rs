@@ -61,7 +61,7 @@ fn exposed_loss_agrees_with_its_twin() {
     p.append(&mut gpu, &scene(40, &v, 1)).unwrap();
     p.set_keyframe(&mut gpu, 1, &harsh()).unwrap();
     p.set_mask(&mut gpu, &mask(w, h)).unwrap();
-    let picture = wide(&render(&mut gpu, &mut p, &v).grey);
+    let picture = wide(&render(&mut gpu, &mut p, &v).colour);
     let weights = Weights { ssim: SSIM as f32, needle: 0.0, scale: 0.0, ..Weights::default() };
     let (y, seen) = (levels(&harsh()), mask(w, h));
 

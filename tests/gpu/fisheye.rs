@@ -4,7 +4,7 @@
 use super::splat::{compare_differences, compare_step, open, render, shape, train, view, Rng};
 use super::twins;
 use glam::{DVec2, DVec3};
-use stipple::map::pipeline::{Fisheye, SplatInit, View};
+use stipple::map::pipeline::{Fisheye, Gaussian, View};
 use stipple::stereo::Pinhole;
 use stipple_drivers::{Camera, Lens};
 
@@ -20,18 +20,18 @@ pub fn wide_view(width: usize, height: usize) -> View {
 }
 
 /// A Gaussian at an angle off the axis, at an azimuth and a distance.
-fn at(v: &View, theta: f64, phi: f64, range: f64, r: &mut Rng) -> SplatInit {
+fn at(v: &View, theta: f64, phi: f64, range: f64, r: &mut Rng) -> Gaussian {
     let d = DVec3::new(theta.sin() * phi.cos(), theta.sin() * phi.sin(), theta.cos());
-    SplatInit {
+    Gaussian {
         mean: v.world_from_cam.transform(d * range).as_vec3().to_array(),
         log_scale: std::array::from_fn(|_| r.uniform(-3.0, -1.0) as f32),
         quat_xyzw: std::array::from_fn(|_| r.uniform(-1.0, 1.0) as f32),
         opacity_logit: r.uniform(-3.0, 3.0) as f32,
-        colour: r.uniform(0.05, 0.95) as f32,
+        colour: [r.uniform(0.05, 0.95) as f32; 3],
     }
 }
 
-pub fn around(n: usize, v: &View, seed: u64) -> Vec<SplatInit> {
+pub fn around(n: usize, v: &View, seed: u64) -> Vec<Gaussian> {
     let mut r = Rng(seed);
     let mut one = |i: usize| {
         let theta = match i % 4 {
@@ -69,7 +69,7 @@ fn every_angle_projects_as_the_calibrated_camera_does() {
         Camera { width: 64, height: 48, fx: c.fx, fy: c.fy, cx: c.cx, cy: c.cy, lens: Lens::KannalaBrandt { k: K } };
     let mut r = Rng(1);
     let angles: Vec<f64> = (0..100).map(|i| f64::from(i) * 0.031 + 1e-5).collect();
-    let splats: Vec<SplatInit> = angles.iter().map(|t| at(&v, *t, 40.0 * t, 1.0 + t, &mut r)).collect();
+    let splats: Vec<Gaussian> = angles.iter().map(|t| at(&v, *t, 40.0 * t, 1.0 + t, &mut r)).collect();
     let (mut gpu, mut p) = open(shape(&v, 100, 1 << 16));
     p.append(&mut gpu, &splats).unwrap();
     render(&mut gpu, &mut p, &v);

@@ -4,7 +4,7 @@
 use super::splat::{psnr, render, write_png, Rng};
 use glam::{DQuat, DVec3};
 use stipple::gpu::Gpu;
-use stipple::map::pipeline::{LearningRates, Pipeline, Shape, SplatInit, View, Weights};
+use stipple::map::pipeline::{Gaussian, LearningRates, Pipeline, Shape, View, Weights};
 use stipple::stereo::Pinhole;
 use stipple_drivers::Pose;
 
@@ -29,17 +29,17 @@ fn grey(x: f64, y: f64) -> f64 {
 }
 
 /// Discs of `sigma` on the wall; depth off by `noise` of itself.
-fn wall(n: usize, sigma: f64, noise: f64, logit: f32, r: &mut Rng) -> Vec<SplatInit> {
+fn wall(n: usize, sigma: f64, noise: f64, logit: f32, r: &mut Rng) -> Vec<Gaussian> {
     (0..n)
         .map(|_| {
             let (x, y) = (r.uniform(-3.0, 3.0), r.uniform(-2.2, 2.2));
             let z = relief(x, y) * (1.0 + r.uniform(-noise, noise));
-            SplatInit {
+            Gaussian {
                 mean: [x as f32, y as f32, z as f32],
                 log_scale: [sigma.ln() as f32; 3],
                 quat_xyzw: [0.0, 0.0, 0.0, 1.0],
                 opacity_logit: logit,
-                colour: grey(x, y) as f32,
+                colour: [grey(x, y) as f32; 3],
             }
         })
         .collect()
@@ -56,7 +56,6 @@ fn held_out_views_by_regulariser() {
         intersections: 1 << 19,
         keyframes: TRAINED as u32,
         channels: 1,
-        sh_degree: 0,
         cameras: 1,
     };
     let mut gpu = Gpu::open(&crate::config(), Pipeline::arena_bytes(&s)).unwrap();
@@ -67,7 +66,7 @@ fn held_out_views_by_regulariser() {
 
     p.append(&mut gpu, &wall(40_000, 0.02, 0.0, 3.0, &mut Rng(1))).unwrap();
     let mut photograph = |v: &View| -> Vec<u8> {
-        render(&mut gpu, &mut p, v).grey.iter().map(|g| (g.clamp(0.0, 1.0) * 255.0).round() as u8).collect()
+        render(&mut gpu, &mut p, v).colour.iter().map(|g| (g.clamp(0.0, 1.0) * 255.0).round() as u8).collect()
     };
     let goals: Vec<Vec<u8>> = training.iter().map(&mut photograph).collect();
     let truth: Vec<Vec<u8>> = unseen.iter().map(&mut photograph).collect();
@@ -95,10 +94,10 @@ fn held_out_views_by_regulariser() {
             p.train(&mut gpu, &training[i], i as u32, &rates, &weights).unwrap();
         }
         let mut mean = |views: &[View], goals: &[Vec<u8>]| {
-            let each = views.iter().zip(goals).map(|(v, g)| psnr(&render(&mut gpu, &mut p, v).grey, g));
+            let each = views.iter().zip(goals).map(|(v, g)| psnr(&render(&mut gpu, &mut p, v).colour, g));
             each.sum::<f64>() / views.len() as f64
         };
         println!("{name:>20}: trained {:.2} dB, held out {:.2} dB", mean(&training, &goals), mean(&unseen, &truth));
-        write_png(&name.replace(' ', "_"), &render(&mut gpu, &mut p, &unseen[2]).grey, &truth[2], SIZE.0, SIZE.1);
+        write_png(&name.replace(' ', "_"), &render(&mut gpu, &mut p, &unseen[2]).colour, &truth[2], SIZE.0, SIZE.1);
     }
 }

@@ -1,9 +1,9 @@
 //! Kernels against their twins, on whatever Vulkan device there is (lavapipe in CI).
 #![allow(clippy::unwrap_used)]
 
+mod chroma;
 mod exposure;
 mod fisheye;
-mod harmonics;
 mod held_out;
 mod occupancy;
 mod pool;

@@ -4,7 +4,7 @@ use super::splat::{shape, view, Rng};
 use super::twins::occupancy as twin;
 use stipple::gpu::{Gpu, GpuOptions};
 use stipple::map::occupancy::{Occupancy, FREE, HELD, UNKNOWN};
-use stipple::map::pipeline::{Pipeline, PruneRule, SplatInit};
+use stipple::map::pipeline::{Gaussian, Pipeline, PruneRule};
 use stipple_drivers::Pose;
 
 const CELL_M: f64 = 0.125;
@@ -34,13 +34,13 @@ impl Grid {
     }
 
     fn append(&mut self, means: &[[f32; 3]]) {
-        let splat = |mean: &[f32; 3]| SplatInit {
+        let splat = |mean: &[f32; 3]| Gaussian {
             mean: *mean,
             log_scale: [-3.0; 3],
             quat_xyzw: [0.0, 0.0, 0.0, 1.0],
-            ..SplatInit::default()
+            ..Gaussian::default()
         };
-        let splats: Vec<SplatInit> = means.iter().map(splat).collect();
+        let splats: Vec<Gaussian> = means.iter().map(splat).collect();
         assert_eq!(self.pipeline.append(&mut self.gpu, &splats).unwrap(), means.len());
     }
 

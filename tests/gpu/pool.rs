@@ -7,7 +7,7 @@ use glam::{DQuat, DVec3, DVec4, Vec3, Vec4};
 use stipple::gpu::kernels::types::{Moments, Splat};
 use stipple::gpu::{Gpu, GpuOptions};
 use stipple::map::blocks::importance_of_bin;
-use stipple::map::pipeline::{Pipeline, PruneRule, SplatInit, Tiling, View};
+use stipple::map::pipeline::{Gaussian, Pipeline, PruneRule, Tiling, View};
 use stipple_drivers::Pose;
 
 const KEEP_ALL: PruneRule = PruneRule { opacity_min: 1e-9, scale_max_m: 1e3, importance_min: 0.0, steps_min: 0 };
@@ -24,9 +24,8 @@ fn moments(gpu: &mut Gpu, p: &Pipeline) -> Vec<Moments> {
     out
 }
 
-fn splats(gpu: &mut Gpu, p: &mut Pipeline) -> Vec<SplatInit> {
-    let mut out = Vec::new();
-    p.download(gpu, &mut out).unwrap();
+fn splats(gpu: &mut Gpu, p: &mut Pipeline) -> Vec<Gaussian> {
+    let out = p.download(gpu).unwrap();
     out
 }
 
@@ -142,7 +141,7 @@ fn correction_moves_block_rigidly() {
     assert_eq!(before[..40], after[..40], "the other block stays");
     let wide = |v: [f32; 4]| Vec4::from(v).as_dvec4();
     for i in 40..120 {
-        let of = |s: &SplatInit, m: &Moments| Moved {
+        let of = |s: &Gaussian, m: &Moments| Moved {
             mean: glam::Vec3::from(s.mean).as_dvec3(),
             quat: wide(s.quat_xyzw),
             m_mean: wide(m.m[0]).truncate(),
@@ -156,13 +155,13 @@ fn correction_moves_block_rigidly() {
         assert!(near(got.m_mean.extend(0.0), want.m_mean.extend(0.0)), "{i}");
         assert!(near(got.v_mean.extend(0.0), want.v_mean.extend(0.0)), "{i}");
         assert!(near(got.m_quat, want.m_quat) && near(got.v_quat, want.v_quat), "{i}");
-        let rest = |s: &SplatInit, m: &Moments| (s.log_scale, s.opacity_logit, s.colour, m.m[1], m.v[1]);
+        let rest = |s: &Gaussian, m: &Moments| (s.log_scale, s.opacity_logit, s.colour, m.m[1], m.v[1]);
         assert_eq!(rest(&before[i], &old[i]), rest(&after[i], &new[i]));
     }
     // With both blocks moved, the moved camera sees the same picture.
     p.move_blocks(&mut gpu, [(4, by)].into_iter()).unwrap();
     let moved = render(&mut gpu, &mut p, &View { world_from_cam: by * v.world_from_cam, ..v });
-    let worst = picture.grey.iter().zip(&moved.grey).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+    let worst = picture.colour.iter().zip(&moved.colour).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
     assert!(worst < 1.5 / 255.0, "{worst}");
 }
 

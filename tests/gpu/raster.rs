@@ -92,18 +92,18 @@ impl Rig {
                 conic_shade: [s[4], s[5], s[6], s[7]].map(|v| v as f32),
             })
             .collect();
-        let tints: Vec<[f32; 2]> = splats.iter().map(|s| [s[8] as f32, s[9] as f32]).collect();
+        let chroma: Vec<[f32; 2]> = splats.iter().map(|s| [s[8] as f32, s[9] as f32]).collect();
         let ranges = self.upload(&(0..tiles).map(|t| [t * n, (t + 1) * n]).chain([[0, 0]]).collect::<Vec<_>>());
         let intersections = self.upload(&(0..tiles * n).collect::<Vec<_>>());
         let owners = self.upload(&(0..tiles * n).map(|e| e % n).collect::<Vec<_>>());
-        let (records, tints) = (self.upload(&records), self.upload(&tints));
+        let (records, chroma) = (self.upload(&records), self.upload(&chroma));
         let pixel_gradient = self.upload(&words(v, channels as usize));
         let rendered = self.upload(&vec![0f32; (channels as usize + 2) * W * H]);
         let gradients = self.upload(&vec![f32::NAN; tiles as usize * splats.len() * slot_words]);
 
         let spec = raster_forward::Spec { lanes, column, depth, channels };
         let forward = self.gpu.kernel_variant::<raster_forward::K>(spec, variant).unwrap();
-        let spec = raster_backward::Spec { lanes, column, channels, degree: 0 };
+        let spec = raster_backward::Spec { lanes, column, channels };
         let backward = self.gpu.kernel_variant::<raster_backward::K>(spec, variant).unwrap();
         let size = [W as u32, H as u32];
         let mut rec = self.gpu.record();
@@ -112,7 +112,7 @@ impl Rig {
             intersections: intersections.read(),
             owners: owners.read(),
             projected_in: records.read(),
-            tints: tints.read(),
+            chroma: chroma.read(),
             rendered: rendered.write(),
         };
         rec.dispatch(&forward, bind, raster_forward::Push { size }, Threads::d1(tiles * lanes));
@@ -121,7 +121,7 @@ impl Rig {
             intersections: intersections.read(),
             owners: owners.read(),
             projected_in: records.read(),
-            tints: tints.read(),
+            chroma: chroma.read(),
             rendered: rendered.read(),
             pixel_gradient: pixel_gradient.read(),
             isect_gradients: gradients.write(),

@@ -4,14 +4,12 @@ use super::splat::{open, scene, shape, target, train, view, Rng, FAST};
 use super::twins::chunks;
 use stipple::gpu::kernels::{sum_chunks, types::Moments};
 use stipple::gpu::{Gpu, GpuOptions};
-use stipple::map::pipeline::{Pipeline, Rendered, Shape, SplatInit, StepStats, Tiling, Weights};
+use stipple::map::pipeline::{Gaussian, Pipeline, Rendered, Shape, StepStats, Tiling, Weights};
 use stipple::map::tiling::CHUNK_GPU;
 
 /// The map, to the bit.
 fn map(gpu: &mut Gpu, p: &mut Pipeline) -> Vec<u32> {
-    let mut map: Vec<SplatInit> = Vec::new();
-    p.download(gpu, &mut map).unwrap();
-    bytemuck::cast_slice(&map).to_vec()
+    bytemuck::cast_slice(&p.download(gpu).unwrap()).to_vec()
 }
 
 #[test]
@@ -64,7 +62,7 @@ fn sums_of_chunks_equal_their_twin_and_nothing_else_changes() {
         }
     }
     owners.truncate(CAPACITY);
-    for (channels, degree, words) in [(1, 0, 8), (3, 0, 12), (1, 2, 12)] {
+    for (channels, words) in [(1, 8), (3, 12)] {
         for count in [0, 15, 16, 2048, CAPACITY - 7] {
             let before: Vec<f32> = (0..CAPACITY * words).map(|_| r.uniform(-1.0, 1.5) as f32).collect();
             let mut gpu = Gpu::open(&crate::config(), 1 << 20).unwrap();
@@ -75,7 +73,7 @@ fn sums_of_chunks_equal_their_twin_and_nothing_else_changes() {
             gpu.upload(on_gpu, 0, &owners).unwrap();
             let slots = gpu.alloc::<f32>("slots", before.len()).unwrap();
             gpu.upload(slots, 0, &before).unwrap();
-            let k = gpu.kernel::<sum_chunks::K>(sum_chunks::Spec { channels, degree, chunk: CHUNK_GPU }).unwrap();
+            let k = gpu.kernel::<sum_chunks::K>(sum_chunks::Spec { channels, chunk: CHUNK_GPU }).unwrap();
             let mut rec = gpu.record();
             let bind = sum_chunks::Bind {
                 isect_count: isect_count.read(),
@@ -107,8 +105,8 @@ fn sums_of_chunks_equal_their_twin_and_nothing_else_changes() {
 #[test]
 fn gradients_summed_in_chunks_are_those_summed_one_by_one() {
     let v = view(65, 47);
-    for (channels, sh_degree) in [(1, 0), (3, 2)] {
-        let s = Shape { channels, sh_degree, ..shape(&v, 128, 1 << 14) };
+    for channels in [1, 3] {
+        let s = Shape { channels, ..shape(&v, 128, 1 << 14) };
         let of = |chunk: u32| {
             let mut gpu = Gpu::open(&crate::config(), Pipeline::arena_bytes(&s)).unwrap();
             let tiling = Tiling { chunk, ..Tiling::of(gpu.caps()) };
@@ -145,18 +143,18 @@ fn gradients_summed_in_chunks_are_those_summed_one_by_one() {
 fn a_pool_a_quarter_full_or_a_quarter_seen_against_a_full_one() {
     const N: u32 = 10_000;
     let v = view(320, 240);
-    let behind = |s: &SplatInit| {
+    let behind = |s: &Gaussian| {
         let away = v.world_from_cam.transform(glam::DVec3::NEG_Z * 5.0).as_vec3().to_array();
-        SplatInit { mean: away, ..*s }
+        Gaussian { mean: away, ..*s }
     };
     let rig = |capacity: u32, hidden: usize| {
         let s = shape(&v, capacity, 1 << 20);
         let (mut gpu, mut p) = open(s);
         // As wide as their share of the picture.
-        let small = |s: SplatInit| SplatInit { log_scale: [-4.0; 3], ..s };
-        let seen: Vec<SplatInit> = scene(N as usize, &v, 9).into_iter().map(small).collect();
+        let small = |s: Gaussian| Gaussian { log_scale: [-4.0; 3], ..s };
+        let seen: Vec<Gaussian> = scene(N as usize, &v, 9).into_iter().map(small).collect();
         p.append(&mut gpu, &seen).unwrap();
-        let unseen: Vec<SplatInit> = seen.iter().cycle().take(hidden).map(behind).collect();
+        let unseen: Vec<Gaussian> = seen.iter().cycle().take(hidden).map(behind).collect();
         p.append(&mut gpu, &unseen).unwrap();
         p.set_keyframe(&mut gpu, 0, &target(320, 240)).unwrap();
         gpu.time_commands(0);

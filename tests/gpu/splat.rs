@@ -6,7 +6,7 @@ use glam::{DQuat, DVec3};
 use stipple::config::GpuConfig;
 use stipple::gpu::{Gpu, GpuOptions};
 use stipple::map::pipeline::{
-    Exposure, Goal, LearningRates, Pipeline, PruneRule, Rendered, Shape, SplatInit, StepStats, Tiling, View, Weights,
+    Exposure, Gaussian, Goal, LearningRates, Pipeline, PruneRule, Rendered, Shape, StepStats, Tiling, View, Weights,
 };
 use stipple::stereo::Pinhole;
 use stipple_drivers::Pose;
@@ -36,7 +36,7 @@ pub fn view(width: usize, height: usize) -> View {
 }
 
 /// Gaussians in and a little outside the view, some behind the camera.
-pub fn scene(n: usize, view: &View, seed: u64) -> Vec<SplatInit> {
+pub fn scene(n: usize, view: &View, seed: u64) -> Vec<Gaussian> {
     let mut r = Rng(seed);
     let c = &view.camera;
     (0..n)
@@ -46,12 +46,12 @@ pub fn scene(n: usize, view: &View, seed: u64) -> Vec<SplatInit> {
             let y = r.uniform(-0.1, 1.1) * c.height as f64 - c.cy;
             let p = view.world_from_cam.transform(DVec3::new(x / c.fx * z, y / c.fy * z, z));
             let q: [f64; 4] = std::array::from_fn(|_| r.uniform(-1.0, 1.0));
-            SplatInit {
+            Gaussian {
                 mean: p.as_vec3().to_array(),
                 log_scale: std::array::from_fn(|_| r.uniform(-4.0, -1.2) as f32),
                 quat_xyzw: q.map(|v| v as f32),
                 opacity_logit: r.uniform(-3.0, 3.5) as f32,
-                colour: r.uniform(0.05, 0.95) as f32,
+                colour: [r.uniform(0.05, 0.95) as f32; 3],
             }
         })
         .collect()
@@ -72,7 +72,7 @@ pub fn mask(width: usize, height: usize) -> Vec<u8> {
 
 pub fn shape(v: &View, splats: u32, intersections: u32) -> Shape {
     let (width, height) = (v.camera.width as u32, v.camera.height as u32);
-    Shape { width, height, splats, intersections, keyframes: 2, channels: 1, sh_degree: 0, cameras: 1 }
+    Shape { width, height, splats, intersections, keyframes: 2, channels: 1, cameras: 1 }
 }
 
 pub fn open(shape: Shape) -> (Gpu, Pipeline) {
@@ -109,7 +109,7 @@ fn twin_gradients_agree_with_finite_differences() {
 }
 
 /// The twin's gradient by every parameter of every Gaussian and by the pose.
-pub fn compare_differences(v: &View, splats: &[SplatInit]) {
+pub fn compare_differences(v: &View, splats: &[Gaussian]) {
     const STEP: f64 = 1e-6;
     let (w, h) = (v.camera.width, v.camera.height);
     let splats: Vec<Parameters> = splats.iter().map(twins::project::parameters).collect();
@@ -145,7 +145,7 @@ pub fn compare_differences(v: &View, splats: &[SplatInit]) {
 }
 
 /// Everything a step leaves behind, beside what its twin says.
-pub fn compare_step(v: &View, splats: &[SplatInit], tiling: Option<Tiling>) {
+pub fn compare_step(v: &View, splats: &[Gaussian], tiling: Option<Tiling>) {
     let (w, h) = (v.camera.width, v.camera.height);
     let n = splats.len();
     let s = shape(v, n as u32, 1 << 16);
@@ -180,7 +180,7 @@ pub fn compare_step(v: &View, splats: &[SplatInit], tiling: Option<Tiling>) {
     // raster_forward: a decision on the alpha floor may fall either way, which is worth 1/255 of a grey level.
     let flip = if twin.rendered.margin > 1e-5 { 0.0 } else { 1.0 / 255.0 };
     let alpha = twin.rendered.transmittance.iter().map(|t| 1.0 - t);
-    assert!(worst(wide(&picture.grey), twin.rendered.planes.colour[0].iter().copied()) < 1e-5 + flip);
+    assert!(worst(wide(&picture.colour), twin.rendered.planes.colour[0].iter().copied()) < 1e-5 + flip);
     assert!(worst(wide(&picture.alpha), alpha) < 1e-5 + flip);
     assert!(worst(wide(&picture.depth), twin.rendered.depth.iter().copied()) < 1e-3 + 4.0 * flip);
 
@@ -245,7 +245,7 @@ fn one_pixel_and_odd_sizes_agree_with_their_twin() {
         let doubles: Vec<Parameters> = splats.iter().map(twins::project::parameters).collect();
         let twin = twins::raster::forward(&twins::flat(&twins::project_all(&doubles, &v, &[0.0; 6])), w, h);
         let picture = render(&mut gpu, &mut p, &v);
-        assert!(worst(wide(&picture.grey), twin.planes.colour[0].clone()) < 1e-5, "{w}x{h}");
+        assert!(worst(wide(&picture.colour), twin.planes.colour[0].clone()) < 1e-5, "{w}x{h}");
         p.set_keyframe(&mut gpu, 0, &target(w, h)).unwrap();
         assert!(p.train(&mut gpu, &v, 0, &STILL, &Weights::default()).unwrap().loss.is_finite());
     }
@@ -256,7 +256,7 @@ fn an_empty_map_renders_nothing_and_trains() {
     let v = view(33, 21);
     let (mut gpu, mut p) = open(shape(&v, 16, 1024));
     let picture = render(&mut gpu, &mut p, &v);
-    assert!(picture.grey.iter().chain(&picture.alpha).chain(&picture.depth).all(|x| *x == 0.0));
+    assert!(picture.colour.iter().chain(&picture.alpha).chain(&picture.depth).all(|x| *x == 0.0));
     p.set_keyframe(&mut gpu, 0, &target(33, 21)).unwrap();
     let step = p.train(&mut gpu, &v, 0, &STILL, &Weights::default()).unwrap();
     assert_eq!((step.stats.visible, step.stats.intersections), (0, 0));
@@ -279,9 +279,8 @@ fn two_runs_are_bit_identical() {
         p.append(&mut gpu, &scene(500, &v, 9)).unwrap();
         p.set_keyframe(&mut gpu, 0, &target(65, 47)).unwrap();
         let steps = train(&mut gpu, &mut p, &v, 10);
-        let mut map = Vec::new();
-        p.download(&mut gpu, &mut map).unwrap();
-        (steps, map, render(&mut gpu, &mut p, &v).grey)
+        let map = p.download(&mut gpu).unwrap();
+        (steps, map, render(&mut gpu, &mut p, &v).colour)
     };
     let (a, b) = (run(), run());
     assert_eq!(a.0, b.0);
@@ -309,7 +308,7 @@ fn a_full_intersection_list_loses_the_farthest_and_says_so() {
 
     // The nearest third alone fits, and the cut picture has all of it: where it is opaque nothing changed.
     let cam_from_world = v.world_from_cam.inverse();
-    let depth = |s: &SplatInit| cam_from_world.transform(glam::Vec3::from(s.mean).as_dvec3()).z;
+    let depth = |s: &Gaussian| cam_from_world.transform(glam::Vec3::from(s.mean).as_dvec3()).z;
     splats.retain(|s| depth(s) > 0.0);
     splats.sort_by(|a, b| depth(a).total_cmp(&depth(b)));
     splats.truncate(splats.len() / 3);
@@ -334,7 +333,7 @@ fn splats_that_are_not_finite_do_not_change_the_picture() {
         }
         mixed.insert(7 * i, s);
     }
-    let run = |splats: &[SplatInit]| {
+    let run = |splats: &[Gaussian]| {
         let (mut gpu, mut p) = open(shape(&v, 64, 1 << 16));
         p.append(&mut gpu, splats).unwrap();
         let picture = render(&mut gpu, &mut p, &v);
@@ -342,7 +341,7 @@ fn splats_that_are_not_finite_do_not_change_the_picture() {
         let steps = train(&mut gpu, &mut p, &v, 3);
         let pruned =
             p.prune(&mut gpu, &PruneRule { opacity_min: 1e-6, scale_max_m: 100.0, ..PruneRule::default() }).unwrap();
-        (picture.grey, steps, pruned)
+        (picture.colour, steps, pruned)
     };
     let (clean, dirty) = (run(&good), run(&mixed));
     assert_eq!(clean.0, dirty.0);
@@ -364,8 +363,7 @@ fn a_full_pool_takes_no_more_and_reuses_what_was_pruned() {
     assert_eq!(p.prune(&mut gpu, &PruneRule::default()).unwrap(), 0);
     assert_eq!(p.count(), 15);
     assert_eq!(p.append(&mut gpu, &splats[20..]).unwrap(), 5);
-    let mut map = Vec::new();
-    p.download(&mut gpu, &mut map).unwrap();
+    let map = p.download(&mut gpu).unwrap();
     assert_eq!(map.len(), 20);
     assert!(splats[5..25].iter().all(|s| map.contains(s)));
 }
@@ -384,12 +382,12 @@ fn training_on_one_picture_converges() {
     let (mut gpu, mut p) = open(shape(&v, 1024, 1 << 16));
     p.append(&mut gpu, &scene(1024, &v, 8)).unwrap();
     p.set_keyframe(&mut gpu, 0, &goal).unwrap();
-    let before = psnr(&render(&mut gpu, &mut p, &v).grey, &goal);
+    let before = psnr(&render(&mut gpu, &mut p, &v).colour, &goal);
     let steps = train(&mut gpu, &mut p, &v, 150);
     let picture = render(&mut gpu, &mut p, &v);
-    let after = psnr(&picture.grey, &goal);
+    let after = psnr(&picture.colour, &goal);
     println!("PSNR {before:.1} -> {after:.1} dB, loss {:.4} -> {:.4}", steps[0].loss, steps[149].loss);
-    write_png("converged", &picture.grey, &goal, w, h);
+    write_png("converged", &picture.colour, &goal, w, h);
     assert!(before < 15.0 && after > 25.0, "PSNR {before:.1} -> {after:.1} dB");
 }
 

@@ -4,33 +4,32 @@
 use super::splat::{compare_step, mask, open, render, scene, shape, target, train, view, Rng, FAST};
 use glam::DVec3;
 use stipple::gpu::kernels::types::Moments;
-use stipple::map::pipeline::{Rendered, SplatInit, View, Weights};
+use stipple::map::pipeline::{Gaussian, Rendered, View, Weights};
 
 /// A Gaussian at a place of the camera frame.
-fn splat(v: &View, p_cam: DVec3, log_scale: [f32; 3], opacity_logit: f32) -> SplatInit {
-    SplatInit {
+fn splat(v: &View, p_cam: DVec3, log_scale: [f32; 3], opacity_logit: f32) -> Gaussian {
+    Gaussian {
         mean: v.world_from_cam.transform(p_cam).as_vec3().to_array(),
         log_scale,
         quat_xyzw: [0.1, -0.3, 0.2, 0.9],
         opacity_logit,
-        colour: 0.6,
+        colour: [0.6; 3],
     }
 }
 
-fn finite(s: &SplatInit) -> bool {
+fn finite(s: &Gaussian) -> bool {
     bytemuck::cast_slice::<_, f32>(std::slice::from_ref(s)).iter().all(|v| v.is_finite())
 }
 
 /// Trains, and everything there is stays finite.
-fn survives(v: &View, splats: &[SplatInit], goal: &[u8], steps: usize) -> Vec<SplatInit> {
+fn survives(v: &View, splats: &[Gaussian], goal: &[u8], steps: usize) -> Vec<Gaussian> {
     let (mut gpu, mut p) = open(shape(v, splats.len() as u32, 1 << 17));
     p.append(&mut gpu, splats).unwrap();
     p.set_keyframe(&mut gpu, 0, goal).unwrap();
     for step in train(&mut gpu, &mut p, v, steps) {
         assert!(step.loss.is_finite() && step.pose_gradient.iter().all(|g| g.is_finite()), "{step:?}");
     }
-    let mut map = Vec::new();
-    p.download(&mut gpu, &mut map).unwrap();
+    let map = p.download(&mut gpu).unwrap();
     assert!(map.iter().all(finite));
     map
 }
@@ -59,7 +58,7 @@ fn needles_of_condition_to_1e8_agree_with_the_twin() {
     for k in [2, 4, 6, 8] {
         let long_px = 0.3f64.sqrt() * 10f64.powf(0.5 * f64::from(k));
         let long = (long_px * 2.0 / v.camera.fx).ln() as f32;
-        let splats: Vec<SplatInit> =
+        let splats: Vec<Gaussian> =
             (0..3).map(|i| splat(&v, DVec3::new(0.1 * f64::from(i), -0.1, 2.0), [long, -11.0, -11.0], -1.0)).collect();
         compare_step(&v, &splats, None);
         survives(&v, &splats, &target(33, 21), 20);
@@ -71,7 +70,7 @@ fn opacities_within_an_ulp_of_none_and_all_agree_with_the_twin() {
     let v = view(33, 21);
     let ulp_of_one = (2f32.powi(24)).ln(); // 1 - σ(x) = 2^-24
     let logits = [-1e30, -104.0, -88.0, -17.0, -5.6, 0.0, 4.0, ulp_of_one, 17.0, 88.0, 1e30];
-    let splats: Vec<SplatInit> = logits
+    let splats: Vec<Gaussian> = logits
         .iter()
         .enumerate()
         .map(|(i, logit)| splat(&v, DVec3::new(0.2 * i as f64 - 1.0, 0.1, 3.0 + 0.1 * i as f64), [-3.0; 3], *logit))
@@ -85,7 +84,7 @@ fn gaussians_about_the_near_plane_are_drawn_in_front_of_it_only() {
     let v = view(33, 21);
     let near = f64::from(0.05f32);
     let depths = [-5.0, -near, 0.0, 1e-9, near - 1e-5, near + 1e-5, 0.06, 0.2];
-    let splats: Vec<SplatInit> =
+    let splats: Vec<Gaussian> =
         depths.iter().map(|z| splat(&v, DVec3::new(0.002, 0.001, *z), [-8.0, -7.0, -6.0], -2.0)).collect();
     let (mut gpu, mut p) = open(shape(&v, 8, 1 << 14));
     p.append(&mut gpu, &splats).unwrap();
@@ -99,11 +98,11 @@ fn gaussians_about_the_near_plane_are_drawn_in_front_of_it_only() {
 fn gaussians_over_the_whole_screen_and_thousands_in_a_pixel_agree_with_the_twin() {
     let v = view(33, 21);
     let mut r = Rng(2);
-    let mut crowd: Vec<SplatInit> = (0..2000)
+    let mut crowd: Vec<Gaussian> = (0..2000)
         .map(|i| {
             let z = 1.0 + 1e-3 * f64::from(i);
             let mut s = splat(&v, DVec3::new(1e-3 * z, 2e-3 * z, z), [-6.0; 3], -5.0);
-            s.colour = r.uniform(0.0, 1.0) as f32;
+            s.colour = [r.uniform(0.0, 1.0) as f32; 3];
             s
         })
         .collect();
@@ -119,14 +118,14 @@ type Left = (Vec<f32>, Vec<Moments>, Vec<[f64; 6]>);
 fn guests_that_are_not_finite_are_counted_and_leave_the_others_to_the_bit() {
     let v = view(33, 21);
     let good = scene(30, &v, 4);
-    let run = |guest: Option<SplatInit>| -> (Left, u32) {
+    let run = |guest: Option<Gaussian>| -> (Left, u32) {
         let (mut gpu, mut p) = open(shape(&v, 31, 1 << 14));
         let mut splats = good.clone();
         splats.splice(11..11, guest);
         p.append(&mut gpu, &splats).unwrap();
         p.set_keyframe(&mut gpu, 0, &target(33, 21)).unwrap();
         p.set_mask(&mut gpu, &mask(33, 21)).unwrap();
-        let picture = render(&mut gpu, &mut p, &v).grey;
+        let picture = render(&mut gpu, &mut p, &v).colour;
         let steps = train(&mut gpu, &mut p, &v, 3);
         let mut moments = vec![Moments::default(); splats.len()];
         gpu.download(p.buffers().moments, 0, &mut moments).unwrap();
@@ -149,7 +148,7 @@ fn guests_that_are_not_finite_are_counted_and_leave_the_others_to_the_bit() {
     }
     // Finite, and yet nothing that can be drawn.
     for quat in [[1e-4; 4], [1e30; 4]] {
-        let (dirty, _) = run(Some(SplatInit { quat_xyzw: quat, ..good[0] }));
+        let (dirty, _) = run(Some(Gaussian { quat_xyzw: quat, ..good[0] }));
         assert!(clean.0 == dirty.0 && clean.2 == dirty.2, "{quat:?}");
     }
 }
@@ -161,8 +160,7 @@ fn a_gaussian_without_rotation_is_not_taken() {
     let mut splats = scene(4, &v, 4);
     splats[1].quat_xyzw = [0.0; 4];
     assert_eq!(p.append(&mut gpu, &splats).unwrap(), 3);
-    let mut map = Vec::new();
-    p.download(&mut gpu, &mut map).unwrap();
+    let map = p.download(&mut gpu).unwrap();
     assert_eq!((map.len(), p.count()), (3, 3));
 }
 
@@ -173,7 +171,7 @@ fn black_and_saturated_images_are_learnt() {
         let goal = vec![level; 33 * 21];
         let map = survives(&v, &scene(100, &v, 3), &goal, 150);
         // COLOUR_MAX of project_backward: a keyframe's exposure may darken it again.
-        assert!(map.iter().all(|s| (0.0..=8.0).contains(&s.colour)));
+        assert!(map.iter().all(|s| (0.0..=8.0).contains(&s.colour[0])));
     }
 }
 
@@ -194,8 +192,7 @@ fn noise(steps: usize) {
         let s = p.train(&mut gpu, &v, 0, &FAST, &Weights::default()).unwrap();
         assert!(s.loss.is_finite() && s.pose_gradient.iter().all(|g| g.is_finite()), "{step}: {s:?}");
     }
-    let mut map = Vec::new();
-    p.download(&mut gpu, &mut map).unwrap();
+    let map = p.download(&mut gpu).unwrap();
     assert!(map.len() == 128 && map.iter().all(finite));
 }
 

@@ -151,7 +151,6 @@ fn measure(config: &GpuConfig, scene: &Scene, tiling: Tiling, peaks: &Peaks, qui
         keyframes: 1,
         cameras: 1,
         channels: 1,
-        sh_degree: 0,
     };
     let mut gpu = Gpu::open(config, Pipeline::arena_bytes(&shape))?;
     let mut p = Pipeline::with_tiling(&mut gpu, shape, tiling)?;

@@ -4,7 +4,7 @@ use glam::DVec3;
 use std::path::Path;
 use stipple::config::{GpuConfig, StereoConfig};
 use stipple::gpu::Gpu;
-use stipple::map::pipeline::{SplatInit, View};
+use stipple::map::pipeline::{Gaussian, View};
 use stipple::stereo::{DepthMap, Pinhole, Stereo};
 use stipple_drivers::replay::{OpenOptions, Recording};
 use stipple_drivers::types::Image;
@@ -13,7 +13,7 @@ use stipple_drivers::{Fault, FaultKind, Frames, Pose};
 pub struct Scene {
     pub name: String,
     pub view: View,
-    pub splats: Vec<SplatInit>,
+    pub splats: Vec<Gaussian>,
     pub image: Vec<u8>,
     pub mask: Vec<u8>,
 }
@@ -46,12 +46,12 @@ impl Scene {
                 let (x, y) = (r.uniform(0.0, width as f64), r.uniform(0.0, height as f64));
                 let z = 3.0 + (x * 0.02).sin() + (y * 0.03).cos();
                 let p = DVec3::new((x - camera.cx) / f * z, (y - camera.cy) / f * z, z);
-                SplatInit {
+                Gaussian {
                     mean: p.as_vec3().to_array(),
                     log_scale: std::array::from_fn(|_| (z / f * pitch * r.uniform(0.5, 1.2)).ln() as f32),
                     quat_xyzw: std::array::from_fn(|_| r.uniform(-1.0, 1.0) as f32),
                     opacity_logit: r.uniform(-1.0, 2.0) as f32,
-                    colour: r.uniform(0.1, 0.9) as f32,
+                    colour: [r.uniform(0.1, 0.9) as f32; 3],
                 }
             })
             .collect();
@@ -105,12 +105,12 @@ impl Scene {
             let z = f64::from(metres[i]);
             let (x, y) = ((i % camera.width) as f64, (i / camera.width) as f64);
             let p = DVec3::new((x - camera.cx) / camera.fx * z, (y - camera.cy) / camera.fy * z, z);
-            SplatInit {
+            Gaussian {
                 mean: p.as_vec3().to_array(),
                 log_scale: [(z / camera.fx * pitch).ln() as f32; 3],
                 quat_xyzw: [0.0, 0.0, 0.0, 1.0],
                 opacity_logit: SEED_OPACITY_LOGIT,
-                colour: f32::from(image.pixels[i]) / 255.0,
+                colour: [f32::from(image.pixels[i]) / 255.0; 3],
             }
         };
         let place = folder.file_name().map_or_else(String::new, |n| n.to_string_lossy().into_owned());

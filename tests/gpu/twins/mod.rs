@@ -2,7 +2,6 @@
 
 pub mod chunks;
 pub mod dual;
-pub mod harmonics;
 pub mod loss;
 pub mod occupancy;
 pub mod pool;

@@ -1,4 +1,4 @@
-//! Twins of prune.comp, repack.comp, importance.comp, move_block.comp and the word of worth.glsl.
+//! Twins of prune.comp, repack.comp, importance.comp, move_block.comp and the word of importance.glsl.
 
 use glam::{DMat3, DQuat, DVec3, DVec4};
 use stipple_drivers::Pose;

@@ -3,19 +3,19 @@
 
 use super::dual::{constant, cross, dot, variable, Dual};
 use glam::DMat3;
-use stipple::map::pipeline::{SplatInit, View};
+use stipple::map::pipeline::{Gaussian, View};
 
 pub const NEAR: f64 = 0.05;
 pub const LOW_PASS: f64 = 0.3;
 const MARGIN: f64 = 0.15;
 const LOG_SCALE: (f64, f64) = (-11.5, 4.6);
 
-/// Parameters in the order of `SplatInit`: mean, log scale, quaternion xyzw, opacity logit, grey.
+/// Parameters in the order of `Gaussian`: mean, log scale, quaternion xyzw, opacity logit, grey.
 pub type Parameters = [f64; 12];
 
-pub fn parameters(s: &SplatInit) -> Parameters {
+pub fn parameters(s: &Gaussian) -> Parameters {
     let mut p = [0.0; 12];
-    let all = s.mean.iter().chain(&s.log_scale).chain(&s.quat_xyzw).chain([&s.opacity_logit, &s.colour]);
+    let all = s.mean.iter().chain(&s.log_scale).chain(&s.quat_xyzw).chain([&s.opacity_logit, &s.colour[0]]);
     all.zip(&mut p).for_each(|(a, b)| *b = f64::from(*a));
     p
 }
