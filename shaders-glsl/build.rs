@@ -13,14 +13,14 @@ mod reflect;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-/// Kernels that measure a device, for `stipple-bench` alone.
-const INSTRUMENTS: &str = "tests/bench/kernels";
+/// Kernels that measure a device or test the core, with the feature `instruments` alone.
+const INSTRUMENTS: [&str; 2] = ["tests/bench/kernels", "tests/gpu/selftest"];
 
 fn main() {
     opencv_shim();
     drivers_build::recordings("../shared/data");
     println!("cargo:rerun-if-changed=shaders-glsl");
-    println!("cargo:rerun-if-changed={INSTRUMENTS}");
+    INSTRUMENTS.iter().for_each(|folder| println!("cargo:rerun-if-changed={folder}"));
     if let Err(errors) = kernels() {
         for e in errors {
             eprintln!("error: {e}");
@@ -34,7 +34,7 @@ fn kernels() -> Result<(), Vec<String>> {
     let out = PathBuf::from(std::env::var_os("OUT_DIR").ok_or_else(|| one("cargo sets OUT_DIR".into()))?);
     let mut files = Vec::new();
     let instruments = std::env::var_os("CARGO_FEATURE_INSTRUMENTS").is_some();
-    for folder in std::iter::once("shaders-glsl").chain(instruments.then_some(INSTRUMENTS)) {
+    for folder in std::iter::once("shaders-glsl").chain(INSTRUMENTS.into_iter().filter(|_| instruments)) {
         find(Path::new(folder), &mut files).map_err(|e| one(format!("{folder}: {e}")))?;
     }
     files.sort();
