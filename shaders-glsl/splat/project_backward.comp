@@ -93,7 +93,9 @@ float[7] update(uint rank) {
     const uint slot = slots[rank];
     Splat s = splats[slot];
     Local l;
-    place(push.camera, s, l);
+    if (!place(push.camera, s, l)) {  // project rounded it in
+        return pose;
+    }
     flatten(push.camera, vec2(push.size), l);
     Gradient g = pull_back(push.camera, l, s.scale_colour.xyz, v0.xy, vec3(v0.zw, v1.x));
     const float per_splat = 1.0 / float(visible_count[0]);
