@@ -5,7 +5,7 @@ use std::path::Path;
 use std::process::Command;
 use std::time::Instant;
 use stipple::config::Board;
-use stipple::map::{Did, Keyframe, Mapper, Offer, Panel};
+use stipple::map::{Keyframe, Mapper, Panel, StepKind};
 use stipple_drivers::replay::{OpenOptions, Recording};
 use stipple_drivers::sim::{write_euroc_colour, Scenario, Sim};
 use stipple_drivers::types::pose_at;
@@ -45,7 +45,7 @@ fn a_colour_recording_becomes_a_map_in_its_colours() {
     let recording = Recording::open(&path, &OpenOptions::default()).unwrap();
     let board = board(&["map.colour=true"]);
     let mut mapper = Mapper::open(&recording.calibration, &board).unwrap();
-    let mut frames = Frames::in_colour(&recording.calibration, mapper.colours_offered());
+    let mut frames = Frames::in_colour(&recording.calibration, 1);
     let mut reader = recording.reader();
     assert!(reader.has_colour(2));
     for (i, frame) in recording.frames.iter().enumerate() {
@@ -53,9 +53,9 @@ fn a_colour_recording_becomes_a_map_in_its_colours() {
         let world_from_body = pose_at(&recording.truth, frame.t, Span(50_000_000)).unwrap();
         let Frames { images, colours, .. } = frames.clone();
         let keyframe = Keyframe { id: i as u64, t: frame.t, world_from_body, images, colours, held_out: i % 4 == 3 };
-        assert_eq!(mapper.offer(&keyframe), Offer::Accepted);
+        mapper.ingest(&keyframe).unwrap();
         for _ in 0..40 {
-            assert_ne!(mapper.step(Instant::now()).unwrap().did, Did::Idle);
+            assert_ne!(mapper.step(Instant::now()).unwrap().kind, StepKind::Idle);
         }
     }
     let q = mapper.evaluate().unwrap();

@@ -12,7 +12,7 @@
 mod world;
 
 use stipple::config::{NetworkConfig, StereoConfig, StereoMethod};
-use stipple::stereo::{Disparity, Method};
+use stipple::stereo::{Disparity, Matcher};
 use stipple_drivers::Image;
 use world::Noise;
 
@@ -194,7 +194,7 @@ fn the_runtime_answers_what_the_network_is() {
     let file = dir.path().join("correlation.onnx");
     std::fs::write(&file, model()).unwrap();
     let (left, right) = pair();
-    let mut method = Method::new(W, H, &config(&file), None).unwrap_or_else(|e| panic!("{e}"));
+    let mut method = Matcher::new(W, H, &config(&file), None).unwrap_or_else(|e| panic!("{e}"));
     let mut found = Disparity::new(W, H);
     method.compute(None, &left, &right, &mut found).unwrap();
     let given = |image: &Image| image.pixels.iter().map(|p| (f64::from(*p) / 255.0 - 0.5) / 0.25).collect::<Vec<f64>>();
@@ -221,7 +221,7 @@ fn a_model_that_is_described_wrongly_is_refused_at_boot() {
     let right = config(&file);
     let said = |network: NetworkConfig| {
         let config = StereoConfig { network, ..right.clone() };
-        Method::new(W, H, &config, None).err().map(|f| f.to_string()).unwrap_or_default()
+        Matcher::new(W, H, &config, None).err().map(|f| f.to_string()).unwrap_or_default()
     };
     let name = said(NetworkConfig { left: "image1".into(), ..right.network.clone() });
     assert!(name.contains("image1") && name.contains("[stereo.network]"), "{name}");
@@ -239,6 +239,6 @@ fn without_the_runtime_the_fault_names_what_to_install() {
     std::fs::write(&file, model()).unwrap();
     let mut config = config(&file);
     config.network.runtime = dir.path().join("libonnxruntime.so").to_str().unwrap().into();
-    let said = Method::new(W, H, &config, None).err().map(|f| f.to_string()).unwrap_or_default();
+    let said = Matcher::new(W, H, &config, None).err().map(|f| f.to_string()).unwrap_or_default();
     assert!(said.contains("stereo.network.runtime") && said.contains("pip install onnxruntime"), "{said}");
 }

@@ -8,7 +8,7 @@
 mod world;
 
 use stipple::config::{StereoConfig, StereoMethod};
-use stipple::stereo::{Disparity, Method};
+use stipple::stereo::{Disparity, Matcher};
 use stipple_drivers::host::rss_peak_bytes;
 use stipple_drivers::Image;
 use world::Noise;
@@ -32,7 +32,7 @@ fn a_hundred_pairs_take_no_more_memory_than_ten() {
     let pairs: Vec<[Image; 2]> = (0..8).map(|i| pair(3 + 7 * i, &mut Noise(i as u64))).collect();
     for method in [StereoMethod::Bm, StereoMethod::Sgbm] {
         let config = StereoConfig { method, disparities: 64, ..StereoConfig::default() };
-        let mut matcher = Method::new(WIDTH, HEIGHT, &config, None).unwrap();
+        let mut matcher = Matcher::new(WIDTH, HEIGHT, &config, None).unwrap();
         let mut found = Disparity::new(WIDTH, HEIGHT);
         let mut run = |n: usize| {
             for [left, right] in (0..n).map(|i| &pairs[i % pairs.len()]) {

@@ -34,15 +34,15 @@ vec3 pull_back_pinhole(vec2 focal, Local l, vec2 v_centre, mat3x2 v_v, out mat3 
 }
 
 vec3 pull_back_fisheye(vec2 focal, vec4 k, Local l, vec2 v_centre, mat3x2 v_v, out mat3 v_axes) {
-    const Bend b = bend(k, l.p);
-    const mat3x2 j = bend_jacobian(b, l.p);
+    const Distortion b = distort(k, l.p);
+    const mat3x2 j = distortion_jacobian(b, l.p);
     mat3x2 v_j = mat3x2(0.0);
     for (int i = 0; i < 3; ++i) {
         const vec2 scaled = focal * v_v[i];
         v_axes[i] = scaled * j;
         v_j += outerProduct(scaled, l.axes[i]);
     }
-    return bend_gradient(b, l.p, focal * v_centre, v_j);
+    return distortion_gradient(b, l.p, focal * v_centre, v_j);
 }
 
 /// A V_k = adj(C') V_k / det without the cancellation of the product: a needle's own terms are zero exactly.
@@ -67,7 +67,7 @@ Gradient pull_back(Camera c, Local l, vec3 log_scale, vec2 v_centre, vec3 v_coni
     Gradient g;
     mat3 v_axes;
     if (FISHEYE) {
-        g.cam = pull_back_fisheye(c.focal_centre.xy, c.bend, l, v_centre, v_v, v_axes);
+        g.cam = pull_back_fisheye(c.focal_centre.xy, c.distortion, l, v_centre, v_v, v_axes);
     } else {
         g.cam = pull_back_pinhole(c.focal_centre.xy, l, v_centre, v_v, v_axes);
     }

@@ -7,10 +7,10 @@
 layout(constant_id = 10) const bool FISHEYE = false;
 
 struct Camera {
-    vec4 turn;          // cam_from_world, xyzw
-    vec4 shift;         // cam_from_world, m; fisheye: the widest angle off the axis, rad
+    vec4 rotation;      // cam_from_world, xyzw
+    vec4 translation;   // cam_from_world, m; fisheye: the widest angle off the axis, rad
     vec4 focal_centre;  // fx, fy, cx, cy of the host: integer = pixel centre, px
-    vec4 bend;          // fisheye: k1..k4
+    vec4 distortion;    // fisheye: k1..k4
 };
 
 struct Local {
@@ -50,19 +50,19 @@ mat3 rotation_of(vec4 q) {
 }
 
 mat3 cam_from_world(Camera c) {
-    return rotation_of(c.turn);
+    return rotation_of(c.rotation);
 }
 
 bool in_view(Camera c, Local l) {
     if (FISHEYE) {
-        return l.depth >= NEAR && angle_off_axis(length(l.p.xy), l.p.z) <= c.shift.w;
+        return l.depth >= NEAR && angle_off_axis(length(l.p.xy), l.p.z) <= c.translation.w;
     }
     return l.depth >= NEAR;
 }
 
 /// The Gaussian in the camera frame; false when it is not in front of the camera or not finite.
 bool place(Camera c, Splat s, out Local l) {
-    l.p = cam_from_world(c) * s.mean_opacity.xyz + c.shift.xyz;
+    l.p = cam_from_world(c) * s.mean_opacity.xyz + c.translation.xyz;
     l.depth = FISHEYE ? length(l.p) : l.p.z;
     const float norm2 = dot(s.quat, s.quat);
     if (!(finite(vec4(l.p, l.depth)) && in_view(c, l) && finite(s.mean_opacity) && finite(s.scale_colour) &&
@@ -91,9 +91,9 @@ void flatten_pinhole(Camera c, vec2 size, inout Local l) {
 
 void flatten_fisheye(Camera c, inout Local l) {
     const vec2 focal = c.focal_centre.xy;
-    const Bend b = bend(c.bend, l.p);
+    const Distortion b = distort(c.distortion, l.p);
     l.centre = focal * b.a * l.p.xy + principal_point(c);
-    const mat3x2 j = bend_jacobian(b, l.p);
+    const mat3x2 j = distortion_jacobian(b, l.p);
     for (int k = 0; k < 3; ++k) {
         l.jacobian_axes[k] = focal * (j * l.axes[k]);
     }

@@ -4,7 +4,7 @@
 //   a = D / √u,  h = D'(θ) / (u + z²) = -∂a/∂z,  g = (z h - a) / u = 2 ∂a/∂u
 // Near the axis these cancel; there they are series of s = u / z²: a = F(s) / z.
 
-struct Bend {
+struct Distortion {
     float a, g, h;
     float g_u, g_z, h_u, h_z;  // their slopes, for the backward pass
 };
@@ -23,7 +23,7 @@ float angle_off_axis(float r, float z) {
     return z < 0.0 ? 2.0 * HALF_PI - angle : angle;
 }
 
-Bend bend_near_axis(vec4 k, float s, float z) {
+Distortion distort_near_axis(vec4 k, float s, float z) {
     const float c1 = k.x - 1.0 / 3.0, c2 = 0.2 - k.x + k.y;
     const float c3 = -1.0 / 7.0 + 14.0 / 15.0 * k.x - 5.0 / 3.0 * k.y + k.z;
     const float c4 = 1.0 / 9.0 - 818.0 / 945.0 * k.x + 19.0 / 9.0 * k.y - 7.0 / 3.0 * k.z + k.w;
@@ -32,21 +32,21 @@ Bend bend_near_axis(vec4 k, float s, float z) {
     const float f2 = 2.0 * c2 + s * (6.0 * c3 + s * 12.0 * c4);
     const float w = 1.0 / z, w2 = w * w;
     const float e = f0 + 2.0 * s * f1, e_s = 3.0 * f1 + 2.0 * s * f2;
-    return Bend(f0 * w, 2.0 * f1 * w2 * w, e * w2, 2.0 * f2 * w2 * w2 * w, -(6.0 * f1 + 4.0 * s * f2) * w2 * w2,
+    return Distortion(f0 * w, 2.0 * f1 * w2 * w, e * w2, 2.0 * f2 * w2 * w2 * w, -(6.0 * f1 + 4.0 * s * f2) * w2 * w2,
                 e_s * w2 * w2, -2.0 * (e + s * e_s) * w2 * w);
 }
 
-Bend bend(vec4 k, vec3 p) {
+Distortion distort(vec4 k, vec3 p) {
     const float u = dot(p.xy, p.xy), z = p.z;
     if (z > 0.0 && u < NEAR_AXIS * z * z) {
-        return bend_near_axis(k, u / (z * z), z);
+        return distort_near_axis(k, u / (z * z), z);
     }
     const float r = sqrt(u), theta = angle_off_axis(r, z), t2 = theta * theta;
     const float d = theta * (1.0 + t2 * (k.x + t2 * (k.y + t2 * (k.z + t2 * k.w))));
     const float d1 = 1.0 + t2 * (3.0 * k.x + t2 * (5.0 * k.y + t2 * (7.0 * k.z + t2 * 9.0 * k.w)));
     const float d2 = theta * (6.0 * k.x + t2 * (20.0 * k.y + t2 * (42.0 * k.z + t2 * 72.0 * k.w)));
     const float inv = 1.0 / (u + z * z);
-    Bend b;
+    Distortion b;
     b.a = d / r;
     b.h = d1 * inv;
     b.g = (z * b.h - b.a) / u;
@@ -58,13 +58,13 @@ Bend bend(vec4 k, vec3 p) {
 }
 
 /// J without the focal length: columns by x, y, z.
-mat3x2 bend_jacobian(Bend b, vec3 p) {
+mat3x2 distortion_jacobian(Distortion b, vec3 p) {
     const float cross_term = b.g * p.x * p.y;
     return mat3x2(b.a + b.g * p.x * p.x, cross_term, cross_term, b.a + b.g * p.y * p.y, -b.h * p.x, -b.h * p.y);
 }
 
 /// By p, from the gradients by the centre and by J, both times the focal length.
-vec3 bend_gradient(Bend b, vec3 p, vec2 v_centre, mat3x2 v_jacobian) {
+vec3 distortion_gradient(Distortion b, vec3 p, vec2 v_centre, mat3x2 v_jacobian) {
     const float x = p.x, y = p.y;
     const float shear = v_jacobian[1].x + v_jacobian[0].y;
     const float v_a = v_jacobian[0].x + v_jacobian[1].y + dot(v_centre, p.xy);

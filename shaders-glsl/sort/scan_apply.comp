@@ -1,17 +1,16 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Second half of an exclusive scan. In: data[0..count], sums[block]. Out: data scanned in place.
+// Second half of an exclusive scan. In: data[0..n], sums[block]. Out: data scanned in place.
 // Two dispatches for any length: a block walks its tiles, so the block sums always fit one workgroup.
 #include "tile_scan.glsl"
 
 layout(local_size_x = 256) in;
 
 layout(set = 0, binding = 0, std430) buffer Data { uint data[]; };
-layout(set = 0, binding = 1, std430) readonly buffer Count { uint count[]; };
-layout(set = 0, binding = 2, std430) readonly buffer Sums { uint sums[]; };
+layout(set = 0, binding = 1, std430) readonly buffer Sums { uint sums[]; };
 
 layout(push_constant) uniform Push {
-    uint capacity;
+    uint n;
     uint blocks;
 };
 
@@ -19,7 +18,7 @@ void main() {
     uint lane = gl_LocalInvocationID.x;
     uint block = gl_WorkGroupID.x;
     if (block >= blocks) return;
-    uvec2 range = block_range(min(count[0], capacity), blocks, block);
+    uvec2 range = block_range(n, blocks, block);
     uint carry;
     lanes_exclusive(lane, lane < block ? sums[lane] : 0u, carry);
     for (uint first = range.x; first < range.y; first += TILE) {

@@ -1,16 +1,15 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// First half of an exclusive scan: the sum of each block. In: data[0..count]. Out: sums[block].
+// First half of an exclusive scan: the sum of each block. In: data[0..n]. Out: sums[block].
 #include "tile_scan.glsl"
 
 layout(local_size_x = 256) in;
 
 layout(set = 0, binding = 0, std430) readonly buffer Data { uint data[]; };
-layout(set = 0, binding = 1, std430) readonly buffer Count { uint count[]; };
-layout(set = 0, binding = 2, std430) writeonly buffer Sums { uint sums[]; };
+layout(set = 0, binding = 1, std430) writeonly buffer Sums { uint sums[]; };
 
 layout(push_constant) uniform Push {
-    uint capacity;
+    uint n;
     uint blocks; // at most 256
 };
 
@@ -18,7 +17,7 @@ void main() {
     uint lane = gl_LocalInvocationID.x;
     uint block = gl_WorkGroupID.x;
     if (block >= blocks) return;
-    uvec2 range = block_range(min(count[0], capacity), blocks, block);
+    uvec2 range = block_range(n, blocks, block);
     uint sum = 0u;
     for (uint i = range.x + lane; i < range.y; i += LANES) sum += data[i];
     uint total;

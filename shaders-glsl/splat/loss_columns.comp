@@ -1,12 +1,11 @@
 // Last pass of the loss (1 - λ)|x - y| + λ(1 - SSIM), mean over valid pixels, of x = gain · rendered + offset: its
-// gradient by the rendered image and, where EXPOSURE is set, by gain and offset.
+// gradient by the rendered image, by gain and by offset.
 // in   filtered_planes (slopes filtered along rows), grey (rendered), targets, mask
 // out  grey_gradient, zero where masked; loss_sums[group]: |x - y|, gradient by gain, by offset, 0
 #version 450
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
 layout(local_size_x = 64) in;
-layout(constant_id = 0) const bool EXPOSURE = false;
 
 #include "../common/index.glsl"
 #include "../common/ssim.glsl"
@@ -68,10 +67,7 @@ void main() {
     const uint runs = (push.size.y + RUN - 1) / RUN;
     // All threads stay for the sum.
     const vec3 s = at < push.size.x * runs ? column_run(at % push.size.x, at / push.size.x * RUN) : vec3(0.0);
-    vec4 total = vec4(sum64(s.x), vec3(0.0));
-    if (EXPOSURE) {
-        total.yz = vec2(sum64(s.y), sum64(s.z));
-    }
+    const vec4 total = vec4(sum64(s.x), sum64(s.y), sum64(s.z), 0.0);
     if (gl_LocalInvocationID.x == 0) {
         loss_sums[push.group + group_index()] = total;
     }

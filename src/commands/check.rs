@@ -13,7 +13,7 @@ pub struct Args {
 pub fn check(args: &Args) -> Result<(), Fault> {
     let board = args.board.load()?;
     let rig = memory::largest_rig(&board);
-    memory::print(&memory::footprint(&rig, &board, true));
+    memory::print(&memory::footprint(&rig, &board, true)?);
     memory::check_fits(&args.board.path().display().to_string(), &rig, &board, true)?;
     println!("{:>12}       fits memory_max_mib = {}", "", board.memory_max_mib);
     Ok(())

@@ -4,7 +4,7 @@
 //! variants takes the first one whose SPIR-V capabilities the device has.
 
 use super::device::{boot, Device};
-use super::memory::{Arena, Range, ALIGN};
+use super::memory::{Backed, Range, ALIGN};
 use super::record::COMMANDS_MAX;
 use super::GpuError;
 use ash::vk;
@@ -111,9 +111,6 @@ pub(super) struct Pipelines {
 type SetKey = (u32, [Range; BUFFERS_MAX]);
 
 impl Pipelines {
-    /// The table is a power of two of slots, at most 7/8 full, with a control byte each.
-    pub const BYTES: usize = (SETS_MAX * 8 / 7).next_power_of_two() * (size_of::<(SetKey, vk::DescriptorSet)>() + 1);
-
     pub fn new(device: &Arc<Device>) -> Result<Pipelines, Fault> {
         let sizes = [vk::DescriptorPoolSize::default()
             .ty(vk::DescriptorType::STORAGE_BUFFER)
@@ -187,7 +184,7 @@ impl Pipelines {
         &mut self,
         index: u32,
         ranges: &[Range; BUFFERS_MAX],
-        arena: &Arena,
+        memory: &Backed,
     ) -> Result<vk::DescriptorSet, GpuError> {
         if let Some(&set) = self.sets.get(&(index, *ranges)) {
             return Ok(set);
@@ -196,7 +193,7 @@ impl Pipelines {
         for r in &ranges[..pipeline.bindings.len()] {
             let bindable =
                 r.start % ALIGN == 0 && r.start < r.end && r.end - r.start <= self.device.caps.binding_max_bytes;
-            if !bindable || r.end > arena.bytes() {
+            if !bindable || r.end > memory.bytes {
                 return Err(GpuError::Binding { kernel: pipeline.name, start: r.start, end: r.end });
             }
         }
@@ -212,7 +209,7 @@ impl Pipelines {
         let mut infos = [vk::DescriptorBufferInfo::default(); BUFFERS_MAX];
         let mut writes = [vk::WriteDescriptorSet::default(); BUFFERS_MAX];
         for (i, r) in ranges.iter().enumerate().take(pipeline.bindings.len()) {
-            infos[i] = vk::DescriptorBufferInfo { buffer: arena.buffer(), offset: r.start, range: r.end - r.start };
+            infos[i] = vk::DescriptorBufferInfo { buffer: memory.buffer, offset: r.start, range: r.end - r.start };
         }
         for ((write, info), &(binding, _)) in writes.iter_mut().zip(&infos).zip(pipeline.bindings) {
             *write = vk::WriteDescriptorSet::default()

@@ -1,7 +1,8 @@
-//! One arena of device memory, bump-allocated at boot, and one staging buffer to fill and read it.
+//! One buffer of device memory, handed out at boot by an `Arena`, and one staging buffer to fill and read it.
 //!
-//! `Buf<T>` is a plain copyable handle. Nothing is freed before the arena is: capacity comes from the
-//! board's budget, and a budget that does not fit is refused at boot.
+//! `Buf<T>` is a plain copyable handle. Nothing is freed before the device is closed: capacity comes from the board's
+//! budget, and a budget that does not fit is refused at boot. An arena is bookkeeping alone, so what allocates from one
+//! can be run without a device first, to learn how large the buffer must be (`Arena::counting`).
 
 use super::device::{boot, unavailable, Device};
 use crate::mem::Footprint;
@@ -15,7 +16,7 @@ pub const ALIGN: u64 = 256;
 /// Host side of every transfer; longer ones go in pieces.
 pub const STAGING_BYTES: usize = 4 << 20;
 /// Places at the end of staging that stay as they are until the next report to the same place, and their size.
-pub const REPORTS: usize = 2;
+pub const REPORTS: usize = 3;
 pub const REPORT_BYTES: usize = 256;
 /// What is left of it for transfers.
 pub(super) const TRANSFER_BYTES: usize = STAGING_BYTES - REPORTS * REPORT_BYTES;
@@ -126,10 +127,11 @@ macro_rules! binding {
 }
 binding!(Read, Write, ReadWrite);
 
-/// A buffer with memory of its own. Used for the arena and for staging.
-struct Backed {
+/// A Vulkan buffer with memory of its own.
+pub(super) struct Backed {
     device: Arc<Device>,
-    buffer: vk::Buffer,
+    pub buffer: vk::Buffer,
+    pub bytes: u64,
     memory: vk::DeviceMemory,
 }
 
@@ -144,7 +146,7 @@ impl Backed {
         let info = vk::BufferCreateInfo::default().size(bytes).usage(usage);
         // SAFETY: the device is alive, and `bytes` is positive.
         let buffer = unsafe { device.raw.create_buffer(&info, None) }.map_err(boot("vkCreateBuffer"))?;
-        let mut backed = Backed { device: device.clone(), buffer, memory: vk::DeviceMemory::null() };
+        let mut backed = Backed { device: device.clone(), buffer, bytes, memory: vk::DeviceMemory::null() };
         // SAFETY: the buffer was just made.
         let needs = unsafe { device.raw.get_buffer_memory_requirements(buffer) };
         let kind = preferences
@@ -179,40 +181,26 @@ impl Drop for Backed {
     }
 }
 
+/// Where in the one buffer the next part goes.
 pub struct Arena {
-    backed: Backed,
     bytes: u64,
     used: u64,
+    /// Largest part that a kernel can bind, bytes.
+    binding_max: u64,
     rows: Vec<(&'static str, u64)>,
 }
 
 impl Arena {
-    pub fn new(device: &Arc<Device>, bytes: u64) -> Result<Arena, Fault> {
-        let bytes = bytes.next_multiple_of(ALIGN).max(ALIGN);
-        if bytes > device.caps.allocation_max_bytes {
-            return Err(Fault::new(
-                FaultKind::Config,
-                "gpu arena",
-                format!(
-                    "{} MiB asked for; {} allocates at most {} MiB at once",
-                    bytes >> 20,
-                    device.caps.name,
-                    device.caps.allocation_max_bytes >> 20
-                ),
-                "lower the board's [budget]",
-            ));
-        }
-        let usage = vk::BufferUsageFlags::STORAGE_BUFFER
-            | vk::BufferUsageFlags::INDIRECT_BUFFER
-            | vk::BufferUsageFlags::TRANSFER_SRC
-            | vk::BufferUsageFlags::TRANSFER_DST;
-        let local = vk::MemoryPropertyFlags::DEVICE_LOCAL;
-        // Memory the host also sees is scarce on discrete devices: taken only if there is no other.
-        let preferences = [(local, vk::MemoryPropertyFlags::HOST_VISIBLE), (local, vk::MemoryPropertyFlags::empty())];
-        let backed = Backed::new(device, "arena", bytes, usage, &preferences)?;
-        Ok(Arena { backed, bytes, used: 0, rows: Vec::new() })
+    /// Without an end: to run what allocates and ask how many bytes it took.
+    pub fn counting() -> Arena {
+        Arena::new(u64::MAX, u64::MAX)
     }
 
+    pub(super) fn new(bytes: u64, binding_max: u64) -> Arena {
+        Arena { bytes, used: 0, binding_max, rows: Vec::new() }
+    }
+
+    /// Takes `len` elements. `name` should say which budget sizes it.
     pub fn alloc<T: bytemuck::Pod>(&mut self, name: &'static str, len: usize) -> Result<Buf<T>, Fault> {
         let refuse = |what: String| {
             let fix = format!("change the [budget] entry that sizes `{name}`");
@@ -222,10 +210,8 @@ impl Arena {
             .checked_mul(size_of::<T>() as u64)
             .filter(|&b| b > 0)
             .ok_or_else(|| refuse(format!("{len} elements of {} bytes is no size", size_of::<T>())))?;
-        let most = self.backed.device.caps.binding_max_bytes;
-        if bytes > most {
-            let device = &self.backed.device.caps.name;
-            return Err(refuse(format!("{bytes} bytes; {device} binds at most {most} at once")));
+        if bytes > self.binding_max {
+            return Err(refuse(format!("{bytes} bytes; the device binds at most {} at once", self.binding_max)));
         }
         let left = self.bytes - self.used;
         if bytes > left {
@@ -237,28 +223,40 @@ impl Arena {
         Ok(Buf { offset, len, of: PhantomData })
     }
 
-    pub fn buffer(&self) -> vk::Buffer {
-        self.backed.buffer
-    }
-
     /// All of it, to be cleared.
-    pub fn whole(&self) -> Buf<u32> {
+    pub(super) fn whole(&self) -> Buf<u32> {
         Buf { offset: 0, len: self.bytes as usize / 4, of: PhantomData }
-    }
-
-    pub fn bytes(&self) -> u64 {
-        self.bytes
     }
 
     pub fn used(&self) -> u64 {
         self.used
     }
 
+    /// Bytes by name, alignment included.
     pub fn footprint(&self) -> Footprint {
         let mut f = Footprint::default();
         self.rows.iter().for_each(|&(name, bytes)| f.gpu(name, bytes as usize));
         f
     }
+}
+
+/// The buffer that an arena of `bytes` hands out.
+pub(super) fn arena_buffer(device: &Arc<Device>, bytes: u64) -> Result<Backed, Fault> {
+    let caps = &device.caps;
+    if bytes > caps.allocation_max_bytes {
+        let mib = |bytes: u64| bytes >> 20;
+        let most = mib(caps.allocation_max_bytes);
+        let what = format!("{} MiB asked for; {} allocates at most {most} MiB at once", mib(bytes), caps.name);
+        return Err(Fault::new(FaultKind::Config, "gpu arena", what, "lower the board's [budget]"));
+    }
+    let usage = vk::BufferUsageFlags::STORAGE_BUFFER
+        | vk::BufferUsageFlags::INDIRECT_BUFFER
+        | vk::BufferUsageFlags::TRANSFER_SRC
+        | vk::BufferUsageFlags::TRANSFER_DST;
+    let local = vk::MemoryPropertyFlags::DEVICE_LOCAL;
+    // Memory the host also sees is scarce on discrete devices: taken only if there is no other.
+    let preferences = [(local, vk::MemoryPropertyFlags::HOST_VISIBLE), (local, vk::MemoryPropertyFlags::empty())];
+    Backed::new(device, "arena", bytes, usage, &preferences)
 }
 
 pub struct Staging {

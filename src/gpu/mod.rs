@@ -45,16 +45,15 @@ mod tests;
 
 pub use device::{Caps, DeviceKind, Subgroup};
 pub use kernel::{Access, Kernel, KernelDef, Reflected, Variant, BUFFERS_MAX, PUSH_MAX, SPECS_MAX};
-pub use memory::{Buf, Range, Read, ReadWrite, Write, ALIGN, REPORTS, REPORT_BYTES, STAGING_BYTES};
+pub use memory::{Arena, Buf, Range, Read, ReadWrite, Write, ALIGN, REPORTS, REPORT_BYTES, STAGING_BYTES};
 pub use record::{Recorder, Threads, COMMANDS_MAX, GROUPS_MAX};
 pub use submit::{Ticket, Timing};
 
 use crate::config::GpuConfig;
-use crate::mem::Footprint;
 use ash::vk;
 use device::Device;
 use kernel::Pipelines;
-use memory::{report_offset, Arena, Staging, TRANSFER_BYTES};
+use memory::{arena_buffer, report_offset, Backed, Staging, TRANSFER_BYTES};
 use std::fmt;
 use std::sync::Arc;
 use stipple_drivers::{Fault, FaultKind};
@@ -122,6 +121,8 @@ pub struct Gpu {
     submitter: Submitter,
     pipelines: Pipelines,
     staging: Staging,
+    /// What the arena hands out.
+    memory: Backed,
     arena: Arena,
     /// The recording's memory while nobody records.
     spare: Option<Recorder>,
@@ -145,11 +146,13 @@ impl Gpu {
     pub fn open_with(config: &GpuConfig, arena_bytes: u64, options: GpuOptions) -> Result<Gpu, Fault> {
         let device = Arc::new(Device::open(config, options.validation)?);
         let staging = Staging::new(&device)?;
+        let arena_bytes = arena_bytes.next_multiple_of(ALIGN).max(ALIGN);
         let mut gpu = Gpu {
             submitter: Submitter::new(&device, staging.buffer(), config.submission_max_ms)?,
             pipelines: Pipelines::new(&device)?,
             staging,
-            arena: Arena::new(&device, arena_bytes)?,
+            memory: arena_buffer(&device, arena_bytes)?,
+            arena: Arena::new(arena_bytes, device.caps.binding_max_bytes),
             spare: Some(Recorder::new()),
             lost: false,
             device,
@@ -167,7 +170,12 @@ impl Gpu {
         &self.device.caps
     }
 
-    /// Takes `len` elements from the arena, at boot. `name` should say which budget sizes it.
+    /// Where buffers are taken from, at boot.
+    pub fn arena(&mut self) -> &mut Arena {
+        &mut self.arena
+    }
+
+    /// Takes `len` elements from the arena.
     pub fn alloc<T: bytemuck::Pod>(&mut self, name: &'static str, len: usize) -> Result<Buf<T>, Fault> {
         self.arena.alloc(name, len)
     }
@@ -215,7 +223,7 @@ impl Gpu {
         let started = match rec.error {
             _ if self.lost => Err(GpuError::Lost),
             Some(e) => Err(e),
-            None => self.submitter.start(&rec, &mut self.pipelines, &self.arena),
+            None => self.submitter.start(&rec, &mut self.pipelines, &self.memory),
         };
         self.put_back(rec);
         self.note(started)
@@ -248,7 +256,7 @@ impl Gpu {
             self.staging.bytes_mut()[..piece.len()].copy_from_slice(piece);
             let size = piece.len() as u64;
             let region = vk::BufferCopy { src_offset: 0, dst_offset: start + done, size };
-            let moved = self.submitter.transfer(self.staging.buffer(), self.arena.buffer(), region);
+            let moved = self.submitter.transfer(self.staging.buffer(), self.memory.buffer, region);
             self.note(moved)?;
             done += size;
         }
@@ -263,7 +271,7 @@ impl Gpu {
         for piece in bytemuck::cast_slice_mut::<T, u8>(items).chunks_mut(TRANSFER_BYTES) {
             let size = piece.len() as u64;
             let region = vk::BufferCopy { src_offset: start + done, dst_offset: 0, size };
-            let moved = self.submitter.transfer(self.arena.buffer(), self.staging.buffer(), region);
+            let moved = self.submitter.transfer(self.memory.buffer, self.staging.buffer(), region);
             self.note(moved)?;
             piece.copy_from_slice(self.staging.bytes(0, piece.len()));
             done += size;
@@ -271,24 +279,14 @@ impl Gpu {
         Ok(())
     }
 
-    /// What the last `Recorder::read_back` brought, until the next transfer. Waits for all that was started.
-    pub fn read_back<T: bytemuck::Pod>(&mut self, items: &mut [T]) -> Result<(), GpuError> {
-        self.wait()?;
-        self.copy_out(0, TRANSFER_BYTES, items)
-    }
-
     /// What a recording's `Recorder::report` brought to `place`. Waits for that recording alone.
     pub fn report<T: bytemuck::Pod>(&mut self, ticket: Ticket, place: usize, items: &mut [T]) -> Result<(), GpuError> {
         self.finish(ticket)?;
-        self.copy_out(report_offset(place.min(REPORTS - 1)) as usize, REPORT_BYTES, items)
-    }
-
-    fn copy_out<T: bytemuck::Pod>(&self, at: usize, of: usize, items: &mut [T]) -> Result<(), GpuError> {
         let bytes = bytemuck::cast_slice_mut::<T, u8>(items);
-        if bytes.len() > of {
-            return Err(GpuError::OutOfRange { at: 0, len: bytes.len(), of });
+        if bytes.len() > REPORT_BYTES || place >= REPORTS {
+            return Err(GpuError::OutOfRange { at: 0, len: bytes.len(), of: REPORT_BYTES });
         }
-        bytes.copy_from_slice(self.staging.bytes(at, bytes.len()));
+        bytes.copy_from_slice(self.staging.bytes(report_offset(place) as usize, bytes.len()));
         Ok(())
     }
 
@@ -297,7 +295,7 @@ impl Gpu {
         self.submitter.last_ms
     }
 
-    /// Time on the device, by kernel (and `fill`, `copy`, `read back`), since boot. A command's time runs from the end of the
+    /// Time on the device, by kernel (and `fill`, `report`), since boot. A command's time runs from the end of the
     /// one before, so the times of a submission add up to the whole.
     pub fn timings(&self) -> &[Timing] {
         &self.submitter.timings
@@ -319,26 +317,8 @@ impl Gpu {
         self.submitter.longest_ms
     }
 
-    pub fn arena_bytes(&self) -> u64 {
-        self.arena.bytes()
-    }
-
     pub fn arena_used(&self) -> u64 {
         self.arena.used()
-    }
-
-    /// Arena bytes by name, alignment included.
-    pub fn footprint(&self) -> Footprint {
-        self.arena.footprint()
-    }
-
-    /// Host memory one `Gpu` takes, whatever the board.
-    pub fn host_footprint() -> Footprint {
-        let mut f = Footprint::default();
-        f.host("gpu staging", STAGING_BYTES);
-        f.host("gpu recording", Recorder::BYTES);
-        f.host("gpu descriptor sets", Pipelines::BYTES);
-        f
     }
 
     /// Warnings and errors of the validation layer so far; none without validation.

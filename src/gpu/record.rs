@@ -6,7 +6,7 @@
 //! there is.
 
 use super::kernel::{Access, Kernel, KernelDef, BUFFERS_MAX, PUSH_MAX};
-use super::memory::{Buf, Range, REPORTS, REPORT_BYTES, TRANSFER_BYTES};
+use super::memory::{Buf, Range, REPORTS, REPORT_BYTES};
 use super::GpuError;
 
 /// Commands of one recording.
@@ -62,8 +62,7 @@ pub(super) enum Work {
     Dispatch { kernel: u32, ranges: [Range; BUFFERS_MAX], push: [u8; PUSH_MAX], groups: [u32; 3] },
     Indirect { kernel: u32, ranges: [Range; BUFFERS_MAX], push: [u8; PUSH_MAX], at: u64 },
     Fill { range: Range, value: u32 },
-    Copy { from: Range, to: Range },
-    ReadBack { from: Range, report: Option<usize> },
+    Report { from: Range, place: usize },
 }
 
 #[derive(Clone, Copy)]
@@ -77,7 +76,7 @@ pub struct Recorder {
     pub(super) commands: Vec<Command>,
     /// Bytes touched since the last barrier, and whether they were written.
     open: Vec<(Range, bool)>,
-    reads_back: bool,
+    reports: bool,
     pub(super) error: Option<GpuError>,
 }
 
@@ -85,13 +84,11 @@ pub struct Recorder {
 const OPEN_MAX: usize = COMMANDS_MAX * (BUFFERS_MAX + 1);
 
 impl Recorder {
-    pub(super) const BYTES: usize = COMMANDS_MAX * size_of::<Command>() + OPEN_MAX * size_of::<(Range, bool)>();
-
     pub(super) fn new() -> Recorder {
         Recorder {
             commands: Vec::with_capacity(COMMANDS_MAX),
             open: Vec::with_capacity(OPEN_MAX),
-            reads_back: false,
+            reports: false,
             error: None,
         }
     }
@@ -99,7 +96,7 @@ impl Recorder {
     pub(super) fn clear(&mut self) {
         self.commands.clear();
         self.open.clear();
-        self.reads_back = false;
+        self.reports = false;
         self.error = None;
     }
 
@@ -145,40 +142,16 @@ impl Recorder {
         }
     }
 
-    /// Copies the first `len` elements.
-    pub fn copy<T>(&mut self, from: Buf<T>, to: Buf<T>, len: usize) {
-        if len > from.len().min(to.len()) {
-            return self.fail(GpuError::OutOfRange { at: 0, len, of: from.len().min(to.len()) });
-        }
-        let (from, to) = (from.part(0, len).range(), to.part(0, len).range());
-        if from.overlaps(&to) {
-            return self.fail(GpuError::Binding { kernel: "copy", start: to.start, end: to.end });
-        }
-        if from.start < from.end {
-            let touched = [(from, Access::Read), (to, Access::Write)];
-            self.push(Work::Copy { from, to }, touched.into_iter());
-        }
-    }
-
-    /// Brings `buf` to the host within this submission: `Gpu::read_back` has it afterwards. One a recording.
-    pub fn read_back<T>(&mut self, buf: Buf<T>) {
-        self.bring(buf, None, TRANSFER_BYTES);
-    }
-
-    /// As `read_back`, to a place of its own below `REPORTS`, where it stays until the next report to it:
-    /// `Gpu::report` has it.
+    /// Brings `buf` to the host within this submission, to a place below `REPORTS`, where it stays until the next report
+    /// to it: `Gpu::report` has it. One a recording.
     pub fn report<T>(&mut self, buf: Buf<T>, place: usize) {
-        self.bring(buf, Some(place), if place < REPORTS { REPORT_BYTES } else { 0 });
-    }
-
-    fn bring<T>(&mut self, buf: Buf<T>, report: Option<usize>, most: usize) {
         let from = buf.range();
-        if buf.bytes() > most as u64 || self.reads_back {
-            return self.fail(GpuError::Binding { kernel: "read back", start: from.start, end: from.end });
+        if buf.bytes() > REPORT_BYTES as u64 || place >= REPORTS || self.reports {
+            return self.fail(GpuError::Binding { kernel: "report", start: from.start, end: from.end });
         }
-        self.reads_back = true;
+        self.reports = true;
         if from.start < from.end {
-            self.push(Work::ReadBack { from, report }, std::iter::once((from, Access::Read)));
+            self.push(Work::Report { from, place }, std::iter::once((from, Access::Read)));
         }
     }
 

@@ -12,7 +12,7 @@
 
 use super::device::{boot, Device};
 use super::kernel::Pipelines;
-use super::memory::{report_offset, Arena, Range};
+use super::memory::{report_offset, Backed, Range};
 use super::pieces::{axis, Pace};
 use super::record::{Command, Recorder, Work, COMMANDS_MAX};
 use super::GpuError;
@@ -38,8 +38,7 @@ pub struct Timing {
 
 /// Rows of `Submitter::timings` that are not kernels.
 const FILL: usize = 0;
-const COPY: usize = 1;
-const READ_BACK: usize = 2;
+const REPORT: usize = 1;
 
 /// A recording that was started: the number of its last part.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -84,7 +83,7 @@ pub(super) struct Submitter {
     /// Parts started, and those of them waited for.
     started: u64,
     ended: u64,
-    /// Where read-backs go.
+    /// Where reports go.
     staging: vk::Buffer,
     stamps: Vec<u64>,
     pub timings: Vec<Timing>,
@@ -142,8 +141,7 @@ impl Submitter {
             timed_in: 1,
         };
         s.row("fill");
-        s.row("copy");
-        s.row("read back");
+        s.row("report");
         let raw = &device.raw;
         // SAFETY: the device is alive; each object is destroyed by `Drop`, also after a failure here.
         unsafe {
@@ -179,7 +177,7 @@ impl Submitter {
     }
 
     /// Encodes a recording and starts it, part after part, waiting for the oldest where all slots are taken.
-    pub fn start(&mut self, rec: &Recorder, pipelines: &mut Pipelines, arena: &Arena) -> Result<Ticket, GpuError> {
+    pub fn start(&mut self, rec: &Recorder, pipelines: &mut Pipelines, memory: &Backed) -> Result<Ticket, GpuError> {
         if pipelines.must_forget_sets(rec.commands.len()) {
             self.finish_all()?;
             pipelines.forget_sets()?;
@@ -198,7 +196,7 @@ impl Submitter {
             let slot = self.free_slot()?;
             self.slots[slot].ends = if from == all { all } else { 0 };
             self.begin(slot)?;
-            if let Err(e) = self.encode_part(rec, &part, slot, each, pipelines, arena) {
+            if let Err(e) = self.encode_part(rec, &part, slot, each, pipelines, memory) {
                 // SAFETY: recording, not in flight: back to where the next `begin` expects it.
                 unsafe {
                     self.device
@@ -282,8 +280,7 @@ impl Submitter {
         match command.work {
             Work::Dispatch { kernel, .. } | Work::Indirect { kernel, .. } => self.rows[kernel as usize],
             Work::Fill { .. } => FILL,
-            Work::Copy { .. } => COPY,
-            Work::ReadBack { .. } => READ_BACK,
+            Work::Report { .. } => REPORT,
         }
     }
 
@@ -294,7 +291,7 @@ impl Submitter {
         slot: usize,
         each: bool,
         pipelines: &mut Pipelines,
-        arena: &Arena,
+        memory: &Backed,
     ) -> Result<(), GpuError> {
         let commands = &rec.commands[part.from..part.to.max(part.from + 1)];
         let each = each && self.has_stamps();
@@ -310,7 +307,7 @@ impl Submitter {
             self.stamp(slot, 0);
         }
         for (i, command) in commands.iter().enumerate() {
-            let groups = self.encode(command, part.slabs.as_ref(), self.slots[slot].commands, pipelines, arena)?;
+            let groups = self.encode(command, part.slabs.as_ref(), self.slots[slot].commands, pipelines, memory)?;
             if timed {
                 let row = self.row_of(command);
                 let begins = part.slabs.as_ref().is_none_or(|slabs| slabs.start == 0);
@@ -347,7 +344,7 @@ impl Submitter {
         slabs: Option<&std::ops::Range<u32>>,
         cb: vk::CommandBuffer,
         pipelines: &mut Pipelines,
-        arena: &Arena,
+        memory: &Backed,
     ) -> Result<u32, GpuError> {
         let raw = &self.device.raw;
         if command.barrier_before {
@@ -355,7 +352,7 @@ impl Submitter {
         }
         if let Work::Dispatch { kernel, ranges, push, .. } | Work::Indirect { kernel, ranges, push, .. } = &command.work
         {
-            let set = pipelines.set(*kernel, ranges, arena)?;
+            let set = pipelines.set(*kernel, ranges, memory)?;
             let p = pipelines.get(*kernel);
             let point = vk::PipelineBindPoint::COMPUTE;
             // SAFETY: recording; pipeline, layout and set belong together, and live as long as `Gpu`.
@@ -367,7 +364,7 @@ impl Submitter {
                 }
             }
         }
-        let inside = |kernel: &'static str, r: Range| match r.end <= arena.bytes() {
+        let inside = |kernel: &'static str, r: Range| match r.end <= memory.bytes {
             true => Ok(()),
             false => Err(GpuError::Binding { kernel, start: r.start, end: r.end }),
         };
@@ -375,10 +372,9 @@ impl Submitter {
             Work::Dispatch { .. } => {}
             Work::Indirect { at, .. } => inside("indirect", Range { start: at, end: at + 12 })?,
             Work::Fill { range, .. } => inside("fill", range)?,
-            Work::Copy { from, to } => inside("copy", from).and(inside("copy", to))?,
-            Work::ReadBack { from, .. } => inside("read back", from)?,
+            Work::Report { from, .. } => inside("report", from)?,
         }
-        let arena = arena.buffer();
+        let memory = memory.buffer;
         let mut dispatched = 0;
         // SAFETY: recording; ranges lie in the arena, and the recorder checked their alignment. Slabs are of kernels whose
         // pipeline may begin anywhere.
@@ -397,19 +393,14 @@ impl Submitter {
                     }
                     dispatched = x * y * z;
                 }
-                Work::Indirect { at, .. } => raw.cmd_dispatch_indirect(cb, arena, at),
+                Work::Indirect { at, .. } => raw.cmd_dispatch_indirect(cb, memory, at),
                 Work::Fill { range, value } => {
-                    raw.cmd_fill_buffer(cb, arena, range.start, range.end - range.start, value);
+                    raw.cmd_fill_buffer(cb, memory, range.start, range.end - range.start, value);
                 }
-                Work::Copy { from, to } => {
-                    let region =
-                        [vk::BufferCopy { src_offset: from.start, dst_offset: to.start, size: from.end - from.start }];
-                    raw.cmd_copy_buffer(cb, arena, arena, &region);
-                }
-                Work::ReadBack { from, report } => {
-                    let dst_offset = report.map_or(0, report_offset);
+                Work::Report { from, place } => {
+                    let dst_offset = report_offset(place);
                     let region = [vk::BufferCopy { src_offset: from.start, dst_offset, size: from.end - from.start }];
-                    raw.cmd_copy_buffer(cb, arena, self.staging, &region);
+                    raw.cmd_copy_buffer(cb, memory, self.staging, &region);
                     self.barrier_to_host(cb);
                 }
             }

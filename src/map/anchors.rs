@@ -1,469 +1,325 @@
-//! Seeds of an anchor keyframe: where its view is uncovered, Gaussians are put on the stereo depth.
+//! What makes an anchor of a keyframe: how much of its view the map lacks, stereo depth, seeds, and densification.
 //!
-//! Pixels are picked by error diffusion (Floyd and Steinberg 1976) of a density that follows the image
-//! gradient: evenly spaced where the image is flat, denser on detail, and the spacing is known,
-//! so the size of a Gaussian is the distance to its neighbours. Where matching found no depth (bare walls)
-//! the inverse depth of the nearest matches left, right, above and below is carried over, the background
-//! preferred; such seeds start large and faint so that others overrule them.
+//! ```text
+//! rendered -> covered and right -------------------------------> stored, to be trained on with the rest
+//!          -> uncovered or mismatched: seeds on its depth --> burst -> densified -> stored
+//! ```
+//!
+//! An anchor costs the other views: its seeds stand before what they see, and are in its exposure; where the steps to make
+//! that good do not come, the map ends worse than it was. Hence what is only mismatched waits until the last anchor had
+//! time to show what it is good for, seeds are faint and no more than steps can train, a burst trains the other views as
+//! well, and exposures start without what earlier ones learnt of blur.
+//!
+//! An anchor opens a block of the pool; what its seeds and its densification need and is not free is taken from the least
+//! important, if the board lets.
 
-use super::occupancy::{HELD, UNKNOWN};
-use super::pipeline::Gaussian;
-use super::schedule::Rng;
-use super::view::{Exposure, View};
+use super::cameras::RectifiedPair;
+use super::coverage::{Coverage, Seen};
+use super::densify::{densify, mean};
+use super::diffusion::Diffusion;
+use super::keyframes::Keyframe;
+use super::occupancy::{self, Occupancy};
+use super::pool::{threshold, PruneRule};
+use super::scene::Scene;
+use super::seeds::{Seed, Seeder};
+use super::store::Store;
+use super::view::View;
+use crate::config::MapConfig;
 use crate::counters::Counters;
-use crate::mem::Footprint;
-use crate::stereo::DepthMap;
-use glam::DVec3;
-use stipple_drivers::Image;
+use crate::gpu::{Gpu, GpuError};
+use crate::mem::unsealed;
+use crate::stereo::{DepthMap, Stereo};
+use stipple_drivers::{Fault, Image};
 
-/// A Gaussian to be: isotropic, at a pixel's depth.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Seed {
-    pub p_world: DVec3,
-    /// Standard deviation, m.
-    pub sigma_m: f64,
-    pub opacity: f64,
-    /// That it is the colour of.
-    pub pixel: u32,
+/// Part of a view that must have depth to seed from; the rest is continued from it.
+const DEPTH_MIN: f64 = 0.01;
+/// Fewer steps than this and a Gaussian's importance is not known.
+const STEPS_JUDGED: u32 = 30;
+/// Steps a keyframe that anchors count on, however few they were so far: the first, which is all there is to see, and others.
+const STEPS_FIRST: usize = 40;
+const STEPS_MIN: usize = 8;
+/// Part of the pool that one anchor may evict.
+const EVICTED_MAX: usize = 16;
+/// Part of what is free that a whole uncovered view may take, so that there is always room for the next; and part of
+/// the pool where others are evicted for it.
+const FREE_SHARE: usize = 8;
+const POOL_SHARE: usize = 16;
+
+/// A keyframe that became an anchor.
+#[derive(Clone, Copy, Debug)]
+pub struct NewAnchor {
+    pub seeded: u32,
+    /// Median depth of the first anchor, m.
+    pub scene_depth_m: Option<f64>,
 }
 
-impl Seed {
-    /// With the colour of its pixel in the exposure of the map.
-    pub fn gaussian(&self, planes: &[Image], exposure: Exposure) -> Gaussian {
-        let level =
-            |plane: &Image| exposure.inverse(f64::from(plane.pixels[self.pixel as usize]) / 255.0).max(0.0) as f32;
-        Gaussian {
-            mean: self.p_world.as_vec3().to_array(),
-            log_scale: [self.sigma_m.ln() as f32; 3],
-            quat_xyzw: [0.0, 0.0, 0.0, 1.0],
-            opacity_logit: (self.opacity / (1.0 - self.opacity)).ln() as f32,
-            colour: std::array::from_fn(|c| level(&planes[c.min(planes.len() - 1)])),
+/// Host memory of the making of anchors.
+pub struct Workspace {
+    /// Depth of the newest anchor, m.
+    depth: DepthMap,
+    seeder: Seeder,
+    diffusion: Diffusion,
+    newcomers: Vec<Seed>,
+    /// The occupancy's, by seed.
+    answers: Vec<u32>,
+    /// SSIM of the newest anchor by pixel, with room for more channels.
+    similarity: Vec<f32>,
+}
+
+impl Workspace {
+    pub fn new(width: usize, height: usize, channels: usize, config: &MapConfig) -> Workspace {
+        let seeds_max = config.seeds_per_anchor as usize;
+        Workspace {
+            depth: DepthMap::new(width, height),
+            seeder: Seeder::new(width, height, seeds_max),
+            diffusion: Diffusion::new(width, height),
+            newcomers: Vec::with_capacity(config.densify_max as usize),
+            answers: Vec::with_capacity(seeds_max),
+            similarity: Vec::with_capacity(channels * width * height),
         }
     }
 }
 
-/// σ over the spacing of seeds: neighbours meet at about 0.6 of their peak.
-pub(super) const SPREAD: f64 = 0.5;
-/// Spacing of seeds, px.
-pub(super) const SPACING_PX: [f64; 2] = [1.0, 12.0];
-/// What stands wrongly before other views hides little of them. At 0.7 and 0.5, on V1_01 at 28 steps a second (scale 2,
-/// 60 k): 21.71 dB and 19.74 held out against 23.24 and 21.01; at 150 steps a keyframe (52 k) 30.04 and 23.11 against 30.19
-/// and 23.25. At 0.2 and 0.15: 30.00 and 23.15.
-const OPACITY_MATCHED: f64 = 0.35;
-const OPACITY_FILLED: f64 = 0.25;
-/// Density of a filled pixel over that of a matched one: bare walls need few Gaussians.
-const DENSITY_FILLED: f64 = 0.5;
-/// Gradient, grey levels a pixel, that doubles the density of a flat area.
-const GRADIENT_DOUBLES: f64 = 6.0;
-/// Neighbours whose inverse depth exceeds the farthest's by this are foreground, and not carried over.
-const FOREGROUND: f32 = 1.25;
-/// Below this rendered alpha a pixel takes seeds even in an occupied cell.
-const SEED_ALPHA: f32 = 0.5;
-
-/// A pixel rendered this far from what was seen takes seeds even in an occupied cell.
-const SEED_ERROR: f64 = 0.1;
-
-/// What an anchor sees.
-pub struct Seen<'a> {
-    /// Grey, or red, green and blue.
-    pub planes: &'a [Image],
-    pub valid: &'a [u8],
-    /// As the raster counts it.
-    pub depth: &'a DepthMap,
-    /// Rendered before the anchor was added.
-    pub alpha: &'a [f32],
-    pub colour: &'a [f32],
-    /// Of the image; renderings and seeds are in the map's.
-    pub exposure: Exposure,
-    /// m; zero where nothing was hit.
-    pub rendered_depth: &'a [f32],
-    pub from: View,
+pub struct Anchors {
+    config: MapConfig,
+    /// The newest keyframe without distortion, where that is not what trains.
+    pair: Option<RectifiedPair>,
+    work: Workspace,
+    occupancy: Occupancy,
+    /// Steps when the last anchor came.
+    anchored_at: u64,
 }
 
-impl Seen<'_> {
-    pub fn width(&self) -> usize {
-        self.planes[0].width
+impl Anchors {
+    pub fn new(
+        gpu: &mut Gpu,
+        buffers: occupancy::Buffers,
+        work: Workspace,
+        pair: Option<RectifiedPair>,
+        config: &MapConfig,
+    ) -> Result<Anchors, Fault> {
+        let occupancy = Occupancy::new(gpu, buffers, config.occupancy_cell_m)?;
+        Ok(Anchors { config: config.clone(), pair, work, occupancy, anchored_at: 0 })
     }
 
-    /// Mean over the channels of |rendered - seen| at a pixel, in the map's exposure.
-    pub fn error(&self, i: usize) -> f64 {
-        let of = |(channel, plane): (usize, &Image)| {
-            let rendered = self.colour[channel * self.alpha.len() + i];
-            (f64::from(rendered) - self.exposure.inverse(f64::from(plane.pixels[i]) / 255.0)).abs()
-        };
-        self.planes.iter().enumerate().map(of).sum::<f64>() / self.planes.len() as f64
-    }
-}
-
-/// Fractions of a view's valid pixels that the map does not reconstruct.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Missing {
-    /// Rendered alpha below `covered_alpha`.
-    pub bare: f64,
-    /// Covered, and rendered farther than `error` from what is seen, in the exposure of the map.
-    pub wrong: f64,
-}
-
-impl Missing {
-    pub fn of(view: &Seen, covered_alpha: f64, error: f64) -> Missing {
-        let (mut bare, mut wrong, mut n) = (0u32, 0u32, 0u32);
-        for i in (0..view.valid.len()).filter(|&i| view.valid[i] != 0) {
-            n += 1;
-            if f64::from(view.alpha[i]) < covered_alpha {
-                bare += 1;
-            } else {
-                wrong += u32::from(view.error(i) > error);
-            }
-        }
-        let part = |k: u32| f64::from(k) / f64::from(n.max(1));
-        Missing { bare: part(bare), wrong: part(wrong) }
-    }
-}
-
-/// Picks seeds; owns the scratch it needs.
-pub struct Seeder {
-    filled: Vec<f32>,
-    /// Seeds wanted a pixel.
-    pub(super) density: Vec<f32>,
-    /// Index of the nearest matched pixel left, right, above, below; `NONE` without.
-    nearest: [Vec<u32>; 4],
-    /// Error carried to the row being walked and to the next, one pixel of margin on each side.
-    carried: [Vec<f32>; 2],
-    pub(super) seeds: Vec<Seed>,
-    /// Where each seed is, and whether it is wanted even in an occupied cell.
-    points: Vec<[f32; 4]>,
-    pub(super) seeds_max: usize,
-}
-
-const NONE: u32 = u32::MAX;
-
-impl Seeder {
-    pub fn footprint(pixels: usize, seeds_max: usize) -> Footprint {
-        let mut f = Footprint::default();
-        f.host("map: seeding scratch", pixels * 6 * size_of::<f32>());
-        f.host("map: seeds", seeds_max * (size_of::<Seed>() + size_of::<[f32; 4]>()));
-        f
-    }
-
-    pub fn new(width: usize, height: usize, seeds_max: usize) -> Seeder {
-        let n = width * height;
-        Seeder {
-            filled: vec![0.0; n],
-            density: vec![0.0; n],
-            nearest: std::array::from_fn(|_| vec![NONE; n]),
-            carried: std::array::from_fn(|_| vec![0.0; width + 2]),
-            seeds: Vec::with_capacity(seeds_max),
-            points: Vec::with_capacity(seeds_max),
-            seeds_max,
-        }
-    }
-
-    /// Picks seeds as dense as `whole` for a view, and answers where they are; `settle` says which of them stay.
-    pub fn seed(&mut self, seen: &Seen, whole: usize, counters: &Counters) -> &[[f32; 4]] {
-        self.fill(&seen.depth.metres, seen.depth.width);
-        self.set_density(seen, self.seeds_max.min(whole));
-        self.points.clear();
-        self.pick(seen, self.seeds_max, counters, |seeder, x, y| seeder.put(seen, x, y));
-        &self.points
-    }
-
-    /// Of the picked, at most `room`: those whose cell holds nothing yet, or that the rendering lacks.
-    pub fn settle(&mut self, answers: &[u32], room: usize, counters: &Counters) -> &[Seed] {
-        let mut kept = 0;
-        for i in 0..self.seeds.len() {
-            let lacking = self.points[i][3] != 0.0;
-            counters.occupancy_full.add(u64::from(answers[i] == UNKNOWN));
-            if answers[i] == HELD && !lacking {
-                counters.seeds_occupied.add(1);
-            } else if kept == room {
-                counters.splats_full.add(1);
-            } else {
-                self.seeds[kept] = self.seeds[i];
-                kept += 1;
-            }
-        }
-        self.seeds.truncate(kept);
-        &self.seeds
-    }
-
-    /// Calls `put` for pixels picked as `density` says, as long as there are fewer than `room` seeds.
-    pub(super) fn pick(
+    /// Makes stored image `index`, the first of `keyframe`, an anchor when the map after `steps` does not show its view,
+    /// or not well.
+    pub fn try_anchor(
         &mut self,
-        seen: &Seen,
-        room: usize,
+        scene: &mut Scene,
+        stereo: &mut Stereo,
+        keyframe: &Keyframe,
+        index: usize,
+        steps: u64,
         counters: &Counters,
-        mut put: impl FnMut(&mut Seeder, usize, usize),
-    ) {
-        self.seeds.clear();
-        let (w, h) = (seen.width(), seen.planes[0].height);
-        // The first row inherits what a row above would have left, else a sparse pattern starts late.
-        let mut rng = Rng::new(1);
-        self.carried[0].fill_with(|| rng.below(1024) as f32 / 1024.0 - 0.5);
-        self.carried[1].fill(0.0);
-        for y in 0..h {
-            for step in 0..w {
-                // Alternate rows run backwards, else the pattern leans.
-                let x = if y % 2 == 0 { step } else { w - 1 - step };
-                let wanted = self.density[y * w + x] + self.carried[0][x + 1];
-                let picked = wanted >= 0.5;
-                let rest = wanted - if picked { 1.0 } else { 0.0 };
-                let (ahead, behind) = if y % 2 == 0 { (x + 2, x) } else { (x, x + 2) };
-                self.carried[0][ahead] += rest * (7.0 / 16.0);
-                self.carried[1][behind] += rest * (3.0 / 16.0);
-                self.carried[1][x + 1] += rest * (5.0 / 16.0);
-                self.carried[1][ahead] += rest * (1.0 / 16.0);
-                if picked && self.density[y * w + x] > 0.0 {
-                    if self.seeds.len() == room {
-                        counters.splats_full.add(1);
-                    } else {
-                        put(self, x, y);
-                    }
-                }
+    ) -> Result<Option<NewAnchor>, GpuError> {
+        if let Some(pair) = &mut self.pair {
+            for (channel, plane) in pair.planes.iter_mut().enumerate() {
+                stereo.views.rectify(0, keyframe.plane(0, channel), plane);
             }
-            self.carried.swap(0, 1);
-            self.carried[1].fill(0.0);
         }
-    }
-
-    fn put(&mut self, seen: &Seen, x: usize, y: usize) {
-        let i = y * seen.width() + x;
-        let c = seen.from.camera;
-        let matched = seen.depth.metres[i] > 0.0;
-        let z = f64::from(if matched { seen.depth.metres[i] } else { self.filled[i] });
-        let Some(p_world) = seen.from.point(x, y, z) else { return };
-        let lacking = seen.alpha[i] < SEED_ALPHA || seen.error(i) >= SEED_ERROR;
-        let [px, py, pz] = p_world.as_vec3().to_array();
-        self.points.push([px, py, pz, f32::from(u8::from(lacking))]);
-        let spacing_px = (1.0 / f64::from(self.density[i])).sqrt().clamp(SPACING_PX[0], SPACING_PX[1]);
-        self.seeds.push(Seed {
-            p_world,
-            sigma_m: SPREAD * spacing_px * z / c.fx,
-            opacity: if matched { OPACITY_MATCHED } else { OPACITY_FILLED },
-            pixel: i as u32,
-        });
-    }
-
-    /// Seeds a pixel, so that a whole uncovered view gets `seeds` of them.
-    fn set_density(&mut self, seen: &Seen, seeds: usize) {
-        let (w, h) = (seen.width(), seen.planes[0].height);
-        let px = |x: usize, y: usize| {
-            let sum = seen.planes.iter().map(|p| f64::from(p.pixels[y * w + x])).sum::<f64>();
-            sum / seen.planes.len() as f64
+        // Seeds come of the rectified pair, whatever the lens of what trains.
+        let rect = stereo.views.camera();
+        let world_from_cam = scene.store.world_from_body(index) * rect.body_from_rect;
+        let view = View { world_from_cam, camera: rect.pinhole, fisheye: None };
+        self.render(scene, index, &view)?;
+        let coverage = {
+            let seen = seen(scene, &self.pair, index, &view, stereo.views.valid_mask(), &self.work.depth.metres);
+            Coverage::new(&seen, self.config.covered_alpha, self.config.wrong_error)
         };
-        let mut sum = 0.0;
-        for y in 0..h {
-            for x in 0..w {
-                let i = y * w + x;
-                let mut weight = 0.0;
-                if seen.valid[i] != 0 && self.filled[i] > 0.0 {
-                    let (x0, x1) = (x.saturating_sub(1), (x + 1).min(w - 1));
-                    let (y0, y1) = (y.saturating_sub(1), (y + 1).min(h - 1));
-                    let gradient = 0.5 * (px(x1, y) - px(x0, y)).hypot(px(x, y1) - px(x, y0));
-                    weight = 1.0 + gradient / GRADIENT_DOUBLES;
-                    if seen.depth.metres[i] <= 0.0 {
-                        weight *= DENSITY_FILLED;
-                    }
-                    sum += weight;
-                }
-                self.density[i] = weight as f32;
-            }
+        let least = self.config.anchor_missing_min;
+        let proven = steps - self.anchored_at >= u64::from(self.config.wrong_after_steps);
+        if coverage.uncovered <= least && (coverage.lacking() <= least || !proven) {
+            return Ok(None);
         }
-        let scale = (seeds as f64 / f64::max(sum, 1.0)) as f32;
-        for i in 0..w * h {
-            self.density[i] = (self.density[i] * scale).min(1.0);
+        if !self.match_depth(scene, stereo, keyframe, counters) {
+            return Ok(None);
+        }
+        if let Some(pair) = &mut self.pair {
+            pair.distort(&self.work.depth.metres, &view.camera);
+        }
+        let first = scene.store.anchors() == 0;
+        let whole = self.seeds_of_a_view(scene, steps);
+        let wanted = (coverage.lacking() * whole as f64).ceil() as usize;
+        let room = self.make_room(scene, wanted, counters)?;
+        if room == 0 && !self.config.evict {
+            return Ok(None);
+        }
+        scene.pipeline.pool.open_block(index as u32);
+        let seeded = self.seed(scene, index, &view, stereo.views.valid_mask(), (whole, room), counters)? as u32;
+        counters.anchors_for_error.add(u64::from(coverage.uncovered <= least));
+        self.anchored_at = steps;
+        let entry = scene.store.get_mut(index);
+        (entry.anchor, entry.placed) = (true, entry.given);
+        let scene_depth_m = if first { median_depth(&self.work.depth.metres) } else { None };
+        Ok(Some(NewAnchor { seeded, scene_depth_m }))
+    }
+
+    /// Draws what the rectified pair should see into the scene, and exposes the new image by what trains.
+    fn render(&self, scene: &mut Scene, index: usize, rectified: &View) -> Result<(), GpuError> {
+        // Without distortion, what lies beyond a fisheye's rim is drawn across the picture: it tells no exposure.
+        let own = scene.view(index);
+        scene.render(if self.pair.is_some() { &own } else { rectified })?;
+        if self.config.refine_exposure {
+            scene.expose(index);
+        }
+        if self.pair.is_some() {
+            scene.render(rectified)?;
+        }
+        Ok(())
+    }
+
+    /// Whether the pair could be matched. One that cannot gives no depth, and no anchor; the keyframe is still trained on.
+    fn match_depth(
+        &mut self,
+        scene: &mut Scene,
+        stereo: &mut Stereo,
+        keyframe: &Keyframe,
+        counters: &Counters,
+    ) -> bool {
+        let depth = &mut self.work.depth;
+        let [left, right, ..] = &keyframe.images[..] else { return false };
+        let Ok(found) = unsealed(|| stereo.depth(Some(&mut scene.gpu), left, right, depth)) else {
+            counters.depth_failures.add(1);
+            return false;
+        };
+        let enough = found as f64 >= DEPTH_MIN * depth.metres.len() as f64;
+        counters.depth_absent.add(u64::from(!enough));
+        enough
+    }
+
+    /// Seeds as dense as `whole` for a view, `room` at most; how many.
+    fn seed(
+        &mut self,
+        scene: &mut Scene,
+        index: usize,
+        view: &View,
+        valid: &[u8],
+        (whole, room): (usize, usize),
+        counters: &Counters,
+    ) -> Result<usize, GpuError> {
+        let Workspace { depth, seeder, diffusion, answers, .. } = &mut self.work;
+        let points =
+            seeder.seed(&seen(scene, &self.pair, index, view, valid, &depth.metres), whole, diffusion, counters);
+        self.occupancy.look_up(&mut scene.gpu, &scene.pipeline.pool, points, answers)?;
+        let (exposure, planes) = (scene.store.exposure(index), planes(&scene.store, &self.pair, index));
+        let splats = seeder.keep(answers, room, counters).iter().map(|s| s.gaussian(planes, exposure));
+        scene.pipeline.pool.append(&mut scene.gpu, splats)
+    }
+
+    /// Adds Gaussians where the newest anchor's picture is least like its image, through the lens that trains.
+    pub fn densify(
+        &mut self,
+        scene: &mut Scene,
+        index: usize,
+        steps: u64,
+        counters: &Counters,
+    ) -> Result<(), GpuError> {
+        if self.config.densify_max == 0 || scene.pipeline.pool.newest() != Some(index as u32) {
+            return Ok(());
+        }
+        let (view, target) = (scene.view(index), scene.target(index));
+        scene.render(&view)?;
+        scene.pipeline.similarity(&mut scene.gpu, &target, &mut self.work.similarity)?;
+        let lacking = 0.5 * (1.0 - mean(&self.work.similarity, &scene.camera(index).valid));
+        let wanted = (f64::from(self.config.densify_max) * lacking) as usize;
+        let wanted = wanted.min(self.affordable(scene, steps));
+        let wanted = wanted.min(self.make_room(scene, wanted, counters)?);
+        let Workspace { depth, diffusion, newcomers, similarity, .. } = &mut self.work;
+        let depth = self.pair.as_ref().map_or(&depth.metres, |pair| &pair.distance);
+        let planes = scene.store.planes(index);
+        let seen = Seen {
+            planes,
+            valid: &scene.cameras[0].valid,
+            depth,
+            rendered: &scene.rendered,
+            exposure: target.exposure,
+            view,
+        };
+        densify(&seen, similarity, wanted, diffusion, newcomers, counters);
+        let splats = newcomers.iter().map(|s| s.gaussian(planes, target.exposure));
+        let added = scene.pipeline.pool.append(&mut scene.gpu, splats)?;
+        counters.splats_densified.add(added as u64);
+        Ok(())
+    }
+
+    /// Seeds for a view that is all uncovered.
+    fn seeds_of_a_view(&self, scene: &Scene, steps: u64) -> usize {
+        let pool = &scene.pipeline.pool;
+        let share = if self.config.evict { pool.capacity() / POOL_SHARE } else { pool.room().div_ceil(FREE_SHARE) };
+        share.min(self.config.seeds_per_anchor as usize).min(self.affordable(scene, steps))
+    }
+
+    /// Gaussians that an anchor may add at the steps a keyframe gets here: more than are trained cost every later step
+    /// its time and give nothing back.
+    fn affordable(&self, scene: &Scene, steps: u64) -> usize {
+        let steps = (steps / scene.store.training().len().max(1) as u64) as usize;
+        match self.config.seeds_per_step as usize {
+            0 => usize::MAX,
+            limit => limit * steps.max(if scene.store.anchors() == 0 { STEPS_FIRST } else { STEPS_MIN }),
         }
     }
 
-    /// Depth where there is a match, else inverse depth carried over from the nearest matches around.
-    fn fill(&mut self, metres: &[f32], width: usize) {
-        let height = metres.len() / width;
-        let [left, right, up, down] = &mut self.nearest;
-        for y in 0..height {
-            for x in 0..width {
-                let i = y * width + x;
-                let own = if metres[i] > 0.0 { i as u32 } else { NONE };
-                left[i] = if own == NONE && x > 0 { left[i - 1] } else { own };
-                up[i] = if own == NONE && y > 0 { up[i - width] } else { own };
-            }
+    /// Removes what is faint, huge or not finite, and where that leaves less room than wanted, the least important.
+    /// Answers the room there is then.
+    fn make_room(&self, scene: &mut Scene, wanted: usize, counters: &Counters) -> Result<usize, GpuError> {
+        let (gpu, pool) = (&mut scene.gpu, &mut scene.pipeline.pool);
+        let mut rule = PruneRule { steps_min: STEPS_JUDGED, ..PruneRule::default() };
+        let mut evicted = 0;
+        if self.config.evict && pool.room() < wanted {
+            let bins = pool.importance(gpu, STEPS_JUDGED)?;
+            let most = pool.capacity() / EVICTED_MAX;
+            (rule.importance_min, evicted) = threshold(&bins, wanted - pool.room(), most);
         }
-        for y in (0..height).rev() {
-            for x in (0..width).rev() {
-                let i = y * width + x;
-                let own = if metres[i] > 0.0 { i as u32 } else { NONE };
-                right[i] = if own == NONE && x + 1 < width { right[i + 1] } else { own };
-                down[i] = if own == NONE && y + 1 < height { down[i + width] } else { own };
-            }
-        }
-        for i in 0..metres.len() {
-            self.filled[i] = if metres[i] > 0.0 {
-                metres[i]
-            } else {
-                let around = self.nearest.each_ref().map(|n| n[i]);
-                carried_depth(metres, width, i, around)
-            };
-        }
+        let removed = pool.prune(gpu, &rule)?;
+        counters.splats_evicted.add(evicted.min(removed) as u64);
+        counters.splats_pruned.add(removed.saturating_sub(evicted) as u64);
+        Ok(pool.room())
     }
 }
 
-fn carried_depth(metres: &[f32], width: usize, i: usize, around: [u32; 4]) -> f32 {
-    let inverse = |j: u32| 1.0 / metres[j as usize];
-    let known = || around.iter().copied().filter(|&j| j != NONE);
-    let farthest = known().map(inverse).fold(f32::INFINITY, f32::min);
-    let (mut sum, mut weights) = (0.0, 0.0);
-    for j in known().filter(|&j| inverse(j) <= FOREGROUND * farthest) {
-        let (dx, dy) = ((j as usize % width).abs_diff(i % width), (j as usize / width).abs_diff(i / width));
-        let weight = 1.0 / (dx + dy) as f32;
-        sum += weight * inverse(j);
-        weights += weight;
-    }
-    if weights > 0.0 {
-        weights / sum
-    } else {
-        0.0
-    }
+/// The image that seeds take their colour from.
+fn planes<'a>(store: &'a Store, pair: &'a Option<RectifiedPair>, index: usize) -> &'a [Image] {
+    pair.as_ref().map_or_else(|| store.planes(index), |pair| &pair.planes)
+}
+
+/// What a new keyframe sees without distortion, beside the scene's last picture, which was drawn from there.
+fn seen<'a>(
+    scene: &'a Scene,
+    pair: &'a Option<RectifiedPair>,
+    index: usize,
+    view: &View,
+    valid: &'a [u8],
+    depth: &'a [f32],
+) -> Seen<'a> {
+    let (planes, exposure) = (planes(&scene.store, pair, index), scene.store.exposure(index));
+    Seen { planes, valid, depth, rendered: &scene.rendered, exposure, view: *view }
+}
+
+/// Median of the pixels that have depth, by counting them in 256 bins of 1/depth; allocates nothing.
+fn median_depth(metres: &[f32]) -> Option<f64> {
+    const BINS: usize = 256;
+    const NEAREST_M: f32 = 0.1;
+    let mut bins = [0u32; BINS];
+    let bin = |z: f32| ((NEAREST_M / z * BINS as f32) as usize).min(BINS - 1);
+    metres.iter().filter(|z| **z > 0.0).for_each(|&z| bins[bin(z)] += 1);
+    let half = bins.iter().sum::<u32>().div_ceil(2);
+    let mut passed = 0;
+    let at = bins.iter().position(|n| {
+        passed += n;
+        half > 0 && passed >= half
+    })?;
+    Some(f64::from(NEAREST_M) * BINS as f64 / (at as f64 + 0.5))
 }
 
 #[cfg(test)]
-pub(super) mod tests {
-    use super::super::occupancy::FREE;
-    use super::*;
-    use crate::stereo::Pinhole;
-    use stipple_drivers::Pose;
-
-    pub const W: usize = 64;
-    pub const H: usize = 48;
-
-    pub fn from() -> View {
-        let camera = Pinhole { width: W, height: H, fx: 50.0, fy: 50.0, cx: 31.5, cy: 23.5 };
-        View { world_from_cam: Pose::IDENTITY, camera, fisheye: None }
-    }
-
-    /// Rendered black by a map that is `alpha` opaque.
-    fn seen<'a>(image: &'a Image, depth: &'a DepthMap, alpha: &'a [f32]) -> Seen<'a> {
-        Seen {
-            planes: std::slice::from_ref(image),
-            valid: &[1; W * H],
-            depth,
-            alpha,
-            colour: &[0.0; W * H],
-            exposure: Exposure::default(),
-            rendered_depth: &[0.0; W * H],
-            from: from(),
-        }
-    }
-
-    /// With every cell held as `answer` says.
-    fn seed(seeder: &mut Seeder, image: &Image, depth: &DepthMap, alpha: f32, answer: u32) -> Vec<Seed> {
-        let n = seeder.seed(&seen(image, depth, &[alpha; W * H]), usize::MAX, &Counters::default()).len();
-        seeder.settle(&vec![answer; n], usize::MAX, &Counters::default()).to_vec()
-    }
-
-    pub fn flat(z: f32) -> DepthMap {
-        DepthMap::of(W, H, vec![z; W * H])
-    }
+mod tests {
+    use super::median_depth;
 
     #[test]
-    fn missing_is_what_is_bare_and_what_is_wrong_of_the_valid() {
-        let (mut image, depth, mut alpha) = (Image::new(W, H), flat(1.0), [0.9; W * H]);
-        image.pixels[..W * H / 4].fill(100);
-        alpha[W * H / 8..W * H / 2].fill(0.01);
-        let v = seen(&image, &depth, &alpha);
-        assert_eq!(Missing::of(&v, 0.05, 0.25), Missing { bare: 3.0 / 8.0, wrong: 1.0 / 8.0 });
-        assert_eq!(Missing::of(&v, 0.05, 0.5).wrong, 0.0);
-        // At half the gain what is seen as 100 would be 200.
-        let dim = Seen { exposure: Exposure { gain: 0.5, offset: 0.0 }, ..v };
-        assert_eq!(Missing::of(&dim, 0.05, 0.5).wrong, 1.0 / 8.0);
-        let mut half = [1; W * H];
-        half[..W * H / 2].fill(0);
-        assert_eq!(Missing::of(&Seen { valid: &half, ..dim }, 0.05, 0.25), Missing { bare: 0.0, wrong: 0.0 });
-        assert_eq!(Missing::of(&Seen { valid: &[0; W * H], ..dim }, 0.05, 0.25), Missing { bare: 0.0, wrong: 0.0 });
-    }
-
-    #[test]
-    fn flat_view_is_seeded_evenly_and_within_budget() {
-        let mut s = Seeder::new(W, H, 300);
-        let seeds = seed(&mut s, &Image::new(W, H), &flat(2.0), 0.0, FREE);
-        assert!((270..=300).contains(&seeds.len()), "{}", seeds.len());
-        // Every 16x16 block gets its share.
-        let mut blocks = [0; 12];
-        for k in &seeds {
-            let (x, y) = (k.p_world.x / 2.0 * 50.0 + 31.5, k.p_world.y / 2.0 * 50.0 + 23.5);
-            blocks[(y / 16.0) as usize * 4 + (x / 16.0) as usize] += 1;
-            assert!((k.p_world.z - 2.0).abs() < 1e-6);
-        }
-        assert!(blocks.iter().all(|n| (20..=30).contains(n)), "{blocks:?}");
-    }
-
-    #[test]
-    fn detail_is_seeded_denser() {
-        let mut image = Image::new(W, H);
-        for (i, p) in image.pixels.iter_mut().enumerate() {
-            *p = if i % W >= W / 2 && (i % W / 2) % 2 == 0 { 200 } else { 60 };
-        }
-        let seeds = seed(&mut Seeder::new(W, H, 300), &image, &flat(2.0), 0.0, FREE);
-        let right = seeds.iter().filter(|k| k.p_world.x > 0.1).count();
-        assert!(right > 3 * (seeds.len() - right), "{right} of {}", seeds.len());
-    }
-
-    #[test]
-    fn occupied_cells_take_no_seed_unless_bare() {
-        let mut s = Seeder::new(W, H, 300);
-        let image = Image::new(W, H);
-        let first = seed(&mut s, &image, &flat(2.0), 0.0, FREE).len();
-        assert_eq!(seed(&mut s, &image, &flat(2.0), 1.0, HELD).len(), 0);
-        assert_eq!(seed(&mut s, &image, &flat(2.0), 1.0, UNKNOWN).len(), first);
-        assert_eq!(seed(&mut s, &image, &flat(2.0), 0.0, HELD).len(), first);
-        let mut wrong = Image::new(W, H);
-        wrong.pixels.fill(200);
-        assert_eq!(seed(&mut s, &wrong, &flat(2.0), 1.0, HELD).len(), first);
-    }
-
-    #[test]
-    fn room_is_never_exceeded() {
-        let mut s = Seeder::new(W, H, 300);
-        let counters = Counters::default();
-        let (image, depth) = (Image::new(W, H), flat(1.0));
-        let seen = Seen {
-            planes: std::slice::from_ref(&image),
-            valid: &[1; W * H],
-            depth: &depth,
-            alpha: &[0.0; W * H],
-            colour: &[0.0; W * H],
-            exposure: Exposure::default(),
-            rendered_depth: &[0.0; W * H],
-            from: from(),
-        };
-        let n = s.seed(&seen, 300, &counters).len();
-        assert!((270..=300).contains(&n), "{n}");
-        assert_eq!((s.settle(&vec![0; n], 25, &counters).len(), counters.splats_full.get()), (25, n as u64 - 25));
-        assert!(s.seed(&seen, 1 << 20, &counters).len() <= 300);
-    }
-
-    #[test]
-    fn holes_take_the_background() {
-        let mut depth = flat(0.0);
-        for y in 0..H {
-            for x in 0..W {
-                depth.metres[y * W + x] = match x {
-                    0..=19 => 1.0,
-                    20..=39 => 0.0,
-                    _ => 3.0,
-                };
-            }
-        }
-        let mut s = Seeder::new(W, H, 300);
-        s.fill(&depth.metres, W);
-        assert!((s.filled[10 * W + 22] - 3.0).abs() < 1e-5);
-        assert_eq!(s.filled[10 * W + 5], 1.0);
-        // A plane is continued as a plane: inverse depth is linear in the image.
-        for y in 0..H {
-            for x in 0..W {
-                let inv = 0.5 + 0.004 * x as f32;
-                depth.metres[y * W + x] = if (20..40).contains(&x) && (10..30).contains(&y) { 0.0 } else { 1.0 / inv };
-            }
-        }
-        s.fill(&depth.metres, W);
-        let error = (1.0 / s.filled[20 * W + 25] - (0.5 + 0.004 * 25.0)).abs();
-        assert!(error < 0.01, "{error}");
+    fn median_depth_ignores_holes() {
+        assert_eq!(median_depth(&[0.0; 9]), None);
+        let z = median_depth(&[0.0, 0.0, 1.0, 2.0, 9.0, 0.0]).expect("three have depth");
+        assert!((z - 2.0).abs() < 0.1, "{z}");
     }
 }

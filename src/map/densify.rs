@@ -3,15 +3,12 @@
 //! As published: `MAX · (1 − mean SSIM) / 2` pixels, drawn with weight 1 − SSIM (here by error diffusion, which draws the
 //! same density without clumps), at the depth of the stereo pair where it is valid and of the rendering elsewhere, as wide
 //! as the distance to the nearest of the other newcomers. A fisheye's rim, which no pair sees, gets none until it is
-//! rendered: depth carried over to it from the nearest matches hid what was to come (12 simulated keyframes at 60 steps:
-//! training 22.30 dB in place of 23.43; without densification 22.82).
+//! rendered: depth carried over to it from the nearest matches would hide what is to come.
 
-use super::anchors::{Seed, Seeder, Seen, SPACING_PX, SPREAD};
-use super::buffers::RUN;
-use super::pipeline::{Goal, Pipeline};
+use super::coverage::Seen;
+use super::diffusion::Diffusion;
+use super::seeds::{Seed, SPACING_PX, SPREAD};
 use crate::counters::Counters;
-use crate::gpu::kernels::{ssim_columns, ssim_rows};
-use crate::gpu::{Gpu, GpuError, Threads};
 use glam::DVec3;
 
 /// Newcomers whose distance makes a Gaussian's width.
@@ -28,86 +25,47 @@ pub fn mean(map: &[f32], valid: &[u8]) -> f64 {
     sum / f64::from(n.max(1))
 }
 
-impl Pipeline {
-    /// SSIM by pixel of what was rendered last against a keyframe, mean of its channels; one where masked. `map` has room for
-    /// them all.
-    pub fn similarity(&mut self, gpu: &mut Gpu, goal: Goal, map: &mut Vec<f32>) -> Result<(), GpuError> {
-        let (n, channels) = (self.shape.pixels(), self.shape.channels);
-        map.resize(n * channels as usize, 1.0);
-        for (channel, plane) in map.chunks_exact_mut(n).enumerate() {
-            self.similarity_of(gpu, &goal, channel as u32, plane)?;
-        }
-        if channels > 1 {
-            (0..n).for_each(|i| map[i] = map[i..].iter().step_by(n).sum::<f32>() / channels as f32);
-            map.truncate(n);
-        }
-        Ok(())
+/// At most `wanted` Gaussians, and no more than `seeds` holds, where `similarity` is low and there is a depth.
+pub fn densify(
+    seen: &Seen,
+    similarity: &[f32],
+    wanted: usize,
+    diffusion: &mut Diffusion,
+    seeds: &mut Vec<Seed>,
+    counters: &Counters,
+) {
+    let wanted = wanted.min(seeds.capacity());
+    let mut sum = 0.0;
+    for i in 0..similarity.len() {
+        let has_depth = seen.depth[i] > 0.0 || rendered_depth(seen, i).is_some();
+        let weight = if seen.valid[i] != 0 && has_depth { (1.0 - similarity[i]).max(0.0) } else { 0.0 };
+        diffusion.density[i] = weight;
+        sum += f64::from(weight);
     }
-
-    fn similarity_of(&mut self, gpu: &mut Gpu, goal: &Goal, channel: u32, map: &mut [f32]) -> Result<(), GpuError> {
-        let (w, h) = (self.shape.width, self.shape.height);
-        let (b, size) = (&self.b, [w, h]);
-        let target = (goal.slot * self.shape.channels + channel) * self.shape.image_words() as u32;
-        let mask = b.mask.part(goal.camera as usize * self.shape.mask_stride(), self.shape.image_words());
-        let exposure = goal.exposure.unwrap_or_default().words();
-        let mut rec = gpu.record();
-        let rows = ssim_rows::Bind {
-            grey: b.rendered.read(),
-            targets: b.targets.read(),
-            mask: mask.read(),
-            filtered: b.over.filtered.write(),
-        };
-        rec.dispatch(
-            &self.k.ssim_rows,
-            rows,
-            ssim_rows::Push { size, target, plane: channel * w * h, exposure },
-            Threads::d1(w.div_ceil(RUN) * h),
-        );
-        let columns = ssim_columns::Bind {
-            filtered: b.over.filtered.read(),
-            mask: mask.read(),
-            slopes: b.over.slopes.write(),
-            ssim_sums: b.ssim_sums.write(),
-        };
-        let threads = Threads::d1(w * h.div_ceil(RUN));
-        rec.dispatch(&self.k.ssim_map, columns, ssim_columns::Push { size, group: 0 }, threads);
-        gpu.submit(rec)?;
-        gpu.download(self.b.over.slopes, 0, map)
-    }
-}
-
-impl Seeder {
-    /// At most `wanted` Gaussians, where `similarity` is low and there is a depth.
-    pub fn densify(&mut self, seen: &Seen, similarity: &[f32], wanted: usize, counters: &Counters) -> &[Seed] {
-        let wanted = wanted.min(self.seeds_max);
-        let mut sum = 0.0;
-        for i in 0..similarity.len() {
-            let has_depth = seen.depth.metres[i] > 0.0 || rendered_depth(seen, i).is_some();
-            let weight = if seen.valid[i] != 0 && has_depth { (1.0 - similarity[i]).max(0.0) } else { 0.0 };
-            self.density[i] = weight;
-            sum += f64::from(weight);
+    diffusion.scale(wanted, sum.max(1e-9));
+    seeds.clear();
+    diffusion.pick(|x, y, _| {
+        if seeds.len() == wanted {
+            counters.splats_full.add(1);
+            return;
         }
-        let scale = (wanted as f64 / sum.max(1e-9)) as f32;
-        self.density.iter_mut().for_each(|d| *d = (*d * scale).min(1.0));
-        self.pick(seen, wanted, counters, |seeder, x, y| {
-            let i = y * seen.width() + x;
-            let matched = seen.depth.metres[i] > 0.0;
-            let z = f64::from(if matched { seen.depth.metres[i] } else { rendered_depth(seen, i).unwrap_or_default() });
-            let Some(p_world) = seen.from.point(x, y, z) else { return };
-            seeder.seeds.push(Seed {
-                p_world,
-                sigma_m: z / seen.from.camera.fx,
-                opacity: if matched { OPACITY_MATCHED } else { OPACITY_RENDERED },
-                pixel: i as u32,
-            });
+        let i = y * seen.width() + x;
+        let matched = seen.depth[i] > 0.0;
+        let z = f64::from(if matched { seen.depth[i] } else { rendered_depth(seen, i).unwrap_or_default() });
+        let Some(p_world) = seen.view.point(x, y, z) else { return };
+        seeds.push(Seed {
+            p_world,
+            sigma_m: z / seen.view.camera.fx,
+            opacity: if matched { OPACITY_MATCHED } else { OPACITY_RENDERED },
+            pixel: i as u32,
         });
-        widen(&mut self.seeds);
-        &self.seeds
-    }
+    });
+    widen(seeds);
 }
 
 fn rendered_depth(seen: &Seen, i: usize) -> Option<f32> {
-    (seen.alpha[i] >= DEPTH_ALPHA && seen.rendered_depth[i] > 0.0).then(|| seen.rendered_depth[i])
+    let r = seen.rendered;
+    (r.alpha[i] >= DEPTH_ALPHA && r.depth[i] > 0.0).then(|| r.depth[i])
 }
 
 /// From a pixel's width to that of the mean distance to the nearest others, within the spacing of seeds.
@@ -132,31 +90,23 @@ fn widen(seeds: &mut [Seed]) {
 
 #[cfg(test)]
 mod tests {
-    use super::super::anchors::tests::{flat, from, H, W};
-    use super::super::view::Exposure;
+    use super::super::coverage::tests::{black, seen, H, W};
     use super::*;
     use stipple_drivers::Image;
 
     #[test]
     fn newcomers_go_where_the_picture_is_wrong_and_to_the_depth_there_is() {
-        let (mut depth, image) = (flat(2.0), Image::new(W, H));
-        // The lower half has no match; it was rendered 3 m away, but for its left quarter, which is bare.
-        depth.metres[W * H / 2..].fill(0.0);
+        let image = Image::new(W, H);
+        // The lower half has no match; it was rendered 3 m away, but for its left quarter, which is uncovered.
+        let depth: Vec<f32> = (0..W * H).map(|i| if i < W * H / 2 { 2.0 } else { 0.0 }).collect();
         let alpha: Vec<f32> = (0..W * H).map(|i| if i % W < W / 4 { 0.1 } else { 0.9 }).collect();
         // Right half wrong.
         let similarity: Vec<f32> = (0..W * H).map(|i| if i % W < W / 2 { 1.0 } else { 0.2 }).collect();
-        let seen = Seen {
-            planes: std::slice::from_ref(&image),
-            valid: &[1; W * H],
-            depth: &depth,
-            alpha: &alpha,
-            colour: &[0.0; W * H],
-            exposure: Exposure::default(),
-            rendered_depth: &[3.0; W * H],
-            from: from(),
-        };
-        let mut s = Seeder::new(W, H, 500);
-        let seeds = s.densify(&seen, &similarity, 200, &Counters::default()).to_vec();
+        let mut rendered = black(&alpha);
+        rendered.depth.fill(3.0);
+        let (v, counters) = (seen(&image, &depth, &rendered), Counters::default());
+        let (mut d, mut seeds) = (Diffusion::new(W, H), Vec::with_capacity(500));
+        densify(&v, &similarity, 200, &mut d, &mut seeds, &counters);
         assert!((180..=200).contains(&seeds.len()), "{}", seeds.len());
         assert!(seeds.iter().all(|k| k.p_world.x > -0.05));
         assert!(seeds.iter().all(|k| (k.p_world.z - 2.0).abs() < 1e-6 || (k.p_world.z - 3.0).abs() < 1e-6));
@@ -164,6 +114,7 @@ mod tests {
         let px = |k: &Seed| k.sigma_m / k.p_world.z * 50.0;
         let mean = seeds.iter().map(px).sum::<f64>() / seeds.len() as f64;
         assert!((0.3 * 2.8..0.7 * 2.8).contains(&mean), "{mean}");
-        assert!(s.densify(&seen, &[1.0; W * H], 200, &Counters::default()).is_empty());
+        densify(&v, &[1.0; W * H], 200, &mut d, &mut seeds, &counters);
+        assert!(seeds.is_empty());
     }
 }

@@ -1,206 +1,250 @@
-//! PSNR and SSIM as the Gaussian splatting literature computes them, over the valid pixels of a view.
+//! How good the map is: PSNR and SSIM of rendered keyframes, and pictures of some of them.
 //!
-//! Images are grey in 0..=1, row-major, or in colour plane by plane; `valid` is of one plane. PSNR is that of one image's mean squared error; figures of a set
-//! are means over its images. SSIM (Wang et al., IEEE TIP 2004) has an 11x11 Gaussian window, σ 1.5 px,
-//! zero-padded, the dynamic range 1; invalid pixels are zero in both images, as the padding is.
+//! A keyframe is compared in its exposure: the one refined beside the map, or, held out, the one between its
+//! neighbours in time, and at the pose it came with; nothing of a held-out image goes into these figures, nor into the
+//! next: at that pose with the correction between its neighbours, where a picture of the map would be taken from.
+//! Held-out keyframes are scored twice more, to tell the error's shares: with gain and offset fitted to the image, and
+//! with the pose refined on it too.
+//! Evaluation changes nothing: a run goes on from it as if there had been none.
 
-pub const WINDOW: usize = 11;
-const RADIUS: usize = WINDOW / 2;
-const SIGMA_PX: f64 = 1.5;
-/// (0.01 L)² and (0.03 L)² of the paper, L = 1.
-const C1: f64 = 1e-4;
-const C2: f64 = 9e-4;
-/// What two equal images score: 1e-10 is below what 8 bits resolve by orders.
-const MSE_MIN: f64 = 1e-10;
+use super::exposure::{fitted_exposure, Exposure};
+use super::refine::Refinement;
+use super::scene::Scene;
+use super::ssim::{mse, psnr_db, Ssim};
+use super::step::{Target, Weights};
+use crate::gpu::GpuError;
+use crate::limits::CAMERAS_MAX;
 
-/// Mean squared error over valid pixels of all planes; `None` if there are none.
-pub fn mse(observed: &[f32], rendered: &[f32], valid: &[u8]) -> Option<f64> {
-    let (mut sum, mut n) = (0.0, 0u32);
-    for i in 0..observed.len() {
-        if valid[i % valid.len()] != 0 {
-            let e = f64::from(observed[i]) - f64::from(rendered[i].clamp(0.0, 1.0));
-            sum += e * e;
-            n += 1;
-        }
-    }
-    (n > 0).then(|| sum / f64::from(n))
+/// A cheap probe on a few views, through the run.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct CurvePoint {
+    pub t_s: f64,
+    pub psnr_db: Option<f64>,
+    pub psnr_heldout_db: Option<f64>,
+    pub splats: u64,
+    pub iterations: u64,
 }
 
-pub fn psnr_db(mse: f64) -> f64 {
-    -10.0 * mse.max(MSE_MIN).log10()
+/// Means over all keyframes of a kind; `None` where there are none.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Evaluation {
+    pub psnr_db: Option<f64>,
+    pub ssim: Option<f64>,
+    pub psnr_heldout_db: Option<f64>,
+    pub ssim_heldout: Option<f64>,
+    /// With the pose correction between its neighbours in time.
+    pub psnr_heldout_between_db: Option<f64>,
+    /// With gain and offset of each held-out view fitted by least squares over its valid pixels.
+    pub psnr_heldout_fitted_db: Option<f64>,
+    pub ssim_heldout_fitted: Option<f64>,
+    /// With its pose refined on the image as well.
+    pub psnr_heldout_aligned_db: Option<f64>,
+    /// Held out, of each camera that trains.
+    pub psnr_heldout_by_camera_db: [Option<f64>; CAMERAS_MAX],
 }
 
-/// Weights of the 1-D window, sum 1; the 2-D window is their product.
-pub fn window() -> [f64; WINDOW] {
-    let mut w = [0.0; WINDOW];
-    for (i, w) in w.iter_mut().enumerate() {
-        let d = i as f64 - RADIUS as f64;
-        *w = (-d * d / (2.0 * SIGMA_PX * SIGMA_PX)).exp();
-    }
-    let sum: f64 = w.iter().sum();
-    w.map(|w| w / sum)
+/// A keyframe and its rendering, row-major at mapping resolution.
+#[derive(Clone, Debug, Default)]
+pub struct Panel {
+    pub name: String,
+    pub width: usize,
+    pub height: usize,
+    /// Grey, or three channels interleaved.
+    pub observed: Vec<u8>,
+    pub rendered: Vec<f32>,
+    /// m, 0 where there is none.
+    pub depth: Vec<f32>,
+    /// Zero where not compared.
+    pub valid: Vec<u8>,
+    pub psnr_db: Option<f64>,
 }
 
-/// Structural similarity, with the buffers of its five filtered moments.
-pub struct Ssim {
-    width: usize,
-    height: usize,
-    moments: [Vec<f64>; 5],
-    rows: Vec<f64>,
+/// Views of a probe, of each kind.
+const PROBED: usize = 5;
+/// Steps of a pose refinement, and the first one's size, m and rad; each is a little smaller than the last.
+const ALIGN_STEPS: i32 = 50;
+const ALIGN_RATE: f64 = 2e-3;
+const ALIGN_DECAY: f64 = 0.93;
+
+/// Sums of one kind of keyframes.
+#[derive(Clone, Copy, Default)]
+struct Mean {
+    sum: f64,
+    n: u32,
 }
 
-impl Ssim {
-    pub fn new(width: usize, height: usize) -> Ssim {
-        let n = width * height;
-        Ssim { width, height, moments: std::array::from_fn(|_| vec![0.0; n]), rows: vec![0.0; n] }
+impl Mean {
+    fn add(&mut self, value: Option<f64>) {
+        if let Some(v) = value {
+            self.sum += v;
+            self.n += 1;
+        }
     }
 
-    /// Mean over valid pixels of all planes; `None` if there are none.
-    pub fn mean(&mut self, observed: &[f32], rendered: &[f32], valid: &[u8]) -> Option<f64> {
-        let (mut sum, mut n) = (0.0, 0u32);
-        for (observed, rendered) in observed.chunks_exact(valid.len()).zip(rendered.chunks_exact(valid.len())) {
-            self.each(observed, rendered, valid, |_, s| {
-                sum += s;
-                n += 1;
-            });
-        }
-        (n > 0).then(|| sum / f64::from(n))
-    }
-
-    /// Calls `f(pixel, ssim)` at every valid pixel.
-    pub fn each(&mut self, observed: &[f32], rendered: &[f32], valid: &[u8], mut f: impl FnMut(usize, f64)) {
-        for i in 0..valid.len() {
-            let inside = f64::from(valid[i].min(1));
-            let x = f64::from(rendered[i].clamp(0.0, 1.0)) * inside;
-            let y = f64::from(observed[i]) * inside;
-            for (m, v) in self.moments.iter_mut().zip([x, y, x * x, y * y, x * y]) {
-                m[i] = v;
-            }
-        }
-        let w = window();
-        for m in &mut self.moments {
-            blur(m, &mut self.rows, self.width, self.height, &w);
-        }
-        for i in (0..valid.len()).filter(|&i| valid[i] != 0) {
-            let [mx, my, xx, yy, xy] = std::array::from_fn(|k| self.moments[k][i]);
-            let (sx, sy, sxy) = (xx - mx * mx, yy - my * my, xy - mx * my);
-            let s = (2.0 * mx * my + C1) * (2.0 * sxy + C2) / ((mx * mx + my * my + C1) * (sx + sy + C2));
-            f(i, s);
-        }
+    fn get(&self) -> Option<f64> {
+        (self.n > 0).then(|| self.sum / f64::from(self.n))
     }
 }
 
-/// Separable filter in place; outside the image is zero.
-fn blur(image: &mut [f64], rows: &mut [f64], width: usize, height: usize, w: &[f64; WINDOW]) {
-    for y in 0..height {
-        for x in 0..width {
-            let (first, last) = (x.saturating_sub(RADIUS), (x + RADIUS).min(width - 1));
-            let taps = &w[first + RADIUS - x..=last + RADIUS - x];
-            let row = &image[y * width + first..=y * width + last];
-            rows[y * width + x] = row.iter().zip(taps).map(|(v, w)| v * w).sum();
+/// Scores a few keyframes spread over the run: those trained on, and those held out. Allocates.
+pub fn sample(scene: &mut Scene) -> Result<[Option<f64>; 2], GpuError> {
+    let mut means = [Mean::default(), Mean::default()];
+    for (held_out, mean) in means.iter_mut().enumerate() {
+        let of_kind: Vec<usize> =
+            first_images(scene).filter(|&i| scene.store.get(i).held_out == (held_out == 1)).collect();
+        for i in spread(&of_kind, PROBED) {
+            mean.add(score(scene, i)?);
         }
     }
-    image.fill(0.0);
-    for y in 0..height {
-        let (first, last) = (y.saturating_sub(RADIUS), (y + RADIUS).min(height - 1));
-        for v in first..=last {
-            let weight = w[v + RADIUS - y];
-            let to = &mut image[y * width..(y + 1) * width];
-            to.iter_mut().zip(&rows[v * width..(v + 1) * width]).for_each(|(t, r)| *t += weight * r);
+    Ok(means.map(|m| m.get()))
+}
+
+/// Scores every keyframe. Allocates.
+pub fn evaluate(scene: &mut Scene, weights: &Weights) -> Result<Evaluation, GpuError> {
+    let mut ssim_of = Ssim::new(scene.rendered.width, scene.rendered.height);
+    let mut means: [[Mean; 2]; 5] = Default::default();
+    let [training, held_out, between, fitted, aligned] = &mut means;
+    let mut by_camera = [Mean::default(); CAMERAS_MAX];
+    for i in 0..scene.store.len() {
+        let observed = observed(scene, i);
+        let mut add = |scene: &Scene, [psnr, ssim]: &mut [Mean; 2]| {
+            let (shown, valid) = (&scene.rendered.colour, &scene.camera(i).valid);
+            psnr.add(mse(&observed, shown, valid).map(psnr_db));
+            ssim.add(ssim_of.mean(&observed, shown, valid));
+        };
+        let scored = score(scene, i)?;
+        if !scene.store.get(i).held_out {
+            add(scene, training);
+            continue;
         }
+        by_camera[scene.store.camera(i)].add(scored);
+        add(scene, held_out);
+        fit(scene, i, &observed);
+        add(scene, fitted);
+        score_at(scene, i, scene.store.between(i))?;
+        add(scene, between);
+        let aligned_by = align(scene, i, &observed, weights)?;
+        score_at(scene, i, aligned_by)?;
+        fit(scene, i, &observed);
+        add(scene, aligned);
     }
+    let [[psnr, ssim], [psnr_heldout, ssim_heldout], [psnr_between, _], [psnr_fitted, ssim_fitted], [psnr_aligned, _]] =
+        means;
+    Ok(Evaluation {
+        psnr_db: psnr.get(),
+        ssim: ssim.get(),
+        psnr_heldout_db: psnr_heldout.get(),
+        ssim_heldout: ssim_heldout.get(),
+        psnr_heldout_between_db: psnr_between.get(),
+        psnr_heldout_fitted_db: psnr_fitted.get(),
+        ssim_heldout_fitted: ssim_fitted.get(),
+        psnr_heldout_aligned_db: psnr_aligned.get(),
+        psnr_heldout_by_camera_db: by_camera.map(|m| m.get()),
+    })
+}
+
+/// Pictures of `count` keyframes spread over the run. Allocates.
+pub fn panels(scene: &mut Scene, count: usize) -> Result<Vec<Panel>, GpuError> {
+    let all: Vec<usize> = first_images(scene).collect();
+    let mut panels = Vec::with_capacity(count);
+    for i in spread(&all, count) {
+        let psnr_db = score(scene, i)?;
+        let valid = scene.camera(i).valid.clone();
+        let (planes, r) = (scene.store.planes(i), &scene.rendered);
+        let n = valid.len();
+        let observed = (0..n).flat_map(|k| planes.iter().map(move |p| p.pixels[k])).collect();
+        let rendered = (0..n).flat_map(|k| r.colour[k..].iter().step_by(n).copied()).collect();
+        let kind = if scene.store.get(i).held_out { "_heldout" } else { "" };
+        panels.push(Panel {
+            name: format!("{:04}{kind}", scene.store.get(i).id),
+            width: r.width,
+            height: r.height,
+            rendered,
+            depth: r.depth.clone(),
+            observed,
+            valid,
+            psnr_db,
+        });
+    }
+    Ok(panels)
+}
+
+/// Renders a keyframe, in its exposure, and compares; `None` where nothing is valid.
+fn score(scene: &mut Scene, index: usize) -> Result<Option<f64>, GpuError> {
+    let view = scene.view(index);
+    scene.render(&view)?;
+    show(scene, scene.store.exposure(index));
+    Ok(mse(&observed(scene, index), &scene.rendered.colour, &scene.camera(index).valid).map(psnr_db))
+}
+
+/// The first camera's images.
+fn first_images(scene: &Scene) -> impl Iterator<Item = usize> {
+    (0..scene.store.len()).step_by(scene.cameras.len())
+}
+
+/// Does what `score` does with another refinement of the keyframe for the moment.
+fn score_at(scene: &mut Scene, index: usize, refined: Refinement) -> Result<(), GpuError> {
+    let first = scene.store.first(index);
+    let own = std::mem::replace(&mut scene.store.get_mut(first).refined, refined);
+    let scored = score(scene, index);
+    scene.store.get_mut(first).refined = own;
+    scored.map(|_| ())
+}
+
+/// Puts the rendering into another exposure.
+fn show(scene: &mut Scene, exposure: Exposure) {
+    scene.rendered.colour.iter_mut().for_each(|x| *x = exposure.observed(f64::from(*x)) as f32);
+}
+
+/// Puts the rendering into the exposure that fits an image best.
+fn fit(scene: &mut Scene, index: usize, observed: &[f32]) {
+    show(scene, fitted_exposure(observed, &scene.rendered.colour, &scene.camera(index).valid));
+}
+
+/// An image plane by plane.
+fn observed(scene: &Scene, index: usize) -> Vec<f32> {
+    scene.store.planes(index).iter().flat_map(|p| &p.pixels).map(|p| f32::from(*p) / 255.0).collect()
+}
+
+/// The refinement of a keyframe from which the map, standing still, looks most like its image.
+fn align(scene: &mut Scene, index: usize, observed: &[f32], weights: &Weights) -> Result<Refinement, GpuError> {
+    let (body_from_cam, view) = (scene.camera(index).body_from_cam, scene.view(index));
+    let given = scene.store.get(scene.store.first(index)).given;
+    scene.render(&view)?;
+    let exposure = fitted_exposure(observed, &scene.rendered.colour, &scene.camera(index).valid);
+    let target = Target { exposure, ..scene.target(index) };
+    let mut refined = Refinement::default();
+    let (mut best, mut best_loss) = (refined, f64::INFINITY);
+    for k in 0..ALIGN_STEPS {
+        let view = scene.camera(index).view(given * refined.body_from_refined);
+        let done = scene.pipeline.evaluate(&mut scene.gpu, &view, target, weights)?;
+        if done.loss < best_loss {
+            (best, best_loss) = (refined, done.loss);
+        }
+        let rate = ALIGN_RATE * ALIGN_DECAY.powi(k);
+        refined.step_pose(&done.pose_gradient, &view.world_from_cam, &body_from_cam, rate);
+    }
+    Ok(best)
+}
+
+/// At most `count` of the items, evenly spread, first and last included.
+fn spread(items: &[usize], count: usize) -> Vec<usize> {
+    let n = items.len();
+    if n <= count {
+        return items.to_vec();
+    }
+    (0..count).map(|k| items[k * (n - 1) / (count - 1).max(1)]).collect()
 }
 
 #[cfg(test)]
 mod tests {
-    #![allow(clippy::unwrap_used)]
-    use super::*;
-
-    fn noise(seed: u32, n: usize) -> Vec<f32> {
-        let mut s = seed;
-        let mut next = || {
-            s = s.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
-            (s >> 8) as f32 / (1 << 24) as f32
-        };
-        (0..n).map(|_| next()).collect()
-    }
+    use super::spread;
 
     #[test]
-    fn psnr_of_a_tenth_is_twenty_db_and_ignores_invalid_pixels() {
-        let observed = [0.5, 0.5, 0.5, 0.9];
-        let rendered = [0.6, 0.4, 0.6, 0.0];
-        let e = mse(&observed, &rendered, &[1, 1, 1, 0]).unwrap();
-        assert!((psnr_db(e) - 20.0).abs() < 1e-5, "{}", psnr_db(e));
-        assert_eq!(mse(&observed, &rendered, &[0; 4]), None);
-    }
-
-    #[test]
-    fn rendered_values_are_clamped_before_comparison() {
-        assert_eq!(mse(&[1.0, 0.0], &[1.7, -0.3], &[1, 1]), Some(0.0));
-    }
-
-    #[test]
-    fn ssim_of_equal_images_is_one() {
-        let a = noise(1, 20 * 15);
-        let s = Ssim::new(20, 15).mean(&a, &a, &[1; 300]).unwrap();
-        assert!((s - 1.0).abs() < 1e-12);
-    }
-
-    #[test]
-    fn ssim_of_constants_is_the_luminance_term() {
-        // Deep inside, variances vanish: (2 a b + C1) / (a² + b² + C1).
-        let (a, b) = (0.25f32, 0.75f32);
-        let mut at_centre = 0.0;
-        let (w, h) = (25, 25);
-        Ssim::new(w, h).each(&[a; 625], &[b; 625], &[1; 625], |i, s| {
-            if i == 12 * w + 12 {
-                at_centre = s;
-            }
-        });
-        let expected = (2.0 * 0.25 * 0.75 + C1) / (0.0625 + 0.5625 + C1);
-        assert!((at_centre - expected).abs() < 1e-6, "{at_centre} {expected}");
-    }
-
-    #[test]
-    fn ssim_equals_the_two_dimensional_definition() {
-        let (w, h) = (17usize, 13usize);
-        let (a, b) = (noise(3, w * h), noise(4, w * h));
-        let mut valid = vec![1u8; w * h];
-        valid[5 * w + 6..5 * w + 11].fill(0);
-        let g = window();
-        let mut worst = 0.0f64;
-        Ssim::new(w, h).each(&a, &b, &valid, |i, s| {
-            let (x0, y0) = ((i % w) as i64, (i / w) as i64);
-            let mut m = [0.0; 5];
-            for dy in -5..=5i64 {
-                for dx in -5..=5i64 {
-                    let (x, y) = (x0 + dx, y0 + dy);
-                    if x < 0 || y < 0 || x >= w as i64 || y >= h as i64 {
-                        continue;
-                    }
-                    let j = y as usize * w + x as usize;
-                    let v = f64::from(valid[j]);
-                    let (p, q) = (f64::from(b[j]) * v, f64::from(a[j]) * v);
-                    let weight = g[(dx + 5) as usize] * g[(dy + 5) as usize];
-                    for (m, t) in m.iter_mut().zip([p, q, p * p, q * q, p * q]) {
-                        *m += weight * t;
-                    }
-                }
-            }
-            let (sx, sy, sxy) = (m[2] - m[0] * m[0], m[3] - m[1] * m[1], m[4] - m[0] * m[1]);
-            let expected =
-                (2.0 * m[0] * m[1] + C1) * (2.0 * sxy + C2) / ((m[0] * m[0] + m[1] * m[1] + C1) * (sx + sy + C2));
-            worst = worst.max((s - expected).abs());
-        });
-        assert!(worst < 1e-10, "{worst}");
-    }
-
-    #[test]
-    fn window_is_the_published_one() {
-        // The values every 3DGS implementation tabulates.
-        let published = [0.00102838, 0.00759876, 0.03600077, 0.10936069, 0.21300553, 0.26601172];
-        for (w, p) in window().iter().zip(published) {
-            assert!((w - p).abs() < 1e-8);
-        }
+    fn spread_takes_first_and_last() {
+        let items: Vec<usize> = (10..30).collect();
+        assert_eq!(spread(&items, 3), [10, 19, 29]);
+        assert_eq!(spread(&items[..2], 3), [10, 11]);
+        assert_eq!(spread(&items, 1), [10]);
     }
 }

@@ -6,82 +6,82 @@
 //! threads, so a map can be repeated to the bit. A cell that loses both its places is not known to be held; the cost is a
 //! duplicate seed, so that is counted and forgotten.
 
-use super::pipeline::Pipeline;
+use super::pool::Pool;
 use crate::gpu::kernels::{occupied, occupy};
-use crate::gpu::{Buf, Gpu, GpuError, Kernel, Threads, ALIGN};
-use crate::mem::Footprint;
+use crate::gpu::{Arena, Buf, Gpu, GpuError, Kernel, Threads};
 use stipple_drivers::Fault;
 
 /// Points that travel to the GPU at a time.
 const POINTS: usize = 4096;
 
-/// What `look` finds at a point.
+/// What `look_up` finds at a point.
 pub const FREE: u32 = 0;
 pub const HELD: u32 = 1;
 /// Both places are other cells'.
 pub const UNKNOWN: u32 = 2;
 
-pub struct Occupancy {
-    occupy: Kernel<occupy::K>,
-    occupied: Kernel<occupied::K>,
-    cells: Buf<u32>,
+#[derive(Clone, Copy)]
+pub struct Buffers {
+    pub cells: Buf<u32>,
     points: Buf<[f32; 4]>,
     found: Buf<u32>,
+}
+
+impl Buffers {
+    /// `cells` is a power of two.
+    pub fn new(arena: &mut Arena, cells: u32) -> Result<Buffers, Fault> {
+        debug_assert!(cells.is_power_of_two());
+        Ok(Buffers {
+            cells: arena.alloc("occupancy: cells", cells as usize)?,
+            points: arena.alloc("occupancy: points asked for", POINTS)?,
+            found: arena.alloc("occupancy: answers", POINTS)?,
+        })
+    }
+}
+
+pub struct Occupancy {
+    pub buffers: Buffers,
+    occupy: Kernel<occupy::K>,
+    occupied: Kernel<occupied::K>,
     per_metre: f32,
 }
 
 impl Occupancy {
-    pub fn footprint(cells: u32) -> Footprint {
-        let mut f = Footprint::default();
-        f.gpu("map: occupancy grid", cells as usize * size_of::<u32>());
-        f.gpu("map: points to place", POINTS * (size_of::<[f32; 4]>() + size_of::<u32>()) + 3 * ALIGN as usize);
-        f
-    }
-
-    /// `cells` is a power of two.
-    pub fn new(gpu: &mut Gpu, cell_m: f64, cells: u32) -> Result<Occupancy, Fault> {
-        debug_assert!(cells.is_power_of_two());
+    pub fn new(gpu: &mut Gpu, buffers: Buffers, cell_m: f64) -> Result<Occupancy, Fault> {
         Ok(Occupancy {
-            occupy: gpu.kernel::<occupy::K>(occupy::Spec::default())?,
-            occupied: gpu.kernel::<occupied::K>(occupied::Spec::default())?,
-            cells: gpu.alloc("map: occupancy grid", cells as usize)?,
-            points: gpu.alloc("map: points to place", POINTS)?,
-            found: gpu.alloc("map: points placed", POINTS)?,
+            buffers,
+            occupy: gpu.kernel(occupy::Spec::default())?,
+            occupied: gpu.kernel(occupied::Spec::default())?,
             per_metre: (1.0 / cell_m) as f32,
         })
     }
 
     /// Which of `points` lie in cells that hold Gaussians of the pool; one answer a point.
-    pub fn look(
-        &mut self,
+    pub fn look_up(
+        &self,
         gpu: &mut Gpu,
-        pipeline: &Pipeline,
+        pool: &Pool,
         points: &[[f32; 4]],
         answers: &mut Vec<u32>,
     ) -> Result<(), GpuError> {
-        let (splats, per_metre, mask) = (pipeline.count() as u32, self.per_metre, self.cells.len() as u32 - 1);
+        let Buffers { cells, points: asked, found } = self.buffers;
+        let (splats, per_metre, mask) = (pool.count(), self.per_metre, cells.len() as u32 - 1);
         let mut rec = gpu.record();
-        rec.fill(self.cells, u32::MAX);
-        let bind = occupy::Bind { splats: pipeline.buffers().splats.read(), cells: self.cells.read_write() };
+        rec.fill(cells, u32::MAX);
+        let bind = occupy::Bind { splats: pool.buffers.splats.read(), cells: cells.read_write() };
         rec.dispatch(&self.occupy, bind, occupy::Push { splats, per_metre, mask }, Threads::d1(splats));
         gpu.submit(rec)?;
         answers.clear();
         answers.resize(points.len(), FREE);
         for (points, answers) in points.chunks(POINTS).zip(answers.chunks_mut(POINTS)) {
-            gpu.upload(self.points, 0, points)?;
+            gpu.upload(asked, 0, points)?;
             let mut rec = gpu.record();
-            let bind =
-                occupied::Bind { points: self.points.read(), cells: self.cells.read(), found: self.found.write() };
+            let bind = occupied::Bind { points: asked.read(), cells: cells.read(), found: found.write() };
             let n = points.len() as u32;
             rec.dispatch(&self.occupied, bind, occupied::Push { points: n, per_metre, mask }, Threads::d1(n));
             gpu.submit(rec)?;
-            gpu.download(self.found, 0, answers)?;
+            gpu.download(found, 0, answers)?;
         }
         Ok(())
-    }
-
-    /// What is in the table, for tests.
-    pub fn cells(&self) -> Buf<u32> {
-        self.cells
     }
 }

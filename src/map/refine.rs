@@ -6,12 +6,10 @@
 //! nothing of it ever goes back to odometry. The gauge, where the map as a whole is and how bright, is no keyframe's:
 //! a decay of every correction towards none, decoupled from the gradient (AdamW; Loshchilov & Hutter, ICLR 2019), holds
 //! it, and what one exposure moves by all move back together, since a map that is still dim would else brighten them all.
-//! Fixing the first keyframe instead leaves it worst fitted: V1_01 on an H200, 300 steps a keyframe, every 8th view held
-//! out, then every 5th: 28.68 dB and 22.59 held out, 27.89 and 21.30; with the decay alone 29.47 and 22.74, 29.40 and
-//! 21.72. As Adam moves at most about `rate` a step, the decay also bounds a correction, by 1 / DECAY an axis.
+//! Fixing the first keyframe instead leaves it worst fitted. As Adam moves at most about `rate` a step, the decay also
+//! bounds a correction, by 1 / DECAY an axis.
 
-use super::view::{Exposure, Goal, StepStats, View};
-use super::Mapper;
+use super::exposure::{Exposure, PIVOT};
 use glam::{DQuat, DVec3};
 use stipple_drivers::Pose;
 
@@ -19,20 +17,10 @@ const BETA1: f64 = 0.9;
 /// Keyframes take tens of steps, not thousands: the second moment must settle within them.
 const BETA2: f64 = 0.99;
 const EPSILON: f64 = 1e-12;
-/// A step's decay over its rate, 1/m and 1/rad: an axis moves 20 cm and 0.2 rad at most. Ten times as much: -0.6 dB and
-/// -0.03 held out, every 5th view -0.5 and -0.2.
+/// A step's decay over its rate, 1/m and 1/rad: an axis moves 20 cm and 0.2 rad at most.
 const POSE_DECAY: f64 = 5.0;
-/// The same of the exposure, by ln gain and grey level. At 20 and 200 times as much (scale 4, 60 steps a keyframe, every
-/// 5th view): -1.0 and -1.5 dB, held out -0.5 and +0.1.
+/// The same of the exposure, by ln gain and grey level.
 const EXPOSURE_DECAY: f64 = 0.1;
-/// Gain and level turn about this grey, the middle of what cameras expose for: about zero a change of gain would
-/// look like one of the offset, and Adam, which takes each alone, would be slow.
-const PIVOT: f64 = 0.5;
-/// Cameras range over more stops, but two keyframes of one flight that overlap do not.
-const GAIN_MAX: f64 = 8.0;
-/// A pixel this opaque shows the map, and a view with this share of them tells its exposure.
-const SHOWN_ALPHA: f32 = 0.9;
-const SHOWN_MIN: f64 = 0.2;
 
 /// Adam over N numbers.
 #[derive(Clone, Copy, Debug)]
@@ -65,7 +53,7 @@ impl<const N: usize> Adam<N> {
     }
 }
 
-/// Of one keyframe.
+/// What was found out about one keyframe.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Refinement {
     pub body_from_refined: Pose,
@@ -93,8 +81,8 @@ impl Refinement {
         let d = self.pose.step(&in_body(gradient, world_from_cam, body_from_cam), rate);
         let keep = 1.0 - rate * POSE_DECAY;
         let Pose { q, p } = self.body_from_refined;
-        let turn = DQuat::from_scaled_axis(keep * q.to_scaled_axis()) * DQuat::from_scaled_axis(three(&d, 3));
-        self.body_from_refined = Pose::new(turn, keep * p + q * three(&d, 0));
+        let rotation = DQuat::from_scaled_axis(keep * q.to_scaled_axis()) * DQuat::from_scaled_axis(three(&d, 3));
+        self.body_from_refined = Pose::new(rotation, keep * p + q * three(&d, 0));
     }
 
     /// One step down `gradient`, by [gain, offset]; ln gain and the level of mid-grey move at most about `rate`. Answers
@@ -102,118 +90,29 @@ impl Refinement {
     pub fn step_exposure(&mut self, gradient: &[f64; 2], rate: f64) -> [f64; 2] {
         let Exposure { gain, .. } = self.exposure;
         let d = self.exposed.step(&[gain * (gradient[0] - PIVOT * gradient[1]), gradient[1]], rate);
-        let before = levels(&self.exposure);
+        let before = self.exposure.levels();
         let keep = 1.0 - rate * EXPOSURE_DECAY;
-        self.exposure = of_levels([keep * before[0] + d[0], keep * before[1] + d[1]]);
-        let after = levels(&self.exposure);
+        self.exposure = Exposure::from_levels([keep * before[0] + d[0], keep * before[1] + d[1]]);
+        let after = self.exposure.levels();
         [after[0] - before[0], after[1] - before[1]]
     }
 
     /// Moves ln gain and the level of mid-grey.
     pub fn shift_exposure(&mut self, by: [f64; 2]) {
-        let [log_gain, level] = levels(&self.exposure);
-        self.exposure = of_levels([log_gain + by[0], level + by[1]]);
-    }
-}
-
-/// ln gain, and how far mid-grey moves.
-fn levels(e: &Exposure) -> [f64; 2] {
-    [e.gain.ln(), e.offset + PIVOT * (e.gain - 1.0)]
-}
-
-fn of_levels([log_gain, level]: [f64; 2]) -> Exposure {
-    let gain = log_gain.exp().clamp(1.0 / GAIN_MAX, GAIN_MAX);
-    Exposure { gain, offset: level - PIVOT * (gain - 1.0) }
-}
-
-impl Mapper {
-    pub(super) fn goal(&self, index: usize) -> Goal {
-        let exposure = self.config.refine_exposure.then(|| self.store.exposure(index));
-        Goal { slot: index as u32, camera: self.store.camera(index) as u32, exposure }
-    }
-
-    /// After a training step on an image: one of its keyframe's pose and of its exposure.
-    pub(super) fn refine(&mut self, index: usize, view: &View, done: &StepStats) {
-        let (first, part) = (self.store.first(index), self.rate_part());
-        if self.config.refine_pose {
-            let body_from_cam = self.eyes[self.store.camera(index)].body_from_cam;
-            let rate = part * self.config.lr_pose;
-            let refined = &mut self.store.get_mut(first).refined;
-            refined.step_pose(&done.pose_gradient, &view.world_from_cam, &body_from_cam, rate);
-        }
-        if self.config.refine_exposure {
-            let refined = &mut self.store.get_mut(index).refined;
-            let moved = refined.step_exposure(&done.exposure_gradient, part * self.config.lr_exposure);
-            self.store.balance_exposure(moved);
-        }
-    }
-
-    /// Before a new keyframe is seeded from: its gain from the mean grey of what its rendering already shows of it.
-    /// A fit of both would take the blur of an unfinished map for a low contrast.
-    pub(super) fn expose(&mut self, index: usize) {
-        if !self.config.refine_exposure || self.store.training().first() == Some(&(index as u32)) {
-            return;
-        }
-        let (valid, r) = (&self.eye(index).valid, &self.rendered);
-        let (mut seen, mut n, mut observed, mut rendered) = (0u32, 0u32, 0.0, 0.0);
-        let planes = self.store.planes(index);
-        for i in (0..valid.len()).filter(|&i| valid[i] != 0) {
-            n += 1;
-            if r.alpha[i] > SHOWN_ALPHA {
-                seen += 1;
-                let channels = planes.len() as f64;
-                observed += planes.iter().map(|p| f64::from(p.pixels[i])).sum::<f64>() / (255.0 * channels);
-                let level: f32 = r.colour[i..].iter().step_by(r.alpha.len()).sum();
-                rendered += f64::from(level / r.alpha[i]) / channels;
-            }
-        }
-        let e = &mut self.store.get_mut(index).refined.exposure;
-        if f64::from(seen) >= SHOWN_MIN * f64::from(n.max(1)) && rendered > 0.0 {
-            let gain = (observed - e.offset * f64::from(seen)) / rendered;
-            e.gain = gain.clamp(1.0 / GAIN_MAX, GAIN_MAX);
-        }
+        let [log_gain, level] = self.exposure.levels();
+        self.exposure = Exposure::from_levels([log_gain + by[0], level + by[1]]);
     }
 }
 
 /// A gradient by a camera's pose as one by the body's, both perturbed on the right: p += R δ, R <- R Exp(θ).
 fn in_body(gradient: &[f64; 6], world_from_cam: &Pose, body_from_cam: &Pose) -> [f64; 6] {
     let by_p = body_from_cam.q * (world_from_cam.q.conjugate() * three(gradient, 0));
-    let by_turn = body_from_cam.q * three(gradient, 3) + body_from_cam.p.cross(by_p);
-    [by_p.x, by_p.y, by_p.z, by_turn.x, by_turn.y, by_turn.z]
+    let by_rotation = body_from_cam.q * three(gradient, 3) + body_from_cam.p.cross(by_p);
+    [by_p.x, by_p.y, by_p.z, by_rotation.x, by_rotation.y, by_rotation.z]
 }
 
 fn three(v: &[f64], at: usize) -> DVec3 {
     DVec3::new(v[at], v[at + 1], v[at + 2])
-}
-
-/// Grey levels between which a camera's pixel is neither black nor saturated: beyond them a rendering may rightly be
-/// darker or brighter than the image, so they say nothing of the exposure.
-const UNSATURATED: std::ops::Range<f32> = 0.02..0.98;
-
-/// The exposure that takes a rendering closest to an image, in closed form: linear least squares of gain and offset
-/// over the valid pixels of all planes that the camera did not saturate. A flat or empty rendering gets the offset alone.
-pub fn fitted_exposure(observed: &[f32], rendered: &[f32], valid: &[u8]) -> Exposure {
-    let (mut n, mut sx, mut sy, mut sxx, mut sxy) = (0.0, 0.0, 0.0, 0.0, 0.0);
-    let tells = |i: &usize| valid[i % valid.len()] != 0 && UNSATURATED.contains(&observed[*i]);
-    for i in (0..observed.len()).filter(tells) {
-        let (x, y) = (f64::from(rendered[i]), f64::from(observed[i]));
-        (n, sx, sy, sxx, sxy) = (n + 1.0, sx + x, sy + y, sxx + x * x, sxy + x * y);
-    }
-    if n == 0.0 {
-        return Exposure::default();
-    }
-    let variance = sxx - sx * sx / n;
-    let gain = if variance > 1e-9 * n { (sxy - sx * sy / n) / variance } else { 1.0 };
-    Exposure { gain, offset: (sy - gain * sx) / n }
-}
-
-/// The one of these exposures that is nearest to all of them: the least sum of distances by ln gain and by the level of
-/// mid-grey (the medoid). `None` of none.
-pub fn median_exposure(exposures: &[Exposure]) -> Option<Exposure> {
-    let all: Vec<[f64; 2]> = exposures.iter().map(levels).collect();
-    let distance = |a: &[f64; 2]| all.iter().map(|b| (a[0] - b[0]).hypot(a[1] - b[1])).sum::<f64>();
-    let nearest = (0..all.len()).min_by(|i, j| distance(&all[*i]).total_cmp(&distance(&all[*j])))?;
-    Some(exposures[nearest])
 }
 
 #[cfg(test)]
@@ -299,36 +198,5 @@ mod tests {
         r.step_pose(&[f64::NAN, 0.0, 0.0, 0.0, 0.0, 0.0], &Pose::IDENTITY, &Pose::IDENTITY, 0.1);
         r.step_exposure(&[0.0, f64::INFINITY], 0.1);
         assert_eq!((r.body_from_refined, r.exposure), (Pose::IDENTITY, Exposure::default()));
-    }
-
-    #[test]
-    fn median_exposure_is_one_of_them_and_no_outlier() {
-        let of = |gain: f64| Exposure { gain, offset: 0.0 };
-        assert_eq!(median_exposure(&[of(1.0), of(8.0), of(1.1), of(0.2), of(1.2)]), Some(of(1.1)));
-        assert_eq!(median_exposure(&[]), None);
-    }
-
-    #[test]
-    fn saturated_pixels_do_not_tell_the_exposure() {
-        // The map is rightly brighter than white where a camera saturated.
-        let rendered: Vec<f32> = (0..100).map(|i| 0.02 * i as f32).collect();
-        let observed: Vec<f32> = rendered.iter().map(|x| (0.8 * x + 0.1).clamp(0.0, 1.0)).collect();
-        let e = fitted_exposure(&observed, &rendered, &[1; 100]);
-        assert!((e.gain - 0.8).abs() < 1e-5 && (e.offset - 0.1).abs() < 1e-5, "{e:?}");
-    }
-
-    #[test]
-    fn fitted_exposure_is_the_least_squares_one() {
-        let rendered: Vec<f32> = (0..100).map(|i| (i % 17) as f32 / 17.0).collect();
-        let observed: Vec<f32> = rendered.iter().map(|x| 0.8 * x + 0.1).collect();
-        let mut valid = [1u8; 100];
-        valid[3] = 0;
-        let mut spoiled = observed.clone();
-        spoiled[3] = 9.0;
-        let e = fitted_exposure(&spoiled, &rendered, &valid);
-        assert!((e.gain - 0.8).abs() < 1e-5 && (e.offset - 0.1).abs() < 1e-5, "{e:?}");
-        let flat = fitted_exposure(&observed, &[0.5; 100], &valid);
-        assert!(flat.gain == 1.0 && flat.offset.is_finite());
-        assert_eq!(fitted_exposure(&observed, &rendered, &[0; 100]), Exposure::default());
     }
 }

@@ -6,8 +6,7 @@
 //! pass also leaves out what is not to be sorted, which compacts a list for nothing.
 
 use crate::gpu::kernels::{radix_count, radix_scatter, scan_apply, scan_reduce};
-use crate::gpu::{Buf, Gpu, Kernel, Recorder, Threads};
-use crate::mem::Footprint;
+use crate::gpu::{Arena, Buf, Caps, DeviceKind, Gpu, Kernel, Recorder, Threads};
 use stipple_drivers::Fault;
 
 /// How a pass is cut.
@@ -36,53 +35,61 @@ pub const NONE: u32 = u32::MAX;
 const _: () = assert!((CPU.groups << CPU.digit_bits) as usize <= TABLE_LEN);
 const _: () = assert!((GPU.groups << GPU.digit_bits) as usize <= TABLE_LEN);
 
+impl Cut {
+    pub fn of(caps: &Caps) -> Cut {
+        let cores = std::thread::available_parallelism().map_or(1, |n| n.get() as u32);
+        match caps.kind {
+            DeviceKind::Cpu => Cut { groups: (2 * cores).min(CPU.groups), ..CPU },
+            _ => GPU,
+        }
+    }
+}
+
+/// What sorts and scans work in.
+#[derive(Clone, Copy)]
+pub struct Buffers {
+    table: Buf<u32>,
+    sums: Buf<u32>,
+    unlimited: Buf<u32>,
+}
+
+impl Buffers {
+    pub fn new(arena: &mut Arena) -> Result<Buffers, Fault> {
+        Ok(Buffers {
+            table: arena.alloc("sort: digit table", TABLE_LEN)?,
+            sums: arena.alloc("scan: block sums", SCAN_BLOCKS_MAX as usize)?,
+            unlimited: arena.alloc("sort: unlimited", 1)?,
+        })
+    }
+}
+
 /// Exclusive prefix sum in place, modulo 2^32.
+#[derive(Clone, Copy)]
 pub struct Scan {
     reduce: Kernel<scan_reduce::K>,
     apply: Kernel<scan_apply::K>,
     sums: Buf<u32>,
-    /// Stands in for the count where the length is the buffer's.
-    unlimited: Buf<u32>,
     blocks: u32,
 }
 
 impl Scan {
-    pub fn footprint() -> Footprint {
-        let mut f = Footprint::default();
-        f.gpu("scan: block sums", (SCAN_BLOCKS_MAX as usize + 1) * size_of::<u32>());
-        f
-    }
-
-    pub fn new(gpu: &mut Gpu) -> Result<Scan, Fault> {
-        let scan = Scan {
-            reduce: gpu.kernel::<scan_reduce::K>(scan_reduce::Spec::default())?,
-            apply: gpu.kernel::<scan_apply::K>(scan_apply::Spec::default())?,
-            sums: gpu.alloc("scan: block sums", SCAN_BLOCKS_MAX as usize)?,
-            unlimited: gpu.alloc("scan: unlimited", 1)?,
-            blocks: if is_cpu(gpu) { SCAN_BLOCKS_CPU } else { SCAN_BLOCKS_MAX },
-        };
-        gpu.upload(scan.unlimited, 0, &[u32::MAX]).map_err(Fault::from)?;
-        Ok(scan)
-    }
-
-    /// A count that is more than any.
-    pub fn unlimited(&self) -> Buf<u32> {
-        self.unlimited
+    pub fn new(gpu: &mut Gpu, buffers: &Buffers) -> Result<Scan, Fault> {
+        Ok(Scan {
+            reduce: gpu.kernel(scan_reduce::Spec::default())?,
+            apply: gpu.kernel(scan_apply::Spec::default())?,
+            sums: buffers.sums,
+            blocks: if gpu.caps().kind == DeviceKind::Cpu { SCAN_BLOCKS_CPU } else { SCAN_BLOCKS_MAX },
+        })
     }
 
     /// Scans the whole buffer.
     pub fn record(&self, rec: &mut Recorder, data: Buf<u32>) {
-        self.record_counted(rec, data, self.unlimited);
-    }
-
-    /// Scans `data[..count[0]]`, or all of it when the count is more.
-    pub fn record_counted(&self, rec: &mut Recorder, data: Buf<u32>, count: Buf<u32>) {
-        let (capacity, blocks) = (data.len() as u32, self.blocks);
+        let (n, blocks) = (data.len() as u32, self.blocks);
         let threads = Threads::groups(blocks, 1, 1);
-        let sums = scan_reduce::Bind { data: data.read(), count: count.read(), sums: self.sums.write() };
-        rec.dispatch(&self.reduce, sums, scan_reduce::Push { capacity, blocks }, threads);
-        let scanned = scan_apply::Bind { data: data.read_write(), count: count.read(), sums: self.sums.read() };
-        rec.dispatch(&self.apply, scanned, scan_apply::Push { capacity, blocks }, threads);
+        let sums = scan_reduce::Bind { data: data.read(), sums: self.sums.write() };
+        rec.dispatch(&self.reduce, sums, scan_reduce::Push { n, blocks }, threads);
+        let scanned = scan_apply::Bind { data: data.read_write(), sums: self.sums.read() };
+        rec.dispatch(&self.apply, scanned, scan_apply::Push { n, blocks }, threads);
     }
 }
 
@@ -91,6 +98,8 @@ pub struct Sorter {
     count: Kernel<radix_count::K>,
     scatter: Kernel<radix_scatter::K>,
     table: Buf<u32>,
+    /// Stands in for a count where all keys of a buffer are sorted.
+    pub unlimited: Buf<u32>,
     cut: Cut,
 }
 
@@ -102,25 +111,16 @@ pub struct Pairs {
 }
 
 impl Sorter {
-    pub fn footprint() -> Footprint {
-        let mut f = Footprint::default();
-        f.gpu("sort: digit table", TABLE_LEN * size_of::<u32>());
-        f
-    }
-
-    pub fn new(gpu: &mut Gpu) -> Result<Sorter, Fault> {
-        let cores = std::thread::available_parallelism().map_or(1, |n| n.get() as u32);
-        let cpu = Cut { groups: (2 * cores).min(CPU.groups), ..CPU };
-        Sorter::with_cut(gpu, if is_cpu(gpu) { cpu } else { GPU })
-    }
-
-    /// As `new`, with the other kind of device's cut: both must give the same.
-    pub fn with_cut(gpu: &mut Gpu, cut: Cut) -> Result<Sorter, Fault> {
+    /// The result does not depend on the cut.
+    pub fn new(gpu: &mut Gpu, buffers: &Buffers, cut: Cut) -> Result<Sorter, Fault> {
         let digits_max = 1 << cut.digit_bits;
+        let Buffers { table, unlimited, .. } = *buffers;
+        gpu.upload(unlimited, 0, &[u32::MAX])?;
         Ok(Sorter {
-            count: gpu.kernel::<radix_count::K>(radix_count::Spec { digits_max })?,
-            scatter: gpu.kernel::<radix_scatter::K>(radix_scatter::Spec { digits_max, lanes: cut.lanes })?,
-            table: gpu.alloc("sort: digit table", TABLE_LEN)?,
+            count: gpu.kernel(radix_count::Spec { digits_max })?,
+            scatter: gpu.kernel(radix_scatter::Spec { digits_max, lanes: cut.lanes })?,
+            table,
+            unlimited,
             cut,
         })
     }
@@ -183,8 +183,4 @@ impl Sorter {
         };
         rec.dispatch(&self.scatter, moved, bytemuck::cast(push), threads);
     }
-}
-
-fn is_cpu(gpu: &Gpu) -> bool {
-    gpu.caps().kind == crate::gpu::DeviceKind::Cpu
 }

@@ -1,95 +1,118 @@
-//! Training steps from the host's side: started and finished, one ahead of the other, or both at once.
+//! What goes into a training step and what comes out of it.
 
-use super::buffers::GROUP;
-use super::pipeline::Pipeline;
-use super::view::{pose_gradient, stats, Goal, LearningRates, StepStats, View, Weights};
+use super::exposure::Exposure;
+use super::view::View;
 use crate::gpu::kernels::types::Status;
-use crate::gpu::{Gpu, GpuError, Ticket, REPORTS};
+use glam::DVec3;
 
-/// A training step that was started, and what its answer will be read with.
-#[must_use]
-#[derive(Clone, Copy, Debug)]
-pub struct Step {
-    ticket: Ticket,
-    /// Of its status among the reports.
-    place: usize,
-    pub view: View,
-    goal: Goal,
-    weights: Weights,
+/// What a step compares the rendering with.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Target {
+    /// Place of the stored image.
+    pub image: u32,
+    /// The camera whose mask holds.
+    pub camera: u32,
+    /// In which the rendering is compared.
+    pub exposure: Exposure,
 }
 
-impl Pipeline {
-    /// One step on a keyframe, or its slot. The view must have the pipeline's shape.
-    pub fn train(
-        &mut self,
-        gpu: &mut Gpu,
-        view: &View,
-        goal: impl Into<Goal>,
-        rates: &LearningRates,
-        weights: &Weights,
-    ) -> Result<StepStats, GpuError> {
-        self.pass(gpu, view, goal.into(), Some(rates), weights)
+impl From<u32> for Target {
+    fn from(image: u32) -> Target {
+        Target { image, camera: 0, exposure: Exposure::default() }
     }
+}
 
-    /// What `train` would answer; the map, Adam's moments included, stays as it is to the bit.
-    pub fn look(
-        &mut self,
-        gpu: &mut Gpu,
-        view: &View,
-        goal: impl Into<Goal>,
-        weights: &Weights,
-    ) -> Result<StepStats, GpuError> {
-        self.pass(gpu, view, goal.into(), None, weights)
+/// Adam step sizes: m, ln m, quaternion, logit, level.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct LearningRates {
+    pub position: f32,
+    pub scale: f32,
+    pub rotation: f32,
+    pub opacity: f32,
+    pub colour: f32,
+}
+
+/// Weights of the loss (1 - ssim)·L1 + ssim·(1 - SSIM) + mean over the visible of the rest.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Weights {
+    pub ssim: f32,
+    /// On ln(longest axis / second axis) above ln 3.
+    pub needle: f32,
+    /// On ln(longest axis) above ln(scale_soft_m).
+    pub scale: f32,
+    pub scale_soft_m: f32,
+    /// On the opacity.
+    pub opacity: f32,
+}
+
+impl Default for Weights {
+    fn default() -> Self {
+        Weights { ssim: 0.2, needle: 0.1, scale: 0.1, scale_soft_m: 0.1, opacity: 0.0 }
     }
+}
 
-    fn pass(
-        &mut self,
-        gpu: &mut Gpu,
-        view: &View,
-        goal: Goal,
-        rates: Option<&LearningRates>,
-        weights: &Weights,
-    ) -> Result<StepStats, GpuError> {
-        let mut rec = gpu.record();
-        self.record_step(&mut rec, view, &goal, rates, weights);
-        rec.read_back(self.b.status);
-        gpu.submit(rec)?;
-        let status = self.status(gpu)?;
-        Ok(self.step_stats(view, &goal, weights, &status))
+/// A picture of the map; sized by the view.
+#[derive(Clone, Debug, Default)]
+pub struct Rendered {
+    pub width: usize,
+    pub height: usize,
+    /// Plane by plane: grey, or red, green and blue.
+    pub colour: Vec<f32>,
+    pub alpha: Vec<f32>,
+    /// Expected depth, m; zero where nothing was hit.
+    pub depth: Vec<f32>,
+}
+
+impl Rendered {
+    /// A blank one.
+    pub fn new(width: usize, height: usize, channels: usize) -> Rendered {
+        let planes = |n: usize| vec![0.0; n * width * height];
+        Rendered { width, height, colour: planes(channels), alpha: planes(1), depth: planes(1) }
     }
+}
 
-    /// Starts what `train` does. `finish` must have its answer before the step after next is started.
-    pub fn start(
-        &mut self,
-        gpu: &mut Gpu,
-        view: &View,
-        goal: impl Into<Goal>,
-        rates: &LearningRates,
-        weights: &Weights,
-    ) -> Result<Step, GpuError> {
-        let goal = goal.into();
-        let place = self.steps_started % REPORTS;
-        self.steps_started += 1;
-        let mut rec = gpu.record();
-        self.record_step(&mut rec, view, &goal, Some(rates), weights);
-        rec.report(self.b.status, place);
-        let ticket = gpu.start(rec)?;
-        Ok(Step { ticket, place, view: *view, goal, weights: *weights })
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Stats {
+    pub visible: u32,
+    pub intersections: u32,
+    /// Intersections there was no room for: the farthest.
+    pub overflow: u32,
+    /// Gaussians culled for not being finite.
+    pub failed: u32,
+}
+
+impl From<&Status> for Stats {
+    fn from(s: &Status) -> Stats {
+        Stats {
+            visible: s.visible,
+            intersections: s.intersections,
+            overflow: s.intersections_needed - s.intersections,
+            failed: s.not_finite,
+        }
     }
+}
 
-    /// Waits for a step that was started; its answer.
-    pub fn finish(&self, gpu: &mut Gpu, step: &Step) -> Result<StepStats, GpuError> {
-        let mut status = [Status::default()];
-        gpu.report(step.ticket, step.place, &mut status)?;
-        Ok(self.step_stats(&step.view, &step.goal, &step.weights, &status[0]))
-    }
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct StepStats {
+    pub stats: Stats,
+    pub loss: f64,
+    pub l1: f64,
+    pub ssim: f64,
+    /// Gaussians not moved because their gradient was not finite.
+    pub gradients_rejected: u32,
+    /// Gradient by [p, θ] of world_from_cam: p additive in world, rotation perturbed on the right.
+    pub pose_gradient: [f64; 6],
+    /// Gradient by [gain, offset].
+    pub exposure_gradient: [f64; 2],
+}
 
-    fn step_stats(&self, view: &View, goal: &Goal, weights: &Weights, s: &Status) -> StepStats {
-        let valid = f64::from(self.valid_pixels[goal.camera as usize].max(1) * self.shape.channels);
-        let (l1, ssim) = (f64::from(s.l1_sum) / valid, f64::from(s.ssim_sum) / valid);
-        let lambda = f64::from(weights.ssim);
+impl StepStats {
+    /// Of a step from `view` on `values` compared values.
+    pub(super) fn new(s: &Status, view: &View, values: f64, ssim_weight: f32) -> StepStats {
+        let (l1, ssim) = (f64::from(s.l1_sum) / values, f64::from(s.ssim_sum) / values);
+        let lambda = f64::from(ssim_weight);
         StepStats {
-            stats: stats(s),
+            stats: s.into(),
             loss: (1.0 - lambda) * l1 + lambda * (1.0 - ssim),
             l1,
             ssim,
@@ -98,29 +121,11 @@ impl Pipeline {
             exposure_gradient: s.exposure.map(f64::from),
         }
     }
+}
 
-    /// One step down a gradient by pixel that the caller gives in place of a loss: planes by colour.
-    pub fn descend(
-        &mut self,
-        gpu: &mut Gpu,
-        view: &View,
-        pixel_gradient: &[f32],
-        rates: &LearningRates,
-        weights: &Weights,
-    ) -> Result<StepStats, GpuError> {
-        gpu.upload(self.b.pixel_gradient, 0, pixel_gradient)?;
-        let mut rec = gpu.record();
-        let by_tile = self.record_picture(&mut rec, view, &self.k.raster_forward);
-        self.record_update(&mut rec, view, by_tile, Some(rates), weights);
-        self.record_summary(&mut rec, 0, self.high_water.div_ceil(GROUP));
-        rec.read_back(self.b.status);
-        gpu.submit(rec)?;
-        let s = self.status(gpu)?;
-        Ok(StepStats {
-            stats: stats(&s),
-            gradients_rejected: s.gradients_refused as u32,
-            pose_gradient: pose_gradient(view, &s.pose),
-            ..StepStats::default()
-        })
-    }
+/// From points moved in the camera frame to the camera moved in the world.
+fn pose_gradient(view: &View, g: &[f32; 6]) -> [f64; 6] {
+    let v = |i: usize| DVec3::new(f64::from(g[i]), f64::from(g[i + 1]), f64::from(g[i + 2]));
+    let (p, turn) = (-(view.world_from_cam.q * v(0)), -v(3));
+    [p.x, p.y, p.z, turn.x, turn.y, turn.z]
 }

@@ -6,7 +6,7 @@
 //! fit. This thread decodes, then runs the mapper on the frames that tracking gives back, in their order, while tracking
 //! goes on.
 
-use super::mapping::{drain, Keyframes, Mapping, SLICE};
+use super::mapping::{Keyframes, Mapping, SLICE};
 use super::sensors::Recorded;
 use super::status::{Gauges, Status};
 use super::tracking::{FramePacket, Inlet, Link, Tracker};
@@ -112,8 +112,8 @@ pub fn fly(
     status: &mut Status,
 ) -> Flown {
     let (counters, gauges) = (Counters::default(), Gauges::default());
-    let queue = mapping.as_ref().map(|m| m.queue(calibration));
-    let colours = mapping.as_ref().map_or(0, |m| m.mapper.colours_offered());
+    let queue = mapping.as_ref().map(|m| m.queue.clone());
+    let colours = queue.as_ref().map_or(0, |q| q.colours());
     let mut keyframes = Keyframes::new(options.holdout);
     let (total, length_s) = (recorded.stamps.len(), recorded.length_s());
     let mut packets: Vec<Box<FramePacket>> =
@@ -139,19 +139,19 @@ pub fn fly(
             while sent > 0 {
                 let Some(packet) = waker.wait(&ended, || done.pop()) else { return };
                 sent -= 1;
-                keyframes.pass_on(&packet, queue.as_ref(), &counters);
+                keyframes.pass_on(&packet, queue.as_deref(), &counters);
                 let frames = gauges.frames.fetch_add(1, Relaxed) + 1;
                 gauges.keyframes.store(keyframes.count, Relaxed);
                 let since_first = packet.frames.t - reading.recorded.stamps[0];
                 gauges.played_ms.store((since_first.secs() * 1e3) as u64, Relaxed);
                 packets.push(packet);
-                if let (Some(m), Some(queue)) = (&mut mapping, &queue) {
+                if let Some(m) = &mut mapping {
                     if !budget.ahead() {
-                        drain(queue, m);
+                        m.collect();
                     }
                     budget.spend(m, frames, since_first, &gauges);
                     if budget.ahead() {
-                        drain(queue, m);
+                        m.collect();
                     }
                 }
                 status.show(&gauges);

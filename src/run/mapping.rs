@@ -5,10 +5,12 @@ use super::tracking::FramePacket;
 use crate::config::Board;
 use crate::counters::Counters;
 use crate::gpu::GpuError;
-use crate::map::{CurvePoint, Did, Keyframe, Mapper, PoseCorrection};
+use crate::map::{cameras, CurvePoint, Keyframe, Mapper, PoseCorrection, StepKind};
 use crate::mem::{seal_thread, unsealed};
 use crossbeam_queue::ArrayQueue;
+use std::collections::VecDeque;
 use std::sync::atomic::Ordering::Relaxed;
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 use stipple_drivers::{host, Calibration, Fault, Frames, Image, Nanos, Pose};
 
@@ -25,6 +27,10 @@ const CURVE_POINTS: usize = 4096;
 
 pub struct Mapping {
     pub mapper: Mapper,
+    /// Where keyframes and corrections come from.
+    pub queue: Arc<KeyframeQueue>,
+    /// Keyframes taken from it, oldest first; corrections still reach them.
+    waiting: VecDeque<Box<Keyframe>>,
     pub curve: Vec<CurvePoint>,
     pub iteration_ms: Vec<f32>,
     pub iterations: u64,
@@ -48,6 +54,8 @@ impl Mapping {
         let mapper = super::apart("mapping", build)?;
         Ok(Mapping {
             mapper,
+            queue: Arc::new(KeyframeQueue::new(calibration, board)),
+            waiting: VecDeque::with_capacity(KEYFRAME_SLOTS),
             curve: Vec::with_capacity(CURVE_POINTS),
             iteration_ms: Vec::with_capacity(ITERATION_TIMES),
             iterations: 0,
@@ -59,33 +67,49 @@ impl Mapping {
         })
     }
 
-    /// A queue shaped for the keyframes that the mapper wants.
-    pub fn queue(&self, calibration: &Calibration) -> KeyframeQueue {
-        KeyframeQueue::new(calibration, self.mapper.images(), self.mapper.colours_offered())
+    /// Takes over the keyframes and corrections that came.
+    pub fn collect(&mut self) {
+        self.queue.collect(&mut self.waiting, |correction| self.mapper.correct(correction));
     }
 
-    /// One slice of work. Answers false when there was nothing to do.
+    /// One slice of work: keyframes first, until one becomes an anchor, then training. At least one thing is done; answers
+    /// false when there was nothing to do.
     pub fn step(&mut self, deadline: Instant, gauges: &Gauges) -> bool {
         if self.failure.is_some() {
             return false;
         }
-        let report = match self.mapper.step(deadline) {
-            Ok(report) => report,
+        let start = Instant::now();
+        let worked = match self.work(deadline) {
+            Ok(worked) => worked,
             Err(e) => {
                 self.fail(e);
                 return false;
             }
         };
-        self.iterations += u64::from(report.iterations);
-        self.busy_s += report.ms * 1e-3;
-        if report.iterations > 0 && self.iteration_ms.len() < ITERATION_TIMES {
-            self.iteration_ms.push((report.ms / f64::from(report.iterations)) as f32);
-        }
-        self.anchors += u64::from(matches!(report.did, Did::Anchor { .. }));
+        self.busy_s += start.elapsed().as_secs_f64();
         gauges.anchors.store(self.anchors, Relaxed);
         gauges.iterations.store(self.iterations, Relaxed);
         gauges.splats.store(self.mapper.splat_count() as u64, Relaxed);
-        !matches!(report.did, Did::Idle)
+        worked
+    }
+
+    fn work(&mut self, deadline: Instant) -> Result<bool, GpuError> {
+        while let Some(keyframe) = self.waiting.pop_front() {
+            let kind = self.mapper.ingest(&keyframe);
+            // As many places as slots: there is always room.
+            let _ = self.queue.spare.push(keyframe);
+            let anchor = matches!(kind?, StepKind::Anchor { .. });
+            self.anchors += u64::from(anchor);
+            if anchor || Instant::now() >= deadline {
+                return Ok(true);
+            }
+        }
+        let report = self.mapper.step(deadline)?;
+        self.iterations += u64::from(report.iterations);
+        if report.iterations > 0 && self.iteration_ms.len() < ITERATION_TIMES {
+            self.iteration_ms.push((report.ms / f64::from(report.iterations)) as f32);
+        }
+        Ok(report.kind != StepKind::Idle)
     }
 
     /// Samples the curve when its period has passed; `t_s` is the run time so far.
@@ -121,33 +145,40 @@ impl Mapping {
 pub struct KeyframeQueue {
     spare: ArrayQueue<Box<Keyframe>>,
     offered: ArrayQueue<Box<Keyframe>>,
-    pub corrections: ArrayQueue<PoseCorrection>,
+    corrections: ArrayQueue<PoseCorrection>,
+    colours: usize,
 }
 
-/// Keyframes between tracking and the mapper's own queue: as many as come while an anchor is being made.
-pub const KEYFRAME_SLOTS: usize = 8;
+/// Keyframes between tracking and the map: as many as come while one or two anchors are being made.
+pub const KEYFRAME_SLOTS: usize = 12;
 
 /// Pose corrections that wait: those of four windows.
 const CORRECTION_SLOTS: usize = 64;
 
 impl KeyframeQueue {
-    /// Shaped for keyframes of so many images, the first `colours` of them in colour.
-    pub fn new(calibration: &Calibration, images: usize, colours: usize) -> KeyframeQueue {
+    /// Shaped for the images that the board's map wants of this rig.
+    pub fn new(calibration: &Calibration, board: &Board) -> KeyframeQueue {
         let q = KeyframeQueue {
             spare: ArrayQueue::new(KEYFRAME_SLOTS),
             offered: ArrayQueue::new(KEYFRAME_SLOTS),
             corrections: ArrayQueue::new(CORRECTION_SLOTS),
+            colours: cameras::colours(calibration.cameras.len(), &board.map),
         };
         for _ in 0..KEYFRAME_SLOTS {
             let shape = |i: usize| {
                 let c = &calibration.cameras[i].camera;
                 Image::new(c.width, c.height)
             };
-            let colours = (0..colours).map(|i| std::array::from_fn(|_| shape(i))).collect();
-            let images = (0..images).map(shape).collect();
+            let colours = (0..q.colours).map(|i| std::array::from_fn(|_| shape(i))).collect();
+            let images = (0..cameras::images(calibration.cameras.len(), &board.map)).map(shape).collect();
             let _ = q.spare.push(Box::new(Keyframe { images, colours, ..Keyframe::default() }));
         }
         q
+    }
+
+    /// Images of a keyframe that are wanted in colour.
+    pub fn colours(&self) -> usize {
+        self.colours
     }
 
     /// Copies a keyframe in; false when every slot is taken.
@@ -164,12 +195,18 @@ impl KeyframeQueue {
         true
     }
 
-    /// Lends the oldest keyframe out and takes its slot back; `None` when there is none.
-    pub fn take<R>(&self, lend: impl FnOnce(&Keyframe) -> R) -> Option<R> {
-        let slot = self.offered.pop()?;
-        let r = lend(&slot);
-        let _ = self.spare.push(slot);
-        Some(r)
+    /// Appends the keyframes that came to `waiting`, which corrections still reach, and calls `correct` with these.
+    fn collect(&self, waiting: &mut VecDeque<Box<Keyframe>>, mut correct: impl FnMut(&PoseCorrection)) {
+        let mut offered = std::iter::from_fn(|| self.offered.pop());
+        waiting.extend(&mut offered);
+        while let Some(correction) = self.corrections.pop() {
+            // Its keyframe was offered before.
+            waiting.extend(&mut offered);
+            for keyframe in waiting.iter_mut().filter(|k| k.id == correction.id) {
+                keyframe.world_from_body = correction.world_from_body;
+            }
+            correct(&correction);
+        }
     }
 }
 
@@ -246,20 +283,10 @@ impl Keyframes {
     }
 }
 
-/// Hands waiting keyframes and corrections to the mapper while it has room.
-pub fn drain(queue: &KeyframeQueue, mapping: &mut Mapping) {
-    let mapper = &mut mapping.mapper;
-    while mapper.has_room() && queue.take(|keyframe| mapper.offer(keyframe)).is_some() {}
-    while let Some(correction) = queue.corrections.pop() {
-        mapper.correct(&correction);
-    }
-}
-
 /// Thread `mapping`: keyframes first, then single steps, until tracking has ended and `over` answers true; `over` is
 /// given the seconds since `start`.
 pub fn map(
     mut mapping: Mapping,
-    queue: &KeyframeQueue,
     gauges: &Gauges,
     start: Instant,
     tracked: impl Fn() -> bool,
@@ -269,7 +296,7 @@ pub fn map(
     seal_thread();
     loop {
         let tracked = tracked();
-        drain(queue, &mut mapping);
+        mapping.collect();
         let worked = mapping.step(Instant::now() + SLICE, gauges);
         let t_s = start.elapsed().as_secs_f64();
         mapping.sample_if_due(t_s, gauges);
@@ -287,4 +314,34 @@ pub fn map(
     }
     unsealed(|| mapping.sample(start.elapsed().as_secs_f64(), gauges));
     mapping
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::DVec3;
+    use stipple_drivers::{Camera, ImuCalibration, Lens, RigCamera};
+
+    fn queue() -> KeyframeQueue {
+        let lens = Lens::Radtan { k1: 0.0, k2: 0.0, p1: 0.0, p2: 0.0 };
+        let camera = Camera { width: 4, height: 3, fx: 4.0, fy: 4.0, cx: 2.0, cy: 1.0, lens };
+        let cameras = vec![RigCamera::new(camera, Pose::IDENTITY); 2];
+        let board = include_str!("../../board-configs/lavapipe.toml");
+        let board = Board::parse("lavapipe.toml", board, &[]).expect("a board of ours");
+        KeyframeQueue::new(&Calibration { cameras, imu: ImuCalibration::CONSUMER }, &board)
+    }
+
+    #[test]
+    fn full_queue_rejects_newest_keeps_order_and_lets_corrections_reach_what_waits() {
+        let (q, mut waiting, mut corrected) = (queue(), VecDeque::new(), vec![]);
+        let frames = Frames { images: vec![Image::new(4, 3); 2], ..Frames::default() };
+        let offer = |id: u64| q.offer(&frames, |k| k.id = id);
+        assert!((0..KEYFRAME_SLOTS as u64).all(offer) && !offer(99));
+        let correction = PoseCorrection { id: 2, world_from_body: Pose { p: DVec3::X, ..Pose::IDENTITY } };
+        assert!(q.corrections.push(correction).is_ok());
+        q.collect(&mut waiting, |c| corrected.push(c.id));
+        assert_eq!(corrected, [2]);
+        assert!(waiting.iter().enumerate().all(|(i, k)| k.id == i as u64));
+        assert_eq!([1, 2].map(|i| waiting[i].world_from_body.p), [DVec3::ZERO, DVec3::X]);
+    }
 }

@@ -6,16 +6,16 @@ use super::tracking::FramePacket;
 use crate::config::Board;
 use crate::frontend::Frontend;
 use crate::limits::CAMERAS_MAX;
-use crate::map::{eyes, Mapper};
+use crate::map::{cameras, Mapper};
 use crate::mem::Footprint;
-use crate::stereo::{Method, Stereo};
+use crate::stereo::Matcher;
 use crate::vio::Vio;
 use stipple_drivers::record::ring_bytes;
 use stipple_drivers::{Calibration, Camera, Fault, FaultKind, ImuCalibration, Lens, Pose, RigCamera};
 
 /// Everything a run with this rig takes, without the operating system's and the drivers' own; with the ring of a recording
 /// where it `records`.
-pub fn footprint(calibration: &Calibration, board: &Board, records: bool) -> Footprint {
+pub fn footprint(calibration: &Calibration, board: &Board, records: bool) -> Result<Footprint, Fault> {
     let pixels: usize = calibration.cameras.iter().map(|c| c.camera.width * c.camera.height).sum();
     let coloured: usize = colours(calibration, board).iter().map(|c| 3 * c.camera.width * c.camera.height).sum();
     let mut f = Footprint::default();
@@ -23,21 +23,20 @@ pub fn footprint(calibration: &Calibration, board: &Board, records: bool) -> Foo
     f.extend(Frontend::footprint(calibration, &board.frontend));
     f.extend(Vio::footprint());
     if board.map.enabled {
-        let images = eyes::images(calibration.cameras.len(), &board.map);
+        let images = cameras::images(calibration.cameras.len(), &board.map);
         let keyframe: usize = calibration.cameras.iter().take(images).map(|c| c.camera.width * c.camera.height).sum();
         f.host("queues: keyframes", KEYFRAME_SLOTS * (keyframe + coloured));
-        f.extend(Stereo::footprint(calibration, &board.stereo, board.map.scale));
-        f.extend(Mapper::footprint(calibration, board));
+        f.extend(Mapper::footprint(calibration, board)?);
     }
     if records {
         f.host("queues: recording", ring_bytes(pixels + coloured, board.record.ring_frames as usize));
     }
-    f
+    Ok(f)
 }
 
 /// The cameras that are read in colour.
 pub fn colours<'a>(calibration: &'a Calibration, board: &Board) -> &'a [RigCamera] {
-    let n = if board.map.enabled { eyes::colours(calibration.cameras.len(), &board.map) } else { 0 };
+    let n = if board.map.enabled { cameras::colours(calibration.cameras.len(), &board.map) } else { 0 };
     &calibration.cameras[..n]
 }
 
@@ -48,7 +47,7 @@ pub fn largest_rig(board: &Board) -> Calibration {
     let lens = Lens::Radtan { k1: 0.0, k2: 0.0, p1: 0.0, p2: 0.0 };
     let camera = Camera { width, height, fx: f, fy: f, cx: width as f64 / 2.0, cy: height as f64 / 2.0, lens };
     let at = |x: f64| RigCamera::new(camera, Pose { p: glam::DVec3::new(x, 0.0, 0.0), ..Pose::IDENTITY });
-    let cameras = eyes::count(CAMERAS_MAX, &board.map).max(2);
+    let cameras = cameras::count(CAMERAS_MAX, &board.map).max(2);
     Calibration { cameras: (0..cameras).map(|i| at(0.1 * i as f64)).collect(), imu: ImuCalibration::CONSUMER }
 }
 
@@ -69,9 +68,9 @@ pub fn check_fits(place: &str, calibration: &Calibration, board: &Board, records
     }
     if board.map.enabled {
         let left = &calibration.cameras[0].camera;
-        Method::admit(left.width, left.height, &board.stereo)?;
+        Matcher::check_supported(left.width, left.height, &board.stereo)?;
     }
-    let f = footprint(calibration, board, records);
+    let f = footprint(calibration, board, records)?;
     let max = board.memory_max_mib << 20;
     if f.total() > max {
         let largest = f.rows.iter().max_by_key(|r| r.bytes).map_or("", |r| r.name);

@@ -43,7 +43,7 @@ use crate::counters::Counters;
 use crate::output::report::Report;
 use crate::output::OutputDir;
 use mailbox::{Capture, Mailbox};
-use mapping::{KeyframeQueue, Keyframes, Mapping};
+use mapping::{Keyframes, Mapping};
 use recorder::Recording;
 use sensors::{Input, Sensors, Source};
 use status::{print_err, Gauges, Status};
@@ -291,7 +291,8 @@ pub fn fly_in_real_time(
     run: &Realtime,
     status: &mut Status,
 ) -> Flown {
-    let colours = mapping.as_ref().map_or(0, |m| m.mapper.colours_offered());
+    let queue = mapping.as_ref().map(|m| m.queue.clone());
+    let colours = queue.as_ref().map_or(0, |q| q.colours());
     let shared = Shared {
         start: Instant::now(),
         mailbox: Mailbox::new(packets(tracker.threads()), calibration, colours),
@@ -300,8 +301,7 @@ pub fn fly_in_real_time(
         source_done: AtomicBool::new(false),
         tracking_done: AtomicBool::new(false),
     };
-    let queue: Option<KeyframeQueue> = mapping.as_ref().map(|m| m.queue(calibration));
-    let (s, link, queue) = (&shared, &Link::default(), queue.as_ref());
+    let (s, link, queue) = (&shared, &Link::default(), queue.as_deref());
     let (mut keyframes, mut notices) = (Keyframes::new(run.holdout), vec![]);
     let mapping = std::thread::scope(|scope| {
         let (taker, keyframes) = (&link.taker, &mut keyframes);
@@ -325,10 +325,10 @@ pub fn fly_in_real_time(
         let take = move || s.mailbox.take(&mut held, &s.source_done, &s.counters);
         let ended = waker::SetOnDrop(&s.tracking_done, None);
         spawn_tracking(scope, link, &mut tracker, Inlet { take, over: &s.source_done }, &s.counters, give, ended);
-        let mapping_thread = mapping.zip(queue).map(|(mapping, queue)| {
+        let mapping_thread = mapping.map(|mapping| {
             let tracked = || s.tracking_done.load(Ordering::Acquire);
             let over = |t_s: f64| run.stop.load(Relaxed) || run.until_s.is_none_or(|until| t_s >= until);
-            spawn(scope, "mapping", move || mapping::map(mapping, queue, &s.gauges, s.start, tracked, over))
+            spawn(scope, "mapping", move || mapping::map(mapping, &s.gauges, s.start, tracked, over))
         });
         let mapping_done = || mapping_thread.as_ref().is_none_or(|t| t.is_finished());
         while !(s.tracking_done.load(Relaxed) && mapping_done()) {

@@ -221,7 +221,7 @@ fn curve_point(c: &crate::map::CurvePoint) -> CurvePoint {
         t_s: c.t_s,
         psnr_db: c.psnr_db,
         psnr_heldout_db: c.psnr_heldout_db,
-        splats: u64::from(c.splats),
+        splats: c.splats,
         iterations: c.iterations,
     }
 }

@@ -7,9 +7,8 @@
 //! smaller the disparity is, since far off two surfaces differ by little and the wrong one of them is as wrong; and the
 //! share of the window where nothing was matched. Sums of the window are carried along columns and rows.
 
-use super::method::Disparity;
+use super::matcher::Disparity;
 use crate::config::{StereoConfig, StereoMethod};
-use crate::mem::Footprint;
 use stipple_drivers::Image;
 
 /// What a method's errors were fitted with.
@@ -57,12 +56,6 @@ struct Sums {
 }
 
 impl Confidence {
-    pub fn footprint(width: usize) -> Footprint {
-        let mut f = Footprint::default();
-        f.host("stereo: sums of the confidence", width * size_of::<Sums>());
-        f
-    }
-
     pub fn new(width: usize, config: &StereoConfig) -> Confidence {
         let fit = if config.method == StereoMethod::Bm { BM } else { SGBM };
         Confidence { fit, columns: vec![Sums::default(); width] }

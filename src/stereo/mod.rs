@@ -1,13 +1,13 @@
 //! Stereo: a raw pair in, a rectified left image and a depth map at mapping resolution out, by the
-//! method that the board file names (`method`).
+//! method that the board file names (`matcher`).
 //!
-//! `Stereo` owns the maps made at boot and every buffer it works in. Rectification runs at full
+//! `RectifiedViews` owns the maps made at boot, `Stereo` every buffer it matches in. Rectification runs at full
 //! resolution (matching needs it) and the mapping resolution is a box average of it, so that a
 //! mapping pixel is the mean of the light that fell on it. Depth is asked for anchors only.
 
 pub mod alignment;
 pub mod confidence;
-pub mod method;
+pub mod matcher;
 pub mod onnx;
 pub mod opencv;
 pub mod rectify;
@@ -16,12 +16,12 @@ pub mod sgm;
 pub mod wls;
 
 use crate::config::{StereoConfig, StereoMethod};
-use crate::gpu::Gpu;
+use crate::gpu::{Arena, Gpu};
 use crate::mem::Footprint;
-pub use method::{Disparity, Method};
+pub use matcher::{Disparity, Matcher};
 use rectify::{box_average, Rectification, Remap};
 use rectify_gpu::Rectifier;
-use stipple_drivers::{Calibration, Fault, Image, Pose, RigCamera};
+use stipple_drivers::{Calibration, Camera, Fault, Image, Pose, RigCamera};
 
 /// An undistorted camera: px = (fx x/z + cx, fy y/z + cy), integer = pixel centre.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -78,66 +78,30 @@ impl DepthMap {
     }
 }
 
-pub struct Stereo {
+/// The rig without distortion: both views at full resolution, and the left one at mapping resolution.
+pub struct RectifiedViews {
     full: RectifiedCamera,
     mapping: RectifiedCamera,
     divisor: usize,
     maps: [Remap; 2],
     rectified: [Image; 2],
-    /// Of the method that runs on the GPU.
-    rectifier: Option<Rectifier>,
-    method: Method,
-    disparity: Disparity,
     valid: Vec<u8>,
-    depth_range_m: [f64; 2],
     rig: Vec<RigCamera>,
 }
 
-impl Stereo {
-    pub fn footprint(calibration: &Calibration, config: &StereoConfig, divisor: u32) -> Footprint {
-        let camera = &calibration.cameras[0].camera;
-        let px = camera.width * camera.height;
-        let mut f = Footprint::default();
-        f.host("stereo: rectification maps", 2 * px * size_of::<rectify::Tap>());
-        f.host("stereo: rectified pair", 2 * px);
-        f.host("stereo: disparity and its deviation", 2 * px * size_of::<f32>());
-        f.host("stereo: valid mask", px / (divisor * divisor) as usize);
-        if rectifies_on_gpu(calibration, config) {
-            f.extend(Rectifier::footprint(camera.width, camera.height));
-        }
-        f.extend(Method::footprint(camera.width, camera.height, config));
-        f
-    }
-
-    /// `gpu` is for the methods that run there; its arena must hold the footprint.
-    pub fn new(
-        calibration: &Calibration,
-        config: &StereoConfig,
-        divisor: u32,
-        mut gpu: Option<&mut Gpu>,
-    ) -> Result<Stereo, Fault> {
+impl RectifiedViews {
+    pub fn new(calibration: &Calibration, divisor: u32) -> Result<RectifiedViews, Fault> {
         let r = Rectification::new(calibration)?;
-        let full = r.camera;
-        let divisor = divisor as usize;
-        let Pinhole { width, height, .. } = full.pinhole;
+        let (full, divisor) = (r.camera, divisor as usize);
         let maps = [r.map(&calibration.cameras[0]), r.map(&calibration.cameras[1])];
-        let mapping = RectifiedCamera { pinhole: full.pinhole.divided(divisor), ..full };
-        let valid = maps[0].valid_blocks(divisor);
-        let rectifier = match &mut gpu {
-            Some(gpu) if rectifies_on_gpu(calibration, config) => Some(Rectifier::new(gpu, width, height, &maps)?),
-            _ => None,
-        };
-        Ok(Stereo {
+        let image = || Image::new(full.pinhole.width, full.pinhole.height);
+        Ok(RectifiedViews {
             full,
-            mapping,
+            mapping: RectifiedCamera { pinhole: full.pinhole.divided(divisor), ..full },
             divisor,
+            valid: maps[0].valid_blocks(divisor),
             maps,
-            rectified: [Image::new(width, height), Image::new(width, height)],
-            rectifier,
-            method: Method::new(width, height, config, gpu)?,
-            disparity: Disparity::new(width, height),
-            valid,
-            depth_range_m: [config.depth_min_m, config.depth_max_m],
+            rectified: [image(), image()],
             rig: calibration.cameras.clone(),
         })
     }
@@ -152,7 +116,7 @@ impl Stereo {
         &self.valid
     }
 
-    /// As `valid_mask`, of either side: 0 left, 1 right.
+    /// The same of either side: 0 left, 1 right.
     pub fn valid_of(&self, side: usize) -> Vec<u8> {
         self.maps[side].valid_blocks(self.divisor)
     }
@@ -167,15 +131,80 @@ impl Stereo {
         self.divisor
     }
 
-    /// The left image without distortion, at mapping resolution. `out` is pre-shaped.
-    pub fn rectify(&mut self, raw_left: &Image, out: &mut Image) {
-        self.rectify_of(0, raw_left, out);
-    }
-
-    /// As `rectify`, of either side.
-    pub fn rectify_of(&mut self, side: usize, raw: &Image, out: &mut Image) {
+    /// One side's image (0 left, 1 right) without distortion, at mapping resolution. `out` is pre-shaped.
+    pub fn rectify(&mut self, side: usize, raw: &Image, out: &mut Image) {
         self.maps[side].apply(raw, &mut self.rectified[side]);
         box_average(&self.rectified[side], self.divisor, out);
+    }
+}
+
+/// What matching keeps on the GPU, if it runs there.
+#[derive(Clone, Copy, Default)]
+pub struct Buffers {
+    rectifier: Option<rectify_gpu::Buffers>,
+    sgm: Option<sgm::Buffers>,
+}
+
+impl Buffers {
+    pub fn new(arena: &mut Arena, calibration: &Calibration, config: &StereoConfig) -> Result<Buffers, Fault> {
+        let Camera { width, height, .. } = calibration.cameras[0].camera;
+        if config.method != StereoMethod::Sgm {
+            return Ok(Buffers::default());
+        }
+        let one_size = images_of_one_size(calibration);
+        Ok(Buffers {
+            rectifier: one_size.then(|| rectify_gpu::Buffers::new(arena, width, height)).transpose()?,
+            sgm: Some(sgm::Buffers::new(arena, &sgm::Shape::of(width, height, config))?),
+        })
+    }
+}
+
+pub struct Stereo {
+    pub views: RectifiedViews,
+    /// The matcher's on the GPU, where the raw images have the rectified ones' size.
+    rectifier: Option<Rectifier>,
+    matcher: Matcher,
+    disparity: Disparity,
+    depth_range_m: [f64; 2],
+}
+
+impl Stereo {
+    /// Host rows of what `new` takes; the GPU's are `Buffers`. Answers the views, for what is built on them.
+    pub fn footprint(
+        calibration: &Calibration,
+        config: &StereoConfig,
+        divisor: u32,
+        f: &mut Footprint,
+    ) -> Result<RectifiedViews, Fault> {
+        let views = f.build("stereo: rectification", || RectifiedViews::new(calibration, divisor))?;
+        let Pinhole { width, height, .. } = views.full.pinhole;
+        f.build("stereo: disparity and its deviation", || Disparity::new(width, height));
+        Matcher::footprint(width, height, config, f)?;
+        Ok(views)
+    }
+
+    /// `gpu` is for the matcher that runs there; its arena must hold `Buffers`.
+    pub fn new(
+        calibration: &Calibration,
+        config: &StereoConfig,
+        divisor: u32,
+        mut gpu: Option<&mut Gpu>,
+    ) -> Result<Stereo, Fault> {
+        let views = RectifiedViews::new(calibration, divisor)?;
+        let Pinhole { width, height, .. } = views.full.pinhole;
+        let mut rectifier = None;
+        let mut buffers = Buffers::default();
+        if let Some(gpu) = &mut gpu {
+            buffers = Buffers::new(gpu.arena(), calibration, config)?;
+            rectifier = buffers.rectifier.map(|b| Rectifier::new(gpu, b, width, height, &views.maps)).transpose()?;
+        }
+        Ok(Stereo {
+            views,
+            rectifier,
+            matcher: Matcher::new(width, height, config, gpu.zip(buffers.sgm))?,
+            disparity: Disparity::new(width, height),
+            depth_range_m: [config.depth_min_m, config.depth_max_m],
+        })
     }
 
     /// Depth at mapping resolution. `out` is pre-shaped, `gpu` the one given to `new`. Answers how many pixels have
@@ -187,15 +216,16 @@ impl Stereo {
         raw_right: &Image,
         out: &mut DepthMap,
     ) -> Result<usize, Fault> {
-        match (&mut self.method, &mut self.rectifier, gpu) {
-            (Method::Sgm(sgm), Some(rectifier), Some(gpu)) => {
-                method::compute_raw(sgm, rectifier, gpu, [raw_left, raw_right], &mut self.disparity)?;
+        match (&mut self.matcher, &mut self.rectifier, gpu) {
+            (Matcher::Sgm(sgm), Some(rectifier), Some(gpu)) => {
+                matcher::compute_raw(sgm, rectifier, gpu, [raw_left, raw_right], &mut self.disparity)?;
             }
-            (method, _, gpu) => {
-                self.maps[0].apply(raw_left, &mut self.rectified[0]);
-                self.maps[1].apply(raw_right, &mut self.rectified[1]);
-                let [left, right] = &self.rectified;
-                method.compute(gpu, left, right, &mut self.disparity)?;
+            (matcher, _, gpu) => {
+                let RectifiedViews { maps, rectified, .. } = &mut self.views;
+                maps[0].apply(raw_left, &mut rectified[0]);
+                maps[1].apply(raw_right, &mut rectified[1]);
+                let [left, right] = rectified;
+                matcher.compute(gpu, left, right, &mut self.disparity)?;
             }
         }
         Ok(self.disparity_to_depth(out))
@@ -205,9 +235,9 @@ impl Stereo {
     /// of the block has one: the mean would invent surfaces between foreground and background.
     fn disparity_to_depth(&self, out: &mut DepthMap) -> usize {
         const BLOCK_MAX: usize = 16; // divisor 4
-        let (w, s) = (self.full.pinhole.width, self.divisor);
-        let fb = self.full.pinhole.fx * self.full.baseline_m;
-        let sigma_max = self.method.sigma_max_px();
+        let RectifiedViews { full, divisor: s, valid, .. } = &self.views;
+        let (w, s, fb) = (full.pinhole.width, *s, full.pinhole.fx * full.baseline_m);
+        let sigma_max = self.matcher.sigma_max_px();
         let mut found = 0;
         for y in 0..out.height {
             for x in 0..out.width {
@@ -223,7 +253,7 @@ impl Stereo {
                     }
                 }
                 let (mut depth, mut deviation) = (0.0, 0.0);
-                if 2 * n >= s * s && n > 0 && self.valid[y * out.width + x] != 0 {
+                if 2 * n >= s * s && n > 0 && valid[y * out.width + x] != 0 {
                     block[..n].sort_unstable_by(|a, b| a.0.total_cmp(&b.0));
                     let (d, sigma) = (f64::from(block[n / 2].0), f64::from(block[n / 2].1));
                     let z = fb / d;
@@ -241,11 +271,9 @@ impl Stereo {
     }
 }
 
-/// Where the matcher runs on the GPU and both raw images have the rectified one's size.
-fn rectifies_on_gpu(calibration: &Calibration, config: &StereoConfig) -> bool {
-    let [left, right, ..] = &calibration.cameras[..] else { return false };
+fn images_of_one_size(calibration: &Calibration) -> bool {
     let size = |c: &RigCamera| (c.camera.width, c.camera.height);
-    config.method == StereoMethod::Sgm && size(left) == size(right)
+    matches!(&calibration.cameras[..], [left, right, ..] if size(left) == size(right))
 }
 
 #[cfg(test)]
@@ -253,7 +281,7 @@ mod tests {
     use super::*;
     #[cfg(feature = "opencv")]
     use crate::config::StereoMethod;
-    use stipple_drivers::{Camera, ImuCalibration, Lens};
+    use stipple_drivers::{ImuCalibration, Lens};
 
     fn rig(lens: Lens, f: f64) -> Calibration {
         let camera = Camera { width: 320, height: 240, fx: f, fy: f, cx: 160.3, cy: 118.9, lens };
@@ -286,7 +314,7 @@ mod tests {
         let (left, right) = (draw(&rig.cameras[0]), draw(&rig.cameras[1]));
         for divisor in [1, 2] {
             let mut stereo = Stereo::new(&rig, &StereoConfig::default(), divisor, None).expect("a sound rig");
-            let camera = stereo.camera();
+            let camera = stereo.views.camera();
             let mut depth = DepthMap::new(camera.pinhole.width, camera.pinhole.height);
             let found = stereo.depth(None, &left, &right, &mut depth).expect("matching runs");
             assert!(found * 2 > depth.metres.len(), "{found} of {}", depth.metres.len());

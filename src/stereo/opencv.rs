@@ -4,7 +4,6 @@
 #![allow(unsafe_code)]
 
 use crate::config::{StereoConfig, StereoMethod};
-use crate::mem::Footprint;
 use stipple_drivers::{Fault, Image};
 
 /// OpenCV's disparities are in 1/16 px.
@@ -20,23 +19,17 @@ pub struct OpenCv {
     fixed: Vec<i16>,
 }
 
-impl OpenCv {
-    /// Ours, and OpenCV's own working buffers. BM: two prefiltered images with borders, sums over the disparity range
-    /// for each of its row strips, the cost image of the left-right check. SGBM: rows of costs and of path costs.
-    pub fn footprint(width: usize, height: usize, config: &StereoConfig) -> Footprint {
-        let (disparities, block) = (config.disparities as usize, config.block_px as usize);
-        let padded = (width + disparities) * height;
-        let mut f = Footprint::default();
-        f.host("stereo: disparity of OpenCV", width * height * size_of::<i16>());
-        if config.method == StereoMethod::Sgbm {
-            // 16-bit costs: sums of a window's rows, their total, four path costs of this row and the last.
-            let rows = config.sgbm_block_px as usize + 2 + 1 + 2 * 4 + 1;
-            f.host("stereo: OpenCV semi-global matching (estimate)", 10 * padded + 2 * rows * width * disparities);
-        } else {
-            let strip = (disparities + 2) * 4 * (height + block + 2);
-            f.host("stereo: OpenCV block matching (estimate)", 8 * padded + 4 * strip);
-        }
-        f
+/// Bytes that OpenCV allocates behind us, by reading it. BM: two prefiltered images with borders, sums over the disparity
+/// range for each of its row strips, the cost image of the left-right check. SGBM: rows of costs and of path costs.
+pub fn working_bytes(width: usize, height: usize, config: &StereoConfig) -> usize {
+    let (disparities, block) = (config.disparities as usize, config.block_px as usize);
+    let padded = (width + disparities) * height;
+    if config.method == StereoMethod::Sgbm {
+        // 16-bit costs: sums of a window's rows, their total, four path costs of this row and the last.
+        let rows = config.sgbm_block_px as usize + 2 + 1 + 2 * 4 + 1;
+        10 * padded + 2 * rows * width * disparities
+    } else {
+        8 * padded + 4 * (disparities + 2) * 4 * (height + block + 2)
     }
 }
 
@@ -181,7 +174,7 @@ unsafe impl Send for OpenCv {}
 #[cfg(not(feature = "opencv"))]
 impl OpenCv {
     pub fn new(_width: usize, _height: usize, config: &StereoConfig) -> Result<OpenCv, Fault> {
-        Err(super::method::refused_without_opencv(config.method))
+        Err(super::matcher::refused_without_opencv(config.method))
     }
 
     pub fn compute(&mut self, _left: &Image, _right: &Image, disparity_px: &mut [f32]) -> Result<(), Fault> {

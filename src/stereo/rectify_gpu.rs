@@ -3,55 +3,70 @@
 
 use super::rectify::Remap;
 use crate::gpu::kernels::rectify;
-use crate::gpu::{Buf, Gpu, GpuError, Kernel, Recorder, Threads, ALIGN};
-use crate::mem::Footprint;
+use crate::gpu::{Arena, Buf, Gpu, GpuError, Kernel, Recorder, Threads};
 use stipple_drivers::{Fault, Image};
 
-pub struct Rectifier {
-    kernel: Kernel<rectify::K>,
+#[derive(Clone, Copy)]
+pub struct Buffers {
     raw: Buf<u32>,
     taps: Buf<[u32; 2]>,
+}
+
+impl Buffers {
+    pub fn new(arena: &mut Arena, width: usize, height: usize) -> Result<Buffers, Fault> {
+        Ok(Buffers {
+            raw: arena.alloc("stereo: raw pair", 2 * image_bytes(width, height) / size_of::<u32>())?,
+            taps: arena.alloc("stereo: rectification maps on the GPU", 2 * width * height)?,
+        })
+    }
+}
+
+pub struct Rectifier {
+    buffers: Buffers,
+    kernel: Kernel<rectify::K>,
     size: [u32; 2],
     /// Host side of the raw images.
     bytes: Vec<u8>,
 }
 
-/// Of one image, rows being whole words.
-fn image_bytes(width: usize, height: usize) -> usize {
+/// Bytes of one image whose rows are whole words.
+pub fn image_bytes(width: usize, height: usize) -> usize {
     width.next_multiple_of(4) * height
 }
 
-impl Rectifier {
-    pub fn footprint(width: usize, height: usize) -> Footprint {
-        let mut f = Footprint::default();
-        f.gpu("stereo: raw pair", 2 * image_bytes(width, height) + ALIGN as usize);
-        f.gpu("stereo: rectification maps on the GPU", 2 * width * height * size_of::<[u32; 2]>() + ALIGN as usize);
-        f.host("stereo: raw pair", 2 * image_bytes(width, height));
-        f
-    }
+/// Room for a pair of images on its way to the GPU.
+pub fn packed(width: usize, height: usize) -> Vec<u8> {
+    vec![0; 2 * image_bytes(width, height)]
+}
 
-    pub fn new(gpu: &mut Gpu, width: usize, height: usize, maps: &[Remap; 2]) -> Result<Rectifier, Fault> {
-        let r = Rectifier {
-            kernel: gpu.kernel_in_pieces(rectify::Spec::default())?,
-            raw: gpu.alloc("stereo: raw pair", image_bytes(width, height) / 2)?,
-            taps: gpu.alloc("stereo: rectification maps on the GPU", 2 * width * height)?,
-            size: [width as u32, height as u32],
-            bytes: vec![0; 2 * image_bytes(width, height)],
-        };
+impl Rectifier {
+    pub fn new(
+        gpu: &mut Gpu,
+        buffers: Buffers,
+        width: usize,
+        height: usize,
+        maps: &[Remap; 2],
+    ) -> Result<Rectifier, Fault> {
         for (side, map) in maps.iter().enumerate() {
-            gpu.upload(r.taps, side * width * height, &map.taps(width.next_multiple_of(4)))?;
+            gpu.upload(buffers.taps, side * width * height, &map.taps(width.next_multiple_of(4)))?;
         }
-        Ok(r)
+        Ok(Rectifier {
+            buffers,
+            kernel: gpu.kernel_in_pieces(rectify::Spec::default())?,
+            size: [width as u32, height as u32],
+            bytes: packed(width, height),
+        })
     }
 
     pub fn load(&mut self, gpu: &mut Gpu, left: &Image, right: &Image) -> Result<(), GpuError> {
         pack(left, right, &mut self.bytes);
-        gpu.upload(self.raw.cast(), 0, &self.bytes)
+        gpu.upload(self.buffers.raw.cast(), 0, &self.bytes)
     }
 
     /// Writes the rectified pair to `images`.
     pub fn record(&self, rec: &mut Recorder, images: Buf<u32>) {
-        let bind = rectify::Bind { raw: self.raw.read(), taps: self.taps.read(), images: images.write() };
+        let bind =
+            rectify::Bind { raw: self.buffers.raw.read(), taps: self.buffers.taps.read(), images: images.write() };
         rec.dispatch(&self.kernel, bind, rectify::Push { size: self.size }, Threads::d1(images.len() as u32));
     }
 }

@@ -16,14 +16,13 @@
 //!
 //! All until the filter is integers, and no sum depends on the order of threads: the result is the same in every run.
 
-use super::rectify_gpu::{pack, Rectifier};
+use super::rectify_gpu::{image_bytes, pack, packed, Rectifier};
 use super::wls::Wls;
 use crate::config::StereoConfig;
 use crate::gpu::kernels::{
     aggregate, census, match_left, match_right, speckle_count, speckle_drop, speckle_join, verify,
 };
-use crate::gpu::{Buf, DeviceKind, Gpu, GpuError, Kernel, Recorder, Threads, ALIGN};
-use crate::mem::Footprint;
+use crate::gpu::{Arena, Buf, DeviceKind, Gpu, GpuError, Kernel, Recorder, Threads, ALIGN};
 use stipple_drivers::{Fault, Image};
 
 /// Disparities one invocation of `aggregate` holds.
@@ -93,11 +92,6 @@ impl Shape {
         [self.width as u32, self.height as u32]
     }
 
-    /// Bytes of an image whose rows are whole words.
-    fn image_bytes(&self) -> usize {
-        self.width.next_multiple_of(4) * self.height
-    }
-
     /// Elements of four bytes a pixel, so that the next buffer is aligned.
     fn plane(&self) -> usize {
         self.pixels().next_multiple_of(ALIGN as usize / 4)
@@ -144,31 +138,40 @@ pub struct Sgm {
     bytes: Vec<u8>,
 }
 
+impl Buffers {
+    pub fn new(arena: &mut Arena, shape: &Shape) -> Result<Buffers, Fault> {
+        let (plane, pixels) = (shape.plane(), shape.pixels());
+        let image_words = image_bytes(shape.width, shape.height) / size_of::<u32>();
+        let images = arena.alloc("sgm: images", 2 * image_words)?;
+        let strings = arena.alloc("sgm: census strings", 2 * plane)?;
+        let words: Buf<u32> = arena.alloc("sgm: disparities", 4 * plane)?;
+        let sums: Buf<u32> = arena.alloc("sgm: sums", plane * shape.disparities as usize / 2)?;
+        Ok(Buffers {
+            images,
+            strings,
+            sums: sums.cast(),
+            right: words.part(0, pixels),
+            disparity: words.part(plane, pixels).cast(),
+            deviation: words.part(2 * plane, pixels).cast(),
+            labels: words.part(3 * plane, pixels),
+            areas: sums.part(0, pixels),
+            data: sums.part(plane, 2 * pixels).cast(),
+            medians: sums.part(3 * plane, 2 * pixels).cast(),
+            ratios: sums.part(5 * plane, pixels).cast(),
+        })
+    }
+}
+
 impl Sgm {
-    pub fn footprint(shape: &Shape) -> Footprint {
-        let mut f = Footprint::default();
-        f.gpu("sgm: images", 2 * shape.image_bytes() + ALIGN as usize);
-        f.gpu("sgm: census strings", 2 * shape.plane() * size_of::<u32>());
-        f.gpu("sgm: disparities", 4 * shape.plane() * size_of::<u32>());
-        f.gpu("sgm: sums", shape.plane() * shape.disparities as usize * size_of::<u16>());
-        f.host("sgm: images", 2 * shape.image_bytes());
-        f
-    }
-
-    pub fn new(gpu: &mut Gpu, shape: Shape) -> Result<Sgm, Fault> {
+    pub fn new(gpu: &mut Gpu, buffers: Buffers, shape: Shape) -> Result<Sgm, Fault> {
         let group = if gpu.caps().kind == DeviceKind::Cpu { GROUP_CPU } else { GROUP_GPU };
-        Sgm::with_group(gpu, shape, group)
+        Sgm::with_group(gpu, buffers, shape, group)
     }
 
-    /// As `new`, with about this many invocations a workgroup of `aggregate`; the result does not depend on it.
-    pub fn with_group(gpu: &mut Gpu, shape: Shape, group: u32) -> Result<Sgm, Fault> {
+    /// Does what `new` does with about this many invocations a workgroup of `aggregate`; the result does not depend on it.
+    pub fn with_group(gpu: &mut Gpu, buffers: Buffers, shape: Shape, group: u32) -> Result<Sgm, Fault> {
         let lanes = shape.disparities / RUN;
         let paths = (group / lanes).max(1);
-        let (plane, pixels) = (shape.plane(), shape.pixels());
-        let images = gpu.alloc("sgm: images", shape.image_bytes() / 2)?;
-        let strings = gpu.alloc("sgm: census strings", 2 * plane)?;
-        let words: Buf<u32> = gpu.alloc("sgm: disparities", 4 * plane)?;
-        let sums: Buf<u32> = gpu.alloc("sgm: sums", plane * shape.disparities as usize / 2)?;
         Ok(Sgm {
             k: Kernels {
                 census: gpu.kernel_in_pieces(census::Spec::default())?,
@@ -180,22 +183,10 @@ impl Sgm {
                 speckle_count: gpu.kernel_in_pieces(speckle_count::Spec::default())?,
                 speckle_drop: gpu.kernel_in_pieces(speckle_drop::Spec::default())?,
             },
-            b: Buffers {
-                images,
-                strings,
-                sums: sums.cast(),
-                right: words.part(0, pixels),
-                disparity: words.part(plane, pixels).cast(),
-                deviation: words.part(2 * plane, pixels).cast(),
-                labels: words.part(3 * plane, pixels),
-                areas: sums.part(0, pixels),
-                data: sums.part(plane, 2 * pixels).cast(),
-                medians: sums.part(3 * plane, 2 * pixels).cast(),
-                ratios: sums.part(5 * plane, pixels).cast(),
-            },
+            b: buffers,
             paths,
             wls: Wls::new(gpu)?,
-            bytes: vec![0; 2 * shape.image_bytes()],
+            bytes: packed(shape.width, shape.height),
             shape,
         })
     }
@@ -218,7 +209,7 @@ impl Sgm {
         self.finish(gpu, rec, disparity, deviation)
     }
 
-    /// As `compute`, of a raw pair.
+    /// Does what `compute` does with a raw pair.
     pub fn compute_raw(
         &mut self,
         gpu: &mut Gpu,

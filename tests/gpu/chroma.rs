@@ -8,7 +8,7 @@ use super::twins::raster::{backward, forward, Planes};
 use super::twins::{flat, project_all};
 use stipple::gpu::kernels::types::Moments;
 use stipple::gpu::{Gpu, GpuOptions};
-use stipple::map::pipeline::{Gaussian, Pipeline, PruneRule, Shape, StepStats, View, Weights};
+use stipple::map::{Gaussian, Pipeline, PruneRule, Shape, StepStats, View, Weights};
 
 const W: usize = 33;
 const H: usize = 21;
@@ -57,8 +57,8 @@ fn picture_loss_and_gradients_agree_with_the_twin_of_each_channel() {
     let by_splat = backward(&flats, W, H, &gradient);
 
     let (mut gpu, mut p) = open(in_colour(&v, 60));
-    p.append(&mut gpu, &splats).unwrap();
-    p.set_keyframe(&mut gpu, 0, &target()).unwrap();
+    p.pool.append(&mut gpu, &splats).unwrap();
+    p.loss.set_image(&mut gpu, 0, &target()).unwrap();
     let picture = super::splat::render(&mut gpu, &mut p, &v);
     let want: Vec<f64> = rendered.planes.colour.concat();
     let worst = wide(&picture.colour).iter().zip(&want).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
@@ -67,9 +67,9 @@ fn picture_loss_and_gradients_agree_with_the_twin_of_each_channel() {
     assert!((step.l1 - l1).abs() < 1e-5, "{} against {l1}", step.l1);
     // Adam's first moment after one step from rest: a tenth of the gradient.
     let mut moments = vec![Moments::default(); 60];
-    gpu.download(p.buffers().moments, 0, &mut moments).unwrap();
+    gpu.download(p.pool.buffers.moments, 0, &mut moments).unwrap();
     let mut chroma = vec![[0f32; 4]; 60];
-    gpu.download(p.buffers().chroma_moments, 0, &mut chroma).unwrap();
+    gpu.download(p.pool.buffers.chroma_moments, 0, &mut chroma).unwrap();
     let scale = by_splat.iter().flat_map(|g| [g[6], g[8], g[9]]).fold(0.0f64, |m, g| m.max(g.abs()));
     for (i, want) in by_splat.iter().enumerate() {
         for (got, want) in [moments[i].m[1][3], chroma[i][0], chroma[i][1]].iter().zip([want[6], want[8], want[9]]) {
@@ -85,10 +85,10 @@ fn what_is_left_after_pruning_keeps_its_colour() {
     let mut splats = coloured(60, &v);
     splats.iter_mut().step_by(3).for_each(|s| s.opacity_logit = -9.0);
     let (mut gpu, mut p) = open(in_colour(&v, 60));
-    p.append(&mut gpu, &splats).unwrap();
-    assert_eq!(p.prune(&mut gpu, &PruneRule::default()).unwrap(), 20);
+    p.pool.append(&mut gpu, &splats).unwrap();
+    assert_eq!(p.pool.prune(&mut gpu, &PruneRule::default()).unwrap(), 20);
     let kept: Vec<Gaussian> = splats.iter().enumerate().filter(|(i, _)| i % 3 != 0).map(|(_, s)| *s).collect();
-    assert_eq!(p.download(&mut gpu).unwrap(), kept);
+    assert_eq!(p.pool.download(&mut gpu).unwrap(), kept);
 }
 
 #[test]
@@ -97,8 +97,8 @@ fn a_map_learns_a_coloured_picture() {
     let v = view(W, H);
     let planes = target();
     let (mut gpu, mut p) = open(in_colour(&v, 400));
-    p.append(&mut gpu, &scene(400, &v, 8)).unwrap();
-    p.set_keyframe(&mut gpu, 0, &planes).unwrap();
+    p.pool.append(&mut gpu, scene(400, &v, 8)).unwrap();
+    p.loss.set_image(&mut gpu, 0, &planes).unwrap();
     let losses: Vec<StepStats> =
         (0..STEPS).map(|_| p.train(&mut gpu, &v, 0, &super::splat::FAST, &PLAIN).unwrap()).collect();
     assert!(losses[STEPS - 1].loss < 0.4 * losses[0].loss, "{} -> {}", losses[0].loss, losses[STEPS - 1].loss);
@@ -114,13 +114,13 @@ fn the_validation_layer_is_silent_in_colour() {
     let v = view(W, H);
     let s = in_colour(&v, 32);
     let options = GpuOptions { validation: true };
-    let mut gpu = match Gpu::open_with(&Default::default(), Pipeline::arena_bytes(&s), options) {
+    let mut gpu = match Gpu::open_with(&Default::default(), Pipeline::arena_bytes(&s).unwrap(), options) {
         Ok(gpu) => gpu,
         Err(fault) => return println!("ignored: the_validation_layer_is_silent_in_colour: {fault}"),
     };
     let mut p = Pipeline::new(&mut gpu, s).unwrap();
-    p.append(&mut gpu, &coloured(32, &v)).unwrap();
-    p.set_keyframe(&mut gpu, 0, &target()).unwrap();
+    p.pool.append(&mut gpu, coloured(32, &v)).unwrap();
+    p.loss.set_image(&mut gpu, 0, &target()).unwrap();
     p.train(&mut gpu, &v, 0, &STILL, &PLAIN).unwrap();
     assert_eq!(gpu.validation_messages(), Vec::<String>::new());
 }

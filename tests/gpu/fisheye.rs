@@ -4,7 +4,7 @@
 use super::splat::{compare_differences, compare_step, open, render, shape, train, view, Rng};
 use super::twins;
 use glam::{DVec2, DVec3};
-use stipple::map::pipeline::{Fisheye, Gaussian, View};
+use stipple::map::{Fisheye, Gaussian, View};
 use stipple::stereo::Pinhole;
 use stipple_drivers::{Camera, Lens};
 
@@ -71,13 +71,13 @@ fn every_angle_projects_as_the_calibrated_camera_does() {
     let angles: Vec<f64> = (0..100).map(|i| f64::from(i) * 0.031 + 1e-5).collect();
     let splats: Vec<Gaussian> = angles.iter().map(|t| at(&v, *t, 40.0 * t, 1.0 + t, &mut r)).collect();
     let (mut gpu, mut p) = open(shape(&v, 100, 1 << 16));
-    p.append(&mut gpu, &splats).unwrap();
+    p.pool.append(&mut gpu, &splats).unwrap();
     render(&mut gpu, &mut p, &v);
     let (mut count, mut visible, mut projected) = ([0], vec![0u32; 100], vec![Default::default(); 100]);
-    gpu.download(p.buffers().visible_count, 0, &mut count).unwrap();
-    gpu.download(p.buffers().ranked, 0, &mut visible).unwrap();
+    gpu.download(p.renderer.buffers.visible_count, 0, &mut count).unwrap();
+    gpu.download(p.renderer.buffers.ranked, 0, &mut visible).unwrap();
     visible.truncate(count[0] as usize);
-    gpu.download(p.buffers().projected, 0, &mut projected).unwrap();
+    gpu.download(p.renderer.buffers.projected, 0, &mut projected).unwrap();
     let mut drawn = 0;
     for (i, s) in splats.iter().enumerate() {
         let twin = twins::project::project(&twins::project::parameters(s), &v, &[0.0; 6]);
@@ -117,9 +117,9 @@ fn angles_end_where_the_image_or_the_growth_of_the_radius_does() {
 fn a_map_trains_on_a_fisheye_image() {
     let v = wide_view(64, 48);
     let (mut gpu, mut p) = open(shape(&v, 600, 1 << 16));
-    p.append(&mut gpu, &around(600, &v, 7)).unwrap();
+    p.pool.append(&mut gpu, around(600, &v, 7)).unwrap();
     let goal: Vec<u8> = (0..64 * 48).map(|i| (128.0 + 90.0 * ((i % 64) as f64 * 0.2).sin()) as u8).collect();
-    p.set_keyframe(&mut gpu, 0, &goal).unwrap();
+    p.loss.set_image(&mut gpu, 0, &goal).unwrap();
     let steps = train(&mut gpu, &mut p, &v, 100);
     assert!(steps[99].loss < 0.5 * steps[0].loss, "{} -> {}", steps[0].loss, steps[99].loss);
 }

@@ -4,7 +4,7 @@
 use super::splat::{psnr, render, write_png, Rng};
 use glam::{DQuat, DVec3};
 use stipple::gpu::Gpu;
-use stipple::map::pipeline::{Gaussian, LearningRates, Pipeline, Shape, View, Weights};
+use stipple::map::{Gaussian, LearningRates, Pipeline, Shape, View, Weights};
 use stipple::stereo::Pinhole;
 use stipple_drivers::Pose;
 
@@ -54,17 +54,17 @@ fn held_out_views_by_regulariser() {
         height,
         splats: 40_000,
         intersections: 1 << 19,
-        keyframes: TRAINED as u32,
+        images: TRAINED as u32,
         channels: 1,
         cameras: 1,
     };
-    let mut gpu = Gpu::open(&crate::config(), Pipeline::arena_bytes(&s)).unwrap();
+    let mut gpu = Gpu::open(&crate::config(), Pipeline::arena_bytes(&s).unwrap()).unwrap();
     let mut p = Pipeline::new(&mut gpu, s).unwrap();
     let training: Vec<View> =
         (0..TRAINED).map(|i| view(-0.5 + 0.2 * i as f64, 0.1 * (i % 3) as f64, 0.04 * (i % 2) as f64)).collect();
     let unseen = [view(-0.9, 0.0, 0.1), view(0.05, -0.35, 0.0), view(0.95, 0.2, -0.12), view(0.0, 0.5, 0.15)];
 
-    p.append(&mut gpu, &wall(40_000, 0.02, 0.0, 3.0, &mut Rng(1))).unwrap();
+    p.pool.append(&mut gpu, wall(40_000, 0.02, 0.0, 3.0, &mut Rng(1))).unwrap();
     let mut photograph = |v: &View| -> Vec<u8> {
         render(&mut gpu, &mut p, v).colour.iter().map(|g| (g.clamp(0.0, 1.0) * 255.0).round() as u8).collect()
     };
@@ -83,10 +83,10 @@ fn held_out_views_by_regulariser() {
     ];
     let rates = LearningRates { position: 1e-3, scale: 5e-3, rotation: 2e-3, opacity: 5e-2, colour: 5e-3 };
     for (name, weights) in cases {
-        p.clear();
-        p.append(&mut gpu, &wall(4000, 0.05, 0.03, 0.0, &mut Rng(7))).unwrap();
+        p.pool.clear();
+        p.pool.append(&mut gpu, wall(4000, 0.05, 0.03, 0.0, &mut Rng(7))).unwrap();
         for (i, g) in goals.iter().enumerate() {
-            p.set_keyframe(&mut gpu, i as u32, g).unwrap();
+            p.loss.set_image(&mut gpu, i as u32, g).unwrap();
         }
         let mut r = Rng(3);
         for _ in 0..STEPS {

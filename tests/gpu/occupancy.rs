@@ -2,9 +2,9 @@
 
 use super::splat::{shape, view, Rng};
 use super::twins::occupancy as twin;
-use stipple::gpu::{Gpu, GpuOptions};
-use stipple::map::occupancy::{Occupancy, FREE, HELD, UNKNOWN};
-use stipple::map::pipeline::{Gaussian, Pipeline, PruneRule};
+use stipple::gpu::{Arena, Gpu, GpuOptions};
+use stipple::map::occupancy::{Buffers, Occupancy, FREE, HELD, UNKNOWN};
+use stipple::map::{Gaussian, Pipeline, PruneRule};
 use stipple_drivers::Pose;
 
 const CELL_M: f64 = 0.125;
@@ -18,7 +18,9 @@ struct Grid {
 impl Grid {
     fn open(cells: u32, validation: bool) -> Option<Grid> {
         let shape = shape(&view(16, 16), 20_000, 20_000);
-        let bytes = Pipeline::arena_bytes(&shape) + Occupancy::footprint(cells).gpu_total();
+        let mut arena = Arena::counting();
+        Buffers::new(&mut arena, cells).unwrap();
+        let bytes = Pipeline::arena_bytes(&shape).unwrap() + arena.used();
         let opened = Gpu::open_with(&crate::config(), bytes, GpuOptions { validation });
         let mut gpu = match opened {
             Ok(gpu) => gpu,
@@ -29,7 +31,8 @@ impl Grid {
             Err(fault) => panic!("{fault}"),
         };
         let pipeline = Pipeline::new(&mut gpu, shape).unwrap();
-        let occupancy = Occupancy::new(&mut gpu, CELL_M, cells).unwrap();
+        let buffers = Buffers::new(gpu.arena(), cells).unwrap();
+        let occupancy = Occupancy::new(&mut gpu, buffers, CELL_M).unwrap();
         Some(Grid { gpu, pipeline, occupancy })
     }
 
@@ -41,12 +44,12 @@ impl Grid {
             ..Gaussian::default()
         };
         let splats: Vec<Gaussian> = means.iter().map(splat).collect();
-        assert_eq!(self.pipeline.append(&mut self.gpu, &splats).unwrap(), means.len());
+        assert_eq!(self.pipeline.pool.append(&mut self.gpu, &splats).unwrap(), means.len());
     }
 
     fn look(&mut self, points: &[[f32; 4]]) -> Vec<u32> {
         let mut out = Vec::new();
-        self.occupancy.look(&mut self.gpu, &self.pipeline, points, &mut out).unwrap();
+        self.occupancy.look_up(&mut self.gpu, &self.pipeline.pool, points, &mut out).unwrap();
         out
     }
 }
@@ -66,16 +69,16 @@ fn a_cell_is_held_as_long_as_a_gaussian_is_in_it() {
     let (p, q) = ([-0.01, 2.05, 1.0], [0.01, 2.05, 1.0]);
     let asked = [at(p), at([-0.1, 2.05, 1.0]), at(q)];
     assert_eq!(g.look(&asked), [FREE; 3]);
-    g.pipeline.open_block(1);
+    g.pipeline.pool.open_block(1);
     g.append(&[p]);
     assert_eq!(g.look(&asked), [HELD, HELD, FREE]);
     // A correction takes it along.
     let by = Pose { p: glam::DVec3::new(0.02, 0.0, 0.0), ..Pose::IDENTITY };
-    g.pipeline.move_blocks(&mut g.gpu, [(1, by)].into_iter()).unwrap();
+    g.pipeline.pool.move_blocks(&mut g.gpu, [(1, by)].into_iter()).unwrap();
     assert_eq!(g.look(&asked), [FREE, FREE, HELD]);
     // Evicted, it leaves room to be seeded again.
     let all = PruneRule { opacity_min: 0.9, ..PruneRule::default() };
-    assert_eq!(g.pipeline.prune(&mut g.gpu, &all).unwrap(), 1);
+    assert_eq!(g.pipeline.pool.prune(&mut g.gpu, &all).unwrap(), 1);
     assert_eq!(g.look(&asked), [FREE; 3]);
 }
 
@@ -94,7 +97,7 @@ fn answers_agree_with_the_twin_in_tables_with_room_and_without() {
         all.reverse();
         twin::occupy(&mut table, 8.0, &all);
         let mut got = vec![0; cells as usize];
-        g.gpu.download(g.occupancy.cells(), 0, &mut got).unwrap();
+        g.gpu.download(g.occupancy.buffers.cells, 0, &mut got).unwrap();
         assert!(got == table, "tables differ");
         assert_eq!(answers, twin::occupied(&table, 8.0, &points));
         let count = |a: u32| answers.iter().filter(|k| **k == a).count();

@@ -6,38 +6,37 @@ use super::twins::pool::{self, Moved};
 use glam::{DQuat, DVec3, DVec4, Vec3, Vec4};
 use stipple::gpu::kernels::types::{Moments, Splat};
 use stipple::gpu::{Gpu, GpuOptions};
-use stipple::map::blocks::importance_of_bin;
-use stipple::map::pipeline::{Gaussian, Pipeline, PruneRule, Tiling, View};
+use stipple::map::pool::importance_of_bin;
+use stipple::map::{Gaussian, Pipeline, PruneRule, Tiling, View};
 use stipple_drivers::Pose;
 
 const KEEP_ALL: PruneRule = PruneRule { opacity_min: 1e-9, scale_max_m: 1e3, importance_min: 0.0, steps_min: 0 };
 
 fn states(gpu: &mut Gpu, p: &Pipeline) -> Vec<u32> {
-    let mut out = vec![0; p.count()];
-    gpu.download(p.buffers().steps, 0, &mut out).unwrap();
+    let mut out = vec![0; p.pool.count() as usize];
+    gpu.download(p.pool.buffers.steps, 0, &mut out).unwrap();
     out
 }
 
 fn moments(gpu: &mut Gpu, p: &Pipeline) -> Vec<Moments> {
-    let mut out = vec![Moments::default(); p.count()];
-    gpu.download(p.buffers().moments, 0, &mut out).unwrap();
+    let mut out = vec![Moments::default(); p.pool.count() as usize];
+    gpu.download(p.pool.buffers.moments, 0, &mut out).unwrap();
     out
 }
 
 fn splats(gpu: &mut Gpu, p: &mut Pipeline) -> Vec<Gaussian> {
-    let out = p.download(gpu).unwrap();
-    out
+    p.pool.download(gpu).unwrap()
 }
 
 /// Two blocks of Gaussians, trained a little.
 fn trained(v: &View, n: usize) -> (Gpu, Pipeline) {
     let (mut gpu, mut p) = open(shape(v, n as u32, 1 << 16));
     let all = scene(n, v, 11);
-    p.open_block(4);
-    p.append(&mut gpu, &all[..n / 3]).unwrap();
-    p.open_block(9);
-    p.append(&mut gpu, &all[n / 3..]).unwrap();
-    p.set_keyframe(&mut gpu, 0, &target(v.camera.width, v.camera.height)).unwrap();
+    p.pool.open_block(4);
+    p.pool.append(&mut gpu, &all[..n / 3]).unwrap();
+    p.pool.open_block(9);
+    p.pool.append(&mut gpu, &all[n / 3..]).unwrap();
+    p.loss.set_image(&mut gpu, 0, &target(v.camera.width, v.camera.height)).unwrap();
     train(&mut gpu, &mut p, v, 5);
     (gpu, p)
 }
@@ -47,7 +46,7 @@ fn eviction_takes_the_least_valuable_and_keeps_the_order_of_anchors() {
     let v = view(64, 48);
     let (mut gpu, mut p) = trained(&v, 300);
     let (before, words, moved) = (splats(&mut gpu, &mut p), states(&mut gpu, &p), moments(&mut gpu, &p));
-    let bins = p.importance(&mut gpu, 5).unwrap();
+    let bins = p.pool.importance(&mut gpu, 5).unwrap();
     assert_eq!(bins, pool::importance(&words, 5));
     assert!(bins.iter().filter(|n| **n > 0).count() > 8, "{bins:?}");
 
@@ -61,7 +60,7 @@ fn eviction_takes_the_least_valuable_and_keeps_the_order_of_anchors() {
     let importance_min = importance_of_bin(bin.unwrap());
     let kept: Vec<bool> =
         words.iter().map(|s| pool::steps_of(*s) < 5 || pool::importance_of(*s) >= f64::from(importance_min)).collect();
-    let gone = p.prune(&mut gpu, &PruneRule { importance_min, steps_min: 5, ..KEEP_ALL }).unwrap();
+    let gone = p.pool.prune(&mut gpu, &PruneRule { importance_min, steps_min: 5, ..KEEP_ALL }).unwrap();
     assert_eq!(gone, kept.iter().filter(|k| !**k).count());
     assert!(gone > 10 && gone <= third as usize, "{gone} of {third}");
     assert_eq!(splats(&mut gpu, &mut p), pool::repack(&before, &kept));
@@ -69,12 +68,12 @@ fn eviction_takes_the_least_valuable_and_keeps_the_order_of_anchors() {
     let bytes = |m: &[Moments]| bytemuck::cast_slice::<_, u32>(m).to_vec();
     assert_eq!(bytes(&moments(&mut gpu, &p)), bytes(&pool::repack(&moved, &kept)));
     let first = kept[..100].iter().filter(|k| **k).count() as u32;
-    assert_eq!((p.block(4), p.block(9)), (0..first, first..p.count() as u32));
-    assert_eq!(p.block(5), 0..0);
+    assert_eq!((p.pool.block(4), p.pool.block(9)), (0..first, first..p.pool.count()));
+    assert_eq!(p.pool.block(5), 0..0);
 
     // The freed room is at the end, and the newest block takes it.
-    assert_eq!(p.append(&mut gpu, &before[..gone]).unwrap(), gone);
-    assert_eq!((p.count(), p.block(9).end), (300, 300));
+    assert_eq!(p.pool.append(&mut gpu, &before[..gone]).unwrap(), gone);
+    assert_eq!((p.pool.count(), p.pool.block(9).end), (300, 300));
 }
 
 #[test]
@@ -84,28 +83,28 @@ fn gaps_close_in_pieces_where_scratch_is_short() {
     let (mut gpu, mut p) = open(shape(&v, 200, 200));
     let mut all = scene(200, &v, 3);
     all.iter_mut().step_by(3).for_each(|s| s.opacity_logit = -30.0);
-    p.append(&mut gpu, &all).unwrap();
+    p.pool.append(&mut gpu, &all).unwrap();
     let kept: Vec<bool> = (0..200).map(|i| i % 3 != 0).collect();
-    assert_eq!(p.prune(&mut gpu, &KEEP_ALL).unwrap(), 67);
+    assert_eq!(p.pool.prune(&mut gpu, &KEEP_ALL).unwrap(), 67);
     assert_eq!(splats(&mut gpu, &mut p), pool::repack(&all, &kept));
-    assert_eq!(p.prune(&mut gpu, &KEEP_ALL).unwrap(), 0);
+    assert_eq!(p.pool.prune(&mut gpu, &KEEP_ALL).unwrap(), 0);
 }
 
 #[test]
 fn importance_is_the_mean_of_what_the_opacity_gradient_says() {
     let v = view(64, 48);
     let (mut gpu, mut p) = open(shape(&v, 60, 1 << 16));
-    p.append(&mut gpu, &scene(60, &v, 2)).unwrap();
-    p.set_keyframe(&mut gpu, 0, &target(64, 48)).unwrap();
+    p.pool.append(&mut gpu, scene(60, &v, 2)).unwrap();
+    p.loss.set_image(&mut gpu, 0, &target(64, 48)).unwrap();
     let mut expected = vec![0u32; 60];
     for _ in 0..3 {
         train(&mut gpu, &mut p, &v, 1);
         let (mut offsets, mut ranks, mut seen) = (vec![0u32; 61], vec![0u32; 60], [0u32]);
-        gpu.download(p.buffers().tile_offsets, 0, &mut offsets).unwrap();
-        gpu.download(p.buffers().ranked, 0, &mut ranks).unwrap();
-        gpu.download(p.buffers().visible_count, 0, &mut seen).unwrap();
+        gpu.download(p.renderer.buffers.tile_offsets, 0, &mut offsets).unwrap();
+        gpu.download(p.renderer.buffers.ranked, 0, &mut ranks).unwrap();
+        gpu.download(p.renderer.buffers.visible_count, 0, &mut seen).unwrap();
         let mut gradients = vec![0f32; 8 * offsets[seen[0] as usize] as usize];
-        gpu.download(p.buffers().over.isect_gradients, 0, &mut gradients).unwrap();
+        gpu.download(p.backward.isect_gradients, 0, &mut gradients).unwrap();
         for r in 0..seen[0] as usize {
             let tiles = offsets[r] as usize..offsets[r + 1] as usize;
             if !tiles.is_empty() {
@@ -136,7 +135,7 @@ fn correction_moves_block_rigidly() {
     let picture = render(&mut gpu, &mut p, &v);
     let (before, old) = (splats(&mut gpu, &mut p), moments(&mut gpu, &p));
     let by = pose(5);
-    p.move_blocks(&mut gpu, [(9, by)].into_iter()).unwrap();
+    p.pool.move_blocks(&mut gpu, [(9, by)].into_iter()).unwrap();
     let (after, new) = (splats(&mut gpu, &mut p), moments(&mut gpu, &p));
     assert_eq!(before[..40], after[..40], "the other block stays");
     let wide = |v: [f32; 4]| Vec4::from(v).as_dvec4();
@@ -159,7 +158,7 @@ fn correction_moves_block_rigidly() {
         assert_eq!(rest(&before[i], &old[i]), rest(&after[i], &new[i]));
     }
     // With both blocks moved, the moved camera sees the same picture.
-    p.move_blocks(&mut gpu, [(4, by)].into_iter()).unwrap();
+    p.pool.move_blocks(&mut gpu, [(4, by)].into_iter()).unwrap();
     let moved = render(&mut gpu, &mut p, &View { world_from_cam: by * v.world_from_cam, ..v });
     let worst = picture.colour.iter().zip(&moved.colour).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
     assert!(worst < 1.5 / 255.0, "{worst}");
@@ -173,7 +172,7 @@ fn training_goes_on_after_a_move_as_if_nothing_happened() {
         let (mut gpu, mut p) = trained(&v, 120);
         let mut view = v;
         if moved {
-            p.move_blocks(&mut gpu, [(4, by), (9, by)].into_iter()).unwrap();
+            p.pool.move_blocks(&mut gpu, [(4, by), (9, by)].into_iter()).unwrap();
             view.world_from_cam = by * v.world_from_cam;
         }
         train(&mut gpu, &mut p, &view, 30).last().unwrap().loss
@@ -187,22 +186,22 @@ fn training_goes_on_after_a_move_as_if_nothing_happened() {
 fn the_validation_layer_is_silent_about_the_pool() {
     let v = view(33, 21);
     let s = shape(&v, 64, 4096);
-    let opened = Gpu::open_with(&crate::config(), Pipeline::arena_bytes(&s), GpuOptions { validation: true });
+    let opened = Gpu::open_with(&crate::config(), Pipeline::arena_bytes(&s).unwrap(), GpuOptions { validation: true });
     let mut gpu = match opened {
         Ok(gpu) => gpu,
         Err(fault) => return println!("ignored: the_validation_layer_is_silent_about_the_pool: {fault}"),
     };
     let mut p = Pipeline::new(&mut gpu, s).unwrap();
-    p.open_block(0);
+    p.pool.open_block(0);
     let mut all = scene(64, &v, 1);
     all[3].opacity_logit = f32::NAN;
-    p.append(&mut gpu, &all).unwrap();
-    p.importance(&mut gpu, 0).unwrap();
-    assert_eq!(p.prune(&mut gpu, &KEEP_ALL).unwrap(), 1);
-    p.move_blocks(&mut gpu, [(0, pose(1))].into_iter()).unwrap();
+    p.pool.append(&mut gpu, &all).unwrap();
+    p.pool.importance(&mut gpu, 0).unwrap();
+    assert_eq!(p.pool.prune(&mut gpu, &KEEP_ALL).unwrap(), 1);
+    p.pool.move_blocks(&mut gpu, [(0, pose(1))].into_iter()).unwrap();
     assert_eq!(gpu.validation_messages(), Vec::<String>::new());
     let mut one = [Splat::default()];
-    gpu.download(p.buffers().splats, 0, &mut one).unwrap();
+    gpu.download(p.pool.buffers.splats, 0, &mut one).unwrap();
 }
 
 #[test]
@@ -212,7 +211,7 @@ fn a_loop_that_moves_thousands_of_anchors_fits() {
     let before = splats(&mut gpu, &mut p);
     let there = Pose { p: DVec3::X, ..Pose::IDENTITY };
     let and_back = [(4, there), (4, there.inverse())];
-    p.move_blocks(&mut gpu, and_back.into_iter().cycle().take(3000)).unwrap();
+    p.pool.move_blocks(&mut gpu, and_back.into_iter().cycle().take(3000)).unwrap();
     for (now, then) in splats(&mut gpu, &mut p).iter().zip(&before) {
         let (now, then) = (DVec3::from(Vec3::from(now.mean)), DVec3::from(Vec3::from(then.mean)));
         assert!(now.distance(then) < 1e-3, "{now} {then}");

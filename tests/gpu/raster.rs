@@ -4,7 +4,7 @@ use super::splat::{worst, Rng};
 use super::twins::raster::{backward, forward, Flat, Planes};
 use stipple::gpu::kernels::{raster_backward, raster_forward, types::Projected};
 use stipple::gpu::{Buf, Gpu, Threads};
-use stipple::map::pipeline::Tiling;
+use stipple::map::Tiling;
 
 const W: usize = 37;
 const H: usize = 21;

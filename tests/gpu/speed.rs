@@ -4,12 +4,12 @@ use super::splat::{open, scene, shape, target, train, view, Rng, FAST};
 use super::twins::chunks;
 use stipple::gpu::kernels::{sum_chunks, types::Moments};
 use stipple::gpu::{Gpu, GpuOptions};
-use stipple::map::pipeline::{Gaussian, Pipeline, Rendered, Shape, StepStats, Tiling, Weights};
 use stipple::map::tiling::CHUNK_GPU;
+use stipple::map::{Gaussian, Pipeline, Rendered, Shape, StepStats, Tiling, Weights};
 
 /// The map, to the bit.
 fn map(gpu: &mut Gpu, p: &mut Pipeline) -> Vec<u32> {
-    bytemuck::cast_slice(&p.download(gpu).unwrap()).to_vec()
+    bytemuck::cast_slice(&p.pool.download(gpu).unwrap()).to_vec()
 }
 
 #[test]
@@ -18,8 +18,8 @@ fn steps_started_ahead_leave_the_same_map_and_answers_to_the_bit() {
     let v = view(65, 47);
     let s = shape(&v, 512, 1 << 16);
     let ready = |gpu: &mut Gpu, p: &mut Pipeline| {
-        p.append(gpu, &scene(500, &v, 9)).unwrap();
-        p.set_keyframe(gpu, 0, &target(65, 47)).unwrap();
+        p.pool.append(gpu, scene(500, &v, 9)).unwrap();
+        p.loss.set_image(gpu, 0, &target(65, 47)).unwrap();
     };
     let (mut gpu, mut p) = open(s);
     ready(&mut gpu, &mut p);
@@ -27,7 +27,7 @@ fn steps_started_ahead_leave_the_same_map_and_answers_to_the_bit() {
     let waited_for = map(&mut gpu, &mut p);
 
     let validated = GpuOptions { validation: true };
-    let Ok(mut gpu) = Gpu::open_with(&crate::config(), Pipeline::arena_bytes(&s), validated) else {
+    let Ok(mut gpu) = Gpu::open_with(&crate::config(), Pipeline::arena_bytes(&s).unwrap(), validated) else {
         return println!("ignored: there is no validation layer");
     };
     let mut p = Pipeline::new(&mut gpu, s).unwrap();
@@ -108,20 +108,20 @@ fn gradients_summed_in_chunks_are_those_summed_one_by_one() {
     for channels in [1, 3] {
         let s = Shape { channels, ..shape(&v, 128, 1 << 14) };
         let of = |chunk: u32| {
-            let mut gpu = Gpu::open(&crate::config(), Pipeline::arena_bytes(&s)).unwrap();
+            let mut gpu = Gpu::open(&crate::config(), Pipeline::arena_bytes(&s).unwrap()).unwrap();
             let tiling = Tiling { chunk, ..Tiling::of(gpu.caps()) };
             let mut p = Pipeline::with_tiling(&mut gpu, s, tiling).unwrap();
             let mut all = scene(128, &v, 9);
             // So near that they cover every tile.
             all.iter_mut().step_by(5).for_each(|s| s.log_scale = [0.3; 3]);
-            p.append(&mut gpu, &all).unwrap();
+            p.pool.append(&mut gpu, &all).unwrap();
             let picture = target(65, 47).repeat(channels as usize);
-            p.set_keyframe(&mut gpu, 0, &picture).unwrap();
+            p.loss.set_image(&mut gpu, 0, &picture).unwrap();
             let step = train(&mut gpu, &mut p, &v, 1)[0];
             let mut moments = vec![Moments::default(); 128];
-            gpu.download(p.buffers().moments, 0, &mut moments).unwrap();
+            gpu.download(p.pool.buffers.moments, 0, &mut moments).unwrap();
             let mut states = vec![0u32; 128];
-            gpu.download(p.buffers().steps, 0, &mut states).unwrap();
+            gpu.download(p.pool.buffers.steps, 0, &mut states).unwrap();
             let first: Vec<f32> = moments.iter().flat_map(|m| m.m.into_iter().flatten()).collect();
             (step, first, states)
         };
@@ -153,10 +153,10 @@ fn a_pool_a_quarter_full_or_a_quarter_seen_against_a_full_one() {
         // As wide as their share of the picture.
         let small = |s: Gaussian| Gaussian { log_scale: [-4.0; 3], ..s };
         let seen: Vec<Gaussian> = scene(N as usize, &v, 9).into_iter().map(small).collect();
-        p.append(&mut gpu, &seen).unwrap();
+        p.pool.append(&mut gpu, &seen).unwrap();
         let unseen: Vec<Gaussian> = seen.iter().cycle().take(hidden).map(behind).collect();
-        p.append(&mut gpu, &unseen).unwrap();
-        p.set_keyframe(&mut gpu, 0, &target(320, 240)).unwrap();
+        p.pool.append(&mut gpu, &unseen).unwrap();
+        p.loss.set_image(&mut gpu, 0, &target(320, 240)).unwrap();
         gpu.time_commands(0);
         (gpu, p)
     };

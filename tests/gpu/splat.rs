@@ -5,8 +5,8 @@ use super::twins::{self, project::Parameters};
 use glam::{DQuat, DVec3};
 use stipple::config::GpuConfig;
 use stipple::gpu::{Gpu, GpuOptions};
-use stipple::map::pipeline::{
-    Exposure, Gaussian, Goal, LearningRates, Pipeline, PruneRule, Rendered, Shape, StepStats, Tiling, View, Weights,
+use stipple::map::{
+    Exposure, Gaussian, LearningRates, Pipeline, PruneRule, Rendered, Shape, StepStats, Target, Tiling, View, Weights,
 };
 use stipple::stereo::Pinhole;
 use stipple_drivers::Pose;
@@ -72,7 +72,7 @@ pub fn mask(width: usize, height: usize) -> Vec<u8> {
 
 pub fn shape(v: &View, splats: u32, intersections: u32) -> Shape {
     let (width, height) = (v.camera.width as u32, v.camera.height as u32);
-    Shape { width, height, splats, intersections, keyframes: 2, channels: 1, cameras: 1 }
+    Shape { width, height, splats, intersections, images: 2, channels: 1, cameras: 1 }
 }
 
 pub fn open(shape: Shape) -> (Gpu, Pipeline) {
@@ -83,7 +83,7 @@ pub fn open(shape: Shape) -> (Gpu, Pipeline) {
 pub fn open_with(shape: Shape, baseline: bool) -> (Gpu, Pipeline) {
     let config = crate::config();
     let config = GpuConfig { subgroups: config.subgroups && !baseline, ..config };
-    let mut gpu = Gpu::open(&config, Pipeline::arena_bytes(&shape)).unwrap();
+    let mut gpu = Gpu::open(&config, Pipeline::arena_bytes(&shape).unwrap()).unwrap();
     let p = Pipeline::new(&mut gpu, shape).unwrap();
     (gpu, p)
 }
@@ -149,14 +149,14 @@ pub fn compare_step(v: &View, splats: &[Gaussian], tiling: Option<Tiling>) {
     let (w, h) = (v.camera.width, v.camera.height);
     let n = splats.len();
     let s = shape(v, n as u32, 1 << 16);
-    let mut gpu = Gpu::open(&crate::config(), Pipeline::arena_bytes(&s)).unwrap();
+    let mut gpu = Gpu::open(&crate::config(), Pipeline::arena_bytes(&s).unwrap()).unwrap();
     let mut p = match tiling {
         Some(tiling) => Pipeline::with_tiling(&mut gpu, s, tiling).unwrap(),
         None => Pipeline::new(&mut gpu, s).unwrap(),
     };
-    assert_eq!(p.append(&mut gpu, splats).unwrap(), n);
-    p.set_keyframe(&mut gpu, 1, &target(w, h)).unwrap();
-    p.set_mask(&mut gpu, &mask(w, h)).unwrap();
+    assert_eq!(p.pool.append(&mut gpu, splats).unwrap(), n);
+    p.loss.set_image(&mut gpu, 1, &target(w, h)).unwrap();
+    p.loss.set_mask(&mut gpu, 0, &mask(w, h)).unwrap();
 
     let doubles: Vec<Parameters> = splats.iter().map(twins::project::parameters).collect();
     let goal: Vec<f64> = target(w, h).iter().map(|g| f64::from(*g) / 255.0).collect();
@@ -165,7 +165,7 @@ pub fn compare_step(v: &View, splats: &[Gaussian], tiling: Option<Tiling>) {
     // project
     let picture = render(&mut gpu, &mut p, v);
     let mut projected = vec![Default::default(); n];
-    gpu.download(p.buffers().projected, 0, &mut projected).unwrap();
+    gpu.download(p.renderer.buffers.projected, 0, &mut projected).unwrap();
     for (i, t) in twins::project_all(&doubles, v, &[0.0; 6]).iter().enumerate() {
         // Those off the image are culled by the kernel and keep zeros.
         let (Some(t), true) = (t, projected[i].conic_shade[3] != 0.0) else { continue };
@@ -188,7 +188,7 @@ pub fn compare_step(v: &View, splats: &[Gaussian], tiling: Option<Tiling>) {
     let weights = Weights { ssim: SSIM, needle: 0.0, scale: 0.0, scale_soft_m: 1.0, opacity: 0.0 };
     let step = p.train(&mut gpu, v, 1, &STILL, &weights).unwrap();
     let mut gradient = vec![0f32; w * h];
-    gpu.download(p.buffers().pixel_gradient, 0, &mut gradient).unwrap();
+    gpu.download(p.loss.buffers.pixel_gradient, 0, &mut gradient).unwrap();
     let scale = twin.loss.gradient.iter().fold(0.0f64, |m, g| m.max(g.abs()));
     assert!((step.l1 - twin.loss.l1).abs() < 1e-5 + flip && (step.ssim - twin.loss.ssim).abs() < 1e-4 + flip);
     let error = worst(wide(&gradient), twin.loss.gradient.iter().copied());
@@ -196,7 +196,7 @@ pub fn compare_step(v: &View, splats: &[Gaussian], tiling: Option<Tiling>) {
 
     // raster_backward and project_backward: after one step from rest Adam's first moment is a tenth of the gradient.
     let mut moments = vec![Default::default(); n];
-    gpu.download(p.buffers().moments, 0, &mut moments).unwrap();
+    gpu.download(p.pool.buffers.moments, 0, &mut moments).unwrap();
     let groups: [(&str, std::ops::Range<usize>); 5] =
         [("mean", 0..3), ("log scale", 3..6), ("quaternion", 6..10), ("opacity", 10..11), ("grey", 11..12)];
     for (name, range) in groups {
@@ -241,12 +241,12 @@ fn one_pixel_and_odd_sizes_agree_with_their_twin() {
         let v = view(w, h);
         let (mut gpu, mut p) = open(shape(&v, 16, 4096));
         let splats = scene(16, &v, 5);
-        p.append(&mut gpu, &splats).unwrap();
+        p.pool.append(&mut gpu, &splats).unwrap();
         let doubles: Vec<Parameters> = splats.iter().map(twins::project::parameters).collect();
         let twin = twins::raster::forward(&twins::flat(&twins::project_all(&doubles, &v, &[0.0; 6])), w, h);
         let picture = render(&mut gpu, &mut p, &v);
         assert!(worst(wide(&picture.colour), twin.planes.colour[0].clone()) < 1e-5, "{w}x{h}");
-        p.set_keyframe(&mut gpu, 0, &target(w, h)).unwrap();
+        p.loss.set_image(&mut gpu, 0, &target(w, h)).unwrap();
         assert!(p.train(&mut gpu, &v, 0, &STILL, &Weights::default()).unwrap().loss.is_finite());
     }
 }
@@ -257,7 +257,7 @@ fn an_empty_map_renders_nothing_and_trains() {
     let (mut gpu, mut p) = open(shape(&v, 16, 1024));
     let picture = render(&mut gpu, &mut p, &v);
     assert!(picture.colour.iter().chain(&picture.alpha).chain(&picture.depth).all(|x| *x == 0.0));
-    p.set_keyframe(&mut gpu, 0, &target(33, 21)).unwrap();
+    p.loss.set_image(&mut gpu, 0, &target(33, 21)).unwrap();
     let step = p.train(&mut gpu, &v, 0, &STILL, &Weights::default()).unwrap();
     assert_eq!((step.stats.visible, step.stats.intersections), (0, 0));
     assert!(step.l1 > 0.1);
@@ -276,10 +276,10 @@ fn two_runs_are_bit_identical() {
     let v = view(65, 47);
     let run = || {
         let (mut gpu, mut p) = open(shape(&v, 512, 1 << 16));
-        p.append(&mut gpu, &scene(500, &v, 9)).unwrap();
-        p.set_keyframe(&mut gpu, 0, &target(65, 47)).unwrap();
+        p.pool.append(&mut gpu, scene(500, &v, 9)).unwrap();
+        p.loss.set_image(&mut gpu, 0, &target(65, 47)).unwrap();
         let steps = train(&mut gpu, &mut p, &v, 10);
-        let map = p.download(&mut gpu).unwrap();
+        let map = p.pool.download(&mut gpu).unwrap();
         (steps, map, render(&mut gpu, &mut p, &v).colour)
     };
     let (a, b) = (run(), run());
@@ -293,17 +293,17 @@ fn a_full_intersection_list_loses_the_farthest_and_says_so() {
     let v = view(64, 48);
     let mut splats = scene(64, &v, 2);
     let (mut gpu, mut p) = open(shape(&v, 64, 1 << 16));
-    p.append(&mut gpu, &splats).unwrap();
+    p.pool.append(&mut gpu, &splats).unwrap();
     let mut out = Rendered::default();
     let full = p.render(&mut gpu, &v, &mut out).unwrap();
     assert_eq!(full.overflow, 0);
 
     let capacity = full.intersections / 2;
     let (mut gpu, mut p) = open(shape(&v, 64, capacity));
-    p.append(&mut gpu, &splats).unwrap();
+    p.pool.append(&mut gpu, &splats).unwrap();
     let cut = p.render(&mut gpu, &v, &mut out).unwrap();
     assert_eq!((cut.intersections, cut.overflow), (capacity, full.intersections - capacity));
-    p.set_keyframe(&mut gpu, 0, &target(64, 48)).unwrap();
+    p.loss.set_image(&mut gpu, 0, &target(64, 48)).unwrap();
     assert!(train(&mut gpu, &mut p, &v, 3).iter().all(|s| s.loss.is_finite()));
 
     // The nearest third alone fits, and the cut picture has all of it: where it is opaque nothing changed.
@@ -313,7 +313,7 @@ fn a_full_intersection_list_loses_the_farthest_and_says_so() {
     splats.sort_by(|a, b| depth(a).total_cmp(&depth(b)));
     splats.truncate(splats.len() / 3);
     let (mut gpu, mut p) = open(shape(&v, 64, 1 << 16));
-    p.append(&mut gpu, &splats).unwrap();
+    p.pool.append(&mut gpu, &splats).unwrap();
     let near = render(&mut gpu, &mut p, &v);
     assert!(near.alpha.iter().zip(&out.alpha).all(|(n, c)| *c >= n - 1e-6));
 }
@@ -335,12 +335,14 @@ fn splats_that_are_not_finite_do_not_change_the_picture() {
     }
     let run = |splats: &[Gaussian]| {
         let (mut gpu, mut p) = open(shape(&v, 64, 1 << 16));
-        p.append(&mut gpu, splats).unwrap();
+        p.pool.append(&mut gpu, splats).unwrap();
         let picture = render(&mut gpu, &mut p, &v);
-        p.set_keyframe(&mut gpu, 0, &target(64, 48)).unwrap();
+        p.loss.set_image(&mut gpu, 0, &target(64, 48)).unwrap();
         let steps = train(&mut gpu, &mut p, &v, 3);
-        let pruned =
-            p.prune(&mut gpu, &PruneRule { opacity_min: 1e-6, scale_max_m: 100.0, ..PruneRule::default() }).unwrap();
+        let pruned = p
+            .pool
+            .prune(&mut gpu, &PruneRule { opacity_min: 1e-6, scale_max_m: 100.0, ..PruneRule::default() })
+            .unwrap();
         (picture.colour, steps, pruned)
     };
     let (clean, dirty) = (run(&good), run(&mixed));
@@ -357,13 +359,13 @@ fn a_full_pool_takes_no_more_and_reuses_what_was_pruned() {
     let mut splats = scene(30, &v, 6);
     splats[..5].iter_mut().for_each(|s| s.opacity_logit = -8.0);
     splats[5..].iter_mut().for_each(|s| s.opacity_logit = 1.0);
-    assert_eq!(p.append(&mut gpu, &splats).unwrap(), 20);
-    assert_eq!(p.append(&mut gpu, &splats).unwrap(), 0);
-    assert_eq!(p.prune(&mut gpu, &PruneRule::default()).unwrap(), 5);
-    assert_eq!(p.prune(&mut gpu, &PruneRule::default()).unwrap(), 0);
-    assert_eq!(p.count(), 15);
-    assert_eq!(p.append(&mut gpu, &splats[20..]).unwrap(), 5);
-    let map = p.download(&mut gpu).unwrap();
+    assert_eq!(p.pool.append(&mut gpu, &splats).unwrap(), 20);
+    assert_eq!(p.pool.append(&mut gpu, &splats).unwrap(), 0);
+    assert_eq!(p.pool.prune(&mut gpu, &PruneRule::default()).unwrap(), 5);
+    assert_eq!(p.pool.prune(&mut gpu, &PruneRule::default()).unwrap(), 0);
+    assert_eq!(p.pool.count(), 15);
+    assert_eq!(p.pool.append(&mut gpu, &splats[20..]).unwrap(), 5);
+    let map = p.pool.download(&mut gpu).unwrap();
     assert_eq!(map.len(), 20);
     assert!(splats[5..25].iter().all(|s| map.contains(s)));
 }
@@ -380,8 +382,8 @@ fn training_on_one_picture_converges() {
     let v = view(w, h);
     let goal = target(w, h);
     let (mut gpu, mut p) = open(shape(&v, 1024, 1 << 16));
-    p.append(&mut gpu, &scene(1024, &v, 8)).unwrap();
-    p.set_keyframe(&mut gpu, 0, &goal).unwrap();
+    p.pool.append(&mut gpu, scene(1024, &v, 8)).unwrap();
+    p.loss.set_image(&mut gpu, 0, &goal).unwrap();
     let before = psnr(&render(&mut gpu, &mut p, &v).colour, &goal);
     let steps = train(&mut gpu, &mut p, &v, 150);
     let picture = render(&mut gpu, &mut p, &v);
@@ -409,18 +411,18 @@ pub fn write_png(name: &str, picture: &[f32], goal: &[u8], width: usize, height:
 fn the_validation_layer_is_silent() {
     let v = view(33, 21);
     let s = shape(&v, 64, 4096);
-    let opened = Gpu::open_with(&crate::config(), Pipeline::arena_bytes(&s), GpuOptions { validation: true });
+    let opened = Gpu::open_with(&crate::config(), Pipeline::arena_bytes(&s).unwrap(), GpuOptions { validation: true });
     let mut gpu = match opened {
         Ok(gpu) => gpu,
         Err(fault) => return println!("ignored: the_validation_layer_is_silent: {fault}"),
     };
     let mut p = Pipeline::new(&mut gpu, s).unwrap();
-    p.append(&mut gpu, &scene(64, &v, 1)).unwrap();
-    p.set_keyframe(&mut gpu, 0, &target(33, 21)).unwrap();
+    p.pool.append(&mut gpu, scene(64, &v, 1)).unwrap();
+    p.loss.set_image(&mut gpu, 0, &target(33, 21)).unwrap();
     train(&mut gpu, &mut p, &v, 2);
-    let goal = Goal { slot: 0, camera: 0, exposure: Some(Exposure { gain: 1.2, offset: 0.1 }) };
+    let goal = Target { image: 0, camera: 0, exposure: Exposure { gain: 1.2, offset: 0.1 } };
     p.train(&mut gpu, &v, goal, &FAST, &Weights::default()).unwrap();
     render(&mut gpu, &mut p, &v);
-    p.prune(&mut gpu, &PruneRule::default()).unwrap();
+    p.pool.prune(&mut gpu, &PruneRule::default()).unwrap();
     assert_eq!(gpu.validation_messages(), Vec::<String>::new());
 }

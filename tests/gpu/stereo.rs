@@ -3,12 +3,12 @@
 use super::stereo_scenes::{draw, Scene, Texture};
 use super::twins::stereo::{self as twin, Grey, Penalties, Variance};
 use stipple::config::{GpuConfig, StereoConfig, StereoMethod};
-use stipple::gpu::{Gpu, GpuOptions};
+use stipple::gpu::{Arena, Gpu, GpuOptions};
 use stipple::stereo::rectify::Rectification;
-use stipple::stereo::rectify_gpu::Rectifier;
+use stipple::stereo::rectify_gpu::{self, Rectifier};
 use stipple::stereo::sgm::{self, Sgm, Shape};
 use stipple::stereo::wls::Wls;
-use stipple::stereo::{DepthMap, Stereo};
+use stipple::stereo::{Buffers, DepthMap, Stereo};
 use stipple_drivers::{Calibration, Camera, Image, ImuCalibration, Lens, Pose, RigCamera};
 
 pub fn shape(width: usize, height: usize, disparities: u32) -> Shape {
@@ -16,9 +16,20 @@ pub fn shape(width: usize, height: usize, disparities: u32) -> Shape {
 }
 
 pub fn open(shape: Shape) -> (Gpu, Sgm) {
-    let mut gpu = Gpu::open(&GpuConfig::default(), Sgm::footprint(&shape).gpu_total()).unwrap();
-    let sgm = Sgm::new(&mut gpu, shape).unwrap();
+    let mut gpu = Gpu::open(&GpuConfig::default(), arena_bytes(&shape)).unwrap();
+    let sgm = matcher(&mut gpu, shape);
     (gpu, sgm)
+}
+
+fn arena_bytes(shape: &Shape) -> u64 {
+    let mut arena = Arena::counting();
+    sgm::Buffers::new(&mut arena, shape).unwrap();
+    arena.used()
+}
+
+fn matcher(gpu: &mut Gpu, shape: Shape) -> Sgm {
+    let buffers = sgm::Buffers::new(gpu.arena(), &shape).unwrap();
+    Sgm::new(gpu, buffers, shape).unwrap()
 }
 
 pub fn run(gpu: &mut Gpu, sgm: &mut Sgm, left: &Image, right: &Image) -> (Vec<f32>, Vec<f32>) {
@@ -173,8 +184,9 @@ fn raw_pairs_are_rectified_as_on_the_cpu() {
         let maps = [0, 1].map(|i| rectification.map(&rig.cameras[i]));
         let (left, right) = draw(&Scene::steps(w, h), 6);
         let stride = w.next_multiple_of(4);
-        let mut gpu = Gpu::open(&GpuConfig::default(), Rectifier::footprint(w, h).gpu_total() + (1 << 16)).unwrap();
-        let mut rectifier = Rectifier::new(&mut gpu, w, h, &maps).unwrap();
+        let mut gpu = Gpu::open(&GpuConfig::default(), 1 << 20).unwrap();
+        let buffers = rectify_gpu::Buffers::new(gpu.arena(), w, h).unwrap();
+        let mut rectifier = Rectifier::new(&mut gpu, buffers, w, h, &maps).unwrap();
         let images = gpu.alloc::<u32>("images", 2 * stride * h / 4).unwrap();
         rectifier.load(&mut gpu, &left, &right).unwrap();
         let mut rec = gpu.record();
@@ -220,10 +232,11 @@ fn a_wall_seen_through_two_lenses_has_its_depth() {
     };
     let images = [draw(&rig.cameras[0]), draw(&rig.cameras[1])];
     let config = StereoConfig { method: StereoMethod::Sgm, disparities: 32, ..StereoConfig::default() };
-    let bytes = Stereo::footprint(&rig, &config, 2).gpu_total();
-    let mut gpu = Gpu::open(&GpuConfig::default(), bytes).unwrap();
+    let mut arena = Arena::counting();
+    Buffers::new(&mut arena, &rig, &config).unwrap();
+    let mut gpu = Gpu::open(&GpuConfig::default(), arena.used()).unwrap();
     let mut stereo = Stereo::new(&rig, &config, 2, Some(&mut gpu)).unwrap();
-    let camera = stereo.camera();
+    let camera = stereo.views.camera();
     let mut depth = DepthMap::new(camera.pinhole.width, camera.pinhole.height);
     let found = stereo.depth(Some(&mut gpu), &images[0], &images[1], &mut depth).unwrap();
     assert!(found * 10 > depth.metres.len() * 8, "{found} of {}", depth.metres.len());
@@ -258,8 +271,9 @@ fn sums_do_not_depend_on_the_workgroup() {
     let (left, right) = draw(&Scene::steps(150, 90), 1);
     let s = shape(150, 90, 48);
     let found = [8, 32, 256].map(|group| {
-        let mut gpu = Gpu::open(&GpuConfig::default(), Sgm::footprint(&s).gpu_total()).unwrap();
-        let mut sgm = Sgm::with_group(&mut gpu, s, group).unwrap();
+        let mut gpu = Gpu::open(&GpuConfig::default(), arena_bytes(&s)).unwrap();
+        let buffers = sgm::Buffers::new(gpu.arena(), &s).unwrap();
+        let mut sgm = Sgm::with_group(&mut gpu, buffers, s, group).unwrap();
         let found = run(&mut gpu, &mut sgm, &left, &right);
         println!("group {group}: {:?}", gpu.timings().iter().find(|t| t.name == "aggregate"));
         found
@@ -273,8 +287,8 @@ fn depth_in_pieces_of_any_length_is_the_same_to_the_bit() {
     let s = shape(150, 90, 48);
     let [whole, short, shortest] = [1e6, 2.0, 1e-6].map(|submission_max_ms| {
         let config = GpuConfig { submission_max_ms, ..GpuConfig::default() };
-        let mut gpu = Gpu::open(&config, Sgm::footprint(&s).gpu_total()).unwrap();
-        let mut sgm = Sgm::new(&mut gpu, s).unwrap();
+        let mut gpu = Gpu::open(&config, arena_bytes(&s)).unwrap();
+        let mut sgm = matcher(&mut gpu, s);
         let found = [(); 2].map(|()| {
             let before = gpu.submissions();
             let found = run(&mut gpu, &mut sgm, &left, &right);
@@ -298,11 +312,11 @@ fn the_validation_layer_is_silent_about_matching() {
     let options = GpuOptions { validation: true };
     // Short enough that long dispatches are cut.
     let config = GpuConfig { submission_max_ms: 0.1, ..GpuConfig::default() };
-    let mut gpu = match Gpu::open_with(&config, Sgm::footprint(&s).gpu_total(), options) {
+    let mut gpu = match Gpu::open_with(&config, arena_bytes(&s), options) {
         Ok(gpu) => gpu,
         Err(fault) => return println!("ignored: the_validation_layer_is_silent_about_matching: {fault}"),
     };
-    let mut sgm = Sgm::new(&mut gpu, s).unwrap();
+    let mut sgm = matcher(&mut gpu, s);
     let (left, right) = draw(&Scene::steps(64, 48), 1);
     run(&mut gpu, &mut sgm, &left, &right);
     assert_eq!(gpu.validation_messages(), Vec::<String>::new());

@@ -4,7 +4,7 @@
 use super::splat::{compare_step, mask, open, render, scene, shape, target, train, view, Rng, FAST};
 use glam::DVec3;
 use stipple::gpu::kernels::types::Moments;
-use stipple::map::pipeline::{Gaussian, Rendered, View, Weights};
+use stipple::map::{Gaussian, Rendered, View, Weights};
 
 /// A Gaussian at a place of the camera frame.
 fn splat(v: &View, p_cam: DVec3, log_scale: [f32; 3], opacity_logit: f32) -> Gaussian {
@@ -24,12 +24,12 @@ fn finite(s: &Gaussian) -> bool {
 /// Trains, and everything there is stays finite.
 fn survives(v: &View, splats: &[Gaussian], goal: &[u8], steps: usize) -> Vec<Gaussian> {
     let (mut gpu, mut p) = open(shape(v, splats.len() as u32, 1 << 17));
-    p.append(&mut gpu, splats).unwrap();
-    p.set_keyframe(&mut gpu, 0, goal).unwrap();
+    p.pool.append(&mut gpu, splats).unwrap();
+    p.loss.set_image(&mut gpu, 0, goal).unwrap();
     for step in train(&mut gpu, &mut p, v, steps) {
         assert!(step.loss.is_finite() && step.pose_gradient.iter().all(|g| g.is_finite()), "{step:?}");
     }
-    let map = p.download(&mut gpu).unwrap();
+    let map = p.pool.download(&mut gpu).unwrap();
     assert!(map.iter().all(finite));
     map
 }
@@ -87,7 +87,7 @@ fn gaussians_about_the_near_plane_are_drawn_in_front_of_it_only() {
     let splats: Vec<Gaussian> =
         depths.iter().map(|z| splat(&v, DVec3::new(0.002, 0.001, *z), [-8.0, -7.0, -6.0], -2.0)).collect();
     let (mut gpu, mut p) = open(shape(&v, 8, 1 << 14));
-    p.append(&mut gpu, &splats).unwrap();
+    p.pool.append(&mut gpu, &splats).unwrap();
     let mut out = Rendered::default();
     assert_eq!(p.render(&mut gpu, &v, &mut out).unwrap().visible, 3);
     compare_step(&v, &splats[5..], None);
@@ -122,13 +122,13 @@ fn guests_that_are_not_finite_are_counted_and_leave_the_others_to_the_bit() {
         let (mut gpu, mut p) = open(shape(&v, 31, 1 << 14));
         let mut splats = good.clone();
         splats.splice(11..11, guest);
-        p.append(&mut gpu, &splats).unwrap();
-        p.set_keyframe(&mut gpu, 0, &target(33, 21)).unwrap();
-        p.set_mask(&mut gpu, &mask(33, 21)).unwrap();
+        p.pool.append(&mut gpu, &splats).unwrap();
+        p.loss.set_image(&mut gpu, 0, &target(33, 21)).unwrap();
+        p.loss.set_mask(&mut gpu, 0, &mask(33, 21)).unwrap();
         let picture = render(&mut gpu, &mut p, &v).colour;
         let steps = train(&mut gpu, &mut p, &v, 3);
         let mut moments = vec![Moments::default(); splats.len()];
-        gpu.download(p.buffers().moments, 0, &mut moments).unwrap();
+        gpu.download(p.pool.buffers.moments, 0, &mut moments).unwrap();
         if guest.is_some() {
             moments.remove(11);
         }
@@ -159,9 +159,9 @@ fn a_gaussian_without_rotation_is_not_taken() {
     let (mut gpu, mut p) = open(shape(&v, 8, 1 << 12));
     let mut splats = scene(4, &v, 4);
     splats[1].quat_xyzw = [0.0; 4];
-    assert_eq!(p.append(&mut gpu, &splats).unwrap(), 3);
-    let map = p.download(&mut gpu).unwrap();
-    assert_eq!((map.len(), p.count()), (3, 3));
+    assert_eq!(p.pool.append(&mut gpu, &splats).unwrap(), 3);
+    let map = p.pool.download(&mut gpu).unwrap();
+    assert_eq!((map.len(), p.pool.count()), (3, 3));
 }
 
 #[test]
@@ -181,18 +181,18 @@ fn noise(steps: usize) {
     let mut r = Rng(11);
     let base = view(w, h);
     let (mut gpu, mut p) = open(shape(&base, 128, 1 << 14));
-    p.append(&mut gpu, &scene(128, &base, 1)).unwrap();
+    p.pool.append(&mut gpu, scene(128, &base, 1)).unwrap();
     for step in 0..steps {
         if step % 16 == 0 {
             let image: Vec<u8> = (0..w * h).map(|_| r.uniform(0.0, 256.0) as u8).collect();
-            p.set_keyframe(&mut gpu, 0, &image).unwrap();
+            p.loss.set_image(&mut gpu, 0, &image).unwrap();
         }
         let mut v = base;
         v.world_from_cam.p += DVec3::new(r.uniform(-1.0, 1.0), r.uniform(-1.0, 1.0), r.uniform(-3.0, 2.0));
         let s = p.train(&mut gpu, &v, 0, &FAST, &Weights::default()).unwrap();
         assert!(s.loss.is_finite() && s.pose_gradient.iter().all(|g| g.is_finite()), "{step}: {s:?}");
     }
-    let map = p.download(&mut gpu).unwrap();
+    let map = p.pool.download(&mut gpu).unwrap();
     assert!(map.len() == 128 && map.iter().all(finite));
 }
 

@@ -168,19 +168,19 @@ fn what_is_appended_begins_anew() {
     let v = view(33, 21);
     let splats = scene(40, &v, 1);
     let (mut gpu, mut p) = open(shape(&v, 40, 1 << 12));
-    let state = |gpu: &mut Gpu, p: &stipple::map::pipeline::Pipeline, n: usize| {
-        let b = p.buffers();
+    let state = |gpu: &mut Gpu, p: &stipple::map::Pipeline, n: usize| {
+        let b = p.pool.buffers;
         let (s, m, k) = (b.splats, b.moments, b.steps);
         (read::<Splat>(gpu, s, n), read::<Moments>(gpu, m, n), read::<u32>(gpu, k, n))
     };
     // What an earlier map left in the slots.
-    p.append(&mut gpu, &splats).unwrap();
+    p.pool.append(&mut gpu, &splats).unwrap();
     train(&mut gpu, &mut p, &v, 2);
-    p.clear();
-    p.append(&mut gpu, &splats[..25]).unwrap();
+    p.pool.clear();
+    p.pool.append(&mut gpu, &splats[..25]).unwrap();
     train(&mut gpu, &mut p, &v, 2);
     let before = state(&mut gpu, &p, 25);
-    p.append(&mut gpu, &splats[25..]).unwrap();
+    p.pool.append(&mut gpu, &splats[25..]).unwrap();
     let after = state(&mut gpu, &p, 40);
     assert_eq!((&before.0[..], &before.1[..], &before.2[..]), (&after.0[..25], &after.1[..25], &after.2[..25]));
     for (i, s) in splats.iter().enumerate().skip(25) {

@@ -8,7 +8,6 @@ mod runtime;
 
 use super::Disparity;
 use crate::config::{Fit, NetworkConfig};
-use crate::mem::Footprint;
 use runtime::{Refused, Session};
 use stipple_drivers::{Fault, FaultKind, Image};
 
@@ -31,22 +30,18 @@ fn inner(width: usize, height: usize, config: &NetworkConfig) -> [usize; 2] {
     [or(config.width, width), or(config.height, height)]
 }
 
+/// Inputs and output, at the size of the images; what the runtime takes for weights and activations is not known before.
+pub fn tensors([width, height]: [usize; 2]) -> [Vec<f32>; 3] {
+    [3, 3, 1].map(|channels| vec![0.0; channels * width * height])
+}
+
 fn bad(key: &str, what: String, fix: &str) -> Fault {
     Fault::new(FaultKind::Config, format!("stereo.network.{key}"), what, fix)
 }
 
 impl Network {
-    /// Ours; what the runtime takes for weights and activations is its own and not known before.
-    pub fn footprint(width: usize, height: usize, config: &NetworkConfig) -> Footprint {
-        let [w, h] = inner(width, height, config);
-        let mut f = Footprint::default();
-        f.host("stereo: network inputs", 2 * config.channels as usize * w * h * size_of::<f32>());
-        f.host("stereo: network output", w * h * size_of::<f32>());
-        f
-    }
-
     /// What can be said of a board without the runtime: a model is named and there, and its size holds the images.
-    pub fn admit(width: usize, height: usize, config: &NetworkConfig) -> Result<(), Fault> {
+    pub fn check_files(width: usize, height: usize, config: &NetworkConfig) -> Result<(), Fault> {
         if config.model.is_empty() {
             return Err(bad("model", "names no file, and stereo.method is `onnx`".into(), "name an ONNX file"));
         }
@@ -63,7 +58,7 @@ impl Network {
 
     /// Loads runtime and model, and runs it once, so that what is wrong with either is said at boot.
     pub fn new(width: usize, height: usize, config: &NetworkConfig) -> Result<Network, Fault> {
-        Network::admit(width, height, config)?;
+        Network::check_files(width, height, config)?;
         let [w, h] = inner(width, height, config);
         let names = [config.left.as_str(), &config.right, &config.disparity];
         let shape = [1, config.channels as usize, h, w];

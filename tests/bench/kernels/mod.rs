@@ -17,7 +17,7 @@ use std::path::PathBuf;
 use std::time::Instant;
 use stipple::config::{GpuConfig, StereoConfig};
 use stipple::gpu::{Gpu, Timing};
-use stipple::map::pipeline::{LearningRates, Pipeline, Shape, StepStats, Tiling, View, Weights};
+use stipple::map::{LearningRates, Pipeline, Shape, StepStats, Tiling, View, Weights};
 use stipple::output::chart::{bars, Chart, Series};
 use stipple::output::OutputDir;
 use stipple_drivers::Fault;
@@ -148,15 +148,15 @@ fn measure(config: &GpuConfig, scene: &Scene, tiling: Tiling, peaks: &Peaks, qui
         height: camera.height as u32,
         splats: n as u32,
         intersections: (16 * n + 200_000).min(INTERSECTIONS_MAX) as u32,
-        keyframes: 1,
+        images: 1,
         cameras: 1,
         channels: 1,
     };
-    let mut gpu = Gpu::open(config, Pipeline::arena_bytes(&shape))?;
+    let mut gpu = Gpu::open(config, Pipeline::arena_bytes(&shape)?)?;
     let mut p = Pipeline::with_tiling(&mut gpu, shape, tiling)?;
-    p.append(&mut gpu, &scene.splats)?;
-    p.set_keyframe(&mut gpu, 0, &scene.image)?;
-    p.set_mask(&mut gpu, &scene.mask)?;
+    p.pool.append(&mut gpu, &scene.splats)?;
+    p.loss.set_image(&mut gpu, 0, &scene.image)?;
+    p.loss.set_mask(&mut gpu, 0, &scene.mask)?;
     let mut step = |gpu: &mut Gpu| -> Result<f64, Fault> {
         p.train(gpu, &scene.view, 0, &RATES, &Weights::default())?;
         Ok(gpu.last_submit_ms())
@@ -242,7 +242,7 @@ fn costs(timings: &[Timing], before: &[(u64, f64)], counts: &Counts, peaks: &Pea
 
 /// Mean and largest length of the lists of tiles, of those that have one.
 fn lists(gpu: &mut Gpu, p: &Pipeline) -> Result<(f64, u32), Fault> {
-    let ranges = p.buffers().ranges;
+    let ranges = p.renderer.buffers.ranges;
     let mut all = vec![[0u32; 2]; ranges.len()];
     gpu.download(ranges, 0, &mut all).map_err(Fault::from)?;
     let lengths: Vec<u32> = all.iter().map(|[from, to]| to - from).filter(|n| *n > 0).collect();

@@ -3,9 +3,9 @@
 use glam::DVec3;
 use std::path::Path;
 use stipple::config::{GpuConfig, StereoConfig};
-use stipple::gpu::Gpu;
-use stipple::map::pipeline::{Gaussian, View};
-use stipple::stereo::{DepthMap, Pinhole, Stereo};
+use stipple::gpu::{Arena, Gpu};
+use stipple::map::{Gaussian, View};
+use stipple::stereo::{Buffers, DepthMap, Pinhole, Stereo};
 use stipple_drivers::replay::{OpenOptions, Recording};
 use stipple_drivers::types::Image;
 use stipple_drivers::{Fault, FaultKind, Frames, Pose};
@@ -70,12 +70,14 @@ impl Scene {
     pub fn recorded(folder: &Path, n: usize, config: &StereoConfig, device: &GpuConfig) -> Result<Scene, Fault> {
         const TRIED: usize = 8;
         let recording = Recording::open(folder, &OpenOptions::default())?;
-        let mut gpu = match Stereo::footprint(&recording.calibration, config, 1).gpu_total() {
+        let mut arena = Arena::counting();
+        Buffers::new(&mut arena, &recording.calibration, config)?;
+        let mut gpu = match arena.used() {
             0 => None,
             bytes => Some(Gpu::open(device, bytes)?),
         };
         let mut stereo = Stereo::new(&recording.calibration, config, 1, gpu.as_mut())?;
-        let camera = stereo.camera().pinhole;
+        let camera = stereo.views.camera().pinhole;
         let (mut frames, mut reader) = (Frames::for_rig(&recording.calibration), recording.reader());
         let mut depth = DepthMap::new(camera.width, camera.height);
         let mut best: Option<(usize, Vec<f32>, Image)> = None;
@@ -87,7 +89,7 @@ impl Scene {
             let found = stereo.depth(gpu.as_mut(), &frames.images[0], &frames.images[1], &mut depth)?;
             if best.as_ref().is_none_or(|b| found > b.0) {
                 let mut image = Image::new(camera.width, camera.height);
-                stereo.rectify(&frames.images[0], &mut image);
+                stereo.views.rectify(0, &frames.images[0], &mut image);
                 best = Some((found, depth.metres.clone(), image));
             }
         }
@@ -118,7 +120,7 @@ impl Scene {
             name: format!("{place}, {n} from stereo depth"),
             view: View { world_from_cam: Pose::IDENTITY, camera, fisheye: None },
             splats: (0..n).map(splat).collect(),
-            mask: stereo.valid_mask().to_vec(),
+            mask: stereo.views.valid_mask().to_vec(),
             image: image.pixels,
         })
     }

@@ -2,15 +2,16 @@
 
 use std::time::Instant;
 use stipple::config::{Board, GpuConfig, StereoConfig, StereoMethod};
-use stipple::gpu::Gpu;
-use stipple::stereo::{Disparity, Method};
+use stipple::gpu::{Arena, Gpu};
+use stipple::mem::Footprint;
+use stipple::stereo::{sgm, Disparity, Matcher};
 use stipple_drivers::{Fault, Image};
 
 pub const NAMES: [&str; 5] = ["bm", "sgbm", "sgm", "sgm_wls", "onnx"];
 
 /// A method for pairs of one size.
 pub struct Runner {
-    method: Method,
+    matcher: Matcher,
     gpu: Option<Gpu>,
     pub bytes: u64,
     pub device: String,
@@ -42,20 +43,28 @@ impl Runner {
             _ => (StereoMethod::Onnx, false),
         };
         let config = StereoConfig { method, wls, disparities, ..base.stereo.clone() };
-        let footprint = Method::footprint(width, height, &config);
-        let mut gpu = match footprint.gpu_total() {
-            0 => None,
-            bytes => Some(Gpu::open(&base.gpu, bytes)?),
-        };
-        let method = Method::new(width, height, &config, gpu.as_mut())?;
+        let mut footprint = Footprint::default();
+        Matcher::footprint(width, height, &config, &mut footprint)?;
+        let mut gpu = None;
+        if method == StereoMethod::Sgm {
+            let shape = sgm::Shape::of(width, height, &config);
+            let mut arena = Arena::counting();
+            sgm::Buffers::new(&mut arena, &shape)?;
+            footprint.extend(arena.footprint());
+            let mut device = Gpu::open(&base.gpu, arena.used())?;
+            let buffers = sgm::Buffers::new(device.arena(), &shape)?;
+            gpu = Some((device, buffers));
+        }
+        let matcher = Matcher::new(width, height, &config, gpu.as_mut().map(|(gpu, buffers)| (gpu, *buffers)))?;
+        let gpu = gpu.map(|(gpu, _)| gpu);
         let device = gpu.as_ref().map_or_else(cpu, |g| g.caps().name.clone());
-        Ok(Runner { method, gpu, bytes: footprint.total(), device })
+        Ok(Runner { matcher, gpu, bytes: footprint.total(), device })
     }
 
     /// Wall time, ms.
     pub fn run(&mut self, left: &Image, right: &Image, out: &mut Disparity) -> Result<f64, Fault> {
         let start = Instant::now();
-        self.method.compute(self.gpu.as_mut(), left, right, out)?;
+        self.matcher.compute(self.gpu.as_mut(), left, right, out)?;
         Ok(start.elapsed().as_secs_f64() * 1e3)
     }
 }

@@ -11,7 +11,7 @@ pub mod stereo;
 pub mod tiles;
 
 use project::{Parameters, Projected};
-use stipple::map::pipeline::View;
+use stipple::map::View;
 
 /// Loss of a scene against a target and its gradient by every parameter and the pose twist.
 pub struct Step {

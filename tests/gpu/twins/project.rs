@@ -3,7 +3,7 @@
 
 use super::dual::{constant, cross, dot, variable, Dual};
 use glam::DMat3;
-use stipple::map::pipeline::{Gaussian, View};
+use stipple::map::{Gaussian, View};
 
 pub const NEAR: f64 = 0.05;
 pub const LOW_PASS: f64 = 0.3;

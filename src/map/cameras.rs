@@ -1,20 +1,18 @@
 //! The cameras that train the map: what each sees of a keyframe, through which lens, and which of its pixels count.
 //!
 //! `rectified`: the left view of the pair, then the right one, as pinholes. `fisheye`: each raw Kannala-Brandt image
-//! as it is, with its own intrinsics; the pair is then rectified only for its depth (`Pair`). All have one size.
+//! as it is, with its own intrinsics; the pair is then rectified only for its depth (`RectifiedPair`). All have one size.
 
-use super::keyframes::Keyframe;
 use super::view::{Fisheye, View};
 use crate::config::{MapConfig, Projection};
-use crate::mem::Footprint;
 use crate::stereo::rectify::box_average;
-use crate::stereo::{DepthMap, Pinhole, Stereo};
+use crate::stereo::{Pinhole, RectifiedViews};
 use glam::{DVec2, DVec3};
-use stipple_drivers::{Calibration, Fault, FaultKind, Image, Lens, Pose, RigCamera};
+use stipple_drivers::{Fault, FaultKind, Image, Lens, Pose, RigCamera};
 
 /// One camera that trains.
 #[derive(Clone, Debug)]
-pub struct Eye {
+pub struct TrainingCamera {
     pub camera: Pinhole,
     pub fisheye: Option<Fisheye>,
     pub body_from_cam: Pose,
@@ -22,7 +20,7 @@ pub struct Eye {
     pub valid: Vec<u8>,
 }
 
-impl Eye {
+impl TrainingCamera {
     pub fn view(&self, world_from_body: Pose) -> View {
         View { world_from_cam: world_from_body * self.body_from_cam, camera: self.camera, fisheye: self.fisheye }
     }
@@ -42,7 +40,7 @@ pub fn images(cameras: usize, config: &MapConfig) -> usize {
     count(cameras, config).max(2)
 }
 
-/// Of the images that train, how many in colour.
+/// Images of them that are wanted in colour.
 pub fn colours(cameras: usize, config: &MapConfig) -> usize {
     if config.colour {
         count(cameras, config)
@@ -51,24 +49,13 @@ pub fn colours(cameras: usize, config: &MapConfig) -> usize {
     }
 }
 
-/// Of a colour, whichever camera's.
+/// Channels of a colour, whichever camera's.
 pub fn channels(config: &MapConfig) -> usize {
     if config.colour {
         3
     } else {
         1
     }
-}
-
-pub fn footprint(calibration: &Calibration, config: &MapConfig, pixels: usize) -> Footprint {
-    let n = count(calibration.cameras.len(), config);
-    let mut f = Footprint::default();
-    f.host("map: masks of the cameras", n * pixels);
-    if config.projection == Projection::Fisheye {
-        f.host("map: rectified image to seed from", channels(config) * pixels);
-        f.host("map: depth as the fisheye sees it", pixels * (size_of::<u32>() + 2 * size_of::<f32>()));
-    }
-    f
 }
 
 /// The rectified pair beside a fisheye map: the image that seeds take their colour from, and its depth as the left lens
@@ -78,21 +65,22 @@ pub fn footprint(calibration: &Calibration, config: &MapConfig, pixels: usize) -
 /// its own. It is taken from the nearest, not between several: that would invent surfaces between foreground and background.
 /// It is a distance along the ray, as the fisheye's raster counts it, since z shrinks towards 90 degrees and changes sign
 /// beyond. Beyond the rectified view (50 degrees off its axis) there is none.
-pub struct Pair {
+pub struct RectifiedPair {
     /// Grey, or red, green and blue.
     pub planes: Vec<Image>,
-    pub distance: DepthMap,
+    /// m; zero where there is none.
+    pub distance: Vec<f32>,
     /// By raw pixel at mapping resolution: the rectified one, or `NONE`.
     rectified: Vec<u32>,
 }
 
 const NONE: u32 = u32::MAX;
 
-impl Pair {
+impl RectifiedPair {
     /// `None` where the rectified view itself trains.
-    pub fn new(stereo: &Stereo, left: &Eye, channels: usize) -> Option<Pair> {
+    pub fn new(views: &RectifiedViews, left: &TrainingCamera, channels: usize) -> Option<RectifiedPair> {
         left.fisheye?;
-        let rect = stereo.camera();
+        let rect = views.camera();
         let Pinhole { width, height, fx, fy, cx, cy } = rect.pinhole;
         let rect_from_cam = rect.body_from_rect.inverse() * left.body_from_cam;
         let ray = View { world_from_cam: rect_from_cam, camera: left.camera, fisheye: left.fisheye };
@@ -102,40 +90,39 @@ impl Pair {
             let inside = (0.0..width as f64).contains(&x) && (0.0..height as f64).contains(&y);
             inside.then(|| (y as usize * width + x as usize) as u32)
         };
-        Some(Pair {
+        Some(RectifiedPair {
             planes: vec![Image::new(width, height); channels],
-            distance: DepthMap::new(width, height),
+            distance: vec![0.0; width * height],
             rectified: (0..width * height).map(|i| of(i).unwrap_or(NONE)).collect(),
         })
     }
 
-    /// From depth along the rectified axis.
-    pub fn bend(&mut self, depth: &DepthMap, rect: &Pinhole) {
-        let DepthMap { metres, sigma_m, .. } = &mut self.distance;
-        for ((to, sigma), &from) in metres.iter_mut().zip(sigma_m).zip(&self.rectified) {
+    /// Takes over depth along the rectified axis.
+    pub fn distort(&mut self, depth: &[f32], rect: &Pinhole) {
+        for (to, &from) in self.distance.iter_mut().zip(&self.rectified) {
             let (x, y) = ((from as usize % rect.width) as f64, (from as usize / rect.width) as f64);
             let stretch = DVec3::new((x - rect.cx) / rect.fx, (y - rect.cy) / rect.fy, 1.0).length() as f32;
-            let of = |plane: &[f32]| plane.get(from as usize).map_or(0.0, |z| z * stretch);
-            (*to, *sigma) = (of(&depth.metres), of(&depth.sigma_m));
+            *to = depth.get(from as usize).map_or(0.0, |z| z * stretch);
         }
     }
 }
 
-pub fn eyes(stereo: &Stereo, config: &MapConfig) -> Result<Vec<Eye>, Fault> {
-    let rig = stereo.rig();
+/// The cameras that train, of a rectified rig.
+pub fn training(views: &RectifiedViews, config: &MapConfig) -> Result<Vec<TrainingCamera>, Fault> {
+    let rig = views.rig();
     let one = |i: usize| match config.projection {
-        Projection::Rectified => Ok(Eye {
-            camera: stereo.camera().pinhole,
+        Projection::Rectified => Ok(TrainingCamera {
+            camera: views.camera().pinhole,
             fisheye: None,
-            body_from_cam: Pose { p: rig[i].body_from_cam.p, ..stereo.camera().body_from_rect },
-            valid: stereo.valid_of(i),
+            body_from_cam: Pose { p: rig[i].body_from_cam.p, ..views.camera().body_from_rect },
+            valid: views.valid_of(i),
         }),
-        Projection::Fisheye => bent(i, &rig[i], &stereo.camera().pinhole, config.scale as usize),
+        Projection::Fisheye => fisheye(i, &rig[i], &views.camera().pinhole, config.scale as usize),
     };
     (0..count(rig.len(), config)).map(one).collect()
 }
 
-fn bent(i: usize, c: &RigCamera, mapping: &Pinhole, divisor: usize) -> Result<Eye, Fault> {
+fn fisheye(i: usize, c: &RigCamera, mapping: &Pinhole, divisor: usize) -> Result<TrainingCamera, Fault> {
     let bad =
         |what: String| Fault::new(FaultKind::Config, "map.projection", what, "set map.projection = \"rectified\"");
     let Lens::KannalaBrandt { k } = c.camera.lens else {
@@ -154,28 +141,22 @@ fn bent(i: usize, c: &RigCamera, mapping: &Pinhole, divisor: usize) -> Result<Ey
         u8::from(bearing.is_some_and(|b| b.z.clamp(-1.0, 1.0).acos() <= ANGLE_MAX))
     };
     let valid = (0..camera.width * camera.height).map(|i| within(i % camera.width, i / camera.width)).collect();
-    Ok(Eye { camera, fisheye: Some(Fisheye::new(k, &camera)), body_from_cam: c.body_from_cam, valid })
-}
-
-/// One plane of what camera `i` saw, raw.
-pub fn raw(keyframe: &Keyframe, i: usize, channel: usize) -> &Image {
-    keyframe.colours.get(i).map_or(&keyframe.images[i], |colour| &colour[channel])
+    Ok(TrainingCamera { camera, fisheye: Some(Fisheye::new(k, &camera)), body_from_cam: c.body_from_cam, valid })
 }
 
 /// The image of camera `i` that trains, from its raw one.
-pub fn draw(i: usize, eye: &Eye, stereo: &mut Stereo, raw: &Image, out: &mut Image) {
-    match eye.fisheye {
-        None => stereo.rectify_of(i, raw, out),
-        Some(_) => box_average(raw, stereo.divisor(), out),
+pub fn draw(i: usize, camera: &TrainingCamera, views: &mut RectifiedViews, raw: &Image, out: &mut Image) {
+    match camera.fisheye {
+        None => views.rectify(i, raw, out),
+        Some(_) => box_average(raw, views.divisor(), out),
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::StereoConfig;
     use glam::{DQuat, DVec3};
-    use stipple_drivers::{Camera, ImuCalibration};
+    use stipple_drivers::{Calibration, Camera, ImuCalibration};
 
     fn rig() -> Calibration {
         let lens = Lens::KannalaBrandt { k: [0.0034, 0.0008, -0.0017, 0.0003] };
@@ -188,11 +169,11 @@ mod tests {
 
     /// A floor seen by the rectified view is the same floor seen by the raw lens.
     #[test]
-    fn depth_of_the_pair_is_bent_to_distance_along_the_raw_lens_rays() {
-        let stereo = Stereo::new(&rig(), &StereoConfig::default(), 1, None).expect("a sound rig");
+    fn depth_of_the_pair_becomes_distance_along_the_raw_lens_rays() {
+        let views = RectifiedViews::new(&rig(), 1).expect("a sound rig");
         let config = MapConfig { projection: Projection::Fisheye, ..MapConfig::default() };
-        let eye = eyes(&stereo, &config).expect("Kannala-Brandt lenses").remove(0);
-        let rect = stereo.camera();
+        let left = training(&views, &config).expect("Kannala-Brandt lenses").remove(0);
+        let rect = views.camera();
         let flat = View { world_from_cam: rect.body_from_rect, camera: rect.pinhole, fisheye: None };
         // y down: half a metre below the rig, as far as 4 m.
         let floor = |x: usize, y: usize| {
@@ -205,12 +186,12 @@ mod tests {
             }
         };
         let (w, h) = (rect.pinhole.width, rect.pinhole.height);
-        let metres = (0..w * h).map(|i| floor(i % w, i / w)).collect();
-        let mut pair = Pair::new(&stereo, &eye, 1).expect("a fisheye trains");
-        pair.bend(&DepthMap::of(w, h, metres), &rect.pinhole);
-        let raw = eye.view(Pose::IDENTITY);
+        let metres: Vec<f32> = (0..w * h).map(|i| floor(i % w, i / w)).collect();
+        let mut pair = RectifiedPair::new(&views, &left, 1).expect("a fisheye trains");
+        pair.distort(&metres, &rect.pinhole);
+        let raw = left.view(Pose::IDENTITY);
         let (mut seen, mut worst) = (0, 0.0f64);
-        for (i, &r) in pair.distance.metres.iter().enumerate().filter(|(_, r)| **r > 0.0) {
+        for (i, &r) in pair.distance.iter().enumerate().filter(|(_, r)| **r > 0.0) {
             let p = raw.point(i % w, i / w, f64::from(r)).expect("inside the lens");
             // Half a rectified pixel off, of a floor seen at a slant.
             let slant = f64::from(r).powi(2) / 0.5 / rect.pinhole.fx;
@@ -218,6 +199,6 @@ mod tests {
             seen += 1;
         }
         assert!(seen > 1000 && worst < 0.6, "{seen} px, off by {worst} px");
-        assert!(pair.distance.metres[..w].iter().all(|r| *r == 0.0), "the ceiling has no depth");
+        assert!(pair.distance[..w].iter().all(|r| *r == 0.0), "the ceiling has no depth");
     }
 }

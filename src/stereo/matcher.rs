@@ -8,9 +8,9 @@
 //! | `onnx` | CPU, a network of the user's | as the first |
 
 use super::confidence::Confidence;
-use super::onnx::Network;
-use super::opencv::OpenCv;
-use super::rectify_gpu::Rectifier;
+use super::onnx::{self, Network};
+use super::opencv::{self, OpenCv};
+use super::rectify_gpu::{packed, Rectifier};
 use super::sgm::{self, Sgm};
 use super::wls::Wls;
 use crate::config::{StereoConfig, StereoMethod};
@@ -18,13 +18,14 @@ use crate::gpu::Gpu;
 use crate::mem::Footprint;
 use stipple_drivers::{Fault, FaultKind, Image};
 
-/// Of each pixel of the rectified left image: x_left - x_right, px, negative where unknown, and its standard deviation.
+/// Disparity x_left - x_right of each pixel of the rectified left image, px, negative where unknown, and its standard
+/// deviation.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Disparity {
     pub width: usize,
     pub height: usize,
     pub px: Vec<f32>,
-    /// Of no meaning where the disparity is unknown.
+    /// Without meaning where the disparity is unknown.
     pub sigma_px: Vec<f32>,
 }
 
@@ -38,54 +39,61 @@ impl Disparity {
     }
 }
 
-pub enum Method {
+pub enum Matcher {
     OpenCv(OpenCv, Confidence),
     Onnx(Box<Network>, Confidence),
     Sgm(Box<Sgm>),
 }
 
-impl Method {
-    /// Host and GPU memory of the method that `config` names, for images of this size.
-    pub fn footprint(width: usize, height: usize, config: &StereoConfig) -> Footprint {
-        let mut f = Footprint::default();
+impl Matcher {
+    /// Host rows of what `new` takes for images of this size.
+    pub fn footprint(width: usize, height: usize, config: &StereoConfig, f: &mut Footprint) -> Result<(), Fault> {
         match config.method {
             StereoMethod::Bm | StereoMethod::Sgbm => {
-                f.extend(OpenCv::footprint(width, height, config));
-                f.extend(Confidence::footprint(width));
+                f.build("stereo: disparity of OpenCV", || OpenCv::new(width, height, config))?;
+                f.host("stereo: OpenCV's own buffers (estimate)", opencv::working_bytes(width, height, config));
+                f.build("stereo: sums of the confidence", || Confidence::new(width, config));
             }
             StereoMethod::Onnx => {
-                f.extend(Network::footprint(width, height, &config.network));
-                f.extend(Confidence::footprint(width));
+                f.build("stereo: network tensors, for images of this size", || onnx::tensors([width, height]));
+                f.build("stereo: sums of the confidence", || Confidence::new(width, config));
             }
-            StereoMethod::Sgm => f.extend(Sgm::footprint(&sgm::Shape::of(width, height, config))),
+            StereoMethod::Sgm => {
+                f.build("stereo: pair on its way to the GPU", || [packed(width, height), packed(width, height)]);
+            }
         }
-        f
+        Ok(())
     }
 
     /// Whether this program has the method, for images of this size, and its files are there.
-    pub fn admit(width: usize, height: usize, config: &StereoConfig) -> Result<(), Fault> {
+    pub fn check_supported(width: usize, height: usize, config: &StereoConfig) -> Result<(), Fault> {
         match config.method {
             StereoMethod::Bm | StereoMethod::Sgbm if !cfg!(feature = "opencv") => {
                 Err(refused_without_opencv(config.method))
             }
-            StereoMethod::Onnx => Network::admit(width, height, &config.network),
+            StereoMethod::Onnx => Network::check_files(width, height, &config.network),
             _ => Ok(()),
         }
     }
 
-    /// `gpu` is for the methods that run there; its arena must hold the footprint.
-    pub fn new(width: usize, height: usize, config: &StereoConfig, gpu: Option<&mut Gpu>) -> Result<Method, Fault> {
+    /// `gpu` is for the method that runs there, with its buffers.
+    pub fn new(
+        width: usize,
+        height: usize,
+        config: &StereoConfig,
+        gpu: Option<(&mut Gpu, sgm::Buffers)>,
+    ) -> Result<Matcher, Fault> {
         match config.method {
             StereoMethod::Bm | StereoMethod::Sgbm => {
-                Ok(Method::OpenCv(OpenCv::new(width, height, config)?, Confidence::new(width, config)))
+                Ok(Matcher::OpenCv(OpenCv::new(width, height, config)?, Confidence::new(width, config)))
             }
             StereoMethod::Onnx => {
                 let network = Network::new(width, height, &config.network)?;
-                Ok(Method::Onnx(Box::new(network), Confidence::new(width, config)))
+                Ok(Matcher::Onnx(Box::new(network), Confidence::new(width, config)))
             }
             StereoMethod::Sgm => {
-                let gpu = gpu.ok_or_else(|| without_gpu(config.method))?;
-                Ok(Method::Sgm(Box::new(Sgm::new(gpu, sgm::Shape::of(width, height, config))?)))
+                let (gpu, buffers) = gpu.ok_or_else(|| without_gpu(config.method))?;
+                Ok(Matcher::Sgm(Box::new(Sgm::new(gpu, buffers, sgm::Shape::of(width, height, config))?)))
             }
         }
     }
@@ -93,8 +101,8 @@ impl Method {
     /// What may be further off than this is filled in, not seen: no depth, px.
     pub fn sigma_max_px(&self) -> f32 {
         match self {
-            Method::Sgm(_) => Wls::SIGMA_MAX_PX,
-            Method::OpenCv(..) | Method::Onnx(..) => f32::INFINITY,
+            Matcher::Sgm(_) => Wls::SIGMA_MAX_PX,
+            Matcher::OpenCv(..) | Matcher::Onnx(..) => f32::INFINITY,
         }
     }
 
@@ -111,17 +119,17 @@ impl Method {
             return Ok(());
         }
         match self {
-            Method::OpenCv(matcher, confidence) => {
+            Matcher::OpenCv(matcher, confidence) => {
                 matcher.compute(left, right, &mut out.px)?;
                 confidence.estimate(left, out);
                 Ok(())
             }
-            Method::Onnx(network, confidence) => {
+            Matcher::Onnx(network, confidence) => {
                 network.compute(left, right, out)?;
                 confidence.estimate(left, out);
                 Ok(())
             }
-            Method::Sgm(sgm) => {
+            Matcher::Sgm(sgm) => {
                 let gpu = gpu.ok_or_else(|| without_gpu(StereoMethod::Sgm))?;
                 Ok(sgm.compute(gpu, left, right, &mut out.px, &mut out.sigma_px)?)
             }
@@ -129,7 +137,7 @@ impl Method {
     }
 }
 
-/// As `Method::compute`, of a raw pair, by the method that rectifies too.
+/// Does what `Matcher::compute` does with a raw pair, by the method that rectifies too.
 pub fn compute_raw(
     sgm: &mut Sgm,
     rectifier: &mut Rectifier,
@@ -175,7 +183,8 @@ mod tests {
     fn a_program_without_opencv_says_so_and_what_to_use() {
         let said = refused_without_opencv(StereoMethod::Sgbm).to_string();
         assert!(said.contains("`sgbm`") && said.contains("feature `opencv`") && said.contains("\"sgm\""), "{said}");
-        let named = |method| Method::admit(8, 8, &StereoConfig { method, ..StereoConfig::default() }).is_ok();
+        let named =
+            |method| Matcher::check_supported(8, 8, &StereoConfig { method, ..StereoConfig::default() }).is_ok();
         assert_eq!((named(StereoMethod::Bm), named(StereoMethod::Sgm)), (cfg!(feature = "opencv"), true));
     }
 }

@@ -1,0 +1,228 @@
+//! The images to train on, and how far a picture is from one: (1 - λ)|x - y| + λ(1 - SSIM) and its gradient by pixel.
+//!
+//! ```text
+//! ssim_rows -> ssim_columns -> loss_rows -> loss_columns        picture -> gradient by pixel, channel by channel
+//! ```
+
+use super::shape::{Scratch, Shape, RUN};
+use super::step::Target;
+use crate::gpu::kernels::{loss_columns, loss_rows, ssim_columns, ssim_rows};
+use crate::gpu::{Arena, Buf, Gpu, GpuError, Kernel, Recorder, Threads};
+use crate::limits::CAMERAS_MAX;
+use stipple_drivers::Fault;
+
+#[derive(Clone, Copy)]
+pub struct Buffers {
+    images: Buf<u32>,
+    masks: Buf<u32>,
+    /// By colour, plane by plane.
+    pub pixel_gradient: Buf<f32>,
+    pub ssim_sums: Buf<f32>,
+    /// |x - y|, gradient by gain and by offset.
+    pub loss_sums: Buf<[f32; 4]>,
+}
+
+impl Buffers {
+    pub fn new(arena: &mut Arena, shape: &Shape) -> Result<Buffers, Fault> {
+        let groups = (shape.channels * shape.loss_groups()) as usize;
+        let images = (shape.channels * shape.images) as usize;
+        Ok(Buffers {
+            images: arena.alloc("keyframes: images", shape.image_words() * images)?,
+            masks: arena.alloc("keyframes: masks", shape.cameras as usize * shape.mask_stride())?,
+            pixel_gradient: arena.alloc("pixels: gradient", shape.channels as usize * shape.pixels())?,
+            ssim_sums: arena.alloc("pixels: SSIM by workgroup", groups)?,
+            loss_sums: arena.alloc("pixels: L1 and exposure gradient by workgroup", groups)?,
+        })
+    }
+}
+
+pub struct Loss {
+    pub buffers: Buffers,
+    shape: Shape,
+    filtered: Buf<f32>,
+    slopes: Buf<f32>,
+    /// Pixels that count, by camera.
+    valid_pixels: [u32; CAMERAS_MAX],
+    /// An image on its way to the device.
+    words: Vec<u32>,
+    ssim_rows: Kernel<ssim_rows::K>,
+    ssim_columns: Kernel<ssim_columns::K>,
+    ssim_map: Kernel<ssim_columns::K>,
+    loss_rows: Kernel<loss_rows::K>,
+    loss_columns: Kernel<loss_columns::K>,
+}
+
+impl Loss {
+    /// Every pixel counts until a mask is set.
+    pub fn new(gpu: &mut Gpu, buffers: Buffers, scratch: &Scratch, shape: &Shape) -> Result<Loss, Fault> {
+        let mut loss = Loss {
+            buffers,
+            shape: *shape,
+            filtered: scratch.filtered,
+            slopes: scratch.slopes,
+            valid_pixels: [0; CAMERAS_MAX],
+            words: Vec::with_capacity(shape.image_words()),
+            ssim_rows: gpu.kernel(ssim_rows::Spec::default())?,
+            ssim_columns: gpu.kernel(ssim_columns::Spec { map: 0 })?,
+            ssim_map: gpu.kernel(ssim_columns::Spec { map: 1 })?,
+            loss_rows: gpu.kernel(loss_rows::Spec::default())?,
+            loss_columns: gpu.kernel(loss_columns::Spec::default())?,
+        };
+        let all = vec![255; shape.pixels()];
+        (0..shape.cameras as usize).try_for_each(|camera| loss.set_mask(gpu, camera, &all))?;
+        Ok(loss)
+    }
+
+    /// Stores one channel of an image: row-major, stride = width.
+    pub fn set_plane(&mut self, gpu: &mut Gpu, image: u32, channel: usize, plane: &[u8]) -> Result<(), GpuError> {
+        self.pack(plane);
+        let at = (image as usize * self.shape.channels as usize + channel) * self.shape.image_words();
+        gpu.upload(self.buffers.images, at, &self.words)
+    }
+
+    /// Stores an image, plane by plane.
+    pub fn set_image(&mut self, gpu: &mut Gpu, image: u32, planes: &[u8]) -> Result<(), GpuError> {
+        let mut planes = planes.chunks_exact(self.shape.pixels()).enumerate();
+        planes.try_for_each(|(channel, plane)| self.set_plane(gpu, image, channel, plane))
+    }
+
+    /// Pixels that count, of every image of a camera: zero is ignored.
+    pub fn set_mask(&mut self, gpu: &mut Gpu, camera: usize, mask: &[u8]) -> Result<(), GpuError> {
+        self.valid_pixels[camera] = mask.iter().filter(|m| **m != 0).count() as u32;
+        self.pack(mask);
+        gpu.upload(self.buffers.masks, camera * self.shape.mask_stride(), &self.words)
+    }
+
+    fn pack(&mut self, image: &[u8]) {
+        assert_eq!(image.len(), self.shape.pixels(), "images are of the shape the map was made with");
+        self.words.clear();
+        for row in image.chunks_exact(self.shape.width as usize) {
+            self.words.extend(row.chunks(4).map(|c| {
+                let mut b = [0; 4];
+                b[..c.len()].copy_from_slice(c);
+                u32::from_le_bytes(b)
+            }));
+        }
+    }
+
+    /// How many values a target compares: valid pixels, each channel's.
+    pub fn values(&self, target: &Target) -> f64 {
+        f64::from(self.valid_pixels[target.camera as usize].max(1) * self.shape.channels)
+    }
+
+    /// Channel by channel: each is an image of its own.
+    pub fn record(&self, rec: &mut Recorder, rendered: Buf<f32>, target: &Target, ssim_weight: f32) {
+        let (b, size) = (&self.buffers, [self.shape.width, self.shape.height]);
+        let values = self.values(target) as f32;
+        for channel in 0..self.shape.channels {
+            let group = channel * self.shape.loss_groups();
+            self.record_ssim(rec, rendered, target, channel, &self.ssim_columns, group);
+            rec.dispatch(
+                &self.loss_rows,
+                loss_rows::Bind { slopes: self.slopes.read(), filtered: self.filtered.write() },
+                loss_rows::Push { size },
+                self.rows(),
+            );
+            rec.dispatch(
+                &self.loss_columns,
+                loss_columns::Bind {
+                    filtered: self.filtered.read(),
+                    grey: rendered.read(),
+                    targets: b.images.read(),
+                    mask: self.mask(target).read(),
+                    grey_gradient: b.pixel_gradient.write(),
+                    loss_sums: b.loss_sums.write(),
+                },
+                loss_columns::Push {
+                    size,
+                    target: self.word_of(target, channel),
+                    plane: channel * size[0] * size[1],
+                    group,
+                    exposure: target.exposure.words(),
+                    l1_weight: (1.0 - ssim_weight) / values,
+                    ssim_weight: ssim_weight / values,
+                },
+                self.columns(),
+            );
+        }
+    }
+
+    /// SSIM by pixel of a picture against an image, mean of its channels; one where masked. `map` has room for them all.
+    pub fn similarity(
+        &self,
+        gpu: &mut Gpu,
+        rendered: Buf<f32>,
+        target: &Target,
+        map: &mut Vec<f32>,
+    ) -> Result<(), GpuError> {
+        let (n, channels) = (self.shape.pixels(), self.shape.channels);
+        map.resize(n * channels as usize, 1.0);
+        for (channel, plane) in map.chunks_exact_mut(n).enumerate() {
+            let mut rec = gpu.record();
+            self.record_ssim(&mut rec, rendered, target, channel as u32, &self.ssim_map, 0);
+            gpu.submit(rec)?;
+            gpu.download(self.slopes, 0, plane)?;
+        }
+        if channels > 1 {
+            (0..n).for_each(|i| map[i] = map[i..].iter().step_by(n).sum::<f32>() / channels as f32);
+            map.truncate(n);
+        }
+        Ok(())
+    }
+
+    fn record_ssim(
+        &self,
+        rec: &mut Recorder,
+        rendered: Buf<f32>,
+        target: &Target,
+        channel: u32,
+        columns: &Kernel<ssim_columns::K>,
+        group: u32,
+    ) {
+        let (b, size) = (&self.buffers, [self.shape.width, self.shape.height]);
+        rec.dispatch(
+            &self.ssim_rows,
+            ssim_rows::Bind {
+                grey: rendered.read(),
+                targets: b.images.read(),
+                mask: self.mask(target).read(),
+                filtered: self.filtered.write(),
+            },
+            ssim_rows::Push {
+                size,
+                target: self.word_of(target, channel),
+                plane: channel * size[0] * size[1],
+                exposure: target.exposure.words(),
+            },
+            self.rows(),
+        );
+        rec.dispatch(
+            columns,
+            ssim_columns::Bind {
+                filtered: self.filtered.read(),
+                mask: self.mask(target).read(),
+                slopes: self.slopes.write(),
+                ssim_sums: b.ssim_sums.write(),
+            },
+            ssim_columns::Push { size, group },
+            self.columns(),
+        );
+    }
+
+    fn mask(&self, target: &Target) -> Buf<u32> {
+        self.buffers.masks.part(target.camera as usize * self.shape.mask_stride(), self.shape.image_words())
+    }
+
+    /// Where a target's plane begins among the images, words.
+    fn word_of(&self, target: &Target, channel: u32) -> u32 {
+        (target.image * self.shape.channels + channel) * self.shape.image_words() as u32
+    }
+
+    fn rows(&self) -> Threads {
+        Threads::d1(self.shape.width.div_ceil(RUN) * self.shape.height)
+    }
+
+    fn columns(&self) -> Threads {
+        Threads::d1(self.shape.width * self.shape.height.div_ceil(RUN))
+    }
+}

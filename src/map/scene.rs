@@ -1,0 +1,67 @@
+//! The map as it stands: Gaussians on the device, the keyframes that they are trained on, and the cameras that saw these.
+
+use super::cameras::TrainingCamera;
+use super::exposure::{gain_from, median_exposure, Exposure};
+use super::pipeline::Pipeline;
+use super::step::{Rendered, Target};
+use super::store::Store;
+use super::view::View;
+use crate::gpu::{Gpu, GpuError};
+
+pub struct Scene {
+    pub gpu: Gpu,
+    pub pipeline: Pipeline,
+    pub store: Store,
+    pub cameras: Vec<TrainingCamera>,
+    /// The last picture.
+    pub rendered: Rendered,
+}
+
+impl Scene {
+    /// The camera of a stored image.
+    pub fn camera(&self, index: usize) -> &TrainingCamera {
+        &self.cameras[self.store.camera(index)]
+    }
+
+    /// Where a stored image was taken, as far as is known.
+    pub fn view(&self, index: usize) -> View {
+        self.camera(index).view(self.store.world_from_body(index))
+    }
+
+    /// What a step on a stored image compares with.
+    pub fn target(&self, index: usize) -> Target {
+        Target { image: index as u32, camera: self.store.camera(index) as u32, exposure: self.store.exposure(index) }
+    }
+
+    /// Draws the map into `rendered`.
+    pub fn render(&mut self, view: &View) -> Result<(), GpuError> {
+        self.pipeline.render(&mut self.gpu, view, &mut self.rendered).map(|_| ())
+    }
+
+    /// Takes the gain of a new image from what `rendered`, its view, already shows of it. The first is the gauge.
+    pub fn expose(&mut self, index: usize) {
+        if self.store.training().first() == Some(&(index as u32)) {
+            return;
+        }
+        let offset = self.store.get(index).refined.exposure.offset;
+        if let Some(gain) = gain_from(self.store.planes(index), offset, &self.rendered, &self.camera(index).valid) {
+            self.store.get_mut(index).refined.exposure.gain = gain;
+        }
+    }
+
+    /// Puts the Gaussians of anchors that were corrected by more than `tolerance` (m, rad) where their anchors are now;
+    /// how many anchors.
+    pub fn apply_corrections(&mut self, tolerance: f64) -> Result<u64, GpuError> {
+        let mut moved = 0;
+        let displaced = self.store.displaced(tolerance).inspect(|_| moved += 1);
+        self.pipeline.pool.move_blocks(&mut self.gpu, displaced)?;
+        Ok(moved)
+    }
+
+    /// The exposure of the median training view: what takes the map's colours, whose gauge is none of a camera's, to what
+    /// most images show. Allocates.
+    pub fn median_exposure(&self) -> Exposure {
+        let exposures: Vec<Exposure> = self.store.training().iter().map(|i| self.store.exposure(*i as usize)).collect();
+        median_exposure(&exposures).unwrap_or_default()
+    }
+}

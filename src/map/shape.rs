@@ -1,0 +1,132 @@
+//! How large the buffers of the splat kernels are, and the bytes that the stages of a step use in turn.
+
+use super::sort::Pairs;
+use crate::gpu::{Arena, Buf, ALIGN};
+use crate::limits::CAMERAS_MAX;
+use stipple_drivers::{Fault, FaultKind};
+
+/// Capacities of the map, from the board's budget and the training cameras.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Shape {
+    /// Mapping resolution, px.
+    pub width: u32,
+    pub height: u32,
+    pub splats: u32,
+    /// (Gaussian, tile) pairs of one view.
+    pub intersections: u32,
+    /// Images kept to train on.
+    pub images: u32,
+    /// Channels of a colour: 1, grey, or 3.
+    pub channels: u32,
+    /// Cameras that train, each with a mask.
+    pub cameras: u32,
+}
+
+/// Pixels of a run filtered by one thread of the loss: RUN of ssim.glsl.
+pub const RUN: u32 = 8;
+/// Invocations of a workgroup of every kernel that reduces.
+pub const GROUP: u32 = 64;
+/// Side of the smallest tile, px: 8 lanes with columns of 8, or 32 with columns of 2.
+const TILE_MIN: u32 = 8;
+
+impl Shape {
+    pub fn check(&self) -> Result<(), Fault> {
+        let sizes = [self.width, self.height, self.splats, self.intersections, self.images];
+        if !sizes.contains(&0) && [1, 3].contains(&self.channels) && (1..=CAMERAS_MAX as u32).contains(&self.cameras) {
+            return Ok(());
+        }
+        let what = format!("{self:?} has a zero, neither 1 nor 3 channels, or no or too many cameras");
+        Err(Fault::new(FaultKind::Config, "map", what, "raise the board's [budget]"))
+    }
+
+    pub fn pixels(&self) -> usize {
+        self.width as usize * self.height as usize
+    }
+
+    /// Words of one stored 8-bit image; rows are padded to whole words.
+    pub fn image_words(&self) -> usize {
+        self.width.div_ceil(4) as usize * self.height as usize
+    }
+
+    /// Words from one camera's mask to the next: where a buffer may be bound.
+    pub fn mask_stride(&self) -> usize {
+        aligned(self.image_words())
+    }
+
+    /// Workgroups of the column passes of the loss, each channel's.
+    pub fn loss_groups(&self) -> u32 {
+        (self.width * self.height.div_ceil(RUN)).div_ceil(GROUP)
+    }
+
+    /// Words of an intersection's gradient: SLOT of raster_backward.
+    pub fn gradient_words(&self) -> usize {
+        if self.channels == 3 {
+            12
+        } else {
+            8
+        }
+    }
+
+    /// Elements of a buffer that only colour maps need; a buffer cannot be empty.
+    pub fn in_colour(&self, n: usize) -> usize {
+        if self.channels == 3 {
+            n
+        } else {
+            1
+        }
+    }
+
+    pub fn tiles_max(&self) -> usize {
+        // Half as wide and twice as high is as much, but for a ragged edge.
+        (self.width.div_ceil(TILE_MIN) + 1) as usize * self.height.div_ceil(TILE_MIN) as usize
+    }
+}
+
+/// Bytes used in turn: to sort, then by the loss, then for the gradients of intersections. What a step needs after its
+/// stage is not here.
+#[derive(Clone, Copy)]
+pub struct Scratch {
+    /// While sorting. Keys of Gaussians and of intersections are not needed at the same time, so they are the same.
+    pub depth_keys: Buf<u32>,
+    pub isect_keys: Buf<u32>,
+    spare: Pairs,
+    /// In the loss: filtered moments (5 planes) and SSIM slopes (3).
+    pub filtered: Buf<f32>,
+    pub slopes: Buf<f32>,
+    /// In the backward pass.
+    pub isect_gradients: Buf<f32>,
+}
+
+/// Words of `n` and the gap to where the next buffer may start.
+fn aligned(n: usize) -> usize {
+    n.next_multiple_of(ALIGN as usize / size_of::<u32>())
+}
+
+impl Scratch {
+    pub fn new(arena: &mut Arena, shape: &Shape) -> Result<Scratch, Fault> {
+        let (slots, isects, pixels) = (shape.splats as usize + 1, shape.intersections as usize, shape.pixels());
+        let keys = slots.max(isects);
+        let planes = aligned(5 * pixels) + 3 * pixels;
+        let gradients = shape.gradient_words() * isects;
+        let words = planes.max(gradients).max(3 * aligned(keys));
+        let all = arena.alloc::<u32>("intersections: gradients, over sort keys and loss planes", words)?;
+        let nth = |i: usize| all.part(i * aligned(keys), keys);
+        Ok(Scratch {
+            depth_keys: nth(0).part(0, slots),
+            isect_keys: nth(0).part(0, isects),
+            spare: Pairs { keys: nth(1), payload: nth(2) },
+            filtered: all.part(0, 5 * pixels).cast(),
+            slopes: all.part(aligned(5 * pixels), 3 * pixels).cast(),
+            isect_gradients: all.part(0, gradients).cast(),
+        })
+    }
+
+    /// What to sort `keys` from and to, so that after `passes` the payload is in `into`.
+    pub fn pairs(&self, keys: Buf<u32>, into: Buf<u32>, passes: u32) -> (Pairs, Pairs) {
+        let (from, to) = match passes % 2 {
+            0 => (into, self.spare.payload),
+            _ => (self.spare.payload, into),
+        };
+        (Pairs { keys, payload: from }, Pairs { keys: self.spare.keys, payload: to })
+    }
+}

@@ -1,0 +1,230 @@
+//! The images the map is trained and judged on, at mapping resolution, and what is known of each. Everything is sized at
+//! boot; full is a value.
+
+use super::exposure::Exposure;
+use super::keyframes::{Keyframe, PoseCorrection};
+use super::refine::Refinement;
+use super::shape::Shape;
+use stipple_drivers::{Image, Nanos, Pose};
+
+/// One camera's image of a keyframe in the store.
+#[derive(Clone, Copy, Debug)]
+pub struct Stored {
+    pub id: u64,
+    pub t: Nanos,
+    /// Odometry's pose, with its corrections.
+    pub given: Pose,
+    /// `given` when the Gaussians of an anchor were last put in place.
+    pub placed: Pose,
+    pub held_out: bool,
+    pub anchor: bool,
+    /// What the mapper found out beside it.
+    pub refined: Refinement,
+}
+
+impl Stored {
+    /// Odometry's pose with the mapper's own correction.
+    pub fn world_from_refined(&self) -> Pose {
+        self.given * self.refined.body_from_refined
+    }
+}
+
+/// The images the map trains on, at mapping resolution, and what is known of each. A keyframe has one of every camera
+/// that trains, side by side; what is known of the body is in the first of them.
+pub struct Store {
+    cameras: usize,
+    /// Planes of an image: grey, or red, green and blue.
+    channels: usize,
+    entries: Vec<Stored>,
+    planes: Vec<Image>,
+    training: Vec<u32>,
+}
+
+impl Store {
+    pub fn new(shape: &Shape) -> Store {
+        let (capacity, channels) = (shape.images as usize, shape.channels as usize);
+        let image = || Image::new(shape.width as usize, shape.height as usize);
+        Store {
+            cameras: shape.cameras as usize,
+            channels,
+            entries: Vec::with_capacity(capacity),
+            planes: (0..capacity * channels).map(|_| image()).collect(),
+            training: Vec::with_capacity(capacity),
+        }
+    }
+
+    pub fn len(&self) -> usize {
+        self.entries.len()
+    }
+
+    /// Whether a keyframe would find no room for all its images.
+    pub fn is_full(&self) -> bool {
+        (self.entries.len() + self.cameras) * self.channels > self.planes.len()
+    }
+
+    /// The camera that an image is of.
+    pub fn camera(&self, index: usize) -> usize {
+        index % self.cameras
+    }
+
+    /// The first image of the same keyframe.
+    pub fn first(&self, index: usize) -> usize {
+        index - self.camera(index)
+    }
+
+    /// Where the body was when an image was taken: odometry's pose with the mapper's own correction.
+    pub fn world_from_body(&self, index: usize) -> Pose {
+        self.get(self.first(index)).world_from_refined()
+    }
+
+    /// Takes the next camera of a keyframe, whose planes `draw` makes one by one; `None` when the store is full.
+    pub fn add(&mut self, keyframe: &Keyframe, mut draw: impl FnMut(usize, &mut Image)) -> Option<usize> {
+        let index = self.entries.len();
+        let planes = self.planes.get_mut(index * self.channels..(index + 1) * self.channels)?;
+        planes.iter_mut().enumerate().for_each(|(channel, plane)| draw(channel, plane));
+        let &Keyframe { id, t, world_from_body, held_out, .. } = keyframe;
+        let mut refined = Refinement::default();
+        // Cameras change their exposure slowly: the last one's is the best guess. Not so its offset, which cameras keep: what
+        // training put there is the blur of a map that was not finished, and handed on it grows from view to view, as gains
+        // fall to a quarter and seeds get ever more contrast to make up for it.
+        let last = self.training.iter().rev().find(|k| self.camera(**k as usize) == self.camera(index));
+        refined.exposure.gain = last.map_or(1.0, |&k| self.get(k as usize).refined.exposure.gain);
+        let (given, placed) = (world_from_body, world_from_body);
+        self.entries.push(Stored { id, t, given, placed, held_out, anchor: false, refined });
+        if !held_out {
+            self.training.push(index as u32);
+        }
+        Some(index)
+    }
+
+    pub fn get(&self, index: usize) -> &Stored {
+        &self.entries[index]
+    }
+
+    pub fn get_mut(&mut self, index: usize) -> &mut Stored {
+        &mut self.entries[index]
+    }
+
+    /// Grey, or red, green and blue.
+    pub fn planes(&self, index: usize) -> &[Image] {
+        &self.planes[index * self.channels..][..self.channels]
+    }
+
+    /// An image's exposure: its own where it is trained on; of one held out, what those beside it in time make likely.
+    pub fn exposure(&self, index: usize) -> Exposure {
+        let e = self.get(index);
+        if e.held_out {
+            self.between(index).exposure
+        } else {
+            e.refined.exposure
+        }
+    }
+
+    /// An image's exposure and its keyframe's correction, which all its images share.
+    fn refined(&self, index: usize) -> Refinement {
+        let mut refined = self.get(index).refined;
+        refined.body_from_refined = self.get(self.first(index)).refined.body_from_refined;
+        refined
+    }
+
+    /// What the keyframes trained on before and after one were refined by, at its time.
+    pub fn between(&self, index: usize) -> Refinement {
+        let t = self.get(index).t;
+        let at = self.training.partition_point(|k| (*k as usize) < index);
+        let same = |k: &&u32| self.camera(**k as usize) == self.camera(index);
+        let of = |k: &u32| (self.get(*k as usize).t, self.refined(*k as usize));
+        let after = self.training[at..].iter().find(same).map(of);
+        let before = self.training[..at].iter().rev().find(same).map(of);
+        match (before, after) {
+            (Some((t0, a)), Some((t1, b))) if t1 > t0 => {
+                a.towards(&b, ((t - t0).secs() / (t1 - t0).secs()).clamp(0.0, 1.0))
+            }
+            (one, other) => one.or(other).map_or_else(Refinement::default, |(_, refined)| refined),
+        }
+    }
+
+    /// After the exposure of one image that is trained on moved: all of them move back by its share, so that their mean
+    /// stays.
+    pub fn balance_exposure(&mut self, moved: [f64; 2]) {
+        let share = moved.map(|x| -x / self.training.len().max(1) as f64);
+        for k in &self.training {
+            self.entries[*k as usize].refined.shift_exposure(share);
+        }
+    }
+
+    /// Indices of keyframes that may be trained on.
+    pub fn training(&self) -> &[u32] {
+        &self.training
+    }
+
+    pub fn anchors(&self) -> usize {
+        self.entries.iter().filter(|e| e.anchor).count()
+    }
+
+    /// A correction moves what was refined along; what is not finite moves nothing. Answers whether there was one to take.
+    pub fn correct(&mut self, correction: &PoseCorrection) -> bool {
+        let to = correction.world_from_body;
+        // The newest are corrected most.
+        let found = self.entries.iter_mut().step_by(self.cameras).rev().find(|e| e.id == correction.id);
+        let Some(e) = found.filter(|_| to.p.is_finite() && to.q.is_finite()) else { return false };
+        e.given = to;
+        true
+    }
+
+    /// Anchors whose pose was corrected by more than `tolerance` (m, rad) since their Gaussians were put in place, and
+    /// by what; they count as in place from here on.
+    pub fn displaced(&mut self, tolerance: f64) -> impl Iterator<Item = (u32, Pose)> + '_ {
+        self.entries.iter_mut().enumerate().filter(|(_, e)| e.anchor).filter_map(move |(i, e)| {
+            let by = e.given * e.placed.inverse();
+            let turned = (e.given.q * e.placed.q.inverse()).to_scaled_axis().length();
+            if (e.given.p - e.placed.p).length() <= tolerance && turned <= tolerance {
+                return None;
+            }
+            e.placed = e.given;
+            Some((i as u32, by))
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::DVec3;
+
+    fn keyframe(id: u64, held_out: bool) -> Keyframe {
+        Keyframe { id, held_out, ..Keyframe::default() }
+    }
+
+    fn store(images: u32, cameras: u32) -> Store {
+        Store::new(&Shape { width: 2, height: 2, splats: 1, intersections: 1, images, channels: 1, cameras })
+    }
+
+    #[test]
+    fn held_out_keyframes_are_stored_but_not_for_training() {
+        let mut s = store(3, 1);
+        for id in 0..3 {
+            assert_eq!(s.add(&keyframe(id, id == 1), |_, i| i.pixels.fill(9)), Some(id as usize));
+        }
+        assert_eq!(s.add(&keyframe(3, false), |_, _| {}), None);
+        assert_eq!(s.training(), [0, 2]);
+        assert_eq!((s.len(), s.planes(1)[0].pixels[3]), (3, 9));
+    }
+
+    #[test]
+    fn images_of_one_keyframe_share_its_pose_and_not_their_exposure() {
+        let mut s = store(5, 2);
+        for id in 0..2 {
+            assert!(!s.is_full());
+            for camera in 0..2 {
+                let index = s.add(&keyframe(id, false), |_, _| {}).expect("room for five");
+                assert_eq!((s.camera(index), s.first(index)), (camera, 2 * id as usize));
+            }
+        }
+        assert!(s.is_full(), "one image more is no keyframe");
+        assert!(s.correct(&PoseCorrection { id: 1, world_from_body: Pose { p: DVec3::X, ..Pose::IDENTITY } }));
+        assert_eq!([1, 2, 3].map(|i| s.world_from_body(i).p), [DVec3::ZERO, DVec3::X, DVec3::X]);
+        s.get_mut(1).refined.exposure.gain = 2.0;
+        assert_eq!(s.add(&keyframe(2, false), |_, _| {}), Some(4));
+        assert_eq!([0, 1, 4].map(|i| s.exposure(i).gain), [1.0, 2.0, 1.0]);
+    }
+}
