@@ -8,14 +8,16 @@ pub const STATES: usize = 5;
 pub const KEYFRAMES: usize = 10;
 /// Time offset, extrinsics of every camera, scale of the inertial unit, where they are estimated.
 pub const RIG_DIM: usize = 1 + 6 * CAMERAS_MAX + 6;
-/// Window dimension at its peak: one more of each just before marginalisation.
+/// Frames in the window at its peak: one more of each just before marginalization.
+pub const FRAMES: usize = STATES + 1 + KEYFRAMES + 1;
+/// Window dimension at its peak.
 pub const WINDOW_DIM: usize = 15 * (STATES + 1) + 6 * (KEYFRAMES + 1) + RIG_DIM;
 /// Points tracked in one camera at a time.
 pub const TRACKS: usize = 300;
 /// Landmarks alive in the window.
 pub const LANDMARKS: usize = 1200;
 /// Observations of one landmark: every camera of every frame of the window.
-pub const OBSERVATIONS: usize = CAMERAS_MAX * (STATES + 1 + KEYFRAMES + 1);
+pub const OBSERVATIONS: usize = CAMERAS_MAX * FRAMES;
 /// Inertial samples between two frames: 1 kHz over half a second.
 pub const IMU_BETWEEN_FRAMES: usize = 512;
 /// Pyramid levels, the full image included.
@@ -23,3 +25,4 @@ pub const PYRAMID_LEVELS: usize = 4;
 
 const _: () = assert!(LANDMARKS >= 2 * TRACKS, "a keyframe change keeps the old landmarks while new ones arrive");
 const _: () = assert!(STATES >= 2, "an inertial factor needs two states");
+const _: () = assert!(FRAMES <= u8::MAX as usize, "observations name slots in a byte");

@@ -291,10 +291,10 @@ fn truncated_image_is_counted_and_the_run_goes_on() {
     let report: serde_json::Value = serde_json::from_slice(&fs::read(out.join("report.json")).unwrap()).unwrap();
     assert_eq!(report["count_frames_unreadable"], 1);
     // What the report says of the estimator's state, every bit and reason by name.
-    for bit in stipple::vio::health::Health::NAMES {
+    for bit in stipple::vio::Health::NAMES {
         assert!(report[format!("health_{bit}_frames")].is_u64(), "{bit}");
     }
-    for (counter, _) in stipple::vio::Stats::default().counters() {
+    for (counter, _) in stipple::vio::Stats::default().list() {
         assert!(report[format!("count_{counter}")].is_u64(), "{counter}");
     }
     assert!(report["quality_p50"].as_u64().unwrap() > 0 && report["quality_under_50"].is_number());

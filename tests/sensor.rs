@@ -12,8 +12,7 @@ use std::sync::{Arc, OnceLock};
 use stipple::config::{FrontendConfig, VioConfig};
 use stipple::frontend::{Frontend, Prediction, Tracks};
 use stipple::output::metrics::trajectory_error;
-use stipple::vio::rig::RigEstimate;
-use stipple::vio::Vio;
+use stipple::vio::{Predictor, RigEstimate, Vio};
 use stipple_drivers::sim::{rig_named, Scenario, Sim};
 use stipple_drivers::{Calibration, Frames, ImuSample, Pose, Span, TimedPose};
 use world::{Noise, Path, World, FRAME_SECS, RATE_HZ};
@@ -52,17 +51,21 @@ fn render(scenario: &Scenario) -> Flight {
 
 fn fly(what: &str, flight: &Flight, vio: &VioConfig, frontend: &FrontendConfig) -> Found {
     let mut tracker = Frontend::new(&flight.calibration, frontend).unwrap();
+    let mut predictor = Predictor::new(&flight.calibration, vio);
     let mut vio = Vio::new(&flight.calibration, vio);
+    let mut before = None;
     let mut estimated = Vec::new();
     let mut samples = flight.imu.iter();
     for frames in &flight.frames {
         for s in samples.by_ref() {
             vio.on_imu(*s);
+            predictor.on_imu(*s);
             if s.t >= frames.t {
                 break;
             }
         }
-        let prediction = Prediction { prev_from_now: vio.predict_motion(frames.t) };
+        let prediction = Prediction { prev_from_now: predictor.motion_to(frames.t, before.as_ref()) };
+        before = vio.odometry();
         let tracks = tracker.track(frames, &prediction);
         if let Some(o) = vio.on_tracks(tracks).odometry {
             estimated.push(TimedPose { t: o.t, pose: o.world_from_body });

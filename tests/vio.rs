@@ -14,7 +14,7 @@ use stipple::config::{FrontendConfig, VioConfig};
 use stipple::frontend::{Frontend, Prediction, Tracks};
 use stipple::mem::{heap_after_seal, seal_thread, unsealed, CountingAllocator};
 use stipple::output::metrics::trajectory_error;
-use stipple::vio::Vio;
+use stipple::vio::{Predictor, Update, Vio};
 use stipple_drivers::replay::{OpenOptions, Recording};
 use stipple_drivers::sim::{Scenario, Sim};
 use stipple_drivers::{Calibration, Frames, ImuSample, Span, TimedPose};
@@ -147,6 +147,8 @@ fn follow(
 ) -> (Run, [f64; 2]) {
     let mut frontend = Frontend::new(rig, &FrontendConfig::default()).unwrap();
     let mut vio = Vio::new(rig, &VioConfig::default());
+    let mut predictor = Predictor::new(rig, &VioConfig::default());
+    let mut before = None;
     let mut frames = Arc::new(Frames::for_rig(rig));
     let mut estimated = Vec::new();
     let mut secs = [0.0; 2];
@@ -156,9 +158,12 @@ fn follow(
         read(i, Arc::make_mut(&mut frames));
         while let Some(s) = imu.next_if(|s| s.t <= frames.t + period) {
             vio.on_imu(*s);
+            predictor.on_imu(*s);
         }
         let start = std::time::Instant::now();
-        let tracks = frontend.track(&frames, &Prediction { prev_from_now: vio.predict_motion(frames.t) });
+        let prev_from_now = predictor.motion_to(frames.t, before.as_ref());
+        before = vio.odometry();
+        let tracks = frontend.track(&frames, &Prediction { prev_from_now });
         let middle = std::time::Instant::now();
         let update = vio.on_tracks(tracks);
         secs[0] += (middle - start).as_secs_f64();
@@ -187,7 +192,7 @@ fn fly(scenario: &Scenario) -> (Run, [f64; 2]) {
     follow(&rig, &imu, truth, sim.frame_count(), |i, out| sim.render(i, out))
 }
 
-fn trace(i: usize, tracks: &Tracks, vio: &Vio, u: &stipple::vio::Update, truth: &[TimedPose]) {
+fn trace(i: usize, tracks: &Tracks, vio: &Vio, u: &Update, truth: &[TimedPose]) {
     let Some(o) = u.odometry else { return eprintln!("{i}: not running, {} tracks", tracks.cameras[0].len()) };
     let g = stipple_drivers::types::pose_at(truth, o.t, Span::from_secs(0.1));
     let tilt = g.map_or(f64::NAN, |g| {
@@ -195,15 +200,12 @@ fn trace(i: usize, tracks: &Tracks, vio: &Vio, u: &stipple::vio::Update, truth: 
         a.angle_between(b).to_degrees()
     });
     eprintln!(
-        "{i}: kf {} tracks {}/{} connected {} landmarks {} it {} cost {:.1} -> {:.1} tilt {tilt:.2} v {:.3} bg {:.4} ba {:.3}",
+        "{i}: kf {} tracks {}/{} connected {} iterations {} tilt {tilt:.2} v {:.3} bg {:.4} ba {:.3}",
         u.keyframe as u8,
         tracks.cameras[0].len(),
         tracks.cameras[1].len(),
         u.connected,
-        vio.landmarks(),
-        u.outcome.iterations,
-        u.outcome.cost_before,
-        u.outcome.cost,
+        vio.stats().solver_iterations,
         o.v_world,
         o.gyro_bias,
         o.accel_bias

@@ -22,31 +22,19 @@ pub mod patch;
 mod pattern;
 pub mod pyramid;
 mod rig;
+mod tracks;
+
+pub use tracks::{Track, Tracks};
 
 use crate::config::FrontendConfig;
 use crate::limits::{CAMERAS_MAX, PYRAMID_LEVELS, TRACKS};
-use crate::mem::{Footprint, List};
+use crate::mem::Footprint;
 use detect::Detector;
 use patch::{align_stack, take_stack, Stack, Template, Warp, STEP_MIN};
 use pyramid::{Levels, Pyramid, Seen};
 use rig::Rig;
 use std::sync::Arc;
 use stipple_drivers::{Calibration, Fault, FaultKind, Frames, Nanos, Pose};
-
-/// A point tracked in one camera. The same `id` in two cameras is the same point in space.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Track {
-    pub id: u64,
-    /// Pixel in the raw (distorted) image; integer = pixel centre.
-    pub px: [f32; 2],
-}
-
-/// Points seen at one instant, `cameras[camera]`, ascending id.
-#[derive(Clone, Debug, Default)]
-pub struct Tracks {
-    pub t: Nanos,
-    pub cameras: [List<Track, TRACKS>; CAMERAS_MAX],
-}
 
 /// What is known of the motion before the images are looked at.
 #[derive(Clone, Copy, Debug, Default)]

@@ -1,7 +1,7 @@
 //! Three by three blocks of larger matrices, from and to the vector types the rest of the program uses.
 
-use glam::DMat3;
-use nalgebra::SMatrix;
+use glam::{DMat3, DVec3};
+use nalgebra::{Matrix3, SMatrix, Vector3};
 
 /// The block whose first row and column these are.
 pub fn block<const R: usize, const C: usize>(m: &SMatrix<f64, R, C>, row: usize, col: usize) -> DMat3 {
@@ -15,4 +15,12 @@ pub fn put<const R: usize, const C: usize>(m: &mut SMatrix<f64, R, C>, row: usiz
             m[(row + r, col + c)] = x.col(c)[r];
         }
     }
+}
+
+pub fn vector(v: DVec3) -> Vector3<f64> {
+    Vector3::new(v.x, v.y, v.z)
+}
+
+pub fn matrix(m: DMat3) -> Matrix3<f64> {
+    Matrix3::from_fn(|i, j| m.col(j)[i])
 }

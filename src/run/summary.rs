@@ -11,7 +11,7 @@ use crate::output::metrics::{percentile, trajectory_error, TrajectoryError};
 use crate::output::panel::{panel, Picture, View};
 use crate::output::report::{seconds_to, CurvePoint, ExtrinsicsFound, KernelTime, Report, GOOD_DB};
 use crate::output::{atomically, ply, trajectory, OutputDir};
-use crate::vio::rig::RigEstimate;
+use crate::vio::RigEstimate;
 use stipple_drivers::{host, Fault, Nanos, TimedPose};
 
 /// Keyframes drawn into DIR/renders.
@@ -84,7 +84,7 @@ pub fn conclude(title: Title, mut flown: Flown, out: &OutputDir) -> Result<Repor
     report.rss_peak_bytes = host::rss_peak_bytes();
     report.set_counters(&counted(&flown, &title.opened));
     if let Some(run) = flown.tracker.odometry() {
-        report.set_health(run.back.tally().health());
+        report.set_health(run.back.health_frames());
     }
     write_files(&report, &flown, &estimated, &title.truth, error.as_ref(), &panels, out)?;
     Ok(report)
@@ -128,7 +128,7 @@ fn track_figures(report: &mut Report, flown: &Flown) -> Vec<TimedPose> {
     report.estimator_ms_p99 = percentile(&run.back.ms, 0.99);
     flown.tracker.rig().into_iter().for_each(|rig| rig_figures(report, &rig));
     report.estimator_bytes = Some(run.bytes);
-    if let Some((least, median, under)) = run.back.tally().quality() {
+    if let Some((least, median, under)) = run.back.quality_summary() {
         (report.quality_min, report.quality_p50) = (Some(least.into()), Some(median.into()));
         report.quality_under_50 = Some(under);
     }

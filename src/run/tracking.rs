@@ -2,13 +2,13 @@
 //!
 //! ```text
 //! next() -> front end -tracked-> back end -> give()      packets
-//!               ^---predictors----'                      one a frame
+//!               ^-----states------'                      one a frame
 //! ```
 //!
 //! The two halves of odometry share one thread in turns or have a thread each. The front end follows points, the back end
-//! estimates. All that passes between them travels in a `FramePacket`, besides the `Predictor` that the back end gives
-//! back. The front end begins frame k when the predictor of frame k-2 has come, and predicts from that even where the state
-//! after k-1 is known: so neither queue can fill, and poses are the same bit for bit on one thread and on two.
+//! estimates. All that passes between them travels in a `FramePacket`, besides the state that the back end gives back. The
+//! front end begins frame k when the state after frame k-2 has come, and predicts from that even where the one after k-1 is
+//! known: so neither queue can fill, and poses are the same bit for bit on one thread and on two.
 //!
 //! With `--poses` the poses come from a table, odometry is skipped, and every frame is a keyframe.
 
@@ -16,14 +16,9 @@ use super::waker::{SetOnDrop, Waker};
 use crate::config::Board;
 use crate::counters::Counters;
 use crate::frontend::{Frontend, Prediction, Tracks};
-use crate::limits::IMU_BETWEEN_FRAMES;
+use crate::limits::{FRAMES, IMU_BETWEEN_FRAMES};
 use crate::mem::{seal_thread, List};
-use crate::vio::health::Health;
-use crate::vio::predict::Predictor;
-use crate::vio::rig::RigEstimate;
-use crate::vio::samples::ImuRing;
-use crate::vio::window::FRAMES;
-use crate::vio::{Odometry, Tally, Vio};
+use crate::vio::{Health, Odometry, Predictor, RigEstimate, Vio};
 use crossbeam_queue::ArrayQueue;
 use std::sync::atomic::AtomicBool;
 use std::sync::Arc;
@@ -113,8 +108,7 @@ pub struct OdometryRun {
 /// The half that follows points.
 pub struct Front {
     frontend: Frontend,
-    imu: ImuRing,
-    last: Option<Nanos>,
+    predictor: Predictor,
     /// Wall time of each frame, ms.
     pub ms: Vec<f64>,
     /// Wall time of all frames, with what was waited for the back end, s.
@@ -124,19 +118,14 @@ pub struct Front {
 }
 
 impl Front {
-    pub fn track(&mut self, packet: &mut FramePacket, predictor: &Predictor) {
+    /// `state` is the back end's after the frame before the last.
+    pub fn track(&mut self, packet: &mut FramePacket, state: Option<&Odometry>) {
         packet.begun = Instant::now();
-        for sample in packet.imu.iter() {
-            if self.imu.admits(sample) {
-                self.imu.push(*sample);
-            }
-        }
+        packet.imu.iter().for_each(|s| self.predictor.on_imu(*s));
         if packet.imu_only {
             return;
         }
-        let t = packet.frames.t;
-        let prediction = Prediction { prev_from_now: self.last.map(|prev| predictor.motion(&self.imu, prev, t)) };
-        self.last = Some(t);
+        let prediction = Prediction { prev_from_now: self.predictor.motion_to(packet.frames.t, state) };
         packet.tracks.clone_from(self.frontend.track(&packet.frames, &prediction));
         let secs = packet.begun.elapsed().as_secs_f64();
         self.busy_s += secs;
@@ -160,13 +149,19 @@ pub struct Back {
 }
 
 impl Back {
-    /// Counts of frames by health and quality.
-    pub fn tally(&self) -> &Tally {
-        self.vio.tally()
+    /// Names of health and the frames that had each, as `Vio::health_frames`.
+    pub fn health_frames(&self) -> impl Iterator<Item = (&'static str, u64)> + '_ {
+        self.vio.health_frames()
     }
 
-    pub fn predictor(&self) -> Predictor {
-        self.vio.predictor()
+    /// Least and median quality and the part of frames under 50, as `Vio::quality_summary`.
+    pub fn quality_summary(&self) -> Option<(u8, u8, f64)> {
+        self.vio.quality_summary()
+    }
+
+    /// The newest state.
+    pub fn odometry(&self) -> Option<Odometry> {
+        self.vio.odometry()
     }
 
     /// Fills in `packet.tracked`.
@@ -214,8 +209,7 @@ impl OdometryRun {
         Ok(OdometryRun {
             front: Front {
                 frontend: Frontend::new(calibration, &board.frontend)?,
-                imu: ImuRing::new(),
-                last: None,
+                predictor: Predictor::new(calibration, &board.vio),
                 ms: Vec::with_capacity(frames),
                 busy_s: 0.0,
                 cpu_s: None,
@@ -289,7 +283,7 @@ impl Tracker {
             ("frontend_images_refused", f.images_refused),
             ("frames_without_odometry", without as u64),
         ];
-        list.extend(run.back.vio.stats().counters());
+        list.extend(run.back.vio.stats().list());
         list
     }
 }
@@ -309,7 +303,7 @@ fn look_up(poses: &[TimedPose], packet: &mut FramePacket, counters: &Counters) {
 /// What the threads of tracking share.
 pub struct Link {
     tracked: ArrayQueue<Box<FramePacket>>,
-    predictors: ArrayQueue<Predictor>,
+    states: ArrayQueue<Option<Odometry>>,
     /// Wakes the thread that takes packets.
     pub taker: Waker,
     back: Waker,
@@ -321,7 +315,7 @@ impl Default for Link {
     fn default() -> Link {
         Link {
             tracked: ArrayQueue::new(BETWEEN_HALVES),
-            predictors: ArrayQueue::new(BETWEEN_HALVES),
+            states: ArrayQueue::new(BETWEEN_HALVES),
             taker: Waker::default(),
             back: Waker::default(),
             front_done: AtomicBool::new(false),
@@ -379,12 +373,12 @@ pub fn in_turns(
     mut give: impl FnMut(Box<FramePacket>),
 ) {
     seal();
-    let start = back.predictor();
-    let (mut predictor, mut next) = (start, start);
+    let start = back.odometry();
+    let (mut state, mut next) = (start, start);
     while let Some(mut packet) = inlet.next(link) {
-        front.track(&mut packet, &predictor);
+        front.track(&mut packet, state.as_ref());
         back.estimate(&mut packet);
-        (predictor, next) = (next, back.predictor());
+        (state, next) = (next, back.odometry());
         give(packet);
     }
     front.cpu_s = Some(thread_cpu().total_s());
@@ -395,20 +389,20 @@ pub fn follow_points(
     link: &Link,
     mut inlet: Inlet<impl FnMut() -> Option<Box<FramePacket>>>,
     front: &mut Front,
-    start: Predictor,
+    start: Option<Odometry>,
 ) {
     let _ended = SetOnDrop(&link.front_done, Some(&link.back));
     seal();
-    let (mut predictor, mut frames) = (start, 0u64);
+    let (mut state, mut frames) = (start, 0u64);
     loop {
         if frames >= BETWEEN_HALVES as u64 {
             let begun = Instant::now();
-            let Some(newer) = link.taker.wait(&link.back_done, || link.predictors.pop()) else { break };
+            let Some(newer) = link.taker.wait(&link.back_done, || link.states.pop()) else { break };
             front.busy_s += begun.elapsed().as_secs_f64();
-            predictor = newer;
+            state = newer;
         }
         let Some(mut packet) = inlet.next(link) else { break };
-        front.track(&mut packet, &predictor);
+        front.track(&mut packet, state.as_ref());
         frames += 1;
         // There is room: the back end has finished all but the last.
         let _ = link.tracked.push(packet);
@@ -423,7 +417,7 @@ pub fn estimate(link: &Link, back: &mut Back, mut give: impl FnMut(Box<FramePack
     seal();
     while let Some(mut packet) = link.back.wait(&link.front_done, || link.tracked.pop()) {
         back.estimate(&mut packet);
-        let _ = link.predictors.push(back.predictor());
+        let _ = link.states.push(back.odometry());
         link.taker.wake();
         give(packet);
     }

@@ -7,32 +7,35 @@
 //! `S = J P Jᵀ + J_ρ σ_ρ² J_ρᵀ + 2 σ² I` against a chi-square bound. When many fail at once it is the
 //! prediction that is wrong, and the gate is left open.
 
+use super::inertial::Covariance;
 use super::landmarks::{Landmark, Landmarks, Observation};
 use super::projection::{observe, Host};
 use super::rig::{EXTRINSIC_DIM, TIME_DIM};
 use super::window::{Window, POSE_DIM};
 use crate::frontend::Tracks;
 use crate::limits::{CAMERAS_MAX, TRACKS};
+use crate::math::block::matrix;
 use glam::DMat3;
-use nalgebra::{SMatrix, SVector};
+use nalgebra::{Matrix3, SMatrix, SVector};
 
 /// Two degrees of freedom pass with all but 4e-6 of true views.
 const CHI_SQUARE_MAX: f64 = 25.0;
-/// Of fewer known views, or when a smaller share passes, nothing is refused.
+/// With fewer known views, or when a smaller share passes, nothing is refused.
 const VIEWS_MIN: usize = 8;
 const PASS_MIN: f64 = 0.6;
 
 /// Covariance of the predicted pose relative to the window, errors [p in the world, θ on the right].
 pub type PoseCovariance = SMatrix<f64, POSE_DIM, POSE_DIM>;
 
-/// Of a frame predicted from `slot` by an increment: its covariance, and that of velocity and gyro bias over it.
-pub fn predicted_covariance(window: &Window, slot: usize, from: &[[f64; 15]; 15]) -> PoseCovariance {
+/// Covariance of the frame in `slot`, which is where an increment led from the frame before it, whose velocity and
+/// gyro bias have the covariance `from`.
+pub fn predicted_covariance(window: &Window, slot: usize, from: &Covariance) -> PoseCovariance {
     let frame = window.frame(slot);
     let (dt, inc) = (frame.increment.dt, &frame.increment.covariance);
-    let before = window.slots().rev().nth(1).map_or(DMat3::IDENTITY, |s| window.frame(s).body.r);
-    let r = SMatrix::<f64, 3, 3>::from_fn(|i, j| before.col(j)[i]);
+    let before = window.slots().rev().nth(1).map_or(DMat3::IDENTITY, |s| window.frame(s).world_from_body.r);
+    let r = matrix(before);
     let block = |row: usize, col: usize| inc.fixed_view::<3, 3>(row, col).into_owned();
-    let of = |at: usize| SMatrix::<f64, 3, 3>::from_fn(|i, j| from[at + i][at + j]) * (dt * dt);
+    let of = |at: usize| Matrix3::from_fn(|i, j| from[at + i][at + j]) * (dt * dt);
     let mut p = PoseCovariance::zeros();
     p.fixed_view_mut::<3, 3>(0, 0).copy_from(&(r * block(0, 0) * r.transpose() + of(6)));
     p.fixed_view_mut::<3, 3>(3, 3).copy_from(&(block(3, 3) + of(9)));
@@ -54,7 +57,7 @@ fn distance(l: &Landmark, o: &Observation, window: &Window, p: &PoseCovariance, 
     Some(e.dot(&(s.try_inverse()? * e)))
 }
 
-/// What became of a frame's tracks at the gate.
+/// What the gate did to a frame's tracks.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Passed {
     pub refused: usize,

@@ -8,12 +8,13 @@
 //! is noise have no depth and give no pose: where there are only such, gravity is the mean specific
 //! force, the velocity is unknown and said to be, and the window must find it.
 
-use super::landmarks::find_track;
-use super::marginalization::Sigma;
-use super::preintegration::{Increment, Noise, GRAVITY};
-use super::residuals::{huber, reproject, Motion, Point, Transform};
+use super::inertial::{Motion, MotionSigma};
+use super::model::Model;
+use super::preintegration::{Increment, GRAVITY};
+use super::reprojection::{huber, reproject, Point, Transform};
 use super::samples::ImuRing;
-use super::solve::Model;
+use super::triangulation::InverseDistance;
+use super::zero_velocity::{REST_ACCEL, REST_GYRO, REST_PX};
 use crate::config::VioConfig;
 use crate::frontend::Tracks;
 use crate::limits::TRACKS;
@@ -22,13 +23,9 @@ use glam::{DMat3, DQuat, DVec2, DVec3};
 use nalgebra::{SMatrix, SVector};
 use stipple_drivers::{Nanos, Pose, Span};
 
-/// At rest: quiet this long, s; spread of gyro rad/s and accelerometer m/s² below these; a gyro mean
-/// that a bias can explain, rad/s; tracks that moved less than this, px.
+/// At rest the unit is quiet for this long, s, and its mean rate is one that a bias can explain, rad/s.
 const REST_SPAN: f64 = 0.5;
-pub const REST_GYRO: f64 = 0.03;
-pub const REST_ACCEL: f64 = 0.3;
 const REST_GYRO_MEAN: f64 = 0.15;
-pub const REST_PX: f64 = 0.5;
 
 /// Alignment: span, s, and frames it takes at least and at most.
 const ALIGN_SPAN: f64 = 0.45;
@@ -44,8 +41,8 @@ const POSITION_MISFIT: f64 = 0.05;
 const RESECTION_ROTATION: f64 = 2e-3;
 /// An inverse distance of this many standard deviations is a measured one.
 const DEPTH_SIGNIFICANT: f64 = 3.0;
-/// Resections that may fail before the mean force has to do; and alignments that vision and inertia may
-/// refuse by contradicting each other, which starting all the same would not mend: some ten seconds.
+/// Resections that may fail, and alignments that may contradict each other, before the mean force has to do. The
+/// latter are many, some ten seconds, since starting all the same would not mend a contradiction.
 const ATTEMPTS: u32 = 3;
 const REFUSALS: u32 = 20;
 /// The mean force: over this long, s; how far from gravity's length it may be, m/s²; and what is then known of
@@ -62,22 +59,25 @@ const ALIGNED_GYRO: f64 = 0.02;
 /// Position and yaw are ours to choose; this fixes them, m and rad.
 pub const GAUGE_SIGMA: f64 = 1e-4;
 
+/// The first state, and how well it is known.
 #[derive(Clone, Copy, Debug)]
 pub struct Start {
     pub motion: Motion,
-    pub sigma: Sigma,
+    pub sigma: MotionSigma,
 }
 
+/// A track of the reference frame.
 #[derive(Clone, Copy, Debug)]
-struct Sighting {
+struct ReferencePoint {
     id: u64,
     px: DVec2,
     /// With its standard deviation relative to the inverse distance; none where stereo does not measure one.
     point: Option<(Point, f64)>,
 }
 
+/// A frame resected against the reference, and the increment that leads to it from the one before.
 #[derive(Clone, Copy, Debug)]
-struct Step {
+struct ResectedFrame {
     t: Nanos,
     reference_from_body: Pose,
     /// Standard deviation of the position along its worst axis, m.
@@ -85,10 +85,13 @@ struct Step {
     increment: Increment,
 }
 
+/// Looks for a start in the frames it is given.
 #[derive(Clone, Debug)]
 pub struct Initializer {
-    sightings: Vec<Sighting>,
-    steps: Vec<Step>,
+    reference: Vec<ReferencePoint>,
+    /// The reference frame first.
+    frames: Vec<ResectedFrame>,
+    /// Resections and alignments that failed.
     attempts: u32,
     refusals: u32,
 }
@@ -96,49 +99,44 @@ pub struct Initializer {
 impl Initializer {
     pub fn new() -> Initializer {
         Initializer {
-            sightings: Vec::with_capacity(TRACKS),
-            steps: Vec::with_capacity(ALIGN_FRAMES_MAX),
+            reference: Vec::with_capacity(TRACKS),
+            frames: Vec::with_capacity(ALIGN_FRAMES_MAX),
             attempts: 0,
             refusals: 0,
         }
     }
 
-    pub const BYTES: usize = TRACKS * size_of::<Sighting>() + ALIGN_FRAMES_MAX * size_of::<Step>();
+    pub const BYTES: usize = TRACKS * size_of::<ReferencePoint>() + ALIGN_FRAMES_MAX * size_of::<ResectedFrame>();
 
     pub fn clear(&mut self) {
-        self.sightings.clear();
-        self.steps.clear();
+        self.reference.clear();
+        self.frames.clear();
         (self.attempts, self.refusals) = (0, 0);
     }
 
-    pub fn add(
-        &mut self,
-        tracks: &Tracks,
-        imu: &ImuRing,
-        noise: &Noise,
-        model: &Model,
-        config: &VioConfig,
-    ) -> Option<Start> {
-        let Some(last) = self.steps.last().copied() else {
-            self.refer_to(tracks, model, config);
+    /// Takes what the cameras saw at one instant, inertial samples up to it known; answers the state of that instant
+    /// once a start is found.
+    pub fn add(&mut self, tracks: &Tracks, imu: &ImuRing, model: &Model) -> Option<Start> {
+        let Some(last) = self.frames.last().copied() else {
+            self.refer_to(tracks, model);
             return None;
         };
-        if let Some(start) = self.at_rest(tracks, imu, config) {
+        if let Some(start) = self.at_rest(tracks, imu, &model.config) {
             return Some(start);
         }
-        let increment = imu.integrate(last.t, tracks.t, DVec3::ZERO, DVec3::ZERO, noise);
+        let increment = imu.integrate(last.t, tracks.t, DVec3::ZERO, DVec3::ZERO, &model.noise);
         let before =
-            self.steps.len().checked_sub(2).map_or(last.reference_from_body, |i| self.steps[i].reference_from_body);
+            self.frames.len().checked_sub(2).map_or(last.reference_from_body, |i| self.frames[i].reference_from_body);
         let stride = last.reference_from_body.p - before.p;
         let guess = Pose::new(last.reference_from_body.q * increment.q, last.reference_from_body.p + stride);
-        let resected = resect(&self.sightings, tracks, model, guess);
+        let resected = resect(&self.reference, tracks, model, guess);
         if let Some((reference_from_body, sigma)) = resected {
-            self.steps.push(Step { t: tracks.t, reference_from_body, sigma, increment });
-            let span = (tracks.t - self.steps[0].t).secs();
-            if !(span >= ALIGN_SPAN && self.steps.len() >= ALIGN_FRAMES_MIN) && self.steps.len() < ALIGN_FRAMES_MAX {
+            self.frames.push(ResectedFrame { t: tracks.t, reference_from_body, sigma, increment });
+            let span = (tracks.t - self.frames[0].t).secs();
+            if !(span >= ALIGN_SPAN && self.frames.len() >= ALIGN_FRAMES_MIN) && self.frames.len() < ALIGN_FRAMES_MAX {
                 return None;
             }
-            let start = align(&self.steps, self.scale_sigma(), config);
+            let start = align(&self.frames, self.scale_sigma(), &model.config);
             if start.is_some() {
                 return start;
             }
@@ -146,33 +144,32 @@ impl Initializer {
         } else {
             self.attempts += 1;
         }
-        self.refer_to(tracks, model, config);
+        self.refer_to(tracks, model);
         if self.attempts >= ATTEMPTS || self.refusals >= REFUSALS {
-            return from_mean_force(tracks.t, imu, noise, config);
+            return from_mean_force(tracks.t, imu, model);
         }
         None
     }
 
     /// Relative deviation of all distances together.
     fn scale_sigma(&self) -> f64 {
-        let information: f64 = self.sightings.iter().filter_map(|s| s.point).map(|(_, r)| 1.0 / (r * r)).sum();
+        let information: f64 = self.reference.iter().filter_map(|s| s.point).map(|(_, r)| 1.0 / (r * r)).sum();
         1.0 / information.max(1.0).sqrt()
     }
 
     /// Starts over from this frame: its stereo points are the metric reference.
-    fn refer_to(&mut self, tracks: &Tracks, model: &Model, config: &VioConfig) {
-        self.steps.clear();
-        self.steps.push(Step {
+    fn refer_to(&mut self, tracks: &Tracks, model: &Model) {
+        self.frames.clear();
+        self.frames.push(ResectedFrame {
             t: tracks.t,
             reference_from_body: Pose::IDENTITY,
             sigma: 0.0,
             increment: Increment::new(DVec3::ZERO, DVec3::ZERO),
         });
-        self.sightings.clear();
+        self.reference.clear();
         for track in tracks.cameras[0].iter() {
-            let px = DVec2::new(track.px[0] as f64, track.px[1] as f64);
-            let point = stereo_point(track.id, px, tracks, model, config);
-            self.sightings.push(Sighting { id: track.id, px, point });
+            let (px, point) = (track.px(), stereo_point(track.id, track.px(), tracks, model));
+            self.reference.push(ReferencePoint { id: track.id, px, point });
         }
     }
 
@@ -181,8 +178,8 @@ impl Initializer {
         let quiet = s.gyro_sigma < REST_GYRO && s.accel_sigma < REST_ACCEL && s.gyro.length() < REST_GYRO_MEAN;
         // By axis, so that noise of both does not add up to a motion.
         let (mut still, mut seen) = ([0, 0], 0);
-        for s in &self.sightings {
-            if let Some(t) = find_track(&tracks.cameras[0], s.id) {
+        for s in &self.reference {
+            if let Some(t) = tracks.find(0, s.id) {
                 seen += 1;
                 still[0] += ((t.px[0] as f64 - s.px.x).abs() < REST_PX) as usize;
                 still[1] += ((t.px[1] as f64 - s.px.y).abs() < REST_PX) as usize;
@@ -199,44 +196,38 @@ impl Initializer {
     }
 }
 
-impl Default for Initializer {
-    fn default() -> Self {
-        Initializer::new()
+fn sigma(config: &VioConfig, tilt: f64, v: f64, bg: f64) -> MotionSigma {
+    MotionSigma {
+        p: GAUGE_SIGMA,
+        yaw: GAUGE_SIGMA,
+        tilt,
+        v,
+        bg: bg.min(config.gyro_bias_sigma),
+        ba: config.accel_bias_sigma,
     }
-}
-
-fn sigma(config: &VioConfig, tilt: f64, v: f64, bg: f64) -> Sigma {
-    Sigma { p: GAUGE_SIGMA, yaw: GAUGE_SIGMA, tilt, v, bg: bg.min(config.gyro_bias_sigma), ba: config.accel_bias_sigma }
 }
 
 /// A point from the stereo views of one frame, in its camera 0, and the relative deviation of its inverse
 /// distance; `None` when that is not significant.
-fn stereo_point(id: u64, px: DVec2, tracks: &Tracks, model: &Model, config: &VioConfig) -> Option<(Point, f64)> {
-    let cameras = &model.cameras;
-    let bearing = cameras[0].camera.unproject(px)?;
-    let host = &cameras[0].body_from_cam;
-    let (mut num, mut den) = (0.0, 0.0);
-    for (camera, camera_model) in cameras.iter().enumerate().skip(1) {
-        let Some(seen) = find_track(&tracks.cameras[camera], id) else { continue };
-        let to_view = camera_model.body_from_cam.r.transpose();
-        let offset = host.p - camera_model.body_from_cam.p;
-        let view = camera_model.camera.unproject(DVec2::new(seen.px[0] as f64, seen.px[1] as f64))?;
-        if offset.length() < config.triangulation_baseline_min_m {
-            continue;
-        }
-        let (a, b) = (view.cross(to_view * (host.r * bearing)), view.cross(to_view * offset));
-        num -= a.dot(b);
-        den += b.length_squared();
+fn stereo_point(id: u64, px: DVec2, tracks: &Tracks, model: &Model) -> Option<(Point, f64)> {
+    let host = &model.cameras[0];
+    let bearing = host.camera.unproject(px)?;
+    let mut distance = InverseDistance::default();
+    for (c, camera) in model.cameras.iter().enumerate().skip(1) {
+        let Some(seen) = tracks.find(c, id) else { continue };
+        let seen = camera.camera.unproject(seen.px())?;
+        let baseline_min = model.config.triangulation_baseline_min_m;
+        distance.add(&host.body_from_cam, bearing, &camera.body_from_cam, seen, baseline_min);
     }
     // Two views, each with the noise of a pixel.
-    let sigma = std::f64::consts::SQRT_2 * model.sigma_px / (cameras[0].camera.fx * den.sqrt());
-    let rho = num / den;
+    let sigma_px = std::f64::consts::SQRT_2 * model.config.observation_sigma_px;
+    let (rho, sigma) = (distance.rho(), sigma_px / (host.camera.fx * distance.information.sqrt()));
     (rho > DEPTH_SIGNIFICANT * sigma).then(|| (Point::new(bearing, rho), sigma / rho))
 }
 
 /// The body's pose from the reference's points, and the deviation of its position along the worst axis:
 /// Gauss-Newton with Huber on all cameras' views.
-fn resect(sightings: &[Sighting], tracks: &Tracks, model: &Model, guess: Pose) -> Option<(Pose, f64)> {
+fn resect(points: &[ReferencePoint], tracks: &Tracks, model: &Model, guess: Pose) -> Option<(Pose, f64)> {
     let reference = Transform { r: DMat3::IDENTITY, p: DVec3::ZERO };
     let mut pose = guess;
     let (mut inliers, mut sigma) = (0, 0.0);
@@ -245,16 +236,15 @@ fn resect(sightings: &[Sighting], tracks: &Tracks, model: &Model, guess: Pose) -
         let mut h = SMatrix::<f64, 6, 6>::identity() * 1e-6;
         let mut b = SVector::<f64, 6>::zeros();
         inliers = 0;
-        for s in sightings {
-            let Some((point, _)) = &s.point else { continue };
-            for (camera, camera_model) in model.cameras.iter().enumerate() {
-                let Some(seen) = find_track(&tracks.cameras[camera], s.id) else { continue };
-                let Some(r) = reproject(point, &model.cameras[0].body_from_cam, &reference, camera_model, &body) else {
-                    continue;
-                };
-                let e = r.px - DVec2::new(seen.px[0] as f64, seen.px[1] as f64);
-                inliers += (camera == 0 && e.length() < 3.0 * model.huber_px) as usize;
-                let (w, _) = huber(e.length(), model.huber_px);
+        for p in points {
+            let Some((point, _)) = &p.point else { continue };
+            for (c, camera) in model.cameras.iter().enumerate() {
+                let Some(seen) = tracks.find(c, p.id) else { continue };
+                let host_cam = &model.cameras[0].body_from_cam;
+                let Some(r) = reproject(point, host_cam, &reference, camera, &body) else { continue };
+                let e = r.px - seen.px();
+                inliers += (c == 0 && e.length() < 3.0 * model.config.huber_px) as usize;
+                let (w, _) = huber(e.length(), model.config.huber_px);
                 for (row, e) in [e.x, e.y].into_iter().enumerate() {
                     let j = SVector::<f64, 6>::from_row_slice(&r.d_target[row]);
                     h += j * j.transpose() * w;
@@ -270,7 +260,7 @@ fn resect(sightings: &[Sighting], tracks: &Tracks, model: &Model, guess: Pose) -
         pose = Pose::new(pose.q * so3::exp(DVec3::new(d[3], d[4], d[5])), pose.p + DVec3::new(d[0], d[1], d[2]));
         if d.norm() < 1e-5 && iteration > 0 || iteration + 1 == RESECTION_ITERATIONS {
             let position = factor.inverse().fixed_view::<3, 3>(0, 0).into_owned();
-            sigma = model.sigma_px * position.symmetric_eigenvalues().max().max(0.0).sqrt();
+            sigma = model.config.observation_sigma_px * position.symmetric_eigenvalues().max().max(0.0).sqrt();
             break;
         }
     }
@@ -279,15 +269,15 @@ fn resect(sightings: &[Sighting], tracks: &Tracks, model: &Model, guess: Pose) -
 
 /// Velocity, gravity and gyro bias from resected poses and the increments between them. `scale_sigma`: how
 /// wrong all distances may be together.
-fn align(steps: &[Step], scale_sigma: f64, config: &VioConfig) -> Option<Start> {
+fn align(frames: &[ResectedFrame], scale_sigma: f64, config: &VioConfig) -> Option<Start> {
     let ridge = (RESECTION_ROTATION / config.gyro_bias_sigma).powi(2);
     let (mut h, mut b) = (DMat3::IDENTITY * ridge, DVec3::ZERO);
-    for k in 1..steps.len() {
-        let (from, to) = (&steps[k - 1].reference_from_body, &steps[k]);
-        let turned = from.q.conjugate() * to.reference_from_body.q;
+    for k in 1..frames.len() {
+        let (from, to) = (&frames[k - 1].reference_from_body, &frames[k]);
+        let rotation = from.q.conjugate() * to.reference_from_body.q;
         let j = to.increment.d_q_bg();
         h += j.transpose() * j;
-        b += j.transpose() * so3::log(to.increment.q.conjugate() * turned);
+        b += j.transpose() * so3::log(to.increment.q.conjugate() * rotation);
     }
     let bg = h.inverse() * b;
 
@@ -295,14 +285,14 @@ fn align(steps: &[Step], scale_sigma: f64, config: &VioConfig) -> Option<Start> 
     let (mut t, mut s, mut v) = (0.0, DVec3::ZERO, DVec3::ZERO);
     let (mut h, mut b) = ([0.0; 3], [DVec3::ZERO; 2]);
     let mut rows = [(0.0, DVec3::ZERO); ALIGN_FRAMES_MAX];
-    for k in 1..steps.len() {
-        let inc = &steps[k].increment;
+    for k in 1..frames.len() {
+        let inc = &frames[k].increment;
         let (dp, _, dv) = inc.corrected(bg, DVec3::ZERO);
-        let q = steps[k - 1].reference_from_body.q;
+        let q = frames[k - 1].reference_from_body.q;
         s += v * inc.dt + q * dp;
         v += q * dv;
         t += inc.dt;
-        let y = steps[k].reference_from_body.p - s;
+        let y = frames[k].reference_from_body.p - s;
         let a = [t, 0.5 * t * t];
         h[0] += a[0] * a[0];
         h[1] += a[0] * a[1];
@@ -318,18 +308,18 @@ fn align(steps: &[Step], scale_sigma: f64, config: &VioConfig) -> Option<Start> 
     let g = g.normalize() * -GRAVITY.z;
     let v0 = (b[0] - g * h[1]) / h[0];
     let misfit =
-        rows[1..steps.len()].iter().map(|(t, y)| (*y - v0 * *t - g * (0.5 * t * t)).length_squared()).sum::<f64>();
-    let misfit = (misfit / steps.len() as f64).sqrt();
+        rows[1..frames.len()].iter().map(|(t, y)| (*y - v0 * *t - g * (0.5 * t * t)).length_squared()).sum::<f64>();
+    let misfit = (misfit / frames.len() as f64).sqrt();
     if !(misfit < POSITION_MISFIT) {
         return None;
     }
-    // Of the two unknowns, each by the deviation of one position.
-    let noise = steps[1..].iter().map(|s| s.sigma).fold(misfit, f64::max);
+    // Deviations of the two unknowns, by that of one position.
+    let noise = frames[1..].iter().map(|f| f.sigma).fold(misfit, f64::max);
     let det = h[0] * h[2] - h[1] * h[1];
     let (sigma_g, sigma_v) =
         (noise * (h[0] / det).sqrt(), noise * ((h[2] - 2.0 * t * h[1] + t * t * h[0]) / det).max(0.0).sqrt());
     let world_from_reference = Pose::new(DQuat::from_rotation_arc(-g.normalize(), DVec3::Z), DVec3::ZERO);
-    let last = &steps[steps.len() - 1].reference_from_body;
+    let last = &frames[frames.len() - 1].reference_from_body;
     let motion = Motion {
         pose: world_from_reference * *last,
         v: world_from_reference.q * (v0 + g * t + v),
@@ -342,14 +332,14 @@ fn align(steps: &[Step], scale_sigma: f64, config: &VioConfig) -> Option<Start> 
 }
 
 /// Tilt from the mean specific force of the last second, the rest unknown.
-fn from_mean_force(t: Nanos, imu: &ImuRing, noise: &Noise, config: &VioConfig) -> Option<Start> {
+fn from_mean_force(t: Nanos, imu: &ImuRing, model: &Model) -> Option<Start> {
     let span = Span::from_secs(MEAN_SPAN);
     imu.statistics(t, span)?;
-    let inc = imu.integrate(t - span, t, DVec3::ZERO, DVec3::ZERO, noise);
+    let inc = imu.integrate(t - span, t, DVec3::ZERO, DVec3::ZERO, &model.noise);
     if (inc.v.length() / inc.dt + GRAVITY.z).abs() > MEAN_FORCE_MISFIT {
         return None;
     }
     let up = inc.q.conjugate() * inc.v.try_normalize()?;
     let motion = Motion { pose: Pose::new(DQuat::from_rotation_arc(up, DVec3::Z), DVec3::ZERO), ..Motion::default() };
-    Some(Start { motion, sigma: sigma(config, MEAN_FORCE_TILT, MEAN_FORCE_V, config.gyro_bias_sigma) })
+    Some(Start { motion, sigma: sigma(&model.config, MEAN_FORCE_TILT, MEAN_FORCE_V, model.config.gyro_bias_sigma) })
 }

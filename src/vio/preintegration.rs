@@ -229,7 +229,7 @@ impl Increment {
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used)]
-    use super::super::residuals::Motion;
+    use super::super::inertial::Motion;
     use super::super::samples::ImuRing;
     use super::super::world;
     use super::*;

@@ -1,34 +1,31 @@
-//! Where a restart goes on: the last estimate nothing spoke against, carried on by inertia.
+//! Recovery after a reset: a restart resumes from the last estimate nothing spoke against, carried on by inertia.
 //!
 //! Vision or inertia go wrong some frames before it shows, so after a disagreement it is an estimate of
-//! `LAG` before the first doubt that a restart goes on from. While nothing speaks against the inertial samples either (no frame came, nothing was seen) the carried
-//! pose is the best there is, and its covariance, propagated with it, says how good. Where a restart
-//! finds another velocity than the carried state expects, inertia lied meanwhile: the trusted pose is
-//! kept as it was, widened by how far the rig may have come since. Down is carried by the gyro alone; a
+//! `LAG` before the first doubt that a restart resumes from. While nothing speaks against the inertial samples either
+//! (no frame came, nothing was seen) the carried pose is the best there is, and its covariance, propagated with it,
+//! says how good. Where a restart finds another velocity than the carried state expects, inertia lied meanwhile: the
+//! trusted pose is kept as it was, widened by how far the rig may have come since. Down is carried by the gyro alone; a
 //! restart that finds another one, for some seconds, is refused, for its accelerometer lies.
 
 use super::health::Reset;
+use super::inertial::{Covariance, Mat15, Motion, MotionSigma};
 use super::initialization::{Start, GAUGE_SIGMA};
-use super::marginalization::Sigma;
 use super::preintegration::{Increment, Noise};
-use super::residuals::{Mat15, Motion};
 use super::samples::ImuRing;
-use crate::math::block::put;
+use crate::math::block::{put, vector};
 use crate::math::so3;
 use glam::{DMat3, DQuat, DVec3};
-use nalgebra::SMatrix;
+use nalgebra::{Matrix3, SMatrix};
 use stipple_drivers::{Nanos, Pose, Span};
-
-type Mat3 = SMatrix<f64, 3, 3>;
 
 /// An estimate is confirmed when nothing spoke against it for this long, s. Less than the ring of samples holds.
 const LAG: f64 = 0.4;
 /// For this long after the trusted estimate its down is better than a restart's that contradicts it, s.
 const DOWN_HOLDS: f64 = 5.0;
-/// Samples are folded in this long after they came, s: the ring of samples need not hold a whole outage, and
+/// Samples are integrated this long after they came, s: the ring of samples need not hold a whole outage, and
 /// no frame is that late.
-const FOLD: f64 = 0.2;
-/// How fast an estimator that is down assumes to move at least, m/s, and to turn, rad/s.
+const DELAY: f64 = 0.2;
+/// How fast an estimator that is down assumes to move at least, m/s, and to rotate, rad/s.
 const SPEED_UNSEEN: f64 = 0.5;
 const RATE_UNSEEN: f64 = 0.5;
 /// Squared distances beyond which a restart contradicts the carried state: three and two dimensions, 99.9 %.
@@ -37,72 +34,22 @@ const TILT_GATE: f64 = 13.8;
 /// A restart this unsure of its velocity, m/s, cannot vouch for the inertial samples.
 const VOUCHING_V: f64 = 0.3;
 
+/// Keeps what a restart resumes from.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Recovery {
     newest: Option<TrustedState>,
     /// Waits for `LAG`, then is the confirmed one.
     candidate: Option<TrustedState>,
     confirmed: Option<TrustedState>,
-}
-
-/// What a restart does not know of where it is in the world of before: position and yaw, which no sensor
-/// observes. Apart from the window's covariance, whose precision it would cost, it is what it was at the
-/// start and is added.
-#[derive(Clone, Copy, Debug, Default)]
-pub struct Origin {
-    p: DVec3,
-    sigma_p: f64,
-    sigma_yaw: f64,
-}
-
-impl Origin {
-    /// Takes its share out of the deviations of a start.
-    pub fn split(start: &mut Start) -> Origin {
-        let apart = |sigma: &mut f64| {
-            let rest = (sigma.powi(2) - GAUGE_SIGMA.powi(2)).max(0.0).sqrt();
-            *sigma = sigma.min(GAUGE_SIGMA);
-            rest
-        };
-        let p = start.motion.pose.p;
-        Origin { p, sigma_p: apart(&mut start.sigma.p), sigma_yaw: apart(&mut start.sigma.yaw) }
-    }
-
-    /// The covariance of a motion whose errors within its own world have covariance `c`.
-    pub fn add_to(&self, mut c: [[f64; 15]; 15], motion: &Motion) -> [[f64; 15]; 15] {
-        let turn =
-            [DVec3::Z.cross(motion.pose.p - self.p), motion.pose.q.conjugate() * DVec3::Z, DVec3::Z.cross(motion.v)];
-        for i in 0..9 {
-            c[i][i] += if i < 3 { self.sigma_p.powi(2) } else { 0.0 };
-            for j in 0..9 {
-                c[i][j] += turn[i / 3][i % 3] * turn[j / 3][j % 3] * self.sigma_yaw.powi(2);
-            }
-        }
-        c
-    }
-}
-
-#[derive(Clone, Copy, Debug)]
-struct TrustedState {
-    t: Nanos,
-    pose: Pose,
-    speed: f64,
-    sigma_p: f64,
-    sigma_yaw: f64,
-    carried: DeadReckoning,
-}
-
-/// A motion and its covariance, errors [p, θ, v, bg, ba].
-#[derive(Clone, Copy, Debug)]
-struct DeadReckoning {
-    t: Nanos,
-    motion: Motion,
-    covariance: Mat15,
+    /// Why there is a restart.
+    reset_by: Reset,
+    origin: Origin,
 }
 
 impl Recovery {
     /// An estimate nothing speaks against.
-    pub fn add(&mut self, t: Nanos, motion: &Motion, covariance: &[[f64; 15]; 15]) {
-        let newest = TrustedState::at(t, motion, covariance);
+    pub fn trust(&mut self, t: Nanos, motion: &Motion, covariance: &Covariance) {
+        let newest = TrustedState::new(t, motion, covariance);
         match &self.candidate {
             Some(c) if (t - c.t).secs() < LAG => {}
             waited => (self.confirmed, self.candidate) = (waited.or(self.confirmed), Some(newest)),
@@ -115,28 +62,88 @@ impl Recovery {
         self.candidate = None;
     }
 
+    /// Why the estimate is given up, and a restart will be needed.
+    pub fn reset(&mut self, why: Reset) {
+        self.reset_by = why;
+    }
+
     /// Carries on as time passes.
-    pub fn fold(&mut self, now: Nanos, imu: &ImuRing, noise: &Noise) {
-        let t = now - Span::from_secs(FOLD);
+    pub fn propagate(&mut self, now: Nanos, imu: &ImuRing, noise: &Noise) {
+        let t = now - Span::from_secs(DELAY);
         for trusted in [&mut self.newest, &mut self.confirmed].into_iter().flatten() {
-            if (t - trusted.carried.t).secs() > 0.5 * FOLD {
+            if (t - trusted.carried.t).secs() > 0.5 * DELAY {
                 trusted.carried.advance(t, imu, noise);
             }
         }
     }
 
-    /// A restart at `t` in the world of before: position and yaw as trusted, the rest of `start`. `None` while
-    /// the start cannot be true.
-    pub fn resume(&mut self, start: &Start, why: Reset, t: Nanos, imu: &ImuRing, noise: &Noise) -> Option<Start> {
-        let suspect = matches!(why, Reset::Disagreement | Reset::State);
+    /// A restart at `t` in the world of before: position and yaw as trusted, the rest of `start`; what is not known of
+    /// the two is kept apart for `in_world`. `None` while the start cannot be true.
+    pub fn resume(&mut self, start: &Start, t: Nanos, imu: &ImuRing, noise: &Noise) -> Option<Start> {
+        let suspect = matches!(self.reset_by, Reset::Disagreement | Reset::State);
         let from = if suspect { self.confirmed } else { self.newest.or(self.confirmed) };
         self.candidate = None;
-        from.map_or(Some(*start), |mut from| from.resume(start, suspect, t, imu, noise))
+        let resumed = from.map_or(Some(*start), |mut from| from.resume(start, suspect, t, imu, noise));
+        resumed.map(|mut start| {
+            self.origin = Origin::split(&mut start);
+            start
+        })
+    }
+
+    /// The covariance, in the world of before, of a motion whose errors since the restart have covariance `c`.
+    pub fn in_world(&self, c: Covariance, motion: &Motion) -> Covariance {
+        self.origin.add_to(c, motion)
     }
 }
 
+/// What a restart does not know of where it is in the world of before: position and yaw, which no sensor
+/// observes. Apart from the window's covariance, whose precision it would cost, it is what it was at the
+/// start and is added.
+#[derive(Clone, Copy, Debug, Default)]
+struct Origin {
+    p: DVec3,
+    sigma_p: f64,
+    sigma_yaw: f64,
+}
+
+impl Origin {
+    /// Takes its share out of the deviations of a start.
+    fn split(start: &mut Start) -> Origin {
+        let apart = |sigma: &mut f64| {
+            let rest = (sigma.powi(2) - GAUGE_SIGMA.powi(2)).max(0.0).sqrt();
+            *sigma = sigma.min(GAUGE_SIGMA);
+            rest
+        };
+        let p = start.motion.pose.p;
+        Origin { p, sigma_p: apart(&mut start.sigma.p), sigma_yaw: apart(&mut start.sigma.yaw) }
+    }
+
+    fn add_to(&self, mut c: Covariance, motion: &Motion) -> Covariance {
+        let d_yaw =
+            [DVec3::Z.cross(motion.pose.p - self.p), motion.pose.q.conjugate() * DVec3::Z, DVec3::Z.cross(motion.v)];
+        for i in 0..9 {
+            c[i][i] += if i < 3 { self.sigma_p.powi(2) } else { 0.0 };
+            for j in 0..9 {
+                c[i][j] += d_yaw[i / 3][i % 3] * d_yaw[j / 3][j % 3] * self.sigma_yaw.powi(2);
+            }
+        }
+        c
+    }
+}
+
+/// An estimate nothing spoke against, as it was and as inertia carries it on.
+#[derive(Clone, Copy, Debug)]
+struct TrustedState {
+    t: Nanos,
+    pose: Pose,
+    speed: f64,
+    sigma_p: f64,
+    sigma_yaw: f64,
+    carried: DeadReckoning,
+}
+
 impl TrustedState {
-    fn at(t: Nanos, motion: &Motion, covariance: &[[f64; 15]; 15]) -> TrustedState {
+    fn new(t: Nanos, motion: &Motion, covariance: &Covariance) -> TrustedState {
         let covariance = Mat15::from_fn(|i, j| covariance[i][j]);
         let carried = DeadReckoning { t, motion: *motion, covariance };
         let (sigma_p, sigma_yaw) = (carried.sigma(0), carried.about_world_axis(DVec3::Z));
@@ -170,11 +177,19 @@ impl TrustedState {
 
 /// `start` with the position and the yaw of `pose`.
 fn in_world_of(pose: &Pose, start: &Motion) -> Motion {
-    let turn = pose.q * start.pose.q.conjugate();
-    // The part of the turn about the world's axis; none is left when it is half a turn about a level axis.
-    let twist = DQuat::from_xyzw(0.0, 0.0, turn.z, turn.w);
+    let rotation = pose.q * start.pose.q.conjugate();
+    // The part of it about the world's axis; none is left when it is half a turn about a level axis.
+    let twist = DQuat::from_xyzw(0.0, 0.0, rotation.z, rotation.w);
     let twist = if twist.length_squared() > 1e-12 { twist.normalize() } else { DQuat::IDENTITY };
     Motion { pose: Pose::new(twist * start.pose.q, pose.p), v: twist * start.v, ..*start }
+}
+
+/// A motion carried on by inertial samples, and its covariance, errors [p, θ, v, bg, ba].
+#[derive(Clone, Copy, Debug)]
+struct DeadReckoning {
+    t: Nanos,
+    motion: Motion,
+    covariance: Mat15,
 }
 
 /// Derivative of the motion after an increment to the motion before it.
@@ -205,10 +220,10 @@ impl DeadReckoning {
         let mut p = f * self.covariance * f.transpose();
         // Increment errors are in the first body frame, but for the rotation's, which is on the right.
         let r = from.pose.rotation();
-        let mut turn = SMatrix::<f64, 9, 9>::identity();
-        put(&mut turn, 0, 0, r);
-        put(&mut turn, 6, 6, r);
-        let added = turn * inc.covariance * turn.transpose();
+        let mut to_world = SMatrix::<f64, 9, 9>::identity();
+        put(&mut to_world, 0, 0, r);
+        put(&mut to_world, 6, 6, r);
+        let added = to_world * inc.covariance * to_world.transpose();
         for i in 0..9 {
             for j in 0..9 {
                 p[(i, j)] += added[(i, j)];
@@ -221,37 +236,35 @@ impl DeadReckoning {
         (self.t, self.motion, self.covariance) = (t, from.propagate(&inc), p);
     }
 
-    fn block(&self, at: usize) -> Mat3 {
+    fn block(&self, at: usize) -> Matrix3<f64> {
         self.covariance.fixed_view::<3, 3>(at, at).into_owned()
     }
 
-    /// Of the three errors from `at`, along the axis on which it is largest.
+    /// Standard deviation of the three errors from `at`, along the axis on which it is largest.
     fn sigma(&self, at: usize) -> f64 {
         self.block(at).symmetric_eigenvalues().max().max(0.0).sqrt()
     }
 
-    fn sigmas(&self) -> Sigma {
+    fn sigmas(&self) -> MotionSigma {
         let [x, y, yaw] = [DVec3::X, DVec3::Y, DVec3::Z].map(|axis| self.about_world_axis(axis));
         let [p, v, bg, ba] = [0, 6, 9, 12].map(|at| self.sigma(at));
-        Sigma { p, tilt: x.max(y), yaw, v, bg, ba }
+        MotionSigma { p, tilt: x.max(y), yaw, v, bg, ba }
     }
 
     fn about_world_axis(&self, axis: DVec3) -> f64 {
-        let a = self.motion.pose.q.conjugate() * axis;
-        let a = SMatrix::<f64, 3, 1>::new(a.x, a.y, a.z);
+        let a = vector(self.motion.pose.q.conjugate() * axis);
         a.dot(&(self.block(3) * a)).max(0.0).sqrt()
     }
 
     /// Whether a restart's velocity is what this leads one to expect.
-    fn expects_velocity(&self, start: &Motion, sigma: &Sigma) -> bool {
-        let dv = start.v - self.motion.v;
-        let dv = SMatrix::<f64, 3, 1>::new(dv.x, dv.y, dv.z);
-        let spread = self.block(6) + Mat3::identity() * (sigma.v * sigma.v);
+    fn expects_velocity(&self, start: &Motion, sigma: &MotionSigma) -> bool {
+        let dv = vector(start.v - self.motion.v);
+        let spread = self.block(6) + Matrix3::identity() * (sigma.v * sigma.v);
         spread.cholesky().is_some_and(|factor| dv.dot(&factor.solve(&dv)) < VELOCITY_GATE)
     }
 
     /// Whether a restart's down is.
-    fn expects_down(&self, start: &Motion, sigma: &Sigma) -> bool {
+    fn expects_down(&self, start: &Motion, sigma: &MotionSigma) -> bool {
         let tilt = (self.motion.pose.q.conjugate() * DVec3::Z).angle_between(start.pose.q.conjugate() * DVec3::Z);
         let [x, y] = [DVec3::X, DVec3::Y].map(|axis| self.about_world_axis(axis));
         tilt * tilt < TILT_GATE * (x.max(y).powi(2) + sigma.tilt * sigma.tilt)
@@ -265,21 +278,21 @@ mod tests {
     use crate::config::VioConfig;
 
     #[test]
-    fn origin_turns_and_shifts_what_is_seen_from_it() {
+    fn origin_rotates_and_translates_what_is_seen_from_it() {
         let motion = Motion { pose: Path { rest: -1.0 }.pose(0.4), v: DVec3::new(1.0, 2.0, 3.0), ..Motion::default() };
-        let sigma = Sigma { p: 0.5, yaw: 0.2, tilt: 0.1, v: 0.3, bg: 0.1, ba: 0.1 };
+        let sigma = MotionSigma { p: 0.5, yaw: 0.2, tilt: 0.1, v: 0.3, bg: 0.1, ba: 0.1 };
         let mut start = Start { motion: Motion::default(), sigma };
         let origin = Origin::split(&mut start);
         let c = origin.add_to([[0.0; 15]; 15], &motion);
-        // A turn of the world by a small angle moves the motion by these errors.
+        // A rotation of the world by a small angle moves the motion by these errors.
         const H: f64 = 1e-6;
-        let turn = DQuat::from_rotation_z(H);
-        let th = so3::log(motion.pose.q.conjugate() * turn * motion.pose.q);
-        let d = [turn * motion.pose.p - motion.pose.p, th, turn * motion.v - motion.v].map(|x| x / H);
+        let rotation = DQuat::from_rotation_z(H);
+        let th = so3::log(motion.pose.q.conjugate() * rotation * motion.pose.q);
+        let d = [rotation * motion.pose.p - motion.pose.p, th, rotation * motion.v - motion.v].map(|x| x / H);
         for i in 0..9 {
             for j in 0..9 {
-                let shift = if i == j && i < 3 { 0.25 } else { 0.0 };
-                let expected = shift + 0.04 * d[i / 3][i % 3] * d[j / 3][j % 3];
+                let translation = if i == j && i < 3 { 0.25 } else { 0.0 };
+                let expected = translation + 0.04 * d[i / 3][i % 3] * d[j / 3][j % 3];
                 assert!((c[i][j] - expected).abs() < 1e-5 * (1.0 + expected.abs()), "{i} {j}: {} {expected}", c[i][j]);
             }
         }

@@ -1,15 +1,15 @@
-//! What of the rig may be estimated along with the window: the cameras' time offset, where each
-//! camera sits on the body, the inertial unit's scale. One block of columns that leaves the window
-//! never; what is not estimated has none.
+//! The part of the rig that may be estimated along with the window: the cameras' time offset, the place of each
+//! camera on the body, the scale of the inertial unit. One block of columns that never leaves the window; what is
+//! not estimated has no column.
 //!
-//! Like a frame, the block is anchored once the prior touches it.
+//! Like a frame, the block has a fixed linearization point once the prior touches it.
 
-use super::residuals::{CameraModel, Transform};
+use super::reprojection::{CameraModel, Transform};
 use crate::config::VioConfig;
 use crate::limits::{CAMERAS_MAX, RIG_DIM};
 use crate::math::so3;
 use glam::DVec3;
-use stipple_drivers::Pose;
+use stipple_drivers::{Calibration, Pose};
 
 /// Errors in order: time offset, [p, θ] of each camera (θ on the right), gyro scale, accelerometer scale.
 pub const TIME_DIM: usize = 1;
@@ -17,39 +17,19 @@ pub const EXTRINSIC_DIM: usize = 6;
 pub const SCALE_DIM: usize = 6;
 const _: () = assert!(RIG_DIM == TIME_DIM + EXTRINSIC_DIM * CAMERAS_MAX + SCALE_DIM);
 
-/// Further than this from its calibration a rig is not estimated but lost: s, m, rad, and of scales. The
-/// bounds of the deviations that a board may state lie well within.
+/// Bounds of what is estimated, beyond the calibration: s, m, rad, and of scales. A rig further off is lost. The
+/// deviations that a board may state lie well within.
 const TIME_OFFSET_MAX: f64 = 0.3;
 const TRANSLATION_MAX: f64 = 3.0;
 const ROTATION_MAX: f64 = 1.5;
 const SCALE_MAX: f64 = 0.9;
 
-/// What is estimated. Nothing unless the board asks.
+/// Which parts are estimated: nothing unless the board asks.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Parts {
     pub time_offset: bool,
     pub extrinsics: bool,
     pub imu_scale: bool,
-}
-
-/// What is known of the rig before flying: standard deviations, s, m, rad, and of scales.
-#[derive(Clone, Copy, Debug)]
-pub struct RigSigma {
-    pub time_offset: f64,
-    pub extrinsic_p: f64,
-    pub extrinsic_theta: f64,
-    pub imu_scale: f64,
-}
-
-impl RigSigma {
-    pub fn new(config: &VioConfig) -> RigSigma {
-        RigSigma {
-            time_offset: config.time_offset_sigma_s,
-            extrinsic_p: config.extrinsics_sigma_m,
-            extrinsic_theta: config.extrinsics_sigma_rad,
-            imu_scale: config.imu_scale_sigma,
-        }
-    }
 }
 
 impl Parts {
@@ -64,25 +44,23 @@ impl Parts {
     pub fn any(self) -> bool {
         self.time_offset || self.extrinsics || self.imu_scale
     }
-
-    /// Columns that cameras touch: time offset, then extrinsics of `cameras`.
-    pub fn camera_dim(self, cameras: usize) -> usize {
-        self.time_offset as usize * TIME_DIM + self.extrinsics as usize * EXTRINSIC_DIM * cameras
-    }
-
-    pub fn imu_dim(self) -> usize {
-        self.imu_scale as usize * SCALE_DIM
-    }
 }
 
+/// Values of the rig that estimation may change.
 #[derive(Clone, Copy, Debug)]
-pub struct Rig {
+pub struct RigParameters {
     /// Added to the stamps of images, beyond what the calibration adds, s.
     pub time_offset: f64,
     pub body_from_cam: [Pose; CAMERAS_MAX],
-    /// Factors on what the unit reads, less one.
+    /// Factors on the readings of each axis, less one.
     pub gyro_scale: DVec3,
     pub accel_scale: DVec3,
+}
+
+impl RigParameters {
+    fn calibrated(body_from_cam: [Pose; CAMERAS_MAX]) -> RigParameters {
+        RigParameters { time_offset: 0.0, body_from_cam, gyro_scale: DVec3::ZERO, accel_scale: DVec3::ZERO }
+    }
 }
 
 /// Estimate and standard deviation of what the board asks for; `None` for the rest.
@@ -90,7 +68,7 @@ pub struct Rig {
 pub struct RigEstimate {
     /// Beyond the calibration's, s.
     pub time_offset: Option<[f64; 2]>,
-    /// Of each camera: [p, θ] over the calibration, m and rad, θ on the right; and deviations.
+    /// [p, θ] of each camera over the calibration, m and rad, θ on the right; and deviations.
     pub extrinsics: [Option<[[f64; EXTRINSIC_DIM]; 2]>; CAMERAS_MAX],
     /// Factors less one of the gyro's axes and the accelerometer's; and deviations.
     pub imu_scale: Option<[[f64; SCALE_DIM]; 2]>,
@@ -98,7 +76,7 @@ pub struct RigEstimate {
 
 impl RigEstimate {
     pub fn new(rig: &RigState, deviations: &[f64; RIG_DIM]) -> RigEstimate {
-        let camera_model = |c: usize| {
+        let extrinsics = |c: usize| {
             let at = rig.extrinsic_column(c).filter(|_| c < rig.cameras.len())?;
             let (from, to) = (&rig.calibrated[c], &rig.now.body_from_cam[c]);
             let (p, th) = (to.p - from.p, so3::log(from.q.conjugate() * to.q));
@@ -108,44 +86,45 @@ impl RigEstimate {
         let scales = [g.x, g.y, g.z, a.x, a.y, a.z];
         RigEstimate {
             time_offset: rig.parts.time_offset.then(|| [rig.now.time_offset, deviations[0]]),
-            extrinsics: std::array::from_fn(camera_model),
+            extrinsics: std::array::from_fn(extrinsics),
             imu_scale: rig.parts.imu_scale.then(|| [scales, std::array::from_fn(|i| deviations[rig.camera_dim() + i])]),
         }
     }
 }
 
+/// The rig as it is estimated.
 #[derive(Clone, Debug)]
 pub struct RigState {
     pub parts: Parts,
-    pub now: Rig,
-    linearization_point: Rig,
-    pub is_linearized: bool,
-    /// Error since the anchor, of the estimated parts one after the other.
+    pub now: RigParameters,
+    linearization_point: Option<RigParameters>,
+    /// Error since the linearization point, of the estimated parts one after the other.
     pub delta: [f64; RIG_DIM],
     /// `now` and where Jacobians are taken, as residuals use them.
     cameras: Vec<CameraModel>,
     cameras_linearized: Vec<CameraModel>,
-    saved: (Rig, [f64; RIG_DIM]),
+    saved: (RigParameters, [f64; RIG_DIM]),
+    /// A shutter rolls.
     rolls: bool,
     calibrated: [Pose; CAMERAS_MAX],
 }
 
 impl RigState {
-    pub fn new(cameras: &[CameraModel], poses: &[Pose], parts: Parts) -> RigState {
+    /// A rig as calibrated.
+    pub fn new(cameras: &[CameraModel], calibration: &Calibration, config: &VioConfig) -> RigState {
         let mut body_from_cam = [Pose::IDENTITY; CAMERAS_MAX];
-        body_from_cam.iter_mut().zip(poses).for_each(|(to, from)| *to = *from);
-        let rig = Rig { time_offset: 0.0, body_from_cam, gyro_scale: DVec3::ZERO, accel_scale: DVec3::ZERO };
+        body_from_cam.iter_mut().zip(&calibration.cameras).for_each(|(to, from)| *to = from.body_from_cam);
+        let rig = RigParameters::calibrated(body_from_cam);
         RigState {
-            parts,
+            parts: Parts::new(config),
             now: rig,
-            linearization_point: rig,
-            is_linearized: false,
+            linearization_point: None,
             delta: [0.0; RIG_DIM],
             cameras: cameras.to_vec(),
             cameras_linearized: cameras.to_vec(),
             saved: (rig, [0.0; RIG_DIM]),
             calibrated: body_from_cam,
-            rolls: cameras.iter().any(|e| e.readout > 0.0),
+            rolls: cameras.iter().any(|c| c.readout > 0.0),
         }
     }
 
@@ -155,30 +134,43 @@ impl RigState {
         !(self.rolls || self.parts.time_offset || self.parts.extrinsics)
     }
 
+    /// Whether Jacobians are taken at a fixed point and no longer at the estimate.
+    pub fn is_linearized(&self) -> bool {
+        self.linearization_point.is_some()
+    }
+
     /// The rig at which Jacobians are taken.
-    pub fn linearized(&self) -> &Rig {
-        if self.is_linearized {
-            &self.linearization_point
-        } else {
-            &self.now
-        }
+    pub fn linearized(&self) -> &RigParameters {
+        self.linearization_point.as_ref().unwrap_or(&self.now)
     }
 
     /// Standard deviations of the estimated parts at the start, in the order of the columns.
-    pub fn sigmas(&self, s: &RigSigma) -> [f64; RIG_DIM] {
-        let (cameras, n) = (self.camera_dim(), self.camera_dim() + self.parts.imu_dim());
+    pub fn sigmas(&self, config: &VioConfig) -> [f64; RIG_DIM] {
+        let (cameras, n) = (self.camera_dim(), self.dim());
         let of = |i: usize| match i {
             i if i >= n => f64::INFINITY,
-            i if i >= cameras => s.imu_scale,
-            0 if self.parts.time_offset => s.time_offset,
-            i if (i - self.parts.time_offset as usize * TIME_DIM) % EXTRINSIC_DIM < 3 => s.extrinsic_p,
-            _ => s.extrinsic_theta,
+            i if i >= cameras => config.imu_scale_sigma,
+            0 if self.parts.time_offset => config.time_offset_sigma_s,
+            i if (i - self.parts.time_offset as usize * TIME_DIM) % EXTRINSIC_DIM < 3 => config.extrinsics_sigma_m,
+            _ => config.extrinsics_sigma_rad,
         };
         std::array::from_fn(of)
     }
 
+    /// Number of columns that cameras touch: time offset, then extrinsics of each camera.
     pub fn camera_dim(&self) -> usize {
-        self.parts.camera_dim(self.cameras.len())
+        let extrinsics = self.parts.extrinsics as usize * EXTRINSIC_DIM * self.cameras.len();
+        self.parts.time_offset as usize * TIME_DIM + extrinsics
+    }
+
+    /// Number of columns that the inertial unit touches.
+    pub fn imu_dim(&self) -> usize {
+        self.parts.imu_scale as usize * SCALE_DIM
+    }
+
+    /// Number of all columns of the rig.
+    pub fn dim(&self) -> usize {
+        self.camera_dim() + self.imu_dim()
     }
 
     /// First column of a camera's extrinsics.
@@ -186,29 +178,31 @@ impl RigState {
         self.parts.extrinsics.then(|| self.parts.time_offset as usize * TIME_DIM + EXTRINSIC_DIM * camera)
     }
 
+    /// The cameras at the estimate.
     #[inline]
     pub fn cameras(&self) -> &[CameraModel] {
         &self.cameras
     }
 
+    /// The cameras at the linearization point.
     #[inline]
     pub fn cameras_linearized(&self) -> &[CameraModel] {
         &self.cameras_linearized
     }
 
+    /// From here on Jacobians are taken at the present estimate.
     pub fn fix_linearization_point(&mut self) {
-        if !self.is_linearized {
-            (self.is_linearized, self.linearization_point, self.delta) = (true, self.now, [0.0; RIG_DIM]);
+        if self.linearization_point.is_none() {
+            (self.linearization_point, self.delta) = (Some(self.now), [0.0; RIG_DIM]);
             self.refresh();
         }
     }
 
-    /// What was learnt stays, unless it makes no sense; the prior that anchored it is gone.
+    /// Frees the linearization point of a prior that is gone. What was learnt stays, unless it makes no sense.
     pub fn release(&mut self) {
-        self.is_linearized = false;
+        self.linearization_point = None;
         if !self.is_sane() {
-            let body_from_cam = self.calibrated;
-            self.now = Rig { time_offset: 0.0, body_from_cam, gyro_scale: DVec3::ZERO, accel_scale: DVec3::ZERO };
+            self.now = RigParameters::calibrated(self.calibrated);
         }
         self.refresh();
     }
@@ -217,8 +211,8 @@ impl RigState {
     pub fn is_sane(&self) -> bool {
         let (rig, n) = (&self.now, self.cameras.len());
         let near = |(a, b): (&Pose, &Pose)| {
-            let turn = so3::log(a.q.conjugate() * b.q).length();
-            a.p.distance(b.p) < TRANSLATION_MAX && turn < ROTATION_MAX
+            let rotation = so3::log(a.q.conjugate() * b.q).length();
+            a.p.distance(b.p) < TRANSLATION_MAX && rotation < ROTATION_MAX
         };
         let scale = rig.gyro_scale.abs().max(rig.accel_scale.abs()).max_element();
         let finite = rig.gyro_scale.is_finite() && rig.accel_scale.is_finite();
@@ -232,12 +226,12 @@ impl RigState {
         if !self.parts.extrinsics {
             return;
         }
-        for (c, camera_model) in self.cameras.iter_mut().enumerate() {
-            camera_model.body_from_cam = Transform::from(&self.now.body_from_cam[c]);
+        for (c, camera) in self.cameras.iter_mut().enumerate() {
+            camera.body_from_cam = Transform::from(&self.now.body_from_cam[c]);
         }
-        let fixed = if self.is_linearized { &self.linearization_point } else { &self.now };
-        for (c, camera_model) in self.cameras_linearized.iter_mut().enumerate() {
-            camera_model.body_from_cam = Transform::from(&fixed.body_from_cam[c]);
+        let fixed = *self.linearized();
+        for (c, camera) in self.cameras_linearized.iter_mut().enumerate() {
+            camera.body_from_cam = Transform::from(&fixed.body_from_cam[c]);
         }
     }
 
@@ -247,13 +241,11 @@ impl RigState {
         let mut d = [0.0; RIG_DIM];
         d[..n].copy_from_slice(cameras);
         d[n..n + imu.len()].copy_from_slice(imu);
-        let base = if self.is_linearized {
+        let base = self.linearization_point.unwrap_or(self.now);
+        if self.linearization_point.is_some() {
             self.delta.iter_mut().zip(&d).for_each(|(sum, d)| *sum += d);
             d = self.delta;
-            self.linearization_point
-        } else {
-            self.now
-        };
+        }
         let at = |i: usize| DVec3::new(d[i], d[i + 1], d[i + 2]);
         self.now = base;
         if self.parts.time_offset {
@@ -272,6 +264,7 @@ impl RigState {
         self.refresh();
     }
 
+    /// Keeps the estimate for `restore`.
     pub fn save(&mut self) {
         self.saved = (self.now, self.delta);
     }

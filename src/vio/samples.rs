@@ -48,10 +48,6 @@ impl ImuRing {
 
     pub const BYTES: usize = IMU_BETWEEN_FRAMES * size_of::<ImuSample>();
 
-    pub fn clear(&mut self) {
-        self.count = 0;
-    }
-
     /// Whether a sample is finite, newer than the last, and does not leap ahead of it.
     pub fn admits(&mut self, s: &ImuSample) -> bool {
         let last = self.newest().map(|n| n.t);
@@ -94,6 +90,7 @@ impl ImuRing {
         self.len().checked_sub(1).map(|i| self.get(i))
     }
 
+    #[cfg(test)]
     pub fn iter(&self) -> impl Iterator<Item = &ImuSample> {
         (0..self.len()).map(|i| self.get(i))
     }

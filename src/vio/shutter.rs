@@ -4,10 +4,10 @@
 //! In τ the body goes on with the velocity and rate it has, both seen from the body:
 //! `R(τ) = R Exp(ω τ)`, `p(τ) = p + R v τ`. To the residuals that is a camera that sits elsewhere on the
 //! body, `body_from_cam(τ) = (Exp(ω τ), v τ) body_from_cam`, so poses have the Jacobians they always had,
-//! and turning or shifting the world changes no residual: position and yaw stay unobservable. The twist
-//! is held through an optimisation, and for good once its frame is anchored.
+//! and rotating or translating the world changes no residual: position and yaw stay unobservable. The twist
+//! is held through an optimization, and for good once its frame has a fixed linearization point.
 
-use super::residuals::{ExtrinsicDerivatives, Transform};
+use super::reprojection::{ExtrinsicDerivatives, Transform};
 use crate::math::so3;
 use glam::{DMat3, DVec3};
 
@@ -18,40 +18,42 @@ pub struct Twist {
     pub w: DVec3,
 }
 
-/// Where a camera sits τ after the stamp, and how that depends on τ and on where it sits at the stamp.
+/// The place of a camera τ after the stamp, and its derivatives to τ and to its place at the stamp.
 #[derive(Clone, Copy, Debug)]
 pub struct DelayedCamera {
     pub body_from_cam: Transform,
-    turn: DMat3,
+    /// Rotation of the body in τ.
+    rotation: DMat3,
     /// Derivatives of [p, θ] to τ.
     d_p: DVec3,
     d_theta: DVec3,
 }
 
 impl DelayedCamera {
+    /// `tau` in seconds.
     pub fn new(body_from_cam: &Transform, twist: &Twist, tau: f64) -> DelayedCamera {
-        let turn = so3::exp_matrix(twist.w * tau);
+        let rotation = so3::exp_matrix(twist.w * tau);
         DelayedCamera {
-            body_from_cam: Transform { r: turn * body_from_cam.r, p: turn * body_from_cam.p + twist.v * tau },
-            turn,
-            d_p: turn * twist.w.cross(body_from_cam.p) + twist.v,
+            body_from_cam: Transform { r: rotation * body_from_cam.r, p: rotation * body_from_cam.p + twist.v * tau },
+            rotation,
+            d_p: rotation * twist.w.cross(body_from_cam.p) + twist.v,
             d_theta: body_from_cam.r.transpose() * twist.w,
         }
     }
 
     /// Derivatives to [p, θ] of the camera at τ, made derivatives to those at the stamp and to τ.
-    fn carry_back(&self, d: &[f64; 6]) -> ([f64; 6], f64) {
+    fn to_stamp(self, d: &[f64; 6]) -> ([f64; 6], f64) {
         let (d_p, d_theta) = (DVec3::new(d[0], d[1], d[2]), DVec3::new(d[3], d[4], d[5]));
-        let p = self.turn.transpose() * d_p;
+        let p = self.rotation.transpose() * d_p;
         ([p.x, p.y, p.z, d[3], d[4], d[5]], d_p.dot(self.d_p) + d_theta.dot(self.d_theta))
     }
 }
 
-/// Derivatives to both cameras where they sit at the stamp; answers those to the time offset, which delays
-/// both views alike.
-pub fn carry_back(d: &mut ExtrinsicDerivatives, host: &DelayedCamera, target: &DelayedCamera) -> [f64; 2] {
+/// Turns derivatives to both cameras at their instants into those to the cameras at the stamp; answers the
+/// derivatives of the pixel to the time offset, which delays both views alike.
+pub fn to_stamp(d: &mut ExtrinsicDerivatives, host: &DelayedCamera, target: &DelayedCamera) -> [f64; 2] {
     std::array::from_fn(|k| {
-        let (of_host, of_target) = (host.carry_back(&d.host[k]), target.carry_back(&d.target[k]));
+        let (of_host, of_target) = (host.to_stamp(&d.host[k]), target.to_stamp(&d.target[k]));
         (d.host[k], d.target[k]) = (of_host.0, of_target.0);
         of_host.1 + of_target.1
     })
@@ -60,7 +62,7 @@ pub fn carry_back(d: &mut ExtrinsicDerivatives, host: &DelayedCamera, target: &D
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used)]
-    use super::super::residuals::{predict, reproject_with_extrinsics, CameraModel, Point};
+    use super::super::reprojection::{predict, reproject_with_extrinsics, CameraModel, Point};
     use super::*;
     use glam::{DQuat, DVec2};
     use stipple_drivers::{Camera, Lens, Pose};
@@ -105,12 +107,12 @@ mod tests {
         Camera { width: 752, height: 480, fx: 458.0, fy: 457.0, cx: 367.0, cy: 248.0, lens }
     }
 
-    fn shifted(s: &Scene) -> [DelayedCamera; 2] {
+    fn delayed(s: &Scene) -> [DelayedCamera; 2] {
         [0, 1].map(|k| DelayedCamera::new(&Transform::from(&s.poses[2 + k]), &TWISTS[k], s.time_offset + ROWS[k]))
     }
 
     fn pixel(point: &Point, s: &Scene) -> DVec2 {
-        let [host, target] = shifted(s);
+        let [host, target] = delayed(s);
         let camera_model = CameraModel { camera: camera(), body_from_cam: target.body_from_cam, readout: 0.0 };
         predict(point, &host.body_from_cam, &Transform::from(&s.poses[0]), &camera_model, &Transform::from(&s.poses[1]))
             .unwrap()
@@ -124,11 +126,11 @@ mod tests {
             Point::new(DVec3::new(-0.3, 0.1, 1.0).normalize(), 0.0),
             Point::new(DVec3::new(0.2, 0.3, 1.0).normalize(), 1.5),
         ] {
-            let [host, target] = shifted(&s);
+            let [host, target] = delayed(&s);
             let camera_model = CameraModel { camera: camera(), body_from_cam: target.body_from_cam, readout: 0.0 };
             let (a, b) = (Transform::from(&s.poses[0]), Transform::from(&s.poses[1]));
             let (r, mut d) = reproject_with_extrinsics(&point, &host.body_from_cam, &a, &camera_model, &b).unwrap();
-            let d_time = carry_back(&mut d, &host, &target);
+            let d_time = to_stamp(&mut d, &host, &target);
             assert!((r.px - pixel(&point, &s)).length() < 1e-12);
             let close = |analytic: f64, numeric: f64, what: &str| {
                 let error = (analytic - numeric).abs() / (1.0 + analytic.abs());
@@ -156,15 +158,15 @@ mod tests {
     }
 
     #[test]
-    fn a_shifted_camera_is_where_the_body_takes_it() {
+    fn a_delayed_camera_is_where_the_body_takes_it() {
         let (s, tau) = (scene(), 0.01);
-        let shifted = DelayedCamera::new(&Transform::from(&s.poses[2]), &TWISTS[0], tau);
+        let delayed = DelayedCamera::new(&Transform::from(&s.poses[2]), &TWISTS[0], tau);
         let body = s.poses[0];
         let later = Pose::new(body.q * so3::exp(TWISTS[0].w * tau), body.p + body.q * TWISTS[0].v * tau);
         let expected = later * s.poses[2];
-        let found = body.rotation() * shifted.body_from_cam.p + body.p;
+        let found = body.rotation() * delayed.body_from_cam.p + body.p;
         assert!((found - expected.p).length() < 1e-12);
-        let turned = body.rotation() * shifted.body_from_cam.r;
-        assert!((turned - expected.rotation()).to_cols_array().iter().all(|x| x.abs() < 1e-12));
+        let rotation = body.rotation() * delayed.body_from_cam.r;
+        assert!((rotation - expected.rotation()).to_cols_array().iter().all(|x| x.abs() < 1e-12));
     }
 }

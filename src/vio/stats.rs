@@ -1,73 +1,58 @@
 //! What the estimator counts, and under which names it reaches the report.
 
-use super::health::Health;
+use super::health::{Health, Reset};
+use stipple_drivers::counters;
 
-/// What was dropped, refused, or went wrong so far.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Stats {
-    pub frames: u64,
-    pub keyframes: u64,
-    pub imu_rejected: u64,
+counters! {
+    /// What was dropped, refused, repaired or done so far.
+    #[derive(Clone, Copy, PartialEq, Eq)]
+    pub struct Stats of u64, read by u64::clone;
+    imu_rejected,
     /// Samples of which one axis could not be motion, and was put between its neighbours.
-    pub imu_repaired: u64,
-    pub imu_overflow: u64,
+    imu_repaired,
+    imu_overflow,
     /// Samples at the end of the sensor's range.
-    pub imu_saturated: u64,
-    /// Frames not newer than the last.
-    pub frames_rejected: u64,
-    /// Tracks of cameras the rig has not, with pixels that are none, or out of order.
-    pub tracks_rejected: u64,
-    /// Views of known landmarks too far from where these must be.
-    pub tracks_gated: u64,
-    /// Frames of which so many were that the prediction must have been wrong, and none was refused.
-    pub gates_opened: u64,
-    pub landmarks_full: u64,
-    pub outliers: u64,
-    pub solver_failures: u64,
-    /// All resets; below by their reason.
-    pub resets: u64,
-    /// No frame came for `FRAME_GAP_MAX`.
-    pub resets_frame_gap: u64,
-    /// Vision and inertia disagreed.
-    pub resets_disagreement: u64,
-    /// Nothing known was seen for too long.
-    pub resets_unseen: u64,
-    /// The state was not finite, or beyond what flies.
-    pub resets_state: u64,
+    imu_saturated,
     /// Holes in the inertial samples.
-    pub imu_gaps: u64,
+    imu_gaps,
+    /// Frames not newer than the last.
+    frames_rejected,
+    /// Tracks of cameras the rig has not, with pixels that are none, or out of order.
+    tracks_rejected,
+    /// Views of known landmarks too far from where these must be.
+    tracks_gated,
+    /// Frames of which so many were that the prediction must have been wrong, and none was refused.
+    gates_opened,
+    landmarks_full,
+    outliers,
+    solver_failures,
+    /// All resets; below by their reason.
+    resets,
+    /// No frame came for `FRAME_GAP_MAX`.
+    resets_frame_gap,
+    /// Vision and inertia disagreed.
+    resets_disagreement,
+    /// Nothing known was seen for too long.
+    resets_unseen,
+    /// The state was not finite, or beyond what flies.
+    resets_state,
     /// Frames of which a camera saw next to nothing while another did.
-    pub camera_blind: u64,
-    pub iterations: u64,
+    camera_blind,
     /// Frames held still because nothing moved.
-    pub zero_velocity_updates: u64,
+    zero_velocity_updates,
+    solver_iterations,
 }
 
 impl Stats {
-    /// What was dropped, refused or went wrong, by name.
-    pub fn counters(&self) -> [(&'static str, u64); 20] {
-        [
-            ("imu_rejected", self.imu_rejected),
-            ("imu_repaired", self.imu_repaired),
-            ("imu_overflow", self.imu_overflow),
-            ("imu_saturated", self.imu_saturated),
-            ("imu_gaps", self.imu_gaps),
-            ("frames_rejected", self.frames_rejected),
-            ("tracks_rejected", self.tracks_rejected),
-            ("tracks_gated", self.tracks_gated),
-            ("gates_opened", self.gates_opened),
-            ("landmarks_full", self.landmarks_full),
-            ("outliers", self.outliers),
-            ("solver_failures", self.solver_failures),
-            ("resets", self.resets),
-            ("resets_frame_gap", self.resets_frame_gap),
-            ("resets_disagreement", self.resets_disagreement),
-            ("resets_unseen", self.resets_unseen),
-            ("resets_state", self.resets_state),
-            ("camera_blind", self.camera_blind),
-            ("zero_velocity_updates", self.zero_velocity_updates),
-            ("solver_iterations", self.iterations),
-        ]
+    pub fn add_reset(&mut self, why: Reset) {
+        self.resets += 1;
+        match why {
+            Reset::FrameGap => self.resets_frame_gap += 1,
+            Reset::Disagreement => self.resets_disagreement += 1,
+            Reset::Unseen => self.resets_unseen += 1,
+            Reset::State => self.resets_state += 1,
+            Reset::Asked => {}
+        }
     }
 }
 

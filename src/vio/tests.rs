@@ -1,11 +1,16 @@
-//! The estimator on the made-up world, where its insides are seen.
+//! The estimator on the synthetic world, where its insides are seen.
 
+use super::estimator::Estimator;
+use super::factors::{of_window, view_rows, Factor};
+use super::inertial::{InertialWeight, MotionSigma};
+use super::rows::{scatter, FactorRows, POINT_DIM};
+use super::window::{Frame, Layout};
 use super::world::{self, Path, World, FRAME_SECS, RATE_HZ};
 use super::*;
+use crate::limits::FRAMES;
 use crate::math::dense::System;
-use marginalization::Sigma;
+use nalgebra::{Matrix3, Vector3};
 use stipple_drivers::Span;
-use window::Layout;
 
 fn run(vio: &mut Vio, frames: std::ops::Range<usize>, world: &mut World) {
     let mut tracks = Tracks::default();
@@ -24,10 +29,11 @@ fn run(vio: &mut Vio, frames: std::ops::Range<usize>, world: &mut World) {
     }
 }
 
-/// The direction in which the whole window moves (or turns about the world's axis).
-fn gauge(vio: &Vio, shift: DVec3, turn: DVec3, slot: usize) -> [f64; 15] {
-    let m = vio.window.frame(slot).motion_linearized();
-    let (p, th, v) = (shift + turn.cross(m.pose.p), m.pose.q.conjugate() * turn, turn.cross(m.v));
+/// The direction in which the whole window is translated, and rotated about the world's axis.
+fn gauge(estimator: &Estimator, translation: DVec3, rotation: DVec3, slot: usize) -> [f64; 15] {
+    let m = estimator.window.frame(slot).linearized();
+    let (p, v) = (translation + rotation.cross(m.pose.p), rotation.cross(m.v));
+    let th = m.pose.q.conjugate() * rotation;
     let mut d = [0.0; 15];
     (0..3).for_each(|i| (d[i], d[3 + i], d[6 + i]) = (p[i], th[i], v[i]));
     d
@@ -47,18 +53,23 @@ fn energies(frames: usize, config: &VioConfig, readout: Span) -> ([f64; 4], f64)
     world.rig.cameras.iter_mut().for_each(|c| c.readout = readout);
     let mut vio = Vio::new(&world.rig, config);
     run(&mut vio, 0..12, &mut world);
-    assert!(vio.running);
+    assert!(vio.is_running());
     // The first state is still in the window; with its position and yaw its velocity is left free too,
     // which as a vector of the world would tell yaw.
-    let first = vio.window.slots().next().expect("a running window has frames");
-    let motion = vio.window.frame(first).linearization_point;
-    let sigma = Sigma { p: 1e9, yaw: 1e9, tilt: 0.05, v: 1e9, bg: 0.02, ba: 0.3 };
-    vio.prior.start(first, &motion, &sigma, (&vio.window.rig, &vio.rig_sigma));
+    let Estimator { window, prior, rig_deviations, .. } = &mut vio.estimator;
+    let first = window.slots().next().expect("a running window has frames");
+    let motion = window.frame(first).linearization_point.expect("the prior is about the first state");
+    let sigma = MotionSigma { p: 1e9, yaw: 1e9, tilt: 0.05, v: 1e9, bg: 0.02, ba: 0.3 };
+    *rig_deviations = window.rig.sigmas(config);
+    prior.start(first, &motion, &sigma, &window.rig, rig_deviations);
     run(&mut vio, 12..frames, &mut world);
-    assert!(vio.stats.resets == 0 && vio.window.keyframe_poses().count() > 3);
-    let energy = |shift: DVec3, turn: DVec3| vio.prior.energy(&vio.window, |slot| gauge(&vio, shift, turn, slot));
+    let estimator = &vio.estimator;
+    assert!(vio.stats.resets == 0 && estimator.window.keyframe_poses().count() > 3);
+    let energy = |translation: DVec3, rotation: DVec3| {
+        estimator.prior.energy(&estimator.window, |slot| gauge(estimator, translation, rotation, slot))
+    };
     let tilt = energy(DVec3::ZERO, DVec3::X).min(energy(DVec3::ZERO, DVec3::Y));
-    (UNOBSERVABLE.map(|(_, shift, turn)| energy(shift, turn)), tilt)
+    (UNOBSERVABLE.map(|(_, translation, rotation)| energy(translation, rotation)), tilt)
 }
 
 fn four_directions_stay_empty(energy_max: f64, config: &VioConfig, readout: Span) {
@@ -90,40 +101,55 @@ fn prior_learns_no_more_when_the_rig_is_estimated_and_rows_roll() {
 }
 
 /// A window in which only inertial factors and finished landmarks act between the frames that leave and
-/// those that stay, so that before and after marginalisation it holds the same quadratic on what stays.
+/// those that stay, so that before and after marginalization it holds the same quadratic on what stays.
 /// The newest is pushed off by `push` in every error.
-fn ready_to_marginalize(push: f64) -> Vio {
+fn ready_to_marginalize(push: f64) -> Estimator {
     let mut world = World::new(Path { rest: -1.0 });
     let mut vio = Vio::new(&world.rig, &VioConfig::default());
     run(&mut vio, 0..40, &mut world);
-    let oldest = vio.window.states().next().expect("a running window has states");
-    let newest = vio.window.newest().expect("a running window has a newest frame");
+    let mut estimator = vio.estimator;
+    let window = &mut estimator.window;
+    let oldest = window.states().next().expect("a running window has states");
+    let newest = *window.frame(window.newest().expect("a running window has a newest frame"));
     // One more state, by inertia alone, so that one is due to leave; and no live landmark.
-    let from = vio.window.frame(newest).now;
-    let t = vio.window.frame(newest).t + Span::from_secs(0.05);
-    let inc = vio.imu.integrate(vio.window.frame(newest).t, t, from.bg, from.ba, &vio.noise);
-    let mut frame = Frame::first(t, from.propagate(&inc).plus(&[push; 15]));
-    frame.weight = vio.inertial_weight(&inc);
+    let (from, t) = (newest.now, newest.t + Span::from_secs(0.05));
+    let inc = vio.imu.integrate(newest.t, t, from.bg, from.ba, &estimator.model.noise);
+    let mut frame = Frame::new(t, from.propagate(&inc).plus(&[push; 15]));
+    frame.weight = InertialWeight::new(&inc, &estimator.model.noise);
     frame.increment = inc;
-    vio.window.push(frame).expect("room for one");
-    let boundary = vio.window.states().nth(1).expect("a second state");
-    let (window, old) = (&vio.window, vio.window.frame(boundary).t);
-    vio.landmarks.retain(|l| l.observations.iter().all(|o| window.frame(o.slot as usize).t <= old));
-    assert!(vio.window.frame(oldest).moving);
-    vio
+    window.push(frame).expect("room for one");
+    let boundary = window.frame(window.states().nth(1).expect("a second state")).t;
+    let is_finished = |s: u8| window.frame(s as usize).t <= boundary;
+    estimator.landmarks.retain(|l| l.observations.iter().all(|o| is_finished(o.slot)));
+    assert!(window.frame(oldest).is_state);
+    estimator
 }
 
-fn newton(vio: &mut Vio) -> [[f64; 15]; FRAMES] {
-    vio.solver.newton_step(&vio.window, &vio.landmarks, &mut vio.prior, &vio.model)
+/// The undamped step of every slot.
+fn newton(estimator: &mut Estimator) -> [[f64; 15]; FRAMES] {
+    let Estimator { window, landmarks, prior, solver, model, .. } = estimator;
+    by_slot(solver.newton_step(window, landmarks, prior, model), window)
+}
+
+fn by_slot(step: &[f64], window: &window::Window) -> [[f64; 15]; FRAMES] {
+    let layout = Layout::of(window);
+    let mut steps = [[0.0; 15]; FRAMES];
+    for slot in window.slots() {
+        for (part, first) in layout.state(slot).into_iter().zip([0, 6]) {
+            let Some(part) = part else { continue };
+            steps[slot][first..first + part.len].copy_from_slice(&step[part.at..part.at + part.len]);
+        }
+    }
+    steps
 }
 
 #[test]
-fn marginalising_keeps_the_step_of_what_stays() {
-    let mut vio = ready_to_marginalize(0.01);
-    let before = newton(&mut vio);
-    vio.marginalize();
-    let after = newton(&mut vio);
-    for slot in vio.window.states() {
+fn marginalizing_keeps_the_step_of_what_stays() {
+    let mut estimator = ready_to_marginalize(0.01);
+    let before = newton(&mut estimator);
+    estimator.marginalize();
+    let after = newton(&mut estimator);
+    for slot in estimator.window.states() {
         for i in 0..15 {
             let (a, b) = (before[slot][i], after[slot][i]);
             assert!((a - b).abs() < 1e-7 + 1e-5 * a.abs(), "slot {slot} error {i}: {a} then {b}");
@@ -131,42 +157,52 @@ fn marginalising_keeps_the_step_of_what_stays() {
     }
 }
 
-/// The normal equations of the same window by the textbook: landmarks eliminated by Schur complement, in f64,
+/// The normal equations of the same window by the textbook: landmarks eliminated by Schur complement,
 /// from rows that are not yet eliminated.
-fn schur_step(vio: &mut Vio) -> (Vec<f64>, Vec<f64>) {
-    let layout = Layout::of(&vio.window);
-    let mut system = System::new(layout.dim);
-    system.clear(layout.dim);
-    vio.prior.add_to(&vio.window, &layout, &mut system);
-    let mut linear = linear::Linear::new();
-    let states: Vec<usize> = vio.window.states().collect();
-    for pair in states.windows(2) {
-        linear::inertial_rows(&vio.window, pair[0], pair[1], &layout, &mut linear);
-        linear.add_to(0, &mut system);
-    }
-    for l in &vio.landmarks.pool {
-        let Some(rows) = linear::raw_landmark_rows(l, &vio.window, &vio.model, &layout, &mut linear) else { continue };
-        let n = layout.dim;
-        let mut v = nalgebra::Matrix3::<f64>::zeros();
-        let (mut w, mut g) = (vec![[0.0; 3]; n], nalgebra::Vector3::<f64>::zeros());
-        for row in &rows {
-            let j = nalgebra::Vector3::from_row_slice(&row[..3]);
+fn schur_step(estimator: &mut Estimator) -> (Vec<f64>, Vec<f64>) {
+    let Estimator { window, landmarks, prior, model, .. } = estimator;
+    let layout = Layout::of(window);
+    let n = layout.dim;
+    let mut system = System::new(n);
+    system.clear(n);
+    prior.add_to(window, &layout, &mut system);
+    let mut rows = FactorRows::new();
+    for factor in of_window(window, &landmarks.pool) {
+        let Factor::Landmark(l) = factor else {
+            factor.linearize(window, model, &layout, &mut rows);
+            rows.add_to(0, &mut system);
+            continue;
+        };
+        view_rows(l, window, model, &layout, &mut rows);
+        // [point | all columns of the layout | r]
+        let mut raw = vec![vec![0.0; POINT_DIM + n + 1]; rows.rows.len()];
+        for (i, wide) in raw.iter_mut().enumerate() {
+            let row = rows.rows.row(i);
+            wide[..POINT_DIM].copy_from_slice(&row[..POINT_DIM]);
+            scatter(&row[POINT_DIM..], &rows.columns, &mut wide[POINT_DIM..]);
+        }
+        if factor.linearize(window, model, &layout, &mut rows).first.is_none() {
+            continue;
+        }
+        let (mut v, mut g) = (Matrix3::<f64>::zeros(), Vector3::<f64>::zeros());
+        let mut w = vec![Vector3::<f64>::zeros(); n];
+        for row in &raw {
+            let j = Vector3::from_row_slice(&row[..3]);
             v += j * j.transpose();
             g += j * row[3 + n];
             for a in 0..n {
-                (0..3).for_each(|k| w[a][k] += row[3 + a] * j[k]);
+                w[a] += j * row[3 + a];
                 system.b[a] += row[3 + a] * row[3 + n];
                 (0..=a).for_each(|b| system.add(a, b, row[3 + a] * row[3 + b]));
             }
         }
         let inverse = v.try_inverse().expect("a determined point");
-        let w: Vec<_> = w.iter().map(|w| nalgebra::Vector3::from_row_slice(w)).collect();
         for a in 0..n {
             system.b[a] -= w[a].dot(&(inverse * g));
             (0..=a).for_each(|b| system.add(a, b, -w[a].dot(&(inverse * w[b]))));
         }
     }
-    let (b, mut x) = (system.b.clone(), vec![0.0; layout.dim]);
+    let (b, mut x) = (system.b.clone(), vec![0.0; n]);
     system.solve_damped(|_| 0.0, &mut system.clone(), &mut x);
     (b, x)
 }
@@ -176,19 +212,15 @@ fn qr_and_schur_complement_agree() {
     let mut world = World::new(Path { rest: -1.0 });
     let mut vio = Vio::new(&world.rig, &VioConfig::default());
     run(&mut vio, 0..60, &mut world);
-    assert!(vio.landmarks.pool.len() > 50);
-    let steps = newton(&mut vio);
-    let (b, x) = schur_step(&mut vio);
-    let layout = Layout::of(&vio.window);
-    let largest = |x: &[f64]| x.iter().fold(0.0f64, |m, x| m.max(x.abs()));
-    assert!(largest(&b) > 0.0);
-    for slot in vio.window.slots() {
-        for (part, first) in layout.state(slot).into_iter().zip([0, 6]) {
-            let Some(part) = part else { continue };
-            for i in 0..part.len {
-                let (qr, schur) = (steps[slot][first + i], x[part.at + i]);
-                assert!((qr - schur).abs() < 1e-7 + 1e-5 * qr.abs(), "slot {slot} error {}: {qr} {schur}", first + i);
-            }
+    let estimator = &mut vio.estimator;
+    assert!(estimator.landmarks.pool.len() > 50);
+    let steps = newton(estimator);
+    let (b, x) = schur_step(estimator);
+    assert!(b.iter().any(|b| *b != 0.0));
+    let schur = by_slot(&x, &estimator.window);
+    for slot in estimator.window.slots() {
+        for (i, (qr, schur)) in steps[slot].iter().zip(&schur[slot]).enumerate() {
+            assert!((qr - schur).abs() < 1e-7 + 1e-5 * qr.abs(), "slot {slot} error {i}: {qr} {schur}");
         }
     }
 }
@@ -215,7 +247,7 @@ fn restart_goes_on_where_it_was() {
     let before = vio.window().last().expect("a running window has frames");
     vio.reset();
     run(&mut vio, 60..80, &mut world);
-    assert!(vio.running && vio.stats.resets == 1);
+    assert!(vio.is_running() && vio.stats.resets == 1);
     let after = vio.window().next().expect("a running window has frames");
     // Half a second of alignment at up to 1 m/s, carried by inertia.
     let truly = |t: Nanos| path.pose(t.0 as f64 * 1e-9);
@@ -241,21 +273,23 @@ fn prediction_meets_the_next_estimate() {
     let mut world = World::new(Path { rest: -1.0 });
     let mut vio = Vio::new(&world.rig, &VioConfig::default());
     run(&mut vio, 0..59, &mut world);
-    let published = vio.predictor();
+    let before = vio.odometry();
     run(&mut vio, 59..60, &mut world);
-    let last = vio.window().last().expect("a running window has frames");
-    let t = last.0 + Span::from_secs(FRAME_SECS);
+    let last = vio.odometry().expect("running");
+    let t = last.t + Span::from_secs(FRAME_SECS);
     for k in 1..=10 {
-        vio.on_imu(world.imu((last.0 .0 as f64 * 1e-9) + k as f64 / RATE_HZ));
+        vio.on_imu(world.imu((last.t.0 as f64 * 1e-9) + k as f64 / RATE_HZ));
     }
     let predicted = vio.predict(t).expect("running");
-    let motion = vio.predict_motion(t).expect("running");
+    let mut predictor = Predictor::new(&world.rig, &VioConfig::default());
+    vio.imu.iter().for_each(|s| predictor.on_imu(*s));
+    predictor.motion_to(last.t, None);
+    let motion = predictor.motion_to(t, before.as_ref()).expect("a second frame");
     let mut tracks = Tracks::default();
     world.tracks(t.0 as f64 * 1e-9, &mut tracks);
     let update = vio.on_tracks(&tracks).odometry.expect("running");
     assert!((predicted.world_from_body.p - update.world_from_body.p).length() < 0.005);
-    assert!((last.1 * motion).p.distance(predicted.world_from_body.p) < 0.005);
-    assert_eq!(motion, published.motion(&vio.imu, last.0, t), "a tracker of its own predicts the same");
+    assert!((last.world_from_body * motion).p.distance(predicted.world_from_body.p) < 0.005);
 }
 
 #[test]
@@ -266,10 +300,10 @@ fn uncertainty_of_position_and_yaw_only_grows() {
     for frames in [0..100, 100..300, 300..600] {
         run(&mut vio, frames, &mut world);
         let c = vio.covariance().expect("running");
-        let world_from_body = vio.window.frame(vio.window.newest().expect("running")).now.pose.rotation();
-        let theta = nalgebra::Matrix3::from_fn(|i, j| c[3 + i][3 + j]);
+        let world_from_body = vio.odometry().expect("running").world_from_body.rotation();
+        let theta = Matrix3::from_fn(|i, j| c[3 + i][3 + j]);
         let up = world_from_body.transpose() * DVec3::Z;
-        let up = nalgebra::Vector3::new(up.x, up.y, up.z);
+        let up = Vector3::new(up.x, up.y, up.z);
         sigmas.push(((0..3).map(|i| c[i][i]).sum::<f64>().sqrt(), up.dot(&(theta * up)).sqrt()));
     }
     eprintln!("position, m, and yaw, rad, after 5, 15 and 30 s: {sigmas:.4?}");
@@ -288,7 +322,7 @@ fn gated(moved: impl Fn(u64) -> bool) -> (u64, u64, u64) {
     world.tracks(60.0 * FRAME_SECS + 0.0012, &mut tracks);
     let mut count = 0;
     for track in tracks.cameras.iter_mut().flat_map(|c| c.iter_mut()) {
-        if vio.landmarks.find(track.id).is_some() && moved(track.id) {
+        if vio.estimator.landmarks.find(track.id).is_some() && moved(track.id) {
             (track.px[0], count) = (track.px[0] + 12.0, count + 1);
         }
     }

@@ -1,116 +1,117 @@
-//! The frames being estimated: up to eight keyframe poses and four states with velocity and biases.
+//! The frames being estimated: states with velocity and biases, and older keyframes as poses only; how many of each
+//! is in `limits.rs`.
 //!
 //! Frames live in stable slots, so landmarks and the prior name them by slot; `order` is by time.
-//! A frame the prior touches is *anchored*: its estimate is kept as a fixed linearisation point
-//! plus an error, and every Jacobian to it is taken at that point (first-estimate Jacobians), which
+//! A frame the prior touches has a fixed linearization point: its estimate is kept as that point
+//! plus an error, and every Jacobian to it is taken there (first-estimate Jacobians), which
 //! keeps position and yaw unobservable as they are.
 
+use super::inertial::{InertialWeight, Motion};
 use super::preintegration::{Increment, Mat9};
-use super::residuals::{InertialWeight, Motion, Transform};
+use super::reprojection::Transform;
 use super::rig::RigState;
 use super::shutter::Twist;
-use crate::limits::{KEYFRAMES, STATES};
+use crate::limits::FRAMES;
 use crate::math::dense::Columns;
 use crate::mem::List;
 use glam::DVec3;
 use stipple_drivers::Nanos;
 
-/// Frames at the peak, just before marginalisation.
-pub const FRAMES: usize = STATES + 1 + KEYFRAMES + 1;
+/// Dimensions of [p, θ], and of [v, bg, ba].
 pub const POSE_DIM: usize = 6;
 pub const MOTION_DIM: usize = 9;
 
+/// One frame of the window.
 #[derive(Clone, Copy, Debug)]
 pub struct Frame {
     pub t: Nanos,
+    /// The estimate.
     pub now: Motion,
     pub keyframe: bool,
     /// Velocity and biases are still estimated.
-    pub moving: bool,
-    pub is_linearized: bool,
-    pub linearization_point: Motion,
-    /// Error since the anchor, [p, θ, v, bg, ba].
+    pub is_state: bool,
+    /// Where Jacobians are taken for good, once the prior is about this frame.
+    pub linearization_point: Option<Motion>,
+    /// Error since the linearization point, [p, θ, v, bg, ba].
     pub delta: [f64; 15],
-    /// From the frame before, when that one is moving.
+    /// Inertial samples since the frame before, when that one is a state.
     pub increment: Increment,
     pub weight: InertialWeight,
-    /// What the gyro reads at the stamp, and the twist held from it through an optimisation.
+    /// Reading of the gyro at the stamp, rad/s, and the twist held from it through an optimization.
     pub rate: DVec3,
     pub twist: Twist,
     /// Mean rate of a frame found at rest, rad/s.
-    pub rest: Option<DVec3>,
+    pub rest_rate: Option<DVec3>,
     /// Landmarks it hosted when it became a keyframe.
     pub hosted: usize,
-    pub body: Transform,
-    /// Where Jacobians are taken: the anchor, or now.
-    pub body_linearized: Transform,
+    /// Pose at the estimate, and where Jacobians are taken.
+    pub world_from_body: Transform,
+    pub world_from_body_linearized: Transform,
 }
 
 impl Frame {
-    pub fn first(t: Nanos, now: Motion) -> Frame {
+    /// A state that nothing has been measured at.
+    pub fn new(t: Nanos, now: Motion) -> Frame {
         let mut f = Frame {
             t,
             now,
             keyframe: false,
-            moving: true,
-            is_linearized: false,
-            linearization_point: now,
+            is_state: true,
+            linearization_point: None,
             delta: [0.0; 15],
             increment: Increment::new(now.bg, now.ba),
             weight: InertialWeight { increment: Mat9::zeros(), bg: 0.0, ba: 0.0 },
             rate: DVec3::ZERO,
             twist: Twist::default(),
-            rest: None,
+            rest_rate: None,
             hosted: 0,
-            body: Transform::default(),
-            body_linearized: Transform::default(),
+            world_from_body: Transform::default(),
+            world_from_body_linearized: Transform::default(),
         };
         f.refresh();
         f
     }
 
-    pub fn refresh(&mut self) {
-        self.body = Transform::from(&self.now.pose);
-        self.body_linearized =
-            if self.is_linearized { Transform::from(&self.linearization_point.pose) } else { self.body };
+    fn refresh(&mut self) {
+        self.world_from_body = Transform::from(&self.now.pose);
+        self.world_from_body_linearized = Transform::from(&self.linearized().pose);
     }
 
-    /// Takes the twist of the estimate; an anchored frame has its own for good.
+    /// Takes the twist of the estimate; a frame with a fixed linearization point has its own for good.
     pub fn hold_twist(&mut self) {
-        if !self.is_linearized {
+        if self.linearization_point.is_none() {
             let to_body = self.now.pose.q.conjugate();
             self.twist = Twist { v: to_body * self.now.v, w: self.rate - self.now.bg };
         }
     }
 
     /// Motion at which Jacobians are taken.
-    pub fn motion_linearized(&self) -> &Motion {
-        if self.is_linearized {
-            &self.linearization_point
-        } else {
-            &self.now
-        }
+    pub fn linearized(&self) -> &Motion {
+        self.linearization_point.as_ref().unwrap_or(&self.now)
     }
 
+    /// From here on Jacobians are taken at the present estimate.
     pub fn fix_linearization_point(&mut self) {
-        if !self.is_linearized {
-            (self.is_linearized, self.linearization_point, self.delta) = (true, self.now, [0.0; 15]);
+        if self.linearization_point.is_none() {
+            (self.linearization_point, self.delta) = (Some(self.now), [0.0; 15]);
             self.refresh();
         }
     }
 
-    /// Moves by an error: an anchored frame accumulates it in the tangent space of its anchor.
+    /// Moves by an error, which a frame with a fixed linearization point sums up in the tangent space there.
     pub fn step(&mut self, d: &[f64; 15]) {
-        if self.is_linearized {
-            (0..15).for_each(|i| self.delta[i] += d[i]);
-            self.now = self.linearization_point.plus(&self.delta);
-        } else {
-            self.now = self.now.plus(d);
+        match self.linearization_point {
+            Some(point) => {
+                (0..15).for_each(|i| self.delta[i] += d[i]);
+                self.now = point.plus(&self.delta);
+            }
+            None => self.now = self.now.plus(d),
         }
         self.refresh();
     }
 }
 
+/// The frames, in slots, and the rig.
 #[derive(Clone, Debug)]
 pub struct Window {
     frames: Vec<Frame>,
@@ -123,12 +124,13 @@ pub struct Window {
 
 impl Window {
     pub fn new(rig: RigState) -> Window {
-        let frames = vec![Frame::first(Nanos(0), Motion::default()); FRAMES];
+        let frames = vec![Frame::new(Nanos(0), Motion::default()); FRAMES];
         Window { saved: frames.clone(), frames, used: [false; FRAMES], order: List::default(), rig }
     }
 
     pub const BYTES: usize = 2 * FRAMES * size_of::<Frame>();
 
+    /// Forgets the frames and keeps what was learnt of the rig.
     pub fn clear(&mut self) {
         self.used = [false; FRAMES];
         self.order.clear();
@@ -149,18 +151,22 @@ impl Window {
         self.order.retain(|s| *s as usize != slot);
     }
 
+    /// Slots of all frames, oldest first.
     pub fn slots(&self) -> impl DoubleEndedIterator<Item = usize> + '_ {
         self.order.iter().map(|s| *s as usize)
     }
 
+    /// Slots of states, oldest first.
     pub fn states(&self) -> impl DoubleEndedIterator<Item = usize> + '_ {
-        self.slots().filter(|s| self.frames[*s].moving)
+        self.slots().filter(|s| self.frames[*s].is_state)
     }
 
+    /// Slots of frames that are poses only, oldest first.
     pub fn keyframe_poses(&self) -> impl DoubleEndedIterator<Item = usize> + '_ {
-        self.slots().filter(|s| !self.frames[*s].moving)
+        self.slots().filter(|s| !self.frames[*s].is_state)
     }
 
+    /// Slot of the newest frame.
     pub fn newest(&self) -> Option<usize> {
         self.order.last().map(|s| *s as usize)
     }
@@ -174,13 +180,14 @@ impl Window {
         &mut self.frames[slot]
     }
 
-    /// Before views are predicted: see `shutter`. Frames of a plain rig need none.
+    /// Takes the twists that views are predicted with (`shutter.rs`). Frames of a plain rig need none.
     pub fn hold_twists(&mut self) {
         if !self.rig.is_plain() {
             self.frames.iter_mut().for_each(Frame::hold_twist);
         }
     }
 
+    /// Keeps all estimates for `restore`.
     pub fn save(&mut self) {
         self.saved.copy_from_slice(&self.frames);
         self.rig.save();
@@ -191,6 +198,7 @@ impl Window {
         self.rig.restore();
     }
 
+    /// Moves every frame and the rig by the solution of a system.
     pub fn step(&mut self, layout: &Layout, dx: &[f64]) {
         for i in 0..self.order.len() {
             let slot = self.order[i] as usize;
@@ -203,7 +211,7 @@ impl Window {
             }
             self.frames[slot].step(&d);
         }
-        let part = |span: Option<Columns>| span.map_or(&[][..], |s| &dx[s.at..s.at + s.len]);
+        let part = |columns: Option<Columns>| columns.map_or(&[][..], |c| &dx[c.at..c.at + c.len]);
         if layout.cameras.is_some() || layout.imu.is_some() {
             self.rig.step(part(layout.cameras), part(layout.imu));
         }
@@ -227,13 +235,13 @@ impl Layout {
         Layout { pose: [ABSENT; FRAMES], motion: [ABSENT; FRAMES], cameras: None, imu: None, dim: 0 }
     }
 
-    /// Every variable of the window.
+    /// Columns of every variable of the window: the rig first, the newest state last.
     pub fn of(window: &Window) -> Layout {
         let mut l = Layout::empty();
         l.add_rig(&window.rig);
         for slot in window.slots() {
             l.add_pose(slot);
-            if window.frame(slot).moving {
+            if window.frame(slot).is_state {
                 l.add_motion(slot);
             }
         }
@@ -255,14 +263,14 @@ impl Layout {
         }
     }
 
-    /// What is estimated of the rig, if anything.
+    /// Columns of what is estimated of the rig, if anything.
     pub fn add_rig(&mut self, rig: &RigState) {
         let mut add = |len: usize| {
-            let span = Columns { at: self.dim, len };
+            let columns = Columns { at: self.dim, len };
             self.dim += len;
-            (len > 0).then_some(span)
+            (len > 0).then_some(columns)
         };
-        (self.cameras, self.imu) = (add(rig.camera_dim()), add(rig.parts.imu_dim()));
+        (self.cameras, self.imu) = (add(rig.camera_dim()), add(rig.imu_dim()));
     }
 
     /// Columns of the rig that views touch.
@@ -275,7 +283,7 @@ impl Layout {
         self.imu
     }
 
-    /// Pose, then velocity and biases.
+    /// Columns of a frame's pose, then of its velocity and biases.
     pub fn state(&self, slot: usize) -> [Option<Columns>; 2] {
         [
             self.pose(slot).map(|at| Columns { at, len: POSE_DIM }),

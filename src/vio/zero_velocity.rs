@@ -2,20 +2,24 @@
 //! the pixel noise let a resting rig creep, and no keyframe is ever taken to stop it.
 //!
 //! A frame is at rest when the inertial samples are quiet, its tracks have not moved against a frame
-//! at least `Gate::reference` older, and the estimate is not already fast: far points of a rig in
+//! at least `Rest::reference` older, and the estimate is not already fast: far points of a rig in
 //! smooth flight stand as still as those of a rig on a table. A rig on the ground with its motors on
 //! shakes as it does in flight (EuRoC V1_01: 1.5 m/s², 0.1 rad/s), so quiet it is not: then nothing may
 //! have moved against the oldest frame of the window, which a hovering rig leaves behind.
 
-use super::initialization::{REST_ACCEL, REST_GYRO, REST_PX};
-use super::landmarks::find_track;
+use super::inertial::Motion;
 use super::samples::ImuRing;
-use super::window::{Frame, Window};
+use super::window::Window;
 use crate::frontend::Tracks;
 use crate::limits::TRACKS;
 use crate::mem::List;
+use glam::DVec3;
 use stipple_drivers::Span;
 
+/// At rest the samples of a unit spread by less than this, rad/s and m/s², and tracks move less than this, px.
+pub const REST_GYRO: f64 = 0.03;
+pub const REST_ACCEL: f64 = 0.3;
+pub const REST_PX: f64 = 0.5;
 /// Standard deviations of "does not move", m/s, and of "the mean rate is the bias", rad/s.
 const SIGMA_V: f64 = 4e-3;
 const SIGMA_GYRO: f64 = 2e-3;
@@ -28,7 +32,7 @@ const COMMON_MIN: usize = 12;
 const LAG: usize = 2;
 
 /// What counts as rest.
-struct Gate {
+struct Rest {
     /// Spread of the samples, rad/s and m/s², over this long, s.
     gyro: f64,
     accel: f64,
@@ -36,22 +40,22 @@ struct Gate {
     /// The youngest frame to compare tracks with, s, and how far they may have moved, px.
     reference: f64,
     px: f64,
-    /// An estimate faster than this is not overruled, m/s; nor a turn, rad/s.
+    /// An estimate faster than this is not overruled, m/s; nor a rotation, rad/s.
     speed: f64,
     rate: f64,
 }
 
-const QUIET: Gate =
-    Gate { gyro: REST_GYRO, accel: REST_ACCEL, span: 0.3, reference: 0.1, px: REST_PX, speed: 0.1, rate: 0.02 };
+const QUIET: Rest =
+    Rest { gyro: REST_GYRO, accel: REST_ACCEL, span: 0.3, reference: 0.1, px: REST_PX, speed: 0.1, rate: 0.02 };
 /// Twice what V1_01 shakes by on the ground. A shaken camera's tracks scatter by half a pixel.
-const SHAKEN: Gate = Gate { gyro: 0.25, accel: 3.0, span: 0.4, reference: 0.25, px: 1.0, speed: 0.03, rate: 0.01 };
+const SHAKEN: Rest = Rest { gyro: 0.25, accel: 3.0, span: 0.4, reference: 0.25, px: 1.0, speed: 0.03, rate: 0.01 };
 
 /// Holds the frame that has since been seen to stand; answers whether it did.
 pub fn hold(newest: usize, window: &mut Window, tracks: &[Tracks], imu: &ImuRing) -> bool {
     let Some(held) = window.states().rev().nth(LAG) else { return false };
     let span = stands(newest, window, tracks, imu);
     let rest = span.and_then(|span| imu.statistics(window.frame(held).t, span)).map(|s| s.gyro);
-    window.frame_mut(held).rest = rest;
+    window.frame_mut(held).rest_rate = rest;
     rest.is_some()
 }
 
@@ -59,29 +63,29 @@ pub fn hold(newest: usize, window: &mut Window, tracks: &[Tracks], imu: &ImuRing
 /// rate is then the gyro's bias.
 fn stands(slot: usize, window: &Window, tracks: &[Tracks], imu: &ImuRing) -> Option<Span> {
     let old_enough =
-        |gate: &Gate, r: &usize| window.frame(*r).t <= window.frame(slot).t - Span::from_secs(gate.reference);
+        |rest: &Rest, r: &usize| window.frame(*r).t <= window.frame(slot).t - Span::from_secs(rest.reference);
     let recent = || window.slots().rev().find(|r| old_enough(&QUIET, r));
     let oldest = || {
         let shares = |r: &usize| common(&tracks[*r], &tracks[slot]).take(COMMON_MIN).count() == COMMON_MIN;
         window.slots().take_while(|r| old_enough(&SHAKEN, r)).find(shares)
     };
-    let passes = |gate: &Gate, reference: &dyn Fn() -> Option<usize>| {
+    let passes = |rest: &Rest, reference: &dyn Fn() -> Option<usize>| {
         let frame = window.frame(slot);
-        let span = Span::from_secs(gate.span);
+        let span = Span::from_secs(rest.span);
         let s = imu.statistics(frame.t, span)?;
-        let quiet = s.gyro_sigma < gate.gyro && s.accel_sigma < gate.accel;
-        if !quiet || (s.gyro - frame.now.bg).length() > gate.rate || frame.now.v.length() > gate.speed {
+        let quiet = s.gyro_sigma < rest.gyro && s.accel_sigma < rest.accel;
+        if !quiet || (s.gyro - frame.now.bg).length() > rest.rate || frame.now.v.length() > rest.speed {
             return None;
         }
         let moved = median_displacement(&tracks[reference()?], &tracks[slot])?;
-        (moved < gate.px as f32).then_some(span)
+        (moved < rest.px as f32).then_some(span)
     };
     passes(&QUIET, &recent).or_else(|| passes(&SHAKEN, &oldest))
 }
 
-/// Where points that both see were and are, in camera 0.
+/// Pixels in camera 0 of the points that both see, before and now.
 fn common<'a>(from: &'a Tracks, to: &'a Tracks) -> impl Iterator<Item = ([f32; 2], [f32; 2])> + 'a {
-    to.cameras[0].iter().filter_map(|t| find_track(&from.cameras[0], t.id).map(|f| (f.px, t.px)))
+    to.cameras[0].iter().filter_map(|t| from.find(0, t.id).map(|f| (f.px, t.px)))
 }
 
 /// The larger axis of the median absolute displacement in camera 0, px. By axis, so that noise of
@@ -105,44 +109,40 @@ fn median_displacement(from: &Tracks, to: &Tracks) -> Option<f32> {
 }
 
 /// Reciprocal deviations of the residual: of velocity, then of the gyro's bias.
-pub const REST_WEIGHTS: [f64; 6] = {
+pub const WEIGHTS: [f64; 6] = {
     let (v, g) = (1.0 / SIGMA_V, 1.0 / SIGMA_GYRO);
     [v, v, v, g, g, g]
 };
 
-/// Whitened residual of a frame at rest: velocity, then gyro bias beside the mean rate. Its derivative to
-/// [v, bg] is the diagonal of `REST_WEIGHTS`.
-pub fn rest_residual(frame: &Frame) -> Option<[f64; 6]> {
-    let (v, g) = (frame.now.v / SIGMA_V, (frame.now.bg - frame.rest?) / SIGMA_GYRO);
-    Some([v.x, v.y, v.z, g.x, g.y, g.z])
+/// Whitened residual of a state at rest: velocity, then gyro bias beside the mean rate. Its derivative to
+/// [v, bg] is the diagonal of `WEIGHTS`.
+pub fn residual(now: &Motion, rate: DVec3) -> [f64; 6] {
+    let (v, g) = (now.v / SIGMA_V, (now.bg - rate) / SIGMA_GYRO);
+    [v.x, v.y, v.z, g.x, g.y, g.z]
 }
 
-pub fn rest_cost(frame: &Frame) -> f64 {
-    rest_residual(frame).map_or(0.0, |r| 0.5 * r.iter().map(|r| r * r).sum::<f64>())
+/// Half the squared residual.
+pub fn cost(now: &Motion, rate: DVec3) -> f64 {
+    0.5 * residual(now, rate).iter().map(|r| r * r).sum::<f64>()
 }
 
 #[cfg(test)]
 mod tests {
-    use super::super::residuals::Motion;
     use super::*;
-    use glam::DVec3;
-    use stipple_drivers::Nanos;
 
     #[test]
-    fn weights_of_the_rest_factor_are_the_derivatives_of_its_residual() {
+    fn weights_are_the_derivatives_of_the_residual() {
         let now = Motion { v: DVec3::new(0.02, -0.01, 0.03), bg: DVec3::new(0.01, 0.0, -0.02), ..Motion::default() };
-        let mut frame = Frame::first(Nanos(0), now);
-        assert_eq!(rest_cost(&frame), 0.0);
-        frame.rest = Some(DVec3::new(0.012, 0.001, -0.021));
+        let rate = DVec3::new(0.012, 0.001, -0.021);
         for i in 0..15 {
             let at = |h: f64| {
                 let mut d = [0.0; 15];
                 d[i] = h;
-                rest_residual(&Frame { now: now.plus(&d), ..frame }).expect("at rest")
+                residual(&now.plus(&d), rate)
             };
             let (up, down) = (at(1e-6), at(-1e-6));
             for k in 0..6 {
-                let expected = if i == k + 6 { REST_WEIGHTS[k] } else { 0.0 };
+                let expected = if i == k + 6 { WEIGHTS[k] } else { 0.0 };
                 assert!(((up[k] - down[k]) / 2e-6 - expected).abs() < 1e-5, "error {i}, residual {k}");
             }
         }

@@ -13,14 +13,16 @@ use crate::flight::{errors, estimate_from_truth, fly, from_rest, Plan, Record};
 use crate::page::{count, millimetres, number, percent, text, Page, Part, Table};
 use crate::stability;
 use crate::table;
-use nalgebra::{Matrix3, Vector3};
+use nalgebra::{Matrix3, SMatrix, SVector, Vector3};
 use std::path::PathBuf;
 use stipple::config::VioConfig;
 use stipple::output::chart::{Chart, Series};
 use stipple::output::metrics::percentile;
 use stipple::output::OutputDir;
-use stipple::vio::residuals::{Mat15, Vec15};
 use stipple_drivers::Fault;
+
+type Mat15 = SMatrix<f64, 15, 15>;
+type Vec15 = SVector<f64, 15>;
 
 const DIM: f64 = 15.0;
 /// Two-sided 95 % of a normal distribution.

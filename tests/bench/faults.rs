@@ -15,7 +15,7 @@ use stipple::run::sensors::Recorded;
 use stipple::run::status::Status;
 use stipple::run::tracking::{OdometryRun, Tracker};
 use stipple::run::{fly_in_real_time, memory, Flown, Realtime};
-use stipple::vio::health::Health;
+use stipple::vio::Health;
 use stipple_drivers::inject::{Kind, Rule};
 use stipple_drivers::paced::Images;
 use stipple_drivers::sim::{Scenario, Sim};

@@ -150,7 +150,7 @@ pub struct Record {
     pub frame: usize,
     pub truth: TimedPose,
     pub estimate: Option<TimedPose>,
-    pub health: stipple::vio::health::Health,
+    pub health: stipple::vio::Health,
     pub quality: u8,
     pub resets: u64,
     /// Distance of the position's error in its covariance, `√(eᵀ P⁻¹ e)`; the world is that of the first estimate.

@@ -4,6 +4,8 @@
 //! Frames are rendered by the simulator and, where the recordings are, those of MH_01. Calls are timed one by one, and their median
 //! is given: the shortest takes 40 times what reading the clock does.
 
+mod window;
+
 use crate::inputs;
 use crate::page::{count, number, text, Page, Part, Table};
 use crate::run::default_board;
@@ -23,10 +25,10 @@ use stipple::output::report::Report;
 use stipple::output::OutputDir;
 use stipple::run::sensors::Input;
 use stipple::run::{fly, Options, Pace, Steps};
-use stipple::vio::stages::{Extent, Stages};
-use stipple::vio::Vio;
+use stipple::vio::{Predictor, Vio};
 use stipple_drivers::sim::Scenario;
 use stipple_drivers::{Calibration, Fault, Frames, ImuSample, Pose, Span};
+use window::{Extent, Stages};
 
 /// Part of a flight that is held in memory, s, and how many of its frames pass before any is timed: the estimator's
 /// window is full by then.
@@ -176,9 +178,9 @@ struct Flight {
 }
 
 /// Samples of the estimator up to the first past each frame.
-fn deliver<'a>(vio: &mut Vio, imu: &mut impl Iterator<Item = &'a ImuSample>, frames: &Frames) {
+fn deliver<'a>(imu: &mut impl Iterator<Item = &'a ImuSample>, frames: &Frames, mut take: impl FnMut(ImuSample)) {
     for s in imu {
-        vio.on_imu(*s);
+        take(*s);
         if s.t >= frames.t {
             break;
         }
@@ -190,10 +192,16 @@ fn prepare(name: &'static str, input: inputs::Flight) -> Result<Flight, Fault> {
     let mut frontend = Frontend::new(&calibration, &FrontendConfig::default())?;
     let mut vio = Vio::new(&calibration, &VioConfig::default());
     let (mut predicted, mut tracks) = (Vec::new(), Vec::new());
+    let mut predictor = Predictor::new(&calibration, &VioConfig::default());
+    let mut before = None;
     let mut samples = imu.iter();
     for f in &frames {
-        deliver(&mut vio, &mut samples, f);
-        let prev_from_now = vio.predict_motion(f.t);
+        deliver(&mut samples, f, |s| {
+            vio.on_imu(s);
+            predictor.on_imu(s);
+        });
+        let prev_from_now = predictor.motion_to(f.t, before.as_ref());
+        before = vio.odometry();
         predicted.push(prev_from_now);
         let found = frontend.track(f, &Prediction { prev_from_now });
         vio.on_tracks(found);
@@ -260,7 +268,7 @@ fn windows(flight: &Flight) -> [Option<Stages>; 4] {
     let mut vio = Vio::new(&flight.calibration, &VioConfig::default());
     let (mut imu, mut found) = (flight.imu.iter(), [const { None }; 4]);
     for (i, f) in flight.frames.iter().enumerate() {
-        deliver(&mut vio, &mut imu, f);
+        deliver(&mut imu, f, |s| vio.on_imu(s));
         let entered = Stages::new(&vio, &flight.tracks[i]).filter(|_| i >= FRAMES_BEFORE);
         vio.on_tracks(&flight.tracks[i]);
         let Some(mut stages) = entered else { continue };
@@ -332,7 +340,7 @@ fn frames(clock: &mut Clock, flight: &Flight) -> Result<(), Fault> {
         }
         i += 1;
         let took = timed(|| {
-            deliver(&mut vio, &mut imu, &flight.frames[i - 1]);
+            deliver(&mut imu, &flight.frames[i - 1], |s| vio.on_imu(s));
             vio.on_tracks(&flight.tracks[i - 1])
         });
         (i > FRAMES_BEFORE).then_some(took)

@@ -7,7 +7,7 @@ use crate::world::Noise;
 use glam::{DQuat, DVec3};
 use std::ops::Range;
 use stipple::frontend::Tracks;
-use stipple::vio::health::Health;
+use stipple::vio::Health;
 use stipple_drivers::{ImuSample, Nanos, Pose};
 
 /// Frames during which passing faults last; t = 5 s is frame 80.

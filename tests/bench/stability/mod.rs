@@ -18,8 +18,7 @@ use crate::table;
 use std::path::PathBuf;
 use stipple::output::metrics::trajectory_error;
 use stipple::output::OutputDir;
-use stipple::vio::health::Health;
-use stipple::vio::{Stats, Vio};
+use stipple::vio::{Health, Stats, Vio};
 use stipple_drivers::{Fault, TimedPose};
 
 /// A quality this low says that the estimate is not to be relied on.
@@ -297,9 +296,9 @@ pub fn table(rows: &[Row]) -> Table {
 
 /// The estimator's counters in each case.
 fn counters(rows: &[Row]) -> Table {
-    let names = rows.first().map_or(vec![], |r| r.stats.counters().iter().map(|c| count(c.0)).collect());
+    let names = rows.first().map_or(vec![], |r| r.stats.list().iter().map(|c| count(c.0)).collect());
     Table::new("counters", "Counters", rows, &[vec![text("case")], names].concat(), |r| {
-        let counts = r.stats.counters().into_iter().map(|c| c.1.into());
+        let counts = r.stats.list().into_iter().map(|c| c.1.into());
         (false, std::iter::once(r.name.into()).chain(counts).collect())
     })
 }

@@ -6,8 +6,7 @@ use crate::inputs::{self, Flight};
 use std::sync::Arc;
 use stipple::config::{FrontendConfig, VioConfig};
 use stipple::frontend::{Frontend, Prediction};
-use stipple::vio::health::Health;
-use stipple::vio::Vio;
+use stipple::vio::{Health, Predictor, Vio};
 use stipple_drivers::types::pose_at;
 use stipple_drivers::{Fault, Frames, Span, TimedPose};
 
@@ -93,6 +92,8 @@ fn lit(from: &Frames, frame: usize, light: fn(usize, usize) -> Light, out: &mut 
 fn fly(flight: &Flight, light: fn(usize, usize) -> Light) -> Result<(Vec<Record>, Vio), Fault> {
     let mut frontend = Frontend::new(&flight.calibration, &FrontendConfig::default())?;
     let mut vio = Vio::new(&flight.calibration, &VioConfig::default());
+    let mut predictor = Predictor::new(&flight.calibration, &VioConfig::default());
+    let mut before = None;
     let mut frames = Arc::new(Frames::for_rig(&flight.calibration));
     let mut samples = flight.imu.iter();
     let mut records = Vec::new();
@@ -100,11 +101,13 @@ fn fly(flight: &Flight, light: fn(usize, usize) -> Light) -> Result<(Vec<Record>
         lit(original, i, light, Arc::make_mut(&mut frames));
         for sample in samples.by_ref() {
             vio.on_imu(*sample);
+            predictor.on_imu(*sample);
             if sample.t >= frames.t {
                 break;
             }
         }
-        let prediction = Prediction { prev_from_now: vio.predict_motion(frames.t) };
+        let prediction = Prediction { prev_from_now: predictor.motion_to(frames.t, before.as_ref()) };
+        before = vio.odometry();
         let update = vio.on_tracks(frontend.track(&frames, &prediction));
         let Some(truth) = pose_at(&flight.truth, frames.t, TRUTH_HOLE) else { continue };
         records.push(Record {

@@ -8,7 +8,7 @@ use crate::world::Noise;
 use glam::{DQuat, DVec3};
 use stipple::config::VioConfig;
 use stipple::output::metrics::trajectory_error;
-use stipple::vio::health::Health;
+use stipple::vio::Health;
 use stipple::vio::Stats;
 use stipple_drivers::{ImuSample, Nanos, Pose, TimedPose};
 

@@ -4,21 +4,20 @@
 //! the window; of a landmark's own three rows the step of its point is found afterwards. The sum is
 //! solved with its diagonal scaled to one.
 
+use super::factors::{self, Factor};
+use super::inertial::{Covariance, Mat15};
 use super::landmarks::Landmarks;
-use super::linear::{
-    cost_of_views, inertial_residual_at, inertial_rows, landmark_rows, rest_rows, Linear, POINT_DIM, SPANS,
-};
-use super::marginalization::Prior;
-use super::residuals::{CameraModel, Mat15, Point};
-use super::window::{Layout, Window, FRAMES, POSE_DIM};
-use super::zero_velocity::rest_cost;
-use crate::config::VioConfig;
-use crate::limits::{LANDMARKS, RIG_DIM, WINDOW_DIM};
+use super::model::Model;
+use super::prior::Prior;
+use super::reprojection::Point;
+use super::rows::{FactorRows, PARTS_MAX, POINT_DIM, SHARED_DIM};
+use super::window::{Layout, Window};
+use crate::limits::{LANDMARKS, WINDOW_DIM};
 use crate::math::dense::{Columns, System};
 use crate::mem::List;
 use glam::DVec2;
 
-pub(super) const LAMBDA_START: f64 = 1e-4;
+pub const LAMBDA_START: f64 = 1e-4;
 const LAMBDA_MIN: f64 = 1e-6;
 const LAMBDA_MAX: f64 = 1e2;
 /// Done when a step changes no error by this (m, rad, m/s ...), or the cost, in variances, by this: a
@@ -30,91 +29,61 @@ const COST_SETTLED: f64 = 0.5;
 const COST_NUMERIC: f64 = 1e-3;
 /// Added to the diagonal whatever lambda is, so that unobserved directions stay put.
 const DAMPING_MIN: f64 = 1e-6;
-/// Columns of a landmark's rows besides its point.
-const LOCAL_DIM: usize = POSE_DIM * FRAMES + RIG_DIM;
-
-/// Everything constant about the rig, the weights and the shape.
-#[derive(Clone, Debug)]
-pub struct Model {
-    pub cameras: Vec<CameraModel>,
-    pub sigma_px: f64,
-    pub huber_px: f64,
-    pub iterations_max: u32,
-    /// States and keyframe poses at rest.
-    pub states: usize,
-    pub keyframes: usize,
-}
-
-impl Model {
-    pub fn new(cameras: Vec<CameraModel>, config: &VioConfig) -> Model {
-        Model {
-            cameras,
-            sigma_px: config.observation_sigma_px,
-            huber_px: config.huber_px,
-            iterations_max: config.iterations_max,
-            states: config.states as usize,
-            keyframes: config.keyframes as usize,
-        }
-    }
-}
-
-/// The three rows that hold a landmark's point: `R d + W dx + g = 0` gives its step d.
-#[derive(Clone, Copy, Debug)]
-struct Own {
-    /// Upper triangle.
-    r: [[f64; POINT_DIM]; POINT_DIM],
-    w: [[f64; LOCAL_DIM]; POINT_DIM],
-    g: [f64; POINT_DIM],
-    saved: Point,
-}
-
+/// A landmark as QR left it: the three rows that hold its point, `R d + W dx + g = 0`, give its step d.
 #[derive(Clone, Debug)]
 struct Eliminated {
-    own: Own,
-    spans: List<Columns, SPANS>,
+    /// Upper triangle.
+    r: [[f64; POINT_DIM]; POINT_DIM],
+    w: [[f64; SHARED_DIM]; POINT_DIM],
+    g: [f64; POINT_DIM],
+    /// Columns of the window that W is about.
+    columns: List<Columns, PARTS_MAX>,
+    /// Its views determine the point; otherwise it does not move.
     determined: bool,
+    /// Before the step.
+    saved: Point,
 }
 
 impl Eliminated {
     fn empty() -> Eliminated {
-        let own = Own {
+        Eliminated {
             r: [[0.0; POINT_DIM]; POINT_DIM],
-            w: [[0.0; LOCAL_DIM]; POINT_DIM],
+            w: [[0.0; SHARED_DIM]; POINT_DIM],
             g: [0.0; POINT_DIM],
-            saved: Point { s: DVec2::ZERO, rho: 0.0 },
-        };
-        Eliminated { own, spans: List::default(), determined: false }
+            columns: List::default(),
+            determined: false,
+            saved: Point::default(),
+        }
     }
 
-    fn take(&mut self, linear: &Linear, point: Point, determined: bool) {
-        self.own.saved = point;
-        self.determined = determined;
+    fn take(&mut self, rows: &FactorRows, point: Point, determined: bool) {
+        (self.saved, self.determined) = (point, determined);
         if !determined {
             return;
         }
-        self.spans.clone_from(&linear.spans);
-        let n = linear.rows.cols() - 1 - POINT_DIM;
+        self.columns.clone_from(&rows.columns);
+        let n = rows.rows.cols() - 1 - POINT_DIM;
         for i in 0..POINT_DIM {
-            let row = linear.rows.row(i);
-            self.own.r[i].copy_from_slice(&row[..POINT_DIM]);
-            self.own.w[i][..n].copy_from_slice(&row[POINT_DIM..POINT_DIM + n]);
-            self.own.g[i] = row[POINT_DIM + n];
+            let row = rows.rows.row(i);
+            self.r[i].copy_from_slice(&row[..POINT_DIM]);
+            self.w[i][..n].copy_from_slice(&row[POINT_DIM..POINT_DIM + n]);
+            self.g[i] = row[POINT_DIM + n];
         }
     }
 
     /// Decrease of the cost by the point's own step.
     fn decrease(&self) -> f64 {
         if self.determined {
-            0.5 * self.own.g.iter().map(|g| g * g).sum::<f64>()
+            0.5 * self.g.iter().map(|g| g * g).sum::<f64>()
         } else {
             0.0
         }
     }
 
-    /// Of the inverse distance, the frames taken as known; infinite when nothing determines it.
+    /// Standard deviation of the inverse distance, the frames taken as known; infinite when nothing determines it.
     fn rho_sigma(&self) -> f32 {
         if self.determined {
-            (1.0 / self.own.r[POINT_DIM - 1][POINT_DIM - 1].abs()) as f32
+            (1.0 / self.r[POINT_DIM - 1][POINT_DIM - 1].abs()) as f32
         } else {
             f32::INFINITY
         }
@@ -124,13 +93,13 @@ impl Eliminated {
         let mut d = [0.0; POINT_DIM];
         if self.determined {
             for i in (0..POINT_DIM).rev() {
-                let mut sum = self.own.g[i];
-                let mut w = self.own.w[i].iter();
-                for s in self.spans.iter() {
-                    sum += w.by_ref().zip(&dx[s.at..s.at + s.len]).map(|(w, x)| w * x).sum::<f64>();
+                let mut sum = self.g[i];
+                let mut w = self.w[i].iter();
+                for c in self.columns.iter() {
+                    sum += w.by_ref().zip(&dx[c.at..c.at + c.len]).map(|(w, x)| w * x).sum::<f64>();
                 }
-                (i + 1..POINT_DIM).for_each(|j| sum += self.own.r[i][j] * d[j]);
-                d[i] = -sum / self.own.r[i][i];
+                (i + 1..POINT_DIM).for_each(|j| sum += self.r[i][j] * d[j]);
+                d[i] = -sum / self.r[i][i];
             }
         }
         d
@@ -142,31 +111,28 @@ impl Eliminated {
 pub struct Solver {
     system: System,
     factor: System,
-    pub linear: Linear,
+    pub rows: FactorRows,
     eliminated: Vec<Eliminated>,
     dx: Vec<f64>,
 }
 
+/// What an optimization took.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Outcome {
     pub iterations: u32,
     /// Steps that were not finite.
     pub failures: u32,
-    pub cost_before: f64,
-    pub cost: f64,
 }
 
-pub(super) fn cost_of(window: &Window, landmarks: &Landmarks, prior: &Prior, model: &Model) -> f64 {
-    let mut cost = prior.cost(window);
-    let mut before = None;
-    for slot in window.states() {
-        if let Some(from) = before {
-            cost += 0.5 * inertial_residual_at(window, from, slot).norm_squared();
-        }
-        cost += rest_cost(window.frame(slot));
-        before = Some(slot);
+/// Cost of the prior and of all factors at the estimate. Views are summed by themselves: they are many, and small
+/// beside the rest.
+pub fn cost_of(window: &Window, landmarks: &Landmarks, prior: &Prior, model: &Model) -> f64 {
+    let (mut cost, mut views) = (prior.cost(window), 0.0);
+    for factor in factors::of_window(window, &landmarks.pool) {
+        let sum = if matches!(factor, Factor::Landmark(_)) { &mut views } else { &mut cost };
+        factor.add_cost(window, model, sum);
     }
-    cost + cost_of_views(&landmarks.pool, window, model)
+    cost + views
 }
 
 impl Solver {
@@ -174,7 +140,7 @@ impl Solver {
         Solver {
             system: System::new(WINDOW_DIM),
             factor: System::new(WINDOW_DIM),
-            linear: Linear::new(),
+            rows: FactorRows::new(),
             eliminated: vec![Eliminated::empty(); LANDMARKS],
             dx: vec![0.0; WINDOW_DIM],
         }
@@ -182,10 +148,11 @@ impl Solver {
 
     pub const BYTES: usize = LANDMARKS * size_of::<Eliminated>()
         + 2 * System::bytes(WINDOW_DIM)
-        + Linear::BYTES
+        + FactorRows::BYTES
         + WINDOW_DIM * size_of::<f64>();
 
-    pub(super) fn linearize(
+    /// Sums the squares of all factors and of the prior up; answers their cost.
+    pub fn linearize(
         &mut self,
         window: &Window,
         landmarks: &Landmarks,
@@ -193,34 +160,26 @@ impl Solver {
         model: &Model,
         layout: &Layout,
     ) -> f64 {
-        let (system, linear) = (&mut self.system, &mut self.linear);
+        let (system, rows) = (&mut self.system, &mut self.rows);
         system.clear(layout.dim);
         let mut cost = prior.add_to(window, layout, system);
-        let mut before = None;
-        for slot in window.states() {
-            if let Some(from) = before {
-                cost += inertial_rows(window, from, slot, layout, linear);
-                linear.add_to(0, system);
+        let mut eliminated = self.eliminated.iter_mut();
+        for factor in factors::of_window(window, &landmarks.pool) {
+            let linearized = factor.linearize(window, model, layout, rows);
+            cost += linearized.cost;
+            if let Some(first) = linearized.first {
+                rows.add_to(first, system);
             }
-            if let Some(c) = rest_rows(window, slot, layout, linear) {
-                cost += c;
-                linear.add_to(0, system);
+            if let Factor::Landmark(l) = factor {
+                let out = eliminated.next().expect("room for every landmark");
+                out.take(rows, l.point, linearized.first.is_some());
             }
-            before = Some(slot);
-        }
-        for (l, out) in landmarks.pool.iter().zip(&mut self.eliminated) {
-            let (c, determined) = landmark_rows(l, window, model, layout, linear);
-            cost += c;
-            if determined {
-                linear.add_to(POINT_DIM, system);
-            }
-            out.take(linear, l.point, determined);
         }
         cost
     }
 
     /// Solves the damped system; answers the decrease it predicts, `None` when not finite.
-    pub(super) fn step(&mut self, lambda: f64, landmarks: usize) -> Option<f64> {
+    pub fn step(&mut self, lambda: f64, landmarks: usize) -> Option<f64> {
         let n = self.system.dim;
         let damping = |h: f64| (lambda * h).max(DAMPING_MIN);
         self.system.solve_damped(damping, &mut self.factor, &mut self.dx);
@@ -241,31 +200,17 @@ impl Solver {
         }
     }
 
-    /// The undamped step of every slot, for tests of what the system says.
+    /// The undamped step, in the columns of `Layout::of`, for tests of what the system says.
     #[cfg(test)]
-    pub fn newton_step(
-        &mut self,
-        window: &Window,
-        landmarks: &Landmarks,
-        prior: &mut Prior,
-        model: &Model,
-    ) -> [[f64; 15]; FRAMES] {
-        let layout = Layout::of(window);
-        self.linearize(window, landmarks, prior, model, &layout);
+    pub fn newton_step(&mut self, window: &Window, landmarks: &Landmarks, prior: &mut Prior, model: &Model) -> &[f64] {
+        self.linearize(window, landmarks, prior, model, &Layout::of(window));
         self.system.solve_damped(|_| 0.0, &mut self.factor, &mut self.dx);
-        let mut steps = [[0.0; 15]; FRAMES];
-        for slot in window.slots() {
-            for (part, first) in layout.state(slot).into_iter().zip([0, POSE_DIM]) {
-                let Some(part) = part else { continue };
-                (0..part.len).for_each(|i| steps[slot][first + i] = self.dx[part.at + i]);
-            }
-        }
-        steps
+        &self.dx[..self.system.dim]
     }
 
-    /// Covariance of the newest state from the last linearisation, all else eliminated. Its columns are
+    /// Covariance of the newest state from the last linearization, all else eliminated. Its columns are
     /// the last ones of `Layout::of`. `None` when the normal equations do not determine it.
-    pub fn newest_covariance(&mut self) -> Option<[[f64; 15]; 15]> {
+    pub fn newest_covariance(&mut self) -> Option<Covariance> {
         let first = self.system.dim.checked_sub(15)?;
         self.factor.copy_from(&self.system);
         self.factor.eliminate(first);
@@ -275,12 +220,13 @@ impl Solver {
     }
 
     /// Standard deviations of the rig's columns, which are the first of `Layout::of`, from the last
-    /// linearisation.
+    /// linearization.
     pub fn rig_deviations(&mut self, out: &mut [f64]) {
         let n = out.len().min(self.system.dim);
         self.system.deviations(&mut self.factor, &mut out[..n]);
     }
 
+    /// Steps until they settle; leaves `rho_sigma` of every landmark behind.
     pub fn optimize(
         &mut self,
         window: &mut Window,
@@ -291,8 +237,8 @@ impl Solver {
         let layout = Layout::of(window);
         let (mut lambda, mut growth) = (LAMBDA_START, 2.0);
         let mut cost = self.linearize(window, landmarks, prior, model, &layout);
-        let mut outcome = Outcome { cost_before: cost, ..Outcome::default() };
-        while outcome.iterations < model.iterations_max && lambda <= LAMBDA_MAX {
+        let mut outcome = Outcome::default();
+        while outcome.iterations < model.config.iterations_max && lambda <= LAMBDA_MAX {
             outcome.iterations += 1;
             let Some(predicted) = self.step(lambda, landmarks.pool.len()) else {
                 outcome.failures += 1;
@@ -308,14 +254,14 @@ impl Solver {
                 let done = largest < STEP_SETTLED || cost - trial < COST_SETTLED;
                 cost = trial;
                 (lambda, growth) = ((lambda * (1.0 - (2.0 * gain - 1.0).powi(3)).max(1.0 / 3.0)).max(LAMBDA_MIN), 2.0);
-                if done || outcome.iterations == model.iterations_max {
+                if done || outcome.iterations == model.config.iterations_max {
                     break;
                 }
                 self.linearize(window, landmarks, prior, model, &layout);
             } else {
                 window.restore();
                 for (l, e) in landmarks.pool.iter_mut().zip(&self.eliminated) {
-                    l.point = e.own.saved;
+                    l.point = e.saved;
                 }
                 if predicted < COST_NUMERIC {
                     break;
@@ -326,13 +272,6 @@ impl Solver {
         for (l, e) in landmarks.pool.iter_mut().zip(&self.eliminated) {
             l.rho_sigma = e.rho_sigma();
         }
-        outcome.cost = cost;
         outcome
-    }
-}
-
-impl Default for Solver {
-    fn default() -> Self {
-        Solver::new()
     }
 }

@@ -1,0 +1,265 @@
+//! The window estimator: one frame in, its optimized state out, while nothing has gone wrong.
+//!
+//! Per frame: preintegrate the inertial samples since the last one and predict; attach tracks to
+//! landmarks; perhaps declare a keyframe and triangulate; optimize the window; drop outliers;
+//! marginalize back to the resting size. After Usenko et al., RA-L 2020, with the state of a new frame output after
+//! its own optimization. Where it starts, and when it is given up, is the supervisor's (`mod.rs`) to say.
+
+use super::factors::inertial_residual_at;
+use super::gate::{gate, predicted_covariance, Passed};
+use super::inertial::{Covariance, InertialWeight, Motion};
+use super::initialization::Start;
+use super::landmarks::Landmarks;
+use super::marginalization::Marginalizer;
+use super::model::Model;
+use super::monitor::Evidence;
+use super::preintegration::Increment;
+use super::prior::Prior;
+use super::rig::RigState;
+use super::samples::ImuRing;
+use super::solver::{Outcome, Solver};
+use super::triangulation::{drop_outliers, triangulate};
+use super::window::{Frame, Window};
+use super::zero_velocity;
+use crate::config::VioConfig;
+use crate::frontend::Tracks;
+use crate::limits::{FRAMES, RIG_DIM};
+use stipple_drivers::{Calibration, Nanos};
+
+/// With fewer landmarks in view than this a keyframe is declared at once.
+pub const CONNECTED_FEW: usize = 20;
+/// A state this far from sense is a failure: m/s, m/s², rad/s.
+const SPEED_MAX: f64 = 100.0;
+const ACCEL_BIAS_MAX: f64 = 5.0;
+const GYRO_BIAS_MAX: f64 = 1.0;
+/// Deviations of the rig by which the bound of outliers is widened.
+const RIG_SIGMAS: f64 = 3.0;
+
+/// What one frame led to.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Step {
+    pub keyframe: bool,
+    /// Points seen that are landmarks, and that are not.
+    pub connected: usize,
+    pub unconnected: usize,
+    pub gate: Passed,
+    /// Zero velocity was measured.
+    pub at_rest: bool,
+    pub outcome: Outcome,
+    pub outliers: usize,
+    /// Landmarks refused because there was no room.
+    pub landmarks_full: usize,
+    /// Covariance of the newest state; `None` where the window does not determine it.
+    pub covariance: Option<Covariance>,
+    /// `None` at a start.
+    pub evidence: Option<Evidence>,
+}
+
+#[derive(Clone, Debug)]
+pub struct Estimator {
+    pub model: Model,
+    pub window: Window,
+    /// Tracks of the frame in each slot.
+    pub tracks: Vec<Tracks>,
+    pub landmarks: Landmarks,
+    pub prior: Prior,
+    pub solver: Solver,
+    marginalizer: Marginalizer,
+    /// Standard deviations of the rig, in the order of its columns.
+    pub rig_deviations: [f64; RIG_DIM],
+    frames_since_keyframe: u32,
+}
+
+impl Estimator {
+    pub fn new(calibration: &Calibration, config: &VioConfig) -> Estimator {
+        let model = Model::new(calibration, config);
+        let rig = RigState::new(&model.cameras, calibration, config);
+        Estimator {
+            rig_deviations: rig.sigmas(config),
+            model,
+            window: Window::new(rig),
+            tracks: vec![Tracks::default(); FRAMES],
+            landmarks: Landmarks::new(),
+            prior: Prior::new(),
+            solver: Solver::new(),
+            marginalizer: Marginalizer::new(),
+            frames_since_keyframe: 0,
+        }
+    }
+
+    /// Bytes of window, landmarks, solver, and of prior and marginalization.
+    pub const BYTES: [usize; 4] = [
+        Window::BYTES + FRAMES * size_of::<Tracks>(),
+        Landmarks::BYTES,
+        Solver::BYTES,
+        Prior::BYTES + Marginalizer::BYTES,
+    ];
+
+    /// The newest frame; `None` until started.
+    pub fn newest(&self) -> Option<&Frame> {
+        self.window.newest().map(|slot| self.window.frame(slot))
+    }
+
+    /// Forgets everything but what was learnt of the rig.
+    pub fn clear(&mut self) {
+        self.window.clear();
+        self.landmarks.clear();
+        self.prior.clear();
+        self.frames_since_keyframe = 0;
+    }
+
+    /// First frame of an empty window.
+    pub fn start(&mut self, tracks: &Tracks, start: &Start, imu: &ImuRing) -> Step {
+        let Start { motion, sigma } = start;
+        let mut frame = Frame::new(tracks.t, *motion);
+        frame.rate = imu.rate_at(tracks.t);
+        frame.hold_twist();
+        frame.fix_linearization_point();
+        let slot = self.window.push(frame).expect("an empty window has room");
+        self.window.rig.fix_linearization_point();
+        self.rig_deviations = self.window.rig.sigmas(&self.model.config);
+        self.prior.start(slot, motion, sigma, &self.window.rig, &self.rig_deviations);
+        self.tracks[slot].clone_from(tracks);
+        let landmarks_full = self.make_keyframe(slot);
+        Step {
+            keyframe: true,
+            connected: self.landmarks.pool.len(),
+            landmarks_full,
+            covariance: Some(sigma.covariance(motion)),
+            ..Step::default()
+        }
+    }
+
+    /// One more frame of a window that has some. `covariance` is that of the newest state so far, which the gate
+    /// needs.
+    pub fn advance(&mut self, tracks: &Tracks, imu: &ImuRing, covariance: Option<&Covariance>) -> Step {
+        let before = self.window.newest().expect("a started window has frames");
+        let (slot, mut step) = self.enter(before, tracks, imu, covariance);
+        if step.keyframe {
+            step.landmarks_full = self.make_keyframe(slot);
+        }
+
+        step.outcome = self.solver.optimize(&mut self.window, &mut self.landmarks, &mut self.prior, &self.model);
+        step.covariance = self.solver.newest_covariance();
+        let views = self.landmarks.views_in(slot);
+        let n = self.window.rig.dim();
+        if step.keyframe && n > 0 {
+            self.solver.rig_deviations(&mut self.rig_deviations[..n]);
+        }
+        let px_max = self.outlier_px(slot);
+        step.outliers = drop_outliers(&mut self.landmarks, &self.window, px_max);
+        step.evidence = Some(self.evidence(before, slot, views));
+        self.marginalize();
+        step
+    }
+
+    /// The frame after that in slot `before`, where inertia puts it.
+    pub fn propagated(&self, before: usize, t: Nanos, imu: &ImuRing) -> Frame {
+        let before = self.window.frame(before);
+        let inc = imu.integrate(before.t, t, before.now.bg, before.now.ba, &self.model.noise);
+        let mut frame = Frame::new(t, before.now.propagate(&self.scaled(&inc)));
+        frame.weight = InertialWeight::new(&inc, &self.model.noise);
+        frame.increment = inc;
+        frame.rate = imu.rate_at(t);
+        frame
+    }
+
+    /// The newest motion carried by the inertial samples to `t`, or as it is where that is older.
+    pub fn predict(&self, t: Nanos, imu: &ImuRing) -> Option<(Nanos, Motion)> {
+        let f = self.newest()?;
+        let inc = imu.integrate(f.t, t.max(f.t), f.now.bg, f.now.ba, &self.model.noise);
+        Some((f.t.max(t), f.now.propagate(&self.scaled(&inc))))
+    }
+
+    fn scaled(&self, inc: &Increment) -> Increment {
+        let rig = &self.window.rig.now;
+        inc.rescaled(rig.gyro_scale, rig.accel_scale)
+    }
+
+    /// Takes a frame into the window; answers its slot, and whether it is to be a keyframe.
+    pub fn enter(
+        &mut self,
+        before: usize,
+        tracks: &Tracks,
+        imu: &ImuRing,
+        covariance: Option<&Covariance>,
+    ) -> (usize, Step) {
+        let mut step = Step::default();
+        let frame = self.propagated(before, tracks.t, imu);
+        let slot = self.window.push(frame).expect("marginalization left room for one frame");
+        self.window.hold_twists();
+        self.tracks[slot].clone_from(tracks);
+        if let Some(covariance) = covariance {
+            let p = predicted_covariance(&self.window, slot, covariance);
+            let config = &self.model.config;
+            // Wider while the rig is not known well.
+            let sigma_px = config.observation_sigma_px + self.outlier_px(slot) - config.outlier_px;
+            step.gate = gate(slot, &mut self.tracks[slot], &self.landmarks, &self.window, &p, sigma_px);
+        }
+        if self.model.config.zero_velocity {
+            step.at_rest = zero_velocity::hold(slot, &mut self.window, &self.tracks, imu);
+        }
+        (step.connected, step.unconnected) = self.landmarks.attach(slot, &self.tracks[slot]);
+        self.frames_since_keyframe += 1;
+        step.keyframe = self.is_keyframe_due(step.connected, step.unconnected);
+        (slot, step)
+    }
+
+    fn is_keyframe_due(&self, connected: usize, unconnected: usize) -> bool {
+        let config = &self.model.config;
+        let fraction = connected as f64 / (connected + unconnected).max(1) as f64;
+        let due = fraction < config.keyframe_connected_min && self.frames_since_keyframe > config.keyframe_gap_min;
+        unconnected > 0 && (due || connected < CONNECTED_FEW)
+    }
+
+    /// Answers how many landmarks had no room.
+    pub fn make_keyframe(&mut self, slot: usize) -> usize {
+        let px_max = self.outlier_px(slot);
+        let (made, full) = triangulate(&mut self.landmarks, slot, &self.window, &self.tracks, &self.model, px_max);
+        self.frames_since_keyframe = 0;
+        let frame = self.window.frame_mut(slot);
+        (frame.keyframe, frame.hosted) = (true, made);
+        full
+    }
+
+    /// Views further than this from their prediction are wrong, px: wider while the rig is not known well.
+    fn outlier_px(&self, slot: usize) -> f64 {
+        let (rig, sigma) = (&self.window.rig, &self.rig_deviations);
+        let cameras = &self.model.cameras;
+        let focal = cameras.iter().fold(0.0f64, |f, c| f.max(c.camera.fx));
+        let time = if rig.parts.time_offset { sigma[0] * self.window.frame(slot).twist.w.length() } else { 0.0 };
+        let thetas = (0..cameras.len()).filter_map(|c| rig.extrinsic_column(c)).flat_map(|at| at + 3..at + 6);
+        let rotation = thetas.fold(0.0f64, |m, i| m.max(sigma[i]));
+        self.model.config.outlier_px + RIG_SIGMAS * focal * (time + rotation)
+    }
+
+    /// `views` of the frame there were before outliers were dropped.
+    fn evidence(&self, before: usize, slot: usize, views: usize) -> Evidence {
+        let known = self.landmarks.pool.iter().filter(|l| l.host as usize != slot).map(|l| l.views_in(slot)).sum();
+        Evidence {
+            t: self.window.frame(slot).t,
+            views,
+            inliers: self.landmarks.views_in(slot),
+            known,
+            misfit: inertial_residual_at(&self.window, before, slot).norm_squared() / 15.0,
+        }
+    }
+
+    /// Brings the window back to its resting size.
+    pub fn marginalize(&mut self) {
+        let (window, landmarks, rows) = (&mut self.window, &mut self.landmarks, &mut self.solver.rows);
+        self.marginalizer.marginalize(window, landmarks, &mut self.prior, rows, &self.model);
+    }
+
+    /// Whether the newest state is finite, and one that flies.
+    pub fn is_sane(&self) -> bool {
+        self.newest().is_some_and(|f| {
+            let m = &f.now;
+            self.window.rig.is_sane()
+                && m.is_finite()
+                && m.v.length() < SPEED_MAX
+                && m.ba.length() < ACCEL_BIAS_MAX
+                && m.bg.length() < GYRO_BIAS_MAX
+        })
+    }
+}

@@ -1,0 +1,210 @@
+//! The factors of the window: everything that was measured, each as whitened residuals of frames, points and rig.
+//!
+//! There is one list of them. The cost, the linearization and the marginalization go through it and know none of its
+//! members, so that a new kind of measurement (a barometer, GNSS) is a variant of `Factor`, its place in
+//! `measured_at`, a cost and its rows. The prior stands apart (`prior.rs`): it is not measured but kept.
+//!
+//! Rows are `[J | r]` of a least-squares problem. A landmark's are `[point | frames | r]`; Householder QR of the three
+//! columns of the point leaves rows that do not contain it (Demmel et al., ICCV 2021). Residuals are taken at the
+//! estimate, Jacobians at the linearization points, those to the rig's columns too.
+
+use super::inertial::{inertial_jacobians, inertial_residual, scale_jacobian, Vec15};
+use super::landmarks::{Landmark, Observation};
+use super::model::Model;
+use super::projection::{host_cam, observe, predicted, CameraColumns, Host};
+use super::reprojection::huber;
+use super::rig::SCALE_DIM;
+use super::rows::{FactorRows, POINT_DIM};
+use super::window::{Layout, Window, MOTION_DIM, POSE_DIM};
+use super::zero_velocity;
+use crate::limits::{FRAMES, RIG_DIM};
+use crate::math::dense::Columns;
+use glam::DVec3;
+
+/// Square root of the information on an inverse distance nothing observes, m.
+const RHO_RIDGE: f64 = 1e-3;
+/// An observation whose point has left the camera model costs as if this far off, px.
+const LOST_PX: f64 = 20.0;
+
+/// One measurement, by the slots of the frames it is about.
+#[derive(Clone, Copy, Debug)]
+pub enum Factor<'a> {
+    /// The inertial samples between two states.
+    Inertial { from: usize, to: usize },
+    /// A state seen at rest, with the mean rate of the gyro, rad/s.
+    ZeroVelocity { slot: usize, rate: DVec3 },
+    /// All views of a landmark.
+    Landmark(&'a Landmark),
+}
+
+/// What linearizing a factor gave besides its rows.
+#[derive(Clone, Copy, Debug)]
+pub struct Linearized {
+    /// At the estimate.
+    pub cost: f64,
+    /// First of the rows that speak of the window alone; those before hold the landmark's point. `None` where the
+    /// views do not determine the point: then they say nothing of the window.
+    pub first: Option<usize>,
+}
+
+/// Every factor of the window, oldest first.
+pub fn of_window<'a>(window: &'a Window, landmarks: &'a [Landmark]) -> impl Iterator<Item = Factor<'a>> + 'a {
+    let before = std::iter::once(None).chain(window.states().map(Some));
+    let of_states = before.zip(window.states()).flat_map(|(from, to)| {
+        from.map(|from| Factor::Inertial { from, to }).into_iter().chain(measured_at(window, to))
+    });
+    of_states.chain(landmarks.iter().map(Factor::Landmark))
+}
+
+/// The factors that leave with a state, of which `next` is the one after it, and with the landmarks that leave too.
+pub fn of_leaving<'a>(
+    window: &'a Window,
+    (state, next): (usize, usize),
+    landmarks: impl Iterator<Item = &'a Landmark> + 'a,
+) -> impl Iterator<Item = Factor<'a>> + 'a {
+    let inertial = Factor::Inertial { from: state, to: next };
+    std::iter::once(inertial).chain(measured_at(window, state)).chain(landmarks.map(Factor::Landmark))
+}
+
+/// What was measured at one state alone.
+fn measured_at<'a>(window: &Window, slot: usize) -> impl Iterator<Item = Factor<'a>> {
+    window.frame(slot).rest_rate.map(|rate| Factor::ZeroVelocity { slot, rate }).into_iter()
+}
+
+impl Factor<'_> {
+    /// Adds half the squared whitened residual at the estimate, robust for views.
+    pub fn add_cost(self, window: &Window, model: &Model, sum: &mut f64) {
+        match self {
+            Factor::Inertial { from, to } => *sum += 0.5 * inertial_residual_at(window, from, to).norm_squared(),
+            Factor::ZeroVelocity { slot, rate } => *sum += zero_velocity::cost(&window.frame(slot).now, rate),
+            Factor::Landmark(l) => costs_of_views(l, window, model).for_each(|cost| *sum += cost),
+        }
+    }
+
+    /// Its rows in the columns of a layout, as far as these are in it.
+    pub fn linearize(self, window: &Window, model: &Model, layout: &Layout, out: &mut FactorRows) -> Linearized {
+        match self {
+            Factor::Inertial { from, to } => {
+                Linearized { cost: inertial_rows(window, from, to, layout, out), first: Some(0) }
+            }
+            Factor::ZeroVelocity { slot, rate } => {
+                Linearized { cost: zero_velocity_rows(window, slot, rate, layout, out), first: Some(0) }
+            }
+            Factor::Landmark(l) => {
+                let cost = view_rows(l, window, model, layout, out);
+                Linearized { cost, first: (out.rows.eliminate(POINT_DIM) == POINT_DIM).then_some(POINT_DIM) }
+            }
+        }
+    }
+}
+
+/// The whitened inertial residual between two states at the estimate, the unit's scale included.
+pub fn inertial_residual_at(window: &Window, from: usize, to: usize) -> Vec15 {
+    let (a, b, rig) = (window.frame(from), window.frame(to), &window.rig);
+    if rig.parts.imu_scale {
+        let scaled = b.increment.rescaled(rig.now.gyro_scale, rig.now.accel_scale);
+        inertial_residual(&scaled, &b.weight, &a.now, &b.now)
+    } else {
+        inertial_residual(&b.increment, &b.weight, &a.now, &b.now)
+    }
+}
+
+fn inertial_rows(window: &Window, from: usize, to: usize, layout: &Layout, out: &mut FactorRows) -> f64 {
+    let (a, b) = (window.frame(from), window.frame(to));
+    let rig = &window.rig;
+    let r = inertial_residual_at(window, from, to);
+    let (before, after) = (a.linearized(), b.linearized());
+    let (gyro, accel) = (rig.linearized().gyro_scale, rig.linearized().accel_scale);
+    let (ja, jb) = if rig.parts.imu_scale {
+        inertial_jacobians(&b.increment.rescaled(gyro, accel), &b.weight, before, after)
+    } else {
+        inertial_jacobians(&b.increment, &b.weight, before, after)
+    };
+    let scale = layout.imu();
+    out.begin(0, layout.state(from).into_iter().chain(layout.state(to)).flatten().chain(scale));
+    let scale = scale.map(|s| (out.offset(s.at), scale_jacobian(&b.increment, &b.weight, before, after, gyro, accel)));
+    let at = [from, to].map(|s| layout.state(s).map(|part| part.map(|p| out.offset(p.at))));
+    for i in 0..r.len() {
+        let row = out.rows.push();
+        for (at, j) in at.iter().zip([&ja, &jb]) {
+            for (part, columns) in at.iter().zip([0..POSE_DIM, POSE_DIM..POSE_DIM + MOTION_DIM]) {
+                let Some(part) = part else { continue };
+                columns.enumerate().for_each(|(k, c)| row[part + k] = j[(i, c)]);
+            }
+        }
+        if let Some((at, j)) = &scale {
+            (0..SCALE_DIM).for_each(|k| row[at + k] = j[(i, k)]);
+        }
+        row[row.len() - 1] = r[i];
+    }
+    0.5 * r.norm_squared()
+}
+
+/// It is linear, so it has no linearization point to keep.
+fn zero_velocity_rows(window: &Window, slot: usize, rate: DVec3, layout: &Layout, out: &mut FactorRows) -> f64 {
+    let now = &window.frame(slot).now;
+    let [_, motion] = layout.state(slot);
+    out.begin(0, motion.into_iter());
+    for (i, (r, weight)) in zero_velocity::residual(now, rate).into_iter().zip(zero_velocity::WEIGHTS).enumerate() {
+        let row = out.rows.push();
+        (row[i], row[MOTION_DIM]) = (weight, r);
+    }
+    zero_velocity::cost(now, rate)
+}
+
+fn costs_of_views<'a>(l: &'a Landmark, window: &'a Window, model: &Model) -> impl Iterator<Item = f64> + 'a {
+    let inv_sigma = 1.0 / model.config.observation_sigma_px;
+    let huber_width = model.config.huber_px * inv_sigma;
+    let host_cam = host_cam(l, window);
+    let off = move |o: &Observation| predicted(l, &host_cam, o, window).map_or(LOST_PX, |px| (px - o.px()).length());
+    l.observations.iter().map(move |o| huber(off(o) * inv_sigma, huber_width).1)
+}
+
+/// Views in frames of the layout, `[point | frames | r]`, before the point is eliminated; answers their cost.
+pub fn view_rows(landmark: &Landmark, window: &Window, model: &Model, layout: &Layout, out: &mut FactorRows) -> f64 {
+    let host = landmark.host as usize;
+    let views = landmark.observations.iter().filter(|o| layout.pose(o.slot as usize).is_some());
+    let mut touched = [false; FRAMES];
+    views.clone().for_each(|o| touched[o.slot as usize] = true);
+    let others = (0..FRAMES).any(|s| touched[s] && s != host);
+    touched[host] = others;
+    let frames = (0..FRAMES).filter(|s| touched[*s] && others).filter_map(|s| layout.pose(s));
+    out.begin(POINT_DIM, frames.map(|at| Columns { at, len: POSE_DIM }).chain(layout.cameras()));
+    let host_at = layout.pose(host).filter(|_| others).map(|at| out.offset(at));
+
+    let mut cost = 0.0;
+    let inv_sigma = 1.0 / model.config.observation_sigma_px;
+    let huber_width = model.config.huber_px * inv_sigma;
+    let cameras_at = layout.cameras().map(|s| (out.offset(s.at), s.len));
+    let host_view = Host::of(landmark, window);
+    let mut columns: CameraColumns = [[0.0; RIG_DIM - SCALE_DIM]; 2];
+    for o in views {
+        let Some(r) = observe(landmark, &host_view, o, window, &mut columns) else {
+            cost += huber(LOST_PX * inv_sigma, huber_width).1;
+            continue;
+        };
+        let (weight, c) = huber(r.px.length() * inv_sigma, huber_width);
+        cost += c;
+        let weight = weight.sqrt() * inv_sigma;
+        let target_at = layout.pose(o.slot as usize).filter(|_| o.slot != landmark.host).map(|at| out.offset(at));
+        for axis in 0..2 {
+            let row = out.rows.push();
+            let mut put = |at: usize, x: &[f64]| {
+                row[at..].iter_mut().zip(x).for_each(|(to, x)| *to = x * weight);
+            };
+            put(0, &r.d_point[axis]);
+            if let Some((at, len)) = cameras_at {
+                put(at, &columns[axis][..len]);
+            }
+            // In its host's own frame a view says nothing about poses.
+            if let (Some(host_at), Some(target_at)) = (host_at, target_at) {
+                put(host_at, &r.d_host[axis]);
+                put(target_at, &r.d_target[axis]);
+            }
+            let last = row.len() - 1;
+            row[last] = r.px[axis] * weight;
+        }
+    }
+    out.rows.push()[POINT_DIM - 1] = RHO_RIDGE;
+    cost
+}

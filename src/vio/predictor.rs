@@ -1,0 +1,84 @@
+//! The motion between two frames before their images are looked at, for a tracker on a thread of its own: a past state
+//! carried by the inertial samples to both.
+//!
+//! The state is that of the frame *before* the last, though the last one's may be known already:
+//! so a tracker may work on a frame while the estimator is still busy with the one before it, and
+//! what it finds does not depend on whether it did. What the state's error adds over one more frame
+//! is far below a pixel, since only the motion between the two frames is used.
+
+use super::inertial::Motion;
+use super::preintegration::Noise;
+use super::samples::ImuRing;
+use super::Odometry;
+use crate::config::VioConfig;
+use glam::DVec3;
+use stipple_drivers::{Calibration, ImuSample, Nanos, Pose};
+
+/// Predicts for one tracker, with inertial samples of its own.
+#[derive(Clone, Debug)]
+pub struct Predictor {
+    noise: Noise,
+    imu: ImuRing,
+    /// Stamp of the frame before.
+    last: Option<Nanos>,
+}
+
+impl Predictor {
+    pub fn new(calibration: &Calibration, config: &VioConfig) -> Predictor {
+        Predictor { noise: Noise::new(&calibration.imu, config), imu: ImuRing::new(), last: None }
+    }
+
+    /// Takes a sample; refuses what the estimator refuses.
+    pub fn on_imu(&mut self, sample: ImuSample) {
+        if self.imu.admits(&sample) {
+            self.imu.push(sample);
+        }
+    }
+
+    /// Motion of the body from the frame before to the one at `t`, `before_from_now`; `None` at the first frame.
+    /// `state` is what the estimator knew after the frame two before this one; without it only the gyro predicts, a
+    /// rotation. Samples up to `t` must have come; the newest is held where they have not.
+    pub fn motion_to(&mut self, t: Nanos, state: Option<&Odometry>) -> Option<Pose> {
+        let last = self.last.replace(t)?;
+        let Some(state) = state else {
+            let inc = self.imu.integrate(last, t, DVec3::ZERO, DVec3::ZERO, &self.noise);
+            return Some(Pose::new(inc.q, DVec3::ZERO));
+        };
+        let carry = |from: &Motion, t0, t1| from.propagate(&self.imu.integrate(t0, t1, from.bg, from.ba, &self.noise));
+        let before = carry(&Motion::from(state), state.t, last.max(state.t));
+        let now = carry(&before, last.max(state.t), t);
+        Some(before.pose.inverse() * now.pose)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::world::{calibration, rate_and_force, Path};
+    use super::*;
+
+    fn at(t: f64) -> Nanos {
+        Nanos((t * 1e9).round() as i64)
+    }
+
+    #[test]
+    fn motion_from_two_frames_ago_is_that_of_the_path() {
+        let path = Path { rest: -1.0 };
+        let mut predictor = Predictor::new(&calibration(), &VioConfig::default());
+        for i in 0..80 {
+            let t = i as f64 / 200.0;
+            let (gyro_body, accel_body) = rate_and_force(|t| path.pose(t), t);
+            predictor.on_imu(ImuSample { t: at(t), gyro_body, accel_body });
+        }
+        let (t0, t1, t2) = (0.1012, 0.1512, 0.2012);
+        let v_world = (path.pose(t0 + 1e-5).p - path.pose(t0 - 1e-5).p) / 2e-5;
+        let (gyro_bias, accel_bias) = (DVec3::ZERO, DVec3::ZERO);
+        let state = Odometry { t: at(t0), world_from_body: path.pose(t0), v_world, gyro_bias, accel_bias };
+        let truth = path.pose(t1).inverse() * path.pose(t2);
+        assert_eq!(predictor.clone().motion_to(at(t1), Some(&state)), None, "nothing is before the first frame");
+        predictor.motion_to(at(t1), None);
+        let moved = predictor.clone().motion_to(at(t2), Some(&state)).expect("a second frame");
+        assert!((moved.p - truth.p).length() < 1e-4 && moved.q.angle_between(truth.q) < 1e-4, "{moved:?} {truth:?}");
+        let rotated = predictor.motion_to(at(t2), None).expect("a second frame");
+        assert!(rotated.p == DVec3::ZERO && rotated.q.angle_between(truth.q) < 1e-4, "{rotated:?} {truth:?}");
+    }
+}

@@ -1,0 +1,85 @@
+//! The rows `[J | r]` of one factor: only the columns it touches, and how they go into a system or a stack.
+
+use crate::limits::{FRAMES, OBSERVATIONS, RIG_DIM, WINDOW_DIM};
+use crate::math::dense::{Columns, System};
+use crate::math::qr::Rows;
+use crate::mem::List;
+
+/// Columns of a point, first in the rows of a landmark.
+pub const POINT_DIM: usize = 3;
+/// Parts of the window that one factor can touch: the poses a landmark sees and the cameras, or all of two states and
+/// the inertial unit.
+pub const PARTS_MAX: usize = FRAMES + 2;
+/// Columns besides those of the point.
+pub const SHARED_DIM: usize = super::window::POSE_DIM * FRAMES + RIG_DIM;
+const COLS_MAX: usize = POINT_DIM + SHARED_DIM + 1;
+const ROWS_MAX: usize = 2 * OBSERVATIONS + 1;
+/// Rows of the stack of a marginalization: what stays of it when triangular, and the largest factors.
+pub const STACK_ROWS: usize = WINDOW_DIM + 4 * ROWS_MAX;
+
+/// The rows of one factor; reused for every factor.
+#[derive(Clone, Debug)]
+pub struct FactorRows {
+    pub rows: Rows,
+    /// Columns of the window, ascending; they follow each other in the rows after the point's.
+    pub columns: List<Columns, PARTS_MAX>,
+    /// Columns before them that are the factor's own.
+    own: usize,
+    gram: Vec<f64>,
+}
+
+impl FactorRows {
+    pub fn new() -> FactorRows {
+        FactorRows {
+            rows: Rows::new(ROWS_MAX, COLS_MAX),
+            columns: List::default(),
+            own: 0,
+            gram: vec![0.0; Rows::gram_len(COLS_MAX)],
+        }
+    }
+
+    pub const BYTES: usize = Rows::bytes(ROWS_MAX, COLS_MAX) + Rows::gram_len(COLS_MAX) * size_of::<f64>();
+
+    /// Empties, for rows with `own` columns before those of the window.
+    pub fn begin(&mut self, own: usize, columns: impl Iterator<Item = Columns>) {
+        self.columns.clear();
+        for part in columns {
+            self.columns.push(part).expect("PARTS_MAX is the most a factor touches");
+        }
+        self.columns.sort_unstable_by_key(|c| c.at);
+        self.own = own;
+        self.rows.clear(own + self.columns.iter().map(|c| c.len).sum::<usize>() + 1);
+    }
+
+    /// Where the columns of the window from `at` are in the rows.
+    pub fn offset(&self, at: usize) -> usize {
+        self.own + self.columns.iter().take_while(|c| c.at != at).map(|c| c.len).sum::<usize>()
+    }
+
+    /// Adds the square of the rows from `first`, the factor's own columns left out.
+    pub fn add_to(&mut self, first: usize, system: &mut System) {
+        let stride = self.rows.gram(first, &mut self.gram);
+        system.add_gram(&self.gram, stride, self.own, &self.columns);
+    }
+
+    /// Appends the rows from `first`, the factor's own columns left out; makes room when there is none.
+    pub fn append_to(&self, first: usize, stack: &mut Rows) {
+        if stack.room() < self.rows.len() - first {
+            stack.triangularize();
+        }
+        for i in first..self.rows.len() {
+            let row = &self.rows.row(i)[self.own..];
+            scatter(row, &self.columns, stack.push());
+        }
+    }
+}
+
+/// Puts a row, whose columns belong to `columns` one after the other, into a wider one; the last stays the last.
+pub fn scatter(row: &[f64], columns: &[Columns], out: &mut [f64]) {
+    let mut from = 0;
+    for c in columns {
+        out[c.at..c.at + c.len].copy_from_slice(&row[from..from + c.len]);
+        from += c.len;
+    }
+    out[out.len() - 1] = row[from];
+}
