@@ -7,6 +7,7 @@
 
 use super::factors::inertial_residual_at;
 use super::gate::{gate, predicted_covariance, Passed};
+use super::graph::Graph;
 use super::inertial::{Covariance, InertialWeight, Motion};
 use super::initialization::Start;
 use super::landmarks::Landmarks;
@@ -58,11 +59,9 @@ pub struct Step {
 #[derive(Clone, Debug)]
 pub struct Estimator {
     pub model: Model,
-    pub window: Window,
+    pub graph: Graph,
     /// Tracks of the frame in each slot.
     pub tracks: Vec<Tracks>,
-    pub landmarks: Landmarks,
-    pub prior: Prior,
     pub solver: Solver,
     marginalizer: Marginalizer,
     /// Standard deviations of the rig, in the order of its columns.
@@ -77,10 +76,8 @@ impl Estimator {
         Estimator {
             rig_deviations: rig.sigmas(config),
             model,
-            window: Window::new(rig),
+            graph: Graph::new(rig),
             tracks: vec![Tracks::default(); FRAMES],
-            landmarks: Landmarks::new(),
-            prior: Prior::new(),
             solver: Solver::new(),
             marginalizer: Marginalizer::new(),
             frames_since_keyframe: 0,
@@ -97,14 +94,12 @@ impl Estimator {
 
     /// The newest frame; `None` until started.
     pub fn newest(&self) -> Option<&Frame> {
-        self.window.newest().map(|slot| self.window.frame(slot))
+        self.graph.window.newest().map(|slot| self.graph.window.frame(slot))
     }
 
     /// Forgets everything but what was learnt of the rig.
     pub fn clear(&mut self) {
-        self.window.clear();
-        self.landmarks.clear();
-        self.prior.clear();
+        self.graph.clear();
         self.frames_since_keyframe = 0;
     }
 
@@ -115,15 +110,15 @@ impl Estimator {
         frame.rate = imu.rate_at(tracks.t);
         frame.hold_twist();
         frame.fix_linearization_point();
-        let slot = self.window.push(frame).expect("an empty window has room");
-        self.window.rig.fix_linearization_point();
-        self.rig_deviations = self.window.rig.sigmas(&self.model.config);
-        self.prior.start(slot, motion, sigma, &self.window.rig, &self.rig_deviations);
+        let slot = self.graph.window.push(frame).expect("an empty window has room");
+        self.graph.window.rig.fix_linearization_point();
+        self.rig_deviations = self.graph.window.rig.sigmas(&self.model.config);
+        self.graph.prior.start(slot, motion, sigma, &self.graph.window.rig, &self.rig_deviations);
         self.tracks[slot].clone_from(tracks);
         let landmarks_full = self.make_keyframe(slot);
         Step {
             keyframe: true,
-            connected: self.landmarks.pool.len(),
+            connected: self.graph.landmarks.pool.len(),
             landmarks_full,
             covariance: Some(sigma.covariance(motion)),
             ..Step::default()
@@ -133,21 +128,21 @@ impl Estimator {
     /// One more frame of a window that has some. `covariance` is that of the newest state so far, which the gate
     /// needs.
     pub fn advance(&mut self, tracks: &Tracks, imu: &ImuRing, covariance: Option<&Covariance>) -> Step {
-        let before = self.window.newest().expect("a started window has frames");
+        let before = self.graph.window.newest().expect("a started window has frames");
         let (slot, mut step) = self.enter(before, tracks, imu, covariance);
         if step.keyframe {
             step.landmarks_full = self.make_keyframe(slot);
         }
 
-        step.outcome = self.solver.optimize(&mut self.window, &mut self.landmarks, &mut self.prior, &self.model);
+        step.outcome = self.solver.optimize(&mut self.graph, &self.model);
         step.covariance = self.solver.newest_covariance();
-        let views = self.landmarks.views_in(slot);
-        let n = self.window.rig.dim();
+        let views = self.graph.landmarks.views_in(slot);
+        let n = self.graph.window.rig.dim();
         if step.keyframe && n > 0 {
             self.solver.rig_deviations(&mut self.rig_deviations[..n]);
         }
         let px_max = self.outlier_px(slot);
-        step.outliers = drop_outliers(&mut self.landmarks, &self.window, px_max);
+        step.outliers = drop_outliers(&mut self.graph, px_max);
         step.evidence = Some(self.evidence(before, slot, views));
         self.marginalize();
         step
@@ -155,7 +150,7 @@ impl Estimator {
 
     /// The frame after that in slot `before`, where inertia puts it.
     pub fn propagated(&self, before: usize, t: Nanos, imu: &ImuRing) -> Frame {
-        let before = self.window.frame(before);
+        let before = self.graph.window.frame(before);
         let inc = imu.integrate(before.t, t, before.now.bg, before.now.ba, &self.model.noise);
         let mut frame = Frame::new(t, before.now.propagate(&self.scaled(&inc)));
         frame.weight = InertialWeight::new(&inc, &self.model.noise);
@@ -172,7 +167,7 @@ impl Estimator {
     }
 
     fn scaled(&self, inc: &Increment) -> Increment {
-        let rig = &self.window.rig.now;
+        let rig = &self.graph.window.rig.now;
         inc.rescaled(rig.gyro_scale, rig.accel_scale)
     }
 
@@ -186,20 +181,20 @@ impl Estimator {
     ) -> (usize, Step) {
         let mut step = Step::default();
         let frame = self.propagated(before, tracks.t, imu);
-        let slot = self.window.push(frame).expect("marginalization left room for one frame");
-        self.window.hold_twists();
+        let slot = self.graph.window.push(frame).expect("marginalization left room for one frame");
+        self.graph.window.hold_twists();
         self.tracks[slot].clone_from(tracks);
         if let Some(covariance) = covariance {
-            let p = predicted_covariance(&self.window, slot, covariance);
+            let p = predicted_covariance(&self.graph.window, slot, covariance);
             let config = &self.model.config;
             // Wider while the rig is not known well.
             let sigma_px = config.observation_sigma_px + self.outlier_px(slot) - config.outlier_px;
-            step.gate = gate(slot, &mut self.tracks[slot], &self.landmarks, &self.window, &p, sigma_px);
+            step.gate = gate(&self.graph, slot, &mut self.tracks[slot], &p, sigma_px);
         }
         if self.model.config.zero_velocity {
-            step.at_rest = zero_velocity::hold(slot, &mut self.window, &self.tracks, imu);
+            step.at_rest = zero_velocity::hold(slot, &mut self.graph.window, &self.tracks, imu);
         }
-        (step.connected, step.unconnected) = self.landmarks.attach(slot, &self.tracks[slot]);
+        (step.connected, step.unconnected) = self.graph.landmarks.attach(slot, &self.tracks[slot]);
         self.frames_since_keyframe += 1;
         step.keyframe = self.is_keyframe_due(step.connected, step.unconnected);
         (slot, step)
@@ -215,19 +210,19 @@ impl Estimator {
     /// Answers how many landmarks had no room.
     pub fn make_keyframe(&mut self, slot: usize) -> usize {
         let px_max = self.outlier_px(slot);
-        let (made, full) = triangulate(&mut self.landmarks, slot, &self.window, &self.tracks, &self.model, px_max);
+        let (made, full) = triangulate(&mut self.graph, slot, &self.tracks, &self.model, px_max);
         self.frames_since_keyframe = 0;
-        let frame = self.window.frame_mut(slot);
+        let frame = self.graph.window.frame_mut(slot);
         (frame.keyframe, frame.hosted) = (true, made);
         full
     }
 
     /// Views further than this from their prediction are wrong, px: wider while the rig is not known well.
     fn outlier_px(&self, slot: usize) -> f64 {
-        let (rig, sigma) = (&self.window.rig, &self.rig_deviations);
+        let (rig, sigma) = (&self.graph.window.rig, &self.rig_deviations);
         let cameras = &self.model.cameras;
         let focal = cameras.iter().fold(0.0f64, |f, c| f.max(c.camera.fx));
-        let time = if rig.parts.time_offset { sigma[0] * self.window.frame(slot).twist.w.length() } else { 0.0 };
+        let time = if rig.parts.time_offset { sigma[0] * self.graph.window.frame(slot).twist.w.length() } else { 0.0 };
         let thetas = (0..cameras.len()).filter_map(|c| rig.extrinsic_column(c)).flat_map(|at| at + 3..at + 6);
         let rotation = thetas.fold(0.0f64, |m, i| m.max(sigma[i]));
         self.model.config.outlier_px + RIG_SIGMAS * focal * (time + rotation)
@@ -235,27 +230,27 @@ impl Estimator {
 
     /// `views` of the frame there were before outliers were dropped.
     fn evidence(&self, before: usize, slot: usize, views: usize) -> Evidence {
-        let known = self.landmarks.pool.iter().filter(|l| l.host as usize != slot).map(|l| l.views_in(slot)).sum();
+        let known =
+            self.graph.landmarks.pool.iter().filter(|l| l.host as usize != slot).map(|l| l.views_in(slot)).sum();
         Evidence {
-            t: self.window.frame(slot).t,
+            t: self.graph.window.frame(slot).t,
             views,
-            inliers: self.landmarks.views_in(slot),
+            inliers: self.graph.landmarks.views_in(slot),
             known,
-            misfit: inertial_residual_at(&self.window, before, slot).norm_squared() / 15.0,
+            misfit: inertial_residual_at(&self.graph.window, before, slot).norm_squared() / 15.0,
         }
     }
 
     /// Brings the window back to its resting size.
     pub fn marginalize(&mut self) {
-        let (window, landmarks, rows) = (&mut self.window, &mut self.landmarks, &mut self.solver.rows);
-        self.marginalizer.marginalize(window, landmarks, &mut self.prior, rows, &self.model);
+        self.marginalizer.marginalize(&mut self.graph, &mut self.solver.rows, &self.model);
     }
 
     /// Whether the newest state is finite, and one that flies.
     pub fn is_sane(&self) -> bool {
         self.newest().is_some_and(|f| {
             let m = &f.now;
-            self.window.rig.is_sane()
+            self.graph.window.rig.is_sane()
                 && m.is_finite()
                 && m.v.length() < SPEED_MAX
                 && m.ba.length() < ACCEL_BIAS_MAX

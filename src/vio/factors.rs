@@ -100,26 +100,17 @@ impl Factor<'_> {
 
 /// The whitened inertial residual between two states at the estimate, the unit's scale included.
 pub fn inertial_residual_at(window: &Window, from: usize, to: usize) -> Vec15 {
-    let (a, b, rig) = (window.frame(from), window.frame(to), &window.rig);
-    if rig.parts.imu_scale {
-        let scaled = b.increment.rescaled(rig.now.gyro_scale, rig.now.accel_scale);
-        inertial_residual(&scaled, &b.weight, &a.now, &b.now)
-    } else {
-        inertial_residual(&b.increment, &b.weight, &a.now, &b.now)
-    }
+    let (a, b, rig) = (window.frame(from), window.frame(to), &window.rig.now);
+    let scaled = b.increment.rescaled(rig.gyro_scale, rig.accel_scale);
+    inertial_residual(&scaled, &b.weight, &a.now, &b.now)
 }
 
 fn inertial_rows(window: &Window, from: usize, to: usize, layout: &Layout, out: &mut FactorRows) -> f64 {
-    let (a, b) = (window.frame(from), window.frame(to));
-    let rig = &window.rig;
+    let (a, b, rig) = (window.frame(from), window.frame(to), window.rig.linearized());
     let r = inertial_residual_at(window, from, to);
     let (before, after) = (a.linearized(), b.linearized());
-    let (gyro, accel) = (rig.linearized().gyro_scale, rig.linearized().accel_scale);
-    let (ja, jb) = if rig.parts.imu_scale {
-        inertial_jacobians(&b.increment.rescaled(gyro, accel), &b.weight, before, after)
-    } else {
-        inertial_jacobians(&b.increment, &b.weight, before, after)
-    };
+    let (gyro, accel) = (rig.gyro_scale, rig.accel_scale);
+    let (ja, jb) = inertial_jacobians(&b.increment.rescaled(gyro, accel), &b.weight, before, after);
     let scale = layout.imu();
     out.begin(0, layout.state(from).into_iter().chain(layout.state(to)).flatten().chain(scale));
     let scale = scale.map(|s| (out.offset(s.at), scale_jacobian(&b.increment, &b.weight, before, after, gyro, accel)));

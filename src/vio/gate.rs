@@ -7,8 +7,9 @@
 //! `S = J P Jᵀ + J_ρ σ_ρ² J_ρᵀ + 2 σ² I` against a chi-square bound. When many fail at once it is the
 //! prediction that is wrong, and the gate is left open.
 
+use super::graph::Graph;
 use super::inertial::Covariance;
-use super::landmarks::{Landmark, Landmarks, Observation};
+use super::landmarks::{Landmark, Observation};
 use super::projection::{observe, Host};
 use super::rig::{EXTRINSIC_DIM, TIME_DIM};
 use super::window::{Window, POSE_DIM};
@@ -66,14 +67,8 @@ pub struct Passed {
 }
 
 /// Takes out of `tracks` the views of known landmarks that cannot be theirs.
-pub fn gate(
-    slot: usize,
-    tracks: &mut Tracks,
-    landmarks: &Landmarks,
-    window: &Window,
-    p: &PoseCovariance,
-    sigma_px: f64,
-) -> Passed {
+pub fn gate(graph: &Graph, slot: usize, tracks: &mut Tracks, p: &PoseCovariance, sigma_px: f64) -> Passed {
+    let Graph { window, landmarks, .. } = graph;
     let mut wrong = [[false; TRACKS]; CAMERAS_MAX];
     let (mut known, mut refused) = (0, 0);
     for (camera, list) in tracks.cameras.iter().enumerate() {

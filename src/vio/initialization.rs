@@ -11,7 +11,7 @@
 use super::inertial::{Motion, MotionSigma};
 use super::model::Model;
 use super::preintegration::{Increment, GRAVITY};
-use super::reprojection::{huber, reproject, Point, Transform};
+use super::reprojection::{huber, Point, Transform, View};
 use super::samples::ImuRing;
 use super::triangulation::InverseDistance;
 use super::zero_velocity::{REST_ACCEL, REST_GYRO, REST_PX};
@@ -241,7 +241,8 @@ fn resect(points: &[ReferencePoint], tracks: &Tracks, model: &Model, guess: Pose
             for (c, camera) in model.cameras.iter().enumerate() {
                 let Some(seen) = tracks.find(c, p.id) else { continue };
                 let host_cam = &model.cameras[0].body_from_cam;
-                let Some(r) = reproject(point, host_cam, &reference, camera, &body) else { continue };
+                let view = View { host_cam, host: &reference, camera, target: &body };
+                let Some(r) = view.reproject(point) else { continue };
                 let e = r.px - seen.px();
                 inliers += (c == 0 && e.length() < 3.0 * model.config.huber_px) as usize;
                 let (w, _) = huber(e.length(), model.config.huber_px);

@@ -9,9 +9,10 @@
 //! leaving one is the boundary: nothing newer is linearized.
 
 use super::factors;
+use super::graph::Graph;
 use super::landmarks::{Landmark, Landmarks};
 use super::model::Model;
-use super::prior::{Block, Blocks, Prior};
+use super::prior::{Block, Blocks};
 use super::rows::{FactorRows, STACK_ROWS};
 use super::window::{Layout, Window};
 use crate::limits::WINDOW_DIM;
@@ -64,10 +65,9 @@ impl Leaving {
         self.keyframe.into_iter().for_each(|s| layout.add_pose(s));
         let leaving = layout.dim;
         let mut blocks = Blocks::default();
-        let mut keep = |b: Block| blocks.push(b).expect("a block a frame, one of motion and two of the rig");
+        let mut keep = |b: Block| blocks.push(b).expect("a block a frame, one of motion and one of the rig");
         layout.add_rig(&window.rig);
-        layout.cameras().into_iter().for_each(|_| keep(Block::Cameras));
-        layout.imu().into_iter().for_each(|_| keep(Block::Imu));
+        keep(Block::Rig);
         let kept = window.keyframe_poses().filter(|s| Some(*s) != self.keyframe);
         for s in kept.chain(self.keeps_pose.then_some(self.state)).chain([self.boundary]) {
             layout.add_pose(s);
@@ -91,15 +91,9 @@ impl Marginalizer {
 
     pub const BYTES: usize = Rows::bytes(STACK_ROWS, WINDOW_DIM + 1);
 
-    /// Brings the window back to its resting size.
-    pub fn marginalize(
-        &mut self,
-        window: &mut Window,
-        landmarks: &mut Landmarks,
-        prior: &mut Prior,
-        rows: &mut FactorRows,
-        model: &Model,
-    ) {
+    /// Brings the window back to its resting size. `rows` is scratch.
+    pub fn marginalize(&mut self, graph: &mut Graph, rows: &mut FactorRows, model: &Model) {
+        let Graph { window, landmarks, prior } = graph;
         let Some(leaving) = Leaving::choose(window, landmarks, model) else { return };
         let (layout, columns, blocks) = leaving.layout(window);
         let stack = &mut self.stack;
@@ -117,7 +111,7 @@ impl Marginalizer {
         for b in blocks.iter() {
             match b {
                 Block::Pose(s) | Block::Motion(s) => window.frame_mut(*s as usize).fix_linearization_point(),
-                Block::Cameras | Block::Imu => window.rig.fix_linearization_point(),
+                Block::Rig => window.rig.fix_linearization_point(),
             }
         }
         prior.take(stack, columns, blocks, window);

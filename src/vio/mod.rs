@@ -17,6 +17,7 @@
 mod estimator;
 mod factors;
 mod gate;
+mod graph;
 mod health;
 mod inertial;
 mod initialization;
@@ -347,13 +348,13 @@ impl Vio {
 
     /// What is estimated of the rig; `None` when nothing is.
     pub fn rig(&self) -> Option<RigEstimate> {
-        let rig = &self.estimator.window.rig;
+        let rig = &self.estimator.graph.window.rig;
         rig.parts.any().then(|| RigEstimate::new(rig, &self.estimator.rig_deviations))
     }
 
     /// Instant, pose, and whether it is a keyframe, of every frame of the window, oldest first.
     pub fn window(&self) -> impl Iterator<Item = (Nanos, Pose, bool)> + '_ {
-        let window = &self.estimator.window;
+        let window = &self.estimator.graph.window;
         window.slots().map(|s| window.frame(s)).map(|f| (f.t, f.now.pose, f.keyframe))
     }
 
@@ -384,10 +385,11 @@ impl Vio {
 pub mod instruments {
     pub use super::estimator::Estimator;
     pub use super::factors::{of_window, Factor};
+    pub use super::graph::Graph;
     pub use super::inertial::Covariance;
     pub use super::preintegration::Increment;
     pub use super::samples::ImuRing;
-    pub use super::solver::{cost_of, Outcome, LAMBDA_START};
+    pub use super::solver::{Outcome, LAMBDA_START};
     pub use super::window::Layout;
 
     /// The window estimator, the inertial samples, and the covariance of the newest state.

@@ -18,8 +18,7 @@ pub enum Block {
     Pose(u8),
     Motion(u8),
     #[default]
-    Cameras,
-    Imu,
+    Rig,
 }
 
 pub type Blocks = List<Block, { 2 * FRAMES }>;
@@ -29,8 +28,7 @@ impl Block {
         match self {
             Block::Pose(_) => POSE_DIM,
             Block::Motion(_) => MOTION_DIM,
-            Block::Cameras => rig.camera_dim(),
-            Block::Imu => rig.imu_dim(),
+            Block::Rig => rig.dim(),
         }
     }
 
@@ -38,20 +36,17 @@ impl Block {
         let columns = match self {
             Block::Pose(s) => layout.state(s as usize)[0],
             Block::Motion(s) => layout.state(s as usize)[1],
-            Block::Cameras => layout.cameras(),
-            Block::Imu => layout.imu(),
+            Block::Rig => Some(layout.rig),
         };
         columns.expect("the layout holds all that the prior is about")
     }
 
     /// Error since the linearization point.
     fn delta(self, window: &Window, out: &mut [f64]) {
-        let n = out.len();
         match self {
             Block::Pose(s) => out.copy_from_slice(&window.frame(s as usize).delta[..POSE_DIM]),
             Block::Motion(s) => out.copy_from_slice(&window.frame(s as usize).delta[POSE_DIM..]),
-            Block::Cameras => out.copy_from_slice(&window.rig.delta[..n]),
-            Block::Imu => out.copy_from_slice(&window.rig.delta[window.rig.camera_dim()..][..n]),
+            Block::Rig => out.copy_from_slice(&window.rig.delta[..out.len()]),
         }
     }
 }
@@ -93,9 +88,8 @@ impl Prior {
         rig_sigmas: &[f64; RIG_DIM],
     ) {
         self.blocks.clear();
-        let blocks = [Block::Pose(slot as u8), Block::Motion(slot as u8), Block::Cameras, Block::Imu];
-        for block in blocks.into_iter().filter(|b| b.width(rig) > 0) {
-            let _ = self.blocks.push(block);
+        for block in [Block::Pose(slot as u8), Block::Motion(slot as u8), Block::Rig] {
+            self.blocks.push(block).expect("room for the blocks of one state");
         }
         self.rows.clear(15 + rig.dim() + 1);
         let r = motion.pose.rotation();
@@ -203,7 +197,7 @@ impl Prior {
         let of = |b: Block, out: &mut [f64]| match b {
             Block::Pose(s) => out.copy_from_slice(&direction(s as usize)[..POSE_DIM]),
             Block::Motion(s) => out.copy_from_slice(&direction(s as usize)[POSE_DIM..]),
-            Block::Cameras | Block::Imu => out.fill(0.0),
+            Block::Rig => out.fill(0.0),
         };
         self.residuals(self.deltas(window, of)).map(|(jd, _)| 0.5 * jd * jd).sum()
     }

@@ -1,13 +1,13 @@
 //! Projection of a landmark into a view of it, by the rig as it is estimated: where each camera sits, and when each
 //! row was taken.
 //!
-//! Where nothing of that is estimated and shutters are global, this is `predict` and `reproject` as they
-//! stand. Otherwise both cameras, the host's and the viewing one, are carried to their instants
+//! Where nothing of that is estimated and shutters are global, this is `reprojection.rs` as it
+//! stands. Otherwise both cameras, the host's and the viewing one, are carried to their instants
 //! (`shutter.rs`), and the view touches the cameras' columns of the rig. Residuals are taken at the
 //! estimate, Jacobians at the linearization points.
 
 use super::landmarks::{Landmark, Observation};
-use super::reprojection::{predict, reproject, reproject_with_extrinsics, CameraModel, Reprojection, Transform};
+use super::reprojection::{CameraModel, Reprojection, Transform, View};
 use super::rig::{EXTRINSIC_DIM, TIME_DIM};
 use super::shutter::{to_stamp, DelayedCamera};
 use super::window::Window;
@@ -42,10 +42,11 @@ pub fn predicted(l: &Landmark, host_cam: &Transform, o: &Observation, window: &W
     let host = &window.frame(l.host as usize).world_from_body;
     let target = &window.frame(o.slot as usize).world_from_body;
     if window.rig.is_plain() {
-        return predict(&l.point, host_cam, host, camera, target);
+        return View { host_cam, host, camera, target }.predict(&l.point);
     }
     let body_from_cam = placed(o.camera as usize, o.px[1], o.slot as usize, window);
-    predict(&l.point, host_cam, host, &CameraModel { body_from_cam, ..*camera }, target)
+    let camera = &CameraModel { body_from_cam, ..*camera };
+    View { host_cam, host, camera, target }.predict(&l.point)
 }
 
 /// The host's camera at the estimate, and at the linearization point where that has to be carried to its instant.
@@ -67,27 +68,28 @@ impl Host {
 /// `None` where the camera cannot see the point.
 pub fn observe(
     l: &Landmark,
-    host: &Host,
+    at: &Host,
     o: &Observation,
     window: &Window,
     columns: &mut CameraColumns,
 ) -> Option<Reprojection> {
     let rig = &window.rig;
     let (host_frame, frame) = (window.frame(l.host as usize), window.frame(o.slot as usize));
-    let (host_body, body) = (&host_frame.world_from_body_linearized, &frame.world_from_body_linearized);
-    let (host_camera, camera) = (l.host_camera as usize, o.camera as usize);
-    let model = &rig.cameras_linearized()[camera];
-    let mut r = if let Some(host) = &host.delayed {
-        let target = delayed(model, rig.linearized().time_offset, o.px[1], o.slot as usize, window);
-        let model = CameraModel { body_from_cam: target.body_from_cam, ..*model };
-        let (r, mut d) = reproject_with_extrinsics(&l.point, &host.body_from_cam, host_body, &model, body)?;
-        let d_time = to_stamp(&mut d, host, &target);
+    let (host, target) = (&host_frame.world_from_body_linearized, &frame.world_from_body_linearized);
+    let cameras = [l.host_camera, o.camera].map(usize::from);
+    let [host_camera, camera] = cameras.map(|c| &rig.cameras_linearized()[c]);
+    let mut r = if let Some(host_cam) = &at.delayed {
+        let seeing = delayed(camera, rig.linearized().time_offset, o.px[1], o.slot as usize, window);
+        let camera = &CameraModel { body_from_cam: seeing.body_from_cam, ..*camera };
+        let view = View { host_cam: &host_cam.body_from_cam, host, camera, target };
+        let (r, mut d) = view.reproject_with_extrinsics(&l.point)?;
+        let d_time = to_stamp(&mut d, host_cam, &seeing);
         for (k, row) in columns.iter_mut().enumerate() {
             row.fill(0.0);
             if rig.parts.time_offset {
                 row[0] = d_time[k];
             }
-            for (camera, d) in [(host_camera, &d.host[k]), (camera, &d.target[k])] {
+            for (camera, d) in cameras.into_iter().zip([&d.host[k], &d.target[k]]) {
                 if let Some(at) = rig.extrinsic_column(camera) {
                     row[at..].iter_mut().zip(d).for_each(|(sum, d)| *sum += d);
                 }
@@ -95,12 +97,11 @@ pub fn observe(
         }
         r
     } else {
-        let host_cam = &rig.cameras_linearized()[host_camera].body_from_cam;
-        reproject(&l.point, host_cam, host_body, model, body)?
+        View { host_cam: &host_camera.body_from_cam, host, camera, target }.reproject(&l.point)?
     };
     let fixed = host_frame.linearization_point.is_some() || frame.linearization_point.is_some();
     if fixed || rig.is_linearized() {
-        r.px = predicted(l, &host.now, o, window)?;
+        r.px = predicted(l, &at.now, o, window)?;
     }
     r.px -= o.px();
     Some(r)

@@ -88,63 +88,21 @@ pub struct ExtrinsicDerivatives {
     pub target: [[f64; 6]; 2],
 }
 
+/// The two cameras of a view: where the host's sits on its body and that body in the world, the camera that sees the
+/// point and the body it is on.
+#[derive(Clone, Copy, Debug)]
+pub struct View<'a> {
+    pub host_cam: &'a Transform,
+    pub host: &'a Transform,
+    pub camera: &'a CameraModel,
+    pub target: &'a Transform,
+}
+
 /// A point, scaled by its inverse distance, in each frame on the way from its host's camera to another.
 struct Ray {
     x_host: DVec3,
     x_target: DVec3,
     x_cam: DVec3,
-}
-
-#[inline(always)]
-fn trace(point: &Point, host_cam: &Transform, host: &Transform, camera: &CameraModel, target: &Transform) -> Ray {
-    let x_host = host_cam.r * point.bearing() + host_cam.p * point.rho;
-    let x_rel = host.r * x_host + (host.p - target.p) * point.rho;
-    let x_target = target.r.transpose() * x_rel;
-    let x_cam = camera.body_from_cam.r.transpose() * (x_target - camera.body_from_cam.p * point.rho);
-    Ray { x_host, x_target, x_cam }
-}
-
-/// Pixel at which `camera` on the body at `target` sees the point of a camera at `host_cam` on the body at `host`.
-/// `None` where the camera cannot see it.
-pub fn predict(
-    point: &Point,
-    host_cam: &Transform,
-    host: &Transform,
-    camera: &CameraModel,
-    target: &Transform,
-) -> Option<DVec2> {
-    camera.camera.project(trace(point, host_cam, host, camera, target).x_cam)
-}
-
-/// The same pixel with its derivatives to both frames and to the point.
-#[inline]
-pub fn reproject(
-    point: &Point,
-    host_cam: &Transform,
-    host: &Transform,
-    camera: &CameraModel,
-    target: &Transform,
-) -> Option<Reprojection> {
-    derive(point, host_cam, host, camera, target, |_, _, _| {})
-}
-
-/// The same pixel with derivatives also to where the cameras sit.
-pub fn reproject_with_extrinsics(
-    point: &Point,
-    host_cam: &Transform,
-    host: &Transform,
-    camera: &CameraModel,
-    target: &Transform,
-) -> Option<(Reprojection, ExtrinsicDerivatives)> {
-    let mut d = ExtrinsicDerivatives::default();
-    let bearing = point.bearing();
-    let r = derive(point, host_cam, host, camera, target, |k, ray, g| {
-        let (th_host, th_target) = (bearing.cross(g.point), g.cam.cross(ray.x_cam));
-        let (p_host, p_target) = (g.host * point.rho, g.target * -point.rho);
-        d.host[k] = [p_host.x, p_host.y, p_host.z, th_host.x, th_host.y, th_host.z];
-        d.target[k] = [p_target.x, p_target.y, p_target.z, th_target.x, th_target.y, th_target.z];
-    })?;
-    Some((r, d))
 }
 
 /// A row of d(px)/d(x_cam), carried back through each frame on the ray's way.
@@ -155,38 +113,68 @@ struct Gradient {
     point: DVec3,
 }
 
-/// Reprojection; `each` gets the gradient of each coordinate of the pixel.
-#[inline(always)]
-fn derive(
-    point: &Point,
-    host_cam: &Transform,
-    host: &Transform,
-    camera: &CameraModel,
-    target: &Transform,
-    mut each: impl FnMut(usize, &Ray, &Gradient),
-) -> Option<Reprojection> {
-    let rho = point.rho;
-    let ray = trace(point, host_cam, host, camera, target);
-    let (px, d_px) = camera.camera.project_with_jacobian(ray.x_cam)?;
-    let d_bearing = point.d_bearing();
-    let d_rho_rel = host.r * host_cam.p + host.p - target.p;
-    let mut out = Reprojection { px, ..Reprojection::default() };
-    for k in 0..2 {
-        let g_cam = DVec3::from_array(d_px[k]);
-        let g_target = camera.body_from_cam.r * g_cam;
-        let g_world = target.r * g_target;
-        let g_host = host.r.transpose() * g_world;
-        let g_point = host_cam.r.transpose() * g_host;
-        let p = g_world * rho;
-        let th_host = ray.x_host.cross(g_host);
-        let th_target = g_target.cross(ray.x_target);
-        out.d_host[k] = [p.x, p.y, p.z, th_host.x, th_host.y, th_host.z];
-        out.d_target[k] = [-p.x, -p.y, -p.z, th_target.x, th_target.y, th_target.z];
-        let d_rho = g_world.dot(d_rho_rel) - g_target.dot(camera.body_from_cam.p);
-        out.d_point[k] = [g_point.dot(d_bearing[0]), g_point.dot(d_bearing[1]), d_rho];
-        each(k, &ray, &Gradient { cam: g_cam, target: g_target, host: g_host, point: g_point });
+impl View<'_> {
+    /// Pixel at which the point is seen; `None` where the camera cannot see it.
+    pub fn predict(&self, point: &Point) -> Option<DVec2> {
+        self.camera.camera.project(self.trace(point).x_cam)
     }
-    Some(out)
+
+    /// The same pixel with its derivatives to both frames and to the point.
+    #[inline]
+    pub fn reproject(&self, point: &Point) -> Option<Reprojection> {
+        self.derive(point, |_, _, _| {})
+    }
+
+    /// The same pixel with derivatives also to where the cameras sit.
+    pub fn reproject_with_extrinsics(&self, point: &Point) -> Option<(Reprojection, ExtrinsicDerivatives)> {
+        let mut d = ExtrinsicDerivatives::default();
+        let bearing = point.bearing();
+        let r = self.derive(point, |k, ray, g| {
+            let (th_host, th_target) = (bearing.cross(g.point), g.cam.cross(ray.x_cam));
+            let (p_host, p_target) = (g.host * point.rho, g.target * -point.rho);
+            d.host[k] = [p_host.x, p_host.y, p_host.z, th_host.x, th_host.y, th_host.z];
+            d.target[k] = [p_target.x, p_target.y, p_target.z, th_target.x, th_target.y, th_target.z];
+        })?;
+        Some((r, d))
+    }
+
+    #[inline(always)]
+    fn trace(&self, point: &Point) -> Ray {
+        let View { host_cam, host, camera, target } = self;
+        let x_host = host_cam.r * point.bearing() + host_cam.p * point.rho;
+        let x_rel = host.r * x_host + (host.p - target.p) * point.rho;
+        let x_target = target.r.transpose() * x_rel;
+        let x_cam = camera.body_from_cam.r.transpose() * (x_target - camera.body_from_cam.p * point.rho);
+        Ray { x_host, x_target, x_cam }
+    }
+
+    /// Reprojection; `each` gets the gradient of each coordinate of the pixel.
+    #[inline(always)]
+    fn derive(&self, point: &Point, mut each: impl FnMut(usize, &Ray, &Gradient)) -> Option<Reprojection> {
+        let View { host_cam, host, camera, target } = self;
+        let rho = point.rho;
+        let ray = self.trace(point);
+        let (px, d_px) = camera.camera.project_with_jacobian(ray.x_cam)?;
+        let d_bearing = point.d_bearing();
+        let d_rho_rel = host.r * host_cam.p + host.p - target.p;
+        let mut out = Reprojection { px, ..Reprojection::default() };
+        for k in 0..2 {
+            let g_cam = DVec3::from_array(d_px[k]);
+            let g_target = camera.body_from_cam.r * g_cam;
+            let g_world = target.r * g_target;
+            let g_host = host.r.transpose() * g_world;
+            let g_point = host_cam.r.transpose() * g_host;
+            let p = g_world * rho;
+            let th_host = ray.x_host.cross(g_host);
+            let th_target = g_target.cross(ray.x_target);
+            out.d_host[k] = [p.x, p.y, p.z, th_host.x, th_host.y, th_host.z];
+            out.d_target[k] = [-p.x, -p.y, -p.z, th_target.x, th_target.y, th_target.z];
+            let d_rho = g_world.dot(d_rho_rel) - g_target.dot(camera.body_from_cam.p);
+            out.d_point[k] = [g_point.dot(d_bearing[0]), g_point.dot(d_bearing[1]), d_rho];
+            each(k, &ray, &Gradient { cam: g_cam, target: g_target, host: g_host, point: g_point });
+        }
+        Some(out)
+    }
 }
 
 /// Huber on a whitened length: (weight of the squared residual, cost).
@@ -255,24 +243,14 @@ mod tests {
                 Point::new(DVec3::new(-0.3, 0.1, 1.0).normalize(), 0.0),
                 Point::new(DVec3::new(0.4, 0.3, 1.0).normalize(), 1.5),
             ] {
+                let on = |m: &Motion| Transform::from(&m.pose);
                 let f = |point: &Point, host: &Motion, target: &Motion| {
-                    predict(
-                        point,
-                        &camera.body_from_cam,
-                        &Transform::from(&host.pose),
-                        &camera,
-                        &Transform::from(&target.pose),
-                    )
-                    .unwrap()
+                    let (host, target) = (&on(host), &on(target));
+                    View { host_cam: &camera.body_from_cam, host, camera: &camera, target }.predict(point).unwrap()
                 };
-                let r = reproject(
-                    &point,
-                    &camera.body_from_cam,
-                    &Transform::from(&host.pose),
-                    &camera,
-                    &Transform::from(&target.pose),
-                )
-                .unwrap();
+                let (on_host, on_target) = (&on(&host), &on(&target));
+                let host_cam = &camera.body_from_cam;
+                let r = View { host_cam, host: on_host, camera: &camera, target: on_target }.reproject(&point).unwrap();
                 assert!((r.px - f(&point, &host, &target)).length() < 1e-12);
                 for i in 0..6 {
                     let d_host = (f(&point, &moved(&host, i, H), &target) - f(&point, &moved(&host, i, -H), &target))

@@ -235,12 +235,11 @@ impl RigState {
         }
     }
 
-    /// Moves by errors of the cameras' columns and of the inertial unit's.
-    pub fn step(&mut self, cameras: &[f64], imu: &[f64]) {
-        let n = cameras.len();
+    /// Moves by an error of its columns.
+    pub fn step(&mut self, error: &[f64]) {
+        let n = self.camera_dim();
         let mut d = [0.0; RIG_DIM];
-        d[..n].copy_from_slice(cameras);
-        d[n..n + imu.len()].copy_from_slice(imu);
+        d[..error.len()].copy_from_slice(error);
         let base = self.linearization_point.unwrap_or(self.now);
         if self.linearization_point.is_some() {
             self.delta.iter_mut().zip(&d).for_each(|(sum, d)| *sum += d);

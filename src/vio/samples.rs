@@ -6,6 +6,7 @@ use super::preintegration::{Increment, Noise};
 use super::spikes::Spikes;
 use crate::limits::IMU_BETWEEN_FRAMES;
 use glam::DVec3;
+use std::collections::VecDeque;
 use stipple_drivers::{ImuSample, Nanos, Span};
 
 /// A stamp further ahead than this of the one before it is not believed alone, s.
@@ -30,20 +31,19 @@ impl Leap {
     }
 }
 
-/// The newest samples; old ones are overwritten.
+/// The newest samples, ascending stamps; old ones are overwritten.
 #[derive(Clone, Debug)]
 pub struct ImuRing {
-    samples: Vec<ImuSample>,
-    /// Samples ever pushed.
-    count: usize,
+    /// Never longer than its capacity at the start.
+    samples: VecDeque<ImuSample>,
     leap: Leap,
     spikes: Spikes,
 }
 
 impl ImuRing {
     pub fn new() -> ImuRing {
-        let samples = vec![ImuSample::default(); IMU_BETWEEN_FRAMES];
-        ImuRing { samples, count: 0, leap: Leap::default(), spikes: Spikes::default() }
+        let samples = VecDeque::with_capacity(IMU_BETWEEN_FRAMES);
+        ImuRing { samples, leap: Leap::default(), spikes: Spikes::default() }
     }
 
     pub const BYTES: usize = IMU_BETWEEN_FRAMES * size_of::<ImuSample>();
@@ -54,73 +54,46 @@ impl ImuRing {
         s.is_finite() && last.is_none_or(|n| s.t > n) && !self.leap.refuses(last, s.t)
     }
 
-    /// Returns the sample that was overwritten.
+    /// Takes a sample that was admitted; returns the one that was overwritten.
     pub fn push(&mut self, s: ImuSample) -> Option<ImuSample> {
-        let at = self.count % IMU_BETWEEN_FRAMES;
-        let old = (self.count >= IMU_BETWEEN_FRAMES).then(|| self.samples[at]);
-        self.samples[at] = s;
-        self.count += 1;
+        let old = if self.samples.len() == IMU_BETWEEN_FRAMES { self.samples.pop_front() } else { None };
+        self.samples.push_back(s);
         old
     }
 
     /// Judges the sample before the newest; answers whether it was repaired. What was integrated up to it before stays.
     pub fn repair(&mut self, noise: &Noise) -> bool {
-        if self.len() < 3 {
-            return false;
-        }
-        let [before, now, after] = [3, 2, 1].map(|back| (self.count - back) % IMU_BETWEEN_FRAMES);
-        let [a, b, c] = [before, now, after].map(|at| &self.samples[at]);
+        let Some(before) = self.samples.len().checked_sub(3) else { return false };
+        let [a, b, c] = [0, 1, 2].map(|i| &self.samples[before + i]);
         let repaired = self.spikes.repaired(a, b, c, noise);
         if let Some(s) = repaired {
-            self.samples[now] = s;
+            self.samples[before + 1] = s;
         }
         repaired.is_some()
     }
 
-    fn len(&self) -> usize {
-        self.count.min(IMU_BETWEEN_FRAMES)
-    }
-
-    /// `i` = 0 is the oldest kept.
-    fn get(&self, i: usize) -> &ImuSample {
-        &self.samples[(self.count - self.len() + i) % IMU_BETWEEN_FRAMES]
-    }
-
     pub fn newest(&self) -> Option<&ImuSample> {
-        self.len().checked_sub(1).map(|i| self.get(i))
+        self.samples.back()
     }
 
     #[cfg(test)]
     pub fn iter(&self) -> impl Iterator<Item = &ImuSample> {
-        (0..self.len()).map(|i| self.get(i))
+        self.samples.iter()
     }
 
     /// First index with a stamp after `t`.
     fn after(&self, t: Nanos) -> usize {
-        let (mut lo, mut hi) = (0, self.len());
-        while lo < hi {
-            let mid = (lo + hi) / 2;
-            if self.get(mid).t <= t {
-                lo = mid + 1;
-            } else {
-                hi = mid;
-            }
-        }
-        lo
+        self.samples.partition_point(|s| s.t <= t)
     }
 
     /// Rate and force at `t`: linear between samples, held outside them.
     fn sample_at(&self, t: Nanos) -> Option<(DVec3, DVec3)> {
-        let n = self.len();
         let next = self.after(t);
-        if n == 0 {
-            return None;
-        }
-        if next == 0 || next == n {
-            let s = self.get(next.min(n - 1));
-            return Some((s.gyro_body, s.accel_body));
-        }
-        let (a, b) = (self.get(next - 1), self.get(next));
+        let before = next.checked_sub(1).map(|i| &self.samples[i]);
+        let (Some(a), Some(b)) = (before, self.samples.get(next)) else {
+            let nearest = before.or(self.samples.front())?;
+            return Some((nearest.gyro_body, nearest.accel_body));
+        };
         let s = (t - a.t).secs() / (b.t - a.t).secs();
         Some((a.gyro_body.lerp(b.gyro_body, s), a.accel_body.lerp(b.accel_body, s)))
     }
@@ -142,8 +115,7 @@ impl ImuRing {
             inc.step_between([w, a], [w1, a1], (to - t).secs(), &noise.between((w, a), (w1, a1)));
             (t, w, a) = (to, w1, a1);
         };
-        for i in self.after(t0)..self.after(t1) {
-            let s = self.get(i);
+        for s in self.samples.range(self.after(t0)..self.after(t1)) {
             step(s.t, s.gyro_body, s.accel_body);
         }
         if let Some((w1, a1)) = self.sample_at(t1) {
@@ -155,34 +127,27 @@ impl ImuRing {
     /// Mean and standard deviation (norm over axes) of the last `span`, when it is covered.
     pub fn statistics(&self, until: Nanos, span: Span) -> Option<Statistics> {
         let (from, to) = (self.after(until - span), self.after(until));
-        let n = to - from;
-        if n < 10 || (self.get(to - 1).t - self.get(from).t).secs() < 0.9 * span.secs() {
+        let samples = || self.samples.range(from..to);
+        let n = samples().len();
+        if n < 10 || (self.samples[to - 1].t - self.samples[from].t).secs() < 0.9 * span.secs() {
             return None;
         }
         let scale = 1.0 / n as f64;
-        let mean = |f: &dyn Fn(&ImuSample) -> DVec3| {
-            (from..to).map(|i| f(self.get(i))).fold(DVec3::ZERO, |a, b| a + b) * scale
+        let mean = |f: fn(&ImuSample) -> DVec3| samples().map(f).fold(DVec3::ZERO, |a, b| a + b) * scale;
+        let spread = |f: fn(&ImuSample) -> DVec3, m: DVec3| {
+            (samples().map(|s| (f(s) - m).length_squared()).sum::<f64>() * scale).sqrt()
         };
-        let gyro = mean(&|s| s.gyro_body);
-        let accel = mean(&|s| s.accel_body);
-        let spread = |f: &dyn Fn(&ImuSample) -> DVec3, m: DVec3| {
-            ((from..to).map(|i| (f(self.get(i)) - m).length_squared()).sum::<f64>() * scale).sqrt()
-        };
+        let (gyro, accel) = (mean(|s| s.gyro_body), mean(|s| s.accel_body));
         Some(Statistics {
             gyro,
             accel,
-            gyro_sigma: spread(&|s| s.gyro_body, gyro),
-            accel_sigma: spread(&|s| s.accel_body, accel),
+            gyro_sigma: spread(|s| s.gyro_body, gyro),
+            accel_sigma: spread(|s| s.accel_body, accel),
         })
     }
 }
 
-impl Default for ImuRing {
-    fn default() -> Self {
-        ImuRing::new()
-    }
-}
-
+/// Readings over a span: means, rad/s and m/s², and their standard deviations, norms over the axes.
 #[derive(Clone, Copy, Debug)]
 pub struct Statistics {
     pub gyro: DVec3,

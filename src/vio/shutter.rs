@@ -62,7 +62,7 @@ pub fn to_stamp(d: &mut ExtrinsicDerivatives, host: &DelayedCamera, target: &Del
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used)]
-    use super::super::reprojection::{predict, reproject_with_extrinsics, CameraModel, Point};
+    use super::super::reprojection::{CameraModel, Point, View};
     use super::*;
     use glam::{DQuat, DVec2};
     use stipple_drivers::{Camera, Lens, Pose};
@@ -114,8 +114,9 @@ mod tests {
     fn pixel(point: &Point, s: &Scene) -> DVec2 {
         let [host, target] = delayed(s);
         let camera_model = CameraModel { camera: camera(), body_from_cam: target.body_from_cam, readout: 0.0 };
-        predict(point, &host.body_from_cam, &Transform::from(&s.poses[0]), &camera_model, &Transform::from(&s.poses[1]))
-            .unwrap()
+        let [a, b] = [0, 1].map(|k| Transform::from(&s.poses[k]));
+        let view = View { host_cam: &host.body_from_cam, host: &a, camera: &camera_model, target: &b };
+        view.predict(point).unwrap()
     }
 
     #[test]
@@ -129,7 +130,8 @@ mod tests {
             let [host, target] = delayed(&s);
             let camera_model = CameraModel { camera: camera(), body_from_cam: target.body_from_cam, readout: 0.0 };
             let (a, b) = (Transform::from(&s.poses[0]), Transform::from(&s.poses[1]));
-            let (r, mut d) = reproject_with_extrinsics(&point, &host.body_from_cam, &a, &camera_model, &b).unwrap();
+            let view = View { host_cam: &host.body_from_cam, host: &a, camera: &camera_model, target: &b };
+            let (r, mut d) = view.reproject_with_extrinsics(&point).unwrap();
             let d_time = to_stamp(&mut d, &host, &target);
             assert!((r.px - pixel(&point, &s)).length() < 1e-12);
             let close = |analytic: f64, numeric: f64, what: &str| {

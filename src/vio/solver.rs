@@ -5,13 +5,12 @@
 //! solved with its diagonal scaled to one.
 
 use super::factors::{self, Factor};
+use super::graph::Graph;
 use super::inertial::{Covariance, Mat15};
-use super::landmarks::Landmarks;
 use super::model::Model;
-use super::prior::Prior;
 use super::reprojection::Point;
 use super::rows::{FactorRows, PARTS_MAX, POINT_DIM, SHARED_DIM};
-use super::window::{Layout, Window};
+use super::window::Layout;
 use crate::limits::{LANDMARKS, WINDOW_DIM};
 use crate::math::dense::{Columns, System};
 use crate::mem::List;
@@ -124,17 +123,6 @@ pub struct Outcome {
     pub failures: u32,
 }
 
-/// Cost of the prior and of all factors at the estimate. Views are summed by themselves: they are many, and small
-/// beside the rest.
-pub fn cost_of(window: &Window, landmarks: &Landmarks, prior: &Prior, model: &Model) -> f64 {
-    let (mut cost, mut views) = (prior.cost(window), 0.0);
-    for factor in factors::of_window(window, &landmarks.pool) {
-        let sum = if matches!(factor, Factor::Landmark(_)) { &mut views } else { &mut cost };
-        factor.add_cost(window, model, sum);
-    }
-    cost + views
-}
-
 impl Solver {
     pub fn new() -> Solver {
         Solver {
@@ -152,14 +140,8 @@ impl Solver {
         + WINDOW_DIM * size_of::<f64>();
 
     /// Sums the squares of all factors and of the prior up; answers their cost.
-    pub fn linearize(
-        &mut self,
-        window: &Window,
-        landmarks: &Landmarks,
-        prior: &mut Prior,
-        model: &Model,
-        layout: &Layout,
-    ) -> f64 {
+    pub fn linearize(&mut self, graph: &mut Graph, model: &Model, layout: &Layout) -> f64 {
+        let Graph { window, landmarks, prior } = graph;
         let (system, rows) = (&mut self.system, &mut self.rows);
         system.clear(layout.dim);
         let mut cost = prior.add_to(window, layout, system);
@@ -191,9 +173,9 @@ impl Solver {
         (decrease.is_finite() && self.dx[..n].iter().all(|x| x.is_finite())).then_some(decrease)
     }
 
-    fn apply(&self, window: &mut Window, landmarks: &mut Landmarks, layout: &Layout) {
-        window.step(layout, &self.dx);
-        for (l, e) in landmarks.pool.iter_mut().zip(&self.eliminated) {
+    fn apply(&self, graph: &mut Graph, layout: &Layout) {
+        graph.window.step(layout, &self.dx);
+        for (l, e) in graph.landmarks.pool.iter_mut().zip(&self.eliminated) {
             let [x, y, rho] = e.step(&self.dx);
             l.point.s += DVec2::new(x, y);
             l.point.rho = (l.point.rho + rho).max(0.0);
@@ -202,8 +184,8 @@ impl Solver {
 
     /// The undamped step, in the columns of `Layout::of`, for tests of what the system says.
     #[cfg(test)]
-    pub fn newton_step(&mut self, window: &Window, landmarks: &Landmarks, prior: &mut Prior, model: &Model) -> &[f64] {
-        self.linearize(window, landmarks, prior, model, &Layout::of(window));
+    pub fn newton_step(&mut self, graph: &mut Graph, model: &Model) -> &[f64] {
+        self.linearize(graph, model, &Layout::of(&graph.window));
         self.system.solve_damped(|_| 0.0, &mut self.factor, &mut self.dx);
         &self.dx[..self.system.dim]
     }
@@ -227,27 +209,21 @@ impl Solver {
     }
 
     /// Steps until they settle; leaves `rho_sigma` of every landmark behind.
-    pub fn optimize(
-        &mut self,
-        window: &mut Window,
-        landmarks: &mut Landmarks,
-        prior: &mut Prior,
-        model: &Model,
-    ) -> Outcome {
-        let layout = Layout::of(window);
+    pub fn optimize(&mut self, graph: &mut Graph, model: &Model) -> Outcome {
+        let layout = Layout::of(&graph.window);
         let (mut lambda, mut growth) = (LAMBDA_START, 2.0);
-        let mut cost = self.linearize(window, landmarks, prior, model, &layout);
+        let mut cost = self.linearize(graph, model, &layout);
         let mut outcome = Outcome::default();
         while outcome.iterations < model.config.iterations_max && lambda <= LAMBDA_MAX {
             outcome.iterations += 1;
-            let Some(predicted) = self.step(lambda, landmarks.pool.len()) else {
+            let Some(predicted) = self.step(lambda, graph.landmarks.pool.len()) else {
                 outcome.failures += 1;
                 (lambda, growth) = (lambda * 10.0, 2.0);
                 continue;
             };
-            window.save();
-            self.apply(window, landmarks, &layout);
-            let trial = cost_of(window, landmarks, prior, model);
+            graph.window.save();
+            self.apply(graph, &layout);
+            let trial = graph.cost(model);
             let gain = (cost - trial) / predicted;
             if gain > 0.0 && predicted > 0.0 {
                 let largest = self.dx[..layout.dim].iter().fold(0.0f64, |m, x| m.max(x.abs()));
@@ -257,10 +233,10 @@ impl Solver {
                 if done || outcome.iterations == model.config.iterations_max {
                     break;
                 }
-                self.linearize(window, landmarks, prior, model, &layout);
+                self.linearize(graph, model, &layout);
             } else {
-                window.restore();
-                for (l, e) in landmarks.pool.iter_mut().zip(&self.eliminated) {
+                graph.window.restore();
+                for (l, e) in graph.landmarks.pool.iter_mut().zip(&self.eliminated) {
                     l.point = e.saved;
                 }
                 if predicted < COST_NUMERIC {
@@ -269,7 +245,7 @@ impl Solver {
                 (lambda, growth) = (lambda * growth, growth * 2.0);
             }
         }
-        for (l, e) in landmarks.pool.iter_mut().zip(&self.eliminated) {
+        for (l, e) in graph.landmarks.pool.iter_mut().zip(&self.eliminated) {
             l.rho_sigma = e.rho_sigma();
         }
         outcome

@@ -2,6 +2,7 @@
 
 use super::estimator::Estimator;
 use super::factors::{of_window, view_rows, Factor};
+use super::graph::Graph;
 use super::inertial::{InertialWeight, MotionSigma};
 use super::rows::{scatter, FactorRows, POINT_DIM};
 use super::window::{Frame, Layout};
@@ -31,7 +32,7 @@ fn run(vio: &mut Vio, frames: std::ops::Range<usize>, world: &mut World) {
 
 /// The direction in which the whole window is translated, and rotated about the world's axis.
 fn gauge(estimator: &Estimator, translation: DVec3, rotation: DVec3, slot: usize) -> [f64; 15] {
-    let m = estimator.window.frame(slot).linearized();
+    let m = estimator.graph.window.frame(slot).linearized();
     let (p, v) = (translation + rotation.cross(m.pose.p), rotation.cross(m.v));
     let th = m.pose.q.conjugate() * rotation;
     let mut d = [0.0; 15];
@@ -56,7 +57,7 @@ fn energies(frames: usize, config: &VioConfig, readout: Span) -> ([f64; 4], f64)
     assert!(vio.is_running());
     // The first state is still in the window; with its position and yaw its velocity is left free too,
     // which as a vector of the world would tell yaw.
-    let Estimator { window, prior, rig_deviations, .. } = &mut vio.estimator;
+    let Estimator { graph: Graph { window, prior, .. }, rig_deviations, .. } = &mut vio.estimator;
     let first = window.slots().next().expect("a running window has frames");
     let motion = window.frame(first).linearization_point.expect("the prior is about the first state");
     let sigma = MotionSigma { p: 1e9, yaw: 1e9, tilt: 0.05, v: 1e9, bg: 0.02, ba: 0.3 };
@@ -64,9 +65,9 @@ fn energies(frames: usize, config: &VioConfig, readout: Span) -> ([f64; 4], f64)
     prior.start(first, &motion, &sigma, &window.rig, rig_deviations);
     run(&mut vio, 12..frames, &mut world);
     let estimator = &vio.estimator;
-    assert!(vio.stats.resets == 0 && estimator.window.keyframe_poses().count() > 3);
+    assert!(vio.stats.resets == 0 && estimator.graph.window.keyframe_poses().count() > 3);
     let energy = |translation: DVec3, rotation: DVec3| {
-        estimator.prior.energy(&estimator.window, |slot| gauge(estimator, translation, rotation, slot))
+        estimator.graph.prior.energy(&estimator.graph.window, |slot| gauge(estimator, translation, rotation, slot))
     };
     let tilt = energy(DVec3::ZERO, DVec3::X).min(energy(DVec3::ZERO, DVec3::Y));
     (UNOBSERVABLE.map(|(_, translation, rotation)| energy(translation, rotation)), tilt)
@@ -108,7 +109,7 @@ fn ready_to_marginalize(push: f64) -> Estimator {
     let mut vio = Vio::new(&world.rig, &VioConfig::default());
     run(&mut vio, 0..40, &mut world);
     let mut estimator = vio.estimator;
-    let window = &mut estimator.window;
+    let window = &mut estimator.graph.window;
     let oldest = window.states().next().expect("a running window has states");
     let newest = *window.frame(window.newest().expect("a running window has a newest frame"));
     // One more state, by inertia alone, so that one is due to leave; and no live landmark.
@@ -120,15 +121,15 @@ fn ready_to_marginalize(push: f64) -> Estimator {
     window.push(frame).expect("room for one");
     let boundary = window.frame(window.states().nth(1).expect("a second state")).t;
     let is_finished = |s: u8| window.frame(s as usize).t <= boundary;
-    estimator.landmarks.retain(|l| l.observations.iter().all(|o| is_finished(o.slot)));
+    estimator.graph.landmarks.retain(|l| l.observations.iter().all(|o| is_finished(o.slot)));
     assert!(window.frame(oldest).is_state);
     estimator
 }
 
 /// The undamped step of every slot.
 fn newton(estimator: &mut Estimator) -> [[f64; 15]; FRAMES] {
-    let Estimator { window, landmarks, prior, solver, model, .. } = estimator;
-    by_slot(solver.newton_step(window, landmarks, prior, model), window)
+    let Estimator { graph, solver, model, .. } = estimator;
+    by_slot(solver.newton_step(graph, model), &graph.window)
 }
 
 fn by_slot(step: &[f64], window: &window::Window) -> [[f64; 15]; FRAMES] {
@@ -149,7 +150,7 @@ fn marginalizing_keeps_the_step_of_what_stays() {
     let before = newton(&mut estimator);
     estimator.marginalize();
     let after = newton(&mut estimator);
-    for slot in estimator.window.states() {
+    for slot in estimator.graph.window.states() {
         for i in 0..15 {
             let (a, b) = (before[slot][i], after[slot][i]);
             assert!((a - b).abs() < 1e-7 + 1e-5 * a.abs(), "slot {slot} error {i}: {a} then {b}");
@@ -160,7 +161,7 @@ fn marginalizing_keeps_the_step_of_what_stays() {
 /// The normal equations of the same window by the textbook: landmarks eliminated by Schur complement,
 /// from rows that are not yet eliminated.
 fn schur_step(estimator: &mut Estimator) -> (Vec<f64>, Vec<f64>) {
-    let Estimator { window, landmarks, prior, model, .. } = estimator;
+    let Estimator { graph: Graph { window, landmarks, prior }, model, .. } = estimator;
     let layout = Layout::of(window);
     let n = layout.dim;
     let mut system = System::new(n);
@@ -213,12 +214,12 @@ fn qr_and_schur_complement_agree() {
     let mut vio = Vio::new(&world.rig, &VioConfig::default());
     run(&mut vio, 0..60, &mut world);
     let estimator = &mut vio.estimator;
-    assert!(estimator.landmarks.pool.len() > 50);
+    assert!(estimator.graph.landmarks.pool.len() > 50);
     let steps = newton(estimator);
     let (b, x) = schur_step(estimator);
     assert!(b.iter().any(|b| *b != 0.0));
-    let schur = by_slot(&x, &estimator.window);
-    for slot in estimator.window.slots() {
+    let schur = by_slot(&x, &estimator.graph.window);
+    for slot in estimator.graph.window.slots() {
         for (i, (qr, schur)) in steps[slot].iter().zip(&schur[slot]).enumerate() {
             assert!((qr - schur).abs() < 1e-7 + 1e-5 * qr.abs(), "slot {slot} error {i}: {qr} {schur}");
         }
@@ -322,7 +323,7 @@ fn gated(moved: impl Fn(u64) -> bool) -> (u64, u64, u64) {
     world.tracks(60.0 * FRAME_SECS + 0.0012, &mut tracks);
     let mut count = 0;
     for track in tracks.cameras.iter_mut().flat_map(|c| c.iter_mut()) {
-        if vio.estimator.landmarks.find(track.id).is_some() && moved(track.id) {
+        if vio.estimator.graph.landmarks.find(track.id).is_some() && moved(track.id) {
             (track.px[0], count) = (track.px[0] + 12.0, count + 1);
         }
     }

@@ -1,6 +1,7 @@
 //! Landmarks made of tracks by triangulation, and views that do not fit dropped.
 
-use super::landmarks::{Landmark, Landmarks, Observation};
+use super::graph::Graph;
+use super::landmarks::{Landmark, Observation};
 use super::model::Model;
 use super::projection::{host_cam, placed, predicted};
 use super::reprojection::{Point, Transform};
@@ -52,14 +53,8 @@ struct View {
 
 /// Makes landmarks of the unconnected tracks of the frame in `slot`, each hosted by the first camera that can;
 /// views further than `px_max` from where the point then is are left out. Answers (made, refused because full).
-pub fn triangulate(
-    landmarks: &mut Landmarks,
-    slot: usize,
-    window: &Window,
-    tracks: &[Tracks],
-    model: &Model,
-    px_max: f64,
-) -> (usize, usize) {
+pub fn triangulate(graph: &mut Graph, slot: usize, tracks: &[Tracks], model: &Model, px_max: f64) -> (usize, usize) {
+    let Graph { window, landmarks, .. } = graph;
     let (mut made, mut full) = (0, 0);
     for (camera, list) in tracks[slot].cameras.iter().enumerate() {
         let before = landmarks.pool.len();
@@ -86,7 +81,8 @@ pub fn triangulate(
 }
 
 /// Drops views further than `px_max` from their prediction; answers how many.
-pub fn drop_outliers(landmarks: &mut Landmarks, window: &Window, px_max: f64) -> usize {
+pub fn drop_outliers(graph: &mut Graph, px_max: f64) -> usize {
+    let Graph { window, landmarks, .. } = graph;
     let mut dropped = 0;
     landmarks.retain_views(|l, o| {
         let px = predicted(l, &host_cam(l, window), o, window);

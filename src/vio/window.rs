@@ -203,36 +203,30 @@ impl Window {
         for i in 0..self.order.len() {
             let slot = self.order[i] as usize;
             let mut d = [0.0; 15];
-            if let Some(o) = layout.pose(slot) {
-                d[..POSE_DIM].copy_from_slice(&dx[o..o + POSE_DIM]);
-            }
-            if let Some(o) = layout.motion(slot) {
-                d[POSE_DIM..].copy_from_slice(&dx[o..o + MOTION_DIM]);
+            for (part, first) in layout.state(slot).into_iter().zip([0, POSE_DIM]) {
+                let Some(part) = part else { continue };
+                d[first..first + part.len].copy_from_slice(&dx[part.at..part.at + part.len]);
             }
             self.frames[slot].step(&d);
         }
-        let part = |columns: Option<Columns>| columns.map_or(&[][..], |c| &dx[c.at..c.at + c.len]);
-        if layout.cameras.is_some() || layout.imu.is_some() {
-            self.rig.step(part(layout.cameras), part(layout.imu));
-        }
+        self.rig.step(&dx[layout.rig.at..][..layout.rig.len]);
     }
 }
 
-const ABSENT: usize = usize::MAX;
-
-/// Columns of the frames in a linear system.
+/// Columns of the frames and of the rig in a linear system.
 #[derive(Clone, Copy, Debug)]
 pub struct Layout {
-    pose: [usize; FRAMES],
-    motion: [usize; FRAMES],
-    cameras: Option<Columns>,
-    imu: Option<Columns>,
+    pose: [Option<usize>; FRAMES],
+    motion: [Option<usize>; FRAMES],
+    /// All columns of the rig: those that cameras touch, then those of the inertial unit.
+    pub rig: Columns,
+    camera_dim: usize,
     pub dim: usize,
 }
 
 impl Layout {
     pub fn empty() -> Layout {
-        Layout { pose: [ABSENT; FRAMES], motion: [ABSENT; FRAMES], cameras: None, imu: None, dim: 0 }
+        Layout { pose: [None; FRAMES], motion: [None; FRAMES], rig: Columns::default(), camera_dim: 0, dim: 0 }
     }
 
     /// Columns of every variable of the window: the rig first, the newest state last.
@@ -250,54 +244,43 @@ impl Layout {
 
     /// Adding twice keeps the first column.
     pub fn add_pose(&mut self, slot: usize) {
-        if self.pose[slot] == ABSENT {
-            self.pose[slot] = self.dim;
+        if self.pose[slot].is_none() {
+            self.pose[slot] = Some(self.dim);
             self.dim += POSE_DIM;
         }
     }
 
     pub fn add_motion(&mut self, slot: usize) {
-        if self.motion[slot] == ABSENT {
-            self.motion[slot] = self.dim;
-            self.dim += MOTION_DIM;
-        }
+        self.motion[slot] = Some(self.dim);
+        self.dim += MOTION_DIM;
     }
 
-    /// Columns of what is estimated of the rig, if anything.
+    /// What is estimated of the rig, if anything.
     pub fn add_rig(&mut self, rig: &RigState) {
-        let mut add = |len: usize| {
-            let columns = Columns { at: self.dim, len };
-            self.dim += len;
-            (len > 0).then_some(columns)
-        };
-        (self.cameras, self.imu) = (add(rig.camera_dim()), add(rig.imu_dim()));
+        (self.rig, self.camera_dim) = (Columns { at: self.dim, len: rig.dim() }, rig.camera_dim());
+        self.dim += self.rig.len;
     }
 
     /// Columns of the rig that views touch.
     pub fn cameras(&self) -> Option<Columns> {
-        self.cameras
+        (self.camera_dim > 0).then_some(Columns { len: self.camera_dim, ..self.rig })
     }
 
     /// Columns of the rig that inertial factors touch.
     pub fn imu(&self) -> Option<Columns> {
-        self.imu
+        let (at, len) = (self.rig.at + self.camera_dim, self.rig.len - self.camera_dim);
+        (len > 0).then_some(Columns { at, len })
     }
 
     /// Columns of a frame's pose, then of its velocity and biases.
     pub fn state(&self, slot: usize) -> [Option<Columns>; 2] {
-        [
-            self.pose(slot).map(|at| Columns { at, len: POSE_DIM }),
-            self.motion(slot).map(|at| Columns { at, len: MOTION_DIM }),
-        ]
+        let motion = self.motion[slot].map(|at| Columns { at, len: MOTION_DIM });
+        [self.pose(slot).map(|at| Columns { at, len: POSE_DIM }), motion]
     }
 
+    /// First column of a frame's pose.
     #[inline]
     pub fn pose(&self, slot: usize) -> Option<usize> {
-        (self.pose[slot] != ABSENT).then_some(self.pose[slot])
-    }
-
-    #[inline]
-    pub fn motion(&self, slot: usize) -> Option<usize> {
-        (self.motion[slot] != ABSENT).then_some(self.motion[slot])
+        self.pose[slot]
     }
 }

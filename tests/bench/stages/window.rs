@@ -4,7 +4,7 @@
 
 use stipple::frontend::Tracks;
 use stipple::vio::instruments::{
-    cost_of, of_window, parts, Covariance, Estimator, Factor, ImuRing, Increment, Layout, Outcome, LAMBDA_START,
+    of_window, parts, Covariance, Estimator, Factor, Graph, ImuRing, Increment, Layout, Outcome, LAMBDA_START,
 };
 use stipple::vio::Vio;
 
@@ -35,59 +35,58 @@ impl Stages {
     /// Lets the frame in. `None` while the estimator is not running.
     pub fn new(vio: &Vio, tracks: &Tracks) -> Option<Stages> {
         let (estimator, imu, covariance) = parts(vio);
-        let before = estimator.window.newest()?;
+        let before = estimator.graph.window.newest()?;
         let (mut estimator, imu) = (estimator.clone(), imu.clone());
         let (slot, step) = estimator.enter(before, tracks, &imu, covariance);
-        let layout = Layout::of(&estimator.window);
+        let layout = Layout::of(&estimator.graph.window);
         Some(Stages { estimator, imu, layout, slot, before, keyframe: step.keyframe })
     }
 
     pub fn extent(&self) -> Extent {
-        let (window, pool) = (&self.estimator.window, &self.estimator.landmarks.pool);
+        let (window, pool) = (&self.estimator.graph.window, &self.estimator.graph.landmarks.pool);
         let (landmarks, views) = (pool.len(), pool.iter().map(|l| l.observations.len()).sum());
         Extent { frames: window.slots().count(), landmarks, views, columns: self.layout.dim }
     }
 
     /// The samples since the frame before, and the weight of their increment.
     pub fn preintegrate(&self) -> Increment {
-        self.estimator.propagated(self.before, self.estimator.window.frame(self.slot).t, &self.imu).increment
+        self.estimator.propagated(self.before, self.estimator.graph.window.frame(self.slot).t, &self.imu).increment
     }
 
     /// Landmarks made of the frame's other points, as of a keyframe's; answers how many.
     pub fn triangulate(&mut self) -> usize {
         self.estimator.make_keyframe(self.slot);
-        self.estimator.window.frame(self.slot).hosted
+        self.estimator.graph.window.frame(self.slot).hosted
     }
 
     /// The rows of all landmarks with their points eliminated, not summed: a part of `linearize`. Answers the
     /// cost.
     pub fn eliminate(&mut self) -> f64 {
-        let Estimator { window, landmarks, solver, model, .. } = &mut self.estimator;
+        let Estimator { graph: Graph { window, landmarks, .. }, solver, model, .. } = &mut self.estimator;
         let points = of_window(window, &landmarks.pool).filter(|f| matches!(f, Factor::Landmark(_)));
         points.map(|f| f.linearize(window, model, &self.layout, &mut solver.rows).cost).sum()
     }
 
     /// All factors summed; answers the cost.
     pub fn linearize(&mut self) -> f64 {
-        let Estimator { window, landmarks, prior, solver, model, .. } = &mut self.estimator;
-        solver.linearize(window, landmarks, prior, model, &self.layout)
+        let Estimator { graph, solver, model, .. } = &mut self.estimator;
+        solver.linearize(graph, model, &self.layout)
     }
 
     /// The damped step of what `linearize` summed; answers the decrease it predicts.
     pub fn solve(&mut self) -> Option<f64> {
-        self.estimator.solver.step(LAMBDA_START, self.estimator.landmarks.pool.len())
+        self.estimator.solver.step(LAMBDA_START, self.estimator.graph.landmarks.pool.len())
     }
 
     /// The cost of the window, which judges a step.
     pub fn cost(&self) -> f64 {
-        let Estimator { window, landmarks, prior, model, .. } = &self.estimator;
-        cost_of(window, landmarks, prior, model)
+        self.estimator.graph.cost(&self.estimator.model)
     }
 
     /// All iterations.
     pub fn optimize(&mut self) -> Outcome {
-        let Estimator { window, landmarks, prior, solver, model, .. } = &mut self.estimator;
-        solver.optimize(window, landmarks, prior, model)
+        let Estimator { graph, solver, model, .. } = &mut self.estimator;
+        solver.optimize(graph, model)
     }
 
     /// Covariance of the newest state, from what `linearize` summed.
@@ -97,7 +96,7 @@ impl Stages {
 
     /// Brings the window back to its resting size; answers how many keyframes left it.
     pub fn marginalize(&mut self) -> usize {
-        let keyframes = |e: &Estimator| e.window.slots().filter(|s| e.window.frame(*s).keyframe).count();
+        let keyframes = |e: &Estimator| e.graph.window.slots().filter(|s| e.graph.window.frame(*s).keyframe).count();
         let before = keyframes(&self.estimator);
         self.estimator.marginalize();
         before - keyframes(&self.estimator)
