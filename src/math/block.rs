@@ -17,10 +17,12 @@ pub fn put<const R: usize, const C: usize>(m: &mut SMatrix<f64, R, C>, row: usiz
     }
 }
 
+/// The same vector for nalgebra.
 pub fn vector(v: DVec3) -> Vector3<f64> {
     Vector3::new(v.x, v.y, v.z)
 }
 
+/// The same matrix for nalgebra.
 pub fn matrix(m: DMat3) -> Matrix3<f64> {
     Matrix3::from_fn(|i, j| m.col(j)[i])
 }

@@ -2,7 +2,7 @@
 //!
 //! A row is `[A | b]`. Orthogonal transforms of the rows change neither the sum of squares nor its
 //! minimum, and never square the condition of A. Columns that depend on earlier ones to working
-//! precision are recognised (rank-revealing without column exchange, so that the caller's order of
+//! precision are recognized (rank-revealing without column exchange, so that the caller's order of
 //! elimination stands): what rounding left of them is dropped, so that a direction nobody observed
 //! stays unobserved.
 
@@ -61,12 +61,9 @@ impl Rows {
         debug_assert!(self.rows_max * self.stride <= self.a.len());
     }
 
-    pub fn len(&self) -> usize {
+    /// Rows there are.
+    pub fn count(&self) -> usize {
         self.rows
-    }
-
-    pub fn is_empty(&self) -> bool {
-        self.rows == 0
     }
 
     pub fn cols(&self) -> usize {
@@ -115,7 +112,7 @@ impl Rows {
         self.rows = last - rank;
     }
 
-    /// As few rows as hold the same information.
+    /// Leaves as few rows as hold the same information.
     pub fn triangularize(&mut self) {
         self.marginalize(0);
     }
@@ -286,7 +283,7 @@ mod tests {
         // What no column explains is dropped: all but b's own square stays.
         let mut c = a.clone();
         c.triangularize();
-        assert_eq!(c.len(), 11);
+        assert_eq!(c.count(), 11);
         let (before, after) = (gram(&a, 0), gram(&c, 0));
         close(&before[..11], &after[..11], tolerance);
         assert!(after[11][11] < before[11][11]);

@@ -15,6 +15,7 @@ pub fn hat(a: DVec3) -> DMat3 {
     DMat3::from_cols(DVec3::new(0.0, a.z, -a.y), DVec3::new(-a.z, 0.0, a.x), DVec3::new(a.y, -a.x, 0.0))
 }
 
+/// Unit quaternion of a rotation vector, rad.
 pub fn exp(phi: DVec3) -> DQuat {
     let th2 = phi.length_squared();
     let (s, w) = if th2 < SMALL_ANGLE2 {
@@ -26,7 +27,7 @@ pub fn exp(phi: DVec3) -> DQuat {
     DQuat::from_xyzw(s * phi.x, s * phi.y, s * phi.z, w).normalize()
 }
 
-/// The same as a matrix (Rodrigues).
+/// Rotation matrix of a rotation vector (Rodrigues).
 pub fn exp_matrix(phi: DVec3) -> DMat3 {
     let th2 = phi.length_squared();
     let (a, b) = if th2 < SMALL_ANGLE2 {
@@ -52,6 +53,7 @@ pub fn log(q: DQuat) -> DVec3 {
     }
 }
 
+/// Jr(φ): `Exp(φ + δ) ≈ Exp(φ) Exp(Jr(φ) δ)`.
 pub fn right_jacobian(phi: DVec3) -> DMat3 {
     let th2 = phi.length_squared();
     let (a, b) = if th2 < SMALL_ANGLE2 {
@@ -64,6 +66,7 @@ pub fn right_jacobian(phi: DVec3) -> DMat3 {
     DMat3::IDENTITY - k * a + k * k * b
 }
 
+/// Jr⁻¹(φ).
 pub fn right_jacobian_inverse(phi: DVec3) -> DMat3 {
     let th2 = phi.length_squared();
     let b = if th2 < SMALL_ANGLE2 {

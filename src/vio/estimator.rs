@@ -27,7 +27,7 @@ use crate::frontend::Tracks;
 use crate::limits::{FRAMES, RIG_DIM};
 use stipple_drivers::{Calibration, Nanos};
 
-/// With fewer landmarks in view than this a keyframe is declared at once.
+/// A keyframe is declared at once when fewer landmarks than this are in view.
 pub const CONNECTED_FEW: usize = 20;
 /// A state this far from sense is a failure: m/s, m/s², rad/s.
 const SPEED_MAX: f64 = 100.0;
@@ -150,9 +150,8 @@ impl Estimator {
 
     /// The frame after that in slot `before`, where inertia puts it.
     pub fn propagated(&self, before: usize, t: Nanos, imu: &ImuRing) -> Frame {
-        let before = self.graph.window.frame(before);
-        let inc = imu.integrate(before.t, t, before.now.bg, before.now.ba, &self.model.noise);
-        let mut frame = Frame::new(t, before.now.propagate(&self.scaled(&inc)));
+        let (inc, motion) = self.carried(self.graph.window.frame(before), t, imu);
+        let mut frame = Frame::new(t, motion);
         frame.weight = InertialWeight::new(&inc, &self.model.noise);
         frame.increment = inc;
         frame.rate = imu.rate_at(t);
@@ -161,14 +160,16 @@ impl Estimator {
 
     /// The newest motion carried by the inertial samples to `t`, or as it is where that is older.
     pub fn predict(&self, t: Nanos, imu: &ImuRing) -> Option<(Nanos, Motion)> {
-        let f = self.newest()?;
-        let inc = imu.integrate(f.t, t.max(f.t), f.now.bg, f.now.ba, &self.model.noise);
-        Some((f.t.max(t), f.now.propagate(&self.scaled(&inc))))
+        let newest = self.newest()?;
+        let t = t.max(newest.t);
+        Some((t, self.carried(newest, t, imu).1))
     }
 
-    fn scaled(&self, inc: &Increment) -> Increment {
+    /// The samples since a frame, and the motion they lead to.
+    fn carried(&self, from: &Frame, t: Nanos, imu: &ImuRing) -> (Increment, Motion) {
         let rig = &self.graph.window.rig.now;
-        inc.rescaled(rig.gyro_scale, rig.accel_scale)
+        let inc = imu.integrate(from.t, t, from.now.bg, from.now.ba, &self.model.noise);
+        (inc, from.now.propagate(&inc.rescaled(rig.gyro_scale, rig.accel_scale)))
     }
 
     /// Takes a frame into the window; answers its slot, and whether it is to be a keyframe.
@@ -207,7 +208,7 @@ impl Estimator {
         unconnected > 0 && (due || connected < CONNECTED_FEW)
     }
 
-    /// Answers how many landmarks had no room.
+    /// Declares the frame in `slot` a keyframe and triangulates; answers how many landmarks had no room.
     pub fn make_keyframe(&mut self, slot: usize) -> usize {
         let px_max = self.outlier_px(slot);
         let (made, full) = triangulate(&mut self.graph, slot, &self.tracks, &self.model, px_max);
@@ -217,7 +218,7 @@ impl Estimator {
         full
     }
 
-    /// Views further than this from their prediction are wrong, px: wider while the rig is not known well.
+    /// Distance from its prediction at which a view is wrong, px: wider while the rig is not known well.
     fn outlier_px(&self, slot: usize) -> f64 {
         let (rig, sigma) = (&self.graph.window.rig, &self.rig_deviations);
         let cameras = &self.model.cameras;
@@ -228,7 +229,7 @@ impl Estimator {
         self.model.config.outlier_px + RIG_SIGMAS * focal * (time + rotation)
     }
 
-    /// `views` of the frame there were before outliers were dropped.
+    /// Evidence for the monitor; `views` of the frame there were before outliers were dropped.
     fn evidence(&self, before: usize, slot: usize, views: usize) -> Evidence {
         let known =
             self.graph.landmarks.pool.iter().filter(|l| l.host as usize != slot).map(|l| l.views_in(slot)).sum();

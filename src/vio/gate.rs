@@ -21,7 +21,7 @@ use nalgebra::{Matrix3, SMatrix, SVector};
 
 /// Two degrees of freedom pass with all but 4e-6 of true views.
 const CHI_SQUARE_MAX: f64 = 25.0;
-/// With fewer known views, or when a smaller share passes, nothing is refused.
+/// Least number of known views, and share of them that passes, for any to be refused.
 const VIEWS_MIN: usize = 8;
 const PASS_MIN: f64 = 0.6;
 
@@ -75,7 +75,7 @@ pub fn gate(graph: &Graph, slot: usize, tracks: &mut Tracks, p: &PoseCovariance,
         for (i, track) in list.iter().enumerate() {
             let Some(l) = landmarks.find(track.id).map(|at| &landmarks.pool[at]) else { continue };
             let seen = Observation { slot: slot as u8, camera: camera as u8, px: track.px };
-            // A point that cannot be predicted is left to the optimisation to judge.
+            // A point that cannot be predicted is left to the optimization to judge.
             let Some(d) = distance(l, &seen, window, p, sigma_px) else { continue };
             known += 1;
             // Also when it is not a number.

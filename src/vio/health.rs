@@ -121,7 +121,7 @@ pub enum Reset {
     Unseen,
     /// Not finite, or beyond what flies.
     State,
-    /// By the caller.
+    /// The caller asked for it.
     #[default]
     Asked,
 }

@@ -229,7 +229,8 @@ mod tests {
         let mut inc = Increment::new(DVec3::new(0.005, 0.0, -0.01), DVec3::new(0.05, -0.05, 0.1));
         for k in 0..12 {
             let t = k as f64 * 0.3;
-            inc.step(DVec3::new(t.sin(), 0.7, -t.cos()), DVec3::new(1.0, t.cos(), 9.0 + t.sin()), 0.005, &noise);
+            let sample = [DVec3::new(t.sin(), 0.7, -t.cos()), DVec3::new(1.0, t.cos(), 9.0 + t.sin())];
+            inc.step_between(sample, sample, 0.005, &noise);
         }
         let weight = InertialWeight { increment: inc.whitening().unwrap(), bg: 300.0, ba: 20.0 };
         (inc, weight)

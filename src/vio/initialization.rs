@@ -23,7 +23,7 @@ use glam::{DMat3, DQuat, DVec2, DVec3};
 use nalgebra::{SMatrix, SVector};
 use stipple_drivers::{Nanos, Pose, Span};
 
-/// At rest the unit is quiet for this long, s, and its mean rate is one that a bias can explain, rad/s.
+/// Rest: the unit is quiet for this long, s, and its mean rate is one that a bias can explain, rad/s.
 const REST_SPAN: f64 = 0.5;
 const REST_GYRO_MEAN: f64 = 0.15;
 
@@ -43,15 +43,15 @@ const RESECTION_ROTATION: f64 = 2e-3;
 const DEPTH_SIGNIFICANT: f64 = 3.0;
 /// Resections that may fail, and alignments that may contradict each other, before the mean force has to do. The
 /// latter are many, some ten seconds, since starting all the same would not mend a contradiction.
-const ATTEMPTS: u32 = 3;
-const REFUSALS: u32 = 20;
+const RESECTIONS_FAILED_MAX: u32 = 3;
+const ALIGNMENTS_FAILED_MAX: u32 = 20;
 /// The mean force: over this long, s; how far from gravity's length it may be, m/s²; and what is then known of
 /// tilt, rad, and of velocity, m/s.
 const MEAN_SPAN: f64 = 1.0;
 const MEAN_FORCE_MISFIT: f64 = 2.5;
 const MEAN_FORCE_TILT: f64 = 0.3;
 const MEAN_FORCE_V: f64 = 3.0;
-/// Least deviations of an alignment in motion: tilt, rad; velocity, m/s; gyro bias, rad/s. The accelerometer's
+/// Lower bounds of the deviations of an alignment in motion: tilt, rad; velocity, m/s; gyro bias, rad/s. The accelerometer's
 /// unknown bias sets them.
 const ALIGNED_TILT: f64 = 0.05;
 const ALIGNED_V: f64 = 0.1;
@@ -71,7 +71,7 @@ pub struct Start {
 struct ReferencePoint {
     id: u64,
     px: DVec2,
-    /// With its standard deviation relative to the inverse distance; none where stereo does not measure one.
+    /// The point, and the relative standard deviation of its inverse distance; `None` where stereo does not measure one.
     point: Option<(Point, f64)>,
 }
 
@@ -91,9 +91,8 @@ pub struct Initializer {
     reference: Vec<ReferencePoint>,
     /// The reference frame first.
     frames: Vec<ResectedFrame>,
-    /// Resections and alignments that failed.
-    attempts: u32,
-    refusals: u32,
+    resections_failed: u32,
+    alignments_failed: u32,
 }
 
 impl Initializer {
@@ -101,8 +100,8 @@ impl Initializer {
         Initializer {
             reference: Vec::with_capacity(TRACKS),
             frames: Vec::with_capacity(ALIGN_FRAMES_MAX),
-            attempts: 0,
-            refusals: 0,
+            resections_failed: 0,
+            alignments_failed: 0,
         }
     }
 
@@ -111,7 +110,7 @@ impl Initializer {
     pub fn clear(&mut self) {
         self.reference.clear();
         self.frames.clear();
-        (self.attempts, self.refusals) = (0, 0);
+        (self.resections_failed, self.alignments_failed) = (0, 0);
     }
 
     /// Takes what the cameras saw at one instant, inertial samples up to it known; answers the state of that instant
@@ -125,30 +124,27 @@ impl Initializer {
             return Some(start);
         }
         let increment = imu.integrate(last.t, tracks.t, DVec3::ZERO, DVec3::ZERO, &model.noise);
-        let before =
-            self.frames.len().checked_sub(2).map_or(last.reference_from_body, |i| self.frames[i].reference_from_body);
-        let stride = last.reference_from_body.p - before.p;
-        let guess = Pose::new(last.reference_from_body.q * increment.q, last.reference_from_body.p + stride);
-        let resected = resect(&self.reference, tracks, model, guess);
-        if let Some((reference_from_body, sigma)) = resected {
+        let before = self.frames[self.frames.len().saturating_sub(2)].reference_from_body;
+        let last = last.reference_from_body;
+        let guess = Pose::new(last.q * increment.q, last.p + (last.p - before.p));
+        if let Some((reference_from_body, sigma)) = resect(&self.reference, tracks, model, guess) {
             self.frames.push(ResectedFrame { t: tracks.t, reference_from_body, sigma, increment });
-            let span = (tracks.t - self.frames[0].t).secs();
-            if !(span >= ALIGN_SPAN && self.frames.len() >= ALIGN_FRAMES_MIN) && self.frames.len() < ALIGN_FRAMES_MAX {
+            let (n, span) = (self.frames.len(), (tracks.t - self.frames[0].t).secs());
+            if n < ALIGN_FRAMES_MAX && (n < ALIGN_FRAMES_MIN || span < ALIGN_SPAN) {
                 return None;
             }
             let start = align(&self.frames, self.scale_sigma(), &model.config);
             if start.is_some() {
                 return start;
             }
-            self.refusals += 1;
+            self.alignments_failed += 1;
         } else {
-            self.attempts += 1;
+            self.resections_failed += 1;
         }
         self.refer_to(tracks, model);
-        if self.attempts >= ATTEMPTS || self.refusals >= REFUSALS {
-            return from_mean_force(tracks.t, imu, model);
-        }
-        None
+        let exhausted =
+            self.resections_failed >= RESECTIONS_FAILED_MAX || self.alignments_failed >= ALIGNMENTS_FAILED_MAX;
+        exhausted.then(|| from_mean_force(tracks.t, imu, model))?
     }
 
     /// Relative deviation of all distances together.
@@ -197,14 +193,8 @@ impl Initializer {
 }
 
 fn sigma(config: &VioConfig, tilt: f64, v: f64, bg: f64) -> MotionSigma {
-    MotionSigma {
-        p: GAUGE_SIGMA,
-        yaw: GAUGE_SIGMA,
-        tilt,
-        v,
-        bg: bg.min(config.gyro_bias_sigma),
-        ba: config.accel_bias_sigma,
-    }
+    let (bg, ba) = (bg.min(config.gyro_bias_sigma), config.accel_bias_sigma);
+    MotionSigma { p: GAUGE_SIGMA, tilt, yaw: GAUGE_SIGMA, v, bg, ba }
 }
 
 /// A point from the stereo views of one frame, in its camera 0, and the relative deviation of its inverse

@@ -23,7 +23,7 @@ impl Observation {
 /// A point and its views.
 #[derive(Clone, Debug, Default)]
 pub struct Landmark {
-    /// Of its tracks.
+    /// Id of its tracks.
     pub id: u64,
     /// Slot of the frame it is given in, and the camera of that frame whose ray the point is on.
     pub host: u8,

@@ -57,7 +57,7 @@ impl Leaving {
 
     /// Columns of every frame up to the boundary, the leaving ones first; how many leave, and the blocks that stay.
     fn layout(&self, window: &Window) -> (Layout, usize, Blocks) {
-        let mut layout = Layout::empty();
+        let mut layout = Layout::default();
         layout.add_motion(self.state);
         if !self.keeps_pose {
             layout.add_pose(self.state);

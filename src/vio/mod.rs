@@ -96,7 +96,7 @@ impl From<&Odometry> for Motion {
 /// What one frame led to.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Update {
-    /// `None` until initialised.
+    /// `None` until initialized.
     pub odometry: Option<Odometry>,
     pub keyframe: bool,
     /// Tracks that are landmarks, a point that several cameras see once.
@@ -114,7 +114,7 @@ pub struct Vio {
     estimator: Estimator,
     monitor: Monitor,
     recovery: Recovery,
-    /// Of the newest state in the world, in which a restart stands where it stands.
+    /// Covariance of the newest state in the world of the first start.
     covariance: Option<Covariance>,
     /// Stamp of the newest frame.
     last: Option<Nanos>,
@@ -218,7 +218,7 @@ impl Vio {
         update
     }
 
-    /// Without what no tracker of this rig says: cameras it has not, pixels that are none, ids out of order.
+    /// The tracks that a tracker of this rig can give: no cameras it has not, no pixels that are none, ids in order.
     fn admitted(&mut self, tracks: &Tracks) -> Tracks {
         let mut clean = tracks.clone();
         for (camera, list) in clean.cameras.iter_mut().enumerate() {
@@ -290,7 +290,7 @@ impl Vio {
         Update { odometry, keyframe: step.keyframe, connected: step.connected, ..Update::default() }
     }
 
-    /// `step` unless there was none, or a reset after it.
+    /// Bits of a frame; `step` is what it led to, unless there was none or a reset came after it.
     fn health(&mut self, tracks: &Tracks, step: Option<&Step>) -> Health {
         let mut h = std::mem::take(&mut self.pending) | self.monitor.bits();
         let model = &self.estimator.model;
@@ -311,7 +311,7 @@ impl Vio {
         h
     }
 
-    /// Forgets everything but the inertial samples and where it was, and initialises again.
+    /// Forgets everything but the inertial samples and where it was, and initializes again.
     pub fn reset(&mut self) {
         self.reset_for(Reset::Asked);
     }
@@ -330,18 +330,18 @@ impl Vio {
         self.estimator.newest().is_some()
     }
 
-    /// The newest state. `None` until initialised.
+    /// The newest state. `None` until initialized.
     pub fn odometry(&self) -> Option<Odometry> {
         self.estimator.newest().map(|f| Odometry::new(f.t, &f.now))
     }
 
-    /// The newest state carried by the inertial samples to `t`. `None` until initialised.
+    /// The newest state carried by the inertial samples to `t`. `None` until initialized.
     pub fn predict(&self, t: Nanos) -> Option<Odometry> {
         self.estimator.predict(t, &self.imu).map(|(t, motion)| Odometry::new(t, &motion))
     }
 
     /// Covariance of the newest state, errors [p, θ, v, bg, ba]: p, m, and v, m/s, in the world; θ, rad, on the right
-    /// of the rotation; biases, rad/s and m/s². `None` until initialised, and where the window does not determine it.
+    /// of the rotation; biases, rad/s and m/s². `None` until initialized, and where the window does not determine it.
     pub fn covariance(&self) -> Option<&[[f64; 15]; 15]> {
         self.covariance.as_ref()
     }

@@ -4,15 +4,14 @@
 use super::health::{Health, Reset};
 use stipple_drivers::Nanos;
 
-/// Fewer of its views than this agree with a frame after optimization: the frame is suspect.
+/// Share of a frame's views that must agree with it after optimization, once it has so many: otherwise it is suspect.
 const INLIERS_MIN: f64 = 0.65;
 const VIEWS_MIN: usize = 10;
 /// Squared whitened residual of the newest inertial factor, per dimension, that is suspect.
 const MISFIT_MAX: f64 = 30.0;
 /// This many more suspect frames than others are a divergence: wrong tracks and samples also agree by chance.
 const SUSPECT_MAX: u32 = 10;
-/// With fewer views than this of landmarks it knew for longer than this, s, inertia alone carries the
-/// estimate too far.
+/// Known landmarks have fewer views than this for longer than this, s: inertia alone carries the estimate too far.
 const SEEN_VIEWS: usize = 6;
 const UNSEEN_MAX: f64 = 3.0;
 /// Frames that see enough of them end that.

@@ -2,7 +2,7 @@
 //! velocity in the first body frame, with their covariance and their derivatives to the biases (Forster et al.,
 //! T-RO 2017).
 //!
-//! A step from one sample to the next is a midpoint step: the mean of both rates and forces, the force turned by
+//! A step from one sample to the next is a midpoint step: the mean of both rates and forces, the force rotated by
 //! the rotation at mid-step. Covariance and derivatives are those of the step as taken. `ImuRing::integrate`
 //! interpolates at the ends, so that an increment covers exactly `[t0, t1]`, and crosses gaps with the noise of
 //! not having measured.
@@ -154,11 +154,6 @@ impl Increment {
         Increment { p: self.p + part(0), q: self.q * so3::exp(part(3)), v: self.v + part(6), ..*self }
     }
 
-    /// One step of `dt` with constant rate and specific force.
-    pub fn step(&mut self, gyro: DVec3, accel: DVec3, dt: f64, noise: &Noise) {
-        self.step_between([gyro, accel], [gyro, accel], dt, noise);
-    }
-
     /// One step of `dt` between two samples of [rate, specific force].
     pub fn step_between(&mut self, first: [DVec3; 2], second: [DVec3; 2], dt: f64, noise: &Noise) {
         if !(dt > 0.0) {
@@ -168,18 +163,18 @@ impl Increment {
         let (a0, a1) = (first[1] - self.ba, second[1] - self.ba);
         // Rotation since the start of the step, at its middle and at its end.
         let (half, whole) = ((w0 * 0.25 + w1 * 0.25) * dt, (w0 * 0.5 + w1 * 0.5) * dt);
-        let (turned_half, turned) = (so3::exp(half), so3::exp(whole));
-        let r = DMat3::from_quat(self.q * turned_half);
+        let (to_half, to_end) = (so3::exp(half), so3::exp(whole));
+        let r = DMat3::from_quat(self.q * to_half);
         let force = a0.lerp(a1, 0.5);
         let (dv, dp) = (r * force * dt, r * force * (0.5 * dt * dt));
 
         // Errors: rotation right-perturbed, R Exp(φ) Exp(θ') with θ' = Exp(-φ) θ + Jr(φ) dφ.
         let tilt = r * so3::hat(-force);
-        let by_theta = tilt * DMat3::from_quat(turned_half.conjugate());
+        let by_theta = tilt * DMat3::from_quat(to_half.conjugate());
         let mut f = Mat9::identity();
         put(&mut f, 0, 3, by_theta * (0.5 * dt * dt));
         put(&mut f, 0, 6, DMat3::IDENTITY * dt);
-        put(&mut f, 3, 3, DMat3::from_quat(turned.conjugate()));
+        put(&mut f, 3, 3, DMat3::from_quat(to_end.conjugate()));
         put(&mut f, 6, 3, by_theta * dt);
         // Derivatives to the readings of both samples, each axis by a factor a sample.
         let by_rate = tilt * so3::right_jacobian(half) * (0.25 * dt);
@@ -216,7 +211,7 @@ impl Increment {
         }
         self.p += self.v * dt + dp;
         self.v += dv;
-        self.q = (self.q * turned).normalize();
+        self.q = (self.q * to_end).normalize();
         self.dt += dt;
     }
 
@@ -368,9 +363,9 @@ mod tests {
             let e = error(&start(t).propagate(&inc).pose, &PATH.pose(t + 0.05));
             [e.0 * e.0 / 40.0, e.1 * e.1 / 40.0]
         });
-        let [moved, turned] = squares.fold([0.0, 0.0], |a, b| [a[0] + b[0], a[1] + b[1]]).map(f64::sqrt);
+        let [moved, rotated] = squares.fold([0.0, 0.0], |a, b| [a[0] + b[0], a[1] + b[1]]).map(f64::sqrt);
         let lost = 2e-3 * 0.05f64.powf(1.5) / 3f64.sqrt();
-        assert!(moved < 0.1 * lost && turned < 2e-6, "{moved} m, {turned} rad over 50 ms");
+        assert!(moved < 0.1 * lost && rotated < 2e-6, "{moved} m, {rotated} rad over 50 ms");
     }
 
     #[test]
@@ -393,7 +388,7 @@ mod tests {
         let mut random = world::Noise(3);
         let sample = |k: usize| world::rate_and_force(|t| PATH.pose(t), 0.5 + (k as f64 + 0.5) * DT);
         let clean = (0..STEPS).fold(Increment::new(DVec3::ZERO, DVec3::ZERO), |mut inc, k| {
-            inc.step(sample(k).0, sample(k).1, DT, &NOISE);
+            inc.step_between(sample(k).into(), sample(k).into(), DT, &NOISE);
             inc
         });
         let samples: Vec<_> = (0..STEPS).map(sample).collect();
@@ -402,7 +397,8 @@ mod tests {
             let mut inc = Increment::new(DVec3::ZERO, DVec3::ZERO);
             for (gyro, accel) in &samples {
                 let gyro = *gyro + random.vector() * (NOISE.gyro / DT.sqrt());
-                inc.step(gyro, *accel + random.vector() * (NOISE.accel / DT.sqrt()), DT, &NOISE);
+                let sample = [gyro, *accel + random.vector() * (NOISE.accel / DT.sqrt())];
+                inc.step_between(sample, sample, DT, &NOISE);
             }
             let th = so3::log(clean.q.conjugate() * inc.q);
             let (p, v) = (inc.p - clean.p, inc.v - clean.v);

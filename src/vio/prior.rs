@@ -125,18 +125,18 @@ impl Prior {
     /// `J δ` and r, a row at a time.
     fn residuals(&self, d: [f64; WINDOW_DIM]) -> impl Iterator<Item = (f64, f64)> + '_ {
         let n = self.rows.cols() - 1;
-        (0..self.rows.len()).map(move |i| {
+        (0..self.rows.count()).map(move |i| {
             let row = self.rows.row(i);
             ((0..n).map(|c| row[c] * d[c]).sum::<f64>(), row[n])
         })
     }
 
-    /// The same at the estimate.
+    /// `J δ` and r at the estimate.
     fn residuals_now(&self, window: &Window) -> impl Iterator<Item = (f64, f64)> + '_ {
         self.residuals(self.deltas(window, |b, out| b.delta(window, out)))
     }
 
-    /// At the estimate.
+    /// Cost at the estimate.
     pub fn cost(&self, window: &Window) -> f64 {
         self.residuals_now(window).map(|(jd, r)| 0.5 * (jd + r) * (jd + r)).sum()
     }
@@ -180,12 +180,12 @@ impl Prior {
         self.blocks = blocks;
         let n = stack.cols() - left;
         self.rows.clear(n);
-        for i in 0..stack.len() {
+        for i in 0..stack.count() {
             self.rows.push().copy_from_slice(&stack.row(i)[left..]);
         }
         let mut at_delta = [0.0; WINDOW_DIM + 1];
         at_delta.iter_mut().zip(self.residuals_now(window)).for_each(|(to, (jd, _))| *to = jd);
-        for (i, jd) in at_delta[..self.rows.len()].iter().enumerate() {
+        for (i, jd) in at_delta[..self.rows.count()].iter().enumerate() {
             self.rows.row_mut(i)[n - 1] -= *jd;
         }
         self.stride = self.rows.gram(0, &mut self.gram);

@@ -22,7 +22,7 @@ fn delayed(camera: &CameraModel, time_offset: f64, row: f32, slot: usize, window
     DelayedCamera::new(&camera.body_from_cam, &window.frame(slot).twist, tau)
 }
 
-/// Where a camera sits on the body when it takes a row, px, of the frame in `slot`.
+/// Place of a camera on the body when it takes a row, px, of the frame in `slot`.
 pub fn placed(camera: usize, row: f32, slot: usize, window: &Window) -> Transform {
     let camera = &window.rig.cameras()[camera];
     if window.rig.is_plain() {
@@ -31,7 +31,7 @@ pub fn placed(camera: usize, row: f32, slot: usize, window: &Window) -> Transfor
     delayed(camera, window.rig.now.time_offset, row, slot, window).body_from_cam
 }
 
-/// Where the camera sits that a landmark is hosted in, for all its views.
+/// Place of the camera that a landmark is hosted in, for all its views.
 pub fn host_cam(l: &Landmark, window: &Window) -> Transform {
     placed(l.host_camera as usize, l.host_row, l.host as usize, window)
 }

@@ -20,7 +20,7 @@ use stipple_drivers::{Nanos, Pose, Span};
 
 /// An estimate is confirmed when nothing spoke against it for this long, s. Less than the ring of samples holds.
 const LAG: f64 = 0.4;
-/// For this long after the trusted estimate its down is better than a restart's that contradicts it, s.
+/// Time after the trusted estimate for which its down is better than a restart's that contradicts it, s.
 const DOWN_HOLDS: f64 = 5.0;
 /// Samples are integrated this long after they came, s: the ring of samples need not hold a whole outage, and
 /// no frame is that late.
@@ -49,9 +49,11 @@ pub struct Recovery {
 impl Recovery {
     /// An estimate nothing speaks against.
     pub fn trust(&mut self, t: Nanos, motion: &Motion, covariance: &Covariance) {
-        let newest = TrustedState::new(t, motion, covariance);
+        let covariance = Mat15::from_fn(|i, j| covariance[i][j]);
+        let then = DeadReckoning { t, motion: *motion, covariance };
+        let newest = TrustedState { then, carried: then };
         match &self.candidate {
-            Some(c) if (t - c.t).secs() < LAG => {}
+            Some(c) if (t - c.then.t).secs() < LAG => {}
             waited => (self.confirmed, self.candidate) = (waited.or(self.confirmed), Some(newest)),
         }
         self.newest = Some(newest);
@@ -134,44 +136,35 @@ impl Origin {
 /// An estimate nothing spoke against, as it was and as inertia carries it on.
 #[derive(Clone, Copy, Debug)]
 struct TrustedState {
-    t: Nanos,
-    pose: Pose,
-    speed: f64,
-    sigma_p: f64,
-    sigma_yaw: f64,
+    then: DeadReckoning,
     carried: DeadReckoning,
 }
 
 impl TrustedState {
-    fn new(t: Nanos, motion: &Motion, covariance: &Covariance) -> TrustedState {
-        let covariance = Mat15::from_fn(|i, j| covariance[i][j]);
-        let carried = DeadReckoning { t, motion: *motion, covariance };
-        let (sigma_p, sigma_yaw) = (carried.sigma(0), carried.about_world_axis(DVec3::Z));
-        TrustedState { t, pose: motion.pose, speed: motion.v.length(), sigma_p, sigma_yaw, carried }
-    }
-
     fn resume(&mut self, start: &Start, suspect: bool, t: Nanos, imu: &ImuRing, noise: &Noise) -> Option<Start> {
-        self.carried.advance(t, imu, noise);
-        let away = (t - self.t).secs();
+        let TrustedState { then, carried } = self;
+        carried.advance(t, imu, noise);
+        let away = (t - then.t).secs();
         let mut sigma = start.sigma;
-        if !suspect && sigma.v > self.carried.sigma(6) {
+        if !suspect && sigma.v > carried.sigma(6) {
             // Dead reckoning knows the motion better than a start that does not see it.
-            return Some(Start { motion: self.carried.motion, sigma: self.carried.sigmas() });
+            return Some(Start { motion: carried.motion, sigma: carried.sigmas() });
         }
-        let moved = in_world_of(&self.carried.motion.pose, &start.motion);
-        if away < DOWN_HOLDS && !self.carried.expects_down(&moved, &sigma) {
+        let moved = in_world_of(&carried.motion.pose, &start.motion);
+        if away < DOWN_HOLDS && !carried.expects_down(&moved, &sigma) {
             return None;
         }
-        if self.carried.expects_velocity(&moved, &sigma) && (!suspect || sigma.v < VOUCHING_V) {
-            sigma.p = sigma.p.hypot(self.carried.sigma(0));
-            sigma.yaw = sigma.yaw.hypot(self.carried.about_world_axis(DVec3::Z));
+        if carried.expects_velocity(&moved, &sigma) && (!suspect || sigma.v < VOUCHING_V) {
+            sigma.p = sigma.p.hypot(carried.sigma(0));
+            sigma.yaw = sigma.yaw.hypot(carried.about_world_axis(DVec3::Z));
             return Some(Start { motion: moved, sigma });
         }
-        let speed = self.speed.max(moved.v.length()).max(SPEED_UNSEEN);
-        sigma.p += self.sigma_p + speed * away;
+        let speed = then.motion.v.length().max(moved.v.length()).max(SPEED_UNSEEN);
+        sigma.p += then.sigma(0) + speed * away;
         // Beyond half a turn a yaw is no more unknown.
-        sigma.yaw = (sigma.yaw + self.sigma_yaw + RATE_UNSEEN * away).min(std::f64::consts::PI);
-        Some(Start { motion: in_world_of(&self.pose, &start.motion), sigma })
+        let yaw = sigma.yaw + then.about_world_axis(DVec3::Z) + RATE_UNSEEN * away;
+        sigma.yaw = yaw.min(std::f64::consts::PI);
+        Some(Start { motion: in_world_of(&then.motion.pose, &start.motion), sigma })
     }
 }
 

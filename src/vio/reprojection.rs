@@ -8,7 +8,7 @@
 use glam::{DMat3, DVec2, DVec3};
 use stipple_drivers::{Camera, Pose, RigCamera};
 
-/// A pose with its rotation as a matrix, which what projects many points needs; `r` turns, `p` is in metres.
+/// A pose with its rotation as a matrix, for what projects many points; `p` in m.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Transform {
     pub r: DMat3,
@@ -37,7 +37,7 @@ impl From<&RigCamera> for CameraModel {
 }
 
 impl CameraModel {
-    /// When a row is exposed, after the stamp, which is the middle row's, s.
+    /// Time at which a row is exposed, after the stamp, which is the middle row's, s.
     pub fn row_delay(&self, row: f64) -> f64 {
         self.readout * (row / (self.camera.height - 1).max(1) as f64 - 0.5)
     }
@@ -119,13 +119,13 @@ impl View<'_> {
         self.camera.camera.project(self.trace(point).x_cam)
     }
 
-    /// The same pixel with its derivatives to both frames and to the point.
+    /// That pixel with its derivatives to both frames and to the point.
     #[inline]
     pub fn reproject(&self, point: &Point) -> Option<Reprojection> {
         self.derive(point, |_, _, _| {})
     }
 
-    /// The same pixel with derivatives also to where the cameras sit.
+    /// That pixel with derivatives also to where the cameras sit.
     pub fn reproject_with_extrinsics(&self, point: &Point) -> Option<(Reprojection, ExtrinsicDerivatives)> {
         let mut d = ExtrinsicDerivatives::default();
         let bearing = point.bearing();

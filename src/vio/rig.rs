@@ -66,7 +66,7 @@ impl RigParameters {
 /// Estimate and standard deviation of what the board asks for; `None` for the rest.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct RigEstimate {
-    /// Beyond the calibration's, s.
+    /// Time offset beyond the calibration's, and its deviation, s.
     pub time_offset: Option<[f64; 2]>,
     /// [p, θ] of each camera over the calibration, m and rad, θ on the right; and deviations.
     pub extrinsics: [Option<[[f64; EXTRINSIC_DIM]; 2]>; CAMERAS_MAX],
@@ -190,7 +190,7 @@ impl RigState {
         &self.cameras_linearized
     }
 
-    /// From here on Jacobians are taken at the present estimate.
+    /// Makes the present estimate the point at which Jacobians are taken from now on.
     pub fn fix_linearization_point(&mut self) {
         if self.linearization_point.is_none() {
             (self.linearization_point, self.delta) = (Some(self.now), [0.0; RIG_DIM]);

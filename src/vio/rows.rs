@@ -51,7 +51,7 @@ impl FactorRows {
         self.rows.clear(own + self.columns.iter().map(|c| c.len).sum::<usize>() + 1);
     }
 
-    /// Where the columns of the window from `at` are in the rows.
+    /// Column of the rows at which the columns of the window from `at` begin.
     pub fn offset(&self, at: usize) -> usize {
         self.own + self.columns.iter().take_while(|c| c.at != at).map(|c| c.len).sum::<usize>()
     }
@@ -64,10 +64,10 @@ impl FactorRows {
 
     /// Appends the rows from `first`, the factor's own columns left out; makes room when there is none.
     pub fn append_to(&self, first: usize, stack: &mut Rows) {
-        if stack.room() < self.rows.len() - first {
+        if stack.room() < self.rows.count() - first {
             stack.triangularize();
         }
-        for i in first..self.rows.len() {
+        for i in first..self.rows.count() {
             let row = &self.rows.row(i)[self.own..];
             scatter(row, &self.columns, stack.push());
         }

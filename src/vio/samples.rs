@@ -107,7 +107,7 @@ impl ImuRing {
     pub fn integrate(&self, t0: Nanos, t1: Nanos, bg: DVec3, ba: DVec3, noise: &Noise) -> Increment {
         let mut inc = Increment::new(bg, ba);
         let Some((mut w, mut a)) = self.sample_at(t0) else {
-            inc.step(bg, ba, (t1 - t0).secs(), noise);
+            inc.step_between([bg, ba], [bg, ba], (t1 - t0).secs(), noise);
             return inc;
         };
         let mut t = t0;

@@ -39,7 +39,7 @@ struct Eliminated {
     columns: List<Columns, PARTS_MAX>,
     /// Its views determine the point; otherwise it does not move.
     determined: bool,
-    /// Before the step.
+    /// The point before the step.
     saved: Point,
 }
 

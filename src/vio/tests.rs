@@ -176,7 +176,7 @@ fn schur_step(estimator: &mut Estimator) -> (Vec<f64>, Vec<f64>) {
         };
         view_rows(l, window, model, &layout, &mut rows);
         // [point | all columns of the layout | r]
-        let mut raw = vec![vec![0.0; POINT_DIM + n + 1]; rows.rows.len()];
+        let mut raw = vec![vec![0.0; POINT_DIM + n + 1]; rows.rows.count()];
         for (i, wide) in raw.iter_mut().enumerate() {
             let row = rows.rows.row(i);
             wide[..POINT_DIM].copy_from_slice(&row[..POINT_DIM]);

@@ -10,7 +10,7 @@ use crate::frontend::{Track, Tracks};
 use crate::limits::{CAMERAS_MAX, FRAMES, LANDMARKS};
 use glam::DVec3;
 
-/// Nearer points than this are refused when triangulated, 1/m.
+/// Inverse distance above which points are refused when triangulated, 1/m.
 const RHO_MAX: f64 = 5.0;
 /// Bearing noise used to tell a far point from one behind the camera, rad.
 const BEARING_SIGMA: f64 = 2e-3;

@@ -30,7 +30,7 @@ pub struct Frame {
     pub keyframe: bool,
     /// Velocity and biases are still estimated.
     pub is_state: bool,
-    /// Where Jacobians are taken for good, once the prior is about this frame.
+    /// Point at which Jacobians are taken for good, once the prior is about this frame.
     pub linearization_point: Option<Motion>,
     /// Error since the linearization point, [p, θ, v, bg, ba].
     pub delta: [f64; 15],
@@ -44,7 +44,7 @@ pub struct Frame {
     pub rest_rate: Option<DVec3>,
     /// Landmarks it hosted when it became a keyframe.
     pub hosted: usize,
-    /// Pose at the estimate, and where Jacobians are taken.
+    /// Pose at the estimate, and at the point where Jacobians are taken.
     pub world_from_body: Transform,
     pub world_from_body_linearized: Transform,
 }
@@ -90,7 +90,7 @@ impl Frame {
         self.linearization_point.as_ref().unwrap_or(&self.now)
     }
 
-    /// From here on Jacobians are taken at the present estimate.
+    /// Makes the present estimate the point at which Jacobians are taken from now on.
     pub fn fix_linearization_point(&mut self) {
         if self.linearization_point.is_none() {
             (self.linearization_point, self.delta) = (Some(self.now), [0.0; 15]);
@@ -214,7 +214,7 @@ impl Window {
 }
 
 /// Columns of the frames and of the rig in a linear system.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Default)]
 pub struct Layout {
     pose: [Option<usize>; FRAMES],
     motion: [Option<usize>; FRAMES],
@@ -225,13 +225,9 @@ pub struct Layout {
 }
 
 impl Layout {
-    pub fn empty() -> Layout {
-        Layout { pose: [None; FRAMES], motion: [None; FRAMES], rig: Columns::default(), camera_dim: 0, dim: 0 }
-    }
-
     /// Columns of every variable of the window: the rig first, the newest state last.
     pub fn of(window: &Window) -> Layout {
-        let mut l = Layout::empty();
+        let mut l = Layout::default();
         l.add_rig(&window.rig);
         for slot in window.slots() {
             l.add_pose(slot);
