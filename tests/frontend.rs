@@ -135,7 +135,7 @@ fn a_slip_between_frames_is_caught_by_the_epipolar_gate() {
     see(&calibration, [0.0; 2], 2.0, 4.0, Arc::make_mut(&mut frames));
     let left = pairs(frontend.track(&frames, &Prediction::default())).len();
     assert!(matched >= 15 && left == 0, "{matched} -> {left}");
-    assert!(frontend.stats().epipolar_rejected as usize >= matched / 2, "{:?}", frontend.stats());
+    assert!(frontend.stats().tracks_epipolar_rejected as usize >= matched / 2, "{:?}", frontend.stats());
 }
 
 #[test]
@@ -162,7 +162,7 @@ fn more_corners_than_room_are_counted_and_never_stored() {
         assert!(tracks.cameras[0].len() > TRACKS * 3 / 4 && tracks.cameras[0].len() <= TRACKS);
         assert!(tracks.cameras[0].windows(2).all(|w| w[0].id < w[1].id));
     }
-    assert!(frontend.stats().full > 0);
+    assert!(frontend.stats().tracks_full > 0);
 }
 
 #[test]
@@ -321,10 +321,10 @@ fn a_camera_with_an_image_of_another_size_sees_nothing_that_frame() {
         see(&calibration, [0.0; 2], 2.0, 0.0, Arc::make_mut(&mut frames));
         let before = frontend.track(&frames, &Prediction::default()).clone();
         let good = std::mem::replace(&mut Arc::make_mut(&mut frames).images[1], wrong);
-        let lost = frontend.stats().lost;
+        let lost = frontend.stats().tracks_lost;
         let blind = frontend.track(&frames, &Prediction::default()).clone();
-        assert_eq!((frontend.stats().images_refused, blind.cameras[1].len()), (1, 0));
-        assert_eq!(frontend.stats().lost - lost, before.cameras[1].len() as u64);
+        assert_eq!((frontend.stats().frontend_images_refused, blind.cameras[1].len()), (1, 0));
+        assert_eq!(frontend.stats().tracks_lost - lost, before.cameras[1].len() as u64);
         // nothing moved, and the other camera did not notice
         let kept = blind.cameras[0].iter().filter(|a| before.cameras[0].iter().any(|b| a.id == b.id)).count();
         assert_eq!(kept, before.cameras[0].len());
@@ -349,7 +349,7 @@ fn missing_images_blind_their_cameras_and_spare_ones_are_ignored() {
         for camera in 0..2 {
             assert_eq!(tracks.cameras[camera].is_empty(), camera >= count, "camera {camera} of {count} images");
         }
-        assert_eq!(frontend.stats().images_refused, refused, "{count} images");
+        assert_eq!(frontend.stats().frontend_images_refused, refused, "{count} images");
     }
 }
 

@@ -237,7 +237,7 @@ fn tracker(frames: usize) {
             assert!(list.iter().all(inside), "frame {i}: {list:?}");
             assert!(list.windows(2).all(|w| w[0].id < w[1].id), "ids ascend");
         }
-        assert_eq!(frontend.stats().images_refused, refused, "frame {i}: every refused image is counted");
+        assert_eq!(frontend.stats().frontend_images_refused, refused, "frame {i}: every refused image is counted");
     }
 }
 

@@ -11,24 +11,12 @@ use stipple_drivers::Image;
 pub const BORDER: usize = 19;
 /// Widest cell a board file may ask for, px.
 const CELL_MAX: usize = 200;
+/// Neighbouring pixels of the ring that must differ, and the ring, from the top clockwise.
 const ARC: usize = 9;
+#[rustfmt::skip]
 const RING: [(isize, isize); 16] = [
-    (0, -3),
-    (1, -3),
-    (2, -2),
-    (3, -1),
-    (3, 0),
-    (3, 1),
-    (2, 2),
-    (1, 3),
-    (0, 3),
-    (-1, 3),
-    (-2, 2),
-    (-3, 1),
-    (-3, 0),
-    (-3, -1),
-    (-2, -2),
-    (-1, -3),
+    (0, -3), (1, -3), (2, -2), (3, -1), (3, 0), (3, 1), (2, 2), (1, 3),
+    (0, 3), (-1, 3), (-2, 2), (-3, 1), (-3, 0), (-3, -1), (-2, -2), (-1, -3),
 ];
 
 #[derive(Clone, Copy, Debug, PartialEq)]

@@ -11,17 +11,18 @@
 //! does, or where those that do are blind, so that what is seen twice is found once. The same id in another
 //! camera is the same point. Each view is followed in its own camera; a point lives while any camera sees
 //! it, and what one camera lost is looked for again from another in every frame. The patch of the last
-//! frame finds the point, the patch first seen (the anchor) places it: without an anchor each frame adds its
-//! own rounding to the
-//! drift. A prediction is refined over the fine levels alone, which is faster and slips less; where it fails
-//! the whole pyramid is searched. An image that is missing or not of its camera's size is refused: that
+//! frame finds the point, the patch first seen (the reference) places it: without a reference each frame adds its
+//! own rounding to the drift. A prediction is refined over the fine levels alone, which is faster and slips less;
+//! where it fails the whole pyramid is searched. An image that is missing or not of its camera's size is refused: that
 //! camera sees nothing in this frame. Same frames and predictions, same bits out.
 
-pub mod detect;
-pub mod patch;
+mod detect;
+mod geometry;
+mod patch;
 mod pattern;
-pub mod pyramid;
-mod rig;
+mod points;
+mod pyramid;
+mod search;
 mod tracks;
 
 pub use tracks::{Track, Tracks};
@@ -30,53 +31,49 @@ use crate::config::FrontendConfig;
 use crate::limits::{CAMERAS_MAX, PYRAMID_LEVELS, TRACKS};
 use crate::mem::Footprint;
 use detect::Detector;
-use patch::{align_stack, take_stack, Stack, Template, Warp, STEP_MIN};
-use pyramid::{Levels, Pyramid, Seen};
-use rig::Rig;
+use geometry::RigGeometry;
+use patch::{take_stack, Stack, Warp, STEP_MIN};
+use points::{distance, Patch, Point, Points, FINE_LEVELS};
+use pyramid::{FramePyramids, Pyramid};
+use search::{Limits, Search};
 use std::sync::Arc;
-use stipple_drivers::{Calibration, Fault, FaultKind, Frames, Nanos, Pose};
+use stipple_drivers::{counters, Calibration, Fault, FaultKind, Frames, Nanos, Pose};
 
 /// What is known of the motion before the images are looked at.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Prediction {
-    /// Motion of the body since the previous frame, from the IMU.
+    /// Motion of the body since the previous frame, from the inertial samples; `None` where it is not known.
     pub prev_from_now: Option<Pose>,
 }
 
-/// What happened to points since the start.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Stats {
-    pub frames: u64,
-    pub created: u64,
+counters! {
+    /// What happened to points since the start.
+    #[derive(Clone, Copy, PartialEq, Eq)]
+    pub struct Stats of u64, read by u64::clone;
+    tracks_created,
     /// Views that were not found again (of a point that may live on in another camera).
-    pub lost: u64,
+    tracks_lost,
     /// Views found from another camera.
-    pub matched: u64,
+    tracks_matched,
     /// Views dropped because their ray misses that of the first camera that sees the point.
-    pub epipolar_rejected: u64,
+    tracks_epipolar_rejected,
     /// Points dropped because an older one is near.
-    pub crowded: u64,
+    tracks_crowded,
     /// Corners and views that did not fit.
-    pub full: u64,
+    tracks_full,
     /// Images that were missing, not of their camera's size, or of a camera the rig has not.
-    pub images_refused: u64,
+    frontend_images_refused,
 }
 
-/// Levels a prediction is refined over, the full image included; the rest are for where it fails.
-const FINE_LEVELS: usize = 2;
-/// The way back only has to arrive: it is refined until a step is below this, px.
-const STEP_MIN_CHECK: f32 = 0.05;
-/// Views end this close to the border, px.
-const MARGIN_PX: f32 = 2.0;
 /// Share of a patch's contrast that may stay unexplained from one frame to the next, and between
 /// cameras, whose views differ more.
 const UNEXPLAINED_MAX: f32 = 0.4;
 const UNEXPLAINED_MATCH_MAX: f32 = 0.6;
-/// The anchor places a point while it leaves at most this many times what the last frame's patch
-/// leaves unexplained, and does not pull it further than this, px. (Measured: an anchor kept longer
+/// The reference places a point while it leaves at most this many times what the last frame's patch
+/// leaves unexplained, and does not pull it further than this, px. (Measured: a reference kept longer
 /// trades drift for the bias of a view that has changed, an affine one adds its own noise.)
-const ANCHOR_LEFT_MAX: f32 = 2.0;
-const ANCHOR_PULL_MAX_PX: f32 = 1.0;
+const REFERENCE_LEFT_MAX: f32 = 2.0;
+const REFERENCE_PULL_MAX_PX: f32 = 1.0;
 /// A corner is worth following when one grey level of noise moves it less than this, px.
 const SIGMA_MAX_PX: f32 = 0.2;
 /// Points keep this share of a cell from each other.
@@ -98,69 +95,29 @@ const SEARCH_WAIT_MAX: u64 = 16;
 /// A camera with fewer points than this gives none to the others: they look for their own.
 const GIVES_MIN: usize = 8;
 
-#[derive(Clone, Copy)]
-struct Point {
-    id: u64,
-    /// Along the ray of the first camera that sees it; kept while no second camera does.
-    inverse_depth: Option<f64>,
-    /// Frame of the next search along the epipolar curve in each camera, and the wait after it.
-    search_at: [u64; CAMERAS_MAX],
-    search_wait: [u64; CAMERAS_MAX],
-    views: [Option<[f32; 2]>; CAMERAS_MAX],
-    /// Of each view, in the camera's `patches`.
-    slots: [usize; CAMERAS_MAX],
-}
-
-impl Point {
-    fn first(&self) -> Option<usize> {
-        self.views.iter().position(Option::is_some)
-    }
-}
-
-/// What a view looked like: in the last frame at the fine levels, and at its anchor. Coarse levels
-/// are taken from the last frame's pyramid when they are needed.
-#[derive(Clone, Default)]
-struct Patch {
-    last: [Template; FINE_LEVELS],
-    anchor: Template,
-    /// Direction of the turn since the anchor.
-    turn: [f32; 2],
-}
-
-impl Patch {
-    fn restart(&mut self, stack: &Stack) {
-        self.last.copy_from_slice(&stack[..FINE_LEVELS]);
-        self.anchor = stack[0];
-        self.turn = [1.0, 0.0];
-    }
-}
-
+/// The tracker of one rig.
 pub struct Frontend {
-    rig: Rig,
-    iterations: usize,
-    recovered_max_px: f32,
+    rig: RigGeometry,
+    limits: Limits,
     spacing_px: f32,
-    now: Seen,
-    before: Seen,
+    now: FramePyramids,
+    before: FramePyramids,
     /// Cameras whose image was taken; the pyramids of the others are of an old one and are not looked at.
     seeing: [bool; CAMERAS_MAX],
     detectors: Vec<Detector>,
-    /// Ascending id.
-    points: Vec<Point>,
-    /// `patches[camera][slot]`
-    patches: Vec<Vec<Patch>>,
-    /// Free slots of each camera.
-    free: Vec<Vec<usize>>,
+    points: Points,
     /// Patch that is looked for, and where it was found.
     source: Stack,
     scratch: Stack,
     inverse_depths: Vec<f64>,
-    next_id: u64,
+    /// Frames so far.
+    frame: u64,
     tracks: Tracks,
     stats: Stats,
 }
 
 impl Frontend {
+    /// Fails where the rig has no camera, too many, or one too small.
     pub fn new(calibration: &Calibration, config: &FrontendConfig) -> Result<Frontend, Fault> {
         let n = calibration.cameras.len();
         let least = 4 * detect::BORDER;
@@ -169,28 +126,26 @@ impl Frontend {
             let what = format!("the tracker takes 1 to {CAMERAS_MAX} cameras of at least {least} px a side");
             return Err(Fault::new(FaultKind::Config, "calibration", what, "use a calibration of this rig"));
         }
-        let rig = Rig::new(calibration, config.epipolar_max);
+        let rig = RigGeometry::new(calibration, config.epipolar_max);
         Ok(Frontend {
             detectors: (0..n).map(|camera| detector(calibration, &rig, camera, config)).collect(),
             rig,
-            iterations: config.iterations as usize,
-            recovered_max_px: config.forward_backward_max_px as f32,
+            limits: Limits::new(config),
             spacing_px: SPACING * config.grid_px as f32,
-            now: Seen::nothing_yet(calibration),
-            before: Seen::nothing_yet(calibration),
+            now: FramePyramids::new(calibration),
+            before: FramePyramids::new(calibration),
             seeing: [false; CAMERAS_MAX],
-            points: Vec::with_capacity(n * TRACKS),
-            patches: (0..n).map(|_| vec![Patch::default(); TRACKS]).collect(),
-            free: (0..n).map(|_| (0..TRACKS).rev().collect()).collect(),
+            points: Points::new(n),
             source: Default::default(),
             scratch: Default::default(),
             inverse_depths: Vec::with_capacity(n * TRACKS),
-            next_id: 0,
+            frame: 0,
             tracks: Tracks::default(),
             stats: Stats::default(),
         })
     }
 
+    /// Host memory by part.
     pub fn footprint(calibration: &Calibration, config: &FrontendConfig) -> Footprint {
         let mut f = Footprint::default();
         let sizes = calibration.cameras.iter().map(|c| (c.camera.width, c.camera.height));
@@ -203,6 +158,7 @@ impl Frontend {
         f
     }
 
+    /// What happened to points since the start.
     pub fn stats(&self) -> &Stats {
         &self.stats
     }
@@ -212,7 +168,7 @@ impl Frontend {
     pub fn track(&mut self, frames: &Arc<Frames>, prediction: &Prediction) -> &Tracks {
         std::mem::swap(&mut self.now, &mut self.before);
         self.now.frames = frames.clone();
-        self.stats.frames += 1;
+        self.frame += 1;
         self.look();
         let median = self.median_inverse_depth();
         self.follow(prediction, median);
@@ -220,7 +176,7 @@ impl Frontend {
         self.find_missing(0, median);
         self.drop_unseen();
         for camera in 0..self.cameras() {
-            let first_new = self.points.len();
+            let first_new = self.points.list.len();
             if self.seeing[camera] {
                 self.detect(camera);
             }
@@ -234,8 +190,8 @@ impl Frontend {
 
     /// Takes the images that are of their camera's size; the cameras of the others lose all their views.
     fn look(&mut self) {
-        let Seen { frames, pyramids } = &mut self.now;
-        self.stats.images_refused += frames.images.len().saturating_sub(pyramids.len()) as u64;
+        let FramePyramids { frames, pyramids } = &mut self.now;
+        self.stats.frontend_images_refused += frames.images.len().saturating_sub(pyramids.len()) as u64;
         for (camera, pyramid) in pyramids.iter_mut().enumerate() {
             let image = frames.images.get(camera).filter(|image| pyramid.fits(image));
             self.seeing[camera] = image.is_some();
@@ -245,21 +201,20 @@ impl Frontend {
             if self.seeing[camera] {
                 continue;
             }
-            self.stats.images_refused += 1;
-            for i in 0..self.points.len() {
-                self.stats.lost += u64::from(self.points[i].views[camera].is_some());
-                self.lose(i, camera);
+            self.stats.frontend_images_refused += 1;
+            for i in 0..self.points.list.len() {
+                self.stats.tracks_lost += u64::from(self.points.lose(i, camera));
             }
         }
     }
 
     fn cameras(&self) -> usize {
-        self.patches.len()
+        self.detectors.len()
     }
 
     fn median_inverse_depth(&mut self) -> f64 {
         self.inverse_depths.clear();
-        self.inverse_depths.extend(self.points.iter().filter_map(|p| p.inverse_depth));
+        self.inverse_depths.extend(self.points.list.iter().filter_map(|p| p.inverse_depth));
         let middle = self.inverse_depths.len() / 2;
         if self.inverse_depths.is_empty() {
             return INVERSE_DEPTH_START;
@@ -267,88 +222,72 @@ impl Frontend {
         *self.inverse_depths.select_nth_unstable_by(middle, f64::total_cmp).1
     }
 
+    /// Finds every view of the last frame in this one.
     fn follow(&mut self, prediction: &Prediction, median: f64) {
         for camera in 0..self.cameras() {
             let motion = prediction.prev_from_now.map(|m| self.rig.motion(camera, &m));
-            for i in 0..self.points.len() {
-                let point = self.points[i];
+            for i in 0..self.points.list.len() {
+                let point = self.points.list[i];
                 let Some(px) = point.views[camera] else { continue };
                 let q = point.inverse_depth.unwrap_or(median);
                 let start = motion.and_then(|m| self.rig.transfer(camera, camera, &m, px, q));
-                let fine = FINE_LEVELS - 1;
-                let predicted = start.and_then(|s| self.follow_view(camera, point.slots[camera], px, s, fine));
+                let predicted = start.and_then(|s| self.follow_view(&point, camera, s, FINE_LEVELS - 1));
                 // A wrong prediction must not lose what a still camera would keep.
                 let view = predicted.or_else(|| {
-                    let coarse = PYRAMID_LEVELS - 1;
-                    self.follow_view(camera, point.slots[camera], px, start.unwrap_or(Warp::upright(px)), coarse)
+                    let start = start.unwrap_or(Warp::upright(px));
+                    self.follow_view(&point, camera, start, PYRAMID_LEVELS - 1)
                 });
                 match view {
-                    Some(_) => self.points[i].views[camera] = view,
-                    None => {
-                        self.lose(i, camera);
-                        self.stats.lost += 1;
-                    }
+                    Some(_) => self.points.list[i].views[camera] = view,
+                    None => self.stats.tracks_lost += u64::from(self.points.lose(i, camera)),
                 }
             }
         }
-        for i in 0..self.points.len() {
+        for i in 0..self.points.list.len() {
             self.gate(i);
         }
         self.thin();
     }
 
-    /// Ends a view and frees its patch.
-    fn lose(&mut self, i: usize, camera: usize) {
-        if self.points[i].views[camera].take().is_some() {
-            self.free[camera].push(self.points[i].slots[camera]);
-        }
-    }
-
-    /// Of points that came too near to each other the oldest stays: judged where the younger is seen first.
+    /// Drops points that came too near to an older one, judged where the younger is seen first.
     fn thin(&mut self) {
-        for i in 1..self.points.len() {
-            let Some(first) = self.points[i].first() else { continue };
-            let px = self.points[i].views[first].expect("it is seen there");
-            if is_near(&self.points[..i], first, px, self.spacing_px) {
-                (0..self.cameras()).for_each(|camera| self.lose(i, camera));
-                self.stats.crowded += 1;
+        for i in 1..self.points.list.len() {
+            let Some(first) = self.points.list[i].first() else { continue };
+            let px = self.points.list[i].views[first].expect("it is seen there");
+            if self.points.is_near(i, first, px, self.spacing_px) {
+                for camera in 0..self.cameras() {
+                    self.points.lose(i, camera);
+                }
+                self.stats.tracks_crowded += 1;
             }
         }
     }
 
-    /// One view from the last frame to this one, from level `coarsest` on.
-    fn follow_view(
-        &mut self,
-        camera: usize,
-        slot: usize,
-        px: [f32; 2],
-        start: Warp,
-        coarsest: usize,
-    ) -> Option<[f32; 2]> {
-        let search = Search { from: self.before.levels(camera), to: self.now.levels(camera), px, start, coarsest };
-        let patch = &mut self.patches[camera][slot];
+    /// Finds one view of the last frame in this one, from level `coarsest` on.
+    fn follow_view(&mut self, point: &Point, camera: usize, start: Warp, coarsest: usize) -> Option<[f32; 2]> {
+        let px = point.views[camera]?;
+        let (from, to) = (self.before.levels(camera), self.now.levels(camera));
+        let search = Search { from, to, px, start, coarsest, limits: self.limits };
+        let patch = &mut self.points.patches[camera][point.patches[camera]];
         let mut stack = &patch.last[..];
         if coarsest >= FINE_LEVELS {
             self.source[..FINE_LEVELS].copy_from_slice(stack);
             take_stack(&mut self.source, &search.from, px, FINE_LEVELS..coarsest + 1);
             stack = &self.source;
         }
-        let (found, left) = align_stack(stack, &search.to, start, coarsest, self.iterations, STEP_MIN)?;
-        if left > UNEXPLAINED_MAX {
+        let (found, left) = search.find(stack).filter(|(_, left)| *left <= UNEXPLAINED_MAX)?;
+        let mut referred = found;
+        referred.rotate(patch.rotation[0], patch.rotation[1]);
+        let reference_left = patch.reference.align(search.to[0], &mut referred, self.limits.iterations, STEP_MIN);
+        let holds = reference_left.is_some_and(|l| l < REFERENCE_LEFT_MAX * left)
+            && distance(referred.px(), found.px()) < REFERENCE_PULL_MAX_PX;
+        let placed = if holds { referred.px() } else { found.px() };
+        if !search.returns(&mut self.scratch, found, placed) {
             return None;
         }
-        let mut anchored = found;
-        anchored.turn(patch.turn[0], patch.turn[1]);
-        let anchor_left = patch.anchor.align(search.to[0], &mut anchored, self.iterations, STEP_MIN);
-        let held = anchor_left.is_some_and(|l| l < ANCHOR_LEFT_MAX * left)
-            && distance(anchored.px(), found.px()) < ANCHOR_PULL_MAX_PX;
-        let placed = if held { anchored.px() } else { found.px() };
-        if !search.returns(&mut self.scratch, found, placed, self.iterations, self.recovered_max_px) {
-            return None;
-        }
-        if held {
+        if holds {
             patch.last.copy_from_slice(&self.scratch[..FINE_LEVELS]);
-            patch.turn = [anchored.c, anchored.s];
+            patch.rotation = [referred.c, referred.s];
         } else {
             patch.restart(&self.scratch);
         }
@@ -357,8 +296,8 @@ impl Frontend {
 
     /// Drops views that disagree with the first and triangulates from those that agree.
     fn gate(&mut self, i: usize) {
-        let Point { views, .. } = self.points[i];
-        let Some(first) = self.points[i].first() else { return };
+        let Point { views, .. } = self.points.list[i];
+        let Some(first) = self.points.list[i].first() else { return };
         let Some(f) = views[first].and_then(|px| self.rig.bearing(first, px)) else { return };
         let (mut sum, mut weights) = (0.0, 0.0);
         for camera in first + 1..self.cameras() {
@@ -370,21 +309,21 @@ impl Frontend {
                     weights += weight;
                 }
                 None => {
-                    self.lose(i, camera);
-                    self.stats.epipolar_rejected += 1;
+                    self.points.lose(i, camera);
+                    self.stats.tracks_epipolar_rejected += 1;
                 }
             }
         }
         if weights > 0.0 {
-            self.points[i].inverse_depth = Some((sum / weights).max(0.0));
+            self.points.list[i].inverse_depth = Some((sum / weights).max(0.0));
         }
     }
 
     /// Looks for the missing views of points `first..` from a camera that has them.
     fn find_missing(&mut self, first: usize, median: f64) {
-        for i in first..self.points.len() {
-            let views = self.points[i].views;
-            let Some(from) = self.points[i].first() else { continue };
+        for i in first..self.points.list.len() {
+            let views = self.points.list[i].views;
+            let Some(from) = self.points.list[i].first() else { continue };
             for to in 0..self.cameras() {
                 if views[to].is_none() && self.seeing[to] {
                     self.find_view(i, from, to, median);
@@ -394,40 +333,37 @@ impl Frontend {
         }
     }
 
-    /// One view from another camera of the same instant.
+    /// Looks for one view from another camera of the same instant.
     fn find_view(&mut self, i: usize, from: usize, to: usize, median: f64) {
-        let Some(&slot) = self.free[to].last() else {
-            self.stats.full += 1;
-            return;
-        };
-        if let Some(px) = self.search_view(i, from, to, slot, median) {
-            self.free[to].pop();
-            (self.points[i].views[to], self.points[i].slots[to]) = (Some(px), slot);
-            self.stats.matched += 1;
+        if !self.points.has_room(to) {
+            self.stats.tracks_full += 1;
+        } else if let Some(px) = self.search_view(i, from, to, median) {
+            self.points.add_view(i, to, px, &self.scratch);
+            self.stats.tracks_matched += 1;
         }
     }
 
-    /// Where it is; its patch goes to `slot`.
-    fn search_view(&mut self, i: usize, from: usize, to: usize, slot: usize, median: f64) -> Option<[f32; 2]> {
-        let point = self.points[i];
+    /// Where that view is; what it looks like is left in `scratch`.
+    fn search_view(&mut self, i: usize, from: usize, to: usize, median: f64) -> Option<[f32; 2]> {
+        let point = self.points.list[i];
         let px = point.views[from]?;
-        let due = self.stats.frames >= point.search_at[to];
+        let due = self.frame >= point.search_at[to];
         if !due && point.inverse_depth.is_none() {
             return None;
         }
         let relative = self.rig.between(from, to);
         let q = point.inverse_depth.unwrap_or(median);
-        self.source[..FINE_LEVELS].copy_from_slice(&self.patches[from][point.slots[from]].last);
+        self.source[..FINE_LEVELS].copy_from_slice(&self.points.patches[from][point.patches[from]].last);
         take_stack(&mut self.source, &self.now.levels(from), px, FINE_LEVELS..PYRAMID_LEVELS);
         let guess = self.rig.transfer(from, to, &relative, px, q);
-        if let Some(found) = guess.and_then(|g| self.match_view(slot, from, to, px, g, PYRAMID_LEVELS - 1)) {
+        if let Some(found) = guess.and_then(|g| self.match_view((from, to), px, g, PYRAMID_LEVELS - 1)) {
             return Some(found);
         }
         if !due {
             return None;
         }
         let wait = (2 * point.search_wait[to]).clamp(1, SEARCH_WAIT_MAX);
-        (self.points[i].search_at[to], self.points[i].search_wait[to]) = (self.stats.frames + wait, wait);
+        (self.points.list[i].search_at[to], self.points.list[i].search_wait[to]) = (self.frame + wait, wait);
         let template = &self.source[SEARCH_LEVEL];
         if !template.usable() {
             return None;
@@ -446,77 +382,60 @@ impl Frontend {
             }
         }
         let tries = best.into_iter().filter(|b| b.0 < f32::MAX);
-        tries.map(|b| b.1).find_map(|warp| self.match_view(slot, from, to, px, warp, SEARCH_LEVEL))
+        tries.map(|b| b.1).find_map(|warp| self.match_view((from, to), px, warp, SEARCH_LEVEL))
     }
 
     /// Aligns the source patch of one camera in another, both ways, and accepts it only where rays meet.
     fn match_view(
         &mut self,
-        slot: usize,
-        from: usize,
-        to: usize,
+        (from, to): (usize, usize),
         px: [f32; 2],
         start: Warp,
         coarsest: usize,
     ) -> Option<[f32; 2]> {
-        let (warp, left) = align_stack(&self.source, &self.now.levels(to), start, coarsest, self.iterations, STEP_MIN)?;
+        let (levels_from, levels_to) = (self.now.levels(from), self.now.levels(to));
+        let search = Search { from: levels_from, to: levels_to, px, start, coarsest, limits: self.limits };
+        let (warp, left) = search.find(&self.source)?;
         let (f, g) = (self.rig.bearing(from, px)?, self.rig.bearing(to, warp.px())?);
-        if left > UNEXPLAINED_MATCH_MAX || self.rig.triangulate(from, to, f, g).is_none() {
-            return None;
-        }
-        let search = Search { from: self.now.levels(from), to: self.now.levels(to), px, start, coarsest };
-        if !search.returns(&mut self.scratch, warp, warp.px(), self.iterations, self.recovered_max_px) {
-            return None;
-        }
-        self.patches[to][slot].restart(&self.scratch);
-        Some(warp.px())
+        let meets = left <= UNEXPLAINED_MATCH_MAX && self.rig.triangulate(from, to, f, g).is_some();
+        (meets && search.returns(&mut self.scratch, warp, warp.px())).then_some(warp.px())
     }
 
     fn drop_unseen(&mut self) {
-        self.points.retain(|p| p.first().is_some());
+        self.points.list.retain(|p| p.first().is_some());
     }
 
-    /// New points of one camera. What an earlier camera sees too it has looked for already.
+    /// Creates points of one camera. What an earlier camera sees too it has looked for already.
     fn detect(&mut self, camera: usize) {
         let mut seen = [0; CAMERAS_MAX];
-        for p in &self.points {
+        for p in &self.points.list {
             (0..CAMERAS_MAX).for_each(|c| seen[c] += usize::from(p.views[c].is_some()));
         }
         let others = (0..camera).filter(|c| seen[*c] >= GIVES_MIN).fold(0, |bits, c| bits | 1 << c);
-        let points = self.points.iter().filter_map(|p| p.views[camera]);
-        let room = self.free[camera].len().min(self.points.capacity() - self.points.len());
+        let points = self.points.list.iter().filter_map(|p| p.views[camera]);
+        let room = self.points.room(camera);
         let (corners, excess) = self.detectors[camera].detect(self.now.levels(camera)[0], points, others, room);
-        self.stats.full += excess as u64;
+        self.stats.tracks_full += excess as u64;
         for corner in corners {
             let px = [corner.x as f32, corner.y as f32];
             take_stack(&mut self.scratch, &self.now.levels(camera), px, 0..FINE_LEVELS);
             let sharp = self.scratch[0].usable() && self.scratch[0].sigma_px() < SIGMA_MAX_PX;
             let known = self.rig.bearing(camera, px).is_some();
-            if !sharp || !known || is_near(&self.points, camera, px, self.spacing_px) {
+            let near = || self.points.is_near(self.points.list.len(), camera, px, self.spacing_px);
+            if !sharp || !known || near() {
                 continue;
             }
-            let slot = self.free[camera].pop().expect("no more corners than free slots");
-            self.patches[camera][slot].restart(&self.scratch);
-            let mut point = Point {
-                id: self.next_id,
-                inverse_depth: None,
-                search_at: [0; CAMERAS_MAX],
-                search_wait: [0; CAMERAS_MAX],
-                views: [None; CAMERAS_MAX],
-                slots: [0; CAMERAS_MAX],
-            };
-            (point.views[camera], point.slots[camera]) = (Some(px), slot);
-            self.points.push(point);
-            self.next_id += 1;
-            self.stats.created += 1;
+            self.points.create(camera, px, &self.scratch);
+            self.stats.tracks_created += 1;
         }
     }
 
+    /// Lists what each camera sees.
     fn publish(&mut self, t: Nanos) {
         self.tracks.t = t;
         for (camera, list) in self.tracks.cameras.iter_mut().enumerate() {
             list.clear();
-            for p in &self.points {
+            for p in &self.points.list {
                 if let Some(px) = p.views[camera] {
                     list.push(Track { id: p.id, px }).expect("a camera has TRACKS patches, one a view");
                 }
@@ -525,44 +444,8 @@ impl Frontend {
     }
 }
 
-/// A patch at `px` of one image looked for around `start` in another.
-struct Search<'a> {
-    from: Levels<'a>,
-    to: Levels<'a>,
-    px: [f32; 2],
-    start: Warp,
-    coarsest: usize,
-}
-
-impl Search<'_> {
-    /// Takes the patch where it was placed and aligns it back: it must arrive where it came from.
-    /// The way back starts as far off as the way there did, and at the coarsest level too.
-    fn returns(
-        &self,
-        stack: &mut Stack,
-        found: Warp,
-        placed: [f32; 2],
-        iterations: usize,
-        recovered_max_px: f32,
-    ) -> bool {
-        let image = self.to[0];
-        let [right, bottom] = [image.width, image.height].map(|n| (n - 1) as f32 - MARGIN_PX);
-        if !(placed[0] >= MARGIN_PX && placed[1] >= MARGIN_PX && placed[0] <= right && placed[1] <= bottom) {
-            return false;
-        }
-        take_stack(stack, &self.to, placed, 0..FINE_LEVELS.max(self.coarsest + 1));
-        // What the anchor moved here, it moves there.
-        let (dx, dy) = (placed[0] - found.x, placed[1] - found.y);
-        let origin = [self.px[0] + found.c * dx + found.s * dy, self.px[1] + found.c * dy - found.s * dx];
-        let (x, y) = (found.x + origin[0] - self.start.x, found.y + origin[1] - self.start.y);
-        let back = Warp { x, y, c: found.c, s: -found.s };
-        align_stack(&stack[..], &self.from, back, self.coarsest, iterations, STEP_MIN_CHECK)
-            .is_some_and(|(recovered, _)| distance(recovered.px(), origin) <= recovered_max_px)
-    }
-}
-
 /// The grid of a camera, knowing which cells earlier cameras see at the distance guessed before any is known.
-fn detector(calibration: &Calibration, rig: &Rig, camera: usize, config: &FrontendConfig) -> Detector {
+fn detector(calibration: &Calibration, rig: &RigGeometry, camera: usize, config: &FrontendConfig) -> Detector {
     let of = &calibration.cameras[camera].camera;
     let mut detector = Detector::new(of.width, of.height, config);
     let sees = |px, other| rig.transfer(camera, other, &rig.between(camera, other), px, INVERSE_DEPTH_START).is_some();
@@ -570,10 +453,11 @@ fn detector(calibration: &Calibration, rig: &Rig, camera: usize, config: &Fronte
     detector
 }
 
-fn is_near(points: &[Point], camera: usize, px: [f32; 2], spacing_px: f32) -> bool {
-    points.iter().any(|p| p.views[camera].is_some_and(|q| distance(px, q) < spacing_px))
-}
-
-fn distance(a: [f32; 2], b: [f32; 2]) -> f32 {
-    (a[0] - b[0]).hypot(a[1] - b[1])
+/// The insides, for benches that time them.
+#[cfg(feature = "instruments")]
+#[doc(hidden)]
+pub mod instruments {
+    pub use super::detect::Detector;
+    pub use super::patch::{align_stack, take_stack, Stack, Warp, STEP_MIN};
+    pub use super::pyramid::Pyramid;
 }

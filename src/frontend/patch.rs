@@ -1,6 +1,6 @@
 //! Patch alignment: inverse-compositional SE(2) on mean-normalised patches, coarse to fine.
 //!
-//! A template is taken once, upright, at a point of one image; alignment moves and turns it over
+//! A template is taken once, upright, at a point of one image; alignment moves and rotates it over
 //! another image until the two agree (Baker and Matthews, IJCV 2004). Dividing a patch by its mean
 //! makes the residual blind to exposure and gain.
 //!
@@ -30,7 +30,7 @@ const STEP_MIN_COARSE: f32 = 0.1;
 /// A step this long has left the basin, px.
 const STEP_MAX: f32 = 10.0;
 
-/// Where the patch is and how it is turned: (x, y) + [c -s; s c] o.
+/// Place and rotation of a patch: (x, y) + [c -s; s c] o.
 #[derive(Clone, Copy, Debug, PartialEq, Default)]
 pub struct Warp {
     pub x: f32,
@@ -48,7 +48,7 @@ impl Warp {
         [self.x, self.y]
     }
 
-    /// The same place and turn on a coarser level.
+    /// The warp on a coarser level.
     pub fn at_level(&self, level: usize) -> Warp {
         let k = 1.0 / (1 << level) as f32;
         Warp { x: self.x * k, y: self.y * k, ..*self }
@@ -63,11 +63,11 @@ impl Warp {
     fn step(&mut self, inc: [f32; 3]) {
         self.x += self.c * inc[0] - self.s * inc[1];
         self.y += self.s * inc[0] + self.c * inc[1];
-        self.turn(1.0, inc[2]);
+        self.rotate(1.0, inc[2]);
     }
 
-    /// Turns further by the direction (c, s), which need not be of unit length.
-    pub fn turn(&mut self, c: f32, s: f32) {
+    /// Rotates further by the direction (c, s), which need not be of unit length.
+    pub fn rotate(&mut self, c: f32, s: f32) {
         let (tc, ts) = (self.c * c - self.s * s, self.s * c + self.c * s);
         let n = 1.0 / (tc * tc + ts * ts).sqrt();
         (self.c, self.s) = (tc * n, ts * n);
@@ -275,13 +275,7 @@ fn dot(a: &[f32; N], b: &[f32; N]) -> f32 {
 }
 
 fn sum(a: &[f32; N]) -> f32 {
-    let mut s = [0f32; 4];
-    for a in a.chunks_exact(4) {
-        for i in 0..4 {
-            s[i] += a[i];
-        }
-    }
-    (s[0] + s[1]) + (s[2] + s[3])
+    dot(a, &[1.0; N])
 }
 
 /// (JᵀJ)⁻¹ of three columns, by cofactors in f64; `None` when nearly singular.
@@ -320,7 +314,7 @@ struct Block {
 }
 
 const BLOCK: usize = 16;
-/// From a sample to the end of the block, px: a sample's neighbour, and a pixel for rounding.
+/// Least distance of a sample from the end of the block, px: its neighbour, and a pixel for rounding.
 const REACH: f32 = RADIUS + 1.0;
 /// 2^23: adding it to a float leaves no bits for a fraction.
 const ROUND: f32 = 8388608.0;
@@ -412,7 +406,7 @@ mod tests {
         120.0 + 16.0 * fine + 20.0 * coarse
     }
 
-    /// The image in which the patch at (60, 50) appears at `place`, turned by `angle`, `gain` times as bright.
+    /// The image in which the patch at (60, 50) appears at `place`, rotated by `angle`, `gain` times as bright.
     fn moved(place: [f64; 2], angle: f64, gain: f64) -> (Image, Pyramid) {
         let mut image = Image::new(128, 104);
         let (s, c) = angle.sin_cos();
@@ -440,14 +434,14 @@ mod tests {
     }
 
     #[test]
-    fn sub_pixel_shifts_and_turns_are_recovered() {
+    fn sub_pixel_translations_and_rotations_are_recovered() {
         for (dx, dy, angle) in
             [(0.0, 0.0, 0.0), (0.37, -0.81, 0.0), (5.3, 3.6, 0.05), (-9.2, 6.1, -0.1), (2.5, 2.5, 0.2)]
         {
             let (warp, left) = follow([60.0 + dx, 50.0 + dy], angle, 1.0);
             let error = (warp.x as f64 - 60.0 - dx).hypot(warp.y as f64 - 50.0 - dy);
-            let turn = (warp.s as f64).atan2(warp.c as f64) - angle;
-            assert!(error < 0.05 && turn.abs() < 0.01, "({dx}, {dy}, {angle}): {error} px, {turn} rad");
+            let rotation = (warp.s as f64).atan2(warp.c as f64) - angle;
+            assert!(error < 0.05 && rotation.abs() < 0.01, "({dx}, {dy}, {angle}): {error} px, {rotation} rad");
             assert!(left < 0.01, "{left}");
         }
     }

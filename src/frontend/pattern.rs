@@ -11,7 +11,7 @@ pub(super) const SIDE: usize = 8;
 pub(super) const GRID: usize = SIDE + 2;
 /// Pixels around a template: the grid, and one more for the bilinear neighbours.
 pub(super) type Pixels = [[i16; GRID + 1]; GRID + 1];
-/// Of an interpolated gradient: 255·64 fits 16 bits.
+/// Steps of an interpolated gradient in one grey: 255·64 fits 16 bits.
 pub(super) const FRACTION: f32 = 64.0;
 /// Grid index of each offset; the offset is `index - GRID/2 + 1/2`.
 pub(super) const PATTERN: [[usize; 2]; N] = pattern();

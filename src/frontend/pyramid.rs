@@ -10,6 +10,7 @@ use crate::limits::PYRAMID_LEVELS;
 use std::sync::Arc;
 use stipple_drivers::{Calibration, Frames, Image, RigCamera};
 
+/// The levels above one image.
 pub struct Pyramid {
     /// Width and height of the image.
     size: (usize, usize),
@@ -58,25 +59,26 @@ impl Pyramid {
         }
     }
 
-    /// With the image it was built from.
+    /// All levels, with the image it was built from.
     pub fn over<'a>(&'a self, image: &'a Image) -> Levels<'a> {
         std::array::from_fn(|l| if l == 0 { image } else { &self.above[l - 1] })
     }
 }
 
-/// A frame and what was made of it: the images are shared, not copied.
-pub struct Seen {
+/// A frame and the pyramids of its images, which are shared, not copied.
+pub struct FramePyramids {
     pub frames: Arc<Frames>,
     pub pyramids: Vec<Pyramid>,
 }
 
-impl Seen {
-    pub fn nothing_yet(calibration: &Calibration) -> Seen {
+impl FramePyramids {
+    /// Room for the frames of a rig.
+    pub fn new(calibration: &Calibration) -> FramePyramids {
         let pyramid = |c: &RigCamera| Pyramid::new(c.camera.width, c.camera.height);
-        Seen { frames: Arc::default(), pyramids: calibration.cameras.iter().map(pyramid).collect() }
+        FramePyramids { frames: Arc::default(), pyramids: calibration.cameras.iter().map(pyramid).collect() }
     }
 
-    /// Of a camera that saw something.
+    /// Levels of a camera whose image was taken.
     pub fn levels(&self, camera: usize) -> Levels<'_> {
         self.pyramids[camera].over(&self.frames.images[camera])
     }

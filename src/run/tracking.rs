@@ -269,20 +269,10 @@ impl Tracker {
 
     pub fn counters(&self) -> Vec<(&'static str, u64)> {
         let Some(run) = self.odometry() else { return vec![] };
-        let f = run.front.frontend.stats();
+        let mut list = run.front.frontend.stats().list();
         // The first frames of a run that starts in motion, and those after a reset.
         let without = run.back.frame_ms.len().saturating_sub(run.back.trajectory.len());
-        let mut list = vec![
-            ("tracks_created", f.created),
-            ("tracks_lost", f.lost),
-            ("tracks_matched", f.matched),
-            ("tracks_epipolar_rejected", f.epipolar_rejected),
-            ("tracks_crowded", f.crowded),
-            ("tracks_full", f.full),
-            // `images_wrong_size` is the reader's.
-            ("frontend_images_refused", f.images_refused),
-            ("frames_without_odometry", without as u64),
-        ];
+        list.push(("frames_without_odometry", without as u64));
         list.extend(run.back.vio.stats().list());
         list
     }

@@ -129,7 +129,7 @@ pub struct Vio {
 impl Vio {
     pub fn new(calibration: &Calibration, config: &VioConfig) -> Vio {
         Vio {
-            imu: ImuRing::new(),
+            imu: ImuRing::empty(),
             initializer: Initializer::new(),
             estimator: Estimator::new(calibration, config),
             monitor: Monitor::default(),

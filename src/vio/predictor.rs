@@ -25,7 +25,7 @@ pub struct Predictor {
 
 impl Predictor {
     pub fn new(calibration: &Calibration, config: &VioConfig) -> Predictor {
-        Predictor { noise: Noise::new(&calibration.imu, config), imu: ImuRing::new(), last: None }
+        Predictor { noise: Noise::new(&calibration.imu, config), imu: ImuRing::empty(), last: None }
     }
 
     /// Takes a sample; refuses what the estimator refuses.

@@ -247,7 +247,7 @@ mod tests {
     }
 
     fn ring(rate: f64, t1: f64) -> ImuRing {
-        let mut ring = ImuRing::new();
+        let mut ring = ImuRing::empty();
         for i in 0..=(t1 * rate) as usize + 1 {
             let t = i as f64 / rate;
             let (gyro_body, accel_body) = world::rate_and_force(|t| PATH.pose(t), t);
@@ -420,7 +420,7 @@ mod tests {
     #[test]
     fn gap_widens_the_covariance() {
         let full = ring(200.0, 0.3);
-        let mut holed = ImuRing::new();
+        let mut holed = ImuRing::empty();
         full.iter().filter(|s| s.t < at(0.1) || s.t > at(0.2)).for_each(|s| {
             holed.push(*s);
         });

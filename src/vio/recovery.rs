@@ -295,7 +295,7 @@ mod tests {
     #[test]
     fn transition_matches_differences_of_the_propagation() {
         let mut world = World::new(Path { rest: -1.0 });
-        let mut ring = ImuRing::new();
+        let mut ring = ImuRing::empty();
         for i in 0..100 {
             ring.push(world.imu(i as f64 / RATE_HZ));
         }

@@ -41,7 +41,7 @@ pub struct ImuRing {
 }
 
 impl ImuRing {
-    pub fn new() -> ImuRing {
+    pub fn empty() -> ImuRing {
         let samples = VecDeque::with_capacity(IMU_BETWEEN_FRAMES);
         ImuRing { samples, leap: Leap::default(), spikes: Spikes::default() }
     }
@@ -162,7 +162,7 @@ mod tests {
 
     #[test]
     fn ring_keeps_the_newest_and_gives_back_what_it_overwrote() {
-        let mut ring = ImuRing::new();
+        let mut ring = ImuRing::empty();
         let sample = |i: usize| ImuSample { t: Nanos(i as i64), ..ImuSample::default() };
         for i in 0..IMU_BETWEEN_FRAMES {
             assert!(ring.push(sample(i)).is_none());

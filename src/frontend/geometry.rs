@@ -4,14 +4,15 @@ use super::patch::Warp;
 use glam::{DVec2, DVec3};
 use stipple_drivers::{Calibration, Camera, Pose};
 
-/// Half the width of the patch: the lever that shows how it turns, px.
+/// Half the width of the patch: the lever that shows its rotation, px.
 const LEVER_PX: f32 = 4.0;
 /// A negative inverse depth of this many pixels of disparity is a far point and noise, px.
 const DISPARITY_SLACK_PX: f64 = 2.0;
-/// Nearer than this there is no point to follow, m.
+/// Least distance of a point, m.
 const DEPTH_MIN: f64 = 0.1;
 
-pub struct Rig {
+/// The cameras of a rig and where they sit.
+pub struct RigGeometry {
     cameras: Vec<Camera>,
     body_from_cam: Vec<Pose>,
     /// `between[to * cameras + from]` is `to_from_from`.
@@ -19,9 +20,9 @@ pub struct Rig {
     epipolar_max: f64,
 }
 
-impl Rig {
-    pub fn new(calibration: &Calibration, epipolar_max: f64) -> Rig {
-        Rig {
+impl RigGeometry {
+    pub fn new(calibration: &Calibration, epipolar_max: f64) -> RigGeometry {
+        RigGeometry {
             cameras: calibration.cameras.iter().map(|c| c.camera).collect(),
             between: calibration
                 .cameras
@@ -33,6 +34,7 @@ impl Rig {
         }
     }
 
+    /// Unit ray of a pixel; `None` outside the camera model.
     pub fn bearing(&self, camera: usize, px: [f32; 2]) -> Option<DVec3> {
         self.cameras[camera].unproject(DVec2::new(px[0] as f64, px[1] as f64))
     }
@@ -48,7 +50,7 @@ impl Rig {
         self.between[to * self.cameras.len() + from]
     }
 
-    /// Where a patch at an inverse distance (1/m) appears in camera `to`, and how it is turned.
+    /// Place and rotation in camera `to` of a patch at an inverse distance, 1/m; `None` where it is not seen.
     pub fn transfer(
         &self,
         from: usize,
@@ -65,7 +67,7 @@ impl Rig {
         let centre = send(px)?;
         let mut warp = Warp::upright(centre);
         if let Some(side) = send([px[0] + LEVER_PX, px[1]]) {
-            warp.turn(side[0] - centre[0], side[1] - centre[1]);
+            warp.rotate(side[0] - centre[0], side[1] - centre[1]);
         }
         Some(warp)
     }
@@ -94,11 +96,11 @@ mod tests {
     use glam::DQuat;
     use stipple_drivers::{ImuCalibration, ImuCorrection, Lens, RigCamera};
 
-    fn rig() -> Rig {
+    fn rig() -> RigGeometry {
         let lens = Lens::KannalaBrandt { k: [0.01, -0.01, 0.006, -0.0017] };
         let camera = Camera { width: 640, height: 480, fx: 300.0, fy: 300.0, cx: 320.0, cy: 240.0, lens };
-        let turned = Pose::new(DQuat::from_euler(glam::EulerRot::XYZ, 0.02, -0.05, 0.2), DVec3::new(0.1, 0.01, 0.0));
-        let cameras = [Pose::IDENTITY, turned].map(|body_from_cam| RigCamera::new(camera, body_from_cam)).to_vec();
+        let rolled = Pose::new(DQuat::from_euler(glam::EulerRot::XYZ, 0.02, -0.05, 0.2), DVec3::new(0.1, 0.01, 0.0));
+        let cameras = [Pose::IDENTITY, rolled].map(|body_from_cam| RigCamera::new(camera, body_from_cam)).to_vec();
         let imu = ImuCalibration {
             rate_hz: 200.0,
             gyro_noise: 1e-3,
@@ -107,7 +109,7 @@ mod tests {
             accel_walk: 1e-4,
             correction: ImuCorrection::NONE,
         };
-        Rig::new(&Calibration { cameras, imu }, 0.005)
+        RigGeometry::new(&Calibration { cameras, imu }, 0.005)
     }
 
     #[test]
@@ -118,7 +120,7 @@ mod tests {
             let warp = rig.transfer(0, 1, &rig.between(0, 1), px, q).unwrap();
             let (f, g) = (rig.bearing(0, px).unwrap(), rig.bearing(1, warp.px()).unwrap());
             assert!((rig.triangulate(0, 1, f, g).unwrap().0 - q).abs() < 1e-3);
-            // the second camera is rolled by 0.2 rad, so the patch turns the other way
+            // the second camera is rolled by 0.2 rad, so the patch rotates the other way
             assert!((warp.s.atan2(warp.c) + 0.2).abs() < 0.05);
         }
     }
