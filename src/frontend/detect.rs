@@ -19,6 +19,7 @@ const RING: [(isize, isize); 16] = [
     (0, 3), (-1, 3), (-2, 2), (-3, 1), (-3, 0), (-3, -1), (-2, -2), (-1, -3),
 ];
 
+/// A corner at an integer pixel, and the largest threshold at which it is one.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Corner {
     pub x: usize,
@@ -55,6 +56,7 @@ impl Detector {
         }
     }
 
+    /// Bytes of its lists.
     pub fn bytes(width: usize, height: usize, config: &FrontendConfig) -> usize {
         let cell = (config.grid_px as usize).min(CELL_MAX);
         (width / cell) * (height / cell) * (size_of::<bool>() + size_of::<u8>() + size_of::<Corner>())

@@ -70,8 +70,8 @@ counters! {
 const UNEXPLAINED_MAX: f32 = 0.4;
 const UNEXPLAINED_MATCH_MAX: f32 = 0.6;
 /// The reference places a point while it leaves at most this many times what the last frame's patch
-/// leaves unexplained, and does not pull it further than this, px. (Measured: a reference kept longer
-/// trades drift for the bias of a view that has changed, an affine one adds its own noise.)
+/// leaves unexplained, and does not pull it further than this, px. Kept longer it would trade
+/// drift for the bias of a view that has changed.
 const REFERENCE_LEFT_MAX: f32 = 2.0;
 const REFERENCE_PULL_MAX_PX: f32 = 1.0;
 /// A corner is worth following when one grey level of noise moves it less than this, px.

@@ -40,10 +40,12 @@ pub struct Warp {
 }
 
 impl Warp {
+    /// At a pixel, not rotated.
     pub fn upright(px: [f32; 2]) -> Warp {
         Warp { x: px[0], y: px[1], c: 1.0, s: 0.0 }
     }
 
+    /// Its place.
     pub fn px(&self) -> [f32; 2] {
         [self.x, self.y]
     }
@@ -96,6 +98,7 @@ impl Default for Template {
 }
 
 impl Template {
+    /// Whether there was enough contrast to align to.
     pub fn usable(&self) -> bool {
         self.inside != 0
     }

@@ -48,6 +48,7 @@ impl Patch {
     }
 }
 
+/// All points, their patches, and the room that is left.
 pub struct Points {
     /// Ascending id.
     pub list: Vec<Point>,

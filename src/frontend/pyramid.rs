@@ -39,6 +39,7 @@ impl Pyramid {
         Pyramid { size: (width, height), above, columns: vec![0; width + 5] }
     }
 
+    /// Bytes of the levels above the image.
     pub fn bytes(width: usize, height: usize) -> usize {
         let (w, h) = (sizes(width), sizes(height));
         (1..PYRAMID_LEVELS).map(|l| w[l] * h[l]).sum::<usize>() + 2 * (width + 5)

@@ -14,6 +14,7 @@ pub struct Track {
 }
 
 impl Track {
+    /// The pixel in double precision.
     pub fn px(&self) -> DVec2 {
         DVec2::new(self.px[0] as f64, self.px[1] as f64)
     }

@@ -10,6 +10,7 @@ use super::wide::Wide;
 /// A pivot that elimination brought under so many epsilons of its diagonal is rounding noise.
 const PIVOT_EPSILONS: f64 = 100.0;
 
+/// H and b of `½ xᵀ H x + bᵀ x`.
 #[derive(Clone, Debug)]
 pub struct System {
     h: Vec<f64>,
@@ -40,6 +41,7 @@ impl System {
         }
     }
 
+    /// Bytes that `new` takes.
     pub const fn bytes(capacity: usize) -> usize {
         (capacity * capacity + 3 * capacity) * size_of::<f64>()
     }

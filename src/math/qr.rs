@@ -51,6 +51,7 @@ impl Rows {
         }
     }
 
+    /// Bytes that `new` takes.
     pub const fn bytes(rows_max: usize, cols_max: usize) -> usize {
         ((rows_max + 2) * padded(cols_max) + rows_max) * size_of::<f64>()
     }
@@ -66,6 +67,7 @@ impl Rows {
         self.rows
     }
 
+    /// Columns there are, b included.
     pub fn cols(&self) -> usize {
         self.cols
     }

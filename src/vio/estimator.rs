@@ -56,6 +56,7 @@ pub struct Step {
     pub evidence: Option<Evidence>,
 }
 
+/// The window and what works on it.
 #[derive(Clone, Debug)]
 pub struct Estimator {
     pub model: Model,

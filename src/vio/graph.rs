@@ -7,6 +7,7 @@ use super::prior::Prior;
 use super::rig::RigState;
 use super::window::Window;
 
+/// Variables of the window and the prior on them.
 #[derive(Clone, Debug)]
 pub struct Graph {
     pub window: Window,

@@ -18,10 +18,13 @@ impl Health {
     pub const INITIALISING: Health = Health(1);
     /// No camera tracked anything.
     pub const NO_TRACKS: Health = Health(1 << 1);
+    /// Fewer landmarks are in view than declare a keyframe at once.
     pub const FEW_LANDMARKS: Health = Health(1 << 2);
     /// Inertial samples are missing since the last frame.
     pub const IMU_GAP: Health = Health(1 << 3);
+    /// A sample since the last frame was at the end of the sensor's range.
     pub const IMU_SATURATED: Health = Health(1 << 4);
+    /// A sample since the last frame was refused or repaired.
     pub const IMU_REJECTED: Health = Health(1 << 5);
     /// A step of the solver was not finite.
     pub const SOLVER_FAILED: Health = Health(1 << 6);
@@ -46,6 +49,7 @@ impl Health {
     /// Reset at this frame: the state was not finite or beyond what flies.
     pub const STATE_RESET: Health = Health(1 << 16);
 
+    /// Name of each bit, as in the report, the lowest first.
     pub const NAMES: [&str; 17] = [
         "initialising",
         "no_tracks",
@@ -68,17 +72,14 @@ impl Health {
     /// Bits of a normal flight.
     pub const NORMAL: Health = Health(Health::INITIALISING.0 | Health::ZERO_VELOCITY.0);
 
+    /// Sets bits when a condition holds; clears none.
     pub fn set(&mut self, bits: Health, when: bool) {
         self.0 |= if when { bits.0 } else { 0 };
     }
 
+    /// Whether all of these bits are set.
     pub fn has(self, bits: Health) -> bool {
         self.0 & bits.0 == bits.0
-    }
-
-    /// Some of the bits.
-    pub fn any(self, bits: Health) -> bool {
-        self.0 & bits.0 != 0
     }
 
     /// Names of the reasons.
@@ -92,11 +93,9 @@ const LANDMARKS_ENOUGH: f64 = 40.0;
 const SIGMA_V_HALF: f64 = 0.05;
 
 /// 0 to 100: `100 min(1, landmarks / 40) / (1 + σ_v / 0.05 m/s)`, with σ_v² the trace of the velocity's
-/// covariance. The velocity's and not the position's, because odometry's position error only ever grows;
-/// σ_v is by how much it may grow each second: 5 mm at 91, 5 cm at 50, half a metre at 9. Zero without a
-/// covariance. Measured by `stipple-bench consistency` over flights gone wrong, the mean error of the velocity
-/// is 1.2 m/s up to 10, 0.16 m/s up to 20, 0.03 m/s up to 65 and 0.01 m/s above: what is claimed, or a third of
-/// it. A fault that has not shown yet is in no quality.
+/// covariance; zero without a covariance. The velocity's and not the position's, because odometry's position error only
+/// ever grows; σ_v is by how much it may grow each second: 5 mm at 91, 5 cm at 50, half a metre at 9. A fault that has
+/// not shown yet is in no quality.
 pub fn quality(covariance: Option<&Covariance>, landmarks: usize) -> u8 {
     let Some(c) = covariance else { return 0 };
     let seen = (landmarks as f64 / LANDMARKS_ENOUGH).min(1.0);

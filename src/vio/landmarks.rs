@@ -15,6 +15,7 @@ pub struct Observation {
 }
 
 impl Observation {
+    /// In double precision.
     pub fn px(&self) -> DVec2 {
         DVec2::new(self.px[0] as f64, self.px[1] as f64)
     }
@@ -43,6 +44,7 @@ impl Landmark {
     }
 }
 
+/// The points, and an index by id.
 #[derive(Clone, Debug)]
 pub struct Landmarks {
     pub pool: Vec<Landmark>,
@@ -57,6 +59,7 @@ impl Landmarks {
 
     pub const BYTES: usize = LANDMARKS * (size_of::<Landmark>() + size_of::<(u64, u16)>());
 
+    /// Forgets all points.
     pub fn clear(&mut self) {
         self.pool.clear();
         self.index.clear();

@@ -6,6 +6,7 @@ use crate::config::VioConfig;
 use crate::limits::CAMERAS_MAX;
 use stipple_drivers::Calibration;
 
+/// Constants of one rig and its settings.
 #[derive(Clone, Debug)]
 pub struct Model {
     pub cameras: Vec<CameraModel>,

@@ -121,6 +121,7 @@ impl Increment {
         }
     }
 
+    /// Derivatives of p, q (on the right) and v to the biases, per rad/s and per m/s².
     pub fn d_p_bg(&self) -> DMat3 {
         block(&self.d_bg, 0, 0)
     }

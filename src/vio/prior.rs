@@ -21,6 +21,7 @@ pub enum Block {
     Rig,
 }
 
+/// Blocks in the order of their columns.
 pub type Blocks = List<Block, { 2 * FRAMES }>;
 
 impl Block {
@@ -72,6 +73,7 @@ impl Prior {
     pub const BYTES: usize =
         Rows::bytes(WINDOW_DIM + 1, WINDOW_DIM + 1) + Rows::gram_len(WINDOW_DIM + 1) * size_of::<f64>();
 
+    /// Knows nothing any more.
     pub fn clear(&mut self) {
         self.blocks.clear();
         self.rows.clear(1);

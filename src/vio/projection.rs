@@ -56,6 +56,7 @@ pub struct Host {
 }
 
 impl Host {
+    /// Host of all views of a landmark.
     pub fn of(l: &Landmark, window: &Window) -> Host {
         let (rig, slot) = (&window.rig, l.host as usize);
         let camera = &rig.cameras_linearized()[l.host_camera as usize];

@@ -57,6 +57,7 @@ impl Point {
         Point { s: bearing.truncate() / (1.0 + bearing.z), rho }
     }
 
+    /// Unit ray to the point, in its host's camera.
     pub fn bearing(&self) -> DVec3 {
         let n = self.s.length_squared();
         (2.0 * self.s).extend(1.0 - n) / (1.0 + n)

@@ -41,6 +41,7 @@ impl Parts {
         }
     }
 
+    /// Whether anything is estimated.
     pub fn any(self) -> bool {
         self.time_offset || self.extrinsics || self.imu_scale
     }
@@ -268,6 +269,7 @@ impl RigState {
         self.saved = (self.now, self.delta);
     }
 
+    /// Takes back the estimate as `save` kept it.
     pub fn restore(&mut self) {
         (self.now, self.delta) = self.saved;
         self.refresh();

@@ -41,6 +41,7 @@ pub struct ImuRing {
 }
 
 impl ImuRing {
+    /// A ring without samples.
     pub fn empty() -> ImuRing {
         let samples = VecDeque::with_capacity(IMU_BETWEEN_FRAMES);
         ImuRing { samples, leap: Leap::default(), spikes: Spikes::default() }
@@ -72,6 +73,7 @@ impl ImuRing {
         repaired.is_some()
     }
 
+    /// The newest sample.
     pub fn newest(&self) -> Option<&ImuSample> {
         self.samples.back()
     }

@@ -16,18 +16,19 @@ use crate::math::dense::{Columns, System};
 use crate::mem::List;
 use glam::DVec2;
 
+/// Damping, as a share of the diagonal: at the start, at least, at most.
 pub const LAMBDA_START: f64 = 1e-4;
 const LAMBDA_MIN: f64 = 1e-6;
 const LAMBDA_MAX: f64 = 1e2;
 /// Done when a step changes no error by this (m, rad, m/s ...), or the cost, in variances, by this: a
-/// thousandth of a window's. Below 1e-3 MH_01 and the test room end the same at twice the iterations; four times
-/// as much saves MH_01 a quarter of them and takes a single camera from 0.012 to 0.026 m.
+/// thousandth of a window's.
 const STEP_SETTLED: f64 = 1e-4;
 const COST_SETTLED: f64 = 0.5;
 /// A rejected step that promised less than this is rounding.
 const COST_NUMERIC: f64 = 1e-3;
 /// Added to the diagonal whatever lambda is, so that unobserved directions stay put.
 const DAMPING_MIN: f64 = 1e-6;
+
 /// A landmark as QR left it: the three rows that hold its point, `R d + W dx + g = 0`, give its step d.
 #[derive(Clone, Debug)]
 struct Eliminated {

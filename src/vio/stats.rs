@@ -44,6 +44,7 @@ counters! {
 }
 
 impl Stats {
+    /// A reset, by its reason.
     pub fn add_reset(&mut self, why: Reset) {
         self.resets += 1;
         match why {

@@ -146,6 +146,7 @@ impl Window {
         Some(slot)
     }
 
+    /// Frees the slot of a frame.
     pub fn remove(&mut self, slot: usize) {
         self.used[slot] = false;
         self.order.retain(|s| *s as usize != slot);
@@ -171,6 +172,7 @@ impl Window {
         self.order.last().map(|s| *s as usize)
     }
 
+    /// The frame in a slot.
     #[inline]
     pub fn frame(&self, slot: usize) -> &Frame {
         &self.frames[slot]
@@ -193,6 +195,7 @@ impl Window {
         self.rig.save();
     }
 
+    /// Takes back all estimates as `save` kept them.
     pub fn restore(&mut self) {
         self.frames.copy_from_slice(&self.saved);
         self.rig.restore();
@@ -238,7 +241,7 @@ impl Layout {
         l
     }
 
-    /// Adding twice keeps the first column.
+    /// Columns of a frame's pose; adding twice keeps the first.
     pub fn add_pose(&mut self, slot: usize) {
         if self.pose[slot].is_none() {
             self.pose[slot] = Some(self.dim);
@@ -246,6 +249,7 @@ impl Layout {
         }
     }
 
+    /// Columns of a state's velocity and biases.
     pub fn add_motion(&mut self, slot: usize) {
         self.motion[slot] = Some(self.dim);
         self.dim += MOTION_DIM;

@@ -26,9 +26,9 @@ const SIGMA_GYRO: f64 = 2e-3;
 /// Tracks in common with the reference.
 const COMMON_MIN: usize = 12;
 
-/// The frame that is held is this many older than the newest, which stands too: a rig that gathers way is seen to
-/// only after a tenth of a second. Held itself, the newest frame of the simulated demo still stood at 3 cm/s, and
-/// a single camera took its scale from that: 1.3 % short. As many states are in every window.
+/// Frames by which the one that is held is older than the newest, which stands too: a rig that gathers way is seen to
+/// only after a tenth of a second, and held meanwhile it costs a single camera its scale. As many states are in every
+/// window.
 const LAG: usize = 2;
 
 /// What counts as rest.
