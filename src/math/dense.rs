@@ -5,7 +5,7 @@
 //! pivots that are zero to working precision: an unobserved direction is dropped, not divided by
 //! rounding noise.
 
-use super::wide::Wide;
+use super::wide::wide;
 
 /// A pivot that elimination brought under so many epsilons of its diagonal is rounding noise.
 const PIVOT_EPSILONS: f64 = 100.0;
@@ -79,15 +79,15 @@ impl System {
     }
 
     /// Adds a product of rows `[A | b]` (lower triangle, see `qr::Rows::gram`) whose columns, from
-    /// `first`, belong to `spans`, ascending, with b after them.
-    pub fn add_gram(&mut self, gram: &[f64], stride: usize, first: usize, spans: &[Columns]) {
-        AddGram { system: self, gram, stride, first, spans }.wide();
+    /// `first`, belong to `parts`, ascending, with b after them.
+    pub fn add_gram(&mut self, gram: &[f64], stride: usize, first: usize, parts: &[Columns]) {
+        add_gram(self, gram, stride, first, parts);
     }
 
     /// Eliminates the first `m` variables in place: the trailing block of (H, b) becomes the Schur
     /// complement, the leading columns hold L and the leading diagonal D (0 where skipped).
     pub fn eliminate(&mut self, m: usize) {
-        Eliminate { system: self, variables: m }.wide();
+        eliminate(self, m);
     }
 
     /// Scales the diagonal to one and factors, for `substitute`. Destroys the system.
@@ -175,16 +175,9 @@ impl System {
     }
 }
 
-struct Eliminate<'a> {
-    system: &'a mut System,
-    variables: usize,
-}
-
-impl Wide for Eliminate<'_> {
-    type Output = ();
-    #[inline(always)]
-    fn run(self) {
-        let Eliminate { system, variables: m } = self;
+wide! {
+    /// Eliminates the first `m` variables.
+    fn eliminate<'a>(system: &'a mut System, m: usize) -> () {
         let (n, c) = (system.dim, system.capacity);
         let least = PIVOT_EPSILONS * f64::EPSILON;
         for i in 0..n {
@@ -218,26 +211,22 @@ impl Wide for Eliminate<'_> {
     }
 }
 
-struct AddGram<'a> {
-    system: &'a mut System,
-    gram: &'a [f64],
-    stride: usize,
-    first: usize,
-    spans: &'a [Columns],
-}
-
-impl Wide for AddGram<'_> {
-    type Output = ();
-    #[inline(always)]
-    fn run(self) {
-        let AddGram { system, gram, stride, first, spans } = self;
+wide! {
+    /// Adds a product of rows.
+    fn add_gram<'a>(
+        system: &'a mut System,
+        gram: &'a [f64],
+        stride: usize,
+        first: usize,
+        parts: &'a [Columns],
+    ) -> () {
         let mut i = first;
-        for (k, rows) in spans.iter().enumerate() {
+        for (k, rows) in parts.iter().enumerate() {
             for r in 0..rows.len {
                 let from = &gram[i * stride..][..stride];
                 let to = &mut system.h[(rows.at + r) * system.capacity..][..system.capacity];
                 let mut j = first;
-                for columns in &spans[..k] {
+                for columns in &parts[..k] {
                     let pairs = to[columns.at..].iter_mut().zip(&from[j..]);
                     pairs.take(columns.len).for_each(|(to, from)| *to += *from);
                     j += columns.len;
@@ -249,10 +238,10 @@ impl Wide for AddGram<'_> {
         }
         let from = &gram[i * stride..][..stride];
         let mut j = first;
-        for span in spans {
-            let pairs = system.b[span.at..].iter_mut().zip(&from[j..]);
-            pairs.take(span.len).for_each(|(to, from)| *to += *from);
-            j += span.len;
+        for part in parts {
+            let pairs = system.b[part.at..].iter_mut().zip(&from[j..]);
+            pairs.take(part.len).for_each(|(to, from)| *to += *from);
+            j += part.len;
         }
     }
 }

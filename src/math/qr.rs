@@ -6,7 +6,7 @@
 //! elimination stands): what rounding left of them is dropped, so that a direction nobody observed
 //! stays unobserved.
 
-use super::wide::Wide;
+use super::wide::wide;
 
 /// What is left of a column is rounding when it is under this many epsilons of its length before
 /// elimination: a few roundings in each of a hundred reflections.
@@ -101,15 +101,15 @@ impl Rows {
     /// do not contain them. Answers the rank.
     pub fn eliminate(&mut self, n: usize) -> usize {
         self.measure(n);
-        self.reflect(0, n, 0)
+        reflect(self, 0, n, 0)
     }
 
     /// Eliminates columns `0..n` and drops the rows that hold them; makes what is left triangular and drops the
     /// rows in which no column is left.
     pub fn marginalize(&mut self, n: usize) {
         self.measure(self.cols);
-        let rank = self.reflect(0, n, 0);
-        let last = self.reflect(n, self.cols - 1, rank);
+        let rank = reflect(self, 0, n, 0);
+        let last = reflect(self, n, self.cols - 1, rank);
         self.a.copy_within(rank * self.stride..last * self.stride, 0);
         self.rows = last - rank;
     }
@@ -129,16 +129,10 @@ impl Rows {
         }
     }
 
-    /// Householder reflections of columns `from..to`, the first of them to row `pivot`; answers the row after the
-    /// last. A column that depends on earlier ones takes no row.
-    fn reflect(&mut self, from: usize, to: usize, pivot: usize) -> usize {
-        Reflect { rows: self, from, to, pivot }.wide()
-    }
-
     /// `[A | b]ᵀ [A | b]` of the rows from `first`, lower triangle, into `out` with the stride it answers.
     pub fn gram(&self, first: usize, out: &mut [f64]) -> usize {
         let stride = self.stride;
-        Gram { rows: &self.a[first * stride..self.rows * stride], stride, cols: self.cols, out }.wide();
+        gram(&self.a[first * stride..self.rows * stride], stride, self.cols, out);
         stride
     }
 
@@ -148,18 +142,11 @@ impl Rows {
     }
 }
 
-struct Reflect<'a> {
-    rows: &'a mut Rows,
-    from: usize,
-    to: usize,
-    pivot: usize,
-}
-
-impl Wide for Reflect<'_> {
-    type Output = usize;
-    #[inline(always)]
-    fn run(self) -> usize {
-        let Reflect { rows, from, to, mut pivot } = self;
+wide! {
+    /// Householder reflections of columns `from..to`, the first of them to row `pivot`; answers the row after the
+    /// last. A column that depends on earlier ones takes no row.
+    fn reflect<'a>(rows: &'a mut Rows, from: usize, to: usize, pivot: usize) -> usize {
+        let mut pivot = pivot;
         let stride = rows.stride;
         let least = (RANK_EPSILONS * f64::EPSILON).powi(2);
         for c in from..to {
@@ -209,21 +196,13 @@ impl Wide for Reflect<'_> {
     }
 }
 
-struct Gram<'a> {
-    rows: &'a [f64],
-    stride: usize,
-    cols: usize,
-    out: &'a mut [f64],
-}
-
-impl Wide for Gram<'_> {
-    type Output = ();
-    #[inline(always)]
-    fn run(self) {
-        for i in (0..self.cols).step_by(GRAM_ROWS) {
+wide! {
+    /// Lower triangle of the product of rows `stride` long, of which `cols` columns count.
+    fn gram<'a>(rows: &'a [f64], stride: usize, cols: usize, out: &'a mut [f64]) -> () {
+        for i in (0..cols).step_by(GRAM_ROWS) {
             for j in (0..i + GRAM_ROWS).step_by(LANES) {
                 let mut sum = [[0.0; LANES]; GRAM_ROWS];
-                for row in self.rows.chunks_exact(self.stride) {
+                for row in rows.chunks_exact(stride) {
                     let right: &[f64; LANES] = row[j..j + LANES].try_into().expect("rows are padded to lanes");
                     let left: &[f64; GRAM_ROWS] = row[i..i + GRAM_ROWS].try_into().expect("lanes are whole");
                     for (sum, x) in sum.iter_mut().zip(left) {
@@ -233,7 +212,7 @@ impl Wide for Gram<'_> {
                     }
                 }
                 for (k, sum) in sum.iter().enumerate() {
-                    self.out[(i + k) * self.stride + j..][..LANES].copy_from_slice(sum);
+                    out[(i + k) * stride + j..][..LANES].copy_from_slice(sum);
                 }
             }
         }

@@ -1,24 +1,23 @@
 //! Loops compiled for the vector registers of the machine they run on.
 
-/// A loop that is compiled also for wider vector registers than the target guarantees. `run` and all it
-/// calls must be `#[inline(always)]`: what is not inlined is compiled for the target.
-pub trait Wide: Sized {
-    type Output;
-    fn run(self) -> Self::Output;
-
-    /// Runs with the vector registers the machine has. Products are never fused with sums, so the result
-    /// is the same to the bit on every width.
-    fn wide(self) -> Self::Output {
-        pulp::Arch::new().dispatch(Dispatched(self))
-    }
+/// Defines a function of which a copy is compiled for each width of vector registers that a machine may have, and which
+/// runs the widest there is. What it calls must be `#[inline(always)]`, or it is compiled for the target's alone.
+/// Products are never fused with sums, so the result is the same to the bit on every width.
+macro_rules! wide {
+    ($(#[$meta:meta])* fn $name:ident<$l:lifetime>($($arg:ident: $of:ty),+ $(,)?) -> $out:ty $body:block) => {
+        $(#[$meta])*
+        fn $name<$l>($($arg: $of),+) -> $out {
+            struct Call<$l> { $($arg: $of),+ }
+            impl<$l> pulp::NullaryFnOnce for Call<$l> {
+                type Output = $out;
+                #[inline(always)]
+                fn call(self) -> $out {
+                    let Call { $($arg),+ } = self;
+                    $body
+                }
+            }
+            pulp::Arch::new().dispatch(Call { $($arg),+ })
+        }
+    };
 }
-
-struct Dispatched<W>(W);
-
-impl<W: Wide> pulp::NullaryFnOnce for Dispatched<W> {
-    type Output = W::Output;
-    #[inline(always)]
-    fn call(self) -> W::Output {
-        self.0.run()
-    }
-}
+pub(crate) use wide;
