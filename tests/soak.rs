@@ -19,9 +19,12 @@ use std::process::{Command, Stdio};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use stipple::config::{FrontendConfig, VioConfig};
+use stipple::counters::{Counter, Counters};
 use stipple::frontend::{Frontend, Prediction, Track, Tracks};
+use stipple::run::gate::ImuGate;
 use stipple::vio::{Health, Update, Vio};
 use stipple_drivers::sim::{euroc_rig, write_euroc, Scenario, Sim};
+use stipple_drivers::source::ImuReading;
 use stipple_drivers::{Frames, Image, ImuSample, Nanos, Pose, Span};
 use world::{Noise, Path, World, FRAME_SECS, RATE_HZ};
 
@@ -133,29 +136,21 @@ fn fly(seed: u64, segments: &[(Kind, usize)]) -> Option<f64> {
     let mut noise = Noise(seed);
     let mut vio = Vio::new(&world.rig, &VioConfig::default());
     let mut tracks = Tracks::default();
-    let (mut sample, mut sent, mut taken, mut refused) = (0, 0u64, 0u64, 0u64);
-    let (mut newest, mut leapt) = (None::<Nanos>, None::<Nanos>);
-    let far = |from: Nanos, to: Nanos| i128::from(to.0) - i128::from(from.0) > 5_000_000_000;
+    let (mut gate, counters) = (ImuGate::new(&world.rig.imu), Counters::default());
+    let (mut sample, mut given, mut sent, mut taken) = (0, 0u64, 0u64, 0u64);
     let kinds = segments.iter().flat_map(|(kind, n)| std::iter::repeat_n(*kind, *n));
     let mut error = None;
     for (frame, kind) in kinds.chain(std::iter::repeat_n(Kind::Good, GOOD)).enumerate() {
         let t = frame as f64 * FRAME_SECS + 0.0012;
         while (sample as f64) / RATE_HZ < t + 1.0 / RATE_HZ {
             let mut s = world.imu(sample as f64 / RATE_HZ);
+            let arrived = s.t;
             spoil_sample(kind, &mut s, &mut noise);
-            // Newer than the last; a leap of five seconds is believed when the next sample agrees.
-            let follows = s.is_finite() && newest.is_none_or(|n| s.t > n);
-            let confirmed = leapt.is_some_and(|to| s.t > to && !far(to, s.t));
-            let leaps = follows && newest.is_some_and(|n| far(n, s.t)) && !confirmed;
-            if follows {
-                leapt = leaps.then_some(s.t);
-            }
-            if follows && !leaps {
-                newest = Some(s.t);
-            } else {
-                refused += 1;
-            }
-            vio.on_imu(s);
+            let reading = ImuReading { sample: s, ..ImuReading::default() };
+            gate.pass(&reading, arrived, &counters, &mut |s| {
+                given += 1;
+                vio.on_imu(s);
+            });
             sample += 1;
         }
         world.tracks(t, &mut tracks);
@@ -168,8 +163,13 @@ fn fly(seed: u64, segments: &[(Kind, usize)]) -> Option<f64> {
         let in_body = |pose: &Pose, v: DVec3| pose.q.conjugate() * v;
         error = update.odometry.map(|o| in_body(&o.world_from_body, o.v_world).distance(in_body(&path.pose(t), v(t))));
     }
-    let s = vio.stats();
-    assert_eq!(s.imu_rejected, refused, "every refused sample is counted");
+    gate.lose(&mut |s| {
+        given += 1;
+        vio.on_imu(s);
+    });
+    let (s, c) = (vio.stats(), &counters);
+    let refused = [&c.imu_rejected, &c.imu_not_newer, &c.imu_timestamp_jump, &c.imu_frozen].map(Counter::get);
+    assert_eq!(given + refused.iter().sum::<u64>(), sample, "every refused sample is counted");
     assert_eq!(taken + s.frames_rejected, sent, "every frame is counted");
     error
 }

@@ -67,18 +67,18 @@ impl ImuCorrection {
     /// The true sample of a reading.
     pub fn apply(&self, s: &ImuSample) -> ImuSample {
         ImuSample {
-            t: s.t,
             gyro_body: self.gyro_scale * s.gyro_body - self.gyro_bias,
             accel_body: self.accel_scale * s.accel_body - self.accel_bias,
+            ..*s
         }
     }
 
     /// The reading of a true sample.
     pub fn undo(&self, s: &ImuSample) -> ImuSample {
         ImuSample {
-            t: s.t,
             gyro_body: self.gyro_scale.inverse() * (s.gyro_body + self.gyro_bias),
             accel_body: self.accel_scale.inverse() * (s.accel_body + self.accel_bias),
+            ..*s
         }
     }
 }
@@ -95,10 +95,14 @@ pub struct ImuCalibration {
     pub accel_noise: f64,
     /// m/s³/√Hz
     pub accel_walk: f64,
+    /// Ends of the ranges of gyro and accelerometer, rad/s and m/s².
+    pub range: [f64; 2],
     pub correction: ImuCorrection,
 }
 
 impl ImuCalibration {
+    /// 2000 degrees a second and 16 g: ranges of consumer units that a drone does not leave.
+    pub const RANGE: [f64; 2] = [34.906_585, 156.906_4];
     /// A good consumer unit at 200 Hz.
     pub const CONSUMER: ImuCalibration = ImuCalibration {
         rate_hz: 200.0,
@@ -106,6 +110,7 @@ impl ImuCalibration {
         gyro_walk: 1e-5,
         accel_noise: 1e-3,
         accel_walk: 1e-4,
+        range: ImuCalibration::RANGE,
         correction: ImuCorrection::NONE,
     };
 }

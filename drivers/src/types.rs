@@ -57,6 +57,8 @@ pub struct ImuSample {
     pub t: Nanos,
     pub gyro_body: DVec3,
     pub accel_body: DVec3,
+    /// Whether gyro and accelerometer stand at the end of their range on an axis, so that what happened beyond is not known.
+    pub saturated: [bool; 2],
 }
 
 impl ImuSample {

@@ -75,10 +75,6 @@ section! {
     extrinsics_sigma_rad: f64 = 0.02;
     /// Standard deviation of the scale of an axis before it is estimated.
     imu_scale_sigma: f64 = 0.02;
-    /// Ends of the gyro's range, rad/s: `imu.gyro_range_dps`.
-    gyro_max: f64 = 34.9;
-    /// Ends of the accelerometer's range, m/s²: `imu.accel_range_g`.
-    accel_max: f64 = 156.9;
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]

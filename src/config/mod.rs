@@ -140,8 +140,6 @@ impl Board {
             };
             Fault::new(FaultKind::Config, at, what, format!("change {key}"))
         })?;
-        board.vio.gyro_max = board.imu.gyro_range_dps.to_radians();
-        board.vio.accel_max = board.imu.accel_range_g * G;
         Ok(board)
     }
 
@@ -207,9 +205,6 @@ impl Board {
         wrong.or_else(|| self.imu.wrong(&self.gpio)).map_or(Ok(()), Err)
     }
 }
-
-/// Standard gravity, m/s².
-const G: f64 = 9.80665;
 
 fn lookup<'a>(table: &'a toml::Table, key: &str) -> Option<&'a toml::Value> {
     match key.split_once('.') {

@@ -171,6 +171,12 @@ const FROZEN_SAMPLES: u32 = 50;
 const SPIDEV: &str = "/dev/spidev";
 
 impl ImuConfig {
+    /// Ends of the ranges of gyro and accelerometer, rad/s and m/s².
+    pub fn range(&self) -> [f64; 2] {
+        const G: f64 = 9.80665;
+        [self.gyro_range_dps.to_radians(), self.accel_range_g * G]
+    }
+
     /// The first key that is wrong, and why.
     pub(super) fn wrong(&self, gpio: &GpioConfig) -> Option<Wrong> {
         let named = (

@@ -107,6 +107,7 @@ mod tests {
             gyro_walk: 1e-5,
             accel_noise: 1e-2,
             accel_walk: 1e-4,
+            range: ImuCalibration::RANGE,
             correction: ImuCorrection::NONE,
         };
         RigGeometry::new(&Calibration { cameras, imu }, 0.005)

@@ -3,16 +3,17 @@
 //! estimator is refused.
 //!
 //! A stamp ahead of its arrival by more than `JUMP_MAX` is refused, and so is one that is not newer than the last. If that
-//! is all that comes for `RELEARN`, the sensor's clock has changed for good and is believed from then on.
+//! is all that comes for `RELEARN`, the sensor's clock has changed for good and is believed from then on. Arrivals are on
+//! any clock that keeps going; without one, as of a recording read ahead, a sample arrives at its own stamp.
 
+use super::spikes::Spikes;
 use crate::counters::{Counter, Counters};
-use std::time::{Duration, Instant};
 use stipple_drivers::source::ImuReading;
-use stipple_drivers::{Frames, Image, ImuSample, Nanos};
+use stipple_drivers::{Frames, Image, ImuCalibration, ImuSample, Nanos, Span};
 
 /// Largest step of a stamp beyond the time that passed: further than a queue of frames can be behind.
-const JUMP_MAX: Duration = Duration::from_secs(1);
-const RELEARN: Duration = Duration::from_secs(2);
+const JUMP_MAX: Span = Span(1_000_000_000);
+const RELEARN: Span = Span(2_000_000_000);
 /// Intervals of whose median the period is made.
 const INTERVALS: usize = 15;
 /// One pixel in so many tells two pictures apart: noise changes half of them.
@@ -22,13 +23,16 @@ const BLANK_LEVELS: u8 = 6;
 /// So many readings in a row, all six axes alike to the last bit, no working unit gives: one whose noise is a third of a
 /// step repeats itself one time in five, and this often in a row never.
 const FROZEN_AFTER: u32 = 20;
+/// A reading this near the end of its range stands at it.
+const RANGE_FRACTION: f64 = 0.99;
 
 /// The stamps of one sensor.
 #[derive(Default)]
 pub struct Stamps {
-    last: Option<(Nanos, Instant)>,
-    /// Since when nothing was believed.
-    refusing: Option<Instant>,
+    /// Stamp and arrival of the last that was believed.
+    last: Option<(Nanos, Nanos)>,
+    /// Arrival since which nothing was believed.
+    refusing: Option<Nanos>,
     intervals: [i64; INTERVALS],
     count: usize,
 }
@@ -55,11 +59,10 @@ impl Stamps {
     }
 
     /// Whether a sample with this stamp, which arrived at `now`, is believed.
-    pub fn admit(&mut self, t: Nanos, now: Instant, counters: &StampCounters) -> bool {
+    pub fn admit(&mut self, t: Nanos, now: Nanos, counters: &StampCounters) -> bool {
         if let Some((last, at)) = self.last {
-            let elapsed = (now - at).as_nanos() as i64;
             let not_newer = t <= last;
-            if not_newer || (t - last).0 > elapsed + JUMP_MAX.as_nanos() as i64 {
+            if not_newer || (t - last).0 > (now - at).0 + JUMP_MAX.0 {
                 let since = *self.refusing.get_or_insert(now);
                 if now - since < RELEARN {
                     if not_newer { counters.not_newer } else { counters.jumped }.add(1);
@@ -98,7 +101,8 @@ impl FrameGate {
         FrameGate { stamps: Stamps::default(), looks: shape.images.iter().map(look).collect(), blank: false }
     }
 
-    pub fn admit(&mut self, frames: &Frames, now: Instant, c: &Counters) -> bool {
+    /// Whether frames that arrived at `now` are believed.
+    pub fn admit(&mut self, frames: &Frames, now: Nanos, c: &Counters) -> bool {
         let counters = StampCounters {
             missing: &c.frames_missing,
             not_newer: &c.frames_not_newer,
@@ -128,29 +132,60 @@ impl FrameGate {
 }
 
 /// The readings of an inertial unit.
-#[derive(Default)]
 pub struct ImuGate {
     pub stamps: Stamps,
+    /// Ends of the ranges of gyro and accelerometer, rad/s and m/s².
+    range: [f64; 2],
     last: Option<ImuSample>,
     repeated: u32,
+    spikes: Spikes,
 }
 
 impl ImuGate {
-    pub fn admit(&mut self, reading: &ImuReading, now: Instant, c: &Counters) -> bool {
+    pub fn new(imu: &ImuCalibration) -> ImuGate {
+        ImuGate {
+            stamps: Stamps::default(),
+            range: imu.range,
+            last: None,
+            repeated: 0,
+            spikes: Spikes::new(imu.rate_hz),
+        }
+    }
+
+    /// Takes a reading that arrived at `now` and gives what is believed, in order: nothing, this one, or the one that was
+    /// held back before it, too.
+    pub fn pass(&mut self, reading: &ImuReading, now: Nanos, c: &Counters, give: &mut impl FnMut(ImuSample)) {
         let counters =
             StampCounters { missing: &c.imu_missing, not_newer: &c.imu_not_newer, jumped: &c.imu_timestamp_jump };
-        let sample = reading.sample;
-        if !self.stamps.admit(sample.t, now, &counters) {
-            return false;
+        let mut sample = reading.sample;
+        if !sample.is_finite() {
+            c.imu_rejected.add(1);
+            return;
         }
-        c.imu_saturated.add(u64::from(reading.saturated));
+        if !self.stamps.admit(sample.t, now, &counters) {
+            return;
+        }
         let same = |s: ImuSample| s.gyro_body == sample.gyro_body && s.accel_body == sample.accel_body;
         self.repeated = if self.last.is_some_and(same) { self.repeated + 1 } else { 0 };
         self.last = Some(sample);
         if self.repeated >= FROZEN_AFTER {
             c.imu_frozen.add(if self.repeated == FROZEN_AFTER { u64::from(FROZEN_AFTER) } else { 1 });
+            return;
         }
-        self.repeated < FROZEN_AFTER
+        let peaks = [sample.gyro_body, sample.accel_body].map(|v| v.abs().max_element());
+        sample.saturated = std::array::from_fn(|i| peaks[i] >= RANGE_FRACTION * self.range[i]);
+        if reading.saturated && sample.saturated == [false; 2] {
+            // The unit does not say which: an end that the calibration has moved.
+            sample.saturated = [true; 2];
+        }
+        c.imu_saturated.add(u64::from(sample.saturated != [false; 2]));
+        c.imu_repaired.add(u64::from(self.spikes.pass(sample, give)));
+    }
+
+    /// Gives the sample that is held back, where there is one; after a loss the unit's clock may be another.
+    pub fn lose(&mut self, give: &mut impl FnMut(ImuSample)) {
+        self.spikes.flush(give);
+        self.stamps.forget();
     }
 }
 
@@ -162,10 +197,10 @@ mod tests {
 
     /// Stamps (ms) that arrive every 20 ms: those believed, and counts of missing, not newer, jumped.
     fn believed(stamps: &[i64]) -> (Vec<i64>, [u64; 3]) {
-        let (mut gate, start) = (Stamps::default(), Instant::now());
+        let mut gate = Stamps::default();
         let [missing, not_newer, jumped] = [Counter::default(), Counter::default(), Counter::default()];
         let counters = StampCounters { missing: &missing, not_newer: &not_newer, jumped: &jumped };
-        let arrives = |i: usize| start + Duration::from_millis(20 * i as u64);
+        let arrives = |i: usize| Nanos(20 * i as i64 * MS);
         let list = stamps.iter().enumerate();
         let kept = list.filter(|(i, t)| gate.admit(Nanos(**t * MS), arrives(*i), &counters)).map(|(_, t)| *t);
         (kept.collect(), [missing.get(), not_newer.get(), jumped.get()])
@@ -190,14 +225,39 @@ mod tests {
 
     #[test]
     fn a_unit_that_hangs_is_refused_and_one_repetition_is_not() {
-        let (mut gate, c, start) = (ImuGate::default(), Counters::default(), Instant::now());
+        let (mut gate, c) = (ImuGate::new(&ImuCalibration::CONSUMER), Counters::default());
         let values = (0..100).map(|i: i32| if (50..75).contains(&i) { 50 } else { i / 2 });
-        let admitted = values.enumerate().filter(|(i, v)| {
-            let gyro_body = glam::DVec3::splat(f64::from(*v));
-            let sample = ImuSample { t: Nanos(*i as i64 * MS), gyro_body, ..ImuSample::default() };
-            gate.admit(&ImuReading { sample, ..ImuReading::default() }, start, &c)
-        });
-        assert_eq!((admitted.count(), c.imu_frozen.get()), (100 - 5, 24));
+        let mut given = 0;
+        for (i, v) in values.enumerate() {
+            let (t, gyro_body) = (Nanos(i as i64 * MS), glam::DVec3::splat(f64::from(v)));
+            let sample = ImuSample { t, gyro_body, ..ImuSample::default() };
+            gate.pass(&ImuReading { sample, ..ImuReading::default() }, t, &c, &mut |_| given += 1);
+        }
+        assert_eq!((given, c.imu_frozen.get()), (100 - 5, 24));
+    }
+
+    #[test]
+    fn the_ends_of_the_ranges_are_flagged() {
+        let (mut gate, c) = (ImuGate::new(&ImuCalibration::CONSUMER), Counters::default());
+        let mut flags = vec![];
+        for (i, (gyro, accel, said)) in
+            [(1.0, 9.8, false), (34.8, 9.8, false), (1.0, -156.5, false), (2.0, 9.8, true)].into_iter().enumerate()
+        {
+            let (gyro_body, accel_body) = (glam::DVec3::X * gyro, glam::DVec3::Z * accel);
+            let sample = ImuSample { t: Nanos(i as i64 * MS), gyro_body, accel_body, ..ImuSample::default() };
+            let reading = ImuReading { sample, saturated: said, ..ImuReading::default() };
+            gate.pass(&reading, sample.t, &c, &mut |s| flags.push(s.saturated));
+        }
+        assert_eq!(flags, [[false, false], [true, false], [false, true], [true, true]]);
+        assert_eq!(c.imu_saturated.get(), 3);
+    }
+
+    #[test]
+    fn what_is_no_number_is_refused() {
+        let (mut gate, c) = (ImuGate::new(&ImuCalibration::CONSUMER), Counters::default());
+        let sample = ImuSample { accel_body: glam::DVec3::NAN, ..ImuSample::default() };
+        gate.pass(&ImuReading { sample, ..ImuReading::default() }, Nanos(0), &c, &mut |_| panic!("given"));
+        assert_eq!(c.imu_rejected.get(), 1);
     }
 
     #[test]
@@ -208,10 +268,14 @@ mod tests {
         };
         let c = Counters::default();
         let mut gate = FrameGate::new(&Frames { images: vec![Image::new(80, 80)], ..Frames::default() });
-        let (start, black) = (Instant::now(), Image::new(80, 80));
+        let black = Image::new(80, 80);
         let pictures = [picture(3), picture(5), picture(5), black.clone(), black, picture(7)];
         let admitted = pictures.into_iter().enumerate().map(|(i, image)| {
-            gate.admit(&Frames { t: Nanos(i as i64 * MS), images: vec![image], colours: vec![] }, start, &c)
+            gate.admit(
+                &Frames { t: Nanos(i as i64 * MS), images: vec![image], colours: vec![] },
+                Nanos(i as i64 * MS),
+                &c,
+            )
         });
         assert_eq!(admitted.collect::<Vec<_>>(), [true, true, false, true, true, true]);
         assert_eq!((c.frames_frozen.get(), c.frames_blank.get()), (1, 2));

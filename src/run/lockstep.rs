@@ -6,6 +6,7 @@
 //! fit. This thread decodes, then runs the mapper on the frames that tracking gives back, in their order, while tracking
 //! goes on.
 
+use super::gate::{FrameGate, ImuGate};
 use super::mapping::{Keyframes, Mapping, SLICE};
 use super::sensors::Recorded;
 use super::status::{Gauges, Status};
@@ -14,8 +15,10 @@ use super::waker::{SetOnDrop, Waker};
 use super::{spawn_tracking, Flown, Options, Steps};
 use crate::counters::Counters;
 use crossbeam_queue::ArrayQueue;
+use std::cell::Cell;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::time::{Duration, Instant};
+use stipple_drivers::source::ImuReading;
 use stipple_drivers::{host, Calibration, ImuSample, Span};
 
 /// Frames decoded at once: 24 MiB of two 752x480 cameras. What the threads of tracking lose at its ends is one stage of one
@@ -122,7 +125,8 @@ pub fn fly(
     let (over, ended) = (AtomicBool::new(false), AtomicBool::new(false));
     let (waker, link, stop) = (Waker::default(), Link::default(), host::stop_asked_for());
     let mut budget = Budget { steps, total, spent: 0, start: Instant::now() };
-    let mut reading = Reading { recorded, next: 0, samples: 0 };
+    let gates = (FrameGate::new(&packets[0].frames), ImuGate::new(&calibration.imu));
+    let mut reading = Reading { recorded, gates, next: 0, samples: 0 };
     std::thread::scope(|scope| {
         let (taken, given, woken) = (&waiting, &done, &waker);
         let give = move |packet| {
@@ -187,17 +191,18 @@ fn map_until(m: &mut Mapping, busy_s: f64, gauges: &Gauges) {
     }
 }
 
-/// A recording, and how far it has been read.
+/// A recording, and how far it has been read. It is read ahead: for the gates a sample arrives at its own stamp.
 struct Reading {
     recorded: Recorded,
+    gates: (FrameGate, ImuGate),
     next: usize,
     samples: usize,
 }
 
 impl Reading {
     /// Decodes frames into every packet but the last, or until the recording ends, hands them over together, and answers
-    /// how many. Packets come back in order: the last is the one the front end still reads. A frame that cannot be read
-    /// leaves its samples to the next.
+    /// how many. Packets come back in order: the last is the one the front end still reads. A frame that cannot be read or
+    /// is refused leaves its samples to the next.
     fn batch(
         &mut self,
         packets: &mut Vec<Box<FramePacket>>,
@@ -205,6 +210,7 @@ impl Reading {
         counters: &Counters,
     ) -> usize {
         let Recorded { images, stamps, imu } = &mut self.recorded;
+        let (frame_gate, imu_gate) = &mut self.gates;
         let mut sent = 0;
         let writable = packets.len() - 1;
         for packet in &mut packets[..writable] {
@@ -213,14 +219,25 @@ impl Reading {
             while self.next < stamps.len() && !read {
                 let i = self.next;
                 self.next += 1;
-                // One sample past the frame, to interpolate at its stamp.
-                let samples: &[ImuSample] = &imu[self.samples..];
-                let upto = samples.iter().position(|s| s.t >= stamps[i]).map_or(samples.len(), |at| at + 1);
-                samples[..upto].iter().for_each(|s| packet.push_imu(*s, counters));
-                self.samples += upto;
+                // Up to one sample past the frame, to interpolate at its stamp.
+                let past = Cell::new(false);
+                let mut push = |sample: ImuSample| {
+                    past.set(sample.t >= stamps[i]);
+                    packet.push_imu(sample, counters);
+                };
+                while let (false, Some(&sample)) = (past.get(), imu.get(self.samples)) {
+                    self.samples += 1;
+                    let reading = ImuReading { sample, ..ImuReading::default() };
+                    imu_gate.pass(&reading, sample.t, counters, &mut push);
+                    if self.samples == imu.len() {
+                        imu_gate.lose(&mut push);
+                    }
+                }
                 let frames = packet.writable().expect("it is not the last that came back");
                 read = images.read(i, frames).is_ok();
                 counters.frames_unreadable.add(u64::from(!read));
+                read = read && frame_gate.admit(frames, stamps[i], counters);
+                packet.blank = frame_gate.blank;
             }
             sent += usize::from(read);
         }

@@ -16,7 +16,7 @@ use crossbeam_queue::ArrayQueue;
 use std::sync::atomic::{AtomicBool, AtomicI64, AtomicU64, Ordering::Relaxed};
 use std::sync::OnceLock;
 use std::time::{Duration, Instant};
-use stipple_drivers::host::{thread_cpu, CpuTime};
+use stipple_drivers::host::{monotonic, thread_cpu, CpuTime};
 use stipple_drivers::source::{FrameSource, ImuBatch, ImuSource, SourceFault, Wait};
 use stipple_drivers::{Calibration, Fault, ImuSample, Span};
 
@@ -267,7 +267,7 @@ pub fn camera(mailbox: &Mailbox, source: &mut dyn FrameSource, tracking: &Waker,
             }
         }
         mailbox.arrived.fetch_add(1, Relaxed);
-        if !gate.admit(&packet.frames, Instant::now(), c) {
+        if !gate.admit(&packet.frames, monotonic(), c) {
             continue;
         }
         packet.blank = gate.blank;
@@ -298,8 +298,20 @@ pub fn camera(mailbox: &Mailbox, source: &mut dyn FrameSource, tracking: &Waker,
 }
 
 /// Thread `imu`. Ends with its source or with the cameras.
-pub fn inertial(mailbox: &Mailbox, source: &mut dyn ImuSource, tracking: &Waker, over: &AtomicBool, c: &Counters) {
-    let (mut batch, mut gate) = (ImuBatch::default(), ImuGate::default());
+pub fn inertial(
+    mailbox: &Mailbox,
+    source: &mut dyn ImuSource,
+    mut gate: ImuGate,
+    tracking: &Waker,
+    over: &AtomicBool,
+    c: &Counters,
+) {
+    let mut batch = ImuBatch::default();
+    // Never refused: while no frame comes the oldest make room.
+    let mut queue = |sample: ImuSample| {
+        c.imu_overflow.add(u64::from(mailbox.imu.force_push(sample).is_some()));
+        mailbox.imu_until.store(sample.t.0, Relaxed);
+    };
     let mut liveness = Liveness {
         name: "inertial unit",
         heard: Instant::now(),
@@ -319,7 +331,7 @@ pub fn inertial(mailbox: &Mailbox, source: &mut dyn ImuSource, tracking: &Waker,
             Ok(Wait::Got) => {}
             Ok(Wait::TimedOut) => continue,
             Err(SourceFault::Lost(_)) => {
-                gate.stamps.forget();
+                gate.lose(&mut queue);
                 continue;
             }
             Ok(Wait::Ended) => break,
@@ -329,14 +341,11 @@ pub fn inertial(mailbox: &Mailbox, source: &mut dyn ImuSource, tracking: &Waker,
                 break;
             }
         }
-        let now = Instant::now();
-        for reading in batch.iter().filter(|r| gate.admit(r, now, c)) {
-            // Never refused: while no frame comes the oldest make room.
-            c.imu_overflow.add(u64::from(mailbox.imu.force_push(reading.sample).is_some()));
-            mailbox.imu_until.store(reading.sample.t.0, Relaxed);
-        }
+        let now = monotonic();
+        batch.iter().for_each(|reading| gate.pass(reading, now, c, &mut queue));
         tracking.wake();
     }
+    gate.lose(&mut queue);
     mailbox.imu_away.store(true, Relaxed);
 }
 

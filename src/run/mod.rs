@@ -32,6 +32,7 @@ pub mod mapping;
 pub mod memory;
 pub mod recorder;
 pub mod sensors;
+mod spikes;
 pub mod status;
 pub mod status_led;
 pub mod summary;
@@ -42,6 +43,7 @@ use crate::config::{Board, InjectConfig};
 use crate::counters::Counters;
 use crate::output::report::Report;
 use crate::output::OutputDir;
+use gate::ImuGate;
 use mailbox::{Capture, Mailbox};
 use mapping::{Keyframes, Mapping};
 use recorder::Recording;
@@ -143,6 +145,7 @@ pub fn fly(
     options: &Options,
     led: Option<StatusLed>,
 ) -> Result<Outcome, Fault> {
+    input.calibration.imu.range = board.imu.range();
     memory::check_fits(&input.place, &input.calibration, board, options.record.is_some())?;
     let colours = memory::colours(&input.calibration, board).len();
     input.needs_colour(colours)?;
@@ -223,13 +226,14 @@ pub fn fly(
 
 /// Reads `input` at its own pace with the threads of a flight, shows every packet to `observer`, and makes nothing of it.
 pub fn observe(
-    input: Input,
+    mut input: Input,
     board: &Board,
     duration_s: Option<f64>,
     record: Option<(&std::path::Path, stipple_drivers::record::Format)>,
     observer: Box<dyn FnMut(&FramePacket) + Send>,
     status: &mut Status,
 ) -> Result<(Flown, Result<(), Fault>), Fault> {
+    input.calibration.imu.range = board.imu.range();
     let calibration = &input.calibration;
     let live = matches!(input.source, Source::Live { .. });
     let sensors = match input.source {
@@ -310,7 +314,8 @@ pub fn fly_in_real_time(
             let _ended = waker::SetOnDrop(&s.source_done, Some(taker));
             mailbox::camera(&s.mailbox, frames, taker, &s.counters, &s.gauges);
         });
-        spawn(scope, "imu", move || mailbox::inertial(&s.mailbox, imu, taker, &s.source_done, &s.counters));
+        let gate = ImuGate::new(&calibration.imu);
+        spawn(scope, "imu", move || mailbox::inertial(&s.mailbox, imu, gate, taker, &s.source_done, &s.counters));
         let observes = matches!(tracker, Tracker::Observer(_));
         let give = move |packet: Box<FramePacket>| {
             if !packet.imu_only {

@@ -216,16 +216,7 @@ mod tests {
     }
 
     fn increment() -> (Increment, InertialWeight) {
-        let noise = Noise {
-            gyro: 1e-3,
-            accel: 1e-2,
-            gyro_walk: 1e-4,
-            accel_walk: 1e-3,
-            period: 0.005,
-            gyro_max: 35.0,
-            accel_max: 160.0,
-            scale: true,
-        };
+        let noise = Noise { gyro: 1e-3, accel: 1e-2, gyro_walk: 1e-4, accel_walk: 1e-3, period: 0.005, scale: true };
         let mut inc = Increment::new(DVec3::new(0.005, 0.0, -0.01), DVec3::new(0.05, -0.05, 0.1));
         for k in 0..12 {
             let t = k as f64 * 0.3;

@@ -36,7 +36,6 @@ mod rows;
 mod samples;
 mod shutter;
 mod solver;
-mod spikes;
 mod stats;
 mod triangulation;
 mod window;
@@ -57,7 +56,7 @@ use inertial::{Covariance, Motion};
 use initialization::{Initializer, RESECTION_MIN};
 use monitor::Monitor;
 use recovery::Recovery;
-use samples::{ImuRing, Leap};
+use samples::ImuRing;
 use stats::Tally;
 use stipple_drivers::{Calibration, ImuSample, Nanos, Pose};
 
@@ -118,7 +117,6 @@ pub struct Vio {
     covariance: Option<Covariance>,
     /// Stamp of the newest frame.
     last: Option<Nanos>,
-    leap: Leap,
     /// What the inertial samples since then suffered.
     pending: Health,
     stats: Stats,
@@ -136,7 +134,6 @@ impl Vio {
             recovery: Recovery::default(),
             covariance: None,
             last: None,
-            leap: Leap::default(),
             pending: Health::default(),
             stats: Stats::default(),
             tally: Tally::default(),
@@ -157,7 +154,7 @@ impl Vio {
         f
     }
 
-    /// Takes a sample; refuses what is not finite, not newer than the last, or leaps ahead of it.
+    /// Takes a sample that the gate let through; refuses what is not finite or not newer than the last.
     pub fn on_imu(&mut self, s: ImuSample) {
         let noise = &self.estimator.model.noise;
         if !self.imu.admits(&s) {
@@ -166,20 +163,14 @@ impl Vio {
             return;
         }
         let gap = self.imu.newest().is_some_and(|n| noise.is_gap((s.t - n.t).secs()));
-        let clipped = noise.clipped(s.gyro_body, s.accel_body);
-        let saturated = clipped.0 || clipped.1;
         let overwritten = self.imu.push(s);
-        let repaired = self.imu.repair(noise);
         self.pending.set(Health::IMU_GAP, gap);
-        self.pending.set(Health::IMU_SATURATED, saturated);
-        self.pending.set(Health::IMU_REJECTED, repaired);
+        self.pending.set(Health::IMU_SATURATED, s.saturated != [false; 2]);
         self.recovery.propagate(s.t, &self.imu, noise);
         // Over a longer gap there will be a reset, and what dead reckoning has integrated by then is not needed.
         let needed = |old: ImuSample, t: Nanos| old.t > t && (s.t - t).secs() <= FRAME_GAP_MAX;
         let lost = overwritten.zip(self.estimator.newest()).is_some_and(|(old, newest)| needed(old, newest.t));
         self.stats.imu_gaps += u64::from(gap);
-        self.stats.imu_saturated += u64::from(saturated);
-        self.stats.imu_repaired += u64::from(repaired);
         self.stats.imu_overflow += u64::from(lost);
     }
 
@@ -187,7 +178,7 @@ impl Vio {
     /// the newest is held where they have not. A frame that is not newer than the last is refused and counted.
     pub fn on_tracks(&mut self, tracks: &Tracks) -> Update {
         let last = self.last;
-        if last.is_some_and(|t| tracks.t <= t) || self.leap.refuses(last, tracks.t) {
+        if last.is_some_and(|t| tracks.t <= t) {
             self.stats.frames_rejected += 1;
             return Update::default();
         }

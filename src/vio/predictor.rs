@@ -67,7 +67,7 @@ mod tests {
         for i in 0..80 {
             let t = i as f64 / 200.0;
             let (gyro_body, accel_body) = rate_and_force(|t| path.pose(t), t);
-            predictor.on_imu(ImuSample { t: at(t), gyro_body, accel_body });
+            predictor.on_imu(ImuSample { t: at(t), gyro_body, accel_body, ..ImuSample::default() });
         }
         let (t0, t1, t2) = (0.1012, 0.1512, 0.2012);
         let v_world = (path.pose(t0 + 1e-5).p - path.pose(t0 - 1e-5).p) / 2e-5;

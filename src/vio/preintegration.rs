@@ -24,15 +24,13 @@ pub const GRAVITY: DVec3 = DVec3::new(0.0, 0.0, -9.81);
 const GAP_PERIODS: f64 = 4.0;
 const GAP_GYRO: f64 = 0.2;
 const GAP_ACCEL: f64 = 1.0;
-/// A sample this near the end of its range is clipped, and what it hides, as densities: a shock is several
-/// samples long and all of one sign.
-const RANGE_FRACTION: f64 = 0.99;
-const CLIPPED_GYRO: f64 = 1.0;
-const CLIPPED_ACCEL: f64 = 5.0;
+/// What saturated samples hide, as densities: a shock is several samples long and all of one sign.
+const SATURATED_GYRO: f64 = 1.0;
+const SATURATED_ACCEL: f64 = 5.0;
 /// Position noise of integrating in steps, m/√s; keeps one-step increments invertible.
 const POSITION_NOISE: f64 = 1e-4;
 
-/// Continuous noise densities that the estimator believes, and ranges of the sensors.
+/// Continuous noise densities that the estimator believes.
 #[derive(Clone, Copy, Debug)]
 pub struct Noise {
     pub gyro: f64,
@@ -41,9 +39,6 @@ pub struct Noise {
     pub accel_walk: f64,
     /// Nominal sample period, s.
     pub period: f64,
-    /// Ends of the sensors' ranges, rad/s and m/s².
-    pub gyro_max: f64,
-    pub accel_max: f64,
     /// Derivatives to the scales of the axes are wanted.
     pub scale: bool,
 }
@@ -57,8 +52,6 @@ impl Noise {
             gyro_walk: imu.gyro_walk,
             accel_walk: imu.accel_walk,
             period: 1.0 / imu.rate_hz,
-            gyro_max: config.gyro_max,
-            accel_max: config.accel_max,
             scale: config.estimate_imu_scale,
         }
     }
@@ -68,18 +61,12 @@ impl Noise {
         dt > GAP_PERIODS * self.period
     }
 
-    /// Whether the (gyro, accelerometer) is at the end of its range on any axis.
-    pub fn clipped(&self, gyro: DVec3, accel: DVec3) -> (bool, bool) {
-        let at_end = |x: DVec3, max: f64| x.abs().max_element() >= RANGE_FRACTION * max;
-        (at_end(gyro, self.gyro_max), at_end(accel, self.accel_max))
-    }
-
-    /// The noise of a step between two samples: that of not having measured where one is clipped.
-    pub fn between(&self, a: (DVec3, DVec3), b: (DVec3, DVec3)) -> Noise {
-        let (first, second) = (self.clipped(a.0, a.1), self.clipped(b.0, b.1));
+    /// The noise of a step between two samples, by whether gyro and accelerometer were saturated at either: that of not
+    /// having measured where one was.
+    pub fn between(&self, a: [bool; 2], b: [bool; 2]) -> Noise {
         Noise {
-            gyro: if first.0 || second.0 { CLIPPED_GYRO } else { self.gyro },
-            accel: if first.1 || second.1 { CLIPPED_ACCEL } else { self.accel },
+            gyro: if a[0] || b[0] { SATURATED_GYRO } else { self.gyro },
+            accel: if a[1] || b[1] { SATURATED_ACCEL } else { self.accel },
             ..*self
         }
     }
@@ -231,16 +218,8 @@ mod tests {
     use super::*;
     use stipple_drivers::{ImuSample, Nanos, Pose};
 
-    const NOISE: Noise = Noise {
-        gyro: 1e-3,
-        accel: 2e-2,
-        gyro_walk: 1e-4,
-        accel_walk: 1e-3,
-        period: 0.005,
-        gyro_max: 35.0,
-        accel_max: 160.0,
-        scale: true,
-    };
+    const NOISE: Noise =
+        Noise { gyro: 1e-3, accel: 2e-2, gyro_walk: 1e-4, accel_walk: 1e-3, period: 0.005, scale: true };
     const PATH: world::Path = world::Path { rest: -1.0 };
 
     fn at(t: f64) -> Nanos {
@@ -252,7 +231,7 @@ mod tests {
         for i in 0..=(t1 * rate) as usize + 1 {
             let t = i as f64 / rate;
             let (gyro_body, accel_body) = world::rate_and_force(|t| PATH.pose(t), t);
-            ring.push(ImuSample { t: at(t), gyro_body, accel_body });
+            ring.push(ImuSample { t: at(t), gyro_body, accel_body, ..ImuSample::default() });
         }
         ring
     }

@@ -3,56 +3,29 @@
 //! Samples are interpolated at the ends of what is integrated; outside the samples the nearest is held.
 
 use super::preintegration::{Increment, Noise};
-use super::spikes::Spikes;
 use crate::limits::IMU_BETWEEN_FRAMES;
 use glam::DVec3;
 use std::collections::VecDeque;
 use stipple_drivers::{ImuSample, Nanos, Span};
-
-/// A stamp further ahead than this of the one before it is not believed alone, s.
-const LEAP_MAX: f64 = 5.0;
-
-/// Refuses a stamp that leaps ahead, since believing it would make every later one too old; the next that
-/// agrees with it is believed.
-#[derive(Clone, Copy, Debug, Default)]
-pub struct Leap {
-    to: Option<Nanos>,
-}
-
-impl Leap {
-    pub fn refuses(&mut self, last: Option<Nanos>, t: Nanos) -> bool {
-        let far = |from: Nanos| (t - from).secs() > LEAP_MAX;
-        if !last.is_some_and(far) || self.to.is_some_and(|to| t > to && !far(to)) {
-            self.to = None;
-            return false;
-        }
-        self.to = Some(t);
-        true
-    }
-}
 
 /// The newest samples, ascending stamps; old ones are overwritten.
 #[derive(Clone, Debug)]
 pub struct ImuRing {
     /// Never longer than its capacity at the start.
     samples: VecDeque<ImuSample>,
-    leap: Leap,
-    spikes: Spikes,
 }
 
 impl ImuRing {
     /// A ring without samples.
     pub fn empty() -> ImuRing {
-        let samples = VecDeque::with_capacity(IMU_BETWEEN_FRAMES);
-        ImuRing { samples, leap: Leap::default(), spikes: Spikes::default() }
+        ImuRing { samples: VecDeque::with_capacity(IMU_BETWEEN_FRAMES) }
     }
 
     pub const BYTES: usize = IMU_BETWEEN_FRAMES * size_of::<ImuSample>();
 
-    /// Whether a sample is finite, newer than the last, and does not leap ahead of it.
-    pub fn admits(&mut self, s: &ImuSample) -> bool {
-        let last = self.newest().map(|n| n.t);
-        s.is_finite() && last.is_none_or(|n| s.t > n) && !self.leap.refuses(last, s.t)
+    /// Whether a sample is finite and newer than the last.
+    pub fn admits(&self, s: &ImuSample) -> bool {
+        s.is_finite() && self.newest().is_none_or(|n| s.t > n.t)
     }
 
     /// Takes a sample that was admitted; returns the one that was overwritten.
@@ -60,17 +33,6 @@ impl ImuRing {
         let old = if self.samples.len() == IMU_BETWEEN_FRAMES { self.samples.pop_front() } else { None };
         self.samples.push_back(s);
         old
-    }
-
-    /// Judges the sample before the newest; answers whether it was repaired. What was integrated up to it before stays.
-    pub fn repair(&mut self, noise: &Noise) -> bool {
-        let Some(before) = self.samples.len().checked_sub(3) else { return false };
-        let [a, b, c] = [0, 1, 2].map(|i| &self.samples[before + i]);
-        let repaired = self.spikes.repaired(a, b, c, noise);
-        if let Some(s) = repaired {
-            self.samples[before + 1] = s;
-        }
-        repaired.is_some()
     }
 
     /// The newest sample.
@@ -88,40 +50,45 @@ impl ImuRing {
         self.samples.partition_point(|s| s.t <= t)
     }
 
-    /// Rate and force at `t`: linear between samples, held outside them.
-    fn sample_at(&self, t: Nanos) -> Option<(DVec3, DVec3)> {
+    /// The reading at `t`: linear between samples, held outside them; saturated where a sample is that it is made of.
+    fn sample_at(&self, t: Nanos) -> Option<ImuSample> {
         let next = self.after(t);
         let before = next.checked_sub(1).map(|i| &self.samples[i]);
         let (Some(a), Some(b)) = (before, self.samples.get(next)) else {
-            let nearest = before.or(self.samples.front())?;
-            return Some((nearest.gyro_body, nearest.accel_body));
+            return before.or(self.samples.front()).copied();
         };
         let s = (t - a.t).secs() / (b.t - a.t).secs();
-        Some((a.gyro_body.lerp(b.gyro_body, s), a.accel_body.lerp(b.accel_body, s)))
+        Some(ImuSample {
+            t,
+            gyro_body: a.gyro_body.lerp(b.gyro_body, s),
+            accel_body: a.accel_body.lerp(b.accel_body, s),
+            saturated: [0, 1].map(|i| a.saturated[i] || b.saturated[i]),
+        })
     }
 
     /// What the gyro read at `t`, rad/s; zero without any sample.
     pub fn rate_at(&self, t: Nanos) -> DVec3 {
-        self.sample_at(t).map_or(DVec3::ZERO, |s| s.0)
+        self.sample_at(t).map_or(DVec3::ZERO, |s| s.gyro_body)
     }
 
     /// The increment over `[t0, t1]`. Without any sample: gravity-free rest with the noise of a gap.
     pub fn integrate(&self, t0: Nanos, t1: Nanos, bg: DVec3, ba: DVec3, noise: &Noise) -> Increment {
         let mut inc = Increment::new(bg, ba);
-        let Some((mut w, mut a)) = self.sample_at(t0) else {
+        let Some(mut last) = self.sample_at(t0) else {
             inc.step_between([bg, ba], [bg, ba], (t1 - t0).secs(), noise);
             return inc;
         };
         let mut t = t0;
-        let mut step = |to: Nanos, w1: DVec3, a1: DVec3| {
-            inc.step_between([w, a], [w1, a1], (to - t).secs(), &noise.between((w, a), (w1, a1)));
-            (t, w, a) = (to, w1, a1);
+        let mut step = |to: Nanos, s: &ImuSample| {
+            let (a, b) = ([last.gyro_body, last.accel_body], [s.gyro_body, s.accel_body]);
+            inc.step_between(a, b, (to - t).secs(), &noise.between(last.saturated, s.saturated));
+            (t, last) = (to, *s);
         };
         for s in self.samples.range(self.after(t0)..self.after(t1)) {
-            step(s.t, s.gyro_body, s.accel_body);
+            step(s.t, s);
         }
-        if let Some((w1, a1)) = self.sample_at(t1) {
-            step(t1, w1, a1);
+        if let Some(end) = self.sample_at(t1) {
+            step(t1, &end);
         }
         inc
     }

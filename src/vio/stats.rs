@@ -8,11 +8,7 @@ counters! {
     #[derive(Clone, Copy, PartialEq, Eq)]
     pub struct Stats of u64, read by u64::clone;
     imu_rejected,
-    /// Samples of which one axis could not be motion, and was put between its neighbours.
-    imu_repaired,
     imu_overflow,
-    /// Samples at the end of the sensor's range.
-    imu_saturated,
     /// Holes in the inertial samples.
     imu_gaps,
     /// Frames not newer than the last.

@@ -261,7 +261,12 @@ fn restart_goes_on_where_it_was() {
 #[test]
 fn samples_that_are_not_finite_or_not_newer_are_counted_and_refused() {
     let mut vio = Vio::new(&world::calibration(), &VioConfig::default());
-    let sample = |t: i64, x: f64| ImuSample { t: Nanos(t), gyro_body: DVec3::splat(x), accel_body: DVec3::Z };
+    let sample = |t: i64, x: f64| ImuSample {
+        t: Nanos(t),
+        gyro_body: DVec3::splat(x),
+        accel_body: DVec3::Z,
+        ..ImuSample::default()
+    };
     for (t, x) in [(1, 0.0), (1, 0.0), (0, 0.0), (2, f64::NAN), (3, f64::INFINITY), (4, 0.0)] {
         vio.on_imu(sample(t, x));
     }

@@ -3,9 +3,12 @@
 use crate::world::{room, stream, Noise, Path, World, FRAME_SECS, RATE_HZ};
 use glam::{DQuat, DVec3};
 use stipple::config::VioConfig;
+use stipple::counters::Counters;
 use stipple::frontend::Tracks;
+use stipple::run::gate::ImuGate;
 use stipple::vio::{Update, Vio};
-use stipple_drivers::{ImuSample, Nanos, Pose, TimedPose};
+use stipple_drivers::source::ImuReading;
+use stipple_drivers::{ImuCalibration, ImuSample, Nanos, Pose, TimedPose};
 
 /// Inertial samples alone before the first frame, s.
 pub const BEFORE: f64 = 1.0;
@@ -18,6 +21,8 @@ pub struct Plan {
     pub pose: fn(f64) -> Pose,
     pub scene: fn(&mut Noise) -> Vec<DVec3>,
     pub config: fn(&mut VioConfig),
+    /// What is known of the ends of the ranges of gyro and accelerometer, rad/s and m/s².
+    pub range: [f64; 2],
     pub frames: usize,
     /// Standard deviations of the biases at the start, rad/s and m/s²; those of the world where `None`.
     pub biases: Option<(f64, f64)>,
@@ -34,6 +39,7 @@ impl Default for Plan {
             pose: moving,
             scene: |noise| room(1500, noise),
             config: |_| {},
+            range: ImuCalibration::RANGE,
             frames: 160,
             biases: None,
             frame: |_| true,
@@ -77,7 +83,7 @@ pub struct EstimatedFrame<'a> {
     pub vio: &'a Vio,
 }
 
-/// Flies a plan; `each` sees every frame that arrived. Same seed, same flight.
+/// Flies a plan, its samples through the gate; `each` sees every frame that arrived. Same seed, same flight.
 pub fn fly(plan: &Plan, seed: u64, mut each: impl FnMut(&EstimatedFrame)) -> Vio {
     let mut noise = stream(seed, 1);
     let points = (plan.scene)(&mut noise);
@@ -87,7 +93,9 @@ pub fn fly(plan: &Plan, seed: u64, mut each: impl FnMut(&EstimatedFrame)) -> Vio
     }
     let mut config = VioConfig::default();
     (plan.config)(&mut config);
+    world.rig.imu.range = plan.range;
     let mut vio = Vio::new(&world.rig, &config);
+    let (mut gate, counters) = (ImuGate::new(&world.rig.imu), Counters::default());
     let mut tracks = Tracks::default();
     let mut sample = 0;
     for frame in 0..plan.frames {
@@ -98,7 +106,9 @@ pub fn fly(plan: &Plan, seed: u64, mut each: impl FnMut(&EstimatedFrame)) -> Vio
             let mut s = world.imu(at);
             (plan.warp)(&mut s, &mut noise);
             if (plan.sample)(at) {
-                vio.on_imu(s);
+                let reading = ImuReading { sample: s, ..ImuReading::default() };
+                let arrived = Nanos((at * 1e9) as i64);
+                gate.pass(&reading, arrived, &counters, &mut |s| vio.on_imu(s));
             }
             sample += 1;
         }

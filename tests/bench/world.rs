@@ -53,6 +53,7 @@ pub fn calibration() -> Calibration {
         gyro_walk: 2e-5,
         accel_noise: 2e-3,
         accel_walk: 3e-3,
+        range: ImuCalibration::RANGE,
         correction: ImuCorrection::NONE,
     };
     Calibration { cameras: vec![eye(0.055), eye(-0.055)], imu }
@@ -152,6 +153,7 @@ impl World {
             t: Nanos((t * 1e9).round() as i64),
             gyro_body: gyro + self.gyro_bias + self.noise.vector() * self.rig.imu.gyro_noise * root,
             accel_body: accel + self.accel_bias + self.noise.vector() * self.rig.imu.accel_noise * root,
+            ..ImuSample::default()
         }
     }
 

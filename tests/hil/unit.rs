@@ -30,7 +30,12 @@ pub fn counts(s: &ImuSample) -> Counts {
 
 pub fn sample(t: Nanos, c: Counts) -> ImuSample {
     let [ax, ay, az, gx, gy, gz] = c.map(f64::from);
-    ImuSample { t, gyro_body: glam::dvec3(gx, gy, gz) * GYRO, accel_body: glam::dvec3(ax, ay, az) * ACCEL }
+    ImuSample {
+        t,
+        gyro_body: glam::dvec3(gx, gy, gz) * GYRO,
+        accel_body: glam::dvec3(ax, ay, az) * ACCEL,
+        ..ImuSample::default()
+    }
 }
 
 /// The unit, which never rests: what it gives before the recording starts is the recording backwards.

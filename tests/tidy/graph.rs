@@ -119,7 +119,7 @@ fn resolve(codes: &BTreeMap<Path, String>, from: &Path, path: &Path) -> Option<P
         }
     }
     while let Some(next) = rest.first() {
-        let deeper = [&at[..], &[next.clone()]].concat();
+        let deeper = [&at[..], std::slice::from_ref(next)].concat();
         if !codes.contains_key(&deeper) {
             break;
         }

@@ -6,7 +6,7 @@ mod graph;
 mod source;
 
 use graph::{paths, Graph};
-use source::{closing, code, files, is_test_file, shipped_code, File};
+use source::{closing, code, files, is_test_file, shipped_code};
 use std::collections::{BTreeMap, BTreeSet};
 
 /// Modules everybody may see.

@@ -20,7 +20,7 @@ pub struct Reading {
 impl Reading {
     /// The sample, where both sensors are there.
     fn whole(self) -> Option<ImuReading> {
-        let sample = ImuSample { t: self.t, gyro_body: self.gyro?, accel_body: self.accel? };
+        let sample = ImuSample { t: self.t, gyro_body: self.gyro?, accel_body: self.accel?, ..ImuSample::default() };
         Some(ImuReading { sample, temperature_c: self.temperature_c, saturated: self.saturated })
     }
 }

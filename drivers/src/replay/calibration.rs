@@ -28,6 +28,7 @@ pub const IMU_DEFAULTS: ImuCalibration = ImuCalibration {
     gyro_walk: 2.2e-5,
     accel_noise: 2.8e-3,
     accel_walk: 8.6e-4,
+    range: ImuCalibration::RANGE,
     correction: ImuCorrection::NONE,
 };
 /// Longest readout, s: a camera of one frame a second has no longer one.
@@ -235,6 +236,7 @@ fn yaml_imu(path: &Path, rate: &str, findings: &mut Findings) -> Result<ImuCalib
         gyro_walk: positive("gyroscope_random_walk")?,
         accel_noise: positive("accelerometer_noise_density")?,
         accel_walk: positive("accelerometer_random_walk")?,
+        range: ImuCalibration::RANGE,
         correction: ImuCorrection::NONE,
     })
 }
@@ -279,6 +281,7 @@ fn basalt(file: &Document) -> Result<Calibration, Fault> {
         gyro_walk: noise("gyro_bias_std")?,
         accel_noise: noise("accel_noise_std")?,
         accel_walk: noise("accel_bias_std")?,
+        range: ImuCalibration::RANGE,
         correction: basalt_correction(file)?,
     };
     Ok(Calibration { cameras, imu })

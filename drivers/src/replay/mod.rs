@@ -117,7 +117,7 @@ fn read_imu(path: &Path, hole: Span, findings: &mut Findings) -> Result<Vec<ImuS
         let [t, values @ ..] = fields else { return None };
         let v: [f64; 6] = table::numbers(values)?.try_into().ok()?;
         let (gyro_body, accel_body) = (DVec3::new(v[0], v[1], v[2]), DVec3::new(v[3], v[4], v[5]));
-        Some(ImuSample { t: Nanos(t.parse().ok()?), gyro_body, accel_body })
+        Some(ImuSample { t: Nanos(t.parse().ok()?), gyro_body, accel_body, ..ImuSample::default() })
     };
     let mut rows = table::read(path, COLUMNS, parse, findings)?;
     rows.retain(|row| {

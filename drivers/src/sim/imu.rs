@@ -67,7 +67,12 @@ pub fn simulate(
         let w = m.gyro_body + gyro + normal() * (noise.gyro_noise * root_rate);
         let f = force + accel + normal() * (noise.accel_noise * root_rate);
         let (w_max, f_max) = (DVec3::splat(errors.gyro_max), DVec3::splat(errors.accel_max));
-        samples.push(ImuSample { t, gyro_body: w.clamp(-w_max, w_max), accel_body: f.clamp(-f_max, f_max) });
+        samples.push(ImuSample {
+            t,
+            gyro_body: w.clamp(-w_max, w_max),
+            accel_body: f.clamp(-f_max, f_max),
+            ..ImuSample::default()
+        });
         biases.push(Bias { t, gyro, accel });
         gyro += normal() * (noise.gyro_walk / root_rate);
         accel += normal() * (noise.accel_walk / root_rate);

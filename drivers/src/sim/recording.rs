@@ -52,6 +52,7 @@ pub fn read(truth: &Path, imu: Option<&Path>) -> Result<Recording, Fault> {
             t,
             gyro_body: DVec3::new(v[0], v[1], v[2]),
             accel_body: DVec3::new(v[3], v[4], v[5]),
+            ..ImuSample::default()
         };
         recording.imu = Some(rows(path, 6)?.into_iter().map(sample).collect());
     }

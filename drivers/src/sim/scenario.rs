@@ -229,6 +229,7 @@ pub fn euroc_rig() -> Calibration {
             gyro_walk: 1.9393e-5,
             accel_noise: 2.0e-3,
             accel_walk: 3.0e-3,
+            range: ImuCalibration::RANGE,
             correction: ImuCorrection::NONE,
         },
     }

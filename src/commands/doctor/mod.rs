@@ -225,7 +225,7 @@ fn sensed(input: Input, board: &Board, look_s: f64) -> Result<Vec<Check>, Fault>
     checks.extend(seen.light.iter().enumerate().map(|(camera, light)| light.check(camera)));
     checks.push(seen.pairs.check(board));
     checks.extend(signals::inertia(&seen.samples, calibration));
-    checks.push(signals::saturation(&seen.samples, c.imu_saturated.get(), board));
+    checks.push(signals::saturation(&seen.samples));
     let found = agreement(&seen.turning.turns, &seen.samples, calibration.cameras[0].body_from_cam.q);
     checks.extend(signals::turning(found.as_ref()));
     Ok(checks)

@@ -2,7 +2,6 @@
 
 use super::agreement::{median, Agreement};
 use super::Check;
-use crate::config::Board;
 use glam::{DMat3, DVec3};
 use stipple_drivers::{Calibration, Frames, ImuSample, Nanos};
 
@@ -150,11 +149,8 @@ pub fn inertia(imu: &[ImuSample], calibration: &Calibration) -> Vec<Check> {
 }
 
 /// Samples at the ends of the ranges.
-pub fn saturation(imu: &[ImuSample], said: u64, board: &Board) -> Check {
-    let (gyro, accel) = (0.98 * board.vio.gyro_max, 0.98 * board.vio.accel_max);
-    let at_end =
-        imu.iter().filter(|s| s.gyro_body.abs().max_element() >= gyro || s.accel_body.abs().max_element() >= accel);
-    let n = said.max(at_end.count() as u64);
+pub fn saturation(imu: &[ImuSample]) -> Check {
+    let n = imu.iter().filter(|s| s.saturated != [false; 2]).count();
     let peak = |f: fn(&ImuSample) -> DVec3| imu.iter().map(|s| f(s).abs().max_element()).fold(0.0, f64::max);
     let (w, a) = (peak(|s| s.gyro_body), peak(|s| s.accel_body));
     let what = format!("saturation: {n} of {} samples; peaks {w:.1} rad/s, {a:.1} m/s²", imu.len());

@@ -8,7 +8,7 @@ use glam::{DQuat, DVec3};
 use std::ops::Range;
 use stipple::frontend::Tracks;
 use stipple::vio::Health;
-use stipple_drivers::{ImuSample, Nanos, Pose};
+use stipple_drivers::{ImuCalibration, ImuSample, Nanos, Pose};
 
 /// Frames during which passing faults last; t = 5 s is frame 80.
 const AT: usize = 80;
@@ -187,9 +187,9 @@ fn inertial(plan: fn() -> Plan, long: fn() -> Plan) -> Vec<Case> {
         case("imu gap 50 ms", Plan { sample: |t| !(5.0..5.05).contains(&t), ..plan() }).fault(AT, AT + 2).says(Health::IMU_GAP),
         case("imu gap 500 ms", Plan { sample: |t| !(5.0..5.5).contains(&t), ..plan() }).fault(AT, AT + 11).says(Health::IMU_GAP),
         case("imu stamps jittered by 2 ms", Plan { warp: jitter, ..plan() }),
-        case("gyro saturated", Plan { warp: clip_gyro, config: |c| c.gyro_max = GYRO_RANGE, ..plan() }).says(Health::IMU_SATURATED),
-        case("accelerometer saturated", Plan { warp: clip_accel, config: |c| c.accel_max = ACCEL_RANGE, ..plan() }).says(Health::IMU_SATURATED),
-        case("imu samples not finite or late", Plan { warp: poison, ..plan() }).says(Health::IMU_REJECTED),
+        case("gyro saturated", Plan { warp: clip_gyro, range: [GYRO_RANGE, ImuCalibration::RANGE[1]], ..plan() }).says(Health::IMU_SATURATED),
+        case("accelerometer saturated", Plan { warp: clip_accel, range: [ImuCalibration::RANGE[0], ACCEL_RANGE], ..plan() }).says(Health::IMU_SATURATED),
+        case("imu samples not finite or late", Plan { warp: poison, ..plan() }),
         case("accelerometer 8 m/s2 wrong 2 s", Plan { warp: lean, ..long() }).fault(AT, AT + 40).says(Health::DIVERGED_RESET | Health::VISION_DISAGREES).expect(Reset, 0.012, SAID),
     ]
 }

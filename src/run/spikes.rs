@@ -1,17 +1,16 @@
-//! One reading that cannot be motion: a bit turned over on the way from the unit.
+//! Repair of one reading that cannot be motion: a bit turned over on the way from the unit.
 //!
 //! Judged once the next sample is there, against both neighbours. Such a reading stands out on one axis, in one sample, while
 //! that axis goes on behind it as before and the other five see nothing. A shock is no such thing: it lasts, or it is felt
 //! about every axis. What stands out is told by what the axis did lately, so that vibration raises its own bar.
 //!
 //! It takes little to be wrong in a new way here, so it is bounded: one in eight samples, eight at once, and none at the end of its
-//! range, which has a meaning of its own (`Noise::between`). Bits below what stands out cost millimetres, those above did cost
+//! range, which has a meaning of its own. Bits below what stands out cost millimetres, those above did cost
 //! centimetres and decimetres: `stipple-bench faults`.
 
-use super::preintegration::Noise;
-use stipple_drivers::ImuSample;
+use stipple_drivers::{ImuSample, Span};
 
-/// Of the axes in order: gyro x, y, z, accelerometer x, y, z.
+/// Axes in order: gyro x, y, z, accelerometer x, y, z.
 const AXES: usize = 6;
 /// What stands out by less is left alone, rad/s and m/s²: 0.14 degrees and 5 cm/s by a sample of 5 ms. On the flights of
 /// EuRoC at hand (88 thousand samples, motors on) a lone axis stands out by 0.29 rad/s and 15.3 m/s² at most, ...
@@ -25,6 +24,8 @@ const QUIET_LEVELS: f64 = 6.0;
 const QUIET: f64 = 0.05;
 /// Samples over which a level is averaged; before so many nothing is judged.
 const AVERAGED: u32 = 64;
+/// Neighbours further apart than so many periods tell nothing of each other.
+const PERIODS_MAX: f64 = 4.0;
 /// What a repair costs, and is saved up at most, in samples.
 const COST: u32 = 8;
 const SAVED_MAX: u32 = 64;
@@ -34,9 +35,14 @@ fn axes(s: &ImuSample) -> [f64; AXES] {
     [w.x, w.y, w.z, a.x, a.y, a.z]
 }
 
-/// What each axis does from sample to sample, and how many repairs are allowed.
-#[derive(Clone, Copy, Debug, Default)]
+/// The samples of one unit on their way through: what each axis does from sample to sample, and how many repairs are allowed.
+#[derive(Clone, Debug)]
 pub struct Spikes {
+    /// Neighbours further apart than this tell nothing of each other.
+    interval_max: Span,
+    /// The two samples before the next, repaired; the later one may be held back.
+    last: [Option<ImuSample>; 2],
+    held: bool,
     /// Mean distance of a reading from the middle of its neighbours.
     level: [f64; AXES],
     seen: u32,
@@ -44,27 +50,69 @@ pub struct Spikes {
 }
 
 impl Spikes {
-    /// `now` as it must have been, if `before` and `after` say that a reading of it is none.
-    pub fn repaired(
-        &mut self,
-        before: &ImuSample,
-        now: &ImuSample,
-        after: &ImuSample,
-        noise: &Noise,
-    ) -> Option<ImuSample> {
-        if noise.is_gap((after.t - before.t).secs() * 0.5) {
+    pub fn new(rate_hz: f64) -> Spikes {
+        let interval_max = Span::from_secs(PERIODS_MAX / rate_hz);
+        Spikes { interval_max, last: [None; 2], held: false, level: [0.0; AXES], seen: 0, saved: 0 }
+    }
+
+    /// Takes a sample and gives those that are judged; answers whether one of them was repaired. A sample that jumps is held
+    /// back until the next one tells what it was.
+    pub fn pass(&mut self, sample: ImuSample, give: &mut impl FnMut(ImuSample)) -> bool {
+        let mut repaired = None;
+        if let [Some(before), Some(now)] = self.last {
+            repaired = self.judge(&before, &now, &sample);
+        }
+        let [_, now] = &mut self.last;
+        *now = repaired.or(*now);
+        self.flush(give);
+        self.last.rotate_left(1);
+        self.last[1] = Some(sample);
+        self.held = self.jumps();
+        if !self.held {
+            give(sample);
+        }
+        repaired.is_some()
+    }
+
+    /// Gives the sample that is held back, where there is one: none comes for long.
+    pub fn flush(&mut self, give: &mut impl FnMut(ImuSample)) {
+        if let (true, Some(sample)) = (std::mem::take(&mut self.held), self.last[1]) {
+            give(sample);
+        }
+    }
+
+    /// Whether the newest sample may turn out to be a spike. What stands out by `d` of the middle of its neighbours, which
+    /// are at most `BACK d` apart, is at least `(1 - BACK / 2) d` from each.
+    fn jumps(&self) -> bool {
+        let [Some(before), Some(now)] = &self.last else { return false };
+        let (a, b) = (axes(before), axes(now));
+        let far = |i: usize| (b[i] - a[i]).abs() > (1.0 - 0.5 * BACK) * self.out_min(i);
+        self.may_repair() && now.t - before.t <= self.interval_max && (0..AXES).any(far)
+    }
+
+    fn may_repair(&self) -> bool {
+        self.seen >= AVERAGED && self.saved >= COST
+    }
+
+    /// Least distance from the middle of its neighbours at which a reading of an axis stands out.
+    fn out_min(&self, axis: usize) -> f64 {
+        OUT_MIN[axis / 3].max(OUT_LEVELS * self.level[axis])
+    }
+
+    /// `now` as it must have been, if its neighbours say that a reading of it is none.
+    fn judge(&mut self, before: &ImuSample, now: &ImuSample, after: &ImuSample) -> Option<ImuSample> {
+        if (after.t - before.t).secs() > 2.0 * self.interval_max.secs() {
             return None;
         }
         let [a, b, c] = [before, now, after].map(axes);
         // At even intervals; at uneven ones the middle is off by a part of what the axis moves on.
         let out: [f64; AXES] = std::array::from_fn(|i| (b[i] - 0.5 * (a[i] + c[i])).abs());
-        let clipped = noise.clipped(now.gyro_body, now.accel_body);
-        let lone = (0..AXES).find(|i| self.stands_out(*i, &a, &b, &c, out[*i]));
-        let lone = lone.filter(|_| self.seen >= AVERAGED && self.saved >= COST && !(clipped.0 || clipped.1));
+        let lone = (0..AXES).find(|i| self.held && self.stands_out(*i, &a, &b, &c, out[*i]));
+        let lone = lone.filter(|_| self.may_repair() && now.saturated == [false; 2]);
         self.learn(&out, lone);
-        let mut repaired = *now;
         let i = lone?;
         let middle = 0.5 * (a[i] + c[i]);
+        let mut repaired = *now;
         if i < 3 {
             repaired.gyro_body[i] = middle;
         } else {
@@ -79,9 +127,7 @@ impl Spikes {
             let change = (b[k] - a[k]).abs().min((c[k] - b[k]).abs());
             change <= QUIET_LEVELS * self.level[k] + QUIET * OUT_MIN[k / 3]
         };
-        out > OUT_MIN[i / 3].max(OUT_LEVELS * self.level[i])
-            && (c[i] - a[i]).abs() < BACK * out
-            && (0..AXES).all(|k| k == i || quiet(k))
+        out > self.out_min(i) && (c[i] - a[i]).abs() < BACK * out && (0..AXES).all(|k| k == i || quiet(k))
     }
 
     /// Levels follow what the axes do, not what is taken out of them, and no single reading raises one much.
@@ -98,9 +144,8 @@ impl Spikes {
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used)]
-    use super::super::world::{calibration, Noise as Random};
     use super::*;
-    use crate::config::VioConfig;
+    use crate::world::Noise;
     use glam::DVec3;
     use stipple_drivers::Nanos;
 
@@ -108,8 +153,7 @@ mod tests {
 
     /// A second of a unit that turns and shakes a little, `spoil`ed, and which samples were repaired.
     fn repaired(spoil: impl Fn(usize, &mut ImuSample)) -> (Vec<ImuSample>, Vec<usize>) {
-        let mut random = Random(7);
-        let noise = Noise::new(&calibration().imu, &VioConfig::default());
+        let mut random = Noise(7);
         let mut list: Vec<ImuSample> = (0..200)
             .map(|i| {
                 let turn = DVec3::new(1.0, 0.5, -2.0) * (i as f64 * 0.03).sin();
@@ -117,18 +161,24 @@ mod tests {
                     t: Nanos(i * 5_000_000),
                     gyro_body: turn + random.vector() * 0.02,
                     accel_body: GRAVITY + turn + random.vector() * 0.3,
+                    saturated: [false; 2],
                 }
             })
             .collect();
-        list.iter_mut().enumerate().for_each(|(i, s)| spoil(i, s));
-        let (mut spikes, mut found) = (Spikes::default(), vec![]);
-        for i in 1..list.len() - 1 {
-            if let Some(s) = spikes.repaired(&list[i - 1], &list[i], &list[i + 1], &noise) {
-                list[i] = s;
-                found.push(i);
+        for (i, s) in list.iter_mut().enumerate() {
+            spoil(i, s);
+            s.saturated[1] = s.accel_body.abs().max_element() > 150.0;
+        }
+        let (mut spikes, mut given, mut found) = (Spikes::new(200.0), vec![], vec![]);
+        for (i, s) in list.iter().enumerate() {
+            if spikes.pass(*s, &mut |s| given.push(s)) {
+                found.push(i - 1);
             }
         }
-        (list, found)
+        spikes.flush(&mut |s| given.push(s));
+        assert_eq!(given.len(), list.len(), "each is given once");
+        assert!(given.is_sorted_by_key(|s| s.t));
+        (given, found)
     }
 
     #[test]
@@ -172,7 +222,11 @@ mod tests {
 
     #[test]
     fn a_sample_at_the_end_of_its_range_is_left_as_it_is() {
-        assert!(repaired(|i, s| s.gyro_body.z = if i == 100 { 34.9 } else { s.gyro_body.z }).1.is_empty());
+        assert!(repaired(|i, s| if i == 100 {
+            (s.gyro_body.z, s.saturated) = (34.9, [true, false])
+        })
+        .1
+        .is_empty());
     }
 
     #[test]
