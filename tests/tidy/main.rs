@@ -240,6 +240,7 @@ fn names_a_unit(doc: &str) -> bool {
 }
 
 /// Public items of the sensors' crate and of the estimator are documented: numbers with their unit, results with their error.
+/// A field may be documented by the comment on the fields before it or on its struct, a plain `new` by its type.
 #[test]
 fn public_items_say_what_they_are() {
     const SUFFIXES: [&str; 14] =
@@ -251,7 +252,7 @@ fn public_items_say_what_they_are() {
             continue;
         }
         let code = shipped_code(&file.text);
-        let mut doc = String::new();
+        let (mut doc, mut group) = (String::new(), String::new());
         for (number, (line, code)) in file.text.lines().zip(code.lines()).enumerate() {
             let (line, code) = (line.trim(), code.trim());
             if let Some(text) = line.strip_prefix("///") {
@@ -263,11 +264,17 @@ fn public_items_say_what_they_are() {
                 let name = item.map(|i| i.split([':', '(', '<', ' ', '=']).next().unwrap_or(""));
                 let is_field = item.is_some_and(|i| i.ends_with(',') && i.contains(": "));
                 let number_of = item.is_some_and(|i| [": f64", ": f32", ": Option<f64>"].iter().any(|t| i.contains(t)));
-                let suffixed = name.is_some_and(|n| SUFFIXES.iter().any(|s| n.ends_with(s)));
+                let suffixed = name.is_some_and(|n| n == "BYTES" || SUFFIXES.iter().any(|s| n.ends_with(s)));
                 let fallible = item.is_some_and(|i| i.contains("fn ") && i.contains("Fault>"));
                 let says_error = ["rror", "fuse", "ail", "ault", "cannot", "refus"].iter().any(|w| doc.contains(w));
                 let at = format!("{}:{}", file.path, number + 1);
-                if item.is_some() && doc.is_empty() && !suffixed {
+                if is_field && doc.is_empty() {
+                    doc.clone_from(&group);
+                } else if item.is_some() {
+                    group.clone_from(&doc);
+                }
+                let is_new = item.is_some_and(|i| i.starts_with("fn new(") && !fallible);
+                if item.is_some() && doc.is_empty() && !suffixed && !is_new {
                     offences.push(format!("{at}: no doc comment: {code}"));
                 } else if is_field && number_of && !suffixed && !names_a_unit(&doc) {
                     offences.push(format!("{at}: no unit: {code}"));
