@@ -8,7 +8,7 @@
 //! is in the unit's clock and along orthogonal axes, and an online estimate of either is what the calibration left over.
 
 use crate::camera::Camera;
-use crate::types::{ImuSample, Nanos, Pose, Span};
+use crate::types::{Frames, Image, ImuSample, Nanos, Pose, Span};
 use glam::{DMat3, DVec3};
 
 /// A camera of the rig: its lens, its pose and its timing.
@@ -120,4 +120,19 @@ impl ImuCalibration {
 pub struct Calibration {
     pub cameras: Vec<RigCamera>,
     pub imu: ImuCalibration,
+}
+
+impl Frames {
+    /// Black images in the shape of a rig, so that reading into them allocates nothing.
+    pub fn for_rig(calibration: &Calibration) -> Frames {
+        let shape = |c: &RigCamera| Image::new(c.camera.width, c.camera.height);
+        Frames { t: Nanos(0), images: calibration.cameras.iter().map(shape).collect(), colours: Vec::new() }
+    }
+
+    /// The same, with colours of the first `cameras`.
+    pub fn in_colour(calibration: &Calibration, cameras: usize) -> Frames {
+        let mut frames = Frames::for_rig(calibration);
+        frames.colours = frames.images.iter().take(cameras).map(|i| std::array::from_fn(|_| i.clone())).collect();
+        frames
+    }
 }

@@ -113,12 +113,6 @@ pub struct Frames {
 }
 
 impl Frames {
-    /// Black images in the shape of a rig, so that reading into them allocates nothing.
-    pub fn for_rig(calibration: &crate::Calibration) -> Frames {
-        let shape = |c: &crate::RigCamera| Image::new(c.camera.width, c.camera.height);
-        Frames { t: Nanos(0), images: calibration.cameras.iter().map(shape).collect(), colours: Vec::new() }
-    }
-
     /// Copies frames of the same shape; allocates nothing.
     pub fn copy_from(&mut self, other: &Frames) {
         self.t = other.t;
@@ -126,13 +120,6 @@ impl Frames {
         for (to, from) in self.images.iter_mut().zip(&other.images).chain(colours) {
             to.copy_from(from);
         }
-    }
-
-    /// The same, with colours of the first `cameras`.
-    pub fn in_colour(calibration: &crate::Calibration, cameras: usize) -> Frames {
-        let mut frames = Frames::for_rig(calibration);
-        frames.colours = frames.images.iter().take(cameras).map(|i| std::array::from_fn(|_| i.clone())).collect();
-        frames
     }
 }
 

@@ -4,8 +4,7 @@
 //! things on it, a sofa, ...) put side by side along the walls and on a coarse grid inside; a set that would come nearer to
 //! the path than `KEEP_CLEAR` is left out.
 
-use super::light::LightMap;
-use super::room::{Light, Room, Shape, Solid};
+use super::room::{Light, LightMap, Room, Shape, Solid};
 use super::texture::Material::{
     Books, Brick, Concrete, Crate, Drawers, Leaves, Marble, Parquet, Plaid, Plaster, Poster, Print, Rug,
 };

@@ -4,12 +4,11 @@
 //! instant, and `write_euroc` writes them in the EuRoC ASL layout. Geometry is ray-cast analytically through the camera
 //! models that the estimator inverts, so any error that remains downstream is the estimator's. Errors of the sensors
 //! (`CameraErrors`, `ImuErrors`) are in their data and not in the calibration that is handed out. Read in this order:
-//! `scenario` (paths), `spline` (motion), `room` and `furnish` (geometry), `texture` and `light` (appearance), `render`
+//! `scenario` (paths), `spline` (motion), `room` and `furnish` (geometry), `texture` and `room::light` (appearance), `render`
 //! (images), `imu`.
 
 mod furnish;
 pub mod imu;
-mod light;
 mod recording;
 mod render;
 mod room;

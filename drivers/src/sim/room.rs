@@ -2,10 +2,13 @@
 //!
 //! A `Room` is one box seen from inside and solids in it: blocks (boxes turned about z), balls and drums (upright
 //! cylinders). `nearest` finds the face that a ray meets first, exactly. Furniture is in `furnish.rs`, baked light in
-//! `light.rs`, surface patterns in `texture.rs`. World frame: z up, metres, f32 (1e-7 of a metre is finer than any sensor
+//! `room/light.rs`, surface patterns in `texture.rs`. World frame: z up, metres, f32 (1e-7 of a metre is finer than any sensor
 //! here).
 
-use super::light::LightMap;
+mod light;
+
+pub use light::LightMap;
+
 use super::texture::Material;
 use glam::{Vec2, Vec3};
 

@@ -1,6 +1,5 @@
 //! Faults of system calls: which call failed on which device, and what to do about it.
 
-use super::find::Select;
 use crate::{Fault, FaultKind};
 use std::io;
 
@@ -8,12 +7,6 @@ use std::io;
 pub(super) fn refused(place: &str, purpose: &str, call: &str, e: &io::Error) -> Fault {
     let (kind, fix) = remedy(e);
     Fault::new(kind, place, format!("cannot {purpose}: {call}: {e}"), fix)
-}
-
-/// The fault of a camera that is not there.
-pub(super) fn no_camera(select: &Select, what: String) -> Fault {
-    let fix = "check its cable and power, and camera.devices in the board file";
-    Fault::new(FaultKind::Unavailable, select.to_string(), what, fix)
 }
 
 /// Whether the device behind a descriptor is gone.

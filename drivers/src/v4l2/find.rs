@@ -2,7 +2,7 @@
 //! a camera is named by the serial number of its USB device, by its place on the bus, or by a link that udev keeps; never by
 //! /dev/videoN.
 
-use super::fault::{no_camera, refused};
+use super::fault::refused;
 use super::kernel::{Kernel, Listed, Request};
 use super::uapi::*;
 use crate::{Fault, FaultKind};
@@ -106,6 +106,12 @@ pub(super) fn find(kernel: &dyn Kernel, select: &Select) -> Result<PathBuf, Faul
             Err(Fault::new(FaultKind::Config, select.to_string(), what, "name one by path:/dev/v4l/by-path/LINK"))
         }
     }
+}
+
+/// The fault of a camera that is not there.
+fn no_camera(select: &Select, what: String) -> Fault {
+    let fix = "check its cable and power, and camera.devices in the board file";
+    Fault::new(FaultKind::Unavailable, select.to_string(), what, fix)
 }
 
 fn ask(kernel: &dyn Kernel, listed: &Listed) -> Result<Candidate, Fault> {

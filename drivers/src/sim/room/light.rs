@@ -3,7 +3,7 @@
 //! The room does not change, so lamps (Lambert, inverse square, soft shadows) and the ambient term (occluded in corners and
 //! under furniture) are computed once; a pixel then costs one look-up.
 
-use super::room::{Face, Light, Room, Solid};
+use super::{Face, Light, Room, Solid};
 use glam::{Vec2, Vec3};
 
 /// The irradiance of all faces.
