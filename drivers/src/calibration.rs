@@ -14,7 +14,9 @@ use glam::{DMat3, DVec3};
 /// A camera of the rig: its lens, its pose and its timing.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RigCamera {
+    /// Size and lens.
     pub camera: Camera,
+    /// `body_from_cam`, m: the camera's frame is x right, y down, z forward, the body's that of the inertial unit.
     pub body_from_cam: Pose,
     /// The inertial unit's clock less the camera's.
     pub time_offset: Span,
@@ -47,11 +49,13 @@ impl RigCamera {
 /// The correction of a unit's readings: the true rate or force is `scale * reading - bias`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ImuCorrection {
-    /// Scale and misalignment of the axes.
+    /// Scale and misalignment of the gyro's axes.
     pub gyro_scale: DMat3,
+    /// Scale and misalignment of the accelerometer's axes.
     pub accel_scale: DMat3,
-    /// rad/s, m/s²
+    /// rad/s, of the gyro's axes.
     pub gyro_bias: DVec3,
+    /// m/s², of the accelerometer's axes.
     pub accel_bias: DVec3,
 }
 
@@ -87,16 +91,17 @@ impl ImuCorrection {
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ImuCalibration {
     pub rate_hz: f64,
-    /// rad/s/√Hz
+    /// White noise of the gyro, rad/s per √Hz.
     pub gyro_noise: f64,
-    /// rad/s²/√Hz
+    /// Random walk of the gyro's bias, rad/s per s and √Hz.
     pub gyro_walk: f64,
-    /// m/s²/√Hz
+    /// White noise of the accelerometer, m/s² per √Hz.
     pub accel_noise: f64,
-    /// m/s³/√Hz
+    /// Random walk of the accelerometer's bias, m/s² per s and √Hz.
     pub accel_walk: f64,
     /// Ends of the ranges of gyro and accelerometer, rad/s and m/s².
     pub range: [f64; 2],
+    /// Correction of readings that a source applies.
     pub correction: ImuCorrection,
 }
 
@@ -118,7 +123,9 @@ impl ImuCalibration {
 /// The calibration of a rig; the body frame is that of the inertial unit.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Calibration {
+    /// Cameras in the order of their images, cam0 first.
     pub cameras: Vec<RigCamera>,
+    /// The inertial unit, whose frame is the body's.
     pub imu: ImuCalibration,
 }
 

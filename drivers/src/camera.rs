@@ -29,12 +29,19 @@ pub enum Lens {
 /// A camera: size, focal lengths and principal point in pixels, and its lens.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Camera {
+    /// Columns, pixels.
     pub width: usize,
+    /// Rows, pixels.
     pub height: usize,
+    /// Focal length along x, px.
     pub fx: f64,
+    /// Focal length along y, px.
     pub fy: f64,
+    /// Column of the principal point, px.
     pub cx: f64,
+    /// Row of the principal point, px.
     pub cy: f64,
+    /// Distortion.
     pub lens: Lens,
 }
 

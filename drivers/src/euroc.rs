@@ -7,8 +7,9 @@ use glam::{DMat3, DVec3};
 use png::{BitDepth, ColorType, EncodingError};
 use std::io::{self, Write};
 
-/// Headlines of the tables of images and of inertial samples.
+/// Headline of the table of images.
 pub const IMAGE_COLUMNS: &str = "#timestamp [ns],filename\n";
+/// Headline of the table of inertial samples.
 pub const IMU_COLUMNS: &str = "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],\
                                a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]\n";
 

@@ -27,6 +27,7 @@ pub enum FaultKind {
 /// An error with its place, its cause and its remedy.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Fault {
+    /// What sort of thing went wrong.
     pub kind: FaultKind,
     /// File, file:line, key of a board file, or device.
     pub place: String,

@@ -23,34 +23,34 @@ mod c {
     use super::*;
 
     #[repr(C)]
-    pub struct Chip {
+    pub(super) struct Chip {
         _private: [u8; 0],
     }
 
     #[repr(C)]
-    pub struct Line {
+    pub(super) struct Line {
         _private: [u8; 0],
     }
 
     /// `struct gpiod_line_request_config`
     #[repr(C)]
-    pub struct Request {
-        pub consumer: *const c_char,
-        pub request_type: c_int,
-        pub flags: c_int,
+    pub(super) struct Request {
+        pub(super) consumer: *const c_char,
+        pub(super) request_type: c_int,
+        pub(super) flags: c_int,
     }
 
     /// `struct gpiod_line_event`
     #[repr(C)]
-    pub struct Event {
-        pub t: libc::timespec,
-        pub kind: c_int,
+    pub(super) struct Event {
+        pub(super) t: libc::timespec,
+        pub(super) kind: c_int,
     }
 
-    pub const DIRECTION_OUTPUT: c_int = 3;
-    pub const EVENT_FALLING: c_int = 4;
-    pub const EVENT_RISING: c_int = 5;
-    pub const ACTIVE_LOW: c_int = 4;
+    pub(super) const DIRECTION_OUTPUT: c_int = 3;
+    pub(super) const EVENT_FALLING: c_int = 4;
+    pub(super) const EVENT_RISING: c_int = 5;
+    pub(super) const ACTIVE_LOW: c_int = 4;
 
     /// In tests every call can be made to fail.
     #[cfg(test)]
@@ -62,14 +62,14 @@ mod c {
     #[cfg(not(test))]
     #[link(name = "gpiod")]
     extern "C" {
-        pub fn gpiod_chip_open_lookup(descr: *const c_char) -> *mut Chip;
-        pub fn gpiod_chip_close(chip: *mut Chip);
-        pub fn gpiod_chip_get_line(chip: *mut Chip, offset: c_uint) -> *mut Line;
-        pub fn gpiod_chip_find_line(chip: *mut Chip, name: *const c_char) -> *mut Line;
-        pub fn gpiod_line_request(line: *mut Line, config: *const Request, default: c_int) -> c_int;
-        pub fn gpiod_line_set_value(line: *mut Line, value: c_int) -> c_int;
-        pub fn gpiod_line_event_wait(line: *mut Line, timeout: *const libc::timespec) -> c_int;
-        pub fn gpiod_line_event_read_multiple(line: *mut Line, events: *mut Event, count: c_uint) -> c_int;
+        pub(super) fn gpiod_chip_open_lookup(descr: *const c_char) -> *mut Chip;
+        pub(super) fn gpiod_chip_close(chip: *mut Chip);
+        pub(super) fn gpiod_chip_get_line(chip: *mut Chip, offset: c_uint) -> *mut Line;
+        pub(super) fn gpiod_chip_find_line(chip: *mut Chip, name: *const c_char) -> *mut Line;
+        pub(super) fn gpiod_line_request(line: *mut Line, config: *const Request, default: c_int) -> c_int;
+        pub(super) fn gpiod_line_set_value(line: *mut Line, value: c_int) -> c_int;
+        pub(super) fn gpiod_line_event_wait(line: *mut Line, timeout: *const libc::timespec) -> c_int;
+        pub(super) fn gpiod_line_event_read_multiple(line: *mut Line, events: *mut Event, count: c_uint) -> c_int;
     }
 }
 
@@ -172,7 +172,7 @@ pub struct DataReady {
 const EVENTS: usize = 16;
 
 impl DataReady {
-    /// Requests the line for edges.
+    /// Requests the line for edges; a fault where it cannot be had.
     pub fn open(name: &LineName, edge: Edge) -> Result<DataReady, Fault> {
         let mut opened = DataReady { line: None, name: name.clone(), edge };
         opened.reopen().map_err(|EdgeFault(errno)| cannot_use(name, errno))?;
@@ -235,13 +235,14 @@ pub struct Output {
 }
 
 impl Output {
-    /// Requests the line, inactive at first.
+    /// Requests the line, inactive at first; a fault where it cannot be had.
     pub fn open(name: &LineName, active_low: bool) -> Result<Output, Fault> {
         let flags = if active_low { c::ACTIVE_LOW } else { 0 };
         let line = Line::request(name, c::DIRECTION_OUTPUT, flags).map_err(|errno| cannot_use(name, errno))?;
         Ok(Output { line, name: name.clone() })
     }
 
+    /// Makes the line active or inactive; a fault where the line is gone.
     pub fn set(&mut self, active: bool) -> Result<(), Fault> {
         // SAFETY: the line is requested for as long as `self` lives.
         match unsafe { c::gpiod_line_set_value(self.line.line, c_int::from(active)) } {
@@ -279,7 +280,7 @@ impl Trigger {
         missed
     }
 
-    /// Gives one pulse now; sleeps for its length.
+    /// Gives one pulse now; sleeps for its length. A fault where the line is gone.
     pub fn pulse(&mut self) -> Result<(), Fault> {
         self.line.set(true)?;
         std::thread::sleep(std::time::Duration::from_nanos(self.pulse.0.max(0) as u64));

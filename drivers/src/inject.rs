@@ -58,13 +58,14 @@ const COUNTERS: [[&str; 2]; 9] = [
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Rule {
+    /// What happens to a frame or sample that is struck.
     pub fault: Kind,
     /// The window in which it strikes, after the source's first stamp, s.
     #[serde(default)]
     pub start_s: f64,
     #[serde(default = "forever")]
     pub end_s: f64,
-    /// Probability with which each frame or sample in the window is struck.
+    /// Chance of each frame or sample in the window to be struck, a fraction.
     #[serde(default = "always")]
     pub probability: f64,
     /// How long it lasts once it strikes, s; 0: for the one frame or sample.

@@ -77,6 +77,7 @@ pub enum SourceFault {
 }
 
 impl SourceFault {
+    /// The fault behind it.
     pub fn fault(&self) -> &Fault {
         match self {
             SourceFault::Lost(fault) | SourceFault::Broken(fault) => fault,
@@ -96,6 +97,7 @@ impl std::error::Error for SourceFault {}
 /// An inertial sample with what its source knows beside it.
 #[derive(Clone, Copy, Debug, PartialEq, Default)]
 pub struct ImuReading {
+    /// Stamp, angular velocity and specific force.
     pub sample: ImuSample,
     pub temperature_c: Option<f32>,
     /// An axis stands at the end of its range.

@@ -54,14 +54,18 @@ impl std::ops::Sub<Span> for Nanos {
 /// One inertial sample in the body frame (body = IMU): angular velocity, rad/s, and specific force, m/s².
 #[derive(Clone, Copy, Debug, PartialEq, Default)]
 pub struct ImuSample {
+    /// When it was taken.
     pub t: Nanos,
+    /// Angular velocity in the body frame, rad/s.
     pub gyro_body: DVec3,
+    /// Specific force in the body frame, m/s².
     pub accel_body: DVec3,
     /// Whether gyro and accelerometer stand at the end of their range on an axis, so that what happened beyond is not known.
     pub saturated: [bool; 2],
 }
 
 impl ImuSample {
+    /// Whether all six numbers are finite.
     pub fn is_finite(&self) -> bool {
         self.gyro_body.is_finite() && self.accel_body.is_finite()
     }
@@ -70,8 +74,11 @@ impl ImuSample {
 /// An 8-bit grey image, row-major, stride = width. Integer pixel coordinates are pixel centres.
 #[derive(Clone, Debug, PartialEq, Eq, Default)]
 pub struct Image {
+    /// Columns, pixels.
     pub width: usize,
+    /// Rows, pixels.
     pub height: usize,
+    /// Grey levels, row after row.
     pub pixels: Vec<u8>,
 }
 
@@ -105,7 +112,9 @@ pub fn luma(r: u8, g: u8, b: u8) -> u8 {
 /// The images of all cameras of a rig at one mid-exposure instant `t`: `images[camera]`.
 #[derive(Clone, Debug, Default)]
 pub struct Frames {
+    /// Mid-exposure instant of the images.
     pub t: Nanos,
+    /// Grey images, one for each camera.
     pub images: Vec<Image>,
     /// Colours of the first cameras, where they are asked for; `images` are then their luma, which is all that tracking and
     /// stereo read.
@@ -126,8 +135,9 @@ impl Frames {
 /// A rigid transform `a_from_b`: `p_a = q * p_b + p`. `q` is kept normalised.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Pose {
+    /// Rotation `a_from_b`, of unit length.
     pub q: DQuat,
-    /// m
+    /// Origin of b in a, m.
     pub p: DVec3,
 }
 
@@ -161,6 +171,7 @@ impl Pose {
         Pose::new(self.q.slerp(other.q, s), self.p.lerp(other.p, s))
     }
 
+    /// Whether all numbers are finite.
     pub fn is_finite(&self) -> bool {
         self.q.is_finite() && self.p.is_finite()
     }
@@ -177,7 +188,9 @@ impl std::ops::Mul for Pose {
 /// A pose `world_from_body` at an instant, as in ground truth and trajectories.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct TimedPose {
+    /// When the body was there.
     pub t: Nanos,
+    /// `world_from_body`, m.
     pub pose: Pose,
 }
 

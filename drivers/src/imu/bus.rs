@@ -137,7 +137,8 @@ pub struct I2c {
 }
 
 impl I2c {
-    /// Opens the adapter `place` (a path, or its driver's name for it); nothing is sent yet.
+    /// Opens the adapter `place` (a path, or its driver's name for it); nothing is sent yet. A fault where it
+    /// is missing, refuses, or cannot burst a FIFO.
     pub fn open(place: &str, address: u16) -> Result<I2c, Fault> {
         I2c::open_in(place, address, ioctl)
     }
@@ -262,6 +263,7 @@ pub struct Spi {
 
 impl Spi {
     /// Opens a spidev node with a clock of `hz`; `dummy` bytes stand between address and data of a read.
+    /// A fault where the node is missing or refuses.
     pub fn open(path: &str, hz: u32, dummy: usize) -> Result<Spi, Fault> {
         Spi::open_in(path, hz, dummy, ioctl)
     }

@@ -10,7 +10,9 @@ use crate::types::{Nanos, Span};
 
 /// A die and its bus.
 pub struct Die {
+    /// The wires to it, and the clock it is read by.
     pub bus: Box<dyn Bus>,
+    /// The table of its chip.
     pub spec: &'static DieSpec,
     /// Steps from idle to sampling.
     configure: Vec<Step>,
@@ -27,8 +29,11 @@ pub struct Die {
 /// A burst: the FIFO was counted between two instants, and `parsed` says what it held beside samples.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Burst {
+    /// Instant before the count was read.
     pub before: Nanos,
+    /// Instant after the count was read.
     pub after: Nanos,
+    /// What the burst held beside samples.
     pub parsed: Parsed,
 }
 
@@ -36,6 +41,7 @@ pub struct Burst {
 const UPLOAD_CHUNK: usize = 32;
 
 impl Die {
+    /// A die that is not started yet; `upload` is its configuration file, empty where it needs none.
     pub fn new(bus: Box<dyn Bus>, spec: &'static DieSpec, setting: &Setting, upload: Vec<u8>) -> Die {
         let (configure, parser) = ((spec.configure)(setting), Parser::new(spec.fifo.layout, spec.big_endian));
         Die { bus, spec, configure, upload, bank: None, parser, buffer: Box::new([0; TRANSFER_MAX]), cross_axis: 0 }
@@ -58,17 +64,20 @@ impl Die {
         self.bus.read(address, into)
     }
 
+    /// Reads one register; fails as the bus does.
     pub fn read_byte(&mut self, register: Reg) -> Result<u8, BusFault> {
         let mut byte = [0];
         self.read_into(register, &mut byte)?;
         Ok(byte[0])
     }
 
+    /// Writes one register; fails as the bus does.
     pub fn write(&mut self, register: Reg, value: u8) -> Result<(), BusFault> {
         let address = self.select(register)?;
         self.bus.write(address, &[value])
     }
 
+    /// Takes steps in order, up to the first that fails.
     pub fn run(&mut self, steps: &[Step]) -> Result<(), ImuError> {
         steps.iter().try_for_each(|step| self.step(*step))
     }
@@ -217,14 +226,15 @@ impl Die {
         }
     }
 
-    /// The newest sample of one sensor, counts, from its registers.
+    /// The newest sample of one sensor, counts, from its registers; fails as the bus does.
     pub fn newest(&mut self, sensor: &SensorSpec) -> Result<[i16; 3], BusFault> {
         let mut bytes = [0; 6];
         self.read_into(sensor.data, &mut bytes)?;
         Ok(triple(&bytes, 0, self.spec.big_endian))
     }
 
-    /// The temperature, °C, of a die that does not put it into its FIFO; `None` where it is not known.
+    /// The temperature, °C, of a die that does not put it into its FIFO; `None` where it is not known. Fails as
+    /// the bus does.
     pub fn temperature(&mut self) -> Result<Option<f32>, BusFault> {
         let mut word = [0; 2];
         let (word, shift) = match self.spec.temperature.from {

@@ -45,6 +45,7 @@ impl EdgeQueue {
         &self.stamps
     }
 
+    /// Forgets all edges that wait.
     pub fn clear(&mut self) {
         self.stamps.clear();
     }

@@ -8,8 +8,11 @@ use super::chips::Layout;
 /// One sample, in counts. A die with one sensor fills one of the two.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Default)]
 pub struct Raw {
+    /// Acceleration, counts.
     pub accel: Option<[i16; 3]>,
+    /// Angular velocity, counts.
     pub gyro: Option<[i16; 3]>,
+    /// Temperature, counts.
     pub temperature: Option<i16>,
 }
 
@@ -47,6 +50,7 @@ pub fn triple(bytes: &[u8], at: usize, big_endian: bool) -> [i16; 3] {
 }
 
 impl Parser {
+    /// A parser of a FIFO of this layout that has seen nothing yet.
     pub fn new(layout: Layout, big_endian: bool) -> Parser {
         Parser { layout, big_endian, half: None, temperature: None }
     }

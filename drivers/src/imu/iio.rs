@@ -41,8 +41,9 @@ pub struct IioOptions {
     pub rate_hz: f64,
     /// Equal values in a row that are no coincidence; 0: never.
     pub frozen_samples: u32,
-    /// Where sysfs lists the devices, and where their nodes are.
+    /// Where sysfs lists the devices.
     pub sysfs: PathBuf,
+    /// Where their nodes are: /dev.
     pub dev: PathBuf,
 }
 
@@ -73,7 +74,7 @@ pub struct IioImu {
 }
 
 impl IioImu {
-    /// Finds the devices, sets them and starts their buffers.
+    /// Finds the devices, sets them and starts their buffers; a fault where one is missing or refuses a setting.
     pub fn open(options: &IioOptions) -> Result<IioImu, Fault> {
         let wanted = [&options.device, &options.accel_device];
         let streams = wanted.iter().filter(|w| !w.is_empty()).map(|w| Stream::open(options, w));

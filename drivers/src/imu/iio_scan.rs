@@ -11,12 +11,17 @@ use glam::DVec3;
 /// How a channel is stored, as its `_type` says.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Storage {
+    /// Whether the high byte comes first.
     pub big_endian: bool,
+    /// Whether values are in two's complement.
     pub signed: bool,
+    /// Bits of the value.
     pub bits: u32,
     /// Bytes of one value.
     pub bytes: usize,
+    /// Values stored one after another, of which the first counts.
     pub repeat: usize,
+    /// Bits below the value, which do not count.
     pub shift: u32,
 }
 
@@ -91,10 +96,15 @@ pub fn channel(name: &str) -> Channel {
 /// A channel as its files describe it; its value is (raw + offset) * scale in the kernel's units (rad/s, m/s², m°C, ns).
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Element {
+    /// What it measures.
     pub channel: Channel,
+    /// Place in the order of the scan.
     pub index: u32,
+    /// How it is stored.
     pub storage: Storage,
+    /// Added to the raw value, in its units.
     pub offset: f64,
+    /// Kernel's units of one count.
     pub scale: f64,
 }
 
@@ -107,6 +117,7 @@ pub struct Scan {
 }
 
 impl Scan {
+    /// The scan of these elements, which may come in any order.
     pub fn new(mut elements: Vec<Element>) -> Scan {
         elements.sort_by_key(|e| e.index);
         let mut at = 0usize;

@@ -10,10 +10,14 @@ use std::collections::VecDeque;
 /// A sample of a unit, or of half of one: rad/s, m/s².
 #[derive(Clone, Copy, Debug, PartialEq, Default)]
 pub struct Reading {
+    /// Instant of the sample.
     pub t: Nanos,
+    /// Angular velocity in the body frame, rad/s.
     pub gyro: Option<DVec3>,
+    /// Specific force in the body frame, m/s².
     pub accel: Option<DVec3>,
     pub temperature_c: Option<f32>,
+    /// An axis stands at the end of its range.
     pub saturated: bool,
 }
 
@@ -49,6 +53,7 @@ pub struct Merge {
 }
 
 impl Merge {
+    /// A merge of a gyro with an accelerometer of this period.
     pub fn new(accel_period: Span) -> Merge {
         // Three periods: a sample lost here and there is no hole.
         let hole = Span(accel_period.0.saturating_mul(3));
@@ -56,6 +61,7 @@ impl Merge {
         Merge { gyro: queue(), accel: queue(), hole, temperature_c: None, unpaired: 0 }
     }
 
+    /// Forgets the halves that wait; gyro samples among them count as unpaired.
     pub fn clear(&mut self) {
         self.unpaired += self.gyro.len() as u64;
         self.gyro.clear();

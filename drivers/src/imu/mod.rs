@@ -51,7 +51,7 @@ pub enum ImuOptions {
 
 impl ImuOptions {
     /// Opens the unit. `data_ready` is the line on which a unit that is driven by its registers says that a sample is ready,
-    /// where that is wired; the kernel's driver has a line of its own.
+    /// where that is wired; the kernel's driver has a line of its own. A fault where the unit is missing or fails its test.
     pub fn open(&self, data_ready: Option<DataReady>) -> Result<HardwareImu, Fault> {
         Ok(match self {
             ImuOptions::Register(options) => HardwareImu::Register(Box::new(options.open(data_ready)?)),
@@ -110,6 +110,7 @@ pub struct RegisterOptions {
     /// The smallest ranges that hold these are taken.
     pub accel_range_g: f64,
     pub gyro_range_dps: f64,
+    /// Whether the unit tests itself before it starts; the board must stand still meanwhile.
     pub self_test: bool,
     /// File of the BMI270's configuration; empty for other chips.
     pub configuration: PathBuf,
@@ -118,7 +119,7 @@ pub struct RegisterOptions {
 }
 
 impl RegisterOptions {
-    /// Opens the buses, tests the unit where that is asked for, and starts it.
+    /// Opens the buses, tests the unit where that is asked for, and starts it. A fault where one of these fails.
     pub fn open(&self, data_ready: Option<DataReady>) -> Result<RegisterImu, Fault> {
         let chip = Chip::named(&self.chip)?;
         if self.wiring.len() != chip.dies.len() {

@@ -30,9 +30,9 @@ const SLIP_MIN: f64 = 0.1;
 pub struct ClockReport {
     /// Sample rate by the host's clock.
     pub rate_hz: f64,
-    /// Deviation of that from the nominal rate: a positive one runs fast.
+    /// Deviation of that from the nominal rate, a ratio in 1e-6: a positive one runs fast.
     pub drift_ppm: f64,
-    /// Standard deviation of the drift.
+    /// Standard deviation of the drift, a ratio in 1e-6.
     pub sigma_ppm: f64,
 }
 
@@ -53,6 +53,7 @@ pub struct Timeline {
 }
 
 impl Timeline {
+    /// A line that knows the nominal period and no sample yet.
     pub fn new(nominal: Span) -> Timeline {
         let nominal = nominal.0.max(1) as f64;
         let var = [0.0, (PERIOD_SIGMA * nominal).powi(2), 0.0];

@@ -54,7 +54,9 @@ impl Axes {
 
 /// A die, its clock and its sensors.
 pub struct Unit {
+    /// The die that is read.
     pub die: Die,
+    /// The estimate of its clock.
     pub line: Timeline,
     accel: Option<Axes>,
     gyro: Option<Axes>,
@@ -68,6 +70,7 @@ pub struct Unit {
 }
 
 impl Unit {
+    /// A unit that is not started yet, of the rate, Hz, that its setting gives.
     pub fn new(die: Die, setting: &Setting, rate_hz: f64, frozen_samples: u32) -> Unit {
         let axes = |name, si, sensor: &Option<SensorSpec>, code| {
             sensor.as_ref().map(|sensor: &SensorSpec| Axes::new(name, si, sensor.range(code)))

@@ -82,6 +82,7 @@ pub struct Recorder {
 /// The outcome of a recording.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Recorded {
+    /// Counters of the recording, by name.
     pub counters: Vec<(&'static str, u64)>,
     /// The first failure to write, if there was one.
     pub failure: Option<String>,
@@ -113,7 +114,7 @@ impl Taps {
     }
 }
 
-/// Makes the folder `dir`, which must not exist or be empty, ready for a recording.
+/// Makes the folder `dir`, which must not exist or be empty, ready for a recording; a fault where that fails.
 pub fn open(dir: &Path, format: Format, calibration: &Calibration) -> Result<Box<dyn Sink>, Fault> {
     let fault = |e: io::Error| {
         let fix = "choose a folder that can be written to and has room";

@@ -34,12 +34,13 @@ pub const IMU_DEFAULTS: ImuCalibration = ImuCalibration {
 /// Longest readout, s: a camera of one frame a second has no longer one.
 const READOUT_MAX: f64 = 1.0;
 
-/// Reads a Kalibr camchain.yaml, a Basalt json, or a EuRoC `mav0` folder.
+/// Reads a Kalibr camchain.yaml, a Basalt json, or a EuRoC `mav0` folder; a fault where anything in it is wrong.
 pub fn read_calibration(path: &Path) -> Result<Calibration, Fault> {
     read(path, None, &mut Findings::default())
 }
 
-/// Reads a calibration file or folder; `readout` is the readout time that the board file states.
+/// Reads a calibration file or folder; `readout` is the readout time that the board file states. A
+/// fault names the file, the line and the key.
 pub fn read(path: &Path, readout: Option<Span>, findings: &mut Findings) -> Result<Calibration, Fault> {
     let mut calibration = if path.is_dir() {
         euroc(path, readout, findings)?

@@ -18,7 +18,8 @@ fn number(name: &str) -> Option<usize> {
     digits.bytes().all(|b| b.is_ascii_digit()).then(|| digits.parse().ok())?
 }
 
-/// The number of camera folders in `mav0`; one at least, as a recording without any lacks cam0.
+/// The number of camera folders in `mav0`; one at least, as a recording without any lacks cam0. A fault where there are
+/// more than a rig may have.
 pub fn recorded(mav0: &Path) -> Result<usize, Fault> {
     let entries = std::fs::read_dir(mav0).map_err(|e| {
         Fault::new(FaultKind::NoInput, mav0.display().to_string(), format!("cannot read: {e}"), "check the path")

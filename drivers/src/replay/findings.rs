@@ -38,7 +38,9 @@ crate::counters! {
 /// Warnings, each "file:line: what", and counters.
 #[derive(Clone, Debug, Default)]
 pub struct Findings {
+    /// Warnings in the order in which they were met.
     pub warnings: Vec<String>,
+    /// Counters of all faults, those without a warning included.
     pub counters: ReplayCounters,
 }
 

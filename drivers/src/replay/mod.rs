@@ -53,18 +53,22 @@ impl Default for OpenOptions {
 /// unit's axes is applied: stamps of images are in the inertial unit's clock, samples are corrected.
 #[derive(Clone, Debug)]
 pub struct Recording {
+    /// The calibration that was applied.
     pub calibration: Calibration,
+    /// Inertial samples, corrected.
     pub imu: Vec<ImuSample>,
+    /// Frames in the order of their stamps.
     pub frames: Vec<FrameFiles>,
     /// Ground truth, `world_from_body`; empty where the recording has none.
     pub truth: Vec<TimedPose>,
     /// "file:line: what", at most `findings::WARNINGS_OF_A_KIND` of each kind.
     pub warnings: Vec<String>,
+    /// Counters of what was wrong.
     pub counters: ReplayCounters,
 }
 
 impl Recording {
-    /// Opens a folder that holds `mav0/`, or `mav0/` itself.
+    /// Opens a folder that holds `mav0/`, or `mav0/` itself. A fault where the whole recording is of no use.
     pub fn open(dataset: &Path, options: &OpenOptions) -> Result<Recording, Fault> {
         let (home, mav0) = layout(dataset)?;
         let mut findings = Findings::default();

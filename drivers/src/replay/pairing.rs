@@ -11,16 +11,20 @@ use std::sync::Arc;
 /// An image file, and the table and line that list it.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ImageFile {
+    /// The image.
     pub path: PathBuf,
     /// The csv that lists it.
     pub list: Arc<Path>,
+    /// The line of `list`, from 1.
     pub line: usize,
 }
 
 /// One image of every camera, taken together; `t` is camera 0's stamp in the inertial unit's clock.
 #[derive(Clone, Debug, PartialEq)]
 pub struct FrameFiles {
+    /// Camera 0's stamp, in the inertial unit's clock.
     pub t: Nanos,
+    /// The files, one for each camera.
     pub images: Vec<ImageFile>,
 }
 

@@ -9,7 +9,9 @@ use std::path::Path;
 /// A row, and the line of the file in which it stands, from 1.
 #[derive(Clone, Debug)]
 pub struct Row<T> {
+    /// The line, from 1.
     pub line: usize,
+    /// What the row says.
     pub value: T,
 }
 
@@ -26,7 +28,7 @@ pub fn read_strictly<T>(
     Ok(rows)
 }
 
-/// Reads a file that must exist.
+/// Reads a file; a fault where that fails.
 pub fn read_bytes(path: &Path) -> Result<Vec<u8>, Fault> {
     std::fs::read(path).map_err(|e| {
         let fix = "check the path and that the recording is complete";

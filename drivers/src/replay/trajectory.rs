@@ -10,14 +10,15 @@ use std::path::Path;
 
 const COLUMNS: &str = "stamp, x y z, unit quaternion (wxyz and ns between commas; xyzw and s between blanks)";
 
-/// Reads a table of `world_from_body` poses. Nothing may be wrong in it, as a caller has no way to learn of it later.
+/// Reads a table of `world_from_body` poses. Nothing may be wrong in it, as a caller has no way to learn of it later: the
+/// first finding is a fault.
 pub fn read_trajectory(path: &Path) -> Result<Vec<TimedPose>, Fault> {
     let mut findings = Findings::default();
     let poses = read(path, &mut findings)?;
     findings.refuse_any().map(|()| poses)
 }
 
-/// Reads a table of poses; rows that are wrong are dropped.
+/// Reads a table of poses; rows that are wrong are dropped, and none left is a fault.
 pub fn read(path: &Path, findings: &mut Findings) -> Result<Vec<TimedPose>, Fault> {
     let is_tum = |text: &[u8]| !text.split(|b| *b == b'\n').any(|l| !l.starts_with(b"#") && l.contains(&b','));
     let tum = is_tum(&table::read_bytes(path)?);

@@ -15,11 +15,13 @@ pub const GRAVITY: DVec3 = DVec3::new(0.0, 0.0, -9.81);
 /// Errors of an inertial unit that its calibration file does not state.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ImuErrors {
-    /// Standard deviations of the biases at the start: rad/s, m/s².
+    /// Standard deviation of the gyro's biases at the start, rad/s.
     pub gyro_bias: f64,
+    /// Standard deviation of the accelerometer's biases at the start, m/s².
     pub accel_bias: f64,
-    /// Range of an axis: rad/s, m/s².
+    /// Range of an axis of the gyro, rad/s.
     pub gyro_max: f64,
+    /// Range of an axis of the accelerometer, m/s².
     pub accel_max: f64,
     /// The correction of scales and misalignments that would make the readings right.
     pub axes: ImuCorrection,
@@ -39,8 +41,11 @@ impl ImuErrors {
 /// True biases at an instant: rad/s, m/s².
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Bias {
+    /// Instant by the unit's clock.
     pub t: Nanos,
+    /// Bias of the gyro in the body frame, rad/s.
     pub gyro: DVec3,
+    /// Bias of the accelerometer in the body frame, m/s².
     pub accel: DVec3,
 }
 

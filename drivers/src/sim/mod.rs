@@ -53,8 +53,11 @@ const METER_PERIOD: f64 = 0.5;
 pub struct State {
     /// `world_from_body`
     pub pose: Pose,
+    /// Velocity in the world frame, m/s.
     pub v_world: DVec3,
+    /// Bias of the gyro in the body frame, rad/s.
     pub gyro_bias: DVec3,
+    /// Bias of the accelerometer in the body frame, m/s².
     pub accel_bias: DVec3,
 }
 
@@ -82,12 +85,13 @@ pub struct Sim {
 }
 
 impl Sim {
-    /// Makes a scenario ready; renders with as many threads as the machine has.
+    /// Makes a scenario ready; renders with as many threads as the machine has. A fault where the
+    /// scenario makes no sense.
     pub fn new(scenario: &Scenario) -> Result<Sim, Fault> {
         Sim::with_threads(scenario, std::thread::available_parallelism().map_or(1, |n| n.get()))
     }
 
-    /// Makes a scenario ready; the images do not depend on `threads`.
+    /// Makes a scenario ready; the images do not depend on `threads`. A fault as of `new`.
     pub fn with_threads(scenario: &Scenario, threads: usize) -> Result<Sim, Fault> {
         check(scenario)?;
         let rig = scenario.rig();

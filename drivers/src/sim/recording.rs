@@ -19,7 +19,7 @@ use std::path::Path;
 /// EuRoC stay below 0.08.
 const JUMP: f64 = 0.2;
 
-/// Reads the path, and the real inertial samples where their file is given.
+/// Reads the path, and the real inertial samples where their file is given; a fault where a row is wrong.
 pub fn read(truth: &Path, imu: Option<&Path>) -> Result<Recording, Fault> {
     let mut recording = Recording { poses: Vec::new(), biases: Vec::new(), imu: None };
     let mut shift = DVec3::ZERO;

@@ -22,12 +22,12 @@ const EDGE: usize = 4;
 const ROLL_MOVE: f32 = 0.02;
 const ROLL_TURN: f32 = 0.02;
 
-/// The sensor behind the lens. Grey levels (DN) are those of the 8-bit image.
+/// The sensor behind the lens. Grey levels are those of the 8-bit image.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Sensor {
-    /// Standard deviation of the read noise, DN.
+    /// Standard deviation of the read noise, grey levels.
     pub read_noise: f64,
-    /// Variance of the shot noise per grey level, DN.
+    /// Variance of the shot noise per grey level, grey levels.
     pub shot_noise: f64,
     /// Light lost at the edge of a field of view of 45° half angle, fraction.
     pub vignette: f64,
@@ -38,6 +38,7 @@ pub struct Sensor {
 pub struct Hit {
     /// Along the unit ray, m.
     pub distance: f32,
+    /// Index in `Room::faces`, or `NOTHING`.
     pub face: u32,
 }
 
@@ -62,11 +63,14 @@ struct Cone {
 /// A camera at an instant, in the room's frame.
 #[derive(Clone, Copy)]
 pub struct View {
+    /// Centre of the camera in the world frame, m.
     pub origin: Vec3,
+    /// `world_from_cam`.
     pub turn: Quat,
 }
 
 impl View {
+    /// The view of a camera's pose.
     pub fn new(world_from_cam: &Pose) -> View {
         View { origin: world_from_cam.p.as_vec3(), turn: world_from_cam.q.as_quat() }
     }
@@ -75,9 +79,11 @@ impl View {
 /// The view and the exposure of a row.
 #[derive(Clone, Copy)]
 pub struct Row {
+    /// Pose of the camera when the row is exposed.
     pub view: View,
-    /// Grey levels per unit of radiance, and grey levels added.
+    /// Grey levels per unit of radiance.
     pub gain: f32,
+    /// Added to every pixel, grey levels.
     pub offset: f32,
 }
 
@@ -99,6 +105,7 @@ impl Rows<'_> {
 /// The sensor and the noise stream of one image.
 #[derive(Clone, Copy)]
 pub struct Exposure {
+    /// Noise and vignette.
     pub sensor: Sensor,
     /// Differs for every image of a run.
     pub stream: u32,
@@ -120,6 +127,7 @@ struct Seen {
 /// Memory that is reused between frames: nothing here allocates after construction.
 pub struct Scratch {
     lists: Vec<Lists>,
+    /// What each pixel saw in the last `cast`, row-major.
     pub hits: Vec<Hit>,
 }
 
@@ -146,6 +154,7 @@ impl Lists {
 }
 
 impl Scratch {
+    /// Memory for images of at most so many pixels, and for so many threads.
     pub fn new(room: &Room, pixels: usize, threads: usize) -> Scratch {
         let n = room.solids.len();
         Scratch {
@@ -158,6 +167,7 @@ impl Scratch {
 }
 
 impl Lens {
+    /// Bearings of a camera, one for each pixel.
     pub fn new(camera: &Camera) -> Lens {
         let (width, height) = (camera.width, camera.height);
         let at = |i: usize| camera.unproject(DVec2::new((i % width) as f64, (i / width) as f64));

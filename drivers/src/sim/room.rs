@@ -26,14 +26,17 @@ pub enum Shape {
 /// A piece of furniture, or a part of one.
 #[derive(Clone, Copy, Debug)]
 pub struct Solid {
+    /// Shape in the solid's own frame.
     pub shape: Shape,
+    /// Centre in the world frame, m.
     pub centre: Vec3,
-    /// Rotation about z.
+    /// Cosine of the rotation about z, a ratio.
     pub cos: f32,
+    /// Sine of the rotation about z, a ratio.
     pub sin: f32,
     /// Index of its first face; a block has six, a ball one, a drum three: side, top, bottom.
     pub face: u32,
-    /// Radius of the bounding sphere.
+    /// Radius of the bounding sphere, m.
     pub bound: f32,
 }
 
@@ -59,25 +62,33 @@ pub enum Chart {
 /// A surface with its material.
 #[derive(Clone, Copy, Debug)]
 pub struct Face {
+    /// Where it lies, and its surface coordinates.
     pub chart: Chart,
     /// Extent along u and v, m.
     pub size: Vec2,
+    /// Pattern of the surface.
     pub material: Material,
+    /// Seed of the pattern.
     pub seed: u32,
 }
 
 /// Surface coordinate, m, outward normal and tangents at a point.
 #[derive(Clone, Copy, Debug)]
 pub struct Place {
+    /// Surface coordinate, m.
     pub at: Vec2,
+    /// Outward unit normal.
     pub normal: Vec3,
+    /// Tangent along the first coordinate.
     pub u: Vec3,
+    /// Tangent along the second coordinate.
     pub v: Vec3,
 }
 
 /// A lamp.
 #[derive(Clone, Copy, Debug)]
 pub struct Light {
+    /// Place in the world frame, m.
     pub at: Vec3,
     /// Radiant intensity, in units in which 1 at 1 m lights a white surface fully.
     pub power: f32,
@@ -85,12 +96,17 @@ pub struct Light {
 
 /// A box seen from inside, its furniture and its light.
 pub struct Room {
+    /// Corner of least coordinates, m.
     pub low: Vec3,
+    /// Corner of largest coordinates, m.
     pub high: Vec3,
+    /// Furniture.
     pub solids: Vec<Solid>,
     /// The first six are the room's: -x, +x, -y, +y, floor, ceiling.
     pub faces: Vec<Face>,
+    /// Lamps.
     pub lights: Vec<Light>,
+    /// Light of the lamps on every face.
     pub light_map: LightMap,
 }
 

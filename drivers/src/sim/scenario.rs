@@ -17,7 +17,9 @@ use std::path::Path;
 /// A flight to simulate.
 #[derive(Clone, Debug)]
 pub struct Scenario {
+    /// Name in messages.
     pub name: String,
+    /// Seed of all that is random: furniture, patterns, noise.
     pub seed: u64,
     /// Length of the run; a recorded path may end sooner.
     pub duration: Span,
@@ -27,10 +29,15 @@ pub struct Scenario {
     pub calibration: Calibration,
     /// Images are made this many times smaller on each side.
     pub image_divisor: usize,
+    /// Noise and vignette of the sensors.
     pub sensor: Sensor,
+    /// Changes of the exposure.
     pub light: Light,
+    /// Errors of the cameras beyond the calibration.
     pub camera_errors: CameraErrors,
+    /// Errors of the inertial unit beyond the calibration.
     pub imu_errors: ImuErrors,
+    /// Path of the body.
     pub path: Flight,
 }
 
@@ -49,7 +56,7 @@ pub struct CameraErrors {
 pub struct Light {
     /// Steps, each with its instant of the run, the factor of the exposure from then on, and grey levels added.
     pub steps: Vec<(Span, f64, f64)>,
-    /// Flicker of the lamps: share of the light that comes and goes, and its frequency.
+    /// Flicker of the lamps: the fraction of the light that comes and goes.
     pub flicker: f64,
     pub flicker_hz: f64,
 }
@@ -119,7 +126,7 @@ impl Scenario {
     }
 
     /// The flight of a EuRoC `state_groundtruth_estimate0` csv, with the inertial samples of `imu` (EuRoC `imu0` csv) or,
-    /// without it, simulated along the smoothed path.
+    /// without it, simulated along the smoothed path. A fault where a file cannot be read.
     pub fn from_euroc(truth: &Path, imu: Option<&Path>) -> Result<Scenario, Fault> {
         let recording = recording::read(truth, imu)?;
         let span = |p: &[TimedPose]| p.last().map_or(0.0, |l| (l.t - p[0].t).secs());

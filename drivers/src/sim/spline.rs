@@ -23,9 +23,13 @@ pub struct Spline {
 /// The motion at one instant: m, m/s, m/s², rad/s.
 #[derive(Clone, Copy, Debug)]
 pub struct Motion {
+    /// `world_from_body`, m.
     pub pose: Pose,
+    /// Velocity in the world frame, m/s.
     pub v_world: DVec3,
+    /// Acceleration in the world frame, m/s².
     pub a_world: DVec3,
+    /// Angular velocity in the body frame, rad/s.
     pub gyro_body: DVec3,
 }
 

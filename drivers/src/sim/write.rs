@@ -19,7 +19,7 @@ pub fn write_euroc(sim: &mut Sim, dir: &Path, progress: impl FnMut(usize, usize)
     write_shaped(sim, dir, frames, progress)
 }
 
-/// Writes all frames as `write_euroc` does, with images in colour.
+/// Writes all frames as `write_euroc` does, with images in colour. A fault as of `write_euroc`.
 pub fn write_euroc_colour(sim: &mut Sim, dir: &Path, progress: impl FnMut(usize, usize)) -> Result<(), Fault> {
     let frames = Frames::in_colour(sim.calibration(), sim.calibration().cameras.len());
     write_shaped(sim, dir, frames, progress)

@@ -56,6 +56,7 @@ impl Request<'_> {
 /// A video node of this machine.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Listed {
+    /// The node, such as /dev/video0.
     pub path: PathBuf,
     /// Serial number of the USB device behind it.
     pub serial: Option<String>,
@@ -64,6 +65,7 @@ pub(super) struct Listed {
 /// The answer of poll for one descriptor.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(super) struct Ready {
+    /// A filled buffer waits.
     pub readable: bool,
     /// POLLERR or POLLHUP: not streaming, or gone.
     pub error: bool,

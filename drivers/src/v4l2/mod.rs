@@ -43,8 +43,9 @@ pub struct Settings {
     pub devices: Vec<Select>,
     /// `None`: the first of the formats, in the order of `Format`, that the camera has in its size.
     pub format: Option<Format>,
-    /// Size of one camera's picture, pixels.
+    /// Columns of one camera's picture, pixels.
     pub width: usize,
+    /// Rows of one camera's picture, pixels.
     pub height: usize,
     pub rate_hz: f64,
     /// Zero: as the camera has it.
@@ -53,6 +54,7 @@ pub struct Settings {
     pub exposure_line: Span,
     /// Other controls, by the names of `v4l2-ctl --list-ctrls`: gain, black level, trigger.
     pub controls: Vec<(String, i64)>,
+    /// Event that the driver stamps.
     pub stamp: StampPoint,
     /// From the end of the first row's exposure until the last row was received.
     pub transfer: Span,

@@ -30,11 +30,13 @@ const BUFFERS_MAX: u32 = 32;
 /// A node that streams.
 pub(super) struct Node {
     kernel: Arc<dyn Kernel>,
+    /// Descriptor of the open node.
     pub fd: i32,
     /// Path, and the camera's own name, for messages.
     pub name: String,
     /// `CAPTURE` or `CAPTURE_MULTI`.
     kind: u32,
+    /// Format of its pictures.
     pub format: Format,
     /// The whole picture.
     pub part: Part,
@@ -70,7 +72,9 @@ pub(super) struct Filled {
     index: u32,
     start: usize,
     bytes: usize,
+    /// Number of the frame by the driver's count.
     pub sequence: u32,
+    /// Flags of the buffer: clock and event of the stamp.
     pub flags: u32,
     pub stamp_s: i64,
     pub stamp_us: i64,
@@ -88,7 +92,9 @@ pub(super) enum Taken {
 
 /// A system call that failed while streaming.
 pub(super) struct Failure {
+    /// Name of the call in the documentation.
     pub call: &'static str,
+    /// What the kernel answered.
     pub error: io::Error,
 }
 

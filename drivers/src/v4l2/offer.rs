@@ -10,6 +10,7 @@ const ENTRIES_MAX: u32 = 256;
 
 /// One format that a camera offers.
 pub(super) struct Offer {
+    /// Code of the format.
     pub fourcc: u32,
     /// Empty where the driver does not list them: then any may be asked for.
     sizes: Vec<FrameSize>,

@@ -74,8 +74,9 @@ impl Format {
 pub(super) struct Part {
     /// First column.
     pub x: usize,
-    /// Size of the whole picture; the image that is written gives that of the part.
+    /// Columns of the whole picture, pixels; the image that is written gives those of the part.
     pub width: usize,
+    /// Rows of the whole picture, pixels.
     pub height: usize,
     /// Bytes from row to row.
     pub stride: usize,

@@ -45,7 +45,7 @@ pub struct Rig {
 }
 
 impl Rig {
-    /// Finds, sets and starts the cameras of `calibration`.
+    /// Finds, sets and starts the cameras of `calibration`; a fault where one is missing or refuses a setting.
     pub fn open(settings: Settings, calibration: &Calibration) -> Result<Rig, Fault> {
         Rig::open_in(Arc::new(Linux), settings, calibration)
     }

@@ -24,7 +24,9 @@ pub enum StampPoint {
 /// What is needed to make mid-exposure stamps of a driver's.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Timing {
+    /// Event that the driver stamps.
     pub point: StampPoint,
+    /// Length of a row's exposure.
     pub exposure: Span,
     /// From the end of the first row's exposure until the last row was received.
     pub transfer: Span,

@@ -22,13 +22,17 @@ const ERRORS_MAX: u32 = 8;
 
 /// An image that still lies in the kernel's buffer; `t` is in the calibration's clock.
 pub(super) struct Held {
+    /// The buffer.
     pub filled: Filled,
+    /// Mid-exposure instant in the calibration's clock.
     pub t: Nanos,
 }
 
 /// A node and its held images, oldest first.
 pub(super) struct Stream {
+    /// The node that streams.
     pub node: Node,
+    /// Images that wait for their partners, oldest first.
     pub held: VecDeque<Held>,
     timing: Timing,
     gaps: Gaps,

@@ -53,9 +53,11 @@ pub const fn banked(bank: u8, address: u8) -> Reg {
 
 /// What there is to know of one die.
 pub struct DieSpec {
+    /// The name in messages.
     pub name: &'static str,
     /// WHO_AM_I, and its possible answers.
     pub who: Reg,
+    /// Answers to WHO_AM_I that mean this die.
     pub who_answers: &'static [u8],
     /// The register that selects a bank, and the shift of the bank's number in it.
     pub bank_select: Option<(u8, u32)>,
@@ -63,10 +65,15 @@ pub struct DieSpec {
     pub spi_dummy: usize,
     /// Byte order of all words.
     pub big_endian: bool,
+    /// The accelerometer, if it has one.
     pub accel: Option<SensorSpec>,
+    /// The gyro, if it has one.
     pub gyro: Option<SensorSpec>,
+    /// Rates of its sensors, which share one.
     pub rates: Rates,
+    /// Its thermometer.
     pub temperature: Temperature,
+    /// Its queue of samples.
     pub fifo: Fifo,
     /// Steps from any state to a known idle one; WHO_AM_I is read after them.
     pub reset: &'static [Step],
@@ -74,6 +81,7 @@ pub struct DieSpec {
     pub configure: fn(&Setting) -> Vec<Step>,
     /// The part of the gyro's z that is in its x, in 1/512, seven bits (BMI270).
     pub cross_axis: Option<Reg>,
+    /// Tests that it makes of itself, in this order.
     pub self_tests: &'static [SelfTest],
 }
 
@@ -87,8 +95,11 @@ pub struct SensorSpec {
 
 /// A range of a sensor: full scale, its code, and the size of a step. Accelerometers in g, gyros in °/s.
 pub struct Range {
+    /// Largest magnitude, in the sensor's unit.
     pub full_scale: f64,
+    /// Code that sets the range.
     pub code: u8,
+    /// Size of a step, in the sensor's unit.
     pub per_lsb: f64,
 }
 
@@ -136,8 +147,11 @@ impl Rates {
 
 /// The temperature of a die: °C = raw * c_per_lsb + c_at_zero.
 pub struct Temperature {
+    /// Where the raw value stands.
     pub from: TemperatureSource,
+    /// °C of a step.
     pub c_per_lsb: f64,
+    /// °C at a raw value of 0.
     pub c_at_zero: f64,
 }
 
@@ -157,16 +171,19 @@ pub struct Fifo {
     /// Where the count stands: a word (a byte where `count_bytes` is 1), masked by `count_mask`.
     pub count: Reg,
     pub count_bytes: usize,
+    /// Bits of the word that are the count.
     pub count_mask: u16,
     /// Bits beside the count that say that samples were lost; 0: none do.
     pub overrun: u16,
     /// Bytes that one count stands for.
     pub unit: usize,
+    /// The register that gives the content, byte after byte.
     pub data: Reg,
     /// Bytes.
     pub capacity: usize,
     /// Bytes from which on the next sample is refused or overwrites the oldest: the content is of no use then.
     pub full: usize,
+    /// How samples stand in the bytes.
     pub layout: Layout,
     /// Steps that empty it.
     pub reset: &'static [Step],
@@ -199,8 +216,11 @@ impl Layout {
 /// How a die is to be set, in its own codes.
 #[derive(Clone, Copy, Debug)]
 pub struct Setting {
+    /// Code of the rate.
     pub rate: u8,
+    /// Code of the accelerometer's range.
     pub accel: u8,
+    /// Code of the gyro's range.
     pub gyro: u8,
     /// It is wired by SPI: its I2C interface is turned off.
     pub spi: bool,
@@ -233,11 +253,15 @@ pub enum SelfTest {
 
 /// The newest sample with the force on less that with it off, in g or °/s, must lie `within` on each axis.
 pub struct ExcitationTest {
+    /// The sensor under test.
     pub sensor: Sensor,
+    /// Steps before the test.
     pub prepare: &'static [Step],
+    /// Steps that turn the force on, and wait.
     pub on: &'static [Step],
+    /// Steps that turn it off, and wait.
     pub off: &'static [Step],
-    /// Size of a step at the range that `prepare` sets.
+    /// Size of a step at the range that `prepare` sets, in the sensor's unit.
     pub per_lsb: f64,
     /// Least and largest answer of each axis.
     pub within: [(f64, f64); 3],
@@ -245,9 +269,13 @@ pub struct ExcitationTest {
 
 /// The answer, in steps, is compared with the factory's, which was `FACTORY_BASE * 1.01^(code - 1)` steps.
 pub struct FactoryTest {
+    /// The sensor under test.
     pub sensor: Sensor,
+    /// Steps before the test.
     pub prepare: &'static [Step],
+    /// Steps that turn the force on.
     pub on: &'static [Step],
+    /// Steps that turn it off.
     pub off: &'static [Step],
     /// Codes of the three axes.
     pub codes: [Reg; 3],
@@ -260,15 +288,19 @@ pub struct FactoryTest {
 
 /// The die is triggered and answers in a register.
 pub struct BuiltInTest {
+    /// The sensor under test.
     pub sensor: Sensor,
+    /// Steps before the test.
     pub prepare: &'static [Step],
     /// Register and value that start it.
     pub trigger: (Reg, u8),
+    /// The register that answers.
     pub answer: Reg,
     /// Bit of the answer that says that it is done.
     pub done: u8,
     /// Bits of the answer that say how it went, and their value if all is well.
     pub verdict: u8,
+    /// Value of these bits if all is well.
     pub good: u8,
 }
 
@@ -286,7 +318,7 @@ const RATE_WITHIN_ALONE: f64 = 0.25;
 
 impl DieSpec {
     /// The setting nearest to what is asked for, and its rate, Hz: the nearest rate, and the smallest ranges that hold
-    /// `accel_g` and `gyro_dps`.
+    /// `accel_g` and `gyro_dps`. A fault where the die has none near enough, or that holds them.
     pub fn setting(&self, rate_hz: f64, accel_g: f64, gyro_dps: f64) -> Result<(Setting, f64), Fault> {
         let (hz, rate) = self.rates.nearest(rate_hz);
         let within = if self.gyro.is_some() { RATE_WITHIN } else { RATE_WITHIN_ALONE };

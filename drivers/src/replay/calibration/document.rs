@@ -9,12 +9,14 @@ use std::path::{Path, PathBuf};
 
 /// A parsed file, with its text for line numbers.
 pub struct Document {
+    /// The file it was read from.
     pub path: PathBuf,
     text: String,
     root: Value,
 }
 
 impl Document {
+    /// Reads and parses a file; a fault where it cannot be read or is neither YAML nor JSON.
     pub fn read(path: &Path) -> Result<Document, Fault> {
         let bytes = table::read_bytes(path)?;
         let wrong = |line: usize, what: String| {
@@ -36,6 +38,7 @@ impl Document {
         Ok(Document { path: path.to_path_buf(), root: root?, text })
     }
 
+    /// Whether there is such a key.
     pub fn has(&self, key: &str) -> bool {
         self.root.pointer(key).is_some()
     }
@@ -77,17 +80,17 @@ impl Document {
         self.root.pointer(key).ok_or_else(|| self.fault(key, "this key is missing"))
     }
 
-    /// A word.
+    /// A word; a fault where there is none.
     pub fn text(&self, key: &str) -> Result<&str, Fault> {
         self.get(key)?.as_str().ok_or_else(|| self.fault(key, "must be a word"))
     }
 
-    /// A finite number; text that is one counts.
+    /// A finite number; text that is one counts. A fault where there is none.
     pub fn number(&self, key: &str) -> Result<f64, Fault> {
         finite(self.get(key)?).ok_or_else(|| self.fault(key, "must be a number"))
     }
 
-    /// A number above zero.
+    /// A number above zero; a fault where there is none.
     pub fn positive(&self, key: &str) -> Result<f64, Fault> {
         let value = self.number(key)?;
         if value > 0.0 {
@@ -96,7 +99,7 @@ impl Document {
         Err(self.fault(key, "must be positive"))
     }
 
-    /// A list of `n` numbers, or of lists that hold so many in all.
+    /// A list of `n` numbers, or of lists that hold so many in all; a fault where they are not.
     pub fn numbers(&self, key: &str, n: usize) -> Result<Vec<f64>, Fault> {
         let wrong = || self.fault(key, "must be a list of numbers");
         let items = self.get(key)?.as_array().ok_or_else(wrong)?;
@@ -108,7 +111,7 @@ impl Document {
         Ok(values)
     }
 
-    /// A rigid transform, from the 16 numbers of its matrix, row by row.
+    /// A rigid transform, from the 16 numbers of its matrix, row by row; a fault where it is none.
     pub fn transform(&self, key: &str) -> Result<Pose, Fault> {
         rigid(&self.numbers(key, 16)?).map_err(|what| self.fault(key, what))
     }
