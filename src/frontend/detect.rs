@@ -56,12 +56,6 @@ impl Detector {
         }
     }
 
-    /// Bytes of its lists.
-    pub fn bytes(width: usize, height: usize, config: &FrontendConfig) -> usize {
-        let cell = (config.grid_px as usize).min(CELL_MAX);
-        (width / cell) * (height / cell) * (size_of::<bool>() + size_of::<u8>() + size_of::<Corner>())
-    }
-
     /// Marks each cell by the cameras that see its middle.
     pub fn share(&mut self, sees: impl Fn([f32; 2]) -> u8) {
         for k in 0..self.shared.len() {

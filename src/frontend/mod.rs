@@ -29,12 +29,11 @@ pub use tracks::{Track, Tracks};
 
 use crate::config::FrontendConfig;
 use crate::limits::{CAMERAS_MAX, PYRAMID_LEVELS, TRACKS};
-use crate::mem::Footprint;
 use detect::Detector;
 use geometry::RigGeometry;
 use patch::{take_stack, Stack, Warp, STEP_MIN};
-use points::{distance, Patch, Point, Points, FINE_LEVELS};
-use pyramid::{FramePyramids, Pyramid};
+use points::{distance, Point, Points, FINE_LEVELS};
+use pyramid::FramePyramids;
 use search::{Limits, Search};
 use std::sync::Arc;
 use stipple_drivers::{counters, Calibration, Fault, FaultKind, Frames, Nanos, Pose};
@@ -143,19 +142,6 @@ impl Frontend {
             tracks: Tracks::default(),
             stats: Stats::default(),
         })
-    }
-
-    /// Host memory by part.
-    pub fn footprint(calibration: &Calibration, config: &FrontendConfig) -> Footprint {
-        let mut f = Footprint::default();
-        let sizes = calibration.cameras.iter().map(|c| (c.camera.width, c.camera.height));
-        f.host("frontend pyramids", 2 * sizes.clone().map(|(w, h)| Pyramid::bytes(w, h)).sum::<usize>());
-        f.host("frontend patches", calibration.cameras.len() * TRACKS * size_of::<Patch>());
-        let grid = sizes.map(|(w, h)| Detector::bytes(w, h, config)).sum::<usize>();
-        let each = size_of::<Point>() + size_of::<usize>() + size_of::<f64>();
-        let points = calibration.cameras.len() * TRACKS * each;
-        f.host("frontend points", size_of::<Frontend>() + points + grid);
-        f
     }
 
     /// What happened to points since the start.

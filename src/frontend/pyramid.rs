@@ -39,12 +39,6 @@ impl Pyramid {
         Pyramid { size: (width, height), above, columns: vec![0; width + 5] }
     }
 
-    /// Bytes of the levels above the image.
-    pub fn bytes(width: usize, height: usize) -> usize {
-        let (w, h) = (sizes(width), sizes(height));
-        (1..PYRAMID_LEVELS).map(|l| w[l] * h[l]).sum::<usize>() + 2 * (width + 5)
-    }
-
     /// Whether an image has the size given at construction, and all its pixels.
     pub fn fits(&self, image: &Image) -> bool {
         let (width, height) = self.size;

@@ -41,11 +41,6 @@ impl System {
         }
     }
 
-    /// Bytes that `new` takes.
-    pub const fn bytes(capacity: usize) -> usize {
-        (capacity * capacity + 3 * capacity) * size_of::<f64>()
-    }
-
     /// Sets the dimension and zeroes.
     pub fn clear(&mut self, dim: usize) {
         debug_assert!(dim <= self.capacity);

@@ -51,11 +51,6 @@ impl Rows {
         }
     }
 
-    /// Bytes that `new` takes.
-    pub const fn bytes(rows_max: usize, cols_max: usize) -> usize {
-        ((rows_max + 2) * padded(cols_max) + rows_max) * size_of::<f64>()
-    }
-
     /// Empties, for rows of `cols` columns, b included.
     pub fn clear(&mut self, cols: usize) {
         (self.rows, self.cols, self.stride) = (0, cols, padded(cols));

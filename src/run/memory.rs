@@ -1,35 +1,31 @@
 //! The byte table: everything a board buys at boot, summed before anything is bought.
 
-use super::mapping::KEYFRAME_SLOTS;
-use super::packets;
-use super::tracking::FramePacket;
+use super::mailbox::Mailbox;
+use super::mapping::KeyframeQueue;
+use super::tracking::OdometryRun;
+use super::{packets, POSES_KEPT};
 use crate::config::Board;
-use crate::frontend::Frontend;
 use crate::limits::CAMERAS_MAX;
 use crate::map::{cameras, Mapper};
 use crate::mem::Footprint;
 use crate::stereo::Matcher;
-use crate::vio::Vio;
-use stipple_drivers::record::ring_bytes;
-use stipple_drivers::{Calibration, Camera, Fault, FaultKind, ImuCalibration, Lens, Pose, RigCamera};
+use stipple_drivers::record::Ring;
+use stipple_drivers::{Calibration, Camera, Fault, FaultKind, Frames, ImuCalibration, Lens, Pose, RigCamera};
 
 /// Everything a run with this rig takes, without the operating system's and the drivers' own; with the ring of a recording
-/// where it `records`.
+/// where it `records`. Each part is built once and dropped again. Fails where a part cannot take the rig.
 pub fn footprint(calibration: &Calibration, board: &Board, records: bool) -> Result<Footprint, Fault> {
-    let pixels: usize = calibration.cameras.iter().map(|c| c.camera.width * c.camera.height).sum();
-    let coloured: usize = colours(calibration, board).iter().map(|c| 3 * c.camera.width * c.camera.height).sum();
+    let colours = colours(calibration, board).len();
     let mut f = Footprint::default();
-    f.host("queues: frames", packets(board.frontend.threads) * (pixels + coloured + FramePacket::BYTES));
-    f.extend(Frontend::footprint(calibration, &board.frontend));
-    f.extend(Vio::footprint());
+    f.build("queues: frames and samples", || Mailbox::new(packets(board.frontend.threads), calibration, colours));
+    OdometryRun::measured(calibration, board, POSES_KEPT, &mut f)?;
     if board.map.enabled {
-        let images = cameras::images(calibration.cameras.len(), &board.map);
-        let keyframe: usize = calibration.cameras.iter().take(images).map(|c| c.camera.width * c.camera.height).sum();
-        f.host("queues: keyframes", KEYFRAME_SLOTS * (keyframe + coloured));
+        f.build("queues: keyframes", || KeyframeQueue::new(calibration, board));
         f.extend(Mapper::footprint(calibration, board)?);
     }
     if records {
-        f.host("queues: recording", ring_bytes(pixels + coloured, board.record.ring_frames as usize));
+        let shape = Frames::in_colour(calibration, colours);
+        f.build("queues: recording", || Ring::new(&shape, board.record.ring_frames as usize));
     }
     Ok(f)
 }

@@ -3,7 +3,7 @@
 use super::sensors::Sensors;
 use crate::config::Board;
 use std::path::{Path, PathBuf};
-use stipple_drivers::record::{self, Format, Recorder};
+use stipple_drivers::record::{self, Format, Recorder, Ring};
 use stipple_drivers::{Calibration, Fault, FaultKind, Frames};
 
 /// A recording under way.
@@ -37,7 +37,7 @@ impl Recording {
         shape: &Frames,
     ) -> Result<(Sensors, Option<Recording>), Fault> {
         let sink = record::open(dir, format, calibration)?;
-        let (recorder, taps) = record::start(sink, shape, board.record.ring_frames as usize);
+        let (recorder, taps) = record::start(sink, Ring::new(shape, board.record.ring_frames as usize));
         let (frames, imu) = taps.on(sensors.frames, sensors.imu);
         let sensors = Sensors { frames: Box::new(frames), imu: Box::new(imu) };
         Ok((sensors, Some(Recording { recorder, dir: dir.into() })))

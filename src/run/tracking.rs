@@ -17,7 +17,7 @@ use crate::config::Board;
 use crate::counters::Counters;
 use crate::frontend::{Frontend, Prediction, Tracks};
 use crate::limits::{FRAMES, IMU_BETWEEN_FRAMES};
-use crate::mem::{seal_thread, List};
+use crate::mem::{seal_thread, Footprint, List};
 use crate::vio::{Health, Odometry, Predictor, RigEstimate, Vio};
 use crossbeam_queue::ArrayQueue;
 use std::sync::atomic::AtomicBool;
@@ -73,9 +73,6 @@ impl FramePacket {
     pub fn writable(&mut self) -> Option<&mut Frames> {
         Arc::get_mut(&mut self.frames)
     }
-
-    /// Size without images, bytes.
-    pub const BYTES: usize = size_of::<FramePacket>();
 
     /// Adds a sample; a full list drops its oldest, which is counted.
     pub fn push_imu(&mut self, sample: ImuSample, counters: &Counters) {
@@ -205,26 +202,33 @@ fn keep<T>(list: &mut Vec<T>, item: T) {
 }
 
 impl OdometryRun {
+    /// Tracker and estimator of a rig, with room for the poses of so many frames. Fails where the tracker cannot take the rig.
     pub fn new(calibration: &Calibration, board: &Board, frames: usize) -> Result<OdometryRun, Fault> {
+        OdometryRun::measured(calibration, board, frames, &mut Footprint::default())
+    }
+
+    /// Does what `new` does, and adds what it takes to `footprint`.
+    pub fn measured(
+        calibration: &Calibration,
+        board: &Board,
+        frames: usize,
+        footprint: &mut Footprint,
+    ) -> Result<OdometryRun, Fault> {
+        let mut f = Footprint::default();
+        let frontend = f.build("tracking: front end", || Frontend::new(calibration, &board.frontend))?;
+        let estimator = || (Vio::new(calibration, &board.vio), Predictor::new(calibration, &board.vio));
+        let (vio, predictor) = f.build("tracking: estimator", estimator);
+        let bytes = f.total();
+        let trajectory = f.build("tracking: poses of frames", || Vec::with_capacity(frames));
+        let health = f.build("tracking: health of frames", || Vec::with_capacity(frames));
+        let [front_ms, ms] = f.build("tracking: times of frames", || [(); 2].map(|()| Vec::with_capacity(frames)));
+        let frame_ms = f.build("tracking: latencies of frames", || Vec::with_capacity(frames));
+        footprint.extend(f);
         Ok(OdometryRun {
-            front: Front {
-                frontend: Frontend::new(calibration, &board.frontend)?,
-                predictor: Predictor::new(calibration, &board.vio),
-                ms: Vec::with_capacity(frames),
-                busy_s: 0.0,
-                cpu_s: None,
-            },
-            back: Back {
-                vio: Vio::new(calibration, &board.vio),
-                trajectory: Vec::with_capacity(frames),
-                ms: Vec::with_capacity(frames),
-                busy_s: 0.0,
-                health: Vec::with_capacity(frames),
-                frame_ms: Vec::with_capacity(frames),
-                cpu_s: None,
-            },
+            front: Front { frontend, predictor, ms: front_ms, busy_s: 0.0, cpu_s: None },
+            back: Back { vio, trajectory, ms, busy_s: 0.0, health, frame_ms, cpu_s: None },
             threads: board.frontend.threads,
-            bytes: Frontend::footprint(calibration, &board.frontend).total() + Vio::footprint().total(),
+            bytes,
         })
     }
 

@@ -10,17 +10,15 @@ use super::gate::{gate, predicted_covariance, Passed};
 use super::graph::Graph;
 use super::inertial::{Covariance, InertialWeight, Motion};
 use super::initialization::Start;
-use super::landmarks::Landmarks;
 use super::marginalization::Marginalizer;
 use super::model::Model;
 use super::monitor::Evidence;
 use super::preintegration::Increment;
-use super::prior::Prior;
 use super::rig::RigState;
 use super::samples::ImuRing;
 use super::solver::{Outcome, Solver};
 use super::triangulation::{drop_outliers, triangulate};
-use super::window::{Frame, Window};
+use super::window::Frame;
 use super::zero_velocity;
 use crate::config::VioConfig;
 use crate::frontend::Tracks;
@@ -84,14 +82,6 @@ impl Estimator {
             frames_since_keyframe: 0,
         }
     }
-
-    /// Bytes of window, landmarks, solver, and of prior and marginalization.
-    pub const BYTES: [usize; 4] = [
-        Window::BYTES + FRAMES * size_of::<Tracks>(),
-        Landmarks::BYTES,
-        Solver::BYTES,
-        Prior::BYTES + Marginalizer::BYTES,
-    ];
 
     /// The newest frame; `None` until started.
     pub fn newest(&self) -> Option<&Frame> {

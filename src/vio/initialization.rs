@@ -105,8 +105,6 @@ impl Initializer {
         }
     }
 
-    pub const BYTES: usize = TRACKS * size_of::<ReferencePoint>() + ALIGN_FRAMES_MAX * size_of::<ResectedFrame>();
-
     /// Starts over.
     pub fn clear(&mut self) {
         self.reference.clear();

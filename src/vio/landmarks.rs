@@ -57,8 +57,6 @@ impl Landmarks {
         Landmarks { pool: Vec::with_capacity(LANDMARKS), index: Vec::with_capacity(LANDMARKS) }
     }
 
-    pub const BYTES: usize = LANDMARKS * (size_of::<Landmark>() + size_of::<(u64, u16)>());
-
     /// Forgets all points.
     pub fn clear(&mut self) {
         self.pool.clear();

@@ -89,8 +89,6 @@ impl Marginalizer {
         Marginalizer { stack: Rows::new(STACK_ROWS, WINDOW_DIM + 1) }
     }
 
-    pub const BYTES: usize = Rows::bytes(STACK_ROWS, WINDOW_DIM + 1);
-
     /// Brings the window back to its resting size. `rows` is scratch.
     pub fn marginalize(&mut self, graph: &mut Graph, rows: &mut FactorRows, model: &Model) {
         let Graph { window, landmarks, prior } = graph;

@@ -48,7 +48,6 @@ pub use stats::Stats;
 
 use crate::config::VioConfig;
 use crate::frontend::Tracks;
-use crate::mem::Footprint;
 use estimator::{Estimator, Step, CONNECTED_FEW};
 use glam::DVec3;
 use health::{quality, sigma_v, Reset, SIGMA_V_UNOBSERVED};
@@ -139,19 +138,6 @@ impl Vio {
             tally: Tally::default(),
             hash: FNV_START,
         }
-    }
-
-    /// Host memory by part.
-    pub fn footprint() -> Footprint {
-        let mut f = Footprint::default();
-        let [window, landmarks, solver, prior] = Estimator::BYTES;
-        f.host("vio: inertial ring", ImuRing::BYTES);
-        f.host("vio: window", window);
-        f.host("vio: landmarks", landmarks);
-        f.host("vio: solver", solver);
-        f.host("vio: prior and marginalisation", prior);
-        f.host("vio: initialisation", Initializer::BYTES);
-        f
     }
 
     /// Takes a sample that the gate let through; refuses what is not finite or not newer than the last.

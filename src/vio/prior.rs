@@ -70,9 +70,6 @@ impl Prior {
         Prior { rows, gram: vec![0.0; Rows::gram_len(cols)], stride: 0, blocks: List::default() }
     }
 
-    pub const BYTES: usize =
-        Rows::bytes(WINDOW_DIM + 1, WINDOW_DIM + 1) + Rows::gram_len(WINDOW_DIM + 1) * size_of::<f64>();
-
     /// Knows nothing any more.
     pub fn clear(&mut self) {
         self.blocks.clear();

@@ -38,8 +38,6 @@ impl FactorRows {
         }
     }
 
-    pub const BYTES: usize = Rows::bytes(ROWS_MAX, COLS_MAX) + Rows::gram_len(COLS_MAX) * size_of::<f64>();
-
     /// Empties, for rows with `own` columns before those of the window.
     pub fn begin(&mut self, own: usize, columns: impl Iterator<Item = Columns>) {
         self.columns.clear();

@@ -21,8 +21,6 @@ impl ImuRing {
         ImuRing { samples: VecDeque::with_capacity(IMU_BETWEEN_FRAMES) }
     }
 
-    pub const BYTES: usize = IMU_BETWEEN_FRAMES * size_of::<ImuSample>();
-
     /// Whether a sample is finite and newer than the last.
     pub fn admits(&self, s: &ImuSample) -> bool {
         s.is_finite() && self.newest().is_none_or(|n| s.t > n.t)

@@ -135,11 +135,6 @@ impl Solver {
         }
     }
 
-    pub const BYTES: usize = LANDMARKS * size_of::<Eliminated>()
-        + 2 * System::bytes(WINDOW_DIM)
-        + FactorRows::BYTES
-        + WINDOW_DIM * size_of::<f64>();
-
     /// Sums the squares of all factors and of the prior up; answers their cost.
     pub fn linearize(&mut self, graph: &mut Graph, model: &Model, layout: &Layout) -> f64 {
         let Graph { window, landmarks, prior } = graph;

@@ -128,8 +128,6 @@ impl Window {
         Window { saved: frames.clone(), frames, used: [false; FRAMES], order: List::default(), rig }
     }
 
-    pub const BYTES: usize = 2 * FRAMES * size_of::<Frame>();
-
     /// Forgets the frames and keeps what was learnt of the rig.
     pub fn clear(&mut self) {
         self.used = [false; FRAMES];

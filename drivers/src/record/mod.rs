@@ -47,11 +47,6 @@ const NICE: i32 = 5;
 /// Samples that may wait for the writer: eight seconds of a 1 kHz unit.
 const IMU_SLOTS: usize = 8192;
 
-/// Bytes of a ring of `slots` frames of `frame_bytes`, between sources and writer.
-pub fn ring_bytes(frame_bytes: usize, slots: usize) -> usize {
-    slots * frame_bytes + (slots + IMU_SLOTS) * size_of::<Item>()
-}
-
 counters! {
     struct Counts of Counter, read by Counter::get;
     /// Frames written, frames dropped for a full ring, and frames whose writing failed.
@@ -131,13 +126,29 @@ pub fn open(dir: &Path, format: Format, calibration: &Calibration) -> Result<Box
     })
 }
 
-/// Starts the writer, with a ring of `slots` frames of this shape.
-pub fn start(mut sink: Box<dyn Sink>, shape: &Frames, slots: usize) -> (Recorder, Taps) {
-    let (items, waiting) = mpsc::sync_channel(slots + IMU_SLOTS);
-    let (give_back, spare) = mpsc::sync_channel(slots);
-    for _ in 0..slots {
-        let _ = give_back.send(Box::new(shape.clone()));
+/// The frames and samples between sources and writer, and those that are free.
+pub struct Ring {
+    items: mpsc::SyncSender<Item>,
+    waiting: mpsc::Receiver<Item>,
+    give_back: mpsc::SyncSender<Box<Frames>>,
+    spare: mpsc::Receiver<Box<Frames>>,
+}
+
+impl Ring {
+    /// A ring of `slots` frames of this shape.
+    pub fn new(shape: &Frames, slots: usize) -> Ring {
+        let (items, waiting) = mpsc::sync_channel(slots + IMU_SLOTS);
+        let (give_back, spare) = mpsc::sync_channel(slots);
+        for _ in 0..slots {
+            let _ = give_back.send(Box::new(shape.clone()));
+        }
+        Ring { items, waiting, give_back, spare }
     }
+}
+
+/// Starts the writer behind a ring.
+pub fn start(mut sink: Box<dyn Sink>, ring: Ring) -> (Recorder, Taps) {
+    let Ring { items, waiting, give_back, spare } = ring;
     let (counts, in_ring) = (Arc::new(Counts::default()), Arc::new(AtomicU64::new(0)));
     let (c, taken) = (counts.clone(), in_ring.clone());
     let thread = std::thread::spawn(move || {
