@@ -5,8 +5,7 @@
 
 use super::device::{boot, Device};
 use super::memory::{Backed, Range, ALIGN};
-use super::record::COMMANDS_MAX;
-use super::GpuError;
+use super::{GpuError, COMMANDS_MAX};
 use ash::vk;
 use std::collections::HashMap;
 use std::marker::PhantomData;

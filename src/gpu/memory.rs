@@ -21,7 +21,7 @@ pub const REPORT_BYTES: usize = 256;
 /// What is left of it for transfers.
 pub(super) const TRANSFER_BYTES: usize = STAGING_BYTES - REPORTS * REPORT_BYTES;
 
-/// Of a report in staging.
+/// Where a report begins in staging, bytes.
 pub(super) fn report_offset(place: usize) -> u64 {
     (TRANSFER_BYTES + place * REPORT_BYTES) as u64
 }

@@ -46,7 +46,7 @@ mod tests;
 pub use device::{Caps, DeviceKind, Subgroup};
 pub use kernel::{Access, Kernel, KernelDef, Reflected, Variant, BUFFERS_MAX, PUSH_MAX, SPECS_MAX};
 pub use memory::{Arena, Buf, Range, Read, ReadWrite, Write, ALIGN, REPORTS, REPORT_BYTES, STAGING_BYTES};
-pub use record::{Recorder, Threads, COMMANDS_MAX, GROUPS_MAX};
+pub use record::{Recorder, Threads, GROUPS_MAX};
 pub use submit::{Ticket, Timing};
 
 use crate::config::GpuConfig;
@@ -58,6 +58,9 @@ use std::fmt;
 use std::sync::Arc;
 use stipple_drivers::{Fault, FaultKind};
 use submit::Submitter;
+
+/// Commands that one recording holds.
+pub const COMMANDS_MAX: usize = 1024;
 
 /// What can go wrong after boot. Plain data: making one allocates nothing.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -185,7 +188,7 @@ impl Gpu {
         self.make(&spec, None, false)
     }
 
-    /// As `kernel`, of one that may take long: a dispatch that would pass `submission_max_ms` is several. Its workgroups
+    /// Does what `kernel` does for one that may take long: a dispatch that would pass `submission_max_ms` is several. Its workgroups
     /// must not ask how many there are, but for the width of a wrapped row (`Threads::d1`).
     pub fn kernel_in_pieces<K: KernelDef>(&mut self, spec: K::Spec) -> Result<Kernel<K>, Fault> {
         self.make(&spec, None, true)
@@ -312,7 +315,7 @@ impl Gpu {
         self.submitter.submissions
     }
 
-    /// Of all submissions so far, ms on the device.
+    /// Time of the longest submission so far, ms on the device.
     pub fn longest_submission_ms(&self) -> f64 {
         self.submitter.longest_ms
     }

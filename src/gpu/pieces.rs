@@ -5,7 +5,7 @@
 //! of two for a piece that is slower than the one before, and no more than `GROWTH` times as many as were ever timed.
 //! Workgroups of a dispatch cannot wait for each other, so the result does not depend on the pieces.
 
-/// Of a kernel that has never run: of the slowest, `aggregate` at 128 disparities, one core of lavapipe takes 2 ms each.
+/// Workgroups of a kernel that has never run: of the slowest, `aggregate` at 128 disparities, one core of lavapipe takes 2 ms each.
 const FIRST: u32 = 2;
 /// A clock may be too coarse for a small piece, and caches may hold it.
 const GROWTH: u32 = 16;
@@ -22,7 +22,7 @@ pub(super) fn axis([_, y, z]: [u32; 3]) -> usize {
     }
 }
 
-/// Of a kernel on this device, as last timed.
+/// How fast a kernel runs on this device, as last timed.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Pace {
     ms_per_group: f64,

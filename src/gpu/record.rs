@@ -7,10 +7,8 @@
 
 use super::kernel::{Access, Kernel, KernelDef, BUFFERS_MAX, PUSH_MAX};
 use super::memory::{Buf, Range, REPORTS, REPORT_BYTES};
-use super::GpuError;
+use super::{GpuError, COMMANDS_MAX};
 
-/// Commands of one recording.
-pub const COMMANDS_MAX: usize = 1024;
 /// Workgroups every device takes in one dimension.
 pub const GROUPS_MAX: u32 = 65535;
 

@@ -14,8 +14,8 @@ use super::device::{boot, Device};
 use super::kernel::Pipelines;
 use super::memory::{report_offset, Backed, Range};
 use super::pieces::{axis, Pace};
-use super::record::{Command, Recorder, Work, COMMANDS_MAX};
-use super::GpuError;
+use super::record::{Command, Recorder, Work};
+use super::{GpuError, COMMANDS_MAX};
 use ash::vk;
 use std::sync::Arc;
 use std::time::Instant;
@@ -89,19 +89,19 @@ pub(super) struct Submitter {
     pub timings: Vec<Timing>,
     /// Row of each kernel, by index.
     rows: Vec<usize>,
-    /// Of each row.
+    /// How long a workgroup of each row takes.
     paces: Vec<Pace>,
     /// When the host last saw a part end.
     seen: Instant,
-    /// Of the last whole recording.
+    /// Time of the last whole recording.
     pub last_ms: f64,
-    /// Of a command of it, on average.
+    /// Mean time of its commands.
     mean_ms: f64,
-    /// Of the parts that have ended of the recording whose parts are ending.
+    /// Time so far of the recording whose parts are ending.
     total_ms: f64,
     submission_max_ms: f64,
     pub submissions: u64,
-    /// Of all parts so far.
+    /// Time of the longest part so far.
     pub longest_ms: f64,
     recordings: u64,
     /// Every command of one recording in so many is timed; zero: of none.
@@ -212,7 +212,7 @@ impl Submitter {
         Ok(Ticket(self.started))
     }
 
-    /// Of the next part; its submission, if any, has ended.
+    /// The slot of the next part; its submission, if any, has ended.
     fn free_slot(&mut self) -> Result<usize, GpuError> {
         if self.started - self.ended == SLOTS as u64 {
             self.end_oldest()?;

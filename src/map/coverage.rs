@@ -1,7 +1,7 @@
 //! What a keyframe sees, beside what the map shows from there, and how much of it the map lacks.
 
 use super::exposure::Exposure;
-use super::step::Rendered;
+use super::render::Rendered;
 use super::view::View;
 use stipple_drivers::Image;
 

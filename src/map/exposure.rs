@@ -1,6 +1,6 @@
 //! How an image was exposed, and what can be told of it from a rendering.
 
-use super::step::Rendered;
+use super::render::Rendered;
 use stipple_drivers::Image;
 
 /// What an image shows of the map's level x is gain · x + offset.
@@ -42,7 +42,7 @@ impl Exposure {
         Exposure { gain, offset: level - PIVOT * (gain - 1.0) }
     }
 
-    /// As kernels take it.
+    /// Gain and offset for a kernel.
     pub fn words(self) -> [f32; 2] {
         [self.gain as f32, self.offset as f32]
     }

@@ -8,7 +8,7 @@ pub struct Keyframe {
     pub id: u64,
     pub t: Nanos,
     pub world_from_body: Pose,
-    /// As the cameras gave them: left, right, and further ones that train.
+    /// Images as the cameras gave them: left, right, and further ones that train.
     pub images: Vec<Image>,
     /// The colours of the images that train on them.
     pub colours: Vec<Colour>,

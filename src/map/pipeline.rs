@@ -10,10 +10,10 @@
 use super::backward::{self, Backward};
 use super::loss::{self, Loss};
 use super::pool::{self, Pool};
-use super::render::{self, Renderer};
+use super::render::{self, Rendered, Renderer};
 use super::shape::{Scratch, Shape, GROUP};
 use super::sort::{self, Scan};
-use super::step::{LearningRates, Rendered, Stats, StepStats, Target, Weights};
+use super::step::{LearningRates, Stats, StepStats, Target, Weights};
 use super::tiling::Tiling;
 use super::view::View;
 use crate::gpu::kernels::summary;

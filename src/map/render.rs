@@ -61,6 +61,26 @@ impl Buffers {
     }
 }
 
+/// A picture of the map; sized by the view.
+#[derive(Clone, Debug, Default)]
+pub struct Rendered {
+    pub width: usize,
+    pub height: usize,
+    /// Plane by plane: grey, or red, green and blue.
+    pub colour: Vec<f32>,
+    pub alpha: Vec<f32>,
+    /// Expected depth, m; zero where nothing was hit.
+    pub depth: Vec<f32>,
+}
+
+impl Rendered {
+    /// A blank one.
+    pub fn new(width: usize, height: usize, channels: usize) -> Rendered {
+        let planes = |n: usize| vec![0.0; n * width * height];
+        Rendered { width, height, colour: planes(channels), alpha: planes(1), depth: planes(1) }
+    }
+}
+
 /// A kernel made for each of the two lenses.
 pub struct ByLens<K> {
     pub pinhole: Kernel<K>,

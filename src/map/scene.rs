@@ -3,7 +3,8 @@
 use super::cameras::TrainingCamera;
 use super::exposure::{gain_from, median_exposure, Exposure};
 use super::pipeline::Pipeline;
-use super::step::{Rendered, Target};
+use super::render::Rendered;
+use super::step::Target;
 use super::store::Store;
 use super::view::View;
 use crate::gpu::{Gpu, GpuError};

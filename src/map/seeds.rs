@@ -91,7 +91,7 @@ impl Seeder {
         &self.points
     }
 
-    /// Of the picked, at most `room`: those whose cell holds nothing yet, or that the rendering lacks.
+    /// Keeps at most `room` of the picked: those whose cell holds nothing yet, or that the rendering lacks.
     pub fn keep(&mut self, answers: &[u32], room: usize, counters: &Counters) -> &[Seed] {
         let mut kept = 0;
         for i in 0..self.seeds.len() {

@@ -51,26 +51,6 @@ impl Default for Weights {
     }
 }
 
-/// A picture of the map; sized by the view.
-#[derive(Clone, Debug, Default)]
-pub struct Rendered {
-    pub width: usize,
-    pub height: usize,
-    /// Plane by plane: grey, or red, green and blue.
-    pub colour: Vec<f32>,
-    pub alpha: Vec<f32>,
-    /// Expected depth, m; zero where nothing was hit.
-    pub depth: Vec<f32>,
-}
-
-impl Rendered {
-    /// A blank one.
-    pub fn new(width: usize, height: usize, channels: usize) -> Rendered {
-        let planes = |n: usize| vec![0.0; n * width * height];
-        Rendered { width, height, colour: planes(channels), alpha: planes(1), depth: planes(1) }
-    }
-}
-
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Stats {
     pub visible: u32,
@@ -107,7 +87,7 @@ pub struct StepStats {
 }
 
 impl StepStats {
-    /// Of a step from `view` on `values` compared values.
+    /// What the device says of a step from `view` on `values` compared values.
     pub(super) fn new(s: &Status, view: &View, values: f64, ssim_weight: f32) -> StepStats {
         let (l1, ssim) = (f64::from(s.l1_sum) / values, f64::from(s.ssim_sum) / values);
         let lambda = f64::from(ssim_weight);

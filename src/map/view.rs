@@ -73,7 +73,7 @@ impl View {
         [self.camera.width as u32, self.camera.height as u32]
     }
 
-    /// As kernels take it.
+    /// The camera and its pose for a kernel.
     pub(super) fn words(&self) -> CameraWords {
         let cam_from_world = self.world_from_cam.inverse();
         let (q, t, c) = (cam_from_world.q.as_quat(), cam_from_world.p.as_vec3(), &self.camera);

@@ -10,7 +10,7 @@ use std::io::{self, Write};
 /// Error drawn at full brightness, of a grey range 0..1.
 const ERROR_FULL: f32 = 0.25;
 const GAP_PX: usize = 4;
-/// Of pixels without a value.
+/// Colour of pixels without a value.
 pub const MISSING: [u8; 3] = [48, 48, 48];
 const INK: [u8; 3] = [235, 235, 235];
 /// Panel width at which labels are drawn one font pixel to one image pixel.
@@ -52,7 +52,7 @@ pub struct View<'a> {
     pub depth: &'a [f32],
     /// Zero where the observed pixel is not to be compared; empty compares all.
     pub valid: &'a [u8],
-    /// Of the rendering, shown in its label.
+    /// PSNR of the rendering, shown in its label.
     pub psnr_db: Option<f64>,
 }
 

@@ -46,7 +46,7 @@ pub struct Report {
     pub quality_min: Option<u32>,
     pub quality_p50: Option<u32>,
     pub quality_under_50: Option<f64>,
-    /// Of every odometry state, bit for bit.
+    /// Hash of the bits of every odometry state.
     pub vio_hash: Option<String>,
 
     /// What was estimated of the rig, over its calibration, and standard deviations.

@@ -15,7 +15,7 @@ const CELL: usize = 32;
 const ALIKE: f64 = 0.9;
 const DETAIL: f64 = 4000.0;
 
-/// Of one pair or of many.
+/// How far the rows of one or more pairs are apart.
 #[derive(Clone, Debug, Default)]
 pub struct Alignment {
     /// Rows by which each matched corner is lower in the right image, px.

@@ -7,7 +7,7 @@
 //! smaller the disparity is, since far off two surfaces differ by little and the wrong one of them is as wrong; and the
 //! share of the window where nothing was matched. Sums of the window are carried along columns and rows.
 
-use super::matcher::Disparity;
+use super::Disparity;
 use crate::config::{StereoConfig, StereoMethod};
 use stipple_drivers::Image;
 
@@ -51,7 +51,7 @@ struct Sums {
     /// Columns, rows and disparities.
     first: [f64; 3],
     squares: [f64; 3],
-    /// Of columns and rows with disparities.
+    /// Columns and rows times disparities.
     products: [f64; 2],
 }
 
@@ -149,7 +149,7 @@ impl Fit {
 mod tests {
     use super::*;
 
-    /// Of a picture whose columns differ by `contrast`, with `step` px more disparity right of the middle.
+    /// Deviations in a picture whose columns differ by `contrast`, with `step` px more disparity right of the middle.
     fn sigmas(contrast: u8, step: f32) -> Vec<f32> {
         let (w, h) = (64, 32);
         let mut image = Image::new(w, h);

@@ -11,33 +11,13 @@ use super::confidence::Confidence;
 use super::onnx::{self, Network};
 use super::opencv::{self, OpenCv};
 use super::rectify_gpu::{packed, Rectifier};
+use super::sgm::wls::Wls;
 use super::sgm::{self, Sgm};
-use super::wls::Wls;
+use super::Disparity;
 use crate::config::{StereoConfig, StereoMethod};
 use crate::gpu::Gpu;
 use crate::mem::Footprint;
 use stipple_drivers::{Fault, FaultKind, Image};
-
-/// Disparity x_left - x_right of each pixel of the rectified left image, px, negative where unknown, and its standard
-/// deviation.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Disparity {
-    pub width: usize,
-    pub height: usize,
-    pub px: Vec<f32>,
-    /// Without meaning where the disparity is unknown.
-    pub sigma_px: Vec<f32>,
-}
-
-impl Disparity {
-    pub fn new(width: usize, height: usize) -> Disparity {
-        Disparity { width, height, px: vec![-1.0; width * height], sigma_px: vec![0.0; width * height] }
-    }
-
-    fn forget(&mut self) {
-        self.px.fill(-1.0);
-    }
-}
 
 pub enum Matcher {
     OpenCv(OpenCv, Confidence),
@@ -69,7 +49,7 @@ impl Matcher {
     pub fn check_supported(width: usize, height: usize, config: &StereoConfig) -> Result<(), Fault> {
         match config.method {
             StereoMethod::Bm | StereoMethod::Sgbm if !cfg!(feature = "opencv") => {
-                Err(refused_without_opencv(config.method))
+                Err(opencv::refused_without_opencv(config.method))
             }
             StereoMethod::Onnx => Network::check_files(width, height, &config.network),
             _ => Ok(()),
@@ -168,20 +148,13 @@ fn without_gpu(method: StereoMethod) -> Fault {
     Fault::new(FaultKind::Config, "stereo.method", what, "use `bm` or `sgbm`")
 }
 
-/// Why `bm` and `sgbm` are refused by a program without OpenCV.
-pub fn refused_without_opencv(method: StereoMethod) -> Fault {
-    let what = format!("`{}` is OpenCV's and this program was built without the cargo feature `opencv`", method.name());
-    let fix = "set stereo.method = \"sgm\", or build with the feature (on by default; needs libopencv-calib3d-dev)";
-    Fault::new(FaultKind::Config, "stereo.method", what, fix)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
     fn a_program_without_opencv_says_so_and_what_to_use() {
-        let said = refused_without_opencv(StereoMethod::Sgbm).to_string();
+        let said = opencv::refused_without_opencv(StereoMethod::Sgbm).to_string();
         assert!(said.contains("`sgbm`") && said.contains("feature `opencv`") && said.contains("\"sgm\""), "{said}");
         let named =
             |method| Matcher::check_supported(8, 8, &StereoConfig { method, ..StereoConfig::default() }).is_ok();

@@ -13,12 +13,11 @@ pub mod opencv;
 pub mod rectify;
 pub mod rectify_gpu;
 pub mod sgm;
-pub mod wls;
 
 use crate::config::{StereoConfig, StereoMethod};
 use crate::gpu::{Arena, Gpu};
 use crate::mem::Footprint;
-pub use matcher::{Disparity, Matcher};
+pub use matcher::Matcher;
 use rectify::{box_average, Rectification, Remap};
 use rectify_gpu::Rectifier;
 use stipple_drivers::{Calibration, Camera, Fault, Image, Pose, RigCamera};
@@ -57,6 +56,27 @@ pub struct RectifiedCamera {
     pub baseline_m: f64,
 }
 
+/// Disparity x_left - x_right of each pixel of the rectified left image, px, negative where unknown, and its standard
+/// deviation.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Disparity {
+    pub width: usize,
+    pub height: usize,
+    pub px: Vec<f32>,
+    /// Without meaning where the disparity is unknown.
+    pub sigma_px: Vec<f32>,
+}
+
+impl Disparity {
+    pub fn new(width: usize, height: usize) -> Disparity {
+        Disparity { width, height, px: vec![-1.0; width * height], sigma_px: vec![0.0; width * height] }
+    }
+
+    fn forget(&mut self) {
+        self.px.fill(-1.0);
+    }
+}
+
 /// Depth along the optical axis, m; 0 where unknown.
 #[derive(Clone, Debug, PartialEq)]
 pub struct DepthMap {
@@ -72,7 +92,7 @@ impl DepthMap {
         DepthMap::of(width, height, vec![0.0; width * height])
     }
 
-    /// Of depths without error.
+    /// A map of depths without error.
     pub fn of(width: usize, height: usize, metres: Vec<f32>) -> DepthMap {
         DepthMap { width, height, sigma_m: vec![0.0; metres.len()], metres }
     }

@@ -4,7 +4,7 @@
 #![allow(unsafe_code)]
 
 use crate::config::{StereoConfig, StereoMethod};
-use stipple_drivers::{Fault, Image};
+use stipple_drivers::{Fault, FaultKind, Image};
 
 /// OpenCV's disparities are in 1/16 px.
 #[cfg(feature = "opencv")]
@@ -31,6 +31,13 @@ pub fn working_bytes(width: usize, height: usize, config: &StereoConfig) -> usiz
     } else {
         8 * padded + 4 * (disparities + 2) * 4 * (height + block + 2)
     }
+}
+
+/// Why `bm` and `sgbm` are refused by a program without OpenCV.
+pub fn refused_without_opencv(method: StereoMethod) -> Fault {
+    let what = format!("`{}` is OpenCV's and this program was built without the cargo feature `opencv`", method.name());
+    let fix = "set stereo.method = \"sgm\", or build with the feature (on by default; needs libopencv-calib3d-dev)";
+    Fault::new(FaultKind::Config, "stereo.method", what, fix)
 }
 
 #[cfg(feature = "opencv")]
@@ -109,7 +116,6 @@ pub fn rectification_map(
 impl OpenCv {
     /// `config.method` says which of the two.
     pub fn new(width: usize, height: usize, config: &StereoConfig) -> Result<OpenCv, Fault> {
-        use stipple_drivers::FaultKind;
         let int = |v: u32| v as std::ffi::c_int;
         let (w, h) = (width as std::ffi::c_int, height as std::ffi::c_int);
         let (disparities, uniqueness) = (int(config.disparities), int(config.uniqueness_percent));
@@ -133,7 +139,6 @@ impl OpenCv {
 
     /// Disparity of the left image, px, negative where unknown.
     pub fn compute(&mut self, left: &Image, right: &Image, disparity_px: &mut [f32]) -> Result<(), Fault> {
-        use stipple_drivers::FaultKind;
         let px = self.width * self.height;
         assert!(
             left.pixels.len() == px && right.pixels.len() == px && disparity_px.len() == px,
@@ -174,7 +179,7 @@ unsafe impl Send for OpenCv {}
 #[cfg(not(feature = "opencv"))]
 impl OpenCv {
     pub fn new(_width: usize, _height: usize, config: &StereoConfig) -> Result<OpenCv, Fault> {
-        Err(super::matcher::refused_without_opencv(config.method))
+        Err(refused_without_opencv(config.method))
     }
 
     pub fn compute(&mut self, _left: &Image, _right: &Image, disparity_px: &mut [f32]) -> Result<(), Fault> {

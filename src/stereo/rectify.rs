@@ -150,7 +150,7 @@ impl Remap {
         }
     }
 
-    /// As a kernel takes it, for raw rows of `stride` bytes: the source's place in bytes, all ones where there is none, and
+    /// The look-ups for a kernel, with raw rows of `stride` bytes: the source's place in bytes, all ones where there is none, and
     /// the weights to the right and down.
     pub fn taps(&self, stride: usize) -> Vec<[u32; 2]> {
         let place =

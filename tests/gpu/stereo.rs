@@ -6,8 +6,8 @@ use stipple::config::{GpuConfig, StereoConfig, StereoMethod};
 use stipple::gpu::{Arena, Gpu, GpuOptions};
 use stipple::stereo::rectify::Rectification;
 use stipple::stereo::rectify_gpu::{self, Rectifier};
+use stipple::stereo::sgm::wls::Wls;
 use stipple::stereo::sgm::{self, Sgm, Shape};
-use stipple::stereo::wls::Wls;
 use stipple::stereo::{Buffers, DepthMap, Stereo};
 use stipple_drivers::{Calibration, Camera, Image, ImuCalibration, Lens, Pose, RigCamera};
 
@@ -147,7 +147,7 @@ fn filter_agrees_with_its_twin() {
             twin::smooth_lines(&grey(&left), &mut data, columns, lambda, f64::from(Wls::SIGMA));
         }
     }
-    let own = stipple::stereo::wls::Variance::FITTED;
+    let own = stipple::stereo::sgm::wls::Variance::FITTED;
     let variance = Variance {
         weight_min: f64::from(Wls::WEIGHT_MIN),
         fill: f64::from(Wls::FILL),

@@ -14,7 +14,7 @@ use stipple_drivers::{Fault, FaultKind, Image};
 pub struct Network {
     config: NetworkConfig,
     session: Session,
-    /// Of the images, and of the network.
+    /// Width and height of the images, and of the network's inputs.
     size: [usize; 2],
     inner: [usize; 2],
     output: Vec<f32>,

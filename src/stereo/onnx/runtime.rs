@@ -180,7 +180,7 @@ pub enum Refused {
 const LIBRARIES: [&str; 2] = ["libonnxruntime.so.1", "libonnxruntime.so"];
 
 impl Session {
-    /// Of a model with inputs `names[0]` and `names[1]` of `shape` and output `names[2]`. `runtime` is a library's
+    /// Opens a model with inputs `names[0]` and `names[1]` of `shape` and output `names[2]`. `runtime` is a library's
     /// path, or empty.
     pub fn open(
         runtime: &str,

@@ -16,14 +16,16 @@
 //!
 //! All until the filter is integers, and no sum depends on the order of threads: the result is the same in every run.
 
+pub mod wls;
+
 use super::rectify_gpu::{image_bytes, pack, packed, Rectifier};
-use super::wls::Wls;
 use crate::config::StereoConfig;
 use crate::gpu::kernels::{
     aggregate, census, match_left, match_right, speckle_count, speckle_drop, speckle_join, verify,
 };
 use crate::gpu::{Arena, Buf, DeviceKind, Gpu, GpuError, Kernel, Recorder, Threads, ALIGN};
 use stipple_drivers::{Fault, Image};
+use wls::Wls;
 
 /// Disparities one invocation of `aggregate` holds.
 const RUN: u32 = 8;

@@ -2,7 +2,7 @@
 //! disparities and on the weights, whose quotient is the disparity. Three passes of rows and columns with falling strength
 //! stand for the solve in two dimensions.
 
-use super::sgm::Buffers;
+use super::Buffers;
 use crate::gpu::kernels::{fill_rows, median, settle, smooth_lines};
 use crate::gpu::{Gpu, Kernel, Recorder, Threads};
 use stipple_drivers::Fault;
