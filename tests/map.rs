@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use stipple::config::Board;
 use stipple::map::{Keyframe, Mapper, Panel, PoseCorrection, StepKind};
 use stipple::mem::{heap_after_seal, seal_thread, CountingAllocator};
-use stipple::output::panel::{panel, View};
+use stipple::output::panel::panel;
 use stipple_drivers::replay::{OpenOptions, Recording};
 use stipple_drivers::sim::{Scenario, Sim};
 use stipple_drivers::types::pose_at;
@@ -362,10 +362,8 @@ fn a_recorded_room_maps_to_the_same_bits_twice_over_500_steps() {
 }
 
 fn write_png(dir: &std::path::Path, p: &Panel) {
-    let Panel { width, height, observed, rendered, depth, valid, psnr_db, .. } = p;
-    let view = View { width: *width, height: *height, observed, rendered, depth, valid, psnr_db: *psnr_db };
     let file = std::fs::File::create(dir.join(format!("{}.png", p.name))).unwrap();
-    panel(&view).write_png(&mut std::io::BufWriter::new(file)).unwrap();
+    panel(p).write_png(&mut std::io::BufWriter::new(file)).unwrap();
 }
 
 #[test]

@@ -42,7 +42,8 @@ pub struct Caps {
     pub name: String,
     pub kind: DeviceKind,
     pub subgroup_size: u32,
-    pub subgroup: Subgroup,
+    /// Bits of VkSubgroupFeatureFlagBits that compute kernels may use; none with `GpuConfig::subgroups = false`.
+    pub subgroup_operations: u32,
     pub invocations_max: u32,
     pub shared_max_bytes: u32,
     /// Largest buffer a kernel can bind, bytes.
@@ -54,48 +55,25 @@ pub struct Caps {
     pub(super) timestamp_bits: u32,
 }
 
-/// Subgroup operations compute kernels may use. `GpuConfig::subgroups = false` clears all of them.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Subgroup {
-    pub vote: bool,
-    pub arithmetic: bool,
-    pub ballot: bool,
-    pub shuffle: bool,
-    pub shuffle_relative: bool,
-    pub clustered: bool,
-    pub quad: bool,
-}
-
-impl Subgroup {
-    fn new(p: &vk::PhysicalDeviceSubgroupProperties) -> Subgroup {
-        let compute = p.supported_stages.contains(vk::ShaderStageFlags::COMPUTE);
-        let has = |f: vk::SubgroupFeatureFlags| compute && p.supported_operations.contains(f);
-        Subgroup {
-            vote: has(vk::SubgroupFeatureFlags::VOTE),
-            arithmetic: has(vk::SubgroupFeatureFlags::ARITHMETIC),
-            ballot: has(vk::SubgroupFeatureFlags::BALLOT),
-            shuffle: has(vk::SubgroupFeatureFlags::SHUFFLE),
-            shuffle_relative: has(vk::SubgroupFeatureFlags::SHUFFLE_RELATIVE),
-            clustered: has(vk::SubgroupFeatureFlags::CLUSTERED),
-            quad: has(vk::SubgroupFeatureFlags::QUAD),
-        }
-    }
+/// SPIR-V capabilities of kernels. Those of subgroup operations follow `GROUP` in the order of VkSubgroupFeatureFlagBits.
+pub mod capability {
+    pub const MATRIX: u32 = 0;
+    pub const SHADER: u32 = 1;
+    pub const GROUP: u32 = 61;
+    pub const GROUP_VOTE: u32 = 62;
+    pub const GROUP_ARITHMETIC: u32 = 63;
+    pub const GROUP_SHUFFLE: u32 = 65;
+    pub const GROUP_QUAD: u32 = 68;
 }
 
 impl Caps {
     /// Whether a module that declares this SPIR-V capability may run.
     pub fn allows(&self, capability: u32) -> bool {
-        let s = &self.subgroup;
+        use capability::*;
         match capability {
-            // Matrix, Shader, GroupNonUniform: every Vulkan 1.1 compute queue.
-            0 | 1 | 61 => true,
-            62 => s.vote,
-            63 => s.arithmetic,
-            64 => s.ballot,
-            65 => s.shuffle,
-            66 => s.shuffle_relative,
-            67 => s.clustered,
-            68 => s.quad,
+            // Every Vulkan 1.1 compute queue.
+            MATRIX | SHADER | GROUP => true,
+            GROUP_VOTE..=GROUP_QUAD => self.subgroup_operations >> (capability - GROUP) & 1 != 0,
             _ => false,
         }
     }
@@ -148,7 +126,7 @@ impl Device {
             destroy_instance(&instance, &messenger);
         })?;
         if !config.subgroups {
-            caps.subgroup = Subgroup::default();
+            caps.subgroup_operations = 0;
         }
         let queues = [vk::DeviceQueueCreateInfo::default().queue_family_index(family).queue_priorities(&[1.0])];
         let info = vk::DeviceCreateInfo::default().queue_create_infos(&queues);
@@ -331,13 +309,14 @@ fn describe(instance: &ash::Instance, physical: vk::PhysicalDevice) -> Option<Ch
         instance.get_physical_device_properties2(physical, &mut all);
         (instance.get_physical_device_queue_family_properties(physical), all.properties)
     };
+    let in_compute = subgroup.supported_stages.contains(vk::ShaderStageFlags::COMPUTE);
     let family = families.iter().position(|f| f.queue_flags.contains(vk::QueueFlags::COMPUTE))?;
     let bits = families[family].timestamp_valid_bits;
     let caps = Caps {
         name: properties.device_name_as_c_str().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default(),
         kind: DeviceKind::new(properties.device_type),
         subgroup_size: subgroup.subgroup_size,
-        subgroup: Subgroup::new(&subgroup),
+        subgroup_operations: if in_compute { subgroup.supported_operations.as_raw() } else { 0 },
         invocations_max: properties.limits.max_compute_work_group_invocations,
         shared_max_bytes: properties.limits.max_compute_shared_memory_size,
         binding_max_bytes: u64::from(properties.limits.max_storage_buffer_range),

@@ -43,7 +43,7 @@ mod submit;
 #[cfg(test)]
 mod tests;
 
-pub use device::{Caps, DeviceKind, Subgroup};
+pub use device::{capability, Caps, DeviceKind};
 pub use kernel::{Access, Kernel, KernelDef, Reflected, Variant, BUFFERS_MAX, PUSH_MAX, SPECS_MAX};
 pub use memory::{Arena, Buf, Range, Read, ReadWrite, Write, ALIGN, REPORTS, REPORT_BYTES, STAGING_BYTES};
 pub use record::{Recorder, Threads, GROUPS_MAX};

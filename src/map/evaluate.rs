@@ -14,10 +14,12 @@ use super::ssim::{mse, psnr_db, Ssim};
 use super::step::{Target, Weights};
 use crate::gpu::GpuError;
 use crate::limits::CAMERAS_MAX;
+use serde::{Deserialize, Serialize};
 
 /// A cheap probe on a few views, through the run.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct CurvePoint {
+    /// Seconds since the run began.
     pub t_s: f64,
     pub psnr_db: Option<f64>,
     pub psnr_heldout_db: Option<f64>,
@@ -51,11 +53,13 @@ pub struct Panel {
     pub height: usize,
     /// Grey, or three channels interleaved.
     pub observed: Vec<u8>,
+    /// 0..1, as many channels or one.
     pub rendered: Vec<f32>,
-    /// m, 0 where there is none.
+    /// m; not positive or not finite where there is none.
     pub depth: Vec<f32>,
-    /// Zero where not compared.
+    /// Zero where not compared; empty compares all.
     pub valid: Vec<u8>,
+    /// PSNR of the rendering.
     pub psnr_db: Option<f64>,
 }
 

@@ -1,5 +1,6 @@
 //! How a picture is cut into tiles for the raster, and sums over tiles into chunks, by what the device is.
 
+use crate::gpu::capability::{GROUP_SHUFFLE, GROUP_VOTE};
 use crate::gpu::{Caps, DeviceKind};
 
 /// The size of a tile, and the variant of the raster that draws it.
@@ -24,7 +25,7 @@ impl Tiling {
     pub fn of(caps: &Caps) -> Tiling {
         // Intel's compiler picks a width per kernel, narrower than the one it reports.
         let fixed_width = !caps.name.contains("Intel");
-        let sub = caps.subgroup.vote && caps.subgroup.shuffle && fixed_width;
+        let sub = caps.allows(GROUP_VOTE) && caps.allows(GROUP_SHUFFLE) && fixed_width;
         // A card with more processors than a picture has tiles waits for its longest list, which halves with the tile:
         // an NVIDIA H200 takes 0.434 ms a step at 52 k Gaussians instead of 0.469, and 0.475 with columns of 2. Where
         // tiles are plenty, fewer pixels a lane only make more lists. All tiles of such a card are under way at once, so

@@ -5,6 +5,7 @@
 
 use super::font;
 use super::metrics::percentile;
+use crate::map::Panel;
 use std::io::{self, Write};
 
 /// Error drawn at full brightness, of a grey range 0..1.
@@ -37,23 +38,6 @@ pub struct Picture {
     pub width: usize,
     pub height: usize,
     pub pixels: Vec<[u8; 3]>,
-}
-
-/// What a panel shows; every buffer is row-major at mapping resolution.
-#[derive(Clone, Copy, Debug)]
-pub struct View<'a> {
-    pub width: usize,
-    pub height: usize,
-    /// Grey, or three channels interleaved.
-    pub observed: &'a [u8],
-    /// 0..1, grey or three channels interleaved.
-    pub rendered: &'a [f32],
-    /// m; not positive or not finite where there is none.
-    pub depth: &'a [f32],
-    /// Zero where the observed pixel is not to be compared; empty compares all.
-    pub valid: &'a [u8],
-    /// PSNR of the rendering, shown in its label.
-    pub psnr_db: Option<f64>,
 }
 
 impl Picture {
@@ -104,11 +88,11 @@ impl Picture {
 }
 
 /// Draws the four panels.
-pub fn panel(view: &View) -> Picture {
+pub fn panel(view: &Panel) -> Picture {
     let (w, h) = (view.width, view.height);
     let magnify = ((w + LABEL_WIDTH_PX / 2) / LABEL_WIDTH_PX).max(1);
     let top = (font::HEIGHT + 4) * magnify;
-    let (near, far) = depth_range(view.depth);
+    let (near, far) = depth_range(&view.depth);
     let decibels = view.psnr_db.map_or(String::new(), |d| format!("  {d:.1} dB"));
     let labels = [
         "observed".to_string(),
@@ -143,12 +127,12 @@ pub fn panel(view: &View) -> Picture {
     picture
 }
 
-fn observed(view: &View, i: usize) -> [f32; 3] {
-    channels(view.observed, view.width * view.height, i, |v| v as f32 / 255.0)
+fn observed(view: &Panel, i: usize) -> [f32; 3] {
+    channels(&view.observed, view.width * view.height, i, |v| v as f32 / 255.0)
 }
 
-fn rendered(view: &View, i: usize) -> [f32; 3] {
-    channels(view.rendered, view.width * view.height, i, |v| v)
+fn rendered(view: &Panel, i: usize) -> [f32; 3] {
+    channels(&view.rendered, view.width * view.height, i, |v| v)
 }
 
 fn channels<T: Copy>(values: &[T], pixels: usize, i: usize, unit: impl Fn(T) -> f32) -> [f32; 3] {
@@ -209,15 +193,8 @@ mod tests {
         depth[1] = f32::NAN;
         let mut valid = vec![1u8; n];
         valid[2] = 0;
-        let view = View {
-            width,
-            height,
-            observed: &observed,
-            rendered: &rendered,
-            depth: &depth,
-            valid: &valid,
-            psnr_db: Some(31.25),
-        };
+        let psnr_db = Some(31.25);
+        let view = Panel { width, height, observed, rendered, depth, valid, psnr_db, ..Panel::default() };
         let p = panel(&view);
         let top = p.height - height;
         assert_eq!((p.width, top), (4 * 64 + 3 * GAP_PX, 12));
@@ -235,15 +212,13 @@ mod tests {
 
     #[test]
     fn colour_and_grey_buffers_are_both_taken() {
-        let rgb = [10u8, 20, 30, 40, 50, 60];
-        let view = View {
+        let view = Panel {
             width: 2,
             height: 1,
-            observed: &rgb,
-            rendered: &[0.5, 1.0],
-            depth: &[f32::NAN; 2],
-            valid: &[],
-            psnr_db: None,
+            observed: vec![10, 20, 30, 40, 50, 60],
+            rendered: vec![0.5, 1.0],
+            depth: vec![f32::NAN; 2],
+            ..Panel::default()
         };
         let p = panel(&view);
         assert_eq!(pixel(&p, 1, p.height - 1), [40, 50, 60]);

@@ -32,38 +32,38 @@ pub fn write_ply(out: &mut impl Write, splats: impl ExactSizeIterator<Item = Gau
     Ok(())
 }
 
-/// Reads what `write_ply` wrote; any other layout is an error.
-pub fn read_ply(bytes: &[u8]) -> io::Result<Vec<Gaussian>> {
-    let wrong = |what: &str| io::Error::new(io::ErrorKind::InvalidData, what.to_string());
-    const END: &[u8] = b"end_header\n";
-    let body = bytes.windows(END.len()).position(|w| w == END).ok_or_else(|| wrong("no end_header"))? + END.len();
-    let header = std::str::from_utf8(&bytes[..body]).map_err(|_| wrong("the header is not text"))?;
-    let names: Vec<&str> = header.lines().filter_map(|l| l.strip_prefix("property float ")).collect();
-    if !header.starts_with("ply\nformat binary_little_endian 1.0\n") || names != PROPERTIES {
-        return Err(wrong("not a map of this program"));
-    }
-    let count: Option<usize> = header.lines().find_map(|l| l.strip_prefix("element vertex ")?.parse().ok());
-    let row_bytes = 4 * PROPERTIES.len();
-    if count.and_then(|n| n.checked_mul(row_bytes)) != Some(bytes.len() - body) {
-        return Err(wrong("the size does not agree with the header"));
-    }
-    let splat = |row: &[u8]| {
-        let f = |i: usize| f32::from_le_bytes([row[4 * i], row[4 * i + 1], row[4 * i + 2], row[4 * i + 3]]);
-        Gaussian {
-            mean: [f(0), f(1), f(2)],
-            log_scale: [f(10), f(11), f(12)],
-            quat_xyzw: [f(14), f(15), f(16), f(13)],
-            opacity_logit: f(9),
-            colour: [6, 7, 8].map(|i| 0.5 + SH0 * f(i)),
-        }
-    };
-    Ok(bytes[body..].chunks_exact(row_bytes).map(splat).collect())
-}
-
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
+
+    /// Reads what `write_ply` wrote; any other layout is an error.
+    fn read_ply(bytes: &[u8]) -> io::Result<Vec<Gaussian>> {
+        let wrong = |what: &str| io::Error::new(io::ErrorKind::InvalidData, what.to_string());
+        const END: &[u8] = b"end_header\n";
+        let body = bytes.windows(END.len()).position(|w| w == END).ok_or_else(|| wrong("no end_header"))? + END.len();
+        let header = std::str::from_utf8(&bytes[..body]).map_err(|_| wrong("the header is not text"))?;
+        let names: Vec<&str> = header.lines().filter_map(|l| l.strip_prefix("property float ")).collect();
+        if !header.starts_with("ply\nformat binary_little_endian 1.0\n") || names != PROPERTIES {
+            return Err(wrong("not a map of this program"));
+        }
+        let count: Option<usize> = header.lines().find_map(|l| l.strip_prefix("element vertex ")?.parse().ok());
+        let row_bytes = 4 * PROPERTIES.len();
+        if count.and_then(|n| n.checked_mul(row_bytes)) != Some(bytes.len() - body) {
+            return Err(wrong("the size does not agree with the header"));
+        }
+        let splat = |row: &[u8]| {
+            let f = |i: usize| f32::from_le_bytes([row[4 * i], row[4 * i + 1], row[4 * i + 2], row[4 * i + 3]]);
+            Gaussian {
+                mean: [f(0), f(1), f(2)],
+                log_scale: [f(10), f(11), f(12)],
+                quat_xyzw: [f(14), f(15), f(16), f(13)],
+                opacity_logit: f(9),
+                colour: [6, 7, 8].map(|i| 0.5 + SH0 * f(i)),
+            }
+        };
+        Ok(bytes[body..].chunks_exact(row_bytes).map(splat).collect())
+    }
 
     fn splats() -> Vec<Gaussian> {
         let splat = |i: i32| Gaussian {

@@ -1,5 +1,6 @@
 //! `report.json`: one flat object. A figure that was not measured is null, never zero.
 
+use crate::map::CurvePoint;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::io::{self, Write};
@@ -105,16 +106,6 @@ pub struct ExtrinsicsFound {
     pub p_sigma_m: [f64; 3],
     pub theta_rad: [f64; 3],
     pub theta_sigma_rad: [f64; 3],
-}
-
-#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
-pub struct CurvePoint {
-    /// Seconds since the run began.
-    pub t_s: f64,
-    pub psnr_db: Option<f64>,
-    pub psnr_heldout_db: Option<f64>,
-    pub splats: u64,
-    pub iterations: u64,
 }
 
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]

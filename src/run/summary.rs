@@ -8,8 +8,8 @@ use crate::map::{Evaluation, Gaussian, Mapper, Panel};
 use crate::mem;
 use crate::output::html::{write_html, Evidence};
 use crate::output::metrics::{percentile, trajectory_error, TrajectoryError};
-use crate::output::panel::{panel, Picture, View};
-use crate::output::report::{seconds_to, CurvePoint, ExtrinsicsFound, KernelTime, Report, GOOD_DB};
+use crate::output::panel::{panel, Picture};
+use crate::output::report::{seconds_to, ExtrinsicsFound, KernelTime, Report, GOOD_DB};
 use crate::output::{atomically, ply, trajectory, OutputDir};
 use crate::vio::RigEstimate;
 use stipple_drivers::{host, Fault, Nanos, TimedPose};
@@ -57,7 +57,7 @@ pub fn conclude(title: Title, mut flown: Flown, out: &OutputDir) -> Result<Repor
         report.splats = Some(m.mapper.splat_count() as u64);
         report.gpu_bytes = Some(m.mapper.gpu_bytes());
         report.device = Some(m.mapper.device().to_string());
-        report.curve = m.curve.iter().map(curve_point).collect();
+        report.curve = m.curve.clone();
         report.seconds_to_25_db = seconds_to(&report.curve, GOOD_DB);
         report.kernels = m.mapper.kernel_times().into_iter().map(kernel_time).collect();
         report.kernels.sort_by(|a, b| b.total_ms.total_cmp(&a.total_ms));
@@ -190,7 +190,7 @@ fn write_files(
     out: &OutputDir,
 ) -> Result<(), Fault> {
     out.write("trajectory.tum", |w| trajectory::write_tum(w, estimated))?;
-    let pictures: Vec<(String, Picture)> = panels.iter().map(|p| (p.name.clone(), panel(&view(p)))).collect();
+    let pictures: Vec<(String, Picture)> = panels.iter().map(|p| (p.name.clone(), panel(p))).collect();
     if !pictures.is_empty() {
         out.replace_folder("renders", |dir| {
             pictures.iter().try_for_each(|(name, p)| atomically(&dir.join(format!("{name}.png")), |w| p.write_png(w)))
@@ -202,28 +202,6 @@ fn write_files(
     out.write("report.html", |w| write_html(w, report, &evidence))?;
     // Last: whoever finds report.json finds everything it speaks of.
     out.write("report.json", |w| report.write_json(w))
-}
-
-fn view(p: &Panel) -> View<'_> {
-    View {
-        width: p.width,
-        height: p.height,
-        observed: &p.observed,
-        rendered: &p.rendered,
-        depth: &p.depth,
-        valid: &p.valid,
-        psnr_db: p.psnr_db,
-    }
-}
-
-fn curve_point(c: &crate::map::CurvePoint) -> CurvePoint {
-    CurvePoint {
-        t_s: c.t_s,
-        psnr_db: c.psnr_db,
-        psnr_heldout_db: c.psnr_heldout_db,
-        splats: c.splats,
-        iterations: c.iterations,
-    }
 }
 
 fn kernel_time(k: crate::gpu::Timing) -> KernelTime {

@@ -67,49 +67,7 @@ mod ffi {
             right: *const u8,
             disparity: *mut i16,
         ) -> c_int;
-        #[cfg(test)]
-        pub fn stipple_rectification_map(
-            fisheye: c_int,
-            k: *const f64,
-            distortion: *const f64,
-            turn: *const f64,
-            rectified: *const f64,
-            width: c_int,
-            height: c_int,
-            x: *mut f32,
-            y: *mut f32,
-        ) -> c_int;
     }
-}
-
-/// Raw pixels of every rectified one, as OpenCV has them: of Brown's lens or of Kannala's and Brandt's. `k` and
-/// `rectified` are fx fy cx cy, `turn` is rect_from_cam row by row.
-#[cfg(all(test, feature = "opencv"))]
-pub fn rectification_map(
-    fisheye: bool,
-    k: [f64; 4],
-    distortion: [f64; 4],
-    turn: [f64; 9],
-    rectified: [f64; 4],
-    [width, height]: [usize; 2],
-) -> Vec<[f32; 2]> {
-    let (mut x, mut y) = (vec![0f32; width * height], vec![0f32; width * height]);
-    // SAFETY: arrays of the lengths that the function reads, buffers of width * height that it writes, all alive.
-    let rc = unsafe {
-        ffi::stipple_rectification_map(
-            std::ffi::c_int::from(fisheye),
-            k.as_ptr(),
-            distortion.as_ptr(),
-            turn.as_ptr(),
-            rectified.as_ptr(),
-            width as std::ffi::c_int,
-            height as std::ffi::c_int,
-            x.as_mut_ptr(),
-            y.as_mut_ptr(),
-        )
-    };
-    assert_eq!(rc, 0, "OpenCV makes a map");
-    x.into_iter().zip(y).map(|(x, y)| [x, y]).collect()
 }
 
 #[cfg(feature = "opencv")]
@@ -186,5 +144,54 @@ impl OpenCv {
         assert!(self.fixed.len() == self.width * self.height, "none is ever made");
         disparity_px.fill(-1.0);
         Ok(())
+    }
+}
+
+#[cfg(test)]
+#[cfg(feature = "opencv")]
+pub mod tests {
+    use std::ffi::c_int;
+
+    extern "C" {
+        fn stipple_rectification_map(
+            fisheye: c_int,
+            k: *const f64,
+            distortion: *const f64,
+            turn: *const f64,
+            rectified: *const f64,
+            width: c_int,
+            height: c_int,
+            x: *mut f32,
+            y: *mut f32,
+        ) -> c_int;
+    }
+
+    /// Raw pixels of every rectified one, as OpenCV has them: of Brown's lens or of Kannala's and Brandt's. `k` and
+    /// `rectified` are fx fy cx cy, `turn` is rect_from_cam row by row.
+    pub fn rectification_map(
+        fisheye: bool,
+        k: [f64; 4],
+        distortion: [f64; 4],
+        turn: [f64; 9],
+        rectified: [f64; 4],
+        [width, height]: [usize; 2],
+    ) -> Vec<[f32; 2]> {
+        let (mut x, mut y) = (vec![0f32; width * height], vec![0f32; width * height]);
+        // SAFETY: arrays of the lengths that the function reads, buffers of width * height that it writes, all alive.
+        let rc = unsafe {
+            stipple_rectification_map(
+                c_int::from(fisheye),
+                k.as_ptr(),
+                distortion.as_ptr(),
+                turn.as_ptr(),
+                rectified.as_ptr(),
+                width as c_int,
+                height as c_int,
+                x.as_mut_ptr(),
+                y.as_mut_ptr(),
+            )
+        };
+        assert_eq!(rc, 0, "OpenCV makes a map");
+        x.into_iter().zip(y).map(|(x, y)| [x, y]).collect()
     }
 }

@@ -246,7 +246,14 @@ mod tests {
                 let turn =
                     DMat3::from_quat(r.body_from_rect.conjugate() * c.body_from_cam.q).transpose().to_cols_array();
                 let rectified = [p.fx, p.fy, p.cx, p.cy];
-                super::super::opencv::rectification_map(fisheye, k, distortion, turn, rectified, [p.width, p.height])
+                super::super::opencv::tests::rectification_map(
+                    fisheye,
+                    k,
+                    distortion,
+                    turn,
+                    rectified,
+                    [p.width, p.height],
+                )
             })
             .collect();
         let (worst, n) = worst(&rig, |_, c, i| {

@@ -14,7 +14,7 @@ mod reflect;
 use stipple::config::GpuConfig;
 use stipple::gpu::kernels::{self, args, axpy, group_sum, layouts, types};
 use stipple::gpu::{
-    Buf, Gpu, GpuError, GpuOptions, Kernel, Recorder, Threads, ALIGN, COMMANDS_MAX, REPORTS, STAGING_BYTES,
+    capability, Buf, Gpu, GpuError, GpuOptions, Kernel, Recorder, Threads, ALIGN, COMMANDS_MAX, REPORTS, STAGING_BYTES,
 };
 use stipple::mem;
 use stipple_drivers::FaultKind;
@@ -278,7 +278,7 @@ fn variants_agree_and_are_taken_by_the_device() {
     let sums = gpu.alloc::<u32>("sums", 4).unwrap();
     let expected: Vec<u32> = items.chunks(256).map(|c| c.iter().sum()).collect();
     for variant in ["", "subgroup"] {
-        if variant == "subgroup" && !gpu.caps().subgroup.arithmetic {
+        if variant == "subgroup" && !gpu.caps().allows(capability::GROUP_ARITHMETIC) {
             continue;
         }
         let k = gpu.kernel_variant::<group_sum::K>(group_sum::Spec {}, variant).unwrap();
@@ -288,7 +288,7 @@ fn variants_agree_and_are_taken_by_the_device() {
         assert_eq!(read(&mut gpu, sums), expected, "variant {variant:?}");
     }
     let taken = gpu.kernel::<group_sum::K>(group_sum::Spec {}).unwrap().name();
-    assert_eq!(taken, if gpu.caps().subgroup.arithmetic { "group_sum_subgroup" } else { "group_sum" });
+    assert_eq!(taken, if gpu.caps().allows(capability::GROUP_ARITHMETIC) { "group_sum_subgroup" } else { "group_sum" });
     let config = GpuConfig { subgroups: false, ..Default::default() };
     let mut plain = Gpu::open(&config, 1 << 16).unwrap();
     assert_eq!(plain.kernel::<group_sum::K>(group_sum::Spec {}).unwrap().name(), "group_sum");
