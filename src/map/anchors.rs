@@ -25,7 +25,6 @@ use super::seeds::{Seed, Seeder};
 use super::store::Store;
 use super::view::View;
 use crate::config::MapConfig;
-use crate::counters::Counters;
 use crate::gpu::{Gpu, GpuError};
 use crate::mem::unsealed;
 use crate::stereo::{DepthMap, Stereo};
@@ -102,7 +101,7 @@ impl Anchors {
         Ok(Anchors { config: config.clone(), pair, work, occupancy, anchored_at: 0 })
     }
 
-    /// Makes stored image `index`, the first of `keyframe`, an anchor when the map after `steps` does not show its view,
+    /// Makes stored image `index`, the first of `keyframe`, an anchor when the map does not show its view,
     /// or not well.
     pub fn try_anchor(
         &mut self,
@@ -110,8 +109,6 @@ impl Anchors {
         stereo: &mut Stereo,
         keyframe: &Keyframe,
         index: usize,
-        steps: u64,
-        counters: &Counters,
     ) -> Result<Option<NewAnchor>, GpuError> {
         if let Some(pair) = &mut self.pair {
             for (channel, plane) in pair.planes.iter_mut().enumerate() {
@@ -128,27 +125,27 @@ impl Anchors {
             Coverage::new(&seen, self.config.covered_alpha, self.config.wrong_error)
         };
         let least = self.config.anchor_missing_min;
-        let proven = steps - self.anchored_at >= u64::from(self.config.wrong_after_steps);
+        let proven = scene.steps - self.anchored_at >= u64::from(self.config.wrong_after_steps);
         if coverage.uncovered <= least && (coverage.lacking() <= least || !proven) {
             return Ok(None);
         }
-        if !self.match_depth(scene, stereo, keyframe, counters) {
+        if !self.match_depth(scene, stereo, keyframe) {
             return Ok(None);
         }
         if let Some(pair) = &mut self.pair {
             pair.distort(&self.work.depth.metres, &view.camera);
         }
         let first = scene.store.anchors() == 0;
-        let whole = self.seeds_of_a_view(scene, steps);
+        let whole = self.seeds_of_a_view(scene);
         let wanted = (coverage.lacking() * whole as f64).ceil() as usize;
-        let room = self.make_room(scene, wanted, counters)?;
+        let room = self.make_room(scene, wanted)?;
         if room == 0 && !self.config.evict {
             return Ok(None);
         }
         scene.pipeline.pool.open_block(index as u32);
-        let seeded = self.seed(scene, index, &view, stereo.views.valid_mask(), (whole, room), counters)? as u32;
-        counters.anchors_for_error.add(u64::from(coverage.uncovered <= least));
-        self.anchored_at = steps;
+        let seeded = self.seed(scene, index, &view, stereo.views.valid_mask(), (whole, room))? as u32;
+        scene.counters.anchors_for_error.add(u64::from(coverage.uncovered <= least));
+        self.anchored_at = scene.steps;
         let entry = scene.store.get_mut(index);
         (entry.anchor, entry.placed) = (true, entry.given);
         let scene_depth_m = if first { median_depth(&self.work.depth.metres) } else { None };
@@ -170,21 +167,15 @@ impl Anchors {
     }
 
     /// Whether the pair could be matched. One that cannot gives no depth, and no anchor; the keyframe is still trained on.
-    fn match_depth(
-        &mut self,
-        scene: &mut Scene,
-        stereo: &mut Stereo,
-        keyframe: &Keyframe,
-        counters: &Counters,
-    ) -> bool {
+    fn match_depth(&mut self, scene: &mut Scene, stereo: &mut Stereo, keyframe: &Keyframe) -> bool {
         let depth = &mut self.work.depth;
         let [left, right, ..] = &keyframe.images[..] else { return false };
         let Ok(found) = unsealed(|| stereo.depth(Some(&mut scene.gpu), left, right, depth)) else {
-            counters.depth_failures.add(1);
+            scene.counters.depth_failures.add(1);
             return false;
         };
         let enough = found as f64 >= DEPTH_MIN * depth.metres.len() as f64;
-        counters.depth_absent.add(u64::from(!enough));
+        scene.counters.depth_absent.add(u64::from(!enough));
         enough
     }
 
@@ -196,25 +187,18 @@ impl Anchors {
         view: &View,
         valid: &[u8],
         (whole, room): (usize, usize),
-        counters: &Counters,
     ) -> Result<usize, GpuError> {
         let Workspace { depth, seeder, diffusion, answers, .. } = &mut self.work;
-        let points =
-            seeder.seed(&seen(scene, &self.pair, index, view, valid, &depth.metres), whole, diffusion, counters);
+        let seen = seen(scene, &self.pair, index, view, valid, &depth.metres);
+        let points = seeder.seed(&seen, whole, diffusion, &scene.counters);
         self.occupancy.look_up(&mut scene.gpu, &scene.pipeline.pool, points, answers)?;
         let (exposure, planes) = (scene.store.exposure(index), planes(&scene.store, &self.pair, index));
-        let splats = seeder.keep(answers, room, counters).iter().map(|s| s.gaussian(planes, exposure));
+        let splats = seeder.keep(answers, room, &scene.counters).iter().map(|s| s.gaussian(planes, exposure));
         scene.pipeline.pool.append(&mut scene.gpu, splats)
     }
 
     /// Adds Gaussians where the newest anchor's picture is least like its image, through the lens that trains.
-    pub fn densify(
-        &mut self,
-        scene: &mut Scene,
-        index: usize,
-        steps: u64,
-        counters: &Counters,
-    ) -> Result<(), GpuError> {
+    pub fn densify(&mut self, scene: &mut Scene, index: usize) -> Result<(), GpuError> {
         if self.config.densify_max == 0 || scene.pipeline.pool.newest() != Some(index as u32) {
             return Ok(());
         }
@@ -223,37 +207,31 @@ impl Anchors {
         scene.pipeline.similarity(&mut scene.gpu, &target, &mut self.work.similarity)?;
         let lacking = 0.5 * (1.0 - mean(&self.work.similarity, &scene.camera(index).valid));
         let wanted = (f64::from(self.config.densify_max) * lacking) as usize;
-        let wanted = wanted.min(self.affordable(scene, steps));
-        let wanted = wanted.min(self.make_room(scene, wanted, counters)?);
+        let wanted = wanted.min(self.affordable(scene));
+        let wanted = wanted.min(self.make_room(scene, wanted)?);
         let Workspace { depth, diffusion, newcomers, similarity, .. } = &mut self.work;
         let depth = self.pair.as_ref().map_or(&depth.metres, |pair| &pair.distance);
         let planes = scene.store.planes(index);
-        let seen = Seen {
-            planes,
-            valid: &scene.cameras[0].valid,
-            depth,
-            rendered: &scene.rendered,
-            exposure: target.exposure,
-            view,
-        };
-        densify(&seen, similarity, wanted, diffusion, newcomers, counters);
+        let (valid, rendered, exposure) = (&scene.cameras[0].valid, &scene.rendered, target.exposure);
+        let seen = Seen { planes, valid, depth, rendered, exposure, view };
+        densify(&seen, similarity, wanted, diffusion, newcomers, &scene.counters);
         let splats = newcomers.iter().map(|s| s.gaussian(planes, target.exposure));
         let added = scene.pipeline.pool.append(&mut scene.gpu, splats)?;
-        counters.splats_densified.add(added as u64);
+        scene.counters.splats_densified.add(added as u64);
         Ok(())
     }
 
     /// Seeds for a view that is all uncovered.
-    fn seeds_of_a_view(&self, scene: &Scene, steps: u64) -> usize {
+    fn seeds_of_a_view(&self, scene: &Scene) -> usize {
         let pool = &scene.pipeline.pool;
         let share = if self.config.evict { pool.capacity() / POOL_SHARE } else { pool.room().div_ceil(FREE_SHARE) };
-        share.min(self.config.seeds_per_anchor as usize).min(self.affordable(scene, steps))
+        share.min(self.config.seeds_per_anchor as usize).min(self.affordable(scene))
     }
 
     /// Gaussians that an anchor may add at the steps a keyframe gets here: more than are trained cost every later step
     /// its time and give nothing back.
-    fn affordable(&self, scene: &Scene, steps: u64) -> usize {
-        let steps = (steps / scene.store.training().len().max(1) as u64) as usize;
+    fn affordable(&self, scene: &Scene) -> usize {
+        let steps = (scene.steps / scene.store.training().len().max(1) as u64) as usize;
         match self.config.seeds_per_step as usize {
             0 => usize::MAX,
             limit => limit * steps.max(if scene.store.anchors() == 0 { STEPS_FIRST } else { STEPS_MIN }),
@@ -262,7 +240,7 @@ impl Anchors {
 
     /// Removes what is faint, huge or not finite, and where that leaves less room than wanted, the least important.
     /// Answers the room there is then.
-    fn make_room(&self, scene: &mut Scene, wanted: usize, counters: &Counters) -> Result<usize, GpuError> {
+    fn make_room(&self, scene: &mut Scene, wanted: usize) -> Result<usize, GpuError> {
         let (gpu, pool) = (&mut scene.gpu, &mut scene.pipeline.pool);
         let mut rule = PruneRule { steps_min: STEPS_JUDGED, ..PruneRule::default() };
         let mut evicted = 0;
@@ -272,8 +250,8 @@ impl Anchors {
             (rule.importance_min, evicted) = threshold(&bins, wanted - pool.room(), most);
         }
         let removed = pool.prune(gpu, &rule)?;
-        counters.splats_evicted.add(evicted.min(removed) as u64);
-        counters.splats_pruned.add(removed.saturating_sub(evicted) as u64);
+        scene.counters.splats_evicted.add(evicted.min(removed) as u64);
+        scene.counters.splats_pruned.add(removed.saturating_sub(evicted) as u64);
         Ok(pool.room())
     }
 }

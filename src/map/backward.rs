@@ -8,7 +8,7 @@
 //! the same in every run.
 
 use super::pool::Pool;
-use super::render::{ByLens, Renderer};
+use super::render::Renderer;
 use super::shape::{Scratch, Shape, GROUP};
 use super::step::{LearningRates, Weights};
 use super::tiling::Tiling;
@@ -39,9 +39,8 @@ pub struct Backward {
     sum_chunks: Option<Kernel<sum_chunks::K>>,
     /// In colour.
     chroma: Option<Kernel<chroma_backward::K>>,
-    project: ByLens<project_backward::K>,
-    /// The same, leaving the map as it is.
-    project_still: ByLens<project_backward::K>,
+    /// By lens: leaving the map as it is, and taking a step.
+    project: [[Kernel<project_backward::K>; 2]; 2],
 }
 
 impl Backward {
@@ -53,13 +52,12 @@ impl Backward {
         tiling: Tiling,
     ) -> Result<Backward, Fault> {
         let (channels, Tiling { lanes, column, variant, chunk }) = (shape.channels, tiling);
-        let mut project = |learn, fisheye| gpu.kernel(project_backward::Spec { channels, chunk, fisheye, learn });
+        let mut project = |fisheye, learn| gpu.kernel(project_backward::Spec { channels, chunk, fisheye, learn });
         Ok(Backward {
             buffers,
             isect_gradients: scratch.isect_gradients,
             capacity: shape.intersections,
-            project: ByLens { pinhole: project(true, false)?, fisheye: project(true, true)? },
-            project_still: ByLens { pinhole: project(false, false)?, fisheye: project(false, true)? },
+            project: [[project(false, false)?, project(false, true)?], [project(true, false)?, project(true, true)?]],
             raster: gpu.kernel_variant(raster_backward::Spec { lanes, column, channels }, variant)?,
             sum_chunks: (chunk > 1).then(|| gpu.kernel(sum_chunks::Spec { channels, chunk })).transpose()?,
             chroma: (channels == 3).then(|| gpu.kernel(chroma_backward::Spec { chunk })).transpose()?,
@@ -128,10 +126,10 @@ impl Backward {
         weights: &Weights,
     ) {
         let b = &renderer.buffers;
-        let kernel = if rates.is_some() { &self.project } else { &self.project_still };
+        let kernel = &self.project[view.lens()][usize::from(rates.is_some())];
         let rates = rates.copied().unwrap_or_default();
         rec.dispatch(
-            kernel.of(view),
+            kernel,
             project_backward::Bind {
                 visible_count: b.visible_count.read(),
                 slots: b.ranked.read(),

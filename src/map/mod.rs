@@ -94,7 +94,6 @@ pub struct Mapper {
     stereo: Stereo,
     anchors: Anchors,
     trainer: Trainer,
-    counters: Counters,
     /// Corrections move Gaussians when they exceed this, m and rad.
     move_tolerance: f64,
     /// Corrections came since anchors were last put in place.
@@ -137,11 +136,10 @@ impl Mapper {
         gpu.time_commands(TIMED_IN);
         let (store, rendered) = (Store::new(&shape), Rendered::new(w, h, channels));
         Ok(Mapper {
-            scene: Scene { gpu, pipeline, store, cameras, rendered },
+            scene: Scene { gpu, pipeline, store, cameras, rendered, steps: 0, counters: Counters::default() },
             stereo,
             anchors,
             trainer: Trainer::new(config),
-            counters: Counters::default(),
             move_tolerance: config.move_tolerance,
             corrected: false,
         })
@@ -153,7 +151,7 @@ impl Mapper {
         self.finish_pending()?;
         let Scene { gpu, pipeline, store, cameras, .. } = &mut self.scene;
         if store.is_full() {
-            self.counters.keyframe_store_full.add(1);
+            self.scene.counters.keyframe_store_full.add(1);
             return Ok(StepKind::Dropped);
         }
         let index = store.len();
@@ -168,8 +166,7 @@ impl Mapper {
         if keyframe.held_out {
             return Ok(StepKind::Stored);
         }
-        let (steps, counters) = (self.trainer.steps, &self.counters);
-        let anchor = self.anchors.try_anchor(&mut self.scene, &mut self.stereo, keyframe, index, steps, counters)?;
+        let anchor = self.anchors.try_anchor(&mut self.scene, &mut self.stereo, keyframe, index)?;
         Ok(anchor.map_or(StepKind::Stored, |anchor| {
             self.trainer.scene_depth_m = anchor.scene_depth_m.unwrap_or(self.trainer.scene_depth_m);
             self.trainer.start_burst(index);
@@ -191,7 +188,7 @@ impl Mapper {
             if self.trainer.must_wait() {
                 self.finish_pending()?;
             }
-            let Some(kind) = self.trainer.step(&mut self.scene, &self.counters)? else {
+            let Some(kind) = self.trainer.step(&mut self.scene)? else {
                 self.finish_pending()?;
                 break;
             };
@@ -209,15 +206,15 @@ impl Mapper {
     fn apply_corrections(&mut self) -> Result<(), GpuError> {
         if std::mem::take(&mut self.corrected) {
             self.finish_pending()?;
-            self.counters.blocks_moved.add(self.scene.apply_corrections(self.move_tolerance)?);
+            self.scene.apply_corrections(self.move_tolerance)?;
         }
         Ok(())
     }
 
     /// Takes in the training step in flight; an anchor whose burst it ends is densified.
     fn finish_pending(&mut self) -> Result<(), GpuError> {
-        match self.trainer.finish_pending(&mut self.scene, &self.counters)? {
-            Some(anchor) => self.anchors.densify(&mut self.scene, anchor, self.trainer.steps, &self.counters),
+        match self.trainer.finish_pending(&mut self.scene)? {
+            Some(anchor) => self.anchors.densify(&mut self.scene, anchor),
             None => Ok(()),
         }
     }
@@ -225,7 +222,7 @@ impl Mapper {
     /// Scores a few keyframes at run time `t_s`. Allocates.
     pub fn sample(&mut self, t_s: f64) -> Result<CurvePoint, GpuError> {
         let [psnr_db, psnr_heldout_db] = evaluate::sample(&mut self.scene)?;
-        let (splats, iterations) = (u64::from(self.scene.pipeline.pool.count()), self.trainer.steps);
+        let (splats, iterations) = (u64::from(self.scene.pipeline.pool.count()), self.scene.steps);
         Ok(CurvePoint { t_s, psnr_db, psnr_heldout_db, splats, iterations })
     }
 
@@ -268,11 +265,11 @@ impl Mapper {
 
     /// Training steps started.
     pub fn iterations(&self) -> u64 {
-        self.trainer.steps
+        self.scene.steps
     }
 
     pub fn counters(&self) -> &Counters {
-        &self.counters
+        &self.scene.counters
     }
 
     pub fn gpu_bytes(&self) -> u64 {

@@ -81,21 +81,6 @@ impl Rendered {
     }
 }
 
-/// A kernel made for each of the two lenses.
-pub struct ByLens<K> {
-    pub pinhole: Kernel<K>,
-    pub fisheye: Kernel<K>,
-}
-
-impl<K> ByLens<K> {
-    pub fn of(&self, view: &View) -> &Kernel<K> {
-        match view.fisheye {
-            None => &self.pinhole,
-            Some(_) => &self.fisheye,
-        }
-    }
-}
-
 pub struct Renderer {
     pub buffers: Buffers,
     pub tiling: Tiling,
@@ -103,7 +88,8 @@ pub struct Renderer {
     capacity: u32,
     scan: Scan,
     sorter: Sorter,
-    project: ByLens<project::K>,
+    /// By lens.
+    project: [Kernel<project::K>; 2],
     count_tiles: Kernel<count_tiles::K>,
     emit_tiles: Kernel<emit_tiles::K>,
     tile_ranges: Kernel<tile_ranges::K>,
@@ -125,6 +111,7 @@ impl Renderer {
         let raster = |gpu: &mut Gpu, depth| {
             gpu.kernel_variant(raster_forward::Spec { lanes, column, depth, channels: shape.channels }, variant)
         };
+        let project = |gpu: &mut Gpu, fisheye| gpu.kernel(project::Spec { lanes, column, fisheye });
         Ok(Renderer {
             buffers,
             tiling,
@@ -132,10 +119,7 @@ impl Renderer {
             capacity: shape.intersections,
             scan: Scan::new(gpu, sort)?,
             sorter: Sorter::new(gpu, sort, cut)?,
-            project: ByLens {
-                pinhole: gpu.kernel(project::Spec { lanes, column, fisheye: false })?,
-                fisheye: gpu.kernel(project::Spec { lanes, column, fisheye: true })?,
-            },
+            project: [project(gpu, false)?, project(gpu, true)?],
             count_tiles: gpu.kernel(count_tiles::Spec { lanes, column })?,
             emit_tiles: gpu.kernel(emit_tiles::Spec { lanes, column })?,
             tile_ranges: gpu.kernel(tile_ranges::Spec::default())?,
@@ -174,7 +158,7 @@ impl Renderer {
         let (b, n) = (&self.buffers, pool.count());
         rec.fill(b.failed, 0);
         rec.dispatch(
-            self.project.of(view),
+            &self.project[view.lens()],
             project::Bind {
                 splats: pool.buffers.splats.read(),
                 projected_out: b.projected.write(),

@@ -7,6 +7,7 @@ use super::render::Rendered;
 use super::step::Target;
 use super::store::Store;
 use super::view::View;
+use crate::counters::Counters;
 use crate::gpu::{Gpu, GpuError};
 
 pub struct Scene {
@@ -16,6 +17,9 @@ pub struct Scene {
     pub cameras: Vec<TrainingCamera>,
     /// The last picture.
     pub rendered: Rendered,
+    /// Training steps started.
+    pub steps: u64,
+    pub counters: Counters,
 }
 
 impl Scene {
@@ -51,12 +55,10 @@ impl Scene {
     }
 
     /// Puts the Gaussians of anchors that were corrected by more than `tolerance` (m, rad) where their anchors are now;
-    /// how many anchors.
-    pub fn apply_corrections(&mut self, tolerance: f64) -> Result<u64, GpuError> {
-        let mut moved = 0;
-        let displaced = self.store.displaced(tolerance).inspect(|_| moved += 1);
-        self.pipeline.pool.move_blocks(&mut self.gpu, displaced)?;
-        Ok(moved)
+    /// these are counted.
+    pub fn apply_corrections(&mut self, tolerance: f64) -> Result<(), GpuError> {
+        let displaced = self.store.displaced(tolerance).inspect(|_| self.counters.blocks_moved.add(1));
+        self.pipeline.pool.move_blocks(&mut self.gpu, displaced)
     }
 
     /// The exposure of the median training view: what takes the map's colours, whose gauge is none of a camera's, to what

@@ -10,7 +10,6 @@ use super::schedule::Schedule;
 use super::step::{LearningRates, StepStats, Weights};
 use super::StepKind;
 use crate::config::MapConfig;
-use crate::counters::Counters;
 use crate::gpu::GpuError;
 
 /// A training step that was started and whose answer was not taken in yet.
@@ -29,8 +28,6 @@ pub struct Trainer {
     schedule: Schedule,
     /// Median depth of the first anchor, m: what a position step is measured in.
     pub scene_depth_m: f64,
-    /// Steps started.
-    pub steps: u64,
     in_flight: Option<InFlight>,
     /// The loss of the last step that has ended.
     pub loss: f64,
@@ -49,7 +46,6 @@ impl Trainer {
             },
             schedule: Schedule::new(config.seed),
             scene_depth_m: SCENE_DEPTH_M,
-            steps: 0,
             in_flight: None,
             loss: 0.0,
         }
@@ -70,7 +66,7 @@ impl Trainer {
     }
 
     /// Starts a step, then finishes the one before it; `None` when there is nothing to train.
-    pub fn step(&mut self, scene: &mut Scene, counters: &Counters) -> Result<Option<StepKind>, GpuError> {
+    pub fn step(&mut self, scene: &mut Scene) -> Result<Option<StepKind>, GpuError> {
         let burst = self.schedule.in_burst();
         if scene.pipeline.pool.count() == 0 || (self.trained_enough(scene) && !burst) {
             return Ok(None);
@@ -78,9 +74,9 @@ impl Trainer {
         let Some(index) = self.schedule.next(scene.store.training()) else { return Ok(None) };
         let (view, target, rates) = (scene.view(index), scene.target(index), self.rates(scene));
         let step = scene.pipeline.start(&mut scene.gpu, &view, target, &rates, &self.weights)?;
-        self.steps += 1;
+        scene.steps += 1;
         if let Some(before) = self.in_flight.replace(InFlight { index, step }) {
-            let ended = self.finish(before, scene, counters)?;
+            let ended = self.finish(before, scene)?;
             debug_assert!(ended.is_none(), "the last step of a burst is waited for before another starts");
         }
         Ok(Some(if burst { StepKind::Burst } else { StepKind::Train }))
@@ -88,21 +84,17 @@ impl Trainer {
 
     /// Finishes the step in flight, if any: before anything but training is done with the map. Answers the anchor whose
     /// burst it ended.
-    pub fn finish_pending(&mut self, scene: &mut Scene, counters: &Counters) -> Result<Option<usize>, GpuError> {
+    pub fn finish_pending(&mut self, scene: &mut Scene) -> Result<Option<usize>, GpuError> {
         match self.in_flight.take() {
-            Some(last) => self.finish(last, scene, counters),
+            Some(last) => self.finish(last, scene),
             None => Ok(None),
         }
     }
 
-    fn finish(
-        &mut self,
-        InFlight { index, step }: InFlight,
-        scene: &mut Scene,
-        counters: &Counters,
-    ) -> Result<Option<usize>, GpuError> {
+    fn finish(&mut self, InFlight { index, step }: InFlight, scene: &mut Scene) -> Result<Option<usize>, GpuError> {
         let done = scene.pipeline.finish(&mut scene.gpu, &step)?;
         self.loss = done.loss;
+        let counters = &scene.counters;
         counters.intersections_overflow.add(u64::from(done.stats.overflow > 0));
         counters.splats_not_finite.add(u64::from(done.stats.failed));
         counters.gradients_rejected.add(u64::from(done.gradients_rejected));
@@ -130,12 +122,12 @@ impl Trainer {
     /// Steps past this only teach the map the few views it has, and what they do not show looks covered to the next.
     fn trained_enough(&self, scene: &Scene) -> bool {
         let most = u64::from(self.config.steps_per_keyframe_max);
-        most > 0 && self.steps >= most * scene.store.training().len() as u64
+        most > 0 && scene.steps >= most * scene.store.training().len() as u64
     }
 
     /// Smaller as the steps a keyframe has had grow: large ones find the picture, small ones settle it.
     fn rate_part(&self, scene: &Scene) -> f64 {
-        let steps = self.steps as f64 / scene.store.len().max(1) as f64;
+        let steps = scene.steps as f64 / scene.store.len().max(1) as f64;
         f64::max(self.config.lr_part_min, 1.0 / (1.0 + steps / self.config.lr_halving_steps))
     }
 

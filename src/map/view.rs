@@ -68,6 +68,11 @@ impl Fisheye {
 }
 
 impl View {
+    /// Which of two kernels draws it: 0 for a pinhole, 1 for a fisheye.
+    pub(super) fn lens(&self) -> usize {
+        usize::from(self.fisheye.is_some())
+    }
+
     /// Width and height, px.
     pub(super) fn size(&self) -> [u32; 2] {
         [self.camera.width as u32, self.camera.height as u32]

@@ -174,15 +174,14 @@ fn mapping(report: &Report) -> [Option<String>; 4] {
     let of = |value: &dyn Fn(usize) -> Option<f64>| -> Vec<(f64, f64)> {
         (0..curve.len()).filter_map(|i| value(i).map(|v| (curve[i].t_s, v))).collect()
     };
-    let line = |name, ink, points| Series { name, ink, dots: true, points };
     let run_time = "run time, s";
     let psnr = Chart {
         title: "PSNR",
         x: run_time,
         y: "dB",
         series: vec![
-            line("training views", 1, of(&|i| curve[i].psnr_db)),
-            line("held-out views", 2, of(&|i| curve[i].psnr_heldout_db)),
+            Series::dots("training views", 1, of(&|i| curve[i].psnr_db)),
+            Series::dots("held-out views", 2, of(&|i| curve[i].psnr_heldout_db)),
         ],
         levels: report.seconds_to_25_db.map(|_| ("25 dB", GOOD_DB)).into_iter().collect(),
         ..Chart::default()
@@ -191,7 +190,7 @@ fn mapping(report: &Report) -> [Option<String>; 4] {
         title,
         x: run_time,
         from_zero: true,
-        series: vec![line(title, 1, of(&|i| Some(value(i))))],
+        series: vec![Series::dots(title, 1, of(&|i| Some(value(i))))],
         ..Chart::default()
     };
     let splats = count("Gaussians", &|i| curve[i].splats as f64);

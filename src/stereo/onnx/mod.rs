@@ -91,11 +91,7 @@ impl Network {
             for x in 0..w {
                 let d = match self.config.fit {
                     Fit::Pad => self.output[y * nw + x],
-                    Fit::Scale => {
-                        let at = |k: usize, n: usize, of: usize| (k as f32 + 0.5) * n as f32 / of as f32 - 0.5;
-                        let scale = w as f32 / nw as f32;
-                        scale * bilinear(&self.output, [nw, nh], at(x, nw, w), at(y, nh, h))
-                    }
+                    Fit::Scale => w as f32 / nw as f32 * scaled(|i| self.output[i], [nw, nh], [w, h], x, y),
                 };
                 let d = sign * d;
                 // Neither zero, which is infinitely far, nor past the right image's edge.
@@ -115,14 +111,7 @@ fn normalise(image: &Image, [nw, nh]: [usize; 2], config: &NetworkConfig, into: 
         for x in 0..nw {
             let level = match config.fit {
                 Fit::Pad => grey(y.min(h - 1) * w + x.min(w - 1)),
-                Fit::Scale => {
-                    let at = |k: usize, n: usize, of: usize| (k as f32 + 0.5) * of as f32 / n as f32 - 0.5;
-                    let (u, v) = (at(x, nw, w).clamp(0.0, (w - 1) as f32), at(y, nh, h).clamp(0.0, (h - 1) as f32));
-                    let (i, j) = ((u as usize).min(w - 2), (v as usize).min(h - 2));
-                    let (s, t) = (u - i as f32, v - j as f32);
-                    let row = |j: usize| grey(j * w + i) * (1.0 - s) + grey(j * w + i + 1) * s;
-                    row(j) * (1.0 - t) + row(j + 1) * t
-                }
+                Fit::Scale => scaled(grey, [w, h], [nw, nh], x, y),
             };
             for c in 0..config.channels as usize {
                 let value = (f64::from(level) * config.scale - config.mean[c]) / config.deviation[c];
@@ -132,11 +121,15 @@ fn normalise(image: &Image, [nw, nh]: [usize; 2], config: &NetworkConfig, into: 
     }
 }
 
-fn bilinear(values: &[f32], [w, h]: [usize; 2], x: f32, y: f32) -> f32 {
-    let (x, y) = (x.clamp(0.0, (w - 1) as f32), y.clamp(0.0, (h - 1) as f32));
-    let (i, j) = ((x as usize).min(w - 2), (y as usize).min(h - 2));
-    let (s, t) = (x - i as f32, y - j as f32);
-    let row = |j: usize| values[j * w + i] * (1.0 - s) + values[j * w + i + 1] * s;
+/// Pixel (x, y) of a picture of `w` x `h` that is scaled to `to`, bilinearly.
+fn scaled(values: impl Fn(usize) -> f32, [w, h]: [usize; 2], to: [usize; 2], x: usize, y: usize) -> f32 {
+    let at = |k: usize, n: usize, to: usize| {
+        let at = ((k as f32 + 0.5) * n as f32 / to as f32 - 0.5).clamp(0.0, (n - 1) as f32);
+        let first = (at as usize).min(n - 2);
+        (first, at - first as f32)
+    };
+    let ((i, s), (j, t)) = (at(x, w, to[0]), at(y, h, to[1]));
+    let row = |j: usize| values(j * w + i) * (1.0 - s) + values(j * w + i + 1) * s;
     row(j) * (1.0 - t) + row(j + 1) * t
 }
 
