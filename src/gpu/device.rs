@@ -86,12 +86,20 @@ pub struct Device {
     pub caps: Caps,
     pub memory: vk::PhysicalDeviceMemoryProperties,
     names: Option<ash::ext::debug_utils::Device>,
+    /// The last field: it goes after the device.
+    instance: Instance,
+}
+
+/// The instance, and what the validation layer said.
+struct Instance {
+    raw: ash::Instance,
+    /// Whether objects can be named.
+    debug: bool,
     messenger: Option<Messenger>,
     /// Boxed: the messenger holds its address.
     messages: Box<Mutex<Vec<String>>>,
-    instance: ash::Instance,
     /// The loaded library; its functions are used until the instance is gone.
-    _entry: ash::Entry,
+    entry: ash::Entry,
 }
 
 pub(super) fn unavailable(what: impl Into<String>) -> Fault {
@@ -110,41 +118,25 @@ pub(super) fn boot(call: &'static str) -> impl Fn(vk::Result) -> Fault {
 
 impl Device {
     pub fn open(config: &GpuConfig, validation: bool) -> Result<Device, Fault> {
-        // SAFETY: the library found is the system's Vulkan loader; it has no unsound initialiser.
-        let entry = unsafe { ash::Entry::load() }
-            .map_err(|e| unavailable(format!("no Vulkan loader (libvulkan.so.1): {e}")))?;
-        let messages = Box::new(Mutex::new(Vec::with_capacity(MESSAGES_MAX)));
-        let (instance, debug) = instance(&entry, validation)?;
-        let messenger = match (validation && debug).then(|| messenger(&entry, &instance, &messages)).transpose() {
-            Ok(m) => m,
-            Err(fault) => {
-                destroy_instance(&instance, &None);
-                return Err(fault);
-            }
-        };
-        let (physical, family, mut caps) = choose(&instance, config).inspect_err(|_| {
-            destroy_instance(&instance, &messenger);
-        })?;
+        let instance = Instance::new(validation)?;
+        let (physical, family, mut caps) = choose(&instance.raw, config)?;
         if !config.subgroups {
             caps.subgroup_operations = 0;
         }
         let queues = [vk::DeviceQueueCreateInfo::default().queue_family_index(family).queue_priorities(&[1.0])];
         let info = vk::DeviceCreateInfo::default().queue_create_infos(&queues);
         // SAFETY: `physical` belongs to `instance`, and `family` is one of its queue families.
-        let raw = unsafe { instance.create_device(physical, &info, None) }.map_err(|r| {
-            destroy_instance(&instance, &messenger);
-            boot("vkCreateDevice")(r)
-        })?;
+        let raw = unsafe { instance.raw.create_device(physical, &info, None) }.map_err(boot("vkCreateDevice"))?;
         // SAFETY: one queue of this family was requested above; `physical` is alive.
         let (queue, memory) =
-            unsafe { (raw.get_device_queue(family, 0), instance.get_physical_device_memory_properties(physical)) };
-        let names = debug.then(|| ash::ext::debug_utils::Device::new(&instance, &raw));
-        Ok(Device { raw, queue, family, caps, memory, names, messenger, messages, instance, _entry: entry })
+            unsafe { (raw.get_device_queue(family, 0), instance.raw.get_physical_device_memory_properties(physical)) };
+        let names = instance.debug.then(|| ash::ext::debug_utils::Device::new(&instance.raw, &raw));
+        Ok(Device { raw, queue, family, caps, memory, names, instance })
     }
 
     /// What the validation layer said so far, warnings and errors.
     pub fn messages(&self) -> Vec<String> {
-        self.messages.lock().map(|m| m.clone()).unwrap_or_default()
+        self.instance.messages.lock().map(|m| m.clone()).unwrap_or_default()
     }
 
     /// Names an object for validation messages and GPU debuggers.
@@ -172,23 +164,39 @@ impl Device {
 impl Drop for Device {
     fn drop(&mut self) {
         // SAFETY: whoever made objects of this device held an Arc of it, so they are gone, and they waited
-        // for their work. The instance goes after the device, the loader (a field) after both.
+        // for their work. The instance (a field) goes after the device.
         unsafe { self.raw.destroy_device(None) };
         // Whoever asked for validation gets to see what it said, leaks at destruction included.
         self.messages().iter().for_each(|m| eprintln!("vulkan validation: {m}"));
-        destroy_instance(&self.instance, &self.messenger);
     }
 }
 
 type Messenger = (ash::ext::debug_utils::Instance, vk::DebugUtilsMessengerEXT);
 
-fn destroy_instance(instance: &ash::Instance, messenger: &Option<Messenger>) {
-    // SAFETY: the messenger is of this instance, and no device of it is left.
-    unsafe {
-        if let Some((debug, m)) = messenger {
-            debug.destroy_debug_utils_messenger(*m, None);
+impl Instance {
+    fn new(validation: bool) -> Result<Instance, Fault> {
+        // SAFETY: the library found is the system's Vulkan loader; it has no unsound initialiser.
+        let entry = unsafe { ash::Entry::load() }
+            .map_err(|e| unavailable(format!("no Vulkan loader (libvulkan.so.1): {e}")))?;
+        let messages = Box::new(Mutex::new(Vec::with_capacity(MESSAGES_MAX)));
+        let (raw, debug) = instance(&entry, validation)?;
+        let mut instance = Instance { raw, debug, messenger: None, messages, entry };
+        if validation && debug {
+            instance.messenger = Some(messenger(&instance.entry, &instance.raw, &instance.messages)?);
         }
-        instance.destroy_instance(None);
+        Ok(instance)
+    }
+}
+
+impl Drop for Instance {
+    fn drop(&mut self) {
+        // SAFETY: the messenger is of this instance, and no device of it is left: `Device` destroys its own first.
+        unsafe {
+            if let Some((debug, m)) = &self.messenger {
+                debug.destroy_debug_utils_messenger(*m, None);
+            }
+            self.raw.destroy_instance(None);
+        }
     }
 }
 

@@ -66,6 +66,7 @@ pub trait KernelDef: 'static {
 }
 
 /// A pipeline of one `Gpu`; a plain handle.
+#[derive(Clone, Copy)]
 pub struct Kernel<K> {
     pub(super) index: u32,
     pub(super) local: [u32; 3],
@@ -79,13 +80,6 @@ impl<K> Kernel<K> {
         self.name
     }
 }
-
-impl<K> Clone for Kernel<K> {
-    fn clone(&self) -> Self {
-        *self
-    }
-}
-impl<K> Copy for Kernel<K> {}
 
 pub(super) struct Pipeline {
     pub name: &'static str,

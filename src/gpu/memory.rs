@@ -27,6 +27,7 @@ pub(super) fn report_offset(place: usize) -> u64 {
 }
 
 /// `len` elements of `T` in the arena.
+#[derive(Clone, Copy)]
 pub struct Buf<T> {
     offset: u64,
     len: usize,
@@ -34,10 +35,13 @@ pub struct Buf<T> {
 }
 
 /// A buffer a kernel only reads.
+#[derive(Clone, Copy)]
 pub struct Read<T>(Buf<T>);
 /// A buffer a kernel only writes.
+#[derive(Clone, Copy)]
 pub struct Write<T>(Buf<T>);
 /// A buffer a kernel reads and writes.
+#[derive(Clone, Copy)]
 pub struct ReadWrite<T>(Buf<T>);
 
 /// Bytes of the arena, `start..end`.
@@ -97,13 +101,6 @@ impl<T> Buf<T> {
     }
 }
 
-impl<T> Clone for Buf<T> {
-    fn clone(&self) -> Self {
-        *self
-    }
-}
-impl<T> Copy for Buf<T> {}
-
 impl<T> std::fmt::Debug for Buf<T> {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         write!(f, "Buf {{ offset: {}, len: {} }}", self.offset, self.len)
@@ -112,12 +109,6 @@ impl<T> std::fmt::Debug for Buf<T> {
 
 macro_rules! binding {
     ($($name:ident),+) => {$(
-        impl<T> Clone for $name<T> {
-            fn clone(&self) -> Self {
-                *self
-            }
-        }
-        impl<T> Copy for $name<T> {}
         impl<T> $name<T> {
             pub fn range(&self) -> Range {
                 self.0.range()

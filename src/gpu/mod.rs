@@ -222,13 +222,14 @@ impl Gpu {
     }
 
     /// Starts a recording; the one before may still be running. What is recorded sees all that was started before it.
-    pub fn start(&mut self, rec: Recorder) -> Result<Ticket, GpuError> {
+    pub fn start(&mut self, mut rec: Recorder) -> Result<Ticket, GpuError> {
         let started = match rec.error {
             _ if self.lost => Err(GpuError::Lost),
             Some(e) => Err(e),
             None => self.submitter.start(&rec, &mut self.pipelines, &self.memory),
         };
-        self.put_back(rec);
+        rec.clear();
+        self.spare = Some(rec);
         self.note(started)
     }
 
@@ -243,11 +244,7 @@ impl Gpu {
 
     /// Waits for all that was started.
     pub fn wait(&mut self) -> Result<(), GpuError> {
-        if self.lost {
-            return Err(GpuError::Lost);
-        }
-        let done = self.submitter.finish_all();
-        self.note(done)
+        self.finish(self.submitter.latest())
     }
 
     /// Copies `items` to `buf[at..]` and waits.
@@ -327,11 +324,6 @@ impl Gpu {
     /// Warnings and errors of the validation layer so far; none without validation.
     pub fn validation_messages(&self) -> Vec<String> {
         self.device.messages()
-    }
-
-    fn put_back(&mut self, mut rec: Recorder) {
-        rec.clear();
-        self.spare = Some(rec);
     }
 
     /// Remembers a loss: what is in flight then never ends.

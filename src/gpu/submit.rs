@@ -228,8 +228,13 @@ impl Submitter {
         Ok(())
     }
 
-    pub fn finish_all(&mut self) -> Result<(), GpuError> {
-        self.finish(Ticket(self.started))
+    /// The last that was started.
+    pub fn latest(&self) -> Ticket {
+        Ticket(self.started)
+    }
+
+    fn finish_all(&mut self) -> Result<(), GpuError> {
+        self.finish(self.latest())
     }
 
     /// Waits for the oldest part under way and adds its times to the table.

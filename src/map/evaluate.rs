@@ -96,8 +96,8 @@ pub fn sample(scene: &mut Scene) -> Result<[Option<f64>; 2], GpuError> {
     for (held_out, mean) in means.iter_mut().enumerate() {
         let of_kind: Vec<usize> =
             first_images(scene).filter(|&i| scene.store.get(i).held_out == (held_out == 1)).collect();
-        for i in spread(&of_kind, PROBED) {
-            mean.add(score(scene, i)?);
+        for i in spread(of_kind.len(), PROBED) {
+            mean.add(score(scene, of_kind[i])?);
         }
     }
     Ok(means.map(|m| m.get()))
@@ -151,7 +151,7 @@ pub fn evaluate(scene: &mut Scene, weights: &Weights) -> Result<Evaluation, GpuE
 pub fn panels(scene: &mut Scene, count: usize) -> Result<Vec<Panel>, GpuError> {
     let all: Vec<usize> = first_images(scene).collect();
     let mut panels = Vec::with_capacity(count);
-    for i in spread(&all, count) {
+    for i in spread(all.len(), count).map(|i| all[i]) {
         let psnr_db = score(scene, i)?;
         let valid = scene.camera(i).valid.clone();
         let (planes, r) = (scene.store.planes(i), &scene.rendered);
@@ -231,24 +231,21 @@ fn align(scene: &mut Scene, index: usize, observed: &[f32], weights: &Weights) -
     Ok(best)
 }
 
-/// At most `count` of the items, evenly spread, first and last included.
-fn spread(items: &[usize], count: usize) -> Vec<usize> {
-    let n = items.len();
-    if n <= count {
-        return items.to_vec();
-    }
-    (0..count).map(|k| items[k * (n - 1) / (count - 1).max(1)]).collect()
+/// At most `count` indices of `len` things, evenly spread, first and last included.
+pub fn spread(len: usize, count: usize) -> impl Iterator<Item = usize> {
+    let n = len.min(count);
+    (0..n).map(move |i| i * (len - 1) / (n - 1).max(1))
 }
 
 #[cfg(test)]
 mod tests {
-    use super::spread;
-
     #[test]
-    fn spread_takes_first_and_last() {
-        let items: Vec<usize> = (10..30).collect();
-        assert_eq!(spread(&items, 3), [10, 19, 29]);
-        assert_eq!(spread(&items[..2], 3), [10, 11]);
-        assert_eq!(spread(&items, 1), [10]);
+    fn spread_keeps_both_ends() {
+        let spread = |len, count| super::spread(len, count).collect::<Vec<_>>();
+        assert_eq!(spread(11, 6), [0, 2, 4, 6, 8, 10]);
+        assert_eq!(spread(20, 3), [0, 9, 19]);
+        assert_eq!(spread(2, 6), [0, 1]);
+        assert_eq!((spread(1, 6), spread(20, 1)), (vec![0], vec![0]));
+        assert!(spread(0, 6).is_empty());
     }
 }

@@ -46,7 +46,7 @@ use stipple_drivers::{Calibration, Fault};
 use store::Store;
 use trainer::Trainer;
 
-pub use evaluate::{CurvePoint, Evaluation, Panel};
+pub use evaluate::{spread, CurvePoint, Evaluation, Panel};
 pub use exposure::Exposure;
 pub use keyframes::{Keyframe, PoseCorrection};
 pub use pipeline::Pipeline;

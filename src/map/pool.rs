@@ -310,7 +310,7 @@ impl Pool {
     }
 
     /// Sets the kept slots from `first` on down to where `kept` says, as many at once as the scratch holds.
-    fn record_repack<T>(&self, rec: &mut Recorder, first: u32, array: Buf<T>) {
+    fn record_repack<T: Copy>(&self, rec: &mut Recorder, first: u32, array: Buf<T>) {
         let stride = (size_of::<T>() / size_of::<u32>()) as u32;
         let at_once = (self.scratch.len() as u32 / stride).max(1);
         for first in (first..self.count).step_by(at_once as usize) {

@@ -7,6 +7,7 @@ use super::chart::{bars, escape, histogram, Chart, Series};
 use super::metrics::{percentile, TrajectoryError};
 use super::panel::Picture;
 use super::report::{KernelTime, Report, GOOD_DB};
+use crate::map::spread;
 use glam::DVec3;
 use std::fmt::Write;
 use std::io;
@@ -284,7 +285,7 @@ fn pictures(out: &mut impl io::Write, pictures: &[(String, Picture)]) -> io::Res
         return Ok(());
     }
     write!(out, "<section><h2>Renders</h2><p class=\"note\">Observed, rendered, absolute error, depth.</p>")?;
-    for index in spread_indices(pictures.len(), PICTURES_MAX) {
+    for index in spread(pictures.len(), PICTURES_MAX) {
         let (caption, picture) = &pictures[index];
         figure(out, caption, &picture.shrunk(PICTURE_WIDTH_MAX))?;
     }
@@ -296,12 +297,6 @@ pub fn figure(out: &mut impl io::Write, caption: &str, picture: &Picture) -> io:
     let mut bytes = Vec::new();
     picture.write_png(&mut bytes)?;
     write!(out, "<figure class=\"wide\"><img alt=\"{0}\" src=\"data:image/png;base64,{1}\"><figcaption>{0}</figcaption></figure>", escape(caption), base64(&bytes))
-}
-
-/// At most `count` indices of `len`, evenly spread, ends included.
-fn spread_indices(len: usize, count: usize) -> Vec<usize> {
-    let n = len.min(count);
-    (0..n).map(|i| if n == 1 { 0 } else { i * (len - 1) / (n - 1) }).collect()
 }
 
 fn events(report: &Report, warnings: &[String]) -> String {
@@ -379,14 +374,6 @@ mod tests {
         assert_eq!(base64(b"Ma"), "TWE=");
         assert_eq!(base64(b"M"), "TQ==");
         assert_eq!(base64(&[0xff, 0xfe, 0xfd]), "//79");
-    }
-
-    #[test]
-    fn spread_keeps_both_ends() {
-        assert_eq!(spread_indices(11, 6), [0, 2, 4, 6, 8, 10]);
-        assert_eq!(spread_indices(2, 6), [0, 1]);
-        assert_eq!(spread_indices(1, 6), [0]);
-        assert!(spread_indices(0, 6).is_empty());
     }
 
     #[test]

@@ -111,7 +111,7 @@ impl Matcher {
             }
             Matcher::Sgm(sgm) => {
                 let gpu = gpu.ok_or_else(|| without_gpu(StereoMethod::Sgm))?;
-                Ok(sgm.compute(gpu, left, right, &mut out.px, &mut out.sigma_px)?)
+                Ok(sgm.compute(gpu, left, right, out)?)
             }
         }
     }
@@ -129,7 +129,7 @@ pub fn compute_raw(
         out.forget();
         return Ok(());
     }
-    Ok(sgm.compute_raw(gpu, rectifier, [left, right], &mut out.px, &mut out.sigma_px)?)
+    Ok(sgm.compute_raw(gpu, rectifier, [left, right], out)?)
 }
 
 /// Whether an image holds nothing to match: a covered or dead camera still shows noise of a level or two, and

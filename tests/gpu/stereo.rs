@@ -8,7 +8,7 @@ use stipple::stereo::rectify::Rectification;
 use stipple::stereo::rectify_gpu::{self, Rectifier};
 use stipple::stereo::sgm::wls::Wls;
 use stipple::stereo::sgm::{self, Sgm, Shape};
-use stipple::stereo::{Buffers, DepthMap, Stereo};
+use stipple::stereo::{Buffers, DepthMap, Disparity, Stereo};
 use stipple_drivers::{Calibration, Camera, Image, ImuCalibration, Lens, Pose, RigCamera};
 
 pub fn shape(width: usize, height: usize, disparities: u32) -> Shape {
@@ -33,9 +33,9 @@ fn matcher(gpu: &mut Gpu, shape: Shape) -> Sgm {
 }
 
 pub fn run(gpu: &mut Gpu, sgm: &mut Sgm, left: &Image, right: &Image) -> (Vec<f32>, Vec<f32>) {
-    let mut out = (vec![0.0; left.pixels.len()], vec![0.0; left.pixels.len()]);
-    sgm.compute(gpu, left, right, &mut out.0, &mut out.1).unwrap();
-    out
+    let mut out = Disparity::new(left.width, left.height);
+    sgm.compute(gpu, left, right, &mut out).unwrap();
+    (out.px, out.sigma_px)
 }
 
 fn grey(image: &Image) -> Grey {

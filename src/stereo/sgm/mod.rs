@@ -19,6 +19,7 @@
 pub mod wls;
 
 use super::rectify_gpu::{image_bytes, pack, packed, Rectifier};
+use super::Disparity;
 use crate::config::StereoConfig;
 use crate::gpu::kernels::{
     aggregate, census, match_left, match_right, speckle_count, speckle_drop, speckle_join, verify,
@@ -198,17 +199,10 @@ impl Sgm {
     }
 
     /// Disparities of the left image, px, negative where unknown, and their standard deviation.
-    pub fn compute(
-        &mut self,
-        gpu: &mut Gpu,
-        left: &Image,
-        right: &Image,
-        disparity: &mut [f32],
-        deviation: &mut [f32],
-    ) -> Result<(), GpuError> {
+    pub fn compute(&mut self, gpu: &mut Gpu, left: &Image, right: &Image, out: &mut Disparity) -> Result<(), GpuError> {
         self.load(gpu, left, right)?;
         let rec = gpu.record();
-        self.finish(gpu, rec, disparity, deviation)
+        self.finish(gpu, rec, out)
     }
 
     /// Does what `compute` does with a raw pair.
@@ -217,29 +211,22 @@ impl Sgm {
         gpu: &mut Gpu,
         rectifier: &mut Rectifier,
         [left, right]: [&Image; 2],
-        disparity: &mut [f32],
-        deviation: &mut [f32],
+        out: &mut Disparity,
     ) -> Result<(), GpuError> {
         rectifier.load(gpu, left, right)?;
         let mut rec = gpu.record();
         rectifier.record(&mut rec, self.b.images);
-        self.finish(gpu, rec, disparity, deviation)
+        self.finish(gpu, rec, out)
     }
 
-    fn finish(
-        &self,
-        gpu: &mut Gpu,
-        mut rec: Recorder,
-        disparity: &mut [f32],
-        deviation: &mut [f32],
-    ) -> Result<(), GpuError> {
+    fn finish(&self, gpu: &mut Gpu, mut rec: Recorder, out: &mut Disparity) -> Result<(), GpuError> {
         self.record_sums(&mut rec);
         self.record_matches(&mut rec);
         self.record_speckles(&mut rec);
         self.record_filter(&mut rec);
         gpu.submit(rec)?;
-        gpu.download(self.b.disparity, 0, disparity)?;
-        gpu.download(self.b.deviation, 0, deviation)
+        gpu.download(self.b.disparity, 0, &mut out.px)?;
+        gpu.download(self.b.deviation, 0, &mut out.sigma_px)
     }
 
     /// Copies the rectified pair to the GPU.
