@@ -230,8 +230,8 @@ fn sleep(secs: f64) {
 }
 
 /// A rig of cameras that fails as its rules say.
-pub struct FaultyFrames<S> {
-    source: S,
+pub struct FaultyFrames {
+    source: Box<dyn FrameSource>,
     plan: Plan,
     last: LastFrames,
 }
@@ -245,9 +245,9 @@ struct LastFrames {
     again: bool,
 }
 
-impl<S: FrameSource> FaultyFrames<S> {
+impl FaultyFrames {
     /// Wraps a rig; `shape` has the shape of the frames that `next` will fill.
-    pub fn new(source: S, rules: &[Rule], seed: u64, shape: Frames) -> FaultyFrames<S> {
+    pub fn new(source: Box<dyn FrameSource>, rules: &[Rule], seed: u64, shape: Frames) -> FaultyFrames {
         let plan = Plan::new(rules, seed, "camera");
         let kept = plan.has(Kind::Freeze) || plan.has(Kind::Duplicate);
         FaultyFrames { source, plan, last: LastFrames { frames: shape, kept, again: false } }
@@ -297,7 +297,7 @@ impl LastFrames {
     }
 }
 
-impl<S: FrameSource> FrameSource for FaultyFrames<S> {
+impl FrameSource for FaultyFrames {
     fn next(&mut self, timeout: Span, frames: &mut Frames) -> Result<Wait, SourceFault> {
         let FaultyFrames { source, plan, last } = self;
         if std::mem::take(&mut last.again) {
@@ -311,7 +311,7 @@ impl<S: FrameSource> FrameSource for FaultyFrames<S> {
     }
 
     fn inner(&self) -> Option<&dyn FrameSource> {
-        Some(&self.source)
+        Some(&*self.source)
     }
 
     fn away(&self) -> Option<&Fault> {
@@ -328,15 +328,15 @@ const GYRO_RANGE: f64 = 34.907;
 const ACCEL_RANGE: f64 = 156.91;
 
 /// An inertial unit that fails as its rules say.
-pub struct FaultyImu<S> {
-    source: S,
+pub struct FaultyImu {
+    source: Box<dyn ImuSource>,
     plan: Plan,
     last: ImuReading,
 }
 
-impl<S: ImuSource> FaultyImu<S> {
+impl FaultyImu {
     /// Wraps a unit; cameras with the same seed are struck independently.
-    pub fn new(source: S, rules: &[Rule], seed: u64) -> FaultyImu<S> {
+    pub fn new(source: Box<dyn ImuSource>, rules: &[Rule], seed: u64) -> FaultyImu {
         // Another random stream than the cameras'.
         FaultyImu { source, plan: Plan::new(rules, seed ^ 0x494D_5500, "imu"), last: ImuReading::default() }
     }
@@ -386,7 +386,7 @@ fn flip(reading: &mut ImuReading, rng: &mut ChaCha8Rng) {
     }
 }
 
-impl<S: ImuSource> ImuSource for FaultyImu<S> {
+impl ImuSource for FaultyImu {
     fn next(&mut self, timeout: Span, batch: &mut ImuBatch) -> Result<Wait, SourceFault> {
         let FaultyImu { source, plan, last } = self;
         plan.read(timeout, |plan, left| {
@@ -397,7 +397,7 @@ impl<S: ImuSource> ImuSource for FaultyImu<S> {
     }
 
     fn inner(&self) -> Option<&dyn ImuSource> {
-        Some(&self.source)
+        Some(&*self.source)
     }
 
     fn counters(&self) -> Vec<(&'static str, u64)> {

@@ -110,23 +110,3 @@ pub const IMU_BATCH: usize = 256;
 
 /// The readings of one call, oldest first.
 pub type ImuBatch = List<ImuReading, IMU_BATCH>;
-
-impl FrameSource for Box<dyn FrameSource> {
-    fn next(&mut self, timeout: Span, frames: &mut Frames) -> Result<Wait, SourceFault> {
-        (**self).next(timeout, frames)
-    }
-
-    fn inner(&self) -> Option<&dyn FrameSource> {
-        Some(&**self)
-    }
-}
-
-impl ImuSource for Box<dyn ImuSource> {
-    fn next(&mut self, timeout: Span, batch: &mut ImuBatch) -> Result<Wait, SourceFault> {
-        (**self).next(timeout, batch)
-    }
-
-    fn inner(&self) -> Option<&dyn ImuSource> {
-        Some(&**self)
-    }
-}

@@ -312,10 +312,12 @@ pub fn fly_in_real_time(
         let Sensors { frames, imu } = &mut sensors;
         spawn(scope, "camera", move || {
             let _ended = waker::SetOnDrop(&s.source_done, Some(taker));
-            mailbox::camera(&s.mailbox, frames, taker, &s.counters, &s.gauges);
+            mailbox::camera(&s.mailbox, &mut **frames, taker, &s.counters, &s.gauges);
         });
         let gate = ImuGate::new(&calibration.imu);
-        spawn(scope, "imu", move || mailbox::inertial(&s.mailbox, imu, gate, taker, &s.source_done, &s.counters));
+        spawn(scope, "imu", move || {
+            mailbox::inertial(&s.mailbox, &mut **imu, gate, taker, &s.source_done, &s.counters)
+        });
         let observes = matches!(tracker, Tracker::Observer(_));
         let give = move |packet: Box<FramePacket>| {
             if !packet.imu_only {

@@ -37,8 +37,8 @@ impl Recording {
         shape: &Frames,
     ) -> Result<(Sensors, Option<Recording>), Fault> {
         let sink = record::open(dir, format, calibration)?;
-        let (recorder, taps) = record::start(sink, Ring::new(shape, board.record.ring_frames as usize));
-        let (frames, imu) = taps.on(sensors.frames, sensors.imu);
+        let ring = Ring::new(shape, board.record.ring_frames as usize);
+        let (recorder, frames, imu) = record::start(sink, (sensors.frames, sensors.imu), ring);
         let sensors = Sensors { frames: Box::new(frames), imu: Box::new(imu) };
         Ok((sensors, Some(Recording { recorder, dir: dir.into() })))
     }

@@ -15,7 +15,7 @@ fn shape() -> Frames {
 }
 
 /// Frames of 20 ms whose pixels say their number, ten times as fast.
-fn camera(rules: &[Rule]) -> FaultyFrames<PacedFrames> {
+fn camera(rules: &[Rule]) -> FaultyFrames {
     let frame = |i: i64| {
         let image = Image { pixels: vec![i as u8 + 1; 16], ..Image::new(4, 4) };
         Frames { t: Nanos(i * 20 * MS), images: vec![image], colours: vec![] }
@@ -23,7 +23,7 @@ fn camera(rules: &[Rule]) -> FaultyFrames<PacedFrames> {
     let frames: Vec<Frames> = (0..FRAMES).map(frame).collect();
     let stamps: Vec<Nanos> = frames.iter().map(|f| f.t).collect();
     let source = PacedFrames::new(Images::Rendered(frames), stamps, Pace::at_speed(Nanos(0), 10.0));
-    FaultyFrames::new(source, rules, 7, shape())
+    FaultyFrames::new(Box::new(source), rules, 7, shape())
 }
 
 /// Number by stamp and by pixel of every frame delivered, and how often it was lost.
@@ -114,7 +114,7 @@ fn a_unit_fails_as_told() {
         Rule::within(Kind::BitFlip, 1.0, 1.01),
         Rule::within(Kind::Unplug, 1.2, 1.6),
     ];
-    let mut source = FaultyImu::new(PacedImu::new(samples, Pace::at_speed(Nanos(0), 10.0)), &rules, 3);
+    let mut source = FaultyImu::new(Box::new(PacedImu::new(samples, Pace::at_speed(Nanos(0), 10.0))), &rules, 3);
     let (mut batch, mut seen, mut lost) = (ImuBatch::default(), vec![], 0);
     loop {
         match source.next(Span(10 * MS), &mut batch) {

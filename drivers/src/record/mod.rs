@@ -83,32 +83,6 @@ pub struct Recorded {
     pub failure: Option<String>,
 }
 
-/// Taps on the two sources; the recording ends when both are gone.
-pub struct Taps {
-    frames: FrameTap,
-    imu: ImuTap,
-}
-
-struct FrameTap {
-    spare: Receiver<Box<Frames>>,
-    items: SyncSender<Item>,
-    counts: Arc<Counts>,
-    /// Frames in the ring.
-    waiting: Arc<AtomicU64>,
-}
-
-struct ImuTap {
-    items: SyncSender<Item>,
-    counts: Arc<Counts>,
-}
-
-impl Taps {
-    /// Puts the taps on two sources.
-    pub fn on<F: FrameSource, I: ImuSource>(self, frames: F, imu: I) -> (TappedFrames<F>, TappedImu<I>) {
-        (TappedFrames { source: frames, tap: self.frames }, TappedImu { source: imu, tap: self.imu })
-    }
-}
-
 /// Makes the folder `dir`, which must not exist or be empty, ready for a recording; a fault where that fails.
 pub fn open(dir: &Path, format: Format, calibration: &Calibration) -> Result<Box<dyn Sink>, Fault> {
     let fault = |e: io::Error| {
@@ -146,8 +120,12 @@ impl Ring {
     }
 }
 
-/// Starts the writer behind a ring.
-pub fn start(mut sink: Box<dyn Sink>, ring: Ring) -> (Recorder, Taps) {
+/// Starts the writer behind a ring, and taps on the two sources. The recording ends when both taps are gone.
+pub fn start(
+    mut sink: Box<dyn Sink>,
+    (frames, imu): (Box<dyn FrameSource>, Box<dyn ImuSource>),
+    ring: Ring,
+) -> (Recorder, TappedFrames, TappedImu) {
     let Ring { items, waiting, give_back, spare } = ring;
     let (counts, in_ring) = (Arc::new(Counts::default()), Arc::new(AtomicU64::new(0)));
     let (c, taken) = (counts.clone(), in_ring.clone());
@@ -177,9 +155,9 @@ pub fn start(mut sink: Box<dyn Sink>, ring: Ring) -> (Recorder, Taps) {
         c.record_cpu_us.add((1e6 * host::thread_cpu().total_s()) as u64);
         failure
     });
-    let frames = FrameTap { spare, items: items.clone(), counts: counts.clone(), waiting: in_ring };
-    let imu = ImuTap { items, counts: counts.clone() };
-    (Recorder { counts, thread }, Taps { frames, imu })
+    let tapped = TappedFrames { source: frames, spare, items: items.clone(), counts: counts.clone(), waiting: in_ring };
+    let tapped_imu = TappedImu { source: imu, items, counts: counts.clone() };
+    (Recorder { counts, thread }, tapped, tapped_imu)
 }
 
 impl Recorder {
@@ -190,62 +168,57 @@ impl Recorder {
     }
 }
 
-impl FrameTap {
-    fn take(&mut self, frames: &Frames) {
-        let Ok(mut slot) = self.spare.try_recv() else {
-            self.counts.record_frames_dropped.add(1);
-            return;
-        };
-        slot.copy_from(frames);
-        self.counts.record_ring_most.raise(self.waiting.fetch_add(1, Relaxed) + 1);
-        // The queue has room for every slot and as many samples as are let in beside them.
-        let _ = self.items.try_send(Item::Frames(slot));
-    }
-}
-
-impl ImuTap {
-    fn take(&mut self, reading: &ImuReading) {
-        if self.items.try_send(Item::Imu(*reading)).is_err() {
-            self.counts.record_imu_dropped.add(1);
-        }
-    }
-}
-
 /// Cameras that are recorded.
-pub struct TappedFrames<S> {
-    source: S,
-    tap: FrameTap,
+pub struct TappedFrames {
+    source: Box<dyn FrameSource>,
+    spare: Receiver<Box<Frames>>,
+    items: SyncSender<Item>,
+    counts: Arc<Counts>,
+    /// Frames in the ring.
+    waiting: Arc<AtomicU64>,
 }
 
-impl<S: FrameSource> FrameSource for TappedFrames<S> {
+impl FrameSource for TappedFrames {
     fn next(&mut self, timeout: Span, frames: &mut Frames) -> Result<Wait, SourceFault> {
         let wait = self.source.next(timeout, frames)?;
         if wait == Wait::Got {
-            self.tap.take(frames);
+            if let Ok(mut slot) = self.spare.try_recv() {
+                slot.copy_from(frames);
+                self.counts.record_ring_most.raise(self.waiting.fetch_add(1, Relaxed) + 1);
+                // The queue has room for every slot and as many samples as are let in beside them.
+                let _ = self.items.try_send(Item::Frames(slot));
+            } else {
+                self.counts.record_frames_dropped.add(1);
+            }
         }
         Ok(wait)
     }
 
     fn inner(&self) -> Option<&dyn FrameSource> {
-        Some(&self.source)
+        Some(&*self.source)
     }
 }
 
 /// An inertial unit that is recorded.
-pub struct TappedImu<S> {
-    source: S,
-    tap: ImuTap,
+pub struct TappedImu {
+    source: Box<dyn ImuSource>,
+    items: SyncSender<Item>,
+    counts: Arc<Counts>,
 }
 
-impl<S: ImuSource> ImuSource for TappedImu<S> {
+impl ImuSource for TappedImu {
     fn next(&mut self, timeout: Span, batch: &mut ImuBatch) -> Result<Wait, SourceFault> {
         let wait = self.source.next(timeout, batch)?;
-        batch.iter().for_each(|reading| self.tap.take(reading));
+        for reading in batch.iter() {
+            if self.items.try_send(Item::Imu(*reading)).is_err() {
+                self.counts.record_imu_dropped.add(1);
+            }
+        }
         Ok(wait)
     }
 
     fn inner(&self) -> Option<&dyn ImuSource> {
-        Some(&self.source)
+        Some(&*self.source)
     }
 }
 

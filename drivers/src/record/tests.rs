@@ -47,9 +47,8 @@ fn sources(frames: usize) -> (PacedFrames, PacedImu) {
 /// Plays `frames` frames through taps into `sink`; the longest call of the camera beyond its pace, and what came of it.
 fn record(sink: Box<dyn Sink>, frames: usize, slots: usize) -> (Duration, Recorded) {
     let shape = frame(0);
-    let (recorder, taps) = start(sink, Ring::new(&shape, slots));
     let (camera, unit) = sources(frames);
-    let (mut camera, mut unit) = taps.on(camera, unit);
+    let (recorder, mut camera, mut unit) = start(sink, (Box::new(camera), Box::new(unit)), Ring::new(&shape, slots));
     let mut slowest = Duration::ZERO;
     std::thread::scope(|s| {
         s.spawn(move || {
