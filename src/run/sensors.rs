@@ -253,12 +253,12 @@ fn calibration(path: &Path, board: &Board) -> Result<Calibration, Fault> {
 }
 
 /// An inertial unit whose readings are corrected by its calibration, as those of recordings are.
-struct CorrectedImu<S> {
-    source: S,
+struct CorrectedImu {
+    source: Box<dyn ImuSource>,
     correction: ImuCorrection,
 }
 
-impl<S: ImuSource> ImuSource for CorrectedImu<S> {
+impl ImuSource for CorrectedImu {
     fn next(&mut self, timeout: Span, batch: &mut ImuBatch) -> Result<Wait, SourceFault> {
         let wait = self.source.next(timeout, batch)?;
         batch.iter_mut().for_each(|reading| reading.sample = self.correction.apply(&reading.sample));
@@ -266,7 +266,7 @@ impl<S: ImuSource> ImuSource for CorrectedImu<S> {
     }
 
     fn inner(&self) -> Option<&dyn ImuSource> {
-        Some(&self.source)
+        Some(&*self.source)
     }
 }
 

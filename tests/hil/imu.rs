@@ -14,7 +14,7 @@ use std::time::Duration;
 use stipple_drivers::gpio::{DataReady, Edge, LineName, Output, Trigger};
 use stipple_drivers::host::monotonic;
 use stipple_drivers::imu::edges::{EdgeQueue, Edges};
-use stipple_drivers::imu::{HardwareImu, IioOptions, ImuOptions, RegisterOptions, Wiring};
+use stipple_drivers::imu::{IioImu, IioOptions, RegisterImu, RegisterOptions, Wiring};
 use stipple_drivers::source::{ImuBatch, ImuReading, ImuSource, SourceFault, Wait};
 use stipple_drivers::{Nanos, Span};
 
@@ -109,7 +109,7 @@ struct Seen {
 }
 
 /// Reads until there are so many more, a minute at most.
-fn read(imu: &mut HardwareImu, n: usize, seen: &mut Seen) {
+fn read(imu: &mut dyn ImuSource, n: usize, seen: &mut Seen) {
     let (until, wanted) = (monotonic() + Span(60_000 * MS), seen.readings.len() + n);
     let mut batch = ImuBatch::default();
     while seen.readings.len() < wanted && monotonic() < until {
@@ -120,7 +120,7 @@ fn read(imu: &mut HardwareImu, n: usize, seen: &mut Seen) {
             Err(fault) => panic!("{fault}"),
         }
     }
-    assert!(seen.readings.len() >= wanted, "{} of {wanted}: {:?}", seen.readings.len(), imu.counts());
+    assert!(seen.readings.len() >= wanted, "{} of {wanted}: {:?}", seen.readings.len(), imu.counters());
 }
 
 /// The numbers of the samples: every value of each must be right, stamps must grow.
@@ -143,7 +143,7 @@ fn missing(numbers: &[usize]) -> usize {
     numbers.windows(2).map(|w| w[1].checked_sub(w[0] + 1).expect("in order and once")).sum()
 }
 
-fn registers_on(wiring: Wiring, edges: bool) -> HardwareImu {
+fn registers_on(wiring: Wiring, edges: bool) -> RegisterImu {
     let options = RegisterOptions {
         chip: "mpu-6500".into(),
         wiring: vec![wiring],
@@ -154,7 +154,7 @@ fn registers_on(wiring: Wiring, edges: bool) -> HardwareImu {
         configuration: PathBuf::new(),
         frozen_samples: 50,
     };
-    ImuOptions::Register(options).open(edges.then(data_ready)).unwrap()
+    options.open(edges.then(data_ready)).unwrap()
 }
 
 fn i2c() -> Wiring {
@@ -302,7 +302,7 @@ mod registers {
     fn another_chip_or_nobody_does_not_start() {
         let options = |chip: &str, address| {
             let wiring = Wiring::I2c { adapter: "hil-imu i2c".into(), address };
-            ImuOptions::Register(RegisterOptions {
+            RegisterOptions {
                 chip: chip.into(),
                 wiring: vec![wiring],
                 rate_hz: 100.0,
@@ -311,7 +311,7 @@ mod registers {
                 self_test: false,
                 configuration: PathBuf::new(),
                 frozen_samples: 0,
-            })
+            }
         };
         let refused = |chip, address| options(chip, address).open(None).map(|_| ()).unwrap_err().to_string();
         assert!(refused("mpu-6500", 0x69).contains("imu.address"), "{}", refused("mpu-6500", 0x69));
@@ -335,7 +335,7 @@ mod kernel {
             sysfs: "/sys/bus/iio/devices".into(),
             dev: "/dev".into(),
         };
-        let mut imu = ImuOptions::Iio(options.clone()).open(None).unwrap();
+        let mut imu = IioImu::open(&options).unwrap();
         let mut seen = empty();
         read(&mut imu, 400, &mut seen);
         // The driver's own range, as sysfs says it.
@@ -359,7 +359,7 @@ mod kernel {
         assert!(worst < PERIOD.0 / 2000, "{worst} us");
         assert_eq!((missing(&numbers), c.imu_restarts), (0, 0));
         // Another reader is refused and spoils nothing.
-        let fault = ImuOptions::Iio(options).open(None).map(|_| ()).unwrap_err();
+        let fault = IioImu::open(&options).map(|_| ()).unwrap_err();
         assert!(fault.to_string().contains("end what else reads it"), "{fault}");
         read(&mut imu, 100, &mut seen);
         assert_eq!((missing(&super::numbers(&seen, scales[0], scales[1])), imu.counts().imu_restarts), (0, 0));

@@ -95,7 +95,7 @@ impl IioImu {
     pub fn counts(&self) -> ImuCounters {
         ImuCounters {
             imu_unpaired: self.merge.as_ref().map_or(0, |m| m.unpaired),
-            imu_rate_millihertz: (self.streams[0].line.report().rate_hz * 1e3).round() as u64,
+            imu_rate_millihertz: (self.streams[0].line.rate_hz() * 1e3).round() as u64,
             ..self.counters
         }
     }

@@ -32,7 +32,7 @@ pub use iio::{IioImu, IioOptions};
 pub use register::RegisterImu;
 
 use crate::gpio::DataReady;
-use crate::source::{ImuBatch, ImuSource, SourceFault, Wait};
+use crate::source::ImuSource;
 use crate::types::Span;
 use crate::{Fault, FaultKind};
 use bus::{Bus, I2c, Spi};
@@ -52,40 +52,11 @@ pub enum ImuOptions {
 impl ImuOptions {
     /// Opens the unit. `data_ready` is the line on which a unit that is driven by its registers says that a sample is ready,
     /// where that is wired; the kernel's driver has a line of its own. A fault where the unit is missing or fails its test.
-    pub fn open(&self, data_ready: Option<DataReady>) -> Result<HardwareImu, Fault> {
+    pub fn open(&self, data_ready: Option<DataReady>) -> Result<Box<dyn ImuSource>, Fault> {
         Ok(match self {
-            ImuOptions::Register(options) => HardwareImu::Register(Box::new(options.open(data_ready)?)),
-            ImuOptions::Iio(options) => HardwareImu::Iio(Box::new(IioImu::open(options)?)),
+            ImuOptions::Register(options) => Box::new(options.open(data_ready)?),
+            ImuOptions::Iio(options) => Box::new(IioImu::open(options)?),
         })
-    }
-}
-
-/// The inertial unit of a live run.
-pub enum HardwareImu {
-    Register(Box<RegisterImu>),
-    Iio(Box<IioImu>),
-}
-
-impl HardwareImu {
-    /// The counters so far.
-    pub fn counts(&self) -> ImuCounters {
-        match self {
-            HardwareImu::Register(imu) => imu.counts(),
-            HardwareImu::Iio(imu) => imu.counts(),
-        }
-    }
-}
-
-impl ImuSource for HardwareImu {
-    fn next(&mut self, timeout: Span, batch: &mut ImuBatch) -> Result<Wait, SourceFault> {
-        match self {
-            HardwareImu::Register(imu) => imu.next(timeout, batch),
-            HardwareImu::Iio(imu) => imu.next(timeout, batch),
-        }
-    }
-
-    fn counters(&self) -> Vec<(&'static str, u64)> {
-        self.counts().list()
     }
 }
 

@@ -108,7 +108,7 @@ impl RegisterImu {
             imu_edges_refused: self.queue.refused,
             imu_edges_unmatched: self.queue.unmatched,
             imu_unpaired: self.merge.as_ref().map_or(0, |m| m.unpaired),
-            imu_rate_millihertz: (self.units[0].line.report().rate_hz * 1e3).round() as u64,
+            imu_rate_millihertz: (self.units[0].line.rate_hz() * 1e3).round() as u64,
             ..self.counters
         }
     }

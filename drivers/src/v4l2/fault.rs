@@ -15,31 +15,23 @@ pub(super) fn is_gone(e: &io::Error) -> bool {
 }
 
 fn remedy(e: &io::Error) -> (FaultKind, &'static str) {
-    match e.raw_os_error() {
-        _ if is_gone(e) => (FaultKind::Unavailable, "check its cable and power"),
-        Some(libc::EBUSY) => {
-            (FaultKind::Unavailable, "another program streams from it (`fuser -v /dev/video*`): stop that")
+    let fix = match e.raw_os_error() {
+        _ if is_gone(e) => "check its cable and power",
+        Some(libc::EBUSY) => "another program streams from it (`fuser -v /dev/video*`): stop that",
+        Some(libc::EACCES | libc::EPERM) => "add the user to the group `video` (the units in board-configs/ do)",
+        Some(libc::ENOMEM) => "the kernel has no memory for its buffers: free some, or lower the cameras' size",
+        Some(libc::ENOSPC) => {
+            "the bus has no bandwidth left: put the cameras on separate controllers, or lower camera.rate_hz"
         }
-        Some(libc::EACCES | libc::EPERM) => {
-            (FaultKind::Unavailable, "add the user to the group `video` (the units in board-configs/ do)")
-        }
-        Some(libc::ENOMEM) => {
-            (FaultKind::Unavailable, "the kernel has no memory for its buffers: free some, or lower the cameras' size")
-        }
-        Some(libc::ENOSPC) => (
-            FaultKind::Unavailable,
-            "the bus has no bandwidth left: put the cameras on separate controllers, or lower camera.rate_hz",
-        ),
-        Some(libc::ENOTTY) => {
-            (FaultKind::Unavailable, "its driver cannot do this: it is not a camera, or needs a newer kernel")
-        }
+        Some(libc::ENOTTY) => "its driver cannot do this: it is not a camera, or needs a newer kernel",
+        Some(libc::EMFILE | libc::ENFILE) => "raise the limit of open files (`ulimit -n`)",
         Some(libc::EIO | libc::EPROTO | libc::ETIMEDOUT | libc::EPIPE) => {
-            (FaultKind::Io, "the camera does not answer: check its cable and power, `dmesg` says more")
+            return (FaultKind::Io, "the camera does not answer: check its cable and power, `dmesg` says more")
         }
         Some(libc::EINVAL | libc::ERANGE) => {
-            (FaultKind::Config, "the camera refuses the value: compare [camera] with `v4l2-ctl --all`")
+            return (FaultKind::Config, "the camera refuses the value: compare [camera] with `v4l2-ctl --all`")
         }
-        Some(libc::EMFILE | libc::ENFILE) => (FaultKind::Unavailable, "raise the limit of open files (`ulimit -n`)"),
-        _ => (FaultKind::Io, "`dmesg` says more"),
-    }
+        _ => return (FaultKind::Io, "`dmesg` says more"),
+    };
+    (FaultKind::Unavailable, fix)
 }
