@@ -24,7 +24,7 @@ use stipple_drivers::{host, Calibration, ImuSample, Span};
 /// Frames decoded at once: 24 MiB of two 752x480 cameras. What the threads of tracking lose at its ends is one stage of one
 /// frame in so many.
 const BATCH: usize = 32;
-/// And the one before the batch, from which points are followed.
+/// Packets in all: a batch, and the one before it, from which points are followed.
 const PACKETS: usize = BATCH + 1;
 
 /// Spends the mapping steps of a flight, or its seconds.

@@ -136,7 +136,7 @@ impl Mailbox {
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Capture {
     pub frames: u64,
-    /// Of the images of one frame.
+    /// Size of the images of one frame.
     pub frame_bytes: usize,
     pub cpu: CpuTime,
 }

@@ -40,7 +40,7 @@ pub enum Factor<'a> {
 /// What linearizing a factor gave besides its rows.
 #[derive(Clone, Copy, Debug)]
 pub struct Linearized {
-    /// At the estimate.
+    /// Cost at the estimate, half a sum of squared deviations without unit.
     pub cost: f64,
     /// First of the rows that speak of the window alone; those before hold the landmark's point. `None` where the
     /// views do not determine the point: then they say nothing of the window.

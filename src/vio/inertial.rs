@@ -28,6 +28,7 @@ impl Motion {
         }
     }
 
+    /// Whether every number of it is finite.
     pub fn is_finite(&self) -> bool {
         self.pose.is_finite() && self.v.is_finite() && self.bg.is_finite() && self.ba.is_finite()
     }
@@ -47,7 +48,9 @@ impl Motion {
 /// Covariance of a motion, errors [p, θ, v, bg, ba]: p and v in the world, m and m/s; θ on the right of the
 /// rotation, rad; gyro bias, rad/s; accelerometer bias, m/s².
 pub type Covariance = [[f64; 15]; 15];
+/// Matrix over errors [p, θ, v, bg, ba].
 pub type Mat15 = SMatrix<f64, 15, 15>;
+/// Errors [p, θ, v, bg, ba].
 pub type Vec15 = SMatrix<f64, 15, 1>;
 
 /// Standard deviations of a motion: position, m; tilt and yaw about world axes, rad; velocity, m/s; gyro bias,
@@ -80,7 +83,8 @@ impl MotionSigma {
     }
 }
 
-/// Whitening of an inertial factor: inverse deviations of the increment and of the bias walk over it.
+/// Whitening of an inertial factor: inverse deviations of the increment [p, θ, v] and of the walks of the biases over it,
+/// in inverse units of rad/s and m/s².
 #[derive(Clone, Copy, Debug)]
 pub struct InertialWeight {
     pub increment: Mat9,

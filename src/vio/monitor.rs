@@ -30,7 +30,7 @@ pub struct Evidence {
     /// Inliers of landmarks that earlier frames saw: a landmark made of this frame alone
     /// says nothing of where it is.
     pub known: usize,
-    /// Squared whitened inertial residual per dimension.
+    /// Squared whitened inertial residual per dimension, without unit.
     pub misfit: f64,
 }
 

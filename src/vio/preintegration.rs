@@ -14,6 +14,7 @@ use glam::{DMat3, DQuat, DVec3};
 use nalgebra::SMatrix;
 use stipple_drivers::ImuCalibration;
 
+/// Matrix over errors [p, θ, v].
 pub type Mat9 = SMatrix<f64, 9, 9>;
 type Mat93 = SMatrix<f64, 9, 3>;
 
@@ -30,7 +31,8 @@ const SATURATED_ACCEL: f64 = 5.0;
 /// Position noise of integrating in steps, m/√s; keeps one-step increments invertible.
 const POSITION_NOISE: f64 = 1e-4;
 
-/// Continuous noise densities that the estimator believes.
+/// Noise that the estimator believes, as continuous densities: white noise of gyro and accelerometer, rad/s and m/s² per √Hz,
+/// and walks of their biases, rad/s and m/s² per s and √Hz.
 #[derive(Clone, Copy, Debug)]
 pub struct Noise {
     pub gyro: f64,
@@ -72,7 +74,8 @@ impl Noise {
     }
 }
 
-/// Increment over `dt`; error order of covariance rows: [p, θ, v].
+/// Increment over `dt`, s, in the body frame at its start: position, m, rotation, velocity, m/s; the rows of its covariance
+/// are errors [p, θ, v].
 #[derive(Clone, Copy, Debug)]
 pub struct Increment {
     pub dt: f64,

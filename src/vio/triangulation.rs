@@ -20,7 +20,7 @@ const BEARING_SIGMA: f64 = 2e-3;
 #[derive(Clone, Copy, Debug, Default)]
 pub struct InverseDistance {
     numerator: f64,
-    /// Information, rad²·m².
+    /// Information, rad² m².
     pub information: f64,
 }
 

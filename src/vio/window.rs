@@ -176,6 +176,7 @@ impl Window {
         &self.frames[slot]
     }
 
+    /// The frame in a slot that is taken, to change it.
     pub fn frame_mut(&mut self, slot: usize) -> &mut Frame {
         &mut self.frames[slot]
     }

@@ -240,7 +240,7 @@ fn names_a_unit(doc: &str) -> bool {
 }
 
 /// Public items of the sensors' crate and of the estimator are documented: numbers with their unit, results with their error.
-/// A field may be documented by the comment on the fields before it or on its struct, a plain `new` by its type.
+/// The comment on an item or a struct goes for what follows without an empty line; a plain `new` is documented by its type.
 #[test]
 fn public_items_say_what_they_are() {
     const SUFFIXES: [&str; 14] =
@@ -268,7 +268,9 @@ fn public_items_say_what_they_are() {
                 let fallible = item.is_some_and(|i| i.contains("fn ") && i.contains("Fault>"));
                 let says_error = ["rror", "fuse", "ail", "ault", "cannot", "refus"].iter().any(|w| doc.contains(w));
                 let at = format!("{}:{}", file.path, number + 1);
-                if is_field && doc.is_empty() {
+                if line.is_empty() {
+                    group.clear();
+                } else if item.is_some() && doc.is_empty() {
                     doc.clone_from(&group);
                 } else if item.is_some() {
                     group.clone_from(&doc);
