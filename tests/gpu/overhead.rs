@@ -36,7 +36,7 @@ fn timings_name_every_command_and_add_up() {
     gpu.submit(rec).unwrap();
     let wall_ms = start.elapsed().as_secs_f64() * 1e3;
     let t = gpu.timings();
-    assert_eq!(t.iter().map(|t| t.name).collect::<Vec<_>>(), ["fill", "read back", "axpy"]);
+    assert_eq!(t.iter().map(|t| t.name).collect::<Vec<_>>(), ["fill", "report", "axpy"]);
     assert_eq!(t[0].count - fills, 1);
     if gpu.caps().timestamp_period_ns > 0.0 {
         assert_eq!(t[2].count, 3);
