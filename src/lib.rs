@@ -45,15 +45,43 @@ extern crate self as stipple;
 pub mod world;
 
 pub mod commands;
-pub mod config;
-pub mod counters;
-pub mod frontend;
-pub mod gpu;
-pub mod limits;
-pub mod map;
-pub mod math;
 pub mod mem;
-pub mod output;
-pub mod run;
-pub mod stereo;
-pub mod vio;
+
+cfg_if::cfg_if! {
+    if #[cfg(feature = "instruments")] {
+        #[doc(hidden)]
+        pub mod config;
+        #[doc(hidden)]
+        pub mod counters;
+        #[doc(hidden)]
+        pub mod frontend;
+        #[doc(hidden)]
+        pub mod gpu;
+        #[doc(hidden)]
+        pub mod limits;
+        #[doc(hidden)]
+        pub mod map;
+        #[doc(hidden)]
+        pub mod math;
+        #[doc(hidden)]
+        pub mod output;
+        #[doc(hidden)]
+        pub mod run;
+        #[doc(hidden)]
+        pub mod stereo;
+        #[doc(hidden)]
+        pub mod vio;
+    } else {
+        mod config;
+        mod counters;
+        mod frontend;
+        mod gpu;
+        mod limits;
+        mod map;
+        mod math;
+        mod output;
+        mod run;
+        mod stereo;
+        mod vio;
+    }
+}

@@ -44,6 +44,8 @@ pub struct Key {
     /// `section.key`; without a section for those at the top.
     pub name: &'static str,
     /// Meaning, and when to change it.
+    #[cfg_attr(not(feature = "instruments"), allow(dead_code))]
+    // the test that writes board-configs/README.md reads it
     pub doc: &'static str,
     pub bound: Bound,
 }

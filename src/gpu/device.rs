@@ -61,6 +61,7 @@ pub mod capability {
     pub const SHADER: u32 = 1;
     pub const GROUP: u32 = 61;
     pub const GROUP_VOTE: u32 = 62;
+    #[cfg(feature = "instruments")]
     pub const GROUP_ARITHMETIC: u32 = 63;
     pub const GROUP_SHUFFLE: u32 = 65;
     pub const GROUP_QUAD: u32 = 68;

@@ -40,6 +40,7 @@ pub struct Variant {
 }
 
 /// What a module declares, for the test of the baseline.
+#[cfg_attr(not(feature = "instruments"), allow(dead_code))]
 #[derive(Clone, Copy, Debug)]
 pub struct Reflected {
     pub name: &'static str,

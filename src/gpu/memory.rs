@@ -62,6 +62,7 @@ impl<T> Buf<T> {
         self.len
     }
 
+    #[cfg(feature = "instruments")]
     pub fn is_empty(&self) -> bool {
         self.len == 0
     }

@@ -44,10 +44,12 @@ mod submit;
 mod tests;
 
 pub use device::{capability, Caps, DeviceKind};
-pub use kernel::{Access, Kernel, KernelDef, Reflected, Variant, BUFFERS_MAX, PUSH_MAX, SPECS_MAX};
-pub use memory::{Arena, Buf, Range, Read, ReadWrite, Write, ALIGN, REPORTS, REPORT_BYTES, STAGING_BYTES};
-pub use record::{Recorder, Threads, GROUPS_MAX};
+pub use kernel::{Access, Kernel, KernelDef, Reflected, Variant, BUFFERS_MAX, SPECS_MAX};
+pub use memory::{Arena, Buf, Range, Read, ReadWrite, Write, ALIGN, REPORTS, REPORT_BYTES};
+pub use record::{Recorder, Threads};
 pub use submit::{Ticket, Timing};
+#[cfg(feature = "instruments")]
+pub use {kernel::PUSH_MAX, memory::STAGING_BYTES, record::GROUPS_MAX};
 
 use crate::config::GpuConfig;
 use ash::vk;
@@ -179,6 +181,7 @@ impl Gpu {
     }
 
     /// Takes `len` elements from the arena.
+    #[cfg(feature = "instruments")]
     pub fn alloc<T: bytemuck::Pod>(&mut self, name: &'static str, len: usize) -> Result<Buf<T>, Fault> {
         self.arena.alloc(name, len)
     }
@@ -291,6 +294,7 @@ impl Gpu {
     }
 
     /// Time on the device of the last recording waited for, ms; without timestamps, until the host saw its end.
+    #[cfg(feature = "instruments")]
     pub fn last_submit_ms(&self) -> f64 {
         self.submitter.last_ms
     }
@@ -308,11 +312,13 @@ impl Gpu {
     }
 
     /// Submissions so far; a recording that takes longer than `submission_max_ms` is several.
+    #[cfg(feature = "instruments")]
     pub fn submissions(&self) -> u64 {
         self.submitter.submissions
     }
 
     /// Time of the longest submission so far, ms on the device.
+    #[cfg(feature = "instruments")]
     pub fn longest_submission_ms(&self) -> f64 {
         self.submitter.longest_ms
     }
@@ -322,6 +328,7 @@ impl Gpu {
     }
 
     /// Warnings and errors of the validation layer so far; none without validation.
+    #[cfg(feature = "instruments")]
     pub fn validation_messages(&self) -> Vec<String> {
         self.device.messages()
     }

@@ -28,6 +28,7 @@ impl Threads {
         Threads { count: [n, 1, 1], groups: false }
     }
 
+    #[cfg(feature = "instruments")]
     pub fn d2(x: u32, y: u32) -> Threads {
         Threads { count: [x, y, 1], groups: false }
     }
@@ -154,15 +155,18 @@ impl Recorder {
     }
 
     /// Commands recorded so far.
+    #[cfg(feature = "instruments")]
     pub fn len(&self) -> usize {
         self.commands.len()
     }
 
+    #[cfg(feature = "instruments")]
     pub fn is_empty(&self) -> bool {
         self.commands.is_empty()
     }
 
     /// Barriers inserted so far.
+    #[cfg(feature = "instruments")]
     pub fn barriers(&self) -> usize {
         self.commands.iter().filter(|c| c.barrier_before).count()
     }

@@ -81,6 +81,7 @@ impl Loss {
     }
 
     /// Stores an image, plane by plane.
+    #[cfg(feature = "instruments")]
     pub fn set_image(&mut self, gpu: &mut Gpu, image: u32, planes: &[u8]) -> Result<(), GpuError> {
         let mut planes = planes.chunks_exact(self.shape.pixels()).enumerate();
         planes.try_for_each(|(channel, plane)| self.set_plane(gpu, image, channel, plane))

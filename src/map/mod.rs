@@ -50,13 +50,18 @@ pub use evaluate::{spread, CurvePoint, Evaluation, Panel};
 pub use exposure::Exposure;
 pub use keyframes::{Keyframe, PoseCorrection};
 pub use pipeline::Pipeline;
-pub use pool::{Gaussian, PruneRule};
+pub use pool::Gaussian;
 pub use render::Rendered;
 pub use shape::Shape;
-pub use step::{LearningRates, StepStats, Target, Weights};
-pub use store::Stored;
-pub use tiling::Tiling;
-pub use view::{Fisheye, View};
+
+#[cfg(feature = "instruments")]
+pub use {
+    pool::PruneRule,
+    step::{LearningRates, StepStats, Target, Weights},
+    store::Stored,
+    tiling::Tiling,
+    view::{Fisheye, View},
+};
 
 /// What the mapper did.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -247,6 +252,7 @@ impl Mapper {
     }
 
     /// A keyframe as stored, in the order they came.
+    #[cfg(feature = "instruments")]
     pub fn keyframe(&self, index: usize) -> &Stored {
         self.scene.store.get(index * self.scene.cameras.len())
     }
@@ -255,15 +261,18 @@ impl Mapper {
         self.scene.pipeline.pool.count() as usize
     }
 
+    #[cfg(feature = "instruments")]
     pub fn anchor_count(&self) -> usize {
         self.scene.store.anchors()
     }
 
+    #[cfg(feature = "instruments")]
     pub fn keyframe_count(&self) -> usize {
         self.scene.store.len() / self.scene.cameras.len()
     }
 
     /// Training steps started.
+    #[cfg(feature = "instruments")]
     pub fn iterations(&self) -> u64 {
         self.scene.steps
     }

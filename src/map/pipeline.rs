@@ -74,6 +74,7 @@ const WAITED_FOR: usize = REPORTS - 1;
 
 impl Pipeline {
     /// Bytes of an arena that `new` takes all of.
+    #[cfg(feature = "instruments")]
     pub fn arena_bytes(shape: &Shape) -> Result<u64, Fault> {
         let mut arena = Arena::counting();
         Buffers::new(&mut arena, shape)?;
@@ -103,6 +104,7 @@ impl Pipeline {
         })
     }
 
+    #[cfg(feature = "instruments")]
     pub fn shape(&self) -> &Shape {
         &self.shape
     }
@@ -131,6 +133,7 @@ impl Pipeline {
     }
 
     /// One step on an image. The view must have the shape's size.
+    #[cfg(feature = "instruments")]
     pub fn train(
         &mut self,
         gpu: &mut Gpu,

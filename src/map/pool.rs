@@ -256,6 +256,7 @@ impl Pool {
     }
 
     /// Empties the pool.
+    #[cfg(feature = "instruments")]
     pub fn clear(&mut self) {
         self.count = 0;
         self.host.blocks.clear();

@@ -30,6 +30,7 @@ const TABLE_LEN: usize = 1 << 16;
 const SCAN_BLOCKS_MAX: u32 = 256;
 const SCAN_BLOCKS_CPU: u32 = 16;
 /// A key that the first pass leaves out.
+#[cfg(feature = "instruments")]
 pub const NONE: u32 = u32::MAX;
 
 const _: () = assert!((CPU.groups << CPU.digit_bits) as usize <= TABLE_LEN);

@@ -156,11 +156,13 @@ fn depth_range(depth: &[f32]) -> (f32, f32) {
 }
 
 /// Near (0) to far (1).
+#[cfg(feature = "instruments")]
 pub fn depth_colour(s: f32) -> [u8; 3] {
     ramp(&DEPTH_RAMP, s)
 }
 
 /// None (0) to full (1).
+#[cfg(feature = "instruments")]
 pub fn error_colour(s: f32) -> [u8; 3] {
     ramp(&ERROR_RAMP, s)
 }

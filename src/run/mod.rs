@@ -75,6 +75,7 @@ pub enum Steps {
     /// Steps a second of the recording: plays a device that slow.
     PerSecond(f64),
     /// Seconds of mapping, spread evenly over the frames. Only tracking is deterministic then.
+    #[cfg_attr(not(feature = "instruments"), allow(dead_code))] // a bench asks for it
     EqualTime(f64),
 }
 

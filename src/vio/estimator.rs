@@ -150,6 +150,7 @@ impl Estimator {
     }
 
     /// The newest motion carried by the inertial samples to `t`, or as it is where that is older.
+    #[cfg(feature = "instruments")]
     pub fn predict(&self, t: Nanos, imu: &ImuRing) -> Option<(Nanos, Motion)> {
         let newest = self.newest()?;
         let t = t.max(newest.t);

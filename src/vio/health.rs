@@ -70,6 +70,7 @@ impl Health {
         "state_reset",
     ];
     /// Bits of a normal flight.
+    #[cfg(feature = "instruments")]
     pub const NORMAL: Health = Health(Health::INITIALISING.0 | Health::ZERO_VELOCITY.0);
 
     /// Sets bits when a condition holds; clears none.
@@ -83,6 +84,7 @@ impl Health {
     }
 
     /// Names of the reasons.
+    #[cfg(feature = "instruments")]
     pub fn reasons(self) -> impl Iterator<Item = &'static str> {
         Health::NAMES.into_iter().enumerate().filter(move |(i, _)| self.0 >> i & 1 == 1).map(|(_, n)| n)
     }

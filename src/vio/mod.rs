@@ -289,6 +289,7 @@ impl Vio {
     }
 
     /// Forgets everything but the inertial samples and where it was, and initializes again.
+    #[cfg(feature = "instruments")]
     pub fn reset(&mut self) {
         self.reset_for(Reset::Asked);
     }
@@ -313,6 +314,7 @@ impl Vio {
     }
 
     /// The newest state carried by the inertial samples to `t`. `None` until initialized.
+    #[cfg(feature = "instruments")]
     pub fn predict(&self, t: Nanos) -> Option<Odometry> {
         self.estimator.predict(t, &self.imu).map(|(t, motion)| Odometry::new(t, &motion))
     }

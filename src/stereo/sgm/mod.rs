@@ -194,6 +194,7 @@ impl Sgm {
         })
     }
 
+    #[cfg(feature = "instruments")]
     pub fn buffers(&self) -> &Buffers {
         &self.b
     }
