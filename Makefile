@@ -59,6 +59,7 @@ bench-odometry: deps
 lint:
 	cargo fmt --all --check
 	cargo clippy --workspace --all-targets --locked -- -D warnings
+	cargo clippy --locked --bin stipple -- -D warnings
 
 deps:
 	@missing=; for p in $(PACKAGES); do \
