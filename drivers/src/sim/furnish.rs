@@ -5,8 +5,8 @@
 //! the path than `KEEP_CLEAR` is left out.
 
 use super::room::{Light, LightMap, Room, Shape, Solid};
-use super::texture::Material::{
-    Books, Brick, Concrete, Crate, Drawers, Leaves, Marble, Parquet, Plaid, Plaster, Poster, Print, Rug,
+use super::texture::{
+    BOOKS, BRICK, CONCRETE, CRATE, DRAWERS, LEAVES, MARBLE, PARQUET, PLAID, PLASTER, POSTER, PRINT, RUG,
 };
 use glam::{vec3, Vec2, Vec3};
 use rand::{Rng, SeedableRng};
@@ -67,7 +67,7 @@ impl Set {
 /// Builds, furnishes and lights a room; `path` is sampled densely in world coordinates.
 pub fn furnish(low: Vec3, high: Vec3, path: &[Vec3], seed: u64, threads: usize) -> Room {
     let mut rng = ChaCha8Rng::seed_from_u64(seed ^ 0x526F_6F6D);
-    let walls = [Brick, Concrete, Plaster, Plaster];
+    let walls = [BRICK, CONCRETE, PLASTER, PLASTER];
     let mut room = Room::empty(low, high, walls, rng.random());
     add_rug(&mut room, &mut rng);
     along_walls(&mut room, path, &mut rng);
@@ -83,7 +83,7 @@ fn add_rug(room: &mut Room, rng: &mut ChaCha8Rng) {
     let mid = (room.low + room.high) * 0.5;
     let half = vec3(0.24 * (room.high.x - room.low.x), 0.2 * (room.high.y - room.low.y), 0.006);
     let half = half.min(vec3(2.2, 1.6, 1.0));
-    room.add_block(mid.with_z(room.low.z), half, (1.0, 0.0), Plaid, Rug, rng.random());
+    room.add_block(mid.with_z(room.low.z), half, (1.0, 0.0), PLAID, RUG, rng.random());
 }
 
 fn along_walls(room: &mut Room, path: &[Vec3], rng: &mut ChaCha8Rng) {
@@ -150,59 +150,59 @@ fn place(room: &mut Room, set: Set, stand: Stand, path: &[Vec3], rng: &mut ChaCh
     }
     match set {
         Set::Shelf => {
-            room.add_block(stand.base, half, (stand.cos, stand.sin), Books, Crate, rng.random());
+            room.add_block(stand.base, half, (stand.cos, stand.sin), BOOKS, CRATE, rng.random());
         }
         Set::Cabinet => cabinet(room, stand, rng),
         Set::Table => table(room, stand, rng),
         Set::Sofa => sofa(room, stand, rng),
         Set::Crates => crates(room, stand, rng),
         Set::Plant => {
-            room.add_drum(stand.base, 0.19, 0.42, Brick, rng.random());
-            room.add_drum(stand.at(0.0, 0.0, 0.42), 0.03, 0.2, Crate, rng.random());
-            room.add_ball(stand.at(0.0, 0.0, 0.85), 0.33, Leaves, rng.random());
+            room.add_drum(stand.base, 0.19, 0.42, BRICK, rng.random());
+            room.add_drum(stand.at(0.0, 0.0, 0.42), 0.03, 0.2, CRATE, rng.random());
+            room.add_ball(stand.at(0.0, 0.0, 0.85), 0.33, LEAVES, rng.random());
         }
         Set::Pillar => {
             let height = room.high.z - room.low.z;
-            room.add_drum(stand.base, 0.16, height, Marble, rng.random());
+            room.add_drum(stand.base, 0.16, height, MARBLE, rng.random());
         }
         Set::Column => {
-            room.add_block(stand.base, vec3(0.2, 0.2, 0.45), (stand.cos, stand.sin), Marble, Marble, rng.random());
-            room.add_ball(stand.at(0.0, 0.0, 1.08), 0.18, Marble, rng.random());
+            room.add_block(stand.base, vec3(0.2, 0.2, 0.45), (stand.cos, stand.sin), MARBLE, MARBLE, rng.random());
+            room.add_ball(stand.at(0.0, 0.0, 1.08), 0.18, MARBLE, rng.random());
         }
     }
 }
 
 fn cabinet(room: &mut Room, stand: Stand, rng: &mut ChaCha8Rng) {
     let turn = (stand.cos, stand.sin);
-    room.add_block(stand.base, vec3(0.4, 0.22, 0.54), turn, Drawers, Crate, rng.random());
-    room.add_ball(stand.at(-0.2, 0.0, 1.08 + 0.15), 0.15, Marble, rng.random());
+    room.add_block(stand.base, vec3(0.4, 0.22, 0.54), turn, DRAWERS, CRATE, rng.random());
+    room.add_ball(stand.at(-0.2, 0.0, 1.08 + 0.15), 0.15, MARBLE, rng.random());
     let turn = stand.turned(rng.random_range(-0.5..0.5));
-    room.add_block(stand.at(0.18, 0.0, 1.08), vec3(0.13, 0.1, 0.14), turn, Print, Print, rng.random());
+    room.add_block(stand.at(0.18, 0.0, 1.08), vec3(0.13, 0.1, 0.14), turn, PRINT, PRINT, rng.random());
 }
 
 fn table(room: &mut Room, stand: Stand, rng: &mut ChaCha8Rng) {
     let turn = (stand.cos, stand.sin);
     const HEIGHT: f32 = 0.72;
     for (x, y) in [(-0.66, -0.3), (0.66, -0.3), (-0.66, 0.3), (0.66, 0.3)] {
-        room.add_block(stand.at(x, y, 0.0), vec3(0.03, 0.03, 0.5 * HEIGHT), turn, Parquet, Parquet, rng.random());
+        room.add_block(stand.at(x, y, 0.0), vec3(0.03, 0.03, 0.5 * HEIGHT), turn, PARQUET, PARQUET, rng.random());
     }
-    room.add_block(stand.at(0.0, 0.0, HEIGHT), vec3(0.74, 0.36, 0.02), turn, Parquet, Parquet, rng.random());
+    room.add_block(stand.at(0.0, 0.0, HEIGHT), vec3(0.74, 0.36, 0.02), turn, PARQUET, PARQUET, rng.random());
     let top = HEIGHT + 0.04;
     for x in [-0.5, -0.1, 0.35] {
         let turn = stand.turned(rng.random_range(-0.6..0.6));
         let y = rng.random_range(-0.12..0.12);
         match rng.random_range(0..4) {
-            0 => room.add_ball(stand.at(x, y, top + 0.12), 0.12, Plaid, rng.random()),
-            1 => room.add_drum(stand.at(x, y, top), 0.08, 0.24, Marble, rng.random()),
-            2 => room.add_block(stand.at(x, y, top), vec3(0.15, 0.11, 0.03), turn, Books, Print, rng.random()),
-            _ => room.add_block(stand.at(x, y, top), vec3(0.13, 0.12, 0.15), turn, Print, Poster, rng.random()),
+            0 => room.add_ball(stand.at(x, y, top + 0.12), 0.12, PLAID, rng.random()),
+            1 => room.add_drum(stand.at(x, y, top), 0.08, 0.24, MARBLE, rng.random()),
+            2 => room.add_block(stand.at(x, y, top), vec3(0.15, 0.11, 0.03), turn, BOOKS, PRINT, rng.random()),
+            _ => room.add_block(stand.at(x, y, top), vec3(0.13, 0.12, 0.15), turn, PRINT, POSTER, rng.random()),
         }
     }
 }
 
 fn sofa(room: &mut Room, stand: Stand, rng: &mut ChaCha8Rng) {
     let turn = (stand.cos, stand.sin);
-    let cloth = Plaid;
+    let cloth = PLAID;
     let seed = rng.random();
     room.add_block(stand.at(0.0, 0.06, 0.06), vec3(0.72, 0.34, 0.18), turn, cloth, cloth, seed);
     room.add_block(stand.at(0.0, -0.34, 0.06), vec3(0.72, 0.07, 0.4), turn, cloth, cloth, seed);
@@ -210,14 +210,14 @@ fn sofa(room: &mut Room, stand: Stand, rng: &mut ChaCha8Rng) {
     room.add_block(stand.at(0.83, 0.0, 0.0), vec3(0.1, 0.41, 0.3), turn, cloth, cloth, seed);
     for x in [-0.4, 0.35] {
         let turn = stand.turned(rng.random_range(-0.7..0.7));
-        room.add_block(stand.at(x, 0.0, 0.42), vec3(0.17, 0.07, 0.15), turn, Rug, Rug, rng.random());
+        room.add_block(stand.at(x, 0.0, 0.42), vec3(0.17, 0.07, 0.15), turn, RUG, RUG, rng.random());
     }
 }
 
 fn crates(room: &mut Room, stand: Stand, rng: &mut ChaCha8Rng) {
     let mut add = |x: f32, y: f32, z: f32, half: Vec3| {
         let turn = stand.turned(rng.random_range(-0.3..0.3));
-        room.add_block(stand.at(x, y, z), half, turn, Crate, Crate, rng.random());
+        room.add_block(stand.at(x, y, z), half, turn, CRATE, CRATE, rng.random());
     };
     add(-0.3, -0.02, 0.0, Vec3::splat(0.26));
     add(0.3, 0.04, 0.0, vec3(0.23, 0.25, 0.2));
@@ -233,7 +233,7 @@ fn hang_picture(room: &mut Room, at: Vec2, inward: Vec2, bottom: f32, rng: &mut 
         return;
     }
     let base = (at + inward * half.y).extend(z);
-    room.add_block(base, half, (inward.y, -inward.x), Poster, Crate, rng.random());
+    room.add_block(base, half, (inward.y, -inward.x), POSTER, CRATE, rng.random());
 }
 
 /// Lamps under the ceiling, one for about every 12 m².

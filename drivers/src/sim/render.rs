@@ -225,67 +225,32 @@ impl Lens {
 }
 
 /// Finds distance and face at every pixel centre, into `scratch.hits`.
-pub fn cast(room: &Room, lens: &Lens, views: Rows, scratch: &mut Scratch) {
-    let Scratch { lists, hits } = scratch;
-    let hits = &mut hits[..lens.width * lens.height];
-    let work = |first_row: usize, hits: &mut [Hit], lists: &mut Lists| {
-        let rows = hits.len() / lens.width;
-        for ty in first_row / TILE..(first_row + rows).div_ceil(TILE) {
-            lists.look_around(room, views, ty, ty == first_row / TILE);
-            for tx in 0..lens.tiles_across() {
-                lists.tile(lens, views, tx, ty);
-                for y in ty * TILE..((ty + 1) * TILE).min(first_row + rows) {
-                    let view = views.at(y).view;
-                    for x in tx * TILE..((tx + 1) * TILE).min(lens.width) {
-                        let d = lens.bearings[y * lens.width + x];
-                        let hit = if d == Vec3::ZERO {
-                            Hit { distance: 0.0, face: NOTHING }
-                        } else {
-                            meet(room, &lists.tile, view.origin, view.turn * d)
-                        };
-                        hits[(y - first_row) * lens.width + x] = hit;
-                    }
-                }
-            }
+pub fn cast(room: &Room, lens: &Lens, rows: Rows, scratch: &mut Scratch) {
+    let hits = &mut scratch.hits[..lens.width * lens.height];
+    fill(room, lens, rows, hits, &mut scratch.lists, |tile, x, y| {
+        let (view, d) = (rows.at(y).view, lens.bearings[y * lens.width + x]);
+        if d == Vec3::ZERO {
+            return Hit { distance: 0.0, face: NOTHING };
         }
-    };
-    in_bands(lens, hits, lists, work);
+        meet(room, tile.solids(), view.origin, view.turn * d)
+    });
 }
 
 /// Writes grey levels from the hits of the last `cast` of the same rows.
-pub fn shade(room: &Room, lens: &Lens, views: Rows, exposure: &Exposure, scratch: &mut Scratch, out: &mut [u8]) {
-    let Scratch { lists, hits } = scratch;
-    let hits = &hits[..lens.width * lens.height];
-    let work = |first_row: usize, out: &mut [u8], lists: &mut Lists| {
-        let rows = out.len() / lens.width;
-        for ty in first_row / TILE..(first_row + rows).div_ceil(TILE) {
-            lists.look_around(room, views, ty, ty == first_row / TILE);
-            for tx in 0..lens.tiles_across() {
-                let mut listed = false;
-                for y in ty * TILE..((ty + 1) * TILE).min(first_row + rows) {
-                    let Row { view, gain, offset } = *views.at(y);
-                    for x in tx * TILE..((tx + 1) * TILE).min(lens.width) {
-                        let i = y * lens.width + x;
-                        let light = if is_edge(hits, lens, x, y) {
-                            if !listed {
-                                lists.tile(lens, views, tx, ty);
-                                listed = true;
-                            }
-                            edge_radiance(room, lens, view, &lists.tile, (x, y), exposure.channel)
-                        } else if hits[i].face == NOTHING {
-                            0.0
-                        } else {
-                            let d = view.turn * lens.bearings[i];
-                            radiance(room, view, d, hits[i], lens.pixel_angle[i], exposure.channel)
-                        };
-                        out[i - first_row * lens.width] =
-                            develop(light * gain, offset, lens.bearings[i].z, i, exposure);
-                    }
-                }
-            }
-        }
-    };
-    in_bands(lens, out, lists, work);
+pub fn shade(room: &Room, lens: &Lens, rows: Rows, exposure: &Exposure, scratch: &mut Scratch, out: &mut [u8]) {
+    let hits = &scratch.hits[..lens.width * lens.height];
+    fill(room, lens, rows, out, &mut scratch.lists, |tile, x, y| {
+        let (i, Row { view, gain, offset }) = (y * lens.width + x, *rows.at(y));
+        let light = if is_edge(hits, lens, x, y) {
+            edge_radiance(room, lens, view, tile.solids(), (x, y), exposure.channel)
+        } else if hits[i].face == NOTHING {
+            0.0
+        } else {
+            let d = view.turn * lens.bearings[i];
+            radiance(room, view, d, hits[i], lens.pixel_angle[i], exposure.channel)
+        };
+        develop(light * gain, offset, lens.bearings[i].z, i, exposure)
+    });
 }
 
 /// The mean radiance of a sparse set of pixels, as an exposure meter sees it.
@@ -313,20 +278,58 @@ pub fn depths(lens: &Lens, hits: &[Hit], out: &mut [f32]) {
     }
 }
 
-/// Gives each thread a band of an image, whole tile rows, as equal as can be: `work` is told the band's first row.
-fn in_bands<T: Send>(
+/// A tile of an image, and the solids that its rays may meet, listed when they are first asked for.
+struct Tile<'a> {
+    lens: &'a Lens,
+    rows: Rows<'a>,
+    lists: &'a mut Lists,
+    listed: bool,
+    x: usize,
+    y: usize,
+}
+
+impl Tile<'_> {
+    #[inline]
+    fn solids(&mut self) -> &[Seen] {
+        if !self.listed {
+            self.lists.tile(self.lens, self.rows, self.x, self.y);
+            self.listed = true;
+        }
+        &self.lists.tile
+    }
+}
+
+/// Fills an image with what `pixel` gives for each tile, column and row. Each thread has a band of whole tile rows, as equal
+/// as can be.
+fn fill<T: Send>(
+    room: &Room,
     lens: &Lens,
+    rows: Rows,
     pixels: &mut [T],
     lists: &mut [Lists],
-    work: impl Fn(usize, &mut [T], &mut Lists) + Sync,
+    pixel: impl Fn(&mut Tile, usize, usize) -> T + Sync,
 ) {
-    let rows = lens.height.div_ceil(TILE).div_ceil(lists.len()) * TILE;
-    let (mut bands, mut lists) = (pixels.chunks_mut(rows * lens.width).enumerate(), lists.iter_mut());
+    let band_rows = lens.height.div_ceil(TILE).div_ceil(lists.len()) * TILE;
+    let work = |k: usize, band: &mut [T], lists: &mut Lists| {
+        let (first, end) = (k * band_rows, k * band_rows + band.len() / lens.width);
+        for ty in first / TILE..end.div_ceil(TILE) {
+            lists.look_around(room, rows, ty, ty == first / TILE);
+            for tx in 0..lens.tiles_across() {
+                let mut tile = Tile { lens, rows, lists, listed: false, x: tx, y: ty };
+                for y in ty * TILE..((ty + 1) * TILE).min(end) {
+                    for x in tx * TILE..((tx + 1) * TILE).min(lens.width) {
+                        band[(y - first) * lens.width + x] = pixel(&mut tile, x, y);
+                    }
+                }
+            }
+        }
+    };
+    let (mut bands, mut lists) = (pixels.chunks_mut(band_rows * lens.width).enumerate(), lists.iter_mut());
     let (first, spare) = (bands.next(), lists.next());
     std::thread::scope(|scope| {
         for ((k, band), list) in bands.zip(lists) {
             let work = &work;
-            scope.spawn(move || work(k * rows, band, list));
+            scope.spawn(move || work(k, band, list));
         }
         if let (Some((_, band)), Some(list)) = (first, spare) {
             work(0, band, list);

@@ -9,7 +9,7 @@ mod light;
 
 pub use light::LightMap;
 
-use super::texture::Material;
+use super::texture::{Material, CEILING_TILE, PARQUET};
 use glam::{Vec2, Vec3};
 
 /// No face: the ray left the room (only rays outside the lens' domain do).
@@ -126,8 +126,8 @@ impl Room {
             wall(corner(high.x, high.y), -y, e.y, 1),
             wall(corner(high.x, low.y), -x, e.x, 2),
             wall(corner(low.x, high.y), x, e.x, 3),
-            face(corner(low.x, low.y), x, y, flat, Material::Parquet, seed.wrapping_add(4)),
-            face(ceiling, x, -y, flat, Material::CeilingTile, seed.wrapping_add(5)),
+            face(corner(low.x, low.y), x, y, flat, PARQUET, seed.wrapping_add(4)),
+            face(ceiling, x, -y, flat, CEILING_TILE, seed.wrapping_add(5)),
         ];
         Room { low, high, solids: Vec::new(), faces, lights: Vec::new(), light_map: LightMap::default() }
     }

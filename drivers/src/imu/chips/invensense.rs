@@ -138,21 +138,21 @@ const MPU_TESTS: &[SelfTest] = &[
 pub const ICM_20948: DieSpec = DieSpec {
     name: "ICM-20948",
     // WHO_AM_I.
-    who: banked(0, 0x00),
+    who: 0x00,
     who_answers: &[0xEA],
     // REG_BANK_SEL, bits 5:4, in every bank.
     bank_select: Some((0x7F, 4)),
     spi_dummy: 0,
     big_endian: true,
-    accel: Some(SensorSpec { ranges: ACCEL_2_TO_16, data: banked(0, 0x2D) }),
-    gyro: Some(SensorSpec { ranges: GYRO_250_TO_2000, data: banked(0, 0x33) }),
+    accel: Some(SensorSpec { ranges: ACCEL_2_TO_16, data: 0x2D }),
+    gyro: Some(SensorSpec { ranges: GYRO_250_TO_2000, data: 0x33 }),
     // GYRO_SMPLRT_DIV and ACCEL_SMPLRT_DIV: 1125 Hz / (1 + divider) for both while both run.
     rates: Rates::Divided { base_hz: 1125.0, code_max: 255 },
     temperature: DEGREES,
     // FIFO_COUNTH and FIFO_R_W.
-    fifo: fifo_512(banked(0, 0x70), banked(0, 0x72), ICM_20948_FRAME, ICM_20948_FIFO_RESET),
+    fifo: fifo_512(0x70, 0x72, ICM_20948_FRAME, ICM_20948_FIFO_RESET),
     // PWR_MGMT_1: DEVICE_RESET, then awake on the best clock.
-    reset: &[Write(banked(0, 0x06), 0x80), WaitUs(100_000), Write(banked(0, 0x06), 0x01), WaitUs(20_000)],
+    reset: &[Write(0x06, 0x80), WaitUs(100_000), Write(0x06, 0x01), WaitUs(20_000)],
     configure: configure_icm_20948,
     cross_axis: None,
     self_tests: ICM_20948_TESTS,
@@ -161,21 +161,21 @@ pub const ICM_20948: DieSpec = DieSpec {
 /// FIFO_EN_2: accelerometer, gyro, temperature. USER_CTRL: FIFO_EN. FIFO_RST: assert and release. As in ArduPilot, nothing
 /// goes into the FIFO meanwhile.
 const ICM_20948_FIFO_RESET: &[Step] = &[
-    Write(banked(0, 0x67), 0x00),
-    Change(banked(0, 0x03), 0x40, 0x00),
-    Write(banked(0, 0x68), 0x1F),
-    Write(banked(0, 0x68), 0x00),
-    Change(banked(0, 0x03), 0x00, 0x40),
-    Write(banked(0, 0x67), 0x1F),
+    Write(0x67, 0x00),
+    Change(0x03, 0x40, 0x00),
+    Write(0x68, 0x1F),
+    Write(0x68, 0x00),
+    Change(0x03, 0x00, 0x40),
+    Write(0x67, 0x1F),
 ];
 
 fn configure_icm_20948(s: &Setting) -> Vec<Step> {
     // GYRO_CONFIG_1 and ACCEL_CONFIG: bands of 51, 120 or 152 Hz (gyro), 50, 111 or 246 Hz (accelerometer).
     let band = band(1125.0, s.rate);
     vec![
-        Write(banked(0, 0x07), 0x00),
+        Write(0x07, 0x00),
         // USER_CTRL: by SPI the I2C interface off.
-        Write(banked(0, 0x03), if s.spi { 0x10 } else { 0x00 }),
+        Write(0x03, if s.spi { 0x10 } else { 0x00 }),
         Write(banked(2, 0x00), s.rate),
         Write(banked(2, 0x01), band << 3 | s.gyro << 1 | 1),
         // ODR_ALIGN_EN: both sensors start their samples together.
@@ -184,12 +184,12 @@ fn configure_icm_20948(s: &Setting) -> Vec<Step> {
         Write(banked(2, 0x11), s.rate),
         Write(banked(2, 0x14), band << 3 | s.accel << 1 | 1),
         // INT_PIN_CFG and INT_ENABLE_1: active high, a pulse, raw data ready.
-        Write(banked(0, 0x0F), 0x10),
-        Write(banked(0, 0x11), u8::from(s.data_ready)),
+        Write(0x0F, 0x10),
+        Write(0x11, u8::from(s.data_ready)),
         // The gyro's start-up time is 35 ms; Linux waits 70.
         WaitUs(70_000),
         // FIFO_MODE: takes no more when full.
-        Write(banked(0, 0x69), 0x1F),
+        Write(0x69, 0x1F),
     ]
 }
 
@@ -198,7 +198,7 @@ const ICM_20948_TESTS: &[SelfTest] = &[
     SelfTest::Factory(FactoryTest {
         sensor: Sensor::Gyro,
         prepare: &[
-            Write(banked(0, 0x07), 0x00),
+            Write(0x07, 0x00),
             Write(banked(2, 0x00), 0x0A),
             Write(banked(2, 0x11), 0x0A),
             Write(banked(2, 0x01), 0x11),
@@ -230,7 +230,7 @@ const ICM_20948_TESTS: &[SelfTest] = &[
 pub const ICM_42688_P: DieSpec = DieSpec {
     name: "ICM-42688-P",
     // WHO_AM_I.
-    who: banked(0, 0x75),
+    who: 0x75,
     who_answers: &[0x47],
     // REG_BANK_SEL, bits 2:0.
     bank_select: Some((0x76, 0)),
@@ -239,57 +239,57 @@ pub const ICM_42688_P: DieSpec = DieSpec {
     accel: Some(SensorSpec {
         // ACCEL_CONFIG0.
         ranges: &[range(2.0, 3), range(4.0, 2), range(8.0, 1), range(16.0, 0)],
-        data: banked(0, 0x1F),
+        data: 0x1F,
     }),
     // GYRO_CONFIG0.
-    gyro: Some(SensorSpec { ranges: GYRO_125_TO_2000, data: banked(0, 0x25) }),
+    gyro: Some(SensorSpec { ranges: GYRO_125_TO_2000, data: 0x25 }),
     rates: Rates::Listed(&[(25.0, 10), (50.0, 9), (100.0, 8), (200.0, 7), (500.0, 15), (1000.0, 6), (2000.0, 5)]),
     // "FIFO", packet 3: the byte of the FIFO / 2.07 + 25.
     temperature: Temperature { from: TemperatureSource::Frames, c_per_lsb: 1.0 / 2.07, c_at_zero: 25.0 },
     fifo: Fifo {
         // FIFO_COUNTH and L; 2 KiB ("FIFO"), and what the read path holds.
-        count: banked(0, 0x2E),
+        count: 0x2E,
         count_bytes: 2,
         count_mask: 0xFFFF,
         overrun: 0,
         unit: 1,
-        data: banked(0, 0x30),
+        data: 0x30,
         capacity: 2080,
         full: 2048 - 16 + 1,
         layout: Layout::Packet3,
         reset: ICM_42688_P_FIFO_RESET,
     },
     // DEVICE_CONFIG: soft reset, 1 ms; the read settles the interface.
-    reset: &[Write(banked(0, 0x11), 0x01), WaitUs(2000), Touch(banked(0, 0x75))],
+    reset: &[Write(0x11, 0x01), WaitUs(2000), Touch(0x75)],
     configure: configure_icm_42688_p,
     cross_axis: None,
     self_tests: ICM_42688_P_TESTS,
 };
 
 /// SIGNAL_PATH_RESET: FIFO_FLUSH. The first count after it is always 0, whatever the FIFO holds.
-const ICM_42688_P_FIFO_RESET: &[Step] = &[Write(banked(0, 0x4B), 0x02), WaitUs(100), Touch(banked(0, 0x2E))];
+const ICM_42688_P_FIFO_RESET: &[Step] = &[Write(0x4B, 0x02), WaitUs(100), Touch(0x2E)];
 
 fn configure_icm_42688_p(s: &Setting) -> Vec<Step> {
     vec![
         // INT_CONFIG and INT_CONFIG1: a pulse, push-pull, active high; INT_ASYNC_RESET off, as its text
         // demands for the pins to work.
-        Write(banked(0, 0x14), 0x03),
-        Write(banked(0, 0x64), 0x00),
+        Write(0x14, 0x03),
+        Write(0x64, 0x00),
         // INTF_CONFIG0: count in bytes, big-endian; by SPI the I2C interface off.
-        Write(banked(0, 0x4C), 0x30 | if s.spi { 0x03 } else { 0x00 }),
+        Write(0x4C, 0x30 | if s.spi { 0x03 } else { 0x00 }),
         // INTF_CONFIG1, bits 7:6: no adaptive full scale. While it switches, at some 100 °/s, the gyro stands still for 1 to
         // 2 ms (ArduPilot, pull request 25332; Betaflight, 13132; PX4, 22254).
-        Change(banked(0, 0x4D), 0xC0, 0x40),
-        Write(banked(0, 0x4F), s.gyro << 5 | s.rate),
-        Write(banked(0, 0x50), s.accel << 5 | s.rate),
+        Change(0x4D, 0xC0, 0x40),
+        Write(0x4F, s.gyro << 5 | s.rate),
+        Write(0x50, s.accel << 5 | s.rate),
         // PWR_MGMT0: both in low-noise mode; nothing may be written for 200 µs, the gyro needs 45 ms.
-        Write(banked(0, 0x4E), 0x0F),
+        Write(0x4E, 0x0F),
         WaitUs(60_000),
         // INT_SOURCE0: data ready on INT1.
-        Write(banked(0, 0x65), if s.data_ready { 0x08 } else { 0x00 }),
+        Write(0x65, if s.data_ready { 0x08 } else { 0x00 }),
         // FIFO_CONFIG1: temperature, gyro, accelerometer. FIFO_CONFIG: a stream.
-        Write(banked(0, 0x5F), 0x07),
-        Write(banked(0, 0x16), 0x40),
+        Write(0x5F, 0x07),
+        Write(0x16, 0x40),
     ]
 }
 
@@ -297,9 +297,9 @@ fn configure_icm_42688_p(s: &Setting) -> Vec<Step> {
 const ICM_42688_P_TESTS: &[SelfTest] = &[
     SelfTest::Factory(FactoryTest {
         sensor: Sensor::Gyro,
-        prepare: &[Write(banked(0, 0x4F), 0x66), Write(banked(0, 0x50), 0x66), Write(banked(0, 0x4E), 0x0F)],
-        on: &[Write(banked(0, 0x70), 0x07)],
-        off: &[Write(banked(0, 0x70), 0x00)],
+        prepare: &[Write(0x4F, 0x66), Write(0x50, 0x66), Write(0x4E, 0x0F)],
+        on: &[Write(0x70, 0x07)],
+        off: &[Write(0x70, 0x00)],
         codes: [banked(1, 0x5F), banked(1, 0x60), banked(1, 0x61)],
         ratio: (0.5, f64::INFINITY),
         uncoded: GYRO_UNCODED,
@@ -308,8 +308,8 @@ const ICM_42688_P_TESTS: &[SelfTest] = &[
     SelfTest::Factory(FactoryTest {
         sensor: Sensor::Accel,
         prepare: &[],
-        on: &[Write(banked(0, 0x70), 0x78)],
-        off: &[Write(banked(0, 0x70), 0x00)],
+        on: &[Write(0x70, 0x78)],
+        off: &[Write(0x70, 0x00)],
         codes: [banked(2, 0x3B), banked(2, 0x3C), banked(2, 0x3D)],
         ratio: (0.5, 1.5),
         // 50 to 1200 mg.
