@@ -53,6 +53,9 @@ const Z_MIN: f64 = 1e-6;
 const R2_UNBOUNDED: f64 = 1e4;
 
 impl Lens {
+    /// No distortion.
+    pub const NONE: Lens = Lens::Radtan { k1: 0.0, k2: 0.0, p1: 0.0, p2: 0.0 };
+
     /// A rational lens. Its domain ends where the calibration says (`r_max` of x/z, y/z; 0: it does not say), but not beyond
     /// the place where the radius stops growing, which is found in steps of 0.1 %.
     pub fn rational(k: [f64; 6], p1: f64, p2: f64, r_max: f64) -> Lens {

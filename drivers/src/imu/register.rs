@@ -34,13 +34,10 @@ const EDGES_RETRY: Span = Span(1_000_000_000);
 /// The golden ratio's fraction: multiples of it fill the unit interval as evenly as can be.
 const GOLDEN: f64 = 0.618_033_988_749_895;
 
+/// A lost unit is looked for again at `retry`.
 enum State {
     Running,
-    /// When it is looked for again, and why it is lost.
-    Lost {
-        retry: Nanos,
-        why: ImuError,
-    },
+    Lost { retry: Nanos, why: ImuError },
 }
 
 /// A unit of one or two dies, and its data-ready line.

@@ -49,17 +49,15 @@ fn excitation(die: &mut Die, test: &ExcitationTest) -> Result<(), ImuError> {
 }
 
 fn factory(die: &mut Die, test: &FactoryTest) -> Result<(), ImuError> {
-    let settle = [Step::WaitUs(test.settle_us)];
+    let ((switch, force), settle) = (test.switch, Step::WaitUs(test.settle_us));
     die.run(test.prepare)?;
-    die.run(&settle)?;
+    die.run(&[settle])?;
     let off = mean(die, test.sensor)?;
-    die.run(test.on)?;
-    die.run(&settle)?;
+    die.run(&[Step::Write(switch, force), settle])?;
     let on = mean(die, test.sensor)?;
-    die.run(test.off)?;
-    die.run(&settle)?;
+    die.run(&[Step::Write(switch, 0), settle])?;
     let mut codes = [0; 3];
-    for (code, register) in codes.iter_mut().zip(test.codes) {
+    for (code, register) in codes.iter_mut().zip(test.codes..) {
         *code = die.read_byte(register)?;
     }
     // Code 0: the factory left no measurement, and the answer itself must do.

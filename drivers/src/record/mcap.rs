@@ -146,13 +146,13 @@ impl McapSink {
         Ok(())
     }
 
-    /// Closes the file after its last whole chunk.
-    fn give_up(&mut self) {
-        if let Some(Open { writer, good, .. }) = self.file.take() {
-            let file = writer.into_inner();
+    /// Closes the file after its last whole chunk where a write failed.
+    fn settled(&mut self, written: Result<(), McapError>) -> io::Result<()> {
+        if let Some(Open { writer, good, .. }) = self.file.take_if(|_| written.is_err()) {
             // A disk that refuses this leaves a cut chunk, which readers pass over.
-            let _ = file.set_len(good);
+            let _ = writer.into_inner().set_len(good);
         }
+        written.map_err(failed)
     }
 }
 
@@ -164,10 +164,7 @@ fn attach(writer: &mut Writer<File>, sensor: &str, yaml: String) -> Result<(), M
 impl Sink for McapSink {
     fn frames(&mut self, frames: &Frames) -> io::Result<()> {
         let written = self.all(frames);
-        if written.is_err() {
-            self.give_up();
-        }
-        written.map_err(failed)
+        self.settled(written)
     }
 
     fn imu(&mut self, reading: &ImuReading) -> io::Result<()> {
@@ -181,10 +178,7 @@ impl Sink for McapSink {
             cdr.floats(&[0.0; 9]);
         }
         let written = self.write(|file| file.imu, s.t, 0);
-        if written.is_err() {
-            self.give_up();
-        }
-        written.map_err(failed)
+        self.settled(written)
     }
 
     fn finish(&mut self) -> io::Result<()> {

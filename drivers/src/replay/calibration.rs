@@ -182,24 +182,23 @@ fn yaml_camera(file: &Document, at: &str, coefficients: &str) -> Result<Camera, 
     let numbers = |name: &str, n: usize| file.numbers(&key(name), n);
     let size = numbers("resolution", 2)?;
     let (model, distortion) = (file.text(&key("camera_model"))?, file.text(&key("distortion_model"))?);
-    let (f, lens) = match (model, distortion) {
-        ("pinhole", "none") => (numbers("intrinsics", 4)?, Lens::Radtan { k1: 0.0, k2: 0.0, p1: 0.0, p2: 0.0 }),
+    let lens = match (model, distortion) {
+        ("pinhole", "none") => Lens::NONE,
         ("pinhole", "radtan" | "radial-tangential") => {
             let d = numbers(coefficients, 4)?;
-            (numbers("intrinsics", 4)?, Lens::Radtan { k1: d[0], k2: d[1], p1: d[2], p2: d[3] })
+            Lens::Radtan { k1: d[0], k2: d[1], p1: d[2], p2: d[3] }
         }
         ("pinhole", "rational_polynomial") => {
             let d = numbers(coefficients, 8)?;
-            let k = [d[0], d[1], d[4], d[5], d[6], d[7]];
-            (numbers("intrinsics", 4)?, Lens::rational(k, d[2], d[3], 0.0))
+            Lens::rational([d[0], d[1], d[4], d[5], d[6], d[7]], d[2], d[3], 0.0)
         }
         ("pinhole", "equidistant") => {
             let d = numbers(coefficients, 4)?;
-            (numbers("intrinsics", 4)?, Lens::KannalaBrandt { k: [d[0], d[1], d[2], d[3]] })
+            Lens::KannalaBrandt { k: [d[0], d[1], d[2], d[3]] }
         }
         ("ds", "none") => {
             let v = numbers("intrinsics", 6)?;
-            (v[2..].to_vec(), Lens::DoubleSphere { xi: v[0], alpha: v[1] })
+            Lens::DoubleSphere { xi: v[0], alpha: v[1] }
         }
         _ => {
             let what = format!(
@@ -208,6 +207,9 @@ fn yaml_camera(file: &Document, at: &str, coefficients: &str) -> Result<Camera, 
             return Err(file.fault(&key("distortion_model"), &what));
         }
     };
+    // The double sphere's own two stand before the focal lengths.
+    let own = if model == "ds" { 2 } else { 0 };
+    let f = &numbers("intrinsics", own + 4)?[own..];
     checked(file, at, [size[0], size[1]], [f[0], f[1], f[2], f[3]], lens)
 }
 
@@ -252,7 +254,7 @@ fn basalt(file: &Document) -> Result<Calibration, Fault> {
         let size = file.numbers(&format!("/value0/resolution/{k}"), 2)?;
         let number = |name: &str| file.number(&format!("{at}/intrinsics/{name}"));
         let lens = match file.text(&format!("{at}/camera_type"))? {
-            "pinhole" => Lens::Radtan { k1: 0.0, k2: 0.0, p1: 0.0, p2: 0.0 },
+            "pinhole" => Lens::NONE,
             "kb4" => Lens::KannalaBrandt { k: [number("k1")?, number("k2")?, number("k3")?, number("k4")?] },
             "ds" => Lens::DoubleSphere { xi: number("xi")?, alpha: number("alpha")? },
             "pinhole-radtan8" => {

@@ -40,23 +40,12 @@ pub struct Solid {
     pub bound: f32,
 }
 
-/// The map from points of a face to surface coordinates.
+/// The map from points of a face to surface coordinates. The `origin` of a flat one is the corner where u = v = 0.
 #[derive(Clone, Copy, Debug)]
 pub enum Chart {
-    /// `origin` is the corner where u = v = 0.
-    Flat {
-        origin: Vec3,
-        u: Vec3,
-        v: Vec3,
-    },
-    Ball {
-        centre: Vec3,
-        radius: f32,
-    },
-    Drum {
-        base: Vec3,
-        radius: f32,
-    },
+    Flat { origin: Vec3, u: Vec3, v: Vec3 },
+    Ball { centre: Vec3, radius: f32 },
+    Drum { base: Vec3, radius: f32 },
 }
 
 /// A surface with its material.

@@ -39,7 +39,7 @@ impl<'a> Controls<'a> {
                 Err(e) => return Err(refused(name, "list its controls", "VIDIOC_QUERY_EXT_CTRL", &e)),
             }
         }
-        known.retain(|c| c.flags & CONTROL_DISABLED == 0 && is_number(c.kind));
+        known.retain(|c| c.flags & CONTROL_DISABLED == 0 && CONTROL_NUMBERS.contains(&c.kind));
         Ok(Controls { kernel, fd, name, known })
     }
 
@@ -114,12 +114,6 @@ impl<'a> Controls<'a> {
     fn wrong(&self, what: String, fix: &str) -> Fault {
         Fault::new(FaultKind::Config, self.name, what, fix)
     }
-}
-
-fn is_number(kind: u32) -> bool {
-    let numbers =
-        [CONTROL_INTEGER, CONTROL_BOOLEAN, CONTROL_MENU, CONTROL_INTEGER64, CONTROL_BITMASK, CONTROL_INTEGER_MENU];
-    numbers.contains(&kind)
 }
 
 /// The name as v4l2-ctl writes it: lower case, anything but letters and digits as one underscore.

@@ -32,11 +32,9 @@ pub(super) const NEXT_CONTROL: u32 = 0x8000_0000;
 pub(super) const CONTROL_DISABLED: u32 = 0x1;
 pub(super) const CONTROL_READ_ONLY: u32 = 0x4;
 pub(super) const CONTROL_INTEGER: u32 = 1;
-pub(super) const CONTROL_BOOLEAN: u32 = 2;
-pub(super) const CONTROL_MENU: u32 = 3;
 pub(super) const CONTROL_INTEGER64: u32 = 5;
-pub(super) const CONTROL_BITMASK: u32 = 8;
-pub(super) const CONTROL_INTEGER_MENU: u32 = 9;
+/// Kinds whose value is a number: these two, BOOLEAN, MENU, BITMASK and INTEGER_MENU.
+pub(super) const CONTROL_NUMBERS: [u32; 6] = [CONTROL_INTEGER, CONTROL_INTEGER64, 2, 3, 8, 9];
 pub(super) const CID_EXPOSURE: u32 = 0x0098_0911;
 pub(super) const CID_EXPOSURE_AUTO: u32 = 0x009a_0901;
 pub(super) const CID_EXPOSURE_ABSOLUTE: u32 = 0x009a_0902;

@@ -27,10 +27,22 @@ const fn fifo_512(count: Reg, data: Reg, layout: Layout, reset: &'static [Step])
     }
 }
 
-/// Answers to the self-test, in steps, of a die without factory codes (Criteria B of AN-MPU-9250A-03): 60 °/s at ±250 °/s,
-/// 225 to 675 mg at ±2 g.
-const GYRO_UNCODED: (f64, f64) = (60.0 * 32768.0 / 250.0, f64::INFINITY);
-const ACCEL_UNCODED: (f64, f64) = (0.225 * 16384.0, 0.675 * 16384.0);
+/// The gyro's test at ±250 °/s, by application note AN-MPU-9250A-03: at least half the factory's answer, or 60 °/s where the
+/// factory left no codes (criteria B).
+const fn gyro_test(prepare: &'static [Step], switch: (Reg, u8), codes: Reg, settle_us: u32) -> SelfTest {
+    let (ratio, uncoded) = ((0.5, f64::INFINITY), (60.0 * 32768.0 / 250.0, f64::INFINITY));
+    SelfTest::Factory(FactoryTest { sensor: Sensor::Gyro, prepare, switch, codes, ratio, uncoded, settle_us })
+}
+
+/// The accelerometer's test at ±2 g after the gyro's, by the same note: half to one and a half of the factory's answer, or
+/// `uncoded_g` where it left no codes.
+const fn accel_test(switch: (Reg, u8), codes: Reg, uncoded_g: (f64, f64), settle_us: u32) -> SelfTest {
+    let (ratio, uncoded) = ((0.5, 1.5), (uncoded_g.0 * 16384.0, uncoded_g.1 * 16384.0));
+    SelfTest::Factory(FactoryTest { sensor: Sensor::Accel, prepare: &[], switch, codes, ratio, uncoded, settle_us })
+}
+
+/// Criteria B of AN-MPU-9250A-03 for the accelerometer, g.
+const ACCEL_UNCODED_G: (f64, f64) = (0.225, 0.675);
 
 /// Frames of the MPUs and of the ICM-20948: in the order of their registers.
 const MPU_FRAME: Layout = Layout::Plain { len: 14, accel: Some(0), temperature: Some(6), gyro: Some(8) };
@@ -110,26 +122,13 @@ fn configure_mpu(s: &Setting) -> Vec<Step> {
 
 /// Application note "MPU-Hardware Offset Registers and self-test" (AN-MPU-9250A-03): ±250 °/s and ±2 g, filters at 2.
 const MPU_TESTS: &[SelfTest] = &[
-    SelfTest::Factory(FactoryTest {
-        sensor: Sensor::Gyro,
-        prepare: &[Write(0x19, 0), Write(0x1A, 2), Write(0x1D, 2), Write(0x1B, 0), Write(0x1C, 0)],
-        on: &[Write(0x1B, 0xE0)],
-        off: &[Write(0x1B, 0x00)],
-        codes: [0x00, 0x01, 0x02],
-        ratio: (0.5, f64::INFINITY),
-        uncoded: GYRO_UNCODED,
-        settle_us: 25_000,
-    }),
-    SelfTest::Factory(FactoryTest {
-        sensor: Sensor::Accel,
-        prepare: &[],
-        on: &[Write(0x1C, 0xE0)],
-        off: &[Write(0x1C, 0x00)],
-        codes: [0x0D, 0x0E, 0x0F],
-        ratio: (0.5, 1.5),
-        uncoded: ACCEL_UNCODED,
-        settle_us: 25_000,
-    }),
+    gyro_test(
+        &[Write(0x19, 0), Write(0x1A, 2), Write(0x1D, 2), Write(0x1B, 0), Write(0x1C, 0)],
+        (0x1B, 0xE0),
+        0x00,
+        25_000,
+    ),
+    accel_test((0x1C, 0xE0), 0x0D, ACCEL_UNCODED_G, 25_000),
 ];
 
 /// ICM-20948. Data sheet DS-000189. The motion processor inside is not used.
@@ -195,32 +194,19 @@ fn configure_icm_20948(s: &Setting) -> Vec<Step> {
 
 /// SELF_TEST_X_GYRO to Z_ACCEL (codes), GYRO_CONFIG_2 and ACCEL_CONFIG_2 (switches); the procedure is that of the MPUs.
 const ICM_20948_TESTS: &[SelfTest] = &[
-    SelfTest::Factory(FactoryTest {
-        sensor: Sensor::Gyro,
-        prepare: &[
+    gyro_test(
+        &[
             Write(0x07, 0x00),
             Write(banked(2, 0x00), 0x0A),
             Write(banked(2, 0x11), 0x0A),
             Write(banked(2, 0x01), 0x11),
             Write(banked(2, 0x14), 0x39),
         ],
-        on: &[Write(banked(2, 0x02), 0x38)],
-        off: &[Write(banked(2, 0x02), 0x00)],
-        codes: [banked(1, 0x02), banked(1, 0x03), banked(1, 0x04)],
-        ratio: (0.5, f64::INFINITY),
-        uncoded: GYRO_UNCODED,
-        settle_us: 40_000,
-    }),
-    SelfTest::Factory(FactoryTest {
-        sensor: Sensor::Accel,
-        prepare: &[],
-        on: &[Write(banked(2, 0x15), 0x1C)],
-        off: &[Write(banked(2, 0x15), 0x00)],
-        codes: [banked(1, 0x0E), banked(1, 0x0F), banked(1, 0x10)],
-        ratio: (0.5, 1.5),
-        uncoded: ACCEL_UNCODED,
-        settle_us: 40_000,
-    }),
+        (banked(2, 0x02), 0x38),
+        banked(1, 0x02),
+        40_000,
+    ),
+    accel_test((banked(2, 0x15), 0x1C), banked(1, 0x0E), ACCEL_UNCODED_G, 40_000),
 ];
 
 /// ICM-42688-P. Data sheet DS-000347, register descriptions.
@@ -295,25 +281,6 @@ fn configure_icm_42688_p(s: &Setting) -> Vec<Step> {
 
 /// SELF_TEST_CONFIG; codes XG_ST_DATA of bank 1 and XA_ST_DATA of bank 2; at ±250 °/s and ±2 g, 1 kHz.
 const ICM_42688_P_TESTS: &[SelfTest] = &[
-    SelfTest::Factory(FactoryTest {
-        sensor: Sensor::Gyro,
-        prepare: &[Write(0x4F, 0x66), Write(0x50, 0x66), Write(0x4E, 0x0F)],
-        on: &[Write(0x70, 0x07)],
-        off: &[Write(0x70, 0x00)],
-        codes: [banked(1, 0x5F), banked(1, 0x60), banked(1, 0x61)],
-        ratio: (0.5, f64::INFINITY),
-        uncoded: GYRO_UNCODED,
-        settle_us: 200_000,
-    }),
-    SelfTest::Factory(FactoryTest {
-        sensor: Sensor::Accel,
-        prepare: &[],
-        on: &[Write(0x70, 0x78)],
-        off: &[Write(0x70, 0x00)],
-        codes: [banked(2, 0x3B), banked(2, 0x3C), banked(2, 0x3D)],
-        ratio: (0.5, 1.5),
-        // 50 to 1200 mg.
-        uncoded: (0.05 * 16384.0, 1.2 * 16384.0),
-        settle_us: 200_000,
-    }),
+    gyro_test(&[Write(0x4F, 0x66), Write(0x50, 0x66), Write(0x4E, 0x0F)], (0x70, 0x07), banked(1, 0x5F), 200_000),
+    accel_test((0x70, 0x78), banked(2, 0x3B), (0.05, 1.2), 200_000),
 ];

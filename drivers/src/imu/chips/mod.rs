@@ -273,12 +273,10 @@ pub struct FactoryTest {
     pub sensor: Sensor,
     /// Steps before the test.
     pub prepare: &'static [Step],
-    /// Steps that turn the force on.
-    pub on: &'static [Step],
-    /// Steps that turn it off.
-    pub off: &'static [Step],
-    /// Codes of the three axes.
-    pub codes: [Reg; 3],
+    /// Register that turns the force on by this value, and off by zero.
+    pub switch: (Reg, u8),
+    /// First of three registers with the codes of the axes.
+    pub codes: Reg,
     /// Answer over that at the factory.
     pub ratio: (f64, f64),
     /// Answer, steps, of a die of which the factory left no codes.
