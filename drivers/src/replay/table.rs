@@ -71,13 +71,8 @@ pub fn read<T>(
         }
     }
     if rows.is_empty() {
-        let what = format!("holds no rows of {columns}");
-        return Err(Fault::new(
-            FaultKind::Data,
-            path.display().to_string(),
-            what,
-            "check that the recording is complete",
-        ));
+        let (place, fix) = (path.display().to_string(), "check that the recording is complete");
+        return Err(Fault::new(FaultKind::Data, place, format!("holds no rows of {columns}"), fix));
     }
     Ok(rows)
 }

@@ -82,14 +82,10 @@ pub(super) struct Part {
     pub stride: usize,
 }
 
-/// Why a picture cannot be read.
+/// Why a picture cannot be read: the driver wrote fewer bytes than it has, or they are no such picture.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) enum Unreadable {
-    /// The driver wrote fewer bytes than the picture has.
-    Short {
-        needed: usize,
-        got: usize,
-    },
+    Short { needed: usize, got: usize },
     Undecodable(String),
 }
 

@@ -89,14 +89,10 @@ pub(super) struct Gaps {
     last: Option<(u32, Nanos)>,
 }
 
-/// How a frame follows the one before.
+/// How a frame follows the one before: as the next, or with a stamp that is not newer than the last one's.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Order {
-    Next {
-        missed_by_sequence: u64,
-        missed_by_stamp: u64,
-    },
-    /// Its stamp is not newer than the last one's.
+    Next { missed_by_sequence: u64, missed_by_stamp: u64 },
     NotNewer,
 }
 

@@ -87,6 +87,22 @@ const fn headed_fifo(capacity: usize, frame: usize, config: usize) -> Fifo {
     }
 }
 
+/// ACC_CONF, acc_odr.
+const BMI088_ACCEL_RATES: &[(f64, u8)] =
+    &[(12.5, 5), (25.0, 6), (50.0, 7), (100.0, 8), (200.0, 9), (400.0, 10), (800.0, 11), (1600.0, 12)];
+
+/// The self-test of both accelerometers: positive less negative excitation, at least so much on each axis, g.
+const fn accel_test(prepare: &'static [Step], full_scale_g: f64, [x, y, z]: [f64; 3]) -> SelfTest {
+    SelfTest::Excitation(ExcitationTest {
+        sensor: Sensor::Accel,
+        prepare,
+        on: &[Write(0x6D, 0x0D), WaitUs(55_000)],
+        off: &[Write(0x6D, 0x09), WaitUs(55_000)],
+        per_lsb: full_scale_g / 32768.0,
+        within: [(x, f64::INFINITY), (y, f64::INFINITY), (z, f64::INFINITY)],
+    })
+}
+
 /// BMI088, accelerometer. Data sheet BST-BMI088-DS001.
 ///
 /// Checked against Bosch's BMI08x_SensorAPI, Zephyr's bmi08x, Linux's bmi088-accel, ArduPilot and PX4.
@@ -105,17 +121,7 @@ pub const BMI088_ACCEL: DieSpec = DieSpec {
         data: 0x12,
     }),
     gyro: None,
-    // ACC_CONF, acc_odr.
-    rates: Rates::Listed(&[
-        (12.5, 5),
-        (25.0, 6),
-        (50.0, 7),
-        (100.0, 8),
-        (200.0, 9),
-        (400.0, 10),
-        (800.0, 11),
-        (1600.0, 12),
-    ]),
+    rates: Rates::Listed(BMI088_ACCEL_RATES),
     // TEMP_MSB and TEMP_LSB: 0.125 °C a step from 23 °C.
     temperature: Temperature { from: TemperatureSource::ElevenBits(0x22), c_per_lsb: 0.125, c_at_zero: 23.0 },
     // "FIFO", accelerometer: 1 KiB.
@@ -133,16 +139,8 @@ pub const BMI088_ACCEL: DieSpec = DieSpec {
     ],
     configure: configure_bmi088_accel,
     cross_axis: None,
-    self_tests: &[SelfTest::Excitation(ExcitationTest {
-        sensor: Sensor::Accel,
-        // "Self-test: accelerometer": 24 g, 1600 Hz (0xAC as the text explains; the 0xA7 that it prints is 50 Hz); positive
-        // less negative excitation: 1, 1 and 0.5 g at least.
-        prepare: &[Write(0x41, 0x03), Write(0x40, 0xAC), WaitUs(3000)],
-        on: &[Write(0x6D, 0x0D), WaitUs(55_000)],
-        off: &[Write(0x6D, 0x09), WaitUs(55_000)],
-        per_lsb: 24.0 / 32768.0,
-        within: [(1.0, f64::INFINITY), (1.0, f64::INFINITY), (0.5, f64::INFINITY)],
-    })],
+    // "Self-test: accelerometer": 24 g, 1600 Hz (0xAC as the text explains; the 0xA7 that it prints is 50 Hz); 1, 1 and 0.5 g.
+    self_tests: &[accel_test(&[Write(0x41, 0x03), Write(0x40, 0xAC), WaitUs(3000)], 24.0, [1.0, 1.0, 0.5])],
 };
 
 fn configure_bmi088_accel(s: &Setting) -> Vec<Step> {
@@ -187,15 +185,8 @@ pub const BMI270: DieSpec = DieSpec {
     // GYR_CAS, factor_zx.
     cross_axis: Some(0x3C),
     self_tests: &[
-        SelfTest::Excitation(ExcitationTest {
-            sensor: Sensor::Accel,
-            // "Accelerometer self-test": 16 g, 1600 Hz, high amplitude; positive less negative excitation: 16, 15 and 10 g at least.
-            prepare: &[Write(0x7D, 0x04), Write(0x41, 0x03), Write(0x40, 0xAC), WaitUs(3000)],
-            on: &[Write(0x6D, 0x0D), WaitUs(55_000)],
-            off: &[Write(0x6D, 0x09), WaitUs(55_000)],
-            per_lsb: 16.0 / 32768.0,
-            within: [(16.0, f64::INFINITY), (15.0, f64::INFINITY), (10.0, f64::INFINITY)],
-        }),
+        // "Accelerometer self-test": 16 g, 1600 Hz, high amplitude; 16, 15 and 10 g.
+        accel_test(&[Write(0x7D, 0x04), Write(0x41, 0x03), Write(0x40, 0xAC), WaitUs(3000)], 16.0, [16.0, 15.0, 10.0]),
         // "Gyroscope self-test": only the accelerometer is on, g_trigger of CMD starts it, GYR_SELF_TEST_AXES says when it is
         // done and which axes passed.
         SelfTest::BuiltIn(BuiltInTest {

@@ -8,6 +8,16 @@ const fn stepped(full_scale: f64, code: u8, per_lsb: f64) -> Range {
     Range { full_scale, code, per_lsb }
 }
 
+/// CTRL1_XL and "Mechanical characteristics": codes out of order.
+const ACCEL_RANGES: &[Range] =
+    &[stepped(2.0, 0, 0.061e-3), stepped(4.0, 2, 0.122e-3), stepped(8.0, 3, 0.244e-3), stepped(16.0, 1, 0.488e-3)];
+/// CTRL2_G and "Mechanical characteristics": full scale is less than 2^15 steps.
+const GYRO_RANGES: &[Range] =
+    &[stepped(250.0, 0, 8.75e-3), stepped(500.0, 1, 17.5e-3), stepped(1000.0, 2, 35e-3), stepped(2000.0, 3, 70e-3)];
+/// CTRL1_XL and CTRL2_G, ODR, of both sensors.
+const RATES: &[(f64, u8)] =
+    &[(12.5, 1), (26.0, 2), (52.0, 3), (104.0, 4), (208.0, 5), (417.0, 6), (833.0, 7), (1667.0, 8), (3333.0, 9)];
+
 /// LSM6DSOX. Data sheet DS12814 and application note AN5272.
 ///
 /// Checked against ST's lsm6dsox-pid with its self-test example and Linux's st_lsm6dsx. ST's alone confirms the flags of an
@@ -20,38 +30,9 @@ pub const LSM6DSOX: DieSpec = DieSpec {
     bank_select: None,
     spi_dummy: 0,
     big_endian: false,
-    accel: Some(SensorSpec {
-        // CTRL1_XL and "Mechanical characteristics": codes out of order.
-        ranges: &[
-            stepped(2.0, 0, 0.061e-3),
-            stepped(4.0, 2, 0.122e-3),
-            stepped(8.0, 3, 0.244e-3),
-            stepped(16.0, 1, 0.488e-3),
-        ],
-        data: 0x28,
-    }),
-    gyro: Some(SensorSpec {
-        // CTRL2_G and "Mechanical characteristics": full scale is less than 2^15 steps.
-        ranges: &[
-            stepped(250.0, 0, 8.75e-3),
-            stepped(500.0, 1, 17.5e-3),
-            stepped(1000.0, 2, 35e-3),
-            stepped(2000.0, 3, 70e-3),
-        ],
-        data: 0x22,
-    }),
-    // CTRL1_XL and CTRL2_G, ODR, of both.
-    rates: Rates::Listed(&[
-        (12.5, 1),
-        (26.0, 2),
-        (52.0, 3),
-        (104.0, 4),
-        (208.0, 5),
-        (417.0, 6),
-        (833.0, 7),
-        (1667.0, 8),
-        (3333.0, 9),
-    ]),
+    accel: Some(SensorSpec { ranges: ACCEL_RANGES, data: 0x28 }),
+    gyro: Some(SensorSpec { ranges: GYRO_RANGES, data: 0x22 }),
+    rates: Rates::Listed(RATES),
     // "Temperature sensor characteristics": 256 steps a degree from 25 °C.
     temperature: Temperature { from: TemperatureSource::Frames, c_per_lsb: 1.0 / 256.0, c_at_zero: 25.0 },
     fifo: Fifo {
