@@ -1,17 +1,14 @@
 //! `stipple calib-check`: what a recording says of its own calibration.
 
-use super::doctor::agreement::{agreement, Agreement};
-use super::doctor::rotation::Turning;
-use super::doctor::{all_passed, signals, Check};
+use super::checks::rows::Rows;
+use super::checks::{all_passed, gyro, Check, Follower};
 use super::BoardArgs;
-use crate::config::{Board, FrontendConfig};
+use crate::config::Board;
 use crate::run::sensors::open_recording;
-use crate::stereo::alignment::Alignment;
-use crate::stereo::rectify::Rectification;
 use std::path::PathBuf;
 use std::sync::Arc;
 use stipple_drivers::replay::{Reader, Recording};
-use stipple_drivers::{Fault, FaultKind, Frames, Image, Nanos};
+use stipple_drivers::{Fault, FaultKind, Frames, Nanos};
 
 #[derive(clap::Args)]
 pub struct Args {
@@ -26,8 +23,6 @@ pub struct Args {
 
 /// Stereo pairs that are matched, evenly over the recording.
 const PAIRS: usize = 8;
-/// Half of what costs `bm` a third more error and 2 % of its pixels (hard_misaligned in `stipple-bench stereo`).
-pub const ROWS_MAX_PX: f64 = 0.5;
 
 pub fn calib_check(args: &Args) -> Result<(), Fault> {
     let board = args.board.load()?;
@@ -36,8 +31,8 @@ pub fn calib_check(args: &Args) -> Result<(), Fault> {
     let cameras = recording.calibration.cameras.len();
     println!("{:<6} {} frames of {cameras} camera{}", "", recording.frames.len(), if cameras == 1 { "" } else { "s" });
     let mut checks = vec![rows(&recording, &mut reader, &board)];
-    let turned = turned(&recording, &mut reader, &board.frontend)?;
-    checks.extend(signals::turning(turned.as_ref()));
+    let follower = follow(&recording, &mut reader, &board)?;
+    checks.extend(gyro::checks(follower.agreement(&recording.imu, &board.vio).as_ref()));
     let counters = [recording.counters.list(), reader.counters().list()].concat();
     let mut first = recording.warnings.first().or(reader.warnings().first()).map(|w| format!("the first: {w}"));
     for (name, n) in counters.into_iter().filter(|(_, n)| *n > 0) {
@@ -57,58 +52,28 @@ fn rows(recording: &Recording, reader: &mut Reader, board: &Board) -> Check {
     if recording.calibration.cameras.len() < 2 {
         return Check::ok("vertical disparity: one camera has none");
     }
-    let rectification = match Rectification::new(&recording.calibration) {
-        Ok(rectification) => rectification,
-        Err(fault) => {
-            let fix = "right for cameras that look apart; odometry needs no more, a map does";
-            return Check::warn(format!("vertical disparity: the calibration {}", fault.what), fix);
-        }
-    };
-    let p = rectification.camera.pinhole;
-    let maps = [0, 1].map(|i| rectification.map(&recording.calibration.cameras[i]));
+    let mut rows = Rows::new(&recording.calibration, board.stereo.disparities);
     let mut frames = Frames::for_rig(&recording.calibration);
-    let mut pair = [Image::new(p.width, p.height), Image::new(p.width, p.height)];
-    let mut alignment = Alignment::default();
-    let (mut read, looked_at) = (0, PAIRS.min(recording.frames.len()));
+    let (mut unread, looked_at) = (0, PAIRS.min(recording.frames.len()));
     for k in 0..looked_at {
         let index = (2 * k + 1) * recording.frames.len() / (2 * looked_at);
-        if reader.read(index, &mut frames).is_ok() {
-            (0..2).for_each(|i| maps[i].apply(&frames.images[i], &mut pair[i]));
-            alignment.add(&pair[0], &pair[1], board.stereo.disparities as usize);
-            read += 1;
+        match reader.read(index, &mut frames) {
+            Ok(_) => rows.add(&frames),
+            Err(_) => unread += 1,
         }
     }
-    let corners = alignment.rows.len();
-    let unread = if read < looked_at {
-        format!("; {} of {looked_at} pairs cannot be read", looked_at - read)
-    } else {
-        String::new()
+    let remark = match unread {
+        0 => String::new(),
+        n => format!("; {n} of {looked_at} pairs cannot be read"),
     };
-    match alignment.summary() {
-        None => Check::warn(
-            format!("vertical disparity: only {corners} corners match, too few to say{unread}"),
-            "record something with detail, a metre away or more",
-        ),
-        Some((rows, spread)) => {
-            let what = format!(
-                "vertical disparity: camera 1 sees points {rows:+.2} px lower after rectification (median of {corners} \
-                 corners, deviation {:.2} px{unread})",
-                1.4826 * spread
-            );
-            if rows.abs() > ROWS_MAX_PX {
-                Check::warn(what, "stereo matches rows: calibrate the extrinsics and principal points anew")
-            } else {
-                Check::ok(what)
-            }
-        }
-    }
+    rows.check("vertical disparity", &remark, false)
 }
 
 /// Frames in order that are followed, from where the gyro turns most.
 const FOLLOWED: usize = 300;
 
-/// The rotation of camera 0 against the gyro's.
-fn turned(recording: &Recording, reader: &mut Reader, config: &FrontendConfig) -> Result<Option<Agreement>, Fault> {
+/// Points followed over those frames.
+fn follow(recording: &Recording, reader: &mut Reader, board: &Board) -> Result<Follower, Fault> {
     let rate = |t: Nanos| {
         let at = recording.imu.partition_point(|s| s.t < t);
         recording.imu.get(at).map_or(0.0, |s| s.gyro_body.length())
@@ -122,12 +87,12 @@ fn turned(recording: &Recording, reader: &mut Reader, config: &FrontendConfig) -
         }
         sum += rates.get(from + n).copied().unwrap_or(0.0) - rates[from];
     }
-    let mut turning = Turning::new(&recording.calibration, config)?;
+    let mut follower = Follower::new(&recording.calibration, &board.frontend)?;
     let mut frames = Arc::new(Frames::for_rig(&recording.calibration));
     for i in first..first + n {
         if reader.read(i, Arc::make_mut(&mut frames)).is_ok() {
-            turning.add(&frames);
+            follower.add(&frames);
         }
     }
-    Ok(agreement(&turning.turns, &recording.imu, recording.calibration.cameras[0].body_from_cam.q))
+    Ok(follower)
 }

@@ -2,6 +2,7 @@
 
 mod calib_check;
 mod check;
+mod checks;
 mod demo;
 mod doctor;
 mod record;

@@ -1,6 +1,6 @@
 //! The computer: Vulkan, memory, disk.
 
-use super::Check;
+use crate::commands::checks::Check;
 use crate::config::Board;
 use crate::gpu::kernels::ALL;
 use crate::gpu::{DeviceKind, Gpu};

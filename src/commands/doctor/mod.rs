@@ -2,12 +2,11 @@
 //!
 //! What it asks of the user is to hold the rig still for two seconds and then to turn it about all three axes.
 
-pub mod agreement;
-pub mod machine;
-pub mod motion;
-pub mod rotation;
-pub mod signals;
+mod machine;
+mod signals;
 
+use super::checks::rows::Rows;
+use super::checks::{all_passed, gyro, Check, Follower, Verdict};
 use super::{open_input, seconds, BoardArgs};
 use crate::config::Board;
 use crate::run::mailbox::Capture;
@@ -15,14 +14,10 @@ use crate::run::sensors::{self, Input, Source};
 use crate::run::status::{print_err, Status};
 use crate::run::tracking::FramePacket;
 use crate::run::{observe, Flown};
-use crate::stereo::alignment::Alignment;
-use crate::stereo::rectify::Rectification;
-use agreement::agreement;
-use rotation::Turning;
 use signals::Light;
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
-use stipple_drivers::{Calibration, Fault, FaultKind, Frames, Image, ImuSample, Nanos};
+use stipple_drivers::{Calibration, Fault, FaultKind, ImuSample, Nanos};
 
 #[derive(clap::Args)]
 pub struct Args {
@@ -42,112 +37,14 @@ pub struct Args {
 /// Stereo pairs matched, one in so many frames.
 const PAIR_EVERY: usize = 25;
 
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Verdict {
-    Ok,
-    Warn,
-    Fail,
-}
-
-/// One line of the answer, and what to do.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Check {
-    pub verdict: Verdict,
-    what: String,
-    fix: String,
-}
-
-impl Check {
-    pub fn ok(what: impl Into<String>) -> Check {
-        Check { verdict: Verdict::Ok, what: what.into(), fix: String::new() }
-    }
-
-    pub fn warn(what: impl Into<String>, fix: impl Into<String>) -> Check {
-        Check { verdict: Verdict::Warn, what: what.into(), fix: fix.into() }
-    }
-
-    pub fn fail(what: impl Into<String>, fix: impl Into<String>) -> Check {
-        Check { verdict: Verdict::Fail, what: what.into(), fix: fix.into() }
-    }
-
-    pub fn print(&self) {
-        let verdict = match self.verdict {
-            Verdict::Ok => "ok",
-            Verdict::Warn => "warn",
-            Verdict::Fail => "fail",
-        };
-        println!("{verdict:<6} {}", self.what);
-        if !self.fix.is_empty() {
-            println!("{:<6} -> {}", "", self.fix);
-        }
-    }
-}
-
 /// What the sensors gave.
 struct Seen {
     calibration: Calibration,
-    disparities: usize,
     frames: Vec<Nanos>,
     samples: Vec<ImuSample>,
     light: Vec<Light>,
-    turning: Turning,
-    pairs: Pairs,
-}
-
-/// Matches of the left image in the right one, and the other way round: of swapped cameras only the other way has any.
-struct Pairs {
-    rectification: Result<Rectification, Fault>,
-    straight: Alignment,
-    swapped: Alignment,
-}
-
-impl Pairs {
-    fn add(&mut self, calibration: &Calibration, frames: &Arc<Frames>, disparities: usize) {
-        let Ok(rectification) = &self.rectification else { return };
-        let p = rectification.camera.pinhole;
-        let view = |i: usize, image: usize| {
-            let mut out = Image::new(p.width, p.height);
-            rectification.map(&calibration.cameras[i]).apply(&frames.images[image], &mut out);
-            out
-        };
-        self.straight.add(&view(0, 0), &view(1, 1), disparities);
-        self.swapped.add(&view(0, 1), &view(1, 0), disparities);
-    }
-
-    fn check(&self, board: &Board) -> Check {
-        match &self.rectification {
-            Err(fault) if board.map.enabled => {
-                return Check::fail(format!("stereo: the calibration {}", fault.what), fault.fix.clone())
-            }
-            Err(fault) => {
-                let fix = "right for cameras that look apart; odometry needs no more, a map does";
-                return Check::warn(format!("stereo: the calibration {}", fault.what), fix);
-            }
-            Ok(_) => {}
-        }
-        let (n, m) = (self.straight.rows.len(), self.swapped.rows.len());
-        if m > 2 * n && m > 20 {
-            let what = format!("stereo: {n} corners match as calibrated, {m} with the cameras swapped");
-            return Check::fail(
-                what,
-                "cameras 0 and 1 are swapped: exchange them in camera.devices or in the calibration",
-            );
-        }
-        match self.straight.summary() {
-            None => Check::warn(
-                format!("stereo: only {n} corners match"),
-                "look at something with detail, a metre away or more",
-            ),
-            Some((rows, _)) if rows.abs() > super::calib_check::ROWS_MAX_PX => Check::warn(
-                format!("stereo: camera 1 sees points {rows:+.2} px lower after rectification"),
-                "stereo matches rows: calibrate the extrinsics and principal points anew",
-            ),
-            Some((rows, spread)) => Check::ok(format!(
-                "stereo: rows agree to {rows:+.2} px ({n} corners, deviation {:.2} px)",
-                1.4826 * spread
-            )),
-        }
-    }
+    follower: Follower,
+    rows: Rows,
 }
 
 pub fn doctor(args: &Args) -> Result<(), Fault> {
@@ -187,21 +84,6 @@ pub fn doctor(args: &Args) -> Result<(), Fault> {
     all_passed(FaultKind::Unavailable, args.board.path(), checks.iter().chain(&sensed))
 }
 
-/// An error where a check failed.
-pub fn all_passed<'a>(
-    kind: FaultKind,
-    place: &std::path::Path,
-    checks: impl Iterator<Item = &'a Check>,
-) -> Result<(), Fault> {
-    match checks.filter(|c| c.verdict == Verdict::Fail).count() {
-        0 => Ok(()),
-        n => {
-            let what = format!("{n} check{} failed", if n == 1 { "" } else { "s" });
-            Err(Fault::new(kind, place.display().to_string(), what, "see the lines above"))
-        }
-    }
-}
-
 fn sensed(input: Input, board: &Board, look_s: f64) -> Result<Vec<Check>, Fault> {
     let rate_hz = match input.source {
         Source::Live { rate_hz, .. } => Some(rate_hz),
@@ -223,11 +105,10 @@ fn sensed(input: Input, board: &Board, look_s: f64) -> Result<Vec<Check>, Fault>
     checks.push(skew(seen, &flown));
     checks.extend(flown.capture.and_then(|c| capture(&c, seen, &flown)));
     checks.extend(seen.light.iter().enumerate().map(|(camera, light)| light.check(camera)));
-    checks.push(seen.pairs.check(board));
+    checks.push(seen.rows.check("stereo", "", board.map.enabled));
     checks.extend(signals::inertia(&seen.samples, calibration));
     checks.push(signals::saturation(&seen.samples));
-    let found = agreement(&seen.turning.turns, &seen.samples, calibration.cameras[0].body_from_cam.q);
-    checks.extend(signals::turning(found.as_ref()));
+    checks.extend(gyro::checks(seen.follower.agreement(&seen.samples, &board.vio).as_ref()));
     Ok(checks)
 }
 
@@ -259,16 +140,11 @@ fn skew(seen: &Seen, flown: &Flown) -> Check {
 fn look(input: Input, board: &Board, look_s: f64) -> Result<(Seen, Flown), Fault> {
     let calibration = input.calibration.clone();
     let seen = Arc::new(Mutex::new(Seen {
-        disparities: board.stereo.disparities as usize,
         frames: vec![],
         samples: vec![],
         light: vec![Light::new(); calibration.cameras.len()],
-        turning: Turning::new(&calibration, &board.frontend)?,
-        pairs: Pairs {
-            rectification: Rectification::new(&calibration),
-            straight: Alignment::default(),
-            swapped: Alignment::default(),
-        },
+        follower: Follower::new(&calibration, &board.frontend)?,
+        rows: Rows::new(&calibration, board.stereo.disparities),
         calibration,
     }));
     let shared = seen.clone();
@@ -289,10 +165,10 @@ impl Seen {
         }
         let frames = &packet.frames;
         if self.frames.len() % PAIR_EVERY == 0 {
-            self.pairs.add(&self.calibration, frames, self.disparities);
+            self.rows.add(frames);
             self.light.iter_mut().enumerate().for_each(|(camera, light)| light.add(frames, camera));
         }
         self.frames.push(frames.t);
-        self.turning.add(frames);
+        self.follower.add(frames);
     }
 }

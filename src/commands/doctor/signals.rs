@@ -1,8 +1,7 @@
 //! What samples and images say by themselves: rates, light, noise, gravity, ranges.
 
-use super::agreement::{median, Agreement};
-use super::Check;
-use glam::{DMat3, DVec3};
+use crate::commands::checks::Check;
+use glam::DVec3;
 use stipple_drivers::{Calibration, Frames, ImuSample, Nanos};
 
 /// At rest: the gyro's deviation is below this, rad/s. A hand trembles with 0.05.
@@ -35,6 +34,12 @@ pub fn rate(name: &str, stamps: &[Nanos], missing: u64, expected_hz: Option<f64>
         return Check::warn(what, "more than one in a hundred is missing: check bandwidth, cable and CPU load");
     }
     Check::ok(what)
+}
+
+fn median(values: &[f64]) -> f64 {
+    let mut sorted = values.to_vec();
+    sorted.sort_by(f64::total_cmp);
+    sorted.get(sorted.len() / 2).copied().unwrap_or(0.0)
 }
 
 /// Light of one camera over all frames.
@@ -157,116 +162,5 @@ pub fn saturation(imu: &[ImuSample]) -> Check {
     match n {
         0 => Check::ok(what),
         _ => Check::warn(what, "widen imu.gyro_range_dps or imu.accel_range_g, or damp the mount"),
-    }
-}
-
-/// Least correlation of the two rates at which they are believed to be of one rig.
-const CORRELATED: f64 = 0.8;
-/// Deviations above which nothing is said: s, degrees.
-const OFFSET_SIGMA_MAX: f64 = 2e-3;
-const TURNED_SIGMA_MAX: f64 = 1.0;
-/// Images 8 ms late cost odometry eight times its error (README), and of simulated flights the offset is found to 0.7 ms.
-const OFFSET_OK: f64 = 1.5e-3;
-const OFFSET_FAIL: f64 = 8e-3;
-/// Degrees. A hand-held recording of good calibration is found 1.0 off, beyond its deviation.
-const TURNED_OK: f64 = 2.0;
-const TURNED_FAIL: f64 = 5.0;
-
-/// Offset in time, extrinsics, signs and bias, of cameras and gyro.
-pub fn turning(found: Option<&Agreement>) -> Vec<Check> {
-    let advice = "turn the rig by hand about all three axes for ten seconds, before something with corners in it";
-    let Some(a) = found else {
-        return vec![Check::warn("camera against gyro: too few frames with points to say", advice)];
-    };
-    let rms = |axis: usize| a.excitation.col(axis)[axis].sqrt();
-    let turned = format!("turned {:.2}, {:.2}, {:.2} rad/s rms about the camera's x, y, z", rms(0), rms(1), rms(2));
-    // What turns little correlates little, and is no fault.
-    if a.correlation < CORRELATED && a.offset_sigma_s < OFFSET_SIGMA_MAX {
-        let what =
-            format!("camera against gyro: the rates do not agree at any offset ({:.2}); {turned}", a.correlation);
-        let fix = "check that both sensors are fixed to one another, the lens calibration, and which camera is which";
-        return vec![Check::fail(what, fix)];
-    }
-    let mut checks = vec![offset(a), axes(a, &turned), extrinsics(a)];
-    let (b, s) = (a.bias, a.bias_sigma);
-    let what =
-        format!("gyro bias in motion: {:+.4}, {:+.4}, {:+.4} rad/s, each ± {:.4}", b.x, b.y, b.z, s.max_element());
-    checks.push(match () {
-        _ if s.max_element() > 0.02 => Check::warn(what, advice),
-        _ if b.length() > 0.1 => Check::warn(what, "a large bias: let the unit warm up, or calibrate it"),
-        _ => Check::ok(what),
-    });
-    checks
-}
-
-/// The axis of camera 0 about which it turned least, and how to turn more.
-fn least_turned(a: &Agreement) -> String {
-    let eigen = nalgebra::Matrix3::from(a.excitation.to_cols_array_2d()).symmetric_eigen();
-    let axis = eigen.eigenvectors.column(eigen.eigenvalues.imin()).iamax();
-    let way = ["x (nod)", "y (left and right)", "z (roll)"][axis];
-    format!("turn more about the camera's {way}, to and fro, before something with corners in it")
-}
-
-fn offset(a: &Agreement) -> Check {
-    let (ms, sigma) = (1e3 * a.offset_s, 1e3 * a.offset_sigma_s);
-    if a.offset_sigma_s > OFFSET_SIGMA_MAX {
-        let what = format!("time offset: {ms:+.1} ± {sigma:.1} ms, too unsure to say: the rate changed too little");
-        return Check::warn(what, "turn the rig to and fro, faster, before something with corners in it");
-    }
-    let what = format!("time offset: the gyro's clock is {ms:+.2} ± {sigma:.2} ms ahead of what the calibration says");
-    let fix = format!(
-        "add {:+.4} s to timeshift_cam_imu; vio.estimate_time_offset = true takes out what is left",
-        a.offset_s
-    );
-    match a.offset_s.abs() - 2.0 * a.offset_sigma_s {
-        s if s < OFFSET_OK => Check::ok(what),
-        s if s < OFFSET_FAIL => Check::warn(what, fix),
-        _ => Check::fail(what, fix),
-    }
-}
-
-fn axes(a: &Agreement, turned: &str) -> Check {
-    let names = ["x", "y", "z"];
-    let fix = "correct the mounting matrix of the unit";
-    if a.axes == DMat3::IDENTITY {
-        return match a.handed {
-            true => Check::ok(format!("axes: right-handed; {turned}")),
-            false => Check::warn(format!("axes: {turned}: not enough to tell their signs"), least_turned(a)),
-        };
-    }
-    let signs = DVec3::new(a.axes.x_axis.x, a.axes.y_axis.y, a.axes.z_axis.z);
-    let flipped: Vec<usize> = (0..3).filter(|k| signs[*k] < 0.0).collect();
-    if signs.abs() == DVec3::ONE && flipped.len() == 1 {
-        let what = format!("axes: the gyro's {} axis has the wrong sign", names[flipped[0]]);
-        return Check::fail(what, format!("{fix}: its axes are left-handed"));
-    }
-    let reads = |body: usize| {
-        let row = a.axes.row(body);
-        let axis = (0..3).find(|k| row[*k] != 0.0).unwrap_or(body);
-        format!("{}{}", if row[axis] < 0.0 { "-" } else { "" }, names[axis])
-    };
-    let hand = if a.axes.determinant() < 0.0 { "; as read they are left-handed" } else { "" };
-    let what = format!("axes: the body's x, y, z are the gyro's {}, {}, {}{hand}", reads(0), reads(1), reads(2));
-    Check::fail(what, format!("{fix}, or body_from_cam of every camera"))
-}
-
-fn extrinsics(a: &Agreement) -> Check {
-    let angle = a.turned.length().to_degrees();
-    let about = a.turned.normalize_or_zero();
-    let sigma = (about.dot(a.turned_covariance * about)).sqrt().to_degrees();
-    let most = (0..3).map(|k| a.turned_covariance.col(k)[k].sqrt().to_degrees()).fold(0.0, f64::max);
-    if most > TURNED_SIGMA_MAX {
-        let what = format!("extrinsics: known to ± {most:.1}° only");
-        return Check::warn(what, least_turned(a));
-    }
-    let what = format!(
-        "extrinsics: camera 0 is {angle:.2} ± {sigma:.2}° about ({:.2}, {:.2}, {:.2}) from where the calibration has it ({} intervals, {:.3} rad/s unexplained)",
-        about.x, about.y, about.z, a.intervals, a.residual
-    );
-    let fix = "calibrate body_from_cam of camera 0 anew";
-    match angle - 2.0 * sigma {
-        d if d < TURNED_OK => Check::ok(what),
-        d if d < TURNED_FAIL => Check::warn(what, fix),
-        _ => Check::fail(what, fix),
     }
 }
