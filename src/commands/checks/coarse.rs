@@ -186,13 +186,13 @@ const POINT_SIGMA: f64 = 1e-3;
 /// Inverse depth of a point that one camera sees, and its deviation, 1/m.
 const INVERSE_DEPTH: [f64; 2] = [0.25, 0.5];
 /// Deviation of the translation between neighbouring frames, m.
-const MOVED_SIGMA: f64 = 0.2;
+const MOVED_SIGMA: f64 = 0.05;
 /// Distance in deviations at which a point has half its weight.
 const CAUCHY: f64 = 3.0;
 const POINTS_MIN: usize = 10;
 /// Share of points, each by its weight, that must follow one motion.
 const AGREEING_MIN: f64 = 0.6;
-const ITERATIONS: usize = 40;
+const ITERATIONS: usize = 20;
 
 /// A point on the plane at distance 1, before and now, and its inverse depth with deviation, 1/m.
 #[derive(Clone, Copy, Debug)]

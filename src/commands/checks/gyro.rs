@@ -67,7 +67,7 @@ fn least_turned(c: &Coarse) -> String {
 fn offset(a: &Fine) -> Check {
     let (ms, sigma) = (1e3 * a.offset_s, 1e3 * a.offset_sigma_s);
     if a.offset_sigma_s > OFFSET_SIGMA_MAX {
-        let what = format!("time offset: {ms:+.1} ± {sigma:.1} ms, too unsure to say: the rate changed too little");
+        let what = format!("time offset: {ms:+.1} ± {sigma:.1} ms, too unsure to say: the rate changed too little or not for long enough");
         return Check::warn(what, "turn the rig to and fro, faster, before something with corners in it");
     }
     let what = format!("time offset: the gyro's clock is {ms:+.2} ± {sigma:.2} ms ahead of what the calibration says");
