@@ -310,7 +310,7 @@ mod tests {
             let sample = |i: usize| {
                 let t = i as f64 * 0.005;
                 let read = self.axes.transpose() * ((self.rate)(t - self.offset) + BIAS);
-                ImuSample { t: stamp(t), gyro_body: read, accel_body: DVec3::ZERO }
+                ImuSample { t: stamp(t), gyro_body: read, accel_body: DVec3::ZERO, ..ImuSample::default() }
             };
             let mut imu: Vec<ImuSample> = (0..(SECONDS / 0.005) as usize).map(sample).collect();
             imu.iter_mut().for_each(|s| s.gyro_body += normal() * 2.4e-3);

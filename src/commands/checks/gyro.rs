@@ -40,7 +40,11 @@ pub fn checks(found: Option<&Agreement>) -> Vec<Check> {
     }
     let axes = axes(c, &turned);
     let Some(fine) = &a.fine else {
-        let what = "camera against gyro: cannot tell offset, extrinsics and bias: odometry does not follow the rig";
+        let what = format!(
+            "camera against gyro: about {:+.1} ms by their rates alone; odometry does not follow the rig to tell it with \
+             extrinsics and bias",
+            1e3 * c.offset_s
+        );
         return vec![axes, Check::warn(what, ADVICE)];
     };
     vec![offset(fine), axes, extrinsics(fine, c, a.frames), bias(fine)]
