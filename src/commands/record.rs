@@ -41,7 +41,7 @@ pub fn record(args: &Args) -> Result<(), Fault> {
         FormatName::Euroc => Format::Euroc,
         FormatName::Mcap => Format::Mcap,
     };
-    let mut status = Status::new(args.duration.or(input.length_s())).with_led(led);
+    let mut status = Status::new(args.duration.or(input.source.length_s())).with_led(led);
     let (mut flown, recorded) =
         observe(input, &board, args.duration, Some((&args.out, format)), Box::new(|_| {}), &mut status)?;
     let line = flown.capture.and_then(|c| c.line(&flown.source));

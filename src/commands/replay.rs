@@ -67,8 +67,8 @@ pub fn replay(args: &Args) -> Result<(), Fault> {
         poses: args.poses.clone(),
         holdout: args.holdout.unwrap_or(0),
         duration_s: args.duration,
-        record: None,
         inject: args.inject.as_deref().map(InjectConfig::load).transpose()?.unwrap_or_default(),
+        ..Options::default()
     };
     finish(fly(input, &board, &out, &options, None)?, &out)
 }

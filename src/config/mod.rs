@@ -101,12 +101,8 @@ impl Board {
     pub fn load(path: &Path, overrides: &[String]) -> Result<Board, Fault> {
         let place = path.display().to_string();
         let text = std::fs::read_to_string(path).map_err(|e| {
-            Fault::new(
-                FaultKind::NoInput,
-                &place,
-                format!("cannot read the board file: {e}"),
-                "name one, such as those of board-configs/",
-            )
+            let what = format!("cannot read the board file: {e}");
+            Fault::new(FaultKind::NoInput, &place, what, "name one, such as those of board-configs/")
         })?;
         Board::parse(&place, &text, overrides)
     }
@@ -243,12 +239,8 @@ fn shown(assignment: &str) -> String {
 }
 
 fn in_override(assignment: &str, what: &str) -> Fault {
-    Fault::new(
-        FaultKind::Config,
-        shown(assignment),
-        what.replace('\n', " "),
-        "write section.key=value with a key of board-configs/",
-    )
+    let fix = "write section.key=value with a key of board-configs/";
+    Fault::new(FaultKind::Config, shown(assignment), what.replace('\n', " "), fix)
 }
 
 /// The key and the value of one `a.b=value`; the value is TOML, and a bare word is a string.

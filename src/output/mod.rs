@@ -93,21 +93,13 @@ fn partial_name(path: &Path) -> PathBuf {
 }
 
 fn cannot_create(path: &Path, e: &io::Error) -> Fault {
-    Fault::new(
-        FaultKind::NoOutput,
-        path.display().to_string(),
-        format!("cannot be created: {e}"),
-        "choose an --out folder that can be written to",
-    )
+    let (place, what) = (path.display().to_string(), format!("cannot be created: {e}"));
+    Fault::new(FaultKind::NoOutput, place, what, "choose an --out folder that can be written to")
 }
 
 fn cannot_write(path: &Path, e: &io::Error) -> Fault {
-    Fault::new(
-        FaultKind::Io,
-        path.display().to_string(),
-        format!("cannot be written: {e}"),
-        "check the free space of the disk",
-    )
+    let (place, what) = (path.display().to_string(), format!("cannot be written: {e}"));
+    Fault::new(FaultKind::Io, place, what, "check the free space of the disk")
 }
 
 #[cfg(test)]

@@ -18,7 +18,7 @@ const INK: [u8; 3] = [235, 235, 235];
 const LABEL_WIDTH_PX: usize = 220;
 
 /// Near to far: warm to cool, lightness rising to the middle.
-const DEPTH_RAMP: [[u8; 3]; 8] = [
+pub const DEPTH_RAMP: [[u8; 3]; 8] = [
     [122, 4, 3],
     [217, 56, 7],
     [253, 143, 40],
@@ -29,7 +29,7 @@ const DEPTH_RAMP: [[u8; 3]; 8] = [
     [66, 52, 148],
 ];
 /// None to full: black through violet and orange to pale yellow, lightness rising throughout.
-const ERROR_RAMP: [[u8; 3]; 6] =
+pub const ERROR_RAMP: [[u8; 3]; 6] =
     [[0, 0, 4], [66, 10, 104], [147, 38, 103], [221, 81, 58], [252, 165, 10], [252, 255, 164]];
 
 /// An 8-bit RGB picture, row-major.
@@ -155,20 +155,8 @@ fn depth_range(depth: &[f32]) -> (f32, f32) {
     (near, far.max(1.01 * near))
 }
 
-/// Near (0) to far (1).
-#[cfg(feature = "instruments")]
-pub fn depth_colour(s: f32) -> [u8; 3] {
-    ramp(&DEPTH_RAMP, s)
-}
-
-/// None (0) to full (1).
-#[cfg(feature = "instruments")]
-pub fn error_colour(s: f32) -> [u8; 3] {
-    ramp(&ERROR_RAMP, s)
-}
-
 /// Colour at `s` of 0..1 along evenly spaced anchors.
-fn ramp<const N: usize>(anchors: &[[u8; 3]; N], s: f32) -> [u8; 3] {
+pub fn ramp<const N: usize>(anchors: &[[u8; 3]; N], s: f32) -> [u8; 3] {
     let at = if s.is_finite() { s.clamp(0.0, 1.0) * (N - 1) as f32 } else { (N - 1) as f32 };
     let i = (at as usize).min(N - 2);
     let f = at - i as f32;

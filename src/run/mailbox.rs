@@ -195,7 +195,13 @@ struct Liveness<'a> {
     told: bool,
 }
 
-impl Liveness<'_> {
+impl<'a> Liveness<'a> {
+    /// A sensor that answers, and where its losses, silences and time away are counted.
+    fn new(name: &'static str, counted: [&'a Counter; 3], notices: &'a ArrayQueue<String>) -> Liveness<'a> {
+        let [lost, silent, away_ms] = counted;
+        Liveness { name, heard: Instant::now(), away: false, lost, silent, away_ms, notices, said: None, told: false }
+    }
+
     fn lose(&mut self, counter: &Counter, what: impl FnOnce() -> String) {
         self.away = true;
         counter.add(1);
@@ -235,17 +241,8 @@ pub fn camera(mailbox: &Mailbox, source: &mut dyn FrameSource, tracking: &Waker,
     let Some(mut packet) = mailbox.writable() else { return };
     let mut gate = FrameGate::new(&packet.frames);
     let _metered = Metered(mailbox, thread_cpu(), packet.frames.images.iter().map(|i| i.pixels.len()).sum());
-    let mut liveness = Liveness {
-        name: "camera",
-        heard: Instant::now(),
-        away: false,
-        lost: &c.camera_lost,
-        silent: &c.camera_silent,
-        away_ms: &c.camera_away_ms,
-        notices: &mailbox.notices,
-        said: None,
-        told: false,
-    };
+    let counted = [&c.camera_lost, &c.camera_silent, &c.camera_away_ms];
+    let mut liveness = Liveness::new("camera", counted, &mailbox.notices);
     let mut eye = Liveness { name: "one camera", lost: &c.one_camera_lost, away_ms: &c.one_camera_away_ms, ..liveness };
     let mut span = None;
     while !mailbox.stop.load(Relaxed) {
@@ -312,17 +309,8 @@ pub fn inertial(
         c.imu_overflow.add(u64::from(mailbox.imu.force_push(sample).is_some()));
         mailbox.imu_until.store(sample.t.0, Relaxed);
     };
-    let mut liveness = Liveness {
-        name: "inertial unit",
-        heard: Instant::now(),
-        away: false,
-        lost: &c.imu_lost,
-        silent: &c.imu_silent,
-        away_ms: &c.imu_away_ms,
-        notices: &mailbox.notices,
-        said: None,
-        told: false,
-    };
+    let counted = [&c.imu_lost, &c.imu_silent, &c.imu_away_ms];
+    let mut liveness = Liveness::new("inertial unit", counted, &mailbox.notices);
     while !over.load(Relaxed) {
         let answer = source.next(PATIENCE, &mut batch);
         let away = liveness.update(&answer);

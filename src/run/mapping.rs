@@ -210,29 +210,8 @@ impl KeyframeQueue {
     }
 }
 
-/// Keyframes the estimator may still move: the newest ones, by stamp.
-struct Recent {
-    entries: [(Nanos, u64); Recent::LEN],
-    next: usize,
-}
-
-impl Recent {
-    /// More than a window holds.
-    const LEN: usize = 32;
-
-    fn new() -> Recent {
-        Recent { entries: [(Nanos::MIN, 0); Recent::LEN], next: 0 }
-    }
-
-    fn add(&mut self, t: Nanos, id: u64) {
-        self.entries[self.next % Recent::LEN] = (t, id);
-        self.next += 1;
-    }
-
-    fn find(&self, t: Nanos) -> Option<u64> {
-        self.entries.iter().find(|e| e.0 == t).map(|e| e.1)
-    }
-}
+/// Newest keyframes, which the estimator may still move: more than a window holds.
+const RECENT: usize = 32;
 
 /// Numbers keyframes, chooses the held-out ones, and hands them to the mapper where there is one.
 pub struct Keyframes {
@@ -240,12 +219,13 @@ pub struct Keyframes {
     holdout: u32,
     /// Keyframes accepted by the mapper's queue; without a mapper, all.
     pub count: u64,
-    recent: Recent,
+    /// Stamps and numbers of the newest.
+    recent: VecDeque<(Nanos, u64)>,
 }
 
 impl Keyframes {
     pub fn new(holdout: u32) -> Keyframes {
-        Keyframes { holdout, count: 0, recent: Recent::new() }
+        Keyframes { holdout, count: 0, recent: VecDeque::with_capacity(RECENT) }
     }
 
     fn fill(&mut self, slot: &mut Keyframe, world_from_body: Pose) {
@@ -269,13 +249,14 @@ impl Keyframes {
         }
         let id = self.count;
         if queue.offer(&packet.frames, |keyframe| self.fill(keyframe, tracked.world_from_body)) {
-            self.recent.add(packet.frames.t, id);
+            self.recent.truncate(RECENT - 1);
+            self.recent.push_front((packet.frames.t, id));
         } else {
             counters.keyframes_rejected.add(1);
         }
         for (t, world_from_body) in tracked.corrections.iter() {
-            if let Some(id) = self.recent.find(*t).filter(|found| *found != id) {
-                if queue.corrections.push(PoseCorrection { id, world_from_body: *world_from_body }).is_err() {
+            if let Some((_, id)) = self.recent.iter().find(|(at, found)| at == t && *found != id) {
+                if queue.corrections.push(PoseCorrection { id: *id, world_from_body: *world_from_body }).is_err() {
                     counters.corrections_full.add(1);
                 }
             }

@@ -54,12 +54,8 @@ pub fn check_fits(place: &str, calibration: &Calibration, board: &Board, records
         if c.camera.width > w || c.camera.height > h {
             let what =
                 format!("camera {i} is {}x{} px, the board's budget is {w}x{h}", c.camera.width, c.camera.height);
-            return Err(Fault::new(
-                FaultKind::Config,
-                place,
-                what,
-                "raise budget.image_width_max and image_height_max",
-            ));
+            let fix = "raise budget.image_width_max and image_height_max";
+            return Err(Fault::new(FaultKind::Config, place, what, fix));
         }
     }
     if board.map.enabled {

@@ -50,19 +50,21 @@ use recorder::Recording;
 use sensors::{Input, Sensors, Source};
 use status::{print_err, Gauges, Status};
 use status_led::StatusLed;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering, Ordering::Relaxed};
 use std::thread::{Builder, JoinHandle, Scope, ScopedJoinHandle};
 use std::time::{Duration, Instant};
 use stipple_drivers::paced::FRAMES_UNREADABLE;
+use stipple_drivers::record::Format;
 use stipple_drivers::replay::read_trajectory;
 use stipple_drivers::{host, Calibration, Fault, FaultKind, Frames};
 use tracking::{FramePacket, Inlet, Link, OdometryRun, Tracker};
 
 /// How frames arrive and mapping steps are spent.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub enum Pace {
     /// Frames arrive at their time; what is not done in time is not done.
+    #[default]
     Recorded,
     /// Deterministic: every frame is tracked, and mapping takes a stated number of steps.
     Lockstep(Steps),
@@ -79,7 +81,7 @@ pub enum Steps {
     EqualTime(f64),
 }
 
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Default)]
 pub struct Options {
     pub pace: Pace,
     /// Table of poses in place of odometry.
@@ -92,19 +94,6 @@ pub struct Options {
     pub record: Option<PathBuf>,
     /// Faults added to the sensors of a recording.
     pub inject: InjectConfig,
-}
-
-impl Default for Options {
-    fn default() -> Options {
-        Options {
-            pace: Pace::Recorded,
-            poses: None,
-            holdout: 0,
-            duration_s: None,
-            record: None,
-            inject: InjectConfig::default(),
-        }
-    }
 }
 
 /// What a flight left, beside its files.
@@ -178,10 +167,7 @@ pub fn fly(
         truth: input.truth,
         opened: input.opened,
     };
-    let length_s = match &input.source {
-        Source::Live { .. } => None,
-        Source::Recorded(r) => Some(r.length_s()),
-    };
+    let length_s = input.source.length_s();
     let mut status = Status::new(options.duration_s.or(length_s)).with_led(led);
     let (calibration, live) = (&input.calibration, length_s.is_none());
     let (mut flown, recording) = match (input.source, options.pace) {
@@ -190,12 +176,9 @@ pub fn fly(
         }
         (source, _) => {
             let shape = || Frames::in_colour(calibration, colours);
-            let sensors = match source {
-                Source::Recorded(recorded) => recorded.paced(),
-                Source::Live { sensors, .. } => sensors,
-            };
-            let (sensors, recording) =
-                Recording::start(options.record.as_deref(), sensors, calibration, board, &shape())?;
+            let sensors = source.sensors();
+            let record = options.record.as_deref().map(|dir| (dir, Format::Euroc));
+            let (sensors, recording) = Recording::start(record, sensors, calibration, board, &shape())?;
             let sensors = sensors.with_faults(&options.inject, shape);
             let realtime = Realtime {
                 holdout: options.holdout,
@@ -230,25 +213,19 @@ pub fn observe(
     mut input: Input,
     board: &Board,
     duration_s: Option<f64>,
-    record: Option<(&std::path::Path, stipple_drivers::record::Format)>,
+    record: Option<(&Path, Format)>,
     observer: Box<dyn FnMut(&FramePacket) + Send>,
     status: &mut Status,
 ) -> Result<(Flown, Result<(), Fault>), Fault> {
     input.calibration.imu.range = board.imu.range();
     let calibration = &input.calibration;
     let live = matches!(input.source, Source::Live { .. });
-    let sensors = match input.source {
-        Source::Live { sensors, .. } => sensors,
-        Source::Recorded(mut recorded) => {
-            recorded.cut(duration_s);
-            recorded.paced()
-        }
-    };
+    if let Source::Recorded(recorded) = &mut input.source {
+        recorded.cut(duration_s);
+    }
+    let sensors = input.source.sensors();
     let shape = Frames::for_rig(calibration);
-    let (sensors, recording) = match record {
-        Some((dir, format)) => Recording::of(dir, format, sensors, calibration, board, &shape)?,
-        None => (sensors, None),
-    };
+    let (sensors, recording) = Recording::start(record, sensors, calibration, board, &shape)?;
     let realtime =
         Realtime { holdout: 0, until_s: None, sensors_s: duration_s.filter(|_| live), stop: host::stop_asked_for() };
     let mut flown = fly_in_real_time(sensors, calibration, Tracker::Observer(observer), None, &realtime, status);
@@ -354,11 +331,9 @@ pub fn fly_in_real_time(
     });
     let warnings = sensors.frames.warnings().to_vec();
     let mut source = [sensors.frames.counters(), sensors.imu.counters()].concat();
-    source
-        .iter()
-        .filter(|(name, _)| *name == FRAMES_UNREADABLE)
-        .for_each(|(_, n)| s.counters.frames_unreadable.add(*n));
-    source.retain(|(name, _)| *name != FRAMES_UNREADABLE);
+    let unreadable = |count: &(&str, u64)| count.0 == FRAMES_UNREADABLE;
+    source.iter().filter(|count| unreadable(count)).for_each(|(_, n)| s.counters.frames_unreadable.add(*n));
+    source.retain(|count| !unreadable(count));
     // A recording ends when its taps are gone.
     drop(sensors);
     let arrived = s.mailbox.arrived.load(Relaxed) + s.counters.frames_unreadable.get();
@@ -412,11 +387,12 @@ fn spawn_tracking<'scope, 'env>(
     match tracker {
         Tracker::Table(poses) => spawn(scope, "tracking", move || {
             let _ended = ended;
-            tracking::by_table(link, inlet, poses, counters, give);
+            tracking::seal();
+            tracking::without_odometry(link, inlet, |packet| tracking::look_up(poses, packet, counters), give);
         }),
         Tracker::Observer(observer) => spawn(scope, "tracking", move || {
             let _ended = ended;
-            tracking::observe(link, inlet, observer, give);
+            tracking::without_odometry(link, inlet, |packet| observer(packet), give);
         }),
         Tracker::Odometry(run) => {
             let OdometryRun { front, back, threads, .. } = run.as_mut();
@@ -426,7 +402,7 @@ fn spawn_tracking<'scope, 'env>(
                     tracking::in_turns(link, inlet, front, back, give);
                 })
             } else {
-                let start = back.odometry();
+                let start = back.vio.odometry();
                 spawn(scope, "frontend", move || tracking::follow_points(link, inlet, front, start));
                 spawn(scope, "estimator", move || {
                     let _ended = ended;

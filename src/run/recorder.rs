@@ -13,29 +13,15 @@ pub struct Recording {
 }
 
 impl Recording {
-    /// Records what `sensors` give to `dir` as EuRoC, if there is a `dir`.
+    /// Records what `sensors` give, in frames of this shape, to a folder that must not hold anything; nothing without one.
     pub fn start(
-        dir: Option<&Path>,
+        to: Option<(&Path, Format)>,
         sensors: Sensors,
         calibration: &Calibration,
         board: &Board,
         shape: &Frames,
     ) -> Result<(Sensors, Option<Recording>), Fault> {
-        match dir {
-            Some(dir) => Recording::of(dir, Format::Euroc, sensors, calibration, board, shape),
-            None => Ok((sensors, None)),
-        }
-    }
-
-    /// Records what `sensors` give, in frames of this shape, to `dir`, which must not hold anything.
-    pub fn of(
-        dir: &Path,
-        format: Format,
-        sensors: Sensors,
-        calibration: &Calibration,
-        board: &Board,
-        shape: &Frames,
-    ) -> Result<(Sensors, Option<Recording>), Fault> {
+        let Some((dir, format)) = to else { return Ok((sensors, None)) };
         let sink = record::open(dir, format, calibration)?;
         let ring = Ring::new(shape, board.record.ring_frames as usize);
         let (recorder, frames, imu) = record::start(sink, (sensors.frames, sensors.imu), ring);

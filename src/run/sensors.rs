@@ -133,12 +133,22 @@ impl Input {
             _ => Ok(()),
         }
     }
+}
 
+impl Source {
     /// Seconds it lasts; `None` of live sensors.
     pub fn length_s(&self) -> Option<f64> {
-        match &self.source {
+        match self {
             Source::Live { .. } => None,
             Source::Recorded(r) => Some(r.length_s()),
+        }
+    }
+
+    /// The sensors; a recording plays in their place, at its pace.
+    pub fn sensors(self) -> Sensors {
+        match self {
+            Source::Live { sensors, .. } => sensors,
+            Source::Recorded(r) => r.paced(),
         }
     }
 }

@@ -84,7 +84,7 @@ pub fn conclude(title: Title, mut flown: Flown, out: &OutputDir) -> Result<Repor
     report.rss_peak_bytes = host::rss_peak_bytes();
     report.set_counters(&counted(&flown, &title.opened));
     if let Some(run) = flown.tracker.odometry() {
-        report.set_health(run.back.health_frames());
+        report.set_health(run.back.vio.health_frames());
     }
     write_files(&report, &flown, &estimated, &title.truth, error.as_ref(), &panels, out)?;
     Ok(report)
@@ -126,13 +126,13 @@ fn track_figures(report: &mut Report, flown: &Flown) -> Vec<TimedPose> {
     report.frontend_ms_p99 = percentile(&run.front.ms, 0.99);
     report.estimator_ms_p50 = percentile(&run.back.ms, 0.5);
     report.estimator_ms_p99 = percentile(&run.back.ms, 0.99);
-    flown.tracker.rig().into_iter().for_each(|rig| rig_figures(report, &rig));
+    run.back.vio.rig().into_iter().for_each(|rig| rig_figures(report, &rig));
     report.estimator_bytes = Some(run.bytes);
-    if let Some((least, median, under)) = run.back.quality_summary() {
+    if let Some((least, median, under)) = run.back.vio.quality_summary() {
         (report.quality_min, report.quality_p50) = (Some(least.into()), Some(median.into()));
         report.quality_under_50 = Some(under);
     }
-    report.vio_hash = flown.tracker.hash().map(|h| format!("{h:016x}"));
+    report.vio_hash = Some(format!("{:016x}", run.back.vio.hash()));
     run.back.trajectory.iter().map(|o| TimedPose { t: o.t, pose: o.world_from_body }).collect()
 }
 

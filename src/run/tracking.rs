@@ -18,7 +18,7 @@ use crate::counters::Counters;
 use crate::frontend::{Frontend, Prediction, Tracks};
 use crate::limits::{FRAMES, IMU_BETWEEN_FRAMES};
 use crate::mem::{seal_thread, Footprint, List};
-use crate::vio::{Health, Odometry, Predictor, RigEstimate, Vio};
+use crate::vio::{Health, Odometry, Predictor, Vio};
 use crossbeam_queue::ArrayQueue;
 use std::sync::atomic::AtomicBool;
 use std::sync::Arc;
@@ -132,7 +132,7 @@ impl Front {
 
 /// The half that estimates. Its lists have room for every frame, bought at the start.
 pub struct Back {
-    vio: Vio,
+    pub vio: Vio,
     pub trajectory: Vec<Odometry>,
     /// Wall time of each frame, ms.
     pub ms: Vec<f64>,
@@ -146,21 +146,6 @@ pub struct Back {
 }
 
 impl Back {
-    /// Names of health and the frames that had each, as `Vio::health_frames`.
-    pub fn health_frames(&self) -> impl Iterator<Item = (&'static str, u64)> + '_ {
-        self.vio.health_frames()
-    }
-
-    /// Least and median quality and the part of frames under 50, as `Vio::quality_summary`.
-    pub fn quality_summary(&self) -> Option<(u8, u8, f64)> {
-        self.vio.quality_summary()
-    }
-
-    /// The newest state.
-    pub fn odometry(&self) -> Option<Odometry> {
-        self.vio.odometry()
-    }
-
     /// Fills in `packet.tracked`.
     pub fn estimate(&mut self, packet: &mut FramePacket) {
         let begun = Instant::now();
@@ -261,16 +246,6 @@ impl Tracker {
         }
     }
 
-    /// What was estimated of the rig, where the board asks for it.
-    pub fn rig(&self) -> Option<RigEstimate> {
-        self.odometry()?.back.vio.rig()
-    }
-
-    /// Hash over the bits of all keyframe poses.
-    pub fn hash(&self) -> Option<u64> {
-        Some(self.odometry()?.back.vio.hash())
-    }
-
     pub fn counters(&self) -> Vec<(&'static str, u64)> {
         let Some(run) = self.odometry() else { return vec![] };
         let mut list = run.front.frontend.stats().list();
@@ -283,7 +258,7 @@ impl Tracker {
 }
 
 /// Fills in the pose of a packet from a table: every frame is a keyframe.
-fn look_up(poses: &[TimedPose], packet: &mut FramePacket, counters: &Counters) {
+pub fn look_up(poses: &[TimedPose], packet: &mut FramePacket, counters: &Counters) {
     packet.tracked = None;
     if packet.imu_only {
         return;
@@ -330,30 +305,15 @@ impl<T: FnMut() -> Option<Box<FramePacket>>> Inlet<'_, T> {
     }
 }
 
-/// Thread `tracking` with a table of poses.
-pub fn by_table(
+/// Thread `tracking` without odometry: shows every packet to `see`.
+pub fn without_odometry(
     link: &Link,
     mut inlet: Inlet<impl FnMut() -> Option<Box<FramePacket>>>,
-    poses: &[TimedPose],
-    counters: &Counters,
+    mut see: impl FnMut(&mut FramePacket),
     mut give: impl FnMut(Box<FramePacket>),
 ) {
-    seal();
     while let Some(mut packet) = inlet.next(link) {
-        look_up(poses, &mut packet, counters);
-        give(packet);
-    }
-}
-
-/// Thread `tracking` that only shows packets to somebody.
-pub fn observe(
-    link: &Link,
-    mut inlet: Inlet<impl FnMut() -> Option<Box<FramePacket>>>,
-    observer: &mut dyn FnMut(&FramePacket),
-    mut give: impl FnMut(Box<FramePacket>),
-) {
-    while let Some(packet) = inlet.next(link) {
-        observer(&packet);
+        see(&mut packet);
         give(packet);
     }
 }
@@ -367,12 +327,12 @@ pub fn in_turns(
     mut give: impl FnMut(Box<FramePacket>),
 ) {
     seal();
-    let start = back.odometry();
+    let start = back.vio.odometry();
     let (mut state, mut next) = (start, start);
     while let Some(mut packet) = inlet.next(link) {
         front.track(&mut packet, state.as_ref());
         back.estimate(&mut packet);
-        (state, next) = (next, back.odometry());
+        (state, next) = (next, back.vio.odometry());
         give(packet);
     }
     front.cpu_s = Some(thread_cpu().total_s());
@@ -411,7 +371,7 @@ pub fn estimate(link: &Link, back: &mut Back, mut give: impl FnMut(Box<FramePack
     seal();
     while let Some(mut packet) = link.back.wait(&link.front_done, || link.tracked.pop()) {
         back.estimate(&mut packet);
-        let _ = link.states.push(back.odometry());
+        let _ = link.states.push(back.vio.odometry());
         link.taker.wake();
         give(packet);
     }
@@ -419,7 +379,7 @@ pub fn estimate(link: &Link, back: &mut Back, mut give: impl FnMut(Box<FramePack
 }
 
 /// From here on the thread allocates nothing; what asking for its own handle allocates comes first.
-fn seal() {
+pub fn seal() {
     let _ = std::thread::current();
     seal_thread();
 }

@@ -15,6 +15,7 @@ use stipple::run::status::Status;
 use stipple::run::tracking::{OdometryRun, Tracker};
 use stipple::run::{fly_in_real_time, memory, Realtime};
 use stipple_drivers::paced::Images;
+use stipple_drivers::record::Format;
 use stipple_drivers::sim::Scenario;
 use stipple_drivers::{Calibration, Fault, Frames, ImuSample, Span};
 
@@ -68,6 +69,7 @@ impl Flight {
             imu: self.imu.clone(),
         };
         let shape = Frames::for_rig(&self.calibration);
+        let into = into.map(|dir| (dir, Format::Euroc));
         let (sensors, recording) = Recording::start(into, recorded.paced(), &self.calibration, board, &shape)?;
         let tracker = Tracker::Odometry(Box::new(OdometryRun::new(&self.calibration, board, self.frames.len())?));
         let options = Realtime { holdout: 0, until_s: None, sensors_s: None, stop: &AtomicBool::new(false) };

@@ -4,7 +4,7 @@
 //! fixed ones, so that pictures compare. What is unknown is dark grey.
 
 use super::sets::Pair;
-use stipple::output::panel::{depth_colour, error_colour, Picture, MISSING};
+use stipple::output::panel::{ramp, Picture, DEPTH_RAMP, ERROR_RAMP, MISSING};
 use stipple::stereo::Disparity;
 
 /// Drawn at full brightness, px.
@@ -19,16 +19,16 @@ pub fn picture(pair: &Pair, found: &Disparity) -> Picture {
     let known = || pair.truth.iter().copied().filter(|d| *d >= 0.0);
     let (near, far) = (known().fold(1.0, f32::max), known().fold(f32::INFINITY, f32::min).min(1e6));
     let colour = |d: f32| match d >= 0.0 {
-        true => depth_colour((near - d) / (near - far).max(1.0)),
+        true => ramp(&DEPTH_RAMP, (near - d) / (near - far).max(1.0)),
         false => MISSING,
     };
     let both = |i: usize| found.px[i] >= 0.0 && pair.truth[i] >= 0.0;
     let deviation = |i: usize| match found.px[i] >= 0.0 {
-        true => error_colour(found.sigma_px[i] / SIGMA_FULL),
+        true => ramp(&ERROR_RAMP, found.sigma_px[i] / SIGMA_FULL),
         false => MISSING,
     };
     let error = |i: usize| match both(i) {
-        true => error_colour((found.px[i] - pair.truth[i]).abs() / ERROR_FULL),
+        true => ramp(&ERROR_RAMP, (found.px[i] - pair.truth[i]).abs() / ERROR_FULL),
         false => MISSING,
     };
     let eye = |i: usize| [pair.left.pixels[i]; 3];
