@@ -377,7 +377,7 @@ fn both_cameras_of_a_pair_train_one_map() {
     let q = mapper.evaluate().unwrap();
     println!("{q:?}");
     assert_eq!(mapper.keyframe_count(), 4);
-    let [left, right, others @ ..] = q.psnr_heldout_by_camera_db;
+    let [left, right, others @ ..] = &q.psnr_heldout_by_camera_db[..] else { panic!("{q:?}") };
     assert!(left.unwrap() > 15.0 && right.unwrap() > 15.0, "{q:?}");
     assert_eq!(others, [None; 2]);
 }

@@ -4,7 +4,7 @@
 
 use glam::{DQuat, DVec3};
 use std::path::{Path, PathBuf};
-use stipple::map::{CurvePoint, Gaussian, Panel};
+use stipple::map::{CurvePoint, Evaluation, Gaussian, Panel};
 use stipple::output::html::{write_html, Evidence};
 use stipple::output::metrics::{percentile, trajectory_error};
 use stipple::output::panel::{panel, Picture};
@@ -109,10 +109,13 @@ fn report(tracking: &[f64]) -> Report {
         tracking_fps: Some(61.8),
         tracking_ms_p50: percentile(tracking, 0.5),
         tracking_ms_p99: percentile(tracking, 0.99),
-        psnr_db: Some(24.87),
-        ssim: Some(0.812),
-        psnr_heldout_db: Some(23.4),
-        ssim_heldout: Some(0.774),
+        quality: Evaluation {
+            psnr_db: Some(24.87),
+            ssim: Some(0.812),
+            psnr_heldout_db: Some(23.4),
+            ssim_heldout: Some(0.774),
+            ..Evaluation::default()
+        },
         splats: Some(45_632),
         iterations: Some(780),
         iteration_ms_p50: Some(76.3),

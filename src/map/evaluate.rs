@@ -28,7 +28,8 @@ pub struct CurvePoint {
 }
 
 /// Means over all keyframes of a kind; `None` where there are none.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
 pub struct Evaluation {
     pub psnr_db: Option<f64>,
     pub ssim: Option<f64>,
@@ -42,7 +43,7 @@ pub struct Evaluation {
     /// With its pose refined on the image as well.
     pub psnr_heldout_aligned_db: Option<f64>,
     /// Held out, of each camera that trains.
-    pub psnr_heldout_by_camera_db: [Option<f64>; CAMERAS_MAX],
+    pub psnr_heldout_by_camera_db: Vec<Option<f64>>,
 }
 
 /// A keyframe and its rendering, row-major at mapping resolution.
@@ -70,58 +71,42 @@ const ALIGN_STEPS: i32 = 50;
 const ALIGN_RATE: f64 = 2e-3;
 const ALIGN_DECAY: f64 = 0.93;
 
-/// Sums of one kind of keyframes.
-#[derive(Clone, Copy, Default)]
-struct Mean {
-    sum: f64,
-    n: u32,
-}
-
-impl Mean {
-    fn add(&mut self, value: Option<f64>) {
-        if let Some(v) = value {
-            self.sum += v;
-            self.n += 1;
-        }
-    }
-
-    fn get(&self) -> Option<f64> {
-        (self.n > 0).then(|| self.sum / f64::from(self.n))
-    }
+/// Mean of what could be measured.
+fn mean(values: &[Option<f64>]) -> Option<f64> {
+    let n = values.iter().flatten().count();
+    (n > 0).then(|| values.iter().flatten().sum::<f64>() / n as f64)
 }
 
 /// Scores a few keyframes spread over the run: those trained on, and those held out. Allocates.
 pub fn sample(scene: &mut Scene) -> Result<[Option<f64>; 2], GpuError> {
-    let mut means = [Mean::default(), Mean::default()];
-    for (held_out, mean) in means.iter_mut().enumerate() {
-        let of_kind: Vec<usize> =
-            first_images(scene).filter(|&i| scene.store.get(i).held_out == (held_out == 1)).collect();
-        for i in spread(of_kind.len(), PROBED) {
-            mean.add(score(scene, of_kind[i])?);
-        }
-    }
-    Ok(means.map(|m| m.get()))
+    let mut probe = |held_out: bool| {
+        let of_kind: Vec<usize> = first_images(scene).filter(|&i| scene.store.get(i).held_out == held_out).collect();
+        let scores = spread(of_kind.len(), PROBED).map(|i| score(scene, of_kind[i]));
+        Ok(mean(&scores.collect::<Result<Vec<_>, GpuError>>()?))
+    };
+    Ok([probe(false)?, probe(true)?])
 }
 
 /// Scores every keyframe. Allocates.
 pub fn evaluate(scene: &mut Scene, weights: &Weights) -> Result<Evaluation, GpuError> {
     let mut ssim_of = Ssim::new(scene.rendered.width, scene.rendered.height);
-    let mut means: [[Mean; 2]; 5] = Default::default();
-    let [training, held_out, between, fitted, aligned] = &mut means;
-    let mut by_camera = [Mean::default(); CAMERAS_MAX];
+    // PSNR and SSIM of each kind.
+    let mut all: [[Vec<Option<f64>>; 2]; 5] = Default::default();
+    let [training, held_out, between, fitted, aligned] = &mut all;
+    let mut by_camera: [Vec<Option<f64>>; CAMERAS_MAX] = Default::default();
     for i in 0..scene.store.len() {
         let observed = observed(scene, i);
-        let mut add = |scene: &Scene, [psnr, ssim]: &mut [Mean; 2]| {
+        let mut add = |scene: &Scene, [psnr, ssim]: &mut [Vec<Option<f64>>; 2]| {
             let (shown, valid) = (&scene.rendered.colour, &scene.camera(i).valid);
-            psnr.add(mse(&observed, shown, valid).map(psnr_db));
-            ssim.add(ssim_of.mean(&observed, shown, valid));
+            psnr.push(mse(&observed, shown, valid).map(psnr_db));
+            ssim.push(ssim_of.mean(&observed, shown, valid));
         };
         let scored = score(scene, i)?;
         if !scene.store.get(i).held_out {
             add(scene, training);
             continue;
         }
-        by_camera[scene.store.camera(i)].add(scored);
+        by_camera[scene.store.camera(i)].push(scored);
         add(scene, held_out);
         fit(scene, i, &observed);
         add(scene, fitted);
@@ -132,18 +117,17 @@ pub fn evaluate(scene: &mut Scene, weights: &Weights) -> Result<Evaluation, GpuE
         fit(scene, i, &observed);
         add(scene, aligned);
     }
-    let [[psnr, ssim], [psnr_heldout, ssim_heldout], [psnr_between, _], [psnr_fitted, ssim_fitted], [psnr_aligned, _]] =
-        means;
+    let [training, held_out, between, fitted, aligned] = all.map(|kind| kind.map(|values| mean(&values)));
     Ok(Evaluation {
-        psnr_db: psnr.get(),
-        ssim: ssim.get(),
-        psnr_heldout_db: psnr_heldout.get(),
-        ssim_heldout: ssim_heldout.get(),
-        psnr_heldout_between_db: psnr_between.get(),
-        psnr_heldout_fitted_db: psnr_fitted.get(),
-        ssim_heldout_fitted: ssim_fitted.get(),
-        psnr_heldout_aligned_db: psnr_aligned.get(),
-        psnr_heldout_by_camera_db: by_camera.map(|m| m.get()),
+        psnr_db: training[0],
+        ssim: training[1],
+        psnr_heldout_db: held_out[0],
+        ssim_heldout: held_out[1],
+        psnr_heldout_between_db: between[0],
+        psnr_heldout_fitted_db: fitted[0],
+        ssim_heldout_fitted: fitted[1],
+        psnr_heldout_aligned_db: aligned[0],
+        psnr_heldout_by_camera_db: by_camera.iter().map(|values| mean(values)).collect(),
     })
 }
 

@@ -1,6 +1,6 @@
 //! `report.json`: one flat object. A figure that was not measured is null, never zero.
 
-use crate::map::CurvePoint;
+use crate::map::{CurvePoint, Evaluation};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::io::{self, Write};
@@ -60,19 +60,8 @@ pub struct Report {
     pub accel_scale: Option<[f64; 3]>,
     pub accel_scale_sigma: Option<[f64; 3]>,
 
-    pub psnr_db: Option<f64>,
-    pub ssim: Option<f64>,
-    pub psnr_heldout_db: Option<f64>,
-    pub ssim_heldout: Option<f64>,
-    /// With the pose correction of the map's own keyframes between which each was taken.
-    pub psnr_heldout_between_db: Option<f64>,
-    /// With gain and offset of each held-out view fitted to its image.
-    pub psnr_heldout_fitted_db: Option<f64>,
-    pub ssim_heldout_fitted: Option<f64>,
-    /// With its pose refined on its image alone as well.
-    pub psnr_heldout_aligned_db: Option<f64>,
-    /// Held out, of each camera that trains.
-    pub psnr_heldout_by_camera_db: Vec<Option<f64>>,
+    #[serde(flatten)]
+    pub quality: Evaluation,
     pub splats: Option<u64>,
     pub iterations: Option<u64>,
     pub iteration_ms_p50: Option<f64>,
@@ -178,7 +167,8 @@ mod tests {
     fn report_is_flat_and_reads_back() {
         let counters = Counters::default();
         counters.outliers.add(7);
-        let mut report = Report { psnr_db: Some(24.5), ..Report::default() };
+        let mut report = Report { wall_s: Some(24.5), ..Report::default() };
+        report.quality = Evaluation { psnr_db: Some(24.5), ..Evaluation::default() };
         report.set_counters(&counters.list());
         report.set_health([("imu_gap", 3)].into_iter());
         report.curve.push(CurvePoint {
@@ -216,7 +206,8 @@ mod tests {
 
     #[test]
     fn figures_that_are_not_numbers_become_null() {
-        let report = Report { ssim: Some(f64::NAN), psnr_db: Some(f64::INFINITY), ..Report::default() };
+        let quality = Evaluation { ssim: Some(f64::NAN), psnr_db: Some(f64::INFINITY), ..Evaluation::default() };
+        let report = Report { quality, ..Report::default() };
         let json = serde_json::to_value(&report).unwrap();
         assert!(json["ssim"].is_null() && json["psnr_db"].is_null());
     }

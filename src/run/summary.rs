@@ -64,7 +64,7 @@ pub fn conclude(title: Title, mut flown: Flown, out: &OutputDir) -> Result<Repor
         if m.failure.is_none() {
             match measure(&mut m.mapper) {
                 Ok((quality, drawn, splats)) => {
-                    map_figures(&mut report, &quality);
+                    report.quality = quality;
                     panels = drawn;
                     out.write("map.ply", |w| ply::write_ply(w, splats.into_iter()))?;
                 }
@@ -156,18 +156,6 @@ fn rig_figures(report: &mut Report, rig: &RigEstimate) {
     }
 }
 
-fn map_figures(report: &mut Report, q: &Evaluation) {
-    report.psnr_db = q.psnr_db;
-    report.ssim = q.ssim;
-    report.psnr_heldout_db = q.psnr_heldout_db;
-    report.ssim_heldout = q.ssim_heldout;
-    report.psnr_heldout_between_db = q.psnr_heldout_between_db;
-    report.psnr_heldout_fitted_db = q.psnr_heldout_fitted_db;
-    report.ssim_heldout_fitted = q.ssim_heldout_fitted;
-    report.psnr_heldout_aligned_db = q.psnr_heldout_aligned_db;
-    report.psnr_heldout_by_camera_db = q.psnr_heldout_by_camera_db.to_vec();
-}
-
 type Measured = (Evaluation, Vec<Panel>, Vec<Gaussian>);
 
 /// The map's figures, pictures of it, and its Gaussians as viewers show them: in the exposure of most images.
@@ -241,11 +229,11 @@ pub fn seven_lines(r: &Report, out: &OutputDir) -> String {
         count(r.splats),
         count(r.iterations),
         or_dash(r.iteration_ms_p50, 1, "ms"),
-        or_dash(r.psnr_db, 2, "dB"),
-        r.ssim.map_or_else(|| "-".to_string(), |v| format!("{v:.3}")),
-        or_dash(r.psnr_heldout_db, 2, "dB"),
-        or_dash(r.psnr_heldout_fitted_db, 2, "dB"),
-        or_dash(r.psnr_heldout_aligned_db, 2, "dB"),
+        or_dash(r.quality.psnr_db, 2, "dB"),
+        r.quality.ssim.map_or_else(|| "-".to_string(), |v| format!("{v:.3}")),
+        or_dash(r.quality.psnr_heldout_db, 2, "dB"),
+        or_dash(r.quality.psnr_heldout_fitted_db, 2, "dB"),
+        or_dash(r.quality.psnr_heldout_aligned_db, 2, "dB"),
         bytes(r.gpu_bytes),
         bytes(r.rss_peak_bytes),
         count(r.heap_after_seal),

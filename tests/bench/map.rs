@@ -127,8 +127,8 @@ pub fn run(args: &Args) -> Result<(), Fault> {
             variant.name,
             report.splats.unwrap_or(0),
             report.iterations.unwrap_or(0),
-            db(report.psnr_db),
-            db(report.psnr_heldout_db)
+            db(report.quality.psnr_db),
+            db(report.quality.psnr_heldout_db)
         );
         Ok(Row { variant, cap, report })
     };
@@ -176,8 +176,10 @@ fn page(sweep: &Sweep) -> Page {
     let (dataset, device) = (first.and_then(|r| r.dataset.clone()), first.and_then(|r| r.device.clone()));
     let scale = first.and_then(|r| r.scale);
     let named = |v: &Option<String>| v.clone().unwrap_or("-".into());
-    let psnr: [(&str, Get); 2] = [("training", |r| r.report.psnr_db), ("held out", |r| r.report.psnr_heldout_db)];
-    let ssim: [(&str, Get); 2] = [("training", |r| r.report.ssim), ("held out", |r| r.report.ssim_heldout)];
+    let psnr: [(&str, Get); 2] =
+        [("training", |r| r.report.quality.psnr_db), ("held out", |r| r.report.quality.psnr_heldout_db)];
+    let ssim: [(&str, Get); 2] =
+        [("training", |r| r.report.quality.ssim), ("held out", |r| r.report.quality.ssim_heldout)];
     let mut charts = vec![];
     for line in LINES {
         let own = |what: &[(&'static str, Get)]| -> Vec<(&str, Vec<(f64, f64)>)> {
@@ -187,7 +189,7 @@ fn page(sweep: &Sweep) -> Page {
         charts.push(against_cap(&format!("SSIM: {}", line.name), "SSIM", own(&ssim)));
     }
     let lines = |get: Get| LINES.iter().map(|line| (line.name, along(line, get, sweep))).collect();
-    charts.push(against_cap("Training PSNR by method", "PSNR, dB", lines(|r| r.report.psnr_db)));
+    charts.push(against_cap("Training PSNR by method", "PSNR, dB", lines(|r| r.report.quality.psnr_db)));
     charts.push(against_cap("Gaussians used", "Gaussians", lines(|r| r.report.splats.map(|n| n as f64))));
     charts.push(over_time(sweep));
     Page {
@@ -228,11 +230,11 @@ fn table(sweep: &Sweep) -> Table {
         count("keyframes") => r.1.report.keyframes,
         count("steps") => r.1.report.iterations,
         number("step", "ms", 2) => r.1.step_ms(sweep.seconds),
-        number("PSNR", "dB", 2) => r.1.report.psnr_db,
-        number("SSIM", "", 3) => r.1.report.ssim,
-        number("held out", "dB", 2) => r.1.report.psnr_heldout_db,
-        number("held out SSIM", "", 3) => r.1.report.ssim_heldout,
-        number("held out pose refined", "dB", 2) => r.1.report.psnr_heldout_aligned_db,
+        number("PSNR", "dB", 2) => r.1.report.quality.psnr_db,
+        number("SSIM", "", 3) => r.1.report.quality.ssim,
+        number("held out", "dB", 2) => r.1.report.quality.psnr_heldout_db,
+        number("held out SSIM", "", 3) => r.1.report.quality.ssim_heldout,
+        number("held out pose refined", "dB", 2) => r.1.report.quality.psnr_heldout_aligned_db,
         mebibytes("GPU memory") => r.1.report.gpu_bytes,
     ])
 }
@@ -272,8 +274,8 @@ fn conclusion(sweep: &Sweep) -> String {
         low.cap,
         high.cap,
         sweep.seconds,
-        change(|r| r.report.psnr_db),
-        change(|r| r.report.psnr_heldout_db),
+        change(|r| r.report.quality.psnr_db),
+        change(|r| r.report.quality.psnr_heldout_db),
         low.report.splats.unwrap_or(0),
         high.report.splats.unwrap_or(0)
     )

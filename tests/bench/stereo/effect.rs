@@ -55,7 +55,7 @@ impl Effect {
         let db = |v: Option<f64>| v.map_or("-".to_string(), |v| format!("{v:.2} dB"));
         let [a, b] = AT_S.map(|t| db(self.psnr_at(t)));
         let r = &self.report;
-        let (end, held_out, anchors) = (db(r.psnr_db), db(r.psnr_heldout_db), r.anchors.unwrap_or(0));
+        let (end, held_out, anchors) = (db(r.quality.psnr_db), db(r.quality.psnr_heldout_db), r.anchors.unwrap_or(0));
         format!(
             "map with {:<9} {a} at 10 s, {b} at 30 s, {end} at the end, held out {held_out}, {anchors} anchors",
             self.method
