@@ -7,7 +7,7 @@ use std::time::Instant;
 use stipple::config::Board;
 use stipple::map::{Keyframe, Mapper, Panel, StepKind};
 use stipple_drivers::replay::{OpenOptions, Recording};
-use stipple_drivers::sim::{write_euroc_colour, Scenario, Sim};
+use stipple_drivers::sim::{write_euroc, Scenario, Sim};
 use stipple_drivers::types::pose_at;
 use stipple_drivers::{Frames, Span};
 
@@ -22,7 +22,7 @@ fn board(overrides: &[&str]) -> Board {
 fn written(dir: &Path) {
     let mut scenario = Scenario::named("demo").unwrap();
     (scenario.image_divisor, scenario.rate_hz, scenario.duration) = (4, 2.5, Span::from_secs(3.6));
-    write_euroc_colour(&mut Sim::new(&scenario).unwrap(), dir, |_, _| {}).unwrap();
+    write_euroc(&mut Sim::new(&scenario).unwrap(), dir, scenario.calibration.cameras.len(), |_, _| {}).unwrap();
 }
 
 /// PSNR of each channel of a rendering against each of what was seen.

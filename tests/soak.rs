@@ -294,7 +294,7 @@ fn a_run_of_minutes_takes_no_more_memory_files_and_threads() {
     let (data, out) = (dir.path().join("flight"), dir.path().join("out"));
     let mut scenario = Scenario::named("demo").unwrap();
     (scenario.image_divisor, scenario.duration) = (4, Span::from_secs(60.0 * minutes));
-    write_euroc(&mut Sim::new(&scenario).unwrap(), &data, |_, _| {}).unwrap();
+    write_euroc(&mut Sim::new(&scenario).unwrap(), &data, 0, |_, _| {}).unwrap();
     let mut child = Command::new(env!("CARGO_BIN_EXE_stipple"))
         .current_dir(env!("CARGO_MANIFEST_DIR"))
         .args(["run", "board-configs/lavapipe.toml", "--set", "map.scale=1"])

@@ -307,7 +307,7 @@ fn a_written_run_is_whole_and_can_be_flown_again() {
     let scenario = Scenario { duration: Span::from_secs(0.8), image_divisor: 4, ..Scenario::named("hover").unwrap() };
     let mut sim = Sim::new(&scenario).unwrap();
     let mut told = 0;
-    write_euroc(&mut sim, &dir, |done, all| {
+    write_euroc(&mut sim, &dir, 0, |done, all| {
         assert!(done == told + 1 && all == sim_frames(0.8));
         told = done;
     })
@@ -343,7 +343,7 @@ fn a_written_run_is_whole_and_can_be_flown_again() {
     read.reader().read(16, &mut shown).unwrap();
     sim.render(16, &mut made);
     assert!(shown.t == made.t && shown.images == made.images);
-    let refused = write_euroc(&mut sim, &dir, |_, _| {}).unwrap_err();
+    let refused = write_euroc(&mut sim, &dir, 0, |_, _| {}).unwrap_err();
     assert_eq!(refused.kind, FaultKind::NoOutput);
 }
 
@@ -359,7 +359,7 @@ fn a_failed_write_leaves_nothing_behind() {
     let scenario = Scenario { duration: Span::from_secs(0.6), image_divisor: 4, ..Scenario::named("static").unwrap() };
     let mut sim = Sim::new(&scenario).unwrap();
     for dir in [blocked.clone(), blocked.join("below")] {
-        assert_eq!(write_euroc(&mut sim, &dir, |_, _| {}).unwrap_err().kind, FaultKind::NoOutput);
+        assert_eq!(write_euroc(&mut sim, &dir, 0, |_, _| {}).unwrap_err().kind, FaultKind::NoOutput);
     }
     assert_eq!(std::fs::read_dir(parent.path()).unwrap().count(), 1);
 }
@@ -407,7 +407,7 @@ fn a_time_offset_moves_stamps_and_not_images_and_its_calibration_moves_them_back
 
     let dir = tempfile::tempdir().unwrap();
     let (out, chain) = (dir.path().join("late"), dir.path().join("camchain.yaml"));
-    write_euroc(&mut late, &out, |_, _| {}).unwrap();
+    write_euroc(&mut late, &out, 0, |_, _| {}).unwrap();
     let mut text = String::new();
     for (k, c) in exact.calibration().cameras.iter().enumerate() {
         let m = c.camera;
@@ -447,7 +447,7 @@ fn a_written_rolling_shutter_comes_back_with_its_middle_rows_at_the_stamp() {
     let mut sim = Sim::new(&scenario).unwrap();
     let dir = tempfile::tempdir().unwrap();
     let out = dir.path().join("rolling");
-    write_euroc(&mut sim, &out, |_, _| {}).unwrap();
+    write_euroc(&mut sim, &out, 0, |_, _| {}).unwrap();
     let read = Recording::open(&out, &OpenOptions::default()).unwrap();
     assert!(read.calibration.cameras.iter().all(|c| c.readout == Span(20_000_000)));
     assert_eq!(read.frames[3].t, sim.stamp(3));

@@ -2,7 +2,7 @@
 
 use super::{rendering_progress, seconds};
 use std::path::PathBuf;
-use stipple_drivers::sim::{rig_named, write_euroc, write_euroc_colour, Scenario, Sim, RIGS};
+use stipple_drivers::sim::{rig_named, write_euroc, Scenario, Sim, RIGS};
 use stipple_drivers::{Fault, FaultKind, Span};
 
 #[derive(clap::Args)]
@@ -100,8 +100,8 @@ pub fn sim(args: &Args) -> Result<(), Fault> {
     }
     args.defects.apply(&mut scenario)?;
     let mut sim = Sim::new(&scenario)?;
-    let write = if args.colour { write_euroc_colour } else { write_euroc };
-    write(&mut sim, &args.out, rendering_progress)?;
+    let colours = if args.colour { sim.calibration().cameras.len() } else { 0 };
+    write_euroc(&mut sim, &args.out, colours, rendering_progress)?;
     crate::run::status::print_out(args.out.display());
     Ok(())
 }

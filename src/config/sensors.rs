@@ -179,11 +179,8 @@ impl ImuConfig {
 
     /// The first key that is wrong, and why.
     pub(super) fn wrong(&self, gpio: &GpioConfig) -> Option<Wrong> {
-        let named = (
-            !self.device.is_empty(),
-            "imu.device",
-            "must say where imu.chip is: I2C adapter, spidev node or IIO device",
-        );
+        let somewhere = "must say where imu.chip is: I2C adapter, spidev node or IIO device";
+        let named = (!self.device.is_empty(), "imu.device", somewhere);
         let rules: &[(bool, &'static str, &str)] = match self.chip.as_str() {
             "" => &[],
             IIO => &[

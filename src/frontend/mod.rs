@@ -405,7 +405,7 @@ impl Frontend {
         for corner in corners {
             let px = [corner.x as f32, corner.y as f32];
             take_stack(&mut self.scratch, &self.now.levels(camera), px, 0..FINE_LEVELS);
-            let sharp = self.scratch[0].usable() && self.scratch[0].sigma_px() < SIGMA_MAX_PX;
+            let sharp = self.scratch[0].usable() && self.scratch[0].sigma_px < SIGMA_MAX_PX;
             let known = self.rig.bearing(camera, px).is_some();
             let near = || self.points.is_near(self.points.list.len(), camera, px, self.spacing_px);
             if !sharp || !known || near() {

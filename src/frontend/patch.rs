@@ -85,8 +85,8 @@ pub struct Template {
     gain: [[f32; N]; 3],
     /// Σ(value - 1)²
     contrast: f32,
-    /// See `sigma_px`.
-    sigma_px: f32,
+    /// Standard deviation of the aligned place for one grey level of image noise, px.
+    pub sigma_px: f32,
     /// Bit i: offset i was inside the image. 0: not usable.
     inside: u64,
 }
@@ -101,11 +101,6 @@ impl Template {
     /// Whether there was enough contrast to align to.
     pub fn usable(&self) -> bool {
         self.inside != 0
-    }
-
-    /// Standard deviation of the aligned place for one grey level of image noise, px.
-    pub fn sigma_px(&self) -> f32 {
-        self.sigma_px
     }
 
     /// Takes the patch at a pixel of a level.

@@ -73,18 +73,6 @@ impl System {
         self.h[i * self.capacity + j] += x;
     }
 
-    /// Adds a product of rows `[A | b]` (lower triangle, see `qr::Rows::gram`) whose columns, from
-    /// `first`, belong to `parts`, ascending, with b after them.
-    pub fn add_gram(&mut self, gram: &[f64], stride: usize, first: usize, parts: &[Columns]) {
-        add_gram(self, gram, stride, first, parts);
-    }
-
-    /// Eliminates the first `m` variables in place: the trailing block of (H, b) becomes the Schur
-    /// complement, the leading columns hold L and the leading diagonal D (0 where skipped).
-    pub fn eliminate(&mut self, m: usize) {
-        eliminate(self, m);
-    }
-
     /// Scales the diagonal to one and factors, for `substitute`. Destroys the system.
     fn factor(&mut self) {
         let (n, c) = (self.dim, self.capacity);
@@ -100,7 +88,7 @@ impl System {
         // The scales are kept where b was; elimination mixes b, so it gets them back.
         let mut scales = [0.0; crate::limits::WINDOW_DIM];
         scales[..n].copy_from_slice(&self.b[..n]);
-        self.eliminate(n);
+        eliminate(self, n);
         self.b[..n].copy_from_slice(&scales[..n]);
     }
 
@@ -171,8 +159,9 @@ impl System {
 }
 
 wide! {
-    /// Eliminates the first `m` variables.
-    fn eliminate<'a>(system: &'a mut System, m: usize) -> () {
+    /// Eliminates the first `m` variables in place: the trailing block of (H, b) becomes the Schur
+    /// complement, the leading columns hold L and the leading diagonal D (0 where skipped).
+    pub fn eliminate<'a>(system: &'a mut System, m: usize) -> () {
         let (n, c) = (system.dim, system.capacity);
         let least = PIVOT_EPSILONS * f64::EPSILON;
         for i in 0..n {
@@ -207,8 +196,9 @@ wide! {
 }
 
 wide! {
-    /// Adds a product of rows.
-    fn add_gram<'a>(
+    /// Adds a product of rows `[A | b]` (lower triangle, see `qr::Rows::gram`) whose columns, from
+    /// `first`, belong to `parts`, ascending, with b after them.
+    pub fn add_gram<'a>(
         system: &'a mut System,
         gram: &'a [f64],
         stride: usize,
@@ -283,7 +273,7 @@ mod tests {
         let s = example(12);
         let x = solved(&s);
         let mut e = s.clone();
-        e.eliminate(5);
+        eliminate(&mut e, 5);
         let mut kept = System::new(7);
         kept.clear(7);
         for i in 0..7 {
@@ -321,7 +311,7 @@ mod tests {
         let mut s = System::new(8);
         s.clear(8);
         // The first column is left out, the second goes to 1, the others to 4 and 5.
-        s.add_gram(&gram, stride, 1, &[Columns { at: 1, len: 1 }, Columns { at: 4, len: 2 }]);
+        add_gram(&mut s, &gram, stride, 1, &[Columns { at: 1, len: 1 }, Columns { at: 4, len: 2 }]);
         let dot = |i: usize, j: usize| (0..5).map(|r| rows.row(r)[i] * rows.row(r)[j]).sum::<f64>();
         for (i, a) in [(1, 1), (4, 2), (5, 3)] {
             assert!((s.b[i] - dot(a, 4)).abs() < 1e-14);

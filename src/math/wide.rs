@@ -4,9 +4,9 @@
 /// runs the widest there is. What it calls must be `#[inline(always)]`, or it is compiled for the target's alone.
 /// Products are never fused with sums, so the result is the same to the bit on every width.
 macro_rules! wide {
-    ($(#[$meta:meta])* fn $name:ident<$l:lifetime>($($arg:ident: $of:ty),+ $(,)?) -> $out:ty $body:block) => {
+    ($(#[$meta:meta])* $seen:vis fn $name:ident<$l:lifetime>($($arg:ident: $of:ty),+ $(,)?) -> $out:ty $body:block) => {
         $(#[$meta])*
-        fn $name<$l>($($arg: $of),+) -> $out {
+        $seen fn $name<$l>($($arg: $of),+) -> $out {
             struct Call<$l> { $($arg: $of),+ }
             impl<$l> pulp::NullaryFnOnce for Call<$l> {
                 type Output = $out;

@@ -235,12 +235,8 @@ fn thinned(points: &[(f64, f64)], path: bool) -> Vec<(f64, f64)> {
         return finite;
     }
     if path {
-        return finite
-            .iter()
-            .copied()
-            .step_by(finite.len().div_ceil(POINTS_MAX))
-            .chain(finite.last().copied())
-            .collect();
+        let step = finite.len().div_ceil(POINTS_MAX);
+        return finite.iter().step_by(step).chain(finite.last()).copied().collect();
     }
     let extremes = |stretch: &[(f64, f64)]| {
         let low = (0..stretch.len()).min_by(|&a, &b| stretch[a].1.total_cmp(&stretch[b].1)).unwrap_or(0);

@@ -9,7 +9,7 @@ use super::panel::Picture;
 use super::report::{KernelTime, Report, GOOD_DB};
 use crate::map::spread;
 use glam::DVec3;
-use std::fmt::Write;
+use std::fmt::{Display, Write};
 use std::io;
 use stipple_drivers::{Nanos, TimedPose};
 
@@ -154,14 +154,13 @@ fn table_of_rig(report: &Report) -> String {
     for (name, v, s) in scales {
         rows.extend(pair(v, s, PERCENT).map(|shown| (name.to_string(), Some(shown), "%")));
     }
-    let rows: Vec<Row> = rows.iter().map(|(name, value, unit)| (name.as_str(), value.clone(), *unit)).collect();
     if rows.is_empty() {
         return String::new();
     }
     table("Rig, over its calibration", &rows)
 }
 
-fn table(title: &str, rows: &[Row]) -> String {
+fn table<Name: Display>(title: &str, rows: &[(Name, Option<String>, &str)]) -> String {
     let mut html = format!("<table><caption>{title}</caption>");
     for (name, value, unit) in rows {
         let value = value.as_deref().unwrap_or("\u{2013}");
@@ -307,12 +306,8 @@ fn events(report: &Report, warnings: &[String]) -> String {
     } else {
         html.push_str("<table class=\"counters\">");
         for (name, n) in counted {
-            let _ = write!(
-                html,
-                "<tr><th scope=\"row\">{}</th><td>{}</td></tr>",
-                escape(&name.replace('_', " ")),
-                grouped(n)
-            );
+            let name = escape(&name.replace('_', " "));
+            let _ = write!(html, "<tr><th scope=\"row\">{name}</th><td>{}</td></tr>", grouped(n));
         }
         html.push_str("</table>");
     }

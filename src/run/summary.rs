@@ -120,12 +120,10 @@ fn track_figures(report: &mut Report, flown: &Flown) -> Vec<TimedPose> {
     report.tracking_threads = Some(run.threads);
     report.tracking_fps = run.fps();
     report.tracking_cpu_ms = run.cpu_ms();
-    report.tracking_ms_p50 = percentile(&ms, 0.5);
-    report.tracking_ms_p99 = percentile(&ms, 0.99);
-    report.frontend_ms_p50 = percentile(&run.front.ms, 0.5);
-    report.frontend_ms_p99 = percentile(&run.front.ms, 0.99);
-    report.estimator_ms_p50 = percentile(&run.back.ms, 0.5);
-    report.estimator_ms_p99 = percentile(&run.back.ms, 0.99);
+    let percentiles = |ms: &[f64]| (percentile(ms, 0.5), percentile(ms, 0.99));
+    (report.tracking_ms_p50, report.tracking_ms_p99) = percentiles(&ms);
+    (report.frontend_ms_p50, report.frontend_ms_p99) = percentiles(&run.front.ms);
+    (report.estimator_ms_p50, report.estimator_ms_p99) = percentiles(&run.back.ms);
     run.back.vio.rig().into_iter().for_each(|rig| rig_figures(report, &rig));
     report.estimator_bytes = Some(run.bytes);
     if let Some((least, median, under)) = run.back.vio.quality_summary() {

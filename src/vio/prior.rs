@@ -8,7 +8,7 @@ use super::rig::RigState;
 use super::rows::scatter;
 use super::window::{Layout, Window, MOTION_DIM, POSE_DIM};
 use crate::limits::{FRAMES, RIG_DIM, WINDOW_DIM};
-use crate::math::dense::{Columns, System};
+use crate::math::dense::{add_gram, Columns, System};
 use crate::math::qr::Rows;
 use crate::mem::List;
 
@@ -159,7 +159,7 @@ impl Prior {
             b[..n].iter_mut().zip(self.rows.row(i)).for_each(|(b, j)| *b += *j * e);
         }
         self.gram[n * self.stride..][..n].copy_from_slice(&b[..n]);
-        system.add_gram(&self.gram, self.stride, 0, &self.columns(layout));
+        add_gram(system, &self.gram, self.stride, 0, &self.columns(layout));
         cost
     }
 

@@ -1,7 +1,7 @@
 //! The rows `[J | r]` of one factor: only the columns it touches, and how they go into a system or a stack.
 
 use crate::limits::{FRAMES, OBSERVATIONS, RIG_DIM, WINDOW_DIM};
-use crate::math::dense::{Columns, System};
+use crate::math::dense::{add_gram, Columns, System};
 use crate::math::qr::Rows;
 use crate::mem::List;
 
@@ -57,7 +57,7 @@ impl FactorRows {
     /// Adds the square of the rows from `first`, the factor's own columns left out.
     pub fn add_to(&mut self, first: usize, system: &mut System) {
         let stride = self.rows.gram(first, &mut self.gram);
-        system.add_gram(&self.gram, stride, self.own, &self.columns);
+        add_gram(system, &self.gram, stride, self.own, &self.columns);
     }
 
     /// Appends the rows from `first`, the factor's own columns left out; makes room when there is none.

@@ -12,7 +12,7 @@ use super::reprojection::Point;
 use super::rows::{FactorRows, PARTS_MAX, POINT_DIM, SHARED_DIM};
 use super::window::Layout;
 use crate::limits::{LANDMARKS, WINDOW_DIM};
-use crate::math::dense::{Columns, System};
+use crate::math::dense::{eliminate, Columns, System};
 use crate::mem::List;
 use glam::DVec2;
 
@@ -191,7 +191,7 @@ impl Solver {
     pub fn newest_covariance(&mut self) -> Option<Covariance> {
         let first = self.system.dim.checked_sub(15)?;
         self.factor.copy_from(&self.system);
-        self.factor.eliminate(first);
+        eliminate(&mut self.factor, first);
         let information = Mat15::from_fn(|i, j| self.factor.at(first + i, first + j));
         let covariance = information.cholesky()?.inverse();
         covariance.iter().all(|x| x.is_finite()).then(|| covariance.into())

@@ -20,7 +20,7 @@ mod write;
 pub use imu::{Bias, ImuErrors, GRAVITY};
 pub use render::Sensor;
 pub use scenario::{euroc_rig, rig_named, CameraErrors, Flight, Light, Recording, Scenario, RIGS};
-pub use write::{write_euroc, write_euroc_colour};
+pub use write::write_euroc;
 
 use crate::calibration::Calibration;
 use crate::fault::{Fault, FaultKind};

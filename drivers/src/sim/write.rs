@@ -12,21 +12,10 @@ use std::fs::{self, File};
 use std::io::{BufWriter, Write};
 use std::path::Path;
 
-/// Writes all frames; `progress` is told (frames written, frames in all). `dir` must not exist or be empty; nothing is left
-/// behind on failure.
-pub fn write_euroc(sim: &mut Sim, dir: &Path, progress: impl FnMut(usize, usize)) -> Result<(), Fault> {
-    let frames = Frames::for_rig(sim.calibration());
-    write_shaped(sim, dir, frames, progress)
-}
-
-/// Writes all frames as `write_euroc` does, with images in colour. A fault as of `write_euroc`.
-pub fn write_euroc_colour(sim: &mut Sim, dir: &Path, progress: impl FnMut(usize, usize)) -> Result<(), Fault> {
-    let frames = Frames::in_colour(sim.calibration(), sim.calibration().cameras.len());
-    write_shaped(sim, dir, frames, progress)
-}
-
-/// Writes images of the shape of `frames`.
-fn write_shaped(sim: &mut Sim, dir: &Path, frames: Frames, progress: impl FnMut(usize, usize)) -> Result<(), Fault> {
+/// Writes all frames, the first `colours` cameras in colour; `progress` is told (frames written, frames in all). `dir` must
+/// not exist or be empty; nothing is left behind on failure.
+pub fn write_euroc(sim: &mut Sim, dir: &Path, colours: usize, progress: impl FnMut(usize, usize)) -> Result<(), Fault> {
+    let frames = Frames::in_colour(sim.calibration(), colours);
     if fs::read_dir(dir).is_ok_and(|mut d| d.next().is_some()) || dir.is_file() {
         let (place, fix) = (dir.display().to_string(), "remove it or choose another folder");
         return Err(Fault::new(FaultKind::NoOutput, place, "exists and is not an empty folder", fix));

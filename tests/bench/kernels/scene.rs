@@ -140,7 +140,7 @@ mod tests {
         let mut scenario = Scenario::named("demo").unwrap();
         (scenario.image_divisor, scenario.duration) = (4, Span::from_secs(1.0));
         let dir = tempfile::tempdir().unwrap();
-        write_euroc(&mut Sim::new(&scenario).unwrap(), dir.path(), |_, _| {}).unwrap();
+        write_euroc(&mut Sim::new(&scenario).unwrap(), dir.path(), 0, |_, _| {}).unwrap();
         let config = StereoConfig { method: StereoMethod::Sgm, disparities: 32, ..StereoConfig::default() };
         let scene = Scene::recorded(dir.path(), 2000, &config, &GpuConfig::default()).unwrap();
         assert_eq!((scene.splats.len(), scene.image.len()), (2000, 188 * 120));
