@@ -20,8 +20,10 @@ pub fn footprint(calibration: &Calibration, board: &Board, records: bool) -> Res
     f.build("queues: frames and samples", || Mailbox::new(packets(board.frontend.threads), calibration, colours));
     OdometryRun::measured(calibration, board, POSES_KEPT, &mut f)?;
     if board.map.enabled {
+        // First, since it refuses a rig without the cameras that keyframes have images of.
+        let mapper = Mapper::footprint(calibration, board)?;
         f.build("queues: keyframes", || KeyframeQueue::new(calibration, board));
-        f.extend(Mapper::footprint(calibration, board)?);
+        f.extend(mapper);
     }
     if records {
         let shape = Frames::in_colour(calibration, colours);
