@@ -22,14 +22,12 @@ pub struct RigGeometry {
 
 impl RigGeometry {
     pub fn new(calibration: &Calibration, epipolar_max: f64) -> RigGeometry {
+        let body_from_cam: Vec<Pose> = calibration.cameras.iter().map(|c| c.body_from_cam).collect();
+        let from_all = |to: &Pose| body_from_cam.iter().map(|from| to.inverse() * *from).collect::<Vec<_>>();
         RigGeometry {
             cameras: calibration.cameras.iter().map(|c| c.camera).collect(),
-            between: calibration
-                .cameras
-                .iter()
-                .flat_map(|to| calibration.cameras.iter().map(|from| to.body_from_cam.inverse() * from.body_from_cam))
-                .collect(),
-            body_from_cam: calibration.cameras.iter().map(|c| c.body_from_cam).collect(),
+            between: body_from_cam.iter().flat_map(from_all).collect(),
+            body_from_cam,
             epipolar_max,
         }
     }

@@ -143,16 +143,9 @@ pub fn panels(scene: &mut Scene, count: usize) -> Result<Vec<Panel>, GpuError> {
         let observed = (0..n).flat_map(|k| planes.iter().map(move |p| p.pixels[k])).collect();
         let rendered = (0..n).flat_map(|k| r.colour[k..].iter().step_by(n).copied()).collect();
         let kind = if scene.store.get(i).held_out { "_heldout" } else { "" };
-        panels.push(Panel {
-            name: format!("{:04}{kind}", scene.store.get(i).id),
-            width: r.width,
-            height: r.height,
-            rendered,
-            depth: r.depth.clone(),
-            observed,
-            valid,
-            psnr_db,
-        });
+        let name = format!("{:04}{kind}", scene.store.get(i).id);
+        let (width, height, depth) = (r.width, r.height, r.depth.clone());
+        panels.push(Panel { name, width, height, observed, rendered, depth, valid, psnr_db });
     }
     Ok(panels)
 }

@@ -30,15 +30,8 @@ pub struct Columns {
 
 impl System {
     pub fn new(capacity: usize) -> System {
-        let zeros = |n: usize| vec![0.0; n];
-        System {
-            h: zeros(capacity * capacity),
-            b: zeros(capacity),
-            scale: zeros(capacity),
-            column: zeros(capacity),
-            capacity,
-            dim: 0,
-        }
+        let (h, zeros) = (vec![0.0; capacity * capacity], || vec![0.0; capacity]);
+        System { h, b: zeros(), scale: zeros(), column: zeros(), capacity, dim: 0 }
     }
 
     /// Sets the dimension and zeroes.

@@ -48,13 +48,8 @@ pub fn trajectory_error(estimated: &[TimedPose], truth: &[TimedPose]) -> Option<
     let errors: Vec<(Nanos, f64)> =
         pairs.iter().map(|&(t, e, g)| (t, truth_from_estimate.transform(e).distance(g))).collect();
     let (rte_1s_m, rpe_deg) = relative_error(estimated, truth, DELTA).unzip();
-    Some(TrajectoryError {
-        ate_rmse_m: rms(errors.iter().map(|e| e.1)).expect("there are at least PAIRS_MIN errors"),
-        rte_1s_m,
-        rpe_deg,
-        truth_from_estimate,
-        errors,
-    })
+    let ate_rmse_m = rms(errors.iter().map(|e| e.1)).expect("there are at least PAIRS_MIN errors");
+    Some(TrajectoryError { ate_rmse_m, rte_1s_m, rpe_deg, truth_from_estimate, errors })
 }
 
 /// The rigid transform that minimises Σ|T a - b|² over pairs (a, b).

@@ -143,13 +143,8 @@ pub struct ImuGate {
 
 impl ImuGate {
     pub fn new(imu: &ImuCalibration) -> ImuGate {
-        ImuGate {
-            stamps: Stamps::default(),
-            range: imu.range,
-            last: None,
-            repeated: 0,
-            spikes: Spikes::new(imu.rate_hz),
-        }
+        let spikes = Spikes::new(imu.rate_hz);
+        ImuGate { stamps: Stamps::default(), range: imu.range, last: None, repeated: 0, spikes }
     }
 
     /// Takes a reading that arrived at `now` and gives what is believed, in order: nothing, this one, or the one that was

@@ -7,7 +7,7 @@ use crate::gpu::GpuError;
 use crate::map::{Evaluation, Gaussian, Mapper, Panel};
 use crate::mem;
 use crate::output::html::{write_html, Evidence};
-use crate::output::metrics::{percentile, trajectory_error, TrajectoryError};
+use crate::output::metrics::{percentile, trajectory_error};
 use crate::output::panel::{panel, Picture};
 use crate::output::report::{seconds_to, ExtrinsicsFound, KernelTime, Report, GOOD_DB};
 use crate::output::{atomically, ply, trajectory, OutputDir};
@@ -86,7 +86,10 @@ pub fn conclude(title: Title, mut flown: Flown, out: &OutputDir) -> Result<Repor
     if let Some(run) = flown.tracker.odometry() {
         report.set_health(run.back.vio.health_frames());
     }
-    write_files(&report, &flown, &estimated, &title.truth, error.as_ref(), &panels, out)?;
+    let tracking_ms: &[(Nanos, f64)] = flown.tracker.odometry().map_or(&[], |run| &run.back.frame_ms);
+    let (estimated, truth, error, warnings) = (&estimated[..], &title.truth[..], error.as_ref(), &flown.warnings[..]);
+    let evidence = Evidence { estimated, truth, error, tracking_ms, pictures: &[], warnings };
+    write_files(&report, &evidence, &panels, out)?;
     Ok(report)
 }
 
@@ -166,25 +169,16 @@ fn measure(mapper: &mut Mapper) -> Result<Measured, GpuError> {
     Ok((quality, panels, splats))
 }
 
-fn write_files(
-    report: &Report,
-    flown: &Flown,
-    estimated: &[TimedPose],
-    truth: &[TimedPose],
-    error: Option<&TrajectoryError>,
-    panels: &[Panel],
-    out: &OutputDir,
-) -> Result<(), Fault> {
-    out.write("trajectory.tum", |w| trajectory::write_tum(w, estimated))?;
+/// Writes the files of DIR; `evidence` is without its pictures, which are made of `panels`.
+fn write_files(report: &Report, evidence: &Evidence, panels: &[Panel], out: &OutputDir) -> Result<(), Fault> {
+    out.write("trajectory.tum", |w| trajectory::write_tum(w, evidence.estimated))?;
     let pictures: Vec<(String, Picture)> = panels.iter().map(|p| (p.name.clone(), panel(p))).collect();
     if !pictures.is_empty() {
         out.replace_folder("renders", |dir| {
             pictures.iter().try_for_each(|(name, p)| atomically(&dir.join(format!("{name}.png")), |w| p.write_png(w)))
         })?;
     }
-    let tracking_ms: &[(Nanos, f64)] = flown.tracker.odometry().map_or(&[], |run| &run.back.frame_ms);
-    let shown: Vec<(String, Picture)> = pictures.iter().map(|(n, p)| (n.clone(), p.shrunk(1600))).collect();
-    let evidence = Evidence { estimated, truth, error, tracking_ms, pictures: &shown, warnings: &flown.warnings };
+    let evidence = Evidence { pictures: &pictures, ..*evidence };
     out.write("report.html", |w| write_html(w, report, &evidence))?;
     // Last: whoever finds report.json finds everything it speaks of.
     out.write("report.json", |w| report.write_json(w))
