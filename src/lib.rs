@@ -49,16 +49,27 @@ pub mod mem;
 
 cfg_if::cfg_if! {
     if #[cfg(feature = "instruments")] {
+        #[doc(hidden)]
         pub mod config;
+        #[doc(hidden)]
         pub mod counters;
+        #[doc(hidden)]
         pub mod frontend;
+        #[doc(hidden)]
         pub mod gpu;
+        #[doc(hidden)]
         pub mod limits;
+        #[doc(hidden)]
         pub mod map;
+        #[doc(hidden)]
         pub mod math;
+        #[doc(hidden)]
         pub mod output;
+        #[doc(hidden)]
         pub mod run;
+        #[doc(hidden)]
         pub mod stereo;
+        #[doc(hidden)]
         pub mod vio;
     } else {
         mod config;
