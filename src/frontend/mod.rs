@@ -155,7 +155,7 @@ impl Frontend {
         std::mem::swap(&mut self.now, &mut self.before);
         self.now.frames = frames.clone();
         self.frame += 1;
-        self.look();
+        self.build_pyramids();
         let median = self.median_inverse_depth();
         self.follow(prediction, median);
         let median = self.median_inverse_depth();
@@ -175,7 +175,7 @@ impl Frontend {
     }
 
     /// Takes the images that are of their camera's size; the cameras of the others lose all their views.
-    fn look(&mut self) {
+    fn build_pyramids(&mut self) {
         let FramePyramids { frames, pyramids } = &mut self.now;
         self.stats.frontend_images_refused += frames.images.len().saturating_sub(pyramids.len()) as u64;
         for (camera, pyramid) in pyramids.iter_mut().enumerate() {

@@ -82,7 +82,7 @@ impl<K> Kernel<K> {
     }
 }
 
-pub(super) struct Pipeline {
+pub(super) struct ComputePipeline {
     pub name: &'static str,
     pub raw: vk::Pipeline,
     pub layout: vk::PipelineLayout,
@@ -97,7 +97,7 @@ pub(super) struct Pipeline {
 /// All pipelines, and the descriptor sets made for them so far.
 pub(super) struct Pipelines {
     device: Arc<Device>,
-    list: Vec<Pipeline>,
+    list: Vec<ComputePipeline>,
     pool: vk::DescriptorPool,
     sets: HashMap<SetKey, vk::DescriptorSet>,
 }
@@ -115,7 +115,7 @@ impl Pipelines {
         Ok(Pipelines { device: device.clone(), list: Vec::new(), pool, sets: HashMap::with_capacity(SETS_MAX) })
     }
 
-    pub fn get(&self, index: u32) -> &Pipeline {
+    pub fn get(&self, index: u32) -> &ComputePipeline {
         &self.list[index as usize]
     }
 
@@ -146,7 +146,7 @@ impl Pipelines {
             )));
         }
         // Filled step by step: a failure half-way drops what is there through `Pipelines`.
-        self.list.push(Pipeline {
+        self.list.push(ComputePipeline {
             name: variant.name,
             raw: vk::Pipeline::null(),
             layout: vk::PipelineLayout::null(),
@@ -219,7 +219,7 @@ impl Pipelines {
     }
 }
 
-impl Pipeline {
+impl ComputePipeline {
     fn build(
         &mut self,
         device: &Device,

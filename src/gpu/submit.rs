@@ -13,7 +13,7 @@
 use super::device::{boot, Device};
 use super::kernel::Pipelines;
 use super::memory::{report_offset, Backed, Range};
-use super::pieces::{axis, Pace};
+use super::pieces::{axis, PieceTiming};
 use super::record::{Command, Recorder, Work};
 use super::{GpuError, COMMANDS_MAX};
 use ash::vk;
@@ -90,7 +90,7 @@ pub(super) struct Submitter {
     /// Row of each kernel, by index.
     rows: Vec<usize>,
     /// How long a workgroup of each row takes.
-    paces: Vec<Pace>,
+    paces: Vec<PieceTiming>,
     /// When the host last saw a part end.
     seen: Instant,
     /// Time of the last whole recording.
@@ -172,7 +172,7 @@ impl Submitter {
 
     fn row(&mut self, name: &'static str) -> usize {
         self.timings.push(Timing { name, count: 0, total_ms: 0.0, last_ms: 0.0 });
-        self.paces.push(Pace::default());
+        self.paces.push(PieceTiming::default());
         self.timings.len() - 1
     }
 

@@ -14,7 +14,7 @@
 //! important, if the board lets.
 
 use super::cameras::RectifiedPair;
-use super::coverage::{Coverage, Seen};
+use super::coverage::{Coverage, KeyframeView};
 use super::densify::{densify, mean};
 use super::diffusion::Diffusion;
 use super::keyframes::Keyframe;
@@ -213,7 +213,7 @@ impl Anchors {
         let depth = self.pair.as_ref().map_or(&depth.metres, |pair| &pair.distance);
         let planes = scene.store.planes(index);
         let (valid, rendered, exposure) = (&scene.cameras[0].valid, &scene.rendered, target.exposure);
-        let seen = Seen { planes, valid, depth, rendered, exposure, view };
+        let seen = KeyframeView { planes, valid, depth, rendered, exposure, view };
         densify(&seen, similarity, wanted, diffusion, newcomers, &scene.counters);
         let splats = newcomers.iter().map(|s| s.gaussian(planes, target.exposure));
         let added = scene.pipeline.pool.append(&mut scene.gpu, splats)?;
@@ -269,9 +269,9 @@ fn seen<'a>(
     view: &View,
     valid: &'a [u8],
     depth: &'a [f32],
-) -> Seen<'a> {
+) -> KeyframeView<'a> {
     let (planes, exposure) = (planes(&scene.store, pair, index), scene.store.exposure(index));
-    Seen { planes, valid, depth, rendered: &scene.rendered, exposure, view: *view }
+    KeyframeView { planes, valid, depth, rendered: &scene.rendered, exposure, view: *view }
 }
 
 /// Median of the pixels that have depth, by counting them in 256 bins of 1/depth; allocates nothing.

@@ -7,7 +7,7 @@ use stipple_drivers::Image;
 
 /// A keyframe's picture, its depth, and the rendering of the map from the same place before the keyframe adds to it.
 #[derive(Clone, Copy)]
-pub struct Seen<'a> {
+pub struct KeyframeView<'a> {
     /// Grey, or red, green and blue.
     pub planes: &'a [Image],
     /// Zero where a pixel does not count.
@@ -20,7 +20,7 @@ pub struct Seen<'a> {
     pub view: View,
 }
 
-impl Seen<'_> {
+impl KeyframeView<'_> {
     pub fn width(&self) -> usize {
         self.planes[0].width
     }
@@ -45,7 +45,7 @@ pub struct Coverage {
 }
 
 impl Coverage {
-    pub fn new(seen: &Seen, alpha_min: f64, error_max: f64) -> Coverage {
+    pub fn new(seen: &KeyframeView, alpha_min: f64, error_max: f64) -> Coverage {
         let (mut uncovered, mut mismatched, mut n) = (0u32, 0u32, 0u32);
         for i in (0..seen.valid.len()).filter(|&i| seen.valid[i] != 0) {
             n += 1;
@@ -83,9 +83,9 @@ pub mod tests {
         Rendered { alpha: alpha.to_vec(), ..Rendered::new(W, H, 1) }
     }
 
-    pub fn seen<'a>(image: &'a Image, depth: &'a [f32], rendered: &'a Rendered) -> Seen<'a> {
+    pub fn seen<'a>(image: &'a Image, depth: &'a [f32], rendered: &'a Rendered) -> KeyframeView<'a> {
         let planes = std::slice::from_ref(image);
-        Seen { planes, valid: &[1; W * H], depth, rendered, exposure: Exposure::default(), view: view() }
+        KeyframeView { planes, valid: &[1; W * H], depth, rendered, exposure: Exposure::default(), view: view() }
     }
 
     #[test]
@@ -99,11 +99,11 @@ pub mod tests {
         assert_eq!(Coverage::new(&v, 0.05, 0.25), Coverage { uncovered: 3.0 / 8.0, mismatched: 1.0 / 8.0 });
         assert_eq!(Coverage::new(&v, 0.05, 0.5).mismatched, 0.0);
         // At half the gain what is seen as 100 would be 200.
-        let dim = Seen { exposure: Exposure { gain: 0.5, offset: 0.0 }, ..v };
+        let dim = KeyframeView { exposure: Exposure { gain: 0.5, offset: 0.0 }, ..v };
         assert_eq!(Coverage::new(&dim, 0.05, 0.5).mismatched, 1.0 / 8.0);
         let mut half = [1; W * H];
         half[..W * H / 2].fill(0);
-        assert_eq!(Coverage::new(&Seen { valid: &half, ..dim }, 0.05, 0.25), none);
-        assert_eq!(Coverage::new(&Seen { valid: &[0; W * H], ..dim }, 0.05, 0.25), none);
+        assert_eq!(Coverage::new(&KeyframeView { valid: &half, ..dim }, 0.05, 0.25), none);
+        assert_eq!(Coverage::new(&KeyframeView { valid: &[0; W * H], ..dim }, 0.05, 0.25), none);
     }
 }

@@ -5,7 +5,7 @@
 //! as the distance to the nearest of the other newcomers. A fisheye's rim, which no pair sees, gets none until it is
 //! rendered: depth carried over to it from the nearest matches would hide what is to come.
 
-use super::coverage::Seen;
+use super::coverage::KeyframeView;
 use super::diffusion::Diffusion;
 use super::seeds::{Seed, SPACING_PX, SPREAD};
 use crate::counters::Counters;
@@ -27,7 +27,7 @@ pub fn mean(map: &[f32], valid: &[u8]) -> f64 {
 
 /// At most `wanted` Gaussians, and no more than `seeds` holds, where `similarity` is low and there is a depth.
 pub fn densify(
-    seen: &Seen,
+    seen: &KeyframeView,
     similarity: &[f32],
     wanted: usize,
     diffusion: &mut Diffusion,
@@ -63,7 +63,7 @@ pub fn densify(
     widen(seeds);
 }
 
-fn rendered_depth(seen: &Seen, i: usize) -> Option<f32> {
+fn rendered_depth(seen: &KeyframeView, i: usize) -> Option<f32> {
     let r = seen.rendered;
     (r.alpha[i] >= DEPTH_ALPHA && r.depth[i] > 0.0).then(|| r.depth[i])
 }

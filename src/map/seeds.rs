@@ -4,7 +4,7 @@
 //! known, so the size of a Gaussian is the distance to its neighbours. Where there is only filled-in depth, seeds are few
 //! and faint, so that others overrule them.
 
-use super::coverage::Seen;
+use super::coverage::KeyframeView;
 use super::depth_fill::DepthFill;
 use super::diffusion::Diffusion;
 use super::exposure::Exposure;
@@ -76,7 +76,13 @@ impl Seeder {
     }
 
     /// Picks seeds as dense as `whole` for a view, and answers where they are; `keep` says which of them stay.
-    pub fn seed(&mut self, seen: &Seen, whole: usize, diffusion: &mut Diffusion, counters: &Counters) -> &[[f32; 4]] {
+    pub fn seed(
+        &mut self,
+        seen: &KeyframeView,
+        whole: usize,
+        diffusion: &mut Diffusion,
+        counters: &Counters,
+    ) -> &[[f32; 4]] {
         self.fill.fill(seen.depth);
         self.set_density(seen, self.seeds_max.min(whole), diffusion);
         self.points.clear();
@@ -110,7 +116,7 @@ impl Seeder {
         &self.seeds
     }
 
-    fn put(&mut self, seen: &Seen, x: usize, y: usize, density: f32) {
+    fn put(&mut self, seen: &KeyframeView, x: usize, y: usize, density: f32) {
         let i = y * seen.width() + x;
         let matched = seen.depth[i] > 0.0;
         let z = f64::from(self.fill.metres[i]);
@@ -128,7 +134,7 @@ impl Seeder {
     }
 
     /// Seeds a pixel, so that a whole uncovered view gets `seeds` of them.
-    fn set_density(&self, seen: &Seen, seeds: usize, diffusion: &mut Diffusion) {
+    fn set_density(&self, seen: &KeyframeView, seeds: usize, diffusion: &mut Diffusion) {
         let (w, h) = (seen.width(), seen.planes[0].height);
         let px = |x: usize, y: usize| {
             let sum = seen.planes.iter().map(|p| f64::from(p.pixels[y * w + x])).sum::<f64>();

@@ -115,7 +115,7 @@ pub struct Exposure {
 
 /// A solid as seen from a view, for the tile tests.
 #[derive(Clone, Copy)]
-struct Seen {
+struct SolidInView {
     solid: u32,
     /// Nearest it can be, m.
     near: f32,
@@ -133,8 +133,8 @@ pub struct Scratch {
 
 /// The lists of one thread: all solids nearest first, and those of a tile.
 struct Lists {
-    seen: Vec<Seen>,
-    tile: Vec<Seen>,
+    seen: Vec<SolidInView>,
+    tile: Vec<SolidInView>,
 }
 
 impl Lists {
@@ -290,7 +290,7 @@ struct Tile<'a> {
 
 impl Tile<'_> {
     #[inline]
-    fn solids(&mut self) -> &[Seen] {
+    fn solids(&mut self) -> &[SolidInView] {
         if !self.listed {
             self.lists.tile(self.lens, self.rows, self.x, self.y);
             self.listed = true;
@@ -338,7 +338,7 @@ fn fill<T: Send>(
 }
 
 /// Lists all solids from a view, nearest first.
-fn look_around(room: &Room, view: View, slack: f32, seen: &mut Vec<Seen>) {
+fn look_around(room: &Room, view: View, slack: f32, seen: &mut Vec<SolidInView>) {
     seen.clear();
     for (k, s) in room.solids.iter().enumerate() {
         let c = s.centre - view.origin;
@@ -347,13 +347,13 @@ fn look_around(room: &Room, view: View, slack: f32, seen: &mut Vec<Seen>) {
         let sin = (bound / range).min(1.0);
         let cos = (1.0 - sin * sin).sqrt();
         let near = (range - bound).max(0.0);
-        seen.push(Seen { solid: k as u32, near, axis: c / range, cos, sin });
+        seen.push(SolidInView { solid: k as u32, near, axis: c / range, cos, sin });
     }
     seen.sort_unstable_by(|a, b| a.near.total_cmp(&b.near).then(a.solid.cmp(&b.solid)));
 }
 
 /// Lists the solids whose bounding sphere may meet the cone.
-fn tile_list(seen: &[Seen], cone: &Cone, view: View, slack: f32, list: &mut Vec<Seen>) {
+fn tile_list(seen: &[SolidInView], cone: &Cone, view: View, slack: f32, list: &mut Vec<SolidInView>) {
     list.clear();
     let axis = view.turn * cone.axis;
     list.extend(seen.iter().filter(|s| {
@@ -365,7 +365,7 @@ fn tile_list(seen: &[Seen], cone: &Cone, view: View, slack: f32, list: &mut Vec<
 }
 
 #[inline]
-fn meet(room: &Room, list: &[Seen], o: Vec3, d: Vec3) -> Hit {
+fn meet(room: &Room, list: &[SolidInView], o: Vec3, d: Vec3) -> Hit {
     let mut best = room.shell(o, d);
     for s in list {
         if s.near > best.0 {
@@ -418,7 +418,7 @@ fn edge_radiance(
     room: &Room,
     lens: &Lens,
     view: View,
-    list: &[Seen],
+    list: &[SolidInView],
     (x, y): (usize, usize),
     channel: Option<usize>,
 ) -> f32 {

@@ -14,7 +14,7 @@ use crate::run::sensors::{self, Input, Source};
 use crate::run::status::{print_err, Status};
 use crate::run::tracking::FramePacket;
 use crate::run::{observe, Flown};
-use signals::Light;
+use signals::Brightness;
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
 use stipple_drivers::{Calibration, Fault, FaultKind, ImuSample, Nanos};
@@ -38,11 +38,11 @@ pub struct Args {
 const PAIR_EVERY: usize = 25;
 
 /// What the sensors gave.
-struct Seen {
+struct Gathered {
     calibration: Calibration,
     frames: Vec<Nanos>,
     samples: Vec<ImuSample>,
-    light: Vec<Light>,
+    light: Vec<Brightness>,
     follower: Follower,
     rows: Rows,
 }
@@ -89,7 +89,7 @@ fn sensed(input: Input, board: &Board, look_s: f64) -> Result<Vec<Check>, Fault>
         Source::Live { rate_hz, .. } => Some(rate_hz),
         Source::Recorded(_) => None,
     };
-    let (seen, flown) = look(input, board, look_s)?;
+    let (seen, flown) = gather(input, board, look_s)?;
     let (seen, calibration) = (&seen, &seen.calibration);
     let mut checks = vec![];
     if let Some(fault) = &flown.broken {
@@ -115,7 +115,7 @@ fn sensed(input: Input, board: &Board, look_s: f64) -> Result<Vec<Check>, Fault>
 /// More of a core than this to read the cameras is more than odometry takes itself.
 const CAPTURE_SHARE_MAX: f64 = 0.25;
 
-fn capture(capture: &Capture, seen: &Seen, flown: &Flown) -> Option<Check> {
+fn capture(capture: &Capture, seen: &Gathered, flown: &Flown) -> Option<Check> {
     let what = format!("capture: {}", capture.line(&flown.source)?);
     let look_s = (*seen.frames.last()? - *seen.frames.first()?).secs();
     if capture.cpu.total_s() > CAPTURE_SHARE_MAX * look_s {
@@ -126,7 +126,7 @@ fn capture(capture: &Capture, seen: &Seen, flown: &Flown) -> Option<Check> {
 }
 
 /// Images without a partner within the tolerance, as the source counts them.
-fn skew(seen: &Seen, flown: &Flown) -> Check {
+fn skew(seen: &Gathered, flown: &Flown) -> Check {
     let unpaired: u64 = flown.source.iter().filter(|(name, _)| name.ends_with("images_unpaired")).map(|(_, n)| n).sum();
     let what = format!("left and right: {unpaired} images without a partner in {} frames", seen.frames.len());
     match unpaired {
@@ -137,12 +137,12 @@ fn skew(seen: &Seen, flown: &Flown) -> Check {
 }
 
 /// Reads the sensors for a while.
-fn look(input: Input, board: &Board, look_s: f64) -> Result<(Seen, Flown), Fault> {
+fn gather(input: Input, board: &Board, look_s: f64) -> Result<(Gathered, Flown), Fault> {
     let calibration = input.calibration.clone();
-    let seen = Arc::new(Mutex::new(Seen {
+    let seen = Arc::new(Mutex::new(Gathered {
         frames: vec![],
         samples: vec![],
-        light: vec![Light::new(); calibration.cameras.len()],
+        light: vec![Brightness::new(); calibration.cameras.len()],
         follower: Follower::new(&calibration, &board.frontend)?,
         rows: Rows::new(&calibration, board.stereo.disparities),
         calibration,
@@ -157,7 +157,7 @@ fn look(input: Input, board: &Board, look_s: f64) -> Result<(Seen, Flown), Fault
     Ok((seen, flown))
 }
 
-impl Seen {
+impl Gathered {
     fn add(&mut self, packet: &FramePacket) {
         self.samples.extend(packet.imu.iter());
         if packet.imu_only {

@@ -42,15 +42,15 @@ fn median(values: &[f64]) -> f64 {
     sorted.get(sorted.len() / 2).copied().unwrap_or(0.0)
 }
 
-/// Light of one camera over all frames.
+/// Brightness of one camera over all frames.
 #[derive(Clone, Debug)]
-pub struct Light {
+pub struct Brightness {
     levels: [u64; 256],
 }
 
-impl Light {
-    pub fn new() -> Light {
-        Light { levels: [0; 256] }
+impl Brightness {
+    pub fn new() -> Brightness {
+        Brightness { levels: [0; 256] }
     }
 
     pub fn add(&mut self, frames: &Frames, camera: usize) {
