@@ -10,7 +10,7 @@
 //!
 //! Rooms: `math`, `mem`, `limits`, `config` and `counters` are seen by all. `frontend` and `vio` see the vocabulary of
 //! `stipple-drivers`, `vio` also the frontend's `Tracks`; `stereo` and `map` see `gpu`, `map` also `stereo`; `output` sees what it
-//! writes of `map` and `vio`. `run` sees all of these, `commands` see `run`, and nobody sees `commands`. tests/tidy checks it.
+//! writes of `map` and `vio`. `run` sees all of these, `commands` see all, and nobody sees `commands`. tests/tidy checks it.
 //!
 //! # Glossary
 //!
@@ -24,14 +24,17 @@
 //! | deviation | standard deviation, wherever an error is stated |
 //! | exposure | gain and offset that take a rendering to what a camera recorded |
 //! | frame | the images of all cameras at one mid-exposure instant |
+//! | gate | what judges and repairs samples and frames before anybody uses them (`run::gate`) |
 //! | held out | a keyframe that is never trained on, only evaluated |
 //! | increment | inertial samples between two frames, integrated (preintegration) |
 //! | keyframe | a frame kept in the estimator's window as a pose, and offered to the map |
 //! | landmark | a point of the estimator: direction and inverse distance in its host keyframe |
 //! | lockstep | a deterministic replay: a stated number of training steps a frame |
+//! | mailbox | where the newest frame and all samples wait for tracking |
 //! | marginalization | taking old frames out of the window; what they knew stays as the prior |
 //! | packet | a frame on its way through tracking, with its inertial samples and results |
 //! | seal | the moment after which our threads allocate nothing |
+//! | pool | the fixed number of places for Gaussians (*splats* in the budget and in kernels) |
 //! | seed | a new Gaussian at a pixel of an anchor, at its stereo depth |
 //! | slot | a place in a pool of fixed size |
 //! | step | one training step: a view rendered, compared, and the Gaussians moved |

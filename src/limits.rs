@@ -2,7 +2,7 @@
 
 /// Cameras on a rig. Two is what every board has; four is what headsets have.
 pub const CAMERAS_MAX: usize = 4;
-/// Newest frames kept with velocity and biases (15 dof), at most; the board says how many.
+/// Newest frames kept with velocity and biases (15 dof), at most; `vio.states`, a tuning constant, says how many.
 pub const STATES: usize = 5;
 /// Older frames kept as poses only (6 dof), at most.
 pub const KEYFRAMES: usize = 10;

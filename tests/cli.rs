@@ -210,6 +210,35 @@ fn a_rig_without_stereo_is_refused_a_map_and_told_how_to_fly_without() {
     }
 }
 
+/// A second run into the same folder leaves nothing of the first; without its second camera's images no flight starts, which is said.
+#[test]
+fn a_run_leaves_no_map_of_an_earlier_one_and_says_that_nothing_was_tracked() {
+    let dir = tempfile::tempdir().unwrap();
+    let (data, out) = (flight(dir.path(), "0.5"), dir.path().join("out"));
+    fs::create_dir_all(out.join("renders")).unwrap();
+    fs::write(out.join("map.ply"), "old").unwrap();
+    for image in fs::read_dir(data.join("mav0/cam0/data")).unwrap() {
+        fs::write(image.unwrap().path(), "no image").unwrap();
+    }
+    fs::copy(data.join("mav0/cam1/data").read_dir().unwrap().next().unwrap().unwrap().path(), {
+        data.join("mav0/cam0/data").read_dir().unwrap().next().unwrap().unwrap().path()
+    })
+    .unwrap();
+    let o = replay(&data, &out, &["--set", "map.enabled=false"]);
+    assert!(o.status.success() && text(&o).contains("no frame got a pose"), "{}", text(&o));
+    assert!(!out.join("map.ply").exists() && !out.join("renders").exists() && out.join("report.json").exists());
+}
+
+#[test]
+fn steps_are_for_lockstep() {
+    let dir = tempfile::tempdir().unwrap();
+    let (data, out) = (flight(dir.path(), "0.2"), dir.path().join("out"));
+    let o =
+        stipple(&["replay", data.to_str().unwrap(), "--board", BOARD, "--steps", "5", "--out", out.to_str().unwrap()]);
+    assert_eq!(o.status.code(), Some(USAGE));
+    assert!(text(&o).contains("--pace lockstep"), "{}", text(&o));
+}
+
 #[test]
 fn unknown_key_of_a_board_is_named_with_its_line() {
     let dir = tempfile::tempdir().unwrap();
@@ -321,7 +350,7 @@ fn wrong_usage_is_exit_64() {
     assert_eq!(stipple(&["sim", "nonesuch", "--out", "/nonexistent/x"]).status.code(), Some(USAGE));
 }
 
-/// The figure that `check --dataset` gives: how much lower camera 1 sees points, px.
+/// The figure that `calib-check` gives: how much lower camera 1 sees points, px.
 fn rows_lower(data: &Path) -> (String, f64) {
     let o = stipple(&["calib-check", data.to_str().unwrap()]);
     assert!(o.status.success(), "{}", text(&o));
@@ -332,7 +361,7 @@ fn rows_lower(data: &Path) -> (String, f64) {
 }
 
 #[test]
-fn check_of_a_recording_detects_a_row_of_vertical_misalignment() {
+fn calib_check_detects_a_row_of_vertical_misalignment() {
     let dir = tempfile::tempdir().unwrap();
     let data = flight(dir.path(), "0.4");
     let (said, rows) = rows_lower(&data);

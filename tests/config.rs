@@ -278,3 +278,11 @@ fn shipped_boards_load_and_are_named_after_their_file() {
     seen.sort();
     assert_eq!(seen, ["drone-pi5", "jetson-orin-nano", "lavapipe", "raspberry-pi-5", "x86-igpu"]);
 }
+
+#[test]
+fn the_calibration_to_begin_with_is_one() {
+    let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("board-configs/camchain-example.yaml");
+    let calibration = stipple_drivers::replay::read_calibration(&file).unwrap();
+    let second_from_first = calibration.cameras[1].body_from_cam.inverse() * calibration.cameras[0].body_from_cam;
+    assert!((second_from_first.p - glam::DVec3::new(-0.1, 0.0, 0.0)).length() < 1e-12);
+}

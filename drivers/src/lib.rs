@@ -8,7 +8,7 @@
 //! - the operating system (`host`)
 //!
 //! It builds and tests without Vulkan or OpenCV and knows nothing of the program: no threads of its own but the recorder's
-//! writer, no configuration file, no exit codes.
+//! writer and the simulator's renderers, no configuration file, no exit codes.
 
 pub mod calibration;
 pub mod camera;

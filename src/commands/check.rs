@@ -15,6 +15,9 @@ pub fn check(args: &Args) -> Result<(), Fault> {
     let rig = memory::largest_rig(&board);
     memory::print(&memory::footprint(&rig, &board, true)?);
     memory::check_fits(&args.board.path().display().to_string(), &rig, &board, true)?;
-    println!("{:>12}       fits memory_max_mib = {}", "", board.memory_max_mib);
+    println!(
+        "{:>12}       fits memory_max_mib = {}; sensors and calibration are judged by doctor",
+        "", board.memory_max_mib
+    );
     Ok(())
 }

@@ -149,7 +149,7 @@ fn finish(outcome: Outcome, out: &OutputDir) -> Result<(), Fault> {
 fn seconds(text: &str) -> Result<f64, String> {
     match text.parse::<f64>() {
         Ok(s) if s.is_finite() && s > 0.0 => Ok(s),
-        _ => Err("a positive number of seconds".into()),
+        _ => Err("must be a positive number".into()),
     }
 }
 

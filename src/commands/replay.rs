@@ -6,7 +6,7 @@ use crate::output::OutputDir;
 use crate::run::sensors::Input;
 use crate::run::{fly, Options, Pace, Steps};
 use std::path::PathBuf;
-use stipple_drivers::Fault;
+use stipple_drivers::{Fault, FaultKind};
 
 #[derive(clap::Args)]
 pub struct Args {
@@ -19,9 +19,9 @@ pub struct Args {
     out: PathBuf,
     #[arg(long, value_enum, default_value = "recorded")]
     pace: PaceName,
-    /// Mapping steps a frame in lockstep
-    #[arg(long, value_name = "N", default_value = "2", value_parser = clap::value_parser!(u32).range(..=1000))]
-    steps: u32,
+    /// Mapping steps a frame in lockstep; without it 2
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(..=1000))]
+    steps: Option<u32>,
     /// Mapping steps a second of the recording in lockstep, instead: plays a device that slow
     #[arg(long, value_name = "N", value_parser = seconds, conflicts_with = "steps")]
     steps_per_s: Option<f64>,
@@ -53,17 +53,27 @@ enum PaceName {
     Lockstep,
 }
 
+impl Args {
+    fn pace(&self) -> Result<Pace, Fault> {
+        match (self.pace, self.steps, self.steps_per_s) {
+            (PaceName::Recorded, None, None) => Ok(Pace::Recorded),
+            (PaceName::Recorded, ..) => {
+                let fix = "add --pace lockstep, or leave it out: at recorded pace mapping takes the time there is";
+                Err(Fault::new(FaultKind::Usage, "--steps", "is for --pace lockstep", fix))
+            }
+            (PaceName::Lockstep, _, Some(rate)) => Ok(Pace::Lockstep(Steps::PerSecond(rate))),
+            (PaceName::Lockstep, n, None) => Ok(Pace::Lockstep(Steps::PerFrame(n.unwrap_or(2)))),
+        }
+    }
+}
+
 pub fn replay(args: &Args) -> Result<(), Fault> {
     let scale: Vec<String> = args.scale.iter().map(|s| format!("map.scale={s}")).collect();
     let board = args.board.load_with(&scale)?;
     let input = Input::recording(&args.dataset, args.calibration.as_deref(), &board)?;
     let out = OutputDir::create(&args.out)?;
-    let steps = args.steps_per_s.map_or(Steps::PerFrame(args.steps), Steps::PerSecond);
     let options = Options {
-        pace: match args.pace {
-            PaceName::Recorded => Pace::Recorded,
-            PaceName::Lockstep => Pace::Lockstep(steps),
-        },
+        pace: args.pace()?,
         poses: args.poses.clone(),
         holdout: args.holdout.unwrap_or(0),
         duration_s: args.duration,

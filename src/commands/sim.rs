@@ -7,7 +7,7 @@ use stipple_drivers::{Fault, FaultKind, Span};
 
 #[derive(clap::Args)]
 pub struct Args {
-    /// A scenario's name, or `euroc` to fly the trajectory of --truth
+    /// demo, hover, circle, aggressive or static; or `euroc`, to fly the trajectory of --truth
     scenario: String,
     /// Folder to write
     #[arg(long, value_name = "DIR")]
@@ -18,13 +18,13 @@ pub struct Args {
     /// EuRoC IMU csv to use in place of a simulated IMU
     #[arg(long, value_name = "CSV", requires = "truth")]
     imu: Option<PathBuf>,
-    /// Seconds of the flight to write
+    /// Seconds of the flight to write; without it all of it, some 10
     #[arg(long, value_name = "S", value_parser = seconds)]
     duration: Option<f64>,
-    /// Seed of the room and of the sensors' noise
+    /// Seed of the room and of the sensors' noise; without it the scenario's own
     #[arg(long, value_name = "N")]
     seed: Option<u64>,
-    /// Cameras: mono, stereo, opposed, four
+    /// Cameras: mono, stereo, opposed or four; without it stereo
     #[arg(long, value_name = "NAME")]
     rig: Option<String>,
     /// Write images as RGB; grey otherwise
@@ -82,6 +82,9 @@ impl Defects {
 pub fn sim(args: &Args) -> Result<(), Fault> {
     let mut scenario = match (&args.truth, args.scenario.as_str()) {
         (Some(truth), "euroc") => Scenario::from_euroc(truth, args.imu.as_deref())?,
+        (None, "euroc") => {
+            return Err(Fault::new(FaultKind::Usage, "euroc", "needs the path to fly", "add --truth CSV"));
+        }
         (None, name) => Scenario::named(name).ok_or_else(|| unknown_scenario(name))?,
         (Some(_), name) => {
             let fix = "use the scenario `euroc` with --truth";

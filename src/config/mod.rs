@@ -100,9 +100,14 @@ impl Board {
     /// Reads a board file, applies `key.path=value` overrides, validates.
     pub fn load(path: &Path, overrides: &[String]) -> Result<Board, Fault> {
         let place = path.display().to_string();
-        let text = std::fs::read_to_string(path).map_err(|e| {
-            let what = format!("cannot read the board file: {e}");
-            Fault::new(FaultKind::NoInput, &place, what, "name one, such as those of board-configs/")
+        let text = std::fs::read_to_string(path).map_err(|e| match e.kind() {
+            std::io::ErrorKind::InvalidData => {
+                Fault::new(FaultKind::Config, &place, "is not text", "save the board file as UTF-8")
+            }
+            _ => {
+                let what = format!("cannot read the board file: {e}");
+                Fault::new(FaultKind::NoInput, &place, what, "name one, such as those of board-configs/")
+            }
         })?;
         Board::parse(&place, &text, overrides)
     }

@@ -37,12 +37,12 @@ const STEPS_JUDGED: u32 = 30;
 /// Steps a keyframe that anchors count on, however few they were so far: the first, which is all there is to see, and others.
 const STEPS_FIRST: usize = 40;
 const STEPS_MIN: usize = 8;
-/// Part of the pool that one anchor may evict.
-const EVICTED_MAX: usize = 16;
-/// Part of what is free that a whole uncovered view may take, so that there is always room for the next; and part of
-/// the pool where others are evicted for it.
-const FREE_SHARE: usize = 8;
-const POOL_SHARE: usize = 16;
+/// One anchor may evict one in so many of the pool.
+const EVICTED_DIVISOR: usize = 16;
+/// A whole uncovered view may take one in so many of the free places, so that there is always room for the next; and one in so
+/// many of the pool where others are evicted for it.
+const FREE_DIVISOR: usize = 8;
+const POOL_DIVISOR: usize = 16;
 
 /// A keyframe that became an anchor.
 #[derive(Clone, Copy, Debug)]
@@ -224,7 +224,7 @@ impl Anchors {
     /// Seeds for a view that is all uncovered.
     fn seeds_of_a_view(&self, scene: &Scene) -> usize {
         let pool = &scene.pipeline.pool;
-        let share = if self.config.evict { pool.capacity() / POOL_SHARE } else { pool.room().div_ceil(FREE_SHARE) };
+        let share = if self.config.evict { pool.capacity() / POOL_DIVISOR } else { pool.room().div_ceil(FREE_DIVISOR) };
         share.min(self.config.seeds_per_anchor as usize).min(self.affordable(scene))
     }
 
@@ -246,7 +246,7 @@ impl Anchors {
         let mut evicted = 0;
         if self.config.evict && pool.room() < wanted {
             let bins = pool.importance(gpu, STEPS_JUDGED)?;
-            let most = pool.capacity() / EVICTED_MAX;
+            let most = pool.capacity() / EVICTED_DIVISOR;
             (rule.importance_min, evicted) = threshold(&bins, wanted - pool.room(), most);
         }
         let removed = pool.prune(gpu, &rule)?;

@@ -62,6 +62,17 @@ impl OutputDir {
         atomically(&self.file(name), write)
     }
 
+    /// Removes what an earlier run left under `name`, a file or a folder, and this one does not write. Fails where it cannot
+    /// be removed.
+    pub fn remove(&self, name: &str) -> Result<(), Fault> {
+        let path = self.file(name);
+        let removed = if path.is_dir() { clear(&path) } else { fs::remove_file(&path) };
+        match removed {
+            Err(e) if e.kind() != io::ErrorKind::NotFound => Err(cannot_write(&path, &e)),
+            _ => Ok(()),
+        }
+    }
+
     /// Replaces the subfolder `name` by what `fill` puts into it, so that files of an earlier run
     /// never mix with those of this one.
     pub fn replace_folder<R>(&self, name: &str, fill: impl FnOnce(&Path) -> Result<R, Fault>) -> Result<R, Fault> {
@@ -137,6 +148,16 @@ mod tests {
         let fault = OutputDir::create(&dir.path().join("file/out")).unwrap_err();
         assert_eq!(fault.kind, FaultKind::NoOutput);
         assert!(fault.place.contains("file/out"), "{fault}");
+    }
+
+    #[test]
+    fn what_an_earlier_run_left_is_removed_and_what_is_not_there_is_no_error() {
+        let dir = tempfile::tempdir().unwrap();
+        let out = OutputDir::create(dir.path()).unwrap();
+        out.write("map.ply", |w| w.write_all(b"old")).unwrap();
+        out.replace_folder("renders", |d| atomically(&d.join("1.png"), |w| w.write_all(b"x"))).unwrap();
+        ["map.ply", "renders", "never"].iter().for_each(|name| out.remove(name).unwrap());
+        assert!(names(dir.path()).is_empty());
     }
 
     #[test]

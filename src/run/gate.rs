@@ -11,13 +11,14 @@ use crate::counters::{Counter, Counters};
 use stipple_drivers::source::ImuReading;
 use stipple_drivers::{Frames, Image, ImuCalibration, ImuSample, Nanos, Span};
 
-/// Largest step of a stamp beyond the time that passed: further than a queue of frames can be behind.
+/// Largest step of a stamp beyond the time that passed, ns: further than a queue of frames can be behind.
 const JUMP_MAX: Span = Span(1_000_000_000);
+/// Time after which a clock that jumped is believed, ns.
 const RELEARN: Span = Span(2_000_000_000);
 /// Intervals of whose median the period is made.
 const INTERVALS: usize = 15;
-/// One pixel in so many tells two pictures apart: noise changes half of them.
-const LOOKED_AT: usize = 61;
+/// Every 61st pixel is compared to tell two pictures apart: noise changes half of them.
+const PIXEL_STRIDE: usize = 61;
 /// Grey levels between the darkest and the brightest pixel of a covered eye.
 const BLANK_LEVELS: u8 = 6;
 /// So many readings in a row, all six axes alike to the last bit, no working unit gives: one whose noise is a third of a
@@ -89,7 +90,7 @@ impl Stamps {
 /// The frames of a rig.
 pub struct FrameGate {
     pub stamps: Stamps,
-    /// Pixels of the last frame, every `LOOKED_AT`th.
+    /// Pixels of the last frame, every `PIXEL_STRIDE`th.
     looks: Vec<Vec<u8>>,
     /// A camera saw nothing in it.
     pub blank: bool,
@@ -97,7 +98,7 @@ pub struct FrameGate {
 
 impl FrameGate {
     pub fn new(shape: &Frames) -> FrameGate {
-        let look = |image: &Image| vec![0; image.pixels.len().div_ceil(LOOKED_AT)];
+        let look = |image: &Image| vec![0; image.pixels.len().div_ceil(PIXEL_STRIDE)];
         FrameGate { stamps: Stamps::default(), looks: shape.images.iter().map(look).collect(), blank: false }
     }
 
@@ -114,7 +115,7 @@ impl FrameGate {
         let (mut frozen, mut blank) = (false, false);
         for (image, look) in frames.images.iter().zip(&mut self.looks) {
             let (mut same, mut low, mut high) = (true, u8::MAX, 0);
-            for (px, kept) in image.pixels.iter().step_by(LOOKED_AT).zip(look) {
+            for (px, kept) in image.pixels.iter().step_by(PIXEL_STRIDE).zip(look) {
                 same &= px == kept;
                 (low, high) = (low.min(*px), high.max(*px));
                 *kept = *px;

@@ -208,7 +208,7 @@ pub fn fly(
     Ok(Outcome { report, capture, fault })
 }
 
-/// Reads `input` at its own pace with the threads of a flight, shows every packet to `observer`, and makes nothing of it.
+/// Reads `input` at its own pace with the threads of a flight, shows every packet to `observer`, without estimating or mapping.
 pub fn observe(
     mut input: Input,
     board: &Board,

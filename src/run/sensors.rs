@@ -230,9 +230,9 @@ pub fn parts(path: &Path, board: &Board) -> Vec<(&'static str, Result<String, Fa
     });
     let count = |c: &Calibration| format!("{} cameras", c.cameras.len());
     parts.push(("calibration", calibration.as_ref().map(count).map_err(Fault::clone)));
-    if calibration.is_ok() {
-        parts.push(("cameras", cameras));
-    }
+    let unopened =
+        |_| Fault::new(FaultKind::Config, "cameras", "not opened: they need the calibration", "mend rig.calibration");
+    parts.push(("cameras", if calibration.is_ok() { cameras } else { cameras.map_err(unopened) }));
     let none = || Fault::new(FaultKind::Config, "[imu]", "names no chip", "write imu.chip and where it is wired");
     let data_ready = board.gpio.data_ready().map(|(line, edge)| DataReady::open(&line, edge)).transpose();
     if board.gpio.data_ready().is_some() {

@@ -49,7 +49,7 @@ pub fn conclude(title: Title, mut flown: Flown, out: &OutputDir) -> Result<Repor
         report.rte_1s_m = e.rte_1s_m;
         report.rpe_deg = e.rpe_deg;
     }
-    let mut panels = vec![];
+    let (mut panels, mut mapped) = (vec![], false);
     if let Some(m) = &mut flown.mapping {
         report.anchors = Some(m.anchors);
         report.iterations = Some(m.iterations);
@@ -67,15 +67,21 @@ pub fn conclude(title: Title, mut flown: Flown, out: &OutputDir) -> Result<Repor
                     report.quality = quality;
                     panels = drawn;
                     out.write("map.ply", |w| ply::write_ply(w, splats.into_iter()))?;
+                    mapped = true;
                 }
                 Err(e) => m.failure = Some(e.to_string()),
             }
         }
         if let Some(why) = &m.failure {
-            let warning = format!("the map is incomplete: {why}");
-            eprintln!("stipple: warning: {warning}");
-            flown.warnings.push(warning);
+            warn(&mut flown.warnings, format!("the map is incomplete: {why}"));
         }
+    }
+    if !mapped {
+        out.remove("map.ply")?;
+    }
+    if flown.tracker.odometry().is_some_and(|run| run.back.trajectory.is_empty()) {
+        let why = "no frame got a pose, odometry never started: its health and the counters in report.json say why";
+        warn(&mut flown.warnings, why.into());
     }
     if let Some(capture) = &flown.capture {
         (report.camera_cpu_ms, report.camera_kernel_ms) = capture.ms_a_frame().unzip();
@@ -91,6 +97,11 @@ pub fn conclude(title: Title, mut flown: Flown, out: &OutputDir) -> Result<Repor
     let evidence = Evidence { estimated, truth, error, tracking_ms, pictures: &[], warnings };
     write_files(&report, &evidence, &panels, out)?;
     Ok(report)
+}
+
+fn warn(warnings: &mut Vec<String>, what: String) {
+    super::status::print_err(format_args!("stipple: warning: {what}"));
+    warnings.push(what);
 }
 
 /// Every counter of a run, each under one name.
@@ -173,7 +184,9 @@ fn measure(mapper: &mut Mapper) -> Result<Measured, GpuError> {
 fn write_files(report: &Report, evidence: &Evidence, panels: &[Panel], out: &OutputDir) -> Result<(), Fault> {
     out.write("trajectory.tum", |w| trajectory::write_tum(w, evidence.estimated))?;
     let pictures: Vec<(String, Picture)> = panels.iter().map(|p| (p.name.clone(), panel(p))).collect();
-    if !pictures.is_empty() {
+    if pictures.is_empty() {
+        out.remove("renders")?;
+    } else {
         out.replace_folder("renders", |dir| {
             pictures.iter().try_for_each(|(name, p)| atomically(&dir.join(format!("{name}.png")), |w| p.write_png(w)))
         })?;

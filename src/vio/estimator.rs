@@ -6,10 +6,10 @@
 //! its own optimization. Where it starts, and when it is given up, is the supervisor's (`mod.rs`) to say.
 
 use super::factors::inertial_residual_at;
-use super::gate::{gate, predicted_covariance, Passed};
 use super::graph::Graph;
 use super::inertial::{Covariance, InertialWeight, Motion};
 use super::initialization::Start;
+use super::innovation_gate::{gate, predicted_covariance, Passed};
 use super::marginalization::Marginalizer;
 use super::model::Model;
 use super::monitor::Evidence;

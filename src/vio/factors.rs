@@ -6,7 +6,7 @@
 //!
 //! Rows are `[J | r]` of a least-squares problem. A landmark's are `[point | frames | r]`; Householder QR of the three
 //! columns of the point leaves rows that do not contain it (Demmel et al., ICCV 2021). Residuals are taken at the
-//! estimate, Jacobians at the linearization points, those to the rig's columns too.
+//! estimate, Jacobians at the first estimates (FEJ), those to the rig's columns too.
 
 use super::inertial::{inertial_jacobians, inertial_residual, scale_jacobian, Vec15};
 use super::landmarks::{Landmark, Observation};
@@ -56,7 +56,7 @@ pub fn of_window<'a>(window: &'a Window, landmarks: &'a [Landmark]) -> impl Iter
     of_states.chain(landmarks.iter().map(Factor::Landmark))
 }
 
-/// The factors that leave with a state, of which `next` is the one after it, and with the landmarks that leave too.
+/// The factors removed when `state` and some landmarks are marginalized; `next` is the state after it.
 pub fn of_leaving<'a>(
     window: &'a Window,
     (state, next): (usize, usize),

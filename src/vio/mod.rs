@@ -12,15 +12,15 @@
 //! what came of each (`monitor`), and after a reset resumes from what was trusted (`recovery`).
 //!
 //! Until motion and gravity are known tracks give no odometry. The same input gives
-//! bit-identical output; `hash` proves it. Nothing is allocated after `new`.
+//! bit-identical output; `hash` compares keyframe poses. Nothing is allocated after `new`.
 
 mod estimator;
 mod factors;
-mod gate;
 mod graph;
 mod health;
 mod inertial;
 mod initialization;
+mod innovation_gate;
 mod landmarks;
 mod marginalization;
 mod model;
@@ -161,7 +161,7 @@ impl Vio {
     }
 
     /// Takes what the cameras saw at one instant. Inertial samples up to it must have come before;
-    /// the newest is held where they have not. A frame that is not newer than the last is refused and counted.
+    /// where they have not, the last is taken as constant. A frame that is not newer than the last is refused and counted.
     pub fn on_tracks(&mut self, tracks: &Tracks) -> Update {
         let last = self.last;
         if last.is_some_and(|t| tracks.t <= t) {

@@ -1,6 +1,6 @@
 //! `stipple-bench map`: what a map is worth at equal time, against the cap of Gaussians and without parts of the method.
 //!
-//! Every run plays the same input through the daemon with the same seconds of mapping, spread evenly over its frames
+//! Every run plays the same input through the program with the same seconds of mapping, spread evenly over its frames
 //! (lockstep by time: what a step costs is part of what is measured, so figures repeat only as well as the clock
 //! does). Each leaves its own report in a folder of DIR.
 

@@ -13,9 +13,8 @@ use std::collections::{BTreeMap, BTreeSet};
 const COMMON: [&str; 5] = ["math", "mem", "limits", "config", "counters"];
 /// What else a module may see. `run` sees all of these, `commands` sees `run` too, nobody sees `commands`; a module that is
 /// not here sees only the common ones.
-const EDGES: [(&str, &[&str]); 7] = [
+const EDGES: [(&str, &[&str]); 6] = [
     ("vio", &["frontend"]),
-    ("loops", &["vio"]),
     ("stereo", &["gpu"]),
     ("map", &["gpu", "stereo"]),
     ("output", &["map", "vio"]),

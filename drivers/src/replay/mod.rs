@@ -103,7 +103,7 @@ fn layout(dataset: &Path) -> Result<(PathBuf, PathBuf), Fault> {
         Err(Fault::new(FaultKind::NoInput, dataset.display().to_string(), what, fix))
     };
     if !dataset.is_dir() {
-        return missing("no such folder");
+        return missing(if dataset.exists() { "is a file, not a folder" } else { "no such folder" });
     }
     let inner = dataset.join("mav0");
     if inner.is_dir() {

@@ -1,4 +1,4 @@
-//! The estimator survives what goes wrong on a flight within a stated error, or notices and starts again. The rows are those of `stipple bench stability`, here on fewer flights;
+//! The estimator survives what goes wrong on a flight within a stated error, or notices and starts again. The rows are those of `stipple-bench stability`, here on fewer flights;
 //! `cargo test --bin stipple-bench stability -- --nocapture` prints them.
 #![allow(clippy::unwrap_used)]
 
