@@ -70,9 +70,9 @@ section! {
     /// Keyframes that the mapper keeps to train and evaluate on. One comes a second, so this is the length of a flight.
     keyframes: u32, Bound::Within(2.0, 4096.0);
     /// Widest camera image that the board accepts.
-    image_width_max: u32, Bound::Within(64.0, 4096.0);
+    image_width_max: u32, Bound::Within(96.0, 4096.0);
     /// Highest camera image that the board accepts.
-    image_height_max: u32, Bound::Within(64.0, 4096.0);
+    image_height_max: u32, Bound::Within(96.0, 4096.0);
 }
 
 /// Every key of a board file, section by section.
@@ -234,8 +234,13 @@ fn in_file(place: &str, text: &str, e: &toml::de::Error) -> Fault {
     let line = e.span().filter(|s| !s.is_empty()).map(|s| line_at(text, s.start));
     let at = line.map_or(place.to_string(), |l| format!("{place}:{l}"));
     let written = line.and_then(|l| text.lines().nth(l - 1)).map_or(String::new(), |l| format!(" (`{}`)", l.trim()));
-    let what = e.message().replace('\n', " ");
-    Fault::new(FaultKind::Config, at, format!("{what}{written}"), "board-configs/ shows every section")
+    Fault::new(FaultKind::Config, at, format!("{}{written}", plain(e.message())), "board-configs/ shows every section")
+}
+
+/// What the parser says, on one line and with types as a stranger calls them.
+fn plain(message: &str) -> String {
+    let types = [("expected f64", "expected a number"), ("expected u32", "expected a whole number, not negative")];
+    types.iter().fold(message.replace('\n', " "), |said, (of_rust, word)| said.replace(of_rust, word))
 }
 
 /// An override as part of a one-line message.
@@ -245,7 +250,7 @@ fn shown(assignment: &str) -> String {
 
 fn in_override(assignment: &str, what: &str) -> Fault {
     let fix = "write section.key=value with a key of board-configs/";
-    Fault::new(FaultKind::Config, shown(assignment), what.replace('\n', " "), fix)
+    Fault::new(FaultKind::Config, shown(assignment), plain(what), fix)
 }
 
 /// The key and the value of one `a.b=value`; the value is TOML, and a bare word is a string.
