@@ -179,8 +179,9 @@ fn images_of_another_size_than_the_calibration_says_are_counted_and_refused() {
 
 /// Largest ATE of the demo's flight, m. A map is drawn where odometry says, so a surface 2 m away must not move by half a pixel
 /// of these images of 229 px focal length, or by one where no two cameras see the same; one camera knows its scale by inertia
-/// alone, and a hundredth of these 2 m do.
-const RIG_ERRORS: [(&str, f64); 4] = [("mono", 0.02), ("stereo", 0.0044), ("opposed", 0.0087), ("four", 0.0044)];
+/// alone, and a hundredth of these 2 m do. No bound is wider than an earlier one, which was one and a half times what was met
+/// (`opposed`).
+const RIG_ERRORS: [(&str, f64); 4] = [("mono", 0.02), ("stereo", 0.0044), ("opposed", 0.0075), ("four", 0.0044)];
 
 #[test]
 fn recordings_of_one_to_four_cameras_are_flown_without_a_map() {

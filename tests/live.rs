@@ -77,8 +77,8 @@ fn a_run_maps_while_it_tracks() {
     let frames = r["frames"].as_u64().unwrap();
     assert!(count(&r, "frames_overwritten") * 100 <= frames, "tracking waits for mapping: {said}");
     assert!(r["anchors"].as_u64().unwrap() > 0 && r["splats"].as_u64().unwrap() > 1000, "{said}");
-    // A tenth of the range of grey off: the room is told from its mean grey, of which the demo's views are 14 dB.
-    assert!(r["psnr_db"].as_f64().unwrap() > 17.0, "{said}");
+    // A tenth of the range of grey off at most. One grey for each of the demo's views, its mean, is 11.8 to 13.7 dB.
+    assert!(r["psnr_db"].as_f64().unwrap() > 20.0, "{said}");
     assert_eq!(count(&r, "gpu_failures"), 0, "{said}");
 }
 

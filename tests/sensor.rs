@@ -179,11 +179,12 @@ fn a_rolling_shutter_costs_little_once_modelled() {
     assert!(modelled.ate < 1.7 * clean.ate && not.ate > 3.0 * modelled.ate);
 }
 
-/// Bounds are those of `RIG_ERRORS` in tests/cli.rs: half a pixel at 2 m, one without a pair, a hundredth with one camera.
+/// Half a pixel at 2 m, one without a pair, a hundredth with one camera (`RIG_ERRORS` in tests/cli.rs), but never wider than the
+/// earlier bound, which was one and a half times what was met (`mono`, `four`).
 #[test]
 fn rigs_of_one_to_four_cameras_are_followed() {
     let (vio, frontend) = usual();
-    for (name, most) in [("mono", 0.02), ("opposed", 0.0087), ("four", 0.0044)] {
+    for (name, most) in [("mono", 0.016), ("opposed", 0.0087), ("four", 0.0034)] {
         let mut s = scenario("demo");
         s.calibration = rig_named(name).unwrap();
         let found = fly(name, &render(&s), &vio, &frontend);
