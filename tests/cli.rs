@@ -326,7 +326,7 @@ fn truncated_image_is_counted_and_the_run_goes_on() {
     for bit in stipple::vio::Health::NAMES {
         assert!(report[format!("health_{bit}_frames")].is_u64(), "{bit}");
     }
-    for (counter, _) in stipple::vio::Stats::default().list() {
+    for (counter, _) in stipple::vio::instruments::Stats::default().list() {
         assert!(report[format!("count_{counter}")].is_u64(), "{counter}");
     }
     assert!(report["quality_p50"].as_u64().unwrap() > 0 && report["quality_under_50"].is_number());

@@ -62,6 +62,8 @@ pub struct ImuSample {
     pub accel_body: DVec3,
     /// Whether gyro and accelerometer stand at the end of their range on an axis, so that what happened beyond is not known.
     pub saturated: [bool; 2],
+    /// Whether its reading was repaired, or samples since the one before were refused.
+    pub doubted: bool,
 }
 
 impl ImuSample {

@@ -139,13 +139,15 @@ pub struct ImuGate {
     range: [f64; 2],
     last: Option<ImuSample>,
     repeated: u32,
+    /// Samples since the last one given were refused.
+    refused: bool,
     spikes: Spikes,
 }
 
 impl ImuGate {
     pub fn new(imu: &ImuCalibration) -> ImuGate {
         let spikes = Spikes::new(imu.rate_hz);
-        ImuGate { stamps: Stamps::default(), range: imu.range, last: None, repeated: 0, spikes }
+        ImuGate { stamps: Stamps::default(), range: imu.range, last: None, repeated: 0, refused: false, spikes }
     }
 
     /// Takes a reading that arrived at `now` and gives what is believed, in order: nothing, this one, or the one that was
@@ -154,6 +156,7 @@ impl ImuGate {
         let counters =
             StampCounters { missing: &c.imu_missing, not_newer: &c.imu_not_newer, jumped: &c.imu_timestamp_jump };
         let mut sample = reading.sample;
+        let refused = std::mem::replace(&mut self.refused, true);
         if !sample.is_finite() {
             c.imu_rejected.add(1);
             return;
@@ -174,6 +177,7 @@ impl ImuGate {
             // The unit does not say which: an end that the calibration has moved.
             sample.saturated = [true; 2];
         }
+        (self.refused, sample.doubted) = (false, refused);
         c.imu_saturated.add(u64::from(sample.saturated != [false; 2]));
         c.imu_repaired.add(u64::from(self.spikes.pass(sample, give)));
     }
@@ -223,13 +227,15 @@ mod tests {
     fn a_unit_that_hangs_is_refused_and_one_repetition_is_not() {
         let (mut gate, c) = (ImuGate::new(&ImuCalibration::CONSUMER), Counters::default());
         let values = (0..100).map(|i: i32| if (50..75).contains(&i) { 50 } else { i / 2 });
-        let mut given = 0;
+        let (mut given, mut doubted) = (0, 0);
         for (i, v) in values.enumerate() {
             let (t, gyro_body) = (Nanos(i as i64 * MS), glam::DVec3::splat(f64::from(v)));
             let sample = ImuSample { t, gyro_body, ..ImuSample::default() };
-            gate.pass(&ImuReading { sample, ..ImuReading::default() }, t, &c, &mut |_| given += 1);
+            gate.pass(&ImuReading { sample, ..ImuReading::default() }, t, &c, &mut |s| {
+                (given, doubted) = (given + 1, doubted + u32::from(s.doubted));
+            });
         }
-        assert_eq!((given, c.imu_frozen.get()), (100 - 5, 24));
+        assert_eq!((given, doubted, c.imu_frozen.get()), (100 - 5, 1, 24));
     }
 
     #[test]

@@ -112,7 +112,7 @@ impl Spikes {
         self.learn(&out, lone);
         let i = lone?;
         let middle = 0.5 * (a[i] + c[i]);
-        let mut repaired = *now;
+        let mut repaired = ImuSample { doubted: true, ..*now };
         if i < 3 {
             repaired.gyro_body[i] = middle;
         } else {
@@ -161,7 +161,7 @@ mod tests {
                     t: Nanos(i * 5_000_000),
                     gyro_body: turn + random.vector() * 0.02,
                     accel_body: GRAVITY + turn + random.vector() * 0.3,
-                    saturated: [false; 2],
+                    ..ImuSample::default()
                 }
             })
             .collect();
@@ -193,6 +193,7 @@ mod tests {
         });
         assert_eq!(found, [100, 120]);
         for i in found {
+            assert!(list[i].doubted && !list[i + 1].doubted, "{i}");
             assert!((list[i].gyro_body - plain[i].gyro_body).length() < 0.2, "{i}");
             assert!((list[i].accel_body - plain[i].accel_body).length() < 2.0, "{i}");
         }

@@ -43,8 +43,6 @@ mod zero_velocity;
 
 pub use health::Health;
 pub use predictor::Predictor;
-pub use rig::RigEstimate;
-pub use stats::Stats;
 
 use crate::config::VioConfig;
 use crate::frontend::Tracks;
@@ -55,8 +53,9 @@ use inertial::{Covariance, Motion};
 use initialization::{Initializer, RESECTION_MIN};
 use monitor::Monitor;
 use recovery::Recovery;
+use rig::RigEstimate;
 use samples::ImuRing;
-use stats::Tally;
+use stats::{Stats, Tally};
 use stipple_drivers::{Calibration, ImuSample, Nanos, Pose};
 
 /// No image is this wide.
@@ -151,6 +150,7 @@ impl Vio {
         let gap = self.imu.newest().is_some_and(|n| noise.is_gap((s.t - n.t).secs()));
         let overwritten = self.imu.push(s);
         self.pending.set(Health::IMU_GAP, gap);
+        self.pending.set(Health::IMU_REJECTED, s.doubted);
         self.pending.set(Health::IMU_SATURATED, s.saturated != [false; 2]);
         self.recovery.propagate(s.t, &self.imu, noise);
         // Over a longer gap there will be a reset, and what dead reckoning has integrated by then is not needed.
@@ -367,8 +367,10 @@ pub mod instruments {
     pub use super::graph::Graph;
     pub use super::inertial::Covariance;
     pub use super::preintegration::Increment;
+    pub use super::rig::RigEstimate;
     pub use super::samples::ImuRing;
     pub use super::solver::{Outcome, LAMBDA_START};
+    pub use super::stats::Stats;
     pub use super::window::Layout;
 
     /// The window estimator, the inertial samples, and the covariance of the newest state.

@@ -61,6 +61,7 @@ impl ImuRing {
             gyro_body: a.gyro_body.lerp(b.gyro_body, s),
             accel_body: a.accel_body.lerp(b.accel_body, s),
             saturated: [0, 1].map(|i| a.saturated[i] || b.saturated[i]),
+            doubted: false,
         })
     }
 

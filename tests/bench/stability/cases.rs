@@ -189,7 +189,7 @@ fn inertial(plan: fn() -> Plan, long: fn() -> Plan) -> Vec<Case> {
         case("imu stamps jittered by 2 ms", Plan { warp: jitter, ..plan() }),
         case("gyro saturated", Plan { warp: clip_gyro, range: [GYRO_RANGE, ImuCalibration::RANGE[1]], ..plan() }).says(Health::IMU_SATURATED),
         case("accelerometer saturated", Plan { warp: clip_accel, range: [ImuCalibration::RANGE[0], ACCEL_RANGE], ..plan() }).says(Health::IMU_SATURATED),
-        case("imu samples not finite or late", Plan { warp: poison, ..plan() }),
+        case("imu samples not finite or late", Plan { warp: poison, ..plan() }).says(Health::IMU_REJECTED),
         case("accelerometer 8 m/s2 wrong 2 s", Plan { warp: lean, ..long() }).fault(AT, AT + 40).says(Health::DIVERGED_RESET | Health::VISION_DISAGREES).expect(Reset, 0.012, SAID),
     ]
 }

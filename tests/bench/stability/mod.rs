@@ -18,7 +18,8 @@ use crate::table;
 use std::path::PathBuf;
 use stipple::output::metrics::trajectory_error;
 use stipple::output::OutputDir;
-use stipple::vio::{Health, Stats, Vio};
+use stipple::vio::instruments::Stats;
+use stipple::vio::{Health, Vio};
 use stipple_drivers::{Fault, TimedPose};
 
 /// A quality this low says that the estimate is not to be relied on.

@@ -7,8 +7,8 @@ use crate::flight::{record, Plan, Record};
 use crate::world::Noise;
 use glam::{DQuat, DVec3};
 use stipple::output::metrics::trajectory_error;
+use stipple::vio::instruments::Stats;
 use stipple::vio::Health;
-use stipple::vio::Stats;
 use stipple_drivers::{ImuSample, Nanos, Pose, TimedPose};
 
 struct Run {
