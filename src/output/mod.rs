@@ -5,7 +5,6 @@
 //! as they were and at most one hidden `.NAME.partial`, which the next run overwrites.
 
 pub mod chart;
-mod font;
 pub mod html;
 pub mod metrics;
 pub mod panel;

@@ -1,9 +1,8 @@
-//! One keyframe at a glance: observed | rendered | absolute error | depth, side by side with labels.
+//! One keyframe at a glance: observed | rendered | absolute error | depth, side by side.
 //!
 //! Error is drawn on a fixed scale so that panels of one run compare; depth on the logarithm
-//! between its own 2nd and 98th percentile, which the label states. Pixels without a value are dark grey.
+//! between its own 2nd and 98th percentile, which the caption states. Pixels without a value are dark grey.
 
-use super::font;
 use super::metrics::percentile;
 use crate::map::Panel;
 use std::io::{self, Write};
@@ -13,9 +12,6 @@ const ERROR_FULL: f32 = 0.25;
 const GAP_PX: usize = 4;
 /// Colour of pixels without a value.
 pub const MISSING: [u8; 3] = [48, 48, 48];
-const INK: [u8; 3] = [235, 235, 235];
-/// Panel width at which labels are drawn one font pixel to one image pixel.
-const LABEL_WIDTH_PX: usize = 220;
 
 /// Near to far: warm to cool, lightness rising to the middle.
 pub const DEPTH_RAMP: [[u8; 3]; 8] = [
@@ -72,42 +68,30 @@ impl Picture {
         Picture { width, height, pixels: (0..width * height).map(block).collect() }
     }
 
-    fn paste(&mut self, x0: usize, y0: usize, width: usize, colour: impl Iterator<Item = [u8; 3]>) {
+    fn paste(&mut self, x0: usize, width: usize, colour: impl Iterator<Item = [u8; 3]>) {
         for (i, c) in colour.enumerate() {
-            self.pixels[(y0 + i / width) * self.width + x0 + i % width] = c;
+            self.pixels[i / width * self.width + x0 + i % width] = c;
         }
     }
+}
 
-    fn label(&mut self, x0: usize, y0: usize, magnify: usize, text: &str) {
-        font::draw(text, magnify, |x, y| {
-            if x0 + x < self.width && y0 + y < self.height {
-                self.pixels[(y0 + y) * self.width + x0 + x] = INK;
-            }
-        });
-    }
+/// What the four panels of a keyframe are, in words.
+pub fn caption(view: &Panel) -> String {
+    let (near, far) = depth_range(&view.depth);
+    let decibels = view.psnr_db.map_or(String::new(), |d| format!(", {d:.1} dB"));
+    let name = &view.name;
+    format!("{name}: observed | rendered{decibels} | error, 0 to {ERROR_FULL} | depth, {near:.1} to {far:.1} m")
 }
 
 /// Draws the four panels.
 pub fn panel(view: &Panel) -> Picture {
     let (w, h) = (view.width, view.height);
-    let magnify = ((w + LABEL_WIDTH_PX / 2) / LABEL_WIDTH_PX).max(1);
-    let top = (font::HEIGHT + 4) * magnify;
     let (near, far) = depth_range(&view.depth);
-    let decibels = view.psnr_db.map_or(String::new(), |d| format!("  {d:.1} dB"));
-    let labels = [
-        "observed".to_string(),
-        format!("rendered{decibels}"),
-        format!("|error|  0 - {ERROR_FULL}"),
-        format!("depth  {near:.1} - {far:.1} m"),
-    ];
-    let mut picture = Picture::filled(4 * w + 3 * GAP_PX, top + h, [16, 16, 16]);
+    let mut picture = Picture::filled(4 * w + 3 * GAP_PX, h, [16, 16, 16]);
     let column = |index: usize| index * (w + GAP_PX);
-    for (index, text) in labels.iter().enumerate() {
-        picture.label(column(index) + 2 * magnify, 2 * magnify, magnify, text);
-    }
     let compared = |i: usize| view.valid.get(i).is_none_or(|&v| v != 0);
-    picture.paste(column(0), top, w, (0..w * h).map(|i| observed(view, i).map(byte)));
-    picture.paste(column(1), top, w, (0..w * h).map(|i| rendered(view, i).map(byte)));
+    picture.paste(column(0), w, (0..w * h).map(|i| observed(view, i).map(byte)));
+    picture.paste(column(1), w, (0..w * h).map(|i| rendered(view, i).map(byte)));
     let error = |i: usize| {
         let (a, b) = (observed(view, i), rendered(view, i));
         // As PSNR counts it: a window brighter than the image can be is no error.
@@ -118,12 +102,12 @@ pub fn panel(view: &Panel) -> Picture {
             MISSING
         }
     };
-    picture.paste(column(2), top, w, (0..w * h).map(error));
+    picture.paste(column(2), w, (0..w * h).map(error));
     let depth = |i: usize| match view.depth[i] {
         d if d.is_finite() && d > 0.0 => ramp(&DEPTH_RAMP, (d / near).ln() / (far / near).ln().max(1e-6)),
         _ => MISSING,
     };
-    picture.paste(column(3), top, w, (0..w * h).map(depth));
+    picture.paste(column(3), w, (0..w * h).map(depth));
     picture
 }
 
@@ -186,18 +170,17 @@ mod tests {
         let psnr_db = Some(31.25);
         let view = Panel { width, height, observed, rendered, depth, valid, psnr_db, ..Panel::default() };
         let p = panel(&view);
-        let top = p.height - height;
-        assert_eq!((p.width, top), (4 * 64 + 3 * GAP_PX, 12));
-        assert_eq!(pixel(&p, 0, top), [51, 51, 51]);
-        assert_eq!(pixel(&p, 64 + GAP_PX + 1, top), [51, 51, 51]);
+        assert_eq!((p.width, p.height), (4 * 64 + 3 * GAP_PX, height));
+        assert_eq!(pixel(&p, 0, 0), [51, 51, 51]);
+        assert_eq!(pixel(&p, 64 + GAP_PX + 1, 0), [51, 51, 51]);
         let (error, depth) = (2 * (64 + GAP_PX), 3 * (64 + GAP_PX));
-        assert_eq!(pixel(&p, error, top), ERROR_RAMP[5]);
-        assert_eq!(pixel(&p, error + 1, top), ERROR_RAMP[0]);
-        assert_eq!(pixel(&p, error + 2, top), MISSING);
-        assert_eq!(pixel(&p, depth, top), DEPTH_RAMP[0]);
-        assert_eq!(pixel(&p, depth + 1, top), MISSING);
-        assert_eq!(pixel(&p, depth + 63, top), DEPTH_RAMP[7]);
-        assert!((0..top).any(|y| (0..64).any(|x| pixel(&p, x, y) == INK)), "there is a label");
+        assert_eq!(pixel(&p, error, 0), ERROR_RAMP[5]);
+        assert_eq!(pixel(&p, error + 1, 0), ERROR_RAMP[0]);
+        assert_eq!(pixel(&p, error + 2, 0), MISSING);
+        assert_eq!(pixel(&p, depth, 0), DEPTH_RAMP[0]);
+        assert_eq!(pixel(&p, depth + 1, 0), MISSING);
+        assert_eq!(pixel(&p, depth + 63, 0), DEPTH_RAMP[7]);
+        assert_eq!(caption(&view), ": observed | rendered, 31.2 dB | error, 0 to 0.25 | depth, 1.0 to 64.0 m");
     }
 
     #[test]

@@ -8,10 +8,9 @@ use crate::map::{Evaluation, Gaussian, Mapper, Panel};
 use crate::mem;
 use crate::output::html::{write_html, Evidence};
 use crate::output::metrics::{percentile, trajectory_error};
-use crate::output::panel::{panel, Picture};
+use crate::output::panel::{caption, panel, Picture};
 use crate::output::report::{seconds_to, ExtrinsicsFound, KernelTime, Report, GOOD_DB};
 use crate::output::{atomically, ply, trajectory, OutputDir};
-use crate::vio::RigEstimate;
 use stipple_drivers::{host, Fault, Nanos, TimedPose};
 
 /// Keyframes drawn into DIR/renders.
@@ -138,7 +137,25 @@ fn track_figures(report: &mut Report, flown: &Flown) -> Vec<TimedPose> {
     (report.tracking_ms_p50, report.tracking_ms_p99) = percentiles(&ms);
     (report.frontend_ms_p50, report.frontend_ms_p99) = percentiles(&run.front.ms);
     (report.estimator_ms_p50, report.estimator_ms_p99) = percentiles(&run.back.ms);
-    run.back.vio.rig().into_iter().for_each(|rig| rig_figures(report, &rig));
+    if let Some(rig) = run.back.vio.rig() {
+        let three = |v: &[f64], at: usize| std::array::from_fn(|i| v[at + i]);
+        (report.time_offset_s, report.time_offset_sigma_s) = rig.time_offset.map(|[t, s]| (t, s)).unzip();
+        let found = rig.extrinsics.iter().enumerate().filter_map(|(camera, e)| {
+            let [v, s] = (*e)?;
+            Some(ExtrinsicsFound {
+                camera,
+                p_m: three(&v, 0),
+                p_sigma_m: three(&s, 0),
+                theta_rad: three(&v, 3),
+                theta_sigma_rad: three(&s, 3),
+            })
+        });
+        report.extrinsics = found.collect();
+        if let Some([v, s]) = rig.imu_scale {
+            (report.gyro_scale, report.gyro_scale_sigma) = (Some(three(&v, 0)), Some(three(&s, 0)));
+            (report.accel_scale, report.accel_scale_sigma) = (Some(three(&v, 3)), Some(three(&s, 3)));
+        }
+    }
     report.estimator_bytes = Some(run.bytes);
     if let Some((least, median, under)) = run.back.vio.quality_summary() {
         (report.quality_min, report.quality_p50) = (Some(least.into()), Some(median.into()));
@@ -146,26 +163,6 @@ fn track_figures(report: &mut Report, flown: &Flown) -> Vec<TimedPose> {
     }
     report.vio_hash = Some(format!("{:016x}", run.back.vio.hash()));
     run.back.trajectory.iter().map(|o| TimedPose { t: o.t, pose: o.world_from_body }).collect()
-}
-
-fn rig_figures(report: &mut Report, rig: &RigEstimate) {
-    let three = |v: &[f64], at: usize| std::array::from_fn(|i| v[at + i]);
-    (report.time_offset_s, report.time_offset_sigma_s) = rig.time_offset.map(|[t, s]| (t, s)).unzip();
-    let found = rig.extrinsics.iter().enumerate().filter_map(|(camera, e)| {
-        let [v, s] = (*e)?;
-        Some(ExtrinsicsFound {
-            camera,
-            p_m: three(&v, 0),
-            p_sigma_m: three(&s, 0),
-            theta_rad: three(&v, 3),
-            theta_sigma_rad: three(&s, 3),
-        })
-    });
-    report.extrinsics = found.collect();
-    if let Some([v, s]) = rig.imu_scale {
-        (report.gyro_scale, report.gyro_scale_sigma) = (Some(three(&v, 0)), Some(three(&s, 0)));
-        (report.accel_scale, report.accel_scale_sigma) = (Some(three(&v, 3)), Some(three(&s, 3)));
-    }
 }
 
 type Measured = (Evaluation, Vec<Panel>, Vec<Gaussian>);
@@ -183,12 +180,13 @@ fn measure(mapper: &mut Mapper) -> Result<Measured, GpuError> {
 /// Writes the files of DIR; `evidence` is without its pictures, which are made of `panels`.
 fn write_files(report: &Report, evidence: &Evidence, panels: &[Panel], out: &OutputDir) -> Result<(), Fault> {
     out.write("trajectory.tum", |w| trajectory::write_tum(w, evidence.estimated))?;
-    let pictures: Vec<(String, Picture)> = panels.iter().map(|p| (p.name.clone(), panel(p))).collect();
+    let pictures: Vec<(String, Picture)> = panels.iter().map(|p| (caption(p), panel(p))).collect();
     if pictures.is_empty() {
         out.remove("renders")?;
     } else {
         out.replace_folder("renders", |dir| {
-            pictures.iter().try_for_each(|(name, p)| atomically(&dir.join(format!("{name}.png")), |w| p.write_png(w)))
+            let mut drawn = panels.iter().zip(&pictures);
+            drawn.try_for_each(|(p, (_, d))| atomically(&dir.join(format!("{}.png", p.name)), |w| d.write_png(w)))
         })?;
     }
     let evidence = Evidence { pictures: &pictures, ..*evidence };
