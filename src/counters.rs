@@ -91,6 +91,8 @@ stipple_drivers::counters! {
     splats_not_finite,
     /// Gaussians skipped by the optimiser because a gradient was not finite.
     gradients_rejected,
+    /// Times that the mapper's process was started again, with an empty map.
+    map_restarts,
     /// GPU submissions that failed.
     gpu_failures,
 }

@@ -10,9 +10,10 @@
 use crate::camera::Camera;
 use crate::types::{Frames, Image, ImuSample, Nanos, Pose, Span};
 use glam::{DMat3, DVec3};
+use serde::{Deserialize, Serialize};
 
 /// A camera of the rig: its lens, its pose and its timing.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct RigCamera {
     /// Size and lens.
     pub camera: Camera,
@@ -47,7 +48,7 @@ impl RigCamera {
 }
 
 /// The correction of a unit's readings: the true rate or force is `scale * reading - bias`.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ImuCorrection {
     /// Scale and misalignment of the gyro's axes.
     pub gyro_scale: DMat3,
@@ -88,7 +89,7 @@ impl ImuCorrection {
 }
 
 /// Continuous-time noise densities of the inertial unit, and the correction of its axes.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ImuCalibration {
     pub rate_hz: f64,
     /// White noise of the gyro, rad/s per √Hz.
@@ -121,7 +122,7 @@ impl ImuCalibration {
 }
 
 /// The calibration of a rig; the body frame is that of the inertial unit.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Calibration {
     /// Cameras in the order of their images, cam0 first.
     pub cameras: Vec<RigCamera>,

@@ -11,10 +11,11 @@
 #![allow(clippy::neg_cmp_op_on_partial_ord)]
 
 use glam::{DVec2, DVec3};
+use serde::{Deserialize, Serialize};
 use std::f64::consts::PI;
 
 /// A distortion model with its coefficients.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub enum Lens {
     /// Radial factor 1 + k1 u + k2 u², u = r².
     Radtan { k1: f64, k2: f64, p1: f64, p2: f64 },
@@ -27,7 +28,7 @@ pub enum Lens {
 }
 
 /// A camera: size, focal lengths and principal point in pixels, and its lens.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Camera {
     /// Columns, pixels.
     pub width: usize,

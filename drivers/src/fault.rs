@@ -1,10 +1,11 @@
 //! The one error type of boot and of input: what is wrong, where, why, and what to do. It prints as one line.
 
+use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::path::Path;
 
 /// What sort of thing went wrong, for whoever must decide what to do about it (a program: its exit code).
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum FaultKind {
     /// The program was asked for something that it does not do.
     Usage,
@@ -25,7 +26,7 @@ pub enum FaultKind {
 }
 
 /// An error with its place, its cause and its remedy.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Fault {
     /// What sort of thing went wrong.
     pub kind: FaultKind,

@@ -66,24 +66,96 @@ pub fn end_when_unread() {
 
 static STOP: AtomicBool = AtomicBool::new(false);
 
-extern "C" fn ask_to_stop(_signal: libc::c_int) {
-    STOP.store(true, Ordering::Relaxed);
+/// Signals that ask a run to stop: from a keyboard, from a service manager, from a terminal that is gone.
+const STOP_SIGNALS: [libc::c_int; 3] = [libc::SIGINT, libc::SIGTERM, libc::SIGHUP];
+
+extern "C" fn ask_to_stop(signal: libc::c_int) {
+    if STOP.swap(true, Ordering::Relaxed) {
+        // SAFETY: both calls may be made in a signal handler. The signal is blocked while its handler runs, and ends the
+        // program as soon as it returns.
+        unsafe {
+            libc::signal(signal, libc::SIG_DFL);
+            libc::raise(signal);
+        }
+    }
 }
 
-/// The flag that SIGINT and SIGTERM set, from the first call on, instead of ending the program. The second signal of a
-/// kind ends it as it would have without.
-pub fn stop_asked_for() -> &'static AtomicBool {
-    // SAFETY: the handler does nothing but store to an atomic, which a signal may do. The struct is plain integers, for
-    // which zero is valid.
+fn on_stop_signals(handler: libc::sighandler_t) {
+    // SAFETY: the handler is a function that does only what a signal may do, or a constant that ignores the signal. The
+    // struct is plain integers, for which zero is valid.
     unsafe {
         let mut action: libc::sigaction = std::mem::zeroed();
-        action.sa_sigaction = ask_to_stop as extern "C" fn(libc::c_int) as usize;
-        action.sa_flags = libc::SA_RESETHAND | libc::SA_RESTART;
-        for signal in [libc::SIGINT, libc::SIGTERM] {
+        action.sa_sigaction = handler;
+        action.sa_flags = libc::SA_RESTART;
+        for signal in STOP_SIGNALS {
             libc::sigaction(signal, &action, std::ptr::null_mut());
         }
     }
+}
+
+/// The flag that SIGINT, SIGTERM and SIGHUP set, from the first call on, instead of ending the program. A second signal, of
+/// any of them, ends it at once.
+pub fn stop_asked_for() -> &'static AtomicBool {
+    on_stop_signals(ask_to_stop as extern "C" fn(libc::c_int) as usize);
     &STOP
+}
+
+/// Makes this process end with the one that started it, `parent`, whatever ends that, and leaves signals that ask to stop to
+/// it. Fails where that one has ended already.
+pub fn live_with_parent(parent: u32) -> std::io::Result<()> {
+    on_stop_signals(libc::SIG_IGN);
+    // SAFETY: plain integers.
+    let orphan = unsafe {
+        libc::prctl(libc::PR_SET_PDEATHSIG, libc::SIGKILL);
+        libc::getppid() as u32 != parent
+    };
+    if orphan {
+        return Err(std::io::Error::other("its parent has ended"));
+    }
+    Ok(())
+}
+
+/// Asks for real-time priority of the calling thread (SCHED_FIFO, 1 to 99): ordinary threads of all processes wait for it.
+/// Threads and processes that it starts are ordinary. Fails where the system does not allow it (`LimitRTPRIO`).
+pub fn ask_for_realtime(priority: i32) -> std::io::Result<()> {
+    let parameter = libc::sched_param { sched_priority: priority };
+    // SAFETY: zero means the calling thread; the struct outlives the call.
+    let failed = unsafe { libc::sched_setscheduler(0, libc::SCHED_FIFO | libc::SCHED_RESET_ON_FORK, &parameter) };
+    if failed == 0 {
+        Ok(())
+    } else {
+        Err(std::io::Error::last_os_error())
+    }
+}
+
+/// Keeps every page that this process has used, and will use, in memory. Fails where the system does not allow it
+/// (`LimitMEMLOCK`).
+pub fn lock_memory() -> std::io::Result<()> {
+    // SAFETY: plain integers.
+    let failed = unsafe { libc::mlockall(libc::MCL_CURRENT | libc::MCL_FUTURE | libc::MCL_ONFAULT) };
+    if failed == 0 {
+        Ok(())
+    } else {
+        Err(std::io::Error::last_os_error())
+    }
+}
+
+/// Whether a descriptor takes a few hundred bytes now, without waiting. One whose reader is gone takes them: writing fails.
+pub fn is_writable(fd: i32) -> bool {
+    let mut asked = libc::pollfd { fd, events: libc::POLLOUT, revents: 0 };
+    // SAFETY: one struct, which outlives the call.
+    unsafe { libc::poll(&mut asked, 1, 0) == 1 }
+}
+
+/// Whether another process is stopped (SIGSTOP), and its resident set, bytes; `None` where there is no such process.
+pub fn stopped_and_resident(pid: u32) -> Option<(bool, u64)> {
+    let text = std::fs::read_to_string(format!("/proc/{pid}/stat")).ok()?;
+    // The name, in parentheses, may hold anything; fields after it are numbered from 3.
+    let fields: Vec<&str> = text.rsplit_once(')')?.1.split_whitespace().collect();
+    let (state, pages): (&str, u64) = (fields.first()?, fields.get(21)?.parse().ok()?);
+    // SAFETY: plain integers.
+    let page = unsafe { libc::sysconf(libc::_SC_PAGESIZE) };
+    Some((matches!(state, "T" | "t"), pages * page as u64))
 }
 
 /// Bytes that can still be written below the folder `at`; `None` where there is no such folder.

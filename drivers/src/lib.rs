@@ -5,7 +5,7 @@
 //! - sources of frames and samples behind two traits (`source`): cameras (`v4l2`), inertial units (`imu`), recordings
 //!   (`replay`, played by `paced`), faults on purpose (`inject`); lines of GPIO (`gpio`)
 //! - written recordings (`record`, `euroc`) and the simulator (`sim`)
-//! - the operating system (`host`)
+//! - the operating system (`host`), memory that two processes share (`shared`)
 //!
 //! It builds and tests without Vulkan or OpenCV and knows nothing of the program: no threads of its own but the recorder's
 //! writer and the simulator's renderers, no configuration file, no exit codes.
@@ -23,6 +23,7 @@ pub mod list;
 pub mod paced;
 pub mod record;
 pub mod replay;
+pub mod shared;
 pub mod sim;
 pub mod source;
 pub mod types;

@@ -4,13 +4,14 @@
 //! `world_from_body * body_from_cam`.
 
 use glam::{DMat3, DQuat, DVec3};
+use serde::{Deserialize, Serialize};
 
 /// An instant: nanoseconds of a recording's clock, or of the host's monotonic one. Sums and differences saturate.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Default)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Default, Serialize, Deserialize)]
 pub struct Nanos(pub i64);
 
 /// The difference of two instants, nanoseconds.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Default)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Default, Serialize, Deserialize)]
 pub struct Span(pub i64);
 
 impl Nanos {
@@ -135,7 +136,7 @@ impl Frames {
 }
 
 /// A rigid transform `a_from_b`: `p_a = q * p_b + p`. `q` is kept normalised.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Pose {
     /// Rotation `a_from_b`, of unit length.
     pub q: DQuat,

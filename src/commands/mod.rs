@@ -45,6 +45,9 @@ enum Command {
     Check(check::Args),
     /// Judge the calibration of a recording: rectified rows, clock offset, gyro axes and bias, camera attitude
     CalibCheck(calib_check::Args),
+    /// Map for a process that flies; `run` starts it
+    #[command(hide = true)]
+    MapWorker,
     /// Judge each part of a board and its live sensors, and say what to do
     Doctor(doctor::Args),
 }
@@ -72,6 +75,7 @@ pub fn main() -> ExitCode {
         Command::Check(args) => check::check(&args),
         Command::CalibCheck(args) => calib_check::calib_check(&args),
         Command::Doctor(args) => doctor::doctor(&args),
+        Command::MapWorker => crate::run::worker::serve(std::io::stdin().lock(), std::io::stdout().lock()),
     };
     match done {
         Ok(()) => ExitCode::SUCCESS,

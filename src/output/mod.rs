@@ -47,7 +47,6 @@ impl OutputDir {
         Ok(OutputDir { path: path.to_path_buf() })
     }
 
-    #[cfg(feature = "instruments")]
     pub fn path(&self) -> &Path {
         &self.path
     }

@@ -116,8 +116,8 @@ pub fn seconds_to(curve: &[CurvePoint], db: f64) -> Option<f64> {
 }
 
 impl Report {
-    pub fn set_counters(&mut self, counters: &[(&str, u64)]) {
-        self.counts = counters.iter().map(|(name, n)| (format!("{COUNT}{name}"), *n)).collect();
+    pub fn set_counters(&mut self, counters: &[(impl AsRef<str>, u64)]) {
+        self.counts = counters.iter().map(|(name, n)| (format!("{COUNT}{}", name.as_ref()), *n)).collect();
     }
 
     /// Frames on which each bit of the odometry's health was set; after the counters.

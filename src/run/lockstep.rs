@@ -7,11 +7,13 @@
 //! goes on.
 
 use super::gate::{FrameGate, ImuGate};
-use super::mapping::{Keyframes, Mapping, SLICE};
+use super::keyframes::Keyframes;
+use super::mapping::{Mapping, SLICE};
 use super::sensors::Recorded;
 use super::status::{Gauges, Status};
 use super::tracking::{FramePacket, Inlet, Link, Tracker};
 use super::waker::{SetOnDrop, Waker};
+use super::worker::MapSide;
 use super::{spawn_tracking, Flown, Options, Steps};
 use crate::counters::Counters;
 use crossbeam_queue::ArrayQueue;
@@ -109,14 +111,16 @@ pub fn fly(
     recorded: Recorded,
     calibration: &Calibration,
     mut tracker: Tracker,
-    mut mapping: Option<Mapping>,
+    map: Option<MapSide>,
     options: &Options,
     steps: Steps,
     status: &mut Status,
 ) -> Flown {
     let (counters, gauges) = (Counters::default(), Gauges::default());
-    let queue = mapping.as_ref().map(|m| m.queue.clone());
-    let colours = queue.as_ref().map_or(0, |q| q.colours());
+    // Steps in lockstep are taken in this process.
+    let mut mapping = if let Some(MapSide::Here(mapping)) = map { Some(mapping) } else { None };
+    let ring = mapping.as_ref().map(|m| m.ring.clone());
+    let colours = ring.as_ref().map_or(0, |r| r.colours());
     let mut keyframes = Keyframes::new(options.holdout);
     let (total, length_s) = (recorded.stamps.len(), recorded.length_s());
     let mut packets: Vec<Box<FramePacket>> =
@@ -143,7 +147,7 @@ pub fn fly(
             while sent > 0 {
                 let Some(packet) = waker.wait(&ended, || done.pop()) else { return };
                 sent -= 1;
-                keyframes.pass_on(&packet, queue.as_deref(), &counters);
+                keyframes.pass_on(&packet, ring.as_deref(), &counters);
                 let frames = gauges.frames.fetch_add(1, Relaxed) + 1;
                 gauges.keyframes.store(keyframes.count, Relaxed);
                 let since_first = packet.frames.t - reading.recorded.stamps[0];
@@ -167,7 +171,7 @@ pub fn fly(
     }
     Flown {
         tracker,
-        mapping,
+        map: mapping.map(MapSide::Here),
         counters,
         frames: reading.next,
         keyframes: keyframes.count,

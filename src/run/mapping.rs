@@ -1,18 +1,21 @@
-//! The mapping side of a flight: keyframes in, a map and its error against run time out.
+//! The mapping side of a flight, in a thread of it or in a process of its own: keyframes in, a map and its error against
+//! run time out.
 
+use super::keyframes::KeyframeRing;
 use super::status::Gauges;
-use super::tracking::FramePacket;
 use crate::config::Board;
-use crate::counters::Counters;
 use crate::gpu::GpuError;
-use crate::map::{cameras, CurvePoint, Keyframe, Mapper, PoseCorrection, StepKind};
-use crate::mem::{seal_thread, unsealed};
-use crossbeam_queue::ArrayQueue;
-use std::collections::VecDeque;
+use crate::map::{CurvePoint, Evaluation, Keyframe, Mapper, StepKind};
+use crate::mem::{self, seal_thread, unsealed};
+use crate::output::metrics::percentile;
+use crate::output::panel::{caption, panel, Picture};
+use crate::output::report::KernelTime;
+use crate::output::{ply, OutputDir};
+use serde::{Deserialize, Serialize};
 use std::sync::atomic::Ordering::Relaxed;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
-use stipple_drivers::{host, Calibration, Fault, Frames, Image, Nanos, Pose};
+use stipple_drivers::{host, Calibration, Fault};
 
 /// Nice value of the threads that map: after the sensors, odometry and recording. What is not mapped in time comes later.
 pub const NICE: i32 = 10;
@@ -28,9 +31,11 @@ const CURVE_POINTS: usize = 4096;
 pub struct Mapping {
     pub mapper: Mapper,
     /// Where keyframes and corrections come from.
-    pub queue: Arc<KeyframeQueue>,
-    /// Keyframes taken from it, oldest first; corrections still reach them.
-    waiting: VecDeque<Box<Keyframe>>,
+    pub ring: Arc<KeyframeRing>,
+    /// The keyframe in hand.
+    keyframe: Keyframe,
+    /// Keyframes with lower numbers may be taken.
+    collected: u64,
     pub curve: Vec<CurvePoint>,
     pub iteration_ms: Vec<f32>,
     pub iterations: u64,
@@ -46,7 +51,7 @@ pub struct Mapping {
 impl Mapping {
     /// Opens the device on a thread of low priority: the threads of a CPU device inherit it, so
     /// that odometry is served first.
-    pub fn open(calibration: &Calibration, board: &Board) -> Result<Mapping, Fault> {
+    pub fn open(calibration: &Calibration, board: &Board, ring: Arc<KeyframeRing>) -> Result<Mapping, Fault> {
         let build = || {
             host::lower_priority(NICE);
             Mapper::open(calibration, board)
@@ -54,8 +59,9 @@ impl Mapping {
         let mapper = super::apart("mapping", build)?;
         Ok(Mapping {
             mapper,
-            queue: Arc::new(KeyframeQueue::new(calibration, board)),
-            waiting: VecDeque::with_capacity(KEYFRAME_SLOTS),
+            keyframe: ring.shape().clone(),
+            ring,
+            collected: 0,
             curve: Vec::with_capacity(CURVE_POINTS),
             iteration_ms: Vec::with_capacity(ITERATION_TIMES),
             iterations: 0,
@@ -69,7 +75,8 @@ impl Mapping {
 
     /// Takes over the keyframes and corrections that came.
     pub fn collect(&mut self) {
-        self.queue.collect(&mut self.waiting, |correction| self.mapper.correct(correction));
+        self.ring.corrections(|correction| self.mapper.correct(correction));
+        self.collected = self.ring.offered();
     }
 
     /// One slice of work: keyframes first, until one becomes an anchor, then training. At least one thing is done; answers
@@ -94,10 +101,9 @@ impl Mapping {
     }
 
     fn work(&mut self, deadline: Instant) -> Result<bool, GpuError> {
-        while let Some(keyframe) = self.waiting.pop_front() {
-            let kind = self.mapper.ingest(&keyframe);
-            // As many places as slots: there is always room.
-            let _ = self.queue.spare.push(keyframe);
+        while let Some(slot) = self.ring.take(self.collected, &mut self.keyframe) {
+            let kind = self.mapper.ingest(&self.keyframe);
+            self.ring.done(slot);
             let anchor = matches!(kind?, StepKind::Anchor { .. });
             self.anchors += u64::from(anchor);
             if anchor || Instant::now() >= deadline {
@@ -141,126 +147,95 @@ impl Mapping {
     }
 }
 
-/// Keyframes on their way to the mapper: a fixed number of pre-shaped boxes going round.
-pub struct KeyframeQueue {
-    spare: ArrayQueue<Box<Keyframe>>,
-    offered: ArrayQueue<Box<Keyframe>>,
-    corrections: ArrayQueue<PoseCorrection>,
-    colours: usize,
+/// Keyframes drawn into DIR/renders.
+const PANELS: usize = 12;
+
+/// What mapping came to. Figures that could not be had are `None`.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct MapResult {
+    pub anchors: u64,
+    pub iterations: u64,
+    pub iteration_ms_p50: Option<f64>,
+    pub splats: u64,
+    pub gpu_bytes: u64,
+    pub device: String,
+    pub curve: Vec<CurvePoint>,
+    pub kernels: Vec<KernelTime>,
+    pub counters: Vec<(String, u64)>,
+    pub quality: Evaluation,
+    /// `map.ply` was written.
+    pub written: bool,
+    /// Why the map is incomplete, where it is.
+    pub failure: Option<String>,
+    /// Of a process of its own; zero otherwise.
+    pub heap_after_seal: u64,
+    pub rss_peak_bytes: u64,
+    #[serde(skip)]
+    pub drawn: Vec<Drawn>,
 }
 
-/// Keyframes between tracking and the map: as many as come while one or two anchors are being made.
-pub const KEYFRAME_SLOTS: usize = 12;
+/// A keyframe beside its rendering.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Drawn {
+    pub name: String,
+    pub caption: String,
+    pub picture: Picture,
+}
 
-/// Pose corrections that wait: those of four windows.
-const CORRECTION_SLOTS: usize = 64;
-
-impl KeyframeQueue {
-    /// Shaped for the images that the board's map wants of this rig.
-    pub fn new(calibration: &Calibration, board: &Board) -> KeyframeQueue {
-        let q = KeyframeQueue {
-            spare: ArrayQueue::new(KEYFRAME_SLOTS),
-            offered: ArrayQueue::new(KEYFRAME_SLOTS),
-            corrections: ArrayQueue::new(CORRECTION_SLOTS),
-            colours: cameras::colours(calibration.cameras.len(), &board.map),
+impl Mapping {
+    /// Writes `map.ply`, evaluates and draws, in this order, and calls `tell` with what there is after each, so that a
+    /// process whose time is over has told the most important first.
+    pub fn conclude(&mut self, out: &OutputDir, tell: &mut dyn FnMut(&MapResult)) -> MapResult {
+        let ms: Vec<f64> = self.iteration_ms.iter().map(|v| f64::from(*v)).collect();
+        let mut kernels = self.mapper.kernel_times();
+        kernels.sort_by(|a, b| b.total_ms.total_cmp(&a.total_ms));
+        let kernel =
+            |k: crate::gpu::Timing| KernelTime { name: k.name.to_string(), dispatches: k.count, total_ms: k.total_ms };
+        let mut result = MapResult {
+            anchors: self.anchors,
+            iterations: self.iterations,
+            iteration_ms_p50: percentile(&ms, 0.5),
+            splats: self.mapper.splat_count() as u64,
+            gpu_bytes: self.mapper.gpu_bytes(),
+            device: self.mapper.device().to_string(),
+            curve: self.curve.clone(),
+            kernels: kernels.into_iter().map(kernel).collect(),
+            heap_after_seal: mem::heap_after_seal(),
+            ..MapResult::default()
         };
-        for _ in 0..KEYFRAME_SLOTS {
-            let shape = |i: usize| {
-                let c = &calibration.cameras[i].camera;
-                Image::new(c.width, c.height)
-            };
-            let colours = (0..q.colours).map(|i| std::array::from_fn(|_| shape(i))).collect();
-            let images = (0..cameras::images(calibration.cameras.len(), &board.map)).map(shape).collect();
-            let _ = q.spare.push(Box::new(Keyframe { images, colours, ..Keyframe::default() }));
+        if self.failure.is_none() {
+            self.failure = self.measure(out, &mut result, tell).err();
         }
-        q
+        result.failure = self.failure.clone();
+        result.counters = self.mapper.counters().list().into_iter().map(|(name, n)| (name.to_string(), n)).collect();
+        result.rss_peak_bytes = host::rss_peak_bytes().unwrap_or(0);
+        tell(&result);
+        result
     }
 
-    /// Images of a keyframe that are wanted in colour.
-    pub fn colours(&self) -> usize {
-        self.colours
-    }
-
-    /// Copies a keyframe in; false when every slot is taken.
-    pub fn offer(&self, frames: &Frames, fill: impl FnOnce(&mut Keyframe)) -> bool {
-        let Some(mut slot) = self.spare.pop() else { return false };
-        slot.t = frames.t;
-        let colours = slot.colours.iter_mut().flatten().zip(frames.colours.iter().flatten());
-        for (to, from) in slot.images.iter_mut().zip(&frames.images).chain(colours) {
-            to.copy_from(from);
+    /// Writes the Gaussians as viewers show them, in the exposure of most images; then figures, then pictures.
+    fn measure(
+        &mut self,
+        out: &OutputDir,
+        result: &mut MapResult,
+        tell: &mut dyn FnMut(&MapResult),
+    ) -> Result<(), String> {
+        let gpu = |e: GpuError| e.to_string();
+        let mut splats = self.mapper.splats().map_err(gpu)?;
+        let exposure = self.mapper.median_exposure();
+        for colour in splats.iter_mut().flat_map(|s| &mut s.colour) {
+            *colour = exposure.observed(f64::from(*colour)) as f32;
         }
-        fill(&mut slot);
-        // As many places as slots: there is always room.
-        let _ = self.offered.push(slot);
-        true
-    }
-
-    /// Appends the keyframes that came to `waiting`, which corrections still reach, and calls `correct` with these.
-    fn collect(&self, waiting: &mut VecDeque<Box<Keyframe>>, mut correct: impl FnMut(&PoseCorrection)) {
-        let mut offered = std::iter::from_fn(|| self.offered.pop());
-        waiting.extend(&mut offered);
-        while let Some(correction) = self.corrections.pop() {
-            // Its keyframe was offered before.
-            waiting.extend(&mut offered);
-            for keyframe in waiting.iter_mut().filter(|k| k.id == correction.id) {
-                keyframe.world_from_body = correction.world_from_body;
-            }
-            correct(&correction);
-        }
-    }
-}
-
-/// Newest keyframes, which the estimator may still move: more than a window holds.
-const RECENT: usize = 32;
-
-/// Numbers keyframes, chooses the held-out ones, and hands them to the mapper where there is one.
-pub struct Keyframes {
-    /// Every Nth keyframe is held out; 0: none.
-    holdout: u32,
-    /// Keyframes accepted by the mapper's queue; without a mapper, all.
-    pub count: u64,
-    /// Stamps and numbers of the newest.
-    recent: VecDeque<(Nanos, u64)>,
-}
-
-impl Keyframes {
-    pub fn new(holdout: u32) -> Keyframes {
-        Keyframes { holdout, count: 0, recent: VecDeque::with_capacity(RECENT) }
-    }
-
-    fn fill(&mut self, slot: &mut Keyframe, world_from_body: Pose) {
-        slot.id = self.count;
-        slot.world_from_body = world_from_body;
-        let n = u64::from(self.holdout);
-        slot.held_out = n > 0 && self.count % n == n - 1;
-        self.count += 1;
-    }
-
-    /// Hands a tracked frame on: a keyframe to the mapper, and the window's newer poses with it.
-    pub fn pass_on(&mut self, packet: &FramePacket, queue: Option<&KeyframeQueue>, counters: &Counters) {
-        let Some(tracked) = packet.tracked.as_ref().filter(|t| t.keyframe) else { return };
-        let Some(queue) = queue else {
-            self.count += 1;
-            return;
-        };
-        if packet.blank {
-            counters.keyframes_blank.add(1);
-            return;
-        }
-        let id = self.count;
-        if queue.offer(&packet.frames, |keyframe| self.fill(keyframe, tracked.world_from_body)) {
-            self.recent.truncate(RECENT - 1);
-            self.recent.push_front((packet.frames.t, id));
-        } else {
-            counters.keyframes_rejected.add(1);
-        }
-        for (t, world_from_body) in tracked.corrections.iter() {
-            if let Some((_, id)) = self.recent.iter().find(|(at, found)| at == t && *found != id) {
-                if queue.corrections.push(PoseCorrection { id: *id, world_from_body: *world_from_body }).is_err() {
-                    counters.corrections_full.add(1);
-                }
-            }
-        }
+        let written = out.write("map.ply", |w| ply::write_ply(w, splats.into_iter()));
+        written.map_err(|fault| fault.to_string())?;
+        result.written = true;
+        tell(result);
+        result.quality = self.mapper.evaluate().map_err(gpu)?;
+        tell(result);
+        let panels = self.mapper.panels(PANELS).map_err(gpu)?;
+        let draw = |p: &crate::map::Panel| Drawn { name: p.name.clone(), caption: caption(p), picture: panel(p) };
+        result.drawn = panels.iter().map(draw).collect();
+        Ok(())
     }
 }
 
@@ -279,15 +254,12 @@ pub fn map(
         let tracked = tracked();
         mapping.collect();
         let worked = mapping.step(Instant::now() + SLICE, gauges);
+        gauges.slices.fetch_add(1, Relaxed);
         let t_s = start.elapsed().as_secs_f64();
         mapping.sample_if_due(t_s, gauges);
         gauges.broke.fetch_or(mapping.failure.is_some(), Relaxed);
-        if tracked {
-            // Nothing is played any more; the run's own time is what progresses.
-            gauges.played_ms.fetch_max((t_s * 1e3) as u64, Relaxed);
-            if over(t_s) || mapping.failure.is_some() {
-                break;
-            }
+        if tracked && (over(t_s) || mapping.failure.is_some()) {
+            break;
         }
         if !worked {
             std::thread::sleep(IDLE);
@@ -295,34 +267,4 @@ pub fn map(
     }
     unsealed(|| mapping.sample(start.elapsed().as_secs_f64(), gauges));
     mapping
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use glam::DVec3;
-    use stipple_drivers::{Camera, ImuCalibration, Lens, RigCamera};
-
-    fn queue() -> KeyframeQueue {
-        let lens = Lens::Radtan { k1: 0.0, k2: 0.0, p1: 0.0, p2: 0.0 };
-        let camera = Camera { width: 4, height: 3, fx: 4.0, fy: 4.0, cx: 2.0, cy: 1.0, lens };
-        let cameras = vec![RigCamera::new(camera, Pose::IDENTITY); 2];
-        let board = include_str!("../../board-configs/lavapipe.toml");
-        let board = Board::parse("lavapipe.toml", board, &[]).expect("a board of ours");
-        KeyframeQueue::new(&Calibration { cameras, imu: ImuCalibration::CONSUMER }, &board)
-    }
-
-    #[test]
-    fn full_queue_rejects_newest_keeps_order_and_lets_corrections_reach_what_waits() {
-        let (q, mut waiting, mut corrected) = (queue(), VecDeque::new(), vec![]);
-        let frames = Frames { images: vec![Image::new(4, 3); 2], ..Frames::default() };
-        let offer = |id: u64| q.offer(&frames, |k| k.id = id);
-        assert!((0..KEYFRAME_SLOTS as u64).all(offer) && !offer(99));
-        let correction = PoseCorrection { id: 2, world_from_body: Pose { p: DVec3::X, ..Pose::IDENTITY } };
-        assert!(q.corrections.push(correction).is_ok());
-        q.collect(&mut waiting, |c| corrected.push(c.id));
-        assert_eq!(corrected, [2]);
-        assert!(waiting.iter().enumerate().all(|(i, k)| k.id == i as u64));
-        assert_eq!([1, 2].map(|i| waiting[i].world_from_body.p), [DVec3::ZERO, DVec3::X]);
-    }
 }

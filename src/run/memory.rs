@@ -1,7 +1,7 @@
 //! The byte table: everything a board buys at boot, summed before anything is bought.
 
+use super::keyframes::KeyframeRing;
 use super::mailbox::Mailbox;
-use super::mapping::KeyframeQueue;
 use super::tracking::OdometryRun;
 use super::{packets, POSES_KEPT};
 use crate::config::Board;
@@ -22,7 +22,7 @@ pub fn footprint(calibration: &Calibration, board: &Board, records: bool) -> Res
     if board.map.enabled {
         // First, since it refuses a rig without the cameras that keyframes have images of.
         let mapper = Mapper::footprint(calibration, board)?;
-        f.build("queues: keyframes", || KeyframeQueue::new(calibration, board));
+        f.host("queues: keyframes", KeyframeRing::bytes(calibration, board));
         f.extend(mapper);
     }
     if records {

@@ -13,7 +13,8 @@
 //! | tracking | front end and back end in turns; offers keyframes | sealed |
 //! | or frontend | follows points (`frontend.threads = 2`) | sealed |
 //! | and estimator | estimates, one frame behind at most; offers keyframes | sealed |
-//! | mapping | rectification, depth, training; low priority, as are the CPU device's own threads | sealed; OpenCV and the driver allocate behind it |
+//! | mapping | rectification, depth, training; low priority, as are the CPU device's own threads; `stipple run` has it in a process of its own | sealed; OpenCV and the driver allocate behind it |
+//! | map-answers | reads what that process tells | free |
 //! | trigger | starts the cameras' exposures, where a line is wired for it | free |
 //! | led | shows the state of a run, where a line is wired for it | free |
 //! | writer (the recorder's) | writes what is recorded, if anything is; low priority | free |
@@ -26,6 +27,7 @@
 //! mapping ends with the run's time.
 
 pub mod gate;
+mod keyframes;
 mod lockstep;
 pub mod mailbox;
 pub mod mapping;
@@ -38,14 +40,16 @@ pub mod status_led;
 pub mod summary;
 pub mod tracking;
 pub mod waker;
+pub mod worker;
 
 use crate::config::{Board, InjectConfig};
 use crate::counters::Counters;
 use crate::output::report::Report;
 use crate::output::OutputDir;
 use gate::ImuGate;
+use keyframes::{KeyframeRing, Keyframes};
 use mailbox::{Capture, Mailbox};
-use mapping::{Keyframes, Mapping};
+use mapping::Mapping;
 use recorder::Recording;
 use sensors::{Input, Sensors, Source};
 use status::{print_err, Gauges, Status};
@@ -59,6 +63,7 @@ use stipple_drivers::record::Format;
 use stipple_drivers::replay::read_trajectory;
 use stipple_drivers::{host, Calibration, Fault, FaultKind, Frames};
 use tracking::{FramePacket, Inlet, Link, OdometryRun, Tracker};
+use worker::{MapSide, Worker};
 
 /// How frames arrive and mapping steps are spent.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -92,6 +97,8 @@ pub struct Options {
     pub duration_s: Option<f64>,
     /// Folder that the samples are recorded to, too.
     pub record: Option<PathBuf>,
+    /// Mapping is done by a process of its own.
+    pub map_apart: bool,
     /// Faults added to the sensors of a recording.
     pub inject: InjectConfig,
 }
@@ -108,7 +115,7 @@ pub struct Outcome {
 /// A flight that has ended, before it is evaluated.
 pub struct Flown {
     pub tracker: Tracker,
-    pub mapping: Option<Mapping>,
+    pub map: Option<MapSide>,
     pub counters: Counters,
     pub frames: usize,
     pub keyframes: u64,
@@ -153,7 +160,13 @@ pub fn fly(
         Some(path) => Tracker::Table(read_trajectory(path)?),
         None => Tracker::Odometry(Box::new(OdometryRun::new(&input.calibration, board, frames)?)),
     };
-    let mapping = if board.map.enabled { Some(Mapping::open(&input.calibration, board)?) } else { None };
+    let here = || Mapping::open(&input.calibration, board, KeyframeRing::new(&input.calibration, board)?.into());
+    let lockstep = matches!((&options.pace, &input.source), (Pace::Lockstep(_), Source::Recorded(_)));
+    let map = match (board.map.enabled, options.map_apart && !lockstep) {
+        (false, _) => None,
+        (true, false) => Some(MapSide::Here(Box::new(here()?))),
+        (true, true) => Some(MapSide::Apart(Box::new(Worker::start(&input.calibration, board, out)?))),
+    };
     input.warnings.iter().for_each(|warning| print_err(format_args!("stipple: warning: {warning}")));
     let title = summary::Title {
         dataset: input.name,
@@ -172,7 +185,7 @@ pub fn fly(
     let (calibration, live) = (&input.calibration, length_s.is_none());
     let (mut flown, recording) = match (input.source, options.pace) {
         (Source::Recorded(recorded), Pace::Lockstep(steps)) => {
-            (lockstep::fly(recorded, calibration, tracker, mapping, options, steps, &mut status), None)
+            (lockstep::fly(recorded, calibration, tracker, map, options, steps, &mut status), None)
         }
         (source, _) => {
             let shape = || Frames::in_colour(calibration, colours);
@@ -186,7 +199,7 @@ pub fn fly(
                 sensors_s: options.duration_s.filter(|_| live),
                 stop: host::stop_asked_for(),
             };
-            (fly_in_real_time(sensors, calibration, tracker, mapping, &realtime, &mut status), recording)
+            (fly_in_real_time(sensors, calibration, tracker, map, &realtime, &mut status), recording)
         }
     };
     status.finish();
@@ -269,12 +282,12 @@ pub fn fly_in_real_time(
     mut sensors: Sensors,
     calibration: &Calibration,
     mut tracker: Tracker,
-    mapping: Option<Mapping>,
+    map: Option<MapSide>,
     run: &Realtime,
     status: &mut Status,
 ) -> Flown {
-    let queue = mapping.as_ref().map(|m| m.queue.clone());
-    let colours = queue.as_ref().map_or(0, |q| q.colours());
+    let ring = map.as_ref().map(|m| m.ring().clone());
+    let colours = ring.as_ref().map_or(0, |r| r.colours());
     let shared = Shared {
         start: Instant::now(),
         mailbox: Mailbox::new(packets(tracker.threads()), calibration, colours),
@@ -283,9 +296,9 @@ pub fn fly_in_real_time(
         source_done: AtomicBool::new(false),
         tracking_done: AtomicBool::new(false),
     };
-    let (s, link, queue) = (&shared, &Link::default(), queue.as_deref());
+    let (s, link, ring) = (&shared, &Link::default(), ring.as_deref());
     let (mut keyframes, mut notices) = (Keyframes::new(run.holdout), vec![]);
-    let mapping = std::thread::scope(|scope| {
+    let map = std::thread::scope(|scope| {
         let (taker, keyframes) = (&link.taker, &mut keyframes);
         let Sensors { frames, imu } = &mut sensors;
         spawn(scope, "camera", move || {
@@ -299,7 +312,7 @@ pub fn fly_in_real_time(
         let observes = matches!(tracker, Tracker::Observer(_));
         let give = move |packet: Box<FramePacket>| {
             if !packet.imu_only {
-                keyframes.pass_on(&packet, queue, &s.counters);
+                keyframes.pass_on(&packet, ring, &s.counters);
                 s.gauges.frames.fetch_add(1, Relaxed);
                 s.gauges.posed.fetch_add(u64::from(observes || packet.tracked.is_some()), Relaxed);
                 s.gauges.keyframes.store(keyframes.count, Relaxed);
@@ -310,24 +323,40 @@ pub fn fly_in_real_time(
         let take = move || s.mailbox.take(&mut held, &s.source_done, &s.counters);
         let ended = waker::SetOnDrop(&s.tracking_done, None);
         spawn_tracking(scope, link, &mut tracker, Inlet { take, over: &s.source_done }, &s.counters, give, ended);
-        let mapping_thread = mapping.map(|mapping| {
-            let tracked = || s.tracking_done.load(Ordering::Acquire);
-            let over = |t_s: f64| run.stop.load(Relaxed) || run.until_s.is_none_or(|until| t_s >= until);
-            spawn(scope, "mapping", move || mapping::map(mapping, &s.gauges, s.start, tracked, over))
-        });
-        let mapping_done = || mapping_thread.as_ref().is_none_or(|t| t.is_finished());
-        while !(s.tracking_done.load(Relaxed) && mapping_done()) {
-            let over = run.sensors_s.is_some_and(|limit| s.start.elapsed().as_secs_f64() >= limit);
-            s.mailbox.stop.fetch_or(over || run.stop.load(Relaxed), Relaxed);
+        let tracked = || s.tracking_done.load(Ordering::Acquire);
+        let over = |t_s: f64| run.stop.load(Relaxed) || run.until_s.is_none_or(|until| t_s >= until);
+        let (mut worker, mut thread) = (None, None);
+        match map {
+            Some(MapSide::Apart(apart)) => worker = Some(apart),
+            Some(MapSide::Here(here)) => {
+                let work = move || mapping::map(*here, &s.gauges, s.start, tracked, over);
+                thread = Some(spawn(scope, "mapping", work));
+            }
+            None => {}
+        }
+        loop {
+            let t_s = s.start.elapsed().as_secs_f64();
+            let mapped = thread.as_ref().map_or(worker.is_none() || over(t_s), ScopedJoinHandle::is_finished);
+            if tracked() && mapped {
+                break;
+            }
+            s.mailbox.stop.fetch_or(run.sensors_s.is_some_and(|limit| t_s >= limit) || run.stop.load(Relaxed), Relaxed);
             s.gauges.broke.fetch_or(!s.mailbox.broken.is_empty(), Relaxed);
-            while let Some(line) = s.mailbox.notices.pop() {
+            let said = worker.as_mut().and_then(|w| w.watch(&s.gauges));
+            for line in said.into_iter().chain(std::iter::from_fn(|| s.mailbox.notices.pop())) {
                 status.say(&line);
                 notices.push(line);
+            }
+            if tracked() {
+                // Nothing is played any more; the run's own time is what progresses.
+                s.gauges.played_ms.fetch_max((t_s * 1e3) as u64, Relaxed);
             }
             status.show(&s.gauges);
             std::thread::sleep(STATUS_PERIOD);
         }
-        mapping_thread.map(|t| t.join().expect("threads of a run answer with values, not panics"))
+        s.counters.map_restarts.add(worker.as_ref().map_or(0, |w| w.restarts));
+        let here = |t: ScopedJoinHandle<_>| t.join().expect("threads of a run answer with values, not panics");
+        thread.map(|t| MapSide::Here(Box::new(here(t)))).or(worker.map(MapSide::Apart))
     });
     let warnings = sensors.frames.warnings().to_vec();
     let mut source = [sensors.frames.counters(), sensors.imu.counters()].concat();
@@ -339,7 +368,7 @@ pub fn fly_in_real_time(
     let arrived = s.mailbox.arrived.load(Relaxed) + s.counters.frames_unreadable.get();
     Flown {
         tracker,
-        mapping,
+        map,
         frames: arrived as usize,
         keyframes: keyframes.count,
         wall_s: shared.start.elapsed().as_secs_f64(),

@@ -19,6 +19,8 @@ pub struct Gauges {
     pub anchors: AtomicU64,
     pub splats: AtomicU64,
     pub iterations: AtomicU64,
+    /// Slices of work that mapping has ended.
+    pub slices: AtomicU64,
     /// Training PSNR of the last probe, 0.01 dB.
     pub psnr_cdb: AtomicU64,
     /// Time of the recording played so far, ms.

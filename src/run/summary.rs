@@ -1,20 +1,16 @@
 //! What a finished flight leaves: the report, the files of DIR, seven lines of text.
 
+use super::mapping::{Drawn, MapResult};
 use super::memory::mib;
 use super::tracking::Tracker;
 use super::Flown;
-use crate::gpu::GpuError;
-use crate::map::{Evaluation, Gaussian, Mapper, Panel};
 use crate::mem;
 use crate::output::html::{write_html, Evidence};
 use crate::output::metrics::{percentile, trajectory_error};
-use crate::output::panel::{caption, panel, Picture};
-use crate::output::report::{seconds_to, ExtrinsicsFound, KernelTime, Report, GOOD_DB};
-use crate::output::{atomically, ply, trajectory, OutputDir};
+use crate::output::panel::Picture;
+use crate::output::report::{seconds_to, ExtrinsicsFound, Report, GOOD_DB};
+use crate::output::{atomically, trajectory, OutputDir};
 use stipple_drivers::{host, Fault, Nanos, TimedPose};
-
-/// Keyframes drawn into DIR/renders.
-const PANELS: usize = 12;
 
 /// What was flown, as the report names it.
 pub struct Title {
@@ -48,34 +44,24 @@ pub fn conclude(title: Title, mut flown: Flown, out: &OutputDir) -> Result<Repor
         report.rte_1s_m = e.rte_1s_m;
         report.rpe_deg = e.rpe_deg;
     }
-    let (mut panels, mut mapped) = (vec![], false);
-    if let Some(m) = &mut flown.mapping {
+    let map = flown.map.take().map(|map| map.conclude(out));
+    if let Some(m) = &map {
         report.anchors = Some(m.anchors);
         report.iterations = Some(m.iterations);
-        report.iteration_ms_p50 = percentile(&m.iteration_ms.iter().map(|v| f64::from(*v)).collect::<Vec<_>>(), 0.5);
-        report.splats = Some(m.mapper.splat_count() as u64);
-        report.gpu_bytes = Some(m.mapper.gpu_bytes());
-        report.device = Some(m.mapper.device().to_string());
+        report.iteration_ms_p50 = m.iteration_ms_p50;
+        report.splats = Some(m.splats);
+        report.gpu_bytes = Some(m.gpu_bytes);
+        report.device = Some(m.device.clone());
         report.curve = m.curve.clone();
         report.seconds_to_25_db = seconds_to(&report.curve, GOOD_DB);
-        report.kernels = m.mapper.kernel_times().into_iter().map(kernel_time).collect();
-        report.kernels.sort_by(|a, b| b.total_ms.total_cmp(&a.total_ms));
-        if m.failure.is_none() {
-            match measure(&mut m.mapper) {
-                Ok((quality, drawn, splats)) => {
-                    report.quality = quality;
-                    panels = drawn;
-                    out.write("map.ply", |w| ply::write_ply(w, splats.into_iter()))?;
-                    mapped = true;
-                }
-                Err(e) => m.failure = Some(e.to_string()),
-            }
-        }
+        report.kernels = m.kernels.clone();
+        report.quality = m.quality.clone();
+        report.heap_after_seal = Some(heap + m.heap_after_seal);
         if let Some(why) = &m.failure {
             warn(&mut flown.warnings, format!("the map is incomplete: {why}"));
         }
     }
-    if !mapped {
+    if !map.as_ref().is_some_and(|m| m.written) {
         out.remove("map.ply")?;
     }
     if flown.tracker.odometry().is_some_and(|run| run.back.trajectory.is_empty()) {
@@ -87,14 +73,14 @@ pub fn conclude(title: Title, mut flown: Flown, out: &OutputDir) -> Result<Repor
         report.camera_copies = capture.copies(&flown.source);
     }
     report.rss_peak_bytes = host::rss_peak_bytes();
-    report.set_counters(&counted(&flown, &title.opened));
+    report.set_counters(&counted(&flown, map.as_ref(), &title.opened));
     if let Some(run) = flown.tracker.odometry() {
         report.set_health(run.back.vio.health_frames());
     }
     let tracking_ms: &[(Nanos, f64)] = flown.tracker.odometry().map_or(&[], |run| &run.back.frame_ms);
     let (estimated, truth, error, warnings) = (&estimated[..], &title.truth[..], error.as_ref(), &flown.warnings[..]);
     let evidence = Evidence { estimated, truth, error, tracking_ms, pictures: &[], warnings };
-    write_files(&report, &evidence, &panels, out)?;
+    write_files(&report, &evidence, map.map_or(vec![], |m| m.drawn), out)?;
     Ok(report)
 }
 
@@ -104,13 +90,15 @@ fn warn(warnings: &mut Vec<String>, what: String) {
 }
 
 /// Every counter of a run, each under one name.
-fn counted(flown: &Flown, opened: &[(&'static str, u64)]) -> Vec<(&'static str, u64)> {
-    let mut all = flown.counters.list();
-    let mapper = flown.mapping.as_ref().map(|m| m.mapper.counters().list()).unwrap_or_default();
-    for (name, n) in opened.iter().chain(&flown.source).chain(&flown.tracker.counters()).chain(&mapper) {
-        match all.iter_mut().find(|(known, _)| *known == *name) {
+fn counted(flown: &Flown, map: Option<&MapResult>, opened: &[(&'static str, u64)]) -> Vec<(String, u64)> {
+    let owned = |list: &[(&'static str, u64)]| list.iter().map(|(name, n)| (name.to_string(), *n)).collect::<Vec<_>>();
+    let mut all = owned(&flown.counters.list());
+    let mapper = map.map_or(vec![], |m| m.counters.clone());
+    let others = [owned(opened), owned(&flown.source), owned(&flown.tracker.counters()), mapper];
+    for (name, n) in others.into_iter().flatten() {
+        match all.iter_mut().find(|(known, _)| *known == name) {
             Some((_, sum)) => *sum += n,
-            None => all.push((name, *n)),
+            None => all.push((name, n)),
         }
     }
     all
@@ -165,38 +153,22 @@ fn track_figures(report: &mut Report, flown: &Flown) -> Vec<TimedPose> {
     run.back.trajectory.iter().map(|o| TimedPose { t: o.t, pose: o.world_from_body }).collect()
 }
 
-type Measured = (Evaluation, Vec<Panel>, Vec<Gaussian>);
-
-/// The map's figures, pictures of it, and its Gaussians as viewers show them: in the exposure of most images.
-fn measure(mapper: &mut Mapper) -> Result<Measured, GpuError> {
-    let (quality, panels, mut splats) = (mapper.evaluate()?, mapper.panels(PANELS)?, mapper.splats()?);
-    let exposure = mapper.median_exposure();
-    for colour in splats.iter_mut().flat_map(|s| &mut s.colour) {
-        *colour = exposure.observed(f64::from(*colour)) as f32;
-    }
-    Ok((quality, panels, splats))
-}
-
-/// Writes the files of DIR; `evidence` is without its pictures, which are made of `panels`.
-fn write_files(report: &Report, evidence: &Evidence, panels: &[Panel], out: &OutputDir) -> Result<(), Fault> {
+/// Writes the files of DIR; `evidence` is without its pictures.
+fn write_files(report: &Report, evidence: &Evidence, drawn: Vec<Drawn>, out: &OutputDir) -> Result<(), Fault> {
     out.write("trajectory.tum", |w| trajectory::write_tum(w, evidence.estimated))?;
-    let pictures: Vec<(String, Picture)> = panels.iter().map(|p| (caption(p), panel(p))).collect();
-    if pictures.is_empty() {
+    if drawn.is_empty() {
         out.remove("renders")?;
     } else {
         out.replace_folder("renders", |dir| {
-            let mut drawn = panels.iter().zip(&pictures);
-            drawn.try_for_each(|(p, (_, d))| atomically(&dir.join(format!("{}.png", p.name)), |w| d.write_png(w)))
+            let mut all = drawn.iter();
+            all.try_for_each(|d| atomically(&dir.join(format!("{}.png", d.name)), |w| d.picture.write_png(w)))
         })?;
     }
+    let pictures: Vec<(String, Picture)> = drawn.into_iter().map(|d| (d.caption, d.picture)).collect();
     let evidence = Evidence { pictures: &pictures, ..*evidence };
     out.write("report.html", |w| write_html(w, report, &evidence))?;
     // Last: whoever finds report.json finds everything it speaks of.
     out.write("report.json", |w| report.write_json(w))
-}
-
-fn kernel_time(k: crate::gpu::Timing) -> KernelTime {
-    KernelTime { name: k.name.to_string(), dispatches: k.count, total_ms: k.total_ms }
 }
 
 /// Seven lines of figures for a person to read.

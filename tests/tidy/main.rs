@@ -24,8 +24,8 @@ const EDGES: [(&str, &[&str]); 6] = [
 /// Where `unsafe` may stand: the GPU, the allocator, the shims of OpenCV and ONNX Runtime, system calls of drivers.
 const UNSAFE: [&str; 5] =
     ["src/gpu/", "src/mem.rs", "src/stereo/opencv.rs", "src/stereo/onnx/runtime.rs", "drivers/src/"];
-/// Where threads may start: those of a flight, the recorder's writer, the simulator's renderers.
-const SPAWNS: [&str; 3] = ["src/run/mod.rs", "drivers/src/record/mod.rs", "drivers/src/sim/"];
+/// Where threads and processes may start: those of a flight, the recorder's writer, the simulator's renderers.
+const SPAWNS: [&str; 4] = ["src/run/mod.rs", "src/run/worker.rs", "drivers/src/record/mod.rs", "drivers/src/sim/"];
 const RUST_LINES_MAX: usize = 600;
 const FUNCTION_LINES_MAX: usize = 90;
 const KERNEL_LINES_MAX: usize = 250;

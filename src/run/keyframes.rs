@@ -1,0 +1,375 @@
+//! Keyframes on their way to the mapper, through memory that its process may share with the one that flies.
+//!
+//! A fixed number of slots, each with a state, a head and the images; tracking fills free ones and waits for nobody: an
+//! offer may fail. Pose corrections go through a ring of their own. A slot that was mapped keeps its keyframe until it is
+//! filled anew, so that a mapper that starts again is offered the newest keyframes once more. While there is no mapper
+//! the oldest keyframe makes room for the newest.
+
+use super::tracking::FramePacket;
+use crate::config::Board;
+use crate::counters::Counters;
+use crate::map::{cameras, Keyframe, PoseCorrection};
+use glam::{DQuat, DVec3};
+use std::collections::VecDeque;
+use std::ops::Range;
+use std::sync::atomic::{AtomicU64, Ordering::Acquire, Ordering::Relaxed, Ordering::Release};
+use stipple_drivers::shared::{read_bytes, words_of, write_bytes, SharedWords};
+use stipple_drivers::{Calibration, Fault, FaultKind, Frames, Image, Nanos, Pose};
+
+/// Keyframes between tracking and the map: as many as come while one or two anchors are being made.
+pub const SLOTS: usize = 12;
+/// Pose corrections that wait: those of four windows.
+const CORRECTIONS: usize = 64;
+
+/// What the two sides tell each other beside keyframes, a word each.
+#[derive(Clone, Copy)]
+pub enum Word {
+    /// The mapper is ready for keyframes.
+    Ready,
+    /// Counted up by the mapper's process several times a second.
+    Beat,
+    /// Counted up whenever the mapper ends a slice of work.
+    Progress,
+    /// The run is over: evaluate, tell, end.
+    Stop,
+    Anchors,
+    Splats,
+    Iterations,
+    /// Training PSNR of the last probe, 0.01 dB.
+    PsnrCdb,
+    /// No mapper takes keyframes.
+    Absent,
+    /// Corrections written, and read, so far.
+    Written,
+    Read,
+}
+
+const WORDS: usize = 16;
+/// A correction: number of the keyframe, and its pose.
+const POSE: usize = 7;
+const CORRECTION: usize = 1 + POSE;
+/// Head of a slot: state, number, stamp, whether it is held out, pose.
+const HEAD: usize = 4 + POSE;
+
+/// States of a slot. `DONE` is free, and still holds a keyframe.
+const EMPTY: u64 = 0;
+const FILLING: u64 = 1;
+const OFFERED: u64 = 2;
+const TAKEN: u64 = 3;
+const DONE: u64 = 4;
+
+pub struct KeyframeRing {
+    words: SharedWords,
+    /// Images and colours of a slot that holds nothing, to be cloned.
+    shape: Keyframe,
+    slot_words: usize,
+}
+
+impl KeyframeRing {
+    /// Takes new memory, for the images that the board's map wants of this rig.
+    pub fn new(calibration: &Calibration, board: &Board) -> Result<KeyframeRing, Fault> {
+        let shape = shape(calibration, board);
+        KeyframeRing::on(SharedWords::create(words(&shape)), shape)
+    }
+
+    /// Maps the memory that the process which flies has taken, by its descriptor.
+    pub fn attach(fd: i32, calibration: &Calibration, board: &Board) -> Result<KeyframeRing, Fault> {
+        let shape = shape(calibration, board);
+        KeyframeRing::on(SharedWords::attach(fd, words(&shape)), shape)
+    }
+
+    fn on(shared: std::io::Result<SharedWords>, shape: Keyframe) -> Result<KeyframeRing, Fault> {
+        let slot_words = HEAD + image_words(&shape);
+        let refused = |e: std::io::Error| {
+            Fault::new(FaultKind::Unavailable, "the ring of keyframes", format!("no shared memory: {e}"), "free memory")
+        };
+        shared.map(|words| KeyframeRing { words, shape, slot_words }).map_err(refused)
+    }
+
+    /// Bytes that `new` takes, and the keyframe that the mapper reads from it.
+    pub fn bytes(calibration: &Calibration, board: &Board) -> usize {
+        let shape = shape(calibration, board);
+        (words(&shape) + image_words(&shape)) * size_of::<u64>()
+    }
+
+    /// The descriptor of its memory.
+    pub fn number(&self) -> i32 {
+        self.words.number()
+    }
+
+    /// A keyframe to read slots into.
+    pub fn shape(&self) -> &Keyframe {
+        &self.shape
+    }
+
+    /// Images of a keyframe that are wanted in colour.
+    pub fn colours(&self) -> usize {
+        self.shape.colours.len()
+    }
+
+    pub fn word(&self, word: Word) -> &AtomicU64 {
+        &self.words[word as usize]
+    }
+
+    fn slot(&self, slot: usize) -> &[AtomicU64] {
+        let start = WORDS + CORRECTIONS * CORRECTION + slot * self.slot_words;
+        &self.words[start..start + self.slot_words]
+    }
+
+    fn correction(&self, number: u64) -> &[AtomicU64] {
+        let start = WORDS + number as usize % CORRECTIONS * CORRECTION;
+        &self.words[start..start + CORRECTION]
+    }
+
+    /// Takes the slot of those in one of `states` whose keyframe is the oldest, and puts it in state `to`.
+    fn claim(&self, states: &[u64], numbers: Range<u64>, to: u64) -> Option<usize> {
+        loop {
+            let seen = (0..SLOTS).map(|i| (i, self.slot(i)[0].load(Acquire), self.slot(i)[1].load(Relaxed)));
+            let fits = |(_, state, id): &(usize, u64, u64)| states.contains(state) && numbers.contains(id);
+            let (i, state, _) = seen.filter(fits).min_by_key(|(_, state, id)| (*state != EMPTY, *id))?;
+            if self.slot(i)[0].compare_exchange(state, to, Acquire, Relaxed).is_ok() {
+                return Some(i);
+            }
+        }
+    }
+
+    /// Copies a keyframe in; false when every slot is taken.
+    pub fn offer(&self, frames: &Frames, id: u64, held_out: bool, world_from_body: &Pose) -> bool {
+        let all = 0..u64::MAX;
+        let free = self.claim(&[EMPTY, DONE], all.clone(), FILLING);
+        let absent = || self.word(Word::Absent).load(Acquire) != 0;
+        let Some(i) = free.or_else(|| absent().then(|| self.claim(&[OFFERED], all, FILLING)).flatten()) else {
+            return false;
+        };
+        let slot = self.slot(i);
+        slot[1].store(id, Relaxed);
+        slot[2].store(frames.t.0 as u64, Relaxed);
+        slot[3].store(u64::from(held_out), Relaxed);
+        write_pose(&slot[4..HEAD], world_from_body);
+        let mut at = HEAD;
+        let colours = frames.colours.iter().take(self.colours()).flatten();
+        for image in frames.images.iter().take(self.shape.images.len()).chain(colours) {
+            let end = at + words_of(image.pixels.len());
+            write_bytes(&slot[at..end], &image.pixels);
+            at = end;
+        }
+        slot[0].store(OFFERED, Release);
+        true
+    }
+
+    /// Reads the oldest keyframe with a number under `until` that waits; answers its slot, which is busy until it is `done`.
+    pub fn take(&self, until: u64, keyframe: &mut Keyframe) -> Option<usize> {
+        let i = self.claim(&[OFFERED], 0..until, TAKEN)?;
+        let slot = self.slot(i);
+        keyframe.id = slot[1].load(Relaxed);
+        keyframe.t = Nanos(slot[2].load(Relaxed) as i64);
+        keyframe.held_out = slot[3].load(Relaxed) != 0;
+        keyframe.world_from_body = read_pose(&slot[4..HEAD]);
+        let mut at = HEAD;
+        for image in keyframe.images.iter_mut().chain(keyframe.colours.iter_mut().flatten()) {
+            let end = at + words_of(image.pixels.len());
+            read_bytes(&slot[at..end], &mut image.pixels);
+            at = end;
+        }
+        Some(i)
+    }
+
+    /// Frees the slot of a keyframe that was taken.
+    pub fn done(&self, slot: usize) {
+        self.slot(slot)[0].store(DONE, Release);
+    }
+
+    /// One more than the highest number of a keyframe that waits.
+    pub fn offered(&self) -> u64 {
+        let waits = |i: &usize| self.slot(*i)[0].load(Acquire) == OFFERED;
+        (0..SLOTS).filter(waits).map(|i| self.slot(i)[1].load(Relaxed) + 1).max().unwrap_or(0)
+    }
+
+    /// Hands over a better pose; false when as many wait as may.
+    fn push_correction(&self, correction: &PoseCorrection) -> bool {
+        let written = self.word(Word::Written).load(Relaxed);
+        if written - self.word(Word::Read).load(Acquire) >= CORRECTIONS as u64 {
+            return false;
+        }
+        let to = self.correction(written);
+        to[0].store(correction.id, Relaxed);
+        write_pose(&to[1..], &correction.world_from_body);
+        self.word(Word::Written).store(written + 1, Release);
+        true
+    }
+
+    /// Calls `correct` with the corrections that came, which reach keyframes that wait, too.
+    pub fn corrections(&self, mut correct: impl FnMut(&PoseCorrection)) {
+        let written = self.word(Word::Written).load(Acquire);
+        for number in self.word(Word::Read).load(Relaxed)..written {
+            let from = self.correction(number);
+            let correction = PoseCorrection { id: from[0].load(Relaxed), world_from_body: read_pose(&from[1..]) };
+            for slot in (0..SLOTS).map(|i| self.slot(i)) {
+                if slot[0].load(Acquire) == OFFERED && slot[1].load(Relaxed) == correction.id {
+                    write_pose(&slot[4..HEAD], &correction.world_from_body);
+                }
+            }
+            correct(&correction);
+            self.word(Word::Read).store(number + 1, Release);
+        }
+    }
+
+    /// Makes ready for another mapper after one has died: what it had finished is offered again. What it was busy with is
+    /// not, as that may be what broke it.
+    pub fn offer_again(&self) {
+        for slot in (0..SLOTS).map(|i| self.slot(i)) {
+            let _ = slot[0].compare_exchange(TAKEN, EMPTY, Acquire, Relaxed);
+            let _ = slot[0].compare_exchange(DONE, OFFERED, Acquire, Relaxed);
+        }
+    }
+}
+
+fn words(shape: &Keyframe) -> usize {
+    WORDS + CORRECTIONS * CORRECTION + SLOTS * (HEAD + image_words(shape))
+}
+
+fn image_words(shape: &Keyframe) -> usize {
+    shape.images.iter().chain(shape.colours.iter().flatten()).map(|i| words_of(i.pixels.len())).sum()
+}
+
+/// A keyframe with the images that the board's map wants of this rig.
+fn shape(calibration: &Calibration, board: &Board) -> Keyframe {
+    let count = calibration.cameras.len();
+    let image = |i: usize| {
+        let c = &calibration.cameras[i].camera;
+        Image::new(c.width, c.height)
+    };
+    let colours = (0..cameras::colours(count, &board.map)).map(|i| std::array::from_fn(|_| image(i))).collect();
+    let images = (0..cameras::images(count, &board.map)).map(image).collect();
+    Keyframe { images, colours, ..Keyframe::default() }
+}
+
+fn write_pose(words: &[AtomicU64], pose: &Pose) {
+    let (q, p) = (pose.q, pose.p);
+    let numbers = [q.x, q.y, q.z, q.w, p.x, p.y, p.z];
+    words.iter().zip(numbers).for_each(|(word, n)| word.store(n.to_bits(), Relaxed));
+}
+
+fn read_pose(words: &[AtomicU64]) -> Pose {
+    let n: [f64; POSE] = std::array::from_fn(|i| f64::from_bits(words[i].load(Relaxed)));
+    Pose { q: DQuat::from_xyzw(n[0], n[1], n[2], n[3]), p: DVec3::new(n[4], n[5], n[6]) }
+}
+
+/// Newest keyframes, which the estimator may still move: more than a window holds.
+const RECENT: usize = 32;
+
+/// Numbers keyframes, chooses the held-out ones, and hands them to the mapper where there is one.
+pub struct Keyframes {
+    /// Every Nth keyframe is held out; 0: none.
+    holdout: u32,
+    /// Keyframes that found a slot; without a mapper, all.
+    pub count: u64,
+    /// Stamps and numbers of the newest.
+    recent: VecDeque<(Nanos, u64)>,
+}
+
+impl Keyframes {
+    pub fn new(holdout: u32) -> Keyframes {
+        Keyframes { holdout, count: 0, recent: VecDeque::with_capacity(RECENT) }
+    }
+
+    /// Hands a tracked frame on: a keyframe to the mapper, and the window's newer poses with it.
+    pub fn pass_on(&mut self, packet: &FramePacket, ring: Option<&KeyframeRing>, counters: &Counters) {
+        let Some(tracked) = packet.tracked.as_ref().filter(|t| t.keyframe) else { return };
+        let Some(ring) = ring else {
+            self.count += 1;
+            return;
+        };
+        if packet.blank {
+            counters.keyframes_blank.add(1);
+            return;
+        }
+        let (id, n) = (self.count, u64::from(self.holdout));
+        if ring.offer(&packet.frames, id, n > 0 && id % n == n - 1, &tracked.world_from_body) {
+            self.count += 1;
+            self.recent.truncate(RECENT - 1);
+            self.recent.push_front((packet.frames.t, id));
+        } else {
+            counters.keyframes_rejected.add(1);
+        }
+        for (t, world_from_body) in tracked.corrections.iter() {
+            if let Some((_, id)) = self.recent.iter().find(|(at, found)| at == t && *found != id) {
+                let pushed = ring.push_correction(&PoseCorrection { id: *id, world_from_body: *world_from_body });
+                counters.corrections_full.add(u64::from(!pushed));
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use stipple_drivers::{Camera, ImuCalibration, Lens, RigCamera};
+
+    fn ring() -> KeyframeRing {
+        let lens = Lens::Radtan { k1: 0.0, k2: 0.0, p1: 0.0, p2: 0.0 };
+        let camera = Camera { width: 5, height: 3, fx: 4.0, fy: 4.0, cx: 2.0, cy: 1.0, lens };
+        let cameras = vec![RigCamera::new(camera, Pose::IDENTITY); 2];
+        let board = include_str!("../../board-configs/lavapipe.toml");
+        let board = Board::parse("lavapipe.toml", board, &[]).expect("a board of ours");
+        KeyframeRing::new(&Calibration { cameras, imu: ImuCalibration::CONSUMER }, &board).expect("some bytes")
+    }
+
+    /// Offers a keyframe whose pixels tell its number.
+    fn offer(ring: &KeyframeRing, id: u64) -> bool {
+        let image = Image { pixels: vec![id as u8; 15], ..Image::new(5, 3) };
+        let frames = Frames { t: Nanos(id as i64 * 7), images: vec![image; 2], colours: vec![] };
+        ring.offer(&frames, id, id == 3, &Pose::IDENTITY)
+    }
+
+    /// The numbers of what waits, in order; each is marked as done.
+    fn drained(ring: &KeyframeRing) -> Vec<u64> {
+        let mut keyframe = ring.shape().clone();
+        let next = |keyframe: &mut Keyframe| ring.take(u64::MAX, keyframe).map(|slot| ring.done(slot));
+        std::iter::from_fn(|| next(&mut keyframe).map(|()| keyframe.id)).collect()
+    }
+
+    #[test]
+    fn a_full_ring_rejects_the_newest_keeps_order_and_lets_corrections_reach_what_waits() {
+        let (ring, mut corrected) = (ring(), vec![]);
+        assert!((0..SLOTS as u64).all(|id| offer(&ring, id)) && !offer(&ring, 99));
+        let moved = Pose { p: DVec3::X, ..Pose::IDENTITY };
+        assert!(ring.push_correction(&PoseCorrection { id: 2, world_from_body: moved }));
+        ring.corrections(|c| corrected.push(c.id));
+        assert_eq!(corrected, [2]);
+        let mut keyframe = ring.shape().clone();
+        for id in 0..4 {
+            let slot = ring.take(4, &mut keyframe).expect("it waits");
+            let x = if id == 2 { 1.0 } else { 0.0 };
+            assert_eq!((keyframe.id, keyframe.t, keyframe.world_from_body.p.x), (id, Nanos(id as i64 * 7), x));
+            assert_eq!((keyframe.held_out, &keyframe.images[1].pixels[..]), (id == 3, &[id as u8; 15][..]));
+            ring.done(slot);
+        }
+        assert_eq!(ring.take(4, &mut keyframe), None, "only those that were asked for");
+        assert_eq!(drained(&ring), (4..SLOTS as u64).collect::<Vec<_>>());
+    }
+
+    #[test]
+    fn corrections_are_bounded() {
+        let ring = ring();
+        let correction = PoseCorrection { id: 0, world_from_body: Pose::IDENTITY };
+        assert!((0..CORRECTIONS).all(|_| ring.push_correction(&correction)) && !ring.push_correction(&correction));
+        ring.corrections(|_| ());
+        assert!(ring.push_correction(&correction));
+    }
+
+    #[test]
+    fn a_mapper_that_died_leaves_the_newest_keyframes_to_the_next_but_not_what_it_was_busy_with() {
+        let (ring, mut keyframe) = (ring(), ring().shape().clone());
+        assert!((0..5).all(|id| offer(&ring, id)));
+        (0..3).for_each(|_| ring.done(ring.take(9, &mut keyframe).expect("it waits")));
+        let _busy = ring.take(9, &mut keyframe).expect("it waits");
+        ring.word(Word::Absent).store(1, Release);
+        ring.offer_again();
+        // Nobody takes them: the oldest makes room.
+        assert!((5..5 + SLOTS as u64).all(|id| offer(&ring, id)));
+        assert_eq!(drained(&ring), (5..5 + SLOTS as u64).collect::<Vec<_>>());
+        ring.offer_again();
+        assert_eq!(drained(&ring), (5..5 + SLOTS as u64).collect::<Vec<_>>());
+    }
+}

@@ -1,0 +1,415 @@
+//! Mapping in a process of its own, so that a GPU driver that crashes, hangs or leaks takes no odometry with it.
+//!
+//! The process that flies starts `stipple map-worker`, tells it everything on its standard input, and hands keyframes over
+//! through shared memory (`keyframes`). It looks at the worker fifty times a second: one that has ended is started again,
+//! one that is stopped, hangs or takes too much memory is killed first. A worker that starts again has an empty map, and is
+//! offered the newest keyframes once more. When the run is over the worker writes `map.ply`, evaluates, and answers on its
+//! standard output: frames of four bytes of length (little endian) and JSON.
+
+use super::keyframes::{KeyframeRing, Word};
+use super::mapping::{self, Drawn, MapResult, Mapping};
+use super::status::Gauges;
+use crate::config::Board;
+use crate::mem::unsealed;
+use crate::output::panel::Picture;
+use crate::output::OutputDir;
+use serde::{Deserialize, Serialize};
+use std::io::{self, Read, Write};
+use std::path::PathBuf;
+use std::process::{Child, Command, ExitStatus, Stdio};
+use std::sync::atomic::Ordering::{Acquire, Relaxed, Release};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+use stipple_drivers::{host, Calibration, Fault, FaultKind};
+
+/// The first start may compile every kernel.
+const BOOT_MAX: Duration = Duration::from_secs(120);
+/// A process that gives no sign of life for so long hangs, and so does one whose slice of work takes longer than the second:
+/// an anchor's depth on two cores without a GPU takes ten seconds.
+const SILENCE_MAX: Duration = Duration::from_secs(5);
+const SLICE_MAX: Duration = Duration::from_secs(30);
+/// A worker that lives longer starts again at once; others wait for twice as long each time, up to `PAUSE_MAX`.
+const LIFE_MIN: Duration = Duration::from_secs(30);
+const PAUSE_MAX: Duration = Duration::from_secs(32);
+/// Evaluation after the end of a run; what is told by then counts.
+const CONCLUSION_MAX: Duration = Duration::from_secs(60);
+/// What a driver may take beside the board's memory table, bytes: Mesa's compiler alone has 150 MiB.
+const DRIVER_BYTES: u64 = 512 << 20;
+/// Period of the signs of life, and of looks at the worker's memory.
+const BEAT: Duration = Duration::from_millis(100);
+/// Bytes of the longest answer: a picture.
+const ANSWER_MAX: u32 = 1 << 28;
+
+/// Everything a worker has to know.
+#[derive(Serialize, Deserialize)]
+struct Setup {
+    board: Board,
+    calibration: Calibration,
+    out: PathBuf,
+    /// Descriptor of the ring of keyframes.
+    ring: i32,
+    /// Time of the run so far, s.
+    run_s: f64,
+    parent: u32,
+}
+
+#[derive(Serialize, Deserialize)]
+enum Answer {
+    /// It cannot start.
+    Refused(Fault),
+    Result(Box<MapResult>),
+    /// Its pixels follow, as a frame of their own.
+    Picture {
+        name: String,
+        caption: String,
+        width: usize,
+        height: usize,
+    },
+}
+
+/// What a worker has answered so far.
+#[derive(Default)]
+struct Told {
+    refused: Option<Fault>,
+    result: Option<MapResult>,
+    drawn: Vec<Drawn>,
+}
+
+struct Running {
+    child: Child,
+    told: Arc<Mutex<Told>>,
+    reader: JoinHandle<()>,
+    started: Instant,
+    /// Values of the words for beats and slices, and when they last changed.
+    beat: (u64, Instant),
+    slice: (u64, Instant),
+    looked: Instant,
+}
+
+/// The mapping of a run: a thread of the same process, or a worker.
+pub enum MapSide {
+    Here(Box<Mapping>),
+    Apart(Box<Worker>),
+}
+
+impl MapSide {
+    /// Where keyframes go.
+    pub fn ring(&self) -> &Arc<KeyframeRing> {
+        match self {
+            MapSide::Here(mapping) => &mapping.ring,
+            MapSide::Apart(worker) => &worker.ring,
+        }
+    }
+
+    /// Ends mapping: writes `map.ply`, and answers what it came to.
+    pub fn conclude(self, out: &OutputDir) -> MapResult {
+        match self {
+            MapSide::Here(mut mapping) => MapResult { heap_after_seal: 0, ..mapping.conclude(out, &mut |_| ()) },
+            MapSide::Apart(worker) => worker.conclude(),
+        }
+    }
+}
+
+/// The worker of a run, as the process that flies sees it.
+pub struct Worker {
+    pub ring: Arc<KeyframeRing>,
+    board: Board,
+    calibration: Calibration,
+    out: PathBuf,
+    begun: Instant,
+    running: Option<Running>,
+    pause: Duration,
+    next_start: Instant,
+    pub restarts: u64,
+    bytes_max: u64,
+}
+
+impl Worker {
+    /// Starts the worker and waits until it is ready. Fails where it says why it cannot be.
+    pub fn start(calibration: &Calibration, board: &Board, out: &OutputDir) -> Result<Worker, Fault> {
+        let now = Instant::now();
+        let mut worker = Worker {
+            ring: Arc::new(KeyframeRing::new(calibration, board)?),
+            board: board.clone(),
+            calibration: calibration.clone(),
+            out: out.path().to_path_buf(),
+            begun: now,
+            running: None,
+            pause: Duration::ZERO,
+            next_start: now,
+            restarts: 0,
+            bytes_max: (board.memory_max_mib << 20) + DRIVER_BYTES,
+        };
+        worker.spawn().map_err(|e| refused(format!("the mapper's process does not start: {e}")))?;
+        let gauges = Gauges::default();
+        while worker.ring.word(Word::Ready).load(Acquire) == 0 && !host::stop_asked_for().load(Relaxed) {
+            let told = worker.running.as_ref().map(|r| r.told.clone());
+            if let Some(why) = worker.watch(&gauges) {
+                // What it said may come just after its end.
+                std::thread::sleep(BEAT);
+                let said = told.and_then(|told| lock(&told).refused.take());
+                return Err(said.unwrap_or_else(|| refused(why)));
+            }
+            std::thread::sleep(Duration::from_millis(5));
+        }
+        worker.begun = Instant::now();
+        Ok(worker)
+    }
+
+    fn spawn(&mut self) -> io::Result<()> {
+        let setup = Setup {
+            board: self.board.clone(),
+            calibration: self.calibration.clone(),
+            out: self.out.clone(),
+            ring: self.ring.number(),
+            run_s: self.begun.elapsed().as_secs_f64(),
+            parent: std::process::id(),
+        };
+        self.ring.word(Word::Ready).store(0, Release);
+        self.ring.word(Word::Stop).store(0, Release);
+        let mut command = Command::new("/proc/self/exe");
+        command.arg("map-worker").stdin(Stdio::piped()).stdout(Stdio::piped());
+        let mut child = command.spawn()?;
+        let (Some(mut tell), Some(answers)) = (child.stdin.take(), child.stdout.take()) else {
+            return Err(io::Error::other("it has no pipes"));
+        };
+        tell.write_all(&serde_json::to_vec(&setup)?)?;
+        drop(tell);
+        let told = Arc::new(Mutex::new(Told::default()));
+        let (into, now) = (told.clone(), Instant::now());
+        let reader = super::start("map-answers", move || read_answers(answers, &into));
+        let (beat, slice) = ((0, now), (0, now));
+        self.running = Some(Running { child, told, reader, started: now, beat, slice, looked: now });
+        Ok(())
+    }
+
+    /// Looks after the worker; answers what went wrong, once. Never waits.
+    pub fn watch(&mut self, gauges: &Gauges) -> Option<String> {
+        let (now, ring) = (Instant::now(), self.ring.clone());
+        let Some(running) = &mut self.running else {
+            if now >= self.next_start {
+                ring.offer_again();
+                if let Err(e) = self.spawn() {
+                    self.postpone(now, Duration::ZERO);
+                    return Some(format!("the mapper does not start again: {e}"));
+                }
+                self.restarts += 1;
+            }
+            return None;
+        };
+        let ready = ring.word(Word::Ready).load(Acquire) != 0;
+        let Some(why) = running.judge(&ring, ready, self.bytes_max, now) else {
+            if ready {
+                ring.word(Word::Absent).store(0, Release);
+                for (gauge, word) in [
+                    (&gauges.anchors, Word::Anchors),
+                    (&gauges.splats, Word::Splats),
+                    (&gauges.iterations, Word::Iterations),
+                    (&gauges.psnr_cdb, Word::PsnrCdb),
+                ] {
+                    gauge.store(ring.word(word).load(Relaxed), Relaxed);
+                }
+            }
+            return None;
+        };
+        let life = now - running.started;
+        ring.word(Word::Absent).store(1, Release);
+        if let Some(running) = self.running.take() {
+            running.end();
+        }
+        self.postpone(now, life);
+        let pause = self.next_start.saturating_duration_since(now).as_secs();
+        Some(format!("the mapper {why}; it starts again in {pause} s, with an empty map"))
+    }
+
+    fn postpone(&mut self, now: Instant, life: Duration) {
+        if life >= LIFE_MIN {
+            self.pause = Duration::ZERO;
+        }
+        self.next_start = now + self.pause;
+        self.pause = (2 * self.pause).clamp(Duration::from_secs(1), PAUSE_MAX);
+    }
+
+    /// Lets the worker evaluate, for as long as it may take, and answers what it told.
+    pub fn conclude(mut self) -> MapResult {
+        let none = |failure: &str| MapResult { failure: Some(failure.into()), ..MapResult::default() };
+        let Some(mut running) = self.running.take() else { return none("there was no mapper when the run ended") };
+        let (asked, mut cut) = (Instant::now(), None);
+        self.ring.word(Word::Stop).store(1, Release);
+        while matches!(running.child.try_wait(), Ok(None)) && cut.is_none() {
+            let late = asked.elapsed() >= CONCLUSION_MAX;
+            let stopped = host::stopped_and_resident(running.child.id()).is_some_and(|(stopped, _)| stopped);
+            if late || stopped {
+                cut = Some(if late { "evaluation took too long" } else { "the mapper was stopped" });
+            }
+            std::thread::sleep(Duration::from_millis(20));
+        }
+        let told = running.end();
+        let mut told = lock(&told);
+        let Some(mut result) = told.result.take() else { return none(cut.unwrap_or("the mapper died at the end")) };
+        result.failure = result.failure.or(cut.map(Into::into));
+        result.drawn = std::mem::take(&mut told.drawn);
+        result
+    }
+}
+
+impl Running {
+    /// Why the worker cannot go on, if so.
+    fn judge(&mut self, ring: &KeyframeRing, ready: bool, bytes_max: u64, now: Instant) -> Option<String> {
+        match self.child.try_wait() {
+            Ok(Some(status)) => return Some(ended(status)),
+            Ok(None) => {}
+            Err(e) => return Some(format!("cannot be watched: {e}")),
+        }
+        for (seen, word) in [(&mut self.beat, Word::Beat), (&mut self.slice, Word::Progress)] {
+            let value = ring.word(word).load(Relaxed);
+            if value != seen.0 {
+                *seen = (value, now);
+            }
+        }
+        if !ready {
+            let late = now - self.started > BOOT_MAX;
+            self.slice.1 = now;
+            return late.then(|| format!("was not ready after {} s", BOOT_MAX.as_secs()));
+        }
+        if now - self.beat.1 > SILENCE_MAX {
+            return Some(format!("gave no sign of life for {} s", SILENCE_MAX.as_secs()));
+        }
+        if now - self.slice.1 > SLICE_MAX {
+            return Some(format!("hangs: a slice of its work takes over {} s", SLICE_MAX.as_secs()));
+        }
+        if now - self.looked < BEAT {
+            return None;
+        }
+        self.looked = now;
+        match host::stopped_and_resident(self.child.id()) {
+            Some((true, _)) => Some("was stopped".into()),
+            Some((_, bytes)) if bytes > bytes_max => {
+                Some(format!("takes {} MiB of memory, {} are allowed", bytes >> 20, bytes_max >> 20))
+            }
+            _ => None,
+        }
+    }
+
+    /// Kills it if it still runs, and answers what it told.
+    fn end(mut self) -> Arc<Mutex<Told>> {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+        let _ = self.reader.join();
+        self.told
+    }
+}
+
+impl Drop for Worker {
+    fn drop(&mut self) {
+        if let Some(running) = self.running.take() {
+            running.end();
+        }
+    }
+}
+
+fn ended(status: ExitStatus) -> String {
+    use std::os::unix::process::ExitStatusExt;
+    match (status.signal(), status.code()) {
+        (Some(signal), _) => format!("was ended by signal {signal}"),
+        (None, code) => format!("ended with exit code {}", code.unwrap_or(-1)),
+    }
+}
+
+fn refused(what: String) -> Fault {
+    Fault::new(FaultKind::Unavailable, "map-worker", what, "see `stipple doctor`, or set map.enabled=false")
+}
+
+fn lock(told: &Mutex<Told>) -> std::sync::MutexGuard<'_, Told> {
+    told.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// Reads what a worker answers until it ends.
+fn read_answers(mut from: impl Read, told: &Mutex<Told>) {
+    let mut next = || {
+        let mut length = [0; 4];
+        from.read_exact(&mut length).ok()?;
+        let length = u32::from_le_bytes(length);
+        let mut bytes = vec![0; if length <= ANSWER_MAX { length as usize } else { return None }];
+        from.read_exact(&mut bytes).ok()?;
+        Some(bytes)
+    };
+    while let Some(answer) = next().and_then(|bytes| serde_json::from_slice(&bytes).ok()) {
+        match answer {
+            Answer::Refused(fault) => lock(told).refused = Some(fault),
+            Answer::Result(result) => lock(told).result = Some(*result),
+            Answer::Picture { name, caption, width, height } => {
+                let Some(bytes) = next().filter(|b| b.len() == 3 * width * height) else { return };
+                let pixels = bytes.chunks_exact(3).map(|c| [c[0], c[1], c[2]]).collect();
+                lock(told).drawn.push(Drawn { name, caption, picture: Picture { width, height, pixels } });
+            }
+        }
+    }
+}
+
+fn tell(to: &mut impl Write, answer: &Answer) -> io::Result<()> {
+    send(to, &serde_json::to_vec(answer)?)
+}
+
+fn send(to: &mut impl Write, frame: &[u8]) -> io::Result<()> {
+    to.write_all(&(frame.len() as u32).to_le_bytes())?;
+    to.write_all(frame)?;
+    to.flush()
+}
+
+/// The worker's own work: reads what it has to know from `input`, maps until it is asked to stop, and tells `output`.
+pub fn serve(mut input: impl Read, mut output: impl Write) -> Result<(), Fault> {
+    let broken = |e: io::Error| refused(format!("the process that flies cannot be reached: {e}"));
+    let mut text = Vec::new();
+    input.read_to_end(&mut text).map_err(broken)?;
+    let setup: Setup = serde_json::from_slice(&text).map_err(|e| {
+        let what = format!("standard input says nothing that a mapper understands: {e}");
+        Fault::new(FaultKind::Usage, "map-worker", what, "it is started by `stipple run`, not by hand")
+    })?;
+    host::live_with_parent(setup.parent).map_err(broken)?;
+    let start = Instant::now().checked_sub(Duration::from_secs_f64(setup.run_s.max(0.0))).unwrap_or_else(Instant::now);
+    let opened = KeyframeRing::attach(setup.ring, &setup.calibration, &setup.board).and_then(|ring| {
+        let ring = Arc::new(ring);
+        Ok((ring.clone(), OutputDir::create(&setup.out)?, Mapping::open(&setup.calibration, &setup.board, ring)?))
+    });
+    let (ring, out, mapping) = match opened {
+        Ok(opened) => opened,
+        Err(fault) => {
+            tell(&mut output, &Answer::Refused(fault.clone())).map_err(broken)?;
+            return Err(fault);
+        }
+    };
+    let gauges = Arc::new(Gauges::default());
+    let (beating, seen) = (ring.clone(), gauges.clone());
+    super::start("beat", move || loop {
+        beating.word(Word::Beat).fetch_add(1, Relaxed);
+        for (gauge, word) in [
+            (&seen.anchors, Word::Anchors),
+            (&seen.splats, Word::Splats),
+            (&seen.iterations, Word::Iterations),
+            (&seen.psnr_cdb, Word::PsnrCdb),
+            (&seen.slices, Word::Progress),
+        ] {
+            beating.word(word).store(gauge.load(Relaxed), Relaxed);
+        }
+        std::thread::sleep(BEAT);
+    });
+    ring.word(Word::Ready).store(1, Release);
+    let stop = || ring.word(Word::Stop).load(Acquire) != 0;
+    let mut mapping = mapping::map(mapping, &gauges, start, || true, |_| stop());
+    if !stop() {
+        // The device failed: another process may have more luck with it.
+        let why = mapping.failure.unwrap_or_default();
+        return Err(refused(why));
+    }
+    let mut told = Ok(());
+    let mut say = |result: &MapResult| told = tell(&mut output, &Answer::Result(Box::new(result.clone())));
+    let result = unsealed(|| mapping.conclude(&out, &mut say));
+    told.map_err(broken)?;
+    for Drawn { name, caption, picture: Picture { width, height, pixels } } in result.drawn {
+        tell(&mut output, &Answer::Picture { name, caption, width, height }).map_err(broken)?;
+        send(&mut output, pixels.as_flattened()).map_err(broken)?;
+    }
+    Ok(())
+}
