@@ -91,6 +91,10 @@ stipple_drivers::counters! {
     splats_not_finite,
     /// Gaussians skipped by the optimiser because a gradient was not finite.
     gradients_rejected,
+    /// Lines that standard error did not take: it is closed, or nobody reads.
+    lines_lost,
+    /// Times that a thread gave no sign of life for longer than it may.
+    threads_silent,
     /// Times that the mapper's process was started again, with an empty map.
     map_restarts,
     /// GPU submissions that failed.

@@ -66,6 +66,7 @@ pub fn main() -> ExitCode {
     if matches!(cli.command, Command::Check(_) | Command::CalibCheck(_) | Command::Doctor(_)) {
         stipple_drivers::host::end_when_unread();
     }
+    crate::run::threads::abort_on_panic(crate::run::status_led::show_panic);
     let done = match cli.command {
         Command::Run(args) => run::run(&args),
         Command::Replay(args) => replay::replay(&args),

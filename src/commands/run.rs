@@ -36,6 +36,6 @@ pub fn run(args: &Args) -> Result<(), Fault> {
     let out = OutputDir::create(&args.out)?;
     let inject = args.inject.as_deref().map(InjectConfig::load).transpose()?.unwrap_or_default();
     let (duration_s, record) = (args.duration, args.record.clone());
-    let options = Options { duration_s, record, inject, map_apart: true, ..Options::default() };
+    let options = Options { duration_s, record, inject, service: true, ..Options::default() };
     finish(fly(input, &board, &out, &options, led)?, &out)
 }

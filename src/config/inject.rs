@@ -15,6 +15,18 @@ pub struct InjectConfig {
     pub camera: Vec<Rule>,
     /// `[[imu]]`, a fault each.
     pub imu: Vec<Rule>,
+    /// `[[thread]]`, a panic each.
+    pub thread: Vec<ThreadRule>,
+}
+
+/// A panic of a thread of the run.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ThreadRule {
+    /// Name of the thread, as debuggers show it.
+    pub name: String,
+    /// When it panics, after its start, s.
+    pub panic_s: f64,
 }
 
 impl InjectConfig {
@@ -33,6 +45,9 @@ impl InjectConfig {
 
     /// Refuses rules that make no sense.
     fn check(&self) -> Result<(), String> {
+        if let Some(rule) = self.thread.iter().find(|rule| rule.panic_s < 0.0 || !rule.panic_s.is_finite()) {
+            return Err(format!("thread {}: panic_s must be a number of seconds", rule.name));
+        }
         for (key, rules) in [("camera", &self.camera), ("imu", &self.imu)] {
             for (i, rule) in rules.iter().enumerate() {
                 let blind = key == "imu" && (rule.fault == Kind::Blackout || rule.camera.is_some());

@@ -8,6 +8,7 @@
 
 use super::gate::{FrameGate, ImuGate};
 use super::status::Gauges;
+use super::threads;
 use super::tracking::FramePacket;
 use super::waker::Waker;
 use crate::counters::{Counter, Counters};
@@ -246,6 +247,7 @@ pub fn camera(mailbox: &Mailbox, source: &mut dyn FrameSource, tracking: &Waker,
     let mut eye = Liveness { name: "one camera", lost: &c.one_camera_lost, away_ms: &c.one_camera_away_ms, ..liveness };
     let mut span = None;
     while !mailbox.stop.load(Relaxed) {
+        threads::alive();
         let frames = packet.writable().expect("it was taken as such, and nobody else has it");
         let answer = source.next(PATIENCE, frames);
         if liveness.update(&answer) && answer.is_err() {
@@ -312,6 +314,7 @@ pub fn inertial(
     let counted = [&c.imu_lost, &c.imu_silent, &c.imu_away_ms];
     let mut liveness = Liveness::new("inertial unit", counted, &mailbox.notices);
     while !over.load(Relaxed) {
+        threads::alive();
         let answer = source.next(PATIENCE, &mut batch);
         let away = liveness.update(&answer);
         mailbox.imu_away.store(away, Relaxed);

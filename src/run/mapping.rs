@@ -3,6 +3,7 @@
 
 use super::keyframes::KeyframeRing;
 use super::status::Gauges;
+use super::threads;
 use crate::config::Board;
 use crate::gpu::GpuError;
 use crate::map::{CurvePoint, Evaluation, Keyframe, Mapper, StepKind};
@@ -167,7 +168,7 @@ pub struct MapResult {
     pub written: bool,
     /// Why the map is incomplete, where it is.
     pub failure: Option<String>,
-    /// Of a process of its own; zero otherwise.
+    /// Figures of a process of its own; zero without one.
     pub heap_after_seal: u64,
     pub rss_peak_bytes: u64,
     #[serde(skip)]
@@ -255,6 +256,7 @@ pub fn map(
         mapping.collect();
         let worked = mapping.step(Instant::now() + SLICE, gauges);
         gauges.slices.fetch_add(1, Relaxed);
+        threads::alive();
         let t_s = start.elapsed().as_secs_f64();
         mapping.sample_if_due(t_s, gauges);
         gauges.broke.fetch_or(mapping.failure.is_some(), Relaxed);

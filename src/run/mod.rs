@@ -38,6 +38,7 @@ mod spikes;
 pub mod status;
 pub mod status_led;
 pub mod summary;
+pub mod threads;
 pub mod tracking;
 pub mod waker;
 pub mod worker;
@@ -97,8 +98,8 @@ pub struct Options {
     pub duration_s: Option<f64>,
     /// Folder that the samples are recorded to, too.
     pub record: Option<PathBuf>,
-    /// Mapping is done by a process of its own.
-    pub map_apart: bool,
+    /// Mapping is done by a process of its own, and threads ask for real-time priority.
+    pub service: bool,
     /// Faults added to the sensors of a recording.
     pub inject: InjectConfig,
 }
@@ -142,6 +143,10 @@ pub fn fly(
     options: &Options,
     led: Option<StatusLed>,
 ) -> Result<Outcome, Fault> {
+    if options.service {
+        threads::ask_for_realtime();
+    }
+    threads::panic_in(options.inject.thread.iter().map(|rule| (rule.name.clone(), rule.panic_s)));
     input.calibration.imu.range = board.imu.range();
     memory::check_fits(&input.place, &input.calibration, board, options.record.is_some())?;
     let colours = memory::colours(&input.calibration, board).len();
@@ -162,7 +167,7 @@ pub fn fly(
     };
     let here = || Mapping::open(&input.calibration, board, KeyframeRing::new(&input.calibration, board)?.into());
     let lockstep = matches!((&options.pace, &input.source), (Pace::Lockstep(_), Source::Recorded(_)));
-    let map = match (board.map.enabled, options.map_apart && !lockstep) {
+    let map = match (board.map.enabled, options.service && !lockstep) {
         (false, _) => None,
         (true, false) => Some(MapSide::Here(Box::new(here()?))),
         (true, true) => Some(MapSide::Apart(Box::new(Worker::start(&input.calibration, board, out)?))),
@@ -297,8 +302,8 @@ pub fn fly_in_real_time(
         tracking_done: AtomicBool::new(false),
     };
     let (s, link, ring) = (&shared, &Link::default(), ring.as_deref());
-    let (mut keyframes, mut notices) = (Keyframes::new(run.holdout), vec![]);
-    let map = std::thread::scope(|scope| {
+    let mut keyframes = Keyframes::new(run.holdout);
+    let (map, notices) = std::thread::scope(|scope| {
         let (taker, keyframes) = (&link.taker, &mut keyframes);
         let Sensors { frames, imu } = &mut sensors;
         spawn(scope, "camera", move || {
@@ -334,29 +339,11 @@ pub fn fly_in_real_time(
             }
             None => {}
         }
-        loop {
-            let t_s = s.start.elapsed().as_secs_f64();
-            let mapped = thread.as_ref().map_or(worker.is_none() || over(t_s), ScopedJoinHandle::is_finished);
-            if tracked() && mapped {
-                break;
-            }
-            s.mailbox.stop.fetch_or(run.sensors_s.is_some_and(|limit| t_s >= limit) || run.stop.load(Relaxed), Relaxed);
-            s.gauges.broke.fetch_or(!s.mailbox.broken.is_empty(), Relaxed);
-            let said = worker.as_mut().and_then(|w| w.watch(&s.gauges));
-            for line in said.into_iter().chain(std::iter::from_fn(|| s.mailbox.notices.pop())) {
-                status.say(&line);
-                notices.push(line);
-            }
-            if tracked() {
-                // Nothing is played any more; the run's own time is what progresses.
-                s.gauges.played_ms.fetch_max((t_s * 1e3) as u64, Relaxed);
-            }
-            status.show(&s.gauges);
-            std::thread::sleep(STATUS_PERIOD);
-        }
+        let mapped = |t_s: f64, apart: bool| thread.as_ref().map_or(!apart || over(t_s), ScopedJoinHandle::is_finished);
+        let notices = supervise(s, run, worker.as_deref_mut(), mapped, status);
         s.counters.map_restarts.add(worker.as_ref().map_or(0, |w| w.restarts));
-        let here = |t: ScopedJoinHandle<_>| t.join().expect("threads of a run answer with values, not panics");
-        thread.map(|t| MapSide::Here(Box::new(here(t)))).or(worker.map(MapSide::Apart))
+        let here = |t: ScopedJoinHandle<_>| t.join().expect("a panic ends the process before");
+        (thread.map(|t| MapSide::Here(Box::new(here(t)))).or(worker.map(MapSide::Apart)), notices)
     });
     let warnings = sensors.frames.warnings().to_vec();
     let mut source = [sensors.frames.counters(), sensors.imu.counters()].concat();
@@ -381,14 +368,51 @@ pub fn fly_in_real_time(
     }
 }
 
+/// The main thread's work while sensors, tracking and mapping go on: takes stops, looks after the worker and the threads,
+/// and shows how it goes. Answers the lines it said.
+fn supervise(
+    s: &Shared,
+    run: &Realtime,
+    mut worker: Option<&mut Worker>,
+    mapped: impl Fn(f64, bool) -> bool,
+    status: &mut Status,
+) -> Vec<String> {
+    let (_watched, mut notices, mut silent) = (threads::watch("main"), vec![], None);
+    loop {
+        threads::alive();
+        let t_s = s.start.elapsed().as_secs_f64();
+        let tracked = s.tracking_done.load(Ordering::Acquire);
+        if tracked && mapped(t_s, worker.is_some()) {
+            return notices;
+        }
+        s.mailbox.stop.fetch_or(run.sensors_s.is_some_and(|limit| t_s >= limit) || run.stop.load(Relaxed), Relaxed);
+        s.gauges.broke.fetch_or(!s.mailbox.broken.is_empty(), Relaxed);
+        let was = std::mem::replace(&mut silent, threads::silent());
+        let hangs = silent.filter(|_| was.is_none()).map(|name| format!("thread {name} gives no sign of life"));
+        s.counters.threads_silent.add(u64::from(hangs.is_some()));
+        let looked = worker.as_mut().and_then(|w| w.watch(&s.gauges));
+        let queued = std::iter::from_fn(|| s.mailbox.notices.pop());
+        for line in hangs.into_iter().chain(looked).chain(threads::refused()).chain(queued) {
+            status.say(&line);
+            notices.push(line);
+        }
+        if tracked {
+            // Nothing is played any more; the run's own time is what progresses.
+            s.gauges.played_ms.fetch_max((t_s * 1e3) as u64, Relaxed);
+        }
+        status.show(&s.gauges);
+        std::thread::sleep(STATUS_PERIOD);
+    }
+}
+
 /// Starts a named thread that ends by itself or is asked to.
 fn start<T: Send + 'static>(name: &str, work: impl FnOnce() -> T + Send + 'static) -> JoinHandle<T> {
     Builder::new().name(name.into()).spawn(work).expect(FEW_THREADS)
 }
 
 /// Does work on a named thread of its own and waits for it.
-fn apart<T: Send>(name: &str, work: impl FnOnce() -> T + Send) -> T {
-    std::thread::scope(|scope| spawn(scope, name, work).join().expect("boot faults are values, not panics"))
+fn apart<T: Send>(name: &'static str, work: impl FnOnce() -> T + Send) -> T {
+    std::thread::scope(|scope| spawn(scope, name, work).join().expect("a panic ends the process before"))
 }
 
 const FEW_THREADS: &str = "the system starts the few threads of a flight";
@@ -396,10 +420,14 @@ const FEW_THREADS: &str = "the system starts the few threads of a flight";
 /// Starts a named thread of a flight.
 fn spawn<'scope, T: Send + 'scope>(
     scope: &'scope Scope<'scope, '_>,
-    name: &str,
+    name: &'static str,
     work: impl FnOnce() -> T + Send + 'scope,
 ) -> ScopedJoinHandle<'scope, T> {
-    Builder::new().name(name.into()).spawn_scoped(scope, work).expect(FEW_THREADS)
+    let watched = move || {
+        let _watched = threads::watch(name);
+        work()
+    };
+    Builder::new().name(name.into()).spawn_scoped(scope, watched).expect(FEW_THREADS)
 }
 
 /// Starts the threads of tracking. `give` gets each packet back, in order, on the last of them, and `ended` is dropped at

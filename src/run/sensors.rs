@@ -2,6 +2,7 @@
 //! become one `Input`, so that everything behind it is wired once.
 
 use super::status::print_err;
+use super::threads;
 use crate::config::{Board, InjectConfig};
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
@@ -293,6 +294,7 @@ impl Pulses {
         let (stop, counts): (Arc<AtomicBool>, Arc<[Counter; 2]>) = Default::default();
         let (asked, counted) = (stop.clone(), counts.clone());
         let thread = super::start("trigger", move || {
+            threads::ask_for_priority(threads::TRIGGER_PRIORITY);
             while !asked.load(Relaxed) {
                 counted[1].add(trigger.wait());
                 counted[0].add(u64::from(trigger.pulse().is_err()));

@@ -6,6 +6,7 @@ use std::fmt;
 use std::io::{self, IsTerminal, Write as _};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
 use std::time::{Duration, Instant};
+use stipple_drivers::host;
 
 /// Written by the threads of a run, read by whoever shows it.
 #[derive(Default)]
@@ -74,6 +75,7 @@ impl Status {
         }
         let played = g.played_ms.load(Relaxed).min(self.total_ms.unwrap_or(u64::MAX));
         match &self.bar {
+            Some(_) if !host::is_writable(STDERR) => {}
             Some(bar) => {
                 bar.set_position(played);
                 bar.set_message(line(g));
@@ -90,7 +92,8 @@ impl Status {
     /// Prints a line that stays.
     pub fn say(&self, text: &str) {
         match &self.bar {
-            Some(bar) => bar.println(format!("stipple: {text}")),
+            Some(bar) if host::is_writable(STDERR) => bar.println(format!("stipple: {text}")),
+            Some(_) => {}
             None if self.next_line.is_some() => print_err(format_args!("stipple: {text}")),
             None => {}
         }
@@ -116,9 +119,23 @@ fn line(g: &Gauges) -> String {
     )
 }
 
-/// Prints a line to standard error; a closed one is no reason to end a flight.
+const STDERR: i32 = 2;
+/// What a pipe that is writable takes without waiting.
+const LINE_BYTES_MAX: usize = 4096;
+/// Lines that nobody took.
+static LINES_LOST: AtomicU64 = AtomicU64::new(0);
+
+/// Prints a line to standard error. One that is closed, or whose reader has stopped reading, costs the line and nothing else.
 pub fn print_err(line: fmt::Arguments) {
-    let _ = writeln!(io::stderr(), "{line}");
+    let text = format!("{line}\n");
+    let bytes = &text.as_bytes()[..text.len().min(LINE_BYTES_MAX)];
+    let written = host::is_writable(STDERR) && io::stderr().write_all(bytes).is_ok();
+    LINES_LOST.fetch_add(u64::from(!written), Relaxed);
+}
+
+/// Lines that standard error did not take so far.
+pub fn lines_lost() -> u64 {
+    LINES_LOST.load(Relaxed)
 }
 
 /// Prints a line of the result to standard output; a closed one likewise.

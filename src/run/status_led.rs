@@ -30,6 +30,17 @@ const LOST_AFTER: Duration = Duration::from_millis(500);
 /// How long a fault is shown when nothing runs any more.
 const FAULT_SHOWN: Duration = Duration::from_secs(2);
 
+static IS_WIRED: AtomicBool = AtomicBool::new(false);
+static PANICKED: AtomicBool = AtomicBool::new(false);
+
+/// Turns the LED on, where there is one, and leaves time for it: the process is about to abort.
+pub fn show_panic() {
+    PANICKED.store(true, Relaxed);
+    if IS_WIRED.load(Relaxed) {
+        std::thread::sleep(2 * TICK);
+    }
+}
+
 impl State {
     /// Whether the LED is on at this time after some second began.
     fn is_on(self, at: Duration) -> bool {
@@ -65,10 +76,13 @@ impl StatusLed {
     fn start(mut set: impl FnMut(bool) + Send + 'static) -> StatusLed {
         let (state, stop) = (Arc::new(AtomicU8::new(State::Boot as u8)), Arc::new(AtomicBool::new(false)));
         let (shown, asked, begun) = (state.clone(), stop.clone(), Instant::now());
+        IS_WIRED.store(true, Relaxed);
         let thread = super::start("led", move || {
             let mut was = false;
             while !asked.load(Relaxed) {
-                let on = STATES[usize::from(shown.load(Relaxed))].is_on(begun.elapsed());
+                let state = STATES[usize::from(shown.load(Relaxed))];
+                // Nobody blinks for a process that has ended: after a panic it stays on.
+                let on = PANICKED.load(Relaxed) || state.is_on(begun.elapsed());
                 if on != was {
                     was = on;
                     set(on);

@@ -72,6 +72,7 @@ pub fn conclude(title: Title, mut flown: Flown, out: &OutputDir) -> Result<Repor
         (report.camera_cpu_ms, report.camera_kernel_ms) = capture.ms_a_frame().unzip();
         report.camera_copies = capture.copies(&flown.source);
     }
+    flown.counters.lines_lost.add(super::status::lines_lost());
     report.rss_peak_bytes = host::rss_peak_bytes();
     report.set_counters(&counted(&flown, map.as_ref(), &title.opened));
     if let Some(run) = flown.tracker.odometry() {

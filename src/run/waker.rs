@@ -1,5 +1,6 @@
 //! How the threads of a flight wait for one another: parked, without a lock.
 
+use super::threads;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::OnceLock;
 use std::thread::{park_timeout, Thread};
@@ -25,6 +26,7 @@ impl Waker {
         loop {
             // Read before the queue, so that what came last is still taken.
             let over = over.load(Ordering::Acquire);
+            threads::alive();
             let polled = poll();
             if polled.is_some() || over {
                 return polled;

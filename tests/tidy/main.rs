@@ -29,8 +29,8 @@ const SPAWNS: [&str; 4] = ["src/run/mod.rs", "src/run/worker.rs", "drivers/src/r
 const RUST_LINES_MAX: usize = 600;
 const FUNCTION_LINES_MAX: usize = 90;
 const KERNEL_LINES_MAX: usize = 250;
-/// Lines of code that the product may have, and its estimator, frontend, mapper, GPU core, stereo and kernels together.
-const CODE_MAX: usize = 30_000;
+/// Lines of code that the product may have (30 000 for what flew in one process without a log), and its estimator, frontend, mapper, GPU core, stereo and kernels together.
+const CODE_MAX: usize = 34_000;
 const CORE_MAX: usize = 14_000;
 const CORE: [&str; 10] = [
     "src/vio/",
