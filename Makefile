@@ -6,17 +6,17 @@
 # The one place where Debian packages are listed:
 #   g++                    linker, and the compiler of the OpenCV shim
 #   glslang-tools          GLSL -> SPIR-V in the build
-#   libgpiod-dev           GPIO lines: data ready, camera trigger, LED (1.6, as in JetPack 6; the library itself comes with it)
 #   libopencv-calib3d-dev  block matching
 #   libvulkan1             Vulkan loader
 #   mesa-vulkan-drivers    lavapipe (Vulkan on the CPU), and the drivers of Intel, AMD and Pi GPUs
 #   vulkan-validationlayers  the tests run the pipeline under the Khronos validation layer
-PACKAGES := g++ glslang-tools libgpiod-dev libopencv-calib3d-dev libvulkan1 mesa-vulkan-drivers vulkan-validationlayers
+PACKAGES := g++ glslang-tools libopencv-calib3d-dev libvulkan1 mesa-vulkan-drivers vulkan-validationlayers
 
 # What `make hil` needs besides: a machine to emulate, and the headers of the kernel it boots.
 #   qemu-system-x86 busybox-static cpio kmod xz-utils  the machine and its first file system
 #   linux-headers-amd64    builds the modules that Debian does not (tests/hil/prepare.sh)
-#   gpiod i2c-tools v4l-utils  what a failing test is looked into with
+#   gpiod                  brings libgpiod2
+#   i2c-tools v4l-utils    what a failing test is looked into with, with gpiod's own tools
 HIL_PACKAGES := busybox-static cpio gpiod i2c-tools kmod linux-headers-amd64 qemu-system-x86 v4l-utils xz-utils
 
 OUT ?= out/demo

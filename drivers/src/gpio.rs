@@ -1,5 +1,7 @@
-//! Single lines of GPIO through libgpiod 1.6, which Debian 12 and JetPack 6 ship: a data-ready input whose edges the kernel
+//! Single lines of GPIO through libgpiod, version 1 or 2 as the machine has it: a data-ready input whose edges the kernel
 //! stamps, an output that triggers cameras, and one for a status LED. No thread is started here.
+//!
+//! The library is loaded when the first line is opened: what names no line runs without it.
 //!
 //! A chip is chosen by its label, name or path, a line by its name or offset. Offsets of lines are a matter of wiring; the
 //! numbers of chips change with the order in which drivers are probed, so a label is the better choice.
@@ -8,70 +10,26 @@
 //! that come when the queue is full; `imu::edges` finds that out by counting.
 #![allow(unsafe_code)]
 
+mod abi;
+mod library;
+#[cfg(test)]
+mod tests;
+mod v1;
+mod v2;
+
 use crate::host::monotonic;
 use crate::imu::edges::{EdgeFault, EdgeQueue, Edges};
 use crate::types::{Nanos, Span};
 use crate::{Fault, FaultKind};
-use serde::{Deserialize, Serialize};
-use std::ffi::{c_char, c_int, c_uint, CString};
+pub use abi::Edge;
+use abi::{Purpose, Wanted, EVENTS};
+use library::{library, Library, Line};
+use std::ffi::CString;
 
+#[cfg(not(test))]
+use libc::clock_nanosleep;
 #[cfg(test)]
-mod tests;
-
-/// The part of <gpiod.h>, version 1, that is used.
-mod c {
-    use super::*;
-
-    #[repr(C)]
-    pub(super) struct Chip {
-        _private: [u8; 0],
-    }
-
-    #[repr(C)]
-    pub(super) struct Line {
-        _private: [u8; 0],
-    }
-
-    /// `struct gpiod_line_request_config`
-    #[repr(C)]
-    pub(super) struct Request {
-        pub(super) consumer: *const c_char,
-        pub(super) request_type: c_int,
-        pub(super) flags: c_int,
-    }
-
-    /// `struct gpiod_line_event`
-    #[repr(C)]
-    pub(super) struct Event {
-        pub(super) t: libc::timespec,
-        pub(super) kind: c_int,
-    }
-
-    pub(super) const DIRECTION_OUTPUT: c_int = 3;
-    pub(super) const EVENT_FALLING: c_int = 4;
-    pub(super) const EVENT_RISING: c_int = 5;
-    pub(super) const ACTIVE_LOW: c_int = 4;
-
-    /// In tests every call can be made to fail.
-    #[cfg(test)]
-    pub use super::tests::simulated::*;
-
-    #[cfg(not(test))]
-    pub use libc::clock_nanosleep;
-
-    #[cfg(not(test))]
-    #[link(name = "gpiod")]
-    extern "C" {
-        pub(super) fn gpiod_chip_open_lookup(descr: *const c_char) -> *mut Chip;
-        pub(super) fn gpiod_chip_close(chip: *mut Chip);
-        pub(super) fn gpiod_chip_get_line(chip: *mut Chip, offset: c_uint) -> *mut Line;
-        pub(super) fn gpiod_chip_find_line(chip: *mut Chip, name: *const c_char) -> *mut Line;
-        pub(super) fn gpiod_line_request(line: *mut Line, config: *const Request, default: c_int) -> c_int;
-        pub(super) fn gpiod_line_set_value(line: *mut Line, value: c_int) -> c_int;
-        pub(super) fn gpiod_line_event_wait(line: *mut Line, timeout: *const libc::timespec) -> c_int;
-        pub(super) fn gpiod_line_event_read_multiple(line: *mut Line, events: *mut Event, count: c_uint) -> c_int;
-    }
-}
+use tests::simulated::clock_nanosleep;
 
 /// A line as a board file names it.
 #[derive(Clone, Debug, PartialEq, Eq, Default)]
@@ -88,66 +46,21 @@ impl std::fmt::Display for LineName {
     }
 }
 
-/// The edge that means that a sample is ready.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Edge {
-    Rising,
-    Falling,
-}
-
-/// A requested line. Dropping it closes its chip, which releases the line and puts an output back to its hardware default.
-struct Line {
-    chip: *mut c::Chip,
-    line: *mut c::Line,
-}
-
-// SAFETY: libgpiod's handles hold file descriptors and no thread's state; only their one owner uses them.
-unsafe impl Send for Line {}
-
-fn errno() -> i32 {
-    std::io::Error::last_os_error().raw_os_error().unwrap_or(libc::EIO)
-}
-
-fn c_string(text: &str) -> Result<CString, i32> {
-    CString::new(text).map_err(|_| libc::EINVAL)
-}
-
-impl Line {
-    fn request(name: &LineName, kind: c_int, flags: c_int) -> Result<Line, i32> {
-        let (chip_name, line_name) = (c_string(&name.chip)?, c_string(&name.line)?);
-        // SAFETY: a string that outlives the call; the result is checked.
-        let chip = unsafe { c::gpiod_chip_open_lookup(chip_name.as_ptr()) };
-        if chip.is_null() {
-            return Err(errno());
-        }
-        // From here on dropping it closes the chip.
-        let mut found = Line { chip, line: std::ptr::null_mut() };
-        // SAFETY: the chip is open; strings outlive the calls; a missing line is null.
-        found.line = unsafe {
-            match name.line.parse() {
-                Ok(offset) => c::gpiod_chip_get_line(chip, offset),
-                Err(_) => c::gpiod_chip_find_line(chip, line_name.as_ptr()),
-            }
-        };
-        if found.line.is_null() {
-            return Err(libc::ENOENT);
-        }
-        let request = c::Request { consumer: c"stipple".as_ptr(), request_type: kind, flags };
-        // SAFETY: the line belongs to the open chip; the request and its string outlive the call.
-        match unsafe { c::gpiod_line_request(found.line, &request, 0) } {
-            ..0 => Err(errno()),
-            _ => Ok(found),
-        }
+impl LineName {
+    /// The library and what it is asked for; a fault where there is no library.
+    fn wanted(&self, purpose: Purpose) -> Result<(&'static Library, Wanted), Fault> {
+        let library = library().map_err(|why| {
+            let what = format!("cannot be used: libgpiod cannot be loaded: {why}");
+            Fault::new(FaultKind::Unavailable, format!("GPIO {self}"), what, INSTALL)
+        })?;
+        let text = |text: &str| CString::new(text).map_err(|_| cannot_use(self, libc::EINVAL));
+        let offset = self.line.parse().ok();
+        Ok((library, Wanted { chip: text(&self.chip)?, line: text(&self.line)?, offset, purpose }))
     }
 }
 
-impl Drop for Line {
-    fn drop(&mut self) {
-        // SAFETY: it was opened and nobody else closes it; this releases the line too, after which nothing uses it.
-        unsafe { c::gpiod_chip_close(self.chip) }
-    }
-}
+const INSTALL: &str =
+    "apt install libgpiod3 (libgpiod2 on Debian 12 and Ubuntu 24.04), or name no GPIO line in the board file";
 
 fn cannot_use(name: &LineName, errno: i32) -> Fault {
     let fix = match errno {
@@ -164,52 +77,36 @@ fn cannot_use(name: &LineName, errno: i32) -> Fault {
 pub struct DataReady {
     /// `None` while it is gone.
     line: Option<Line>,
-    name: LineName,
-    edge: Edge,
+    library: &'static Library,
+    wanted: Wanted,
 }
-
-/// Edges that the kernel queues for one line.
-const EVENTS: usize = 16;
 
 impl DataReady {
     /// Requests the line for edges; a fault where it cannot be had.
     pub fn open(name: &LineName, edge: Edge) -> Result<DataReady, Fault> {
-        let mut opened = DataReady { line: None, name: name.clone(), edge };
+        let (library, wanted) = name.wanted(Purpose::Edges(edge))?;
+        let mut opened = DataReady { line: None, library, wanted };
         opened.reopen().map_err(|EdgeFault(errno)| cannot_use(name, errno))?;
         Ok(opened)
     }
 
-    fn line(&self) -> Result<&Line, EdgeFault> {
-        self.line.as_ref().ok_or(EdgeFault(libc::ENODEV))
+    fn line(&mut self) -> Result<&mut Line, EdgeFault> {
+        self.line.as_mut().ok_or(EdgeFault(libc::ENODEV))
     }
 }
 
 impl Edges for DataReady {
     fn wait(&mut self, timeout: Span) -> Result<bool, EdgeFault> {
-        let timeout = timespec(timeout.0.max(0));
-        // SAFETY: the line is requested for events; the timeout outlives the call.
-        match unsafe { c::gpiod_line_event_wait(self.line()?.line, &timeout) } {
-            ready @ (0 | 1) => Ok(ready == 1),
-            // A signal is no fault.
-            _ if errno() == libc::EINTR => Ok(false),
-            _ => Err(EdgeFault(errno())),
-        }
+        self.line()?.wait(timeout).map_err(EdgeFault)
     }
 
     fn drain(&mut self, into: &mut EdgeQueue) -> Result<(), EdgeFault> {
         // Reading blocks where there is nothing, so it is asked for first.
         while self.wait(Span(0))? {
-            let mut events = [const { c::Event { t: timespec(0), kind: 0 } }; EVENTS];
-            // SAFETY: the line is requested for events; there is room for as many as are asked for.
-            let read =
-                unsafe { c::gpiod_line_event_read_multiple(self.line()?.line, events.as_mut_ptr(), EVENTS as c_uint) };
-            if read < 0 {
-                return Err(EdgeFault(errno()));
-            }
+            let mut stamps = [Nanos(0); EVENTS];
+            let read = self.line()?.read(&mut stamps).map_err(EdgeFault)?;
             let now = monotonic();
-            for event in &events[..(read as usize).min(EVENTS)] {
-                into.push(Nanos(event.t.tv_sec * 1_000_000_000 + event.t.tv_nsec), now);
-            }
+            stamps[..read].iter().for_each(|stamp| into.push(*stamp, now));
         }
         Ok(())
     }
@@ -217,8 +114,7 @@ impl Edges for DataReady {
     fn reopen(&mut self) -> Result<(), EdgeFault> {
         // The line is busy until the old request is gone.
         self.line = None;
-        let kind = if self.edge == Edge::Rising { c::EVENT_RISING } else { c::EVENT_FALLING };
-        self.line = Some(Line::request(&self.name, kind, 0).map_err(EdgeFault)?);
+        self.line = Some(Line::request(self.library, &self.wanted).map_err(EdgeFault)?);
         Ok(())
     }
 }
@@ -237,18 +133,14 @@ pub struct Output {
 impl Output {
     /// Requests the line, inactive at first; a fault where it cannot be had.
     pub fn open(name: &LineName, active_low: bool) -> Result<Output, Fault> {
-        let flags = if active_low { c::ACTIVE_LOW } else { 0 };
-        let line = Line::request(name, c::DIRECTION_OUTPUT, flags).map_err(|errno| cannot_use(name, errno))?;
+        let (library, wanted) = name.wanted(Purpose::Output { active_low })?;
+        let line = Line::request(library, &wanted).map_err(|errno| cannot_use(name, errno))?;
         Ok(Output { line, name: name.clone() })
     }
 
     /// Makes the line active or inactive; a fault where the line is gone.
     pub fn set(&mut self, active: bool) -> Result<(), Fault> {
-        // SAFETY: the line is requested for as long as `self` lives.
-        match unsafe { c::gpiod_line_set_value(self.line.line, c_int::from(active)) } {
-            ..0 => Err(cannot_use(&self.name, errno())),
-            _ => Ok(()),
-        }
+        self.line.set(active).map_err(|errno| cannot_use(&self.name, errno))
     }
 }
 
@@ -272,7 +164,7 @@ impl Trigger {
     pub fn wait(&mut self) -> u64 {
         let due = timespec(self.due.0);
         // SAFETY: the instant outlives the call; the remaining time is not asked for.
-        while unsafe { c::clock_nanosleep(libc::CLOCK_MONOTONIC, libc::TIMER_ABSTIME, &due, std::ptr::null_mut()) }
+        while unsafe { clock_nanosleep(libc::CLOCK_MONOTONIC, libc::TIMER_ABSTIME, &due, std::ptr::null_mut()) }
             == libc::EINTR
         {}
         let missed;
