@@ -6,7 +6,7 @@
 # The one place where Debian packages are listed:
 #   g++                    linker, and the compiler of the OpenCV shim
 #   glslang-tools          GLSL -> SPIR-V in the build
-#   libopencv-calib3d-dev  block matching
+#   libopencv-calib3d-dev  block matching; its libraries are loaded where a board asks for it
 #   libvulkan1             Vulkan loader
 #   mesa-vulkan-drivers    lavapipe (Vulkan on the CPU), and the drivers of Intel, AMD and Pi GPUs
 #   vulkan-validationlayers  the tests run the pipeline under the Khronos validation layer

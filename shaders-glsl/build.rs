@@ -1,4 +1,4 @@
-//! Compiles every kernel under shaders-glsl/ and writes the Rust that calls it; compiles the OpenCV shim.
+//! Compiles every kernel under shaders-glsl/ and writes the Rust that calls it; builds the OpenCV shim.
 //!
 //! GLSL is the single source: `glslangValidator` makes SPIR-V, `reflect.rs` reads the interface out of
 //! it, `emit.rs` writes `$OUT_DIR/kernels.rs`. A kernel with the line `// variants: subgroup` is compiled once
@@ -109,7 +109,7 @@ fn glslang(file: &Path, define: &str, spv: &Path) -> Result<(), String> {
     ))
 }
 
-/// Matching from Debian's OpenCV; see src/stereo/opencv.rs.
+/// Matching by OpenCV: a shared object of its own, which src/stereo/opencv.rs carries and loads.
 fn opencv_shim() {
     let shim = "src/stereo/opencv.cpp";
     println!("cargo:rerun-if-changed={shim}");
@@ -121,7 +121,10 @@ fn opencv_shim() {
         headers.join("opencv2/calib3d.hpp").exists(),
         "OpenCV's calib3d headers are missing: apt-get install libopencv-calib3d-dev, or build with --no-default-features"
     );
-    cc::Build::new().cpp(true).std("c++17").opt_level(2).include(headers).file(shim).compile("stipple_opencv");
-    println!("cargo:rustc-link-lib=opencv_calib3d");
-    println!("cargo:rustc-link-lib=opencv_core");
+    let out = PathBuf::from(std::env::var_os("OUT_DIR").expect("cargo sets OUT_DIR")).join("stipple_opencv.so");
+    let compiler = cc::Build::new().cpp(true).std("c++17").opt_level(2).debug(false).include(headers).get_compiler();
+    let mut command = compiler.to_command();
+    command.args(["-shared", "-fPIC", "-s", "-Wl,-z,defs", "-o"]).arg(out).arg(shim);
+    let built = command.args(["-lopencv_calib3d", "-lopencv_core"]).status();
+    assert!(built.is_ok_and(|status| status.success()), "cannot build {shim}");
 }

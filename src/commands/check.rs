@@ -2,6 +2,7 @@
 
 use super::BoardArgs;
 use crate::run::memory;
+use crate::run::status::print_err;
 use stipple_drivers::Fault;
 
 #[derive(clap::Args)]
@@ -11,7 +12,10 @@ pub struct Args {
 }
 
 pub fn check(args: &Args) -> Result<(), Fault> {
-    let board = args.board.load()?;
+    let mut board = args.board.load()?;
+    if let Some(warning) = memory::replace_missing(&mut board) {
+        print_err(format_args!("stipple: warning: {warning}"));
+    }
     let rig = memory::largest_rig(&board);
     memory::print(&memory::footprint(&rig, &board, true)?);
     memory::check_fits(&args.board.path().display().to_string(), &rig, &board, true)?;

@@ -105,8 +105,8 @@ impl StereoMethod {
 section! {
     /// Stereo depth, which seeds the map.
     StereoConfig, "stereo.";
-    /// bm (OpenCV block matching; fast on a CPU), sgbm (OpenCV semi-global), sgm (semi-global on the GPU; the best where there is
-    /// one) or onnx (a network of yours).
+    /// bm (OpenCV block matching; fast on a CPU), sgbm (OpenCV semi-global; sgm does the work of both where OpenCV is missing),
+    /// sgm (semi-global on the GPU; the best where there is one) or onnx (a network of yours).
     method: StereoMethod = if cfg!(feature = "opencv") { StereoMethod::Bm } else { StereoMethod::Sgm };
     /// Range of disparities at full resolution, px. Raise it to see nearer than focal length times baseline over this.
     disparities: u32 = 96, Bound::Multiple(16.0, 512.0, 16.0);

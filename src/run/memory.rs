@@ -12,6 +12,11 @@ use crate::stereo::Matcher;
 use stipple_drivers::record::Ring;
 use stipple_drivers::{Calibration, Camera, Fault, FaultKind, Frames, ImuCalibration, Lens, Pose, RigCamera};
 
+/// Puts what this machine has in the place of a library that it lacks; answers what that was.
+pub fn replace_missing(board: &mut Board) -> Option<Fault> {
+    board.map.enabled.then(|| Matcher::replace_missing(&mut board.stereo)).flatten()
+}
+
 /// Everything a run with this rig takes, without the operating system's and the drivers' own; with the ring of a recording
 /// where it `records`. Each part is built once and dropped again. Fails where a part cannot take the rig.
 pub fn footprint(calibration: &Calibration, board: &Board, records: bool) -> Result<Footprint, Fault> {

@@ -57,6 +57,7 @@ use status::{print_err, Gauges, Status};
 use status_led::StatusLed;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering, Ordering::Relaxed};
+use std::sync::Arc;
 use std::thread::{Builder, JoinHandle, Scope, ScopedJoinHandle};
 use std::time::{Duration, Instant};
 use stipple_drivers::paced::FRAMES_UNREADABLE;
@@ -147,8 +148,18 @@ pub fn fly(
         threads::ask_for_realtime();
     }
     threads::panic_in(options.inject.thread.iter().map(|rule| (rule.name.clone(), rule.panic_s)));
+    let mut board = board.clone();
+    // In a service libraries of the mapper are its process's business, and so is whether all of it fits.
+    let apart = board.map.enabled && options.service && matches!(options.pace, Pace::Recorded);
+    if !apart {
+        input.warnings.extend(memory::replace_missing(&mut board).map(|missing| missing.to_string()));
+    }
+    input.warnings.iter().for_each(|warning| print_err(format_args!("stipple: warning: {warning}")));
+    let board = &board;
     input.calibration.imu.range = board.imu.range();
-    memory::check_fits(&input.place, &input.calibration, board, options.record.is_some())?;
+    if !apart {
+        memory::check_fits(&input.place, &input.calibration, board, options.record.is_some())?;
+    }
     let colours = memory::colours(&input.calibration, board).len();
     input.needs_colour(colours)?;
     let frames = match &mut input.source {
@@ -165,14 +176,16 @@ pub fn fly(
         Some(path) => Tracker::Table(read_trajectory(path)?),
         None => Tracker::Odometry(Box::new(OdometryRun::new(&input.calibration, board, frames)?)),
     };
-    let here = || Mapping::open(&input.calibration, board, KeyframeRing::new(&input.calibration, board)?.into());
-    let lockstep = matches!((&options.pace, &input.source), (Pace::Lockstep(_), Source::Recorded(_)));
-    let map = match (board.map.enabled, options.service && !lockstep) {
+    let ring = || KeyframeRing::new(&input.calibration, board).map(Arc::new);
+    let map = match (board.map.enabled, apart) {
         (false, _) => None,
-        (true, false) => Some(MapSide::Here(Box::new(here()?))),
-        (true, true) => Some(MapSide::Apart(Box::new(Worker::start(&input.calibration, board, out)?))),
+        (true, false) => Some(MapSide::Here(Box::new(Mapping::open(&input.calibration, board, ring()?)?))),
+        (true, true) => {
+            let worker = Worker::start(&input.place, &input.calibration, board, out, options.record.is_some())?;
+            input.warnings.extend(worker.warning.clone());
+            Some(MapSide::Apart(Box::new(worker)))
+        }
     };
-    input.warnings.iter().for_each(|warning| print_err(format_args!("stipple: warning: {warning}")));
     let title = summary::Title {
         dataset: input.name,
         board: board.name.clone(),

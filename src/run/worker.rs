@@ -8,7 +8,8 @@
 
 use super::keyframes::{KeyframeRing, Word};
 use super::mapping::{self, Drawn, MapResult, Mapping};
-use super::status::Gauges;
+use super::memory;
+use super::status::{print_err, Gauges};
 use crate::config::Board;
 use crate::mem::unsealed;
 use crate::output::panel::Picture;
@@ -49,6 +50,8 @@ struct Setup {
     out: PathBuf,
     /// Descriptor of the ring of keyframes.
     ring: i32,
+    /// The recording or rig, for errors, and whether samples are recorded: on the first start the whole run must fit.
+    first: Option<(String, bool)>,
     /// Time of the run so far, s.
     run_s: f64,
     parent: u32,
@@ -58,6 +61,8 @@ struct Setup {
 enum Answer {
     /// It cannot start.
     Refused(Fault),
+    /// It takes keyframes; what it lacks.
+    Ready(Option<Fault>),
     Result(Box<MapResult>),
     /// Its pixels follow, as a frame of their own.
     Picture {
@@ -72,6 +77,7 @@ enum Answer {
 #[derive(Default)]
 struct Told {
     refused: Option<Fault>,
+    ready: Option<Option<Fault>>,
     result: Option<MapResult>,
     drawn: Vec<Drawn>,
 }
@@ -122,12 +128,21 @@ pub struct Worker {
     pause: Duration,
     next_start: Instant,
     pub restarts: u64,
+    /// What the worker lacks, and does without.
+    pub warning: Option<String>,
     bytes_max: u64,
 }
 
 impl Worker {
     /// Starts the worker and waits until it is ready. Fails where it says why it cannot be.
-    pub fn start(calibration: &Calibration, board: &Board, out: &OutputDir) -> Result<Worker, Fault> {
+    /// `place` names the rig; `records` where the run is recorded, too.
+    pub fn start(
+        place: &str,
+        calibration: &Calibration,
+        board: &Board,
+        out: &OutputDir,
+        records: bool,
+    ) -> Result<Worker, Fault> {
         let now = Instant::now();
         let mut worker = Worker {
             ring: Arc::new(KeyframeRing::new(calibration, board)?),
@@ -139,17 +154,22 @@ impl Worker {
             pause: Duration::ZERO,
             next_start: now,
             restarts: 0,
+            warning: None,
             bytes_max: (board.memory_max_mib << 20) + DRIVER_BYTES,
         };
-        worker.spawn().map_err(|e| refused(format!("the mapper's process does not start: {e}")))?;
-        let gauges = Gauges::default();
-        while worker.ring.word(Word::Ready).load(Acquire) == 0 && !host::stop_asked_for().load(Relaxed) {
-            let told = worker.running.as_ref().map(|r| r.told.clone());
+        let first = Some((place.to_string(), records));
+        worker.spawn(first).map_err(|e| refused(format!("the mapper's process does not start: {e}")))?;
+        let (gauges, told) = (Gauges::default(), worker.running.as_ref().map(|r| r.told.clone()));
+        let told = told.unwrap_or_default();
+        while !host::stop_asked_for().load(Relaxed) {
+            if let Some(missing) = lock(&told).ready.take() {
+                worker.warning = missing.map(|fault| fault.to_string());
+                worker.warning.iter().for_each(|why| print_err(format_args!("stipple: warning: {why}")));
+                break;
+            }
+            // All that it said was read when it was found to have ended.
             if let Some(why) = worker.watch(&gauges) {
-                // What it said may come just after its end.
-                std::thread::sleep(BEAT);
-                let said = told.and_then(|told| lock(&told).refused.take());
-                return Err(said.unwrap_or_else(|| refused(why)));
+                return Err(lock(&told).refused.take().unwrap_or_else(|| refused(why)));
             }
             std::thread::sleep(Duration::from_millis(5));
         }
@@ -157,12 +177,13 @@ impl Worker {
         Ok(worker)
     }
 
-    fn spawn(&mut self) -> io::Result<()> {
+    fn spawn(&mut self, first: Option<(String, bool)>) -> io::Result<()> {
         let setup = Setup {
             board: self.board.clone(),
             calibration: self.calibration.clone(),
             out: self.out.clone(),
             ring: self.ring.number(),
+            first,
             run_s: self.begun.elapsed().as_secs_f64(),
             parent: std::process::id(),
         };
@@ -190,7 +211,7 @@ impl Worker {
         let Some(running) = &mut self.running else {
             if now >= self.next_start {
                 ring.offer_again();
-                if let Err(e) = self.spawn() {
+                if let Err(e) = self.spawn(None) {
                     self.postpone(now, Duration::ZERO);
                     return Some(format!("the mapper does not start again: {e}"));
                 }
@@ -338,6 +359,7 @@ fn read_answers(mut from: impl Read, told: &Mutex<Told>) {
     while let Some(answer) = next().and_then(|bytes| serde_json::from_slice(&bytes).ok()) {
         match answer {
             Answer::Refused(fault) => lock(told).refused = Some(fault),
+            Answer::Ready(missing) => lock(told).ready = Some(missing),
             Answer::Result(result) => lock(told).result = Some(*result),
             Answer::Picture { name, caption, width, height } => {
                 let Some(bytes) = next().filter(|b| b.len() == 3 * width * height) else { return };
@@ -363,15 +385,18 @@ pub fn serve(mut input: impl Read, mut output: impl Write) -> Result<(), Fault> 
     let broken = |e: io::Error| refused(format!("the process that flies cannot be reached: {e}"));
     let mut text = Vec::new();
     input.read_to_end(&mut text).map_err(broken)?;
-    let setup: Setup = serde_json::from_slice(&text).map_err(|e| {
+    let mut setup: Setup = serde_json::from_slice(&text).map_err(|e| {
         let what = format!("standard input says nothing that a mapper understands: {e}");
         Fault::new(FaultKind::Usage, "map-worker", what, "it is started by `stipple run`, not by hand")
     })?;
     host::live_with_parent(setup.parent).map_err(broken)?;
     let start = Instant::now().checked_sub(Duration::from_secs_f64(setup.run_s.max(0.0))).unwrap_or_else(Instant::now);
-    let opened = KeyframeRing::attach(setup.ring, &setup.calibration, &setup.board).and_then(|ring| {
+    let missing = memory::replace_missing(&mut setup.board);
+    let Setup { board, calibration, first, .. } = &setup;
+    let fits = first.as_ref().map(|(place, records)| memory::check_fits(place, calibration, board, *records));
+    let opened = fits.transpose().and_then(|_| KeyframeRing::attach(setup.ring, calibration, board)).and_then(|ring| {
         let ring = Arc::new(ring);
-        Ok((ring.clone(), OutputDir::create(&setup.out)?, Mapping::open(&setup.calibration, &setup.board, ring)?))
+        Ok((ring.clone(), OutputDir::create(&setup.out)?, Mapping::open(calibration, board, ring)?))
     });
     let (ring, out, mapping) = match opened {
         Ok(opened) => opened,
@@ -395,6 +420,7 @@ pub fn serve(mut input: impl Read, mut output: impl Write) -> Result<(), Fault> 
         }
         std::thread::sleep(BEAT);
     });
+    tell(&mut output, &Answer::Ready(missing)).map_err(broken)?;
     ring.word(Word::Ready).store(1, Release);
     let stop = || ring.word(Word::Stop).load(Acquire) != 0;
     let mut mapping = mapping::map(mapping, &gauges, start, || true, |_| stop());

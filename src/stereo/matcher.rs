@@ -26,6 +26,14 @@ pub enum Matcher {
 }
 
 impl Matcher {
+    /// Puts `sgm` in the place of a method of OpenCV's that cannot be loaded on this machine; answers why.
+    pub fn replace_missing(config: &mut StereoConfig) -> Option<Fault> {
+        let mut missing = opencv::missing(config.method)?;
+        missing.what += "; `sgm` matches in its place";
+        config.method = StereoMethod::Sgm;
+        Some(missing)
+    }
+
     /// Host rows of what `new` takes for images of this size.
     pub fn footprint(width: usize, height: usize, config: &StereoConfig, f: &mut Footprint) -> Result<(), Fault> {
         match config.method {

@@ -1,9 +1,21 @@
 //! Block matching (`cv::StereoBM`, Konolige) and semi-global block matching (`cv::StereoSGBM`,
 //! Hirschmüller) by Debian's OpenCV behind a C++ shim of four functions: no OpenCV type crosses it,
 //! exceptions end in it. Built with the feature `opencv`; without it both are refused at boot.
+//!
+//! The shim is a shared object that the program carries and loads when a board asks for a method of OpenCV's. It needs the
+//! version of OpenCV that it was built with; where that is missing, `missing` says so and the rest runs.
 #![allow(unsafe_code)]
 
 use crate::config::{StereoConfig, StereoMethod};
+#[cfg(feature = "opencv")]
+use libloading::os::unix::{Library, RTLD_LOCAL, RTLD_NOW};
+#[cfg(feature = "opencv")]
+use std::{
+    ffi::{c_int, c_void},
+    io::Write,
+    os::fd::{AsRawFd, FromRawFd},
+    sync::OnceLock,
+};
 use stipple_drivers::{Fault, FaultKind, Image};
 
 /// OpenCV's disparities are in 1/16 px.
@@ -11,6 +23,8 @@ use stipple_drivers::{Fault, FaultKind, Image};
 const SUBPIXEL: f32 = 16.0;
 
 pub struct OpenCv {
+    #[cfg(feature = "opencv")]
+    shim: &'static Shim,
     #[cfg(feature = "opencv")]
     handle: std::ptr::NonNull<std::ffi::c_void>,
     width: usize,
@@ -40,33 +54,62 @@ pub fn refused_without_opencv(method: StereoMethod) -> Fault {
     Fault::new(FaultKind::Config, "stereo.method", what, fix)
 }
 
+/// Why OpenCV's `method` cannot run on this machine; nothing where it can, or is not OpenCV's.
+pub fn missing(method: StereoMethod) -> Option<Fault> {
+    match method {
+        #[cfg(feature = "opencv")]
+        StereoMethod::Bm | StereoMethod::Sgbm => shim().err().map(|why| not_loaded(method, why)),
+        _ => None,
+    }
+}
+
 #[cfg(feature = "opencv")]
-mod ffi {
-    use std::ffi::{c_int, c_void};
-    extern "C" {
-        pub fn stipple_bm_new(
-            width: c_int,
-            height: c_int,
-            disparities: c_int,
-            block: c_int,
-            uniqueness: c_int,
-        ) -> *mut c_void;
-        pub fn stipple_sgbm_new(
-            width: c_int,
-            height: c_int,
-            disparities: c_int,
-            block: c_int,
-            uniqueness: c_int,
-            p1: c_int,
-            p2: c_int,
-        ) -> *mut c_void;
-        pub fn stipple_matcher_free(handle: *mut c_void);
-        pub fn stipple_matcher_compute(
-            handle: *mut c_void,
-            left: *const u8,
-            right: *const u8,
-            disparity: *mut i16,
-        ) -> c_int;
+fn not_loaded(method: StereoMethod, why: &str) -> Fault {
+    let what = format!("`{}` is OpenCV's, which cannot be loaded: {why}", method.name());
+    let fix = "apt install the libopencv-calib3d that this program was built with, or set stereo.method = \"sgm\"";
+    Fault::new(FaultKind::Unavailable, "stereo.method", what, fix)
+}
+
+/// The functions of opencv.cpp.
+#[cfg(feature = "opencv")]
+struct Shim {
+    bm_new: unsafe extern "C" fn(c_int, c_int, c_int, c_int, c_int) -> *mut c_void,
+    sgbm_new: unsafe extern "C" fn(c_int, c_int, c_int, c_int, c_int, c_int, c_int) -> *mut c_void,
+    matcher_free: unsafe extern "C" fn(*mut c_void),
+    matcher_compute: unsafe extern "C" fn(*mut c_void, *const u8, *const u8, *mut i16) -> c_int,
+    _library: Library,
+}
+
+/// The shim, loaded when it is first asked for, or why it cannot be.
+#[cfg(feature = "opencv")]
+fn shim() -> Result<&'static Shim, &'static str> {
+    static LOADED: OnceLock<Result<Shim, String>> = OnceLock::new();
+    LOADED.get_or_init(|| load().map_err(|e| e.to_string())).as_ref().map_err(String::as_str)
+}
+
+#[cfg(feature = "opencv")]
+fn load() -> Result<Shim, Box<dyn std::error::Error>> {
+    const BYTES: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/stipple_opencv.so"));
+    // SAFETY: a C string; the answer is checked, and nobody else has the descriptor.
+    let file = unsafe {
+        match libc::memfd_create(c"stipple_opencv.so".as_ptr(), libc::MFD_CLOEXEC) {
+            ..0 => Err(std::io::Error::last_os_error()),
+            fd => Ok(std::fs::File::from_raw_fd(fd)),
+        }
+    };
+    let file = file.and_then(|mut file| file.write_all(BYTES).map(|()| file))?;
+    let path = format!("/proc/self/fd/{}", file.as_raw_fd());
+    // SAFETY: our own library and OpenCV's, which a program may load at any time. It stays loaded with its table; the
+    // functions have the types of opencv.cpp, which is built with this file.
+    unsafe {
+        let library = Library::open(Some(path), RTLD_NOW | RTLD_LOCAL)?;
+        Ok(Shim {
+            bm_new: *library.get(b"stipple_bm_new\0")?,
+            sgbm_new: *library.get(b"stipple_sgbm_new\0")?,
+            matcher_free: *library.get(b"stipple_matcher_free\0")?,
+            matcher_compute: *library.get(b"stipple_matcher_compute\0")?,
+            _library: library,
+        })
     }
 }
 
@@ -74,8 +117,9 @@ mod ffi {
 impl OpenCv {
     /// `config.method` says which of the two.
     pub fn new(width: usize, height: usize, config: &StereoConfig) -> Result<OpenCv, Fault> {
-        let int = |v: u32| v as std::ffi::c_int;
-        let (w, h) = (width as std::ffi::c_int, height as std::ffi::c_int);
+        let shim = shim().map_err(|why| not_loaded(config.method, why))?;
+        let int = |v: u32| v as c_int;
+        let (w, h) = (width as c_int, height as c_int);
         let (disparities, uniqueness) = (int(config.disparities), int(config.uniqueness_percent));
         // SAFETY: plain integers in; the answer is null or a handle owned by `self` until `drop`.
         let handle = unsafe {
@@ -83,16 +127,16 @@ impl OpenCv {
                 // What changes by one disparity and by more costs, as OpenCV's samples choose it.
                 let block = int(config.sgbm_block_px);
                 let area = block * block;
-                ffi::stipple_sgbm_new(w, h, disparities, block, uniqueness, 8 * area, 32 * area)
+                (shim.sgbm_new)(w, h, disparities, block, uniqueness, 8 * area, 32 * area)
             } else {
-                ffi::stipple_bm_new(w, h, disparities, int(config.block_px), uniqueness)
+                (shim.bm_new)(w, h, disparities, int(config.block_px), uniqueness)
             }
         };
         let handle = std::ptr::NonNull::new(handle).ok_or_else(|| {
             let what = "OpenCV refuses these matching settings";
             Fault::new(FaultKind::Config, "stereo", what, "see stereo.* in the board file")
         })?;
-        Ok(OpenCv { handle, width, height, fixed: vec![0; width * height] })
+        Ok(OpenCv { shim, handle, width, height, fixed: vec![0; width * height] })
     }
 
     /// Disparity of the left image, px, negative where unknown.
@@ -104,7 +148,7 @@ impl OpenCv {
         );
         // SAFETY: the three buffers hold width * height items (asserted, and by construction) and outlive the call.
         let rc = unsafe {
-            ffi::stipple_matcher_compute(
+            (self.shim.matcher_compute)(
                 self.handle.as_ptr(),
                 left.pixels.as_ptr(),
                 right.pixels.as_ptr(),
@@ -126,7 +170,7 @@ impl OpenCv {
 impl Drop for OpenCv {
     fn drop(&mut self) {
         // SAFETY: `handle` came from one of the two `new` and is freed once.
-        unsafe { ffi::stipple_matcher_free(self.handle.as_ptr()) }
+        unsafe { (self.shim.matcher_free)(self.handle.as_ptr()) }
     }
 }
 
@@ -150,21 +194,20 @@ impl OpenCv {
 #[cfg(test)]
 #[cfg(feature = "opencv")]
 pub mod tests {
+    use super::shim;
     use std::ffi::c_int;
 
-    extern "C" {
-        fn stipple_rectification_map(
-            fisheye: c_int,
-            k: *const f64,
-            distortion: *const f64,
-            turn: *const f64,
-            rectified: *const f64,
-            width: c_int,
-            height: c_int,
-            x: *mut f32,
-            y: *mut f32,
-        ) -> c_int;
-    }
+    type RectificationMap = unsafe extern "C" fn(
+        c_int,
+        *const f64,
+        *const f64,
+        *const f64,
+        *const f64,
+        c_int,
+        c_int,
+        *mut f32,
+        *mut f32,
+    ) -> c_int;
 
     /// Raw pixels of every rectified one, as OpenCV has them: of Brown's lens or of Kannala's and Brandt's. `k` and
     /// `rectified` are fx fy cx cy, `turn` is rect_from_cam row by row.
@@ -177,9 +220,12 @@ pub mod tests {
         [width, height]: [usize; 2],
     ) -> Vec<[f32; 2]> {
         let (mut x, mut y) = (vec![0f32; width * height], vec![0f32; width * height]);
-        // SAFETY: arrays of the lengths that the function reads, buffers of width * height that it writes, all alive.
+        let library = &shim().expect("OpenCV is here")._library;
+        // SAFETY: the type is that of opencv.cpp; arrays of the lengths that the function reads, buffers of width * height
+        // that it writes, all alive.
         let rc = unsafe {
-            stipple_rectification_map(
+            let map = library.get::<RectificationMap>(b"stipple_rectification_map\0").expect("the shim has it");
+            map(
                 c_int::from(fisheye),
                 k.as_ptr(),
                 distortion.as_ptr(),

@@ -10,6 +10,7 @@ use super::checks::{all_passed, gyro, Check, Follower, Verdict};
 use super::{open_input, seconds, BoardArgs};
 use crate::config::Board;
 use crate::run::mailbox::Capture;
+use crate::run::memory;
 use crate::run::sensors::{self, Input, Source};
 use crate::run::status::{print_err, Status};
 use crate::run::tracking::FramePacket;
@@ -48,8 +49,10 @@ struct Gathered {
 }
 
 pub fn doctor(args: &Args) -> Result<(), Fault> {
-    let board = args.board.load()?;
+    let mut board = args.board.load()?;
+    let missing = memory::replace_missing(&mut board);
     let mut checks = machine::vulkan(&board);
+    checks.extend(missing.map(|m| Check::warn(format!("stereo: {}", m.what), m.fix)));
     checks.push(machine::disk(&args.out));
     checks.iter().for_each(Check::print);
     let sensed = match open_input(args.dataset.as_deref(), &args.board, &board) {

@@ -144,22 +144,13 @@ unsafe impl Send for Session {}
 
 /// The table of the library at `path`, or why there is none.
 fn load(path: &str) -> Result<(Api, String), String> {
-    let name = CString::new(path).map_err(|_| "its name holds a zero".to_string())?;
-    // SAFETY: plain C strings; a library that loads stays loaded for the life of the program. OrtGetApiBase is the
-    // entry point that ONNX Runtime documents, and answers a pointer to a static.
+    // SAFETY: a library that loads stays loaded for the life of the program. OrtGetApiBase is the entry point that ONNX
+    // Runtime documents, of this signature, and answers a pointer to a static.
     unsafe {
-        let library = libc::dlopen(name.as_ptr(), libc::RTLD_NOW | libc::RTLD_LOCAL);
-        if library.is_null() {
-            let said = libc::dlerror();
-            let said = if said.is_null() { "no reason given".into() } else { CStr::from_ptr(said).to_string_lossy() };
-            return Err(said.replace('\n', " "));
-        }
-        let entry = libc::dlsym(library, c"OrtGetApiBase".as_ptr());
-        if entry.is_null() {
-            return Err("it has no OrtGetApiBase: not ONNX Runtime".into());
-        }
-        // SAFETY: the signature that ONNX Runtime documents for it.
-        let entry: unsafe extern "C" fn() -> *const ApiBase = std::mem::transmute(entry);
+        let library = libloading::Library::new(path).map_err(|why| why.to_string().replace('\n', " "))?;
+        let library = std::mem::ManuallyDrop::new(library);
+        let entry = library.get::<unsafe extern "C" fn() -> *const ApiBase>(b"OrtGetApiBase\0");
+        let entry = entry.map_err(|_| "it has no OrtGetApiBase: not ONNX Runtime")?;
         let base = entry();
         let version = CStr::from_ptr(((*base).version)()).to_string_lossy().into_owned();
         let table = ((*base).get_api)(API_VERSION);
