@@ -3,7 +3,7 @@
 #![allow(clippy::unwrap_used)]
 
 use std::path::Path;
-use stipple::config::{keys, Board, StereoMethod};
+use stipple::config::{keys, Board, InjectConfig, StereoMethod};
 use stipple_drivers::gpio::Edge;
 use stipple_drivers::imu::ImuOptions;
 use stipple_drivers::{Fault, FaultKind};
@@ -285,4 +285,16 @@ fn the_calibration_to_begin_with_is_one() {
     let calibration = stipple_drivers::replay::read_calibration(&file).unwrap();
     let second_from_first = calibration.cameras[1].body_from_cam.inverse() * calibration.cameras[0].body_from_cam;
     assert!((second_from_first.p - glam::DVec3::new(-0.1, 0.0, 0.0)).length() < 1e-12);
+}
+
+#[test]
+fn board_files_that_are_pipes_devices_or_without_end_are_refused_unread() {
+    let dir = tempfile::tempdir().unwrap();
+    let (pipe, large) = (dir.path().join("pipe.toml"), dir.path().join("large.toml"));
+    assert!(std::process::Command::new("mkfifo").arg(&pipe).status().unwrap().success());
+    std::fs::File::create(&large).unwrap().set_len(1 << 40).unwrap();
+    for (path, word) in [(pipe.as_path(), "plain file"), (Path::new("/dev/zero"), "plain file"), (&large, "at most")] {
+        let faults = [Board::load(path, &[]).unwrap_err(), InjectConfig::load(path).unwrap_err()];
+        assert!(faults.iter().all(|f| f.kind == FaultKind::NoInput && f.what.contains(word)), "{faults:?}");
+    }
 }

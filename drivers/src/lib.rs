@@ -19,6 +19,7 @@ pub mod gpio;
 pub mod host;
 pub mod imu;
 pub mod inject;
+pub mod input;
 pub mod list;
 pub mod paced;
 pub mod record;

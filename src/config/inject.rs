@@ -4,7 +4,7 @@
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 use stipple_drivers::inject::{Kind, Rule};
-use stipple_drivers::{Fault, FaultKind};
+use stipple_drivers::{input, Fault, FaultKind};
 
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -34,7 +34,7 @@ impl InjectConfig {
     pub fn load(path: &Path) -> Result<InjectConfig, Fault> {
         let place = path.display().to_string();
         let fix = "write seed = 1 and [[camera]] or [[imu]] with fault, start_s and end_s";
-        let text = std::fs::read_to_string(path).map_err(|e| {
+        let text = input::read_settings(path).map_err(|e| {
             Fault::new(FaultKind::NoInput, &place, format!("cannot read the rules of faults: {e}"), fix)
         })?;
         let config: InjectConfig = toml::from_str(&text)

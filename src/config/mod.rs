@@ -20,7 +20,7 @@ use section::section;
 use sensors::Wrong;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
-use stipple_drivers::{Fault, FaultKind};
+use stipple_drivers::{input, Fault, FaultKind};
 
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -100,7 +100,7 @@ impl Board {
     /// Reads a board file, applies `key.path=value` overrides, validates.
     pub fn load(path: &Path, overrides: &[String]) -> Result<Board, Fault> {
         let place = path.display().to_string();
-        let text = std::fs::read_to_string(path).map_err(|e| match e.kind() {
+        let text = input::read_settings(path).map_err(|e| match e.kind() {
             std::io::ErrorKind::InvalidData => {
                 Fault::new(FaultKind::Config, &place, "is not text", "save the board file as UTF-8")
             }

@@ -238,9 +238,14 @@ impl Devices {
         let given = dir.join("given");
         for k in 0..2 {
             let (from, to) = (self.flight.join(format!("mav0/cam{k}")), given.join(format!("mav0/cam{k}")));
-            fs::create_dir_all(&to).unwrap();
+            fs::create_dir_all(to.join("data")).unwrap();
             fs::copy(from.join("sensor.yaml"), to.join("sensor.yaml")).unwrap();
-            std::os::unix::fs::symlink(from.join("data"), to.join("data")).unwrap();
+            for image in fs::read_dir(from.join("data")).unwrap() {
+                // A recording is read from its own folder: no link leads out of it.
+                let image = image.unwrap();
+                let name = to.join("data").join(image.file_name());
+                fs::hard_link(image.path(), &name).or_else(|_| fs::copy(image.path(), &name).map(drop)).unwrap();
+            }
             let list = fs::read_to_string(from.join("data.csv")).unwrap();
             let rows = list.lines().skip(1).map(|l| l.split_once(',').unwrap().1).zip(&self.stamps);
             let rows: String = rows.map(|(name, t)| format!("{},{name}\n", (self.start + *t).0)).collect();

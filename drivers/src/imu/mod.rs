@@ -34,7 +34,7 @@ pub use register::RegisterImu;
 use crate::gpio::DataReady;
 use crate::source::ImuSource;
 use crate::types::Span;
-use crate::{Fault, FaultKind};
+use crate::{input, Fault, FaultKind};
 use bus::{Bus, I2c, Spi};
 use chips::Chip;
 use die::Die;
@@ -132,7 +132,8 @@ impl RegisterOptions {
         let place = self.configuration.display().to_string();
         let fix =
             "set imu.configuration to a file of the bytes of bmi270_config_file, from Bosch's BMI270_SensorAPI, as sent";
-        let bytes = std::fs::read(&self.configuration)
+        let mut bytes = Vec::new();
+        input::read(&self.configuration, input::SETTINGS_BYTES_MAX, &mut bytes)
             .map_err(|e| Fault::new(FaultKind::NoInput, &place, format!("cannot be read: {e}"), fix))?;
         if bytes.len() != BYTES {
             let what = format!("{} bytes, not {BYTES}", bytes.len());

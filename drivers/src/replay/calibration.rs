@@ -315,8 +315,8 @@ fn basalt_correction(file: &Document) -> Result<ImuCorrection, Fault> {
 
 /// Largest deviation from a rotation: calibrated ones are printed rounded; more is a mistake.
 const ROTATION_TOLERANCE: f64 = 1e-3;
-/// Largest side of an image, pixels: buffers of this size are allocated.
-const SIDE_MAX: f64 = 16384.0;
+/// Largest side of an image, pixels: that of every board. Buffers of this size are allocated.
+const SIDE_MAX: f64 = 4096.0;
 
 /// The camera, if its numbers make sense.
 fn checked(file: &Document, at: &str, size: [f64; 2], f: [f64; 4], lens: Lens) -> Result<Camera, Fault> {
@@ -325,7 +325,7 @@ fn checked(file: &Document, at: &str, size: [f64; 2], f: [f64; 4], lens: Lens) -
         // Basalt keeps the sizes beside the intrinsics.
         let key =
             if at.contains("intrinsics") { at.replace("intrinsics", "resolution") } else { format!("{at}/resolution") };
-        return Err(file.fault(&key, "resolution must be two whole numbers from 1 to 16384"));
+        return Err(file.fault(&key, "resolution must be two whole numbers from 1 to 4096"));
     }
     if !(f[0] > 0.0 && f[1] > 0.0) {
         return Err(file.fault(&format!("{at}/intrinsics"), "focal lengths fx and fy must be positive"));

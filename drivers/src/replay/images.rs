@@ -5,9 +5,11 @@
 
 use super::findings::{Findings, ReplayCounters};
 use super::pairing::{FrameFiles, ImageFile};
+use crate::input;
 use crate::types::{luma, Colour, Frames, Image};
 use std::fmt;
-use std::io::{Cursor, Read};
+use std::io::{Cursor, ErrorKind};
+use std::path::Path;
 use zune_jpeg::zune_core::bytestream::ZCursor;
 use zune_jpeg::zune_core::{colorspace::ColorSpace, options::DecoderOptions};
 use zune_jpeg::JpegDecoder;
@@ -23,17 +25,19 @@ pub enum ImageFault {
 }
 
 /// Decodes the frames of a recording.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub struct Reader {
-    frames: Vec<FrameFiles>,
+    frames: Box<[FrameFiles]>,
+    /// The recording's folder, canonical: no link leads out of it.
+    root: Box<Path>,
     file: Vec<u8>,
     decoded: Vec<u8>,
     findings: Findings,
 }
 
 impl Reader {
-    pub(super) fn new(frames: Vec<FrameFiles>) -> Reader {
-        Reader { frames, ..Reader::default() }
+    pub(super) fn new(frames: Box<[FrameFiles]>, root: Box<Path>) -> Reader {
+        Reader { frames, root, file: vec![], decoded: vec![], findings: Findings::default() }
     }
 
     /// Faults of the images read so far.
@@ -48,7 +52,8 @@ impl Reader {
 
     /// Whether the first `cameras` have colour, by the first image of each that can be read.
     pub fn has_colour(&self, cameras: usize) -> bool {
-        let coloured = |k: usize| self.frames.iter().find_map(|f| is_coloured(f.images.get(k)?)).unwrap_or(false);
+        let coloured =
+            |k: usize| self.frames.iter().find_map(|f| is_coloured(f.images.get(k)?, &self.root)).unwrap_or(false);
         (0..cameras).all(coloured)
     }
 
@@ -61,7 +66,7 @@ impl Reader {
         out.t = frame.t;
         let mut colours = out.colours.iter_mut();
         for (file, image) in frame.images.iter().zip(&mut out.images) {
-            let read = read_image(file, &mut self.file, &mut self.decoded, image, colours.next());
+            let read = read_image(file, &self.root, &mut self.file, &mut self.decoded, image, colours.next());
             let Err((fault, what)) = read else { continue };
             let counter: fn(&mut ReplayCounters) -> &mut u64 = match fault {
                 ImageFault::Missing => |c| &mut c.images_missing,
@@ -83,12 +88,13 @@ type Why = (ImageFault, String);
 
 fn read_image(
     file: &ImageFile,
+    root: &Path,
     bytes: &mut Vec<u8>,
     decoded: &mut Vec<u8>,
     out: &mut Image,
     colour: Option<&mut Colour>,
 ) -> Result<(), Why> {
-    read_file(file, bytes)?;
+    read_file(file, root, bytes)?;
     if bytes.starts_with(b"\x89PNG") {
         read_png(bytes, decoded, out, colour)
     } else if bytes.starts_with(b"\xff\xd8") {
@@ -101,25 +107,21 @@ fn read_image(
     }
 }
 
-/// The bytes of a file: of a plain one, as a pipe would wait for ever, and no more than `FILE_BYTES_MAX`.
-fn read_file(file: &ImageFile, bytes: &mut Vec<u8>) -> Result<(), Why> {
-    let missing = |e: std::io::Error| (ImageFault::Missing, format!("cannot read: {e}"));
-    let about = std::fs::metadata(&file.path).map_err(missing)?;
-    if !about.is_file() {
-        return Err((ImageFault::Missing, "is not a plain file".to_string()));
+/// Reads the bytes of a file of the recording.
+fn read_file(file: &ImageFile, root: &Path, bytes: &mut Vec<u8>) -> Result<(), Why> {
+    if input::leads_out(&file.path, root) {
+        return Err((ImageFault::Missing, "is a link out of the recording".to_string()));
     }
-    if about.len() > FILE_BYTES_MAX {
-        return Err(undecodable(format_args!("{} bytes, more than any image of a camera", about.len())));
-    }
-    bytes.clear();
-    std::fs::File::open(&file.path).and_then(|f| f.take(FILE_BYTES_MAX).read_to_end(bytes)).map_err(missing)?;
-    Ok(())
+    input::read(&file.path, FILE_BYTES_MAX, bytes).map_err(|e| match e.kind() {
+        ErrorKind::FileTooLarge => undecodable(e),
+        _ => (ImageFault::Missing, format!("cannot read: {e}")),
+    })
 }
 
 /// Whether an image has colour; `None` where its header cannot be read.
-fn is_coloured(file: &ImageFile) -> Option<bool> {
+fn is_coloured(file: &ImageFile, root: &Path) -> Option<bool> {
     let mut bytes = Vec::new();
-    read_file(file, &mut bytes).ok()?;
+    read_file(file, root, &mut bytes).ok()?;
     if bytes.starts_with(b"\x89PNG") {
         let mut decoder = png::Decoder::new(Cursor::new(&bytes));
         decoder.set_transformations(png::Transformations::EXPAND);

@@ -6,6 +6,9 @@
 //! useless (no calibration, an empty table) is a `Fault`; one that hurts a row or an image costs that row or image, a named
 //! counter and a warning with file and line. Stamps that do not grow are dropped so that the most rows stay (`order`): one
 //! corrupt stamp far in the future costs itself and not the rest of the recording.
+//!
+//! A recording may come from anywhere: files are read with a limit of size, names and links in it lead to nothing outside
+//! its folder, and pipes and devices are not opened (`input`).
 
 mod calibration;
 mod cameras;
@@ -25,7 +28,7 @@ pub(crate) use table::{numbers, read_strictly, Row};
 pub use trajectory::read_trajectory;
 
 use crate::types::{ImuSample, Nanos, Span, TimedPose};
-use crate::{Calibration, Fault, FaultKind};
+use crate::{input, Calibration, Fault, FaultKind};
 use findings::Findings;
 use glam::DVec3;
 use std::path::{Path, PathBuf};
@@ -65,12 +68,15 @@ pub struct Recording {
     pub warnings: Vec<String>,
     /// Counters of what was wrong.
     pub counters: ReplayCounters,
+    /// The folder that holds it, canonical.
+    root: PathBuf,
 }
 
 impl Recording {
     /// Opens a folder that holds `mav0/`, or `mav0/` itself. A fault where the whole recording is of no use.
     pub fn open(dataset: &Path, options: &OpenOptions) -> Result<Recording, Fault> {
         let (home, mav0) = layout(dataset)?;
+        let root = root(&home, &mav0)?;
         let mut findings = Findings::default();
         let calibration = match &options.calibration {
             Some(path) => calibration::read(path, options.readout, &mut findings)?,
@@ -87,12 +93,12 @@ impl Recording {
             .find(|path| path.is_file())
             .map_or(Ok(Vec::new()), |path| trajectory::read(&path, &mut findings))?;
         let Findings { warnings, counters } = findings;
-        Ok(Recording { calibration, imu, frames, truth, warnings, counters })
+        Ok(Recording { calibration, imu, frames, truth, warnings, counters, root })
     }
 
     /// A decoder of the frames, with memory of its own, for one thread.
     pub fn reader(&self) -> Reader {
-        Reader::new(self.frames.clone())
+        Reader::new(self.frames.as_slice().into(), self.root.as_path().into())
     }
 }
 
@@ -113,6 +119,29 @@ fn layout(dataset: &Path) -> Result<(PathBuf, PathBuf), Fault> {
         return Ok((dataset.join(".."), dataset.to_path_buf()));
     }
     missing("holds neither mav0/ nor cam0/")
+}
+
+/// The canonical path of the folder `home`; a fault where a folder or a table of the recording is a link that leads out of
+/// it. Images are looked at one by one when they are read.
+fn root(home: &Path, mav0: &Path) -> Result<PathBuf, Fault> {
+    let fault =
+        |path: &Path, what: String, fix: &str| Fault::new(FaultKind::NoInput, path.display().to_string(), what, fix);
+    let cannot = |e: std::io::Error| fault(home, format!("cannot read: {e}"), "check the path");
+    let root = std::fs::canonicalize(home).map_err(cannot)?;
+    let inside =
+        |folder: &Path| std::fs::read_dir(folder).into_iter().flatten().flatten().map(|e| e.path()).collect::<Vec<_>>();
+    let sensors = inside(mav0);
+    let tables = sensors.iter().flat_map(|folder| inside(folder));
+    let beside = ["dso", "dso/camchain.yaml", "dso/imu_config.yaml", "camchain.yaml", "imu_config.yaml"];
+    let mut names = [mav0.to_path_buf()].into_iter().chain(beside.map(|name| home.join(name)));
+    let out = names.find(|p| input::leads_out(p, &root));
+    match out.or_else(|| sensors.iter().cloned().chain(tables).find(|p| input::leads_out(p, &root))) {
+        Some(link) => {
+            let fix = "put there what it points to: a recording is read from its own folder alone";
+            Err(fault(&link, "is a link out of the recording".into(), fix))
+        }
+        None => Ok(root),
+    }
 }
 
 fn read_imu(path: &Path, hole: Span, findings: &mut Findings) -> Result<Vec<ImuSample>, Fault> {

@@ -3,7 +3,7 @@
 
 use super::findings::Findings;
 use super::order;
-use crate::{Fault, FaultKind, Nanos};
+use crate::{input, Fault, FaultKind, Nanos};
 use std::path::Path;
 
 /// A row, and the line of the file in which it stands, from 1.
@@ -28,9 +28,13 @@ pub fn read_strictly<T>(
     Ok(rows)
 }
 
-/// Reads a file; a fault where that fails.
-pub fn read_bytes(path: &Path) -> Result<Vec<u8>, Fault> {
-    std::fs::read(path).map_err(|e| {
+/// Largest table, bytes: an hour of a 1 kHz unit, at 140 a row.
+pub const TABLE_BYTES_MAX: u64 = 1 << 29;
+
+/// Reads a file of at most `bytes_max` bytes; a fault where that fails.
+pub fn read_bytes(path: &Path, bytes_max: u64) -> Result<Vec<u8>, Fault> {
+    let mut bytes = Vec::new();
+    input::read(path, bytes_max, &mut bytes).map(|()| bytes).map_err(|e| {
         let fix = "check the path and that the recording is complete";
         Fault::new(FaultKind::NoInput, path.display().to_string(), format!("cannot read: {e}"), fix)
     })
@@ -44,7 +48,7 @@ pub fn read<T>(
     parse: impl Fn(&[&str]) -> Option<T>,
     findings: &mut Findings,
 ) -> Result<Vec<Row<T>>, Fault> {
-    let bytes = read_bytes(path)?;
+    let bytes = read_bytes(path, TABLE_BYTES_MAX)?;
     let text = String::from_utf8_lossy(&bytes);
     let mut rows = Vec::new();
     let mut headline = true;

@@ -21,7 +21,7 @@ pub fn read_trajectory(path: &Path) -> Result<Vec<TimedPose>, Fault> {
 /// Reads a table of poses; rows that are wrong are dropped, and none left is a fault.
 pub fn read(path: &Path, findings: &mut Findings) -> Result<Vec<TimedPose>, Fault> {
     let is_tum = |text: &[u8]| !text.split(|b| *b == b'\n').any(|l| !l.starts_with(b"#") && l.contains(&b','));
-    let tum = is_tum(&table::read_bytes(path)?);
+    let tum = is_tum(&table::read_bytes(path, table::TABLE_BYTES_MAX)?);
     let rows = table::read(path, COLUMNS, |fields| if tum { tum_row(fields) } else { euroc_row(fields) }, findings)?;
     let rows = order::increasing(rows, |r| r.t, path, findings);
     Ok(rows.into_iter().map(|r| r.value).collect())

@@ -2,6 +2,7 @@
 
 use super::super::{findings, table};
 use super::rigid;
+use crate::input::SETTINGS_BYTES_MAX;
 use crate::types::Pose;
 use crate::{Fault, FaultKind};
 use serde_json::Value;
@@ -18,7 +19,7 @@ pub struct Document {
 impl Document {
     /// Reads and parses a file; a fault where it cannot be read or is neither YAML nor JSON.
     pub fn read(path: &Path) -> Result<Document, Fault> {
-        let bytes = table::read_bytes(path)?;
+        let bytes = table::read_bytes(path, SETTINGS_BYTES_MAX)?;
         let wrong = |line: usize, what: String| {
             let place = findings::place(path, line);
             Fault::new(FaultKind::Config, place, what.replace('\n', " "), "correct the calibration file")
