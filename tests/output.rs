@@ -205,7 +205,7 @@ fn a_run_leaves_complete_files_that_agree() {
     write_ply(&mut map, splats()).unwrap();
     assert_eq!(read("map.ply"), map);
     assert_eq!(read("trajectory.tum").iter().filter(|b| **b == b'\n').count(), 1 + estimated.len());
-    assert_eq!(std::fs::read_dir(out.file("renders")).unwrap().count(), 8);
+    assert_eq!(std::fs::read_dir(out.file("renders")).unwrap().count(), 1 + 8, "the list of them, and they");
     let hidden = |e: std::io::Result<std::fs::DirEntry>| e.unwrap().file_name().to_string_lossy().starts_with('.');
     assert!(!std::fs::read_dir(out.path()).unwrap().any(hidden), "nothing half written is left");
     check_page(&String::from_utf8(read("report.html")).unwrap(), &report);

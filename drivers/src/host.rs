@@ -1,6 +1,9 @@
 //! What the program asks of the operating system: priority, clocks, signals, memory and disk.
 #![allow(unsafe_code)]
 
+use std::fs::File;
+use std::io;
+use std::os::fd::AsRawFd;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -167,6 +170,25 @@ pub fn disk_free(at: &Path) -> Option<u64> {
         (libc::statvfs(path.as_ptr(), &mut s), s)
     };
     (asked == 0).then(|| s.f_bavail * s.f_frsize)
+}
+
+/// Writes the entries of the folder that holds `path` to the disk: until then a power cut may undo a new name. A file
+/// system that knows no such thing is no failure.
+pub fn sync_folder_of(path: &Path) -> io::Result<()> {
+    let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    match File::open(folder)?.sync_all() {
+        Err(e) if matches!(e.kind(), io::ErrorKind::InvalidInput | io::ErrorKind::Unsupported) => Ok(()),
+        done => done,
+    }
+}
+
+/// Writes everything that waits for the disk of an open file to it: in one go, where there are many small files.
+pub fn sync_disk_of(file: &File) -> io::Result<()> {
+    // SAFETY: an open file, borrowed for the call.
+    match unsafe { libc::syncfs(file.as_raw_fd()) } {
+        0 => Ok(()),
+        _ => Err(io::Error::last_os_error()),
+    }
 }
 
 /// Memory that can be had without swapping, bytes; `None` where /proc is absent.

@@ -1,8 +1,10 @@
 //! What a run leaves behind: trajectory, map, renders, report, and the folder they go to.
 //!
-//! A file appears under its final name only when it is complete: it is written to a hidden name
-//! in the same folder, flushed to the disk and renamed. A run that dies leaves earlier results
-//! as they were and at most one hidden `.NAME.partial`, which the next run overwrites.
+//! A file appears under its final name only when it is complete: it is written to a hidden name in the same folder, flushed
+//! to the disk and renamed, and the folder is flushed too. A run that dies leaves earlier results as they were and at most
+//! one hidden `.NAME.partial`, which the next run removes. No link is followed: the hidden name is made anew, and renaming
+//! replaces a link rather than what it points to. A folder of results is replaced only if it holds nothing but what this
+//! program wrote: a hidden `.stipple` in it lists that.
 
 pub mod chart;
 pub mod html;
@@ -12,25 +14,39 @@ pub mod ply;
 pub mod report;
 pub mod trajectory;
 
+use std::ffi::OsString;
 use std::fs::{self, File};
 use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
-use stipple_drivers::{Fault, FaultKind};
+use stipple_drivers::host::sync_folder_of;
+use stipple_drivers::{input, Fault, FaultKind};
 
 /// Writes `path` through `write`, all or nothing.
 pub fn atomically<R>(path: &Path, write: impl FnOnce(&mut BufWriter<File>) -> io::Result<R>) -> Result<R, Fault> {
     let partial = partial_name(path);
-    let file = File::create(&partial).map_err(|e| cannot_create(path, &e))?;
+    let file = create_anew(&partial).map_err(|e| cannot_create(path, &e))?;
     let mut out = BufWriter::with_capacity(1 << 16, file);
     let written = write(&mut out)
         .and_then(|r| out.flush().map(|()| r))
         .and_then(|r| out.get_ref().sync_all().map(|()| r))
-        .and_then(|r| fs::rename(&partial, path).map(|()| r));
+        .and_then(|r| fs::rename(&partial, path).map(|()| r))
+        .and_then(|r| sync_folder_of(path).map(|()| r));
     written.map_err(|e| {
         // The write error is the one to report; a leftover hidden file is harmless.
         let _ = fs::remove_file(&partial);
         cannot_write(path, &e)
     })
+}
+
+/// Makes a file under a name of ours, in place of what an earlier run left there or somebody else put there.
+fn create_anew(path: &Path) -> io::Result<File> {
+    absent(fs::remove_file(path))?;
+    File::create_new(path)
+}
+
+/// What is not there need not be removed.
+fn absent(removed: io::Result<()>) -> io::Result<()> {
+    removed.or_else(|e| if e.kind() == io::ErrorKind::NotFound { Ok(()) } else { Err(e) })
 }
 
 /// The folder of `--out`: created and proved writable before any work starts.
@@ -40,10 +56,12 @@ pub struct OutputDir {
 }
 
 impl OutputDir {
+    /// Refuses, before any work, a folder whose `renders` this program did not write.
     pub fn create(path: &Path) -> Result<OutputDir, Fault> {
         fs::create_dir_all(path).map_err(|e| cannot_create(path, &e))?;
         let probe = path.join(".writable.partial");
-        File::create(&probe).and_then(|_| fs::remove_file(&probe)).map_err(|e| cannot_create(path, &e))?;
+        create_anew(&probe).and_then(|_| fs::remove_file(&probe)).map_err(|e| cannot_create(path, &e))?;
+        own_files(&path.join("renders"))?;
         Ok(OutputDir { path: path.to_path_buf() })
     }
 
@@ -64,10 +82,9 @@ impl OutputDir {
     /// be removed.
     pub fn remove(&self, name: &str) -> Result<(), Fault> {
         let path = self.file(name);
-        let removed = if path.is_dir() { clear(&path) } else { fs::remove_file(&path) };
-        match removed {
-            Err(e) if e.kind() != io::ErrorKind::NotFound => Err(cannot_write(&path, &e)),
-            _ => Ok(()),
+        match path.is_dir() {
+            true => clear(&path),
+            false => absent(fs::remove_file(&path)).map_err(|e| cannot_write(&path, &e)),
         }
     }
 
@@ -76,9 +93,16 @@ impl OutputDir {
     pub fn replace_folder<R>(&self, name: &str, fill: impl FnOnce(&Path) -> Result<R, Fault>) -> Result<R, Fault> {
         let folder = self.file(name);
         let partial = partial_name(&folder);
-        let made = clear(&partial).and_then(|()| fs::create_dir(&partial)).map_err(|e| cannot_create(&folder, &e));
-        let filled = made.and_then(|()| fill(&partial)).and_then(|r| {
-            clear(&folder).and_then(|()| fs::rename(&partial, &folder)).map_err(|e| cannot_write(&folder, &e))?;
+        // Under a hidden name of ours, so whatever is there is ours; a link is removed, not followed.
+        let made = absent(fs::remove_dir_all(&partial)).and_then(|()| fs::create_dir(&partial));
+        let filled = made.map_err(|e| cannot_create(&folder, &e)).and_then(|()| fill(&partial)).and_then(|r| {
+            let names = entries(&partial).map_err(|e| cannot_write(&folder, &e))?;
+            atomically(&partial.join(LIST), |w| {
+                names.iter().try_for_each(|name| writeln!(w, "{}", Path::new(name).display()))
+            })?;
+            clear(&folder)?;
+            let renamed = fs::rename(&partial, &folder).and_then(|()| sync_folder_of(&folder));
+            renamed.map_err(|e| cannot_write(&folder, &e))?;
             Ok(r)
         });
         if filled.is_err() {
@@ -88,12 +112,40 @@ impl OutputDir {
     }
 }
 
-/// Removes a folder of an earlier run, if there is one.
-fn clear(folder: &Path) -> io::Result<()> {
-    match fs::remove_dir_all(folder) {
-        Err(e) if e.kind() == io::ErrorKind::NotFound => Ok(()),
-        other => other,
+/// The list of what this program wrote into a folder, a name a line.
+const LIST: &str = ".stipple";
+
+fn entries(folder: &Path) -> io::Result<Vec<OsString>> {
+    fs::read_dir(folder)?.map(|e| Ok(e?.file_name())).collect()
+}
+
+/// The files of a folder of results; none where there is no such folder. A fault where this program did not write them all.
+fn own_files(folder: &Path) -> Result<Vec<PathBuf>, Fault> {
+    let about = match fs::symlink_metadata(folder) {
+        Ok(about) => about,
+        Err(_) => return Ok(vec![]),
+    };
+    let foreign = |what: String| {
+        let fix = "move it elsewhere, or choose another --out folder";
+        Err(Fault::new(FaultKind::NoOutput, folder.display().to_string(), what, fix))
+    };
+    if !about.is_dir() {
+        return foreign("is not a folder of this program's results".into());
     }
+    let names = entries(folder).map_err(|e| cannot_write(folder, &e))?;
+    // Without a list, nothing in it is ours.
+    let list = input::read_settings(&folder.join(LIST)).unwrap_or_default();
+    let own = |name: &&OsString| *name == LIST || list.lines().any(|l| name.to_str() == Some(l));
+    match names.iter().find(|name| !own(name)) {
+        Some(name) => foreign(format!("holds {}, which this program did not write", Path::new(name).display())),
+        None => Ok(names.iter().map(|name| folder.join(name)).collect()),
+    }
+}
+
+/// Removes a folder of an earlier run, if there is one and nothing of anybody else is in it.
+fn clear(folder: &Path) -> Result<(), Fault> {
+    let removed = own_files(folder)?.iter().try_for_each(fs::remove_file);
+    removed.and_then(|()| absent(fs::remove_dir(folder))).map_err(|e| cannot_write(folder, &e))
 }
 
 fn partial_name(path: &Path) -> PathBuf {
@@ -170,6 +222,61 @@ mod tests {
         });
         assert!(failed.is_err());
         assert_eq!(names(dir.path()), ["renders"]);
-        assert_eq!(names(&dir.path().join("renders")), ["2.png"]);
+        assert_eq!(names(&dir.path().join("renders")), [LIST, "2.png"]);
+    }
+
+    #[test]
+    fn links_in_the_place_of_results_are_replaced_and_what_they_point_to_is_left() {
+        use std::os::unix::fs::symlink;
+        let (dir, other) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+        let victim = other.path().join("victim");
+        fs::write(&victim, b"precious").unwrap();
+        for name in ["a.txt", ".a.txt.partial", ".writable.partial"] {
+            symlink(&victim, dir.path().join(name)).unwrap();
+        }
+        symlink(other.path(), dir.path().join(".renders.partial")).unwrap();
+        let out = OutputDir::create(dir.path()).unwrap();
+        out.write("a.txt", |w| w.write_all(b"new")).unwrap();
+        out.replace_folder("renders", |d| atomically(&d.join("1.png"), |w| w.write_all(b"x"))).unwrap();
+        assert_eq!(fs::read(&victim).unwrap(), b"precious");
+        assert_eq!(fs::read(dir.path().join("a.txt")).unwrap(), b"new");
+        assert_eq!(
+            (names(dir.path()), names(other.path())),
+            (vec!["a.txt".into(), "renders".into()], vec!["victim".into()])
+        );
+        assert!(!fs::symlink_metadata(dir.path().join("a.txt")).unwrap().is_symlink());
+    }
+
+    /// `renders` of a user, a file that a user added to ours, and a link to a folder of ours: none is touched.
+    #[test]
+    fn a_folder_that_holds_files_of_others_is_refused_before_any_work_and_left_as_it_is() {
+        let dir = tempfile::tempdir().unwrap();
+        let renders = dir.path().join("renders");
+        let fill = |d: &Path| atomically(&d.join("1.png"), |w| w.write_all(b"new"));
+        let out = OutputDir::create(dir.path()).unwrap();
+        let refused = |word: &str| {
+            let faults = [
+                OutputDir::create(dir.path()).map(drop).unwrap_err(),
+                out.replace_folder("renders", fill).unwrap_err(),
+                out.remove("renders").unwrap_err(),
+            ];
+            assert!(faults.iter().all(|f| f.kind == FaultKind::NoOutput && f.what.contains(word)), "{faults:?}");
+            assert_eq!(names(dir.path()).len(), 1, "nothing half written is left: {:?}", names(dir.path()));
+        };
+        fs::create_dir(&renders).unwrap();
+        fs::write(renders.join("1.png"), b"a user's").unwrap();
+        refused("holds 1.png");
+        assert_eq!(fs::read(renders.join("1.png")).unwrap(), b"a user's");
+        fs::remove_file(renders.join("1.png")).unwrap();
+        out.replace_folder("renders", fill).unwrap();
+        fs::write(renders.join("notes.txt"), b"a user's").unwrap();
+        refused("holds notes.txt");
+        assert_eq!(names(&renders), [LIST, "1.png", "notes.txt"]);
+        fs::remove_file(renders.join("notes.txt")).unwrap();
+        let kept = tempfile::tempdir().unwrap();
+        fs::rename(&renders, kept.path().join("r")).unwrap();
+        std::os::unix::fs::symlink(kept.path().join("r"), &renders).unwrap();
+        refused("not a folder of this program's");
+        assert_eq!(names(&kept.path().join("r")), [LIST, "1.png"]);
     }
 }

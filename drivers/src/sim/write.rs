@@ -22,6 +22,11 @@ pub fn write_euroc(sim: &mut Sim, dir: &Path, colours: usize, progress: impl FnM
     }
     let name = dir.file_name().map_or_else(|| "out".into(), |n| n.to_string_lossy().into_owned());
     let partial = dir.with_file_name(format!(".{name}.partial-{}", std::process::id()));
+    if let Some(parent) = dir.parent() {
+        make_dir(parent)?;
+    }
+    // Made here, so that no link of somebody else lies in it.
+    fs::create_dir(&partial).map_err(|e| cannot(&partial, e))?;
     let written = write_all(sim, &partial.join("mav0"), frames, progress)
         .and_then(|()| fs::rename(&partial, dir).map_err(|e| cannot(dir, e)));
     if written.is_err() {
