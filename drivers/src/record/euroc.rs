@@ -9,7 +9,7 @@ use crate::calibration::RigCamera;
 use crate::euroc::{camera_yaml, imu_row, imu_yaml, png, IMAGE_COLUMNS, IMU_COLUMNS};
 use crate::source::ImuReading;
 use crate::types::Frames;
-use crate::Calibration;
+use crate::{host, Calibration};
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
@@ -87,13 +87,13 @@ impl EurocSink {
             let data = folder.join("data");
             fs::create_dir_all(&data)?;
             // The rate is in the stamps.
-            fs::write(folder.join("sensor.yaml"), camera_yaml(camera, &format!("recorded cam{k}"), 0.0))?;
+            write_new(&folder.join("sensor.yaml"), camera_yaml(camera, &format!("recorded cam{k}"), 0.0).as_bytes())?;
             let rows = Rows::create(&folder.join("data.csv"), IMAGE_COLUMNS)?;
             cameras.push(CameraFolder { camera: *camera, data, rows, before: 0 });
         }
         let folder = mav.join("imu0");
         fs::create_dir_all(&folder)?;
-        fs::write(folder.join("sensor.yaml"), imu_yaml(&calibration.imu, "recorded, corrected"))?;
+        write_new(&folder.join("sensor.yaml"), imu_yaml(&calibration.imu, "recorded, corrected").as_bytes())?;
         let imu = Rows::create(&folder.join("data.csv"), IMU_COLUMNS)?;
         Ok(EurocSink { cameras, imu, encoded: Vec::new() })
     }
@@ -103,7 +103,7 @@ impl EurocSink {
             let (partial, path) = names(folder, frames);
             self.encoded.clear();
             png(&mut self.encoded, image, frames.colours.get(k)).map_err(io::Error::other)?;
-            let written = fs::write(&partial, &self.encoded).and_then(|()| fs::rename(&partial, &path));
+            let written = write_new(&partial, &self.encoded).and_then(|()| fs::rename(&partial, &path));
             if written.is_err() {
                 // Gives the disk back what half an image took.
                 let _ = fs::remove_file(&partial);
@@ -125,6 +125,11 @@ impl EurocSink {
         }
         listed
     }
+}
+
+/// Writes a file that is not there yet, which a link would be.
+fn write_new(path: &Path, bytes: &[u8]) -> io::Result<()> {
+    File::create_new(path)?.write_all(bytes)
 }
 
 /// The hidden name of an image, and its own.
@@ -159,7 +164,12 @@ impl Sink for EurocSink {
         Ok(())
     }
 
+    fn sync(&mut self) -> io::Result<()> {
+        host::sync_disk_of(&self.imu.file)
+    }
+
     fn finish(&mut self) -> io::Result<()> {
-        self.imu.flush()
+        self.imu.flush()?;
+        self.sync()
     }
 }

@@ -2,21 +2,24 @@
 //! `sensor_msgs/msg/CompressedImage`, lossless at half the bytes of raw ones; the calibration is attached as EuRoC's
 //! sensor.yaml.
 //!
-//! A chunk holds one frame and the samples before it, and is written at once when the frame is complete. A kill or a full
-//! disk cuts off the last chunk at most; after a failure the next frame begins another file.
+//! A chunk holds one frame and the samples before it, and is written at once when the frame is complete. A kill cuts off the
+//! last chunk at most. The first write that fails takes its chunk back, closes the file, and ends the recording: what comes
+//! after it is counted as failed. The index of a file is kept in memory until the file ends, so a file ends after
+//! `FRAMES_PER_FILE` frames and another begins.
 
 use super::Sink;
 use crate::calibration::RigCamera;
 use crate::euroc::{camera_yaml, imu_yaml, png};
 use crate::source::ImuReading;
 use crate::types::{Frames, Nanos};
-use crate::Calibration;
+use crate::{host, Calibration};
 use ::mcap::records::MessageHeader;
 use ::mcap::{Attachment, McapError, WriteOptions, Writer};
 use std::borrow::Cow;
 use std::collections::BTreeMap;
-use std::fs::{File, OpenOptions};
+use std::fs::File;
 use std::io;
+use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 
 const HEADER: &str = "\
@@ -51,13 +54,29 @@ float64 y
 float64 z
 ";
 
+/// Frames of one file: two minutes at 30 Hz, whose index takes 1 MiB of memory.
+const FRAMES_PER_FILE: u32 = 4096;
+/// The end of a file without a summary: the records DataEnd and Footer, whose numbers and checksums are 0, and the magic.
+const END: [u8; 50] = {
+    let mut end = [0; 50];
+    let magic = *b"\x89MCAP0\r\n";
+    (end[0], end[1], end[13], end[14]) = (0x0f, 4, 0x02, 20);
+    let mut i = 0;
+    while i < magic.len() {
+        end[42 + i] = magic[i];
+        i += 1;
+    }
+    end
+};
+
 /// Writes files recording-000.mcap and so on.
 pub struct McapSink {
     dir: PathBuf,
     calibration: Calibration,
-    /// `None` after a failure.
+    /// `None` after a failure: the recording has ended.
     file: Option<Open>,
     files: u32,
+    pub(super) frames_per_file: u32,
     sequence: u32,
     encoded: Vec<u8>,
     message: Vec<u8>,
@@ -65,9 +84,11 @@ pub struct McapSink {
 
 struct Open {
     writer: Writer<File>,
-    path: PathBuf,
+    /// The same file, to look at its size and to bring it to the disk.
+    file: File,
     /// Bytes up to the last whole chunk.
     good: u64,
+    frames: u32,
     images: Vec<u16>,
     imu: u16,
 }
@@ -87,6 +108,7 @@ impl McapSink {
             calibration: calibration.clone(),
             file: None,
             files: 0,
+            frames_per_file: FRAMES_PER_FILE,
             sequence: 0,
             encoded: Vec::new(),
             message: Vec::new(),
@@ -97,10 +119,11 @@ impl McapSink {
 
     fn begin(&mut self) -> Result<Open, McapError> {
         let path = self.dir.join(format!("recording-{:03}.mcap", self.files));
-        let file = OpenOptions::new().write(true).create_new(true).open(&path)?;
+        let created = File::create_new(&path)?;
+        let file = created.try_clone()?;
         self.files += 1;
         let options = WriteOptions::new().profile("ros2").library("stipple").compression(None).disable_seeking(true);
-        let mut writer = options.create(file)?;
+        let mut writer = options.create(created)?;
         let none = BTreeMap::new();
         let image =
             writer.add_schema("sensor_msgs/msg/CompressedImage", "ros2msg", format!("{IMAGE}{HEADER}").as_bytes())?;
@@ -113,15 +136,13 @@ impl McapSink {
         let imu = writer.add_channel(imu, "/imu0", "cdr", &none)?;
         attach(&mut writer, "imu0", imu_yaml(&self.calibration.imu, "recorded, corrected"))?;
         writer.flush()?;
-        let good = std::fs::metadata(&path)?.len();
-        Ok(Open { writer, path, good, images, imu })
+        host::sync_folder_of(&path)?;
+        let good = file.metadata()?.len();
+        Ok(Open { writer, file, good, frames: 0, images, imu })
     }
 
     fn write(&mut self, channel: impl Fn(&Open) -> u16, t: Nanos, sequence: u32) -> Result<(), McapError> {
-        if self.file.is_none() {
-            self.file = Some(self.begin()?);
-        }
-        let file = self.file.as_mut().expect("opened above");
+        let Some(file) = &mut self.file else { return Err(io::Error::other("it ended when a write failed").into()) };
         let t = t.0.max(0) as u64;
         let header = MessageHeader { channel_id: channel(file), sequence, log_time: t, publish_time: t };
         file.writer.write_to_known_channel(&header, &self.message)
@@ -129,6 +150,10 @@ impl McapSink {
 
     fn all(&mut self, frames: &Frames) -> Result<(), McapError> {
         self.sequence += 1;
+        if self.file.as_ref().is_some_and(|file| file.frames >= self.frames_per_file) {
+            self.end()?;
+            self.file = Some(self.begin()?);
+        }
         for (k, image) in frames.images.iter().enumerate() {
             let camera: RigCamera = self.calibration.cameras[k];
             self.encoded.clear();
@@ -142,15 +167,32 @@ impl McapSink {
         }
         let file = self.file.as_mut().expect("a message was written to it");
         file.writer.flush()?;
-        file.good = std::fs::metadata(&file.path)?.len();
+        file.good = file.file.metadata()?.len();
+        file.frames += 1;
+        Ok(())
+    }
+
+    /// Writes the index of the file and brings all of it to the disk.
+    fn end(&mut self) -> Result<(), McapError> {
+        let Some(open) = &mut self.file else { return Ok(()) };
+        open.writer.finish()?;
+        open.file.sync_all()?;
+        self.file = None;
         Ok(())
     }
 
     /// Closes the file after its last whole chunk where a write failed.
     fn settled(&mut self, written: Result<(), McapError>) -> io::Result<()> {
-        if let Some(Open { writer, good, .. }) = self.file.take_if(|_| written.is_err()) {
-            // A disk that refuses this leaves a cut chunk, which readers pass over.
-            let _ = writer.into_inner().set_len(good);
+        if let Some(Open { writer, file, good, .. }) = self.file.take_if(|_| written.is_err()) {
+            // Without what it writes when it is dropped.
+            drop(writer.into_inner());
+            // The cut chunk makes room for the end. A disk that refuses it leaves a file that was never closed, as a kill
+            // does, whose whole chunks are read.
+            let closed = file.set_len(good).and_then(|()| file.write_all_at(&END, good));
+            if closed.is_err() {
+                let _ = file.set_len(good);
+            }
+            let _ = file.sync_all();
         }
         written.map_err(failed)
     }
@@ -181,11 +223,13 @@ impl Sink for McapSink {
         self.settled(written)
     }
 
+    fn sync(&mut self) -> io::Result<()> {
+        self.file.as_ref().map_or(Ok(()), |open| open.file.sync_data())
+    }
+
     fn finish(&mut self) -> io::Result<()> {
-        match self.file.take() {
-            Some(mut file) => file.writer.finish().map(|_| ()).map_err(failed),
-            None => Ok(()),
-        }
+        let ended = self.end();
+        self.settled(ended)
     }
 }
 

@@ -3,7 +3,8 @@
 //! A tap on each source copies what passes into a ring of fixed size; a thread of low priority writes it. A full ring drops
 //! and counts, and the source never waits. What was written stays readable whatever happens: an image appears whole or not
 //! at all and is listed after it appeared; a chunk of MCAP is complete or taken back. A full disk loses what comes until it
-//! has room again, and nothing before.
+//! has room again (an MCAP ends there), and nothing before. A power cut loses what was not yet brought to the disk, which
+//! the writer does every second and at the end.
 
 mod euroc;
 mod mcap;
@@ -18,9 +19,10 @@ use crate::{counters, host, Calibration, Fault, FaultKind};
 use std::io;
 use std::path::Path;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
-use std::sync::mpsc::{Receiver, SyncSender};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender};
 use std::sync::{mpsc, Arc};
 use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
 
 /// A recording's format on disk. A write that fails leaves what was written before as it was.
 pub trait Sink: Send {
@@ -28,7 +30,9 @@ pub trait Sink: Send {
     fn frames(&mut self, frames: &Frames) -> io::Result<()>;
     /// Writes one inertial sample.
     fn imu(&mut self, reading: &ImuReading) -> io::Result<()>;
-    /// Writes what is left: nothing more comes.
+    /// Brings what was written to the disk.
+    fn sync(&mut self) -> io::Result<()>;
+    /// Writes what is left and brings it to the disk: nothing more comes.
     fn finish(&mut self) -> io::Result<()>;
 }
 
@@ -44,6 +48,8 @@ pub enum Format {
 
 /// Nice value of the writer's thread: after the sensors and odometry, before a map. What is not written in time is lost.
 const NICE: i32 = 5;
+/// Time between what is brought to the disk: what a power cut may cost.
+const SYNC_EVERY: Duration = Duration::from_secs(1);
 /// Samples that may wait for the writer: eight seconds of a 1 kHz unit.
 const IMU_SLOTS: usize = 8192;
 
@@ -57,6 +63,8 @@ counters! {
     record_ring_most,
     /// CPU time of the writer, us.
     record_cpu_us,
+    /// Longest time that it took to bring a second of it to the disk, us.
+    record_sync_us_most,
     /// Inertial samples written, dropped for a full ring, and failed.
     record_imu_written,
     record_imu_dropped,
@@ -131,33 +139,65 @@ pub fn start(
     let (c, taken) = (counts.clone(), in_ring.clone());
     let thread = std::thread::spawn(move || {
         host::lower_priority(NICE);
-        let mut failure: Option<String> = None;
-        let mut count = |done: io::Result<()>, good: &Counter, bad: &Counter| match done {
-            Ok(()) => good.add(1),
-            Err(e) => {
-                bad.add(1);
-                failure.get_or_insert_with(|| e.to_string());
-            }
+        let give_back = |frames| {
+            let _ = give_back.send(frames);
+            taken.fetch_sub(1, Relaxed);
         };
-        while let Ok(item) = waiting.recv() {
-            match item {
-                Item::Frames(frames) => {
-                    count(sink.frames(&frames), &c.record_frames_written, &c.record_frames_failed);
-                    let _ = give_back.send(frames);
-                    taken.fetch_sub(1, Relaxed);
-                }
-                Item::Imu(reading) => count(sink.imu(&reading), &c.record_imu_written, &c.record_imu_failed),
-            }
-        }
-        if let Err(e) = sink.finish() {
-            failure.get_or_insert_with(|| e.to_string());
-        }
+        let failure = write_all(&mut *sink, &waiting, give_back, &c);
         c.record_cpu_us.add((1e6 * host::thread_cpu().total_s()) as u64);
         failure
     });
     let tapped = TappedFrames { source: frames, spare, items: items.clone(), counts: counts.clone(), waiting: in_ring };
     let tapped_imu = TappedImu { source: imu, items, counts: counts.clone() };
     (Recorder { counts, thread }, tapped, tapped_imu)
+}
+
+/// Writes what comes until both taps are gone; the first failure, if there was one.
+fn write_all(
+    sink: &mut dyn Sink,
+    waiting: &Receiver<Item>,
+    give_back: impl Fn(Box<Frames>),
+    c: &Counts,
+) -> Option<String> {
+    let mut failure: Option<String> = None;
+    let mut note = |done: io::Result<()>| match done {
+        Ok(()) => true,
+        Err(e) => {
+            failure.get_or_insert_with(|| e.to_string());
+            false
+        }
+    };
+    // When the first item was written that may not be on the disk yet.
+    let mut unsynced: Option<Instant> = None;
+    loop {
+        let item = match waiting.recv_timeout(SYNC_EVERY) {
+            Ok(item) => Some(item),
+            Err(RecvTimeoutError::Timeout) => None,
+            Err(RecvTimeoutError::Disconnected) => break,
+        };
+        if item.is_some() {
+            unsynced = unsynced.or_else(|| Some(Instant::now()));
+        }
+        match item {
+            Some(Item::Frames(frames)) => {
+                let written = note(sink.frames(&frames));
+                if written { &c.record_frames_written } else { &c.record_frames_failed }.add(1);
+                give_back(frames);
+            }
+            Some(Item::Imu(reading)) => {
+                let written = note(sink.imu(&reading));
+                if written { &c.record_imu_written } else { &c.record_imu_failed }.add(1);
+            }
+            None => {}
+        }
+        if unsynced.take_if(|since| since.elapsed() >= SYNC_EVERY).is_some() {
+            let begun = Instant::now();
+            note(sink.sync());
+            c.record_sync_us_most.raise(begun.elapsed().as_micros() as u64);
+        }
+    }
+    note(sink.finish());
+    failure
 }
 
 impl Recorder {

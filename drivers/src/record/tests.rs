@@ -90,8 +90,8 @@ fn a_recording_reads_back_bit_for_bit() {
     assert!(back.calibration.cameras.iter().zip(&rig().cameras).all(|(a, b)| a.camera == b.camera));
 }
 
-/// Takes 30 ms a frame where one comes every 5 ms.
-struct SlowDisk(Vec<Nanos>);
+/// Takes 30 ms a frame where one comes every 5 ms, and counts how often it is brought to the disk.
+struct SlowDisk(Vec<Nanos>, Arc<AtomicU64>);
 
 impl Sink for SlowDisk {
     fn frames(&mut self, frames: &Frames) -> io::Result<()> {
@@ -102,6 +102,10 @@ impl Sink for SlowDisk {
     fn imu(&mut self, _: &ImuReading) -> io::Result<()> {
         Ok(())
     }
+    fn sync(&mut self) -> io::Result<()> {
+        self.1.fetch_add(1, Relaxed);
+        Ok(())
+    }
     fn finish(&mut self) -> io::Result<()> {
         assert!(self.0.windows(2).all(|w| w[0] < w[1]), "in order");
         Ok(())
@@ -110,7 +114,7 @@ impl Sink for SlowDisk {
 
 #[test]
 fn a_slow_disk_costs_frames_of_the_recording_and_no_time_of_the_source() {
-    let (slowest, r) = record(Box::new(SlowDisk(vec![])), 100, 4);
+    let (slowest, r) = record(Box::new(SlowDisk(vec![], Arc::default())), 100, 4);
     let (written, dropped) = (count(&r, "record_frames_written"), count(&r, "record_frames_dropped"));
     assert_eq!((written + dropped, &r.failure), (100, &None));
     assert!(dropped > 40 && written >= 10, "{written} written, {dropped} dropped");
@@ -175,6 +179,49 @@ fn a_full_disk_leaves_every_frame_before_it_readable() {
     });
 }
 
+/// What was recorded is on the disk within a second, not when the kernel likes.
+#[test]
+fn a_recording_is_brought_to_the_disk_every_second() {
+    let syncs = Arc::new(AtomicU64::new(0));
+    let begun = Instant::now();
+    let (_, r) = record(Box::new(SlowDisk(vec![], syncs.clone())), 450, 4);
+    let (seconds, syncs) = (begun.elapsed().as_secs(), syncs.load(Relaxed));
+    assert!(r.failure.is_none() && syncs >= 1 && syncs <= seconds, "{syncs} times in {seconds} s");
+}
+
+/// Images of each camera in an MCAP whose end is whole.
+fn images(file: &Path) -> u64 {
+    let file = std::fs::read(file).unwrap();
+    let messages = ::mcap::MessageStream::new(&file).unwrap().map(Result::unwrap);
+    messages.filter(|m| m.channel.topic == "/cam1/image").count() as u64
+}
+
+#[test]
+fn a_full_disk_ends_an_mcap_in_one_file_that_is_closed_and_readable() {
+    on_a_small_disk("record::tests::a_full_disk_ends_an_mcap_in_one_file_that_is_closed_and_readable", |disk| {
+        let out = disk.join("r");
+        let mut sink = McapSink::create(&out_folder(&out), &rig()).unwrap();
+        let reading = ImuReading::default();
+        let mut written = 0;
+        while sink.imu(&reading).and_then(|()| sink.frames(&frame(written))).is_ok() {
+            written += 1;
+        }
+        // As before, every sample and frame from then on began another file.
+        for i in 0..20 {
+            assert!(sink.imu(&reading).is_err() && sink.frames(&frame(100 + i)).is_err());
+        }
+        sink.finish().unwrap();
+        assert_eq!(std::fs::read_dir(&out).unwrap().count(), 1);
+        assert!(written > 20, "{written}");
+        assert_eq!(images(&out.join("recording-000.mcap")), written as u64);
+    });
+}
+
+fn out_folder(out: &Path) -> std::path::PathBuf {
+    std::fs::create_dir(out).unwrap();
+    out.to_path_buf()
+}
+
 #[test]
 fn a_full_disk_leaves_every_whole_chunk_of_mcap_readable() {
     on_a_small_disk("record::tests::a_full_disk_leaves_every_whole_chunk_of_mcap_readable", |disk| {
@@ -182,10 +229,41 @@ fn a_full_disk_leaves_every_whole_chunk_of_mcap_readable() {
         let (_, r) = record(open(&out, Format::Mcap, &rig()).unwrap(), 80, 100);
         let (written, failed) = (count(&r, "record_frames_written"), count(&r, "record_frames_failed"));
         assert!(written > 20 && failed > 10 && written + failed == 80, "{r:?}");
-        let file = std::fs::read(out.join("recording-000.mcap")).unwrap();
-        let ignore_end = ::mcap::read::Options::IgnoreEndMagic.into();
-        let messages = ::mcap::MessageStream::new_with_options(&file, ignore_end).unwrap().map_while(Result::ok);
-        let images = messages.filter(|m| m.channel.topic == "/cam1/image").count() as u64;
-        assert_eq!(images, written);
+        assert!(r.failure.clone().unwrap().contains("space"), "{r:?}");
+        assert_eq!(images(&out.join("recording-000.mcap")), written);
     });
+}
+
+/// The index of a file is kept in memory until it ends: the number of frames of a file bounds it.
+#[test]
+fn a_long_mcap_goes_on_in_another_file_and_each_is_whole() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut sink = McapSink::create(dir.path(), &rig()).unwrap();
+    sink.frames_per_file = 4;
+    (0..10).for_each(|i| sink.frames(&frame(i)).unwrap());
+    sink.finish().unwrap();
+    let file = |k: usize| dir.path().join(format!("recording-00{k}.mcap"));
+    assert_eq!([0, 1, 2].map(|k| images(&file(k))), [4, 4, 2]);
+    for k in 0..3 {
+        let summary = ::mcap::Summary::read(&std::fs::read(file(k)).unwrap()).unwrap().unwrap();
+        // Schemas and channels, which the calibration's attachments part, are in chunks of their own.
+        assert!(summary.chunk_indexes.len() <= 4 + 4 && summary.attachment_indexes.len() == 3);
+    }
+}
+
+/// Somebody else's links under the names of a recording lead nowhere.
+#[test]
+fn a_recording_follows_no_link() {
+    let (dir, other) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+    let victim = other.path().join("victim");
+    std::fs::write(&victim, "precious").unwrap();
+    let mut sink = EurocSink::create(dir.path(), &rig()).unwrap();
+    let partial = dir.path().join("mav0/cam0/data").join(format!(".{}.partial", frame(0).t.0));
+    std::os::unix::fs::symlink(&victim, partial).unwrap();
+    assert!(sink.frames(&frame(0)).is_err());
+    sink.frames(&frame(1)).unwrap();
+    sink.finish().unwrap();
+    std::os::unix::fs::symlink(&victim, other.path().join("recording-000.mcap")).unwrap();
+    assert!(McapSink::create(other.path(), &rig()).is_err());
+    assert_eq!(std::fs::read(&victim).unwrap(), b"precious");
 }
