@@ -2,14 +2,16 @@
 #![cfg(test)]
 #![allow(clippy::unwrap_used)]
 
+#[path = "../../../tests/program/small_disk.rs"]
+mod small_disk;
+
 use super::*;
 use crate::paced::{Images, Pace, PacedFrames, PacedImu};
 use crate::replay::{OpenOptions, Recording};
 use crate::sim::euroc_rig;
 use crate::types::{ImuSample, Nanos};
 use glam::DVec3;
-use std::io::Write;
-use std::process::Command;
+use small_disk::on_a_small_disk;
 use std::time::{Duration, Instant};
 
 const MS: i64 = 1_000_000;
@@ -123,49 +125,9 @@ fn a_slow_disk_costs_frames_of_the_recording_and_no_time_of_the_source() {
     assert!(slowest < Duration::from_millis(30 * 4), "{slowest:?}");
 }
 
-/// Unmounts a disk, whatever became of the test.
-struct Mounted<'a>(&'a Path);
-
-impl Drop for Mounted<'_> {
-    fn drop(&mut self) {
-        let _ = Command::new("umount").arg(self.0).status();
-    }
-}
-
-/// Runs `body` on a disk of two megabytes. Where mounting is refused, the test runs itself again as root of a namespace of
-/// its own; where that is refused too, it is left out and says so, or fails if STIPPLE_REQUIRE_MOUNT is 1.
-fn on_a_small_disk(test: &str, body: impl FnOnce(&Path)) {
-    const MOUNT: [&str; 6] = ["mount", "-t", "tmpfs", "-o", "size=2m", "tmpfs"];
-    const NAMESPACE: [&str; 2] = ["unshare", "-Umr"];
-    let dir = tempfile::tempdir().unwrap();
-    let runs = |words: &[&str]| {
-        let output = Command::new(words[0]).args(&words[1..]).arg(dir.path()).output();
-        output.is_ok_and(|o| o.status.success())
-    };
-    if runs(&MOUNT) {
-        let _disk = Mounted(dir.path());
-        body(dir.path());
-    } else if runs(&[&NAMESPACE[..], &MOUNT].concat()) {
-        let own = std::env::current_exe().unwrap();
-        let again =
-            Command::new(NAMESPACE[0]).arg(NAMESPACE[1]).arg(own).args(["--exact", test, "--nocapture"]).output();
-        let again = again.unwrap();
-        let said = String::from_utf8_lossy(&again.stdout);
-        assert!(
-            again.status.success() && said.contains("1 passed"),
-            "{said}{}",
-            String::from_utf8_lossy(&again.stderr)
-        );
-    } else {
-        assert!(std::env::var("STIPPLE_REQUIRE_MOUNT").as_deref() != Ok("1"), "a small disk cannot be mounted here");
-        // Past the capture of output, which shows what passed tests print to nobody.
-        writeln!(io::stderr(), "LEFT OUT: {test}: a small disk cannot be mounted here, nor in a namespace").unwrap();
-    }
-}
-
 #[test]
 fn a_full_disk_leaves_every_frame_before_it_readable() {
-    on_a_small_disk("record::tests::a_full_disk_leaves_every_frame_before_it_readable", |disk| {
+    on_a_small_disk("2m", "record::tests::a_full_disk_leaves_every_frame_before_it_readable", |disk| {
         let out = disk.join("r");
         // 38 KiB a frame: full after some fifty.
         let (_, r) = record(open(&out, Format::Euroc, &rig()).unwrap(), 80, 100);
@@ -224,7 +186,7 @@ fn out_folder(out: &Path) -> std::path::PathBuf {
 
 #[test]
 fn a_full_disk_leaves_every_whole_chunk_of_mcap_readable() {
-    on_a_small_disk("record::tests::a_full_disk_leaves_every_whole_chunk_of_mcap_readable", |disk| {
+    on_a_small_disk("2m", "record::tests::a_full_disk_leaves_every_whole_chunk_of_mcap_readable", |disk| {
         let out = disk.join("r");
         let (_, r) = record(open(&out, Format::Mcap, &rig()).unwrap(), 80, 100);
         let (written, failed) = (count(&r, "record_frames_written"), count(&r, "record_frames_failed"));
