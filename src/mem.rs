@@ -12,6 +12,48 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 pub use stipple_drivers::List;
 
+/// A list of fixed size for a run without an end: holds every item while they fit, then every second, every fourth and so on.
+#[derive(Clone, Debug)]
+pub struct Thinned<T> {
+    items: Vec<T>,
+    stride: u64,
+    /// Items pushed.
+    pub seen: u64,
+}
+
+impl<T> Thinned<T> {
+    pub fn with_capacity(capacity: usize) -> Thinned<T> {
+        Thinned { items: Vec::with_capacity(capacity.max(2)), stride: 1, seen: 0 }
+    }
+
+    /// Whether it holds everything that was pushed.
+    pub fn is_whole(&self) -> bool {
+        self.stride == 1
+    }
+
+    pub fn push(&mut self, item: T) {
+        if self.seen % self.stride == 0 && self.items.len() == self.items.capacity() {
+            let mut index = 0;
+            self.items.retain(|_| {
+                index += 1;
+                index % 2 == 1
+            });
+            self.stride *= 2;
+        }
+        if self.seen % self.stride == 0 {
+            self.items.push(item);
+        }
+        self.seen += 1;
+    }
+}
+
+impl<T> std::ops::Deref for Thinned<T> {
+    type Target = [T];
+    fn deref(&self) -> &[T] {
+        &self.items
+    }
+}
+
 /// Bytes a part takes, by name; `stipple check` prints the sum of all of them.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Footprint {
@@ -122,5 +164,25 @@ unsafe impl GlobalAlloc for CountingAllocator {
         count(new_size as i64 - layout.size() as i64);
         // SAFETY: as above.
         unsafe { System.realloc(ptr, layout, new_size) }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_full_list_is_thinned_evenly_and_never_grows() {
+        for capacity in [2, 5, 8] {
+            let mut list = Thinned::with_capacity(capacity);
+            for i in 0..1000u64 {
+                list.push(i);
+                let step = list.get(1).map_or(1, |second| second - list[0]);
+                assert!(list.is_whole() == (i < capacity as u64) && list.seen == i + 1);
+                assert!(list[0] == 0 && list.windows(2).all(|w| w[1] - w[0] == step), "{list:?}");
+                assert!(list.len() <= capacity && i - list[list.len() - 1] < step, "{list:?} after {i}");
+                assert_eq!(list.items.capacity(), capacity);
+            }
+        }
     }
 }

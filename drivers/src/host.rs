@@ -53,9 +53,18 @@ pub fn thread_cpu() -> CpuTime {
 
 /// Now by `CLOCK_MONOTONIC`, in which the kernel stamps frames, edges and inertial samples.
 pub fn monotonic() -> crate::Nanos {
+    now(libc::CLOCK_MONOTONIC)
+}
+
+/// Now by `CLOCK_MONOTONIC`, by `CLOCK_BOOTTIME`, which goes on in suspend, and by `CLOCK_REALTIME`, since 1970.
+pub fn clocks() -> [crate::Nanos; 3] {
+    [libc::CLOCK_MONOTONIC, libc::CLOCK_BOOTTIME, libc::CLOCK_REALTIME].map(now)
+}
+
+fn now(clock: libc::clockid_t) -> crate::Nanos {
     let mut t = libc::timespec { tv_sec: 0, tv_nsec: 0 };
-    // SAFETY: `t` outlives the call; the clock exists on every Linux.
-    unsafe { libc::clock_gettime(libc::CLOCK_MONOTONIC, &mut t) };
+    // SAFETY: `t` outlives the call; the clocks asked for exist on every Linux.
+    unsafe { libc::clock_gettime(clock, &mut t) };
     crate::Nanos(t.tv_sec * 1_000_000_000 + t.tv_nsec)
 }
 

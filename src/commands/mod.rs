@@ -6,6 +6,7 @@ mod checks;
 mod demo;
 mod doctor;
 mod record;
+mod recover;
 mod replay;
 mod run;
 mod sim;
@@ -37,6 +38,8 @@ enum Command {
     Replay(replay::Args),
     /// Record the board's sensors until stopped (SIGINT, SIGTERM)
     Record(record::Args),
+    /// Write the trajectory of a run that was killed or cut off, from its log
+    Recover(recover::Args),
     /// Fly through a simulated room and map it; needs no data
     Demo(demo::Args),
     /// Write a simulated flight as an EuRoC folder with ground truth
@@ -66,11 +69,15 @@ pub fn main() -> ExitCode {
     if matches!(cli.command, Command::Check(_) | Command::CalibCheck(_) | Command::Doctor(_)) {
         stipple_drivers::host::end_when_unread();
     }
-    crate::run::threads::abort_on_panic(crate::run::status_led::show_panic);
+    crate::run::threads::abort_on_panic(|what| {
+        crate::run::log::close_for_panic(what);
+        crate::run::status_led::show_panic();
+    });
     let done = match cli.command {
         Command::Run(args) => run::run(&args),
         Command::Replay(args) => replay::replay(&args),
         Command::Record(args) => record::record(&args),
+        Command::Recover(args) => recover::recover(&args),
         Command::Demo(args) => demo::demo(&args),
         Command::Sim(args) => sim::sim(&args),
         Command::Check(args) => check::check(&args),

@@ -5,14 +5,19 @@ use std::io::{self, Write};
 use stipple_drivers::TimedPose;
 
 pub fn write_tum(out: &mut impl Write, poses: &[TimedPose]) -> io::Result<()> {
-    writeln!(out, "# t_s tx_m ty_m tz_m qx qy qz qw (world from body)")?;
-    for TimedPose { t, pose } in poses {
-        let sign = if t.0 < 0 { "-" } else { "" };
-        let (s, ns) = (t.0.unsigned_abs() / 1_000_000_000, t.0.unsigned_abs() % 1_000_000_000);
-        let ([x, y, z], [qx, qy, qz, qw]) = (pose.p.to_array(), pose.q.to_array());
-        writeln!(out, "{sign}{s}.{ns:09} {x:.6} {y:.6} {z:.6} {qx:.8} {qy:.8} {qz:.8} {qw:.8}")?;
-    }
-    Ok(())
+    write_head(out)?;
+    poses.iter().try_for_each(|pose| write_line(out, pose))
+}
+
+pub fn write_head(out: &mut impl Write) -> io::Result<()> {
+    writeln!(out, "# t_s tx_m ty_m tz_m qx qy qz qw (world from body)")
+}
+
+pub fn write_line(out: &mut impl Write, TimedPose { t, pose }: &TimedPose) -> io::Result<()> {
+    let sign = if t.0 < 0 { "-" } else { "" };
+    let (s, ns) = (t.0.unsigned_abs() / 1_000_000_000, t.0.unsigned_abs() % 1_000_000_000);
+    let ([x, y, z], [qx, qy, qz, qw]) = (pose.p.to_array(), pose.q.to_array());
+    writeln!(out, "{sign}{s}.{ns:09} {x:.6} {y:.6} {z:.6} {qx:.8} {qy:.8} {qz:.8} {qw:.8}")
 }
 
 #[cfg(test)]

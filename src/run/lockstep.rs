@@ -163,6 +163,7 @@ pub fn fly(
                     }
                 }
                 status.show(&gauges);
+                status.log_counters(&counters, &gauges);
             }
         }
     });

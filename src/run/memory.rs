@@ -1,9 +1,10 @@
 //! The byte table: everything a board buys at boot, summed before anything is bought.
 
 use super::keyframes::KeyframeRing;
+use super::log;
 use super::mailbox::Mailbox;
 use super::tracking::OdometryRun;
-use super::{packets, POSES_KEPT};
+use super::{packets, FRAMES_KEPT};
 use crate::config::Board;
 use crate::limits::CAMERAS_MAX;
 use crate::map::{cameras, Mapper};
@@ -23,7 +24,8 @@ pub fn footprint(calibration: &Calibration, board: &Board, records: bool) -> Res
     let colours = colours(calibration, board).len();
     let mut f = Footprint::default();
     f.build("queues: frames and samples", || Mailbox::new(packets(board.frontend.threads), calibration, colours));
-    OdometryRun::measured(calibration, board, POSES_KEPT, &mut f)?;
+    OdometryRun::measured(calibration, board, FRAMES_KEPT, &mut f)?;
+    log::Queue::measured(&mut f);
     if board.map.enabled {
         // First, since it refuses a rig without the cameras that keyframes have images of.
         let mapper = Mapper::footprint(calibration, board)?;

@@ -17,6 +17,7 @@
 //! | map-answers | reads what that process tells | free |
 //! | trigger | starts the cameras' exposures, where a line is wired for it | free |
 //! | led | shows the state of a run, where a line is wired for it | free |
+//! | log | writes states, events and counters to DIR; low priority | free |
 //! | writer (the recorder's) | writes what is recorded, if anything is; low priority | free |
 //!
 //! In lockstep the main thread is sensors and mapping too.
@@ -29,6 +30,7 @@
 pub mod gate;
 mod keyframes;
 mod lockstep;
+pub mod log;
 pub mod mailbox;
 pub mod mapping;
 pub mod memory;
@@ -49,6 +51,7 @@ use crate::output::report::Report;
 use crate::output::OutputDir;
 use gate::ImuGate;
 use keyframes::{KeyframeRing, Keyframes};
+use log::{EventKind, Log};
 use mailbox::{Capture, Mailbox};
 use mapping::Mapping;
 use recorder::Recording;
@@ -133,8 +136,8 @@ pub struct Flown {
     pub notices: Vec<String>,
 }
 
-/// Poses kept for the trajectory of a run without an end: half an hour at 30 Hz, 15 MiB. The run goes on past it.
-const POSES_KEPT: usize = 1 << 16;
+/// Frames that a run without an end is judged by, evenly spread: the log has all of them.
+const FRAMES_KEPT: usize = 1 << 14;
 
 /// Flies `input` on `board` and writes what it leaves to `out`.
 pub fn fly(
@@ -146,6 +149,10 @@ pub fn fly(
 ) -> Result<Outcome, Fault> {
     if options.service {
         threads::ask_for_realtime();
+    }
+    if let Some(rule) = options.inject.thread.iter().find(|rule| !threads::is_watched(&rule.name)) {
+        let what = format!("no thread of the name {} can be asked to panic", rule.name);
+        return Err(Fault::new(FaultKind::Config, "--inject", what, "name camera, imu or tracking"));
     }
     threads::panic_in(options.inject.thread.iter().map(|rule| (rule.name.clone(), rule.panic_s)));
     let mut board = board.clone();
@@ -169,10 +176,10 @@ pub fn fly(
         }
         // A rate that the camera made a little higher is no reason to lose the end.
         Source::Live { rate_hz, .. } => {
-            POSES_KEPT.min(options.duration_s.map_or(f64::INFINITY, |s| 1.2 * s * *rate_hz + 100.0) as usize)
+            FRAMES_KEPT.min(options.duration_s.map_or(f64::INFINITY, |s| 1.2 * s * *rate_hz + 100.0) as usize)
         }
     };
-    let tracker = match &options.poses {
+    let mut tracker = match &options.poses {
         Some(path) => Tracker::Table(read_trajectory(path)?),
         None => Tracker::Odometry(Box::new(OdometryRun::new(&input.calibration, board, frames)?)),
     };
@@ -199,7 +206,11 @@ pub fn fly(
         opened: input.opened,
     };
     let length_s = input.source.length_s();
-    let mut status = Status::new(options.duration_s.or(length_s)).with_led(led);
+    let log = Log::start(out.path().into(), log::LIMITS, &title.to_string());
+    if let Tracker::Odometry(run) = &mut tracker {
+        run.back.log = Some(log.sender());
+    }
+    let mut status = Status::new(options.duration_s.or(length_s)).with_led(led).with_log(log.sender());
     let (calibration, live) = (&input.calibration, length_s.is_none());
     let (mut flown, recording) = match (input.source, options.pace) {
         (Source::Recorded(recorded), Pace::Lockstep(steps)) => {
@@ -222,16 +233,20 @@ pub fn fly(
     };
     status.finish();
     flown.warnings.iter().for_each(|warning| print_err(format_args!("stipple: warning: {warning}")));
-    if !live && flown.counters.frames_unreadable.get() == frames as u64 {
+    let unread = (!live && flown.counters.frames_unreadable.get() == frames as u64).then(|| {
         let first = flown.warnings.first().map_or("", String::as_str);
         let what = format!("none of its {frames} frames can be read, the first: {first}");
-        return Err(Fault::new(FaultKind::Data, input.place, what, "check that the recording is complete"));
-    }
-    flown.warnings.splice(..0, input.warnings);
+        Fault::new(FaultKind::Data, input.place, what, "check that the recording is complete")
+    });
     let capture = flown.capture.and_then(|c| c.line(&flown.source));
     let broken = flown.broken.take();
     let recorded = recording.map(|r| r.finish(&mut flown.source));
-    let report = summary::conclude(title, flown, out)?;
+    let logged = summary::close_log(log, &title, &mut flown, unread.as_ref().or(broken.as_ref()));
+    if let Some(fault) = unread {
+        return Err(fault);
+    }
+    flown.warnings.splice(..0, input.warnings);
+    let report = summary::conclude(title, flown, &logged, out)?;
     let fault = recorded.and_then(Result::err).or(broken);
     if fault.is_none() {
         status.ended_well();
@@ -404,16 +419,19 @@ fn supervise(
         let hangs = silent.filter(|_| was.is_none()).map(|name| format!("thread {name} gives no sign of life"));
         s.counters.threads_silent.add(u64::from(hangs.is_some()));
         let looked = worker.as_mut().and_then(|w| w.watch(&s.gauges));
-        let queued = std::iter::from_fn(|| s.mailbox.notices.pop());
-        for line in hangs.into_iter().chain(looked).chain(threads::refused()).chain(queued) {
-            status.say(&line);
+        let mut say = |kind, line: String| {
+            status.say(kind, &line);
             notices.push(line);
-        }
+        };
+        hangs.into_iter().chain(threads::refused()).for_each(|line| say(EventKind::System, line));
+        looked.into_iter().for_each(|line| say(EventKind::Map, line));
+        std::iter::from_fn(|| s.mailbox.notices.pop()).for_each(|line| say(EventKind::Sensor, line));
         if tracked {
             // Nothing is played any more; the run's own time is what progresses.
             s.gauges.played_ms.fetch_max((t_s * 1e3) as u64, Relaxed);
         }
         status.show(&s.gauges);
+        status.log_counters(&s.counters, &s.gauges);
         std::thread::sleep(STATUS_PERIOD);
     }
 }

@@ -1,6 +1,8 @@
 //! What a run shows while it goes on: a bar on a terminal, one line a second otherwise, and a status LED where one is wired.
 
+use super::log::{EventKind, LogSender};
 use super::status_led::StatusLed;
+use crate::counters::Counters;
 use indicatif::{ProgressBar, ProgressStyle};
 use std::fmt;
 use std::io::{self, IsTerminal, Write as _};
@@ -35,6 +37,11 @@ pub struct Status {
     /// `None`: never.
     next_line: Option<Instant>,
     led: Option<StatusLed>,
+    log: Option<LogSender>,
+    /// When counters are logged next.
+    next_count: Instant,
+    /// Whether it was said that logging ended.
+    log_ended: bool,
 }
 
 const LINE_PERIOD: Duration = Duration::from_secs(1);
@@ -49,17 +56,24 @@ impl Status {
             bar.set_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()));
             bar
         });
-        Status { bar, total_ms, next_line: Some(Instant::now() + LINE_PERIOD), led: None }
+        Status { bar, total_ms, next_line: Some(Instant::now() + LINE_PERIOD), ..Status::silent() }
     }
 
     /// Shows nothing.
     pub fn silent() -> Status {
-        Status { bar: None, total_ms: None, next_line: None, led: None }
+        let next_count = Instant::now() + LINE_PERIOD;
+        Status { bar: None, total_ms: None, next_line: None, led: None, log: None, next_count, log_ended: false }
     }
 
     /// Shows it on the LED of a board that has one, too.
     pub fn with_led(mut self, led: Option<StatusLed>) -> Status {
         self.led = led;
+        self
+    }
+
+    /// Logs what it says, and counters, too.
+    pub fn with_log(mut self, log: LogSender) -> Status {
+        self.log = Some(log);
         self
     }
 
@@ -89,8 +103,32 @@ impl Status {
         }
     }
 
-    /// Prints a line that stays.
-    pub fn say(&self, text: &str) {
+    /// Logs counters and gauges once a second, and says it when logging has ended. Cheap to call often.
+    pub fn log_counters(&mut self, counters: &Counters, g: &Gauges) {
+        let Some(log) = self.log.as_ref().filter(|_| Instant::now() >= self.next_count) else { return };
+        let gauges = [
+            ("frames", &g.frames),
+            ("keyframes", &g.keyframes),
+            ("anchors", &g.anchors),
+            ("splats", &g.splats),
+            ("iterations", &g.iterations),
+        ];
+        let all = gauges.iter().map(|(name, n)| (*name, n.load(Relaxed))).chain(counters.list());
+        log.counters(all.map(|(name, n)| (name.into(), n)).collect());
+        self.next_count += LINE_PERIOD;
+        if let (false, Some(why)) = (self.log_ended, log.notice()) {
+            self.print(why);
+            self.log_ended = true;
+        }
+    }
+
+    /// Prints a line that stays, and logs it as an event.
+    pub fn say(&self, kind: EventKind, text: &str) {
+        self.log.iter().for_each(|log| log.event(kind, text));
+        self.print(text);
+    }
+
+    fn print(&self, text: &str) {
         match &self.bar {
             Some(bar) if host::is_writable(STDERR) => bar.println(format!("stipple: {text}")),
             Some(_) => {}

@@ -1,5 +1,6 @@
-//! What a finished flight leaves: the report, the files of DIR, seven lines of text.
+//! What a finished flight leaves: the end of its log, the report, the files of DIR, seven lines of text.
 
+use super::log::{read, EventKind, Log};
 use super::mapping::{Drawn, MapResult};
 use super::memory::mib;
 use super::tracking::Tracker;
@@ -10,6 +11,10 @@ use crate::output::metrics::{percentile, trajectory_error};
 use crate::output::panel::Picture;
 use crate::output::report::{seconds_to, ExtrinsicsFound, Report, GOOD_DB};
 use crate::output::{atomically, trajectory, OutputDir};
+use std::borrow::Cow;
+use std::fmt;
+use std::path::PathBuf;
+use std::sync::atomic::Ordering::Relaxed;
 use stipple_drivers::{host, Fault, Nanos, TimedPose};
 
 /// What was flown, as the report names it.
@@ -23,8 +28,47 @@ pub struct Title {
     pub opened: Vec<(&'static str, u64)>,
 }
 
-/// Measures a finished flight, writes DIR, and answers the report.
-pub fn conclude(title: Title, mut flown: Flown, out: &OutputDir) -> Result<Report, Fault> {
+impl fmt::Display for Title {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        write!(f, "{} on {}, {}", self.dataset, self.board, self.pace)
+    }
+}
+
+/// Writes the end of a flight, by a fault if there was one, to its log and closes it: all that comes after may fail. Answers
+/// the files.
+pub fn close_log(log: Log, title: &Title, flown: &mut Flown, fault: Option<&Fault>) -> Vec<PathBuf> {
+    let sender = log.sender();
+    sender.counters(counted(flown, None, &title.opened));
+    let why = match fault {
+        Some(fault) => fault.to_string(),
+        None if host::stop_asked_for().load(Relaxed) => "stopped by a signal".into(),
+        None => "the sensors or the time asked for ended".into(),
+    };
+    sender.event(EventKind::End, &why);
+    let files = log.finish(&mut flown.source);
+    flown.warnings.extend(sender.notice().map(str::to_string));
+    files
+}
+
+/// Writes the trajectory: from memory where that holds every pose, else from the log, and past its end what memory has.
+pub fn write_trajectory(
+    whole: bool,
+    estimated: &[TimedPose],
+    logged: &[PathBuf],
+    out: &OutputDir,
+) -> Result<(), Fault> {
+    out.write("trajectory.tum", |w| {
+        if whole {
+            return trajectory::write_tum(w, estimated);
+        }
+        let last = read::write_trajectory(logged, w, |_, _| {})?;
+        let mut rest = estimated.iter().filter(|pose| last.is_none_or(|last| pose.t > last));
+        rest.try_for_each(|pose| trajectory::write_line(w, pose))
+    })
+}
+
+/// Measures a finished flight, writes DIR, and answers the report. The trajectory comes first: no figure is worth it.
+pub fn conclude(title: Title, mut flown: Flown, logged: &[PathBuf], out: &OutputDir) -> Result<Report, Fault> {
     let heap = mem::heap_after_seal();
     let mut report = Report {
         dataset: Some(title.dataset),
@@ -38,6 +82,8 @@ pub fn conclude(title: Title, mut flown: Flown, out: &OutputDir) -> Result<Repor
         ..Report::default()
     };
     let estimated = track_figures(&mut report, &flown);
+    let whole = flown.tracker.odometry().is_none_or(|run| run.back.trajectory.is_whole());
+    write_trajectory(whole, &estimated, logged, out)?;
     let error = trajectory_error(&estimated, &title.truth).filter(|_| flown.tracker.odometry().is_some());
     if let Some(e) = &error {
         report.ate_rmse_m = Some(e.ate_rmse_m);
@@ -91,10 +137,10 @@ fn warn(warnings: &mut Vec<String>, what: String) {
 }
 
 /// Every counter of a run, each under one name.
-fn counted(flown: &Flown, map: Option<&MapResult>, opened: &[(&'static str, u64)]) -> Vec<(String, u64)> {
-    let owned = |list: &[(&'static str, u64)]| list.iter().map(|(name, n)| (name.to_string(), *n)).collect::<Vec<_>>();
+fn counted(flown: &Flown, map: Option<&MapResult>, opened: &[(&'static str, u64)]) -> Vec<(Cow<'static, str>, u64)> {
+    let owned = |list: &[(&'static str, u64)]| list.iter().map(|(name, n)| ((*name).into(), *n)).collect::<Vec<_>>();
     let mut all = owned(&flown.counters.list());
-    let mapper = map.map_or(vec![], |m| m.counters.clone());
+    let mapper = map.map_or(vec![], |m| m.counters.iter().map(|(name, n)| (name.clone().into(), *n)).collect());
     let others = [owned(opened), owned(&flown.source), owned(&flown.tracker.counters()), mapper];
     for (name, n) in others.into_iter().flatten() {
         match all.iter_mut().find(|(known, _)| *known == name) {
@@ -151,12 +197,11 @@ fn track_figures(report: &mut Report, flown: &Flown) -> Vec<TimedPose> {
         report.quality_under_50 = Some(under);
     }
     report.vio_hash = Some(format!("{:016x}", run.back.vio.hash()));
-    run.back.trajectory.iter().map(|o| TimedPose { t: o.t, pose: o.world_from_body }).collect()
+    run.back.trajectory.to_vec()
 }
 
 /// Writes the files of DIR; `evidence` is without its pictures.
 fn write_files(report: &Report, evidence: &Evidence, drawn: Vec<Drawn>, out: &OutputDir) -> Result<(), Fault> {
-    out.write("trajectory.tum", |w| trajectory::write_tum(w, evidence.estimated))?;
     if drawn.is_empty() {
         out.remove("renders")?;
     } else {

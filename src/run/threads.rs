@@ -131,7 +131,7 @@ pub fn is_watched(name: &str) -> bool {
 }
 
 /// Makes a panic of any thread end the process; `tell` is called before.
-pub fn abort_on_panic(tell: impl Fn() + Send + Sync + 'static) {
+pub fn abort_on_panic(tell: impl Fn(&str) + Send + Sync + 'static) {
     static TOLD: AtomicBool = AtomicBool::new(false);
     std::panic::set_hook(Box::new(move |info| {
         // One that panics while another does is not waited for.
@@ -139,10 +139,9 @@ pub fn abort_on_panic(tell: impl Fn() + Send + Sync + 'static) {
             let what = info.to_string().replace('\n', " ");
             let thread = std::thread::current();
             let name = thread.name().unwrap_or("without a name");
-            print_err(format_args!(
-                "stipple: thread {name} {what}; this is a mistake of the program, please report it"
-            ));
-            tell();
+            let what = format!("thread {name} {what}");
+            print_err(format_args!("stipple: {what}; this is a mistake of the program, please report it"));
+            tell(&what);
         }
         std::process::abort();
     }));

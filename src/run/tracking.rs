@@ -12,12 +12,13 @@
 //!
 //! With `--poses` the poses come from a table, odometry is skipped, and every frame is a keyframe.
 
+use super::log::{LogSender, State};
 use super::waker::{SetOnDrop, Waker};
 use crate::config::Board;
 use crate::counters::Counters;
 use crate::frontend::{Frontend, Prediction, Tracks};
 use crate::limits::{FRAMES, IMU_BETWEEN_FRAMES};
-use crate::mem::{seal_thread, Footprint, List};
+use crate::mem::{seal_thread, Footprint, List, Thinned};
 use crate::vio::{Health, Odometry, Predictor, Vio};
 use crossbeam_queue::ArrayQueue;
 use std::sync::atomic::AtomicBool;
@@ -107,7 +108,7 @@ pub struct Front {
     frontend: Frontend,
     predictor: Predictor,
     /// Wall time of each frame, ms.
-    pub ms: Vec<f64>,
+    pub ms: Thinned<f64>,
     /// Wall time of all frames, with what was waited for the back end, s.
     pub busy_s: f64,
     /// CPU time of the thread, s; that of both halves where they share one.
@@ -126,23 +127,25 @@ impl Front {
         packet.tracks.clone_from(self.frontend.track(&packet.frames, &prediction));
         let secs = packet.begun.elapsed().as_secs_f64();
         self.busy_s += secs;
-        keep(&mut self.ms, secs * 1e3);
+        self.ms.push(secs * 1e3);
     }
 }
 
-/// The half that estimates. Its lists have room for every frame, bought at the start.
+/// The half that estimates. Its lists are bought at the start: what a run is judged by. They hold every frame of a
+/// recording, and are thinned in a run without an end, of which the log has every frame.
 pub struct Back {
     pub vio: Vio,
-    pub trajectory: Vec<Odometry>,
+    pub trajectory: Thinned<TimedPose>,
     /// Wall time of each frame, ms.
-    pub ms: Vec<f64>,
+    pub ms: Thinned<f64>,
     /// Wall time of all frames, s.
     pub busy_s: f64,
     /// Health of every frame, with a pose or without.
-    pub health: Vec<(Nanos, Health)>,
+    pub health: Thinned<(Nanos, Health)>,
     /// Time from when the front end took a frame until its pose was there, ms.
-    pub frame_ms: Vec<(Nanos, f64)>,
+    pub frame_ms: Thinned<(Nanos, f64)>,
     pub cpu_s: Option<f64>,
+    pub log: Option<LogSender>,
 }
 
 impl Back {
@@ -161,13 +164,17 @@ impl Back {
             corrections: if update.keyframe { self.keyframe_poses() } else { List::default() },
         });
         if let Some(odometry) = update.odometry {
-            keep(&mut self.trajectory, odometry);
+            self.trajectory.push(TimedPose { t: odometry.t, pose: odometry.world_from_body });
         }
         let secs = begun.elapsed().as_secs_f64();
         self.busy_s += secs;
-        keep(&mut self.ms, secs * 1e3);
-        keep(&mut self.health, (packet.frames.t, update.health));
-        keep(&mut self.frame_ms, (packet.frames.t, packet.begun.elapsed().as_secs_f64() * 1e3));
+        self.ms.push(secs * 1e3);
+        self.health.push((packet.frames.t, update.health));
+        let latency_ms = packet.begun.elapsed().as_secs_f64() * 1e3;
+        self.frame_ms.push((packet.frames.t, latency_ms));
+        if let Some(log) = &self.log {
+            log.state(State::new(packet.frames.t, &update, latency_ms));
+        }
     }
 
     fn keyframe_poses(&self) -> List<(Nanos, Pose), FRAMES> {
@@ -179,15 +186,8 @@ impl Back {
     }
 }
 
-/// Appends where there is room; nothing grows during a flight.
-fn keep<T>(list: &mut Vec<T>, item: T) {
-    if list.len() < list.capacity() {
-        list.push(item);
-    }
-}
-
 impl OdometryRun {
-    /// Tracker and estimator of a rig, with room for the poses of so many frames. Fails where the tracker cannot take the rig.
+    /// Tracker and estimator of a rig, with room for so many frames in each list. Fails where the tracker cannot take the rig.
     pub fn new(calibration: &Calibration, board: &Board, frames: usize) -> Result<OdometryRun, Fault> {
         OdometryRun::measured(calibration, board, frames, &mut Footprint::default())
     }
@@ -204,14 +204,14 @@ impl OdometryRun {
         let estimator = || (Vio::new(calibration, &board.vio), Predictor::new(calibration, &board.vio));
         let (vio, predictor) = f.build("tracking: estimator", estimator);
         let bytes = f.total();
-        let trajectory = f.build("tracking: poses of frames", || Vec::with_capacity(frames));
-        let health = f.build("tracking: health of frames", || Vec::with_capacity(frames));
-        let [front_ms, ms] = f.build("tracking: times of frames", || [(); 2].map(|()| Vec::with_capacity(frames)));
-        let frame_ms = f.build("tracking: latencies of frames", || Vec::with_capacity(frames));
+        let trajectory = f.build("tracking: poses of frames", || Thinned::with_capacity(frames));
+        let health = f.build("tracking: health of frames", || Thinned::with_capacity(frames));
+        let [front_ms, ms] = f.build("tracking: times of frames", || [(); 2].map(|()| Thinned::with_capacity(frames)));
+        let frame_ms = f.build("tracking: latencies of frames", || Thinned::with_capacity(frames));
         footprint.extend(f);
         Ok(OdometryRun {
             front: Front { frontend, predictor, ms: front_ms, busy_s: 0.0, cpu_s: None },
-            back: Back { vio, trajectory, ms, busy_s: 0.0, health, frame_ms, cpu_s: None },
+            back: Back { vio, trajectory, ms, busy_s: 0.0, health, frame_ms, cpu_s: None, log: None },
             threads: board.frontend.threads,
             bytes,
         })
@@ -222,13 +222,13 @@ impl OdometryRun {
     pub fn fps(&self) -> Option<f64> {
         let (front, back) = (self.front.busy_s, self.back.busy_s);
         let busy = if self.threads == 1 { front + back } else { front.max(back) };
-        (busy > 0.0).then(|| self.back.ms.len() as f64 / busy)
+        (busy > 0.0).then(|| self.back.ms.seen as f64 / busy)
     }
 
     /// CPU time of all threads of tracking, ms a frame.
     pub fn cpu_ms(&self) -> Option<f64> {
         let total = self.front.cpu_s? + if self.threads == 1 { 0.0 } else { self.back.cpu_s? };
-        let frames = self.back.ms.len();
+        let frames = self.back.ms.seen;
         (frames > 0).then(|| 1e3 * total / frames as f64)
     }
 }
@@ -250,8 +250,7 @@ impl Tracker {
         let Some(run) = self.odometry() else { return vec![] };
         let mut list = run.front.frontend.stats().list();
         // The first frames of a run that starts in motion, and those after a reset.
-        let without = run.back.frame_ms.len().saturating_sub(run.back.trajectory.len());
-        list.push(("frames_without_odometry", without as u64));
+        list.push(("frames_without_odometry", run.back.frame_ms.seen.saturating_sub(run.back.trajectory.seen)));
         list.extend(run.back.vio.stats().list());
         list
     }

@@ -1,6 +1,6 @@
 //! Mapping in a process of its own, so that a GPU driver that crashes, hangs or leaks takes no odometry with it.
 //!
-//! The process that flies starts `stipple map-worker`, tells it everything on its standard input, and hands keyframes over
+//! The process that flies starts `stipple map-worker`, tells it everything on its standard input (TOML), and hands keyframes over
 //! through shared memory (`keyframes`). It looks at the worker fifty times a second: one that has ended is started again,
 //! one that is stopped, hangs or takes too much memory is killed first. A worker that starts again has an empty map, and is
 //! offered the newest keyframes once more. When the run is over the worker writes `map.ply`, evaluates, and answers on its
@@ -195,7 +195,7 @@ impl Worker {
         let (Some(mut tell), Some(answers)) = (child.stdin.take(), child.stdout.take()) else {
             return Err(io::Error::other("it has no pipes"));
         };
-        tell.write_all(&serde_json::to_vec(&setup)?)?;
+        tell.write_all(toml::to_string(&setup).map_err(io::Error::other)?.as_bytes())?;
         drop(tell);
         let told = Arc::new(Mutex::new(Told::default()));
         let (into, now) = (told.clone(), Instant::now());
@@ -383,9 +383,9 @@ fn send(to: &mut impl Write, frame: &[u8]) -> io::Result<()> {
 /// The worker's own work: reads what it has to know from `input`, maps until it is asked to stop, and tells `output`.
 pub fn serve(mut input: impl Read, mut output: impl Write) -> Result<(), Fault> {
     let broken = |e: io::Error| refused(format!("the process that flies cannot be reached: {e}"));
-    let mut text = Vec::new();
-    input.read_to_end(&mut text).map_err(broken)?;
-    let mut setup: Setup = serde_json::from_slice(&text).map_err(|e| {
+    let mut text = String::new();
+    input.read_to_string(&mut text).map_err(broken)?;
+    let mut setup: Setup = toml::from_str(&text).map_err(|e| {
         let what = format!("standard input says nothing that a mapper understands: {e}");
         Fault::new(FaultKind::Usage, "map-worker", what, "it is started by `stipple run`, not by hand")
     })?;

@@ -216,8 +216,7 @@ impl Flight {
 
     fn judge(&self, played: &Flown, flown: usize, strikes: Nanos, ends: Nanos) -> Outcome {
         let run = played.tracker.odometry().expect("flown by odometry");
-        let trajectory: Vec<TimedPose> =
-            run.back.trajectory.iter().map(|o| TimedPose { t: o.t, pose: o.world_from_body }).collect();
+        let trajectory = run.back.trajectory.to_vec();
         let after: Vec<TimedPose> = trajectory.iter().filter(|p| p.t >= ends).copied().collect();
         let ate = |list: &[TimedPose]| trajectory_error(list, &self.truth).map(|e| e.ate_rmse_m);
         let health = &run.back.health;

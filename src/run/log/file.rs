@@ -1,0 +1,202 @@
+//! The files of a log: MCAP, one chunk a sync.
+
+use super::{Clocks, Content, Event, EventKind, Limits, Record};
+use crate::vio::Health;
+use ::mcap::records::MessageHeader;
+use ::mcap::{McapError, WriteOptions, Writer};
+use serde::Serialize;
+use std::collections::BTreeMap;
+use std::fs::{read_dir, File, OpenOptions};
+use std::io;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+use stipple_drivers::{host, Nanos};
+
+/// Topic and schema of each channel; a schema says only what a viewer needs.
+pub const STATE: &str = "/state";
+pub const EVENT: &str = "/event";
+pub const COUNTERS: &str = "/counters";
+pub const CLOCKS: &str = "/clocks";
+const CHANNELS: [(&str, &str, &str); 4] = [
+    (
+        STATE,
+        "stipple.State",
+        r#"{"type":"object","properties":{"t_ns":{"type":"integer"},"estimate":{"type":"object","properties":{
+"p_m":{"type":"array","items":{"type":"number"}},"q_xyzw":{"type":"array","items":{"type":"number"}},
+"v_world":{"type":"array","items":{"type":"number"}},"gyro_bias":{"type":"array","items":{"type":"number"}},
+"accel_bias":{"type":"array","items":{"type":"number"}}}},"health":{"type":"integer"},"quality":{"type":"integer"},
+"keyframe":{"type":"boolean"},"latency_ms":{"type":"number"}}}"#,
+    ),
+    (EVENT, "stipple.Event", r#"{"type":"object","properties":{"kind":{"type":"string"},"text":{"type":"string"}}}"#),
+    (COUNTERS, "stipple.Counters", r#"{"type":"object"}"#),
+    (
+        CLOCKS,
+        "stipple.Clocks",
+        r#"{"type":"object","properties":{"monotonic_ns":{"type":"integer"},"boottime_ns":{"type":"integer"},
+"realtime_ns":{"type":"integer"},"run_ns":{"type":"integer"}}}"#,
+    ),
+];
+const CLOCKS_PERIOD: Duration = Duration::from_secs(60);
+
+fn failed(e: McapError) -> io::Error {
+    match e {
+        McapError::Io(e) => e,
+        other => io::Error::other(other),
+    }
+}
+
+/// Writes log-0000.mcap and so on, after those that are there.
+pub struct LogFiles {
+    dir: PathBuf,
+    limits: Limits,
+    run_ns: i64,
+    clocks_due: Instant,
+    open: Option<Open>,
+    json: Vec<u8>,
+    pub written: Vec<PathBuf>,
+}
+
+struct Open {
+    writer: Writer<File>,
+    /// The writer's, too.
+    file: File,
+    /// Bytes up to the last whole chunk.
+    good: u64,
+    channels: [u16; CHANNELS.len()],
+}
+
+impl LogFiles {
+    pub fn new(dir: PathBuf, limits: Limits) -> LogFiles {
+        let run_ns = Clocks::now(None).realtime_ns;
+        LogFiles { dir, limits, run_ns, clocks_due: Instant::now(), open: None, json: vec![], written: vec![] }
+    }
+
+    /// Begins the next file.
+    pub fn begin(&mut self) -> io::Result<()> {
+        self.needs_room()?;
+        let path = next_file(&self.dir)?;
+        let file = OpenOptions::new().write(true).create_new(true).open(&path)?;
+        // A name is on the disk when its folder is.
+        File::open(&self.dir)?.sync_all()?;
+        // A chunk ends where a sync asks for it, so that what a failure takes back is known.
+        let options = WriteOptions::new().library("stipple").compression(None).disable_seeking(true).chunk_size(None);
+        let mut writer = options.create(file.try_clone()?).map_err(failed)?;
+        let names = Health::NAMES.iter().enumerate().map(|(bit, name)| (format!("health bit {bit}"), name.to_string()));
+        let (names, none) = (names.collect(), BTreeMap::new());
+        let mut channels = [0; CHANNELS.len()];
+        for (id, (topic, name, schema)) in channels.iter_mut().zip(CHANNELS) {
+            let schema = writer.add_schema(name, "jsonschema", schema.as_bytes()).map_err(failed)?;
+            let notes = if topic == STATE { &names } else { &none };
+            *id = writer.add_channel(schema, topic, "json", notes).map_err(failed)?;
+        }
+        self.open = Some(Open { writer, file, good: 0, channels });
+        self.written.push(path);
+        self.tie_clocks()
+    }
+
+    /// Fails where the disk has less room than the floor.
+    fn needs_room(&self) -> io::Result<()> {
+        match host::disk_free(&self.dir) {
+            Some(free) if free < self.limits.free => {
+                let (free, floor) = (free >> 20, self.limits.free >> 20);
+                let place = self.dir.display();
+                Err(io::Error::other(format!("{place} has {free} MiB of free space, and {floor} are kept: make room")))
+            }
+            _ => Ok(()),
+        }
+    }
+
+    fn tie_clocks(&mut self) -> io::Result<()> {
+        self.clocks_due = Instant::now() + CLOCKS_PERIOD;
+        self.message(CLOCKS, host::monotonic(), None, &Clocks::now(Some(self.run_ns)))
+    }
+
+    pub fn write(&mut self, record: &Record) -> io::Result<()> {
+        let at = record.at;
+        match &record.content {
+            Content::State(state) => self.message(STATE, at, Some(state.t_ns), state),
+            Content::Event(kind, text) => {
+                let event = Event { kind: *kind, text: String::from_utf8_lossy(text) };
+                self.message(EVENT, at, None, &event)
+            }
+            Content::Counters(list) => {
+                self.message(COUNTERS, at, None, &list.iter().map(|(name, n)| (name, n)).collect::<BTreeMap<_, _>>())
+            }
+        }
+    }
+
+    fn message(&mut self, topic: &str, at: Nanos, taken: Option<i64>, content: &impl Serialize) -> io::Result<()> {
+        let Some(open) = &mut self.open else { return Ok(()) };
+        self.json.clear();
+        serde_json::to_writer(&mut self.json, content)?;
+        let channel = CHANNELS.iter().position(|c| c.0 == topic).expect("one of CHANNELS");
+        let [log_time, publish_time] = [at.0, taken.unwrap_or(at.0)].map(|t| t.max(0) as u64);
+        let header = MessageHeader { channel_id: open.channels[channel], sequence: 0, log_time, publish_time };
+        open.writer.write_to_known_channel(&header, &self.json).map_err(failed)
+    }
+
+    /// Puts everything on the disk; closes the file where it is full or the log is `over`.
+    pub fn sync(&mut self, over: bool) -> io::Result<()> {
+        if Instant::now() >= self.clocks_due {
+            self.tie_clocks()?;
+        }
+        let Some(open) = &mut self.open else { return Ok(()) };
+        open.writer.flush().map_err(failed)?;
+        open.file.sync_data()?;
+        open.good = open.file.metadata()?.len();
+        let full = open.good >= self.limits.file;
+        if over || full {
+            self.close()?;
+        }
+        if full && !over {
+            self.begin()?;
+        }
+        Ok(())
+    }
+
+    /// Ends the log where the disk has less room than the floor, and fails then.
+    pub fn leave_room(&mut self) -> io::Result<()> {
+        let Err(why) = self.needs_room() else { return Ok(()) };
+        let text = why.to_string().into();
+        self.message(EVENT, host::monotonic(), None, &Event { kind: EventKind::Disk, text })?;
+        self.close()?;
+        Err(why)
+    }
+
+    fn close(&mut self) -> io::Result<()> {
+        let Some(open) = &mut self.open else { return Ok(()) };
+        open.writer.flush().map_err(failed)?;
+        open.good = open.file.metadata()?.len();
+        open.writer.finish().map_err(failed)?;
+        open.file.sync_all()?;
+        self.open = None;
+        Ok(())
+    }
+
+    /// Leaves the file as it was after its last whole chunk.
+    pub fn give_up(&mut self) {
+        if let Some(Open { writer, file, good, .. }) = self.open.take() {
+            drop(writer.into_inner());
+            // A disk that refuses this leaves a cut chunk, which readers pass over.
+            let _ = file.set_len(good).and_then(|()| file.sync_all());
+        }
+    }
+}
+
+/// Numbers and names of the logs in a folder, in order.
+pub fn logs(dir: &Path) -> io::Result<Vec<(u64, PathBuf)>> {
+    let number = |name: &str| name.strip_prefix("log-")?.strip_suffix(".mcap")?.parse().ok();
+    let mut found = vec![];
+    for entry in read_dir(dir)? {
+        let entry = entry?;
+        found.extend(number(&entry.file_name().to_string_lossy()).map(|n: u64| (n, entry.path())));
+    }
+    found.sort();
+    Ok(found)
+}
+
+/// The name of the next log in a folder.
+fn next_file(dir: &Path) -> io::Result<PathBuf> {
+    let next = logs(dir)?.last().map_or(0, |(n, _)| n + 1);
+    Ok(dir.join(format!("log-{next:04}.mcap")))
+}

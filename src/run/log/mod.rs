@@ -1,0 +1,324 @@
+//! The log of a run: what it knew, on the disk while it goes on, so that a run that dies loses a second.
+//!
+//! ```text
+//! any thread -> queue of fixed size -> thread `log` -> DIR/log-0000.mcap, DIR/log-0001.mcap, ..
+//! ```
+//!
+//! A push neither waits nor allocates; what finds the queue full is counted. Files are appended to, synced each
+//! `SYNC_PERIOD`, rotated by size, and never removed or overwritten: another run in the same folder numbers on, and each file
+//! names its run. Where the disk has less room than a floor, or refuses a write, logging ends, with a notice and a counter;
+//! what was written stays as it is and the run goes on. MCAP with messages in JSON: Foxglove and `mcap cat --json` show it,
+//! and at 30 Hz it takes 18 kB/s.
+
+mod file;
+pub mod read;
+#[cfg(test)]
+mod tests;
+
+use crate::mem::{Footprint, List};
+use crate::vio::{Odometry, Update};
+use crossbeam_queue::ArrayQueue;
+use file::LogFiles;
+use serde::{Deserialize, Serialize};
+use std::borrow::Cow;
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+use stipple_drivers::counters::Counter;
+use stipple_drivers::{counters, host, Nanos, Pose};
+
+/// Records that may wait for the disk: two minutes at 30 Hz. A card that stalls, stalls for seconds.
+const QUEUE: usize = 4096;
+/// The longest text of an event, bytes; the rest is cut off.
+const TEXT: usize = 200;
+/// A cut-off run loses what came since the last sync, and the sync may take as long again.
+const SYNC_PERIOD: Duration = Duration::from_millis(500);
+/// A process whose thread panicked has ended within a second.
+const PANIC_MAX: Duration = Duration::from_millis(700);
+const POLL_PERIOD: Duration = Duration::from_millis(50);
+/// Nice value of the thread: as the recorder's, after sensors and odometry.
+const NICE: i32 = 5;
+
+/// When a file is full, and when the disk is, bytes.
+#[derive(Clone, Copy, Debug)]
+pub struct Limits {
+    pub file: u64,
+    /// Space that is left to others, and to what a run writes at its end.
+    pub free: u64,
+}
+
+/// An hour of a camera at 30 Hz is one file.
+pub const LIMITS: Limits = Limits { file: 64 << 20, free: 64 << 20 };
+
+counters! {
+    struct Counts of Counter, read by Counter::get;
+    /// Records on the disk; records lost, since the queue was full or logging had ended.
+    log_records_written,
+    log_records_lost,
+    /// Files begun, and times that logging ended before the run did.
+    log_files,
+    log_ended_early,
+}
+
+/// The estimate of a state, as a log has it: the fields of `Odometry`.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Estimate {
+    pub p_m: [f64; 3],
+    /// World from body, w last.
+    pub q_xyzw: [f64; 4],
+    pub v_world: [f64; 3],
+    pub gyro_bias: [f64; 3],
+    pub accel_bias: [f64; 3],
+}
+
+impl From<&Odometry> for Estimate {
+    fn from(o: &Odometry) -> Estimate {
+        Estimate {
+            p_m: o.world_from_body.p.to_array(),
+            q_xyzw: o.world_from_body.q.to_array(),
+            v_world: o.v_world.to_array(),
+            gyro_bias: o.gyro_bias.to_array(),
+            accel_bias: o.accel_bias.to_array(),
+        }
+    }
+}
+
+impl Estimate {
+    pub fn pose(&self) -> Pose {
+        Pose { q: glam::DQuat::from_array(self.q_xyzw), p: self.p_m.into() }
+    }
+}
+
+/// One frame, with a pose or without.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct State {
+    /// Mid-exposure, in the clock of the frames.
+    pub t_ns: i64,
+    pub estimate: Option<Estimate>,
+    /// The bits of `Health`, which the channel names.
+    pub health: u32,
+    pub quality: u8,
+    pub keyframe: bool,
+    /// From when the front end took the frame until its pose was there, ms.
+    pub latency_ms: f64,
+}
+
+impl State {
+    pub fn new(t: Nanos, update: &Update, latency_ms: f64) -> State {
+        let estimate = update.odometry.as_ref().map(Estimate::from);
+        let (health, quality, keyframe) = (update.health.0, update.quality, update.keyframe);
+        State { t_ns: t.0, estimate, health, quality, keyframe, latency_ms }
+    }
+}
+
+/// What an event is about.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum EventKind {
+    Start,
+    /// A sensor was lost or came back.
+    Sensor,
+    /// A thread hangs, or the system refuses what a run asks for.
+    System,
+    Map,
+    /// Logging ends before the run does.
+    Disk,
+    /// A thread panicked: the process ends.
+    Panic,
+    End,
+}
+
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Event<'a> {
+    pub kind: EventKind,
+    pub text: Cow<'a, str>,
+}
+
+/// Ties the clocks to one another, and a file to its run. First in each file, and once a minute.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Clocks {
+    pub monotonic_ns: i64,
+    /// Goes on in suspend.
+    pub boottime_ns: i64,
+    /// Since 1970, UTC, as far as the machine knows.
+    pub realtime_ns: i64,
+    /// When the run began: `realtime_ns` then.
+    pub run_ns: i64,
+}
+
+impl Clocks {
+    fn now(run_ns: Option<i64>) -> Clocks {
+        let [monotonic_ns, boottime_ns, realtime_ns] = host::clocks().map(|t| t.0);
+        Clocks { monotonic_ns, boottime_ns, realtime_ns, run_ns: run_ns.unwrap_or(realtime_ns) }
+    }
+}
+
+enum Content {
+    State(State),
+    Event(EventKind, List<u8, TEXT>),
+    /// From a thread that may allocate; none that is zero.
+    Counters(Vec<(Cow<'static, str>, u64)>),
+}
+
+struct Record {
+    at: Nanos,
+    content: Content,
+}
+
+/// What the threads of a run and the log's share.
+pub struct Queue {
+    records: ArrayQueue<Record>,
+    over: AtomicBool,
+    /// Its thread has ended.
+    closed: AtomicBool,
+    counts: Counts,
+    /// Why logging ended early.
+    notice: OnceLock<String>,
+}
+
+impl Queue {
+    pub fn measured(footprint: &mut Footprint) -> Queue {
+        let records = footprint.build("queues: log", || ArrayQueue::new(QUEUE));
+        Queue { records, over: false.into(), closed: false.into(), counts: Counts::default(), notice: OnceLock::new() }
+    }
+
+    fn push(&self, content: Content) {
+        let full = self.records.push(Record { at: host::monotonic(), content }).is_err();
+        self.counts.log_records_lost.add(u64::from(full));
+    }
+}
+
+/// Where the threads of a run hand over what is logged.
+#[derive(Clone)]
+pub struct LogSender(Arc<Queue>);
+
+impl LogSender {
+    pub fn state(&self, state: State) {
+        self.0.push(Content::State(state));
+    }
+
+    pub fn event(&self, kind: EventKind, text: &str) {
+        let mut cut = List::default();
+        let end = (0..=TEXT.min(text.len())).rev().find(|i| text.is_char_boundary(*i)).unwrap_or(0);
+        for byte in &text.as_bytes()[..end] {
+            let _ = cut.push(*byte);
+        }
+        self.0.push(Content::Event(kind, cut));
+    }
+
+    /// Counters as they stand; from a thread that may allocate.
+    pub fn counters(&self, mut list: Vec<(Cow<'static, str>, u64)>) {
+        list.retain(|(_, n)| *n > 0);
+        self.0.push(Content::Counters(list));
+    }
+
+    /// Why logging ended early, where it did.
+    pub fn notice(&self) -> Option<&str> {
+        self.0.notice.get().map(String::as_str)
+    }
+}
+
+/// A log being written.
+pub struct Log {
+    queue: Arc<Queue>,
+    /// `None` once it was waited for.
+    thread: Option<JoinHandle<Vec<PathBuf>>>,
+}
+
+impl Drop for Log {
+    fn drop(&mut self) {
+        self.end();
+    }
+}
+
+impl Log {
+    /// Begins the log of a run in `dir`. A log that cannot be written is a notice, and no reason not to fly.
+    pub fn start(dir: PathBuf, limits: Limits, what: &str) -> Log {
+        let queue = Arc::new(Queue::measured(&mut Footprint::default()));
+        let shared = queue.clone();
+        LogSender(queue.clone()).event(EventKind::Start, what);
+        let thread = super::start("log", move || {
+            host::lower_priority(NICE);
+            let files = write(&shared, LogFiles::new(dir, limits));
+            shared.closed.store(true, Ordering::Release);
+            files
+        });
+        *lock_last() = Some(queue.clone());
+        Log { queue, thread: Some(thread) }
+    }
+
+    pub fn sender(&self) -> LogSender {
+        LogSender(self.queue.clone())
+    }
+
+    /// Waits until everything is on the disk, adds the counters of the log, and answers its files.
+    pub fn finish(mut self, counters: &mut Vec<(&'static str, u64)>) -> Vec<PathBuf> {
+        let files = self.end();
+        counters.extend(self.queue.counts.list());
+        files
+    }
+
+    fn end(&mut self) -> Vec<PathBuf> {
+        self.queue.over.store(true, Ordering::Release);
+        let Some(thread) = self.thread.take() else { return vec![] };
+        thread.thread().unpark();
+        thread.join().unwrap_or_default()
+    }
+}
+
+/// The log that was begun last.
+static LAST: Mutex<Option<Arc<Queue>>> = Mutex::new(None);
+
+fn lock_last() -> MutexGuard<'static, Option<Arc<Queue>>> {
+    LAST.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// Ends the log with a panic, and waits until it is on the disk, or for `PANIC_MAX`.
+pub fn close_for_panic(what: &str) {
+    let Some(queue) = LAST.try_lock().ok().and_then(|last| last.clone()) else { return };
+    LogSender(queue.clone()).event(EventKind::Panic, what);
+    queue.over.store(true, Ordering::Release);
+    let limit = Instant::now() + PANIC_MAX;
+    while !queue.closed.load(Ordering::Acquire) && Instant::now() < limit {
+        std::thread::sleep(POLL_PERIOD / 10);
+    }
+}
+
+/// Thread `log`: answers the files it wrote.
+fn write(queue: &Queue, mut files: LogFiles) -> Vec<PathBuf> {
+    let counts = &queue.counts;
+    let (mut due, mut ended, mut unsynced) = (Instant::now() + SYNC_PERIOD, files.begin().err(), 0);
+    loop {
+        // Read before the queue, so that what came last is still written.
+        let over = queue.over.load(Ordering::Acquire);
+        // At most what the queue holds, so that the next sync is not put off.
+        for record in std::iter::from_fn(|| queue.records.pop()).take(QUEUE) {
+            unsynced += 1;
+            if ended.is_none() {
+                ended = files.write(&record).err();
+            }
+        }
+        if ended.is_none() && (over || Instant::now() >= due) {
+            ended = files.sync(over).err();
+            due = Instant::now() + SYNC_PERIOD;
+            if ended.is_none() {
+                counts.log_records_written.add(std::mem::take(&mut unsynced));
+                ended = files.leave_room().err();
+            }
+        }
+        if let Some(why) = &ended {
+            counts.log_records_lost.add(std::mem::take(&mut unsynced));
+            if queue.notice.set(format!("the log of this run ended early: {why}")).is_ok() {
+                counts.log_ended_early.add(1);
+                files.give_up();
+            }
+        }
+        if over {
+            counts.log_files.add(files.written.len() as u64);
+            return files.written;
+        }
+        std::thread::park_timeout(POLL_PERIOD);
+    }
+}

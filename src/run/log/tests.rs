@@ -1,0 +1,189 @@
+//! Logs that are whole, cut off anywhere, and on a disk that is full.
+#![allow(clippy::unwrap_used)]
+
+#[path = "../../../tests/program/small_disk.rs"]
+mod small_disk;
+
+use super::read::{read_files, runs, Message};
+use super::*;
+use crate::output::OutputDir;
+use crate::run::summary::write_trajectory;
+use small_disk::on_a_small_disk;
+use std::fs;
+use std::path::Path;
+use stipple_drivers::TimedPose;
+
+const LARGE: Limits = Limits { file: 1 << 30, free: 0 };
+
+/// Frame i at 20 Hz; the first five have no pose.
+fn state(i: u64) -> State {
+    // Of few digits: JSON is parsed to the last bit but one.
+    let x = 0.5 + i as f64 / 4.0;
+    let estimate = Estimate {
+        p_m: [x, -x, 0.0],
+        q_xyzw: [0.0, 0.6, 0.0, 0.8],
+        v_world: [x; 3],
+        gyro_bias: [1e-3; 3],
+        accel_bias: [0.1; 3],
+    };
+    let estimate = (i >= 5).then_some(estimate);
+    State { t_ns: i as i64 * 50_000_000, estimate, health: 1, quality: 90, keyframe: i % 5 == 0, latency_ms: 4.5 }
+}
+
+/// Logs frames, so many between syncs, and answers the files and the counters.
+fn log(dir: &Path, limits: Limits, frames: &[u64], between: usize) -> (Vec<PathBuf>, Vec<(&'static str, u64)>) {
+    let log = Log::start(dir.into(), limits, "a test");
+    let sender = log.sender();
+    for (i, batch) in frames.chunks(between).enumerate() {
+        std::thread::sleep((SYNC_PERIOD + 3 * POLL_PERIOD) * i.min(1) as u32);
+        batch.iter().for_each(|i| sender.state(state(*i)));
+    }
+    sender.counters(vec![("frames".into(), 7), ("resets".into(), 0)]);
+    sender.event(EventKind::End, "over");
+    let mut counters = vec![];
+    let files = log.finish(&mut counters);
+    (files, counters)
+}
+
+fn some(frames: std::ops::Range<u64>) -> Vec<u64> {
+    frames.collect()
+}
+
+fn states(files: &[PathBuf]) -> Vec<State> {
+    let mut found = vec![];
+    let each = |_, message: Message| {
+        if let Message::State(s) = message {
+            found.push(s);
+        }
+        Ok(())
+    };
+    read_files(files, each).unwrap();
+    found
+}
+
+fn count(counters: &[(&str, u64)], name: &str) -> u64 {
+    counters.iter().find(|(n, _)| *n == name).unwrap().1
+}
+
+#[test]
+fn what_was_logged_is_read_back_across_files_and_runs() {
+    let dir = tempfile::tempdir().unwrap();
+    // Full at once: each sync begins another.
+    let small = Limits { file: 1, free: 0 };
+    let (first, counters) = log(dir.path(), small, &some(0..3), 1);
+    assert!(first.len() >= 3 && count(&counters, "log_files") == first.len() as u64, "{first:?}");
+    assert_eq!((count(&counters, "log_records_written"), count(&counters, "log_records_lost")), (6, 0));
+    let (second, _) = log(dir.path(), LARGE, &some(3..300), 4000);
+    let found = runs(dir.path()).unwrap();
+    assert_eq!(found.iter().map(|r| r.files.clone()).collect::<Vec<_>>(), [first.clone(), second.clone()]);
+    assert!(found[0].run_ns < found[1].run_ns);
+    assert!(states(&[first, second.clone()].concat()).into_iter().eq((0..300).map(state)));
+    let mut rest = vec![];
+    let each = |_, message: Message| {
+        rest.extend((!matches!(message, Message::State(_))).then(|| format!("{message:?}")));
+        Ok(())
+    };
+    read_files(&second, each).unwrap();
+    assert!(rest[0].starts_with("Clocks(") && rest[1].contains("Start") && rest[1].contains("a test"), "{rest:?}");
+    assert!(rest[2] == r#"Counters({"frames": 7})"# && rest[3].contains("End"), "{rest:?}");
+}
+
+#[test]
+fn a_log_cut_off_at_any_byte_gives_every_whole_message_before_it() {
+    let dir = tempfile::tempdir().unwrap();
+    let (files, _) = log(dir.path(), LARGE, &some(0..500), 4000);
+    let whole = fs::read(&files[0]).unwrap();
+    // The end of the messages, in the one chunk; summary and index come after.
+    let needle = b"\"latency_ms\":4.5}";
+    let ends: Vec<usize> =
+        (0..whole.len() - needle.len()).filter(|i| whole[*i..].starts_with(needle)).map(|i| i + needle.len()).collect();
+    assert_eq!(ends.len(), 500);
+    let cut = dir.path().join("log-0001.mcap");
+    let from = (ends[499] - 4096..ends[499] + 64).chain(whole.len() - 4096..whole.len()).chain(0..400);
+    for bytes in from {
+        fs::write(&cut, &whole[..bytes]).unwrap();
+        let found = states(std::slice::from_ref(&cut));
+        assert_eq!(found.len(), ends.iter().filter(|end| **end <= bytes).count(), "cut to {bytes} bytes");
+    }
+}
+
+#[test]
+fn damage_and_what_is_no_log_are_passed_over() {
+    let dir = tempfile::tempdir().unwrap();
+    let (files, _) = log(dir.path(), LARGE, &some(0..100), 4000);
+    let mut bytes = fs::read(&files[0]).unwrap();
+    let mut seed = 1u32;
+    for at in (100..bytes.len()).step_by(211) {
+        seed = seed.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+        let was = std::mem::replace(&mut bytes[at], (seed >> 24) as u8);
+        let path = dir.path().join("log-0001.mcap");
+        fs::write(&path, &bytes).unwrap();
+        assert!(states(&[path]).len() <= 100);
+        bytes[at] = was;
+    }
+    fs::write(dir.path().join("log-0001.mcap"), b"").unwrap();
+    fs::write(dir.path().join("log-x.mcap"), b"no number").unwrap();
+    let pipe = dir.path().join("log-0007.mcap");
+    assert!(std::process::Command::new("mkfifo").arg(&pipe).status().unwrap().success());
+    assert_eq!(runs(dir.path()).unwrap().len(), 1);
+    let (next, _) = log(dir.path(), LARGE, &some(0..1), 4000);
+    assert_eq!(next, [dir.path().join("log-0008.mcap")]);
+}
+
+#[test]
+fn a_full_disk_ends_the_log_and_keeps_every_record_before() {
+    on_a_small_disk("1m", "run::log::tests::a_full_disk_ends_the_log_and_keeps_every_record_before", |disk| {
+        // 150 kB a sync.
+        let (files, counters) = log(disk, LARGE, &some(0..5000), 500);
+        let (written, lost) = (count(&counters, "log_records_written"), count(&counters, "log_records_lost"));
+        assert_eq!((files.len(), count(&counters, "log_ended_early"), written + lost), (1, 1, 5003), "{counters:?}");
+        let found = states(&files);
+        // And the event of its start.
+        assert!(written > 2000 && found.len() as u64 + 1 == written, "{} of {written}", found.len());
+        assert!(found.iter().enumerate().all(|(i, found)| *found == state(i as u64)));
+        assert_eq!(fs::read_dir(disk).unwrap().count(), 1, "no file for each record that fails");
+    });
+}
+
+#[test]
+fn a_disk_under_the_floor_is_left_alone() {
+    let dir = tempfile::tempdir().unwrap();
+    let log = Log::start(dir.path().into(), Limits { file: 1 << 20, free: u64::MAX }, "a test");
+    let sender = log.sender();
+    sender.state(state(0));
+    let mut counters = vec![];
+    assert!(log.finish(&mut counters).is_empty());
+    assert_eq!((count(&counters, "log_records_lost"), fs::read_dir(dir.path()).unwrap().count()), (2, 0));
+    assert!(sender.notice().unwrap().contains("make room"), "{:?}", sender.notice());
+}
+
+#[test]
+fn a_full_queue_loses_and_counts_and_never_waits() {
+    let queue = Arc::new(Queue::measured(&mut Footprint::default()));
+    let sender = LogSender(queue.clone());
+    (0..QUEUE as u64 + 10).for_each(|i| sender.state(state(i)));
+    // Cut where a character begins.
+    sender.event(EventKind::Sensor, &"ü".repeat(TEXT));
+    assert_eq!((queue.records.len(), queue.counts.log_records_lost.get()), (QUEUE, 11));
+    while queue.records.pop().is_some() {}
+    sender.event(EventKind::Sensor, &format!("a{}", "ü".repeat(TEXT)));
+    let Content::Event(_, text) = queue.records.pop().unwrap().content else { panic!("an event") };
+    assert_eq!(String::from_utf8(text.to_vec()).unwrap(), format!("a{}", "ü".repeat(TEXT / 2 - 1)));
+}
+
+#[test]
+fn a_long_run_takes_its_trajectory_from_the_log_and_what_came_after_from_memory() {
+    let dir = tempfile::tempdir().unwrap();
+    let (files, _) = log(dir.path(), LARGE, &some(0..1000), 4000);
+    let timed = |i: u64| TimedPose { t: Nanos(state(i).t_ns), pose: state(i).estimate.unwrap().pose() };
+    let out = OutputDir::create(dir.path()).unwrap();
+    let of = |whole: bool, kept: Vec<TimedPose>, files: &[PathBuf]| {
+        write_trajectory(whole, &kept, files, &out).unwrap();
+        fs::read_to_string(dir.path().join("trajectory.tum")).unwrap()
+    };
+    // The memory of a run of 1200 frames, of which 1000 were logged, and of which it has one in 16.
+    let thinned: Vec<TimedPose> = (5..1200).step_by(16).map(timed).collect();
+    let expected = (5..1000).chain(thinned.iter().map(|p| p.t.0 as u64 / 50_000_000).filter(|i| *i >= 1000));
+    assert_eq!(of(false, thinned.clone(), &files), of(true, expected.map(timed).collect(), &[]));
+    assert_eq!(of(false, thinned.clone(), &[]), of(true, thinned, &[]));
+}

@@ -1,0 +1,127 @@
+//! The log of a run, and what `stipple recover` makes of it: after an end, after SIGKILL at any moment, and on a disk that is full.
+#![allow(clippy::unwrap_used)]
+
+mod program;
+#[path = "program/small_disk.rs"]
+mod small_disk;
+
+use program::{flight, stipple, text, BOARD};
+use serde_json::Value;
+use small_disk::on_a_small_disk;
+use std::fs;
+use std::io::{BufRead, BufReader};
+use std::path::Path;
+use std::process::{Command, Output, Stdio};
+use std::time::Duration;
+
+fn fly(what: &[&str], out: &Path) -> Command {
+    let mut command = stipple();
+    let more = ["--board", BOARD, "--set", "map.enabled=false", "--out", out.to_str().unwrap()];
+    command.args(what).args(more);
+    command
+}
+
+fn recover(out: &Path) -> Output {
+    stipple().args(["recover", out.to_str().unwrap()]).output().unwrap()
+}
+
+fn poses(out: &Path) -> usize {
+    fs::read_to_string(out.join("trajectory.tum")).unwrap().lines().skip(1).count()
+}
+
+fn report(out: &Path) -> Value {
+    serde_json::from_slice(&fs::read(out.join("report.json")).unwrap()).unwrap()
+}
+
+#[test]
+fn a_log_gives_the_trajectory_that_the_run_wrote() {
+    let dir = tempfile::tempdir().unwrap();
+    let (data, out) = (flight(dir.path(), "3"), dir.path().join("out"));
+    let o = fly(&["replay", data.to_str().unwrap(), "--pace", "lockstep"], &out).output().unwrap();
+    assert!(o.status.success(), "{}", text(&o));
+    let r = report(&out);
+    let counts =
+        ["log_records_lost", "log_ended_early", "log_files"].map(|n| r[format!("count_{n}")].as_u64().unwrap());
+    assert_eq!((counts, &r["heap_after_seal"]), ([0, 0, 1], &0.into()));
+    let tum = out.join("trajectory.tum");
+    let wrote = fs::read(&tum).unwrap();
+    // What a run wrote at its end stays, though it were changed.
+    fs::write(&tum, b"mine").unwrap();
+    let o = recover(&out);
+    assert!(text(&o).contains("stays as it is") && fs::read(&tum).unwrap() == b"mine", "{}", text(&o));
+    fs::remove_file(&tum).unwrap();
+    let o = recover(&out);
+    assert!(
+        o.status.success()
+            && text(&o).contains(" 61 frames")
+            && text(&o).contains(": 3.0 s, ")
+            && text(&o).contains("ended: "),
+        "{}",
+        text(&o)
+    );
+    assert!(fs::read(&tum).unwrap() == wrote);
+    // Another run in the same folder loses nothing of the one before.
+    let o = fly(&["run", "--dataset", data.to_str().unwrap(), "--duration", "2"], &out).output().unwrap();
+    assert!(o.status.success(), "{}", text(&o));
+    assert!(out.join("log-0001.mcap").is_file());
+    assert!(recover(&out).status.success() && poses(&out) < 45);
+    assert!(fs::read(out.join("trajectory-log-0000.tum")).unwrap() == wrote);
+}
+
+#[test]
+fn a_killed_run_is_recovered_but_for_its_last_second() {
+    let dir = tempfile::tempdir().unwrap();
+    let (data, out) = (flight(dir.path(), "8"), dir.path().join("out"));
+    for pause_ms in [0, 130, 370] {
+        let _ = fs::remove_dir_all(&out);
+        let mut child = fly(&["run", "--dataset", data.to_str().unwrap()], &out)
+            .stdout(Stdio::null())
+            .stderr(Stdio::piped())
+            .spawn()
+            .unwrap();
+        // One line a second: "3.0 of 8.0 s: 57 frames, ..".
+        let lines = BufReader::new(child.stderr.take().unwrap()).lines().map_while(Result::ok);
+        let frames = |line: String| line.split_once(" s: ")?.1.split_once(" frames")?.0.parse::<u64>().ok();
+        let frames = lines.filter_map(frames).find(|n| *n >= 30).unwrap();
+        std::thread::sleep(Duration::from_millis(1000 + pause_ms));
+        child.kill().unwrap();
+        child.wait().unwrap();
+        assert!(!out.join("trajectory.tum").exists());
+        let o = recover(&out);
+        let said = text(&o);
+        assert!(o.status.success() && said.contains("cut off without an end"), "{said}");
+        let logged: u64 = said.split_once(" frames").unwrap().0.rsplit_once(' ').unwrap().1.parse().unwrap();
+        assert!(logged >= frames, "{frames} a second before the end: {said}");
+        assert!(logged < 10 + poses(&out) as u64, "{said}");
+    }
+}
+
+#[test]
+fn a_folder_without_a_log_is_told_so() {
+    let dir = tempfile::tempdir().unwrap();
+    for (place, code) in [(dir.path().join("no"), 66), (dir.path().to_path_buf(), 65)] {
+        let o = recover(&place);
+        assert_eq!(o.status.code(), Some(code), "{}", text(&o));
+    }
+    assert!(!dir.path().join("no").exists());
+}
+
+/// A disk with a little more room than the log leaves to others: the log ends, and the run does not.
+#[test]
+fn a_disk_that_fills_ends_the_log_and_not_the_run() {
+    on_a_small_disk("65600k", "a_disk_that_fills_ends_the_log_and_not_the_run", |disk| {
+        let dir = tempfile::tempdir().unwrap();
+        let (data, out) = (flight(dir.path(), "8"), disk.join("out"));
+        let o = fly(&["run", "--dataset", data.to_str().unwrap()], &out).output().unwrap();
+        let (r, said) = (report(&out), text(&o));
+        assert!(o.status.success() && said.matches("the log of this run ended early").count() == 1, "{said}");
+        assert!(said.contains("are kept: make room") && r["count_log_ended_early"] == 1, "{said}");
+        let lost = r["count_log_records_lost"].as_u64().unwrap();
+        assert!(lost > 20 && r["frames"].as_u64().unwrap() > 100 && poses(&out) > 90, "{said}");
+        // All that was written is there, and says why there is no more.
+        fs::remove_file(out.join("trajectory.tum")).unwrap();
+        let o = recover(&out);
+        assert!(o.status.success() && text(&o).contains("make room"), "{}", text(&o));
+        assert!(poses(&out) > 10, "{}", text(&o));
+    });
+}
