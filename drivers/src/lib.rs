@@ -20,6 +20,7 @@ pub mod host;
 pub mod imu;
 pub mod inject;
 pub mod input;
+mod jpeg_scan;
 pub mod list;
 pub mod paced;
 pub mod record;

@@ -104,3 +104,11 @@ fn files_are_read_up_to_their_limit_and_what_says_no_size_is_too() {
     assert_eq!(fs::metadata(endless).unwrap().size(), 0);
     assert!(input::read(endless, 10, &mut bytes).unwrap_err().to_string().contains("10 at most"));
 }
+
+/// A JPEG whose decoder stops half way and says that all is well: found by `make fuzz`.
+#[test]
+fn no_image_shows_a_part_of_the_image_before_it() {
+    let f = Folder::new();
+    f.write(&format!("cam0/data/{T0}.png"), include_bytes!("folder/broken_scan.jpg"));
+    first_image(&f, ImageFault::Undecodable, "breaks off");
+}

@@ -6,6 +6,7 @@
 use super::findings::{Findings, ReplayCounters};
 use super::pairing::{FrameFiles, ImageFile};
 use crate::input;
+use crate::jpeg_scan::check_whole;
 use crate::types::{luma, Colour, Frames, Image};
 use std::fmt;
 use std::io::{Cursor, ErrorKind};
@@ -175,6 +176,7 @@ fn read_png(bytes: &[u8], decoded: &mut Vec<u8>, out: &mut Image, colour: Option
 
 /// A decoder to the colour space `space`, whose headers are read and checked.
 fn jpeg_decoder<'a>(bytes: &'a [u8], space: ColorSpace, out: &Image) -> Result<JpegDecoder<ZCursor<&'a [u8]>>, Why> {
+    check_whole(bytes).map_err(undecodable)?;
     let options = DecoderOptions::default().set_strict_mode(true).jpeg_set_out_colorspace(space);
     let mut decoder = JpegDecoder::new_with_options(ZCursor::new(bytes), options);
     decoder.decode_headers().map_err(undecodable)?;

@@ -1,6 +1,7 @@
 //! A picture as a camera's driver gives it, to 8-bit grey: the only copy between the kernel's buffer and the tracker. Deeper
 //! pixels keep their high bits, colour pictures the camera's own luma.
 
+use crate::jpeg_scan::check_whole;
 use crate::types::Image;
 use serde::{Deserialize, Serialize};
 use zune_jpeg::zune_core::bytestream::ZCursor;
@@ -177,13 +178,10 @@ fn packed<const N: usize>(row: &[u8], x: usize, to: &mut [u8]) {
     (N * whole..to.len()).for_each(|i| to[i] = row[(x + i) + (x + i) / N]);
 }
 
-/// Decodes a JPEG, strictly: half a picture is an error and not a picture whose rest is grey. The decoder forgives a last row
-/// that is cut, so the marker at the end is looked for, which nothing inside coded pixels looks like. Padding may follow it.
+/// Decodes a JPEG, strictly: half a picture is an error and not a picture whose rest is grey, or the last picture's.
 fn decode(bytes: &[u8], part: Part, scratch: &mut Vec<u8>, out: &mut Image) -> Result<(), Unreadable> {
     let undecodable = |e: &dyn std::fmt::Display| Unreadable::Undecodable(e.to_string());
-    if !bytes.windows(2).rev().any(|w| w == [0xff, 0xd9]) {
-        return Err(undecodable(&"it is cut: there is no marker of its end"));
-    }
+    check_whole(bytes).map_err(|what| undecodable(&what))?;
     let options = DecoderOptions::default().set_strict_mode(true).jpeg_set_out_colorspace(ColorSpace::Luma);
     let mut decoder = JpegDecoder::new_with_options(ZCursor::new(bytes), options);
     decoder.decode_headers().map_err(|e| undecodable(&e))?;
