@@ -21,7 +21,7 @@ HIL_PACKAGES := busybox-static cpio gpiod i2c-tools kmod linux-headers-amd64 qem
 
 OUT ?= out/demo
 
-.PHONY: demo test hil test-onnx soak bench-odometry lint deps
+.PHONY: demo test hil test-onnx soak fuzz bench-odometry lint deps
 
 demo: deps
 	cargo build --release --locked
@@ -51,6 +51,11 @@ test-onnx:
 MINUTES ?= 5
 soak: deps
 	STIPPLE_SOAK_MINUTES=$(MINUTES) cargo test --locked --test soak -- --ignored --nocapture --test-threads 1
+
+# Inputs guided by coverage for everything that reads files of strangers, SECONDS each. TARGETS="tables image" are some.
+SECONDS ?= 60
+fuzz: deps
+	tests/fuzz/run $(SECONDS) $(TARGETS)
 
 # Times of each stage of tracker and estimator, and frames a second on one thread and on two; a minute and a half.
 bench-odometry: deps

@@ -387,3 +387,10 @@ fn calib_check_detects_a_row_of_vertical_misalignment() {
     // In rectified pixels, which are a little larger or smaller than raw ones.
     assert!((rows + 1.0).abs() < 0.25 && said.contains("warn"), "{said}");
 }
+
+/// Faults are for recordings: a run with the board's own sensors takes none, whatever is asked.
+#[test]
+fn no_faults_are_injected_into_live_sensors() {
+    let o = stipple(&["run", "--board", BOARD, "--inject", "faults.toml"]);
+    assert!(o.status.code() == Some(USAGE) && text(&o).contains("--dataset"), "{}", text(&o));
+}
