@@ -112,3 +112,11 @@ fn no_image_shows_a_part_of_the_image_before_it() {
     f.write(&format!("cam0/data/{T0}.png"), include_bytes!("folder/broken_scan.jpg"));
     first_image(&f, ImageFault::Undecodable, "breaks off");
 }
+
+/// A palette of 49 bytes made the decoder panic: found by `make fuzz`.
+#[test]
+fn a_broken_palette_is_an_error_and_no_panic() {
+    let f = Folder::new();
+    f.write(&format!("cam0/data/{T0}.png"), include_bytes!("folder/broken_palette.png"));
+    first_image(&f, ImageFault::Undecodable, "palette is broken");
+}

@@ -146,11 +146,24 @@ fn check_size(width: usize, height: usize, out: &Image) -> Result<(), Why> {
     Err((ImageFault::WrongSize, what))
 }
 
+/// Refuses a palette that the decoder does not look at before it takes colours from it: more than 256, parts of one, or fewer
+/// colours than transparencies.
+fn check_palette(info: &png::Info) -> Result<(), Why> {
+    let bytes = |chunk: &Option<std::borrow::Cow<[u8]>>| chunk.as_ref().map_or(0, |c| c.len());
+    let (palette, transparencies) = (bytes(&info.palette), bytes(&info.trns));
+    let is_sound = palette % 3 == 0 && palette <= 3 * 256 && transparencies <= palette / 3;
+    match info.color_type == png::ColorType::Indexed && !is_sound {
+        true => Err(undecodable("its palette is broken")),
+        false => Ok(()),
+    }
+}
+
 fn read_png(bytes: &[u8], decoded: &mut Vec<u8>, out: &mut Image, colour: Option<&mut Colour>) -> Result<(), Why> {
     let mut decoder = png::Decoder::new(Cursor::new(bytes));
     decoder.set_transformations(png::Transformations::EXPAND | png::Transformations::STRIP_16);
     let mut reader = decoder.read_info().map_err(undecodable)?;
     check_size(reader.info().width as usize, reader.info().height as usize, out)?;
+    check_palette(reader.info())?;
     let channels = reader.output_color_type().0.samples();
     if channels == 1 {
         reader.next_frame(&mut out.pixels).map_err(undecodable)?;
