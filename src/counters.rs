@@ -85,8 +85,9 @@ stipple_drivers::counters! {
     anchors_for_error,
     /// Anchors whose Gaussians were moved after a correction.
     blocks_moved,
-    /// Steps whose (Gaussian, tile) list overflowed.
+    /// Steps not taken because their (Gaussian, tile) list overflowed; pictures and steps drawn coarser so that it did not.
     intersections_overflow,
+    views_coarsened,
     /// Gaussians left out of a step because a parameter was not finite.
     splats_not_finite,
     /// Gaussians skipped by the optimiser because a gradient was not finite.

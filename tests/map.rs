@@ -126,6 +126,29 @@ fn flight_becomes_a_map_that_held_out_views_confirm() {
 }
 
 #[test]
+fn a_fifth_of_the_intersections_makes_as_many_anchors_and_nearly_as_good_a_map() {
+    let (calibration, keyframes) = flight(8);
+    let run = |intersections: u32| {
+        let intersections = format!("budget.intersections={intersections}");
+        let board = board(&["map.scale=1", "budget.splats=4000", &intersections]);
+        let mut mapper = Mapper::open(&calibration, &board).unwrap();
+        for k in &keyframes {
+            mapper.ingest(k).unwrap();
+            train(&mut mapper, 40);
+        }
+        let quality = mapper.evaluate().unwrap();
+        let counters = mapper.counters();
+        let coarse = (counters.views_coarsened.get(), counters.intersections_overflow.get());
+        println!("{intersections}: {quality:?}, {} anchors, {coarse:?}", mapper.anchor_count());
+        (quality.psnr_db.unwrap(), mapper.anchor_count(), coarse)
+    };
+    let (enough, few) = (run(400_000), run(5000));
+    assert_eq!(enough.2, (0, 0));
+    assert!(few.2 .0 > 100 && few.2 .1 < 60, "{few:?}");
+    assert!(few.0 > enough.0 - 2.0 && few.1.abs_diff(enough.1) * 5 <= enough.1, "{few:?} after {enough:?}");
+}
+
+#[test]
 fn held_out_views_are_never_anchors_and_never_trained_on() {
     let (calibration, mut keyframes) = flight(2);
     keyframes.iter_mut().for_each(|k| k.held_out = true);

@@ -23,12 +23,18 @@ uvec2 tile_grid(uvec2 size) {
     return (size + uvec2(TILE_W, TILE_H) - 1) / uvec2(TILE_W, TILE_H);
 }
 
-Ellipse ellipse_of(Projected g, uvec2 size) {
+/// Up to where the Gaussian is listed; coarser, up to where it is brighter: the level falls by `coarseness`, and past zero
+/// nothing is left of it.
+float level_of(float opacity, float coarseness) {
+    return 2.0 * log(opacity / ALPHA_MIN) - coarseness;
+}
+
+Ellipse ellipse_of(Projected g, uvec2 size, float coarseness) {
     Ellipse e;
     e.centre = g.centre_conic.xy;
     e.conic = vec3(g.centre_conic.zw, g.conic_shade.x);
     // A hair wide: the raster decides about each pixel, this only must not lose one.
-    e.t = 2.0 * log(g.conic_shade.y / ALPHA_MIN) * 1.001 + 0.001;
+    e.t = level_of(g.conic_shade.y, coarseness) * 1.001 + 0.001;
     e.det = max(e.conic.x * e.conic.z - e.conic.y * e.conic.y, 1e-12);
     const float extent = sqrt(e.t * e.conic.x / e.det);
     const float top = clamp(e.centre.y - extent, -1.0, float(size.y + TILE_H));

@@ -36,7 +36,8 @@ void main() {
         return;
     }
     const uint begin = tile_offsets[rank], end = min(tile_offsets[rank + 1], push.capacity);
-    if (begin >= end) {
+    // A list that lost Gaussians shows holes, which are nothing to learn from.
+    if (begin >= end || tile_offsets[visible_count[0]] > push.capacity) {
         return;
     }
     vec2 g = vec2(0.0);

@@ -12,6 +12,7 @@ layout(local_size_x = 64) in;
 layout(push_constant) uniform Push {
     uvec2 size;
     uint splats;
+    float coarseness;
 } push;
 
 layout(set = 0, binding = 0, std430) readonly buffer VisibleCount { uint visible_count[]; };
@@ -26,7 +27,7 @@ void main() {
     }
     uint count = 0;
     if (rank < visible_count[0]) {
-        const Ellipse e = ellipse_of(projected[slots[rank]], push.size);
+        const Ellipse e = ellipse_of(projected[slots[rank]], push.size, push.coarseness);
         for (int row = e.rows.x; row <= e.rows.y; ++row) {
             const ivec2 columns = columns_of(e, row, push.size);
             count += uint(max(0, columns.y - columns.x + 1));

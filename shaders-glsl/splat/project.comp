@@ -16,6 +16,7 @@ layout(push_constant) uniform Push {
     Camera camera;
     uvec2 size;
     uint splats;
+    float coarseness;
 } push;
 
 layout(set = 0, binding = 0, std430) readonly buffer Splats { Splat splats[]; };
@@ -34,7 +35,10 @@ uint project(Splat s, uint slot) {
     if (!(opacity > ALPHA_MIN && finite(l.centre.x) && finite(l.centre.y) && finite(vec4(l.conic, opacity)))) {
         return NONE;
     }
-    const float t = 2.0 * log(opacity / ALPHA_MIN);
+    const float t = level_of(opacity, push.coarseness);
+    if (!(t >= 0.0)) {
+        return NONE;
+    }
     const vec2 extent = sqrt(t * l.cov.xz);
     if (!(all(greaterThan(l.centre + extent, vec2(0.0))) && all(lessThan(l.centre - extent, vec2(push.size))))) {
         return NONE;

@@ -4,8 +4,8 @@
 //      summed by sum_chunks)
 // out  splats, moments, steps (count and importance of this Gaussian, see importance.glsl); sums[8 group + ..]: gradient by a small
 //      translation (3) and rotation (3) of the camera frame applied to points, count of refused gradients, 0
-// A step whose gradient is not finite is not taken, and counted. Without LEARN no step is taken and the map
-// stays as it is to the bit: only the sums are written.
+// A step whose gradient is not finite is not taken, and counted. Without LEARN, or where the list overflowed, no step is
+// taken and the map stays as it is to the bit: only the sums are written.
 #version 450
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
@@ -110,7 +110,9 @@ float[7] update(uint rank) {
     const vec3 turn = cross(l.p, g.cam) + g.turn;
     pose = float[7](g.cam.x, g.cam.y, g.cam.z, turn.x, turn.y, turn.z, 0.0);
 
-    if (!LEARN) {
+    // A list that lost Gaussians shows holes, which are nothing to learn from.
+    const bool whole = tile_offsets[visible_count[0]] <= push.capacity;
+    if (!(LEARN && whole)) {
         return pose;
     }
     const uint state = after_step(steps[slot], worth);

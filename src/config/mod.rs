@@ -65,7 +65,7 @@ section! {
     Budget, "budget.", required;
     /// Gaussians in the pool: 192 bytes each on the GPU. As many as the GPU trains at a few steps a frame.
     splats: u32, Bound::Within(256.0, 4_000_000.0);
-    /// (Gaussian, tile) pairs of one view, 40 bytes each; the farthest are dropped past it. 13 to 25 for each Gaussian.
+    /// (Gaussian, tile) pairs of one view, 40 bytes each; a view that needs more is drawn coarser. 13 to 25 for each Gaussian.
     intersections: u32, Bound::Within(1024.0, 64_000_000.0);
     /// Keyframes that the mapper keeps to train and evaluate on. One comes a second, so this is the length of a flight.
     keyframes: u32, Bound::Within(2.0, 4096.0);

@@ -14,6 +14,7 @@
 //! important, if the board lets.
 
 use super::cameras::RectifiedPair;
+use super::coarseness::Coarseness;
 use super::coverage::{Coverage, KeyframeView};
 use super::densify::{densify, mean};
 use super::diffusion::Diffusion;
@@ -118,7 +119,7 @@ impl Anchors {
         // Seeds come of the rectified pair, whatever the lens of what trains.
         let rect = stereo.views.camera();
         let world_from_cam = scene.store.world_from_body(index) * rect.body_from_rect;
-        let view = View { world_from_cam, camera: rect.pinhole, fisheye: None };
+        let view = View { world_from_cam, camera: rect.pinhole, fisheye: None, coarseness: Coarseness::default() };
         self.render(scene, index, &view)?;
         let coverage = {
             let seen = seen(scene, &self.pair, index, &view, stereo.views.valid_mask(), &self.work.depth.metres);
@@ -155,8 +156,9 @@ impl Anchors {
     /// Draws what the rectified pair should see into the scene, and exposes the new image by what trains.
     fn render(&self, scene: &mut Scene, index: usize, rectified: &View) -> Result<(), GpuError> {
         // Without distortion, what lies beyond a fisheye's rim is drawn across the picture: it tells no exposure.
-        let own = scene.view(index);
-        scene.render(if self.pair.is_some() { &own } else { rectified })?;
+        let own = View { coarseness: Coarseness::default(), ..scene.view(index) };
+        let coarseness = scene.render(if self.pair.is_some() { &own } else { rectified })?;
+        scene.store.get_mut(index).coarseness = coarseness;
         if self.config.refine_exposure {
             scene.expose(index);
         }

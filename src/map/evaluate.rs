@@ -12,6 +12,7 @@ use super::refine::Refinement;
 use super::scene::Scene;
 use super::ssim::{mse, psnr_db, Ssim};
 use super::step::{Target, Weights};
+use super::view::View;
 use crate::gpu::GpuError;
 use crate::limits::CAMERAS_MAX;
 use serde::{Deserialize, Serialize};
@@ -191,13 +192,13 @@ fn observed(scene: &Scene, index: usize) -> Vec<f32> {
 fn align(scene: &mut Scene, index: usize, observed: &[f32], weights: &Weights) -> Result<Refinement, GpuError> {
     let (body_from_cam, view) = (scene.camera(index).body_from_cam, scene.view(index));
     let given = scene.store.get(scene.store.first(index)).given;
-    scene.render(&view)?;
+    let coarseness = scene.render(&view)?;
     let exposure = fitted_exposure(observed, &scene.rendered.colour, &scene.camera(index).valid);
     let target = Target { exposure, ..scene.target(index) };
     let mut refined = Refinement::default();
     let (mut best, mut best_loss) = (refined, f64::INFINITY);
     for k in 0..ALIGN_STEPS {
-        let view = scene.camera(index).view(given * refined.body_from_refined);
+        let view = View { coarseness, ..scene.camera(index).view(given * refined.body_from_refined) };
         let done = scene.pipeline.evaluate(&mut scene.gpu, &view, target, weights)?;
         if done.loss < best_loss {
             (best, best_loss) = (refined, done.loss);

@@ -8,6 +8,7 @@
 pub mod anchors;
 pub mod backward;
 pub mod cameras;
+mod coarseness;
 pub mod coverage;
 mod densify;
 mod depth_fill;
@@ -56,6 +57,7 @@ pub use shape::Shape;
 
 #[cfg(feature = "instruments")]
 pub use {
+    coarseness::Coarseness,
     pool::PruneRule,
     step::{LearningRates, StepStats, Target, Weights},
     store::Stored,

@@ -8,6 +8,7 @@
 //! that the device need not wait for the host.
 
 use super::backward::{self, Backward};
+use super::coarseness::Coarseness;
 use super::loss::{self, Loss};
 use super::pool::{self, Pool};
 use super::render::{self, Rendered, Renderer};
@@ -109,12 +110,19 @@ impl Pipeline {
         &self.shape
     }
 
-    /// Draws the map. Views up to the shape in size.
+    /// Draws the map, coarser than `view` asks where it would not fit. Views up to the shape in size.
     pub fn render(&self, gpu: &mut Gpu, view: &View, out: &mut Rendered) -> Result<Stats, GpuError> {
-        let mut rec = gpu.record();
-        self.renderer.record(&mut rec, &self.pool, view, true);
-        self.record_summary(&mut rec, 0, 0);
-        let status = self.status(gpu, rec)?;
+        let mut view = *view;
+        let stats = loop {
+            let mut rec = gpu.record();
+            self.renderer.record(&mut rec, &self.pool, &view, true);
+            self.record_summary(&mut rec, 0, 0);
+            let stats = Stats::new(&self.status(gpu, rec)?, &view);
+            if stats.overflow == 0 {
+                break stats;
+            }
+            view.coarseness = self.coarseness_after(&stats);
+        };
         let n = view.camera.width * view.camera.height;
         (out.width, out.height) = (view.camera.width, view.camera.height);
         let channels = self.shape.channels as usize;
@@ -124,7 +132,12 @@ impl Pipeline {
             gpu.download(self.renderer.buffers.rendered, plane * n, pixels)?;
         }
         out.alpha.iter_mut().for_each(|t| *t = 1.0 - *t);
-        Ok((&status).into())
+        Ok(stats)
+    }
+
+    /// How coarsely a view is drawn next.
+    pub fn coarseness_after(&self, stats: &Stats) -> Coarseness {
+        stats.coarseness.after(stats.intersections + stats.overflow, self.shape.intersections)
     }
 
     /// SSIM by pixel of what was rendered last against an image.

@@ -155,7 +155,7 @@ impl Renderer {
 
     /// The visible, front to back.
     fn record_order(&self, rec: &mut Recorder, pool: &Pool, view: &View) {
-        let (b, n) = (&self.buffers, pool.count());
+        let (b, n, coarseness) = (&self.buffers, pool.count(), view.coarseness.level());
         rec.fill(b.failed, 0);
         rec.dispatch(
             &self.project[view.lens()],
@@ -165,7 +165,7 @@ impl Renderer {
                 keys: self.scratch.depth_keys.write(),
                 failed: b.failed.read_write(),
             },
-            project::Push { camera: view.words(), size: view.size(), splats: n },
+            project::Push { camera: view.words(), size: view.size(), splats: n, coarseness },
             Threads::d1(n + 1),
         );
         let keys = self.scratch.depth_keys.part(0, n as usize + 1);
@@ -175,7 +175,7 @@ impl Renderer {
 
     /// What each tile shows, front to back.
     fn record_lists(&self, rec: &mut Recorder, pool: &Pool, view: &View) {
-        let (b, n, size) = (&self.buffers, pool.count(), view.size());
+        let (b, n, size, coarseness) = (&self.buffers, pool.count(), view.size(), view.coarseness.level());
         let per_slot = Threads::d1(n + 1);
         rec.dispatch(
             &self.count_tiles,
@@ -185,7 +185,7 @@ impl Renderer {
                 projected_in: b.projected.read(),
                 tile_counts: b.tile_offsets.write(),
             },
-            count_tiles::Push { size, splats: n },
+            count_tiles::Push { size, splats: n, coarseness },
             per_slot,
         );
         self.scan.record(rec, b.tile_offsets.part(0, n as usize + 1));
@@ -200,7 +200,7 @@ impl Renderer {
                 owners: b.owners.write(),
                 isect_count: b.isect_count.write(),
             },
-            emit_tiles::Push { size, splats: n, capacity: self.capacity },
+            emit_tiles::Push { size, splats: n, capacity: self.capacity, coarseness },
             per_slot,
         );
         let tiles = self.tiles(view);

@@ -1,10 +1,11 @@
 //! The map as it stands: Gaussians on the device, the keyframes that they are trained on, and the cameras that saw these.
 
 use super::cameras::TrainingCamera;
+use super::coarseness::Coarseness;
 use super::exposure::{gain_from, median_exposure, Exposure};
 use super::pipeline::Pipeline;
 use super::render::Rendered;
-use super::step::Target;
+use super::step::{Stats, Target};
 use super::store::Store;
 use super::view::View;
 use crate::counters::Counters;
@@ -30,7 +31,8 @@ impl Scene {
 
     /// Where a stored image was taken, as far as is known.
     pub fn view(&self, index: usize) -> View {
-        self.camera(index).view(self.store.world_from_body(index))
+        let view = self.camera(index).view(self.store.world_from_body(index));
+        View { coarseness: self.store.get(index).coarseness, ..view }
     }
 
     /// What a step on a stored image compares with.
@@ -38,9 +40,11 @@ impl Scene {
         Target { image: index as u32, camera: self.store.camera(index) as u32, exposure: self.store.exposure(index) }
     }
 
-    /// Draws the map into `rendered`.
-    pub fn render(&mut self, view: &View) -> Result<(), GpuError> {
-        self.pipeline.render(&mut self.gpu, view, &mut self.rendered).map(|_| ())
+    /// Draws the map into `rendered`; how coarsely, that the view might fit.
+    pub fn render(&mut self, view: &View) -> Result<Coarseness, GpuError> {
+        let Stats { coarseness, .. } = self.pipeline.render(&mut self.gpu, view, &mut self.rendered)?;
+        self.counters.views_coarsened.add(u64::from(coarseness > Coarseness::default()));
+        Ok(coarseness)
     }
 
     /// Takes the gain of a new image from what `rendered`, its view, already shows of it. The first is the gauge.

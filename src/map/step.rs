@@ -1,5 +1,6 @@
 //! What goes into a training step and what comes out of it.
 
+use super::coarseness::Coarseness;
 use super::exposure::Exposure;
 use super::view::View;
 use crate::gpu::kernels::types::Status;
@@ -55,19 +56,23 @@ impl Default for Weights {
 pub struct Stats {
     pub visible: u32,
     pub intersections: u32,
-    /// Intersections there was no room for: the farthest.
+    /// Intersections there was no room for: the farthest. None of a picture, which is drawn coarser until it fits.
     pub overflow: u32,
     /// Gaussians culled for not being finite.
     pub failed: u32,
+    /// What was left out, that the rest might fit.
+    pub coarseness: Coarseness,
 }
 
-impl From<&Status> for Stats {
-    fn from(s: &Status) -> Stats {
+impl Stats {
+    /// What the device says of a picture from `view`.
+    pub(super) fn new(s: &Status, view: &View) -> Stats {
         Stats {
             visible: s.visible,
             intersections: s.intersections,
             overflow: s.intersections_needed - s.intersections,
             failed: s.not_finite,
+            coarseness: view.coarseness,
         }
     }
 }
@@ -92,7 +97,7 @@ impl StepStats {
         let (l1, ssim) = (f64::from(s.l1_sum) / values, f64::from(s.ssim_sum) / values);
         let lambda = f64::from(ssim_weight);
         StepStats {
-            stats: s.into(),
+            stats: Stats::new(s, view),
             loss: (1.0 - lambda) * l1 + lambda * (1.0 - ssim),
             l1,
             ssim,

@@ -1,6 +1,7 @@
 //! The images the map is trained and judged on, at mapping resolution, and what is known of each. Everything is sized at
 //! boot; full is a value.
 
+use super::coarseness::Coarseness;
 use super::exposure::Exposure;
 use super::keyframes::{Keyframe, PoseCorrection};
 use super::refine::Refinement;
@@ -20,6 +21,8 @@ pub struct Stored {
     pub anchor: bool,
     /// What the mapper found out beside it.
     pub refined: Refinement,
+    /// What its view leaves out, that its list of intersections may hold it.
+    pub coarseness: Coarseness,
 }
 
 impl Stored {
@@ -89,8 +92,9 @@ impl Store {
         // fall to a quarter and seeds get ever more contrast to make up for it.
         let last = self.training.iter().rev().find(|k| self.camera(**k as usize) == self.camera(index));
         refined.exposure.gain = last.map_or(1.0, |&k| self.get(k as usize).refined.exposure.gain);
+        let coarseness = last.map_or(Coarseness::default(), |&k| self.get(k as usize).coarseness);
         let (given, placed) = (world_from_body, world_from_body);
-        self.entries.push(Stored { id, t, given, placed, held_out, anchor: false, refined });
+        self.entries.push(Stored { id, t, given, placed, held_out, anchor: false, refined, coarseness });
         if !held_out {
             self.training.push(index as u32);
         }

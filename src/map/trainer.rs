@@ -4,6 +4,7 @@
 //! is therefore taken in exactly one step late, whenever the device ends it, and before anything else is done with the
 //! map: the same seed and keyframes give the same map to the bit.
 
+use super::coarseness::Coarseness;
 use super::pipeline::Step;
 use super::scene::Scene;
 use super::schedule::Schedule;
@@ -95,10 +96,17 @@ impl Trainer {
         let done = scene.pipeline.finish(&mut scene.gpu, &step)?;
         self.loss = done.loss;
         let counters = &scene.counters;
-        counters.intersections_overflow.add(u64::from(done.stats.overflow > 0));
+        let whole = done.stats.overflow == 0;
+        counters.intersections_overflow.add(u64::from(!whole));
+        counters.views_coarsened.add(u64::from(whole && step.view.coarseness > Coarseness::default()));
         counters.splats_not_finite.add(u64::from(done.stats.failed));
         counters.gradients_rejected.add(u64::from(done.gradients_rejected));
-        self.refine(scene, index, &step, &done);
+        let entry = scene.store.get_mut(index);
+        entry.coarseness = scene.pipeline.coarseness_after(&done.stats);
+        // A step on a picture with holes was not taken, and tells nothing of pose and exposure.
+        if whole {
+            self.refine(scene, index, &step, &done);
+        }
         Ok(self.schedule.took())
     }
 

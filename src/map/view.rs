@@ -1,5 +1,6 @@
 //! A camera and where it looks from: what a picture of the map is drawn for.
 
+use super::coarseness::Coarseness;
 use crate::gpu::kernels::types::Camera as CameraWords;
 use crate::stereo::Pinhole;
 use glam::{DVec2, DVec3};
@@ -12,6 +13,7 @@ pub struct View {
     pub camera: Pinhole,
     /// The lens that bends what `camera` would see; a pinhole without.
     pub fisheye: Option<Fisheye>,
+    pub coarseness: Coarseness,
 }
 
 impl View {

@@ -67,7 +67,12 @@ fn lists_of_tiles_equal_their_twins() {
             projected_in: records.read(),
             tile_counts: counts.write(),
         };
-        rec.dispatch(&count_kernel, bind, count_tiles::Push { size: SIZE, splats: n }, Threads::d1(n + 1));
+        rec.dispatch(
+            &count_kernel,
+            bind,
+            count_tiles::Push { size: SIZE, splats: n, coarseness: 0.0 },
+            Threads::d1(n + 1),
+        );
         gpu.submit(rec).unwrap();
         let counted = read(&mut gpu, counts, n as usize + 1);
         assert_eq!(counted[n as usize], 0);
@@ -94,7 +99,12 @@ fn lists_of_tiles_equal_their_twins() {
                 owners: owners.write(),
                 isect_count: totals.write(),
             };
-            rec.dispatch(&emit_kernel, bind, emit_tiles::Push { size: SIZE, splats: n, capacity }, Threads::d1(n));
+            rec.dispatch(
+                &emit_kernel,
+                bind,
+                emit_tiles::Push { size: SIZE, splats: n, capacity, coarseness: 0.0 },
+                Threads::d1(n),
+            );
             gpu.submit(rec).unwrap();
             assert_eq!(read(&mut gpu, totals, 2), [capacity, needed]);
             let mut listed = read(&mut gpu, keys, capacity as usize);
