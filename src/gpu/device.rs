@@ -7,6 +7,7 @@
 use crate::config::GpuConfig;
 use ash::vk;
 use std::ffi::{c_void, CStr, CString};
+use std::sync::atomic::AtomicBool;
 use std::sync::Mutex;
 use stipple_drivers::{Fault, FaultKind};
 
@@ -86,6 +87,8 @@ pub struct Device {
     pub family: u32,
     pub caps: Caps,
     pub memory: vk::PhysicalDeviceMemoryProperties,
+    /// What is in flight may never end: nothing of the device is destroyed.
+    pub abandoned: AtomicBool,
     names: Option<ash::ext::debug_utils::Device>,
     /// The last field: it goes after the device.
     instance: Instance,
@@ -132,7 +135,7 @@ impl Device {
         let (queue, memory) =
             unsafe { (raw.get_device_queue(family, 0), instance.raw.get_physical_device_memory_properties(physical)) };
         let names = instance.debug.then(|| ash::ext::debug_utils::Device::new(&instance.raw, &raw));
-        Ok(Device { raw, queue, family, caps, memory, names, instance })
+        Ok(Device { raw, queue, family, caps, memory, abandoned: AtomicBool::new(false), names, instance })
     }
 
     /// What the validation layer said so far, warnings and errors.

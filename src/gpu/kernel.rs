@@ -9,6 +9,7 @@ use super::{GpuError, COMMANDS_MAX};
 use ash::vk;
 use std::collections::HashMap;
 use std::marker::PhantomData;
+use std::sync::atomic::Ordering::Relaxed;
 use std::sync::Arc;
 use stipple_drivers::{Fault, FaultKind};
 
@@ -287,6 +288,9 @@ impl ComputePipeline {
 
 impl Drop for Pipelines {
     fn drop(&mut self) {
+        if self.device.abandoned.load(Relaxed) {
+            return;
+        }
         // SAFETY: `Gpu` waits for the device before its fields are dropped; null handles are ignored.
         unsafe {
             for p in &self.list {

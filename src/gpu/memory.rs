@@ -8,6 +8,7 @@ use super::device::{boot, unavailable, Device};
 use crate::mem::Footprint;
 use ash::vk;
 use std::marker::PhantomData;
+use std::sync::atomic::Ordering::Relaxed;
 use std::sync::Arc;
 use stipple_drivers::{Fault, FaultKind};
 
@@ -165,6 +166,9 @@ impl Backed {
 
 impl Drop for Backed {
     fn drop(&mut self) {
+        if self.device.abandoned.load(Relaxed) {
+            return;
+        }
         // SAFETY: `Gpu` waits for the device before its fields are dropped; null memory is ignored.
         unsafe {
             self.device.raw.destroy_buffer(self.buffer, None);

@@ -57,6 +57,7 @@ use device::Device;
 use kernel::Pipelines;
 use memory::{arena_buffer, report_offset, Backed, Staging, TRANSFER_BYTES};
 use std::fmt;
+use std::sync::atomic::Ordering::Relaxed;
 use std::sync::Arc;
 use stipple_drivers::{Fault, FaultKind};
 use submit::Submitter;
@@ -197,9 +198,9 @@ impl Gpu {
         self.make(&spec, None, true)
     }
 
-    /// Makes a pipeline of one variant: `""` is the baseline.
+    /// Does what `kernel_in_pieces` does with one variant: `""` is the baseline.
     pub fn kernel_variant<K: KernelDef>(&mut self, spec: K::Spec, variant: &str) -> Result<Kernel<K>, Fault> {
-        self.make(&spec, Some(variant), false)
+        self.make(&spec, Some(variant), true)
     }
 
     fn make<K: KernelDef>(
@@ -342,9 +343,12 @@ impl Gpu {
 
 impl Drop for Gpu {
     fn drop(&mut self) {
-        // SAFETY: the queue is used by this thread alone. If waiting fails the device is lost, and
-        // destroying the objects of a lost device is allowed.
-        let _ = unsafe { self.device.raw.device_wait_idle() };
+        // To destroy a device that hangs waits for it without end, and what it uses must not go before it. It is left to the
+        // end of the process.
+        if self.wait().is_err() {
+            self.device.abandoned.store(true, Relaxed);
+            std::mem::forget(self.device.clone());
+        }
     }
 }
 

@@ -17,14 +17,15 @@ use super::pieces::{axis, PieceTiming};
 use super::record::{Command, Recorder, Work};
 use super::{GpuError, COMMANDS_MAX};
 use ash::vk;
+use std::sync::atomic::Ordering::Relaxed;
 use std::sync::Arc;
 use std::time::Instant;
 use stipple_drivers::Fault;
 
 /// Submissions under way at once: one runs, one waits. A third would only make answers older.
 const SLOTS: usize = 2;
-/// Far above any submission the budget allows, on the slowest CPU device: past it the device hangs.
-const HUNG_NS: u64 = 60_000_000_000;
+/// Ten times what the slowest board allows a submission, lavapipe's second: past it the device hangs.
+const HUNG_NS: u64 = 10_000_000_000;
 const STAMPS: usize = COMMANDS_MAX + 1;
 
 /// Time on the device of everything with one name.
@@ -100,6 +101,8 @@ pub(super) struct Submitter {
     /// Time so far of the recording whose parts are ending.
     total_ms: f64,
     submission_max_ms: f64,
+    /// A submission that takes longer hangs.
+    pub hung_ns: u64,
     pub submissions: u64,
     /// Time of the longest part so far.
     pub longest_ms: f64,
@@ -135,6 +138,7 @@ impl Submitter {
             mean_ms: 0.0,
             total_ms: 0.0,
             submission_max_ms,
+            hung_ns: HUNG_NS,
             submissions: 0,
             longest_ms: 0.0,
             recordings: 0,
@@ -511,7 +515,7 @@ impl Submitter {
         let fence = [self.slots[slot].fence];
         // SAFETY: the fence was given to a submission.
         unsafe {
-            self.device.raw.wait_for_fences(&fence, true, HUNG_NS).map_err(GpuError::of("vkWaitForFences"))?;
+            self.device.raw.wait_for_fences(&fence, true, self.hung_ns).map_err(GpuError::of("vkWaitForFences"))?;
             self.device.raw.reset_fences(&fence).map_err(GpuError::of("vkResetFences"))
         }
     }
@@ -547,6 +551,9 @@ fn divisible(command: &Command, pipelines: &Pipelines) -> Option<[u32; 3]> {
 
 impl Drop for Submitter {
     fn drop(&mut self) {
+        if self.device.abandoned.load(Relaxed) {
+            return;
+        }
         // SAFETY: `Gpu` waits for the device before its fields are dropped; null handles are ignored.
         unsafe {
             for slot in &self.slots {

@@ -37,3 +37,22 @@ fn validation_names_kernels_and_reports_a_missing_barrier() {
     assert!(said.iter().any(|m| m.contains("SYNC-HAZARD")), "{said:?}");
     assert!(said.iter().any(|m| m.contains("axpy")), "{said:?}");
 }
+
+#[test]
+fn a_device_that_hangs_is_lost_and_closing_it_does_not_wait() {
+    const N: usize = 1 << 20;
+    let mut gpu = Gpu::open(&GpuConfig { submission_max_ms: 1e9, ..GpuConfig::default() }, 16 << 20).unwrap();
+    let [x, y] = ["x", "y"].map(|name| gpu.alloc::<f32>(name, N).unwrap());
+    let k = gpu.kernel::<axpy::K>(axpy::Spec::default()).unwrap();
+    gpu.submitter.hung_ns = 1;
+    let mut rec = gpu.record();
+    for _ in 0..200 {
+        let bind = axpy::Bind { x: x.read(), y: y.read_write() };
+        rec.dispatch(&k, bind, axpy::Push { n: N as u32, a: 1.0 }, Threads::d1(N as u32));
+    }
+    assert_eq!(gpu.submit(rec), Err(GpuError::Lost));
+    assert_eq!(gpu.wait(), Err(GpuError::Lost));
+    let closing = std::time::Instant::now();
+    drop(gpu);
+    assert!(closing.elapsed().as_millis() < 50, "{:?}", closing.elapsed());
+}
