@@ -3,8 +3,8 @@
 use super::splat::{open, scene, shape, train, view, Rng};
 use super::twins::tiles::{summary as summed, tile_ranges as ranges_of, touched, Ellipse, Grid};
 use stipple::config::GpuConfig;
-use stipple::gpu::kernels::types::{Moments, Projected, Splat, Status};
-use stipple::gpu::kernels::{count_tiles, emit_tiles, summary, tile_ranges};
+use stipple::gpu::kernels::types::{Camera, Moments, Projected, Splat, Status};
+use stipple::gpu::kernels::{count_tiles, emit_tiles, project_backward, summary, tile_ranges};
 use stipple::gpu::{Buf, Gpu, Threads};
 
 const SIZE: [u32; 2] = [157, 93];
@@ -131,6 +131,61 @@ fn lists_of_tiles_equal_their_twins() {
             assert_eq!(read(&mut gpu, ranges, tiles + 1), ranges_of(&listed, tiles + 1));
         }
     }
+}
+
+#[test]
+fn a_gaussian_that_only_the_forward_pass_could_place_is_left_as_it_is() {
+    // Behind the camera, and yet in the list: as where the two passes round the near plane differently.
+    let v = view(64, 48);
+    let behind = v.world_from_cam.transform(glam::DVec3::new(0.0, 0.0, -1.0)).as_vec3();
+    let splat = Splat {
+        mean_opacity: [behind.x, behind.y, behind.z, 1.0],
+        scale_colour: [-3.0; 4],
+        quat: [0.0, 0.0, 0.0, 1.0],
+    };
+    let mut gpu = Gpu::open(&GpuConfig::default(), 1 << 20).unwrap();
+    let spec = project_backward::Spec { channels: 1, chunk: 1, fisheye: false, learn: true };
+    let kernel = gpu.kernel::<project_backward::K>(spec).unwrap();
+    let (one, slots) = (upload(&mut gpu, &[1u32]), upload(&mut gpu, &[0u32]));
+    let (offsets, gradients) = (upload(&mut gpu, &[0u32, 1]), upload(&mut gpu, &[[1f32; 4]; 2]));
+    let (splats, moments) = (upload(&mut gpu, &[splat]), upload(&mut gpu, &[Moments::default()]));
+    let (steps, sums) = (upload(&mut gpu, &[0u32]), upload(&mut gpu, &[9f32; 8]));
+    let bind = project_backward::Bind {
+        visible_count: one.read(),
+        slots: slots.read(),
+        tile_offsets: offsets.read(),
+        isect_gradients: gradients.read(),
+        splats: splats.read_write(),
+        moments_in_out: moments.read_write(),
+        steps: steps.read_write(),
+        sums: sums.write(),
+    };
+    let camera = Camera {
+        rotation: v.world_from_cam.inverse().q.as_quat().to_array(),
+        translation: v.world_from_cam.inverse().p.as_vec3().extend(0.0).to_array(),
+        focal_centre: [50.0, 50.0, 32.0, 24.0],
+        distortion: [0.0; 4],
+    };
+    let push = project_backward::Push {
+        camera,
+        size: [64, 48],
+        capacity: 1,
+        rate_position: 0.1,
+        rate_scale: 0.1,
+        rate_rotation: 0.1,
+        rate_opacity: 0.1,
+        rate_colour: 0.1,
+        weight_needle: 0.1,
+        weight_scale: 0.1,
+        log_scale_soft: -4.0,
+        weight_opacity: 0.1,
+    };
+    let mut rec = gpu.record();
+    rec.dispatch(&kernel, bind, push, Threads::d1(1));
+    gpu.submit(rec).unwrap();
+    assert_eq!(read(&mut gpu, splats, 1), [splat]);
+    assert_eq!((read(&mut gpu, moments, 1), read(&mut gpu, steps, 1)), (vec![Moments::default()], vec![0]));
+    assert_eq!(read(&mut gpu, sums, 8), [0.0; 8]);
 }
 
 #[test]
