@@ -52,7 +52,8 @@ impl Backward {
         tiling: Tiling,
     ) -> Result<Backward, Fault> {
         let (channels, Tiling { lanes, column, variant, chunk }) = (shape.channels, tiling);
-        let mut project = |fisheye, learn| gpu.kernel(project_backward::Spec { channels, chunk, fisheye, learn });
+        let mut project =
+            |fisheye, learn| gpu.kernel_in_pieces(project_backward::Spec { channels, chunk, fisheye, learn });
         Ok(Backward {
             buffers,
             isect_gradients: scratch.isect_gradients,
@@ -60,7 +61,7 @@ impl Backward {
             project: [[project(false, false)?, project(false, true)?], [project(true, false)?, project(true, true)?]],
             raster: gpu.kernel_variant(raster_backward::Spec { lanes, column, channels }, variant)?,
             sum_chunks: (chunk > 1).then(|| gpu.kernel(sum_chunks::Spec { channels, chunk })).transpose()?,
-            chroma: (channels == 3).then(|| gpu.kernel(chroma_backward::Spec { chunk })).transpose()?,
+            chroma: (channels == 3).then(|| gpu.kernel_in_pieces(chroma_backward::Spec { chunk })).transpose()?,
         })
     }
 

@@ -62,11 +62,11 @@ impl Loss {
             slopes: scratch.slopes,
             valid_pixels: [0; CAMERAS_MAX],
             words: Vec::with_capacity(shape.image_words()),
-            ssim_rows: gpu.kernel(ssim_rows::Spec::default())?,
-            ssim_columns: gpu.kernel(ssim_columns::Spec { map: 0 })?,
-            ssim_map: gpu.kernel(ssim_columns::Spec { map: 1 })?,
-            loss_rows: gpu.kernel(loss_rows::Spec::default())?,
-            loss_columns: gpu.kernel(loss_columns::Spec::default())?,
+            ssim_rows: gpu.kernel_in_pieces(ssim_rows::Spec::default())?,
+            ssim_columns: gpu.kernel_in_pieces(ssim_columns::Spec { map: 0 })?,
+            ssim_map: gpu.kernel_in_pieces(ssim_columns::Spec { map: 1 })?,
+            loss_rows: gpu.kernel_in_pieces(loss_rows::Spec::default())?,
+            loss_columns: gpu.kernel_in_pieces(loss_columns::Spec::default())?,
         };
         let all = vec![255; shape.pixels()];
         (0..shape.cameras as usize).try_for_each(|camera| loss.set_mask(gpu, camera, &all))?;

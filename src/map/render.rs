@@ -111,7 +111,7 @@ impl Renderer {
         let raster = |gpu: &mut Gpu, depth| {
             gpu.kernel_variant(raster_forward::Spec { lanes, column, depth, channels: shape.channels }, variant)
         };
-        let project = |gpu: &mut Gpu, fisheye| gpu.kernel(project::Spec { lanes, column, fisheye });
+        let project = |gpu: &mut Gpu, fisheye| gpu.kernel_in_pieces(project::Spec { lanes, column, fisheye });
         Ok(Renderer {
             buffers,
             tiling,
@@ -120,8 +120,8 @@ impl Renderer {
             scan: Scan::new(gpu, sort)?,
             sorter: Sorter::new(gpu, sort, cut)?,
             project: [project(gpu, false)?, project(gpu, true)?],
-            count_tiles: gpu.kernel(count_tiles::Spec { lanes, column })?,
-            emit_tiles: gpu.kernel(emit_tiles::Spec { lanes, column })?,
+            count_tiles: gpu.kernel_in_pieces(count_tiles::Spec { lanes, column })?,
+            emit_tiles: gpu.kernel_in_pieces(emit_tiles::Spec { lanes, column })?,
             tile_ranges: gpu.kernel(tile_ranges::Spec::default())?,
             raster: [raster(gpu, false)?, raster(gpu, true)?],
         })

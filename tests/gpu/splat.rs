@@ -295,6 +295,30 @@ fn two_runs_are_bit_identical() {
 }
 
 #[test]
+fn training_in_pieces_of_any_length_is_the_same_to_the_bit() {
+    let v = view(65, 47);
+    let run = |submission_max_ms: f64| {
+        let shape = shape(&v, 512, 1 << 16);
+        let config = GpuConfig { submission_max_ms, ..crate::config() };
+        let mut gpu = Gpu::open(&config, Pipeline::arena_bytes(&shape).unwrap()).unwrap();
+        let mut p = Pipeline::new(&mut gpu, shape).unwrap();
+        p.pool.append(&mut gpu, scene(500, &v, 9)).unwrap();
+        p.loss.set_image(&mut gpu, 0, &target(65, 47)).unwrap();
+        let first = train(&mut gpu, &mut p, &v, 2);
+        let before = gpu.submissions();
+        let steps = train(&mut gpu, &mut p, &v, 3);
+        let submissions = gpu.submissions() - before;
+        (submissions, first, steps, p.pool.download(&mut gpu).unwrap(), render(&mut gpu, &mut p, &v).colour)
+    };
+    let [whole, short] = [1e6, 1e-6].map(run);
+    // A step is one submission where nothing has to be cut; else the rasters alone are a tile or two each.
+    assert!(whole.0 == 3 && short.0 > 3 * 2 * 12, "{} {}", whole.0, short.0);
+    assert_eq!((&whole.1, &whole.2), (&short.1, &short.2));
+    assert_eq!(bytemuck::cast_slice::<_, u32>(&whole.3), bytemuck::cast_slice::<_, u32>(&short.3));
+    assert_eq!(whole.4, short.4);
+}
+
+#[test]
 fn a_view_that_overflows_its_list_is_drawn_coarser_and_never_loses_the_background() {
     let v = view(64, 48);
     let splats = scene(64, &v, 2);
