@@ -147,26 +147,11 @@ pub fn fly(
     options: &Options,
     led: Option<StatusLed>,
 ) -> Result<Outcome, Fault> {
-    if options.service {
-        threads::ask_for_realtime();
-    }
-    if let Some(rule) = options.inject.thread.iter().find(|rule| !threads::is_watched(&rule.name)) {
-        let what = format!("no thread of the name {} can be asked to panic", rule.name);
-        return Err(Fault::new(FaultKind::Config, "--inject", what, "name camera, imu or tracking"));
-    }
-    threads::panic_in(options.inject.thread.iter().map(|rule| (rule.name.clone(), rule.panic_s)));
     let mut board = board.clone();
-    // In a service libraries of the mapper are its process's business, and so is whether all of it fits.
+    // In a service the mapper's libraries are its process's business, and so is whether all of it fits.
     let apart = board.map.enabled && options.service && matches!(options.pace, Pace::Recorded);
-    if !apart {
-        input.warnings.extend(memory::replace_missing(&mut board).map(|missing| missing.to_string()));
-    }
-    input.warnings.iter().for_each(|warning| print_err(format_args!("stipple: warning: {warning}")));
+    prepare(&mut input, &mut board, options, apart)?;
     let board = &board;
-    input.calibration.imu.range = board.imu.range();
-    if !apart {
-        memory::check_fits(&input.place, &input.calibration, board, options.record.is_some())?;
-    }
     let colours = memory::colours(&input.calibration, board).len();
     input.needs_colour(colours)?;
     let frames = match &mut input.source {
@@ -183,16 +168,7 @@ pub fn fly(
         Some(path) => Tracker::Table(read_trajectory(path)?),
         None => Tracker::Odometry(Box::new(OdometryRun::new(&input.calibration, board, frames)?)),
     };
-    let ring = || KeyframeRing::new(&input.calibration, board).map(Arc::new);
-    let map = match (board.map.enabled, apart) {
-        (false, _) => None,
-        (true, false) => Some(MapSide::Here(Box::new(Mapping::open(&input.calibration, board, ring()?)?))),
-        (true, true) => {
-            let worker = Worker::start(&input.place, &input.calibration, board, out, options.record.is_some())?;
-            input.warnings.extend(worker.warning.clone());
-            Some(MapSide::Apart(Box::new(worker)))
-        }
-    };
+    let map = if board.map.enabled { Some(open_map(&mut input, board, out, options, apart)?) } else { None };
     let title = summary::Title {
         dataset: input.name,
         board: board.name.clone(),
@@ -252,6 +228,44 @@ pub fn fly(
         status.ended_well();
     }
     Ok(Outcome { report, capture, fault })
+}
+
+/// Asks for priorities, puts what this machine has in the place of what it lacks, and refuses a board that does not fit.
+fn prepare(input: &mut Input, board: &mut Board, options: &Options, apart: bool) -> Result<(), Fault> {
+    if options.service {
+        threads::ask_for_realtime();
+    }
+    if let Some(rule) = options.inject.thread.iter().find(|rule| !threads::is_watched(&rule.name)) {
+        let what = format!("no thread of the name {} can be asked to panic", rule.name);
+        return Err(Fault::new(FaultKind::Config, "--inject", what, "name camera, imu or tracking"));
+    }
+    threads::panic_in(options.inject.thread.iter().map(|rule| (rule.name.clone(), rule.panic_s)));
+    if !apart {
+        input.warnings.extend(memory::replace_missing(board).map(|missing| missing.to_string()));
+    }
+    input.warnings.iter().for_each(|warning| print_err(format_args!("stipple: warning: {warning}")));
+    input.calibration.imu.range = board.imu.range();
+    if !apart {
+        memory::check_fits(&input.place, &input.calibration, board, options.record.is_some())?;
+    }
+    Ok(())
+}
+
+/// Opens the mapper in this process, or `apart` in one of its own.
+fn open_map(
+    input: &mut Input,
+    board: &Board,
+    out: &OutputDir,
+    options: &Options,
+    apart: bool,
+) -> Result<MapSide, Fault> {
+    if apart {
+        let worker = Worker::start(&input.place, &input.calibration, board, out, options.record.is_some())?;
+        input.warnings.extend(worker.warning.clone());
+        return Ok(MapSide::Apart(Box::new(worker)));
+    }
+    let ring = Arc::new(KeyframeRing::new(&input.calibration, board)?);
+    Ok(MapSide::Here(Box::new(Mapping::open(&input.calibration, board, ring)?)))
 }
 
 /// Reads `input` at its own pace with the threads of a flight, shows every packet to `observer`, without estimating or mapping.
