@@ -133,9 +133,15 @@ fn own_files(folder: &Path) -> Result<Vec<PathBuf>, Fault> {
         return foreign("is not a folder of this program's results".into());
     }
     let names = entries(folder).map_err(|e| cannot_write(folder, &e))?;
-    // Without a list, nothing in it is ours.
+    // Without a list, nothing in it is ours, but for the pictures of an earlier version beside its report.
     let list = input::read_settings(&folder.join(LIST)).unwrap_or_default();
-    let own = |name: &&OsString| *name == LIST || list.lines().any(|l| name.to_str() == Some(l));
+    let earlier = list.is_empty() && folder.with_file_name("report.json").is_file();
+    let picture = |name: &str| {
+        let number = name.strip_suffix(".png").map(|n| n.strip_suffix("_heldout").unwrap_or(n));
+        number.is_some_and(|n| n.len() >= 4 && n.bytes().all(|b| b.is_ascii_digit()))
+    };
+    let listed = |name: &str| list.lines().any(|l| l == name) || earlier && picture(name);
+    let own = |name: &&OsString| *name == LIST || name.to_str().is_some_and(listed);
     match names.iter().find(|name| !own(name)) {
         Some(name) => foreign(format!("holds {}, which this program did not write", Path::new(name).display())),
         None => Ok(names.iter().map(|name| folder.join(name)).collect()),
@@ -223,6 +229,19 @@ mod tests {
         assert!(failed.is_err());
         assert_eq!(names(dir.path()), ["renders"]);
         assert_eq!(names(&dir.path().join("renders")), [LIST, "2.png"]);
+    }
+
+    #[test]
+    fn the_pictures_of_an_earlier_version_are_known_by_their_names_and_its_report() {
+        let dir = tempfile::tempdir().unwrap();
+        let renders = dir.path().join("renders");
+        fs::create_dir(&renders).unwrap();
+        ["0007.png", "0012_heldout.png"].iter().for_each(|n| fs::write(renders.join(n), b"x").unwrap());
+        assert!(OutputDir::create(dir.path()).is_err(), "another program's");
+        fs::write(dir.path().join("report.json"), b"{}").unwrap();
+        assert!(OutputDir::create(dir.path()).is_ok());
+        fs::write(renders.join("7.png"), b"x").unwrap();
+        assert!(OutputDir::create(dir.path()).is_err());
     }
 
     #[test]
