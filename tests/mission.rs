@@ -204,3 +204,66 @@ fn a_panic_in_any_thread_ends_the_process_at_once() {
     let o = run(&data, &out).output().unwrap();
     assert!(o.status.success() && out.join("report.json").exists(), "the next start: {}", text(&o));
 }
+
+/// `cargo test --release --test mission disturbed -- --ignored --nocapture`: passes of MH_01, every other one with its
+/// mapper killed (20) or stopped (5) at a random moment. Frames of all passes of a kind are pooled.
+#[test]
+#[ignore = "ten minutes, on a machine that does nothing else"]
+fn tracking_is_not_disturbed_by_a_mapper_that_dies() {
+    let recordings = std::env::var_os("STIPPLE_RECORDINGS").map_or("../shared/data".into(), PathBuf::from);
+    let data = recordings.join("euroc_MH_01_easy_11s");
+    let mut random = 0x9e37_79b9_7f4a_7c15_u64;
+    let mut pooled: [(Vec<f64>, Vec<f64>); 2] = Default::default();
+    let (mut dropped, mut mapped, mut noticed) = ([0, 0], vec![], vec![]);
+    for pass in 0..50 {
+        let (disturbed, how) = (pass % 2, if pass < 40 { "KILL" } else { "STOP" });
+        let (_dir, out) = folder();
+        let child = run(&data, &out).spawn().unwrap();
+        let first = worker(&child);
+        random = random.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
+        if disturbed == 1 {
+            // From when the first frames come until a second before the last.
+            std::thread::sleep(Duration::from_millis(1500 + random / (u64::MAX / 8500)));
+            kill(first, how);
+            let begun = Instant::now();
+            wait_for("another mapper", || children(child.id()).into_iter().find(|pid| *pid != first));
+            noticed.push(begun.elapsed().as_secs_f64());
+        }
+        let o = child.wait_with_output().unwrap();
+        assert!(o.status.success(), "{}", text(&o));
+        dropped[disturbed] += report(&out)["frames_dropped"].as_u64().unwrap();
+        let log = fs::read(out.join("log-0000.mcap")).unwrap();
+        let mut lost_at = None;
+        for message in mcap::MessageStream::new(&log).unwrap().map(Result::unwrap) {
+            let value: Value = serde_json::from_slice(&message.data).unwrap();
+            match message.channel.topic.as_str() {
+                "/state" => {
+                    pooled[disturbed].0.push(value["latency_ms"].as_f64().unwrap());
+                    pooled[disturbed].1.push(value["cpu_ms"].as_f64().unwrap());
+                }
+                "/event" if value["kind"] == "map" => {
+                    let starts = value["text"].as_str().unwrap().contains("maps again");
+                    match lost_at {
+                        Some(lost) if starts => mapped.push((message.log_time - lost) as f64 * 1e-9),
+                        _ => lost_at = Some(message.log_time),
+                    }
+                }
+                _ => {}
+            }
+        }
+    }
+    let at = |list: &mut Vec<f64>, share: f64| {
+        list.sort_by(f64::total_cmp);
+        list[(share * (list.len() - 1) as f64) as usize]
+    };
+    let [quiet, disturbed] = pooled.each_mut().map(|(ms, cpu)| (at(ms, 0.5), at(cpu, 0.99), ms.len()));
+    let most = |list: &[f64]| list.iter().copied().fold(0.0, f64::max);
+    println!("| | undisturbed | mapper killed or stopped | ratio |\n|---|---|---|---|");
+    println!("| frames; lost | {}; {} | {}; {} | |", quiet.2, dropped[0], disturbed.2, dropped[1]);
+    println!("| tracking, median | {:.2} ms | {:.2} ms | {:.3} |", quiet.0, disturbed.0, disturbed.0 / quiet.0);
+    println!("| CPU a frame, 99 % | {:.2} ms | {:.2} ms | {:.3} |", quiet.1, disturbed.1, disturbed.1 / quiet.1);
+    println!("| noticed after, at most | | {:.2} s of {} | |", most(&noticed), noticed.len());
+    println!("| maps again after, at most | | {:.2} s of {} | |", most(&mapped), mapped.len());
+    assert!(dropped[1] == 0 && disturbed.0 < 1.05 * quiet.0 && disturbed.1 < 1.15 * quiet.1);
+    assert!(most(&noticed) < 2.0 && most(&mapped) < 3.0);
+}

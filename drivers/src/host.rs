@@ -51,6 +51,14 @@ pub fn thread_cpu() -> CpuTime {
     CpuTime { user_s: secs(used.ru_utime), kernel_s: secs(used.ru_stime) }
 }
 
+/// CPU time that the calling thread has used so far, exact to the call: for the parts of a frame. Allocates nothing.
+pub fn thread_cpu_now() -> std::time::Duration {
+    let mut t = libc::timespec { tv_sec: 0, tv_nsec: 0 };
+    // SAFETY: `t` outlives the call; the clock exists on every Linux.
+    unsafe { libc::clock_gettime(libc::CLOCK_THREAD_CPUTIME_ID, &mut t) };
+    std::time::Duration::new(t.tv_sec as u64, t.tv_nsec as u32)
+}
+
 /// Now by `CLOCK_MONOTONIC`, in which the kernel stamps frames, edges and inertial samples.
 pub fn monotonic() -> crate::Nanos {
     now(libc::CLOCK_MONOTONIC)

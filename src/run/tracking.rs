@@ -23,8 +23,8 @@ use crate::vio::{Health, Odometry, Predictor, Vio};
 use crossbeam_queue::ArrayQueue;
 use std::sync::atomic::AtomicBool;
 use std::sync::Arc;
-use std::time::Instant;
-use stipple_drivers::host::thread_cpu;
+use std::time::{Duration, Instant};
+use stipple_drivers::host::{thread_cpu, thread_cpu_now};
 use stipple_drivers::types::pose_at;
 use stipple_drivers::{Calibration, Fault, Frames, ImuSample, Nanos, Pose, Span, TimedPose};
 
@@ -54,6 +54,8 @@ pub struct FramePacket {
     pub tracked: Option<Tracked>,
     /// When the front end took it.
     begun: Instant,
+    /// CPU time that following its points took.
+    cpu: Duration,
 }
 
 impl FramePacket {
@@ -67,6 +69,7 @@ impl FramePacket {
             tracks: Tracks::default(),
             tracked: None,
             begun: Instant::now(),
+            cpu: Duration::ZERO,
         })
     }
 
@@ -118,6 +121,7 @@ pub struct Front {
 impl Front {
     /// `state` is the back end's after the frame before the last.
     pub fn track(&mut self, packet: &mut FramePacket, state: Option<&Odometry>) {
+        let cpu = thread_cpu_now();
         packet.begun = Instant::now();
         packet.imu.iter().for_each(|s| self.predictor.on_imu(*s));
         if packet.imu_only {
@@ -128,6 +132,7 @@ impl Front {
         let secs = packet.begun.elapsed().as_secs_f64();
         self.busy_s += secs;
         self.ms.push(secs * 1e3);
+        packet.cpu = thread_cpu_now() - cpu;
     }
 }
 
@@ -151,7 +156,7 @@ pub struct Back {
 impl Back {
     /// Fills in `packet.tracked`.
     pub fn estimate(&mut self, packet: &mut FramePacket) {
-        let begun = Instant::now();
+        let (begun, cpu) = (Instant::now(), thread_cpu_now());
         packet.imu.iter().for_each(|s| self.vio.on_imu(*s));
         packet.tracked = None;
         if packet.imu_only {
@@ -173,7 +178,8 @@ impl Back {
         let latency_ms = packet.begun.elapsed().as_secs_f64() * 1e3;
         self.frame_ms.push((packet.frames.t, latency_ms));
         if let Some(log) = &self.log {
-            log.state(State::new(packet.frames.t, &update, latency_ms));
+            let cpu = packet.cpu + (thread_cpu_now() - cpu);
+            log.state(State::new(packet.frames.t, &update, latency_ms, cpu.as_secs_f64() * 1e3));
         }
     }
 

@@ -222,7 +222,7 @@ impl Worker {
         let ready = ring.word(Word::Ready).load(Acquire) != 0;
         let Some(why) = running.judge(&ring, ready, self.bytes_max, now) else {
             if ready {
-                ring.word(Word::Absent).store(0, Release);
+                let again = ring.word(Word::Absent).swap(0, Release) != 0;
                 for (gauge, word) in [
                     (&gauges.anchors, Word::Anchors),
                     (&gauges.splats, Word::Splats),
@@ -231,6 +231,7 @@ impl Worker {
                 ] {
                     gauge.store(ring.word(word).load(Relaxed), Relaxed);
                 }
+                return again.then(|| "the mapper maps again".into());
             }
             return None;
         };

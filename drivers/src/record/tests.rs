@@ -160,7 +160,7 @@ fn images(file: &Path) -> u64 {
 
 #[test]
 fn a_full_disk_ends_an_mcap_in_one_file_that_is_closed_and_readable() {
-    on_a_small_disk("record::tests::a_full_disk_ends_an_mcap_in_one_file_that_is_closed_and_readable", |disk| {
+    on_a_small_disk("2m", "record::tests::a_full_disk_ends_an_mcap_in_one_file_that_is_closed_and_readable", |disk| {
         let out = disk.join("r");
         let mut sink = McapSink::create(&out_folder(&out), &rig()).unwrap();
         let reading = ImuReading::default();

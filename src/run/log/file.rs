@@ -25,7 +25,7 @@ const CHANNELS: [(&str, &str, &str); 4] = [
 "p_m":{"type":"array","items":{"type":"number"}},"q_xyzw":{"type":"array","items":{"type":"number"}},
 "v_world":{"type":"array","items":{"type":"number"}},"gyro_bias":{"type":"array","items":{"type":"number"}},
 "accel_bias":{"type":"array","items":{"type":"number"}}}},"health":{"type":"integer"},"quality":{"type":"integer"},
-"keyframe":{"type":"boolean"},"latency_ms":{"type":"number"}}}"#,
+"keyframe":{"type":"boolean"},"latency_ms":{"type":"number"},"cpu_ms":{"type":"number"}}}"#,
     ),
     (EVENT, "stipple.Event", r#"{"type":"object","properties":{"kind":{"type":"string"},"text":{"type":"string"}}}"#),
     (COUNTERS, "stipple.Counters", r#"{"type":"object"}"#),

@@ -103,13 +103,15 @@ pub struct State {
     pub keyframe: bool,
     /// From when the front end took the frame until its pose was there, ms.
     pub latency_ms: f64,
+    /// CPU time that tracking it took, ms.
+    pub cpu_ms: f64,
 }
 
 impl State {
-    pub fn new(t: Nanos, update: &Update, latency_ms: f64) -> State {
+    pub fn new(t: Nanos, update: &Update, latency_ms: f64, cpu_ms: f64) -> State {
         let estimate = update.odometry.as_ref().map(Estimate::from);
         let (health, quality, keyframe) = (update.health.0, update.quality, update.keyframe);
-        State { t_ns: t.0, estimate, health, quality, keyframe, latency_ms }
+        State { t_ns: t.0, estimate, health, quality, keyframe, latency_ms, cpu_ms }
     }
 }
 

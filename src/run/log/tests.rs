@@ -27,7 +27,8 @@ fn state(i: u64) -> State {
         accel_bias: [0.1; 3],
     };
     let estimate = (i >= 5).then_some(estimate);
-    State { t_ns: i as i64 * 50_000_000, estimate, health: 1, quality: 90, keyframe: i % 5 == 0, latency_ms: 4.5 }
+    let keyframe = i % 5 == 0;
+    State { t_ns: i as i64 * 50_000_000, estimate, health: 1, quality: 90, keyframe, latency_ms: 4.5, cpu_ms: 3.5 }
 }
 
 /// Logs frames, so many between syncs, and answers the files and the counters.
@@ -94,7 +95,7 @@ fn a_log_cut_off_at_any_byte_gives_every_whole_message_before_it() {
     let (files, _) = log(dir.path(), LARGE, &some(0..500), 4000);
     let whole = fs::read(&files[0]).unwrap();
     // The end of the messages, in the one chunk; summary and index come after.
-    let needle = b"\"latency_ms\":4.5}";
+    let needle = b"\"cpu_ms\":3.5}";
     let ends: Vec<usize> =
         (0..whole.len() - needle.len()).filter(|i| whole[*i..].starts_with(needle)).map(|i| i + needle.len()).collect();
     assert_eq!(ends.len(), 500);
