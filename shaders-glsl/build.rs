@@ -10,6 +10,7 @@ mod drivers_build;
 mod emit;
 mod reflect;
 
+use std::hash::{DefaultHasher, Hash, Hasher};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
@@ -53,7 +54,12 @@ fn kernels() -> Result<(), Vec<String>> {
         return Err(errors);
     }
     sources.sort_by(|a, b| a.stem.cmp(&b.stem));
-    let text = emit::emit(&sources)?;
+    let mut text = emit::emit(&sources)?;
+    let mut hasher = DefaultHasher::new();
+    for (_, _, spv) in sources.iter().flat_map(|s| &s.variants) {
+        std::fs::read(spv).map_err(|e| one(format!("{spv}: {e}")))?.hash(&mut hasher);
+    }
+    text += &format!("/// Hash of every module.\npub const HASH: u64 = {};\n", hasher.finish());
     std::fs::write(out.join("kernels.rs"), text).map_err(|e| one(format!("kernels.rs: {e}")))
 }
 

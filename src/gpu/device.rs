@@ -87,6 +87,7 @@ pub struct Device {
     pub family: u32,
     pub caps: Caps,
     pub memory: vk::PhysicalDeviceMemoryProperties,
+    pub properties: vk::PhysicalDeviceProperties,
     /// What is in flight may never end: nothing of the device is destroyed.
     pub abandoned: AtomicBool,
     names: Option<ash::ext::debug_utils::Device>,
@@ -132,10 +133,13 @@ impl Device {
         // SAFETY: `physical` belongs to `instance`, and `family` is one of its queue families.
         let raw = unsafe { instance.raw.create_device(physical, &info, None) }.map_err(boot("vkCreateDevice"))?;
         // SAFETY: one queue of this family was requested above; `physical` is alive.
-        let (queue, memory) =
-            unsafe { (raw.get_device_queue(family, 0), instance.raw.get_physical_device_memory_properties(physical)) };
+        let (queue, memory, properties) = unsafe {
+            let queue = raw.get_device_queue(family, 0);
+            let memory = instance.raw.get_physical_device_memory_properties(physical);
+            (queue, memory, instance.raw.get_physical_device_properties(physical))
+        };
         let names = instance.debug.then(|| ash::ext::debug_utils::Device::new(&instance.raw, &raw));
-        Ok(Device { raw, queue, family, caps, memory, abandoned: AtomicBool::new(false), names, instance })
+        Ok(Device { raw, queue, family, caps, memory, properties, abandoned: AtomicBool::new(false), names, instance })
     }
 
     /// What the validation layer said so far, warnings and errors.

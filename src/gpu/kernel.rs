@@ -3,6 +3,7 @@
 //! `KernelDef` is implemented by what the build writes from GLSL, never by hand. A kernel with faster
 //! variants takes the first one whose SPIR-V capabilities the device has.
 
+use super::cache::PipelineCache;
 use super::device::{boot, Device};
 use super::memory::{Backed, Range, ALIGN};
 use super::{GpuError, COMMANDS_MAX};
@@ -99,6 +100,7 @@ pub(super) struct ComputePipeline {
 pub(super) struct Pipelines {
     device: Arc<Device>,
     list: Vec<ComputePipeline>,
+    pub cache: Option<PipelineCache>,
     pool: vk::DescriptorPool,
     sets: HashMap<SetKey, vk::DescriptorSet>,
 }
@@ -113,7 +115,13 @@ impl Pipelines {
         let info = vk::DescriptorPoolCreateInfo::default().max_sets(SETS_MAX as u32).pool_sizes(&sizes);
         // SAFETY: the device is alive.
         let pool = unsafe { device.raw.create_descriptor_pool(&info, None) }.map_err(boot("vkCreateDescriptorPool"))?;
-        Ok(Pipelines { device: device.clone(), list: Vec::new(), pool, sets: HashMap::with_capacity(SETS_MAX) })
+        Ok(Pipelines {
+            device: device.clone(),
+            list: Vec::new(),
+            cache: None,
+            pool,
+            sets: HashMap::with_capacity(SETS_MAX),
+        })
     }
 
     pub fn get(&self, index: u32) -> &ComputePipeline {
@@ -158,7 +166,8 @@ impl Pipelines {
             bindings: K::BINDINGS,
         });
         let index = self.list.len() - 1;
-        self.list[index].build(&self.device, variant, K::SPEC_IDS, &K::spec_words(spec))?;
+        let cache = self.cache.as_ref().map_or(vk::PipelineCache::null(), |c| c.raw);
+        self.list[index].build(&self.device, cache, variant, K::SPEC_IDS, &K::spec_words(spec))?;
         Ok(Kernel { index: index as u32, local, name: variant.name, of: PhantomData })
     }
 
@@ -224,6 +233,7 @@ impl ComputePipeline {
     fn build(
         &mut self,
         device: &Device,
+        cache: vk::PipelineCache,
         variant: &Variant,
         ids: &[u32],
         words: &[u32; SPECS_MAX],
@@ -277,7 +287,7 @@ impl ComputePipeline {
             let info = [vk::ComputePipelineCreateInfo::default().flags(flags).stage(stage).layout(self.layout)];
             let made = device
                 .raw
-                .create_compute_pipelines(vk::PipelineCache::null(), &info, None)
+                .create_compute_pipelines(cache, &info, None)
                 .map_err(|(_, r)| boot("vkCreateComputePipelines")(r))?;
             self.raw = made[0];
         }

@@ -33,6 +33,7 @@
 //! ```
 #![allow(unsafe_code)]
 
+mod cache;
 mod device;
 mod kernel;
 pub mod kernels;
@@ -43,6 +44,7 @@ mod submit;
 #[cfg(test)]
 mod tests;
 
+pub use cache::cache_folder;
 pub use device::{capability, Caps, DeviceKind};
 pub use kernel::{Access, Kernel, KernelDef, Reflected, Variant, BUFFERS_MAX, SPECS_MAX};
 pub use memory::{Arena, Buf, Range, Read, ReadWrite, Write, ALIGN, REPORTS, REPORT_BYTES};
@@ -53,10 +55,12 @@ pub use {kernel::PUSH_MAX, memory::STAGING_BYTES, record::GROUPS_MAX};
 
 use crate::config::GpuConfig;
 use ash::vk;
+use cache::PipelineCache;
 use device::Device;
 use kernel::Pipelines;
 use memory::{arena_buffer, report_offset, Backed, Staging, TRANSFER_BYTES};
 use std::fmt;
+use std::path::Path;
 use std::sync::atomic::Ordering::Relaxed;
 use std::sync::Arc;
 use stipple_drivers::{Fault, FaultKind};
@@ -185,6 +189,17 @@ impl Gpu {
     #[cfg(feature = "instruments")]
     pub fn alloc<T: bytemuck::Pod>(&mut self, name: &'static str, len: usize) -> Result<Buf<T>, Fault> {
         self.arena.alloc(name, len)
+    }
+
+    /// Takes from `folder` what the driver compiled in earlier runs, for the pipelines made from now on; how many bytes there were.
+    pub fn reuse_pipelines(&mut self, folder: &Path) -> usize {
+        self.pipelines.cache = PipelineCache::open(&self.device, folder).ok();
+        self.pipelines.cache.as_ref().map_or(0, |c| c.taken)
+    }
+
+    /// Writes to the folder of `reuse_pipelines` what was compiled since, and ends its use.
+    pub fn keep_pipelines(&mut self) -> Result<(), Fault> {
+        self.pipelines.cache.take().map_or(Ok(()), |mut cache| cache.keep())
     }
 
     /// Makes a pipeline, of the fastest variant of the kernel that the device has.

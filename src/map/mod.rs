@@ -36,7 +36,7 @@ pub mod view;
 
 use crate::config::Board;
 use crate::counters::Counters;
-use crate::gpu::{Arena, Gpu, GpuError, Timing};
+use crate::gpu::{cache_folder, Arena, Gpu, GpuError, Timing};
 use crate::mem::Footprint;
 use crate::stereo::{self, Stereo};
 use anchors::{Anchors, Workspace};
@@ -127,6 +127,7 @@ impl Mapper {
     /// Opens the board's device with all the memory it will take.
     pub fn open(calibration: &Calibration, board: &Board) -> Result<Mapper, Fault> {
         let mut gpu = Gpu::open(&board.gpu, buffers(calibration, board)?.used())?;
+        cache_folder().iter().for_each(|folder| _ = gpu.reuse_pipelines(folder));
         let stereo = Stereo::new(calibration, &board.stereo, board.map.scale, Some(&mut gpu))?;
         let config = &board.map;
         let shape = shape(calibration, board);
@@ -150,6 +151,11 @@ impl Mapper {
             move_tolerance: config.move_tolerance,
             corrected: false,
         })
+    }
+
+    /// Writes what the driver compiled to the user's cache, so that later starts are quicker.
+    pub fn keep_pipelines(&mut self) -> Result<(), Fault> {
+        self.scene.gpu.keep_pipelines()
     }
 
     /// Stores a keyframe, and makes it an anchor when the map does not show its view, or not well.

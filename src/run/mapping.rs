@@ -2,7 +2,7 @@
 //! run time out.
 
 use super::keyframes::KeyframeRing;
-use super::status::Gauges;
+use super::status::{print_err, Gauges};
 use super::threads;
 use crate::config::Board;
 use crate::gpu::GpuError;
@@ -55,7 +55,11 @@ impl Mapping {
     pub fn open(calibration: &Calibration, board: &Board, ring: Arc<KeyframeRing>) -> Result<Mapping, Fault> {
         let build = || {
             host::lower_priority(NICE);
-            Mapper::open(calibration, board)
+            let mut mapper = Mapper::open(calibration, board)?;
+            if let Err(why) = mapper.keep_pipelines() {
+                print_err(format_args!("stipple: note: {why}"));
+            }
+            Ok::<Mapper, Fault>(mapper)
         };
         let mapper = super::apart("mapping", build)?;
         Ok(Mapping {

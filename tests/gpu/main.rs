@@ -1,6 +1,7 @@
 //! Kernels against their twins, on whatever Vulkan device there is (lavapipe in CI).
 #![allow(clippy::unwrap_used)]
 
+mod cache;
 mod chroma;
 mod exposure;
 mod fisheye;
@@ -8,6 +9,8 @@ mod held_out;
 mod occupancy;
 mod pool;
 mod raster;
+#[path = "../program/small_disk.rs"]
+mod small_disk;
 mod sort;
 mod speed;
 mod splat;
