@@ -47,10 +47,12 @@ test-onnx:
 	if [ -n "$$lib" ]; then STIPPLE_ONNXRUNTIME=$$(realpath $$lib) cargo test --locked --test onnx -- --ignored; \
 	else echo "left out: the tests of tests/onnx.rs that need ONNX Runtime, which pip could not fetch"; fi
 
-# A minute of garbage for the tracker and the estimator, then MINUTES of a run whose memory, files and threads are watched.
+# A minute of garbage for the tracker and the estimator, then MINUTES of a run SPEED times as fast as life, whose memory, files
+# and threads are watched. The two hours of a release: MINUTES=24. Where tracking cannot keep up, a lower SPEED.
 MINUTES ?= 5
+SPEED ?= 5
 soak: deps
-	STIPPLE_SOAK_MINUTES=$(MINUTES) cargo test --locked --test soak -- --ignored --nocapture --test-threads 1
+	STIPPLE_SOAK_MINUTES=$(MINUTES) STIPPLE_SOAK_SPEED=$(SPEED) cargo test --locked --test soak -- --ignored --nocapture --test-threads 1
 
 # Inputs guided by coverage for everything that reads files of strangers, SECONDS each. TARGETS="tables image" are some.
 SECONDS ?= 60

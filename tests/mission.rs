@@ -5,7 +5,7 @@
 
 mod program;
 
-use program::{flight, signal, stipple, text, BOARD};
+use program::{children, flight, signal, stipple, text, BOARD};
 use serde_json::Value;
 use std::fs;
 use std::io::{Read, Write};
@@ -41,16 +41,6 @@ fn wait_for<T>(what: &str, mut look: impl FnMut() -> Option<T>) -> T {
         assert!(begun.elapsed() < PATIENCE, "waited for {what}");
         std::thread::sleep(Duration::from_millis(10));
     }
-}
-
-/// The processes that `parent` has started.
-fn children(parent: u32) -> Vec<u32> {
-    let all = fs::read_dir("/proc").unwrap().filter_map(|e| e.unwrap().file_name().to_str()?.parse::<u32>().ok());
-    let parent_of = |pid: &u32| {
-        let stat = fs::read_to_string(format!("/proc/{pid}/stat")).ok()?;
-        stat.rsplit_once(')')?.1.split_whitespace().nth(1)?.parse::<u32>().ok()
-    };
-    all.filter(|pid| parent_of(pid) == Some(parent)).collect()
 }
 
 /// The mapper of a run, once it maps: its kernels hold buffers.

@@ -58,6 +58,8 @@ pub struct Pace {
     start: Instant,
     /// Seconds of the recording per second.
     speed: f64,
+    /// Length of a lap, where the recording begins again each time it ends.
+    lap: Option<Span>,
 }
 
 impl Pace {
@@ -68,7 +70,20 @@ impl Pace {
 
     /// A pace so many times as fast.
     pub fn at_speed(first: Nanos, speed: f64) -> Pace {
-        Pace { first, start: Instant::now(), speed }
+        Pace { first, start: Instant::now(), speed, lap: None }
+    }
+
+    /// The same pace for a recording that begins again after each `lap`, and whose stamps go on growing.
+    pub fn repeating(self, lap: Span) -> Pace {
+        Pace { lap: Some(lap), ..self }
+    }
+
+    /// Which of `count` parts is played as the `n`th, and how much later than it was recorded; `None` after the last.
+    fn part(&self, n: usize, count: usize) -> Option<(usize, Span)> {
+        match self.lap {
+            Some(lap) if count > 0 => Some((n % count, Span(lap.0 * (n / count) as i64))),
+            _ => (n < count).then_some((n, Span(0))),
+        }
     }
 
     fn due(&self, t: Nanos) -> Instant {
@@ -111,12 +126,14 @@ impl FrameSource for PacedFrames {
     fn next(&mut self, timeout: Span, frames: &mut Frames) -> Result<Wait, SourceFault> {
         let limit = after(timeout);
         loop {
-            let Some(&t) = self.stamps.get(self.next) else { return Ok(Wait::Ended) };
+            let Some((index, later)) = self.pace.part(self.next, self.stamps.len()) else { return Ok(Wait::Ended) };
+            let t = self.stamps[index] + later;
             if self.pace.due(t) > limit {
                 self.pace.wait(t, limit);
                 return Ok(Wait::TimedOut);
             }
-            let read = self.images.read(self.next, frames);
+            let read = self.images.read(index, frames);
+            frames.t = frames.t + later;
             self.next += 1;
             self.pace.wait(t, limit);
             match read {
@@ -151,15 +168,23 @@ impl PacedImu {
     }
 }
 
+impl PacedImu {
+    fn upcoming(&self) -> Option<ImuSample> {
+        let (index, later) = self.pace.part(self.next, self.samples.len())?;
+        let sample = self.samples[index];
+        Some(ImuSample { t: sample.t + later, ..sample })
+    }
+}
+
 impl ImuSource for PacedImu {
     fn next(&mut self, timeout: Span, batch: &mut ImuBatch) -> Result<Wait, SourceFault> {
         batch.clear();
-        let Some(first) = self.samples.get(self.next) else { return Ok(Wait::Ended) };
+        let Some(first) = self.upcoming() else { return Ok(Wait::Ended) };
         if !self.pace.wait(first.t, after(timeout)) {
             return Ok(Wait::TimedOut);
         }
         let now = Instant::now();
-        while let Some(&sample) = self.samples.get(self.next).filter(|s| self.pace.due(s.t) <= now) {
+        while let Some(sample) = self.upcoming().filter(|s| self.pace.due(s.t) <= now) {
             if batch.push(ImuReading { sample, ..ImuReading::default() }).is_err() {
                 break;
             }
@@ -201,6 +226,26 @@ mod tests {
         }
         assert_eq!(seen, [0, 20, 40, 60]);
         assert!(waits >= 3, "{waits}");
+    }
+
+    #[test]
+    fn a_recording_that_repeats_goes_on_with_stamps_that_grow() {
+        let (images, stamps) = frames(3);
+        let sample = |i: i64| ImuSample { t: Nanos(i * 20 * MS), ..ImuSample::default() };
+        let pace = Pace::at_speed(Nanos(0), 100.0).repeating(Span(60 * MS));
+        let mut imu = PacedImu::new((0..3).map(sample).collect(), pace);
+        let mut source = PacedFrames::new(images, stamps, pace);
+        let mut out = Frames { images: vec![Image::new(2, 2)], ..Frames::default() };
+        for i in 0..10 {
+            while source.next(Span(MS), &mut out).unwrap() != Wait::Got {}
+            assert_eq!(out.t, Nanos(i * 20 * MS));
+        }
+        let (mut batch, mut seen) = (ImuBatch::default(), vec![]);
+        while seen.len() < 10 {
+            imu.next(Span(MS), &mut batch).unwrap();
+            seen.extend(batch.iter().map(|r| r.sample.t.0 / MS));
+        }
+        assert_eq!(seen[..10], [0, 20, 40, 60, 80, 100, 120, 140, 160, 180]);
     }
 
     #[test]

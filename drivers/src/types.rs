@@ -189,7 +189,7 @@ impl std::ops::Mul for Pose {
 }
 
 /// A pose `world_from_body` at an instant, as in ground truth and trajectories.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Default)]
 pub struct TimedPose {
     /// When the body was there.
     pub t: Nanos,

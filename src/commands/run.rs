@@ -3,6 +3,7 @@
 use super::{finish, open_input, seconds, BoardArgs};
 use crate::config::InjectConfig;
 use crate::output::OutputDir;
+use crate::run::sensors::Playback;
 use crate::run::status_led::StatusLed;
 use crate::run::{fly, Options};
 use std::path::PathBuf;
@@ -21,6 +22,12 @@ pub struct Args {
     /// Play this recording in place of the sensors, at its pace
     #[arg(long, value_name = "DIR")]
     dataset: Option<PathBuf>,
+    /// Play the recording so many times as fast
+    #[arg(long, value_name = "N", requires = "dataset", default_value = "1", value_parser = speed)]
+    speed: f64,
+    /// Begin the recording again each time it ends, until stopped or for --duration
+    #[arg(long, requires = "dataset")]
+    repeat: bool,
     /// Faults to inject into the recording: a TOML file of [[camera]] and [[imu]] rules
     #[arg(long, value_name = "FILE", requires = "dataset")]
     inject: Option<PathBuf>,
@@ -36,6 +43,12 @@ pub fn run(args: &Args) -> Result<(), Fault> {
     let out = OutputDir::create(&args.out)?;
     let inject = args.inject.as_deref().map(InjectConfig::load).transpose()?.unwrap_or_default();
     let (duration_s, record) = (args.duration, args.record.clone());
-    let options = Options { duration_s, record, inject, service: true, ..Options::default() };
+    let playback = Playback { speed: args.speed, repeats: args.repeat };
+    let options = Options { duration_s, record, inject, service: true, playback, ..Options::default() };
     finish(fly(input, &board, &out, &options, led)?, &out)
+}
+
+/// Parses a speed that timers and queues can follow.
+fn speed(text: &str) -> Result<f64, String> {
+    seconds(text).ok().filter(|s| (0.01..=100.0).contains(s)).ok_or_else(|| "must be from 0.01 to 100".into())
 }

@@ -55,7 +55,7 @@ use log::{EventKind, Log};
 use mailbox::{Capture, Mailbox};
 use mapping::Mapping;
 use recorder::Recording;
-use sensors::{Input, Sensors, Source};
+use sensors::{Input, Playback, Sensors, Source};
 use status::{print_err, Gauges, Status};
 use status_led::StatusLed;
 use std::path::{Path, PathBuf};
@@ -106,6 +106,8 @@ pub struct Options {
     pub service: bool,
     /// Faults added to the sensors of a recording.
     pub inject: InjectConfig,
+    /// How a recording is played in real time.
+    pub playback: Playback,
 }
 
 /// What a flight left, beside its files.
@@ -132,12 +134,14 @@ pub struct Flown {
     pub capture: Option<Capture>,
     /// The fault of the source that broke, if one did.
     pub broken: Option<Fault>,
-    /// Lines about sensors lost and found again.
+    /// The first lines about sensors lost and found again.
     pub notices: Vec<String>,
 }
 
 /// Frames that a run without an end is judged by, evenly spread: the log has all of them.
 const FRAMES_KEPT: usize = 1 << 14;
+/// Lines of a run that are kept for what judges it: the log has all of them.
+const NOTICES_KEPT: usize = 64;
 
 /// Flies `input` on `board` and writes what it leaves to `out`.
 pub fn fly(
@@ -154,16 +158,8 @@ pub fn fly(
     let board = &board;
     let colours = memory::colours(&input.calibration, board).len();
     input.needs_colour(colours)?;
-    let frames = match &mut input.source {
-        Source::Recorded(r) => {
-            r.cut(options.duration_s);
-            r.stamps.len()
-        }
-        // A rate that the camera made a little higher is no reason to lose the end.
-        Source::Live { rate_hz, .. } => {
-            FRAMES_KEPT.min(options.duration_s.map_or(f64::INFINITY, |s| 1.2 * s * *rate_hz + 100.0) as usize)
-        }
-    };
+    let Playback { speed, repeats } = options.playback;
+    let frames = frames_kept(&mut input, options);
     let mut tracker = match &options.poses {
         Some(path) => Tracker::Table(read_trajectory(path)?),
         None => Tracker::Odometry(Box::new(OdometryRun::new(&input.calibration, board, frames)?)),
@@ -181,12 +177,13 @@ pub fn fly(
         truth: input.truth,
         opened: input.opened,
     };
-    let length_s = input.source.length_s();
+    let length_s = input.source.length_s().filter(|_| !repeats);
     let log = Log::start(out.path().into(), log::LIMITS, &title.to_string());
     if let Tracker::Odometry(run) = &mut tracker {
         run.back.log = Some(log.sender());
     }
-    let mut status = Status::new(options.duration_s.or(length_s)).with_led(led).with_log(log.sender());
+    let mut status =
+        Status::new(options.duration_s.map(|s| s * speed).or(length_s)).with_led(led).with_log(log.sender());
     let (calibration, live) = (&input.calibration, length_s.is_none());
     let (mut flown, recording) = match (input.source, options.pace) {
         (Source::Recorded(recorded), Pace::Lockstep(steps)) => {
@@ -194,7 +191,7 @@ pub fn fly(
         }
         (source, _) => {
             let shape = || Frames::in_colour(calibration, colours);
-            let sensors = source.sensors();
+            let sensors = source.sensors(options.playback);
             let record = options.record.as_deref().map(|dir| (dir, Format::Euroc));
             let (sensors, recording) = Recording::start(record, sensors, calibration, board, &shape())?;
             let sensors = sensors.with_faults(&options.inject, shape);
@@ -228,6 +225,26 @@ pub fn fly(
         status.ended_well();
     }
     Ok(Outcome { report, capture, fault })
+}
+
+/// Cuts a recording to the time it is played for; answers how many frames the run keeps to be judged by.
+fn frames_kept(input: &mut Input, options: &Options) -> usize {
+    let Playback { speed, repeats } = options.playback;
+    match &mut input.source {
+        Source::Recorded(_) if repeats => {
+            // It is of the first lap alone.
+            input.truth.clear();
+            FRAMES_KEPT
+        }
+        Source::Recorded(r) => {
+            r.cut(options.duration_s.map(|s| s * speed));
+            r.stamps.len()
+        }
+        // A rate that the camera made a little higher is no reason to lose the end.
+        Source::Live { rate_hz, .. } => {
+            FRAMES_KEPT.min(options.duration_s.map_or(f64::INFINITY, |s| 1.2 * s * *rate_hz + 100.0) as usize)
+        }
+    }
 }
 
 /// Asks for priorities, puts what this machine has in the place of what it lacks, and refuses a board that does not fit.
@@ -283,7 +300,7 @@ pub fn observe(
     if let Source::Recorded(recorded) = &mut input.source {
         recorded.cut(duration_s);
     }
-    let sensors = input.source.sensors();
+    let sensors = input.source.sensors(Playback::default());
     let shape = Frames::for_rig(calibration);
     let (sensors, recording) = Recording::start(record, sensors, calibration, board, &shape)?;
     let realtime =
@@ -411,7 +428,7 @@ pub fn fly_in_real_time(
 }
 
 /// The main thread's work while sensors, tracking and mapping go on: takes stops, looks after the worker and the threads,
-/// and shows how it goes. Answers the lines it said.
+/// and shows how it goes. Answers the first lines it said.
 fn supervise(
     s: &Shared,
     run: &Realtime,
@@ -435,7 +452,10 @@ fn supervise(
         let looked = worker.as_mut().and_then(|w| w.watch(&s.gauges));
         let mut say = |kind, line: String| {
             status.say(kind, &line);
-            notices.push(line);
+            // A cable that comes loose each second, for hours, is in the log.
+            if notices.len() < NOTICES_KEPT {
+                notices.push(line);
+            }
         };
         hangs.into_iter().chain(threads::refused()).for_each(|line| say(EventKind::System, line));
         looked.into_iter().for_each(|line| say(EventKind::Map, line));

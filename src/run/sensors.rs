@@ -48,6 +48,21 @@ pub struct Recorded {
     pub imu: Vec<ImuSample>,
 }
 
+/// How a recording is played.
+#[derive(Clone, Copy, Debug)]
+pub struct Playback {
+    /// Seconds of it per second.
+    pub speed: f64,
+    /// It begins again each time it ends, and its stamps go on growing.
+    pub repeats: bool,
+}
+
+impl Default for Playback {
+    fn default() -> Playback {
+        Playback { speed: 1.0, repeats: false }
+    }
+}
+
 /// A rig of cameras and an inertial unit.
 pub struct Sensors {
     pub frames: Box<dyn FrameSource>,
@@ -145,11 +160,11 @@ impl Source {
         }
     }
 
-    /// The sensors; a recording plays in their place, at its pace.
-    pub fn sensors(self) -> Sensors {
+    /// The sensors; a recording plays in their place.
+    pub fn sensors(self, playback: Playback) -> Sensors {
         match self {
             Source::Live { sensors, .. } => sensors,
-            Source::Recorded(r) => r.paced(),
+            Source::Recorded(r) => r.paced(playback),
         }
     }
 }
@@ -170,9 +185,17 @@ impl Recorded {
         }
     }
 
-    /// Plays it at its recorded pace.
-    pub fn paced(self) -> Sensors {
-        let pace = Pace::starting(self.stamps.first().copied().unwrap_or_default());
+    /// Plays it.
+    pub fn paced(mut self, playback: Playback) -> Sensors {
+        let first = self.stamps.first().copied().unwrap_or_default();
+        let mut pace = Pace::at_speed(first, playback.speed);
+        if playback.repeats {
+            // The first frame of the next lap takes the place of the last of this one: no sample is missing between them.
+            let last = if self.stamps.len() > 1 { self.stamps.pop() } else { None };
+            let end = last.unwrap_or(first + Span::from_secs(1.0));
+            self.imu.retain(|s| s.t >= first && s.t < end);
+            pace = pace.repeating(end - first);
+        }
         Sensors {
             frames: Box::new(PacedFrames::new(self.images, self.stamps, pace)),
             imu: Box::new(PacedImu::new(self.imu.into(), pace)),

@@ -11,7 +11,7 @@ use std::sync::atomic::AtomicBool;
 use stipple::config::{Board, InjectConfig};
 use stipple::output::metrics::trajectory_error;
 use stipple::output::OutputDir;
-use stipple::run::sensors::Recorded;
+use stipple::run::sensors::{Playback, Recorded};
 use stipple::run::status::Status;
 use stipple::run::tracking::{OdometryRun, Tracker};
 use stipple::run::{fly_in_real_time, memory, Flown, Realtime};
@@ -204,7 +204,9 @@ impl Flight {
         let flown = stamps.len();
         let (first, images) = (stamps[0], Images::Rendered(self.frames.clone()));
         let shape = || Frames::for_rig(calibration);
-        let sensors = Recorded { images, stamps, imu: self.sim.imu().to_vec() }.paced().with_faults(&inject, shape);
+        let sensors = Recorded { images, stamps, imu: self.sim.imu().to_vec() }
+            .paced(Playback::default())
+            .with_faults(&inject, shape);
         let run = OdometryRun::new(calibration, &self.board, self.frames.len())?;
         let options = Realtime { holdout: 0, until_s: None, sensors_s: None, stop: &AtomicBool::new(false) };
         let mut silent = Status::silent();

@@ -10,7 +10,7 @@ use stipple::config::Board;
 use stipple::output::metrics::percentile;
 use stipple::output::OutputDir;
 use stipple::run::recorder::Recording;
-use stipple::run::sensors::{Input, Recorded, Source};
+use stipple::run::sensors::{Input, Playback, Recorded, Source};
 use stipple::run::status::Status;
 use stipple::run::tracking::{OdometryRun, Tracker};
 use stipple::run::{fly_in_real_time, memory, Realtime};
@@ -70,7 +70,8 @@ impl Flight {
         };
         let shape = Frames::for_rig(&self.calibration);
         let into = into.map(|dir| (dir, Format::Euroc));
-        let (sensors, recording) = Recording::start(into, recorded.paced(), &self.calibration, board, &shape)?;
+        let (sensors, recording) =
+            Recording::start(into, recorded.paced(Playback::default()), &self.calibration, board, &shape)?;
         let tracker = Tracker::Odometry(Box::new(OdometryRun::new(&self.calibration, board, self.frames.len())?));
         let options = Realtime { holdout: 0, until_s: None, sensors_s: None, stop: &AtomicBool::new(false) };
         let flown = fly_in_real_time(sensors, &self.calibration, tracker, None, &options, &mut Status::silent());

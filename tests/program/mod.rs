@@ -23,6 +23,18 @@ pub fn signal(child: &Child, name: &str) {
     assert!(told.success());
 }
 
+/// The processes that `parent` has started.
+#[allow(dead_code)] // not every binary of tests does
+pub fn children(parent: u32) -> Vec<u32> {
+    let all = std::fs::read_dir("/proc").unwrap().filter_map(|e| e.unwrap().file_name().to_str()?.parse::<u32>().ok());
+    let parent_of = |pid: &u32| {
+        let stat = std::fs::read_to_string(format!("/proc/{pid}/stat")).ok()?;
+        stat.rsplit_once(')')?.1.split_whitespace().nth(1)?.parse::<u32>().ok()
+    };
+    all.filter(|pid| parent_of(pid) == Some(parent)).collect()
+}
+
+#[allow(dead_code)] // not every binary of tests does
 pub fn flight(dir: &Path, seconds: &str) -> PathBuf {
     let out = dir.join("flight");
     let args = ["sim", "demo", "--duration", seconds, "--out", out.to_str().unwrap()];
