@@ -160,11 +160,23 @@ pub fn lock_memory() -> std::io::Result<()> {
     }
 }
 
-/// Whether a descriptor takes a few hundred bytes now, without waiting. One whose reader is gone takes them: writing fails.
-pub fn is_writable(fd: i32) -> bool {
+/// Whether a descriptor takes a few hundred bytes within `wait_ms`. One whose reader is gone takes them: writing fails.
+pub fn is_writable(fd: i32, wait_ms: i32) -> bool {
     let mut asked = libc::pollfd { fd, events: libc::POLLOUT, revents: 0 };
     // SAFETY: one struct, which outlives the call.
-    unsafe { libc::poll(&mut asked, 1, 0) == 1 }
+    unsafe { libc::poll(&mut asked, 1, wait_ms) == 1 }
+}
+
+/// Locks a file or folder against other processes that lock it, until it is closed. Fails where one has.
+pub fn lock(file: &std::fs::File) -> std::io::Result<()> {
+    use std::os::fd::AsRawFd;
+    // SAFETY: the descriptor is open.
+    let failed = unsafe { libc::flock(file.as_raw_fd(), libc::LOCK_EX | libc::LOCK_NB) };
+    if failed == 0 {
+        Ok(())
+    } else {
+        Err(std::io::Error::last_os_error())
+    }
 }
 
 /// Whether another process is stopped (SIGSTOP), and its resident set, bytes; `None` where there is no such process.

@@ -23,6 +23,7 @@ pub fn recover(args: &Args) -> Result<(), Fault> {
     };
     let runs = runs(&args.dir).map_err(unread)?;
     let out = OutputDir::create(&args.dir)?;
+    let _lock = out.lock()?;
     let mut poses = 0;
     for (i, run) in runs.iter().enumerate() {
         let name = match run.files[0].file_stem() {
@@ -66,7 +67,7 @@ fn recover_run(run: &LoggedRun, out: &OutputDir, name: &str) -> Result<u64, Faul
     }
     let names: Vec<_> = run.files.iter().filter_map(|f| Some(f.file_name()?.to_string_lossy())).collect();
     let seconds = span.map_or(0.0, |[first, last]| (last - first).secs());
-    let end = end.map_or("cut off without an end".into(), |why| format!("ended: {why}"));
+    let end = end.map_or("cut off or damaged here, without an end".into(), |why| format!("ended: {why}"));
     print_out(format_args!("{}: {seconds:.1} s, {frames} frames, {poses} with a pose; {end}", names.join(", ")));
     events.iter().for_each(print_out);
     print_out(format_args!(

@@ -28,7 +28,7 @@ pub struct Args {
     /// Calibration in place of the recording's own: Kalibr's camchain.yaml or Basalt's json
     #[arg(long, value_name = "FILE")]
     calibration: Option<PathBuf>,
-    /// Faults to inject into the sensors at recorded pace: a TOML file of [[camera]] and [[imu]] rules
+    /// Faults to inject into the sensors at recorded pace: a TOML file of [[camera]], [[imu]] and [[thread]] rules
     #[arg(long, value_name = "FILE")]
     inject: Option<PathBuf>,
     /// Skip odometry: poses from this table (EuRoC or TUM csv); every frame it covers is a keyframe

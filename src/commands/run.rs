@@ -28,7 +28,7 @@ pub struct Args {
     /// Begin the recording again each time it ends, until stopped or for --duration
     #[arg(long, requires = "dataset")]
     repeat: bool,
-    /// Faults to inject into the recording: a TOML file of [[camera]] and [[imu]] rules
+    /// Faults to inject into the recording: a TOML file of [[camera]], [[imu]] and [[thread]] rules
     #[arg(long, value_name = "FILE", requires = "dataset")]
     inject: Option<PathBuf>,
     /// Record the samples to this folder too, as EuRoC

@@ -33,7 +33,8 @@ impl InjectConfig {
     /// Reads a file of rules; an error names the first one that makes no sense.
     pub fn load(path: &Path) -> Result<InjectConfig, Fault> {
         let place = path.display().to_string();
-        let fix = "write seed = 1 and [[camera]] or [[imu]] with fault, start_s and end_s";
+        let fix =
+            "write seed = 1, [[camera]] or [[imu]] with fault, start_s and end_s, or [[thread]] with name and panic_s";
         let text = input::read_settings(path).map_err(|e| {
             Fault::new(FaultKind::NoInput, &place, format!("cannot read the rules of faults: {e}"), fix)
         })?;

@@ -19,7 +19,7 @@ use std::fs::{self, File};
 use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
 use stipple_drivers::host::sync_folder_of;
-use stipple_drivers::{input, Fault, FaultKind};
+use stipple_drivers::{host, input, Fault, FaultKind};
 
 /// Writes `path` through `write`, all or nothing.
 pub fn atomically<R>(path: &Path, write: impl FnOnce(&mut BufWriter<File>) -> io::Result<R>) -> Result<R, Fault> {
@@ -60,9 +60,27 @@ impl OutputDir {
     pub fn create(path: &Path) -> Result<OutputDir, Fault> {
         fs::create_dir_all(path).map_err(|e| cannot_create(path, &e))?;
         let probe = path.join(".writable.partial");
-        create_anew(&probe).and_then(|_| fs::remove_file(&probe)).map_err(|e| cannot_create(path, &e))?;
+        let probed = create_anew(&probe).map(drop).or_else(|e| match e.kind() {
+            // Another run asks at this moment.
+            io::ErrorKind::AlreadyExists => Ok(()),
+            _ => Err(e),
+        });
+        probed.and_then(|()| absent(fs::remove_file(&probe))).map_err(|e| cannot_create(path, &e))?;
         own_files(&path.join("renders"))?;
         Ok(OutputDir { path: path.to_path_buf() })
+    }
+
+    /// Keeps other runs out of the folder until the answer is dropped. Fails where another has it.
+    pub fn lock(&self) -> Result<File, Fault> {
+        let locked = File::open(&self.path).and_then(|folder| host::lock(&folder).map(|()| folder));
+        locked.map_err(|e| {
+            let what = match e.kind() {
+                io::ErrorKind::WouldBlock => "another run writes to it".into(),
+                _ => format!("cannot be locked: {e}"),
+            };
+            let fix = "wait until it has ended, or choose another --out folder";
+            Fault::new(FaultKind::NoOutput, self.path.display().to_string(), what, fix)
+        })
     }
 
     pub fn path(&self) -> &Path {

@@ -154,6 +154,7 @@ pub fn fly(
     let mut board = board.clone();
     // In a service the mapper's libraries are its process's business, and so is whether all of it fits.
     let apart = board.map.enabled && options.service && matches!(options.pace, Pace::Recorded);
+    let _lock = out.lock()?;
     prepare(&mut input, &mut board, options, apart)?;
     let board = &board;
     let colours = memory::colours(&input.calibration, board).len();
@@ -219,8 +220,9 @@ pub fn fly(
         return Err(fault);
     }
     flown.warnings.splice(..0, input.warnings);
-    let report = summary::conclude(title, flown, &logged, out)?;
-    let fault = recorded.and_then(Result::err).or(broken);
+    flown.warnings.extend(flown.notices.iter().filter(|line| line.starts_with(worker::NAME)).cloned());
+    let (report, unwritten) = summary::conclude(title, flown, &logged, out);
+    let fault = recorded.and_then(Result::err).or(broken).or(unwritten);
     if fault.is_none() {
         status.ended_well();
     }
@@ -254,7 +256,12 @@ fn prepare(input: &mut Input, board: &mut Board, options: &Options, apart: bool)
     }
     if let Some(rule) = options.inject.thread.iter().find(|rule| !threads::is_watched(&rule.name)) {
         let what = format!("no thread of the name {} can be asked to panic", rule.name);
-        return Err(Fault::new(FaultKind::Config, "--inject", what, "name camera, imu or tracking"));
+        return Err(Fault::new(
+            FaultKind::Config,
+            "--inject",
+            what,
+            "name main, camera, imu, tracking (of one thread), frontend, estimator (of two) or mapping (of a replay)",
+        ));
     }
     threads::panic_in(options.inject.thread.iter().map(|rule| (rule.name.clone(), rule.panic_s)));
     if !apart {

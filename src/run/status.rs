@@ -89,7 +89,7 @@ impl Status {
         }
         let played = g.played_ms.load(Relaxed).min(self.total_ms.unwrap_or(u64::MAX));
         match &self.bar {
-            Some(_) if !host::is_writable(STDERR) => {}
+            Some(_) if !host::is_writable(STDERR, 0) => {}
             Some(bar) => {
                 bar.set_position(played);
                 bar.set_message(line(g));
@@ -130,7 +130,7 @@ impl Status {
 
     fn print(&self, text: &str) {
         match &self.bar {
-            Some(bar) if host::is_writable(STDERR) => bar.println(format!("stipple: {text}")),
+            Some(bar) if host::is_writable(STDERR, 0) => bar.println(format!("stipple: {text}")),
             Some(_) => {}
             None if self.next_line.is_some() => print_err(format_args!("stipple: {text}")),
             None => {}
@@ -157,6 +157,7 @@ fn line(g: &Gauges) -> String {
     )
 }
 
+const STDOUT: i32 = 1;
 const STDERR: i32 = 2;
 /// What a pipe that is writable takes without waiting.
 const LINE_BYTES_MAX: usize = 4096;
@@ -167,7 +168,7 @@ static LINES_LOST: AtomicU64 = AtomicU64::new(0);
 pub fn print_err(line: fmt::Arguments) {
     let text = format!("{line}\n");
     let bytes = &text.as_bytes()[..text.len().min(LINE_BYTES_MAX)];
-    let written = host::is_writable(STDERR) && io::stderr().write_all(bytes).is_ok();
+    let written = host::is_writable(STDERR, 0) && io::stderr().write_all(bytes).is_ok();
     LINES_LOST.fetch_add(u64::from(!written), Relaxed);
 }
 
@@ -176,7 +177,9 @@ pub fn lines_lost() -> u64 {
     LINES_LOST.load(Relaxed)
 }
 
-/// Prints a line of the result to standard output; a closed one likewise.
+/// Prints lines of the result to standard output; one that is closed, or that nobody reads for five seconds, likewise.
 pub fn print_out(line: impl fmt::Display) {
-    let _ = writeln!(io::stdout(), "{line}");
+    if host::is_writable(STDOUT, 5000) {
+        let _ = writeln!(io::stdout(), "{line}");
+    }
 }

@@ -67,8 +67,9 @@ pub fn write_trajectory(
     })
 }
 
-/// Measures a finished flight, writes DIR, and answers the report. The trajectory comes first: no figure is worth it.
-pub fn conclude(title: Title, mut flown: Flown, logged: &[PathBuf], out: &OutputDir) -> Result<Report, Fault> {
+/// Measures a finished flight, writes DIR, and answers the report, and the first fault of a file that could not be written;
+/// the others are tried. The trajectory comes first: no figure is worth it.
+pub fn conclude(title: Title, mut flown: Flown, logged: &[PathBuf], out: &OutputDir) -> (Report, Option<Fault>) {
     let heap = mem::heap_after_seal();
     let mut report = Report {
         dataset: Some(title.dataset),
@@ -83,7 +84,10 @@ pub fn conclude(title: Title, mut flown: Flown, logged: &[PathBuf], out: &Output
     };
     let estimated = track_figures(&mut report, &flown);
     let whole = flown.tracker.odometry().is_none_or(|run| run.back.trajectory.is_whole());
-    write_trajectory(whole, &estimated, logged, out)?;
+    let mut fault = write_trajectory(whole, &estimated, logged, out).err().map(|fault| {
+        let fix = "make room, then `stipple recover` with this folder writes what the log holds";
+        Fault { fix: fix.into(), ..fault }
+    });
     let error = trajectory_error(&estimated, &title.truth).filter(|_| flown.tracker.odometry().is_some());
     if let Some(e) = &error {
         report.ate_rmse_m = Some(e.ate_rmse_m);
@@ -108,7 +112,7 @@ pub fn conclude(title: Title, mut flown: Flown, logged: &[PathBuf], out: &Output
         }
     }
     if !map.as_ref().is_some_and(|m| m.written) {
-        out.remove("map.ply")?;
+        fault = fault.or(out.remove("map.ply").err());
     }
     if flown.tracker.odometry().is_some_and(|run| run.back.trajectory.is_empty()) {
         let why = "no frame got a pose, odometry never started: its health and the counters in report.json say why";
@@ -127,8 +131,8 @@ pub fn conclude(title: Title, mut flown: Flown, logged: &[PathBuf], out: &Output
     let tracking_ms: &[(Nanos, f64)] = flown.tracker.odometry().map_or(&[], |run| &run.back.frame_ms);
     let (estimated, truth, error, warnings) = (&estimated[..], &title.truth[..], error.as_ref(), &flown.warnings[..]);
     let evidence = Evidence { estimated, truth, error, tracking_ms, pictures: &[], warnings };
-    write_files(&report, &evidence, map.map_or(vec![], |m| m.drawn), out)?;
-    Ok(report)
+    let written = write_files(&report, &evidence, map.map_or(vec![], |m| m.drawn), out);
+    (report, fault.or(written))
 }
 
 fn warn(warnings: &mut Vec<String>, what: String) {
@@ -200,21 +204,21 @@ fn track_figures(report: &mut Report, flown: &Flown) -> Vec<TimedPose> {
     run.back.trajectory.to_vec()
 }
 
-/// Writes the files of DIR; `evidence` is without its pictures.
-fn write_files(report: &Report, evidence: &Evidence, drawn: Vec<Drawn>, out: &OutputDir) -> Result<(), Fault> {
-    if drawn.is_empty() {
-        out.remove("renders")?;
-    } else {
-        out.replace_folder("renders", |dir| {
+/// Writes the files of DIR, and answers the first fault; `evidence` is without its pictures.
+fn write_files(report: &Report, evidence: &Evidence, drawn: Vec<Drawn>, out: &OutputDir) -> Option<Fault> {
+    let renders = match drawn.is_empty() {
+        true => out.remove("renders"),
+        false => out.replace_folder("renders", |dir| {
             let mut all = drawn.iter();
             all.try_for_each(|d| atomically(&dir.join(format!("{}.png", d.name)), |w| d.picture.write_png(w)))
-        })?;
-    }
+        }),
+    };
     let pictures: Vec<(String, Picture)> = drawn.into_iter().map(|d| (d.caption, d.picture)).collect();
     let evidence = Evidence { pictures: &pictures, ..*evidence };
-    out.write("report.html", |w| write_html(w, report, &evidence))?;
-    // Last: whoever finds report.json finds everything it speaks of.
-    out.write("report.json", |w| report.write_json(w))
+    let page = out.write("report.html", |w| write_html(w, report, &evidence));
+    // Last: whoever finds report.json finds what could be written of all that it speaks of.
+    let figures = out.write("report.json", |w| report.write_json(w));
+    [renders, page, figures].into_iter().find_map(Result::err)
 }
 
 /// Seven lines of figures for a person to read.

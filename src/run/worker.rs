@@ -16,6 +16,7 @@ use crate::output::panel::Picture;
 use crate::output::OutputDir;
 use serde::{Deserialize, Serialize};
 use std::io::{self, Read, Write};
+use std::os::unix::process::{CommandExt, ExitStatusExt};
 use std::path::PathBuf;
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::atomic::Ordering::{Acquire, Relaxed, Release};
@@ -24,6 +25,8 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 use stipple_drivers::{host, Calibration, Fault, FaultKind};
 
+/// How lines about the worker begin.
+pub const NAME: &str = "the mapper";
 /// The first start may compile every kernel.
 const BOOT_MAX: Duration = Duration::from_secs(120);
 /// A process that gives no sign of life for so long hangs, and so does one whose slice of work takes longer than the second:
@@ -190,7 +193,7 @@ impl Worker {
         self.ring.word(Word::Ready).store(0, Release);
         self.ring.word(Word::Stop).store(0, Release);
         let mut command = Command::new("/proc/self/exe");
-        command.arg("map-worker").stdin(Stdio::piped()).stdout(Stdio::piped());
+        command.arg0("stipple").arg("map-worker").stdin(Stdio::piped()).stdout(Stdio::piped());
         let mut child = command.spawn()?;
         let (Some(mut tell), Some(answers)) = (child.stdin.take(), child.stdout.take()) else {
             return Err(io::Error::other("it has no pipes"));
@@ -213,7 +216,7 @@ impl Worker {
                 ring.offer_again();
                 if let Err(e) = self.spawn(None) {
                     self.postpone(now, Duration::ZERO);
-                    return Some(format!("the mapper does not start again: {e}"));
+                    return Some(format!("{NAME} does not start again: {e}"));
                 }
                 self.restarts += 1;
             }
@@ -231,18 +234,22 @@ impl Worker {
                 ] {
                     gauge.store(ring.word(word).load(Relaxed), Relaxed);
                 }
-                return again.then(|| "the mapper maps again".into());
+                return again.then(|| format!("{NAME} maps again"));
             }
             return None;
         };
         let life = now - running.started;
         ring.word(Word::Absent).store(1, Release);
-        if let Some(running) = self.running.take() {
-            running.end();
-        }
+        let told = self.running.take().map(Running::end);
+        // Before the first is ready its fault is `start`'s to tell.
+        let said =
+            told.and_then(|told| lock(&told).refused.clone()).map_or(String::new(), |fault| format!(" ({fault})"));
         self.postpone(now, life);
-        let pause = self.next_start.saturating_duration_since(now).as_secs();
-        Some(format!("the mapper {why}; it starts again in {pause} s, with an empty map"))
+        let when = match self.next_start.saturating_duration_since(now).as_secs() {
+            0 => "now".into(),
+            s => format!("in {s} s"),
+        };
+        Some(format!("{NAME} {why}{said}; it starts again {when}, with an empty map"))
     }
 
     fn postpone(&mut self, now: Instant, life: Duration) {
@@ -263,7 +270,7 @@ impl Worker {
             let late = asked.elapsed() >= CONCLUSION_MAX;
             let stopped = host::stopped_and_resident(running.child.id()).is_some_and(|(stopped, _)| stopped);
             if late || stopped {
-                cut = Some(if late { "evaluation took too long" } else { "the mapper was stopped" });
+                cut = Some(if late { "evaluation took too long" } else { "the mapper was stopped (SIGSTOP)" });
             }
             std::thread::sleep(Duration::from_millis(20));
         }
@@ -306,7 +313,7 @@ impl Running {
         }
         self.looked = now;
         match host::stopped_and_resident(self.child.id()) {
-            Some((true, _)) => Some("was stopped".into()),
+            Some((true, _)) => Some("was stopped (SIGSTOP)".into()),
             Some((_, bytes)) if bytes > bytes_max => {
                 Some(format!("takes {} MiB of memory, {} are allowed", bytes >> 20, bytes_max >> 20))
             }
@@ -332,9 +339,9 @@ impl Drop for Worker {
 }
 
 fn ended(status: ExitStatus) -> String {
-    use std::os::unix::process::ExitStatusExt;
     match (status.signal(), status.code()) {
         (Some(signal), _) => format!("was ended by signal {signal}"),
+        (None, Some(0)) => "ended".into(),
         (None, code) => format!("ended with exit code {}", code.unwrap_or(-1)),
     }
 }
@@ -402,8 +409,8 @@ pub fn serve(mut input: impl Read, mut output: impl Write) -> Result<(), Fault> 
     let (ring, out, mapping) = match opened {
         Ok(opened) => opened,
         Err(fault) => {
-            tell(&mut output, &Answer::Refused(fault.clone())).map_err(broken)?;
-            return Err(fault);
+            // The process that flies says it.
+            return tell(&mut output, &Answer::Refused(fault)).map_err(broken);
         }
     };
     let gauges = Arc::new(Gauges::default());
@@ -427,8 +434,8 @@ pub fn serve(mut input: impl Read, mut output: impl Write) -> Result<(), Fault> 
     let mut mapping = mapping::map(mapping, &gauges, start, || true, |_| stop());
     if !stop() {
         // The device failed: another process may have more luck with it.
-        let why = mapping.failure.unwrap_or_default();
-        return Err(refused(why));
+        let fault = refused(mapping.failure.unwrap_or_default());
+        return tell(&mut output, &Answer::Refused(fault)).map_err(broken);
     }
     let mut told = Ok(());
     let mut say = |result: &MapResult| told = tell(&mut output, &Answer::Result(Box::new(result.clone())));

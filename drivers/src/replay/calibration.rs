@@ -99,7 +99,7 @@ pub fn of_recording(
     match candidates.iter().map(|name| home.join(name)).find(|path| path.is_file()) {
         Some(path) => read(&path, readout, findings),
         None => {
-            let fix = "add it, or name one with replay.calibration";
+            let fix = "add it, or name one with --calibration FILE";
             let what = "no calibration: neither cam0/sensor.yaml in it nor camchain.yaml beside it";
             Err(Fault::new(FaultKind::NoInput, mav0.display().to_string(), what, fix))
         }

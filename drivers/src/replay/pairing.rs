@@ -43,7 +43,7 @@ pub fn image_lists(
     let (recorded, calibrated) = (cameras::recorded(mav0)?, calibration.cameras.len());
     if recorded != calibrated {
         let what = format!("holds {}, the calibration has {}", cameras::named(recorded), cameras::named(calibrated));
-        let fix = "take the others out of the one that has more, or name the right calibration with replay.calibration";
+        let fix = "take the others out of the one that has more, or name the right calibration with --calibration FILE";
         return Err(Fault::new(FaultKind::Config, mav0.display().to_string(), what, fix));
     }
     let list = |k: usize| list_path(mav0, k);

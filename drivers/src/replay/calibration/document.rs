@@ -16,6 +16,20 @@ pub struct Document {
     root: Value,
 }
 
+/// No calibration nests as deep; the parser of YAML takes the longer the deeper.
+const DEPTH_MAX: i32 = 64;
+
+/// The first line where brackets nest too deep.
+fn too_deep(text: &str) -> Option<usize> {
+    let mut depth = 0;
+    let deep = |byte: u8| {
+        depth += i32::from(matches!(byte, b'[' | b'{')) - i32::from(matches!(byte, b']' | b'}'));
+        depth > DEPTH_MAX
+    };
+    let at = text.bytes().position(deep)?;
+    Some(1 + text[..at].matches('\n').count())
+}
+
 impl Document {
     /// Reads and parses a file; a fault where it cannot be read or is neither YAML nor JSON.
     pub fn read(path: &Path) -> Result<Document, Fault> {
@@ -29,6 +43,9 @@ impl Document {
             // OpenCV writes "%YAML:1.0", which is not YAML; blanked, so that lines keep their numbers.
             let end = text.find('\n').unwrap_or(text.len());
             text.replace_range(..end, "");
+        }
+        if let Some(line) = too_deep(&text) {
+            return Err(wrong(line, format!("has lists within lists, more than {DEPTH_MAX} deep")));
         }
         let root: Result<Value, _> = if text.trim_start().starts_with('{') {
             serde_json::from_str(&text).map_err(|e| wrong(e.line(), e.to_string()))
