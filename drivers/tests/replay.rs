@@ -284,7 +284,7 @@ fn a_calibration_of_another_number_of_cameras_is_refused() {
         f.write("../chain.yaml", camchain(cameras));
         let fault = with("../chain.yaml").unwrap_err();
         assert!(fault.kind == FaultKind::Config && fault.what.contains(said), "{fault}");
-        assert!(fault.fix.contains("replay.calibration"), "{fault}");
+        assert!(fault.fix.contains("--calibration FILE"), "{fault}");
     }
     f.write("../chain.yaml", camchain(5));
     let fault = with("../chain.yaml").unwrap_err();
