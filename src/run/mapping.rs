@@ -107,9 +107,9 @@ impl Mapping {
 
     fn work(&mut self, deadline: Instant) -> Result<bool, GpuError> {
         while let Some(slot) = self.ring.take(self.collected, &mut self.keyframe) {
-            let kind = self.mapper.ingest(&self.keyframe);
+            // A slot at which the device failed stays taken: the next mapper is not offered its keyframe.
+            let anchor = matches!(self.mapper.ingest(&self.keyframe)?, StepKind::Anchor { .. });
             self.ring.done(slot);
-            let anchor = matches!(kind?, StepKind::Anchor { .. });
             self.anchors += u64::from(anchor);
             if anchor || Instant::now() >= deadline {
                 return Ok(true);

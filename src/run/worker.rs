@@ -33,6 +33,8 @@ const BOOT_MAX: Duration = Duration::from_secs(120);
 /// an anchor's depth on two cores without a GPU takes ten seconds.
 const SILENCE_MAX: Duration = Duration::from_secs(5);
 const SLICE_MAX: Duration = Duration::from_secs(30);
+/// A killed process is waited for so long.
+const DEATH_MAX: Duration = Duration::from_millis(500);
 /// A worker that lives longer starts again at once; others wait for twice as long each time, up to `PAUSE_MAX`.
 const LIFE_MIN: Duration = Duration::from_secs(30);
 const PAUSE_MAX: Duration = Duration::from_secs(32);
@@ -321,11 +323,18 @@ impl Running {
         }
     }
 
-    /// Kills it if it still runs, and answers what it told.
+    /// Kills it if it still runs, and answers what it told. One that a driver holds in the kernel cannot end yet: it is left
+    /// to it, as it never runs again.
     fn end(mut self) -> Arc<Mutex<Told>> {
         let _ = self.child.kill();
-        let _ = self.child.wait();
-        let _ = self.reader.join();
+        let limit = Instant::now() + DEATH_MAX;
+        while matches!(self.child.try_wait(), Ok(None)) && Instant::now() < limit {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        if matches!(self.child.try_wait(), Ok(Some(_))) {
+            // Its answers end with it.
+            let _ = self.reader.join();
+        }
         self.told
     }
 }
