@@ -162,7 +162,16 @@ pub fn lock_memory() -> std::io::Result<()> {
 
 /// Whether a descriptor takes a few hundred bytes within `wait_ms`. One whose reader is gone takes them: writing fails.
 pub fn is_writable(fd: i32, wait_ms: i32) -> bool {
-    let mut asked = libc::pollfd { fd, events: libc::POLLOUT, revents: 0 };
+    is_ready(fd, libc::POLLOUT, wait_ms)
+}
+
+/// Whether a descriptor has something to read, or its end, within `wait_ms`.
+pub fn is_readable(fd: i32, wait_ms: i32) -> bool {
+    is_ready(fd, libc::POLLIN, wait_ms)
+}
+
+fn is_ready(fd: i32, events: i16, wait_ms: i32) -> bool {
+    let mut asked = libc::pollfd { fd, events, revents: 0 };
     // SAFETY: one struct, which outlives the call.
     unsafe { libc::poll(&mut asked, 1, wait_ms) == 1 }
 }

@@ -4,7 +4,7 @@ use super::{finish, seconds, BoardArgs};
 use crate::config::InjectConfig;
 use crate::output::OutputDir;
 use crate::run::sensors::Input;
-use crate::run::{fly, Options, Pace, Steps};
+use crate::run::{fly, threads, Options, Pace, Steps};
 use std::path::PathBuf;
 use stipple_drivers::{Fault, FaultKind};
 
@@ -70,6 +70,8 @@ impl Args {
 pub fn replay(args: &Args) -> Result<(), Fault> {
     let scale: Vec<String> = args.scale.iter().map(|s| format!("map.scale={s}")).collect();
     let board = args.board.load_with(&scale)?;
+    let inject = args.inject.as_deref().map(InjectConfig::load).transpose()?.unwrap_or_default();
+    threads::panic_in(&inject.thread)?;
     let input = Input::recording(&args.dataset, args.calibration.as_deref(), &board)?;
     let out = OutputDir::create(&args.out)?;
     let options = Options {
@@ -77,7 +79,7 @@ pub fn replay(args: &Args) -> Result<(), Fault> {
         poses: args.poses.clone(),
         holdout: args.holdout.unwrap_or(0),
         duration_s: args.duration,
-        inject: args.inject.as_deref().map(InjectConfig::load).transpose()?.unwrap_or_default(),
+        inject,
         ..Options::default()
     };
     finish(fly(input, &board, &out, &options, None)?, &out)

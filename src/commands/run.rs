@@ -5,7 +5,7 @@ use crate::config::InjectConfig;
 use crate::output::OutputDir;
 use crate::run::sensors::Playback;
 use crate::run::status_led::StatusLed;
-use crate::run::{fly, Options};
+use crate::run::{fly, threads, Options};
 use std::path::PathBuf;
 use stipple_drivers::Fault;
 
@@ -38,10 +38,13 @@ pub struct Args {
 
 pub fn run(args: &Args) -> Result<(), Fault> {
     let board = args.board.load()?;
+    let inject = args.inject.as_deref().map(InjectConfig::load).transpose()?.unwrap_or_default();
+    // Before the threads of light and trigger start.
+    threads::panic_in(&inject.thread)?;
+    threads::ask_for_realtime();
     let led = StatusLed::open(board.gpio.led())?;
     let input = open_input(args.dataset.as_deref(), &args.board, &board)?;
     let out = OutputDir::create(&args.out)?;
-    let inject = args.inject.as_deref().map(InjectConfig::load).transpose()?.unwrap_or_default();
     let (duration_s, record) = (args.duration, args.record.clone());
     let playback = Playback { speed: args.speed, repeats: args.repeat };
     let options = Options { duration_s, record, inject, service: true, playback, ..Options::default() };

@@ -9,7 +9,7 @@ mod method;
 mod section;
 mod sensors;
 
-pub use inject::InjectConfig;
+pub use inject::{InjectConfig, ThreadRule};
 pub use method::{
     Fit, FrontendConfig, GpuConfig, MapConfig, NetworkConfig, Projection, StereoConfig, StereoMethod, VioConfig,
 };

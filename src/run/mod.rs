@@ -18,7 +18,8 @@
 //! | trigger | starts the cameras' exposures, where a line is wired for it | free |
 //! | led | shows the state of a run, where a line is wired for it | free |
 //! | log | writes states, events and counters to DIR; low priority | free |
-//! | writer (the recorder's) | writes what is recorded, if anything is; low priority | free |
+//! | writer | writes what is recorded, if anything is; low priority | free |
+//! | beat | says for the mapper's process that it lives | free |
 //!
 //! In lockstep the main thread is sensors and mapping too.
 //!
@@ -249,21 +250,8 @@ fn frames_kept(input: &mut Input, options: &Options) -> usize {
     }
 }
 
-/// Asks for priorities, puts what this machine has in the place of what it lacks, and refuses a board that does not fit.
+/// Puts what this machine has in the place of what it lacks, and refuses a board that does not fit.
 fn prepare(input: &mut Input, board: &mut Board, options: &Options, apart: bool) -> Result<(), Fault> {
-    if options.service {
-        threads::ask_for_realtime();
-    }
-    if let Some(rule) = options.inject.thread.iter().find(|rule| !threads::is_watched(&rule.name)) {
-        let what = format!("no thread of the name {} can be asked to panic", rule.name);
-        return Err(Fault::new(
-            FaultKind::Config,
-            "--inject",
-            what,
-            "name main, camera, imu, tracking (of one thread), frontend, estimator (of two) or mapping (of a replay)",
-        ));
-    }
-    threads::panic_in(options.inject.thread.iter().map(|rule| (rule.name.clone(), rule.panic_s)));
     if !apart {
         input.warnings.extend(memory::replace_missing(board).map(|missing| missing.to_string()));
     }
@@ -478,8 +466,16 @@ fn supervise(
 }
 
 /// Starts a named thread that ends by itself or is asked to.
-fn start<T: Send + 'static>(name: &str, work: impl FnOnce() -> T + Send + 'static) -> JoinHandle<T> {
-    Builder::new().name(name.into()).spawn(work).expect(FEW_THREADS)
+fn start<T: Send + 'static>(name: &'static str, work: impl FnOnce() -> T + Send + 'static) -> JoinHandle<T> {
+    Builder::new().name(name.into()).spawn(watched(name, work)).expect(FEW_THREADS)
+}
+
+/// Work that is watched under a name while it goes on.
+fn watched<T>(name: &'static str, work: impl FnOnce() -> T) -> impl FnOnce() -> T {
+    move || {
+        let _watched = threads::watch(name);
+        work()
+    }
 }
 
 /// Does work on a named thread of its own and waits for it.
@@ -495,11 +491,7 @@ fn spawn<'scope, T: Send + 'scope>(
     name: &'static str,
     work: impl FnOnce() -> T + Send + 'scope,
 ) -> ScopedJoinHandle<'scope, T> {
-    let watched = move || {
-        let _watched = threads::watch(name);
-        work()
-    };
-    Builder::new().name(name.into()).spawn_scoped(scope, watched).expect(FEW_THREADS)
+    Builder::new().name(name.into()).spawn_scoped(scope, watched(name, work)).expect(FEW_THREADS)
 }
 
 /// Starts the threads of tracking. `give` gets each packet back, in order, on the last of them, and `ended` is dropped at

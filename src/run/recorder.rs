@@ -1,6 +1,7 @@
 //! Recording beside a flight: taps on its sensors, and a writer behind a ring of fixed size.
 
 use super::sensors::Sensors;
+use super::threads;
 use crate::config::Board;
 use std::path::{Path, PathBuf};
 use stipple_drivers::record::{self, Format, Recorder, Ring};
@@ -24,7 +25,12 @@ impl Recording {
         let Some((dir, format)) = to else { return Ok((sensors, None)) };
         let sink = record::open(dir, format, calibration)?;
         let ring = Ring::new(shape, board.record.ring_frames as usize);
-        let (recorder, frames, imu) = record::start(sink, (sensors.frames, sensors.imu), ring);
+        let mut watched = None;
+        let alive = move || {
+            watched.get_or_insert_with(|| threads::watch(record::WRITER));
+            threads::alive();
+        };
+        let (recorder, frames, imu) = record::start(sink, (sensors.frames, sensors.imu), ring, alive);
         let sensors = Sensors { frames: Box::new(frames), imu: Box::new(imu) };
         Ok((sensors, Some(Recording { recorder, dir: dir.into() })))
     }

@@ -317,8 +317,8 @@ impl Pulses {
         let (stop, counts): (Arc<AtomicBool>, Arc<[Counter; 2]>) = Default::default();
         let (asked, counted) = (stop.clone(), counts.clone());
         let thread = super::start("trigger", move || {
-            threads::ask_for_priority(threads::TRIGGER_PRIORITY);
             while !asked.load(Relaxed) {
+                threads::alive();
                 counted[1].add(trigger.wait());
                 counted[0].add(u64::from(trigger.pulse().is_err()));
             }

@@ -8,6 +8,7 @@
 //! | fault: something broke, or the run could not start | three quick flashes a second, two seconds of them after the end |
 //! | ended as asked | off |
 
+use super::threads;
 use std::sync::atomic::{AtomicBool, AtomicU8, Ordering::Relaxed};
 use std::sync::Arc;
 use std::thread::JoinHandle;
@@ -80,6 +81,7 @@ impl StatusLed {
         let thread = super::start("led", move || {
             let mut was = false;
             while !asked.load(Relaxed) {
+                threads::alive();
                 let state = STATES[usize::from(shown.load(Relaxed))];
                 // Nobody blinks for a process that has ended: after a panic it stays on.
                 let on = PANICKED.load(Relaxed) || state.is_on(begun.elapsed());

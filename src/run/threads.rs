@@ -5,30 +5,36 @@
 //! writes one line, lets the light and the log tell of it, and aborts, so that nothing waits for a thread that is gone.
 
 use super::status::print_err;
+use crate::config::ThreadRule;
 use std::cell::Cell;
 use std::sync::atomic::{AtomicBool, AtomicI64, Ordering::Relaxed};
 use std::sync::{Mutex, MutexGuard, PoisonError};
-use stipple_drivers::{host, Span};
+use stipple_drivers::{host, Fault, FaultKind, Span};
 
 /// Threads of a run that are watched at once.
 const SLOTS: usize = 16;
-/// Priorities among real-time threads, and how long each may be silent, s. An anchor may take the mapper long.
-const WATCHED: [(&str, i32, f64); 7] = [
+/// Priorities among real-time threads, and how long each may be silent, s. A pulse that starts an exposure comes before
+/// everything; an anchor may take the mapper long, and a card that stalls those who write.
+const WATCHED: [(&str, i32, f64); 13] = [
     ("main", 0, 5.0),
+    ("trigger", 13, 5.0),
     ("imu", 12, 5.0),
     ("camera", 11, 5.0),
     ("tracking", 10, 5.0),
     ("frontend", 10, 5.0),
     ("estimator", 10, 5.0),
     ("mapping", 0, 60.0),
+    ("map-answers", 0, 5.0),
+    ("beat", 0, 5.0),
+    ("led", 0, 5.0),
+    ("log", 0, 30.0),
+    ("writer", 0, 30.0),
 ];
-/// A pulse that starts an exposure comes before everything.
-pub const TRIGGER_PRIORITY: i32 = 13;
 
 /// What is known of the threads: their names, panics asked for, and why the system refused a priority.
 struct Registry {
     names: [Option<&'static str>; SLOTS],
-    panics: Vec<(String, f64)>,
+    panics: Vec<ThreadRule>,
     refused: Option<String>,
 }
 
@@ -39,7 +45,8 @@ static PANICS: [AtomicI64; SLOTS] = [const { AtomicI64::new(0) }; SLOTS];
 static REALTIME: AtomicBool = AtomicBool::new(false);
 
 thread_local! {
-    static SLOT: Cell<usize> = const { Cell::new(SLOTS) };
+    /// Where the calling thread is watched, and its name.
+    static SLOT: Cell<Option<(usize, &'static str)>> = const { Cell::new(None) };
 }
 
 fn registry() -> MutexGuard<'static, Registry> {
@@ -56,10 +63,10 @@ pub fn watch(name: &'static str) -> Watched {
     if slot < SLOTS {
         registry.names[slot] = Some(name);
         let now = host::monotonic();
-        let panics = registry.panics.iter().find(|(thread, _)| thread == name);
-        PANICS[slot].store(panics.map_or(0, |(_, s)| (now + Span::from_secs(*s)).0), Relaxed);
+        let panics = registry.panics.iter().find(|rule| rule.name == name);
+        PANICS[slot].store(panics.map_or(0, |rule| (now + Span::from_secs(rule.panic_s)).0), Relaxed);
         BEATS[slot].store(now.0, Relaxed);
-        SLOT.set(slot);
+        SLOT.set(Some((slot, name)));
     }
     drop(registry);
     if let Some((_, priority, _)) = WATCHED.iter().find(|(known, priority, _)| *known == name && *priority > 0) {
@@ -71,7 +78,7 @@ pub fn watch(name: &'static str) -> Watched {
 impl Drop for Watched {
     fn drop(&mut self) {
         if self.0 < SLOTS {
-            SLOT.set(SLOTS);
+            SLOT.set(None);
             registry().names[self.0] = None;
         }
     }
@@ -79,8 +86,7 @@ impl Drop for Watched {
 
 /// Says that the calling thread goes on. Allocates nothing.
 pub fn alive() {
-    let slot = SLOT.get();
-    if slot < SLOTS {
+    if let Some((slot, _)) = SLOT.get() {
         let now = host::monotonic().0;
         BEATS[slot].store(now, Relaxed);
         let at = PANICS[slot].load(Relaxed);
@@ -106,8 +112,7 @@ pub fn ask_for_realtime() {
     }
 }
 
-/// Gives the calling thread a real-time priority where the run asks for them.
-pub fn ask_for_priority(priority: i32) {
+fn ask_for_priority(priority: i32) {
     if REALTIME.load(Relaxed) {
         if let Err(e) = host::ask_for_realtime(priority) {
             registry().refused = Some(format!("threads have no real-time priority: {e}; allow it with LimitRTPRIO=20"));
@@ -120,14 +125,20 @@ pub fn refused() -> Option<String> {
     registry().refused.take()
 }
 
-/// Makes threads of these names panic so many seconds after their start.
-pub fn panic_in(threads: impl Iterator<Item = (String, f64)>) {
-    registry().panics.extend(threads);
+/// Makes threads that start from here on panic by these rules; fails where one names no thread.
+pub fn panic_in(rules: &[ThreadRule]) -> Result<(), Fault> {
+    let names = WATCHED.map(|(name, ..)| name);
+    if let Some(rule) = rules.iter().find(|rule| !names.contains(&&*rule.name)) {
+        let what = format!("no thread of the name {} can be asked to panic", rule.name);
+        return Err(Fault::new(FaultKind::Config, "--inject", what, format!("name one of {}", names.join(", "))));
+    }
+    registry().panics.extend_from_slice(rules);
+    Ok(())
 }
 
-/// Whether a thread of this name can be asked to panic.
-pub fn is_watched(name: &str) -> bool {
-    WATCHED.iter().any(|(known, ..)| *known == name)
+/// The rules of `panic_in`, for a process that this one starts.
+pub fn panics() -> Vec<ThreadRule> {
+    registry().panics.clone()
 }
 
 /// Makes a panic of any thread end the process; `tell` is called before.
@@ -138,7 +149,7 @@ pub fn abort_on_panic(tell: impl Fn(&str) + Send + Sync + 'static) {
         if !TOLD.swap(true, Relaxed) {
             let what = info.to_string().replace('\n', " ");
             let thread = std::thread::current();
-            let name = thread.name().unwrap_or("without a name");
+            let name = SLOT.get().map(|(_, name)| name).or(thread.name()).unwrap_or("without a name");
             let what = format!("thread {name} {what}");
             print_err(format_args!("stipple: {what}; this is a mistake of the program, please report it"));
             tell(&what);

@@ -10,12 +10,14 @@ use super::keyframes::{KeyframeRing, Word};
 use super::mapping::{self, Drawn, MapResult, Mapping};
 use super::memory;
 use super::status::{print_err, Gauges};
-use crate::config::Board;
+use super::threads;
+use crate::config::{Board, ThreadRule};
 use crate::mem::unsealed;
 use crate::output::panel::Picture;
 use crate::output::OutputDir;
 use serde::{Deserialize, Serialize};
 use std::io::{self, Read, Write};
+use std::os::fd::AsRawFd;
 use std::os::unix::process::{CommandExt, ExitStatusExt};
 use std::path::PathBuf;
 use std::process::{Child, Command, ExitStatus, Stdio};
@@ -57,6 +59,8 @@ struct Setup {
     ring: i32,
     /// The recording or rig, for errors, and whether samples are recorded: on the first start the whole run must fit.
     first: Option<(String, bool)>,
+    /// Panics of its threads.
+    panics: Vec<ThreadRule>,
     /// Time of the run so far, s.
     run_s: f64,
     parent: u32,
@@ -188,6 +192,8 @@ impl Worker {
             calibration: self.calibration.clone(),
             out: self.out.clone(),
             ring: self.ring.number(),
+            // The next one is to live.
+            panics: if first.is_some() { threads::panics() } else { vec![] },
             first,
             run_s: self.begun.elapsed().as_secs_f64(),
             parent: std::process::id(),
@@ -364,8 +370,11 @@ fn lock(told: &Mutex<Told>) -> std::sync::MutexGuard<'_, Told> {
 }
 
 /// Reads what a worker answers until it ends.
-fn read_answers(mut from: impl Read, told: &Mutex<Told>) {
+fn read_answers(mut from: impl Read + AsRawFd, told: &Mutex<Told>) {
     let mut next = || {
+        while !host::is_readable(from.as_raw_fd(), BEAT.as_millis() as i32) {
+            threads::alive();
+        }
         let mut length = [0; 4];
         from.read_exact(&mut length).ok()?;
         let length = u32::from_le_bytes(length);
@@ -407,6 +416,7 @@ pub fn serve(mut input: impl Read, mut output: impl Write) -> Result<(), Fault> 
         Fault::new(FaultKind::Usage, "map-worker", what, "it is started by `stipple run`, not by hand")
     })?;
     host::live_with_parent(setup.parent).map_err(broken)?;
+    threads::panic_in(&setup.panics)?;
     let start = Instant::now().checked_sub(Duration::from_secs_f64(setup.run_s.max(0.0))).unwrap_or_else(Instant::now);
     let missing = memory::replace_missing(&mut setup.board);
     let Setup { board, calibration, first, .. } = &setup;
@@ -425,6 +435,7 @@ pub fn serve(mut input: impl Read, mut output: impl Write) -> Result<(), Fault> 
     let gauges = Arc::new(Gauges::default());
     let (beating, seen) = (ring.clone(), gauges.clone());
     super::start("beat", move || loop {
+        threads::alive();
         beating.word(Word::Beat).fetch_add(1, Relaxed);
         for (gauge, word) in [
             (&seen.anchors, Word::Anchors),
@@ -440,7 +451,9 @@ pub fn serve(mut input: impl Read, mut output: impl Write) -> Result<(), Fault> 
     tell(&mut output, &Answer::Ready(missing)).map_err(broken)?;
     ring.word(Word::Ready).store(1, Release);
     let stop = || ring.word(Word::Stop).load(Acquire) != 0;
+    let watched = threads::watch("mapping");
     let mut mapping = mapping::map(mapping, &gauges, start, || true, |_| stop());
+    drop(watched);
     if !stop() {
         // The device failed: another process may have more luck with it.
         let fault = refused(mapping.failure.unwrap_or_default());

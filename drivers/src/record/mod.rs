@@ -21,7 +21,7 @@ use std::path::Path;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender};
 use std::sync::{mpsc, Arc};
-use std::thread::JoinHandle;
+use std::thread::{Builder, JoinHandle};
 use std::time::{Duration, Instant};
 
 /// A recording's format on disk. A write that fails leaves what was written before as it was.
@@ -128,25 +128,31 @@ impl Ring {
     }
 }
 
-/// Starts the writer behind a ring, and taps on the two sources. The recording ends when both taps are gone.
+/// Name of the writer's thread.
+pub const WRITER: &str = "writer";
+
+/// Starts the writer behind a ring, and taps on the two sources. The recording ends when both taps are gone. The writer calls
+/// `alive` before each piece of work, and once a second while there is none.
 pub fn start(
     mut sink: Box<dyn Sink>,
     (frames, imu): (Box<dyn FrameSource>, Box<dyn ImuSource>),
     ring: Ring,
+    mut alive: impl FnMut() + Send + 'static,
 ) -> (Recorder, TappedFrames, TappedImu) {
     let Ring { items, waiting, give_back, spare } = ring;
     let (counts, in_ring) = (Arc::new(Counts::default()), Arc::new(AtomicU64::new(0)));
     let (c, taken) = (counts.clone(), in_ring.clone());
-    let thread = std::thread::spawn(move || {
+    let work = move || {
         host::lower_priority(NICE);
         let give_back = |frames| {
             let _ = give_back.send(frames);
             taken.fetch_sub(1, Relaxed);
         };
-        let failure = write_all(&mut *sink, &waiting, give_back, &c);
+        let failure = write_all(&mut *sink, &waiting, give_back, &c, &mut alive);
         c.record_cpu_us.add((1e6 * host::thread_cpu().total_s()) as u64);
         failure
-    });
+    };
+    let thread = Builder::new().name(WRITER.into()).spawn(work).expect("the system starts one more thread");
     let tapped = TappedFrames { source: frames, spare, items: items.clone(), counts: counts.clone(), waiting: in_ring };
     let tapped_imu = TappedImu { source: imu, items, counts: counts.clone() };
     (Recorder { counts, thread }, tapped, tapped_imu)
@@ -158,6 +164,7 @@ fn write_all(
     waiting: &Receiver<Item>,
     give_back: impl Fn(Box<Frames>),
     c: &Counts,
+    alive: &mut dyn FnMut(),
 ) -> Option<String> {
     let mut failure: Option<String> = None;
     let mut note = |done: io::Result<()>| match done {
@@ -170,6 +177,7 @@ fn write_all(
     // When the first item was written that may not be on the disk yet.
     let mut unsynced: Option<Instant> = None;
     loop {
+        alive();
         let item = match waiting.recv_timeout(SYNC_EVERY) {
             Ok(item) => Some(item),
             Err(RecvTimeoutError::Timeout) => None,

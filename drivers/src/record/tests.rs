@@ -50,7 +50,8 @@ fn sources(frames: usize) -> (PacedFrames, PacedImu) {
 fn record(sink: Box<dyn Sink>, frames: usize, slots: usize) -> (Duration, Recorded) {
     let shape = frame(0);
     let (camera, unit) = sources(frames);
-    let (recorder, mut camera, mut unit) = start(sink, (Box::new(camera), Box::new(unit)), Ring::new(&shape, slots));
+    let (recorder, mut camera, mut unit) =
+        start(sink, (Box::new(camera), Box::new(unit)), Ring::new(&shape, slots), || ());
     let mut slowest = Duration::ZERO;
     std::thread::scope(|s| {
         s.spawn(move || {

@@ -14,6 +14,7 @@ use super::texture::{self, Spot};
 use crate::camera::Camera;
 use crate::types::Pose;
 use glam::{DVec2, Quat, Vec2, Vec3};
+use std::thread::Builder;
 
 /// Side of a tile, pixels, and of the grid of rays of an edge pixel.
 const TILE: usize = 16;
@@ -329,7 +330,8 @@ fn fill<T: Send>(
     std::thread::scope(|scope| {
         for ((k, band), list) in bands.zip(lists) {
             let work = &work;
-            scope.spawn(move || work(k, band, list));
+            let draw = move || work(k, band, list);
+            Builder::new().name("render".into()).spawn_scoped(scope, draw).expect("the system starts a few threads");
         }
         if let (Some((_, band)), Some(list)) = (first, spare) {
             work(0, band, list);

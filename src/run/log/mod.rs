@@ -15,6 +15,7 @@ pub mod read;
 #[cfg(test)]
 mod tests;
 
+use super::threads;
 use crate::mem::{Footprint, List};
 use crate::vio::{Odometry, Update};
 use crossbeam_queue::ArrayQueue;
@@ -38,6 +39,7 @@ const SYNC_PERIOD: Duration = Duration::from_millis(500);
 /// A process whose thread panicked has ended within a second.
 const PANIC_MAX: Duration = Duration::from_millis(700);
 const POLL_PERIOD: Duration = Duration::from_millis(50);
+const THREAD: &str = "log";
 /// Nice value of the thread: as the recorder's, after sensors and odometry.
 const NICE: i32 = 5;
 
@@ -241,7 +243,7 @@ impl Log {
         let queue = Arc::new(Queue::measured(&mut Footprint::default()));
         let shared = queue.clone();
         LogSender(queue.clone()).event(EventKind::Start, what);
-        let thread = super::start("log", move || {
+        let thread = super::start(THREAD, move || {
             host::lower_priority(NICE);
             let files = write(&shared, LogFiles::new(dir, limits));
             shared.closed.store(true, Ordering::Release);
@@ -280,6 +282,10 @@ fn lock_last() -> MutexGuard<'static, Option<Arc<Queue>>> {
 /// Ends the log with a panic, and waits until it is on the disk, or for `PANIC_MAX`.
 pub fn close_for_panic(what: &str) {
     let Some(queue) = LAST.try_lock().ok().and_then(|last| last.clone()) else { return };
+    if std::thread::current().name() == Some(THREAD) {
+        // Nobody is left to write it.
+        return;
+    }
     LogSender(queue.clone()).event(EventKind::Panic, what);
     queue.over.store(true, Ordering::Release);
     let limit = Instant::now() + PANIC_MAX;
@@ -293,6 +299,7 @@ fn write(queue: &Queue, mut files: LogFiles) -> Vec<PathBuf> {
     let counts = &queue.counts;
     let (mut due, mut ended, mut unsynced) = (Instant::now() + SYNC_PERIOD, files.begin().err(), 0);
     loop {
+        threads::alive();
         // Read before the queue, so that what came last is still written.
         let over = queue.over.load(Ordering::Acquire);
         // At most what the queue holds, so that the next sync is not put off.

@@ -5,6 +5,7 @@
 
 use super::{Face, Light, Room, Solid};
 use glam::{Vec2, Vec3};
+use std::thread::Builder;
 
 /// The irradiance of all faces.
 #[derive(Clone, Debug, Default)]
@@ -50,7 +51,7 @@ impl LightMap {
         std::thread::scope(|scope| {
             for (k, out) in nodes.chunks_mut(share).enumerate() {
                 let grids = &grids;
-                scope.spawn(move || {
+                let bake = move || {
                     let mut near = Vec::with_capacity(room.solids.len());
                     for (i, node) in out.iter_mut().enumerate() {
                         let i = k * share + i;
@@ -59,7 +60,8 @@ impl LightMap {
                         let at = Vec2::new((i % g.columns) as f32, (i / g.columns) as f32) / g.density;
                         *node = irradiance(room, &room.faces[f], at, &mut near);
                     }
-                });
+                };
+                Builder::new().name("light".into()).spawn_scoped(scope, bake).expect("the system starts a few threads");
             }
         });
         LightMap { grids, nodes }
