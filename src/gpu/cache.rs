@@ -50,6 +50,8 @@ pub(super) struct PipelineCache {
     /// Hash of the file as it was read.
     held: Option<u64>,
     path: PathBuf,
+    /// Where the file is from when the driver is given it until `keep`: a start that does not get as far leaves none to the next.
+    tried: PathBuf,
     device: Arc<Device>,
 }
 
@@ -60,7 +62,9 @@ impl PipelineCache {
         let path = folder.join(format!("pipelines-{:08x}-{:08x}", of.vendor_id, of.device_id));
         let mut file = Vec::new();
         let read = input::read(&path, BYTES_MAX, &mut file).ok();
-        let found = read.and_then(|()| checked(&file, of)).unwrap_or_default();
+        let tried = path.with_extension("tried");
+        let found = read.and_then(|()| checked(&file, of)).filter(|_| fs::rename(&path, &tried).is_ok());
+        let found = found.unwrap_or_default();
         let made = |data| {
             let info = vk::PipelineCacheCreateInfo::default().initial_data(data);
             // SAFETY: the device is alive; the data is what this driver gave, to the byte, and outlives the call.
@@ -68,10 +72,10 @@ impl PipelineCache {
         };
         let (raw, taken) = made(found).map(|raw| (raw, found)).or_else(|_| made(&[]).map(|raw| (raw, &[][..])))?;
         let held = (!taken.is_empty()).then(|| sum(taken, of));
-        Ok(PipelineCache { raw, taken: taken.len(), held, path, device: device.clone() })
+        Ok(PipelineCache { raw, taken: taken.len(), held, path, tried, device: device.clone() })
     }
 
-    /// Writes what is new.
+    /// Writes what is new; the driver has worked with what there was.
     pub fn keep(&mut self) -> Result<(), Fault> {
         self.write().map_err(|e| {
             Fault::new(
@@ -87,7 +91,7 @@ impl PipelineCache {
         // SAFETY: the cache and its device are alive, and one thread uses them.
         let data = unsafe { self.device.raw.get_pipeline_cache_data(self.raw) }.map_err(io::Error::other)?;
         let sum = sum(&data, &self.device.properties);
-        if self.held == Some(sum) {
+        if self.held == Some(sum) && fs::rename(&self.tried, &self.path).is_ok() {
             return Ok(());
         }
         if (HEAD + data.len()) as u64 > BYTES_MAX {
@@ -114,13 +118,16 @@ impl PipelineCache {
             // The first error is the one to report.
             let _ = fs::remove_file(&partial);
         })?;
-        self.held = Some(sum);
+        let _ = fs::remove_file(&self.tried);
         Ok(())
     }
 }
 
 impl Drop for PipelineCache {
     fn drop(&mut self) {
+        if self.held.is_some() && !self.path.exists() {
+            let _ = fs::rename(&self.tried, &self.path);
+        }
         if !self.device.abandoned.load(Relaxed) {
             // SAFETY: no pipeline is being made, and pipelines do not need the cache that they were made with.
             unsafe { self.device.raw.destroy_pipeline_cache(self.raw, None) };

@@ -45,6 +45,8 @@ pub struct Mapping {
     pub anchors: u64,
     /// Why mapping stopped before the end, if it did; odometry goes on.
     pub failure: Option<String>,
+    /// There was a step, and the driver is well.
+    has_worked: bool,
     period_s: f64,
     next_curve_s: f64,
 }
@@ -55,11 +57,7 @@ impl Mapping {
     pub fn open(calibration: &Calibration, board: &Board, ring: Arc<KeyframeRing>) -> Result<Mapping, Fault> {
         let build = || {
             host::lower_priority(NICE);
-            let mut mapper = Mapper::open(calibration, board)?;
-            if let Err(why) = mapper.keep_pipelines() {
-                print_err(format_args!("stipple: note: {why}"));
-            }
-            Ok::<Mapper, Fault>(mapper)
+            Mapper::open(calibration, board)
         };
         let mapper = super::apart("mapping", build)?;
         Ok(Mapping {
@@ -73,6 +71,7 @@ impl Mapping {
             busy_s: 0.0,
             anchors: 0,
             failure: None,
+            has_worked: false,
             period_s: board.map.curve_period_s,
             next_curve_s: board.map.curve_period_s,
         })
@@ -99,6 +98,11 @@ impl Mapping {
             }
         };
         self.busy_s += start.elapsed().as_secs_f64();
+        if worked && !std::mem::replace(&mut self.has_worked, true) {
+            unsealed(|| {
+                self.mapper.keep_pipelines().unwrap_or_else(|why| print_err(format_args!("stipple: note: {why}")))
+            });
+        }
         gauges.anchors.store(self.anchors, Relaxed);
         gauges.iterations.store(self.iterations, Relaxed);
         gauges.splats.store(self.mapper.splat_count() as u64, Relaxed);

@@ -71,6 +71,27 @@ fn a_damaged_cache_is_not_taken_and_is_written_anew() {
     assert_eq!(fs::read(&file).unwrap(), whole);
 }
 
+/// A driver that crashes over what it is given would do so at each start.
+#[test]
+fn a_start_that_dies_with_a_cache_leaves_none_to_the_next() {
+    let dir = tempfile::tempdir().unwrap();
+    let file = kept(&mut open(), dir.path());
+    let whole = fs::read(&file).unwrap();
+    let mut dies = open();
+    assert!(dies.reuse_pipelines(dir.path()) > 0 && !file.exists());
+    std::mem::forget(dies);
+    let mut gpu = open();
+    assert_eq!(start(&mut gpu, dir.path()), (0, Ok(())));
+    assert_eq!(fs::read(&file).unwrap(), whole, "written anew");
+    assert!(start(&mut gpu, dir.path()).0 > 0);
+    // One that ends by itself puts it back.
+    let mut ends = open();
+    assert!(ends.reuse_pipelines(dir.path()) > 0);
+    drop(ends);
+    assert!(start(&mut gpu, dir.path()).0 > 0);
+    assert_eq!(names(dir.path()), [file.as_path()], "something is left over");
+}
+
 #[test]
 fn a_cache_that_cannot_be_kept_is_a_fault_and_stops_nothing() {
     let dir = tempfile::tempdir().unwrap();
