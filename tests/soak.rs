@@ -265,10 +265,10 @@ const GROWTH_MAX: [u64; 2] = [1 << 20, 8 << 20];
 /// An image being read when looked at.
 const FILES_SLACK: u64 = 1;
 const WARM: Duration = Duration::from_secs(60);
-/// Of these a flight has none; others, such as a full store of keyframes, are how a map in fixed memory lives.
+/// Counters that stay zero in a flight; others, such as a full store of keyframes, are how a map in fixed memory lives.
 const LOSSES: [&str; 8] =
     ["frames_", "camera_", "imu_", "log_records_lost", "log_ended", "lines_lost", "threads_", "map_"];
-/// Of the frames, what a machine that does other work beside may overtake.
+/// Share of the frames that a machine which does other work beside may overtake.
 const OVERWRITTEN_MAX: f64 = 1e-3;
 /// Frames until odometry starts, at the first motion.
 const STARTING_MAX: f64 = 100.0;

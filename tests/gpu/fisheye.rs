@@ -8,7 +8,7 @@ use stipple::map::{Fisheye, Gaussian, View};
 use stipple::stereo::Pinhole;
 use stipple_drivers::{Camera, Lens};
 
-/// Of TUM-VI's cameras.
+/// Distortion of TUM-VI's cameras.
 const K: [f64; 4] = [0.0034, 0.0008, -0.0017, 0.0003];
 
 /// Sees about 95 degrees off its axis at the sides, and more in the corners.

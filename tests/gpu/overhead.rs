@@ -55,7 +55,7 @@ fn timings_name_every_command_and_add_up() {
 }
 
 #[test]
-#[ignore = "a measurement"]
+#[ignore = "prints times of submissions and transfers: cargo test --release --test gpu overhead_of_submissions_and_transfers -- --ignored --nocapture"]
 fn overhead_of_submissions_and_transfers() {
     let mut gpu = Gpu::open_with(&GpuConfig::default(), 64 << 20, GpuOptions::default()).unwrap();
     let (x, y) = (gpu.alloc::<f32>("x", 4 << 20).unwrap(), gpu.alloc::<f32>("y", 4 << 20).unwrap());

@@ -150,9 +150,8 @@ fn scan_equals_its_twin() {
     }
 }
 
-/// Prints times; run with `--ignored --nocapture`.
 #[test]
-#[ignore = "a measurement"]
+#[ignore = "prints times of sorts and scans of three sizes: cargo test --release --test gpu sort_and_scan_times -- --ignored --nocapture"]
 fn sort_and_scan_times() {
     for n in [30_000, 300_000, 3_000_000] {
         let mut rig = Rig::new(n);

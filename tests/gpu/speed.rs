@@ -137,9 +137,8 @@ fn gradients_summed_in_chunks_are_those_summed_one_by_one() {
     }
 }
 
-/// Run with --ignored --nocapture.
 #[test]
-#[ignore = "a measurement"]
+#[ignore = "prints times of steps with pools of several fillings: cargo test --release --test gpu a_pool_a_quarter_full_or_a_quarter_seen_against_a_full_one -- --ignored --nocapture"]
 fn a_pool_a_quarter_full_or_a_quarter_seen_against_a_full_one() {
     const N: u32 = 10_000;
     let v = view(320, 240);

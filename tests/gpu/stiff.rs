@@ -202,7 +202,7 @@ fn noise_leaves_every_parameter_finite() {
 }
 
 #[test]
-#[ignore = "the long form"]
+#[ignore = "the long form of the test above, minutes: cargo test --release --test gpu ten_thousand_iterations_on_noise_leave_every_parameter_finite -- --ignored --nocapture"]
 fn ten_thousand_iterations_on_noise_leave_every_parameter_finite() {
     noise(10_000);
 }

@@ -37,7 +37,7 @@ impl Planes {
         Planes { colour: [zeros(), zeros(), zeros()] }
     }
 
-    /// Of grey alone.
+    /// Planes of grey alone.
     pub fn grey(grey: &[f64]) -> Planes {
         let mut p = Planes::zeros(grey.len());
         p.colour[0].copy_from_slice(grey);
