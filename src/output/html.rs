@@ -115,13 +115,14 @@ fn tables(report: &Report) -> String {
         ("Iteration time, median", f(report.iteration_ms_p50, 1), "ms"),
         ("Time until training views stay at 25 dB", f(report.seconds_to_25_db, 0), "s"),
     ];
-    let cost: [Row; 7] = [
+    let cost: [Row; 8] = [
         ("Run time", f(report.wall_s, 1), "s"),
         ("Keyframes", n(report.keyframes), ""),
         ("Anchors", n(report.anchors), ""),
         ("Tracker and estimator", mib(report.estimator_bytes), "MiB"),
         ("GPU memory", mib(report.gpu_bytes), "MiB"),
         ("Resident memory, peak", mib(report.rss_peak_bytes), "MiB"),
+        ("Resident memory of the mapper's process, peak", mib(report.map_rss_peak_bytes), "MiB"),
         ("Heap allocations after seal", n(report.heap_after_seal), ""),
     ];
     let parts = [table("Odometry", &odometry), table("Map", &map), table("Cost", &cost), table_of_rig(report)];

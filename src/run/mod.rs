@@ -135,8 +135,8 @@ pub struct Flown {
     pub capture: Option<Capture>,
     /// The fault of the source that broke, if one did.
     pub broken: Option<Fault>,
-    /// The first lines about sensors lost and found again.
-    pub notices: Vec<String>,
+    /// The first lines about sensors lost and found again, threads that hang, and the mapper.
+    pub notices: Vec<(EventKind, String)>,
 }
 
 /// Frames that a run without an end is judged by, evenly spread: the log has all of them.
@@ -221,7 +221,9 @@ pub fn fly(
         return Err(fault);
     }
     flown.warnings.splice(..0, input.warnings);
-    flown.warnings.extend(flown.notices.iter().filter(|line| line.starts_with(worker::NAME)).cloned());
+    flown
+        .warnings
+        .extend(flown.notices.iter().filter(|(kind, _)| *kind == EventKind::Map).map(|(_, line)| line.clone()));
     let (report, unwritten) = summary::conclude(title, flown, &logged, out);
     let fault = recorded.and_then(Result::err).or(broken).or(unwritten);
     if fault.is_none() {
@@ -430,7 +432,7 @@ fn supervise(
     mut worker: Option<&mut Worker>,
     mapped: impl Fn(f64, bool) -> bool,
     status: &mut Status,
-) -> Vec<String> {
+) -> Vec<(EventKind, String)> {
     let (_watched, mut notices, mut silent) = (threads::watch("main"), vec![], None);
     loop {
         threads::alive();
@@ -449,7 +451,7 @@ fn supervise(
             status.say(kind, &line);
             // A cable that comes loose each second, for hours, is in the log.
             if notices.len() < NOTICES_KEPT {
-                notices.push(line);
+                notices.push((kind, line));
             }
         };
         hangs.into_iter().chain(threads::refused()).for_each(|line| say(EventKind::System, line));

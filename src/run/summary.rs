@@ -107,6 +107,7 @@ pub fn conclude(title: Title, mut flown: Flown, logged: &[PathBuf], out: &Output
         report.kernels = m.kernels.clone();
         report.quality = m.quality.clone();
         report.heap_after_seal = Some(heap + m.heap_after_seal);
+        report.map_rss_peak_bytes = Some(m.rss_peak_bytes).filter(|bytes| *bytes > 0);
         if let Some(why) = &m.failure {
             warn(&mut flown.warnings, format!("the map is incomplete: {why}"));
         }

@@ -27,8 +27,6 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 use stipple_drivers::{host, Calibration, Fault, FaultKind};
 
-/// How lines about the worker begin.
-pub const NAME: &str = "the mapper";
 /// The first start may compile every kernel.
 const BOOT_MAX: Duration = Duration::from_secs(120);
 /// A process that gives no sign of life for so long hangs, and so does one whose slice of work takes longer than the second:
@@ -120,7 +118,9 @@ impl MapSide {
     /// Ends mapping: writes `map.ply`, and answers what it came to.
     pub fn conclude(self, out: &OutputDir) -> MapResult {
         match self {
-            MapSide::Here(mut mapping) => MapResult { heap_after_seal: 0, ..mapping.conclude(out, &mut |_| ()) },
+            MapSide::Here(mut mapping) => {
+                MapResult { heap_after_seal: 0, rss_peak_bytes: 0, ..mapping.conclude(out, &mut |_| ()) }
+            }
             MapSide::Apart(worker) => worker.conclude(),
         }
     }
@@ -224,7 +224,7 @@ impl Worker {
                 ring.offer_again();
                 if let Err(e) = self.spawn(None) {
                     self.postpone(now, Duration::ZERO);
-                    return Some(format!("{NAME} does not start again: {e}"));
+                    return Some(format!("the mapper does not start again: {e}"));
                 }
                 self.restarts += 1;
             }
@@ -242,7 +242,7 @@ impl Worker {
                 ] {
                     gauge.store(ring.word(word).load(Relaxed), Relaxed);
                 }
-                return again.then(|| format!("{NAME} maps again"));
+                return again.then(|| "the mapper maps again".into());
             }
             return None;
         };
@@ -257,7 +257,7 @@ impl Worker {
             0 => "now".into(),
             s => format!("in {s} s"),
         };
-        Some(format!("{NAME} {why}{said}; it starts again {when}, with an empty map"))
+        Some(format!("the mapper {why}{said}; it starts again {when}, with an empty map"))
     }
 
     fn postpone(&mut self, now: Instant, life: Duration) {
