@@ -316,6 +316,33 @@ fn panics_of_each_thread() {
     }
 }
 
+/// The pause before the next start grows with each death; at the end of a run there is a mapper all the same.
+#[test]
+fn a_mapper_that_pauses_when_a_run_ends_is_started_for_the_map() {
+    for dies_again in [false, true] {
+        let (dir, out) = folder();
+        let data = flight(dir.path(), "8");
+        let child = run(&data, &out).spawn().unwrap();
+        let mut mapper = worker(&child);
+        std::thread::sleep(Duration::from_millis(1500));
+        // It pauses for 0, 1, 2 and 4 seconds.
+        for died in 1..=4 + usize::from(dies_again) {
+            kill(mapper, "KILL");
+            wait_for("its end", || has_ended(mapper));
+            if died < 4 + usize::from(dies_again) {
+                mapper = wait_for("another mapper", || children(child.id()).into_iter().find(|pid| *pid != mapper));
+            }
+        }
+        let o = child.wait_with_output().unwrap();
+        let (r, said) = (report(&out), text(&o));
+        assert!(o.status.success() && said.contains("starts again in 4 s"), "{said}");
+        assert_eq!(r["count_map_restarts"], 4, "{said}");
+        assert_eq!(out.join("map.ply").exists(), !dies_again, "{said}");
+        assert_eq!(r["splats"].as_u64().unwrap() > 500, !dies_again, "{said}");
+        assert_eq!(said.contains("died at the end, though it was started again for the end"), dies_again, "{said}");
+    }
+}
+
 /// `cargo test --release --test mission disturbed -- --ignored --nocapture`: passes of MH_01, every other one with its
 /// mapper killed (20) or stopped (5) at a random moment. Frames of all passes of a kind are pooled.
 #[test]

@@ -268,27 +268,52 @@ impl Worker {
         self.pause = (2 * self.pause).clamp(Duration::from_secs(1), PAUSE_MAX);
     }
 
-    /// Lets the worker evaluate, for as long as it may take, and answers what it told.
+    /// Lets the worker evaluate, for as long as it may take, and answers what it told. Where there is none, as it pauses
+    /// after it died, one is started for the keyframes that wait.
     pub fn conclude(mut self) -> MapResult {
-        let none = |failure: &str| MapResult { failure: Some(failure.into()), ..MapResult::default() };
-        let Some(mut running) = self.running.take() else { return none("there was no mapper when the run ended") };
+        let late = self.running.is_none();
+        if late {
+            self.ring.offer_again();
+            if let Err(e) = self.spawn(None) {
+                return incomplete(&format!("there was no mapper when the run ended, and none starts: {e}"));
+            }
+        }
+        let mut result = self.evaluate(late);
+        if late {
+            result.counters.push(("map_restarts".into(), 1));
+            result.failure = result.failure.map(|why| format!("{why}, though it was started again for the end"));
+        }
+        result
+    }
+
+    /// Asks the worker for what it came to; where it is `late`, after it took what waits.
+    fn evaluate(&mut self, late: bool) -> MapResult {
+        let Some(mut running) = self.running.take() else { return incomplete("there was no mapper") };
         let (asked, mut cut) = (Instant::now(), None);
-        self.ring.word(Word::Stop).store(1, Release);
         while matches!(running.child.try_wait(), Ok(None)) && cut.is_none() {
-            let late = asked.elapsed() >= CONCLUSION_MAX;
+            let waits = self.ring.word(Word::Ready).load(Acquire) == 0 || self.ring.offered() > 0;
+            let stop = !late || !waits || asked.elapsed() >= CONCLUSION_MAX / 2;
+            self.ring.word(Word::Stop).store(stop.into(), Release);
+            let over = asked.elapsed() >= CONCLUSION_MAX;
             let stopped = host::stopped_and_resident(running.child.id()).is_some_and(|(stopped, _)| stopped);
-            if late || stopped {
-                cut = Some(if late { "evaluation took too long" } else { "the mapper was stopped (SIGSTOP)" });
+            if over || stopped {
+                cut = Some(if over { "evaluation took too long" } else { "the mapper was stopped (SIGSTOP)" });
             }
             std::thread::sleep(Duration::from_millis(20));
         }
         let told = running.end();
         let mut told = lock(&told);
-        let Some(mut result) = told.result.take() else { return none(cut.unwrap_or("the mapper died at the end")) };
+        let Some(mut result) = told.result.take() else {
+            return incomplete(cut.unwrap_or("the mapper died at the end"));
+        };
         result.failure = result.failure.or(cut.map(Into::into));
         result.drawn = std::mem::take(&mut told.drawn);
         result
     }
+}
+
+fn incomplete(why: &str) -> MapResult {
+    MapResult { failure: Some(why.into()), ..MapResult::default() }
 }
 
 impl Running {
