@@ -96,7 +96,7 @@ impl PipelineCache {
         }
         if (HEAD + data.len()) as u64 > BYTES_MAX {
             // Too many specialisations came together: the next start collects its own.
-            let _ = fs::remove_file(&self.path);
+            let _ = [&self.path, &self.tried].map(fs::remove_file);
             return Ok(());
         }
         let partial = self.path.with_extension("partial");
