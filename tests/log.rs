@@ -1,4 +1,5 @@
-//! The log of a run, and what `stipple recover` makes of it: after an end, after SIGKILL at any moment, and on a disk that is full.
+//! The log of a run, and what `stipple recover` makes of it: after an end, after SIGKILL at any moment, with damage,
+//! and on a disk that is full or gone.
 #![allow(clippy::unwrap_used)]
 
 mod program;
@@ -60,6 +61,20 @@ fn a_log_gives_the_trajectory_that_the_run_wrote() {
         text(&o)
     );
     assert!(fs::read(&tum).unwrap() == wrote);
+    // Damage costs the part of the log that it is in.
+    let log = out.join("log-0000.mcap");
+    let whole = fs::read(&log).unwrap();
+    let mut damaged = whole.clone();
+    damaged[whole.len() / 2..][..512].fill(0);
+    fs::write(&log, damaged).unwrap();
+    fs::remove_file(&tum).unwrap();
+    let o = recover(&out);
+    let said = text(&o);
+    assert!(said.contains("are damaged or cut off: skipped") && said.contains("ended: "), "{said}");
+    let of_whole = String::from_utf8(wrote.clone()).unwrap();
+    let lines = fs::read_to_string(&tum).unwrap();
+    assert!(poses(&out) > 10 && lines.lines().all(|line| of_whole.lines().any(|l| l == line)), "{said}");
+    fs::write(&log, whole).unwrap();
     // Another run in the same folder loses nothing of the one before.
     let o = fly(&["run", "--dataset", data.to_str().unwrap(), "--duration", "2"], &out).output().unwrap();
     assert!(o.status.success(), "{}", text(&o));

@@ -8,6 +8,9 @@ use std::io;
 use std::path::{Path, PathBuf};
 use stipple_drivers::{Fault, FaultKind, Nanos};
 
+/// Damaged places that are named one by one.
+const DAMAGE_LINES: usize = 16;
+
 #[derive(clap::Args)]
 pub struct Args {
     /// Folder of the run, as it was given to --out
@@ -70,6 +73,14 @@ fn recover_run(run: &LoggedRun, out: &OutputDir, name: &str) -> Result<u64, Faul
     let end = end.map_or("cut off or damaged here, without an end".into(), |why| format!("ended: {why}"));
     print_out(format_args!("{}: {seconds:.1} s, {frames} frames, {poses} with a pose; {end}", names.join(", ")));
     events.iter().for_each(print_out);
+    for (path, range) in run.damage.iter().take(DAMAGE_LINES) {
+        let (file, bytes) = (path.display(), range.end - range.start);
+        print_out(format_args!("{file}: {bytes} bytes from byte {} on are damaged or cut off: skipped", range.start));
+    }
+    if let Some(more) = run.damage.get(DAMAGE_LINES..).filter(|more| !more.is_empty()) {
+        let bytes: u64 = more.iter().map(|(_, range)| range.end - range.start).sum();
+        print_out(format_args!("and {bytes} bytes in {} more places", more.len()));
+    }
     print_out(format_args!(
         "{}{}",
         path.display(),

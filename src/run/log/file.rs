@@ -1,4 +1,5 @@
-//! The files of a log: MCAP, one chunk a sync.
+//! The files of a log: MCAP, in chunks of half a second at most. A chunk has a checksum, names its run and numbers its
+//! messages: by itself it says what it is, whatever became of the rest of the file.
 
 use super::{Clocks, Content, Event, EventKind, Limits, Record};
 use crate::vio::Health;
@@ -9,7 +10,6 @@ use std::collections::BTreeMap;
 use std::fs::{read_dir, File, OpenOptions};
 use std::io;
 use std::path::{Path, PathBuf};
-use std::time::{Duration, Instant};
 use stipple_drivers::{host, Nanos};
 
 /// Topic and schema of each channel; a schema says only what a viewer needs.
@@ -36,7 +36,13 @@ const CHANNELS: [(&str, &str, &str); 4] = [
 "realtime_ns":{"type":"integer"},"run_ns":{"type":"integer"}}}"#,
     ),
 ];
-const CLOCKS_PERIOD: Duration = Duration::from_secs(60);
+/// Bytes of messages that end a chunk before the next sync does, as after a stall of the disk: damage costs whole chunks.
+const CHUNK: usize = 16 << 10;
+
+/// What a channel holds. Readers know it by its number, since its record may be lost.
+pub fn topic(channel: u16) -> Option<&'static str> {
+    CHANNELS.get(usize::from(channel).checked_sub(1)?).map(|c| c.0)
+}
 
 fn failed(e: McapError) -> io::Error {
     match e {
@@ -50,7 +56,8 @@ pub struct LogFiles {
     dir: PathBuf,
     limits: Limits,
     run_ns: i64,
-    clocks_due: Instant,
+    /// Messages of the run so far: each has the next number.
+    sequence: u32,
     open: Option<Open>,
     json: Vec<u8>,
     pub written: Vec<PathBuf>,
@@ -60,15 +67,16 @@ struct Open {
     writer: Writer<File>,
     /// The writer's, too.
     file: File,
-    /// Bytes up to the last whole chunk.
+    /// Bytes up to the last sync.
     good: u64,
-    channels: [u16; CHANNELS.len()],
+    /// Bytes of messages since the last chunk was ended.
+    chunk: usize,
 }
 
 impl LogFiles {
     pub fn new(dir: PathBuf, limits: Limits) -> LogFiles {
         let run_ns = Clocks::now(None).realtime_ns;
-        LogFiles { dir, limits, run_ns, clocks_due: Instant::now(), open: None, json: vec![], written: vec![] }
+        LogFiles { dir, limits, run_ns, sequence: 0, open: None, json: vec![], written: vec![] }
     }
 
     /// Begins the next file.
@@ -78,20 +86,19 @@ impl LogFiles {
         let file = OpenOptions::new().write(true).create_new(true).open(&path)?;
         // A name is on the disk when its folder is.
         File::open(&self.dir)?.sync_all()?;
-        // A chunk ends where a sync asks for it, so that what a failure takes back is known.
+        // A chunk ends where it is asked for, and the next begins with the clocks.
         let options = WriteOptions::new().library("stipple").compression(None).disable_seeking(true).chunk_size(None);
         let mut writer = options.create(file.try_clone()?).map_err(failed)?;
         let names = Health::NAMES.iter().enumerate().map(|(bit, name)| (format!("health bit {bit}"), name.to_string()));
         let (names, none) = (names.collect(), BTreeMap::new());
-        let mut channels = [0; CHANNELS.len()];
-        for (id, (topic, name, schema)) in channels.iter_mut().zip(CHANNELS) {
+        for (topic, name, schema) in CHANNELS {
             let schema = writer.add_schema(name, "jsonschema", schema.as_bytes()).map_err(failed)?;
             let notes = if topic == STATE { &names } else { &none };
-            *id = writer.add_channel(schema, topic, "json", notes).map_err(failed)?;
+            writer.add_channel(schema, topic, "json", notes).map_err(failed)?;
         }
-        self.open = Some(Open { writer, file, good: 0, channels });
+        self.open = Some(Open { writer, file, good: 0, chunk: 0 });
         self.written.push(path);
-        self.tie_clocks()
+        Ok(())
     }
 
     /// Fails where the disk has less room than the floor.
@@ -104,11 +111,6 @@ impl LogFiles {
             }
             _ => Ok(()),
         }
-    }
-
-    fn tie_clocks(&mut self) -> io::Result<()> {
-        self.clocks_due = Instant::now() + CLOCKS_PERIOD;
-        self.message(CLOCKS, host::monotonic(), None, &Clocks::now(Some(self.run_ns)))
     }
 
     pub fn write(&mut self, record: &Record) -> io::Result<()> {
@@ -126,22 +128,28 @@ impl LogFiles {
     }
 
     fn message(&mut self, topic: &str, at: Nanos, taken: Option<i64>, content: &impl Serialize) -> io::Result<()> {
+        if self.open.as_ref().is_some_and(|open| open.chunk == 0) {
+            self.put(CLOCKS, host::monotonic(), None, &Clocks::now(Some(self.run_ns)))?;
+        }
+        self.put(topic, at, taken, content)?;
+        self.open.as_mut().filter(|open| open.chunk >= CHUNK).map_or(Ok(()), Open::end_chunk)
+    }
+
+    fn put(&mut self, topic: &str, at: Nanos, taken: Option<i64>, content: &impl Serialize) -> io::Result<()> {
         let Some(open) = &mut self.open else { return Ok(()) };
         self.json.clear();
         serde_json::to_writer(&mut self.json, content)?;
         let channel = CHANNELS.iter().position(|c| c.0 == topic).expect("one of CHANNELS");
         let [log_time, publish_time] = [at.0, taken.unwrap_or(at.0)].map(|t| t.max(0) as u64);
-        let header = MessageHeader { channel_id: open.channels[channel], sequence: 0, log_time, publish_time };
+        let header = MessageHeader { channel_id: channel as u16 + 1, sequence: self.sequence, log_time, publish_time };
+        (self.sequence, open.chunk) = (self.sequence.wrapping_add(1), open.chunk + self.json.len());
         open.writer.write_to_known_channel(&header, &self.json).map_err(failed)
     }
 
     /// Puts everything on the disk; closes the file where it is full or the log is `over`.
     pub fn sync(&mut self, over: bool) -> io::Result<()> {
-        if Instant::now() >= self.clocks_due {
-            self.tie_clocks()?;
-        }
         let Some(open) = &mut self.open else { return Ok(()) };
-        open.writer.flush().map_err(failed)?;
+        open.end_chunk()?;
         open.file.sync_data()?;
         open.good = open.file.metadata()?.len();
         let full = open.good >= self.limits.file;
@@ -165,7 +173,7 @@ impl LogFiles {
 
     fn close(&mut self) -> io::Result<()> {
         let Some(open) = &mut self.open else { return Ok(()) };
-        open.writer.flush().map_err(failed)?;
+        open.end_chunk()?;
         open.good = open.file.metadata()?.len();
         open.writer.finish().map_err(failed)?;
         open.file.sync_all()?;
@@ -173,13 +181,20 @@ impl LogFiles {
         Ok(())
     }
 
-    /// Leaves the file as it was after its last whole chunk.
+    /// Leaves the file as it was after its last sync.
     pub fn give_up(&mut self) {
         if let Some(Open { writer, file, good, .. }) = self.open.take() {
             drop(writer.into_inner());
             // A disk that refuses this leaves a cut chunk, which readers pass over.
             let _ = file.set_len(good).and_then(|()| file.sync_all());
         }
+    }
+}
+
+impl Open {
+    fn end_chunk(&mut self) -> io::Result<()> {
+        self.chunk = 0;
+        self.writer.flush().map_err(failed)
     }
 }
 

@@ -140,7 +140,7 @@ pub struct Event<'a> {
     pub text: Cow<'a, str>,
 }
 
-/// Ties the clocks to one another, and a file to its run. First in each file, and once a minute.
+/// Ties the clocks to one another, and a chunk to its run: the first message of each.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Clocks {
     pub monotonic_ns: i64,

@@ -8,9 +8,12 @@ use super::read::{read_files, runs, Message};
 use super::*;
 use crate::output::OutputDir;
 use crate::run::summary::write_trajectory;
+use proptest::collection::vec;
+use proptest::prelude::*;
 use small_disk::on_a_small_disk;
 use std::fs;
 use std::path::Path;
+use std::sync::LazyLock;
 use stipple_drivers::TimedPose;
 
 const LARGE: Limits = Limits { file: 1 << 30, free: 0 };
@@ -78,7 +81,7 @@ fn what_was_logged_is_read_back_across_files_and_runs() {
     let found = runs(dir.path()).unwrap();
     assert_eq!(found.iter().map(|r| r.files.clone()).collect::<Vec<_>>(), [first.clone(), second.clone()]);
     assert!(found[0].run_ns < found[1].run_ns);
-    assert!(states(&[first, second.clone()].concat()).into_iter().eq((0..300).map(state)));
+    assert!([states(&first), states(&second)].concat().into_iter().eq((0..300).map(state)));
     let mut rest = vec![];
     let each = |_, message: Message| {
         rest.extend((!matches!(message, Message::State(_))).then(|| format!("{message:?}")));
@@ -89,23 +92,87 @@ fn what_was_logged_is_read_back_across_files_and_runs() {
     assert!(rest[2] == r#"Counters({"frames": 7})"# && rest[3].contains("End"), "{rest:?}");
 }
 
+/// Frames in a chunk that is ended by its size, and some more.
+const CHUNK: usize = 70;
+
 #[test]
-fn a_log_cut_off_at_any_byte_gives_every_whole_message_before_it() {
+fn a_log_cut_off_at_any_byte_gives_every_whole_chunk_before_it() {
     let dir = tempfile::tempdir().unwrap();
     let (files, _) = log(dir.path(), LARGE, &some(0..500), 4000);
     let whole = fs::read(&files[0]).unwrap();
-    // The end of the messages, in the one chunk; summary and index come after.
     let needle = b"\"cpu_ms\":3.5}";
     let ends: Vec<usize> =
         (0..whole.len() - needle.len()).filter(|i| whole[*i..].starts_with(needle)).map(|i| i + needle.len()).collect();
     assert_eq!(ends.len(), 500);
     let cut = dir.path().join("log-0001.mcap");
-    let from = (ends[499] - 4096..ends[499] + 64).chain(whole.len() - 4096..whole.len()).chain(0..400);
+    let mut before = 0;
+    let from = (0..400).chain((ends[250]..whole.len() - 4096).step_by(997)).chain(whole.len() - 4096..whole.len());
     for bytes in from {
         fs::write(&cut, &whole[..bytes]).unwrap();
         let found = states(std::slice::from_ref(&cut));
-        assert_eq!(found.len(), ends.iter().filter(|end| **end <= bytes).count(), "cut to {bytes} bytes");
+        assert!(found.iter().enumerate().all(|(i, found)| *found == state(i as u64)));
+        let written = ends.iter().filter(|end| **end <= bytes).count();
+        assert!((before..=written).contains(&found.len()) && found.len() + CHUNK > written, "cut to {bytes} bytes");
+        before = found.len();
     }
+}
+
+/// The logs of two runs, of frames 0 to 999 and 5000 to 5999.
+static TWO_LOGS: LazyLock<[Vec<u8>; 2]> = LazyLock::new(|| {
+    let dir = tempfile::tempdir().unwrap();
+    [0, 5000].map(|first| fs::read(&log(dir.path(), LARGE, &some(first..first + 1000), 4000).0[0]).unwrap())
+});
+
+proptest! {
+    /// Whatever a disk may make of a part of a log, what is read was logged, in order, and what is lost is near the damage.
+    #[test]
+    fn damage_costs_the_chunks_it_meets_and_makes_no_frame(
+        (spot, source) in (0.0..1.0, 0.0..1.0), length in 1usize..60_000, kind in 0..8, random in vec(any::<u8>(), 512),
+    ) {
+        let [mut bytes, other] = TWO_LOGS.clone();
+        let at = (spot * bytes.len() as f64) as usize;
+        let end = (at + length).min(bytes.len());
+        let length = end - at;
+        let from = (source * (other.len().min(bytes.len()) - length) as f64) as usize;
+        let repeated = |pattern: &[u8]| pattern.iter().copied().cycle().take(length).collect::<Vec<_>>();
+        let (keeps, with) = match kind {
+            0 => (end, repeated(&[0])),
+            1 => (end, repeated(&random)),
+            2 => (end, repeated(&[6, 9])),
+            3 => (end, repeated(b"{\"t_ns\":5,\"estimate\":null}")),
+            4 => (end, vec![]),
+            5 => (end, bytes[from..from + length].to_vec()),
+            6 => (at, bytes[from..from + length].to_vec()),
+            _ => (end, other[from..from + length].to_vec()),
+        };
+        bytes.splice(at..keeps, with);
+        let dir = tempfile::tempdir().unwrap();
+        fs::write(dir.path().join("log-0000.mcap"), &bytes).unwrap();
+        let runs = runs(dir.path()).unwrap();
+        prop_assert!(runs.len() == 1);
+        let found = states(&runs[0].files);
+        prop_assert!(found.windows(2).all(|f| f[0].t_ns < f[1].t_ns));
+        prop_assert!(found.iter().all(|f| f.t_ns < state(1000).t_ns && *f == state(f.t_ns as u64 / 50_000_000)));
+        let most = (length / (16 << 10) + 2) * CHUNK;
+        prop_assert!(found.len() + most >= 1000, "{} of 1000 for {length} bytes at {at}", found.len());
+    }
+}
+
+/// Zeroes are what a card may answer for a block that it cannot read.
+#[test]
+fn a_zeroed_block_costs_a_chunk_and_is_found() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("log-0000.mcap");
+    let mut bytes = TWO_LOGS[0].clone();
+    fs::write(&path, &bytes).unwrap();
+    assert_eq!(runs(dir.path()).unwrap()[0].damage, []);
+    let middle = bytes.len() / 2;
+    bytes[middle..middle + 512].fill(0);
+    fs::write(&path, &bytes).unwrap();
+    let runs = runs(dir.path()).unwrap();
+    let [(place, range)] = &runs[0].damage[..] else { panic!("{runs:?}") };
+    assert!(*place == path && range.contains(&(middle as u64)) && range.end - range.start < 40_000, "{runs:?}");
+    assert!(states(&[path]).len() > 1000 - 2 * CHUNK);
 }
 
 #[test]
