@@ -140,3 +140,36 @@ fn a_disk_that_fills_ends_the_log_and_not_the_run() {
         assert!(poses(&out) > 10, "{}", text(&o));
     });
 }
+
+/// A disk that is pulled out, or that its driver makes read-only after an error: from then on, every call that would write to
+/// it fails with the error code of that (tests/program/pulled_disk.c).
+#[test]
+fn a_disk_pulled_out_or_made_read_only_ends_the_log_and_not_the_run() {
+    let dir = tempfile::tempdir().unwrap();
+    let (data, shim) = (flight(dir.path(), "5"), dir.path().join("pulled_disk.so"));
+    let source = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/program/pulled_disk.c");
+    let built = Command::new("cc").args(["-shared", "-fPIC", "-o"]).arg(&shim).arg(source).arg("-ldl").status();
+    assert!(built.unwrap().success());
+    for (code, name) in [("5", "os error 5"), ("30", "os error 30")] {
+        let (out, pulled) = (dir.path().join(code), dir.path().join(format!("pulled-{code}")));
+        let mut command = fly(&["run", "--dataset", data.to_str().unwrap()], &out);
+        let shimmed = [("LD_PRELOAD", &shim), ("PULLED_DISK", &out), ("PULLED_FLAG", &pulled)];
+        command.envs(shimmed).env("PULLED_ERRNO", code).stdout(Stdio::null()).stderr(Stdio::piped());
+        let mut child = command.spawn().unwrap();
+        let mut said = vec![];
+        for line in BufReader::new(child.stderr.take().unwrap()).lines().map_while(Result::ok) {
+            if line.starts_with("2.") && line.contains(" frames") {
+                fs::write(&pulled, b"").unwrap();
+            }
+            said.push(line);
+        }
+        let (ended, said) = (child.wait().unwrap(), said.join("\n"));
+        assert_eq!(ended.code(), Some(73), "{said}");
+        // The run went on to its end, and said once that the log had not.
+        assert!(said.contains("\n4.") && said.matches("the log of this run ended early").count() == 1, "{said}");
+        assert!(said.contains(name) && said.lines().count() < 20, "{said}");
+        assert!(!out.join("trajectory.tum").exists() && !out.join("report.json").exists());
+        let o = recover(&out);
+        assert!(o.status.success() && (15..60).contains(&poses(&out)), "{} of\n{said}", text(&o));
+    }
+}

@@ -85,7 +85,7 @@ pub fn conclude(title: Title, mut flown: Flown, logged: &[PathBuf], out: &Output
     let estimated = track_figures(&mut report, &flown);
     let whole = flown.tracker.odometry().is_none_or(|run| run.back.trajectory.is_whole());
     let mut fault = write_trajectory(whole, &estimated, logged, out).err().map(|fault| {
-        let fix = "make room, then `stipple recover` with this folder writes what the log holds";
+        let fix = "make room or mend the disk, then `stipple recover` with this folder writes what the log holds";
         Fault { fix: fix.into(), ..fault }
     });
     let error = trajectory_error(&estimated, &title.truth).filter(|_| flown.tracker.odometry().is_some());
