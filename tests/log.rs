@@ -89,6 +89,8 @@ fn a_killed_run_is_recovered_but_for_its_last_second() {
     let (data, out) = (flight(dir.path(), "8"), dir.path().join("out"));
     for pause_ms in [0, 130, 370] {
         let _ = fs::remove_dir_all(&out);
+        fs::create_dir(&out).unwrap();
+        fs::write(out.join("map.ply"), b"of an earlier run").unwrap();
         let mut child = fly(&["run", "--dataset", data.to_str().unwrap()], &out)
             .stdout(Stdio::null())
             .stderr(Stdio::piped())
@@ -101,7 +103,8 @@ fn a_killed_run_is_recovered_but_for_its_last_second() {
         std::thread::sleep(Duration::from_millis(1000 + pause_ms));
         child.kill().unwrap();
         child.wait().unwrap();
-        assert!(!out.join("trajectory.tum").exists());
+        assert!(!out.join("trajectory.tum").exists() && !out.join("map.ply").exists());
+        assert!(out.join("previous-map.ply").exists());
         let o = recover(&out);
         let said = text(&o);
         assert!(o.status.success() && said.contains("cut off or damaged here"), "{said}");

@@ -49,6 +49,9 @@ fn absent(removed: io::Result<()>) -> io::Result<()> {
     removed.or_else(|e| if e.kind() == io::ErrorKind::NotFound { Ok(()) } else { Err(e) })
 }
 
+/// What a run writes at its end.
+const RESULTS: [&str; 5] = ["trajectory.tum", "map.ply", "renders", "report.html", "report.json"];
+
 /// The folder of `--out`: created and proved writable before any work starts.
 #[derive(Clone, Debug)]
 pub struct OutputDir {
@@ -104,6 +107,20 @@ impl OutputDir {
             true => clear(&path),
             false => absent(fs::remove_file(&path)).map_err(|e| cannot_write(&path, &e)),
         }
+    }
+
+    /// Renames the results of an earlier run, if there are any, to `previous-map.ply` and so on, in place of what has such a
+    /// name: should this run be killed, what lies beside its log is not taken for its own.
+    pub fn set_aside(&self) -> Result<(), Fault> {
+        let previous = |name: &str| format!("previous-{name}");
+        let mut there = RESULTS.into_iter().filter(|name| self.file(name).symlink_metadata().is_ok()).peekable();
+        if there.peek().is_some() {
+            RESULTS.iter().try_for_each(|name| self.remove(&previous(name)))?;
+        }
+        there.try_for_each(|name| {
+            let path = self.file(name);
+            fs::rename(&path, self.file(&previous(name))).map_err(|e| cannot_write(&path, &e))
+        })
     }
 
     /// Replaces the subfolder `name` by what `fill` puts into it, so that files of an earlier run
@@ -232,6 +249,24 @@ mod tests {
         out.replace_folder("renders", |d| atomically(&d.join("1.png"), |w| w.write_all(b"x"))).unwrap();
         ["map.ply", "renders", "never"].iter().for_each(|name| out.remove(name).unwrap());
         assert!(names(dir.path()).is_empty());
+    }
+
+    #[test]
+    fn results_of_an_earlier_run_are_set_aside_until_there_are_others() {
+        let dir = tempfile::tempdir().unwrap();
+        let out = OutputDir::create(dir.path()).unwrap();
+        out.write("map.ply", |w| w.write_all(b"1")).unwrap();
+        out.write("log-0000.mcap", |w| w.write_all(b"1")).unwrap();
+        out.replace_folder("renders", |d| atomically(&d.join("1.png"), |w| w.write_all(b"x"))).unwrap();
+        // The second of two finds nothing: a run between them was killed.
+        for _ in 0..2 {
+            out.set_aside().unwrap();
+            assert_eq!(names(dir.path()), ["log-0000.mcap", "previous-map.ply", "previous-renders"]);
+            assert_eq!(names(&dir.path().join("previous-renders")), [LIST, "1.png"]);
+        }
+        out.write("report.json", |w| w.write_all(b"2")).unwrap();
+        out.set_aside().unwrap();
+        assert_eq!(names(dir.path()), ["log-0000.mcap", "previous-report.json"]);
     }
 
     #[test]

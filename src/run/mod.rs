@@ -180,6 +180,7 @@ pub fn fly(
         opened: input.opened,
     };
     let length_s = input.source.length_s().filter(|_| !repeats);
+    out.set_aside()?;
     let log = Log::start(out.path().into(), log::LIMITS, &title.to_string());
     if let Tracker::Odometry(run) = &mut tracker {
         run.back.log = Some(log.sender());
