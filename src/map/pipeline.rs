@@ -137,7 +137,7 @@ impl Pipeline {
 
     /// How coarsely a view is drawn next.
     pub fn coarseness_after(&self, stats: &Stats) -> Coarseness {
-        stats.coarseness.after(stats.intersections + stats.overflow, self.shape.intersections)
+        stats.coarseness.after(stats.needed(), self.shape.intersections)
     }
 
     /// SSIM by pixel of what was rendered last against an image.

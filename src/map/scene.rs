@@ -42,8 +42,9 @@ impl Scene {
 
     /// Draws the map into `rendered`; how coarsely, that the view might fit.
     pub fn render(&mut self, view: &View) -> Result<Coarseness, GpuError> {
-        let Stats { coarseness, .. } = self.pipeline.render(&mut self.gpu, view, &mut self.rendered)?;
+        let Stats { coarseness, intersections, .. } = self.pipeline.render(&mut self.gpu, view, &mut self.rendered)?;
         self.counters.views_coarsened.add(u64::from(coarseness > Coarseness::default()));
+        self.counters.intersections_most.raise(u64::from(intersections));
         Ok(coarseness)
     }
 

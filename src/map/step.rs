@@ -75,6 +75,11 @@ impl Stats {
             coarseness: view.coarseness,
         }
     }
+
+    /// Intersections that the picture would have had in a list with room.
+    pub fn needed(&self) -> u32 {
+        self.intersections + self.overflow
+    }
 }
 
 #[derive(Clone, Copy, Debug, Default, PartialEq)]

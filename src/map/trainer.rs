@@ -98,6 +98,7 @@ impl Trainer {
         let counters = &scene.counters;
         let whole = done.stats.overflow == 0;
         counters.intersections_overflow.add(u64::from(!whole));
+        counters.intersections_most.raise(u64::from(done.stats.needed()));
         counters.views_coarsened.add(u64::from(whole && step.view.coarseness > Coarseness::default()));
         counters.splats_not_finite.add(u64::from(done.stats.failed));
         counters.gradients_rejected.add(u64::from(done.gradients_rejected));
