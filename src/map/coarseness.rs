@@ -17,9 +17,9 @@ const RISE: f32 = 0.2;
 const FALL: f32 = 0.05;
 /// Parts of a list. Where less than `ROOM` is needed it falls; past `TIGHT` it rises before the growth of the Gaussians in
 /// training costs a step, to where about `AIM` is needed. A list that never overflowed may be full to the last place.
-const ROOM: f64 = 0.83;
-const AIM: f64 = 0.87;
-const TIGHT: f64 = 0.94;
+const ROOM: f64 = 0.75;
+const AIM: f64 = 0.8;
+const TIGHT: f64 = 0.9;
 
 impl Coarseness {
     pub fn level(self) -> f32 {
@@ -56,10 +56,10 @@ mod tests {
     fn a_view_that_overflows_is_drawn_coarser_until_it_fits_and_finer_again_when_there_is_room() {
         assert_eq!(settled(900.0, Coarseness::default()), (Coarseness::default(), 900));
         let (coarse, needed) = settled(9000.0, Coarseness::default());
-        assert!(coarse > Coarseness::default() && (830..=940).contains(&needed), "{coarse:?} {needed}");
+        assert!(coarse > Coarseness::default() && (750..=900).contains(&needed), "{coarse:?} {needed}");
         // Between the two it stays as it is, and it rises before the list is full.
         assert_eq!(coarse.after(needed, 1000), coarse);
-        assert!(coarse.after(960, 1000) > coarse && Coarseness::default().after(1000, 1000) == Coarseness::default());
+        assert!(coarse.after(950, 1000) > coarse && Coarseness::default().after(1000, 1000) == Coarseness::default());
         assert_eq!(settled(700.0, coarse).0, Coarseness::default());
         assert_eq!(Coarseness(MAX).after(u32::MAX, 1), Coarseness(MAX));
     }
