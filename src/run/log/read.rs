@@ -5,10 +5,9 @@ use super::file::{logs, topic, CLOCKS, COUNTERS, EVENT, STATE};
 use super::{Clocks, Event, State};
 use crate::output::trajectory;
 use ::mcap::parse_record;
-use ::mcap::read::ChunkReader;
 use ::mcap::records::{op, Record};
+use ::mcap::sans_io::linear_reader::{LinearReadEvent, LinearReader, LinearReaderOptions};
 use serde::Deserialize;
-use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::{self, Write};
@@ -89,7 +88,7 @@ impl Window {
     }
 
     /// The length of the chunk that begins there, and its records; none where its head or its checksum does not hold.
-    fn chunk(&mut self, at: u64) -> io::Result<Option<(u64, Vec<Record<'_>>)>> {
+    fn chunk(&mut self, at: u64) -> io::Result<Option<(u64, Vec<Record<'static>>)>> {
         let head = self.bytes(at, CHUNK_HEAD)?;
         if head.len() < CHUNK_HEAD || head[0] != op::CHUNK || number(head, 1) > LENGTH_MAX as u64 {
             return Ok(None);
@@ -102,10 +101,23 @@ impl Window {
             return Ok(None);
         }
         let bytes = self.bytes(at, HEAD + body)?;
-        let record = bytes.get(HEAD..HEAD + body).map(|bytes| parse_record(op::CHUNK, bytes));
-        let Some(Ok(Record::Chunk { header, data: Cow::Borrowed(data) })) = record else { return Ok(None) };
-        let records = ChunkReader::new(header, data).and_then(|all| all.collect::<Result<Vec<_>, _>>());
-        Ok(records.ok().map(|records| ((HEAD + body) as u64, records)))
+        // The checksum is looked at before any record is: a length of a record is believed.
+        let mut reader = LinearReader::new_with_options(
+            LinearReaderOptions::default()
+                .with_skip_start_magic(true)
+                .with_skip_end_magic(true)
+                .with_prevalidate_chunk_crcs(true)
+                .with_record_length_limit(LENGTH_MAX),
+        );
+        reader.insert(bytes.len()).copy_from_slice(bytes);
+        reader.notify_read(bytes.len());
+        let mut records = vec![];
+        while let Some(Ok(LinearReadEvent::Record { opcode, data })) = reader.next_event() {
+            if opcode == op::MESSAGE {
+                records.extend(parse_record(opcode, data).ok().map(Record::into_owned));
+            }
+        }
+        Ok((!records.is_empty()).then_some(((HEAD + body) as u64, records)))
     }
 }
 
