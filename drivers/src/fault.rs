@@ -1,7 +1,7 @@
 //! The one error type of boot and of input: what is wrong, where, why, and what to do. It prints as one line.
 
 use serde::{Deserialize, Serialize};
-use std::fmt;
+use std::fmt::{self, Write as _};
 use std::path::Path;
 
 /// What sort of thing went wrong, for whoever must decide what to do about it (a program: its exit code).
@@ -52,12 +52,23 @@ impl Fault {
 
 impl fmt::Display for Fault {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{}: {}", self.place, self.what)?;
-        if !self.fix.is_empty() {
-            write!(f, "; {}", self.fix)?;
-        }
-        Ok(())
+        let (separator, fix) = if self.fix.is_empty() { ("", "") } else { ("; ", &self.fix[..]) };
+        // What it quotes of a file may hold anything.
+        let text = [&self.place, ": ", &self.what, separator, fix].into_iter().flat_map(str::chars);
+        text.map(|c| if c.is_control() { ' ' } else { c }).try_for_each(|c| f.write_char(c))
     }
 }
 
 impl std::error::Error for Fault {}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_fault_is_one_line_whatever_it_quotes() {
+        let fault = Fault::new(FaultKind::Data, "a.yaml:6", "lens x\n\r> is not known", "correct it");
+        assert_eq!(fault.to_string(), "a.yaml:6: lens x  > is not known; correct it");
+        assert_eq!(Fault { fix: String::new(), ..fault }.to_string(), "a.yaml:6: lens x  > is not known");
+    }
+}

@@ -1,14 +1,15 @@
 //! Whether a JPEG is whole, where its decoder does not tell: `zune-jpeg` forgives a last row that is cut, and stops with
 //! success at a marker inside the scan of a baseline image whose first scan has all components. The rows after that are left
-//! as they were, which are those of the image before. ITU-T T.81, annex B and F.2.2.5.
+//! as they were, which are those of the image before. It panics at colours that are sampled more finely than brightness.
+//! ITU-T T.81, annex B and F.2.2.5.
 
 const START_OF_FRAME: std::ops::RangeInclusive<u8> = 0xc0..=0xc2;
 const PROGRESSIVE: u8 = 0xc2;
 const END_OF_IMAGE: u8 = 0xd9;
 const START_OF_SCAN: u8 = 0xda;
 
-/// Refuses a JPEG without its end, and one with a marker inside the scan of all components. What else is wrong, its decoder
-/// says.
+/// Refuses a JPEG without its end, one with a marker inside the scan of all components, and one whose colours are sampled as
+/// no camera does. What else is wrong, its decoder says.
 pub fn check_whole(jpeg: &[u8]) -> Result<(), &'static str> {
     // Nothing inside coded pixels looks like a marker. Padding may follow the end.
     if !jpeg.windows(2).rev().any(|w| w == [0xff, END_OF_IMAGE]) {
@@ -24,6 +25,11 @@ pub fn check_whole(jpeg: &[u8]) -> Result<(), &'static str> {
         if START_OF_FRAME.contains(marker) {
             // A progressive image has many scans, and is decoded as a whole.
             components = body.get(5).filter(|_| *marker != PROGRESSIVE);
+            let mut samplings = body.get(6..length).unwrap_or_default().chunks_exact(3).map(|component| component[1]);
+            let first = samplings.next();
+            if !samplings.all(|s| s == 0x11 || Some(s) == first) {
+                return Err("its colours are sampled more finely than its brightness");
+            }
         }
         rest = body.get(length..).unwrap_or_default();
         if *marker == START_OF_SCAN {
@@ -54,6 +60,11 @@ mod tests {
         let twice = [&jpeg[..jpeg.len() - 4], &jpeg[scan..]].concat();
         let comment = [&jpeg[..jpeg.len() - 4], &[0xff, 0xfe, 0, 2], &jpeg[jpeg.len() - 4..]].concat();
         assert_eq!([twice, comment].map(|jpeg| check_whole(&jpeg)), [Err("a marker breaks off its only scan"); 2]);
+        let frame = jpeg.windows(2).position(|w| w == [0xff, 0xc0]).expect("it has one");
+        let mut finer = jpeg.clone();
+        // Three components, the second 2 x 4 times as fine.
+        finer.splice(frame..frame + 13, [0xff, 0xc0, 0, 17, 8, 0, 16, 0, 16, 3, 1, 0x11, 0, 2, 0x24, 1, 3, 0x11, 1]);
+        assert_eq!(check_whole(&finer), Err("its colours are sampled more finely than its brightness"));
         for end in 0..jpeg.len() {
             let _ = check_whole(&jpeg[..end]);
         }
