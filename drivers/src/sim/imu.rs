@@ -8,6 +8,7 @@ use glam::DVec3;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::StandardNormal;
+use std::f64::consts::FRAC_1_SQRT_2;
 
 /// Gravity in the world frame, m/s².
 pub const GRAVITY: DVec3 = DVec3::new(0.0, 0.0, -9.81);
@@ -25,16 +26,19 @@ pub struct ImuErrors {
     pub accel_max: f64,
     /// The correction of scales and misalignments that would make the readings right.
     pub axes: ImuCorrection,
+    /// Standard deviation of an axis while motors shake the unit, rad/s and m/s².
+    pub shaken: [f64; 2],
 }
 
 impl ImuErrors {
-    /// The ADIS16448 of EuRoC: 1000 °/s, 18 g.
+    /// The ADIS16448 of EuRoC: 1000 °/s, 18 g; shaken as V1_01 on the ground with its motors on.
     pub const EUROC: ImuErrors = ImuErrors {
         gyro_bias: 0.02,
         accel_bias: 0.05,
         gyro_max: 17.453_293,
         accel_max: 18.0 * 9.81,
         axes: ImuCorrection::NONE,
+        shaken: [0.06, 0.9],
     };
 }
 
@@ -49,7 +53,9 @@ pub struct Bias {
     pub accel: DVec3,
 }
 
-/// Samples of a spline, whose time 0 is `start`, at `stamps`, and the biases in them.
+/// Samples of a spline, whose time 0 is `start`, at `stamps`, and the biases in them. `motors`: whether they run so many
+/// seconds from the start. What they shake stays where it is, so a sample's share is the difference of two random numbers,
+/// whose integral is none.
 pub fn simulate(
     spline: &Spline,
     start: Nanos,
@@ -57,6 +63,7 @@ pub fn simulate(
     noise: &ImuCalibration,
     errors: &ImuErrors,
     seed: u64,
+    motors: impl Fn(f64) -> bool,
 ) -> (Vec<ImuSample>, Vec<Bias>) {
     let mut rng = ChaCha8Rng::seed_from_u64(seed ^ 0x0049_4D55);
     let mut normal = || DVec3::from_array(std::array::from_fn(|_| rng.sample::<f64, _>(StandardNormal)));
@@ -66,11 +73,16 @@ pub fn simulate(
     let mut accel = normal() * errors.accel_bias;
     let mut samples = Vec::with_capacity(stamps.len());
     let mut biases = Vec::with_capacity(stamps.len());
+    let mut shaken = [DVec3::ZERO; 2];
     for &t in stamps {
         let m = spline.at((t - start).secs());
         let force = m.pose.q.conjugate() * (m.a_world - GRAVITY);
-        let w = m.gyro_body + gyro + normal() * (noise.gyro_noise * root_rate);
-        let f = force + accel + normal() * (noise.accel_noise * root_rate);
+        let before = shaken;
+        if motors((t - start).secs()) {
+            shaken = errors.shaken.map(|sigma| normal() * (sigma * FRAC_1_SQRT_2));
+        }
+        let w = m.gyro_body + gyro + normal() * (noise.gyro_noise * root_rate) + shaken[0] - before[0];
+        let f = force + accel + normal() * (noise.accel_noise * root_rate) + shaken[1] - before[1];
         let (w_max, f_max) = (DVec3::splat(errors.gyro_max), DVec3::splat(errors.accel_max));
         samples.push(ImuSample {
             t,

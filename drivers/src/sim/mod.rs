@@ -115,7 +115,8 @@ impl Sim {
             }
             None => {
                 let ticks = imu::ticks(first, last, calibration.imu.rate_hz);
-                imu::simulate(&spline, start, &ticks, &calibration.imu, &scenario.imu_errors, scenario.seed)
+                let (noise, errors) = (&calibration.imu, &scenario.imu_errors);
+                imu::simulate(&spline, start, &ticks, noise, errors, scenario.seed, |t| scenario.path.motors(t))
             }
         };
         imu.iter_mut().for_each(|s| *s = scenario.imu_errors.axes.undo(s));

@@ -82,6 +82,11 @@ pub enum Flight {
     Demo,
     /// Up to 4 m/s, 8 m/s² and 3 rad/s.
     Aggressive,
+    /// Flies as `Demo`, lands and rests, takes off and hovers, flies on; `rest` and `hover` in s, the flights are `PAUSE_FLIGHT`.
+    Pauses {
+        rest: f64,
+        hover: f64,
+    },
     Recorded(Recording),
 }
 
@@ -96,17 +101,24 @@ pub struct Recording {
     pub imu: Option<Vec<ImuSample>>,
 }
 
-const NAMED: [(&str, Flight, f64); 5] = [
+const NAMED: [(&str, Flight, f64); 6] = [
     ("demo", Flight::Demo, 10.0),
     ("hover", Flight::Hover, 10.0),
     ("circle", Flight::Circle, 12.0),
     ("aggressive", Flight::Aggressive, 12.0),
     ("static", Flight::Static, 5.0),
+    ("pauses", Flight::Pauses { rest: 60.0, hover: 20.0 }, 100.0),
 ];
 
 /// Time at rest at the start, and time in which the flight gathers way, s.
 const REST: f64 = 1.2;
 const GATHER: f64 = 1.2;
+/// `Pauses`: length of each of its two flights, s; of landing, of taking off and of coming to hover, s; height of the landed
+/// body, m; share of `Hover`'s motion that is left.
+pub const PAUSE_FLIGHT: f64 = 10.0;
+const PAUSE_LAND: f64 = 2.5;
+const PAUSE_HEIGHT: f64 = 0.6;
+const PAUSE_WOBBLE: f64 = 0.25;
 
 impl Scenario {
     /// The names of scenarios.
@@ -118,8 +130,8 @@ impl Scenario {
     pub fn named(name: &str) -> Option<Scenario> {
         let (name, flight, secs) = NAMED.iter().find(|n| n.0 == name)?;
         let mut scenario = Scenario::flying(name, flight.clone(), *secs);
-        if matches!(flight, Flight::Demo) {
-            // Maps in minutes on a software rasteriser.
+        if matches!(flight, Flight::Demo | Flight::Pauses { .. }) {
+            // Maps in minutes on a software rasteriser; a flight of minutes.
             scenario.image_divisor = 2;
         }
         Some(scenario)
@@ -243,6 +255,12 @@ pub fn euroc_rig() -> Calibration {
 }
 
 impl Flight {
+    /// Whether motors shake the unit `t` seconds from the start; only `Pauses` has any, on while it hovers.
+    pub fn motors(&self, t: f64) -> bool {
+        let Flight::Pauses { rest, hover } = self else { return false };
+        (PAUSE_FLIGHT + rest..PAUSE_FLIGHT + rest + hover).contains(&t)
+    }
+
     /// `world_from_cam0` of an invented flight, `t` seconds from its start. The room is centred on the origin with its floor
     /// at z = 0. `None` for a recording.
     pub fn look(&self, t: f64) -> Option<Pose> {
@@ -251,10 +269,8 @@ impl Flight {
             Flight::Recorded(_) => return None,
             Flight::Static => look(DVec3::new(0.3, -0.4, 1.4), 0.9, -0.1, 0.0),
             Flight::Hover => {
-                let wobble = |f: f64| (TAU * f * s).sin();
-                let p = DVec3::new(0.3, -0.4, 1.4)
-                    + DVec3::new(0.2 * wobble(0.21), 0.15 * wobble(0.33), 0.12 * wobble(0.27));
-                look(p, 0.9 + 0.09 * wobble(0.37), -0.1 + 0.07 * wobble(0.43), 0.06 * wobble(0.51))
+                let (p, turn) = wobble(s);
+                look(DVec3::new(0.3, -0.4, 1.4) + p, 0.9 + turn.x, -0.1 + turn.y, turn.z)
             }
             Flight::Circle => {
                 let a = 0.7 * s;
@@ -262,11 +278,17 @@ impl Flight {
                 look(p, a + TAU / 2.0 + 0.25 * (1.5 * a).sin(), -0.12 + 0.08 * (3.0 * a).sin(), 0.05 * (2.0 * a).sin())
             }
             Flight::Demo => {
-                // Once round in ten seconds.
-                let a = 0.766 * s;
-                let p = DVec3::new(1.6 * a.cos(), 1.05 * a.sin(), 1.35 + 0.3 * (2.0 * a).sin());
-                let yaw = a + 0.35 * (2.0 * a).sin();
-                look(p, yaw, -0.12 + 0.14 * (3.0 * a).sin(), 0.08 * (2.5 * a).sin())
+                let (p, [yaw, pitch, roll]) = round(s);
+                look(p, yaw, pitch, roll)
+            }
+            Flight::Pauses { rest, hover } => {
+                let (stop, up, go) = (PAUSE_FLIGHT - PAUSE_LAND, PAUSE_FLIGHT + rest, PAUSE_FLIGHT + rest + hover);
+                let (mut p, [yaw, pitch, roll]) = round(s - under_way(t - stop) + under_way(t - go));
+                let over = |at: f64| smooth((t - at) / PAUSE_LAND);
+                p.z += (over(stop) - over(up)) * (PAUSE_HEIGHT - p.z);
+                let (dp, turn) = wobble(t - up);
+                let share = PAUSE_WOBBLE * (over(up) - over(go - PAUSE_LAND));
+                look(p + dp * share, yaw + turn.x * share, pitch + turn.y * share, roll + turn.z * share)
             }
             Flight::Aggressive => {
                 let a = 1.05 * s;
@@ -279,8 +301,34 @@ impl Flight {
 
 /// Seconds under way at `t`: none at rest, then smoothly more, then as time passes.
 fn way(t: f64) -> f64 {
-    let h = ((t - REST) / GATHER).clamp(0.0, 1.0);
-    GATHER * (h * h * h - 0.5 * h * h * h * h) + (t - REST - GATHER).max(0.0)
+    under_way(t - REST)
+}
+
+fn under_way(t: f64) -> f64 {
+    let h = (t / GATHER).clamp(0.0, 1.0);
+    GATHER * (h * h * h - 0.5 * h * h * h * h) + (t - GATHER).max(0.0)
+}
+
+/// From 0 at 0 to 1 at 1, with two derivatives that are zero at both.
+fn smooth(x: f64) -> f64 {
+    let x = x.clamp(0.0, 1.0);
+    x * x * x * (10.0 - 15.0 * x + 6.0 * x * x)
+}
+
+/// Displacement, m, and turn (yaw, pitch, roll) of a multicopter that holds its place.
+fn wobble(s: f64) -> (DVec3, DVec3) {
+    let w = |f: f64| (TAU * f * s).sin();
+    (
+        DVec3::new(0.2 * w(0.21), 0.15 * w(0.33), 0.12 * w(0.27)),
+        DVec3::new(0.09 * w(0.37), 0.07 * w(0.43), 0.06 * w(0.51)),
+    )
+}
+
+/// Position, yaw, pitch and roll on a path around the room, once in ten seconds.
+fn round(s: f64) -> (DVec3, [f64; 3]) {
+    let a = 0.766 * s;
+    let p = DVec3::new(1.6 * a.cos(), 1.05 * a.sin(), 1.35 + 0.3 * (2.0 * a).sin());
+    (p, [a + 0.35 * (2.0 * a).sin(), -0.12 + 0.14 * (3.0 * a).sin(), 0.08 * (2.5 * a).sin()])
 }
 
 /// `world_from_cam` at `p`, looking along `yaw` (from x towards y) and `pitch` (up), rolled clockwise.
