@@ -134,7 +134,7 @@ impl Estimator {
         }
         let px_max = self.outlier_px(slot);
         step.outliers = drop_outliers(&mut self.graph, px_max);
-        step.evidence = Some(self.evidence(before, slot, views));
+        step.evidence = Some(self.evidence(before, slot, views, step.at_rest));
         self.marginalize();
         step
     }
@@ -189,7 +189,8 @@ impl Estimator {
         }
         (step.connected, step.unconnected) = self.graph.landmarks.attach(slot, &self.tracks[slot]);
         self.frames_since_keyframe += 1;
-        step.keyframe = self.is_keyframe_due(step.connected, step.unconnected);
+        // At rest there is no parallax to triangulate by: a keyframe would only push out one that has some.
+        step.keyframe = !step.at_rest && self.is_keyframe_due(step.connected, step.unconnected);
         (slot, step)
     }
 
@@ -222,7 +223,7 @@ impl Estimator {
     }
 
     /// Evidence for the monitor; `views` of the frame there were before outliers were dropped.
-    fn evidence(&self, before: usize, slot: usize, views: usize) -> Evidence {
+    fn evidence(&self, before: usize, slot: usize, views: usize, at_rest: bool) -> Evidence {
         let known =
             self.graph.landmarks.pool.iter().filter(|l| l.host as usize != slot).map(|l| l.views_in(slot)).sum();
         Evidence {
@@ -230,6 +231,7 @@ impl Estimator {
             views,
             inliers: self.graph.landmarks.views_in(slot),
             known,
+            at_rest,
             misfit: inertial_residual_at(&self.graph.window, before, slot).norm_squared() / 15.0,
         }
     }

@@ -16,8 +16,8 @@ use super::samples::ImuRing;
 use super::triangulation::InverseDistance;
 use super::zero_velocity::{REST_ACCEL, REST_GYRO, REST_PX};
 use crate::config::VioConfig;
-use crate::frontend::Tracks;
-use crate::limits::TRACKS;
+use crate::frontend::{Track, Tracks};
+use crate::limits::{CAMERAS_MAX, TRACKS};
 use crate::math::so3;
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use nalgebra::{SMatrix, SVector};
@@ -66,10 +66,11 @@ pub struct Start {
     pub sigma: MotionSigma,
 }
 
-/// A track of the reference frame.
+/// A track of the reference frame, in the first camera that sees it.
 #[derive(Clone, Copy, Debug)]
 struct ReferencePoint {
     id: u64,
+    camera: usize,
     px: DVec2,
     /// The point, and the relative standard deviation of its inverse distance; `None` where stereo does not measure one.
     point: Option<(Point, f64)>,
@@ -98,7 +99,7 @@ pub struct Initializer {
 impl Initializer {
     pub fn new() -> Initializer {
         Initializer {
-            reference: Vec::with_capacity(TRACKS),
+            reference: Vec::with_capacity(TRACKS * CAMERAS_MAX),
             frames: Vec::with_capacity(ALIGN_FRAMES_MAX),
             resections_failed: 0,
             alignments_failed: 0,
@@ -162,9 +163,11 @@ impl Initializer {
             increment: Increment::new(DVec3::ZERO, DVec3::ZERO),
         });
         self.reference.clear();
-        for track in tracks.cameras[0].iter() {
-            let (px, point) = (track.px(), stereo_point(track.id, track.px(), tracks, model));
-            self.reference.push(ReferencePoint { id: track.id, px, point });
+        for (camera, list) in tracks.cameras.iter().enumerate() {
+            for track in list.iter().filter(|t| (0..camera).all(|c| tracks.find(c, t.id).is_none())) {
+                let point = stereo_point(track, camera, tracks, model);
+                self.reference.push(ReferencePoint { id: track.id, camera, px: track.px(), point });
+            }
         }
     }
 
@@ -174,7 +177,7 @@ impl Initializer {
         // By axis, so that noise of both does not add up to a motion.
         let (mut still, mut seen) = ([0, 0], 0);
         for s in &self.reference {
-            if let Some(t) = tracks.find(0, s.id) {
+            if let Some(t) = tracks.find(s.camera, s.id) {
                 seen += 1;
                 still[0] += ((t.px[0] as f64 - s.px.x).abs() < REST_PX) as usize;
                 still[1] += ((t.px[1] as f64 - s.px.y).abs() < REST_PX) as usize;
@@ -196,14 +199,14 @@ fn sigma(config: &VioConfig, tilt: f64, v: f64, bg: f64) -> MotionSigma {
     MotionSigma { p: GAUGE_SIGMA, tilt, yaw: GAUGE_SIGMA, v, bg, ba }
 }
 
-/// A point from the stereo views of one frame, in its camera 0, and the relative deviation of its inverse
+/// A point from the stereo views of one frame, in the camera of `track`, and the relative deviation of its inverse
 /// distance; `None` when that is not significant.
-fn stereo_point(id: u64, px: DVec2, tracks: &Tracks, model: &Model) -> Option<(Point, f64)> {
-    let host = &model.cameras[0];
-    let bearing = host.camera.unproject(px)?;
+fn stereo_point(track: &Track, camera: usize, tracks: &Tracks, model: &Model) -> Option<(Point, f64)> {
+    let host = &model.cameras[camera];
+    let bearing = host.camera.unproject(track.px())?;
     let mut distance = InverseDistance::default();
-    for (c, camera) in model.cameras.iter().enumerate().skip(1) {
-        let Some(seen) = tracks.find(c, id) else { continue };
+    for (c, camera) in model.cameras.iter().enumerate().skip(camera + 1) {
+        let Some(seen) = tracks.find(c, track.id) else { continue };
         let seen = camera.camera.unproject(seen.px())?;
         let baseline_min = model.config.triangulation_baseline_min_m;
         distance.add(&host.body_from_cam, bearing, &camera.body_from_cam, seen, baseline_min);
@@ -229,11 +232,11 @@ fn resect(points: &[ReferencePoint], tracks: &Tracks, model: &Model, guess: Pose
             let Some((point, _)) = &p.point else { continue };
             for (c, camera) in model.cameras.iter().enumerate() {
                 let Some(seen) = tracks.find(c, p.id) else { continue };
-                let host_cam = &model.cameras[0].body_from_cam;
+                let host_cam = &model.cameras[p.camera].body_from_cam;
                 let view = View { host_cam, host: &reference, camera, target: &body };
                 let Some(r) = view.reproject(point) else { continue };
                 let e = r.px - seen.px();
-                inliers += (c == 0 && e.length() < 3.0 * model.config.huber_px) as usize;
+                inliers += (c == p.camera && e.length() < 3.0 * model.config.huber_px) as usize;
                 let (w, _) = huber(e.length(), model.config.huber_px);
                 for (row, e) in [e.x, e.y].into_iter().enumerate() {
                     let j = SVector::<f64, 6>::from_row_slice(&r.d_target[row]);

@@ -214,7 +214,7 @@ impl Vio {
     /// First frame of the window, once motion and gravity are known.
     fn start(&mut self, tracks: &Tracks) -> Option<Step> {
         // Without anything to see, the mean force would start a flight that nothing corrects.
-        if tracks.cameras[0].len() < RESECTION_MIN {
+        if tracks.cameras.iter().all(|camera| camera.len() < RESECTION_MIN) {
             return None;
         }
         let model = &self.estimator.model;

@@ -30,6 +30,8 @@ pub struct Evidence {
     /// Inliers of landmarks that earlier frames saw: a landmark made of this frame alone
     /// says nothing of where it is.
     pub known: usize,
+    /// Its views stand still, which says where it is as well as known landmarks would.
+    pub at_rest: bool,
     /// Squared whitened inertial residual per dimension, without unit.
     pub misfit: f64,
 }
@@ -54,10 +56,11 @@ impl Monitor {
         self.now = Health::default();
         self.now.set(Health::VISION_DISAGREES, vision);
         self.now.set(Health::INERTIA_DISAGREES, inertia);
-        self.now.set(Health::INERTIA_ALONE, e.known < SEEN_VIEWS);
+        let seen = e.known >= SEEN_VIEWS || e.at_rest;
+        self.now.set(Health::INERTIA_ALONE, !seen);
         self.frames = self.frames.saturating_add(1);
         self.suspect = if vision || inertia { self.suspect + 1 } else { self.suspect.saturating_sub(1) };
-        if e.known >= SEEN_VIEWS {
+        if seen {
             self.seeing = self.seeing.saturating_add(1);
         } else if self.unseen_since.is_none() {
             (self.unseen_since, self.seeing) = (Some(e.t), 0);
@@ -87,7 +90,7 @@ mod tests {
     use super::*;
 
     fn frame(i: i64, views: usize, inliers: usize, misfit: f64) -> Evidence {
-        Evidence { t: Nanos(i * 50_000_000), views, inliers, known: inliers, misfit }
+        Evidence { t: Nanos(i * 50_000_000), views, inliers, known: inliers, at_rest: false, misfit }
     }
 
     /// The frame that ends a flight of such frames, and why.

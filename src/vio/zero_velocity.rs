@@ -11,7 +11,7 @@ use super::inertial::Motion;
 use super::samples::ImuRing;
 use super::window::Window;
 use crate::frontend::Tracks;
-use crate::limits::TRACKS;
+use crate::limits::{CAMERAS_MAX, TRACKS};
 use crate::mem::List;
 use glam::DVec3;
 use stipple_drivers::Span;
@@ -66,7 +66,7 @@ fn stands(slot: usize, window: &Window, tracks: &[Tracks], imu: &ImuRing) -> Opt
         |rest: &Rest, r: &usize| window.frame(*r).t <= window.frame(slot).t - Span::from_secs(rest.reference);
     let recent = || window.slots().rev().find(|r| old_enough(&QUIET, r));
     let oldest = || {
-        let shares = |r: &usize| common(&tracks[*r], &tracks[slot]).take(COMMON_MIN).count() == COMMON_MIN;
+        let shares = |r: &usize| (0..CAMERAS_MAX).any(|c| shares_enough(&tracks[*r], &tracks[slot], c));
         window.slots().take_while(|r| old_enough(&SHAKEN, r)).find(shares)
     };
     let passes = |rest: &Rest, reference: &dyn Fn() -> Option<usize>| {
@@ -77,22 +77,31 @@ fn stands(slot: usize, window: &Window, tracks: &[Tracks], imu: &ImuRing) -> Opt
         if !quiet || (s.gyro - frame.now.bg).length() > rest.rate || frame.now.v.length() > rest.speed {
             return None;
         }
-        let moved = median_displacement(&tracks[reference()?], &tracks[slot])?;
+        let moved = displacement(&tracks[reference()?], &tracks[slot])?;
         (moved < rest.px as f32).then_some(span)
     };
     passes(&QUIET, &recent).or_else(|| passes(&SHAKEN, &oldest))
 }
 
-/// Pixels in camera 0 of the points that both see, before and now.
-fn common<'a>(from: &'a Tracks, to: &'a Tracks) -> impl Iterator<Item = ([f32; 2], [f32; 2])> + 'a {
-    to.cameras[0].iter().filter_map(|t| from.find(0, t.id).map(|f| (f.px, t.px)))
+/// Pixels in one camera of the points that both see, before and now.
+fn common<'a>(from: &'a Tracks, to: &'a Tracks, camera: usize) -> impl Iterator<Item = ([f32; 2], [f32; 2])> + 'a {
+    to.cameras[camera].iter().filter_map(move |t| from.find(camera, t.id).map(|f| (f.px, t.px)))
 }
 
-/// The larger axis of the median absolute displacement in camera 0, px. By axis, so that noise of
+fn shares_enough(from: &Tracks, to: &Tracks, camera: usize) -> bool {
+    common(from, to, camera).take(COMMON_MIN).count() == COMMON_MIN
+}
+
+/// Median displacement, px, in the camera that sees the most of it; `None` where none shares enough points.
+fn displacement(from: &Tracks, to: &Tracks) -> Option<f32> {
+    (0..CAMERAS_MAX).filter_map(|camera| median_displacement(from, to, camera)).reduce(f32::max)
+}
+
+/// The larger axis of the median absolute displacement in a camera, px. By axis, so that noise of
 /// both does not add up to a motion.
-fn median_displacement(from: &Tracks, to: &Tracks) -> Option<f32> {
+fn median_displacement(from: &Tracks, to: &Tracks, camera: usize) -> Option<f32> {
     let mut moved: [List<f32, TRACKS>; 2] = Default::default();
-    for (before, now) in common(from, to) {
+    for (before, now) in common(from, to, camera) {
         for axis in 0..2 {
             let _ = moved[axis].push((now[axis] - before[axis]).abs());
         }

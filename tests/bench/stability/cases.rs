@@ -174,6 +174,8 @@ fn lost(plan: fn() -> Plan, long: fn() -> Plan) -> Vec<Case> {
         case("right camera blind 1 s", Plan { spoil: |i, t| if (AT..AT + 20).contains(&i) { t.cameras[1].clear() }, ..plan() }).fault(AT, AT + 20).says(Health::ONE_CAMERA_BLIND),
         case("left camera blind for good", Plan { spoil: |i, t| if i >= AT { t.cameras[0].clear() }, ..long() }).fault(AT, EVER).says(Health::ONE_CAMERA_BLIND).expect(Survived, 0.03, 0.008),
         case("right camera blind for good", Plan { spoil: |i, t| if i >= AT { t.cameras[1].clear() }, ..long() }).fault(AT, EVER).says(Health::ONE_CAMERA_BLIND),
+        case("left camera dead from the start", Plan { spoil: |_, t| t.cameras[0].clear(), pose: from_rest, ..plan() }).says(Health::ONE_CAMERA_BLIND).expect(Survived, 0.03, 0.0),
+        case("left camera dead, 100 frames dropped", Plan { frame: |i| !(AT..AT + 100).contains(&i), spoil: |i, t| if i >= AT { t.cameras[0].clear() }, frames: 300, ..plan() }).fault(AT, AT + 100).says(Health::FRAME_GAP_RESET).expect(Reset, 0.03, 0.4),
         case("dark 1 s", Plan { spoil: |i, t| if (AT..AT + 20).contains(&i) { thin(t, 0) }, ..plan() }).fault(AT, AT + 20).says(Health::NO_TRACKS | Health::INERTIA_ALONE),
         case("dark 4 s", Plan { spoil: |i, t| if (AT..AT + 80).contains(&i) { thin(t, 0) }, ..long() }).fault(AT, AT + 80).says(Health::NO_TRACKS | Health::UNSEEN_RESET).expect(Reset, 0.008, 0.3),
     ]
