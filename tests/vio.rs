@@ -14,10 +14,10 @@ use stipple::config::{FrontendConfig, VioConfig};
 use stipple::frontend::{Frontend, Prediction, Tracks};
 use stipple::mem::{heap_after_seal, seal_thread, unsealed, CountingAllocator};
 use stipple::output::metrics::trajectory_error;
-use stipple::vio::{Odometry, Predictor, Update, Vio};
+use stipple::vio::{Health, Odometry, Predictor, Update, Vio};
 use stipple_drivers::replay::{OpenOptions, Recording};
 use stipple_drivers::sim::{Flight, Scenario, Sim};
-use stipple_drivers::{Calibration, Frames, ImuSample, Nanos, Span, TimedPose};
+use stipple_drivers::{Calibration, Frames, ImuSample, Nanos, Pose, Span, TimedPose};
 use world::{Path, World, FRAME_SECS, RATE_HZ};
 
 #[global_allocator]
@@ -126,6 +126,92 @@ fn garbage_tracks_give_finite_odometry_or_none() {
     };
     let run = simulate_spoiled(Path { rest: -1.0 }, 0.0, |_| true, |_| true, garbage);
     assert!(run.estimated.iter().all(|e| e.pose.is_finite()));
+}
+
+/// What was published of a frame: epoch, pose, whether dead reckoning made it, its deviation along the worst axis, and truth.
+struct Published {
+    epoch: u32,
+    pose: Pose,
+    dead_reckoned: bool,
+    sigma_p_m: f64,
+    truth: Pose,
+}
+
+/// Ten seconds whose inertial samples and tracks are spoiled, as they would be published.
+fn published(spoil: impl Fn(f64, &mut ImuSample, &mut Tracks)) -> Vec<Published> {
+    let path = Path { rest: -1.0 };
+    let mut world = World::new(path);
+    let mut vio = Vio::new(&world.rig, &VioConfig::default());
+    let (mut tracks, mut sample, mut list) = (Tracks::default(), 0, vec![]);
+    for frame in 0..200 {
+        let t = f64::from(frame) * FRAME_SECS + 0.0012;
+        world.tracks(t, &mut tracks);
+        while f64::from(sample) / RATE_HZ < t + 1.0 / RATE_HZ {
+            let at = f64::from(sample) / RATE_HZ;
+            let mut s = world.imu(at);
+            spoil(at, &mut s, &mut Tracks::default());
+            vio.on_imu(s);
+            sample += 1;
+        }
+        spoil(t, &mut ImuSample::default(), &mut tracks);
+        let u = vio.on_tracks(&tracks);
+        assert!(u.odometry.is_none() || u.dead_reckoned.is_none());
+        assert_eq!(u.health.has(Health::DEAD_RECKONED), u.dead_reckoned.is_some());
+        let Some(o) = u.odometry.or(u.dead_reckoned) else {
+            assert!(list.is_empty(), "{t}: a state is published from the first start on");
+            continue;
+        };
+        let c = u.covariance.expect("a state has a covariance");
+        let sigma_p_m = c[0][0].max(c[1][1]).max(c[2][2]).sqrt();
+        let (pose, dead_reckoned) = (o.world_from_body, u.dead_reckoned.is_some());
+        list.push(Published { epoch: u.epoch, pose, dead_reckoned, sigma_p_m, truth: path.pose(t) });
+    }
+    list
+}
+
+/// Checks that the poses of an epoch move as truth does from frame to frame; answers the epochs.
+fn epochs_without_jumps(list: &[Published], jump_max_m: f64) -> Vec<u32> {
+    for pair in list.windows(2).filter(|pair| pair[0].epoch == pair[1].epoch) {
+        let moved = |p: &dyn Fn(&Published) -> Pose| (p(&pair[0]).inverse() * p(&pair[1])).p;
+        let jump = (moved(&|p| p.pose) - moved(&|p| p.truth)).length();
+        assert!(jump < jump_max_m, "{jump} m in epoch {}", pair[0].epoch);
+    }
+    let mut epochs: Vec<u32> = list.iter().map(|p| p.epoch).collect();
+    assert!(epochs.is_sorted());
+    epochs.dedup();
+    epochs
+}
+
+#[test]
+fn a_blinded_rig_is_carried_by_inertia_in_an_epoch_of_its_own() {
+    let list = published(|t, _, tracks| {
+        if (3.0..7.0).contains(&t) {
+            tracks.cameras.iter_mut().for_each(|c| c.clear());
+        }
+    });
+    // Inertia alone for four seconds: its velocity is off by less than 0.2 m/s at the end.
+    assert_eq!(epochs_without_jumps(&list, 0.02), [0, 1]);
+    assert!(list.iter().any(|p| p.dead_reckoned));
+    assert!(!list.last().expect("it is published to the end").dead_reckoned, "it starts again when it sees");
+    for p in &list {
+        let error = (p.pose.p - p.truth.p - (list[0].pose.p - list[0].truth.p)).length();
+        assert!(error < 0.05 + 4.0 * p.sigma_p_m, "{error} m at a deviation of {} m", p.sigma_p_m);
+    }
+}
+
+#[test]
+fn inertial_samples_that_lie_begin_an_epoch_where_they_are_given_up_and_one_where_they_are_contradicted() {
+    let list = published(|t, sample, _| {
+        if (3.0..4.0).contains(&t) {
+            sample.accel_body.x += 30.0;
+        }
+    });
+    let last = list.last().expect("it is published to the end");
+    assert!(!last.dead_reckoned && last.epoch == 2, "epoch {}", last.epoch);
+    let recovered: Vec<_> = list.into_iter().filter(|p| p.epoch == 2).collect();
+    epochs_without_jumps(&recovered, 0.02);
+    let error = (recovered[0].pose.p - recovered[0].truth.p).length();
+    assert!(error < 0.05 + 4.0 * recovered[0].sigma_p_m, "{error} m, {} m", recovered[0].sigma_p_m);
 }
 
 fn recording(name: &str) -> Option<PathBuf> {

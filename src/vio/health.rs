@@ -48,9 +48,15 @@ impl Health {
     pub const UNSEEN_RESET: Health = Health(1 << 15);
     /// Reset at this frame: the state was not finite or beyond what flies.
     pub const STATE_RESET: Health = Health(1 << 16);
+    /// No estimator runs: the state is the last one that was trusted, carried on by inertia.
+    pub const DEAD_RECKONED: Health = Health(1 << 17);
+
+    /// The bits of a frame at which the estimator was reset.
+    pub const RESETS: Health =
+        Health(Health::DIVERGED_RESET.0 | Health::FRAME_GAP_RESET.0 | Health::UNSEEN_RESET.0 | Health::STATE_RESET.0);
 
     /// Name of each bit, as in the report, the lowest first.
-    pub const NAMES: [&str; 17] = [
+    pub const NAMES: [&str; 18] = [
         "initialising",
         "no_tracks",
         "few_landmarks",
@@ -68,6 +74,7 @@ impl Health {
         "frame_gap_reset",
         "unseen_reset",
         "state_reset",
+        "dead_reckoned",
     ];
     /// Bits of a normal flight.
     #[cfg(feature = "instruments")]
@@ -84,7 +91,6 @@ impl Health {
     }
 
     /// Names of the reasons.
-    #[cfg(feature = "instruments")]
     pub fn reasons(self) -> impl Iterator<Item = &'static str> {
         Health::NAMES.into_iter().enumerate().filter(move |(i, _)| self.0 >> i & 1 == 1).map(|(_, n)| n)
     }

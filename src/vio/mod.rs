@@ -93,8 +93,15 @@ impl From<&Odometry> for Motion {
 /// What one frame led to.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Update {
-    /// `None` until initialized.
+    /// Poses of one epoch are in one frame and do not jump. A reset begins the next, which starts where dead reckoning
+    /// guesses it in the frame of the one before; so does a restart that dead reckoning contradicts.
+    pub epoch: u32,
+    /// `None` until initialized, and again after a reset.
     pub odometry: Option<Odometry>,
+    /// The last state that was trusted, carried on by inertia, while there is no `odometry`.
+    pub dead_reckoned: Option<Odometry>,
+    /// Covariance of whichever of the two there is, as `Vio::covariance`.
+    pub covariance: Option<[[f64; 15]; 15]>,
     pub keyframe: bool,
     /// Tracks that are landmarks, a point that several cameras see once.
     pub connected: usize,
@@ -119,6 +126,7 @@ pub struct Vio {
     pending: Health,
     stats: Stats,
     tally: Tally,
+    epoch: u32,
     hash: u64,
 }
 
@@ -135,6 +143,7 @@ impl Vio {
             pending: Health::default(),
             stats: Stats::default(),
             tally: Tally::default(),
+            epoch: 0,
             hash: FNV_START,
         }
     }
@@ -166,7 +175,7 @@ impl Vio {
         let last = self.last;
         if last.is_some_and(|t| tracks.t <= t) {
             self.stats.frames_rejected += 1;
-            return Update::default();
+            return Update { epoch: self.epoch, ..Update::default() };
         }
         self.last = Some(tracks.t);
         let tracks = &self.admitted(tracks);
@@ -186,6 +195,12 @@ impl Vio {
         update.health = self.health(tracks, step.as_ref());
         reset.into_iter().for_each(|why| update.health.set(why.bit(), true));
         update.quality = quality(self.covariance(), update.connected);
+        (update.epoch, update.covariance) = (self.epoch, self.covariance);
+        if update.odometry.is_none() {
+            let carried = self.recovery.dead_reckoned(tracks.t, &self.imu, &self.estimator.model.noise).unzip();
+            (update.dead_reckoned, update.covariance) = (carried.0.map(|m| Odometry::new(tracks.t, &m)), carried.1);
+        }
+        update.health.set(Health::DEAD_RECKONED, update.dead_reckoned.is_some());
         self.stats.camera_blind += u64::from(update.health.has(Health::ONE_CAMERA_BLIND));
         self.tally.add(update.health, update.odometry.map(|_| update.quality));
         match (self.estimator.newest(), &self.covariance) {
@@ -223,6 +238,7 @@ impl Vio {
             self.initializer.clear();
             return None;
         };
+        self.epoch += u32::from(self.recovery.jumped());
         let step = self.estimator.start(tracks, &start, &self.imu);
         self.take(&step);
         Some(step)
@@ -300,6 +316,7 @@ impl Vio {
         self.initializer.clear();
         self.monitor = Monitor::default();
         self.covariance = None;
+        self.epoch += 1;
         self.stats.add_reset(why);
     }
 

@@ -43,6 +43,8 @@ pub struct Recovery {
     confirmed: Option<TrustedState>,
     /// Why there is a restart.
     reset_by: Reset,
+    /// The last restart was not where dead reckoning had led.
+    jumped: bool,
     origin: Origin,
 }
 
@@ -82,14 +84,43 @@ impl Recovery {
     /// A restart at `t` in the world of before: position and yaw as trusted, the rest of `start`; what is not known of
     /// the two is kept apart for `in_world`. `None` while the start cannot be true.
     pub fn resume(&mut self, start: &Start, t: Nanos, imu: &ImuRing, noise: &Noise) -> Option<Start> {
-        let suspect = matches!(self.reset_by, Reset::Disagreement | Reset::State);
-        let from = if suspect { self.confirmed } else { self.newest.or(self.confirmed) };
+        let suspect = self.is_suspect();
         self.candidate = None;
-        let resumed = from.map_or(Some(*start), |mut from| from.resume(start, suspect, t, imu, noise));
-        resumed.map(|mut start| {
+        let from = self.trusted();
+        let resumed = from.map_or(Some((*start, false)), |mut from| from.resume(start, suspect, t, imu, noise));
+        resumed.map(|(mut start, jumped)| {
+            self.jumped = jumped;
             self.origin = Origin::split(&mut start);
             start
         })
+    }
+
+    /// Whether the last restart was not where dead reckoning had led.
+    pub fn jumped(&self) -> bool {
+        self.jumped
+    }
+
+    /// After a reset, what a restart would resume from, carried to `t`, and its covariance. `None` where nothing was
+    /// trusted before, or nothing finite came of it.
+    pub fn dead_reckoned(&self, t: Nanos, imu: &ImuRing, noise: &Noise) -> Option<(Motion, Covariance)> {
+        let mut carried = self.trusted()?.carried;
+        carried.advance(t, imu, noise);
+        let covariance: Covariance = std::array::from_fn(|i| std::array::from_fn(|j| carried.covariance[(i, j)]));
+        let finite = carried.motion.is_finite() && covariance.iter().flatten().all(|c| c.is_finite());
+        finite.then_some((carried.motion, covariance))
+    }
+
+    /// The samples, or the estimate, may have been wrong for some time before the reset.
+    fn is_suspect(&self) -> bool {
+        matches!(self.reset_by, Reset::Disagreement | Reset::State)
+    }
+
+    fn trusted(&self) -> Option<TrustedState> {
+        if self.is_suspect() {
+            self.confirmed
+        } else {
+            self.newest.or(self.confirmed)
+        }
     }
 
     /// The covariance, in the world of before, of a motion whose errors since the restart have covariance `c`.
@@ -141,14 +172,22 @@ struct TrustedState {
 }
 
 impl TrustedState {
-    fn resume(&mut self, start: &Start, suspect: bool, t: Nanos, imu: &ImuRing, noise: &Noise) -> Option<Start> {
+    /// Where to start, and whether that is elsewhere than dead reckoning led.
+    fn resume(
+        &mut self,
+        start: &Start,
+        suspect: bool,
+        t: Nanos,
+        imu: &ImuRing,
+        noise: &Noise,
+    ) -> Option<(Start, bool)> {
         let TrustedState { then, carried } = self;
         carried.advance(t, imu, noise);
         let away = (t - then.t).secs();
         let mut sigma = start.sigma;
         if !suspect && sigma.v > carried.sigma(6) {
             // Dead reckoning knows the motion better than a start that does not see it.
-            return Some(Start { motion: carried.motion, sigma: carried.sigmas() });
+            return Some((Start { motion: carried.motion, sigma: carried.sigmas() }, false));
         }
         let moved = in_world_of(&carried.motion.pose, &start.motion);
         if away < DOWN_HOLDS && !carried.expects_down(&moved, &sigma) {
@@ -157,14 +196,14 @@ impl TrustedState {
         if carried.expects_velocity(&moved, &sigma) && (!suspect || sigma.v < VOUCHING_V) {
             sigma.p = sigma.p.hypot(carried.sigma(0));
             sigma.yaw = sigma.yaw.hypot(carried.about_world_axis(DVec3::Z));
-            return Some(Start { motion: moved, sigma });
+            return Some((Start { motion: moved, sigma }, false));
         }
         let speed = then.motion.v.length().max(moved.v.length()).max(SPEED_UNSEEN);
         sigma.p += then.sigma(0) + speed * away;
         // Beyond half a turn a yaw is no more unknown.
         let yaw = sigma.yaw + then.about_world_axis(DVec3::Z) + RATE_UNSEEN * away;
         sigma.yaw = yaw.min(std::f64::consts::PI);
-        Some(Start { motion: in_world_of(&then.motion.pose, &start.motion), sigma })
+        Some((Start { motion: in_world_of(&then.motion.pose, &start.motion), sigma }, true))
     }
 }
 
