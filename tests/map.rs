@@ -34,7 +34,7 @@ fn flight(count: usize) -> (Calibration, Vec<Keyframe>) {
         sim.render(k * apart, &mut frames);
         let images = frames.images.clone();
         let world_from_body = sim.truth_at(frames.t).pose;
-        Keyframe { id: k as u64, t: frames.t, world_from_body, images, colours: vec![], held_out: k % 4 == 3 }
+        Keyframe { id: k as u64, t: frames.t, world_from_body, images, colours: vec![], epoch: 0, held_out: k % 4 == 3 }
     };
     let keyframes = (0..count).map(&mut keyframe).collect();
     (calibration, keyframes)
@@ -53,7 +53,7 @@ fn fisheye_flight(count: usize) -> (Calibration, Vec<Keyframe>) {
     let mut keyframe = |k: usize| {
         sim.render(40 + 10 * k, &mut frames);
         let (images, world_from_body) = (frames.images.clone(), sim.truth_at(frames.t).pose);
-        Keyframe { id: k as u64, t: frames.t, world_from_body, images, colours: vec![], held_out: false }
+        Keyframe { id: k as u64, t: frames.t, world_from_body, images, colours: vec![], epoch: 0, held_out: false }
     };
     let keyframes = (0..count).map(&mut keyframe).collect();
     (calibration, keyframes)
@@ -340,7 +340,9 @@ fn play(mapper: &mut Mapper, recording: &Recording, keyframes: usize, steps: u32
         reader.read(i, &mut frames).unwrap();
         let images = frames.images.clone();
         let held_out = id % 8 == 7;
-        mapper.ingest(&Keyframe { id, t: frame.t, world_from_body, images, colours: vec![], held_out }).unwrap();
+        mapper
+            .ingest(&Keyframe { id, t: frame.t, world_from_body, images, colours: vec![], epoch: 0, held_out })
+            .unwrap();
         id += 1;
         train(mapper, steps);
     }
@@ -513,4 +515,40 @@ fn a_black_eye_makes_no_anchor_and_is_counted() {
     assert_eq!((mapper.counters().depth_absent.get(), mapper.splat_count()), (1, 0));
     assert!(matches!(mapper.ingest(&keyframes[1]).unwrap(), StepKind::Anchor { seeded } if seeded > 0));
     assert_eq!(mapper.counters().depth_absent.get(), 1);
+}
+
+/// A reset moves the frame of what comes after it, here by 0.36 m: the same room from the same places, at other poses.
+#[test]
+fn epochs_share_no_gaussian() {
+    let (calibration, keyframes) = flight(4);
+    let shift = Pose { p: glam::DVec3::new(0.3, 0.2, 0.0), ..Pose::IDENTITY };
+    let alone = |keyframes: &[Keyframe]| {
+        let mut mapper = Mapper::open(&calibration, &board(&[])).unwrap();
+        for k in keyframes {
+            mapper.ingest(k).unwrap();
+            train(&mut mapper, 20);
+        }
+        mapper
+    };
+    let later: Vec<Keyframe> = keyframes
+        .iter()
+        .map(|k| Keyframe { id: k.id + 4, epoch: 1, world_from_body: shift * k.world_from_body, ..k.clone() })
+        .collect();
+    let mut first = alone(&keyframes[..3]);
+    let before = first.splats().unwrap();
+    let (one, anchors) = (before.len(), first.anchor_count());
+    // Its first view shows nothing of the epoch before, and is an anchor with as many seeds as the first of all.
+    let kind = first.ingest(&later[0]).unwrap();
+    assert!(matches!(kind, StepKind::Anchor { seeded } if seeded > 500), "{kind:?}");
+    // The burst that follows draws views of both epochs. Gaussians of the first learn from the first's alone: a map of the
+    // first alone looks no better from there than this one.
+    train(&mut first, 120);
+    assert!(first.anchor_count() > anchors && first.splat_count() > one);
+    let both = first.evaluate().unwrap().psnr_db.unwrap();
+    let mut mixed = alone(&keyframes[..3]);
+    mixed.ingest(&Keyframe { epoch: 0, ..later[0].clone() }).unwrap();
+    train(&mut mixed, 120);
+    let mixed = mixed.evaluate().unwrap().psnr_db.unwrap();
+    println!("epochs apart {both:.2} dB, as if of one frame {mixed:.2} dB");
+    assert!(both > mixed + 1.0, "{both} {mixed}");
 }

@@ -177,6 +177,7 @@ fn a_run_leaves_complete_files_that_agree() {
     ];
     let evidence = Evidence {
         estimated: &estimated,
+        epochs: &[(Nanos(30_000_000_000), 1)],
         truth: &truth,
         error: Some(&error),
         tracking_ms: &tracking,

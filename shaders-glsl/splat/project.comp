@@ -1,4 +1,4 @@
-// Puts every Gaussian of the pool on the image: one thread a slot.
+// Puts every Gaussian of an epoch on the image: one thread a slot, those of earlier epochs included.
 // in   splats
 // out  projected[slot]; keys[slot], by depth, NONE where not visible and past the last; failed[0] counts those
 //      not finite
@@ -15,7 +15,8 @@ layout(local_size_x = 64) in;
 layout(push_constant) uniform Push {
     Camera camera;
     uvec2 size;
-    uint splats;
+    uint first;         // slots of the epoch
+    uint splats;        // and their end
     float coarseness;
 } push;
 
@@ -57,7 +58,7 @@ void main() {
         return;
     }
     const Splat s = splats[slot];
-    keys[slot] = project(s, slot);
+    keys[slot] = slot < push.first ? NONE : project(s, slot);
     if (!(finite(s.mean_opacity) && finite(s.scale_colour) && finite(s.quat))) {
         atomicAdd(failed[0], 1);
     }

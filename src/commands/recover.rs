@@ -1,5 +1,6 @@
 //! `stipple recover`: the trajectory of a run that left its log and nothing else.
 
+use crate::output::trajectory::TumWriter;
 use crate::output::OutputDir;
 use crate::run::log::read::{runs, write_trajectory, LoggedRun, Message};
 use crate::run::log::EventKind;
@@ -52,7 +53,7 @@ fn recover_run(run: &LoggedRun, out: &OutputDir, name: &str) -> Result<u64, Faul
             Message::State(state) => {
                 span = Some([span.map_or(Nanos(state.t_ns), |[first, _]| first), Nanos(state.t_ns)]);
                 frames += 1;
-                poses += u64::from(state.estimate.is_some());
+                poses += u64::from(state.estimate.is_some() && !state.dead_reckoned);
             }
             Message::Event(e) if e.kind == EventKind::End => end = Some(e.text.to_string()),
             Message::Event(e) => events.push(format!("{:9.2} s  {}", (at - begun).secs().max(0.0), e.text)),
@@ -64,9 +65,11 @@ fn recover_run(run: &LoggedRun, out: &OutputDir, name: &str) -> Result<u64, Faul
     // A run that came to its end wrote it after its log, maybe with poses that the log had no room for.
     let kept = modified(&path) >= newest;
     if kept {
-        write_trajectory(&run.files, &mut io::sink(), each).map_err(|e| cannot_read(run, &e))?;
+        TumWriter::begin(&mut io::sink())
+            .and_then(|mut sink| write_trajectory(&run.files, &mut sink, each))
+            .map_err(|e| cannot_read(run, &e))?;
     } else {
-        out.write(name, |w| write_trajectory(&run.files, w, each))?;
+        out.write(name, |w| write_trajectory(&run.files, &mut TumWriter::begin(w)?, each))?;
     }
     let names: Vec<_> = run.files.iter().filter_map(|f| Some(f.file_name()?.to_string_lossy())).collect();
     let seconds = span.map_or(0.0, |[first, last]| (last - first).secs());

@@ -119,7 +119,8 @@ impl Anchors {
         // Seeds come of the rectified pair, whatever the lens of what trains.
         let rect = stereo.views.camera();
         let world_from_cam = scene.store.world_from_body(index) * rect.body_from_rect;
-        let view = View { world_from_cam, camera: rect.pinhole, fisheye: None, coarseness: Coarseness::default() };
+        let (coarseness, epoch) = (Coarseness::default(), keyframe.epoch);
+        let view = View { world_from_cam, camera: rect.pinhole, fisheye: None, coarseness, epoch };
         self.render(scene, index, &view)?;
         let coverage = {
             let seen = seen(scene, &self.pair, index, &view, stereo.views.valid_mask(), &self.work.depth.metres);
@@ -143,7 +144,7 @@ impl Anchors {
         if room == 0 && !self.config.evict {
             return Ok(None);
         }
-        scene.pipeline.pool.open_block(index as u32);
+        scene.pipeline.pool.open_block(index as u32, keyframe.epoch);
         let seeded = self.seed(scene, index, &view, stereo.views.valid_mask(), (whole, room))? as u32;
         scene.counters.anchors_for_error.add(u64::from(coverage.uncovered <= least));
         self.anchored_at = scene.steps;
@@ -193,7 +194,7 @@ impl Anchors {
         let Workspace { depth, seeder, diffusion, answers, .. } = &mut self.work;
         let seen = seen(scene, &self.pair, index, view, valid, &depth.metres);
         let points = seeder.seed(&seen, whole, diffusion, &scene.counters);
-        self.occupancy.look_up(&mut scene.gpu, &scene.pipeline.pool, points, answers)?;
+        self.occupancy.look_up(&mut scene.gpu, &scene.pipeline.pool, view.epoch, points, answers)?;
         let (exposure, planes) = (scene.store.exposure(index), planes(&scene.store, &self.pair, index));
         let splats = seeder.keep(answers, room, &scene.counters).iter().map(|s| s.gaussian(planes, exposure));
         scene.pipeline.pool.append(&mut scene.gpu, splats)

@@ -112,7 +112,7 @@ impl Backward {
                 chroma_moments: pool.buffers.chroma_moments.read_write(),
             };
             let push = chroma_backward::Push { capacity: self.capacity, rate: rates.colour };
-            rec.dispatch(chroma, bind, push, Threads::d1(pool.count()));
+            rec.dispatch(chroma, bind, push, Threads::d1(pool.slots(view.epoch).end));
         }
         self.record_project(rec, pool, renderer, view, rates, weights);
     }
@@ -155,7 +155,7 @@ impl Backward {
                 log_scale_soft: weights.scale_soft_m.ln(),
                 weight_opacity: weights.opacity,
             },
-            Threads::d1(pool.count()),
+            Threads::d1(pool.slots(view.epoch).end),
         );
     }
 }

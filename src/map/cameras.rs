@@ -28,6 +28,7 @@ impl TrainingCamera {
             camera: self.camera,
             fisheye: self.fisheye,
             coarseness: Coarseness::default(),
+            epoch: 0,
         }
     }
 }
@@ -94,6 +95,7 @@ impl RectifiedPair {
             camera: left.camera,
             fisheye: left.fisheye,
             coarseness: Coarseness::default(),
+            epoch: 0,
         };
         let of = |i: usize| {
             let p = ray.point(i % width, i / width, 1.0).filter(|p| p.z > 0.0)?;
@@ -190,6 +192,7 @@ mod tests {
             camera: rect.pinhole,
             fisheye: None,
             coarseness: Coarseness::default(),
+            epoch: 0,
         };
         // y down: half a metre below the rig, as far as 4 m.
         let floor = |x: usize, y: usize| {

@@ -76,7 +76,7 @@ pub mod tests {
 
     pub fn view() -> View {
         let camera = Pinhole { width: W, height: H, fx: 50.0, fy: 50.0, cx: 31.5, cy: 23.5 };
-        View { world_from_cam: Pose::IDENTITY, camera, fisheye: None, coarseness: Coarseness::default() }
+        View { world_from_cam: Pose::IDENTITY, camera, fisheye: None, coarseness: Coarseness::default(), epoch: 0 }
     }
 
     /// Black, as opaque as `alpha`.

@@ -7,6 +7,8 @@ use stipple_drivers::{Colour, Image, Nanos, Pose};
 pub struct Keyframe {
     pub id: u64,
     pub t: Nanos,
+    /// Keyframes of different epochs are in different frames, and train different Gaussians.
+    pub epoch: u32,
     pub world_from_body: Pose,
     /// Images as the cameras gave them: left, right, and further ones that train.
     pub images: Vec<Image>,

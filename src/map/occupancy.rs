@@ -56,20 +56,22 @@ impl Occupancy {
         })
     }
 
-    /// Which of `points` lie in cells that hold Gaussians of the pool; one answer a point.
+    /// Which of `points` lie in cells that hold Gaussians of an epoch of the pool; one answer a point.
     pub fn look_up(
         &self,
         gpu: &mut Gpu,
         pool: &Pool,
+        epoch: u32,
         points: &[[f32; 4]],
         answers: &mut Vec<u32>,
     ) -> Result<(), GpuError> {
         let Buffers { cells, points: asked, found } = self.buffers;
-        let (splats, per_metre, mask) = (pool.count(), self.per_metre, cells.len() as u32 - 1);
+        let (slots, per_metre, mask) = (pool.slots(epoch), self.per_metre, cells.len() as u32 - 1);
         let mut rec = gpu.record();
         rec.fill(cells, u32::MAX);
         let bind = occupy::Bind { splats: pool.buffers.splats.read(), cells: cells.read_write() };
-        rec.dispatch(&self.occupy, bind, occupy::Push { splats, per_metre, mask }, Threads::d1(splats));
+        let push = occupy::Push { first: slots.start, splats: slots.end, per_metre, mask };
+        rec.dispatch(&self.occupy, bind, push, Threads::d1(slots.end));
         gpu.submit(rec)?;
         answers.clear();
         answers.resize(points.len(), FREE);

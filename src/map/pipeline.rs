@@ -226,7 +226,7 @@ impl Pipeline {
         self.renderer.record(rec, &self.pool, view, false);
         self.loss.record(rec, self.renderer.buffers.rendered, target, weights.ssim);
         self.backward.record(rec, &self.pool, &self.renderer, gradient, view, rates, weights);
-        self.record_summary(rec, shape.channels * shape.loss_groups(), self.pool.count().div_ceil(GROUP));
+        self.record_summary(rec, shape.channels * shape.loss_groups(), self.pool.slots(view.epoch).end.div_ceil(GROUP));
     }
 
     fn record_summary(&self, rec: &mut Recorder, image_groups: u32, splat_groups: u32) {

@@ -67,6 +67,7 @@ impl Default for PruneRule {
 #[derive(Clone, Copy, Debug)]
 struct Block {
     anchor: u32,
+    epoch: u32,
     first: u32,
 }
 
@@ -200,17 +201,26 @@ impl Pool {
         self.capacity as usize
     }
 
-    /// What is appended from now on belongs to `anchor`.
-    pub fn open_block(&mut self, anchor: u32) {
+    /// What is appended from now on belongs to `anchor`, of an epoch that is none before the newest's.
+    pub fn open_block(&mut self, anchor: u32, epoch: u32) {
         let blocks = &mut self.host.blocks;
         if blocks.len() < blocks.capacity() {
-            blocks.push(Block { anchor, first: self.count });
+            blocks.push(Block { anchor, epoch, first: self.count });
         }
     }
 
     /// The anchor that what is appended belongs to.
     pub fn newest(&self) -> Option<u32> {
         self.host.blocks.last().map(|b| b.anchor)
+    }
+
+    /// The slots of an epoch's Gaussians: all of them where no block was opened.
+    pub fn slots(&self, epoch: u32) -> Range<u32> {
+        let blocks = &self.host.blocks;
+        let begin = |i: usize| blocks.get(i).map_or(self.count, |b| b.first);
+        let (before, upto) =
+            (blocks.partition_point(|b| b.epoch < epoch), blocks.partition_point(|b| b.epoch <= epoch));
+        (if before == 0 { 0 } else { begin(before) })..begin(upto)
     }
 
     /// The slots of an anchor's Gaussians; empty where it has none.

@@ -155,7 +155,8 @@ impl Renderer {
 
     /// The visible, front to back.
     fn record_order(&self, rec: &mut Recorder, pool: &Pool, view: &View) {
-        let (b, n, coarseness) = (&self.buffers, pool.count(), view.coarseness.level());
+        let (b, slots, coarseness) = (&self.buffers, pool.slots(view.epoch), view.coarseness.level());
+        let (first, n) = (slots.start, slots.end);
         rec.fill(b.failed, 0);
         rec.dispatch(
             &self.project[view.lens()],
@@ -165,7 +166,7 @@ impl Renderer {
                 keys: self.scratch.depth_keys.write(),
                 failed: b.failed.read_write(),
             },
-            project::Push { camera: view.words(), size: view.size(), splats: n, coarseness },
+            project::Push { camera: view.words(), size: view.size(), first, splats: n, coarseness },
             Threads::d1(n + 1),
         );
         let keys = self.scratch.depth_keys.part(0, n as usize + 1);
@@ -175,7 +176,8 @@ impl Renderer {
 
     /// What each tile shows, front to back.
     fn record_lists(&self, rec: &mut Recorder, pool: &Pool, view: &View) {
-        let (b, n, size, coarseness) = (&self.buffers, pool.count(), view.size(), view.coarseness.level());
+        let (b, n) = (&self.buffers, pool.slots(view.epoch).end);
+        let (size, coarseness) = (view.size(), view.coarseness.level());
         let per_slot = Threads::d1(n + 1);
         rec.dispatch(
             &self.count_tiles,

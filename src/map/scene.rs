@@ -6,7 +6,7 @@ use super::exposure::{gain_from, median_exposure, Exposure};
 use super::pipeline::Pipeline;
 use super::render::Rendered;
 use super::step::{Stats, Target};
-use super::store::Store;
+use super::store::{Store, Stored};
 use super::view::View;
 use crate::counters::Counters;
 use crate::gpu::{Gpu, GpuError};
@@ -32,7 +32,8 @@ impl Scene {
     /// Where a stored image was taken, as far as is known.
     pub fn view(&self, index: usize) -> View {
         let view = self.camera(index).view(self.store.world_from_body(index));
-        View { coarseness: self.store.get(index).coarseness, ..view }
+        let Stored { coarseness, epoch, .. } = *self.store.get(index);
+        View { coarseness, epoch, ..view }
     }
 
     /// What a step on a stored image compares with.

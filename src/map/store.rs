@@ -13,6 +13,7 @@ use stipple_drivers::{Image, Nanos, Pose};
 pub struct Stored {
     pub id: u64,
     pub t: Nanos,
+    pub epoch: u32,
     /// Odometry's pose, with its corrections.
     pub given: Pose,
     /// `given` when the Gaussians of an anchor were last put in place.
@@ -85,7 +86,7 @@ impl Store {
         let index = self.entries.len();
         let planes = self.planes.get_mut(index * self.channels..(index + 1) * self.channels)?;
         planes.iter_mut().enumerate().for_each(|(channel, plane)| draw(channel, plane));
-        let &Keyframe { id, t, world_from_body, held_out, .. } = keyframe;
+        let &Keyframe { id, t, epoch, world_from_body, held_out, .. } = keyframe;
         let mut refined = Refinement::default();
         // Cameras change their exposure slowly: the last one's is the best guess. Not so its offset, which cameras keep: what
         // training put there is the blur of a map that was not finished, and handed on it grows from view to view, as gains
@@ -94,7 +95,7 @@ impl Store {
         refined.exposure.gain = last.map_or(1.0, |&k| self.get(k as usize).refined.exposure.gain);
         let coarseness = last.map_or(Coarseness::default(), |&k| self.get(k as usize).coarseness);
         let (given, placed) = (world_from_body, world_from_body);
-        self.entries.push(Stored { id, t, given, placed, held_out, anchor: false, refined, coarseness });
+        self.entries.push(Stored { id, t, epoch, given, placed, held_out, anchor: false, refined, coarseness });
         if !held_out {
             self.training.push(index as u32);
         }

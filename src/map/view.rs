@@ -14,6 +14,8 @@ pub struct View {
     /// The lens that bends what `camera` would see; a pinhole without.
     pub fisheye: Option<Fisheye>,
     pub coarseness: Coarseness,
+    /// Only the Gaussians of this epoch are seen.
+    pub epoch: u32,
 }
 
 impl View {

@@ -7,6 +7,7 @@ use super::chart::{bars, escape, histogram, Chart, Series};
 use super::metrics::{percentile, TrajectoryError};
 use super::panel::Picture;
 use super::report::{KernelTime, Report, GOOD_DB};
+use super::trajectory::epoch_at;
 use crate::map::spread;
 use glam::DVec3;
 use std::fmt::{Display, Write};
@@ -24,6 +25,8 @@ const KERNELS_MAX: usize = 20;
 pub struct Evidence<'a> {
     /// The trajectory of the run, in its own frame.
     pub estimated: &'a [TimedPose],
+    /// First frame and number of each epoch.
+    pub epochs: &'a [(Nanos, u32)],
     /// Empty where there is none.
     pub truth: &'a [TimedPose],
     pub error: Option<&'a TrajectoryError>,
@@ -88,7 +91,7 @@ fn tables(report: &Report) -> String {
     let f = |v: Option<f64>, decimals: usize| v.filter(|v| v.is_finite()).map(|v| format!("{v:.decimals$}"));
     let n = |v: Option<u64>| v.map(grouped);
     let mib = |v: Option<u64>| v.map(|b| format!("{:.1}", b as f64 / (1 << 20) as f64));
-    let odometry: [Row; 11] = [
+    let odometry: [Row; 12] = [
         ("Trajectory error (ATE)", f(report.ate_rmse_m, 4), "m"),
         ("Error over 1 s (RTE)", f(report.rte_1s_m, 4), "m"),
         ("Rotation over 1 s (RPE)", f(report.rpe_deg, 3), "\u{b0}"),
@@ -97,6 +100,7 @@ fn tables(report: &Report) -> String {
         ("Tracking time, 99 %", f(report.tracking_ms_p99, 2), "ms"),
         ("Frames tracked", n(report.frames), ""),
         ("Frames dropped", n(report.frames_dropped), ""),
+        ("Epochs: 1, and one for each reset", n(report.epochs.map(u64::from)), ""),
         ("Quality, median", n(report.quality_p50.map(u64::from)), "of 100"),
         ("Quality, lowest", n(report.quality_min.map(u64::from)), "of 100"),
         ("Frames of quality under 50", f(report.quality_under_50.map(|v| 100.0 * v), 1), "%"),
@@ -204,13 +208,24 @@ fn trajectory(evidence: &Evidence) -> [Option<String>; 4] {
     let end = evidence.estimated.last().map_or(start, |e| e.t);
     let onto_truth = evidence.error.map(|e| e.truth_from_estimate).unwrap_or_default();
     let secs = |t: Nanos| (t - start).secs();
+    let epoch = |e: &TimedPose| epoch_at(evidence.epochs, e.t);
+    let epochs: Vec<(String, u8, &[TimedPose])> = evidence
+        .estimated
+        .chunk_by(|a, b| epoch(a) == epoch(b))
+        .map(|poses| match epoch(&poses[0]) {
+            0 => ("estimate".into(), 1, poses),
+            epoch => (format!("epoch {epoch}"), 1 + (epoch % 2) as u8, poses),
+        })
+        .collect();
     let series = |point: &dyn Fn(Nanos, DVec3) -> (f64, f64)| {
         let seen = |e: &&TimedPose| e.t >= start && e.t <= end;
         // Truth without an alignment is in another frame than the estimate: it is not drawn.
         let truth = if evidence.error.is_some() { evidence.truth } else { &[] };
         let truth = truth.iter().filter(seen).map(|e| point(e.t, e.pose.p)).collect();
-        let estimate = evidence.estimated.iter().map(|e| point(e.t, onto_truth.transform(e.pose.p))).collect();
-        vec![Series::line("ground truth", 3, truth), Series::line("estimate", 1, estimate)]
+        let estimates = epochs.iter().map(|(name, ink, poses)| {
+            Series::line(name, *ink, poses.iter().map(|e| point(e.t, onto_truth.transform(e.pose.p))).collect())
+        });
+        std::iter::once(Series::line("ground truth", 3, truth)).chain(estimates).collect::<Vec<_>>()
     };
     let above = Chart {
         title: "Seen from above",

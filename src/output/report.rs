@@ -22,6 +22,8 @@ pub struct Report {
     pub frames_dropped: Option<u64>,
     pub keyframes: Option<u64>,
     pub anchors: Option<u64>,
+    /// Frames of reference of the trajectory: one, and one more for each reset and each restart elsewhere.
+    pub epochs: Option<u32>,
 
     pub ate_rmse_m: Option<f64>,
     pub rte_1s_m: Option<f64>,
@@ -150,7 +152,7 @@ mod tests {
         tracking_ms_p99 tracking_threads tracking_cpu_ms frontend_ms_p50 frontend_ms_p99 estimator_ms_p50 \
         estimator_ms_p99 psnr_db ssim psnr_heldout_db ssim_heldout psnr_heldout_between_db psnr_heldout_fitted_db ssim_heldout_fitted psnr_heldout_aligned_db splats iterations \
         iteration_ms_p50 seconds_to_25_db gpu_bytes estimator_bytes quality_min quality_p50 quality_under_50 rss_peak_bytes map_rss_peak_bytes heap_after_seal wall_s device vio_hash dataset board pace scale \
-        camera_cpu_ms camera_kernel_ms camera_copies time_offset_s time_offset_sigma_s gyro_scale gyro_scale_sigma accel_scale accel_scale_sigma";
+        camera_cpu_ms camera_kernel_ms camera_copies time_offset_s time_offset_sigma_s gyro_scale gyro_scale_sigma accel_scale accel_scale_sigma epochs";
 
     #[test]
     fn unmeasured_figures_are_null_and_present() {

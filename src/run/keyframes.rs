@@ -48,8 +48,9 @@ const WORDS: usize = 16;
 /// A correction: number of the keyframe, and its pose.
 const POSE: usize = 7;
 const CORRECTION: usize = 1 + POSE;
-/// Head of a slot: state, number, stamp, whether it is held out, pose.
-const HEAD: usize = 4 + POSE;
+/// Head of a slot: state, number, stamp, whether it is held out, epoch, pose.
+const HEAD: usize = POSE_AT + POSE;
+const POSE_AT: usize = 5;
 
 /// States of a slot. `DONE` is free, and still holds a keyframe.
 const EMPTY: u64 = 0;
@@ -134,7 +135,7 @@ impl KeyframeRing {
     }
 
     /// Copies a keyframe in; false when every slot is taken.
-    pub fn offer(&self, frames: &Frames, id: u64, held_out: bool, world_from_body: &Pose) -> bool {
+    pub fn offer(&self, frames: &Frames, id: u64, held_out: bool, (epoch, world_from_body): (u32, &Pose)) -> bool {
         let all = 0..u64::MAX;
         let free = self.claim(&[EMPTY, DONE], all.clone(), FILLING);
         let absent = || self.word(Word::Absent).load(Acquire) != 0;
@@ -145,7 +146,8 @@ impl KeyframeRing {
         slot[1].store(id, Relaxed);
         slot[2].store(frames.t.0 as u64, Relaxed);
         slot[3].store(u64::from(held_out), Relaxed);
-        write_pose(&slot[4..HEAD], world_from_body);
+        slot[4].store(u64::from(epoch), Relaxed);
+        write_pose(&slot[POSE_AT..HEAD], world_from_body);
         let mut at = HEAD;
         let colours = frames.colours.iter().take(self.colours()).flatten();
         for image in frames.images.iter().take(self.shape.images.len()).chain(colours) {
@@ -164,7 +166,8 @@ impl KeyframeRing {
         keyframe.id = slot[1].load(Relaxed);
         keyframe.t = Nanos(slot[2].load(Relaxed) as i64);
         keyframe.held_out = slot[3].load(Relaxed) != 0;
-        keyframe.world_from_body = read_pose(&slot[4..HEAD]);
+        keyframe.epoch = slot[4].load(Relaxed) as u32;
+        keyframe.world_from_body = read_pose(&slot[POSE_AT..HEAD]);
         let mut at = HEAD;
         for image in keyframe.images.iter_mut().chain(keyframe.colours.iter_mut().flatten()) {
             let end = at + words_of(image.pixels.len());
@@ -206,7 +209,7 @@ impl KeyframeRing {
             let correction = PoseCorrection { id: from[0].load(Relaxed), world_from_body: read_pose(&from[1..]) };
             for slot in (0..SLOTS).map(|i| self.slot(i)) {
                 if slot[0].load(Acquire) == OFFERED && slot[1].load(Relaxed) == correction.id {
-                    write_pose(&slot[4..HEAD], &correction.world_from_body);
+                    write_pose(&slot[POSE_AT..HEAD], &correction.world_from_body);
                 }
             }
             correct(&correction);
@@ -285,7 +288,7 @@ impl Keyframes {
             return;
         }
         let (id, n) = (self.count, u64::from(self.holdout));
-        if ring.offer(&packet.frames, id, n > 0 && id % n == n - 1, &tracked.world_from_body) {
+        if ring.offer(&packet.frames, id, n > 0 && id % n == n - 1, (packet.epoch, &tracked.world_from_body)) {
             self.count += 1;
             self.recent.truncate(RECENT - 1);
             self.recent.push_front((packet.frames.t, id));
@@ -319,7 +322,7 @@ mod tests {
     fn offer(ring: &KeyframeRing, id: u64) -> bool {
         let image = Image { pixels: vec![id as u8; 15], ..Image::new(5, 3) };
         let frames = Frames { t: Nanos(id as i64 * 7), images: vec![image; 2], colours: vec![] };
-        ring.offer(&frames, id, id == 3, &Pose::IDENTITY)
+        ring.offer(&frames, id, id == 3, (id as u32 / 4, &Pose::IDENTITY))
     }
 
     /// The numbers of what waits, in order; each is marked as done.

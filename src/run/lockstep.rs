@@ -8,6 +8,7 @@
 
 use super::gate::{FrameGate, ImuGate};
 use super::keyframes::Keyframes;
+use super::log::EventKind;
 use super::mapping::{Mapping, SLICE};
 use super::sensors::Recorded;
 use super::status::{Gauges, Status};
@@ -148,6 +149,10 @@ pub fn fly(
                 let Some(packet) = waker.wait(&ended, || done.pop()) else { return };
                 sent -= 1;
                 keyframes.pass_on(&packet, ring.as_deref(), &counters);
+                gauges.set_epoch(packet.epoch, packet.health);
+                if let Some(line) = status.epoch_begun(&gauges) {
+                    status.say(EventKind::Epoch, &line);
+                }
                 let frames = gauges.frames.fetch_add(1, Relaxed) + 1;
                 gauges.keyframes.store(keyframes.count, Relaxed);
                 let since_first = packet.frames.t - reading.recorded.stamps[0];

@@ -376,6 +376,7 @@ pub fn fly_in_real_time(
             if !packet.imu_only {
                 keyframes.pass_on(&packet, ring, &s.counters);
                 s.gauges.frames.fetch_add(1, Relaxed);
+                s.gauges.set_epoch(packet.epoch, packet.health);
                 s.gauges.posed.fetch_add(u64::from(observes || packet.tracked.is_some()), Relaxed);
                 s.gauges.keyframes.store(keyframes.count, Relaxed);
             }
@@ -448,6 +449,7 @@ fn supervise(
         let hangs = silent.filter(|_| was.is_none()).map(|name| format!("thread {name} gives no sign of life"));
         s.counters.threads_silent.add(u64::from(hangs.is_some()));
         let looked = worker.as_mut().and_then(|w| w.watch(&s.gauges));
+        let epoch = status.epoch_begun(&s.gauges);
         let mut say = |kind, line: String| {
             status.say(kind, &line);
             // A cable that comes loose each second, for hours, is in the log.
@@ -456,6 +458,7 @@ fn supervise(
             }
         };
         hangs.into_iter().chain(threads::refused()).for_each(|line| say(EventKind::System, line));
+        epoch.into_iter().for_each(|line| say(EventKind::Epoch, line));
         looked.into_iter().for_each(|line| say(EventKind::Map, line));
         std::iter::from_fn(|| s.mailbox.notices.pop()).for_each(|line| say(EventKind::Sensor, line));
         if tracked {

@@ -3,10 +3,11 @@
 use super::log::{EventKind, LogSender};
 use super::status_led::StatusLed;
 use crate::counters::Counters;
+use crate::vio::Health;
 use indicatif::{ProgressBar, ProgressStyle};
 use std::fmt;
 use std::io::{self, IsTerminal, Write as _};
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
+use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering::Acquire, Ordering::Relaxed, Ordering::Release};
 use std::time::{Duration, Instant};
 use stipple_drivers::host;
 
@@ -28,6 +29,19 @@ pub struct Gauges {
     pub psnr_cdb: AtomicU64,
     /// Time of the recording played so far, ms.
     pub played_ms: AtomicU64,
+    /// The epoch of the newest frame, and the health of the epoch's first.
+    pub epoch: AtomicU32,
+    pub epoch_health: AtomicU32,
+}
+
+impl Gauges {
+    /// Takes note of the epoch of a frame.
+    pub fn set_epoch(&self, epoch: u32, health: Health) {
+        if epoch != self.epoch.load(Relaxed) {
+            self.epoch_health.store(health.0, Relaxed);
+            self.epoch.store(epoch, Release);
+        }
+    }
 }
 
 pub struct Status {
@@ -42,6 +56,8 @@ pub struct Status {
     next_count: Instant,
     /// Whether it was said that logging ended.
     log_ended: bool,
+    /// The epoch that was told last.
+    epoch: u32,
 }
 
 const LINE_PERIOD: Duration = Duration::from_secs(1);
@@ -62,7 +78,16 @@ impl Status {
     /// Shows nothing.
     pub fn silent() -> Status {
         let next_count = Instant::now() + LINE_PERIOD;
-        Status { bar: None, total_ms: None, next_line: None, led: None, log: None, next_count, log_ended: false }
+        Status {
+            bar: None,
+            total_ms: None,
+            next_line: None,
+            led: None,
+            log: None,
+            next_count,
+            log_ended: false,
+            epoch: 0,
+        }
     }
 
     /// Shows it on the LED of a board that has one, too.
@@ -120,6 +145,21 @@ impl Status {
             self.print(why);
             self.log_ended = true;
         }
+    }
+
+    /// A line about an epoch that began since this was asked last.
+    pub fn epoch_begun(&mut self, g: &Gauges) -> Option<String> {
+        let epoch = g.epoch.load(Acquire);
+        if std::mem::replace(&mut self.epoch, epoch) == epoch {
+            return None;
+        }
+        let health = Health(g.epoch_health.load(Relaxed));
+        let resets = Health::RESETS.0;
+        let why = match Health(health.0 & resets).reasons().next() {
+            Some(reset) => format!("{reset}: poses go on in a frame that dead reckoning guesses"),
+            None => "odometry runs again, elsewhere than dead reckoning led".into(),
+        };
+        Some(format!("epoch {epoch} begins: {why}"))
     }
 
     /// Prints a line that stays, and logs it as an event.

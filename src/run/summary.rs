@@ -10,7 +10,8 @@ use crate::output::html::{write_html, Evidence};
 use crate::output::metrics::{percentile, trajectory_error};
 use crate::output::panel::Picture;
 use crate::output::report::{seconds_to, ExtrinsicsFound, Report, GOOD_DB};
-use crate::output::{atomically, trajectory, OutputDir};
+use crate::output::trajectory::{epoch_at, TumWriter};
+use crate::output::{atomically, OutputDir};
 use std::borrow::Cow;
 use std::fmt;
 use std::path::PathBuf;
@@ -53,17 +54,15 @@ pub fn close_log(log: Log, title: &Title, flown: &mut Flown, fault: Option<&Faul
 /// Writes the trajectory: from memory where that holds every pose, else from the log, and past its end what memory has.
 pub fn write_trajectory(
     whole: bool,
-    estimated: &[TimedPose],
+    (estimated, epochs): (&[TimedPose], &[(Nanos, u32)]),
     logged: &[PathBuf],
     out: &OutputDir,
 ) -> Result<(), Fault> {
     out.write("trajectory.tum", |w| {
-        if whole {
-            return trajectory::write_tum(w, estimated);
-        }
-        let last = read::write_trajectory(logged, w, |_, _| {})?;
+        let mut file = TumWriter::begin(w)?;
+        let last = if whole { None } else { read::write_trajectory(logged, &mut file, |_, _| {})? };
         let mut rest = estimated.iter().filter(|pose| last.is_none_or(|last| pose.t > last));
-        rest.try_for_each(|pose| trajectory::write_line(w, pose))
+        rest.try_for_each(|pose| file.pose(epoch_at(epochs, pose.t), pose))
     })
 }
 
@@ -84,7 +83,9 @@ pub fn conclude(title: Title, mut flown: Flown, logged: &[PathBuf], out: &Output
     };
     let estimated = track_figures(&mut report, &flown);
     let whole = flown.tracker.odometry().is_none_or(|run| run.back.trajectory.is_whole());
-    let mut fault = write_trajectory(whole, &estimated, logged, out).err().map(|fault| {
+    let epochs = flown.tracker.odometry().map_or(vec![], |run| run.back.epochs.to_vec());
+    report.epochs = epochs.last().map(|(_, last)| last + 1);
+    let mut fault = write_trajectory(whole, (&estimated, &epochs), logged, out).err().map(|fault| {
         let fix = "make room or mend the disk, then `stipple recover` with this folder writes what the log holds";
         Fault { fix: fix.into(), ..fault }
     });
@@ -131,7 +132,7 @@ pub fn conclude(title: Title, mut flown: Flown, logged: &[PathBuf], out: &Output
     }
     let tracking_ms: &[(Nanos, f64)] = flown.tracker.odometry().map_or(&[], |run| &run.back.frame_ms);
     let (estimated, truth, error, warnings) = (&estimated[..], &title.truth[..], error.as_ref(), &flown.warnings[..]);
-    let evidence = Evidence { estimated, truth, error, tracking_ms, pictures: &[], warnings };
+    let evidence = Evidence { estimated, epochs: &epochs, truth, error, tracking_ms, pictures: &[], warnings };
     let written = write_files(&report, &evidence, map.map_or(vec![], |m| m.drawn), out);
     (report, fault.or(written))
 }

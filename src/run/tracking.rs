@@ -52,6 +52,9 @@ pub struct FramePacket {
     pub imu: List<ImuSample, IMU_BETWEEN_FRAMES>,
     pub tracks: Tracks,
     pub tracked: Option<Tracked>,
+    /// The epoch of its pose, and what the frame suffered from.
+    pub epoch: u32,
+    pub health: Health,
     /// When the front end took it.
     begun: Instant,
     /// CPU time that following its points took.
@@ -68,6 +71,8 @@ impl FramePacket {
             imu: List::default(),
             tracks: Tracks::default(),
             tracked: None,
+            epoch: 0,
+            health: Health::default(),
             begun: Instant::now(),
             cpu: Duration::ZERO,
         })
@@ -136,6 +141,9 @@ impl Front {
     }
 }
 
+/// Epochs that are kept.
+const EPOCHS: usize = 64;
+
 /// The half that estimates. Its lists are bought at the start: what a run is judged by. They hold every frame of a
 /// recording, and are thinned in a run without an end, of which the log has every frame.
 pub struct Back {
@@ -151,6 +159,8 @@ pub struct Back {
     pub frame_ms: Thinned<(Nanos, f64)>,
     pub cpu_s: Option<f64>,
     pub log: Option<LogSender>,
+    /// First frame and number of each epoch, the earliest.
+    pub epochs: List<(Nanos, u32), EPOCHS>,
 }
 
 impl Back {
@@ -163,6 +173,11 @@ impl Back {
             return;
         }
         let update = self.vio.on_tracks(&packet.tracks);
+        (packet.epoch, packet.health) = (update.epoch, update.health);
+        if self.epochs.last().is_none_or(|(_, last)| *last != update.epoch) {
+            // The log has those for which there is no room.
+            let _ = self.epochs.push((packet.frames.t, update.epoch));
+        }
         packet.tracked = update.odometry.map(|o| Tracked {
             world_from_body: o.world_from_body,
             keyframe: update.keyframe,
@@ -217,7 +232,17 @@ impl OdometryRun {
         footprint.extend(f);
         Ok(OdometryRun {
             front: Front { frontend, predictor, ms: front_ms, busy_s: 0.0, cpu_s: None },
-            back: Back { vio, trajectory, ms, busy_s: 0.0, health, frame_ms, cpu_s: None, log: None },
+            back: Back {
+                vio,
+                trajectory,
+                ms,
+                busy_s: 0.0,
+                health,
+                frame_ms,
+                cpu_s: None,
+                log: None,
+                epochs: List::default(),
+            },
             threads: board.frontend.threads,
             bytes,
         })

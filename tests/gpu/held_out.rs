@@ -21,6 +21,7 @@ fn view(x: f64, y: f64, turn: f64) -> View {
         camera,
         fisheye: None,
         coarseness: Coarseness::default(),
+        epoch: 0,
     }
 }
 

@@ -49,7 +49,7 @@ impl Grid {
 
     fn look(&mut self, points: &[[f32; 4]]) -> Vec<u32> {
         let mut out = Vec::new();
-        self.occupancy.look_up(&mut self.gpu, &self.pipeline.pool, points, &mut out).unwrap();
+        self.occupancy.look_up(&mut self.gpu, &self.pipeline.pool, 0, points, &mut out).unwrap();
         out
     }
 }
@@ -69,7 +69,7 @@ fn a_cell_is_held_as_long_as_a_gaussian_is_in_it() {
     let (p, q) = ([-0.01, 2.05, 1.0], [0.01, 2.05, 1.0]);
     let asked = [at(p), at([-0.1, 2.05, 1.0]), at(q)];
     assert_eq!(g.look(&asked), [FREE; 3]);
-    g.pipeline.pool.open_block(1);
+    g.pipeline.pool.open_block(1, 0);
     g.append(&[p]);
     assert_eq!(g.look(&asked), [HELD, HELD, FREE]);
     // A correction takes it along.

@@ -7,7 +7,7 @@ use glam::{DQuat, DVec3, DVec4, Vec3, Vec4};
 use stipple::gpu::kernels::types::{Moments, Splat};
 use stipple::gpu::{Gpu, GpuOptions};
 use stipple::map::pool::importance_of_bin;
-use stipple::map::{Gaussian, Pipeline, PruneRule, Tiling, View};
+use stipple::map::{Gaussian, Pipeline, PruneRule, Rendered, Shape, Tiling, View};
 use stipple_drivers::Pose;
 
 const KEEP_ALL: PruneRule = PruneRule { opacity_min: 1e-9, scale_max_m: 1e3, importance_min: 0.0, steps_min: 0 };
@@ -32,9 +32,9 @@ fn splats(gpu: &mut Gpu, p: &mut Pipeline) -> Vec<Gaussian> {
 fn trained(v: &View, n: usize) -> (Gpu, Pipeline) {
     let (mut gpu, mut p) = open(shape(v, n as u32, 1 << 16));
     let all = scene(n, v, 11);
-    p.pool.open_block(4);
+    p.pool.open_block(4, 0);
     p.pool.append(&mut gpu, &all[..n / 3]).unwrap();
-    p.pool.open_block(9);
+    p.pool.open_block(9, 0);
     p.pool.append(&mut gpu, &all[n / 3..]).unwrap();
     p.loss.set_image(&mut gpu, 0, &target(v.camera.width, v.camera.height)).unwrap();
     train(&mut gpu, &mut p, v, 5);
@@ -192,7 +192,7 @@ fn the_validation_layer_is_silent_about_the_pool() {
         Err(fault) => return println!("ignored: the_validation_layer_is_silent_about_the_pool: {fault}"),
     };
     let mut p = Pipeline::new(&mut gpu, s).unwrap();
-    p.pool.open_block(0);
+    p.pool.open_block(0, 0);
     let mut all = scene(64, &v, 1);
     all[3].opacity_logit = f32::NAN;
     p.pool.append(&mut gpu, &all).unwrap();
@@ -216,4 +216,37 @@ fn a_loop_that_moves_thousands_of_anchors_fits() {
         let (now, then) = (DVec3::from(Vec3::from(now.mean)), DVec3::from(Vec3::from(then.mean)));
         assert!(now.distance(then) < 1e-3, "{now} {then}");
     }
+}
+
+#[test]
+fn a_view_shows_and_trains_its_own_epoch_alone() {
+    let v = view(64, 48);
+    let (mut gpu, mut p) = open(Shape { images: 4, ..shape(&v, 300, 1 << 16) });
+    let all = scene(300, &v, 11);
+    let draw = |gpu: &mut Gpu, p: &Pipeline, epoch: u32| {
+        let mut out = Rendered::new(64, 48, 1);
+        p.render(gpu, &View { epoch, ..v }, &mut out).unwrap();
+        out.colour
+    };
+    let alone = |range: std::ops::Range<usize>| {
+        let (mut gpu, mut p) = open(shape(&v, 300, 1 << 16));
+        p.pool.append(&mut gpu, &all[range]).unwrap();
+        draw(&mut gpu, &p, 0)
+    };
+    for (anchor, epoch, range) in [(0, 0, 0..100), (1, 1, 100..180), (2, 1, 180..220), (3, 3, 220..300)] {
+        p.pool.open_block(anchor, epoch);
+        p.pool.append(&mut gpu, &all[range]).unwrap();
+    }
+    for (epoch, range) in [(0, 0..100), (1, 100..220), (3, 220..300)] {
+        assert_eq!(p.pool.slots(epoch), range.start as u32..range.end as u32);
+        assert!(draw(&mut gpu, &p, epoch) == alone(range), "epoch {epoch}");
+    }
+    assert!(draw(&mut gpu, &p, 2).iter().all(|x| *x == 0.0), "an epoch without a block shows nothing");
+    p.loss.set_image(&mut gpu, 0, &target(64, 48)).unwrap();
+    let before = splats(&mut gpu, &mut p);
+    train(&mut gpu, &mut p, &View { epoch: 1, ..v }, 3);
+    let after = splats(&mut gpu, &mut p);
+    let moved = |range: std::ops::Range<usize>| range.filter(|i| before[*i] != after[*i]).count();
+    assert_eq!((moved(0..100), moved(220..300)), (0, 0));
+    assert!(moved(100..220) > 60);
 }

@@ -38,6 +38,7 @@ pub fn view(width: usize, height: usize) -> View {
         camera,
         fisheye: None,
         coarseness: Coarseness::default(),
+        epoch: 0,
     }
 }
 

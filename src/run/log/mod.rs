@@ -98,7 +98,13 @@ impl Estimate {
 pub struct State {
     /// Mid-exposure, in the clock of the frames.
     pub t_ns: i64,
+    /// Poses of one epoch are in one frame; `vio::Update` says when the next begins.
+    pub epoch: u32,
     pub estimate: Option<Estimate>,
+    /// The estimate is the last one that was trusted, carried on by inertia: no estimator runs.
+    pub dead_reckoned: bool,
+    /// Standard deviations of the estimate: position, m, and velocity, m/s, in the world; rotation, rad, in the body.
+    pub sigma: Option<[f32; 9]>,
     /// The bits of `Health`, which the channel names.
     pub health: u32,
     pub quality: u8,
@@ -111,9 +117,22 @@ pub struct State {
 
 impl State {
     pub fn new(t: Nanos, update: &Update, latency_ms: f64, cpu_ms: f64) -> State {
-        let estimate = update.odometry.as_ref().map(Estimate::from);
-        let (health, quality, keyframe) = (update.health.0, update.quality, update.keyframe);
-        State { t_ns: t.0, estimate, health, quality, keyframe, latency_ms, cpu_ms }
+        let estimate = update.odometry.or(update.dead_reckoned).as_ref().map(Estimate::from);
+        // Position, velocity, rotation.
+        let order = [0, 1, 2, 6, 7, 8, 3, 4, 5];
+        let sigma = update.covariance.map(|c| order.map(|i| c[i][i].sqrt() as f32));
+        State {
+            t_ns: t.0,
+            epoch: update.epoch,
+            estimate,
+            dead_reckoned: update.dead_reckoned.is_some(),
+            sigma: sigma.filter(|_| estimate.is_some()),
+            health: update.health.0,
+            quality: update.quality,
+            keyframe: update.keyframe,
+            latency_ms,
+            cpu_ms,
+        }
     }
 }
 
@@ -127,6 +146,8 @@ pub enum EventKind {
     /// A thread hangs, or the system refuses what a run asks for.
     System,
     Map,
+    /// The estimator was reset, or started again elsewhere than dead reckoning led.
+    Epoch,
     /// Logging ends before the run does.
     Disk,
     /// A thread panicked: the process ends.

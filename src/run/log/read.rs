@@ -3,7 +3,7 @@
 
 use super::file::{logs, topic, CLOCKS, COUNTERS, EVENT, STATE};
 use super::{Clocks, Event, State};
-use crate::output::trajectory;
+use crate::output::trajectory::TumWriter;
 use ::mcap::parse_record;
 use ::mcap::records::{op, Record};
 use ::mcap::sans_io::linear_reader::{LinearReadEvent, LinearReader, LinearReaderOptions};
@@ -226,16 +226,17 @@ pub fn read_files(files: &[PathBuf], mut each: impl FnMut(Nanos, Message) -> io:
 /// Writes the trajectory that the files of a run hold, and shows every message; answers the stamp of the last pose.
 pub fn write_trajectory(
     files: &[PathBuf],
-    out: &mut impl Write,
+    out: &mut TumWriter<impl Write>,
     mut each: impl FnMut(Nanos, &Message),
 ) -> io::Result<Option<Nanos>> {
     let mut last = None;
-    trajectory::write_head(out)?;
     read_files(files, |at, message| {
         each(at, &message);
-        let Message::State(State { t_ns, estimate: Some(estimate), .. }) = message else { return Ok(()) };
+        let Message::State(State { t_ns, epoch, estimate: Some(estimate), dead_reckoned: false, .. }) = message else {
+            return Ok(());
+        };
         last = Some(Nanos(t_ns));
-        trajectory::write_line(out, &TimedPose { t: Nanos(t_ns), pose: estimate.pose() })
+        out.pose(epoch, &TimedPose { t: Nanos(t_ns), pose: estimate.pose() })
     })?;
     Ok(last)
 }

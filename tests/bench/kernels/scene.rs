@@ -58,7 +58,13 @@ impl Scene {
         let level = |i: usize| 128.0 + 90.0 * ((i % width) as f64 * 0.2).sin() * ((i / width) as f64 * 0.15).cos();
         Scene {
             name: format!("{width}x{height}, {n} Gaussians"),
-            view: View { world_from_cam: Pose::IDENTITY, camera, fisheye: None, coarseness: Coarseness::default() },
+            view: View {
+                world_from_cam: Pose::IDENTITY,
+                camera,
+                fisheye: None,
+                coarseness: Coarseness::default(),
+                epoch: 0,
+            },
             splats,
             image: (0..width * height).map(|i| level(i) as u8).collect(),
             mask: vec![255; width * height],
@@ -118,7 +124,13 @@ impl Scene {
         let place = folder.file_name().map_or_else(String::new, |n| n.to_string_lossy().into_owned());
         Ok(Scene {
             name: format!("{place}, {n} from stereo depth"),
-            view: View { world_from_cam: Pose::IDENTITY, camera, fisheye: None, coarseness: Coarseness::default() },
+            view: View {
+                world_from_cam: Pose::IDENTITY,
+                camera,
+                fisheye: None,
+                coarseness: Coarseness::default(),
+                epoch: 0,
+            },
             splats: (0..n).map(splat).collect(),
             mask: stereo.views.valid_mask().to_vec(),
             image: image.pixels,
