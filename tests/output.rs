@@ -10,7 +10,7 @@ use stipple::output::metrics::{percentile, trajectory_error};
 use stipple::output::panel::{panel, Picture};
 use stipple::output::ply::write_ply;
 use stipple::output::report::{KernelTime, Report};
-use stipple::output::trajectory::write_tum;
+use stipple::output::trajectory::{epoch_at, TumWriter};
 use stipple::output::{atomically, OutputDir};
 use stipple_drivers::{Nanos, Pose, TimedPose};
 
@@ -175,9 +175,10 @@ fn a_run_leaves_complete_files_that_agree() {
         "mav0/cam1/data.csv:214: image 1403636590213555456.png has no partner within 2 ms; the pair is skipped".into(),
         "mav0/imu0/data.csv:5120: 35 ms without inertial samples".into(),
     ];
+    let epochs = [(Nanos(0), 0), (Nanos(30_000_000_000), 1)];
     let evidence = Evidence {
         estimated: &estimated,
-        epochs: &[(Nanos(30_000_000_000), 1)],
+        epochs: &epochs,
         truth: &truth,
         error: Some(&error),
         tracking_ms: &tracking,
@@ -185,7 +186,11 @@ fn a_run_leaves_complete_files_that_agree() {
         warnings: &warnings,
     };
 
-    out.write("trajectory.tum", |w| write_tum(w, &estimated)).unwrap();
+    out.write("trajectory.tum", |w| {
+        let mut file = TumWriter::begin(w)?;
+        estimated.iter().try_for_each(|pose| file.pose(epoch_at(&epochs, pose.t), pose))
+    })
+    .unwrap();
     out.write("map.ply", |w| write_ply(w, splats())).unwrap();
     out.replace_folder("renders", |dir| {
         let name = |i| dir.join(format!("{i:04}.png"));

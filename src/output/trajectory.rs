@@ -4,12 +4,6 @@
 use std::io::{self, Write};
 use stipple_drivers::{Nanos, TimedPose};
 
-/// Poses of one epoch.
-pub fn write_tum(out: &mut impl Write, poses: &[TimedPose]) -> io::Result<()> {
-    let mut file = TumWriter::begin(out)?;
-    poses.iter().try_for_each(|pose| file.pose(0, pose))
-}
-
 /// The epoch of an instant, of first frame and number of each; the first of all for what was before.
 pub fn epoch_at(epochs: &[(Nanos, u32)], t: Nanos) -> u32 {
     let begun = epochs.partition_point(|(start, _)| *start <= t);
@@ -72,7 +66,8 @@ mod tests {
             TimedPose { t: Nanos(-1_500_000_000), pose },
         ];
         let mut text = Vec::new();
-        write_tum(&mut text, &poses).unwrap();
+        let mut file = TumWriter::begin(&mut text).unwrap();
+        poses.iter().for_each(|pose| file.pose(0, pose).unwrap());
         let text = String::from_utf8(text).unwrap();
         let lines: Vec<&str> = text.lines().skip(1).collect();
         let rest = "1.000000 -2.500000 0.250000 0.00000000 0.60000000 0.00000000 0.80000000";
