@@ -210,7 +210,7 @@ fn a_run_leaves_complete_files_that_agree() {
     let mut map = Vec::new();
     write_ply(&mut map, splats()).unwrap();
     assert_eq!(read("map.ply"), map);
-    assert_eq!(read("trajectory.tum").iter().filter(|b| **b == b'\n').count(), 1 + estimated.len());
+    assert_eq!(read("trajectory.tum").iter().filter(|b| **b == b'\n').count(), 2 + estimated.len(), "head and epoch");
     assert_eq!(std::fs::read_dir(out.file("renders")).unwrap().count(), 1 + 8, "the list of them, and they");
     let hidden = |e: std::io::Result<std::fs::DirEntry>| e.unwrap().file_name().to_string_lossy().starts_with('.');
     assert!(!std::fs::read_dir(out.path()).unwrap().any(hidden), "nothing half written is left");
