@@ -3,7 +3,6 @@
 //! `rectified`: the left view of the pair, then the right one, as pinholes. `fisheye`: each raw Kannala-Brandt image
 //! as it is, with its own intrinsics; the pair is then rectified only for its depth (`RectifiedPair`). All have one size.
 
-use super::coarseness::Coarseness;
 use super::view::{Fisheye, View};
 use crate::config::{MapConfig, Projection};
 use crate::stereo::rectify::box_average;
@@ -23,13 +22,7 @@ pub struct TrainingCamera {
 
 impl TrainingCamera {
     pub fn view(&self, world_from_body: Pose) -> View {
-        View {
-            world_from_cam: world_from_body * self.body_from_cam,
-            camera: self.camera,
-            fisheye: self.fisheye,
-            coarseness: Coarseness::default(),
-            epoch: 0,
-        }
+        View::new(world_from_body * self.body_from_cam, self.camera, self.fisheye)
     }
 }
 
@@ -90,13 +83,7 @@ impl RectifiedPair {
         let rect = views.camera();
         let Pinhole { width, height, fx, fy, cx, cy } = rect.pinhole;
         let rect_from_cam = rect.body_from_rect.inverse() * left.body_from_cam;
-        let ray = View {
-            world_from_cam: rect_from_cam,
-            camera: left.camera,
-            fisheye: left.fisheye,
-            coarseness: Coarseness::default(),
-            epoch: 0,
-        };
+        let ray = View::new(rect_from_cam, left.camera, left.fisheye);
         let of = |i: usize| {
             let p = ray.point(i % width, i / width, 1.0).filter(|p| p.z > 0.0)?;
             let (x, y) = ((fx * p.x / p.z + cx).round(), (fy * p.y / p.z + cy).round());
@@ -187,13 +174,7 @@ mod tests {
         let config = MapConfig { projection: Projection::Fisheye, ..MapConfig::default() };
         let left = training(&views, &config).expect("Kannala-Brandt lenses").remove(0);
         let rect = views.camera();
-        let flat = View {
-            world_from_cam: rect.body_from_rect,
-            camera: rect.pinhole,
-            fisheye: None,
-            coarseness: Coarseness::default(),
-            epoch: 0,
-        };
+        let flat = View::new(rect.body_from_rect, rect.pinhole, None);
         // y down: half a metre below the rig, as far as 4 m.
         let floor = |x: usize, y: usize| {
             let ray = flat.point(x, y, 1.0).expect("pinholes see everywhere") - flat.world_from_cam.p;

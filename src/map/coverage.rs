@@ -66,7 +66,6 @@ impl Coverage {
 
 #[cfg(test)]
 pub mod tests {
-    use super::super::coarseness::Coarseness;
     use super::*;
     use crate::stereo::Pinhole;
     use stipple_drivers::Pose;
@@ -76,7 +75,7 @@ pub mod tests {
 
     pub fn view() -> View {
         let camera = Pinhole { width: W, height: H, fx: 50.0, fy: 50.0, cx: 31.5, cy: 23.5 };
-        View { world_from_cam: Pose::IDENTITY, camera, fisheye: None, coarseness: Coarseness::default(), epoch: 0 }
+        View::new(Pose::IDENTITY, camera, None)
     }
 
     /// Black, as opaque as `alpha`.

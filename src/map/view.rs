@@ -19,6 +19,11 @@ pub struct View {
 }
 
 impl View {
+    /// A view of the first epoch that leaves nothing out.
+    pub fn new(world_from_cam: Pose, camera: Pinhole, fisheye: Option<Fisheye>) -> View {
+        View { world_from_cam, camera, fisheye, coarseness: Coarseness::default(), epoch: 0 }
+    }
+
     /// In the world, what a pixel shows at `depth` as the raster counts it: along the axis, of a fisheye along the ray.
     /// `None` outside the lens' domain.
     pub fn point(&self, x: usize, y: usize, depth: f64) -> Option<DVec3> {

@@ -4,7 +4,7 @@
 use super::splat::{psnr, render, write_png, Rng};
 use glam::{DQuat, DVec3};
 use stipple::gpu::Gpu;
-use stipple::map::{Coarseness, Gaussian, LearningRates, Pipeline, Shape, View, Weights};
+use stipple::map::{Gaussian, LearningRates, Pipeline, Shape, View, Weights};
 use stipple::stereo::Pinhole;
 use stipple_drivers::Pose;
 
@@ -16,13 +16,7 @@ const STEPS: usize = 900;
 fn view(x: f64, y: f64, turn: f64) -> View {
     let (width, height) = SIZE;
     let camera = Pinhole { width, height, fx: 130.0, fy: 130.0, cx: 79.5, cy: 59.5 };
-    View {
-        world_from_cam: Pose::new(DQuat::from_rotation_y(turn), DVec3::new(x, y, 0.0)),
-        camera,
-        fisheye: None,
-        coarseness: Coarseness::default(),
-        epoch: 0,
-    }
+    View::new(Pose::new(DQuat::from_rotation_y(turn), DVec3::new(x, y, 0.0)), camera, None)
 }
 
 fn relief(x: f64, y: f64) -> f64 {

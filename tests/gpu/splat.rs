@@ -33,13 +33,7 @@ pub fn view(width: usize, height: usize) -> View {
     let camera =
         Pinhole { width, height, fx: f, fy: 1.1 * f, cx: 0.5 * width as f64 - 0.3, cy: 0.5 * height as f64 + 0.4 };
     let q = DQuat::from_scaled_axis(DVec3::new(0.3, -0.5, 0.2));
-    View {
-        world_from_cam: Pose::new(q, DVec3::new(1.0, -2.0, 0.5)),
-        camera,
-        fisheye: None,
-        coarseness: Coarseness::default(),
-        epoch: 0,
-    }
+    View::new(Pose::new(q, DVec3::new(1.0, -2.0, 0.5)), camera, None)
 }
 
 /// Gaussians in and a little outside the view, some behind the camera.

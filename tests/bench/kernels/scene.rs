@@ -4,7 +4,7 @@ use glam::DVec3;
 use std::path::Path;
 use stipple::config::{GpuConfig, StereoConfig};
 use stipple::gpu::{Arena, Gpu};
-use stipple::map::{Coarseness, Gaussian, View};
+use stipple::map::{Gaussian, View};
 use stipple::stereo::{Buffers, DepthMap, Pinhole, Stereo};
 use stipple_drivers::replay::{OpenOptions, Recording};
 use stipple_drivers::types::Image;
@@ -58,13 +58,7 @@ impl Scene {
         let level = |i: usize| 128.0 + 90.0 * ((i % width) as f64 * 0.2).sin() * ((i / width) as f64 * 0.15).cos();
         Scene {
             name: format!("{width}x{height}, {n} Gaussians"),
-            view: View {
-                world_from_cam: Pose::IDENTITY,
-                camera,
-                fisheye: None,
-                coarseness: Coarseness::default(),
-                epoch: 0,
-            },
+            view: View::new(Pose::IDENTITY, camera, None),
             splats,
             image: (0..width * height).map(|i| level(i) as u8).collect(),
             mask: vec![255; width * height],
@@ -124,13 +118,7 @@ impl Scene {
         let place = folder.file_name().map_or_else(String::new, |n| n.to_string_lossy().into_owned());
         Ok(Scene {
             name: format!("{place}, {n} from stereo depth"),
-            view: View {
-                world_from_cam: Pose::IDENTITY,
-                camera,
-                fisheye: None,
-                coarseness: Coarseness::default(),
-                epoch: 0,
-            },
+            view: View::new(Pose::IDENTITY, camera, None),
             splats: (0..n).map(splat).collect(),
             mask: stereo.views.valid_mask().to_vec(),
             image: image.pixels,
