@@ -27,6 +27,8 @@ use stipple_drivers::{Calibration, Nanos};
 
 /// A keyframe is declared at once when fewer landmarks than this are in view.
 pub const CONNECTED_FEW: usize = 20;
+/// A vehicle faster than this moves, m/s: a start at rest is not that unsure of its velocity.
+const MOVING: f64 = 0.3;
 /// A state this far from sense is a failure: m/s, m/s², rad/s.
 const SPEED_MAX: f64 = 100.0;
 const ACCEL_BIAS_MAX: f64 = 5.0;
@@ -66,6 +68,8 @@ pub struct Estimator {
     /// Standard deviations of the rig, in the order of its columns.
     pub rig_deviations: [f64; RIG_DIM],
     frames_since_keyframe: u32,
+    /// There was motion since the start.
+    moved: bool,
 }
 
 impl Estimator {
@@ -80,6 +84,7 @@ impl Estimator {
             solver: Solver::new(),
             marginalizer: Marginalizer::new(),
             frames_since_keyframe: 0,
+            moved: false,
         }
     }
 
@@ -91,7 +96,7 @@ impl Estimator {
     /// Forgets everything but what was learnt of the rig.
     pub fn clear(&mut self) {
         self.graph.clear();
-        self.frames_since_keyframe = 0;
+        (self.frames_since_keyframe, self.moved) = (0, false);
     }
 
     /// First frame of an empty window.
@@ -189,8 +194,9 @@ impl Estimator {
         }
         (step.connected, step.unconnected) = self.graph.landmarks.attach(slot, &self.tracks[slot]);
         self.frames_since_keyframe += 1;
-        // At rest there is no parallax to triangulate by: a keyframe would only push out one that has some.
-        step.keyframe = !step.at_rest && self.is_keyframe_due(step.connected, step.unconnected);
+        // At rest there is no parallax to triangulate by: once there was motion, a keyframe would push out one that has some.
+        self.moved |= !step.at_rest && self.graph.window.frame(slot).now.v.length() > MOVING;
+        step.keyframe = !(step.at_rest && self.moved) && self.is_keyframe_due(step.connected, step.unconnected);
         (slot, step)
     }
 
