@@ -51,8 +51,8 @@ pub struct Limits {
     pub free: u64,
 }
 
-/// An hour of a camera at 30 Hz is one file.
-pub const LIMITS: Limits = Limits { file: 64 << 20, free: 64 << 20 };
+/// Ten minutes of a camera at 30 Hz are one file. The index of a file is in memory until its end: a quarter of a mebibyte.
+pub const LIMITS: Limits = Limits { file: 16 << 20, free: 64 << 20 };
 
 counters! {
     struct Counts of Counter, read by Counter::get;
