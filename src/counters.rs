@@ -88,8 +88,8 @@ stipple_drivers::counters! {
     /// Steps not taken because their (Gaussian, tile) list overflowed; pictures and steps drawn coarser so that it did not.
     intersections_overflow,
     views_coarsened,
-    /// The most (Gaussian, tile) pairs that a picture or a step needed, as coarsely as it was drawn: with none drawn coarser, what
-    /// budget.intersections must be for none to be.
+    /// The most (Gaussian, tile) pairs that a picture or a step needed. Where views_coarsened is zero, budget.intersections need
+    /// not be larger.
     intersections_most,
     /// Gaussians left out of a step because a parameter was not finite.
     splats_not_finite,

@@ -50,7 +50,8 @@ pub(super) struct PipelineCache {
     /// Hash of the file as it was read.
     held: Option<u64>,
     path: PathBuf,
-    /// Where the file is from when the driver is given it until `keep`: a start that does not get as far leaves none to the next.
+    /// Name of the file from when the driver is given it until `keep`, when it is known that the driver can live with it. A
+    /// start that crashes in between leaves no cache to the next.
     tried: PathBuf,
     device: Arc<Device>,
 }

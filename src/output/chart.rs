@@ -133,7 +133,7 @@ impl Chart<'_> {
             return;
         }
         let mut x = LEFT;
-        for s in self.series.iter().filter(|s| !s.points.is_empty()) {
+        for s in self.series.iter().filter(|s| !s.points.is_empty() && !s.name.is_empty()) {
             let _ = write!(svg, r#"<path class="line ink{}" d="M{x} 30h16"/>"#, s.ink);
             text(svg, "tick", (x + 21.0, 34.0), "start", s.name);
             // 6.2 px a character: the mean advance of a 12 px sans-serif face.

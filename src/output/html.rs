@@ -100,7 +100,7 @@ fn tables(report: &Report) -> String {
         ("Tracking time, 99 %", f(report.tracking_ms_p99, 2), "ms"),
         ("Frames tracked", n(report.frames), ""),
         ("Frames dropped", n(report.frames_dropped), ""),
-        ("Epochs: 1, and one for each reset", n(report.epochs.map(u64::from)), ""),
+        ("Epochs (frames of reference)", n(report.epochs.map(u64::from)), ""),
         ("Quality, median", n(report.quality_p50.map(u64::from)), "of 100"),
         ("Quality, lowest", n(report.quality_min.map(u64::from)), "of 100"),
         ("Frames of quality under 50", f(report.quality_under_50.map(|v| 100.0 * v), 1), "%"),
@@ -214,7 +214,8 @@ fn trajectory(evidence: &Evidence) -> [Option<String>; 4] {
         .chunk_by(|a, b| epoch(a) == epoch(b))
         .map(|poses| match epoch(&poses[0]) {
             0 => ("estimate".into(), 1, poses),
-            epoch => (format!("epoch {epoch}"), 1 + (epoch % 2) as u8, poses),
+            // The legend has room for a few.
+            epoch => (if epoch < 4 { format!("epoch {epoch}") } else { String::new() }, 1 + (epoch % 2) as u8, poses),
         })
         .collect();
     let series = |point: &dyn Fn(Nanos, DVec3) -> (f64, f64)| {

@@ -109,8 +109,8 @@ impl OutputDir {
         }
     }
 
-    /// Renames the results of an earlier run, if there are any, to `previous-map.ply` and so on, in place of what has such a
-    /// name: should this run be killed, what lies beside its log is not taken for its own.
+    /// Renames the results of an earlier run, if there are any, to `previous-map.ply` and so on, and removes what had these
+    /// names: after a kill they are not taken for results of this run.
     pub fn set_aside(&self) -> Result<(), Fault> {
         let previous = |name: &str| format!("previous-{name}");
         let mut there = RESULTS.into_iter().filter(|name| self.file(name).symlink_metadata().is_ok()).peekable();

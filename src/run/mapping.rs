@@ -45,7 +45,7 @@ pub struct Mapping {
     pub anchors: u64,
     /// Why mapping stopped before the end, if it did; odometry goes on.
     pub failure: Option<String>,
-    /// There was a step, and the driver is well.
+    /// A step succeeded: the driver can live with its pipeline cache.
     has_worked: bool,
     period_s: f64,
     next_curve_s: f64,

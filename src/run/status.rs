@@ -153,9 +153,8 @@ impl Status {
         if std::mem::replace(&mut self.epoch, epoch) == epoch {
             return None;
         }
-        let health = Health(g.epoch_health.load(Relaxed));
-        let resets = Health::RESETS.0;
-        let why = match Health(health.0 & resets).reasons().next() {
+        let resets = Health(g.epoch_health.load(Relaxed) & Health::RESETS.0);
+        let why = match resets.reasons().next() {
             Some(reset) => format!("{reset}: poses go on in a frame that dead reckoning guesses"),
             None => "odometry runs again, elsewhere than dead reckoning led".into(),
         };

@@ -3,7 +3,7 @@
 use super::log::{read, EventKind, Log};
 use super::mapping::{Drawn, MapResult};
 use super::memory::mib;
-use super::tracking::Tracker;
+use super::tracking::{OdometryRun, Tracker};
 use super::Flown;
 use crate::mem;
 use crate::output::html::{write_html, Evidence};
@@ -82,9 +82,10 @@ pub fn conclude(title: Title, mut flown: Flown, logged: &[PathBuf], out: &Output
         ..Report::default()
     };
     let estimated = track_figures(&mut report, &flown);
-    let whole = flown.tracker.odometry().is_none_or(|run| run.back.trajectory.is_whole());
     let epochs = flown.tracker.odometry().map_or(vec![], |run| run.back.epochs.to_vec());
-    report.epochs = epochs.last().map(|(_, last)| last + 1);
+    let whole = |run: &OdometryRun| run.back.trajectory.is_whole() && !run.back.epochs.is_full();
+    let whole = flown.tracker.odometry().is_none_or(whole);
+    report.epochs = flown.tracker.odometry().map(|run| run.back.vio.epoch() + 1);
     let mut fault = write_trajectory(whole, (&estimated, &epochs), logged, out).err().map(|fault| {
         let fix = "make room or mend the disk, then `stipple recover` with this folder writes what the log holds";
         Fault { fix: fix.into(), ..fault }

@@ -141,7 +141,7 @@ impl Front {
     }
 }
 
-/// Epochs that are kept.
+/// Epochs that a run is judged by.
 const EPOCHS: usize = 64;
 
 /// The half that estimates. Its lists are bought at the start: what a run is judged by. They hold every frame of a
@@ -159,7 +159,7 @@ pub struct Back {
     pub frame_ms: Thinned<(Nanos, f64)>,
     pub cpu_s: Option<f64>,
     pub log: Option<LogSender>,
-    /// First frame and number of each epoch, the earliest.
+    /// First frame and number of each epoch. Where there are more, the log has them.
     pub epochs: List<(Nanos, u32), EPOCHS>,
 }
 
@@ -175,7 +175,6 @@ impl Back {
         let update = self.vio.on_tracks(&packet.tracks);
         (packet.epoch, packet.health) = (update.epoch, update.health);
         if self.epochs.last().is_none_or(|(_, last)| *last != update.epoch) {
-            // The log has those for which there is no room.
             let _ = self.epochs.push((packet.frames.t, update.epoch));
         }
         packet.tracked = update.odometry.map(|o| Tracked {

@@ -192,7 +192,7 @@ impl Worker {
             calibration: self.calibration.clone(),
             out: self.out.clone(),
             ring: self.ring.number(),
-            // The next one is to live.
+            // One that is started again is not asked to panic.
             panics: if first.is_some() { threads::panics() } else { vec![] },
             first,
             run_s: self.begun.elapsed().as_secs_f64(),
@@ -354,8 +354,8 @@ impl Running {
         }
     }
 
-    /// Kills it if it still runs, and answers what it told. One that a driver holds in the kernel cannot end yet: it is left
-    /// to it, as it never runs again.
+    /// Kills it if it still runs, and answers what it told. One that is stuck in a driver cannot end yet; it is not waited for,
+    /// as it runs no more of its own code.
     fn end(mut self) -> Arc<Mutex<Told>> {
         let _ = self.child.kill();
         let limit = Instant::now() + DEATH_MAX;

@@ -27,7 +27,7 @@ use stipple_drivers::{Calibration, Nanos};
 
 /// A keyframe is declared at once when fewer landmarks than this are in view.
 pub const CONNECTED_FEW: usize = 20;
-/// A vehicle faster than this moves, m/s: a start at rest is not that unsure of its velocity.
+/// Speed above which the vehicle counts as moving, m/s: more than the error of the first estimates of a start at rest.
 const MOVING: f64 = 0.3;
 /// A state this far from sense is a failure: m/s, m/s², rad/s.
 const SPEED_MAX: f64 = 100.0;

@@ -354,6 +354,11 @@ impl Vio {
         window.slots().map(|s| window.frame(s)).map(|f| (f.t, f.now.pose, f.keyframe))
     }
 
+    /// The epoch of the newest frame.
+    pub fn epoch(&self) -> u32 {
+        self.epoch
+    }
+
     /// FNV-1a over stamp and pose bits of every keyframe as it was output.
     pub fn hash(&self) -> u64 {
         self.hash

@@ -30,7 +30,7 @@ pub struct Evidence {
     /// Inliers of landmarks that earlier frames saw: a landmark made of this frame alone
     /// says nothing of where it is.
     pub known: usize,
-    /// Its views stand still, which says where it is as well as known landmarks would.
+    /// The zero-velocity check holds, which is as good as seeing known landmarks.
     pub at_rest: bool,
     /// Squared whitened inertial residual per dimension, without unit.
     pub misfit: f64,

@@ -172,7 +172,7 @@ struct TrustedState {
 }
 
 impl TrustedState {
-    /// Where to start, and whether that is elsewhere than dead reckoning led.
+    /// The start, and whether it lies elsewhere than dead reckoning led.
     fn resume(
         &mut self,
         start: &Start,

@@ -54,8 +54,8 @@ pub struct Bias {
 }
 
 /// Samples of a spline, whose time 0 is `start`, at `stamps`, and the biases in them. `motors`: whether they run so many
-/// seconds from the start. What they shake stays where it is, so a sample's share is the difference of two random numbers,
-/// whose integral is none.
+/// seconds from the start. Vibration moves the unit nowhere, so it is the difference of successive random numbers, whose
+/// integral is zero.
 pub fn simulate(
     spline: &Spline,
     start: Nanos,

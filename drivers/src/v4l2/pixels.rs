@@ -290,9 +290,8 @@ mod tests {
         }
     }
 
-    /// `cargo test -p stipple-drivers --lib cost_of_a_picture -- --ignored --nocapture`
     #[test]
-    #[ignore = "a measurement"]
+    #[ignore = "prints times of conversions: cargo test --release -p stipple-drivers --lib cost_of_a_picture -- --ignored --nocapture"]
     fn cost_of_a_picture() {
         const RUNS: usize = 200;
         let (width, height) = (752, 480);

@@ -134,7 +134,7 @@ fn messages<'a>(records: &'a [Record]) -> impl Iterator<Item = (u32, Nanos, Mess
 fn scan(path: &Path) -> io::Result<(Vec<Chunk>, Vec<Range<u64>>)> {
     let mut file = Window::open(path)?;
     let (mut chunks, mut damage): (Vec<Chunk>, Vec<Range<u64>>) = (vec![], vec![]);
-    // Up to `known` everything is known, if the record at `last` is one: it has no checksum, and may hide a chunk.
+    // Bytes up to `known` are accounted for. The record at `last` has no checksum: it was none where a chunk is found in it.
     let (mut at, mut last, mut known) = (0, 0, 0);
     while at < file.size {
         if let Some((length, records)) = file.chunk(at)? {
