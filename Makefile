@@ -67,6 +67,8 @@ lint:
 	cargo fmt --all --check
 	cargo clippy --workspace --all-targets --locked -- -D warnings
 	cargo clippy --locked --bin stipple -- -D warnings
+	cargo fmt --manifest-path tests/fuzz/Cargo.toml --check
+	CARGO_TARGET_DIR=target/fuzz RUSTFLAGS="--cfg fuzzing" cargo clippy --locked --manifest-path tests/fuzz/Cargo.toml -- -D warnings
 
 deps:
 	@missing=; for p in $(PACKAGES); do \

@@ -37,7 +37,8 @@ pub fn recording() -> (TempDir, PathBuf) {
         (0..3).for_each(|i| write(&mav0, &format!("cam{k}/data/{}.png", T0 + i * FRAME), &image));
     }
     write(&mav0, "imu0/sensor.yaml", IMU);
-    let rows = (0..40).map(|i| format!("{},0.0,0.1,0.2,0.0,0.0,9.81\n", T0 - FRAME + i * 5_000_000)).collect::<String>();
+    let rows =
+        (0..40).map(|i| format!("{},0.0,0.1,0.2,0.0,0.0,9.81\n", T0 - FRAME + i * 5_000_000)).collect::<String>();
     write(&mav0, "imu0/data.csv", rows);
     write(&mav0, "state_groundtruth_estimate0/data.csv", format!("{T0},1,2,3,1,0,0,0\n"));
     (dir, mav0)

@@ -7,6 +7,7 @@ use libfuzzer_sys::fuzz_target;
 use std::fs;
 use std::path::PathBuf;
 use std::sync::LazyLock;
+use stipple::output::trajectory::TumWriter;
 use stipple::run::log::read::{read_files, runs, write_trajectory, Message};
 use stipple::run::log::{Estimate, Limits, Log, State};
 use tempfile::TempDir;
@@ -23,7 +24,18 @@ fn state(i: i64) -> State {
         accel_bias: [0.5; 3],
     };
     let estimate = (i > 5).then_some(estimate);
-    State { t_ns: i, estimate, health: 1, quality: 9, keyframe: i % 5 == 0, latency_ms: 4.5, cpu_ms: 3.5 }
+    State {
+        t_ns: i,
+        epoch: (i / 100) as u32,
+        estimate,
+        dead_reckoned: i % 7 == 0,
+        sigma: estimate.map(|_| [0.25; 9]),
+        health: 1,
+        quality: 9,
+        keyframe: i % 5 == 0,
+        latency_ms: 4.5,
+        cpu_ms: 3.5,
+    }
 }
 
 static FOLDER: LazyLock<(TempDir, PathBuf)> = LazyLock::new(|| {
@@ -78,6 +90,8 @@ fuzz_target!(|data: &[u8]| {
             Ok(())
         };
         read_files(&run.files, each).expect("the folder can be read");
-        write_trajectory(&run.files, &mut std::io::sink(), |_, _| {}).expect("the folder can be read");
+        let mut sink = std::io::sink();
+        let mut out = TumWriter::begin(&mut sink).expect("a sink takes everything");
+        write_trajectory(&run.files, &mut out, |_, _| {}).expect("the folder can be read");
     }
 });
