@@ -23,11 +23,13 @@ fails() { echo "bare-debian.sh: $*" >&2; exit 1; }
 echo "Debian $(cat "$root/etc/debian_version"), $(inside dpkg-query -f '.\n' -W | wc -l) packages"
 ! inside ldconfig -p | grep -E 'gpiod|opencv' || fails "the root is not bare"
 ! inside ldd ./stipple | grep -E 'gpiod|opencv|not found' || fails "the program needs more than it may"
-inside rm -rf flight out
+inside rm -rf flight out demo
 inside ./stipple sim demo --duration 3 --out flight 2>&1 | tail -1
 said=$(inside ./stipple replay flight --board lavapipe.toml --scale 2 --pace lockstep --out out 2>&1) || fails "the flight: $said"
 grep -v '^[0-9]' <<<"$said" # without the lines of progress
 [ "$(grep -c 'sgm. matches in its place' <<<"$said")" = 1 ] || fails "no warning, or more than one"
 [ -s "$root/opt/stipple/out/map.ply" ] || fails "no map"
+inside ./stipple demo --board lavapipe.toml --out demo >/dev/null 2>&1 || fails "the demo"
+[ -s "$root/opt/stipple/demo/report.html" ] || fails "no report of the demo"
 said=$(inside ./stipple run --board lavapipe.toml --set gpio.led=gpiochip0:3 --out none 2>&1) && fails "a LED without libgpiod"
 grep 'apt install libgpiod3' <<<"$said" || fails "the LED: $said"
