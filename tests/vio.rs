@@ -91,6 +91,55 @@ fn room_from_motion_stays_within_two_centimetres() {
     check("moving start", &simulate(Path { rest: -1.0 }, 0.0, |_| true), 185, 0.02);
 }
 
+/// Ten seconds of a flight under way from the start, by a unit of `rate_hz` and the first so many cameras.
+fn started_in_motion(rate_hz: f64, cameras: usize) -> Run {
+    let path = Path { rest: -1.0 };
+    let mut world = World::new(path);
+    world.rig.imu.rate_hz = rate_hz;
+    let mut rig = world.rig.clone();
+    rig.cameras.truncate(cameras);
+    let mut vio = Vio::new(&rig, &VioConfig::default());
+    let mut tracks = Tracks::default();
+    let (mut estimated, mut truth, mut sample) = (Vec::new(), Vec::new(), 0);
+    for frame in 0..200 {
+        let t = frame as f64 * FRAME_SECS + 0.0012;
+        while (sample as f64) / rate_hz < t + 1.0 / rate_hz {
+            vio.on_imu(world.imu(sample as f64 / rate_hz));
+            sample += 1;
+        }
+        world.tracks(t, &mut tracks);
+        tracks.cameras[cameras..].iter_mut().for_each(|c| c.clear());
+        truth.push(TimedPose { t: tracks.t, pose: path.pose(t) });
+        estimated.extend(vio.on_tracks(&tracks).odometry.map(|o| TimedPose { t: o.t, pose: o.world_from_body }));
+    }
+    Run { estimated, truth, vio }
+}
+
+/// The inertial history is one of seconds, however fast the unit.
+#[test]
+fn room_from_motion_at_every_rate_of_the_unit() {
+    let good = [100.0, 400.0, 1000.0, 4000.0].map(|rate_hz| {
+        let run = started_in_motion(rate_hz, 2);
+        let first = (run.estimated[0].t - run.truth[0].t).secs();
+        holds(&format!("from motion at {rate_hz} Hz, first pose after {first:.2} s"), &run, 185, 0.02)
+            && run.vio.stats().imu_overflow == 0
+    });
+    assert_eq!(good, [true; 4]);
+}
+
+/// One camera does not see how far things are: it begins with the mean force, and finds its scale on the way.
+#[test]
+fn room_from_motion_with_one_camera_at_every_rate_of_the_unit() {
+    let good = [100.0, 400.0, 1000.0, 4000.0].map(|rate_hz| {
+        let mut run = started_in_motion(rate_hz, 1);
+        let first = (run.estimated[0].t - run.truth[0].t).secs();
+        run.estimated.drain(..run.estimated.len() - 100);
+        holds(&format!("one camera at {rate_hz} Hz, first pose after {first:.2} s, last 5 s"), &run, 100, 0.03)
+            && first < 1.0
+    });
+    assert_eq!(good, [true; 4]);
+}
+
 #[test]
 fn room_with_lost_frames_stays_within_two_centimetres() {
     let keep = |i: usize| i % 7 != 3 && !(90..96).contains(&i);

@@ -42,6 +42,9 @@ section! {
     estimate_extrinsics: bool = false;
     /// Whether the scale of the inertial unit's axes is estimated. Set it for a unit that was not calibrated.
     estimate_imu_scale: bool = false;
+    /// Gravity where the rig flies, m/s²: 9.780 at the equator, 9.807 at 45° and 9.832 at the poles, less 0.003 for each
+    /// kilometre of height.
+    gravity: f64 = 9.81, Bound::Within(9.7, 9.9);
     tuning
     /// Standard deviation of an observation, px.
     observation_sigma_px: f64 = 0.5;
@@ -54,8 +57,8 @@ section! {
     keyframes: u32 = 7;
     /// A keyframe is due when fewer than this fraction of points are landmarks.
     keyframe_connected_min: f64 = 0.7;
-    /// Frames between two keyframes, at least.
-    keyframe_gap_min: u32 = 5;
+    /// Time between two keyframes, at least, s: at 20 Hz every fifth frame may be one.
+    keyframe_gap_min_s: f64 = 0.225;
     /// Baseline that triangulates, m.
     triangulation_baseline_min_m: f64 = 0.05;
     /// Standard deviation of the accelerometer's bias at the start, m/s².

@@ -29,6 +29,8 @@ pub struct Rows {
     cols: usize,
     stride: usize,
     rows_max: usize,
+    /// Columns that were not finite in the last elimination, and were taken for zero.
+    not_finite: u64,
 }
 
 const fn padded(n: usize) -> usize {
@@ -48,6 +50,7 @@ impl Rows {
             cols: 0,
             stride: 0,
             rows_max,
+            not_finite: 0,
         }
     }
 
@@ -100,13 +103,15 @@ impl Rows {
     }
 
     /// Eliminates columns `0..n` and drops the rows that hold them; makes what is left triangular and drops the
-    /// rows in which no column is left.
-    pub fn marginalize(&mut self, n: usize) {
+    /// rows in which no column is left. Answers how many columns were not finite, and were taken for zero.
+    pub fn marginalize(&mut self, n: usize) -> u64 {
+        self.not_finite = 0;
         self.measure(self.cols);
         let rank = reflect(self, 0, n, 0);
         let last = reflect(self, n, self.cols - 1, rank);
         self.a.copy_within(rank * self.stride..last * self.stride, 0);
         self.rows = last - rank;
+        self.not_finite
     }
 
     /// Leaves as few rows as hold the same information.
@@ -156,6 +161,7 @@ wide! {
             }
             // Also false where anything is not finite.
             if !(square > least * rows.lengths[c]) {
+                rows.not_finite += u64::from(!(square + rows.lengths[c]).is_finite());
                 (pivot..rows.rows).for_each(|i| rows.a[i * stride + c] = 0.0);
                 continue;
             }
@@ -238,6 +244,18 @@ mod tests {
         for (a, b) in a.iter().flatten().zip(b.iter().flatten()) {
             assert!((a - b).abs() <= tolerance, "{a} {b}");
         }
+    }
+
+    #[test]
+    fn column_that_is_not_finite_is_told() {
+        let mut rows = Rows::new(4, 4);
+        rows.clear(4);
+        rows.push().copy_from_slice(&[1.0, 2.0, 3.0, 4.0]);
+        rows.push().copy_from_slice(&[0.0, 1.0, 2.0, 3.0]);
+        let mut broken = rows.clone();
+        broken.row_mut(1)[1] = f64::NAN;
+        assert_eq!(rows.marginalize(1), 0);
+        assert!(broken.marginalize(1) > 0);
     }
 
     #[test]

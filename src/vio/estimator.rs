@@ -44,6 +44,10 @@ pub struct Step {
     pub connected: usize,
     pub unconnected: usize,
     pub gate: Passed,
+    /// The samples since the last frame say nothing: their covariance could not be factored.
+    pub inertia_lost: bool,
+    /// Columns that marginalization had to drop because they were not finite.
+    pub columns_lost: u64,
     /// Zero velocity was measured.
     pub at_rest: bool,
     pub outcome: Outcome,
@@ -67,7 +71,8 @@ pub struct Estimator {
     marginalizer: Marginalizer,
     /// Standard deviations of the rig, in the order of its columns.
     pub rig_deviations: [f64; RIG_DIM],
-    frames_since_keyframe: u32,
+    /// Stamp of the newest keyframe.
+    keyframe_at: Nanos,
     /// There was motion since the start.
     moved: bool,
 }
@@ -83,7 +88,7 @@ impl Estimator {
             tracks: vec![Tracks::default(); FRAMES],
             solver: Solver::new(),
             marginalizer: Marginalizer::new(),
-            frames_since_keyframe: 0,
+            keyframe_at: Nanos(0),
             moved: false,
         }
     }
@@ -96,7 +101,7 @@ impl Estimator {
     /// Forgets everything but what was learnt of the rig.
     pub fn clear(&mut self) {
         self.graph.clear();
-        (self.frames_since_keyframe, self.moved) = (0, false);
+        self.moved = false;
     }
 
     /// First frame of an empty window.
@@ -140,7 +145,7 @@ impl Estimator {
         let px_max = self.outlier_px(slot);
         step.outliers = drop_outliers(&mut self.graph, px_max);
         step.evidence = Some(self.evidence(before, slot, views, step.at_rest));
-        self.marginalize();
+        step.columns_lost = self.marginalize();
         step
     }
 
@@ -179,6 +184,7 @@ impl Estimator {
     ) -> (usize, Step) {
         let mut step = Step::default();
         let frame = self.propagated(before, tracks.t, imu);
+        step.inertia_lost = frame.weight.is_nothing();
         let slot = self.graph.window.push(frame).expect("marginalization left room for one frame");
         self.graph.window.hold_twists();
         self.tracks[slot].clone_from(tracks);
@@ -193,17 +199,18 @@ impl Estimator {
             step.at_rest = zero_velocity::hold(slot, &mut self.graph.window, &self.tracks, imu);
         }
         (step.connected, step.unconnected) = self.graph.landmarks.attach(slot, &self.tracks[slot]);
-        self.frames_since_keyframe += 1;
         // At rest there is no parallax to triangulate by: once there was motion, a keyframe would push out one that has some.
         self.moved |= !step.at_rest && self.graph.window.frame(slot).now.v.length() > MOVING;
-        step.keyframe = !(step.at_rest && self.moved) && self.is_keyframe_due(step.connected, step.unconnected);
+        let due = self.is_keyframe_due(tracks.t, step.connected, step.unconnected);
+        step.keyframe = due && !(step.at_rest && self.moved);
         (slot, step)
     }
 
-    fn is_keyframe_due(&self, connected: usize, unconnected: usize) -> bool {
+    fn is_keyframe_due(&self, t: Nanos, connected: usize, unconnected: usize) -> bool {
         let config = &self.model.config;
         let fraction = connected as f64 / (connected + unconnected).max(1) as f64;
-        let due = fraction < config.keyframe_connected_min && self.frames_since_keyframe > config.keyframe_gap_min;
+        let gap = (t - self.keyframe_at).secs();
+        let due = fraction < config.keyframe_connected_min && gap > config.keyframe_gap_min_s;
         unconnected > 0 && (due || connected < CONNECTED_FEW)
     }
 
@@ -211,8 +218,8 @@ impl Estimator {
     pub fn make_keyframe(&mut self, slot: usize) -> usize {
         let px_max = self.outlier_px(slot);
         let (made, full) = triangulate(&mut self.graph, slot, &self.tracks, &self.model, px_max);
-        self.frames_since_keyframe = 0;
         let frame = self.graph.window.frame_mut(slot);
+        self.keyframe_at = frame.t;
         (frame.keyframe, frame.hosted) = (true, made);
         full
     }
@@ -234,6 +241,7 @@ impl Estimator {
             self.graph.landmarks.pool.iter().filter(|l| l.host as usize != slot).map(|l| l.views_in(slot)).sum();
         Evidence {
             t: self.graph.window.frame(slot).t,
+            dt: (self.graph.window.frame(slot).t - self.graph.window.frame(before).t).secs(),
             views,
             inliers: self.graph.landmarks.views_in(slot),
             known,
@@ -242,9 +250,9 @@ impl Estimator {
         }
     }
 
-    /// Brings the window back to its resting size.
-    pub fn marginalize(&mut self) {
-        self.marginalizer.marginalize(&mut self.graph, &mut self.solver.rows, &self.model);
+    /// Brings the window back to its resting size; answers how many columns were not finite and are lost.
+    pub fn marginalize(&mut self) -> u64 {
+        self.marginalizer.marginalize(&mut self.graph, &mut self.solver.rows, &self.model)
     }
 
     /// Whether the newest state is finite, and one that flies.

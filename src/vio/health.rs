@@ -1,7 +1,5 @@
 //! Health: what is wrong with a frame, one bit a reason, and how good the estimate is.
 
-use super::inertial::Covariance;
-
 /// What a frame suffered from, as bits; none is a frame without complaint.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Health(pub u32);
@@ -50,13 +48,15 @@ impl Health {
     pub const STATE_RESET: Health = Health(1 << 16);
     /// No estimator runs: the state is the last one that was trusted, carried on by inertia.
     pub const DEAD_RECKONED: Health = Health(1 << 17);
+    /// The frame was refused: it is no newer than the last.
+    pub const FRAME_REJECTED: Health = Health(1 << 18);
 
     /// The bits of a frame at which the estimator was reset.
     pub const RESETS: Health =
         Health(Health::DIVERGED_RESET.0 | Health::FRAME_GAP_RESET.0 | Health::UNSEEN_RESET.0 | Health::STATE_RESET.0);
 
     /// Name of each bit, as in the report, the lowest first.
-    pub const NAMES: [&str; 18] = [
+    pub const NAMES: [&str; 19] = [
         "initialising",
         "no_tracks",
         "few_landmarks",
@@ -75,6 +75,7 @@ impl Health {
         "unseen_reset",
         "state_reset",
         "dead_reckoned",
+        "frame_rejected",
     ];
     /// Bits of a normal flight.
     #[cfg(feature = "instruments")]
@@ -96,27 +97,30 @@ impl Health {
     }
 }
 
-/// Landmarks that are enough, and the velocity's standard deviation at which half is lost, m/s.
-const LANDMARKS_ENOUGH: f64 = 40.0;
+/// The velocity's standard deviation at which half is lost, m/s.
 const SIGMA_V_HALF: f64 = 0.05;
+/// Landmarks that are enough however large the image is, and the share of it that one takes, px²: a square of 95 px, so that
+/// EuRoC's image of 752x480 holds those 40, and half of it on each side holds 10.
+const LANDMARKS_ENOUGH: f64 = 40.0;
+const LANDMARK_PX2: f64 = 9025.0;
 
-/// 0 to 100: `100 min(1, landmarks / 40) / (1 + σ_v / 0.05 m/s)`, with σ_v² the trace of the velocity's
-/// covariance; zero without a covariance. The velocity's and not the position's, because odometry's position error only
+/// Landmarks that are enough in images of so many pixels.
+pub fn landmarks_enough(pixels: usize) -> f64 {
+    (pixels as f64 / LANDMARK_PX2).clamp(1.0, LANDMARKS_ENOUGH)
+}
+
+/// 0 to 100: `100 min(1, landmarks / enough) / (1 + σ_v / 0.05 m/s)`, with σ_v² the trace of the covariance of the velocity
+/// in the body's frame; zero where that is unknown. The velocity's and not the position's, because odometry's position error only
 /// ever grows; σ_v is by how much it may grow each second: 5 mm at 91, 5 cm at 50, half a metre at 9. A fault that has
 /// not shown yet is in no quality.
-pub fn quality(covariance: Option<&Covariance>, landmarks: usize) -> u8 {
-    let Some(c) = covariance else { return 0 };
-    let seen = (landmarks as f64 / LANDMARKS_ENOUGH).min(1.0);
-    (100.0 * seen / (1.0 + sigma_v(c) / SIGMA_V_HALF)).round() as u8
+pub fn quality(sigma_v: Option<f64>, landmarks: usize, enough: f64) -> u8 {
+    let Some(sigma_v) = sigma_v else { return 0 };
+    let seen = (landmarks as f64 / enough).min(1.0);
+    (100.0 * seen / (1.0 + sigma_v / SIGMA_V_HALF)).round() as u8
 }
 
 /// A velocity this uncertain is not one to fly by, m/s: a walk's.
 pub const SIGMA_V_UNOBSERVED: f64 = 0.5;
-
-/// Standard deviation of the velocity, m/s, all axes.
-pub fn sigma_v(covariance: &Covariance) -> f64 {
-    (covariance[6][6] + covariance[7][7] + covariance[8][8]).sqrt()
-}
 
 /// Why the estimate was given up.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -162,9 +166,14 @@ mod tests {
 
     #[test]
     fn quality_falls_with_uncertain_velocity_and_with_few_landmarks() {
-        let mut c = [[0.0; 15]; 15];
-        assert_eq!((quality(None, 90), quality(Some(&c), 90), quality(Some(&c), 10)), (0, 100, 25));
-        c[7][7] = SIGMA_V_HALF.powi(2);
-        assert_eq!(quality(Some(&c), 90), 50);
+        let of = |sigma, landmarks| quality(sigma, landmarks, landmarks_enough(752 * 480));
+        assert_eq!([of(None, 90), of(Some(0.0), 90), of(Some(0.0), 10)], [0, 100, 25]);
+        assert_eq!(of(Some(SIGMA_V_HALF), 90), 50);
+    }
+
+    #[test]
+    fn small_image_that_holds_what_it_can_is_not_half_as_good() {
+        assert_eq!(quality(Some(0.0), 10, landmarks_enough(376 * 240)), 100);
+        assert_eq!(landmarks_enough(1920 * 1080), LANDMARKS_ENOUGH);
     }
 }

@@ -1,10 +1,10 @@
 //! Inertial residual between two states and its derivatives, which are checked by finite differences.
 
-use super::preintegration::{Increment, Mat9, Noise, GRAVITY};
-use crate::math::block::{block, put};
+use super::preintegration::{Increment, Mat9, Noise};
+use crate::math::block::{block, matrix, put};
 use crate::math::so3;
 use glam::{DMat3, DVec3};
-use nalgebra::SMatrix;
+use nalgebra::{Matrix3, SMatrix};
 use stipple_drivers::Pose;
 
 /// Pose in the world, velocity in the world, m/s, and biases in the body, rad/s and m/s².
@@ -38,8 +38,11 @@ impl Motion {
         let (p, q, v) = inc.corrected(self.bg, self.ba);
         let dt = inc.dt;
         Motion {
-            pose: Pose::new(self.pose.q * q, self.pose.p + self.v * dt + GRAVITY * (0.5 * dt * dt) + self.pose.q * p),
-            v: self.v + GRAVITY * dt + self.pose.q * v,
+            pose: Pose::new(
+                self.pose.q * q,
+                self.pose.p + self.v * dt + inc.gravity * (0.5 * dt * dt) + self.pose.q * p,
+            ),
+            v: self.v + inc.gravity * dt + self.pose.q * v,
             ..*self
         }
     }
@@ -52,6 +55,16 @@ pub type Covariance = [[f64; 15]; 15];
 pub type Mat15 = SMatrix<f64, 15, 15>;
 /// Errors [p, θ, v, bg, ba].
 pub type Vec15 = SMatrix<f64, 15, 1>;
+
+/// Covariance, m²/s², of the velocity in the body's frame, Rᵀ v. That in the world contains the unknown yaw times the speed, which no
+/// sensor observes and which makes nothing drift.
+pub fn body_velocity_covariance(c: &Covariance, motion: &Motion) -> Matrix3<f64> {
+    let to_body = motion.pose.rotation().transpose();
+    let (d_v, d_theta) = (matrix(to_body), matrix(so3::hat(to_body * motion.v)));
+    let block = |row: usize, col: usize| Matrix3::from_fn(|i, j| c[row + i][col + j]);
+    let cross = d_v * block(6, 3) * d_theta.transpose();
+    d_v * block(6, 6) * d_v.transpose() + d_theta * block(3, 3) * d_theta.transpose() + cross + cross.transpose()
+}
 
 /// Standard deviations of a motion: position, m; tilt and yaw about world axes, rad; velocity, m/s; gyro bias,
 /// rad/s; accelerometer bias, m/s².
@@ -102,6 +115,11 @@ impl InertialWeight {
             ba: 1.0 / (noise.accel_walk * root_dt),
         }
     }
+
+    /// Whether the covariance could not be factored.
+    pub fn is_nothing(&self) -> bool {
+        self.increment == Mat9::zeros()
+    }
 }
 
 /// Whitened residual [p, θ, v, bg, ba] between two frames.
@@ -109,9 +127,9 @@ pub fn inertial_residual(inc: &Increment, w: &InertialWeight, a: &Motion, b: &Mo
     let dt = inc.dt;
     let (p, q, v) = inc.corrected(a.bg, a.ba);
     let to_a = a.pose.q.conjugate();
-    let r_p = to_a * (b.pose.p - a.pose.p - a.v * dt - GRAVITY * (0.5 * dt * dt)) - p;
+    let r_p = to_a * (b.pose.p - a.pose.p - a.v * dt - inc.gravity * (0.5 * dt * dt)) - p;
     let r_q = so3::log(q.conjugate() * to_a * b.pose.q);
-    let r_v = to_a * (b.v - a.v - GRAVITY * dt) - v;
+    let r_v = to_a * (b.v - a.v - inc.gravity * dt) - v;
     let r = SMatrix::<f64, 9, 1>::from_column_slice(&[r_p.x, r_p.y, r_p.z, r_q.x, r_q.y, r_q.z, r_v.x, r_v.y, r_v.z]);
     let mut out = Vec15::zeros();
     out.fixed_rows_mut::<9>(0).copy_from(&(w.increment * r));
@@ -135,7 +153,7 @@ pub fn inertial_jacobians(inc: &Increment, w: &InertialWeight, a: &Motion, b: &M
     let mut jb = Mat15::zeros();
     let mut set = |m: usize, row: usize, col: usize, x: DMat3| put([&mut ja, &mut jb][m], row, col, x);
     set(0, 0, 0, -r_to_a);
-    set(0, 0, 3, so3::hat(to_a * (b.pose.p - a.pose.p - a.v * dt - GRAVITY * (0.5 * dt * dt))));
+    set(0, 0, 3, so3::hat(to_a * (b.pose.p - a.pose.p - a.v * dt - inc.gravity * (0.5 * dt * dt))));
     set(0, 0, 6, r_to_a * -dt);
     set(0, 0, 9, -inc.d_p_bg());
     set(0, 0, 12, -inc.d_p_ba());
@@ -145,7 +163,7 @@ pub fn inertial_jacobians(inc: &Increment, w: &InertialWeight, a: &Motion, b: &M
     let correction = d_bg * (a.bg - inc.bg);
     set(0, 3, 9, -jr_inv * DMat3::from_quat(so3::exp(-r_q)) * so3::right_jacobian(correction) * d_bg);
     set(1, 3, 3, jr_inv);
-    set(0, 6, 3, so3::hat(to_a * (b.v - a.v - GRAVITY * dt)));
+    set(0, 6, 3, so3::hat(to_a * (b.v - a.v - inc.gravity * dt)));
     set(0, 6, 6, -r_to_a);
     set(0, 6, 9, -inc.d_v_bg());
     set(0, 6, 12, -inc.d_v_ba());
@@ -220,7 +238,15 @@ mod tests {
     }
 
     fn increment() -> (Increment, InertialWeight) {
-        let noise = Noise { gyro: 1e-3, accel: 1e-2, gyro_walk: 1e-4, accel_walk: 1e-3, period: 0.005, scale: true };
+        let noise = Noise {
+            gyro: 1e-3,
+            accel: 1e-2,
+            gyro_walk: 1e-4,
+            accel_walk: 1e-3,
+            period: 0.005,
+            scale: true,
+            gravity: 9.81,
+        };
         let mut inc = Increment::new(DVec3::new(0.005, 0.0, -0.01), DVec3::new(0.05, -0.05, 0.1));
         for k in 0..12 {
             let t = k as f64 * 0.3;
@@ -265,6 +291,16 @@ mod tests {
             let d = (at(H) - at(-H)) / (2.0 * H);
             (0..15).for_each(|row| close(j[(row, i)], d[row], "scale"));
         }
+    }
+
+    /// Yaw in the world is ours to choose: however unknown, it says nothing of how fast the rig drifts.
+    #[test]
+    fn unknown_yaw_is_no_uncertainty_of_the_velocity_in_the_body() {
+        let m = motion(1.0);
+        let yaw = [DVec3::ZERO, m.pose.q.conjugate() * DVec3::Z, DVec3::Z.cross(m.v)];
+        let mut c = [[0.0; 15]; 15];
+        (0..9).for_each(|i| (0..9).for_each(|j| c[i][j] = 0.04 * yaw[i / 3][i % 3] * yaw[j / 3][j % 3]));
+        assert!(c[6][6] > 1e-3 && body_velocity_covariance(&c, &m).norm() < 1e-12);
     }
 
     #[test]

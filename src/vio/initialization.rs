@@ -10,7 +10,7 @@
 
 use super::inertial::{Motion, MotionSigma};
 use super::model::Model;
-use super::preintegration::{Increment, GRAVITY};
+use super::preintegration::Increment;
 use super::reprojection::{huber, Point, Transform, View};
 use super::samples::ImuRing;
 use super::triangulation::InverseDistance;
@@ -189,7 +189,7 @@ impl Initializer {
         let q = DQuat::from_rotation_arc(s.accel.normalize(), DVec3::Z);
         let motion = Motion { pose: Pose::new(q, DVec3::ZERO), bg: s.gyro, ..Motion::default() };
         // The tilt is as good as the unknown accelerometer bias lets it be.
-        let tilt = config.accel_bias_sigma / -GRAVITY.z;
+        let tilt = config.accel_bias_sigma / config.gravity;
         Some(Start { motion, sigma: sigma(config, tilt, 0.02, 0.01) })
     }
 }
@@ -295,10 +295,10 @@ fn align(frames: &[ResectedFrame], scale_sigma: f64, config: &VioConfig) -> Opti
         rows[k] = (t, y);
     }
     let g = (b[1] * h[0] - b[0] * h[1]) / (h[0] * h[2] - h[1] * h[1]);
-    if !g.is_finite() || (g.length() + GRAVITY.z).abs() > GRAVITY_MISFIT {
+    if !g.is_finite() || (g.length() - config.gravity).abs() > GRAVITY_MISFIT {
         return None;
     }
-    let g = g.normalize() * -GRAVITY.z;
+    let g = g.normalize() * config.gravity;
     let v0 = (b[0] - g * h[1]) / h[0];
     let misfit =
         rows[1..frames.len()].iter().map(|(t, y)| (*y - v0 * *t - g * (0.5 * t * t)).length_squared()).sum::<f64>();
@@ -319,7 +319,7 @@ fn align(frames: &[ResectedFrame], scale_sigma: f64, config: &VioConfig) -> Opti
         bg,
         ba: DVec3::ZERO,
     };
-    let tilt = ALIGNED_TILT.hypot(sigma_g / -GRAVITY.z);
+    let tilt = ALIGNED_TILT.hypot(sigma_g / config.gravity);
     let v = ALIGNED_V.hypot(sigma_v).hypot(scale_sigma * motion.v.length());
     Some(Start { motion, sigma: sigma(config, tilt, v, ALIGNED_GYRO) })
 }
@@ -329,7 +329,7 @@ fn from_mean_force(t: Nanos, imu: &ImuRing, model: &Model) -> Option<Start> {
     let span = Span::from_secs(MEAN_SPAN);
     imu.statistics(t, span)?;
     let inc = imu.integrate(t - span, t, DVec3::ZERO, DVec3::ZERO, &model.noise);
-    if (inc.v.length() / inc.dt + GRAVITY.z).abs() > MEAN_FORCE_MISFIT {
+    if (inc.v.length() / inc.dt - model.config.gravity).abs() > MEAN_FORCE_MISFIT {
         return None;
     }
     let up = inc.q.conjugate() * inc.v.try_normalize()?;

@@ -8,7 +8,7 @@
 //! prediction that is wrong, and the gate is left open.
 
 use super::graph::Graph;
-use super::inertial::Covariance;
+use super::inertial::{body_velocity_covariance, Covariance};
 use super::landmarks::{Landmark, Observation};
 use super::projection::{observe, Host};
 use super::rig::{EXTRINSIC_DIM, TIME_DIM};
@@ -16,7 +16,6 @@ use super::window::{Window, POSE_DIM};
 use crate::frontend::Tracks;
 use crate::limits::{CAMERAS_MAX, TRACKS};
 use crate::math::block::matrix;
-use glam::DMat3;
 use nalgebra::{Matrix3, SMatrix, SVector};
 
 /// Two degrees of freedom pass with all but 4e-6 of true views.
@@ -33,12 +32,14 @@ pub type PoseCovariance = SMatrix<f64, POSE_DIM, POSE_DIM>;
 pub fn predicted_covariance(window: &Window, slot: usize, from: &Covariance) -> PoseCovariance {
     let frame = window.frame(slot);
     let (dt, inc) = (frame.increment.dt, &frame.increment.covariance);
-    let before = window.slots().rev().nth(1).map_or(DMat3::IDENTITY, |s| window.frame(s).world_from_body.r);
-    let r = matrix(before);
+    let before = window.slots().rev().nth(1).map(|s| window.frame(s).now).unwrap_or_default();
+    let r = matrix(before.pose.rotation());
     let block = |row: usize, col: usize| inc.fixed_view::<3, 3>(row, col).into_owned();
     let of = |at: usize| Matrix3::from_fn(|i, j| from[at + i][at + j]) * (dt * dt);
     let mut p = PoseCovariance::zeros();
-    p.fixed_view_mut::<3, 3>(0, 0).copy_from(&(r * block(0, 0) * r.transpose() + of(6)));
+    // In the body, since the world's yaw moves the points that the window sees too.
+    let of_velocity = r * body_velocity_covariance(from, &before) * r.transpose() * (dt * dt);
+    p.fixed_view_mut::<3, 3>(0, 0).copy_from(&(r * block(0, 0) * r.transpose() + of_velocity));
     p.fixed_view_mut::<3, 3>(3, 3).copy_from(&(block(3, 3) + of(9)));
     let cross = r * block(0, 3);
     p.fixed_view_mut::<3, 3>(0, 3).copy_from(&cross);

@@ -89,10 +89,11 @@ impl Marginalizer {
         Marginalizer { stack: Rows::new(STACK_ROWS, WINDOW_DIM + 1) }
     }
 
-    /// Brings the window back to its resting size. `rows` is scratch.
-    pub fn marginalize(&mut self, graph: &mut Graph, rows: &mut FactorRows, model: &Model) {
+    /// Brings the window back to its resting size; answers how many columns were not finite, whose part of the prior is
+    /// lost. `rows` is scratch.
+    pub fn marginalize(&mut self, graph: &mut Graph, rows: &mut FactorRows, model: &Model) -> u64 {
         let Graph { window, landmarks, prior } = graph;
-        let Some(leaving) = Leaving::choose(window, landmarks, model) else { return };
+        let Some(leaving) = Leaving::choose(window, landmarks, model) else { return 0 };
         let (layout, columns, blocks) = leaving.layout(window);
         let stack = &mut self.stack;
         stack.clear(layout.dim + 1);
@@ -105,7 +106,7 @@ impl Marginalizer {
         }
         landmarks.retain(|l| !leaving.finishes(l, &layout));
 
-        stack.marginalize(columns);
+        let lost = stack.marginalize(columns);
         for b in blocks.iter() {
             match b {
                 Block::Pose(s) | Block::Motion(s) => window.frame_mut(*s as usize).fix_linearization_point(),
@@ -122,6 +123,7 @@ impl Marginalizer {
             window.remove(slot);
             landmarks.forget(slot);
         }
+        lost
     }
 }
 

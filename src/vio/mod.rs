@@ -48,8 +48,8 @@ use crate::config::VioConfig;
 use crate::frontend::Tracks;
 use estimator::{Estimator, Step, CONNECTED_FEW};
 use glam::DVec3;
-use health::{quality, sigma_v, Reset, SIGMA_V_UNOBSERVED};
-use inertial::{Covariance, Motion};
+use health::{quality, Reset, SIGMA_V_UNOBSERVED};
+use inertial::{body_velocity_covariance, Covariance, Motion};
 use initialization::{Initializer, RESECTION_MIN};
 use monitor::Monitor;
 use recovery::Recovery;
@@ -62,6 +62,8 @@ use stipple_drivers::{Calibration, ImuSample, Nanos, Pose};
 const PX_MAX: f32 = 65536.0;
 /// Inertia alone is not believed for longer than this, s; the ring of samples may not hold more either.
 const FRAME_GAP_MAX: f64 = 2.0;
+/// The most that a start is worth after one that was lied to, until it is trusted.
+const QUALITY_SUSPECT: u8 = 20;
 /// A camera with fewer than one in so many of another's tracks is blind.
 const BLIND_FRACTION: usize = 10;
 
@@ -133,7 +135,7 @@ pub struct Vio {
 impl Vio {
     pub fn new(calibration: &Calibration, config: &VioConfig) -> Vio {
         Vio {
-            imu: ImuRing::empty(),
+            imu: ImuRing::new(calibration.imu.rate_hz),
             initializer: Initializer::new(),
             estimator: Estimator::new(calibration, config),
             monitor: Monitor::default(),
@@ -175,7 +177,8 @@ impl Vio {
         let last = self.last;
         if last.is_some_and(|t| tracks.t <= t) {
             self.stats.frames_rejected += 1;
-            return Update { epoch: self.epoch, ..Update::default() };
+            self.tally.add(Health::FRAME_REJECTED, None);
+            return Update { epoch: self.epoch, health: Health::FRAME_REJECTED, ..Update::default() };
         }
         self.last = Some(tracks.t);
         let tracks = &self.admitted(tracks);
@@ -194,7 +197,10 @@ impl Vio {
         let mut update = step.as_ref().map_or(Update::default(), |step| self.output(step));
         update.health = self.health(tracks, step.as_ref());
         reset.into_iter().for_each(|why| update.health.set(why.bit(), true));
-        update.quality = quality(self.covariance(), update.connected);
+        update.quality = quality(self.sigma_v(), update.connected, self.estimator.model.landmarks_enough);
+        if self.recovery.is_suspect() && !self.monitor.is_trusted() {
+            update.quality = update.quality.min(QUALITY_SUSPECT);
+        }
         (update.epoch, update.covariance) = (self.epoch, self.covariance);
         if update.odometry.is_none() {
             let carried = self.recovery.dead_reckoned(tracks.t, &self.imu, &self.estimator.model.noise).unzip();
@@ -262,6 +268,9 @@ impl Vio {
         s.landmarks_full += step.landmarks_full as u64;
         s.outliers += step.outliers as u64;
         s.solver_failures += u64::from(step.outcome.failures);
+        s.solver_steps_rejected += u64::from(step.outcome.rejected);
+        s.inertia_lost += u64::from(step.inertia_lost);
+        s.prior_columns_lost += step.columns_lost;
         s.solver_iterations += u64::from(step.outcome.iterations);
     }
 
@@ -290,7 +299,7 @@ impl Vio {
         let seen = tracks.cameras[..model.cameras.len()].iter().map(|c| c.len());
         let (least, most) = seen.fold((usize::MAX, 0), |(a, b), n| (a.min(n), b.max(n)));
         let held = self.imu.newest().is_none_or(|n| model.noise.is_gap((tracks.t - n.t).secs()));
-        let unobserved = self.covariance.as_ref().is_none_or(|c| !(sigma_v(c) < SIGMA_V_UNOBSERVED));
+        let unobserved = self.sigma_v().is_none_or(|sigma| !(sigma < SIGMA_V_UNOBSERVED));
         h.set(Health::INITIALISING, !self.is_running());
         h.set(Health::NO_TRACKS, most == 0);
         h.set(Health::IMU_GAP, held);
@@ -340,6 +349,12 @@ impl Vio {
     /// of the rotation; biases, rad/s and m/s². `None` until initialized, and where the window does not determine it.
     pub fn covariance(&self) -> Option<&[[f64; 15]; 15]> {
         self.covariance.as_ref()
+    }
+
+    /// Standard deviation of the velocity in the body's frame, m/s, all axes.
+    fn sigma_v(&self) -> Option<f64> {
+        let now = &self.estimator.newest()?.now;
+        self.covariance.as_ref().map(|c| body_velocity_covariance(c, now).trace().max(0.0).sqrt())
     }
 
     /// What is estimated of the rig; `None` when nothing is.

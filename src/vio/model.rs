@@ -1,5 +1,6 @@
 //! What stays constant while estimating: the cameras as calibrated, the noise of the inertial unit, the settings.
 
+use super::health::landmarks_enough;
 use super::preintegration::Noise;
 use super::reprojection::CameraModel;
 use crate::config::VioConfig;
@@ -12,6 +13,8 @@ pub struct Model {
     pub cameras: Vec<CameraModel>,
     pub noise: Noise,
     pub config: VioConfig,
+    /// Number of landmarks in view that is enough for the largest image of the rig, without unit.
+    pub landmarks_enough: f64,
 }
 
 impl Model {
@@ -20,6 +23,10 @@ impl Model {
             cameras: calibration.cameras.iter().take(CAMERAS_MAX).map(CameraModel::from).collect(),
             noise: Noise::new(&calibration.imu, config),
             config: config.clone(),
+            landmarks_enough: {
+                let pixels = calibration.cameras.iter().map(|c| c.camera.width * c.camera.height).max();
+                landmarks_enough(pixels.unwrap_or(0))
+            },
         }
     }
 }

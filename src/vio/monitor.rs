@@ -9,21 +9,27 @@ const INLIERS_MIN: f64 = 0.65;
 const VIEWS_MIN: usize = 10;
 /// Squared whitened residual of the newest inertial factor, per dimension, that is suspect.
 const MISFIT_MAX: f64 = 30.0;
-/// This many more suspect frames than others are a divergence: wrong tracks and samples also agree by chance.
-const SUSPECT_MAX: u32 = 10;
+/// Suspect frames that last this much longer than others, s, are a divergence: wrong tracks and samples also agree by chance.
+/// Ten frames at 20 Hz.
+const SUSPECT_MAX: f64 = 0.475;
+/// A frame lasts since the one before it, but no longer than this, s; and doubt this short is none.
+const FRAME_MAX: f64 = 0.1;
+const SUSPECT_NONE: f64 = 0.004;
 /// Known landmarks have fewer views than this for longer than this, s: inertia alone carries the estimate too far.
 const SEEN_VIEWS: usize = 6;
 const UNSEEN_MAX: f64 = 3.0;
-/// Frames that see enough of them end that.
-const SEEING_AGAIN: u32 = 3;
-/// Frames after a start that nothing may speak against before it is trusted: what spoiled the last start
+/// Seeing enough of them for so long ends that, s: three frames at 20 Hz.
+const SEEING_AGAIN: f64 = 0.125;
+/// Time after a start in which nothing may speak against it before it is trusted, s: what spoiled the last start
 /// may still be there.
-const PROBATION: u32 = SUSPECT_MAX;
+const PROBATION: f64 = SUSPECT_MAX;
 
 /// What a frame looked like after its optimization.
 #[derive(Clone, Copy, Debug)]
 pub struct Evidence {
     pub t: Nanos,
+    /// Since the frame before, s.
+    pub dt: f64,
     /// Views of landmarks before and after outliers were dropped.
     pub views: usize,
     pub inliers: usize,
@@ -36,14 +42,15 @@ pub struct Evidence {
     pub misfit: f64,
 }
 
-/// Suspect frames so far.
+/// What spoke against the estimate so far.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Monitor {
-    frames: u32,
-    suspect: u32,
+    /// Time since the start, and by which suspect frames lasted longer than others, s.
+    lived: f64,
+    suspect: f64,
     unseen_since: Option<Nanos>,
-    /// Frames since then that saw enough landmarks.
-    seeing: u32,
+    /// Time since then in which enough landmarks were seen, s.
+    seeing: f64,
     /// What speaks against the newest estimate.
     now: Health,
 }
@@ -58,12 +65,13 @@ impl Monitor {
         self.now.set(Health::INERTIA_DISAGREES, inertia);
         let seen = e.known >= SEEN_VIEWS || e.at_rest;
         self.now.set(Health::INERTIA_ALONE, !seen);
-        self.frames = self.frames.saturating_add(1);
-        self.suspect = if vision || inertia { self.suspect + 1 } else { self.suspect.saturating_sub(1) };
+        let dt = e.dt.min(FRAME_MAX);
+        self.lived += dt;
+        self.suspect = if vision || inertia { self.suspect + dt } else { (self.suspect - dt).max(0.0) };
         if seen {
-            self.seeing = self.seeing.saturating_add(1);
+            self.seeing += dt;
         } else if self.unseen_since.is_none() {
-            (self.unseen_since, self.seeing) = (Some(e.t), 0);
+            (self.unseen_since, self.seeing) = (Some(e.t), 0.0);
         }
         if self.seeing >= SEEING_AGAIN {
             self.unseen_since = None;
@@ -81,7 +89,7 @@ impl Monitor {
 
     /// Nothing speaks against the newest estimate, nor did since its start.
     pub fn is_trusted(&self) -> bool {
-        self.suspect == 0 && self.unseen_since.is_none() && self.frames >= PROBATION
+        self.suspect < SUSPECT_NONE && self.unseen_since.is_none() && self.lived >= PROBATION
     }
 }
 
@@ -90,7 +98,7 @@ mod tests {
     use super::*;
 
     fn frame(i: i64, views: usize, inliers: usize, misfit: f64) -> Evidence {
-        Evidence { t: Nanos(i * 50_000_000), views, inliers, known: inliers, at_rest: false, misfit }
+        Evidence { t: Nanos(i * 50_000_000), dt: 0.05, views, inliers, known: inliers, at_rest: false, misfit }
     }
 
     /// The frame that ends a flight of such frames, and why.
@@ -102,7 +110,7 @@ mod tests {
     #[test]
     fn divergence_needs_disagreement_that_lasts() {
         assert_eq!(end(|i| frame(i, 80, if i % 2 == 0 { 70 } else { 5 }, 1.0)), None);
-        let last = SUSPECT_MAX as i64 - 1;
+        let last = 9;
         assert_eq!(end(|i| frame(i, 80, 5, 1.0)), Some((last, Reset::Disagreement)));
         assert_eq!(end(|i| frame(i, 80, 80, f64::NAN)), Some((last, Reset::Disagreement)));
         assert_eq!(end(|i| frame(i, 0, 0, 1.0)), Some((61, Reset::Unseen)));
@@ -111,10 +119,20 @@ mod tests {
     }
 
     #[test]
+    fn divergence_takes_as_long_at_every_frame_rate() {
+        for rate_hz in [10.0, 20.0, 60.0, 120.0] {
+            let mut monitor = Monitor::default();
+            let dt = 1.0 / rate_hz;
+            let end = (1..1000).find(|_| monitor.check(&Evidence { dt, ..frame(0, 80, 5, 1.0) }).is_some());
+            assert!(end.is_some_and(|n| (0.45..=0.5).contains(&(n as f64 * dt))), "{rate_hz} Hz: {end:?}");
+        }
+    }
+
+    #[test]
     fn trust_takes_a_second_look_after_a_start() {
         let mut monitor = Monitor::default();
         let trusted = (0..100).find(|i| monitor.check(&frame(*i, 80, 80, 1.0)).is_none() && monitor.is_trusted());
-        assert_eq!(trusted, Some(PROBATION as i64 - 1));
+        assert_eq!(trusted, Some(9));
         monitor.check(&frame(100, 80, 5, 1.0));
         assert!(!monitor.is_trusted() && monitor.bits() == (Health::VISION_DISAGREES | Health::INERTIA_ALONE));
     }

@@ -25,7 +25,8 @@ pub struct Predictor {
 
 impl Predictor {
     pub fn new(calibration: &Calibration, config: &VioConfig) -> Predictor {
-        Predictor { noise: Noise::new(&calibration.imu, config), imu: ImuRing::empty(), last: None }
+        let imu = ImuRing::new(calibration.imu.rate_hz);
+        Predictor { noise: Noise::new(&calibration.imu, config), imu, last: None }
     }
 
     /// Takes a sample; refuses what the estimator refuses.

@@ -18,8 +18,8 @@ use stipple_drivers::ImuCalibration;
 pub type Mat9 = SMatrix<f64, 9, 9>;
 type Mat93 = SMatrix<f64, 9, 3>;
 
-/// World frame, z up, m/s².
-pub const GRAVITY: DVec3 = DVec3::new(0.0, 0.0, -9.81);
+/// Gravity of an increment that nothing was integrated into, m/s².
+const GRAVITY: f64 = 9.81;
 /// A step longer than this many nominal periods is a gap, and then what may have happened in it, as
 /// densities: rad/s/√Hz and m/s²/√Hz of a hand-held or flying rig.
 const GAP_PERIODS: f64 = 4.0;
@@ -43,6 +43,8 @@ pub struct Noise {
     pub period: f64,
     /// Derivatives to the scales of the axes are wanted.
     pub scale: bool,
+    /// Gravity where the unit is, m/s².
+    pub gravity: f64,
 }
 
 impl Noise {
@@ -55,6 +57,7 @@ impl Noise {
             accel_walk: imu.accel_walk,
             period: 1.0 / imu.rate_hz,
             scale: config.estimate_imu_scale,
+            gravity: config.gravity,
         }
     }
 
@@ -79,6 +82,8 @@ impl Noise {
 #[derive(Clone, Copy, Debug)]
 pub struct Increment {
     pub dt: f64,
+    /// In the world frame, z up, m/s². No part of what was integrated.
+    pub gravity: DVec3,
     pub p: DVec3,
     pub q: DQuat,
     pub v: DVec3,
@@ -98,6 +103,7 @@ impl Increment {
     pub fn new(bg: DVec3, ba: DVec3) -> Increment {
         Increment {
             dt: 0.0,
+            gravity: DVec3::NEG_Z * GRAVITY,
             p: DVec3::ZERO,
             q: DQuat::IDENTITY,
             v: DVec3::ZERO,
@@ -221,8 +227,15 @@ mod tests {
     use super::*;
     use stipple_drivers::{ImuSample, Nanos, Pose};
 
-    const NOISE: Noise =
-        Noise { gyro: 1e-3, accel: 2e-2, gyro_walk: 1e-4, accel_walk: 1e-3, period: 0.005, scale: true };
+    const NOISE: Noise = Noise {
+        gyro: 1e-3,
+        accel: 2e-2,
+        gyro_walk: 1e-4,
+        accel_walk: 1e-3,
+        period: 0.005,
+        scale: true,
+        gravity: GRAVITY,
+    };
     const PATH: world::Path = world::Path { rest: -1.0 };
 
     fn at(t: f64) -> Nanos {
@@ -230,7 +243,7 @@ mod tests {
     }
 
     fn ring(rate: f64, t1: f64) -> ImuRing {
-        let mut ring = ImuRing::empty();
+        let mut ring = ImuRing::new(200.0);
         for i in 0..=(t1 * rate) as usize + 1 {
             let t = i as f64 / rate;
             let (gyro_body, accel_body) = world::rate_and_force(|t| PATH.pose(t), t);
@@ -403,7 +416,7 @@ mod tests {
     #[test]
     fn gap_widens_the_covariance() {
         let full = ring(200.0, 0.3);
-        let mut holed = ImuRing::empty();
+        let mut holed = ImuRing::new(200.0);
         full.iter().filter(|s| s.t < at(0.1) || s.t > at(0.2)).for_each(|s| {
             holed.push(*s);
         });

@@ -71,6 +71,12 @@ impl Recovery {
         self.reset_by = why;
     }
 
+    /// Whether the last estimate was given up because something lied: samples, or the estimate, may have been wrong for some
+    /// time before that, and may be still.
+    pub fn is_suspect(&self) -> bool {
+        matches!(self.reset_by, Reset::Disagreement | Reset::State)
+    }
+
     /// Carries on as time passes.
     pub fn propagate(&mut self, now: Nanos, imu: &ImuRing, noise: &Noise) {
         let t = now - Span::from_secs(DELAY);
@@ -108,11 +114,6 @@ impl Recovery {
         let covariance: Covariance = std::array::from_fn(|i| std::array::from_fn(|j| carried.covariance[(i, j)]));
         let finite = carried.motion.is_finite() && covariance.iter().flatten().all(|c| c.is_finite());
         finite.then_some((carried.motion, covariance))
-    }
-
-    /// The samples, or the estimate, may have been wrong for some time before the reset.
-    fn is_suspect(&self) -> bool {
-        matches!(self.reset_by, Reset::Disagreement | Reset::State)
     }
 
     fn trusted(&self) -> Option<TrustedState> {
@@ -334,7 +335,7 @@ mod tests {
     #[test]
     fn transition_matches_differences_of_the_propagation() {
         let mut world = World::new(Path { rest: -1.0 });
-        let mut ring = ImuRing::empty();
+        let mut ring = ImuRing::new(RATE_HZ);
         for i in 0..100 {
             ring.push(world.imu(i as f64 / RATE_HZ));
         }

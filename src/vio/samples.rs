@@ -3,7 +3,7 @@
 //! Samples are interpolated at the ends of what is integrated; outside the samples the nearest is held.
 
 use super::preintegration::{Increment, Noise};
-use crate::limits::IMU_BETWEEN_FRAMES;
+use crate::limits::IMU_HISTORY_SECS;
 use glam::DVec3;
 use std::collections::VecDeque;
 use stipple_drivers::{ImuSample, Nanos, Span};
@@ -11,14 +11,16 @@ use stipple_drivers::{ImuSample, Nanos, Span};
 /// The newest samples, ascending stamps; old ones are overwritten.
 #[derive(Clone, Debug)]
 pub struct ImuRing {
-    /// Never longer than its capacity at the start.
+    /// Never longer than `capacity`.
     samples: VecDeque<ImuSample>,
+    capacity: usize,
 }
 
 impl ImuRing {
-    /// A ring without samples.
-    pub fn empty() -> ImuRing {
-        ImuRing { samples: VecDeque::with_capacity(IMU_BETWEEN_FRAMES) }
+    /// A ring without samples, for those of `IMU_HISTORY_SECS`.
+    pub fn new(rate_hz: f64) -> ImuRing {
+        let capacity = (IMU_HISTORY_SECS * rate_hz).ceil() as usize;
+        ImuRing { samples: VecDeque::with_capacity(capacity), capacity }
     }
 
     /// Whether a sample is finite and newer than the last.
@@ -28,7 +30,7 @@ impl ImuRing {
 
     /// Takes a sample that was admitted; returns the one that was overwritten.
     pub fn push(&mut self, s: ImuSample) -> Option<ImuSample> {
-        let old = if self.samples.len() == IMU_BETWEEN_FRAMES { self.samples.pop_front() } else { None };
+        let old = if self.samples.len() == self.capacity { self.samples.pop_front() } else { None };
         self.samples.push_back(s);
         old
     }
@@ -73,6 +75,7 @@ impl ImuRing {
     /// The increment over `[t0, t1]`. Without any sample: gravity-free rest with the noise of a gap.
     pub fn integrate(&self, t0: Nanos, t1: Nanos, bg: DVec3, ba: DVec3, noise: &Noise) -> Increment {
         let mut inc = Increment::new(bg, ba);
+        inc.gravity = DVec3::NEG_Z * noise.gravity;
         let Some(mut last) = self.sample_at(t0) else {
             inc.step_between([bg, ba], [bg, ba], (t1 - t0).secs(), noise);
             return inc;
@@ -126,17 +129,45 @@ pub struct Statistics {
 
 #[cfg(test)]
 mod tests {
+    use super::super::inertial::Motion;
     use super::*;
+    use crate::config::VioConfig;
+    use stipple_drivers::ImuCalibration;
 
     #[test]
     fn ring_keeps_the_newest_and_gives_back_what_it_overwrote() {
-        let mut ring = ImuRing::empty();
+        let mut ring = ImuRing::new(200.0);
+        let n = 512;
         let sample = |i: usize| ImuSample { t: Nanos(i as i64), ..ImuSample::default() };
-        for i in 0..IMU_BETWEEN_FRAMES {
+        for i in 0..n {
             assert!(ring.push(sample(i)).is_none());
         }
-        assert_eq!(ring.push(sample(IMU_BETWEEN_FRAMES)).map(|s| s.t), Some(Nanos(0)));
+        assert_eq!(ring.push(sample(n)).map(|s| s.t), Some(Nanos(0)));
         assert_eq!(ring.iter().next().map(|s| s.t), Some(Nanos(1)));
-        assert_eq!(ring.iter().count(), IMU_BETWEEN_FRAMES);
+        assert_eq!(ring.iter().count(), n);
+    }
+
+    #[test]
+    fn history_is_as_long_at_four_kilohertz() {
+        let mut ring = ImuRing::new(4000.0);
+        for i in 0..20_000 {
+            let _ = ring.push(ImuSample { t: Nanos(i * 250_000), ..ImuSample::default() });
+        }
+        let until = Nanos(19_999 * 250_000);
+        assert!(ring.statistics(until, Span::from_secs(2.5)).is_some());
+    }
+
+    #[test]
+    fn unit_at_rest_stands_still_in_the_gravity_of_the_board() {
+        let config = VioConfig { gravity: 9.78, ..VioConfig::default() };
+        let noise = Noise::new(&ImuCalibration::CONSUMER, &config);
+        let mut ring = ImuRing::new(200.0);
+        let accel_body = DVec3::Z * 9.78;
+        for i in 0..200 {
+            let _ = ring.push(ImuSample { t: Nanos(i * 5_000_000), accel_body, ..ImuSample::default() });
+        }
+        let inc = ring.integrate(Nanos(0), Nanos(900_000_000), DVec3::ZERO, DVec3::ZERO, &noise);
+        let moved = Motion::default().propagate(&inc);
+        assert!(moved.pose.p.length() < 1e-9 && moved.v.length() < 1e-9, "{moved:?}");
     }
 }

@@ -120,8 +120,9 @@ pub struct Solver {
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Outcome {
     pub iterations: u32,
-    /// Steps that were not finite.
+    /// Steps that were not finite, and steps that were taken back because they made the cost larger.
     pub failures: u32,
+    pub rejected: u32,
 }
 
 impl Solver {
@@ -238,6 +239,7 @@ impl Solver {
                 if predicted < COST_NUMERIC {
                     break;
                 }
+                outcome.rejected += 1;
                 (lambda, growth) = (lambda * growth, growth * 2.0);
             }
         }

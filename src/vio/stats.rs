@@ -22,6 +22,12 @@ counters! {
     landmarks_full,
     outliers,
     solver_failures,
+    /// Steps of the solver that were taken back because they made the cost larger.
+    solver_steps_rejected,
+    /// Frames whose inertial samples say nothing, since their covariance could not be factored.
+    inertia_lost,
+    /// Columns of the prior that were not finite, and were dropped.
+    prior_columns_lost,
     /// All resets; below by their reason.
     resets,
     /// No frame came for `FRAME_GAP_MAX`.

@@ -353,3 +353,15 @@ fn prediction_that_nearly_all_contradict_refuses_nothing() {
     assert!(moved > 100);
     assert_eq!((refused, opened), (0, 1));
 }
+
+#[test]
+fn frame_that_is_refused_is_not_healthy() {
+    let mut world = World::new(Path { rest: -1.0 });
+    let mut vio = Vio::new(&world.rig, &VioConfig::default());
+    run(&mut vio, 0..20, &mut world);
+    let mut tracks = Tracks::default();
+    world.tracks(0.5, &mut tracks);
+    let update = vio.on_tracks(&tracks);
+    assert!(update.health.has(Health::FRAME_REJECTED) && update.odometry.is_none() && update.quality == 0);
+    assert!(vio.health_frames().any(|f| f == ("frame_rejected", 1)));
+}

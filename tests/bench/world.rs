@@ -146,7 +146,7 @@ impl World {
     /// The next sample; the biases walk on by one.
     pub fn imu(&mut self, t: f64) -> ImuSample {
         let (gyro, accel) = rate_and_force(&self.pose, t);
-        let root = RATE_HZ.sqrt();
+        let root = self.rig.imu.rate_hz.sqrt();
         self.gyro_bias += self.walk.vector() * (self.rig.imu.gyro_walk / root);
         self.accel_bias += self.walk.vector() * (self.rig.imu.accel_walk / root);
         ImuSample {
