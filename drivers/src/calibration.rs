@@ -100,6 +100,8 @@ pub struct ImuCalibration {
     pub accel_noise: f64,
     /// Random walk of the accelerometer's bias, m/s² per s and √Hz.
     pub accel_walk: f64,
+    /// Whether these figures were measured on this very unit; else they are those of a data sheet or of another unit.
+    pub measured: bool,
     /// Ends of the ranges of gyro and accelerometer, rad/s and m/s².
     pub range: [f64; 2],
     /// Correction of readings that a source applies.
@@ -116,6 +118,7 @@ impl ImuCalibration {
         gyro_walk: 1e-5,
         accel_noise: 1e-3,
         accel_walk: 1e-4,
+        measured: false,
         range: ImuCalibration::RANGE,
         correction: ImuCorrection::NONE,
     };

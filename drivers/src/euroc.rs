@@ -13,6 +13,13 @@ pub const IMAGE_COLUMNS: &str = "#timestamp [ns],filename\n";
 pub const IMU_COLUMNS: &str = "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],\
                                a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]\n";
 
+/// Key of a calibration that says where its figures of noise come from, and its two values.
+pub const NOISE_SOURCE: &str = "noise_source";
+/// Figures of a data sheet, or of another unit: what holds without the key.
+pub const DATASHEET: &str = "datasheet";
+/// Figures that were measured on this unit.
+pub const MEASURED: &str = "measured";
+
 /// The sensor.yaml of a camera.
 pub fn camera_yaml(c: &RigCamera, comment: &str, rate_hz: f64) -> String {
     let m = &c.camera;
@@ -46,9 +53,10 @@ pub fn camera_yaml(c: &RigCamera, comment: &str, rate_hz: f64) -> String {
 
 /// The sensor.yaml of the inertial unit.
 pub fn imu_yaml(m: &ImuCalibration, comment: &str) -> String {
+    let source = if m.measured { format!("{NOISE_SOURCE}: {MEASURED}\n") } else { String::new() };
     format!(
         "sensor_type: imu\ncomment: {comment}\n{}rate_hz: {}\ngyroscope_noise_density: {:e}\n\
-         gyroscope_random_walk: {:e}\naccelerometer_noise_density: {:e}\naccelerometer_random_walk: {:e}\n",
+         gyroscope_random_walk: {:e}\naccelerometer_noise_density: {:e}\naccelerometer_random_walk: {:e}\n{source}",
         transform_yaml(&Pose::IDENTITY),
         m.rate_hz,
         m.gyro_noise,

@@ -222,6 +222,22 @@ fn missing_noise_falls_back_to_defaults_with_a_warning() {
 }
 
 #[test]
+fn figures_of_noise_are_a_data_sheets_unless_the_file_says_that_they_were_measured() {
+    let f = Folder::new();
+    assert!(!f.open().unwrap().calibration.imu.measured);
+    for (source, measured) in [("datasheet", false), ("measured", true)] {
+        f.write("imu0/sensor.yaml", format!("{IMU}noise_source: {source}\n"));
+        let imu = f.open().unwrap().calibration.imu;
+        assert_eq!(imu.measured, measured);
+        // A recording hands it on.
+        f.write("imu0/sensor.yaml", stipple_drivers::euroc::imu_yaml(&imu, "recorded"));
+        assert_eq!(f.open().unwrap().calibration.imu, imu);
+    }
+    f.write("imu0/sensor.yaml", format!("{IMU}noise_source: guessed\n"));
+    f.refused(FaultKind::Config, "imu0/sensor.yaml:6", "measured or datasheet");
+}
+
+#[test]
 fn rounded_rotations_are_made_orthonormal() {
     let f = Folder::new();
     f.replace("cam1/sensor.yaml", "data: [1.0,", "data: [1.0003,");

@@ -106,6 +106,7 @@ mod tests {
             accel_noise: 1e-2,
             accel_walk: 1e-4,
             range: ImuCalibration::RANGE,
+            measured: false,
             correction: ImuCorrection::NONE,
         };
         RigGeometry::new(&Calibration { cameras, imu }, 0.005)

@@ -48,11 +48,14 @@ pub struct Noise {
 }
 
 impl Noise {
-    /// The config's scales cover what the data sheet does not: vibration, scale and misalignment errors.
+    /// Figures that were measured are believed as they are. The config's scales cover what a data sheet leaves out: vibration,
+    /// scale and misalignment errors.
     pub fn new(imu: &ImuCalibration, config: &VioConfig) -> Noise {
+        let (gyro_scale, accel_scale) =
+            if imu.measured { (1.0, 1.0) } else { (config.gyro_noise_scale, config.accel_noise_scale) };
         Noise {
-            gyro: imu.gyro_noise * config.gyro_noise_scale,
-            accel: imu.accel_noise * config.accel_noise_scale,
+            gyro: imu.gyro_noise * gyro_scale,
+            accel: imu.accel_noise * accel_scale,
             gyro_walk: imu.gyro_walk,
             accel_walk: imu.accel_walk,
             period: 1.0 / imu.rate_hz,
@@ -411,6 +414,16 @@ mod tests {
                 assert!((sum[(i, j)] - expected[(i, j)]).abs() < 0.08 * scale, "{i} {j}");
             }
         }
+    }
+
+    #[test]
+    fn the_allowance_for_a_data_sheet_does_not_touch_figures_that_were_measured() {
+        let config = VioConfig::default();
+        let of = |measured| Noise::new(&ImuCalibration { measured, ..ImuCalibration::CONSUMER }, &config);
+        let (sheet, own) = (of(false), of(true));
+        assert_eq!((own.gyro, own.accel), (1e-4, 1e-3));
+        assert_eq!((sheet.gyro, sheet.accel), (2e-4, 8e-3));
+        assert_eq!((sheet.gyro_walk, sheet.accel_walk), (own.gyro_walk, own.accel_walk));
     }
 
     #[test]

@@ -35,9 +35,8 @@ const SECOND: usize = 20;
 /// Upper ends of the bins of quality.
 const BINS: [u8; 9] = [2, 10, 20, 35, 50, 65, 75, 85, 100];
 
-/// The world's own noise.
+/// The world's own noise of views and biases.
 fn told(c: &mut VioConfig) {
-    (c.gyro_noise_scale, c.accel_noise_scale) = (1.0, 1.0);
     c.observation_sigma_px = crate::world::SIGMA_PX;
     (c.gyro_bias_sigma, c.accel_bias_sigma) = BIASES;
 }
@@ -65,8 +64,8 @@ fn chi_square(k: f64, z: f64) -> f64 {
     k * (1.0 - v + z * v.sqrt()).powi(3)
 }
 
-fn consistency_of(config: fn(&mut VioConfig), flights: usize) -> Consistency {
-    let plan = Plan { pose: from_rest, biases: Some(BIASES), config, ..Plan::default() };
+fn consistency_of(measured: bool, config: fn(&mut VioConfig), flights: usize) -> Consistency {
+    let plan = Plan { pose: from_rest, biases: Some(BIASES), measured, config, ..Plan::default() };
     let mut sums: Vec<(f64, usize)> = vec![(0.0, 0); plan.frames];
     let (mut blocks, mut n, mut undetermined) = ([0.0; 5], 0, 0);
     for seed in 0..flights as u64 {
@@ -112,14 +111,19 @@ fn consistency_of(config: fn(&mut VioConfig), flights: usize) -> Consistency {
     }
 }
 
-/// The estimator told the world's own noise.
+/// NEES of an estimator told the world's own noise, that of the unit as measured.
 pub fn told_the_truth(flights: usize) -> Consistency {
-    consistency_of(told, flights)
+    consistency_of(true, told, flights)
+}
+
+/// NEES of the same with the figures of the unit stated as those of a data sheet, whose allowance widens what is true.
+pub fn told_a_data_sheet(flights: usize) -> Consistency {
+    consistency_of(false, told, flights)
 }
 
 /// NEES of the default settings, which claim less than they know.
 pub fn at_the_defaults(flights: usize) -> Consistency {
-    consistency_of(|_| {}, flights)
+    consistency_of(false, |_| {}, flights)
 }
 
 /// Errors of the frames within a range of quality.
@@ -180,9 +184,10 @@ pub fn by_quality(flights: &[Vec<Record>], ends: &[u8]) -> Vec<Bin> {
     bins
 }
 
-/// NEES of two estimators: an estimator told the world's own noise, and one at the defaults.
-pub fn summary(told: &Consistency, defaults: &Consistency) -> Table {
-    let rows = [("told the world's own noise", told), ("at the defaults", defaults)];
+/// NEES of three estimators: told the world's own noise, the same with the unit's as a data sheet's, and at the defaults.
+pub fn summary([told, sheet, defaults]: [&Consistency; 3]) -> Table {
+    let rows =
+        [("told the world's own noise", told), ("the unit's as a data sheet's", sheet), ("at the defaults", defaults)];
 
     table!("consistency", "NEES", rows, |r| false, [
         text("estimator") => r.0,
@@ -222,7 +227,7 @@ pub fn diagram(bins: &[Bin]) -> Table {
     ])
 }
 
-fn page(told: &Consistency, defaults: &Consistency, bins: &[Bin]) -> Page {
+fn page([told, sheet, defaults]: [&Consistency; 3], bins: &[Bin]) -> Page {
     let frames: usize = bins.iter().map(|b| b.frames).sum();
     let nees = Chart {
         title: "NEES of 15 errors, mean over the flights",
@@ -262,7 +267,7 @@ fn page(told: &Consistency, defaults: &Consistency, bins: &[Bin]) -> Page {
         parts: vec![
             Part::Note("At the defaults the estimator claims less than it knows, on purpose.".into()),
             Part::Charts("Consistency", vec![nees.svg()]),
-            Part::Table(summary(told, defaults)),
+            Part::Table(summary([told, sheet, defaults])),
             Part::Charts("Quality against actual error", vec![drift, velocity]),
             Part::Table(diagram(bins)),
             Part::Table(by_instant(told, defaults)),
@@ -283,11 +288,11 @@ pub struct Args {
 
 pub fn run(args: &Args) -> Result<(), Fault> {
     let (out, flights) = (OutputDir::create(&args.out)?, args.flights as usize);
-    let (told, defaults) = (told_the_truth(flights), at_the_defaults(flights));
+    let all = [told_the_truth(flights), told_a_data_sheet(flights), at_the_defaults(flights)];
     let seeds = (flights as u64).div_ceil(10);
     let bins = reliability(&(1..=seeds).flat_map(stability::flights).collect::<Vec<_>>());
-    page(&told, &defaults, &bins).write(&out)?;
-    println!("{}\n\n{}", summary(&told, &defaults).text(), diagram(&bins).text());
+    page(all.each_ref(), &bins).write(&out)?;
+    println!("{}\n\n{}", summary(all.each_ref()).text(), diagram(&bins).text());
     println!("\n{}", out.file("consistency.html").display());
     Ok(())
 }
@@ -315,6 +320,16 @@ mod tests {
         // Errors of one flight are alike at all its instants, so that flights are what there is of them.
         let bound = |z: f64| chi_square(3.0 * flights as f64, z) / flights as f64;
         assert!(told.blocks.iter().all(|b| (bound(-Z)..=bound(Z)).contains(b)), "{:?}", told.blocks);
+    }
+
+    /// The allowance for a data sheet must not reach a unit whose noise was measured: of true figures it makes an estimate
+    /// that claims less than it knows.
+    #[test]
+    fn the_allowance_for_a_data_sheet_widens_true_figures_and_stating_them_as_measured_takes_it_away() {
+        let (measured, sheet) = (told_the_truth(4), told_a_data_sheet(4));
+        eprintln!("measured {} {:?}, data sheet {} {:?}", measured.mean, measured.blocks, sheet.mean, sheet.blocks);
+        assert!((measured.bounds.0..=measured.bounds.1).contains(&measured.mean), "{measured:?}");
+        assert!(sheet.mean < sheet.bounds.0 && sheet.mean < measured.mean, "{} {}", sheet.mean, measured.mean);
     }
 
     /// Who fuses the estimate gates it by its deviations: none may be smaller than the errors are, and none more than

@@ -21,6 +21,8 @@ pub struct Plan {
     pub pose: fn(f64) -> Pose,
     pub scene: fn(&mut Noise) -> Vec<DVec3>,
     pub config: fn(&mut VioConfig),
+    /// Whether the unit's noise is stated as measured; else as that of a data sheet.
+    pub measured: bool,
     /// What is known of the ends of the ranges of gyro and accelerometer, rad/s and m/s².
     pub range: [f64; 2],
     pub frames: usize,
@@ -39,6 +41,7 @@ impl Default for Plan {
             pose: moving,
             scene: |noise| room(1500, noise),
             config: |_| {},
+            measured: false,
             range: ImuCalibration::RANGE,
             frames: 160,
             biases: None,
@@ -93,7 +96,7 @@ pub fn fly(plan: &Plan, seed: u64, mut each: impl FnMut(&EstimatedFrame)) -> Vio
     }
     let mut config = VioConfig::default();
     (plan.config)(&mut config);
-    world.rig.imu.range = plan.range;
+    (world.rig.imu.range, world.rig.imu.measured) = (plan.range, plan.measured);
     let mut vio = Vio::new(&world.rig, &config);
     let (mut gate, counters) = (ImuGate::new(&world.rig.imu), Counters::default());
     let mut tracks = Tracks::default();

@@ -54,6 +54,7 @@ pub fn calibration() -> Calibration {
         accel_noise: 2e-3,
         accel_walk: 3e-3,
         range: ImuCalibration::RANGE,
+        measured: false,
         correction: ImuCorrection::NONE,
     };
     Calibration { cameras: vec![eye(0.055), eye(-0.055)], imu }

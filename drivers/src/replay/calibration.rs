@@ -7,11 +7,15 @@
 //! where it has `readout_time` (s, first row to last), `line_delay` (s per row, as Kalibr's rolling-shutter calibration
 //! prints) or `shutter: rolling`; the last alone is refused unless the board file states the time. The board file's time
 //! replaces that of the files.
+//!
+//! Noise: `noise_source: measured` beside the figures says that they were measured on this unit (`stipple calib-noise` prints
+//! it with them); without it they are taken for those of a data sheet.
 
 use super::cameras;
 use super::findings::Findings;
 use crate::calibration::{Calibration, ImuCalibration, ImuCorrection, RigCamera};
 use crate::camera::{Camera, Lens};
+use crate::euroc::{DATASHEET, MEASURED, NOISE_SOURCE};
 use crate::types::{Pose, Span};
 use crate::{Fault, FaultKind};
 use glam::{DMat3, DQuat, DVec3};
@@ -28,6 +32,7 @@ pub const IMU_DEFAULTS: ImuCalibration = ImuCalibration {
     gyro_walk: 2.2e-5,
     accel_noise: 2.8e-3,
     accel_walk: 8.6e-4,
+    measured: false,
     range: ImuCalibration::RANGE,
     correction: ImuCorrection::NONE,
 };
@@ -239,9 +244,20 @@ fn yaml_imu(path: &Path, rate: &str, findings: &mut Findings) -> Result<ImuCalib
         gyro_walk: positive("gyroscope_random_walk")?,
         accel_noise: positive("accelerometer_noise_density")?,
         accel_walk: positive("accelerometer_random_walk")?,
+        measured: measured(&file, at)?,
         range: ImuCalibration::RANGE,
         correction: ImuCorrection::NONE,
     })
+}
+
+/// Whether the file says that its figures of noise were measured on the unit.
+fn measured(file: &Document, at: &str) -> Result<bool, Fault> {
+    let key = format!("{at}/{NOISE_SOURCE}");
+    match if file.has(&key) { file.text(&key)? } else { DATASHEET } {
+        MEASURED => Ok(true),
+        DATASHEET => Ok(false),
+        _ => Err(file.fault(&key, "must be measured or datasheet")),
+    }
 }
 
 fn basalt(file: &Document) -> Result<Calibration, Fault> {
@@ -284,6 +300,7 @@ fn basalt(file: &Document) -> Result<Calibration, Fault> {
         gyro_walk: noise("gyro_bias_std")?,
         accel_noise: noise("accel_noise_std")?,
         accel_walk: noise("accel_bias_std")?,
+        measured: measured(file, "/value0")?,
         range: ImuCalibration::RANGE,
         correction: basalt_correction(file)?,
     };

@@ -249,6 +249,7 @@ pub fn euroc_rig() -> Calibration {
             accel_noise: 2.0e-3,
             accel_walk: 3.0e-3,
             range: ImuCalibration::RANGE,
+            measured: false,
             correction: ImuCorrection::NONE,
         },
     }
