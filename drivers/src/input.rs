@@ -1,6 +1,6 @@
-//! Files that somebody else wrote: read whole, up to a stated size, and only where they are plain files.
+//! Files that somebody else wrote: read up to a stated size, and only where they are plain files.
 
-use std::fs::{self, Metadata, OpenOptions};
+use std::fs::{self, File, Metadata, OpenOptions};
 use std::io::{self, ErrorKind, Read};
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::Path;
@@ -8,9 +8,9 @@ use std::path::Path;
 /// Largest file of settings or of a calibration, bytes: a hundred times those that there are.
 pub const SETTINGS_BYTES_MAX: u64 = 1 << 20;
 
-/// Reads a file of at most `bytes_max` bytes into `into`, whose memory is used again. Fails where it is no plain file
-/// (a pipe would wait for ever, a device may never end) and where it is larger.
-pub fn read(path: &Path, bytes_max: u64, into: &mut Vec<u8>) -> io::Result<()> {
+/// Opens a file of at most `bytes_max` bytes. Fails where it is no plain file (a pipe would wait for ever, a device may never
+/// end) and where it is larger.
+pub fn open(path: &Path, bytes_max: u64) -> io::Result<File> {
     let check = |about: Metadata| match about.len() {
         _ if !about.is_file() => Err(io::Error::new(ErrorKind::InvalidInput, "is not a plain file")),
         bytes if bytes > bytes_max => Err(too_large(bytes, bytes_max)),
@@ -21,6 +21,12 @@ pub fn read(path: &Path, bytes_max: u64, into: &mut Vec<u8>) -> io::Result<()> {
     check(fs::metadata(path)?)?;
     let file = OpenOptions::new().read(true).custom_flags(libc::O_NONBLOCK).open(path)?;
     check(file.metadata()?)?;
+    Ok(file)
+}
+
+/// Reads a file of at most `bytes_max` bytes into `into`, whose memory is used again. Fails as [`open`] does.
+pub fn read(path: &Path, bytes_max: u64, into: &mut Vec<u8>) -> io::Result<()> {
+    let file = open(path, bytes_max)?;
     into.clear();
     let bytes = file.take(bytes_max + 1).read_to_end(into)? as u64;
     if bytes > bytes_max {

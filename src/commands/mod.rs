@@ -1,6 +1,7 @@
 //! The commands of `stipple`, one file each: their arguments, and what they print.
 
 mod calib_check;
+mod calib_noise;
 mod check;
 mod checks;
 mod demo;
@@ -48,6 +49,8 @@ enum Command {
     Check(check::Args),
     /// Judge the calibration of a recording: rectified rows, clock offset, gyro axes and bias, camera attitude
     CalibCheck(calib_check::Args),
+    /// Measure the noise of an inertial unit from a recording of it at rest, and print it as a calibration states it
+    CalibNoise(calib_noise::Args),
     /// Map for a process that flies; `run` starts it
     #[command(hide = true)]
     MapWorker,
@@ -66,7 +69,7 @@ pub fn main() -> ExitCode {
         }
     };
     // What these print is all that they do: a reader that stops, as `head` does, has read enough.
-    if matches!(cli.command, Command::Check(_) | Command::CalibCheck(_) | Command::Doctor(_)) {
+    if matches!(cli.command, Command::Check(_) | Command::CalibCheck(_) | Command::CalibNoise(_) | Command::Doctor(_)) {
         stipple_drivers::host::end_when_unread();
     }
     crate::run::threads::abort_on_panic(|what| {
@@ -82,6 +85,7 @@ pub fn main() -> ExitCode {
         Command::Sim(args) => sim::sim(&args),
         Command::Check(args) => check::check(&args),
         Command::CalibCheck(args) => calib_check::calib_check(&args),
+        Command::CalibNoise(args) => calib_noise::calib_noise(&args),
         Command::Doctor(args) => doctor::doctor(&args),
         Command::MapWorker => crate::run::worker::serve(std::io::stdin().lock(), std::io::stdout().lock()),
     };

@@ -21,7 +21,7 @@ use crate::{Fault, FaultKind};
 use glam::{DMat3, DQuat, DVec3};
 use std::path::{Path, PathBuf};
 
-mod document;
+pub(super) mod document;
 use document::Document;
 
 /// Noise of a consumer MEMS unit (BMI160 with the white noise doubled and the walks times ten, as TUM-VI recommends for
@@ -216,6 +216,13 @@ fn yaml_camera(file: &Document, at: &str, coefficients: &str) -> Result<Camera, 
     let own = if model == "ds" { 2 } else { 0 };
     let f = &numbers("intrinsics", own + 4)?[own..];
     checked(file, at, [size[0], size[1]], [f[0], f[1], f[2], f[3]], lens)
+}
+
+/// The rate of the inertial unit that a sensor.yaml or an imu_config.yaml states, Hz; a fault where it states none.
+pub(super) fn stated_rate(file: &Document) -> Result<f64, Fault> {
+    let at = if file.has("/imu0") { "/imu0" } else { "" };
+    let [euroc, kalibr] = ["rate_hz", "update_rate"].map(|name| format!("{at}/{name}"));
+    file.positive(if file.has(&kalibr) { &kalibr } else { &euroc })
 }
 
 fn yaml_imu(path: &Path, rate: &str, findings: &mut Findings) -> Result<ImuCalibration, Fault> {

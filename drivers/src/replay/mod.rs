@@ -14,6 +14,7 @@ mod calibration;
 mod cameras;
 mod findings;
 mod images;
+mod inertial;
 mod order;
 mod pairing;
 mod table;
@@ -23,6 +24,7 @@ pub use calibration::read_calibration;
 pub use cameras::CAMERAS_MAX;
 pub use findings::ReplayCounters;
 pub use images::{ImageFault, Reader};
+pub use inertial::read_inertial;
 pub use pairing::{FrameFiles, ImageFile};
 pub(crate) use table::{numbers, read_strictly, Row};
 pub use trajectory::read_trajectory;
@@ -144,15 +146,19 @@ fn root(home: &Path, mav0: &Path) -> Result<PathBuf, Fault> {
     }
 }
 
+/// Columns of a table of inertial samples.
+const IMU_COLUMNS: &str = "stamp [ns], gyro x y z [rad/s], accelerometer x y z [m/s²]";
+
+/// The sample of such a row.
+fn imu_of(fields: &[&str]) -> Option<ImuSample> {
+    let [t, values @ ..] = fields else { return None };
+    let v: [f64; 6] = table::numbers(values)?.try_into().ok()?;
+    let (gyro_body, accel_body) = (DVec3::new(v[0], v[1], v[2]), DVec3::new(v[3], v[4], v[5]));
+    Some(ImuSample { t: Nanos(t.parse().ok()?), gyro_body, accel_body, ..ImuSample::default() })
+}
+
 fn read_imu(path: &Path, hole: Span, findings: &mut Findings) -> Result<Vec<ImuSample>, Fault> {
-    const COLUMNS: &str = "stamp [ns], gyro x y z [rad/s], accelerometer x y z [m/s²]";
-    let parse = |fields: &[&str]| -> Option<ImuSample> {
-        let [t, values @ ..] = fields else { return None };
-        let v: [f64; 6] = table::numbers(values)?.try_into().ok()?;
-        let (gyro_body, accel_body) = (DVec3::new(v[0], v[1], v[2]), DVec3::new(v[3], v[4], v[5]));
-        Some(ImuSample { t: Nanos(t.parse().ok()?), gyro_body, accel_body, ..ImuSample::default() })
-    };
-    let mut rows = table::read(path, COLUMNS, parse, findings)?;
+    let mut rows = table::read(path, IMU_COLUMNS, imu_of, findings)?;
     rows.retain(|row| {
         if !row.value.is_finite() {
             findings.warn(|c| &mut c.imu_not_finite, path, row.line, "sample is not finite: dropped");

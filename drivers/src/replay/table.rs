@@ -82,7 +82,7 @@ pub fn read<T>(
 }
 
 /// Fields between commas, or between blanks where there is no comma.
-fn split(content: &str) -> Vec<&str> {
+pub fn split(content: &str) -> Vec<&str> {
     if content.contains(',') {
         content.split(',').map(str::trim).collect()
     } else {
@@ -90,7 +90,8 @@ fn split(content: &str) -> Vec<&str> {
     }
 }
 
-fn excerpt(content: &str) -> String {
+/// The beginning of a row, for messages.
+pub fn excerpt(content: &str) -> String {
     content.chars().take(60).filter(|c| !c.is_control()).collect()
 }
 

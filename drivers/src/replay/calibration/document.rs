@@ -30,15 +30,22 @@ fn too_deep(text: &str) -> Option<usize> {
     Some(1 + text[..at].matches('\n').count())
 }
 
+fn wrong(path: &Path, line: usize, what: String) -> Fault {
+    let place = findings::place(path, line);
+    Fault::new(FaultKind::Config, place, what.replace('\n', " "), "correct the calibration file")
+}
+
 impl Document {
     /// Reads and parses a file; a fault where it cannot be read or is neither YAML nor JSON.
     pub fn read(path: &Path) -> Result<Document, Fault> {
         let bytes = table::read_bytes(path, SETTINGS_BYTES_MAX)?;
-        let wrong = |line: usize, what: String| {
-            let place = findings::place(path, line);
-            Fault::new(FaultKind::Config, place, what.replace('\n', " "), "correct the calibration file")
-        };
-        let mut text = String::from_utf8(bytes).map_err(|_| wrong(0, "is not text".into()))?;
+        let text = String::from_utf8(bytes).map_err(|_| wrong(path, 0, "is not text".into()))?;
+        Document::parse(path, text)
+    }
+
+    /// Parses the text of a file; a fault where it is neither YAML nor JSON.
+    pub fn parse(path: &Path, mut text: String) -> Result<Document, Fault> {
+        let wrong = |line: usize, what: String| wrong(path, line, what);
         if text.starts_with('%') {
             // OpenCV writes "%YAML:1.0", which is not YAML; blanked, so that lines keep their numbers.
             let end = text.find('\n').unwrap_or(text.len());
