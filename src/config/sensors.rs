@@ -33,8 +33,8 @@ section! {
     format: String = String::new();
     /// Frames a second, the trigger's too. More than 30 costs CPU time and gains little.
     rate_hz: f64 = 20.0, Bound::Within(0.1, 1000.0);
-    /// Exposure time; 0: as the camera has it. Fix it: automatic exposure moves the middle of the exposure, which is what
-    /// stamps are, and a long one blurs.
+    /// Exposure time; 0: as the camera has it, followed from frame to frame where its driver tells. Fix it: an automatic one is
+    /// told a frame late, which moves stamps by half its change, and a long one blurs.
     exposure_us: u32 = 0, Bound::Within(0.0, 1_000_000.0);
     /// Time of one line, where the camera counts its exposure in lines (a line of a sensor takes 5 to 60 µs); 0: it counts in
     /// time.

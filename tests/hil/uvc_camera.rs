@@ -6,11 +6,12 @@
 //! PORT is one of the hub's eight. Pictures are `pattern::packed`, and picture `k` is exposed at `k` periods of
 //! CLOCK_MONOTONIC, hence cameras started apart see together; or those of FRAMES, a file of raw ones in FORMAT, once, so
 //! many ns after the instant that `play` names as the lines of INSTANTS say. What the machine is too slow to send in a
-//! quarter of a period is not sent, as a camera does.
+//! quarter of a period is not sent, as a camera does. One whose SERIAL begins with AE exposes automatically, and says how
+//! long in its controls, at first for 4 ms.
 //!
 //! Lines on the standard input: `skip N` (send nothing for N pictures), `corrupt N` (with the error bit), `short N` (end
-//! after half), `silent N` (as skip, and said so), `play NS`, `unplug`. Lines on the standard output: `streaming`, `sent
-//! K`, `not sent K`.
+//! after half), `silent N` (as skip, and said so), `expose N` (for so many 0.1 ms from then on), `play NS`, `unplug`. Lines on
+//! the standard output: `streaming`, `sent K`, `not sent K`.
 
 #[path = "jpeg.rs"]
 mod jpeg;
@@ -49,6 +50,8 @@ struct Bus {
     /// Sequence number and length of each transfer that waits for a payload.
     waiting: VecDeque<(u32, usize)>,
     streaming: bool,
+    /// Exposure that the camera has set, in 0.1 ms.
+    exposure: u32,
 }
 
 #[derive(Default)]
@@ -76,6 +79,7 @@ fn main() {
     });
     let socket = plug(number(0) as u32);
     let bus: Shared<Bus> = Arc::default();
+    bus.0.lock().expect("whole").exposure = 40;
     let orders: Shared<Orders> = Arc::default();
     let answers = Arc::new(Mutex::new(socket.try_clone().expect("a second descriptor")));
     {
@@ -83,9 +87,9 @@ fn main() {
         std::thread::spawn(move || serve(socket, &bus, &answers, &descriptors));
     }
     {
-        let orders = orders.clone();
+        let (orders, bus) = (orders.clone(), bus.clone());
         std::thread::spawn(move || {
-            std::io::stdin().lock().lines().map_while(Result::ok).for_each(|l| obey(&l, &orders))
+            std::io::stdin().lock().lines().map_while(Result::ok).for_each(|l| obey(&l, &orders, &bus))
         });
     }
     expose(&camera, film.as_ref(), &bus, &orders, &answers);
@@ -100,7 +104,7 @@ fn plug(port: u32) -> UnixStream {
     ours
 }
 
-fn obey(line: &str, shared: &Shared<Orders>) {
+fn obey(line: &str, shared: &Shared<Orders>, bus: &Shared<Bus>) {
     let (order, number) = line.split_once(' ').unwrap_or((line, "1"));
     let number: i64 = number.parse().expect("a number");
     let mut orders = shared.0.lock().expect("no thread panics with it");
@@ -108,6 +112,7 @@ fn obey(line: &str, shared: &Shared<Orders>) {
         "skip" | "silent" => orders.skip += number as u32,
         "corrupt" => orders.corrupt += number as u32,
         "short" => orders.short += number as u32,
+        "expose" => bus.0.lock().expect("whole").exposure = number as u32,
         "play" => orders.play = Some(number),
         "unplug" => std::process::exit(0),
         _ => panic!("unknown order {line}"),
@@ -256,6 +261,7 @@ struct Descriptors {
     configuration: Vec<u8>,
     probe: Vec<u8>,
     strings: [String; 3],
+    automatic: bool,
 }
 
 impl Descriptors {
@@ -283,13 +289,16 @@ impl Descriptors {
             [&frame_head[..], &w, &h, &rate, &rate, &long(size), &long(interval), &[1], &long(interval)].concat();
         let colour = [6, 0x24, 0x0d, 1, 1, 4];
         let stream_length = ((14 + format.len() + frame.len() + colour.len()) as u16).to_le_bytes();
+        let automatic = camera.serial.starts_with("AE");
+        // Of the camera terminal: the mode of automatic exposure, and the time of exposure.
+        let controls = if automatic { 0x0a } else { 0 };
         let mut configuration = [
             // Configuration, association, control interface with camera terminal and output.
             &[9, 2, 0, 0, 2, 1, 0, 0x80, 250][..],
             &[8, 0x0b, 0, 2, 0x0e, 3, 0, 2],
             &[9, 4, 0, 0, 0, 0x0e, 1, 0, 2],
             &[13, 0x24, 1, 0, 1, 40, 0, 0x00, 0x6c, 0xdc, 0x02, 1, 1],
-            &[18, 0x24, 2, 1, 1, 2, 0, 0, 0, 0, 0, 0, 0, 0, 3, 0, 0, 0],
+            &[18, 0x24, 2, 1, 1, 2, 0, 0, 0, 0, 0, 0, 0, 0, 3, controls, 0, 0],
             &[9, 0x24, 3, 2, 1, 1, 0, 1, 0],
             // Streaming interface, its one format and size, its bulk endpoint.
             &[9, 4, 1, 0, 1, 0x0e, 2, 0, 0],
@@ -305,7 +314,7 @@ impl Descriptors {
         let probe = [&[1, 0, 1, 1][..], &long(interval), &[0; 10], &long(size), &long(PAYLOAD as u32)].concat();
         let device = vec![18, 1, 0, 2, 0xef, 2, 1, 64, 0x09, 0x12, 1, 0, 0, 1, 1, 2, 3, 1];
         let strings = ["Stipple".to_string(), format!("HIL {}", camera.serial), camera.serial.clone()];
-        Descriptors { device, configuration, probe, strings }
+        Descriptors { device, configuration, probe, strings, automatic }
     }
 
     /// What a control transfer is answered; none: it is not understood.
@@ -313,6 +322,7 @@ impl Descriptors {
         const GET_DESCRIPTOR: (u8, u8) = (0x80, 6);
         const PROBE: u8 = 1;
         const COMMIT: u8 = 2;
+        const TERMINAL: u8 = 1;
         let [kind, request, low, high, ..] = setup;
         let stream = |on: bool| {
             on.then(|| println!("streaming"));
@@ -335,6 +345,7 @@ impl Descriptors {
             (0x02, 1) => stream(false),
             (0x00..=0x02, _) => Some(vec![]),
             (0x80..=0x82, 0) => Some(vec![0, 0]),
+            (0xa1, _) if self.automatic && setup[5] == TERMINAL => exposure(request, high, bus),
             // GET_INFO, GET_LEN, and the one setting there is.
             (0xa1, 0x86) => Some(vec![3]),
             (0xa1, 0x85) => Some(vec![self.probe.len() as u8, 0]),
@@ -343,5 +354,28 @@ impl Descriptors {
             (0x21, 1) => Some(vec![]),
             _ => None,
         }
+    }
+}
+
+/// The answer of the camera terminal: which `request` about which `control`.
+fn exposure(request: u8, control: u8, bus: &Shared<Bus>) -> Option<Vec<u8>> {
+    const AUTO_MODE: u8 = 2;
+    const TIME: u8 = 4;
+    /// The time of exposure is automatic, the aperture is not; the other mode there is: neither is.
+    const APERTURE_PRIORITY: u8 = 8;
+    const MANUAL: u8 = 1;
+    let time = |n: u32| Some(n.to_le_bytes().to_vec());
+    match (control, request) {
+        // GET_CUR, GET_DEF; GET_RES lists the modes.
+        (AUTO_MODE, 0x81 | 0x87) => Some(vec![APERTURE_PRIORITY]),
+        (AUTO_MODE, 0x84) => Some(vec![APERTURE_PRIORITY | MANUAL]),
+        (AUTO_MODE, 0x86) => Some(vec![3]),
+        // GET_CUR, GET_MIN, GET_MAX, GET_RES, GET_DEF; GET_INFO: it is read, set, and changes by itself.
+        (TIME, 0x81) => time(bus.0.lock().expect("whole").exposure),
+        (TIME, 0x82 | 0x84) => time(1),
+        (TIME, 0x83) => time(10_000),
+        (TIME, 0x87) => time(40),
+        (TIME, 0x86) => Some(vec![0x0b]),
+        _ => None,
     }
 }

@@ -1,6 +1,7 @@
 //! Controls of a camera: exposure in time, everything else by the name that `v4l2-ctl --list-ctrls` gives it. Values are
 //! checked against the range that the camera states, and a name it does not have is refused with those it has.
 
+use super::exposure::Exposure;
 use super::fault::refused;
 use super::kernel::{Kernel, Request};
 use super::uapi::*;
@@ -43,8 +44,8 @@ impl<'a> Controls<'a> {
         Ok(Controls { kernel, fd, name, known })
     }
 
-    /// Sets what the settings ask for; answers the exposure that results, zero where the camera does not say.
-    pub(super) fn apply(&self, settings: &Settings) -> Result<Span, Fault> {
+    /// Sets what the settings ask for; answers the exposure that results, which is followed from then on.
+    pub(super) fn apply(&self, settings: &Settings) -> Result<Exposure, Fault> {
         // First of all: a camera that exposes automatically refuses an exposure.
         for (name, value) in &settings.controls {
             let key = format!("camera.controls.{name}");
@@ -56,21 +57,26 @@ impl<'a> Controls<'a> {
         let (control, unit) = match (absolute, lines) {
             (Some(control), _) => (control, EXPOSURE_UNIT),
             (None, Some(control)) => (control, settings.exposure_line),
-            (None, None) if settings.exposure.0 == 0 => return Ok(Span(0)),
+            (None, None) if settings.exposure.0 == 0 => return Ok(Exposure::unknown()),
             (None, None) => {
                 let fix =
                     "state camera.exposure_line_us where it has `exposure` in lines, or leave camera.exposure_us out";
                 return Err(self.wrong(format!("cannot set an exposure in time; it has {}", self.names()), fix));
             }
         };
+        let auto = self.known.iter().find(|c| c.id == CID_EXPOSURE_AUTO);
         if settings.exposure.0 > 0 {
-            if let Some(auto) = self.known.iter().find(|c| c.id == CID_EXPOSURE_AUTO) {
+            if let Some(auto) = auto {
                 self.set("camera.exposure_us", auto, EXPOSURE_MANUAL)?;
             }
             let value = (settings.exposure.0 + unit.0 / 2) / unit.0;
             self.set("camera.exposure_us", control, value)?;
         }
-        Ok(Span(self.get(control)?.saturating_mul(unit.0)))
+        let mut exposure = Exposure::new(control, unit, self.get(control)?);
+        let manual = [EXPOSURE_MANUAL, EXPOSURE_SHUTTER_PRIORITY];
+        let automatic = auto.map_or(Ok(false), |auto| self.get(auto).map(|mode| !manual.contains(&mode)))?;
+        exposure.begin(self.kernel, self.fd, automatic);
+        Ok(exposure)
     }
 
     fn set(&self, key: &str, control: &QueryControl, value: i64) -> Result<(), Fault> {
@@ -95,8 +101,7 @@ impl<'a> Controls<'a> {
         let mut asked = ExtControl { id: control.id, ..ExtControl::default() };
         let answer = self.kernel.ioctl(self.fd, Request::GetExtControl(&mut asked));
         answer.map_err(|e| refused(self.name, &purpose, "VIDIOC_G_EXT_CTRLS", &e))?;
-        // Only the low half is written where a control has 32 bits.
-        Ok(if control.kind == CONTROL_INTEGER64 { asked.value } else { i64::from(asked.value as i32) })
+        Ok(control.number(asked.value))
     }
 
     fn unknown(&self, key: &str, name: &str) -> Fault {

@@ -28,6 +28,9 @@ pub(super) enum Request<'a> {
     QueryControl(&'a mut QueryControl),
     SetExtControl(&'a mut ExtControl),
     GetExtControl(&'a mut ExtControl),
+    SubscribeEvent(&'a mut EventSubscription),
+    /// Does not wait: ENOENT where there is none.
+    DequeueEvent(&'a mut Event),
 }
 
 impl Request<'_> {
@@ -49,6 +52,8 @@ impl Request<'_> {
             Request::QueryControl(_) => "VIDIOC_QUERY_EXT_CTRL",
             Request::SetExtControl(_) => "VIDIOC_S_EXT_CTRLS",
             Request::GetExtControl(_) => "VIDIOC_G_EXT_CTRLS",
+            Request::SubscribeEvent(_) => "VIDIOC_SUBSCRIBE_EVENT",
+            Request::DequeueEvent(_) => "VIDIOC_DQEVENT",
         }
     }
 }
@@ -168,6 +173,8 @@ impl Kernel for Linux {
             Request::QueryControl(a) => call(fd, QUERY_EXT_CTRL, a),
             Request::SetExtControl(a) => one_control(fd, S_EXT_CTRLS, a),
             Request::GetExtControl(a) => one_control(fd, G_EXT_CTRLS, a),
+            Request::SubscribeEvent(a) => call(fd, SUBSCRIBE_EVENT, a),
+            Request::DequeueEvent(a) => call(fd, DQEVENT, a),
         }
     }
 
@@ -246,6 +253,8 @@ mod tests {
             Request::StreamOn(CAPTURE),
             Request::StreamOff(CAPTURE),
             Request::QueryControl(&mut QueryControl::default()),
+            Request::SubscribeEvent(&mut EventSubscription::default()),
+            Request::DequeueEvent(&mut Event::default()),
         ];
         for request in requests {
             let name = request.name();

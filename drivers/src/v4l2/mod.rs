@@ -5,7 +5,8 @@
 //! which also makes 8-bit grey of them (`pixels`). All decisions are functions of numbers, and all system calls go through
 //! one trait, so tests meet each error of each call without a camera.
 //!
-//! Stamps are the driver's, brought to the middle of the exposure of the first row (`stamps::Timing`) and then to the
+//! Stamps are the driver's, brought to the middle of the exposure of the first row (`stamps::Timing`), which is followed from
+//! frame to frame (`exposure`), and then to the
 //! calibration's clock and middle row, as those of recordings are. A frame is `Got` when every camera has one within the
 //! tolerance; an image without a partner is counted and its buffer given back at once. A camera that is unplugged or silent
 //! is closed, and from the next call on looked for by its name and opened again, with growing pauses. Meanwhile the others
@@ -14,6 +15,7 @@
 //! Nothing is allocated between opening and losing a camera, except by the JPEG decoder and to word a warning.
 
 mod controls;
+mod exposure;
 mod fault;
 mod find;
 mod kernel;
@@ -48,7 +50,7 @@ pub struct Settings {
     /// Rows of one camera's picture, pixels.
     pub height: usize,
     pub rate_hz: f64,
-    /// Zero: as the camera has it.
+    /// Zero: as the camera has it, frame by frame.
     pub exposure: Span,
     /// Time of one line, where the camera counts its exposure in lines; zero: it counts in time.
     pub exposure_line: Span,
@@ -91,6 +93,9 @@ crate::counters! {
     /// elsewhere.
     camera_stamps_unknown,
     camera_stamps_copied,
+    /// Images whose exposure is not that of the image before, and cameras whose exposure could not be followed any more.
+    camera_exposure_changes,
+    camera_exposures_lost,
     /// Images dropped for a stamp in the future, or from long ago.
     camera_stamps_implausible,
     /// Images and frames dropped for a stamp that is not newer than the last one's.

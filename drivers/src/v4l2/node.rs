@@ -4,6 +4,7 @@
 #![allow(unsafe_code)]
 
 use super::controls::Controls;
+use super::exposure::{Exposure, Followed};
 use super::fault::refused;
 use super::find::{cannot_open, capabilities, text};
 use super::kernel::{Kernel, Request};
@@ -11,7 +12,7 @@ use super::offer::{self, code_text};
 use super::pixels::{least_bytes, Format, Part};
 use super::uapi::*;
 use super::Settings;
-use crate::types::Span;
+use crate::types::{Nanos, Span};
 use crate::{Fault, FaultKind};
 use std::io;
 use std::path::Path;
@@ -42,8 +43,8 @@ pub(super) struct Node {
     pub part: Part,
     /// From frame to frame.
     pub period: Span,
-    /// The camera's exposure; zero: it does not say.
-    pub exposure: Span,
+    /// The exposure of its newest frame.
+    pub exposure: Exposure,
     buffers: Vec<Mapped>,
 }
 
@@ -104,7 +105,7 @@ impl Node {
         let fd = kernel.open(path).map_err(|e| cannot_open(path, &e))?;
         let part = Part { x: 0, width: want.width * parts, height: want.height, stride: 0 };
         let (name, format) = (path.display().to_string(), Format::Grey);
-        let (period, exposure, buffers) = (Span(0), Span(0), Vec::new());
+        let (period, exposure, buffers) = (Span(0), Exposure::unknown(), Vec::new());
         let mut node = Node { kernel, fd, name, kind: CAPTURE, format, part, period, exposure, buffers };
         node.identify()?;
         let least = node.negotiate(want)?;
@@ -288,6 +289,11 @@ impl Node {
         let (stamp_s, stamp_us) = (b.stamp_s, b.stamp_us);
         let (index, bytes) = (b.index, end - start);
         Ok(Taken::Filled(Filled { index, start, bytes, sequence: b.sequence, flags: b.flags, stamp_s, stamp_us }))
+    }
+
+    /// Brings the exposure to the frame that is stamped so. One system call at most, which does not wait.
+    pub(super) fn follow_exposure(&mut self, stamp: Nanos) -> Followed {
+        self.exposure.follow(&*self.kernel, self.fd, stamp)
     }
 
     /// The bytes that the camera wrote.

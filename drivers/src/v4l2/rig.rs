@@ -81,7 +81,7 @@ impl Rig {
         let line = |s: &Stream| {
             let (node, part) = (&s.node, s.node.part);
             let (name, format) = (&node.name, node.format.name());
-            let (hz, us) = (1.0 / node.period.secs(), node.exposure.0 / 1000);
+            let (hz, us) = (1.0 / node.period.secs(), node.exposure.now.0 / 1000);
             format!("{name}: {format} {}x{} at {hz:.2} Hz, exposure {us} us", part.width, part.height)
         };
         self.streams.iter().flatten().map(line).collect()
@@ -95,7 +95,8 @@ impl Rig {
     fn open_stream(&self, select: &Select, last_image: Option<Nanos>) -> Result<Stream, Fault> {
         let path = find(&*self.kernel, select)?;
         let node = Node::open(self.kernel.clone(), &path, self.parts(), &self.settings)?;
-        let timing = Timing { point: self.settings.stamp, exposure: node.exposure, transfer: self.settings.transfer };
+        let timing =
+            Timing { point: self.settings.stamp, exposure: node.exposure.now, transfer: self.settings.transfer };
         Ok(Stream::new(node, timing, self.kernel.now(), last_image))
     }
 

@@ -1,6 +1,7 @@
 //! One node with the images that were taken from it and wait for their partners. Times come in as numbers; whether a camera
 //! is missed or silent is decided here.
 
+use super::exposure::Followed;
 use super::fault::{is_gone, refused};
 use super::kernel::Ready;
 use super::node::{Failure, Filled, Node};
@@ -107,9 +108,16 @@ impl Stream {
         counters: &mut CameraCounters,
     ) -> Result<(), Fault> {
         (self.last_sign, self.last_image, self.errors) = (now, Some(now), 0);
+        let stamp = stamp_of(filled.flags, filled.stamp_s, filled.stamp_us, now);
+        match self.node.follow_exposure(if let Stamp::Monotonic(t) = stamp { t } else { now }) {
+            Followed::Same => {}
+            Followed::Changed => counters.camera_exposure_changes += 1,
+            Followed::Lost => counters.camera_exposures_lost += 1,
+        }
+        self.timing.exposure = self.node.exposure.now;
         // Now is after the last row, by as long as we were not running.
         let arrived = Timing { point: StampPoint::FrameEnd, ..self.timing }.mid_exposure(now, 0);
-        let stamp = match stamp_of(filled.flags, filled.stamp_s, filled.stamp_us, now) {
+        let stamp = match stamp {
             Stamp::Monotonic(t) => Some(self.timing.mid_exposure(t, filled.flags)),
             Stamp::Implausible => {
                 counters.camera_stamps_implausible += 1;

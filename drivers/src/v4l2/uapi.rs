@@ -31,6 +31,8 @@ pub(super) const SIZE_DISCRETE: u32 = 1;
 pub(super) const NEXT_CONTROL: u32 = 0x8000_0000;
 pub(super) const CONTROL_DISABLED: u32 = 0x1;
 pub(super) const CONTROL_READ_ONLY: u32 = 0x4;
+/// The value changes by itself.
+pub(super) const CONTROL_VOLATILE: u32 = 0x80;
 pub(super) const CONTROL_INTEGER: u32 = 1;
 pub(super) const CONTROL_INTEGER64: u32 = 5;
 /// Kinds whose value is a number: these two, BOOLEAN, MENU, BITMASK and INTEGER_MENU.
@@ -38,8 +40,13 @@ pub(super) const CONTROL_NUMBERS: [u32; 6] = [CONTROL_INTEGER, CONTROL_INTEGER64
 pub(super) const CID_EXPOSURE: u32 = 0x0098_0911;
 pub(super) const CID_EXPOSURE_AUTO: u32 = 0x009a_0901;
 pub(super) const CID_EXPOSURE_ABSOLUTE: u32 = 0x009a_0902;
-/// Value of `CID_EXPOSURE_AUTO` that lets us set the exposure.
+/// Values of `CID_EXPOSURE_AUTO` with which the exposure is what it is set to: set by us, and with an automatic aperture.
 pub(super) const EXPOSURE_MANUAL: i64 = 1;
+pub(super) const EXPOSURE_SHUTTER_PRIORITY: i64 = 2;
+
+/// Event that a control was changed, and that its value was (`V4L2_EVENT_CTRL`, `.._CH_VALUE`).
+pub(super) const EVENT_CONTROL: u32 = 3;
+pub(super) const EVENT_CONTROL_VALUE: u32 = 0x1;
 
 pub(super) const QUERYCAP: u32 = read::<Capability>(0);
 pub(super) const ENUM_FMT: u32 = both::<FormatDescription>(2);
@@ -55,6 +62,8 @@ pub(super) const G_EXT_CTRLS: u32 = both::<ExtControls>(71);
 pub(super) const S_EXT_CTRLS: u32 = both::<ExtControls>(72);
 pub(super) const ENUM_FRAMESIZES: u32 = both::<FrameSize>(74);
 pub(super) const ENUM_FRAMEINTERVALS: u32 = both::<FrameInterval>(75);
+pub(super) const DQEVENT: u32 = read::<Event>(89);
+pub(super) const SUBSCRIBE_EVENT: u32 = write::<EventSubscription>(90);
 pub(super) const QUERY_EXT_CTRL: u32 = both::<QueryControl>(103);
 
 const fn number(direction: u32, size: usize, nr: u32) -> u32 {
@@ -154,9 +163,30 @@ structures! {
         which: u32, count: u32, error_index: u32, request_fd: i32, reserved: u32, controls: u64,
     }
 
+    EventSubscription {
+        kind: u32, id: u32, flags: u32, reserved: [u32; 5],
+    }
+
+    /// `v4l2_event` of a control: what changed of it, its kind, its value (in the low half where it has 32 bits).
+    Event {
+        kind: u32, padding: u32, changes: u32, control_kind: u32, value: i64, rest: [u32; 12],
+        pending: u32, sequence: u32, stamp_s: i64, stamp_ns: i64, id: u32, reserved: [u32; 9],
+    }
+
     QueryControl {
         id: u32, kind: u32, name: [u8; 32], minimum: i64, maximum: i64, step: u64, default: i64, flags: u32,
         elem_size: u32, elems: u32, nr_of_dims: u32, dims: [u32; 4], reserved: [u32; 32],
+    }
+}
+
+impl QueryControl {
+    /// The number of a value, of which only the low half is written where a control has 32 bits.
+    pub(super) fn number(&self, value: i64) -> i64 {
+        if self.kind == CONTROL_INTEGER64 {
+            value
+        } else {
+            i64::from(value as i32)
+        }
     }
 }
 
@@ -171,11 +201,12 @@ const _: () = {
     assert!(std::mem::offset_of!(Buffer, place) == 64);
     assert!(size_of::<Plane>() == 64);
     assert!(size_of::<ExtControl>() == 20);
+    assert!(std::mem::offset_of!(Event, stamp_s) == 80 && std::mem::offset_of!(Event, id) == 96);
     // What the header's macros give.
     assert!(QUERYCAP == 0x8068_5600 && ENUM_FMT == 0xc040_5602 && S_FMT == 0xc0d0_5605 && REQBUFS == 0xc014_5608);
     assert!(QUERYBUF == 0xc058_5609 && QBUF == 0xc058_560f && DQBUF == 0xc058_5611);
     assert!(STREAMON == 0x4004_5612 && STREAMOFF == 0x4004_5613 && S_PARM == 0xc0cc_5616);
     assert!(G_EXT_CTRLS == 0xc020_5647);
     assert!(S_EXT_CTRLS == 0xc020_5648 && ENUM_FRAMESIZES == 0xc02c_564a && ENUM_FRAMEINTERVALS == 0xc034_564b);
-    assert!(QUERY_EXT_CTRL == 0xc0e8_5667);
+    assert!(QUERY_EXT_CTRL == 0xc0e8_5667 && DQEVENT == 0x8088_5659 && SUBSCRIBE_EVENT == 0x4020_565a);
 };

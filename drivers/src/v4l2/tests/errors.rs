@@ -215,7 +215,7 @@ fn rates_that_cannot_be_listed_are_left_out_of_the_list() {
 /// The tests above, together, have met an error of every request there is.
 #[test]
 fn no_request_is_without_a_test_of_its_errors() {
-    let source = include_str!("errors.rs");
+    let source = concat!(include_str!("errors.rs"), include_str!("exposures.rs"));
     let kernel = include_str!("../kernel.rs");
     let names: BTreeSet<&str> = kernel.split('"').filter(|s| s.starts_with("VIDIOC_")).collect();
     assert!(names.len() >= 15, "{names:?}");

@@ -36,6 +36,9 @@ pub struct Cam {
     /// What S_PARM answers: seconds a frame; none: it refuses.
     pub interval: Option<(u32, u32)>,
     pub controls: Vec<(QueryControl, i64)>,
+    /// Controls whose changes are to be told, and those that wait to be: when, which, its value.
+    pub subscribed: Vec<u32>,
+    pub events: VecDeque<(i64, u32, i64)>,
     /// What S_FMT makes of the size, and of bytes a row.
     pub adjust: fn(&mut (u32, u32, u32)),
     pub buffer_bytes: usize,
@@ -67,6 +70,8 @@ pub struct State {
     pub fails: Vec<Fail>,
     pub failed: BTreeSet<&'static str>,
     pub calls: BTreeMap<&'static str, usize>,
+    /// Time that reading a control takes.
+    pub read_takes: i64,
     fds: BTreeMap<i32, usize>,
     mapped: BTreeSet<usize>,
 }
@@ -91,6 +96,8 @@ impl Cam {
             formats: vec![(*b"GREY", vec![(WIDTH as u32, HEIGHT as u32), (32, 16)])],
             interval: Some((1, 20)),
             controls: Vec::new(),
+            subscribed: Vec::new(),
+            events: VecDeque::new(),
             adjust: |_| {},
             buffer_bytes: 64,
             buffers_given: 4,
@@ -129,6 +136,7 @@ impl Cam {
         self.streaming = false;
         self.queued.clear();
         self.done.clear();
+        self.events.clear();
     }
 }
 
@@ -227,7 +235,10 @@ impl Kernel for Machine {
             return refuse(libc::ENODEV);
         }
         c.run(now);
-        answer(c, request)
+        let read = matches!(request, Request::GetExtControl(_));
+        let answered = answer(c, request);
+        s.now += if read { s.read_takes } else { 0 };
+        answered
     }
 
     fn map(&self, fd: i32, offset: i64, length: usize) -> io::Result<*const u8> {
@@ -340,6 +351,15 @@ fn answer(c: &mut Cam, request: Request) -> io::Result<()> {
         Request::SetExtControl(a) => set(c, a.id, a.value),
         // As the kernel does, only the low half is written.
         Request::GetExtControl(a) => a.value = i64::from(get(c, a.id) as u32),
+        Request::SubscribeEvent(a) => {
+            assert_eq!(a.kind, EVENT_CONTROL);
+            c.subscribed.push(a.id);
+        }
+        Request::DequeueEvent(a) => {
+            let Some((at, id, value)) = c.events.pop_front() else { return refuse(libc::ENOENT) };
+            (a.kind, a.id, a.changes, a.value) = (EVENT_CONTROL, id, EVENT_CONTROL_VALUE, i64::from(value as u32));
+            (a.stamp_s, a.stamp_ns) = (at / 1_000_000_000, at % 1_000_000_000);
+        }
     }
     Ok(())
 }

@@ -3,6 +3,7 @@
 #![allow(clippy::unwrap_used)]
 
 mod errors;
+mod exposures;
 mod machine;
 mod streams;
 
