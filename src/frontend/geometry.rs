@@ -22,14 +22,29 @@ pub struct RigGeometry {
 
 impl RigGeometry {
     pub fn new(calibration: &Calibration, epipolar_max: f64) -> RigGeometry {
-        let body_from_cam: Vec<Pose> = calibration.cameras.iter().map(|c| c.body_from_cam).collect();
-        let from_all = |to: &Pose| body_from_cam.iter().map(|from| to.inverse() * *from).collect::<Vec<_>>();
-        RigGeometry {
+        let n = calibration.cameras.len();
+        let mut rig = RigGeometry {
             cameras: calibration.cameras.iter().map(|c| c.camera).collect(),
-            between: body_from_cam.iter().flat_map(from_all).collect(),
-            body_from_cam,
+            body_from_cam: calibration.cameras.iter().map(|c| c.body_from_cam).collect(),
+            between: vec![Pose::IDENTITY; n * n],
             epipolar_max,
+        };
+        rig.refresh();
+        rig
+    }
+
+    fn refresh(&mut self) {
+        let n = self.cameras.len();
+        for (i, between) in self.between.iter_mut().enumerate() {
+            *between = self.body_from_cam[i / n].inverse() * self.body_from_cam[i % n];
         }
+    }
+
+    /// Takes the images of two cameras for each other's; the second time as before.
+    pub fn exchange(&mut self, [a, b]: [usize; 2]) {
+        self.cameras.swap(a, b);
+        self.body_from_cam.swap(a, b);
+        self.refresh();
     }
 
     /// Unit ray of a pixel; `None` outside the camera model.

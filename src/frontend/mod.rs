@@ -16,6 +16,7 @@
 //! where it fails the whole pyramid is searched. An image that is missing or not of its camera's size is refused: that
 //! camera sees nothing in this frame. Same frames and predictions, same bits out.
 
+mod agreement;
 mod detect;
 mod geometry;
 mod patch;
@@ -25,10 +26,12 @@ mod pyramid;
 mod search;
 mod tracks;
 
+pub use agreement::{Verdict, Verdicts};
 pub use tracks::{Track, Tracks};
 
 use crate::config::FrontendConfig;
 use crate::limits::{CAMERAS_MAX, PYRAMID_LEVELS, TRACKS};
+use agreement::Agreement;
 use detect::Detector;
 use geometry::RigGeometry;
 use patch::{take_stack, Stack, Warp, STEP_MIN};
@@ -113,6 +116,7 @@ pub struct Frontend {
     frame: u64,
     tracks: Tracks,
     stats: Stats,
+    agreement: Agreement,
 }
 
 impl Frontend {
@@ -141,12 +145,18 @@ impl Frontend {
             frame: 0,
             tracks: Tracks::default(),
             stats: Stats::default(),
+            agreement: Agreement::default(),
         })
     }
 
     /// What happened to points since the start.
     pub fn stats(&self) -> &Stats {
         &self.stats
+    }
+
+    /// What was found of cameras that do not see what the calibration says.
+    pub fn verdicts(&self) -> Verdicts {
+        self.agreement.verdicts
     }
 
     /// Follows all points into the new images, replaces what was lost. The frame is shared until the next is tracked:
@@ -168,6 +178,7 @@ impl Frontend {
             }
             self.find_missing(first_new, median);
         }
+        self.compare(frames.t, median);
         self.publish(frames.t);
         // Who wrote the frame before may have it back.
         self.before.frames = frames.clone();

@@ -131,6 +131,7 @@ pub fn fly(
     let (waker, link, stop) = (Waker::default(), Link::default(), host::stop_asked_for());
     let mut budget = Budget { steps, total, spent: 0, start: Instant::now() };
     let gates = (FrameGate::new(&packets[0].frames), ImuGate::new(&calibration.imu));
+    let mut notices = vec![];
     let mut reading = Reading { recorded, gates, next: 0, samples: 0 };
     std::thread::scope(|scope| {
         let (taken, given, woken) = (&waiting, &done, &waker);
@@ -152,6 +153,11 @@ pub fn fly(
                 gauges.set_epoch(packet.epoch, packet.health);
                 if let Some(line) = status.epoch_begun(&gauges) {
                     status.say(EventKind::Epoch, &line);
+                }
+                gauges.verdicts.store(packet.verdicts.0, Relaxed);
+                for line in status.cameras_judged(&gauges) {
+                    status.say(EventKind::Warning, &line);
+                    notices.push((EventKind::Warning, line));
                 }
                 let frames = gauges.frames.fetch_add(1, Relaxed) + 1;
                 gauges.keyframes.store(keyframes.count, Relaxed);
@@ -186,7 +192,7 @@ pub fn fly(
         source: reading.recorded.images.counters(),
         capture: None,
         broken: None,
-        notices: vec![],
+        notices,
     }
 }
 

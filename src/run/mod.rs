@@ -182,6 +182,7 @@ pub fn fly(
     let length_s = input.source.length_s().filter(|_| !repeats);
     out.set_aside()?;
     let log = Log::start(out.path().into(), log::LIMITS, &title.to_string());
+    input.warnings.iter().for_each(|warning| log.sender().event(EventKind::Warning, warning));
     if let Tracker::Odometry(run) = &mut tracker {
         run.back.log = Some(log.sender());
     }
@@ -222,9 +223,8 @@ pub fn fly(
         return Err(fault);
     }
     flown.warnings.splice(..0, input.warnings);
-    flown
-        .warnings
-        .extend(flown.notices.iter().filter(|(kind, _)| *kind == EventKind::Map).map(|(_, line)| line.clone()));
+    let warns = |kind: EventKind| matches!(kind, EventKind::Map | EventKind::Warning);
+    flown.warnings.extend(flown.notices.iter().filter(|(kind, _)| warns(*kind)).map(|(_, line)| line.clone()));
     let (report, unwritten) = summary::conclude(title, flown, &logged, out);
     let fault = recorded.and_then(Result::err).or(broken).or(unwritten);
     if fault.is_none() {
@@ -377,6 +377,7 @@ pub fn fly_in_real_time(
                 keyframes.pass_on(&packet, ring, &s.counters);
                 s.gauges.frames.fetch_add(1, Relaxed);
                 s.gauges.set_epoch(packet.epoch, packet.health);
+                s.gauges.verdicts.store(packet.verdicts.0, Relaxed);
                 s.gauges.posed.fetch_add(u64::from(observes || packet.tracked.is_some()), Relaxed);
                 s.gauges.keyframes.store(keyframes.count, Relaxed);
             }
@@ -449,7 +450,7 @@ fn supervise(
         let hangs = silent.filter(|_| was.is_none()).map(|name| format!("thread {name} gives no sign of life"));
         s.counters.threads_silent.add(u64::from(hangs.is_some()));
         let looked = worker.as_mut().and_then(|w| w.watch(&s.gauges));
-        let epoch = status.epoch_begun(&s.gauges);
+        let (epoch, cameras) = (status.epoch_begun(&s.gauges), status.cameras_judged(&s.gauges));
         let mut say = |kind, line: String| {
             status.say(kind, &line);
             // A cable that comes loose each second, for hours, is in the log.
@@ -459,6 +460,7 @@ fn supervise(
         };
         hangs.into_iter().chain(threads::refused()).for_each(|line| say(EventKind::System, line));
         epoch.into_iter().for_each(|line| say(EventKind::Epoch, line));
+        cameras.into_iter().for_each(|line| say(EventKind::Warning, line));
         looked.into_iter().for_each(|line| say(EventKind::Map, line));
         std::iter::from_fn(|| s.mailbox.notices.pop()).for_each(|line| say(EventKind::Sensor, line));
         if tracked {

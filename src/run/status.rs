@@ -3,6 +3,7 @@
 use super::log::{EventKind, LogSender};
 use super::status_led::StatusLed;
 use crate::counters::Counters;
+use crate::frontend::{Verdict, Verdicts};
 use crate::vio::Health;
 use indicatif::{ProgressBar, ProgressStyle};
 use std::fmt;
@@ -32,6 +33,8 @@ pub struct Gauges {
     /// The epoch of the newest frame, and the health of the epoch's first.
     pub epoch: AtomicU32,
     pub epoch_health: AtomicU32,
+    /// `Verdicts` on the cameras.
+    pub verdicts: AtomicU64,
 }
 
 impl Gauges {
@@ -56,8 +59,9 @@ pub struct Status {
     next_count: Instant,
     /// Whether it was said that logging ended.
     log_ended: bool,
-    /// The epoch that was told last.
+    /// The epoch, and the verdicts on cameras, that were told last.
     epoch: u32,
+    verdicts: u64,
 }
 
 const LINE_PERIOD: Duration = Duration::from_secs(1);
@@ -87,6 +91,7 @@ impl Status {
             next_count,
             log_ended: false,
             epoch: 0,
+            verdicts: 0,
         }
     }
 
@@ -161,6 +166,13 @@ impl Status {
         Some(format!("epoch {epoch} begins: {why}"))
     }
 
+    /// A line about each finding on the cameras since this was asked last.
+    pub fn cameras_judged(&mut self, g: &Gauges) -> Vec<String> {
+        let verdicts = g.verdicts.load(Relaxed);
+        let before = std::mem::replace(&mut self.verdicts, verdicts);
+        Verdicts(verdicts & !before).iter().map(|(verdict, cameras)| judged(verdict, cameras)).collect()
+    }
+
     /// Prints a line that stays, and logs it as an event.
     pub fn say(&self, kind: EventKind, text: &str) {
         self.log.iter().for_each(|log| log.event(kind, text));
@@ -180,6 +192,20 @@ impl Status {
         if let Some(bar) = &self.bar {
             bar.finish_and_clear();
         }
+    }
+}
+
+fn judged(verdict: Verdict, [a, b]: [usize; 2]) -> String {
+    match verdict {
+        Verdict::Swapped => format!(
+            "cameras {a} and {b} are swapped: each sees what the other should. Exchange their names in camera.devices, or the \
+             data of their folders in a recording"
+        ),
+        Verdict::Disagree => format!(
+            "camera {b} never agrees with camera {a}: wrong calibration, other frame timing, or covered? `stipple calib-check` \
+             judges a calibration by a recording"
+        ),
+        Verdict::AgreeAfterAll => format!("camera {b} agrees with camera {a} after all"),
     }
 }
 

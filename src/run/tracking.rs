@@ -16,7 +16,7 @@ use super::log::{LogSender, State};
 use super::waker::{SetOnDrop, Waker};
 use crate::config::Board;
 use crate::counters::Counters;
-use crate::frontend::{Frontend, Prediction, Tracks};
+use crate::frontend::{Frontend, Prediction, Tracks, Verdicts};
 use crate::limits::{FRAMES, IMU_BETWEEN_FRAMES};
 use crate::mem::{seal_thread, Footprint, List, Thinned};
 use crate::vio::{Health, Odometry, Predictor, Vio};
@@ -55,6 +55,8 @@ pub struct FramePacket {
     /// The epoch of its pose, and what the frame suffered from.
     pub epoch: u32,
     pub health: Health,
+    /// What was found so far of cameras that do not see what the calibration says.
+    pub verdicts: Verdicts,
     /// When the front end took it.
     begun: Instant,
     /// CPU time that following its points took.
@@ -73,6 +75,7 @@ impl FramePacket {
             tracked: None,
             epoch: 0,
             health: Health::default(),
+            verdicts: Verdicts::default(),
             begun: Instant::now(),
             cpu: Duration::ZERO,
         })
@@ -134,6 +137,7 @@ impl Front {
         }
         let prediction = Prediction { prev_from_now: self.predictor.motion_to(packet.frames.t, state) };
         packet.tracks.clone_from(self.frontend.track(&packet.frames, &prediction));
+        packet.verdicts = self.frontend.verdicts();
         let secs = packet.begun.elapsed().as_secs_f64();
         self.busy_s += secs;
         self.ms.push(secs * 1e3);

@@ -19,6 +19,8 @@ crate::counters! {
     stamps_out_of_order,
     /// Image rows without a partner in every other camera.
     images_unpaired,
+    /// Cameras whose images end before those of another.
+    cameras_ended_early,
     /// Images listed whose file is missing.
     images_missing,
     /// Image files that are cut off or otherwise cannot be decoded.

@@ -33,12 +33,12 @@ pub struct Reader {
     root: Box<Path>,
     file: Vec<u8>,
     decoded: Vec<u8>,
-    findings: Findings,
+    findings: Box<Findings>,
 }
 
 impl Reader {
     pub(super) fn new(frames: Box<[FrameFiles]>, root: Box<Path>) -> Reader {
-        Reader { frames, root, file: vec![], decoded: vec![], findings: Findings::default() }
+        Reader { frames, root, file: vec![], decoded: vec![], findings: Box::default() }
     }
 
     /// Faults of the images read so far.
@@ -53,8 +53,9 @@ impl Reader {
 
     /// Whether the first `cameras` have colour, by the first image of each that can be read.
     pub fn has_colour(&self, cameras: usize) -> bool {
-        let coloured =
-            |k: usize| self.frames.iter().find_map(|f| is_coloured(f.images.get(k)?, &self.root)).unwrap_or(false);
+        let coloured = |k: usize| {
+            self.frames.iter().find_map(|f| is_coloured(f.images.get(k)?.as_ref()?, &self.root)).unwrap_or(false)
+        };
         (0..cameras).all(coloured)
     }
 
@@ -67,7 +68,13 @@ impl Reader {
         out.t = frame.t;
         let mut colours = out.colours.iter_mut();
         for (file, image) in frame.images.iter().zip(&mut out.images) {
-            let read = read_image(file, &self.root, &mut self.file, &mut self.decoded, image, colours.next());
+            let colour = colours.next();
+            let Some(file) = file else {
+                let planes = colour.into_iter().flatten().chain([image]);
+                planes.for_each(|plane| plane.pixels.fill(0));
+                continue;
+            };
+            let read = read_image(file, &self.root, &mut self.file, &mut self.decoded, image, colour);
             let Err((fault, what)) = read else { continue };
             let counter: fn(&mut ReplayCounters) -> &mut u64 = match fault {
                 ImageFault::Missing => |c| &mut c.images_missing,

@@ -183,7 +183,7 @@ fn read_imu(path: &Path, hole: Span, findings: &mut Findings) -> Result<Vec<ImuS
 fn check_cover(frames: &[FrameFiles], imu: &[ImuSample], findings: &mut Findings) {
     let (Some(first), Some(last)) = (imu.first(), imu.last()) else { return };
     for frame in frames.iter().filter(|f| f.t < first.t || f.t > last.t) {
-        let image = &frame.images[0];
+        let Some(image) = frame.images.iter().flatten().next() else { continue };
         let what = "image outside the span of the inertial samples";
         findings.warn(|c| &mut c.images_outside_imu, &image.list, image.line, what);
     }

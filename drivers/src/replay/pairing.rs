@@ -22,11 +22,14 @@ pub struct ImageFile {
 /// One image of every camera, taken together; `t` is camera 0's stamp in the inertial unit's clock.
 #[derive(Clone, Debug, PartialEq)]
 pub struct FrameFiles {
-    /// Camera 0's stamp, in the inertial unit's clock.
+    /// The stamp of the first camera that has an image, in the inertial unit's clock.
     pub t: Nanos,
-    /// The files, one for each camera.
-    pub images: Vec<ImageFile>,
+    /// The files, one for each camera; `None` of a camera whose recording has ended.
+    pub images: Vec<Option<ImageFile>>,
 }
+
+/// A camera that gives nothing for so long before the others end has ended early: ten images at 20 Hz.
+const ENDED_EARLY: Span = Span(500_000_000);
 
 /// A row of an image list; `t` is in the inertial unit's clock once the list was read.
 pub struct ImageRow {
@@ -67,7 +70,8 @@ fn list_path(mav0: &Path, camera: usize) -> PathBuf {
 }
 
 /// Makes frames of the lists, oldest images first: an image whose partners are all within the tolerance makes a frame with
-/// them; any other is unpaired, as a frame needs an image of every camera.
+/// them; any other is unpaired, as a frame needs an image of every camera. When a camera ends early the others go on
+/// without it.
 pub fn into_frames(
     mav0: &Path,
     lists: &[Vec<Row<ImageRow>>],
@@ -75,11 +79,12 @@ pub fn into_frames(
     findings: &mut Findings,
 ) -> Result<Vec<FrameFiles>, Fault> {
     let paths: Vec<Arc<Path>> = (0..lists.len()).map(|k| list_path(mav0, k).into()).collect();
+    let early = ended_early(lists, &paths, findings);
     let mut heads = vec![0usize; lists.len()];
     let mut frames = Vec::new();
     loop {
         let stamp = |k: usize, ahead: usize| lists[k].get(heads[k] + ahead).map(|r| r.value.t);
-        let cameras = 0..lists.len();
+        let cameras = (0..lists.len()).filter(|k| !early[*k] || stamp(*k, 0).is_some());
         let Some(oldest) = cameras.clone().filter(|k| stamp(*k, 0).is_some()).min_by_key(|k| stamp(*k, 0)) else {
             break;
         };
@@ -90,11 +95,12 @@ pub fn into_frames(
         let next_is_closer = newest > t && stamp(oldest, 1).is_some_and(|n| n <= newest);
         if !ended && newest - t <= tolerance && !next_is_closer {
             let image = |k: usize| {
-                let row = &lists[k][heads[k]];
+                let row = lists[k].get(heads[k])?;
                 let path = paths[k].with_file_name("data").join(&row.value.file);
-                ImageFile { path, list: paths[k].clone(), line: row.line }
+                Some(ImageFile { path, list: paths[k].clone(), line: row.line })
             };
-            frames.push(FrameFiles { t: lists[0][heads[0]].value.t, images: cameras.map(image).collect() });
+            let first = (0..lists.len()).find_map(|k| stamp(k, 0)).unwrap_or(t);
+            frames.push(FrameFiles { t: first, images: (0..lists.len()).map(image).collect() });
             heads.iter_mut().for_each(|h| *h += 1);
         } else {
             let line = lists[oldest][heads[oldest]].line;
@@ -109,4 +115,25 @@ pub fn into_frames(
         return Err(Fault::new(FaultKind::Data, mav0.display().to_string(), what, fix));
     }
     Ok(frames)
+}
+
+/// Which cameras end before another does, each with a warning.
+fn ended_early(lists: &[Vec<Row<ImageRow>>], paths: &[Arc<Path>], findings: &mut Findings) -> Vec<bool> {
+    let end = |k: usize| lists[k].last().map(|row| row.value.t);
+    let Some(longest) = (0..lists.len()).rev().max_by_key(|k| end(*k)) else { return vec![] };
+    let mut early = vec![false; lists.len()];
+    for (k, list) in lists.iter().enumerate() {
+        let (Some(row), Some(last)) = (list.last(), end(longest)) else { continue };
+        let before = last - row.value.t;
+        if before > ENDED_EARLY {
+            let what = format!(
+                "camera {k} ended {:.1} s before camera {longest}: goes on with camera {longest}, and black images of camera \
+                 {k}. Add its other images, or see why it stopped",
+                before.secs()
+            );
+            findings.warn(|c| &mut c.cameras_ended_early, &paths[k], row.line, what);
+            early[k] = true;
+        }
+    }
+    early
 }

@@ -143,6 +143,8 @@ pub enum EventKind {
     Start,
     /// A sensor was lost or came back.
     Sensor,
+    /// What is wrong with a recording, or cameras that do not see what the calibration says.
+    Warning,
     /// A thread hangs, or the system refuses what a run asks for.
     System,
     Map,
