@@ -514,6 +514,7 @@ fn heap_is_untouched_after_construction() {
     let path = Path { rest: -1.0 };
     let mut world = World::new(path);
     let mut vio = Vio::new(&world.rig, &VioConfig::default());
+    let mut predictor = Predictor::new(&world.rig, &VioConfig::default());
     let mut tracks = Tracks::default();
     let imu: Vec<ImuSample> = (0..500).map(|i| world.imu(i as f64 / RATE_HZ)).collect();
     let mut imu = imu.iter().peekable();
@@ -524,9 +525,10 @@ fn heap_is_untouched_after_construction() {
         unsealed(|| world.tracks(t, &mut tracks));
         while let Some(s) = imu.next_if(|s| s.t <= tracks.t + Span(5_000_000)) {
             vio.on_imu(*s);
+            predictor.on_imu(*s);
         }
-        vio.on_tracks(&tracks);
-        vio.predict(tracks.t + Span(10_000_000));
+        predictor.on_update(&vio.on_tracks(&tracks));
+        assert_eq!(predictor.state_at(tracks.t + Span(10_000_000)).is_some(), vio.is_running());
     }
     let heap = heap_after_seal() - before;
     unsealed(|| {

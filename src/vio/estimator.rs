@@ -7,13 +7,12 @@
 
 use super::factors::inertial_residual_at;
 use super::graph::Graph;
-use super::inertial::{Covariance, InertialWeight, Motion};
+use super::inertial::{Covariance, InertialWeight};
 use super::initialization::Start;
 use super::innovation_gate::{gate, predicted_covariance, Passed};
 use super::marginalization::Marginalizer;
 use super::model::Model;
 use super::monitor::Evidence;
-use super::preintegration::Increment;
 use super::rig::RigState;
 use super::samples::ImuRing;
 use super::solver::{Outcome, Solver};
@@ -151,27 +150,13 @@ impl Estimator {
 
     /// The frame after that in slot `before`, where inertia puts it.
     pub fn propagated(&self, before: usize, t: Nanos, imu: &ImuRing) -> Frame {
-        let (inc, motion) = self.carried(self.graph.window.frame(before), t, imu);
-        let mut frame = Frame::new(t, motion);
+        let (from, rig) = (self.graph.window.frame(before), &self.graph.window.rig.now);
+        let inc = imu.integrate(from.t, t, from.now.bg, from.now.ba, &self.model.noise);
+        let mut frame = Frame::new(t, from.now.propagate(&inc.rescaled(rig.gyro_scale, rig.accel_scale)));
         frame.weight = InertialWeight::new(&inc, &self.model.noise);
         frame.increment = inc;
         frame.rate = imu.rate_at(t);
         frame
-    }
-
-    /// The newest motion carried by the inertial samples to `t`, or as it is where that is older.
-    #[cfg(feature = "instruments")]
-    pub fn predict(&self, t: Nanos, imu: &ImuRing) -> Option<(Nanos, Motion)> {
-        let newest = self.newest()?;
-        let t = t.max(newest.t);
-        Some((t, self.carried(newest, t, imu).1))
-    }
-
-    /// The samples since a frame, and the motion they lead to.
-    fn carried(&self, from: &Frame, t: Nanos, imu: &ImuRing) -> (Increment, Motion) {
-        let rig = &self.graph.window.rig.now;
-        let inc = imu.integrate(from.t, t, from.now.bg, from.now.ba, &self.model.noise);
-        (inc, from.now.propagate(&inc.rescaled(rig.gyro_scale, rig.accel_scale)))
     }
 
     /// Takes a frame into the window; answers its slot, and whether it is to be a keyframe.

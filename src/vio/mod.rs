@@ -42,6 +42,8 @@ mod window;
 mod zero_velocity;
 
 pub use health::Health;
+#[cfg(feature = "instruments")]
+pub use predictor::Predicted;
 pub use predictor::Predictor;
 
 use crate::config::VioConfig;
@@ -337,12 +339,6 @@ impl Vio {
     /// The newest state. `None` until initialized.
     pub fn odometry(&self) -> Option<Odometry> {
         self.estimator.newest().map(|f| Odometry::new(f.t, &f.now))
-    }
-
-    /// The newest state carried by the inertial samples to `t`. `None` until initialized.
-    #[cfg(feature = "instruments")]
-    pub fn predict(&self, t: Nanos) -> Option<Odometry> {
-        self.estimator.predict(t, &self.imu).map(|(t, motion)| Odometry::new(t, &motion))
     }
 
     /// Covariance of the newest state, errors [p, θ, v, bg, ba]: p, m, and v, m/s, in the world; θ, rad, on the right

@@ -5,6 +5,10 @@
 //! so a tracker may work on a frame while the estimator is still busy with the one before it, and
 //! what it finds does not depend on whether it did. What the state's error adds over one more frame
 //! is far below a pixel, since only the motion between the two frames is used.
+//!
+//! For whoever publishes at the inertial unit's rate it carries the newest state itself, with its covariance
+//! (`on_update`, `state_at`): the estimator is a frame's exposure, transfer and computation late, the samples are not.
+//! One prediction integrates the samples since the frame, some 1 µs each.
 
 use super::inertial::Motion;
 use super::preintegration::Noise;
@@ -13,6 +17,14 @@ use super::Odometry;
 use crate::config::VioConfig;
 use glam::DVec3;
 use stipple_drivers::{Calibration, ImuSample, Nanos, Pose};
+#[cfg(feature = "instruments")]
+use {
+    super::health::Health,
+    super::inertial::{Covariance, Mat15},
+    super::recovery::DeadReckoning,
+    super::{Update, FRAME_GAP_MAX},
+    stipple_drivers::Span,
+};
 
 /// Predicts for one tracker, with inertial samples of its own.
 #[derive(Clone, Debug)]
@@ -21,12 +33,44 @@ pub struct Predictor {
     imu: ImuRing,
     /// Stamp of the frame before.
     last: Option<Nanos>,
+    #[cfg(feature = "instruments")]
+    newest: Option<Newest>,
+}
+
+/// The newest state that the estimator gave.
+#[cfg(feature = "instruments")]
+#[derive(Clone, Copy, Debug)]
+struct Newest {
+    state: DeadReckoning,
+    is_determined: bool,
+    epoch: u32,
+    health: Health,
+    quality: u8,
+}
+
+/// The newest state carried to an instant.
+#[cfg(feature = "instruments")]
+#[derive(Clone, Copy, Debug)]
+pub struct Predicted {
+    pub odometry: Odometry,
+    /// Covariance as `Vio::covariance` has it, with the noise of the samples since.
+    pub covariance: Option<Covariance>,
+    /// Epoch of the frame that is carried, what it suffered from, its quality, and the time since.
+    pub epoch: u32,
+    pub health: Health,
+    pub quality: u8,
+    pub age: Span,
 }
 
 impl Predictor {
     pub fn new(calibration: &Calibration, config: &VioConfig) -> Predictor {
-        let imu = ImuRing::new(calibration.imu.rate_hz);
-        Predictor { noise: Noise::new(&calibration.imu, config), imu, last: None }
+        Predictor {
+            noise: Noise::new(&calibration.imu, config),
+            imu: ImuRing::new(calibration.imu.rate_hz),
+            last: None,
+            #[cfg(feature = "instruments")]
+            newest: None,
+        }
     }
 
     /// Takes a sample; refuses what the estimator refuses.
@@ -49,6 +93,40 @@ impl Predictor {
         let before = carry(&Motion::from(state), state.t, last.max(state.t));
         let now = carry(&before, last.max(state.t), t);
         Some(before.pose.inverse() * now.pose)
+    }
+}
+
+/// For whoever publishes; no program does yet, but for the instruments.
+#[cfg(feature = "instruments")]
+impl Predictor {
+    /// Takes what a frame led to; where that is no state there is none to carry until the next.
+    pub fn on_update(&mut self, update: &Update) {
+        self.newest = update.odometry.or(update.dead_reckoned).map(|o| {
+            let c = update.covariance.unwrap_or_default();
+            Newest {
+                state: DeadReckoning { t: o.t, motion: Motion::from(&o), covariance: Mat15::from_fn(|i, j| c[i][j]) },
+                is_determined: update.covariance.is_some(),
+                epoch: update.epoch,
+                health: update.health,
+                quality: update.quality,
+            }
+        });
+    }
+
+    /// The newest state carried to `t` by the samples that came; past them the last is held, with the noise of a gap.
+    /// `None` without a state, before it, `FRAME_GAP_MAX` after it, and where a sample since was overwritten.
+    pub fn state_at(&self, t: Nanos) -> Option<Predicted> {
+        let Newest { mut state, is_determined, epoch, health, quality } = self.newest?;
+        let age = t - state.t;
+        if age < Span(0) || age.secs() > FRAME_GAP_MAX || !self.imu.covers(state.t) {
+            return None;
+        }
+        state.advance(t, &self.imu, &self.noise);
+        let covariance: Covariance = std::array::from_fn(|i| std::array::from_fn(|j| state.covariance[(i, j)]));
+        let finite = state.motion.is_finite() && covariance.iter().flatten().all(|c| c.is_finite());
+        let odometry = Odometry::new(t, &state.motion);
+        let covariance = is_determined.then_some(covariance);
+        finite.then_some(Predicted { odometry, covariance, epoch, health, quality, age })
     }
 }
 

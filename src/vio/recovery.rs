@@ -219,10 +219,10 @@ fn in_world_of(pose: &Pose, start: &Motion) -> Motion {
 
 /// A motion carried on by inertial samples, and its covariance, errors [p, θ, v, bg, ba].
 #[derive(Clone, Copy, Debug)]
-struct DeadReckoning {
-    t: Nanos,
-    motion: Motion,
-    covariance: Mat15,
+pub struct DeadReckoning {
+    pub t: Nanos,
+    pub motion: Motion,
+    pub covariance: Mat15,
 }
 
 /// Derivative of the motion after an increment to the motion before it.
@@ -243,7 +243,8 @@ fn transition(from: &Motion, inc: &Increment) -> Mat15 {
 }
 
 impl DeadReckoning {
-    fn advance(&mut self, t: Nanos, imu: &ImuRing, noise: &Noise) {
+    /// Carries it on to `t`; an instant that is not later changes nothing.
+    pub fn advance(&mut self, t: Nanos, imu: &ImuRing, noise: &Noise) {
         if t <= self.t {
             return;
         }

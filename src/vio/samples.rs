@@ -40,6 +40,12 @@ impl ImuRing {
         self.samples.back()
     }
 
+    /// Whether no sample after `t` was overwritten.
+    #[cfg(feature = "instruments")]
+    pub fn covers(&self, t: Nanos) -> bool {
+        self.samples.front().is_some_and(|s| s.t <= t)
+    }
+
     #[cfg(test)]
     pub fn iter(&self) -> impl Iterator<Item = &ImuSample> {
         self.samples.iter()

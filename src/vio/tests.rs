@@ -286,9 +286,17 @@ fn prediction_meets_the_next_estimate() {
     for k in 1..=10 {
         vio.on_imu(world.imu((last.t.0 as f64 * 1e-9) + k as f64 / RATE_HZ));
     }
-    let predicted = vio.predict(t).expect("running");
     let mut predictor = Predictor::new(&world.rig, &VioConfig::default());
     vio.imu.iter().for_each(|s| predictor.on_imu(*s));
+    assert!(predictor.state_at(t).is_none(), "no state was given");
+    let covariance = vio.covariance().copied();
+    predictor.on_update(&Update { odometry: Some(last), covariance, epoch: 3, quality: 80, ..Update::default() });
+    let carried = predictor.state_at(t).expect("a state was given");
+    assert!((carried.epoch, carried.quality, carried.age) == (3, 80, t - last.t));
+    assert!(predictor.state_at(last.t - Span(1)).is_none() && predictor.state_at(t + Span::from_secs(3.0)).is_none());
+    let [before_v, v] = [covariance, carried.covariance].map(|c| c.expect("it is determined")[6][6]);
+    assert!(v > before_v, "samples have noise");
+    let predicted = carried.odometry;
     predictor.motion_to(last.t, None);
     let motion = predictor.motion_to(t, before.as_ref()).expect("a second frame");
     let mut tracks = Tracks::default();

@@ -29,14 +29,14 @@ const DIM: f64 = 15.0;
 const Z: f64 = 1.96;
 /// Standard deviations of the biases with which a flight starts, rad/s and m/s²: EuRoC's unit. The estimator is
 /// told the same where it is told the truth.
-const BIASES: (f64, f64) = (0.02, 0.05);
+pub const BIASES: (f64, f64) = (0.02, 0.05);
 /// One second, in frames.
 const SECOND: usize = 20;
 /// Upper ends of the bins of quality.
 const BINS: [u8; 9] = [2, 10, 20, 35, 50, 65, 75, 85, 100];
 
 /// The world's own noise of views and biases.
-fn told(c: &mut VioConfig) {
+pub fn told(c: &mut VioConfig) {
     c.observation_sigma_px = crate::world::SIGMA_PX;
     (c.gyro_bias_sigma, c.accel_bias_sigma) = BIASES;
 }
@@ -62,6 +62,12 @@ pub struct Consistency {
 fn chi_square(k: f64, z: f64) -> f64 {
     let v = 2.0 / (9.0 * k);
     k * (1.0 - v + z * v.sqrt()).powi(3)
+}
+
+/// Bounds of 95 % of the means over flights of a NEES of so many dimensions.
+pub fn bounds(dimensions: f64, flights: usize) -> (f64, f64) {
+    let bound = |z: f64| chi_square(dimensions * flights as f64, z) / flights as f64;
+    (bound(-Z), bound(Z))
 }
 
 fn consistency_of(measured: bool, config: fn(&mut VioConfig), flights: usize) -> Consistency {
@@ -97,8 +103,7 @@ fn consistency_of(measured: bool, config: fn(&mut VioConfig), flights: usize) ->
     let seconds = |i: usize| i as f64 / SECOND as f64;
     let whole = sums.iter().enumerate().filter(|(_, s)| s.1 == flights);
     let over_time: Vec<(f64, f64)> = whole.map(|(i, s)| (seconds(i), s.0 / s.1 as f64)).collect();
-    let bound = |z: f64| chi_square(DIM * flights as f64, z) / flights as f64;
-    let bounds = (bound(-Z), bound(Z));
+    let bounds = bounds(DIM, flights);
     let inside = over_time.iter().filter(|(_, v)| (bounds.0..=bounds.1).contains(v)).count();
     Consistency {
         flights,

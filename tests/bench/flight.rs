@@ -132,7 +132,8 @@ pub fn fly(plan: &Plan, seed: u64, mut each: impl FnMut(&EstimatedFrame)) -> Vio
     vio
 }
 
-fn velocity(pose: fn(f64) -> Pose, t: f64) -> DVec3 {
+/// Velocity along a path, m/s.
+pub fn velocity(pose: fn(f64) -> Pose, t: f64) -> DVec3 {
     const H: f64 = 1e-4;
     (pose(t + H).p - pose(t - H).p) / (2.0 * H)
 }

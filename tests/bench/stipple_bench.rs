@@ -12,6 +12,7 @@ mod map;
 mod odometry;
 mod page;
 mod ply;
+mod predict;
 mod record;
 mod run;
 mod stability;
@@ -43,6 +44,7 @@ enum Bench {
     Stages(stages::Args),
     Stability(stability::Args),
     Consistency(consistency::Args),
+    Predict(predict::Args),
     Map(map::Args),
     Kernels(kernels::Args),
     Stereo(stereo::Args),
@@ -57,6 +59,7 @@ fn run(bench: &Bench) -> Result<(), Fault> {
         Bench::Stages(args) => stages::run(args),
         Bench::Stability(args) => stability::run(args),
         Bench::Consistency(args) => consistency::run(args),
+        Bench::Predict(args) => predict::run(args),
         Bench::Map(args) => map::run(args),
         Bench::Kernels(args) => kernels::run(args),
         Bench::Stereo(args) => stereo::run(args),
