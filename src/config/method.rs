@@ -39,7 +39,8 @@ section! {
     /// and 8.
     accel_noise_scale: f64 = 8.0, Bound::Positive;
     /// Whether the offset between the clocks of cameras and inertial unit is estimated. Set it where they are not triggered
-    /// together; 8 ms cost eight times the error.
+    /// together; 8 ms cost eight times the error. Poses are then at their frames' stamps by the inertial clock; log and report
+    /// have the offset.
     estimate_time_offset: bool = false;
     /// Whether the cameras' places on the body are estimated. Set it after a hard landing, or for a rig that flexes.
     estimate_extrinsics: bool = false;
@@ -76,8 +77,7 @@ section! {
     time_offset_sigma_s: f64 = 0.01;
     /// Standard deviation of a camera's position before it is estimated, m.
     extrinsics_sigma_m: f64 = 0.01;
-    /// Standard deviation of a camera's attitude before it is estimated, rad. Above `frontend.epipolar_max` the tracker drops
-    /// the matches that would tell it.
+    /// Standard deviation of a camera's attitude before it is estimated, rad. The tracker's epipolar gate is wider by three.
     extrinsics_sigma_rad: f64 = 0.02;
     /// Standard deviation of the scale of an axis before it is estimated.
     imu_scale_sigma: f64 = 0.02;

@@ -18,6 +18,8 @@ pub struct RigGeometry {
     /// `between[to * cameras + from]` is `to_from_from`.
     between: Vec<Pose>,
     epipolar_max: f64,
+    /// By how much rays may miss each other beyond that, as places are still being estimated, rad.
+    widened: f64,
 }
 
 impl RigGeometry {
@@ -28,6 +30,7 @@ impl RigGeometry {
             body_from_cam: calibration.cameras.iter().map(|c| c.body_from_cam).collect(),
             between: vec![Pose::IDENTITY; n * n],
             epipolar_max,
+            widened: 0.0,
         };
         rig.refresh();
         rig
@@ -38,6 +41,13 @@ impl RigGeometry {
         for (i, between) in self.between.iter_mut().enumerate() {
             *between = self.body_from_cam[i / n].inverse() * self.body_from_cam[i % n];
         }
+    }
+
+    /// Takes the cameras to be at these places, which may be so far off, rad.
+    pub fn correct(&mut self, body_from_cam: &[Pose], widened: f64) {
+        self.body_from_cam.iter_mut().zip(body_from_cam).for_each(|(to, from)| *to = *from);
+        self.widened = widened;
+        self.refresh();
     }
 
     /// Takes the images of two cameras for each other's; the second time as before.
@@ -91,13 +101,13 @@ impl RigGeometry {
     pub fn triangulate(&self, from: usize, to: usize, f: DVec3, g: DVec3) -> Option<(f64, f64)> {
         let Pose { q: r, p: t } = self.between(from, to);
         let f = r * f;
-        if g.dot(t.normalize().cross(f)).abs() > self.epipolar_max {
+        if g.dot(t.normalize().cross(f)).abs() > self.epipolar_max + self.widened {
             return None;
         }
         let (a, b) = (g.cross(t), g.cross(f));
         let weight = a.length_squared();
         let q = -a.dot(b) / weight;
-        let slack = DISPARITY_SLACK_PX / (self.cameras[from].fx * t.length());
+        let slack = DISPARITY_SLACK_PX / (self.cameras[from].fx * t.length()) + self.widened / t.length();
         (q > -slack && q < 1.0 / DEPTH_MIN && g.dot(f + t * q.max(0.0)) > 0.0).then_some((q, weight))
     }
 }

@@ -97,6 +97,9 @@ const SEARCH_WAIT_MAX: u64 = 16;
 /// A camera with fewer points than this gives none to the others: they look for their own.
 const GIVES_MIN: usize = 8;
 
+/// Deviations of estimated places by which epipolar gates are widened.
+const RIG_SIGMAS: f64 = 3.0;
+
 /// The tracker of one rig.
 pub struct Frontend {
     rig: RigGeometry,
@@ -152,6 +155,12 @@ impl Frontend {
     /// What happened to points since the start.
     pub fn stats(&self) -> &Stats {
         &self.stats
+    }
+
+    /// Takes the cameras to be where they are estimated, with this deviation of their rotation, rad: the next frame is
+    /// followed by it.
+    pub fn correct(&mut self, body_from_cam: &[Pose], sigma_rad: f64) {
+        self.rig.correct(body_from_cam, RIG_SIGMAS * sigma_rad);
     }
 
     /// What was found of cameras that do not see what the calibration says.

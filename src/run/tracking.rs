@@ -19,7 +19,7 @@ use crate::counters::Counters;
 use crate::frontend::{Frontend, Prediction, Tracks, Verdicts};
 use crate::limits::{FRAMES, IMU_BETWEEN_FRAMES};
 use crate::mem::{seal_thread, Footprint, List, Thinned};
-use crate::vio::{Health, Odometry, Predictor, Vio};
+use crate::vio::{Health, Known, Predictor, Vio};
 use crossbeam_queue::ArrayQueue;
 use std::sync::atomic::AtomicBool;
 use std::sync::Arc;
@@ -35,6 +35,7 @@ const BETWEEN_HALVES: usize = 2;
 
 /// A pose and what it means for the map.
 pub struct Tracked {
+    /// Pose at the exposure, as `Vio::window` has it.
     pub world_from_body: Pose,
     pub keyframe: bool,
     /// Newest poses of all keyframes still being optimised; filled beside a keyframe.
@@ -127,15 +128,20 @@ pub struct Front {
 }
 
 impl Front {
-    /// `state` is the back end's after the frame before the last.
-    pub fn track(&mut self, packet: &mut FramePacket, state: Option<&Odometry>) {
+    /// `known` is the back end's after the frame before the last.
+    pub fn track(&mut self, packet: &mut FramePacket, known: &Known) {
         let cpu = thread_cpu_now();
         packet.begun = Instant::now();
+        self.predictor.set_scale(known.imu_scale);
+        if let Some((body_from_cam, sigma_rad)) = &known.cameras {
+            self.frontend.correct(body_from_cam, *sigma_rad);
+        }
         packet.imu.iter().for_each(|s| self.predictor.on_imu(*s));
         if packet.imu_only {
             return;
         }
-        let prediction = Prediction { prev_from_now: self.predictor.motion_to(packet.frames.t, state) };
+        let prediction =
+            Prediction { prev_from_now: self.predictor.motion_to(packet.frames.t, known.odometry.as_ref()) };
         packet.tracks.clone_from(self.frontend.track(&packet.frames, &prediction));
         packet.verdicts = self.frontend.verdicts();
         let secs = packet.begun.elapsed().as_secs_f64();
@@ -181,8 +187,9 @@ impl Back {
         if self.epochs.last().is_none_or(|(_, last)| *last != update.epoch) {
             let _ = self.epochs.push((packet.frames.t, update.epoch));
         }
-        packet.tracked = update.odometry.map(|o| Tracked {
-            world_from_body: o.world_from_body,
+        let exposed = self.vio.window().last().map(|(_, pose, _)| pose);
+        packet.tracked = update.odometry.zip(exposed).map(|(_, world_from_body)| Tracked {
+            world_from_body,
             keyframe: update.keyframe,
             corrections: if update.keyframe { self.keyframe_poses() } else { List::default() },
         });
@@ -197,7 +204,9 @@ impl Back {
         self.frame_ms.push((packet.frames.t, latency_ms));
         if let Some(log) = &self.log {
             let cpu = packet.cpu + (thread_cpu_now() - cpu);
-            log.state(State::new(packet.frames.t, &update, latency_ms, cpu.as_secs_f64() * 1e3));
+            let time_offset_ns = self.vio.time_offset().map(|offset| offset.0);
+            let state = State::new(packet.frames.t, &update, latency_ms, cpu.as_secs_f64() * 1e3);
+            log.state(State { time_offset_ns, ..state });
         }
     }
 
@@ -305,7 +314,7 @@ pub fn look_up(poses: &[TimedPose], packet: &mut FramePacket, counters: &Counter
 /// What the threads of tracking share.
 pub struct Link {
     tracked: ArrayQueue<Box<FramePacket>>,
-    states: ArrayQueue<Option<Odometry>>,
+    states: ArrayQueue<Known>,
     /// Wakes the thread that takes packets.
     pub taker: Waker,
     back: Waker,
@@ -360,12 +369,12 @@ pub fn in_turns(
     mut give: impl FnMut(Box<FramePacket>),
 ) {
     seal();
-    let start = back.vio.odometry();
-    let (mut state, mut next) = (start, start);
+    let start = back.vio.known();
+    let (mut known, mut next) = (start, start);
     while let Some(mut packet) = inlet.next(link) {
-        front.track(&mut packet, state.as_ref());
+        front.track(&mut packet, &known);
         back.estimate(&mut packet);
-        (state, next) = (next, back.vio.odometry());
+        (known, next) = (next, back.vio.known());
         give(packet);
     }
     front.cpu_s = Some(thread_cpu().total_s());
@@ -376,20 +385,20 @@ pub fn follow_points(
     link: &Link,
     mut inlet: Inlet<impl FnMut() -> Option<Box<FramePacket>>>,
     front: &mut Front,
-    start: Option<Odometry>,
+    start: Known,
 ) {
     let _ended = SetOnDrop(&link.front_done, Some(&link.back));
     seal();
-    let (mut state, mut frames) = (start, 0u64);
+    let (mut known, mut frames) = (start, 0u64);
     loop {
         if frames >= BETWEEN_HALVES as u64 {
             let begun = Instant::now();
             let Some(newer) = link.taker.wait(&link.back_done, || link.states.pop()) else { break };
             front.busy_s += begun.elapsed().as_secs_f64();
-            state = newer;
+            known = newer;
         }
         let Some(mut packet) = inlet.next(link) else { break };
-        front.track(&mut packet, state.as_ref());
+        front.track(&mut packet, &known);
         frames += 1;
         // There is room: the back end has finished all but the last.
         let _ = link.tracked.push(packet);
@@ -404,7 +413,7 @@ pub fn estimate(link: &Link, back: &mut Back, mut give: impl FnMut(Box<FramePack
     seal();
     while let Some(mut packet) = link.back.wait(&link.front_done, || link.tracked.pop()) {
         back.estimate(&mut packet);
-        let _ = link.states.push(back.vio.odometry());
+        let _ = link.states.push(back.vio.known());
         link.taker.wake();
         give(packet);
     }

@@ -48,6 +48,7 @@ pub use predictor::Predictor;
 
 use crate::config::VioConfig;
 use crate::frontend::Tracks;
+use crate::limits::CAMERAS_MAX;
 use estimator::{Estimator, Step, CONNECTED_FEW};
 use glam::DVec3;
 use health::{quality, Reset, SIGMA_V_UNOBSERVED};
@@ -58,7 +59,7 @@ use recovery::Recovery;
 use rig::RigEstimate;
 use samples::ImuRing;
 use stats::{Stats, Tally};
-use stipple_drivers::{Calibration, ImuSample, Nanos, Pose};
+use stipple_drivers::{Calibration, ImuSample, Nanos, Pose, Span};
 
 /// No image is this wide.
 const PX_MAX: f32 = 65536.0;
@@ -92,6 +93,17 @@ impl From<&Odometry> for Motion {
     fn from(o: &Odometry) -> Motion {
         Motion { pose: o.world_from_body, v: o.v_world, bg: o.gyro_bias, ba: o.accel_bias }
     }
+}
+
+/// What is known of motion and rig after a frame, for those who work by it.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Known {
+    /// `None` until initialized.
+    pub odometry: Option<Odometry>,
+    /// Where the cameras are on the body, and the largest deviation of their rotations, rad; `None` where it is not estimated.
+    pub cameras: Option<([Pose; CAMERAS_MAX], f64)>,
+    /// Factors on the readings of gyro and accelerometer, less one.
+    pub imu_scale: [DVec3; 2],
 }
 
 /// What one frame led to.
@@ -359,10 +371,28 @@ impl Vio {
         rig.parts.any().then(|| RigEstimate::new(rig, &self.estimator.rig_deviations))
     }
 
-    /// Instant, pose, and whether it is a keyframe, of every frame of the window, oldest first.
+    /// What the tracker works by.
+    pub fn known(&self) -> Known {
+        let rig = &self.estimator.graph.window.rig;
+        let cameras = rig.parts.extrinsics.then(|| {
+            let columns = (0..rig.cameras().len()).filter_map(|c| rig.extrinsic_column(c));
+            let thetas = columns.flat_map(|at| &self.estimator.rig_deviations[at + 3..at + 6]);
+            (rig.now.body_from_cam, thetas.fold(0.0, |most: f64, sigma| most.max(*sigma)))
+        });
+        Known { odometry: self.odometry(), cameras, imu_scale: [rig.now.gyro_scale, rig.now.accel_scale] }
+    }
+
+    /// Time that is to be added to the stamps of images, beyond what the calibration adds; `None` where it is not estimated.
+    pub fn time_offset(&self) -> Option<Span> {
+        let rig = &self.estimator.graph.window.rig;
+        rig.parts.time_offset.then(|| Span::from_secs(rig.now.time_offset))
+    }
+
+    /// Stamp, pose, and whether it is a keyframe, of every frame of the window, oldest first. The pose is that of the
+    /// exposure, by the estimated time offset, of a body whose camera 0 sits where it was calibrated.
     pub fn window(&self) -> impl Iterator<Item = (Nanos, Pose, bool)> + '_ {
         let window = &self.estimator.graph.window;
-        window.slots().map(|s| window.frame(s)).map(|f| (f.t, f.now.pose, f.keyframe))
+        window.slots().map(|s| window.frame(s)).map(|f| (f.t, window.exposed(f), f.keyframe))
     }
 
     /// The epoch of the newest frame.

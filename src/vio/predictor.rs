@@ -33,6 +33,8 @@ pub struct Predictor {
     imu: ImuRing,
     /// Stamp of the frame before.
     last: Option<Nanos>,
+    /// Factors on the readings of gyro and accelerometer, less one.
+    scale: [DVec3; 2],
     #[cfg(feature = "instruments")]
     newest: Option<Newest>,
 }
@@ -68,16 +70,24 @@ impl Predictor {
             noise: Noise::new(&calibration.imu, config),
             imu: ImuRing::new(calibration.imu.rate_hz),
             last: None,
+            scale: [DVec3::ZERO; 2],
             #[cfg(feature = "instruments")]
             newest: None,
         }
     }
 
     /// Takes a sample; refuses what the estimator refuses.
-    pub fn on_imu(&mut self, sample: ImuSample) {
+    pub fn on_imu(&mut self, mut sample: ImuSample) {
+        sample.gyro_body *= 1.0 + self.scale[0];
+        sample.accel_body *= 1.0 + self.scale[1];
         if self.imu.admits(&sample) {
             self.imu.push(sample);
         }
+    }
+
+    /// Takes the factors less one by which the readings of samples to come are to be multiplied, as `Vio::known` has them.
+    pub fn set_scale(&mut self, scale: [DVec3; 2]) {
+        self.scale = scale;
     }
 
     /// Motion of the body from the frame before to the one at `t`, `before_from_now`; `None` at the first frame.

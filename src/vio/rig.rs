@@ -208,6 +208,13 @@ impl RigState {
         self.refresh();
     }
 
+    /// Estimated time from a stamp to the exposure, s, and by what camera 0 is elsewhere on the body than it was calibrated;
+    /// `None` where neither is estimated.
+    pub fn exposure(&self) -> Option<(f64, Pose)> {
+        let is_found = self.parts.time_offset || self.parts.extrinsics;
+        is_found.then(|| (self.now.time_offset, self.now.body_from_cam[0] * self.calibrated[0].inverse()))
+    }
+
     /// Whether a rig could be like this.
     pub fn is_sane(&self) -> bool {
         let (rig, n) = (&self.now, self.cameras.len());

@@ -13,9 +13,10 @@ use super::rig::RigState;
 use super::shutter::Twist;
 use crate::limits::FRAMES;
 use crate::math::dense::Columns;
+use crate::math::so3;
 use crate::mem::List;
 use glam::DVec3;
-use stipple_drivers::Nanos;
+use stipple_drivers::{Nanos, Pose};
 
 /// Dimensions of [p, θ], and of [v, bg, ba].
 pub const POSE_DIM: usize = 6;
@@ -179,6 +180,14 @@ impl Window {
     /// The frame in a slot that is taken, to change it.
     pub fn frame_mut(&mut self, slot: usize) -> &mut Frame {
         &mut self.frames[slot]
+    }
+
+    /// Pose at the exposure of a frame of a body whose camera 0 sits where it was calibrated: what draws by the calibration
+    /// then puts the camera where it was.
+    pub fn exposed(&self, frame: &Frame) -> Pose {
+        let Motion { pose, v, bg, .. } = frame.now;
+        let Some((tau, moved)) = self.rig.exposure() else { return pose };
+        Pose::new(pose.q * so3::exp((frame.rate - bg) * tau), pose.p + v * tau) * moved
     }
 
     /// Takes the twists that views are predicted with (`shutter.rs`). Frames of a plain rig need none.

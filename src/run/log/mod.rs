@@ -96,8 +96,10 @@ impl Estimate {
 /// One frame, with a pose or without.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct State {
-    /// Mid-exposure, in the clock of the frames.
+    /// Stamp of the frame, mid-exposure by the calibration's clocks. The estimate is of this instant by the inertial clock.
     pub t_ns: i64,
+    /// Estimated time from then until the exposure, by the inertial clock; `None` where it is not estimated.
+    pub time_offset_ns: Option<i64>,
     /// Poses of one epoch are in one frame; `vio::Update` says when the next begins.
     pub epoch: u32,
     pub estimate: Option<Estimate>,
@@ -123,6 +125,7 @@ impl State {
         let sigma = update.covariance.map(|c| order.map(|i| c[i][i].sqrt() as f32));
         State {
             t_ns: t.0,
+            time_offset_ns: None,
             epoch: update.epoch,
             estimate,
             dead_reckoned: update.dead_reckoned.is_some(),
