@@ -109,7 +109,7 @@ pub fn into_frames(
             heads[oldest] += 1;
         }
     }
-    if frames.is_empty() {
+    if !frames.iter().any(|f: &FrameFiles| f.images.iter().all(Option::is_some)) {
         let what = format!("no image has a partner within {:.4} s in every camera", tolerance.secs());
         let fix = "check that the cameras are synchronised, or raise replay.pair_tolerance_s";
         return Err(Fault::new(FaultKind::Data, mav0.display().to_string(), what, fix));
