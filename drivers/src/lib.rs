@@ -2,7 +2,7 @@
 //!
 //! - vocabulary: `types` (`Nanos`, `ImuSample`, `Image`, `Frames`, `Pose`), `calibration` and `camera` (the simulator renders
 //!   with the models that the estimator inverts), `fault`, `counters`, `list`
-//! - sources of frames and samples behind two traits (`source`): cameras (`v4l2`), inertial units (`imu`), recordings
+//! - sources of frames and samples behind three traits (`source`): cameras (`v4l2`), inertial units (`imu`), barometers (`baro`), recordings
 //!   (`replay`, played by `paced`), faults on purpose (`inject`); lines of GPIO (`gpio`)
 //! - written recordings (`record`, `euroc`) and the simulator (`sim`)
 //! - the operating system (`host`), memory that two processes share (`shared`)
@@ -10,6 +10,7 @@
 //! It builds and tests without Vulkan or OpenCV and knows nothing of the program: no threads of its own but the recorder's
 //! writer and the simulator's renderers, no configuration file, no exit codes.
 
+pub mod baro;
 pub mod calibration;
 pub mod camera;
 pub mod counters;

@@ -8,7 +8,7 @@
 //! A cable that comes loose ends nothing: `next` answers `Lost` for as long as the device is gone, looks for it again on
 //! every call, and goes on with `Got` when it is back.
 
-use crate::types::{Frames, ImuSample, Span};
+use crate::types::{Frames, ImuSample, Nanos, Span};
 use crate::{Fault, List};
 use std::fmt;
 
@@ -55,6 +55,46 @@ pub trait ImuSource: Send {
         self.inner().map_or_else(Vec::new, |source| source.counters())
     }
 }
+
+/// A sensor beside cameras and inertial unit.
+pub trait AidSource: Send {
+    /// Waits for readings, `timeout` at most, and fills `batch` with them in the order of their stamps. It is empty unless the
+    /// answer is `Got`.
+    fn next(&mut self, timeout: Span, batch: &mut AidBatch) -> Result<Wait, SourceFault>;
+
+    /// Counters so far, by name.
+    fn counters(&self) -> Vec<(&'static str, u64)> {
+        vec![]
+    }
+}
+
+/// What such a sensor measures. Another kind is another variant.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Aid {
+    /// Pressure of the air, Pa.
+    Pressure(f64),
+}
+
+/// A reading of such a sensor.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct AidReading {
+    /// When it was taken.
+    pub t: Nanos,
+    /// What was measured.
+    pub value: Aid,
+}
+
+impl Default for AidReading {
+    fn default() -> AidReading {
+        AidReading { t: Nanos(0), value: Aid::Pressure(f64::NAN) }
+    }
+}
+
+/// Readings of one call at most.
+pub const AID_BATCH: usize = 64;
+
+/// The readings of one call, oldest first.
+pub type AidBatch = List<AidReading, AID_BATCH>;
 
 /// The outcome of waiting for a source.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -45,7 +45,7 @@ pub enum BusFault {
 }
 
 impl BusFault {
-    pub(super) fn of(errno: i32) -> BusFault {
+    pub(crate) fn of(errno: i32) -> BusFault {
         match errno {
             libc::ENXIO | libc::EREMOTEIO => BusFault::Nack,
             libc::EAGAIN | libc::ETIMEDOUT | libc::EBUSY | libc::EINTR => BusFault::Busy,

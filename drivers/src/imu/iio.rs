@@ -345,17 +345,19 @@ fn failed<T>(nothing: T) -> Result<T, i32> {
     }
 }
 
+/// Whether a device has this name or label, or is at this place in the device tree.
+pub(crate) fn is_called(folder: &Path, wanted: &str) -> bool {
+    let by_name = ["name", "label"].iter().any(|f| read_text(&folder.join(f)).as_deref() == Some(wanted));
+    let by_place = || std::fs::canonicalize(folder).is_ok_and(|p| p.to_string_lossy().contains(wanted));
+    by_name || (wanted.contains('/') && by_place())
+}
+
 /// The folder of the device that a board file names.
 fn find(options: &IioOptions, wanted: &str) -> Result<PathBuf, Fault> {
     let entries = std::fs::read_dir(&options.sysfs).into_iter().flatten().filter_map(Result::ok);
     let mut devices: Vec<PathBuf> = entries.map(|e| e.path()).filter(|p| p.join("scan_elements").is_dir()).collect();
     devices.sort();
-    let named = |folder: &&PathBuf| {
-        let by_name = ["name", "label"].iter().any(|f| read_text(&folder.join(f)).as_deref() == Some(wanted));
-        let by_place = || std::fs::canonicalize(folder).is_ok_and(|p| p.to_string_lossy().contains(wanted));
-        by_name || (wanted.contains('/') && by_place())
-    };
-    let found: Vec<&PathBuf> = devices.iter().filter(named).collect();
+    let found: Vec<&PathBuf> = devices.iter().filter(|folder| is_called(folder, wanted)).collect();
     match found[..] {
         [one] => Ok(one.clone()),
         [] => {

@@ -28,6 +28,7 @@ mod timeline;
 mod unit;
 
 pub use counters::ImuCounters;
+pub(crate) use iio::is_called;
 pub use iio::{IioImu, IioOptions};
 pub use register::RegisterImu;
 
@@ -168,6 +169,6 @@ fn watermark(rate_hz: f64) -> usize {
 }
 
 /// Sleeps for a span; not at all where it is negative.
-fn pause(span: Span) {
+pub(crate) fn pause(span: Span) {
     std::thread::sleep(std::time::Duration::from_nanos(span.0.max(0) as u64));
 }
