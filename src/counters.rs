@@ -45,6 +45,12 @@ stipple_drivers::counters! {
     imu_lost,
     imu_silent,
     imu_away_ms,
+    /// Readings of a barometer that did not fit between two frames; times that it was lost, and times that it fell silent; how
+    /// long it was away altogether, ms.
+    aid_overflow,
+    aid_lost,
+    aid_silent,
+    aid_away_ms,
     /// Inertial samples refused: not finite, or not newer than the last.
     imu_rejected,
     /// Inertial samples of which one axis was no motion (a flipped bit), and was put between its neighbours.

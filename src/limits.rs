@@ -10,8 +10,10 @@ pub const KEYFRAMES: usize = 10;
 pub const RIG_DIM: usize = 1 + 6 * CAMERAS_MAX + 6;
 /// Frames in the window at its peak: one more of each just before marginalization.
 pub const FRAMES: usize = STATES + 1 + KEYFRAMES + 1;
+/// The bias of a barometer, one a state, where a board has one.
+pub const HEIGHT_DIM: usize = STATES + 1;
 /// Window dimension at its peak.
-pub const WINDOW_DIM: usize = 15 * (STATES + 1) + 6 * (KEYFRAMES + 1) + RIG_DIM;
+pub const WINDOW_DIM: usize = 15 * (STATES + 1) + 6 * (KEYFRAMES + 1) + RIG_DIM + HEIGHT_DIM;
 /// Points tracked in one camera at a time.
 pub const TRACKS: usize = 300;
 /// Landmarks alive in the window.

@@ -336,6 +336,26 @@ fn truncated_image_is_counted_and_the_run_goes_on() {
 }
 
 #[test]
+fn barometer_of_a_recording_is_used_where_the_board_names_one() {
+    let dir = tempfile::tempdir().unwrap();
+    let data = flight(dir.path(), "3");
+    let fly = |name: &str, set: &[&str]| {
+        let out = dir.path().join(name);
+        let o = replay(&data, &out, &[&["--set", "map.enabled=false"], set].concat());
+        assert!(o.status.success(), "{}", text(&o));
+        serde_json::from_slice::<serde_json::Value>(&fs::read(out.join("report.json")).unwrap()).unwrap()
+    };
+    let (off, on) = (fly("off", &[]), fly("on", &["--set", "baro.chip=bmp388"]));
+    assert!(off["count_heights_used"] == 0 && off["height_bias_m"].is_null());
+    assert!(on["count_heights_used"].as_u64().unwrap() > 20, "{on}");
+    let (bias, sigma) = (on["height_bias_m"].as_f64().unwrap(), on["height_bias_sigma_m"].as_f64().unwrap());
+    assert!(bias.abs() < 0.5 && sigma > 0.0 && sigma < 0.2, "{bias} ± {sigma}");
+    fs::remove_dir_all(data.join("mav0/baro0")).unwrap();
+    let gone = fly("gone", &[]);
+    assert_eq!(off["vio_hash"], gone["vio_hash"], "not named, not looked at");
+}
+
+#[test]
 fn recording_without_a_readable_pair_is_no_result() {
     let dir = tempfile::tempdir().unwrap();
     let data = flight(dir.path(), "0.3");

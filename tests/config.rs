@@ -4,6 +4,7 @@
 
 use std::path::Path;
 use stipple::config::{keys, Board, InjectConfig, StereoMethod};
+use stipple_drivers::baro::BaroOptions;
 use stipple_drivers::gpio::Edge;
 use stipple_drivers::imu::ImuOptions;
 use stipple_drivers::{Fault, FaultKind};
@@ -188,6 +189,20 @@ fn an_inertial_unit_is_described_whole_or_refused() {
 }
 
 #[test]
+fn a_barometer_is_off_unless_it_is_named() {
+    let with = |lines: &str| parse(&format!("{BOARD}[baro]\n{lines}"), &[]);
+    let board = parse(BOARD, &[]).unwrap();
+    assert!(board.baro.options().is_none() && !board.baro.is_named());
+    let board = with("chip = \"bmp388\"\ndevice = \"/dev/i2c-1\"\naddress = 0x77\nnoise_m = 0.1\n").unwrap();
+    assert_eq!(board.baro.options(), Some(BaroOptions::Bmp388 { adapter: "/dev/i2c-1".into(), address: 0x77 }));
+    assert!(board.baro.is_named() && (board.baro.noise_m, board.baro.drift_m, board.baro.air_c) == (0.1, 1.0, 15.0));
+    let board = with("chip = \"iio\"\ndevice = \"dps310\"\n").unwrap();
+    assert_eq!(board.baro.options(), Some(BaroOptions::Iio { device: "dps310".into() }));
+    refused(with("chip = \"bmp085\"\n"), FaultKind::Config, &["test.toml:14", "bmp085", "bmp388"]);
+    refused(with("chip = \"iio\"\nnoise_m = 0\n"), FaultKind::Config, &["test.toml:15", "baro.noise_m"]);
+}
+
+#[test]
 fn missing_file_is_named() {
     refused(Board::load(Path::new("no/such.toml"), &[]), FaultKind::NoInput, &["no/such.toml", "board-configs/"]);
 }
@@ -218,6 +233,7 @@ fn keys_page() -> String {
         ("_mib", "MiB"),
         ("_g", "g"),
         ("_dps", "°/s"),
+        ("_c", "°C"),
         ("image_width_max", "px"),
         ("image_height_max", "px"),
         ("disparities", "px"),

@@ -2,6 +2,7 @@
 
 use crate::calibration::{ImuCalibration, RigCamera};
 use crate::camera::Lens;
+use crate::source::{Aid, AidReading};
 use crate::types::{Colour, Image, ImuSample, Pose};
 use glam::{DMat3, DVec3};
 use png::{BitDepth, ColorType, EncodingError};
@@ -19,6 +20,8 @@ pub const NOISE_SOURCE: &str = "noise_source";
 pub const DATASHEET: &str = "datasheet";
 /// Figures that were measured on this unit.
 pub const MEASURED: &str = "measured";
+/// Headline of the table of a barometer.
+pub const BARO_COLUMNS: &str = "#timestamp [ns],pressure [Pa]\n";
 
 /// The sensor.yaml of a camera.
 pub fn camera_yaml(c: &RigCamera, comment: &str, rate_hz: f64) -> String {
@@ -80,6 +83,12 @@ pub fn transform_yaml(body_from_sensor: &Pose) -> String {
 /// Writes a row of imu0/data.csv.
 pub fn imu_row(out: &mut impl Write, s: &ImuSample) -> io::Result<()> {
     writeln!(out, "{},{},{}", s.t.0, commas(s.gyro_body), commas(s.accel_body))
+}
+
+/// Writes a row of baro0/data.csv: a tenth of a millipascal is a hundredth of a millimetre of height.
+pub fn aid_row(out: &mut impl Write, reading: &AidReading) -> io::Result<()> {
+    let Aid::Pressure(pa) = reading.value;
+    writeln!(out, "{},{pa:.4}", reading.t.0)
 }
 
 /// The three numbers of a row.

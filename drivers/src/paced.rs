@@ -2,7 +2,7 @@
 //! delivered at once and in order, as by a device with a queue.
 
 use crate::replay::{ImageFault, Reader};
-use crate::source::{FrameSource, ImuBatch, ImuReading, ImuSource, SourceFault, Wait};
+use crate::source::{AidBatch, AidReading, AidSource, FrameSource, ImuBatch, ImuReading, ImuSource, SourceFault, Wait};
 use crate::types::{Frames, ImuSample, Nanos, Span};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -186,6 +186,44 @@ impl ImuSource for PacedImu {
         let now = Instant::now();
         while let Some(sample) = self.upcoming().filter(|s| self.pace.due(s.t) <= now) {
             if batch.push(ImuReading { sample, ..ImuReading::default() }).is_err() {
+                break;
+            }
+            self.next += 1;
+        }
+        Ok(Wait::Got)
+    }
+}
+
+/// The barometer of a recording.
+pub struct PacedAids {
+    readings: Vec<AidReading>,
+    pace: Pace,
+    next: usize,
+}
+
+impl PacedAids {
+    /// The readings of a recording, in the order of their stamps.
+    pub fn new(readings: Vec<AidReading>, pace: Pace) -> PacedAids {
+        PacedAids { readings, pace, next: 0 }
+    }
+
+    fn upcoming(&self) -> Option<AidReading> {
+        let (index, later) = self.pace.part(self.next, self.readings.len())?;
+        let reading = self.readings[index];
+        Some(AidReading { t: reading.t + later, ..reading })
+    }
+}
+
+impl AidSource for PacedAids {
+    fn next(&mut self, timeout: Span, batch: &mut AidBatch) -> Result<Wait, SourceFault> {
+        batch.clear();
+        let Some(first) = self.upcoming() else { return Ok(Wait::Ended) };
+        if !self.pace.wait(first.t, after(timeout)) {
+            return Ok(Wait::TimedOut);
+        }
+        let now = Instant::now();
+        while let Some(reading) = self.upcoming().filter(|r| self.pace.due(r.t) <= now) {
+            if batch.push(reading).is_err() {
                 break;
             }
             self.next += 1;

@@ -9,6 +9,7 @@ use proptest::test_runner::RngSeed;
 use std::fs;
 use std::path::Path;
 use stipple_drivers::replay::*;
+use stipple_drivers::source::Aid;
 use stipple_drivers::{FaultKind, Frames, Lens, Nanos, Span};
 
 #[test]
@@ -42,6 +43,23 @@ fn image_without_partner_is_dropped_and_counted() {
     let (r, counted) = f.one_fault();
     assert_eq!((r.frames.len(), counted), (PAIRS - 1, ("images_unpaired", 1)));
     assert!(r.warnings[0].contains("cam0/data.csv:4: "), "{:?}", r.warnings);
+}
+
+#[test]
+fn pressures_are_read_where_there_are_and_a_bad_row_costs_itself() {
+    let f = Folder::new();
+    assert!(f.open().unwrap().aids.is_empty());
+    let rows = [(0, "98000.5"), (20, "nan"), (40, "loud"), (60, "98001"), (50, "98002"), (80, "98003")];
+    let rows = rows.map(|(ms, pa)| format!("{},{pa}\n", T0 + ms * 1_000_000)).concat();
+    f.write("baro0/data.csv", format!("#timestamp [ns],pressure [Pa]\n{rows}"));
+    let r = f.open().unwrap();
+    let read: Vec<_> = r.aids.iter().map(|a| ((a.t.0 - T0) / 1_000_000, a.value)).collect();
+    assert_eq!(read.len(), 3, "{read:?}");
+    assert_eq!((read[0], read[2]), ((0, Aid::Pressure(98000.5)), (80, Aid::Pressure(98003.0))));
+    let c = &r.counters;
+    assert_eq!((c.pressures_not_finite, c.rows_malformed, c.stamps_out_of_order), (1, 1, 1));
+    f.write("baro0/data.csv", "this is, no table\nof, it\n");
+    assert!(f.open().unwrap_err().to_string().contains("baro0/data.csv"));
 }
 
 #[test]

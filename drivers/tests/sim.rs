@@ -7,6 +7,7 @@ use glam::{DMat3, DQuat, DVec2, DVec3};
 use std::path::PathBuf;
 use stipple_drivers::replay::{OpenOptions, Recording};
 use stipple_drivers::sim::{rig_named, write_euroc, Flight, Scenario, Sim, GRAVITY, RIGS};
+use stipple_drivers::source::Aid;
 use stipple_drivers::{Camera, FaultKind, Frames, ImuCalibration, Lens, Nanos, Pose, Span};
 
 fn quiet(name: &str) -> Scenario {
@@ -332,6 +333,11 @@ fn a_written_run_is_whole_and_can_be_flown_again() {
     assert_eq!(recording.imu.unwrap().len(), sim.imu().len());
     let read = Recording::open(&dir, &OpenOptions::default()).unwrap();
     assert!(read.warnings.is_empty(), "{:?}", read.warnings);
+    assert!(sim.aids().len() == 41 && read.aids.len() == 41, "50 a second");
+    for (read, made) in read.aids.iter().zip(sim.aids()) {
+        let [Aid::Pressure(a), Aid::Pressure(b)] = [read, made].map(|a| a.value);
+        assert!(read.t == made.t && (a - b).abs() < 1e-4 && (97_000.0..99_000.0).contains(&a), "{a} {b}");
+    }
     assert_eq!((read.frames.len(), read.imu.len(), read.truth.len()), (17, sim.imu().len(), sim.imu().len()));
     for (a, b) in read.calibration.cameras.iter().zip(&sim.calibration().cameras) {
         assert_eq!(a.camera, b.camera);

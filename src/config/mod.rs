@@ -14,7 +14,7 @@ pub use method::{
     Fit, FrontendConfig, GpuConfig, MapConfig, NetworkConfig, Projection, StereoConfig, StereoMethod, VioConfig,
 };
 pub use section::{Bound, Key};
-pub use sensors::{CameraConfig, GpioConfig, ImuConfig, RecordConfig, RigConfig};
+pub use sensors::{BaroConfig, CameraConfig, GpioConfig, ImuConfig, RecordConfig, RigConfig};
 
 use section::section;
 use sensors::Wrong;
@@ -34,6 +34,8 @@ pub struct Board {
     pub camera: CameraConfig,
     #[serde(default)]
     pub imu: ImuConfig,
+    #[serde(default)]
+    pub baro: BaroConfig,
     #[serde(default)]
     pub gpio: GpioConfig,
     #[serde(default)]
@@ -83,6 +85,7 @@ pub fn keys() -> impl Iterator<Item = &'static Key> {
         RigConfig::KEYS,
         CameraConfig::KEYS,
         ImuConfig::KEYS,
+        BaroConfig::KEYS,
         GpioConfig::KEYS,
         RecordConfig::KEYS,
         FrontendConfig::KEYS,
@@ -202,7 +205,7 @@ impl Board {
         ];
         let broken =
             rules.into_iter().find(|(holds, _, _)| !holds).map(|(_, key, rule)| (key, format!("{key} {rule}")));
-        let wrong = broken.or_else(|| self.camera.wrong()).or_else(|| self.gpio.wrong());
+        let wrong = broken.or_else(|| self.camera.wrong()).or_else(|| self.baro.wrong()).or_else(|| self.gpio.wrong());
         wrong.or_else(|| self.imu.wrong(&self.gpio)).map_or(Ok(()), Err)
     }
 }

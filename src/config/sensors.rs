@@ -1,9 +1,10 @@
-//! The sensors of a live run, and how they are wired: `[rig]`, `[camera]`, `[imu]`, `[gpio]`, `[record]`. Replays read
-//! `rig.readout_s` and `camera.pair_tolerance_s` alone.
+//! The sensors of a live run, and how they are wired: `[rig]`, `[camera]`, `[imu]`, `[baro]`, `[gpio]`, `[record]`.
+//! Replays read `rig.readout_s`, `camera.pair_tolerance_s` and `[baro]` alone.
 
 use super::section::{section, Bound};
 use serde::Deserialize;
 use std::collections::BTreeMap;
+use stipple_drivers::baro::BaroOptions;
 use stipple_drivers::gpio::{Edge, LineName};
 use stipple_drivers::imu::chips::Chip;
 use stipple_drivers::imu::{IioOptions, ImuOptions, RegisterOptions, Wiring};
@@ -99,6 +100,23 @@ section! {
 }
 
 section! {
+    /// A barometer, if there is one. That of a recording is used, too, where this names a chip.
+    BaroConfig, "baro.";
+    /// bmp388, driven by its registers, or iio, driven by the kernel; empty: there is none. It holds the height of a climb.
+    chip: String = String::new();
+    /// Where it is: its I2C adapter (a path, or the name of `i2cdetect -l`), or with iio the name, label or place of the device.
+    device: String = String::new();
+    /// Its address on the I2C bus: 0x76 or 0x77.
+    address: u16 = 0x76, Bound::Within(8.0, 119.0);
+    /// Standard deviation of a reading. Raise it where rotors or wind press on the sensor.
+    noise_m: f64 = 0.03, Bound::Within(0.001, 100.0);
+    /// Standard deviation of its drift in ten minutes, the weather's included.
+    drift_m: f64 = 1.0, Bound::Within(0.001, 1000.0);
+    /// Temperature of the air at the start: ten degrees wrong make a climb 3.5 percent too long or too short.
+    air_c: f64 = 15.0, Bound::Within(-60.0, 60.0);
+}
+
+section! {
     /// Recording beside a run.
     RecordConfig, "record.";
     /// Frames that wait for the disk; those beyond are dropped from the recording, and counted. SD cards stall for a second now
@@ -162,6 +180,8 @@ impl CameraConfig {
     }
 }
 
+/// The barometer that is driven by its registers.
+const BMP388: &str = "bmp388";
 /// The chip's name that means the kernel's driver.
 const IIO: &str = "iio";
 /// Equal samples in a row after which the driver sets the unit up anew. The quietest of the units, at its widest range, has a
@@ -256,6 +276,29 @@ fn line(text: &str) -> Result<Option<(LineName, bool)>, String> {
     match name.rsplit_once(':').filter(|(chip, line)| !chip.is_empty() && !line.is_empty()) {
         Some((chip, line)) => Ok(Some((LineName { chip: chip.into(), line: line.into() }, low))),
         None => Err(format!("`{text}` is not CHIP:LINE, such as pinctrl-rp1:GPIO25")),
+    }
+}
+
+impl BaroConfig {
+    /// The first key that is wrong, and why.
+    pub(super) fn wrong(&self) -> Option<Wrong> {
+        let known = ["", BMP388, IIO].contains(&self.chip.as_str());
+        (!known).then(|| ("baro.chip", format!("baro.chip = \"{}\" must be {BMP388} or {IIO}", self.chip)))
+    }
+
+    /// The barometer to open; none where the board has none.
+    pub fn options(&self) -> Option<BaroOptions> {
+        let device = || self.device.clone();
+        match self.chip.as_str() {
+            "" => None,
+            IIO => Some(BaroOptions::Iio { device: device() }),
+            _ => Some(BaroOptions::Bmp388 { adapter: device(), address: self.address }),
+        }
+    }
+
+    /// Whether there is one.
+    pub fn is_named(&self) -> bool {
+        !self.chip.is_empty()
     }
 }
 

@@ -55,6 +55,9 @@ pub struct Report {
     /// What was estimated of the rig, over its calibration, and standard deviations.
     pub time_offset_s: Option<f64>,
     pub time_offset_sigma_s: Option<f64>,
+    /// By how much a barometer's height had drifted from the estimate's at the end, and its standard deviation.
+    pub height_bias_m: Option<f64>,
+    pub height_bias_sigma_m: Option<f64>,
     pub extrinsics: Vec<ExtrinsicsFound>,
     /// Factors less one, by axis.
     pub gyro_scale: Option<[f64; 3]>,
@@ -152,7 +155,7 @@ mod tests {
         tracking_ms_p99 tracking_threads tracking_cpu_ms frontend_ms_p50 frontend_ms_p99 estimator_ms_p50 \
         estimator_ms_p99 psnr_db ssim psnr_heldout_db ssim_heldout psnr_heldout_between_db psnr_heldout_fitted_db ssim_heldout_fitted psnr_heldout_aligned_db splats iterations \
         iteration_ms_p50 seconds_to_25_db gpu_bytes estimator_bytes quality_min quality_p50 quality_under_50 rss_peak_bytes map_rss_peak_bytes heap_after_seal wall_s device vio_hash dataset board pace scale \
-        camera_cpu_ms camera_kernel_ms camera_copies time_offset_s time_offset_sigma_s gyro_scale gyro_scale_sigma accel_scale accel_scale_sigma epochs";
+        camera_cpu_ms camera_kernel_ms camera_copies time_offset_s time_offset_sigma_s height_bias_m height_bias_sigma_m gyro_scale gyro_scale_sigma accel_scale accel_scale_sigma epochs";
 
     #[test]
     fn unmeasured_figures_are_null_and_present() {

@@ -132,7 +132,7 @@ pub fn fly(
     let mut budget = Budget { steps, total, spent: 0, start: Instant::now() };
     let gates = (FrameGate::new(&packets[0].frames), ImuGate::new(&calibration.imu));
     let mut notices = vec![];
-    let mut reading = Reading { recorded, gates, next: 0, samples: 0 };
+    let mut reading = Reading { recorded, gates, next: 0, samples: 0, aids: 0 };
     std::thread::scope(|scope| {
         let (taken, given, woken) = (&waiting, &done, &waker);
         let give = move |packet| {
@@ -213,6 +213,7 @@ struct Reading {
     gates: (FrameGate, ImuGate),
     next: usize,
     samples: usize,
+    aids: usize,
 }
 
 impl Reading {
@@ -225,12 +226,12 @@ impl Reading {
         waiting: &ArrayQueue<Box<FramePacket>>,
         counters: &Counters,
     ) -> usize {
-        let Recorded { images, stamps, imu } = &mut self.recorded;
+        let Recorded { images, stamps, imu, aids } = &mut self.recorded;
         let (frame_gate, imu_gate) = &mut self.gates;
         let mut sent = 0;
         let writable = packets.len() - 1;
         for packet in &mut packets[..writable] {
-            packet.imu.clear();
+            packet.clear();
             let mut read = false;
             while self.next < stamps.len() && !read {
                 let i = self.next;
@@ -248,6 +249,10 @@ impl Reading {
                     if self.samples == imu.len() {
                         imu_gate.lose(&mut push);
                     }
+                }
+                while let Some(&reading) = aids.get(self.aids).filter(|a| a.t <= stamps[i]) {
+                    self.aids += 1;
+                    packet.push_aid(reading, counters);
                 }
                 let frames = packet.writable().expect("it is not the last that came back");
                 read = images.read(i, frames).is_ok();

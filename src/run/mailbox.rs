@@ -1,4 +1,4 @@
-//! Where frames and samples wait for tracking, and the two threads that put them there.
+//! Where frames and samples wait for tracking, and the threads that put them there.
 //!
 //! Each thread waits for its source, has the gate judge what comes, and delivers: frames to a mailbox of one, where the
 //! newest replaces the one that waits; samples to a queue. A source that is lost or silent is reported in one line when
@@ -18,7 +18,9 @@ use std::sync::atomic::{AtomicBool, AtomicI64, AtomicU64, Ordering::Relaxed};
 use std::sync::OnceLock;
 use std::time::{Duration, Instant};
 use stipple_drivers::host::{monotonic, thread_cpu, CpuTime};
-use stipple_drivers::source::{FrameSource, ImuBatch, ImuSource, SourceFault, Wait};
+use stipple_drivers::source::{
+    AidBatch, AidReading, AidSource, FrameSource, ImuBatch, ImuSource, SourceFault, Wait, AID_BATCH,
+};
 use stipple_drivers::{Calibration, Fault, ImuSample, Span};
 
 /// Longest wait for a source: what ends a run or reports a loss is at most so late.
@@ -41,6 +43,7 @@ pub struct Mailbox {
     pub spare: ArrayQueue<Box<FramePacket>>,
     newest: ArrayQueue<Box<FramePacket>>,
     imu: ArrayQueue<ImuSample>,
+    aids: ArrayQueue<AidReading>,
     /// Stamp of the newest sample, ns.
     imu_until: AtomicI64,
     /// The unit is lost, silent, or its recording over: nobody waits for it.
@@ -49,7 +52,7 @@ pub struct Mailbox {
     pub arrived: AtomicU64,
     /// Cost of reading the cameras, known when the thread `camera` has ended.
     pub capture: OnceLock<Capture>,
-    /// Asks both threads to end.
+    /// Asks the threads to end.
     pub stop: AtomicBool,
     /// Lines to be printed.
     pub notices: ArrayQueue<String>,
@@ -63,6 +66,7 @@ impl Mailbox {
             spare: ArrayQueue::new(packets),
             newest: ArrayQueue::new(1),
             imu: ArrayQueue::new(IMU_SLOTS),
+            aids: ArrayQueue::new(AID_BATCH),
             imu_until: AtomicI64::new(i64::MIN),
             imu_away: AtomicBool::new(false),
             arrived: AtomicU64::new(0),
@@ -82,7 +86,7 @@ impl Mailbox {
     pub fn take(&self, held: &mut Option<Held>, over: &AtomicBool, counters: &Counters) -> Option<Box<FramePacket>> {
         if held.is_none() {
             let Some(mut packet) = self.newest.pop() else { return self.take_samples(counters) };
-            packet.imu.clear();
+            packet.clear();
             packet.imu_only = false;
             *held = Some(Held { packet, since: Instant::now() });
         }
@@ -101,6 +105,10 @@ impl Mailbox {
             return None;
         }
         counters.frames_without_imu.add(u64::from(!reached));
+        // Nobody waits for these: a later frame brings what comes late.
+        while let Some(reading) = self.aids.pop() {
+            packet.push_aid(reading, counters);
+        }
         held.take().map(|h| h.packet)
     }
 
@@ -111,7 +119,7 @@ impl Mailbox {
             return None;
         }
         let mut packet = self.spare.pop()?;
-        packet.imu.clear();
+        packet.clear();
         packet.imu_only = true;
         for _ in 0..SAMPLES_ALONE {
             self.imu.pop().into_iter().for_each(|sample| packet.push_imu(sample, counters));
@@ -338,6 +346,29 @@ pub fn inertial(
     }
     gate.lose(&mut queue);
     mailbox.imu_away.store(true, Relaxed);
+}
+
+/// Thread `barometer`. Ends with its source or with the cameras; a run goes on without it.
+pub fn aids(mailbox: &Mailbox, source: &mut dyn AidSource, over: &AtomicBool, c: &Counters) {
+    let mut batch = AidBatch::default();
+    let mut liveness = Liveness::new("barometer", [&c.aid_lost, &c.aid_silent, &c.aid_away_ms], &mailbox.notices);
+    while !over.load(Relaxed) {
+        threads::alive();
+        let answer = source.next(PATIENCE, &mut batch);
+        liveness.update(&answer);
+        match answer {
+            Ok(Wait::Got) => {}
+            Ok(Wait::TimedOut) | Err(SourceFault::Lost(_)) => continue,
+            Ok(Wait::Ended) => break,
+            Err(broken) => {
+                liveness.lose(&c.aid_lost, || format!("is {broken}"));
+                break;
+            }
+        }
+        for reading in batch.iter() {
+            c.aid_overflow.add(u64::from(mailbox.aids.force_push(*reading).is_some()));
+        }
+    }
 }
 
 #[cfg(test)]

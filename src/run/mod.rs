@@ -10,6 +10,7 @@
 //! | main | opens everything, shows status, reports | free |
 //! | camera | waits for frames, or decodes files and delivers them when they are due | free |
 //! | imu | waits for inertial samples | free |
+//! | barometer | waits for pressures, where there is one | free |
 //! | tracking | front end and back end in turns; offers keyframes | sealed |
 //! | or frontend | follows points (`frontend.threads = 2`) | sealed |
 //! | and estimator | estimates, one frame behind at most; offers keyframes | sealed |
@@ -362,7 +363,7 @@ pub fn fly_in_real_time(
     let mut keyframes = Keyframes::new(run.holdout);
     let (map, notices) = std::thread::scope(|scope| {
         let (taker, keyframes) = (&link.taker, &mut keyframes);
-        let Sensors { frames, imu } = &mut sensors;
+        let Sensors { frames, imu, aids } = &mut sensors;
         spawn(scope, "camera", move || {
             let _ended = waker::SetOnDrop(&s.source_done, Some(taker));
             mailbox::camera(&s.mailbox, &mut **frames, taker, &s.counters, &s.gauges);
@@ -371,6 +372,9 @@ pub fn fly_in_real_time(
         spawn(scope, "imu", move || {
             mailbox::inertial(&s.mailbox, &mut **imu, gate, taker, &s.source_done, &s.counters)
         });
+        if let Some(aids) = aids {
+            spawn(scope, "barometer", move || mailbox::aids(&s.mailbox, &mut **aids, &s.source_done, &s.counters));
+        }
         let observes = matches!(tracker, Tracker::Observer(_));
         let give = move |packet: Box<FramePacket>| {
             if !packet.imu_only {
@@ -405,7 +409,8 @@ pub fn fly_in_real_time(
         (thread.map(|t| MapSide::Here(Box::new(here(t)))).or(worker.map(MapSide::Apart)), notices)
     });
     let warnings = sensors.frames.warnings().to_vec();
-    let mut source = [sensors.frames.counters(), sensors.imu.counters()].concat();
+    let beside = sensors.aids.as_ref().map_or_else(Vec::new, |aids| aids.counters());
+    let mut source = [sensors.frames.counters(), sensors.imu.counters(), beside].concat();
     let unreadable = |count: &(&str, u64)| count.0 == FRAMES_UNREADABLE;
     source.iter().filter(|count| unreadable(count)).for_each(|(_, n)| s.counters.frames_unreadable.add(*n));
     source.retain(|count| !unreadable(count));

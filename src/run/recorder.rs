@@ -5,6 +5,7 @@ use super::threads;
 use crate::config::Board;
 use std::path::{Path, PathBuf};
 use stipple_drivers::record::{self, Format, Recorder, Ring};
+use stipple_drivers::source::AidSource;
 use stipple_drivers::{Calibration, Fault, FaultKind, Frames};
 
 /// A recording under way.
@@ -30,8 +31,10 @@ impl Recording {
             watched.get_or_insert_with(|| threads::watch(record::WRITER));
             threads::alive();
         };
-        let (recorder, frames, imu) = record::start(sink, (sensors.frames, sensors.imu), ring, alive);
-        let sensors = Sensors { frames: Box::new(frames), imu: Box::new(imu) };
+        let sources = (sensors.frames, sensors.imu, sensors.aids);
+        let (recorder, (frames, imu, aids)) = record::start(sink, sources, ring, alive);
+        let aids = aids.map(|aids| Box::new(aids) as Box<dyn AidSource>);
+        let sensors = Sensors { frames: Box::new(frames), imu: Box::new(imu), aids };
         Ok((sensors, Some(Recording { recorder, dir: dir.into() })))
     }
 

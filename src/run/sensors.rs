@@ -11,10 +11,10 @@ use std::thread::JoinHandle;
 use stipple_drivers::counters::Counter;
 use stipple_drivers::gpio::{DataReady, Output, Trigger};
 use stipple_drivers::inject::{FaultyFrames, FaultyImu};
-use stipple_drivers::paced::{Images, Pace, PacedFrames, PacedImu};
+use stipple_drivers::paced::{Images, Pace, PacedAids, PacedFrames, PacedImu};
 use stipple_drivers::replay::{read_calibration, OpenOptions, Recording};
 use stipple_drivers::sim::{Scenario, Sim};
-use stipple_drivers::source::{FrameSource, ImuBatch, ImuSource, SourceFault, Wait};
+use stipple_drivers::source::{AidReading, AidSource, FrameSource, ImuBatch, ImuSource, SourceFault, Wait};
 use stipple_drivers::{v4l2, Calibration, Fault, FaultKind, Frames, ImuCorrection, ImuSample, Nanos, Span, TimedPose};
 
 /// What a flight reads, opened.
@@ -31,6 +31,7 @@ pub struct Input {
     pub source: Source,
 }
 
+#[allow(clippy::large_enum_variant)] // there is one in a run
 pub enum Source {
     /// The board's own sensors, and the frame rate they were asked for, Hz.
     Live {
@@ -46,6 +47,8 @@ pub struct Recorded {
     /// One of each frame.
     pub stamps: Vec<Nanos>,
     pub imu: Vec<ImuSample>,
+    /// Readings of a barometer, where there is one.
+    pub aids: Vec<AidReading>,
 }
 
 /// How a recording is played.
@@ -63,10 +66,11 @@ impl Default for Playback {
     }
 }
 
-/// A rig of cameras and an inertial unit.
+/// A rig of cameras and an inertial unit, and a barometer where the board names one.
 pub struct Sensors {
     pub frames: Box<dyn FrameSource>,
     pub imu: Box<dyn ImuSource>,
+    pub aids: Option<Box<dyn AidSource>>,
 }
 
 /// Opens a recording with what the board says of its rig, and another calibration than its own where one is given.
@@ -93,7 +97,12 @@ impl Input {
             truth: r.truth,
             warnings: r.warnings,
             opened: r.counters.list(),
-            source: Source::Recorded(Recorded { images, stamps: r.frames.iter().map(|f| f.t).collect(), imu: r.imu }),
+            source: Source::Recorded(Recorded {
+                images,
+                stamps: r.frames.iter().map(|f| f.t).collect(),
+                imu: r.imu,
+                aids: r.aids,
+            }),
         })
     }
 
@@ -121,7 +130,12 @@ impl Input {
             truth: sim.truth(),
             warnings: vec![],
             opened: vec![],
-            source: Source::Recorded(Recorded { images: Images::Rendered(frames), stamps, imu: sim.imu().to_vec() }),
+            source: Source::Recorded(Recorded {
+                images: Images::Rendered(frames),
+                stamps,
+                imu: sim.imu().to_vec(),
+                aids: sim.aids().to_vec(),
+            }),
         })
     }
 
@@ -194,11 +208,13 @@ impl Recorded {
             let last = if self.stamps.len() > 1 { self.stamps.pop() } else { None };
             let end = last.unwrap_or(first + Span::from_secs(1.0));
             self.imu.retain(|s| s.t >= first && s.t < end);
+            self.aids.retain(|a| a.t >= first && a.t < end);
             pace = pace.repeating(end - first);
         }
         Sensors {
             frames: Box::new(PacedFrames::new(self.images, self.stamps, pace)),
             imu: Box::new(PacedImu::new(self.imu.into(), pace)),
+            aids: (!self.aids.is_empty()).then(|| Box::new(PacedAids::new(self.aids, pace)) as Box<dyn AidSource>),
         }
     }
 }
@@ -206,14 +222,14 @@ impl Recorded {
 impl Sensors {
     /// Adds faults to what the sensors give; `shape` makes frames of the rig's shape.
     pub fn with_faults(self, inject: &InjectConfig, shape: impl Fn() -> Frames) -> Sensors {
-        let Sensors { mut frames, mut imu } = self;
+        let Sensors { mut frames, mut imu, aids } = self;
         if !inject.camera.is_empty() {
             frames = Box::new(FaultyFrames::new(frames, &inject.camera, inject.seed, shape()));
         }
         if !inject.imu.is_empty() {
             imu = Box::new(FaultyImu::new(imu, &inject.imu, inject.seed));
         }
-        Sensors { frames, imu }
+        Sensors { frames, imu, aids }
     }
 }
 
@@ -241,7 +257,8 @@ fn open(path: &Path, board: &Board) -> Result<(Calibration, Sensors), Fault> {
             Box::new(Triggered { source: rig, pulses: Pulses::start(trigger) })
         }
     };
-    Ok((calibration, Sensors { frames, imu: Box::new(imu) }))
+    let aids = board.baro.options().map(|baro| baro.open()).transpose()?;
+    Ok((calibration, Sensors { frames, imu: Box::new(imu), aids }))
 }
 
 /// Opens each part of a board by itself, where not all can be opened: its name, and what was found or is wrong.
@@ -264,6 +281,9 @@ pub fn parts(path: &Path, board: &Board) -> Vec<(&'static str, Result<String, Fa
     }
     let opened = board.imu.options().ok_or_else(none).and_then(|o| o.open(data_ready.ok().flatten()));
     parts.push(("inertial unit", opened.map(|_| format!("{} answers", board.imu.chip))));
+    if let Some(baro) = board.baro.options() {
+        parts.push(("barometer", baro.open().map(|_| format!("{} answers", board.baro.chip))));
+    }
     let outputs =
         [("trigger line", board.gpio.trigger().map(|(line, low, _)| (line, low))), ("status light", board.gpio.led())];
     for (name, (line, active_low)) in outputs.into_iter().filter_map(|(name, o)| Some((name, o?))) {

@@ -198,6 +198,7 @@ fn track_figures(report: &mut Report, flown: &Flown) -> Vec<TimedPose> {
             (report.accel_scale, report.accel_scale_sigma) = (Some(three(&v, 3)), Some(three(&s, 3)));
         }
     }
+    (report.height_bias_m, report.height_bias_sigma_m) = run.back.vio.height_bias().map(|[b, s]| (b, s)).unzip();
     report.estimator_bytes = Some(run.bytes);
     if let Some((least, median, under)) = run.back.vio.quality_summary() {
         (report.quality_min, report.quality_p50) = (Some(least.into()), Some(median.into()));

@@ -15,11 +15,12 @@ use stipple_drivers::{host, Fault, FaultKind, Span};
 const SLOTS: usize = 16;
 /// Priorities among real-time threads, and how long each may be silent, s. A pulse that starts an exposure comes before
 /// everything; an anchor may take the mapper long, and a card that stalls those who write.
-const WATCHED: [(&str, i32, f64); 13] = [
+const WATCHED: [(&str, i32, f64); 14] = [
     ("main", 0, 5.0),
     ("trigger", 13, 5.0),
     ("imu", 12, 5.0),
     ("camera", 11, 5.0),
+    ("barometer", 10, 5.0),
     ("tracking", 10, 5.0),
     ("frontend", 10, 5.0),
     ("estimator", 10, 5.0),

@@ -25,6 +25,7 @@ use std::sync::atomic::AtomicBool;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use stipple_drivers::host::{thread_cpu, thread_cpu_now};
+use stipple_drivers::source::{AidBatch, AidReading};
 use stipple_drivers::types::pose_at;
 use stipple_drivers::{Calibration, Fault, Frames, ImuSample, Nanos, Pose, Span, TimedPose};
 
@@ -51,6 +52,7 @@ pub struct FramePacket {
     /// A camera saw nothing: no view to train a map on.
     pub blank: bool,
     pub imu: List<ImuSample, IMU_BETWEEN_FRAMES>,
+    pub aids: AidBatch,
     pub tracks: Tracks,
     pub tracked: Option<Tracked>,
     /// The epoch of its pose, and what the frame suffered from.
@@ -72,6 +74,7 @@ impl FramePacket {
             imu_only: false,
             blank: false,
             imu: List::default(),
+            aids: AidBatch::default(),
             tracks: Tracks::default(),
             tracked: None,
             epoch: 0,
@@ -85,6 +88,17 @@ impl FramePacket {
     /// The buffers for the next frame; `None` while the front end still reads this one.
     pub fn writable(&mut self) -> Option<&mut Frames> {
         Arc::get_mut(&mut self.frames)
+    }
+
+    /// Empties it of what came before its frame.
+    pub fn clear(&mut self) {
+        self.imu.clear();
+        self.aids.clear();
+    }
+
+    /// Adds a reading; one that does not fit is counted.
+    pub fn push_aid(&mut self, reading: AidReading, counters: &Counters) {
+        counters.aid_overflow.add(u64::from(self.aids.push(reading).is_err()));
     }
 
     /// Adds a sample; a full list drops its oldest, which is counted.
@@ -178,6 +192,7 @@ impl Back {
     pub fn estimate(&mut self, packet: &mut FramePacket) {
         let (begun, cpu) = (Instant::now(), thread_cpu_now());
         packet.imu.iter().for_each(|s| self.vio.on_imu(*s));
+        packet.aids.iter().for_each(|reading| self.vio.on_aid(reading));
         packet.tracked = None;
         if packet.imu_only {
             return;
@@ -234,7 +249,8 @@ impl OdometryRun {
     ) -> Result<OdometryRun, Fault> {
         let mut f = Footprint::default();
         let frontend = f.build("tracking: front end", || Frontend::new(calibration, &board.frontend))?;
-        let estimator = || (Vio::new(calibration, &board.vio), Predictor::new(calibration, &board.vio));
+        let vio = || Vio::new(calibration, &board.vio).with_barometer(&board.baro);
+        let estimator = || (vio(), Predictor::new(calibration, &board.vio));
         let (vio, predictor) = f.build("tracking: estimator", estimator);
         let bytes = f.total();
         let trajectory = f.build("tracking: poses of frames", || Thinned::with_capacity(frames));

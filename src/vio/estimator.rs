@@ -7,6 +7,7 @@
 
 use super::factors::inertial_residual_at;
 use super::graph::Graph;
+use super::height::{Attached, Heights};
 use super::inertial::{Covariance, InertialWeight};
 use super::initialization::Start;
 use super::innovation_gate::{gate, predicted_covariance, Passed};
@@ -49,6 +50,8 @@ pub struct Step {
     pub columns_lost: u64,
     /// Zero velocity was measured.
     pub at_rest: bool,
+    /// What became of the heights of a barometer.
+    pub heights: Attached,
     pub outcome: Outcome,
     pub outliers: usize,
     /// Landmarks refused because there was no room.
@@ -68,6 +71,10 @@ pub struct Estimator {
     pub tracks: Vec<Tracks>,
     pub solver: Solver,
     marginalizer: Marginalizer,
+    /// Readings of a barometer; `None` where the rig has none.
+    pub heights: Option<Heights>,
+    /// Deviation of the barometer's bias at the newest frame, m.
+    pub height_deviation: Option<f64>,
     /// Standard deviations of the rig, in the order of its columns.
     pub rig_deviations: [f64; RIG_DIM],
     /// Stamp of the newest keyframe.
@@ -87,6 +94,8 @@ impl Estimator {
             tracks: vec![Tracks::default(); FRAMES],
             solver: Solver::new(),
             marginalizer: Marginalizer::new(),
+            heights: None,
+            height_deviation: None,
             keyframe_at: Nanos(0),
             moved: false,
         }
@@ -101,6 +110,8 @@ impl Estimator {
     pub fn clear(&mut self) {
         self.graph.clear();
         self.moved = false;
+        self.height_deviation = None;
+        self.heights.iter_mut().for_each(Heights::forget_bias);
     }
 
     /// First frame of an empty window.
@@ -113,7 +124,7 @@ impl Estimator {
         let slot = self.graph.window.push(frame).expect("an empty window has room");
         self.graph.window.rig.fix_linearization_point();
         self.rig_deviations = self.graph.window.rig.sigmas(&self.model.config);
-        self.graph.prior.start(slot, motion, sigma, &self.graph.window.rig, &self.rig_deviations);
+        self.graph.prior.start(slot, motion, sigma, &self.graph.window, &self.rig_deviations);
         self.tracks[slot].clone_from(tracks);
         let landmarks_full = self.make_keyframe(slot);
         Step {
@@ -134,8 +145,12 @@ impl Estimator {
             step.landmarks_full = self.make_keyframe(slot);
         }
 
+        if let Some(heights) = &mut self.heights {
+            step.heights = heights.attach(&mut self.graph.window);
+        }
         step.outcome = self.solver.optimize(&mut self.graph, &self.model);
         step.covariance = self.solver.newest_covariance();
+        self.height_deviation = self.heights.as_ref().and_then(|_| self.solver.newest_height_deviation());
         let views = self.graph.landmarks.views_in(slot);
         let n = self.graph.window.rig.dim();
         if step.keyframe && n > 0 {
@@ -156,6 +171,10 @@ impl Estimator {
         frame.weight = InertialWeight::new(&inc, &self.model.noise);
         frame.increment = inc;
         frame.rate = imu.rate_at(t);
+        if let Some(heights) = &self.heights {
+            frame.height_bias = self.graph.window.frame(before).height_bias;
+            frame.height_walk = heights.walk_weight(frame.increment.dt);
+        }
         frame
     }
 

@@ -1,13 +1,14 @@
 //! The factors of the window: everything that was measured, each as whitened residuals of frames, points and rig.
 //!
 //! There is one list of them. The cost, the linearization and the marginalization go through it and know none of its
-//! members, so that a new kind of measurement (a barometer, GNSS) is a variant of `Factor`, its place in
-//! `measured_at`, a cost and its rows. The prior stands apart (`prior.rs`): it is not measured but kept.
+//! members, so that a new kind of measurement (GNSS, wheels; `height.rs` is the first) is a variant of `Factor`, its place in
+//! `measured_at` or `between`, a cost and its rows. The prior stands apart (`prior.rs`): it is not measured but kept.
 //!
 //! Rows are `[J | r]` of a least-squares problem. A landmark's are `[point | frames | r]`; Householder QR of the three
 //! columns of the point leaves rows that do not contain it (Demmel et al., ICCV 2021). Residuals are taken at the
 //! estimate, Jacobians at the first estimates (FEJ), those to the rig's columns too.
 
+use super::height;
 use super::inertial::{inertial_jacobians, inertial_residual, scale_jacobian, Vec15};
 use super::landmarks::{Landmark, Observation};
 use super::model::Model;
@@ -15,7 +16,7 @@ use super::projection::{host_cam, observe, predicted, CameraColumns, Host};
 use super::reprojection::huber;
 use super::rig::SCALE_DIM;
 use super::rows::{FactorRows, POINT_DIM};
-use super::window::{Layout, Window, MOTION_DIM, POSE_DIM};
+use super::window::{Height, Layout, Window, MOTION_DIM, POSE_DIM};
 use super::zero_velocity;
 use crate::limits::{FRAMES, RIG_DIM};
 use crate::math::dense::Columns;
@@ -33,6 +34,10 @@ pub enum Factor<'a> {
     Inertial { from: usize, to: usize },
     /// A state seen at rest, with the mean rate of the gyro, rad/s.
     ZeroVelocity { slot: usize, rate: DVec3 },
+    /// What a barometer said at a state, m, and its inverse deviation.
+    Height { slot: usize, height: f64, weight: f64 },
+    /// The walk of its bias between two states.
+    HeightWalk { from: usize, to: usize },
     /// All views of a landmark.
     Landmark(&'a Landmark),
 }
@@ -50,8 +55,8 @@ pub struct Linearized {
 /// Every factor of the window, oldest first.
 pub fn of_window<'a>(window: &'a Window, landmarks: &'a [Landmark]) -> impl Iterator<Item = Factor<'a>> + 'a {
     let before = std::iter::once(None).chain(window.states().map(Some));
-    let of_states = before.zip(window.states()).flat_map(|(from, to)| {
-        from.map(|from| Factor::Inertial { from, to }).into_iter().chain(measured_at(window, to))
+    let of_states = before.zip(window.states()).flat_map(move |(from, to)| {
+        from.into_iter().flat_map(move |from| between(window, from, to)).chain(measured_at(window, to))
     });
     of_states.chain(landmarks.iter().map(Factor::Landmark))
 }
@@ -62,13 +67,23 @@ pub fn of_leaving<'a>(
     (state, next): (usize, usize),
     landmarks: impl Iterator<Item = &'a Landmark> + 'a,
 ) -> impl Iterator<Item = Factor<'a>> + 'a {
-    let inertial = Factor::Inertial { from: state, to: next };
-    std::iter::once(inertial).chain(measured_at(window, state)).chain(landmarks.map(Factor::Landmark))
+    between(window, state, next).chain(measured_at(window, state)).chain(landmarks.map(Factor::Landmark))
+}
+
+/// What ties two states together that follow each other.
+fn between<'a>(window: &Window, from: usize, to: usize) -> impl Iterator<Item = Factor<'a>> {
+    let walk = window.has_heights.then_some(Factor::HeightWalk { from, to });
+    std::iter::once(Factor::Inertial { from, to }).chain(walk)
 }
 
 /// What was measured at one state alone.
 fn measured_at<'a>(window: &Window, slot: usize) -> impl Iterator<Item = Factor<'a>> {
-    window.frame(slot).rest_rate.map(|rate| Factor::ZeroVelocity { slot, rate }).into_iter()
+    let frame = window.frame(slot);
+    let height = match frame.height {
+        Height::Measured { height, weight } => Some(Factor::Height { slot, height, weight }),
+        Height::Unknown | Height::Refused => None,
+    };
+    frame.rest_rate.map(|rate| Factor::ZeroVelocity { slot, rate }).into_iter().chain(height)
 }
 
 impl Factor<'_> {
@@ -77,6 +92,8 @@ impl Factor<'_> {
         match self {
             Factor::Inertial { from, to } => *sum += 0.5 * inertial_residual_at(window, from, to).norm_squared(),
             Factor::ZeroVelocity { slot, rate } => *sum += zero_velocity::cost(&window.frame(slot).now, rate),
+            Factor::Height { slot, height, weight } => *sum += height::weighed(window, slot, height, weight).1,
+            Factor::HeightWalk { from, to } => *sum += 0.5 * height::walk_residual(window, from, to).powi(2),
             Factor::Landmark(l) => costs_of_views(l, window, model).for_each(|cost| *sum += cost),
         }
     }
@@ -89,6 +106,12 @@ impl Factor<'_> {
             }
             Factor::ZeroVelocity { slot, rate } => {
                 Linearized { cost: zero_velocity_rows(window, slot, rate, layout, out), first: Some(0) }
+            }
+            Factor::Height { slot, height, weight } => {
+                Linearized { cost: height::rows(window, slot, (height, weight), layout, out), first: Some(0) }
+            }
+            Factor::HeightWalk { from, to } => {
+                Linearized { cost: height::walk_rows(window, from, to, layout, out), first: Some(0) }
             }
             Factor::Landmark(l) => {
                 let cost = view_rows(l, window, model, layout, out);

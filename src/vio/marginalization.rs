@@ -59,20 +59,28 @@ impl Leaving {
     fn layout(&self, window: &Window) -> (Layout, usize, Blocks) {
         let mut layout = Layout::default();
         layout.add_motion(self.state);
+        layout.add_height_bias(window, self.state);
         if !self.keeps_pose {
             layout.add_pose(self.state);
         }
         self.keyframe.into_iter().for_each(|s| layout.add_pose(s));
         let leaving = layout.dim;
         let mut blocks = Blocks::default();
-        let mut keep = |b: Block| blocks.push(b).expect("a block a frame, one of motion and one of the rig");
+        let mut keep = |b: Block| blocks.push(b).expect("a block a frame, two of the boundary's and one of the rig");
         layout.add_rig(&window.rig);
         keep(Block::Rig);
         let kept = window.keyframe_poses().filter(|s| Some(*s) != self.keyframe);
-        for s in kept.chain(self.keeps_pose.then_some(self.state)).chain([self.boundary]) {
+        for s in kept.chain(self.keeps_pose.then_some(self.state)) {
             layout.add_pose(s);
             keep(Block::Pose(s as u8));
         }
+        // In the order of `Layout::of`.
+        layout.add_height_bias(window, self.boundary);
+        if window.has_heights {
+            keep(Block::HeightBias(self.boundary as u8));
+        }
+        layout.add_pose(self.boundary);
+        keep(Block::Pose(self.boundary as u8));
         layout.add_motion(self.boundary);
         keep(Block::Motion(self.boundary as u8));
         (layout, leaving, blocks)
@@ -111,6 +119,7 @@ impl Marginalizer {
             match b {
                 Block::Pose(s) | Block::Motion(s) => window.frame_mut(*s as usize).fix_linearization_point(),
                 Block::Rig => window.rig.fix_linearization_point(),
+                Block::HeightBias(_) => {}
             }
         }
         prior.take(stack, columns, blocks, window);

@@ -18,6 +18,7 @@ mod estimator;
 mod factors;
 mod graph;
 mod health;
+mod height;
 mod inertial;
 mod initialization;
 mod innovation_gate;
@@ -46,12 +47,13 @@ pub use health::Health;
 pub use predictor::Predicted;
 pub use predictor::Predictor;
 
-use crate::config::VioConfig;
+use crate::config::{BaroConfig, VioConfig};
 use crate::frontend::Tracks;
 use crate::limits::CAMERAS_MAX;
 use estimator::{Estimator, Step, CONNECTED_FEW};
 use glam::DVec3;
 use health::{quality, Reset, SIGMA_V_UNOBSERVED};
+use height::{Heights, Pushed};
 use inertial::{body_velocity_covariance, Covariance, Motion};
 use initialization::{Initializer, RESECTION_MIN};
 use monitor::Monitor;
@@ -59,6 +61,7 @@ use recovery::Recovery;
 use rig::RigEstimate;
 use samples::ImuRing;
 use stats::{Stats, Tally};
+use stipple_drivers::source::{Aid, AidReading};
 use stipple_drivers::{Calibration, ImuSample, Nanos, Pose, Span};
 
 /// No image is this wide.
@@ -185,6 +188,32 @@ impl Vio {
         self.stats.imu_overflow += u64::from(lost);
     }
 
+    /// With a barometer, where the board names one. Without one its readings are not taken, and nothing of it is estimated.
+    pub fn with_barometer(mut self, config: &BaroConfig) -> Vio {
+        self.estimator.heights = config.is_named().then(|| Heights::new(config));
+        self.estimator.graph.window.has_heights = config.is_named();
+        self
+    }
+
+    /// Takes what a sensor beside cameras and inertial unit gave.
+    pub fn on_aid(&mut self, reading: &AidReading) {
+        let Aid::Pressure(pa) = reading.value;
+        if let Some(heights) = &mut self.estimator.heights {
+            match heights.push(reading.t, pa) {
+                Pushed::Taken => {}
+                Pushed::Rejected => self.stats.pressures_rejected += 1,
+                Pushed::Frozen => self.stats.pressures_frozen += 1,
+            }
+        }
+    }
+
+    /// Height by the barometer over that of the estimate at the newest frame, and its deviation, m, both over the first
+    /// reading. `None` without a barometer, and before the first frame with a height.
+    pub fn height_bias(&self) -> Option<[f64; 2]> {
+        let known = self.estimator.heights.as_ref().is_some_and(Heights::knows_bias);
+        Some([self.estimator.newest()?.height_bias, self.estimator.height_deviation.filter(|_| known)?])
+    }
+
     /// Takes what the cameras saw at one instant. Inertial samples up to it must have come before;
     /// where they have not, the last is taken as constant. A frame that is not newer than the last is refused and counted.
     pub fn on_tracks(&mut self, tracks: &Tracks) -> Update {
@@ -279,6 +308,9 @@ impl Vio {
         s.tracks_gated += step.gate.refused as u64;
         s.gates_opened += u64::from(step.gate.open);
         s.zero_velocity_updates += u64::from(step.at_rest);
+        s.heights_used += u64::from(step.heights.used);
+        s.heights_gated += u64::from(step.heights.gated);
+        s.height_steps += u64::from(step.heights.steps);
         s.landmarks_full += step.landmarks_full as u64;
         s.outliers += step.outliers as u64;
         s.solver_failures += u64::from(step.outcome.failures);

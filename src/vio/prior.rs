@@ -3,6 +3,7 @@
 //! Rows are kept over the errors from the linearization points of what they touch, and are never made anew; only
 //! their residual changes with the estimate. What a marginalization leaves of its stack is the next prior.
 
+use super::height;
 use super::inertial::{Motion, MotionSigma};
 use super::rig::RigState;
 use super::rows::scatter;
@@ -17,6 +18,7 @@ use crate::mem::List;
 pub enum Block {
     Pose(u8),
     Motion(u8),
+    HeightBias(u8),
     #[default]
     Rig,
 }
@@ -29,6 +31,7 @@ impl Block {
         match self {
             Block::Pose(_) => POSE_DIM,
             Block::Motion(_) => MOTION_DIM,
+            Block::HeightBias(_) => 1,
             Block::Rig => rig.dim(),
         }
     }
@@ -37,16 +40,18 @@ impl Block {
         let columns = match self {
             Block::Pose(s) => layout.state(s as usize)[0],
             Block::Motion(s) => layout.state(s as usize)[1],
+            Block::HeightBias(s) => layout.height_bias(s as usize),
             Block::Rig => Some(layout.rig),
         };
         columns.expect("the layout holds all that the prior is about")
     }
 
-    /// Error since the linearization point.
+    /// Error since the linearization point; a barometer's bias enters everything linearly, and its point is zero.
     fn delta(self, window: &Window, out: &mut [f64]) {
         match self {
             Block::Pose(s) => out.copy_from_slice(&window.frame(s as usize).delta[..POSE_DIM]),
             Block::Motion(s) => out.copy_from_slice(&window.frame(s as usize).delta[POSE_DIM..]),
+            Block::HeightBias(s) => out[0] = window.frame(s as usize).height_bias,
             Block::Rig => out.copy_from_slice(&window.rig.delta[..out.len()]),
         }
     }
@@ -83,14 +88,16 @@ impl Prior {
         slot: usize,
         motion: &Motion,
         sigma: &MotionSigma,
-        rig: &RigState,
+        window: &Window,
         rig_sigmas: &[f64; RIG_DIM],
     ) {
         self.blocks.clear();
-        for block in [Block::Pose(slot as u8), Block::Motion(slot as u8), Block::Rig] {
+        let (rig, height_bias) = (&window.rig, window.has_heights.then_some(Block::HeightBias(slot as u8)));
+        let blocks = [Block::Pose(slot as u8), Block::Motion(slot as u8), Block::Rig];
+        for block in blocks.into_iter().chain(height_bias) {
             self.blocks.push(block).expect("room for the blocks of one state");
         }
-        self.rows.clear(15 + rig.dim() + 1);
+        self.rows.clear(15 + rig.dim() + usize::from(window.has_heights) + 1);
         let r = motion.pose.rotation();
         let mut diagonal = |i: usize, s: f64| self.rows.push()[i] = 1.0 / s;
         for i in 0..3 {
@@ -101,6 +108,9 @@ impl Prior {
         }
         for (i, s) in rig_sigmas[..rig.dim()].iter().enumerate() {
             diagonal(15 + i, *s);
+        }
+        if window.has_heights {
+            diagonal(15 + rig.dim(), height::BIAS_UNKNOWN);
         }
         for (axis, s) in [sigma.tilt, sigma.tilt, sigma.yaw].into_iter().enumerate() {
             let row = self.rows.push();
@@ -196,7 +206,7 @@ impl Prior {
         let of = |b: Block, out: &mut [f64]| match b {
             Block::Pose(s) => out.copy_from_slice(&direction(s as usize)[..POSE_DIM]),
             Block::Motion(s) => out.copy_from_slice(&direction(s as usize)[POSE_DIM..]),
-            Block::Rig => out.fill(0.0),
+            Block::HeightBias(_) | Block::Rig => out.fill(0.0),
         };
         self.residuals(self.deltas(window, of)).map(|(jd, _)| 0.5 * jd * jd).sum()
     }

@@ -15,6 +15,7 @@ use crate::limits::{LANDMARKS, WINDOW_DIM};
 use crate::math::dense::{eliminate, Columns, System};
 use crate::mem::List;
 use glam::DVec2;
+use nalgebra::SMatrix;
 
 /// Damping, as a share of the diagonal: at the start, at least, at most.
 pub const LAMBDA_START: f64 = 1e-4;
@@ -196,6 +197,17 @@ impl Solver {
         let information = Mat15::from_fn(|i, j| self.factor.at(first + i, first + j));
         let covariance = information.cholesky()?.inverse();
         covariance.iter().all(|x| x.is_finite()).then(|| covariance.into())
+    }
+
+    /// Standard deviation of a barometer's bias at the newest state from the last linearization, m: its column is the last but
+    /// those of the state in `Layout::of`.
+    pub fn newest_height_deviation(&mut self) -> Option<f64> {
+        let first = self.system.dim.checked_sub(16)?;
+        self.factor.copy_from(&self.system);
+        eliminate(&mut self.factor, first);
+        let information = SMatrix::<f64, 16, 16>::from_fn(|i, j| self.factor.at(first + i, first + j));
+        let variance = information.cholesky()?.inverse()[(0, 0)];
+        (variance > 0.0).then(|| variance.sqrt())
     }
 
     /// Standard deviations of the rig's columns, which are the first of `Layout::of`, from the last

@@ -40,6 +40,14 @@ counters! {
     resets_state,
     /// Frames of which a camera saw next to nothing while another did.
     camera_blind,
+    /// Pressures that were no number, of no altitude that is flown, or not newer than the last; and of a barometer that
+    /// repeats itself.
+    pressures_rejected,
+    pressures_frozen,
+    /// Frames with a height; frames whose height could not be; steps that stayed and were taken for a change of the weather.
+    heights_used,
+    heights_gated,
+    height_steps,
     /// Frames held still because nothing moved.
     zero_velocity_updates,
     solver_iterations,

@@ -21,6 +21,19 @@ use stipple_drivers::{Nanos, Pose};
 /// Dimensions of [p, θ], and of [v, bg, ba].
 pub const POSE_DIM: usize = 6;
 pub const MOTION_DIM: usize = 9;
+/// Dimension of a barometer's bias.
+const HEIGHT_BIAS_DIM: usize = 1;
+
+/// What a barometer says of a frame.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Height {
+    /// Nothing yet.
+    Unknown,
+    /// What cannot be.
+    Refused,
+    /// The height above the first reading, m, and its inverse deviation.
+    Measured { height: f64, weight: f64 },
+}
 
 /// One frame of the window.
 #[derive(Clone, Copy, Debug)]
@@ -43,6 +56,10 @@ pub struct Frame {
     pub twist: Twist,
     /// Mean rate of a frame found at rest, rad/s.
     pub rest_rate: Option<DVec3>,
+    /// What a barometer said at the stamp, its bias there, m, and the inverse deviation of its walk since the state before.
+    pub height: Height,
+    pub height_bias: f64,
+    pub height_walk: f64,
     /// Landmarks it hosted when it became a keyframe.
     pub hosted: usize,
     /// Pose at the estimate, and at the point where Jacobians are taken.
@@ -65,6 +82,9 @@ impl Frame {
             rate: DVec3::ZERO,
             twist: Twist::default(),
             rest_rate: None,
+            height: Height::Unknown,
+            height_bias: 0.0,
+            height_walk: 0.0,
             hosted: 0,
             world_from_body: Transform::default(),
             world_from_body_linearized: Transform::default(),
@@ -121,12 +141,14 @@ pub struct Window {
     /// Slots, oldest first.
     pub order: List<u8, FRAMES>,
     pub rig: RigState,
+    /// States have the bias of a barometer.
+    pub has_heights: bool,
 }
 
 impl Window {
     pub fn new(rig: RigState) -> Window {
         let frames = vec![Frame::new(Nanos(0), Motion::default()); FRAMES];
-        Window { saved: frames.clone(), frames, used: [false; FRAMES], order: List::default(), rig }
+        Window { saved: frames.clone(), frames, used: [false; FRAMES], order: List::default(), rig, has_heights: false }
     }
 
     /// Forgets the frames and keeps what was learnt of the rig.
@@ -219,6 +241,7 @@ impl Window {
                 d[first..first + part.len].copy_from_slice(&dx[part.at..part.at + part.len]);
             }
             self.frames[slot].step(&d);
+            self.frames[slot].height_bias += layout.height_bias(slot).map_or(0.0, |part| dx[part.at]);
         }
         self.rig.step(&dx[layout.rig.at..][..layout.rig.len]);
     }
@@ -229,6 +252,7 @@ impl Window {
 pub struct Layout {
     pose: [Option<usize>; FRAMES],
     motion: [Option<usize>; FRAMES],
+    height_bias: [Option<usize>; FRAMES],
     /// All columns of the rig: those that cameras touch, then those of the inertial unit.
     pub rig: Columns,
     camera_dim: usize,
@@ -241,12 +265,23 @@ impl Layout {
         let mut l = Layout::default();
         l.add_rig(&window.rig);
         for slot in window.slots() {
-            l.add_pose(slot);
             if window.frame(slot).is_state {
+                l.add_height_bias(window, slot);
+                l.add_pose(slot);
                 l.add_motion(slot);
+            } else {
+                l.add_pose(slot);
             }
         }
         l
+    }
+
+    /// Column of a barometer's bias at a state, where there is a barometer.
+    pub fn add_height_bias(&mut self, window: &Window, slot: usize) {
+        if window.has_heights {
+            self.height_bias[slot] = Some(self.dim);
+            self.dim += HEIGHT_BIAS_DIM;
+        }
     }
 
     /// Columns of a frame's pose; adding twice keeps the first.
@@ -284,6 +319,11 @@ impl Layout {
     pub fn state(&self, slot: usize) -> [Option<Columns>; 2] {
         let motion = self.motion[slot].map(|at| Columns { at, len: MOTION_DIM });
         [self.pose(slot).map(|at| Columns { at, len: POSE_DIM }), motion]
+    }
+
+    /// Column of a barometer's bias at a state.
+    pub fn height_bias(&self, slot: usize) -> Option<Columns> {
+        self.height_bias[slot].map(|at| Columns { at, len: HEIGHT_BIAS_DIM })
     }
 
     /// First column of a frame's pose.

@@ -204,7 +204,7 @@ impl Flight {
         let flown = stamps.len();
         let (first, images) = (stamps[0], Images::Rendered(self.frames.clone()));
         let shape = || Frames::for_rig(calibration);
-        let sensors = Recorded { images, stamps, imu: self.sim.imu().to_vec() }
+        let sensors = Recorded { images, stamps, imu: self.sim.imu().to_vec(), aids: vec![] }
             .paced(Playback::default())
             .with_faults(&inject, shape);
         let run = OdometryRun::new(calibration, &self.board, self.frames.len())?;

@@ -44,7 +44,7 @@ struct Flight {
 impl Flight {
     fn of(input: Input) -> Flight {
         let (calibration, name) = (input.calibration, input.name);
-        let Source::Recorded(Recorded { mut images, stamps, imu }) = input.source else {
+        let Source::Recorded(Recorded { mut images, stamps, imu, .. }) = input.source else {
             unreachable!("a recording, or a rendered flight")
         };
         let read = |i: usize| {
@@ -67,6 +67,7 @@ impl Flight {
             images: Images::Rendered(self.frames.clone()),
             stamps: self.frames.iter().map(|f| f.t).collect(),
             imu: self.imu.clone(),
+            aids: vec![],
         };
         let shape = Frames::for_rig(&self.calibration);
         let into = into.map(|dir| (dir, Format::Euroc));

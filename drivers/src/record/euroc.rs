@@ -6,8 +6,8 @@
 
 use super::Sink;
 use crate::calibration::RigCamera;
-use crate::euroc::{camera_yaml, imu_row, imu_yaml, png, IMAGE_COLUMNS, IMU_COLUMNS};
-use crate::source::ImuReading;
+use crate::euroc::{aid_row, camera_yaml, imu_row, imu_yaml, png, BARO_COLUMNS, IMAGE_COLUMNS, IMU_COLUMNS};
+use crate::source::{AidReading, ImuReading};
 use crate::types::Frames;
 use crate::{host, Calibration};
 use std::fs::{self, File, OpenOptions};
@@ -55,6 +55,21 @@ impl Rows {
         self.flush()
     }
 
+    /// Adds one row to those that wait, and writes them where they are many.
+    fn queue(&mut self, row: impl FnOnce(&mut Vec<u8>) -> io::Result<()>) -> io::Result<()> {
+        if self.waiting.len() > ROWS_BYTES_MAX {
+            self.flush()?;
+        }
+        row(&mut self.waiting)?;
+        self.count += 1;
+        if self.count >= ROWS {
+            self.count = 0;
+            // What did not fit waits; it counts as failed only when it is given up.
+            let _ = self.flush();
+        }
+        Ok(())
+    }
+
     /// Takes rows back, down to so many bytes.
     fn cut(&mut self, good: u64) -> io::Result<()> {
         self.good = good;
@@ -74,6 +89,9 @@ struct CameraFolder {
 pub struct EurocSink {
     cameras: Vec<CameraFolder>,
     imu: Rows,
+    /// Made with the first reading, in this folder.
+    baro: Option<Rows>,
+    baro_folder: PathBuf,
     encoded: Vec<u8>,
 }
 
@@ -95,7 +113,7 @@ impl EurocSink {
         fs::create_dir_all(&folder)?;
         write_new(&folder.join("sensor.yaml"), imu_yaml(&calibration.imu, "recorded, corrected").as_bytes())?;
         let imu = Rows::create(&folder.join("data.csv"), IMU_COLUMNS)?;
-        Ok(EurocSink { cameras, imu, encoded: Vec::new() })
+        Ok(EurocSink { cameras, imu, baro: None, baro_folder: mav.join("baro0"), encoded: Vec::new() })
     }
 
     fn images(&mut self, frames: &Frames) -> io::Result<()> {
@@ -141,6 +159,7 @@ fn names(folder: &CameraFolder, frames: &Frames) -> (PathBuf, PathBuf) {
 impl Sink for EurocSink {
     fn frames(&mut self, frames: &Frames) -> io::Result<()> {
         self.imu.flush()?;
+        self.baro.as_mut().map_or(Ok(()), Rows::flush)?;
         let written = self.images(frames).and_then(|()| self.list(frames));
         if written.is_err() {
             for folder in &self.cameras {
@@ -151,17 +170,18 @@ impl Sink for EurocSink {
     }
 
     fn imu(&mut self, reading: &ImuReading) -> io::Result<()> {
-        if self.imu.waiting.len() > ROWS_BYTES_MAX {
-            self.imu.flush()?;
-        }
-        imu_row(&mut self.imu.waiting, &reading.sample)?;
-        self.imu.count += 1;
-        if self.imu.count >= ROWS {
-            self.imu.count = 0;
-            // What did not fit waits; it counts as failed only when it is given up.
-            let _ = self.imu.flush();
-        }
-        Ok(())
+        self.imu.queue(|out| imu_row(out, &reading.sample))
+    }
+
+    fn aid(&mut self, reading: &AidReading) -> io::Result<()> {
+        let rows = match self.baro.take() {
+            Some(rows) => rows,
+            None => {
+                fs::create_dir_all(&self.baro_folder)?;
+                Rows::create(&self.baro_folder.join("data.csv"), BARO_COLUMNS)?
+            }
+        };
+        self.baro.insert(rows).queue(|out| aid_row(out, reading))
     }
 
     fn sync(&mut self) -> io::Result<()> {
@@ -170,6 +190,7 @@ impl Sink for EurocSink {
 
     fn finish(&mut self) -> io::Result<()> {
         self.imu.flush()?;
+        self.baro.as_mut().map_or(Ok(()), Rows::flush)?;
         self.sync()
     }
 }

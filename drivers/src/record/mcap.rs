@@ -10,7 +10,7 @@
 use super::Sink;
 use crate::calibration::RigCamera;
 use crate::euroc::{camera_yaml, imu_yaml, png};
-use crate::source::ImuReading;
+use crate::source::{Aid, AidReading, ImuReading};
 use crate::types::{Frames, Nanos};
 use crate::{host, Calibration};
 use ::mcap::records::MessageHeader;
@@ -33,6 +33,7 @@ int32 sec
 uint32 nanosec
 ";
 const IMAGE: &str = "std_msgs/Header header\nstring format\nuint8[] data\n";
+const PRESSURE: &str = "std_msgs/Header header\nfloat64 fluid_pressure\nfloat64 variance\n";
 const IMU: &str = "\
 std_msgs/Header header
 geometry_msgs/Quaternion orientation
@@ -91,6 +92,7 @@ struct Open {
     frames: u32,
     images: Vec<u16>,
     imu: u16,
+    baro: u16,
 }
 
 fn failed(e: McapError) -> io::Error {
@@ -134,11 +136,14 @@ impl McapSink {
             attach(&mut writer, &format!("cam{k}"), camera_yaml(camera, &format!("recorded cam{k}"), 0.0))?;
         }
         let imu = writer.add_channel(imu, "/imu0", "cdr", &none)?;
+        let schema = format!("{PRESSURE}{HEADER}");
+        let baro = writer.add_schema("sensor_msgs/msg/FluidPressure", "ros2msg", schema.as_bytes())?;
+        let baro = writer.add_channel(baro, "/baro0", "cdr", &none)?;
         attach(&mut writer, "imu0", imu_yaml(&self.calibration.imu, "recorded, corrected"))?;
         writer.flush()?;
         host::sync_folder_of(&path)?;
         let good = file.metadata()?.len();
-        Ok(Open { writer, file, good, frames: 0, images, imu })
+        Ok(Open { writer, file, good, frames: 0, images, imu, baro })
     }
 
     fn write(&mut self, channel: impl Fn(&Open) -> u16, t: Nanos, sequence: u32) -> Result<(), McapError> {
@@ -220,6 +225,16 @@ impl Sink for McapSink {
             cdr.floats(&[0.0; 9]);
         }
         let written = self.write(|file| file.imu, s.t, 0);
+        self.settled(written)
+    }
+
+    fn aid(&mut self, reading: &AidReading) -> io::Result<()> {
+        let Aid::Pressure(pa) = reading.value;
+        let mut cdr = Cdr::new(&mut self.message);
+        cdr.header(reading.t, "baro0");
+        // The variance is not known: 0.
+        cdr.floats(&[pa, 0.0]);
+        let written = self.write(|file| file.baro, reading.t, 0);
         self.settled(written)
     }
 

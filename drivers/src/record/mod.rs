@@ -13,7 +13,7 @@ pub use euroc::EurocSink;
 pub use mcap::McapSink;
 
 use crate::counters::Counter;
-use crate::source::{FrameSource, ImuBatch, ImuReading, ImuSource, SourceFault, Wait};
+use crate::source::{AidBatch, AidReading, AidSource, FrameSource, ImuBatch, ImuReading, ImuSource, SourceFault, Wait};
 use crate::types::{Frames, Span};
 use crate::{counters, host, Calibration, Fault, FaultKind};
 use std::io;
@@ -30,6 +30,8 @@ pub trait Sink: Send {
     fn frames(&mut self, frames: &Frames) -> io::Result<()>;
     /// Writes one inertial sample.
     fn imu(&mut self, reading: &ImuReading) -> io::Result<()>;
+    /// Writes one reading of a sensor beside them.
+    fn aid(&mut self, reading: &AidReading) -> io::Result<()>;
     /// Brings what was written to the disk.
     fn sync(&mut self) -> io::Result<()>;
     /// Writes what is left and brings it to the disk: nothing more comes.
@@ -69,11 +71,16 @@ counters! {
     record_imu_written,
     record_imu_dropped,
     record_imu_failed,
+    /// The same of a barometer's readings.
+    record_aids_written,
+    record_aids_dropped,
+    record_aids_failed,
 }
 
 enum Item {
     Frames(Box<Frames>),
     Imu(ImuReading),
+    Aid(AidReading),
 }
 
 /// The writer of a recording.
@@ -131,14 +138,19 @@ impl Ring {
 /// Name of the writer's thread.
 pub const WRITER: &str = "writer";
 
-/// Starts the writer behind a ring, and taps on the two sources. The recording ends when both taps are gone. The writer calls
+/// Cameras, an inertial unit, and a barometer where there is one.
+pub type Sources = (Box<dyn FrameSource>, Box<dyn ImuSource>, Option<Box<dyn AidSource>>);
+/// Sources with taps on them: frames, samples, and a barometer where there is one.
+pub type Tapped = (TappedFrames, TappedImu, Option<TappedAids>);
+
+/// Starts the writer behind a ring, and taps on the sources. The recording ends when both taps are gone. The writer calls
 /// `alive` before each piece of work, and once a second while there is none.
 pub fn start(
     mut sink: Box<dyn Sink>,
-    (frames, imu): (Box<dyn FrameSource>, Box<dyn ImuSource>),
+    (frames, imu, aids): Sources,
     ring: Ring,
     mut alive: impl FnMut() + Send + 'static,
-) -> (Recorder, TappedFrames, TappedImu) {
+) -> (Recorder, Tapped) {
     let Ring { items, waiting, give_back, spare } = ring;
     let (counts, in_ring) = (Arc::new(Counts::default()), Arc::new(AtomicU64::new(0)));
     let (c, taken) = (counts.clone(), in_ring.clone());
@@ -154,8 +166,9 @@ pub fn start(
     };
     let thread = Builder::new().name(WRITER.into()).spawn(work).expect("the system starts one more thread");
     let tapped = TappedFrames { source: frames, spare, items: items.clone(), counts: counts.clone(), waiting: in_ring };
-    let tapped_imu = TappedImu { source: imu, items, counts: counts.clone() };
-    (Recorder { counts, thread }, tapped, tapped_imu)
+    let tapped_imu = TappedImu { source: imu, items: items.clone(), counts: counts.clone() };
+    let tapped_aids = aids.map(|source| TappedAids { source, items, counts: counts.clone() });
+    (Recorder { counts, thread }, (tapped, tapped_imu, tapped_aids))
 }
 
 /// Writes what comes until both taps are gone; the first failure, if there was one.
@@ -195,6 +208,10 @@ fn write_all(
             Some(Item::Imu(reading)) => {
                 let written = note(sink.imu(&reading));
                 if written { &c.record_imu_written } else { &c.record_imu_failed }.add(1);
+            }
+            Some(Item::Aid(reading)) => {
+                let written = note(sink.aid(&reading));
+                if written { &c.record_aids_written } else { &c.record_aids_failed }.add(1);
             }
             None => {}
         }
@@ -267,6 +284,29 @@ impl ImuSource for TappedImu {
 
     fn inner(&self) -> Option<&dyn ImuSource> {
         Some(&*self.source)
+    }
+}
+
+/// A barometer that is recorded.
+pub struct TappedAids {
+    source: Box<dyn AidSource>,
+    items: SyncSender<Item>,
+    counts: Arc<Counts>,
+}
+
+impl AidSource for TappedAids {
+    fn next(&mut self, timeout: Span, batch: &mut AidBatch) -> Result<Wait, SourceFault> {
+        let wait = self.source.next(timeout, batch)?;
+        for reading in batch.iter() {
+            if self.items.try_send(Item::Aid(*reading)).is_err() {
+                self.counts.record_aids_dropped.add(1);
+            }
+        }
+        Ok(wait)
+    }
+
+    fn counters(&self) -> Vec<(&'static str, u64)> {
+        self.source.counters()
     }
 }
 

@@ -6,9 +6,11 @@
 mod small_disk;
 
 use super::*;
+use crate::paced::PacedAids;
 use crate::paced::{Images, Pace, PacedFrames, PacedImu};
 use crate::replay::{OpenOptions, Recording};
 use crate::sim::euroc_rig;
+use crate::source::Aid;
 use crate::types::{ImuSample, Nanos};
 use glam::DVec3;
 use small_disk::on_a_small_disk;
@@ -50,8 +52,8 @@ fn sources(frames: usize) -> (PacedFrames, PacedImu) {
 fn record(sink: Box<dyn Sink>, frames: usize, slots: usize) -> (Duration, Recorded) {
     let shape = frame(0);
     let (camera, unit) = sources(frames);
-    let (recorder, mut camera, mut unit) =
-        start(sink, (Box::new(camera), Box::new(unit)), Ring::new(&shape, slots), || ());
+    let (recorder, (mut camera, mut unit, _)) =
+        start(sink, (Box::new(camera), Box::new(unit), None), Ring::new(&shape, slots), || ());
     let mut slowest = Duration::ZERO;
     std::thread::scope(|s| {
         s.spawn(move || {
@@ -103,6 +105,9 @@ impl Sink for SlowDisk {
         Ok(())
     }
     fn imu(&mut self, _: &ImuReading) -> io::Result<()> {
+        Ok(())
+    }
+    fn aid(&mut self, _: &AidReading) -> io::Result<()> {
         Ok(())
     }
     fn sync(&mut self) -> io::Result<()> {
@@ -212,6 +217,45 @@ fn a_long_mcap_goes_on_in_another_file_and_each_is_whole() {
         // Schemas and channels, which the calibration's attachments part, are in chunks of their own.
         assert!(summary.chunk_indexes.len() <= 4 + 4 && summary.attachment_indexes.len() == 3);
     }
+}
+
+/// A recording without a barometer has no table of it.
+#[test]
+fn pressures_are_recorded_and_read_back() {
+    let readings =
+        (0..50).map(|i| AidReading { t: Nanos(i * 20 * MS), value: Aid::Pressure(98_000.0 + i as f64 / 7.0) });
+    let readings: Vec<AidReading> = readings.collect();
+    let dir = tempfile::tempdir().unwrap();
+    for format in [Format::Euroc, Format::Mcap] {
+        let out = dir.path().join(format!("{format:?}"));
+        let (camera, unit) = sources(10);
+        let baro = PacedAids::new(readings.clone(), Pace::at_speed(Nanos(0), 100.0));
+        let sources: Sources = (Box::new(camera), Box::new(unit), Some(Box::new(baro)));
+        let sink = open(&out, format, &rig()).unwrap();
+        let (recorder, (mut camera, mut unit, baro)) = start(sink, sources, Ring::new(&frame(0), 20), || ());
+        let (mut batch, mut samples, mut shown) = (AidBatch::default(), ImuBatch::default(), frame(0));
+        let mut baro = baro.unwrap();
+        while baro.next(Span(100 * MS), &mut batch).unwrap() != Wait::Ended {}
+        while unit.next(Span(100 * MS), &mut samples).unwrap() != Wait::Ended {}
+        while camera.next(Span(100 * MS), &mut shown).unwrap() != Wait::Ended {}
+        drop((camera, unit, baro));
+        let r = recorder.finish();
+        assert_eq!((count(&r, "record_aids_written"), r.failure), (50, None));
+        if format == Format::Mcap {
+            let file = std::fs::read(out.join("recording-000.mcap")).unwrap();
+            let messages = ::mcap::MessageStream::new(&file).unwrap().map(Result::unwrap);
+            let pressures = messages.filter(|m| m.channel.topic == "/baro0");
+            // Its header ends at 24: four of CDR's own, two words, and "baro0" with its length, aligned to eight after the four.
+            let read = pressures.map(|m| f64::from_le_bytes(m.data[28..36].try_into().unwrap())).collect::<Vec<_>>();
+            assert_eq!((read.len(), read[49]), (50, 98_007.0));
+            continue;
+        }
+        let back = Recording::open(&out, &OpenOptions::default()).unwrap();
+        assert_eq!((back.aids.len(), back.aids[49]), (50, readings[49]));
+    }
+    let without = dir.path().join("without");
+    record(open(&without, Format::Euroc, &rig()).unwrap(), 3, 4);
+    assert!(!without.join("mav0/baro0").exists());
 }
 
 /// Somebody else's links under the names of a recording lead nowhere.

@@ -31,6 +31,8 @@ crate::counters! {
     images_outside_imu,
     /// Inertial samples that are not finite.
     imu_not_finite,
+    /// Pressures that are not finite.
+    pressures_not_finite,
     /// Gaps in the inertial stream.
     imu_holes,
     /// Calibration values that are missing and assumed, or present and not used.

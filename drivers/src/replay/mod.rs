@@ -29,6 +29,7 @@ pub use pairing::{FrameFiles, ImageFile};
 pub(crate) use table::{numbers, read_strictly, Row};
 pub use trajectory::read_trajectory;
 
+use crate::source::{Aid, AidReading};
 use crate::types::{ImuSample, Nanos, Span, TimedPose};
 use crate::{input, Calibration, Fault, FaultKind};
 use findings::Findings;
@@ -62,6 +63,8 @@ pub struct Recording {
     pub calibration: Calibration,
     /// Inertial samples, corrected.
     pub imu: Vec<ImuSample>,
+    /// Readings of a barometer; empty where the recording has none.
+    pub aids: Vec<AidReading>,
     /// Frames in the order of their stamps.
     pub frames: Vec<FrameFiles>,
     /// Ground truth, `world_from_body`; empty where the recording has none.
@@ -89,13 +92,15 @@ impl Recording {
         let mut imu = read_imu(&mav0.join("imu0/data.csv"), options.imu_hole, &mut findings)?;
         imu.iter_mut().for_each(|s| *s = calibration.imu.correction.apply(s));
         check_cover(&frames, &imu, &mut findings);
+        let baro = mav0.join("baro0/data.csv");
+        let aids = if baro.is_file() { read_pressures(&baro, &mut findings)? } else { vec![] };
         let truth = ["state_groundtruth_estimate0/data.csv", "mocap0/data.csv"]
             .into_iter()
             .map(|name| mav0.join(name))
             .find(|path| path.is_file())
             .map_or(Ok(Vec::new()), |path| trajectory::read(&path, &mut findings))?;
         let Findings { warnings, counters } = findings;
-        Ok(Recording { calibration, imu, frames, truth, warnings, counters, root })
+        Ok(Recording { calibration, imu, aids, frames, truth, warnings, counters, root })
     }
 
     /// A decoder of the frames, with memory of its own, for one thread.
@@ -177,6 +182,22 @@ fn read_imu(path: &Path, hole: Span, findings: &mut Findings) -> Result<Vec<ImuS
         }
     }
     Ok(rows.into_iter().map(|r: Row<ImuSample>| r.value).collect())
+}
+
+fn read_pressures(path: &Path, findings: &mut Findings) -> Result<Vec<AidReading>, Fault> {
+    let parse = |fields: &[&str]| -> Option<AidReading> {
+        let [t, pa] = fields else { return None };
+        Some(AidReading { t: Nanos(t.parse().ok()?), value: Aid::Pressure(pa.parse().ok()?) })
+    };
+    let mut rows = table::read(path, "stamp [ns], pressure [Pa]", parse, findings)?;
+    rows.retain(|row| {
+        let Aid::Pressure(pa) = row.value.value;
+        if !pa.is_finite() {
+            findings.warn(|c| &mut c.pressures_not_finite, path, row.line, "pressure is not finite: dropped");
+        }
+        pa.is_finite()
+    });
+    Ok(order::increasing(rows, |r| r.t, path, findings).into_iter().map(|row| row.value).collect())
 }
 
 /// Counts frames outside the inertial stream; they stay, as mapping with given poses can use them.

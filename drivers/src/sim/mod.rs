@@ -7,6 +7,7 @@
 //! `scenario` (paths), `spline` (motion), `room` and `furnish` (geometry), `texture` and `room::light` (appearance), `render`
 //! (images), `imu`.
 
+mod baro;
 mod furnish;
 pub mod imu;
 mod recording;
@@ -24,6 +25,7 @@ pub use write::write_euroc;
 
 use crate::calibration::Calibration;
 use crate::fault::{Fault, FaultKind};
+use crate::source::AidReading;
 use crate::types::{luma, Frames, ImuSample, Nanos, Pose, Span, TimedPose};
 use glam::{DVec3, Vec3};
 use render::{Exposure, Lens, Row, Rows, Scratch, View};
@@ -75,6 +77,7 @@ pub struct Sim {
     start: Nanos,
     stamps: Vec<Nanos>,
     imu: Vec<ImuSample>,
+    aids: Vec<AidReading>,
     biases: Vec<Bias>,
     room: Room,
     lenses: Vec<Lens>,
@@ -120,6 +123,7 @@ impl Sim {
             }
         };
         imu.iter_mut().for_each(|s| *s = scenario.imu_errors.axes.undo(s));
+        let aids = baro::simulate(&spline, start, &imu::ticks(first, last, baro::RATE_HZ), scenario.seed);
         let lenses: Vec<Lens> = calibration.cameras.iter().map(|c| Lens::new(&c.camera)).collect();
         let pixels = calibration.cameras.iter().map(|c| c.camera.width * c.camera.height).max().unwrap_or(0);
         let scratch = Scratch::new(&room, pixels, threads);
@@ -134,6 +138,7 @@ impl Sim {
             start,
             stamps: imu::ticks(first, last, scenario.rate_hz),
             imu,
+            aids,
             biases,
             room,
             lenses,
@@ -148,6 +153,11 @@ impl Sim {
     /// The calibration that is handed out.
     pub fn calibration(&self) -> &Calibration {
         &self.calibration
+    }
+
+    /// Readings of its barometer.
+    pub fn aids(&self) -> &[AidReading] {
+        &self.aids
     }
 
     /// All inertial samples of the run; they begin and end with the frames.

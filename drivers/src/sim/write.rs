@@ -5,7 +5,10 @@
 
 use super::Sim;
 use crate::calibration::RigCamera;
-use crate::euroc::{camera_yaml, commas, imu_row, imu_yaml, png, png_16, transform_yaml, IMAGE_COLUMNS, IMU_COLUMNS};
+use crate::euroc::{
+    aid_row, camera_yaml, commas, imu_row, imu_yaml, png, png_16, transform_yaml, BARO_COLUMNS, IMAGE_COLUMNS,
+    IMU_COLUMNS,
+};
 use crate::types::{Frames, Pose};
 use crate::{Fault, FaultKind};
 use std::fs::{self, File};
@@ -51,6 +54,7 @@ fn write_all(sim: &mut Sim, mav: &Path, frames: Frames, progress: impl FnMut(usi
     make_dir(&mav.join("depth0/data"))?;
     put(&mav.join("imu0"), "sensor.yaml", imu_yaml(&rig.imu, "simulated"))?;
     put(&mav.join("imu0"), "data.csv", imu_table(sim))?;
+    put(&mav.join("baro0"), "data.csv", baro_table(sim))?;
     let (truth, about) =
         (mav.join("state_groundtruth_estimate0"), "sensor_type: visual-inertial\ncomment: simulated, exact\n");
     put(&truth, "sensor.yaml", about.to_string() + &transform_yaml(&Pose::IDENTITY))?;
@@ -105,6 +109,12 @@ fn image_table(sim: &Sim, camera: &RigCamera) -> String {
 fn imu_table(sim: &Sim) -> Vec<u8> {
     let mut table = IMU_COLUMNS.as_bytes().to_vec();
     sim.imu().iter().for_each(|sample| imu_row(&mut table, sample).expect(IN_MEMORY));
+    table
+}
+
+fn baro_table(sim: &Sim) -> Vec<u8> {
+    let mut table = BARO_COLUMNS.as_bytes().to_vec();
+    sim.aids().iter().for_each(|reading| aid_row(&mut table, reading).expect(IN_MEMORY));
     table
 }
 
