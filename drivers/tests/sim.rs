@@ -230,6 +230,44 @@ fn frames_have_texture_almost_everywhere_and_plausible_exposure() {
 }
 
 #[test]
+fn a_person_crosses_follows_and_fills_half_the_view_and_hides_what_is_behind() {
+    let scenario = Scenario::named("demo").unwrap();
+    let mut without = Sim::new(&scenario).unwrap();
+    let mut with = Sim::new(&Scenario { person: true, ..scenario }).unwrap();
+    let mut frames = [Frames::for_rig(with.calibration()), Frames::for_rig(with.calibration())];
+    let (w, h) = (frames[0].images[1].width, frames[0].images[1].height);
+    let mut depths = [vec![0.0; w * h], vec![0.0; w * h]];
+    // Seconds, least share of the view, and the third of the view it is in the middle of.
+    for (t, share, third) in [
+        (1.0, 0.0, None),
+        (3.2, 0.05, Some(0)),
+        (3.4, 0.05, Some(1)),
+        (3.6, 0.05, Some(2)),
+        (6.4, 0.05, Some(1)),
+        (8.7, 0.45, None),
+    ] {
+        let i = (t * 20.0) as usize;
+        for (k, sim) in [&mut without, &mut with].into_iter().enumerate() {
+            sim.render(i, &mut frames[k]);
+            sim.depth(i, 1, &mut depths[k]);
+        }
+        let hidden: Vec<usize> = (0..w * h).filter(|i| depths[0][*i] != depths[1][*i]).collect();
+        assert!(hidden.iter().all(|i| depths[1][*i] < depths[0][*i]), "{t} s: behind what it hides");
+        let seen = hidden.len() as f64 / (w * h) as f64;
+        let column = hidden.iter().map(|i| i % w).sum::<usize>() / hidden.len().max(1);
+        println!("{t} s: {:.1} % of the view, column {column} of {w}", 100.0 * seen);
+        assert!((share..0.6).contains(&seen) && third.is_none_or(|k| 3 * column / w == k), "{t} s: {seen}, {column}");
+        // Pixels on its outline are mixed.
+        let near = |i: usize| [i, i - 1, i + 1, i - w, i + w].iter().any(|j| depths[0][*j] != depths[1][*j]);
+        let pixels = |k: usize| &frames[k].images[1].pixels;
+        let spoiled = (w + 1..w * h - w - 1).filter(|i| !near(*i) && pixels(0)[*i] != pixels(1)[*i]).count();
+        let same = hidden.iter().filter(|i| pixels(0)[**i] == pixels(1)[**i]).count();
+        // A pixel or two where it goes through furniture: the face changes, the depth does not.
+        assert!(spoiled < 5 && 10 * same <= hidden.len(), "{t} s: {spoiled} px beside it, {same} px under it");
+    }
+}
+
+#[test]
 fn a_fisheye_camera_is_rendered_over_its_whole_domain() {
     let mut scenario = quiet("circle");
     let k = [0.0034, 0.0007, -0.0020, 0.0002];

@@ -27,6 +27,9 @@ pub struct Args {
     /// Cameras: mono, stereo, opposed or four; without it stereo
     #[arg(long, value_name = "NAME")]
     rig: Option<String>,
+    /// Let a box of a person's size move through the room: it crosses the view, follows the rig, and fills half of the view
+    #[arg(long)]
+    person: bool,
     /// Write images as RGB; grey otherwise
     #[arg(long)]
     colour: bool,
@@ -101,6 +104,7 @@ pub fn sim(args: &Args) -> Result<(), Fault> {
         let known = || Fault::new(FaultKind::Usage, name, "is not a rig", format!("choose one of {}", RIGS.join(", ")));
         scenario.calibration = rig_named(name).ok_or_else(known)?;
     }
+    scenario.person = args.person;
     args.defects.apply(&mut scenario)?;
     let mut sim = Sim::new(&scenario)?;
     let colours = if args.colour { sim.calibration().cameras.len() } else { 0 };

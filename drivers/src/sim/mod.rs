@@ -4,12 +4,13 @@
 //! instant, and `write_euroc` writes them in the EuRoC ASL layout. Geometry is ray-cast analytically through the camera
 //! models that the estimator inverts, so any error that remains downstream is the estimator's. Errors of the sensors
 //! (`CameraErrors`, `ImuErrors`) are in their data and not in the calibration that is handed out. Read in this order:
-//! `scenario` (paths), `spline` (motion), `room` and `furnish` (geometry), `texture` and `room::light` (appearance), `render`
+//! `scenario` (paths), `spline` (motion), `room`, `furnish` and `person` (geometry), `texture` and `room::light` (appearance), `render`
 //! (images), `imu`.
 
 mod baro;
 mod furnish;
 pub mod imu;
+mod person;
 mod recording;
 mod render;
 mod room;
@@ -28,6 +29,7 @@ use crate::fault::{Fault, FaultKind};
 use crate::source::AidReading;
 use crate::types::{luma, Frames, ImuSample, Nanos, Pose, Span, TimedPose};
 use glam::{DVec3, Vec3};
+use person::Person;
 use render::{Exposure, Lens, Row, Rows, Scratch, View};
 use room::Room;
 use spline::Spline;
@@ -80,6 +82,7 @@ pub struct Sim {
     aids: Vec<AidReading>,
     biases: Vec<Bias>,
     room: Room,
+    person: Option<Person>,
     lenses: Vec<Lens>,
     /// Logarithm of the gain every `METER_PERIOD` from the first frame.
     log_gain: Vec<f32>,
@@ -106,7 +109,8 @@ impl Sim {
         let span = (first - start).secs()..(last - start).secs();
         let (low, high) = bounds(scenario, &spline, span.clone());
         let path: Vec<Vec3> = sample_path(&spline, span).map(|p| p.as_vec3()).collect();
-        let room = furnish::furnish(low, high, &path, scenario.seed, threads);
+        let mut room = furnish::furnish(low, high, &path, scenario.seed, threads);
+        let person = scenario.person.then(|| Person::new(&mut room, scenario.seed as u32));
         let recorded = match &scenario.path {
             Flight::Recorded(r) => r.imu.as_ref().map(|imu| (imu, &r.biases)),
             _ => None,
@@ -141,6 +145,7 @@ impl Sim {
             aids,
             biases,
             room,
+            person,
             lenses,
             log_gain: Vec::new(),
             scratch,
@@ -237,8 +242,13 @@ impl Sim {
         render::depths(&self.lenses[camera], &self.scratch.hits, out);
     }
 
-    /// Sets the views and exposures of a camera's rows, one for all under a global shutter.
+    /// Moves the person, and sets the views and exposures of a camera's rows, one for all under a global shutter.
     fn expose(&mut self, t: Nanos, camera: usize) {
+        if let Some(person) = &self.person {
+            let (spline, first) = (&self.spline, (self.stamps[0] - self.start).secs());
+            let camera = |t: f64| spline.at(first + t).pose * self.rig.cameras[0].body_from_cam;
+            person.step(&mut self.room, (t - self.stamps[0]).secs(), camera);
+        }
         let c = &self.rig.cameras[camera];
         let (rolls, n) = (c.readout.0 > 0, c.camera.height);
         let mut rows = std::mem::take(&mut self.rows);

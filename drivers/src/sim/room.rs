@@ -123,24 +123,23 @@ impl Room {
 
     /// Adds a block standing on `base` (the centre of its underside); `turn` is (cos, sin) about z.
     pub fn add_block(&mut self, base: Vec3, half: Vec3, turn: (f32, f32), side: Material, top: Material, seed: u32) {
+        let first = self.faces.len();
+        for (k, (chart, size)) in block_charts(base, half, turn).into_iter().enumerate() {
+            let material = if k < 4 { side } else { top };
+            self.faces.push(Face { chart, size, material, seed: seed.wrapping_add(k as u32) });
+        }
+        let (shape, centre) = (Shape::Block { half }, base + Vec3::Z * half.z);
         let (cos, sin) = turn;
-        let (ex, ey) = (Vec3::new(cos, sin, 0.0), Vec3::new(-sin, cos, 0.0));
-        let centre = base + Vec3::Z * half.z;
-        let first = self.faces.len() as u32;
-        let size = half * 2.0;
-        let mut wall = |n: Vec3, u: Vec3, reach: f32, width: f32, k: u32| {
-            let origin = base + n * reach - u * (0.5 * width);
-            self.faces.push(face(origin, u, Vec3::Z, Vec2::new(width, size.z), side, seed.wrapping_add(k)));
-        };
-        wall(ex, ey, half.x, size.y, 0);
-        wall(-ex, -ey, half.x, size.y, 1);
-        wall(ey, -ex, half.y, size.x, 2);
-        wall(-ey, ex, half.y, size.x, 3);
-        let corner = centre - ex * half.x - ey * half.y;
-        let flat = Vec2::new(size.x, size.y);
-        self.faces.push(face(corner + Vec3::Z * half.z, ex, ey, flat, top, seed.wrapping_add(4)));
-        self.faces.push(face(corner + ey * size.y - Vec3::Z * half.z, ex, -ey, flat, top, seed.wrapping_add(5)));
-        self.solids.push(Solid { shape: Shape::Block { half }, centre, cos, sin, face: first, bound: half.length() });
+        self.solids.push(Solid { shape, centre, cos, sin, face: first as u32, bound: half.length() });
+    }
+
+    /// Moves a block to stand on `base`, turned as `add_block` has it.
+    pub fn move_block(&mut self, solid: usize, base: Vec3, turn: (f32, f32)) {
+        let s = &mut self.solids[solid];
+        let Shape::Block { half } = s.shape else { return };
+        (s.centre, (s.cos, s.sin)) = (base + Vec3::Z * half.z, turn);
+        let charts = block_charts(base, half, turn);
+        self.faces[s.face as usize..].iter_mut().zip(charts).for_each(|(face, (chart, _))| face.chart = chart);
     }
 
     /// Adds a ball.
@@ -219,6 +218,25 @@ impl Room {
         let wall = (p - self.low).min(self.high - p).min_element();
         self.solids.iter().map(|s| s.distance(p)).fold(wall, f32::min)
     }
+}
+
+/// Charts and sizes of a block's faces: ahead, behind, left, right, top, bottom.
+fn block_charts(base: Vec3, half: Vec3, (cos, sin): (f32, f32)) -> [(Chart, Vec2); 6] {
+    let (ex, ey, size) = (Vec3::new(cos, sin, 0.0), Vec3::new(-sin, cos, 0.0), half * 2.0);
+    let wall = |n: Vec3, u: Vec3, reach: f32, width: f32| {
+        let origin = base + n * reach - u * (0.5 * width);
+        (Chart::Flat { origin, u, v: Vec3::Z }, Vec2::new(width, size.z))
+    };
+    let corner = base + Vec3::Z * half.z - ex * half.x - ey * half.y;
+    let flat = |origin: Vec3, v: Vec3| (Chart::Flat { origin, u: ex, v }, size.truncate());
+    [
+        wall(ex, ey, half.x, size.y),
+        wall(-ex, -ey, half.x, size.y),
+        wall(ey, -ex, half.y, size.x),
+        wall(-ey, ex, half.y, size.x),
+        flat(corner + Vec3::Z * half.z, ey),
+        flat(corner + ey * size.y - Vec3::Z * half.z, -ey),
+    ]
 }
 
 fn face(origin: Vec3, u: Vec3, v: Vec3, size: Vec2, material: Material, seed: u32) -> Face {

@@ -39,6 +39,8 @@ pub struct Scenario {
     pub imu_errors: ImuErrors,
     /// Path of the body.
     pub path: Flight,
+    /// Whether a person moves through the room.
+    pub person: bool,
 }
 
 /// Errors of the cameras that the calibration does not state. A rolling shutter is not one of them: it is the `readout` of
@@ -159,6 +161,7 @@ impl Scenario {
             camera_errors: CameraErrors::default(),
             imu_errors: ImuErrors::EUROC,
             path,
+            person: false,
         }
     }
 
@@ -311,7 +314,7 @@ fn under_way(t: f64) -> f64 {
 }
 
 /// From 0 at 0 to 1 at 1, with two derivatives that are zero at both.
-fn smooth(x: f64) -> f64 {
+pub(super) fn smooth(x: f64) -> f64 {
     let x = x.clamp(0.0, 1.0);
     x * x * x * (10.0 - 15.0 * x + 6.0 * x * x)
 }

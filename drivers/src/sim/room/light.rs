@@ -67,6 +67,12 @@ impl LightMap {
         LightMap { grids, nodes }
     }
 
+    /// Adds the next face, evenly lit.
+    pub fn add_even(&mut self, irradiance: f32) {
+        self.grids.push(Grid { first: self.nodes.len(), columns: 2, rows: 2, density: Vec2::ONE });
+        self.nodes.extend([irradiance; 4]);
+    }
+
     /// The irradiance at a surface coordinate of a face, m.
     #[inline]
     pub fn at(&self, face: usize, at: Vec2) -> f32 {
