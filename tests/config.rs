@@ -7,6 +7,7 @@ use stipple::config::{keys, Board, InjectConfig, StereoMethod};
 use stipple_drivers::baro::BaroOptions;
 use stipple_drivers::gpio::Edge;
 use stipple_drivers::imu::ImuOptions;
+use stipple_drivers::sim::euroc_rig;
 use stipple_drivers::{Fault, FaultKind};
 
 const BOARD: &str = r#"name = "test"
@@ -205,6 +206,35 @@ fn a_barometer_is_off_unless_it_is_named() {
 #[test]
 fn missing_file_is_named() {
     refused(Board::load(Path::new("no/such.toml"), &[]), FaultKind::NoInput, &["no/such.toml", "board-configs/"]);
+}
+
+#[test]
+fn a_mask_that_is_not_within_its_image_is_refused() {
+    let masked = |masks: &str| {
+        let board = parse(BOARD, &[&format!("rig.masks={masks}")])?;
+        let mut calibration = euroc_rig();
+        board.rig.mask(&mut calibration).map(|()| calibration)
+    };
+    let calibration = masked("[[0, 0, 400, 752, 480], [1, 3, 4, 5, 6]]").unwrap();
+    let at = |camera: usize, x: f64, y: f64| calibration.cameras[camera].is_masked(x, y);
+    assert!(at(0, 0.0, 400.0) && at(0, 751.0, 479.0) && at(1, 3.0, 4.0) && at(1, 4.0, 5.0));
+    assert!(!at(0, 0.0, 399.0) && !at(1, 0.0, 400.0) && !at(1, 5.0, 5.0) && !at(1, 2.0, 4.0));
+    for (masks, said) in [
+        ("[[0, 0, 400, 753, 480]]", "752x480"),
+        ("[[0, 0, 0, 752, 481]]", "752x480"),
+        ("[[0, 300, 0, 300, 480]]", "no rectangle"),
+        ("[[2, 0, 0, 9, 9]]", "cameras are 0 to 1"),
+        (&format!("[{}]", ["[1, 0, 0, 9, 9]"; 9].join(", ")), "up to 8"),
+        ("[[0, -1, 0, 9, 9]]", "rig.masks"),
+        ("[[0, nan, 0, 9, 9]]", "rig.masks"),
+        ("[[0, 0.5, 0, 9, 9]]", "rig.masks"),
+        ("[[0, 0, 9, 9]]", "rig.masks"),
+    ] {
+        let fault = masked(masks).expect_err(masks);
+        let line = fault.to_string();
+        assert!(fault.kind == FaultKind::Config && line.contains(said) && line.contains("rig.masks"), "{line}");
+        assert!(!fault.fix.is_empty() && !line.contains('\n'), "{line}");
+    }
 }
 
 #[test]

@@ -10,6 +10,7 @@ use stipple::config::FrontendConfig;
 use stipple::frontend::{Frontend, Prediction, Stats, Tracks};
 use stipple::limits::TRACKS;
 use stipple::mem::{heap_after_seal, seal_thread, unsealed, CountingAllocator};
+use stipple_drivers::calibration::Mask;
 use stipple_drivers::replay::{OpenOptions, Recording};
 use stipple_drivers::sim::{rig_named, Scenario, Sim};
 use stipple_drivers::types::pose_at;
@@ -90,6 +91,26 @@ fn points_move_as_the_wall_does_in_both_cameras() {
             assert!((still[0] - from[0]).hypot(still[1] - from[1]) < 0.15, "frame {k}: {from:?} -> {still:?}");
         }
     }
+}
+
+#[test]
+fn no_track_begins_or_stays_where_the_vehicle_is_in_view() {
+    let mut calibration = rig(480, 360);
+    let seen = |calibration: &Calibration| {
+        let mut frontend = Frontend::new(calibration, &FrontendConfig::default()).unwrap();
+        let mut frames = Arc::new(Frames::for_rig(calibration));
+        let mut inside = 0;
+        for k in 0..12 {
+            see(calibration, [0.04 * k as f64, 0.0], 2.0, 0.0, Arc::make_mut(&mut frames));
+            let tracks = frontend.track(&frames, &Prediction::default());
+            assert!(pairs(tracks).len() > 10, "frame {k}");
+            inside += tracks.cameras[1].iter().filter(|t| (150.0..249.0).contains(&t.px[0]) && t.px[1] < 199.0).count();
+        }
+        inside
+    };
+    assert!(seen(&calibration) > 20);
+    calibration.cameras[1].masks[3] = Mask { left: 150, top: 0, right: 250, bottom: 200 };
+    assert_eq!(seen(&calibration), 0);
 }
 
 #[test]

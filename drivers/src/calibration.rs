@@ -12,6 +12,19 @@ use crate::types::{Frames, Image, ImuSample, Nanos, Pose, Span};
 use glam::{DMat3, DVec3};
 use serde::{Deserialize, Serialize};
 
+/// Most masks of a camera.
+pub const MASKS_MAX: usize = 8;
+
+/// A rectangle of a raw image in which the vehicle itself is seen: columns `left..right` of rows `top..bottom`, px. The default
+/// is none.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Mask {
+    pub left: u32,
+    pub top: u32,
+    pub right: u32,
+    pub bottom: u32,
+}
+
 /// A camera of the rig: its lens, its pose and its timing.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct RigCamera {
@@ -23,12 +36,21 @@ pub struct RigCamera {
     pub time_offset: Span,
     /// From the first row's exposure to the last one's; zero is a global shutter.
     pub readout: Span,
+    /// Where the vehicle is in view.
+    #[serde(default)]
+    pub masks: [Mask; MASKS_MAX],
 }
 
 impl RigCamera {
     /// A camera with a global shutter in the inertial unit's clock.
     pub fn new(camera: Camera, body_from_cam: Pose) -> RigCamera {
-        RigCamera { camera, body_from_cam, time_offset: Span(0), readout: Span(0) }
+        RigCamera { camera, body_from_cam, time_offset: Span(0), readout: Span(0), masks: Default::default() }
+    }
+
+    /// Whether the vehicle is in view at a pixel; integer = pixel centre.
+    pub fn is_masked(&self, x: f64, y: f64) -> bool {
+        let within = |v: f64, low: u32, high: u32| v + 0.5 >= f64::from(low) && v + 0.5 < f64::from(high);
+        self.masks.iter().any(|m| within(x, m.left, m.right) && within(y, m.top, m.bottom))
     }
 
     /// The instant of an image's middle row in the inertial unit's clock, from the camera's own stamp.

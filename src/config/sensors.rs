@@ -1,10 +1,11 @@
 //! The sensors of a live run, and how they are wired: `[rig]`, `[camera]`, `[imu]`, `[baro]`, `[gpio]`, `[record]`.
-//! Replays read `rig.readout_s`, `camera.pair_tolerance_s` and `[baro]` alone.
+//! Replays read `rig.readout_s`, `rig.masks`, `camera.pair_tolerance_s` and `[baro]` alone.
 
 use super::section::{section, Bound};
 use serde::Deserialize;
 use std::collections::BTreeMap;
 use stipple_drivers::baro::BaroOptions;
+use stipple_drivers::calibration::{Mask, MASKS_MAX};
 use stipple_drivers::gpio::{Edge, LineName};
 use stipple_drivers::imu::chips::Chip;
 use stipple_drivers::imu::{IioOptions, ImuOptions, RegisterOptions, Wiring};
@@ -20,6 +21,10 @@ section! {
     /// Rolling shutter: time from the first row to the last; 0: as the calibration says. State it where the calibration says
     /// `shutter: rolling` and no time. Above a tenth of a second the body's motion between rows is no longer of first order.
     readout_s: f64 = 0.0, Bound::Within(0.0, 0.1);
+    /// Parts of the vehicle in view, which neither tracker nor map looks at, as [camera, left, top, right, bottom] in pixels of
+    /// the raw image, right and bottom not included: [[0, 0, 400, 752, 480]]; up to 8 a camera. Draw them 5 px larger than what
+    /// is seen.
+    masks: Vec<[u32; 5]> = Vec::new();
 }
 
 section! {
@@ -122,6 +127,36 @@ section! {
     /// Frames that wait for the disk; those beyond are dropped from the recording, and counted. SD cards stall for a second now
     /// and then: the default is 1.6 s at 20 Hz, 22 MiB of two 752x480 cameras.
     ring_frames: u32 = 32, Bound::Within(1.0, 4096.0);
+}
+
+impl RigConfig {
+    /// Puts the masks into a calibration; an error where one is not within its camera's image.
+    pub fn mask(&self, calibration: &mut Calibration) -> Result<(), Fault> {
+        let count = calibration.cameras.len();
+        for [camera, left, top, right, bottom] in &self.masks {
+            let (camera, mask) = (*camera, Mask { left: *left, top: *top, right: *right, bottom: *bottom });
+            let wrong = |what: String| {
+                let what = format!("[{camera}, {left}, {top}, {right}, {bottom}] {what}");
+                let fix = "write [camera, left, top, right, bottom] in pixels of that camera's raw image";
+                Err(Fault::new(FaultKind::Config, "rig.masks", what, fix))
+            };
+            let Some(of) = calibration.cameras.get_mut(camera as usize) else {
+                return wrong(format!(
+                    "is of a camera that the rig has not: cameras are 0 to {}",
+                    count.saturating_sub(1)
+                ));
+            };
+            let (w, h) = (of.camera.width, of.camera.height);
+            if left >= right || top >= bottom || *right as usize > w || *bottom as usize > h {
+                return wrong(format!("is no rectangle within an image of {w}x{h} px"));
+            }
+            let Some(free) = of.masks.iter_mut().find(|m| **m == Mask::default()) else {
+                return wrong(format!("is one too many: a camera has up to {MASKS_MAX}"));
+            };
+            *free = mask;
+        }
+        Ok(())
+    }
 }
 
 /// A key and what is wrong with its value.

@@ -2,7 +2,7 @@
 
 use super::patch::Warp;
 use glam::{DVec2, DVec3};
-use stipple_drivers::{Calibration, Camera, Pose};
+use stipple_drivers::{Calibration, Pose, RigCamera};
 
 /// Half the width of the patch: the lever that shows its rotation, px.
 const LEVER_PX: f32 = 4.0;
@@ -13,7 +13,7 @@ const DEPTH_MIN: f64 = 0.1;
 
 /// The cameras of a rig and where they sit.
 pub struct RigGeometry {
-    cameras: Vec<Camera>,
+    cameras: Vec<RigCamera>,
     body_from_cam: Vec<Pose>,
     /// `between[to * cameras + from]` is `to_from_from`.
     between: Vec<Pose>,
@@ -26,7 +26,7 @@ impl RigGeometry {
     pub fn new(calibration: &Calibration, epipolar_max: f64) -> RigGeometry {
         let n = calibration.cameras.len();
         let mut rig = RigGeometry {
-            cameras: calibration.cameras.iter().map(|c| c.camera).collect(),
+            cameras: calibration.cameras.clone(),
             body_from_cam: calibration.cameras.iter().map(|c| c.body_from_cam).collect(),
             between: vec![Pose::IDENTITY; n * n],
             epipolar_max,
@@ -57,9 +57,15 @@ impl RigGeometry {
         self.refresh();
     }
 
-    /// Unit ray of a pixel; `None` outside the camera model.
+    /// Unit ray of a pixel; `None` outside the camera model and where the vehicle is in view.
     pub fn bearing(&self, camera: usize, px: [f32; 2]) -> Option<DVec3> {
-        self.cameras[camera].unproject(DVec2::new(px[0] as f64, px[1] as f64))
+        let bearing = self.cameras[camera].camera.unproject(DVec2::new(px[0] as f64, px[1] as f64));
+        bearing.filter(|_| !self.is_masked(camera, px))
+    }
+
+    /// Whether the vehicle is in view at a pixel.
+    pub fn is_masked(&self, camera: usize, px: [f32; 2]) -> bool {
+        self.cameras[camera].is_masked(px[0] as f64, px[1] as f64)
     }
 
     /// Motion of one camera: `now_from_before`, from that of the body.
@@ -84,8 +90,8 @@ impl RigGeometry {
     ) -> Option<Warp> {
         let send = |px: [f32; 2]| {
             let p = to_from_from.q * self.bearing(from, px)? + to_from_from.p * inverse_depth;
-            let at = self.cameras[to].project(p)?;
-            self.cameras[to].contains(at, 0.0).then_some([at.x as f32, at.y as f32])
+            let at = self.cameras[to].camera.project(p)?;
+            self.cameras[to].camera.contains(at, 0.0).then_some([at.x as f32, at.y as f32])
         };
         let centre = send(px)?;
         let mut warp = Warp::upright(centre);
@@ -107,7 +113,7 @@ impl RigGeometry {
         let (a, b) = (g.cross(t), g.cross(f));
         let weight = a.length_squared();
         let q = -a.dot(b) / weight;
-        let slack = DISPARITY_SLACK_PX / (self.cameras[from].fx * t.length()) + self.widened / t.length();
+        let slack = DISPARITY_SLACK_PX / (self.cameras[from].camera.fx * t.length()) + self.widened / t.length();
         (q > -slack && q < 1.0 / DEPTH_MIN && g.dot(f + t * q.max(0.0)) > 0.0).then_some((q, weight))
     }
 }
@@ -117,7 +123,7 @@ mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
     use glam::DQuat;
-    use stipple_drivers::{ImuCalibration, ImuCorrection, Lens, RigCamera};
+    use stipple_drivers::{Camera, ImuCalibration, ImuCorrection, Lens};
 
     fn rig() -> RigGeometry {
         let lens = Lens::KannalaBrandt { k: [0.01, -0.01, 0.006, -0.0017] };

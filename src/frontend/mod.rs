@@ -243,7 +243,7 @@ impl Frontend {
                     let start = start.unwrap_or(Warp::upright(px));
                     self.follow_view(&point, camera, start, PYRAMID_LEVELS - 1)
                 });
-                match view {
+                match view.filter(|px| !self.rig.is_masked(camera, *px)) {
                     Some(_) => self.points.list[i].views[camera] = view,
                     None => self.stats.tracks_lost += u64::from(self.points.lose(i, camera)),
                 }

@@ -137,7 +137,7 @@ fn fisheye(i: usize, c: &RigCamera, mapping: &Pinhole, divisor: usize) -> Result
     }
     let within = |x: usize, y: usize| {
         let centre = |v: usize| (v as f64 + 0.5) * divisor as f64 - 0.5;
-        let bearing = raw.unproject(DVec2::new(centre(x), centre(y)));
+        let bearing = raw.unproject(DVec2::new(centre(x), centre(y))).filter(|_| !c.is_masked(centre(x), centre(y)));
         u8::from(bearing.is_some_and(|b| b.z.clamp(-1.0, 1.0).acos() <= ANGLE_MAX))
     };
     let valid = (0..camera.width * camera.height).map(|i| within(i % camera.width, i / camera.width)).collect();
@@ -156,6 +156,7 @@ pub fn draw(i: usize, camera: &TrainingCamera, views: &mut RectifiedViews, raw: 
 mod tests {
     use super::*;
     use glam::{DQuat, DVec3};
+    use stipple_drivers::calibration::Mask;
     use stipple_drivers::{Calibration, Camera, ImuCalibration};
 
     fn rig() -> Calibration {
@@ -165,6 +166,22 @@ mod tests {
         let right = Pose::new(DQuat::from_rotation_y(0.04), DVec3::new(0.3, 0.1, 0.0));
         let cameras = vec![RigCamera::new(camera, left), RigCamera::new(camera, right)];
         Calibration { cameras, imu: ImuCalibration::CONSUMER }
+    }
+
+    #[test]
+    fn pixels_of_the_vehicle_do_not_train() {
+        let mut masked = rig();
+        masked.cameras[0].masks[0] = Mask { left: 10, top: 70, right: 110, bottom: 120 };
+        for projection in [Projection::Rectified, Projection::Fisheye] {
+            let config = MapConfig { projection, cameras: 2, ..MapConfig::default() };
+            let counts = [rig(), masked.clone()].map(|rig| {
+                let views = RectifiedViews::new(&rig, 1).expect("a sound rig");
+                let cameras = training(&views, &config).expect("Kannala-Brandt lenses");
+                let all = |camera: usize| cameras[camera].valid.iter().filter(|v| **v != 0).count();
+                [all(0), all(1)]
+            });
+            assert!(counts[1][0] + 2000 < counts[0][0] && counts[1][1] == counts[0][1], "{projection:?}: {counts:?}");
+        }
     }
 
     /// A floor seen by the rectified view is the same floor seen by the raw lens.

@@ -81,7 +81,9 @@ pub fn open_recording(dataset: &Path, calibration: Option<&Path>, board: &Board)
         readout: (board.rig.readout_s > 0.0).then(|| Span::from_secs(board.rig.readout_s)),
         ..OpenOptions::default()
     };
-    Recording::open(dataset, &options)
+    let mut recording = Recording::open(dataset, &options)?;
+    board.rig.mask(&mut recording.calibration)?;
+    Ok(recording)
 }
 
 impl Input {
@@ -303,6 +305,7 @@ fn calibration(path: &Path, board: &Board) -> Result<Calibration, Fault> {
     if board.rig.readout_s > 0.0 {
         calibration.cameras.iter_mut().for_each(|c| c.readout = Span::from_secs(board.rig.readout_s));
     }
+    board.rig.mask(&mut calibration)?;
     Ok(calibration)
 }
 

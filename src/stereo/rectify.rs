@@ -65,7 +65,9 @@ impl Rectification {
         for y in 0..p.height {
             for x in 0..p.width {
                 let ray = DVec3::new((x as f64 - p.cx) / p.fx, (y as f64 - p.cy) / p.fy, 1.0);
-                let tap = raw.project(cam_from_rect * ray).filter(|px| raw.contains(*px, 0.0));
+                let tap = raw
+                    .project(cam_from_rect * ray)
+                    .filter(|px| raw.contains(*px, 0.0) && !camera.is_masked(px.x, px.y));
                 taps.push(tap.map_or(Tap { index: OUTSIDE, wx: 0, wy: 0 }, |px| Tap::at(px, raw.width, raw.height)));
             }
         }

@@ -145,7 +145,7 @@ fn kalibr(file: &Document, stated: Option<Span>, findings: &mut Findings) -> Res
         let time_offset = time_offset(file, &at)?;
         let camera = yaml_camera(file, &at, "distortion_coeffs")?;
         let readout = readout(file, &at, &camera, stated)?;
-        cameras.push(RigCamera { camera, body_from_cam, time_offset, readout });
+        cameras.push(RigCamera { time_offset, readout, ..RigCamera::new(camera, body_from_cam) });
     }
     let imu = yaml_imu(&file.path.with_file_name("imu_config.yaml"), "update_rate", findings)?;
     Ok(Calibration { cameras, imu })
