@@ -114,6 +114,28 @@ fn no_track_begins_or_stays_where_the_vehicle_is_in_view() {
 }
 
 #[test]
+fn a_point_that_the_estimator_rejects_is_dropped_and_its_cell_rests() {
+    let calibration = rig(480, 360);
+    let mut frontend = Frontend::new(&calibration, &FrontendConfig::default()).unwrap();
+    let mut frames = Arc::new(Frames::for_rig(&calibration));
+    see(&calibration, [0.0; 2], 2.0, 0.0, Arc::make_mut(&mut frames));
+    let point = frontend.track(&frames, &Prediction::default()).cameras[0][10];
+    let near = |t: &Tracks| t.cameras[0].iter().any(|a| (a.px[0] - point.px[0]).hypot(a.px[1] - point.px[1]) < 10.0);
+    frontend.reject(&[point.id, u64::MAX]);
+    let mut rested = 0;
+    for _ in 0..64 {
+        let tracks = frontend.track(&frames, &Prediction::default());
+        assert!(tracks.find(0, point.id).is_none() && tracks.find(1, point.id).is_none());
+        if near(tracks) {
+            break;
+        }
+        rested += 1;
+    }
+    assert!((1..64).contains(&rested), "the cell rests, and is looked at again: {rested}");
+    assert_eq!(frontend.stats().tracks_contradicted, 1);
+}
+
+#[test]
 fn what_is_covered_is_dropped() {
     let calibration = rig(480, 360);
     let mut frontend = Frontend::new(&calibration, &FrontendConfig::default()).unwrap();

@@ -11,6 +11,9 @@ use stipple_drivers::Image;
 pub const BORDER: usize = 19;
 /// Widest cell a board file may ask for, px.
 const CELL_MAX: usize = 200;
+/// A cell whose point was rejected is not looked at for so many frames, 0.8 s at 20 Hz: a new point of what moves there would
+/// be a landmark before it is rejected too. Chosen of 0 to 40 frames on four flights past a person; neighbours differ little.
+const REST: u32 = 16;
 /// Neighbouring pixels of the ring that must differ, and the ring, from the top clockwise.
 const ARC: usize = 9;
 #[rustfmt::skip]
@@ -35,6 +38,8 @@ pub struct Detector {
     taken: Vec<bool>,
     /// Bit of each other camera that sees a cell too.
     shared: Vec<u8>,
+    /// Frames for which each cell is not looked at.
+    rests: Vec<u32>,
     corners: Vec<Corner>,
     threshold: u8,
     threshold_min: u8,
@@ -50,6 +55,7 @@ impl Detector {
             origin: [(width % cell) / 2, (height % cell) / 2],
             taken: vec![false; columns * rows],
             shared: vec![0; columns * rows],
+            rests: vec![0; columns * rows],
             corners: Vec::with_capacity(columns * rows),
             threshold: config.fast_threshold.min(255) as u8,
             threshold_min: config.fast_threshold_min.clamp(1, 255) as u8,
@@ -64,6 +70,21 @@ impl Detector {
         }
     }
 
+    fn cell_at(&self, [x, y]: [f32; 2]) -> Option<usize> {
+        let rows = self.taken.len() / self.columns.max(1);
+        let i = (x - self.origin[0] as f32) / self.cell as f32;
+        let j = (y - self.origin[1] as f32) / self.cell as f32;
+        let inside = i >= 0.0 && j >= 0.0 && i < self.columns as f32 && j < rows as f32;
+        inside.then(|| j as usize * self.columns + i as usize)
+    }
+
+    /// Lets the cell at a pixel rest, whose point was rejected; the rest of one that rests already is not made longer.
+    pub fn rest(&mut self, px: [f32; 2]) {
+        if let Some(k) = self.cell_at(px).filter(|k| self.rests[*k] == 0) {
+            self.rests[k] = REST;
+        }
+    }
+
     /// Finds at most `room` corners, one in each cell that is free of `points` and that none of the cameras
     /// `others` (bits) sees too; the strongest when there are more. Also answers how many did not fit.
     pub fn detect(
@@ -73,13 +94,13 @@ impl Detector {
         others: u8,
         room: usize,
     ) -> (&[Corner], usize) {
-        self.taken.fill(false);
-        let rows = self.taken.len() / self.columns.max(1);
-        for [x, y] in points {
-            let i = (x - self.origin[0] as f32) / self.cell as f32;
-            let j = (y - self.origin[1] as f32) / self.cell as f32;
-            if i >= 0.0 && j >= 0.0 && i < self.columns as f32 && j < rows as f32 {
-                self.taken[j as usize * self.columns + i as usize] = true;
+        for (taken, rest) in self.taken.iter_mut().zip(&mut self.rests) {
+            *taken = *rest > 0;
+            *rest = rest.saturating_sub(1);
+        }
+        for px in points {
+            if let Some(k) = self.cell_at(px) {
+                self.taken[k] = true;
             }
         }
         self.corners.clear();

@@ -27,7 +27,7 @@ mod search;
 mod tracks;
 
 pub use agreement::{Verdict, Verdicts};
-pub use tracks::{Track, Tracks};
+pub use tracks::{Rejected, Track, Tracks};
 
 use crate::config::FrontendConfig;
 use crate::limits::{CAMERAS_MAX, PYRAMID_LEVELS, TRACKS};
@@ -61,6 +61,8 @@ counters! {
     tracks_epipolar_rejected,
     /// Points dropped because an older one is near.
     tracks_crowded,
+    /// Points dropped because the estimator rejected them.
+    tracks_contradicted,
     /// Corners and views that did not fit.
     tracks_full,
     /// Images that were missing, not of their camera's size, or of a camera the rig has not.
@@ -192,6 +194,21 @@ impl Frontend {
         // Who wrote the frame before may have it back.
         self.before.frames = frames.clone();
         &self.tracks
+    }
+
+    /// Drops the points that the estimator rejected, so that what moves by itself does not keep its places: the cells rest.
+    pub fn reject(&mut self, ids: &[u64]) {
+        for id in ids {
+            let Ok(i) = self.points.list.binary_search_by_key(id, |p| p.id) else { continue };
+            self.stats.tracks_contradicted += 1;
+            for camera in 0..self.cameras() {
+                if let Some(px) = self.points.list[i].views[camera] {
+                    self.detectors[camera].rest(px);
+                }
+                self.points.lose(i, camera);
+            }
+        }
+        self.drop_unseen();
     }
 
     /// Takes the images that are of their camera's size; the cameras of the others lose all their views.

@@ -20,6 +20,9 @@ impl Track {
     }
 }
 
+/// Ids of points that the estimator rejected in one frame; those beyond are left out.
+pub type Rejected = List<u64, TRACKS>;
+
 /// Points seen at one instant, `cameras[camera]`, ascending id.
 #[derive(Clone, Debug, Default)]
 pub struct Tracks {

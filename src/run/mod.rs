@@ -536,7 +536,7 @@ fn spawn_tracking<'scope, 'env>(
                     tracking::in_turns(link, inlet, front, back, give);
                 })
             } else {
-                let start = back.vio.known();
+                let start = back.answer();
                 spawn(scope, "frontend", move || tracking::follow_points(link, inlet, front, start));
                 spawn(scope, "estimator", move || {
                     let _ended = ended;

@@ -2,13 +2,13 @@
 //!
 //! ```text
 //! next() -> front end -tracked-> back end -> give()      packets
-//!               ^-----states------'                      one a frame
+//!               ^----answers------'                      one a frame
 //! ```
 //!
 //! The two halves of odometry share one thread in turns or have a thread each. The front end follows points, the back end
-//! estimates. All that passes between them travels in a `FramePacket`, besides the state that the back end gives back. The
-//! front end begins frame k when the state after frame k-2 has come, and predicts from that even where the one after k-1 is
-//! known: so neither queue can fill, and poses are the same bit for bit on one thread and on two.
+//! estimates. All that passes between them travels in a `FramePacket`, besides what the back end answers: its state, and the
+//! points that it rejected. The front end begins frame k when the answer to frame k-2 has come, and predicts from that even
+//! where the one to k-1 is known: so neither queue can fill, and poses are the same bit for bit on one thread and on two.
 //!
 //! With `--poses` the poses come from a table, odometry is skipped, and every frame is a keyframe.
 
@@ -16,7 +16,7 @@ use super::log::{LogSender, State};
 use super::waker::{SetOnDrop, Waker};
 use crate::config::Board;
 use crate::counters::Counters;
-use crate::frontend::{Frontend, Prediction, Tracks, Verdicts};
+use crate::frontend::{Frontend, Prediction, Rejected, Tracks, Verdicts};
 use crate::limits::{FRAMES, IMU_BETWEEN_FRAMES};
 use crate::mem::{seal_thread, Footprint, List, Thinned};
 use crate::vio::{Health, Known, Predictor, Vio};
@@ -129,6 +129,13 @@ pub struct OdometryRun {
     pub bytes: u64,
 }
 
+/// What the back end tells the front end after a frame.
+#[derive(Clone)]
+pub struct Answer {
+    known: Known,
+    rejected: Rejected,
+}
+
 /// The half that follows points.
 pub struct Front {
     frontend: Frontend,
@@ -142,20 +149,21 @@ pub struct Front {
 }
 
 impl Front {
-    /// `known` is the back end's after the frame before the last.
-    pub fn track(&mut self, packet: &mut FramePacket, known: &Known) {
+    /// `answer` is the back end's to the frame before the last.
+    pub fn track(&mut self, packet: &mut FramePacket, answer: &Answer) {
         let cpu = thread_cpu_now();
         packet.begun = Instant::now();
-        self.predictor.set_scale(known.imu_scale);
-        if let Some((body_from_cam, sigma_rad)) = &known.cameras {
+        self.predictor.set_scale(answer.known.imu_scale);
+        if let Some((body_from_cam, sigma_rad)) = &answer.known.cameras {
             self.frontend.correct(body_from_cam, *sigma_rad);
         }
         packet.imu.iter().for_each(|s| self.predictor.on_imu(*s));
+        self.frontend.reject(&answer.rejected);
         if packet.imu_only {
             return;
         }
         let prediction =
-            Prediction { prev_from_now: self.predictor.motion_to(packet.frames.t, known.odometry.as_ref()) };
+            Prediction { prev_from_now: self.predictor.motion_to(packet.frames.t, answer.known.odometry.as_ref()) };
         packet.tracks.clone_from(self.frontend.track(&packet.frames, &prediction));
         packet.verdicts = self.frontend.verdicts();
         let secs = packet.begun.elapsed().as_secs_f64();
@@ -223,6 +231,11 @@ impl Back {
             let state = State::new(packet.frames.t, &update, latency_ms, cpu.as_secs_f64() * 1e3);
             log.state(State { time_offset_ns, ..state });
         }
+    }
+
+    /// What the front end is to hear, once a frame.
+    pub fn answer(&mut self) -> Answer {
+        Answer { rejected: self.vio.take_rejected(), known: self.vio.known() }
     }
 
     fn keyframe_poses(&self) -> List<(Nanos, Pose), FRAMES> {
@@ -330,7 +343,7 @@ pub fn look_up(poses: &[TimedPose], packet: &mut FramePacket, counters: &Counter
 /// What the threads of tracking share.
 pub struct Link {
     tracked: ArrayQueue<Box<FramePacket>>,
-    states: ArrayQueue<Known>,
+    answers: ArrayQueue<Answer>,
     /// Wakes the thread that takes packets.
     pub taker: Waker,
     back: Waker,
@@ -342,7 +355,7 @@ impl Default for Link {
     fn default() -> Link {
         Link {
             tracked: ArrayQueue::new(BETWEEN_HALVES),
-            states: ArrayQueue::new(BETWEEN_HALVES),
+            answers: ArrayQueue::new(BETWEEN_HALVES),
             taker: Waker::default(),
             back: Waker::default(),
             front_done: AtomicBool::new(false),
@@ -385,12 +398,12 @@ pub fn in_turns(
     mut give: impl FnMut(Box<FramePacket>),
 ) {
     seal();
-    let start = back.vio.known();
-    let (mut known, mut next) = (start, start);
+    let start = back.answer();
+    let (mut answer, mut next) = (start.clone(), start);
     while let Some(mut packet) = inlet.next(link) {
-        front.track(&mut packet, &known);
+        front.track(&mut packet, &answer);
         back.estimate(&mut packet);
-        (known, next) = (next, back.vio.known());
+        (answer, next) = (next, back.answer());
         give(packet);
     }
     front.cpu_s = Some(thread_cpu().total_s());
@@ -401,20 +414,20 @@ pub fn follow_points(
     link: &Link,
     mut inlet: Inlet<impl FnMut() -> Option<Box<FramePacket>>>,
     front: &mut Front,
-    start: Known,
+    start: Answer,
 ) {
     let _ended = SetOnDrop(&link.front_done, Some(&link.back));
     seal();
-    let (mut known, mut frames) = (start, 0u64);
+    let (mut answer, mut frames) = (start, 0u64);
     loop {
         if frames >= BETWEEN_HALVES as u64 {
             let begun = Instant::now();
-            let Some(newer) = link.taker.wait(&link.back_done, || link.states.pop()) else { break };
+            let Some(newer) = link.taker.wait(&link.back_done, || link.answers.pop()) else { break };
             front.busy_s += begun.elapsed().as_secs_f64();
-            known = newer;
+            answer = newer;
         }
         let Some(mut packet) = inlet.next(link) else { break };
-        front.track(&mut packet, &known);
+        front.track(&mut packet, &answer);
         frames += 1;
         // There is room: the back end has finished all but the last.
         let _ = link.tracked.push(packet);
@@ -429,7 +442,7 @@ pub fn estimate(link: &Link, back: &mut Back, mut give: impl FnMut(Box<FramePack
     seal();
     while let Some(mut packet) = link.back.wait(&link.front_done, || link.tracked.pop()) {
         back.estimate(&mut packet);
-        let _ = link.states.push(back.vio.known());
+        let _ = link.answers.push(back.answer());
         link.taker.wake();
         give(packet);
     }

@@ -21,7 +21,7 @@ use super::triangulation::{drop_outliers, triangulate};
 use super::window::Frame;
 use super::zero_velocity;
 use crate::config::VioConfig;
-use crate::frontend::Tracks;
+use crate::frontend::{Rejected, Tracks};
 use crate::limits::{FRAMES, RIG_DIM};
 use stipple_drivers::{Calibration, Nanos};
 
@@ -77,6 +77,8 @@ pub struct Estimator {
     pub height_deviation: Option<f64>,
     /// Standard deviations of the rig, in the order of its columns.
     pub rig_deviations: [f64; RIG_DIM],
+    /// Points that the newest frame's views contradict.
+    pub rejected: Rejected,
     /// Stamp of the newest keyframe.
     keyframe_at: Nanos,
     /// There was motion since the start.
@@ -96,6 +98,7 @@ impl Estimator {
             marginalizer: Marginalizer::new(),
             heights: None,
             height_deviation: None,
+            rejected: Rejected::default(),
             keyframe_at: Nanos(0),
             moved: false,
         }
@@ -110,6 +113,7 @@ impl Estimator {
     pub fn clear(&mut self) {
         self.graph.clear();
         self.moved = false;
+        self.rejected.clear();
         self.height_deviation = None;
         self.heights.iter_mut().for_each(Heights::forget_bias);
     }
@@ -140,6 +144,7 @@ impl Estimator {
     /// needs.
     pub fn advance(&mut self, tracks: &Tracks, imu: &ImuRing, covariance: Option<&Covariance>) -> Step {
         let before = self.graph.window.newest().expect("a started window has frames");
+        self.rejected.clear();
         let (slot, mut step) = self.enter(before, tracks, imu, covariance);
         if step.keyframe {
             step.landmarks_full = self.make_keyframe(slot);
@@ -157,7 +162,7 @@ impl Estimator {
             self.solver.rig_deviations(&mut self.rig_deviations[..n]);
         }
         let px_max = self.outlier_px(slot);
-        step.outliers = drop_outliers(&mut self.graph, px_max);
+        step.outliers = drop_outliers(&mut self.graph, px_max, slot, &mut self.rejected);
         step.evidence = Some(self.evidence(before, slot, views, step.at_rest));
         step.columns_lost = self.marginalize();
         step
@@ -197,7 +202,7 @@ impl Estimator {
             let config = &self.model.config;
             // Wider while the rig is not known well.
             let sigma_px = config.observation_sigma_px + self.outlier_px(slot) - config.outlier_px;
-            step.gate = gate(&self.graph, slot, &mut self.tracks[slot], &p, sigma_px);
+            step.gate = gate(&self.graph, slot, &mut self.tracks[slot], &p, sigma_px, &mut self.rejected);
         }
         if self.model.config.zero_velocity {
             step.at_rest = zero_velocity::hold(slot, &mut self.graph.window, &self.tracks, imu);

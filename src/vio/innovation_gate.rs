@@ -13,7 +13,7 @@ use super::landmarks::{Landmark, Observation};
 use super::projection::{observe, Host};
 use super::rig::{EXTRINSIC_DIM, TIME_DIM};
 use super::window::{Window, POSE_DIM};
-use crate::frontend::Tracks;
+use crate::frontend::{Rejected, Tracks};
 use crate::limits::{CAMERAS_MAX, TRACKS};
 use crate::math::block::matrix;
 use nalgebra::{Matrix3, SMatrix, SVector};
@@ -67,8 +67,22 @@ pub struct Passed {
     pub open: bool,
 }
 
-/// Takes out of `tracks` the views of known landmarks that cannot be theirs.
-pub fn gate(graph: &Graph, slot: usize, tracks: &mut Tracks, p: &PoseCovariance, sigma_px: f64) -> Passed {
+/// Adds an id; a point that several cameras see is rejected once.
+pub fn add_once(rejected: &mut Rejected, id: u64) {
+    if !rejected.contains(&id) {
+        let _ = rejected.push(id);
+    }
+}
+
+/// Takes out of `tracks` the views of known landmarks that cannot be theirs, and lists their ids.
+pub fn gate(
+    graph: &Graph,
+    slot: usize,
+    tracks: &mut Tracks,
+    p: &PoseCovariance,
+    sigma_px: f64,
+    rejected: &mut Rejected,
+) -> Passed {
     let Graph { window, landmarks, .. } = graph;
     let mut wrong = [[false; TRACKS]; CAMERAS_MAX];
     let (mut known, mut refused) = (0, 0);
@@ -89,8 +103,11 @@ pub fn gate(graph: &Graph, slot: usize, tracks: &mut Tracks, p: &PoseCovariance,
     }
     for (list, wrong) in tracks.cameras.iter_mut().zip(&wrong) {
         let mut i = 0;
-        list.retain(|_| {
+        list.retain(|track| {
             i += 1;
+            if wrong[i - 1] {
+                add_once(rejected, track.id);
+            }
             !wrong[i - 1]
         });
     }

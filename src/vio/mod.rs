@@ -48,7 +48,7 @@ pub use predictor::Predicted;
 pub use predictor::Predictor;
 
 use crate::config::{BaroConfig, VioConfig};
-use crate::frontend::Tracks;
+use crate::frontend::{Rejected, Tracks};
 use crate::limits::CAMERAS_MAX;
 use estimator::{Estimator, Step, CONNECTED_FEW};
 use glam::DVec3;
@@ -363,6 +363,11 @@ impl Vio {
     #[cfg(feature = "instruments")]
     pub fn reset(&mut self) {
         self.reset_for(Reset::Asked);
+    }
+
+    /// Points of the last frame that contradict the estimate, once.
+    pub fn take_rejected(&mut self) -> Rejected {
+        std::mem::take(&mut self.estimator.rejected)
     }
 
     fn reset_for(&mut self, why: Reset) {

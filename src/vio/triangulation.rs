@@ -1,12 +1,13 @@
 //! Landmarks made of tracks by triangulation, and views that do not fit dropped.
 
 use super::graph::Graph;
+use super::innovation_gate::add_once;
 use super::landmarks::{Landmark, Observation};
 use super::model::Model;
 use super::projection::{host_cam, placed, predicted};
 use super::reprojection::{Point, Transform};
 use super::window::Window;
-use crate::frontend::{Track, Tracks};
+use crate::frontend::{Rejected, Track, Tracks};
 use crate::limits::{CAMERAS_MAX, FRAMES, LANDMARKS};
 use glam::DVec3;
 
@@ -80,14 +81,18 @@ pub fn triangulate(graph: &mut Graph, slot: usize, tracks: &[Tracks], model: &Mo
     (made, full)
 }
 
-/// Drops views further than `px_max` from their prediction; answers how many.
-pub fn drop_outliers(graph: &mut Graph, px_max: f64) -> usize {
+/// Drops views further than `px_max` from their prediction; answers how many. Adds the ids of those of the frame in `slot`
+/// to `rejected`.
+pub fn drop_outliers(graph: &mut Graph, px_max: f64, slot: usize, rejected: &mut Rejected) -> usize {
     let Graph { window, landmarks, .. } = graph;
     let mut dropped = 0;
     landmarks.retain_views(|l, o| {
         let px = predicted(l, &host_cam(l, window), o, window);
         let fits = px.is_some_and(|px| (px - o.px()).length() <= px_max);
         dropped += !fits as usize;
+        if !fits && usize::from(o.slot) == slot {
+            add_once(rejected, l.id);
+        }
         fits
     });
     dropped

@@ -3,7 +3,7 @@
 use crate::inputs::Flight;
 use std::time::Instant;
 use stipple::config::Board;
-use stipple::frontend::{Frontend, Prediction};
+use stipple::frontend::{Frontend, Prediction, Rejected};
 use stipple::output::metrics::{percentile, trajectory_error};
 use stipple::vio::{Predictor, Vio};
 use stipple_drivers::host::thread_cpu;
@@ -37,7 +37,7 @@ pub fn measure(flight: &Flight, board: &Board) -> Result<Figures, Fault> {
     let mut frontend = Frontend::new(&flight.calibration, &board.frontend)?;
     let mut vio = Vio::new(&flight.calibration, &board.vio);
     let mut predictor = Predictor::new(&flight.calibration, &board.vio);
-    let (mut before, mut keyframes) = (None, 0);
+    let (mut before, mut rejected, mut keyframes) = (None, Rejected::default(), 0);
     let n = flight.frames.len();
     let mut trajectory: Vec<TimedPose> = Vec::with_capacity(n);
     let (mut frontend_ms, mut estimator_ms) = (Vec::with_capacity(n), Vec::with_capacity(n));
@@ -54,7 +54,8 @@ pub fn measure(flight: &Flight, board: &Board) -> Result<Figures, Fault> {
         }
         let begun = Instant::now();
         let prediction = Prediction { prev_from_now: predictor.motion_to(frames.t, before.as_ref()) };
-        before = vio.odometry();
+        frontend.reject(&rejected);
+        (before, rejected) = (vio.odometry(), vio.take_rejected());
         let tracks = frontend.track(frames, &prediction);
         let tracked = Instant::now();
         let update = vio.on_tracks(tracks);
