@@ -9,7 +9,7 @@ use crate::limits::CAMERAS_MAX;
 use stipple_drivers::{Nanos, Span};
 
 /// Cameras agree when this share of the points that both should see is seen in both, and disagree below the other. Normal rigs
-/// have 0.75 to 1 in recordings and simulated flights, rigs that lie 0 to 0.02.
+/// have 0.77 to 1 in recordings and simulated flights, and 0.5 with images shifted by some pixels; rigs that lie have 0 to 0.02.
 const AGREE_MIN: f64 = 0.3;
 const DISAGREE_MAX: f64 = 0.12;
 /// They are swapped when this share is found with the images exchanged: 0.7 to 1 of swapped cameras, 0.01 of others.

@@ -50,9 +50,11 @@ impl RigGeometry {
         self.refresh();
     }
 
-    /// Takes the images of two cameras for each other's; the second time as before.
+    /// Takes the images of two cameras for each other's; the second time as before. Masks stay with their images.
     pub fn exchange(&mut self, [a, b]: [usize; 2]) {
         self.cameras.swap(a, b);
+        let masks = self.cameras[a].masks;
+        self.cameras[a].masks = std::mem::replace(&mut self.cameras[b].masks, masks);
         self.body_from_cam.swap(a, b);
         self.refresh();
     }
@@ -123,6 +125,7 @@ mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
     use glam::DQuat;
+    use stipple_drivers::calibration::Mask;
     use stipple_drivers::{Camera, ImuCalibration, ImuCorrection, Lens};
 
     fn rig() -> RigGeometry {
@@ -141,6 +144,17 @@ mod tests {
             correction: ImuCorrection::NONE,
         };
         RigGeometry::new(&Calibration { cameras, imu }, 0.005)
+    }
+
+    #[test]
+    fn exchanged_cameras_keep_the_masks_of_their_images() {
+        let mut rig = rig();
+        rig.cameras[0].masks[0] = Mask { left: 0, top: 0, right: 100, bottom: 100 };
+        rig.exchange([0, 1]);
+        assert!(rig.is_masked(0, [50.0, 50.0]) && !rig.is_masked(1, [50.0, 50.0]));
+        assert!((rig.between(0, 1).p - DVec3::new(0.1, 0.01, 0.0)).length() < 1e-12, "each is where the other was");
+        rig.exchange([0, 1]);
+        assert!(rig.is_masked(0, [50.0, 50.0]) && !rig.is_masked(1, [50.0, 50.0]));
     }
 
     #[test]
