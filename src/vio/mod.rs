@@ -199,8 +199,10 @@ impl Vio {
     pub fn on_aid(&mut self, reading: &AidReading) {
         let Aid::Pressure(pa) = reading.value;
         if let Some(heights) = &mut self.estimator.heights {
+            let window = &self.estimator.graph.window;
+            let oldest = window.order.iter().map(|slot| window.frame(*slot as usize)).find(|frame| frame.is_state);
             match heights.push(reading.t, pa) {
-                Pushed::Taken => {}
+                Pushed::Taken => self.stats.pressures_late += u64::from(oldest.is_some_and(|f| reading.t < f.t)),
                 Pushed::Rejected => self.stats.pressures_rejected += 1,
                 Pushed::Frozen => self.stats.pressures_frozen += 1,
             }

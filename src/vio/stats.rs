@@ -40,10 +40,12 @@ counters! {
     resets_state,
     /// Frames of which a camera saw next to nothing while another did.
     camera_blind,
-    /// Pressures that were no number, of no altitude that is flown, or not newer than the last; and of a barometer that
-    /// repeats itself.
+    /// Pressures that were no number, of no altitude that is flown, or not newer than the last.
     pressures_rejected,
+    /// Pressures of a barometer that repeats itself.
     pressures_frozen,
+    /// Pressures that came when every frame of their time had left the estimate.
+    pressures_late,
     /// Frames with a height; frames whose height could not be; steps that stayed and were taken for a change of the weather.
     heights_used,
     heights_gated,

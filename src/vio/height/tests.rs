@@ -148,8 +148,9 @@ fn barometer_holds_the_height_of_a_climb_and_its_drift_is_told_apart() {
     assert!(with <= 0.3 && sigmas < 3.5, "{without} {with} {sigmas}");
 }
 
-/// Where the cameras hardly tell how far the walls are the estimate's height is off by more than it says. The barometer still
-/// holds it, though its drift is then not told apart as well as is said.
+/// Where the cameras hardly tell how far the walls are, the estimate's height is off by more than it says. The barometer still
+/// holds it, though its drift is then not told apart as well as is said. Of six seeds these are the two whose height by vision
+/// was worst: the ones with something to hold.
 #[test]
 fn barometer_holds_a_climb_that_vision_does_not() {
     let [without, with, sigmas] = climbs(2.0 * WALLS, &[1, 3]);
@@ -202,12 +203,15 @@ fn readings_that_say_nothing_change_nothing_and_are_counted() {
     let constant = odd(|t, _| Some((t, 98_000.0)));
     let late = odd(|t, h| Some((t - 1.0, pressure(h + 30.0 * t))));
     let backwards = odd(|t, h| Some((100.0 - t, pressure(h))));
-    let counts = |f: &Flight| [f.vio.stats.pressures_rejected, f.vio.stats.pressures_frozen, f.vio.stats.heights_used];
+    let counts = |f: &Flight| {
+        let s = &f.vio.stats;
+        [s.pressures_rejected, s.pressures_frozen, s.pressures_late, s.heights_used]
+    };
     for (name, flight, expected) in [
-        ("absent", &absent, [0, 0, 0]),
-        ("not numbers", &not_numbers, [598, 0, 0]),
-        ("late", &late, [0, 0, 0]),
-        ("backwards", &backwards, [597, 0, 0]),
+        ("absent", &absent, [0, 0, 0, 0]),
+        ("not numbers", &not_numbers, [598, 0, 0, 0]),
+        ("late", &late, [0, 0, 575, 0]),
+        ("backwards", &backwards, [597, 0, 0, 0]),
     ] {
         eprintln!("{name}: bent by {:.6} m, {:?}", flight.bends(&none), counts(flight));
         assert_eq!(counts(flight), expected, "{name}");
