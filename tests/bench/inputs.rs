@@ -48,8 +48,8 @@ pub fn quick() -> Vec<Input> {
 }
 
 /// Inputs whose files are in the folder of recordings, and the simulated flights in any case.
-pub fn all(recordings: Option<&Path>) -> Result<Vec<Input>, Fault> {
-    let folder = folder(recordings)?;
+pub fn all(folders: &Folders) -> Result<Vec<Input>, Fault> {
+    let folder = folders.recordings()?;
     let mut inputs: Vec<Input> = NAMED.into_iter().map(named).collect();
     let recording = folder.join(RECORDING);
     if recording.is_dir() {
@@ -76,17 +76,30 @@ pub fn all(recordings: Option<&Path>) -> Result<Vec<Input>, Fault> {
     Ok(inputs)
 }
 
-/// The folder of recordings: the one named, otherwise $STIPPLE_RECORDINGS, otherwise one beside the project.
-pub fn folder(recordings: Option<&Path>) -> Result<PathBuf, Fault> {
-    match recordings {
-        Some(folder) if folder.is_dir() => Ok(folder.to_path_buf()),
-        Some(folder) => Err(Fault::new(
-            FaultKind::NoInput,
-            folder.display().to_string(),
-            "no such folder",
-            "name the folder of recordings, or leave --recordings out",
-        )),
-        None => Ok(std::env::var_os("STIPPLE_RECORDINGS").map_or_else(|| "../shared/data".into(), PathBuf::from)),
+/// Where a bench over recordings reads and writes.
+#[derive(clap::Args)]
+pub struct Folders {
+    /// Folder for the results
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    /// Folder of recordings; otherwise $STIPPLE_RECORDINGS, otherwise ../shared/data
+    #[arg(long, value_name = "FOLDER")]
+    recordings: Option<PathBuf>,
+}
+
+impl Folders {
+    /// The folder of recordings: the one named, otherwise $STIPPLE_RECORDINGS, otherwise one beside the project.
+    pub fn recordings(&self) -> Result<PathBuf, Fault> {
+        match &self.recordings {
+            Some(folder) if folder.is_dir() => Ok(folder.clone()),
+            Some(folder) => Err(Fault::new(
+                FaultKind::NoInput,
+                folder.display().to_string(),
+                "no such folder",
+                "name the folder of recordings, or leave --recordings out",
+            )),
+            None => Ok(std::env::var_os("STIPPLE_RECORDINGS").map_or_else(|| "../shared/data".into(), PathBuf::from)),
+        }
     }
 }
 

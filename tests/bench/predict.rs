@@ -7,12 +7,11 @@
 
 use crate::consistency::{bounds, told, BIASES};
 use crate::flight::{estimate_from_truth, frame_time, from_rest, velocity, BEFORE};
-use crate::inputs::{self, Flight};
+use crate::inputs::{self, Flight, Folders};
 use crate::page::{count, millimetres, number, percent, text, Page, Part, Table};
 use crate::table;
 use crate::world::{room, stream, World, RATE_HZ};
 use nalgebra::{SMatrix, SVector};
-use std::path::PathBuf;
 use std::time::Instant;
 use stipple::config::{FrontendConfig, VioConfig};
 use stipple::frontend::{Frontend, Prediction, Tracks};
@@ -210,22 +209,18 @@ fn claim_table(rows: &[Claim]) -> Table {
 /// Error and covariance of poses predicted ahead of the estimate
 #[derive(clap::Args)]
 pub struct Args {
-    /// Folder for the results
-    #[arg(long, value_name = "DIR")]
-    out: PathBuf,
-    /// Folder of recordings; otherwise $STIPPLE_RECORDINGS, otherwise ../shared/data
-    #[arg(long, value_name = "FOLDER")]
-    recordings: Option<PathBuf>,
+    #[command(flatten)]
+    folders: Folders,
     /// A short flight
     #[arg(long)]
     quick: bool,
 }
 
 pub fn run(args: &Args) -> Result<(), Fault> {
-    let out = OutputDir::create(&args.out)?;
+    let out = OutputDir::create(&args.folders.out)?;
     let (seconds, flights) = if args.quick { (3.0, 2) } else { (SECONDS, 50) };
     let mut rows = measure("aggressive", &inputs::rendered(aggressive(), seconds)?)?;
-    let truth = inputs::folder(args.recordings.as_deref())?.join(inputs::RECORDING);
+    let truth = args.folders.recordings()?.join(inputs::RECORDING);
     let truth = truth.join("mav0/state_groundtruth_estimate0/data.csv");
     if truth.is_file() && !args.quick {
         let scenario = Scenario::from_euroc(&truth, None)?;

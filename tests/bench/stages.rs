@@ -6,12 +6,12 @@
 
 mod window;
 
-use crate::inputs;
+use crate::inputs::{self, Folders};
 use crate::page::{count, number, text, Page, Part, Table};
 use crate::run::default_board;
 use crate::table;
 use std::hint::black_box;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use stipple::config::{FrontendConfig, VioConfig};
@@ -43,12 +43,8 @@ const QUICK_S: f64 = 0.0;
 /// Times of tracker and estimator by stage, and of whole runs; a minute and a half
 #[derive(clap::Args)]
 pub struct Args {
-    /// Folder for the results
-    #[arg(long, value_name = "DIR")]
-    out: PathBuf,
-    /// Folder of recordings; otherwise $STIPPLE_RECORDINGS, otherwise ../shared/data
-    #[arg(long, value_name = "FOLDER")]
-    recordings: Option<PathBuf>,
+    #[command(flatten)]
+    folders: Folders,
     /// The simulated flight at half its size, a few calls each, no whole run
     #[arg(long)]
     quick: bool,
@@ -105,9 +101,9 @@ struct Run {
 }
 
 pub fn run(args: &Args) -> Result<(), Fault> {
-    let out = OutputDir::create(&args.out)?;
+    let out = OutputDir::create(&args.folders.out)?;
     let mut clock = Clock { stage_s: if args.quick { QUICK_S } else { STAGE_S }, timed: vec![] };
-    let recording = inputs::folder(args.recordings.as_deref())?.join(inputs::RECORDING);
+    let recording = args.folders.recordings()?.join(inputs::RECORDING);
     let recording = Some(recording).filter(|path| path.is_dir() && !args.quick);
     for flight in std::iter::once(simulated(args.quick)).chain(recording.as_deref().map(recorded)) {
         let flight = flight?;

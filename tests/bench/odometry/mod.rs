@@ -8,13 +8,12 @@ mod charts;
 mod measure;
 mod settings;
 
-use crate::inputs::{self, Flight, Input};
+use crate::inputs::{self, Flight, Folders, Input};
 use crate::page::{count, millimetres, number, text, Page, Part, Table};
 use crate::table;
 use measure::{measure, Figures};
 use serde_json::json;
 use settings::{curves, Setting, DEFAULT};
-use std::path::PathBuf;
 use std::time::Instant;
 use stipple::output::OutputDir;
 use stipple_drivers::Fault;
@@ -32,12 +31,8 @@ const AS_FAST: f64 = 1.1;
 /// Error against run time of frontend and estimator over flights and settings
 #[derive(clap::Args)]
 pub struct Args {
-    /// Folder for the results
-    #[arg(long, value_name = "DIR")]
-    out: PathBuf,
-    /// Folder of recordings; otherwise $STIPPLE_RECORDINGS, otherwise ../shared/data
-    #[arg(long, value_name = "FOLDER")]
-    recordings: Option<PathBuf>,
+    #[command(flatten)]
+    folders: Folders,
     /// Seconds of each input, 40 at most
     #[arg(long, value_name = "S", value_parser = crate::seconds)]
     seconds: Option<f64>,
@@ -80,11 +75,11 @@ struct Sweep {
 }
 
 pub fn run(args: &Args) -> Result<(), Fault> {
-    let out = OutputDir::create(&args.out)?;
+    let out = OutputDir::create(&args.folders.out)?;
     let (inputs, settings, seconds) = match args.quick {
         true => (inputs::quick(), settings::quick(), args.seconds.unwrap_or(QUICK_SECONDS)),
         false => (
-            inputs::all(args.recordings.as_deref())?,
+            inputs::all(&args.folders)?,
             if args.defaults { settings::default() } else { settings::all() },
             args.seconds.unwrap_or(SECONDS).min(SECONDS_MAX),
         ),

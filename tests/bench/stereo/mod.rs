@@ -15,13 +15,13 @@ mod sets;
 #[cfg(all(test, feature = "opencv"))]
 mod tests;
 
-use crate::inputs;
+use crate::inputs::Folders;
 use crate::run::Source;
 use effect::Effect;
 pub use methods::{Base, Runner, NAMES};
 use score::Score;
 use sets::Set;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use stipple::config::Board;
 use stipple::output::metrics::percentile;
 use stipple::output::panel::Picture;
@@ -44,12 +44,8 @@ const QUICK: [&str; 2] = ["hard_occlusion", "hard_black_eye"];
 pub struct Args {
     /// Recording of which each method makes a map, too
     dataset: Option<PathBuf>,
-    /// Folder for the results
-    #[arg(long, value_name = "DIR")]
-    out: PathBuf,
-    /// Folder of recordings; otherwise $STIPPLE_RECORDINGS, otherwise ../shared/data
-    #[arg(long, value_name = "FOLDER")]
-    recordings: Option<PathBuf>,
+    #[command(flatten)]
+    folders: Folders,
     /// Board file whose [stereo] and [gpu] to use, and of the map the rest; the methods' own defaults without it
     #[arg(long, value_name = "FILE")]
     board: Option<PathBuf>,
@@ -97,10 +93,10 @@ pub fn run(args: &Args) -> Result<(), Fault> {
     let loaded = board.as_deref().map(|path| Board::load(path, set)).transpose()?;
     // A wrong folder is told now, not after the minutes that come before the maps.
     dataset.as_deref().map(|path| Recording::open(path, &OpenOptions::default())).transpose()?;
-    let out = OutputDir::create(&args.out)?;
+    let out = OutputDir::create(&args.folders.out)?;
     let sets = match args.quick {
         true => scenes::hard().into_iter().filter(|s| QUICK.contains(&s.name.as_str())).collect(),
-        false => all_sets(args.recordings.as_deref())?,
+        false => all_sets(&args.folders)?,
     };
     // After each method: whoever ends a run of many minutes early keeps what there is.
     let keep = |bench: &Bench| page::page(bench).write(&out);
@@ -115,8 +111,8 @@ pub fn run(args: &Args) -> Result<(), Fault> {
     page::page(&bench).finish(&out)
 }
 
-fn all_sets(recordings: Option<&Path>) -> Result<Vec<Set>, Fault> {
-    let folder = inputs::folder(recordings)?;
+fn all_sets(folders: &Folders) -> Result<Vec<Set>, Fault> {
+    let folder = folders.recordings()?;
     let mut sets = sets::middlebury(&folder)?;
     if sets.is_empty() {
         eprintln!("no Middlebury pairs in {}", folder.display());
