@@ -22,7 +22,7 @@ pub const LANDMARKS: usize = 1200;
 pub const OBSERVATIONS: usize = CAMERAS_MAX * FRAMES;
 /// Inertial samples between two frames: 1 kHz over half a second.
 pub const IMU_BETWEEN_FRAMES: usize = 512;
-/// Inertial samples that tracker and estimator remember, s: longer than a start or a gap between frames may last.
+/// Seconds of inertial samples that tracker and estimator keep: longer than a start or a gap between frames may last.
 pub const IMU_HISTORY_SECS: f64 = 2.56;
 /// Pyramid levels, the full image included.
 pub const PYRAMID_LEVELS: usize = 4;

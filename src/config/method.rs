@@ -32,11 +32,11 @@ section! {
     VioConfig, "vio.";
     /// Allowance for a data sheet: factor on the gyro noise density of a calibration that does not say `noise_source: measured`
     /// beside it (`stipple calib-noise` prints it); one that does is believed as it stands, factor 1. A data sheet's figure is
-    /// that of a typical unit at rest: it has neither this unit's vibration nor its errors of scale and axes. Chosen of 1, 2 and
-    /// 4 over ten flights of EuRoC's unit and a simulated one.
+    /// that of a typical unit at rest: it has neither this unit's vibration nor its errors of scale and axes. Chosen from 1, 2
+    /// and 4 over ten flights of EuRoC's unit and a simulated one.
     gyro_noise_scale: f64 = 2.0, Bound::Positive;
-    /// The same for the accelerometer, which feels vibration more and whose errors of scale are multiplied by gravity: chosen of 2, 4
-    /// and 8.
+    /// The same for the accelerometer, which feels vibration more and whose errors of scale are multiplied by gravity: chosen from
+    /// 2, 4 and 8.
     accel_noise_scale: f64 = 8.0, Bound::Positive;
     /// Whether the offset between the clocks of cameras and inertial unit is estimated. Set it where they are not triggered
     /// together; 8 ms cost eight times the error. Poses are then at their frames' stamps by the inertial clock; log and report

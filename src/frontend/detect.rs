@@ -12,7 +12,7 @@ pub const BORDER: usize = 19;
 /// Widest cell a board file may ask for, px.
 const CELL_MAX: usize = 200;
 /// A cell whose point was rejected is not looked at for so many frames, 0.8 s at 20 Hz: a new point of what moves there would
-/// be a landmark before it is rejected too. Chosen of 0 to 40 frames on four flights past a person; neighbours differ little.
+/// be a landmark before it is rejected too. Chosen from 0 to 40 frames on four flights past a person; neighbours differ little.
 const REST: u32 = 16;
 /// Neighbouring pixels of the ring that must differ, and the ring, from the top clockwise.
 const ARC: usize = 9;

@@ -36,7 +36,7 @@ const BETWEEN_HALVES: usize = 2;
 
 /// A pose and what it means for the map.
 pub struct Tracked {
-    /// Pose at the exposure, as `Vio::window` has it.
+    /// Newest estimate of the pose at the exposure.
     pub world_from_body: Pose,
     pub keyframe: bool,
     /// Newest poses of all keyframes still being optimised; filled beside a keyframe.

@@ -121,8 +121,9 @@ pub struct Solver {
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Outcome {
     pub iterations: u32,
-    /// Steps that were not finite, and steps that were taken back because they made the cost larger.
+    /// Steps that were not finite.
     pub failures: u32,
+    /// Steps that were taken back because they made the cost larger.
     pub rejected: u32,
 }
 
