@@ -8,13 +8,14 @@
 use super::factors::inertial_residual_at;
 use super::graph::Graph;
 use super::height::{Attached, Heights};
-use super::inertial::{Covariance, InertialWeight};
-use super::initialization::Start;
+use super::inertial::{body_velocity_covariance, Covariance, InertialWeight, Motion, MotionSigma};
+use super::initialization::{Start, GAUGE_SIGMA, RESECTION_MIN};
 use super::innovation_gate::{gate, predicted_covariance, Passed};
 use super::marginalization::Marginalizer;
 use super::model::Model;
 use super::monitor::Evidence;
-use super::rig::RigState;
+use super::recovery::deviations;
+use super::rig::{RigParameters, RigState};
 use super::samples::ImuRing;
 use super::solver::{Outcome, Solver};
 use super::triangulation::{drop_outliers, triangulate};
@@ -23,6 +24,7 @@ use super::zero_velocity;
 use crate::config::VioConfig;
 use crate::frontend::{Rejected, Tracks};
 use crate::limits::{FRAMES, RIG_DIM};
+use glam::DVec3;
 use stipple_drivers::{Calibration, Nanos};
 
 /// A keyframe is declared at once when fewer landmarks than this are in view.
@@ -33,6 +35,13 @@ const MOVING: f64 = 0.3;
 const SPEED_MAX: f64 = 100.0;
 const ACCEL_BIAS_MAX: f64 = 5.0;
 const GYRO_BIAS_MAX: f64 = 1.0;
+/// An alignment: what the prior says of tilt, rad, and velocity, m/s; times as far as usual a view may be off after each
+/// optimization; the relative deviation of the speed, and so of the scale, and the squared deviations a degree of freedom that are accepted.
+const TILT_UNKNOWN: f64 = 1.0;
+const V_UNKNOWN: f64 = 30.0;
+const ALIGNED_OUTLIERS: [f64; 3] = [5.0, 1.0, 1.0];
+const SPEED_KNOWN: f64 = 0.1;
+const MISFIT_MAX: f64 = 1.5;
 /// Deviations of the rig by which the bound of outliers is widened.
 const RIG_SIGMAS: f64 = 3.0;
 
@@ -120,24 +129,107 @@ impl Estimator {
 
     /// First frame of an empty window.
     pub fn start(&mut self, tracks: &Tracks, start: &Start, imu: &ImuRing) -> Step {
-        let Start { motion, sigma } = start;
-        let mut frame = Frame::new(tracks.t, *motion);
-        frame.rate = imu.rate_at(tracks.t);
-        frame.hold_twist();
-        frame.fix_linearization_point();
-        let slot = self.graph.window.push(frame).expect("an empty window has room");
-        self.graph.window.rig.fix_linearization_point();
-        self.rig_deviations = self.graph.window.rig.sigmas(&self.model.config);
-        self.graph.prior.start(slot, motion, sigma, &self.graph.window, &self.rig_deviations);
-        self.tracks[slot].clone_from(tracks);
+        let slot = self.begin(tracks, &start.motion, imu);
+        self.believe(slot, &start.sigma, [start.motion.bg, start.motion.ba]);
         let landmarks_full = self.make_keyframe(slot);
         Step {
             keyframe: true,
             connected: self.graph.landmarks.pool.len(),
             landmarks_full,
-            covariance: Some(sigma.covariance(motion)),
+            covariance: Some(start.sigma.covariance(&start.motion)),
             ..Step::default()
         }
+    }
+
+    /// Puts a frame into an empty window; answers its slot.
+    fn begin(&mut self, tracks: &Tracks, motion: &Motion, imu: &ImuRing) -> usize {
+        let mut frame = Frame::new(tracks.t, *motion);
+        frame.rate = imu.rate_at(tracks.t);
+        frame.hold_twist();
+        let slot = self.graph.window.push(frame).expect("an empty window has room");
+        self.tracks[slot].clone_from(tracks);
+        slot
+    }
+
+    /// Begins the prior with what is known of the only frame it is about, and of the rig.
+    fn believe(&mut self, slot: usize, sigma: &MotionSigma, biases: [DVec3; 2]) {
+        let Graph { window, prior, .. } = &mut self.graph;
+        window.frame_mut(slot).fix_linearization_point();
+        window.rig.fix_linearization_point();
+        self.rig_deviations = window.rig.sigmas(&self.model.config);
+        prior.start(slot, &window.frame(slot).now, sigma, biases, window, &self.rig_deviations);
+    }
+
+    /// All frames of an empty window at once, the first of them moving as `first` says. The prior knows next to
+    /// nothing: what is known afterwards is what the views and the inertial samples say, each once. Answers the start
+    /// that the newest would be, too. `None` where views and samples disagree or do not tell the speed; then the
+    /// window is empty again.
+    pub fn start_in_motion(&mut self, frames: &[Tracks], first: &Motion, imu: &ImuRing) -> Option<(Start, Step)> {
+        let rig = self.graph.window.rig.now;
+        let mut step = self.fill(frames, first, imu);
+        if !self.knows_speed(&step) {
+            self.clear();
+            self.forget_rig(rig);
+            return None;
+        }
+        let motion = self.newest()?.now;
+        let sigma = deviations(&motion, step.covariance.as_ref()?);
+        let sigma = MotionSigma { p: GAUGE_SIGMA, yaw: GAUGE_SIGMA, ..sigma };
+        step.columns_lost = (0..frames.len()).map(|_| self.marginalize()).sum();
+        Some((Start { motion, sigma }, step))
+    }
+
+    /// Takes the rig back to what it was, for a prior that begins anew.
+    fn forget_rig(&mut self, before: RigParameters) {
+        self.graph.window.rig.now = before;
+        self.graph.window.rig.release();
+    }
+
+    /// Fills an empty window with the frames of an alignment and optimizes it.
+    fn fill(&mut self, frames: &[Tracks], first: &Motion, imu: &ImuRing) -> Step {
+        let rig = self.graph.window.rig.now;
+        let oldest = self.begin(&frames[0], first, imu);
+        let mut slot = oldest;
+        for tracks in &frames[1..] {
+            let frame = self.propagated(slot, tracks.t, imu);
+            slot = self.graph.window.push(frame).expect("room for the frames of an alignment");
+            self.tracks[slot].clone_from(tracks);
+        }
+        let mut step = Step { keyframe: true, ..Step::default() };
+        let px_max = self.outlier_px(slot);
+        self.graph.window.hold_twists();
+        for i in (0..frames.len()).rev() {
+            let slot = self.graph.window.order[i] as usize;
+            let (made, full) =
+                triangulate(&mut self.graph, slot, &self.tracks, &self.model, px_max * ALIGNED_OUTLIERS[0]);
+            let frame = self.graph.window.frame_mut(slot);
+            (frame.keyframe, frame.hosted) = (true, made);
+            step.landmarks_full += full;
+        }
+        let VioConfig { gyro_bias_sigma: bg, accel_bias_sigma: ba, .. } = self.model.config;
+        let sigma = MotionSigma { p: GAUGE_SIGMA, tilt: TILT_UNKNOWN, yaw: GAUGE_SIGMA, v: V_UNKNOWN, bg, ba };
+        for factor in ALIGNED_OUTLIERS {
+            // Linearized anew where the last optimization led, the biases still expected to be none.
+            self.graph.window.frame_mut(oldest).linearization_point = None;
+            self.forget_rig(rig);
+            self.believe(oldest, &sigma, [DVec3::ZERO; 2]);
+            step.outcome = self.solver.optimize(&mut self.graph, &self.model);
+            step.outliers += drop_outliers(&mut self.graph, px_max * factor, slot, &mut self.rejected);
+        }
+        step.covariance = self.solver.newest_covariance();
+        step.connected = self.graph.landmarks.pool.iter().filter(|l| l.views_in(slot) > 0).count();
+        (self.keyframe_at, self.moved) = (frames[frames.len() - 1].t, true);
+        step
+    }
+
+    /// Whether the views of an alignment agree with the samples and tell the speed.
+    fn knows_speed(&self, step: &Step) -> bool {
+        let (Some(frame), Some(covariance)) = (self.newest(), &step.covariance) else { return false };
+        let (speed, sigma) = (frame.now.v.length(), body_velocity_covariance(covariance, &frame.now).trace().sqrt());
+        let views: usize = self.graph.landmarks.pool.iter().map(|l| l.observations.len()).sum();
+        let unknown = 3 * self.graph.landmarks.pool.len() + 15;
+        let misfit = 2.0 * self.graph.cost(&self.model) / (2 * views).saturating_sub(unknown).max(1) as f64;
+        self.is_sane() && sigma < SPEED_KNOWN * speed && misfit < MISFIT_MAX && step.connected >= RESECTION_MIN
     }
 
     /// One more frame of a window that has some. `covariance` is that of the newest state so far, which the gate

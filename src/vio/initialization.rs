@@ -5,9 +5,11 @@
 //! preintegrated increments between these poses are then linear in the first velocity and gravity,
 //! and, through rotation, in the gyro bias (Martinelli, IJCV 2014). The poses do not drift, so half
 //! a second fixes gravity to well under a degree even while shaken by hand. Points whose stereo parallax
-//! is noise have no depth and give no pose: where there are only such, gravity is the mean specific
-//! force, the velocity is unknown and said to be, and the window must find it.
+//! is noise have no depth and give no pose: where there are only such, as with one camera, velocity and gravity come of
+//! directions alone (`alignment.rs`). Where the motion does not tell how fast it is, gravity is after some time the mean
+//! specific force, the velocity is unknown and said to be, and the window must find it.
 
+use super::alignment::Alignment;
 use super::inertial::{Motion, MotionSigma};
 use super::model::Model;
 use super::preintegration::Increment;
@@ -94,6 +96,7 @@ pub struct Initializer {
     frames: Vec<ResectedFrame>,
     resections_failed: u32,
     alignments_failed: u32,
+    alignment: Alignment,
 }
 
 impl Initializer {
@@ -103,6 +106,7 @@ impl Initializer {
             frames: Vec::with_capacity(ALIGN_FRAMES_MAX),
             resections_failed: 0,
             alignments_failed: 0,
+            alignment: Alignment::new(),
         }
     }
 
@@ -111,11 +115,13 @@ impl Initializer {
         self.reference.clear();
         self.frames.clear();
         (self.resections_failed, self.alignments_failed) = (0, 0);
+        self.alignment.clear();
     }
 
     /// Takes what the cameras saw at one instant, inertial samples up to it known; answers the state of that instant
     /// once a start is found.
     pub fn add(&mut self, tracks: &Tracks, imu: &ImuRing, model: &Model) -> Option<Start> {
+        self.alignment.add(tracks);
         let Some(last) = self.frames.last().copied() else {
             self.refer_to(tracks, model);
             return None;
@@ -144,7 +150,21 @@ impl Initializer {
         self.refer_to(tracks, model);
         let exhausted =
             self.resections_failed >= RESECTIONS_FAILED_MAX || self.alignments_failed >= ALIGNMENTS_FAILED_MAX;
+        let exhausted = exhausted && (self.has_distances() || self.alignment.is_overdue(tracks.t));
         exhausted.then(|| from_mean_force(tracks.t, imu, model))?
+    }
+
+    /// Where stereo measures no distances: the newest frames, oldest first, and the motion of the first of them.
+    pub fn align<'a>(&'a mut self, t: Nanos, imu: &ImuRing, model: &Model) -> Option<(&'a [Tracks], Motion)> {
+        if self.has_distances() {
+            return None;
+        }
+        self.alignment.solve(t, imu, model)
+    }
+
+    /// Whether stereo measures as many distances as a resection needs.
+    fn has_distances(&self) -> bool {
+        self.reference.iter().filter(|p| p.point.is_some()).count() >= RESECTION_MIN
     }
 
     /// Relative deviation of all distances together.

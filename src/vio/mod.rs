@@ -14,6 +14,7 @@
 //! Until motion and gravity are known tracks give no odometry. The same input gives
 //! bit-identical output; `hash` compares keyframe poses. Nothing is allocated after `new`.
 
+mod alignment;
 mod estimator;
 mod factors;
 mod graph;
@@ -284,13 +285,27 @@ impl Vio {
             return None;
         }
         let model = &self.estimator.model;
-        let start = self.initializer.add(tracks, &self.imu, model)?;
-        let Some(start) = self.recovery.resume(&start, tracks.t, &self.imu, &model.noise) else {
+        let (start, window) = match self.initializer.add(tracks, &self.imu, model) {
+            Some(start) => (start, None),
+            None => {
+                let (frames, first) = self.initializer.align(tracks.t, &self.imu, model)?;
+                let (start, step) = self.estimator.start_in_motion(frames, &first, &self.imu)?;
+                (start, Some(step))
+            }
+        };
+        let is_first = self.recovery.is_first();
+        let resumed = self.recovery.resume(&start, tracks.t, &self.imu, &self.estimator.model.noise);
+        let window = window.filter(|_| is_first);
+        if window.is_none() {
+            self.estimator.clear();
+        }
+        let Some(start) = resumed else {
             self.initializer.clear();
             return None;
         };
         self.epoch += u32::from(self.recovery.jumped());
-        let step = self.estimator.start(tracks, &start, &self.imu);
+        // A window that was aligned lies in a world of its own; what resumes in an older one begins with its newest state.
+        let step = window.unwrap_or_else(|| self.estimator.start(tracks, &start, &self.imu));
         self.take(&step);
         Some(step)
     }
@@ -487,6 +502,8 @@ fn fnv(hash: u64, word: u64) -> u64 {
     word.to_le_bytes().iter().fold(hash, |h, b| (h ^ *b as u64).wrapping_mul(0x0000_0100_0000_01b3))
 }
 
+#[cfg(test)]
+mod start_tests;
 #[cfg(test)]
 mod tests;
 #[cfg(test)]

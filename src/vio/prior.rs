@@ -12,6 +12,7 @@ use crate::limits::{FRAMES, RIG_DIM, WINDOW_DIM};
 use crate::math::dense::{add_gram, Columns, System};
 use crate::math::qr::Rows;
 use crate::mem::List;
+use glam::DVec3;
 
 /// Variables that a run of columns of the prior belongs to; frames by slot.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -82,12 +83,14 @@ impl Prior {
     }
 
     /// Starts with one state and the rig, whose linearization points are to be fixed, and their standard deviations,
-    /// the rig's in the order of its columns.
+    /// the rig's in the order of its columns. `biases`: what is expected of gyro and accelerometer, where that is not what
+    /// the state has.
     pub fn start(
         &mut self,
         slot: usize,
         motion: &Motion,
         sigma: &MotionSigma,
+        biases: [DVec3; 2],
         window: &Window,
         rig_sigmas: &[f64; RIG_DIM],
     ) {
@@ -99,18 +102,21 @@ impl Prior {
         }
         self.rows.clear(15 + rig.dim() + usize::from(window.has_heights) + 1);
         let r = motion.pose.rotation();
-        let mut diagonal = |i: usize, s: f64| self.rows.push()[i] = 1.0 / s;
+        let mut diagonal = |i: usize, s: f64, off: f64| {
+            let row = self.rows.push();
+            (row[i], row[row.len() - 1]) = (1.0 / s, off / s);
+        };
         for i in 0..3 {
-            diagonal(i, sigma.p);
-            diagonal(6 + i, sigma.v);
-            diagonal(9 + i, sigma.bg);
-            diagonal(12 + i, sigma.ba);
+            diagonal(i, sigma.p, 0.0);
+            diagonal(6 + i, sigma.v, 0.0);
+            diagonal(9 + i, sigma.bg, (motion.bg - biases[0])[i]);
+            diagonal(12 + i, sigma.ba, (motion.ba - biases[1])[i]);
         }
         for (i, s) in rig_sigmas[..rig.dim()].iter().enumerate() {
-            diagonal(15 + i, *s);
+            diagonal(15 + i, *s, 0.0);
         }
         if window.has_heights {
-            diagonal(15 + rig.dim(), height::BIAS_UNKNOWN);
+            diagonal(15 + rig.dim(), height::BIAS_UNKNOWN, 0.0);
         }
         for (axis, s) in [sigma.tilt, sigma.tilt, sigma.yaw].into_iter().enumerate() {
             let row = self.rows.push();

@@ -101,6 +101,11 @@ impl Recovery {
         })
     }
 
+    /// Whether there is nothing yet that a restart would resume from.
+    pub fn is_first(&self) -> bool {
+        self.trusted().is_none()
+    }
+
     /// Whether the last restart was not where dead reckoning had led.
     pub fn jumped(&self) -> bool {
         self.jumped
@@ -223,6 +228,12 @@ pub struct DeadReckoning {
     pub t: Nanos,
     pub motion: Motion,
     pub covariance: Mat15,
+}
+
+/// Standard deviations of a motion, each along the axis on which it is largest.
+pub fn deviations(motion: &Motion, covariance: &Covariance) -> MotionSigma {
+    let covariance = Mat15::from_fn(|i, j| covariance[i][j]);
+    DeadReckoning { t: Nanos(0), motion: *motion, covariance }.sigmas()
 }
 
 /// Derivative of the motion after an increment to the motion before it.

@@ -62,7 +62,7 @@ fn energies(frames: usize, config: &VioConfig, readout: Span) -> ([f64; 4], f64)
     let motion = window.frame(first).linearization_point.expect("the prior is about the first state");
     let sigma = MotionSigma { p: 1e9, yaw: 1e9, tilt: 0.05, v: 1e9, bg: 0.02, ba: 0.3 };
     *rig_deviations = window.rig.sigmas(config);
-    prior.start(first, &motion, &sigma, window, rig_deviations);
+    prior.start(first, &motion, &sigma, [motion.bg, motion.ba], window, rig_deviations);
     run(&mut vio, 12..frames, &mut world);
     let estimator = &vio.estimator;
     assert!(vio.stats.resets == 0 && estimator.graph.window.keyframe_poses().count() > 3);

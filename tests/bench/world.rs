@@ -81,6 +81,12 @@ impl Path {
         );
         Pose::new(q, p)
     }
+
+    /// Velocity at `t`, m/s.
+    pub fn velocity(&self, t: f64) -> DVec3 {
+        const H: f64 = 1e-5;
+        (self.pose(t + H).p - self.pose(t - H).p) / (2.0 * H)
+    }
 }
 
 /// What a perfect inertial sensor on the path `pose` reads at `t`.
