@@ -56,12 +56,7 @@ pub fn all(folders: &Folders) -> Result<Vec<Input>, Fault> {
         let about = "recorded cameras and inertial unit".into();
         inputs.push(Input { name: "MH_01_easy".into(), about, source: Source::Recording(recording) });
     }
-    for (name, start_s) in RECORDED {
-        let files = folder.join(RECORDED_FOLDER).join(name);
-        let (truth, imu) = (files.join("state_groundtruth_estimate0.csv"), files.join("imu0.csv"));
-        if !(truth.is_file() && imu.is_file()) {
-            continue;
-        }
+    for (name, start_s, [truth, imu]) in recorded(&folder) {
         for (unit, imu) in [("simulated", None), ("real", Some(imu))] {
             inputs.push(Input {
                 name: format!("{name} {unit} IMU"),
@@ -74,6 +69,15 @@ pub fn all(folders: &Folders) -> Result<Vec<Input>, Fault> {
         eprintln!("no recordings in {}: simulated flights only", folder.display());
     }
     Ok(inputs)
+}
+
+/// Recorded flights: name, where to begin, s, and tables of poses and of inertial samples; those whose files are there.
+pub fn recorded(folder: &Path) -> impl Iterator<Item = (&'static str, f64, [PathBuf; 2])> + '_ {
+    let files = |(name, start_s)| {
+        let flight = folder.join(RECORDED_FOLDER).join(name);
+        (name, start_s, ["state_groundtruth_estimate0.csv", "imu0.csv"].map(|file| flight.join(file)))
+    };
+    RECORDED.into_iter().map(files).filter(|(_, _, tables)| tables.iter().all(|t| t.is_file()))
 }
 
 /// Where a bench over recordings reads and writes.

@@ -1,6 +1,8 @@
 //! `stipple-bench predict`: how wrong a pose is that inertial samples carry beyond the newest estimate, as whoever publishes at
 //! the inertial unit's rate gives it out, and whether its covariance says so.
 //!
+//! Before that, how far the inertial samples lead from a recorded path: what of an error is the path's own.
+//!
 //! Error: of the motion from the frame's instant to so many milliseconds later, over the frames of a flight; with the samples
 //! up to then, and with those up to the frame alone, the newest held. Consistency: as of `stipple-bench consistency`, of
 //! position, rotation and velocity that are predicted.
@@ -17,8 +19,8 @@ use stipple::config::{FrontendConfig, VioConfig};
 use stipple::frontend::{Frontend, Prediction, Tracks};
 use stipple::output::metrics::percentile;
 use stipple::output::OutputDir;
-use stipple::vio::{Odometry, Predicted, Predictor, Vio};
-use stipple_drivers::sim::Scenario;
+use stipple::vio::{Odometry, Predicted, Predictor, Update, Vio};
+use stipple_drivers::sim::{Scenario, Sim, State};
 use stipple_drivers::types::pose_at;
 use stipple_drivers::{Fault, ImuSample, Nanos, Pose, Span};
 
@@ -27,6 +29,8 @@ const FRAMES: usize = 160;
 /// Gap in the truth that is interpolated across.
 const HOLE: Span = Span(20_000_000);
 const SECONDS: f64 = 12.0;
+/// How long samples are followed from the states of a recorded path, and how often, s.
+const FOLLOWED: f64 = 1.0;
 
 /// Errors at one distance ahead, m and degrees: root mean square, and at the 99th percentile.
 #[derive(Clone, Copy, Debug, Default)]
@@ -183,6 +187,50 @@ pub fn claims(flights: u64) -> Vec<Claim> {
     AHEAD_MS.iter().zip(&sums).map(claim).collect()
 }
 
+/// How far inertial samples lead from a path in a second, from the path's own states and biases: root mean squares.
+pub struct Apart {
+    pub flight: &'static str,
+    pub unit: &'static str,
+    pub times: usize,
+    /// m, m/s and degrees.
+    pub p: f64,
+    pub v: f64,
+    pub turn: f64,
+}
+
+fn apart(flight: &'static str, unit: &'static str, scenario: &Scenario) -> Result<Apart, Fault> {
+    let sim = Sim::new(scenario)?;
+    let mut predictor = Predictor::new(sim.calibration(), &VioConfig::default());
+    let (mut samples, mut fed, mut sums, mut times) = (sim.imu().iter(), Nanos::MIN, [0.0; 3], 0);
+    let frames_between = (FOLLOWED * scenario.rate_hz) as usize;
+    for i in (0..sim.frame_count().saturating_sub(frames_between)).step_by(frames_between) {
+        let [t, then] = [sim.stamp(i), sim.stamp(i + frames_between)];
+        let (from, to) = (sim.truth_at(t), sim.truth_at(then));
+        let State { pose: world_from_body, v_world, gyro_bias, accel_bias } = from;
+        let odometry = Some(Odometry { t, world_from_body, v_world, gyro_bias, accel_bias });
+        predictor.on_update(&Update { odometry, ..Update::default() });
+        feed(&mut samples, then, &mut fed, |s| predictor.on_imu(*s));
+        let Some(Predicted { odometry: o, .. }) = predictor.state_at(then) else { continue };
+        let turn = o.world_from_body.q.angle_between(to.pose.q).to_degrees();
+        let errors = [o.world_from_body.p.distance(to.pose.p), o.v_world.distance(to.v_world), turn];
+        sums.iter_mut().zip(errors).for_each(|(sum, e)| *sum += e * e);
+        times += 1;
+    }
+    let [p, v, turn] = sums.map(|sum: f64| (sum / times.max(1) as f64).sqrt());
+    Ok(Apart { flight, unit, times, p, v, turn })
+}
+
+fn apart_table(rows: &[Apart]) -> Table {
+    table!("apart", "Inertial unit and recorded path, after a second", rows, |r| r.unit == "recorded", [
+        text("flight") => r.flight,
+        text("unit") => r.unit,
+        count("times") => r.times,
+        number("rotation rms", "deg", 3) => r.turn,
+        number("velocity rms", "m/s", 4) => r.v,
+        millimetres("position rms", 2) => r.p,
+    ])
+}
+
 fn ahead_table(rows: &[Ahead]) -> Table {
     table!("ahead", "Ahead of the estimate", rows, |r| r.ms == 20, [
         text("flight") => r.flight.as_str(),
@@ -226,16 +274,26 @@ pub fn run(args: &Args) -> Result<(), Fault> {
         let scenario = Scenario::from_euroc(&truth, None)?;
         rows.extend(measure("path of MH_01", &inputs::rendered(scenario, seconds)?)?);
     }
+    let mut path = vec![];
+    for (name, _, [poses, imu]) in inputs::recorded(&args.folders.recordings()?).filter(|_| !args.quick) {
+        path.push(apart(name, "simulated", &Scenario::from_euroc(&poses, None)?)?);
+        path.push(apart(name, "recorded", &Scenario::from_euroc(&poses, Some(&imu))?)?);
+    }
     let claims = claims(flights);
     let (low, high) = bounds(9.0, flights as usize);
-    let (ahead, claimed) = (ahead_table(&rows), claim_table(&claims));
-    println!("{}\n\n{}\n\n95 % of means over {flights} flights: {low:.2} to {high:.2}", ahead.text(), claimed.text());
+    let (path, ahead, claimed) = (apart_table(&path), ahead_table(&rows), claim_table(&claims));
+    println!(
+        "{}\n\n{}\n\n{}\n\n95 % of means over {flights} flights: {low:.2} to {high:.2}",
+        path.text(),
+        ahead.text(),
+        claimed.text()
+    );
     let page = Page {
         name: "predict",
         title: "Odometry: ahead of the estimate",
         what: format!("poses carried by inertial samples; {flights} seeded flights for the covariance"),
         facts: vec![],
-        parts: vec![Part::Table(ahead), Part::Table(claimed)],
+        parts: vec![Part::Table(path), Part::Table(ahead), Part::Table(claimed)],
     };
     page.write(&out)
 }
