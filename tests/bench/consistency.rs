@@ -34,6 +34,15 @@ pub const BIASES: (f64, f64) = (0.02, 0.05);
 const SECOND: usize = 20;
 /// Upper ends of the bins of quality.
 const BINS: [u8; 9] = [2, 10, 20, 35, 50, 65, 75, 85, 100];
+/// Error of the velocity that earns a quality of 50, m/s: that of the formula of `quality`.
+const HALF: f64 = 0.05;
+
+/// Whether a quality claims no more than an error of the velocity earns, m/s, or at most one bin above it. What is more
+/// modest agrees: landmarks may be few, and doubt says more than the error.
+pub fn agrees(quality: u8, velocity_error: f64) -> bool {
+    let bin = |quality: u8| BINS.partition_point(|to| *to < quality);
+    bin(quality) <= bin((100.0 / (1.0 + velocity_error / HALF)).round() as u8) + 1
+}
 
 /// The world's own noise of views and biases.
 pub fn told(c: &mut VioConfig) {
@@ -253,7 +262,7 @@ fn page([told, sheet, defaults]: [&Consistency; 3], bins: &[Bin]) -> Page {
     };
     // What the formula of `quality` claims, in full view of enough landmarks.
     let claimed: Vec<(f64, f64)> =
-        (1..100).map(|q| (f64::from(q), (0.05 * (100.0 / f64::from(q) - 1.0)).log10())).collect();
+        (1..100).map(|q| (f64::from(q), (HALF * (100.0 / f64::from(q) - 1.0)).log10())).collect();
     let chart = |title, y, mean, high| {
         let series = vec![
             Series::dots("mean", 1, mean),

@@ -177,7 +177,7 @@ fn lost(plan: fn() -> Plan, long: fn() -> Plan) -> Vec<Case> {
         case("left camera dead from the start", Plan { spoil: |_, t| t.cameras[0].clear(), pose: from_rest, ..plan() }).says(Health::ONE_CAMERA_BLIND).expect(Survived, 0.03, 0.0),
         case("left camera dead, 100 frames dropped", Plan { frame: |i| !(AT..AT + 100).contains(&i), spoil: |i, t| if i >= AT { t.cameras[0].clear() }, frames: 300, ..plan() }).fault(AT, AT + 100).says(Health::FRAME_GAP_RESET).expect(Reset, 0.03, 0.4),
         case("dark 1 s", Plan { spoil: |i, t| if (AT..AT + 20).contains(&i) { thin(t, 0) }, ..plan() }).fault(AT, AT + 20).says(Health::NO_TRACKS | Health::INERTIA_ALONE),
-        case("dark 4 s", Plan { spoil: |i, t| if (AT..AT + 80).contains(&i) { thin(t, 0) }, ..long() }).fault(AT, AT + 80).says(Health::NO_TRACKS | Health::UNSEEN_RESET).expect(Reset, 0.008, 0.3),
+        case("dark 4 s", Plan { spoil: |i, t| if (AT..AT + 80).contains(&i) { thin(t, 0) }, frames: 260, ..plan() }).fault(AT, AT + 80).says(Health::NO_TRACKS | Health::UNSEEN_RESET).expect(Reset, 0.008, 0.3),
     ]
 }
 
@@ -204,7 +204,7 @@ fn seeing(plan: fn() -> Plan, long: fn() -> Plan) -> Vec<Case> {
         case("low texture: 10 tracks", Plan { spoil: |i, t| if i >= AT { thin(t, 1) }, ..plan() }).fault(AT, EVER).says(Health::FEW_LANDMARKS).expect(Survived, 0.008, 0.008),
         case("tracks scattered 1 s", Plan { spoil: |i, t| if (AT..AT + 20).contains(&i) { scatter(i, t) }, ..plan() }).fault(AT, AT + 20).says(Health::VISION_DISAGREES).expect(Survived, 0.01, 0.03),
         // It may start again while tracks still lie, and is then off by a velocity it says it does not know.
-        case("tracks scattered 4 s", Plan { spoil: |i, t| if (AT..AT + 80).contains(&i) { scatter(i, t) }, ..long() }).fault(AT, AT + 80).says(Health::VISION_DISAGREES | Health::UNSEEN_RESET).expect(Reset, 0.1, SAID),
+        case("tracks scattered 4 s", Plan { spoil: |i, t| if (AT..AT + 80).contains(&i) { scatter(i, t) }, frames: 260, ..plan() }).fault(AT, AT + 80).says(Health::VISION_DISAGREES | Health::UNSEEN_RESET).expect(Reset, 0.1, SAID),
         case("tracks scattered for good", Plan { spoil: |i, t| if i >= AT { scatter(0, t) }, ..long() }).fault(AT, EVER).says(Health::VISION_DISAGREES | Health::UNSEEN_RESET).expect(Reset, SAID, 0.2),
     ]
 }

@@ -11,10 +11,12 @@ mod rendered;
 #[cfg(test)]
 mod tests;
 
+use crate::consistency::agrees;
 use crate::flight::{record, Plan, Record};
 use crate::missed;
 use crate::page::{count, millimetres, number, text, Page, Part, Table};
 use crate::table;
+use crate::world::FRAME_SECS;
 use std::path::PathBuf;
 use stipple::output::metrics::trajectory_error;
 use stipple::output::OutputDir;
@@ -34,6 +36,10 @@ const FOLLOWED_FRAMES: usize = 3;
 const UNANNOUNCED_MAX: f64 = 0.1;
 /// Distance in its covariance that one restart in four hundred exceeds: χ² of three dimensions, 99.73 %.
 const THREE_SIGMA: f64 = 3.76;
+/// After a reset the quality agrees with the error of the velocity within this, s, and stays so: until then a controller flies
+/// by a claim that nobody checked. The error is its root mean square over a quarter of a second to either side, ns.
+const AGREES_WITHIN_S: f64 = 3.0;
+const EITHER_SIDE: i64 = 250_000_000;
 /// Frames into a fault that lasts for which the jump is taken.
 const JUMP_FRAMES: usize = 20;
 
@@ -105,6 +111,8 @@ pub struct Row {
     pub unannounced: Option<f64>,
     /// Distance of the restart's position from the truth in its covariance.
     pub restart_sigmas: Option<f64>,
+    /// Time after the first pose that follows a reset until the quality agrees with the error of the velocity, s.
+    pub agrees_after: Option<f64>,
     pub stats: Stats,
     /// Bits set once it had started.
     pub health: Health,
@@ -139,6 +147,9 @@ impl Row {
         if let Some(sigmas) = self.restart_sigmas.filter(|s| *s > THREE_SIGMA) {
             return Some(format!("{name}: starts again {sigmas:.1} sigma from the truth"));
         }
+        if let Some(s) = self.agrees_after.filter(|s| *s > AGREES_WITHIN_S) {
+            return Some(format!("{name}: its quality claims too much until {s:.2} s after a restart"));
+        }
         let detected = self.expect == Verdict::Detected;
         let far = over(self.before, self.limits.before)
             || !detected && (over(self.after, self.limits.after) || over(self.jump, self.limits.jump));
@@ -155,6 +166,7 @@ impl Row {
             jump: max(self.jump, other.jump),
             unannounced: max(self.unannounced, other.unannounced),
             restart_sigmas: max(self.restart_sigmas, other.restart_sigmas),
+            agrees_after: max(self.agrees_after, other.agrees_after),
             // Bits that every flight showed.
             health: Health(self.health.0 & other.health.0),
             quality: self.quality.min(other.quality),
@@ -204,6 +216,28 @@ fn unannounced(records: &[Record], from: usize) -> f64 {
     most
 }
 
+/// Time from the first pose that follows a reset until the quality agrees with the error of the velocity and stays so until
+/// the next reset, s; the longest of a flight. `None` without such a pose, infinite where the flight ends in disagreement.
+fn agrees_after(records: &[Record]) -> Option<f64> {
+    let ends = records.last()?.frame;
+    let lives = records.chunk_by(|a, b| a.resets == b.resets).filter(|life| life[0].resets > 0);
+    let settled = lives.filter_map(|life| {
+        let poses: Vec<_> = life.iter().filter_map(|r| Some((r, r.velocity_error?))).collect();
+        let (first, _) = poses.first()?;
+        let rms = |r: &Record| {
+            let near = poses.iter().filter(|(other, _)| (other.truth.t - r.truth.t).0.abs() <= EITHER_SIDE);
+            let (sum, n) = near.fold((0.0, 0.0), |(sum, n), (_, e)| (sum + e * e, n + 1.0));
+            (sum / f64::max(n, 1.0)).sqrt()
+        };
+        let last = poses.iter().rfind(|(r, _)| !agrees(r.quality, rms(r)));
+        Some(last.map_or(0.0, |(r, _)| match r.frame {
+            frame if frame == ends => f64::INFINITY,
+            frame => (frame + 1 - first.frame) as f64 * FRAME_SECS,
+        }))
+    });
+    settled.reduce(f64::max)
+}
+
 /// A flight as a row. `None`: the fault is the whole flight.
 fn judge(case: &Case, records: &[Record], vio: &Vio) -> Row {
     let fault = case.fault;
@@ -237,6 +271,7 @@ fn judge(case: &Case, records: &[Record], vio: &Vio) -> Row {
         jump: last.zip(next).filter(|_| fault.is_some()).and_then(|(a, b)| jump(a, b)),
         unannounced: fault.map(|_| unannounced(records, from)),
         restart_sigmas: restart.and_then(|w| w[1].position_sigmas),
+        agrees_after: agrees_after(records),
         stats: *vio.stats(),
         health,
         quality: of.get(of.len() / 2).copied().unwrap_or(0),
@@ -277,7 +312,15 @@ pub fn flights(seed: u64) -> Vec<Vec<Record>> {
     cases::all().iter().map(|case| record(&case.plan, seed).0).collect()
 }
 
-const NOTE: &str = "Errors are of the part of the flight before and of the part after the fault, each aligned on its own (ATE), and of the motion across it (jump). Survived: within the stated bounds, without a reset. Detected: wrong, and health or quality say so. Unannounced: the largest error of the motion since before the fault, or since the first pose after the reset that warns of nothing, that stands for more than a tenth of a second while nothing warns of it; 100 mm at most, which a drone that holds its place can bear. Restart: distance of its position from the truth in its own covariance (3 dimensions). Bold: not as expected.";
+const NOTE: &str = "Errors are of the part of the flight before and of the part after the fault, each aligned on its own (ATE), and of the motion across it (jump). Survived: within the stated bounds, without a reset. Detected: wrong, and health or quality say so. Unannounced: the largest error of the motion since before the fault, or since the first pose after the reset that warns of nothing, that stands for more than a tenth of a second while nothing warns of it; 100 mm at most, which a drone that holds its place can bear. Restart: distance of its position from the truth in its own covariance (3 dimensions). Quality agrees: seconds from the first pose that follows a reset until the quality claims no more than one bin of the reliability diagram above what the velocity's root mean square error over half a second earns, and stays so (3 s at most; a more modest claim agrees). Bold: not as expected.";
+
+fn shown_seconds(s: f64) -> String {
+    if s.is_finite() {
+        format!("{s:.2}")
+    } else {
+        "never".into()
+    }
+}
 
 pub fn table(rows: &[Row]) -> Table {
     table!("stability", "Cases", rows, |r| r.complaint().is_some(), [
@@ -289,6 +332,7 @@ pub fn table(rows: &[Row]) -> Table {
         millimetres("jump", 1) => r.jump,
         millimetres("unannounced", 1) => r.unannounced,
         number("restart", "sigma", 1) => r.restart_sigmas,
+        text("quality agrees after, s") => r.agrees_after.map_or(String::new(), shown_seconds),
         count("quality") => r.quality,
         count("lowest quality") => r.quality_lowest,
         text("said") => r.health.reasons().collect::<Vec<_>>().join(" "),

@@ -2,7 +2,7 @@
 //! `cargo test --bin stipple-bench stability -- --nocapture` prints them.
 #![allow(clippy::unwrap_used)]
 
-use super::{cases, rows, table, unannounced, Verdict, THREE_SIGMA};
+use super::{agrees_after, cases, rows, table, unannounced, Verdict, AGREES_WITHIN_S, THREE_SIGMA};
 use crate::flight::{record, Plan, Record};
 use crate::world::Noise;
 use glam::{DQuat, DVec3};
@@ -80,12 +80,12 @@ fn flights_gone_wrong_are_survived_or_noticed() {
 /// Frames flown after a fault that ended, where only the restart matters.
 const RESTART_FRAMES: usize = 40;
 
-/// The cases that end in one reset and go on, for a closer look at how; until two seconds after the fault.
-fn recovering(seed: u64) -> Vec<(&'static str, Vec<Record>, Stats)> {
+/// The cases that end in one reset and go on, for a closer look at how; until so many frames after the fault.
+fn recovering(seed: u64, frames: usize) -> Vec<(&'static str, Vec<Record>, Stats)> {
     let mut flown = Vec::new();
     for mut case in cases::all() {
         let Some((_, to)) = case.fault.filter(|f| case.expect == Verdict::Reset && f.1 != usize::MAX) else { continue };
-        case.plan.frames = to + RESTART_FRAMES;
+        case.plan.frames = to + frames;
         let (records, vio) = record(&case.plan, seed);
         flown.push((case.name, records, *vio.stats()));
     }
@@ -96,7 +96,7 @@ fn recovering(seed: u64) -> Vec<(&'static str, Vec<Record>, Stats)> {
 /// does every frame after it.
 #[test]
 fn restart_goes_on_from_the_trusted_pose_with_honest_covariance() {
-    for (name, records, stats) in (0..20).flat_map(|seed| recovering(100 + seed)) {
+    for (name, records, stats) in (0..20).flat_map(|seed| recovering(100 + seed, RESTART_FRAMES)) {
         assert_eq!(stats.resets, 1, "{name}: {stats:?}");
         let after: Vec<_> = records.iter().skip_while(|r| r.resets == 0).filter(|r| r.estimate.is_some()).collect();
         assert!(after.len() > 10, "{name}: {} frames after the restart", after.len());
@@ -107,14 +107,49 @@ fn restart_goes_on_from_the_trusted_pose_with_honest_covariance() {
     }
 }
 
+/// A restart is worth what it says: whoever flies by the quality gets no better claim than the velocity earns.
+#[test]
+fn quality_agrees_with_the_error_within_three_seconds_of_a_restart() {
+    // A second more than the quality has to agree, so that it also stays so.
+    for (name, records, _) in (0..4).flat_map(|seed| recovering(200 + seed, 80)) {
+        let after = agrees_after(&records).expect("it starts again");
+        eprintln!("{name}: {after:.2} s");
+        assert!(after <= AGREES_WITHIN_S, "{name}: the quality claims too much until {after:.2} s after the restart");
+    }
+}
+
+/// A flight at rest in the truth.
+fn made_up(frame: usize) -> Record {
+    let truth = TimedPose { t: Nanos(frame as i64 * 50_000_000), pose: Pose::IDENTITY };
+    let (estimate, health) = (Some(truth), Health::default());
+    Record { frame, truth, estimate, health, quality: 80, resets: 0, position_sigmas: None, velocity_error: None }
+}
+
+#[test]
+fn a_quality_agrees_up_to_one_bin_above_what_the_error_earns() {
+    // An error of 50 mm/s earns 50, which is in the bin below 51 to 65. The reset comes at frame 10, the first pose at frame 20.
+    let flight = |claims: fn(usize) -> u8| -> Vec<Record> {
+        let record = |frame| Record {
+            resets: u64::from(frame >= 10),
+            velocity_error: (frame >= 20).then_some(0.05),
+            quality: claims(frame),
+            ..made_up(frame)
+        };
+        (0..60).map(record).collect()
+    };
+    let after = |claims| agrees_after(&flight(claims)).unwrap();
+    assert_eq!([after(|_| 65), after(|_| 3), after(|_| 66)], [0.0, 0.0, f64::INFINITY]);
+    assert_eq!([after(|i| if i < 40 { 90 } else { 60 }), after(|i| if i == 30 { 70 } else { 50 })], [1.0, 0.55]);
+    assert_eq!(agrees_after(&flight(|_| 90)[..20]), None, "no pose follows the reset");
+}
+
 /// Half a metre to the side from frame 10 on; `warned` frames of it say so.
 fn shifted(warned: std::ops::Range<usize>) -> f64 {
     let record = |frame: usize| {
-        let (t, truth) = (Nanos(frame as i64 * 50_000_000), Pose::IDENTITY);
-        let off = Pose { p: DVec3::X * if frame < 10 { 0.0 } else { 0.5 }, ..truth };
+        let r = made_up(frame);
+        let off = Pose { p: DVec3::X * if frame < 10 { 0.0 } else { 0.5 }, ..Pose::IDENTITY };
         let health = if warned.contains(&frame) { Health::VISION_DISAGREES } else { Health::default() };
-        let (truth, estimate) = (TimedPose { t, pose: truth }, Some(TimedPose { t, pose: off }));
-        Record { frame, truth, estimate, health, quality: 80, resets: 0, position_sigmas: None, velocity_error: None }
+        Record { estimate: Some(TimedPose { pose: off, ..r.truth }), health, ..r }
     };
     unannounced(&(0..30).map(record).collect::<Vec<_>>(), 10)
 }
