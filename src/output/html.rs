@@ -133,6 +133,8 @@ fn tables(report: &Report) -> String {
     format!("<section class=\"tables\">{}</section>", parts.concat())
 }
 
+type RigRow = (String, Option<String>, &'static str);
+
 /// What was estimated of the rig; empty where nothing was.
 fn table_of_rig(report: &Report) -> String {
     let three = |v: [f64; 3], unit: f64| v.map(|x| format!("{:.2}", x * unit)).join(", ");
@@ -142,7 +144,7 @@ fn table_of_rig(report: &Report) -> String {
     const MM: f64 = 1e3;
     const DEGREES: f64 = 180.0 / std::f64::consts::PI;
     const PERCENT: f64 = 100.0;
-    let mut rows: Vec<(String, Option<String>, &str)> = Vec::new();
+    let mut rows: Vec<RigRow> = Vec::new();
     if let Some((t, s)) = report.time_offset_s.zip(report.time_offset_sigma_s) {
         rows.push(("Time offset of the cameras".into(), Some(format!("{:.3} ± {:.3}", t * 1e3, s * 1e3)), "ms"));
     }
@@ -159,10 +161,19 @@ fn table_of_rig(report: &Report) -> String {
     for (name, v, s) in scales {
         rows.extend(pair(v, s, PERCENT).map(|shown| (name.to_string(), Some(shown), "%")));
     }
+    rows.extend(barometer(report));
     if rows.is_empty() {
         return String::new();
     }
     table("Rig, over its calibration", &rows)
+}
+
+/// By how much a barometer's height drifted, and of how many frames; `None` without one.
+fn barometer(report: &Report) -> Option<RigRow> {
+    let shown = report.height_bias_m.zip(report.height_bias_sigma_m).map(|(b, s)| format!("{b:.2} ± {s:.2}"));
+    let [used, refused] = ["heights_used", "heights_gated"].map(|name| report.count(name));
+    let name = format!("Drift of the barometer, {} heights used, {} refused", grouped(used), grouped(refused));
+    (shown.is_some() || used + refused > 0).then_some((name, shown, "m"))
 }
 
 fn table<Name: Display>(title: &str, rows: &[(Name, Option<String>, &str)]) -> String {
@@ -396,5 +407,23 @@ mod tests {
         assert!(page.starts_with("<!doctype html>") && page.ends_with("</main></body></html>\n"));
         assert!(!page.contains("http") && !page.contains("NaN"));
         assert!(page.contains("\u{2013}</td>"), "a dash where nothing was measured");
+    }
+
+    #[test]
+    fn barometer_is_told_of_where_there_is_one() {
+        let page = |report: &Report| {
+            let mut page = Vec::new();
+            write_html(&mut page, report, &Evidence::default()).unwrap();
+            String::from_utf8(page).unwrap()
+        };
+        assert!(!page(&Report::default()).contains("barometer"));
+        let mut report = Report { height_bias_m: Some(-0.314), height_bias_sigma_m: Some(0.021), ..Report::default() };
+        report.set_counters(&[("heights_used", 1234), ("heights_gated", 7)]);
+        let (name, value) = ("Drift of the barometer, 1\u{202f}234 heights used, 7 refused", "-0.31 ± 0.02");
+        assert!(page(&report).contains(&format!("{name}</th><td>{value}</td><td class=\"u\">m</td>")));
+        // All refused: a dash.
+        report = Report::default();
+        report.set_counters(&[("heights_gated", 7)]);
+        assert!(page(&report).contains("0 heights used, 7 refused</th><td>\u{2013}</td>"));
     }
 }

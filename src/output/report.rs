@@ -133,6 +133,11 @@ impl Report {
         self.counts.extend(frames.map(|(name, n)| (format!("health_{name}_frames"), n)));
     }
 
+    /// A counter by its name; 0 where there is none.
+    pub fn count(&self, name: &str) -> u64 {
+        self.counts.get(&format!("{COUNT}{name}")).copied().unwrap_or(0)
+    }
+
     /// Counters that are not zero, without their prefix.
     pub fn counted(&self) -> impl Iterator<Item = (&str, u64)> {
         self.counts.iter().filter(|(_, n)| **n > 0).map(|(name, n)| (name.strip_prefix(COUNT).unwrap_or(name), *n))
