@@ -6,8 +6,8 @@ pub const CAMERAS_MAX: usize = 4;
 pub const STATES: usize = 5;
 /// Older frames kept as poses only (6 dof), at most.
 pub const KEYFRAMES: usize = 10;
-/// Time offset, extrinsics of every camera, scale of the inertial unit, where they are estimated.
-pub const RIG_DIM: usize = 1 + 6 * CAMERAS_MAX + 6;
+/// Time offset and extrinsics of every camera, scale of the inertial unit, where they are estimated.
+pub const RIG_DIM: usize = (1 + 6) * CAMERAS_MAX + 6;
 /// Frames in the window at its peak: one more of each just before marginalization.
 pub const FRAMES: usize = STATES + 1 + KEYFRAMES + 1;
 /// The bias of a barometer, one a state, where a board has one.

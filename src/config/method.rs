@@ -38,9 +38,9 @@ section! {
     /// The same for the accelerometer, which feels vibration more and whose errors of scale are multiplied by gravity: chosen from
     /// 2, 4 and 8.
     accel_noise_scale: f64 = 8.0, Bound::Positive;
-    /// Whether the offset between the clocks of cameras and inertial unit is estimated. Set it where they are not triggered
-    /// together; 8 ms cost eight times the error. Poses are then at their frames' stamps by the inertial clock; log and report
-    /// have the offset.
+    /// Whether the offset between each camera's clock and the inertial unit's is estimated. Set it where they are not triggered
+    /// together, or one camera later than another; 8 ms cost eight times the error. Poses are then at their frames' stamps by the
+    /// inertial clock; log and report have the offsets. The map takes all cameras to be exposed when camera 0 is.
     estimate_time_offset: bool = false;
     /// Whether the cameras' places on the body are estimated. Set it after a hard landing, or for a rig that flexes.
     estimate_extrinsics: bool = false;
@@ -73,7 +73,7 @@ section! {
     outlier_px: f64 = 3.0;
     /// Holds velocity and gyro bias when nothing moves.
     zero_velocity: bool = true;
-    /// Standard deviation of the clocks' offset before it is estimated, s.
+    /// Standard deviation of each camera's offset before it is estimated, s.
     time_offset_sigma_s: f64 = 0.01;
     /// Standard deviation of a camera's position before it is estimated, m.
     extrinsics_sigma_m: f64 = 0.01;

@@ -145,8 +145,9 @@ fn table_of_rig(report: &Report) -> String {
     const DEGREES: f64 = 180.0 / std::f64::consts::PI;
     const PERCENT: f64 = 100.0;
     let mut rows: Vec<RigRow> = Vec::new();
-    if let Some((t, s)) = report.time_offset_s.zip(report.time_offset_sigma_s) {
-        rows.push(("Time offset of the cameras".into(), Some(format!("{:.3} ± {:.3}", t * 1e3, s * 1e3)), "ms"));
+    for t in &report.time_offsets {
+        let shown = format!("{:.3} ± {:.3}", t.offset_s * 1e3, t.offset_sigma_s * 1e3);
+        rows.push((format!("Camera {}, time offset", t.camera), Some(shown), "ms"));
     }
     for e in &report.extrinsics {
         let k = e.camera;

@@ -53,8 +53,7 @@ pub struct Report {
     pub vio_hash: Option<String>,
 
     /// What was estimated of the rig, over its calibration, and standard deviations.
-    pub time_offset_s: Option<f64>,
-    pub time_offset_sigma_s: Option<f64>,
+    pub time_offsets: Vec<TimeOffsetFound>,
     /// By how much a barometer's height had drifted from the estimate's at the end, and its standard deviation.
     pub height_bias_m: Option<f64>,
     pub height_bias_sigma_m: Option<f64>,
@@ -93,6 +92,14 @@ pub struct Report {
     /// `count_<name>` of every counter, `health_<bit>_frames` of every bit of the odometry's health.
     #[serde(flatten)]
     pub counts: BTreeMap<String, u64>,
+}
+
+/// Time that is to be added to the stamps of a camera's images, beyond what its calibration adds.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct TimeOffsetFound {
+    pub camera: usize,
+    pub offset_s: f64,
+    pub offset_sigma_s: f64,
 }
 
 /// Where a camera sits over where it was calibrated: position in the body frame, rotation vector in its own.
@@ -160,7 +167,7 @@ mod tests {
         tracking_ms_p99 tracking_threads tracking_cpu_ms frontend_ms_p50 frontend_ms_p99 estimator_ms_p50 \
         estimator_ms_p99 psnr_db ssim psnr_heldout_db ssim_heldout psnr_heldout_between_db psnr_heldout_fitted_db ssim_heldout_fitted psnr_heldout_aligned_db splats iterations \
         iteration_ms_p50 seconds_to_25_db gpu_bytes estimator_bytes quality_min quality_p50 quality_under_50 rss_peak_bytes map_rss_peak_bytes heap_after_seal wall_s device vio_hash dataset board pace scale \
-        camera_cpu_ms camera_kernel_ms camera_copies time_offset_s time_offset_sigma_s height_bias_m height_bias_sigma_m gyro_scale gyro_scale_sigma accel_scale accel_scale_sigma epochs";
+        camera_cpu_ms camera_kernel_ms camera_copies height_bias_m height_bias_sigma_m gyro_scale gyro_scale_sigma accel_scale accel_scale_sigma epochs";
 
     #[test]
     fn unmeasured_figures_are_null_and_present() {
@@ -170,6 +177,7 @@ mod tests {
         }
         assert!(
             json["curve"].is_array()
+                && json["time_offsets"].is_array()
                 && json["extrinsics"].is_array()
                 && json["kernels"].is_array()
                 && json["warnings"] == 0

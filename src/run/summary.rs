@@ -9,7 +9,7 @@ use crate::mem;
 use crate::output::html::{write_html, Evidence};
 use crate::output::metrics::{percentile, trajectory_error};
 use crate::output::panel::Picture;
-use crate::output::report::{seconds_to, ExtrinsicsFound, Report, GOOD_DB};
+use crate::output::report::{seconds_to, ExtrinsicsFound, Report, TimeOffsetFound, GOOD_DB};
 use crate::output::trajectory::{epoch_at, TumWriter};
 use crate::output::{atomically, OutputDir};
 use std::borrow::Cow;
@@ -181,7 +181,11 @@ fn track_figures(report: &mut Report, flown: &Flown) -> Vec<TimedPose> {
     (report.estimator_ms_p50, report.estimator_ms_p99) = percentiles(&run.back.ms);
     if let Some(rig) = run.back.vio.rig() {
         let three = |v: &[f64], at: usize| std::array::from_fn(|i| v[at + i]);
-        (report.time_offset_s, report.time_offset_sigma_s) = rig.time_offset.map(|[t, s]| (t, s)).unzip();
+        let late = rig.time_offsets.iter().enumerate().filter_map(|(camera, found)| {
+            let [offset_s, offset_sigma_s] = (*found)?;
+            Some(TimeOffsetFound { camera, offset_s, offset_sigma_s })
+        });
+        report.time_offsets = late.collect();
         let found = rig.extrinsics.iter().enumerate().filter_map(|(camera, e)| {
             let [v, s] = (*e)?;
             Some(ExtrinsicsFound {

@@ -36,7 +36,7 @@ const BETWEEN_HALVES: usize = 2;
 
 /// A pose and what it means for the map.
 pub struct Tracked {
-    /// Newest estimate of the pose at the exposure.
+    /// Newest estimate of the pose at camera 0's exposure.
     pub world_from_body: Pose,
     pub keyframe: bool,
     /// Newest poses of all keyframes still being optimised; filled beside a keyframe.
@@ -154,16 +154,16 @@ impl Front {
         let cpu = thread_cpu_now();
         packet.begun = Instant::now();
         self.predictor.set_scale(answer.known.imu_scale);
-        if let Some((body_from_cam, sigma_rad)) = &answer.known.cameras {
-            self.frontend.correct(body_from_cam, *sigma_rad);
-        }
         packet.imu.iter().for_each(|s| self.predictor.on_imu(*s));
         self.frontend.reject(&answer.rejected);
         if packet.imu_only {
             return;
         }
-        let prediction =
-            Prediction { prev_from_now: self.predictor.motion_to(packet.frames.t, answer.known.odometry.as_ref()) };
+        let t = packet.frames.t;
+        if let Some((body_from_cam, sigma_rad)) = self.predictor.cameras_at(t, &answer.known) {
+            self.frontend.correct(&body_from_cam, sigma_rad);
+        }
+        let prediction = Prediction { prev_from_now: self.predictor.motion_to(t, answer.known.odometry.as_ref()) };
         packet.tracks.clone_from(self.frontend.track(&packet.frames, &prediction));
         packet.verdicts = self.frontend.verdicts();
         let secs = packet.begun.elapsed().as_secs_f64();
@@ -227,9 +227,9 @@ impl Back {
         self.frame_ms.push((packet.frames.t, latency_ms));
         if let Some(log) = &self.log {
             let cpu = packet.cpu + (thread_cpu_now() - cpu);
-            let time_offset_ns = self.vio.time_offset().map(|offset| offset.0);
+            let time_offsets_ns = self.vio.time_offsets().map(|offsets| offsets.map(|offset| offset.0));
             let state = State::new(packet.frames.t, &update, latency_ms, cpu.as_secs_f64() * 1e3);
-            log.state(State { time_offset_ns, ..state });
+            log.state(State { time_offsets_ns, ..state });
         }
     }
 

@@ -330,9 +330,11 @@ impl Estimator {
         let (rig, sigma) = (&self.graph.window.rig, &self.rig_deviations);
         let cameras = &self.model.cameras;
         let focal = cameras.iter().fold(0.0f64, |f, c| f.max(c.camera.fx));
-        let time = if rig.parts.time_offset { sigma[0] * self.graph.window.frame(slot).twist.w.length() } else { 0.0 };
+        let most = |m: f64, i: usize| m.max(sigma[i]);
+        let times = (0..cameras.len()).filter_map(|c| rig.time_column(c));
+        let time = times.fold(0.0, most) * self.graph.window.frame(slot).twist.w.length();
         let thetas = (0..cameras.len()).filter_map(|c| rig.extrinsic_column(c)).flat_map(|at| at + 3..at + 6);
-        let rotation = thetas.fold(0.0f64, |m, i| m.max(sigma[i]));
+        let rotation = thetas.fold(0.0, most);
         self.model.config.outlier_px + RIG_SIGMAS * focal * (time + rotation)
     }
 

@@ -14,11 +14,11 @@ use super::landmarks::{Landmark, Observation};
 use super::model::Model;
 use super::projection::{host_cam, observe, predicted, CameraColumns, Host};
 use super::reprojection::huber;
-use super::rig::SCALE_DIM;
+use super::rig::{CAMERA_DIM_MAX, SCALE_DIM};
 use super::rows::{FactorRows, POINT_DIM};
 use super::window::{Height, Layout, Window, MOTION_DIM, POSE_DIM};
 use super::zero_velocity;
-use crate::limits::{FRAMES, RIG_DIM};
+use crate::limits::FRAMES;
 use crate::math::dense::Columns;
 use glam::DVec3;
 
@@ -191,7 +191,7 @@ pub fn view_rows(landmark: &Landmark, window: &Window, model: &Model, layout: &L
     let huber_width = model.config.huber_px * inv_sigma;
     let cameras_at = layout.cameras().map(|s| (out.offset(s.at), s.len));
     let host_view = Host::of(landmark, window);
-    let mut columns: CameraColumns = [[0.0; RIG_DIM - SCALE_DIM]; 2];
+    let mut columns: CameraColumns = [[0.0; CAMERA_DIM_MAX]; 2];
     for o in views {
         let Some(r) = observe(landmark, &host_view, o, window, &mut columns) else {
             cost += huber(LOST_PX * inv_sigma, huber_width).1;

@@ -11,7 +11,7 @@ use super::graph::Graph;
 use super::inertial::{body_velocity_covariance, Covariance};
 use super::landmarks::{Landmark, Observation};
 use super::projection::{observe, Host};
-use super::rig::{EXTRINSIC_DIM, TIME_DIM};
+use super::rig::CAMERA_DIM_MAX;
 use super::window::{Window, POSE_DIM};
 use crate::frontend::{Rejected, Tracks};
 use crate::limits::{CAMERAS_MAX, TRACKS};
@@ -49,7 +49,7 @@ pub fn predicted_covariance(window: &Window, slot: usize, from: &Covariance) -> 
 
 /// Squared Mahalanobis distance of a view from its prediction; `None` where it cannot be predicted.
 fn distance(l: &Landmark, o: &Observation, window: &Window, p: &PoseCovariance, sigma_px: f64) -> Option<f64> {
-    let mut columns = [[0.0; TIME_DIM + EXTRINSIC_DIM * CAMERAS_MAX]; 2];
+    let mut columns = [[0.0; CAMERA_DIM_MAX]; 2];
     let r = observe(l, &Host::of(l, window), o, window, &mut columns)?;
     let j = SMatrix::<f64, 2, POSE_DIM>::from_fn(|i, k| r.d_target[i][k]);
     let d_rho = SVector::<f64, 2>::new(r.d_point[0][2], r.d_point[1][2]) * f64::from(l.rho_sigma);

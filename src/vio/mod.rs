@@ -104,10 +104,21 @@ impl From<&Odometry> for Motion {
 pub struct Known {
     /// `None` until initialized.
     pub odometry: Option<Odometry>,
-    /// Where the cameras are on the body, and the largest deviation of their rotations, rad; `None` where it is not estimated.
-    pub cameras: Option<([Pose; CAMERAS_MAX], f64)>,
+    /// `None` where nothing of the cameras is estimated.
+    pub cameras: Option<Cameras>,
     /// Factors on the readings of gyro and accelerometer, less one.
     pub imu_scale: [DVec3; 2],
+}
+
+/// Where and when the cameras see, as estimated.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Cameras {
+    pub body_from_cam: [Pose; CAMERAS_MAX],
+    /// The largest deviation of their rotations, rad.
+    pub rotation_sigma: f64,
+    /// Time from a frame's stamp to the exposure of each, and the largest deviation, s.
+    pub time_offsets: [f64; CAMERAS_MAX],
+    pub time_sigma: f64,
 }
 
 /// What one frame led to.
@@ -427,23 +438,30 @@ impl Vio {
 
     /// What the tracker works by.
     pub fn known(&self) -> Known {
-        let rig = &self.estimator.graph.window.rig;
-        let cameras = rig.parts.extrinsics.then(|| {
-            let columns = (0..rig.cameras().len()).filter_map(|c| rig.extrinsic_column(c));
-            let thetas = columns.flat_map(|at| &self.estimator.rig_deviations[at + 3..at + 6]);
-            (rig.now.body_from_cam, thetas.fold(0.0, |most: f64, sigma| most.max(*sigma)))
+        let (rig, sigma) = (&self.estimator.graph.window.rig, &self.estimator.rig_deviations);
+        let cameras = (rig.parts.extrinsics || rig.parts.time_offset).then(|| {
+            let most = |m: f64, i: usize| m.max(sigma[i]);
+            let all = 0..rig.cameras().len();
+            let thetas = all.clone().filter_map(|c| rig.extrinsic_column(c)).flat_map(|at| at + 3..at + 6);
+            Cameras {
+                body_from_cam: rig.now.body_from_cam,
+                rotation_sigma: thetas.fold(0.0, most),
+                time_offsets: rig.now.time_offsets,
+                time_sigma: all.filter_map(|c| rig.time_column(c)).fold(0.0, most),
+            }
         });
         Known { odometry: self.odometry(), cameras, imu_scale: [rig.now.gyro_scale, rig.now.accel_scale] }
     }
 
-    /// Time that is to be added to the stamps of images, beyond what the calibration adds; `None` where it is not estimated.
-    pub fn time_offset(&self) -> Option<Span> {
+    /// Time that is to be added to the stamps of each camera's images, beyond what the calibration adds, zero of cameras that
+    /// the rig has not; `None` where it is not estimated.
+    pub fn time_offsets(&self) -> Option<[Span; CAMERAS_MAX]> {
         let rig = &self.estimator.graph.window.rig;
-        rig.parts.time_offset.then(|| Span::from_secs(rig.now.time_offset))
+        rig.parts.time_offset.then(|| rig.now.time_offsets.map(Span::from_secs))
     }
 
     /// Stamp, pose, and whether it is a keyframe, of every frame of the window, oldest first. The pose is that of the
-    /// exposure, by the estimated time offset, of a body whose camera 0 sits where it was calibrated.
+    /// exposure of camera 0, by its estimated time offset, of a body whose camera 0 sits where it was calibrated.
     pub fn window(&self) -> impl Iterator<Item = (Nanos, Pose, bool)> + '_ {
         let window = &self.estimator.graph.window;
         window.slots().map(|s| window.frame(s)).map(|f| (f.t, window.exposed(f), f.keyframe))

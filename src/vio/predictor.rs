@@ -13,8 +13,11 @@
 use super::inertial::Motion;
 use super::preintegration::Noise;
 use super::samples::ImuRing;
-use super::Odometry;
+use super::shutter::Twist;
+use super::{Known, Odometry};
 use crate::config::VioConfig;
+use crate::limits::CAMERAS_MAX;
+use crate::math::so3;
 use glam::DVec3;
 use stipple_drivers::{Calibration, ImuSample, Nanos, Pose};
 #[cfg(feature = "instruments")]
@@ -88,6 +91,24 @@ impl Predictor {
     /// Takes the factors less one by which the readings of samples to come are to be multiplied, as `Vio::known` has them.
     pub fn set_scale(&mut self, scale: [DVec3; 2]) {
         self.scale = scale;
+    }
+
+    /// Places of the cameras on the body as they see the frame at `t`, and how far their rotations may be off, rad; `None` where
+    /// nothing of them is estimated. A camera that is exposed later than camera 0 sees from where the body has moved it to.
+    /// `known` is as for `motion_to`.
+    pub fn cameras_at(&self, t: Nanos, known: &Known) -> Option<([Pose; CAMERAS_MAX], f64)> {
+        let cameras = known.cameras?;
+        let twist = known.odometry.map_or(Twist::default(), |o| Twist {
+            v: o.world_from_body.q.conjugate() * o.v_world,
+            w: self.imu.rate_at(t) - o.gyro_bias,
+        });
+        let mut places = cameras.body_from_cam;
+        for (place, offset) in places.iter_mut().zip(&cameras.time_offsets) {
+            let tau = offset - cameras.time_offsets[0];
+            let moved = Pose::new(so3::exp(twist.w * tau), twist.v * tau);
+            *place = if tau == 0.0 { *place } else { moved * *place };
+        }
+        Some((places, cameras.rotation_sigma + cameras.time_sigma * twist.w.length()))
     }
 
     /// Motion of the body from the frame before to the one at `t`, `before_from_now`; `None` at the first frame.

@@ -8,14 +8,13 @@
 
 use super::landmarks::{Landmark, Observation};
 use super::reprojection::{CameraModel, Reprojection, Transform, View};
-use super::rig::{EXTRINSIC_DIM, TIME_DIM};
+use super::rig::CAMERA_DIM_MAX;
 use super::shutter::{to_stamp, DelayedCamera};
 use super::window::Window;
-use crate::limits::CAMERAS_MAX;
 use glam::DVec2;
 
 /// Derivatives of a view to the rig's columns that cameras touch; the first `camera_dim` are meant.
-pub type CameraColumns = [[f64; TIME_DIM + EXTRINSIC_DIM * CAMERAS_MAX]; 2];
+pub type CameraColumns = [[f64; CAMERA_DIM_MAX]; 2];
 
 fn delayed(camera: &CameraModel, time_offset: f64, row: f32, slot: usize, window: &Window) -> DelayedCamera {
     let tau = time_offset + camera.row_delay(row.into());
@@ -24,11 +23,11 @@ fn delayed(camera: &CameraModel, time_offset: f64, row: f32, slot: usize, window
 
 /// Place of a camera on the body when it takes a row, px, of the frame in `slot`.
 pub fn placed(camera: usize, row: f32, slot: usize, window: &Window) -> Transform {
-    let camera = &window.rig.cameras()[camera];
+    let model = &window.rig.cameras()[camera];
     if window.rig.is_plain() {
-        return camera.body_from_cam;
+        return model.body_from_cam;
     }
-    delayed(camera, window.rig.now.time_offset, row, slot, window).body_from_cam
+    delayed(model, window.rig.now.time_offsets[camera], row, slot, window).body_from_cam
 }
 
 /// Place of the camera that a landmark is hosted in, for all its views.
@@ -58,9 +57,9 @@ pub struct Host {
 impl Host {
     /// Host of all views of a landmark.
     pub fn of(l: &Landmark, window: &Window) -> Host {
-        let (rig, slot) = (&window.rig, l.host as usize);
-        let camera = &rig.cameras_linearized()[l.host_camera as usize];
-        let delayed = || delayed(camera, rig.linearized().time_offset, l.host_row, slot, window);
+        let (rig, slot, camera) = (&window.rig, l.host as usize, l.host_camera as usize);
+        let (model, time_offset) = (&rig.cameras_linearized()[camera], rig.linearized().time_offsets[camera]);
+        let delayed = || delayed(model, time_offset, l.host_row, slot, window);
         Host { now: host_cam(l, window), delayed: (!rig.is_plain()).then(delayed) }
     }
 }
@@ -80,17 +79,18 @@ pub fn observe(
     let cameras = [l.host_camera, o.camera].map(usize::from);
     let [host_camera, camera] = cameras.map(|c| &rig.cameras_linearized()[c]);
     let mut r = if let Some(host_cam) = &at.delayed {
-        let seeing = delayed(camera, rig.linearized().time_offset, o.px[1], o.slot as usize, window);
+        let time_offset = rig.linearized().time_offsets[cameras[1]];
+        let seeing = delayed(camera, time_offset, o.px[1], o.slot as usize, window);
         let camera = &CameraModel { body_from_cam: seeing.body_from_cam, ..*camera };
         let view = View { host_cam: &host_cam.body_from_cam, host, camera, target };
         let (r, mut d) = view.reproject_with_extrinsics(&l.point)?;
         let d_time = to_stamp(&mut d, host_cam, &seeing);
         for (k, row) in columns.iter_mut().enumerate() {
             row.fill(0.0);
-            if rig.parts.time_offset {
-                row[0] = d_time[k];
-            }
-            for (camera, d) in cameras.into_iter().zip([&d.host[k], &d.target[k]]) {
+            for ((camera, d), d_time) in cameras.into_iter().zip([&d.host[k], &d.target[k]]).zip(d_time[k]) {
+                if let Some(at) = rig.time_column(camera) {
+                    row[at] += d_time;
+                }
                 if let Some(at) = rig.extrinsic_column(camera) {
                     row[at..].iter_mut().zip(d).for_each(|(sum, d)| *sum += d);
                 }

@@ -1,5 +1,5 @@
-//! The part of the rig that may be estimated along with the window: the cameras' time offset, the place of each
-//! camera on the body, the scale of the inertial unit. One block of columns that never leaves the window; what is
+//! The part of the rig that may be estimated along with the window: the time offset and the place on the
+//! body of each camera, the scale of the inertial unit. One block of columns that never leaves the window; what is
 //! not estimated has no column.
 //!
 //! Like a frame, the block has a fixed linearization point once the prior touches it.
@@ -11,11 +11,13 @@ use crate::math::so3;
 use glam::DVec3;
 use stipple_drivers::{Calibration, Pose};
 
-/// Errors in order: time offset, [p, θ] of each camera (θ on the right), gyro scale, accelerometer scale.
+/// Errors in order: time offset of each camera, [p, θ] of each camera (θ on the right), gyro scale, accelerometer scale.
 pub const TIME_DIM: usize = 1;
 pub const EXTRINSIC_DIM: usize = 6;
 pub const SCALE_DIM: usize = 6;
-const _: () = assert!(RIG_DIM == TIME_DIM + EXTRINSIC_DIM * CAMERAS_MAX + SCALE_DIM);
+/// Columns that cameras touch, at most.
+pub const CAMERA_DIM_MAX: usize = (TIME_DIM + EXTRINSIC_DIM) * CAMERAS_MAX;
+const _: () = assert!(RIG_DIM == CAMERA_DIM_MAX + SCALE_DIM);
 
 /// Bounds of what is estimated, beyond the calibration: s, m, rad, and of scales. A rig further off is lost. The
 /// deviations that a board may state lie well within.
@@ -50,8 +52,8 @@ impl Parts {
 /// Values of the rig that estimation may change.
 #[derive(Clone, Copy, Debug)]
 pub struct RigParameters {
-    /// Added to the stamps of images, beyond what the calibration adds, s.
-    pub time_offset: f64,
+    /// Added to the stamps of each camera's images, beyond what the calibration adds, s.
+    pub time_offsets: [f64; CAMERAS_MAX],
     pub body_from_cam: [Pose; CAMERAS_MAX],
     /// Factors on the readings of each axis, less one.
     pub gyro_scale: DVec3,
@@ -60,15 +62,16 @@ pub struct RigParameters {
 
 impl RigParameters {
     fn calibrated(body_from_cam: [Pose; CAMERAS_MAX]) -> RigParameters {
-        RigParameters { time_offset: 0.0, body_from_cam, gyro_scale: DVec3::ZERO, accel_scale: DVec3::ZERO }
+        let (gyro_scale, accel_scale) = (DVec3::ZERO, DVec3::ZERO);
+        RigParameters { time_offsets: [0.0; CAMERAS_MAX], body_from_cam, gyro_scale, accel_scale }
     }
 }
 
 /// Estimate and standard deviation of what the board asks for; `None` for the rest.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct RigEstimate {
-    /// Time offset beyond the calibration's, and its deviation, s.
-    pub time_offset: Option<[f64; 2]>,
+    /// Time offset of each camera beyond the calibration's, and its deviation, s.
+    pub time_offsets: [Option<[f64; 2]>; CAMERAS_MAX],
     /// [p, θ] of each camera over the calibration, m and rad, θ on the right; and deviations.
     pub extrinsics: [Option<[[f64; EXTRINSIC_DIM]; 2]>; CAMERAS_MAX],
     /// Factors less one of the gyro's axes and the accelerometer's; and deviations.
@@ -77,8 +80,9 @@ pub struct RigEstimate {
 
 impl RigEstimate {
     pub fn new(rig: &RigState, deviations: &[f64; RIG_DIM]) -> RigEstimate {
+        let time = |c: usize| Some([rig.now.time_offsets[c], deviations[rig.time_column(c)?]]);
         let extrinsics = |c: usize| {
-            let at = rig.extrinsic_column(c).filter(|_| c < rig.cameras.len())?;
+            let at = rig.extrinsic_column(c)?;
             let (from, to) = (&rig.calibrated[c], &rig.now.body_from_cam[c]);
             let (p, th) = (to.p - from.p, so3::log(from.q.conjugate() * to.q));
             Some([[p.x, p.y, p.z, th.x, th.y, th.z], std::array::from_fn(|i| deviations[at + i])])
@@ -86,7 +90,7 @@ impl RigEstimate {
         let (g, a) = (rig.now.gyro_scale, rig.now.accel_scale);
         let scales = [g.x, g.y, g.z, a.x, a.y, a.z];
         RigEstimate {
-            time_offset: rig.parts.time_offset.then(|| [rig.now.time_offset, deviations[0]]),
+            time_offsets: std::array::from_fn(time),
             extrinsics: std::array::from_fn(extrinsics),
             imu_scale: rig.parts.imu_scale.then(|| [scales, std::array::from_fn(|i| deviations[rig.camera_dim() + i])]),
         }
@@ -151,17 +155,22 @@ impl RigState {
         let of = |i: usize| match i {
             i if i >= n => f64::INFINITY,
             i if i >= cameras => config.imu_scale_sigma,
-            0 if self.parts.time_offset => config.time_offset_sigma_s,
-            i if (i - self.parts.time_offset as usize * TIME_DIM) % EXTRINSIC_DIM < 3 => config.extrinsics_sigma_m,
+            i if i < self.time_dim() => config.time_offset_sigma_s,
+            i if (i - self.time_dim()) % EXTRINSIC_DIM < 3 => config.extrinsics_sigma_m,
             _ => config.extrinsics_sigma_rad,
         };
         std::array::from_fn(of)
     }
 
-    /// Number of columns that cameras touch: time offset, then extrinsics of each camera.
+    /// Number of columns of time offsets.
+    fn time_dim(&self) -> usize {
+        self.parts.time_offset as usize * TIME_DIM * self.cameras.len()
+    }
+
+    /// Number of columns that cameras touch: the time offsets of all, then their extrinsics.
     pub fn camera_dim(&self) -> usize {
         let extrinsics = self.parts.extrinsics as usize * EXTRINSIC_DIM * self.cameras.len();
-        self.parts.time_offset as usize * TIME_DIM + extrinsics
+        self.time_dim() + extrinsics
     }
 
     /// Number of columns that the inertial unit touches.
@@ -174,9 +183,15 @@ impl RigState {
         self.camera_dim() + self.imu_dim()
     }
 
+    /// Column of a camera's time offset.
+    pub fn time_column(&self, camera: usize) -> Option<usize> {
+        (self.parts.time_offset && camera < self.cameras.len()).then_some(TIME_DIM * camera)
+    }
+
     /// First column of a camera's extrinsics.
     pub fn extrinsic_column(&self, camera: usize) -> Option<usize> {
-        self.parts.extrinsics.then(|| self.parts.time_offset as usize * TIME_DIM + EXTRINSIC_DIM * camera)
+        let is_estimated = self.parts.extrinsics && camera < self.cameras.len();
+        is_estimated.then(|| self.time_dim() + EXTRINSIC_DIM * camera)
     }
 
     /// The cameras at the estimate.
@@ -208,11 +223,12 @@ impl RigState {
         self.refresh();
     }
 
-    /// Estimated time from a stamp to the exposure, s, and by what camera 0 is elsewhere on the body than it was calibrated;
-    /// `None` where neither is estimated.
+    /// Estimated time from a stamp to camera 0's exposure, s, and by what camera 0 is elsewhere on the body than it was
+    /// calibrated; `None` where neither is estimated. Whoever draws all cameras by it draws another one as far off as it
+    /// is exposed at another instant than camera 0.
     pub fn exposure(&self) -> Option<(f64, Pose)> {
         let is_found = self.parts.time_offset || self.parts.extrinsics;
-        is_found.then(|| (self.now.time_offset, self.now.body_from_cam[0] * self.calibrated[0].inverse()))
+        is_found.then(|| (self.now.time_offsets[0], self.now.body_from_cam[0] * self.calibrated[0].inverse()))
     }
 
     /// Whether a rig could be like this.
@@ -224,7 +240,7 @@ impl RigState {
         };
         let scale = rig.gyro_scale.abs().max(rig.accel_scale.abs()).max_element();
         let finite = rig.gyro_scale.is_finite() && rig.accel_scale.is_finite();
-        rig.time_offset.abs() < TIME_OFFSET_MAX
+        rig.time_offsets.iter().all(|t| t.abs() < TIME_OFFSET_MAX)
             && finite
             && scale < SCALE_MAX
             && rig.body_from_cam[..n].iter().zip(&self.calibrated[..n]).all(near)
@@ -255,10 +271,10 @@ impl RigState {
         }
         let at = |i: usize| DVec3::new(d[i], d[i + 1], d[i + 2]);
         self.now = base;
-        if self.parts.time_offset {
-            self.now.time_offset += d[0];
-        }
         for c in 0..self.cameras.len() {
+            if let Some(i) = self.time_column(c) {
+                self.now.time_offsets[c] += d[i];
+            }
             if let Some(i) = self.extrinsic_column(c) {
                 let pose = &base.body_from_cam[c];
                 self.now.body_from_cam[c] = Pose::new(pose.q * so3::exp(at(i + 3)), pose.p + at(i));

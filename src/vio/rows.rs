@@ -1,6 +1,6 @@
 //! The rows `[J | r]` of one factor: only the columns it touches, and how they go into a system or a stack.
 
-use crate::limits::{FRAMES, HEIGHT_DIM, OBSERVATIONS, RIG_DIM, WINDOW_DIM};
+use crate::limits::{CAMERAS_MAX, FRAMES, HEIGHT_DIM, OBSERVATIONS, RIG_DIM, WINDOW_DIM};
 use crate::math::dense::{add_gram, Columns, System};
 use crate::math::qr::Rows;
 use crate::mem::List;
@@ -15,8 +15,9 @@ pub const SHARED_DIM: usize = super::window::POSE_DIM * FRAMES + RIG_DIM;
 const COLS_MAX: usize = POINT_DIM + SHARED_DIM + 1;
 const ROWS_MAX: usize = 2 * OBSERVATIONS + 1;
 /// Rows of the stack of a marginalization: what stays of it when triangular, and the largest factors. How many there are
-/// decides when it is made triangular, and so the last bits: those of heights have room among them.
-pub const STACK_ROWS: usize = WINDOW_DIM - HEIGHT_DIM + 4 * ROWS_MAX;
+/// decides when it is made triangular, and so the last bits: those of heights and of the second to last camera's time offset
+/// have room among them.
+pub const STACK_ROWS: usize = WINDOW_DIM - HEIGHT_DIM - (CAMERAS_MAX - 1) + 4 * ROWS_MAX;
 
 /// The rows of one factor; reused for every factor.
 #[derive(Clone, Debug)]

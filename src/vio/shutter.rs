@@ -49,13 +49,13 @@ impl DelayedCamera {
     }
 }
 
-/// Turns derivatives to both cameras at their instants into those to the cameras at the stamp; answers the
-/// derivatives of the pixel to the time offset, which delays both views alike.
-pub fn to_stamp(d: &mut ExtrinsicDerivatives, host: &DelayedCamera, target: &DelayedCamera) -> [f64; 2] {
+/// Turns derivatives to both cameras at their instants into those to the cameras at the stamp; answers, for each
+/// coordinate of the pixel, the derivatives to the time offsets of the host's camera and of the seeing one.
+pub fn to_stamp(d: &mut ExtrinsicDerivatives, host: &DelayedCamera, target: &DelayedCamera) -> [[f64; 2]; 2] {
     std::array::from_fn(|k| {
         let (of_host, of_target) = (host.to_stamp(&d.host[k]), target.to_stamp(&d.target[k]));
         (d.host[k], d.target[k]) = (of_host.0, of_target.0);
-        of_host.1 + of_target.1
+        [of_host.1, of_target.1]
     })
 }
 
@@ -82,11 +82,11 @@ mod tests {
         }
     }
 
-    /// Host pose, target pose, host camera, target camera, time offset.
+    /// Host pose, target pose, host camera, target camera; time offsets of both cameras.
     #[derive(Clone, Copy)]
     struct Scene {
         poses: [Pose; 4],
-        time_offset: f64,
+        time_offsets: [f64; 2],
     }
 
     const TWISTS: [Twist; 2] = [
@@ -99,7 +99,7 @@ mod tests {
     fn scene() -> Scene {
         let mut host_cam = pose(0.3);
         host_cam.p = DVec3::new(0.05, 0.1, -0.02);
-        Scene { poses: [pose(1.0), pose(1.2), host_cam, pose(0.25)], time_offset: 0.004 }
+        Scene { poses: [pose(1.0), pose(1.2), host_cam, pose(0.25)], time_offsets: [0.004, -0.003] }
     }
 
     fn camera() -> Camera {
@@ -108,7 +108,7 @@ mod tests {
     }
 
     fn delayed(s: &Scene) -> [DelayedCamera; 2] {
-        [0, 1].map(|k| DelayedCamera::new(&Transform::from(&s.poses[2 + k]), &TWISTS[k], s.time_offset + ROWS[k]))
+        [0, 1].map(|k| DelayedCamera::new(&Transform::from(&s.poses[2 + k]), &TWISTS[k], s.time_offsets[k] + ROWS[k]))
     }
 
     fn pixel(point: &Point, s: &Scene) -> DVec2 {
@@ -153,9 +153,15 @@ mod tests {
                     (0..2).for_each(|k| close(analytic[k][i], numeric[k], what));
                 }
             }
-            let at = |h: f64| pixel(&point, &Scene { time_offset: s.time_offset + h, ..s });
-            let numeric = (at(H) - at(-H)) / (2.0 * H);
-            (0..2).for_each(|k| close(d_time[k], numeric[k], "time"));
+            for (which, what) in ["time of the host", "time of the view"].into_iter().enumerate() {
+                let at = |h: f64| {
+                    let mut s = s;
+                    s.time_offsets[which] += h;
+                    pixel(&point, &s)
+                };
+                let numeric = (at(H) - at(-H)) / (2.0 * H);
+                (0..2).for_each(|k| close(d_time[k][which], numeric[k], what));
+            }
         }
     }
 

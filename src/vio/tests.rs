@@ -4,6 +4,8 @@ use super::estimator::Estimator;
 use super::factors::{of_window, view_rows, Factor};
 use super::graph::Graph;
 use super::inertial::{InertialWeight, MotionSigma};
+use super::projection::{observe, Host};
+use super::rig::CAMERA_DIM_MAX;
 use super::rows::{scatter, FactorRows, POINT_DIM};
 use super::window::{Frame, Layout};
 use super::world::{self, Path, World, FRAME_SECS, RATE_HZ};
@@ -99,6 +101,52 @@ fn prior_learns_no_more_when_the_rig_is_estimated_and_rows_roll() {
         ..VioConfig::default()
     };
     four_directions_stay_empty(1e-9, &all, Span::from_secs(0.002));
+}
+
+/// A view in one camera of a landmark hosted in the other touches the columns of both, one in the host's own camera sums up.
+#[test]
+fn columns_of_two_cameras_match_differences_where_their_offsets_differ() {
+    const H: f64 = 1e-6;
+    let both = VioConfig { estimate_time_offset: true, estimate_extrinsics: true, ..VioConfig::default() };
+    let mut world = World::new(Path { rest: -1.0 });
+    let mut vio = Vio::new(&world.rig, &both);
+    run(&mut vio, 0..60, &mut world);
+    let Graph { window, landmarks, .. } = &mut vio.estimator.graph;
+    // Differences are taken at the estimate, so derivatives have to be.
+    for slot in window.order.clone().iter() {
+        let frame = window.frame_mut(*slot as usize);
+        frame.linearization_point = None;
+        frame.step(&[0.0; 15]);
+    }
+    window.rig.release();
+    window.rig.step(&[0.004, -0.003]);
+    let mut seen = [0; 2];
+    for (l, o) in landmarks.pool.iter().flat_map(|l| l.observations.iter().map(move |o| (l, o))) {
+        let view = |window: &window::Window| {
+            let mut columns = [[0.0; CAMERA_DIM_MAX]; 2];
+            let r = observe(l, &Host::of(l, window), o, window, &mut columns);
+            (r.expect("a landmark in view").px, columns)
+        };
+        seen[usize::from(l.host_camera == o.camera)] += 1;
+        let analytic = view(window).1;
+        for i in 0..window.rig.camera_dim() {
+            let mut at = |h: f64| {
+                let mut error = [0.0; CAMERA_DIM_MAX];
+                error[i] = h;
+                window.rig.save();
+                window.rig.step(&error);
+                let px = view(window).0;
+                window.rig.restore();
+                px
+            };
+            let numeric = (at(H) - at(-H)) / (2.0 * H);
+            for (k, row) in analytic.iter().enumerate() {
+                let error = (row[i] - numeric[k]).abs() / (1.0 + row[i].abs());
+                assert!(error < 2e-6, "column {i}: analytic {}, numeric {}", row[i], numeric[k]);
+            }
+        }
+    }
+    assert!(seen.iter().all(|n| *n > 100), "views in another and in the host's camera: {seen:?}");
 }
 
 /// A window in which only inertial factors and finished landmarks act between the frames that leave and

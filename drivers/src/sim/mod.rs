@@ -74,6 +74,7 @@ pub struct Sim {
     calibration: Calibration,
     rig: Calibration,
     time_offset: Span,
+    late: Vec<Span>,
     spline: Spline,
     /// Stamp of spline time 0.
     start: Nanos,
@@ -138,6 +139,7 @@ impl Sim {
             calibration,
             rig,
             time_offset: scenario.camera_errors.time_offset,
+            late: scenario.camera_errors.late.clone(),
             spline,
             start,
             stamps: imu::ticks(first, last, scenario.rate_hz),
@@ -242,8 +244,10 @@ impl Sim {
         render::depths(&self.lenses[camera], &self.scratch.hits, out);
     }
 
-    /// Moves the person, and sets the views and exposures of a camera's rows, one for all under a global shutter.
+    /// Moves the person, and sets the views and exposures of a camera's rows, one for all under a global shutter, in the frame
+    /// of `t`.
     fn expose(&mut self, t: Nanos, camera: usize) {
+        let t = t + self.late.get(camera).copied().unwrap_or_default();
         if let Some(person) = &self.person {
             let (spline, first) = (&self.spline, (self.stamps[0] - self.start).secs());
             let camera = |t: f64| spline.at(first + t).pose * self.rig.cameras[0].body_from_cam;

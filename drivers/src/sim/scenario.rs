@@ -49,6 +49,8 @@ pub struct Scenario {
 pub struct CameraErrors {
     /// The inertial unit's clock less the stamps of images.
     pub time_offset: Span,
+    /// Camera k takes its images so much after the instant of the frame, whose stamp does not tell; beyond the list, at it.
+    pub late: Vec<Span>,
     /// Camera k truly stands at `body_from_cam * extrinsics[k]`; beyond the list, where the calibration says.
     pub extrinsics: Vec<Pose>,
 }

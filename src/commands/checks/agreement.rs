@@ -122,7 +122,7 @@ impl Follower {
             return None;
         }
         let (odometry, covariance, rig) = (vio.odometry()?, vio.covariance()?, vio.rig()?);
-        let ([offset, offset_sigma_s], [e, sigma]) = (rig.time_offset?, rig.extrinsics[0]?);
+        let ([offset, offset_sigma_s], [e, sigma]) = (rig.time_offsets[0]?, rig.extrinsics[0]?);
         let cam = self.calibration.cameras[0].body_from_cam.q;
         let turned = cam.conjugate() * coarse.rotation.conjugate() * cam * exp(DVec3::new(e[3], e[4], e[5]));
         Some(Fine {

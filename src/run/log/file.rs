@@ -21,7 +21,7 @@ const CHANNELS: [(&str, &str, &str); 4] = [
     (
         STATE,
         "stipple.State",
-        r#"{"type":"object","properties":{"t_ns":{"type":"integer"},"time_offset_ns":{"type":"integer"},"epoch":{"type":"integer"},"estimate":{"type":"object","properties":{
+        r#"{"type":"object","properties":{"t_ns":{"type":"integer"},"time_offsets_ns":{"type":"array","items":{"type":"integer"}},"epoch":{"type":"integer"},"estimate":{"type":"object","properties":{
 "p_m":{"type":"array","items":{"type":"number"}},"q_xyzw":{"type":"array","items":{"type":"number"}},
 "v_world":{"type":"array","items":{"type":"number"}},"gyro_bias":{"type":"array","items":{"type":"number"}},
 "accel_bias":{"type":"array","items":{"type":"number"}}}},"dead_reckoned":{"type":"boolean"},

@@ -16,6 +16,7 @@ pub mod read;
 mod tests;
 
 use super::threads;
+use crate::limits::CAMERAS_MAX;
 use crate::mem::{Footprint, List};
 use crate::vio::{Odometry, Update};
 use crossbeam_queue::ArrayQueue;
@@ -98,8 +99,9 @@ impl Estimate {
 pub struct State {
     /// Stamp of the frame, mid-exposure by the calibration's clocks. The estimate is of this instant by the inertial clock.
     pub t_ns: i64,
-    /// Estimated time from then until the exposure, by the inertial clock; `None` where it is not estimated.
-    pub time_offset_ns: Option<i64>,
+    /// Estimated time from then until the exposure of each camera, by the inertial clock, zero of cameras that the rig has not;
+    /// `None` where it is not estimated.
+    pub time_offsets_ns: Option<[i64; CAMERAS_MAX]>,
     /// Poses of one epoch are in one frame; `vio::Update` says when the next begins.
     pub epoch: u32,
     pub estimate: Option<Estimate>,
@@ -125,7 +127,7 @@ impl State {
         let sigma = update.covariance.map(|c| order.map(|i| c[i][i].sqrt() as f32));
         State {
             t_ns: t.0,
-            time_offset_ns: None,
+            time_offsets_ns: None,
             epoch: update.epoch,
             estimate,
             dead_reckoned: update.dead_reckoned.is_some(),

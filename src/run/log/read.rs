@@ -25,7 +25,8 @@ const READ: usize = 1 << 16;
 const HEAD: usize = 1 + 8;
 const CHUNK_HEAD: usize = HEAD + 8 + 8 + 8 + 4 + 4 + 8;
 
-/// A message of a log.
+/// A message of a log. A reader has one at a time, and most are states.
+#[allow(clippy::large_enum_variant)]
 #[derive(Debug, PartialEq)]
 pub enum Message<'a> {
     State(State),

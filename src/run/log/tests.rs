@@ -35,7 +35,7 @@ fn state(i: u64) -> State {
         t_ns: i as i64 * 50_000_000,
         epoch: 0,
         estimate,
-        time_offset_ns: Some(-1500),
+        time_offsets_ns: Some([-1500, 2500, 0, 0]),
         dead_reckoned: false,
         sigma: Some([0.5; 9]),
         health: 1,

@@ -28,7 +28,7 @@ fn state(i: i64) -> State {
         t_ns: i,
         epoch: (i / 100) as u32,
         estimate,
-        time_offset_ns: (i % 3 == 0).then_some(4),
+        time_offsets_ns: (i % 3 == 0).then_some([4, -4, 0, 0]),
         dead_reckoned: i % 7 == 0,
         sigma: estimate.map(|_| [0.25; 9]),
         health: 1,
