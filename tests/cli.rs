@@ -80,6 +80,25 @@ fn a_rolling_shutter_is_refused_until_the_board_states_its_readout_and_the_repor
 }
 
 #[test]
+fn a_rig_at_rest_is_reported_as_not_found() {
+    let dir = tempfile::tempdir().unwrap();
+    let (dataset, out) = (dir.path().join("flight"), dir.path().join("out"));
+    let o = stipple(&["sim", "static", "--out", dataset.to_str().unwrap(), "--duration", "3"]);
+    assert!(o.status.success(), "{}", text(&o));
+    let o = replay(&dataset, &out, &["--set", "map.enabled=false", "--set", "vio.estimate_extrinsics=true"]);
+    let said = text(&o);
+    assert!(o.status.success() && said.contains("the place of camera 1 is not found"), "{said}");
+    let report: serde_json::Value = serde_json::from_slice(&fs::read(out.join("report.json")).unwrap()).unwrap();
+    let found = report["convergence"].as_array().unwrap();
+    assert!(found.len() == 2 && report["warnings"].as_u64() >= Some(2), "{report}");
+    for (camera, part) in found.iter().enumerate() {
+        assert!(part["part"] == "extrinsics" && part["camera"] == camera && part["converged"] == false, "{part}");
+        assert!(part["sigma_left"].as_f64().unwrap() > 0.5, "{part}");
+    }
+    assert!(fs::read_to_string(out.join("report.html")).unwrap().contains("Camera 1, extrinsics"));
+}
+
+#[test]
 fn missing_folder_is_named() {
     let dir = tempfile::tempdir().unwrap();
     let out = dir.path().join("out");

@@ -155,6 +155,11 @@ fn table_of_rig(report: &Report) -> String {
         let turn = pair(Some(e.theta_rad), Some(e.theta_sigma_rad), DEGREES);
         rows.push((format!("Camera {k}, rotation"), turn, "\u{b0}"));
     }
+    for c in report.convergence.iter().filter(|c| !c.converged) {
+        let of = c.camera.map_or(String::new(), |camera| format!("Camera {camera}, "));
+        let shown = format!("not found, {:.0} % of the deviation at the start left", 100.0 * c.sigma_left);
+        rows.push((format!("{of}{}", c.part.replace('_', " ")), Some(shown), ""));
+    }
     let scales = [
         ("Gyro scale", report.gyro_scale, report.gyro_scale_sigma),
         ("Accelerometer scale", report.accel_scale, report.accel_scale_sigma),

@@ -58,6 +58,8 @@ pub struct Report {
     pub height_bias_m: Option<f64>,
     pub height_bias_sigma_m: Option<f64>,
     pub extrinsics: Vec<ExtrinsicsFound>,
+    /// How well each part is known of what is estimated of the rig.
+    pub convergence: Vec<Convergence>,
     /// Factors less one, by axis.
     pub gyro_scale: Option<[f64; 3]>,
     pub gyro_scale_sigma: Option<[f64; 3]>,
@@ -100,6 +102,18 @@ pub struct TimeOffsetFound {
     pub camera: usize,
     pub offset_s: f64,
     pub offset_sigma_s: f64,
+}
+
+/// Whether a part of the rig was found, and what is left of its deviation.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Convergence {
+    /// `time_offset`, `extrinsics`, `gyro_scale` or `accel_scale`.
+    pub part: String,
+    /// The camera that it is of, if any.
+    pub camera: Option<usize>,
+    pub converged: bool,
+    /// The largest of its deviations, as a share of what it was at the start.
+    pub sigma_left: f64,
 }
 
 /// Where a camera sits over where it was calibrated: position in the body frame, rotation vector in its own.
@@ -178,6 +192,7 @@ mod tests {
         assert!(
             json["curve"].is_array()
                 && json["time_offsets"].is_array()
+                && json["convergence"].is_array()
                 && json["extrinsics"].is_array()
                 && json["kernels"].is_array()
                 && json["warnings"] == 0

@@ -154,8 +154,8 @@ pub fn fly(
                 if let Some(line) = status.epoch_begun(&gauges) {
                     status.say(EventKind::Epoch, &line);
                 }
-                gauges.verdicts.store(packet.verdicts.0, Relaxed);
-                for line in status.cameras_judged(&gauges) {
+                gauges.set_found(&packet);
+                for line in status.rig_judged(&gauges) {
                     status.say(EventKind::Warning, &line);
                     notices.push((EventKind::Warning, line));
                 }

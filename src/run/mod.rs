@@ -209,6 +209,7 @@ pub fn fly(
             (fly_in_real_time(sensors, calibration, tracker, map, &realtime, &mut status), recording)
         }
     };
+    judge_rig(&mut flown, &mut status);
     status.finish();
     flown.warnings.iter().for_each(|warning| print_err(format_args!("stipple: warning: {warning}")));
     let unread = (!live && flown.counters.frames_unreadable.get() == frames as u64).then(|| {
@@ -232,6 +233,15 @@ pub fn fly(
         status.ended_well();
     }
     Ok(Outcome { report, capture, fault })
+}
+
+/// Says what is estimated of the rig and was not found by the end of the flight.
+fn judge_rig(flown: &mut Flown, status: &mut Status) {
+    let Some(run) = flown.tracker.odometry() else { return };
+    for line in status.rig_found(run.back.vio.rig_findings_at_end()) {
+        status.say(EventKind::Warning, &line);
+        flown.notices.push((EventKind::Warning, line));
+    }
 }
 
 /// Cuts a recording to the time it is played for; answers how many frames the run keeps to be judged by.
@@ -381,7 +391,7 @@ pub fn fly_in_real_time(
                 keyframes.pass_on(&packet, ring, &s.counters);
                 s.gauges.frames.fetch_add(1, Relaxed);
                 s.gauges.set_epoch(packet.epoch, packet.health);
-                s.gauges.verdicts.store(packet.verdicts.0, Relaxed);
+                s.gauges.set_found(&packet);
                 s.gauges.posed.fetch_add(u64::from(observes || packet.tracked.is_some()), Relaxed);
                 s.gauges.keyframes.store(keyframes.count, Relaxed);
             }
@@ -455,7 +465,7 @@ fn supervise(
         let hangs = silent.filter(|_| was.is_none()).map(|name| format!("thread {name} gives no sign of life"));
         s.counters.threads_silent.add(u64::from(hangs.is_some()));
         let looked = worker.as_mut().and_then(|w| w.watch(&s.gauges));
-        let (epoch, cameras) = (status.epoch_begun(&s.gauges), status.cameras_judged(&s.gauges));
+        let (epoch, rig) = (status.epoch_begun(&s.gauges), status.rig_judged(&s.gauges));
         let mut say = |kind, line: String| {
             status.say(kind, &line);
             // A cable that comes loose each second, for hours, is in the log.
@@ -465,7 +475,7 @@ fn supervise(
         };
         hangs.into_iter().chain(threads::refused()).for_each(|line| say(EventKind::System, line));
         epoch.into_iter().for_each(|line| say(EventKind::Epoch, line));
-        cameras.into_iter().for_each(|line| say(EventKind::Warning, line));
+        rig.into_iter().for_each(|line| say(EventKind::Warning, line));
         looked.into_iter().for_each(|line| say(EventKind::Map, line));
         std::iter::from_fn(|| s.mailbox.notices.pop()).for_each(|line| say(EventKind::Sensor, line));
         if tracked {

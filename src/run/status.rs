@@ -2,9 +2,10 @@
 
 use super::log::{EventKind, LogSender};
 use super::status_led::StatusLed;
+use super::tracking::FramePacket;
 use crate::counters::Counters;
 use crate::frontend::{Verdict, Verdicts};
-use crate::vio::Health;
+use crate::vio::{Finding, Findings, Health, Part};
 use indicatif::{ProgressBar, ProgressStyle};
 use std::fmt;
 use std::io::{self, IsTerminal, Write as _};
@@ -33,8 +34,9 @@ pub struct Gauges {
     /// The epoch of the newest frame, and the health of the epoch's first.
     pub epoch: AtomicU32,
     pub epoch_health: AtomicU32,
-    /// `Verdicts` on the cameras.
+    /// `Verdicts` on the cameras, and `Findings` on what is estimated of the rig.
     pub verdicts: AtomicU64,
+    pub findings: AtomicU64,
 }
 
 impl Gauges {
@@ -44,6 +46,12 @@ impl Gauges {
             self.epoch_health.store(health.0, Relaxed);
             self.epoch.store(epoch, Release);
         }
+    }
+
+    /// Takes note of what was found of the rig by a frame.
+    pub fn set_found(&self, packet: &FramePacket) {
+        self.verdicts.store(packet.verdicts.0, Relaxed);
+        self.findings.store(packet.findings.0, Relaxed);
     }
 }
 
@@ -59,9 +67,10 @@ pub struct Status {
     next_count: Instant,
     /// Whether it was said that logging ended.
     log_ended: bool,
-    /// The epoch, and the verdicts on cameras, that were told last.
+    /// The epoch, the verdicts on cameras, and the findings on the rig, that were told last.
     epoch: u32,
     verdicts: u64,
+    findings: u64,
 }
 
 const LINE_PERIOD: Duration = Duration::from_secs(1);
@@ -92,6 +101,7 @@ impl Status {
             log_ended: false,
             epoch: 0,
             verdicts: 0,
+            findings: 0,
         }
     }
 
@@ -166,11 +176,22 @@ impl Status {
         Some(format!("epoch {epoch} begins: {why}"))
     }
 
-    /// A line about each finding on the cameras since this was asked last.
-    pub fn cameras_judged(&mut self, g: &Gauges) -> Vec<String> {
+    /// A line about each finding on cameras and rig since this was asked last.
+    pub fn rig_judged(&mut self, g: &Gauges) -> Vec<String> {
         let verdicts = g.verdicts.load(Relaxed);
         let before = std::mem::replace(&mut self.verdicts, verdicts);
-        Verdicts(verdicts & !before).iter().map(|(verdict, cameras)| judged(verdict, cameras)).collect()
+        let of_cameras = Verdicts(verdicts & !before).iter().map(|(verdict, cameras)| judged(verdict, cameras));
+        of_cameras.chain(self.rig_found(Findings(g.findings.load(Relaxed)))).collect()
+    }
+
+    /// A line about each finding on what is estimated of the rig since this was asked last.
+    pub fn rig_found(&mut self, findings: Findings) -> Vec<String> {
+        let before = std::mem::replace(&mut self.findings, findings.0);
+        let new = Findings(findings.0 & !before);
+        let thrown = "what was estimated of the rig can be no rig and is thrown away, its calibration is used again: is it of this \
+                      rig, with its cameras in order?";
+        let thrown = new.has_thrown_away().then(|| thrown.to_string());
+        thrown.into_iter().chain(new.iter().map(|(finding, part)| found(finding, part))).collect()
     }
 
     /// Prints a line that stays, and logs it as an event.
@@ -206,6 +227,29 @@ fn judged(verdict: Verdict, [a, b]: [usize; 2]) -> String {
              judges a calibration by a recording"
         ),
         Verdict::AgreeAfterAll => format!("camera {b} agrees with camera {a} after all"),
+    }
+}
+
+/// Fits an event.
+fn found(finding: Finding, part: Part) -> String {
+    let (name, key) = match part {
+        Part::TimeOffset(c) => (format!("time offset of camera {c}"), "vio.time_offset_sigma_s"),
+        Part::Extrinsics(c) => (format!("place of camera {c}"), "vio.extrinsics_sigma_*"),
+        Part::GyroScale => ("scale of the gyro".into(), "vio.imu_scale_sigma"),
+        Part::AccelScale => ("scale of the accelerometer".into(), "vio.imu_scale_sigma"),
+    };
+    match finding {
+        Finding::Unknown => format!(
+            "the {name} is not found, poses are as wrong as its calibration: turn and accelerate about all axes, or calibrate it"
+        ),
+        Finding::Moving => format!(
+            "the {name} is not found, its estimate goes on moving by many deviations: is a part loose, or the rest of the \
+             calibration wrong?"
+        ),
+        Finding::TooFar => format!(
+            "the {name} is estimated further from its calibration than the board deems possible: calibrate it, or raise {key}"
+        ),
+        Finding::FoundAfterAll => format!("the {name} is found after all"),
     }
 }
 

@@ -9,9 +9,10 @@ use crate::mem;
 use crate::output::html::{write_html, Evidence};
 use crate::output::metrics::{percentile, trajectory_error};
 use crate::output::panel::Picture;
-use crate::output::report::{seconds_to, ExtrinsicsFound, Report, TimeOffsetFound, GOOD_DB};
+use crate::output::report::{seconds_to, Convergence, ExtrinsicsFound, Report, TimeOffsetFound, GOOD_DB};
 use crate::output::trajectory::{epoch_at, TumWriter};
 use crate::output::{atomically, OutputDir};
+use crate::vio::Part;
 use std::borrow::Cow;
 use std::fmt;
 use std::path::PathBuf;
@@ -197,6 +198,17 @@ fn track_figures(report: &mut Report, flown: &Flown) -> Vec<TimedPose> {
             })
         });
         report.extrinsics = found.collect();
+        let judged = run.back.vio.rig_parts().map(|judged| {
+            let (part, camera) = match judged.part {
+                Part::TimeOffset(c) => ("time_offset", Some(c)),
+                Part::Extrinsics(c) => ("extrinsics", Some(c)),
+                Part::GyroScale => ("gyro_scale", None),
+                Part::AccelScale => ("accel_scale", None),
+            };
+            let (converged, sigma_left) = (judged.doubt.is_none(), judged.left);
+            Convergence { part: part.into(), camera, converged, sigma_left }
+        });
+        report.convergence = judged.collect();
         if let Some([v, s]) = rig.imu_scale {
             (report.gyro_scale, report.gyro_scale_sigma) = (Some(three(&v, 0)), Some(three(&s, 0)));
             (report.accel_scale, report.accel_scale_sigma) = (Some(three(&v, 3)), Some(three(&s, 3)));

@@ -19,7 +19,7 @@ use crate::counters::Counters;
 use crate::frontend::{Frontend, Prediction, Rejected, Tracks, Verdicts};
 use crate::limits::{FRAMES, IMU_BETWEEN_FRAMES};
 use crate::mem::{seal_thread, Footprint, List, Thinned};
-use crate::vio::{Health, Known, Predictor, Vio};
+use crate::vio::{Findings, Health, Known, Predictor, Vio};
 use crossbeam_queue::ArrayQueue;
 use std::sync::atomic::AtomicBool;
 use std::sync::Arc;
@@ -60,6 +60,8 @@ pub struct FramePacket {
     pub health: Health,
     /// What was found so far of cameras that do not see what the calibration says.
     pub verdicts: Verdicts,
+    /// What was found so far of what is estimated of the rig.
+    pub findings: Findings,
     /// When the front end took it.
     begun: Instant,
     /// CPU time that following its points took.
@@ -80,6 +82,7 @@ impl FramePacket {
             epoch: 0,
             health: Health::default(),
             verdicts: Verdicts::default(),
+            findings: Findings::default(),
             begun: Instant::now(),
             cpu: Duration::ZERO,
         })
@@ -207,6 +210,7 @@ impl Back {
         }
         let update = self.vio.on_tracks(&packet.tracks);
         (packet.epoch, packet.health) = (update.epoch, update.health);
+        packet.findings = self.vio.rig_findings();
         if self.epochs.last().is_none_or(|(_, last)| *last != update.epoch) {
             let _ = self.epochs.push((packet.frames.t, update.epoch));
         }

@@ -15,6 +15,7 @@
 //! bit-identical output; `hash` compares keyframe poses. Nothing is allocated after `new`.
 
 mod alignment;
+mod convergence;
 mod estimator;
 mod factors;
 mod graph;
@@ -43,6 +44,7 @@ mod triangulation;
 mod window;
 mod zero_velocity;
 
+pub use convergence::{Finding, Findings, Judged, Part};
 pub use health::Health;
 #[cfg(feature = "instruments")]
 pub use predictor::Predicted;
@@ -51,6 +53,7 @@ pub use predictor::Predictor;
 use crate::config::{BaroConfig, VioConfig};
 use crate::frontend::{Rejected, Tracks};
 use crate::limits::CAMERAS_MAX;
+use convergence::Convergence;
 use estimator::{Estimator, Step, CONNECTED_FEW};
 use glam::DVec3;
 use health::{quality, Reset, SIGMA_V_UNOBSERVED};
@@ -149,6 +152,7 @@ pub struct Vio {
     estimator: Estimator,
     monitor: Monitor,
     recovery: Recovery,
+    convergence: Convergence,
     /// Covariance of the newest state in the world of the first start.
     covariance: Option<Covariance>,
     /// Stamp of the newest frame.
@@ -163,10 +167,12 @@ pub struct Vio {
 
 impl Vio {
     pub fn new(calibration: &Calibration, config: &VioConfig) -> Vio {
+        let estimator = Estimator::new(calibration, config);
         Vio {
             imu: ImuRing::new(calibration.imu.rate_hz),
             initializer: Initializer::new(),
-            estimator: Estimator::new(calibration, config),
+            convergence: Convergence::new(estimator.rig_deviations),
+            estimator,
             monitor: Monitor::default(),
             recovery: Recovery::default(),
             covariance: None,
@@ -325,6 +331,10 @@ impl Vio {
     fn advance(&mut self, tracks: &Tracks) -> Step {
         let step = self.estimator.advance(tracks, &self.imu, self.covariance.as_ref());
         self.take(&step);
+        if let Some(evidence) = step.evidence.as_ref().filter(|_| !step.at_rest) {
+            let Estimator { graph, rig_deviations, .. } = &self.estimator;
+            self.convergence.add(evidence.dt, &graph.window.rig, rig_deviations);
+        }
         step
     }
 
@@ -400,6 +410,9 @@ impl Vio {
 
     fn reset_for(&mut self, why: Reset) {
         self.recovery.reset(why);
+        let thrown_away = !self.estimator.graph.window.rig.is_sane();
+        self.stats.rigs_thrown_away += u64::from(thrown_away);
+        self.convergence.restart(thrown_away);
         self.estimator.clear();
         self.initializer.clear();
         self.monitor = Monitor::default();
@@ -434,6 +447,21 @@ impl Vio {
     pub fn rig(&self) -> Option<RigEstimate> {
         let rig = &self.estimator.graph.window.rig;
         rig.parts.any().then(|| RigEstimate::new(rig, &self.estimator.rig_deviations))
+    }
+
+    /// What was found so far of what is estimated of the rig, after some time of motion.
+    pub fn rig_findings(&self) -> Findings {
+        self.convergence.findings
+    }
+
+    /// The same at the end of a run, however short.
+    pub fn rig_findings_at_end(&self) -> Findings {
+        self.convergence.concluded(&self.estimator.graph.window.rig, &self.estimator.rig_deviations)
+    }
+
+    /// How well each part of the rig is known that is estimated.
+    pub fn rig_parts(&self) -> impl Iterator<Item = Judged> + '_ {
+        self.convergence.parts(&self.estimator.graph.window.rig, &self.estimator.rig_deviations)
     }
 
     /// What the tracker works by.

@@ -80,19 +80,12 @@ pub struct RigEstimate {
 
 impl RigEstimate {
     pub fn new(rig: &RigState, deviations: &[f64; RIG_DIM]) -> RigEstimate {
-        let time = |c: usize| Some([rig.now.time_offsets[c], deviations[rig.time_column(c)?]]);
-        let extrinsics = |c: usize| {
-            let at = rig.extrinsic_column(c)?;
-            let (from, to) = (&rig.calibrated[c], &rig.now.body_from_cam[c]);
-            let (p, th) = (to.p - from.p, so3::log(from.q.conjugate() * to.q));
-            Some([[p.x, p.y, p.z, th.x, th.y, th.z], std::array::from_fn(|i| deviations[at + i])])
-        };
-        let (g, a) = (rig.now.gyro_scale, rig.now.accel_scale);
-        let scales = [g.x, g.y, g.z, a.x, a.y, a.z];
+        let errors = rig.errors();
+        let six = |at: usize| [&errors, deviations].map(|v| std::array::from_fn(|i| v[at + i]));
         RigEstimate {
-            time_offsets: std::array::from_fn(time),
-            extrinsics: std::array::from_fn(extrinsics),
-            imu_scale: rig.parts.imu_scale.then(|| [scales, std::array::from_fn(|i| deviations[rig.camera_dim() + i])]),
+            time_offsets: std::array::from_fn(|c| rig.time_column(c).map(|at| [errors[at], deviations[at]])),
+            extrinsics: std::array::from_fn(|c| rig.extrinsic_column(c).map(six)),
+            imu_scale: rig.parts.imu_scale.then(|| six(rig.camera_dim())),
         }
     }
 }
@@ -192,6 +185,27 @@ impl RigState {
     pub fn extrinsic_column(&self, camera: usize) -> Option<usize> {
         let is_estimated = self.parts.extrinsics && camera < self.cameras.len();
         is_estimated.then(|| self.time_dim() + EXTRINSIC_DIM * camera)
+    }
+
+    /// Estimate of every column, over the calibration.
+    pub fn errors(&self) -> [f64; RIG_DIM] {
+        let mut errors = [0.0; RIG_DIM];
+        let mut put = |at: usize, vectors: [DVec3; 2]| {
+            errors[at..].iter_mut().zip(vectors.iter().flat_map(DVec3::to_array)).for_each(|(to, x)| *to = x);
+        };
+        for c in 0..self.cameras.len() {
+            if let Some(at) = self.extrinsic_column(c) {
+                let (from, to) = (&self.calibrated[c], &self.now.body_from_cam[c]);
+                put(at, [to.p - from.p, so3::log(from.q.conjugate() * to.q)]);
+            }
+        }
+        if self.parts.imu_scale {
+            put(self.camera_dim(), [self.now.gyro_scale, self.now.accel_scale]);
+        }
+        for c in 0..self.cameras.len() {
+            self.time_column(c).into_iter().for_each(|at| errors[at] = self.now.time_offsets[c]);
+        }
+        errors
     }
 
     /// The cameras at the estimate.

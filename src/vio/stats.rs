@@ -38,6 +38,8 @@ counters! {
     resets_unseen,
     /// The state was not finite, or beyond what flies.
     resets_state,
+    /// Resets at which what was learnt of the rig was thrown away, since no rig could be so.
+    rigs_thrown_away,
     /// Frames of which a camera saw next to nothing while another did.
     camera_blind,
     /// Pressures that were no number, of no altitude that is flown, or not newer than the last.

@@ -12,6 +12,7 @@ use super::world::{self, Path, World, FRAME_SECS, RATE_HZ};
 use super::*;
 use crate::limits::FRAMES;
 use crate::math::dense::System;
+use glam::DQuat;
 use nalgebra::{Matrix3, Vector3};
 use stipple_drivers::Span;
 
@@ -147,6 +148,33 @@ fn columns_of_two_cameras_match_differences_where_their_offsets_differ() {
         }
     }
     assert!(seen.iter().all(|n| *n > 100), "views in another and in the host's camera: {seen:?}");
+}
+
+/// So little motion that nothing can be told for half a minute, then a flight.
+#[test]
+fn a_place_that_is_not_found_is_said_to_be_so_after_some_motion_and_found_later() {
+    const CALM: f64 = 25.0;
+    let flight = Path { rest: CALM };
+    let path = move |t: f64| {
+        let sway = Pose::new(DQuat::IDENTITY, DVec3::new(0.0, 0.02 * (2.0 * t).sin(), 0.0));
+        flight.pose(t) * sway
+    };
+    let mut world = World::seen_from(path, world::room(1500, &mut world::Noise(7)), world::Noise(7));
+    let usual = VioConfig { zero_velocity: false, ..VioConfig::default() };
+    let config = VioConfig { estimate_extrinsics: true, extrinsics_sigma_m: 0.03, ..usual };
+    let mut vio = Vio::new(&world.rig, &config);
+    let findings = |vio: &Vio| vio.rig_findings().iter().collect::<Vec<_>>();
+    run(&mut vio, 0..360, &mut world);
+    assert_eq!(findings(&vio), [], "too early to tell");
+    run(&mut vio, 360..480, &mut world);
+    let unknown = [0, 1].map(|c| (Finding::Unknown, Part::Extrinsics(c)));
+    assert_eq!(findings(&vio), unknown);
+    run(&mut vio, 480..900, &mut world);
+    vio.rig_parts().for_each(|part| eprintln!("{part:.2?}"));
+    let found = [0, 1].map(|c| (Finding::FoundAfterAll, Part::Extrinsics(c)));
+    assert_eq!(findings(&vio), [unknown, found].concat());
+    vio.convergence.restart(true);
+    assert!(vio.rig_findings().has_thrown_away() && findings(&vio).len() == 4);
 }
 
 /// A window in which only inertial factors and finished landmarks act between the frames that leave and

@@ -148,7 +148,8 @@ pub enum EventKind {
     Start,
     /// A sensor was lost or came back.
     Sensor,
-    /// What is wrong with a recording, or cameras that do not see what the calibration says.
+    /// What is wrong with a recording, cameras that do not see what the calibration says, or what is estimated of the rig and
+    /// not found.
     Warning,
     /// A thread hangs, or the system refuses what a run asks for.
     System,
