@@ -23,24 +23,24 @@ use glam::{DMat3, DQuat, DVec3};
 use nalgebra::{Matrix3, SMatrix};
 use stipple_drivers::{Nanos, Pose};
 
-/// Frames: how many at most and at least, and how far apart they are at least, s.
+/// Frames that are aligned, at most and at least, and the least time between two, s.
 pub const FRAMES_MAX: usize = 10;
 const FRAMES_MIN: usize = 6;
 const SPACING: f64 = 0.09;
-/// Frames from one to that which shows how it turned.
+/// Frames between the two of a pair whose epipolar planes tell the gyro's bias.
 const PAIR: usize = 2;
-/// Time without success after which a start has to do without, s.
+/// Time without success after which the start falls back to the mean force, s.
 const WAIT: f64 = 1.5;
-/// Bounds on what fits, in deviations of a direction, one for each step.
+/// Width of the robust weight at each step, in deviations of a bearing.
 const BOUNDS: [f64; 12] = [200.0, 100.0, 50.0, 25.0, 12.0, 8.0, 6.0, 4.0, 3.0, 3.0, 3.0, 3.0];
-/// The same for the path, whose rotations are not that well known yet.
+/// The same for the path, while the rotations are still less well known.
 const PATH_BOUNDS: [f64; 4] = [100.0, 50.0, 30.0, 20.0];
-/// How far the samples may lead from the path, m, and how wrong gravity's length may be, m/s², by the biases, while a factor is
-/// sought; and the factors that are tried.
+/// What unknown biases may do while the scale is searched: to positions, m, and to gravity's length, m/s².
 const ROUGH_POSITION: f64 = 0.02;
 const GRAVITY_LENGTH: f64 = 0.2;
-/// How far the samples have to lead from a parabola to tell a factor, m: several times what their noise does.
+/// Least distance of the sampled path from a parabola that tells the scale, m: several times what the samples' noise makes.
 const EXCITED: f64 = 0.002;
+/// Scales that are tried: how many, the least, and the ratio of two neighbours.
 const FACTORS: i32 = 120;
 const FACTOR_MIN: f64 = 0.02;
 const FACTOR_STEP: f64 = 1.07;
@@ -48,7 +48,7 @@ const FACTOR_STEP: f64 = 1.07;
 const GRAVITY_LENGTH_FINE: f64 = 0.01;
 /// Tracks that have to fit.
 const TRACKS_MIN: usize = 12;
-/// A point nearer than this, m, is behind the camera or wrong.
+/// Least distance of a point ahead of its camera, m.
 const DISTANCE_MIN: f64 = 0.1;
 
 const _: () = assert!(15 * FRAMES_MAX + RIG_DIM <= WINDOW_DIM, "the window takes all frames as states");

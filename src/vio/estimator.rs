@@ -35,11 +35,13 @@ const MOVING: f64 = 0.3;
 const SPEED_MAX: f64 = 100.0;
 const ACCEL_BIAS_MAX: f64 = 5.0;
 const GYRO_BIAS_MAX: f64 = 1.0;
-/// An alignment: what the prior says of tilt, rad, and velocity, m/s; times as far as usual a view may be off after each
-/// optimization; the relative deviation of the speed, and so of the scale, and the squared deviations a degree of freedom that are accepted.
+/// Prior of a window that starts in motion: deviations of tilt, rad, and of velocity, m/s.
 const TILT_UNKNOWN: f64 = 1.0;
 const V_UNKNOWN: f64 = 30.0;
+/// Bound on outliers after each of its optimizations, as a factor on the usual one.
 const ALIGNED_OUTLIERS: [f64; 3] = [5.0, 1.0, 1.0];
+/// Such a start is accepted when the speed's deviation is below this share of the speed, and the mean squared residual, in
+/// deviations and for each degree of freedom, below this bound.
 const SPEED_KNOWN: f64 = 0.1;
 const MISFIT_MAX: f64 = 1.5;
 /// Deviations of the rig by which the bound of outliers is widened.
