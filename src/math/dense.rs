@@ -66,6 +66,25 @@ impl System {
         self.h[i * self.capacity + j] += x;
     }
 
+    /// Adds `AᵀB` of two rows, `of_rows` of A in the columns `rows`, and B in `columns`, which are not after them; of
+    /// the same columns only the lower triangle.
+    #[inline(always)]
+    pub fn add_product(&mut self, rows: Columns, of_rows: [&[f64]; 2], columns: Columns, of_columns: [&[f64]; 2]) {
+        for (p, (x, y)) in of_rows[0].iter().zip(of_rows[1]).enumerate() {
+            let n = if rows.at == columns.at { p + 1 } else { columns.len };
+            let to = &mut self.h[(rows.at + p) * self.capacity + columns.at..][..n];
+            let pairs = of_columns[0].iter().zip(of_columns[1]);
+            to.iter_mut().zip(pairs).for_each(|(h, (a, b))| *h += x * a + y * b);
+        }
+    }
+
+    /// Adds `Aᵀr` of two rows.
+    #[inline(always)]
+    pub fn add_linear(&mut self, rows: Columns, of_rows: [&[f64]; 2], r: [f64; 2]) {
+        let pairs = of_rows[0].iter().zip(of_rows[1]);
+        self.b[rows.at..].iter_mut().zip(pairs).for_each(|(to, (x, y))| *to += x * r[0] + y * r[1]);
+    }
+
     /// Scales the diagonal to one and factors, for `substitute`. Destroys the system.
     fn factor(&mut self) {
         let (n, c) = (self.dim, self.capacity);

@@ -4,4 +4,4 @@ pub mod block;
 pub mod dense;
 pub mod qr;
 pub mod so3;
-mod wide;
+pub(crate) mod wide;

@@ -11,6 +11,8 @@ use super::wide::wide;
 /// What is left of a column is rounding when it is under this many epsilons of its length before
 /// elimination: a few roundings in each of a hundred reflections.
 const RANK_EPSILONS: f64 = 200.0;
+/// The same of squared lengths.
+pub const RANK_SQUARE: f64 = RANK_EPSILONS * RANK_EPSILONS * f64::EPSILON * f64::EPSILON;
 /// Elements a row is padded to: a whole number of the widest vectors.
 const LANES: usize = 8;
 /// Rows of the product computed together, to use each load several times.
@@ -148,7 +150,6 @@ wide! {
     fn reflect<'a>(rows: &'a mut Rows, from: usize, to: usize, pivot: usize) -> usize {
         let mut pivot = pivot;
         let stride = rows.stride;
-        let least = (RANK_EPSILONS * f64::EPSILON).powi(2);
         for c in from..to {
             if pivot == rows.rows {
                 break;
@@ -160,7 +161,7 @@ wide! {
                 square += v[i] * v[i];
             }
             // Also false where anything is not finite.
-            if !(square > least * rows.lengths[c]) {
+            if !(square > RANK_SQUARE * rows.lengths[c]) {
                 rows.not_finite += u64::from(!(square + rows.lengths[c]).is_finite());
                 (pivot..rows.rows).for_each(|i| rows.a[i * stride + c] = 0.0);
                 continue;

@@ -184,7 +184,7 @@ pub fn view_rows(landmark: &Landmark, window: &Window, model: &Model, layout: &L
     touched[host] = others;
     let frames = (0..FRAMES).filter(|s| touched[*s] && others).filter_map(|s| layout.pose(s));
     out.begin(POINT_DIM, frames.map(|at| Columns { at, len: POSE_DIM }).chain(layout.cameras()));
-    let host_at = layout.pose(host).filter(|_| others).map(|at| out.offset(at));
+    let host_at = layout.pose(host).filter(|_| others);
 
     let mut cost = 0.0;
     let inv_sigma = 1.0 / model.config.observation_sigma_px;
@@ -200,7 +200,12 @@ pub fn view_rows(landmark: &Landmark, window: &Window, model: &Model, layout: &L
         let (weight, c) = huber(r.px.length() * inv_sigma, huber_width);
         cost += c;
         let weight = weight.sqrt() * inv_sigma;
-        let target_at = layout.pose(o.slot as usize).filter(|_| o.slot != landmark.host).map(|at| out.offset(at));
+        let target_at = layout.pose(o.slot as usize).filter(|_| o.slot != landmark.host);
+        // In its host's own frame a view says nothing about poses.
+        let frames = host_at.zip(target_at).map(|(host, target)| [host, target]);
+        let frames_at = frames.map(|at| at.map(|at| out.offset(at)));
+        let ascending = frames.map(|[a, b]| [a.min(b), a.max(b)]);
+        out.frames.push(ascending).expect("OBSERVATIONS is the most a landmark has");
         for axis in 0..2 {
             let row = out.rows.push();
             let mut put = |at: usize, x: &[f64]| {
@@ -210,8 +215,7 @@ pub fn view_rows(landmark: &Landmark, window: &Window, model: &Model, layout: &L
             if let Some((at, len)) = cameras_at {
                 put(at, &columns[axis][..len]);
             }
-            // In its host's own frame a view says nothing about poses.
-            if let (Some(host_at), Some(target_at)) = (host_at, target_at) {
+            if let Some([host_at, target_at]) = frames_at {
                 put(host_at, &r.d_host[axis]);
                 put(target_at, &r.d_target[axis]);
             }

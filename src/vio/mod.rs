@@ -16,6 +16,7 @@
 
 mod alignment;
 mod convergence;
+mod elimination;
 mod estimator;
 mod factors;
 mod graph;
@@ -526,7 +527,7 @@ impl Vio {
 #[doc(hidden)]
 pub mod instruments {
     pub use super::estimator::Estimator;
-    pub use super::factors::{of_window, Factor};
+    pub use super::factors::view_rows;
     pub use super::graph::Graph;
     pub use super::inertial::Covariance;
     pub use super::preintegration::Increment;

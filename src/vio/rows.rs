@@ -1,6 +1,6 @@
 //! The rows `[J | r]` of one factor: only the columns it touches, and how they go into a system or a stack.
 
-use crate::limits::{CAMERAS_MAX, FRAMES, HEIGHT_DIM, OBSERVATIONS, RIG_DIM, WINDOW_DIM};
+use crate::limits::{CAMERAS_MAX, FRAMES, HEIGHT_DIM, LANDMARKS, OBSERVATIONS, RIG_DIM, WINDOW_DIM};
 use crate::math::dense::{add_gram, Columns, System};
 use crate::math::qr::Rows;
 use crate::mem::List;
@@ -12,8 +12,11 @@ pub const POINT_DIM: usize = 3;
 pub const PARTS_MAX: usize = FRAMES + 2;
 /// Columns besides those of the point.
 pub const SHARED_DIM: usize = super::window::POSE_DIM * FRAMES + RIG_DIM;
-const COLS_MAX: usize = POINT_DIM + SHARED_DIM + 1;
-const ROWS_MAX: usize = 2 * OBSERVATIONS + 1;
+pub const COLS_MAX: usize = POINT_DIM + SHARED_DIM + 1;
+/// Rows of the largest factor.
+pub const ROWS_MAX: usize = 2 * OBSERVATIONS + 1;
+/// Rows that a landmark's point takes with it, of all landmarks.
+const POINT_ROWS_MAX: usize = POINT_DIM * LANDMARKS;
 /// Rows of the stack of a marginalization: what stays of it when triangular, and the largest factors. How many there are
 /// decides when it is made triangular, and so the last bits: those of heights and of the second to last camera's time offset
 /// have room among them.
@@ -27,15 +30,28 @@ pub struct FactorRows {
     pub columns: List<Columns, PARTS_MAX>,
     /// Columns before them that are the factor's own.
     own: usize,
+    /// A landmark's rows come in pairs, a view each. The columns of the window at which the poses of its two frames begin,
+    /// ascending; `None` where the pair is about the point and the cameras alone.
+    pub frames: List<Option<[usize; 2]>, OBSERVATIONS>,
     gram: Vec<f64>,
 }
 
 impl FactorRows {
     pub fn new() -> FactorRows {
+        FactorRows::with_room(ROWS_MAX)
+    }
+
+    /// Room for the rows that the points of all landmarks take with them.
+    pub fn of_points() -> FactorRows {
+        FactorRows::with_room(POINT_ROWS_MAX)
+    }
+
+    fn with_room(rows_max: usize) -> FactorRows {
         FactorRows {
-            rows: Rows::new(ROWS_MAX, COLS_MAX),
+            rows: Rows::new(rows_max, COLS_MAX),
             columns: List::default(),
             own: 0,
+            frames: List::default(),
             gram: vec![0.0; Rows::gram_len(COLS_MAX)],
         }
     }
@@ -48,6 +64,7 @@ impl FactorRows {
         }
         self.columns.sort_unstable_by_key(|c| c.at);
         self.own = own;
+        self.frames.clear();
         self.rows.clear(own + self.columns.iter().map(|c| c.len).sum::<usize>() + 1);
     }
 
@@ -59,6 +76,13 @@ impl FactorRows {
     /// Adds the square of the rows from `first`, the factor's own columns left out.
     pub fn add_to(&mut self, first: usize, system: &mut System) {
         let stride = self.rows.gram(first, &mut self.gram);
+        add_gram(system, &self.gram, stride, self.own, &self.columns);
+    }
+
+    /// Subtracts the square of all rows.
+    pub fn subtract_from(&mut self, system: &mut System) {
+        let stride = self.rows.gram(0, &mut self.gram);
+        self.gram[..self.rows.cols() * stride].iter_mut().for_each(|x| *x = -*x);
         add_gram(system, &self.gram, stride, self.own, &self.columns);
     }
 

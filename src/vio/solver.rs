@@ -1,20 +1,15 @@
-//! Levenberg-Marquardt over the window, landmarks eliminated one by one by QR.
-//!
-//! What is summed up is the square of the rows that QR left without their landmark, dimension of
-//! the window; of a landmark's own three rows the step of its point is found afterwards. The sum is
-//! solved with its diagonal scaled to one.
+//! Levenberg-Marquardt over the window. Landmarks are eliminated (`elimination.rs`), and what is left is solved with its
+//! diagonal scaled to one.
 
-use super::factors::{self, Factor};
+use super::elimination::Elimination;
+use super::factors::{self, view_rows, Factor};
 use super::graph::Graph;
 use super::inertial::{Covariance, Mat15};
 use super::model::Model;
-use super::reprojection::Point;
-use super::rows::{FactorRows, PARTS_MAX, POINT_DIM, SHARED_DIM};
+use super::rows::FactorRows;
 use super::window::Layout;
-use crate::limits::{LANDMARKS, WINDOW_DIM};
-use crate::math::dense::{eliminate, Columns, System};
-use crate::mem::List;
-use glam::DVec2;
+use crate::limits::WINDOW_DIM;
+use crate::math::dense::{eliminate, System};
 use nalgebra::SMatrix;
 
 /// Damping, as a share of the diagonal: at the start, at least, at most.
@@ -30,90 +25,13 @@ const COST_NUMERIC: f64 = 1e-3;
 /// Added to the diagonal whatever lambda is, so that unobserved directions stay put.
 const DAMPING_MIN: f64 = 1e-6;
 
-/// A landmark as QR left it: the three rows that hold its point, `R d + W dx + g = 0`, give its step d.
-#[derive(Clone, Debug)]
-struct Eliminated {
-    /// Upper triangle.
-    r: [[f64; POINT_DIM]; POINT_DIM],
-    w: [[f64; SHARED_DIM]; POINT_DIM],
-    g: [f64; POINT_DIM],
-    /// Columns of the window that W is about.
-    columns: List<Columns, PARTS_MAX>,
-    /// Its views determine the point; otherwise it does not move.
-    determined: bool,
-    /// The point before the step.
-    saved: Point,
-}
-
-impl Eliminated {
-    fn empty() -> Eliminated {
-        Eliminated {
-            r: [[0.0; POINT_DIM]; POINT_DIM],
-            w: [[0.0; SHARED_DIM]; POINT_DIM],
-            g: [0.0; POINT_DIM],
-            columns: List::default(),
-            determined: false,
-            saved: Point::default(),
-        }
-    }
-
-    fn take(&mut self, rows: &FactorRows, point: Point, determined: bool) {
-        (self.saved, self.determined) = (point, determined);
-        if !determined {
-            return;
-        }
-        self.columns.clone_from(&rows.columns);
-        let n = rows.rows.cols() - 1 - POINT_DIM;
-        for i in 0..POINT_DIM {
-            let row = rows.rows.row(i);
-            self.r[i].copy_from_slice(&row[..POINT_DIM]);
-            self.w[i][..n].copy_from_slice(&row[POINT_DIM..POINT_DIM + n]);
-            self.g[i] = row[POINT_DIM + n];
-        }
-    }
-
-    /// Decrease of the cost by the point's own step.
-    fn decrease(&self) -> f64 {
-        if self.determined {
-            0.5 * self.g.iter().map(|g| g * g).sum::<f64>()
-        } else {
-            0.0
-        }
-    }
-
-    /// Standard deviation of the inverse distance, the frames taken as known; infinite when nothing determines it.
-    fn rho_sigma(&self) -> f32 {
-        if self.determined {
-            (1.0 / self.r[POINT_DIM - 1][POINT_DIM - 1].abs()) as f32
-        } else {
-            f32::INFINITY
-        }
-    }
-
-    fn step(&self, dx: &[f64]) -> [f64; POINT_DIM] {
-        let mut d = [0.0; POINT_DIM];
-        if self.determined {
-            for i in (0..POINT_DIM).rev() {
-                let mut sum = self.g[i];
-                let mut w = self.w[i].iter();
-                for c in self.columns.iter() {
-                    sum += w.by_ref().zip(&dx[c.at..c.at + c.len]).map(|(w, x)| w * x).sum::<f64>();
-                }
-                (i + 1..POINT_DIM).for_each(|j| sum += self.r[i][j] * d[j]);
-                d[i] = -sum / self.r[i][i];
-            }
-        }
-        d
-    }
-}
-
 /// Buffers of the solver, bought once.
 #[derive(Clone, Debug)]
 pub struct Solver {
     system: System,
     factor: System,
     pub rows: FactorRows,
-    eliminated: Vec<Eliminated>,
+    elimination: Elimination,
     dx: Vec<f64>,
 }
 
@@ -133,7 +51,7 @@ impl Solver {
             system: System::new(WINDOW_DIM),
             factor: System::new(WINDOW_DIM),
             rows: FactorRows::new(),
-            eliminated: vec![Eliminated::empty(); LANDMARKS],
+            elimination: Elimination::new(),
             dx: vec![0.0; WINDOW_DIM],
         }
     }
@@ -143,24 +61,23 @@ impl Solver {
         let Graph { window, landmarks, prior } = graph;
         let (system, rows) = (&mut self.system, &mut self.rows);
         system.clear(layout.dim);
+        self.elimination.begin(layout);
         let mut cost = prior.add_to(window, layout, system);
-        let mut eliminated = self.eliminated.iter_mut();
         for factor in factors::of_window(window, &landmarks.pool) {
-            let linearized = factor.linearize(window, model, layout, rows);
-            cost += linearized.cost;
-            if let Some(first) = linearized.first {
-                rows.add_to(first, system);
-            }
             if let Factor::Landmark(l) = factor {
-                let out = eliminated.next().expect("room for every landmark");
-                out.take(rows, l.point, linearized.first.is_some());
+                cost += view_rows(l, window, model, layout, rows);
+                self.elimination.eliminate(l, rows, layout.cameras(), system);
+            } else {
+                cost += factor.linearize(window, model, layout, rows).cost;
+                rows.add_to(0, system);
             }
         }
+        self.elimination.subtract_from(system);
         cost
     }
 
     /// Solves the damped system; answers the decrease it predicts, `None` when not finite.
-    pub fn step(&mut self, lambda: f64, landmarks: usize) -> Option<f64> {
+    pub fn step(&mut self, lambda: f64) -> Option<f64> {
         let n = self.system.dim;
         let damping = |h: f64| (lambda * h).max(DAMPING_MIN);
         self.system.solve_damped(damping, &mut self.factor, &mut self.dx);
@@ -168,17 +85,13 @@ impl Solver {
         for (i, x) in self.dx[..n].iter().enumerate() {
             decrease += 0.5 * (damping(self.system.at(i, i)) * x * x - x * self.system.b[i]);
         }
-        decrease += self.eliminated[..landmarks].iter().map(Eliminated::decrease).sum::<f64>();
+        decrease += self.elimination.decrease();
         (decrease.is_finite() && self.dx[..n].iter().all(|x| x.is_finite())).then_some(decrease)
     }
 
     fn apply(&self, graph: &mut Graph, layout: &Layout) {
         graph.window.step(layout, &self.dx);
-        for (l, e) in graph.landmarks.pool.iter_mut().zip(&self.eliminated) {
-            let [x, y, rho] = e.step(&self.dx);
-            l.point.s += DVec2::new(x, y);
-            l.point.rho = (l.point.rho + rho).max(0.0);
-        }
+        self.elimination.apply(&mut graph.landmarks.pool, &self.dx);
     }
 
     /// The undamped step, in the columns of `Layout::of`, for tests of what the system says.
@@ -226,7 +139,7 @@ impl Solver {
         let mut outcome = Outcome::default();
         while outcome.iterations < model.config.iterations_max && lambda <= LAMBDA_MAX {
             outcome.iterations += 1;
-            let Some(predicted) = self.step(lambda, graph.landmarks.pool.len()) else {
+            let Some(predicted) = self.step(lambda) else {
                 outcome.failures += 1;
                 (lambda, growth) = (lambda * 10.0, 2.0);
                 continue;
@@ -246,9 +159,7 @@ impl Solver {
                 self.linearize(graph, model, &layout);
             } else {
                 graph.window.restore();
-                for (l, e) in graph.landmarks.pool.iter_mut().zip(&self.eliminated) {
-                    l.point = e.saved;
-                }
+                self.elimination.restore(&mut graph.landmarks.pool);
                 if predicted < COST_NUMERIC {
                     break;
                 }
@@ -256,9 +167,7 @@ impl Solver {
                 (lambda, growth) = (lambda * growth, growth * 2.0);
             }
         }
-        for (l, e) in graph.landmarks.pool.iter_mut().zip(&self.eliminated) {
-            l.rho_sigma = e.rho_sigma();
-        }
+        self.elimination.tell_deviations(&mut graph.landmarks.pool);
         outcome
     }
 }

@@ -315,6 +315,11 @@ impl Layout {
         (len > 0).then_some(Columns { at, len })
     }
 
+    /// Columns of all poses.
+    pub fn poses(&self) -> impl Iterator<Item = Columns> + '_ {
+        self.pose.iter().flatten().map(|at| Columns { at: *at, len: POSE_DIM })
+    }
+
     /// Columns of a frame's pose, then of its velocity and biases.
     pub fn state(&self, slot: usize) -> [Option<Columns>; 2] {
         let motion = self.motion[slot].map(|at| Columns { at, len: MOTION_DIM });

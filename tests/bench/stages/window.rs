@@ -4,7 +4,7 @@
 
 use stipple::frontend::Tracks;
 use stipple::vio::instruments::{
-    of_window, parts, Covariance, Estimator, Factor, Graph, ImuRing, Increment, Layout, Outcome, LAMBDA_START,
+    parts, view_rows, Covariance, Estimator, Graph, ImuRing, Increment, Layout, Outcome, LAMBDA_START,
 };
 use stipple::vio::Vio;
 
@@ -59,12 +59,10 @@ impl Stages {
         self.estimator.graph.window.frame(self.slot).hosted
     }
 
-    /// The rows of all landmarks with their points eliminated, not summed: a part of `linearize`. Answers the
-    /// cost.
-    pub fn eliminate(&mut self) -> f64 {
+    /// The rows of all landmarks, neither eliminated nor summed: a part of `linearize`. Answers the cost.
+    pub fn view_rows(&mut self) -> f64 {
         let Estimator { graph: Graph { window, landmarks, .. }, solver, model, .. } = &mut self.estimator;
-        let points = of_window(window, &landmarks.pool).filter(|f| matches!(f, Factor::Landmark(_)));
-        points.map(|f| f.linearize(window, model, &self.layout, &mut solver.rows).cost).sum()
+        landmarks.pool.iter().map(|l| view_rows(l, window, model, &self.layout, &mut solver.rows)).sum()
     }
 
     /// All factors summed; answers the cost.
@@ -75,7 +73,7 @@ impl Stages {
 
     /// The damped step of what `linearize` summed; answers the decrease it predicts.
     pub fn solve(&mut self) -> Option<f64> {
-        self.estimator.solver.step(LAMBDA_START, self.estimator.graph.landmarks.pool.len())
+        self.estimator.solver.step(LAMBDA_START)
     }
 
     /// The cost of the window, which judges a step.
