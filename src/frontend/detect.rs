@@ -5,6 +5,7 @@
 //! only saves time where there is texture. Ties go to the first in scan order.
 
 use crate::config::FrontendConfig;
+use crate::math::wide::wide;
 use stipple_drivers::Image;
 
 /// Corners keep this far from the image border, so that coarse levels see most of the patch, px.
@@ -121,19 +122,28 @@ impl Detector {
     }
 }
 
-/// The strongest corner of the square cell at `at`, if any exceeds the least threshold.
-pub fn strongest(image: &Image, at: [usize; 2], cell: usize, threshold: u8, threshold_min: u8) -> Option<Corner> {
-    let mut t = threshold.max(threshold_min);
-    loop {
-        let best = scan(image, at, cell, t);
-        if best.is_some() || t == threshold_min {
-            return best;
+wide! {
+    /// The strongest corner of the square cell at `at`, if any exceeds the least threshold.
+    pub fn strongest<'a>(
+        image: &'a Image,
+        at: [usize; 2],
+        cell: usize,
+        threshold: u8,
+        threshold_min: u8,
+    ) -> Option<Corner> {
+        let mut t = threshold.max(threshold_min);
+        loop {
+            let best = scan(image, at, cell, t);
+            if best.is_some() || t == threshold_min {
+                return best;
+            }
+            t = (t / 2).max(threshold_min);
         }
-        t = (t / 2).max(threshold_min);
     }
 }
 
 /// The strongest corner whose score exceeds `threshold`.
+#[inline(always)]
 fn scan(image: &Image, at: [usize; 2], cell: usize, threshold: u8) -> Option<Corner> {
     let w = image.width;
     let x0 = at[0].max(BORDER);
@@ -159,6 +169,7 @@ fn scan(image: &Image, at: [usize; 2], cell: usize, threshold: u8) -> Option<Cor
 
 /// Marks the pixels of a row that can be corners: an arc of nine of sixteen holds one of every
 /// opposite pair. Four pairs are looked at, many pixels at once.
+#[inline(always)]
 fn candidates(pixels: &[u8], row: usize, stride: usize, threshold: u8, maybe: &mut [bool]) {
     let n = maybe.len();
     let ring = |k: usize| {
@@ -178,6 +189,7 @@ fn candidates(pixels: &[u8], row: usize, stride: usize, threshold: u8, maybe: &m
 }
 
 /// The largest difference exceeded in one direction by nine neighbouring pixels of the ring, or 0.
+#[inline(always)]
 fn score(pixels: &[u8], at: usize, stride: usize) -> u8 {
     let c = pixels[at] as i16;
     let mut d = [0i16; 32];

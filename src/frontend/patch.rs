@@ -18,6 +18,7 @@
 use super::pattern::{gradients, pixels_around, values, ALL, DX, DY, FRACTION, N, RUNS};
 use super::pyramid::Levels;
 use crate::limits::PYRAMID_LEVELS;
+use crate::math::wide::wide;
 use stipple_drivers::Image;
 
 /// No offset is longer (3.5² + 1.5² = 14.5 = 3.81²), px.
@@ -105,96 +106,22 @@ impl Template {
 
     /// Takes the patch at a pixel of a level.
     pub fn take(&mut self, image: &Image, x: f32, y: f32) {
-        self.inside = 0;
-        if !(x >= 0.0 && y >= 0.0 && x <= (image.width - 1) as f32 && y <= (image.height - 1) as f32) {
-            return;
-        }
-        let Some((pixels, [fx, fy], inside)) = pixels_around(image, x, y) else { return };
-        let mut g = [[0f32; N]; 3];
-        let mut g_mean = [0f32; 3];
-        let on = weights(inside);
-        let value = values(&pixels, fx, fy);
-        let [gx, gy] = gradients(&pixels, fx, fy).map(|g| g.map(|row| row.map(|v| 0.5 / FRACTION * f32::from(v))));
-        let [g0, g1, _] = &mut g;
-        let mut k = 0;
-        for (j, (from, run)) in RUNS.into_iter().enumerate() {
-            for (out, row) in [(&mut self.value, &value[j]), (&mut *g0, &gx[j]), (&mut *g1, &gy[j])] {
-                out[k..k + run].copy_from_slice(&row[from..from + run]);
-            }
-            k += run;
-        }
-        if inside != ALL {
-            for k in 0..N {
-                self.value[k] *= on[k];
-                g[0][k] *= on[k];
-                g[1][k] *= on[k];
-            }
-        }
-        for k in 0..N {
-            g[2][k] = DX[k] * g[1][k] - DY[k] * g[0][k];
-        }
-        let count = inside.count_ones() as f32;
-        let mean = sum(&self.value) / count;
-        if !(mean > 1.0) {
-            return; // black: a ratio of noise
-        }
-        for a in 0..3 {
-            g_mean[a] = sum(&g[a]) / count;
-        }
-        let scale = 1.0 / mean;
-        let mut spread = [0f32; N];
-        for k in 0..N {
-            self.value[k] *= scale;
-            spread[k] = on[k] * (self.value[k] - 1.0);
-            for a in 0..3 {
-                g[a][k] = on[k] * (g[a][k] - self.value[k] * g_mean[a]) * scale;
-            }
-        }
-        self.contrast = dot(&spread, &spread);
-        let Some(inv) = invert_normal(&g) else { return };
-        for a in 0..3 {
-            for k in 0..N {
-                self.gain[a][k] = inv[a][0] * g[0][k] + inv[a][1] * g[1][k] + inv[a][2] * g[2][k];
-            }
-        }
-        self.sigma_px = (inv[0][0] + inv[1][1]).sqrt() / mean;
-        self.inside = inside;
+        take(self, image, x, y);
     }
 
     /// Moves `warp` (pixels of this level) onto the template. Answers what share of the template's
     /// contrast was left unexplained before the last step, or `None` when it slid off.
     pub fn align(&self, image: &Image, warp: &mut Warp, iterations: usize, step_min: f32) -> Option<f32> {
-        let mut left = f32::MAX;
-        let mut block: Option<Block> = None;
-        let mut r = [0f32; N];
-        for _ in 0..iterations {
-            if !block.as_ref().is_some_and(|b| b.holds(warp)) {
-                block = Block::around(image, warp.x, warp.y);
-            }
-            left = self.difference(image, block.as_ref(), warp, &mut r)?;
-            let mut inc = [0f32; 3];
-            for a in 0..3 {
-                inc[a] = -dot(&self.gain[a], &r);
-            }
-            let length = inc[0].abs().max(inc[1].abs()).max(RADIUS * inc[2].abs());
-            if !(length < STEP_MAX) {
-                return None;
-            }
-            warp.step(inc);
-            if length < step_min {
-                break;
-            }
-        }
-        Some(left)
+        align(self, image, warp, iterations, step_min)
     }
 
     /// Σr²/contrast at a warp. `None` unless more than half of the pattern is in both images.
     pub fn unexplained(&self, image: &Image, warp: &Warp) -> Option<f32> {
-        let block = Block::around(image, warp.x, warp.y);
-        self.difference(image, block.as_ref(), warp, &mut [0f32; N])
+        unexplained(self, image, warp)
     }
 
     /// r_i, and as above. The block, where there is one, holds the warp.
+    #[inline(always)]
     fn difference(&self, image: &Image, block: Option<&Block>, warp: &Warp, r: &mut [f32; N]) -> Option<f32> {
         let mut inside = self.inside;
         match block {
@@ -226,6 +153,105 @@ impl Template {
             }
         }
         Some(dot(r, r) / self.contrast)
+    }
+}
+
+wide! {
+    fn take<'a>(template: &'a mut Template, image: &'a Image, x: f32, y: f32) -> () {
+        template.inside = 0;
+        if !(x >= 0.0 && y >= 0.0 && x <= (image.width - 1) as f32 && y <= (image.height - 1) as f32) {
+            return;
+        }
+        let Some((pixels, [fx, fy], inside)) = pixels_around(image, x, y) else { return };
+        let mut g = [[0f32; N]; 3];
+        let mut g_mean = [0f32; 3];
+        let on = weights(inside);
+        let value = values(&pixels, fx, fy);
+        let [gx, gy] = gradients(&pixels, fx, fy).map(|g| g.map(|row| row.map(|v| 0.5 / FRACTION * f32::from(v))));
+        let [g0, g1, _] = &mut g;
+        let mut k = 0;
+        for (j, (from, run)) in RUNS.into_iter().enumerate() {
+            for (out, row) in [(&mut template.value, &value[j]), (&mut *g0, &gx[j]), (&mut *g1, &gy[j])] {
+                out[k..k + run].copy_from_slice(&row[from..from + run]);
+            }
+            k += run;
+        }
+        if inside != ALL {
+            for k in 0..N {
+                template.value[k] *= on[k];
+                g[0][k] *= on[k];
+                g[1][k] *= on[k];
+            }
+        }
+        for k in 0..N {
+            g[2][k] = DX[k] * g[1][k] - DY[k] * g[0][k];
+        }
+        let count = inside.count_ones() as f32;
+        let mean = sum(&template.value) / count;
+        if !(mean > 1.0) {
+            return; // black: a ratio of noise
+        }
+        for a in 0..3 {
+            g_mean[a] = sum(&g[a]) / count;
+        }
+        let scale = 1.0 / mean;
+        let mut spread = [0f32; N];
+        for k in 0..N {
+            template.value[k] *= scale;
+            spread[k] = on[k] * (template.value[k] - 1.0);
+            for a in 0..3 {
+                g[a][k] = on[k] * (g[a][k] - template.value[k] * g_mean[a]) * scale;
+            }
+        }
+        template.contrast = dot(&spread, &spread);
+        let Some(inv) = invert_normal(&g) else { return };
+        for a in 0..3 {
+            for k in 0..N {
+                template.gain[a][k] = inv[a][0] * g[0][k] + inv[a][1] * g[1][k] + inv[a][2] * g[2][k];
+            }
+        }
+        template.sigma_px = (inv[0][0] + inv[1][1]).sqrt() / mean;
+        template.inside = inside;
+    }
+}
+
+wide! {
+    fn unexplained<'a>(template: &'a Template, image: &'a Image, warp: &'a Warp) -> Option<f32> {
+        let block = Block::around(image, warp.x, warp.y);
+        template.difference(image, block.as_ref(), warp, &mut [0f32; N])
+    }
+}
+
+wide! {
+    fn align<'a>(
+        template: &'a Template,
+        image: &'a Image,
+        warp: &'a mut Warp,
+        iterations: usize,
+        step_min: f32,
+    ) -> Option<f32> {
+        let mut left = f32::MAX;
+        let mut block: Option<Block> = None;
+        let mut r = [0f32; N];
+        for _ in 0..iterations {
+            if !block.as_ref().is_some_and(|b| b.holds(warp)) {
+                block = Block::around(image, warp.x, warp.y);
+            }
+            left = template.difference(image, block.as_ref(), warp, &mut r)?;
+            let mut inc = [0f32; 3];
+            for a in 0..3 {
+                inc[a] = -dot(&template.gain[a], &r);
+            }
+            let length = inc[0].abs().max(inc[1].abs()).max(RADIUS * inc[2].abs());
+            if !(length < STEP_MAX) {
+                return None;
+            }
+            warp.step(inc);
+            if length < step_min {
+                break;
+            }
+        }
+        Some(left)
     }
 }
 
@@ -262,6 +288,7 @@ pub fn align_stack(
 }
 
 /// Sums in four lanes: the order is fixed, and the compiler may use vectors.
+#[inline(always)]
 fn dot(a: &[f32; N], b: &[f32; N]) -> f32 {
     let mut s = [0f32; 4];
     for (a, b) in a.chunks_exact(4).zip(b.chunks_exact(4)) {
@@ -272,14 +299,19 @@ fn dot(a: &[f32; N], b: &[f32; N]) -> f32 {
     (s[0] + s[1]) + (s[2] + s[3])
 }
 
+#[inline(always)]
 fn sum(a: &[f32; N]) -> f32 {
     dot(a, &[1.0; N])
 }
 
 /// (JᵀJ)⁻¹ of three columns, by cofactors in f64; `None` when nearly singular.
+#[inline(always)]
 fn invert_normal(j: &[[f32; N]; 3]) -> Option<[[f32; 3]; 3]> {
-    let h = |a: usize, b: usize| dot(&j[a], &j[b]) as f64;
-    let (xx, xy, xt, yy, yt, tt) = (h(0, 0), h(0, 1), h(0, 2), h(1, 1), h(1, 2), h(2, 2));
+    let mut h = [0.0; 6];
+    for (h, (a, b)) in h.iter_mut().zip([(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]) {
+        *h = f64::from(dot(&j[a], &j[b]));
+    }
+    let [xx, xy, xt, yy, yt, tt] = h;
     let c = [
         [yy * tt - yt * yt, xt * yt - xy * tt, xy * yt - xt * yy],
         [xt * yt - xy * tt, xx * tt - xt * xt, xy * xt - xx * yt],
@@ -295,6 +327,7 @@ fn invert_normal(j: &[[f32; N]; 3]) -> Option<[[f32; 3]; 3]> {
 }
 
 /// 1 for the offsets that were inside, 0 for the others.
+#[inline(always)]
 fn weights(inside: u64) -> [f32; N] {
     let mut on = [1.0; N];
     if inside != ALL {
@@ -319,6 +352,7 @@ const ROUND: f32 = 8388608.0;
 
 impl Block {
     /// Around a place; `None` where it does not lie within the image.
+    #[inline(always)]
     fn around(image: &Image, x: f32, y: f32) -> Option<Block> {
         let (left, top) = ((x - 0.5 * BLOCK as f32).round(), (y - 0.5 * BLOCK as f32).round());
         let (right, bottom) = (image.width as f32 - BLOCK as f32, image.height as f32 - BLOCK as f32);
@@ -333,12 +367,14 @@ impl Block {
         Some(Block { pixels, left, top })
     }
 
+    #[inline(always)]
     fn holds(&self, warp: &Warp) -> bool {
         let within = |v: f32| v >= REACH && v <= (BLOCK - 1) as f32 - REACH;
         within(warp.x - self.left) && within(warp.y - self.top)
     }
 
     /// Bilinear samples at the warped offsets.
+    #[inline(always)]
     fn sample(&self, warp: &Warp, out: &mut [f32; N]) {
         let (cx, cy) = (warp.x - self.left, warp.y - self.top);
         let (mut fx, mut fy, mut at) = ([0f32; N], [0f32; N], [0u32; N]);
@@ -366,6 +402,7 @@ impl Block {
 }
 
 /// Bilinear samples at the warped offsets near the border; answers which were inside.
+#[inline(always)]
 fn sample(image: &Image, warp: &Warp, out: &mut [f32; N]) -> u64 {
     let w = image.width;
     let (right, bottom) = ((w - 1) as f32, (image.height - 1) as f32);
@@ -382,7 +419,7 @@ fn sample(image: &Image, warp: &Warp, out: &mut [f32; N]) -> u64 {
     inside
 }
 
-#[inline]
+#[inline(always)]
 fn bilinear(q: &[u8], stride: usize, fx: f32, fy: f32) -> f32 {
     let q = &q[..stride + 2];
     let (a, b, c, d) = (q[0] as f32, q[1] as f32, q[stride] as f32, q[stride + 1] as f32);

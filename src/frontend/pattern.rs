@@ -64,6 +64,7 @@ const fn offsets(axis: usize) -> [f32; N] {
 
 /// Pixels around a point inside the image, the bilinear fraction of the samples among them, and which offsets
 /// (with their four neighbours) lie inside it. `None` when half of them or more do not.
+#[inline(always)]
 pub(super) fn pixels_around(image: &Image, x: f32, y: f32) -> Option<(Pixels, [f32; 2], u64)> {
     let half = (GRID as f32 - 1.0) / 2.0;
     let (left, top) = ((x - half).floor(), (y - half).floor());
@@ -102,6 +103,7 @@ pub(super) fn pixels_around(image: &Image, x: f32, y: f32) -> Option<(Pixels, [f
 }
 
 /// Bilinear samples of the pattern's square.
+#[inline(always)]
 pub(super) fn values(pixels: &Pixels, fx: f32, fy: f32) -> [[f32; SIDE]; SIDE] {
     let (w00, w10, w01, w11) = ((1.0 - fx) * (1.0 - fy), fx * (1.0 - fy), (1.0 - fx) * fy, fx * fy);
     let mut out = [[0.0; SIDE]; SIDE];
@@ -115,6 +117,7 @@ pub(super) fn values(pixels: &Pixels, fx: f32, fy: f32) -> [[f32; SIDE]; SIDE] {
 }
 
 /// Twice the gradient by x and by y at the samples of the pattern's square, in 1/FRACTION grey a pixel.
+#[inline(always)]
 pub(super) fn gradients(pixels: &Pixels, fx: f32, fy: f32) -> [[[i16; SIDE]; SIDE]; 2] {
     let whole = |v: f32| (v * FRACTION).round() as i16;
     let (x, y, w11) = (whole(fx), whole(fy), whole(fx * fy));

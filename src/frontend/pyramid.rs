@@ -7,6 +7,7 @@
 //! The finest level is the image itself, where its camera wrote it: a pyramid owns those above it.
 
 use crate::limits::PYRAMID_LEVELS;
+use crate::math::wide::wide;
 use std::sync::Arc;
 use stipple_drivers::{Calibration, Frames, Image, RigCamera};
 
@@ -86,26 +87,28 @@ fn reflect(i: isize, n: usize) -> usize {
     (if i > last { 2 * last - i } else { i }) as usize
 }
 
-fn halve(src: &Image, dst: &mut Image, columns: &mut [u16]) {
-    let (w, h) = (src.width, src.height);
-    let columns = &mut columns[..w + 5];
-    for (y, out) in dst.pixels.chunks_exact_mut(dst.width).enumerate() {
-        let row = |dy: isize| {
-            let r = reflect(2 * y as isize + dy, h) * w;
-            &src.pixels[r..r + w]
-        };
-        let (a, b, c, d, e) = (row(-2), row(-1), row(0), row(1), row(2));
-        for (x, sum) in columns[2..w + 2].iter_mut().enumerate() {
-            // at most 16·255
-            *sum = a[x] as u16 + e[x] as u16 + 4 * (b[x] as u16 + d[x] as u16) + 6 * c[x] as u16;
-        }
-        for x in [-2, -1, w as isize, w as isize + 1] {
-            columns[(x + 2) as usize] = columns[2 + reflect(x, w)];
-        }
-        let even = columns.chunks_exact(2);
-        for ((o, p), (q, r)) in out.iter_mut().zip(even.clone()).zip(even.clone().skip(1).zip(even.skip(2))) {
-            // at most 256·255 + 128, which fits
-            *o = ((p[0] + 4 * (p[1] + q[1]) + 6 * q[0] + r[0] + 128) >> 8) as u8;
+wide! {
+    fn halve<'a>(src: &'a Image, dst: &'a mut Image, columns: &'a mut [u16]) -> () {
+        let (w, h) = (src.width, src.height);
+        let columns = &mut columns[..w + 5];
+        for (y, out) in dst.pixels.chunks_exact_mut(dst.width).enumerate() {
+            let row = |dy: isize| {
+                let r = reflect(2 * y as isize + dy, h) * w;
+                &src.pixels[r..r + w]
+            };
+            let (a, b, c, d, e) = (row(-2), row(-1), row(0), row(1), row(2));
+            for (x, sum) in columns[2..w + 2].iter_mut().enumerate() {
+                // at most 16·255
+                *sum = a[x] as u16 + e[x] as u16 + 4 * (b[x] as u16 + d[x] as u16) + 6 * c[x] as u16;
+            }
+            for x in [-2, -1, w as isize, w as isize + 1] {
+                columns[(x + 2) as usize] = columns[2 + reflect(x, w)];
+            }
+            let even = columns.chunks_exact(2);
+            for ((o, p), (q, r)) in out.iter_mut().zip(even.clone()).zip(even.clone().skip(1).zip(even.skip(2))) {
+                // at most 256·255 + 128, which fits
+                *o = ((p[0] + 4 * (p[1] + q[1]) + 6 * q[0] + r[0] + 128) >> 8) as u8;
+            }
         }
     }
 }
