@@ -92,9 +92,10 @@ impl Camera {
     pub fn project_with_jacobian(&self, p: DVec3) -> Option<(DVec2, ProjectionJacobian)> {
         let (m, dm) = match self.lens {
             Lens::Radtan { k1, k2, p1, p2 } => {
-                brown(p, radtan_r2_max(k1, k2), |u| (1.0 + u * (k1 + u * k2), k1 + 2.0 * k2 * u), p1, p2)?
+                let inside = |u| u < R2_UNBOUNDED && (radtan_grows(u, k1, k2) || u < radtan_r2_max(k1, k2));
+                brown(p, inside, |u| (1.0 + u * (k1 + u * k2), k1 + 2.0 * k2 * u), p1, p2)?
             }
-            Lens::Rational { k, p1, p2, r2_max } => brown(p, r2_max, |u| rational_radial(u, &k), p1, p2)?,
+            Lens::Rational { k, p1, p2, r2_max } => brown(p, |u| u < r2_max, |u| rational_radial(u, &k), p1, p2)?,
             Lens::KannalaBrandt { k } => kannala_brandt(p, &k)?,
             Lens::DoubleSphere { xi, alpha } => double_sphere(p, xi, alpha)?,
         };
@@ -121,6 +122,13 @@ impl Camera {
 
 /// A point of the normalised image plane, and its derivative to the point in the camera frame.
 type Normalised = (DVec2, [[f64; 3]; 2]);
+
+/// Whether r(1 + k1 r² + k2 r⁴) certainly grows up to r² = u: where the Bernstein coefficients of its derivative are positive,
+/// which for most points of a lens tells without a root.
+fn radtan_grows(u: f64, k1: f64, k2: f64) -> bool {
+    let k1u = k1 * u;
+    1.0 + 1.5 * k1u > 0.0 && 1.0 + 3.0 * k1u + 5.0 * k2 * u * u > 0.0
+}
 
 /// Squared radius (of x/z, y/z) at which r(1 + k1 r² + k2 r⁴) stops growing.
 fn radtan_r2_max(k1: f64, k2: f64) -> f64 {
@@ -157,13 +165,19 @@ fn brown_distort(a: DVec2, radial: impl Fn(f64) -> (f64, f64), p1: f64, p2: f64)
 }
 
 #[inline(always)]
-fn brown(p: DVec3, r2_max: f64, radial: impl Fn(f64) -> (f64, f64), p1: f64, p2: f64) -> Option<Normalised> {
+fn brown(
+    p: DVec3,
+    inside: impl Fn(f64) -> bool,
+    radial: impl Fn(f64) -> (f64, f64),
+    p1: f64,
+    p2: f64,
+) -> Option<Normalised> {
     if !(p.z > Z_MIN) {
         return None;
     }
     let iz = 1.0 / p.z;
     let a = DVec2::new(p.x * iz, p.y * iz);
-    if !(a.length_squared() < r2_max) {
+    if !inside(a.length_squared()) {
         return None;
     }
     let (m, d) = brown_distort(a, radial, p1, p2);
@@ -176,8 +190,8 @@ fn brown(p: DVec3, r2_max: f64, radial: impl Fn(f64) -> (f64, f64), p1: f64, p2:
 }
 
 /// The place where a function that grows on low..high (given with its derivative) reaches `target`: Newton's method, halving
-/// the bracket where a step leaves it. Where the derivative is not positive counts as beyond.
-fn growing_root(target: f64, mut low: f64, mut high: f64, f: impl Fn(f64) -> (f64, f64)) -> f64 {
+/// the bracket where a step leaves it, until a step is under `settled`. Where the derivative is not positive counts as beyond.
+fn growing_root(target: f64, mut low: f64, mut high: f64, settled: f64, f: impl Fn(f64) -> (f64, f64)) -> f64 {
     let mut x = target.clamp(low, high);
     for _ in 0..60 {
         let (value, derivative) = f(x);
@@ -191,7 +205,7 @@ fn growing_root(target: f64, mut low: f64, mut high: f64, f: impl Fn(f64) -> (f6
         let next = if grows && newton >= low && newton <= high { newton } else { 0.5 * (low + high) };
         let step = next - x;
         x = next;
-        if step.abs() < 1e-15 {
+        if step.abs() < settled {
             break;
         }
     }
@@ -208,7 +222,7 @@ fn brown_inverse(m: DVec2, r2_max: f64, radial: impl Fn(f64) -> (f64, f64), p1: 
     if !(distorted > 1e-12) {
         return (distorted >= 0.0).then_some(DVec3::Z);
     }
-    let mut a = m * (growing_root(distorted, 0.0, 0.999 * r2_max.sqrt(), radius) / distorted);
+    let mut a = m * (growing_root(distorted, 0.0, 0.999 * r2_max.sqrt(), 1e-3, radius) / distorted);
     for _ in 0..30 {
         let (f, j) = brown_distort(a, &radial, p1, p2);
         let e = f - m;
@@ -312,7 +326,7 @@ fn kannala_brandt_inverse(m: DVec2, k: &[f64; 4]) -> Option<DVec3> {
         }
         (low, high) = (high, (high + STEP).min(PI));
     }
-    let th = growing_root(r, low, high, |th| kb_polynomial(th, k));
+    let th = growing_root(r, low, high, 1e-15, |th| kb_polynomial(th, k));
     let (d, _) = kb_polynomial(th, k);
     ((d - r).abs() < 1e-9 && kb_grows(th, k)).then(|| (m / r * th.sin()).extend(th.cos()))
 }
