@@ -51,10 +51,9 @@ section! {
     gravity: f64 = 9.81, Bound::Within(9.7, 9.9);
     tuning
     /// Standard deviation of an observation, px.
-    observation_sigma_px: f64 = 0.3;
-    /// Width of Huber's weight, px. One deviation, since tracks that slide along edges or move by themselves err by more than
-    /// Gaussian ones; chosen from 1.0 to 0.05, the deviation from 0.5 to 0.2.
-    huber_px: f64 = 0.3;
+    observation_sigma_px: f64 = 0.5;
+    /// Width of Huber's weight, px.
+    huber_px: f64 = 1.0;
     iterations_max: u32 = 7;
     /// Newest frames kept with velocity and biases.
     states: u32 = 3;

@@ -167,7 +167,7 @@ fn zero_velocity_rows(window: &Window, slot: usize, rate: DVec3, layout: &Layout
 }
 
 fn costs_of_views<'a>(l: &'a Landmark, window: &'a Window, model: &Model) -> impl Iterator<Item = f64> + 'a {
-    let inv_sigma = model.per_view_px;
+    let inv_sigma = 1.0 / model.config.observation_sigma_px;
     let huber_width = model.config.huber_px * inv_sigma;
     let host_cam = host_cam(l, window);
     let off = move |o: &Observation| predicted(l, &host_cam, o, window).map_or(LOST_PX, |px| (px - o.px()).length());
@@ -187,7 +187,7 @@ pub fn view_rows(landmark: &Landmark, window: &Window, model: &Model, layout: &L
     let host_at = layout.pose(host).filter(|_| others);
 
     let mut cost = 0.0;
-    let inv_sigma = model.per_view_px;
+    let inv_sigma = 1.0 / model.config.observation_sigma_px;
     let huber_width = model.config.huber_px * inv_sigma;
     let cameras_at = layout.cameras().map(|s| (out.offset(s.at), s.len));
     let host_view = Host::of(landmark, window);

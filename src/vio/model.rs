@@ -2,7 +2,7 @@
 
 use super::health::landmarks_enough;
 use super::preintegration::Noise;
-use super::reprojection::{huber_scale, CameraModel};
+use super::reprojection::CameraModel;
 use crate::config::VioConfig;
 use crate::limits::CAMERAS_MAX;
 use stipple_drivers::Calibration;
@@ -13,8 +13,6 @@ pub struct Model {
     pub cameras: Vec<CameraModel>,
     pub noise: Noise,
     pub config: VioConfig,
-    /// Inverse deviation by which views are whitened, 1/px: Huber's weights then sum up to what the estimate knows.
-    pub per_view_px: f64,
     /// Number of landmarks in view that is enough for the largest image of the rig, without unit.
     pub landmarks_enough: f64,
 }
@@ -25,10 +23,6 @@ impl Model {
             cameras: calibration.cameras.iter().take(CAMERAS_MAX).map(CameraModel::from).collect(),
             noise: Noise::new(&calibration.imu, config),
             config: config.clone(),
-            per_view_px: {
-                let sigma = config.observation_sigma_px;
-                1.0 / (sigma * huber_scale(config.huber_px / sigma))
-            },
             landmarks_enough: {
                 let pixels = calibration.cameras.iter().map(|c| c.camera.width * c.camera.height).max();
                 landmarks_enough(pixels.unwrap_or(0))

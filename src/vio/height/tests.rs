@@ -80,12 +80,7 @@ fn fly(
     let mut noise = Noise(seed);
     let points = shaft(half, &mut noise);
     let mut world = World::seen_from(pose, points, noise);
-    let mut config = VioConfig::default();
-    if half > WALLS {
-        // Told that its cameras are poor, which far from walls is enough for vision to lose the height.
-        (config.observation_sigma_px, config.huber_px) = (0.5, 1.0);
-    }
-    let mut vio = Vio::new(&world.rig, &config);
+    let mut vio = Vio::new(&world.rig, &VioConfig::default());
     if barometer {
         vio = vio.with_barometer(&BaroConfig { chip: "bmp388".into(), ..BaroConfig::default() });
     }
@@ -153,14 +148,14 @@ fn barometer_holds_the_height_of_a_climb_and_its_drift_is_told_apart() {
     assert!(with <= 0.3 && sigmas < 3.5, "{without} {with} {sigmas}");
 }
 
-/// Where the cameras hardly tell how far the walls are and are believed to be poor, the estimate's height is off by more than it
-/// says. The barometer still holds it, though its drift is then not told apart as well as is said. Of six seeds these are the two whose height by vision
+/// Where the cameras hardly tell how far the walls are, the estimate's height is off by more than it says. The barometer still
+/// holds it, though its drift is then not told apart as well as is said. Of six seeds these are the two whose height by vision
 /// was worst: the ones with something to hold.
 #[test]
 fn barometer_holds_a_climb_that_vision_does_not() {
     let [without, with, sigmas] = climbs(2.0 * WALLS, &[1, 3]);
     eprintln!("climb far from walls: {without:.3} m without barometer, {with:.3} with; bias within {sigmas:.2} sigma");
-    assert!(without > 1.0 && with < without / 2.0, "{without} {with}");
+    assert!(without > 1.0 && with < without / 3.0, "{without} {with}");
 }
 
 /// Ten seconds of a flight in a room, where a barometer adds nothing.
