@@ -8,7 +8,7 @@
 
 use super::landmarks::Landmark;
 use super::reprojection::Point;
-use super::rows::{FactorRows, COLS_MAX, POINT_DIM, ROWS_MAX};
+use super::rows::{FactorRows, COLS_MAX, PARTS_MAX, POINT_DIM, ROWS_MAX};
 use super::window::{Layout, POSE_DIM};
 use crate::limits::LANDMARKS;
 use crate::math::dense::{Columns, System};
@@ -66,7 +66,8 @@ impl Elimination {
         let mut w = [[0.0; COLS_MAX]; POINT_DIM];
         let b = rows.rows.cols() - 1;
         add_views(rows, cameras, &self.q, &mut w, system);
-        let mut moves = [(0, 0, 0); super::rows::PARTS_MAX];
+        // Where each part of W is, where it goes, and how wide it is.
+        let mut moves = [(0, 0, 0); PARTS_MAX];
         let mut from = POINT_DIM;
         for (to, c) in moves.iter_mut().zip(rows.columns.iter()) {
             *to = (from, self.rows.offset(c.at), c.len);
@@ -105,7 +106,7 @@ impl Elimination {
         }
     }
 
-    /// Moves them back.
+    /// Takes the last step of the points back.
     pub fn restore(&self, landmarks: &mut [Landmark]) {
         landmarks.iter_mut().zip(&self.points).for_each(|(l, p)| l.point = p.saved);
     }

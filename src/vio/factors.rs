@@ -5,7 +5,8 @@
 //! `measured_at` or `between`, a cost and its rows. The prior stands apart (`prior.rs`): it is not measured but kept.
 //!
 //! Rows are `[J | r]` of a least-squares problem. A landmark's are `[point | frames | r]`; Householder QR of the three
-//! columns of the point leaves rows that do not contain it (Demmel et al., ICCV 2021). Residuals are taken at the
+//! columns of the point leaves rows that do not contain it (Demmel et al., ICCV 2021), for the marginalization; the solver sums
+//! views up sparsely instead, and knows a landmark by name for that (`elimination.rs`). Residuals are taken at the
 //! estimate, Jacobians at the first estimates (FEJ), those to the rig's columns too.
 
 use super::height;

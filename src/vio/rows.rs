@@ -11,11 +11,12 @@ pub const POINT_DIM: usize = 3;
 /// the inertial unit.
 pub const PARTS_MAX: usize = FRAMES + 2;
 /// Columns besides those of the point.
-pub const SHARED_DIM: usize = super::window::POSE_DIM * FRAMES + RIG_DIM;
+const SHARED_DIM: usize = super::window::POSE_DIM * FRAMES + RIG_DIM;
+/// Columns of the rows of the largest factor, the point's and r included.
 pub const COLS_MAX: usize = POINT_DIM + SHARED_DIM + 1;
 /// Rows of the largest factor.
 pub const ROWS_MAX: usize = 2 * OBSERVATIONS + 1;
-/// Rows that a landmark's point takes with it, of all landmarks.
+/// Rows `[W | g]` of the points of all landmarks, see `elimination.rs`.
 const POINT_ROWS_MAX: usize = POINT_DIM * LANDMARKS;
 /// Rows of the stack of a marginalization: what stays of it when triangular, and the largest factors. How many there are
 /// decides when it is made triangular, and so the last bits: those of heights and of the second to last camera's time offset
@@ -41,7 +42,7 @@ impl FactorRows {
         FactorRows::with_room(ROWS_MAX)
     }
 
-    /// Room for the rows that the points of all landmarks take with them.
+    /// Room for the rows `[W | g]` of the points of all landmarks.
     pub fn of_points() -> FactorRows {
         FactorRows::with_room(POINT_ROWS_MAX)
     }
