@@ -51,9 +51,10 @@ section! {
     gravity: f64 = 9.81, Bound::Within(9.7, 9.9);
     tuning
     /// Standard deviation of an observation, px.
-    observation_sigma_px: f64 = 0.5;
-    /// Width of Huber's weight, px.
-    huber_px: f64 = 1.0;
+    observation_sigma_px: f64 = 0.3;
+    /// Width of Huber's weight, px. Half a deviation, since tracks that slide along edges or move by themselves err by more than
+    /// Gaussian ones.
+    huber_px: f64 = 0.15;
     iterations_max: u32 = 7;
     /// Newest frames kept with velocity and biases.
     states: u32 = 3;

@@ -43,7 +43,9 @@ const ALIGNED_OUTLIERS: [f64; 3] = [5.0, 1.0, 1.0];
 /// Such a start is accepted when the speed's deviation is below this share of the speed, and the mean squared residual, in
 /// deviations and for each degree of freedom, below this bound.
 const SPEED_KNOWN: f64 = 0.1;
-const MISFIT_MAX: f64 = 1.5;
+const MISFIT_MAX: f64 = 0.75;
+/// Share of a frame's views that fit it below which they have misled the optimization, which is done again without the others.
+const MISLED: f64 = 0.3;
 /// Deviations of the rig by which the bound of outliers is widened.
 const RIG_SIGMAS: f64 = 3.0;
 
@@ -146,6 +148,7 @@ impl Estimator {
     /// Puts a frame into an empty window; answers its slot.
     fn begin(&mut self, tracks: &Tracks, motion: &Motion, imu: &ImuRing) -> usize {
         let mut frame = Frame::new(tracks.t, *motion);
+        frame.doubted = true;
         frame.rate = imu.rate_at(tracks.t);
         frame.hold_twist();
         let slot = self.graph.window.push(frame).expect("an empty window has room");
@@ -193,7 +196,7 @@ impl Estimator {
         let oldest = self.begin(&frames[0], first, imu);
         let mut slot = oldest;
         for tracks in &frames[1..] {
-            let frame = self.propagated(slot, tracks.t, imu);
+            let frame = Frame { doubted: true, ..self.propagated(slot, tracks.t, imu) };
             slot = self.graph.window.push(frame).expect("room for the frames of an alignment");
             self.tracks[slot].clone_from(tracks);
         }
@@ -236,10 +239,11 @@ impl Estimator {
 
     /// One more frame of a window that has some. `covariance` is that of the newest state so far, which the gate
     /// needs.
-    pub fn advance(&mut self, tracks: &Tracks, imu: &ImuRing, covariance: Option<&Covariance>) -> Step {
+    pub fn advance(&mut self, tracks: &Tracks, imu: &ImuRing, covariance: Option<&Covariance>, trusted: bool) -> Step {
         let before = self.graph.window.newest().expect("a started window has frames");
         self.rejected.clear();
         let (slot, mut step) = self.enter(before, tracks, imu, covariance);
+        self.graph.window.frame_mut(slot).doubted = step.gate.open || !trusted;
         if step.keyframe {
             step.landmarks_full = self.make_keyframe(slot);
         }
@@ -247,8 +251,7 @@ impl Estimator {
         if let Some(heights) = &mut self.heights {
             step.heights = heights.attach(&mut self.graph.window);
         }
-        step.outcome = self.solver.optimize(&mut self.graph, &self.model);
-        step.covariance = self.solver.newest_covariance();
+        self.solve(&mut step);
         self.height_deviation = self.heights.as_ref().and_then(|_| self.solver.newest_height_deviation());
         let views = self.graph.landmarks.views_in(slot);
         let n = self.graph.window.rig.dim();
@@ -257,9 +260,22 @@ impl Estimator {
         }
         let px_max = self.outlier_px(slot);
         step.outliers = drop_outliers(&mut self.graph, px_max, slot, &mut self.rejected);
-        step.evidence = Some(self.evidence(before, slot, views, step.at_rest));
+        let evidence = self.evidence(before, slot, views, step.at_rest);
+        if views > 0 && (evidence.inliers as f64) < MISLED * views as f64 {
+            self.solve(&mut step);
+        }
+        step.evidence = Some(evidence);
         step.columns_lost = self.marginalize();
         step
+    }
+
+    /// Optimizes the window; adds what that took to `step`.
+    fn solve(&mut self, step: &mut Step) {
+        let Outcome { iterations, failures, rejected } = self.solver.optimize(&mut self.graph, &self.model);
+        step.outcome.iterations += iterations;
+        step.outcome.failures += failures;
+        step.outcome.rejected += rejected;
+        step.covariance = self.solver.newest_covariance();
     }
 
     /// The frame after that in slot `before`, where inertia puts it.

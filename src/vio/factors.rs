@@ -14,7 +14,6 @@ use super::inertial::{inertial_jacobians, inertial_residual, scale_jacobian, Vec
 use super::landmarks::{Landmark, Observation};
 use super::model::Model;
 use super::projection::{host_cam, observe, predicted, CameraColumns, Host};
-use super::reprojection::huber;
 use super::rig::{CAMERA_DIM_MAX, SCALE_DIM};
 use super::rows::{FactorRows, POINT_DIM};
 use super::window::{Height, Layout, Window, MOTION_DIM, POSE_DIM};
@@ -167,12 +166,10 @@ fn zero_velocity_rows(window: &Window, slot: usize, rate: DVec3, layout: &Layout
     zero_velocity::cost(now, rate)
 }
 
-fn costs_of_views<'a>(l: &'a Landmark, window: &'a Window, model: &Model) -> impl Iterator<Item = f64> + 'a {
-    let inv_sigma = 1.0 / model.config.observation_sigma_px;
-    let huber_width = model.config.huber_px * inv_sigma;
+fn costs_of_views<'a>(l: &'a Landmark, window: &'a Window, model: &'a Model) -> impl Iterator<Item = f64> + 'a {
     let host_cam = host_cam(l, window);
     let off = move |o: &Observation| predicted(l, &host_cam, o, window).map_or(LOST_PX, |px| (px - o.px()).length());
-    l.observations.iter().map(move |o| huber(off(o) * inv_sigma, huber_width).1)
+    l.observations.iter().map(move |o| model.view_noise(window.frame(o.slot as usize)).weigh(off(o)).1)
 }
 
 /// Views in frames of the layout, `[point | frames | r]`, before the point is eliminated; answers their cost.
@@ -188,19 +185,17 @@ pub fn view_rows(landmark: &Landmark, window: &Window, model: &Model, layout: &L
     let host_at = layout.pose(host).filter(|_| others);
 
     let mut cost = 0.0;
-    let inv_sigma = 1.0 / model.config.observation_sigma_px;
-    let huber_width = model.config.huber_px * inv_sigma;
     let cameras_at = layout.cameras().map(|s| (out.offset(s.at), s.len));
     let host_view = Host::of(landmark, window);
     let mut columns: CameraColumns = [[0.0; CAMERA_DIM_MAX]; 2];
     for o in views {
+        let noise = model.view_noise(window.frame(o.slot as usize));
         let Some(r) = observe(landmark, &host_view, o, window, &mut columns) else {
-            cost += huber(LOST_PX * inv_sigma, huber_width).1;
+            cost += noise.weigh(LOST_PX).1;
             continue;
         };
-        let (weight, c) = huber(r.px.length() * inv_sigma, huber_width);
+        let (weight, c) = noise.weigh(r.px.length());
         cost += c;
-        let weight = weight.sqrt() * inv_sigma;
         let target_at = layout.pose(o.slot as usize).filter(|_| o.slot != landmark.host);
         // In its host's own frame a view says nothing about poses.
         let frames = host_at.zip(target_at).map(|(host, target)| [host, target]);

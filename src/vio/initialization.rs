@@ -41,6 +41,8 @@ const GRAVITY_MISFIT: f64 = 1.5;
 const POSITION_MISFIT: f64 = 0.05;
 /// Rotation noise of one resection, rad: the weight of the gyro bias' prior.
 const RESECTION_ROTATION: f64 = 2e-3;
+/// Width of Huber's weight of a resection, px; a view three times as far off is no inlier.
+const START_HUBER_PX: f64 = 1.0;
 /// An inverse distance of this many standard deviations is a measured one.
 const DEPTH_SIGNIFICANT: f64 = 3.0;
 /// Resections that may fail, and alignments that may contradict each other, before the mean force has to do. The
@@ -256,8 +258,8 @@ fn resect(points: &[ReferencePoint], tracks: &Tracks, model: &Model, guess: Pose
                 let view = View { host_cam, host: &reference, camera, target: &body };
                 let Some(r) = view.reproject(point) else { continue };
                 let e = r.px - seen.px();
-                inliers += (c == p.camera && e.length() < 3.0 * model.config.huber_px) as usize;
-                let (w, _) = huber(e.length(), model.config.huber_px);
+                inliers += (c == p.camera && e.length() < 3.0 * START_HUBER_PX) as usize;
+                let (w, _) = huber(e.length(), START_HUBER_PX);
                 for (row, e) in [e.x, e.y].into_iter().enumerate() {
                     let j = SVector::<f64, 6>::from_row_slice(&r.d_target[row]);
                     h += j * j.transpose() * w;

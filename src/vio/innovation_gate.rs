@@ -4,8 +4,8 @@
 //! further from that than the uncertainty of the prediction allows is left out. The uncertainty is that
 //! of the motion since the frame before (inertial increment, and the velocity and gyro bias it
 //! started from), of the landmark's inverse distance, and of both views: `eᵀ S⁻¹ e` with
-//! `S = J P Jᵀ + J_ρ σ_ρ² J_ρᵀ + 2 σ² I` against a chi-square bound. When many fail at once it is the
-//! prediction that is wrong, and the gate is left open.
+//! `S = J P Jᵀ + J_ρ σ_ρ² J_ρᵀ + 2 σ² I` against a chi-square bound. When most of many fail at once
+//! it may be the prediction that is wrong, and the gate is left open.
 
 use super::graph::Graph;
 use super::inertial::{body_velocity_covariance, Covariance};
@@ -20,7 +20,8 @@ use nalgebra::{Matrix3, SMatrix, SVector};
 
 /// Two degrees of freedom pass with all but 4e-6 of true views.
 const CHI_SQUARE_MAX: f64 = 25.0;
-/// Least number of known views, and share of them that passes, for any to be refused.
+/// Where so many known views are seen and less than this share of them passes, it is the prediction that is wrong. Fewer views
+/// cannot tell, and would drag the pose along.
 const VIEWS_MIN: usize = 8;
 const PASS_MIN: f64 = 0.6;
 
@@ -98,8 +99,8 @@ pub fn gate(
             refused += wrong[camera][i] as usize;
         }
     }
-    if known < VIEWS_MIN || ((known - refused) as f64) < PASS_MIN * known as f64 {
-        return Passed { refused: 0, open: refused > 0 };
+    if known >= VIEWS_MIN && ((known - refused) as f64) < PASS_MIN * known as f64 {
+        return Passed { refused: 0, open: true };
     }
     for (list, wrong) in tracks.cameras.iter_mut().zip(&wrong) {
         let mut i = 0;

@@ -17,6 +17,11 @@ use nalgebra::{Matrix3, Vector3};
 use stipple_drivers::Span;
 
 fn run(vio: &mut Vio, frames: std::ops::Range<usize>, world: &mut World) {
+    run_seeing(vio, frames, world, |_| {});
+}
+
+/// Flies; `spoil` may change what the cameras see.
+fn run_seeing(vio: &mut Vio, frames: std::ops::Range<usize>, world: &mut World, spoil: impl Fn(&mut Tracks)) {
     let mut tracks = Tracks::default();
     for frame in frames {
         let t = frame as f64 * FRAME_SECS + 0.0012;
@@ -29,6 +34,7 @@ fn run(vio: &mut Vio, frames: std::ops::Range<usize>, world: &mut World) {
             sample += 1;
         }
         world.tracks(t, &mut tracks);
+        spoil(&mut tracks);
         vio.on_tracks(&tracks);
     }
 }
@@ -400,9 +406,12 @@ fn uncertainty_of_position_and_yaw_only_grows() {
     assert!(sigmas.windows(2).all(|w| w[1].0 > w[0].0 && w[1].1 > w[0].1), "{sigmas:?}");
 }
 
-/// The next frame of a running flight, with every landmark's view for which `moved` answers true moved by 12 px;
+/// Every track.
+const ALL: usize = usize::MAX;
+
+/// The next frame of a running flight, in which at most so many tracks are seen, with every landmark's view for which `moved` answers true moved by 12 px;
 /// answers how many were moved, and how many views and frames the gate refused and left alone.
-fn gated(moved: impl Fn(u64) -> bool) -> (u64, u64, u64) {
+fn gated(seen: usize, moved: impl Fn(u64) -> bool) -> (u64, u64, u64) {
     let mut world = World::new(Path { rest: -1.0 });
     let mut vio = Vio::new(&world.rig, &VioConfig::default());
     run(&mut vio, 0..60, &mut world);
@@ -410,9 +419,12 @@ fn gated(moved: impl Fn(u64) -> bool) -> (u64, u64, u64) {
     (1..=10).for_each(|k| vio.on_imu(world.imu(newest.0 as f64 * 1e-9 + k as f64 / RATE_HZ)));
     let mut tracks = Tracks::default();
     world.tracks(60.0 * FRAME_SECS + 0.0012, &mut tracks);
+    let known = |id: u64| vio.estimator.graph.landmarks.find(id).is_some();
+    let ids: Vec<u64> = tracks.cameras[0].iter().map(|t| t.id).filter(|id| known(*id)).take(seen).collect();
+    tracks.cameras.iter_mut().for_each(|c| c.retain(|t| seen == ALL || ids.contains(&t.id)));
     let mut count = 0;
     for track in tracks.cameras.iter_mut().flat_map(|c| c.iter_mut()) {
-        if vio.estimator.graph.landmarks.find(track.id).is_some() && moved(track.id) {
+        if known(track.id) && moved(track.id) {
             (track.px[0], count) = (track.px[0] + 12.0, count + 1);
         }
     }
@@ -423,8 +435,8 @@ fn gated(moved: impl Fn(u64) -> bool) -> (u64, u64, u64) {
 
 #[test]
 fn views_that_cannot_be_their_landmarks_are_refused_and_true_ones_are_not() {
-    let (none, by_itself, _) = gated(|_| false);
-    let (moved, refused, opened) = gated(|id| id % 5 == 0);
+    let (none, by_itself, _) = gated(ALL, |_| false);
+    let (moved, refused, opened) = gated(ALL, |id| id % 5 == 0);
     // Of the world's own views one in a hundred is 15 px off.
     assert!(none == 0 && by_itself <= 6, "{by_itself} refused of a true frame");
     assert!(moved > 20 && refused >= moved && refused <= moved + by_itself, "{refused} of {moved}");
@@ -433,9 +445,16 @@ fn views_that_cannot_be_their_landmarks_are_refused_and_true_ones_are_not() {
 
 #[test]
 fn prediction_that_nearly_all_contradict_refuses_nothing() {
-    let (moved, refused, opened) = gated(|_| true);
+    let (moved, refused, opened) = gated(ALL, |_| true);
     assert!(moved > 100);
     assert_eq!((refused, opened), (0, 1));
+}
+
+#[test]
+fn few_views_are_refused_where_all_contradict_the_prediction() {
+    let (moved, refused, opened) = gated(3, |_| true);
+    assert!((3..=6).contains(&moved));
+    assert_eq!((refused, opened), (moved, 0));
 }
 
 #[test]

@@ -44,6 +44,8 @@ pub struct Frame {
     pub keyframe: bool,
     /// Velocity and biases are still estimated.
     pub is_state: bool,
+    /// Its views may all be wrong, and count less: they contradict its prediction, or the estimate was not trusted yet.
+    pub doubted: bool,
     /// Point at which Jacobians are taken for good, once the prior is about this frame.
     pub linearization_point: Option<Motion>,
     /// Error since the linearization point, [p, θ, v, bg, ba].
@@ -75,6 +77,7 @@ impl Frame {
             now,
             keyframe: false,
             is_state: true,
+            doubted: false,
             linearization_point: None,
             delta: [0.0; 15],
             increment: Increment::new(now.bg, now.ba),

@@ -105,6 +105,10 @@ fn fly(
             readings += 1;
         }
         world.tracks(t, &mut tracks);
+        // Far from walls few corners are found.
+        if half > WALLS {
+            tracks.cameras.iter_mut().for_each(|c| c.retain(|t| t.id % 3 == 0));
+        }
         let Some(odometry) = vio.on_tracks(&tracks).odometry else { continue };
         let (z, truth) = (odometry.world_from_body.p.z, pose(t).p.z);
         let offset = *start.get_or_insert(z - truth);
@@ -133,7 +137,8 @@ fn climbs(half: f64, seeds: &[u64]) -> [f64; 3] {
             "walls {half} m away, seed {seed}: height off by {off:.3} m at most without barometer, {on:.3} with, {z:.3} at the \
              top; bias by {bias:.3} of {sigma:.3}, {sigmas:.2} sigma at most"
         );
-        assert!(with.vio.stats.heights_used > 600 && with.vio.stats.heights_gated == 0);
+        let s = &with.vio.stats;
+        assert!(s.heights_used > 500 && 5 * s.heights_gated < s.heights_used, "{s:?}");
         bare += off * off / seeds.len() as f64;
         aided += on * on / seeds.len() as f64;
         worst = worst.max(sigmas);
@@ -148,12 +153,11 @@ fn barometer_holds_the_height_of_a_climb_and_its_drift_is_told_apart() {
     assert!(with <= 0.3 && sigmas < 3.5, "{without} {with} {sigmas}");
 }
 
-/// Where the cameras hardly tell how far the walls are, the estimate's height is off by more than it says. The barometer still
-/// holds it, though its drift is then not told apart as well as is said. Of six seeds these are the two whose height by vision
-/// was worst: the ones with something to hold.
+/// Far walls of which a third of the points is seen: the height by vision is off by metres, more than the estimate says, and
+/// heights are refused for a while. The barometer holds it all the same, though its drift is not told apart as well as is said.
 #[test]
 fn barometer_holds_a_climb_that_vision_does_not() {
-    let [without, with, sigmas] = climbs(2.0 * WALLS, &[1, 3]);
+    let [without, with, sigmas] = climbs(2.0 * WALLS, &[1, 2, 3]);
     eprintln!("climb far from walls: {without:.3} m without barometer, {with:.3} with; bias within {sigmas:.2} sigma");
     assert!(without > 1.0 && with < without / 3.0, "{without} {with}");
 }
