@@ -23,7 +23,7 @@ use super::window::Frame;
 use super::zero_velocity;
 use crate::config::VioConfig;
 use crate::frontend::{Rejected, Tracks};
-use crate::limits::{FRAMES, RIG_DIM};
+use crate::limits::{CAMERAS_MAX, FRAMES, RIG_DIM};
 use glam::DVec3;
 use stipple_drivers::{Calibration, Nanos};
 
@@ -135,7 +135,7 @@ impl Estimator {
     pub fn start(&mut self, tracks: &Tracks, start: &Start, imu: &ImuRing) -> Step {
         let slot = self.begin(tracks, &start.motion, imu);
         self.believe(slot, &start.sigma, [start.motion.bg, start.motion.ba]);
-        let landmarks_full = self.make_keyframe(slot);
+        let landmarks_full = self.make_keyframe(slot).unwrap_or(0);
         Step {
             keyframe: true,
             connected: self.graph.landmarks.pool.len(),
@@ -245,7 +245,8 @@ impl Estimator {
         let (slot, mut step) = self.enter(before, tracks, imu, covariance);
         self.graph.window.frame_mut(slot).doubted = step.gate.open || !trusted;
         if step.keyframe {
-            step.landmarks_full = self.make_keyframe(slot);
+            let made = self.make_keyframe(slot);
+            (step.keyframe, step.landmarks_full) = (made.is_some(), made.unwrap_or(0));
         }
 
         if let Some(heights) = &mut self.heights {
@@ -333,14 +334,27 @@ impl Estimator {
         unconnected > 0 && (due || connected < CONNECTED_FEW)
     }
 
-    /// Declares the frame in `slot` a keyframe and triangulates; answers how many landmarks had no room.
-    pub fn make_keyframe(&mut self, slot: usize) -> usize {
+    /// Triangulates what the frame in `slot` sees and declares it a keyframe; answers how many landmarks had no room. `None` when
+    /// it is none, since all it would do is push out the keyframe that its points wait to move away from.
+    pub fn make_keyframe(&mut self, slot: usize) -> Option<usize> {
         let px_max = self.outlier_px(slot);
         let (made, full) = triangulate(&mut self.graph, slot, &self.tracks, &self.model, px_max);
+        if made + full == 0 && self.waits_for_baseline(slot) {
+            return None;
+        }
         let frame = self.graph.window.frame_mut(slot);
         self.keyframe_at = frame.t;
         (frame.keyframe, frame.hosted) = (true, made);
-        full
+        Some(full)
+    }
+
+    /// Whether most points of the frame in `slot` are in the newest keyframe too.
+    fn waits_for_baseline(&self, slot: usize) -> bool {
+        let window = &self.graph.window;
+        let Some(keyframe) = window.slots().rev().find(|s| window.frame(*s).keyframe) else { return false };
+        let seen = || self.tracks[slot].cameras.iter().flat_map(|c| c.iter());
+        let both = seen().filter(|t| (0..CAMERAS_MAX).any(|c| self.tracks[keyframe].find(c, t.id).is_some())).count();
+        2 * both > seen().count()
     }
 
     /// Distance from its prediction at which a view is wrong, px: wider while the rig is not known well.

@@ -468,3 +468,20 @@ fn frame_that_is_refused_is_not_healthy() {
     assert!(update.health.has(Health::FRAME_REJECTED) && update.odometry.is_none() && update.quality == 0);
     assert!(vio.health_frames().any(|f| f == ("frame_rejected", 1)));
 }
+
+/// One camera that has lost its points and moves by 6 cm a second: a frame that triangulates nothing must not push out the keyframe
+/// that the vehicle has to move away from.
+#[test]
+fn slow_camera_finds_points_again() {
+    let creep = |t: f64| Pose::new(DQuat::from_rotation_x(0.03 * (9.0 * t).sin()), DVec3::X * 0.06 * t);
+    let mut noise = world::stream(3, 1);
+    let points = world::room(1500, &mut noise);
+    let mut world = World::seen_from(creep, points, noise);
+    let mut vio = Vio::new(&world.rig, &VioConfig::default());
+    run(&mut vio, 0..60, &mut world);
+    run_seeing(&mut vio, 60..200, &mut world, |tracks| {
+        tracks.cameras[1].clear();
+        tracks.cameras[0].iter_mut().for_each(|t| t.id += 1 << 20);
+    });
+    assert!(vio.is_running() && vio.stats.resets == 0, "{:?}", vio.stats);
+}
