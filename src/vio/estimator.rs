@@ -148,7 +148,6 @@ impl Estimator {
     /// Puts a frame into an empty window; answers its slot.
     fn begin(&mut self, tracks: &Tracks, motion: &Motion, imu: &ImuRing) -> usize {
         let mut frame = Frame::new(tracks.t, *motion);
-        frame.doubted = true;
         frame.rate = imu.rate_at(tracks.t);
         frame.hold_twist();
         let slot = self.graph.window.push(frame).expect("an empty window has room");
@@ -194,6 +193,7 @@ impl Estimator {
     fn fill(&mut self, frames: &[Tracks], first: &Motion, imu: &ImuRing) -> Step {
         let rig = self.graph.window.rig.now;
         let oldest = self.begin(&frames[0], first, imu);
+        self.graph.window.frame_mut(oldest).doubted = true;
         let mut slot = oldest;
         for tracks in &frames[1..] {
             let frame = Frame { doubted: true, ..self.propagated(slot, tracks.t, imu) };
@@ -238,12 +238,12 @@ impl Estimator {
     }
 
     /// One more frame of a window that has some. `covariance` is that of the newest state so far, which the gate
-    /// needs.
-    pub fn advance(&mut self, tracks: &Tracks, imu: &ImuRing, covariance: Option<&Covariance>, trusted: bool) -> Step {
+    /// needs; `doubted` says that something speaks against the estimate.
+    pub fn advance(&mut self, tracks: &Tracks, imu: &ImuRing, covariance: Option<&Covariance>, doubted: bool) -> Step {
         let before = self.graph.window.newest().expect("a started window has frames");
         self.rejected.clear();
         let (slot, mut step) = self.enter(before, tracks, imu, covariance);
-        self.graph.window.frame_mut(slot).doubted = step.gate.open || !trusted;
+        self.graph.window.frame_mut(slot).doubted = step.gate.open || doubted;
         if step.keyframe {
             let made = self.make_keyframe(slot);
             (step.keyframe, step.landmarks_full) = (made.is_some(), made.unwrap_or(0));

@@ -330,8 +330,8 @@ impl Vio {
 
     /// One more frame of a running estimator.
     fn advance(&mut self, tracks: &Tracks) -> Step {
-        let trusted = self.monitor.is_trusted();
-        let step = self.estimator.advance(tracks, &self.imu, self.covariance.as_ref(), trusted);
+        let doubted = self.monitor.is_suspect() || self.recovery.is_suspect() && !self.monitor.is_trusted();
+        let step = self.estimator.advance(tracks, &self.imu, self.covariance.as_ref(), doubted);
         self.take(&step);
         if let Some(evidence) = step.evidence.as_ref().filter(|_| !step.at_rest) {
             let Estimator { graph, rig_deviations, .. } = &self.estimator;

@@ -87,9 +87,14 @@ impl Monitor {
         self.now
     }
 
+    /// Something spoke against the estimate of late.
+    pub fn is_suspect(&self) -> bool {
+        self.suspect >= SUSPECT_NONE || self.unseen_since.is_some()
+    }
+
     /// Nothing speaks against the newest estimate, nor did since its start.
     pub fn is_trusted(&self) -> bool {
-        self.suspect < SUSPECT_NONE && self.unseen_since.is_none() && self.lived >= PROBATION
+        !self.is_suspect() && self.lived >= PROBATION
     }
 }
 

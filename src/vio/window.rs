@@ -44,7 +44,7 @@ pub struct Frame {
     pub keyframe: bool,
     /// Velocity and biases are still estimated.
     pub is_state: bool,
-    /// Its views may all be wrong, and count less: they contradict its prediction, or the estimate was not trusted yet.
+    /// Its views may all be wrong, and count less: they contradict its prediction, or something speaks against the estimate.
     pub doubted: bool,
     /// Point at which Jacobians are taken for good, once the prior is about this frame.
     pub linearization_point: Option<Motion>,
