@@ -20,8 +20,8 @@ use nalgebra::{Matrix3, SMatrix, SVector};
 
 /// Two degrees of freedom pass with all but 4e-6 of true views.
 const CHI_SQUARE_MAX: f64 = 25.0;
-/// Where so many known views are seen and less than this share of them passes, it is the prediction that is wrong. Fewer views
-/// cannot tell, and would drag the pose along.
+/// The prediction is taken to be wrong when a frame has at least so many views of known landmarks and less than this share of
+/// them passes. Fewer views cannot tell, and wrong ones would pull the pose with them.
 const VIEWS_MIN: usize = 8;
 const PASS_MIN: f64 = 0.6;
 

@@ -87,7 +87,7 @@ impl Monitor {
         self.now
     }
 
-    /// Something spoke against the estimate of late.
+    /// Suspect frames are not yet outlasted by others, or too few known landmarks are seen.
     pub fn is_suspect(&self) -> bool {
         self.suspect >= SUSPECT_NONE || self.unseen_since.is_some()
     }

@@ -406,12 +406,9 @@ fn uncertainty_of_position_and_yaw_only_grows() {
     assert!(sigmas.windows(2).all(|w| w[1].0 > w[0].0 && w[1].1 > w[0].1), "{sigmas:?}");
 }
 
-/// Every track.
-const ALL: usize = usize::MAX;
-
-/// The next frame of a running flight, in which at most so many tracks are seen, with every landmark's view for which `moved` answers true moved by 12 px;
-/// answers how many were moved, and how many views and frames the gate refused and left alone.
-fn gated(seen: usize, moved: impl Fn(u64) -> bool) -> (u64, u64, u64) {
+/// The next frame of a running flight, which sees at most `landmarks_max` landmarks and whose views of landmarks are moved by
+/// 12 px where `moved` says so by id. Answers how many were moved, and how many views and frames the gate refused and left alone.
+fn gated(landmarks_max: usize, moved: impl Fn(u64) -> bool) -> (u64, u64, u64) {
     let mut world = World::new(Path { rest: -1.0 });
     let mut vio = Vio::new(&world.rig, &VioConfig::default());
     run(&mut vio, 0..60, &mut world);
@@ -420,8 +417,9 @@ fn gated(seen: usize, moved: impl Fn(u64) -> bool) -> (u64, u64, u64) {
     let mut tracks = Tracks::default();
     world.tracks(60.0 * FRAME_SECS + 0.0012, &mut tracks);
     let known = |id: u64| vio.estimator.graph.landmarks.find(id).is_some();
-    let ids: Vec<u64> = tracks.cameras[0].iter().map(|t| t.id).filter(|id| known(*id)).take(seen).collect();
-    tracks.cameras.iter_mut().for_each(|c| c.retain(|t| seen == ALL || ids.contains(&t.id)));
+    let landmarks = tracks.cameras[0].iter().map(|t| t.id).filter(|id| known(*id));
+    let left_out: Vec<u64> = landmarks.skip(landmarks_max).collect();
+    tracks.cameras.iter_mut().for_each(|c| c.retain(|t| !left_out.contains(&t.id)));
     let mut count = 0;
     for track in tracks.cameras.iter_mut().flat_map(|c| c.iter_mut()) {
         if known(track.id) && moved(track.id) {
@@ -435,8 +433,8 @@ fn gated(seen: usize, moved: impl Fn(u64) -> bool) -> (u64, u64, u64) {
 
 #[test]
 fn views_that_cannot_be_their_landmarks_are_refused_and_true_ones_are_not() {
-    let (none, by_itself, _) = gated(ALL, |_| false);
-    let (moved, refused, opened) = gated(ALL, |id| id % 5 == 0);
+    let (none, by_itself, _) = gated(usize::MAX, |_| false);
+    let (moved, refused, opened) = gated(usize::MAX, |id| id % 5 == 0);
     // Of the world's own views one in a hundred is 15 px off.
     assert!(none == 0 && by_itself <= 6, "{by_itself} refused of a true frame");
     assert!(moved > 20 && refused >= moved && refused <= moved + by_itself, "{refused} of {moved}");
@@ -445,7 +443,7 @@ fn views_that_cannot_be_their_landmarks_are_refused_and_true_ones_are_not() {
 
 #[test]
 fn prediction_that_nearly_all_contradict_refuses_nothing() {
-    let (moved, refused, opened) = gated(ALL, |_| true);
+    let (moved, refused, opened) = gated(usize::MAX, |_| true);
     assert!(moved > 100);
     assert_eq!((refused, opened), (0, 1));
 }
