@@ -52,9 +52,9 @@ section! {
     tuning
     /// Standard deviation of an observation, px.
     observation_sigma_px: f64 = 0.3;
-    /// Width of Huber's weight, px. Half a deviation, since tracks that slide along edges or move by themselves err by more than
+    /// Width of Huber's weight, px. Less than a deviation, since tracks that slide along edges or move by themselves err by more than
     /// Gaussian ones.
-    huber_px: f64 = 0.15;
+    huber_px: f64 = 0.2;
     iterations_max: u32 = 7;
     /// Newest frames kept with velocity and biases.
     states: u32 = 3;

@@ -169,7 +169,7 @@ fn zero_velocity_rows(window: &Window, slot: usize, rate: DVec3, layout: &Layout
 fn costs_of_views<'a>(l: &'a Landmark, window: &'a Window, model: &'a Model) -> impl Iterator<Item = f64> + 'a {
     let host_cam = host_cam(l, window);
     let off = move |o: &Observation| predicted(l, &host_cam, o, window).map_or(LOST_PX, |px| (px - o.px()).length());
-    l.observations.iter().map(move |o| model.view_noise(window.frame(o.slot as usize)).weigh(off(o)).1)
+    l.observations.iter().map(move |o| model.view_noise(window.frame(o.slot as usize)).cost(off(o)))
 }
 
 /// Views in frames of the layout, `[point | frames | r]`, before the point is eliminated; answers their cost.
@@ -191,11 +191,11 @@ pub fn view_rows(landmark: &Landmark, window: &Window, model: &Model, layout: &L
     for o in views {
         let noise = model.view_noise(window.frame(o.slot as usize));
         let Some(r) = observe(landmark, &host_view, o, window, &mut columns) else {
-            cost += noise.weigh(LOST_PX).1;
+            cost += noise.cost(LOST_PX);
             continue;
         };
-        let (weight, c) = noise.weigh(r.px.length());
-        cost += c;
+        let whitened = noise.whiten(r.px);
+        cost += whitened.cost;
         let target_at = layout.pose(o.slot as usize).filter(|_| o.slot != landmark.host);
         // In its host's own frame a view says nothing about poses.
         let frames = host_at.zip(target_at).map(|(host, target)| [host, target]);
@@ -204,19 +204,20 @@ pub fn view_rows(landmark: &Landmark, window: &Window, model: &Model, layout: &L
         out.frames.push(ascending).expect("OBSERVATIONS is the most a landmark has");
         for axis in 0..2 {
             let row = out.rows.push();
-            let mut put = |at: usize, x: &[f64]| {
-                row[at..].iter_mut().zip(x).for_each(|(to, x)| *to = x * weight);
+            let by = whitened.rows.col(axis);
+            let mut put = |at: usize, [x, y]: [&[f64]; 2]| {
+                row[at..].iter_mut().zip(x).zip(y).for_each(|((to, x), y)| *to = x * by.x + y * by.y);
             };
-            put(0, &r.d_point[axis]);
+            put(0, [&r.d_point[0], &r.d_point[1]]);
             if let Some((at, len)) = cameras_at {
-                put(at, &columns[axis][..len]);
+                put(at, [&columns[0][..len], &columns[1][..len]]);
             }
             if let Some([host_at, target_at]) = frames_at {
-                put(host_at, &r.d_host[axis]);
-                put(target_at, &r.d_target[axis]);
+                put(host_at, [&r.d_host[0], &r.d_host[1]]);
+                put(target_at, [&r.d_target[0], &r.d_target[1]]);
             }
             let last = row.len() - 1;
-            row[last] = r.px[axis] * weight;
+            row[last] = whitened.error[axis];
         }
     }
     out.rows.push()[POINT_DIM - 1] = RHO_RIDGE;

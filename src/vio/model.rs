@@ -2,20 +2,21 @@
 
 use super::health::landmarks_enough;
 use super::preintegration::Noise;
-use super::reprojection::{huber, huber_scale, CameraModel};
+use super::reprojection::{huber, huber_scale, CameraModel, CURVATURE};
 use super::window::Frame;
 use crate::config::VioConfig;
 use crate::limits::CAMERAS_MAX;
+use glam::{DMat2, DVec2};
 use stipple_drivers::Calibration;
 
 /// Deviation of a view of a doubted frame, as a factor on that of other views, and Huber's width for it, in such deviations.
 const DOUBTED_SIGMA: f64 = 5.0 / 3.0;
 const DOUBTED_WIDTH: f64 = 2.0;
 
-/// By how much views count.
+/// Noise of a view: Gaussian errors, and Huber's cost of them.
 #[derive(Clone, Copy, Debug)]
 pub struct ViewNoise {
-    /// Inverse deviation by which errors are whitened, 1/px: Huber's weights then sum up to what the estimate knows.
+    /// Inverse deviation by which errors are whitened, 1/px: the squared rows then sum up to what the estimate knows.
     inv_sigma: f64,
     /// Width of Huber's weight, in those deviations.
     width: f64,
@@ -27,11 +28,34 @@ impl ViewNoise {
         ViewNoise { inv_sigma, width: width_px * inv_sigma }
     }
 
-    /// Factor on the rows of a view that is off by so many px, 1/px, and its cost.
-    pub fn weigh(&self, off_px: f64) -> (f64, f64) {
-        let (weight, cost) = huber(off_px * self.inv_sigma, self.width);
-        (weight.sqrt() * self.inv_sigma, cost)
+    /// Cost of a view that is off by so many px.
+    pub fn cost(&self, off_px: f64) -> f64 {
+        huber(off_px * self.inv_sigma, self.width).1
     }
+
+    /// Whitening of a view that is off by `px`.
+    pub fn whiten(&self, px: DVec2) -> Whitened {
+        let off = px.length();
+        let (weight, cost) = huber(off * self.inv_sigma, self.width);
+        let scale = weight.sqrt() * self.inv_sigma;
+        if weight == 1.0 {
+            return Whitened { rows: DMat2::from_diagonal(DVec2::splat(scale)), error: px * scale, cost };
+        }
+        let along = px / off;
+        let rows = DMat2::IDENTITY - DMat2::from_cols(along * along.x, along * along.y) * (1.0 - CURVATURE.sqrt());
+        Whitened { rows: rows * scale, error: px * (scale / CURVATURE.sqrt()), cost }
+    }
+}
+
+/// The two rows of a view `[J | r]`, in px, as they go into the normal equations: `rows J` and `error`. Their square has the
+/// gradient of Huber's cost.
+#[derive(Clone, Copy, Debug)]
+pub struct Whitened {
+    /// 1/px; symmetric.
+    pub rows: DMat2,
+    /// Without unit.
+    pub error: DVec2,
+    pub cost: f64,
 }
 
 /// Constants of one rig and its settings.
@@ -40,6 +64,7 @@ pub struct Model {
     pub cameras: Vec<CameraModel>,
     pub noise: Noise,
     pub config: VioConfig,
+    /// Noise of the views of a frame, and of one in doubt.
     views: ViewNoise,
     doubted_views: ViewNoise,
     /// Number of landmarks in view that is enough for the largest image of the rig, without unit.

@@ -12,14 +12,16 @@ use crate::limits::WINDOW_DIM;
 use crate::math::dense::{eliminate, System};
 use nalgebra::SMatrix;
 
-/// Damping, as a share of the diagonal: at the start, at least, at most.
-pub const LAMBDA_START: f64 = 1e-4;
+/// Damping, as a share of the diagonal: at the start, at least, at most. With ten times as much at the start the scale of a
+/// scene that is far away, whose curvature is a small part of a position's, does not arrive: on a climb of 120 m between walls
+/// 40 m away the height was off by 6 m instead of 0.6.
+pub const LAMBDA_START: f64 = 1e-5;
 const LAMBDA_MIN: f64 = 1e-6;
 const LAMBDA_MAX: f64 = 1e2;
-/// Done when a step changes no error by this (m, rad, m/s ...), or the cost, in variances, by this: a
-/// thousandth of a window's.
+/// Done when a step changes no error by this (m, rad, m/s ...), or the cost, in variances, by this: some thousandths of a
+/// window's, of which a further step would gain a fraction.
 const STEP_SETTLED: f64 = 1e-4;
-const COST_SETTLED: f64 = 0.5;
+const COST_SETTLED: f64 = 1.0;
 /// A rejected step that promised less than this is rounding.
 const COST_NUMERIC: f64 = 1e-3;
 /// Added to the diagonal whatever lambda is, so that unobserved directions stay put.
