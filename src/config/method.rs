@@ -52,8 +52,8 @@ section! {
     tuning
     /// Standard deviation of an observation, px.
     observation_sigma_px: f64 = 0.3;
-    /// Width of Huber's weight, px. Less than a deviation, since tracks that slide along edges or move by themselves err by more than
-    /// Gaussian ones.
+    /// Width of Huber's weight, px. Less than a deviation: tracks slide along edges and move by themselves, and their errors are
+    /// larger than Gaussian ones.
     huber_px: f64 = 0.2;
     iterations_max: u32 = 7;
     /// Newest frames kept with velocity and biases.

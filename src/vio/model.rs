@@ -96,3 +96,26 @@ impl Model {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn whitened_rows_have_the_gradient_of_the_cost_and_the_stated_curvature() {
+        const H: f64 = 1e-6;
+        let noise = ViewNoise::new(0.3, 0.2);
+        for px in [DVec2::ZERO, DVec2::new(0.03, -0.05), DVec2::new(0.7, 0.2), DVec2::new(-3.0, 40.0)] {
+            let Whitened { rows, error, cost } = noise.whiten(px);
+            assert_eq!(cost, noise.cost(px.length()));
+            let slope =
+                |axis: DVec2| (noise.cost((px + axis * H).length()) - noise.cost((px - axis * H).length())) / (2.0 * H);
+            let off = rows * error - DVec2::new(slope(DVec2::X), slope(DVec2::Y));
+            assert!(off.length() < 1e-5, "{px}: the gradient is off by {off}");
+            let along = px.normalize_or(DVec2::X);
+            let [on, across] = [along, along.perp()].map(|axis| (rows * axis).length_squared());
+            let share = if px.length() > 0.2 { CURVATURE } else { 1.0 };
+            assert!((on - share * across).abs() < 1e-9 * across, "{px}: {on} along, {across} across");
+        }
+    }
+}
