@@ -5,7 +5,6 @@ mod cache;
 mod chroma;
 mod exposure;
 mod fisheye;
-mod held_out;
 mod occupancy;
 mod pool;
 mod raster;

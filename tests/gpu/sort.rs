@@ -149,27 +149,3 @@ fn scan_equals_its_twin() {
         assert!(out == scanned(&data, count), "{count}");
     }
 }
-
-#[test]
-#[ignore = "prints times of sorts and scans of three sizes: cargo test --release --test gpu sort_and_scan_times -- --ignored --nocapture"]
-fn sort_and_scan_times() {
-    for n in [30_000, 300_000, 3_000_000] {
-        let mut rig = Rig::new(n);
-        let keys = noise(1, n);
-        for bits in [11, 16, 22, 32] {
-            let best = (0..5).map(|_| rig.sort(&keys, n as u32, bits).2).fold(f64::INFINITY, f64::min);
-            println!("sort {n:8} keys {bits:2} bits {best:8.3} ms");
-        }
-        let mut best = f64::INFINITY;
-        for _ in 0..5 {
-            let mut rec = rig.gpu.record();
-            rig.scan.record(&mut rec, rig.pairs.keys);
-            rig.gpu.submit(rec).unwrap();
-            best = best.min(rig.gpu.last_submit_ms());
-        }
-        println!("scan {n:8}              {best:8.3} ms");
-        for t in rig.gpu.timings() {
-            println!("    {t:?}");
-        }
-    }
-}

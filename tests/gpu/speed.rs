@@ -5,7 +5,7 @@ use super::twins::chunks;
 use stipple::gpu::kernels::{sum_chunks, types::Moments};
 use stipple::gpu::{Gpu, GpuOptions};
 use stipple::map::tiling::CHUNK_GPU;
-use stipple::map::{Gaussian, Pipeline, Rendered, Shape, StepStats, Tiling, Weights};
+use stipple::map::{Pipeline, Rendered, Shape, StepStats, Tiling, Weights};
 
 /// The map, to the bit.
 fn map(gpu: &mut Gpu, p: &mut Pipeline) -> Vec<u32> {
@@ -134,41 +134,5 @@ fn gradients_summed_in_chunks_are_those_summed_one_by_one() {
         // Importance may round to the neighbour of 8 bits.
         let near = |(a, b): (&u32, &u32)| (a & 0xffff) == (b & 0xffff) && (a >> 16).abs_diff(b >> 16) <= 1;
         assert!(states.iter().zip(&chunked_states).all(near));
-    }
-}
-
-#[test]
-#[ignore = "prints times of steps with pools of several fillings: cargo test --release --test gpu a_pool_a_quarter_full_or_a_quarter_seen_against_a_full_one -- --ignored --nocapture"]
-fn a_pool_a_quarter_full_or_a_quarter_seen_against_a_full_one() {
-    const N: u32 = 10_000;
-    let v = view(320, 240);
-    let behind = |s: &Gaussian| {
-        let away = v.world_from_cam.transform(glam::DVec3::NEG_Z * 5.0).as_vec3().to_array();
-        Gaussian { mean: away, ..*s }
-    };
-    let rig = |capacity: u32, hidden: usize| {
-        let s = shape(&v, capacity, 1 << 20);
-        let (mut gpu, mut p) = open(s);
-        // As wide as their share of the picture.
-        let small = |s: Gaussian| Gaussian { log_scale: [-4.0; 3], ..s };
-        let seen: Vec<Gaussian> = scene(N as usize, &v, 9).into_iter().map(small).collect();
-        p.pool.append(&mut gpu, &seen).unwrap();
-        let unseen: Vec<Gaussian> = seen.iter().cycle().take(hidden).map(behind).collect();
-        p.pool.append(&mut gpu, &unseen).unwrap();
-        p.loss.set_image(&mut gpu, 0, &target(320, 240)).unwrap();
-        gpu.time_commands(0);
-        (gpu, p)
-    };
-    let mut rigs = [rig(N, 0), rig(4 * N, 0), rig(4 * N, 3 * N as usize)];
-    // The least of many, in turn: other load only adds.
-    let mut least = [f64::INFINITY; 3];
-    for _ in 0..100 {
-        for ((gpu, p), least) in rigs.iter_mut().zip(&mut least) {
-            p.train(gpu, &v, 0, &super::splat::STILL, &Weights::default()).unwrap();
-            *least = least.min(gpu.last_submit_ms());
-        }
-    }
-    for (name, ms) in ["full", "a quarter full", "a quarter seen"].iter().zip(least) {
-        println!("{name}: {ms:.3} ms a step");
     }
 }
