@@ -7,9 +7,9 @@
 #[path = "../../shaders-glsl/emit.rs"]
 mod emit;
 mod interface;
-mod overhead;
 #[path = "../../shaders-glsl/reflect.rs"]
 mod reflect;
+mod timings;
 
 use stipple::config::GpuConfig;
 use stipple::gpu::kernels::{self, args, axpy, group_sum, layouts, types};
