@@ -429,9 +429,19 @@ fn calib_check_detects_a_row_of_vertical_misalignment() {
     assert!((rows + 1.0).abs() < 0.25 && said.contains("warn"), "{said}");
 }
 
-/// Faults are for recordings: a run with the board's own sensors takes none, whatever is asked.
+/// Faults are for recordings: a run with the board's own sensors takes none unless they are allowed by name.
 #[test]
-fn no_faults_are_injected_into_live_sensors() {
-    let o = stipple(&["run", "--board", BOARD, "--inject", "faults.toml"]);
-    assert!(o.status.code() == Some(USAGE) && text(&o).contains("--dataset"), "{}", text(&o));
+fn faults_are_injected_into_live_sensors_only_where_allowed() {
+    let dir = tempfile::tempdir().unwrap();
+    let (faults, out) = (dir.path().join("faults.toml"), dir.path().join("out"));
+    fs::write(&faults, "[[thread]]\nname = \"camera\"\npanic_s = 1.0\n").unwrap();
+    let [faults, out] = [&faults, &out].map(|p| p.to_str().unwrap());
+    let live = ["run", "--board", BOARD, "--out", out, "--inject", faults];
+    let o = stipple(&live);
+    assert!(o.status.code() == Some(USAGE) && text(&o).contains("--allow-injection"), "{}", text(&o));
+    // This board names no sensors, which is what is wrong then.
+    let o = stipple(&[&live[..], &["--allow-injection"]].concat());
+    assert!(!o.status.success() && text(&o).contains("[camera] devices"), "{}", text(&o));
+    let o = stipple(&["run", "--board", BOARD, "--allow-injection"]);
+    assert!(o.status.code() == Some(USAGE) && text(&o).contains("--inject"), "{}", text(&o));
 }

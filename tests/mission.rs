@@ -3,19 +3,21 @@
 //! next one starts.
 #![allow(clippy::unwrap_used)]
 
+#[path = "program/panics.rs"]
+mod panics;
 mod program;
 
+use panics::{panic_after, Panicked};
 use program::{children, flight, signal, stipple, text, BOARD};
 use serde_json::Value;
 use std::fs;
-use std::io::{BufRead, BufReader, Read, Write};
+use std::io::{Read, Write};
 use std::os::fd::OwnedFd;
 use std::os::unix::net::UnixStream;
 use std::os::unix::process::ExitStatusExt;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
-use stipple_drivers::{host, Nanos};
 
 const PATIENCE: Duration = Duration::from_secs(30);
 
@@ -197,10 +199,11 @@ fn nobody_needs_to_read_what_a_run_says() {
 }
 
 /// Threads that the program starts in a run of a recording, and what makes a run have them. `trigger` needs cameras.
-const THREADS: [(&str, &[&str]); 12] = [
+const THREADS: [(&str, &[&str]); 13] = [
     ("main", &[]),
     ("camera", &[]),
     ("imu", &[]),
+    ("barometer", &["--set", "baro.chip=bmp388"]),
     ("tracking", &["--set", "frontend.threads=1"]),
     ("frontend", &["--set", "frontend.threads=2"]),
     ("estimator", &["--set", "frontend.threads=2"]),
@@ -223,54 +226,17 @@ fn build_gpio(folder: &Path) {
     fs::copy(folder.join("libgpiod.so.3"), folder.join("libgpiod.so.2")).unwrap();
 }
 
-/// What became of a run one of whose threads panicked.
-struct Panicked {
-    /// From the line about it until the thread's process had ended, s.
-    end_s: f64,
-    /// From the last frame of the log before the panic to the panic, s.
-    lost_s: f64,
-}
-
 /// Lets a thread of a run panic, so many seconds after it started, and judges what is left in `out`.
 fn panicked(pass: usize, (thread, args): (&str, &[&str]), at_s: f64, data: &Path, out: &Path) -> Panicked {
     let (rules, recorded) = (out.with_extension("toml"), out.with_extension(format!("recorded-{pass}")));
-    fs::write(&rules, format!("[[thread]]\nname = \"{thread}\"\npanic_s = {at_s}\n")).unwrap();
     let mut command = run(data, out);
-    command.args(["--inject", rules.to_str().unwrap()]).args(args).env("LD_LIBRARY_PATH", data.with_file_name("gpio"));
+    command.args(panic_after(thread, at_s, &rules)).args(args);
+    command.env("LD_LIBRARY_PATH", data.with_file_name("gpio"));
     command.args((thread == "writer").then_some(&recorded));
-    let mut child = command.stdout(Stdio::null()).spawn().unwrap();
-    let (mut said, mut at, mut ended) = (String::new(), None, None);
-    // Both processes have ended when nobody can write any more.
-    for line in BufReader::new(child.stderr.take().unwrap()).lines().map(Result::unwrap) {
-        if line.contains(" panicked at ") {
-            at = Some((Instant::now(), host::monotonic()));
-        } else if line.contains("was ended by signal 6") {
-            ended = Some(Instant::now());
-        }
-        said += &(line + "\n");
-    }
-    let (status, ended) = (child.wait().unwrap(), ended.unwrap_or_else(Instant::now));
-    let (began, at) = at.unwrap_or_else(|| panic!("{thread}: no panic: {said}"));
-    assert!(
-        said.matches(" panicked at ").count() == 1 && said.contains(&format!("thread {thread} panicked")),
-        "{said}"
-    );
     let flies_on = MAPPERS.contains(&thread);
-    if flies_on {
-        assert!(status.success() && report(out)["count_map_restarts"] == 1, "{thread}: {said}");
-    } else {
-        assert_eq!(status.signal(), Some(6), "{thread}: {said}");
-    }
-    let logs = fs::read_dir(out).unwrap().map(|e| e.unwrap().path());
-    let log = fs::read(logs.filter(|p| p.extension().is_some_and(|e| e == "mcap")).max().unwrap()).unwrap();
-    let messages = mcap::MessageStream::new_with_options(&log, mcap::read::Options::IgnoreEndMagic.into()).unwrap();
-    let frames = messages.map_while(Result::ok).filter(|m| m.channel.topic == "/state").map(|m| m.log_time as i64);
-    let last = frames.filter(|t| *t <= at.0).max().unwrap_or_else(|| panic!("{thread}: no frame: {said}"));
-    let o = stipple().args(["recover", out.to_str().unwrap()]).output().unwrap();
-    // Who writes the log cannot write of its own end.
-    let told = flies_on || thread == "log" || text(&o).contains(&format!("thread {thread} panicked"));
-    assert!(o.status.success() && told, "{}", text(&o));
-    Panicked { end_s: (ended - began).as_secs_f64(), lost_s: (at - Nanos(last)).secs() }
+    let left = Panicked::judge(command.stdout(Stdio::null()).spawn().unwrap(), thread, flies_on, out);
+    assert!(!flies_on || report(out)["count_map_restarts"] == 1, "{thread}: one restart");
+    left
 }
 
 /// A start in a folder where others have panicked.

@@ -10,6 +10,7 @@ use std::path::PathBuf;
 use stipple_drivers::Fault;
 
 #[derive(clap::Args)]
+#[command(group(clap::ArgGroup::new("what --inject may disturb").args(["dataset", "allow_injection"]).multiple(true)))]
 pub struct Args {
     #[command(flatten)]
     board: BoardArgs,
@@ -29,8 +30,11 @@ pub struct Args {
     #[arg(long, requires = "dataset")]
     repeat: bool,
     /// Faults to inject into the recording: a TOML file of [[camera]], [[imu]] and [[thread]] rules
-    #[arg(long, value_name = "FILE", requires = "dataset")]
+    #[arg(long, value_name = "FILE", requires = "what --inject may disturb")]
     inject: Option<PathBuf>,
+    /// Inject the faults into the board's own sensors: for tests on the ground only
+    #[arg(long, requires = "inject")]
+    allow_injection: bool,
     /// Record the samples to this folder too, as EuRoC
     #[arg(long, value_name = "DIR")]
     record: Option<PathBuf>,
@@ -43,7 +47,10 @@ pub fn run(args: &Args) -> Result<(), Fault> {
     threads::panic_in(&inject.thread)?;
     threads::ask_for_realtime();
     let led = StatusLed::open(board.gpio.led())?;
-    let input = open_input(args.dataset.as_deref(), &args.board, &board)?;
+    let mut input = open_input(args.dataset.as_deref(), &args.board, &board)?;
+    if args.inject.is_some() && args.dataset.is_none() {
+        input.warnings.push("faults are injected into the board's own sensors and threads (--allow-injection)".into());
+    }
     let out = OutputDir::create(&args.out)?;
     let (duration_s, record) = (args.duration, args.record.clone());
     let playback = Playback { speed: args.speed, repeats: args.repeat };

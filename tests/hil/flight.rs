@@ -10,12 +10,15 @@
 //! those that the kernel stamped. No alignment: a pose is compared with the pose of the same picture.
 #![allow(clippy::unwrap_used)]
 
+#[path = "../program/panics.rs"]
+mod panics;
 mod plugged;
 #[path = "../program/mod.rs"]
 #[allow(dead_code)] // its recording is of the simulator
 mod program;
 mod unit;
 
+use panics::{panic_after, Panicked};
 use plugged::Uvc;
 use program::{signal, text};
 use serde_json::Value;
@@ -439,6 +442,25 @@ fn flight_goes_on_after_a_plug_was_pulled() {
     assert!(worst < 3.0 * STATED_DEVIATION, "{:.2} mm", worst * 1e3);
     let last = devices.picture(trajectory(&dir.join("out")).last().unwrap().0);
     assert_eq!(last + 1, devices.stamps.len(), "the last picture has a pose");
+}
+
+/// The thread that no recording has (tests/mission.rs has the others): ten panics at moments of their own.
+#[test]
+#[ignore = "needs the machine of tests/hil/flight.sh"]
+fn flight_ends_at_once_when_the_trigger_panics() {
+    for pass in 0..10 {
+        let dir = tempfile::tempdir().unwrap();
+        let (mut devices, dir) = (Devices::plug(), dir.path());
+        let [board, out] = [devices.board(dir), dir.join("out")].map(|p| p.display().to_string());
+        let mut run = stipple(&["run", "--board", &board, "--out", &out, "--allow-injection"]);
+        run.args(["--set", "map.enabled=false", "--set", "gpio.trigger=hil-gpio:camera-trigger"]);
+        run.args(panic_after("trigger", 2.0 + 0.171 * f64::from(pass), &dir.join("rules.toml")));
+        let run = run.stderr(Stdio::piped()).spawn().unwrap();
+        devices.play();
+        let Panicked { end_s, lost_s } = Panicked::judge(run, "trigger", false, Path::new(&out));
+        println!("ended {end_s:.3} s after the panic, last frame of the log {lost_s:.3} s before it");
+        assert!(end_s < 1.0 && lost_s < 1.0);
+    }
 }
 
 #[test]
