@@ -55,7 +55,7 @@ fn failed(e: McapError) -> io::Error {
 /// Writes log-0000.mcap and so on, after those that are there.
 pub struct LogFiles {
     dir: PathBuf,
-    limits: Limits,
+    pub limits: Limits,
     run_ns: i64,
     /// Messages of the run so far: each has the next number.
     sequence: u32,
@@ -68,7 +68,7 @@ struct Open {
     writer: Writer<File>,
     /// The writer's, too.
     file: File,
-    /// Bytes up to the last sync.
+    /// Bytes up to the last chunk that was written whole.
     good: u64,
     /// Bytes of messages since the last chunk was ended.
     chunk: usize,
@@ -152,8 +152,11 @@ impl LogFiles {
         let Some(open) = &mut self.open else { return Ok(()) };
         open.end_chunk()?;
         open.file.sync_data()?;
-        open.good = open.file.metadata()?.len();
         let full = open.good >= self.limits.file;
+        if full && !over {
+            // The next file would not begin: this one says so.
+            self.leave_room()?;
+        }
         if over || full {
             self.close()?;
         }
@@ -175,14 +178,13 @@ impl LogFiles {
     fn close(&mut self) -> io::Result<()> {
         let Some(open) = &mut self.open else { return Ok(()) };
         open.end_chunk()?;
-        open.good = open.file.metadata()?.len();
         open.writer.finish().map_err(failed)?;
         open.file.sync_all()?;
         self.open = None;
         Ok(())
     }
 
-    /// Leaves the file as it was after its last sync.
+    /// Leaves the file with the chunks that were written whole.
     pub fn give_up(&mut self) {
         if let Some(Open { writer, file, good, .. }) = self.open.take() {
             drop(writer.into_inner());
@@ -195,7 +197,9 @@ impl LogFiles {
 impl Open {
     fn end_chunk(&mut self) -> io::Result<()> {
         self.chunk = 0;
-        self.writer.flush().map_err(failed)
+        self.writer.flush().map_err(failed)?;
+        self.good = self.file.metadata()?.len();
+        Ok(())
     }
 }
 

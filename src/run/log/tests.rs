@@ -106,6 +106,41 @@ fn what_was_logged_is_read_back_across_files_and_runs() {
     assert!(rest[2] == r#"Counters({"frames": 7})"# && rest[3].contains("End"), "{rest:?}");
 }
 
+/// The room of a disk goes while a file fills.
+#[test]
+fn the_last_file_says_why_no_other_follows() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut files = LogFiles::new(dir.path().into(), Limits { file: 1, free: 0 });
+    files.begin().unwrap();
+    files.limits.free = u64::MAX;
+    files.write(&Record { at: Nanos(0), content: Content::State(state(7)) }).unwrap();
+    let why = files.sync(false).unwrap_err().to_string();
+    files.give_up();
+    let mut said = vec![];
+    let each = |_, message: Message| {
+        if let Message::Event(event) = message {
+            said.push(event.text.into_owned());
+        }
+        Ok(())
+    };
+    read_files(&files.written, each).unwrap();
+    assert!(why.contains("make room") && said == [why], "{said:?}");
+    assert_eq!(states(&files.written), [state(7)]);
+}
+
+/// A disk that fails between two syncs: a chunk that was written whole stays.
+#[test]
+fn what_was_written_since_the_last_sync_stays() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut files = LogFiles::new(dir.path().into(), LARGE);
+    files.begin().unwrap();
+    (0..500).for_each(|i| files.write(&Record { at: Nanos(0), content: Content::State(state(i)) }).unwrap());
+    files.give_up();
+    let found = states(&files.written);
+    assert!(found.len() + CHUNK > 500, "{}", found.len());
+    assert!(found.iter().enumerate().all(|(i, found)| *found == state(i as u64)));
+}
+
 /// Frames in a chunk that is ended by its size, and some more.
 const CHUNK: usize = 70;
 
