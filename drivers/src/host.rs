@@ -2,8 +2,9 @@
 #![allow(unsafe_code)]
 
 use std::fs::File;
-use std::io;
+use std::io::{self, Write as _};
 use std::os::fd::AsRawFd;
+use std::os::unix::fs::OpenOptionsExt as _;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -100,6 +101,7 @@ extern "C" fn ask_to_stop(signal: libc::c_int) {
     }
 }
 
+/// Sets what SIGINT, SIGTERM and SIGHUP do. One that is ignored already stays so where `nohup` asks for it: SIGHUP.
 fn on_stop_signals(handler: libc::sighandler_t) {
     // SAFETY: the handler is a function that does only what a signal may do, or a constant that ignores the signal. The
     // struct is plain integers, for which zero is valid.
@@ -108,7 +110,11 @@ fn on_stop_signals(handler: libc::sighandler_t) {
         action.sa_sigaction = handler;
         action.sa_flags = libc::SA_RESTART;
         for signal in STOP_SIGNALS {
-            libc::sigaction(signal, &action, std::ptr::null_mut());
+            let mut before: libc::sigaction = std::mem::zeroed();
+            libc::sigaction(signal, std::ptr::null(), &mut before);
+            if signal != libc::SIGHUP || before.sa_sigaction != libc::SIG_IGN {
+                libc::sigaction(signal, &action, std::ptr::null_mut());
+            }
         }
     }
 }
@@ -148,15 +154,68 @@ pub fn ask_for_realtime(priority: i32) -> std::io::Result<()> {
     }
 }
 
-/// Keeps every page that this process has used, and will use, in memory. Fails where the system does not allow it
-/// (`LimitMEMLOCK`).
+/// Keeps every page that this process has used, and will use, in memory. Fails where the system does not allow all of it
+/// (`LimitMEMLOCK`): under a finite limit each later allocation beyond it would fail.
 pub fn lock_memory() -> std::io::Result<()> {
+    let mut limit = libc::rlimit { rlim_cur: 0, rlim_max: 0 };
+    // SAFETY: the struct outlives the call.
+    unsafe { libc::getrlimit(libc::RLIMIT_MEMLOCK, &mut limit) };
+    if limit.rlim_cur != libc::RLIM_INFINITY && !may_lock_all() {
+        return Err(std::io::Error::other(format!("the limit of locked memory is {} KiB", limit.rlim_cur >> 10)));
+    }
     // SAFETY: plain integers.
     let failed = unsafe { libc::mlockall(libc::MCL_CURRENT | libc::MCL_FUTURE | libc::MCL_ONFAULT) };
     if failed == 0 {
         Ok(())
     } else {
         Err(std::io::Error::last_os_error())
+    }
+}
+
+/// Whether this process has CAP_IPC_LOCK, and with it no limit of locked memory.
+fn may_lock_all() -> bool {
+    const CAP_IPC_LOCK: u32 = 14;
+    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
+    let effective = status.lines().find_map(|line| line.strip_prefix("CapEff:"));
+    effective.and_then(|hex| u64::from_str_radix(hex.trim(), 16).ok()).is_some_and(|bits| bits >> CAP_IPC_LOCK & 1 == 1)
+}
+
+/// Ends the process at once, and runs nothing else: no thread is waited for.
+pub fn exit_now(code: i32) -> ! {
+    // SAFETY: takes a plain integer and does not return.
+    unsafe { libc::_exit(code) }
+}
+
+/// Writes to a descriptor without waiting for its reader; answers whether all was taken. A pipe takes up to 4096 bytes whole
+/// or not at all; a terminal and a socket may take a part.
+pub fn write_now(fd: i32, bytes: &[u8]) -> bool {
+    // SAFETY: the bytes outlive the calls.
+    let sent = unsafe { libc::send(fd, bytes.as_ptr().cast(), bytes.len(), libc::MSG_DONTWAIT | libc::MSG_NOSIGNAL) };
+    if sent >= 0 || io::Error::last_os_error().raw_os_error() != Some(libc::ENOTSOCK) {
+        return sent == bytes.len() as isize;
+    }
+    // A terminal that is ready may have room for a single byte; opened again, it is ours to make non-blocking.
+    // SAFETY: a plain integer.
+    if unsafe { libc::isatty(fd) } == 1 {
+        let mut options = std::fs::OpenOptions::new();
+        options.write(true).custom_flags(libc::O_NONBLOCK | libc::O_NOCTTY);
+        if let Ok(mut terminal) = options.open(format!("/proc/self/fd/{fd}")) {
+            return terminal.write_all(bytes).is_ok();
+        }
+    }
+    // SAFETY: the bytes outlive the call.
+    is_writable(fd, 0) && unsafe { libc::write(fd, bytes.as_ptr().cast(), bytes.len()) == bytes.len() as isize }
+}
+
+/// Columns of the terminal that a descriptor is; 80 where it is none.
+pub fn columns(fd: i32) -> u16 {
+    let mut size = libc::winsize { ws_row: 0, ws_col: 0, ws_xpixel: 0, ws_ypixel: 0 };
+    // SAFETY: the struct outlives the call.
+    unsafe { libc::ioctl(fd, libc::TIOCGWINSZ, &mut size) };
+    if size.ws_col == 0 {
+        80
+    } else {
+        size.ws_col
     }
 }
 

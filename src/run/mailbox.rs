@@ -7,7 +7,7 @@
 //! A frame is tracked when a sample at or past its stamp has come, or when none did within `SAMPLE_WAIT`.
 
 use super::gate::{FrameGate, ImuGate};
-use super::status::Gauges;
+use super::status::{self, Gauges};
 use super::threads;
 use super::tracking::FramePacket;
 use super::waker::Waker;
@@ -217,7 +217,7 @@ impl<'a> Liveness<'a> {
         self.told = self.said.is_none_or(|t| t.elapsed() >= REPORT_PERIOD);
         if self.told {
             self.said = Some(Instant::now());
-            let _ = self.notices.push(format!("{} {}", self.name, what()));
+            status::count_lost(self.notices.push(format!("{} {}", self.name, what())));
         }
     }
 
@@ -231,7 +231,7 @@ impl<'a> Liveness<'a> {
                     self.away_ms.add(gone.as_millis() as u64);
                     if self.told {
                         let line = format!("{} is back after {:.1} s", self.name, gone.as_secs_f64());
-                        let _ = self.notices.push(line);
+                        status::count_lost(self.notices.push(line));
                     }
                 }
             }

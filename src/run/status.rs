@@ -6,10 +6,11 @@ use super::tracking::FramePacket;
 use crate::counters::Counters;
 use crate::frontend::{Verdict, Verdicts};
 use crate::vio::{Finding, Findings, Health, Part};
-use indicatif::{ProgressBar, ProgressStyle};
-use std::fmt;
-use std::io::{self, IsTerminal, Write as _};
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle, TermLike};
+use std::fmt::{self, Write as _};
+use std::io::{self, IsTerminal};
 use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering::Acquire, Ordering::Relaxed, Ordering::Release};
+use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 use stipple_drivers::host;
 
@@ -79,7 +80,8 @@ impl Status {
     pub fn new(total_s: Option<f64>) -> Status {
         let total_ms = total_s.map(|s| (s.max(0.0) * 1e3) as u64);
         let bar = io::stderr().is_terminal().then(|| {
-            let bar = total_ms.map_or_else(ProgressBar::new_spinner, ProgressBar::new);
+            let target = ProgressDrawTarget::term_like(Box::<Terminal>::default());
+            let bar = ProgressBar::with_draw_target(total_ms, target);
             let drawn = if total_ms.is_some() { "{bar:30} {percent:>3}%" } else { "{spinner}" };
             let style = ProgressStyle::with_template(&format!("{drawn} {{elapsed}} {{msg}}"));
             bar.set_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()));
@@ -129,7 +131,6 @@ impl Status {
         }
         let played = g.played_ms.load(Relaxed).min(self.total_ms.unwrap_or(u64::MAX));
         match &self.bar {
-            Some(_) if !host::is_writable(STDERR, 0) => {}
             Some(bar) => {
                 bar.set_position(played);
                 bar.set_message(line(g));
@@ -202,8 +203,7 @@ impl Status {
 
     fn print(&self, text: &str) {
         match &self.bar {
-            Some(bar) if host::is_writable(STDERR, 0) => bar.println(format!("stipple: {text}")),
-            Some(_) => {}
+            Some(bar) => bar.println(format!("stipple: {text}")),
             None if self.next_line.is_some() => print_err(format_args!("stipple: {text}")),
             None => {}
         }
@@ -273,15 +273,79 @@ const LINE_BYTES_MAX: usize = 4096;
 /// Lines that nobody took.
 static LINES_LOST: AtomicU64 = AtomicU64::new(0);
 
+/// The terminal of standard error, for a bar that never waits for it.
+#[derive(Debug, Default)]
+struct Terminal(Mutex<String>);
+
+impl Terminal {
+    fn put(&self, text: fmt::Arguments) -> io::Result<()> {
+        let mut waiting = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        waiting.write_fmt(text).map_err(io::Error::other)
+    }
+
+    /// Moves the cursor by `n`, in the direction that ANSI gives this letter.
+    fn step(&self, n: usize, direction: char) -> io::Result<()> {
+        if n == 0 {
+            return Ok(());
+        }
+        self.put(format_args!("\x1b[{n}{direction}"))
+    }
+}
+
+impl TermLike for Terminal {
+    fn width(&self) -> u16 {
+        host::columns(STDERR)
+    }
+
+    fn move_cursor_up(&self, n: usize) -> io::Result<()> {
+        self.step(n, 'A')
+    }
+
+    fn move_cursor_down(&self, n: usize) -> io::Result<()> {
+        self.step(n, 'B')
+    }
+
+    fn move_cursor_right(&self, n: usize) -> io::Result<()> {
+        self.step(n, 'C')
+    }
+
+    fn move_cursor_left(&self, n: usize) -> io::Result<()> {
+        self.step(n, 'D')
+    }
+
+    fn write_line(&self, text: &str) -> io::Result<()> {
+        self.put(format_args!("{text}\n"))
+    }
+
+    fn write_str(&self, text: &str) -> io::Result<()> {
+        self.put(format_args!("{text}"))
+    }
+
+    fn clear_line(&self) -> io::Result<()> {
+        self.put(format_args!("\r\x1b[2K"))
+    }
+
+    fn flush(&self) -> io::Result<()> {
+        let text = std::mem::take(&mut *self.0.lock().unwrap_or_else(PoisonError::into_inner));
+        let written = host::write_now(STDERR, text.as_bytes());
+        LINES_LOST.fetch_add(u64::from(!written), Relaxed);
+        Ok(())
+    }
+}
+
 /// Prints a line to standard error. One that is closed, or whose reader has stopped reading, costs the line and nothing else.
 pub fn print_err(line: fmt::Arguments) {
     let text = format!("{line}\n");
-    let bytes = &text.as_bytes()[..text.len().min(LINE_BYTES_MAX)];
-    let written = host::is_writable(STDERR, 0) && io::stderr().write_all(bytes).is_ok();
+    let written = host::write_now(STDERR, &text.as_bytes()[..text.len().min(LINE_BYTES_MAX)]);
     LINES_LOST.fetch_add(u64::from(!written), Relaxed);
 }
 
-/// Lines that standard error did not take so far.
+/// Counts a line that a full queue gave back.
+pub fn count_lost(pushed: Result<(), String>) {
+    LINES_LOST.fetch_add(u64::from(pushed.is_err()), Relaxed);
+}
+
+/// Lines that standard error, or a queue on the way to it, did not take so far.
 pub fn lines_lost() -> u64 {
     LINES_LOST.load(Relaxed)
 }
@@ -289,6 +353,6 @@ pub fn lines_lost() -> u64 {
 /// Prints lines of the result to standard output; one that is closed, or that nobody reads for five seconds, likewise.
 pub fn print_out(line: impl fmt::Display) {
     if host::is_writable(STDOUT, 5000) {
-        let _ = writeln!(io::stdout(), "{line}");
+        let _ = io::Write::write_fmt(&mut io::stdout(), format_args!("{line}\n"));
     }
 }
