@@ -199,8 +199,10 @@ fn a_senseless_rule_is_named() {
 fn a_flight_goes_on_when_nobody_reads_what_it_says() {
     let dir = tempfile::tempdir().unwrap();
     let (data, out) = (flight(dir.path(), "4"), dir.path().join("out"));
-    let mut child = run(&data, &out, BOARD).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    let mut child = run_and_map(&data, &out, BOARD);
+    child.args(["--set", "map.scale=4"]);
+    let mut child = child.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
     drop((child.stdout.take(), child.stderr.take()));
     assert!(child.wait().unwrap().success());
-    assert!(out.join("report.json").is_file());
+    assert!(out.join("report.json").is_file() && out.join("map.ply").is_file());
 }

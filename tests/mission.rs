@@ -8,7 +8,7 @@ mod panics;
 mod program;
 
 use panics::{panic_after, Panicked};
-use program::{children, flight, signal, stipple, text, BOARD};
+use program::{children, flight, kill, signal, stipple, text, BOARD};
 use serde_json::Value;
 use std::fs;
 use std::io::{Read, Write};
@@ -21,9 +21,15 @@ use std::time::{Duration, Instant};
 
 const PATIENCE: Duration = Duration::from_secs(30);
 
-/// A run with a map, whose output is kept.
+/// A run with a map, whose output is kept. Where tests run under `nohup`, it does not inherit that SIGHUP is ignored.
 fn run(dataset: &Path, out: &Path) -> Command {
-    let mut command = stipple();
+    run_by(&["--default-signal=HUP"], dataset, out)
+}
+
+/// The run, started by `env` with these arguments.
+fn run_by(env: &[&str], dataset: &Path, out: &Path) -> Command {
+    let mut command = Command::new("env");
+    command.current_dir(env!("CARGO_MANIFEST_DIR")).args(env).arg(env!("CARGO_BIN_EXE_stipple"));
     let (dataset, out) = (dataset.to_str().unwrap(), out.to_str().unwrap());
     command.args(["run", "--board", BOARD, "--dataset", dataset, "--out", out, "--set", "map.scale=4"]);
     command.stdout(Stdio::piped()).stderr(Stdio::piped());
@@ -49,10 +55,6 @@ fn wait_for<T>(what: &str, mut look: impl FnMut() -> Option<T>) -> T {
 /// The mapper of a run, once it maps: its kernels hold buffers.
 fn worker(run: &Child) -> u32 {
     wait_for("a mapper", || children(run.id()).first().copied())
-}
-
-fn kill(pid: u32, name: &str) {
-    assert!(Command::new("sh").args(["-c", &format!("kill -{name} {pid}")]).status().unwrap().success());
 }
 
 /// Libraries and devices that a process has mapped.
@@ -159,6 +161,15 @@ fn every_way_to_ask_for_a_stop_writes_the_files_and_a_second_one_ends_at_once() 
         assert!(o.status.success() && out.join("map.ply").exists(), "{name}: {}", text(&o));
         assert!((10..200).contains(&report(&out)["frames"].as_u64().unwrap()));
     }
+    // As `nohup` starts it.
+    let out = dir.path().join("nohup");
+    let child = run_by(&["--ignore-signal=HUP"], &data, &out).spawn().unwrap();
+    worker(&child);
+    signal(&child, "HUP");
+    std::thread::sleep(Duration::from_secs(2));
+    signal(&child, "TERM");
+    let o = child.wait_with_output().unwrap();
+    assert!(o.status.success() && report(&out)["frames"].as_u64().unwrap() > 20, "{}", text(&o));
     let mut child = run(&data, &dir.path().join("twice")).spawn().unwrap();
     let mapper = worker(&child);
     std::thread::sleep(Duration::from_secs(2));
@@ -198,6 +209,82 @@ fn nobody_needs_to_read_what_a_run_says() {
     filled.join().unwrap();
 }
 
+/// A terminal that is stopped (Ctrl-S, a dead link of ssh): it says that it has room until a line is in it, and takes no more.
+#[test]
+fn a_terminal_that_takes_no_more_holds_up_nothing() {
+    let (dir, out) = folder();
+    let data = flight(dir.path(), "20");
+    let words = run(&data, &out);
+    let line: Vec<_> =
+        std::iter::once(words.get_program()).chain(words.get_args()).map(|w| w.to_str().unwrap()).collect();
+    // Its own output is a pipe that nobody reads, after which it reads no more of the terminal.
+    let mut terminal = Command::new("script")
+        .args(["-qec", &line.join(" "), "/dev/null"])
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .current_dir(env!("CARGO_MANIFEST_DIR"))
+        .env("TERM", "xterm")
+        .spawn()
+        .unwrap();
+    let run = wait_for("a run", || children(terminal.id()).first().copied());
+    wait_for("a log", || out.join("log-0000.mcap").exists().then_some(()));
+    std::thread::sleep(Duration::from_secs(3));
+    kill(terminal.id(), "STOP");
+    // The terminal has room for some kilobytes.
+    std::thread::sleep(Duration::from_secs(8));
+    kill(run, "TERM");
+    wait_for("the trajectory", || out.join("trajectory.tum").exists().then_some(()));
+    wait_for("the report", || out.join("report.json").exists().then_some(()));
+    wait_for("the run's end", || has_ended(run));
+    kill(terminal.id(), "CONT");
+    terminal.kill().unwrap();
+    terminal.wait().unwrap();
+}
+
+/// Lets a thread hang from two seconds after it started on, in a run that takes these arguments.
+fn hangs(thread: &str, data: &Path, out: &Path) -> Command {
+    let rules = out.with_extension("toml");
+    fs::write(&rules, format!("[[thread]]\nname = \"{thread}\"\nhang_s = 2.0\n")).unwrap();
+    let mut command = run(data, out);
+    command.args(["--inject", rules.to_str().unwrap()]);
+    command
+}
+
+/// A driver that never answers: who asks for a stop does not wait for it, and the log has the trajectory.
+#[test]
+fn a_thread_that_hangs_does_not_keep_a_run_from_ending() {
+    let dir = tempfile::tempdir().unwrap();
+    let data = flight(dir.path(), "6");
+    for thread in ["camera", "log"] {
+        let out = dir.path().join(thread);
+        let child = hangs(thread, &data, &out).args(["--set", "map.enabled=false"]).spawn().unwrap();
+        wait_for("a log", || out.join("log-0000.mcap").exists().then_some(()));
+        std::thread::sleep(Duration::from_secs(4));
+        signal(&child, "TERM");
+        let begun = Instant::now();
+        let o = child.wait_with_output().unwrap();
+        let limit_s = if thread == "log" { 34 } else { 7 };
+        assert!(begun.elapsed() < Duration::from_secs(limit_s), "after {:?}", begun.elapsed());
+        assert!(o.status.code() == Some(70) && text(&o).contains(&format!("thread {thread} hangs")), "{}", text(&o));
+        let o = stipple().args(["recover", out.to_str().unwrap()]).output().unwrap();
+        assert!(o.status.success() && out.join("trajectory.tum").exists(), "{}", text(&o));
+    }
+}
+
+/// A mapper whose process gives no sign of life is killed and started again.
+#[test]
+fn a_mapper_that_hangs_is_started_again() {
+    let (dir, out) = folder();
+    let data = flight(dir.path(), "12");
+    let o = hangs("beat", &data, &out).output().unwrap();
+    let said = text(&o);
+    assert!(
+        o.status.success() && said.contains("gave no sign of life for 5 s") && said.contains("maps again"),
+        "{said}"
+    );
+    assert!(report(&out)["count_map_restarts"] == 1 && out.join("map.ply").exists(), "{said}");
+}
+
 /// Threads that the program starts in a run of a recording, and what makes a run have them. `trigger` needs cameras.
 const THREADS: [(&str, &[&str]); 13] = [
     ("main", &[]),
@@ -233,8 +320,14 @@ fn panicked(pass: usize, (thread, args): (&str, &[&str]), at_s: f64, data: &Path
     command.args(panic_after(thread, at_s, &rules)).args(args);
     command.env("LD_LIBRARY_PATH", data.with_file_name("gpio"));
     command.args((thread == "writer").then_some(&recorded));
-    let flies_on = MAPPERS.contains(&thread);
-    let left = Panicked::judge(command.stdout(Stdio::null()).spawn().unwrap(), thread, flies_on, out);
+    let (flies_on, lines) = (MAPPERS.contains(&thread), out.with_extension("lines"));
+    command.args((thread != "led").then_some(["--set", "gpio.led=fake:3"]).into_iter().flatten());
+    let child = command.stdout(fs::File::create(&lines).unwrap()).spawn().unwrap();
+    let left = Panicked::judge(child, thread, flies_on, out);
+    // The LED stays on, but for a panic of the thread that sets it.
+    let lines = fs::read_to_string(lines).unwrap();
+    let last = lines.lines().rfind(|line| line.starts_with("set 3 ")).unwrap();
+    assert!(flies_on || thread == "led" || last == "set 3 1", "{thread}: {lines}");
     assert!(!flies_on || report(out)["count_map_restarts"] == 1, "{thread}: one restart");
     left
 }

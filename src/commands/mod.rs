@@ -58,6 +58,12 @@ enum Command {
     Doctor(doctor::Args),
 }
 
+/// Ends the log, and shows a fault on the LED, where the process is about to end by itself.
+fn last_words(why: &str) {
+    crate::run::log::close_for_panic(why);
+    crate::run::status_led::show_panic();
+}
+
 /// Runs the command of the command line.
 pub fn main() -> ExitCode {
     let cli = match Cli::try_parse() {
@@ -72,10 +78,7 @@ pub fn main() -> ExitCode {
     if matches!(cli.command, Command::Check(_) | Command::CalibCheck(_) | Command::CalibNoise(_) | Command::Doctor(_)) {
         stipple_drivers::host::end_when_unread();
     }
-    crate::run::threads::abort_on_panic(|what| {
-        crate::run::log::close_for_panic(what);
-        crate::run::status_led::show_panic();
-    });
+    crate::run::threads::abort_on_panic(last_words);
     let done = match cli.command {
         Command::Run(args) => run::run(&args),
         Command::Replay(args) => replay::replay(&args),

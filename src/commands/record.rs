@@ -1,9 +1,9 @@
 //! `stipple record`: the sensors' samples to disk, and nothing else.
 
 use super::{open_input, seconds, BoardArgs};
-use crate::run::observe;
 use crate::run::status::{print_out, Status};
 use crate::run::status_led::StatusLed;
+use crate::run::{observe, threads};
 use std::path::PathBuf;
 use stipple_drivers::record::Format;
 use stipple_drivers::Fault;
@@ -35,6 +35,7 @@ enum FormatName {
 
 pub fn record(args: &Args) -> Result<(), Fault> {
     let board = args.board.load()?;
+    threads::ask_for_realtime();
     let led = StatusLed::open(board.gpio.led())?;
     let input = open_input(args.dataset.as_deref(), &args.board, &board)?;
     let format = match args.format {

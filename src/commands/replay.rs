@@ -71,7 +71,7 @@ pub fn replay(args: &Args) -> Result<(), Fault> {
     let scale: Vec<String> = args.scale.iter().map(|s| format!("map.scale={s}")).collect();
     let board = args.board.load_with(&scale)?;
     let inject = args.inject.as_deref().map(InjectConfig::load).transpose()?.unwrap_or_default();
-    threads::panic_in(&inject.thread)?;
+    threads::disturb(&inject.thread)?;
     let input = Input::recording(&args.dataset, args.calibration.as_deref(), &board)?;
     let out = OutputDir::create(&args.out)?;
     let options = Options {

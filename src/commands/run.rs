@@ -7,7 +7,7 @@ use crate::run::sensors::Playback;
 use crate::run::status_led::StatusLed;
 use crate::run::{fly, threads, Options};
 use std::path::PathBuf;
-use stipple_drivers::Fault;
+use stipple_drivers::{host, Fault, FaultKind};
 
 #[derive(clap::Args)]
 #[command(group(clap::ArgGroup::new("what --inject may disturb").args(["dataset", "allow_injection"]).multiple(true)))]
@@ -44,7 +44,7 @@ pub fn run(args: &Args) -> Result<(), Fault> {
     let board = args.board.load()?;
     let inject = args.inject.as_deref().map(InjectConfig::load).transpose()?.unwrap_or_default();
     // Before the threads of light and trigger start.
-    threads::panic_in(&inject.thread)?;
+    threads::disturb(&inject.thread)?;
     threads::ask_for_realtime();
     let led = StatusLed::open(board.gpio.led())?;
     let mut input = open_input(args.dataset.as_deref(), &args.board, &board)?;
@@ -54,6 +54,10 @@ pub fn run(args: &Args) -> Result<(), Fault> {
     let out = OutputDir::create(&args.out)?;
     let (duration_s, record) = (args.duration, args.record.clone());
     let playback = Playback { speed: args.speed, repeats: args.repeat };
+    threads::end_where_one_hangs(host::stop_asked_for(), super::last_words).map_err(|e| {
+        let fix = "end other programs, or raise the limit of processes (TasksMax)";
+        Fault::new(FaultKind::Unavailable, "threads", format!("no thread starts: {e}"), fix)
+    })?;
     let options = Options { duration_s, record, inject, service: true, playback, ..Options::default() };
     finish(fly(input, &board, &out, &options, led)?, &out)
 }

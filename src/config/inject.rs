@@ -15,18 +15,22 @@ pub struct InjectConfig {
     pub camera: Vec<Rule>,
     /// `[[imu]]`, a fault each.
     pub imu: Vec<Rule>,
-    /// `[[thread]]`, a panic each.
+    /// `[[thread]]`, a panic or a hang each.
     pub thread: Vec<ThreadRule>,
 }
 
-/// A panic of a thread of the run.
+/// A panic of a thread of the run, or a hang: one of the two.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ThreadRule {
     /// Name of the thread, as debuggers show it.
     pub name: String,
     /// When it panics, after its start, s.
-    pub panic_s: f64,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub panic_s: Option<f64>,
+    /// When it does nothing any more, after its start, s.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub hang_s: Option<f64>,
 }
 
 impl InjectConfig {
@@ -34,7 +38,7 @@ impl InjectConfig {
     pub fn load(path: &Path) -> Result<InjectConfig, Fault> {
         let place = path.display().to_string();
         let fix =
-            "write seed = 1, [[camera]] or [[imu]] with fault, start_s and end_s, or [[thread]] with name and panic_s";
+            "write seed = 1, [[camera]] or [[imu]] with fault, start_s and end_s, or [[thread]] with name and panic_s or hang_s";
         let text = input::read_settings(path).map_err(|e| {
             Fault::new(FaultKind::NoInput, &place, format!("cannot read the rules of faults: {e}"), fix)
         })?;
@@ -46,8 +50,12 @@ impl InjectConfig {
 
     /// Refuses rules that make no sense.
     fn check(&self) -> Result<(), String> {
-        if let Some(rule) = self.thread.iter().find(|rule| rule.panic_s < 0.0 || !rule.panic_s.is_finite()) {
-            return Err(format!("thread {}: panic_s must be a number of seconds", rule.name));
+        let one = |rule: &&ThreadRule| {
+            let given = [rule.panic_s, rule.hang_s].into_iter().flatten();
+            given.clone().count() != 1 || given.clone().any(|s| s < 0.0 || !s.is_finite())
+        };
+        if let Some(rule) = self.thread.iter().find(one) {
+            return Err(format!("thread {}: panic_s or hang_s must be a number of seconds", rule.name));
         }
         for (key, rules) in [("camera", &self.camera), ("imu", &self.imu)] {
             for (i, rule) in rules.iter().enumerate() {

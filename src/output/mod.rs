@@ -73,6 +73,11 @@ impl OutputDir {
         Ok(OutputDir { path: path.to_path_buf() })
     }
 
+    /// A folder that `create` proved writable before; a disk may have been full or unplugged since.
+    pub fn existing(path: &Path) -> OutputDir {
+        OutputDir { path: path.to_path_buf() }
+    }
+
     /// Keeps other runs out of the folder until the answer is dropped. Fails where another has it.
     pub fn lock(&self) -> Result<File, Fault> {
         let locked = File::open(&self.path).and_then(|folder| host::lock(&folder).map(|()| folder));
@@ -119,7 +124,8 @@ impl OutputDir {
         }
         there.try_for_each(|name| {
             let path = self.file(name);
-            fs::rename(&path, self.file(&previous(name))).map_err(|e| cannot_write(&path, &e))
+            let renamed = fs::rename(&path, self.file(&previous(name))).and_then(|()| sync_folder_of(&path));
+            renamed.map_err(|e| cannot_write(&path, &e))
         })
     }
 

@@ -305,11 +305,11 @@ impl Keyframes {
 }
 
 #[cfg(test)]
-mod tests {
+pub mod tests {
     use super::*;
     use stipple_drivers::{Camera, ImuCalibration, Lens, RigCamera};
 
-    fn ring() -> KeyframeRing {
+    pub fn ring() -> KeyframeRing {
         let lens = Lens::Radtan { k1: 0.0, k2: 0.0, p1: 0.0, p2: 0.0 };
         let camera = Camera { width: 5, height: 3, fx: 4.0, fy: 4.0, cx: 2.0, cy: 1.0, lens };
         let cameras = vec![RigCamera::new(camera, Pose::IDENTITY); 2];

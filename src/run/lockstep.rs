@@ -94,7 +94,7 @@ impl Budget {
             (_, Some(s)) if s > length_s && self.total > 1 && length_s > 0.0 => {
                 let frames = (s - length_s) * (self.total - 1) as f64 / length_s;
                 let (mut played_s, steps) = (length_s, self.due(frames as u64, Span::from_secs(s - length_s)));
-                for _ in 0..steps {
+                for _ in (0..steps).take_while(|_| !host::stop_asked_for().load(Relaxed)) {
                     played_s += (s - length_s) / steps as f64;
                     m.step(Instant::now(), gauges);
                     m.sample_if_due(self.run_s(played_s), gauges);

@@ -451,7 +451,7 @@ fn supervise(
     mapped: impl Fn(f64, bool) -> bool,
     status: &mut Status,
 ) -> Vec<(EventKind, String)> {
-    let (_watched, mut notices, mut silent) = (threads::watch("main"), vec![], None);
+    let (_watched, mut notices) = (threads::watch("main"), vec![]);
     loop {
         threads::alive();
         let t_s = s.start.elapsed().as_secs_f64();
@@ -459,11 +459,14 @@ fn supervise(
         if tracked && mapped(t_s, worker.is_some()) {
             return notices;
         }
-        s.mailbox.stop.fetch_or(run.sensors_s.is_some_and(|limit| t_s >= limit) || run.stop.load(Relaxed), Relaxed);
+        if run.sensors_s.is_some_and(|limit| t_s >= limit) || run.stop.load(Relaxed) {
+            s.mailbox.stop.store(true, Relaxed);
+            threads::ending();
+        }
         s.gauges.broke.fetch_or(!s.mailbox.broken.is_empty(), Relaxed);
-        let was = std::mem::replace(&mut silent, threads::silent());
-        let hangs = silent.filter(|_| was.is_none()).map(|name| format!("thread {name} gives no sign of life"));
-        s.counters.threads_silent.add(u64::from(hangs.is_some()));
+        let hangs = threads::fell_silent();
+        s.counters.threads_silent.add(hangs.len() as u64);
+        let hangs = hangs.into_iter().map(|name| format!("thread {name} gives no sign of life"));
         let looked = worker.as_mut().and_then(|w| w.watch(&s.gauges));
         let (epoch, rig) = (status.epoch_begun(&s.gauges), status.rig_judged(&s.gauges));
         let mut say = |kind, line: String| {
@@ -473,7 +476,7 @@ fn supervise(
                 notices.push((kind, line));
             }
         };
-        hangs.into_iter().chain(threads::refused()).for_each(|line| say(EventKind::System, line));
+        hangs.chain(threads::refused()).for_each(|line| say(EventKind::System, line));
         epoch.into_iter().for_each(|line| say(EventKind::Epoch, line));
         rig.into_iter().for_each(|line| say(EventKind::Warning, line));
         looked.into_iter().for_each(|line| say(EventKind::Map, line));

@@ -9,8 +9,12 @@ use crate::config::ThreadRule;
 use std::cell::Cell;
 use std::sync::atomic::{AtomicBool, AtomicI64, Ordering::Relaxed};
 use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
 use stipple_drivers::{host, Fault, FaultKind, Span};
 
+/// How often the guard looks for a thread that hangs, and the exit code then (sysexits).
+const LOOK_PERIOD: Duration = Duration::from_secs(1);
+const EX_SOFTWARE: i32 = 70;
 /// Threads of a run that are watched at once.
 const SLOTS: usize = 16;
 /// Priorities among real-time threads, and how long each may be silent, s. A pulse that starts an exposure comes before
@@ -32,17 +36,27 @@ const WATCHED: [(&str, i32, f64); 14] = [
     ("writer", 0, 30.0),
 ];
 
-/// What is known of the threads: their names, panics asked for, and why the system refused a priority.
+/// What is known of the threads.
 struct Registry {
     names: [Option<&'static str>; SLOTS],
-    panics: Vec<ThreadRule>,
-    refused: Option<String>,
+    /// Panics and hangs that are asked for.
+    rules: Vec<ThreadRule>,
+    /// Why the system refused a priority, and resident memory.
+    refused: [Option<String>; 2],
+    /// Whether that was told.
+    told: [bool; 2],
 }
 
-static REGISTRY: Mutex<Registry> = Mutex::new(Registry { names: [None; SLOTS], panics: vec![], refused: None });
-/// Last sign of life of each thread, and when it is to panic, ns of the monotonic clock; 0: never.
+static REGISTRY: Mutex<Registry> =
+    Mutex::new(Registry { names: [None; SLOTS], rules: vec![], refused: [None, None], told: [false; 2] });
+/// Last sign of life of each thread, and when it is to panic or to hang, ns of the monotonic clock; 0: never.
 static BEATS: [AtomicI64; SLOTS] = [const { AtomicI64::new(0) }; SLOTS];
 static PANICS: [AtomicI64; SLOTS] = [const { AtomicI64::new(0) }; SLOTS];
+static HANGS: [AtomicI64; SLOTS] = [const { AtomicI64::new(0) }; SLOTS];
+/// Whether its silence was told.
+static TOLD: [AtomicBool; SLOTS] = [const { AtomicBool::new(false) }; SLOTS];
+/// Set where the run is to end.
+static ENDING: AtomicBool = AtomicBool::new(false);
 static REALTIME: AtomicBool = AtomicBool::new(false);
 
 thread_local! {
@@ -64,8 +78,11 @@ pub fn watch(name: &'static str) -> Watched {
     if slot < SLOTS {
         registry.names[slot] = Some(name);
         let now = host::monotonic();
-        let panics = registry.panics.iter().find(|rule| rule.name == name);
-        PANICS[slot].store(panics.map_or(0, |rule| (now + Span::from_secs(rule.panic_s)).0), Relaxed);
+        let rule = registry.rules.iter().find(|rule| rule.name == name);
+        let at =
+            |after: fn(&ThreadRule) -> Option<f64>| rule.and_then(after).map_or(0, |s| (now + Span::from_secs(s)).0);
+        PANICS[slot].store(at(|rule| rule.panic_s), Relaxed);
+        HANGS[slot].store(at(|rule| rule.hang_s), Relaxed);
         BEATS[slot].store(now.0, Relaxed);
         SLOT.set(Some((slot, name)));
     }
@@ -89,19 +106,56 @@ impl Drop for Watched {
 pub fn alive() {
     if let Some((slot, _)) = SLOT.get() {
         let now = host::monotonic().0;
+        let hangs = HANGS[slot].load(Relaxed);
+        if hangs != 0 && now >= hangs {
+            loop {
+                std::thread::park();
+            }
+        }
         BEATS[slot].store(now, Relaxed);
         let at = PANICS[slot].load(Relaxed);
         assert!(at == 0 || now < at, "as the rules of --inject ask");
     }
 }
 
-/// The first thread that has been silent for longer than it may, if there is one.
-pub fn silent() -> Option<&'static str> {
+/// Threads that have been silent for longer than they may, and their slots. Allocates nothing.
+fn silent() -> impl Iterator<Item = (usize, &'static str)> {
     let (names, now) = (registry().names, host::monotonic());
-    names.into_iter().zip(&BEATS).find_map(|(name, beat)| {
+    names.into_iter().zip(&BEATS).enumerate().filter_map(move |(slot, (name, beat))| {
         let (known, _, limit_s) = WATCHED.iter().find(|(known, ..)| Some(*known) == name)?;
-        (now.0 - beat.load(Relaxed) > Span::from_secs(*limit_s).0).then_some(*known)
+        let is_silent = now.0 - beat.load(Relaxed) > Span::from_secs(*limit_s).0;
+        TOLD[slot].fetch_and(is_silent, Relaxed);
+        is_silent.then_some((slot, *known))
     })
+}
+
+/// Threads that fell silent for longer than they may since this was asked last.
+pub fn fell_silent() -> Vec<&'static str> {
+    silent().filter(|(slot, _)| !TOLD[*slot].swap(true, Relaxed)).map(|(_, name)| name).collect()
+}
+
+/// Says that the run is to end; a thread that hangs from here on is not waited for.
+pub fn ending() {
+    ENDING.store(true, Relaxed);
+}
+
+/// Starts a thread that ends the process where a run is to end, by `stop` too, and one of its threads hangs: joining that
+/// one, or writing to what it waits for, would take for ever. `tell` is called before.
+pub fn end_where_one_hangs(stop: &'static AtomicBool, tell: impl Fn(&str) + Send + 'static) -> std::io::Result<()> {
+    let watch = move || loop {
+        std::thread::sleep(LOOK_PERIOD);
+        if !ENDING.load(Relaxed) && !stop.load(Relaxed) {
+            continue;
+        }
+        // Who reads a worker's answers goes on when that one is killed.
+        if let Some((_, name)) = silent().find(|(_, name)| *name != "map-answers") {
+            let what = format!("thread {name} hangs and the run is to end: results are not written");
+            print_err(format_args!("stipple: {what}; `stipple recover` reads the trajectory from the log"));
+            tell(&what);
+            host::exit_now(EX_SOFTWARE);
+        }
+    };
+    std::thread::Builder::new().name("guard".into()).spawn(watch).map(drop)
 }
 
 /// Asks for real-time priorities of the threads that start from here on, and for memory that stays resident. What the
@@ -109,37 +163,42 @@ pub fn silent() -> Option<&'static str> {
 pub fn ask_for_realtime() {
     REALTIME.store(true, Relaxed);
     if let Err(e) = host::lock_memory() {
-        registry().refused = Some(format!("memory may be swapped out: {e}; allow it with LimitMEMLOCK=infinity"));
+        registry().refused[1] = Some(format!("memory may be swapped out: {e}; allow it with LimitMEMLOCK=infinity"));
     }
 }
 
 fn ask_for_priority(priority: i32) {
     if REALTIME.load(Relaxed) {
         if let Err(e) = host::ask_for_realtime(priority) {
-            registry().refused = Some(format!("threads have no real-time priority: {e}; allow it with LimitRTPRIO=20"));
+            let why = format!("threads have no real-time priority: {e}; allow it with LimitRTPRIO=20");
+            registry().refused[0] = Some(why);
         }
     }
 }
 
-/// Why the system refused a priority or resident memory, once.
-pub fn refused() -> Option<String> {
-    registry().refused.take()
+/// Why the system refused priorities, and resident memory: each once.
+pub fn refused() -> Vec<String> {
+    let mut registry = registry();
+    let Registry { refused, told, .. } = &mut *registry;
+    let new =
+        refused.iter_mut().zip(told).filter_map(|(why, told)| why.take().filter(|_| !std::mem::replace(told, true)));
+    new.collect()
 }
 
-/// Makes threads that start from here on panic by these rules; fails where one names no thread.
-pub fn panic_in(rules: &[ThreadRule]) -> Result<(), Fault> {
+/// Makes threads that start from here on panic or hang by these rules; fails where one names no thread.
+pub fn disturb(rules: &[ThreadRule]) -> Result<(), Fault> {
     let names = WATCHED.map(|(name, ..)| name);
     if let Some(rule) = rules.iter().find(|rule| !names.contains(&&*rule.name)) {
-        let what = format!("no thread of the name {} can be asked to panic", rule.name);
+        let what = format!("no thread of the name {} can be disturbed", rule.name);
         return Err(Fault::new(FaultKind::Config, "--inject", what, format!("name one of {}", names.join(", "))));
     }
-    registry().panics.extend_from_slice(rules);
+    registry().rules.extend_from_slice(rules);
     Ok(())
 }
 
-/// The rules of `panic_in`, for a process that this one starts.
-pub fn panics() -> Vec<ThreadRule> {
-    registry().panics.clone()
+/// The rules of `disturb`, for a process that this one starts.
+pub fn rules() -> Vec<ThreadRule> {
+    registry().rules.clone()
 }
 
 /// Makes a panic of any thread end the process; `tell` is called before.
@@ -166,13 +225,23 @@ mod tests {
     #[test]
     fn a_thread_is_watched_while_it_lives_and_named_when_it_is_silent() {
         let watched = watch("estimator");
-        assert_eq!(silent(), None);
-        BEATS[watched.0].store(host::monotonic().0 - 6_000_000_000, Relaxed);
-        assert_eq!(silent(), Some("estimator"));
+        assert!(fell_silent().is_empty());
+        let six_seconds = || BEATS[watched.0].store(host::monotonic().0 - 6_000_000_000, Relaxed);
+        six_seconds();
+        assert_eq!((fell_silent(), fell_silent()), (vec!["estimator"], vec![]), "told once");
         alive();
-        assert_eq!(silent(), None);
-        BEATS[watched.0].store(1, Relaxed);
+        assert!(fell_silent().is_empty());
+        six_seconds();
+        assert_eq!(fell_silent(), ["estimator"], "told again");
         drop(watched);
-        assert_eq!(silent(), None, "its thread has ended");
+        assert!(silent().next().is_none(), "its thread has ended");
+    }
+
+    #[test]
+    fn what_the_system_refuses_is_told_once_each() {
+        registry().refused = ["priority".into(), "memory".into()].map(Some);
+        assert_eq!(refused(), ["priority", "memory"]);
+        registry().refused[0] = Some("priority".into());
+        assert!(refused().is_empty(), "each thread asks, and is refused");
     }
 }

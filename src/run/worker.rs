@@ -57,8 +57,8 @@ struct Setup {
     ring: i32,
     /// The recording or rig, for errors, and whether samples are recorded: on the first start the whole run must fit.
     first: Option<(String, bool)>,
-    /// Panics of its threads.
-    panics: Vec<ThreadRule>,
+    /// Panics and hangs of its threads.
+    rules: Vec<ThreadRule>,
     /// Time of the run so far, s.
     run_s: f64,
     parent: u32,
@@ -192,8 +192,8 @@ impl Worker {
             calibration: self.calibration.clone(),
             out: self.out.clone(),
             ring: self.ring.number(),
-            // One that is started again is not asked to panic.
-            panics: if first.is_some() { threads::panics() } else { vec![] },
+            // One that is started again is not disturbed.
+            rules: if first.is_some() { threads::rules() } else { vec![] },
             first,
             run_s: self.begun.elapsed().as_secs_f64(),
             parent: std::process::id(),
@@ -331,9 +331,10 @@ impl Running {
             }
         }
         if !ready {
-            let late = now - self.started > BOOT_MAX;
-            self.slice.1 = now;
-            return late.then(|| format!("was not ready after {} s", BOOT_MAX.as_secs()));
+            (self.beat.1, self.slice.1) = (now, now);
+            if now - self.started > BOOT_MAX {
+                return Some(format!("was not ready after {} s", BOOT_MAX.as_secs()));
+            }
         }
         if now - self.beat.1 > SILENCE_MAX {
             return Some(format!("gave no sign of life for {} s", SILENCE_MAX.as_secs()));
@@ -441,22 +442,23 @@ pub fn serve(mut input: impl Read, mut output: impl Write) -> Result<(), Fault> 
         Fault::new(FaultKind::Usage, "map-worker", what, "it is started by `stipple run`, not by hand")
     })?;
     host::live_with_parent(setup.parent).map_err(broken)?;
-    threads::panic_in(&setup.panics)?;
+    threads::disturb(&setup.rules)?;
     let start = Instant::now().checked_sub(Duration::from_secs_f64(setup.run_s.max(0.0))).unwrap_or_else(Instant::now);
     let missing = memory::replace_missing(&mut setup.board);
     let Setup { board, calibration, first, .. } = &setup;
     let fits = first.as_ref().map(|(place, records)| memory::check_fits(place, calibration, board, *records));
     let opened = fits.transpose().and_then(|_| KeyframeRing::attach(setup.ring, calibration, board)).and_then(|ring| {
         let ring = Arc::new(ring);
-        Ok((ring.clone(), OutputDir::create(&setup.out)?, Mapping::open(calibration, board, ring)?))
+        Ok((ring.clone(), Mapping::open(calibration, board, ring)?))
     });
-    let (ring, out, mapping) = match opened {
+    let (ring, mapping) = match opened {
         Ok(opened) => opened,
         Err(fault) => {
             // The process that flies says it.
             return tell(&mut output, &Answer::Refused(fault)).map_err(broken);
         }
     };
+    let out = OutputDir::existing(&setup.out);
     let gauges = Arc::new(Gauges::default());
     let (beating, seen) = (ring.clone(), gauges.clone());
     super::start("beat", move || loop {
@@ -493,4 +495,81 @@ pub fn serve(mut input: impl Read, mut output: impl Write) -> Result<(), Fault> 
         send(&mut output, pixels.as_flattened()).map_err(broken)?;
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+    use crate::run::keyframes::tests::ring;
+
+    const MANY: u64 = 1 << 40;
+
+    /// A process that is no worker, as one that was started `ago`.
+    fn running(ago: Duration) -> Running {
+        let (told, started) = (Arc::default(), Instant::now().checked_sub(ago).unwrap());
+        let child = Command::new("sleep").arg("60").spawn().unwrap();
+        let (beat, slice) = ((0, started), (0, started));
+        Running { child, told, reader: std::thread::spawn(|| ()), started, beat, slice, looked: started }
+    }
+
+    #[test]
+    fn a_worker_is_judged_by_its_start_its_beats_its_slices_and_its_memory() {
+        let (ring, now) = (ring(), Instant::now());
+        let after = |s| now + Duration::from_secs(s);
+        let mut r = running(Duration::ZERO);
+        assert_eq!(r.judge(&ring, false, MANY, after(110)), None);
+        assert_eq!(r.judge(&ring, false, MANY, after(130)).unwrap(), "was not ready after 120 s");
+        r.end();
+        let mut r = running(Duration::ZERO);
+        // The thread that beats may not have run yet when it is ready.
+        assert_eq!(r.judge(&ring, false, MANY, after(60)), None);
+        assert_eq!(r.judge(&ring, true, MANY, after(61)), None);
+        assert_eq!(r.judge(&ring, true, MANY, after(66)).unwrap(), "gave no sign of life for 5 s");
+        for s in 66..90 {
+            ring.word(Word::Beat).fetch_add(1, Relaxed);
+            assert_eq!(r.judge(&ring, true, MANY, after(s)), None);
+        }
+        ring.word(Word::Beat).fetch_add(1, Relaxed);
+        assert_eq!(r.judge(&ring, true, MANY, after(92)).unwrap(), "hangs: a slice of its work takes over 30 s");
+        ring.word(Word::Progress).fetch_add(1, Relaxed);
+        let why = r.judge(&ring, true, 1 << 10, after(93)).unwrap();
+        assert!(why.starts_with("takes ") && why.ends_with(" 0 are allowed"), "{why}");
+        r.end();
+    }
+
+    #[test]
+    fn a_worker_that_is_stopped_while_it_starts_is_noticed() {
+        let (ring, mut r) = (ring(), running(Duration::from_secs(1)));
+        let told = Command::new("sh").args(["-c", &format!("kill -STOP {}", r.child.id())]).status().unwrap();
+        assert!(told.success());
+        std::thread::sleep(Duration::from_millis(100));
+        assert_eq!(r.judge(&ring, false, MANY, Instant::now()).unwrap(), "was stopped (SIGSTOP)");
+        r.end();
+    }
+
+    #[test]
+    fn pauses_grow_only_where_a_worker_lives_shortly() {
+        let board = Board::parse("lavapipe.toml", include_str!("../../board-configs/lavapipe.toml"), &[]).unwrap();
+        let now = Instant::now();
+        let mut worker = Worker {
+            ring: Arc::new(ring()),
+            board,
+            calibration: Calibration { cameras: vec![], imu: stipple_drivers::ImuCalibration::CONSUMER },
+            out: PathBuf::new(),
+            begun: now,
+            running: None,
+            pause: Duration::ZERO,
+            next_start: now,
+            restarts: 0,
+            warning: None,
+            bytes_max: MANY,
+        };
+        let mut pause = |life_s| {
+            worker.postpone(now, Duration::from_secs(life_s));
+            (worker.next_start - now).as_secs()
+        };
+        assert_eq!([1, 1, 1, 1, 29, 31, 1].map(&mut pause), [0, 1, 2, 4, 8, 0, 1]);
+        assert_eq!([1; 6].map(&mut pause).last(), Some(&32));
+    }
 }

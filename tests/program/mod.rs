@@ -19,8 +19,12 @@ pub fn text(o: &Output) -> String {
 /// Asks it to stop: with `kill` of the shell, since Debian's own is in a package that not every machine has.
 #[allow(dead_code)] // not every binary of tests does
 pub fn signal(child: &Child, name: &str) {
-    let told = Command::new("sh").args(["-c", &format!("kill -{name} {}", child.id())]).status().unwrap();
-    assert!(told.success());
+    kill(child.id(), name);
+}
+
+#[allow(dead_code)] // not every binary of tests does
+pub fn kill(pid: u32, name: &str) {
+    assert!(Command::new("sh").args(["-c", &format!("kill -{name} {pid}")]).status().unwrap().success());
 }
 
 /// The processes that `parent` has started.

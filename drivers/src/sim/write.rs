@@ -9,6 +9,7 @@ use crate::euroc::{
     aid_row, camera_yaml, commas, imu_row, imu_yaml, png, png_16, transform_yaml, BARO_COLUMNS, IMAGE_COLUMNS,
     IMU_COLUMNS,
 };
+use crate::host::sync_folder_of;
 use crate::types::{Frames, Pose};
 use crate::{Fault, FaultKind};
 use std::fs::{self, File};
@@ -31,7 +32,7 @@ pub fn write_euroc(sim: &mut Sim, dir: &Path, colours: usize, progress: impl FnM
     // Made here, so that no link of somebody else lies in it.
     fs::create_dir(&partial).map_err(|e| cannot(&partial, e))?;
     let written = write_all(sim, &partial.join("mav0"), frames, progress)
-        .and_then(|()| fs::rename(&partial, dir).map_err(|e| cannot(dir, e)));
+        .and_then(|()| fs::rename(&partial, dir).and_then(|()| sync_folder_of(dir)).map_err(|e| cannot(dir, e)));
     if written.is_err() {
         // Best effort: the first error is the one to report.
         let _ = fs::remove_dir_all(&partial);
