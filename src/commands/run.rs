@@ -7,7 +7,7 @@ use crate::run::sensors::Playback;
 use crate::run::status_led::StatusLed;
 use crate::run::{fly, threads, Options};
 use std::path::PathBuf;
-use stipple_drivers::{host, Fault, FaultKind};
+use stipple_drivers::{host, Fault};
 
 #[derive(clap::Args)]
 #[command(group(clap::ArgGroup::new("what --inject may disturb").args(["dataset", "allow_injection"]).multiple(true)))]
@@ -54,10 +54,7 @@ pub fn run(args: &Args) -> Result<(), Fault> {
     let out = OutputDir::create(&args.out)?;
     let (duration_s, record) = (args.duration, args.record.clone());
     let playback = Playback { speed: args.speed, repeats: args.repeat };
-    threads::end_where_one_hangs(host::stop_asked_for(), super::last_words).map_err(|e| {
-        let fix = "end other programs, or raise the limit of processes (TasksMax)";
-        Fault::new(FaultKind::Unavailable, "threads", format!("no thread starts: {e}"), fix)
-    })?;
+    threads::end_where_one_hangs(host::stop_asked_for(), super::last_words);
     let options = Options { duration_s, record, inject, service: true, playback, ..Options::default() };
     finish(fly(input, &board, &out, &options, led)?, &out)
 }

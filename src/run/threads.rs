@@ -141,8 +141,8 @@ pub fn ending() {
 
 /// Starts a thread that ends the process where a run is to end, by `stop` too, and one of its threads hangs: joining that
 /// one, or writing to what it waits for, would take for ever. `tell` is called before.
-pub fn end_where_one_hangs(stop: &'static AtomicBool, tell: impl Fn(&str) + Send + 'static) -> std::io::Result<()> {
-    let watch = move || loop {
+pub fn end_where_one_hangs(stop: &'static AtomicBool, tell: impl Fn(&str) + Send + 'static) {
+    super::start("guard", move || loop {
         std::thread::sleep(LOOK_PERIOD);
         if !ENDING.load(Relaxed) && !stop.load(Relaxed) {
             continue;
@@ -154,8 +154,7 @@ pub fn end_where_one_hangs(stop: &'static AtomicBool, tell: impl Fn(&str) + Send
             tell(&what);
             host::exit_now(EX_SOFTWARE);
         }
-    };
-    std::thread::Builder::new().name("guard".into()).spawn(watch).map(drop)
+    });
 }
 
 /// Asks for real-time priorities of the threads that start from here on, and for memory that stays resident. What the
