@@ -11,7 +11,7 @@ use panics::{panic_after, Panicked};
 use program::{children, flight, kill, signal, stipple, text, BOARD};
 use serde_json::Value;
 use std::fs;
-use std::io::{Read, Write};
+use std::io::{BufRead, BufReader, Read, Write};
 use std::os::fd::OwnedFd;
 use std::os::unix::net::UnixStream;
 use std::os::unix::process::ExitStatusExt;
@@ -283,6 +283,39 @@ fn a_mapper_that_hangs_is_started_again() {
         "{said}"
     );
     assert!(report(&out)["count_map_restarts"] == 1 && out.join("map.ply").exists(), "{said}");
+}
+
+/// A GPU whose driver was reset: the mapper says so, a new one opens it again, and odometry loses nothing.
+#[test]
+fn a_gpu_that_is_lost_is_opened_again() {
+    let (dir, out) = folder();
+    let (data, flag) = (flight(dir.path(), "10"), dir.path().join("lost"));
+    let source = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/program/lost_gpu.c");
+    let shim = dir.path().join("vulkan/libvulkan.so.1");
+    fs::create_dir(dir.path().join("vulkan")).unwrap();
+    let built = Command::new("cc").args(["-shared", "-fPIC", "-o"]).arg(&shim).arg(source).arg("-ldl").status();
+    assert!(built.unwrap().success());
+    let known = Command::new("/sbin/ldconfig").arg("-p").output().unwrap();
+    let known = String::from_utf8(known.stdout).unwrap();
+    let real =
+        known.lines().find(|line| line.trim().starts_with("libvulkan.so.1 ")).unwrap().rsplit_once("=> ").unwrap().1;
+    let mut command = run(&data, &out);
+    command.envs([("LD_LIBRARY_PATH", shim.parent().unwrap()), ("REAL_VULKAN", Path::new(real)), ("LOST_GPU", &flag)]);
+    let mut child = command.stdout(Stdio::null()).spawn().unwrap();
+    let mut said = vec![];
+    for line in BufReader::new(child.stderr.take().unwrap()).lines().map(Result::unwrap) {
+        if line.starts_with("3.") && line.contains(" frames") {
+            assert!(!line.contains(" 0 iterations"), "it maps: {line}");
+            fs::write(&flag, b"").unwrap();
+        }
+        said.push(line);
+    }
+    let (status, said) = (child.wait().unwrap(), said.join("\n"));
+    assert!(status.success() && !flag.exists(), "{said}");
+    assert!(said.contains("the Vulkan device is lost") && said.contains("the mapper maps again"), "{said}");
+    let r = report(&out);
+    assert_eq!([&r["count_map_restarts"], &r["count_frames_overwritten"]], [1, 0], "{said}");
+    assert!(r["splats"].as_u64().unwrap() > 0 && out.join("map.ply").exists(), "{said}");
 }
 
 /// Threads that the program starts in a run of a recording, and what makes a run have them. `trigger` needs cameras.
