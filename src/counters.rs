@@ -17,9 +17,11 @@ stipple_drivers::counters! {
     frames_not_newer,
     /// Frames refused: stamped more than a second ahead of their arrival.
     frames_timestamp_jump,
-    /// Frames refused: a camera gave the picture before once more.
+    /// Frames refused: every camera gave the picture before once more.
     frames_frozen,
-    /// Frames of which a camera saw nothing: covered, or its light out.
+    /// Pictures made black: a camera gave the one before once more, and another went on.
+    images_frozen,
+    /// Frames of which a camera saw nothing: covered, its light out, away or hanging.
     frames_blank,
     /// Frames tracked though no inertial sample at their stamp came in time.
     frames_without_imu,

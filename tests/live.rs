@@ -186,6 +186,27 @@ fn a_run_goes_on_with_one_camera_and_says_which_is_gone() {
     assert!(r["ate_rmse_m"].as_f64().unwrap() < 0.03, "{said}");
 }
 
+/// While one frozen image refused the whole frame, the other camera was of no use for these two seconds.
+#[test]
+fn a_run_goes_on_with_one_camera_while_the_other_repeats_an_image() {
+    const RULES: &str = "
+        [[camera]]
+        fault = \"freeze\"
+        camera = 1
+        start_s = 2.0
+        end_s = 4.0
+    ";
+    let dir = tempfile::tempdir().unwrap();
+    let (data, out) = (flight(dir.path(), "6"), dir.path().join("out"));
+    let o = run_with(&data, &out, RULES).output().unwrap();
+    let (r, said) = (report(&out), text(&o));
+    assert!(o.status.success(), "{said}");
+    assert_eq!((count(&r, "frames_frozen"), count(&r, "resets")), (0, 0), "{said}");
+    assert!(count(&r, "images_frozen") > 20, "{said}");
+    assert_eq!(count(&r, "images_frozen"), count(&r, "frames_blank"), "{said}");
+    assert!(r["ate_rmse_m"].as_f64().unwrap() < 0.03, "{said}");
+}
+
 #[test]
 fn a_senseless_rule_is_named() {
     let dir = tempfile::tempdir().unwrap();

@@ -74,7 +74,7 @@ pub struct Rule {
     /// How late `delay` delivers, and how far off `stamp_jump` stamps, s.
     #[serde(default)]
     pub by_s: f64,
-    /// `blackout` and `unplug`: this camera alone, while the others go on.
+    /// `blackout`, `freeze` and `unplug`: this camera alone, while the others go on.
     #[serde(default)]
     pub camera: Option<usize>,
     /// `bit_flip`: bits in each image.
@@ -111,8 +111,8 @@ impl Rule {
             _ if !(self.length_s >= 0.0 && self.length_s.is_finite()) => Err("length_s must not be negative"),
             _ if needs_by && !(self.by_s.is_finite() && self.by_s != 0.0) => Err("this fault needs by_s, in seconds"),
             _ if self.fault == Kind::Delay && self.by_s < 0.0 => Err("a delay is not negative"),
-            _ if self.camera.is_some() && !matches!(self.fault, Kind::Blackout | Kind::Unplug) => {
-                Err("only blackout and unplug strike one camera alone")
+            _ if self.camera.is_some() && !matches!(self.fault, Kind::Blackout | Kind::Freeze | Kind::Unplug) => {
+                Err("only blackout, freeze and unplug strike one camera alone")
             }
             _ => Ok(()),
         }
@@ -271,6 +271,12 @@ impl LastFrames {
             (Kind::Drop | Kind::Gap | Kind::Unplug, _) => delivered = false,
             (Kind::Delay, _) => late_s += rule.by_s,
             (Kind::Duplicate, _) => *again = true,
+            (Kind::Freeze, Some(camera)) => {
+                let images = frames.images.get_mut(camera).zip(last.images.get(camera));
+                let colours = frames.colours.get_mut(camera).zip(last.colours.get(camera));
+                let planes = colours.into_iter().flat_map(|(to, from)| to.iter_mut().zip(from));
+                images.into_iter().chain(planes).for_each(|(to, from)| to.copy_from(from));
+            }
             (Kind::Freeze, _) => {
                 let t = frames.t;
                 frames.copy_from(last);

@@ -92,7 +92,7 @@ pub struct FrameGate {
     pub stamps: Stamps,
     /// Pixels of the last frame, every `PIXEL_STRIDE`th.
     looks: Vec<Vec<u8>>,
-    /// A camera saw nothing in it.
+    /// A camera saw nothing in it, or gave the image before once more.
     pub blank: bool,
 }
 
@@ -102,8 +102,8 @@ impl FrameGate {
         FrameGate { stamps: Stamps::default(), looks: shape.images.iter().map(look).collect(), blank: false }
     }
 
-    /// Whether frames that arrived at `now` are believed.
-    pub fn admit(&mut self, frames: &Frames, now: Nanos, c: &Counters) -> bool {
+    /// Whether frames that arrived at `now` are believed. A camera that hangs gives a black image while another goes on.
+    pub fn admit(&mut self, frames: &mut Frames, now: Nanos, c: &Counters) -> bool {
         let counters = StampCounters {
             missing: &c.frames_missing,
             not_newer: &c.frames_not_newer,
@@ -112,8 +112,8 @@ impl FrameGate {
         if !self.stamps.admit(frames.t, now, &counters) {
             return false;
         }
-        let (mut frozen, mut blank) = (false, false);
-        for (image, look) in frames.images.iter().zip(&mut self.looks) {
+        let (mut frozen, mut blank) = (0, false);
+        for (image, look) in frames.images.iter_mut().zip(&mut self.looks) {
             let (mut same, mut low, mut high) = (true, u8::MAX, 0);
             for (px, kept) in image.pixels.iter().step_by(PIXEL_STRIDE).zip(look) {
                 same &= px == kept;
@@ -121,14 +121,21 @@ impl FrameGate {
                 *kept = *px;
             }
             let dull = high.saturating_sub(low) < BLANK_LEVELS;
-            blank |= dull;
             // Black twice is the dark, not a camera that hangs.
-            frozen |= same && !dull;
+            if same && !dull {
+                frozen += 1;
+                image.pixels.fill(0);
+            }
+            blank |= dull || same;
+        }
+        if frozen == frames.images.len() {
+            c.frames_frozen.add(1);
+            return false;
         }
         self.blank = blank;
         c.frames_blank.add(u64::from(blank));
-        c.frames_frozen.add(u64::from(frozen));
-        !frozen
+        c.images_frozen.add(frozen as u64);
+        true
     }
 }
 
@@ -274,12 +281,41 @@ mod tests {
         let pictures = [picture(3), picture(5), picture(5), black.clone(), black, picture(7)];
         let admitted = pictures.into_iter().enumerate().map(|(i, image)| {
             gate.admit(
-                &Frames { t: Nanos(i as i64 * MS), images: vec![image], colours: vec![] },
+                &mut Frames { t: Nanos(i as i64 * MS), images: vec![image], colours: vec![] },
                 Nanos(i as i64 * MS),
                 &c,
             )
         });
         assert_eq!(admitted.collect::<Vec<_>>(), [true, true, false, true, true, true]);
         assert_eq!((c.frames_frozen.get(), c.frames_blank.get()), (1, 2));
+    }
+
+    /// Seeds of the images of two cameras; a seed of 0 is a covered camera.
+    #[test]
+    fn a_camera_that_hangs_is_blank_while_the_other_goes_on() {
+        let picture = |seed: u8| Image {
+            pixels: (0..6400).map(|i| (i as u8).wrapping_mul(seed)).collect(),
+            ..Image::new(80, 80)
+        };
+        let c = Counters::default();
+        let mut gate = FrameGate::new(&Frames { images: vec![Image::new(80, 80); 2], ..Frames::default() });
+        let seeds = [[3, 5], [7, 5], [9, 5], [9, 5], [11, 13], [11, 0]];
+        let given = seeds.into_iter().enumerate().map(|(i, seeds)| {
+            let t = Nanos(i as i64 * MS);
+            let mut frames = Frames { t, images: seeds.map(picture).to_vec(), colours: vec![] };
+            let admitted = gate.admit(&mut frames, t, &c);
+            let seen = frames.images.iter().zip(seeds).map(|(image, seed)| *image == picture(seed)).collect::<Vec<_>>();
+            (admitted, seen[0], seen[1], gate.blank)
+        });
+        let expected = [
+            (true, true, true, false),
+            (true, true, false, true),
+            (true, true, false, true),
+            (false, false, false, true),
+            (true, true, true, false),
+            (true, false, true, true),
+        ];
+        assert_eq!(given.collect::<Vec<_>>(), expected);
+        assert_eq!((c.frames_frozen.get(), c.images_frozen.get(), c.frames_blank.get()), (1, 3, 3));
     }
 }

@@ -274,7 +274,7 @@ pub fn camera(mailbox: &Mailbox, source: &mut dyn FrameSource, tracking: &Waker,
             }
         }
         mailbox.arrived.fetch_add(1, Relaxed);
-        if !gate.admit(&packet.frames, monotonic(), c) {
+        if !gate.admit(frames, monotonic(), c) {
             continue;
         }
         packet.blank = gate.blank;
