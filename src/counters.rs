@@ -39,7 +39,7 @@ stipple_drivers::counters! {
     imu_missing,
     imu_not_newer,
     imu_timestamp_jump,
-    /// Samples of a unit that repeats itself: twenty and more alike to the last bit.
+    /// Samples of a unit that repeats itself: alike to the last bit for a tenth of a second.
     imu_frozen,
     /// Samples with an axis at the end of its range, as the source says.
     imu_saturated,

@@ -50,6 +50,11 @@ pub trait ImuSource: Send {
         None
     }
 
+    /// Ends of the ranges that gyro and accelerometer are set to, rad/s and m/s², where the source knows them.
+    fn range(&self) -> Option<[f64; 2]> {
+        self.inner()?.range()
+    }
+
     /// Counters so far, by name.
     fn counters(&self) -> Vec<(&'static str, u64)> {
         self.inner().map_or_else(Vec::new, |source| source.counters())
@@ -142,6 +147,19 @@ pub struct ImuReading {
     pub temperature_c: Option<f32>,
     /// An axis stands at the end of its range.
     pub saturated: bool,
+}
+
+/// A reading from this fraction of its range on stands at the end of it.
+pub const RANGE_END: f64 = 0.99;
+
+/// Readings alike to the last bit for so long are of a unit that hangs.
+const FROZEN: Span = Span(100_000_000);
+/// Fewest readings alike that tell: a unit whose noise is a third of a step repeats all six axes one time in five.
+const FROZEN_READINGS_MIN: f64 = 20.0;
+
+/// Readings alike in a row, at a rate in Hz, that are of a unit that hangs.
+pub fn frozen_readings(rate_hz: f64) -> u32 {
+    (FROZEN.secs() * rate_hz).round().max(FROZEN_READINGS_MIN) as u32
 }
 
 /// Samples of one call at most: more than the largest FIFO of the units that are driven holds (LSM6DSOX: 219), fewer than a

@@ -9,6 +9,7 @@ use stipple_drivers::calibration::{Mask, MASKS_MAX};
 use stipple_drivers::gpio::{Edge, LineName};
 use stipple_drivers::imu::chips::Chip;
 use stipple_drivers::imu::{IioOptions, ImuOptions, RegisterOptions, Wiring};
+use stipple_drivers::source::frozen_readings;
 use stipple_drivers::v4l2::{Format, Select, Settings, StampPoint};
 use stipple_drivers::{Calibration, Fault, FaultKind, Span};
 
@@ -219,9 +220,6 @@ impl CameraConfig {
 const BMP388: &str = "bmp388";
 /// The chip's name that means the kernel's driver.
 const IIO: &str = "iio";
-/// Equal samples in a row after which the driver sets the unit up anew. The quietest of the units, at its widest range, has a
-/// noise of a third of a step and more: three axes do not stand still for so long by chance.
-const FROZEN_SAMPLES: u32 = 50;
 /// How the paths of SPI devices begin; every other device is an I2C adapter.
 const SPIDEV: &str = "/dev/spidev";
 
@@ -273,7 +271,7 @@ impl ImuConfig {
                 accel_device: self.accel_device.clone(),
                 trigger: self.trigger.clone(),
                 rate_hz: self.rate_hz,
-                frozen_samples: FROZEN_SAMPLES,
+                frozen_samples: frozen_readings(self.rate_hz),
                 sysfs: "/sys/bus/iio/devices".into(),
                 dev: "/dev".into(),
             })),
@@ -285,7 +283,7 @@ impl ImuConfig {
                 gyro_range_dps: self.gyro_range_dps,
                 self_test: self.self_test,
                 configuration: self.configuration.clone().into(),
-                frozen_samples: FROZEN_SAMPLES,
+                frozen_samples: frozen_readings(self.rate_hz),
             })),
         }
     }

@@ -8,7 +8,7 @@
 
 use super::spikes::Spikes;
 use crate::counters::{Counter, Counters};
-use stipple_drivers::source::ImuReading;
+use stipple_drivers::source::{frozen_readings, ImuReading, RANGE_END};
 use stipple_drivers::{Frames, Image, ImuCalibration, ImuSample, Nanos, Span};
 
 /// Largest step of a stamp beyond the time that passed, ns: further than a queue of frames can be behind.
@@ -21,11 +21,6 @@ const INTERVALS: usize = 15;
 const PIXEL_STRIDE: usize = 61;
 /// Grey levels between the darkest and the brightest pixel of a covered eye.
 const BLANK_LEVELS: u8 = 6;
-/// So many readings in a row, all six axes alike to the last bit, no working unit gives: one whose noise is a third of a
-/// step repeats itself one time in five, and this often in a row never.
-const FROZEN_AFTER: u32 = 20;
-/// A reading this near the end of its range stands at it.
-const RANGE_FRACTION: f64 = 0.99;
 
 /// The stamps of one sensor.
 #[derive(Default)]
@@ -146,6 +141,8 @@ pub struct ImuGate {
     range: [f64; 2],
     last: Option<ImuSample>,
     repeated: u32,
+    /// So many repetitions are of a unit that hangs.
+    frozen_after: u32,
     /// Samples since the last one given were refused.
     refused: bool,
     spikes: Spikes,
@@ -154,7 +151,15 @@ pub struct ImuGate {
 impl ImuGate {
     pub fn new(imu: &ImuCalibration) -> ImuGate {
         let spikes = Spikes::new(imu.rate_hz);
-        ImuGate { stamps: Stamps::default(), range: imu.range, last: None, repeated: 0, refused: false, spikes }
+        ImuGate {
+            stamps: Stamps::default(),
+            range: imu.range,
+            last: None,
+            repeated: 0,
+            frozen_after: frozen_readings(imu.rate_hz),
+            refused: false,
+            spikes,
+        }
     }
 
     /// Takes a reading that arrived at `now` and gives what is believed, in order: nothing, this one, or the one that was
@@ -174,12 +179,12 @@ impl ImuGate {
         let same = |s: ImuSample| s.gyro_body == sample.gyro_body && s.accel_body == sample.accel_body;
         self.repeated = if self.last.is_some_and(same) { self.repeated + 1 } else { 0 };
         self.last = Some(sample);
-        if self.repeated >= FROZEN_AFTER {
-            c.imu_frozen.add(if self.repeated == FROZEN_AFTER { u64::from(FROZEN_AFTER) } else { 1 });
+        if self.repeated >= self.frozen_after {
+            c.imu_frozen.add(if self.repeated == self.frozen_after { u64::from(self.repeated) } else { 1 });
             return;
         }
         let peaks = [sample.gyro_body, sample.accel_body].map(|v| v.abs().max_element());
-        sample.saturated = std::array::from_fn(|i| peaks[i] >= RANGE_FRACTION * self.range[i]);
+        sample.saturated = std::array::from_fn(|i| peaks[i] >= RANGE_END * self.range[i]);
         if reading.saturated && sample.saturated == [false; 2] {
             // The unit does not say which: an end that the calibration has moved.
             sample.saturated = [true; 2];
@@ -243,6 +248,26 @@ mod tests {
             });
         }
         assert_eq!((given, doubted, c.imu_frozen.get()), (100 - 5, 1, 24));
+    }
+
+    /// While twenty repetitions at any rate were a unit that hangs, at 4 kHz that was 5 ms.
+    #[test]
+    fn a_fast_unit_may_repeat_itself_as_long_as_a_slow_one() {
+        for (rate_hz, repeats) in [(50.0, 20), (200.0, 20), (4000.0, 400)] {
+            let (mut gate, c) =
+                (ImuGate::new(&ImuCalibration { rate_hz, ..ImuCalibration::CONSUMER }), Counters::default());
+            for i in 0..=repeats {
+                assert_eq!(c.imu_frozen.get(), 0, "{rate_hz} Hz, {i}");
+                let t = Nanos(i * (1e9 / rate_hz) as i64);
+                gate.pass(
+                    &ImuReading { sample: ImuSample { t, ..ImuSample::default() }, ..ImuReading::default() },
+                    t,
+                    &c,
+                    &mut |_| {},
+                );
+            }
+            assert_eq!(c.imu_frozen.get(), repeats as u64, "{rate_hz} Hz");
+        }
     }
 
     #[test]

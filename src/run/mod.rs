@@ -270,7 +270,7 @@ fn prepare(input: &mut Input, board: &mut Board, options: &Options, apart: bool)
         input.warnings.extend(memory::replace_missing(board).map(|missing| missing.to_string()));
     }
     input.warnings.iter().for_each(|warning| print_err(format_args!("stipple: warning: {warning}")));
-    input.calibration.imu.range = board.imu.range();
+    input.calibration.imu.range = input.source.imu_range(board);
     if !apart {
         memory::check_fits(&input.place, &input.calibration, board, options.record.is_some())?;
     }
@@ -303,7 +303,7 @@ pub fn observe(
     observer: Box<dyn FnMut(&FramePacket) + Send>,
     status: &mut Status,
 ) -> Result<(Flown, Result<(), Fault>), Fault> {
-    input.calibration.imu.range = board.imu.range();
+    input.calibration.imu.range = input.source.imu_range(board);
     let calibration = &input.calibration;
     let live = matches!(input.source, Source::Live { .. });
     if let Source::Recorded(recorded) = &mut input.source {

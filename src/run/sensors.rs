@@ -176,6 +176,15 @@ impl Source {
         }
     }
 
+    /// Ends of the ranges of gyro and accelerometer, rad/s and m/s²: those that a live unit is set to, else the board's.
+    pub fn imu_range(&self, board: &Board) -> [f64; 2] {
+        let set = match self {
+            Source::Live { sensors, .. } => sensors.imu.range(),
+            Source::Recorded(_) => None,
+        };
+        set.unwrap_or(board.imu.range())
+    }
+
     /// The sensors; a recording plays in their place.
     pub fn sensors(self, playback: Playback) -> Sensors {
         match self {

@@ -180,6 +180,11 @@ impl ImuSource for IioImu {
         }
     }
 
+    fn range(&self) -> Option<[f64; 2]> {
+        let of = |axis: Channel| self.streams.iter().find_map(|s| s.device.as_ref()?.scan.range(axis));
+        Some([of(Channel::Gyro(0))?, of(Channel::Accel(0))?])
+    }
+
     fn counters(&self) -> Vec<(&'static str, u64)> {
         self.counts().list()
     }

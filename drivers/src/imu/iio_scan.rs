@@ -5,6 +5,7 @@
 //! I/O", buffers).
 
 use super::merge::Reading;
+use crate::source::RANGE_END;
 use crate::types::Nanos;
 use glam::DVec3;
 
@@ -59,11 +60,14 @@ impl Storage {
         }
     }
 
-    /// Whether a value is the least or largest that its bits can hold.
+    /// End of what its bits can hold.
+    fn end(self) -> f64 {
+        f64::from(self.bits - u32::from(self.signed)).exp2() - 1.0
+    }
+
+    /// Whether a value stands at the end of what its bits can hold.
     fn saturated(self, value: i64) -> bool {
-        let full = 1i64.checked_shl(self.bits - u32::from(self.signed)).unwrap_or(i64::MAX);
-        let least = if self.signed { -full } else { 0 };
-        self.bits < 63 && (value >= full - 1 || value <= least)
+        value.unsigned_abs() as f64 >= RANGE_END * self.end() || !self.signed && value == 0
     }
 }
 
@@ -138,6 +142,11 @@ impl Scan {
         (0..3).all(|i| self.elements.iter().any(|(_, e)| e.channel == axis(i)))
     }
 
+    /// End of the range of an axis, in the kernel's units.
+    pub fn range(&self, axis: Channel) -> Option<f64> {
+        self.elements.iter().find(|(_, e)| e.channel == axis).map(|(_, e)| e.storage.end() * e.scale.abs())
+    }
+
     /// The reading of one scan, and its stamp where it has one; `raw` becomes the axes' raw values, accelerometer first.
     pub fn reading(&self, bytes: &[u8], raw: &mut [i64; 6]) -> (Reading, Option<Nanos>) {
         let (mut accel, mut gyro) = ([0.0; 3], [0.0; 3]);
@@ -175,7 +184,7 @@ mod tests {
         assert_eq!(storage.value(&[0xFF, 0xFE, 9]), -2);
         let storage = Storage::parse("le:s12/16>>4").unwrap();
         assert_eq!((storage.value(&[0x0F, 0x80]), storage.value(&[0xF0, 0x7F])), (-2048, 2047));
-        assert!(storage.saturated(2047) && storage.saturated(-2048) && !storage.saturated(-2047));
+        assert!(storage.saturated(2047) && storage.saturated(-2048) && !storage.saturated(-2026));
         let storage = Storage::parse("le:u24/32>>8").unwrap();
         assert_eq!(storage.value(&[9, 1, 0, 0x80]), 0x80_0001);
         let storage = Storage::parse("le:s64/64>>0").unwrap();

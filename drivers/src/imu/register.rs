@@ -323,6 +323,11 @@ impl ImuSource for RegisterImu {
         }
     }
 
+    fn range(&self) -> Option<[f64; 2]> {
+        let of = |sensor: usize| self.units.iter().find_map(|unit| unit.range()[sensor]);
+        Some([of(0)?, of(1)?])
+    }
+
     fn counters(&self) -> Vec<(&'static str, u64)> {
         self.counts().list()
     }

@@ -8,7 +8,7 @@ use super::error::ImuError;
 use super::frames::Raw;
 use super::merge::Reading;
 use super::timeline::Timeline;
-use crate::source::IMU_BATCH;
+use crate::source::{IMU_BATCH, RANGE_END};
 use crate::types::{Nanos, Span};
 use glam::DVec3;
 
@@ -16,14 +16,13 @@ use glam::DVec3;
 pub const GRAVITY: f64 = 9.80665;
 /// How often a temperature that is not in the frames is read.
 const TEMPERATURE_EVERY: Span = Span(1_000_000_000);
-/// Counts this near, by ratio, to the end of 16 bits, or of the range where that ends before, are clipped.
-const SATURATED: f64 = 0.998;
 
 /// One sensor: counts into SI units, and whether they move.
 struct Axes {
     name: &'static str,
     si_per_lsb: f64,
-    saturated_from: f64,
+    /// End of the range, counts: that of 16 bits, or of the range where that ends before.
+    end: f64,
     last: Option<[i16; 3]>,
     /// How often `last` came again.
     repeats: u32,
@@ -33,8 +32,8 @@ struct Axes {
 impl Axes {
     /// `si` is the sensor's unit in SI units.
     fn new(name: &'static str, si: f64, range: &Range) -> Axes {
-        let saturated_from = SATURATED * (range.full_scale / range.per_lsb).min(f64::from(i16::MAX));
-        Axes { name, si_per_lsb: range.per_lsb * si, saturated_from, last: None, repeats: 0, moved: false }
+        let end = (range.full_scale / range.per_lsb).min(f64::from(i16::MAX));
+        Axes { name, si_per_lsb: range.per_lsb * si, end, last: None, repeats: 0, moved: false }
     }
 
     fn forget(&mut self) {
@@ -47,7 +46,7 @@ impl Axes {
         self.repeats = if again { self.repeats.saturating_add(1) } else { 0 };
         self.last = Some(raw);
         let counts = raw.map(f64::from);
-        *saturated |= counts.iter().any(|c| c.abs() >= self.saturated_from);
+        *saturated |= counts.iter().any(|c| c.abs() >= RANGE_END * self.end);
         DVec3::from(counts) * self.si_per_lsb
     }
 }
@@ -99,6 +98,11 @@ impl Unit {
 
     fn sensors(&mut self) -> impl Iterator<Item = &mut Axes> {
         [&mut self.accel, &mut self.gyro].into_iter().flatten()
+    }
+
+    /// Ends of the ranges of gyro and accelerometer, rad/s and m/s², where the die has them.
+    pub fn range(&self) -> [Option<f64>; 2] {
+        [&self.gyro, &self.accel].map(|axes| axes.as_ref().map(|a| a.end * a.si_per_lsb))
     }
 
     /// Whether every sensor has given two values that differ since the start.

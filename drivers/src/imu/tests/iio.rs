@@ -156,6 +156,7 @@ fn scans_of_one_device_are_read_to_the_bit() {
     assert_eq!(set.map(|f| kernel.set(3, f)), ["1", "1024", "monotonic", "200.000"]);
     assert_eq!(kernel.set(3, "scan_elements/in_anglvel_z_en"), "1");
     assert_eq!(kernel.set(3, "scan_elements/in_magn_x_en"), "0");
+    assert_eq!(imu.range(), Some([GYRO_SCALE, ACCEL_SCALE].map(|scale| 32767.0 * scale)));
     let mut writer = kernel.writer(3);
     assert_eq!(next(&mut imu), (Ok(Wait::TimedOut), vec![]));
     let t = monotonic();
