@@ -7,8 +7,8 @@
 //!
 //! Stamps are the driver's, brought to the middle of the exposure of the first row (`stamps::Timing`), which is followed from
 //! frame to frame (`exposure`), and then to the
-//! calibration's clock and middle row, as those of recordings are. A frame is `Got` when every camera has one within the
-//! tolerance; an image without a partner is counted and its buffer given back at once. A camera that is unplugged or silent
+//! calibration's clock and middle row, as those of recordings are. A frame is `Got` when every camera has one whose exposure
+//! starts or ends within the tolerance, however much exposures differ; its stamp is the first camera's; an image without a partner is counted and its buffer given back at once. A camera that is unplugged or silent
 //! is closed, and from the next call on looked for by its name and opened again, with growing pauses. Meanwhile the others
 //! go on without it: its image is black, and `away` says why. The rig is `Lost` when no camera is left.
 //!
@@ -60,7 +60,7 @@ pub struct Settings {
     pub stamp: StampPoint,
     /// From the end of the first row's exposure until the last row was received.
     pub transfer: Span,
-    /// Largest stamp difference of the images of one frame.
+    /// Largest difference of the starts of exposure of the images of one frame, or of their ends.
     pub pair_tolerance: Span,
 }
 

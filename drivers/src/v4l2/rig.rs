@@ -6,7 +6,7 @@ use super::find::find;
 use super::kernel::{Kernel, Linux, Ready, NODES_MAX};
 use super::node::{Node, Taken};
 use super::pixels::{to_grey, Part, Unreadable};
-use super::stamps::{pair, Pairing, Timing};
+use super::stamps::{pair, spread, Pairing, Timing};
 use super::stream::{stopped, Stream};
 use super::{check, CameraCounters, Select, Settings};
 use crate::source::{FrameSource, SourceFault, Wait};
@@ -196,12 +196,19 @@ impl Rig {
     fn deliver(&mut self, frames: &mut Frames) -> bool {
         loop {
             let (mut heads, mut full, mut of, mut n) = ([None; NODES_MAX], [false; NODES_MAX], [0; NODES_MAX], 0);
+            let mut ends = heads;
             let now = self.kernel.now();
             for (index, stream) in self.streams.iter().enumerate() {
                 if let Some(s) = stream.as_ref().filter(|s| !s.is_missed(now)) {
-                    (heads[n], full[n], of[n]) = (s.held.front().map(|h| h.t), s.is_full(), index);
+                    let head = s.held.front();
+                    (heads[n], ends[n]) = (head.map(|h| h.t - h.half), head.map(|h| h.t + h.half));
+                    (full[n], of[n]) = (s.is_full(), index);
                     n += 1;
                 }
+            }
+            // A trigger starts all exposures together; cameras that are synchronised by their readout end them together.
+            if spread(&ends[..n]) < spread(&heads[..n]) {
+                heads = ends;
             }
             match pair(&heads[..n], &full[..n], self.settings.pair_tolerance) {
                 Pairing::Wait => return false,

@@ -127,6 +127,12 @@ pub(super) enum Pairing {
     Wait,
 }
 
+/// Time from the oldest of the stamps to the newest.
+pub(super) fn spread(stamps: &[Option<Nanos>]) -> Span {
+    let stamps = || stamps.iter().flatten();
+    stamps().max().zip(stamps().min()).map_or(Span(0), |(newest, oldest)| *newest - *oldest)
+}
+
 /// Decides about the oldest frame held of each camera: `heads` are their stamps, `full` says which cameras can hold no more.
 /// Stamps of a camera grow, so the oldest head that is further than the tolerance from the newest can find no partner.
 pub(super) fn pair(heads: &[Option<Nanos>], full: &[bool], tolerance: Span) -> Pairing {

@@ -27,6 +27,8 @@ pub(super) struct Held {
     pub filled: Filled,
     /// Mid-exposure instant in the calibration's clock.
     pub t: Nanos,
+    /// Half the exposure of a row.
+    pub half: Span,
 }
 
 /// A node and its held images, oldest first.
@@ -136,7 +138,8 @@ impl Stream {
             Some((t, Order::Next { missed_by_sequence, missed_by_stamp })) => {
                 counters.camera_missed_by_sequence += missed_by_sequence;
                 counters.camera_missed_by_stamp += missed_by_stamp;
-                self.held.push_back(Held { filled, t: camera.to_imu_clock(t) });
+                let half = Span(self.timing.exposure.0 / 2);
+                self.held.push_back(Held { filled, t: camera.to_imu_clock(t), half });
                 return Ok(());
             }
             Some((_, Order::NotNewer)) => counters.camera_stamps_not_newer += 1,

@@ -80,6 +80,25 @@ fn stamps_follow_an_exposure_that_somebody_sets_from_the_first_frame_after_it() 
     assert!(machine.state().cams.iter().all(|c| c.subscribed == [CID_EXPOSURE_ABSOLUTE]));
 }
 
+/// While images were paired by the middle of their exposures, exposures that differ by 8 ms made it 4 ms: every image was
+/// dropped, as the tolerance is 2 ms.
+#[test]
+fn cameras_are_paired_whose_exposures_differ() {
+    // Started together by a trigger; and ended together by a common readout.
+    for late in [8 * MS, 0] {
+        let machine = pair_of_cameras();
+        let exposure = control(CID_EXPOSURE_ABSOLUTE, "Exposure Time, Absolute", 1, 1000, 1);
+        machine.state().cams.iter_mut().zip([40, 120]).for_each(|(c, count)| c.controls = vec![(exposure, count)]);
+        let mut rig = open(&machine, settings(&["serial:0000", "serial:0001"])).unwrap();
+        let mut frames = Frames::for_rig(&rig_of(2, WIDTH, HEIGHT));
+        machine.shoot(0, 1..20, |_, _| {});
+        machine.shoot(1, 1..20, |_, s| (s.at, s.stamp) = (s.at + late, s.stamp + late));
+        take(&mut rig, &mut frames, 19);
+        assert_eq!(frames.t, mid_exposure(19, 4 * MS), "the stamp is the first camera's");
+        assert_eq!(count(&rig, "camera_images_unpaired"), 0);
+    }
+}
+
 /// An event of another control says nothing of the exposure; nor does one that changed its range alone.
 #[test]
 fn other_events_change_nothing() {
