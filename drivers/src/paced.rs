@@ -15,10 +15,11 @@ pub enum Images {
 }
 
 impl Images {
-    /// Reads frame `index` into pre-shaped `out`; `warnings` keeps those that cannot be read.
+    /// Reads frame `index` into pre-shaped `out`; `warnings` keeps the images that cannot be read, which are black. A fault
+    /// where none can.
     pub fn read(&mut self, index: usize, out: &mut Frames) -> Result<(), ImageFault> {
         match self {
-            Images::Recording(reader) => reader.read(index, out),
+            Images::Recording(reader) => reader.read_any(index, out),
             Images::Rendered(frames) => {
                 out.copy_from(&frames[index]);
                 Ok(())

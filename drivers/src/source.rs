@@ -162,6 +162,12 @@ pub fn frozen_readings(rate_hz: f64) -> u32 {
     (FROZEN.secs() * rate_hz).round().max(FROZEN_READINGS_MIN) as u32
 }
 
+/// The other cameras go on without one that gave no image for so long: five of its periods, and at least half a second, a
+/// quarter of what odometry bridges.
+pub(crate) fn missed_after(period: Span) -> Span {
+    Span(period.0.saturating_mul(5)).max(Span(500_000_000))
+}
+
 /// Samples of one call at most: more than the largest FIFO of the units that are driven holds (LSM6DSOX: 219), fewer than a
 /// tenth of what a run queues.
 pub const IMU_BATCH: usize = 256;

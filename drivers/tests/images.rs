@@ -118,6 +118,23 @@ fn damaged_images_are_counted_and_name_their_row() {
     assert_eq!(read(ImageFault::Undecodable).images_undecodable, 1);
 }
 
+/// While one image that could not be read cost the frame, a camera whose files are missing cost every one.
+#[test]
+fn a_frame_is_given_as_long_as_one_of_its_images_can_be_read() {
+    let f = Folder::new();
+    fs::remove_file(f.path(&format!("cam0/data/{T0}.png"))).unwrap();
+    let r = f.open().unwrap();
+    let (mut reader, mut frames) = (r.reader(), Frames::in_colour(&r.calibration, 1));
+    reader.read(1, &mut frames).unwrap();
+    assert_eq!(reader.read_any(0, &mut frames), Ok(()));
+    assert!(frames.images.iter().zip([vec![0; W * H], grey()]).all(|(image, pixels)| image.pixels == pixels));
+    assert!(frames.colours[0].iter().all(|plane| plane.pixels.iter().all(|px| *px == 0)));
+    assert_eq!(reader.counters().images_missing, 1);
+    f.write(&format!("cam1/data/{T0}.png"), b"no image");
+    assert_eq!(reader.read_any(0, &mut frames), Err(ImageFault::Missing));
+    assert_eq!((reader.counters().images_missing, reader.counters().images_undecodable), (2, 1));
+}
+
 #[test]
 fn images_are_taken_from_the_recording_alone() {
     for file in ["../../cam1/data/1.png", "/etc/passwd", "a/b.png", ".."] {

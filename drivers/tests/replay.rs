@@ -87,6 +87,51 @@ fn cameras_that_never_meet_are_refused() {
     f.refused(FaultKind::Data, "mav0", "no image has a partner");
 }
 
+/// Images of the other camera were dropped as unpaired where a list began late or had a hole, and the recording was refused
+/// where it was empty.
+#[test]
+fn while_a_camera_is_away_the_others_go_on() {
+    type Case = (fn(i64) -> bool, [u64; 3], &'static str);
+    // Images that one of two cameras has of a hundred at 20 Hz; counts of absent and unpaired ones, and of times away.
+    let cases: [Case; 6] = [
+        (|i| !(30..60).contains(&i), [30, 0, 1], "gave no image for 1."),
+        (|i| i >= 30, [30, 0, 1], "began 1.5 s after the others"),
+        (|i| i < 70, [30, 0, 1], "ended 1.5 s before the others"),
+        (|_| false, [100, 0, 1], "has no images"),
+        (|i| (20..40).contains(&i), [80, 0, 2], "ended 3.0 s before the others"),
+        (|i| !(30..36).contains(&i), [0, 6, 0], "has no partner"),
+    ];
+    let rows = |has: fn(i64) -> bool| {
+        (0..100).filter(|i| has(*i)).map(|i| format!("{0},{0}.png\n", T0 + i * FRAME)).collect::<String>()
+    };
+    for (has, [absent, unpaired, away], words) in cases {
+        for k in 0..2 {
+            let f = Folder::new();
+            f.write(&format!("cam{k}/data.csv"), rows(has));
+            f.write(&format!("cam{}/data.csv", 1 - k), rows(|_| true));
+            let r = f.open().unwrap();
+            let c = &r.counters;
+            assert_eq!([c.images_absent, c.images_unpaired, c.cameras_away], [absent, unpaired, away], "{words}");
+            assert_eq!(r.frames.len() as u64, 100 - unpaired, "{words}");
+            let black = r.frames.iter().filter(|f| f.images[k].is_none() && f.images[1 - k].is_some()).count();
+            assert_eq!(black as u64, absent, "{words}");
+            assert!(r.frames.windows(2).all(|w| w[0].t < w[1].t));
+            assert!(r.warnings.iter().any(|w| w.contains(words)), "{words}: {:?}", r.warnings);
+        }
+    }
+}
+
+/// A frame of its own would make the recording last until then.
+#[test]
+fn an_image_far_from_all_others_is_dropped_though_the_other_camera_is_away() {
+    for (line, stamp) in [(2, 17), (PAIRS + 1, i64::MAX)] {
+        let f = Folder::new();
+        f.edit("cam0/data.csv", line, |l| format!("{stamp},{}", l.split_once(',').unwrap().1));
+        let r = f.open().unwrap();
+        assert_eq!((r.frames.len(), r.counters.images_absent, r.counters.images_unpaired), (PAIRS, 1, 1), "{stamp}");
+    }
+}
+
 #[test]
 fn duplicated_stamp_is_dropped_and_counted() {
     let f = Folder::new();
@@ -181,6 +226,7 @@ fn tables_of_another_kind_are_refused() {
     for name in ["cam0/data.csv", "imu0/data.csv", "state_groundtruth_estimate0/data.csv"] {
         for content in ["", "#timestamp\n", "\n\n", "letters,and,more\nletters,and,more\n"] {
             let f = Folder::new();
+            f.remove_camera(1);
             f.write(name, content);
             f.refused(FaultKind::Data, name, if content.contains("letters") { "letters" } else { "holds no rows" });
         }

@@ -19,8 +19,10 @@ crate::counters! {
     stamps_out_of_order,
     /// Image rows without a partner in every other camera.
     images_unpaired,
-    /// Cameras whose images end before those of another.
-    cameras_ended_early,
+    /// Times that a camera was away while another went on: from the start, for a while, from then on, or always.
+    cameras_away,
+    /// Black images in the place of those of cameras that were away.
+    images_absent,
     /// Images listed whose file is missing.
     images_missing,
     /// Image files that are cut off or otherwise cannot be decoded.

@@ -15,7 +15,8 @@ use zune_jpeg::zune_core::bytestream::ZCursor;
 use zune_jpeg::zune_core::{colorspace::ColorSpace, options::DecoderOptions};
 use zune_jpeg::JpegDecoder;
 
-/// Why one frame has no images; the reader's warnings say which file and what. The recording goes on without the frame.
+/// Why an image is missing; the reader's warnings say which file and what. The recording goes on with those of the other
+/// cameras.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ImageFault {
     /// A file cannot be read.
@@ -51,40 +52,60 @@ impl Reader {
         &self.findings.warnings
     }
 
-    /// Whether the first `cameras` have colour, by the first image of each that can be read.
+    /// Whether the first `cameras` have colour, by the first image of each that can be read, if one can.
     pub fn has_colour(&self, cameras: usize) -> bool {
         let coloured = |k: usize| {
-            self.frames.iter().find_map(|f| is_coloured(f.images.get(k)?.as_ref()?, &self.root)).unwrap_or(false)
+            self.frames.iter().find_map(|f| is_coloured(f.images.get(k)?.as_ref()?, &self.root)).unwrap_or(true)
         };
         (0..cameras).all(coloured)
     }
 
-    /// Fills `out`, which is shaped by `Frames::for_rig` or `in_colour`. After a fault its pixels are unspecified.
+    /// Fills `out`, which is shaped by `Frames::for_rig` or `in_colour`. Images of cameras that are away are black, and those
+    /// that cannot be read, of which the first is the fault.
     ///
     /// Panics where there is no frame `index`, or `out` has another number of images.
     pub fn read(&mut self, index: usize, out: &mut Frames) -> Result<(), ImageFault> {
+        self.fill(index, out).1.map_or(Ok(()), Err)
+    }
+
+    /// Fills `out` as [`Reader::read`] does; a fault only where no image can be read.
+    pub fn read_any(&mut self, index: usize, out: &mut Frames) -> Result<(), ImageFault> {
+        match self.fill(index, out) {
+            (0, Some(fault)) => Err(fault),
+            _ => Ok(()),
+        }
+    }
+
+    /// Fills `out`; answers how many images were read, and the fault of the first that could not be.
+    fn fill(&mut self, index: usize, out: &mut Frames) -> (usize, Option<ImageFault>) {
         let frame = &self.frames[index];
         assert_eq!(frame.images.len(), out.images.len(), "Frames::for_rig gives one image for each camera");
         out.t = frame.t;
         let mut colours = out.colours.iter_mut();
+        let (mut count, mut first) = (0, None);
         for (file, image) in frame.images.iter().zip(&mut out.images) {
-            let colour = colours.next();
-            let Some(file) = file else {
-                let planes = colour.into_iter().flatten().chain([image]);
-                planes.for_each(|plane| plane.pixels.fill(0));
+            let mut colour = colours.next();
+            let read = file.as_ref().map(|file| {
+                let colour = colour.as_deref_mut();
+                read_image(file, &self.root, &mut self.file, &mut self.decoded, image, colour)
+                    .map_err(|why| (file, why))
+            });
+            if let Some(Ok(())) = read {
+                count += 1;
                 continue;
-            };
-            let read = read_image(file, &self.root, &mut self.file, &mut self.decoded, image, colour);
-            let Err((fault, what)) = read else { continue };
+            }
+            let planes = colour.into_iter().flatten().chain([image]);
+            planes.for_each(|plane| plane.pixels.fill(0));
+            let Some(Err((file, (fault, what)))) = read else { continue };
             let counter: fn(&mut ReplayCounters) -> &mut u64 = match fault {
                 ImageFault::Missing => |c| &mut c.images_missing,
                 ImageFault::Undecodable => |c| &mut c.images_undecodable,
                 ImageFault::WrongSize => |c| &mut c.images_wrong_size,
             };
             self.findings.warn(counter, &file.list, file.line, format_args!("{}: {what}", file.path.display()));
-            return Err(fault);
+            first = first.or(Some(fault));
         }
-        Ok(())
+        (count, first)
     }
 }
 

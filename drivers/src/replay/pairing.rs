@@ -3,6 +3,7 @@
 use super::findings::Findings;
 use super::table::{self, Row};
 use super::{cameras, order};
+use crate::source::missed_after;
 use crate::types::{Nanos, Span};
 use crate::{Calibration, Fault, FaultKind};
 use std::path::{Path, PathBuf};
@@ -24,18 +25,18 @@ pub struct ImageFile {
 pub struct FrameFiles {
     /// The stamp of the first camera that has an image, in the inertial unit's clock.
     pub t: Nanos,
-    /// The files, one for each camera; `None` of a camera whose recording has ended.
+    /// The files, one for each camera; `None` of a camera that is away.
     pub images: Vec<Option<ImageFile>>,
 }
-
-/// A camera that gives nothing for so long before the others end has ended early: ten images at 20 Hz.
-const ENDED_EARLY: Span = Span(500_000_000);
 
 /// A row of an image list; `t` is in the inertial unit's clock once the list was read.
 pub struct ImageRow {
     t: Nanos,
     file: String,
 }
+
+/// Columns of a list.
+const COLUMNS: &str = "stamp [ns], file name";
 
 /// Reads the image lists of all cameras, each of which must be calibrated and recorded.
 pub fn image_lists(
@@ -57,21 +58,98 @@ pub fn image_lists(
         _ => None,
     };
     let read = |k: usize| {
-        let rows = table::read(&list(k), "stamp [ns], file name", parse, findings)?;
+        let rows = table::read_any(&list(k), COLUMNS, parse, findings)?;
         let mut rows = order::increasing(rows, |r| r.t, &list(k), findings);
         rows.iter_mut().for_each(|r| r.value.t = calibration.cameras[k].to_imu_clock(r.value.t));
         Ok(rows)
     };
-    (0..recorded).map(read).collect()
+    let lists = (0..recorded).map(read).collect::<Result<Vec<_>, _>>()?;
+    match lists.iter().all(Vec::is_empty) {
+        true => Err(table::no_rows(&list(0), COLUMNS)),
+        false => Ok(lists),
+    }
 }
 
 fn list_path(mav0: &Path, camera: usize) -> PathBuf {
     mav0.join(format!("cam{camera}/data.csv"))
 }
 
+/// The lists, and how far they were read.
+struct Heads<'a> {
+    lists: &'a [Vec<Row<ImageRow>>],
+    /// The next image of each camera.
+    heads: Vec<usize>,
+    /// A camera that gives nothing for longer is away.
+    patience: Span,
+    /// The first and the last stamp of all.
+    ends: [Nanos; 2],
+}
+
+impl Heads<'_> {
+    fn of(lists: &[Vec<Row<ImageRow>>]) -> Heads<'_> {
+        let period = |list: &Vec<Row<ImageRow>>| {
+            let mut steps: Vec<Span> = list.windows(2).map(|w| w[1].value.t - w[0].value.t).collect();
+            let middle = steps.len() / 2;
+            (!steps.is_empty()).then(|| *steps.select_nth_unstable(middle).1)
+        };
+        let patience = missed_after(lists.iter().filter_map(period).min().unwrap_or_default());
+        let stamps = || lists.iter().flatten().map(|row| row.value.t);
+        let ends = [stamps().min(), stamps().max()].map(Option::unwrap_or_default);
+        Heads { lists, heads: vec![0; lists.len()], patience, ends }
+    }
+
+    fn row(&self, k: usize, index: usize) -> Option<&Row<ImageRow>> {
+        self.lists[k].get(index)
+    }
+
+    fn next(&self, k: usize) -> Option<Nanos> {
+        self.row(k, self.heads[k]).map(|row| row.value.t)
+    }
+
+    fn after(&self, k: usize) -> Option<Nanos> {
+        self.row(k, self.heads[k] + 1).map(|row| row.value.t)
+    }
+
+    fn before(&self, k: usize) -> Option<Nanos> {
+        self.row(k, self.heads[k].checked_sub(1)?).map(|row| row.value.t)
+    }
+
+    /// Time without an image of a camera before its next one.
+    fn gap(&self, k: usize) -> Span {
+        self.next(k).unwrap_or(self.ends[1]) - self.before(k).unwrap_or(self.ends[0])
+    }
+
+    /// Whether a camera is away at `t`, the oldest of the next stamps.
+    fn is_away(&self, k: usize, t: Nanos, tolerance: Span) -> bool {
+        let gives_none = self.next(k).is_none_or(|next| next - t > tolerance);
+        gives_none && (self.lists[k].is_empty() || self.gap(k) > self.patience)
+    }
+
+    /// Whether the next image of a camera is far from its others, as one of a corrupt stamp is.
+    fn is_stray(&self, k: usize) -> bool {
+        let Some(t) = self.next(k) else { return false };
+        let far =
+            |other: Option<Nanos>| other.is_none_or(|o| (o - t).0.unsigned_abs() > self.patience.0.unsigned_abs());
+        far(self.before(k)) && far(self.after(k))
+    }
+
+    /// The line that shows why a camera is away, and what is said of it.
+    fn why_away(&self, k: usize) -> (usize, String) {
+        let secs = self.gap(k).secs();
+        let line = |index: usize| self.row(k, index).map_or(0, |row| row.line);
+        let (line, what) = match (self.before(k), self.next(k)) {
+            (None, None) => (0, "has no images".to_string()),
+            (None, Some(_)) => (line(0), format!("began {secs:.1} s after the others")),
+            (Some(_), None) => (line(self.heads[k] - 1), format!("ended {secs:.1} s before the others")),
+            (Some(_), Some(_)) => (line(self.heads[k]), format!("gave no image for {secs:.1} s before this one")),
+        };
+        let fix = "Add its other images, or see why it gave none";
+        (line, format!("camera {k} {what}: goes on without it, and black images of camera {k}. {fix}"))
+    }
+}
+
 /// Makes frames of the lists, oldest images first: an image whose partners are all within the tolerance makes a frame with
-/// them; any other is unpaired, as a frame needs an image of every camera. When a camera ends early the others go on
-/// without it.
+/// them; any other is unpaired. While a camera is away, as live, the others go on without it.
 pub fn into_frames(
     mav0: &Path,
     lists: &[Vec<Row<ImageRow>>],
@@ -79,61 +157,45 @@ pub fn into_frames(
     findings: &mut Findings,
 ) -> Result<Vec<FrameFiles>, Fault> {
     let paths: Vec<Arc<Path>> = (0..lists.len()).map(|k| list_path(mav0, k).into()).collect();
-    let early = ended_early(lists, &paths, findings);
-    let mut heads = vec![0usize; lists.len()];
+    let mut heads = Heads::of(lists);
+    // Where each camera stood when it was last said to be away.
+    let mut told = vec![None; lists.len()];
     let mut frames = Vec::new();
-    loop {
-        let stamp = |k: usize, ahead: usize| lists[k].get(heads[k] + ahead).map(|r| r.value.t);
-        let cameras = (0..lists.len()).filter(|k| !early[*k] || stamp(*k, 0).is_some());
-        let Some(oldest) = cameras.clone().filter(|k| stamp(*k, 0).is_some()).min_by_key(|k| stamp(*k, 0)) else {
-            break;
-        };
-        let t = stamp(oldest, 0).expect("chosen among those with a stamp");
-        let newest = cameras.clone().map(|k| stamp(k, 0).unwrap_or(Nanos(i64::MAX))).max().unwrap_or(t);
-        let ended = cameras.clone().any(|k| stamp(k, 0).is_none());
+    while let Some((t, oldest)) = (0..lists.len()).filter_map(|k| Some((heads.next(k)?, k))).min() {
+        let (away, cameras): (Vec<usize>, Vec<usize>) = (0..lists.len()).partition(|k| heads.is_away(*k, t, tolerance));
+        let newest = cameras.iter().map(|k| heads.next(*k).unwrap_or(Nanos(i64::MAX))).max().unwrap_or(t);
         // Where the oldest camera's next image is closer to the others, it is the partner.
-        let next_is_closer = newest > t && stamp(oldest, 1).is_some_and(|n| n <= newest);
-        if !ended && newest - t <= tolerance && !next_is_closer {
-            let image = |k: usize| {
-                let row = lists[k].get(heads[k])?;
-                let path = paths[k].with_file_name("data").join(&row.value.file);
-                Some(ImageFile { path, list: paths[k].clone(), line: row.line })
-            };
-            let first = (0..lists.len()).find_map(|k| stamp(k, 0)).unwrap_or(t);
-            frames.push(FrameFiles { t: first, images: (0..lists.len()).map(image).collect() });
-            heads.iter_mut().for_each(|h| *h += 1);
-        } else {
-            let line = lists[oldest][heads[oldest]].line;
+        let next_is_closer = newest > t && heads.after(oldest).is_some_and(|n| n <= newest);
+        let is_stray = !away.is_empty() && cameras.iter().all(|k| heads.is_stray(*k));
+        if newest - t > tolerance || next_is_closer || is_stray {
+            let line = lists[oldest][heads.heads[oldest]].line;
             let what = format!("image {} has no partner within {:.4} s: dropped", t.0, tolerance.secs());
             findings.warn(|c| &mut c.images_unpaired, &paths[oldest], line, what);
-            heads[oldest] += 1;
+            heads.heads[oldest] += 1;
+            continue;
         }
+        for k in away {
+            findings.counters.images_absent += 1;
+            if told[k].replace(heads.heads[k]) != Some(heads.heads[k]) {
+                let (line, what) = heads.why_away(k);
+                findings.warn(|c| &mut c.cameras_away, &paths[k], line, what);
+            }
+        }
+        let first = cameras.first().and_then(|k| heads.next(*k)).unwrap_or(t);
+        let mut frame = FrameFiles { t: first, images: vec![None; lists.len()] };
+        for k in cameras {
+            let path = |row: &Row<ImageRow>| paths[k].with_file_name("data").join(&row.value.file);
+            let file = |row| ImageFile { path: path(row), list: paths[k].clone(), line: row.line };
+            frame.images[k] = heads.row(k, heads.heads[k]).map(file);
+            heads.heads[k] += 1;
+        }
+        frames.push(frame);
     }
-    if !frames.iter().any(|f: &FrameFiles| f.images.iter().all(Option::is_some)) {
-        let what = format!("no image has a partner within {:.4} s in every camera", tolerance.secs());
+    let recorded = lists.iter().filter(|list| !list.is_empty()).count();
+    if !frames.iter().any(|f: &FrameFiles| f.images.iter().flatten().count() >= recorded.min(2)) {
+        let what = format!("no image has a partner within {:.4} s in another camera", tolerance.secs());
         let fix = "check that the cameras are synchronised, or raise replay.pair_tolerance_s";
         return Err(Fault::new(FaultKind::Data, mav0.display().to_string(), what, fix));
     }
     Ok(frames)
-}
-
-/// Which cameras end before another does, each with a warning.
-fn ended_early(lists: &[Vec<Row<ImageRow>>], paths: &[Arc<Path>], findings: &mut Findings) -> Vec<bool> {
-    let end = |k: usize| lists[k].last().map(|row| row.value.t);
-    let Some(longest) = (0..lists.len()).rev().max_by_key(|k| end(*k)) else { return vec![] };
-    let mut early = vec![false; lists.len()];
-    for (k, list) in lists.iter().enumerate() {
-        let (Some(row), Some(last)) = (list.last(), end(longest)) else { continue };
-        let before = last - row.value.t;
-        if before > ENDED_EARLY {
-            let what = format!(
-                "camera {k} ended {:.1} s before camera {longest}: goes on with camera {longest}, and black images of camera \
-                 {k}. Add its other images, or see why it stopped",
-                before.secs()
-            );
-            findings.warn(|c| &mut c.cameras_ended_early, &paths[k], row.line, what);
-            early[k] = true;
-        }
-    }
-    early
 }

@@ -40,9 +40,29 @@ pub fn read_bytes(path: &Path, bytes_max: u64) -> Result<Vec<u8>, Fault> {
     })
 }
 
+/// Reads every row, as [`read_any`] does; a fault where there is none.
+pub fn read<T>(
+    path: &Path,
+    columns: &str,
+    parse: impl Fn(&[&str]) -> Option<T>,
+    findings: &mut Findings,
+) -> Result<Vec<Row<T>>, Fault> {
+    let rows = read_any(path, columns, parse, findings)?;
+    if rows.is_empty() {
+        return Err(no_rows(path, columns));
+    }
+    Ok(rows)
+}
+
+/// The fault of a table without rows.
+pub fn no_rows(path: &Path, columns: &str) -> Fault {
+    let (place, fix) = (path.display().to_string(), "check that the recording is complete");
+    Fault::new(FaultKind::Data, place, format!("holds no rows of {columns}"), fix)
+}
+
 /// Reads every row. One that cannot be parsed is counted and skipped, but if it is the first, the file is not of the
 /// expected kind, which `columns` names.
-pub fn read<T>(
+pub fn read_any<T>(
     path: &Path,
     columns: &str,
     parse: impl Fn(&[&str]) -> Option<T>,
@@ -73,10 +93,6 @@ pub fn read<T>(
                 findings.warn(|c| &mut c.rows_malformed, path, line, what);
             }
         }
-    }
-    if rows.is_empty() {
-        let (place, fix) = (path.display().to_string(), "check that the recording is complete");
-        return Err(Fault::new(FaultKind::Data, place, format!("holds no rows of {columns}"), fix));
     }
     Ok(rows)
 }

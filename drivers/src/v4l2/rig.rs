@@ -227,7 +227,7 @@ impl Rig {
         }
     }
 
-    /// Copies the oldest image of every camera; whether they make a frame.
+    /// Copies the oldest image of every camera, black where it cannot be read; whether one can, which makes a frame.
     fn write(&mut self, frames: &mut Frames) -> bool {
         let first = self.streams.iter().flatten().find_map(|s| s.held.front());
         let t = first.expect("called when all that are there have one").t;
@@ -236,6 +236,7 @@ impl Rig {
             return false;
         }
         let parts = self.parts();
+        let mut any = false;
         for (camera, image) in frames.images.iter_mut().enumerate() {
             let of = self.streams[camera / parts].as_ref();
             let Some((stream, held)) = of.and_then(|s| Some((s, s.held.front()?))) else {
@@ -247,7 +248,11 @@ impl Rig {
             let bytes = stream.node.bytes(&held.filled);
             let copied = to_grey(stream.node.format, bytes, part, &mut self.scratch, image);
             self.counters.camera_bytes_copied += image.pixels.len() as u64;
-            let Err(why) = copied else { continue };
+            let Err(why) = copied else {
+                any = true;
+                continue;
+            };
+            image.pixels.fill(0);
             match why {
                 Unreadable::Short { .. } => self.counters.camera_images_short += 1,
                 Unreadable::Undecodable(_) => self.counters.camera_images_undecodable += 1,
@@ -255,6 +260,8 @@ impl Rig {
             if self.warnings.len() < WARNINGS_MAX {
                 self.warnings.push(format!("{}: image at {}: {why}", stream.node.name, t.0));
             }
+        }
+        if !any {
             return false;
         }
         // A grey camera's colours are equal.

@@ -7,6 +7,7 @@ use super::kernel::Ready;
 use super::node::{Failure, Filled, Node};
 use super::stamps::{stamp_of, Gaps, Order, Stamp, Timing};
 use super::{CameraCounters, StampPoint};
+use crate::source::missed_after;
 use crate::types::{Nanos, Span};
 use crate::{Fault, FaultKind, RigCamera};
 use std::collections::VecDeque;
@@ -14,10 +15,6 @@ use std::collections::VecDeque;
 /// A camera that gave nothing for so long is opened again. That resets a device that hangs, and no camera that odometry can
 /// use pauses for longer.
 pub(super) const SILENT: Span = Span(2_000_000_000);
-/// The others go on without a camera that gave no image for so many periods, and at least so long: a quarter of what
-/// odometry bridges.
-const MISSED_PERIODS: i64 = 5;
-const MISSED: Span = Span(500_000_000);
 /// Errors in a row after which a camera is opened again.
 const ERRORS_MAX: u32 = 8;
 
@@ -59,8 +56,7 @@ impl Stream {
 
     /// Whether the others go on without it.
     pub(super) fn is_missed(&self, now: Nanos) -> bool {
-        let patience = Span(self.node.period.0.saturating_mul(MISSED_PERIODS)).max(MISSED);
-        self.held.is_empty() && self.last_image.is_some_and(|t| now - t > patience)
+        self.held.is_empty() && self.last_image.is_some_and(|t| now - t > missed_after(self.node.period))
     }
 
     /// Whether it has given nothing for so long that it is opened again.
