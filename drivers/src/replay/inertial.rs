@@ -3,6 +3,7 @@
 
 use super::calibration::{document::Document, stated_rate};
 use super::{imu_of, layout, root, table, IMU_COLUMNS};
+use crate::input::SETTINGS_BYTES_MAX;
 use crate::types::{ImuSample, Nanos};
 use crate::{input, Fault, FaultKind};
 use ::mcap::records::{op, Record};
@@ -109,9 +110,16 @@ fn messages(path: &Path, each: &mut impl FnMut(f64, &ImuSample)) -> Result<(), F
         if ![op::CHANNEL, op::ATTACHMENT, op::MESSAGE].contains(&opcode) {
             continue;
         }
+        if opcode == op::ATTACHMENT && !is_whole(data) {
+            return Err(unreadable(path, "an attachment is cut off"));
+        }
         match ::mcap::parse_record(opcode, data).map_err(|e| unreadable(path, e))? {
             Record::Channel(c) if c.topic == TOPIC => channel = Some(c.id),
             Record::Attachment { header, data, .. } if header.name == CALIBRATION => {
+                if data.len() as u64 > SETTINGS_BYTES_MAX {
+                    let what = format!("{CALIBRATION} has {} bytes, {SETTINGS_BYTES_MAX} at most are read", data.len());
+                    return Err(unreadable(path, what));
+                }
                 let text = String::from_utf8_lossy(&data).into_owned();
                 rate = Some(stated_rate(&Document::parse(&path.join(CALIBRATION), text)?)?);
             }
@@ -130,6 +138,18 @@ fn messages(path: &Path, each: &mut impl FnMut(f64, &ImuSample)) -> Result<(), F
     Ok(())
 }
 
+/// Whether the record of an attachment has all its fields: the parser panics where its checksum is missing.
+fn is_whole(record: &[u8]) -> bool {
+    const TIMES: usize = 16;
+    const LENGTH_AND_CHECKSUM: usize = 12;
+    fn after_text(at: &[u8]) -> Option<&[u8]> {
+        let (length, rest) = at.split_first_chunk()?;
+        rest.get(u32::from_le_bytes(*length) as usize..)
+    }
+    let after_name = record.get(TIMES..).and_then(after_text);
+    after_name.and_then(after_text).is_some_and(|rest| rest.len() >= LENGTH_AND_CHECKSUM)
+}
+
 /// The sample of a `sensor_msgs/msg/Imu` in little-endian CDR, whose numbers are aligned behind a head of four bytes.
 fn sample_of(cdr: &[u8]) -> Option<ImuSample> {
     const HEAD: usize = 4;
@@ -142,4 +162,45 @@ fn sample_of(cdr: &[u8]) -> Option<ImuSample> {
     let vector = |at: usize| Some(DVec3::new(float(at)?, float(at + 8)?, float(at + 16)?));
     let (gyro_body, accel_body) = (vector(velocity)?, vector(velocity + 12 * 8)?);
     (cdr[..2] == [0, 1]).then_some(ImuSample { t: Nanos(t), gyro_body, accel_body, ..ImuSample::default() })
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+
+    /// What reading a file says whose one record is an attachment of this body.
+    fn said_of(body: &[u8]) -> String {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("recording-000.mcap");
+        let record = |op: u8, body: &[u8]| [&[op], &(body.len() as u64).to_le_bytes()[..], body].concat();
+        let magic = b"\x89MCAP0\r\n".to_vec();
+        std::fs::write(&path, [magic, record(op::HEADER, &[0; 8]), record(op::ATTACHMENT, body)].concat()).unwrap();
+        read_inertial(&path, |_, _| {}).map_or_else(|fault| fault.to_string(), |()| String::new())
+    }
+
+    /// An attachment's fields up to its data.
+    fn head() -> Vec<u8> {
+        let text = |s: &str| [&(s.len() as u32).to_le_bytes()[..], s.as_bytes()].concat();
+        [vec![0; 16], text(CALIBRATION), text("application/yaml")].concat()
+    }
+
+    #[test]
+    fn a_calibration_is_read_up_to_the_size_of_settings() {
+        for (more, words) in [(0, ""), (1, "1048576 at most are read")] {
+            let mut yaml = b"rate_hz: 200\n".to_vec();
+            yaml.resize(SETTINGS_BYTES_MAX as usize + more, b'\n');
+            let said = said_of(&[head(), (yaml.len() as u64).to_le_bytes().to_vec(), yaml, vec![0; 4]].concat());
+            assert!(said.contains(words) && said.is_empty() == words.is_empty(), "{said}");
+        }
+    }
+
+    /// The parser panicked.
+    #[test]
+    fn an_attachment_that_is_cut_off_anywhere_is_a_fault() {
+        let whole = [head(), vec![0; 12]].concat();
+        for length in 0..whole.len() {
+            assert!(said_of(&whole[..length]).contains("cut off"), "{length}");
+        }
+    }
 }
