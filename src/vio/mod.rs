@@ -73,7 +73,7 @@ use stipple_drivers::{Calibration, ImuSample, Nanos, Pose, Span};
 const PX_MAX: f32 = 65536.0;
 /// Inertia alone is not believed for longer than this, s; the ring of samples may not hold more either.
 const FRAME_GAP_MAX: f64 = 2.0;
-/// The most that a start is worth after one that was lied to, until it is trusted.
+/// The most that a start is worth after one that was lied to, until it is trusted, and a frame whose views do not fit.
 const QUALITY_SUSPECT: u8 = 20;
 /// A camera with fewer than one in so many of another's tracks is blind.
 const BLIND_FRACTION: usize = 10;
@@ -262,7 +262,8 @@ impl Vio {
         update.health = self.health(tracks, step.as_ref());
         reset.into_iter().for_each(|why| update.health.set(why.bit(), true));
         update.quality = quality(self.sigma_v(), update.connected, self.estimator.model.landmarks_enough);
-        if self.recovery.is_suspect() && !self.monitor.is_trusted() {
+        let untrusted = self.recovery.is_suspect() && !self.monitor.is_trusted();
+        if untrusted || update.health.has(Health::VISION_DISAGREES) {
             update.quality = update.quality.min(QUALITY_SUSPECT);
         }
         (update.epoch, update.covariance) = (self.epoch, self.covariance);

@@ -20,9 +20,9 @@ fn run(vio: &mut Vio, frames: std::ops::Range<usize>, world: &mut World) {
     run_seeing(vio, frames, world, |_| {});
 }
 
-/// Flies; `spoil` may change what the cameras see.
-fn run_seeing(vio: &mut Vio, frames: std::ops::Range<usize>, world: &mut World, spoil: impl Fn(&mut Tracks)) {
-    let mut tracks = Tracks::default();
+/// Flies; `spoil` may change what the cameras see. Answers what the last frame led to.
+fn run_seeing(vio: &mut Vio, frames: std::ops::Range<usize>, world: &mut World, spoil: impl Fn(&mut Tracks)) -> Update {
+    let (mut tracks, mut update) = (Tracks::default(), Update::default());
     for frame in frames {
         let t = frame as f64 * FRAME_SECS + 0.0012;
         let mut sample = ((t - FRAME_SECS) * RATE_HZ).max(0.0) as usize;
@@ -35,8 +35,9 @@ fn run_seeing(vio: &mut Vio, frames: std::ops::Range<usize>, world: &mut World, 
         }
         world.tracks(t, &mut tracks);
         spoil(&mut tracks);
-        vio.on_tracks(&tracks);
+        update = vio.on_tracks(&tracks);
     }
+    update
 }
 
 /// The direction in which the whole window is translated, and rotated about the world's axis.
@@ -453,6 +454,21 @@ fn few_views_are_refused_where_all_contradict_the_prediction() {
     let (moved, refused, opened) = gated(3, |_| true);
     assert!((3..=6).contains(&moved));
     assert_eq!((refused, opened), (moved, 0));
+}
+
+#[test]
+fn frame_whose_views_disagree_claims_little() {
+    let mut world = World::new(Path { rest: -1.0 });
+    let mut vio = Vio::new(&world.rig, &VioConfig::default());
+    run(&mut vio, 0..60, &mut world);
+    let update = run_seeing(&mut vio, 60..61, &mut world, |tracks| {
+        for track in tracks.cameras.iter_mut().flat_map(|c| c.iter_mut()) {
+            let away = [15.0, -15.0][(track.id / 2 % 2) as usize];
+            track.px[(track.id % 2) as usize] += away;
+        }
+    });
+    assert!(update.odometry.is_some() && update.health.has(Health::VISION_DISAGREES), "{:?}", update.health);
+    assert!(update.quality <= QUALITY_SUSPECT, "quality {}", update.quality);
 }
 
 #[test]
