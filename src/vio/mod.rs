@@ -552,6 +552,8 @@ fn fnv(hash: u64, word: u64) -> u64 {
 }
 
 #[cfg(test)]
+mod restart_tests;
+#[cfg(test)]
 mod start_tests;
 #[cfg(test)]
 mod tests;

@@ -4,7 +4,8 @@
 //! `LAG` before the first doubt that a restart resumes from. While nothing speaks against the inertial samples either
 //! (no frame came, nothing was seen) the carried pose is the best there is, and its covariance, propagated with it,
 //! says how good. Where a restart finds another velocity than the carried state expects, inertia lied meanwhile: the
-//! trusted pose is kept as it was, widened by how far the rig may have come since. Down is carried by the gyro alone; a
+//! trusted pose is kept as it was, widened by how far the rig may have come since; so is the first pose of a start that
+//! was given up before anything was trusted. Down is carried by the gyro alone; a
 //! restart that finds another one, for some seconds, is refused, for its accelerometer lies.
 
 use super::health::Reset;
@@ -41,6 +42,8 @@ pub struct Recovery {
     /// Waits for `LAG`, then is the confirmed one.
     candidate: Option<TrustedState>,
     confirmed: Option<TrustedState>,
+    /// The last start: what a restart begins at while nothing is trusted.
+    started: Option<DeadReckoning>,
     /// Why there is a restart.
     reset_by: Reset,
     /// The last restart was not where dead reckoning had led.
@@ -92,10 +95,16 @@ impl Recovery {
     pub fn resume(&mut self, start: &Start, t: Nanos, imu: &ImuRing, noise: &Noise) -> Option<Start> {
         let suspect = self.is_suspect();
         self.candidate = None;
-        let from = self.trusted();
-        let resumed = from.map_or(Some((*start, false)), |mut from| from.resume(start, suspect, t, imu, noise));
+        let resumed = match (self.trusted(), &self.started) {
+            (Some(mut from), _) => from.resume(start, suspect, t, imu, noise),
+            (None, Some(from)) => Some((from.widened(start, t), false)),
+            (None, None) => Some((*start, false)),
+        };
         resumed.map(|(mut start, jumped)| {
             self.jumped = jumped;
+            let covariance = start.sigma.covariance(&start.motion);
+            let covariance = Mat15::from_fn(|i, j| covariance[i][j]);
+            self.started = Some(DeadReckoning { t, motion: start.motion, covariance });
             self.origin = Origin::split(&mut start);
             start
         })
@@ -103,7 +112,7 @@ impl Recovery {
 
     /// Whether there is nothing yet that a restart would resume from.
     pub fn is_first(&self) -> bool {
-        self.trusted().is_none()
+        self.trusted().is_none() && self.started.is_none()
     }
 
     /// Whether the last restart was not where dead reckoning had led.
@@ -204,12 +213,7 @@ impl TrustedState {
             sigma.yaw = sigma.yaw.hypot(carried.about_world_axis(DVec3::Z));
             return Some((Start { motion: moved, sigma }, false));
         }
-        let speed = then.motion.v.length().max(moved.v.length()).max(SPEED_UNSEEN);
-        sigma.p += then.sigma(0) + speed * away;
-        // Beyond half a turn a yaw is no more unknown.
-        let yaw = sigma.yaw + then.about_world_axis(DVec3::Z) + RATE_UNSEEN * away;
-        sigma.yaw = yaw.min(std::f64::consts::PI);
-        Some((Start { motion: in_world_of(&then.motion.pose, &start.motion), sigma }, true))
+        Some((then.widened(start, t), true))
     }
 }
 
@@ -279,6 +283,18 @@ impl DeadReckoning {
             p[(12 + i, 12 + i)] += noise.accel_walk * noise.accel_walk * inc.dt;
         }
         (self.t, self.motion, self.covariance) = (t, from.propagate(&inc), p);
+    }
+
+    /// A start at this pose, as uncertain as the rig may have come by `t`.
+    fn widened(&self, start: &Start, t: Nanos) -> Start {
+        let (motion, mut sigma) = (in_world_of(&self.motion.pose, &start.motion), start.sigma);
+        let away = (t - self.t).secs();
+        let speed = self.motion.v.length().max(motion.v.length()).max(SPEED_UNSEEN);
+        sigma.p += self.sigma(0) + speed * away;
+        // Beyond half a turn a yaw is no more unknown.
+        let yaw = sigma.yaw + self.about_world_axis(DVec3::Z) + RATE_UNSEEN * away;
+        sigma.yaw = yaw.min(std::f64::consts::PI);
+        Start { motion, sigma }
     }
 
     fn block(&self, at: usize) -> Matrix3<f64> {

@@ -1,0 +1,71 @@
+//! Restarts on the synthetic world.
+
+use super::world::{Path, World, FRAME_SECS, RATE_HZ};
+use super::*;
+
+const PATH: Path = Path { rest: -1.0 };
+
+/// A flight in motion whose accelerometer reads `1 / accel_scale` of what it should.
+struct Pilot {
+    world: World,
+    vio: Vio,
+    accel_scale: f64,
+    frame: usize,
+    sample: usize,
+}
+
+impl Pilot {
+    fn new(config: &VioConfig, accel_scale: f64) -> Pilot {
+        let world = World::new(PATH);
+        let vio = Vio::new(&world.rig, config);
+        Pilot { world, vio, accel_scale, frame: 0, sample: 0 }
+    }
+
+    /// The next frame, seen or black.
+    fn next(&mut self, is_seen: bool) -> Update {
+        let t = self.frame as f64 * FRAME_SECS + 0.0012;
+        while (self.sample as f64) / RATE_HZ < t + 1.0 / RATE_HZ {
+            let mut s = self.world.imu(self.sample as f64 / RATE_HZ);
+            s.accel_body /= self.accel_scale;
+            self.vio.on_imu(s);
+            self.sample += 1;
+        }
+        let mut tracks = Tracks::default();
+        self.world.tracks(t, &mut tracks);
+        if !is_seen {
+            tracks.cameras.iter_mut().for_each(|c| c.clear());
+        }
+        self.frame += 1;
+        self.vio.on_tracks(&tracks)
+    }
+
+    /// The first state of the next start, and its covariance.
+    fn start(&mut self) -> (Odometry, Covariance) {
+        let state = |u: Update| u.odometry.zip(u.covariance);
+        (0..40).find_map(|_| state(self.next(true))).expect("it starts within two seconds")
+    }
+}
+
+/// By how much the motion from one state to another is off, m.
+fn error_m(from: &Odometry, to: &Odometry) -> f64 {
+    let truth = |o: &Odometry| PATH.pose(o.t.0 as f64 * 1e-9);
+    let world_from_truth = from.world_from_body * truth(from).inverse();
+    (to.world_from_body.p - (world_from_truth * truth(to)).p).length()
+}
+
+fn sigma_p(c: &Covariance) -> f64 {
+    c[0][0].max(c[1][1]).max(c[2][2]).sqrt()
+}
+
+#[test]
+fn restart_before_anything_was_trusted_is_as_uncertain_as_the_way_since() {
+    let mut pilot = Pilot::new(&VioConfig::default(), 1.0);
+    let (first, _) = pilot.start();
+    (0..5).for_each(|_| _ = pilot.next(true));
+    assert!(!pilot.vio.monitor.is_trusted());
+    pilot.vio.reset();
+    let (again, covariance) = pilot.start();
+    let (error, sigma) = (error_m(&first, &again), sigma_p(&covariance));
+    eprintln!("{error:.2} m after {:.2} s, stated {sigma:.2} m", (again.t - first.t).secs());
+    assert!(error > 0.1 && error < 3.0 * sigma && sigma < 1.5);
+}
