@@ -117,7 +117,7 @@ impl Alignment {
         let start = self.frames[0].t;
         let mut increments = [Increment::new(DVec3::ZERO, DVec3::ZERO); FRAMES_MAX];
         for (increment, tracks) in increments.iter_mut().zip(&self.frames) {
-            *increment = imu.integrate(start, tracks.t, DVec3::ZERO, DVec3::ZERO, &model.noise);
+            *increment = imu.integrate_scaled(start, tracks.t, DVec3::ZERO, DVec3::ZERO, &model.noise);
         }
         let focal = model.cameras.first()?.camera.fx;
         let noise = Deviations {

@@ -131,7 +131,7 @@ impl Initializer {
         if let Some(start) = self.at_rest(tracks, imu, &model.config) {
             return Some(start);
         }
-        let increment = imu.integrate(last.t, tracks.t, DVec3::ZERO, DVec3::ZERO, &model.noise);
+        let increment = imu.integrate_scaled(last.t, tracks.t, DVec3::ZERO, DVec3::ZERO, &model.noise);
         let before = self.frames[self.frames.len().saturating_sub(2)].reference_from_body;
         let last = last.reference_from_body;
         let guess = Pose::new(last.q * increment.q, last.p + (last.p - before.p));
@@ -350,7 +350,7 @@ fn align(frames: &[ResectedFrame], scale_sigma: f64, config: &VioConfig) -> Opti
 fn from_mean_force(t: Nanos, imu: &ImuRing, model: &Model) -> Option<Start> {
     let span = Span::from_secs(MEAN_SPAN);
     imu.statistics(t, span)?;
-    let inc = imu.integrate(t - span, t, DVec3::ZERO, DVec3::ZERO, &model.noise);
+    let inc = imu.integrate_scaled(t - span, t, DVec3::ZERO, DVec3::ZERO, &model.noise);
     if (inc.v.length() / inc.dt - model.config.gravity).abs() > MEAN_FORCE_MISFIT {
         return None;
     }

@@ -345,6 +345,7 @@ impl Vio {
     fn take(&mut self, step: &Step) {
         let now = self.estimator.newest().map(|f| f.now).unwrap_or_default();
         self.covariance = step.covariance.map(|c| self.recovery.in_world(c, &now));
+        self.imu.scale = self.estimator.graph.window.rig.now.imu_scale();
         let s = &mut self.stats;
         s.tracks_gated += step.gate.refused as u64;
         s.gates_opened += u64::from(step.gate.open);
@@ -417,6 +418,7 @@ impl Vio {
         self.stats.rigs_thrown_away += u64::from(thrown_away);
         self.convergence.restart(thrown_away);
         self.estimator.clear();
+        self.imu.scale = self.estimator.graph.window.rig.now.imu_scale();
         self.initializer.clear();
         self.monitor = Monitor::default();
         self.covariance = None;
@@ -481,7 +483,7 @@ impl Vio {
                 time_sigma: all.filter_map(|c| rig.time_column(c)).fold(0.0, most),
             }
         });
-        Known { odometry: self.odometry(), cameras, imu_scale: [rig.now.gyro_scale, rig.now.accel_scale] }
+        Known { odometry: self.odometry(), cameras, imu_scale: rig.now.imu_scale() }
     }
 
     /// Time that is to be added to the stamps of each camera's images, beyond what the calibration adds, zero of cameras that

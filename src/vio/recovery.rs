@@ -264,7 +264,7 @@ impl DeadReckoning {
             return;
         }
         let from = self.motion;
-        let inc = imu.integrate(self.t, t, from.bg, from.ba, noise);
+        let inc = imu.integrate_scaled(self.t, t, from.bg, from.ba, noise);
         let f = transition(&from, &inc);
         let mut p = f * self.covariance * f.transpose();
         // Increment errors are in the first body frame, but for the rotation's, which is on the right.

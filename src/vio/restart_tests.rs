@@ -1,4 +1,4 @@
-//! Restarts on the synthetic world.
+//! Restarts on the synthetic world: before anything was trusted, and with a unit whose scale is estimated.
 
 use super::world::{Path, World, FRAME_SECS, RATE_HZ};
 use super::*;
@@ -68,4 +68,24 @@ fn restart_before_anything_was_trusted_is_as_uncertain_as_the_way_since() {
     let (error, sigma) = (error_m(&first, &again), sigma_p(&covariance));
     eprintln!("{error:.2} m after {:.2} s, stated {sigma:.2} m", (again.t - first.t).secs());
     assert!(error > 0.1 && error < 3.0 * sigma && sigma < 1.5);
+}
+
+#[test]
+fn dead_reckoning_uses_the_estimated_scale() {
+    const SCALE: f64 = 1.02;
+    let config = VioConfig { estimate_imu_scale: true, ..VioConfig::default() };
+    let mut pilot = Pilot::new(&config, SCALE);
+    let known = (0..600).filter_map(|_| pilot.next(true).odometry).last().expect("it flies");
+    let [_, accel] = pilot.vio.known().imu_scale;
+    assert!((accel - (SCALE - 1.0)).abs().max_element() < 0.006, "{accel}");
+    pilot.vio.reset();
+    let mut last = None;
+    for _ in 0..30 {
+        let update = pilot.next(false);
+        let (o, c) = update.dead_reckoned.zip(update.covariance).expect("it was trusted");
+        last = Some((error_m(&known, &o), sigma_p(&c)));
+    }
+    let (error, sigma) = last.expect("frames without a start");
+    eprintln!("dead reckoned {error:.3} m off, stated {sigma:.3} m");
+    assert!(error < 3.0 * sigma);
 }

@@ -65,6 +65,11 @@ impl RigParameters {
         let (gyro_scale, accel_scale) = (DVec3::ZERO, DVec3::ZERO);
         RigParameters { time_offsets: [0.0; CAMERAS_MAX], body_from_cam, gyro_scale, accel_scale }
     }
+
+    /// Factors on the readings of gyro and accelerometer, less one.
+    pub fn imu_scale(&self) -> [DVec3; 2] {
+        [self.gyro_scale, self.accel_scale]
+    }
 }
 
 /// Estimate and standard deviation of what the board asks for; `None` for the rest.

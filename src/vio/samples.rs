@@ -14,13 +14,15 @@ pub struct ImuRing {
     /// Never longer than `capacity`.
     samples: VecDeque<ImuSample>,
     capacity: usize,
+    /// Factors on the readings of gyro and accelerometer, less one, as estimated: without unit.
+    pub scale: [DVec3; 2],
 }
 
 impl ImuRing {
     /// A ring without samples, for those of `IMU_HISTORY_SECS`.
     pub fn new(rate_hz: f64) -> ImuRing {
         let capacity = (IMU_HISTORY_SECS * rate_hz).ceil() as usize;
-        ImuRing { samples: VecDeque::with_capacity(capacity), capacity }
+        ImuRing { samples: VecDeque::with_capacity(capacity), capacity, scale: [DVec3::ZERO; 2] }
     }
 
     /// Whether a sample is finite and newer than the last.
@@ -78,7 +80,13 @@ impl ImuRing {
         self.sample_at(t).map_or(DVec3::ZERO, |s| s.gyro_body)
     }
 
-    /// The increment over `[t0, t1]`. Without any sample: gravity-free rest with the noise of a gap.
+    /// The increment over `[t0, t1]` by the estimated scale.
+    pub fn integrate_scaled(&self, t0: Nanos, t1: Nanos, bg: DVec3, ba: DVec3, noise: &Noise) -> Increment {
+        let [gyro, accel] = self.scale;
+        self.integrate(t0, t1, bg, ba, noise).rescaled(gyro, accel)
+    }
+
+    /// The increment over `[t0, t1]` of what was read. Without any sample: gravity-free rest with the noise of a gap.
     pub fn integrate(&self, t0: Nanos, t1: Nanos, bg: DVec3, ba: DVec3, noise: &Noise) -> Increment {
         let mut inc = Increment::new(bg, ba);
         inc.gravity = DVec3::NEG_Z * noise.gravity;
@@ -101,7 +109,7 @@ impl ImuRing {
         inc
     }
 
-    /// Mean and standard deviation (norm over axes) of the last `span`, when it is covered.
+    /// Mean by the estimated scale, and standard deviation (norm over axes), of the last `span`, when it is covered.
     pub fn statistics(&self, until: Nanos, span: Span) -> Option<Statistics> {
         let (from, to) = (self.after(until - span), self.after(until));
         let samples = || self.samples.range(from..to);
@@ -116,8 +124,8 @@ impl ImuRing {
         };
         let (gyro, accel) = (mean(|s| s.gyro_body), mean(|s| s.accel_body));
         Some(Statistics {
-            gyro,
-            accel,
+            gyro: gyro * (1.0 + self.scale[0]),
+            accel: accel * (1.0 + self.scale[1]),
             gyro_sigma: spread(|s| s.gyro_body, gyro),
             accel_sigma: spread(|s| s.accel_body, accel),
         })
