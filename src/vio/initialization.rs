@@ -33,6 +33,8 @@ const REST_GYRO_MEAN: f64 = 0.15;
 const ALIGN_SPAN: f64 = 0.45;
 const ALIGN_FRAMES_MIN: usize = 6;
 const ALIGN_FRAMES_MAX: usize = 64;
+/// Least time between two of them, s, so that they span it at every frame rate.
+const ALIGN_SPACING: f64 = ALIGN_SPAN / ALIGN_FRAMES_MAX as f64;
 /// Points a resection needs.
 pub const RESECTION_MIN: usize = 12;
 const RESECTION_ITERATIONS: usize = 12;
@@ -130,6 +132,9 @@ impl Initializer {
         };
         if let Some(start) = self.at_rest(tracks, imu, &model.config) {
             return Some(start);
+        }
+        if (tracks.t - last.t).secs() < ALIGN_SPACING {
+            return None;
         }
         let increment = imu.integrate_scaled(last.t, tracks.t, DVec3::ZERO, DVec3::ZERO, &model.noise);
         let before = self.frames[self.frames.len().saturating_sub(2)].reference_from_body;

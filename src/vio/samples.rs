@@ -8,12 +8,17 @@ use glam::DVec3;
 use std::collections::VecDeque;
 use stipple_drivers::{ImuSample, Nanos, Span};
 
+/// Rate at which samples are compared with what counts as rest, Hz: noise spreads with the square root of the rate.
+const REST_RATE_HZ: f64 = 200.0;
+
 /// The newest samples, ascending stamps; old ones are overwritten.
 #[derive(Clone, Debug)]
 pub struct ImuRing {
     /// Never longer than `capacity`.
     samples: VecDeque<ImuSample>,
     capacity: usize,
+    /// Samples in a period of `REST_RATE_HZ`, 1 at least.
+    block: usize,
     /// Factors on the readings of gyro and accelerometer, less one, as estimated: without unit.
     pub scale: [DVec3; 2],
 }
@@ -22,7 +27,8 @@ impl ImuRing {
     /// A ring without samples, for those of `IMU_HISTORY_SECS`.
     pub fn new(rate_hz: f64) -> ImuRing {
         let capacity = (IMU_HISTORY_SECS * rate_hz).ceil() as usize;
-        ImuRing { samples: VecDeque::with_capacity(capacity), capacity, scale: [DVec3::ZERO; 2] }
+        let block = (rate_hz / REST_RATE_HZ).round().max(1.0) as usize;
+        ImuRing { samples: VecDeque::with_capacity(capacity), capacity, block, scale: [DVec3::ZERO; 2] }
     }
 
     /// Whether a sample is finite and newer than the last.
@@ -109,7 +115,8 @@ impl ImuRing {
         inc
     }
 
-    /// Mean by the estimated scale, and standard deviation (norm over axes), of the last `span`, when it is covered.
+    /// Mean by the estimated scale, and standard deviation (norm over axes) at `REST_RATE_HZ`, of the last `span`, when it
+    /// is covered.
     pub fn statistics(&self, until: Nanos, span: Span) -> Option<Statistics> {
         let (from, to) = (self.after(until - span), self.after(until));
         let samples = || self.samples.range(from..to);
@@ -120,7 +127,11 @@ impl ImuRing {
         let scale = 1.0 / n as f64;
         let mean = |f: fn(&ImuSample) -> DVec3| samples().map(f).fold(DVec3::ZERO, |a, b| a + b) * scale;
         let spread = |f: fn(&ImuSample) -> DVec3, m: DVec3| {
-            (samples().map(|s| (f(s) - m).length_squared()).sum::<f64>() * scale).sqrt()
+            let blocks = (from..to).step_by(self.block).map(|i| self.samples.range(i..to.min(i + self.block)));
+            let scale = 1.0 / blocks.len() as f64;
+            let off =
+                blocks.map(|b| (b.len() as f64, b.map(f).fold(DVec3::ZERO, |a, b| a + b))).map(|(n, s)| s / n - m);
+            (off.map(|x| x.length_squared()).sum::<f64>() * scale).sqrt()
         };
         let (gyro, accel) = (mean(|s| s.gyro_body), mean(|s| s.accel_body));
         Some(Statistics {

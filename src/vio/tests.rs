@@ -456,6 +456,44 @@ fn few_views_are_refused_where_all_contradict_the_prediction() {
     assert_eq!((refused, opened), (moved, 0));
 }
 
+/// A unit of 3 mg/√Hz is at rest however fast it is read.
+#[test]
+fn unit_at_rest_starts_at_every_rate() {
+    for rate_hz in [200.0, 1000.0, 4000.0] {
+        let mut world = World::new(Path { rest: 100.0 });
+        (world.rig.imu.rate_hz, world.rig.imu.accel_noise) = (rate_hz, 3e-3);
+        let mut vio = Vio::new(&world.rig, &VioConfig::default());
+        (0..(2.0 * rate_hz) as usize).for_each(|i| vio.on_imu(world.imu(i as f64 / rate_hz)));
+        let mut tracks = Tracks::default();
+        let (mut first, mut held) = (None, 0);
+        for frame in 0..40 {
+            let t = frame as f64 * FRAME_SECS + 0.0012;
+            world.tracks(t, &mut tracks);
+            let update = vio.on_tracks(&tracks);
+            first = first.or(update.odometry.map(|o| (t, o.v_world)));
+            held += usize::from(update.health.has(Health::ZERO_VELOCITY));
+        }
+        let (t, v) = first.expect("it starts");
+        eprintln!("{rate_hz} Hz: starts after {t:.2} s, held for {held} frames");
+        assert!(t < 0.7 && v == DVec3::ZERO && held > 20);
+    }
+}
+
+#[test]
+fn start_in_motion_takes_as_long_at_every_frame_rate() {
+    for frame_hz in [20.0, 140.0, 200.0] {
+        let mut world = World::new(Path { rest: -1.0 });
+        let mut vio = Vio::new(&world.rig, &VioConfig::default());
+        (0..300).for_each(|i| vio.on_imu(world.imu(f64::from(i) / RATE_HZ)));
+        let mut tracks = Tracks::default();
+        let first = (0..300).map(|frame| f64::from(frame) / frame_hz + 0.0012).find(|t| {
+            world.tracks(*t, &mut tracks);
+            vio.on_tracks(&tracks).odometry.is_some()
+        });
+        assert!(first.is_some_and(|t| (0.44..0.52).contains(&t)), "{frame_hz} Hz: starts after {first:?} s");
+    }
+}
+
 #[test]
 fn frame_whose_views_disagree_claims_little() {
     let mut world = World::new(Path { rest: -1.0 });

@@ -14,7 +14,7 @@ use crate::frontend::Tracks;
 use crate::limits::{CAMERAS_MAX, TRACKS};
 use crate::mem::List;
 use glam::DVec3;
-use stipple_drivers::Span;
+use stipple_drivers::{Nanos, Span};
 
 /// At rest the samples of a unit spread by less than this, rad/s and m/s², and tracks move less than this, px.
 pub const REST_GYRO: f64 = 0.03;
@@ -26,10 +26,11 @@ const SIGMA_GYRO: f64 = 2e-3;
 /// Tracks in common with the reference.
 const COMMON_MIN: usize = 12;
 
-/// Frames by which the one that is held is older than the newest, which stands too: a rig that gathers way is seen to
-/// only after a tenth of a second, and held meanwhile it costs a single camera its scale. As many states are in every
-/// window.
-const LAG: usize = 2;
+/// Time by which the frame that is held is older than the newest, which stands too, s, two frames at 20 Hz: a rig that
+/// gathers way is seen to only after a tenth of a second, and held meanwhile it costs a single camera its scale.
+const LAG: f64 = 0.075;
+/// It is as many frames older at least; as many states are in every window.
+const LAG_FRAMES: usize = 2;
 
 /// What counts as rest.
 struct Rest {
@@ -52,11 +53,17 @@ const SHAKEN: Rest = Rest { gyro: 0.25, accel: 3.0, span: 0.4, reference: 0.25, 
 
 /// Holds the frame that has since been seen to stand; answers whether it did.
 pub fn hold(newest: usize, window: &mut Window, tracks: &[Tracks], imu: &ImuRing) -> bool {
-    let Some(held) = window.states().rev().nth(LAG) else { return false };
+    let Some(held) = lagging(window, window.frame(newest).t) else { return false };
     let span = stands(newest, window, tracks, imu);
     let rest = span.and_then(|span| imu.statistics(window.frame(held).t, span)).map(|s| s.gyro);
     window.frame_mut(held).rest_rate = rest;
     rest.is_some()
+}
+
+/// The youngest state `LAG` before `t`, or the oldest of a window that is shorter.
+fn lagging(window: &Window, t: Nanos) -> Option<usize> {
+    let older = || window.states().rev().skip(LAG_FRAMES);
+    older().find(|s| (t - window.frame(*s).t).secs() >= LAG).or_else(|| older().last())
 }
 
 /// How long the samples of a frame at rest have been quiet at least; `None` when it moves or may move. Their mean
