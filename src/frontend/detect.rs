@@ -12,9 +12,11 @@ use stipple_drivers::Image;
 pub const BORDER: usize = 19;
 /// Widest cell a board file may ask for, px.
 const CELL_MAX: usize = 200;
-/// A cell whose point was rejected is not looked at for so many frames, 0.8 s at 20 Hz: a new point of what moves there would
-/// be a landmark before it is rejected too. Chosen from 0 to 40 frames on four flights past a person; neighbours differ little.
-const REST: u32 = 16;
+/// A cell whose point was rejected is not looked at for so long, s, 16 frames at 20 Hz: a new point of what moves there would
+/// be a landmark before it is rejected too. Chosen from 0 to 2 s on four flights past a person; neighbours differ little.
+const REST: f64 = 0.775;
+/// A frame counts for no longer, s: where one is missing, the points it would have shown are, too.
+const FRAME_MAX: f64 = 0.05;
 /// Neighbouring pixels of the ring that must differ, and the ring, from the top clockwise.
 const ARC: usize = 9;
 #[rustfmt::skip]
@@ -39,8 +41,8 @@ pub struct Detector {
     taken: Vec<bool>,
     /// Bit of each other camera that sees a cell too.
     shared: Vec<u8>,
-    /// Frames for which each cell is not looked at.
-    rests: Vec<u32>,
+    /// Time for which each cell is not looked at, s.
+    rests: Vec<f64>,
     corners: Vec<Corner>,
     threshold: u8,
     threshold_min: u8,
@@ -56,7 +58,7 @@ impl Detector {
             origin: [(width % cell) / 2, (height % cell) / 2],
             taken: vec![false; columns * rows],
             shared: vec![0; columns * rows],
-            rests: vec![0; columns * rows],
+            rests: vec![0.0; columns * rows],
             corners: Vec::with_capacity(columns * rows),
             threshold: config.fast_threshold.min(255) as u8,
             threshold_min: config.fast_threshold_min.clamp(1, 255) as u8,
@@ -81,9 +83,14 @@ impl Detector {
 
     /// Lets the cell at a pixel rest, whose point was rejected; the rest of one that rests already is not made longer.
     pub fn rest(&mut self, px: [f32; 2]) {
-        if let Some(k) = self.cell_at(px).filter(|k| self.rests[*k] == 0) {
+        if let Some(k) = self.cell_at(px).filter(|k| self.rests[*k] == 0.0) {
             self.rests[k] = REST;
         }
+    }
+
+    /// Takes it that the last frame came so long after the one before, s.
+    pub fn elapse(&mut self, secs: f64) {
+        self.rests.iter_mut().for_each(|rest| *rest = (*rest - secs.clamp(0.0, FRAME_MAX)).max(0.0));
     }
 
     /// Finds at most `room` corners, one in each cell that is free of `points` and that none of the cameras
@@ -95,10 +102,7 @@ impl Detector {
         others: u8,
         room: usize,
     ) -> (&[Corner], usize) {
-        for (taken, rest) in self.taken.iter_mut().zip(&mut self.rests) {
-            *taken = *rest > 0;
-            *rest = rest.saturating_sub(1);
-        }
+        self.taken.iter_mut().zip(&self.rests).for_each(|(taken, rest)| *taken = *rest > 0.0);
         for px in points {
             if let Some(k) = self.cell_at(px) {
                 self.taken[k] = true;
@@ -260,6 +264,23 @@ mod tests {
                 prop_assert_eq!(got.map(|c| (c.x, c.y)), expect);
                 prop_assert_eq!(got.map_or(5, |c| c.score as i32), best);
             }
+        }
+    }
+
+    #[test]
+    fn cells_rest_as_long_at_every_frame_rate_from_twenty_on() {
+        let image = noise(3, 256, 4);
+        let config = FrontendConfig { grid_px: 20, ..FrontendConfig::default() };
+        for (frame_hz, frames) in [(10.0, 16), (20.0, 16), (60.0, 47)] {
+            let mut detector = Detector::new(image.width, image.height, &config);
+            let all = detector.detect(&image, std::iter::empty(), 0, 100).0.to_vec();
+            detector.rest([all[0].x as f32, all[0].y as f32]);
+            let rested = (0..100).take_while(|_| {
+                let found = detector.detect(&image, std::iter::empty(), 0, 100).0.len();
+                detector.elapse(1.0 / frame_hz);
+                found < all.len()
+            });
+            assert_eq!(rested.count(), frames, "{frame_hz} Hz");
         }
     }
 

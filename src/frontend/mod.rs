@@ -178,6 +178,7 @@ impl Frontend {
         self.frame += 1;
         self.build_pyramids();
         let median = self.median_inverse_depth();
+        let secs = (frames.t - self.before.frames.t).secs();
         self.follow(prediction, median);
         let median = self.median_inverse_depth();
         self.find_missing(0, median);
@@ -186,6 +187,7 @@ impl Frontend {
             let first_new = self.points.list.len();
             if self.seeing[camera] {
                 self.detect(camera);
+                self.detectors[camera].elapse(secs);
             }
             self.find_missing(first_new, median);
         }
