@@ -3,7 +3,8 @@
 //! estimator is refused.
 //!
 //! A stamp ahead of its arrival by more than `JUMP_MAX` is refused, and so is one that is not newer than the last. If that
-//! is all that comes for `RELEARN`, the sensor's clock has changed for good and is believed from then on. Arrivals are on
+//! is all that comes for `RELEARN`, the sensor's clock has changed for good and is believed from then on; who uses stamps
+//! sees that by `Clock`. Arrivals are on
 //! any clock that keeps going; without one, as of a recording read ahead, a sample arrives at its own stamp.
 
 use super::spikes::Spikes;
@@ -12,15 +13,42 @@ use stipple_drivers::source::{frozen_readings, ImuReading, RANGE_END};
 use stipple_drivers::{Frames, Image, ImuCalibration, ImuSample, Nanos, Span};
 
 /// Largest step of a stamp beyond the time that passed, ns: further than a queue of frames can be behind.
-const JUMP_MAX: Span = Span(1_000_000_000);
+pub const JUMP_MAX: Span = Span(1_000_000_000);
 /// Time after which a clock that jumped is believed, ns.
-const RELEARN: Span = Span(2_000_000_000);
+pub const RELEARN: Span = Span(2_000_000_000);
 /// Intervals of whose median the period is made.
 const INTERVALS: usize = 15;
 /// Every 61st pixel is compared to tell two pictures apart: noise changes half of them.
 const PIXEL_STRIDE: usize = 61;
 /// Grey levels between the darkest and the brightest pixel of a covered eye.
 const BLANK_LEVELS: u8 = 6;
+
+/// A believed stamp that is older than the last by more is of another clock: unplugged sensors come back with stamps that are a
+/// little older.
+const BACK_MAX: Span = Span(100_000_000);
+
+/// What stamps are of.
+#[derive(Clone, Copy)]
+pub enum Stream {
+    Frames,
+    Samples,
+}
+
+/// The newest stamps that were believed of frames and of samples.
+#[derive(Default)]
+pub struct Clock([Option<Nanos>; 2]);
+
+impl Clock {
+    /// Whether a stamp that is believed is of a clock that went back. The other stream's stamps are taken to do so, too.
+    pub fn went_back(&mut self, stream: Stream, t: Nanos) -> bool {
+        let back = self.0[stream as usize].is_some_and(|last| last - t > BACK_MAX);
+        if back {
+            *self = Clock::default();
+        }
+        self.0[stream as usize] = Some(t);
+        back
+    }
+}
 
 /// The stamps of one sensor.
 #[derive(Default)]
@@ -233,6 +261,15 @@ mod tests {
         let stamps: Vec<i64> = (0..300).map(|i| 20 * i + if i < 50 { 0 } else { 100_000 }).collect();
         let (kept, [_, _, jumped]) = believed(&stamps);
         assert_eq!((kept.len() as u64 + jumped, jumped), (300, 100));
+    }
+
+    #[test]
+    fn clocks_that_go_back_together_do_so_once() {
+        let mut clock = Clock::default();
+        let mut back = |stream, ms: i64| clock.went_back(stream, Nanos(ms * MS));
+        let (frame, sample) = (Stream::Frames, Stream::Samples);
+        assert!(![back(sample, 9000), back(frame, 9000), back(sample, 8990), back(frame, 9050)].contains(&true));
+        assert_eq!([back(sample, 1000), back(frame, 990), back(sample, 1005)], [true, false, false]);
     }
 
     #[test]

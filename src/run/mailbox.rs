@@ -6,7 +6,7 @@
 //!
 //! A frame is tracked when a sample at or past its stamp has come, or when none did within `SAMPLE_WAIT`.
 
-use super::gate::{FrameGate, ImuGate};
+use super::gate::{FrameGate, ImuGate, JUMP_MAX};
 use super::status::{self, Gauges};
 use super::threads;
 use super::tracking::FramePacket;
@@ -96,7 +96,8 @@ impl Mailbox {
         let mut reached = false;
         while let Some(sample) = self.imu.pop() {
             packet.push_imu(sample, counters);
-            reached = sample.t >= packet.frames.t;
+            // Samples so far ahead are of the clock before.
+            reached = (Span(0)..=JUMP_MAX).contains(&(sample.t - packet.frames.t));
             if reached {
                 break;
             }
@@ -447,5 +448,19 @@ mod tests {
         }
         assert_eq!(taken, (0..3 * IMU_BETWEEN_FRAMES as i64).collect::<Vec<_>>());
         assert_eq!(counters.imu_overflow.get(), 0);
+    }
+
+    #[test]
+    fn samples_of_the_clock_before_are_not_those_a_frame_waits_for() {
+        let (mailbox, counters, over) = (Mailbox::new(4, &euroc_rig(), 0), Counters::default(), AtomicBool::new(false));
+        let mut packet = mailbox.spare.pop().unwrap();
+        packet.writable().unwrap().t = Nanos(5_000_000_000);
+        let _ = mailbox.newest.push(packet);
+        let stamps = [15_000, 15_005, 4_995, 5_000, 5_005].map(|ms| Nanos(ms * 1_000_000));
+        for t in stamps {
+            mailbox.imu.force_push(ImuSample { t, ..ImuSample::default() });
+        }
+        let packet = mailbox.take(&mut None, &over, &counters).unwrap();
+        assert!(packet.imu.iter().map(|s| s.t).eq(stamps[..4].iter().copied()));
     }
 }

@@ -12,6 +12,7 @@
 //!
 //! With `--poses` the poses come from a table, odometry is skipped, and every frame is a keyframe.
 
+use super::gate::{Clock, Stream, RELEARN};
 use super::log::{LogSender, State};
 use super::waker::{SetOnDrop, Waker};
 use crate::config::Board;
@@ -143,6 +144,7 @@ pub struct Answer {
 pub struct Front {
     frontend: Frontend,
     predictor: Predictor,
+    clock: Clock,
     /// Wall time of each frame, ms.
     pub ms: Thinned<f64>,
     /// Wall time of all frames, with what was waited for the back end, s.
@@ -157,12 +159,20 @@ impl Front {
         let cpu = thread_cpu_now();
         packet.begun = Instant::now();
         self.predictor.set_scale(answer.known.imu_scale);
-        packet.imu.iter().for_each(|s| self.predictor.on_imu(*s));
+        for s in packet.imu.iter() {
+            if self.clock.went_back(Stream::Samples, s.t) {
+                self.predictor.change_clock();
+            }
+            self.predictor.on_imu(*s);
+        }
         self.frontend.reject(&answer.rejected);
         if packet.imu_only {
             return;
         }
         let t = packet.frames.t;
+        if self.clock.went_back(Stream::Frames, t) {
+            self.predictor.change_clock();
+        }
         if let Some((body_from_cam, sigma_rad)) = self.predictor.cameras_at(t, &answer.known) {
             self.frontend.correct(&body_from_cam, sigma_rad);
         }
@@ -183,6 +193,7 @@ const EPOCHS: usize = 64;
 /// recording, and are thinned in a run without an end, of which the log has every frame.
 pub struct Back {
     pub vio: Vio,
+    clock: Clock,
     pub trajectory: Thinned<TimedPose>,
     /// Wall time of each frame, ms.
     pub ms: Thinned<f64>,
@@ -202,11 +213,21 @@ impl Back {
     /// Fills in `packet.tracked`.
     pub fn estimate(&mut self, packet: &mut FramePacket) {
         let (begun, cpu) = (Instant::now(), thread_cpu_now());
-        packet.imu.iter().for_each(|s| self.vio.on_imu(*s));
+        // Before the samples, so that a change of the clock forgets those of the clock before.
         packet.aids.iter().for_each(|reading| self.vio.on_aid(reading));
+        for s in packet.imu.iter() {
+            if self.clock.went_back(Stream::Samples, s.t) {
+                self.vio.change_clock(s.t, RELEARN);
+            }
+            self.vio.on_imu(*s);
+        }
         packet.tracked = None;
         if packet.imu_only {
             return;
+        }
+        let t = packet.frames.t;
+        if self.clock.went_back(Stream::Frames, t) {
+            self.vio.change_clock(t, RELEARN);
         }
         let update = self.vio.on_tracks(&packet.tracks);
         (packet.epoch, packet.health) = (update.epoch, update.health);
@@ -276,9 +297,10 @@ impl OdometryRun {
         let frame_ms = f.build("tracking: latencies of frames", || Thinned::with_capacity(frames));
         footprint.extend(f);
         Ok(OdometryRun {
-            front: Front { frontend, predictor, ms: front_ms, busy_s: 0.0, cpu_s: None },
+            front: Front { frontend, predictor, clock: Clock::default(), ms: front_ms, busy_s: 0.0, cpu_s: None },
             back: Back {
                 vio,
+                clock: Clock::default(),
                 trajectory,
                 ms,
                 busy_s: 0.0,
@@ -457,4 +479,90 @@ pub fn estimate(link: &Link, back: &mut Back, mut give: impl FnMut(Box<FramePack
 pub fn seal() {
     let _ = std::thread::current();
     seal_thread();
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::gate::{ImuGate, StampCounters, Stamps};
+    use super::*;
+    use crate::world::{Path, World, FRAME_SECS, RATE_HZ};
+    use stipple_drivers::source::ImuReading;
+
+    const PATH: Path = Path { rest: -1.0 };
+    /// Time at which both clocks go back, and by how much, s.
+    const STEP_AT: f64 = 12.0;
+    const BACK: f64 = 10.0;
+
+    fn stamp(arrival: f64) -> Nanos {
+        Nanos(((arrival - if arrival < STEP_AT { 0.0 } else { BACK }) * 1e9).round() as i64)
+    }
+
+    /// A frame with a pose: when it came, its epoch, by how much its place is off and the stated deviation of that, m.
+    struct Posed {
+        arrival: f64,
+        epoch: u32,
+        error_m: f64,
+        sigma_m: f64,
+    }
+
+    #[test]
+    fn clocks_that_go_back_for_good_begin_an_epoch_within_seconds() {
+        let board = include_str!("../../board-configs/lavapipe.toml");
+        let board = Board::parse("lavapipe.toml", board, &[]).expect("a board of ours");
+        let mut world = World::new(PATH);
+        let run = OdometryRun::new(&world.rig, &board, 1000).expect("a rig of two cameras");
+        let OdometryRun { mut front, mut back, .. } = run;
+        let (counters, mut imu, mut stamps) = (Counters::default(), ImuGate::new(&world.rig.imu), Stamps::default());
+        let frame_counters = StampCounters {
+            missing: &counters.frames_missing,
+            not_newer: &counters.frames_not_newer,
+            jumped: &counters.frames_timestamp_jump,
+        };
+        let mut packets = [(); 3].map(|()| FramePacket::for_rig(&world.rig, 0));
+        let start = back.answer();
+        let (mut answer, mut next, mut sample) = (start.clone(), start, 0);
+        let (mut posed, mut resets): (Vec<Posed>, usize) = (vec![], 0);
+        let mut world_from_truth = None;
+        for frame in 0..400 {
+            let arrival = f64::from(frame) * FRAME_SECS + 0.0012;
+            let packet = &mut packets[0];
+            while f64::from(sample) / RATE_HZ < arrival + 1.0 / RATE_HZ {
+                let at = f64::from(sample) / RATE_HZ;
+                let now = Nanos((at * 1e9) as i64);
+                let sample_now = ImuSample { t: stamp(at), ..world.imu(at) };
+                let reading = ImuReading { sample: sample_now, ..ImuReading::default() };
+                imu.pass(&reading, now, &counters, &mut |s| packet.push_imu(s, &counters));
+                sample += 1;
+            }
+            let mut tracks = Tracks::default();
+            world.tracks(arrival, &mut tracks);
+            tracks.t = stamp(arrival);
+            if !stamps.admit(tracks.t, Nanos((arrival * 1e9) as i64), &frame_counters) {
+                continue;
+            }
+            packet.writable().expect("two frames were tracked since").t = tracks.t;
+            front.track(packet, &answer);
+            packet.tracks = tracks;
+            back.estimate(packet);
+            (answer, next) = (next, back.answer());
+            resets += usize::from(packet.health.has(Health::FRAME_GAP_RESET));
+            if let (Some(tracked), Some(c)) = (&packet.tracked, back.vio.covariance()) {
+                let (pose, truth) = (tracked.world_from_body, PATH.pose(arrival));
+                let world_from_truth = *world_from_truth.get_or_insert(pose * truth.inverse());
+                let error_m = (pose.p - (world_from_truth * truth).p).length();
+                let sigma_m = c[0][0].max(c[1][1]).max(c[2][2]).sqrt();
+                posed.push(Posed { arrival, epoch: packet.epoch, error_m, sigma_m });
+            }
+            packet.clear();
+            packets.rotate_left(1);
+        }
+        let before = posed.iter().filter(|p| p.arrival < STEP_AT).last().expect("it flies before");
+        assert!(before.epoch == 0 && before.arrival > STEP_AT - 0.1);
+        let after = posed.iter().find(|p| p.arrival > STEP_AT).expect("it flies after");
+        eprintln!("back after {:.2} s, {:.2} m off of {:.2} m", after.arrival - STEP_AT, after.error_m, after.sigma_m);
+        assert!(after.arrival < STEP_AT + 4.0 && after.error_m < 3.0 * after.sigma_m);
+        assert!((after.epoch, resets, back.vio.stats().resets_frame_gap) == (1, 1, 1));
+        let last = posed.last().expect("it flies to the end");
+        assert!(last.epoch == 1 && last.arrival > 19.9, "{} at {}", last.epoch, last.arrival);
+    }
 }

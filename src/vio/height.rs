@@ -80,6 +80,11 @@ impl Heights {
         (self.believed, self.refused) = (None, None);
     }
 
+    /// Readings to come are of another clock.
+    pub fn forget_readings(&mut self) {
+        self.readings.clear();
+    }
+
     /// Whether a height was believed since the start.
     pub fn knows_bias(&self) -> bool {
         self.believed.is_some()

@@ -401,6 +401,19 @@ impl Vio {
         h
     }
 
+    /// Goes over to another clock, on which stamps go on at `t`, `unheard` after the last of the one before. Samples and
+    /// readings are forgotten, and the next epoch begins where the estimate was last trusted, as uncertain as the rig may
+    /// have moved since.
+    pub fn change_clock(&mut self, t: Nanos, unheard: Span) {
+        let Some(newest) = self.imu.newest().map(|s| s.t).max(self.last) else { return };
+        self.recovery.change_clock(t - unheard - newest);
+        self.imu.clear();
+        self.estimator.heights.iter_mut().for_each(Heights::forget_readings);
+        self.last = None;
+        self.pending.set(Reset::FrameGap.bit(), true);
+        self.reset_for(Reset::FrameGap);
+    }
+
     /// Forgets everything but the inertial samples and where it was, and initializes again.
     #[cfg(feature = "instruments")]
     pub fn reset(&mut self) {

@@ -93,6 +93,16 @@ impl Predictor {
         self.scale = scale;
     }
 
+    /// Goes over to another clock: forgets samples and frames.
+    pub fn change_clock(&mut self) {
+        self.imu.clear();
+        self.last = None;
+        #[cfg(feature = "instruments")]
+        {
+            self.newest = None;
+        }
+    }
+
     /// Places of the cameras on the body as they see the frame at `t`, and how far their rotations may be off, rad; `None` where
     /// nothing of them is estimated. A camera that is exposed later than camera 0 sees from where the body has moved it to.
     /// `known` is as for `motion_to`.
@@ -112,11 +122,11 @@ impl Predictor {
     }
 
     /// Motion of the body from the frame before to the one at `t`, `before_from_now`; `None` at the first frame.
-    /// `state` is what the estimator knew after the frame two before this one; without it only the gyro predicts, a
-    /// rotation. Samples up to `t` must have come; the newest is held where they have not.
+    /// `state` is what the estimator knew after the frame two before this one; without it, or with one of a clock that was
+    /// ahead, only the gyro predicts, a rotation. Samples up to `t` must have come; the newest is held where they have not.
     pub fn motion_to(&mut self, t: Nanos, state: Option<&Odometry>) -> Option<Pose> {
         let last = self.last.replace(t)?;
-        let Some(state) = state else {
+        let Some(state) = state.filter(|s| s.t <= t) else {
             let inc = self.imu.integrate(last, t, DVec3::ZERO, DVec3::ZERO, &self.noise);
             return Some(Pose::new(inc.q, DVec3::ZERO));
         };

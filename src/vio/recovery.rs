@@ -42,7 +42,7 @@ pub struct Recovery {
     /// Waits for `LAG`, then is the confirmed one.
     candidate: Option<TrustedState>,
     confirmed: Option<TrustedState>,
-    /// The last start: what a restart begins at while nothing is trusted.
+    /// The last start, or what was trusted on another clock: where a restart begins while nothing is trusted.
     started: Option<DeadReckoning>,
     /// Why there is a restart.
     reset_by: Reset,
@@ -72,6 +72,13 @@ impl Recovery {
     /// Why the estimate is given up, and a restart will be needed.
     pub fn reset(&mut self, why: Reset) {
         self.reset_by = why;
+    }
+
+    /// Carries what was trusted over to a clock that is `by` ahead. No samples lead on from there.
+    pub fn change_clock(&mut self, by: Span) {
+        let from = self.trusted().map(|trusted| trusted.then).or(self.started);
+        let started = from.map(|from| DeadReckoning { t: from.t + by, ..from });
+        *self = Recovery { started, reset_by: self.reset_by, ..Recovery::default() };
     }
 
     /// Whether the last estimate was given up because something lied: samples, or the estimate, may have been wrong for some

@@ -43,6 +43,11 @@ impl ImuRing {
         old
     }
 
+    /// Forgets all samples.
+    pub fn clear(&mut self) {
+        self.samples.clear();
+    }
+
     /// The newest sample.
     pub fn newest(&self) -> Option<&ImuSample> {
         self.samples.back()
