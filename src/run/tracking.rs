@@ -556,7 +556,7 @@ mod tests {
             packet.clear();
             packets.rotate_left(1);
         }
-        let before = posed.iter().filter(|p| p.arrival < STEP_AT).last().expect("it flies before");
+        let before = posed.iter().rfind(|p| p.arrival < STEP_AT).expect("it flies before");
         assert!(before.epoch == 0 && before.arrival > STEP_AT - 0.1);
         let after = posed.iter().find(|p| p.arrival > STEP_AT).expect("it flies after");
         eprintln!("back after {:.2} s, {:.2} m off of {:.2} m", after.arrival - STEP_AT, after.error_m, after.sigma_m);
