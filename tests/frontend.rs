@@ -124,6 +124,7 @@ fn a_point_that_the_estimator_rejects_is_dropped_and_its_cell_rests() {
     frontend.reject(&[point.id, u64::MAX]);
     let mut rested = 0;
     for _ in 0..64 {
+        Arc::make_mut(&mut frames).t.0 += 50_000_000;
         let tracks = frontend.track(&frames, &Prediction::default());
         assert!(tracks.find(0, point.id).is_none() && tracks.find(1, point.id).is_none());
         if near(tracks) {

@@ -533,6 +533,9 @@ mod tests {
         ring.word(Word::Beat).fetch_add(1, Relaxed);
         assert_eq!(r.judge(&ring, true, MANY, after(92)).unwrap(), "hangs: a slice of its work takes over 30 s");
         ring.word(Word::Progress).fetch_add(1, Relaxed);
+        while host::stopped_and_resident(r.child.id()).is_some_and(|(_, bytes)| bytes <= 1 << 10) {
+            std::thread::yield_now();
+        }
         let why = r.judge(&ring, true, 1 << 10, after(93)).unwrap();
         assert!(why.starts_with("takes ") && why.ends_with(" 0 are allowed"), "{why}");
         r.end();
