@@ -3,9 +3,9 @@
 //! estimator is refused.
 //!
 //! A stamp ahead of its arrival by more than `JUMP_MAX` is refused, and so is one that is not newer than the last. If that
-//! is all that comes for `RELEARN`, the sensor's clock has changed for good and is believed from then on; who uses stamps
-//! sees that by `Clock`. Arrivals are on
-//! any clock that keeps going; without one, as of a recording read ahead, a sample arrives at its own stamp.
+//! is all that comes for `RELEARN`, the sensor's clock has changed for good and is believed from then on; `Clock` tells users
+//! of stamps when it went back. Arrivals are on any clock that keeps going; without one, as of a recording read ahead, a
+//! sample arrives at its own stamp.
 
 use super::spikes::Spikes;
 use crate::counters::{Counter, Counters};
@@ -331,12 +331,13 @@ mod tests {
         assert_eq!(c.imu_rejected.get(), 1);
     }
 
+    /// An image of 80 by 80 pixels; one of seed 0 is black.
+    fn picture(seed: u8) -> Image {
+        Image { pixels: (0..6400).map(|i| (i as u8).wrapping_mul(seed)).collect(), ..Image::new(80, 80) }
+    }
+
     #[test]
     fn a_hanging_camera_is_refused_and_a_covered_one_is_not() {
-        let picture = |seed: u8| Image {
-            pixels: (0..6400).map(|i| (i as u8).wrapping_mul(seed)).collect(),
-            ..Image::new(80, 80)
-        };
         let c = Counters::default();
         let mut gate = FrameGate::new(&Frames { images: vec![Image::new(80, 80)], ..Frames::default() });
         let black = Image::new(80, 80);
@@ -355,10 +356,6 @@ mod tests {
     /// Seeds of the images of two cameras; a seed of 0 is a covered camera.
     #[test]
     fn a_camera_that_hangs_is_blank_while_the_other_goes_on() {
-        let picture = |seed: u8| Image {
-            pixels: (0..6400).map(|i| (i as u8).wrapping_mul(seed)).collect(),
-            ..Image::new(80, 80)
-        };
         let c = Counters::default();
         let mut gate = FrameGate::new(&Frames { images: vec![Image::new(80, 80); 2], ..Frames::default() });
         let seeds = [[3, 5], [7, 5], [9, 5], [9, 5], [11, 13], [11, 0]];

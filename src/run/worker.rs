@@ -143,6 +143,24 @@ pub struct Worker {
 }
 
 impl Worker {
+    /// A worker that does not run yet, and may be started at once.
+    fn new(ring: KeyframeRing, calibration: Calibration, board: Board, out: PathBuf) -> Worker {
+        let now = Instant::now();
+        Worker {
+            ring: Arc::new(ring),
+            bytes_max: (board.memory_max_mib << 20) + DRIVER_BYTES,
+            board,
+            calibration,
+            out,
+            begun: now,
+            running: None,
+            pause: Duration::ZERO,
+            next_start: now,
+            restarts: 0,
+            warning: None,
+        }
+    }
+
     /// Starts the worker and waits until it is ready. Fails where it says why it cannot be.
     /// `place` names the rig; `records` where the run is recorded, too.
     pub fn start(
@@ -152,20 +170,8 @@ impl Worker {
         out: &OutputDir,
         records: bool,
     ) -> Result<Worker, Fault> {
-        let now = Instant::now();
-        let mut worker = Worker {
-            ring: Arc::new(KeyframeRing::new(calibration, board)?),
-            board: board.clone(),
-            calibration: calibration.clone(),
-            out: out.path().to_path_buf(),
-            begun: now,
-            running: None,
-            pause: Duration::ZERO,
-            next_start: now,
-            restarts: 0,
-            warning: None,
-            bytes_max: (board.memory_max_mib << 20) + DRIVER_BYTES,
-        };
+        let ring = KeyframeRing::new(calibration, board)?;
+        let mut worker = Worker::new(ring, calibration.clone(), board.clone(), out.path().to_path_buf());
         let first = Some((place.to_string(), records));
         worker.spawn(first).map_err(|e| refused(format!("the mapper's process does not start: {e}")))?;
         let (gauges, told) = (Gauges::default(), worker.running.as_ref().map(|r| r.told.clone()));
@@ -554,20 +560,9 @@ mod tests {
     #[test]
     fn pauses_grow_only_where_a_worker_lives_shortly() {
         let board = Board::parse("lavapipe.toml", include_str!("../../board-configs/lavapipe.toml"), &[]).unwrap();
-        let now = Instant::now();
-        let mut worker = Worker {
-            ring: Arc::new(ring()),
-            board,
-            calibration: Calibration { cameras: vec![], imu: stipple_drivers::ImuCalibration::CONSUMER },
-            out: PathBuf::new(),
-            begun: now,
-            running: None,
-            pause: Duration::ZERO,
-            next_start: now,
-            restarts: 0,
-            warning: None,
-            bytes_max: MANY,
-        };
+        let calibration = Calibration { cameras: vec![], imu: stipple_drivers::ImuCalibration::CONSUMER };
+        let mut worker = Worker::new(ring(), calibration, board, PathBuf::new());
+        let now = worker.next_start;
         let mut pause = |life_s| {
             worker.postpone(now, Duration::from_secs(life_s));
             (worker.next_start - now).as_secs()
