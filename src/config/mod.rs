@@ -14,7 +14,7 @@ pub use method::{
     Fit, FrontendConfig, GpuConfig, MapConfig, NetworkConfig, Projection, StereoConfig, StereoMethod, VioConfig,
 };
 pub use section::{Bound, Key};
-pub use sensors::{BaroConfig, CameraConfig, GpioConfig, ImuConfig, RecordConfig, RigConfig};
+pub use sensors::{BaroConfig, CameraConfig, GpioConfig, ImuConfig, LogConfig, RecordConfig, RigConfig};
 
 use section::section;
 use sensors::Wrong;
@@ -40,6 +40,8 @@ pub struct Board {
     pub gpio: GpioConfig,
     #[serde(default)]
     pub record: RecordConfig,
+    #[serde(default)]
+    pub log: LogConfig,
     #[serde(default)]
     pub frontend: FrontendConfig,
     #[serde(default)]
@@ -88,6 +90,7 @@ pub fn keys() -> impl Iterator<Item = &'static Key> {
         BaroConfig::KEYS,
         GpioConfig::KEYS,
         RecordConfig::KEYS,
+        LogConfig::KEYS,
         FrontendConfig::KEYS,
         VioConfig::KEYS,
         StereoConfig::KEYS,

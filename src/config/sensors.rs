@@ -1,4 +1,4 @@
-//! The sensors of a live run, and how they are wired: `[rig]`, `[camera]`, `[imu]`, `[baro]`, `[gpio]`, `[record]`.
+//! The sensors of a live run, and how they are wired: `[rig]`, `[camera]`, `[imu]`, `[baro]`, `[gpio]`, `[record]`, `[log]`.
 //! Replays read `rig.readout_s`, `rig.masks`, `camera.pair_tolerance_s` and `[baro]` alone.
 
 use super::section::{section, Bound};
@@ -128,6 +128,14 @@ section! {
     /// Frames that wait for the disk; those beyond are dropped from the recording, and counted. SD cards stall for a second now
     /// and then: the default is 1.6 s at 20 Hz, 22 MiB of two 752x480 cameras.
     ring_frames: u32 = 32, Bound::Within(1.0, 4096.0);
+}
+
+section! {
+    /// The log of a run.
+    LogConfig, "log.";
+    /// States a second that are carried by the inertial samples to the newest of them, between frames and while no frame comes;
+    /// 0: none. Each takes some 500 bytes of the log.
+    predicted_hz: f64 = 0.0, Bound::Within(0.0, 1000.0);
 }
 
 impl RigConfig {

@@ -7,6 +7,7 @@
 //! A frame is tracked when a sample at or past its stamp has come, or when none did within `SAMPLE_WAIT`.
 
 use super::gate::{FrameGate, ImuGate, JUMP_MAX};
+use super::publisher::Publisher;
 use super::status::{self, Gauges};
 use super::threads;
 use super::tracking::FramePacket;
@@ -309,7 +310,7 @@ pub fn camera(mailbox: &Mailbox, source: &mut dyn FrameSource, tracking: &Waker,
 pub fn inertial(
     mailbox: &Mailbox,
     source: &mut dyn ImuSource,
-    mut gate: ImuGate,
+    (mut gate, mut publisher): (ImuGate, Option<Publisher>),
     tracking: &Waker,
     over: &AtomicBool,
     c: &Counters,
@@ -319,6 +320,7 @@ pub fn inertial(
     let mut queue = |sample: ImuSample| {
         c.imu_overflow.add(u64::from(mailbox.imu.force_push(sample).is_some()));
         mailbox.imu_until.store(sample.t.0, Relaxed);
+        publisher.iter_mut().for_each(|publisher| publisher.on_imu(sample));
     };
     let counted = [&c.imu_lost, &c.imu_silent, &c.imu_away_ms];
     let mut liveness = Liveness::new("inertial unit", counted, &mailbox.notices);

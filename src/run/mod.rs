@@ -9,7 +9,7 @@
 //! |---|---|---|
 //! | main | opens everything, shows status, reports | free |
 //! | camera | waits for frames, or decodes files and delivers them when they are due | free |
-//! | imu | waits for inertial samples | free |
+//! | imu | waits for inertial samples; carries states to them (`log.predicted_hz`) | free |
 //! | barometer | waits for pressures, where there is one | free |
 //! | tracking | front end and back end in turns; offers keyframes | sealed |
 //! | or frontend | follows points (`frontend.threads = 2`) | sealed |
@@ -36,6 +36,7 @@ pub mod log;
 pub mod mailbox;
 pub mod mapping;
 pub mod memory;
+pub mod publisher;
 pub mod recorder;
 pub mod sensors;
 mod spikes;
@@ -186,6 +187,7 @@ pub fn fly(
     input.warnings.iter().for_each(|warning| log.sender().event(EventKind::Warning, warning));
     if let Tracker::Odometry(run) = &mut tracker {
         run.back.log = Some(log.sender());
+        run.publisher.iter_mut().for_each(|publisher| publisher.log = Some(log.sender()));
     }
     let mut status =
         Status::new(options.duration_s.map(|s| s * speed).or(length_s)).with_led(led).with_log(log.sender());
@@ -378,9 +380,9 @@ pub fn fly_in_real_time(
             let _ended = waker::SetOnDrop(&s.source_done, Some(taker));
             mailbox::camera(&s.mailbox, &mut **frames, taker, &s.counters, &s.gauges);
         });
-        let gate = ImuGate::new(&calibration.imu);
+        let (gate, publisher) = (ImuGate::new(&calibration.imu), tracker.take_publisher());
         spawn(scope, "imu", move || {
-            mailbox::inertial(&s.mailbox, &mut **imu, gate, taker, &s.source_done, &s.counters)
+            mailbox::inertial(&s.mailbox, &mut **imu, (gate, publisher), taker, &s.source_done, &s.counters)
         });
         if let Some(aids) = aids {
             spawn(scope, "barometer", move || mailbox::aids(&s.mailbox, &mut **aids, &s.source_done, &s.counters));

@@ -14,6 +14,7 @@
 
 use super::gate::{Clock, Stream, RELEARN};
 use super::log::{LogSender, State};
+use super::publisher::{Newest, Publisher};
 use super::waker::{SetOnDrop, Waker};
 use crate::config::Board;
 use crate::counters::Counters;
@@ -127,6 +128,8 @@ pub enum Tracker {
 pub struct OdometryRun {
     pub front: Front,
     pub back: Back,
+    /// Until the thread that publishes takes it; none where the board asks for none.
+    pub publisher: Option<Publisher>,
     /// 1 or 2.
     pub threads: u32,
     /// Size of front end and estimator together.
@@ -205,6 +208,8 @@ pub struct Back {
     pub frame_ms: Thinned<(Nanos, f64)>,
     pub cpu_s: Option<f64>,
     pub log: Option<LogSender>,
+    /// Where the publisher takes states.
+    newest: Option<Newest>,
     /// First frame and number of each epoch. Where there are more, the log has them.
     pub epochs: List<(Nanos, u32), EPOCHS>,
 }
@@ -250,6 +255,9 @@ impl Back {
         self.health.push((packet.frames.t, update.health));
         let latency_ms = packet.begun.elapsed().as_secs_f64() * 1e3;
         self.frame_ms.push((packet.frames.t, latency_ms));
+        if let Some(newest) = &self.newest {
+            newest.set(&update, self.vio.known().imu_scale);
+        }
         if let Some(log) = &self.log {
             let cpu = packet.cpu + (thread_cpu_now() - cpu);
             let time_offsets_ns = self.vio.time_offsets().map(|offsets| offsets.map(|offset| offset.0));
@@ -291,6 +299,11 @@ impl OdometryRun {
         let estimator = || (vio(), Predictor::new(calibration, &board.vio));
         let (vio, predictor) = f.build("tracking: estimator", estimator);
         let bytes = f.total();
+        let predicted_hz = board.log.predicted_hz;
+        let publisher = (predicted_hz > 0.0).then(|| {
+            let published = || Publisher::new(calibration, &board.vio, predicted_hz);
+            f.build("tracking: states between frames", published)
+        });
         let trajectory = f.build("tracking: poses of frames", || Thinned::with_capacity(frames));
         let health = f.build("tracking: health of frames", || Thinned::with_capacity(frames));
         let [front_ms, ms] = f.build("tracking: times of frames", || [(); 2].map(|()| Thinned::with_capacity(frames)));
@@ -308,8 +321,10 @@ impl OdometryRun {
                 frame_ms,
                 cpu_s: None,
                 log: None,
+                newest: publisher.as_ref().map(|publisher| publisher.newest.clone()),
                 epochs: List::default(),
             },
+            publisher,
             threads: board.frontend.threads,
             bytes,
         })
@@ -335,6 +350,14 @@ impl Tracker {
     /// Threads it takes, 1 or 2.
     pub fn threads(&self) -> u32 {
         self.odometry().map_or(1, |run| run.threads)
+    }
+
+    /// The part that carries states between frames, for the thread that has the samples.
+    pub fn take_publisher(&mut self) -> Option<Publisher> {
+        match self {
+            Tracker::Odometry(run) => run.publisher.take(),
+            Tracker::Table(_) | Tracker::Observer(_) => None,
+        }
     }
 
     pub fn odometry(&self) -> Option<&OdometryRun> {

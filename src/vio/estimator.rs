@@ -8,7 +8,7 @@
 use super::factors::inertial_residual_at;
 use super::graph::Graph;
 use super::height::{Attached, Heights};
-use super::inertial::{body_velocity_covariance, Covariance, InertialWeight, Motion, MotionSigma};
+use super::inertial::{body_velocity_sigma, Covariance, InertialWeight, Motion, MotionSigma};
 use super::initialization::{Start, GAUGE_SIGMA, RESECTION_MIN};
 use super::innovation_gate::{gate, predicted_covariance, Passed};
 use super::marginalization::Marginalizer;
@@ -230,7 +230,7 @@ impl Estimator {
     /// Whether the views of an alignment agree with the samples and tell the speed.
     fn knows_speed(&self, step: &Step) -> bool {
         let (Some(frame), Some(covariance)) = (self.newest(), &step.covariance) else { return false };
-        let (speed, sigma) = (frame.now.v.length(), body_velocity_covariance(covariance, &frame.now).trace().sqrt());
+        let (speed, sigma) = (frame.now.v.length(), body_velocity_sigma(covariance, &frame.now));
         let views: usize = self.graph.landmarks.pool.iter().map(|l| l.observations.len()).sum();
         let unknown = 3 * self.graph.landmarks.pool.len() + 15;
         let misfit = 2.0 * self.graph.cost(&self.model) / (2 * views).saturating_sub(unknown).max(1) as f64;

@@ -66,6 +66,11 @@ pub fn body_velocity_covariance(c: &Covariance, motion: &Motion) -> Matrix3<f64>
     d_v * block(6, 6) * d_v.transpose() + d_theta * block(3, 3) * d_theta.transpose() + cross + cross.transpose()
 }
 
+/// Standard deviation of the velocity in the body's frame, m/s, all axes.
+pub fn body_velocity_sigma(c: &Covariance, motion: &Motion) -> f64 {
+    body_velocity_covariance(c, motion).trace().max(0.0).sqrt()
+}
+
 /// Standard deviations of a motion: position, m; tilt and yaw about world axes, rad; velocity, m/s; gyro bias,
 /// rad/s; accelerometer bias, m/s².
 #[derive(Clone, Copy, Debug)]

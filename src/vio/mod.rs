@@ -47,9 +47,7 @@ mod zero_velocity;
 
 pub use convergence::{Finding, Findings, Judged, Part};
 pub use health::Health;
-#[cfg(feature = "instruments")]
-pub use predictor::Predicted;
-pub use predictor::Predictor;
+pub use predictor::{Predicted, Predictor};
 
 use crate::config::{BaroConfig, VioConfig};
 use crate::frontend::{Rejected, Tracks};
@@ -59,7 +57,7 @@ use estimator::{Estimator, Step, CONNECTED_FEW};
 use glam::DVec3;
 use health::{quality, Reset, SIGMA_V_UNOBSERVED};
 use height::{Heights, Pushed};
-use inertial::{body_velocity_covariance, Covariance, Motion};
+use inertial::{body_velocity_sigma, Covariance, Motion};
 use initialization::{Initializer, RESECTION_MIN};
 use monitor::Monitor;
 use recovery::Recovery;
@@ -455,10 +453,10 @@ impl Vio {
         self.covariance.as_ref()
     }
 
-    /// Standard deviation of the velocity in the body's frame, m/s, all axes.
+    /// Standard deviation of the newest velocity in the frame of the body, m/s, all axes.
     fn sigma_v(&self) -> Option<f64> {
         let now = &self.estimator.newest()?.now;
-        self.covariance.as_ref().map(|c| body_velocity_covariance(c, now).trace().max(0.0).sqrt())
+        self.covariance.as_ref().map(|c| body_velocity_sigma(c, now))
     }
 
     /// What is estimated of the rig; `None` when nothing is.

@@ -6,28 +6,22 @@
 //! what it finds does not depend on whether it did. What the state's error adds over one more frame
 //! is far below a pixel, since only the motion between the two frames is used.
 //!
-//! For whoever publishes at the inertial unit's rate it carries the newest state itself, with its covariance
-//! (`on_update`, `state_at`): the estimator is a frame's exposure, transfer and computation late, the samples are not.
-//! One prediction integrates the samples since the frame, some 1 µs each.
+//! For whoever publishes between frames it carries the newest state itself, with its covariance (`on_update`, `state_at`):
+//! the estimator is a frame's exposure, transfer and computation late, the samples are not. One prediction integrates the
+//! samples since the frame, or since the last `advance`, some 1 µs each.
 
-use super::inertial::Motion;
+use super::health::{self, Health};
+use super::inertial::{body_velocity_sigma, Covariance, Mat15, Motion};
 use super::preintegration::Noise;
+use super::recovery::DeadReckoning;
 use super::samples::ImuRing;
 use super::shutter::Twist;
-use super::{Known, Odometry};
+use super::{Known, Odometry, Update, FRAME_GAP_MAX};
 use crate::config::VioConfig;
 use crate::limits::CAMERAS_MAX;
 use crate::math::so3;
 use glam::DVec3;
-use stipple_drivers::{Calibration, ImuSample, Nanos, Pose};
-#[cfg(feature = "instruments")]
-use {
-    super::health::Health,
-    super::inertial::{Covariance, Mat15},
-    super::recovery::DeadReckoning,
-    super::{Update, FRAME_GAP_MAX},
-    stipple_drivers::Span,
-};
+use stipple_drivers::{Calibration, ImuSample, Nanos, Pose, Span};
 
 /// Predicts for one tracker, with inertial samples of its own.
 #[derive(Clone, Debug)]
@@ -38,14 +32,15 @@ pub struct Predictor {
     last: Option<Nanos>,
     /// Factors on the readings of gyro and accelerometer, less one.
     scale: [DVec3; 2],
-    #[cfg(feature = "instruments")]
     newest: Option<Newest>,
 }
 
 /// The newest state that the estimator gave.
-#[cfg(feature = "instruments")]
 #[derive(Clone, Copy, Debug)]
 struct Newest {
+    /// Stamp of its frame.
+    frame: Nanos,
+    /// Carried by `advance`.
     state: DeadReckoning,
     is_determined: bool,
     epoch: u32,
@@ -54,7 +49,6 @@ struct Newest {
 }
 
 /// The newest state carried to an instant.
-#[cfg(feature = "instruments")]
 #[derive(Clone, Copy, Debug)]
 pub struct Predicted {
     pub odometry: Odometry,
@@ -74,7 +68,6 @@ impl Predictor {
             imu: ImuRing::new(calibration.imu.rate_hz),
             last: None,
             scale: [DVec3::ZERO; 2],
-            #[cfg(feature = "instruments")]
             newest: None,
         }
     }
@@ -97,10 +90,7 @@ impl Predictor {
     pub fn change_clock(&mut self) {
         self.imu.clear();
         self.last = None;
-        #[cfg(feature = "instruments")]
-        {
-            self.newest = None;
-        }
+        self.newest = None;
     }
 
     /// Places of the cameras on the body as they see the frame at `t`, and how far their rotations may be off, rad; `None` where
@@ -137,14 +127,18 @@ impl Predictor {
     }
 }
 
-/// For whoever publishes; no program does yet, but for the instruments.
-#[cfg(feature = "instruments")]
+/// For whoever publishes.
 impl Predictor {
-    /// Takes what a frame led to; where that is no state there is none to carry until the next.
+    /// Takes what a frame led to; where that is no state there is none to carry until the next. A frame that was refused led to
+    /// nothing, and the one before goes on being carried.
     pub fn on_update(&mut self, update: &Update) {
+        if update.health.has(Health::FRAME_REJECTED) {
+            return;
+        }
         self.newest = update.odometry.or(update.dead_reckoned).map(|o| {
             let c = update.covariance.unwrap_or_default();
             Newest {
+                frame: o.t,
                 state: DeadReckoning { t: o.t, motion: Motion::from(&o), covariance: Mat15::from_fn(|i, j| c[i][j]) },
                 is_determined: update.covariance.is_some(),
                 epoch: update.epoch,
@@ -154,20 +148,37 @@ impl Predictor {
         });
     }
 
+    /// Carries the newest state to `t` for good: what is asked for then, of instants not before `t`, costs the samples since.
+    pub fn advance(&mut self, t: Nanos) {
+        if let Some(newest) = &mut self.newest {
+            if self.imu.covers(newest.state.t) {
+                newest.state.advance(t, &self.imu, &self.noise);
+            }
+        }
+    }
+
     /// The newest state carried to `t` by the samples that came; past them the last is held, with the noise of a gap.
-    /// `None` without a state, before it, `FRAME_GAP_MAX` after it, and where a sample since was overwritten.
+    /// `None` without a state; before it or the last `advance`, or `FRAME_GAP_MAX` after; and where a sample since was
+    /// overwritten. Its quality is the frame's, less what the velocity has become uncertain by since, and none `FRAME_GAP_MAX`
+    /// after the frame: then it is dead reckoning.
     pub fn state_at(&self, t: Nanos) -> Option<Predicted> {
-        let Newest { mut state, is_determined, epoch, health, quality } = self.newest?;
-        let age = t - state.t;
-        if age < Span(0) || age.secs() > FRAME_GAP_MAX || !self.imu.covers(state.t) {
+        let Newest { frame, mut state, is_determined, epoch, mut health, mut quality } = self.newest?;
+        let since = t - state.t;
+        if since < Span(0) || since.secs() > FRAME_GAP_MAX || !self.imu.covers(state.t) {
             return None;
         }
         state.advance(t, &self.imu, &self.noise);
         let covariance: Covariance = std::array::from_fn(|i| std::array::from_fn(|j| state.covariance[(i, j)]));
-        let finite = state.motion.is_finite() && covariance.iter().flatten().all(|c| c.is_finite());
-        let odometry = Odometry::new(t, &state.motion);
+        if !state.motion.is_finite() || !covariance.iter().flatten().all(|c| c.is_finite()) {
+            return None;
+        }
+        quality = quality.min(health::quality(Some(body_velocity_sigma(&covariance, &state.motion)), 1, 1.0));
+        let age = t - frame;
+        if age.secs() > FRAME_GAP_MAX {
+            (health, quality) = (health | Health::DEAD_RECKONED, 0);
+        }
         let covariance = is_determined.then_some(covariance);
-        finite.then_some(Predicted { odometry, covariance, epoch, health, quality, age })
+        Some(Predicted { odometry: Odometry::new(t, &state.motion), covariance, epoch, health, quality, age })
     }
 }
 

@@ -54,7 +54,6 @@ impl ImuRing {
     }
 
     /// Whether no sample after `t` was overwritten.
-    #[cfg(feature = "instruments")]
     pub fn covers(&self, t: Nanos) -> bool {
         self.samples.front().is_some_and(|s| s.t <= t)
     }

@@ -104,7 +104,7 @@ impl First {
     }
 
     fn sigma_v(&self) -> f64 {
-        body_velocity_covariance(&self.covariance, &self.motion).trace().sqrt()
+        body_velocity_sigma(&self.covariance, &self.motion)
     }
 }
 

@@ -17,7 +17,8 @@ pub const STATE: &str = "/state";
 pub const EVENT: &str = "/event";
 pub const COUNTERS: &str = "/counters";
 pub const CLOCKS: &str = "/clocks";
-const CHANNELS: [(&str, &str, &str); 4] = [
+pub const PREDICTED: &str = "/predicted";
+const CHANNELS: [(&str, &str, &str); 5] = [
     (
         STATE,
         "stipple.State",
@@ -35,6 +36,13 @@ const CHANNELS: [(&str, &str, &str); 4] = [
         "stipple.Clocks",
         r#"{"type":"object","properties":{"monotonic_ns":{"type":"integer"},"boottime_ns":{"type":"integer"},
 "realtime_ns":{"type":"integer"},"run_ns":{"type":"integer"}}}"#,
+    ),
+    (
+        PREDICTED,
+        "stipple.PredictedState",
+        r#"{"type":"object","properties":{"t_ns":{"type":"integer"},"age_ns":{"type":"integer"},"epoch":{"type":"integer"},
+"estimate":{"type":"object"},"sigma":{"type":"array","items":{"type":"number"}},"health":{"type":"integer"},
+"quality":{"type":"integer"}}}"#,
     ),
 ];
 /// Bytes of messages that end a chunk before the next sync does, as after a stall of the disk: damage costs whole chunks.
@@ -94,7 +102,7 @@ impl LogFiles {
         let (names, none) = (names.collect(), BTreeMap::new());
         for (topic, name, schema) in CHANNELS {
             let schema = writer.add_schema(name, "jsonschema", schema.as_bytes()).map_err(failed)?;
-            let notes = if topic == STATE { &names } else { &none };
+            let notes = if [STATE, PREDICTED].contains(&topic) { &names } else { &none };
             writer.add_channel(schema, topic, "json", notes).map_err(failed)?;
         }
         self.open = Some(Open { writer, file, good: 0, chunk: 0 });
@@ -118,6 +126,7 @@ impl LogFiles {
         let at = record.at;
         match &record.content {
             Content::State(state) => self.message(STATE, at, Some(state.t_ns), state),
+            Content::Predicted(state) => self.message(PREDICTED, at, Some(state.t_ns), state),
             Content::Event(kind, text) => {
                 let event = Event { kind: *kind, text: String::from_utf8_lossy(text) };
                 self.message(EVENT, at, None, &event)

@@ -18,7 +18,7 @@ mod tests;
 use super::threads;
 use crate::limits::CAMERAS_MAX;
 use crate::mem::{Footprint, List};
-use crate::vio::{Odometry, Update};
+use crate::vio::{Odometry, Predicted, Update};
 use crossbeam_queue::ArrayQueue;
 use file::LogFiles;
 use serde::{Deserialize, Serialize};
@@ -119,12 +119,42 @@ pub struct State {
     pub cpu_ms: f64,
 }
 
+/// A state between frames, carried by inertial samples; what has the name of a field of `State` is the same.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct PredictedState {
+    /// Stamp of the sample that it was carried to, and the time since the frame that it was carried from.
+    pub t_ns: i64,
+    pub age_ns: i64,
+    pub epoch: u32,
+    pub estimate: Estimate,
+    pub sigma: Option<[f32; 9]>,
+    pub health: u32,
+    pub quality: u8,
+}
+
+impl From<&Predicted> for PredictedState {
+    fn from(p: &Predicted) -> PredictedState {
+        PredictedState {
+            t_ns: p.odometry.t.0,
+            age_ns: p.age.0,
+            epoch: p.epoch,
+            estimate: Estimate::from(&p.odometry),
+            sigma: p.covariance.as_ref().map(deviations),
+            health: p.health.0,
+            quality: p.quality,
+        }
+    }
+}
+
+/// Standard deviations of position, velocity and rotation.
+fn deviations(c: &[[f64; 15]; 15]) -> [f32; 9] {
+    [0, 1, 2, 6, 7, 8, 3, 4, 5].map(|i| c[i][i].sqrt() as f32)
+}
+
 impl State {
     pub fn new(t: Nanos, update: &Update, latency_ms: f64, cpu_ms: f64) -> State {
         let estimate = update.odometry.or(update.dead_reckoned).as_ref().map(Estimate::from);
-        // Position, velocity, rotation.
-        let order = [0, 1, 2, 6, 7, 8, 3, 4, 5];
-        let sigma = update.covariance.map(|c| order.map(|i| c[i][i].sqrt() as f32));
+        let sigma = update.covariance.as_ref().map(deviations);
         State {
             t_ns: t.0,
             time_offsets_ns: None,
@@ -190,6 +220,7 @@ impl Clocks {
 
 enum Content {
     State(State),
+    Predicted(PredictedState),
     Event(EventKind, List<u8, TEXT>),
     /// From a thread that may allocate; none that is zero.
     Counters(Vec<(Cow<'static, str>, u64)>),
@@ -230,6 +261,10 @@ pub struct LogSender(Arc<Queue>);
 impl LogSender {
     pub fn state(&self, state: State) {
         self.0.push(Content::State(state));
+    }
+
+    pub fn predicted(&self, state: PredictedState) {
+        self.0.push(Content::Predicted(state));
     }
 
     pub fn event(&self, kind: EventKind, text: &str) {
