@@ -4,7 +4,7 @@
 use std::fs::File;
 use std::io::{self, Write as _};
 use std::os::fd::AsRawFd;
-use std::os::unix::fs::OpenOptionsExt as _;
+use std::os::unix::fs::{FileTypeExt as _, OpenOptionsExt as _};
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -194,17 +194,25 @@ pub fn write_now(fd: i32, bytes: &[u8]) -> bool {
     if sent >= 0 || io::Error::last_os_error().raw_os_error() != Some(libc::ENOTSOCK) {
         return sent == bytes.len() as isize;
     }
-    // A terminal that is ready may have room for a single byte; opened again, it is ours to make non-blocking.
+    // A terminal that is ready may have room for a single byte, and another process may fill a pipe between question and write.
+    // Opened again, either is ours to make non-blocking.
     // SAFETY: a plain integer.
-    if unsafe { libc::isatty(fd) } == 1 {
+    let is_terminal = unsafe { libc::isatty(fd) } == 1;
+    let place = format!("/proc/self/fd/{fd}");
+    if is_terminal || std::fs::metadata(&place).is_ok_and(|m| m.file_type().is_fifo()) {
         let mut options = std::fs::OpenOptions::new();
         options.write(true).custom_flags(libc::O_NONBLOCK | libc::O_NOCTTY);
-        if let Ok(mut terminal) = options.open(format!("/proc/self/fd/{fd}")) {
-            return terminal.write_all(bytes).is_ok();
+        if let Ok(mut file) = options.open(place) {
+            return file.write_all(bytes).is_ok();
         }
     }
+    // That of another user, as behind `su`, cannot be opened: a terminal that holds nothing back has room for a line.
+    let mut waiting = 0;
+    // SAFETY: the integer outlives the call.
+    let mut is_empty = || unsafe { libc::ioctl(fd, libc::TIOCOUTQ, &mut waiting) == 0 && waiting == 0 };
+    let has_room = if is_terminal { is_empty() } else { is_writable(fd, 0) };
     // SAFETY: the bytes outlive the call.
-    is_writable(fd, 0) && unsafe { libc::write(fd, bytes.as_ptr().cast(), bytes.len()) == bytes.len() as isize }
+    has_room && unsafe { libc::write(fd, bytes.as_ptr().cast(), bytes.len()) == bytes.len() as isize }
 }
 
 /// Columns of the terminal that a descriptor is; 80 where it is none.
