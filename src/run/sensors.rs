@@ -10,6 +10,7 @@ use std::sync::Arc;
 use std::thread::JoinHandle;
 use stipple_drivers::counters::Counter;
 use stipple_drivers::gpio::{DataReady, Output, Trigger};
+use stipple_drivers::imu::ImuOptions;
 use stipple_drivers::inject::{FaultyFrames, FaultyImu};
 use stipple_drivers::paced::{Images, Pace, PacedAids, PacedFrames, PacedImu};
 use stipple_drivers::replay::{read_calibration, OpenOptions, Recording};
@@ -176,13 +177,16 @@ impl Source {
         }
     }
 
-    /// Ends of the ranges of gyro and accelerometer, rad/s and m/s²: those that a live unit is set to, else the board's.
+    /// Ends of the ranges of gyro and accelerometer, rad/s and m/s²: those that a live unit is set to, else the board's. Of one
+    /// that the kernel drives the end of its storage is known, which may lie beyond the sensor's: the smaller counts.
     pub fn imu_range(&self, board: &Board) -> [f64; 2] {
+        let asked = board.imu.range();
         let set = match self {
-            Source::Live { sensors, .. } => sensors.imu.range(),
-            Source::Recorded(_) => None,
+            Source::Live { sensors, .. } => sensors.imu.range().unwrap_or(asked),
+            Source::Recorded(_) => asked,
         };
-        set.unwrap_or(board.imu.range())
+        let is_bound = matches!(board.imu.options(), Some(ImuOptions::Iio(_)));
+        std::array::from_fn(|i| if is_bound { set[i].min(asked[i]) } else { set[i] })
     }
 
     /// The sensors; a recording plays in their place.
@@ -389,5 +393,48 @@ impl<S: FrameSource> FrameSource for Triggered<S> {
         let [failed, missed] = &*self.pulses.counts;
         list.extend([("trigger_failures", failed.get()), ("trigger_missed", missed.get())]);
         list
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+
+    struct Unit([f64; 2]);
+
+    impl ImuSource for Unit {
+        fn next(&mut self, _: Span, _: &mut ImuBatch) -> Result<Wait, SourceFault> {
+            Ok(Wait::TimedOut)
+        }
+
+        fn range(&self) -> Option<[f64; 2]> {
+            Some(self.0)
+        }
+    }
+
+    struct NoFrames;
+
+    impl FrameSource for NoFrames {
+        fn next(&mut self, _: Span, _: &mut Frames) -> Result<Wait, SourceFault> {
+            Ok(Wait::TimedOut)
+        }
+    }
+
+    /// ST's gyros end at 2000 °/s and their storage at 2294: readings that were clipped counted as sound. A BMI088 that is
+    /// asked for 16 g is set to 24 g, and means it.
+    #[test]
+    fn the_end_of_a_kernel_devices_storage_is_no_more_than_a_bound() {
+        let lavapipe = include_str!("../../board-configs/lavapipe.toml");
+        let asked = Board::parse("", lavapipe, &[]).unwrap().imu.range();
+        let (wide, narrow) = (asked.map(|end| 1.147 * end), asked.map(|end| 0.5 * end));
+        for (chip, of_wide) in [("iio", asked), ("bmi088", wide)] {
+            let set = [format!("imu.chip={chip}"), "imu.device=mpu6500".into()];
+            let board = Board::parse("", lavapipe, &set).unwrap();
+            for (set, taken) in [(wide, of_wide), (narrow, narrow)] {
+                let sensors = Sensors { frames: Box::new(NoFrames), imu: Box::new(Unit(set)), aids: None };
+                assert_eq!(Source::Live { sensors, rate_hz: 20.0 }.imu_range(&board), taken, "{chip}");
+            }
+        }
     }
 }

@@ -142,9 +142,13 @@ impl Scan {
         (0..3).all(|i| self.elements.iter().any(|(_, e)| e.channel == axis(i)))
     }
 
-    /// End of the range of an axis, in the kernel's units.
+    /// End of what the storage of an axis can hold to either side, in the kernel's units: the sensor's own range may end
+    /// before it. `None` where zero is no value of it.
     pub fn range(&self, axis: Channel) -> Option<f64> {
-        self.elements.iter().find(|(_, e)| e.channel == axis).map(|(_, e)| e.storage.end() * e.scale.abs())
+        let (_, e) = self.elements.iter().find(|(_, e)| e.channel == axis)?;
+        let (least, most) = (if e.storage.signed { -e.storage.end() } else { 0.0 }, e.storage.end());
+        let reach = (most + e.offset).min(-(least + e.offset));
+        (reach > 0.0).then_some(reach * e.scale.abs())
     }
 
     /// The reading of one scan, and its stamp where it has one; `raw` becomes the axes' raw values, accelerometer first.
@@ -231,6 +235,22 @@ mod tests {
         assert!((reading.temperature_c.unwrap() - 20.998).abs() < 1e-3);
         let odd = Scan::new(vec![element(Channel::Other, 0, "le:u8/8>>0", 0.0, 1.0), stamp]);
         assert_eq!((odd.bytes, odd.elements[1].0), (16, 8));
+    }
+
+    /// Values are (raw + offset) * scale: the nearer end counts, and where zero is no value none is known.
+    #[test]
+    fn ranges_reach_as_far_to_either_side() {
+        for (storage, offset, end) in [
+            ("le:s12/16>>4", 0.0, Some(1023.5)),
+            ("le:s12/16>>4", -47.0, Some(1000.0)),
+            ("le:u12/16>>4", -2048.0, Some(1023.5)),
+            ("le:u12/16>>4", -2000.0, Some(1000.0)),
+            ("le:u12/16>>4", 0.0, None),
+            ("le:u12/16>>4", -5000.0, None),
+        ] {
+            let scan = Scan::new(vec![element(Channel::Gyro(0), 0, storage, offset, -0.5)]);
+            assert_eq!(scan.range(Channel::Gyro(0)), end, "{storage} {offset}");
+        }
     }
 
     proptest! {
