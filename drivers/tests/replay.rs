@@ -84,7 +84,13 @@ fn closest_of_two_candidates_is_paired() {
 fn cameras_that_never_meet_are_refused() {
     let f = Folder::new();
     f.write("cam1/data.csv", "1,a.png\n2,b.png\n");
-    f.refused(FaultKind::Data, "mav0", "no image has a partner");
+    let fault = f.refused(FaultKind::Data, "mav0", "no image has a partner");
+    assert!(fault.fix.contains("camera.pair_tolerance_s"), "{fault}");
+}
+
+/// Rows of a camera that has these of a hundred images at 20 Hz.
+fn rows(has: fn(i64) -> bool) -> String {
+    (0..100).filter(|i| has(*i)).map(|i| format!("{0},{0}.png\n", T0 + i * FRAME)).collect()
 }
 
 /// Images of the other camera were dropped as unpaired where a list began late or had a hole, and the recording was refused
@@ -101,9 +107,6 @@ fn while_a_camera_is_away_the_others_go_on() {
         (|i| (20..40).contains(&i), [80, 0, 2], "ended 3.0 s before the others"),
         (|i| !(30..36).contains(&i), [0, 6, 0], "has no partner"),
     ];
-    let rows = |has: fn(i64) -> bool| {
-        (0..100).filter(|i| has(*i)).map(|i| format!("{0},{0}.png\n", T0 + i * FRAME)).collect::<String>()
-    };
     for (has, [absent, unpaired, away], words) in cases {
         for k in 0..2 {
             let f = Folder::new();
@@ -121,15 +124,44 @@ fn while_a_camera_is_away_the_others_go_on() {
     }
 }
 
-/// A frame of its own would make the recording last until then.
+/// A frame of its own would make the recording last until then, and the one image that is missing beside it no pause.
 #[test]
 fn an_image_far_from_all_others_is_dropped_though_the_other_camera_is_away() {
-    for (line, stamp) in [(2, 17), (PAIRS + 1, i64::MAX)] {
+    for (line, stamp, lost) in [(2, 17, 2), (PAIRS + 1, i64::MAX, PAIRS + 1)] {
         let f = Folder::new();
         f.edit("cam0/data.csv", line, |l| format!("{stamp},{}", l.split_once(',').unwrap().1));
         let r = f.open().unwrap();
-        assert_eq!((r.frames.len(), r.counters.images_absent, r.counters.images_unpaired), (PAIRS, 1, 1), "{stamp}");
+        let c = &r.counters;
+        assert_eq!((r.frames.len(), c.images_absent, c.images_unpaired), (PAIRS - 1, 0, 2), "{stamp}");
+        let dropped = format!("cam0/data.csv:{line}: image {stamp} is more than 0.5 s from its camera's others");
+        assert!(r.warnings[0].contains(&dropped), "{:?}", r.warnings);
+        assert!(r.warnings[1].contains(&format!("cam1/data.csv:{lost}: ")), "{:?}", r.warnings);
     }
+    // What is said of a camera that is away is not measured from there.
+    type Case = (fn(i64) -> bool, &'static str);
+    let cases: [Case; 2] = [
+        (|i| i >= 30, "camera 0 began 1.5 s after the others"),
+        (|i| i < 70, "camera 0 ended 1.5 s before the others"),
+    ];
+    for (has, words) in cases {
+        let f = Folder::new();
+        f.write("cam0/data.csv", format!("17,a.png\n{}{},b.png\n", rows(has), i64::MAX));
+        f.write("cam1/data.csv", rows(|_| true));
+        let r = f.open().unwrap();
+        let c = &r.counters;
+        assert_eq!([c.images_absent, c.images_unpaired, c.cameras_away, r.frames.len() as u64], [30, 2, 1, 100]);
+        assert!(r.warnings.iter().any(|w| w.contains(words)), "{words}: {:?}", r.warnings);
+    }
+}
+
+/// Live it is so: a slow camera is not away between its images.
+#[test]
+fn a_camera_is_away_by_its_own_period() {
+    let f = Folder::new();
+    f.write("cam0/data.csv", rows(|_| true));
+    f.write("cam1/data.csv", rows(|i| i % 20 == 0));
+    let r = f.open().unwrap();
+    assert_eq!((r.frames.len(), r.counters.images_unpaired, r.counters.images_absent), (5, 95, 0));
 }
 
 #[test]

@@ -7,7 +7,7 @@ use crate::config::Board;
 use crate::run::sensors::open_recording;
 use std::path::PathBuf;
 use std::sync::Arc;
-use stipple_drivers::replay::{Reader, Recording};
+use stipple_drivers::replay::{FrameFiles, Reader, Recording};
 use stipple_drivers::{Fault, FaultKind, Frames, Nanos};
 
 #[derive(clap::Args)]
@@ -54,9 +54,9 @@ fn rows(recording: &Recording, reader: &mut Reader, board: &Board) -> Check {
     }
     let mut rows = Rows::new(&recording.calibration, board.stereo.disparities);
     let mut frames = Frames::for_rig(&recording.calibration);
-    let (mut unread, looked_at) = (0, PAIRS.min(recording.frames.len()));
-    for k in 0..looked_at {
-        let index = (2 * k + 1) * recording.frames.len() / (2 * looked_at);
+    let (mut unread, pairs) = (0, pairs(&recording.frames));
+    let looked_at = pairs.len();
+    for index in pairs {
         match reader.read(index, &mut frames) {
             Ok(_) => rows.add(&frames),
             Err(_) => unread += 1,
@@ -67,6 +67,14 @@ fn rows(recording: &Recording, reader: &mut Reader, board: &Board) -> Check {
         n => format!("; {n} of {looked_at} pairs cannot be read"),
     };
     rows.check("vertical disparity", &remark, false)
+}
+
+/// The frames to look at. While camera 0 or 1 is away, there are no pairs.
+fn pairs(frames: &[FrameFiles]) -> Vec<usize> {
+    let is_pair = |f: &FrameFiles| f.images.iter().take(2).all(Option::is_some);
+    let whole: Vec<usize> = (0..frames.len()).filter(|i| is_pair(&frames[*i])).collect();
+    let count = PAIRS.min(whole.len());
+    (0..count).map(|k| whole[(2 * k + 1) * whole.len() / (2 * count)]).collect()
 }
 
 /// Frames in order that are followed, from where the gyro turns most.
@@ -95,4 +103,23 @@ fn follow(recording: &Recording, reader: &mut Reader, board: &Board) -> Result<F
         }
     }
     Ok(follower)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use stipple_drivers::replay::ImageFile;
+
+    /// Black images of a camera that is away were matched, too.
+    #[test]
+    fn pairs_are_of_cameras_that_are_there() {
+        let image = Some(ImageFile { path: "a.png".into(), list: PathBuf::from("data.csv").into(), line: 1 });
+        let frame = |k: usize| {
+            let images = (0..3).map(|camera| if k < 84 && camera > 0 { None } else { image.clone() }).collect();
+            FrameFiles { t: Nanos(k as i64), images }
+        };
+        let frames: Vec<FrameFiles> = (0..100).map(frame).collect();
+        assert_eq!(pairs(&frames), [85, 87, 89, 91, 93, 95, 97, 99]);
+        assert_eq!((pairs(&frames[..85]), pairs(&frames[..84])), (vec![84], vec![]));
+    }
 }

@@ -53,8 +53,8 @@ section! {
     stamp: StampPoint = StampPoint::Driver;
     /// Time from the end of the first row's exposure until the last row is received: by so much frame-end stamps are late.
     transfer_s: f64 = 0.0, Bound::Within(0.0, 0.5);
-    /// Largest difference of the stamps of one frame's images, of recordings too. Two milliseconds are for cameras of one
-    /// trigger; two that run freely need up to half a period.
+    /// Largest difference of one frame's images: live of the starts of their exposures or of the ends, in recordings of their
+    /// stamps. Two milliseconds are for cameras of one trigger; two that run freely need up to half a period.
     pair_tolerance_s: f64 = 0.002, Bound::Within(0.0, 1.0);
 }
 

@@ -88,7 +88,7 @@ impl Recording {
             None => calibration::of_recording(&home, &mav0, options.readout, &mut findings)?,
         };
         let lists = pairing::image_lists(&mav0, &calibration, &mut findings)?;
-        let frames = pairing::into_frames(&mav0, &lists, options.pair_tolerance, &mut findings)?;
+        let frames = pairing::into_frames(&mav0, lists, options.pair_tolerance, &mut findings)?;
         let mut imu = read_imu(&mav0.join("imu0/data.csv"), options.imu_hole, &mut findings)?;
         imu.iter_mut().for_each(|s| *s = calibration.imu.correction.apply(s));
         check_cover(&frames, &imu, &mut findings);

@@ -74,25 +74,50 @@ fn list_path(mav0: &Path, camera: usize) -> PathBuf {
     mav0.join(format!("cam{camera}/data.csv"))
 }
 
+/// A camera that gives no image for longer is away, by the median of its periods.
+fn patience(list: &[Row<ImageRow>]) -> Span {
+    let mut steps: Vec<Span> = list.windows(2).map(|w| w[1].value.t - w[0].value.t).collect();
+    let middle = steps.len() / 2;
+    missed_after(if steps.is_empty() { Span(0) } else { *steps.select_nth_unstable(middle).1 })
+}
+
+/// Leaves out images that are far from their camera's others and have no partner, as those of corrupt stamps: a frame of such
+/// a one would make the recording last until then. One camera alone needs no partners.
+fn drop_strays(lists: &mut [Vec<Row<ImageRow>>], tolerance: Span, paths: &[Arc<Path>], findings: &mut Findings) {
+    let stamps: Vec<Vec<Nanos>> = lists.iter().map(|list| list.iter().map(|row| row.value.t).collect()).collect();
+    for (k, list) in lists.iter_mut().enumerate().filter(|_| stamps.len() > 1) {
+        let patience = patience(list);
+        list.retain(|Row { line, value: ImageRow { t, .. } }| {
+            let kept = stamps.iter().enumerate().any(|(camera, of)| {
+                let (itself, reach) = if camera == k { (1, patience) } else { (0, tolerance) };
+                let at = of.partition_point(|s| s < t);
+                let near = |i: usize| of.get(i).is_some_and(|s| (*t - *s).max(*s - *t) <= reach);
+                at > 0 && near(at - 1) || near(at + itself)
+            });
+            if !kept {
+                let far = format!("more than {:.1} s from its camera's others", patience.secs());
+                let what = format!("image {} is {far}, and has no partner: dropped", t.0);
+                findings.warn(|c| &mut c.images_unpaired, &paths[k], *line, what);
+            }
+            kept
+        });
+    }
+}
+
 /// The lists, and how far they were read.
 struct Heads<'a> {
     lists: &'a [Vec<Row<ImageRow>>],
     /// The next image of each camera.
     heads: Vec<usize>,
-    /// A camera that gives nothing for longer is away.
-    patience: Span,
+    /// Each camera's: one that gives nothing for longer is away.
+    patience: Vec<Span>,
     /// The first and the last stamp of all.
     ends: [Nanos; 2],
 }
 
 impl Heads<'_> {
     fn of(lists: &[Vec<Row<ImageRow>>]) -> Heads<'_> {
-        let period = |list: &Vec<Row<ImageRow>>| {
-            let mut steps: Vec<Span> = list.windows(2).map(|w| w[1].value.t - w[0].value.t).collect();
-            let middle = steps.len() / 2;
-            (!steps.is_empty()).then(|| *steps.select_nth_unstable(middle).1)
-        };
-        let patience = missed_after(lists.iter().filter_map(period).min().unwrap_or_default());
+        let patience = lists.iter().map(|list| patience(list)).collect();
         let stamps = || lists.iter().flatten().map(|row| row.value.t);
         let ends = [stamps().min(), stamps().max()].map(Option::unwrap_or_default);
         Heads { lists, heads: vec![0; lists.len()], patience, ends }
@@ -122,15 +147,7 @@ impl Heads<'_> {
     /// Whether a camera is away at `t`, the oldest of the next stamps.
     fn is_away(&self, k: usize, t: Nanos, tolerance: Span) -> bool {
         let gives_none = self.next(k).is_none_or(|next| next - t > tolerance);
-        gives_none && (self.lists[k].is_empty() || self.gap(k) > self.patience)
-    }
-
-    /// Whether the next image of a camera is far from its others, as one of a corrupt stamp is.
-    fn is_stray(&self, k: usize) -> bool {
-        let Some(t) = self.next(k) else { return false };
-        let far =
-            |other: Option<Nanos>| other.is_none_or(|o| (o - t).0.unsigned_abs() > self.patience.0.unsigned_abs());
-        far(self.before(k)) && far(self.after(k))
+        gives_none && (self.lists[k].is_empty() || self.gap(k) > self.patience[k])
     }
 
     /// The line that shows why a camera is away, and what is said of it.
@@ -152,12 +169,14 @@ impl Heads<'_> {
 /// them; any other is unpaired. While a camera is away, as live, the others go on without it.
 pub fn into_frames(
     mav0: &Path,
-    lists: &[Vec<Row<ImageRow>>],
+    mut lists: Vec<Vec<Row<ImageRow>>>,
     tolerance: Span,
     findings: &mut Findings,
 ) -> Result<Vec<FrameFiles>, Fault> {
     let paths: Vec<Arc<Path>> = (0..lists.len()).map(|k| list_path(mav0, k).into()).collect();
-    let mut heads = Heads::of(lists);
+    let recorded = lists.iter().filter(|list| !list.is_empty()).count();
+    drop_strays(&mut lists, tolerance, &paths, findings);
+    let mut heads = Heads::of(&lists);
     // Where each camera stood when it was last said to be away.
     let mut told = vec![None; lists.len()];
     let mut frames = Vec::new();
@@ -166,8 +185,7 @@ pub fn into_frames(
         let newest = cameras.iter().map(|k| heads.next(*k).unwrap_or(Nanos(i64::MAX))).max().unwrap_or(t);
         // Where the oldest camera's next image is closer to the others, it is the partner.
         let next_is_closer = newest > t && heads.after(oldest).is_some_and(|n| n <= newest);
-        let is_stray = !away.is_empty() && cameras.iter().all(|k| heads.is_stray(*k));
-        if newest - t > tolerance || next_is_closer || is_stray {
+        if newest - t > tolerance || next_is_closer {
             let line = lists[oldest][heads.heads[oldest]].line;
             let what = format!("image {} has no partner within {:.4} s: dropped", t.0, tolerance.secs());
             findings.warn(|c| &mut c.images_unpaired, &paths[oldest], line, what);
@@ -191,10 +209,9 @@ pub fn into_frames(
         }
         frames.push(frame);
     }
-    let recorded = lists.iter().filter(|list| !list.is_empty()).count();
     if !frames.iter().any(|f: &FrameFiles| f.images.iter().flatten().count() >= recorded.min(2)) {
         let what = format!("no image has a partner within {:.4} s in another camera", tolerance.secs());
-        let fix = "check that the cameras are synchronised, or raise replay.pair_tolerance_s";
+        let fix = "check that the cameras are synchronised, or raise camera.pair_tolerance_s";
         return Err(Fault::new(FaultKind::Data, mav0.display().to_string(), what, fix));
     }
     Ok(frames)
