@@ -148,7 +148,7 @@ fn a_replay_says_that_cameras_are_swapped_in_every_place() {
 
 #[test]
 fn a_recording_that_loses_a_camera_goes_on_with_the_other() {
-    // Rows of its list that are left: the first is the headline.
+    // Rows of its list that are lost; row 0 is the headline.
     let cases: [(usize, std::ops::Range<usize>, &str); 4] = [
         (1, 42..82, "ended 2.0 s before the others"),
         (0, 42..82, "ended 2.0 s before the others"),

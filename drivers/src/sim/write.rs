@@ -32,11 +32,10 @@ pub fn write_euroc(sim: &mut Sim, dir: &Path, colours: usize, progress: impl FnM
     // Made here, so that no link of somebody else lies in it.
     fs::create_dir(&partial).map_err(|e| cannot(&partial, e))?;
     let written = write_all(sim, &partial.join("mav0"), frames, progress)
-        .and_then(|()| fs::rename(&partial, dir).and_then(|()| sync_folder_of(dir)).map_err(|e| cannot(dir, e)));
-    if written.is_err() {
-        // Best effort: the first error is the one to report.
-        let _ = fs::remove_dir_all(&partial);
-    }
+        .and_then(|()| fs::rename(&partial, dir).map_err(|e| cannot(dir, e)));
+    // Best effort: the first error is the one to report; and a run that is whole and in its place is written, though a folder
+    // that one may write and not read cannot be synced.
+    let _ = if written.is_err() { fs::remove_dir_all(&partial) } else { sync_folder_of(dir) };
     written
 }
 

@@ -6,11 +6,11 @@
 //! one trait, so tests meet each error of each call without a camera.
 //!
 //! Stamps are the driver's, brought to the middle of the exposure of the first row (`stamps::Timing`), which is followed from
-//! frame to frame (`exposure`), and then to the
-//! calibration's clock and middle row, as those of recordings are. A frame is `Got` when every camera has one whose exposure
-//! starts or ends within the tolerance, however much exposures differ; its stamp is the first camera's; an image without a partner is counted and its buffer given back at once. A camera that is unplugged or silent
-//! is closed, and from the next call on looked for by its name and opened again, with growing pauses. Meanwhile the others
-//! go on without it: its image is black, and `away` says why. The rig is `Lost` when no camera is left.
+//! frame to frame (`exposure`), and then to the calibration's clock and middle row, as those of recordings are. A frame is
+//! `Got` when every camera has one whose exposure starts or ends within the tolerance, however much exposures differ; its
+//! stamp is the first camera's; an image without a partner is counted and its buffer given back at once. A camera that is
+//! unplugged or silent is closed, and from the next call on looked for by its name and opened again, with growing pauses.
+//! Meanwhile the others go on without it: its image is black, and `away` says why. The rig is `Lost` when no camera is left.
 //!
 //! Nothing is allocated between opening and losing a camera, except by the JPEG decoder and to word a warning.
 

@@ -236,12 +236,12 @@ impl Rig {
             return false;
         }
         let parts = self.parts();
-        let mut any = false;
+        let (mut any, mut absent) = (false, 0);
         for (camera, image) in frames.images.iter_mut().enumerate() {
             let of = self.streams[camera / parts].as_ref();
             let Some((stream, held)) = of.and_then(|s| Some((s, s.held.front()?))) else {
                 image.pixels.fill(0);
-                self.counters.camera_images_absent += 1;
+                absent += 1;
                 continue;
             };
             let part = Part { x: camera % parts * image.width, ..stream.node.part };
@@ -272,6 +272,7 @@ impl Rig {
         frames.t = t;
         self.last = t;
         self.counters.camera_frames += 1;
+        self.counters.camera_images_absent += absent;
         true
     }
 

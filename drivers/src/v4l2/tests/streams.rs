@@ -185,6 +185,19 @@ fn without_one_camera_the_other_goes_on_and_it_comes_back_by_itself_under_anothe
 }
 
 #[test]
+fn a_lost_cameras_black_images_are_counted_in_frames_alone() {
+    let machine = pair_of_cameras();
+    let (mut rig, mut frames) = opened(&machine);
+    machine.shoot(0, 1..11, |_, _| {});
+    machine.shoot(1, 1..40, |k, s| s.bytes.truncate(if (15..25).contains(&k) { 1 } else { usize::MAX }));
+    take(&mut rig, &mut frames, 10);
+    machine.state().cams[0].present = false;
+    take(&mut rig, &mut frames, 19);
+    assert_is_alone(&frames, 39);
+    assert_eq!((count(&rig, "camera_images_short"), count(&rig, "camera_images_absent")), (10, 19));
+}
+
+#[test]
 fn without_any_camera_the_rig_is_lost_at_once_and_comes_back_by_itself() {
     let machine = pair_of_cameras();
     let (mut rig, mut frames) = opened(&machine);
