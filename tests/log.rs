@@ -6,7 +6,7 @@ mod program;
 #[path = "program/small_disk.rs"]
 mod small_disk;
 
-use program::{children, flight, kill, stipple, text, BOARD};
+use program::{children, flight, kill, shared_library, stipple, text, BOARD};
 use serde_json::Value;
 use small_disk::on_a_small_disk;
 use std::fs;
@@ -152,9 +152,7 @@ fn a_disk_that_fills_ends_the_log_and_not_the_run() {
 fn a_disk_pulled_out_or_made_read_only_ends_the_log_and_not_the_run() {
     let dir = tempfile::tempdir().unwrap();
     let (data, shim) = (flight(dir.path(), "5"), dir.path().join("pulled_disk.so"));
-    let source = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/program/pulled_disk.c");
-    let built = Command::new("cc").args(["-shared", "-fPIC", "-o"]).arg(&shim).arg(source).arg("-ldl").status();
-    assert!(built.unwrap().success());
+    shared_library("tests/program/pulled_disk.c", &[], &shim);
     for (code, name) in [("5", "os error 5"), ("30", "os error 30")] {
         let (out, pulled) = (dir.path().join(code), dir.path().join(format!("pulled-{code}")));
         let mut command = fly(&["run", "--dataset", data.to_str().unwrap()], &out);

@@ -8,7 +8,7 @@ mod panics;
 mod program;
 
 use panics::{panic_after, Panicked};
-use program::{children, flight, kill, signal, stipple, text, BOARD};
+use program::{children, flight, kill, shared_library, signal, stipple, text, BOARD};
 use serde_json::Value;
 use std::fs;
 use std::io::{BufRead, BufReader, Read, Write};
@@ -236,6 +236,10 @@ fn a_terminal_that_takes_no_more_holds_up_nothing() {
     wait_for("the trajectory", || out.join("trajectory.tum").exists().then_some(()));
     wait_for("the report", || out.join("report.json").exists().then_some(()));
     wait_for("the run's end", || has_ended(run));
+    let report = report(&out);
+    // The terminal was full, and the run was stopped before its flight was over.
+    assert!(report["count_lines_lost"].as_u64().is_some_and(|lost| lost > 0), "{report}");
+    assert!(report["frames"].as_u64().unwrap() < 380, "{report}");
     kill(terminal.id(), "CONT");
     terminal.kill().unwrap();
     terminal.wait().unwrap();
@@ -290,11 +294,9 @@ fn a_mapper_that_hangs_is_started_again() {
 fn a_gpu_that_is_lost_is_opened_again() {
     let (dir, out) = folder();
     let (data, flag) = (flight(dir.path(), "10"), dir.path().join("lost"));
-    let source = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/program/lost_gpu.c");
     let shim = dir.path().join("vulkan/libvulkan.so.1");
     fs::create_dir(dir.path().join("vulkan")).unwrap();
-    let built = Command::new("cc").args(["-shared", "-fPIC", "-o"]).arg(&shim).arg(source).arg("-ldl").status();
-    assert!(built.unwrap().success());
+    shared_library("tests/program/lost_gpu.c", &[], &shim);
     let known = Command::new("/sbin/ldconfig").arg("-p").output().unwrap();
     let known = String::from_utf8(known.stdout).unwrap();
     let real =
@@ -340,9 +342,7 @@ const MAPPERS: [&str; 2] = ["mapping", "beat"];
 /// A libgpiod whose lines go nowhere, where a run looks first; both names, so that the machine's is not found.
 fn build_gpio(folder: &Path) {
     fs::create_dir(folder).unwrap();
-    let mut compiler = Command::new("cc");
-    compiler.args(["-shared", "-fPIC", "-DVERSION=1", "drivers/tests/gpio/fake.c", "-o"]);
-    assert!(compiler.arg(folder.join("libgpiod.so.3")).status().unwrap().success());
+    shared_library("drivers/tests/gpio/fake.c", &["-DVERSION=1"], &folder.join("libgpiod.so.3"));
     fs::copy(folder.join("libgpiod.so.3"), folder.join("libgpiod.so.2")).unwrap();
 }
 

@@ -38,6 +38,15 @@ pub fn children(parent: u32) -> Vec<u32> {
     all.filter(|pid| parent_of(pid) == Some(parent)).collect()
 }
 
+/// Compiles a source of tests/program or drivers/tests, with these definitions, into a library that a program can be given.
+#[allow(dead_code)] // not every binary of tests does
+pub fn shared_library(source: &str, definitions: &[&str], to: &Path) {
+    let source = Path::new(env!("CARGO_MANIFEST_DIR")).join(source);
+    let mut compiler = Command::new("cc");
+    compiler.args(["-shared", "-fPIC"]).args(definitions).arg("-o").arg(to).arg(source).arg("-ldl");
+    assert!(compiler.status().unwrap().success(), "{compiler:?}");
+}
+
 #[allow(dead_code)] // not every binary of tests does
 pub fn flight(dir: &Path, seconds: &str) -> PathBuf {
     let out = dir.join("flight");
