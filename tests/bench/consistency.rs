@@ -79,8 +79,8 @@ pub fn bounds(dimensions: f64, flights: usize) -> (f64, f64) {
     (bound(-Z), bound(Z))
 }
 
-fn consistency_of(measured: bool, config: fn(&mut VioConfig), flights: usize) -> Consistency {
-    let plan = Plan { pose: from_rest, biases: Some(BIASES), measured, config, ..Plan::default() };
+fn consistency_of(measured: bool, biases: (f64, f64), config: fn(&mut VioConfig), flights: usize) -> Consistency {
+    let plan = Plan { pose: from_rest, biases: Some(biases), measured, config, ..Plan::default() };
     let mut sums: Vec<(f64, usize)> = vec![(0.0, 0); plan.frames];
     let (mut blocks, mut n, mut undetermined) = ([0.0; 5], 0, 0);
     for seed in 0..flights as u64 {
@@ -127,22 +127,28 @@ fn consistency_of(measured: bool, config: fn(&mut VioConfig), flights: usize) ->
 
 /// NEES of an estimator told the world's own noise, that of the unit as measured.
 pub fn told_the_truth(flights: usize) -> Consistency {
-    consistency_of(true, told, flights)
+    consistency_of(true, BIASES, told, flights)
 }
 
 /// NEES of the same with the figures of the unit stated as those of a data sheet, whose allowance widens what is true.
 pub fn told_a_data_sheet(flights: usize) -> Consistency {
-    consistency_of(false, told, flights)
+    consistency_of(false, BIASES, told, flights)
 }
 
 /// NEES of the default settings with a unit whose noise was measured.
 pub fn at_the_defaults_measured(flights: usize) -> Consistency {
-    consistency_of(true, |_| {}, flights)
+    consistency_of(true, BIASES, |_| {}, flights)
+}
+
+/// NEES of the same with biases as large as the default settings expect.
+pub fn at_the_defaults_expected(flights: usize) -> Consistency {
+    let VioConfig { gyro_bias_sigma, accel_bias_sigma, .. } = VioConfig::default();
+    consistency_of(true, (gyro_bias_sigma, accel_bias_sigma), |_| {}, flights)
 }
 
 /// NEES of the default settings, which claim less than they know.
 pub fn at_the_defaults(flights: usize) -> Consistency {
-    consistency_of(false, |_| {}, flights)
+    consistency_of(false, BIASES, |_| {}, flights)
 }
 
 /// Errors of the frames within a range of quality.
@@ -205,11 +211,12 @@ pub fn by_quality(flights: &[Vec<Record>], ends: &[u8]) -> Vec<Bin> {
 
 /// NEES of estimators that are told the world's own noise, or are at the defaults, with the unit's as measured or as a data
 /// sheet's.
-pub fn summary(all: [&Consistency; 4]) -> Table {
+pub fn summary(all: [&Consistency; 5]) -> Table {
     let names = [
         "told the world's own noise",
         "told, the unit's as a data sheet's",
         "at the defaults, the unit's as measured",
+        "the same, biases as large as expected",
         "at the defaults",
     ];
     let rows = names.into_iter().zip(all);
@@ -252,8 +259,8 @@ pub fn diagram(bins: &[Bin]) -> Table {
     ])
 }
 
-fn page(all: [&Consistency; 4], bins: &[Bin]) -> Page {
-    let [told, _, _, defaults] = all;
+fn page(all: [&Consistency; 5], bins: &[Bin]) -> Page {
+    let [told, _, _, _, defaults] = all;
     let frames: usize = bins.iter().map(|b| b.frames).sum();
     let nees = Chart {
         title: "NEES of 15 errors, mean over the flights",
@@ -314,7 +321,9 @@ pub struct Args {
 
 pub fn run(args: &Args) -> Result<(), Fault> {
     let (out, flights) = (OutputDir::create(&args.out)?, args.flights as usize);
-    let all = [told_the_truth, told_a_data_sheet, at_the_defaults_measured, at_the_defaults].map(|f| f(flights));
+    let settings =
+        [told_the_truth, told_a_data_sheet, at_the_defaults_measured, at_the_defaults_expected, at_the_defaults];
+    let all = settings.map(|f| f(flights));
     let seeds = (flights as u64).div_ceil(10);
     let bins = reliability(&(1..=seeds).flat_map(stability::flights).collect::<Vec<_>>());
     page(all.each_ref(), &bins).write(&out)?;
