@@ -15,7 +15,7 @@ const CELL_MAX: usize = 200;
 /// A cell whose point was rejected is not looked at for so long, s, 16 frames at 20 Hz: a new point of what moves there would
 /// be a landmark before it is rejected too. Chosen from 0 to 2 s on four flights past a person; neighbours differ little.
 const REST: f64 = 0.775;
-/// A frame counts for no longer, s: where one is missing, the points it would have shown are, too.
+/// A frame counts for no longer, s: while frames are missing, no point is looked for either.
 const FRAME_MAX: f64 = 0.05;
 /// Neighbouring pixels of the ring that must differ, and the ring, from the top clockwise.
 const ARC: usize = 9;

@@ -111,8 +111,8 @@ pub fn landmarks_enough(pixels: usize) -> f64 {
 
 /// 0 to 100: `100 min(1, landmarks / enough) / (1 + σ_v / 0.05 m/s)`, with σ_v² the trace of the covariance of the velocity
 /// in the body's frame; zero where that is unknown. The velocity's and not the position's, because odometry's position error only
-/// ever grows; σ_v is by how much it may grow each second: 5 mm at 91, 5 cm at 50, half a metre at 9. A fault that has
-/// not shown yet is in no quality; views that do not fit are (`mod.rs`).
+/// ever grows; σ_v is by how much it may grow each second: 5 mm at 91, 5 cm at 50, half a metre at 9. Quality does not
+/// know of faults that have not shown; `Vio::on_tracks` limits that of frames whose views do not fit.
 pub fn quality(sigma_v: Option<f64>, landmarks: usize, enough: f64) -> u8 {
     let Some(sigma_v) = sigma_v else { return 0 };
     let seen = (landmarks as f64 / enough).min(1.0);

@@ -33,8 +33,8 @@ const REST_GYRO_MEAN: f64 = 0.15;
 const ALIGN_SPAN: f64 = 0.45;
 const ALIGN_FRAMES_MIN: usize = 6;
 const ALIGN_FRAMES_MAX: usize = 64;
-/// Least time between two of them, s, so that they span it at every frame rate.
-const ALIGN_SPACING: f64 = ALIGN_SPAN / ALIGN_FRAMES_MAX as f64;
+/// Least time between two frames of an alignment, s, so that the most of them span `ALIGN_SPAN` at every frame rate.
+const ALIGN_SPACING: f64 = ALIGN_SPAN / (ALIGN_FRAMES_MAX - 1) as f64;
 /// Points a resection needs.
 pub const RESECTION_MIN: usize = 12;
 const RESECTION_ITERATIONS: usize = 12;

@@ -192,7 +192,12 @@ impl Vio {
             self.pending.set(Health::IMU_REJECTED, true);
             return;
         }
-        let gap = self.imu.newest().is_some_and(|n| noise.is_gap((s.t - n.t).secs()));
+        let since = self.imu.newest().map_or(0.0, |n| (s.t - n.t).secs());
+        let gap = noise.is_gap(since);
+        if since > FRAME_GAP_MAX {
+            // One sample held for minutes leads nowhere.
+            self.recovery.interrupt(Span(0));
+        }
         let overwritten = self.imu.push(s);
         self.pending.set(Health::IMU_GAP, gap);
         self.pending.set(Health::IMU_REJECTED, s.doubted);
@@ -314,7 +319,7 @@ impl Vio {
         let resumed = self.recovery.resume(&start, tracks.t, &self.imu, &self.estimator.model.noise);
         let window = window.filter(|_| is_first);
         if window.is_none() {
-            self.estimator.clear();
+            self.clear_estimator();
         }
         let Some(start) = resumed else {
             self.initializer.clear();
@@ -404,7 +409,7 @@ impl Vio {
     /// have moved since.
     pub fn change_clock(&mut self, t: Nanos, unheard: Span) {
         let Some(newest) = self.imu.newest().map(|s| s.t).max(self.last) else { return };
-        self.recovery.change_clock(t - unheard - newest);
+        self.recovery.interrupt(t - unheard - newest);
         self.imu.clear();
         self.estimator.heights.iter_mut().for_each(Heights::forget_readings);
         self.last = None;
@@ -428,13 +433,17 @@ impl Vio {
         let thrown_away = !self.estimator.graph.window.rig.is_sane();
         self.stats.rigs_thrown_away += u64::from(thrown_away);
         self.convergence.restart(thrown_away);
-        self.estimator.clear();
-        self.imu.scale = self.estimator.graph.window.rig.now.imu_scale();
+        self.clear_estimator();
         self.initializer.clear();
         self.monitor = Monitor::default();
         self.covariance = None;
         self.epoch += 1;
         self.stats.add_reset(why);
+    }
+
+    fn clear_estimator(&mut self) {
+        self.estimator.clear();
+        self.imu.scale = self.estimator.graph.window.rig.now.imu_scale();
     }
 
     /// Whether there is odometry: a start was found, and no reset came since.

@@ -11,7 +11,7 @@
 //! samples since the frame, or since the last `advance`, some 1 µs each.
 
 use super::health::{self, Health};
-use super::inertial::{body_velocity_sigma, Covariance, Mat15, Motion};
+use super::inertial::{body_velocity_sigma, Covariance, Motion};
 use super::preintegration::Noise;
 use super::recovery::DeadReckoning;
 use super::samples::ImuRing;
@@ -30,8 +30,6 @@ pub struct Predictor {
     imu: ImuRing,
     /// Stamp of the frame before.
     last: Option<Nanos>,
-    /// Factors on the readings of gyro and accelerometer, less one.
-    scale: [DVec3; 2],
     newest: Option<Newest>,
 }
 
@@ -67,23 +65,20 @@ impl Predictor {
             noise: Noise::new(&calibration.imu, config),
             imu: ImuRing::new(calibration.imu.rate_hz),
             last: None,
-            scale: [DVec3::ZERO; 2],
             newest: None,
         }
     }
 
     /// Takes a sample; refuses what the estimator refuses.
-    pub fn on_imu(&mut self, mut sample: ImuSample) {
-        sample.gyro_body *= 1.0 + self.scale[0];
-        sample.accel_body *= 1.0 + self.scale[1];
+    pub fn on_imu(&mut self, sample: ImuSample) {
         if self.imu.admits(&sample) {
             self.imu.push(sample);
         }
     }
 
-    /// Takes the factors less one by which the readings of samples to come are to be multiplied, as `Vio::known` has them.
+    /// Takes the factors less one by which readings are to be multiplied, as `Vio::known` has them.
     pub fn set_scale(&mut self, scale: [DVec3; 2]) {
-        self.scale = scale;
+        self.imu.scale = scale;
     }
 
     /// Goes over to another clock: forgets samples and frames.
@@ -100,7 +95,7 @@ impl Predictor {
         let cameras = known.cameras?;
         let twist = known.odometry.map_or(Twist::default(), |o| Twist {
             v: o.world_from_body.q.conjugate() * o.v_world,
-            w: self.imu.rate_at(t) - o.gyro_bias,
+            w: self.imu.rate_at(t) * (1.0 + self.imu.scale[0]) - o.gyro_bias,
         });
         let mut places = cameras.body_from_cam;
         for (place, offset) in places.iter_mut().zip(&cameras.time_offsets) {
@@ -117,10 +112,12 @@ impl Predictor {
     pub fn motion_to(&mut self, t: Nanos, state: Option<&Odometry>) -> Option<Pose> {
         let last = self.last.replace(t)?;
         let Some(state) = state.filter(|s| s.t <= t) else {
-            let inc = self.imu.integrate(last, t, DVec3::ZERO, DVec3::ZERO, &self.noise);
+            let inc = self.imu.integrate_scaled(last, t, DVec3::ZERO, DVec3::ZERO, &self.noise);
             return Some(Pose::new(inc.q, DVec3::ZERO));
         };
-        let carry = |from: &Motion, t0, t1| from.propagate(&self.imu.integrate(t0, t1, from.bg, from.ba, &self.noise));
+        let imu = &self.imu;
+        let carry =
+            |from: &Motion, t0, t1| from.propagate(&imu.integrate_scaled(t0, t1, from.bg, from.ba, &self.noise));
         let before = carry(&Motion::from(state), state.t, last.max(state.t));
         let now = carry(&before, last.max(state.t), t);
         Some(before.pose.inverse() * now.pose)
@@ -135,16 +132,13 @@ impl Predictor {
         if update.health.has(Health::FRAME_REJECTED) {
             return;
         }
-        self.newest = update.odometry.or(update.dead_reckoned).map(|o| {
-            let c = update.covariance.unwrap_or_default();
-            Newest {
-                frame: o.t,
-                state: DeadReckoning { t: o.t, motion: Motion::from(&o), covariance: Mat15::from_fn(|i, j| c[i][j]) },
-                is_determined: update.covariance.is_some(),
-                epoch: update.epoch,
-                health: update.health,
-                quality: update.quality,
-            }
+        self.newest = update.odometry.or(update.dead_reckoned).map(|o| Newest {
+            frame: o.t,
+            state: DeadReckoning::new(o.t, &Motion::from(&o), &update.covariance.unwrap_or_default()),
+            is_determined: update.covariance.is_some(),
+            epoch: update.epoch,
+            health: update.health,
+            quality: update.quality,
         });
     }
 
@@ -168,10 +162,7 @@ impl Predictor {
             return None;
         }
         state.advance(t, &self.imu, &self.noise);
-        let covariance: Covariance = std::array::from_fn(|i| std::array::from_fn(|j| state.covariance[(i, j)]));
-        if !state.motion.is_finite() || !covariance.iter().flatten().all(|c| c.is_finite()) {
-            return None;
-        }
+        let covariance = state.covariance()?;
         quality = quality.min(health::quality(Some(body_velocity_sigma(&covariance, &state.motion)), 1, 1.0));
         let age = t - frame;
         if age.secs() > FRAME_GAP_MAX {

@@ -5,8 +5,8 @@
 //! (no frame came, nothing was seen) the carried pose is the best there is, and its covariance, propagated with it,
 //! says how good. Where a restart finds another velocity than the carried state expects, inertia lied meanwhile: the
 //! trusted pose is kept as it was, widened by how far the rig may have come since; so is the first pose of a start that
-//! was given up before anything was trusted. Down is carried by the gyro alone; a
-//! restart that finds another one, for some seconds, is refused, for its accelerometer lies.
+//! was given up before anything was trusted, and the trusted pose before a hole of the samples. Down is carried by the gyro
+//! alone; a restart that finds another one, for some seconds, is refused, for its accelerometer lies.
 
 use super::health::Reset;
 use super::inertial::{Covariance, Mat15, Motion, MotionSigma};
@@ -42,10 +42,11 @@ pub struct Recovery {
     /// Waits for `LAG`, then is the confirmed one.
     candidate: Option<TrustedState>,
     confirmed: Option<TrustedState>,
-    /// The last start, or what was trusted on another clock: where a restart begins while nothing is trusted.
+    /// The last start, or what was trusted on another clock or before a hole of the samples: where a restart begins while
+    /// nothing is trusted.
     started: Option<DeadReckoning>,
-    /// Why there is a restart.
-    reset_by: Reset,
+    /// Something lied before a reset, and nothing was trusted since.
+    suspect: bool,
     /// The last restart was not where dead reckoning had led.
     jumped: bool,
     origin: Origin,
@@ -54,8 +55,8 @@ pub struct Recovery {
 impl Recovery {
     /// An estimate nothing speaks against.
     pub fn trust(&mut self, t: Nanos, motion: &Motion, covariance: &Covariance) {
-        let covariance = Mat15::from_fn(|i, j| covariance[i][j]);
-        let then = DeadReckoning { t, motion: *motion, covariance };
+        self.suspect = false;
+        let then = DeadReckoning::new(t, motion, covariance);
         let newest = TrustedState { then, carried: then };
         match &self.candidate {
             Some(c) if (t - c.then.t).secs() < LAG => {}
@@ -71,20 +72,21 @@ impl Recovery {
 
     /// Why the estimate is given up, and a restart will be needed.
     pub fn reset(&mut self, why: Reset) {
-        self.reset_by = why;
+        self.suspect |= matches!(why, Reset::Disagreement | Reset::State);
     }
 
-    /// Carries what was trusted over to a clock that is `by` ahead. No samples lead on from there.
-    pub fn change_clock(&mut self, by: Span) {
+    /// Carries what was trusted past a hole of the samples, or over to a clock that is `by` ahead. No samples lead on from
+    /// there.
+    pub fn interrupt(&mut self, by: Span) {
         let from = self.trusted().map(|trusted| trusted.then).or(self.started);
         let started = from.map(|from| DeadReckoning { t: from.t + by, ..from });
-        *self = Recovery { started, reset_by: self.reset_by, ..Recovery::default() };
+        *self = Recovery { started, suspect: self.suspect, origin: self.origin, ..Recovery::default() };
     }
 
-    /// Whether the last estimate was given up because something lied: samples, or the estimate, may have been wrong for some
-    /// time before that, and may be still.
+    /// Whether an estimate was given up because something lied, and none was trusted since: samples, or the estimate, may have
+    /// been wrong for some time before that, and may be still.
     pub fn is_suspect(&self) -> bool {
-        matches!(self.reset_by, Reset::Disagreement | Reset::State)
+        self.suspect
     }
 
     /// Carries on as time passes.
@@ -109,9 +111,7 @@ impl Recovery {
         };
         resumed.map(|(mut start, jumped)| {
             self.jumped = jumped;
-            let covariance = start.sigma.covariance(&start.motion);
-            let covariance = Mat15::from_fn(|i, j| covariance[i][j]);
-            self.started = Some(DeadReckoning { t, motion: start.motion, covariance });
+            self.started = Some(DeadReckoning::new(t, &start.motion, &start.sigma.covariance(&start.motion)));
             self.origin = Origin::split(&mut start);
             start
         })
@@ -132,9 +132,7 @@ impl Recovery {
     pub fn dead_reckoned(&self, t: Nanos, imu: &ImuRing, noise: &Noise) -> Option<(Motion, Covariance)> {
         let mut carried = self.trusted()?.carried;
         carried.advance(t, imu, noise);
-        let covariance: Covariance = std::array::from_fn(|i| std::array::from_fn(|j| carried.covariance[(i, j)]));
-        let finite = carried.motion.is_finite() && covariance.iter().flatten().all(|c| c.is_finite());
-        finite.then_some((carried.motion, covariance))
+        carried.covariance().map(|covariance| (carried.motion, covariance))
     }
 
     fn trusted(&self) -> Option<TrustedState> {
@@ -243,8 +241,7 @@ pub struct DeadReckoning {
 
 /// Standard deviations of a motion, each along the axis on which it is largest.
 pub fn deviations(motion: &Motion, covariance: &Covariance) -> MotionSigma {
-    let covariance = Mat15::from_fn(|i, j| covariance[i][j]);
-    DeadReckoning { t: Nanos(0), motion: *motion, covariance }.sigmas()
+    DeadReckoning::new(Nanos(0), motion, covariance).sigmas()
 }
 
 /// Derivative of the motion after an increment to the motion before it.
@@ -265,6 +262,16 @@ fn transition(from: &Motion, inc: &Increment) -> Mat15 {
 }
 
 impl DeadReckoning {
+    pub fn new(t: Nanos, motion: &Motion, covariance: &Covariance) -> DeadReckoning {
+        DeadReckoning { t, motion: *motion, covariance: Mat15::from_fn(|i, j| covariance[i][j]) }
+    }
+
+    /// Its covariance; `None` where motion or covariance is not finite.
+    pub fn covariance(&self) -> Option<Covariance> {
+        let finite = self.motion.is_finite() && self.covariance.iter().all(|c| c.is_finite());
+        finite.then(|| std::array::from_fn(|i| std::array::from_fn(|j| self.covariance[(i, j)])))
+    }
+
     /// Carries it on to `t`; an instant that is not later changes nothing.
     pub fn advance(&mut self, t: Nanos, imu: &ImuRing, noise: &Noise) {
         if t <= self.t {

@@ -39,6 +39,12 @@ impl Pilot {
         self.vio.on_tracks(&tracks)
     }
 
+    /// Loses all frames and samples of so many frames.
+    fn lose(&mut self, frames: usize) {
+        self.frame += frames;
+        self.sample += (frames as f64 * FRAME_SECS * RATE_HZ).round() as usize;
+    }
+
     /// The first state of the next start, and its covariance.
     fn start(&mut self) -> (Odometry, Covariance) {
         let state = |u: Update| u.odometry.zip(u.covariance);
@@ -68,6 +74,34 @@ fn restart_before_anything_was_trusted_is_as_uncertain_as_the_way_since() {
     let (error, sigma) = (error_m(&first, &again), sigma_p(&covariance));
     eprintln!("{error:.2} m after {:.2} s, stated {sigma:.2} m", (again.t - first.t).secs());
     assert!(error > 0.1 && error < 3.0 * sigma && sigma < 1.5);
+}
+
+/// The last sample before the hole, held for a hundred seconds, led some kilometres away.
+#[test]
+fn restart_after_a_hole_of_the_samples_is_where_it_was_and_as_uncertain_as_the_way_since() {
+    let mut pilot = Pilot::new(&VioConfig::default(), 1.0);
+    let known = (0..60).filter_map(|_| pilot.next(true).odometry).last().expect("it flies");
+    pilot.lose(2000);
+    let update = pilot.next(true);
+    assert!(update.health.has(Health::FRAME_GAP_RESET) && update.dead_reckoned.is_none(), "{update:?}");
+    let (again, covariance) = pilot.start();
+    let (error, sigma) = (error_m(&known, &again), sigma_p(&covariance));
+    eprintln!("{error:.2} m off, stated {sigma:.2} m");
+    assert!(again.world_from_body.p.distance(known.world_from_body.p) < 0.2);
+    assert!(error < 3.0 * sigma && sigma > 10.0);
+}
+
+#[test]
+fn restart_after_a_lie_is_suspect_until_it_is_trusted_whatever_resets_it_meanwhile() {
+    let mut pilot = Pilot::new(&VioConfig::default(), 1.0);
+    (0..60).for_each(|_| _ = pilot.next(true));
+    pilot.vio.reset_for(Reset::Disagreement);
+    pilot.start();
+    pilot.vio.reset_for(Reset::FrameGap);
+    pilot.start();
+    assert!(pilot.next(true).quality <= QUALITY_SUSPECT);
+    let last = (0..40).map(|_| pilot.next(true)).last().expect("frames");
+    assert!(last.quality > QUALITY_SUSPECT, "{last:?}");
 }
 
 #[test]

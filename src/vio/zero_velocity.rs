@@ -27,9 +27,10 @@ const SIGMA_GYRO: f64 = 2e-3;
 const COMMON_MIN: usize = 12;
 
 /// Time by which the frame that is held is older than the newest, which stands too, s, two frames at 20 Hz: a rig that
-/// gathers way is seen to only after a tenth of a second, and held meanwhile it costs a single camera its scale.
-const LAG: f64 = 0.075;
-/// It is as many frames older at least; as many states are in every window.
+/// gathers way is seen to only after a tenth of a second, and held meanwhile it costs a single camera its scale. No multiple
+/// of a common frame period, so that jitter of the stamps does not change which frame is held.
+const LAG: f64 = 0.0725;
+/// The frame that is held is as many frames older than the newest at least; every window has as many states.
 const LAG_FRAMES: usize = 2;
 
 /// What counts as rest.
