@@ -1,5 +1,5 @@
 //! The sensors of a live run, and how they are wired: `[rig]`, `[camera]`, `[imu]`, `[baro]`, `[gpio]`, `[record]`, `[log]`.
-//! Replays read `rig.readout_s`, `rig.masks`, `camera.pair_tolerance_s` and `[baro]` alone.
+//! Replays read `rig.readout_s`, `rig.masks`, `camera.pair_tolerance_s`, `[baro]` and `[log]` alone.
 
 use super::section::{section, Bound};
 use serde::Deserialize;
@@ -133,8 +133,8 @@ section! {
 section! {
     /// The log of a run.
     LogConfig, "log.";
-    /// States a second that are carried by the inertial samples to the newest of them, between frames and while no frame comes;
-    /// 0: none. Each takes some 500 bytes of the log.
+    /// Rate at which the newest state, carried by the inertial samples to the newest of them, is logged on /predicted, between
+    /// frames and while none comes: one a sample at most, of odometry in real time; 0: none. Each takes 500 bytes.
     predicted_hz: f64 = 0.0, Bound::Within(0.0, 1000.0);
 }
 

@@ -7,20 +7,29 @@
 use super::gate::{Clock, Stream};
 use super::log::LogSender;
 use crate::config::VioConfig;
-use crate::vio::{Predictor, Update};
-use crossbeam_queue::ArrayQueue;
+use crate::vio::{Health, Predictor, Update};
 use glam::DVec3;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 use stipple_drivers::{Calibration, ImuSample, Nanos, Span};
 
-/// What the estimator last gave, with its factors, less one, on the readings of gyro and accelerometer.
+/// What the estimator gave, and its factors, less one, on the readings of gyro and accelerometer.
+type Given = (Update, [DVec3; 2]);
+
+/// What it gave last.
 #[derive(Clone)]
-pub struct Newest(Arc<ArrayQueue<(Update, [DVec3; 2])>>);
+pub struct Newest(Arc<Mutex<Option<Given>>>);
 
 impl Newest {
-    /// Replaces what was not taken yet.
+    /// Replaces what was not taken yet. A frame that was refused replaces nothing.
     pub fn set(&self, update: &Update, imu_scale: [DVec3; 2]) {
-        self.0.force_push((*update, imu_scale));
+        if !update.health.has(Health::FRAME_REJECTED) {
+            *self.0.lock().unwrap_or_else(PoisonError::into_inner) = Some((*update, imu_scale));
+        }
+    }
+
+    /// Takes it without waiting: where it is being replaced, it is there at the next sample.
+    fn take(&self) -> Option<Given> {
+        self.0.try_lock().ok()?.take()
     }
 }
 
@@ -38,7 +47,7 @@ impl Publisher {
     /// A publisher of `rate_hz` states a second at most.
     pub fn new(calibration: &Calibration, vio: &VioConfig, rate_hz: f64) -> Publisher {
         Publisher {
-            newest: Newest(Arc::new(ArrayQueue::new(1))),
+            newest: Newest(Arc::default()),
             log: None,
             predictor: Predictor::new(calibration, vio),
             clock: Clock::default(),
@@ -50,11 +59,11 @@ impl Publisher {
     /// Takes a sample, and logs the state at its stamp where one is due.
     pub fn on_imu(&mut self, sample: ImuSample) {
         let t = sample.t;
+        let update = self.newest.take();
         if self.clock.went_back(Stream::Samples, t) {
             self.predictor.change_clock();
             self.due = None;
-        }
-        if let Some((update, scale)) = self.newest.0.pop() {
+        } else if let Some((update, scale)) = update {
             self.predictor.set_scale(scale);
             self.predictor.on_update(&update);
         }

@@ -8,7 +8,7 @@
 //! `SYNC_PERIOD`, rotated by size, and never removed or overwritten: another run in the same folder numbers on, and each file
 //! names its run. Where the disk has less room than a floor, or refuses a write, logging ends, with a notice and a counter;
 //! what was written stays as it is and the run goes on. MCAP with messages in JSON: Foxglove and `mcap cat --json` show it,
-//! and at 30 frames a second it takes 23 kB/s.
+//! and at 30 frames a second it takes 23 kB/s, 0.5 kB more for each state between frames (`log.predicted_hz`).
 
 mod file;
 pub mod read;
@@ -263,8 +263,13 @@ impl LogSender {
         self.0.push(Content::State(state));
     }
 
+    /// Half of the queue is left to what comes once a frame, and to events.
     pub fn predicted(&self, state: PredictedState) {
-        self.0.push(Content::Predicted(state));
+        if self.0.records.len() < QUEUE / 2 {
+            self.0.push(Content::Predicted(state));
+        } else {
+            self.0.counts.log_records_lost.add(1);
+        }
     }
 
     pub fn event(&self, kind: EventKind, text: &str) {
