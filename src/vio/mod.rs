@@ -195,7 +195,8 @@ impl Vio {
         let since = self.imu.newest().map_or(0.0, |n| (s.t - n.t).secs());
         let gap = noise.is_gap(since);
         if since > FRAME_GAP_MAX {
-            // One sample held for minutes leads nowhere.
+            // One sample held for minutes leads nowhere: what is dead-reckoned meanwhile goes back to where it was trusted.
+            self.epoch += u32::from(!self.is_running() && !self.recovery.is_first());
             self.recovery.interrupt(Span(0));
         }
         let overwritten = self.imu.push(s);

@@ -72,6 +72,10 @@ impl Predictor {
     /// Takes a sample; refuses what the estimator refuses.
     pub fn on_imu(&mut self, sample: ImuSample) {
         if self.imu.admits(&sample) {
+            if self.imu.newest().is_some_and(|n| (sample.t - n.t).secs() > FRAME_GAP_MAX) {
+                // One sample held for minutes leads nowhere.
+                self.change_clock();
+            }
             self.imu.push(sample);
         }
     }
@@ -81,7 +85,7 @@ impl Predictor {
         self.imu.scale = scale;
     }
 
-    /// Goes over to another clock: forgets samples and frames.
+    /// Goes over to another clock, or past a gap of the samples: forgets samples and frames.
     pub fn change_clock(&mut self) {
         self.imu.clear();
         self.last = None;
@@ -132,7 +136,9 @@ impl Predictor {
         if update.health.has(Health::FRAME_REJECTED) {
             return;
         }
-        self.newest = update.odometry.or(update.dead_reckoned).map(|o| Newest {
+        // A stamp so far ahead is of a clock that was.
+        let is_ahead = |t: Nanos| self.imu.newest().is_some_and(|n| (t - n.t).secs() > FRAME_GAP_MAX);
+        self.newest = update.odometry.or(update.dead_reckoned).filter(|o| !is_ahead(o.t)).map(|o| Newest {
             frame: o.t,
             state: DeadReckoning::new(o.t, &Motion::from(&o), &update.covariance.unwrap_or_default()),
             is_determined: update.covariance.is_some(),
@@ -153,8 +159,8 @@ impl Predictor {
 
     /// The newest state carried to `t` by the samples that came; past them the last is held, with the noise of a gap.
     /// `None` without a state; before it or the last `advance`, or `FRAME_GAP_MAX` after; and where a sample since was
-    /// overwritten. Its quality is the frame's, less what the velocity has become uncertain by since, and none `FRAME_GAP_MAX`
-    /// after the frame: then it is dead reckoning.
+    /// overwritten. Its quality is the frame's, less what the velocity has become uncertain by since, and 0 from
+    /// `FRAME_GAP_MAX` after the frame on: then it is dead reckoning.
     pub fn state_at(&self, t: Nanos) -> Option<Predicted> {
         let Newest { frame, mut state, is_determined, epoch, mut health, mut quality } = self.newest?;
         let since = t - state.t;

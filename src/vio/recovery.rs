@@ -13,6 +13,7 @@ use super::inertial::{Covariance, Mat15, Motion, MotionSigma};
 use super::initialization::{Start, GAUGE_SIGMA};
 use super::preintegration::{Increment, Noise};
 use super::samples::ImuRing;
+use super::FRAME_GAP_MAX;
 use crate::math::block::{put, vector};
 use crate::math::so3;
 use glam::{DMat3, DQuat, DVec3};
@@ -128,8 +129,9 @@ impl Recovery {
     }
 
     /// After a reset, what a restart would resume from, carried to `t`, and its covariance. `None` where nothing was
-    /// trusted before, or nothing finite came of it.
+    /// trusted before, nothing finite came of it, or no sample came for `FRAME_GAP_MAX`.
     pub fn dead_reckoned(&self, t: Nanos, imu: &ImuRing, noise: &Noise) -> Option<(Motion, Covariance)> {
+        imu.newest().filter(|n| (t - n.t).secs() <= FRAME_GAP_MAX)?;
         let mut carried = self.trusted()?.carried;
         carried.advance(t, imu, noise);
         carried.covariance().map(|covariance| (carried.motion, covariance))

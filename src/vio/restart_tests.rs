@@ -91,6 +91,22 @@ fn restart_after_a_hole_of_the_samples_is_where_it_was_and_as_uncertain_as_the_w
     assert!(error < 3.0 * sigma && sigma > 10.0);
 }
 
+/// The frame comes before the samples do, and before the start: nothing is known but where it was.
+#[test]
+fn nothing_is_dead_reckoned_across_a_gap_of_the_samples() {
+    let mut pilot = Pilot::new(&VioConfig::default(), 1.0);
+    (0..60).for_each(|_| _ = pilot.next(true));
+    pilot.vio.reset();
+    let before = pilot.next(false);
+    assert!(before.dead_reckoned.is_some());
+    let mut tracks = Tracks::default();
+    pilot.world.tracks(before.dead_reckoned.map_or(0.0, |o| o.t.0 as f64 * 1e-9) + 60.0, &mut tracks);
+    assert!(pilot.vio.clone().on_tracks(&tracks).dead_reckoned.is_none());
+    pilot.lose(1200);
+    let after = pilot.next(false);
+    assert!(after.dead_reckoned.is_none() && after.epoch == before.epoch + 1, "{after:?}");
+}
+
 #[test]
 fn restart_after_a_lie_is_suspect_until_it_is_trusted_whatever_resets_it_meanwhile() {
     let mut pilot = Pilot::new(&VioConfig::default(), 1.0);

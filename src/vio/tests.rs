@@ -379,6 +379,10 @@ fn prediction_meets_the_next_estimate() {
     assert!(predictor.state_at(last.t - Span(1)).is_none() && predictor.state_at(t + Span::from_secs(3.0)).is_none());
     let [before_v, v] = [covariance, carried.covariance].map(|c| c.expect("it is determined")[6][6]);
     assert!(v > before_v, "samples have noise");
+    let mut past_a_gap = predictor.clone();
+    past_a_gap.on_imu(ImuSample { t: t + Span::from_secs(60.0), ..vio.imu.newest().copied().expect("samples") });
+    past_a_gap.advance(t + Span::from_secs(60.0));
+    assert!(past_a_gap.state_at(t + Span::from_secs(60.0)).is_none(), "one sample held for a minute leads nowhere");
     let predicted = carried.odometry;
     predictor.motion_to(last.t, None);
     let motion = predictor.motion_to(t, before.as_ref()).expect("a second frame");
