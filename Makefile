@@ -1,6 +1,6 @@
 # Two commands for a newcomer on Debian 12 with git, make and a Rust toolchain:
 #   make demo    fly and map a simulated room, write out/demo/report.html
-#   make test    run every test
+#   make test    run the tests that need neither hours nor other hardware
 # Both install what is missing (the list below, with sudo when not root) and say so.
 
 # The one place where Debian packages are listed:
