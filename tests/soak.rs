@@ -284,6 +284,33 @@ fn resources(pid: u32) -> Option<[u64; 3]> {
     Some([1024 * kib, std::fs::read_dir(format!("/proc/{pid}/fd")).ok()?.count() as u64, threads])
 }
 
+/// What the log has of a frame: when its state was there, its stamp, and the milliseconds that tracking it took, of the clock
+/// and of a processor.
+struct Seen {
+    at: Nanos,
+    stamp: Nanos,
+    latency_ms: f64,
+    cpu_ms: f64,
+}
+
+/// Says of the gaps among the states of the second before `until` whether tracking was late in them, or what it is given.
+fn say_late(seen: &[Seen], until: Nanos, speed: f64) {
+    let since_due = |s: &Seen| s.at.0 as f64 - (s.stamp - seen[0].stamp).0 as f64 / speed;
+    let least = seen.iter().map(since_due).fold(f64::INFINITY, f64::min);
+    let late = |s: &Seen| (since_due(s) - least) / 1e6;
+    let near = seen.partition_point(|s| (until - s.at).secs() > 1.5)..seen.partition_point(|s| s.at < until);
+    for k in near {
+        let Some([one, next]) = seen.get(k..k + 2) else { continue };
+        if (next.stamp - one.stamp).secs() < 0.075 {
+            continue;
+        }
+        for s in &seen[k.saturating_sub(2)..(k + 4).min(seen.len())] {
+            let (stamp, late, took, cpu) = ((s.stamp - seen[0].stamp).secs(), late(s), s.latency_ms, s.cpu_ms);
+            eprintln!("  frame of {stamp:.2} s: its state came {late:.1} ms late, took {took:.1} ms, {cpu:.1} of them computing");
+        }
+    }
+}
+
 /// A thread on each processor that does nothing but ask, at the highest priority of all, whether the machine runs: where a
 /// host takes a processor of a virtual machine away, no program on it can be in time.
 struct Witness {
@@ -411,10 +438,12 @@ fn a_flight_of_hours_takes_no_more_memory_files_and_threads() {
     let frames = report["frames"].as_u64().unwrap();
     let counted = report.as_object().unwrap().iter().filter(|(_, n)| n.as_u64() != Some(0));
     let counted: Vec<_> = counted.filter_map(|(name, n)| Some((name.strip_prefix("count_")?, n))).collect();
-    let (mut logged, mut overwritten, mut losses) = (0, 0, vec![]);
+    let (mut seen, mut overwritten, mut losses) = (vec![], 0, vec![]);
     read_files(&runs(&out).unwrap()[0].files, |at, message| {
         match message {
-            Message::State(_) => logged += 1,
+            Message::State(s) => {
+                seen.push(Seen { at, stamp: Nanos(s.t_ns), latency_ms: s.latency_ms, cpu_ms: s.cpu_ms });
+            }
             Message::Counters(counters) => {
                 let now = counters.get("frames_overwritten").copied().unwrap_or(0);
                 losses.extend((now > overwritten).then_some((at, now - overwritten)));
@@ -425,6 +454,7 @@ fn a_flight_of_hours_takes_no_more_memory_files_and_threads() {
         Ok(())
     })
     .unwrap();
+    let logged = seen.len() as u64;
     eprintln!("flown {:.0} s in {minutes} minutes: {frames} frames, {logged} in the log", frames as f64 / 20.0);
     // Counters tell within a second what a pause of the machine cost.
     let mut excused = 0;
@@ -438,6 +468,7 @@ fn a_flight_of_hours_takes_no_more_memory_files_and_threads() {
         eprintln!(
             "{lost} frames were overwritten within a second of {s:.1} s; threads that do nothing paused {ms:?} ms"
         );
+        say_late(&seen, at, speed);
         let excuse = paused.iter().map(|p| (p.0 / frame_period.0 + 1) as u64).sum();
         excused += if has_priority { lost.min(excuse) } else { 0 };
     }
