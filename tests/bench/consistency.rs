@@ -59,6 +59,8 @@ pub struct Consistency {
     pub mean: f64,
     /// NEES of position, rotation, velocity, gyro and accelerometer bias: three dimensions each.
     pub blocks: [f64; 5],
+    /// The same by second since the start.
+    pub by_second: Vec<[f64; 5]>,
     /// 95 % of the means at one instant lie between these.
     pub bounds: (f64, f64),
     /// Share of the instants that do.
@@ -82,7 +84,8 @@ pub fn bounds(dimensions: f64, flights: usize) -> (f64, f64) {
 fn consistency_of(measured: bool, biases: (f64, f64), config: fn(&mut VioConfig), flights: usize) -> Consistency {
     let plan = Plan { pose: from_rest, biases: Some(biases), measured, config, ..Plan::default() };
     let mut sums: Vec<(f64, usize)> = vec![(0.0, 0); plan.frames];
-    let (mut blocks, mut n, mut undetermined) = ([0.0; 5], 0, 0);
+    let mut by_second: Vec<([f64; 5], usize)> = vec![];
+    let (mut n, mut undetermined) = (0, 0);
     for seed in 0..flights as u64 {
         let mut to_estimate = None;
         let mut start = None;
@@ -102,7 +105,10 @@ fn consistency_of(measured: bool, biases: (f64, f64), config: fn(&mut VioConfig)
             undetermined -= 1;
             let at = &mut sums[seen.frame - first];
             (at.0, at.1, n) = (at.0 + vector.dot(&factor.solve(&vector)), at.1 + 1, n + 1);
-            for (b, sum) in blocks.iter_mut().enumerate() {
+            by_second.resize(by_second.len().max((seen.frame - first) / SECOND + 1), ([0.0; 5], 0));
+            let (sums, count) = &mut by_second[(seen.frame - first) / SECOND];
+            *count += 1;
+            for (b, sum) in sums.iter_mut().enumerate() {
                 let block = Matrix3::from_fn(|i, j| c[3 * b + i][3 * b + j]);
                 let e = Vector3::new(e[b].x, e[b].y, e[b].z);
                 *sum += block.cholesky().map_or(0.0, |f| e.dot(&f.solve(&e)));
@@ -117,7 +123,8 @@ fn consistency_of(measured: bool, biases: (f64, f64), config: fn(&mut VioConfig)
     Consistency {
         flights,
         mean: sums.iter().map(|s| s.0).sum::<f64>() / f64::from(n.max(1)),
-        blocks: blocks.map(|b| b / f64::from(n.max(1))),
+        blocks: std::array::from_fn(|b| by_second.iter().map(|(sums, _)| sums[b]).sum::<f64>() / f64::from(n.max(1))),
+        by_second: by_second.iter().map(|(sums, n)| sums.map(|sum| sum / *n as f64)).collect(),
         bounds,
         within: inside as f64 / over_time.len().max(1) as f64,
         undetermined,
@@ -246,6 +253,18 @@ fn by_instant(told: &Consistency, defaults: &Consistency) -> Table {
     ])
 }
 
+fn by_second(told: &Consistency) -> Table {
+    let rows = told.by_second.iter().enumerate();
+    table!("nees-by-second", "NEES by second since the start, told the world's own noise", rows, |r| false, [
+        count("from") => r.0,
+        number("position of 3", "", 2) => r.1[0],
+        number("rotation of 3", "", 2) => r.1[1],
+        number("velocity of 3", "", 2) => r.1[2],
+        number("gyro bias of 3", "", 2) => r.1[3],
+        number("accelerometer bias of 3", "", 2) => r.1[4],
+    ])
+}
+
 pub fn diagram(bins: &[Bin]) -> Table {
     table!("reliability", "By quality", bins, |b| false, [
         count("quality from") => b.from,
@@ -301,6 +320,7 @@ fn page(all: [&Consistency; 5], bins: &[Bin]) -> Page {
             Part::Note("At the defaults the estimator claims less than it knows, on purpose.".into()),
             Part::Charts("Consistency", vec![nees.svg()]),
             Part::Table(summary(all)),
+            Part::Table(by_second(told)),
             Part::Charts("Quality against actual error", vec![drift, velocity]),
             Part::Table(diagram(bins)),
             Part::Table(by_instant(told, defaults)),
@@ -327,8 +347,9 @@ pub fn run(args: &Args) -> Result<(), Fault> {
     let seeds = (flights as u64).div_ceil(10);
     let bins = reliability(&(1..=seeds).flat_map(stability::flights).collect::<Vec<_>>());
     page(all.each_ref(), &bins).write(&out)?;
-    println!("{}\n\n{}", summary(all.each_ref()).text(), diagram(&bins).text());
-    println!("\n{}", out.file("consistency.html").display());
+    let tables = [summary(all.each_ref()), by_second(&all[0]), diagram(&bins)];
+    tables.iter().for_each(|table| println!("{}\n", table.text()));
+    println!("{}", out.file("consistency.html").display());
     Ok(())
 }
 
