@@ -12,7 +12,7 @@ use std::sync::{Arc, OnceLock};
 use stipple::config::{FrontendConfig, VioConfig};
 use stipple::frontend::{Frontend, Prediction, Tracks};
 use stipple::output::metrics::trajectory_error;
-use stipple::vio::instruments::RigEstimate;
+use stipple::vio::RigEstimate;
 use stipple::vio::{Finding, Known, Part, Predictor, Vio};
 use stipple_drivers::sim::{rig_named, Scenario, Sim};
 use stipple_drivers::{Calibration, Frames, ImuSample, Pose, Span, TimedPose};

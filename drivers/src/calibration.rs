@@ -53,6 +53,12 @@ impl RigCamera {
         self.masks.iter().any(|m| within(x, m.left, m.right) && within(y, m.top, m.bottom))
     }
 
+    /// Pixels in which the vehicle is not in view.
+    pub fn pixels(&self) -> usize {
+        let free = |y: usize| (0..self.camera.width).filter(|x| !self.is_masked(*x as f64, y as f64)).count();
+        (0..self.camera.height).map(free).sum()
+    }
+
     /// The instant of an image's middle row in the inertial unit's clock, from the camera's own stamp.
     pub fn to_imu_clock(&self, t: Nanos) -> Nanos {
         t + self.time_offset + Span(self.readout.0 / 2)

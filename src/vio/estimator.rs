@@ -28,7 +28,7 @@ use glam::DVec3;
 use stipple_drivers::{Calibration, Nanos};
 
 /// A keyframe is declared at once when fewer landmarks than this are in view.
-pub const CONNECTED_FEW: usize = 20;
+const CONNECTED_FEW: usize = 20;
 /// Speed above which the vehicle counts as moving, m/s: more than the error of the first estimates of a start at rest.
 const MOVING: f64 = 0.3;
 /// A state this far from sense is a failure: m/s, m/s², rad/s.

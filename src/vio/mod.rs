@@ -48,20 +48,20 @@ mod zero_velocity;
 pub use convergence::{Finding, Findings, Judged, Part};
 pub use health::Health;
 pub use predictor::{Predicted, Predictor};
+pub use rig::RigEstimate;
 
 use crate::config::{BaroConfig, VioConfig};
 use crate::frontend::{Rejected, Tracks};
 use crate::limits::CAMERAS_MAX;
 use convergence::Convergence;
-use estimator::{Estimator, Step, CONNECTED_FEW};
+use estimator::{Estimator, Step};
 use glam::DVec3;
-use health::{quality, Reset, SIGMA_V_UNOBSERVED};
+use health::{quality, Reset, FEW, SIGMA_V_UNOBSERVED};
 use height::{Heights, Pushed};
 use inertial::{body_velocity_sigma, Covariance, Motion};
 use initialization::{Initializer, RESECTION_MIN};
 use monitor::Monitor;
 use recovery::Recovery;
-use rig::RigEstimate;
 use samples::ImuRing;
 use stats::{Stats, Tally};
 use stipple_drivers::source::{Aid, AidReading};
@@ -397,7 +397,7 @@ impl Vio {
         h.set(Health::IMU_GAP, held);
         h.set(Health::ONE_CAMERA_BLIND, BLIND_FRACTION * least < most);
         if let Some(step) = step {
-            h.set(Health::FEW_LANDMARKS, step.connected < CONNECTED_FEW);
+            h.set(Health::FEW_LANDMARKS, (step.connected as f64) < FEW * model.landmarks_enough);
             h.set(Health::SOLVER_FAILED, step.outcome.failures > 0);
             h.set(Health::ZERO_VELOCITY, step.at_rest);
             h.set(Health::VELOCITY_UNOBSERVED, unobserved);
@@ -556,7 +556,6 @@ pub mod instruments {
     pub use super::graph::Graph;
     pub use super::inertial::Covariance;
     pub use super::preintegration::Increment;
-    pub use super::rig::RigEstimate;
     pub use super::samples::ImuRing;
     pub use super::solver::{Outcome, LAMBDA_START};
     pub use super::stats::Stats;

@@ -7,7 +7,7 @@ use super::window::Frame;
 use crate::config::VioConfig;
 use crate::limits::CAMERAS_MAX;
 use glam::{DMat2, DVec2};
-use stipple_drivers::Calibration;
+use stipple_drivers::{Calibration, RigCamera};
 
 /// Deviation of a view of a doubted frame, as a factor on that of other views, and Huber's width for it, in such deviations.
 const DOUBTED_SIGMA: f64 = 5.0 / 3.0;
@@ -81,7 +81,7 @@ impl Model {
             noise: Noise::new(&calibration.imu, config),
             config: config.clone(),
             landmarks_enough: {
-                let pixels = calibration.cameras.iter().map(|c| c.camera.width * c.camera.height).max();
+                let pixels = calibration.cameras.iter().map(RigCamera::pixels).max();
                 landmarks_enough(pixels.unwrap_or(0))
             },
         }
@@ -99,7 +99,9 @@ impl Model {
 
 #[cfg(test)]
 mod tests {
+    use super::super::world::{Path, World};
     use super::*;
+    use stipple_drivers::calibration::Mask;
 
     #[test]
     fn whitened_rows_have_the_gradient_of_the_cost_and_the_stated_curvature() {
@@ -117,5 +119,19 @@ mod tests {
             let share = if px.length() > 0.2 { CURVATURE } else { 1.0 };
             assert!((on - share * across).abs() < 1e-9 * across, "{px}: {on} along, {across} across");
         }
+    }
+
+    /// A camera that sees the vehicle in three quarters of its image holds as many landmarks as a smaller one.
+    #[test]
+    fn landmarks_that_are_enough_are_those_that_the_masks_leave_room_for() {
+        let mut calibration = World::new(Path { rest: 0.0 }).rig;
+        let (width, height) = (calibration.cameras[0].camera.width as u32, calibration.cameras[0].camera.height as u32);
+        let whole = Model::new(&calibration, &VioConfig::default()).landmarks_enough;
+        for camera in &mut calibration.cameras {
+            camera.masks[0] = Mask { left: 0, top: 0, right: width, bottom: height / 2 };
+            camera.masks[1] = Mask { left: 0, top: 0, right: width / 2, bottom: height };
+        }
+        let masked = Model::new(&calibration, &VioConfig::default()).landmarks_enough;
+        assert!((whole - 40.0).abs() < 0.1 && (masked - 10.0).abs() < 0.1, "{whole} {masked}");
     }
 }

@@ -541,3 +541,25 @@ fn slow_camera_finds_points_again() {
     });
     assert!(vio.is_running() && vio.stats.resets == 0, "{:?}", vio.stats);
 }
+
+/// What the estimator goes on without is counted.
+#[test]
+fn inertia_that_says_nothing_and_steps_that_are_taken_back_are_counted() {
+    let mut world = World::new(Path { rest: -1.0 });
+    let mut vio = Vio::new(&world.rig, &VioConfig::default());
+    run(&mut vio, 0..40, &mut world);
+    assert_eq!(vio.stats.inertia_lost, 0);
+    let noise = vio.estimator.model.noise;
+    vio.estimator.model.noise.accel = 1e200;
+    run(&mut vio, 40..45, &mut world);
+    assert_eq!((vio.stats.inertia_lost, vio.stats.resets), (5, 0));
+    vio.estimator.model.noise = noise;
+    run(&mut vio, 45..60, &mut world);
+    assert_eq!(vio.stats.solver_steps_rejected, 0);
+    // An estimate that is turned half about lies where the cost is far from a square.
+    let window = &mut vio.estimator.graph.window;
+    let newest = window.newest().expect("a running window has a newest frame");
+    window.frame_mut(newest).now.pose.q *= DQuat::from_rotation_y(2.0);
+    run(&mut vio, 60..62, &mut world);
+    assert!(vio.stats.solver_steps_rejected > 0, "{:?}", vio.stats);
+}
