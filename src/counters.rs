@@ -93,6 +93,8 @@ stipple_drivers::counters! {
     anchors_for_error,
     /// Anchors whose Gaussians were moved after a correction.
     blocks_moved,
+    /// Rectification was made anew: the cameras sit elsewhere on the body than before.
+    rectified_anew,
     /// Steps not taken because their (Gaussian, tile) list overflowed; pictures and steps drawn coarser so that it did not.
     intersections_overflow,
     views_coarsened,

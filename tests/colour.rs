@@ -52,8 +52,9 @@ fn a_colour_recording_becomes_a_map_in_its_colours() {
         reader.read(i, &mut frames).unwrap();
         let world_from_body = pose_at(&recording.truth, frame.t, Span(50_000_000)).unwrap();
         let Frames { images, colours, .. } = frames.clone();
+        let held_out = i % 4 == 3;
         let keyframe =
-            Keyframe { id: i as u64, t: frame.t, world_from_body, images, colours, epoch: 0, held_out: i % 4 == 3 };
+            Keyframe { id: i as u64, t: frame.t, world_from_body, images, colours, held_out, ..Keyframe::default() };
         mapper.ingest(&keyframe).unwrap();
         for _ in 0..40 {
             assert_ne!(mapper.step(Instant::now()).unwrap().kind, StepKind::Idle);

@@ -1,9 +1,11 @@
 //! The mapper as a whole: keyframes with their true poses in, a map with a measured error out.
 #![allow(clippy::unwrap_used)]
 
+use glam::{DQuat, DVec3};
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 use stipple::config::Board;
+use stipple::limits::CAMERAS_MAX;
 use stipple::map::{Keyframe, Mapper, Panel, PoseCorrection, StepKind};
 use stipple::mem::{heap_after_seal, seal_thread, CountingAllocator};
 use stipple::output::panel::panel;
@@ -34,7 +36,8 @@ fn flight(count: usize) -> (Calibration, Vec<Keyframe>) {
         sim.render(k * apart, &mut frames);
         let images = frames.images.clone();
         let world_from_body = sim.truth_at(frames.t).pose;
-        Keyframe { id: k as u64, t: frames.t, world_from_body, images, colours: vec![], epoch: 0, held_out: k % 4 == 3 }
+        let held_out = k % 4 == 3;
+        Keyframe { id: k as u64, t: frames.t, world_from_body, images, held_out, ..Keyframe::default() }
     };
     let keyframes = (0..count).map(&mut keyframe).collect();
     (calibration, keyframes)
@@ -53,7 +56,7 @@ fn fisheye_flight(count: usize) -> (Calibration, Vec<Keyframe>) {
     let mut keyframe = |k: usize| {
         sim.render(40 + 10 * k, &mut frames);
         let (images, world_from_body) = (frames.images.clone(), sim.truth_at(frames.t).pose);
-        Keyframe { id: k as u64, t: frames.t, world_from_body, images, colours: vec![], epoch: 0, held_out: false }
+        Keyframe { id: k as u64, t: frames.t, world_from_body, images, ..Keyframe::default() }
     };
     let keyframes = (0..count).map(&mut keyframe).collect();
     (calibration, keyframes)
@@ -152,6 +155,49 @@ fn a_third_of_the_intersections_makes_as_many_anchors_and_nearly_as_good_a_map()
     assert!(few.0 > enough.0 - 1.5 && few.1.abs_diff(enough.1) * 5 <= enough.1, "{few:?} after {enough:?}");
 }
 
+/// A camera that was knocked askew after it was calibrated, by twice as much as the first keyframes know: what odometry learns of
+/// it reaches the pictures, their poses and stereo.
+#[test]
+fn cameras_that_sit_elsewhere_than_calibrated_are_taken_over_from_keyframes_and_corrections() {
+    // A rectified pair loses its depth where rows are off; of raw images a coarse map loses little, dB.
+    let flights = [(flight(6), vec![], 1.0), (fisheye_flight(4), vec!["map.scale=4", "map.projection=fisheye"], 0.0)];
+    for ((truth, keyframes), settings, lost) in flights {
+        let settings = [settings, vec!["map.refine_pose=false", "map.cameras=2"]].concat();
+        // As known after a part of the way from the calibration to the truth.
+        let rig = |part: f64| {
+            let mut places = [Pose::IDENTITY; CAMERAS_MAX];
+            let cameras = truth.cameras.iter().map(|c| c.body_from_cam);
+            places.iter_mut().zip(cameras).for_each(|(to, from)| *to = from);
+            places[1].q *= DQuat::from_scaled_axis((1.0 - part) * DVec3::new(0.03, -0.01, 0.02));
+            places
+        };
+        let run = |calibration: &Calibration, told: Option<f64>| {
+            let mut mapper = Mapper::open(calibration, &board(&settings)).unwrap();
+            for (n, k) in keyframes.iter().enumerate() {
+                let part = |first: f64| if n < 2 { first } else { 1.0 };
+                mapper.ingest(&Keyframe { body_from_cam: told.map(|first| rig(part(first))), ..k.clone() }).unwrap();
+                if told.is_some() && n == 2 {
+                    for k in &keyframes[..2] {
+                        let world_from_body = k.world_from_body;
+                        mapper.correct(&PoseCorrection { id: k.id, world_from_body, body_from_cam: Some(rig(1.0)) });
+                    }
+                }
+                train(&mut mapper, 40);
+            }
+            let anew = mapper.counters().rectified_anew.get();
+            (mapper.evaluate().unwrap().psnr_db.unwrap(), mapper.anchor_count(), anew)
+        };
+        let mut wrong = truth.clone();
+        wrong.cameras.iter_mut().zip(rig(0.0)).for_each(|(c, place)| c.body_from_cam = place);
+        let (right, untold) = (run(&truth, None), run(&wrong, None));
+        let (at_once, told) = (run(&wrong, Some(1.0)), run(&wrong, Some(0.5)));
+        println!("PSNR, anchors, rectified anew: right {right:?}, told at once {at_once:?}, told {told:?}, not told {untold:?}");
+        assert_eq!((right.2, at_once.2, told.2, untold.2), (0, 1, 2, 0));
+        // The first depths are those of a pair that is half as far askew.
+        assert!(at_once.0 > right.0 - 0.3 && told.0 > 0.5 * (right.0 + untold.0) && untold.0 < right.0 - lost);
+    }
+}
+
 #[test]
 fn held_out_views_are_never_anchors_and_never_trained_on() {
     let (calibration, mut keyframes) = flight(2);
@@ -189,7 +235,8 @@ fn corrections_reach_stored_keyframes_and_their_gaussians() {
     let x = mapper.splats().unwrap()[0].mean[0];
     assert!((f64::from(x) - far.p.x).abs() < 20.0, "seeded where it was: {x}");
     let before = mapper.panels(1).unwrap()[0].psnr_db.unwrap();
-    mapper.correct(&PoseCorrection { id: 0, world_from_body: truth });
+    let to = |id, world_from_body| PoseCorrection { id, world_from_body, body_from_cam: None };
+    mapper.correct(&to(0, truth));
     train(&mut mapper, 1);
     let x = mapper.splats().unwrap()[0].mean[0];
     assert!((f64::from(x) - truth.p.x).abs() < 20.0, "moved with its anchor: {x}");
@@ -197,8 +244,8 @@ fn corrections_reach_stored_keyframes_and_their_gaussians() {
     assert!(after > before - 0.5, "the same picture from there: {before} {after}");
     assert_eq!(mapper.counters().blocks_moved.get(), 1);
     // What is not finite is refused, and a keyframe nobody knows is ignored.
-    mapper.correct(&PoseCorrection { id: 0, world_from_body: Pose { p: truth.p * f64::NAN, ..truth } });
-    mapper.correct(&PoseCorrection { id: 77, world_from_body: far });
+    mapper.correct(&to(0, Pose { p: truth.p * f64::NAN, ..truth }));
+    mapper.correct(&to(77, far));
     train(&mut mapper, 1);
     assert_eq!(mapper.counters().blocks_moved.get(), 1);
 }
@@ -251,7 +298,7 @@ fn corrections_compose_with_what_the_mapper_found() {
     let (was, is) = (off(first.given, given), off(first.world_from_refined(), given * found));
     assert!(is < 0.7 * was, "{is} of {was}");
     let corrected = Pose { p: given.p + glam::DVec3::Z, ..given };
-    mapper.correct(&PoseCorrection { id: 1, world_from_body: corrected });
+    mapper.correct(&PoseCorrection { id: 1, world_from_body: corrected, body_from_cam: None });
     assert_eq!(mapper.keyframe(1).world_from_refined(), corrected * found);
 }
 
@@ -340,9 +387,7 @@ fn play(mapper: &mut Mapper, recording: &Recording, keyframes: usize, steps: u32
         reader.read(i, &mut frames).unwrap();
         let images = frames.images.clone();
         let held_out = id % 8 == 7;
-        mapper
-            .ingest(&Keyframe { id, t: frame.t, world_from_body, images, colours: vec![], epoch: 0, held_out })
-            .unwrap();
+        mapper.ingest(&Keyframe { id, t: frame.t, world_from_body, images, held_out, ..Keyframe::default() }).unwrap();
         id += 1;
         train(mapper, steps);
     }

@@ -13,7 +13,7 @@
 //! An anchor opens a block of the pool; what its seeds and its densification need and is not free is taken from the least
 //! important, if the board lets.
 
-use super::cameras::RectifiedPair;
+use super::cameras::{RectifiedPair, TrainingCamera};
 use super::coarseness::Coarseness;
 use super::coverage::{Coverage, KeyframeView};
 use super::densify::{densify, mean};
@@ -28,7 +28,7 @@ use super::view::View;
 use crate::config::MapConfig;
 use crate::gpu::{Gpu, GpuError};
 use crate::mem::unsealed;
-use crate::stereo::{DepthMap, Stereo};
+use crate::stereo::{DepthMap, RectifiedViews, Stereo};
 use stipple_drivers::{Fault, Image};
 
 /// Part of a view that must have depth to seed from; the rest is continued from it.
@@ -102,6 +102,11 @@ impl Anchors {
         Ok(Anchors { config: config.clone(), pair, work, occupancy, anchored_at: 0 })
     }
 
+    /// Takes over another rectification.
+    pub fn adjust(&mut self, views: &RectifiedViews, left: &TrainingCamera) {
+        self.pair.iter_mut().for_each(|pair| pair.adjust(views, left));
+    }
+
     /// Makes stored image `index`, the first of `keyframe`, an anchor when the map does not show its view,
     /// or not well.
     pub fn try_anchor(
@@ -149,7 +154,7 @@ impl Anchors {
         scene.counters.anchors_for_error.add(u64::from(coverage.uncovered <= least));
         self.anchored_at = scene.steps;
         let entry = scene.store.get_mut(index);
-        (entry.anchor, entry.placed) = (true, entry.given);
+        (entry.anchor, entry.placed) = (true, entry.world_from_cam());
         let scene_depth_m = if first { median_depth(&self.work.depth.metres) } else { None };
         Ok(Some(NewAnchor { seeded, scene_depth_m }))
     }

@@ -20,12 +20,6 @@ pub struct TrainingCamera {
     pub valid: Vec<u8>,
 }
 
-impl TrainingCamera {
-    pub fn view(&self, world_from_body: Pose) -> View {
-        View::new(world_from_body * self.body_from_cam, self.camera, self.fisheye)
-    }
-}
-
 /// Farther off the axis a pixel does not count, rad: lenses are calibrated to about here, and beyond are their mounts.
 const ANGLE_MAX: f64 = 1.65;
 
@@ -80,6 +74,18 @@ impl RectifiedPair {
     /// `None` where the rectified view itself trains.
     pub fn new(views: &RectifiedViews, left: &TrainingCamera, channels: usize) -> Option<RectifiedPair> {
         left.fisheye?;
+        let Pinhole { width, height, .. } = views.camera().pinhole;
+        let mut pair = RectifiedPair {
+            planes: vec![Image::new(width, height); channels],
+            distance: vec![0.0; width * height],
+            rectified: vec![NONE; width * height],
+        };
+        pair.adjust(views, left);
+        Some(pair)
+    }
+
+    /// Takes over another rectification.
+    pub fn adjust(&mut self, views: &RectifiedViews, left: &TrainingCamera) {
         let rect = views.camera();
         let Pinhole { width, height, fx, fy, cx, cy } = rect.pinhole;
         let rect_from_cam = rect.body_from_rect.inverse() * left.body_from_cam;
@@ -90,11 +96,7 @@ impl RectifiedPair {
             let inside = (0.0..width as f64).contains(&x) && (0.0..height as f64).contains(&y);
             inside.then(|| (y as usize * width + x as usize) as u32)
         };
-        Some(RectifiedPair {
-            planes: vec![Image::new(width, height); channels],
-            distance: vec![0.0; width * height],
-            rectified: (0..width * height).map(|i| of(i).unwrap_or(NONE)).collect(),
-        })
+        self.rectified.iter_mut().enumerate().for_each(|(i, to)| *to = of(i).unwrap_or(NONE));
     }
 
     /// Takes over depth along the rectified axis.
@@ -114,12 +116,26 @@ pub fn training(views: &RectifiedViews, config: &MapConfig) -> Result<Vec<Traini
         Projection::Rectified => Ok(TrainingCamera {
             camera: views.camera().pinhole,
             fisheye: None,
-            body_from_cam: Pose { p: rig[i].body_from_cam.p, ..views.camera().body_from_rect },
+            body_from_cam: views.body_from_rect(i),
             valid: views.valid_of(i),
         }),
         Projection::Fisheye => fisheye(i, &rig[i], &views.camera().pinhole, config.scale as usize),
     };
     (0..count(rig.len(), config)).map(one).collect()
+}
+
+/// Takes over where the cameras sit by now. Of pixels that rectification no longer draws, `anew`, none counts, nor of those that
+/// it did not draw before: one mask is for all images of a camera.
+pub fn adjust(cameras: &mut [TrainingCamera], views: &RectifiedViews, anew: bool) {
+    for (i, camera) in cameras.iter_mut().enumerate() {
+        camera.body_from_cam = match camera.fisheye {
+            Some(_) => views.rig()[i].body_from_cam,
+            None => views.body_from_rect(i),
+        };
+        if anew && camera.fisheye.is_none() {
+            camera.valid.iter_mut().zip(views.valid_of(i)).for_each(|(valid, now)| *valid &= now);
+        }
+    }
 }
 
 fn fisheye(i: usize, c: &RigCamera, mapping: &Pinhole, divisor: usize) -> Result<TrainingCamera, Fault> {
@@ -206,7 +222,7 @@ mod tests {
         let metres: Vec<f32> = (0..w * h).map(|i| floor(i % w, i / w)).collect();
         let mut pair = RectifiedPair::new(&views, &left, 1).expect("a fisheye trains");
         pair.distort(&metres, &rect.pinhole);
-        let raw = left.view(Pose::IDENTITY);
+        let raw = View::new(left.body_from_cam, left.camera, left.fisheye);
         let (mut seen, mut worst) = (0, 0.0f64);
         for (i, &r) in pair.distance.iter().enumerate().filter(|(_, r)| **r > 0.0) {
             let p = raw.point(i % w, i / w, f64::from(r)).expect("inside the lens");

@@ -190,16 +190,15 @@ fn observed(scene: &Scene, index: usize) -> Vec<f32> {
 
 /// The refinement of a keyframe from which the map, standing still, looks most like its image.
 fn align(scene: &mut Scene, index: usize, observed: &[f32], weights: &Weights) -> Result<Refinement, GpuError> {
-    let (body_from_cam, view) = (scene.camera(index).body_from_cam, scene.view(index));
+    let (body_from_cam, view) = (scene.store.get(index).body_from_cam, scene.view(index));
     let given = scene.store.get(scene.store.first(index)).given;
-    let (epoch, coarseness) = (view.epoch, scene.render(&view)?);
+    let coarseness = scene.render(&view)?;
     let exposure = fitted_exposure(observed, &scene.rendered.colour, &scene.camera(index).valid);
     let target = Target { exposure, ..scene.target(index) };
     let mut refined = Refinement::default();
     let (mut best, mut best_loss) = (refined, f64::INFINITY);
     for k in 0..ALIGN_STEPS {
-        let at = scene.camera(index).view(given * refined.body_from_refined);
-        let view = View { coarseness, epoch, ..at };
+        let view = View { coarseness, ..scene.view_from(index, given * refined.body_from_refined) };
         let done = scene.pipeline.evaluate(&mut scene.gpu, &view, target, weights)?;
         if done.loss < best_loss {
             (best, best_loss) = (refined, done.loss);

@@ -1,5 +1,6 @@
 //! What crosses the border of the mapper: keyframes, and corrections of their poses.
 
+use crate::limits::CAMERAS_MAX;
 use stipple_drivers::{Colour, Image, Nanos, Pose};
 
 /// Raw images of one instant and where the body was, mid-exposure.
@@ -10,6 +11,8 @@ pub struct Keyframe {
     /// Keyframes of different epochs are in different frames, and train different Gaussians.
     pub epoch: u32,
     pub world_from_body: Pose,
+    /// Where each camera sits, as estimated along with that pose; `None`: as calibrated.
+    pub body_from_cam: Option<[Pose; CAMERAS_MAX]>,
     /// Images as the cameras gave them: left, right, and further ones that train.
     pub images: Vec<Image>,
     /// The colours of the images that train on them.
@@ -30,4 +33,6 @@ impl Keyframe {
 pub struct PoseCorrection {
     pub id: u64,
     pub world_from_body: Pose,
+    /// Where each camera sits, as of a keyframe; `None` changes nothing.
+    pub body_from_cam: Option<[Pose; CAMERAS_MAX]>,
 }

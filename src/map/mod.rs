@@ -43,7 +43,7 @@ use anchors::{Anchors, Workspace};
 use cameras::RectifiedPair;
 use scene::Scene;
 use std::time::Instant;
-use stipple_drivers::{Calibration, Fault};
+use stipple_drivers::{Calibration, Fault, Pose};
 use store::Store;
 use trainer::Trainer;
 
@@ -162,14 +162,18 @@ impl Mapper {
     pub fn ingest(&mut self, keyframe: &Keyframe) -> Result<StepKind, GpuError> {
         self.apply_corrections()?;
         self.finish_pending()?;
-        let Scene { gpu, pipeline, store, cameras, .. } = &mut self.scene;
-        if store.is_full() {
+        if self.scene.store.is_full() {
             self.scene.counters.keyframe_store_full.add(1);
             return Ok(StepKind::Dropped);
         }
+        if let Some(body_from_cam) = &keyframe.body_from_cam {
+            self.adjust(body_from_cam)?;
+        }
+        let Scene { gpu, pipeline, store, cameras, .. } = &mut self.scene;
         let index = store.len();
         for (i, camera) in cameras.iter().enumerate() {
-            store.add(keyframe, |channel, plane| {
+            let poses = [camera.body_from_cam, self.stereo.views.rig()[i].body_from_cam];
+            store.add(keyframe, poses, |channel, plane| {
                 cameras::draw(i, camera, &mut self.stereo.views, keyframe.plane(i, channel), plane);
             });
             for (channel, plane) in store.planes(index + i).iter().enumerate() {
@@ -185,6 +189,21 @@ impl Mapper {
             self.trainer.start_burst(index);
             StepKind::Anchor { seeded: anchor.seeded }
         }))
+    }
+
+    /// Takes over where the cameras sit on the body by now.
+    fn adjust(&mut self, body_from_cam: &[Pose]) -> Result<(), GpuError> {
+        let Scene { gpu, pipeline, cameras, counters, .. } = &mut self.scene;
+        let anew = self.stereo.adjust(gpu, body_from_cam)?;
+        cameras::adjust(cameras, &self.stereo.views, anew);
+        if anew {
+            counters.rectified_anew.add(1);
+            for (i, camera) in cameras.iter().enumerate() {
+                pipeline.loss.set_mask(gpu, i, &camera.valid)?;
+            }
+            self.anchors.adjust(&self.stereo.views, &cameras[0]);
+        }
+        Ok(())
     }
 
     /// Moves a keyframe, and with what is done next the Gaussians of an anchor. Never waits for the GPU.

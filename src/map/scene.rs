@@ -10,6 +10,7 @@ use super::store::{Store, Stored};
 use super::view::View;
 use crate::counters::Counters;
 use crate::gpu::{Gpu, GpuError};
+use stipple_drivers::Pose;
 
 pub struct Scene {
     pub gpu: Gpu,
@@ -31,9 +32,14 @@ impl Scene {
 
     /// Where a stored image was taken, as far as is known.
     pub fn view(&self, index: usize) -> View {
-        let view = self.camera(index).view(self.store.world_from_body(index));
-        let Stored { coarseness, epoch, .. } = *self.store.get(index);
-        View { coarseness, epoch, ..view }
+        self.view_from(index, self.store.world_from_body(index))
+    }
+
+    /// What the camera of a stored image sees where the body is at another pose.
+    pub fn view_from(&self, index: usize, world_from_body: Pose) -> View {
+        let Stored { coarseness, epoch, body_from_cam, .. } = *self.store.get(index);
+        let TrainingCamera { camera, fisheye, .. } = *self.camera(index);
+        View { coarseness, epoch, ..View::new(world_from_body * body_from_cam, camera, fisheye) }
     }
 
     /// What a step on a stored image compares with.

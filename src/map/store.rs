@@ -16,7 +16,10 @@ pub struct Stored {
     pub epoch: u32,
     /// Odometry's pose, with its corrections.
     pub given: Pose,
-    /// `given` when the Gaussians of an anchor were last put in place.
+    /// Where the camera sits on the body that the stored image is of, and the one whose raw image that was drawn from.
+    pub body_from_cam: Pose,
+    body_from_raw: Pose,
+    /// Pose of the camera when the Gaussians of an anchor were last put in place.
     pub placed: Pose,
     pub held_out: bool,
     pub anchor: bool,
@@ -27,6 +30,11 @@ pub struct Stored {
 }
 
 impl Stored {
+    /// Pose of the camera by odometry.
+    pub fn world_from_cam(&self) -> Pose {
+        self.given * self.body_from_cam
+    }
+
     /// Odometry's pose with the mapper's own correction.
     pub fn world_from_refined(&self) -> Pose {
         self.given * self.refined.body_from_refined
@@ -81,8 +89,14 @@ impl Store {
         self.get(self.first(index)).world_from_refined()
     }
 
-    /// Takes the next camera of a keyframe, whose planes `draw` makes one by one; `None` when the store is full.
-    pub fn add(&mut self, keyframe: &Keyframe, mut draw: impl FnMut(usize, &mut Image)) -> Option<usize> {
+    /// Takes the next camera of a keyframe, whose planes `draw` makes one by one; `None` when the store is full. Both poses are
+    /// on the body: of the camera that is drawn, and of the raw one.
+    pub fn add(
+        &mut self,
+        keyframe: &Keyframe,
+        [body_from_cam, body_from_raw]: [Pose; 2],
+        mut draw: impl FnMut(usize, &mut Image),
+    ) -> Option<usize> {
         let index = self.entries.len();
         let planes = self.planes.get_mut(index * self.channels..(index + 1) * self.channels)?;
         planes.iter_mut().enumerate().for_each(|(channel, plane)| draw(channel, plane));
@@ -94,8 +108,19 @@ impl Store {
         let last = self.training.iter().rev().find(|k| self.camera(**k as usize) == self.camera(index));
         refined.exposure.gain = last.map_or(1.0, |&k| self.get(k as usize).refined.exposure.gain);
         let coarseness = last.map_or(Coarseness::default(), |&k| self.get(k as usize).coarseness);
-        let (given, placed) = (world_from_body, world_from_body);
-        self.entries.push(Stored { id, t, epoch, given, placed, held_out, anchor: false, refined, coarseness });
+        self.entries.push(Stored {
+            id,
+            t,
+            epoch,
+            given: world_from_body,
+            body_from_cam,
+            body_from_raw,
+            placed: world_from_body * body_from_cam,
+            held_out,
+            anchor: false,
+            refined,
+            coarseness,
+        });
         if !held_out {
             self.training.push(index as u32);
         }
@@ -170,9 +195,16 @@ impl Store {
     pub fn correct(&mut self, correction: &PoseCorrection) -> bool {
         let to = correction.world_from_body;
         // The newest are corrected most.
-        let found = self.entries.iter_mut().step_by(self.cameras).rev().find(|e| e.id == correction.id);
-        let Some(e) = found.filter(|_| to.p.is_finite() && to.q.is_finite()) else { return false };
-        e.given = to;
+        let found = self.entries.chunks_exact_mut(self.cameras).rev().find(|of_one| of_one[0].id == correction.id);
+        let Some(images) = found.filter(|_| to.is_finite()) else { return false };
+        images[0].given = to;
+        for (e, raw) in
+            images.iter_mut().zip(correction.body_from_cam.iter().flatten()).filter(|(_, raw)| raw.is_finite())
+        {
+            // What was drawn from the raw image keeps its place relative to it.
+            e.body_from_cam = *raw * (e.body_from_raw.inverse() * e.body_from_cam);
+            e.body_from_raw = *raw;
+        }
         true
     }
 
@@ -180,12 +212,13 @@ impl Store {
     /// by what; they count as in place from here on.
     pub fn displaced(&mut self, tolerance: f64) -> impl Iterator<Item = (u32, Pose)> + '_ {
         self.entries.iter_mut().enumerate().filter(|(_, e)| e.anchor).filter_map(move |(i, e)| {
-            let by = e.given * e.placed.inverse();
-            let turned = (e.given.q * e.placed.q.inverse()).to_scaled_axis().length();
-            if (e.given.p - e.placed.p).length() <= tolerance && turned <= tolerance {
+            let now = e.world_from_cam();
+            let by = now * e.placed.inverse();
+            let turned = (now.q * e.placed.q.inverse()).to_scaled_axis().length();
+            if (now.p - e.placed.p).length() <= tolerance && turned <= tolerance {
                 return None;
             }
-            e.placed = e.given;
+            e.placed = now;
             Some((i as u32, by))
         })
     }
@@ -194,7 +227,10 @@ impl Store {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use glam::DVec3;
+    use crate::limits::CAMERAS_MAX;
+    use glam::{DQuat, DVec3};
+
+    const ON_BODY: [Pose; 2] = [Pose::IDENTITY; 2];
 
     fn keyframe(id: u64, held_out: bool) -> Keyframe {
         Keyframe { id, held_out, ..Keyframe::default() }
@@ -208,9 +244,9 @@ mod tests {
     fn held_out_keyframes_are_stored_but_not_for_training() {
         let mut s = store(3, 1);
         for id in 0..3 {
-            assert_eq!(s.add(&keyframe(id, id == 1), |_, i| i.pixels.fill(9)), Some(id as usize));
+            assert_eq!(s.add(&keyframe(id, id == 1), ON_BODY, |_, i| i.pixels.fill(9)), Some(id as usize));
         }
-        assert_eq!(s.add(&keyframe(3, false), |_, _| {}), None);
+        assert_eq!(s.add(&keyframe(3, false), ON_BODY, |_, _| {}), None);
         assert_eq!(s.training(), [0, 2]);
         assert_eq!((s.len(), s.planes(1)[0].pixels[3]), (3, 9));
     }
@@ -221,15 +257,48 @@ mod tests {
         for id in 0..2 {
             assert!(!s.is_full());
             for camera in 0..2 {
-                let index = s.add(&keyframe(id, false), |_, _| {}).expect("room for five");
+                let index = s.add(&keyframe(id, false), ON_BODY, |_, _| {}).expect("room for five");
                 assert_eq!((s.camera(index), s.first(index)), (camera, 2 * id as usize));
             }
         }
         assert!(s.is_full(), "one image more is no keyframe");
-        assert!(s.correct(&PoseCorrection { id: 1, world_from_body: Pose { p: DVec3::X, ..Pose::IDENTITY } }));
+        assert!(s.correct(&PoseCorrection {
+            id: 1,
+            world_from_body: Pose { p: DVec3::X, ..Pose::IDENTITY },
+            body_from_cam: None
+        }));
         assert_eq!([1, 2, 3].map(|i| s.world_from_body(i).p), [DVec3::ZERO, DVec3::X, DVec3::X]);
         s.get_mut(1).refined.exposure.gain = 2.0;
-        assert_eq!(s.add(&keyframe(2, false), |_, _| {}), Some(4));
+        assert_eq!(s.add(&keyframe(2, false), ON_BODY, |_, _| {}), Some(4));
         assert_eq!([0, 1, 4].map(|i| s.exposure(i).gain), [1.0, 2.0, 1.0]);
+    }
+
+    /// An estimator that learns where a camera sits moves the body, not the camera: nor do its image and its Gaussians.
+    #[test]
+    fn a_correction_of_rig_and_pose_that_leaves_the_camera_where_it_was_moves_nothing() {
+        let mut s = store(2, 2);
+        let turned = |x: f64| Pose { q: DQuat::from_rotation_x(x), p: DVec3::new(0.1, x, 0.0) };
+        let (raw, raw_from_cam) = (turned(0.3), Pose { q: DQuat::from_rotation_z(0.02), p: DVec3::ZERO });
+        for _ in 0..2 {
+            s.add(&keyframe(7, false), [raw * raw_from_cam, raw], |_, _| {});
+        }
+        s.get_mut(0).anchor = true;
+        let learnt = turned(0.31);
+        let world_from_body = raw * learnt.inverse();
+        let mut body_from_cam = [learnt; CAMERAS_MAX];
+        assert!(s.correct(&PoseCorrection { id: 7, world_from_body, body_from_cam: Some(body_from_cam) }));
+        for index in 0..2 {
+            let now = s.world_from_body(index) * s.get(index).body_from_cam;
+            let off = now.inverse() * (raw * raw_from_cam);
+            assert!(off.p.length() < 1e-12 && off.q.to_scaled_axis().length() < 1e-12, "{off:?}");
+        }
+        assert_eq!(s.displaced(1e-9).count(), 0);
+        // Of one camera alone: the other stays.
+        body_from_cam[0] = turned(0.4);
+        assert!(s.correct(&PoseCorrection { id: 7, world_from_body, body_from_cam: Some(body_from_cam) }));
+        assert_eq!(s.displaced(1e-9).count(), 1);
+        body_from_cam[0].p.x = f64::NAN;
+        assert!(s.correct(&PoseCorrection { id: 7, world_from_body, body_from_cam: Some(body_from_cam) }));
+        assert!(s.get(0).body_from_cam.is_finite());
     }
 }

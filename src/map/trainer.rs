@@ -115,7 +115,7 @@ impl Trainer {
     fn refine(&self, scene: &mut Scene, index: usize, step: &Step, done: &StepStats) {
         let part = self.rate_part(scene);
         if self.config.refine_pose {
-            let body_from_cam = scene.camera(index).body_from_cam;
+            let body_from_cam = scene.store.get(index).body_from_cam;
             let first = scene.store.first(index);
             let refined = &mut scene.store.get_mut(first).refined;
             let rate = part * self.config.lr_pose;

@@ -8,6 +8,7 @@
 use super::tracking::FramePacket;
 use crate::config::Board;
 use crate::counters::Counters;
+use crate::limits::CAMERAS_MAX;
 use crate::map::{cameras, Keyframe, PoseCorrection};
 use glam::{DQuat, DVec3};
 use std::collections::VecDeque;
@@ -45,12 +46,14 @@ pub enum Word {
 }
 
 const WORDS: usize = 16;
-/// A correction: number of the keyframe, and its pose.
+/// A pose of the body, whether the cameras' are estimated, and these.
 const POSE: usize = 7;
-const CORRECTION: usize = 1 + POSE;
-/// Head of a slot: state, number, stamp, whether it is held out, epoch, pose.
-const HEAD: usize = POSE_AT + POSE;
-const POSE_AT: usize = 5;
+const POSES: usize = POSE + 1 + CAMERAS_MAX * POSE;
+/// A correction: number of the keyframe, and poses.
+const CORRECTION: usize = 1 + POSES;
+/// Head of a slot: state, number, stamp, whether it is held out, epoch, poses.
+const HEAD: usize = POSES_AT + POSES;
+const POSES_AT: usize = 5;
 
 /// States of a slot. `DONE` is free, and still holds a keyframe.
 const EMPTY: u64 = 0;
@@ -135,7 +138,7 @@ impl KeyframeRing {
     }
 
     /// Copies a keyframe in; false when every slot is taken.
-    pub fn offer(&self, frames: &Frames, id: u64, held_out: bool, (epoch, world_from_body): (u32, &Pose)) -> bool {
+    pub fn offer(&self, frames: &Frames, id: u64, held_out: bool, (epoch, poses): (u32, &Poses)) -> bool {
         let all = 0..u64::MAX;
         let free = self.claim(&[EMPTY, DONE], all.clone(), FILLING);
         let absent = || self.word(Word::Absent).load(Acquire) != 0;
@@ -147,7 +150,7 @@ impl KeyframeRing {
         slot[2].store(frames.t.0 as u64, Relaxed);
         slot[3].store(u64::from(held_out), Relaxed);
         slot[4].store(u64::from(epoch), Relaxed);
-        write_pose(&slot[POSE_AT..HEAD], world_from_body);
+        poses.write(&slot[POSES_AT..HEAD]);
         let mut at = HEAD;
         let colours = frames.colours.iter().take(self.colours()).flatten();
         for image in frames.images.iter().take(self.shape.images.len()).chain(colours) {
@@ -167,7 +170,8 @@ impl KeyframeRing {
         keyframe.t = Nanos(slot[2].load(Relaxed) as i64);
         keyframe.held_out = slot[3].load(Relaxed) != 0;
         keyframe.epoch = slot[4].load(Relaxed) as u32;
-        keyframe.world_from_body = read_pose(&slot[POSE_AT..HEAD]);
+        let Poses { world_from_body, body_from_cam } = Poses::read(&slot[POSES_AT..HEAD]);
+        (keyframe.world_from_body, keyframe.body_from_cam) = (world_from_body, body_from_cam);
         let mut at = HEAD;
         for image in keyframe.images.iter_mut().chain(keyframe.colours.iter_mut().flatten()) {
             let end = at + words_of(image.pixels.len());
@@ -189,14 +193,14 @@ impl KeyframeRing {
     }
 
     /// Hands over a better pose; false when as many wait as may.
-    fn push_correction(&self, correction: &PoseCorrection) -> bool {
+    fn push_correction(&self, id: u64, poses: &Poses) -> bool {
         let written = self.word(Word::Written).load(Relaxed);
         if written - self.word(Word::Read).load(Acquire) >= CORRECTIONS as u64 {
             return false;
         }
         let to = self.correction(written);
-        to[0].store(correction.id, Relaxed);
-        write_pose(&to[1..], &correction.world_from_body);
+        to[0].store(id, Relaxed);
+        poses.write(&to[1..]);
         self.word(Word::Written).store(written + 1, Release);
         true
     }
@@ -206,13 +210,14 @@ impl KeyframeRing {
         let written = self.word(Word::Written).load(Acquire);
         for number in self.word(Word::Read).load(Relaxed)..written {
             let from = self.correction(number);
-            let correction = PoseCorrection { id: from[0].load(Relaxed), world_from_body: read_pose(&from[1..]) };
+            let (id, poses) = (from[0].load(Relaxed), Poses::read(&from[1..]));
             for slot in (0..SLOTS).map(|i| self.slot(i)) {
-                if slot[0].load(Acquire) == OFFERED && slot[1].load(Relaxed) == correction.id {
-                    write_pose(&slot[POSE_AT..HEAD], &correction.world_from_body);
+                if slot[0].load(Acquire) == OFFERED && slot[1].load(Relaxed) == id {
+                    poses.write(&slot[POSES_AT..HEAD]);
                 }
             }
-            correct(&correction);
+            let Poses { world_from_body, body_from_cam } = poses;
+            correct(&PoseCorrection { id, world_from_body, body_from_cam });
             self.word(Word::Read).store(number + 1, Release);
         }
     }
@@ -245,6 +250,31 @@ fn shape(calibration: &Calibration, board: &Board) -> Keyframe {
     let colours = (0..cameras::colours(count, &board.map)).map(|i| std::array::from_fn(|_| image(i))).collect();
     let images = (0..cameras::images(count, &board.map)).map(image).collect();
     Keyframe { images, colours, ..Keyframe::default() }
+}
+
+/// Where the body was, and each camera on it, where that is estimated.
+#[derive(Clone, Copy)]
+pub struct Poses {
+    pub world_from_body: Pose,
+    pub body_from_cam: Option<[Pose; CAMERAS_MAX]>,
+}
+
+impl Poses {
+    fn write(&self, words: &[AtomicU64]) {
+        let (body, cameras) = words.split_at(POSE);
+        write_pose(body, &self.world_from_body);
+        cameras[0].store(u64::from(self.body_from_cam.is_some()), Relaxed);
+        let given = self.body_from_cam.iter().flatten();
+        cameras[1..].chunks_exact(POSE).zip(given).for_each(|(words, pose)| write_pose(words, pose));
+    }
+
+    fn read(words: &[AtomicU64]) -> Poses {
+        let (body, cameras) = words.split_at(POSE);
+        let camera = |i: usize| read_pose(&cameras[1 + i * POSE..]);
+        let estimated = cameras[0].load(Relaxed) != 0;
+        let body_from_cam = estimated.then(|| std::array::from_fn(camera));
+        Poses { world_from_body: read_pose(body), body_from_cam }
+    }
 }
 
 fn write_pose(words: &[AtomicU64], pose: &Pose) {
@@ -288,7 +318,9 @@ impl Keyframes {
             return;
         }
         let (id, n) = (self.count, u64::from(self.holdout));
-        if ring.offer(&packet.frames, id, n > 0 && id % n == n - 1, (packet.epoch, &tracked.world_from_body)) {
+        let body_from_cam = tracked.body_from_cam;
+        let poses = Poses { world_from_body: tracked.world_from_body, body_from_cam };
+        if ring.offer(&packet.frames, id, n > 0 && id % n == n - 1, (packet.epoch, &poses)) {
             self.count += 1;
             self.recent.truncate(RECENT - 1);
             self.recent.push_front((packet.frames.t, id));
@@ -297,7 +329,7 @@ impl Keyframes {
         }
         for (t, world_from_body) in tracked.corrections.iter() {
             if let Some((_, id)) = self.recent.iter().find(|(at, found)| at == t && *found != id) {
-                let pushed = ring.push_correction(&PoseCorrection { id: *id, world_from_body: *world_from_body });
+                let pushed = ring.push_correction(*id, &Poses { world_from_body: *world_from_body, body_from_cam });
                 counters.corrections_full.add(u64::from(!pushed));
             }
         }
@@ -318,11 +350,13 @@ pub mod tests {
         KeyframeRing::new(&Calibration { cameras, imu: ImuCalibration::CONSUMER }, &board).expect("some bytes")
     }
 
+    const AT_ORIGIN: Poses = Poses { world_from_body: Pose::IDENTITY, body_from_cam: None };
+
     /// Offers a keyframe whose pixels tell its number.
     fn offer(ring: &KeyframeRing, id: u64) -> bool {
         let image = Image { pixels: vec![id as u8; 15], ..Image::new(5, 3) };
         let frames = Frames { t: Nanos(id as i64 * 7), images: vec![image; 2], colours: vec![] };
-        ring.offer(&frames, id, id == 3, (id as u32 / 4, &Pose::IDENTITY))
+        ring.offer(&frames, id, id == 3, (id as u32 / 4, &AT_ORIGIN))
     }
 
     /// The numbers of what waits, in order; each is marked as done.
@@ -337,7 +371,9 @@ pub mod tests {
         let (ring, mut corrected) = (ring(), vec![]);
         assert!((0..SLOTS as u64).all(|id| offer(&ring, id)) && !offer(&ring, 99));
         let moved = Pose { p: DVec3::X, ..Pose::IDENTITY };
-        assert!(ring.push_correction(&PoseCorrection { id: 2, world_from_body: moved }));
+        let at = |c: usize| Pose { p: DVec3::new(0.0, c as f64, 0.0), ..Pose::IDENTITY };
+        let body_from_cam = Some(std::array::from_fn(at));
+        assert!(ring.push_correction(2, &Poses { world_from_body: moved, body_from_cam }));
         ring.corrections(|c| corrected.push(c.id));
         assert_eq!(corrected, [2]);
         let mut keyframe = ring.shape().clone();
@@ -345,6 +381,7 @@ pub mod tests {
             let slot = ring.take(4, &mut keyframe).expect("it waits");
             let x = if id == 2 { 1.0 } else { 0.0 };
             assert_eq!((keyframe.id, keyframe.t, keyframe.world_from_body.p.x), (id, Nanos(id as i64 * 7), x));
+            assert_eq!(keyframe.body_from_cam, if id == 2 { body_from_cam } else { None });
             assert_eq!((keyframe.held_out, &keyframe.images[1].pixels[..]), (id == 3, &[id as u8; 15][..]));
             ring.done(slot);
         }
@@ -355,10 +392,9 @@ pub mod tests {
     #[test]
     fn corrections_are_bounded() {
         let ring = ring();
-        let correction = PoseCorrection { id: 0, world_from_body: Pose::IDENTITY };
-        assert!((0..CORRECTIONS).all(|_| ring.push_correction(&correction)) && !ring.push_correction(&correction));
+        assert!((0..CORRECTIONS).all(|_| ring.push_correction(0, &AT_ORIGIN)) && !ring.push_correction(0, &AT_ORIGIN));
         ring.corrections(|_| ());
-        assert!(ring.push_correction(&correction));
+        assert!(ring.push_correction(0, &AT_ORIGIN));
     }
 
     #[test]

@@ -13,13 +13,13 @@
 //! With `--poses` the poses come from a table, odometry is skipped, and every frame is a keyframe.
 
 use super::gate::{Clock, Stream, RELEARN};
-use super::log::{LogSender, State};
+use super::log::{LogSender, Rig, State};
 use super::publisher::{Newest, Publisher};
 use super::waker::{SetOnDrop, Waker};
 use crate::config::Board;
 use crate::counters::Counters;
 use crate::frontend::{Frontend, Prediction, Rejected, Tracks, Verdicts};
-use crate::limits::{FRAMES, IMU_BETWEEN_FRAMES};
+use crate::limits::{CAMERAS_MAX, FRAMES, IMU_BETWEEN_FRAMES};
 use crate::mem::{seal_thread, Footprint, List, Thinned};
 use crate::vio::{Findings, Health, Known, Predictor, Vio};
 use crossbeam_queue::ArrayQueue;
@@ -41,6 +41,8 @@ pub struct Tracked {
     /// Newest estimate of the pose at camera 0's exposure.
     pub world_from_body: Pose,
     pub keyframe: bool,
+    /// Where the cameras sit on the body; `None`: as calibrated.
+    pub body_from_cam: Option<[Pose; CAMERAS_MAX]>,
     /// Newest poses of all keyframes still being optimised; filled beside a keyframe.
     pub corrections: List<(Nanos, Pose), FRAMES>,
 }
@@ -240,10 +242,12 @@ impl Back {
         if self.epochs.last().is_none_or(|(_, last)| *last != update.epoch) {
             let _ = self.epochs.push((packet.frames.t, update.epoch));
         }
+        let known = self.vio.known();
         let exposed = self.vio.window().last().map(|(_, pose, _)| pose);
         packet.tracked = update.odometry.zip(exposed).map(|(_, world_from_body)| Tracked {
             world_from_body,
             keyframe: update.keyframe,
+            body_from_cam: known.cameras.map(|cameras| cameras.body_from_cam),
             corrections: if update.keyframe { self.keyframe_poses() } else { List::default() },
         });
         if let Some(odometry) = update.odometry {
@@ -256,13 +260,15 @@ impl Back {
         let latency_ms = packet.begun.elapsed().as_secs_f64() * 1e3;
         self.frame_ms.push((packet.frames.t, latency_ms));
         if let Some(newest) = &self.newest {
-            newest.set(&update, self.vio.known().imu_scale);
+            newest.set(&update, known.imu_scale);
         }
         if let Some(log) = &self.log {
             let cpu = packet.cpu + (thread_cpu_now() - cpu);
             let time_offsets_ns = self.vio.time_offsets().map(|offsets| offsets.map(|offset| offset.0));
             let state = State::new(packet.frames.t, &update, latency_ms, cpu.as_secs_f64() * 1e3);
             log.state(State { time_offsets_ns, ..state });
+            let rig = update.keyframe.then(|| self.vio.rig()).flatten();
+            rig.iter().for_each(|rig| log.rig(Rig::new(t, rig)));
         }
     }
 
@@ -385,8 +391,8 @@ pub fn look_up(poses: &[TimedPose], packet: &mut FramePacket, counters: &Counter
     }
     let pose = pose_at(poses, packet.frames.t, POSE_GAP_MAX);
     counters.frames_without_pose.add(u64::from(pose.is_none()));
-    packet.tracked =
-        pose.map(|world_from_body| Tracked { world_from_body, keyframe: true, corrections: List::default() });
+    let (keyframe, body_from_cam, corrections) = (true, None, List::default());
+    packet.tracked = pose.map(|world_from_body| Tracked { world_from_body, keyframe, body_from_cam, corrections });
 }
 
 /// What the threads of tracking share.

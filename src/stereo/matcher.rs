@@ -10,7 +10,7 @@
 use super::confidence::Confidence;
 use super::onnx::{self, Network};
 use super::opencv::{self, OpenCv};
-use super::rectify_gpu::{packed, Rectifier};
+use super::rectify_gpu::{packed, rows, Rectifier};
 use super::sgm::wls::Wls;
 use super::sgm::{self, Sgm};
 use super::Disparity;
@@ -47,7 +47,9 @@ impl Matcher {
                 f.build("stereo: sums of the confidence", || Confidence::new(width, config));
             }
             StereoMethod::Sgm => {
-                f.build("stereo: pair on its way to the GPU", || [packed(width, height), packed(width, height)]);
+                f.build("stereo: pair on its way to the GPU", || {
+                    ([(); 2].map(|()| packed(width, height)), rows(width))
+                });
             }
         }
         Ok(())

@@ -15,10 +15,10 @@ pub mod rectify_gpu;
 pub mod sgm;
 
 use crate::config::{StereoConfig, StereoMethod};
-use crate::gpu::{Arena, Gpu};
+use crate::gpu::{Arena, Gpu, GpuError};
 use crate::mem::Footprint;
 pub use matcher::Matcher;
-use rectify::{box_average, Rectification, Remap};
+use rectify::{box_average, Rectification, Remap, ROWS_OFF_MAX};
 use rectify_gpu::Rectifier;
 use stipple_drivers::{Calibration, Camera, Fault, Image, Pose, RigCamera};
 
@@ -100,7 +100,9 @@ impl DepthMap {
 
 /// The rig without distortion: both views at full resolution, and the left one at mapping resolution.
 pub struct RectifiedViews {
-    full: RectifiedCamera,
+    rectification: Rectification,
+    /// The rig that the maps were made for.
+    mapped: Vec<RigCamera>,
     mapping: RectifiedCamera,
     divisor: usize,
     maps: [Remap; 2],
@@ -112,12 +114,13 @@ pub struct RectifiedViews {
 impl RectifiedViews {
     pub fn new(calibration: &Calibration, divisor: u32) -> Result<RectifiedViews, Fault> {
         let r = Rectification::new(calibration)?;
-        let (full, divisor) = (r.camera, divisor as usize);
+        let (full, divisor) = (r.camera.pinhole, divisor as usize);
         let maps = [r.map(&calibration.cameras[0]), r.map(&calibration.cameras[1])];
-        let image = || Image::new(full.pinhole.width, full.pinhole.height);
+        let image = || Image::new(full.width, full.height);
         Ok(RectifiedViews {
-            full,
-            mapping: RectifiedCamera { pinhole: full.pinhole.divided(divisor), ..full },
+            mapping: RectifiedCamera { pinhole: full.divided(divisor), ..r.camera },
+            rectification: r,
+            mapped: calibration.cameras.clone(),
             divisor,
             valid: maps[0].valid_blocks(divisor),
             maps,
@@ -141,7 +144,38 @@ impl RectifiedViews {
         self.maps[side].valid_blocks(self.divisor)
     }
 
-    /// Every camera of the rig, as calibrated.
+    /// Takes over where the cameras sit on the body by now. Answers whether the maps were made anew: the rows were off one
+    /// another. Cameras that are no pair any more change nothing.
+    pub fn adjust(&mut self, body_from_cam: &[Pose]) -> bool {
+        let places = || self.rig.iter().zip(body_from_cam);
+        if places().all(|(c, at)| c.body_from_cam == *at) || !places().all(|(_, at)| at.is_finite()) {
+            return false;
+        }
+        self.rig.iter_mut().zip(body_from_cam).for_each(|(c, at)| c.body_from_cam = *at);
+        let Ok(moved) = self.rectification.moved(&self.rig) else {
+            self.rig.clone_from(&self.mapped);
+            return false;
+        };
+        let camera = moved.camera;
+        let anew = self.rectification.rows_off(&self.mapped, &self.rig) > ROWS_OFF_MAX;
+        if anew {
+            self.rectification = moved;
+            self.mapped.clone_from(&self.rig);
+            self.maps.iter_mut().zip(&self.rig).for_each(|(map, camera)| self.rectification.fill(camera, map));
+            self.valid = self.valid_of(0);
+        }
+        let body_from_rect = self.body_from_rect(0);
+        self.mapping = RectifiedCamera { pinhole: self.mapping.pinhole, body_from_rect, ..camera };
+        anew
+    }
+
+    /// Where a rectified camera sits on the body: 0 left, 1 right.
+    pub fn body_from_rect(&self, side: usize) -> Pose {
+        let raw = &self.rig[side].body_from_cam;
+        Pose::new(raw.q * self.rectification.cam_from_rect(&self.mapped[side]), raw.p)
+    }
+
+    /// Every camera of the rig, where it sits by now.
     pub fn rig(&self) -> &[RigCamera] {
         &self.rig
     }
@@ -197,7 +231,7 @@ impl Stereo {
         f: &mut Footprint,
     ) -> Result<RectifiedViews, Fault> {
         let views = f.build("stereo: rectification", || RectifiedViews::new(calibration, divisor))?;
-        let Pinhole { width, height, .. } = views.full.pinhole;
+        let Pinhole { width, height, .. } = views.rectification.camera.pinhole;
         f.build("stereo: disparity and its deviation", || Disparity::new(width, height));
         Matcher::footprint(width, height, config, f)?;
         Ok(views)
@@ -211,7 +245,7 @@ impl Stereo {
         mut gpu: Option<&mut Gpu>,
     ) -> Result<Stereo, Fault> {
         let views = RectifiedViews::new(calibration, divisor)?;
-        let Pinhole { width, height, .. } = views.full.pinhole;
+        let Pinhole { width, height, .. } = views.rectification.camera.pinhole;
         let mut rectifier = None;
         let mut buffers = Buffers::default();
         if let Some(gpu) = &mut gpu {
@@ -225,6 +259,15 @@ impl Stereo {
             disparity: Disparity::new(width, height),
             depth_range_m: [config.depth_min_m, config.depth_max_m],
         })
+    }
+
+    /// Takes over where the cameras sit on the body by now; answers whether rectification was made anew.
+    pub fn adjust(&mut self, gpu: &mut Gpu, body_from_cam: &[Pose]) -> Result<bool, GpuError> {
+        let anew = self.views.adjust(body_from_cam);
+        if let (true, Some(rectifier)) = (anew, &mut self.rectifier) {
+            rectifier.upload(gpu, &self.views.maps)?;
+        }
+        Ok(anew)
     }
 
     /// Depth at mapping resolution. `out` is pre-shaped, `gpu` the one given to `new`. Answers how many pixels have
@@ -255,8 +298,9 @@ impl Stereo {
     /// of the block has one: the mean would invent surfaces between foreground and background.
     fn disparity_to_depth(&self, out: &mut DepthMap) -> usize {
         const BLOCK_MAX: usize = 16; // divisor 4
-        let RectifiedViews { full, divisor: s, valid, .. } = &self.views;
-        let (w, s, fb) = (full.pinhole.width, *s, full.pinhole.fx * full.baseline_m);
+        let RectifiedViews { rectification, mapping, divisor: s, valid, .. } = &self.views;
+        let full = rectification.camera.pinhole;
+        let (w, s, fb) = (full.width, *s, full.fx * mapping.baseline_m);
         let sigma_max = self.matcher.sigma_max_px();
         let mut found = 0;
         for y in 0..out.height {

@@ -23,8 +23,20 @@ pub struct Rectification {
     body_from_rect: DQuat,
 }
 
+/// Rows of the two views may be so far off one another before the maps are made anew, px.
+pub const ROWS_OFF_MAX: f64 = 0.1;
+
 impl Rectification {
     pub fn new(calibration: &Calibration) -> Result<Rectification, Fault> {
+        Rectification::of(&calibration.cameras, None)
+    }
+
+    /// Rectification of cameras that were moved on the body, seen through the same pinhole as before.
+    pub fn moved(&self, cameras: &[RigCamera]) -> Result<Rectification, Fault> {
+        Rectification::of(cameras, Some(self.camera.pinhole))
+    }
+
+    fn of(cameras: &[RigCamera], pinhole: Option<Pinhole>) -> Result<Rectification, Fault> {
         let bad = |what: &str| {
             Fault::new(
                 FaultKind::Config,
@@ -33,7 +45,7 @@ impl Rectification {
                 "a map needs cameras 0 and 1 side by side, looking the same way; without a map: --set map.enabled=false",
             )
         };
-        let [left, right, ..] = &calibration.cameras[..] else {
+        let [left, right, ..] = cameras else {
             return Err(bad("has fewer than two cameras"));
         };
         let along = right.body_from_cam.p - left.body_from_cam.p;
@@ -50,18 +62,43 @@ impl Rectification {
         }
         let z = z.normalize();
         let body_from_rect = DQuat::from_mat3(&DMat3::from_cols(x, z.cross(x), z)).normalize();
-        let pinhole = common_pinhole(left, right, body_from_rect)
+        let pinhole = pinhole
+            .or_else(|| common_pinhole(left, right, body_from_rect))
             .ok_or_else(|| bad("leaves no common view after rectification"))?;
         let pose = Pose::new(body_from_rect, left.body_from_cam.p);
         Ok(Rectification { camera: RectifiedCamera { pinhole, body_from_rect: pose, baseline_m }, body_from_rect })
     }
 
+    /// How the rectified camera is turned in a raw one.
+    pub fn cam_from_rect(&self, camera: &RigCamera) -> DQuat {
+        camera.body_from_cam.q.conjugate() * self.body_from_rect
+    }
+
+    /// How far rows are off one another where the cameras have moved on the body since, px.
+    pub fn rows_off(&self, since: &[RigCamera], now: &[RigCamera]) -> f64 {
+        let [(old, new), (old_right, new_right)] = [0, 1].map(|i| (&since[i].body_from_cam, &now[i].body_from_cam));
+        let (before, after) = (old.inverse() * *old_right, new.inverse() * *new_right);
+        let turned = (before.q.conjugate() * after.q).to_scaled_axis().length();
+        let along = before.p.angle_between(after.p);
+        self.camera.pinhole.fx * (turned + along)
+    }
+
     /// Where each rectified pixel comes from in a raw image of `camera`.
     pub fn map(&self, camera: &RigCamera) -> Remap {
         let p = &self.camera.pinhole;
-        let cam_from_rect = camera.body_from_cam.q.conjugate() * self.body_from_rect;
+        let taps = Vec::with_capacity(p.width * p.height);
+        let mut map = Remap { width: p.width, height: p.height, source_width: camera.camera.width, taps };
+        self.fill(camera, &mut map);
+        map
+    }
+
+    /// The same into a map of this size.
+    pub fn fill(&self, camera: &RigCamera, map: &mut Remap) {
+        let p = &self.camera.pinhole;
+        let cam_from_rect = self.cam_from_rect(camera);
         let raw = &camera.camera;
-        let mut taps = Vec::with_capacity(p.width * p.height);
+        let taps = &mut map.taps;
+        taps.clear();
         for y in 0..p.height {
             for x in 0..p.width {
                 let ray = DVec3::new((x as f64 - p.cx) / p.fx, (y as f64 - p.cy) / p.fy, 1.0);
@@ -71,7 +108,6 @@ impl Rectification {
                 taps.push(tap.map_or(Tap { index: OUTSIDE, wx: 0, wy: 0 }, |px| Tap::at(px, raw.width, raw.height)));
             }
         }
-        Remap { width: p.width, height: p.height, source_width: raw.width, taps }
     }
 }
 
@@ -154,14 +190,14 @@ impl Remap {
 
     /// The look-ups for a kernel, with raw rows of `stride` bytes: the source's place in bytes, all ones where there is none, and
     /// the weights to the right and down.
-    pub fn taps(&self, stride: usize) -> Vec<[u32; 2]> {
+    pub fn taps(&self, stride: usize) -> impl Iterator<Item = [u32; 2]> + '_ {
         let place =
-            |index: u32| (index as usize / self.source_width * stride + index as usize % self.source_width) as u32;
-        let one = |t: &Tap| match t.index {
+            move |index: u32| (index as usize / self.source_width * stride + index as usize % self.source_width) as u32;
+        let one = move |t: &Tap| match t.index {
             OUTSIDE => [OUTSIDE, 0],
             index => [place(index), u32::from(t.wx) | u32::from(t.wy) << 16],
         };
-        self.taps.iter().map(one).collect()
+        self.taps.iter().map(one)
     }
 
     /// 1 for each `divisor` x `divisor` block that has a source everywhere.

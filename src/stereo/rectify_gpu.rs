@@ -27,7 +27,12 @@ pub struct Rectifier {
     size: [u32; 2],
     /// Host side of the raw images.
     bytes: Vec<u8>,
+    /// Host side of a few rows of a map.
+    taps: Vec<[u32; 2]>,
 }
+
+/// Rows of a map that are sent at once.
+const ROWS: usize = 16;
 
 /// Bytes of one image whose rows are whole words.
 pub fn image_bytes(width: usize, height: usize) -> usize {
@@ -39,6 +44,11 @@ pub fn packed(width: usize, height: usize) -> Vec<u8> {
     vec![0; 2 * image_bytes(width, height)]
 }
 
+/// Room for rows of a map on their way to the GPU.
+pub fn rows(width: usize) -> Vec<[u32; 2]> {
+    Vec::with_capacity(ROWS * width)
+}
+
 impl Rectifier {
     pub fn new(
         gpu: &mut Gpu,
@@ -47,15 +57,31 @@ impl Rectifier {
         height: usize,
         maps: &[Remap; 2],
     ) -> Result<Rectifier, Fault> {
-        for (side, map) in maps.iter().enumerate() {
-            gpu.upload(buffers.taps, side * width * height, &map.taps(width.next_multiple_of(4)))?;
-        }
-        Ok(Rectifier {
+        let mut rectifier = Rectifier {
             buffers,
             kernel: gpu.kernel_in_pieces(rectify::Spec::default())?,
             size: [width as u32, height as u32],
             bytes: packed(width, height),
-        })
+            taps: rows(width),
+        };
+        rectifier.upload(gpu, maps)?;
+        Ok(rectifier)
+    }
+
+    /// Puts other maps in the place of those it has.
+    pub fn upload(&mut self, gpu: &mut Gpu, maps: &[Remap; 2]) -> Result<(), GpuError> {
+        let width = self.size[0] as usize;
+        let mut from = 0;
+        for map in maps {
+            let mut taps = map.taps(width.next_multiple_of(4)).peekable();
+            while taps.peek().is_some() {
+                self.taps.clear();
+                self.taps.extend(taps.by_ref().take(ROWS * width));
+                gpu.upload(self.buffers.taps, from, &self.taps)?;
+                from += self.taps.len();
+            }
+        }
+        Ok(())
     }
 
     pub fn load(&mut self, gpu: &mut Gpu, left: &Image, right: &Image) -> Result<(), GpuError> {

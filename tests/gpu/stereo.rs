@@ -200,7 +200,7 @@ fn raw_pairs_are_rectified_as_on_the_cpu() {
             assert!(expected.pixels.iter().filter(|p| **p > 0).count() * 2 > w * h);
             let mut padded = vec![0; stride * (h + 1)];
             (0..h).for_each(|y| padded[y * stride..][..w].copy_from_slice(&raw.pixels[y * w..][..w]));
-            for (i, tap) in maps[side].taps(stride).into_iter().enumerate() {
+            for (i, tap) in maps[side].taps(stride).enumerate() {
                 let here = found[(side * h + i / w) * stride + i % w];
                 assert_eq!(here, expected.pixels[i], "side {side}, pixel {i}");
                 assert_eq!(here, twin::rectify(&padded, stride, tap), "side {side}, pixel {i}");

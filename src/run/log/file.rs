@@ -18,7 +18,8 @@ pub const EVENT: &str = "/event";
 pub const COUNTERS: &str = "/counters";
 pub const CLOCKS: &str = "/clocks";
 pub const PREDICTED: &str = "/predicted";
-const CHANNELS: [(&str, &str, &str); 5] = [
+pub const RIG: &str = "/rig";
+const CHANNELS: [(&str, &str, &str); 6] = [
     (
         STATE,
         "stipple.State",
@@ -43,6 +44,12 @@ const CHANNELS: [(&str, &str, &str); 5] = [
         r#"{"type":"object","properties":{"t_ns":{"type":"integer"},"age_ns":{"type":"integer"},"epoch":{"type":"integer"},
 "estimate":{"type":"object"},"sigma":{"type":"array","items":{"type":"number"}},"health":{"type":"integer"},
 "quality":{"type":"integer"}}}"#,
+    ),
+    (
+        RIG,
+        "stipple.Rig",
+        r#"{"type":"object","properties":{"t_ns":{"type":"integer"},"time_offsets":{"type":"array"},
+"extrinsics":{"type":"array"},"imu_scale":{"type":"array"}}}"#,
     ),
 ];
 /// Bytes of messages that end a chunk before the next sync does, as after a stall of the disk: damage costs whole chunks.
@@ -127,6 +134,7 @@ impl LogFiles {
         match &record.content {
             Content::State(state) => self.message(STATE, at, Some(state.t_ns), state),
             Content::Predicted(state) => self.message(PREDICTED, at, Some(state.t_ns), state),
+            Content::Rig(rig) => self.message(RIG, at, Some(rig.t_ns), rig),
             Content::Event(kind, text) => {
                 let event = Event { kind: *kind, text: String::from_utf8_lossy(text) };
                 self.message(EVENT, at, None, &event)

@@ -18,7 +18,7 @@ mod tests;
 use super::threads;
 use crate::limits::CAMERAS_MAX;
 use crate::mem::{Footprint, List};
-use crate::vio::{Odometry, Predicted, Update};
+use crate::vio::{Odometry, Predicted, RigEstimate, Update};
 use crossbeam_queue::ArrayQueue;
 use file::LogFiles;
 use serde::{Deserialize, Serialize};
@@ -171,6 +171,31 @@ impl State {
     }
 }
 
+/// What is estimated of the rig beside a keyframe: how far it is off the calibration, and the standard deviations.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Rig {
+    /// Stamp of the keyframe.
+    pub t_ns: i64,
+    /// Added to the stamps of each camera, s.
+    pub time_offsets: [Option<[f32; 2]>; CAMERAS_MAX],
+    /// [p, θ] of each camera on the body, m and rad, θ on the right.
+    pub extrinsics: [Option<[[f32; 6]; 2]>; CAMERAS_MAX],
+    /// Factors of the gyro's axes and the accelerometer's, less one.
+    pub imu_scale: Option<[[f32; 6]; 2]>,
+}
+
+impl Rig {
+    pub fn new(t: Nanos, rig: &RigEstimate) -> Rig {
+        let six = |both: [[f64; 6]; 2]| both.map(|six| six.map(|x| x as f32));
+        Rig {
+            t_ns: t.0,
+            time_offsets: rig.time_offsets.map(|found| found.map(|both| both.map(|x| x as f32))),
+            extrinsics: rig.extrinsics.map(|found| found.map(six)),
+            imu_scale: rig.imu_scale.map(six),
+        }
+    }
+}
+
 /// What an event is about.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -221,6 +246,7 @@ impl Clocks {
 enum Content {
     State(State),
     Predicted(PredictedState),
+    Rig(Rig),
     Event(EventKind, List<u8, TEXT>),
     /// From a thread that may allocate; none that is zero.
     Counters(Vec<(Cow<'static, str>, u64)>),
@@ -261,6 +287,10 @@ pub struct LogSender(Arc<Queue>);
 impl LogSender {
     pub fn state(&self, state: State) {
         self.0.push(Content::State(state));
+    }
+
+    pub fn rig(&self, rig: Rig) {
+        self.0.push(Content::Rig(rig));
     }
 
     /// Half of the queue is left to what comes once a frame, and to events.

@@ -1,8 +1,8 @@
 //! Reads logs back, damaged ones and those of a run that was killed or cut off included: every chunk whose checksum holds,
 //! wherever it is found, once, in the order of writing, in memory for one chunk and an index.
 
-use super::file::{logs, topic, CLOCKS, COUNTERS, EVENT, PREDICTED, STATE};
-use super::{Clocks, Event, PredictedState, State};
+use super::file::{logs, topic, CLOCKS, COUNTERS, EVENT, PREDICTED, RIG, STATE};
+use super::{Clocks, Event, PredictedState, Rig, State};
 use crate::output::trajectory::TumWriter;
 use ::mcap::parse_record;
 use ::mcap::records::{op, Record};
@@ -31,6 +31,7 @@ const CHUNK_HEAD: usize = HEAD + 8 + 8 + 8 + 4 + 4 + 8;
 pub enum Message<'a> {
     State(State),
     Predicted(PredictedState),
+    Rig(Rig),
     Event(Event<'a>),
     Counters(BTreeMap<String, u64>),
     Clocks(Clocks),
@@ -44,6 +45,7 @@ impl Message<'_> {
         match topic {
             STATE => of(data).map(Message::State),
             PREDICTED => of(data).map(Message::Predicted),
+            RIG => of(data).map(Message::Rig),
             EVENT => of(data).map(Message::Event),
             COUNTERS => of(data).map(Message::Counters),
             CLOCKS => of(data).map(Message::Clocks),

@@ -18,6 +18,13 @@ use stipple_drivers::TimedPose;
 
 const LARGE: Limits = Limits { file: 1 << 30, free: 0 };
 
+const RIG: Rig = Rig {
+    t_ns: 7,
+    time_offsets: [Some([0.25, 0.5]), None, None, None],
+    extrinsics: [None, Some([[0.125; 6], [0.5; 6]]), None, None],
+    imu_scale: None,
+};
+
 /// Frame i at 20 Hz; the first five have no pose.
 fn state(i: u64) -> State {
     // Of few digits: JSON is parsed to the last bit but one.
@@ -54,6 +61,7 @@ fn log(dir: &Path, limits: Limits, frames: &[u64], between: usize) -> (Vec<PathB
         std::thread::sleep((SYNC_PERIOD + 3 * POLL_PERIOD) * i.min(1) as u32);
         batch.iter().for_each(|i| sender.state(state(*i)));
     }
+    sender.rig(RIG);
     sender.counters(vec![("frames".into(), 7), ("resets".into(), 0)]);
     sender.event(EventKind::End, "over");
     let mut counters = vec![];
@@ -88,7 +96,7 @@ fn what_was_logged_is_read_back_across_files_and_runs() {
     let small = Limits { file: 1, free: 0 };
     let (first, counters) = log(dir.path(), small, &some(0..3), 1);
     assert!(first.len() >= 3 && count(&counters, "log_files") == first.len() as u64, "{first:?}");
-    assert_eq!((count(&counters, "log_records_written"), count(&counters, "log_records_lost")), (6, 0));
+    assert_eq!((count(&counters, "log_records_written"), count(&counters, "log_records_lost")), (7, 0));
     let (second, _) = log(dir.path(), LARGE, &some(3..300), 4000);
     let found = runs(dir.path()).unwrap();
     assert_eq!(found.iter().map(|r| r.files.clone()).collect::<Vec<_>>(), [first.clone(), second.clone()]);
@@ -103,7 +111,8 @@ fn what_was_logged_is_read_back_across_files_and_runs() {
     };
     read_files(&second, each).unwrap();
     assert!(rest[0].starts_with("Clocks(") && rest[1].contains("Start") && rest[1].contains("a test"), "{rest:?}");
-    assert!(rest[2] == r#"Counters({"frames": 7})"# && rest[3].contains("End"), "{rest:?}");
+    assert_eq!(rest[2], format!("{:?}", Message::Rig(RIG)));
+    assert!(rest[3] == r#"Counters({"frames": 7})"# && rest[4].contains("End"), "{rest:?}");
 }
 
 /// The room of a disk goes while a file fills.
@@ -253,7 +262,7 @@ fn a_full_disk_ends_the_log_and_keeps_every_record_before() {
         // 150 kB a sync.
         let (files, counters) = log(disk, LARGE, &some(0..5000), 500);
         let (written, lost) = (count(&counters, "log_records_written"), count(&counters, "log_records_lost"));
-        assert_eq!((files.len(), count(&counters, "log_ended_early"), written + lost), (1, 1, 5003), "{counters:?}");
+        assert_eq!((files.len(), count(&counters, "log_ended_early"), written + lost), (1, 1, 5004), "{counters:?}");
         let found = states(&files);
         // And the event of its start.
         assert!(written > 2000 && found.len() as u64 + 1 == written, "{} of {written}", found.len());
