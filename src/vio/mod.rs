@@ -71,7 +71,7 @@ use stipple_drivers::{Calibration, ImuSample, Nanos, Pose, Span};
 const PX_MAX: f32 = 65536.0;
 /// Inertia alone is not believed for longer than this, s; the ring of samples may not hold more either.
 const FRAME_GAP_MAX: f64 = 2.0;
-/// The most that a start is worth after one that was lied to, until it is trusted, and a frame whose views do not fit.
+/// The most that a start is worth after one that went wrong, until it is trusted, and a frame whose views do not fit.
 const QUALITY_SUSPECT: u8 = 20;
 /// A camera with fewer than one in so many of another's tracks is blind.
 const BLIND_FRACTION: usize = 10;

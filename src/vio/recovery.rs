@@ -3,10 +3,10 @@
 //! Vision or inertia go wrong some frames before it shows, so after a disagreement it is an estimate of
 //! `LAG` before the first doubt that a restart resumes from. While nothing speaks against the inertial samples either
 //! (no frame came, nothing was seen) the carried pose is the best there is, and its covariance, propagated with it,
-//! says how good. Where a restart finds another velocity than the carried state expects, inertia lied meanwhile: the
+//! says how good. Where a restart finds another velocity than the carried state expects, inertia was wrong meanwhile: the
 //! trusted pose is kept as it was, widened by how far the rig may have come since; so is the first pose of a start that
-//! was given up before anything was trusted, and the trusted pose before a hole of the samples. Down is carried by the gyro
-//! alone; a restart that finds another one, for some seconds, is refused, for its accelerometer lies.
+//! was given up before anything was trusted, and the trusted pose before a gap in the samples. Down is carried by the gyro
+//! alone; a restart that finds another one, for some seconds, is refused, for its accelerometer is wrong.
 
 use super::health::Reset;
 use super::inertial::{Covariance, Mat15, Motion, MotionSigma};
@@ -43,10 +43,10 @@ pub struct Recovery {
     /// Waits for `LAG`, then is the confirmed one.
     candidate: Option<TrustedState>,
     confirmed: Option<TrustedState>,
-    /// The last start, or what was trusted on another clock or before a hole of the samples: where a restart begins while
+    /// The last start, or what was trusted on another clock or before a gap in the samples: where a restart begins while
     /// nothing is trusted.
     started: Option<DeadReckoning>,
-    /// Something lied before a reset, and nothing was trusted since.
+    /// Something was wrong before a reset, and nothing was trusted since.
     suspect: bool,
     /// The last restart was not where dead reckoning had led.
     jumped: bool,
@@ -76,7 +76,7 @@ impl Recovery {
         self.suspect |= matches!(why, Reset::Disagreement | Reset::State);
     }
 
-    /// Carries what was trusted past a hole of the samples, or over to a clock that is `by` ahead. No samples lead on from
+    /// Carries what was trusted past a gap in the samples, or over to a clock that is `by` ahead. No samples lead on from
     /// there.
     pub fn interrupt(&mut self, by: Span) {
         let from = self.trusted().map(|trusted| trusted.then).or(self.started);
@@ -84,7 +84,7 @@ impl Recovery {
         *self = Recovery { started, suspect: self.suspect, origin: self.origin, ..Recovery::default() };
     }
 
-    /// Whether an estimate was given up because something lied, and none was trusted since: samples, or the estimate, may have
+    /// Whether an estimate was given up because samples or estimate were wrong, and none was trusted since: they may have
     /// been wrong for some time before that, and may be still.
     pub fn is_suspect(&self) -> bool {
         self.suspect

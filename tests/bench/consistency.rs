@@ -4,7 +4,8 @@
 //! Consistency: normalised estimation error squared (NEES, eᵀ P⁻¹ e) of all fifteen errors over seeded
 //! flights of a world made as the estimator is told, mean over flights at each instant, beside its 95 %
 //! bounds (χ² of 15 N dimensions over N; Bar-Shalom et al. 2001, 5.4). The world of the estimate is tied to
-//! the truth by position and yaw of the first estimate, so position errors are relative to the start.
+//! the truth by position and yaw of the first estimate, so position errors are relative to the start, and blocks are means from
+//! a second after it on.
 //!
 //! Reliability: every frame of the flights of the stability table, by its quality, beside the error of its
 //! velocity and the error of its motion over the next second.
@@ -57,9 +58,10 @@ pub struct Consistency {
     /// Mean over the flights, by time since the start, s.
     pub over_time: Vec<(f64, f64)>,
     pub mean: f64,
-    /// NEES of position, rotation, velocity, gyro and accelerometer bias: three dimensions each.
+    /// NEES of position, rotation, velocity, gyro and accelerometer bias, three dimensions each, from a second after the start on:
+    /// until then the tie to the truth takes the position's away.
     pub blocks: [f64; 5],
-    /// The same by second since the start.
+    /// The same by second since the start, the first included.
     pub by_second: Vec<[f64; 5]>,
     /// 95 % of the means at one instant lie between these.
     pub bounds: (f64, f64),
@@ -115,6 +117,8 @@ fn consistency_of(measured: bool, biases: (f64, f64), config: fn(&mut VioConfig)
             }
         });
     }
+    let later = by_second.get(1..).unwrap_or_default();
+    let counted = later.iter().map(|(_, n)| *n).sum::<usize>().max(1) as f64;
     let seconds = |i: usize| i as f64 / SECOND as f64;
     let whole = sums.iter().enumerate().filter(|(_, s)| s.1 == flights);
     let over_time: Vec<(f64, f64)> = whole.map(|(i, s)| (seconds(i), s.0 / s.1 as f64)).collect();
@@ -123,7 +127,7 @@ fn consistency_of(measured: bool, biases: (f64, f64), config: fn(&mut VioConfig)
     Consistency {
         flights,
         mean: sums.iter().map(|s| s.0).sum::<f64>() / f64::from(n.max(1)),
-        blocks: std::array::from_fn(|b| by_second.iter().map(|(sums, _)| sums[b]).sum::<f64>() / f64::from(n.max(1))),
+        blocks: std::array::from_fn(|b| later.iter().map(|(sums, _)| sums[b]).sum::<f64>() / counted),
         by_second: by_second.iter().map(|(sums, n)| sums.map(|sum| sum / *n as f64)).collect(),
         bounds,
         within: inside as f64 / over_time.len().max(1) as f64,
