@@ -30,7 +30,11 @@ const CHANNELS: [(&str, &str, &str); 6] = [
 "sigma":{"type":"array","items":{"type":"number"}},"health":{"type":"integer"},"quality":{"type":"integer"},
 "keyframe":{"type":"boolean"},"latency_ms":{"type":"number"},"cpu_ms":{"type":"number"}}}"#,
     ),
-    (EVENT, "stipple.Event", r#"{"type":"object","properties":{"kind":{"type":"string"},"text":{"type":"string"}}}"#),
+    (
+        EVENT,
+        "stipple.Event",
+        r#"{"type":"object","properties":{"kind":{"type":"string"},"epoch":{"type":"integer"},"text":{"type":"string"}}}"#,
+    ),
     (COUNTERS, "stipple.Counters", r#"{"type":"object"}"#),
     (
         CLOCKS,
@@ -74,6 +78,8 @@ pub struct LogFiles {
     run_ns: i64,
     /// Messages of the run so far: each has the next number.
     sequence: u32,
+    /// Epoch of the last state.
+    epoch: u32,
     open: Option<Open>,
     json: Vec<u8>,
     pub written: Vec<PathBuf>,
@@ -92,7 +98,7 @@ struct Open {
 impl LogFiles {
     pub fn new(dir: PathBuf, limits: Limits) -> LogFiles {
         let run_ns = Clocks::now(None).realtime_ns;
-        LogFiles { dir, limits, run_ns, sequence: 0, open: None, json: vec![], written: vec![] }
+        LogFiles { dir, limits, run_ns, sequence: 0, epoch: 0, open: None, json: vec![], written: vec![] }
     }
 
     /// Begins the next file.
@@ -132,11 +138,14 @@ impl LogFiles {
     pub fn write(&mut self, record: &Record) -> io::Result<()> {
         let at = record.at;
         match &record.content {
-            Content::State(state) => self.message(STATE, at, Some(state.t_ns), state),
+            Content::State(state) => {
+                self.epoch = state.epoch;
+                self.message(STATE, at, Some(state.t_ns), state)
+            }
             Content::Predicted(state) => self.message(PREDICTED, at, Some(state.t_ns), state),
             Content::Rig(rig) => self.message(RIG, at, Some(rig.t_ns), rig),
             Content::Event(kind, text) => {
-                let event = Event { kind: *kind, text: String::from_utf8_lossy(text) };
+                let event = Event { kind: *kind, epoch: self.epoch, text: String::from_utf8_lossy(text) };
                 self.message(EVENT, at, None, &event)
             }
             Content::Counters(list) => {
@@ -187,7 +196,7 @@ impl LogFiles {
     pub fn leave_room(&mut self) -> io::Result<()> {
         let Err(why) = self.needs_room() else { return Ok(()) };
         let text = why.to_string().into();
-        self.message(EVENT, host::monotonic(), None, &Event { kind: EventKind::Disk, text })?;
+        self.message(EVENT, host::monotonic(), None, &Event { kind: EventKind::Disk, epoch: self.epoch, text })?;
         self.close()?;
         Err(why)
     }

@@ -221,6 +221,9 @@ pub enum EventKind {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Event<'a> {
     pub kind: EventKind,
+    /// Epoch of the state before it; logs of older versions have none.
+    #[serde(default)]
+    pub epoch: u32,
     pub text: Cow<'a, str>,
 }
 

@@ -122,19 +122,20 @@ fn the_last_file_says_why_no_other_follows() {
     let mut files = LogFiles::new(dir.path().into(), Limits { file: 1, free: 0 });
     files.begin().unwrap();
     files.limits.free = u64::MAX;
-    files.write(&Record { at: Nanos(0), content: Content::State(state(7)) }).unwrap();
+    let last = State { epoch: 2, ..state(7) };
+    files.write(&Record { at: Nanos(0), content: Content::State(last) }).unwrap();
     let why = files.sync(false).unwrap_err().to_string();
     files.give_up();
     let mut said = vec![];
     let each = |_, message: Message| {
         if let Message::Event(event) = message {
-            said.push(event.text.into_owned());
+            said.push((event.epoch, event.text.into_owned()));
         }
         Ok(())
     };
     read_files(&files.written, each).unwrap();
-    assert!(why.contains("make room") && said == [why], "{said:?}");
-    assert_eq!(states(&files.written), [state(7)]);
+    assert!(why.contains("make room") && said == [(2, why)], "{said:?}");
+    assert_eq!(states(&files.written), [last]);
 }
 
 /// A disk that fails between two syncs: a chunk that was written whole stays.
