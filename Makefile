@@ -9,8 +9,9 @@
 #   libopencv-calib3d-dev  block matching; its libraries are loaded where a board asks for it
 #   libvulkan1             Vulkan loader
 #   mesa-vulkan-drivers    lavapipe (Vulkan on the CPU), and the drivers of Intel, AMD and Pi GPUs
+#   systemd                judges the unit of the service in the tests
 #   vulkan-validationlayers  the tests run the pipeline under the Khronos validation layer
-PACKAGES := g++ glslang-tools libopencv-calib3d-dev libvulkan1 mesa-vulkan-drivers vulkan-validationlayers
+PACKAGES := g++ glslang-tools libopencv-calib3d-dev libvulkan1 mesa-vulkan-drivers systemd vulkan-validationlayers
 
 # What `make hil` needs besides: a machine to emulate, and the headers of the kernel it boots.
 #   qemu-system-x86 busybox-static cpio kmod xz-utils  the machine and its first file system

@@ -39,6 +39,7 @@ pub mod memory;
 pub mod publisher;
 pub mod recorder;
 pub mod sensors;
+mod service;
 mod spikes;
 pub mod status;
 pub mod status_led;
@@ -189,8 +190,8 @@ pub fn fly(
         run.back.log = Some(log.sender());
         run.publisher.iter_mut().for_each(|publisher| publisher.log = Some(log.sender()));
     }
-    let mut status =
-        Status::new(options.duration_s.map(|s| s * speed).or(length_s)).with_led(led).with_log(log.sender());
+    let total_s = options.duration_s.map(|s| s * speed).or(length_s);
+    let mut status = Status::new(total_s).with_led(led).with_log(log.sender()).with_service(options.service);
     let (calibration, live) = (&input.calibration, length_s.is_none());
     let (mut flown, recording) = match (input.source, options.pace) {
         (Source::Recorded(recorded), Pace::Lockstep(steps)) => {
@@ -464,6 +465,7 @@ fn supervise(
         if run.sensors_s.is_some_and(|limit| t_s >= limit) || run.stop.load(Relaxed) {
             s.mailbox.stop.store(true, Relaxed);
             threads::ending();
+            status.stopping();
         }
         s.gauges.broke.fetch_or(!s.mailbox.broken.is_empty(), Relaxed);
         let hangs = threads::fell_silent();

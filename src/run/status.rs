@@ -1,7 +1,9 @@
 //! What a run shows while it goes on: a bar on a terminal, one line a second otherwise, and a status LED where one is wired.
 
 use super::log::{EventKind, LogSender};
+use super::service::Service;
 use super::status_led::StatusLed;
+use super::threads;
 use super::tracking::FramePacket;
 use crate::counters::Counters;
 use crate::frontend::{Verdict, Verdicts};
@@ -64,6 +66,7 @@ pub struct Status {
     next_line: Option<Instant>,
     led: Option<StatusLed>,
     log: Option<LogSender>,
+    service: Option<Service>,
     /// When counters are logged next.
     next_count: Instant,
     /// Whether it was said that logging ended.
@@ -99,6 +102,7 @@ impl Status {
             next_line: None,
             led: None,
             log: None,
+            service: None,
             next_count,
             log_ended: false,
             epoch: 0,
@@ -119,6 +123,17 @@ impl Status {
         self
     }
 
+    /// Tells the service manager, too, where there is one and this is a `service`.
+    pub fn with_service(mut self, service: bool) -> Status {
+        self.service = service.then(Service::of_this_process).flatten();
+        self
+    }
+
+    /// The run is to end: results are written from here on.
+    pub fn stopping(&mut self) {
+        self.service.iter_mut().for_each(Service::stopping);
+    }
+
     /// The run ended as it was asked to: the LED shows no fault.
     pub fn ended_well(&mut self) {
         self.led.iter_mut().for_each(StatusLed::ended_well);
@@ -128,6 +143,9 @@ impl Status {
     pub fn show(&mut self, g: &Gauges) {
         if let Some(led) = &mut self.led {
             led.show(g.posed.load(Relaxed), g.broke.load(Relaxed), Instant::now());
+        }
+        if let Some(service) = &mut self.service {
+            service.tell(threads::are_alive(), || format!("epoch {}, {}", g.epoch.load(Relaxed), line(g)));
         }
         let played = g.played_ms.load(Relaxed).min(self.total_ms.unwrap_or(u64::MAX));
         match &self.bar {

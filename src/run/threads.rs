@@ -129,6 +129,11 @@ fn silent() -> impl Iterator<Item = (usize, &'static str)> {
     })
 }
 
+/// Whether no thread has been silent for longer than it may. Allocates nothing.
+pub fn are_alive() -> bool {
+    silent().next().is_none()
+}
+
 /// Threads that fell silent for longer than they may since this was asked last.
 pub fn fell_silent() -> Vec<&'static str> {
     silent().filter(|(slot, _)| !TOLD[*slot].swap(true, Relaxed)).map(|(_, name)| name).collect()
