@@ -54,7 +54,7 @@ impl RigCamera {
     }
 
     /// Pixels in which the vehicle is not in view.
-    pub fn pixels(&self) -> usize {
+    pub fn free_pixels(&self) -> usize {
         let free = |y: usize| (0..self.camera.width).filter(|x| !self.is_masked(*x as f64, y as f64)).count();
         (0..self.camera.height).map(free).sum()
     }

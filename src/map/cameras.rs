@@ -124,8 +124,8 @@ pub fn training(views: &RectifiedViews, config: &MapConfig) -> Result<Vec<Traini
     (0..count(rig.len(), config)).map(one).collect()
 }
 
-/// Takes over where the cameras sit by now. Of pixels that rectification no longer draws, `anew`, none counts, nor of those that
-/// it did not draw before: one mask is for all images of a camera.
+/// Takes over where the cameras sit by now. Where rectification was made `anew`, pixels count that it draws now and drew each
+/// time before: all images of a camera have one mask.
 pub fn adjust(cameras: &mut [TrainingCamera], views: &RectifiedViews, anew: bool) {
     for (i, camera) in cameras.iter_mut().enumerate() {
         camera.body_from_cam = match camera.fisheye {
@@ -133,7 +133,7 @@ pub fn adjust(cameras: &mut [TrainingCamera], views: &RectifiedViews, anew: bool
             None => views.body_from_rect(i),
         };
         if anew && camera.fisheye.is_none() {
-            camera.valid.iter_mut().zip(views.valid_of(i)).for_each(|(valid, now)| *valid &= now);
+            views.mask(i, &mut camera.valid);
         }
     }
 }

@@ -11,7 +11,7 @@ pub struct Keyframe {
     /// Keyframes of different epochs are in different frames, and train different Gaussians.
     pub epoch: u32,
     pub world_from_body: Pose,
-    /// Where each camera sits, as estimated along with that pose; `None`: as calibrated.
+    /// Where each camera sits, as estimated along with that pose; `None`: as in the keyframe before, at first as calibrated.
     pub body_from_cam: Option<[Pose; CAMERAS_MAX]>,
     /// Images as the cameras gave them: left, right, and further ones that train.
     pub images: Vec<Image>,

@@ -16,8 +16,9 @@ pub struct Stored {
     pub epoch: u32,
     /// Odometry's pose, with its corrections.
     pub given: Pose,
-    /// Where the camera sits on the body that the stored image is of, and the one whose raw image that was drawn from.
+    /// Where the camera sits on the body by which the stored image was drawn.
     pub body_from_cam: Pose,
+    /// Where the raw camera sits whose image it was drawn from.
     body_from_raw: Pose,
     /// Pose of the camera when the Gaussians of an anchor were last put in place.
     pub placed: Pose,
@@ -30,7 +31,7 @@ pub struct Stored {
 }
 
 impl Stored {
-    /// Pose of the camera by odometry.
+    /// Pose of the camera by odometry; right for the first image of a keyframe alone, which has its pose.
     pub fn world_from_cam(&self) -> Pose {
         self.given * self.body_from_cam
     }
@@ -201,8 +202,10 @@ impl Store {
         for (e, raw) in
             images.iter_mut().zip(correction.body_from_cam.iter().flatten()).filter(|(_, raw)| raw.is_finite())
         {
-            // What was drawn from the raw image keeps its place relative to it.
-            e.body_from_cam = *raw * (e.body_from_raw.inverse() * e.body_from_cam);
+            // What was drawn from the raw image keeps its place relative to it, and what was refined moves along.
+            let moved = *raw * e.body_from_raw.inverse();
+            e.body_from_cam = moved * e.body_from_cam;
+            e.refined.body_from_refined = moved * e.refined.body_from_refined * moved.inverse();
             e.body_from_raw = *raw;
         }
         true
@@ -283,13 +286,15 @@ mod tests {
             s.add(&keyframe(7, false), [raw * raw_from_cam, raw], |_, _| {});
         }
         s.get_mut(0).anchor = true;
+        s.get_mut(0).refined.body_from_refined = turned(0.2);
+        let before = s.world_from_body(0) * s.get(0).body_from_cam;
         let learnt = turned(0.31);
         let world_from_body = raw * learnt.inverse();
         let mut body_from_cam = [learnt; CAMERAS_MAX];
         assert!(s.correct(&PoseCorrection { id: 7, world_from_body, body_from_cam: Some(body_from_cam) }));
         for index in 0..2 {
             let now = s.world_from_body(index) * s.get(index).body_from_cam;
-            let off = now.inverse() * (raw * raw_from_cam);
+            let off = now.inverse() * before;
             assert!(off.p.length() < 1e-12 && off.q.to_scaled_axis().length() < 1e-12, "{off:?}");
         }
         assert_eq!(s.displaced(1e-9).count(), 0);

@@ -1,7 +1,7 @@
 //! Stereo: a raw pair in, a rectified left image and a depth map at mapping resolution out, by the
 //! method that the board file names (`matcher`).
 //!
-//! `RectifiedViews` owns the maps made at boot, `Stereo` every buffer it matches in. Rectification runs at full
+//! `RectifiedViews` owns the maps, `Stereo` every buffer it matches in. Rectification runs at full
 //! resolution (matching needs it) and the mapping resolution is a box average of it, so that a
 //! mapping pixel is the mean of the light that fell on it. Depth is asked for anchors only.
 
@@ -18,7 +18,7 @@ use crate::config::{StereoConfig, StereoMethod};
 use crate::gpu::{Arena, Gpu, GpuError};
 use crate::mem::Footprint;
 pub use matcher::Matcher;
-use rectify::{box_average, Rectification, Remap, ROWS_OFF_MAX};
+use rectify::{box_average, Rectification, Remap, Turned};
 use rectify_gpu::Rectifier;
 use stipple_drivers::{Calibration, Camera, Fault, Image, Pose, RigCamera};
 
@@ -103,6 +103,8 @@ pub struct RectifiedViews {
     rectification: Rectification,
     /// The rig that the maps were made for.
     mapped: Vec<RigCamera>,
+    /// The right camera in the left one, as calibrated.
+    calibrated: Pose,
     mapping: RectifiedCamera,
     divisor: usize,
     maps: [Remap; 2],
@@ -121,6 +123,7 @@ impl RectifiedViews {
             mapping: RectifiedCamera { pinhole: full.divided(divisor), ..r.camera },
             rectification: r,
             mapped: calibration.cameras.clone(),
+            calibrated: left_from_right(&calibration.cameras),
             divisor,
             valid: maps[0].valid_blocks(divisor),
             maps,
@@ -134,7 +137,7 @@ impl RectifiedViews {
         self.mapping
     }
 
-    /// 1 where a mapping pixel is wholly covered by the raw left image, else 0.
+    /// 1 where a mapping pixel is wholly covered by the raw left image, by each rectification so far, else 0.
     pub fn valid_mask(&self) -> &[u8] {
         &self.valid
     }
@@ -144,28 +147,31 @@ impl RectifiedViews {
         self.maps[side].valid_blocks(self.divisor)
     }
 
-    /// Takes over where the cameras sit on the body by now. Answers whether the maps were made anew: the rows were off one
-    /// another. Cameras that are no pair any more change nothing.
+    /// Sets the pixels of a mask of one side to 0 that are not wholly covered.
+    pub fn mask(&self, side: usize, valid: &mut [u8]) {
+        self.maps[side].mask_blocks(self.divisor, valid);
+    }
+
+    /// Takes over where the cameras sit on the body by now. Answers whether the maps were made anew, since rows were off one
+    /// another: not where the cameras are no pair any more, or one that no knock makes of the calibrated. Allocates nothing.
     pub fn adjust(&mut self, body_from_cam: &[Pose]) -> bool {
         let places = || self.rig.iter().zip(body_from_cam);
         if places().all(|(c, at)| c.body_from_cam == *at) || !places().all(|(_, at)| at.is_finite()) {
             return false;
         }
         self.rig.iter_mut().zip(body_from_cam).for_each(|(c, at)| c.body_from_cam = *at);
-        let Ok(moved) = self.rectification.moved(&self.rig) else {
-            self.rig.clone_from(&self.mapped);
-            return false;
-        };
-        let camera = moved.camera;
-        let anew = self.rectification.rows_off(&self.mapped, &self.rig) > ROWS_OFF_MAX;
-        if anew {
+        let now = left_from_right(&self.rig);
+        let moved = self.rectification.moved(&self.rig).filter(|_| Turned::new(&self.calibrated, &now).is_possible());
+        let moved = moved.filter(|_| self.rectification.rows_are_off(&left_from_right(&self.mapped), &now));
+        let anew = moved.is_some();
+        if let Some(moved) = moved {
             self.rectification = moved;
             self.mapped.clone_from(&self.rig);
             self.maps.iter_mut().zip(&self.rig).for_each(|(map, camera)| self.rectification.fill(camera, map));
-            self.valid = self.valid_of(0);
+            self.maps[0].mask_blocks(self.divisor, &mut self.valid);
         }
-        let body_from_rect = self.body_from_rect(0);
-        self.mapping = RectifiedCamera { pinhole: self.mapping.pinhole, body_from_rect, ..camera };
+        let (body_from_rect, baseline_m) = (self.body_from_rect(0), now.p.length());
+        self.mapping = RectifiedCamera { body_from_rect, baseline_m, ..self.mapping };
         anew
     }
 
@@ -335,6 +341,10 @@ impl Stereo {
     }
 }
 
+fn left_from_right(cameras: &[RigCamera]) -> Pose {
+    cameras[0].body_from_cam.inverse() * cameras[1].body_from_cam
+}
+
 fn images_of_one_size(calibration: &Calibration) -> bool {
     let size = |c: &RigCamera| (c.camera.width, c.camera.height);
     matches!(&calibration.cameras[..], [left, right, ..] if size(left) == size(right))
@@ -354,6 +364,40 @@ mod tests {
             cameras: vec![RigCamera::new(camera, Pose::IDENTITY), RigCamera::new(camera, right)],
             imu: ImuCalibration::CONSUMER,
         }
+    }
+
+    /// Maps are made anew for rows that are off, not for a pair that moved as one nor for one that no knock makes.
+    #[test]
+    fn views_follow_cameras_that_moved_and_maps_those_that_a_knock_may_have_moved() {
+        let rig = rig(Lens::Radtan { k1: -0.2, k2: 0.05, p1: 1e-4, p2: -1e-4 }, 200.0);
+        let mut views = RectifiedViews::new(&rig, 1).expect("a sound rig");
+        let [left, right] = [0, 1].map(|i| rig.cameras[i].body_from_cam);
+        let (at_boot, taps) = (views.camera(), views.maps[0].taps(320).collect::<Vec<_>>());
+        let knock = Pose::new(glam::DQuat::from_rotation_x(0.05), glam::DVec3::new(0.0, 0.02, 0.0));
+        let unusable = Pose { p: glam::DVec3::X * f64::NAN, ..right };
+        let turned = |x: f64| right * Pose::new(glam::DQuat::from_rotation_x(x), glam::DVec3::ZERO);
+        let cases = [
+            ([knock * left, knock * right], false),
+            ([left, turned(1e-3)], false),
+            ([left, turned(0.2)], false),
+            ([left, Pose { p: -right.p, ..right }], false),
+            ([left, unusable], false),
+            ([left, turned(0.03)], true),
+            ([left, turned(0.03)], false),
+            ([left, right], true),
+        ];
+        for (n, (places, anew)) in cases.into_iter().enumerate() {
+            assert_eq!(views.adjust(&places), anew, "case {n}");
+            assert!(views.camera().body_from_rect.is_finite() && views.camera().pinhole == at_boot.pinhole, "case {n}");
+            if n == 0 {
+                let off = (knock * at_boot.body_from_rect).inverse() * views.camera().body_from_rect;
+                assert!(off.p.length() < 1e-12 && off.q.to_scaled_axis().length() < 1e-12, "{off:?}");
+            }
+        }
+        let back = views.camera();
+        let off = at_boot.body_from_rect.inverse() * back.body_from_rect;
+        assert!(off.q.to_scaled_axis().length() < 1e-9 && (back.baseline_m - at_boot.baseline_m).abs() < 1e-12);
+        assert!(views.maps[0].taps(320).eq(taps));
     }
 
     #[cfg(feature = "opencv")]

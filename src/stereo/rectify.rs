@@ -1,5 +1,6 @@
 //! Rectification: both cameras turned so that their rows are parallel to the baseline, lens
-//! distortion removed (any model of `stipple_drivers::camera`), as look-up tables made at boot.
+//! distortion removed (any model of `stipple_drivers::camera`), as look-up tables made at boot, and anew where cameras are found
+//! to sit elsewhere.
 //!
 //! The common focal length and principal point are the ones that show the widest view without
 //! blank borders along the middle row and column of both cameras, and no ray further off-axis than
@@ -23,48 +24,48 @@ pub struct Rectification {
     body_from_rect: DQuat,
 }
 
-/// Rows of the two views may be so far off one another before the maps are made anew, px.
-pub const ROWS_OFF_MAX: f64 = 0.1;
+/// Rows of the two views may be so far off one another, in their middle, before the maps are made anew, px.
+const ROWS_OFF_MAX: f64 = 0.25;
+/// What is matched is farther away, m: by so much does it move along a row where the baseline turns.
+const NEAR_M: f64 = 0.5;
+/// A pair that was turned further is not one that was knocked, rad: an estimate that is lost would cost the view its edges.
+const TURNED_MAX: f64 = 0.1;
 
 impl Rectification {
     pub fn new(calibration: &Calibration) -> Result<Rectification, Fault> {
+        let help =
+            "a map needs cameras 0 and 1 side by side, looking the same way; without a map: --set map.enabled=false";
         Rectification::of(&calibration.cameras, None)
+            .map_err(|what| Fault::new(FaultKind::Config, "calibration", what, help))
     }
 
-    /// Rectification of cameras that were moved on the body, seen through the same pinhole as before.
-    pub fn moved(&self, cameras: &[RigCamera]) -> Result<Rectification, Fault> {
-        Rectification::of(cameras, Some(self.camera.pinhole))
+    /// Rectification of cameras that were moved on the body, seen through the same pinhole as before; `None` where they are no
+    /// pair any more.
+    pub fn moved(&self, cameras: &[RigCamera]) -> Option<Rectification> {
+        Rectification::of(cameras, Some(self.camera.pinhole)).ok()
     }
 
-    fn of(cameras: &[RigCamera], pinhole: Option<Pinhole>) -> Result<Rectification, Fault> {
-        let bad = |what: &str| {
-            Fault::new(
-                FaultKind::Config,
-                "calibration",
-                what,
-                "a map needs cameras 0 and 1 side by side, looking the same way; without a map: --set map.enabled=false",
-            )
-        };
+    fn of(cameras: &[RigCamera], pinhole: Option<Pinhole>) -> Result<Rectification, &'static str> {
         let [left, right, ..] = cameras else {
-            return Err(bad("has fewer than two cameras"));
+            return Err("has fewer than two cameras");
         };
         let along = right.body_from_cam.p - left.body_from_cam.p;
         let baseline_m = along.length();
         if !(baseline_m > 1e-4) {
-            return Err(bad("has a zero baseline between cameras 0 and 1"));
+            return Err("has a zero baseline between cameras 0 and 1");
         }
         let axis = |c: &RigCamera| c.body_from_cam.q * DVec3::Z;
         let x = along / baseline_m;
         let forward = axis(left) + axis(right);
         let z = forward - x * x.dot(forward);
         if z.length() < 0.5 || (left.body_from_cam.q * DVec3::X).dot(x) < 0.5 {
-            return Err(bad("has cameras 0 and 1 not side by side (is camera 1 the right one?)"));
+            return Err("has cameras 0 and 1 not side by side (is camera 1 the right one?)");
         }
         let z = z.normalize();
         let body_from_rect = DQuat::from_mat3(&DMat3::from_cols(x, z.cross(x), z)).normalize();
         let pinhole = pinhole
             .or_else(|| common_pinhole(left, right, body_from_rect))
-            .ok_or_else(|| bad("leaves no common view after rectification"))?;
+            .ok_or("leaves no common view after rectification")?;
         let pose = Pose::new(body_from_rect, left.body_from_cam.p);
         Ok(Rectification { camera: RectifiedCamera { pinhole, body_from_rect: pose, baseline_m }, body_from_rect })
     }
@@ -74,13 +75,11 @@ impl Rectification {
         camera.body_from_cam.q.conjugate() * self.body_from_rect
     }
 
-    /// How far rows are off one another where the cameras have moved on the body since, px.
-    pub fn rows_off(&self, since: &[RigCamera], now: &[RigCamera]) -> f64 {
-        let [(old, new), (old_right, new_right)] = [0, 1].map(|i| (&since[i].body_from_cam, &now[i].body_from_cam));
-        let (before, after) = (old.inverse() * *old_right, new.inverse() * *new_right);
-        let turned = (before.q.conjugate() * after.q).to_scaled_axis().length();
-        let along = before.p.angle_between(after.p);
-        self.camera.pinhole.fx * (turned + along)
+    /// Whether rows are off one another where the right camera has moved in the left one from `before` to `after`.
+    pub fn rows_are_off(&self, before: &Pose, after: &Pose) -> bool {
+        let Turned { camera, baseline } = Turned::new(before, after);
+        let fx = self.camera.pinhole.fx;
+        fx * camera + fx * self.camera.baseline_m / NEAR_M * baseline > ROWS_OFF_MAX
     }
 
     /// Where each rectified pixel comes from in a raw image of `camera`.
@@ -162,6 +161,25 @@ impl Tap {
     }
 }
 
+/// How far the right camera and the baseline to it have turned in the left camera, rad.
+pub struct Turned {
+    camera: f64,
+    baseline: f64,
+}
+
+impl Turned {
+    /// Poses of the right camera in the left one, before and after.
+    pub fn new(before: &Pose, after: &Pose) -> Turned {
+        let camera = (before.q.conjugate() * after.q).to_scaled_axis().length();
+        Turned { camera, baseline: before.p.angle_between(after.p) }
+    }
+
+    /// Whether it may have been a knock.
+    pub fn is_possible(&self) -> bool {
+        self.camera.max(self.baseline) < TURNED_MAX
+    }
+}
+
 pub struct Remap {
     width: usize,
     height: usize,
@@ -202,8 +220,14 @@ impl Remap {
 
     /// 1 for each `divisor` x `divisor` block that has a source everywhere.
     pub fn valid_blocks(&self, divisor: usize) -> Vec<u8> {
+        let mut valid = vec![1u8; (self.width / divisor) * (self.height / divisor)];
+        self.mask_blocks(divisor, &mut valid);
+        valid
+    }
+
+    /// Sets the blocks to 0 that have not.
+    pub fn mask_blocks(&self, divisor: usize, valid: &mut [u8]) {
         let (w, h) = (self.width / divisor, self.height / divisor);
-        let mut valid = vec![1u8; w * h];
         for y in 0..h * divisor {
             for x in 0..w * divisor {
                 if self.taps[y * self.width + x].index == OUTSIDE {
@@ -211,7 +235,6 @@ impl Remap {
                 }
             }
         }
-        valid
     }
 }
 

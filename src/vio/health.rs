@@ -103,7 +103,7 @@ const SIGMA_V_HALF: f64 = 0.05;
 /// EuRoC's image of 752x480 holds those 40, and half of it on each side holds 10.
 const LANDMARKS_ENOUGH: f64 = 40.0;
 const LANDMARK_PX2: f64 = 9025.0;
-/// Part of what is enough that is few.
+/// Fewer landmarks than this part of what is enough are few.
 pub const FEW: f64 = 0.5;
 
 /// Landmarks that are enough in images of so many pixels, the vehicle's own left out.

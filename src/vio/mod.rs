@@ -515,7 +515,7 @@ impl Vio {
     }
 
     /// Stamp, pose, and whether it is a keyframe, of every frame of the window, oldest first. The pose is that of the
-    /// exposure of camera 0, by its estimated time offset, of a body whose camera 0 sits where it was calibrated.
+    /// body at the exposure of camera 0, by its estimated time offset; `known` says where the cameras sit on it.
     pub fn window(&self) -> impl Iterator<Item = (Nanos, Pose, bool)> + '_ {
         let window = &self.estimator.graph.window;
         window.slots().map(|s| window.frame(s)).map(|f| (f.t, window.exposed(f), f.keyframe))

@@ -81,7 +81,7 @@ impl Model {
             noise: Noise::new(&calibration.imu, config),
             config: config.clone(),
             landmarks_enough: {
-                let pixels = calibration.cameras.iter().map(RigCamera::pixels).max();
+                let pixels = calibration.cameras.iter().map(RigCamera::free_pixels).max();
                 landmarks_enough(pixels.unwrap_or(0))
             },
         }

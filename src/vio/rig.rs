@@ -242,12 +242,10 @@ impl RigState {
         self.refresh();
     }
 
-    /// Estimated time from a stamp to camera 0's exposure, s, and by what camera 0 is elsewhere on the body than it was
-    /// calibrated; `None` where neither is estimated. Whoever draws all cameras by it draws another one as far off as it
-    /// is exposed at another instant than camera 0.
-    pub fn exposure(&self) -> Option<(f64, Pose)> {
-        let is_found = self.parts.time_offset || self.parts.extrinsics;
-        is_found.then(|| (self.now.time_offsets[0], self.now.body_from_cam[0] * self.calibrated[0].inverse()))
+    /// Estimated time from a stamp to camera 0's exposure, s; `None` where it is not estimated. Whoever draws all cameras by it
+    /// draws another one as far off as it is exposed at another instant than camera 0.
+    pub fn exposure(&self) -> Option<f64> {
+        self.parts.time_offset.then(|| self.now.time_offsets[0])
     }
 
     /// Whether a rig could be like this.

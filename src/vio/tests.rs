@@ -563,3 +563,37 @@ fn inertia_that_says_nothing_and_steps_that_are_taken_back_are_counted() {
     run(&mut vio, 60..62, &mut world);
     assert!(vio.stats.solver_steps_rejected > 0, "{:?}", vio.stats);
 }
+
+/// Poses of the body and places of the cameras on it say together how the cameras moved, whichever of them was knocked: the map
+/// is drawn by both.
+#[test]
+fn cameras_move_as_poses_and_places_together_say() {
+    for knocked in 0..2 {
+        let path = Path { rest: -1.0 };
+        let mut world = World::new(path);
+        let (truth, mut rig) = (world.rig.clone(), world.rig.clone());
+        rig.cameras[knocked].body_from_cam.q *= DQuat::from_scaled_axis(DVec3::new(0.02, -0.03, 0.02));
+        let config = VioConfig { estimate_extrinsics: true, ..VioConfig::default() };
+        let mut vio = Vio::new(&rig, &config);
+        let mut seen = vec![];
+        for frames in [0..600, 600..620] {
+            run(&mut vio, frames, &mut world);
+            let (t, world_from_body, _) = vio.window().last().expect("it runs");
+            let places = vio.known().cameras.expect("they are estimated").body_from_cam;
+            seen.push((path.pose((t - Nanos(0)).secs()), world_from_body, places));
+        }
+        for c in 0..2 {
+            let real = truth.cameras[c].body_from_cam;
+            let [(true_a, a, at_a), (true_b, b, at_b)] = [seen[0], seen[1]];
+            let moved = (a * at_a[c]).inverse() * (b * at_b[c]);
+            let off = ((true_a * real).inverse() * (true_b * real)).inverse() * moved;
+            let turned = off.q.to_scaled_axis().length();
+            eprintln!(
+                "camera {knocked} knocked, camera {c}: off by {:.1} mm, {:.1} mrad",
+                1e3 * off.p.length(),
+                1e3 * turned
+            );
+            assert!(off.p.length() < 0.01 && turned < 0.004);
+        }
+    }
+}

@@ -207,12 +207,11 @@ impl Window {
         &mut self.frames[slot]
     }
 
-    /// Pose at the exposure of a frame of a body whose camera 0 sits where it was calibrated: what draws by the calibration
-    /// then puts the camera where it was.
+    /// Pose of the body at the exposure of a frame by camera 0.
     pub fn exposed(&self, frame: &Frame) -> Pose {
         let Motion { pose, v, bg, .. } = frame.now;
-        let Some((tau, moved)) = self.rig.exposure() else { return pose };
-        Pose::new(pose.q * so3::exp((frame.rate - bg) * tau), pose.p + v * tau) * moved
+        let Some(tau) = self.rig.exposure() else { return pose };
+        Pose::new(pose.q * so3::exp((frame.rate - bg) * tau), pose.p + v * tau)
     }
 
     /// Takes the twists that views are predicted with (`shutter.rs`). Frames of a plain rig need none.

@@ -59,7 +59,7 @@ pub struct Consistency {
     pub over_time: Vec<(f64, f64)>,
     pub mean: f64,
     /// NEES of position, rotation, velocity, gyro and accelerometer bias, three dimensions each, from a second after the start on:
-    /// until then the tie to the truth takes the position's away.
+    /// until then the tie to the truth makes most of the position's error zero.
     pub blocks: [f64; 5],
     /// The same by second since the start, the first included.
     pub by_second: Vec<[f64; 5]>,

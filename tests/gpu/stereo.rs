@@ -186,7 +186,10 @@ fn raw_pairs_are_rectified_as_on_the_cpu() {
         let stride = w.next_multiple_of(4);
         let mut gpu = Gpu::open(&GpuConfig::default(), 1 << 20).unwrap();
         let buffers = rectify_gpu::Buffers::new(gpu.arena(), w, h).unwrap();
-        let mut rectifier = Rectifier::new(&mut gpu, buffers, w, h, &maps).unwrap();
+        // Made for other maps first, as before the cameras moved.
+        let before = [1, 0].map(|i| rectification.map(&rig.cameras[i]));
+        let mut rectifier = Rectifier::new(&mut gpu, buffers, w, h, &before).unwrap();
+        rectifier.upload(&mut gpu, &maps).unwrap();
         let images = gpu.alloc::<u32>("images", 2 * stride * h / 4).unwrap();
         rectifier.load(&mut gpu, &left, &right).unwrap();
         let mut rec = gpu.record();

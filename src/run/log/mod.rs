@@ -171,7 +171,8 @@ impl State {
     }
 }
 
-/// What is estimated of the rig beside a keyframe: how far it is off the calibration, and the standard deviations.
+/// What is estimated of the rig beside a keyframe: how far it is off the calibration, and the standard deviations. `None` where
+/// it is not estimated, or nothing is known of it.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Rig {
     /// Stamp of the keyframe.
@@ -186,12 +187,16 @@ pub struct Rig {
 
 impl Rig {
     pub fn new(t: Nanos, rig: &RigEstimate) -> Rig {
-        let six = |both: [[f64; 6]; 2]| both.map(|six| six.map(|x| x as f32));
+        let six = |both: [[f64; 6]; 2]| {
+            let is_finite = both.as_flattened().iter().all(|x| x.is_finite());
+            is_finite.then(|| both.map(|six| six.map(|x| x as f32)))
+        };
+        let two = |both: [f64; 2]| both.iter().all(|x| x.is_finite()).then(|| both.map(|x| x as f32));
         Rig {
             t_ns: t.0,
-            time_offsets: rig.time_offsets.map(|found| found.map(|both| both.map(|x| x as f32))),
-            extrinsics: rig.extrinsics.map(|found| found.map(six)),
-            imu_scale: rig.imu_scale.map(six),
+            time_offsets: rig.time_offsets.map(|found| found.and_then(two)),
+            extrinsics: rig.extrinsics.map(|found| found.and_then(six)),
+            imu_scale: rig.imu_scale.and_then(six),
         }
     }
 }
