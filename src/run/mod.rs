@@ -460,6 +460,7 @@ fn supervise(
         let t_s = s.start.elapsed().as_secs_f64();
         let tracked = s.tracking_done.load(Ordering::Acquire);
         if tracked && mapped(t_s, worker.is_some()) {
+            status.stopping();
             return notices;
         }
         if run.sensors_s.is_some_and(|limit| t_s >= limit) || run.stop.load(Relaxed) {

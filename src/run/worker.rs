@@ -448,6 +448,8 @@ pub fn serve(mut input: impl Read, mut output: impl Write) -> Result<(), Fault> 
         Fault::new(FaultKind::Usage, "map-worker", what, "it is started by `stipple run`, not by hand")
     })?;
     host::live_with_parent(setup.parent).map_err(broken)?;
+    // Where memory ends, the map goes first.
+    let _ = std::fs::write("/proc/self/oom_score_adj", "500");
     threads::disturb(&setup.rules)?;
     let start = Instant::now().checked_sub(Duration::from_secs_f64(setup.run_s.max(0.0))).unwrap_or_else(Instant::now);
     let missing = memory::replace_missing(&mut setup.board);
