@@ -9,9 +9,10 @@
 #   libopencv-calib3d-dev  block matching; its libraries are loaded where a board asks for it
 #   libvulkan1             Vulkan loader
 #   mesa-vulkan-drivers    lavapipe (Vulkan on the CPU), and the drivers of Intel, AMD and Pi GPUs
+#   python3-pip            fetches the other end of the link to an autopilot in the tests (tests/autopilot)
 #   systemd                judges the unit of the service in the tests
 #   vulkan-validationlayers  the tests run the pipeline under the Khronos validation layer
-PACKAGES := g++ glslang-tools libopencv-calib3d-dev libvulkan1 mesa-vulkan-drivers systemd vulkan-validationlayers
+PACKAGES := g++ glslang-tools libopencv-calib3d-dev libvulkan1 mesa-vulkan-drivers python3-pip systemd vulkan-validationlayers
 
 # What `make hil` needs besides: a machine to emulate, and the headers of the kernel it boots.
 #   qemu-system-x86 busybox-static cpio kmod xz-utils  the machine and its first file system
@@ -28,10 +29,14 @@ demo: deps
 	cargo build --release --locked
 	target/release/stipple demo --board board-configs/lavapipe.toml --out $(OUT)
 
-test: deps
+test: deps target/python/pymavlink
 	cargo check --locked --no-default-features --all-targets
 	cargo test --workspace --locked --no-fail-fast
 	@$(MAKE) --no-print-directory test-onnx
+
+target/python/pymavlink: tests/autopilot/requirements.txt
+	python3 -m pip install --quiet --upgrade --target target/python --requirement $<
+	@touch $@
 
 # The drivers on the real V4L2, USB, I2C, SPI, IIO and GPIO of Debian's kernel, emulated: minutes. TESTS="uvc" runs some.
 hil:

@@ -10,7 +10,7 @@
 //!
 //! Rooms: `math`, `mem`, `limits`, `config` and `counters` are seen by all. `frontend` and `vio` see the vocabulary of
 //! `stipple-drivers`, `vio` also the frontend's `Tracks`; `stereo` and `map` see `gpu`, `map` also `stereo`; `output` sees what it
-//! writes of `map` and `vio`. `run` sees all of these, `commands` see all, and nobody sees `commands`. tests/tidy checks it.
+//! writes of `map` and `vio`, and `publish` what it tells of `vio`. `run` sees all of these, `commands` see all, and nobody sees `commands`. tests/tidy checks it.
 //!
 //! # Glossary
 //!
@@ -69,6 +69,8 @@ cfg_if::cfg_if! {
         #[doc(hidden)]
         pub mod output;
         #[doc(hidden)]
+        pub mod publish;
+        #[doc(hidden)]
         pub mod run;
         #[doc(hidden)]
         pub mod stereo;
@@ -83,6 +85,7 @@ cfg_if::cfg_if! {
         mod map;
         mod math;
         mod output;
+        mod publish;
         mod run;
         mod stereo;
         mod vio;

@@ -5,11 +5,13 @@
 //! same rules as the file. board-configs/README.md lists every key; tests/config.rs writes it.
 
 mod inject;
+mod mavlink;
 mod method;
 mod section;
 mod sensors;
 
 pub use inject::{InjectConfig, ThreadRule};
+pub use mavlink::{Address, MavlinkConfig, StateMessage};
 pub use method::{
     Fit, FrontendConfig, GpuConfig, MapConfig, NetworkConfig, Projection, StereoConfig, StereoMethod, VioConfig,
 };
@@ -42,6 +44,8 @@ pub struct Board {
     pub record: RecordConfig,
     #[serde(default)]
     pub log: LogConfig,
+    #[serde(default)]
+    pub mavlink: MavlinkConfig,
     #[serde(default)]
     pub frontend: FrontendConfig,
     #[serde(default)]
@@ -91,6 +95,7 @@ pub fn keys() -> impl Iterator<Item = &'static Key> {
         GpioConfig::KEYS,
         RecordConfig::KEYS,
         LogConfig::KEYS,
+        MavlinkConfig::KEYS,
         FrontendConfig::KEYS,
         VioConfig::KEYS,
         StereoConfig::KEYS,
@@ -209,6 +214,7 @@ impl Board {
         let broken =
             rules.into_iter().find(|(holds, _, _)| !holds).map(|(_, key, rule)| (key, format!("{key} {rule}")));
         let wrong = broken.or_else(|| self.camera.wrong()).or_else(|| self.baro.wrong()).or_else(|| self.gpio.wrong());
+        let wrong = wrong.or_else(|| self.mavlink.wrong());
         wrong.or_else(|| self.imu.wrong(&self.gpio)).map_or(Ok(()), Err)
     }
 }

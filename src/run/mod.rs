@@ -16,6 +16,7 @@
 //! | and estimator | estimates, one frame behind at most; offers keyframes | sealed |
 //! | mapping | rectification, depth, training; low priority, as are the CPU device's own threads; `stipple run` has it in a process of its own | sealed; OpenCV and the driver allocate behind it |
 //! | map-answers | reads what that process tells | free |
+//! | autopilot | writes states to an autopilot and hears it, where the board names one | free |
 //! | trigger | starts the cameras' exposures, where a line is wired for it | free |
 //! | led | shows the state of a run, where a line is wired for it | free |
 //! | log | writes states, events and counters to DIR; low priority | free |
@@ -29,6 +30,7 @@
 //! Tracking waits for nobody, but for the samples up to a frame. Shutdown: the cameras end, tracking drains and ends,
 //! mapping ends with the run's time.
 
+mod autopilot;
 pub mod gate;
 mod keyframes;
 mod lockstep;
@@ -53,6 +55,7 @@ use crate::config::{Board, InjectConfig};
 use crate::counters::Counters;
 use crate::output::report::Report;
 use crate::output::OutputDir;
+use autopilot::AutopilotThread;
 use gate::ImuGate;
 use keyframes::{KeyframeRing, Keyframes};
 use log::{EventKind, Log};
@@ -198,18 +201,8 @@ pub fn fly(
             (lockstep::fly(recorded, calibration, tracker, map, options, steps, &mut status), None)
         }
         (source, _) => {
-            let shape = || Frames::in_colour(calibration, colours);
-            let sensors = source.sensors(options.playback);
-            let record = options.record.as_deref().map(|dir| (dir, Format::Euroc));
-            let (sensors, recording) = Recording::start(record, sensors, calibration, board, &shape())?;
-            let sensors = sensors.with_faults(&options.inject, shape);
-            let realtime = Realtime {
-                holdout: options.holdout,
-                until_s: options.duration_s,
-                sensors_s: options.duration_s.filter(|_| live),
-                stop: host::stop_asked_for(),
-            };
-            (fly_in_real_time(sensors, calibration, tracker, map, &realtime, &mut status), recording)
+            let before = log.epochs_before;
+            play(source, calibration, (tracker, map), (board, options), (colours, live, before), &mut status)?
         }
     };
     judge_rig(&mut flown, &mut status);
@@ -236,6 +229,37 @@ pub fn fly(
         status.ended_well();
     }
     Ok(Outcome { report, capture, fault })
+}
+
+/// Flies `source` in real time with the `colours` first cameras in colour, records and disturbs it as asked, and tells the
+/// autopilot that the board names; epochs are counted on from those `before`.
+fn play(
+    source: Source,
+    calibration: &Calibration,
+    (mut tracker, map): (Tracker, Option<MapSide>),
+    (board, options): (&Board, &Options),
+    (colours, live, before): (usize, bool, u32),
+    status: &mut Status,
+) -> Result<(Flown, Option<Recording>), Fault> {
+    let shape = || Frames::in_colour(calibration, colours);
+    let stamps = source.stamps(options.playback.speed);
+    let sensors = source.sensors(options.playback);
+    let record = options.record.as_deref().map(|dir| (dir, Format::Euroc));
+    let (sensors, recording) = Recording::start(record, sensors, calibration, board, &shape())?;
+    let sensors = sensors.with_faults(&options.inject, shape);
+    let realtime = Realtime {
+        holdout: options.holdout,
+        until_s: options.duration_s,
+        sensors_s: options.duration_s.filter(|_| live),
+        stop: host::stop_asked_for(),
+    };
+    let autopilot = match options.service {
+        true => AutopilotThread::start(&board.mavlink, stamps, before, &mut tracker, status)?,
+        false => None,
+    };
+    let mut flown = fly_in_real_time(sensors, calibration, tracker, map, &realtime, status);
+    autopilot.into_iter().for_each(|thread| thread.finish(&mut flown.source));
+    Ok((flown, recording))
 }
 
 /// Says what is estimated of the rig and was not found by the end of the flight.
@@ -473,7 +497,8 @@ fn supervise(
         s.counters.threads_silent.add(hangs.len() as u64);
         let hangs = hangs.into_iter().map(|name| format!("thread {name} gives no sign of life"));
         let looked = worker.as_mut().and_then(|w| w.watch(&s.gauges));
-        let (epoch, rig) = (status.epoch_begun(&s.gauges), status.rig_judged(&s.gauges));
+        let (epoch, rig, heard) =
+            (status.epoch_begun(&s.gauges), status.rig_judged(&s.gauges), status.autopilot_said());
         let mut say = |kind, line: String| {
             status.say(kind, &line);
             // A cable that comes loose each second, for hours, is in the log.
@@ -486,6 +511,7 @@ fn supervise(
         rig.into_iter().for_each(|line| say(EventKind::Warning, line));
         looked.into_iter().for_each(|line| say(EventKind::Map, line));
         std::iter::from_fn(|| s.mailbox.notices.pop()).for_each(|line| say(EventKind::Sensor, line));
+        heard.into_iter().for_each(|line| say(EventKind::Autopilot, line));
         if tracked {
             // Nothing is played any more; the run's own time is what progresses.
             s.gauges.played_ms.fetch_max((t_s * 1e3) as u64, Relaxed);

@@ -1,12 +1,14 @@
-//! States between frames: the newest that the estimator gave, carried by the inertial samples that came since, for the log.
+//! States between frames: the newest that the estimator gave, carried by the inertial samples that came since, for the log and
+//! for an autopilot.
 //!
 //! ```text
-//! estimator -> newest update (the last wins) -> thread `imu`, per sample -> log
+//! estimator -> newest update (the last wins) -> thread `imu`, per sample -> log, autopilot
 //! ```
 
 use super::gate::{Clock, Stream};
 use super::log::LogSender;
-use crate::config::VioConfig;
+use crate::config::Board;
+use crate::publish::{self, Feed, Source};
 use crate::vio::{Health, Predictor, Update};
 use glam::DVec3;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -37,45 +39,85 @@ impl Newest {
 pub struct Publisher {
     pub newest: Newest,
     pub log: Option<LogSender>,
+    pub feed: Option<Feed>,
     predictor: Predictor,
     clock: Clock,
-    period: Span,
+    /// Schedules of the log and of the autopilot.
+    schedules: [Schedule; 2],
+}
+
+/// When states are due.
+struct Schedule {
+    /// `None`: never.
+    period: Option<Span>,
     due: Option<Nanos>,
 }
 
+impl Schedule {
+    fn new(rate_hz: f64) -> Schedule {
+        Schedule { period: (rate_hz > 0.0).then(|| Span::from_secs(1.0 / rate_hz)), due: None }
+    }
+
+    /// Whether one is due at `t`; the next one then is a period later, on a grid but for a gap of the samples.
+    fn takes(&mut self, t: Nanos) -> bool {
+        let Some(period) = self.period.filter(|_| self.due.is_none_or(|due| t >= due)) else { return false };
+        self.due = Some(self.due.map_or(t, |due| due.max(t - period)) + period);
+        true
+    }
+}
+
+/// States that an autopilot is offered in the place of frames that do not come, Hz.
+const FILL_HZ: f64 = 30.0;
+
 impl Publisher {
-    /// A publisher of `rate_hz` states a second at most.
-    pub fn new(calibration: &Calibration, vio: &VioConfig, rate_hz: f64) -> Publisher {
+    /// Whether a board asks for states between frames.
+    pub fn is_wanted(board: &Board) -> bool {
+        board.log.predicted_hz > 0.0 || board.mavlink.address().is_some()
+    }
+
+    /// A publisher for the log at the board's rate, and for its autopilot.
+    pub fn new(calibration: &Calibration, board: &Board) -> Publisher {
+        let feed_hz = if board.mavlink.address().is_some() { FILL_HZ } else { 0.0 };
         Publisher {
             newest: Newest(Arc::default()),
             log: None,
-            predictor: Predictor::new(calibration, vio),
+            feed: None,
+            predictor: Predictor::new(calibration, &board.vio),
             clock: Clock::default(),
-            period: Span::from_secs(1.0 / rate_hz),
-            due: None,
+            schedules: [board.log.predicted_hz, feed_hz].map(Schedule::new),
         }
     }
 
-    /// Takes a sample, and logs the state at its stamp where one is due.
+    /// Takes a sample, and hands over the state at its stamp where one is due.
     pub fn on_imu(&mut self, sample: ImuSample) {
         let t = sample.t;
         let update = self.newest.take();
         if self.clock.went_back(Stream::Samples, t) {
             self.predictor.change_clock();
-            self.due = None;
+            self.schedules.iter_mut().for_each(|schedule| schedule.due = None);
         } else if let Some((update, scale)) = update {
             self.predictor.set_scale(scale);
             self.predictor.on_update(&update);
         }
         self.predictor.on_imu(sample);
-        if self.due.is_some_and(|due| t < due) {
+        let [logs, feeds] = self.schedules.each_mut().map(|schedule| schedule.takes(t));
+        if !logs && !feeds {
             return;
         }
-        // On a grid of periods, but for a gap of the samples.
-        self.due = Some(self.due.map_or(t, |due| due.max(t - self.period)) + self.period);
         self.predictor.advance(t);
-        if let Some((log, state)) = self.log.as_ref().zip(self.predictor.state_at(t)) {
+        let Some(state) = self.predictor.state_at(t) else { return };
+        if let Some(log) = self.log.as_ref().filter(|_| logs) {
             log.predicted((&state).into());
+        }
+        if let Some(feed) = self.feed.as_ref().filter(|_| feeds) {
+            feed.state(publish::State {
+                odometry: state.odometry,
+                rate: sample.gyro_body - state.odometry.gyro_bias,
+                covariance: state.covariance,
+                epoch: state.epoch,
+                quality: state.quality,
+                source: Source::Carried,
+            });
         }
     }
 }

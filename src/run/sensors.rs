@@ -4,6 +4,7 @@
 use super::status::print_err;
 use super::threads;
 use crate::config::{Board, InjectConfig};
+use crate::publish::mavlink::Stamps;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::sync::Arc;
@@ -16,7 +17,9 @@ use stipple_drivers::paced::{Images, Pace, PacedAids, PacedFrames, PacedImu};
 use stipple_drivers::replay::{read_calibration, OpenOptions, Recording};
 use stipple_drivers::sim::{Scenario, Sim};
 use stipple_drivers::source::{AidReading, AidSource, FrameSource, ImuBatch, ImuSource, SourceFault, Wait};
-use stipple_drivers::{v4l2, Calibration, Fault, FaultKind, Frames, ImuCorrection, ImuSample, Nanos, Span, TimedPose};
+use stipple_drivers::{
+    host, v4l2, Calibration, Fault, FaultKind, Frames, ImuCorrection, ImuSample, Nanos, Span, TimedPose,
+};
 
 /// What a flight reads, opened.
 pub struct Input {
@@ -187,6 +190,16 @@ impl Source {
         };
         let is_bound = matches!(board.imu.options(), Some(ImuOptions::Iio(_)));
         std::array::from_fn(|i| if is_bound { set[i].min(asked[i]) } else { set[i] })
+    }
+
+    /// How its stamps become those of the monotonic clock, where it begins now and is played at a `speed`.
+    pub fn stamps(&self, speed: f64) -> Stamps {
+        match self {
+            Source::Live { .. } => Stamps::default(),
+            Source::Recorded(r) => {
+                Stamps { stamp: r.stamps.first().copied().unwrap_or_default(), monotonic: host::monotonic(), speed }
+            }
+        }
     }
 
     /// The sensors; a recording plays in their place.

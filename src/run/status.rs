@@ -7,6 +7,7 @@ use super::threads;
 use super::tracking::FramePacket;
 use crate::counters::Counters;
 use crate::frontend::{Verdict, Verdicts};
+use crate::publish::{Feed, Severity};
 use crate::vio::{Finding, Findings, Health, Part};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle, TermLike};
 use std::fmt::{self, Write as _};
@@ -67,6 +68,7 @@ pub struct Status {
     led: Option<StatusLed>,
     log: Option<LogSender>,
     service: Option<Service>,
+    autopilot: Option<Feed>,
     /// When counters are logged next.
     next_count: Instant,
     /// Whether it was said that logging ended.
@@ -103,6 +105,7 @@ impl Status {
             led: None,
             log: None,
             service: None,
+            autopilot: None,
             next_count,
             log_ended: false,
             epoch: 0,
@@ -127,6 +130,16 @@ impl Status {
     pub fn with_service(mut self, service: bool) -> Status {
         self.service = service.then(Service::of_this_process).flatten();
         self
+    }
+
+    /// Tells an autopilot what it says, too.
+    pub fn tell_autopilot(&mut self, feed: Feed) {
+        self.autopilot = Some(feed);
+    }
+
+    /// Lines about the link to the autopilot since this was asked last.
+    pub fn autopilot_said(&self) -> Vec<String> {
+        self.autopilot.iter().flat_map(Feed::notices).collect()
     }
 
     /// The run is to end: results are written from here on.
@@ -216,6 +229,9 @@ impl Status {
     /// Prints a line that stays, and logs it as an event.
     pub fn say(&self, kind: EventKind, text: &str) {
         self.log.iter().for_each(|log| log.event(kind, text));
+        if let Some(feed) = self.autopilot.as_ref().filter(|_| kind != EventKind::Autopilot) {
+            feed.text(Severity::Warning, text);
+        }
         self.print(text);
     }
 

@@ -19,7 +19,7 @@ const EX_SOFTWARE: i32 = 70;
 const SLOTS: usize = 16;
 /// Priorities among real-time threads, and how long each may be silent, s. A pulse that starts an exposure comes before
 /// everything; an anchor may take the mapper long, and a card that stalls those who write.
-const WATCHED: [(&str, i32, f64); 14] = [
+const WATCHED: [(&str, i32, f64); 15] = [
     ("main", 0, 5.0),
     ("trigger", 13, 5.0),
     ("imu", 12, 5.0),
@@ -28,6 +28,7 @@ const WATCHED: [(&str, i32, f64); 14] = [
     ("tracking", 10, 5.0),
     ("frontend", 10, 5.0),
     ("estimator", 10, 5.0),
+    ("autopilot", 9, 5.0),
     ("mapping", 0, 60.0),
     ("map-answers", 0, 5.0),
     ("beat", 0, 5.0),

@@ -21,6 +21,7 @@ use crate::counters::Counters;
 use crate::frontend::{Frontend, Prediction, Rejected, Tracks, Verdicts};
 use crate::limits::{CAMERAS_MAX, FRAMES, IMU_BETWEEN_FRAMES};
 use crate::mem::{seal_thread, Footprint, List, Thinned};
+use crate::publish::Feed;
 use crate::vio::{Findings, Health, Known, Predictor, Vio};
 use crossbeam_queue::ArrayQueue;
 use std::sync::atomic::AtomicBool;
@@ -210,6 +211,7 @@ pub struct Back {
     pub frame_ms: Thinned<(Nanos, f64)>,
     pub cpu_s: Option<f64>,
     pub log: Option<LogSender>,
+    pub feed: Option<Feed>,
     /// Where the publisher takes states.
     newest: Option<Newest>,
     /// First frame and number of each epoch. Where there are more, the log has them.
@@ -262,6 +264,7 @@ impl Back {
         if let Some(newest) = &self.newest {
             newest.set(&update, known.imu_scale);
         }
+        self.feed.iter().for_each(|feed| feed.frame(&update, packet.imu.last()));
         if let Some(log) = &self.log {
             let cpu = packet.cpu + (thread_cpu_now() - cpu);
             let time_offsets_ns = self.vio.time_offsets().map(|offsets| offsets.map(|offset| offset.0));
@@ -305,11 +308,8 @@ impl OdometryRun {
         let estimator = || (vio(), Predictor::new(calibration, &board.vio));
         let (vio, predictor) = f.build("tracking: estimator", estimator);
         let bytes = f.total();
-        let predicted_hz = board.log.predicted_hz;
-        let publisher = (predicted_hz > 0.0).then(|| {
-            let published = || Publisher::new(calibration, &board.vio, predicted_hz);
-            f.build("tracking: states between frames", published)
-        });
+        let publisher = || Publisher::new(calibration, board);
+        let publisher = Publisher::is_wanted(board).then(|| f.build("tracking: states between frames", publisher));
         let trajectory = f.build("tracking: poses of frames", || Thinned::with_capacity(frames));
         let health = f.build("tracking: health of frames", || Thinned::with_capacity(frames));
         let [front_ms, ms] = f.build("tracking: times of frames", || [(); 2].map(|()| Thinned::with_capacity(frames)));
@@ -327,6 +327,7 @@ impl OdometryRun {
                 frame_ms,
                 cpu_s: None,
                 log: None,
+                feed: None,
                 newest: publisher.as_ref().map(|publisher| publisher.newest.clone()),
                 epochs: List::default(),
             },

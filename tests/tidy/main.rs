@@ -13,13 +13,14 @@ use std::collections::{BTreeMap, BTreeSet};
 const COMMON: [&str; 5] = ["math", "mem", "limits", "config", "counters"];
 /// What else a module may see. `run` sees all of these, `commands` sees `run` too, nobody sees `commands`; a module that is
 /// not here sees only the common ones.
-const EDGES: [(&str, &[&str]); 6] = [
+const EDGES: [(&str, &[&str]); 7] = [
     ("vio", &["frontend"]),
     ("stereo", &["gpu"]),
     ("map", &["gpu", "stereo"]),
     ("output", &["map", "vio"]),
-    ("run", &["frontend", "vio", "gpu", "stereo", "map", "output"]),
-    ("commands", &["run", "frontend", "vio", "gpu", "stereo", "map", "output"]),
+    ("publish", &["vio"]),
+    ("run", &["frontend", "vio", "gpu", "stereo", "map", "output", "publish"]),
+    ("commands", &["run", "frontend", "vio", "gpu", "stereo", "map", "output", "publish"]),
 ];
 /// Where `unsafe` may stand: the GPU, the allocator, the shims of OpenCV and ONNX Runtime, system calls of drivers.
 const UNSAFE: [&str; 5] =
@@ -30,7 +31,7 @@ const RUST_LINES_MAX: usize = 600;
 const FUNCTION_LINES_MAX: usize = 90;
 const KERNEL_LINES_MAX: usize = 250;
 /// Lines of code that the product may have, and its estimator, frontend, mapper, GPU core, stereo and kernels together.
-const CODE_MAX: usize = 37_250;
+const CODE_MAX: usize = 38_300;
 const CORE_MAX: usize = 15_750;
 const CORE: [&str; 10] = [
     "src/vio/",

@@ -8,7 +8,7 @@ use ::mcap::{McapError, WriteOptions, Writer};
 use serde::Serialize;
 use std::collections::BTreeMap;
 use std::fs::{read_dir, File, OpenOptions};
-use std::io;
+use std::io::{self, Read, Write as _};
 use std::path::{Path, PathBuf};
 use stipple_drivers::{host, Nanos};
 
@@ -56,6 +56,8 @@ const CHANNELS: [(&str, &str, &str); 6] = [
 "extrinsics":{"type":"array"},"imu_scale":{"type":"array"}}}"#,
     ),
 ];
+/// Name of the file that has the number of epochs begun.
+const EPOCHS: &str = "epochs";
 /// Bytes of messages that end a chunk before the next sync does, as after a stall of the disk: damage costs whole chunks.
 const CHUNK: usize = 16 << 10;
 
@@ -78,8 +80,9 @@ pub struct LogFiles {
     run_ns: i64,
     /// Messages of the run so far: each has the next number.
     sequence: u32,
-    /// Epoch of the last state.
+    /// Epoch of the last state, and how many began in the runs of this folder before.
     epoch: u32,
+    before: u32,
     open: Option<Open>,
     json: Vec<u8>,
     pub written: Vec<PathBuf>,
@@ -96,9 +99,22 @@ struct Open {
 }
 
 impl LogFiles {
-    pub fn new(dir: PathBuf, limits: Limits) -> LogFiles {
+    pub fn new(dir: PathBuf, limits: Limits, before: u32) -> LogFiles {
         let run_ns = Clocks::now(None).realtime_ns;
-        LogFiles { dir, limits, run_ns, sequence: 0, epoch: 0, open: None, json: vec![], written: vec![] }
+        let files =
+            LogFiles { dir, limits, run_ns, sequence: 0, epoch: 0, before, open: None, json: vec![], written: vec![] };
+        files.count_epochs();
+        files
+    }
+
+    /// Notes how many epochs have begun, for the next run. Where it cannot be written, that one counts as this one did.
+    fn count_epochs(&self) {
+        let (note, written) = (self.dir.join(EPOCHS), self.dir.join(format!("{EPOCHS}.new")));
+        let _ = std::fs::remove_file(&written);
+        let begun = self.before.wrapping_add(self.epoch).wrapping_add(1);
+        let mut options = OpenOptions::new();
+        let file = options.write(true).create_new(true).open(&written);
+        let _ = file.and_then(|mut file| writeln!(file, "{begun}")).and_then(|()| std::fs::rename(&written, note));
     }
 
     /// Begins the next file.
@@ -139,7 +155,9 @@ impl LogFiles {
         let at = record.at;
         match &record.content {
             Content::State(state) => {
-                self.epoch = state.epoch;
+                if std::mem::replace(&mut self.epoch, state.epoch) != state.epoch {
+                    self.count_epochs();
+                }
                 self.message(STATE, at, Some(state.t_ns), state)
             }
             Content::Predicted(state) => self.message(PREDICTED, at, Some(state.t_ns), state),
@@ -227,6 +245,13 @@ impl Open {
         self.good = self.file.metadata()?.len();
         Ok(())
     }
+}
+
+/// Epochs that began in the runs of a folder.
+pub fn epochs_begun(dir: &Path) -> u32 {
+    let mut text = String::new();
+    let read = File::open(dir.join(EPOCHS)).and_then(|file| file.take(16).read_to_string(&mut text));
+    read.ok().and_then(|_| text.trim().parse().ok()).unwrap_or(0)
 }
 
 /// Numbers and names of the logs in a folder, in order.

@@ -214,6 +214,8 @@ pub enum EventKind {
     /// A thread hangs, or the system refuses what a run asks for.
     System,
     Map,
+    /// The link to the autopilot, and who is there.
+    Autopilot,
     /// The estimator was reset, or started again elsewhere than dead reckoning led.
     Epoch,
     /// Logging ends before the run does.
@@ -334,6 +336,8 @@ impl LogSender {
 /// A log being written.
 pub struct Log {
     queue: Arc<Queue>,
+    /// Epochs that began in the runs of this folder before.
+    pub epochs_before: u32,
     /// `None` once it was waited for.
     thread: Option<JoinHandle<Vec<PathBuf>>>,
 }
@@ -348,16 +352,16 @@ impl Log {
     /// Begins the log of a run in `dir`. A log that cannot be written is a notice, and no reason not to fly.
     pub fn start(dir: PathBuf, limits: Limits, what: &str) -> Log {
         let queue = Arc::new(Queue::measured(&mut Footprint::default()));
-        let shared = queue.clone();
+        let (shared, epochs_before) = (queue.clone(), file::epochs_begun(&dir));
         LogSender(queue.clone()).event(EventKind::Start, what);
         let thread = super::start(THREAD, move || {
             host::lower_priority(NICE);
-            let files = write(&shared, LogFiles::new(dir, limits));
+            let files = write(&shared, LogFiles::new(dir, limits, epochs_before));
             shared.closed.store(true, Ordering::Release);
             files
         });
         *lock_last() = Some(queue.clone());
-        Log { queue, thread: Some(thread) }
+        Log { queue, epochs_before, thread: Some(thread) }
     }
 
     pub fn sender(&self) -> LogSender {

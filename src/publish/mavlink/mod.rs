@@ -1,0 +1,496 @@
+//! The autopilot's writer: ODOMETRY (or VISION_POSITION_ESTIMATE) of each frame as it comes, HEARTBEAT, TIMESYNC, STATUSTEXT.
+//!
+//! States are sent one by one, the newest first: what a slow link has no room for is left out, never queued. While no frame
+//! comes, states carried by inertial samples take their place, so that a camera that stops for a moment makes no gap that an
+//! autopilot would give up at (PX4 200 ms, ArduPilot 300 ms). Stamps are of the monotonic clock, which TIMESYNC ties to the
+//! autopilot's; they only grow. `reset_counter` is the low byte of the epochs that began in the runs of the folder. A loop closure
+//! moves no message.
+
+mod link;
+mod message;
+pub mod parser;
+
+use super::{Feed, Severity, Source, State};
+use crate::config::{Address, MavlinkConfig, StateMessage};
+use crate::mem::List;
+use link::Link;
+use mavlink::dialects::common::{
+    MavAutopilot, MavModeFlag, MavSeverity, MavState, MavType, HEARTBEAT_DATA, STATUSTEXT_DATA, TIMESYNC_DATA,
+};
+use mavlink::{MAVLinkV2MessageRaw, MavHeader, MessageData};
+use message::Axes;
+use mio::{Events, Poll, Token, Waker};
+use parser::{Heard, Parser, Received};
+use std::collections::VecDeque;
+use std::io;
+use std::net::SocketAddr;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+use stipple_drivers::{host, Fault, FaultKind, Nanos, Span};
+
+/// MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY, and MAV_COMP_ID_AUTOPILOT1.
+const OWN_COMPONENT: u8 = 197;
+const AUTOPILOT: u8 = 1;
+const LINK: Token = Token(0);
+const FEED: Token = Token(1);
+/// Heartbeats and requests of TIMESYNC.
+const SECOND: Duration = Duration::from_secs(1);
+/// Longest sleep, so that a stop is heard.
+const PATIENCE: Duration = Duration::from_millis(50);
+/// Without a frame for so long, states between frames take the place of frames.
+const FILL_AFTER: Duration = Duration::from_millis(90);
+/// A condition is told when it has lasted so long.
+const LASTING: Duration = Duration::from_millis(300);
+/// Without a state for so long, odometry is silent.
+const SILENT: Duration = Duration::from_millis(500);
+/// Without a heartbeat for so long, the autopilot is.
+const UNHEARD: Duration = Duration::from_secs(5);
+/// A stamp that is so much older than the last one is of another clock; one that is older by less is late.
+const CLOCK_STEP: i64 = 1_000_000_000;
+/// Texts are sent at most so often.
+const TEXT_PERIOD: Duration = Duration::from_millis(100);
+/// A text that states kept waiting for so long goes first.
+const TEXT_PATIENCE: Duration = Duration::from_millis(300);
+/// Bytes of a text in one message.
+const CHUNK: usize = 50;
+/// Reads before states are looked at again: a flood does not hold them up.
+const READS: usize = 32;
+/// Answers that may wait.
+const WAITING: usize = 8;
+
+/// How stamps of frames become those of the monotonic clock.
+#[derive(Clone, Copy, Debug)]
+pub struct Stamps {
+    /// This stamp is of this instant.
+    pub stamp: Nanos,
+    pub monotonic: Nanos,
+    /// Seconds of stamps a second.
+    pub speed: f64,
+}
+
+impl Default for Stamps {
+    /// They are of that clock.
+    fn default() -> Stamps {
+        Stamps { stamp: Nanos(0), monotonic: Nanos(0), speed: 1.0 }
+    }
+}
+
+impl Stamps {
+    fn monotonic_us(&self, t: Nanos) -> u64 {
+        let since = t - self.stamp;
+        let since = if self.speed == 1.0 { since } else { Span::from_secs(since.secs() / self.speed) };
+        ((self.monotonic + since).0 / 1000).max(0) as u64
+    }
+}
+
+/// What odometry does, as an autopilot's operator is told.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Condition {
+    Starting,
+    Running,
+    Carried,
+    DeadReckoned,
+    Silent,
+}
+
+impl Condition {
+    fn told(self) -> (Severity, &'static str) {
+        match self {
+            Condition::Starting => (Severity::Notice, "odometry: starting"),
+            Condition::Running => (Severity::Notice, "odometry: running"),
+            Condition::Carried => (Severity::Warning, "odometry: no camera frames, carried by inertia"),
+            Condition::DeadReckoned => (Severity::Critical, "odometry: lost, dead reckoning"),
+            Condition::Silent => (Severity::Critical, "odometry: lost, no states"),
+        }
+    }
+
+    fn state(self) -> MavState {
+        match self {
+            Condition::Starting => MavState::MAV_STATE_CALIBRATING,
+            Condition::Running | Condition::Carried => MavState::MAV_STATE_ACTIVE,
+            Condition::DeadReckoned | Condition::Silent => MavState::MAV_STATE_CRITICAL,
+        }
+    }
+}
+
+/// A text that is being sent, piece by piece.
+struct Text {
+    severity: Severity,
+    text: List<u8, { super::TEXT }>,
+    id: u16,
+    chunk: u8,
+}
+
+/// The writer. It lives on a thread of its own.
+pub struct Autopilot {
+    poll: Poll,
+    events: Events,
+    feed: Feed,
+    address: Address,
+    config: MavlinkConfig,
+    stamps: Stamps,
+    axes: Axes,
+    link: Option<Link>,
+    /// When to open the link again, and whether it was said that it is lost.
+    retry: Instant,
+    is_lost: bool,
+    parser: Parser,
+    sequence: u8,
+    /// The newest state that is to be sent, and the stamp of the last that was, µs.
+    pending: Option<State>,
+    last_sent_us: Option<u64>,
+    /// When the last state came, and the last of a frame.
+    last_state: Option<Instant>,
+    last_frame: Option<Instant>,
+    /// When the next state may be sent by the rate.
+    state_due: Instant,
+    heartbeat_due: Instant,
+    timesync_due: Instant,
+    /// Stamp of the last request.
+    asked: i64,
+    text_due: Instant,
+    answers: VecDeque<TIMESYNC_DATA>,
+    text: Option<Text>,
+    texts: u16,
+    condition: Condition,
+    /// What it seems to be, and since when.
+    seeming: (Condition, Instant),
+    /// When the autopilot was heard last.
+    heard: Option<Instant>,
+}
+
+impl Autopilot {
+    /// A writer to the autopilot that a board names, and what feeds it; `None` where it names none. The link is opened by `run`, again and again
+    /// until it is there: a converter may be plugged in late.
+    pub fn new(config: &MavlinkConfig, stamps: Stamps, epochs_before: u32) -> Result<Option<(Autopilot, Feed)>, Fault> {
+        let Some(address) = config.address() else { return Ok(None) };
+        let refused = |e: io::Error| {
+            Fault::new(FaultKind::Unavailable, "mavlink.link", format!("the system has no epoll for it: {e}"), "")
+        };
+        let poll = Poll::new().map_err(refused)?;
+        let feed = Feed::new(Waker::new(poll.registry(), FEED).map_err(refused)?);
+        let now = Instant::now();
+        let autopilot = Autopilot {
+            poll,
+            events: Events::with_capacity(8),
+            feed: feed.clone(),
+            address,
+            config: config.clone(),
+            stamps,
+            axes: Axes::new(config.mount_rpy_deg, epochs_before),
+            link: None,
+            retry: now,
+            is_lost: false,
+            parser: Parser::new(),
+            sequence: 0,
+            pending: None,
+            last_sent_us: None,
+            last_state: None,
+            last_frame: None,
+            state_due: now,
+            heartbeat_due: now,
+            timesync_due: now,
+            asked: 0,
+            text_due: now,
+            answers: VecDeque::with_capacity(WAITING),
+            text: None,
+            texts: 0,
+            condition: Condition::Starting,
+            seeming: (Condition::Starting, now),
+            heard: None,
+        };
+        Ok(Some((autopilot, feed)))
+    }
+
+    /// Thread `autopilot`: writes until `over`; `alive` is called at least each `PATIENCE`.
+    pub fn run(mut self, over: &AtomicBool, alive: impl Fn()) {
+        while !over.load(Ordering::Acquire) {
+            alive();
+            self.open();
+            let served = self.serve();
+            let wait = served.unwrap_or_else(|e| {
+                self.lose(&e);
+                Duration::ZERO
+            });
+            // Interrupted: it is asked again.
+            let _ = self.poll.poll(&mut self.events, Some(wait.min(PATIENCE)));
+        }
+    }
+
+    fn say(&self, line: String) {
+        // Where many wait, the first ones say what is wrong.
+        let _ = self.feed.0.notices.push(line);
+    }
+
+    fn open(&mut self) {
+        if self.link.is_some() || Instant::now() < self.retry {
+            return;
+        }
+        self.retry = Instant::now() + SECOND;
+        match Link::open(&self.address, self.poll.registry(), LINK) {
+            Ok(link) => {
+                if std::mem::take(&mut self.is_lost) {
+                    self.feed.0.counts.mavlink_reopened.add(1);
+                    self.say(format!("autopilot: link {} is open", self.config.link));
+                }
+                self.link = Some(link);
+            }
+            Err(e) => self.lose(&e),
+        }
+    }
+
+    fn lose(&mut self, e: &io::Error) {
+        (self.link, self.heard) = (None, None);
+        self.retry = Instant::now() + SECOND;
+        if !std::mem::replace(&mut self.is_lost, true) {
+            self.say(format!("autopilot: link {} is lost: {e}; it is tried again each second", self.config.link));
+        }
+    }
+
+    /// Reads and writes what there is; answers how long there is nothing to do.
+    fn serve(&mut self) -> io::Result<Duration> {
+        let more = self.read()?;
+        self.take_states();
+        self.judge();
+        while self.link.as_mut().map_or(Ok(false), Link::is_free)? {
+            if !self.write_one()? {
+                break;
+            }
+        }
+        if more {
+            return Ok(Duration::ZERO);
+        }
+        let now = Instant::now();
+        let texts_due = (self.text.is_some() || !self.feed.0.texts.is_empty()).then_some(self.text_due);
+        let urgent = (self.pending.is_some() || !self.answers.is_empty()).then_some(now);
+        let due = [Some(self.heartbeat_due), Some(self.timesync_due), texts_due, urgent].into_iter().flatten().min();
+        // Nothing is written before the link is open, and free.
+        let free = self.link.as_ref().map_or(self.retry, Link::free_at);
+        Ok(due.unwrap_or(now).max(free).saturating_duration_since(now))
+    }
+
+    /// Reads what came; whether there is more.
+    fn read(&mut self) -> io::Result<bool> {
+        let mut bytes = [0; 2048];
+        for _ in 0..READS {
+            let Some(link) = &mut self.link else { return Ok(false) };
+            let is_whole = link.gives_datagrams();
+            let Some((count, from)) = link.read(&mut bytes)? else { return Ok(false) };
+            let mut parser = std::mem::take(&mut self.parser);
+            let before = parser.malformed;
+            parser.take(&bytes[..count], is_whole, |received| self.hear(&received, from));
+            self.feed.0.counts.mavlink_bytes_malformed.add(parser.malformed - before);
+            self.parser = parser;
+        }
+        Ok(true)
+    }
+
+    fn hear(&mut self, received: &Received, from: Option<SocketAddr>) {
+        self.feed.0.counts.mavlink_received.add(1);
+        match &received.heard {
+            Heard::Heartbeat(beat) if beat.autopilot != MavAutopilot::MAV_AUTOPILOT_INVALID => {
+                self.hear_autopilot(received, beat, from);
+            }
+            // A request to us, or to everybody.
+            Heard::Timesync(t) if t.tc1 == 0 && self.is_for_us(t) => {
+                let (target_system, target_component) = (received.system, received.component);
+                let tc1 = host::monotonic().0;
+                // One that finds the list full comes again.
+                if self.answers.len() < WAITING {
+                    self.answers.push_back(TIMESYNC_DATA { tc1, ts1: t.ts1, target_system, target_component });
+                }
+            }
+            // An answer to us has the stamp of our request, whose fields of the target older ends do not know.
+            Heard::Timesync(t) if t.tc1 != 0 && t.ts1 == self.asked => {
+                let round_us = (host::monotonic().0.saturating_sub(t.ts1) / 1000).clamp(0, 1_000_000);
+                self.feed.0.counts.mavlink_round_trip_us_most.raise(round_us as u64);
+            }
+            _ => {}
+        }
+    }
+
+    fn is_for_us(&self, t: &TIMESYNC_DATA) -> bool {
+        let is_our_system = t.target_system == 0 || u32::from(t.target_system) == self.config.system;
+        is_our_system && [0, OWN_COMPONENT].contains(&t.target_component)
+    }
+
+    fn hear_autopilot(&mut self, received: &Received, beat: &HEARTBEAT_DATA, from: Option<SocketAddr>) {
+        if received.component != AUTOPILOT {
+            return;
+        }
+        if let (Some(link), Some(from)) = (&mut self.link, from) {
+            link.answer_to(from);
+        }
+        if self.heard.replace(Instant::now()).is_none() {
+            let (system, ours) = (u32::from(received.system), self.config.system);
+            let other = if system == ours {
+                String::new()
+            } else {
+                format!("; mavlink.system is {ours}: set it to {system}, or it takes no states")
+            };
+            let kind = match beat.autopilot {
+                MavAutopilot::MAV_AUTOPILOT_PX4 => "PX4",
+                MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA => "ArduPilot",
+                _ => "of another make",
+            };
+            self.say(format!("autopilot: heard on {}: {kind}, system {system}{other}", self.config.link));
+        }
+    }
+
+    /// Takes the newest of the states that came.
+    fn take_states(&mut self) {
+        let (counts, now) = (&self.feed.0.counts, Instant::now());
+        while let Some(state) = self.feed.0.states.pop() {
+            let is_frame = state.source != Source::Carried;
+            if is_frame {
+                self.last_frame = Some(now);
+            }
+            let fills = self.last_frame.is_some_and(|last| now - last >= FILL_AFTER);
+            if is_frame || fills {
+                self.last_state = Some(now);
+                counts.mavlink_states_skipped.add(u64::from(self.pending.replace(state).is_some()));
+            }
+        }
+    }
+
+    /// Tells what odometry does where that changed, and that nothing is heard of the autopilot.
+    fn judge(&mut self) {
+        let now = Instant::now();
+        if self.heard.is_some_and(|heard| now - heard > UNHEARD) {
+            self.heard = None;
+            self.say(format!("autopilot: no heartbeat on {} for {} s", self.config.link, UNHEARD.as_secs()));
+        }
+        let seems = match (&self.pending, self.last_state) {
+            (Some(state), _) => match state.source {
+                Source::Frame => Condition::Running,
+                Source::Carried if state.quality > 0 => Condition::Carried,
+                Source::Carried | Source::DeadReckoned => Condition::DeadReckoned,
+            },
+            (None, Some(at)) if now - at > SILENT => Condition::Silent,
+            _ => self.seeming.0,
+        };
+        if seems != self.seeming.0 {
+            self.seeming = (seems, now);
+        }
+        if self.condition != seems && now - self.seeming.1 >= LASTING {
+            self.condition = seems;
+            let (severity, text) = seems.told();
+            self.feed.text(severity, text);
+        }
+    }
+
+    /// Writes what is most urgent; whether there was something.
+    fn write_one(&mut self) -> io::Result<bool> {
+        let now = Instant::now();
+        if let Some(answer) = self.answers.pop_front() {
+            self.write(&answer)?;
+        } else if now >= self.heartbeat_due {
+            self.heartbeat_due = (self.heartbeat_due + SECOND).max(now);
+            self.write(&HEARTBEAT_DATA {
+                custom_mode: 0,
+                mavtype: MavType::MAV_TYPE_ONBOARD_CONTROLLER,
+                autopilot: MavAutopilot::MAV_AUTOPILOT_INVALID,
+                base_mode: MavModeFlag::empty(),
+                system_status: self.condition.state(),
+                mavlink_version: 3,
+            })?;
+        } else if now >= self.timesync_due {
+            self.timesync_due = (self.timesync_due + SECOND).max(now);
+            self.asked = host::monotonic().0;
+            let ts1 = self.asked;
+            self.write(&TIMESYNC_DATA { tc1: 0, ts1, target_system: 0, target_component: 0 })?;
+        } else if now >= self.text_due + TEXT_PATIENCE && self.write_text()? {
+        } else if let Some(state) = self.pending.take() {
+            self.write_state(&state)?;
+        } else {
+            return Ok(now >= self.text_due && self.write_text()?);
+        }
+        Ok(true)
+    }
+
+    fn write_state(&mut self, state: &State) -> io::Result<()> {
+        let (now, time_us) = (Instant::now(), self.stamps.monotonic_us(state.odometry.t));
+        let behind_us = self.last_sent_us.map_or(-1, |last| last as i64 - time_us as i64);
+        let is_late = (0..CLOCK_STEP / 1000).contains(&behind_us);
+        let period = Duration::from_secs_f64(1.0 / self.config.rate_hz);
+        let skipped = &self.feed.0.counts.mavlink_states_skipped;
+        // A frame that comes a little early is not one too many.
+        if is_late || now + period / 4 < self.state_due {
+            skipped.add(1);
+            return Ok(());
+        }
+        let sent = match self.config.message {
+            StateMessage::Odometry => match self.axes.odometry(state, time_us) {
+                Some(message) => self.write(&message)?,
+                None => false,
+            },
+            StateMessage::VisionPosition => match self.axes.vision_position(state, time_us) {
+                Some(message) => self.write(&message)?,
+                None => false,
+            },
+        };
+        if sent {
+            self.state_due = (self.state_due + period).max(now);
+            self.last_sent_us = Some(time_us);
+            self.feed.0.counts.mavlink_states_sent.add(1);
+        } else {
+            self.feed.0.counts.mavlink_states_skipped.add(1);
+        }
+        Ok(())
+    }
+
+    /// Writes the next piece of a text; whether there was one.
+    fn write_text(&mut self) -> io::Result<bool> {
+        if self.text.is_none() {
+            let Some((severity, text)) = self.feed.0.texts.pop() else { return Ok(false) };
+            // Zero says that there is one piece.
+            self.texts = if text.len() > CHUNK { self.texts.wrapping_add(1).max(1) } else { self.texts };
+            let id = if text.len() > CHUNK { self.texts } else { 0 };
+            self.text = Some(Text { severity, text, id, chunk: 0 });
+        }
+        let Some(Text { severity, text, id, chunk }) = &self.text else { return Ok(false) };
+        let rest = &text[(*chunk as usize * CHUNK).min(text.len())..];
+        let piece = &rest[..rest.len().min(CHUNK)];
+        let mut bytes = [0; CHUNK];
+        bytes[..piece.len()].copy_from_slice(piece);
+        let message = STATUSTEXT_DATA {
+            severity: match severity {
+                Severity::Notice => MavSeverity::MAV_SEVERITY_NOTICE,
+                Severity::Warning => MavSeverity::MAV_SEVERITY_WARNING,
+                Severity::Critical => MavSeverity::MAV_SEVERITY_CRITICAL,
+            },
+            text: mavlink::types::CharArray::new(bytes),
+            id: *id,
+            chunk_seq: *chunk,
+        };
+        // A piece that is not full is the last.
+        let is_last = *id == 0 || piece.len() < CHUNK;
+        if self.write(&message)? {
+            self.text_due = Instant::now() + TEXT_PERIOD;
+            match &mut self.text {
+                Some(text) if !is_last => text.chunk += 1,
+                _ => self.text = None,
+            }
+            return Ok(true);
+        }
+        // It is tried again.
+        self.text_due = Instant::now() + TEXT_PERIOD;
+        Ok(false)
+    }
+
+    /// Writes a message; false where the link refuses it.
+    fn write(&mut self, data: &impl MessageData) -> io::Result<bool> {
+        let Some(link) = &mut self.link else { return Ok(false) };
+        let header =
+            MavHeader { system_id: self.config.system as u8, component_id: OWN_COMPONENT, sequence: self.sequence };
+        let mut raw = MAVLinkV2MessageRaw::new();
+        raw.serialize_message_data(header, data);
+        let sent = link.write(raw.raw_bytes())?;
+        let counts = &self.feed.0.counts;
+        counts.mavlink_sent.add(u64::from(sent));
+        counts.mavlink_refused.add(u64::from(!sent));
+        // Receivers count what is missing.
+        self.sequence = self.sequence.wrapping_add(u8::from(sent));
+        Ok(sent)
+    }
+}

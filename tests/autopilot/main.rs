@@ -1,0 +1,225 @@
+//! What an autopilot hears of a run, by pymavlink as the other end (other_end.py), which has models of the gates of PX4 and of
+//! ArduPilot: over UDP and over a pseudo-terminal that is read as fast as a UART gives bytes; through resets, a cut line, a
+//! reader that stalls, and damaged messages.
+#![allow(clippy::unwrap_used)]
+
+#[path = "../program/mod.rs"]
+mod program;
+
+use glam::{DQuat, DVec3, EulerRot};
+use program::{flight, stipple, text, BOARD};
+use serde_json::Value;
+use std::fs;
+use std::io::{BufRead, BufReader, Read};
+use std::path::Path;
+use std::process::{Child, Command, Stdio};
+use stipple::run::log::read::{read_files, runs, Message};
+
+/// Severities of STATUSTEXT.
+const CRITICAL: u64 = 2;
+const NOTICE: u64 = 5;
+/// The unit of the simulated rig, EuRoC's: its z is forward, its x up.
+const MOUNT: &str = "mavlink.mount_rpy_deg=[0, 90, 0]";
+
+/// The other end of a link, and the link.
+struct OtherEnd(Child, BufReader<std::process::ChildStdout>, String);
+
+fn listen(arguments: &[&str]) -> OtherEnd {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let mut python = Command::new("python3");
+    python.arg(root.join("tests/autopilot/other_end.py")).args(arguments).env("PYTHONPATH", root.join("target/python"));
+    let mut child = python.stdout(Stdio::piped()).spawn().unwrap();
+    let (mut lines, mut first) = (BufReader::new(child.stdout.take().unwrap()), String::new());
+    lines.read_line(&mut first).unwrap();
+    let link = first.strip_prefix("ready ").expect("pymavlink is where `make test` puts it").trim().to_string();
+    OtherEnd(child, lines, link)
+}
+
+impl OtherEnd {
+    fn heard(mut self) -> Value {
+        let mut rest = String::new();
+        self.1.read_to_string(&mut rest).unwrap();
+        assert!(self.0.wait().unwrap().success());
+        serde_json::from_str(&rest).unwrap()
+    }
+}
+
+/// Flies a recording with an autopilot at the other end; the report, what was heard, and what was said.
+fn fly(data: &Path, out: &Path, other: &[&str], more: &[&str]) -> (Value, Value, String) {
+    let other = listen(other);
+    let link = format!("mavlink.link={}", other.2);
+    let mut run = stipple();
+    run.args(["run", "--board", BOARD, "--set", "map.enabled=false", "--set", &link, "--set", MOUNT]);
+    run.args(["--dataset", data.to_str().unwrap(), "--out", out.to_str().unwrap()]).args(more);
+    let o = run.output().unwrap();
+    assert!(o.status.success(), "{}", text(&o));
+    let report = serde_json::from_slice(&fs::read(out.join("report.json")).unwrap()).unwrap();
+    (report, other.heard(), text(&o))
+}
+
+fn rules(dir: &Path, text: &str) -> String {
+    let path = dir.join("inject.toml");
+    fs::write(&path, text).unwrap();
+    path.to_str().unwrap().into()
+}
+
+fn count(report: &Value, name: &str) -> u64 {
+    report.get(format!("count_{name}")).and_then(Value::as_u64).unwrap_or(0)
+}
+
+/// Everything that was sent arrived, in messages that both autopilots take.
+#[track_caller]
+fn whole_and_taken(heard: &Value, report: &Value) {
+    assert_eq!((&heard["lost"], &heard["nan"], &heard["bad"]), (&0.into(), &0.into(), &0.into()), "{heard}");
+    assert_eq!(heard["counts"]["ODOMETRY"].as_u64().unwrap(), count(report, "mavlink_states_sent"), "{heard}");
+    assert!(heard["px4"]["refused"] == 0 && heard["ardupilot"]["refused"] == 0, "{heard}");
+}
+
+#[test]
+fn both_autopilots_take_every_state_in_their_own_axes_and_clocks() {
+    let dir = tempfile::tempdir().unwrap();
+    let (data, out) = (flight(dir.path(), "8"), dir.path().join("out"));
+    let (report, heard, said) = fly(&data, &out, &["udp", "9", "--states"], &[]);
+    whole_and_taken(&heard, &report);
+    assert!(heard["px4"]["gaps"] == 0 && heard["ardupilot"]["unhealthy"] == 0, "{heard}");
+    // A ground vehicle would not know it: onboard controller, no autopilot; the state is active at the end.
+    let beats = heard["heartbeats"].as_array().unwrap();
+    assert!(
+        (7..=10).contains(&beats.len())
+            && beats.last().unwrap().as_array().unwrap()[1..] == [18, 8, 4].map(Value::from),
+        "{beats:?}"
+    );
+    assert!(said.contains("autopilot: heard on udpout:127.0.0.1"), "{said}");
+    assert!(said.contains("PX4, system 1\n"), "{said}");
+    let told = |severity: u64, text: &str| {
+        heard["texts"].as_array().unwrap().iter().any(|t| t[0] == severity && t[1].as_str().unwrap().contains(text))
+    };
+    assert!(told(NOTICE, "odometry: running"), "{heard}");
+    // Both ends have the same clock.
+    let sync = &heard["timesync"];
+    assert!(sync["answers"].as_u64().unwrap() > 50 && sync["offset_ms"].as_f64().unwrap().abs() < 1.0, "{sync}");
+    assert!(count(&report, "mavlink_round_trip_us_most") > 0, "{report}");
+    // The picture is there at its stamp, and tracked in some milliseconds.
+    let age = heard["age_ms"]["median"].as_f64().unwrap();
+    assert!((0.0..50.0).contains(&age), "{age} ms");
+    poses_are_those_of_the_log(&heard, &out);
+}
+
+/// Poses of messages beside those of the log, turned here by the definitions of the axes.
+fn poses_are_those_of_the_log(heard: &Value, out: &Path) {
+    let mut logged = vec![];
+    read_files(&runs(out).unwrap()[0].files, |_, message| {
+        if let Message::State(state) = message {
+            logged.extend(state.estimate);
+        }
+        Ok(())
+    })
+    .unwrap();
+    let told: Vec<Vec<f64>> = serde_json::from_value(heard["states"].clone()).unwrap();
+    assert!(told.len() > 100 && told.len() == logged.len(), "{} {}", told.len(), logged.len());
+    let body_from_vehicle = DQuat::from_euler(EulerRot::XYZ, 0.0, -90f64.to_radians(), 0.0);
+    let first = logged[0].pose().q * body_from_vehicle * DVec3::X;
+    // Columns of the local frame, in the world: forward, right, down.
+    let forward = DVec3::new(first.x, first.y, 0.0).normalize();
+    let axes = [forward, forward.cross(DVec3::Z), DVec3::NEG_Z];
+    let local = |v: DVec3| DVec3::from_array(axes.map(|axis| axis.dot(v)));
+    for (told, logged) in told.iter().zip(&logged) {
+        let (p, q) = (DVec3::from_slice(&told[1..]), DQuat::from_xyzw(told[5], told[6], told[7], told[4]));
+        assert!((p - local(logged.pose().p)).length() < 1e-5);
+        let world_from_vehicle = logged.pose().q * body_from_vehicle;
+        for axis in DVec3::AXES {
+            assert!((q * axis - local(world_from_vehicle * axis)).length() < 1e-5);
+        }
+        // Velocities are in the vehicle's axes.
+        let v = DVec3::from_slice(&told[8..]);
+        assert!((q * v - local(logged.v_world.into())).length() < 1e-4);
+    }
+}
+
+#[test]
+fn states_go_over_a_uart_and_are_thinned_where_it_is_slow() {
+    let dir = tempfile::tempdir().unwrap();
+    let data = flight(dir.path(), "5");
+    let (fast, heard, _) = fly(&data, &dir.path().join("fast"), &["serial", "6"], &[]);
+    whole_and_taken(&heard, &fast);
+    assert!(heard["px4"]["gaps"] == 0 && heard["px4"]["fused"].as_u64().unwrap() > 80, "{heard}");
+    // 244 bytes take 64 ms: a state waits for no other.
+    let slow = ["serial", "7", "--baud", "38400"];
+    let (report, heard, _) = fly(&data, &dir.path().join("slow"), &slow, &[]);
+    whole_and_taken(&heard, &report);
+    let states = heard["counts"]["ODOMETRY"].as_u64().unwrap();
+    assert!(heard["counts"]["HEARTBEAT"].as_u64().unwrap() >= 4, "{heard}");
+    assert!((35..80).contains(&states) && count(&report, "mavlink_states_skipped") > 10, "{heard}");
+    assert!(heard["age_ms"]["median"].as_f64().unwrap() < 64.0 + 64.0 + 50.0, "{heard}");
+}
+
+#[test]
+fn reset_is_counted_once_at_both_ends_and_no_gap_is_one_to_give_up_at() {
+    // Longer than odometry believes inertia alone.
+    const UNPLUGGED: &str = "[[camera]]\nfault = \"unplug\"\nstart_s = 3.0\nend_s = 6.5\n";
+    let dir = tempfile::tempdir().unwrap();
+    let (data, inject) = (flight(dir.path(), "10"), rules(dir.path(), UNPLUGGED));
+    let (report, heard, said) = fly(&data, &dir.path().join("out"), &["udp", "11", "--states"], &["--inject", &inject]);
+    let resets = heard["resets"].as_array().unwrap();
+    assert_eq!(*resets, [0, 1], "{said}");
+    assert!(said.matches("epoch 1 begins").count() == 1 && !said.contains("epoch 2"), "{said}");
+    assert_eq!((&heard["lost"], &heard["nan"]), (&0.into(), &0.into()));
+    assert_eq!(heard["counts"]["ODOMETRY"].as_u64().unwrap(), count(&report, "mavlink_states_sent"));
+    let told: Vec<Vec<f64>> = serde_json::from_value(heard["states"].clone()).unwrap();
+    // Inertia carries states on, and what is not known any more says so.
+    let longest = told.windows(2).map(|s| s[1][0] - s[0][0]).fold(0.0, f64::max) * 1e-6;
+    assert!(longest < 0.2 && told.windows(2).all(|s| s[1][0] > s[0][0]), "{longest} s");
+    let failed = told.iter().filter(|s| s[11] == -1.0).count();
+    assert!((20..120).contains(&failed), "{failed}");
+    let told = |severity: u64, text: &str| {
+        heard["texts"].as_array().unwrap().iter().any(|t| t[0] == severity && t[1].as_str().unwrap().contains(text))
+    };
+    assert!(told(CRITICAL, "odometry: lost") && told(4, "epoch 1 begins"), "{heard}");
+    // A run that is started anew in the same folder begins in another frame.
+    let (_, heard, _) = fly(&data, &dir.path().join("out"), &["udp", "3"], &["--duration", "3"]);
+    assert_eq!(heard["resets"], serde_json::json!([2]));
+}
+
+/// None of it reaches the flight, and the link is there again when the line is.
+#[test]
+fn damaged_messages_and_a_line_that_is_cut_or_stalls_cost_messages_alone() {
+    let dir = tempfile::tempdir().unwrap();
+    let data = flight(dir.path(), "9");
+    for (kind, fault) in [("udp", "--cut"), ("serial", "--cut"), ("udp", "--stall"), ("serial", "--stall")] {
+        let out = dir.path().join(format!("{kind}{fault}"));
+        let (report, heard, said) = fly(&data, &out, &[kind, "9", "--malformed", "1000", fault, "3", "5"], &[]);
+        let case = format!("{kind} {fault}: {heard} {said}");
+        assert!(heard["malformed_sent"].as_u64().unwrap() >= 990, "{case}");
+        assert!(count(&report, "mavlink_bytes_malformed") > 10_000, "{case}");
+        assert!(report["frames"].as_u64().unwrap() >= 178, "{case}");
+        assert!(count(&report, "frames_overwritten") == 0 && heard["nan"] == 0, "{case}");
+        // Two seconds of nine are gone.
+        assert!(heard["counts"]["ODOMETRY"].as_u64().unwrap() > 100, "{case}");
+        assert!(heard["px4"]["stops"].as_u64().unwrap() <= 1, "{case}");
+        if (kind, fault) == ("serial", "--cut") {
+            assert!(said.contains("is lost") && said.contains("is open"), "{case}");
+            assert_eq!(count(&report, "mavlink_reopened"), 1, "{case}");
+        }
+    }
+}
+
+#[test]
+fn link_that_cannot_be_is_named_before_the_flight_and_one_that_is_not_there_yet_is_tried_again() {
+    let dir = tempfile::tempdir().unwrap();
+    let data = flight(dir.path(), "2");
+    let run = |set: &str, out: &str| {
+        let mut run = stipple();
+        run.args(["run", "--board", BOARD, "--set", "map.enabled=false", "--set", set]);
+        run.args(["--dataset", data.to_str().unwrap(), "--out", dir.path().join(out).to_str().unwrap()]);
+        run.output().unwrap()
+    };
+    let wrong = run("mavlink.link=udp:10.0.0.1:14550", "wrong");
+    assert_eq!(wrong.status.code(), Some(78), "{}", text(&wrong));
+    assert!(text(&wrong).contains("must be serial:DEVICE:BAUD, udpout:IP:PORT or udpin:IP:PORT"), "{}", text(&wrong));
+    for absent in ["serial:/dev/stipple-none:57600", "serial:/dev/null:57600", "udpout:127.0.0.1:9"] {
+        let o = run(&format!("mavlink.link={absent}"), "absent");
+        assert!(o.status.success(), "{}", text(&o));
+        let lines = text(&o).matches("is lost").count();
+        assert_eq!(lines, usize::from(absent.starts_with("serial")), "{}", text(&o));
+    }
+}
