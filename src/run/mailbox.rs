@@ -4,7 +4,8 @@
 //! newest replaces the one that waits; samples to a queue. A source that is lost or silent is reported in one line when
 //! it goes and one when it is back, counted, and asked again; nothing is restarted. A broken one ends the run.
 //!
-//! A frame is tracked when a sample at or past its stamp has come, or when none did within `SAMPLE_WAIT`.
+//! A frame is tracked when a sample at or past its stamp has come, or one hardly before it, or when none did within
+//! `SAMPLE_WAIT`.
 
 use super::gate::{FrameGate, ImuGate, JUMP_MAX};
 use super::publisher::Publisher;
@@ -28,6 +29,9 @@ use stipple_drivers::{Calibration, Fault, ImuSample, Span};
 const PATIENCE: Span = Span(100_000_000);
 /// Longest wait of a frame for a sample at its stamp: more than a FIFO of 10 samples at 200 Hz holds back.
 const SAMPLE_WAIT: Duration = Duration::from_millis(100);
+/// A sample that is older than its frame by no more than this is as good as one at it: held for so long, a rate that changes
+/// by 10 rad/s² is 5 mrad/s off, and a wait for the next costs the pose 5 ms at 200 Hz.
+const SAMPLE_EARLY: Span = Span(500_000);
 /// A source that gives nothing for so long is silent: ten frames at 20 Hz.
 const SILENT_AFTER: Duration = Duration::from_millis(500);
 /// Least time between two reports of one sensor.
@@ -98,7 +102,7 @@ impl Mailbox {
         while let Some(sample) = self.imu.pop() {
             packet.push_imu(sample, counters);
             // Samples so far ahead are of the clock before.
-            reached = (Span(0)..=JUMP_MAX).contains(&(sample.t - packet.frames.t));
+            reached = (Span(-SAMPLE_EARLY.0)..=JUMP_MAX).contains(&(sample.t - packet.frames.t));
             if reached {
                 break;
             }

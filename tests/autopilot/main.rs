@@ -223,3 +223,89 @@ fn link_that_cannot_be_is_named_before_the_flight_and_one_that_is_not_there_yet_
         assert_eq!(lines, usize::from(absent.starts_with("serial")), "{}", text(&o));
     }
 }
+
+fn part(values: &mut [f64], part: f64) -> f64 {
+    values.sort_by(f64::total_cmp);
+    values[((part * values.len() as f64) as usize).min(values.len() - 1)]
+}
+
+/// Latencies of tracking in the log of a run, ms.
+fn latencies(out: &Path) -> Vec<f64> {
+    let mut list = vec![];
+    read_files(&runs(out).unwrap()[0].files, |_, message| {
+        if let Message::State(state) = message {
+            list.extend(state.estimate.map(|_| state.latency_ms));
+        }
+        Ok(())
+    })
+    .unwrap();
+    list
+}
+
+/// Time from the stamp of a picture until its pose is at the autopilot's end, with the map on, beside tracking's own.
+#[test]
+#[ignore = "a measurement on the recordings: STIPPLE_RECORDINGS, release build, nothing else on the machine"]
+fn age_of_poses_at_the_other_end() {
+    let data = Path::new(&std::env::var("STIPPLE_RECORDINGS").unwrap()).join("euroc_MH_01_easy_11s");
+    let dir = tempfile::tempdir().unwrap();
+    println!("| link | poses | age: median | p99 | most | tracking: median | p99 | p99 over p99 |\n|---|---|---|---|---|---|---|---|");
+    for (kind, allowed_ms) in [("udp", 3.0), ("serial", 8.0)] {
+        let (mut tracked, mut ages) = (vec![], vec![]);
+        for pass in 0..5 {
+            let out = dir.path().join(format!("{kind}{pass}"));
+            let (report, heard, _) = fly(&data, &out, &[kind, "13", "--ages"], &["--set", "map.enabled=true"]);
+            whole_and_taken(&heard, &report);
+            tracked.extend(latencies(&out));
+            ages.extend(serde_json::from_value::<Vec<f64>>(heard["ages"].clone()).unwrap());
+        }
+        let (n, most) = (ages.len(), ages.iter().copied().fold(0.0, f64::max));
+        let [median, p99] = [0.5, 0.99].map(|p| part(&mut ages, p));
+        let [own, own_p99] = [0.5, 0.99].map(|p| part(&mut tracked, p));
+        let over = p99 - own_p99;
+        println!("| {kind} | {n} | {median:.2} ms | {p99:.2} | {most:.2} | {own:.2} | {own_p99:.2} | {over:+.2} |");
+        assert!(over <= allowed_ms, "{kind}: {over} ms of {allowed_ms}");
+    }
+}
+
+/// Twenty minutes with a fault each minute: a camera that is unplugged for long, an inertial unit that is, and a line that is cut.
+#[test]
+#[ignore = "20 minutes: cargo test --release --test autopilot twenty -- --ignored --nocapture"]
+fn twenty_minutes_with_faults_lose_no_message_and_count_every_reset_once() {
+    let dir = tempfile::tempdir().unwrap();
+    let data = flight(dir.path(), "60");
+    let rule = |minute: u32| {
+        let (sensor, start) = (["camera", "imu"][minute as usize % 2], f64::from(minute) * 60.0 + 20.0);
+        format!("[[{sensor}]]\nfault = \"unplug\"\nstart_s = {start}\nend_s = {}\n", start + 3.5)
+    };
+    let inject = rules(dir.path(), &(0..20).map(rule).collect::<String>());
+    let out = dir.path().join("out");
+    let more = ["--inject", &inject, "--repeat", "--duration", "1200"];
+    let (report, heard, said) = fly(&data, &out, &["udp", "1200", "--malformed", "1000"], &more);
+    let begun: Vec<u64> = serde_json::from_value(heard["resets"].clone()).unwrap();
+    let mut epochs = vec![];
+    read_files(&runs(&out).unwrap()[0].files, |_, message| {
+        if let Message::State(state) = message {
+            if state.estimate.is_some() && epochs.last() != Some(&u64::from(state.epoch % 256)) {
+                epochs.push(u64::from(state.epoch % 256));
+            }
+        }
+        Ok(())
+    })
+    .unwrap();
+    println!(
+        "{} messages, {} of them states, {} lost, {} with NaN, {} resets here, {} in the log; PX4 {}, ArduPilot {}; age {}",
+        heard["counts"],
+        heard["counts"]["ODOMETRY"],
+        heard["lost"],
+        heard["nan"],
+        begun.len() - 1,
+        epochs.len() - 1,
+        heard["px4"],
+        heard["ardupilot"],
+        heard["age_ms"]
+    );
+    assert_eq!((&heard["lost"], &heard["nan"], &heard["bad"]), (&0.into(), &0.into(), &0.into()), "{said}");
+    assert_eq!(begun, epochs, "{said}");
+    assert!(begun.len() > 5 && begun.windows(2).all(|b| b[1] == b[0] + 1), "{begun:?}: {said}");
+    assert!(count(&report, "mavlink_bytes_malformed") > 10_000);
+}

@@ -3,11 +3,10 @@
 
 Prints `ready LINK`, where LINK is what mavlink.link is to be, then listens for SECONDS and prints one JSON object.
 
-usage: other_end.py udp|serial SECONDS [--baud B] [--malformed N] [--deaf FROM TO] [--cut FROM TO] [--stall FROM TO]
+usage: other_end.py udp|serial SECONDS [--baud B] [--ages] [--states] [--malformed N] [--cut FROM TO] [--stall FROM TO]
 
   --malformed N    send N damaged messages, spread over the time
-  --deaf FROM TO   send nothing from then to then, s (the link goes on)
-  --cut FROM TO    close the link from then to then: a cable that is unplugged
+  --cut FROM TO    close the link from then to then, s: a cable that is unplugged
   --stall FROM TO  read nothing from then to then
 """
 
@@ -174,8 +173,9 @@ def main():
     arguments.add_argument("seconds", type=float)
     arguments.add_argument("--baud", type=int, default=921600)
     arguments.add_argument("--malformed", type=int, default=0)
+    arguments.add_argument("--ages", action="store_true", help="give every age, too")
     arguments.add_argument("--states", action="store_true", help="give every state, too")
-    for fault in ("--deaf", "--cut", "--stall"):
+    for fault in ("--cut", "--stall"):
         arguments.add_argument(fault, type=float, nargs=2, default=(math.inf, math.inf))
     a = arguments.parse_args()
     line, gates, draw = Line(a.kind, a.baud), Gates(), random.Random(1)
@@ -247,7 +247,7 @@ def main():
                 received = time.monotonic_ns()
                 rounds.append((received - message.ts1) / 1e6)
                 offsets.append((message.tc1 - (received + message.ts1) / 2) / 1e6)
-        if begun is None or a.deaf[0] <= t < a.deaf[1]:
+        if begun is None:
             continue
         if now >= beat:
             beat = now + 1.0
@@ -261,7 +261,7 @@ def main():
     first = min(ages) if ages else None
     print(json.dumps(dict(
         counts=counts, lost=lost, bad=bad, nan=nan, resets=resets, texts=texts, heartbeats=heartbeats, malformed_sent=sent,
-        px4=gates.px4, ardupilot=gates.ardupilot, states=states,
+        px4=gates.px4, ardupilot=gates.ardupilot, states=states, ages=ages if a.ages else [],
         age_ms=dict(least=first, median=percentile(ages, 0.5), p99=percentile(ages, 0.99), most=max(ages, default=None)),
         timesync=dict(answers=len(rounds), round_ms=percentile(rounds, 0.5), offset_ms=percentile(offsets, 0.5)),
     )))
