@@ -321,7 +321,7 @@ fn a_gpu_that_is_lost_is_opened_again() {
 }
 
 /// Threads that the program starts in a run of a recording, and what makes a run have them. `trigger` needs cameras.
-const THREADS: [(&str, &[&str]); 13] = [
+const THREADS: [(&str, &[&str]); 14] = [
     ("main", &[]),
     ("camera", &[]),
     ("imu", &[]),
@@ -329,6 +329,7 @@ const THREADS: [(&str, &[&str]); 13] = [
     ("tracking", &["--set", "frontend.threads=1"]),
     ("frontend", &["--set", "frontend.threads=2"]),
     ("estimator", &["--set", "frontend.threads=2"]),
+    ("autopilot", &["--set", "mavlink.link=udpout:127.0.0.1:9"]),
     ("log", &[]),
     ("led", &["--set", "gpio.led=fake:3"]),
     ("writer", &["--record"]),

@@ -10,6 +10,9 @@ use std::os::unix::net::{SocketAddr, UnixDatagram};
 use std::path::Path;
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
+use stipple::run::log::read::{read_files, runs, Message};
+use stipple::run::log::State;
+use stipple_drivers::host;
 
 const UNIT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/board-configs/stipple.service");
 
@@ -81,6 +84,39 @@ fn manager_hears_that_a_run_ends_by_itself_and_its_mapper_goes_first_where_memor
     let messages = heard(&socket, Duration::from_secs(30), "STOPPING=1");
     assert!(count(&before, "READY=1") == 1 && count(&messages, "STOPPING=1") == 1, "{before:?} {messages:?}");
     assert!(child.wait().unwrap().success());
+}
+
+/// Ready is a promise: poses follow. `cargo test --release --test service first_pose -- --nocapture` prints when.
+#[test]
+fn first_pose_comes_within_three_seconds_after_ready() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut flights = vec![("simulated flight", flight(dir.path(), "5"))];
+    flights.extend(std::env::var("STIPPLE_RECORDINGS").map(|r| ("MH_01", Path::new(&r).join("euroc_MH_01_easy_11s"))));
+    for (name, data) in flights {
+        let (path, out) = (dir.path().join(format!("{name} notify")), dir.path().join(name));
+        let socket = UnixDatagram::bind(&path).unwrap();
+        let mut command = stipple();
+        command.args(["run", "--board", BOARD, "--set", "map.scale=4", "--dataset", data.to_str().unwrap()]);
+        command.args(["--duration", "5", "--out", out.to_str().unwrap()]).env("NOTIFY_SOCKET", &path);
+        let begun = host::monotonic();
+        let mut child = command.stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
+        heard(&socket, Duration::from_secs(60), "READY=1");
+        let ready = host::monotonic();
+        assert!(child.wait().unwrap().success());
+        let mut first = None;
+        read_files(&runs(&out).unwrap()[0].files, |at, message| {
+            if matches!(message, Message::State(State { estimate: Some(_), .. })) {
+                first.get_or_insert(at);
+            }
+            Ok(())
+        })
+        .unwrap();
+        let (after_start, after_ready) = ((ready - begun).secs(), (first.unwrap() - ready).secs());
+        println!(
+            "{name}: ready {after_start:.2} s after the start of the process, first pose {after_ready:.2} s after that"
+        );
+        assert!(after_ready < 3.0, "{name}: {after_ready} s");
+    }
 }
 
 /// A thread that hangs must reach the watchdog, which starts the run anew.

@@ -11,12 +11,12 @@ section! {
     MavlinkConfig, "mavlink.";
     /// Where it is: `serial:DEVICE:BAUD`, `udpout:IP:PORT` (it listens there), or `udpin:IP:PORT` (it sends there, and is answered).
     link: String = String::new();
-    /// Its system id, which is ours too: of one vehicle there is one.
+    /// Its system id, which our messages have too: the parts of a vehicle have the same one.
     system: u32 = 1, Bound::Within(1.0, 255.0);
     /// `odometry`: poses and velocities; `vision_position`: poses alone, for what does not know ODOMETRY.
     message: StateMessage = StateMessage::Odometry;
     /// Most states a second; no more are sent than there are frames, and than the link has room for.
-    rate_hz: f64 = 50.0, Bound::Within(4.0, 200.0);
+    rate_hz: f64 = 50.0, Bound::Within(10.0, 200.0);
     /// Roll, pitch and yaw of the inertial unit in the vehicle, whose axes are forward, right and down: about the vehicle's axes,
     /// roll first. A unit whose x is forward and z up has [180, 0, 0].
     mount_rpy_deg: [f64; 3] = [0.0; 3];

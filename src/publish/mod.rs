@@ -38,6 +38,13 @@ pub struct State {
     pub source: Source,
 }
 
+impl State {
+    /// Whether odometry has failed: nothing but inertia is left of it.
+    pub fn has_failed(&self) -> bool {
+        self.quality == 0 || self.source == Source::DeadReckoned
+    }
+}
+
 /// Where a state comes from.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Source {
@@ -60,7 +67,7 @@ pub enum Severity {
 counters! {
     /// What writers were given and did with it.
     pub struct Counts of Counter, read by Counter::get;
-    /// States that a newer one replaced, or the link had no room for; texts that found the queue full.
+    /// States that were not sent: a newer one came, the link had no room, or odometry had failed; texts that newer ones replaced.
     mavlink_states_skipped,
     mavlink_texts_lost,
     /// Messages sent, and those of them that are states.
@@ -120,7 +127,7 @@ impl Feed {
         text.as_bytes()[..end].iter().for_each(|byte| {
             let _ = cut.push(*byte);
         });
-        self.0.counts.mavlink_texts_lost.add(u64::from(self.0.texts.push((severity, cut)).is_err()));
+        self.0.counts.mavlink_texts_lost.add(u64::from(self.0.texts.force_push((severity, cut)).is_some()));
         self.wake();
     }
 

@@ -131,7 +131,7 @@ fn silent() -> impl Iterator<Item = (usize, &'static str)> {
 }
 
 /// Threads without which a run is still worth going on.
-const SPARED: [&str; 6] = ["barometer", "map-answers", "beat", "led", "log", "writer"];
+const SPARED: [&str; 7] = ["autopilot", "barometer", "map-answers", "beat", "led", "log", "writer"];
 
 /// Whether no thread that a run needs has been silent for longer than it may. Allocates nothing.
 pub fn are_alive() -> bool {

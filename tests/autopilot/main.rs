@@ -166,18 +166,19 @@ fn reset_is_counted_once_at_both_ends_and_no_gap_is_one_to_give_up_at() {
     assert_eq!((&heard["lost"], &heard["nan"]), (&0.into(), &0.into()));
     assert_eq!(heard["counts"]["ODOMETRY"].as_u64().unwrap(), count(&report, "mavlink_states_sent"));
     let told: Vec<Vec<f64>> = serde_json::from_value(heard["states"].clone()).unwrap();
-    // Inertia carries states on, and what is not known any more says so.
-    let longest = told.windows(2).map(|s| s[1][0] - s[0][0]).fold(0.0, f64::max) * 1e-6;
+    // Inertia carries states on; what is not known any more says so for a second, and then no more.
+    let gaps = told.windows(2).filter(|s| s[0][11] > 0.0).map(|s| s[1][0] - s[0][0]);
+    let longest = gaps.fold(0.0, f64::max) * 1e-6;
     assert!(longest < 0.2 && told.windows(2).all(|s| s[1][0] > s[0][0]), "{longest} s");
     let failed = told.iter().filter(|s| s[11] == -1.0).count();
-    assert!((20..120).contains(&failed), "{failed}");
+    assert!((10..80).contains(&failed), "{failed}");
     let told = |severity: u64, text: &str| {
         heard["texts"].as_array().unwrap().iter().any(|t| t[0] == severity && t[1].as_str().unwrap().contains(text))
     };
     assert!(told(CRITICAL, "odometry: lost") && told(4, "epoch 1 begins"), "{heard}");
     // A run that is started anew in the same folder begins in another frame.
     let (_, heard, _) = fly(&data, &dir.path().join("out"), &["udp", "3"], &["--duration", "3"]);
-    assert_eq!(heard["resets"], serde_json::json!([2]));
+    assert_eq!(heard["resets"], serde_json::json!([10]));
 }
 
 /// None of it reaches the flight, and the link is there again when the line is.
@@ -306,6 +307,7 @@ fn twenty_minutes_with_faults_lose_no_message_and_count_every_reset_once() {
     );
     assert_eq!((&heard["lost"], &heard["nan"], &heard["bad"]), (&0.into(), &0.into(), &0.into()), "{said}");
     assert_eq!(begun, epochs, "{said}");
-    assert!(begun.len() > 5 && begun.windows(2).all(|b| b[1] == b[0] + 1), "{begun:?}: {said}");
+    // An epoch that ends before it has a state is passed over.
+    assert!(begun.len() > 5 && begun.windows(2).all(|b| b[1] > b[0]), "{begun:?}: {said}");
     assert!(count(&report, "mavlink_bytes_malformed") > 10_000);
 }

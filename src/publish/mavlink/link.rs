@@ -4,7 +4,7 @@ use crate::config::Address;
 use mio::net::UdpSocket;
 use mio::unix::SourceFd;
 use mio::{Interest, Registry, Token};
-use rustix::termios::{self, ControlModes, OptionalActions};
+use rustix::termios::{self, ControlModes, OptionalActions, QueueSelector};
 use std::fs::{File, OpenOptions};
 use std::io::{self, ErrorKind, Read, Write};
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
@@ -90,10 +90,17 @@ impl Link {
         }
     }
 
-    /// Answers go there from here on, where the address is not known beforehand.
+    /// Answers go there until it is forgotten, where the address is not known beforehand.
     pub fn answer_to(&mut self, peer: SocketAddr) {
         if let Line::UdpAt(_, known) = &mut self.line {
-            *known = Some(peer);
+            known.get_or_insert(peer);
+        }
+    }
+
+    /// Nobody is answered until there is another.
+    pub fn forget_peer(&mut self) {
+        if let Line::UdpAt(_, known) = &mut self.line {
+            *known = None;
         }
     }
 
@@ -119,7 +126,8 @@ impl Link {
     pub fn write(&mut self, message: &[u8]) -> io::Result<bool> {
         let took = match &mut self.line {
             Line::UdpTo(socket) => is_sent(socket.send(message))?,
-            Line::UdpAt(socket, Some(peer)) => is_sent(socket.send_to(message, *peer))?,
+            // No address of a stranger is a fault of the socket.
+            Line::UdpAt(socket, Some(peer)) => socket.send_to(message, *peer).is_ok(),
             Line::UdpAt(_, None) => false,
             Line::Serial(file) => {
                 let written = write(file, message)?;
@@ -138,6 +146,15 @@ impl Link {
     }
 }
 
+impl Drop for Link {
+    /// Forgets what the UART did not send: closing it would wait for that, for half a minute.
+    fn drop(&mut self) {
+        if let Line::Serial(file) = &self.line {
+            let _ = termios::tcflush(file, QueueSelector::OFlush);
+        }
+    }
+}
+
 fn write(file: &mut File, bytes: &[u8]) -> io::Result<usize> {
     match file.write(bytes) {
         Err(e) if matches!(e.kind(), ErrorKind::WouldBlock | ErrorKind::Interrupted) => Ok(0),
@@ -147,11 +164,15 @@ fn write(file: &mut File, bytes: &[u8]) -> io::Result<usize> {
 
 /// Whether a datagram left. A peer or a network that is not there yet is no fault of the socket.
 fn is_sent(sent: io::Result<usize>) -> io::Result<bool> {
-    use ErrorKind::{ConnectionRefused, HostUnreachable, Interrupted, NetworkDown, NetworkUnreachable, WouldBlock};
+    use ErrorKind::{
+        ConnectionRefused, HostUnreachable, Interrupted, NetworkDown, NetworkUnreachable, PermissionDenied, WouldBlock,
+    };
     match sent {
         Ok(_) => Ok(true),
         Err(e) => match e.kind() {
-            ConnectionRefused | HostUnreachable | NetworkUnreachable | NetworkDown | WouldBlock | Interrupted => {
+            ConnectionRefused | HostUnreachable | NetworkUnreachable | NetworkDown | WouldBlock | Interrupted
+            // A firewall forbids it, or the unit of the service.
+            | PermissionDenied => {
                 Ok(false)
             }
             // No room in the queue of the network's interface.

@@ -1,7 +1,7 @@
 //! States as MAVLink messages, in the frames that autopilots take: poses in MAV_FRAME_LOCAL_FRD (forward as the vehicle looked
 //! when it started, right, down), velocities in MAV_FRAME_BODY_FRD. Both PX4 and ArduPilot take this pair.
 
-use crate::publish::{Source, State};
+use crate::publish::State;
 use glam::{DMat3, DQuat, DVec3, EulerRot};
 use mavlink::dialects::common::{MavEstimatorType, MavFrame, ODOMETRY_DATA, VISION_POSITION_ESTIMATE_DATA};
 use nalgebra::{SMatrix, Vector3};
@@ -60,10 +60,14 @@ impl Axes {
     fn local_from_world(&mut self, state: &State) -> DQuat {
         let (world_from_body, body_from_vehicle) =
             (state.odometry.world_from_body.q, self.vehicle_from_body.conjugate());
-        *self.local_from_world.get_or_insert_with(|| {
+        let first = || {
             let forward = world_from_body * (body_from_vehicle * DVec3::X);
             DQuat::from_rotation_x(std::f64::consts::PI) * DQuat::from_rotation_z(-forward.y.atan2(forward.x))
-        })
+        };
+        let turn = self.local_from_world.unwrap_or_else(first);
+        // A first state that is not finite is not the first.
+        self.local_from_world = Some(turn).filter(|turn| turn.is_finite());
+        turn
     }
 
     /// The state in the axes of messages; `None` where a number of it is not finite, as an f32.
@@ -165,10 +169,10 @@ impl Axes {
 
 /// 1 to 100 percent; -1 where odometry has failed, since 0 is for a quality that is unknown.
 fn quality(state: &State) -> i8 {
-    match state.quality {
-        0 => -1,
-        _ if state.source == Source::DeadReckoned => -1,
-        percent => percent.min(100) as i8,
+    if state.has_failed() {
+        -1
+    } else {
+        state.quality.min(100) as i8
     }
 }
 
@@ -176,6 +180,7 @@ fn quality(state: &State) -> i8 {
 mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
+    use crate::publish::Source;
     use crate::vio::Odometry;
     use stipple_drivers::{Nanos, Pose};
 
@@ -239,6 +244,9 @@ mod tests {
             assert_eq!(of(&mut axes, State { rate: DVec3::splat(bad), ..good }), None);
             assert_eq!(of(&mut axes, State { covariance: Some([[bad; 15]; 15]), ..good }), None);
         }
+        let mut fresh = Axes::new([0.0; 3], 0);
+        assert_eq!(of(&mut fresh, state(DQuat::from_xyzw(f64::NAN, 0.0, 0.0, 1.0), DVec3::ZERO, DVec3::ZERO)), None);
+        assert_eq!(of(&mut fresh, good), Some(80), "a first state that is not finite leaves no mark");
         let unknown = axes.odometry(&good, 0).unwrap();
         assert!(unknown.pose_covariance.iter().chain(&unknown.velocity_covariance).all(|x| x.is_finite()));
     }

@@ -37,8 +37,13 @@ const FEED: Token = Token(1);
 const SECOND: Duration = Duration::from_secs(1);
 /// Longest sleep, so that a stop is heard.
 const PATIENCE: Duration = Duration::from_millis(50);
-/// Without a frame for so long, states between frames take the place of frames.
+/// Without a frame for so long, and for so many periods of the camera, states between frames take the place of frames.
 const FILL_AFTER: Duration = Duration::from_millis(90);
+const FILL_PERIODS: f64 = 1.8;
+/// States that say that odometry has failed are sent for so long; then silence says it, to autopilots that read no quality too.
+const FAILED_TOLD: Duration = Duration::from_secs(1);
+/// A stamp that is so far ahead of now is no stamp, µs.
+const AHEAD_US: u64 = 50_000;
 /// A condition is told when it has lasted so long.
 const LASTING: Duration = Duration::from_millis(300);
 /// Without a state for so long, odometry is silent.
@@ -139,9 +144,12 @@ pub struct Autopilot {
     /// The newest state that is to be sent, and the stamp of the last that was, µs.
     pending: Option<State>,
     last_sent_us: Option<u64>,
-    /// When the last state came, and the last of a frame.
+    /// When the last state came, the last of a frame, and the time between two of these.
     last_state: Option<Instant>,
     last_frame: Option<Instant>,
+    frame_period: Duration,
+    /// Since when odometry has failed.
+    failed: Option<Instant>,
     /// When the next state may be sent by the rate.
     state_due: Instant,
     heartbeat_due: Instant,
@@ -149,7 +157,8 @@ pub struct Autopilot {
     /// Stamp of the last request.
     asked: i64,
     text_due: Instant,
-    answers: VecDeque<TIMESYNC_DATA>,
+    /// Answers, and when their requests came.
+    answers: VecDeque<(TIMESYNC_DATA, i64)>,
     text: Option<Text>,
     texts: u16,
     condition: Condition,
@@ -187,6 +196,8 @@ impl Autopilot {
             last_sent_us: None,
             last_state: None,
             last_frame: None,
+            frame_period: Duration::from_millis(50),
+            failed: None,
             state_due: now,
             heartbeat_due: now,
             timesync_due: now,
@@ -229,6 +240,7 @@ impl Autopilot {
         self.retry = Instant::now() + SECOND;
         match Link::open(&self.address, self.poll.registry(), LINK) {
             Ok(link) => {
+                self.pending = None;
                 if std::mem::take(&mut self.is_lost) {
                     self.feed.0.counts.mavlink_reopened.add(1);
                     self.say(format!("autopilot: link {} is open", self.config.link));
@@ -294,10 +306,11 @@ impl Autopilot {
             // A request to us, or to everybody.
             Heard::Timesync(t) if t.tc1 == 0 && self.is_for_us(t) => {
                 let (target_system, target_component) = (received.system, received.component);
-                let tc1 = host::monotonic().0;
+                let came = host::monotonic().0;
                 // One that finds the list full comes again.
                 if self.answers.len() < WAITING {
-                    self.answers.push_back(TIMESYNC_DATA { tc1, ts1: t.ts1, target_system, target_component });
+                    let answer = TIMESYNC_DATA { tc1: 0, ts1: t.ts1, target_system, target_component };
+                    self.answers.push_back((answer, came));
                 }
             }
             // An answer to us has the stamp of our request, whose fields of the target older ends do not know.
@@ -315,19 +328,19 @@ impl Autopilot {
     }
 
     fn hear_autopilot(&mut self, received: &Received, beat: &HEARTBEAT_DATA, from: Option<SocketAddr>) {
-        if received.component != AUTOPILOT {
+        let (system, ours) = (u32::from(received.system), self.config.system);
+        // Where nobody is heard, another vehicle is worth a line; it is not answered.
+        if received.component != AUTOPILOT || system != ours && self.heard.is_some() {
             return;
         }
-        if let (Some(link), Some(from)) = (&mut self.link, from) {
+        if let (Some(link), Some(from), true) = (&mut self.link, from, system == ours) {
             link.answer_to(from);
         }
         if self.heard.replace(Instant::now()).is_none() {
-            let (system, ours) = (u32::from(received.system), self.config.system);
-            let other = if system == ours {
-                String::new()
-            } else {
-                format!("; mavlink.system is {ours}: set it to {system}, or it takes no states")
-            };
+            let other =
+                if system == ours { String::new() } else { format!("; mavlink.system is {ours}: set it to {system}") };
+            // Who was not there did not hear it.
+            self.condition = Condition::Starting;
             let kind = match beat.autopilot {
                 MavAutopilot::MAV_AUTOPILOT_PX4 => "PX4",
                 MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA => "ArduPilot",
@@ -343,9 +356,12 @@ impl Autopilot {
         while let Some(state) = self.feed.0.states.pop() {
             let is_frame = state.source != Source::Carried;
             if is_frame {
-                self.last_frame = Some(now);
+                let since = self.last_frame.replace(now).map_or(self.frame_period, |last| now - last);
+                // Slower by and by, so that one gap makes no slow camera.
+                self.frame_period = since.min(2 * self.frame_period).max(Duration::from_millis(1));
             }
-            let fills = self.last_frame.is_some_and(|last| now - last >= FILL_AFTER);
+            let patience = FILL_AFTER.max(self.frame_period.mul_f64(FILL_PERIODS));
+            let fills = self.last_frame.is_some_and(|last| now - last >= patience);
             if is_frame || fills {
                 self.last_state = Some(now);
                 counts.mavlink_states_skipped.add(u64::from(self.pending.replace(state).is_some()));
@@ -358,13 +374,14 @@ impl Autopilot {
         let now = Instant::now();
         if self.heard.is_some_and(|heard| now - heard > UNHEARD) {
             self.heard = None;
+            self.link.iter_mut().for_each(Link::forget_peer);
             self.say(format!("autopilot: no heartbeat on {} for {} s", self.config.link, UNHEARD.as_secs()));
         }
         let seems = match (&self.pending, self.last_state) {
             (Some(state), _) => match state.source {
-                Source::Frame => Condition::Running,
-                Source::Carried if state.quality > 0 => Condition::Carried,
-                Source::Carried | Source::DeadReckoned => Condition::DeadReckoned,
+                _ if state.has_failed() => Condition::DeadReckoned,
+                Source::Carried => Condition::Carried,
+                _ => Condition::Running,
             },
             (None, Some(at)) if now - at > SILENT => Condition::Silent,
             _ => self.seeming.0,
@@ -382,8 +399,10 @@ impl Autopilot {
     /// Writes what is most urgent; whether there was something.
     fn write_one(&mut self) -> io::Result<bool> {
         let now = Instant::now();
-        if let Some(answer) = self.answers.pop_front() {
-            self.write(&answer)?;
+        if let Some((answer, came)) = self.answers.pop_front() {
+            // What it waited here is not one end's clock ahead of the other's.
+            let tc1 = came + (host::monotonic().0 - came) / 2;
+            self.write(&TIMESYNC_DATA { tc1, ..answer })?;
         } else if now >= self.heartbeat_due {
             self.heartbeat_due = (self.heartbeat_due + SECOND).max(now);
             self.write(&HEARTBEAT_DATA {
@@ -413,10 +432,14 @@ impl Autopilot {
         let behind_us = self.last_sent_us.map_or(-1, |last| last as i64 - time_us as i64);
         let is_late = (0..CLOCK_STEP / 1000).contains(&behind_us);
         let period = Duration::from_secs_f64(1.0 / self.config.rate_hz);
-        let skipped = &self.feed.0.counts.mavlink_states_skipped;
+        let is_ahead = time_us > host::monotonic().0 as u64 / 1000 + AHEAD_US;
+        self.failed = state.has_failed().then(|| self.failed.unwrap_or(now));
+        // VISION_POSITION_ESTIMATE cannot say it at all.
+        let told = if self.config.message == StateMessage::Odometry { FAILED_TOLD } else { Duration::ZERO };
+        let has_failed = self.failed.is_some_and(|since| now - since >= told);
         // A frame that comes a little early is not one too many.
-        if is_late || now + period / 4 < self.state_due {
-            skipped.add(1);
+        if is_late || is_ahead || has_failed || now + period / 4 < self.state_due {
+            self.feed.0.counts.mavlink_states_skipped.add(1);
             return Ok(());
         }
         let sent = match self.config.message {

@@ -247,11 +247,15 @@ impl Open {
     }
 }
 
-/// Epochs that began in the runs of a folder.
+/// Resets that a run may have had after its last note, when its log had ended.
+const UNNOTED: u32 = 8;
+
+/// Epochs that began in the runs of a folder, with room for those of the last run that were not noted.
 pub fn epochs_begun(dir: &Path) -> u32 {
     let mut text = String::new();
     let read = File::open(dir.join(EPOCHS)).and_then(|file| file.take(16).read_to_string(&mut text));
-    read.ok().and_then(|_| text.trim().parse().ok()).unwrap_or(0)
+    let noted = read.ok().and_then(|_| text.trim().parse::<u32>().ok());
+    noted.map_or(0, |noted| noted.wrapping_add(UNNOTED))
 }
 
 /// Numbers and names of the logs in a folder, in order.
