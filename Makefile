@@ -23,7 +23,7 @@ HIL_PACKAGES := busybox-static cpio gpiod i2c-tools kmod linux-headers-amd64 qem
 
 OUT ?= out/demo
 
-.PHONY: demo test hil test-onnx soak fuzz bench-odometry lint deps
+.PHONY: demo test deb hil test-onnx soak fuzz bench-odometry lint deps
 
 demo: deps
 	cargo build --release --locked
@@ -37,6 +37,11 @@ test: deps target/python/pymavlink
 target/python/pymavlink: tests/autopilot/requirements.txt
 	python3 -m pip install --quiet --upgrade --target target/python --requirement $<
 	@touch $@
+
+# A Debian package, in target/debian. Needs dpkg-dev, and builds cargo-deb first where it is missing.
+deb: deps
+	command -v cargo-deb >/dev/null || cargo install --locked cargo-deb
+	cargo deb --locked --strip
 
 # The drivers on the real V4L2, USB, I2C, SPI, IIO and GPIO of Debian's kernel, emulated: minutes. TESTS="uvc" runs some.
 hil:

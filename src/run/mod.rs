@@ -187,7 +187,9 @@ pub fn fly(
     };
     let length_s = input.source.length_s().filter(|_| !repeats);
     out.set_aside()?;
-    let log = Log::start(out.path().into(), log::LIMITS, &title.to_string());
+    let told = options.service && board.mavlink.address().is_some();
+    let start = if told { Log::start_counting_epochs } else { Log::start };
+    let log = start(out.path().into(), log::LIMITS, &title.to_string());
     input.warnings.iter().for_each(|warning| log.sender().event(EventKind::Warning, warning));
     if let Tracker::Odometry(run) = &mut tracker {
         run.back.log = Some(log.sender());

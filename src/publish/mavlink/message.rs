@@ -12,6 +12,8 @@ pub struct Axes {
     vehicle_from_body: DQuat,
     /// Rotation of the world, whose z is up, in the local frame. Known from the first state on, and the same from there.
     local_from_world: Option<DQuat>,
+    /// Sine of how far the nose pointed up at the first state, until it is asked for.
+    nose_up: Option<f64>,
     epochs_before: u32,
 }
 
@@ -54,14 +56,16 @@ impl Axes {
     pub fn new(rpy_deg: [f64; 3], epochs_before: u32) -> Axes {
         let [roll, pitch, yaw] = rpy_deg.map(f64::to_radians);
         let vehicle_from_body = DQuat::from_euler(EulerRot::ZYX, yaw, pitch, roll);
-        Axes { vehicle_from_body, local_from_world: None, epochs_before }
+        Axes { vehicle_from_body, local_from_world: None, nose_up: None, epochs_before }
     }
 
     fn local_from_world(&mut self, state: &State) -> DQuat {
         let (world_from_body, body_from_vehicle) =
             (state.odometry.world_from_body.q, self.vehicle_from_body.conjugate());
+        let nose_up = &mut self.nose_up;
         let first = || {
             let forward = world_from_body * (body_from_vehicle * DVec3::X);
+            *nose_up = Some(forward.z);
             DQuat::from_rotation_x(std::f64::consts::PI) * DQuat::from_rotation_z(-forward.y.atan2(forward.x))
         };
         let turn = self.local_from_world.unwrap_or_else(first);
@@ -115,6 +119,11 @@ impl Axes {
         let mut of_velocity = velocity * c * velocity.transpose();
         (3..6).for_each(|i| of_velocity[(i, i)] += RATE_SIGMA * RATE_SIGMA);
         (pose * c * pose.transpose(), of_velocity)
+    }
+
+    /// How far the nose pointed up at the first state, degrees: once.
+    pub fn take_nose_up(&mut self) -> Option<f64> {
+        self.nose_up.take().map(|sine| sine.clamp(-1.0, 1.0).asin().to_degrees())
     }
 
     fn reset_counter(&self, state: &State) -> u8 {

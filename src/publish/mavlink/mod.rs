@@ -56,6 +56,8 @@ const CLOCK_STEP: i64 = 1_000_000_000;
 const TEXT_PERIOD: Duration = Duration::from_millis(100);
 /// A text that states kept waiting for so long goes first.
 const TEXT_PATIENCE: Duration = Duration::from_millis(300);
+/// A vehicle that starts so steep, degrees, is likelier one whose inertial unit is mounted otherwise.
+const STEEP: f64 = 45.0;
 /// Bytes of a text in one message.
 const CHUNK: usize = 50;
 /// Reads before states are looked at again: a flood does not hold them up.
@@ -164,8 +166,9 @@ pub struct Autopilot {
     condition: Condition,
     /// What it seems to be, and since when.
     seeming: (Condition, Instant),
-    /// When the autopilot was heard last.
+    /// When the autopilot was heard last, and whether it was told that there is one of another system.
     heard: Option<Instant>,
+    told_other: bool,
 }
 
 impl Autopilot {
@@ -209,6 +212,7 @@ impl Autopilot {
             condition: Condition::Starting,
             seeming: (Condition::Starting, now),
             heard: None,
+            told_other: false,
         };
         Ok(Some((autopilot, feed)))
     }
@@ -328,25 +332,30 @@ impl Autopilot {
     }
 
     fn hear_autopilot(&mut self, received: &Received, beat: &HEARTBEAT_DATA, from: Option<SocketAddr>) {
-        let (system, ours) = (u32::from(received.system), self.config.system);
-        // Where nobody is heard, another vehicle is worth a line; it is not answered.
-        if received.component != AUTOPILOT || system != ours && self.heard.is_some() {
+        if received.component != AUTOPILOT {
             return;
         }
-        if let (Some(link), Some(from), true) = (&mut self.link, from, system == ours) {
-            link.answer_to(from);
+        let (system, ours, link) = (u32::from(received.system), self.config.system, &self.config.link);
+        let kind = match beat.autopilot {
+            MavAutopilot::MAV_AUTOPILOT_PX4 => "PX4",
+            MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA => "ArduPilot",
+            _ => "of another make",
+        };
+        if system != ours {
+            // Another vehicle, or ours by another number. It is not answered.
+            if !std::mem::replace(&mut self.told_other, true) {
+                let fix = format!("if it is ours, set mavlink.system, which is {ours}");
+                self.say(format!("autopilot: another one on {link}: {kind}, system {system}; {fix}"));
+            }
+            return;
+        }
+        if let (Some(open), Some(from)) = (&mut self.link, from) {
+            open.answer_to(from);
         }
         if self.heard.replace(Instant::now()).is_none() {
-            let other =
-                if system == ours { String::new() } else { format!("; mavlink.system is {ours}: set it to {system}") };
+            self.say(format!("autopilot: heard on {link}: {kind}, system {system}"));
             // Who was not there did not hear it.
             self.condition = Condition::Starting;
-            let kind = match beat.autopilot {
-                MavAutopilot::MAV_AUTOPILOT_PX4 => "PX4",
-                MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA => "ArduPilot",
-                _ => "of another make",
-            };
-            self.say(format!("autopilot: heard on {}: {kind}, system {system}{other}", self.config.link));
         }
     }
 
@@ -452,6 +461,11 @@ impl Autopilot {
                 None => false,
             },
         };
+        if let Some(degrees) = self.axes.take_nose_up().filter(|degrees| !(degrees.abs() < STEEP)) {
+            self.say(format!(
+                "autopilot: at the first state the vehicle's nose points {degrees:.0} degrees up: compare mavlink.mount_rpy_deg"
+            ));
+        }
         if sent {
             self.state_due = (self.state_due + period).max(now);
             self.last_sent_us = Some(time_us);

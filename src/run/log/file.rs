@@ -80,9 +80,9 @@ pub struct LogFiles {
     run_ns: i64,
     /// Messages of the run so far: each has the next number.
     sequence: u32,
-    /// Epoch of the last state, and how many began in the runs of this folder before.
+    /// Epoch of the last state, and how many began in the runs of this folder before, where they are counted.
     epoch: u32,
-    before: u32,
+    before: Option<u32>,
     open: Option<Open>,
     json: Vec<u8>,
     pub written: Vec<PathBuf>,
@@ -99,7 +99,7 @@ struct Open {
 }
 
 impl LogFiles {
-    pub fn new(dir: PathBuf, limits: Limits, before: u32) -> LogFiles {
+    pub fn new(dir: PathBuf, limits: Limits, before: Option<u32>) -> LogFiles {
         let run_ns = Clocks::now(None).realtime_ns;
         let files =
             LogFiles { dir, limits, run_ns, sequence: 0, epoch: 0, before, open: None, json: vec![], written: vec![] };
@@ -109,9 +109,10 @@ impl LogFiles {
 
     /// Notes how many epochs have begun, for the next run. Where it cannot be written, that one counts as this one did.
     fn count_epochs(&self) {
+        let Some(before) = self.before else { return };
         let (note, written) = (self.dir.join(EPOCHS), self.dir.join(format!("{EPOCHS}.new")));
         let _ = std::fs::remove_file(&written);
-        let begun = self.before.wrapping_add(self.epoch).wrapping_add(1);
+        let begun = before.wrapping_add(self.epoch).wrapping_add(1);
         let mut options = OpenOptions::new();
         let file = options.write(true).create_new(true).open(&written);
         let _ = file.and_then(|mut file| writeln!(file, "{begun}")).and_then(|()| std::fs::rename(&written, note));

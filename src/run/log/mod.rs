@@ -336,7 +336,7 @@ impl LogSender {
 /// A log being written.
 pub struct Log {
     queue: Arc<Queue>,
-    /// Epochs that began in the runs of this folder before.
+    /// Epochs that began in the runs of this folder before, where they are counted; else 0.
     pub epochs_before: u32,
     /// `None` once it was waited for.
     thread: Option<JoinHandle<Vec<PathBuf>>>,
@@ -351,17 +351,27 @@ impl Drop for Log {
 impl Log {
     /// Begins the log of a run in `dir`. A log that cannot be written is a notice, and no reason not to fly.
     pub fn start(dir: PathBuf, limits: Limits, what: &str) -> Log {
+        Log::begin(dir, limits, what, None)
+    }
+
+    /// Begins one that counts epochs over the runs of `dir`, in a file `epochs` there, for who hears of several runs.
+    pub fn start_counting_epochs(dir: PathBuf, limits: Limits, what: &str) -> Log {
+        let before = file::epochs_begun(&dir);
+        Log::begin(dir, limits, what, Some(before))
+    }
+
+    fn begin(dir: PathBuf, limits: Limits, what: &str, before: Option<u32>) -> Log {
         let queue = Arc::new(Queue::measured(&mut Footprint::default()));
-        let (shared, epochs_before) = (queue.clone(), file::epochs_begun(&dir));
+        let shared = queue.clone();
         LogSender(queue.clone()).event(EventKind::Start, what);
         let thread = super::start(THREAD, move || {
             host::lower_priority(NICE);
-            let files = write(&shared, LogFiles::new(dir, limits, epochs_before));
+            let files = write(&shared, LogFiles::new(dir, limits, before));
             shared.closed.store(true, Ordering::Release);
             files
         });
         *lock_last() = Some(queue.clone());
-        Log { queue, epochs_before, thread: Some(thread) }
+        Log { queue, epochs_before: before.unwrap_or(0), thread: Some(thread) }
     }
 
     pub fn sender(&self) -> LogSender {

@@ -119,7 +119,7 @@ fn what_was_logged_is_read_back_across_files_and_runs() {
 #[test]
 fn the_last_file_says_why_no_other_follows() {
     let dir = tempfile::tempdir().unwrap();
-    let mut files = LogFiles::new(dir.path().into(), Limits { file: 1, free: 0 }, 0);
+    let mut files = LogFiles::new(dir.path().into(), Limits { file: 1, free: 0 }, None);
     files.begin().unwrap();
     files.limits.free = u64::MAX;
     let last = State { epoch: 2, ..state(7) };
@@ -142,7 +142,7 @@ fn the_last_file_says_why_no_other_follows() {
 #[test]
 fn what_was_written_since_the_last_sync_stays() {
     let dir = tempfile::tempdir().unwrap();
-    let mut files = LogFiles::new(dir.path().into(), LARGE, 0);
+    let mut files = LogFiles::new(dir.path().into(), LARGE, None);
     files.begin().unwrap();
     (0..500).for_each(|i| files.write(&Record { at: Nanos(0), content: Content::State(state(i)) }).unwrap());
     files.give_up();
