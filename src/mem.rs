@@ -12,6 +12,16 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 pub use stipple_drivers::List;
 
+/// The bytes of a text, in whole characters, as many as fit.
+pub fn cut<const N: usize>(text: &str) -> List<u8, N> {
+    let end = (0..=N.min(text.len())).rev().find(|i| text.is_char_boundary(*i)).unwrap_or(0);
+    let mut list = List::default();
+    for byte in &text.as_bytes()[..end] {
+        let _ = list.push(*byte);
+    }
+    list
+}
+
 /// A list of fixed size for a run without an end: holds every item while they fit, then every second, every fourth and so on.
 #[derive(Clone, Debug)]
 pub struct Thinned<T> {

@@ -9,7 +9,7 @@
 
 pub mod mavlink;
 
-use crate::mem::List;
+use crate::mem::{cut, List};
 use crate::vio::{Covariance, Odometry, Update};
 use crossbeam_queue::ArrayQueue;
 use glam::DVec3;
@@ -122,12 +122,8 @@ impl Feed {
 
     /// Hands over a text for people.
     pub fn text(&self, severity: Severity, text: &str) {
-        let end = (0..=TEXT.min(text.len())).rev().find(|i| text.is_char_boundary(*i)).unwrap_or(0);
-        let mut cut = List::default();
-        text.as_bytes()[..end].iter().for_each(|byte| {
-            let _ = cut.push(*byte);
-        });
-        self.0.counts.mavlink_texts_lost.add(u64::from(self.0.texts.force_push((severity, cut)).is_some()));
+        let replaced = self.0.texts.force_push((severity, cut(text)));
+        self.0.counts.mavlink_texts_lost.add(u64::from(replaced.is_some()));
         self.wake();
     }
 

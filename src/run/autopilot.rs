@@ -31,7 +31,7 @@ impl AutopilotThread {
         let Some((autopilot, feed)) = Autopilot::new(config, stamps, epochs_before)? else { return Ok(None) };
         if let Tracker::Odometry(run) = tracker {
             run.back.feed = Some(feed.clone());
-            run.publisher.iter_mut().for_each(|publisher| publisher.feed = Some(feed.clone()));
+            run.carrier.iter_mut().for_each(|carrier| carrier.feed = Some(feed.clone()));
         }
         status.tell_autopilot(feed.clone());
         let over = Arc::new(AtomicBool::new(false));

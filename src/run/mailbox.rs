@@ -7,8 +7,8 @@
 //! A frame is tracked when a sample at or past its stamp has come, or one hardly before it, or when none did within
 //! `SAMPLE_WAIT`.
 
+use super::carrier::Carrier;
 use super::gate::{FrameGate, ImuGate, JUMP_MAX};
-use super::publisher::Publisher;
 use super::status::{self, Gauges};
 use super::threads;
 use super::tracking::FramePacket;
@@ -314,7 +314,7 @@ pub fn camera(mailbox: &Mailbox, source: &mut dyn FrameSource, tracking: &Waker,
 pub fn inertial(
     mailbox: &Mailbox,
     source: &mut dyn ImuSource,
-    (mut gate, mut publisher): (ImuGate, Option<Publisher>),
+    (mut gate, mut carrier): (ImuGate, Option<Carrier>),
     tracking: &Waker,
     over: &AtomicBool,
     c: &Counters,
@@ -324,7 +324,7 @@ pub fn inertial(
     let mut queue = |sample: ImuSample| {
         c.imu_overflow.add(u64::from(mailbox.imu.force_push(sample).is_some()));
         mailbox.imu_until.store(sample.t.0, Relaxed);
-        publisher.iter_mut().for_each(|publisher| publisher.on_imu(sample));
+        carrier.iter_mut().for_each(|carrier| carrier.on_imu(sample));
     };
     let counted = [&c.imu_lost, &c.imu_silent, &c.imu_away_ms];
     let mut liveness = Liveness::new("inertial unit", counted, &mailbox.notices);
@@ -438,6 +438,20 @@ mod tests {
         assert!(mailbox.writable().is_none(), "it has to wait");
         drop(front_end);
         assert!(mailbox.writable().is_some());
+    }
+
+    /// Frames of EuRoC are 0.2 µs past a sample.
+    #[test]
+    fn frame_waits_for_a_sample_unless_one_is_hardly_older() {
+        for (older_us, is_taken) in [(0, true), (1, true), (500, true), (501, false)] {
+            let mailbox = Mailbox::new(4, &euroc_rig(), 0);
+            let mut packet = mailbox.writable().unwrap();
+            packet.writable().unwrap().t = Nanos(50_000_000);
+            let _ = mailbox.newest.push(packet);
+            mailbox.imu.force_push(ImuSample { t: Nanos(50_000_000 - older_us * 1000), ..ImuSample::default() });
+            let taken = mailbox.take(&mut None, &AtomicBool::new(false), &Counters::default());
+            assert_eq!(taken.is_some(), is_taken, "{older_us} us");
+        }
     }
 
     #[test]

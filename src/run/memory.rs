@@ -9,6 +9,7 @@ use crate::config::Board;
 use crate::limits::CAMERAS_MAX;
 use crate::map::{cameras, Mapper};
 use crate::mem::Footprint;
+use crate::publish::mavlink::{Autopilot, Stamps};
 use crate::stereo::Matcher;
 use stipple_drivers::record::Ring;
 use stipple_drivers::{Calibration, Camera, Fault, FaultKind, Frames, ImuCalibration, Lens, Pose, RigCamera};
@@ -26,6 +27,9 @@ pub fn footprint(calibration: &Calibration, board: &Board, records: bool) -> Res
     f.build("queues: frames and samples", || Mailbox::new(packets(board.frontend.threads), calibration, colours));
     OdometryRun::measured(calibration, board, FRAMES_KEPT, &mut f)?;
     log::Queue::measured(&mut f);
+    if board.mavlink.address().is_some() {
+        f.build("queues: autopilot", || Autopilot::new(&board.mavlink, Stamps::default(), 0))?;
+    }
     if board.map.enabled {
         // First, since it refuses a rig without the cameras that keyframes have images of.
         let mapper = Mapper::footprint(calibration, board)?;

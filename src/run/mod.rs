@@ -31,6 +31,7 @@
 //! mapping ends with the run's time.
 
 mod autopilot;
+pub mod carrier;
 pub mod gate;
 mod keyframes;
 mod lockstep;
@@ -38,7 +39,6 @@ pub mod log;
 pub mod mailbox;
 pub mod mapping;
 pub mod memory;
-pub mod publisher;
 pub mod recorder;
 pub mod sensors;
 mod service;
@@ -193,7 +193,7 @@ pub fn fly(
     input.warnings.iter().for_each(|warning| log.sender().event(EventKind::Warning, warning));
     if let Tracker::Odometry(run) = &mut tracker {
         run.back.log = Some(log.sender());
-        run.publisher.iter_mut().for_each(|publisher| publisher.log = Some(log.sender()));
+        run.carrier.iter_mut().for_each(|carrier| carrier.log = Some(log.sender()));
     }
     let total_s = options.duration_s.map(|s| s * speed).or(length_s);
     let mut status = Status::new(total_s).with_led(led).with_log(log.sender()).with_service(options.service);
@@ -407,9 +407,9 @@ pub fn fly_in_real_time(
             let _ended = waker::SetOnDrop(&s.source_done, Some(taker));
             mailbox::camera(&s.mailbox, &mut **frames, taker, &s.counters, &s.gauges);
         });
-        let (gate, publisher) = (ImuGate::new(&calibration.imu), tracker.take_publisher());
+        let (gate, carrier) = (ImuGate::new(&calibration.imu), tracker.take_carrier());
         spawn(scope, "imu", move || {
-            mailbox::inertial(&s.mailbox, &mut **imu, (gate, publisher), taker, &s.source_done, &s.counters)
+            mailbox::inertial(&s.mailbox, &mut **imu, (gate, carrier), taker, &s.source_done, &s.counters)
         });
         if let Some(aids) = aids {
             spawn(scope, "barometer", move || mailbox::aids(&s.mailbox, &mut **aids, &s.source_done, &s.counters));

@@ -12,9 +12,9 @@
 //!
 //! With `--poses` the poses come from a table, odometry is skipped, and every frame is a keyframe.
 
+use super::carrier::{Carrier, Newest};
 use super::gate::{Clock, Stream, RELEARN};
 use super::log::{LogSender, Rig, State};
-use super::publisher::{Newest, Publisher};
 use super::waker::{SetOnDrop, Waker};
 use crate::config::Board;
 use crate::counters::Counters;
@@ -132,7 +132,7 @@ pub struct OdometryRun {
     pub front: Front,
     pub back: Back,
     /// Until the thread that publishes takes it; none where the board asks for none.
-    pub publisher: Option<Publisher>,
+    pub carrier: Option<Carrier>,
     /// 1 or 2.
     pub threads: u32,
     /// Size of front end and estimator together.
@@ -212,7 +212,7 @@ pub struct Back {
     pub cpu_s: Option<f64>,
     pub log: Option<LogSender>,
     pub feed: Option<Feed>,
-    /// Where the publisher takes states.
+    /// Where the carrier takes states.
     newest: Option<Newest>,
     /// First frame and number of each epoch. Where there are more, the log has them.
     pub epochs: List<(Nanos, u32), EPOCHS>,
@@ -308,8 +308,8 @@ impl OdometryRun {
         let estimator = || (vio(), Predictor::new(calibration, &board.vio));
         let (vio, predictor) = f.build("tracking: estimator", estimator);
         let bytes = f.total();
-        let publisher = || Publisher::new(calibration, board);
-        let publisher = Publisher::is_wanted(board).then(|| f.build("tracking: states between frames", publisher));
+        let carrier = || Carrier::new(calibration, board);
+        let carrier = Carrier::is_wanted(board).then(|| f.build("tracking: states between frames", carrier));
         let trajectory = f.build("tracking: poses of frames", || Thinned::with_capacity(frames));
         let health = f.build("tracking: health of frames", || Thinned::with_capacity(frames));
         let [front_ms, ms] = f.build("tracking: times of frames", || [(); 2].map(|()| Thinned::with_capacity(frames)));
@@ -328,10 +328,10 @@ impl OdometryRun {
                 cpu_s: None,
                 log: None,
                 feed: None,
-                newest: publisher.as_ref().map(|publisher| publisher.newest.clone()),
+                newest: carrier.as_ref().map(|carrier| carrier.newest.clone()),
                 epochs: List::default(),
             },
-            publisher,
+            carrier,
             threads: board.frontend.threads,
             bytes,
         })
@@ -360,9 +360,9 @@ impl Tracker {
     }
 
     /// The part that carries states between frames, for the thread that has the samples.
-    pub fn take_publisher(&mut self) -> Option<Publisher> {
+    pub fn take_carrier(&mut self) -> Option<Carrier> {
         match self {
-            Tracker::Odometry(run) => run.publisher.take(),
+            Tracker::Odometry(run) => run.carrier.take(),
             Tracker::Table(_) | Tracker::Observer(_) => None,
         }
     }

@@ -244,7 +244,8 @@ impl Autopilot {
         self.retry = Instant::now() + SECOND;
         match Link::open(&self.address, self.poll.registry(), LINK) {
             Ok(link) => {
-                self.pending = None;
+                // What is left of before the loss is of no use.
+                (self.pending, self.parser) = (None, Parser::new());
                 if std::mem::take(&mut self.is_lost) {
                     self.feed.0.counts.mavlink_reopened.add(1);
                     self.say(format!("autopilot: link {} is open", self.config.link));

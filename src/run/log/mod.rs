@@ -17,7 +17,7 @@ mod tests;
 
 use super::threads;
 use crate::limits::CAMERAS_MAX;
-use crate::mem::{Footprint, List};
+use crate::mem::{cut, Footprint, List};
 use crate::vio::{Odometry, Predicted, RigEstimate, Update};
 use crossbeam_queue::ArrayQueue;
 use file::LogFiles;
@@ -313,12 +313,7 @@ impl LogSender {
     }
 
     pub fn event(&self, kind: EventKind, text: &str) {
-        let mut cut = List::default();
-        let end = (0..=TEXT.min(text.len())).rev().find(|i| text.is_char_boundary(*i)).unwrap_or(0);
-        for byte in &text.as_bytes()[..end] {
-            let _ = cut.push(*byte);
-        }
-        self.0.push(Content::Event(kind, cut));
+        self.0.push(Content::Event(kind, cut(text)));
     }
 
     /// Counters as they stand; from a thread that may allocate.

@@ -36,7 +36,7 @@ impl Newest {
 }
 
 /// Carries states on a thread that has the inertial samples.
-pub struct Publisher {
+pub struct Carrier {
     pub newest: Newest,
     pub log: Option<LogSender>,
     pub feed: Option<Feed>,
@@ -69,16 +69,16 @@ impl Schedule {
 /// States that an autopilot is offered in the place of frames that do not come, Hz.
 const FILL_HZ: f64 = 30.0;
 
-impl Publisher {
+impl Carrier {
     /// Whether a board asks for states between frames.
     pub fn is_wanted(board: &Board) -> bool {
         board.log.predicted_hz > 0.0 || board.mavlink.address().is_some()
     }
 
-    /// A publisher for the log at the board's rate, and for its autopilot.
-    pub fn new(calibration: &Calibration, board: &Board) -> Publisher {
+    /// A carrier for the log at the board's rate, and for its autopilot.
+    pub fn new(calibration: &Calibration, board: &Board) -> Carrier {
         let feed_hz = if board.mavlink.address().is_some() { FILL_HZ } else { 0.0 };
-        Publisher {
+        Carrier {
             newest: Newest(Arc::default()),
             log: None,
             feed: None,
