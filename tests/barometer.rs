@@ -10,7 +10,7 @@ use stipple::output::metrics::trajectory_error;
 use stipple::run::sensors::{Playback, Recorded};
 use stipple::run::status::Status;
 use stipple::run::tracking::{OdometryRun, Tracker};
-use stipple::run::{fly_in_real_time, Flown, Realtime};
+use stipple::run::{fly_in_real_time, Flown, Realtime, Steering};
 use stipple_drivers::paced::Images;
 use stipple_drivers::sim::{Scenario, Sim};
 use stipple_drivers::source::{AidBatch, AidReading, AidSource, SourceFault, Wait};
@@ -81,7 +81,18 @@ fn fly(secs: f64, troubles: Vec<(Range<f64>, Trouble)>) -> (Flown, Vec<TimedPose
     let run = OdometryRun::new(sim.calibration(), &board, count).unwrap();
     let options = Realtime { holdout: 0, until_s: None, sensors_s: None, stop: &AtomicBool::new(false) };
     let tracker = Tracker::Odometry(Box::new(run));
-    (fly_in_real_time(sensors, sim.calibration(), tracker, None, &options, &mut Status::silent()), sim.truth())
+    (
+        fly_in_real_time(
+            sensors,
+            sim.calibration(),
+            tracker,
+            None,
+            &options,
+            &mut Status::silent(),
+            &mut Steering::default(),
+        ),
+        sim.truth(),
+    )
 }
 
 /// The run came to its end, the flight is good, and the barometer said this of itself.

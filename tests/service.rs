@@ -153,7 +153,7 @@ fn run_goes_on_when_nobody_reads_what_it_tells() {
 }
 
 /// Directives of the unit, and the version of systemd that first knew each (its NEWS).
-const KNOWN_SINCE: [(&str, u32); 48] = [
+const KNOWN_SINCE: [(&str, u32); 51] = [
     ("AmbientCapabilities", 229),
     ("CacheDirectory", 235),
     ("CapabilityBoundingSet", 20),
@@ -163,6 +163,7 @@ const KNOWN_SINCE: [(&str, u32); 48] = [
     ("DevicePolicy", 208),
     ("DynamicUser", 232),
     ("Environment", 1),
+    ("ExecReload", 1),
     ("ExecStart", 1),
     ("IPAddressAllow", 235),
     ("IPAddressDeny", 235),
@@ -189,6 +190,8 @@ const KNOWN_SINCE: [(&str, u32); 48] = [
     ("RestrictAddressFamilies", 211),
     ("RestrictNamespaces", 233),
     ("RestrictSUIDSGID", 242),
+    ("RuntimeDirectory", 211),
+    ("RuntimeDirectoryMode", 211),
     ("StartLimitIntervalSec", 230),
     ("StateDirectory", 235),
     ("StateDirectoryMode", 235),

@@ -85,6 +85,43 @@ pub fn end_when_unread() {
     }
 }
 
+/// Descriptor of standard output.
+pub const STDOUT: i32 = 1;
+/// Descriptor of standard error.
+pub const STDERR: i32 = 2;
+
+/// Device and inode of an open file; `None` where it is closed.
+pub fn device_and_inode(fd: i32) -> Option<(u64, u64)> {
+    // SAFETY: the struct is plain integers, and a descriptor that is not open makes the call fail.
+    unsafe {
+        let mut stat: libc::stat = std::mem::zeroed();
+        (libc::fstat(fd, &mut stat) == 0).then_some((stat.st_dev, stat.st_ino))
+    }
+}
+
+/// Whether the process at the other end of a Unix socket is root's, this user's, or one of a member of this process's group.
+pub fn peer_is_trusted(socket: i32) -> std::io::Result<bool> {
+    let mut peer = libc::ucred { pid: 0, uid: u32::MAX, gid: u32::MAX };
+    let mut groups = [u32::MAX; 256];
+    let option = |name, to: *mut libc::c_void, bytes: usize| {
+        let mut bytes = bytes as libc::socklen_t;
+        // SAFETY: `to` is `bytes` long, and any bytes are valid there; a descriptor that is no socket makes the call fail.
+        let failed = unsafe { libc::getsockopt(socket, libc::SOL_SOCKET, name, to, &mut bytes) } != 0;
+        if failed {
+            Err(std::io::Error::last_os_error())
+        } else {
+            Ok(bytes as usize)
+        }
+    };
+    option(libc::SO_PEERCRED, (&raw mut peer).cast(), size_of_val(&peer))?;
+    // One in more groups than this counts as a member of none.
+    let count =
+        option(libc::SO_PEERGROUPS, groups.as_mut_ptr().cast(), size_of_val(&groups)).unwrap_or(0) / size_of::<u32>();
+    // SAFETY: neither call can fail.
+    let (uid, gid) = unsafe { (libc::geteuid(), libc::getegid()) };
+    Ok(peer.uid == 0 || peer.uid == uid || peer.gid == gid || groups[..count].contains(&gid))
+}
+
 static STOP: AtomicBool = AtomicBool::new(false);
 
 /// Signals that ask a run to stop: from a keyboard, from a service manager, from a terminal that is gone.
@@ -101,7 +138,8 @@ extern "C" fn ask_to_stop(signal: libc::c_int) {
     }
 }
 
-/// Sets what SIGINT, SIGTERM and SIGHUP do. One that is ignored already stays so where `nohup` asks for it: SIGHUP.
+/// Sets what SIGINT, SIGTERM and SIGHUP do. SIGHUP stays as it is where `nohup`
+/// made it ignored, or where it reloads.
 fn on_stop_signals(handler: libc::sighandler_t) {
     // SAFETY: the handler is a function that does only what a signal may do, or a constant that ignores the signal. The
     // struct is plain integers, for which zero is valid.
@@ -112,18 +150,37 @@ fn on_stop_signals(handler: libc::sighandler_t) {
         for signal in STOP_SIGNALS {
             let mut before: libc::sigaction = std::mem::zeroed();
             libc::sigaction(signal, std::ptr::null(), &mut before);
-            if signal != libc::SIGHUP || before.sa_sigaction != libc::SIG_IGN {
+            let reloads = ask_to_reload as extern "C" fn(libc::c_int) as usize;
+            if signal != libc::SIGHUP || ![libc::SIG_IGN, reloads].contains(&before.sa_sigaction) {
                 libc::sigaction(signal, &action, std::ptr::null_mut());
             }
         }
     }
 }
 
-/// The flag that SIGINT, SIGTERM and SIGHUP set, from the first call on, instead of ending the program. A second signal, of
+/// The flag that SIGINT, SIGTERM and SIGHUP (but see `reload_asked_for`) set, from the first call on, instead of ending the program. A second signal, of
 /// any of them, ends it at once.
 pub fn stop_asked_for() -> &'static AtomicBool {
     on_stop_signals(ask_to_stop as extern "C" fn(libc::c_int) as usize);
     &STOP
+}
+
+static RELOAD: AtomicBool = AtomicBool::new(false);
+
+extern "C" fn ask_to_reload(_: libc::c_int) {
+    RELOAD.store(true, Ordering::Relaxed);
+}
+
+/// The flag that SIGHUP sets from here on, in the place of the one of `stop_asked_for`.
+pub fn reload_asked_for() -> &'static AtomicBool {
+    // SAFETY: the handler does only what a signal may do; the struct is plain integers, for which zero is valid.
+    unsafe {
+        let mut action: libc::sigaction = std::mem::zeroed();
+        action.sa_sigaction = ask_to_reload as extern "C" fn(libc::c_int) as usize;
+        action.sa_flags = libc::SA_RESTART;
+        libc::sigaction(libc::SIGHUP, &action, std::ptr::null_mut());
+    }
+    &RELOAD
 }
 
 /// Makes this process end with the one that started it, `parent`, whatever ends that, and leaves signals that ask to stop to

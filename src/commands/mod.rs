@@ -1,5 +1,6 @@
 //! The commands of `stipple`, one file each: their arguments, and what they print.
 
+mod bugreport;
 mod calib_check;
 mod calib_noise;
 mod check;
@@ -11,6 +12,8 @@ mod recover;
 mod replay;
 mod run;
 mod sim;
+mod status;
+mod top;
 
 use crate::config::Board;
 use crate::output::OutputDir;
@@ -39,6 +42,12 @@ enum Command {
     Replay(replay::Args),
     /// Record the board's sensors until stopped (SIGINT, SIGTERM)
     Record(record::Args),
+    /// Print how a run goes: from its status socket, on one screen, as JSON or as metrics
+    Status(status::Args),
+    /// Show how a run goes, live
+    Top(top::Args),
+    /// Pack what helps to find a fault into one file: the last minutes of the log, board, versions, kernel messages
+    Bugreport(bugreport::Args),
     /// Write the trajectory of a run that was killed or cut off, from its log
     Recover(recover::Args),
     /// Fly through a simulated room and map it; needs no data
@@ -75,7 +84,10 @@ pub fn main() -> ExitCode {
         }
     };
     // What these print is all that they do: a reader that stops, as `head` does, has read enough.
-    if matches!(cli.command, Command::Check(_) | Command::CalibCheck(_) | Command::CalibNoise(_) | Command::Doctor(_)) {
+    if matches!(
+        cli.command,
+        Command::Check(_) | Command::Status(_) | Command::CalibCheck(_) | Command::CalibNoise(_) | Command::Doctor(_)
+    ) {
         stipple_drivers::host::end_when_unread();
     }
     crate::run::threads::abort_on_panic(last_words);
@@ -84,6 +96,9 @@ pub fn main() -> ExitCode {
         Command::Replay(args) => replay::replay(&args),
         Command::Record(args) => record::record(&args),
         Command::Recover(args) => recover::recover(&args),
+        Command::Status(args) => status::status(&args),
+        Command::Top(args) => top::top(&args),
+        Command::Bugreport(args) => bugreport::bugreport(&args),
         Command::Demo(args) => demo::demo(&args),
         Command::Sim(args) => sim::sim(&args),
         Command::Check(args) => check::check(&args),

@@ -2,8 +2,8 @@
 
 use crate::output::trajectory::TumWriter;
 use crate::output::OutputDir;
+use crate::publish::event::EventId;
 use crate::run::log::read::{runs, write_trajectory, LoggedRun, Message};
-use crate::run::log::EventKind;
 use crate::run::status::print_out;
 use std::io;
 use std::path::{Path, PathBuf};
@@ -55,7 +55,7 @@ fn recover_run(run: &LoggedRun, out: &OutputDir, name: &str) -> Result<u64, Faul
                 frames += 1;
                 poses += u64::from(state.estimate.is_some() && !state.dead_reckoned);
             }
-            Message::Event(e) if e.kind == EventKind::End => end = Some(e.text.to_string()),
+            Message::Event(e) if e.id == EventId::End => end = Some(e.text.to_string()),
             Message::Event(e) => events.push(format!("{:9.2} s  {}", (at - begun).secs().max(0.0), e.text)),
             Message::Predicted(_) | Message::Rig(_) | Message::Counters(_) | Message::Clocks(_) => {}
         }

@@ -5,7 +5,7 @@ use crate::config::InjectConfig;
 use crate::output::OutputDir;
 use crate::run::sensors::Playback;
 use crate::run::status_led::StatusLed;
-use crate::run::{fly, threads, Options};
+use crate::run::{fly, threads, BoardSource, Options};
 use std::path::PathBuf;
 use stipple_drivers::{host, Fault};
 
@@ -55,7 +55,8 @@ pub fn run(args: &Args) -> Result<(), Fault> {
     let (duration_s, record) = (args.duration, args.record.clone());
     let playback = Playback { speed: args.speed, repeats: args.repeat };
     threads::end_where_one_hangs(host::stop_asked_for(), super::last_words);
-    let options = Options { duration_s, record, inject, service: true, playback, ..Options::default() };
+    let source = args.board.board.clone().map(|file| BoardSource { file, set: args.board.set.clone() });
+    let options = Options { source, duration_s, record, inject, service: true, playback, ..Options::default() };
     finish(fly(input, &board, &out, &options, led)?, &out)
 }
 

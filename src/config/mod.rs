@@ -4,12 +4,14 @@
 //! the defaults of the method. `--set section.key=value` edits the parsed table before it is checked, so an override obeys the
 //! same rules as the file. board-configs/README.md lists every key; tests/config.rs writes it.
 
+mod governor;
 mod inject;
 mod mavlink;
 mod method;
 mod section;
 mod sensors;
 
+pub use governor::GovernorConfig;
 pub use inject::{InjectConfig, ThreadRule};
 pub use mavlink::{Address, MavlinkConfig, StateMessage};
 pub use method::{
@@ -44,6 +46,8 @@ pub struct Board {
     pub record: RecordConfig,
     #[serde(default)]
     pub log: LogConfig,
+    #[serde(default)]
+    pub governor: GovernorConfig,
     #[serde(default)]
     pub mavlink: MavlinkConfig,
     #[serde(default)]
@@ -95,6 +99,7 @@ pub fn keys() -> impl Iterator<Item = &'static Key> {
         GpioConfig::KEYS,
         RecordConfig::KEYS,
         LogConfig::KEYS,
+        GovernorConfig::KEYS,
         MavlinkConfig::KEYS,
         FrontendConfig::KEYS,
         VioConfig::KEYS,

@@ -273,6 +273,16 @@ impl Mapper {
         self.scene.median_exposure()
     }
 
+    /// The newest epoch and its Gaussians. Allocates.
+    pub fn newest_splats(&mut self) -> Result<(u32, Vec<Gaussian>), GpuError> {
+        let pool = &self.scene.pipeline.pool;
+        let (epoch, slots) = pool.newest_epoch();
+        let mut splats = pool.download(&mut self.scene.gpu)?;
+        splats.truncate(slots.end as usize);
+        splats.drain(..(slots.start as usize).min(splats.len()));
+        Ok((epoch, splats))
+    }
+
     /// The Gaussians alive. Allocates.
     pub fn splats(&mut self) -> Result<Vec<Gaussian>, GpuError> {
         self.scene.pipeline.pool.download(&mut self.scene.gpu)

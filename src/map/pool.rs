@@ -223,6 +223,12 @@ impl Pool {
         (if before == 0 { 0 } else { begin(before) })..begin(upto)
     }
 
+    /// The newest epoch, and the slots of its Gaussians.
+    pub fn newest_epoch(&self) -> (u32, Range<u32>) {
+        let epoch = self.host.blocks.last().map_or(0, |b| b.epoch);
+        (epoch, self.slots(epoch))
+    }
+
     /// The slots of an anchor's Gaussians; empty where it has none.
     pub fn block(&self, anchor: u32) -> Range<u32> {
         let blocks = &self.host.blocks;

@@ -8,7 +8,7 @@
 use super::gate::{Clock, Stream};
 use super::log::LogSender;
 use crate::config::Board;
-use crate::publish::{self, Feed, Source};
+use crate::publish::{self, Feeds, Source};
 use crate::vio::{Health, Predictor, Update};
 use glam::DVec3;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -39,7 +39,7 @@ impl Newest {
 pub struct Carrier {
     pub newest: Newest,
     pub log: Option<LogSender>,
-    pub feed: Option<Feed>,
+    pub feeds: Feeds,
     predictor: Predictor,
     clock: Clock,
     /// Schedules of the log and of the autopilot.
@@ -81,7 +81,7 @@ impl Carrier {
         Carrier {
             newest: Newest(Arc::default()),
             log: None,
-            feed: None,
+            feeds: Feeds::default(),
             predictor: Predictor::new(calibration, &board.vio),
             clock: Clock::default(),
             schedules: [board.log.predicted_hz, feed_hz].map(Schedule::new),
@@ -109,13 +109,14 @@ impl Carrier {
         if let Some(log) = self.log.as_ref().filter(|_| logs) {
             log.predicted((&state).into());
         }
-        if let Some(feed) = self.feed.as_ref().filter(|_| feeds) {
-            feed.state(publish::State {
+        if feeds {
+            self.feeds.state(publish::State {
                 odometry: state.odometry,
                 rate: sample.gyro_body - state.odometry.gyro_bias,
                 covariance: state.covariance,
                 epoch: state.epoch,
                 quality: state.quality,
+                health: state.health,
                 source: Source::Carried,
             });
         }

@@ -10,10 +10,12 @@ use crate::config::Board;
 use crate::counters::Counters;
 use crate::limits::CAMERAS_MAX;
 use crate::map::{cameras, Keyframe, PoseCorrection};
+use crate::publish::cloud::Cloud;
 use glam::{DQuat, DVec3};
 use std::collections::VecDeque;
 use std::ops::Range;
 use std::sync::atomic::{AtomicU64, Ordering::Acquire, Ordering::Relaxed, Ordering::Release};
+use std::sync::Arc;
 use stipple_drivers::shared::{read_bytes, words_of, write_bytes, SharedWords};
 use stipple_drivers::{Calibration, Fault, FaultKind, Frames, Image, Nanos, Pose};
 
@@ -43,6 +45,8 @@ pub enum Word {
     /// Corrections written, and read, so far.
     Written,
     Read,
+    /// Share of its time that the mapper may work, 1/1000; 0: the whole.
+    Share,
 }
 
 const WORDS: usize = 16;
@@ -62,14 +66,26 @@ const OFFERED: u64 = 2;
 const TAKEN: u64 = 3;
 const DONE: u64 = 4;
 
+fn no_memory(e: std::io::Error) -> Fault {
+    Fault::new(FaultKind::Unavailable, "the ring of keyframes", format!("no shared memory: {e}"), "free memory")
+}
+
 pub struct KeyframeRing {
     words: SharedWords,
     /// Images and colours of a slot that holds nothing, to be cloned.
     shape: Keyframe,
     slot_words: usize,
+    /// Where the mapper puts points for readers, where there may be any.
+    pub cloud: Option<Arc<Cloud>>,
 }
 
 impl KeyframeRing {
+    /// With room for a cloud of points.
+    pub fn with_cloud(mut self, cloud: std::io::Result<Cloud>) -> Result<KeyframeRing, Fault> {
+        self.cloud = Some(Arc::new(cloud.map_err(no_memory)?));
+        Ok(self)
+    }
+
     /// Takes new memory, for the images that the board's map wants of this rig.
     pub fn new(calibration: &Calibration, board: &Board) -> Result<KeyframeRing, Fault> {
         let shape = shape(calibration, board);
@@ -84,10 +100,7 @@ impl KeyframeRing {
 
     fn on(shared: std::io::Result<SharedWords>, shape: Keyframe) -> Result<KeyframeRing, Fault> {
         let slot_words = HEAD + image_words(&shape);
-        let refused = |e: std::io::Error| {
-            Fault::new(FaultKind::Unavailable, "the ring of keyframes", format!("no shared memory: {e}"), "free memory")
-        };
-        shared.map(|words| KeyframeRing { words, shape, slot_words }).map_err(refused)
+        shared.map(|words| KeyframeRing { words, shape, slot_words, cloud: None }).map_err(no_memory)
     }
 
     /// Bytes that `new` takes, and the keyframe that the mapper reads from it.

@@ -8,7 +8,6 @@
 
 use super::gate::{FrameGate, ImuGate};
 use super::keyframes::Keyframes;
-use super::log::EventKind;
 use super::mapping::{Mapping, SLICE};
 use super::sensors::Recorded;
 use super::status::{Gauges, Status};
@@ -17,6 +16,7 @@ use super::waker::{SetOnDrop, Waker};
 use super::worker::MapSide;
 use super::{spawn_tracking, Flown, Options, Steps};
 use crate::counters::Counters;
+use crate::publish::event::EventId;
 use crossbeam_queue::ArrayQueue;
 use std::cell::Cell;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
@@ -152,12 +152,12 @@ pub fn fly(
                 keyframes.pass_on(&packet, ring.as_deref(), &counters);
                 gauges.set_epoch(packet.epoch, packet.health);
                 if let Some(line) = status.epoch_begun(&gauges) {
-                    status.say(EventKind::Epoch, &line);
+                    status.say(EventId::Epoch, &line);
                 }
                 gauges.set_found(&packet);
-                for line in status.rig_judged(&gauges) {
-                    status.say(EventKind::Warning, &line);
-                    notices.push((EventKind::Warning, line));
+                for (id, line) in status.rig_judged(&gauges) {
+                    status.say(id, &line);
+                    notices.push((id, line));
                 }
                 let frames = gauges.frames.fetch_add(1, Relaxed) + 1;
                 gauges.keyframes.store(keyframes.count, Relaxed);

@@ -15,6 +15,7 @@ use super::tracking::FramePacket;
 use super::waker::Waker;
 use crate::counters::{Counter, Counters};
 use crate::limits::IMU_BETWEEN_FRAMES;
+use crate::publish::event::{EventId, Notice};
 use crossbeam_queue::ArrayQueue;
 use std::sync::atomic::{AtomicBool, AtomicI64, AtomicU64, Ordering::Relaxed};
 use std::sync::OnceLock;
@@ -60,7 +61,7 @@ pub struct Mailbox {
     /// Asks the threads to end.
     pub stop: AtomicBool,
     /// Lines to be printed.
-    pub notices: ArrayQueue<String>,
+    pub notices: ArrayQueue<Notice>,
     /// What ended the run.
     pub broken: ArrayQueue<Fault>,
 }
@@ -204,7 +205,7 @@ struct Liveness<'a> {
     lost: &'a Counter,
     silent: &'a Counter,
     away_ms: &'a Counter,
-    notices: &'a ArrayQueue<String>,
+    notices: &'a ArrayQueue<Notice>,
     said: Option<Instant>,
     /// The last loss was said, so its end is, too.
     told: bool,
@@ -212,18 +213,18 @@ struct Liveness<'a> {
 
 impl<'a> Liveness<'a> {
     /// A sensor that answers, and where its losses, silences and time away are counted.
-    fn new(name: &'static str, counted: [&'a Counter; 3], notices: &'a ArrayQueue<String>) -> Liveness<'a> {
+    fn new(name: &'static str, counted: [&'a Counter; 3], notices: &'a ArrayQueue<Notice>) -> Liveness<'a> {
         let [lost, silent, away_ms] = counted;
         Liveness { name, heard: Instant::now(), away: false, lost, silent, away_ms, notices, said: None, told: false }
     }
 
-    fn lose(&mut self, counter: &Counter, what: impl FnOnce() -> String) {
+    fn lose(&mut self, counter: &Counter, id: EventId, what: impl FnOnce() -> String) {
         self.away = true;
         counter.add(1);
         self.told = self.said.is_none_or(|t| t.elapsed() >= REPORT_PERIOD);
         if self.told {
             self.said = Some(Instant::now());
-            status::count_lost(self.notices.push(format!("{} {}", self.name, what())));
+            status::count_lost(self.notices.push((id, format!("{} {}", self.name, what()))));
         }
     }
 
@@ -237,13 +238,17 @@ impl<'a> Liveness<'a> {
                     self.away_ms.add(gone.as_millis() as u64);
                     if self.told {
                         let line = format!("{} is back after {:.1} s", self.name, gone.as_secs_f64());
-                        status::count_lost(self.notices.push(line));
+                        status::count_lost(self.notices.push((EventId::SensorBack, line)));
                     }
                 }
             }
-            Err(SourceFault::Lost(fault)) if !self.away => self.lose(self.lost, || format!("lost: {fault}")),
+            Err(SourceFault::Lost(fault)) if !self.away => {
+                self.lose(self.lost, EventId::SensorLost, || format!("lost: {fault}"))
+            }
             Ok(Wait::TimedOut) if !self.away && self.heard.elapsed() >= SILENT_AFTER => {
-                self.lose(self.silent, || format!("is silent for {:.1} s", SILENT_AFTER.as_secs_f64()));
+                self.lose(self.silent, EventId::SensorSilent, || {
+                    format!("is silent for {:.1} s", SILENT_AFTER.as_secs_f64())
+                });
             }
             _ => {}
         }
@@ -368,7 +373,7 @@ pub fn aids(mailbox: &Mailbox, source: &mut dyn AidSource, over: &AtomicBool, c:
             Ok(Wait::TimedOut) | Err(SourceFault::Lost(_)) => continue,
             Ok(Wait::Ended) => break,
             Err(broken) => {
-                liveness.lose(&c.aid_lost, || format!("is {broken}"));
+                liveness.lose(&c.aid_lost, EventId::SensorLost, || format!("is {broken}"));
                 break;
             }
         }

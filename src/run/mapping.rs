@@ -1,17 +1,18 @@
 //! The mapping side of a flight, in a thread of it or in a process of its own: keyframes in, a map and its error against
 //! run time out.
 
-use super::keyframes::KeyframeRing;
+use super::keyframes::{KeyframeRing, Word};
 use super::status::{print_err, Gauges};
 use super::threads;
 use crate::config::Board;
 use crate::gpu::GpuError;
-use crate::map::{CurvePoint, Evaluation, Keyframe, Mapper, StepKind};
+use crate::map::{CurvePoint, Evaluation, Gaussian, Keyframe, Mapper, StepKind};
 use crate::mem::{self, seal_thread, unsealed};
 use crate::output::metrics::percentile;
 use crate::output::panel::{caption, panel, Picture};
 use crate::output::report::KernelTime;
 use crate::output::{ply, OutputDir};
+use crate::publish::cloud::{Point, POINTS};
 use serde::{Deserialize, Serialize};
 use std::sync::atomic::Ordering::Relaxed;
 use std::sync::Arc;
@@ -24,6 +25,8 @@ pub const NICE: i32 = 10;
 pub const SLICE: Duration = Duration::from_millis(50);
 /// Pause of a mapper with nothing to do.
 const IDLE: Duration = Duration::from_micros(500);
+/// Longest rest that the governor asks for at once.
+const REST_MAX: Duration = Duration::from_secs(2);
 /// Iterations whose time is kept for the median.
 const ITERATION_TIMES: usize = 1 << 16;
 /// Samples of error against run time.
@@ -149,11 +152,56 @@ impl Mapping {
         }
     }
 
+    /// How long to rest after work, by the share of its time that the governor leaves the mapper.
+    fn rest(&self, worked: Duration) -> Duration {
+        match self.ring.word(Word::Share).load(Relaxed) {
+            share @ 1..1000 => worked.mul_f64(1000.0 / share as f64 - 1.0).min(REST_MAX),
+            _ => Duration::ZERO,
+        }
+    }
+
+    /// Puts the most important Gaussians where readers of the status socket find them, if one asks.
+    fn show_points(&mut self) {
+        let ring = self.ring.clone();
+        let Some(cloud) = ring.cloud.as_ref().filter(|cloud| self.failure.is_none() && cloud.take_wish()) else {
+            return;
+        };
+        let shown = unsealed(|| {
+            let (epoch, mut splats) = self.mapper.newest_splats()?;
+            let (exposure, of) = (self.mapper.median_exposure(), splats.len());
+            if of > POINTS {
+                splats.select_nth_unstable_by(POINTS, |a, b| importance(b).total_cmp(&importance(a)));
+            }
+            let byte = |v: f64| (v * 255.0).round().clamp(0.0, 255.0) as u8;
+            let point = |s: &Gaussian| Point {
+                p: s.mean,
+                rgb: s.colour.map(|c| byte(exposure.observed(f64::from(c)))),
+                opacity: byte(f64::from(opacity(s))),
+            };
+            cloud.write(self.keyframe.t, epoch, of, splats.iter().take(POINTS).map(point));
+            Ok(())
+        });
+        if let Err(e) = shown {
+            self.fail(e);
+        }
+    }
+
     /// Ends mapping: a device that fails once is lost or hangs.
     fn fail(&mut self, e: GpuError) {
         self.mapper.counters().gpu_failures.add(1);
         self.failure = Some(unsealed(|| e.to_string()));
     }
+}
+
+/// From 0 to 1.
+fn opacity(s: &Gaussian) -> f32 {
+    1.0 / (1.0 + (-s.opacity_logit).exp())
+}
+
+/// How much of the scene a Gaussian covers: opacity times the product of its two largest deviations, m².
+fn importance(s: &Gaussian) -> f32 {
+    let [a, b, c] = s.log_scale;
+    opacity(s) * (a + b + c - a.min(b).min(c)).exp()
 }
 
 /// Keyframes drawn into DIR/renders.
@@ -259,10 +307,18 @@ pub fn map(
 ) -> Mapping {
     host::lower_priority(NICE);
     seal_thread();
+    let mut resumes = Instant::now();
     loop {
         let tracked = tracked();
-        mapping.collect();
-        let worked = mapping.step(Instant::now() + SLICE, gauges);
+        let now = Instant::now();
+        let rests = now < resumes;
+        let worked = !rests && {
+            mapping.collect();
+            let worked = mapping.step(now + SLICE, gauges);
+            mapping.show_points();
+            resumes = Instant::now() + mapping.rest(now.elapsed());
+            worked
+        };
         gauges.slices.fetch_add(1, Relaxed);
         threads::alive();
         let t_s = start.elapsed().as_secs_f64();
@@ -271,7 +327,9 @@ pub fn map(
         if tracked && (over(t_s) || mapping.failure.is_some()) {
             break;
         }
-        if !worked {
+        if rests {
+            std::thread::sleep((resumes - now).min(SLICE));
+        } else if !worked {
             std::thread::sleep(IDLE);
         }
     }

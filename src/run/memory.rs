@@ -9,7 +9,8 @@ use crate::config::Board;
 use crate::limits::CAMERAS_MAX;
 use crate::map::{cameras, Mapper};
 use crate::mem::Footprint;
-use crate::publish::mavlink::{Autopilot, Stamps};
+use crate::publish::mavlink::Autopilot;
+use crate::publish::{cloud, status, Stamps};
 use crate::stereo::Matcher;
 use stipple_drivers::record::Ring;
 use stipple_drivers::{Calibration, Camera, Fault, FaultKind, Frames, ImuCalibration, Lens, Pose, RigCamera};
@@ -30,6 +31,7 @@ pub fn footprint(calibration: &Calibration, board: &Board, records: bool) -> Res
     if board.mavlink.address().is_some() {
         f.build("queues: autopilot", || Autopilot::new(&board.mavlink, Stamps::default(), 0))?;
     }
+    f.host("queues: status socket", status::BYTES + if board.map.enabled { 2 * cloud::BYTES } else { 0 });
     if board.map.enabled {
         // First, since it refuses a rig without the cameras that keyframes have images of.
         let mapper = Mapper::footprint(calibration, board)?;

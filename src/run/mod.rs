@@ -30,9 +30,9 @@
 //! Tracking waits for nobody, but for the samples up to a frame. Shutdown: the cameras end, tracking drains and ends,
 //! mapping ends with the run's time.
 
-mod autopilot;
 pub mod carrier;
 pub mod gate;
+mod governor;
 mod keyframes;
 mod lockstep;
 pub mod log;
@@ -40,28 +40,33 @@ pub mod mailbox;
 pub mod mapping;
 pub mod memory;
 pub mod recorder;
+mod reload;
 pub mod sensors;
 mod service;
 mod spikes;
 pub mod status;
 pub mod status_led;
 pub mod summary;
+mod supervisor;
 pub mod threads;
 pub mod tracking;
 pub mod waker;
 pub mod worker;
+pub mod writers;
 
 use crate::config::{Board, InjectConfig};
 use crate::counters::Counters;
 use crate::output::report::Report;
 use crate::output::OutputDir;
-use autopilot::AutopilotThread;
+use crate::publish::event::{EventId, Notice};
+use crate::publish::status::About;
 use gate::ImuGate;
 use keyframes::{KeyframeRing, Keyframes};
-use log::{EventKind, Log};
+use log::Log;
 use mailbox::{Capture, Mailbox};
 use mapping::Mapping;
 use recorder::Recording;
+pub use reload::BoardSource;
 use sensors::{Input, Playback, Sensors, Source};
 use status::{print_err, Gauges, Status};
 use status_led::StatusLed;
@@ -74,8 +79,10 @@ use stipple_drivers::paced::FRAMES_UNREADABLE;
 use stipple_drivers::record::Format;
 use stipple_drivers::replay::read_trajectory;
 use stipple_drivers::{host, Calibration, Fault, FaultKind, Frames};
+pub use supervisor::Steering;
 use tracking::{FramePacket, Inlet, Link, OdometryRun, Tracker};
 use worker::{MapSide, Worker};
+use writers::Writers;
 
 /// How frames arrive and mapping steps are spent.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -115,6 +122,8 @@ pub struct Options {
     pub inject: InjectConfig,
     /// How a recording is played in real time.
     pub playback: Playback,
+    /// Where the board is read from again, when a service manager asks for it.
+    pub source: Option<BoardSource>,
 }
 
 /// What a flight left, beside its files.
@@ -142,7 +151,7 @@ pub struct Flown {
     /// The fault of the source that broke, if one did.
     pub broken: Option<Fault>,
     /// The first lines about sensors lost and found again, threads that hang, and the mapper.
-    pub notices: Vec<(EventKind, String)>,
+    pub notices: Vec<Notice>,
 }
 
 /// Frames that a run without an end is judged by, evenly spread: the log has all of them.
@@ -158,7 +167,7 @@ pub fn fly(
     options: &Options,
     led: Option<StatusLed>,
 ) -> Result<Outcome, Fault> {
-    let mut board = board.clone();
+    let (given, mut board) = (board, board.clone());
     // In a service the mapper's libraries are its process's business, and so is whether all of it fits.
     let apart = board.map.enabled && options.service && matches!(options.pace, Pace::Recorded);
     let _lock = out.lock()?;
@@ -190,7 +199,7 @@ pub fn fly(
     let told = options.service && board.mavlink.address().is_some();
     let start = if told { Log::start_counting_epochs } else { Log::start };
     let log = start(out.path().into(), log::LIMITS, &title.to_string());
-    input.warnings.iter().for_each(|warning| log.sender().event(EventKind::Warning, warning));
+    input.warnings.iter().for_each(|warning| log.sender().event(EventId::Setup, warning));
     if let Tracker::Odometry(run) = &mut tracker {
         run.back.log = Some(log.sender());
         run.carrier.iter_mut().for_each(|carrier| carrier.log = Some(log.sender()));
@@ -204,7 +213,14 @@ pub fn fly(
         }
         (source, _) => {
             let before = log.epochs_before;
-            play(source, calibration, (tracker, map), (board, options), (colours, live, before), &mut status)?
+            let about = About {
+                version: env!("CARGO_PKG_VERSION"),
+                board: title.board.clone(),
+                dataset: title.dataset.clone(),
+            };
+            let mut steering = Steering::new(given, options.source.as_ref(), status.is_managed());
+            let told = (&*writers::socket(out.path()), about, &mut steering);
+            play(source, calibration, (tracker, map), (board, options), told, (colours, live, before), &mut status)?
         }
     };
     judge_rig(&mut flown, &mut status);
@@ -223,8 +239,7 @@ pub fn fly(
         return Err(fault);
     }
     flown.warnings.splice(..0, input.warnings);
-    let warns = |kind: EventKind| matches!(kind, EventKind::Map | EventKind::Warning);
-    flown.warnings.extend(flown.notices.iter().filter(|(kind, _)| warns(*kind)).map(|(_, line)| line.clone()));
+    flown.warnings.extend(flown.notices.iter().filter(|(id, _)| id.is_reported()).map(|(_, line)| line.clone()));
     let (report, unwritten) = summary::conclude(title, flown, &logged, out);
     let fault = recorded.and_then(Result::err).or(broken).or(unwritten);
     if fault.is_none() {
@@ -234,15 +249,17 @@ pub fn fly(
 }
 
 /// Flies `source` in real time with the `colours` first cameras in colour, records and disturbs it as asked, and tells the
-/// autopilot that the board names; epochs are counted on from those `before`.
+/// autopilot that the board names and the readers of `socket`; epochs are counted on from those `before`.
 fn play(
     source: Source,
     calibration: &Calibration,
     (mut tracker, map): (Tracker, Option<MapSide>),
     (board, options): (&Board, &Options),
+    (socket, about, steering): (&Path, About, &mut Steering),
     (colours, live, before): (usize, bool, u32),
     status: &mut Status,
 ) -> Result<(Flown, Option<Recording>), Fault> {
+    let cloud = map.as_ref().and_then(|map| map.ring().cloud.clone());
     let shape = || Frames::in_colour(calibration, colours);
     let stamps = source.stamps(options.playback.speed);
     let sensors = source.sensors(options.playback);
@@ -255,21 +272,21 @@ fn play(
         sensors_s: options.duration_s.filter(|_| live),
         stop: host::stop_asked_for(),
     };
-    let autopilot = match options.service {
-        true => AutopilotThread::start(&board.mavlink, stamps, before, &mut tracker, status)?,
-        false => None,
+    let writers = match options.service {
+        true => Writers::start(board, stamps, before, (socket, about, cloud), &mut tracker, status)?,
+        false => Writers::default(),
     };
-    let mut flown = fly_in_real_time(sensors, calibration, tracker, map, &realtime, status);
-    autopilot.into_iter().for_each(|thread| thread.finish(&mut flown.source));
+    let mut flown = fly_in_real_time(sensors, calibration, tracker, map, &realtime, status, steering);
+    writers.finish(&mut flown.source);
     Ok((flown, recording))
 }
 
 /// Says what is estimated of the rig and was not found by the end of the flight.
 fn judge_rig(flown: &mut Flown, status: &mut Status) {
     let Some(run) = flown.tracker.odometry() else { return };
-    for line in status.rig_found(run.back.vio.rig_findings_at_end()) {
-        status.say(EventKind::Warning, &line);
-        flown.notices.push((EventKind::Warning, line));
+    for (id, line) in status.rig_found(run.back.vio.rig_findings_at_end()) {
+        status.say(id, &line);
+        flown.notices.push((id, line));
     }
 }
 
@@ -343,7 +360,9 @@ pub fn observe(
     let (sensors, recording) = Recording::start(record, sensors, calibration, board, &shape)?;
     let realtime =
         Realtime { holdout: 0, until_s: None, sensors_s: duration_s.filter(|_| live), stop: host::stop_asked_for() };
-    let mut flown = fly_in_real_time(sensors, calibration, Tracker::Observer(observer), None, &realtime, status);
+    let mut steering = Steering::default();
+    let mut flown =
+        fly_in_real_time(sensors, calibration, Tracker::Observer(observer), None, &realtime, status, &mut steering);
     status.finish();
     flown.source.splice(..0, input.opened);
     let recorded = recording.map_or(Ok(()), |r| r.finish(&mut flown.source));
@@ -387,6 +406,7 @@ pub fn fly_in_real_time(
     map: Option<MapSide>,
     run: &Realtime,
     status: &mut Status,
+    steering: &mut Steering,
 ) -> Flown {
     let ring = map.as_ref().map(|m| m.ring().clone());
     let colours = ring.as_ref().map_or(0, |r| r.colours());
@@ -419,8 +439,7 @@ pub fn fly_in_real_time(
             if !packet.imu_only {
                 keyframes.pass_on(&packet, ring, &s.counters);
                 s.gauges.frames.fetch_add(1, Relaxed);
-                s.gauges.set_epoch(packet.epoch, packet.health);
-                s.gauges.set_found(&packet);
+                s.gauges.set_frame(&packet);
                 s.gauges.posed.fetch_add(u64::from(observes || packet.tracked.is_some()), Relaxed);
                 s.gauges.keyframes.store(keyframes.count, Relaxed);
             }
@@ -442,7 +461,7 @@ pub fn fly_in_real_time(
             None => {}
         }
         let mapped = |t_s: f64, apart: bool| thread.as_ref().map_or(!apart || over(t_s), ScopedJoinHandle::is_finished);
-        let notices = supervise(s, run, worker.as_deref_mut(), mapped, status);
+        let notices = supervisor::supervise(s, run, (worker.as_deref_mut(), ring), mapped, status, steering);
         s.counters.map_restarts.add(worker.as_ref().map_or(0, |w| w.restarts));
         let here = |t: ScopedJoinHandle<_>| t.join().expect("a panic ends the process before");
         (thread.map(|t| MapSide::Here(Box::new(here(t)))).or(worker.map(MapSide::Apart)), notices)
@@ -468,59 +487,6 @@ pub fn fly_in_real_time(
         capture: shared.mailbox.capture.get().copied(),
         broken: shared.mailbox.broken.pop(),
         notices,
-    }
-}
-
-/// The main thread's work while sensors, tracking and mapping go on: takes stops, looks after the worker and the threads,
-/// and shows how it goes. Answers the first lines it said.
-fn supervise(
-    s: &Shared,
-    run: &Realtime,
-    mut worker: Option<&mut Worker>,
-    mapped: impl Fn(f64, bool) -> bool,
-    status: &mut Status,
-) -> Vec<(EventKind, String)> {
-    let (_watched, mut notices) = (threads::watch("main"), vec![]);
-    loop {
-        threads::alive();
-        let t_s = s.start.elapsed().as_secs_f64();
-        let tracked = s.tracking_done.load(Ordering::Acquire);
-        if tracked && mapped(t_s, worker.is_some()) {
-            status.stopping();
-            return notices;
-        }
-        if run.sensors_s.is_some_and(|limit| t_s >= limit) || run.stop.load(Relaxed) {
-            s.mailbox.stop.store(true, Relaxed);
-            threads::ending();
-            status.stopping();
-        }
-        s.gauges.broke.fetch_or(!s.mailbox.broken.is_empty(), Relaxed);
-        let hangs = threads::fell_silent();
-        s.counters.threads_silent.add(hangs.len() as u64);
-        let hangs = hangs.into_iter().map(|name| format!("thread {name} gives no sign of life"));
-        let looked = worker.as_mut().and_then(|w| w.watch(&s.gauges));
-        let (epoch, rig, heard) =
-            (status.epoch_begun(&s.gauges), status.rig_judged(&s.gauges), status.autopilot_said());
-        let mut say = |kind, line: String| {
-            status.say(kind, &line);
-            // A cable that comes loose each second, for hours, is in the log.
-            if notices.len() < NOTICES_KEPT {
-                notices.push((kind, line));
-            }
-        };
-        hangs.chain(threads::refused()).for_each(|line| say(EventKind::System, line));
-        epoch.into_iter().for_each(|line| say(EventKind::Epoch, line));
-        rig.into_iter().for_each(|line| say(EventKind::Warning, line));
-        looked.into_iter().for_each(|line| say(EventKind::Map, line));
-        std::iter::from_fn(|| s.mailbox.notices.pop()).for_each(|line| say(EventKind::Sensor, line));
-        heard.into_iter().for_each(|line| say(EventKind::Autopilot, line));
-        if tracked {
-            // Nothing is played any more; the run's own time is what progresses.
-            s.gauges.played_ms.fetch_max((t_s * 1e3) as u64, Relaxed);
-        }
-        status.show(&s.gauges);
-        status.log_counters(&s.counters, &s.gauges);
-        std::thread::sleep(STATUS_PERIOD);
     }
 }
 

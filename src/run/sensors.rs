@@ -4,7 +4,7 @@
 use super::status::print_err;
 use super::threads;
 use crate::config::{Board, InjectConfig};
-use crate::publish::mavlink::Stamps;
+use crate::publish::Stamps;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::sync::Arc;

@@ -1,21 +1,26 @@
 //! What a run shows while it goes on: a bar on a terminal, one line a second otherwise, and a status LED where one is wired.
 
-use super::log::{EventKind, LogSender};
-use super::service::Service;
+use super::log::LogSender;
+use super::service::{Journal, Service};
 use super::status_led::StatusLed;
 use super::threads;
 use super::tracking::FramePacket;
+use crate::config::MavlinkConfig;
 use crate::counters::Counters;
 use crate::frontend::{Verdict, Verdicts};
-use crate::publish::{Feed, Severity};
+use crate::publish::event::{EventId, Notice};
+use crate::publish::mavlink::Settings;
+use crate::publish::status::message::{GovernorStatus, MapStatus, Summary};
+use crate::publish::status::Shared;
+use crate::publish::{Feed, Feeds};
 use crate::vio::{Finding, Findings, Health, Part};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle, TermLike};
 use std::fmt::{self, Write as _};
 use std::io::{self, IsTerminal};
 use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering::Acquire, Ordering::Relaxed, Ordering::Release};
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
-use stipple_drivers::host;
+use stipple_drivers::host::{self, STDERR, STDOUT};
 
 /// Written by the threads of a run, read by whoever shows it.
 #[derive(Default)]
@@ -33,6 +38,8 @@ pub struct Gauges {
     pub slices: AtomicU64,
     /// Training PSNR of the last probe, 0.01 dB.
     pub psnr_cdb: AtomicU64,
+    /// Longest that tracking took a frame since it was asked last, µs.
+    pub latency_us_most: AtomicU64,
     /// Time of the recording played so far, ms.
     pub played_ms: AtomicU64,
     /// The epoch of the newest frame, and the health of the epoch's first.
@@ -52,6 +59,13 @@ impl Gauges {
         }
     }
 
+    /// Takes note of a frame that was tracked just now.
+    pub fn set_frame(&self, packet: &FramePacket) {
+        self.set_epoch(packet.epoch, packet.health);
+        self.set_found(packet);
+        self.latency_us_most.fetch_max(packet.begun.elapsed().as_micros() as u64, Relaxed);
+    }
+
     /// Takes note of what was found of the rig by a frame.
     pub fn set_found(&self, packet: &FramePacket) {
         self.verdicts.store(packet.verdicts.0, Relaxed);
@@ -68,7 +82,13 @@ pub struct Status {
     led: Option<StatusLed>,
     log: Option<LogSender>,
     service: Option<Service>,
-    autopilot: Option<Feed>,
+    journal: Option<Journal>,
+    /// Writers of the run, the one to the autopilot, and the readers of the status socket.
+    feeds: Feeds,
+    autopilot: Option<Settings>,
+    readers: Option<Arc<Shared>>,
+    /// What share of its time the mapper works, and why.
+    pub governor: GovernorStatus,
     /// When counters are logged next.
     next_count: Instant,
     /// Whether it was said that logging ended.
@@ -105,7 +125,11 @@ impl Status {
             led: None,
             log: None,
             service: None,
+            journal: None,
+            feeds: Feeds::default(),
             autopilot: None,
+            readers: None,
+            governor: GovernorStatus::default(),
             next_count,
             log_ended: false,
             epoch: 0,
@@ -126,20 +150,46 @@ impl Status {
         self
     }
 
-    /// Tells the service manager, too, where there is one and this is a `service`.
+    /// Tells the service manager and its journal, too, where there is one and this is a `service`.
     pub fn with_service(mut self, service: bool) -> Status {
         self.service = service.then(Service::of_this_process).flatten();
+        self.journal = service.then(Journal::of_this_process).flatten();
         self
     }
 
-    /// Tells an autopilot what it says, too.
-    pub fn tell_autopilot(&mut self, feed: Feed) {
-        self.autopilot = Some(feed);
+    /// Tells the writers of a run what it says, too.
+    pub fn tell_writers(&mut self, feeds: Feeds) {
+        self.feeds = feeds;
     }
 
-    /// Lines about the link to the autopilot since this was asked last.
-    pub fn autopilot_said(&self) -> Vec<String> {
-        self.autopilot.iter().flat_map(Feed::notices).collect()
+    /// Where the writer to an autopilot takes other settings from.
+    pub fn tell_autopilot(&mut self, settings: Settings) {
+        self.autopilot = Some(settings);
+    }
+
+    /// Tells the readers of the status socket how the run goes, each second.
+    pub fn tell_readers(&mut self, readers: Arc<Shared>) {
+        self.readers = Some(readers);
+    }
+
+    /// Lines about links since this was asked last.
+    pub fn writers_said(&self) -> Vec<Notice> {
+        self.feeds.0.iter().flat_map(Feed::notices).collect()
+    }
+
+    /// Whether a service manager hears of the run.
+    pub fn is_managed(&self) -> bool {
+        self.service.is_some()
+    }
+
+    /// The board file is being read again.
+    pub fn reloading(&mut self) {
+        self.service.iter_mut().for_each(Service::reloading);
+    }
+
+    /// Takes over what may change of the autopilot's writer while it writes.
+    pub fn set_autopilot(&self, config: &MavlinkConfig) {
+        self.autopilot.iter().for_each(|settings| settings.set(config));
     }
 
     /// The run is to end: results are written from here on.
@@ -166,6 +216,8 @@ impl Status {
                 bar.set_position(played);
                 bar.set_message(line(g));
             }
+            // The journal has the events, and the service manager how it goes.
+            None if self.journal.is_some() => {}
             None if self.next_line.is_some_and(|due| Instant::now() >= due) => {
                 self.next_line = self.next_line.map(|due| due + LINE_PERIOD);
                 let of = self.total_ms.map_or(String::new(), |ms| format!(" of {:.1}", ms as f64 * 1e-3));
@@ -177,7 +229,12 @@ impl Status {
 
     /// Logs counters and gauges once a second, and says it when logging has ended. Cheap to call often.
     pub fn log_counters(&mut self, counters: &Counters, g: &Gauges) {
-        let Some(log) = self.log.as_ref().filter(|_| Instant::now() >= self.next_count) else { return };
+        if Instant::now() < self.next_count {
+            return;
+        }
+        self.next_count += LINE_PERIOD;
+        self.tell_summary(counters, g);
+        let Some(log) = &self.log else { return };
         let gauges = [
             ("frames", &g.frames),
             ("keyframes", &g.keyframes),
@@ -187,11 +244,31 @@ impl Status {
         ];
         let all = gauges.iter().map(|(name, n)| (*name, n.load(Relaxed))).chain(counters.list());
         log.counters(all.map(|(name, n)| (name.into(), n)).collect());
-        self.next_count += LINE_PERIOD;
-        if let (false, Some(why)) = (self.log_ended, log.notice()) {
-            self.print(why);
+        let ended = log.notice().filter(|_| !self.log_ended).map(str::to_string);
+        if let Some(why) = ended {
+            // The log takes no more.
+            self.print(EventId::LogEnded, &why);
+            self.feeds.event(EventId::LogEnded, &why);
             self.log_ended = true;
         }
+    }
+
+    fn tell_summary(&self, counters: &Counters, g: &Gauges) {
+        let Some(readers) = &self.readers else { return };
+        let psnr = g.psnr_cdb.load(Relaxed);
+        readers.tell(Summary {
+            frames: g.frames.load(Relaxed),
+            posed: g.posed.load(Relaxed),
+            map: MapStatus {
+                keyframes: g.keyframes.load(Relaxed),
+                anchors: g.anchors.load(Relaxed),
+                splats: g.splats.load(Relaxed),
+                iterations: g.iterations.load(Relaxed),
+                psnr_db: (psnr > 0).then_some(psnr as f64 * 0.01),
+            },
+            governor: self.governor.clone(),
+            counters: counters.list().into_iter().map(|(name, n)| (name.into(), n)).collect(),
+        });
     }
 
     /// A line about an epoch that began since this was asked last.
@@ -209,7 +286,7 @@ impl Status {
     }
 
     /// A line about each finding on cameras and rig since this was asked last.
-    pub fn rig_judged(&mut self, g: &Gauges) -> Vec<String> {
+    pub fn rig_judged(&mut self, g: &Gauges) -> Vec<Notice> {
         let verdicts = g.verdicts.load(Relaxed);
         let before = std::mem::replace(&mut self.verdicts, verdicts);
         let of_cameras = Verdicts(verdicts & !before).iter().map(|(verdict, cameras)| judged(verdict, cameras));
@@ -217,25 +294,26 @@ impl Status {
     }
 
     /// A line about each finding on what is estimated of the rig since this was asked last.
-    pub fn rig_found(&mut self, findings: Findings) -> Vec<String> {
+    pub fn rig_found(&mut self, findings: Findings) -> Vec<Notice> {
         let before = std::mem::replace(&mut self.findings, findings.0);
         let new = Findings(findings.0 & !before);
         let thrown = "what was estimated of the rig can be no rig and is thrown away, its calibration is used again: is it of this \
                       rig, with its cameras in order?";
-        let thrown = new.has_thrown_away().then(|| thrown.to_string());
+        let thrown = new.has_thrown_away().then(|| (EventId::RigDiscarded, thrown.to_string()));
         thrown.into_iter().chain(new.iter().map(|(finding, part)| found(finding, part))).collect()
     }
 
-    /// Prints a line that stays, and logs it as an event.
-    pub fn say(&self, kind: EventKind, text: &str) {
-        self.log.iter().for_each(|log| log.event(kind, text));
-        if let Some(feed) = self.autopilot.as_ref().filter(|_| kind != EventKind::Autopilot) {
-            feed.text(Severity::Warning, text);
-        }
-        self.print(text);
+    /// Prints a line that stays, logs it as an event, and tells the writers.
+    pub fn say(&self, id: EventId, text: &str) {
+        self.log.iter().for_each(|log| log.event(id, text));
+        self.feeds.event(id, text);
+        self.print(id, text);
     }
 
-    fn print(&self, text: &str) {
+    fn print(&self, id: EventId, text: &str) {
+        if self.journal.as_ref().is_some_and(|journal| journal.write(id, self.epoch, text)) {
+            return;
+        }
         match &self.bar {
             Some(bar) => bar.println(format!("stipple: {text}")),
             None if self.next_line.is_some() => print_err(format_args!("stipple: {text}")),
@@ -250,41 +328,54 @@ impl Status {
     }
 }
 
-fn judged(verdict: Verdict, [a, b]: [usize; 2]) -> String {
+fn judged(verdict: Verdict, [a, b]: [usize; 2]) -> Notice {
     match verdict {
-        Verdict::Swapped => format!(
-            "cameras {a} and {b} are swapped: each sees what the other should. Exchange their names in camera.devices, or the \
-             data of their folders in a recording"
-        ),
-        Verdict::Disagree => format!(
-            "camera {b} never agrees with camera {a}: wrong calibration, other frame timing, or covered? `stipple calib-check` \
-             judges a calibration by a recording"
-        ),
-        Verdict::AgreeAfterAll => format!("camera {b} agrees with camera {a} after all"),
+        Verdict::Swapped => {
+            let line = format!(
+                "cameras {a} and {b} are swapped: each sees what the other should. Exchange their names in camera.devices, or \
+                 the data of their folders in a recording"
+            );
+            (EventId::CamerasSwapped, line)
+        }
+        Verdict::Disagree => {
+            let line = format!(
+                "camera {b} never agrees with camera {a}: wrong calibration, other frame timing, or covered? `stipple \
+                 calib-check` judges a calibration by a recording"
+            );
+            (EventId::CamerasDisagree, line)
+        }
+        Verdict::AgreeAfterAll => (EventId::CamerasAgree, format!("camera {b} agrees with camera {a} after all")),
     }
 }
 
 /// Fits an event.
-fn found(finding: Finding, part: Part) -> String {
+fn found(finding: Finding, part: Part) -> Notice {
     let (name, key) = match part {
         Part::TimeOffset(c) => (format!("time offset of camera {c}"), "vio.time_offset_sigma_s"),
         Part::Extrinsics(c) => (format!("place of camera {c}"), "vio.extrinsics_sigma_*"),
         Part::GyroScale => ("scale of the gyro".into(), "vio.imu_scale_sigma"),
         Part::AccelScale => ("scale of the accelerometer".into(), "vio.imu_scale_sigma"),
     };
-    match finding {
-        Finding::Unknown => format!(
-            "the {name} is not found, poses are as wrong as its calibration: turn and accelerate about all axes, or calibrate it"
+    let (id, what) = match finding {
+        Finding::Unknown => (
+            EventId::RigUnknown,
+            "is not found, poses are as wrong as its calibration: turn and accelerate about all axes, or calibrate it".into(),
         ),
-        Finding::Moving => format!(
-            "the {name} is not found, its estimate goes on moving by many deviations: is a part loose, or the rest of the \
-             calibration wrong?"
+        Finding::Moving => (
+            EventId::RigMoving,
+            "is not found, its estimate goes on moving by many deviations: is a part loose, or the rest of the calibration \
+             wrong?"
+                .into(),
         ),
-        Finding::TooFar => format!(
-            "the {name} is estimated further from its calibration than the board deems possible: calibrate it, or raise {key}"
+        Finding::TooFar => (
+            EventId::RigTooFar,
+            format!(
+                "is estimated further from its calibration than the board deems possible: calibrate it, or raise {key}"
+            ),
         ),
-        Finding::FoundAfterAll => format!("the {name} is found after all"),
-    }
+        Finding::FoundAfterAll => (EventId::RigFound, String::from("is found after all")),
+    };
+    (id, format!("the {name} {what}"))
 }
 
 fn line(g: &Gauges) -> String {
@@ -300,8 +391,6 @@ fn line(g: &Gauges) -> String {
     )
 }
 
-const STDOUT: i32 = 1;
-const STDERR: i32 = 2;
 /// What a pipe that is writable takes without waiting.
 const LINE_BYTES_MAX: usize = 4096;
 /// Lines that nobody took.
@@ -375,7 +464,7 @@ pub fn print_err(line: fmt::Arguments) {
 }
 
 /// Counts a line that a full queue gave back.
-pub fn count_lost(pushed: Result<(), String>) {
+pub fn count_lost<T>(pushed: Result<(), T>) {
     LINES_LOST.fetch_add(u64::from(pushed.is_err()), Relaxed);
 }
 

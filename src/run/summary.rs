@@ -1,6 +1,6 @@
 //! What a finished flight leaves: the end of its log, the report, the files of DIR, seven lines of text.
 
-use super::log::{read, EventKind, Log};
+use super::log::{read, Log};
 use super::mapping::{Drawn, MapResult};
 use super::memory::mib;
 use super::tracking::{OdometryRun, Tracker};
@@ -12,6 +12,7 @@ use crate::output::panel::Picture;
 use crate::output::report::{seconds_to, Convergence, ExtrinsicsFound, Report, TimeOffsetFound, GOOD_DB};
 use crate::output::trajectory::{epoch_at, TumWriter};
 use crate::output::{atomically, OutputDir};
+use crate::publish::event::EventId;
 use crate::vio::Part;
 use std::borrow::Cow;
 use std::fmt;
@@ -46,7 +47,7 @@ pub fn close_log(log: Log, title: &Title, flown: &mut Flown, fault: Option<&Faul
         None if host::stop_asked_for().load(Relaxed) => "stopped by a signal".into(),
         None => "the sensors or the time asked for ended".into(),
     };
-    sender.event(EventKind::End, &why);
+    sender.event(EventId::End, &why);
     let files = log.finish(&mut flown.source);
     flown.warnings.extend(sender.notice().map(str::to_string));
     files

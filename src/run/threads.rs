@@ -16,10 +16,10 @@ use stipple_drivers::{host, Fault, FaultKind, Span};
 const LOOK_PERIOD: Duration = Duration::from_secs(1);
 const EX_SOFTWARE: i32 = 70;
 /// Threads of a run that are watched at once.
-const SLOTS: usize = 16;
+const SLOTS: usize = 20;
 /// Priorities among real-time threads, and how long each may be silent, s. A pulse that starts an exposure comes before
 /// everything; an anchor may take the mapper long, and a card that stalls those who write.
-const WATCHED: [(&str, i32, f64); 15] = [
+const WATCHED: [(&str, i32, f64); 16] = [
     ("main", 0, 5.0),
     ("trigger", 13, 5.0),
     ("imu", 12, 5.0),
@@ -29,6 +29,7 @@ const WATCHED: [(&str, i32, f64); 15] = [
     ("frontend", 10, 5.0),
     ("estimator", 10, 5.0),
     ("autopilot", 9, 5.0),
+    ("status", 0, 30.0),
     ("mapping", 0, 60.0),
     ("map-answers", 0, 5.0),
     ("beat", 0, 5.0),
@@ -131,7 +132,7 @@ fn silent() -> impl Iterator<Item = (usize, &'static str)> {
 }
 
 /// Threads without which a run is still worth going on.
-const SPARED: [&str; 7] = ["autopilot", "barometer", "map-answers", "beat", "led", "log", "writer"];
+const SPARED: [&str; 8] = ["autopilot", "status", "barometer", "map-answers", "beat", "led", "log", "writer"];
 
 /// Whether no thread that a run needs has been silent for longer than it may. Allocates nothing.
 pub fn are_alive() -> bool {

@@ -21,7 +21,7 @@ use crate::counters::Counters;
 use crate::frontend::{Frontend, Prediction, Rejected, Tracks, Verdicts};
 use crate::limits::{CAMERAS_MAX, FRAMES, IMU_BETWEEN_FRAMES};
 use crate::mem::{seal_thread, Footprint, List, Thinned};
-use crate::publish::Feed;
+use crate::publish::Feeds;
 use crate::vio::{Findings, Health, Known, Predictor, Vio};
 use crossbeam_queue::ArrayQueue;
 use std::sync::atomic::AtomicBool;
@@ -68,7 +68,7 @@ pub struct FramePacket {
     /// What was found so far of what is estimated of the rig.
     pub findings: Findings,
     /// When the front end took it.
-    begun: Instant,
+    pub begun: Instant,
     /// CPU time that following its points took.
     cpu: Duration,
 }
@@ -211,7 +211,7 @@ pub struct Back {
     pub frame_ms: Thinned<(Nanos, f64)>,
     pub cpu_s: Option<f64>,
     pub log: Option<LogSender>,
-    pub feed: Option<Feed>,
+    pub feeds: Feeds,
     /// Where the carrier takes states.
     newest: Option<Newest>,
     /// First frame and number of each epoch. Where there are more, the log has them.
@@ -264,7 +264,7 @@ impl Back {
         if let Some(newest) = &self.newest {
             newest.set(&update, known.imu_scale);
         }
-        self.feed.iter().for_each(|feed| feed.frame(&update, packet.imu.last()));
+        self.feeds.frame(&update, packet.imu.last());
         if let Some(log) = &self.log {
             let cpu = packet.cpu + (thread_cpu_now() - cpu);
             let time_offsets_ns = self.vio.time_offsets().map(|offsets| offsets.map(|offset| offset.0));
@@ -327,7 +327,7 @@ impl OdometryRun {
                 frame_ms,
                 cpu_s: None,
                 log: None,
-                feed: None,
+                feeds: Feeds::default(),
                 newest: carrier.as_ref().map(|carrier| carrier.newest.clone()),
                 epochs: List::default(),
             },

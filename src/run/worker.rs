@@ -15,6 +15,8 @@ use crate::config::{Board, ThreadRule};
 use crate::mem::unsealed;
 use crate::output::panel::Picture;
 use crate::output::OutputDir;
+use crate::publish::cloud::Cloud;
+use crate::publish::event::{EventId, Notice};
 use serde::{Deserialize, Serialize};
 use std::io::{self, Read, Write};
 use std::os::fd::AsRawFd;
@@ -53,8 +55,9 @@ struct Setup {
     board: Board,
     calibration: Calibration,
     out: PathBuf,
-    /// Descriptor of the ring of keyframes.
+    /// Descriptors of the ring of keyframes and of the points.
     ring: i32,
+    cloud: Option<i32>,
     /// The recording or rig, for errors, and whether samples are recorded: on the first start the whole run must fit.
     first: Option<(String, bool)>,
     /// Panics and hangs of its threads.
@@ -170,7 +173,7 @@ impl Worker {
         out: &OutputDir,
         records: bool,
     ) -> Result<Worker, Fault> {
-        let ring = KeyframeRing::new(calibration, board)?;
+        let ring = KeyframeRing::new(calibration, board)?.with_cloud(Cloud::create())?;
         let mut worker = Worker::new(ring, calibration.clone(), board.clone(), out.path().to_path_buf());
         let first = Some((place.to_string(), records));
         worker.spawn(first).map_err(|e| refused(format!("the mapper's process does not start: {e}")))?;
@@ -183,7 +186,7 @@ impl Worker {
                 break;
             }
             // All that it said was read when it was found to have ended.
-            if let Some(why) = worker.watch(&gauges) {
+            if let Some((_, why)) = worker.watch(&gauges) {
                 return Err(lock(&told).refused.take().unwrap_or_else(|| refused(why)));
             }
             std::thread::sleep(Duration::from_millis(5));
@@ -198,6 +201,7 @@ impl Worker {
             calibration: self.calibration.clone(),
             out: self.out.clone(),
             ring: self.ring.number(),
+            cloud: self.ring.cloud.as_ref().map(|cloud| cloud.number()),
             // One that is started again is not disturbed.
             rules: if first.is_some() { threads::rules() } else { vec![] },
             first,
@@ -223,14 +227,14 @@ impl Worker {
     }
 
     /// Looks after the worker; answers what went wrong, once. Never waits.
-    pub fn watch(&mut self, gauges: &Gauges) -> Option<String> {
+    pub fn watch(&mut self, gauges: &Gauges) -> Option<Notice> {
         let (now, ring) = (Instant::now(), self.ring.clone());
         let Some(running) = &mut self.running else {
             if now >= self.next_start {
                 ring.offer_again();
                 if let Err(e) = self.spawn(None) {
                     self.postpone(now, Duration::ZERO);
-                    return Some(format!("the mapper does not start again: {e}"));
+                    return Some((EventId::MapperLost, format!("the mapper does not start again: {e}")));
                 }
                 self.restarts += 1;
             }
@@ -248,7 +252,7 @@ impl Worker {
                 ] {
                     gauge.store(ring.word(word).load(Relaxed), Relaxed);
                 }
-                return again.then(|| "the mapper maps again".into());
+                return again.then(|| (EventId::MapperBack, "the mapper maps again".into()));
             }
             return None;
         };
@@ -263,7 +267,7 @@ impl Worker {
             0 => "now".into(),
             s => format!("in {s} s"),
         };
-        Some(format!("the mapper {why}{said}; it starts again {when}, with an empty map"))
+        Some((EventId::MapperLost, format!("the mapper {why}{said}; it starts again {when}, with an empty map")))
     }
 
     fn postpone(&mut self, now: Instant, life: Duration) {
@@ -456,6 +460,10 @@ pub fn serve(mut input: impl Read, mut output: impl Write) -> Result<(), Fault> 
     let Setup { board, calibration, first, .. } = &setup;
     let fits = first.as_ref().map(|(place, records)| memory::check_fits(place, calibration, board, *records));
     let opened = fits.transpose().and_then(|_| KeyframeRing::attach(setup.ring, calibration, board)).and_then(|ring| {
+        let ring = match setup.cloud {
+            Some(cloud) => ring.with_cloud(Cloud::attach(cloud))?,
+            None => ring,
+        };
         let ring = Arc::new(ring);
         Ok((ring.clone(), Mapping::open(calibration, board, ring)?))
     });

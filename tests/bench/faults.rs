@@ -14,7 +14,7 @@ use stipple::output::OutputDir;
 use stipple::run::sensors::{Playback, Recorded};
 use stipple::run::status::Status;
 use stipple::run::tracking::{OdometryRun, Tracker};
-use stipple::run::{fly_in_real_time, memory, Flown, Realtime};
+use stipple::run::{fly_in_real_time, memory, Flown, Realtime, Steering};
 use stipple::vio::Health;
 use stipple_drivers::inject::{Kind, Rule};
 use stipple_drivers::paced::Images;
@@ -211,7 +211,8 @@ impl Flight {
         let options = Realtime { holdout: 0, until_s: None, sensors_s: None, stop: &AtomicBool::new(false) };
         let mut silent = Status::silent();
         let tracker = Tracker::Odometry(Box::new(run));
-        let played = fly_in_real_time(sensors, calibration, tracker, None, &options, &mut silent);
+        let played =
+            fly_in_real_time(sensors, calibration, tracker, None, &options, &mut silent, &mut Steering::default());
         let end_s = case.map_or(STRIKES_S, |c| c.rule.end_s);
         Ok(self.judge(&played, flown, first + Span::from_secs(STRIKES_S), first + Span::from_secs(end_s)))
     }

@@ -13,7 +13,7 @@ use stipple::run::recorder::Recording;
 use stipple::run::sensors::{Input, Playback, Recorded, Source};
 use stipple::run::status::Status;
 use stipple::run::tracking::{OdometryRun, Tracker};
-use stipple::run::{fly_in_real_time, memory, Realtime};
+use stipple::run::{fly_in_real_time, memory, Realtime, Steering};
 use stipple_drivers::paced::Images;
 use stipple_drivers::record::Format;
 use stipple_drivers::sim::Scenario;
@@ -75,7 +75,15 @@ impl Flight {
             Recording::start(into, recorded.paced(Playback::default()), &self.calibration, board, &shape)?;
         let tracker = Tracker::Odometry(Box::new(OdometryRun::new(&self.calibration, board, self.frames.len())?));
         let options = Realtime { holdout: 0, until_s: None, sensors_s: None, stop: &AtomicBool::new(false) };
-        let flown = fly_in_real_time(sensors, &self.calibration, tracker, None, &options, &mut Status::silent());
+        let flown = fly_in_real_time(
+            sensors,
+            &self.calibration,
+            tracker,
+            None,
+            &options,
+            &mut Status::silent(),
+            &mut Steering::default(),
+        );
         let run = flown.tracker.odometry().expect("flown by odometry");
         let ms: Vec<f64> = run.back.frame_ms.iter().map(|(_, ms)| *ms).collect();
         let mut recorded = vec![];

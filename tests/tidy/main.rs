@@ -26,12 +26,18 @@ const EDGES: [(&str, &[&str]); 7] = [
 const UNSAFE: [&str; 5] =
     ["src/gpu/", "src/mem.rs", "src/stereo/opencv.rs", "src/stereo/onnx/runtime.rs", "drivers/src/"];
 /// Where threads and processes may start: those of a flight, the recorder's writer, the simulator's renderers.
-const SPAWNS: [&str; 4] = ["src/run/mod.rs", "src/run/worker.rs", "drivers/src/record/mod.rs", "drivers/src/sim/"];
+const SPAWNS: [&str; 5] = [
+    "src/commands/bugreport.rs",
+    "src/run/mod.rs",
+    "src/run/worker.rs",
+    "drivers/src/record/mod.rs",
+    "drivers/src/sim/",
+];
 const RUST_LINES_MAX: usize = 600;
 const FUNCTION_LINES_MAX: usize = 90;
 const KERNEL_LINES_MAX: usize = 250;
 /// Lines of code that the product may have, and its estimator, frontend, mapper, GPU core, stereo and kernels together.
-const CODE_MAX: usize = 38_400;
+const CODE_MAX: usize = 41_000;
 const CORE_MAX: usize = 15_750;
 const CORE: [&str; 10] = [
     "src/vio/",

@@ -9,7 +9,6 @@ use super::checks::rows::Rows;
 use super::checks::{all_passed, gyro, Check, Follower, Verdict};
 use super::{open_input, seconds, BoardArgs};
 use crate::config::Board;
-use crate::run::log::EventKind;
 use crate::run::mailbox::Capture;
 use crate::run::memory;
 use crate::run::sensors::{self, Input, Source};
@@ -99,10 +98,12 @@ fn sensed(input: Input, board: &Board, look_s: f64) -> Result<Vec<Check>, Fault>
     if let Some(fault) = &flown.broken {
         checks.push(Check::fail(format!("{}: {}", fault.place, fault.what), fault.fix.clone()));
     }
-    for (kind, line) in &flown.notices {
-        let sensor = *kind == EventKind::Sensor;
-        let fix =
-            if sensor { "check plug and cable" } else { "see what else this machine does, and the limits it sets" };
+    for (id, line) in &flown.notices {
+        let fix = if id.is_of_sensor() {
+            "check plug and cable"
+        } else {
+            "see what else this machine does, and the limits it sets"
+        };
         checks.push(Check::warn(line.clone(), fix));
     }
     let c = &flown.counters;

@@ -1,10 +1,11 @@
 //! States as MAVLink messages, in the frames that autopilots take: poses in MAV_FRAME_LOCAL_FRD (forward as the vehicle looked
 //! when it started, right, down), velocities in MAV_FRAME_BODY_FRD. Both PX4 and ArduPilot take this pair.
 
+use crate::publish::turned::Turned;
 use crate::publish::State;
-use glam::{DMat3, DQuat, DVec3, EulerRot};
+use glam::{DQuat, DVec3, EulerRot};
 use mavlink::dialects::common::{MavEstimatorType, MavFrame, ODOMETRY_DATA, VISION_POSITION_ESTIMATE_DATA};
-use nalgebra::{SMatrix, Vector3};
+use nalgebra::SMatrix;
 
 /// Turns of the axes.
 pub struct Axes {
@@ -17,36 +18,12 @@ pub struct Axes {
     epochs_before: u32,
 }
 
-/// A state in the axes of messages.
-#[derive(Clone, Copy, Debug)]
-struct Turned {
-    /// Local frame, m.
-    p: DVec3,
-    local_from_vehicle: DQuat,
-    /// Vehicle's axes, m/s and rad/s.
-    v: DVec3,
-    rate: DVec3,
-    /// Covariance of position and rotation, both in the axes of the local frame.
-    pose_covariance: SMatrix<f64, 6, 6>,
-    /// Covariance of velocity and rate, both in the vehicle's axes.
-    velocity_covariance: SMatrix<f64, 6, 6>,
-}
-
-/// Standard deviation of an angular rate, rad/s, beside that of the gyro's bias: of no autopilot's use, and not zero.
-const RATE_SIGMA: f64 = 0.01;
 /// Variance that stands for one that is unknown: MAVLink would have NaN there.
 const UNKNOWN: f64 = 1e4;
 
-fn dmat(m: DMat3) -> SMatrix<f64, 3, 3> {
-    SMatrix::from_column_slice(&m.to_cols_array())
-}
-
-fn cross(v: DVec3) -> SMatrix<f64, 3, 3> {
-    Vector3::new(v.x, v.y, v.z).cross_matrix()
-}
-
 /// Upper right triangle, row by row.
-fn triangle(m: &SMatrix<f64, 6, 6>) -> [f32; 21] {
+fn triangle(m: &Option<SMatrix<f64, 6, 6>>) -> [f32; 21] {
+    let m = m.unwrap_or_else(|| SMatrix::identity() * UNKNOWN);
     let mut entries = (0..6).flat_map(|row| (row..6).map(move |column| m[(row, column)] as f32));
     std::array::from_fn(|_| entries.next().unwrap_or_default())
 }
@@ -74,51 +51,8 @@ impl Axes {
         turn
     }
 
-    /// The state in the axes of messages; `None` where a number of it is not finite, as an f32.
     fn turn(&mut self, state: &State) -> Option<Turned> {
-        let (l, v) = (self.local_from_world(state), self.vehicle_from_body);
-        let pose = &state.odometry.world_from_body;
-        let v_body = pose.q.conjugate() * state.odometry.v_world;
-        let (pose_covariance, velocity_covariance) = match &state.covariance {
-            Some(c) => self.covariances(l, pose.q, v_body, c),
-            None => (SMatrix::identity() * UNKNOWN, SMatrix::identity() * UNKNOWN),
-        };
-        let turned = Turned {
-            p: l * pose.p,
-            local_from_vehicle: (l * pose.q * v.conjugate()).normalize(),
-            v: v * v_body,
-            rate: v * state.rate,
-            pose_covariance,
-            velocity_covariance,
-        };
-        let vectors = [turned.p, turned.v, turned.rate].into_iter().flat_map(|v| v.to_array());
-        let covariances = [&turned.pose_covariance, &turned.velocity_covariance].into_iter().flatten();
-        let mut all = vectors.chain(turned.local_from_vehicle.to_array()).chain(covariances.copied());
-        all.all(|x| (x as f32).is_finite()).then_some(turned)
-    }
-
-    /// Covariances of `Turned` from that of position and velocity in the world, of rotation on the right and of the biases.
-    fn covariances(
-        &self,
-        l: DQuat,
-        q: DQuat,
-        v_body: DVec3,
-        c: &[[f64; 15]; 15],
-    ) -> (SMatrix<f64, 6, 6>, SMatrix<f64, 6, 6>) {
-        let c = SMatrix::<f64, 15, 15>::from_fn(|i, j| c[i][j]);
-        let (l, turn, v) = (dmat(DMat3::from_quat(l)), dmat(DMat3::from_quat(l * q)), self.vehicle_from_body);
-        let (v, body_from_world) = (dmat(DMat3::from_quat(v)), dmat(DMat3::from_quat(q.conjugate())));
-        // Positions, rotations, velocities and biases of the gyro are the first twelve errors.
-        let (mut pose, mut velocity) = (SMatrix::<f64, 6, 15>::zeros(), SMatrix::<f64, 6, 15>::zeros());
-        pose.fixed_view_mut::<3, 3>(0, 0).copy_from(&l);
-        pose.fixed_view_mut::<3, 3>(3, 3).copy_from(&turn);
-        // R Exp(δ) turns v back to v_body + v_body × δ.
-        velocity.fixed_view_mut::<3, 3>(0, 3).copy_from(&(v * cross(v_body)));
-        velocity.fixed_view_mut::<3, 3>(0, 6).copy_from(&(v * body_from_world));
-        velocity.fixed_view_mut::<3, 3>(3, 9).copy_from(&-v);
-        let mut of_velocity = velocity * c * velocity.transpose();
-        (3..6).for_each(|i| of_velocity[(i, i)] += RATE_SIGMA * RATE_SIGMA);
-        (pose * c * pose.transpose(), of_velocity)
+        Turned::new(state, self.local_from_world(state), self.vehicle_from_body)
     }
 
     /// How far the nose pointed up at the first state, degrees: once.
@@ -205,7 +139,7 @@ mod tests {
             accel_bias: DVec3::ZERO,
         };
         let (rate, covariance, source) = (DVec3::ZERO, None, Source::Frame);
-        State { odometry, rate, covariance, epoch: 258, quality: 80, source }
+        State { odometry, rate, covariance, epoch: 258, quality: 80, health: Default::default(), source }
     }
 
     /// World from the body of EuRoC's vehicle, level, its nose in the direction of `heading`.
@@ -291,11 +225,11 @@ mod tests {
             pose += of_pose * of_pose.transpose();
             velocity += of_velocity * of_velocity.transpose();
         }
-        (3..6).for_each(|i| velocity[(i, i)] += RATE_SIGMA * RATE_SIGMA);
-        assert!((pose - exact.pose_covariance).amax() < 1e-6 * pose.amax());
-        assert!((velocity - exact.velocity_covariance).amax() < 1e-5 * velocity.amax());
+        (3..6).for_each(|i| velocity[(i, i)] += 1e-4);
+        assert!((pose - exact.pose_covariance.unwrap()).amax() < 1e-6 * pose.amax());
+        assert!((velocity - exact.velocity_covariance.unwrap()).amax() < 1e-5 * velocity.amax());
         let told = triangle(&exact.pose_covariance);
         let diagonal = [0, 6, 11, 15, 18, 20].map(|i| told[i]);
-        assert_eq!(diagonal, std::array::from_fn(|i| exact.pose_covariance[(i, i)] as f32));
+        assert_eq!(diagonal, std::array::from_fn(|i| exact.pose_covariance.unwrap()[(i, i)] as f32));
     }
 }

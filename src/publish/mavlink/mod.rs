@@ -10,9 +10,9 @@ mod link;
 mod message;
 pub mod parser;
 
-use super::{Feed, Severity, Source, State};
+use super::event::{EventId, Severity};
+use super::{Event, Feed, Source, Stamps, State};
 use crate::config::{Address, MavlinkConfig, StateMessage};
-use crate::mem::List;
 use link::Link;
 use mavlink::dialects::common::{
     MavAutopilot, MavModeFlag, MavSeverity, MavState, MavType, HEARTBEAT_DATA, STATUSTEXT_DATA, TIMESYNC_DATA,
@@ -25,8 +25,10 @@ use std::collections::VecDeque;
 use std::io;
 use std::net::SocketAddr;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
-use stipple_drivers::{host, Fault, FaultKind, Nanos, Span};
+use stipple_drivers::counters::Counter;
+use stipple_drivers::{counters, host, Fault, FaultKind};
 
 /// MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY, and MAV_COMP_ID_AUTOPILOT1.
 const OWN_COMPONENT: u8 = 197;
@@ -65,29 +67,20 @@ const READS: usize = 32;
 /// Answers that may wait.
 const WAITING: usize = 8;
 
-/// How stamps of frames become those of the monotonic clock.
-#[derive(Clone, Copy, Debug)]
-pub struct Stamps {
-    /// This stamp is of this instant.
-    pub stamp: Nanos,
-    pub monotonic: Nanos,
-    /// Seconds of stamps a second.
-    pub speed: f64,
-}
-
-impl Default for Stamps {
-    /// They are of that clock.
-    fn default() -> Stamps {
-        Stamps { stamp: Nanos(0), monotonic: Nanos(0), speed: 1.0 }
-    }
-}
-
-impl Stamps {
-    fn monotonic_us(&self, t: Nanos) -> u64 {
-        let since = t - self.stamp;
-        let since = if self.speed == 1.0 { since } else { Span::from_secs(since.secs() / self.speed) };
-        ((self.monotonic + since).0 / 1000).max(0) as u64
-    }
+counters! {
+    /// What came over the link.
+    pub struct Counts of Counter, read by Counter::get;
+    /// Messages sent, and those of them that are states.
+    mavlink_sent,
+    mavlink_states_sent,
+    /// Messages that the link refused; times that it was opened anew.
+    mavlink_refused,
+    mavlink_reopened,
+    /// Messages received, and bytes that belong to none.
+    mavlink_received,
+    mavlink_bytes_malformed,
+    /// Longest time from a request of TIMESYNC to its answer, µs.
+    mavlink_round_trip_us_most,
 }
 
 /// What odometry does, as an autopilot's operator is told.
@@ -101,13 +94,13 @@ enum Condition {
 }
 
 impl Condition {
-    fn told(self) -> (Severity, &'static str) {
+    fn told(self) -> (EventId, &'static str) {
         match self {
-            Condition::Starting => (Severity::Notice, "odometry: starting"),
-            Condition::Running => (Severity::Notice, "odometry: running"),
-            Condition::Carried => (Severity::Warning, "odometry: no camera frames, carried by inertia"),
-            Condition::DeadReckoned => (Severity::Critical, "odometry: lost, dead reckoning"),
-            Condition::Silent => (Severity::Critical, "odometry: lost, no states"),
+            Condition::Starting => (EventId::OdometryStarting, "odometry: starting"),
+            Condition::Running => (EventId::OdometryRunning, "odometry: running"),
+            Condition::Carried => (EventId::OdometryCarried, "odometry: no camera frames, carried by inertia"),
+            Condition::DeadReckoned => (EventId::OdometryLost, "odometry: lost, dead reckoning"),
+            Condition::Silent => (EventId::OdometryLost, "odometry: lost, no states"),
         }
     }
 
@@ -122,10 +115,20 @@ impl Condition {
 
 /// A text that is being sent, piece by piece.
 struct Text {
-    severity: Severity,
-    text: List<u8, { super::TEXT }>,
+    event: Event,
     id: u16,
     chunk: u8,
+}
+
+/// Where the writer takes a new rate and kind of message from.
+#[derive(Clone)]
+pub struct Settings(Arc<Mutex<Option<(f64, StateMessage)>>>);
+
+impl Settings {
+    /// Takes over from `config` what may change while the writer writes.
+    pub fn set(&self, config: &MavlinkConfig) {
+        *self.0.lock().unwrap_or_else(PoisonError::into_inner) = Some((config.rate_hz, config.message));
+    }
 }
 
 /// The writer. It lives on a thread of its own.
@@ -133,6 +136,8 @@ pub struct Autopilot {
     poll: Poll,
     events: Events,
     feed: Feed,
+    counts: Arc<Counts>,
+    settings: Settings,
     address: Address,
     config: MavlinkConfig,
     stamps: Stamps,
@@ -180,12 +185,14 @@ impl Autopilot {
             Fault::new(FaultKind::Unavailable, "mavlink.link", format!("the system has no epoll for it: {e}"), "")
         };
         let poll = Poll::new().map_err(refused)?;
-        let feed = Feed::new(Waker::new(poll.registry(), FEED).map_err(refused)?);
+        let feed = Feed::new(Waker::new(poll.registry(), FEED).map_err(refused)?, true);
         let now = Instant::now();
         let autopilot = Autopilot {
             poll,
             events: Events::with_capacity(8),
             feed: feed.clone(),
+            counts: Arc::default(),
+            settings: Settings(Arc::default()),
             address,
             config: config.clone(),
             stamps,
@@ -221,6 +228,10 @@ impl Autopilot {
     pub fn run(mut self, over: &AtomicBool, alive: impl Fn()) {
         while !over.load(Ordering::Acquire) {
             alive();
+            let new = self.settings.0.lock().unwrap_or_else(PoisonError::into_inner).take();
+            if let Some((rate_hz, message)) = new {
+                (self.config.rate_hz, self.config.message) = (rate_hz, message);
+            }
             self.open();
             let served = self.serve();
             let wait = served.unwrap_or_else(|e| {
@@ -232,9 +243,14 @@ impl Autopilot {
         }
     }
 
-    fn say(&self, line: String) {
-        // Where many wait, the first ones say what is wrong.
-        let _ = self.feed.0.notices.push(line);
+    /// Where it takes new settings from.
+    pub fn settings(&self) -> Settings {
+        self.settings.clone()
+    }
+
+    /// What was sent and received so far, for whoever asks while it runs.
+    pub fn counts(&self) -> Arc<Counts> {
+        self.counts.clone()
     }
 
     fn open(&mut self) {
@@ -247,8 +263,8 @@ impl Autopilot {
                 // What is left of before the loss is of no use.
                 (self.pending, self.parser) = (None, Parser::new());
                 if std::mem::take(&mut self.is_lost) {
-                    self.feed.0.counts.mavlink_reopened.add(1);
-                    self.say(format!("autopilot: link {} is open", self.config.link));
+                    self.counts.mavlink_reopened.add(1);
+                    self.feed.say(EventId::LinkOpen, format!("autopilot: link {} is open", self.config.link));
                 }
                 self.link = Some(link);
             }
@@ -260,7 +276,10 @@ impl Autopilot {
         (self.link, self.heard) = (None, None);
         self.retry = Instant::now() + SECOND;
         if !std::mem::replace(&mut self.is_lost, true) {
-            self.say(format!("autopilot: link {} is lost: {e}; it is tried again each second", self.config.link));
+            self.feed.say(
+                EventId::LinkLost,
+                format!("autopilot: link {} is lost: {e}; it is tried again each second", self.config.link),
+            );
         }
     }
 
@@ -278,7 +297,7 @@ impl Autopilot {
             return Ok(Duration::ZERO);
         }
         let now = Instant::now();
-        let texts_due = (self.text.is_some() || !self.feed.0.texts.is_empty()).then_some(self.text_due);
+        let texts_due = (self.text.is_some() || !self.feed.0.events.is_empty()).then_some(self.text_due);
         let urgent = (self.pending.is_some() || !self.answers.is_empty()).then_some(now);
         let due = [Some(self.heartbeat_due), Some(self.timesync_due), texts_due, urgent].into_iter().flatten().min();
         // Nothing is written before the link is open, and free.
@@ -296,14 +315,14 @@ impl Autopilot {
             let mut parser = std::mem::take(&mut self.parser);
             let before = parser.malformed;
             parser.take(&bytes[..count], is_whole, |received| self.hear(&received, from));
-            self.feed.0.counts.mavlink_bytes_malformed.add(parser.malformed - before);
+            self.counts.mavlink_bytes_malformed.add(parser.malformed - before);
             self.parser = parser;
         }
         Ok(true)
     }
 
     fn hear(&mut self, received: &Received, from: Option<SocketAddr>) {
-        self.feed.0.counts.mavlink_received.add(1);
+        self.counts.mavlink_received.add(1);
         match &received.heard {
             Heard::Heartbeat(beat) if beat.autopilot != MavAutopilot::MAV_AUTOPILOT_INVALID => {
                 self.hear_autopilot(received, beat, from);
@@ -321,7 +340,7 @@ impl Autopilot {
             // An answer to us has the stamp of our request, whose fields of the target older ends do not know.
             Heard::Timesync(t) if t.tc1 != 0 && t.ts1 == self.asked => {
                 let round_us = (host::monotonic().0.saturating_sub(t.ts1) / 1000).clamp(0, 1_000_000);
-                self.feed.0.counts.mavlink_round_trip_us_most.raise(round_us as u64);
+                self.counts.mavlink_round_trip_us_most.raise(round_us as u64);
             }
             _ => {}
         }
@@ -346,7 +365,10 @@ impl Autopilot {
             // Another vehicle, or ours by another number. It is not answered.
             if !std::mem::replace(&mut self.told_other, true) {
                 let fix = format!("if it is ours, set mavlink.system, which is {ours}");
-                self.say(format!("autopilot: another one on {link}: {kind}, system {system}; {fix}"));
+                self.feed.say(
+                    EventId::AutopilotForeign,
+                    format!("autopilot: another one on {link}: {kind}, system {system}; {fix}"),
+                );
             }
             return;
         }
@@ -354,7 +376,7 @@ impl Autopilot {
             open.answer_to(from);
         }
         if self.heard.replace(Instant::now()).is_none() {
-            self.say(format!("autopilot: heard on {link}: {kind}, system {system}"));
+            self.feed.say(EventId::AutopilotHeard, format!("autopilot: heard on {link}: {kind}, system {system}"));
             // Who was not there did not hear it.
             self.condition = Condition::Starting;
         }
@@ -362,7 +384,7 @@ impl Autopilot {
 
     /// Takes the newest of the states that came.
     fn take_states(&mut self) {
-        let (counts, now) = (&self.feed.0.counts, Instant::now());
+        let now = Instant::now();
         while let Some(state) = self.feed.0.states.pop() {
             let is_frame = state.source != Source::Carried;
             if is_frame {
@@ -374,7 +396,7 @@ impl Autopilot {
             let fills = self.last_frame.is_some_and(|last| now - last >= patience);
             if is_frame || fills {
                 self.last_state = Some(now);
-                counts.mavlink_states_skipped.add(u64::from(self.pending.replace(state).is_some()));
+                self.feed.0.skipped.add(u64::from(self.pending.replace(state).is_some()));
             }
         }
     }
@@ -385,7 +407,10 @@ impl Autopilot {
         if self.heard.is_some_and(|heard| now - heard > UNHEARD) {
             self.heard = None;
             self.link.iter_mut().for_each(Link::forget_peer);
-            self.say(format!("autopilot: no heartbeat on {} for {} s", self.config.link, UNHEARD.as_secs()));
+            self.feed.say(
+                EventId::AutopilotSilent,
+                format!("autopilot: no heartbeat on {} for {} s", self.config.link, UNHEARD.as_secs()),
+            );
         }
         let seems = match (&self.pending, self.last_state) {
             (Some(state), _) => match state.source {
@@ -401,8 +426,8 @@ impl Autopilot {
         }
         if self.condition != seems && now - self.seeming.1 >= LASTING {
             self.condition = seems;
-            let (severity, text) = seems.told();
-            self.feed.text(severity, text);
+            let (id, text) = seems.told();
+            self.feed.event(id, text);
         }
     }
 
@@ -438,7 +463,7 @@ impl Autopilot {
     }
 
     fn write_state(&mut self, state: &State) -> io::Result<()> {
-        let (now, time_us) = (Instant::now(), self.stamps.monotonic_us(state.odometry.t));
+        let (now, time_us) = (Instant::now(), (self.stamps.monotonic(state.odometry.t).0 / 1000).max(0) as u64);
         let behind_us = self.last_sent_us.map_or(-1, |last| last as i64 - time_us as i64);
         let is_late = (0..CLOCK_STEP / 1000).contains(&behind_us);
         let period = Duration::from_secs_f64(1.0 / self.config.rate_hz);
@@ -449,7 +474,7 @@ impl Autopilot {
         let has_failed = self.failed.is_some_and(|since| now - since >= told);
         // A frame that comes a little early is not one too many.
         if is_late || is_ahead || has_failed || now + period / 4 < self.state_due {
-            self.feed.0.counts.mavlink_states_skipped.add(1);
+            self.feed.0.skipped.add(1);
             return Ok(());
         }
         let sent = match self.config.message {
@@ -463,16 +488,16 @@ impl Autopilot {
             },
         };
         if let Some(degrees) = self.axes.take_nose_up().filter(|degrees| !(degrees.abs() < STEEP)) {
-            self.say(format!(
+            self.feed.say(EventId::MountDoubtful, format!(
                 "autopilot: at the first state the vehicle's nose points {degrees:.0} degrees up: compare mavlink.mount_rpy_deg"
             ));
         }
         if sent {
             self.state_due = (self.state_due + period).max(now);
             self.last_sent_us = Some(time_us);
-            self.feed.0.counts.mavlink_states_sent.add(1);
+            self.counts.mavlink_states_sent.add(1);
         } else {
-            self.feed.0.counts.mavlink_states_skipped.add(1);
+            self.feed.0.skipped.add(1);
         }
         Ok(())
     }
@@ -480,19 +505,20 @@ impl Autopilot {
     /// Writes the next piece of a text; whether there was one.
     fn write_text(&mut self) -> io::Result<bool> {
         if self.text.is_none() {
-            let Some((severity, text)) = self.feed.0.texts.pop() else { return Ok(false) };
+            let Some(event) = self.feed.0.events.pop() else { return Ok(false) };
             // Zero says that there is one piece.
-            self.texts = if text.len() > CHUNK { self.texts.wrapping_add(1).max(1) } else { self.texts };
-            let id = if text.len() > CHUNK { self.texts } else { 0 };
-            self.text = Some(Text { severity, text, id, chunk: 0 });
+            let is_long = event.text.len() > CHUNK;
+            self.texts = if is_long { self.texts.wrapping_add(1).max(1) } else { self.texts };
+            let id = if is_long { self.texts } else { 0 };
+            self.text = Some(Text { event, id, chunk: 0 });
         }
-        let Some(Text { severity, text, id, chunk }) = &self.text else { return Ok(false) };
+        let Some(Text { event: Event { id: event, text, .. }, id, chunk }) = &self.text else { return Ok(false) };
         let rest = &text[(*chunk as usize * CHUNK).min(text.len())..];
         let piece = &rest[..rest.len().min(CHUNK)];
         let mut bytes = [0; CHUNK];
         bytes[..piece.len()].copy_from_slice(piece);
         let message = STATUSTEXT_DATA {
-            severity: match severity {
+            severity: match event.severity() {
                 Severity::Notice => MavSeverity::MAV_SEVERITY_NOTICE,
                 Severity::Warning => MavSeverity::MAV_SEVERITY_WARNING,
                 Severity::Critical => MavSeverity::MAV_SEVERITY_CRITICAL,
@@ -524,7 +550,7 @@ impl Autopilot {
         let mut raw = MAVLinkV2MessageRaw::new();
         raw.serialize_message_data(header, data);
         let sent = link.write(raw.raw_bytes())?;
-        let counts = &self.feed.0.counts;
+        let counts = &self.counts;
         counts.mavlink_sent.add(u64::from(sent));
         counts.mavlink_refused.add(u64::from(!sent));
         // Receivers count what is missing.

@@ -1,7 +1,8 @@
 //! The files of a log: MCAP, in chunks of half a second at most. A chunk has a checksum, names its run and numbers its
 //! messages: by itself it says what it is, whatever became of the rest of the file.
 
-use super::{Clocks, Content, Event, EventKind, Limits, Record};
+use super::{Clocks, Content, Event, Limits, Record};
+use crate::publish::event::EventId;
 use crate::vio::Health;
 use ::mcap::records::MessageHeader;
 use ::mcap::{McapError, WriteOptions, Writer};
@@ -33,7 +34,7 @@ const CHANNELS: [(&str, &str, &str); 6] = [
     (
         EVENT,
         "stipple.Event",
-        r#"{"type":"object","properties":{"kind":{"type":"string"},"epoch":{"type":"integer"},"text":{"type":"string"}}}"#,
+        r#"{"type":"object","properties":{"id":{"type":"string"},"epoch":{"type":"integer"},"text":{"type":"string"}}}"#,
     ),
     (COUNTERS, "stipple.Counters", r#"{"type":"object"}"#),
     (
@@ -163,8 +164,8 @@ impl LogFiles {
             }
             Content::Predicted(state) => self.message(PREDICTED, at, Some(state.t_ns), state),
             Content::Rig(rig) => self.message(RIG, at, Some(rig.t_ns), rig),
-            Content::Event(kind, text) => {
-                let event = Event { kind: *kind, epoch: self.epoch, text: String::from_utf8_lossy(text) };
+            Content::Event(id, text) => {
+                let event = Event { id: *id, epoch: self.epoch, text: String::from_utf8_lossy(text) };
                 self.message(EVENT, at, None, &event)
             }
             Content::Counters(list) => {
@@ -215,7 +216,7 @@ impl LogFiles {
     pub fn leave_room(&mut self) -> io::Result<()> {
         let Err(why) = self.needs_room() else { return Ok(()) };
         let text = why.to_string().into();
-        self.message(EVENT, host::monotonic(), None, &Event { kind: EventKind::Disk, epoch: self.epoch, text })?;
+        self.message(EVENT, host::monotonic(), None, &Event { id: EventId::LogEnded, epoch: self.epoch, text })?;
         self.close()?;
         Err(why)
     }

@@ -18,6 +18,8 @@ mod tests;
 use super::threads;
 use crate::limits::CAMERAS_MAX;
 use crate::mem::{cut, Footprint, List};
+use crate::publish::event::EventId;
+use crate::publish::TEXT;
 use crate::vio::{Odometry, Predicted, RigEstimate, Update};
 use crossbeam_queue::ArrayQueue;
 use file::LogFiles;
@@ -33,8 +35,6 @@ use stipple_drivers::{counters, host, Nanos, Pose};
 
 /// Records that may wait for the disk: two minutes at 30 Hz. A card that stalls, stalls for seconds.
 const QUEUE: usize = 4096;
-/// The longest text of an event, bytes; the rest is cut off.
-const TEXT: usize = 200;
 /// A cut-off run loses what came since the last sync, and the sync may take as long again.
 const SYNC_PERIOD: Duration = Duration::from_millis(500);
 /// A process whose thread panicked has ended within a second.
@@ -201,33 +201,11 @@ impl Rig {
     }
 }
 
-/// What an event is about.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum EventKind {
-    Start,
-    /// A sensor was lost or came back.
-    Sensor,
-    /// What is wrong with a recording, cameras that do not see what the calibration says, or what is estimated of the rig and
-    /// not found.
-    Warning,
-    /// A thread hangs, or the system refuses what a run asks for.
-    System,
-    Map,
-    /// The link to the autopilot, and who is there.
-    Autopilot,
-    /// The estimator was reset, or started again elsewhere than dead reckoning led.
-    Epoch,
-    /// Logging ends before the run does.
-    Disk,
-    /// A thread panicked: the process ends.
-    Panic,
-    End,
-}
-
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Event<'a> {
-    pub kind: EventKind,
+    /// Older versions call it `kind`.
+    #[serde(alias = "kind")]
+    pub id: EventId,
     /// Epoch of the state before it; logs of older versions have none.
     #[serde(default)]
     pub epoch: u32,
@@ -257,7 +235,7 @@ enum Content {
     State(State),
     Predicted(PredictedState),
     Rig(Rig),
-    Event(EventKind, List<u8, TEXT>),
+    Event(EventId, List<u8, TEXT>),
     /// From a thread that may allocate; none that is zero.
     Counters(Vec<(Cow<'static, str>, u64)>),
 }
@@ -312,8 +290,8 @@ impl LogSender {
         }
     }
 
-    pub fn event(&self, kind: EventKind, text: &str) {
-        self.0.push(Content::Event(kind, cut(text)));
+    pub fn event(&self, id: EventId, text: &str) {
+        self.0.push(Content::Event(id, cut(text)));
     }
 
     /// Counters as they stand; from a thread that may allocate.
@@ -358,7 +336,7 @@ impl Log {
     fn begin(dir: PathBuf, limits: Limits, what: &str, before: Option<u32>) -> Log {
         let queue = Arc::new(Queue::measured(&mut Footprint::default()));
         let shared = queue.clone();
-        LogSender(queue.clone()).event(EventKind::Start, what);
+        LogSender(queue.clone()).event(EventId::Start, what);
         let thread = super::start(THREAD, move || {
             host::lower_priority(NICE);
             let files = write(&shared, LogFiles::new(dir, limits, before));
@@ -402,7 +380,7 @@ pub fn close_for_panic(what: &str) {
         // Nobody is left to write it.
         return;
     }
-    LogSender(queue.clone()).event(EventKind::Panic, what);
+    LogSender(queue.clone()).event(EventId::Panic, what);
     queue.over.store(true, Ordering::Release);
     let limit = Instant::now() + PANIC_MAX;
     while !queue.closed.load(Ordering::Acquire) && Instant::now() < limit {

@@ -54,6 +54,18 @@ impl Message<'_> {
     }
 }
 
+/// The newest files of the logs in a folder that have at most `bytes` together; the newest whatever it has.
+pub fn newest_files(dir: &Path, bytes: u64) -> io::Result<Vec<PathBuf>> {
+    let mut sum = 0;
+    let all = logs(dir)?.into_iter().rev().map(|(_, file)| file);
+    let mut fits = |file: &PathBuf| {
+        let is_first = sum == 0;
+        sum += file.metadata().map_or(0, |m| m.len());
+        is_first || sum <= bytes
+    };
+    Ok(all.take_while(|file| fits(file)).collect())
+}
+
 /// A file, of which a part is in memory.
 struct Window {
     file: File,

@@ -63,7 +63,7 @@ fn log(dir: &Path, limits: Limits, frames: &[u64], between: usize) -> (Vec<PathB
     }
     sender.rig(RIG);
     sender.counters(vec![("frames".into(), 7), ("resets".into(), 0)]);
-    sender.event(EventKind::End, "over");
+    sender.event(EventId::End, "over");
     let mut counters = vec![];
     let files = log.finish(&mut counters);
     (files, counters)
@@ -290,10 +290,10 @@ fn a_full_queue_loses_and_counts_and_never_waits() {
     let sender = LogSender(queue.clone());
     (0..QUEUE as u64 + 10).for_each(|i| sender.state(state(i)));
     // Cut where a character begins.
-    sender.event(EventKind::Sensor, &"ü".repeat(TEXT));
+    sender.event(EventId::SensorLost, &"ü".repeat(TEXT));
     assert_eq!((queue.records.len(), queue.counts.log_records_lost.get()), (QUEUE, 11));
     while queue.records.pop().is_some() {}
-    sender.event(EventKind::Sensor, &format!("a{}", "ü".repeat(TEXT)));
+    sender.event(EventId::SensorLost, &format!("a{}", "ü".repeat(TEXT)));
     let Content::Event(_, text) = queue.records.pop().unwrap().content else { panic!("an event") };
     assert_eq!(String::from_utf8(text.to_vec()).unwrap(), format!("a{}", "ü".repeat(TEXT / 2 - 1)));
 }
