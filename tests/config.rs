@@ -2,8 +2,10 @@
 //! that ship load.
 #![allow(clippy::unwrap_used)]
 
+use std::fs;
 use std::path::Path;
 use stipple::config::{keys, Board, InjectConfig, StereoMethod};
+use stipple::publish::event::EVENTS;
 use stipple_drivers::baro::BaroOptions;
 use stipple_drivers::gpio::Edge;
 use stipple_drivers::imu::ImuOptions;
@@ -289,6 +291,32 @@ fn keys_page() -> String {
         page += &format!("| `{name}` | {unit} | {default} | {} |{} |\n", key.bound, key.doc.replace('|', "\\|"));
     }
     page
+}
+
+/// Lists the events, for those who search the journal.
+fn events_page() -> String {
+    let mut page = String::from("| id | level | MESSAGE_ID | meaning |\n|---|---|---|---|\n");
+    for (id, meaning) in EVENTS {
+        let level = format!("{:?}", id.severity()).to_lowercase();
+        page += &format!("| `{}` | {level} | `{:032x}` | {} |\n", id.name(), id.message_id(), meaning.trim());
+    }
+    page
+}
+
+#[test]
+fn the_page_of_events_is_up_to_date() {
+    const PAGE: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/board-configs/events.md");
+    let page = fs::read_to_string(PAGE).unwrap();
+    let (before, table) = page.split_once("| id | level").unwrap();
+    if std::env::var_os("STIPPLE_BLESS").is_some() {
+        fs::write(PAGE, format!("{before}{}", events_page())).unwrap();
+        return;
+    }
+    assert_eq!(
+        format!("| id | level{table}"),
+        events_page(),
+        "STIPPLE_BLESS=1 cargo test --test config writes it anew"
+    );
 }
 
 #[test]

@@ -505,7 +505,9 @@ impl Autopilot {
     /// Writes the next piece of a text; whether there was one.
     fn write_text(&mut self) -> io::Result<bool> {
         if self.text.is_none() {
-            let Some(event) = self.feed.0.events.pop() else { return Ok(false) };
+            // What is said of the link to who is at its other end helps nobody.
+            let of_others = std::iter::from_fn(|| self.feed.0.events.pop()).find(|event| !event.id.is_of_link());
+            let Some(event) = of_others else { return Ok(false) };
             // Zero says that there is one piece.
             let is_long = event.text.len() > CHUNK;
             self.texts = if is_long { self.texts.wrapping_add(1).max(1) } else { self.texts };
