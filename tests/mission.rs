@@ -321,9 +321,10 @@ fn a_gpu_that_is_lost_is_opened_again() {
 }
 
 /// Threads that the program starts in a run of a recording, and what makes a run have them. `trigger` needs cameras.
-const THREADS: [(&str, &[&str]); 14] = [
+const THREADS: [(&str, &[&str]); 15] = [
     ("main", &[]),
     ("camera", &[]),
+    ("status", &[]),
     ("imu", &[]),
     ("barometer", &["--set", "baro.chip=bmp388"]),
     ("tracking", &["--set", "frontend.threads=1"]),

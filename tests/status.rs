@@ -283,6 +283,29 @@ fn points_of_the_map_are_told_as_they_are() {
     assert_eq!(json(&mut reader)["type"], "status");
 }
 
+/// A limit that any frame exceeds stands for a board that is too slow, or too hot.
+#[test]
+fn mapper_that_is_slowed_down_goes_on_and_each_change_is_told() {
+    let run = Run::start(|_, command| {
+        command.args(["--board", BOARD, "--set", "map.scale=4", "--set", "governor.frame_share_max=0.05"]);
+    });
+    let mut events = run.ask("{\"subscribe\":[\"event\"]}\n");
+    let slow = run.status_when(|status| status["governor"]["share"].as_f64() < Some(0.2));
+    assert!(slow["governor"]["reason"].as_str().unwrap().contains("of the time between frames"), "{slow}");
+    let mut changes = vec![];
+    while changes.len() < 5 {
+        let event = json(&mut events);
+        if event["id"] == "mapper_share" {
+            changes.push(event["text"].as_str().unwrap().to_string());
+        }
+    }
+    assert!(changes[0].starts_with("the mapper works 70 % of its time: tracking takes "), "{changes:?}");
+    let work = |status: &Value| ["anchors", "iterations"].map(|name| status["map"][name].as_u64().unwrap());
+    let before = work(&run.status());
+    let after = run.status_when(|status| work(status) != before);
+    assert_eq!(after["counters"]["map_restarts"], 0, "it is slow, and does not hang: {after}");
+}
+
 /// All or nothing, and the manager hears when it begins and when it is over.
 #[test]
 fn board_file_is_reloaded_all_or_nothing() {
