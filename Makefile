@@ -19,7 +19,8 @@ PACKAGES := g++ glslang-tools libopencv-calib3d-dev libvulkan1 mesa-vulkan-drive
 #   linux-headers-amd64    builds the modules that Debian does not (tests/hil/prepare.sh)
 #   gpiod                  brings libgpiod2
 #   i2c-tools v4l-utils    what a failing test is looked into with, with gpiod's own tools
-HIL_PACKAGES := busybox-static cpio gpiod i2c-tools kmod linux-headers-amd64 qemu-system-x86 v4l-utils xz-utils
+#   udev                   gives the sensors' nodes to the groups of the service, as on a vehicle
+HIL_PACKAGES := busybox-static cpio gpiod i2c-tools kmod linux-headers-amd64 qemu-system-x86 udev v4l-utils xz-utils
 
 OUT ?= out/demo
 

@@ -10,6 +10,7 @@
 //! those that the kernel stamped. No alignment: a pose is compared with the pose of the same picture.
 #![allow(clippy::unwrap_used)]
 
+mod devices;
 #[path = "../program/panics.rs"]
 mod panics;
 mod plugged;
@@ -18,25 +19,17 @@ mod plugged;
 mod program;
 mod unit;
 
+use devices::{environment, sensors_of_a_board, wait_until, Devices, MS};
 use panics::{panic_after, Panicked};
-use plugged::Uvc;
 use program::{signal, text};
 use serde_json::Value;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
-use std::time::{Duration, Instant};
-use stipple_drivers::host::monotonic;
-use stipple_drivers::record::{self, Format};
 use stipple_drivers::replay::{OpenOptions, Recording};
-use stipple_drivers::source::ImuReading;
-use stipple_drivers::{Frames, Image, Nanos, Span};
-use unit::{counts, Feed};
+use stipple_drivers::{Frames, Image, ImuSample, Nanos, Span};
+use unit::counts;
 
-const MS: i64 = 1_000_000;
-const FPS: u32 = 20;
-/// From when the cameras stream until the recording starts: the program has its threads by then.
-const BEFORE: Span = Span(200 * MS);
 /// From the last picture until the program is stopped: less than a silence.
 const AFTER: Span = Span(250 * MS);
 /// Inertial samples of the recording on either side of its pictures.
@@ -50,11 +43,6 @@ const RMS_MAX: f64 = 0.005;
 const WORST_MAX: f64 = 0.01;
 /// Deviation of a pose, as odometry states it with two dozen landmarks in view, m.
 const STATED_DEVIATION: f64 = 0.004;
-const PATIENCE: Duration = Duration::from_secs(60);
-
-fn environment(name: &str) -> PathBuf {
-    PathBuf::from(std::env::var_os(name).unwrap_or_else(|| panic!("{name} is set by tests/hil/run")))
-}
 
 /// What the devices can give of a recording: samples in steps of the unit, and pictures, of a quarter of the pixels unless
 /// HIL_FLIGHT ends in -full. Not in the machine, where decoding it takes minutes.
@@ -70,24 +58,16 @@ fn prepare() {
         (c.width, c.height, c.fx, c.fy) = (c.width / 2, c.height / 2, c.fx / 2.0, c.fy / 2.0);
         (c.cx, c.cy) = ((c.cx + 0.5) / 2.0 - 0.5, (c.cy + 0.5) / 2.0 - 0.5);
     }
-    let _ = fs::remove_dir_all(&to);
-    let mut sink = record::open(&to, Format::Euroc, &calibration).unwrap();
-    let (mut whole, mut raw) = (Frames::for_rig(&recording.calibration), [vec![], vec![]]);
-    for i in 0..recording.frames.len() {
+    let (first, last) = (recording.frames[0].t, recording.frames.last().unwrap().t);
+    let during = |s: &&ImuSample| (first - AROUND..=last + AROUND).contains(&s.t);
+    let imu: Vec<_> = recording.imu.iter().filter(during).map(|s| (s.t, counts(s))).collect();
+    let mut whole = Frames::for_rig(&recording.calibration);
+    let frames = (0..recording.frames.len()).map(|i| {
         reader.read(i, &mut whole).unwrap();
-        let images: Vec<Image> = whole.images.iter().map(|i| if halved { half(i) } else { i.clone() }).collect();
-        raw.iter_mut().zip(&images).for_each(|(raw, image)| raw.extend(&image.pixels));
-        sink.frames(&Frames { t: whole.t, images, colours: vec![] }).unwrap();
-    }
-    let (first, last) = (recording.frames[0].t, whole.t);
-    let instants: String = recording.frames.iter().map(|f| format!("{}\n", (f.t - first).0)).collect();
-    fs::write(to.join("instants"), instants).unwrap();
-    for sample in recording.imu.iter().filter(|s| (first - AROUND..=last + AROUND).contains(&s.t)) {
-        let sample = unit::sample(sample.t, counts(sample));
-        sink.imu(&ImuReading { sample, ..ImuReading::default() }).unwrap();
-    }
-    sink.finish().unwrap();
-    raw.iter().enumerate().for_each(|(k, raw)| fs::write(to.join(format!("cam{k}.grey")), raw).unwrap());
+        let images = whole.images.iter().map(|i| if halved { half(i) } else { i.clone() }).collect();
+        Frames { t: whole.t, images, colours: vec![] }
+    });
+    devices::write(&to, &calibration, frames, &imu);
 }
 
 fn half(image: &Image) -> Image {
@@ -101,73 +81,7 @@ fn half(image: &Image) -> Image {
     out
 }
 
-/// Both cameras and the unit.
-struct Devices {
-    flight: PathBuf,
-    size: (usize, usize),
-    /// From the recording's first sample to its first picture, and from there to each.
-    lead: Span,
-    stamps: Vec<Span>,
-    cameras: [Uvc; 2],
-    feed: Feed,
-    /// Ports of the hub that were used.
-    ports: u32,
-    /// When the first picture was exposed.
-    start: Nanos,
-}
-
-const SERIALS: [&str; 2] = ["FLIGHT-L", "FLIGHT-R"];
-
-fn camera(flight: &Path, k: usize, port: u32, size: (usize, usize)) -> Uvc {
-    Uvc::playing(port, SERIALS[k], size, FPS, [&flight.join(format!("cam{k}.grey")), &flight.join("instants")])
-}
-
 impl Devices {
-    fn plug() -> Devices {
-        let flight = environment("HIL_FLIGHT");
-        let recording = Recording::open(&flight, &OpenOptions::default()).unwrap();
-        let c = recording.calibration.cameras[0].camera;
-        let size = (c.width, c.height);
-        let first = recording.frames[0].t;
-        let (lead, stamps) = (first - recording.imu[0].t, recording.frames.iter().map(|f| f.t - first).collect());
-        wait_for("the nodes of the test before to go", || !SERIALS.into_iter().any(is_found));
-        let cameras = [camera(&flight, 0, 0, size), camera(&flight, 1, 1, size)];
-        wait_for("both nodes", || SERIALS.into_iter().all(is_found));
-        let feed = Feed::start(recording.imu.iter().map(counts).collect());
-        Devices { flight, size, lead, stamps, cameras, feed, ports: 2, start: Nanos(0) }
-    }
-
-    /// Plays the recording as soon as a program reads the cameras.
-    fn play(&mut self) {
-        wait_for("a program that reads the cameras", || self.cameras.iter().all(Uvc::is_streaming));
-        self.start = self.feed.play_after(monotonic() + BEFORE) + self.lead;
-        let order = format!("play {}", self.start.0);
-        self.cameras.iter_mut().for_each(|c| c.order(&order));
-    }
-
-    /// When picture `k` is exposed.
-    fn exposed(&self, k: usize) -> Nanos {
-        self.start + self.stamps[k]
-    }
-
-    fn end(&self) -> Nanos {
-        self.exposed(self.stamps.len() - 1)
-    }
-
-    /// The picture of a stamp: the last one exposed.
-    fn picture(&self, t: Nanos) -> usize {
-        self.stamps.partition_point(|s| self.start + *s <= t).saturating_sub(1)
-    }
-
-    /// Pulls a camera's plug and puts it into another port.
-    fn replug(&mut self, k: usize, away: Span) {
-        self.cameras[k].order("unplug");
-        wait_until(monotonic() + away);
-        self.cameras[k] = camera(&self.flight, k, self.ports, self.size);
-        self.cameras[k].order(&format!("play {}", self.start.0));
-        self.ports += 1;
-    }
-
     /// Every sample that was given while the recording played arrived, once, in order; answers what was recorded.
     fn samples_are_whole(&self, dir: &Path) -> Recording {
         let kept = Recording::open(&dir.join("kept"), &OpenOptions::default()).unwrap();
@@ -209,30 +123,9 @@ impl Devices {
     fn board(&self, dir: &Path) -> PathBuf {
         let plain = fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join(program::BOARD)).unwrap();
         let path = dir.join("board.toml");
-        let [left, right] = SERIALS;
-        let text = format!(
-            "{plain}
-            [rig]
-            calibration = \"{}/mav0\"
-            [camera]
-            devices = [\"serial:{left}\", \"serial:{right}\"]
-            rate_hz = {FPS}.0
-            stamp = \"frame-start\"
-            pair_tolerance_s = 0.02
-            [imu]
-            chip = \"mpu-6500\"
-            device = \"hil-imu i2c\"
-            rate_hz = {}.0
-            [gpio]
-            data_ready = \"hil-gpio:imu-ready\"
-            [record]
-            # All of them: PNG is slow here, and written when there is time.
-            ring_frames = 250
-            ",
-            self.flight.display(),
-            unit::RATE_HZ,
-        );
-        fs::write(&path, text).unwrap();
+        let sensors = sensors_of_a_board(&format!("{}/mav0", self.flight.display()), self.fps);
+        // All frames are recorded: PNG is slow here, and written when there is time.
+        fs::write(&path, format!("{plain}{sensors}[record]\nring_frames = 250\n")).unwrap();
         path
     }
 
@@ -307,24 +200,6 @@ fn apart(devices: &Devices, one: &Path, other: &Path) -> (usize, f64, f64) {
     (n, (sum / n.max(1) as f64).sqrt(), worst)
 }
 
-fn wait_for(what: &str, there: impl Fn() -> bool) {
-    let begun = Instant::now();
-    while !there() {
-        assert!(begun.elapsed() < PATIENCE, "waited for {what}");
-        std::thread::sleep(Duration::from_millis(10));
-    }
-}
-
-/// The kernel has made its node.
-fn is_found(serial: &str) -> bool {
-    let nodes = fs::read_dir("/sys/class/video4linux").into_iter().flatten().flatten();
-    nodes.filter_map(|n| fs::read_to_string(n.path().join("name")).ok()).any(|name| name.contains(serial))
-}
-
-fn wait_until(t: Nanos) {
-    std::thread::sleep(Duration::from_nanos((t - monotonic()).0.max(0) as u64));
-}
-
 fn median_and_worst(mut late: Vec<i64>) -> String {
     late.sort_unstable();
     let us = |i: usize| late[i] / 1000;
@@ -382,7 +257,7 @@ fn flight_through_the_kernel_is_the_flight_from_a_folder() {
     );
     // A drone waits for its pose before it takes off: a second is enough for that.
     let without = count(&r, "frames_without_odometry");
-    assert!(n as u64 + without == frames && without <= u64::from(FPS), "{n} of {frames}");
+    assert!(n as u64 + without == frames && without <= u64::from(devices.fps), "{n} of {frames}");
     assert!(rms < RMS_MAX && worst < WORST_MAX && worst_seen < 0.001);
     assert_eq!((&r["heap_after_seal"], &r["pace"]), (&0.into(), &"live".into()));
     let quiet = ["camera_lost", "camera_silent", "imu_lost", "imu_silent", "imu_missing", "imu_frozen", "imu_overflow"];

@@ -10,7 +10,9 @@
 #                that what runs there meets its times however slow the host is; one processor
 #   -w N         with -i: N instructions a nanosecond, by a kernel that is told that its counter of cycles runs N times as
 #                fast: a machine N times as fast to what runs there, in N times the wall time of what keeps it busy
-#   -S           boot systemd of the shared root as PID 1; CMD then runs as a unit
+#   -S           boot systemd of the shared root as PID 1, up to multi-user.target with what Debian starts there and nothing
+#                that was installed besides; CMD runs as a unit of its own
+#   -P COMMAND   with -S: a shell command that runs before systemd does, as one installs on an image
 #   -o FOLDER    mounted read-write at /out in the guest, $OUT there (default: a temporary folder)
 #   -A "ARGS"    more of the kernel's command line
 #   -q "ARGS"    more arguments of QEMU
@@ -20,10 +22,10 @@
 set -euo pipefail
 here=$(dirname "$(realpath "$0")")
 HIL=${HIL:-$(realpath "$here/../..")/target/hil}
-accel=${HIL_ACCEL:-tcg} memory=2048 cpus=1 seconds=300 out= counted=0 work=1 systemd=0 qemu_more= append_more=
-usage() { sed -n 2,19p "$0"; exit 2; }
-while getopts t:m:s:iw:So:A:q: option; do case $option in
-  t) seconds=$OPTARG;; m) memory=$OPTARG;; s) cpus=$OPTARG;; i) counted=1;; w) work=$OPTARG;; S) systemd=1;;
+accel=${HIL_ACCEL:-tcg} memory=2048 cpus=1 seconds=300 out= counted=0 work=1 systemd=0 install=true qemu_more= append_more=
+usage() { sed -n 2,21p "$0"; exit 2; }
+while getopts t:m:s:iw:SP:o:A:q: option; do case $option in
+  t) seconds=$OPTARG;; m) memory=$OPTARG;; s) cpus=$OPTARG;; i) counted=1;; w) work=$OPTARG;; S) systemd=1;; P) install=$OPTARG;;
   o) out=$OPTARG;; A) append_more=$OPTARG;; q) qemu_more=$OPTARG;; *) usage;; esac; done
 shift $((OPTIND-1)); [ $# -gt 0 ] || usage
 kernel=$HIL/kernel
@@ -113,30 +115,29 @@ for i in 1 2 3 4 5 6 7 8 9 10; do
   done; sleep 0.05
 done
 if [ $systemd = 1 ]; then
-  mkdir -p /run/systemd/system
-  cat >/run/systemd/system/hil.target <<U
-[Unit]
-Requires=basic.target
-After=basic.target
-AllowIsolate=yes
-Wants=hil-cmd.service
-U
+  umount /sys/fs/cgroup 2>/dev/null
+  # In the overlay only: no marker of a container, no first boot, no fstab, no unit that this machine's owner installed, no
+  # rebuilding of indices, and tmpfiles leaves the temporary folder.
+  rm -f /.dockerenv /run/.containerenv; : >/etc/fstab
+  rm -rf /etc/systemd/system/*.wants /etc/systemd/system/*.requires
+  [ -s /etc/machine-id ] || echo 0123456789abcdef0123456789abcdef >/etc/machine-id
+  touch /etc/.updated /var/.updated
+  mkdir -p /etc/tmpfiles.d; ln -sf /dev/null /etc/tmpfiles.d/tmp.conf
+  for u in systemd-binfmt.service proc-sys-fs-binfmt_misc.automount systemd-pcrphase-sysinit.service dev-hugepages.mount; do
+    ln -sf /dev/null /etc/systemd/system/\$u; done
+  (cd $folder; $install) >\$P 2>&1 </dev/null || { echo 2 >/out/rc; sync; reboot -f; }
+  mkdir -p /run/systemd/system/multi-user.target.wants
+  ln -s ../hil-cmd.service /run/systemd/system/multi-user.target.wants/
   cat >/run/systemd/system/hil-cmd.service <<U
 [Unit]
 After=basic.target dbus.socket
 [Service]
-Type=oneshot
+Type=exec
 StandardOutput=file:\$P
 StandardError=inherit
 ExecStart=/bin/bash -c '/bin/bash /out/cmd.sh; echo \\\$\\\$? >/out/rc; sync; systemctl reboot -ff'
 U
-  umount /sys/fs/cgroup 2>/dev/null
-  # In the overlay only: no marker of a container, no first-boot or fstab work, and tmpfiles leaves the temporary folder.
-  rm -f /.dockerenv /run/.containerenv; : >/etc/fstab
-  mkdir -p /etc/tmpfiles.d; ln -sf /dev/null /etc/tmpfiles.d/tmp.conf
-  for u in systemd-binfmt.service proc-sys-fs-binfmt_misc.automount systemd-pcrphase-sysinit.service dev-hugepages.mount; do
-    ln -sf /dev/null /etc/systemd/system/\$u; done
-  exec /lib/systemd/systemd --unit=hil.target --show-status=no --log-target=kmsg --log-level=info
+  exec /lib/systemd/systemd --unit=multi-user.target --show-status=no --log-target=kmsg --log-level=info
 fi
 /bin/bash /out/cmd.sh >\$P 2>&1 </dev/null
 echo \$? >/out/rc

@@ -1,4 +1,5 @@
 //! An MPU-6500 that plays a recording: hil-imu's registers and its data-ready line, sample by sample as they are due.
+#![allow(dead_code)] // one test looks at what came, another plays alone
 
 use std::fmt::Write as _;
 use std::fs::{File, OpenOptions};
@@ -40,6 +41,7 @@ pub fn sample(t: Nanos, c: Counts) -> ImuSample {
 
 /// The unit, which never rests: what it gives before the recording starts is the recording backwards.
 pub struct Feed {
+    length: Span,
     /// Sample `n` is due `n` periods after it.
     first: Nanos,
     begins: Arc<AtomicUsize>,
@@ -52,6 +54,7 @@ impl Feed {
     pub fn start(recorded: Vec<Counts>) -> Feed {
         let (begins, given, stop): (Arc<AtomicUsize>, Arc<Mutex<Given>>, Arc<AtomicBool>) = Default::default();
         let lines = std::env::var("HIL_LINES").expect("set by lines.sh");
+        let length = Span(recorded.len() as i64 * PERIOD.0);
         let open = |path: &Path| OpenOptions::new().write(true).open(path).unwrap();
         let registers = open(Path::new("/sys/kernel/debug/hil-imu/regs"));
         let ready = open(&Path::new(&lines).join("sim_gpio3/pull"));
@@ -68,7 +71,12 @@ impl Feed {
                 give(&registers, &ready, counts);
             }
         });
-        Feed { first, begins, given, stop, thread: Some(thread) }
+        Feed { length, first, begins, given, stop, thread: Some(thread) }
+    }
+
+    /// After how long it gives the recording again.
+    pub fn length(&self) -> Span {
+        self.length
     }
 
     fn due(&self, n: usize) -> Nanos {

@@ -10,8 +10,8 @@
 //! long in its controls, at first for 4 ms.
 //!
 //! Lines on the standard input: `skip N` (send nothing for N pictures), `corrupt N` (with the error bit), `short N` (end
-//! after half), `silent N` (as skip, and said so), `expose N` (for so many 0.1 ms from then on), `play NS`, `unplug`. Lines on
-//! the standard output: `streaming`, `sent K`, `not sent K`.
+//! after half), `silent N` (as skip, and said so), `expose N` (for so many 0.1 ms from then on), `repeat NS` (before
+//! `play`: the file begins again each NS), `play NS`, `unplug`. Lines on the standard output: `streaming`, `sent K`, `not sent K`.
 
 #[path = "jpeg.rs"]
 mod jpeg;
@@ -44,6 +44,21 @@ struct Film {
     instants: Vec<i64>,
 }
 
+impl Film {
+    /// The newest picture exposed at `t`, counted on over the times that the film `repeats`.
+    fn newest(&self, t: i64, repeats: Option<i64>) -> i64 {
+        let (times, t) = repeats.map_or((0, t), |every| (t.div_euclid(every), t.rem_euclid(every)));
+        times * self.instants.len() as i64 + self.instants.partition_point(|due| *due <= t) as i64 - 1
+    }
+
+    /// When picture `k` is exposed.
+    fn due(&self, k: i64, repeats: Option<i64>) -> Option<i64> {
+        let n = self.instants.len() as i64;
+        let times = repeats.map_or(0, |every| k / n * every);
+        self.instants.get(repeats.map_or(k, |_| k % n) as usize).map(|due| times + due)
+    }
+}
+
 /// What the host asked for and has not been answered.
 #[derive(Default)]
 struct Bus {
@@ -61,6 +76,8 @@ struct Orders {
     short: u32,
     /// When the first picture of a file is exposed.
     play: Option<i64>,
+    /// After how long the file begins again, ns.
+    repeat: Option<i64>,
 }
 
 type Shared<T> = Arc<(Mutex<T>, Condvar)>;
@@ -114,6 +131,7 @@ fn obey(line: &str, shared: &Shared<Orders>, bus: &Shared<Bus>) {
         "short" => orders.short += number as u32,
         "expose" => bus.0.lock().expect("whole").exposure = number as u32,
         "play" => orders.play = Some(number),
+        "repeat" => orders.repeat = Some(number),
         "unplug" => std::process::exit(0),
         _ => panic!("unknown order {line}"),
     }
@@ -130,22 +148,22 @@ fn expose(
 ) {
     let told = || {
         let orders = orders.1.wait_while(orders.0.lock().expect("whole"), |o| o.play.is_none()).expect("whole");
-        orders.play.expect("waited for")
+        (orders.play.expect("waited for"), orders.repeat)
     };
-    let start = film.map_or(0, |_| told());
+    let (start, repeats) = film.map_or((0, None), |_| told());
     let now = || stipple_drivers::host::monotonic().0 - start;
     let (mut last, mut fid) = (-1, 0u8);
     loop {
         drop(bus.1.wait_while(bus.0.lock().expect("whole"), |b| !b.streaming).expect("whole"));
-        let newest = film.map_or(now() / camera.period, |f| f.instants.partition_point(|t| *t <= now()) as i64 - 1);
+        let newest = film.map_or(now() / camera.period, |f| f.newest(now(), repeats));
         let k = newest.max(last + 1);
-        let due = film.map_or(Some(k * camera.period), |f| f.instants.get(k as usize).copied());
+        let due = film.map_or(Some(k * camera.period), |f| f.due(k, repeats));
         let Some(due) = due else { return park() };
         std::thread::sleep(Duration::from_nanos((due - now()).max(0) as u64));
         let size = Descriptors::picture_bytes(camera);
         let picture = match film {
             None => pattern::packed(&camera.format, k as u32, camera.width, camera.height),
-            Some(film) => film.frames[k as usize * size..][..size].to_vec(),
+            Some(film) => film.frames[k as usize % film.instants.len() * size..][..size].to_vec(),
         };
         last = k;
         let (skip, corrupt, short) = {
