@@ -68,7 +68,16 @@ pub fn sensors() -> Vec<(String, &'static str)> {
 /// Which of the nodes a shell can open that has the unit's properties, with or without its policy on devices.
 pub fn tried(nodes: &[String], policy: bool) -> Vec<String> {
     // One process has its folders. The clock's protection alone makes a policy.
-    let mut left_out = vec!["ExecStart=", "Type=", "WatchdogSec=", "Restart", "StateDirectory", "CacheDirectory"];
+    let mut left_out = vec![
+        "ExecStart=",
+        "ExecReload=",
+        "RuntimeDirectory",
+        "Type=",
+        "WatchdogSec=",
+        "Restart",
+        "StateDirectory",
+        "CacheDirectory",
+    ];
     left_out.extend(["ConfigurationDirectory", "Environment="]);
     if !policy {
         left_out.extend(["Device", "ProtectClock="]);

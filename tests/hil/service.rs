@@ -322,6 +322,34 @@ fn process_has_no_privilege_but_its_priorities() {
 
 #[test]
 #[ignore = "needs the machine of tests/hil/service.sh"]
+fn status_is_told_and_a_reload_is_an_event_of_the_journal() {
+    let vehicle = vehicle();
+    let life = vehicle.tracks(None);
+    let status: Value = serde_json::from_str(&manager::output("stipple", &["status", "--json"])).unwrap();
+    assert!(status["posed"].as_u64() >= Some(1) && status["state"].is_object(), "{status}");
+    let stranger = "setpriv --reuid=65534 --regid=65534 --clear-groups stipple status 2>&1";
+    let refused = manager::output("sh", &["-c", stranger]);
+    assert!(refused.contains("only root, the user that flies"), "{refused}");
+    let events = |id: &str| manager::output("journalctl", &["-b", "-o", "cat", &format!("STIPPLE_EVENT={id}")]);
+    fs::write(BOARD, format!("{}[governor]\nframe_share_max = 0.5\n", vehicle.board)).unwrap();
+    assert!(systemctl(&["reload", "stipple"]));
+    wait_for("the reload", || events("reloaded").contains("reloaded: governor.frame_share_max"));
+    fs::write(BOARD, vehicle.board.replace("splats = 4000", "splats = 5000")).unwrap();
+    assert!(systemctl(&["reload", "stipple"]));
+    wait_for("its refusal", || events("reload_refused").contains("a restart is needed for budget.splats"));
+    fs::write(BOARD, &vehicle.board).unwrap();
+    let p = properties();
+    assert_eq!((&*p["ActiveState"], p["MainPID"].parse()), ("active", Ok(life.pid)));
+    println!(
+        "status: {} of {} frames with a pose; {}",
+        status["posed"],
+        status["frames"],
+        events("reload_refused").trim()
+    );
+}
+
+#[test]
+#[ignore = "needs the machine of tests/hil/service.sh"]
 fn stop_leaves_results() {
     let vehicle = vehicle();
     let life = vehicle.tracks(None);
