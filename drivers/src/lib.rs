@@ -31,6 +31,7 @@ pub mod sim;
 pub mod source;
 pub mod types;
 pub mod v4l2;
+mod ycbcr;
 
 #[cfg(test)]
 #[path = "../../tests/hil/jpeg.rs"]

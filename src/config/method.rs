@@ -202,8 +202,8 @@ section! {
     cameras: u32 = 1, Bound::Within(1.0, CAMERAS_MAX as f64);
     /// rectified (cameras 0 and 1 without distortion) or fisheye (raw images of Kannala-Brandt lenses, all of their view).
     projection: Projection = Projection::Rectified;
-    /// Whether red, green and blue are trained, of recordings in colour: three times the images and the loss of a grey map, and
-    /// 24 bytes a Gaussian more.
+    /// Whether red, green and blue are trained, of cameras or recordings in colour: three times the images and the loss of a grey
+    /// map, and 24 bytes a Gaussian more. A camera without a format in colour is refused.
     colour: bool = false;
     /// Gaussians that an anchor may add for every training step that keyframes got so far on average; 0: no limit. More make
     /// every later step dearer and are not trained themselves: raise it where the mapper has time after the flight.

@@ -35,8 +35,9 @@ section! {
     /// serial:NUMBER of the USB device, bus:INFO of `v4l2-ctl --list-devices`, or path:LINK of /dev/v4l/by-path. Numbers of
     /// /dev/video change from boot to boot. A live run needs it.
     devices: Vec<String> = Vec::new();
-    /// Pixel format: grey, y10, y12, y16, y10p, y12p, nv12, yuyv or mjpeg; empty: the first of these that the camera has. Name
-    /// a grey one where the camera has several: it costs least.
+    /// Pixel format: grey, y10, y12, y16, y10p, y12p, nv12, yuyv, rggb, grbg, gbrg, bggr (a sensor's own pixels of 8 bits) or
+    /// mjpeg; empty: the first of these that the camera has, with map.colour the first from nv12 on. Name a grey one where the
+    /// camera has several and the map is grey: it costs least.
     format: String = String::new();
     /// Frames a second, the trigger's too. More than 30 costs CPU time and gains little.
     rate_hz: f64 = 20.0, Bound::Within(0.1, 1000.0);
@@ -199,8 +200,9 @@ impl CameraConfig {
         }
     }
 
-    /// What the driver is asked for, with images of the calibration's size; an error where the board names no camera.
-    pub fn settings(&self, calibration: &Calibration) -> Result<Settings, Fault> {
+    /// What the driver is asked for, with images of the calibration's size, the first `colours` cameras in colour; an error where
+    /// the board names no camera.
+    pub fn settings(&self, calibration: &Calibration, colours: usize) -> Result<Settings, Fault> {
         let fault = |what: String, fix: &str| Fault::new(FaultKind::Config, "camera.devices", what, fix);
         if self.devices.is_empty() {
             let fix = "write [camera] with devices = [\"serial:..\", ..] and rate_hz (`v4l2-ctl --list-devices`)";
@@ -211,6 +213,7 @@ impl CameraConfig {
         Ok(Settings {
             devices: devices.map_err(|why| fault(why, ""))?,
             format: self.format().map_err(|why| fault(why.to_string(), ""))?,
+            colours,
             width,
             height,
             rate_hz: self.rate_hz,

@@ -1,6 +1,7 @@
 //! What a flight reads: the sensors that a board file names, a recording, or a flight rendered by the simulator. All three
 //! become one `Input`, so that everything behind it is wired once.
 
+use super::memory;
 use super::status::print_err;
 use super::threads;
 use crate::config::{Board, InjectConfig};
@@ -276,7 +277,7 @@ fn open(path: &Path, board: &Board) -> Result<(Calibration, Sensors), Fault> {
     let calibration = calibration(path, board)?;
     let data_ready = board.gpio.data_ready().map(|(line, edge)| DataReady::open(&line, edge)).transpose()?;
     let imu = CorrectedImu { source: options.open(data_ready)?, correction: calibration.imu.correction };
-    let rig = v4l2::Rig::open(board.camera.settings(&calibration)?, &calibration)?;
+    let rig = cameras(&calibration, board)?;
     rig.describe().iter().for_each(|line| print_err(format_args!("stipple: {line}")));
     let frames: Box<dyn FrameSource> = match board.gpio.trigger() {
         None => Box::new(rig),
@@ -289,14 +290,20 @@ fn open(path: &Path, board: &Board) -> Result<(Calibration, Sensors), Fault> {
     Ok((calibration, Sensors { frames, imu: Box::new(imu), aids }))
 }
 
+/// Opens the cameras of a board; those that its map trains in colour give it.
+fn cameras(calibration: &Calibration, board: &Board) -> Result<v4l2::Rig, Fault> {
+    let colours = memory::colours(calibration, board).len();
+    v4l2::Rig::open(board.camera.settings(calibration, colours)?, calibration)
+}
+
 /// Opens each part of a board by itself, where not all can be opened: its name, and what was found or is wrong.
 pub fn parts(path: &Path, board: &Board) -> Vec<(&'static str, Result<String, Fault>)> {
     let mut parts = vec![];
     let calibration = calibration(path, board);
-    let cameras = calibration.as_ref().map_err(Fault::clone).and_then(|calibration| {
-        let rig = v4l2::Rig::open(board.camera.settings(calibration)?, calibration)?;
-        Ok(rig.describe().join("; "))
-    });
+    let cameras = calibration
+        .as_ref()
+        .map_err(Fault::clone)
+        .and_then(|calibration| Ok(cameras(calibration, board)?.describe().join("; ")));
     let count = |c: &Calibration| format!("{} cameras", c.cameras.len());
     parts.push(("calibration", calibration.as_ref().map(count).map_err(Fault::clone)));
     let unopened =

@@ -25,6 +25,7 @@ fn settings(devices: &[&str], width: usize, height: usize, fps: u32) -> Settings
     Settings {
         devices: devices.iter().map(|d| Select::parse(d).unwrap()).collect(),
         format: None,
+        colours: 0,
         width,
         height,
         rate_hz: f64::from(fps),

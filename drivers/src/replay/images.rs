@@ -8,6 +8,7 @@ use super::pairing::{FrameFiles, ImageFile};
 use crate::input;
 use crate::jpeg_scan::check_whole;
 use crate::types::{luma, Colour, Frames, Image};
+use crate::ycbcr::Matrix;
 use std::fmt;
 use std::io::{Cursor, ErrorKind};
 use std::path::Path;
@@ -242,12 +243,8 @@ fn read_jpeg_colour(bytes: &[u8], decoded: &mut Vec<u8>, out: &mut Image, colour
     decoder.decode_into(decoded).map_err(undecodable)?;
     let [red, green, blue] = colour;
     for (i, px) in decoded.chunks_exact(3).enumerate() {
-        // JFIF: full range, BT.601.
-        let (y, cb, cr) = (f32::from(px[0]), f32::from(px[1]) - 128.0, f32::from(px[2]) - 128.0);
         out.pixels[i] = px[0];
-        red.pixels[i] = (y + 1.402 * cr).round() as u8;
-        green.pixels[i] = (y - 0.344_136 * cb - 0.714_136 * cr).round() as u8;
-        blue.pixels[i] = (y + 1.772 * cb).round() as u8;
+        [red.pixels[i], green.pixels[i], blue.pixels[i]] = Matrix::JFIF.rgb(px[0], px[1], px[2]);
     }
     Ok(())
 }

@@ -2,7 +2,7 @@
 //!
 //! A thin layer of our own over the ioctls (`kernel`, `uapi`): buffers are the kernel's, mapped once; frames are paired
 //! while they still lie there (`stamps::pair`), and a pair is written into the caller's images by the one copy there is,
-//! which also makes 8-bit grey of them (`pixels`). All decisions are functions of numbers, and all system calls go through
+//! which also makes 8-bit grey of them (`pixels`), and colours where they are asked for (`colour`). All decisions are functions of numbers, and all system calls go through
 //! one trait, so tests meet each error of each call without a camera.
 //!
 //! Stamps are the driver's, brought to the middle of the exposure of the first row (`stamps::Timing`), which is followed from
@@ -14,6 +14,8 @@
 //!
 //! Nothing is allocated between opening and losing a camera, except by the JPEG decoder and to word a warning.
 
+mod bayer;
+mod colour;
 mod controls;
 mod exposure;
 mod fault;
@@ -43,8 +45,11 @@ use kernel::NODES_MAX;
 pub struct Settings {
     /// One for each camera, in the order of the calibration; or one, with the pictures of all side by side.
     pub devices: Vec<Select>,
-    /// `None`: the first of the formats, in the order of `Format`, that the camera has in its size.
+    /// `None`: the first of the formats, in the order of `Format`, that the camera has in its size; where cameras are read in
+    /// colour, the first in colour.
     pub format: Option<Format>,
+    /// Cameras that are read in colour, the first of the calibration.
+    pub colours: usize,
     /// Columns of one camera's picture, pixels.
     pub width: usize,
     /// Rows of one camera's picture, pixels.
@@ -72,7 +77,7 @@ crate::counters! {
     camera_frames,
     /// Calls that waited in vain.
     camera_timeouts,
-    /// Bytes written from the kernel's buffers into images: of grey pictures once each pixel.
+    /// Bytes written from the kernel's buffers into images: of grey pictures once each pixel, four times in colour.
     camera_bytes_copied,
     /// Images missing before one that came, by its number and by its stamp.
     camera_missed_by_sequence,
@@ -124,6 +129,10 @@ fn check(settings: &Settings, cameras: &[RigCamera]) -> Result<(), Fault> {
         let (w, h) = (c.width, c.height);
         let what = format!("the calibration is of {w}x{h}, the cameras are asked for {width}x{height}");
         return wrong(what, "calibrate at the size that is used");
+    }
+    if let Some(grey) = settings.format.filter(|f| settings.colours > 0 && !f.has_colour()) {
+        let what = format!("map.colour = true, but camera.format = \"{}\" is grey", grey.name());
+        return wrong(what, node::NO_COLOUR);
     }
     let rate = settings.rate_hz;
     if !(rate > 0.0 && rate.is_finite()) {

@@ -3,6 +3,7 @@
 
 #![allow(unsafe_code)]
 
+use super::colour::{least_bytes_in_colour, Stated};
 use super::controls::Controls;
 use super::exposure::{Exposure, Followed};
 use super::fault::refused;
@@ -13,6 +14,7 @@ use super::pixels::{least_bytes, Format, Part};
 use super::uapi::*;
 use super::Settings;
 use crate::types::{Nanos, Span};
+use crate::ycbcr::Matrix;
 use crate::{Fault, FaultKind};
 use std::io;
 use std::path::Path;
@@ -28,6 +30,10 @@ const BUFFERS_MIN: u32 = 3;
 /// VIDEO_MAX_FRAME of the kernel.
 const BUFFERS_MAX: u32 = 32;
 
+/// What to do about a camera without colour.
+pub(super) const NO_COLOUR: &str =
+    "set map.colour = false, or camera.format to nv12, yuyv, rggb, grbg, gbrg, bggr or mjpeg where the camera has one";
+
 /// A node that streams.
 pub(super) struct Node {
     kernel: Arc<dyn Kernel>,
@@ -39,6 +45,8 @@ pub(super) struct Node {
     kind: u32,
     /// Format of its pictures.
     pub format: Format,
+    /// From their YCbCr to RGB.
+    pub matrix: Matrix,
     /// The whole picture.
     pub part: Part,
     /// From frame to frame.
@@ -66,6 +74,7 @@ struct Set {
     stride: usize,
     /// Most bytes of a picture.
     bytes: usize,
+    stated: Stated,
 }
 
 /// A filled buffer that we hold, until `Node::give_back` takes it.
@@ -100,15 +109,22 @@ pub(super) struct Failure {
 }
 
 impl Node {
-    /// Opens and starts a node whose pictures have `parts` cameras side by side.
-    pub(super) fn open(kernel: Arc<dyn Kernel>, path: &Path, parts: usize, want: &Settings) -> Result<Node, Fault> {
+    /// Opens and starts a node whose pictures have `parts` cameras side by side, some of which are read in colour where it is
+    /// `coloured`.
+    pub(super) fn open(
+        kernel: Arc<dyn Kernel>,
+        path: &Path,
+        (parts, coloured): (usize, bool),
+        want: &Settings,
+    ) -> Result<Node, Fault> {
         let fd = kernel.open(path).map_err(|e| cannot_open(path, &e))?;
         let part = Part { x: 0, width: want.width * parts, height: want.height, stride: 0 };
         let (name, format) = (path.display().to_string(), Format::Grey);
         let (period, exposure, buffers) = (Span(0), Exposure::unknown(), Vec::new());
-        let mut node = Node { kernel, fd, name, kind: CAPTURE, format, part, period, exposure, buffers };
+        let matrix = Matrix::JFIF;
+        let mut node = Node { kernel, fd, name, kind: CAPTURE, format, matrix, part, period, exposure, buffers };
         node.identify()?;
-        let least = node.negotiate(want)?;
+        let least = node.negotiate(want, coloured)?;
         node.period = node.set_rate(want)?;
         node.exposure = Controls::list(&*node.kernel, node.fd, &node.name)?.apply(want)?;
         node.map_buffers(least)?;
@@ -140,13 +156,22 @@ impl Node {
     }
 
     /// Sets format and size; answers the least bytes of a picture.
-    fn negotiate(&mut self, want: &Settings) -> Result<usize, Fault> {
+    fn negotiate(&mut self, want: &Settings, coloured: bool) -> Result<usize, Fault> {
         let offers = offer::list(&*self.kernel, self.fd, self.kind)
             .map_err(|(call, e)| self.refused("list its formats", call, e))?;
         let (width, height) = (self.part.width as u32, self.part.height as u32);
         let acceptable = |f: &Format| want.format.is_none_or(|w| w == *f);
-        let fits = |f: Format| offers.iter().find(|o| f.is(o.fourcc) && o.has(width, height));
-        let Some((format, offered)) = Format::all().filter(acceptable).find_map(|f| Some((f, fits(f)?))) else {
+        let first = |is: fn(Format, u32) -> bool| {
+            let fits = |f: Format| Some((f, offers.iter().find(|o| is(f, o.fourcc) && o.has(width, height))?));
+            Format::all().filter(acceptable).find_map(fits)
+        };
+        // Beside cameras in colour one in grey has their format, too, if it can: tracking compares their levels.
+        let in_colour = if want.colours > 0 { first(Format::is_in_colour) } else { None };
+        let any = if coloured { None } else { first(Format::is) };
+        let Some((format, offered)) = in_colour.or(any) else {
+            if coloured {
+                return Err(self.not_in_colour(want, &offers));
+            }
             let asked = want.format.map_or("a format that can be read", Format::name);
             return Err(self.not_offered(&format!("{asked} at {width}x{height}"), &offers));
         };
@@ -159,29 +184,46 @@ impl Node {
         // A driver that leaves the stride out means rows without padding.
         let row_bytes = format.row_bytes(self.part.width);
         self.part.stride = if set.stride == 0 { row_bytes } else { set.stride };
-        let least = least_bytes(format, self.part);
+        let least = if coloured { least_bytes_in_colour(format, self.part) } else { least_bytes(format, self.part) };
         if self.part.stride < row_bytes || set.bytes < least {
             let said = format!("says rows of {} bytes and pictures of {}", set.stride, set.bytes);
             return Err(self.at_fault(format!("{said}, too few for {width}x{height}")));
         }
-        self.format = format;
+        (self.format, self.matrix) = (format, set.stated.matrix());
         Ok(least)
     }
 
     fn set_format(&self, fourcc: u32) -> Result<Set, Fault> {
         let (width, height) = (self.part.width as u32, self.part.height as u32);
         if self.kind == CAPTURE {
-            let mut f = FormatSingle { kind: CAPTURE, width, height, fourcc, field: FIELD_NONE, ..Default::default() };
+            let mut f = FormatSingle { kind: CAPTURE, width, height, fourcc, ..Default::default() };
+            (f.field, f.private) = (FIELD_NONE, FORMAT_EXTENDED);
             self.ioctl("set its format", Request::SetFormat(&mut f))?;
             let (stride, bytes) = (f.bytes_per_line as usize, f.size_image as usize);
-            return Ok(Set { fourcc: f.fourcc, width: f.width, height: f.height, stride, bytes });
+            let stated = Stated { colorspace: f.colorspace, encoding: f.encoding, quantization: f.quantization };
+            return Ok(Set { fourcc: f.fourcc, width: f.width, height: f.height, stride, bytes, stated });
         }
         let mut f = FormatMulti { width, height, fourcc, num_planes: 1, ..Default::default() };
         (f.kind, f.field) = (CAPTURE_MULTI, FIELD_NONE);
         self.ioctl("set its format", Request::SetFormatMulti(&mut f))?;
         // The first plane has the luma, or everything.
         let (stride, bytes) = (f.planes[0].bytes_per_line as usize, f.planes[0].size_image as usize);
-        Ok(Set { fourcc: f.fourcc, width: f.width, height: f.height, stride, bytes })
+        let (encoding, quantization) = (f.encoding.into(), f.quantization.into());
+        let stated = Stated { colorspace: f.colorspace, encoding, quantization };
+        Ok(Set { fourcc: f.fourcc, width: f.width, height: f.height, stride, bytes, stated })
+    }
+
+    /// The fault of a camera without a format in colour, or without the one that the board names.
+    fn not_in_colour(&self, want: &Settings, offers: &[offer::Offer]) -> Fault {
+        let asked = want.format.map_or(String::new(), |f| format!("{} ", f.name()));
+        let list = offer::text(&*self.kernel, self.fd, offers);
+        let size = format!("{}x{}", self.part.width, self.part.height);
+        let separate = offers.iter().any(|o| o.fourcc == u32::from_le_bytes(*b"NM12"));
+        let why = if separate { " (colours of NM12 are not read)" } else { "" };
+        let what = format!(
+            "map.colour = true, but the camera gives no {asked}picture in colour at {size}{why}; it offers {list}"
+        );
+        Fault::new(FaultKind::Config, &self.name, what, NO_COLOUR)
     }
 
     fn at_fault(&self, what: String) -> Fault {

@@ -1,6 +1,7 @@
 //! The cameras of a rig as one source of frames: takes what lies ready in each node, pairs it, writes the pairs into the
 //! caller's images, and opens again what was lost. What waits and what goes on is described in `v4l2`.
 
+use super::colour::{scratch_bytes, to_colour};
 use super::fault::refused;
 use super::find::find;
 use super::kernel::{Kernel, Linux, Ready, NODES_MAX};
@@ -8,9 +9,9 @@ use super::node::{Node, Taken};
 use super::pixels::{to_grey, Part, Unreadable};
 use super::stamps::{pair, spread, Pairing, Timing};
 use super::stream::{stopped, Stream};
-use super::{check, CameraCounters, Select, Settings};
+use super::{check, CameraCounters, Settings};
 use crate::source::{FrameSource, SourceFault, Wait};
-use crate::types::{Frames, Image, Nanos, Span};
+use crate::types::{Colour, Frames, Image, Nanos, Span};
 use crate::{Calibration, Fault, FaultKind, RigCamera};
 use std::sync::Arc;
 
@@ -57,6 +58,9 @@ impl Rig {
     ) -> Result<Rig, Fault> {
         let cameras = calibration.cameras.clone();
         check(&settings, &cameras)?;
+        // Each part of a node's picture is a camera's.
+        let width = settings.width * (cameras.len() / settings.devices.len());
+        let scratch = if settings.colours > 0 { scratch_bytes(width, settings.height) } else { 0 };
         let mut rig = Rig {
             lost: settings.devices.iter().map(|_| None).collect(),
             kernel,
@@ -65,12 +69,12 @@ impl Rig {
             streams: Vec::new(),
             told: false,
             last: Nanos::MIN,
-            scratch: Vec::new(),
+            scratch: Vec::with_capacity(scratch),
             counters: CameraCounters::default(),
             warnings: Vec::with_capacity(WARNINGS_MAX),
         };
-        for select in &rig.settings.devices {
-            let stream = rig.open_stream(select, None)?;
+        for index in 0..rig.settings.devices.len() {
+            let stream = rig.open_stream(index, None)?;
             rig.streams.push(Some(stream));
         }
         Ok(rig)
@@ -92,9 +96,11 @@ impl Rig {
         self.cameras.len() / self.settings.devices.len()
     }
 
-    fn open_stream(&self, select: &Select, last_image: Option<Nanos>) -> Result<Stream, Fault> {
-        let path = find(&*self.kernel, select)?;
-        let node = Node::open(self.kernel.clone(), &path, self.parts(), &self.settings)?;
+    fn open_stream(&self, index: usize, last_image: Option<Nanos>) -> Result<Stream, Fault> {
+        let path = find(&*self.kernel, &self.settings.devices[index])?;
+        // Cameras in colour are the first, and a node's are in their order.
+        let cameras = (self.parts(), index * self.parts() < self.settings.colours);
+        let node = Node::open(self.kernel.clone(), &path, cameras, &self.settings)?;
         let timing =
             Timing { point: self.settings.stamp, exposure: node.exposure.now, transfer: self.settings.transfer };
         Ok(Stream::new(node, timing, self.kernel.now(), last_image))
@@ -122,7 +128,7 @@ impl Rig {
         for index in 0..self.lost.len() {
             let due = self.lost[index].as_ref().is_some_and(|l| l.retry_at <= self.kernel.now());
             if due && self.streams[index].is_none() {
-                match self.open_stream(&self.settings.devices[index], Some(Nanos::MIN)) {
+                match self.open_stream(index, Some(Nanos::MIN)) {
                     Ok(stream) => self.streams[index] = Some(stream),
                     Err(fault) => self.lose(index, fault),
                 }
@@ -237,22 +243,29 @@ impl Rig {
         }
         let parts = self.parts();
         let (mut any, mut absent) = (false, 0);
+        let mut colours = frames.colours.iter_mut();
         for (camera, image) in frames.images.iter_mut().enumerate() {
+            let mut colour = colours.next();
             let of = self.streams[camera / parts].as_ref();
             let Some((stream, held)) = of.and_then(|s| Some((s, s.held.front()?))) else {
-                image.pixels.fill(0);
+                blacken(image, colour);
                 absent += 1;
                 continue;
             };
             let part = Part { x: camera % parts * image.width, ..stream.node.part };
             let bytes = stream.node.bytes(&held.filled);
-            let copied = to_grey(stream.node.format, bytes, part, &mut self.scratch, image);
-            self.counters.camera_bytes_copied += image.pixels.len() as u64;
+            let (format, matrix) = (stream.node.format, &stream.node.matrix);
+            let planes = if colour.is_some() { 4 } else { 1 };
+            let copied = match &mut colour {
+                None => to_grey(format, bytes, part, &mut self.scratch, image),
+                Some(colour) => to_colour((format, matrix), bytes, part, &mut self.scratch, image, colour),
+            };
+            self.counters.camera_bytes_copied += planes * image.pixels.len() as u64;
             let Err(why) = copied else {
                 any = true;
                 continue;
             };
-            image.pixels.fill(0);
+            blacken(image, colour);
             match why {
                 Unreadable::Short { .. } => self.counters.camera_images_short += 1,
                 Unreadable::Undecodable(_) => self.counters.camera_images_undecodable += 1,
@@ -263,11 +276,6 @@ impl Rig {
         }
         if !any {
             return false;
-        }
-        // A grey camera's colours are equal.
-        for (colour, image) in frames.colours.iter_mut().zip(&frames.images) {
-            colour.iter_mut().for_each(|plane| plane.copy_from(image));
-            self.counters.camera_bytes_copied += 3 * image.pixels.len() as u64;
         }
         frames.t = t;
         self.last = t;
@@ -325,13 +333,21 @@ impl Rig {
     }
 }
 
+/// Makes a picture black.
+fn blacken(image: &mut Image, colour: Option<&mut Colour>) {
+    colour.into_iter().flatten().chain([image]).for_each(|plane| plane.pixels.fill(0));
+}
+
 impl FrameSource for Rig {
     fn next(&mut self, timeout: Span, frames: &mut Frames) -> Result<Wait, SourceFault> {
         let shaped =
             |(image, c): (&Image, &RigCamera)| (image.width, image.height) == (c.camera.width, c.camera.height);
-        if frames.images.len() != self.cameras.len() || !frames.images.iter().zip(&self.cameras).all(shaped) {
+        let colours = frames.colours.iter().flat_map(|colour| colour.iter().zip(std::iter::repeat(&self.cameras[0])));
+        let images = frames.images.iter().zip(&self.cameras).chain(colours);
+        let coloured = frames.colours.len() <= self.settings.colours;
+        if frames.images.len() != self.cameras.len() || !coloured || !images.into_iter().all(shaped) {
             let what = "frames are not shaped by the calibration that the cameras were opened with";
-            return Err(SourceFault::Broken(Fault::new(FaultKind::Internal, "cameras", what, "use Frames::for_rig")));
+            return Err(SourceFault::Broken(Fault::new(FaultKind::Internal, "cameras", what, "use Frames::in_colour")));
         }
         let deadline = self.kernel.now() + timeout;
         if self.next_frame(deadline, frames)? {

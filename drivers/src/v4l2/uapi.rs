@@ -8,6 +8,8 @@ pub(super) const CAPTURE: u32 = 1;
 pub(super) const CAPTURE_MULTI: u32 = 9;
 pub(super) const MEMORY_MMAP: u32 = 1;
 pub(super) const FIELD_NONE: u32 = 1;
+/// `V4L2_PIX_FMT_PRIV_MAGIC`.
+pub(super) const FORMAT_EXTENDED: u32 = 0xfeed_cafe;
 /// Most planes of a picture (`VIDEO_MAX_PLANES`).
 pub(super) const PLANES_MAX: usize = 8;
 
@@ -115,7 +117,10 @@ structures! {
     #[repr(align(8))]
     FormatSingle {
         kind: u32, padding: u32, width: u32, height: u32, fourcc: u32, field: u32,
-        bytes_per_line: u32, size_image: u32, rest: [[u32; 11]; 4],
+        bytes_per_line: u32, size_image: u32, colorspace: u32,
+        /// `FORMAT_EXTENDED`: the fields after it are meant.
+        private: u32,
+        flags: u32, encoding: u32, quantization: u32, rest: [[u32; 13]; 3],
     }
 
     PlaneFormat {
@@ -126,7 +131,7 @@ structures! {
     #[repr(align(8))]
     FormatMulti {
         kind: u32, padding: u32, width: u32, height: u32, fourcc: u32, field: u32, colorspace: u32,
-        planes: [PlaneFormat; PLANES_MAX], num_planes: u8, rest: [u8; 19],
+        planes: [PlaneFormat; PLANES_MAX], num_planes: u8, flags: u8, encoding: u8, quantization: u8, rest: [u8; 16],
     }
 
     /// The interval from frame to frame is `numerator` / `denominator` seconds.
@@ -194,7 +199,8 @@ impl QueryControl {
 /// ioctls hold the size of their structure.
 const _: () = {
     assert!(cfg!(all(target_pointer_width = "64", target_endian = "little")));
-    assert!(size_of::<FormatMulti>() == 208);
+    assert!(size_of::<FormatMulti>() == 208 && size_of::<FormatSingle>() == 208);
+    assert!(std::mem::offset_of!(FormatSingle, encoding) == 8 + 36);
     assert!(std::mem::offset_of!(FormatMulti, num_planes) == 8 + 180);
     assert!(std::mem::offset_of!(Buffer, stamp_s) == 24);
     assert!(std::mem::offset_of!(Buffer, sequence) == 56);

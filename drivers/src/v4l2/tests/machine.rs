@@ -41,6 +41,8 @@ pub struct Cam {
     pub events: VecDeque<(i64, u32, i64)>,
     /// What S_FMT makes of the size, and of bytes a row.
     pub adjust: fn(&mut (u32, u32, u32)),
+    /// Colour space, encoding and quantization that S_FMT answers.
+    pub stated: [u32; 3],
     pub buffer_bytes: usize,
     pub buffers_given: u32,
     /// poll reports an error and no call says which.
@@ -99,6 +101,7 @@ impl Cam {
             subscribed: Vec::new(),
             events: VecDeque::new(),
             adjust: |_| {},
+            stated: [0; 3],
             buffer_bytes: 64,
             buffers_given: 4,
             hangs: false,
@@ -307,12 +310,15 @@ fn answer(c: &mut Cam, request: Request) -> io::Result<()> {
             (c.adjust)(&mut got);
             (a.width, a.height, a.bytes_per_line) = got;
             a.size_image = c.buffer_bytes as u32;
+            assert_eq!(a.private, FORMAT_EXTENDED);
+            [a.colorspace, a.encoding, a.quantization] = c.stated;
         }
         Request::SetFormatMulti(a) => {
             let mut got = (a.width, a.height, a.width);
             (c.adjust)(&mut got);
             (a.width, a.height, a.planes[0].bytes_per_line) = got;
             a.planes[0].size_image = c.buffer_bytes as u32;
+            (a.colorspace, a.encoding, a.quantization) = (c.stated[0], c.stated[1] as u8, c.stated[2] as u8);
         }
         Request::SetParm(a) => match c.interval {
             Some((num, den)) => (a.capability, a.numerator, a.denominator) = (CAP_TIME_PER_FRAME, num, den),

@@ -2,6 +2,7 @@
 #![cfg(test)]
 #![allow(clippy::unwrap_used)]
 
+mod colours;
 mod errors;
 mod exposures;
 mod machine;
@@ -21,6 +22,7 @@ fn settings(devices: &[&str]) -> Settings {
     Settings {
         devices: devices.iter().map(|d| Select::parse(d).unwrap()).collect(),
         format: None,
+        colours: 0,
         width: WIDTH,
         height: HEIGHT,
         rate_hz: 20.0,
