@@ -374,6 +374,33 @@ fn vivid_gives_the_same_picture_in_every_format_of_a_multi_planar_queue() {
     }
 }
 
+/// Bars of three quarters of white, yellow, cyan, green, magenta, red, blue and black, by the kernel's own encoder.
+#[test]
+#[ignore = "needs vivid: make hil"]
+fn vivid_bars_come_in_their_colours() {
+    const LEVEL: u8 = 191;
+    let calibration = rig_of(1, 640, 360);
+    let mut frames = Frames::in_colour(&calibration, 1);
+    let bayer = [Format::Rggb, Format::Grbg, Format::Gbrg, Format::Bggr];
+    for format in [Format::Nv12, Format::Yuyv].into_iter().chain(bayer) {
+        let mut rig = open(&Settings { colours: 1, ..vivid(format) }, &calibration);
+        next(&mut rig, &mut frames, no_loss);
+        let at = |x: usize| [0, 1, 2].map(|c| frames.colours[0][c].at(x, 300));
+        let bars: Vec<[u8; 3]> = (0..8).map(|bar| at(40 + 80 * bar)).collect();
+        println!("{}: {bars:?}", rig.describe()[0]);
+        for (bar, colour) in bars.iter().enumerate() {
+            // Green goes after four bars, red after two, blue after one.
+            let exact = [2, 4, 1].map(|bit| if bar & bit == 0 { LEVEL } else { 0 });
+            // Half a level of luma and of chroma, by their coefficients, on each side.
+            assert!((0..3).all(|c| colour[c].abs_diff(exact[c]) <= 4), "{}: bar {bar} is {colour:?}", format.name());
+        }
+    }
+    let rig = open(&Settings { colours: 1, format: None, ..vivid(Format::Grey) }, &calibration);
+    assert!(rig.describe()[0].contains(": nv12 "), "{:?}", rig.describe());
+    let fault = refused(Settings { colours: 1, ..vivid(Format::Grey) }, &calibration).to_string();
+    assert!(fault.contains("map.colour"), "{fault}");
+}
+
 #[test]
 #[ignore = "needs vivid: make hil"]
 fn vivid_errors_of_the_kernel_are_said_and_survived() {
