@@ -76,9 +76,10 @@ pub(super) fn least_bytes_in_colour(format: Format, part: Part) -> usize {
     }
 }
 
-/// Bytes of `scratch` that pictures of this size take at most: a JPEG of three components, and a row of chroma.
-pub(super) fn scratch_bytes(width: usize, height: usize) -> usize {
-    3 * width * height + 2 * width
+/// Bytes of `scratch` that pictures of this size take at most: a row of colours; in colour, a JPEG of three components and a
+/// row of chroma.
+pub(super) fn scratch_bytes(in_colour: bool, width: usize, height: usize) -> usize {
+    3 * width + if in_colour { 3 * width * height } else { 0 }
 }
 
 /// Writes a part of a picture, which has the size of `out`: its grey as `to_grey` does, and its colours.

@@ -165,7 +165,7 @@ impl Node {
             let fits = |f: Format| Some((f, offers.iter().find(|o| is(f, o.fourcc) && o.has(width, height))?));
             Format::all().filter(acceptable).find_map(fits)
         };
-        // Beside cameras in colour one in grey has their format, too, if it can: tracking compares their levels.
+        // A camera in grey beside one in colour gives luma, too, where it can: tracking compares their levels.
         let in_colour = if want.colours > 0 { first(Format::is_in_colour) } else { None };
         let any = if coloured { None } else { first(Format::is) };
         let Some((format, offered)) = in_colour.or(any) else {

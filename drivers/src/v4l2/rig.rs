@@ -60,7 +60,7 @@ impl Rig {
         check(&settings, &cameras)?;
         // Each part of a node's picture is a camera's.
         let width = settings.width * (cameras.len() / settings.devices.len());
-        let scratch = if settings.colours > 0 { scratch_bytes(width, settings.height) } else { 0 };
+        let scratch = scratch_bytes(settings.colours > 0, width, settings.height);
         let mut rig = Rig {
             lost: settings.devices.iter().map(|_| None).collect(),
             kernel,
