@@ -73,7 +73,7 @@ fn prepare() {
     let mut imu: Vec<(Nanos, Counts)> = there.iter().map(|s| (s.t, counts(s))).collect();
     imu.extend(there[1..there.len() - 1].iter().rev().map(|s| {
         let gyro_body = error * 2.0 - s.gyro_body;
-        (back(s.t), counts(&ImuSample { gyro_body, ..(*s).clone() }))
+        (back(s.t), counts(&ImuSample { gyro_body, ..**s }))
     }));
     devices::write(&to, &recording.calibration, frames, &imu);
     let sensors = sensors_of_a_board("mav0", FPS);
