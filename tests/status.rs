@@ -250,6 +250,13 @@ fn strangers_are_refused_and_told_so() {
         return;
     };
     assert!(refused.contains("only root, the user that flies and the members of its group"), "{refused}");
+    // The command says it, too.
+    let mut status = Command::new("setpriv");
+    status.args(["--reuid=65534", "--regid=65534", "--clear-groups", env!("CARGO_BIN_EXE_stipple"), "status"]);
+    for more in [vec![], vec!["--json"]] {
+        let o = status.args(more).arg(&run.out).output().unwrap();
+        assert!(o.status.code() == Some(69) && text(&o).contains("the user that flies"), "{}", text(&o));
+    }
     // Root's group has 0.
     assert!(as_nobody("--groups=0").unwrap().contains("\"status\""));
 }

@@ -3,7 +3,7 @@
 use crate::publish::status::message::{Message, StatusMessage};
 use crate::run::status::print_out;
 use std::fmt::Write as _;
-use std::io::{BufRead, BufReader, Read, Write};
+use std::io::{BufRead, BufReader, ErrorKind, Read, Write};
 use std::os::unix::fs::FileTypeExt;
 use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
@@ -49,11 +49,8 @@ pub fn status(args: &Args) -> Result<(), Fault> {
     }
     run.ask(r#"{"get":"status"}"#)?;
     let line = run.line()?;
-    if args.json {
-        print_out(line.trim_end());
-        return Ok(());
-    }
     match run.read(&line)? {
+        Message::Status(_) if args.json => print_out(line.trim_end()),
         Message::Status(status) => print_out(screen(&status)),
         other => return Err(no_status(&run.path, &format!("it answers {other:?}"))),
     }
@@ -98,8 +95,11 @@ impl Connection {
     }
 
     pub fn ask(&mut self, request: &str) -> Result<(), Fault> {
-        let asked = self.from.get_mut().write_all(format!("{request}\n").as_bytes());
-        asked.map_err(|e| silent(&self.path, &e))
+        match self.from.get_mut().write_all(format!("{request}\n").as_bytes()) {
+            // It was refused before it asked: the next line says why.
+            Err(e) if e.kind() == ErrorKind::BrokenPipe => Ok(()),
+            asked => asked.map_err(|e| silent(&self.path, &e)),
+        }
     }
 
     /// The next line, whole.
