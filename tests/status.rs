@@ -249,7 +249,7 @@ fn strangers_are_refused_and_told_so() {
         eprintln!("left out: setpriv or python3 is missing, or this is not root");
         return;
     };
-    assert!(refused.contains("only root, the user that flies and the members of its group"), "{refused}");
+    assert!(refused.contains("only root, the user that flies and members of the groups"), "{refused}");
     // The command says it, too.
     let mut status = Command::new("setpriv");
     status.args(["--reuid=65534", "--regid=65534", "--clear-groups", env!("CARGO_BIN_EXE_stipple"), "status"]);

@@ -99,10 +99,12 @@ pub fn device_and_inode(fd: i32) -> Option<(u64, u64)> {
     }
 }
 
-/// Whether the process at the other end of a Unix socket is root's, this user's, or one of a member of this process's group.
+/// Whether the process at the other end of a Unix socket is root's, this user's, or in a group that this process is in.
 pub fn peer_is_trusted(socket: i32) -> std::io::Result<bool> {
+    /// More groups than these count as none.
+    const GROUPS: usize = 256;
     let mut peer = libc::ucred { pid: 0, uid: u32::MAX, gid: u32::MAX };
-    let mut groups = [u32::MAX; 256];
+    let (mut theirs, mut ours) = ([u32::MAX; GROUPS], [u32::MAX; GROUPS]);
     let option = |name, to: *mut libc::c_void, bytes: usize| {
         let mut bytes = bytes as libc::socklen_t;
         // SAFETY: `to` is `bytes` long, and any bytes are valid there; a descriptor that is no socket makes the call fail.
@@ -114,12 +116,14 @@ pub fn peer_is_trusted(socket: i32) -> std::io::Result<bool> {
         }
     };
     option(libc::SO_PEERCRED, (&raw mut peer).cast(), size_of_val(&peer))?;
-    // One in more groups than this counts as a member of none.
-    let count =
-        option(libc::SO_PEERGROUPS, groups.as_mut_ptr().cast(), size_of_val(&groups)).unwrap_or(0) / size_of::<u32>();
-    // SAFETY: neither call can fail.
-    let (uid, gid) = unsafe { (libc::geteuid(), libc::getegid()) };
-    Ok(peer.uid == 0 || peer.uid == uid || peer.gid == gid || groups[..count].contains(&gid))
+    let bytes = option(libc::SO_PEERGROUPS, theirs.as_mut_ptr().cast(), size_of_val(&theirs)).unwrap_or(0);
+    let theirs = &theirs[..bytes / size_of::<u32>()];
+    // SAFETY: `ours` has room for as many groups as are asked for; the other two cannot fail.
+    let (count, uid, gid) =
+        unsafe { (libc::getgroups(GROUPS as i32, ours.as_mut_ptr()), libc::geteuid(), libc::getegid()) };
+    let ours = &ours[..usize::try_from(count).unwrap_or(0)];
+    let is_ours = |group: &u32| *group == gid || ours.contains(group);
+    Ok(peer.uid == 0 || peer.uid == uid || is_ours(&peer.gid) || theirs.iter().any(is_ours))
 }
 
 static STOP: AtomicBool = AtomicBool::new(false);

@@ -2,7 +2,7 @@
 //!
 //! A connection sends lines of JSON: `{"get":"status"}`, `"metrics"` or `"points"`, or
 //! `{"subscribe":["state","event","status"],"hz":10}`; it gets lines of JSON (`message`), after the line for points their bytes
-//! (`cloud`). GET /status and GET /metrics of HTTP are answered, too. Root, this user and its group may ask. Memory is fixed: so many
+//! (`cloud`). GET /status and GET /metrics of HTTP are answered, too. Root, this user and members of its groups may ask. Memory is fixed: so many
 //! connections, so many bytes that wait for each; what does not fit is left out and counted.
 
 pub mod client;
@@ -169,7 +169,8 @@ impl StatusServer {
                     Err(error)
                 }
                 (Ok(false), _) => {
-                    let error = "only root, the user that flies and the members of its group may ask".to_string();
+                    let error =
+                        "only root, the user that flies and members of the groups of its process may ask".to_string();
                     refuse(&mut stream, error.clone());
                     Err(error)
                 }
