@@ -16,8 +16,13 @@ mkdir -p /etc/stipple
 cp "$1/board.toml" /etc/stipple/
 (cd "$1" && find mav0 -name sensor.yaml -exec cp --parents {} /etc/stipple/ \;)
 systemctl --root=/ enable stipple
-# Where the machine waits for the host's files, its clock leaps: what is needed later is read before.
-libraries=$(ldd /usr/bin/stipple /usr/bin/systemctl /usr/bin/journalctl /usr/lib/*/libvulkan_lvp.so | awk '/=> \//{print $3}' | sort -u)
+# Where the machine waits for the host's files, its clock leaps, which a watchdog takes for silence: what is needed later is
+# read before.
+tools=$(command -v chrt getent journalctl stat systemctl)
+driver=$(ls /usr/lib/*/libvulkan_lvp.so)
+modules=$(modprobe -a -D vhci-hcd uvcvideo i2c-dev hil-imu gpio-sim | awk '/^insmod/{print $2}')
+# shellcheck disable=SC2086
+libraries=$(ldd /usr/bin/stipple $tools $driver | awk '/=> \//{print $3}' | sort -u)
 find "$1" -type f ! -name '*.png' -exec cat {} + >/dev/null
 # shellcheck disable=SC2086
-cat $libraries /usr/lib/*/libvulkan_lvp.so /usr/bin/{systemctl,journalctl} "$1"/../bin/hil{_service,-uvc-camera} "$1"/../ko/* >/dev/null
+cat $modules $libraries $tools $driver "$1"/../bin/hil{_service,-uvc-camera} >/dev/null
