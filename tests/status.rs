@@ -295,10 +295,11 @@ fn points_of_the_map_are_told_as_they_are() {
 fn mapper_that_is_slowed_down_goes_on_and_each_change_is_told() {
     let run = Run::start(|_, command| {
         command.args(["--board", BOARD, "--set", "map.scale=4", "--set", "governor.frame_share_max=0.05"]);
+        command.args(["--set", "frontend.threads=1"]);
     });
     let mut events = run.ask("{\"subscribe\":[\"event\"]}\n");
     let slow = run.status_when(|status| status["governor"]["share"].as_f64() < Some(0.2));
-    assert!(slow["governor"]["reason"].as_str().unwrap().contains("of the time between frames"), "{slow}");
+    assert!(slow["governor"]["reason"].as_str().unwrap().contains("of its time for a frame"), "{slow}");
     let mut changes = vec![];
     while changes.len() < 5 {
         let event = json(&mut events);

@@ -46,7 +46,7 @@ pub struct Measured {
     pub hottest: Option<(f64, f64, String)>,
     pub power_w: Option<f64>,
     pub throttled: bool,
-    /// Longest time that tracking a frame took, as a share of the time between frames.
+    /// Longest time that tracking a frame took, as a share of what it has: with each of its threads, the time between frames.
     pub frame_share: f64,
     /// Frames that were overwritten before tracking took them.
     pub overwritten: u64,
@@ -54,6 +54,8 @@ pub struct Measured {
 
 pub struct Governor {
     config: GovernorConfig,
+    /// Threads of tracking.
+    threads: u32,
     board: Board,
     next: Instant,
     /// Steps down from the whole time.
@@ -162,9 +164,11 @@ impl EndsWithInput for PathBuf {
 }
 
 impl Governor {
-    pub fn new(config: &GovernorConfig, sys: &Path) -> Governor {
+    /// `threads` track; `sys` is /sys.
+    pub fn new(config: &GovernorConfig, threads: u32, sys: &Path) -> Governor {
         Governor {
             config: config.clone(),
+            threads,
             board: Board::find(sys),
             next: Instant::now() + PERIOD,
             steps: 0,
@@ -201,7 +205,7 @@ impl Governor {
         self.next = now + PERIOD;
         let new_frames = frames.saturating_sub(std::mem::replace(&mut self.frames, frames));
         let overwritten = overwritten.saturating_sub(std::mem::replace(&mut self.overwritten, overwritten));
-        let latency_s = latency_most().as_secs_f64();
+        let latency_s = latency_most().as_secs_f64() / f64::from(self.threads);
         let frame_share = latency_s * (new_frames + overwritten) as f64 / elapsed.as_secs_f64();
         let measured = match self.config.enabled {
             true => Measured { frame_share, overwritten, ..self.board.measure(self.config.temperature_max_c) },
@@ -219,7 +223,7 @@ impl Governor {
         let reason = if m.overwritten > 0 {
             Some(format!("{} frames came before tracking was ready", m.overwritten))
         } else if slow {
-            Some(format!("tracking takes {:.0} % of the time between frames", 100.0 * m.frame_share))
+            Some(format!("tracking takes {:.0} % of its time for a frame", 100.0 * m.frame_share))
         } else if let Some((_, c, name)) = hot {
             Some(format!("{name} is at {c:.0} degrees"))
         } else if let Some(w) = power {
@@ -326,11 +330,11 @@ mod tests {
     #[test]
     fn mapper_slows_down_for_each_reason_and_comes_back_when_there_is_none() {
         let config = GovernorConfig { power_max_w: 10.0, ..GovernorConfig::default() };
-        let governor = || Governor::new(&config, Path::new("/nowhere"));
+        let governor = || Governor::new(&config, 1, Path::new("/nowhere"));
         let calm = Measured { frame_share: 0.3, ..Measured::default() };
         let reasons = [
             (Measured { overwritten: 2, ..calm.clone() }, "2 frames came before", 0.49),
-            (Measured { frame_share: 0.8, ..calm.clone() }, "tracking takes 80 %", 0.7),
+            (Measured { frame_share: 0.9, ..calm.clone() }, "tracking takes 90 %", 0.7),
             (Measured { hottest: Some((1.0, 76.0, "cpu".into())), ..calm.clone() }, "cpu is at 76 degrees", 0.7),
             (Measured { power_w: Some(12.0), ..calm.clone() }, "12.0 W", 0.7),
             (Measured { throttled: true, ..calm.clone() }, "Linux has lowered the clocks", 0.7),
@@ -349,19 +353,19 @@ mod tests {
         }
         // Between the limits nothing changes.
         let mut g = governor();
-        g.judge(&Measured { frame_share: 0.8, ..calm.clone() });
-        assert!((0..100).all(|_| g.judge(&Measured { frame_share: 0.5, ..calm.clone() }).is_none()));
+        g.judge(&Measured { frame_share: 0.9, ..calm.clone() });
+        assert!((0..100).all(|_| g.judge(&Measured { frame_share: 0.7, ..calm.clone() }).is_none()));
         g.set(&GovernorConfig { enabled: false, ..config.clone() });
         assert_eq!((g.judge(&Measured::default()).is_some(), g.share().0), (true, 1.0));
     }
 
     #[test]
     fn time_that_tracking_takes_is_compared_with_the_time_between_frames() {
-        let mut g = Governor::new(&GovernorConfig::default(), Path::new("/nowhere"));
+        let mut g = Governor::new(&GovernorConfig::default(), 2, Path::new("/nowhere"));
         let start = g.next;
-        assert_eq!(g.look(start, 20, 0, || Duration::from_millis(20)), None, "40 % of 50 ms");
+        assert_eq!(g.look(start, 20, 0, || Duration::from_millis(40)), None, "40 % of twice 50 ms");
         assert_eq!(g.look(start, 20, 0, || panic!("not yet")), None);
-        let line = g.look(start + PERIOD, 40, 0, || Duration::from_millis(40));
-        assert!(line.unwrap().contains("tracking takes 80 %"));
+        let line = g.look(start + PERIOD, 40, 0, || Duration::from_millis(90));
+        assert!(line.unwrap().contains("tracking takes 90 %"));
     }
 }

@@ -27,7 +27,13 @@ impl Steering {
     /// Governs the mapper of `board`, and reads the board of a `managed` run again at SIGHUP.
     pub fn new(board: &Board, source: Option<&BoardSource>, managed: bool) -> Steering {
         let reload = source.filter(|_| managed).map(|source| (source.clone(), board.clone(), host::reload_asked_for()));
-        Steering { governor: board.map.enabled.then(|| Governor::new(&board.governor, Path::new("/sys"))), reload }
+        Steering {
+            governor: board
+                .map
+                .enabled
+                .then(|| Governor::new(&board.governor, board.frontend.threads, Path::new("/sys"))),
+            reload,
+        }
     }
 
     /// Reads the board again where that is asked for; answers what it came to.
