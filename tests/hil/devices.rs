@@ -10,7 +10,7 @@ use stipple_drivers::host::monotonic;
 use stipple_drivers::record::{self, Format};
 use stipple_drivers::replay::{OpenOptions, Recording};
 use stipple_drivers::source::ImuReading;
-use stipple_drivers::{Calibration, Frames, Nanos, Span};
+use stipple_drivers::{Calibration, Colour, Frames, Nanos, Span};
 
 pub const MS: i64 = 1_000_000;
 /// From when the cameras stream until the recording starts: the program has its threads by then.
@@ -21,13 +21,36 @@ pub fn environment(name: &str) -> PathBuf {
     PathBuf::from(std::env::var_os(name).unwrap_or_else(|| panic!("{name} is set by tests/hil/run")))
 }
 
-/// Writes what the devices play: frames and samples as they come, as a recording and as the cameras' raw pictures.
+/// The smallest map: the one processor is emulated.
+pub const MAP: &str = "
+    name = \"hil\"
+    memory_max_mib = 640
+    [budget]
+    splats = 4000
+    intersections = 200000
+    keyframes = 40
+    image_width_max = 376
+    image_height_max = 240
+    [map]
+    scale = 4
+    steps_per_keyframe_max = 2
+    [gpu]
+    device = \"llvmpipe\"
+    submission_max_ms = 1000.0
+";
+
+/// Writes what the devices play: frames and samples as they come, as a recording and as the cameras' raw pictures, which are
+/// in colour where the frames are.
 pub fn write(to: &Path, calibration: &Calibration, frames: impl Iterator<Item = Frames>, imu: &[(Nanos, Counts)]) {
     let _ = fs::remove_dir_all(to);
     let mut sink = record::open(to, Format::Euroc, calibration).unwrap();
     let (mut raw, mut first, mut instants) = ([vec![], vec![]], None, String::new());
+    let mut format = "";
     for frame in frames {
-        raw.iter_mut().zip(&frame.images).for_each(|(raw, image)| raw.extend(&image.pixels));
+        format = if frame.colours.is_empty() { "grey" } else { "yuyv" };
+        for (k, raw) in raw.iter_mut().enumerate() {
+            raw.extend(frame.colours.get(k).map_or_else(|| frame.images[k].pixels.clone(), yuyv));
+        }
         instants += &format!("{}\n", (frame.t - *first.get_or_insert(frame.t)).0);
         sink.frames(&frame).unwrap();
     }
@@ -36,7 +59,22 @@ pub fn write(to: &Path, calibration: &Calibration, frames: impl Iterator<Item = 
     }
     sink.finish().unwrap();
     fs::write(to.join("instants"), instants).unwrap();
-    raw.iter().enumerate().for_each(|(k, raw)| fs::write(to.join(format!("cam{k}.grey")), raw).unwrap());
+    raw.iter().enumerate().for_each(|(k, raw)| fs::write(to.join(format!("cam{k}.{format}")), raw).unwrap());
+}
+
+/// BT.601 in the limited range, as the camera's descriptor says; two pixels have the mean of their chroma.
+fn yuyv([red, green, blue]: &Colour) -> Vec<u8> {
+    let ycbcr = |i: usize| {
+        let [r, g, b] = [red, green, blue].map(|plane| f64::from(plane.pixels[i]) / 255.0);
+        let y = 0.299 * r + 0.587 * g + 0.114 * b;
+        [16.0 + 219.0 * y, 128.0 + 224.0 * (b - y) / 1.772, 128.0 + 224.0 * (r - y) / 1.402]
+    };
+    let pair = |i: usize| {
+        let [a, b] = [ycbcr(i), ycbcr(i + 1)];
+        [a[0], (a[1] + b[1]) / 2.0, b[0], (a[2] + b[2]) / 2.0].map(|v| v.round() as u8)
+    };
+    assert!(red.width % 2 == 0, "a pair is of one row");
+    (0..red.pixels.len()).step_by(2).flat_map(pair).collect()
 }
 
 /// Both cameras and the unit.
@@ -60,7 +98,9 @@ pub struct Devices {
 pub const SERIALS: [&str; 2] = ["FLIGHT-L", "FLIGHT-R"];
 
 fn camera(flight: &Path, k: usize, port: u32, size: (usize, usize), fps: u32) -> Uvc {
-    Uvc::playing(port, SERIALS[k], size, fps, [&flight.join(format!("cam{k}.grey")), &flight.join("instants")])
+    let films = ["yuyv", "grey"].map(|format| flight.join(format!("cam{k}.{format}")));
+    let film = films.iter().find(|film| film.exists()).expect("written by prepare");
+    Uvc::playing(port, SERIALS[k], size, fps, [film, &flight.join("instants")])
 }
 
 impl Devices {

@@ -11,6 +11,7 @@
 #![allow(clippy::unwrap_used)]
 
 mod devices;
+mod flown;
 #[path = "../program/panics.rs"]
 mod panics;
 mod plugged;
@@ -20,18 +21,19 @@ mod program;
 mod unit;
 
 use devices::{environment, sensors_of_a_board, wait_until, Devices, MS};
+use flown::{count, counted, report, stipple};
 use panics::{panic_after, Panicked};
-use program::{signal, text};
-use serde_json::Value;
+use program::text;
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Stdio};
+use std::process::Stdio;
 use stipple_drivers::replay::{OpenOptions, Recording};
 use stipple_drivers::{Frames, Image, ImuSample, Nanos, Span};
 use unit::counts;
 
-/// From the last picture until the program is stopped: less than a silence.
-const AFTER: Span = Span(250 * MS);
+/// One picture in so many may be lost to a machine that is slow: two in a row, after which the tracker may not find its
+/// points again, then come less than once a flight.
+const LOST_OF: usize = 30;
 /// Inertial samples of the recording on either side of its pictures.
 const AROUND: Span = Span(100 * MS);
 /// Largest distances from a replay of what was given, m. What differs is stamps, and what they decide: with two dozen
@@ -93,20 +95,6 @@ impl Devices {
         kept
     }
 
-    /// Most pictures that both cameras sent were tracked; answers how many they are, how many were tracked, and how many
-    /// were dropped and counted.
-    fn pairs_are_tracked(&self, r: &Value) -> [u64; 3] {
-        let [left, right] = [0, 1].map(|k| self.cameras[k].sent());
-        let pairs = left.iter().filter(|k| right.contains(k)).count() as u64;
-        let frames = r["frames"].as_u64().unwrap();
-        let lost = r["frames_dropped"].as_u64().unwrap() + count(r, "camera_images_unpaired");
-        println!("{} and {} pictures sent, {pairs} pairs: {frames} tracked, {lost} counted", left.len(), right.len());
-        // One picture in thirty may be lost to a machine that is slow: two in a row, after which the tracker may not find its
-        // points again, then come less than once a flight.
-        assert!(frames * 30 >= 29 * self.stamps.len() as u64, "{frames} of {}", self.stamps.len());
-        [pairs, frames, lost]
-    }
-
     /// PSNR of pictures without any detail, each of its own mean grey, against those of the left camera, dB.
     fn plain_grey_db(&self) -> f64 {
         let film = fs::read(self.flight.join("cam0.grey")).unwrap();
@@ -155,27 +143,6 @@ impl Devices {
     }
 }
 
-/// The program, at the priority of a program: what plays the devices goes before it, as hardware does.
-fn stipple(arguments: &[&str]) -> Command {
-    let mut command = Command::new("chrt");
-    command.args(["--other", "0", env!("CARGO_BIN_EXE_stipple")]).args(arguments);
-    command
-}
-
-fn report(out: &Path) -> Value {
-    serde_json::from_slice(&fs::read(out.join("report.json")).unwrap()).unwrap()
-}
-
-fn count(report: &Value, name: &str) -> u64 {
-    report[format!("count_{name}")].as_u64().unwrap_or(0)
-}
-
-/// Counters that are not zero.
-fn counted(report: &Value) -> String {
-    let all = report.as_object().unwrap().iter().filter(|(k, v)| k.starts_with("count_") && v.as_u64() != Some(0));
-    all.map(|(k, v)| format!("{} {v}", &k[6..])).collect::<Vec<_>>().join(", ")
-}
-
 /// Stamps and positions of a trajectory.
 fn trajectory(out: &Path) -> Vec<(Nanos, [f64; 3])> {
     let text = fs::read_to_string(out.join("trajectory.tum")).unwrap();
@@ -206,16 +173,10 @@ fn median_and_worst(mut late: Vec<i64>) -> String {
     format!("median {} us, {} to {} us", us(late.len() / 2), us(0), us(late.len() - 1))
 }
 
-/// `stipple run` through the whole recording, stopped by SIGTERM; `during` is called once it plays.
+/// The whole recording, which the run records itself.
 fn fly(devices: &mut Devices, dir: &Path, more: &[&str], during: impl FnOnce(&mut Devices)) {
-    let [board, out, kept] = [devices.board(dir), dir.join("out"), dir.join("kept")].map(|p| p.display().to_string());
-    let mut run =
-        stipple(&[&["run", "--board", &board, "--out", &out, "--record", &kept], more].concat()).spawn().unwrap();
-    devices.play();
-    during(devices);
-    wait_until(devices.end() + AFTER);
-    signal(&run, "TERM");
-    assert!(run.wait().unwrap().success());
+    let (board, kept) = (devices.board(dir), dir.join("kept").display().to_string());
+    flown::fly(devices, &board, dir, &[&["--record", &kept], more].concat(), during);
 }
 
 /// From a folder, as given and as seen.
@@ -238,7 +199,7 @@ fn flight_through_the_kernel_is_the_flight_from_a_folder() {
     let r = report(&out);
     println!("{}", counted(&r));
 
-    let [pairs, frames, lost] = devices.pairs_are_tracked(&r);
+    let [pairs, frames, lost] = devices.pairs_are_tracked(&r, devices.stamps.len() / LOST_OF);
     assert_eq!((frames + lost, count(&r, "camera_frames")), (pairs, pairs));
     let kept = devices.samples_are_whole(dir);
     let late = kept.frames.iter().map(|f| (f.t - devices.exposed(devices.picture(f.t))).0).collect();
@@ -280,7 +241,7 @@ fn map_is_trained_on_what_the_cameras_see() {
     assert_eq!(r["heap_after_seal"], 0);
 
     // What comes while the mapper has the one processor may meet no free buffer; the kernel's numbers say so.
-    let [pairs, frames, lost] = devices.pairs_are_tracked(&r);
+    let [pairs, frames, lost] = devices.pairs_are_tracked(&r, devices.stamps.len() / LOST_OF);
     assert!(frames + lost + count(&r, "camera_missed_by_sequence") >= pairs);
     devices.samples_are_whole(dir);
     // Where the run began and which pictures it dropped are its own; its poses are not those of a replay.

@@ -31,15 +31,17 @@ impl Uvc {
         ])
     }
 
-    /// Plays a file of grey pictures at instants of another from when it is ordered to: `play NS`.
+    /// Plays a file of pictures, in the format that its name ends with, at instants of another from when it is ordered to:
+    /// `play NS`.
     pub fn playing(port: u32, serial: &str, (w, h): (usize, usize), fps: u32, [frames, instants]: [&Path; 2]) -> Uvc {
         let [w, h, fps, port] = [w as u32, h as u32, fps, port].map(|n| n.to_string());
+        let format = frames.extension().unwrap().to_str().unwrap().to_string();
         let [frames, instants] = [frames, instants].map(|p| p.display().to_string());
-        Self::start(&[port, serial.into(), "grey".into(), w, h, fps, frames, instants])
+        Self::start(&[port, serial.into(), format, w, h, fps, frames, instants])
     }
 
     fn start(arguments: &[String]) -> Uvc {
-        let program = std::env::var("HIL_UVC_CAMERA").expect("set by uvc.sh and flight.sh");
+        let program = std::env::var("HIL_UVC_CAMERA").expect("set by uvc.sh and those of flights");
         let mut command = Command::new(program);
         let mut process = command.args(arguments).stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().unwrap();
         let (orders, output) = (process.stdin.take().unwrap(), process.stdout.take().unwrap());

@@ -14,7 +14,7 @@ mod plugged;
 mod program;
 mod unit;
 
-use devices::{environment, sensors_of_a_board, wait_until, Devices, MS};
+use devices::{environment, sensors_of_a_board, wait_until, Devices, MAP, MS};
 use manager::{journal, properties, systemctl, tried, wait_for, BOARD, OUT};
 use program::{children, kill};
 use serde_json::Value;
@@ -32,24 +32,6 @@ use unit::{counts, Counts};
 const FPS: u32 = 10;
 const SECOND: usize = FPS as usize;
 const AUTOPILOT: &str = "127.0.0.1:14550";
-/// The smallest map: the one processor is emulated.
-const MAP: &str = "
-    name = \"hil\"
-    memory_max_mib = 640
-    [budget]
-    splats = 4000
-    intersections = 200000
-    keyframes = 40
-    image_width_max = 376
-    image_height_max = 240
-    [map]
-    scale = 4
-    steps_per_keyframe_max = 2
-    [gpu]
-    device = \"llvmpipe\"
-    submission_max_ms = 1000.0
-";
-
 /// What the devices play, and the board file, of a simulated flight from rest to rest. Not in the machine.
 #[test]
 #[ignore = "make hil"]
