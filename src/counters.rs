@@ -71,8 +71,27 @@ stipple_drivers::counters! {
     keyframes_blank,
     /// Pose corrections that found their queue full.
     corrections_full,
-    /// Keyframes dropped because the mapper's store was full.
+    /// Keyframes dropped because the mapper had no room for them.
     keyframe_store_full,
+    /// Anchors not made because there are as many blocks as there may be.
+    blocks_full,
+    /// Keyframes that would have been anchors if what they show were not on disk.
+    anchors_on_disk,
+    /// Blocks and images that came from the disk, and blocks that left the pool for it.
+    blocks_paged_in,
+    blocks_paged_out,
+    images_paged_in,
+    /// Blocks and images that could not be read back.
+    blocks_lost,
+    keyframes_lost,
+    /// What the store of the map was given, wrote and read, bytes; records that were damaged; records that it refused as it
+    /// was full; writes that failed.
+    store_bytes_put,
+    store_bytes_written,
+    store_bytes_read,
+    store_records_damaged,
+    store_refused_full,
+    store_write_errors,
     /// Anchors not made because their pair could not be matched.
     depth_failures,
     /// Anchors not made because their pair showed no depth: a camera is covered, or nothing has detail.

@@ -75,6 +75,8 @@ cfg_if::cfg_if! {
         #[doc(hidden)]
         pub mod stereo;
         #[doc(hidden)]
+        pub mod store;
+        #[doc(hidden)]
         pub mod vio;
     } else {
         mod config;
@@ -88,6 +90,7 @@ cfg_if::cfg_if! {
         mod publish;
         mod run;
         mod stereo;
+        mod store;
         mod vio;
     }
 }

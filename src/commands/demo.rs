@@ -28,6 +28,6 @@ pub fn demo(args: &Args) -> Result<(), Fault> {
     let scenario = Scenario::named("demo").expect("the demo's scenario is compiled in");
     let colours = memory::colours(&scenario.calibration, &board).len();
     let input = Input::rendered(&scenario, colours, rendering_progress)?;
-    let options = Options { holdout: HOLDOUT, duration_s: Some(SECONDS), ..Options::default() };
+    let options = Options { holdout: HOLDOUT, duration_s: Some(SECONDS), fresh: true, ..Options::default() };
     finish(fly(input, &board, &out, &options, None)?, &out)
 }

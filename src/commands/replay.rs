@@ -80,6 +80,7 @@ pub fn replay(args: &Args) -> Result<(), Fault> {
         holdout: args.holdout.unwrap_or(0),
         duration_s: args.duration,
         inject,
+        fresh: true,
         ..Options::default()
     };
     finish(fly(input, &board, &out, &options, None)?, &out)

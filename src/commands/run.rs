@@ -35,6 +35,9 @@ pub struct Args {
     /// Inject the faults into the board's own sensors: for tests on the ground only
     #[arg(long, requires = "inject")]
     allow_injection: bool,
+    /// Begin with an empty map: what earlier runs left in DIR/map is moved to DIR/previous-map
+    #[arg(long)]
+    fresh: bool,
     /// Record the samples to this folder too, as EuRoC
     #[arg(long, value_name = "DIR")]
     record: Option<PathBuf>,
@@ -56,7 +59,8 @@ pub fn run(args: &Args) -> Result<(), Fault> {
     let playback = Playback { speed: args.speed, repeats: args.repeat };
     threads::end_where_one_hangs(host::stop_asked_for(), super::last_words);
     let source = args.board.board.clone().map(|file| BoardSource { file, set: args.board.set.clone() });
-    let options = Options { source, duration_s, record, inject, service: true, playback, ..Options::default() };
+    let fresh = args.fresh;
+    let options = Options { source, duration_s, record, fresh, inject, service: true, playback, ..Options::default() };
     finish(fly(input, &board, &out, &options, led)?, &out)
 }
 

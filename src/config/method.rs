@@ -274,6 +274,20 @@ section! {
 }
 
 section! {
+    /// The map on disk, in `map` of the run's folder: what the mapper's memory does not hold.
+    StoreConfig, "store.";
+    /// Whether the map is kept there, too. Without, mapping ends when `budget.keyframes` have come, and a restart begins anew.
+    enabled: bool = true;
+    /// Space on the disk, MiB, taken in files of 32 MiB as it is needed. A keyframe of 376x240 in grey takes 90 kB, a thousand
+    /// Gaussians 150 kB.
+    max_mib: u64 = 2048, Bound::Within(128.0, 1_048_576.0);
+    /// Most that is written in a second, MiB, on average.
+    write_mib_per_s: f64 = 8.0, Bound::Within(0.1, 4096.0);
+    /// Keyframes that are known: 1 to 2 KiB of memory each, and 2 KiB for the blocks that it may see.
+    keyframes: u32 = 2048, Bound::Within(2.0, 65_536.0);
+}
+
+section! {
     /// The Vulkan device.
     GpuConfig, "gpu.";
     /// Part of the device's name; empty: the first discrete, else integrated, else CPU device. Name one where there are several.

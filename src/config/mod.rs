@@ -15,7 +15,8 @@ pub use governor::GovernorConfig;
 pub use inject::{InjectConfig, ThreadRule};
 pub use mavlink::{Address, MavlinkConfig, StateMessage};
 pub use method::{
-    Fit, FrontendConfig, GpuConfig, MapConfig, NetworkConfig, Projection, StereoConfig, StereoMethod, VioConfig,
+    Fit, FrontendConfig, GpuConfig, MapConfig, NetworkConfig, Projection, StereoConfig, StereoMethod,
+    StoreConfig, VioConfig,
 };
 pub use section::{Bound, Key};
 pub use sensors::{BaroConfig, CameraConfig, GpioConfig, ImuConfig, LogConfig, RecordConfig, RigConfig};
@@ -58,6 +59,8 @@ pub struct Board {
     pub stereo: StereoConfig,
     #[serde(default)]
     pub map: MapConfig,
+    #[serde(default)]
+    pub store: StoreConfig,
     #[serde(default)]
     pub gpu: GpuConfig,
 }
@@ -106,6 +109,7 @@ pub fn keys() -> impl Iterator<Item = &'static Key> {
         StereoConfig::KEYS,
         NetworkConfig::KEYS,
         MapConfig::KEYS,
+        StoreConfig::KEYS,
         GpuConfig::KEYS,
     ];
     // A key that is a section of its own has its keys listed.

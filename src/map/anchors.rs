@@ -13,6 +13,7 @@
 //! An anchor opens a block of the pool; what its seeds and its densification need and is not free is taken from the least
 //! important, if the board lets.
 
+use super::archive::Archive;
 use super::cameras::{RectifiedPair, TrainingCamera};
 use super::coarseness::Coarseness;
 use super::coverage::{Coverage, KeyframeView};
@@ -23,7 +24,7 @@ use super::occupancy::{self, Occupancy};
 use super::pool::{threshold, PruneRule};
 use super::scene::Scene;
 use super::seeds::{Seed, Seeder};
-use super::store::Store;
+use super::views::Views;
 use super::view::View;
 use crate::config::MapConfig;
 use crate::gpu::{Gpu, GpuError};
@@ -107,12 +108,13 @@ impl Anchors {
         self.pair.iter_mut().for_each(|pair| pair.adjust(views, left));
     }
 
-    /// Makes stored image `index`, the first of `keyframe`, an anchor when the map does not show its view,
-    /// or not well.
+    /// Makes stored image `index`, the first of `keyframe`, an anchor when the map, on disk or in the pool, does not show its
+    /// view, or not well.
     pub fn try_anchor(
         &mut self,
         scene: &mut Scene,
         stereo: &mut Stereo,
+        archive: &mut Option<Archive>,
         keyframe: &Keyframe,
         index: usize,
     ) -> Result<Option<NewAnchor>, GpuError> {
@@ -123,10 +125,10 @@ impl Anchors {
         }
         // Seeds come of the rectified pair, whatever the lens of what trains.
         let rect = stereo.views.camera();
-        let world_from_cam = scene.store.world_from_body(index) * rect.body_from_rect;
+        let world_from_cam = scene.views.world_from_body(index) * rect.body_from_rect;
         let (coarseness, epoch) = (Coarseness::default(), keyframe.epoch);
         let view = View { world_from_cam, camera: rect.pinhole, fisheye: None, coarseness, epoch };
-        self.render(scene, index, &view)?;
+        self.render(scene, archive, index, &view)?;
         let coverage = {
             let seen = seen(scene, &self.pair, index, &view, stereo.views.valid_mask(), &self.work.depth.metres);
             Coverage::new(&seen, self.config.covered_alpha, self.config.wrong_error)
@@ -142,31 +144,56 @@ impl Anchors {
         if let Some(pair) = &mut self.pair {
             pair.distort(&self.work.depth.metres, &view.camera);
         }
-        let first = scene.store.anchors() == 0;
+        // Where depth finds what is on disk, nothing is lacking.
+        let hidden = archive.as_mut().and_then(|a| a.hide(&view, &self.work.depth.metres, stereo.views.valid_mask()));
+        let valid = hidden.unwrap_or(stereo.views.valid_mask());
+        let coverage = if hidden.is_some() {
+            let seen = seen(scene, &self.pair, index, &view, valid, &self.work.depth.metres);
+            Coverage::new(&seen, self.config.covered_alpha, self.config.wrong_error)
+        } else {
+            coverage
+        };
+        if coverage.lacking() <= least {
+            scene.counters.anchors_on_disk.add(1);
+            return Ok(None);
+        }
+        let first = scene.views.anchors() == 0;
         let whole = self.seeds_of_a_view(scene);
         let wanted = (coverage.lacking() * whole as f64).ceil() as usize;
         let room = self.make_room(scene, wanted)?;
         if room == 0 && !self.config.evict {
             return Ok(None);
         }
-        scene.pipeline.pool.open_block(index as u32, keyframe.epoch);
-        let seeded = self.seed(scene, index, &view, stereo.views.valid_mask(), (whole, room))? as u32;
+        if !scene.pipeline.pool.open_block(index as u32, keyframe.epoch) {
+            scene.counters.blocks_full.add(1);
+            return Ok(None);
+        }
+        let seeded = self.seed(scene, index, &view, valid, (whole, room))? as u32;
         scene.counters.anchors_for_error.add(u64::from(coverage.uncovered <= least));
         self.anchored_at = scene.steps;
-        let entry = scene.store.get_mut(index);
+        let entry = scene.views.get_mut(index);
         (entry.anchor, entry.placed) = (true, entry.world_from_cam());
         let scene_depth_m = if first { median_depth(&self.work.depth.metres) } else { None };
         Ok(Some(NewAnchor { seeded, scene_depth_m }))
     }
 
     /// Draws what the rectified pair should see into the scene, and exposes the new image by what trains.
-    fn render(&self, scene: &mut Scene, index: usize, rectified: &View) -> Result<(), GpuError> {
+    fn render(
+        &self,
+        scene: &mut Scene,
+        archive: &mut Option<Archive>,
+        index: usize,
+        rectified: &View,
+    ) -> Result<(), GpuError> {
         // Without distortion, what lies beyond a fisheye's rim is drawn across the picture: it tells no exposure.
         let own = View { coarseness: Coarseness::default(), ..scene.view(index) };
         let coarseness = scene.render(if self.pair.is_some() { &own } else { rectified })?;
-        scene.store.get_mut(index).coarseness = coarseness;
+        scene.views.get_mut(index).coarseness = coarseness;
         if self.config.refine_exposure {
             scene.expose(index);
+        }
+        if let Some(archive) = archive {
+            archive.saw(scene, index);
         }
         if self.pair.is_some() {
             scene.render(rectified)?;
@@ -200,13 +227,26 @@ impl Anchors {
         let seen = seen(scene, &self.pair, index, view, valid, &depth.metres);
         let points = seeder.seed(&seen, whole, diffusion, &scene.counters);
         self.occupancy.look_up(&mut scene.gpu, &scene.pipeline.pool, view.epoch, points, answers)?;
-        let (exposure, planes) = (scene.store.exposure(index), planes(&scene.store, &self.pair, index));
+        let (exposure, planes) = (scene.views.exposure(index), planes(&scene.views, &self.pair, index));
         let splats = seeder.keep(answers, room, &scene.counters).iter().map(|s| s.gaussian(planes, exposure));
         scene.pipeline.pool.append(&mut scene.gpu, splats)
     }
 
     /// Adds Gaussians where the newest anchor's picture is least like its image, through the lens that trains.
-    pub fn densify(&mut self, scene: &mut Scene, index: usize) -> Result<(), GpuError> {
+    pub fn densify(&mut self, scene: &mut Scene, archive: &mut Option<Archive>, index: usize) -> Result<(), GpuError> {
+        self.fill_in(scene, index)?;
+        let Some(archive) = archive else { return Ok(()) };
+        if let Some(block) = archive.block_of(index as u32) {
+            archive.save_block(scene, block)?;
+            archive.look_for(scene, block);
+            let view = scene.view(index);
+            scene.render(&view)?;
+            archive.saw(scene, index);
+        }
+        Ok(())
+    }
+
+    fn fill_in(&mut self, scene: &mut Scene, index: usize) -> Result<(), GpuError> {
         if self.config.densify_max == 0 || scene.pipeline.pool.newest() != Some(index as u32) {
             return Ok(());
         }
@@ -219,7 +259,7 @@ impl Anchors {
         let wanted = wanted.min(self.make_room(scene, wanted)?);
         let Workspace { depth, diffusion, newcomers, similarity, .. } = &mut self.work;
         let depth = self.pair.as_ref().map_or(&depth.metres, |pair| &pair.distance);
-        let planes = scene.store.planes(index);
+        let planes = scene.views.planes(index);
         let (valid, rendered, exposure) = (&scene.cameras[0].valid, &scene.rendered, target.exposure);
         let seen = KeyframeView { planes, valid, depth, rendered, exposure, view };
         densify(&seen, similarity, wanted, diffusion, newcomers, &scene.counters);
@@ -239,10 +279,10 @@ impl Anchors {
     /// Gaussians that an anchor may add at the steps a keyframe gets here: more than are trained cost every later step
     /// its time and give nothing back.
     fn affordable(&self, scene: &Scene) -> usize {
-        let steps = (scene.steps / scene.store.training().len().max(1) as u64) as usize;
+        let steps = (scene.steps / scene.views.training().len().max(1) as u64) as usize;
         match self.config.seeds_per_step as usize {
             0 => usize::MAX,
-            limit => limit * steps.max(if scene.store.anchors() == 0 { STEPS_FIRST } else { STEPS_MIN }),
+            limit => limit * steps.max(if scene.views.anchors() == 0 { STEPS_FIRST } else { STEPS_MIN }),
         }
     }
 
@@ -265,8 +305,8 @@ impl Anchors {
 }
 
 /// The image that seeds take their colour from.
-fn planes<'a>(store: &'a Store, pair: &'a Option<RectifiedPair>, index: usize) -> &'a [Image] {
-    pair.as_ref().map_or_else(|| store.planes(index), |pair| &pair.planes)
+fn planes<'a>(views: &'a Views, pair: &'a Option<RectifiedPair>, index: usize) -> &'a [Image] {
+    pair.as_ref().map_or_else(|| views.planes(index), |pair| &pair.planes)
 }
 
 /// What a new keyframe sees without distortion, beside the scene's last picture, which was drawn from there.
@@ -278,7 +318,7 @@ fn seen<'a>(
     valid: &'a [u8],
     depth: &'a [f32],
 ) -> KeyframeView<'a> {
-    let (planes, exposure) = (planes(&scene.store, pair, index), scene.store.exposure(index));
+    let (planes, exposure) = (planes(&scene.views, pair, index), scene.views.exposure(index));
     KeyframeView { planes, valid, depth, rendered: &scene.rendered, exposure, view: *view }
 }
 

@@ -7,6 +7,7 @@
 //! with the pose refined on it too.
 //! Evaluation changes nothing: a run goes on from it as if there had been none.
 
+use super::archive::Archive;
 use super::exposure::{fitted_exposure, Exposure};
 use super::refine::Refinement;
 use super::scene::Scene;
@@ -81,21 +82,29 @@ fn mean(values: &[Option<f64>]) -> Option<f64> {
 /// Scores a few keyframes spread over the run: those trained on, and those held out. Allocates.
 pub fn sample(scene: &mut Scene) -> Result<[Option<f64>; 2], GpuError> {
     let mut probe = |held_out: bool| {
-        let of_kind: Vec<usize> = first_images(scene).filter(|&i| scene.store.get(i).held_out == held_out).collect();
+        let here = |i: &usize| scene.views.has_place(*i) && scene.views.get(*i).held_out == held_out;
+        let of_kind: Vec<usize> = first_images(scene).filter(here).collect();
         let scores = spread(of_kind.len(), PROBED).map(|i| score(scene, of_kind[i]));
         Ok(mean(&scores.collect::<Result<Vec<_>, GpuError>>()?))
     };
     Ok([probe(false)?, probe(true)?])
 }
 
-/// Scores every keyframe. Allocates.
-pub fn evaluate(scene: &mut Scene, weights: &Weights) -> Result<Evaluation, GpuError> {
+/// Scores every keyframe, those on disk too. Allocates.
+pub fn evaluate(
+    scene: &mut Scene,
+    archive: &mut Option<Archive>,
+    weights: &Weights,
+) -> Result<Evaluation, GpuError> {
     let mut ssim_of = Ssim::new(scene.rendered.width, scene.rendered.height);
     // PSNR and SSIM of each kind.
     let mut all: [[Vec<Option<f64>>; 2]; 5] = Default::default();
     let [training, held_out, between, fitted, aligned] = &mut all;
     let mut by_camera: [Vec<Option<f64>>; CAMERAS_MAX] = Default::default();
-    for i in 0..scene.store.len() {
+    for i in 0..scene.views.len() {
+        if !bring(scene, archive, i)? {
+            continue;
+        }
         let observed = observed(scene, i);
         let mut add = |scene: &Scene, [psnr, ssim]: &mut [Vec<Option<f64>>; 2]| {
             let (shown, valid) = (&scene.rendered.colour, &scene.camera(i).valid);
@@ -103,15 +112,15 @@ pub fn evaluate(scene: &mut Scene, weights: &Weights) -> Result<Evaluation, GpuE
             ssim.push(ssim_of.mean(&observed, shown, valid));
         };
         let scored = score(scene, i)?;
-        if !scene.store.get(i).held_out {
+        if !scene.views.get(i).held_out {
             add(scene, training);
             continue;
         }
-        by_camera[scene.store.camera(i)].push(scored);
+        by_camera[scene.views.camera(i)].push(scored);
         add(scene, held_out);
         fit(scene, i, &observed);
         add(scene, fitted);
-        score_at(scene, i, scene.store.between(i))?;
+        score_at(scene, i, scene.views.between(i))?;
         add(scene, between);
         let aligned_by = align(scene, i, &observed, weights)?;
         score_at(scene, i, aligned_by)?;
@@ -133,43 +142,58 @@ pub fn evaluate(scene: &mut Scene, weights: &Weights) -> Result<Evaluation, GpuE
 }
 
 /// Pictures of `count` keyframes spread over the run. Allocates.
-pub fn panels(scene: &mut Scene, count: usize) -> Result<Vec<Panel>, GpuError> {
+pub fn panels(
+    scene: &mut Scene,
+    archive: &mut Option<Archive>,
+    count: usize,
+) -> Result<Vec<Panel>, GpuError> {
     let all: Vec<usize> = first_images(scene).collect();
     let mut panels = Vec::with_capacity(count);
     for i in spread(all.len(), count).map(|i| all[i]) {
+        if !bring(scene, archive, i)? {
+            continue;
+        }
         let psnr_db = score(scene, i)?;
         let valid = scene.camera(i).valid.clone();
-        let (planes, r) = (scene.store.planes(i), &scene.rendered);
+        let (planes, r) = (scene.views.planes(i), &scene.rendered);
         let n = valid.len();
         let observed = (0..n).flat_map(|k| planes.iter().map(move |p| p.pixels[k])).collect();
         let rendered = (0..n).flat_map(|k| r.colour[k..].iter().step_by(n).copied()).collect();
-        let kind = if scene.store.get(i).held_out { "_heldout" } else { "" };
-        let name = format!("{:04}{kind}", scene.store.get(i).id);
+        let kind = if scene.views.get(i).held_out { "_heldout" } else { "" };
+        let name = format!("{:04}{kind}", scene.views.get(i).id);
         let (width, height, depth) = (r.width, r.height, r.depth.clone());
         panels.push(Panel { name, width, height, observed, rendered, depth, valid, psnr_db });
     }
     Ok(panels)
 }
 
+/// Sees that a keyframe and what it sees are in memory; false where its images are lost.
+fn bring(scene: &mut Scene, archive: &mut Option<Archive>, index: usize) -> Result<bool, GpuError> {
+    match archive {
+        Some(archive) => archive.bring(scene, index),
+        None => Ok(scene.views.has_place(index)),
+    }
+}
+
 /// Renders a keyframe, in its exposure, and compares; `None` where nothing is valid.
 fn score(scene: &mut Scene, index: usize) -> Result<Option<f64>, GpuError> {
     let view = scene.view(index);
     scene.render(&view)?;
-    show(scene, scene.store.exposure(index));
+    show(scene, scene.views.exposure(index));
     Ok(mse(&observed(scene, index), &scene.rendered.colour, &scene.camera(index).valid).map(psnr_db))
 }
 
 /// The first camera's images.
 fn first_images(scene: &Scene) -> impl Iterator<Item = usize> {
-    (0..scene.store.len()).step_by(scene.cameras.len())
+    (0..scene.views.len()).step_by(scene.cameras.len())
 }
 
 /// Does what `score` does with another refinement of the keyframe for the moment.
 fn score_at(scene: &mut Scene, index: usize, refined: Refinement) -> Result<(), GpuError> {
-    let first = scene.store.first(index);
-    let own = std::mem::replace(&mut scene.store.get_mut(first).refined, refined);
+    let first = scene.views.first(index);
+    let own = std::mem::replace(&mut scene.views.get_mut(first).refined, refined);
     let scored = score(scene, index);
-    scene.store.get_mut(first).refined = own;
+    scene.views.get_mut(first).refined = own;
     scored.map(|_| ())
 }
 
@@ -185,13 +209,13 @@ fn fit(scene: &mut Scene, index: usize, observed: &[f32]) {
 
 /// An image plane by plane.
 fn observed(scene: &Scene, index: usize) -> Vec<f32> {
-    scene.store.planes(index).iter().flat_map(|p| &p.pixels).map(|p| f32::from(*p) / 255.0).collect()
+    scene.views.planes(index).iter().flat_map(|p| &p.pixels).map(|p| f32::from(*p) / 255.0).collect()
 }
 
 /// The refinement of a keyframe from which the map, standing still, looks most like its image.
 fn align(scene: &mut Scene, index: usize, observed: &[f32], weights: &Weights) -> Result<Refinement, GpuError> {
-    let (body_from_cam, view) = (scene.store.get(index).body_from_cam, scene.view(index));
-    let given = scene.store.get(scene.store.first(index)).given;
+    let (body_from_cam, view) = (scene.views.get(index).body_from_cam, scene.view(index));
+    let given = scene.views.get(scene.views.first(index)).given;
     let coarseness = scene.render(&view)?;
     let exposure = fitted_exposure(observed, &scene.rendered.colour, &scene.camera(index).valid);
     let target = Target { exposure, ..scene.target(index) };

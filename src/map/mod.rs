@@ -6,7 +6,9 @@
 //! anchors. Read `pipeline` for what a training step does on the GPU.
 
 pub mod anchors;
+pub mod archive;
 pub mod backward;
+pub mod block;
 pub mod cameras;
 mod coarseness;
 pub mod coverage;
@@ -15,13 +17,16 @@ mod depth_fill;
 mod diffusion;
 mod evaluate;
 pub mod exposure;
+pub mod horizon;
 mod keyframes;
 pub mod loss;
 pub mod occupancy;
+pub mod paging;
 pub mod pipeline;
 pub mod pool;
 pub mod refine;
 pub mod render;
+mod residency;
 mod scene;
 pub mod schedule;
 mod seeds;
@@ -29,10 +34,10 @@ pub mod shape;
 pub mod sort;
 pub mod ssim;
 pub mod step;
-mod store;
 pub mod tiling;
 mod trainer;
 pub mod view;
+mod views;
 
 use crate::config::Board;
 use crate::counters::Counters;
@@ -40,13 +45,15 @@ use crate::gpu::{cache_folder, Arena, Gpu, GpuError, Timing};
 use crate::mem::Footprint;
 use crate::stereo::{self, Stereo};
 use anchors::{Anchors, Workspace};
+use archive::Archive;
 use cameras::RectifiedPair;
 use scene::Scene;
 use std::time::Instant;
 use stipple_drivers::{Calibration, Fault, Pose};
-use store::Store;
+use views::Views;
 use trainer::Trainer;
 
+pub use archive::Place;
 pub use evaluate::{spread, CurvePoint, Evaluation, Panel};
 pub use exposure::Exposure;
 pub use keyframes::{Keyframe, PoseCorrection};
@@ -60,7 +67,7 @@ pub use {
     coarseness::Coarseness,
     pool::PruneRule,
     step::{LearningRates, StepStats, Target, Weights},
-    store::Stored,
+    views::Stored,
     tiling::Tiling,
     view::{Fisheye, View},
 };
@@ -101,6 +108,10 @@ pub struct Mapper {
     stereo: Stereo,
     anchors: Anchors,
     trainer: Trainer,
+    /// What of the map is on disk; none keeps all of it in memory.
+    archive: Option<Archive>,
+    /// Why there is no archive though there is a place for it.
+    pub unkept: Option<Fault>,
     /// Corrections move Gaussians when they exceed this, m and rad.
     move_tolerance: f64,
     /// Corrections came since anchors were last put in place.
@@ -114,7 +125,11 @@ impl Mapper {
         let views = Stereo::footprint(calibration, &board.stereo, board.map.scale, &mut f)?;
         let shape = shape(calibration, board);
         let (w, h, channels) = (shape.width as usize, shape.height as usize, shape.channels as usize);
-        f.build("map: keyframes", || Store::new(&shape));
+        let known = known(board, &shape);
+        f.build("map: keyframes", || Views::new(&shape, known));
+        if board.store.enabled {
+            Archive::footprint(board, &shape, &mut f);
+        }
         let cameras = f.build("map: cameras", || cameras::training(&views, &board.map))?;
         f.build("map: rectified view of a fisheye", || RectifiedPair::new(&views, &cameras[0], channels));
         f.build("map: rendering", || Rendered::new(w, h, channels));
@@ -124,8 +139,15 @@ impl Mapper {
         Ok(f)
     }
 
-    /// Opens the board's device with all the memory it will take.
+    /// Opens the board's device with all the memory it will take, and keeps the whole map in it.
+    #[cfg(feature = "instruments")]
     pub fn open(calibration: &Calibration, board: &Board) -> Result<Mapper, Fault> {
+        Mapper::open_on(calibration, board, None)
+    }
+
+    /// Opens the board's device with all the memory it will take. The map is kept on disk where there is a place for it that can
+    /// be used (`unkept`).
+    pub fn open_on(calibration: &Calibration, board: &Board, place: Option<Place>) -> Result<Mapper, Fault> {
         let mut gpu = Gpu::open(&board.gpu, buffers(calibration, board)?.used())?;
         cache_folder().iter().for_each(|folder| _ = gpu.reuse_pipelines(folder));
         let stereo = Stereo::new(calibration, &board.stereo, board.map.scale, Some(&mut gpu))?;
@@ -142,12 +164,25 @@ impl Mapper {
         let work = Workspace::new(w, h, channels, config);
         let anchors = Anchors::new(&mut gpu, cells, work, pair, config)?;
         gpu.time_commands(TIMED_IN);
-        let (store, rendered) = (Store::new(&shape), Rendered::new(w, h, channels));
+        let known = if place.is_some() { known(board, &shape) } else { 0 };
+        let (mut views, rendered) = (Views::new(&shape, known), Rendered::new(w, h, channels));
+        let mut trainer = Trainer::new(config);
+        let (mut archive, unkept) = match place.map(|place| Archive::open(place, calibration, board, &shape)) {
+            Some(Err(fault)) => (None, Some(fault)),
+            opened => (opened.and_then(Result::ok), None),
+        };
+        if let Some(archive) = archive.as_mut().filter(|archive| archive.goes_on) {
+            archive.resume(&mut views);
+            trainer.scene_depth_m = archive.scene_depth_m().unwrap_or(trainer.scene_depth_m);
+        }
+        let steps = (0..views.len()).map(|i| u64::from(views.get(i).steps)).sum();
         Ok(Mapper {
-            scene: Scene { gpu, pipeline, store, cameras, rendered, steps: 0, counters: Counters::default() },
+            scene: Scene { gpu, pipeline, views, cameras, rendered, steps, counters: Counters::default() },
             stereo,
             anchors,
-            trainer: Trainer::new(config),
+            trainer,
+            archive,
+            unkept,
             move_tolerance: config.move_tolerance,
             corrected: false,
         })
@@ -162,33 +197,67 @@ impl Mapper {
     pub fn ingest(&mut self, keyframe: &Keyframe) -> Result<StepKind, GpuError> {
         self.apply_corrections()?;
         self.finish_pending()?;
-        if self.scene.store.is_full() {
+        if let Some(archive) = &mut self.archive {
+            let at = (keyframe.t, keyframe.world_from_body);
+            archive.arrive(&mut self.scene, at, keyframe.epoch, self.trainer.in_burst())?;
+            if !self.scene.views.knows_all_it_can() {
+                archive.make_place(&mut self.scene)?;
+            }
+        }
+        if self.scene.views.is_full() {
             self.scene.counters.keyframe_store_full.add(1);
             return Ok(StepKind::Dropped);
         }
         if let Some(body_from_cam) = &keyframe.body_from_cam {
             self.adjust(body_from_cam)?;
         }
-        let Scene { gpu, pipeline, store, cameras, .. } = &mut self.scene;
-        let index = store.len();
-        for (i, camera) in cameras.iter().enumerate() {
-            let poses = [camera.body_from_cam, self.stereo.views.rig()[i].body_from_cam];
-            store.add(keyframe, poses, |channel, plane| {
-                cameras::draw(i, camera, &mut self.stereo.views, keyframe.plane(i, channel), plane);
+        let index = self.scene.views.len();
+        for i in 0..self.scene.cameras.len() {
+            let Scene { views, cameras, .. } = &mut self.scene;
+            let poses = [cameras[i].body_from_cam, self.stereo.views.rig()[i].body_from_cam];
+            views.add(keyframe, poses, |channel, plane| {
+                cameras::draw(i, &cameras[i], &mut self.stereo.views, keyframe.plane(i, channel), plane);
             });
-            for (channel, plane) in store.planes(index + i).iter().enumerate() {
-                pipeline.loss.set_plane(gpu, (index + i) as u32, channel, &plane.pixels)?;
-            }
+            self.scene.upload_image(index + i)?;
         }
-        if keyframe.held_out {
+        if let Some(archive) = &mut self.archive {
+            archive.take_in(&self.scene, index);
+        }
+        let kind = if keyframe.held_out { self.hold_out(index)? } else { self.train_on(keyframe, index)? };
+        if let Some(archive) = &mut self.archive {
+            archive.refresh(&mut self.scene);
+            archive.save_some(&mut self.scene)?;
+        }
+        Ok(kind)
+    }
+
+    /// Takes in a keyframe that is only evaluated.
+    fn hold_out(&mut self, index: usize) -> Result<StepKind, GpuError> {
+        if let Some(archive) = &mut self.archive {
+            let view = self.scene.view(index);
+            self.scene.render(&view)?;
+            archive.saw(&mut self.scene, index);
+        }
+        Ok(StepKind::Stored)
+    }
+
+    /// Takes in a keyframe that is trained on.
+    fn train_on(&mut self, keyframe: &Keyframe, index: usize) -> Result<StepKind, GpuError> {
+        if self.archive.as_ref().is_some_and(Archive::is_full) {
+            self.scene.counters.blocks_full.add(1);
             return Ok(StepKind::Stored);
         }
-        let anchor = self.anchors.try_anchor(&mut self.scene, &mut self.stereo, keyframe, index)?;
-        Ok(anchor.map_or(StepKind::Stored, |anchor| {
-            self.trainer.scene_depth_m = anchor.scene_depth_m.unwrap_or(self.trainer.scene_depth_m);
-            self.trainer.start_burst(index);
-            StepKind::Anchor { seeded: anchor.seeded }
-        }))
+        let (scene, archive) = (&mut self.scene, &mut self.archive);
+        let Some(anchor) = self.anchors.try_anchor(scene, &mut self.stereo, archive, keyframe, index)? else {
+            return Ok(StepKind::Stored);
+        };
+        if let Some(archive) = archive {
+            archive.open_block(&scene.views, index);
+            anchor.scene_depth_m.iter().for_each(|depth| archive.set_scene_depth(*depth));
+        }
+        self.trainer.scene_depth_m = anchor.scene_depth_m.unwrap_or(self.trainer.scene_depth_m);
+        self.trainer.start_burst(index);
+        Ok(StepKind::Anchor { seeded: anchor.seeded })
     }
 
     /// Takes over where the cameras sit on the body by now.
@@ -208,7 +277,7 @@ impl Mapper {
 
     /// Moves a keyframe, and with what is done next the Gaussians of an anchor. Never waits for the GPU.
     pub fn correct(&mut self, correction: &PoseCorrection) {
-        self.corrected |= self.scene.store.correct(correction);
+        self.corrected |= self.scene.views.correct(correction);
     }
 
     /// Trains until `deadline`, and takes at least one step if there is something to train.
@@ -220,6 +289,9 @@ impl Mapper {
             if self.trainer.must_wait() {
                 self.finish_pending()?;
             }
+            if let Some(archive) = &mut self.archive {
+                archive.rotate(&mut self.scene)?;
+            }
             let Some(kind) = self.trainer.step(&mut self.scene)? else {
                 self.finish_pending()?;
                 break;
@@ -227,6 +299,9 @@ impl Mapper {
             report.kind = kind;
             report.iterations += 1;
             report.loss = self.trainer.loss;
+            if let (Some(archive), Some(index)) = (&mut self.archive, self.trainer.trained.take()) {
+                archive.trained(index / self.scene.views.cameras());
+            }
             if Instant::now() >= deadline {
                 break;
             }
@@ -239,6 +314,9 @@ impl Mapper {
         if std::mem::take(&mut self.corrected) {
             self.finish_pending()?;
             self.scene.apply_corrections(self.move_tolerance)?;
+            if let Some(archive) = &mut self.archive {
+                archive.follow(&self.scene.views);
+            }
         }
         Ok(())
     }
@@ -246,7 +324,7 @@ impl Mapper {
     /// Takes in the training step in flight; an anchor whose burst it ends is densified.
     fn finish_pending(&mut self) -> Result<(), GpuError> {
         match self.trainer.finish_pending(&mut self.scene)? {
-            Some(anchor) => self.anchors.densify(&mut self.scene, anchor),
+            Some(anchor) => self.anchors.densify(&mut self.scene, &mut self.archive, anchor),
             None => Ok(()),
         }
     }
@@ -260,12 +338,14 @@ impl Mapper {
 
     /// Scores every keyframe. Allocates.
     pub fn evaluate(&mut self) -> Result<Evaluation, GpuError> {
-        evaluate::evaluate(&mut self.scene, self.trainer.weights())
+        self.finish_pending()?;
+        evaluate::evaluate(&mut self.scene, &mut self.archive, self.trainer.weights())
     }
 
     /// Pictures of `count` keyframes spread over the run. Allocates.
     pub fn panels(&mut self, count: usize) -> Result<Vec<Panel>, GpuError> {
-        evaluate::panels(&mut self.scene, count)
+        self.finish_pending()?;
+        evaluate::panels(&mut self.scene, &mut self.archive, count)
     }
 
     /// The exposure that most images were taken with. Allocates.
@@ -291,21 +371,35 @@ impl Mapper {
     /// A keyframe as stored, in the order they came.
     #[cfg(feature = "instruments")]
     pub fn keyframe(&self, index: usize) -> &Stored {
-        self.scene.store.get(index * self.scene.cameras.len())
+        self.scene.views.get(index * self.scene.cameras.len())
     }
 
+    /// Gaussians of the map, in the pool and on disk.
     pub fn splat_count(&self) -> usize {
-        self.scene.pipeline.pool.count() as usize
+        self.scene.pipeline.pool.count() as usize + self.archive.as_ref().map_or(0, Archive::away)
+    }
+
+    /// The side of the store that reads and writes, where threads are to do that.
+    pub fn disk(&self) -> Option<std::sync::Arc<crate::store::Disk>> {
+        self.archive.as_ref().and_then(Archive::disk)
+    }
+
+    /// Writes all of the map to its store, if it has one, and answers whether the store has all of it then. Fails where it
+    /// cannot be written.
+    pub fn save(&mut self) -> Result<Result<bool, Fault>, GpuError> {
+        self.finish_pending()?;
+        let Some(archive) = &mut self.archive else { return Ok(Ok(false)) };
+        archive.flush(&mut self.scene)
     }
 
     #[cfg(feature = "instruments")]
     pub fn anchor_count(&self) -> usize {
-        self.scene.store.anchors()
+        self.scene.views.anchors()
     }
 
     #[cfg(feature = "instruments")]
     pub fn keyframe_count(&self) -> usize {
-        self.scene.store.len() / self.scene.cameras.len()
+        self.scene.views.len() / self.scene.cameras.len()
     }
 
     /// Training steps started.
@@ -315,6 +409,7 @@ impl Mapper {
     }
 
     pub fn counters(&self) -> &Counters {
+        self.archive.iter().for_each(|archive| archive.count(&self.scene.counters));
         &self.scene.counters
     }
 
@@ -328,6 +423,15 @@ impl Mapper {
 
     pub fn kernel_times(&self) -> Vec<Timing> {
         self.scene.gpu.timings().to_vec()
+    }
+}
+
+/// Views that there is room for beside those whose images are in memory.
+fn known(board: &Board, shape: &Shape) -> usize {
+    if board.store.enabled {
+        archive::keyframes_known(board, shape) * shape.cameras as usize
+    } else {
+        0
     }
 }
 

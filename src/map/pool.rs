@@ -3,8 +3,8 @@
 //! The Gaussians of one anchor lie together, blocks lie in the order of their anchors, and there are no gaps. New
 //! Gaussians go to the end, so only the newest block grows; what is removed leaves a gap that is closed at once by moving
 //! everything behind it down. That keeps a rigid correction of an anchor one sequential pass over its block. Closing gaps
-//! costs two copies of the pool (200 k: 60 MB) and is rare: at anchors only. Who leaves a full pool is read off a
-//! histogram of importance; nothing is sorted.
+//! costs two copies of the pool (200 k: 60 MB) and is rare: at keyframes only. Who leaves a full pool is read off a
+//! histogram of importance; nothing is sorted. Whole blocks come and go by `paging`.
 
 use super::shape::Shape;
 use super::sort::Scan;
@@ -40,7 +40,7 @@ impl Gaussian {
         }
     }
 
-    fn unpacked(s: &Splat, [green, blue]: [f32; 2]) -> Gaussian {
+    pub(super) fn unpacked(s: &Splat, [green, blue]: [f32; 2]) -> Gaussian {
         let ([x, y, z, opacity_logit], [a, b, c, first]) = (s.mean_opacity, s.scale_colour);
         let colour = [first, green, blue];
         Gaussian { mean: [x, y, z], log_scale: [a, b, c], quat_xyzw: s.quat, opacity_logit, colour }
@@ -65,10 +65,10 @@ impl Default for PruneRule {
 
 /// An anchor's Gaussians begin here and end where the next block begins.
 #[derive(Clone, Copy, Debug)]
-struct Block {
-    anchor: u32,
-    epoch: u32,
-    first: u32,
+pub(super) struct Block {
+    pub anchor: u32,
+    pub epoch: u32,
+    pub first: u32,
 }
 
 /// Bins of importance.comp: quarter octaves from 2^-63.
@@ -78,6 +78,8 @@ const LOWEST: u32 = 0x2000_0000;
 const QUARTER_OCTAVE: u32 = 1 << 21;
 /// Gaussians that travel to the GPU at a time.
 const APPENDED_AT_ONCE: usize = 4096;
+/// Blocks in the pool at once.
+pub const BLOCKS: usize = 1024;
 
 /// How many Gaussians have which importance.
 pub type Bins = [u32; BINS];
@@ -116,7 +118,7 @@ pub struct Buffers {
     /// Green and blue, and their moments; one element of a grey map.
     pub chroma: Buf<[f32; 2]>,
     pub chroma_moments: Buf<[f32; 4]>,
-    kept: Buf<u32>,
+    pub(super) kept: Buf<u32>,
     bins: Buf<u32>,
 }
 
@@ -137,16 +139,16 @@ impl Buffers {
 
 /// Host memory of the pool: its blocks, and what is on its way to and from the device.
 pub struct Transfers {
-    blocks: Vec<Block>,
-    splats: Vec<Splat>,
-    chroma: Vec<[f32; 2]>,
-    kept: Vec<u32>,
+    pub(super) blocks: Vec<Block>,
+    pub(super) splats: Vec<Splat>,
+    pub(super) chroma: Vec<[f32; 2]>,
+    pub(super) kept: Vec<u32>,
 }
 
 impl Transfers {
     pub fn new(shape: &Shape) -> Transfers {
         Transfers {
-            blocks: Vec::with_capacity(shape.images as usize),
+            blocks: Vec::with_capacity(BLOCKS),
             splats: Vec::with_capacity(APPENDED_AT_ONCE),
             chroma: Vec::with_capacity(APPENDED_AT_ONCE),
             kept: Vec::with_capacity(shape.splats as usize + 1),
@@ -157,9 +159,9 @@ impl Transfers {
 pub struct Pool {
     pub buffers: Buffers,
     capacity: u32,
-    colour: bool,
-    count: u32,
-    host: Transfers,
+    pub(super) colour: bool,
+    pub(super) count: u32,
+    pub(super) host: Transfers,
     /// Memory that no step under way uses, to close gaps in.
     scratch: Buf<u32>,
     scan: Scan,
@@ -201,12 +203,15 @@ impl Pool {
         self.capacity as usize
     }
 
-    /// What is appended from now on belongs to `anchor`, of an epoch that is none before the newest's.
-    pub fn open_block(&mut self, anchor: u32, epoch: u32) {
+    /// What is appended from now on belongs to `anchor`, of an epoch that is none before the newest's. False, and nothing
+    /// done, where there are as many blocks as there may be.
+    pub fn open_block(&mut self, anchor: u32, epoch: u32) -> bool {
         let blocks = &mut self.host.blocks;
-        if blocks.len() < blocks.capacity() {
+        let fits = blocks.len() < BLOCKS;
+        if fits {
             blocks.push(Block { anchor, epoch, first: self.count });
         }
+        fits
     }
 
     /// The anchor that what is appended belongs to.
@@ -307,6 +312,12 @@ impl Pool {
         let kept = &mut self.host.kept;
         kept.resize(n as usize + 1, 0);
         gpu.download(b.kept, 0, kept)?;
+        self.close_gaps(gpu)
+    }
+
+    /// Moves those that stay down to where `kept`, on the host and on the device, says; answers how many have gone.
+    pub(super) fn close_gaps(&mut self, gpu: &mut Gpu) -> Result<usize, GpuError> {
+        let (n, b, kept) = (self.count, self.buffers, &self.host.kept);
         let Some(first) = (0..n).find(|slot| kept[*slot as usize + 1] == *slot) else { return Ok(0) };
         for block in &mut self.host.blocks {
             block.first = kept[block.first as usize];

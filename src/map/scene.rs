@@ -6,7 +6,7 @@ use super::exposure::{gain_from, median_exposure, Exposure};
 use super::pipeline::Pipeline;
 use super::render::Rendered;
 use super::step::{Stats, Target};
-use super::store::{Store, Stored};
+use super::views::{Stored, Views};
 use super::view::View;
 use crate::counters::Counters;
 use crate::gpu::{Gpu, GpuError};
@@ -15,7 +15,7 @@ use stipple_drivers::Pose;
 pub struct Scene {
     pub gpu: Gpu,
     pub pipeline: Pipeline,
-    pub store: Store,
+    pub views: Views,
     pub cameras: Vec<TrainingCamera>,
     /// The last picture.
     pub rendered: Rendered,
@@ -27,24 +27,33 @@ pub struct Scene {
 impl Scene {
     /// The camera of a stored image.
     pub fn camera(&self, index: usize) -> &TrainingCamera {
-        &self.cameras[self.store.camera(index)]
+        &self.cameras[self.views.camera(index)]
     }
 
     /// Where a stored image was taken, as far as is known.
     pub fn view(&self, index: usize) -> View {
-        self.view_from(index, self.store.world_from_body(index))
+        self.view_from(index, self.views.world_from_body(index))
     }
 
     /// What the camera of a stored image sees where the body is at another pose.
     pub fn view_from(&self, index: usize, world_from_body: Pose) -> View {
-        let Stored { coarseness, epoch, body_from_cam, .. } = *self.store.get(index);
+        let Stored { coarseness, epoch, body_from_cam, .. } = *self.views.get(index);
         let TrainingCamera { camera, fisheye, .. } = *self.camera(index);
         View { coarseness, epoch, ..View::new(world_from_body * body_from_cam, camera, fisheye) }
     }
 
     /// What a step on a stored image compares with.
     pub fn target(&self, index: usize) -> Target {
-        Target { image: index as u32, camera: self.store.camera(index) as u32, exposure: self.store.exposure(index) }
+        Target { image: self.views.image(index) as u32, camera: self.views.camera(index) as u32, exposure: self.views.exposure(index) }
+    }
+
+    /// Brings the planes of a view that has a place to the device.
+    pub fn upload_image(&mut self, index: usize) -> Result<(), GpuError> {
+        let image = self.views.image(index) as u32;
+        for (channel, plane) in self.views.planes(index).iter().enumerate() {
+            self.pipeline.loss.set_plane(&mut self.gpu, image, channel, &plane.pixels)?;
+        }
+        Ok(())
     }
 
     /// Draws the map into `rendered`; how coarsely, that the view might fit.
@@ -57,26 +66,26 @@ impl Scene {
 
     /// Takes the gain of a new image from what `rendered`, its view, already shows of it. The first is the gauge.
     pub fn expose(&mut self, index: usize) {
-        if self.store.training().first() == Some(&(index as u32)) {
+        if self.views.training().first() == Some(&(index as u32)) {
             return;
         }
-        let offset = self.store.get(index).refined.exposure.offset;
-        if let Some(gain) = gain_from(self.store.planes(index), offset, &self.rendered, &self.camera(index).valid) {
-            self.store.get_mut(index).refined.exposure.gain = gain;
+        let offset = self.views.get(index).refined.exposure.offset;
+        if let Some(gain) = gain_from(self.views.planes(index), offset, &self.rendered, &self.camera(index).valid) {
+            self.views.get_mut(index).refined.exposure.gain = gain;
         }
     }
 
     /// Puts the Gaussians of anchors that were corrected by more than `tolerance` (m, rad) where their anchors are now;
     /// these are counted.
     pub fn apply_corrections(&mut self, tolerance: f64) -> Result<(), GpuError> {
-        let displaced = self.store.displaced(tolerance).inspect(|_| self.counters.blocks_moved.add(1));
+        let displaced = self.views.displaced(tolerance).inspect(|_| self.counters.blocks_moved.add(1));
         self.pipeline.pool.move_blocks(&mut self.gpu, displaced)
     }
 
     /// The exposure of the median training view: what takes the map's colours, whose gauge is none of a camera's, to what
     /// most images show. Allocates.
     pub fn median_exposure(&self) -> Exposure {
-        let exposures: Vec<Exposure> = self.store.training().iter().map(|i| self.store.exposure(*i as usize)).collect();
+        let exposures: Vec<Exposure> = self.views.training().iter().map(|i| self.views.exposure(*i as usize)).collect();
         median_exposure(&exposures).unwrap_or_default()
     }
 }

@@ -30,6 +30,8 @@ pub struct Trainer {
     /// Median depth of the first anchor, m: what a position step is measured in.
     pub scene_depth_m: f64,
     in_flight: Option<InFlight>,
+    /// The view of the last step that has ended.
+    pub trained: Option<usize>,
     /// The loss of the last step that has ended.
     pub loss: f64,
 }
@@ -48,6 +50,7 @@ impl Trainer {
             schedule: Schedule::new(config.seed),
             scene_depth_m: SCENE_DEPTH_M,
             in_flight: None,
+            trained: None,
             loss: 0.0,
         }
     }
@@ -61,6 +64,11 @@ impl Trainer {
         self.schedule.start_burst(anchor, self.config.burst_iterations);
     }
 
+    /// Whether the next step is of a new anchor's burst.
+    pub fn in_burst(&self) -> bool {
+        self.schedule.in_burst()
+    }
+
     /// Whether `finish_pending` decides what is next.
     pub fn must_wait(&self) -> bool {
         self.schedule.must_wait()
@@ -72,7 +80,7 @@ impl Trainer {
         if scene.pipeline.pool.count() == 0 || (self.trained_enough(scene) && !burst) {
             return Ok(None);
         }
-        let Some(index) = self.schedule.next(scene.store.training()) else { return Ok(None) };
+        let Some(index) = self.schedule.next(scene.views.ready()) else { return Ok(None) };
         let (view, target, rates) = (scene.view(index), scene.target(index), self.rates(scene));
         let step = scene.pipeline.start(&mut scene.gpu, &view, target, &rates, &self.weights)?;
         scene.steps += 1;
@@ -94,7 +102,7 @@ impl Trainer {
 
     fn finish(&mut self, InFlight { index, step }: InFlight, scene: &mut Scene) -> Result<Option<usize>, GpuError> {
         let done = scene.pipeline.finish(&mut scene.gpu, &step)?;
-        self.loss = done.loss;
+        (self.loss, self.trained) = (done.loss, Some(index));
         let counters = &scene.counters;
         let whole = done.stats.overflow == 0;
         counters.intersections_overflow.add(u64::from(!whole));
@@ -102,8 +110,9 @@ impl Trainer {
         counters.views_coarsened.add(u64::from(whole && step.view.coarseness > Coarseness::default()));
         counters.splats_not_finite.add(u64::from(done.stats.failed));
         counters.gradients_rejected.add(u64::from(done.gradients_rejected));
-        let entry = scene.store.get_mut(index);
+        let entry = scene.views.get_mut(index);
         entry.coarseness = scene.pipeline.coarseness_after(&done.stats);
+        (entry.steps, entry.steps_here) = (entry.steps.saturating_add(1), entry.steps_here.saturating_add(1));
         // A step on a picture with holes was not taken, and tells nothing of pose and exposure.
         if whole {
             self.refine(scene, index, &step, &done);
@@ -115,28 +124,28 @@ impl Trainer {
     fn refine(&self, scene: &mut Scene, index: usize, step: &Step, done: &StepStats) {
         let part = self.rate_part(scene);
         if self.config.refine_pose {
-            let body_from_cam = scene.store.get(index).body_from_cam;
-            let first = scene.store.first(index);
-            let refined = &mut scene.store.get_mut(first).refined;
+            let body_from_cam = scene.views.get(index).body_from_cam;
+            let first = scene.views.first(index);
+            let refined = &mut scene.views.get_mut(first).refined;
             let rate = part * self.config.lr_pose;
             refined.step_pose(&done.pose_gradient, &step.view.world_from_cam, &body_from_cam, rate);
         }
         if self.config.refine_exposure {
-            let refined = &mut scene.store.get_mut(index).refined;
+            let refined = &mut scene.views.get_mut(index).refined;
             let moved = refined.step_exposure(&done.exposure_gradient, part * self.config.lr_exposure);
-            scene.store.balance_exposure(moved);
+            scene.views.balance_exposure(moved);
         }
     }
 
     /// Steps past this only teach the map the few views it has, and what they do not show looks covered to the next.
     fn trained_enough(&self, scene: &Scene) -> bool {
         let most = u64::from(self.config.steps_per_keyframe_max);
-        most > 0 && scene.steps >= most * scene.store.training().len() as u64
+        most > 0 && scene.steps >= most * scene.views.training().len() as u64
     }
 
     /// Smaller as the steps a keyframe has had grow: large ones find the picture, small ones settle it.
     fn rate_part(&self, scene: &Scene) -> f64 {
-        let steps = scene.steps as f64 / scene.store.len().max(1) as f64;
+        let steps = scene.steps as f64 / scene.views.len().max(1) as f64;
         f64::max(self.config.lr_part_min, 1.0 / (1.0 + steps / self.config.lr_halving_steps))
     }
 

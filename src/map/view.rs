@@ -38,6 +38,25 @@ impl View {
         };
         Some(self.world_from_cam.transform(p_cam * depth))
     }
+
+    /// The pixel that shows a point of the world, and its depth as the raster counts it, m; `None` outside the picture.
+    pub fn project(&self, p_world: DVec3) -> Option<(f64, f64, f64)> {
+        let (p, c) = (self.world_from_cam.inverse().transform(p_world), &self.camera);
+        let (px, depth) = match self.fisheye {
+            None if p.z <= 0.0 => return None,
+            None => (DVec2::new(c.fx * p.x / p.z + c.cx, c.fy * p.y / p.z + c.cy), p.z),
+            Some(Fisheye { k, theta_max }) => {
+                if p.truncate().length().atan2(p.z) > theta_max {
+                    return None;
+                }
+                let Pinhole { width, height, fx, fy, cx, cy } = *c;
+                let lens = Lens::KannalaBrandt { k };
+                (Camera { width, height, fx, fy, cx, cy, lens }.project(p)?, p.length())
+            }
+        };
+        let inside = |v: f64, size: usize| v >= -0.5 && v < size as f64 - 0.5;
+        (inside(px.x, c.width) && inside(px.y, c.height)).then_some((px.x, px.y, depth))
+    }
 }
 
 /// A Kannala-Brandt lens, as far as its image is seen.

@@ -6,7 +6,7 @@ use super::status::{print_err, Gauges};
 use super::threads;
 use crate::config::Board;
 use crate::gpu::GpuError;
-use crate::map::{CurvePoint, Evaluation, Gaussian, Keyframe, Mapper, StepKind};
+use crate::map::{CurvePoint, Evaluation, Gaussian, Keyframe, Mapper, Place, StepKind};
 use crate::mem::{self, seal_thread, unsealed};
 use crate::output::metrics::percentile;
 use crate::output::panel::{caption, panel, Picture};
@@ -57,12 +57,22 @@ pub struct Mapping {
 impl Mapping {
     /// Opens the device on a thread of low priority: the threads of a CPU device inherit it, so
     /// that odometry is served first.
-    pub fn open(calibration: &Calibration, board: &Board, ring: Arc<KeyframeRing>) -> Result<Mapping, Fault> {
+    pub fn open(
+        calibration: &Calibration,
+        board: &Board,
+        ring: Arc<KeyframeRing>,
+        place: Option<Place>,
+    ) -> Result<Mapping, Fault> {
         let build = || {
             host::lower_priority(NICE);
-            Mapper::open(calibration, board)
+            Mapper::open_on(calibration, board, place)
         };
         let mapper = super::apart("mapping", build)?;
+        if let Some(disk) = mapper.disk() {
+            let (writes, reads) = (disk.clone(), disk);
+            super::start("store-write", move || writes.write_loop());
+            super::start("store-read", move || reads.read_loop());
+        }
         Ok(Mapping {
             mapper,
             keyframe: ring.shape().clone(),

@@ -16,6 +16,7 @@
 //! | and estimator | estimates, one frame behind at most; offers keyframes | sealed |
 //! | mapping | rectification, depth, training; low priority, as are the CPU device's own threads; `stipple run` has it in a process of its own | sealed; OpenCV and the driver allocate behind it |
 //! | map-answers | reads what that process tells | free |
+//! | store-write, store-read | write and read the map on disk, in the mapper's process | free |
 //! | autopilot | writes states to an autopilot and hears it, where the board names one | free |
 //! | trigger | starts the cameras' exposures, where a line is wired for it | free |
 //! | led | shows the state of a run, where a line is wired for it | free |
@@ -56,6 +57,7 @@ pub mod writers;
 
 use crate::config::{Board, InjectConfig};
 use crate::counters::Counters;
+use crate::map::Place;
 use crate::output::report::Report;
 use crate::output::OutputDir;
 use crate::publish::event::{EventId, Notice};
@@ -74,14 +76,14 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering, Ordering::Relaxed};
 use std::sync::Arc;
 use std::thread::{Builder, JoinHandle, Scope, ScopedJoinHandle};
-use std::time::{Duration, Instant};
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 use stipple_drivers::paced::FRAMES_UNREADABLE;
 use stipple_drivers::record::Format;
 use stipple_drivers::replay::read_trajectory;
 use stipple_drivers::{host, Calibration, Fault, FaultKind, Frames};
 pub use supervisor::Steering;
 use tracking::{FramePacket, Inlet, Link, OdometryRun, Tracker};
-use worker::{MapSide, Worker};
+use worker::{Kept, MapSide, Worker};
 use writers::Writers;
 
 /// How frames arrive and mapping steps are spent.
@@ -116,6 +118,8 @@ pub struct Options {
     pub duration_s: Option<f64>,
     /// Folder that the samples are recorded to, too.
     pub record: Option<PathBuf>,
+    /// The map begins with nothing: what an earlier run left in its store is set aside.
+    pub fresh: bool,
     /// Mapping is done by a process of its own, and threads ask for real-time priority.
     pub service: bool,
     /// Faults added to the sensors of a recording.
@@ -332,12 +336,32 @@ fn open_map(
     apart: bool,
 ) -> Result<MapSide, Fault> {
     if apart {
-        let worker = Worker::start(&input.place, &input.calibration, board, out, options.record.is_some())?;
+        let kept = board.store.enabled.then_some(Kept { fresh: options.fresh, flight: flight() });
+        let worker = Worker::start(&input.place, &input.calibration, board, out, options.record.is_some(), kept)?;
         input.warnings.extend(worker.warning.clone());
         return Ok(MapSide::Apart(Box::new(worker)));
     }
     let ring = Arc::new(KeyframeRing::new(&input.calibration, board)?);
-    Ok(MapSide::Here(Box::new(Mapping::open(&input.calibration, board, ring)?)))
+    let folder = out.file(MAP_STORE);
+    let at_once = matches!(options.pace, Pace::Lockstep(_));
+    let place = Place { folder: &folder, fresh: options.fresh, flight: flight(), at_once };
+    let mapping = Mapping::open(&input.calibration, board, ring, board.store.enabled.then_some(place))?;
+    input.warnings.extend(mapping.mapper.unkept.as_ref().map(|fault| unkept(fault).to_string()));
+    Ok(MapSide::Here(Box::new(mapping)))
+}
+
+/// Folder of the map's store in a run's folder.
+pub const MAP_STORE: &str = "map";
+
+/// The time now, by which a flight is told from others, ms since 1970.
+fn flight() -> i64 {
+    SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_millis() as i64)
+}
+
+/// The fault of a store that cannot be used, and what becomes of the map.
+fn unkept(fault: &Fault) -> Fault {
+    let what = format!("{}; the map is kept in memory alone, and ends where that is full", fault.what);
+    Fault::new(fault.kind, &fault.place, what, &fault.fix)
 }
 
 /// Reads `input` at its own pace with the threads of a flight, shows every packet to `observer`, without estimating or mapping.

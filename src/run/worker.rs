@@ -12,6 +12,7 @@ use super::memory;
 use super::status::{print_err, Gauges};
 use super::threads;
 use crate::config::{Board, ThreadRule};
+use crate::map::Place;
 use crate::mem::unsealed;
 use crate::output::panel::Picture;
 use crate::output::OutputDir;
@@ -65,6 +66,15 @@ struct Setup {
     /// Time of the run so far, s.
     run_s: f64,
     parent: u32,
+    /// None where the map is not kept on disk.
+    kept: Option<Kept>,
+}
+
+/// How the map's store is used: `map::Place`.
+#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
+pub struct Kept {
+    pub fresh: bool,
+    pub flight: i64,
 }
 
 #[derive(Serialize, Deserialize)]
@@ -135,6 +145,7 @@ pub struct Worker {
     board: Board,
     calibration: Calibration,
     out: PathBuf,
+    kept: Option<Kept>,
     begun: Instant,
     running: Option<Running>,
     pause: Duration,
@@ -147,7 +158,7 @@ pub struct Worker {
 
 impl Worker {
     /// A worker that does not run yet, and may be started at once.
-    fn new(ring: KeyframeRing, calibration: Calibration, board: Board, out: PathBuf) -> Worker {
+    fn new(ring: KeyframeRing, calibration: Calibration, board: Board, out: PathBuf, kept: Option<Kept>) -> Worker {
         let now = Instant::now();
         Worker {
             ring: Arc::new(ring),
@@ -155,6 +166,7 @@ impl Worker {
             board,
             calibration,
             out,
+            kept,
             begun: now,
             running: None,
             pause: Duration::ZERO,
@@ -172,9 +184,10 @@ impl Worker {
         board: &Board,
         out: &OutputDir,
         records: bool,
+        kept: Option<Kept>,
     ) -> Result<Worker, Fault> {
         let ring = KeyframeRing::new(calibration, board)?.with_cloud(Cloud::create())?;
-        let mut worker = Worker::new(ring, calibration.clone(), board.clone(), out.path().to_path_buf());
+        let mut worker = Worker::new(ring, calibration.clone(), board.clone(), out.path().to_path_buf(), kept);
         let first = Some((place.to_string(), records));
         worker.spawn(first).map_err(|e| refused(format!("the mapper's process does not start: {e}")))?;
         let (gauges, told) = (Gauges::default(), worker.running.as_ref().map(|r| r.told.clone()));
@@ -207,7 +220,10 @@ impl Worker {
             first,
             run_s: self.begun.elapsed().as_secs_f64(),
             parent: std::process::id(),
+            kept: self.kept,
         };
+        // What another mapper of this flight has kept is gone on with.
+        self.kept.iter_mut().for_each(|kept| kept.fresh = false);
         self.ring.word(Word::Ready).store(0, Release);
         self.ring.word(Word::Stop).store(0, Release);
         let mut command = Command::new("/proc/self/exe");
@@ -263,11 +279,12 @@ impl Worker {
         let said =
             told.and_then(|told| lock(&told).refused.clone()).map_or(String::new(), |fault| format!(" ({fault})"));
         self.postpone(now, life);
+        let with = if self.kept.is_some() { "with what is on disk" } else { "with an empty map" };
         let when = match self.next_start.saturating_duration_since(now).as_secs() {
             0 => "now".into(),
             s => format!("in {s} s"),
         };
-        Some((EventId::MapperLost, format!("the mapper {why}{said}; it starts again {when}, with an empty map")))
+        Some((EventId::MapperLost, format!("the mapper {why}{said}; it starts again {when}, {with}")))
     }
 
     fn postpone(&mut self, now: Instant, life: Duration) {
@@ -465,7 +482,9 @@ pub fn serve(mut input: impl Read, mut output: impl Write) -> Result<(), Fault> 
             None => ring,
         };
         let ring = Arc::new(ring);
-        Ok((ring.clone(), Mapping::open(calibration, board, ring)?))
+        let folder = setup.out.join(super::MAP_STORE);
+        let place = setup.kept.map(|Kept { fresh, flight }| Place { folder: &folder, fresh, flight, at_once: false });
+        Ok((ring.clone(), Mapping::open(calibration, board, ring, place)?))
     });
     let (ring, mapping) = match opened {
         Ok(opened) => opened,
@@ -491,6 +510,7 @@ pub fn serve(mut input: impl Read, mut output: impl Write) -> Result<(), Fault> 
         }
         std::thread::sleep(BEAT);
     });
+    let missing = missing.or(mapping.mapper.unkept.as_ref().map(super::unkept));
     tell(&mut output, &Answer::Ready(missing)).map_err(broken)?;
     ring.word(Word::Ready).store(1, Release);
     let stop = || ring.word(Word::Stop).load(Acquire) != 0;

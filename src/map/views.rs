@@ -1,14 +1,19 @@
-//! The images the map is trained and judged on, at mapping resolution, and what is known of each. Everything is sized at
-//! boot; full is a value.
+//! What the map is trained and judged on: every keyframe that is known, and the images, at mapping resolution, of those that
+//! have a place. Everything is sized at boot; full is a value.
+//!
+//! An entry is one camera's view of a keyframe; those of a keyframe stand side by side and keep their index for good. Images
+//! are what is large: they lie in a fixed number of places, on the host and, by the same numbers, on the GPU. Where there is an
+//! archive they come and go (`archive`); without one a keyframe keeps its place.
 
 use super::coarseness::Coarseness;
 use super::exposure::Exposure;
+use super::horizon::Horizon;
 use super::keyframes::{Keyframe, PoseCorrection};
 use super::refine::Refinement;
 use super::shape::Shape;
 use stipple_drivers::{Image, Nanos, Pose};
 
-/// One camera's image of a keyframe in the store.
+/// One camera's view of a keyframe.
 #[derive(Clone, Copy, Debug)]
 pub struct Stored {
     pub id: u64,
@@ -19,7 +24,7 @@ pub struct Stored {
     /// Where the camera sits on the body by which the stored image was drawn.
     pub body_from_cam: Pose,
     /// Where the raw camera sits whose image it was drawn from.
-    body_from_raw: Pose,
+    pub body_from_raw: Pose,
     /// Pose of the camera when the Gaussians of an anchor were last put in place.
     pub placed: Pose,
     pub held_out: bool,
@@ -28,6 +33,11 @@ pub struct Stored {
     pub refined: Refinement,
     /// What its view leaves out, that its list of intersections may hold it.
     pub coarseness: Coarseness,
+    /// How far it sees.
+    pub horizon: Horizon,
+    /// Training steps on it, and how many of them since its image came to its place.
+    pub steps: u32,
+    pub steps_here: u32,
 }
 
 impl Stored {
@@ -42,42 +52,142 @@ impl Stored {
     }
 }
 
-/// The images the map trains on, at mapping resolution, and what is known of each. A keyframe has one of every camera
-/// that trains, side by side; what is known of the body is in the first of them.
-pub struct Store {
+/// No place, or nobody's.
+const NONE: u32 = u32::MAX;
+
+/// Every keyframe known, and places for the images of some. What is known of the body is in the first entry of a keyframe.
+pub struct Views {
     cameras: usize,
     /// Planes of an image: grey, or red, green and blue.
     channels: usize,
+    /// Entries that there is room for.
+    known: usize,
     entries: Vec<Stored>,
     planes: Vec<Image>,
+    /// The place of each keyframe's images, and the keyframe whose images are at each place.
+    places: Vec<u32>,
+    keyframes: Vec<u32>,
     training: Vec<u32>,
+    /// Entries of `training` that may be trained on now.
+    ready: Vec<u32>,
 }
 
-impl Store {
-    pub fn new(shape: &Shape) -> Store {
-        let (capacity, channels) = (shape.images as usize, shape.channels as usize);
+impl Views {
+    /// Room for the shape's images, and for what is known of `known` of them or more.
+    pub fn new(shape: &Shape, known: usize) -> Views {
+        let (cameras, channels) = (shape.cameras as usize, shape.channels as usize);
+        let places = shape.images as usize / cameras;
+        let known = (known / cameras).max(places) * cameras;
         let image = || Image::new(shape.width as usize, shape.height as usize);
-        Store {
-            cameras: shape.cameras as usize,
+        Views {
+            cameras,
             channels,
-            entries: Vec::with_capacity(capacity),
-            planes: (0..capacity * channels).map(|_| image()).collect(),
-            training: Vec::with_capacity(capacity),
+            known,
+            entries: Vec::with_capacity(known),
+            planes: (0..places * cameras * channels).map(|_| image()).collect(),
+            places: Vec::with_capacity(known / cameras),
+            keyframes: vec![NONE; places],
+            training: Vec::with_capacity(known),
+            ready: Vec::with_capacity(places * cameras),
         }
     }
 
+    /// Entries; those of a keyframe follow one another.
     pub fn len(&self) -> usize {
         self.entries.len()
     }
 
-    /// Whether a keyframe would find no room for all its images.
+    /// Whether another keyframe would find no entry, or no place for its images.
     pub fn is_full(&self) -> bool {
-        (self.entries.len() + self.cameras) * self.channels > self.planes.len()
+        self.entries.len() + self.cameras > self.known || self.free_place().is_none()
+    }
+
+    /// Keyframes that can be known.
+    pub fn keyframes_max(&self) -> usize {
+        self.known / self.cameras
+    }
+
+    /// Keyframes that can have a place at once.
+    pub fn places(&self) -> usize {
+        self.keyframes.len()
+    }
+
+    /// Index of the first view of a keyframe by its number.
+    pub fn index_of(&self, id: u64) -> Option<usize> {
+        let keyframes = self.entries.len() / self.cameras;
+        let id_at = |keyframe: usize| self.entries[keyframe * self.cameras].id;
+        // Numbers grow.
+        let (mut low, mut high) = (0, keyframes);
+        while low < high {
+            let middle = (low + high) / 2;
+            if id_at(middle) < id {
+                low = middle + 1;
+            } else {
+                high = middle;
+            }
+        }
+        (low < keyframes && id_at(low) == id).then_some(low * self.cameras)
+    }
+
+    /// Whether a keyframe would find a place for its images.
+    pub fn has_free_place(&self) -> bool {
+        self.free_place().is_some()
+    }
+
+    /// Whether no other keyframe can be known.
+    pub fn knows_all_it_can(&self) -> bool {
+        self.entries.len() + self.cameras > self.known
+    }
+
+    fn free_place(&self) -> Option<usize> {
+        self.keyframes.iter().position(|k| *k == NONE)
+    }
+
+    /// First entries of the keyframes that have a place.
+    pub fn placed(&self) -> impl Iterator<Item = usize> + '_ {
+        self.keyframes.iter().filter(|k| **k != NONE).map(|k| *k as usize * self.cameras)
+    }
+
+    /// Whether the images of an entry's keyframe have a place.
+    pub fn has_place(&self, index: usize) -> bool {
+        self.places[index / self.cameras] != NONE
+    }
+
+    /// Number of an entry's image among the images that have a place.
+    ///
+    /// # Panics
+    /// Where it has none.
+    pub fn image(&self, index: usize) -> usize {
+        let place = self.places[index / self.cameras];
+        assert!(place != NONE, "the images of entry {index} have a place");
+        place as usize * self.cameras + self.camera(index)
+    }
+
+    /// Gives up the place of an entry's keyframe.
+    pub fn unplace(&mut self, index: usize) {
+        let place = std::mem::replace(&mut self.places[index / self.cameras], NONE);
+        if let Some(keyframe) = self.keyframes.get_mut(place as usize) {
+            *keyframe = NONE;
+        }
+        self.ready.retain(|k| *k as usize / self.cameras != index / self.cameras);
+    }
+
+    /// Gives an entry's keyframe a free place; false where there is none. Its planes are what was there before.
+    pub fn place(&mut self, index: usize) -> bool {
+        let (keyframe, Some(place)) = (index / self.cameras, self.free_place()) else { return false };
+        (self.places[keyframe], self.keyframes[place]) = (place as u32, keyframe as u32);
+        let first = keyframe * self.cameras;
+        self.entries[first..first + self.cameras].iter_mut().for_each(|e| e.steps_here = 0);
+        true
     }
 
     /// The camera that an image is of.
     pub fn camera(&self, index: usize) -> usize {
         index % self.cameras
+    }
+
+    pub fn cameras(&self) -> usize {
+        self.cameras
     }
 
     /// The first image of the same keyframe.
@@ -90,7 +200,7 @@ impl Store {
         self.get(self.first(index)).world_from_refined()
     }
 
-    /// Takes the next camera of a keyframe, whose planes `draw` makes one by one; `None` when the store is full. Both poses are
+    /// Takes the next camera of a keyframe, whose planes `draw` makes one by one; `None` when there is no room. Both poses are
     /// on the body: of the camera that is drawn, and of the raw one.
     pub fn add(
         &mut self,
@@ -99,8 +209,9 @@ impl Store {
         mut draw: impl FnMut(usize, &mut Image),
     ) -> Option<usize> {
         let index = self.entries.len();
-        let planes = self.planes.get_mut(index * self.channels..(index + 1) * self.channels)?;
-        planes.iter_mut().enumerate().for_each(|(channel, plane)| draw(channel, plane));
+        if index == self.known {
+            return None;
+        }
         let &Keyframe { id, t, epoch, world_from_body, held_out, .. } = keyframe;
         let mut refined = Refinement::default();
         // Cameras change their exposure slowly: the last one's is the best guess. Not so its offset, which cameras keep: what
@@ -109,7 +220,7 @@ impl Store {
         let last = self.training.iter().rev().find(|k| self.camera(**k as usize) == self.camera(index));
         refined.exposure.gain = last.map_or(1.0, |&k| self.get(k as usize).refined.exposure.gain);
         let coarseness = last.map_or(Coarseness::default(), |&k| self.get(k as usize).coarseness);
-        self.entries.push(Stored {
+        let stored = Stored {
             id,
             t,
             epoch,
@@ -121,11 +232,38 @@ impl Store {
             anchor: false,
             refined,
             coarseness,
-        });
+            horizon: Horizon::default(),
+            steps: 0,
+            steps_here: 0,
+        };
+        if self.camera(index) == 0 && self.free_place().is_none() {
+            return None;
+        }
+        self.know(stored);
+        if self.camera(index) == 0 {
+            self.place(index);
+        }
         if !held_out {
+            self.ready.push(index as u32);
+        }
+        self.planes_mut(index).iter_mut().enumerate().for_each(|(channel, plane)| draw(channel, plane));
+        Some(index)
+    }
+
+    /// Takes an entry without an image; false when there is no room.
+    pub fn know(&mut self, stored: Stored) -> bool {
+        let index = self.entries.len();
+        if index == self.known {
+            return false;
+        }
+        if self.camera(index) == 0 {
+            self.places.push(NONE);
+        }
+        if !stored.held_out {
             self.training.push(index as u32);
         }
-        Some(index)
+        self.entries.push(stored);
+        true
     }
 
     pub fn get(&self, index: usize) -> &Stored {
@@ -136,9 +274,15 @@ impl Store {
         &mut self.entries[index]
     }
 
-    /// Grey, or red, green and blue.
+    /// Grey, or red, green and blue, of an image that has a place.
     pub fn planes(&self, index: usize) -> &[Image] {
-        &self.planes[index * self.channels..][..self.channels]
+        &self.planes[self.image(index) * self.channels..][..self.channels]
+    }
+
+    /// The same, to be filled.
+    pub fn planes_mut(&mut self, index: usize) -> &mut [Image] {
+        let image = self.image(index);
+        &mut self.planes[image * self.channels..][..self.channels]
     }
 
     /// An image's exposure: its own where it is trained on; of one held out, what those beside it in time make likely.
@@ -183,9 +327,27 @@ impl Store {
         }
     }
 
-    /// Indices of keyframes that may be trained on.
+    /// Entries that are not held out, oldest first.
     pub fn training(&self) -> &[u32] {
         &self.training
+    }
+
+    /// Entries that may be trained on now.
+    pub fn ready(&self) -> &[u32] {
+        &self.ready
+    }
+
+    /// Sets which of the entries that have a place and are not held out may be trained on.
+    pub fn make_ready(&mut self, may: impl Fn(usize) -> bool) {
+        self.ready.clear();
+        for place in 0..self.keyframes.len() {
+            let first = self.keyframes[place] as usize * self.cameras;
+            if self.keyframes[place] != NONE && !self.entries[first].held_out && may(first) {
+                self.ready.extend((first..first + self.cameras).map(|i| i as u32));
+            }
+        }
+        // Draws depend on the order, and the order not on who had which place before.
+        self.ready.sort_unstable();
     }
 
     pub fn anchors(&self) -> usize {
@@ -239,13 +401,14 @@ mod tests {
         Keyframe { id, held_out, ..Keyframe::default() }
     }
 
-    fn store(images: u32, cameras: u32) -> Store {
-        Store::new(&Shape { width: 2, height: 2, splats: 1, intersections: 1, images, channels: 1, cameras })
+    fn views(images: u32, cameras: u32) -> Views {
+        let shape = Shape { width: 2, height: 2, splats: 1, intersections: 1, images, channels: 1, cameras };
+        Views::new(&shape, 0)
     }
 
     #[test]
     fn held_out_keyframes_are_stored_but_not_for_training() {
-        let mut s = store(3, 1);
+        let mut s = views(3, 1);
         for id in 0..3 {
             assert_eq!(s.add(&keyframe(id, id == 1), ON_BODY, |_, i| i.pixels.fill(9)), Some(id as usize));
         }
@@ -256,15 +419,15 @@ mod tests {
 
     #[test]
     fn images_of_one_keyframe_share_its_pose_and_not_their_exposure() {
-        let mut s = store(5, 2);
-        for id in 0..2 {
+        let mut s = views(7, 2);
+        let mut add = |s: &mut Views, id: u64| {
             assert!(!s.is_full());
             for camera in 0..2 {
-                let index = s.add(&keyframe(id, false), ON_BODY, |_, _| {}).expect("room for five");
+                let index = s.add(&keyframe(id, false), ON_BODY, |_, _| {}).expect("room for six");
                 assert_eq!((s.camera(index), s.first(index)), (camera, 2 * id as usize));
             }
-        }
-        assert!(s.is_full(), "one image more is no keyframe");
+        };
+        (0..2).for_each(|id| add(&mut s, id));
         assert!(s.correct(&PoseCorrection {
             id: 1,
             world_from_body: Pose { p: DVec3::X, ..Pose::IDENTITY },
@@ -272,14 +435,28 @@ mod tests {
         }));
         assert_eq!([1, 2, 3].map(|i| s.world_from_body(i).p), [DVec3::ZERO, DVec3::X, DVec3::X]);
         s.get_mut(1).refined.exposure.gain = 2.0;
-        assert_eq!(s.add(&keyframe(2, false), ON_BODY, |_, _| {}), Some(4));
-        assert_eq!([0, 1, 4].map(|i| s.exposure(i).gain), [1.0, 2.0, 1.0]);
+        s.get_mut(3).refined.exposure.gain = 3.0;
+        add(&mut s, 2);
+        assert_eq!([0, 1, 4, 5].map(|i| s.exposure(i).gain), [1.0, 2.0, 1.0, 3.0]);
+        assert!(s.is_full(), "one image more is no keyframe");
+    }
+
+    #[test]
+    fn a_place_that_is_given_up_is_another_keyframes_and_entries_stay() {
+        let mut s = views(2, 1);
+        (0..2).for_each(|id| _ = s.add(&keyframe(id, false), ON_BODY, |_, i| i.pixels.fill(id as u8)));
+        s.unplace(0);
+        assert_eq!((s.len(), s.ready(), s.has_place(0)), (2, &[1][..], false));
+        assert!(s.place(0) && !s.place(1), "both places are taken");
+        s.make_ready(|_| true);
+        assert_eq!((s.image(0), s.ready()), (0, &[0, 1][..]));
+        assert_eq!(s.placed().collect::<Vec<_>>(), [0, 1]);
     }
 
     /// An estimator that learns where a camera sits moves the body, not the camera: nor do its image and its Gaussians.
     #[test]
     fn a_correction_of_rig_and_pose_that_leaves_the_camera_where_it_was_moves_nothing() {
-        let mut s = store(2, 2);
+        let mut s = views(2, 2);
         let turned = |x: f64| Pose { q: DQuat::from_rotation_x(x), p: DVec3::new(0.1, x, 0.0) };
         let (raw, raw_from_cam) = (turned(0.3), Pose { q: DQuat::from_rotation_z(0.02), p: DVec3::ZERO });
         for _ in 0..2 {

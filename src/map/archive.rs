@@ -1,0 +1,727 @@
+//! What of the map is on disk, and what of it is in memory.
+//!
+//! The store on disk is the map: a block of Gaussians for each anchor, and every keyframe with its images. The pool of
+//! Gaussians and the places for images are caches of it, and so the map may be larger than both. What should be in them is
+//! chosen when a keyframe comes (`residency`): blocks go out and come in whole, there and nowhere else, so that no training
+//! step waits for them. Images rotate while the map trains, one at a time.
+//!
+//! Blocks are written once their anchor was densified, again whenever they had a quarter more training steps, and before they
+//! go. Images are written once. Reading and writing are the business of two threads of the store, or, in lockstep, of this one,
+//! so that a run can be repeated to the bit. A full or broken disk costs no map: what cannot be written stays in memory, and
+//! what finds no room there is thinned as without a store.
+
+use super::block::{BlockAbout, KeyframeAbout, RunAbout};
+use super::block::{KIND_BLOCK, KIND_IMAGE, KIND_KEYFRAME, KIND_RUN, NO_BLOCK, SAMPLES};
+use super::horizon::{ball, Horizon};
+use super::paging::splat_bytes;
+use super::refine::Refinement;
+use super::scene::Scene;
+use super::schedule::Rng;
+use super::shape::Shape;
+use super::view::View;
+use super::views::{Stored, Views};
+use crate::config::Board;
+use crate::counters::Counters;
+use crate::gpu::GpuError;
+use crate::limits::CAMERAS_MAX;
+use crate::mem::Footprint;
+use crate::store::{self, Disk, Fetched, Key, Limits, Store};
+use glam::{DVec3, Vec3};
+use std::path::Path;
+use std::sync::Arc;
+use stipple_drivers::{Calibration, Fault, Image, Pose};
+
+/// Blocks that a run may make. One covers some square metres: a large building.
+pub const BLOCKS_KNOWN: usize = 2048;
+/// Buffers between here and the disk: what is written and what is read at a time.
+const BUFFERS: usize = 12;
+const SEGMENT_BYTES: u64 = 32 << 20;
+/// Training steps after which a block is written again, as a part of those it had, and at least.
+const REWRITTEN_PART: f64 = 0.25;
+const REWRITTEN_MIN: u32 = 100;
+/// Blocks and states of keyframes written when a keyframe comes, at most.
+const BLOCKS_AT_ONCE: usize = 2;
+const STATES_AT_ONCE: usize = 4;
+/// Whether blocks keep Adam's moments on disk.
+const MOMENTS: bool = true;
+
+/// Where the store is, and how it is used.
+#[derive(Clone, Copy, Debug)]
+pub struct Place<'a> {
+    pub folder: &'a Path,
+    /// Whether what is there is set aside.
+    pub fresh: bool,
+    /// When the flight began, ms since 1970. A mapper of the flight that was there last goes on with its map; another begins
+    /// a run of its own beside the earlier ones.
+    pub flight: i64,
+    /// Whether what is asked of the disk is done at once, on the mapper's thread: for lockstep.
+    pub at_once: bool,
+}
+
+/// A block that is known.
+#[derive(Clone, Copy, Debug)]
+pub struct Block {
+    /// Index of its anchor among the views.
+    pub anchor: u32,
+    pub epoch: u32,
+    /// Gaussians when it was last looked at.
+    pub count: u32,
+    pub samples: [[f32; 3]; SAMPLES],
+    pub samples_len: u8,
+    pub centre: Vec3,
+    pub radius: f32,
+    /// Where its Gaussians were put in place from.
+    pub placed: Pose,
+    pub in_pool: bool,
+    /// It was asked of the disk and has not come yet.
+    pub asked: bool,
+    /// Training steps of views that see it, and how many of them had been taken when it was last written.
+    pub steps: u32,
+    written: Option<u32>,
+}
+
+impl Block {
+    pub fn points(&self) -> &[[f32; 3]] {
+        &self.samples[..usize::from(self.samples_len)]
+    }
+
+    fn changed(&self) -> bool {
+        self.written.is_none_or(|at| self.steps > at)
+    }
+
+    /// Whether enough steps were taken to write it again.
+    fn is_due(&self) -> bool {
+        self.written.is_none_or(|at| self.steps - at >= REWRITTEN_MIN.max((f64::from(at) * REWRITTEN_PART) as u32))
+    }
+}
+
+/// What the archive knows of a keyframe beside its views.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Known {
+    /// Its images were handed to the store.
+    pub saved: bool,
+    /// Its images were asked of the disk; how many have not come.
+    pub asked: u8,
+    /// Its steps when its state was last written.
+    stated: u32,
+    /// The horizon was taken from a picture with much of it still open.
+    pub open: bool,
+}
+
+pub struct Archive {
+    pub store: Store,
+    disk: Arc<Disk>,
+    at_once: bool,
+    run: u32,
+    /// Epoch 0 of this run, in the store.
+    epoch_base: u32,
+    about: RunAbout,
+    /// Whether the run was there before.
+    pub goes_on: bool,
+    pub blocks: Vec<Block>,
+    pub known: Vec<Known>,
+    /// How many of a block's samples a keyframe sees: keyframe by keyframe.
+    pub sight: Vec<u8>,
+    pub choice: super::residency::Choice,
+    pub rng: Rng,
+    /// The next block and keyframe that are looked at for writing.
+    next_block: usize,
+    next_state: usize,
+    /// The first thing that went wrong with the disk, told once.
+    pub said: bool,
+}
+
+impl Archive {
+    /// Bytes on the host.
+    pub fn footprint(board: &Board, shape: &Shape, f: &mut Footprint) {
+        let keyframes = keyframes_known(board, shape);
+        f.build("map: blocks and keyframes known", || tables(keyframes));
+        f.extend(Store::footprint(&limits(board, shape, false)));
+    }
+
+    /// Opens the store for a run.
+    pub fn open(place: Place, calibration: &Calibration, board: &Board, shape: &Shape) -> Result<Archive, Fault> {
+        if place.fresh {
+            store::set_aside(place.folder)?;
+        }
+        let limits = limits(board, shape, place.at_once);
+        let (store, disk) = Store::open(place.folder, identity(calibration, board, shape), &limits)?;
+        let (mut run, mut epochs) = (0, 0);
+        store.entries(|key, about| {
+            run = run.max(key.run + 1);
+            let epoch = match key.kind {
+                KIND_BLOCK => BlockAbout::decode(about).map(|b| b.epoch),
+                KIND_KEYFRAME => KeyframeAbout::decode(about).map(|k| k.epoch),
+                _ => RunAbout::decode(about).map(|r| r.epoch_base),
+            };
+            epochs = epochs.max(epoch.map_or(0, |e| e + 1));
+        });
+        let last = |store: &Store, run: u32| store.about(&run_key(run)).and_then(|about| RunAbout::decode(&about));
+        let newest = run.checked_sub(1).and_then(|run| Some((run, last(&store, run)?)));
+        let (run, about, goes_on) = match newest.filter(|(_, about)| about.started_unix_ms == place.flight) {
+            Some((run, about)) => (run, about, true),
+            None => {
+                let about = RunAbout {
+                    epoch_base: epochs,
+                    started_unix_ms: place.flight,
+                    colour: shape.channels == 3,
+                    width: shape.width,
+                    height: shape.height,
+                    cameras: shape.cameras,
+                    channels: shape.channels,
+                    scene_depth_m: 0.0,
+                };
+                (run, about, false)
+            }
+        };
+        let keyframes = keyframes_known(board, shape);
+        let (blocks, known, sight, choice) = tables(keyframes);
+        let mut archive = Archive {
+            store,
+            disk: Arc::new(disk),
+            at_once: place.at_once,
+            run,
+            epoch_base: about.epoch_base,
+            about,
+            goes_on,
+            blocks,
+            known,
+            sight,
+            choice,
+            rng: Rng::new(board.map.seed ^ 0x5e7),
+            next_block: 0,
+            next_state: 0,
+            said: false,
+        };
+        archive.state_run();
+        Ok(archive)
+    }
+
+    /// The side of the store that reads and writes, for the threads that do; `None` where this thread does.
+    pub fn disk(&self) -> Option<Arc<Disk>> {
+        (!self.at_once).then(|| self.disk.clone())
+    }
+
+    /// Does what waits for the disk where no threads do.
+    fn serve(&self) {
+        if self.at_once {
+            self.disk.serve();
+        }
+    }
+
+    fn state_run(&mut self) {
+        let about = self.about.encode();
+        self.store.put(run_key(self.run), &about, |_| ());
+        self.serve();
+    }
+
+    /// Median depth of the scene at the first anchor, m, if the run had one.
+    pub fn scene_depth_m(&self) -> Option<f64> {
+        Some(self.about.scene_depth_m).filter(|depth| *depth > 0.0)
+    }
+
+    pub fn set_scene_depth(&mut self, depth_m: f64) {
+        self.about.scene_depth_m = depth_m;
+        self.state_run();
+    }
+
+    fn key(&self, kind: u8, id: u32) -> Key {
+        Key { kind, run: self.run, id }
+    }
+
+    /// Takes over what the last run left: every keyframe and block is known, and none is in memory.
+    pub fn resume(&mut self, views: &mut Views) {
+        let (mut states, cameras) = (vec![], views.cameras());
+        self.store.entries(|key, about| {
+            if key.kind == KIND_KEYFRAME && key.run == self.run {
+                states.extend(KeyframeAbout::decode(about).map(|state| (key.id, state)));
+            }
+        });
+        states.sort_unstable_by_key(|(id, _)| *id);
+        // All views of a keyframe, and its images, or none.
+        let whole: Vec<_> = states
+            .chunk_by(|a, b| a.0 / CAMERAS_MAX as u32 == b.0 / CAMERAS_MAX as u32)
+            .filter(|of_one| of_one.len() == cameras)
+            .filter(|of_one| of_one.iter().all(|(id, _)| self.store.about(&self.key(KIND_IMAGE, *id)).is_some()))
+            .collect();
+        for (id, state) in whole.into_iter().flatten() {
+            views.know(entry(*id, state, self.epoch_base));
+        }
+        self.know_keyframes(views.len() / cameras);
+        self.known.iter_mut().for_each(|k| (k.saved, k.stated) = (true, u32::MAX));
+        let mut found = vec![];
+        self.store.entries(|key, about| {
+            if key.kind == KIND_BLOCK && key.run == self.run {
+                found.extend(BlockAbout::decode(about).map(|block| (key.id, block)));
+            }
+        });
+        found.sort_unstable_by_key(|(id, _)| *id);
+        for (id, b) in found {
+            let Some(anchor) = views.index_of(u64::from(id)) else { continue };
+            let steps = views.get(anchor).steps;
+            let entry = views.get_mut(anchor);
+            (entry.anchor, entry.placed) = (true, b.placed);
+            self.blocks.push(Block {
+                anchor: anchor as u32,
+                epoch: b.epoch - self.epoch_base,
+                count: b.count,
+                samples: b.samples,
+                samples_len: b.samples_len,
+                centre: Vec3::ZERO,
+                radius: 0.0,
+                placed: b.placed,
+                in_pool: false,
+                asked: false,
+                steps,
+                written: Some(steps),
+            });
+            self.measure(self.blocks.len() - 1);
+        }
+    }
+
+    fn know_keyframes(&mut self, count: usize) {
+        while self.known.len() < count && self.known.len() < self.known.capacity() {
+            self.known.push(Known::default());
+        }
+    }
+
+    /// Takes in a keyframe that was added to the views, whose images are written.
+    pub fn take_in(&mut self, scene: &Scene, index: usize) {
+        self.know_keyframes(scene.views.len() / scene.views.cameras());
+        self.save_images(&scene.views, index);
+    }
+
+    /// The number of the block of an anchor.
+    pub fn block_of(&self, anchor: u32) -> Option<usize> {
+        self.blocks.iter().position(|b| b.anchor == anchor)
+    }
+
+    /// Takes in the block that was opened for an anchor.
+    pub fn open_block(&mut self, views: &Views, anchor: usize) {
+        if self.blocks.len() == BLOCKS_KNOWN {
+            return;
+        }
+        let entry = views.get(anchor);
+        self.blocks.push(Block {
+            anchor: anchor as u32,
+            epoch: entry.epoch,
+            count: 0,
+            samples: [[0.0; 3]; SAMPLES],
+            samples_len: 0,
+            centre: Vec3::ZERO,
+            radius: 0.0,
+            placed: entry.placed,
+            in_pool: true,
+            asked: false,
+            steps: 0,
+            written: None,
+        });
+    }
+
+    /// Whether another block can be made.
+    pub fn is_full(&self) -> bool {
+        self.blocks.len() == BLOCKS_KNOWN
+    }
+
+    /// A block's ball, from its samples.
+    fn measure(&mut self, block: usize) {
+        let b = &mut self.blocks[block];
+        (b.centre, b.radius) = ball(&b.samples[..usize::from(b.samples_len)]);
+    }
+
+    /// Hands a block in the pool to the store, and looks where its Gaussians are; false where the store takes none now.
+    pub fn save_block(&mut self, scene: &mut Scene, block: usize) -> Result<bool, GpuError> {
+        if !self.store.has_room() {
+            self.serve();
+            if !self.store.has_room() {
+                return Ok(false);
+            }
+        }
+        let b = self.blocks[block];
+        let id = scene.views.get(b.anchor as usize).id as u32;
+        let (gpu, pool) = (&mut scene.gpu, &mut scene.pipeline.pool);
+        // The header tells where the Gaussians are, so they are looked at first.
+        let (mut bytes, mut failed) = (std::mem::take(&mut self.choice.page), None);
+        bytes.clear();
+        match pool.read_block(gpu, b.anchor, MOMENTS, &mut bytes) {
+            Ok(count) => self.look_at(block, count, &bytes),
+            Err(e) => failed = Some(e),
+        }
+        let b = &self.blocks[block];
+        let about = BlockAbout {
+            epoch: b.epoch + self.epoch_base,
+            count: b.count,
+            colour: pool.colour,
+            moments: MOMENTS,
+            placed: b.placed,
+            moved: Pose::IDENTITY,
+            samples: b.samples,
+            samples_len: b.samples_len,
+        };
+        let taken = failed.is_none()
+            && self.store.put(self.key(KIND_BLOCK, id), &about.encode(), |payload| payload.extend_from_slice(&bytes));
+        self.choice.page = bytes;
+        if taken {
+            let b = &mut self.blocks[block];
+            b.written = Some(b.steps);
+        }
+        self.serve();
+        failed.map_or(Ok(taken), Err)
+    }
+
+    /// Takes a block's samples from its arrays.
+    fn look_at(&mut self, block: usize, count: usize, bytes: &[u8]) {
+        const SPLAT: usize = size_of::<crate::gpu::kernels::types::Splat>();
+        let b = &mut self.blocks[block];
+        (b.count, b.samples_len) = (count as u32, 0);
+        for i in 0..SAMPLES.min(count) {
+            let at = (i * count / SAMPLES.min(count)) * SPLAT;
+            let mean: [f32; 3] = bytemuck::pod_read_unaligned(&bytes[at..at + 12]);
+            if mean.iter().all(|v| v.is_finite()) {
+                b.samples[usize::from(b.samples_len)] = mean;
+                b.samples_len += 1;
+            }
+        }
+        self.measure(block);
+    }
+
+    fn save_images(&mut self, views: &Views, index: usize) {
+        let (keyframe, cameras) = (index / views.cameras(), views.cameras());
+        let Some(known) = self.known.get(keyframe).copied() else { return };
+        if known.saved || !views.has_place(index) {
+            return;
+        }
+        for camera in 0..cameras {
+            let id = image_id(views, keyframe * cameras + camera);
+            let planes = views.planes(keyframe * cameras + camera);
+            let fill = |payload: &mut Vec<u8>| planes.iter().for_each(|p| payload.extend_from_slice(&p.pixels));
+            if !self.store.put(self.key(KIND_IMAGE, id), &[0; store::ABOUT], fill) {
+                return;
+            }
+            self.serve();
+        }
+        self.known[keyframe].saved = true;
+        self.save_state(views, keyframe);
+    }
+
+    /// Hands what is known of a keyframe to the store.
+    fn save_state(&mut self, views: &Views, keyframe: usize) -> bool {
+        let cameras = views.cameras();
+        let home = self.home(keyframe).map_or(NO_BLOCK, |b| views.get(self.blocks[b].anchor as usize).id as u32);
+        for index in keyframe * cameras..(keyframe + 1) * cameras {
+            let about = state(views.get(index), home, self.epoch_base);
+            if !self.store.put(self.key(KIND_KEYFRAME, image_id(views, index)), &about.encode(), |_| ()) {
+                return false;
+            }
+            self.serve();
+        }
+        self.known[keyframe].stated = views.get(keyframe * cameras).steps;
+        true
+    }
+
+    /// The block that a keyframe sees most of.
+    pub fn home(&self, keyframe: usize) -> Option<usize> {
+        let row = &self.sight[keyframe * BLOCKS_KNOWN..][..self.blocks.len()];
+        let most = row.iter().copied().max().filter(|n| *n > 0)?;
+        row.iter().position(|n| *n == most)
+    }
+
+    /// Looks again which blocks a view sees, by its horizon.
+    pub fn look_from(&mut self, view: &View, horizon: &Horizon, keyframe: usize) {
+        for block in 0..self.blocks.len() {
+            self.look(view, horizon, keyframe, block);
+        }
+    }
+
+    fn look(&mut self, view: &View, horizon: &Horizon, keyframe: usize, block: usize) {
+        let b = &self.blocks[block];
+        let seen = if b.epoch == view.epoch && in_reach(view, b) {
+            b.points().iter().filter(|p| horizon.sees(view, Vec3::from_array(**p).as_dvec3())).count() as u8
+        } else {
+            0
+        };
+        self.sight[keyframe * BLOCKS_KNOWN + block] = seen;
+    }
+
+    /// Looks which keyframes see a block.
+    pub fn look_for(&mut self, scene: &Scene, block: usize) {
+        let cameras = scene.views.cameras();
+        for keyframe in 0..self.known.len().min(scene.views.len() / cameras) {
+            let index = keyframe * cameras;
+            let horizon = scene.views.get(index).horizon;
+            self.look(&scene.view(index), &horizon, keyframe, block);
+        }
+    }
+
+    /// Counts a training step on a view.
+    pub fn trained(&mut self, keyframe: usize) {
+        let row = &self.sight[keyframe * BLOCKS_KNOWN..][..self.blocks.len()];
+        for (block, seen) in self.blocks.iter_mut().zip(row) {
+            block.steps += u32::from(*seen > 0);
+        }
+    }
+
+    /// Writes a few of the blocks and states that have changed most while the map trained.
+    pub fn save_some(&mut self, scene: &mut Scene) -> Result<(), GpuError> {
+        let mut written = 0;
+        for _ in 0..self.blocks.len() {
+            self.next_block = (self.next_block + 1) % self.blocks.len();
+            let b = self.blocks[self.next_block];
+            // The newest is written when it is densified.
+            let complete = b.samples_len > 0;
+            if b.in_pool && complete && b.is_due() {
+                if written == BLOCKS_AT_ONCE || !self.save_block(scene, self.next_block)? {
+                    break;
+                }
+                written += 1;
+            }
+        }
+        let keyframes = self.known.len();
+        for _ in 0..STATES_AT_ONCE.min(keyframes) {
+            self.next_state = (self.next_state + 1) % keyframes;
+            self.save_keyframe(&scene.views, self.next_state);
+        }
+        Ok(())
+    }
+
+    /// Writes of a keyframe what was not written yet; whether all of it is in the store.
+    pub fn save_keyframe(&mut self, views: &Views, keyframe: usize) -> bool {
+        let index = keyframe * views.cameras();
+        self.save_images(views, index);
+        let known = self.known[keyframe];
+        known.saved && (known.stated == views.get(index).steps || self.save_state(views, keyframe))
+    }
+
+    /// Writes a block if it has changed since it was written; whether the store has it as it is.
+    pub fn save_if_changed(&mut self, scene: &mut Scene, block: usize) -> Result<bool, GpuError> {
+        Ok(!self.blocks[block].changed() || self.save_block(scene, block)?)
+    }
+
+    /// Writes all that has changed, waits until it is on the disk, and answers whether the store has the whole map. Fails
+    /// where it cannot be written.
+    pub fn flush(&mut self, scene: &mut Scene) -> Result<Result<bool, Fault>, GpuError> {
+        let mut whole = true;
+        for block in 0..self.blocks.len() {
+            if self.blocks[block].in_pool && !self.save_if_changed(scene, block)? {
+                if let Err(fault) = self.store.flush() {
+                    return Ok(Err(fault));
+                }
+                whole &= self.save_if_changed(scene, block)?;
+            }
+        }
+        for keyframe in 0..self.known.len() {
+            if !self.save_keyframe(&scene.views, keyframe) {
+                if let Err(fault) = self.store.flush() {
+                    return Ok(Err(fault));
+                }
+                whole &= self.save_keyframe(&scene.views, keyframe);
+            }
+        }
+        Ok(self.store.flush().map(|()| whole))
+    }
+
+    /// Gaussians that are on disk alone.
+    pub fn away(&self) -> usize {
+        self.blocks.iter().filter(|b| !b.in_pool && b.samples_len > 0).map(|b| b.count as usize).sum()
+    }
+
+    /// Takes over where anchors are by now, and moves what is known of their blocks along.
+    pub fn follow(&mut self, views: &Views) {
+        for block in 0..self.blocks.len() {
+            let b = &mut self.blocks[block];
+            let placed = views.get(b.anchor as usize).placed;
+            let by = placed * b.placed.inverse();
+            if by.p.length() == 0.0 && by.q.to_scaled_axis().length() == 0.0 {
+                continue;
+            }
+            for point in &mut b.samples[..usize::from(b.samples_len)] {
+                *point = by.transform(Vec3::from_array(*point).as_dvec3()).as_vec3().to_array();
+            }
+            b.placed = placed;
+            // Moved, it is another one than on disk.
+            b.steps += u32::from(b.in_pool);
+            self.measure(block);
+        }
+    }
+
+    /// Asks the disk for a block; false where it cannot be asked now.
+    pub fn ask_for_block(&mut self, views: &Views, block: usize) -> bool {
+        let key = self.key(KIND_BLOCK, views.get(self.blocks[block].anchor as usize).id as u32);
+        let asked = self.blocks[block].asked || self.store.fetch(key);
+        self.blocks[block].asked = asked;
+        self.serve();
+        asked
+    }
+
+    /// Asks the disk for a keyframe's images; false where it cannot be asked now.
+    pub fn ask_for_images(&mut self, views: &Views, keyframe: usize) -> bool {
+        let cameras = views.cameras();
+        for camera in 0..cameras {
+            if !self.store.fetch(self.key(KIND_IMAGE, image_id(views, keyframe * cameras + camera))) {
+                return self.known[keyframe].asked > 0;
+            }
+            self.known[keyframe].asked += 1;
+        }
+        self.serve();
+        true
+    }
+
+    /// What came from the disk, told by what it is; buffers are given back by `store.give_back`.
+    pub fn next_fetched(&mut self, views: &Views) -> Option<(Arrived, Fetched)> {
+        let fetched = self.store.fetched()?;
+        let key = fetched.key;
+        let arrived = match key.kind {
+            KIND_BLOCK => {
+                let block = views.index_of(u64::from(key.id)).and_then(|anchor| self.block_of(anchor as u32));
+                block.map_or(Arrived::Unknown, Arrived::Block)
+            }
+            _ => {
+                let (id, camera) = (key.id / CAMERAS_MAX as u32, key.id as usize % CAMERAS_MAX);
+                views.index_of(u64::from(id)).map_or(Arrived::Unknown, |first| Arrived::Image(first + camera))
+            }
+        };
+        Some((arrived, fetched))
+    }
+
+    /// Adds the store's figures to the counters.
+    pub fn count(&self, counters: &Counters) {
+        let f = self.store.figures();
+        for (counter, value) in [
+            (&counters.store_bytes_put, f.put_bytes),
+            (&counters.store_bytes_written, f.written_bytes),
+            (&counters.store_bytes_read, f.read_bytes),
+            (&counters.store_records_damaged, f.records_damaged),
+            (&counters.store_refused_full, f.refused_full),
+            (&counters.store_write_errors, f.write_errors),
+        ] {
+            counter.raise(value);
+        }
+    }
+}
+
+/// What came from the disk.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Arrived {
+    Block(usize),
+    /// The view whose image it is.
+    Image(usize),
+    Unknown,
+}
+
+/// Copies an image's planes from its record; false where it is not as large.
+pub fn read_planes(payload: &[u8], planes: &mut [Image]) -> bool {
+    let bytes: usize = planes.iter().map(|p| p.pixels.len()).sum();
+    if payload.len() != bytes {
+        return false;
+    }
+    let mut rest = payload;
+    for plane in planes {
+        let (pixels, after) = rest.split_at(plane.pixels.len());
+        plane.pixels.copy_from_slice(pixels);
+        rest = after;
+    }
+    true
+}
+
+/// Whether a view may see anything of a block: its ball reaches before the camera and into its cone.
+fn in_reach(view: &View, b: &Block) -> bool {
+    let p: DVec3 = view.world_from_cam.inverse().transform(b.centre.as_dvec3());
+    let radius = f64::from(b.radius);
+    if view.fisheye.is_some() || p.length() <= radius {
+        return true;
+    }
+    let c = &view.camera;
+    let half = |size: usize, f: f64| (size as f64 / 2.0 + 1.0).max(c.cx.max(c.cy).min(size as f64)) / f;
+    let cone = half(c.width, c.fx).hypot(half(c.height, c.fy)).atan();
+    let off = p.truncate().length().atan2(p.z) - (radius / p.length()).asin();
+    off <= cone
+}
+
+fn image_id(views: &Views, index: usize) -> u32 {
+    views.get(index).id as u32 * CAMERAS_MAX as u32 + views.camera(index) as u32
+}
+
+fn run_key(run: u32) -> Key {
+    Key { kind: KIND_RUN, run, id: 0 }
+}
+
+fn state(e: &Stored, home: u32, epoch_base: u32) -> KeyframeAbout {
+    KeyframeAbout {
+        t: e.t,
+        epoch: e.epoch + epoch_base,
+        held_out: e.held_out,
+        anchor: e.anchor,
+        home,
+        given: e.given,
+        refined: e.refined.body_from_refined,
+        body_from_cam: e.body_from_cam,
+        body_from_raw: e.body_from_raw,
+        exposure: e.refined.exposure,
+        coarseness: e.coarseness,
+        steps: e.steps,
+        horizon: e.horizon,
+    }
+}
+
+fn entry(id: u32, s: &KeyframeAbout, epoch_base: u32) -> Stored {
+    Stored {
+        id: u64::from(id / CAMERAS_MAX as u32),
+        t: s.t,
+        epoch: s.epoch.saturating_sub(epoch_base),
+        given: s.given,
+        body_from_cam: s.body_from_cam,
+        body_from_raw: s.body_from_raw,
+        placed: s.given * s.body_from_cam,
+        held_out: s.held_out,
+        anchor: false,
+        refined: Refinement { body_from_refined: s.refined, exposure: s.exposure, ..Refinement::default() },
+        coarseness: s.coarseness,
+        horizon: s.horizon,
+        steps: s.steps,
+        steps_here: 0,
+    }
+}
+
+fn tables(keyframes: usize) -> (Vec<Block>, Vec<Known>, Vec<u8>, super::residency::Choice) {
+    (
+        Vec::with_capacity(BLOCKS_KNOWN),
+        Vec::with_capacity(keyframes),
+        vec![0; keyframes * BLOCKS_KNOWN],
+        super::residency::Choice::new(keyframes),
+    )
+}
+
+fn limits(board: &Board, shape: &Shape, at_once: bool) -> Limits {
+    Limits {
+        bytes_max: board.store.max_mib << 20,
+        segment_bytes: SEGMENT_BYTES,
+        records_max: records_max(board, shape),
+        payload_max: payload_max(board, shape),
+        buffers: BUFFERS,
+        write_bytes_per_s: if at_once { 0 } else { (board.store.write_mib_per_s * 1048576.0) as u64 },
+    }
+}
+
+/// Keyframes that are known at once.
+pub fn keyframes_known(board: &Board, shape: &Shape) -> usize {
+    (board.store.keyframes.max(board.budget.keyframes) as usize).max((shape.images / shape.cameras) as usize)
+}
+
+/// A state and an image of each camera of each keyframe, blocks and runs; twice, for the runs before.
+fn records_max(board: &Board, shape: &Shape) -> usize {
+    2 * (2 * keyframes_known(board, shape) * shape.cameras as usize + BLOCKS_KNOWN + 64)
+}
+
+fn payload_max(board: &Board, shape: &Shape) -> usize {
+    let splats = (board.map.seeds_per_anchor + board.map.densify_max).min(shape.splats) as usize;
+    let block = splats * splat_bytes(shape.channels == 3, MOMENTS);
+    block.max(shape.pixels() * shape.channels as usize)
+}
+
+/// A number of a rig and the form of its images: maps of another are not read.
+fn identity(calibration: &Calibration, board: &Board, shape: &Shape) -> u64 {
+    let Shape { width, height, channels, cameras, .. } = *shape;
+    let text = format!("{:?} {:?} {width} {height} {channels} {cameras}", calibration.cameras, board.map.projection);
+    // FNV-1a.
+    text.bytes().fold(0xcbf2_9ce4_8422_2325, |h, b| (h ^ u64::from(b)).wrapping_mul(0x0100_0000_01b3))
+}

@@ -1,0 +1,133 @@
+//! How far a view sees: the depth of its picture in a few cells, coarse and small enough to keep for every keyframe that is
+//! known, in memory and on disk. With it, which keyframes see a block is told on the host, without drawing anything, whether
+//! or not their images and Gaussians are in memory.
+//!
+//! A cell has the farthest surface in it, so what stands behind a door's edge still counts as seen.
+
+use super::render::Rendered;
+use super::view::View;
+use glam::{DVec3, Vec3};
+
+pub const COLUMNS: usize = 16;
+pub const ROWS: usize = 12;
+pub const CELLS: usize = COLUMNS * ROWS;
+
+/// Nothing is known of how far a cell sees.
+const OPEN: u8 = u8::MAX;
+/// The nearest depth that a cell can have, m, and the ratio from one code to the next: 0.1 m to 100 m in steps of 2.8 %.
+const NEAREST_M: f64 = 0.1;
+const STEP_LN: f64 = 0.0272;
+/// A surface is as deep as this, by a fraction and m: the error of depth, and Gaussians of a wall behind its middle.
+const THICKNESS: f64 = 0.1;
+const THICKNESS_M: f64 = 0.15;
+/// A pixel this opaque shows a surface; a cell with a smaller part of its pixels that do is open.
+const SURFACE_ALPHA: f32 = 0.5;
+const SURFACE_PART: f64 = 0.75;
+
+/// Codes of depth, row by row.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Horizon(pub [u8; CELLS]);
+
+impl Default for Horizon {
+    fn default() -> Horizon {
+        Horizon([OPEN; CELLS])
+    }
+}
+
+/// The cell of a pixel of an image of so many.
+pub fn cell_of(x: f64, y: f64, width: usize, height: usize) -> usize {
+    let nth = |v: f64, size: usize, n: usize| (((v + 0.5) / size as f64 * n as f64) as usize).min(n - 1);
+    nth(y, height, ROWS) * COLUMNS + nth(x, width, COLUMNS)
+}
+
+impl Horizon {
+    /// The horizon of a picture of the map.
+    pub fn of(rendered: &Rendered) -> Horizon {
+        let (w, h) = (rendered.width, rendered.height);
+        let (mut farthest, mut shown, mut all) = ([0.0f32; CELLS], [0u32; CELLS], [0u32; CELLS]);
+        for y in 0..h {
+            for x in 0..w {
+                let (i, cell) = (y * w + x, cell_of(x as f64, y as f64, w, h));
+                all[cell] += 1;
+                if rendered.alpha[i] >= SURFACE_ALPHA && rendered.depth[i] > 0.0 {
+                    shown[cell] += 1;
+                    farthest[cell] = farthest[cell].max(rendered.depth[i]);
+                }
+            }
+        }
+        Horizon(std::array::from_fn(|cell| {
+            let known = f64::from(shown[cell]) >= SURFACE_PART * f64::from(all[cell].max(1));
+            if known {
+                code(f64::from(farthest[cell]))
+            } else {
+                OPEN
+            }
+        }))
+    }
+
+    /// Whether a view with this horizon sees a point of the world; not where nothing is known of how far it sees.
+    pub fn sees(&self, view: &View, p_world: DVec3) -> bool {
+        let Some((x, y, depth)) = view.project(p_world) else { return false };
+        let code = self.0[cell_of(x, y, view.camera.width, view.camera.height)];
+        code != OPEN && depth <= metres(code) * (1.0 + THICKNESS) + THICKNESS_M
+    }
+
+    /// The part of the cells of which nothing is known.
+    pub fn open_part(&self) -> f64 {
+        self.0.iter().filter(|code| **code == OPEN).count() as f64 / CELLS as f64
+    }
+}
+
+fn code(depth_m: f64) -> u8 {
+    ((depth_m / NEAREST_M).ln() / STEP_LN).ceil().clamp(0.0, f64::from(OPEN)) as u8
+}
+
+fn metres(code: u8) -> f64 {
+    NEAREST_M * (f64::from(code) * STEP_LN).exp()
+}
+
+/// A ball around points, m: its centre is their mean.
+pub fn ball(points: &[[f32; 3]]) -> (Vec3, f32) {
+    let sum: Vec3 = points.iter().map(|p| Vec3::from_array(*p)).sum();
+    let centre = sum / points.len().max(1) as f32;
+    let radius = points.iter().map(|p| centre.distance(Vec3::from_array(*p))).fold(0.0, f32::max);
+    (centre, radius)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::map::coverage::tests::{black, view, H, W};
+
+    #[test]
+    fn codes_round_up_by_less_than_a_step() {
+        for depth in [0.05, 0.1, 0.33, 1.0, 7.7, 60.0] {
+            let told = metres(code(depth));
+            assert!(told >= depth && told <= f64::max(depth, NEAREST_M) * STEP_LN.exp() * 1.0001, "{depth}: {told}");
+        }
+        assert_eq!(code(1e9), OPEN);
+    }
+
+    #[test]
+    fn a_wall_hides_what_is_behind_it_and_a_hole_does_not() {
+        let mut rendered = black(&[1.0; W * H]);
+        rendered.depth.fill(2.0);
+        // The right half is uncovered.
+        (0..H).for_each(|y| rendered.alpha[y * W + W / 2..(y + 1) * W].fill(0.0));
+        let (horizon, view) = (Horizon::of(&rendered), view());
+        for (x, z, seen) in [(-0.3, 1.0, true), (-0.3, 2.1, true), (-0.4, 3.0, false), (0.4, 3.0, false), (0.0, -1.0, false)]
+        {
+            assert_eq!(horizon.sees(&view, DVec3::new(x, 0.1, z)), seen, "{x} {z}");
+        }
+        assert!(!horizon.sees(&view, DVec3::new(9.0, 0.0, 1.0)), "beside the picture");
+        assert_eq!((horizon.open_part(), Horizon::default().open_part()), (0.5, 1.0));
+    }
+
+    #[test]
+    fn a_ball_holds_its_points() {
+        let points = [[0.0, 0.0, 0.0], [2.0, 0.0, 0.0], [1.0, 1.0, 0.0]];
+        let (centre, radius) = ball(&points);
+        assert!(points.iter().all(|p| centre.distance(Vec3::from_array(*p)) <= radius));
+        assert_eq!(ball(&[]), (Vec3::ZERO, 0.0));
+    }
+}
