@@ -1,6 +1,9 @@
 //! The mapper as a whole: keyframes with their true poses in, a map with a measured error out.
 #![allow(clippy::unwrap_used)]
 
+mod flight;
+
+use flight::{board, flight, train};
 use glam::{DQuat, DVec3};
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
@@ -16,32 +19,6 @@ use stipple_drivers::{Calibration, Camera, Frames, Lens, Pose, Span};
 
 #[global_allocator]
 static ALLOCATOR: CountingAllocator = CountingAllocator;
-
-fn board(overrides: &[&str]) -> Board {
-    let text = "name = \"test\"\nmemory_max_mib = 2048\n[budget]\nsplats = 20000\nintersections = 400000\n\
-                keyframes = 16\nimage_width_max = 1024\nimage_height_max = 1024\n";
-    let overrides: Vec<String> = overrides.iter().map(|s| s.to_string()).collect();
-    Board::parse("tests/map.rs", text, &overrides).unwrap()
-}
-
-/// `count` keyframes of a simulated flight, half a second apart, at 188 x 120 px; every fourth is held out.
-fn flight(count: usize) -> (Calibration, Vec<Keyframe>) {
-    let mut scenario = Scenario::named("demo").unwrap();
-    scenario.image_divisor = 4;
-    let mut sim = Sim::new(&scenario).unwrap();
-    let calibration = sim.calibration().clone();
-    let mut frames = Frames::for_rig(&calibration);
-    let apart = (scenario.rate_hz / 2.0) as usize;
-    let mut keyframe = |k: usize| {
-        sim.render(k * apart, &mut frames);
-        let images = frames.images.clone();
-        let world_from_body = sim.truth_at(frames.t).pose;
-        let held_out = k % 4 == 3;
-        Keyframe { id: k as u64, t: frames.t, world_from_body, images, held_out, ..Keyframe::default() }
-    };
-    let keyframes = (0..count).map(&mut keyframe).collect();
-    (calibration, keyframes)
-}
 
 /// The same flight through TUM-VI's lenses, 512 px wide.
 fn fisheye_flight(count: usize) -> (Calibration, Vec<Keyframe>) {
@@ -96,19 +73,6 @@ fn fisheye_anchors_are_densified() {
     let (seeded, densified) = (run(0), run(4096));
     println!("seeded {seeded:?} densified {densified:?}");
     assert!(seeded.1 == 0 && densified.1 > 200 && densified.0 > seeded.0 + 0.1, "{seeded:?} {densified:?}");
-}
-
-/// One thing at a time until `steps` training steps are taken.
-fn train(mapper: &mut Mapper, steps: u32) {
-    let mut taken = 0;
-    while taken < steps {
-        let report = mapper.step(Instant::now()).unwrap();
-        assert!(report.iterations <= 1);
-        if report.kind == StepKind::Idle {
-            break;
-        }
-        taken += report.iterations;
-    }
 }
 
 #[test]

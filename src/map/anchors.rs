@@ -21,7 +21,7 @@ use super::densify::{densify, mean};
 use super::diffusion::Diffusion;
 use super::keyframes::Keyframe;
 use super::occupancy::{self, Occupancy};
-use super::pool::{threshold, PruneRule};
+use super::pool::{threshold, PruneRule, FREE_DIVISOR};
 use super::scene::Scene;
 use super::seeds::{Seed, Seeder};
 use super::views::Views;
@@ -41,9 +41,7 @@ const STEPS_FIRST: usize = 40;
 const STEPS_MIN: usize = 8;
 /// One anchor may evict one in so many of the pool.
 const EVICTED_DIVISOR: usize = 16;
-/// A whole uncovered view may take one in so many of the free places, so that there is always room for the next; and one in so
-/// many of the pool where others are evicted for it.
-const FREE_DIVISOR: usize = 8;
+/// A whole uncovered view may take one in so many of the pool where others are evicted for it.
 const POOL_DIVISOR: usize = 16;
 
 /// A keyframe that became an anchor.

@@ -14,6 +14,7 @@ use super::block::{BlockAbout, KeyframeAbout, RunAbout};
 use super::block::{KIND_BLOCK, KIND_IMAGE, KIND_KEYFRAME, KIND_RUN, NO_BLOCK, SAMPLES};
 use super::horizon::{ball, Horizon};
 use super::paging::splat_bytes;
+use super::pool::FREE_DIVISOR;
 use super::refine::Refinement;
 use super::scene::Scene;
 use super::schedule::Rng;
@@ -24,17 +25,17 @@ use crate::config::Board;
 use crate::counters::Counters;
 use crate::gpu::GpuError;
 use crate::limits::CAMERAS_MAX;
-use crate::mem::Footprint;
+use crate::mem::{unsealed, Footprint};
 use crate::store::{self, Disk, Fetched, Key, Limits, Store};
 use glam::{DVec3, Vec3};
 use std::path::Path;
 use std::sync::Arc;
-use stipple_drivers::{Calibration, Fault, Image, Pose};
+use stipple_drivers::{Calibration, Fault, Image, Nanos, Pose};
 
 /// Blocks that a run may make. One covers some square metres: a large building.
 pub const BLOCKS_KNOWN: usize = 2048;
 /// Buffers between here and the disk: what is written and what is read at a time.
-const BUFFERS: usize = 12;
+const BUFFERS: usize = 8;
 const SEGMENT_BYTES: u64 = 32 << 20;
 /// Training steps after which a block is written again, as a part of those it had, and at least.
 const REWRITTEN_PART: f64 = 0.25;
@@ -108,6 +109,39 @@ pub struct Known {
     pub open: bool,
 }
 
+/// What is wanted, and room to find it.
+pub struct Choice {
+    /// Keyframes by how near they are, m.
+    pub order: Vec<(f32, u32)>,
+    pub wanted: Vec<bool>,
+    /// The wanted, most wanted first.
+    pub blocks: Vec<u32>,
+    /// Keyframes all of whose blocks are wanted.
+    pub candidates: Vec<u32>,
+    /// A block on its way to the store.
+    pub page: Vec<u8>,
+    pub leaving: Vec<u32>,
+    /// Pixels that count and do not show what is on disk.
+    pub hidden: Vec<u8>,
+    /// The last keyframe.
+    pub last: Option<(Nanos, Pose)>,
+}
+
+impl Choice {
+    pub fn new(keyframes: usize, payload: usize, pixels: usize) -> Choice {
+        Choice {
+            order: Vec::with_capacity(keyframes),
+            wanted: vec![false; BLOCKS_KNOWN],
+            blocks: Vec::with_capacity(BLOCKS_KNOWN),
+            candidates: Vec::with_capacity(keyframes),
+            page: Vec::with_capacity(payload),
+            leaving: Vec::with_capacity(BLOCKS_KNOWN),
+            hidden: Vec::with_capacity(pixels),
+            last: None,
+        }
+    }
+}
+
 pub struct Archive {
     pub store: Store,
     disk: Arc<Disk>,
@@ -122,20 +156,17 @@ pub struct Archive {
     pub known: Vec<Known>,
     /// How many of a block's samples a keyframe sees: keyframe by keyframe.
     pub sight: Vec<u8>,
-    pub choice: super::residency::Choice,
+    pub choice: Choice,
     pub rng: Rng,
     /// The next block and keyframe that are looked at for writing.
     next_block: usize,
     next_state: usize,
-    /// The first thing that went wrong with the disk, told once.
-    pub said: bool,
 }
 
 impl Archive {
     /// Bytes on the host.
     pub fn footprint(board: &Board, shape: &Shape, f: &mut Footprint) {
-        let keyframes = keyframes_known(board, shape);
-        f.build("map: blocks and keyframes known", || tables(keyframes));
+        f.build("map: blocks and keyframes known", || tables(board, shape));
         f.extend(Store::footprint(&limits(board, shape, false)));
     }
 
@@ -174,8 +205,7 @@ impl Archive {
                 (run, about, false)
             }
         };
-        let keyframes = keyframes_known(board, shape);
-        let (blocks, known, sight, choice) = tables(keyframes);
+        let (blocks, known, sight, choice) = tables(board, shape);
         let mut archive = Archive {
             store,
             disk: Arc::new(disk),
@@ -191,7 +221,6 @@ impl Archive {
             rng: Rng::new(board.map.seed ^ 0x5e7),
             next_block: 0,
             next_state: 0,
-            said: false,
         };
         archive.state_run();
         Ok(archive)
@@ -205,7 +234,7 @@ impl Archive {
     /// Does what waits for the disk where no threads do.
     fn serve(&self) {
         if self.at_once {
-            self.disk.serve();
+            unsealed(|| self.disk.serve());
         }
     }
 
@@ -248,7 +277,9 @@ impl Archive {
             views.know(entry(*id, state, self.epoch_base));
         }
         self.know_keyframes(views.len() / cameras);
-        self.known.iter_mut().for_each(|k| (k.saved, k.stated) = (true, u32::MAX));
+        for (keyframe, known) in self.known.iter_mut().enumerate() {
+            (known.saved, known.stated) = (true, views.get(keyframe * cameras).steps);
+        }
         let mut found = vec![];
         self.store.entries(|key, about| {
             if key.kind == KIND_BLOCK && key.run == self.run {
@@ -441,6 +472,15 @@ impl Archive {
             0
         };
         self.sight[keyframe * BLOCKS_KNOWN + block] = seen;
+    }
+
+    /// Looks from every keyframe that is known.
+    pub fn look_around(&mut self, scene: &Scene) {
+        let cameras = scene.views.cameras();
+        for keyframe in 0..self.known.len() {
+            let horizon = scene.views.get(keyframe * cameras).horizon;
+            self.look_from(&scene.view(keyframe * cameras), &horizon, keyframe);
+        }
     }
 
     /// Looks which keyframes see a block.
@@ -674,7 +714,7 @@ fn entry(id: u32, s: &KeyframeAbout, epoch_base: u32) -> Stored {
         placed: s.given * s.body_from_cam,
         held_out: s.held_out,
         anchor: false,
-        refined: Refinement { body_from_refined: s.refined, exposure: s.exposure, ..Refinement::default() },
+        refined: Refinement::known(s.refined, s.exposure),
         coarseness: s.coarseness,
         horizon: s.horizon,
         steps: s.steps,
@@ -682,12 +722,13 @@ fn entry(id: u32, s: &KeyframeAbout, epoch_base: u32) -> Stored {
     }
 }
 
-fn tables(keyframes: usize) -> (Vec<Block>, Vec<Known>, Vec<u8>, super::residency::Choice) {
+fn tables(board: &Board, shape: &Shape) -> (Vec<Block>, Vec<Known>, Vec<u8>, Choice) {
+    let keyframes = keyframes_known(board, shape);
     (
         Vec::with_capacity(BLOCKS_KNOWN),
         Vec::with_capacity(keyframes),
         vec![0; keyframes * BLOCKS_KNOWN],
-        super::residency::Choice::new(keyframes),
+        Choice::new(keyframes, payload_max(board, shape), shape.pixels()),
     )
 }
 
@@ -713,7 +754,8 @@ fn records_max(board: &Board, shape: &Shape) -> usize {
 }
 
 fn payload_max(board: &Board, shape: &Shape) -> usize {
-    let splats = (board.map.seeds_per_anchor + board.map.densify_max).min(shape.splats) as usize;
+    let seeds = board.map.seeds_per_anchor.min(shape.splats.div_ceil(FREE_DIVISOR as u32));
+    let splats = (seeds + board.map.densify_max).min(shape.splats) as usize;
     let block = splats * splat_bytes(shape.channels == 3, MOMENTS);
     block.max(shape.pixels() * shape.channels as usize)
 }

@@ -176,8 +176,10 @@ impl Mapper {
             trainer.scene_depth_m = archive.scene_depth_m().unwrap_or(trainer.scene_depth_m);
         }
         let steps = (0..views.len()).map(|i| u64::from(views.get(i).steps)).sum();
+        let scene = Scene { gpu, pipeline, views, cameras, rendered, steps, counters: Counters::default() };
+        archive.iter_mut().for_each(|archive| archive.look_around(&scene));
         Ok(Mapper {
-            scene: Scene { gpu, pipeline, views, cameras, rendered, steps, counters: Counters::default() },
+            scene,
             stereo,
             anchors,
             trainer,

@@ -78,6 +78,8 @@ const LOWEST: u32 = 0x2000_0000;
 const QUARTER_OCTAVE: u32 = 1 << 21;
 /// Gaussians that travel to the GPU at a time.
 const APPENDED_AT_ONCE: usize = 4096;
+/// A block's seeds take one in so many of the free places, so that there is always room for the next.
+pub const FREE_DIVISOR: usize = 8;
 /// Blocks in the pool at once.
 pub const BLOCKS: usize = 1024;
 

@@ -63,6 +63,11 @@ pub struct Refinement {
 }
 
 impl Refinement {
+    /// What was found out before, without moments.
+    pub fn known(body_from_refined: Pose, exposure: Exposure) -> Refinement {
+        Refinement { body_from_refined, exposure, ..Refinement::default() }
+    }
+
     /// `part` of the way to another's; without moments.
     pub fn towards(&self, other: &Refinement, part: f64) -> Refinement {
         let (a, b) = (self.body_from_refined, other.body_from_refined);

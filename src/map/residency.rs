@@ -51,39 +51,6 @@ const DEPTH_AGREES_M: f64 = 0.2;
 /// The disk answers within this, or what it was asked for is done without.
 const PATIENCE: Duration = Duration::from_secs(2);
 
-/// What is wanted, and room to find it.
-pub struct Choice {
-    /// Keyframes by how near they are, m.
-    order: Vec<(f32, u32)>,
-    wanted: Vec<bool>,
-    /// The wanted, most wanted first.
-    blocks: Vec<u32>,
-    /// Keyframes all of whose blocks are wanted.
-    pub candidates: Vec<u32>,
-    /// A block on its way to the store.
-    pub page: Vec<u8>,
-    leaving: Vec<u32>,
-    /// Pixels that count and do not show what is on disk.
-    hidden: Vec<u8>,
-    /// The last keyframe.
-    last: Option<(Nanos, Pose)>,
-}
-
-impl Choice {
-    pub fn new(keyframes: usize) -> Choice {
-        Choice {
-            order: Vec::with_capacity(keyframes),
-            wanted: vec![false; BLOCKS_KNOWN],
-            blocks: Vec::with_capacity(BLOCKS_KNOWN),
-            candidates: Vec::with_capacity(keyframes),
-            page: vec![],
-            leaving: Vec::with_capacity(BLOCKS_KNOWN),
-            hidden: vec![],
-            last: None,
-        }
-    }
-}
-
 impl Archive {
     fn sees(&self, keyframe: usize, block: usize) -> bool {
         self.sight[keyframe * BLOCKS_KNOWN + block] >= SEEN_MIN

@@ -1,0 +1,128 @@
+//! A map that is larger than its memory: blocks and images come and go between the mapper and its store on disk.
+#![allow(clippy::unwrap_used)]
+
+mod flight;
+
+use flight::{board, flight, train};
+use std::path::Path;
+use stipple::map::{Evaluation, Keyframe, Mapper, Place};
+use stipple::mem::{heap_after_seal, seal_thread, CountingAllocator};
+use stipple_drivers::Calibration;
+
+#[global_allocator]
+static ALLOCATOR: CountingAllocator = CountingAllocator;
+
+const KEYFRAMES: usize = 20;
+const STEPS: u32 = 30;
+
+fn place(folder: &Path, flight: i64) -> Place<'_> {
+    Place { folder, fresh: false, flight, at_once: true }
+}
+
+fn opened(calibration: &Calibration, settings: &[&str], place: Option<Place>) -> Mapper {
+    let mapper = Mapper::open_on(calibration, &board(settings), place).unwrap();
+    assert!(mapper.unkept.is_none(), "{:?}", mapper.unkept);
+    mapper
+}
+
+/// Maps a flight, and answers how good the map is.
+fn mapped(calibration: &Calibration, keyframes: &[Keyframe], settings: &[&str], place: Option<Place>) -> (Mapper, Evaluation) {
+    let mut mapper = opened(calibration, settings, place);
+    for k in keyframes {
+        mapper.ingest(k).unwrap();
+        train(&mut mapper, STEPS);
+    }
+    let quality = mapper.evaluate().unwrap();
+    (mapper, quality)
+}
+
+fn decibels(quality: &Evaluation) -> [f64; 2] {
+    [quality.psnr_db.unwrap(), quality.psnr_heldout_db.unwrap()]
+}
+
+/// Six places for twenty keyframes: without a store the others are dropped.
+#[test]
+fn few_places_for_images_cost_little() {
+    let (calibration, keyframes) = flight(KEYFRAMES);
+    let dir = tempfile::tempdir().unwrap();
+    let (_, all) = mapped(&calibration, &keyframes, &["budget.keyframes=32"], None);
+    let (few, kept) = mapped(&calibration, &keyframes, &["budget.keyframes=6"], Some(place(dir.path(), 1)));
+    let (_, dropped) = mapped(&calibration, &keyframes, &["budget.keyframes=6"], None);
+    let [all, kept, dropped] = [all, kept, dropped].map(|q| decibels(&q));
+    println!("all {all:.2?}, six places {kept:.2?}, six keyframes {dropped:.2?} dB");
+    let count = few.counters();
+    assert_eq!((count.keyframe_store_full.get(), few.keyframe_count()), (0, KEYFRAMES));
+    assert!(count.images_paged_in.get() > 20 && count.keyframes_lost.get() == 0);
+    assert!((0..2).all(|i| kept[i] > all[i] - 1.0), "{all:?} {kept:?}");
+}
+
+/// A pool of a third of what the map takes.
+#[test]
+fn blocks_leave_a_small_pool_and_come_back_as_they_were() {
+    let (calibration, keyframes) = flight(KEYFRAMES);
+    let dir = tempfile::tempdir().unwrap();
+    let (whole, all) = mapped(&calibration, &keyframes, &["budget.keyframes=32"], None);
+    let size = format!("budget.splats={}", whole.splat_count() / 2);
+    let small = ["budget.keyframes=16", &size];
+    let (paged, kept) = mapped(&calibration, &keyframes, &small, Some(place(dir.path(), 1)));
+    let (_, thinned) = mapped(&calibration, &keyframes, &["budget.keyframes=32", &size], None);
+    let [all, kept, thinned] = [all, kept, thinned].map(|q| decibels(&q));
+    let count = paged.counters();
+    println!(
+        "{} of {}: all {all:.2?}, paged {kept:.2?} ({} Gaussians, {} out, {} in), thinned {thinned:.2?} dB",
+        size,
+        whole.splat_count(),
+        paged.splat_count(),
+        count.blocks_paged_out.get(),
+        count.blocks_paged_in.get()
+    );
+    assert_eq!((count.blocks_lost.get(), count.keyframes_lost.get()), (0, 0));
+}
+
+#[test]
+fn a_mapper_of_the_same_flight_goes_on_with_what_is_on_disk_and_another_flight_does_not() {
+    let (calibration, keyframes) = flight(8);
+    let dir = tempfile::tempdir().unwrap();
+    let run = |flight: i64| opened(&calibration, &[], Some(place(dir.path(), flight)));
+    let mut mapper = run(1);
+    for k in &keyframes {
+        mapper.ingest(k).unwrap();
+        train(&mut mapper, STEPS);
+    }
+    assert!(mapper.save().unwrap().unwrap(), "the store has all of it");
+    let (before, splats) = (decibels(&mapper.evaluate().unwrap()), mapper.splat_count());
+    drop(mapper);
+    let mut again = run(1);
+    assert_eq!((again.splat_count(), again.keyframe_count()), (splats, 8));
+    let after = decibels(&again.evaluate().unwrap());
+    println!("before {before:.3?}, after {after:.3?} dB");
+    assert!((0..2).all(|i| (after[i] - before[i]).abs() < 0.1), "{before:?} {after:?}");
+    train(&mut again, STEPS);
+    drop(again);
+    let other = run(2);
+    assert_eq!((other.splat_count(), other.keyframe_count()), (0, 0));
+}
+
+#[test]
+fn paging_repeats_to_the_bit_and_allocates_nothing() {
+    let (calibration, keyframes) = flight(12);
+    let small = ["budget.keyframes=4", "budget.splats=4000"];
+    let run = || {
+        let dir = tempfile::tempdir().unwrap();
+        let mut mapper = opened(&calibration, &small, Some(place(dir.path(), 1)));
+        seal_thread();
+        let before = heap_after_seal();
+        for k in &keyframes {
+            mapper.ingest(k).unwrap();
+            train(&mut mapper, STEPS);
+        }
+        assert_eq!(heap_after_seal() - before, 0);
+        let quality = mapper.evaluate().unwrap();
+        (mapper.splats().unwrap(), decibels(&quality))
+    };
+    // One after the other, each on a thread of its own: allocations are counted over all threads.
+    let apart = || std::thread::scope(|s| s.spawn(run).join().unwrap());
+    let ((a, quality), (b, same)) = (apart(), apart());
+    assert_eq!(quality, same);
+    assert!(!a.is_empty() && a == b);
+}
