@@ -16,11 +16,11 @@ const COMMON: [&str; 5] = ["math", "mem", "limits", "config", "counters"];
 const EDGES: [(&str, &[&str]); 7] = [
     ("vio", &["frontend"]),
     ("stereo", &["gpu"]),
-    ("map", &["gpu", "stereo"]),
-    ("output", &["map", "vio"]),
+    ("map", &["gpu", "stereo", "store"]),
+    ("output", &["map", "store", "vio"]),
     ("publish", &["vio"]),
-    ("run", &["frontend", "vio", "gpu", "stereo", "map", "output", "publish"]),
-    ("commands", &["run", "frontend", "vio", "gpu", "stereo", "map", "output", "publish"]),
+    ("run", &["frontend", "vio", "gpu", "stereo", "store", "map", "output", "publish"]),
+    ("commands", &["run", "frontend", "vio", "gpu", "stereo", "store", "map", "output", "publish"]),
 ];
 /// Where `unsafe` may stand: the GPU, the allocator, the shims of OpenCV and ONNX Runtime, system calls of drivers.
 const UNSAFE: [&str; 5] =
