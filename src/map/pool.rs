@@ -40,10 +40,21 @@ impl Gaussian {
         }
     }
 
-    fn unpacked(s: &Splat, [green, blue]: [f32; 2]) -> Gaussian {
+    pub(super) fn unpacked(s: &Splat, [green, blue]: [f32; 2]) -> Gaussian {
         let ([x, y, z, opacity_logit], [a, b, c, first]) = (s.mean_opacity, s.scale_colour);
         let colour = [first, green, blue];
         Gaussian { mean: [x, y, z], log_scale: [a, b, c], quat_xyzw: s.quat, opacity_logit, colour }
+    }
+
+    /// From 0 to 1.
+    pub fn opacity(&self) -> f32 {
+        1.0 / (1.0 + (-self.opacity_logit).exp())
+    }
+
+    /// How much of the scene it covers: opacity times the product of its two largest deviations, m².
+    pub fn importance(&self) -> f32 {
+        let [a, b, c] = self.log_scale;
+        self.opacity() * (a + b + c - a.min(b).min(c)).exp()
     }
 }
 
