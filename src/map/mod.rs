@@ -7,6 +7,7 @@
 
 pub mod anchors;
 pub mod backward;
+pub mod block;
 pub mod cameras;
 mod coarseness;
 pub mod coverage;

@@ -1,0 +1,608 @@
+//! The form in which blocks of Gaussians and keyframes lie in the map's store (`store`): bytes from values, and back. No GPU.
+//!
+//! All is little endian, without gaps. A record is an `About` (464 bytes, read at boot) and a payload (read when it is needed).
+//! The first byte of an `About` is `FORM`; what it does not use is zero.
+//!
+//! | kind | id | `About` | payload |
+//! |---|---|---|---|
+//! | `KIND_RUN` | 0 | `RunAbout` | none |
+//! | `KIND_BLOCK` | of its anchor | `BlockAbout` | arrays of `count` elements, one after another: splats (48 bytes each), steps (4), green and blue (8, in colour), Adam's moments (96, if kept), those of green and blue (16, if kept, in colour) |
+//! | `KIND_KEYFRAME` | of the keyframe | `KeyframeAbout` | `CameraAbout` of each camera (132 bytes each), then the pixels of each camera's planes |
+//!
+//! Samples of a block are rounded to 1/65535 of the box around them (0.2 mm in a block of 13 m): they tell where a block is,
+//! and so the poses keep all their digits. Decoding gives `None` for bytes that are not of this form, and never panics.
+
+use super::coarseness::Coarseness;
+use super::exposure::Exposure;
+use super::pool::Gaussian;
+use crate::gpu::kernels::types::{Moments, Splat};
+use crate::store::{About, ABOUT};
+use glam::{DQuat, DVec3, Quat, Vec3, Vec4};
+use stipple_drivers::{Nanos, Pose};
+
+/// `store::Key::kind` of each record of a map.
+pub const KIND_RUN: u8 = 1;
+pub const KIND_BLOCK: u8 = 2;
+pub const KIND_KEYFRAME: u8 = 3;
+/// `KeyframeAbout::home` of a keyframe that belongs to no block.
+pub const NO_BLOCK: u32 = u32::MAX;
+/// Samples of a block.
+pub const SAMPLES: usize = 32;
+
+/// Version of this form.
+const FORM: u8 = 1;
+/// Bytes of a pose: quaternion xyzw, then position.
+const POSE: usize = 7 * size_of::<f64>();
+/// Bytes of a `CameraAbout`.
+const CAMERA: usize = 2 * POSE + 2 * size_of::<f64>() + size_of::<f32>();
+/// Steps of a sample's coordinate in the box around all of them.
+const SAMPLE_STEPS: f32 = 65535.0;
+// Arrays are copied as they are in memory.
+const _: () = assert!(cfg!(target_endian = "little"));
+
+/// What one run did: the frame of its keyframes, and the size of their images.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct RunAbout {
+    /// Its epoch 0 is this one of the store.
+    pub epoch_base: u32,
+    /// When it started, s since 1970.
+    pub started_unix_s: i64,
+    pub colour: bool,
+    /// Size of a stored image, px.
+    pub width: u32,
+    pub height: u32,
+    /// Images of a keyframe, and planes of each.
+    pub cameras: u32,
+    pub channels: u32,
+}
+
+/// What is known of a block without its Gaussians.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct BlockAbout {
+    /// Unique over all runs of the store.
+    pub epoch: u32,
+    /// Gaussians.
+    pub count: u32,
+    pub colour: bool,
+    /// Whether Adam's moments follow.
+    pub moments: bool,
+    /// world_from_cam of the anchor by which the Gaussians were put in place.
+    pub placed: Pose,
+    /// Rigid motion that is to be applied to the Gaussians since they were written.
+    pub moved: Pose,
+    /// Means of Gaussians spread over the block, in the epoch's frame, m; the first `samples_len` are in use.
+    pub samples: [[f32; 3]; SAMPLES],
+    pub samples_len: u8,
+}
+
+impl Default for BlockAbout {
+    fn default() -> BlockAbout {
+        BlockAbout {
+            epoch: 0,
+            count: 0,
+            colour: false,
+            moments: false,
+            placed: Pose::IDENTITY,
+            moved: Pose::IDENTITY,
+            samples: [[0.0; 3]; SAMPLES],
+            samples_len: 0,
+        }
+    }
+}
+
+/// What is known of a keyframe without its images.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct KeyframeAbout {
+    pub t: Nanos,
+    /// Unique over all runs of the store.
+    pub epoch: u32,
+    pub held_out: bool,
+    pub anchor: bool,
+    /// Id of the block that it belongs to, or `NO_BLOCK`.
+    pub home: u32,
+    /// world_from_body by odometry, with its corrections.
+    pub given: Pose,
+    /// body_from_refined
+    pub refined: Pose,
+    /// Of the first camera.
+    pub body_from_cam: Pose,
+    pub exposure: Exposure,
+    /// Of the last training step on it.
+    pub loss: f32,
+}
+
+/// What is known of one image of a keyframe.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct CameraAbout {
+    pub body_from_cam: Pose,
+    pub body_from_raw: Pose,
+    pub exposure: Exposure,
+    pub coarseness: Coarseness,
+}
+
+/// Writes values one after another.
+struct Writer {
+    about: About,
+    at: usize,
+}
+
+impl Writer {
+    fn new() -> Writer {
+        let mut writer = Writer { about: [0; ABOUT], at: 0 };
+        writer.put([FORM]);
+        writer
+    }
+
+    fn put<const N: usize>(&mut self, bytes: [u8; N]) {
+        self.about[self.at..self.at + N].copy_from_slice(&bytes);
+        self.at += N;
+    }
+
+    fn words(&mut self, words: &[u32]) {
+        words.iter().for_each(|word| self.put(word.to_le_bytes()));
+    }
+}
+
+/// Reads values one after another; `None` past the end.
+struct Bytes<'a>(&'a [u8]);
+
+impl<'a> Bytes<'a> {
+    /// What follows the version of an `About`; `None` of another.
+    fn of(about: &'a About) -> Option<Bytes<'a>> {
+        let mut bytes = Bytes(about);
+        (bytes.u8()? == FORM).then_some(bytes)
+    }
+
+    fn take<const N: usize>(&mut self) -> Option<[u8; N]> {
+        let (taken, rest) = self.0.split_first_chunk::<N>()?;
+        self.0 = rest;
+        Some(*taken)
+    }
+
+    fn u8(&mut self) -> Option<u8> {
+        self.take().map(|[byte]| byte)
+    }
+
+    fn bool(&mut self) -> Option<bool> {
+        match self.u8()? {
+            byte @ 0..=1 => Some(byte == 1),
+            _ => None,
+        }
+    }
+
+    fn u32(&mut self) -> Option<u32> {
+        self.take().map(u32::from_le_bytes)
+    }
+
+    fn i64(&mut self) -> Option<i64> {
+        self.take().map(i64::from_le_bytes)
+    }
+
+    fn f32(&mut self) -> Option<f32> {
+        self.take().map(f32::from_le_bytes).filter(|v| v.is_finite())
+    }
+
+    fn f64(&mut self) -> Option<f64> {
+        self.take().map(f64::from_le_bytes).filter(|v| v.is_finite())
+    }
+
+    fn pose(&mut self) -> Option<Pose> {
+        let q = DQuat::from_xyzw(self.f64()?, self.f64()?, self.f64()?, self.f64()?);
+        let p = DVec3::new(self.f64()?, self.f64()?, self.f64()?);
+        q.is_normalized().then_some(Pose { q, p })
+    }
+
+    fn exposure(&mut self) -> Option<Exposure> {
+        let exposure = Exposure { gain: self.f64()?, offset: self.f64()? };
+        (exposure.gain > 0.0).then_some(exposure)
+    }
+
+    /// Three numbers, m.
+    fn place(&mut self) -> Option<Vec3> {
+        Some(Vec3::new(self.f32()?, self.f32()?, self.f32()?))
+    }
+}
+
+fn pose_bytes(pose: &Pose) -> [u8; POSE] {
+    let mut bytes = [0; POSE];
+    let numbers = pose.q.to_array().into_iter().chain(pose.p.to_array());
+    bytes.chunks_exact_mut(size_of::<f64>()).zip(numbers).for_each(|(to, v)| to.copy_from_slice(&v.to_le_bytes()));
+    bytes
+}
+
+fn exposure_bytes(exposure: &Exposure) -> [u8; 2 * size_of::<f64>()] {
+    bytemuck::cast([exposure.gain, exposure.offset])
+}
+
+impl RunAbout {
+    pub fn encode(&self) -> About {
+        let mut w = Writer::new();
+        w.put(self.started_unix_s.to_le_bytes());
+        w.put([u8::from(self.colour)]);
+        w.words(&[self.epoch_base, self.width, self.height, self.cameras, self.channels]);
+        w.about
+    }
+
+    pub fn decode(about: &About) -> Option<RunAbout> {
+        let mut b = Bytes::of(about)?;
+        let (started_unix_s, colour) = (b.i64()?, b.bool()?);
+        let [epoch_base, width, height, cameras, channels] = [b.u32()?, b.u32()?, b.u32()?, b.u32()?, b.u32()?];
+        Some(RunAbout { epoch_base, started_unix_s, colour, width, height, cameras, channels })
+    }
+
+    /// Bytes of one plane; `None` beyond what memory could hold.
+    fn plane_bytes(&self) -> Option<usize> {
+        (self.width as usize).checked_mul(self.height as usize)
+    }
+
+    /// Bytes of a keyframe's payload; `None` beyond what memory could hold.
+    pub fn keyframe_bytes(&self) -> Option<usize> {
+        let planes = self.plane_bytes()?.checked_mul(self.channels as usize)?;
+        planes.checked_add(CAMERA)?.checked_mul(self.cameras as usize)
+    }
+}
+
+impl BlockAbout {
+    /// The samples in use.
+    pub fn samples(&self) -> &[[f32; 3]] {
+        &self.samples[..usize::from(self.samples_len).min(SAMPLES)]
+    }
+
+    /// Samples that are not finite are left out.
+    pub fn encode(&self) -> About {
+        let samples = || self.samples().iter().map(|s| Vec3::from_array(*s)).filter(|s| s.is_finite());
+        let least = samples().reduce(Vec3::min).unwrap_or(Vec3::ZERO);
+        let most = samples().reduce(Vec3::max).unwrap_or(Vec3::ZERO);
+        // Beyond what is one block by far: the size stays a number.
+        let size = (most - least).min(Vec3::splat(f32::MAX));
+        let mut w = Writer::new();
+        w.words(&[self.epoch, self.count]);
+        w.put([u8::from(self.colour)]);
+        w.put([u8::from(self.moments)]);
+        w.put(pose_bytes(&self.placed));
+        w.put(pose_bytes(&self.moved));
+        w.put([samples().count() as u8]);
+        least.to_array().into_iter().chain(size.to_array()).for_each(|v| w.put(v.to_le_bytes()));
+        for sample in samples() {
+            for ((at, least), size) in sample.to_array().into_iter().zip(least.to_array()).zip(size.to_array()) {
+                let step = if size > 0.0 { ((at - least) / size * SAMPLE_STEPS).round() } else { 0.0 };
+                w.put((step as u16).to_le_bytes());
+            }
+        }
+        w.about
+    }
+
+    pub fn decode(about: &About) -> Option<BlockAbout> {
+        let mut b = Bytes::of(about)?;
+        let (epoch, count, colour, moments) = (b.u32()?, b.u32()?, b.bool()?, b.bool()?);
+        let (placed, moved) = (b.pose()?, b.pose()?);
+        let samples_len = b.u8().filter(|n| usize::from(*n) <= SAMPLES)?;
+        let (least, size) = (b.place()?, b.place()?);
+        let mut samples = [[0.0; 3]; SAMPLES];
+        for sample in &mut samples[..usize::from(samples_len)] {
+            for axis in 0..3 {
+                let step = f32::from(b.take().map(u16::from_le_bytes)?);
+                sample[axis] = least[axis] + size[axis] * (step / SAMPLE_STEPS);
+            }
+        }
+        Some(BlockAbout { epoch, count, colour, moments, placed, moved, samples, samples_len })
+    }
+
+    /// Bytes of the payload's arrays, in their order; those that are not kept are empty. `None` beyond what memory could hold.
+    fn lengths(&self) -> Option<[usize; 5]> {
+        let n = self.count as usize;
+        let of = |kept: bool, each: usize| n.checked_mul(if kept { each } else { 0 });
+        Some([
+            of(true, size_of::<Splat>())?,
+            of(true, size_of::<u32>())?,
+            of(self.colour, size_of::<[f32; 2]>())?,
+            of(self.moments, size_of::<Moments>())?,
+            of(self.moments && self.colour, size_of::<[f32; 4]>())?,
+        ])
+    }
+
+    /// Bytes of the payload; `None` beyond what memory could hold.
+    pub fn payload_bytes(&self) -> Option<usize> {
+        self.lengths()?.into_iter().try_fold(0usize, |sum, n| sum.checked_add(n))
+    }
+
+    /// The arrays in a payload; `None` where it has another length.
+    pub fn arrays<'a>(&self, payload: &'a [u8]) -> Option<BlockBytes<'a>> {
+        if self.payload_bytes()? != payload.len() {
+            return None;
+        }
+        let mut rest = payload;
+        let [splats, steps, chroma, moments, chroma_moments] = self.lengths()?.map(|n| {
+            let (array, after) = rest.split_at(n);
+            rest = after;
+            array
+        });
+        Some(BlockBytes { splats, steps, chroma, moments, chroma_moments })
+    }
+}
+
+/// The arrays of a block, as the device has them. Those that are not kept are empty.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct BlockArrays<'a> {
+    pub splats: &'a [Splat],
+    pub steps: &'a [u32],
+    pub chroma: &'a [[f32; 2]],
+    pub moments: &'a [Moments],
+    pub chroma_moments: &'a [[f32; 4]],
+}
+
+impl BlockArrays<'_> {
+    /// Appends a payload.
+    pub fn encode(&self, out: &mut Vec<u8>) {
+        out.extend_from_slice(bytemuck::cast_slice(self.splats));
+        out.extend_from_slice(bytemuck::cast_slice(self.steps));
+        out.extend_from_slice(bytemuck::cast_slice(self.chroma));
+        out.extend_from_slice(bytemuck::cast_slice(self.moments));
+        out.extend_from_slice(bytemuck::cast_slice(self.chroma_moments));
+    }
+}
+
+/// The arrays of a block as they lie in its payload, which may be aligned to nothing: `copied` takes them out.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct BlockBytes<'a> {
+    pub splats: &'a [u8],
+    pub steps: &'a [u8],
+    pub chroma: &'a [u8],
+    pub moments: &'a [u8],
+    pub chroma_moments: &'a [u8],
+}
+
+/// Replaces what is in `to` by the elements of an array in a payload, whole ones. Allocates where `to` has no room.
+pub fn copied<T: bytemuck::Pod>(bytes: &[u8], to: &mut Vec<T>) {
+    to.clear();
+    to.resize(bytes.len() / size_of::<T>(), T::zeroed());
+    let whole = size_of_val(to.as_slice());
+    bytemuck::cast_slice_mut(to).copy_from_slice(&bytes[..whole]);
+}
+
+impl<'a> BlockBytes<'a> {
+    /// The Gaussians, moved by `by` as move_block.comp does: means and rotations.
+    pub fn gaussians(&self, by: &Pose) -> impl ExactSizeIterator<Item = Gaussian> + 'a {
+        let (splats, chroma) = (self.splats, self.chroma);
+        let (turn, shift) = (by.q, by.p);
+        (0..splats.len() / size_of::<Splat>()).map(move |i| {
+            let splat: Splat = bytemuck::pod_read_unaligned(&splats[i * size_of::<Splat>()..][..size_of::<Splat>()]);
+            let grey = [splat.scale_colour[3]; 2];
+            let chroma = chroma.chunks_exact(size_of_val(&grey)).nth(i).map_or(grey, bytemuck::pod_read_unaligned);
+            let g = Gaussian::unpacked(&splat, chroma);
+            let mean = turn * Vec3::from_array(g.mean).as_dvec3() + shift;
+            // The stored quaternion need not be of unit length, and keeps its own.
+            let quat = turn.as_quat().mul_quat(Quat::from_vec4(Vec4::from_array(g.quat_xyzw)));
+            Gaussian { mean: mean.as_vec3().to_array(), quat_xyzw: quat.to_array(), ..g }
+        })
+    }
+}
+
+impl KeyframeAbout {
+    pub fn encode(&self) -> About {
+        let mut w = Writer::new();
+        w.put(self.t.0.to_le_bytes());
+        w.words(&[self.epoch, self.home]);
+        w.put([u8::from(self.held_out)]);
+        w.put([u8::from(self.anchor)]);
+        [self.given, self.refined, self.body_from_cam].iter().for_each(|pose| w.put(pose_bytes(pose)));
+        w.put(exposure_bytes(&self.exposure));
+        w.put(self.loss.to_le_bytes());
+        w.about
+    }
+
+    pub fn decode(about: &About) -> Option<KeyframeAbout> {
+        let mut b = Bytes::of(about)?;
+        let (t, epoch, home) = (Nanos(b.i64()?), b.u32()?, b.u32()?);
+        let (held_out, anchor) = (b.bool()?, b.bool()?);
+        let (given, refined, body_from_cam) = (b.pose()?, b.pose()?, b.pose()?);
+        let (exposure, loss) = (b.exposure()?, b.f32()?);
+        Some(KeyframeAbout { t, epoch, held_out, anchor, home, given, refined, body_from_cam, exposure, loss })
+    }
+}
+
+/// Appends a keyframe's payload: its cameras, and the pixels of all their planes in the same order.
+pub fn encode_keyframe<'a>(cameras: &[CameraAbout], planes: impl Iterator<Item = &'a [u8]>, out: &mut Vec<u8>) {
+    for camera in cameras {
+        out.extend_from_slice(&pose_bytes(&camera.body_from_cam));
+        out.extend_from_slice(&pose_bytes(&camera.body_from_raw));
+        out.extend_from_slice(&exposure_bytes(&camera.exposure));
+        out.extend_from_slice(&camera.coarseness.level().to_le_bytes());
+    }
+    planes.for_each(|plane| out.extend_from_slice(plane));
+}
+
+/// A keyframe's payload.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct KeyframeBytes<'a> {
+    cameras: &'a [u8],
+    planes: &'a [u8],
+    channels: usize,
+    plane_bytes: usize,
+}
+
+impl<'a> KeyframeBytes<'a> {
+    /// The payload of a keyframe of a run; `None` where it has another length.
+    pub fn of(run: &RunAbout, payload: &'a [u8]) -> Option<KeyframeBytes<'a>> {
+        if run.keyframe_bytes()? != payload.len() {
+            return None;
+        }
+        let (cameras, planes) = payload.split_at(run.cameras as usize * CAMERA);
+        Some(KeyframeBytes { cameras, planes, channels: run.channels as usize, plane_bytes: run.plane_bytes()? })
+    }
+
+    pub fn camera(&self, camera: usize) -> Option<CameraAbout> {
+        let mut b = Bytes(self.cameras.chunks_exact(CAMERA).nth(camera)?);
+        let (body_from_cam, body_from_raw, exposure) = (b.pose()?, b.pose()?, b.exposure()?);
+        let coarseness = Coarseness::at(b.f32()?);
+        Some(CameraAbout { body_from_cam, body_from_raw, exposure, coarseness })
+    }
+
+    /// Pixels, row by row.
+    pub fn plane(&self, camera: usize, channel: usize) -> Option<&'a [u8]> {
+        if channel >= self.channels {
+            return None;
+        }
+        let at = camera.checked_mul(self.channels)?.checked_add(channel)?.checked_mul(self.plane_bytes)?;
+        self.planes.get(at..at.checked_add(self.plane_bytes)?)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+    use proptest::prelude::*;
+
+    fn pose() -> impl Strategy<Value = Pose> {
+        (any::<[f64; 3]>(), [-3.0..3.0, -3.0..3.0, -3.0..3.0]).prop_map(|(p, turn): ([f64; 3], [f64; 3])| {
+            let p = DVec3::from_array(p.map(|v| if v.is_finite() { v } else { 0.0 }));
+            Pose::new(DQuat::from_scaled_axis(DVec3::from_array(turn)), p)
+        })
+    }
+
+    fn exposure() -> impl Strategy<Value = Exposure> {
+        (0.01..100.0, -1.0..1.0).prop_map(|(gain, offset)| Exposure { gain, offset })
+    }
+
+    fn block() -> impl Strategy<Value = BlockAbout> {
+        let sample = [-500.0..500.0f32, -500.0..500.0f32, -500.0..500.0f32];
+        let samples = proptest::collection::vec(sample, 0..=SAMPLES);
+        (any::<(u32, bool, bool)>(), 0..40u32, pose(), pose(), samples).prop_map(
+            |(free, count, placed, moved, used)| {
+                let (epoch, colour, moments) = free;
+                let mut samples = [[0.0; 3]; SAMPLES];
+                samples[..used.len()].copy_from_slice(&used);
+                BlockAbout { epoch, count, colour, moments, placed, moved, samples, samples_len: used.len() as u8 }
+            },
+        )
+    }
+
+    /// Elements of any bits, but for those of a float that is not a number, which equals nothing.
+    fn filled<T: bytemuck::Pod>(n: usize, seed: u32) -> Vec<T> {
+        let word = |i: usize| (i as u32).wrapping_mul(0x9e37_79b9).wrapping_add(seed) & 0xbfff_ffff;
+        let words: Vec<u32> = (0..n * size_of::<T>() / 4).map(word).collect();
+        let mut all = vec![];
+        copied(bytemuck::cast_slice(&words), &mut all);
+        all
+    }
+
+    proptest! {
+        #[test]
+        fn runs_and_keyframes_read_back_as_they_were(
+            run in any::<(u32, i64, bool, u32, u32, u32, u32)>(), (t, epoch, home, held_out, anchor) in any::<(i64, u32, u32, bool, bool)>(),
+            poses in [pose(), pose(), pose()], exposure in exposure(), loss in -10.0..10.0f32,
+        ) {
+            let (epoch_base, started_unix_s, colour, width, height, cameras, channels) = run;
+            let run = RunAbout { epoch_base, started_unix_s, colour, width, height, cameras, channels };
+            prop_assert_eq!(RunAbout::decode(&run.encode()), Some(run));
+            let [given, refined, body_from_cam] = poses;
+            let t = Nanos(t);
+            let keyframe = KeyframeAbout { t, epoch, held_out, anchor, home, given, refined, body_from_cam, exposure, loss };
+            prop_assert_eq!(KeyframeAbout::decode(&keyframe.encode()), Some(keyframe));
+        }
+
+        #[test]
+        fn blocks_read_back_with_samples_to_the_step_of_their_box(block in block()) {
+            let read = BlockAbout::decode(&block.encode()).unwrap();
+            prop_assert_eq!(BlockAbout { samples: block.samples, ..read }, block);
+            for axis in 0..3 {
+                let of = |b: &BlockAbout| b.samples().iter().map(|s| s[axis]).collect::<Vec<f32>>();
+                let (was, is) = (of(&block), of(&read));
+                let ends = was.iter().fold([f32::MAX, f32::MIN], |[a, b], v| [a.min(*v), b.max(*v)]);
+                let close = |(a, b): (&f32, &f32)| (a - b).abs() <= (ends[1] - ends[0]) / SAMPLE_STEPS + 1e-4;
+                prop_assert!(was.iter().zip(&is).all(close), "{:?} {:?}", was, is);
+            }
+        }
+
+        #[test]
+        fn arrays_read_back_and_other_lengths_are_refused(block in block(), seed in any::<u32>()) {
+            let n = block.count as usize;
+            let (splats, steps) = (filled(n, seed), filled(n, seed + 1));
+            let chroma = filled(if block.colour { n } else { 0 }, seed);
+            let moments = filled(if block.moments { n } else { 0 }, seed);
+            let chroma_moments = filled(if block.colour && block.moments { n } else { 0 }, seed);
+            let arrays = BlockArrays {
+                splats: &splats, steps: &steps, chroma: &chroma, moments: &moments, chroma_moments: &chroma_moments,
+            };
+            // Behind one byte: nothing is aligned.
+            let mut payload = vec![7];
+            arrays.encode(&mut payload);
+            let bytes = block.arrays(&payload[1..]).unwrap();
+            let mut read: (Vec<Splat>, Vec<u32>, Vec<[f32; 2]>, Vec<Moments>, Vec<[f32; 4]>) = Default::default();
+            copied(bytes.splats, &mut read.0);
+            copied(bytes.steps, &mut read.1);
+            copied(bytes.chroma, &mut read.2);
+            copied(bytes.moments, &mut read.3);
+            copied(bytes.chroma_moments, &mut read.4);
+            prop_assert_eq!(read, (splats, steps, chroma, moments, chroma_moments));
+            prop_assert_eq!(bytes.gaussians(&Pose::IDENTITY).len(), n);
+            prop_assert!(block.arrays(&payload).is_none() && (n == 0 || block.arrays(&payload[2..]).is_none()));
+        }
+
+        #[test]
+        fn foreign_bytes_are_nothing_or_something_and_never_a_panic(
+            about in proptest::collection::vec(any::<u8>(), ABOUT), payload in proptest::collection::vec(any::<u8>(), 0..2000),
+        ) {
+            let mut about: About = about.try_into().unwrap();
+            for form in [FORM, about[0]] {
+                about[0] = form;
+                let run = RunAbout::decode(&about).unwrap_or_default();
+                let _ = KeyframeBytes::of(&run, &payload).map(|k| (k.camera(0), k.plane(0, 0), k.plane(9, 9)));
+                let _ = KeyframeAbout::decode(&about);
+                let _ = BlockAbout::decode(&about).map(|b| b.arrays(&payload).map(|a| a.gaussians(&b.moved).count()));
+            }
+        }
+
+        #[test]
+        fn gaussians_are_moved_as_points_and_frames_are(by in pose(), at in [-9.0..9.0f32, -9.0..9.0f32, -9.0..9.0f32]) {
+            let by = Pose { p: by.p.clamp(DVec3::splat(-50.0), DVec3::splat(50.0)), ..by };
+            let q = Quat::from_xyzw(0.2, -0.4, 0.1, 0.7);
+            let splat = Splat {
+                mean_opacity: [at[0], at[1], at[2], 0.5],
+                scale_colour: [-1.0, -2.0, -3.0, 0.25],
+                quat: q.to_array(),
+            };
+            let mut payload = vec![];
+            BlockArrays { splats: &[splat], steps: &[0], ..BlockArrays::default() }.encode(&mut payload);
+            let block = BlockAbout { count: 1, ..BlockAbout::default() };
+            let g = block.arrays(&payload).unwrap().gaussians(&by).next().unwrap();
+            let to = by.transform(Vec3::from_array(at).as_dvec3());
+            prop_assert!((Vec3::from_array(g.mean).as_dvec3() - to).length() < 1e-5);
+            // The length of the quaternion stays: matrices of it are scaled by its square.
+            let frame = |q: Quat| glam::DMat3::from_quat(q.as_dquat().normalize());
+            let off = frame(Quat::from_array(g.quat_xyzw)) - by.rotation() * frame(q);
+            let length = Quat::from_array(g.quat_xyzw).length();
+            prop_assert!(off.to_cols_array().iter().all(|v| v.abs() < 1e-5) && (length - q.length()).abs() < 1e-5);
+            prop_assert_eq!((g.opacity_logit, g.log_scale, g.colour), (0.5, [-1.0, -2.0, -3.0], [0.25; 3]));
+        }
+    }
+
+    #[test]
+    fn images_read_back_by_camera_and_plane_and_other_lengths_are_refused() {
+        let run = RunAbout { width: 3, height: 2, cameras: 2, channels: 3, ..RunAbout::default() };
+        let camera = |i: f64| CameraAbout {
+            body_from_cam: Pose { p: DVec3::splat(i), ..Pose::IDENTITY },
+            exposure: Exposure { gain: 1.0 + i, offset: 0.1 },
+            coarseness: Coarseness::at(0.5),
+            ..CameraAbout::default()
+        };
+        let planes: Vec<[u8; 6]> = (0..6).map(|i| [i; 6]).collect();
+        let mut payload = vec![];
+        encode_keyframe(&[camera(0.0), camera(1.0)], planes.iter().map(|p| p.as_slice()), &mut payload);
+        let read = KeyframeBytes::of(&run, &payload).unwrap();
+        assert_eq!([0, 1].map(|i| read.camera(i)), [0.0, 1.0].map(|i| Some(camera(i))));
+        assert_eq!((read.plane(0, 1), read.plane(1, 2)), (Some(&[1; 6][..]), Some(&[5; 6][..])));
+        assert_eq!((read.camera(2), read.plane(0, 3), read.plane(2, 0)), (None, None, None));
+        assert!(KeyframeBytes::of(&run, &payload[1..]).is_none());
+        assert!(KeyframeBytes::of(&RunAbout { width: u32::MAX, height: u32::MAX, ..run }, &payload).is_none());
+    }
+
+    #[test]
+    fn another_version_of_the_form_is_not_read() {
+        let mut about = BlockAbout::default().encode();
+        assert!(BlockAbout::decode(&about).is_some());
+        about[0] = FORM + 1;
+        assert!(BlockAbout::decode(&about).is_none());
+    }
+}
