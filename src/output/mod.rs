@@ -12,6 +12,7 @@ pub mod metrics;
 pub mod panel;
 pub mod ply;
 pub mod report;
+pub mod spz;
 pub mod trajectory;
 
 use std::ffi::OsString;
