@@ -7,6 +7,7 @@
 //! program wrote: a hidden `.stipple` in it lists that.
 
 pub mod chart;
+pub mod export;
 pub mod html;
 pub mod metrics;
 pub mod panel;
