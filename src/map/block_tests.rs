@@ -1,6 +1,7 @@
 //! What is written of blocks and keyframes is read back, and what is not of their form is refused.
 #![cfg(test)]
 #![allow(clippy::unwrap_used)]
+
 use super::*;
 use proptest::prelude::*;
 
