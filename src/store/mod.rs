@@ -8,13 +8,33 @@
 //! The owner never waits for the disk: what finds no buffer is refused. One short lock guards the index and the queues; no
 //! file is touched under it, so that the owner waits for copies of a few hundred bytes at most.
 
+mod aside;
+mod compact;
+mod disk;
+mod index;
+mod open;
+mod reader;
 mod record;
+mod scan;
+mod segment;
+mod state;
+#[cfg(test)]
+mod tests;
+mod writer;
 
+pub use aside::set_aside;
+pub use disk::Disk;
+pub use reader::Reader;
 pub use record::{About, Key, ABOUT};
 
 use crate::mem::{Footprint, List};
-use std::path::{Path, PathBuf};
+use disk::Shared;
+use state::State;
+use std::path::Path;
+use std::sync::Arc;
+use std::time::Duration;
 use stipple_drivers::{Fault, FaultKind};
+use writer::Writer;
 
 /// What a store may take; bytes.
 #[derive(Clone, Copy, Debug)]
@@ -84,117 +104,159 @@ pub struct Figures {
 }
 
 /// The owner's side.
-pub struct Store {}
+pub struct Store {
+    shared: Arc<Shared>,
+    warnings: Vec<String>,
+}
 
-/// The disk's side: what two threads run, or what the owner's thread runs in lockstep.
-pub struct Disk {}
-
-/// A store that is read while another may write it.
-pub struct Reader {}
+impl Drop for Store {
+    fn drop(&mut self) {
+        Disk(self.shared.clone()).stop();
+    }
+}
 
 impl Store {
     /// Opens or makes the store in `folder`, for a map of `identity` (a hash of rig and shape). Takes the lock. Fails where the
-    /// folder cannot be written, another run holds it, or it is of another identity or version.
-    pub fn open(folder: &Path, _identity: u64, _limits: &Limits) -> Result<(Store, Disk), Fault> {
-        Err(Fault::new(FaultKind::NoOutput, folder.display().to_string(), "the store is not finished", ""))
+    /// folder cannot be written, another run holds it, it is of another identity or version, or it holds more than the limits
+    /// allow.
+    pub fn open(folder: &Path, identity: u64, limits: &Limits) -> Result<(Store, Disk), Fault> {
+        let (shared, warnings) = open::open(folder, identity, limits)?;
+        let shared = Arc::new(shared);
+        Ok((Store { shared: shared.clone(), warnings }, Disk(shared)))
     }
 
     /// Host memory that a store of these limits takes.
-    pub fn footprint(_limits: &Limits) -> Footprint {
-        Footprint::default()
+    pub fn footprint(limits: &Limits) -> Footprint {
+        let mut footprint = Footprint::default();
+        footprint.build("store", || (State::new(limits, 0), Writer::new(limits)));
+        footprint
     }
 
-    /// What was found at opening that the owner should hear of: foreign files.
+    /// What was found at opening that the owner should hear of: foreign files, parts that cannot be read.
     pub fn warnings(&self) -> &[String] {
-        &[]
+        &self.warnings
     }
 
-    /// Visits the newest generation of every record that is on disk.
-    pub fn entries(&self, _visit: impl FnMut(&Key, &About)) {}
+    /// Visits the newest generation of every record that is on disk. `visit` must not call the store.
+    pub fn entries(&self, mut visit: impl FnMut(&Key, &About)) {
+        let state = self.shared.state();
+        for entry in state.index.entries().iter().filter(|e| !e.is_tombstone) {
+            if let Some(about) = state.index.about(entry) {
+                visit(&entry.key, about);
+            }
+        }
+    }
 
-    /// The header's bytes of the newest generation on disk.
-    pub fn about(&self, _key: &Key) -> Option<About> {
-        None
+    /// What the owner has in the header of the newest generation on disk.
+    pub fn about(&self, key: &Key) -> Option<About> {
+        let state = self.shared.state();
+        state.index.about(state.index.get(key)?).copied()
     }
 
     /// Whether a buffer is free and the disk takes a new key.
     pub fn has_room(&self) -> bool {
-        false
+        let state = self.shared.state();
+        !state.free.is_empty() && state.takes_new(state.limits.payload_max)
     }
 
     /// Hands a record over; false, and counted, where no buffer is free or the store is full. Never waits for the disk. `fill`
     /// writes the payload into an empty buffer of `payload_max` bytes.
-    pub fn put(&mut self, _key: Key, _about: &About, _fill: impl FnOnce(&mut Vec<u8>)) -> bool {
-        false
+    pub fn put(&mut self, key: Key, about: &About, fill: impl FnOnce(&mut Vec<u8>)) -> bool {
+        let mut state = self.shared.state();
+        let Some(mut payload) = state.free.pop() else {
+            state.figures.refused_no_buffer += 1;
+            return false;
+        };
+        drop(state);
+        payload.clear();
+        fill(&mut payload);
+        let mut state = self.shared.state();
+        let is_long = payload.len() > state.limits.payload_max;
+        if is_long || !state.takes(&key, payload.len()) {
+            let figures = &mut state.figures;
+            *(if is_long { &mut figures.refused_too_long } else { &mut figures.refused_full }) += 1;
+            state.take_back(payload);
+            return false;
+        }
+        state.push(key, about, false, payload);
+        drop(state);
+        self.shared.work.notify_all();
+        true
     }
 
     /// Removes a record; false where it is not known, no buffer is free, or too many removals wait for compaction.
-    pub fn remove(&mut self, _key: Key) -> bool {
-        false
+    pub fn remove(&mut self, key: Key) -> bool {
+        let mut state = self.shared.state();
+        if !state.is_known(&key) {
+            return false;
+        }
+        if !state.takes_tombstone() {
+            state.figures.refused_full += 1;
+            return false;
+        }
+        let Some(mut payload) = state.free.pop() else {
+            state.figures.refused_no_buffer += 1;
+            return false;
+        };
+        payload.clear();
+        state.push(key, &[0; ABOUT], true, payload);
+        drop(state);
+        self.shared.work.notify_all();
+        true
     }
 
-    /// Asks for a payload; false where no buffer is free or the key is unknown.
-    pub fn fetch(&mut self, _key: Key) -> bool {
-        false
+    /// Asks for a payload, the one put last; false where no buffer is free or the key is unknown.
+    pub fn fetch(&mut self, key: Key) -> bool {
+        let mut state = self.shared.state();
+        if !state.is_known(&key) {
+            return false;
+        }
+        let Some(payload) = state.free.pop() else { return false };
+        state.asked.push_back((key, payload));
+        drop(state);
+        self.shared.asked.notify_all();
+        true
     }
 
     /// The next payload that was read.
     pub fn fetched(&mut self) -> Option<Fetched> {
-        None
+        self.shared.state().fetched.pop_front()
     }
 
     /// Returns the buffer of a payload.
-    pub fn give_back(&mut self, _fetched: Fetched) {}
+    pub fn give_back(&mut self, fetched: Fetched) {
+        self.shared.state().take_back(fetched.payload);
+    }
 
-    /// Waits until everything put is on disk and synced; where no thread writes, it does so itself. Fails where writing does.
+    /// Waits until everything put is on disk and synced; where no thread writes, it does so itself. Fails where writing does:
+    /// what was put stays in its buffers then, and is tried again.
     pub fn flush(&mut self) -> Result<(), Fault> {
+        let shared = &*self.shared;
+        let mut state = shared.state();
+        let (wanted, failures) = (state.put, state.failures);
+        while state.synced < wanted {
+            if state.failures != failures {
+                let why = String::from_utf8_lossy(&state.last_error).into_owned();
+                let fix = "make room on the disk, or check it";
+                return Err(Fault::new(FaultKind::Io, shared.path.display().to_string(), why, fix));
+            }
+            state.flush_to = wanted;
+            if state.writers == 0 {
+                drop(state);
+                shared.write_all();
+                state = shared.state();
+            } else {
+                shared.work.notify_all();
+                let waited = shared.done.wait_timeout(state, Duration::from_millis(100));
+                state = waited.unwrap_or_else(std::sync::PoisonError::into_inner).0;
+            }
+        }
         Ok(())
     }
 
     pub fn figures(&self) -> Figures {
-        Figures::default()
+        let state = self.shared.state();
+        let (records, live_bytes) = (state.index.records() as u64, state.live());
+        Figures { live_bytes, records, disk_bytes: state.file_bytes(), ..state.figures.clone() }
     }
-}
-
-impl Disk {
-    /// Body of the thread that writes; it ends when the store is dropped or told to stop.
-    pub fn write_loop(&self) {}
-
-    /// Body of the thread that reads; it ends when the store is dropped or told to stop.
-    pub fn read_loop(&self) {}
-
-    /// Does all that waits now, on the caller's thread: instead of both threads, deterministically.
-    pub fn serve(&self) {}
-
-    /// Tells both loops to end.
-    pub fn stop(&self) {}
-}
-
-impl Reader {
-    /// Opens the store in a folder to be read, without its lock. Fails where there is none, or one of another version.
-    pub fn open(folder: &Path) -> Result<Reader, Fault> {
-        Err(Fault::new(FaultKind::NoInput, folder.display().to_string(), "the store is not finished", ""))
-    }
-
-    pub fn identity(&self) -> u64 {
-        0
-    }
-
-    /// Visits the newest generation of every record.
-    pub fn entries(&self, _visit: impl FnMut(&Key, &About)) {}
-
-    pub fn about(&self, _key: &Key) -> Option<About> {
-        None
-    }
-
-    /// Reads a payload, of an older generation where the newest is damaged. Fails where no generation is whole.
-    pub fn read(&mut self, key: Key, _payload: &mut Vec<u8>) -> Result<About, Fault> {
-        Err(Fault::new(FaultKind::NoInput, format!("{key:?}"), "the store is not finished", ""))
-    }
-}
-
-/// Moves the segments of a store to `previous-NAME` beside its folder, in the place of those that are there, and answers where.
-/// Fails where a run holds the store, or a file cannot be moved.
-pub fn set_aside(_folder: &Path) -> Result<Option<PathBuf>, Fault> {
-    Ok(None)
 }
