@@ -104,10 +104,10 @@ pub struct KeyframeAbout {
     pub given: Pose,
     /// body_from_refined
     pub refined: Pose,
-    /// Of the first camera.
+    /// Where the first camera sits on the body, and its exposure.
     pub body_from_cam: Pose,
     pub exposure: Exposure,
-    /// Of the last training step on it.
+    /// The loss of the last training step on it.
     pub loss: f32,
 }
 

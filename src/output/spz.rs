@@ -82,7 +82,7 @@ fn push(to: &mut Element, bytes: impl IntoIterator<Item = u8>) {
     }
 }
 
-/// As many as are needed for positions as far as that.
+/// The most bits with which positions as far as that fit.
 fn fraction_bits(extent_m: f32) -> u8 {
     let fits = |bits: &u8| f64::from(extent_m) * f64::from(1u32 << bits) <= POSITION_MAX;
     (FRACTION_BITS_MIN..=FRACTION_BITS).rev().find(fits).unwrap_or(FRACTION_BITS_MIN)
