@@ -31,8 +31,12 @@ fn block() -> impl Strategy<Value = BlockAbout> {
 fn filled<T: bytemuck::Pod>(n: usize, seed: u32) -> Vec<T> {
     let word = |i: usize| (i as u32).wrapping_mul(0x9e37_79b9).wrapping_add(seed) & 0xbfff_ffff;
     let words: Vec<u32> = (0..n * size_of::<T>() / 4).map(word).collect();
+    taken(bytemuck::cast_slice(&words))
+}
+
+fn taken<T: bytemuck::Pod>(bytes: &[u8]) -> Vec<T> {
     let mut all = vec![];
-    copied(bytemuck::cast_slice(&words), &mut all);
+    copied(bytes, &mut all);
     all
 }
 
@@ -78,12 +82,7 @@ proptest! {
         let mut payload = vec![7];
         arrays.encode(&mut payload);
         let bytes = block.arrays(&payload[1..]).unwrap();
-        let mut read: (Vec<Splat>, Vec<u32>, Vec<[f32; 2]>, Vec<Moments>, Vec<[f32; 4]>) = Default::default();
-        copied(bytes.splats, &mut read.0);
-        copied(bytes.steps, &mut read.1);
-        copied(bytes.chroma, &mut read.2);
-        copied(bytes.moments, &mut read.3);
-        copied(bytes.chroma_moments, &mut read.4);
+        let read = (taken(bytes.splats), taken(bytes.steps), taken(bytes.chroma), taken(bytes.moments), taken(bytes.chroma_moments));
         prop_assert_eq!(read, (splats, steps, chroma, moments, chroma_moments));
         prop_assert_eq!(bytes.gaussians(&Pose::IDENTITY).len(), n);
         prop_assert!(block.arrays(&payload).is_none() && (n == 0 || block.arrays(&payload[2..]).is_none()));

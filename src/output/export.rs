@@ -250,26 +250,24 @@ struct Source {
     payload: Vec<u8>,
 }
 
-/// A block that was read.
-enum Read {
-    /// What is known of it, and a hash of all.
-    Whole(BlockAbout, u64),
+/// Why a block was not read.
+enum Unread {
     Damaged,
     /// It was removed.
     Gone,
 }
 
 impl Source {
-    fn read(&mut self, key: &Key) -> Read {
-        let about = match self.reader.read(*key, &mut self.payload) {
-            Ok(about) => about,
-            Err(fault) if fault.kind == FaultKind::NoInput => return Read::Gone,
-            Err(_) => return Read::Damaged,
-        };
+    /// Reads a block, and answers what is known of it and a hash of all.
+    fn read(&mut self, key: &Key) -> Result<(BlockAbout, u64), Unread> {
+        let about = self.reader.read(*key, &mut self.payload).map_err(|fault| match fault.kind {
+            FaultKind::NoInput => Unread::Gone,
+            _ => Unread::Damaged,
+        })?;
         let mut hasher = DefaultHasher::new();
         (about, &self.payload).hash(&mut hasher);
         let block = BlockAbout::decode(&about).filter(|b| b.arrays(&self.payload).is_some());
-        block.map_or(Read::Damaged, |block| Read::Whole(block, hasher.finish()))
+        Ok((block.ok_or(Unread::Damaged)?, hasher.finish()))
     }
 
     /// The Gaussians of the block that was read last, where they are now.
@@ -285,12 +283,12 @@ impl Source {
         let mut survey = Survey { blocks, damaged, gaussians: 0, extent_m: 0.0, upper: vec![0; BINS] };
         for key in keys {
             match self.read(key) {
-                Read::Whole(block, hash) => {
+                Ok((block, hash)) => {
                     survey.blocks.push((*key, hash));
                     self.gaussians(&block).filter(|g| is_in(region, g)).for_each(|g| survey.count(&g));
                 }
-                Read::Damaged => survey.damaged.push(key.id),
-                Read::Gone => {}
+                Err(Unread::Damaged) => survey.damaged.push(key.id),
+                Err(Unread::Gone) => {}
             }
         }
         survey
@@ -307,7 +305,7 @@ impl Source {
         let mut kept = *kept;
         for (key, hash) in blocks {
             let block = match self.read(key) {
-                Read::Whole(block, now) if now == *hash => block,
+                Ok((block, now)) if now == *hash => block,
                 _ => return Err(Stop::Changed),
             };
             for mut g in self.gaussians(&block).filter(|g| kept.takes(g)) {

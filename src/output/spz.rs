@@ -55,8 +55,7 @@ pub fn write_spz(
     }
     // Degree of the harmonics, bits, flags, reserved.
     gzip.write_all(&[0, bits, 0, 0])?;
-    let arrays: [&dyn Fn(&Gaussian, &mut Element); 5] =
-        [&|g, to| position(g, bits, to), &opacity, &colour, &scale, &rotation];
+    let arrays: [Pack; 5] = [&|g, to| position(g, bits, to), &opacity, &colour, &scale, &rotation];
     for array in arrays {
         let mut left = count;
         all(&mut |g| {
@@ -73,6 +72,8 @@ pub fn write_spz(
     Ok(())
 }
 
+/// Packs what an array has of a Gaussian.
+type Pack<'a> = &'a dyn Fn(&Gaussian, &mut Element);
 type Element = crate::mem::List<u8, ELEMENT_MAX>;
 
 fn push(to: &mut Element, bytes: impl IntoIterator<Item = u8>) {
