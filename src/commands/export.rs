@@ -12,7 +12,7 @@ const DAMAGED_NAMED: usize = 8;
 pub struct Args {
     /// Folder of the run, as it was given to --out; its map store is DIR/map, and a run may be writing to it
     dir: PathBuf,
-    /// File to write; its ending says what: .ply as 3DGS viewers read it, or .spz, a fifth of the size and with y up [default: DIR/export.ply]
+    /// File to write; its ending says what: .ply as 3DGS viewers read it, or .spz, less than a third of the size and with y up [default: DIR/export.ply]
     #[arg(long, value_name = "FILE.ply|FILE.spz")]
     out: Option<PathBuf>,
     /// Number of the run, where the store has several [default: the newest that has a map]

@@ -1,4 +1,4 @@
-//! The map as `.spz`, version 3: Niantic's packed form of Gaussians, a fifth of the PLY, which SuperSplat, Spark and PlayCanvas open.
+//! The map as `.spz`, version 3: Niantic's packed form of Gaussians, 20 bytes each before compression (a PLY: 68).
 //!
 //! A gzip stream of a header of 16 bytes and one array after another: positions (3 x 24 bits, fixed point), opacities (8 bits),
 //! colours (3 x 8), logarithms of scales (3 x 8), rotations (the three smallest components in 32 bits). Spherical harmonics

@@ -376,7 +376,7 @@ fn a_store_that_is_written_to_is_exported_in_whole_blocks() {
     kept.disk.serve();
     kept.store.flush().unwrap();
     let Kept { mut store, disk } = kept;
-    let (until, map) = (Instant::now() + Duration::from_secs(6), dir.path().join("map"));
+    let (until, map) = (Instant::now() + Duration::from_secs(4), dir.path().join("map"));
     let (mut whole, mut changed, mut newest) = (0, 0, 0.0f32);
     std::thread::scope(|scope| {
         scope.spawn(|| disk.write_loop());
