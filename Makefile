@@ -9,7 +9,7 @@
 #   libopencv-calib3d-dev  block matching; its libraries are loaded where a board asks for it
 #   libvulkan1             Vulkan loader
 #   mesa-vulkan-drivers    lavapipe (Vulkan on the CPU), and the drivers of Intel, AMD and Pi GPUs
-#   python3-pip            fetches the other ends in tests of what talks to an autopilot (tests/autopilot) and to ROS (src/bridge)
+#   python3-pip            fetches the other ends of what talks to an autopilot (tests/autopilot), of maps (tests/export) and of ROS (src/bridge)
 #   systemd                judges the unit of the service in the tests
 #   vulkan-validationlayers  the tests run the pipeline under the Khronos validation layer
 PACKAGES := g++ glslang-tools libopencv-calib3d-dev libvulkan1 mesa-vulkan-drivers python3-pip systemd vulkan-validationlayers
@@ -32,12 +32,17 @@ demo: deps
 
 test: deps
 	@$(MAKE) --no-print-directory target/python/pymavlink || echo "left out: the tests of tests/autopilot, since pip could not fetch pymavlink"
+	@$(MAKE) --no-print-directory target/python/gaussforge || echo "left out: the test of tests/export with a foreign reader, since pip could not fetch gaussforge"
 	cargo check --locked --no-default-features --all-targets
 	cargo test --workspace --locked --no-fail-fast
 	@$(MAKE) --no-print-directory test-onnx
 	@$(MAKE) --no-print-directory test-bridge
 
 target/python/pymavlink: tests/autopilot/requirements.txt
+	python3 -m pip install --quiet --upgrade --target target/python --requirement $<
+	@touch $@
+
+target/python/gaussforge: tests/export/requirements.txt
 	python3 -m pip install --quiet --upgrade --target target/python --requirement $<
 	@touch $@
 

@@ -9,7 +9,7 @@
 //! ```
 //!
 //! Rooms: `math`, `mem`, `limits`, `config` and `counters` are seen by all. `frontend` and `vio` see the vocabulary of
-//! `stipple-drivers`, `vio` also the frontend's `Tracks`; `stereo` and `map` see `gpu`, `map` also `stereo`; `output` sees what it
+//! `stipple-drivers`, `vio` also the frontend's `Tracks`; `stereo` and `map` see `gpu`, `map` also `stereo` and `store`; `output` sees what it
 //! writes of `map` and `vio`, and `publish` what it tells of `vio`. `run` sees all of these, `commands` see all, and nobody sees `commands`. tests/tidy checks it.
 //!
 //! # Glossary
@@ -25,6 +25,7 @@
 //! | exposure | gain and offset that take a rendering to what a camera recorded |
 //! | frame | the images of all cameras at one mid-exposure instant |
 //! | gate | what judges and repairs samples and frames before anybody uses them (`run::gate`) |
+//! | generation | the number of a record's version in the store: a newer one replaces an older |
 //! | held out | a keyframe that is never trained on, only evaluated |
 //! | increment | inertial samples between two frames, integrated (preintegration) |
 //! | keyframe | a frame kept in the estimator's window as a pose, and offered to the map |
@@ -33,11 +34,14 @@
 //! | mailbox | where the newest frame and all samples wait for tracking |
 //! | marginalization | taking old frames out of the window; what they knew stays as the prior |
 //! | packet | a frame on its way through tracking, with its inertial samples and results |
+//! | record | what `store` keeps of one block or keyframe: a header and a payload, in a segment |
 //! | seal | the moment after which our threads allocate nothing |
 //! | pool | the fixed number of places for Gaussians (*splats* in the budget and in kernels) |
+//! | segment | a file of the store, of fixed size, that is appended to until it is full |
 //! | seed | a new Gaussian at a pixel of an anchor, at its stereo depth |
 //! | slot | a place in a pool of fixed size |
 //! | step | one training step: a view rendered, compared, and the Gaussians moved |
+//! | tombstone | a record that says that its key was removed |
 //! | track | a point that the frontend follows from frame to frame, by id |
 
 // The world of points for unit tests (tests/bench/world.rs) names this crate as integration tests do.

@@ -7,6 +7,7 @@ mod check;
 mod checks;
 mod demo;
 mod doctor;
+mod export;
 mod record;
 mod recover;
 mod replay;
@@ -50,6 +51,8 @@ enum Command {
     Bugreport(bugreport::Args),
     /// Write the trajectory of a run that was killed or cut off, from its log
     Recover(recover::Args),
+    /// Write the map of a run, or the part of it that is asked for, from its store
+    Export(export::Args),
     /// Fly through a simulated room and map it; needs no data
     Demo(demo::Args),
     /// Write a simulated flight as an EuRoC folder with ground truth
@@ -99,6 +102,7 @@ pub fn main() -> ExitCode {
         Command::Status(args) => status::status(&args),
         Command::Top(args) => top::top(&args),
         Command::Bugreport(args) => bugreport::bugreport(&args),
+        Command::Export(args) => export::export(&args),
         Command::Demo(args) => demo::demo(&args),
         Command::Sim(args) => sim::sim(&args),
         Command::Check(args) => check::check(&args),

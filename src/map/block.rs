@@ -7,17 +7,13 @@
 //! |---|---|---|---|
 //! | `KIND_RUN` | 0 | `RunAbout` | none |
 //! | `KIND_BLOCK` | of its anchor | `BlockAbout` | arrays of `count` elements, one after another: splats (48 bytes each), steps (4), green and blue (8, in colour), Adam's moments (96, if kept), those of green and blue (16, if kept, in colour) |
-//! | `KIND_KEYFRAME` | of the keyframe, times `CAMERAS_MAX`, plus the camera | `KeyframeAbout` | none |
-//! | `KIND_IMAGE` | the same | none | the pixels of each plane |
-//!
-//! What is known of a keyframe changes as long as the map trains; its pixels do not, and are written once.
+//! | `KIND_KEYFRAME` | of the keyframe | `KeyframeAbout` | `CameraAbout` of each camera (132 bytes each), then the pixels of each camera's planes |
 //!
 //! Samples of a block are rounded to 1/65535 of the box around them (0.2 mm in a block of 13 m): they tell where a block is,
 //! and so the poses keep all their digits. Decoding gives `None` for bytes that are not of this form, and never panics.
 
 use super::coarseness::Coarseness;
 use super::exposure::Exposure;
-use super::horizon::Horizon;
 use super::pool::Gaussian;
 use crate::gpu::kernels::types::{Moments, Splat};
 use crate::store::{About, ABOUT};
@@ -28,7 +24,6 @@ use stipple_drivers::{Nanos, Pose};
 pub const KIND_RUN: u8 = 1;
 pub const KIND_BLOCK: u8 = 2;
 pub const KIND_KEYFRAME: u8 = 3;
-pub const KIND_IMAGE: u8 = 4;
 /// `KeyframeAbout::home` of a keyframe that belongs to no block.
 pub const NO_BLOCK: u32 = u32::MAX;
 /// Samples of a block.
@@ -38,6 +33,8 @@ pub const SAMPLES: usize = 32;
 const FORM: u8 = 1;
 /// Bytes of a pose: quaternion xyzw, then position.
 const POSE: usize = 7 * size_of::<f64>();
+/// Bytes of a `CameraAbout`.
+const CAMERA: usize = 2 * POSE + 2 * size_of::<f64>() + size_of::<f32>();
 /// Steps of a sample's coordinate in the box around all of them.
 const SAMPLE_STEPS: f32 = 65535.0;
 // Arrays are copied as they are in memory.
@@ -48,8 +45,8 @@ const _: () = assert!(cfg!(target_endian = "little"));
 pub struct RunAbout {
     /// Its epoch 0 is this one of the store.
     pub epoch_base: u32,
-    /// When the flight began, ms since 1970.
-    pub started_unix_ms: i64,
+    /// When it started, s since 1970.
+    pub started_unix_s: i64,
     pub colour: bool,
     /// Size of a stored image, px.
     pub width: u32,
@@ -57,8 +54,6 @@ pub struct RunAbout {
     /// Images of a keyframe, and planes of each.
     pub cameras: u32,
     pub channels: u32,
-    /// Median depth of what the first anchor saw, m; zero before there is one.
-    pub scene_depth_m: f64,
 }
 
 /// What is known of a block without its Gaussians.
@@ -95,7 +90,7 @@ impl Default for BlockAbout {
     }
 }
 
-/// What is known of one camera's view of a keyframe, without its image.
+/// What is known of a keyframe without its images.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct KeyframeAbout {
     pub t: Nanos,
@@ -103,19 +98,26 @@ pub struct KeyframeAbout {
     pub epoch: u32,
     pub held_out: bool,
     pub anchor: bool,
-    /// Id of the block that it sees most of, or `NO_BLOCK`.
+    /// Id of the block that it belongs to, or `NO_BLOCK`.
     pub home: u32,
     /// world_from_body by odometry, with its corrections.
     pub given: Pose,
     /// body_from_refined
     pub refined: Pose,
+    /// Where the first camera sits on the body, and its exposure.
+    pub body_from_cam: Pose,
+    pub exposure: Exposure,
+    /// The loss of the last training step on it.
+    pub loss: f32,
+}
+
+/// What is known of one image of a keyframe.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct CameraAbout {
     pub body_from_cam: Pose,
     pub body_from_raw: Pose,
     pub exposure: Exposure,
     pub coarseness: Coarseness,
-    /// Training steps on it.
-    pub steps: u32,
-    pub horizon: Horizon,
 }
 
 /// Writes values one after another.
@@ -202,30 +204,41 @@ impl<'a> Bytes<'a> {
 }
 
 fn pose_bytes(pose: &Pose) -> [u8; POSE] {
-    let ([x, y, z, w], [px, py, pz]) = (pose.q.to_array(), pose.p.to_array());
-    std::array::from_fn(|i| [x, y, z, w, px, py, pz][i / 8].to_le_bytes()[i % 8])
+    let mut bytes = [0; POSE];
+    let numbers = pose.q.to_array().into_iter().chain(pose.p.to_array());
+    bytes.chunks_exact_mut(size_of::<f64>()).zip(numbers).for_each(|(to, v)| to.copy_from_slice(&v.to_le_bytes()));
+    bytes
 }
 
-fn exposure_bytes(exposure: &Exposure) -> [u8; 16] {
-    std::array::from_fn(|i| [exposure.gain, exposure.offset][i / 8].to_le_bytes()[i % 8])
+fn exposure_bytes(exposure: &Exposure) -> [u8; 2 * size_of::<f64>()] {
+    bytemuck::cast([exposure.gain, exposure.offset])
 }
 
 impl RunAbout {
     pub fn encode(&self) -> About {
         let mut w = Writer::new();
-        w.put(self.started_unix_ms.to_le_bytes());
+        w.put(self.started_unix_s.to_le_bytes());
         w.put([u8::from(self.colour)]);
         w.words(&[self.epoch_base, self.width, self.height, self.cameras, self.channels]);
-        w.put(self.scene_depth_m.to_le_bytes());
         w.about
     }
 
     pub fn decode(about: &About) -> Option<RunAbout> {
         let mut b = Bytes::of(about)?;
-        let (started_unix_ms, colour) = (b.i64()?, b.bool()?);
+        let (started_unix_s, colour) = (b.i64()?, b.bool()?);
         let [epoch_base, width, height, cameras, channels] = [b.u32()?, b.u32()?, b.u32()?, b.u32()?, b.u32()?];
-        let scene_depth_m = b.f64()?;
-        Some(RunAbout { epoch_base, started_unix_ms, colour, width, height, cameras, channels, scene_depth_m })
+        Some(RunAbout { epoch_base, started_unix_s, colour, width, height, cameras, channels })
+    }
+
+    /// Bytes of one plane; `None` beyond what memory could hold.
+    fn plane_bytes(&self) -> Option<usize> {
+        (self.width as usize).checked_mul(self.height as usize)
+    }
+
+    /// Bytes of a keyframe's payload; `None` beyond what memory could hold.
+    pub fn keyframe_bytes(&self) -> Option<usize> {
+        let planes = self.plane_bytes()?.checked_mul(self.channels as usize)?;
+        planes.checked_add(CAMERA)?.checked_mul(self.cameras as usize)
     }
 }
 
@@ -372,12 +385,9 @@ impl KeyframeAbout {
         w.words(&[self.epoch, self.home]);
         w.put([u8::from(self.held_out)]);
         w.put([u8::from(self.anchor)]);
-        let poses = [self.given, self.refined, self.body_from_cam, self.body_from_raw];
-        poses.iter().for_each(|pose| w.put(pose_bytes(pose)));
+        [self.given, self.refined, self.body_from_cam].iter().for_each(|pose| w.put(pose_bytes(pose)));
         w.put(exposure_bytes(&self.exposure));
-        w.put(self.coarseness.level().to_le_bytes());
-        w.words(&[self.steps]);
-        w.put(self.horizon.0);
+        w.put(self.loss.to_le_bytes());
         w.about
     }
 
@@ -385,162 +395,59 @@ impl KeyframeAbout {
         let mut b = Bytes::of(about)?;
         let (t, epoch, home) = (Nanos(b.i64()?), b.u32()?, b.u32()?);
         let (held_out, anchor) = (b.bool()?, b.bool()?);
-        let (given, refined, body_from_cam, body_from_raw) = (b.pose()?, b.pose()?, b.pose()?, b.pose()?);
-        let (exposure, coarseness) = (b.exposure()?, Coarseness::at(b.f32()?));
-        let (steps, horizon) = (b.u32()?, Horizon(b.take()?));
-        Some(KeyframeAbout {
-            t,
-            epoch,
-            held_out,
-            anchor,
-            home,
-            given,
-            refined,
-            body_from_cam,
-            body_from_raw,
-            exposure,
-            coarseness,
-            steps,
-            horizon,
-        })
+        let (given, refined, body_from_cam) = (b.pose()?, b.pose()?, b.pose()?);
+        let (exposure, loss) = (b.exposure()?, b.f32()?);
+        Some(KeyframeAbout { t, epoch, held_out, anchor, home, given, refined, body_from_cam, exposure, loss })
+    }
+}
+
+/// Appends a keyframe's payload: its cameras, and the pixels of all their planes in the same order.
+pub fn encode_keyframe<'a>(cameras: &[CameraAbout], planes: impl Iterator<Item = &'a [u8]>, out: &mut Vec<u8>) {
+    for camera in cameras {
+        out.extend_from_slice(&pose_bytes(&camera.body_from_cam));
+        out.extend_from_slice(&pose_bytes(&camera.body_from_raw));
+        out.extend_from_slice(&exposure_bytes(&camera.exposure));
+        out.extend_from_slice(&camera.coarseness.level().to_le_bytes());
+    }
+    planes.for_each(|plane| out.extend_from_slice(plane));
+}
+
+/// A keyframe's payload.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct KeyframeBytes<'a> {
+    cameras: &'a [u8],
+    planes: &'a [u8],
+    channels: usize,
+    plane_bytes: usize,
+}
+
+impl<'a> KeyframeBytes<'a> {
+    /// The payload of a keyframe of a run; `None` where it has another length.
+    pub fn of(run: &RunAbout, payload: &'a [u8]) -> Option<KeyframeBytes<'a>> {
+        if run.keyframe_bytes()? != payload.len() {
+            return None;
+        }
+        let (cameras, planes) = payload.split_at(run.cameras as usize * CAMERA);
+        Some(KeyframeBytes { cameras, planes, channels: run.channels as usize, plane_bytes: run.plane_bytes()? })
+    }
+
+    pub fn camera(&self, camera: usize) -> Option<CameraAbout> {
+        let mut b = Bytes(self.cameras.chunks_exact(CAMERA).nth(camera)?);
+        let (body_from_cam, body_from_raw, exposure) = (b.pose()?, b.pose()?, b.exposure()?);
+        let coarseness = Coarseness::at(b.f32()?);
+        Some(CameraAbout { body_from_cam, body_from_raw, exposure, coarseness })
+    }
+
+    /// Pixels, row by row.
+    pub fn plane(&self, camera: usize, channel: usize) -> Option<&'a [u8]> {
+        if channel >= self.channels {
+            return None;
+        }
+        let at = camera.checked_mul(self.channels)?.checked_add(channel)?.checked_mul(self.plane_bytes)?;
+        self.planes.get(at..at.checked_add(self.plane_bytes)?)
     }
 }
 
 #[cfg(test)]
-mod tests {
-    #![allow(clippy::unwrap_used)]
-    use super::*;
-    use crate::map::horizon::CELLS;
-    use proptest::prelude::*;
-
-    fn pose() -> impl Strategy<Value = Pose> {
-        (any::<[f64; 3]>(), [-3.0..3.0, -3.0..3.0, -3.0..3.0]).prop_map(|(p, turn): ([f64; 3], [f64; 3])| {
-            let p = DVec3::from_array(p.map(|v| if v.is_finite() { v } else { 0.0 }));
-            Pose::new(DQuat::from_scaled_axis(DVec3::from_array(turn)), p)
-        })
-    }
-
-    fn exposure() -> impl Strategy<Value = Exposure> {
-        (0.01..100.0, -1.0..1.0).prop_map(|(gain, offset)| Exposure { gain, offset })
-    }
-
-    fn block() -> impl Strategy<Value = BlockAbout> {
-        let sample = [-500.0..500.0f32, -500.0..500.0f32, -500.0..500.0f32];
-        let samples = proptest::collection::vec(sample, 0..=SAMPLES);
-        (any::<(u32, bool, bool)>(), 0..40u32, pose(), pose(), samples).prop_map(|(free, count, placed, moved, used)| {
-            let (epoch, colour, moments) = free;
-            let mut samples = [[0.0; 3]; SAMPLES];
-            samples[..used.len()].copy_from_slice(&used);
-            BlockAbout { epoch, count, colour, moments, placed, moved, samples, samples_len: used.len() as u8 }
-        })
-    }
-
-    /// Elements of any bits, but for those of a float that is not a number, which equals nothing.
-    fn filled<T: bytemuck::Pod>(n: usize, seed: u32) -> Vec<T> {
-        let word = |i: usize| (i as u32).wrapping_mul(0x9e37_79b9).wrapping_add(seed) & 0xbfff_ffff;
-        let words: Vec<u32> = (0..n * size_of::<T>() / 4).map(word).collect();
-        let mut all = vec![];
-        copied(bytemuck::cast_slice(&words), &mut all);
-        all
-    }
-
-    proptest! {
-        #[test]
-        fn runs_and_keyframes_read_back_as_they_were(
-            run in any::<(u32, i64, bool, u32, u32, u32, u32)>(), depth in 0.0..9.0f64, (t, epoch, home, held_out, anchor) in any::<(i64, u32, u32, bool, bool)>(),
-            poses in [pose(), pose(), pose(), pose()], exposure in exposure(), level in 0.0..10.0f32, steps in any::<u32>(), cell in any::<u8>(),
-        ) {
-            let (epoch_base, started_unix_ms, colour, width, height, cameras, channels) = run;
-            let run = RunAbout { epoch_base, started_unix_ms, colour, width, height, cameras, channels, scene_depth_m: depth };
-            prop_assert_eq!(RunAbout::decode(&run.encode()), Some(run));
-            let [given, refined, body_from_cam, body_from_raw] = poses;
-            let (t, coarseness, horizon) = (Nanos(t), Coarseness::at(level), Horizon([cell; CELLS]));
-            let keyframe = KeyframeAbout {
-                t, epoch, held_out, anchor, home, given, refined, body_from_cam, body_from_raw, exposure, coarseness, steps, horizon,
-            };
-            prop_assert_eq!(KeyframeAbout::decode(&keyframe.encode()), Some(keyframe));
-        }
-
-        #[test]
-        fn blocks_read_back_with_samples_to_the_step_of_their_box(block in block()) {
-            let read = BlockAbout::decode(&block.encode()).unwrap();
-            prop_assert_eq!(BlockAbout { samples: block.samples, ..read }, block);
-            for axis in 0..3 {
-                let of = |b: &BlockAbout| b.samples().iter().map(|s| s[axis]).collect::<Vec<f32>>();
-                let (was, is) = (of(&block), of(&read));
-                let ends = was.iter().fold([f32::MAX, f32::MIN], |[a, b], v| [a.min(*v), b.max(*v)]);
-                let close = |(a, b): (&f32, &f32)| (a - b).abs() <= (ends[1] - ends[0]) / SAMPLE_STEPS + 1e-4;
-                prop_assert!(was.iter().zip(&is).all(close), "{:?} {:?}", was, is);
-            }
-        }
-
-        #[test]
-        fn arrays_read_back_and_other_lengths_are_refused(block in block(), seed in any::<u32>()) {
-            let n = block.count as usize;
-            let (splats, steps) = (filled(n, seed), filled(n, seed + 1));
-            let chroma = filled(if block.colour { n } else { 0 }, seed);
-            let moments = filled(if block.moments { n } else { 0 }, seed);
-            let chroma_moments = filled(if block.colour && block.moments { n } else { 0 }, seed);
-            let arrays = BlockArrays {
-                splats: &splats, steps: &steps, chroma: &chroma, moments: &moments, chroma_moments: &chroma_moments,
-            };
-            // Behind one byte: nothing is aligned.
-            let mut payload = vec![7];
-            arrays.encode(&mut payload);
-            let bytes = block.arrays(&payload[1..]).unwrap();
-            let mut read: (Vec<Splat>, Vec<u32>, Vec<[f32; 2]>, Vec<Moments>, Vec<[f32; 4]>) = Default::default();
-            copied(bytes.splats, &mut read.0);
-            copied(bytes.steps, &mut read.1);
-            copied(bytes.chroma, &mut read.2);
-            copied(bytes.moments, &mut read.3);
-            copied(bytes.chroma_moments, &mut read.4);
-            prop_assert_eq!(read, (splats, steps, chroma, moments, chroma_moments));
-            prop_assert_eq!(bytes.gaussians(&Pose::IDENTITY).len(), n);
-            prop_assert!(block.arrays(&payload).is_none() && (n == 0 || block.arrays(&payload[2..]).is_none()));
-        }
-
-        #[test]
-        fn foreign_bytes_are_nothing_or_something_and_never_a_panic(
-            about in proptest::collection::vec(any::<u8>(), ABOUT), payload in proptest::collection::vec(any::<u8>(), 0..2000),
-        ) {
-            let mut about: About = about.try_into().unwrap();
-            for form in [FORM, about[0]] {
-                about[0] = form;
-                let _ = RunAbout::decode(&about);
-                let _ = KeyframeAbout::decode(&about);
-                let _ = BlockAbout::decode(&about).map(|b| b.arrays(&payload).map(|a| a.gaussians(&b.moved).count()));
-            }
-        }
-
-        #[test]
-        fn gaussians_are_moved_as_points_and_frames_are(by in pose(), at in [-9.0..9.0f32, -9.0..9.0f32, -9.0..9.0f32]) {
-            let by = Pose { p: by.p.clamp(DVec3::splat(-50.0), DVec3::splat(50.0)), ..by };
-            let q = Quat::from_xyzw(0.2, -0.4, 0.1, 0.7);
-            let splat = Splat {
-                mean_opacity: [at[0], at[1], at[2], 0.5],
-                scale_colour: [-1.0, -2.0, -3.0, 0.25],
-                quat: q.to_array(),
-            };
-            let mut payload = vec![];
-            BlockArrays { splats: &[splat], steps: &[0], ..BlockArrays::default() }.encode(&mut payload);
-            let block = BlockAbout { count: 1, ..BlockAbout::default() };
-            let g = block.arrays(&payload).unwrap().gaussians(&by).next().unwrap();
-            let to = by.transform(Vec3::from_array(at).as_dvec3());
-            prop_assert!((Vec3::from_array(g.mean).as_dvec3() - to).length() < 1e-5);
-            // The length of the quaternion stays: matrices of it are scaled by its square.
-            let frame = |q: Quat| glam::DMat3::from_quat(q.as_dquat().normalize());
-            let off = frame(Quat::from_array(g.quat_xyzw)) - by.rotation() * frame(q);
-            let length = Quat::from_array(g.quat_xyzw).length();
-            prop_assert!(off.to_cols_array().iter().all(|v| v.abs() < 1e-5) && (length - q.length()).abs() < 1e-5);
-            prop_assert_eq!((g.opacity_logit, g.log_scale, g.colour), (0.5, [-1.0, -2.0, -3.0], [0.25; 3]));
-        }
-    }
-
-    #[test]
-    fn another_version_of_the_form_is_not_read() {
-        let mut about = BlockAbout::default().encode();
-        assert!(BlockAbout::decode(&about).is_some());
-        about[0] = FORM + 1;
-        assert!(BlockAbout::decode(&about).is_none());
-    }
-}
+#[path = "block_tests.rs"]
+mod tests;

@@ -22,6 +22,11 @@ const AIM: f64 = 0.8;
 const TIGHT: f64 = 0.9;
 
 impl Coarseness {
+    /// The one of a level that was kept.
+    pub fn at(level: f32) -> Coarseness {
+        Coarseness(level.clamp(0.0, MAX))
+    }
+
     pub fn level(self) -> f32 {
         self.0
     }

@@ -45,6 +45,17 @@ impl Gaussian {
         let colour = [first, green, blue];
         Gaussian { mean: [x, y, z], log_scale: [a, b, c], quat_xyzw: s.quat, opacity_logit, colour }
     }
+
+    /// From 0 to 1.
+    pub fn opacity(&self) -> f32 {
+        1.0 / (1.0 + (-self.opacity_logit).exp())
+    }
+
+    /// How much of the scene it covers: opacity times the product of its two largest deviations, m².
+    pub fn importance(&self) -> f32 {
+        let [a, b, c] = self.log_scale;
+        self.opacity() * (a + b + c - a.min(b).min(c)).exp()
+    }
 }
 
 /// What `prune` removes.

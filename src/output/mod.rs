@@ -7,11 +7,13 @@
 //! program wrote: a hidden `.stipple` in it lists that.
 
 pub mod chart;
+pub mod export;
 pub mod html;
 pub mod metrics;
 pub mod panel;
 pub mod ply;
 pub mod report;
+pub mod spz;
 pub mod trajectory;
 
 use std::ffi::OsString;

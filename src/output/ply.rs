@@ -21,15 +21,44 @@ fn row(s: &Gaussian) -> [f32; PROPERTIES.len()] {
     [x, y, z, 0.0, 0.0, 0.0, r, g, b, s.opacity_logit, sx, sy, sz, qw, qx, qy, qz]
 }
 
-/// The header states the number of splats, so the iterator must know its length.
-pub fn write_ply(out: &mut impl Write, splats: impl ExactSizeIterator<Item = Gaussian>) -> io::Result<()> {
-    writeln!(out, "ply\nformat binary_little_endian 1.0\nelement vertex {}", splats.len())?;
-    PROPERTIES.iter().try_for_each(|name| writeln!(out, "property float {name}"))?;
-    writeln!(out, "end_header")?;
-    for splat in splats {
-        row(&splat).iter().try_for_each(|value| out.write_all(&value.to_le_bytes()))?;
+/// A file being written. Its header states the number of splats, so that is asked for first and kept to.
+pub struct PlyWriter<'a, W> {
+    out: &'a mut W,
+    left: u64,
+}
+
+impl<W: Write> PlyWriter<'_, W> {
+    pub fn begin(out: &mut W, count: u64) -> io::Result<PlyWriter<'_, W>> {
+        writeln!(out, "ply\nformat binary_little_endian 1.0\nelement vertex {count}")?;
+        PROPERTIES.iter().try_for_each(|name| writeln!(out, "property float {name}"))?;
+        writeln!(out, "end_header")?;
+        Ok(PlyWriter { out, left: count })
     }
-    Ok(())
+
+    pub fn splat(&mut self, splat: &Gaussian) -> io::Result<()> {
+        self.left = self.left.checked_sub(1).ok_or_else(other_count)?;
+        row(splat).iter().try_for_each(|value| self.out.write_all(&value.to_le_bytes()))
+    }
+
+    /// Fails where fewer came than the header states.
+    pub fn end(self) -> io::Result<()> {
+        if self.left > 0 {
+            return Err(other_count());
+        }
+        Ok(())
+    }
+}
+
+pub(super) fn other_count() -> io::Error {
+    io::Error::new(io::ErrorKind::InvalidData, "the number of Gaussians is not the one stated")
+}
+
+pub fn write_ply(out: &mut impl Write, splats: impl ExactSizeIterator<Item = Gaussian>) -> io::Result<()> {
+    let mut ply = PlyWriter::begin(out, splats.len() as u64)?;
+    for splat in splats {
+        ply.splat(&splat)?;
+    }
+    ply.end()
 }
 
 #[cfg(test)]
@@ -111,5 +140,15 @@ mod tests {
         write_ply(&mut bytes, splats().into_iter()).unwrap();
         assert!(read_ply(&bytes[..bytes.len() - 1]).is_err());
         assert!(read_ply(&bytes[..20]).is_err());
+    }
+
+    #[test]
+    fn another_number_than_stated_is_an_error() {
+        let [one, two, _] = splats()[..] else { panic!("three") };
+        let mut bytes = Vec::new();
+        let mut ply = PlyWriter::begin(&mut bytes, 1).unwrap();
+        ply.splat(&one).unwrap();
+        assert!(ply.splat(&two).is_err());
+        assert!(PlyWriter::begin(&mut bytes, 1).unwrap().end().is_err());
     }
 }

@@ -180,13 +180,13 @@ impl Mapping {
             let (epoch, mut splats) = self.mapper.newest_splats()?;
             let (exposure, of) = (self.mapper.median_exposure(), splats.len());
             if of > POINTS {
-                splats.select_nth_unstable_by(POINTS, |a, b| importance(b).total_cmp(&importance(a)));
+                splats.select_nth_unstable_by(POINTS, |a, b| b.importance().total_cmp(&a.importance()));
             }
             let byte = |v: f64| (v * 255.0).round().clamp(0.0, 255.0) as u8;
             let point = |s: &Gaussian| Point {
                 p: s.mean,
                 rgb: s.colour.map(|c| byte(exposure.observed(f64::from(c)))),
-                opacity: byte(f64::from(opacity(s))),
+                opacity: byte(f64::from(s.opacity())),
             };
             cloud.write(self.keyframe.t, epoch, of, splats.iter().take(POINTS).map(point));
             Ok(())
@@ -201,17 +201,6 @@ impl Mapping {
         self.mapper.counters().gpu_failures.add(1);
         self.failure = Some(unsealed(|| e.to_string()));
     }
-}
-
-/// From 0 to 1.
-fn opacity(s: &Gaussian) -> f32 {
-    1.0 / (1.0 + (-s.opacity_logit).exp())
-}
-
-/// How much of the scene a Gaussian covers: opacity times the product of its two largest deviations, m².
-fn importance(s: &Gaussian) -> f32 {
-    let [a, b, c] = s.log_scale;
-    opacity(s) * (a + b + c - a.min(b).min(c)).exp()
 }
 
 /// Keyframes drawn into DIR/renders.

@@ -16,11 +16,11 @@ const COMMON: [&str; 5] = ["math", "mem", "limits", "config", "counters"];
 const EDGES: [(&str, &[&str]); 7] = [
     ("vio", &["frontend"]),
     ("stereo", &["gpu"]),
-    ("map", &["gpu", "stereo"]),
-    ("output", &["map", "vio"]),
+    ("map", &["gpu", "stereo", "store"]),
+    ("output", &["map", "store", "vio"]),
     ("publish", &["vio"]),
-    ("run", &["frontend", "vio", "gpu", "stereo", "map", "output", "publish"]),
-    ("commands", &["run", "frontend", "vio", "gpu", "stereo", "map", "output", "publish"]),
+    ("run", &["frontend", "vio", "gpu", "stereo", "store", "map", "output", "publish"]),
+    ("commands", &["run", "frontend", "vio", "gpu", "stereo", "store", "map", "output", "publish"]),
 ];
 /// Where `unsafe` may stand: the GPU, the allocator, the shims of OpenCV and ONNX Runtime, system calls of drivers.
 const UNSAFE: [&str; 5] =
@@ -41,8 +41,8 @@ const RUST_LINES_MAX: usize = 600;
 const FUNCTION_LINES_MAX: usize = 90;
 const KERNEL_LINES_MAX: usize = 250;
 /// Lines of code that the product may have, and its estimator, frontend, mapper, GPU core, stereo and kernels together.
-const CODE_MAX: usize = 41_000;
-const CORE_MAX: usize = 15_750;
+const CODE_MAX: usize = 44_000;
+const CORE_MAX: usize = 16_200;
 const CORE: [&str; 10] = [
     "src/vio/",
     "src/frontend/",
