@@ -68,12 +68,15 @@ pub struct View {
     pub origin: Vec3,
     /// `world_from_cam`.
     pub turn: Quat,
+    /// The cell of the room that it is in.
+    pub cell: usize,
 }
 
 impl View {
     /// The view of a camera's pose.
-    pub fn new(world_from_cam: &Pose) -> View {
-        View { origin: world_from_cam.p.as_vec3(), turn: world_from_cam.q.as_quat() }
+    pub fn new(room: &Room, world_from_cam: &Pose) -> View {
+        let origin = world_from_cam.p.as_vec3();
+        View { origin, turn: world_from_cam.q.as_quat(), cell: room.cell_of(origin) }
     }
 }
 
@@ -233,7 +236,7 @@ pub fn cast(room: &Room, lens: &Lens, rows: Rows, scratch: &mut Scratch) {
         if d == Vec3::ZERO {
             return Hit { distance: 0.0, face: NOTHING };
         }
-        meet(room, tile.solids(), view.origin, view.turn * d)
+        meet(room, tile.solids(), &view, view.turn * d)
     });
 }
 
@@ -339,10 +342,10 @@ fn fill<T: Send>(
     });
 }
 
-/// Lists all solids from a view, nearest first.
+/// Lists all solids that a view may see, nearest first.
 fn look_around(room: &Room, view: View, slack: f32, seen: &mut Vec<SolidInView>) {
     seen.clear();
-    for (k, s) in room.solids.iter().enumerate() {
+    room.visible(view.cell, view.origin, slack, |k, s| {
         let c = s.centre - view.origin;
         let range = c.length().max(1e-6);
         let bound = s.bound + slack;
@@ -350,7 +353,7 @@ fn look_around(room: &Room, view: View, slack: f32, seen: &mut Vec<SolidInView>)
         let cos = (1.0 - sin * sin).sqrt();
         let near = (range - bound).max(0.0);
         seen.push(SolidInView { solid: k as u32, near, axis: c / range, cos, sin });
-    }
+    });
     seen.sort_unstable_by(|a, b| a.near.total_cmp(&b.near).then(a.solid.cmp(&b.solid)));
 }
 
@@ -367,13 +370,13 @@ fn tile_list(seen: &[SolidInView], cone: &Cone, view: View, slack: f32, list: &m
 }
 
 #[inline]
-fn meet(room: &Room, list: &[SolidInView], o: Vec3, d: Vec3) -> Hit {
-    let mut best = room.shell(o, d);
+fn meet(room: &Room, list: &[SolidInView], view: &View, d: Vec3) -> Hit {
+    let mut best = room.shell(view.cell, view.origin, d);
     for s in list {
         if s.near > best.0 {
             break;
         }
-        room.solids[s.solid as usize].meet(o, d, &mut best);
+        room.solids[s.solid as usize].meet(view.origin, d, &mut best);
     }
     Hit { distance: best.0, face: best.1 }
 }
@@ -410,7 +413,7 @@ fn radiance(room: &Room, view: View, d: Vec3, hit: Hit, angle: f32, channel: Opt
     };
     let footprint = Vec2::new(slide(place.u), slide(place.v)) * (angle * hit.distance);
     let spot = Spot { at: place.at, footprint, size: face.size };
-    let light = texture::albedo(face.material, face.seed, spot) * room.light_map.at(hit.face as usize, place.at);
+    let light = texture::albedo(face.material, face.seed, spot) * room.light(hit.face as usize, place.at);
     channel.map_or(light, |c| light * texture::tint(face.material, face.seed)[c])
 }
 
@@ -433,7 +436,7 @@ fn edge_radiance(
     let mut used = 0;
     for k in 0..RAYS {
         let d = (corner + du * (k % EDGE) as f32 + dv * (k / EDGE) as f32).normalize();
-        let hit = meet(room, list, view.origin, d);
+        let hit = meet(room, list, &view, d);
         let part = parts[..used].iter().position(|p| p.0 == hit.face).unwrap_or(used);
         used = used.max(part + 1);
         let (_, n, sum) = parts[part];
