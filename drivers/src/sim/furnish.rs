@@ -117,7 +117,8 @@ fn along_walls(room: &mut Room, space: &Place, path: &[Vec3], rng: &mut ChaCha8R
         (Vec2::new(a.x, a.y), Vec2::new(0.0, 1.0)),
         (Vec2::new(b.x, b.y), Vec2::new(0.0, -1.0)),
     ];
-    let mut next = 0;
+    // Rooms of a building do not begin with the same piece.
+    let mut next = space.cell;
     for (corner, inward) in walls {
         let along = Vec2::new(inward.y, -inward.x);
         let length = (along * (b - a).truncate()).length();
