@@ -45,6 +45,17 @@ pub struct Evaluation {
     pub psnr_heldout_aligned_db: Option<f64>,
     /// Held out, of each camera that trains.
     pub psnr_heldout_by_camera_db: Vec<Option<f64>>,
+    /// Each keyframe, by its first camera.
+    pub keyframe_scores: Vec<KeyframeScore>,
+}
+
+/// How well the map shows one keyframe.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct KeyframeScore {
+    pub id: u64,
+    pub t_ns: i64,
+    pub held_out: bool,
+    pub psnr_db: Option<f64>,
 }
 
 /// A keyframe and its rendering, row-major at mapping resolution.
@@ -95,6 +106,7 @@ pub fn evaluate(scene: &mut Scene, weights: &Weights) -> Result<Evaluation, GpuE
     let mut all: [[Vec<Option<f64>>; 2]; 5] = Default::default();
     let [training, held_out, between, fitted, aligned] = &mut all;
     let mut by_camera: [Vec<Option<f64>>; CAMERAS_MAX] = Default::default();
+    let mut keyframe_scores = Vec::with_capacity(scene.store.len());
     for i in 0..scene.store.len() {
         let observed = observed(scene, i);
         let mut add = |scene: &Scene, [psnr, ssim]: &mut [Vec<Option<f64>>; 2]| {
@@ -103,6 +115,10 @@ pub fn evaluate(scene: &mut Scene, weights: &Weights) -> Result<Evaluation, GpuE
             ssim.push(ssim_of.mean(&observed, shown, valid));
         };
         let scored = score(scene, i)?;
+        if scene.store.camera(i) == 0 {
+            let s = scene.store.get(i);
+            keyframe_scores.push(KeyframeScore { id: s.id, t_ns: s.t.0, held_out: s.held_out, psnr_db: scored });
+        }
         if !scene.store.get(i).held_out {
             add(scene, training);
             continue;
@@ -129,6 +145,7 @@ pub fn evaluate(scene: &mut Scene, weights: &Weights) -> Result<Evaluation, GpuE
         ssim_heldout_fitted: fitted[1],
         psnr_heldout_aligned_db: aligned[0],
         psnr_heldout_by_camera_db: by_camera.iter().map(|values| mean(values)).collect(),
+        keyframe_scores,
     })
 }
 

@@ -47,7 +47,7 @@ use stipple_drivers::{Calibration, Fault, Pose};
 use store::Store;
 use trainer::Trainer;
 
-pub use evaluate::{spread, CurvePoint, Evaluation, Panel};
+pub use evaluate::{spread, CurvePoint, Evaluation, KeyframeScore, Panel};
 pub use exposure::Exposure;
 pub use keyframes::{Keyframe, PoseCorrection};
 pub use pipeline::Pipeline;

@@ -48,6 +48,7 @@ pub mod status;
 pub mod status_led;
 pub mod summary;
 mod supervisor;
+mod table;
 pub mod threads;
 pub mod tracking;
 pub mod waker;
@@ -80,6 +81,8 @@ use stipple_drivers::record::Format;
 use stipple_drivers::replay::read_trajectory;
 use stipple_drivers::{host, Calibration, Fault, FaultKind, Frames};
 pub use supervisor::Steering;
+pub use table::Spacing;
+use table::Table;
 use tracking::{FramePacket, Inlet, Link, OdometryRun, Tracker};
 use worker::{MapSide, Worker};
 use writers::Writers;
@@ -110,6 +113,8 @@ pub struct Options {
     pub pace: Pace,
     /// Table of poses in place of odometry.
     pub poses: Option<PathBuf>,
+    /// The input's own true poses in place of odometry, and which frames are keyframes.
+    pub at_truth: Option<Spacing>,
     /// Every Nth keyframe is evaluated and never trained on; 0: none.
     pub holdout: u32,
     /// Live sensors are stopped after this time. A recording ends there; past its end the mapper goes on alone.
@@ -177,8 +182,10 @@ pub fn fly(
     input.needs_colour(colours)?;
     let Playback { speed, repeats } = options.playback;
     let frames = frames_kept(&mut input, options);
+    let looked_up = |poses| Tracker::Table(Table { poses, spacing: options.at_truth, last: None });
     let mut tracker = match &options.poses {
-        Some(path) => Tracker::Table(read_trajectory(path)?),
+        Some(path) => looked_up(read_trajectory(path)?),
+        None if options.at_truth.is_some() => looked_up(input.truth.clone()),
         None => Tracker::Odometry(Box::new(OdometryRun::new(&input.calibration, board, frames)?)),
     };
     let map = if board.map.enabled { Some(open_map(&mut input, board, out, options, apart)?) } else { None };
@@ -534,7 +541,7 @@ fn spawn_tracking<'scope, 'env>(
         Tracker::Table(poses) => spawn(scope, "tracking", move || {
             let _ended = ended;
             tracking::seal();
-            tracking::without_odometry(link, inlet, |packet| tracking::look_up(poses, packet, counters), give);
+            tracking::without_odometry(link, inlet, |packet| table::look_up(poses, packet, counters), give);
         }),
         Tracker::Observer(observer) => spawn(scope, "tracking", move || {
             let _ended = ended;

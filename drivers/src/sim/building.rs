@@ -7,9 +7,7 @@
 use super::furnish::{self, Place};
 use super::patrol::{Door, Plan, DOOR};
 use super::room::{Light, LightMap, Opening, Room, AMBIENT, CELLS_MAX};
-use super::texture::{
-    Material, BRICK, CEILING_TILE, CONCRETE, CRATE, MARBLE, PARQUET, PLAID, PLASTER,
-};
+use super::texture::{Material, BRICK, CEILING_TILE, CONCRETE, CRATE, MARBLE, PARQUET, PLAID, PLASTER};
 use glam::{Vec2, Vec3};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -35,9 +33,10 @@ const EVENING_HEIGHT: f32 = 1.9;
 /// Builds, furnishes and lights a building; `path` is sampled densely in world coordinates.
 pub fn build(plan: &Plan, path: &[Vec3], seed: u64, threads: usize) -> Room {
     let mut rng = ChaCha8Rng::seed_from_u64(seed ^ 0x4275_696C);
-    let (low, high) = plan.rooms.iter().fold((Vec3::MAX, Vec3::MIN), |(low, high), r| {
-        (low.min(r.low.as_vec3()), high.max(r.high.as_vec3()))
-    });
+    let (low, high) = plan
+        .rooms
+        .iter()
+        .fold((Vec3::MAX, Vec3::MIN), |(low, high), r| (low.min(r.low.as_vec3()), high.max(r.high.as_vec3())));
     let mut room = Room::empty(low, high, [PLASTER; 4], 0);
     (room.cells.clear(), room.faces.clear());
     let shift = rng.random_range(0..WALLS.len());
@@ -102,9 +101,12 @@ fn open(room: &mut Room, plan: &Plan, door: &Door, seed: u32) {
     let mut corners = (low, high);
     (corners.0[axis], corners.1[axis]) = (near, far);
     room.add_cell(corners.0, corners.1, jamb, seed);
-    for (cell, side, at, to) in
-        [(below, side + 1, near, doorway), (above, side, far, doorway), (doorway, side, near, below), (doorway, side + 1, far, above)]
-    {
+    for (cell, side, at, to) in [
+        (below, side + 1, near, doorway),
+        (above, side, far, doorway),
+        (doorway, side, near, below),
+        (doorway, side + 1, far, above),
+    ] {
         let (low, high) = plane(at);
         room.cells[cell].openings.push(Opening { side, low, high, to });
     }

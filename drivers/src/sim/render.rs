@@ -201,7 +201,8 @@ impl Lens {
         let (width, height) = (camera.width, camera.height);
         let at = |i: usize| camera.unproject(DVec2::new((i % width) as f64, (i / width) as f64));
         let bearings: Vec<Vec3> = (0..width * height).map(|i| at(i).map_or(Vec3::ZERO, |b| b.as_vec3())).collect();
-        let mut lens = Lens { width, height, bearings, pixel_angle: vec![0.0; width * height], cones: vec![], blocks: vec![] };
+        let mut lens =
+            Lens { width, height, bearings, pixel_angle: vec![0.0; width * height], cones: vec![], blocks: vec![] };
         for i in 0..width * height {
             if lens.bearings[i] != Vec3::ZERO {
                 let (du, dv) = lens.gradients(i % width, i / width);
@@ -354,7 +355,8 @@ fn fill<T: Send>(
             for tx in 0..lens.tiles_across() {
                 let mut block = Block { lens, rows, lists, tile_listed: false, listed: false, x: 0, y: 0 };
                 for k in 0..(TILE / BLOCK).pow(2) {
-                    (block.x, block.y) = ((tx * TILE / BLOCK) + k % (TILE / BLOCK), (ty * TILE / BLOCK) + k / (TILE / BLOCK));
+                    (block.x, block.y) =
+                        ((tx * TILE / BLOCK) + k % (TILE / BLOCK), (ty * TILE / BLOCK) + k / (TILE / BLOCK));
                     block.listed = false;
                     for y in block.y * BLOCK..((block.y + 1) * BLOCK).min(end) {
                         for x in block.x * BLOCK..((block.x + 1) * BLOCK).min(lens.width) {
@@ -389,15 +391,7 @@ fn look_around(room: &Room, view: View, slack: f32, seen: &mut Vec<SolidInView>)
         let sin = (bound / range).min(1.0);
         let cos = (1.0 - sin * sin).sqrt();
         let near = (range - bound).max(0.0);
-        seen.push(SolidInView {
-            solid: k as u32,
-            near,
-            centre: c,
-            reach: bound + ROUNDED,
-            axis: c / range,
-            cos,
-            sin,
-        });
+        seen.push(SolidInView { solid: k as u32, near, centre: c, reach: bound + ROUNDED, axis: c / range, cos, sin });
     });
     seen.sort_unstable_by(|a, b| a.near.total_cmp(&b.near).then(a.solid.cmp(&b.solid)));
 }

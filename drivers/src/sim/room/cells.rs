@@ -110,7 +110,8 @@ impl Cell {
         let upright = sides.into_iter().enumerate().map(|(side, plane)| {
             let facing = self.openings.iter().filter(|w| w.side == side as u32);
             let rim = facing.filter_map(|w| {
-                let across = if side < 2 { (p.y - w.low.y).min(w.high.y - p.y) } else { (p.x - w.low.x).min(w.high.x - p.x) };
+                let across =
+                    if side < 2 { (p.y - w.low.y).min(w.high.y - p.y) } else { (p.x - w.low.x).min(w.high.x - p.x) };
                 let inside = across.min(w.high.z - p.z).min(p.z - w.low.z);
                 (inside > 0.0).then(|| plane.max(0.0).hypot(inside))
             });
@@ -185,13 +186,21 @@ impl Room {
     pub fn visible(&self, cell: usize, o: Vec3, slack: f32, mut see: impl FnMut(usize, &Solid)) {
         let mut cells = 0;
         self.look(&[cell, cell], 0, (o.truncate(), slack), None, &mut cells);
-        let seen = self.cells.iter().enumerate().filter(|(k, _)| cells >> k & 1 == 1).flat_map(|(_, c)| c.solids.clone());
+        let seen =
+            self.cells.iter().enumerate().filter(|(k, _)| cells >> k & 1 == 1).flat_map(|(_, c)| c.solids.clone());
         seen.chain(self.loose_from()..self.solids.len()).for_each(|k| see(k, &self.solids[k]));
     }
 
     /// Marks a cell, which is behind `passed` openings, and those behind it, as seen by an eye between the directions right and
     /// left of `window`.
-    fn look(&self, [from, cell]: &[usize; 2], passed: usize, eye: (Vec2, f32), window: Option<(Vec2, Vec2)>, seen: &mut u64) {
+    fn look(
+        &self,
+        [from, cell]: &[usize; 2],
+        passed: usize,
+        eye: (Vec2, f32),
+        window: Option<(Vec2, Vec2)>,
+        seen: &mut u64,
+    ) {
         *seen |= 1 << cell;
         for w in self.cells[*cell].openings.iter().filter(|w| w.to != *from && passed < PASSED_MAX) {
             // Beyond its first opening all that a ray passes is ahead of that: angles are less than half a turn.
