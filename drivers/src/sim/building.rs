@@ -111,3 +111,112 @@ fn open(room: &mut Room, plan: &Plan, door: &Door, seed: u32) {
         room.cells[cell].openings.push(Opening { side, low, high, to });
     }
 }
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::super::patrol::{Extent, Route};
+    use super::super::texture::{albedo, Spot};
+    use super::*;
+    use glam::DVec3;
+
+    fn built(extent: Extent, seed: u64) -> (&'static Plan, Room) {
+        let plan = extent.plan();
+        let path: Vec<Vec3> = Route::new(plan).places().map(|p| p.as_vec3()).collect();
+        (plan, build(plan, &path, seed, 2))
+    }
+
+    /// Whether a point is between the walls of a room or of a doorway, by the plan alone.
+    fn is_free(plan: &Plan, p: Vec3) -> bool {
+        let within =
+            |low: DVec3, high: DVec3| p.cmpge(low.as_vec3() - 1e-3).all() && p.cmple(high.as_vec3() + 1e-3).all();
+        let doorway = |door: &Door| {
+            let (axis, [below, above]) = door.wall(plan.rooms);
+            let (mut low, mut high) = (DVec3::ZERO, DVec3::splat(DOOR.y));
+            (low[axis], high[axis]) = (plan.rooms[below].high[axis], plan.rooms[above].low[axis]);
+            (low[1 - axis], high[1 - axis]) = (door.at - 0.5 * DOOR.x, door.at + 0.5 * DOOR.x);
+            within(low, high)
+        };
+        plan.rooms.iter().any(|r| within(r.low, r.high)) || plan.doors.iter().any(doorway)
+    }
+
+    #[test]
+    fn a_ray_leaves_a_room_through_a_doorway_alone() {
+        for extent in [Extent::Two, Extent::Whole] {
+            let (plan, room) = built(extent, 3);
+            let mut rng = ChaCha8Rng::seed_from_u64(5);
+            let mut left = 0;
+            for r in plan.rooms.iter().cycle().take(4000) {
+                let mut between = |low: f32, high: f32| rng.random_range(low + 0.05..high - 0.05);
+                let (low, high) = (r.low.as_vec3(), r.high.as_vec3());
+                let o = vec3(between(low.x, high.x), between(low.y, high.y), between(low.z, high.z));
+                let d = vec3(between(-1.1, 1.1), between(-1.1, 1.1), between(-0.3, 0.3)).normalize();
+                if room.clearance(o) <= 0.0 {
+                    continue;
+                }
+                let (reach, face) = room.nearest(o, d);
+                assert_eq!(room.faces[face as usize].place(o + d * reach).normal.dot(d) < 0.0, true, "a back is seen");
+                let steps = (reach / 0.02) as usize;
+                let seen = (0..=steps).map(|k| o + d * (reach * k as f32 / steps.max(1) as f32));
+                for p in seen {
+                    assert!(is_free(plan, p), "{}: from {o} along {d}: {p} is in a wall", r.name);
+                }
+                left += usize::from(!r.contains((o + d * reach).as_dvec3()));
+                assert!(!room.blocked(room.cell_of(o), o, d, reach - 0.01), "from {o} along {d}");
+                assert!(room.blocked(room.cell_of(o), o, d, reach + 0.01), "from {o} along {d}");
+            }
+            assert!(left > 50, "{left} rays left their room");
+        }
+    }
+
+    #[test]
+    fn walls_of_different_rooms_do_not_look_alike() {
+        let (plan, room) = built(Extent::Whole, 1);
+        // Levels of each room's four walls at the same places.
+        let n = 300;
+        let levels = |wall: usize| -> Vec<f32> {
+            let face = &room.faces[wall];
+            let spot = |k: i32| {
+                let at = Vec2::new((k % 25) as f32 * 0.09 + 0.2, (k / 25) as f32 * 0.2 + 0.2);
+                albedo(face.material, face.seed, Spot { at, footprint: Vec2::splat(0.02), size: face.size })
+            };
+            let levels: Vec<f32> = (0..n).map(spot).collect();
+            let mean = levels.iter().sum::<f32>() / n as f32;
+            levels.into_iter().map(|v| v - mean).collect()
+        };
+        let walls: Vec<(usize, Vec<f32>)> = (0..plan.rooms.len())
+            .flat_map(|k| (0..4).map(move |w| (k, 6 * k + w)))
+            .map(|(k, w)| (k, levels(w)))
+            .collect();
+        let norm = |v: &[f32]| v.iter().map(|v| v * v).sum::<f32>().sqrt();
+        for (i, (a, x)) in walls.iter().enumerate() {
+            for (b, y) in walls[..i].iter().filter(|(b, _)| a != b) {
+                let alike = x.iter().zip(y).map(|(x, y)| x * y).sum::<f32>() / (norm(x) * norm(y));
+                assert!(alike < 0.7, "{} and {}: {alike}", plan.rooms[*a].name, plan.rooms[*b].name);
+            }
+        }
+    }
+
+    #[test]
+    fn the_light_of_the_second_round_is_dimmer_and_no_multiple_of_the_first() {
+        let (plan, mut room) = built(Extent::Whole, 1);
+        for (k, r) in plan.rooms.iter().enumerate() {
+            let mut ratios = vec![];
+            for face in 6 * k..6 * k + 6 {
+                for i in 0..100 {
+                    let at = room.faces[face].size * Vec2::new((i % 10) as f32 + 0.5, (i / 10) as f32 + 0.5) / 10.0;
+                    let lit = [0.0, 1.0].map(|late| {
+                        room.late = late;
+                        room.light(face, at)
+                    });
+                    ratios.push((lit[1] / lit[0].max(1e-3)).max(1e-3).ln());
+                }
+            }
+            let n = ratios.len() as f32;
+            let mean = ratios.iter().sum::<f32>() / n;
+            let spread = (ratios.iter().map(|r| (r - mean) * (r - mean)).sum::<f32>() / n).sqrt();
+            println!("{}: {:.2} of the light, spread {spread:.2}", r.name, mean.exp());
+            assert!(mean < -0.2 && spread > 0.15, "{}: {mean} {spread}", r.name);
+        }
+    }
+}

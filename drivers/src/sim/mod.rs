@@ -117,7 +117,7 @@ impl Sim {
         let (spline, start, first, last) = motion(scenario, &rig, route.as_ref())?;
         let span = (first - start).secs()..(last - start).secs();
         let mut room = if let (Some(plan), Some(route)) = (plan, &route) {
-            // Of the whole route, so that a shorter flight is the beginning of it.
+            // Of the whole route, so that a shorter flight has the same furniture.
             let path: Vec<Vec3> = route.places().map(|p| p.as_vec3()).collect();
             building::build(plan, &path, scenario.seed, threads)
         } else {
@@ -435,18 +435,22 @@ mod tests {
     /// The tiles' lists of solids leave nothing out: a pixel sees what a test of all solids says.
     #[test]
     fn tile_lists_lose_no_solid() {
-        let mut sim = Sim::with_threads(&Scenario::named("circle").unwrap(), 3).unwrap();
-        for frame in [0, 60, 120, 180] {
-            let view = sim.view(sim.stamp(frame), 1);
-            let rows = [Row { view, gain: 1.0, offset: 0.0 }];
-            render::cast(&sim.room, &sim.lenses[1], Rows(&rows), &mut sim.scratch);
-            let camera = sim.calibration.cameras[1].camera;
-            for i in (0..camera.width * camera.height).step_by(11) {
-                let px = DVec2::new((i % camera.width) as f64, (i / camera.width) as f64);
-                let d = view.turn * camera.unproject(px).unwrap().as_vec3();
-                let (t, face) = sim.room.nearest(view.origin, d);
-                let hit = sim.scratch.hits[i];
-                assert!(hit.face == face || (hit.distance - t).abs() < 1e-4, "frame {frame} pixel {px}");
+        for (name, frames) in
+            [("circle", [0, 60, 120, 180]), ("patrol-two", [52, 165, 385, 612]), ("patrol", [65, 420, 2904, 3875])]
+        {
+            let mut sim = Sim::with_threads(&Scenario::named(name).unwrap(), 3).unwrap();
+            for frame in frames {
+                let view = sim.view(sim.stamp(frame), 1);
+                let rows = [Row { view, gain: 1.0, offset: 0.0 }];
+                render::cast(&sim.room, &sim.lenses[1], Rows(&rows), &mut sim.scratch);
+                let camera = sim.calibration.cameras[1].camera;
+                for i in (0..camera.width * camera.height).step_by(11) {
+                    let px = DVec2::new((i % camera.width) as f64, (i / camera.width) as f64);
+                    let d = view.turn * camera.unproject(px).unwrap().as_vec3();
+                    let (t, face) = sim.room.nearest(view.origin, d);
+                    let hit = sim.scratch.hits[i];
+                    assert!(hit.face == face || (hit.distance - t).abs() < 1e-4, "{name} {frame} pixel {px}");
+                }
             }
         }
     }
