@@ -5,7 +5,8 @@
 //! its mean is in, after the trajectory was put on the truth.
 
 use crate::page::{count, number, text, Page, Part, Table};
-use crate::{ply, run, table};
+use crate::run::default_board;
+use crate::{ply, table};
 use glam::DVec3;
 use serde_json::json;
 use std::path::PathBuf;
@@ -96,7 +97,7 @@ pub fn run(args: &Args) -> Result<(), Fault> {
     let set: Vec<String> = std::iter::once(SCALE.to_string()).chain(args.set.iter().cloned()).collect();
     let board = match &args.board {
         Some(path) => Board::load(path, &set)?,
-        None => run::default_board(&set)?,
+        None => default_board(&set)?,
     };
     let mut scenario = Scenario::named(&args.scenario).filter(|s| !s.rooms().is_empty()).ok_or_else(|| {
         let fix = "choose patrol or patrol-two";
