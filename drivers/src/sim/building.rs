@@ -118,7 +118,7 @@ mod tests {
     use super::super::patrol::{Extent, Route};
     use super::super::texture::{albedo, Spot};
     use super::*;
-    use glam::DVec3;
+    use glam::{vec3, DVec3};
 
     fn built(extent: Extent, seed: u64) -> (&'static Plan, Room) {
         let plan = extent.plan();
@@ -155,7 +155,7 @@ mod tests {
                     continue;
                 }
                 let (reach, face) = room.nearest(o, d);
-                assert_eq!(room.faces[face as usize].place(o + d * reach).normal.dot(d) < 0.0, true, "a back is seen");
+                assert!(room.faces[face as usize].place(o + d * reach).normal.dot(d) < 0.0, "a back is seen");
                 let steps = (reach / 0.02) as usize;
                 let seen = (0..=steps).map(|k| o + d * (reach * k as f32 / steps.max(1) as f32));
                 for p in seen {

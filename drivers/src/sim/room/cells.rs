@@ -11,8 +11,6 @@ use std::ops::Range;
 /// Openings that a ray passes at most, and cells of a building at most (a set of cells is a word).
 const PASSED_MAX: usize = 24;
 pub const CELLS_MAX: usize = 64;
-/// A point as far as this from the plane of an opening is in it, m.
-const ON_PLANE: f32 = 0.01;
 /// An opening as near as this to the eye hides nothing, m.
 const AT_EYE: f32 = 0.1;
 
@@ -50,9 +48,15 @@ impl Opening {
         p.distance(p.clamp(self.low.truncate(), self.high.truncate()))
     }
 
+    /// Whether a point of its side is in it.
     #[inline]
     fn holds(&self, p: Vec3) -> bool {
-        p.cmpge(self.low - ON_PLANE).all() && p.cmple(self.high + ON_PLANE).all()
+        let across = if self.side < 2 {
+            p.y >= self.low.y && p.y <= self.high.y
+        } else {
+            p.x >= self.low.x && p.x <= self.high.x
+        };
+        across && p.z >= self.low.z && p.z <= self.high.z
     }
 
     /// Its ends in plan as seen from a point, the right one first, each moved outwards by `slack`; `None` where it is at the
