@@ -541,7 +541,7 @@ fn spawn_tracking<'scope, 'env>(
         Tracker::Table(poses) => spawn(scope, "tracking", move || {
             let _ended = ended;
             tracking::seal();
-            tracking::without_odometry(link, inlet, |packet| table::look_up(poses, packet, counters), give);
+            tracking::without_odometry(link, inlet, |packet| tracking::look_up(poses, packet, counters), give);
         }),
         Tracker::Observer(observer) => spawn(scope, "tracking", move || {
             let _ended = ended;

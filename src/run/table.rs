@@ -1,10 +1,7 @@
-//! Poses from a table in place of odometry: frames in, their poses and which of them are keyframes out.
+//! Poses from a table in place of odometry: stamps in, poses and which of them make keyframes out.
 
-use super::tracking::{FramePacket, Tracked};
-use crate::counters::Counters;
-use crate::mem::List;
 use stipple_drivers::types::pose_at;
-use stipple_drivers::{Span, TimedPose};
+use stipple_drivers::{Nanos, Pose, Span, TimedPose};
 
 /// Largest gap in a table of poses that is interpolated across.
 const POSE_GAP_MAX: Span = Span(100_000_000);
@@ -35,32 +32,25 @@ impl Spacing {
     }
 }
 
-/// Fills in the pose of a packet from a table.
-pub fn look_up(table: &mut Table, packet: &mut FramePacket, counters: &Counters) {
-    packet.tracked = None;
-    if packet.imu_only {
-        return;
+impl Table {
+    /// The pose at an instant, and whether it makes a keyframe; `None` where the table does not cover it.
+    pub fn at(&mut self, t: Nanos) -> Option<(Pose, bool)> {
+        let now = TimedPose { t, pose: pose_at(&self.poses, t, POSE_GAP_MAX)? };
+        let keyframe = match (&self.spacing, &self.last) {
+            (Some(spacing), Some(last)) => spacing.has_passed(last, &now),
+            _ => true,
+        };
+        if keyframe {
+            self.last = Some(now);
+        }
+        Some((now.pose, keyframe))
     }
-    let t = packet.frames.t;
-    let pose = pose_at(&table.poses, t, POSE_GAP_MAX);
-    counters.frames_without_pose.add(u64::from(pose.is_none()));
-    let Some(world_from_body) = pose else { return };
-    let now = TimedPose { t, pose: world_from_body };
-    let keyframe = match (&table.spacing, &table.last) {
-        (Some(spacing), Some(last)) => spacing.has_passed(last, &now),
-        _ => true,
-    };
-    if keyframe {
-        table.last = Some(now);
-    }
-    packet.tracked = Some(Tracked { world_from_body, keyframe, body_from_cam: None, corrections: List::default() });
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use glam::{DQuat, DVec3};
-    use stipple_drivers::{Nanos, Pose};
 
     #[test]
     fn a_keyframe_comes_when_the_view_has_moved_turned_or_waited() {

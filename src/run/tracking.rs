@@ -383,6 +383,19 @@ impl Tracker {
     }
 }
 
+/// Fills in the pose of a packet from a table.
+pub fn look_up(table: &mut Table, packet: &mut FramePacket, counters: &Counters) {
+    packet.tracked = None;
+    if packet.imu_only {
+        return;
+    }
+    let found = table.at(packet.frames.t);
+    counters.frames_without_pose.add(u64::from(found.is_none()));
+    let (body_from_cam, corrections) = (None, List::default());
+    packet.tracked =
+        found.map(|(pose, keyframe)| Tracked { world_from_body: pose, keyframe, body_from_cam, corrections });
+}
+
 /// What the threads of tracking share.
 pub struct Link {
     tracked: ArrayQueue<Box<FramePacket>>,

@@ -19,6 +19,7 @@ mod room;
 pub mod scenario;
 pub mod spline;
 mod texture;
+mod way;
 mod write;
 
 pub use imu::{Bias, ImuErrors, GRAVITY};

@@ -6,7 +6,7 @@
 //! its length, which also slows the rig down in them; the heading is that of the path a little ahead, smoothed more, with a slow
 //! sweep to both sides.
 
-use super::scenario::{look, smooth, under_way, GATHER, REST};
+use super::way::{look, smooth, under_way, GATHER, REST};
 use crate::types::{Pose, Span};
 use glam::{DVec2, DVec3};
 use std::f64::consts::TAU;
@@ -58,7 +58,9 @@ const HALF_WALL: f64 = 0.1;
 /// A doorway, or the open end of a part of a corridor where its boxes touch: the two boxes, and where along their wall.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Door {
+    /// The two boxes.
     pub rooms: [usize; 2],
+    /// Coordinate of its middle along the wall, m.
     pub at: f64,
 }
 
@@ -86,7 +88,9 @@ pub enum Extent {
 
 /// Floor plan and tours of a patrol.
 pub(super) struct Plan {
+    /// Rooms, then parts of corridors.
     pub rooms: &'static [RoomBox],
+    /// What joins them.
     pub doors: &'static [Door],
     /// Where the flight begins, m.
     start: DVec2,
@@ -95,6 +99,7 @@ pub(super) struct Plan {
     /// Distance of the ring of a room from its walls, m.
     ring: f64,
     rounds: [&'static [Visit]; 2],
+    /// Length of the flight, s.
     pub seconds: f64,
 }
 

@@ -7,6 +7,7 @@ use super::imu::{Bias, ImuErrors};
 use super::patrol::{Extent, Plan, RoomBox, Route};
 use super::recording;
 use super::render::Sensor;
+use super::way::{look, smooth, under_way, REST};
 use crate::calibration::{Calibration, ImuCalibration, ImuCorrection, RigCamera};
 use crate::camera::{Camera, Lens};
 use crate::fault::Fault;
@@ -119,9 +120,6 @@ const NAMED: [(&str, Flight, f64); 8] = [
     ("patrol", Flight::Patrol(Extent::Whole), 600.0),
 ];
 
-/// Time at rest at the start, and time in which the flight gathers way, s.
-pub(super) const REST: f64 = 1.2;
-pub(super) const GATHER: f64 = 1.2;
 /// Frames a second of a patrol: at its speed the view moves by as much between two as elsewhere.
 const PATROL_HZ: f64 = 10.0;
 /// `Pauses`: length of each of its two flights, s; of landing, of taking off and of coming to hover, s; height of the landed
@@ -343,17 +341,6 @@ fn way(t: f64) -> f64 {
     under_way(t - REST)
 }
 
-pub(super) fn under_way(t: f64) -> f64 {
-    let h = (t / GATHER).clamp(0.0, 1.0);
-    GATHER * (h * h * h - 0.5 * h * h * h * h) + (t - GATHER).max(0.0)
-}
-
-/// From 0 at 0 to 1 at 1, with two derivatives that are zero at both.
-pub(super) fn smooth(x: f64) -> f64 {
-    let x = x.clamp(0.0, 1.0);
-    x * x * x * (10.0 - 15.0 * x + 6.0 * x * x)
-}
-
 /// Displacement, m, and turn (yaw, pitch, roll) of a multicopter that holds its place.
 fn wobble(s: f64) -> (DVec3, DVec3) {
     let w = |f: f64| (TAU * f * s).sin();
@@ -368,12 +355,4 @@ fn round(s: f64) -> (DVec3, [f64; 3]) {
     let a = 0.766 * s;
     let p = DVec3::new(1.6 * a.cos(), 1.05 * a.sin(), 1.35 + 0.3 * (2.0 * a).sin());
     (p, [a + 0.35 * (2.0 * a).sin(), -0.12 + 0.14 * (3.0 * a).sin(), 0.08 * (2.5 * a).sin()])
-}
-
-/// `world_from_cam` at `p`, looking along `yaw` (from x towards y) and `pitch` (up), rolled clockwise.
-pub(super) fn look(p: DVec3, yaw: f64, pitch: f64, roll: f64) -> Pose {
-    let forward = DVec3::new(yaw.cos() * pitch.cos(), yaw.sin() * pitch.cos(), pitch.sin());
-    let right = DVec3::new(yaw.sin(), -yaw.cos(), 0.0);
-    let level = DQuat::from_mat3(&DMat3::from_cols(right, forward.cross(right), forward));
-    Pose::new(level * DQuat::from_rotation_z(roll), p)
 }

@@ -8,8 +8,9 @@ use super::{Room, Solid, NOTHING};
 use glam::{Vec2, Vec3};
 use std::ops::Range;
 
-/// Openings that a ray passes at most, and cells of a building at most (a set of cells is a word).
+/// Openings that a ray passes at most.
 const PASSED_MAX: usize = 24;
+/// Cells of a building at most: a set of them is a word.
 pub const CELLS_MAX: usize = 64;
 /// An opening as near as this to the eye hides nothing, m.
 const AT_EYE: f32 = 0.1;
