@@ -367,6 +367,11 @@ pub fn rss_peak_bytes() -> Option<u64> {
     proc_bytes("/proc/self/status", "VmHWM:")
 }
 
+/// The resident set of this process now.
+pub fn rss_bytes() -> Option<u64> {
+    proc_bytes("/proc/self/status", "VmRSS:")
+}
+
 /// A value that a file of /proc gives in KiB, in bytes.
 fn proc_bytes(file: &str, key: &str) -> Option<u64> {
     let text = std::fs::read_to_string(file).ok()?;

@@ -1,7 +1,8 @@
-//! A recording, or a flight rendered into memory, as a pair of sources that deliver at the recorded times. What is late is
+//! A recording, or a simulated flight rendered before or as it is read, as a pair of sources that deliver at the recorded times. What is late is
 //! delivered at once and in order, as by a device with a queue.
 
 use crate::replay::{ImageFault, Reader};
+use crate::sim::Sim;
 use crate::source::{AidBatch, AidReading, AidSource, FrameSource, ImuBatch, ImuReading, ImuSource, SourceFault, Wait};
 use crate::types::{Frames, ImuSample, Nanos, Span};
 use std::sync::Arc;
@@ -12,6 +13,14 @@ pub enum Images {
     Recording(Reader),
     /// Frames in memory.
     Rendered(Vec<Frames>),
+    /// Each frame is rendered when it is read, and kept nowhere: memory does not grow with the flight.
+    Simulated(Box<Simulated>),
+}
+
+/// A simulated flight, and who is told how many of its frames are rendered, of all.
+pub struct Simulated {
+    pub sim: Sim,
+    pub progress: Box<dyn FnMut(usize, usize) + Send>,
 }
 
 impl Images {
@@ -24,6 +33,11 @@ impl Images {
                 out.copy_from(&frames[index]);
                 Ok(())
             }
+            Images::Simulated(flight) => {
+                flight.sim.render(index, out);
+                (flight.progress)(index + 1, flight.sim.frame_count());
+                Ok(())
+            }
         }
     }
 
@@ -32,6 +46,7 @@ impl Images {
         match self {
             Images::Recording(reader) => reader.has_colour(cameras),
             Images::Rendered(frames) => frames.iter().all(|f| f.colours.len() >= cameras),
+            Images::Simulated(_) => true,
         }
     }
 
@@ -39,7 +54,7 @@ impl Images {
     pub fn warnings(&self) -> &[String] {
         match self {
             Images::Recording(reader) => reader.warnings(),
-            Images::Rendered(_) => &[],
+            Images::Rendered(_) | Images::Simulated(_) => &[],
         }
     }
 
@@ -47,7 +62,7 @@ impl Images {
     pub fn counters(&self) -> Vec<(&'static str, u64)> {
         match self {
             Images::Recording(reader) => reader.counters().list(),
-            Images::Rendered(_) => vec![],
+            Images::Rendered(_) | Images::Simulated(_) => vec![],
         }
     }
 }

@@ -34,7 +34,7 @@ fn recordings(test: &str) -> Option<PathBuf> {
 
 #[test]
 fn integrating_the_noise_free_imu_reproduces_the_path() {
-    for name in ["demo", "circle", "aggressive"] {
+    for name in ["demo", "circle", "aggressive", "patrol-two"] {
         let mut scenario = quiet(name);
         scenario.image_divisor = 4;
         let sim = Sim::new(&scenario).unwrap();
@@ -69,6 +69,7 @@ fn flights_begin_with_a_second_at_rest_and_keep_to_their_speed() {
         ("circle", 1.6, 1.6),
         ("demo", 1.8, 2.0),
         ("aggressive", 4.5, 4.5),
+        ("patrol-two", 1.2, 1.05),
     ] {
         let mut scenario = quiet(name);
         scenario.image_divisor = 4;

@@ -7,7 +7,8 @@ use stipple_drivers::{Fault, FaultKind, Span};
 
 #[derive(clap::Args)]
 pub struct Args {
-    /// demo, hover, circle, aggressive or static; or `euroc`, to fly the trajectory of --truth
+    /// demo, hover, circle, aggressive, static or pauses; patrol-two or patrol, through a building; or `euroc`, to fly the
+    /// trajectory of --truth
     scenario: String,
     /// Folder to write
     #[arg(long, value_name = "DIR")]
@@ -18,7 +19,7 @@ pub struct Args {
     /// EuRoC IMU csv to use in place of a simulated IMU
     #[arg(long, value_name = "CSV", requires = "truth")]
     imu: Option<PathBuf>,
-    /// Seconds of the flight to write; without it all of it, some 10
+    /// Seconds of the flight to write; without it all of it, some 10, of patrol 600
     #[arg(long, value_name = "S", value_parser = seconds)]
     duration: Option<f64>,
     /// Seed of the room and of the sensors' noise; without it the scenario's own

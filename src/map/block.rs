@@ -7,13 +7,17 @@
 //! |---|---|---|---|
 //! | `KIND_RUN` | 0 | `RunAbout` | none |
 //! | `KIND_BLOCK` | of its anchor | `BlockAbout` | arrays of `count` elements, one after another: splats (48 bytes each), steps (4), green and blue (8, in colour), Adam's moments (96, if kept), those of green and blue (16, if kept, in colour) |
-//! | `KIND_KEYFRAME` | of the keyframe | `KeyframeAbout` | `CameraAbout` of each camera (132 bytes each), then the pixels of each camera's planes |
+//! | `KIND_KEYFRAME` | of the keyframe, times `CAMERAS_MAX`, plus the camera | `KeyframeAbout` | none |
+//! | `KIND_IMAGE` | the same | none | the pixels of each plane |
+//!
+//! What is known of a keyframe changes as long as the map trains; its pixels do not, and are written once.
 //!
 //! Samples of a block are rounded to 1/65535 of the box around them (0.2 mm in a block of 13 m): they tell where a block is,
 //! and so the poses keep all their digits. Decoding gives `None` for bytes that are not of this form, and never panics.
 
 use super::coarseness::Coarseness;
 use super::exposure::Exposure;
+use super::horizon::Horizon;
 use super::pool::Gaussian;
 use crate::gpu::kernels::types::{Moments, Splat};
 use crate::store::{About, ABOUT};
@@ -24,6 +28,7 @@ use stipple_drivers::{Nanos, Pose};
 pub const KIND_RUN: u8 = 1;
 pub const KIND_BLOCK: u8 = 2;
 pub const KIND_KEYFRAME: u8 = 3;
+pub const KIND_IMAGE: u8 = 4;
 /// `KeyframeAbout::home` of a keyframe that belongs to no block.
 pub const NO_BLOCK: u32 = u32::MAX;
 /// Samples of a block.
@@ -33,8 +38,6 @@ pub const SAMPLES: usize = 32;
 const FORM: u8 = 1;
 /// Bytes of a pose: quaternion xyzw, then position.
 const POSE: usize = 7 * size_of::<f64>();
-/// Bytes of a `CameraAbout`.
-const CAMERA: usize = 2 * POSE + 2 * size_of::<f64>() + size_of::<f32>();
 /// Steps of a sample's coordinate in the box around all of them.
 const SAMPLE_STEPS: f32 = 65535.0;
 // Arrays are copied as they are in memory.
@@ -45,8 +48,8 @@ const _: () = assert!(cfg!(target_endian = "little"));
 pub struct RunAbout {
     /// Its epoch 0 is this one of the store.
     pub epoch_base: u32,
-    /// When it started, s since 1970.
-    pub started_unix_s: i64,
+    /// When the flight began, ms since 1970.
+    pub started_unix_ms: i64,
     pub colour: bool,
     /// Size of a stored image, px.
     pub width: u32,
@@ -54,6 +57,8 @@ pub struct RunAbout {
     /// Images of a keyframe, and planes of each.
     pub cameras: u32,
     pub channels: u32,
+    /// Median depth of what the first anchor saw, m; zero before there is one.
+    pub scene_depth_m: f64,
 }
 
 /// What is known of a block without its Gaussians.
@@ -90,7 +95,7 @@ impl Default for BlockAbout {
     }
 }
 
-/// What is known of a keyframe without its images.
+/// What is known of one camera's view of a keyframe, without its image.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct KeyframeAbout {
     pub t: Nanos,
@@ -98,26 +103,19 @@ pub struct KeyframeAbout {
     pub epoch: u32,
     pub held_out: bool,
     pub anchor: bool,
-    /// Id of the block that it belongs to, or `NO_BLOCK`.
+    /// Id of the block that it sees most of, or `NO_BLOCK`.
     pub home: u32,
     /// world_from_body by odometry, with its corrections.
     pub given: Pose,
     /// body_from_refined
     pub refined: Pose,
-    /// Where the first camera sits on the body, and its exposure.
-    pub body_from_cam: Pose,
-    pub exposure: Exposure,
-    /// The loss of the last training step on it.
-    pub loss: f32,
-}
-
-/// What is known of one image of a keyframe.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct CameraAbout {
     pub body_from_cam: Pose,
     pub body_from_raw: Pose,
     pub exposure: Exposure,
     pub coarseness: Coarseness,
+    /// Training steps on it.
+    pub steps: u32,
+    pub horizon: Horizon,
 }
 
 /// Writes values one after another.
@@ -211,34 +209,25 @@ fn pose_bytes(pose: &Pose) -> [u8; POSE] {
 }
 
 fn exposure_bytes(exposure: &Exposure) -> [u8; 2 * size_of::<f64>()] {
-    bytemuck::cast([exposure.gain, exposure.offset])
+    std::array::from_fn(|i| [exposure.gain, exposure.offset][i / 8].to_le_bytes()[i % 8])
 }
 
 impl RunAbout {
     pub fn encode(&self) -> About {
         let mut w = Writer::new();
-        w.put(self.started_unix_s.to_le_bytes());
+        w.put(self.started_unix_ms.to_le_bytes());
         w.put([u8::from(self.colour)]);
         w.words(&[self.epoch_base, self.width, self.height, self.cameras, self.channels]);
+        w.put(self.scene_depth_m.to_le_bytes());
         w.about
     }
 
     pub fn decode(about: &About) -> Option<RunAbout> {
         let mut b = Bytes::of(about)?;
-        let (started_unix_s, colour) = (b.i64()?, b.bool()?);
+        let (started_unix_ms, colour) = (b.i64()?, b.bool()?);
         let [epoch_base, width, height, cameras, channels] = [b.u32()?, b.u32()?, b.u32()?, b.u32()?, b.u32()?];
-        Some(RunAbout { epoch_base, started_unix_s, colour, width, height, cameras, channels })
-    }
-
-    /// Bytes of one plane; `None` beyond what memory could hold.
-    fn plane_bytes(&self) -> Option<usize> {
-        (self.width as usize).checked_mul(self.height as usize)
-    }
-
-    /// Bytes of a keyframe's payload; `None` beyond what memory could hold.
-    pub fn keyframe_bytes(&self) -> Option<usize> {
-        let planes = self.plane_bytes()?.checked_mul(self.channels as usize)?;
-        planes.checked_add(CAMERA)?.checked_mul(self.cameras as usize)
+        let scene_depth_m = b.f64()?;
+        Some(RunAbout { epoch_base, started_unix_ms, colour, width, height, cameras, channels, scene_depth_m })
     }
 }
 
@@ -385,9 +374,12 @@ impl KeyframeAbout {
         w.words(&[self.epoch, self.home]);
         w.put([u8::from(self.held_out)]);
         w.put([u8::from(self.anchor)]);
-        [self.given, self.refined, self.body_from_cam].iter().for_each(|pose| w.put(pose_bytes(pose)));
+        let poses = [self.given, self.refined, self.body_from_cam, self.body_from_raw];
+        poses.iter().for_each(|pose| w.put(pose_bytes(pose)));
         w.put(exposure_bytes(&self.exposure));
-        w.put(self.loss.to_le_bytes());
+        w.put(self.coarseness.level().to_le_bytes());
+        w.words(&[self.steps]);
+        w.put(self.horizon.0);
         w.about
     }
 
@@ -395,56 +387,24 @@ impl KeyframeAbout {
         let mut b = Bytes::of(about)?;
         let (t, epoch, home) = (Nanos(b.i64()?), b.u32()?, b.u32()?);
         let (held_out, anchor) = (b.bool()?, b.bool()?);
-        let (given, refined, body_from_cam) = (b.pose()?, b.pose()?, b.pose()?);
-        let (exposure, loss) = (b.exposure()?, b.f32()?);
-        Some(KeyframeAbout { t, epoch, held_out, anchor, home, given, refined, body_from_cam, exposure, loss })
-    }
-}
-
-/// Appends a keyframe's payload: its cameras, and the pixels of all their planes in the same order.
-pub fn encode_keyframe<'a>(cameras: &[CameraAbout], planes: impl Iterator<Item = &'a [u8]>, out: &mut Vec<u8>) {
-    for camera in cameras {
-        out.extend_from_slice(&pose_bytes(&camera.body_from_cam));
-        out.extend_from_slice(&pose_bytes(&camera.body_from_raw));
-        out.extend_from_slice(&exposure_bytes(&camera.exposure));
-        out.extend_from_slice(&camera.coarseness.level().to_le_bytes());
-    }
-    planes.for_each(|plane| out.extend_from_slice(plane));
-}
-
-/// A keyframe's payload.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct KeyframeBytes<'a> {
-    cameras: &'a [u8],
-    planes: &'a [u8],
-    channels: usize,
-    plane_bytes: usize,
-}
-
-impl<'a> KeyframeBytes<'a> {
-    /// The payload of a keyframe of a run; `None` where it has another length.
-    pub fn of(run: &RunAbout, payload: &'a [u8]) -> Option<KeyframeBytes<'a>> {
-        if run.keyframe_bytes()? != payload.len() {
-            return None;
-        }
-        let (cameras, planes) = payload.split_at(run.cameras as usize * CAMERA);
-        Some(KeyframeBytes { cameras, planes, channels: run.channels as usize, plane_bytes: run.plane_bytes()? })
-    }
-
-    pub fn camera(&self, camera: usize) -> Option<CameraAbout> {
-        let mut b = Bytes(self.cameras.chunks_exact(CAMERA).nth(camera)?);
-        let (body_from_cam, body_from_raw, exposure) = (b.pose()?, b.pose()?, b.exposure()?);
-        let coarseness = Coarseness::at(b.f32()?);
-        Some(CameraAbout { body_from_cam, body_from_raw, exposure, coarseness })
-    }
-
-    /// Pixels, row by row.
-    pub fn plane(&self, camera: usize, channel: usize) -> Option<&'a [u8]> {
-        if channel >= self.channels {
-            return None;
-        }
-        let at = camera.checked_mul(self.channels)?.checked_add(channel)?.checked_mul(self.plane_bytes)?;
-        self.planes.get(at..at.checked_add(self.plane_bytes)?)
+        let (given, refined, body_from_cam, body_from_raw) = (b.pose()?, b.pose()?, b.pose()?, b.pose()?);
+        let (exposure, coarseness) = (b.exposure()?, Coarseness::at(b.f32()?));
+        let (steps, horizon) = (b.u32()?, Horizon(b.take()?));
+        Some(KeyframeAbout {
+            t,
+            epoch,
+            held_out,
+            anchor,
+            home,
+            given,
+            refined,
+            body_from_cam,
+            body_from_raw,
+            exposure,
+            coarseness,
+            steps,
+            horizon,
+        })
     }
 }
 

@@ -31,11 +31,6 @@ impl Coarseness {
         self.0
     }
 
-    /// The coarseness of a level, within its bounds.
-    pub fn at(level: f32) -> Coarseness {
-        Coarseness(level.clamp(0.0, MAX))
-    }
-
     /// For the next picture from the same place, after one that needed so many of the list's places.
     pub fn after(self, needed: u32, capacity: u32) -> Coarseness {
         let full = f64::from(needed) / f64::from(capacity);

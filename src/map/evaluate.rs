@@ -46,6 +46,17 @@ pub struct Evaluation {
     pub psnr_heldout_aligned_db: Option<f64>,
     /// Held out, of each camera that trains.
     pub psnr_heldout_by_camera_db: Vec<Option<f64>>,
+    /// Each keyframe, by its first camera.
+    pub keyframe_scores: Vec<KeyframeScore>,
+}
+
+/// How well the map shows one keyframe.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct KeyframeScore {
+    pub id: u64,
+    pub t_ns: i64,
+    pub held_out: bool,
+    pub psnr_db: Option<f64>,
 }
 
 /// A keyframe and its rendering, row-major at mapping resolution.
@@ -101,10 +112,15 @@ pub fn evaluate(
     let mut all: [[Vec<Option<f64>>; 2]; 5] = Default::default();
     let [training, held_out, between, fitted, aligned] = &mut all;
     let mut by_camera: [Vec<Option<f64>>; CAMERAS_MAX] = Default::default();
+<<<<<<< HEAD
     for i in 0..scene.views.len() {
         if !bring(scene, archive, i)? {
             continue;
         }
+=======
+    let mut keyframe_scores = Vec::with_capacity(scene.views.len());
+    for i in 0..scene.views.len() {
+>>>>>>> sim
         let observed = observed(scene, i);
         let mut add = |scene: &Scene, [psnr, ssim]: &mut [Vec<Option<f64>>; 2]| {
             let (shown, valid) = (&scene.rendered.colour, &scene.camera(i).valid);
@@ -112,7 +128,15 @@ pub fn evaluate(
             ssim.push(ssim_of.mean(&observed, shown, valid));
         };
         let scored = score(scene, i)?;
+<<<<<<< HEAD
         if !scene.views.get(i).held_out {
+=======
+        if scene.views.camera(i) == 0 {
+            let s = scene.views.get(i);
+            keyframe_scores.push(KeyframeScore { id: s.id, t_ns: s.t.0, held_out: s.held_out, psnr_db: scored });
+        }
+        if !scene.views.get(i).held_out {
+>>>>>>> sim
             add(scene, training);
             continue;
         }
@@ -138,6 +162,7 @@ pub fn evaluate(
         ssim_heldout_fitted: fitted[1],
         psnr_heldout_aligned_db: aligned[0],
         psnr_heldout_by_camera_db: by_camera.iter().map(|values| mean(values)).collect(),
+        keyframe_scores,
     })
 }
 

@@ -54,7 +54,7 @@ use views::Views;
 use trainer::Trainer;
 
 pub use archive::Place;
-pub use evaluate::{spread, CurvePoint, Evaluation, Panel};
+pub use evaluate::{spread, CurvePoint, Evaluation, KeyframeScore, Panel};
 pub use exposure::Exposure;
 pub use keyframes::{Keyframe, PoseCorrection};
 pub use pipeline::Pipeline;

@@ -49,6 +49,7 @@ pub mod status;
 pub mod status_led;
 pub mod summary;
 mod supervisor;
+mod table;
 pub mod threads;
 pub mod tracking;
 pub mod waker;
@@ -82,6 +83,8 @@ use stipple_drivers::record::Format;
 use stipple_drivers::replay::read_trajectory;
 use stipple_drivers::{host, Calibration, Fault, FaultKind, Frames};
 pub use supervisor::Steering;
+pub use table::Spacing;
+use table::Table;
 use tracking::{FramePacket, Inlet, Link, OdometryRun, Tracker};
 use worker::{Kept, MapSide, Worker};
 use writers::Writers;
@@ -112,6 +115,8 @@ pub struct Options {
     pub pace: Pace,
     /// Table of poses in place of odometry.
     pub poses: Option<PathBuf>,
+    /// The input's own true poses in place of odometry, and which frames are keyframes.
+    pub at_truth: Option<Spacing>,
     /// Every Nth keyframe is evaluated and never trained on; 0: none.
     pub holdout: u32,
     /// Live sensors are stopped after this time. A recording ends there; past its end the mapper goes on alone.
@@ -181,8 +186,10 @@ pub fn fly(
     input.needs_colour(colours)?;
     let Playback { speed, repeats } = options.playback;
     let frames = frames_kept(&mut input, options);
+    let looked_up = |poses| Tracker::Table(Table { poses, spacing: options.at_truth, last: None });
     let mut tracker = match &options.poses {
-        Some(path) => Tracker::Table(read_trajectory(path)?),
+        Some(path) => looked_up(read_trajectory(path)?),
+        None if options.at_truth.is_some() => looked_up(input.truth.clone()),
         None => Tracker::Odometry(Box::new(OdometryRun::new(&input.calibration, board, frames)?)),
     };
     let map = if board.map.enabled { Some(open_map(&mut input, board, out, options, apart)?) } else { None };

@@ -14,7 +14,7 @@ use stipple_drivers::counters::Counter;
 use stipple_drivers::gpio::{DataReady, Output, Trigger};
 use stipple_drivers::imu::ImuOptions;
 use stipple_drivers::inject::{FaultyFrames, FaultyImu};
-use stipple_drivers::paced::{Images, Pace, PacedAids, PacedFrames, PacedImu};
+use stipple_drivers::paced::{Images, Pace, PacedAids, PacedFrames, PacedImu, Simulated};
 use stipple_drivers::replay::{read_calibration, OpenOptions, Recording};
 use stipple_drivers::sim::{Scenario, Sim};
 use stipple_drivers::source::{AidReading, AidSource, FrameSource, ImuBatch, ImuSource, SourceFault, Wait};
@@ -129,8 +129,19 @@ impl Input {
             frames.push(f);
             progress(i + 1, count);
         }
-        let stamps = frames.iter().map(|f| f.t).collect();
-        Ok(Input {
+        Ok(Input::flown(scenario, sim, |_| Images::Rendered(frames)))
+    }
+
+    /// Renders each frame when it is read, so that a flight of any length fits; rendering takes its share of the machine while
+    /// it lasts. `progress` is told how many frames are rendered, of all.
+    #[cfg_attr(not(feature = "instruments"), allow(dead_code))] // a bench asks for it
+    pub fn simulated(scenario: &Scenario, progress: impl FnMut(usize, usize) + Send + 'static) -> Result<Input, Fault> {
+        let images = |sim| Images::Simulated(Box::new(Simulated { sim, progress: Box::new(progress) }));
+        Ok(Input::flown(scenario, Sim::new(scenario)?, images))
+    }
+
+    fn flown(scenario: &Scenario, sim: Sim, images: impl FnOnce(Sim) -> Images) -> Input {
+        Input {
             name: format!("simulated flight `{}`", scenario.name),
             place: "the simulated flight".into(),
             calibration: sim.calibration().clone(),
@@ -138,12 +149,12 @@ impl Input {
             warnings: vec![],
             opened: vec![],
             source: Source::Recorded(Recorded {
-                images: Images::Rendered(frames),
-                stamps,
+                stamps: (0..sim.frame_count()).map(|i| sim.stamp(i)).collect(),
                 imu: sim.imu().to_vec(),
                 aids: sim.aids().to_vec(),
+                images: images(sim),
             }),
-        })
+        }
     }
 
     /// Opens the sensors that a board file names.

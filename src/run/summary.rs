@@ -103,6 +103,7 @@ pub fn conclude(title: Title, mut flown: Flown, logged: &[PathBuf], out: &Output
         report.anchors = Some(m.anchors);
         report.iterations = Some(m.iterations);
         report.iteration_ms_p50 = m.iteration_ms_p50;
+        report.iteration_ms_p99 = m.iteration_ms_p99;
         report.splats = Some(m.splats);
         report.gpu_bytes = Some(m.gpu_bytes);
         report.device = Some(m.device.clone());
@@ -169,7 +170,7 @@ fn track_figures(report: &mut Report, flown: &Flown) -> Vec<TimedPose> {
     report.frames_dropped = Some(dropped);
     report.frames = Some((flown.frames as u64).saturating_sub(dropped));
     let run = match &flown.tracker {
-        Tracker::Table(poses) => return poses.clone(),
+        Tracker::Table(table) => return table.poses.clone(),
         Tracker::Observer(_) => return vec![],
         Tracker::Odometry(run) => run,
     };

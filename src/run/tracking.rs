@@ -10,11 +10,13 @@
 //! points that it rejected. The front end begins frame k when the answer to frame k-2 has come, and predicts from that even
 //! where the one to k-1 is known: so neither queue can fill, and poses are the same bit for bit on one thread and on two.
 //!
-//! With `--poses` the poses come from a table, odometry is skipped, and every frame is a keyframe.
+//! With `--poses` the poses come from a table, odometry is skipped, and every frame is a keyframe, or those that are apart by
+//! a stated spacing.
 
 use super::carrier::{Carrier, Newest};
 use super::gate::{Clock, Stream, RELEARN};
 use super::log::{LogSender, Rig, State};
+use super::table::Table;
 use super::waker::{SetOnDrop, Waker};
 use crate::config::Board;
 use crate::counters::Counters;
@@ -29,11 +31,8 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 use stipple_drivers::host::{thread_cpu, thread_cpu_now};
 use stipple_drivers::source::{AidBatch, AidReading};
-use stipple_drivers::types::pose_at;
-use stipple_drivers::{Calibration, Fault, Frames, ImuSample, Nanos, Pose, Span, TimedPose};
+use stipple_drivers::{Calibration, Fault, Frames, ImuSample, Nanos, Pose, TimedPose};
 
-/// Largest gap in a table of poses that is interpolated across.
-const POSE_GAP_MAX: Span = Span(100_000_000);
 /// Packets between the two halves: the one whose points are followed and the one being estimated.
 const BETWEEN_HALVES: usize = 2;
 
@@ -123,7 +122,7 @@ impl FramePacket {
 pub enum Tracker {
     Odometry(Box<OdometryRun>),
     /// Poses looked up by stamp.
-    Table(Vec<TimedPose>),
+    Table(Table),
     /// No poses: each packet is shown to this and given back.
     Observer(Box<dyn FnMut(&FramePacket) + Send>),
 }
@@ -384,16 +383,17 @@ impl Tracker {
     }
 }
 
-/// Fills in the pose of a packet from a table: every frame is a keyframe.
-pub fn look_up(poses: &[TimedPose], packet: &mut FramePacket, counters: &Counters) {
+/// Fills in the pose of a packet from a table.
+pub fn look_up(table: &mut Table, packet: &mut FramePacket, counters: &Counters) {
     packet.tracked = None;
     if packet.imu_only {
         return;
     }
-    let pose = pose_at(poses, packet.frames.t, POSE_GAP_MAX);
-    counters.frames_without_pose.add(u64::from(pose.is_none()));
-    let (keyframe, body_from_cam, corrections) = (true, None, List::default());
-    packet.tracked = pose.map(|world_from_body| Tracked { world_from_body, keyframe, body_from_cam, corrections });
+    let found = table.at(packet.frames.t);
+    counters.frames_without_pose.add(u64::from(found.is_none()));
+    let (body_from_cam, corrections) = (None, List::default());
+    packet.tracked =
+        found.map(|(pose, keyframe)| Tracked { world_from_body: pose, keyframe, body_from_cam, corrections });
 }
 
 /// What the threads of tracking share.

@@ -83,6 +83,11 @@ fn read(path: &std::path::Path) -> Result<Vec<Gaussian>, Fault> {
         .collect())
 }
 
+/// Means of the Gaussians of a map.
+pub fn means(map: &std::path::Path) -> Result<Vec<DVec3>, Fault> {
+    Ok(read(map)?.into_iter().map(|g| g.mean).collect())
+}
+
 /// A Gaussian as a view has it: centre, inverse covariance (a, b, c), depth, reach in pixels.
 struct Splat<'a> {
     of: &'a Gaussian,

@@ -11,6 +11,7 @@ mod kernels;
 mod map;
 mod odometry;
 mod page;
+mod patrol;
 mod ply;
 mod predict;
 mod record;
@@ -51,6 +52,7 @@ enum Bench {
     Faults(faults::Args),
     Record(record::Args),
     Ply(ply::Args),
+    Patrol(patrol::Args),
 }
 
 fn run(bench: &Bench) -> Result<(), Fault> {
@@ -66,6 +68,7 @@ fn run(bench: &Bench) -> Result<(), Fault> {
         Bench::Faults(args) => faults::run(args),
         Bench::Record(args) => record::run(args),
         Bench::Ply(args) => ply::run(args),
+        Bench::Patrol(args) => patrol::run(args),
     }
 }
 

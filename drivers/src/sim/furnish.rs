@@ -4,7 +4,7 @@
 //! things on it, a sofa, ...) put side by side along the walls and on a coarse grid inside; a set that would come nearer to
 //! the path than `KEEP_CLEAR` is left out.
 
-use super::room::{Light, LightMap, Room, Shape, Solid};
+use super::room::{Light, LightMap, Room, Shape, Solid, AMBIENT};
 use super::texture::{
     BOOKS, BRICK, CONCRETE, CRATE, DRAWERS, LEAVES, MARBLE, PARQUET, PLAID, PLASTER, POSTER, PRINT, RUG,
 };
@@ -69,26 +69,47 @@ pub fn furnish(low: Vec3, high: Vec3, path: &[Vec3], seed: u64, threads: usize) 
     let mut rng = ChaCha8Rng::seed_from_u64(seed ^ 0x526F_6F6D);
     let walls = [BRICK, CONCRETE, PLASTER, PLASTER];
     let mut room = Room::empty(low, high, walls, rng.random());
-    add_rug(&mut room, &mut rng);
-    along_walls(&mut room, path, &mut rng);
-    inside(&mut room, path, &mut rng);
-    add_lamps(&mut room);
+    fill(&mut room, &Place { cell: 0, low, high }, path, true, &mut rng);
+    add_lamps(&mut room, low, high);
     let e = high - low;
     let pitch = 0.1 * (e.x * e.y / 48.0).sqrt().clamp(1.0, 2.5);
-    room.light_map = LightMap::bake(&room, pitch, threads);
+    room.light_map = LightMap::bake(&room, AMBIENT, pitch, threads);
     room
 }
 
-fn add_rug(room: &mut Room, rng: &mut ChaCha8Rng) {
-    let mid = (room.low + room.high) * 0.5;
-    let half = vec3(0.24 * (room.high.x - room.low.x), 0.2 * (room.high.y - room.low.y), 0.006);
-    let half = half.min(vec3(2.2, 1.6, 1.0));
-    room.add_block(mid.with_z(room.low.z), half, (1.0, 0.0), PLAID, RUG, rng.random());
+/// What is furnished: a cell and its box, m.
+pub struct Place {
+    pub cell: usize,
+    pub low: Vec3,
+    pub high: Vec3,
 }
 
-fn along_walls(room: &mut Room, path: &[Vec3], rng: &mut ChaCha8Rng) {
+impl Place {
+    /// Whether what is `width` wide along the wall at `foot` would stand before an opening of it.
+    fn is_open(&self, room: &Room, foot: Vec2, width: f32) -> bool {
+        room.cells[self.cell].openings.iter().any(|w| w.distance(foot) < 0.5 * width + 0.15)
+    }
+}
+
+/// Furnishes a cell, the middle of which has a rug unless it is a corridor.
+pub fn fill(room: &mut Room, place: &Place, path: &[Vec3], rug: bool, rng: &mut ChaCha8Rng) {
+    if rug {
+        add_rug(room, place, rng);
+    }
+    along_walls(room, place, path, rng);
+    inside(room, place, path, rng);
+}
+
+fn add_rug(room: &mut Room, &Place { low, high, .. }: &Place, rng: &mut ChaCha8Rng) {
+    let mid = (low + high) * 0.5;
+    let half = vec3(0.24 * (high.x - low.x), 0.2 * (high.y - low.y), 0.006);
+    let half = half.min(vec3(2.2, 1.6, 1.0));
+    room.add_block(mid.with_z(low.z), half, (1.0, 0.0), PLAID, RUG, rng.random());
+}
+
+fn along_walls(room: &mut Room, space: &Place, path: &[Vec3], rng: &mut ChaCha8Rng) {
     const ROUND: [Set; 7] = [Set::Shelf, Set::Table, Set::Crates, Set::Cabinet, Set::Sofa, Set::Shelf, Set::Plant];
-    let (a, b) = (room.low, room.high);
+    let (a, b) = (space.low, space.high);
     // Corner and inward direction of each wall, which runs to the right of that direction.
     let walls = [
         (Vec2::new(a.x, b.y), Vec2::new(1.0, 0.0)),
@@ -96,7 +117,8 @@ fn along_walls(room: &mut Room, path: &[Vec3], rng: &mut ChaCha8Rng) {
         (Vec2::new(a.x, a.y), Vec2::new(0.0, 1.0)),
         (Vec2::new(b.x, b.y), Vec2::new(0.0, -1.0)),
     ];
-    let mut next = 0;
+    // Rooms of a building do not begin with the same piece.
+    let mut next = space.cell;
     for (corner, inward) in walls {
         let along = Vec2::new(inward.y, -inward.x);
         let length = (along * (b - a).truncate()).length();
@@ -109,34 +131,39 @@ fn along_walls(room: &mut Room, path: &[Vec3], rng: &mut ChaCha8Rng) {
                 break;
             }
             let foot = corner + along * (s + 0.5 * e.x) + inward * (0.5 * e.y + 0.01);
-            // The set's +y is `inward`.
-            let stand = Stand { base: foot.extend(a.z), cos: inward.y, sin: -inward.x };
-            place(room, set, stand, path, rng);
-            if e.z < 1.6 {
-                hang_picture(room, corner + along * (s + 0.5 * e.x), inward, e.z.max(1.35), rng);
+            let wall = corner + along * (s + 0.5 * e.x);
+            if !space.is_open(room, wall, e.x) {
+                // The set's +y is `inward`.
+                let stand = Stand { base: foot.extend(a.z), cos: inward.y, sin: -inward.x };
+                place(room, set, stand, path, rng);
+                if e.z < 1.6 {
+                    hang_picture(room, wall, inward, e.z.max(1.35), rng);
+                }
             }
             s += e.x + rng.random_range(0.12..0.4);
         }
         for s in [0.3, length - 0.3] {
             let set = if rng.random_bool(0.5) { Set::Pillar } else { Set::Column };
             let foot = corner + along * s + inward * 0.28;
-            place(room, set, Stand { base: foot.extend(a.z), cos: 1.0, sin: 0.0 }, path, rng);
+            if !space.is_open(room, foot, 0.5) {
+                place(room, set, Stand { base: foot.extend(a.z), cos: 1.0, sin: 0.0 }, path, rng);
+            }
         }
     }
 }
 
-fn inside(room: &mut Room, path: &[Vec3], rng: &mut ChaCha8Rng) {
+fn inside(room: &mut Room, space: &Place, path: &[Vec3], rng: &mut ChaCha8Rng) {
     const ROUND: [Set; 5] = [Set::Crates, Set::Plant, Set::Table, Set::Column, Set::Cabinet];
     const GRID: f32 = 2.4;
-    let e = (room.high - room.low).truncate();
+    let e = (space.high - space.low).truncate();
     let cells = ((e - 2.6) / GRID).floor().max(Vec2::ZERO);
     let (nx, ny) = (cells.x as usize, cells.y as usize);
     let margin = (e - cells * GRID) * 0.5;
     for k in 0..nx * ny {
         let shift = Vec2::new(rng.random_range(0.3..0.7), rng.random_range(0.3..0.7));
-        let at = room.low.truncate() + margin + (Vec2::new((k % nx) as f32, (k / nx) as f32) + shift) * GRID;
+        let at = space.low.truncate() + margin + (Vec2::new((k % nx) as f32, (k / nx) as f32) + shift) * GRID;
         let (sin, cos) = rng.random_range(0.0..std::f32::consts::TAU).sin_cos();
-        place(room, ROUND[k % ROUND.len()], Stand { base: at.extend(room.low.z), cos, sin }, path, rng);
+        place(room, ROUND[k % ROUND.len()], Stand { base: at.extend(space.low.z), cos, sin }, path, rng);
     }
 }
 
@@ -237,13 +264,13 @@ fn hang_picture(room: &mut Room, at: Vec2, inward: Vec2, bottom: f32, rng: &mut 
 }
 
 /// Lamps under the ceiling, one for about every 12 m².
-fn add_lamps(room: &mut Room) {
+pub fn add_lamps(room: &mut Room, low: Vec3, high: Vec3) {
     const SPACING: f32 = 4.0;
-    let e = (room.high - room.low).truncate();
+    let e = (high - low).truncate();
     let n = (e / SPACING).round().max(Vec2::ONE);
     for k in 0..(n.x * n.y) as usize {
         let cell = Vec2::new((k % n.x as usize) as f32 + 0.45, (k / n.x as usize) as f32 + 0.55);
-        let at = (room.low.truncate() + e * cell / n).extend(room.high.z - 0.5);
+        let at = (low.truncate() + e * cell / n).extend(high.z - 0.5);
         let power = if k % 2 == 0 { 2.4 } else { 1.7 };
         room.lights.push(Light { at, power });
     }

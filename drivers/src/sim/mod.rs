@@ -4,12 +4,14 @@
 //! instant, and `write_euroc` writes them in the EuRoC ASL layout. Geometry is ray-cast analytically through the camera
 //! models that the estimator inverts, so any error that remains downstream is the estimator's. Errors of the sensors
 //! (`CameraErrors`, `ImuErrors`) are in their data and not in the calibration that is handed out. Read in this order:
-//! `scenario` (paths), `spline` (motion), `room`, `furnish` and `person` (geometry), `texture` and `room::light` (appearance), `render`
+//! `scenario` and `patrol` (paths), `spline` (motion), `room`, `furnish`, `building` and `person` (geometry), `texture` and `room::light` (appearance), `render`
 //! (images), `imu`.
 
 mod baro;
+mod building;
 mod furnish;
 pub mod imu;
+mod patrol;
 mod person;
 mod recording;
 mod render;
@@ -17,9 +19,11 @@ mod room;
 pub mod scenario;
 pub mod spline;
 mod texture;
+mod way;
 mod write;
 
 pub use imu::{Bias, ImuErrors, GRAVITY};
+pub use patrol::{Extent, RoomBox};
 pub use render::Sensor;
 pub use scenario::{euroc_rig, rig_named, CameraErrors, Flight, Light, Recording, Scenario, RIGS};
 pub use write::write_euroc;
@@ -29,6 +33,7 @@ use crate::fault::{Fault, FaultKind};
 use crate::source::AidReading;
 use crate::types::{luma, Frames, ImuSample, Nanos, Pose, Span, TimedPose};
 use glam::{DVec3, Vec3};
+use patrol::Route;
 use person::Person;
 use render::{Exposure, Lens, Row, Rows, Scratch, View};
 use room::Room;
@@ -83,6 +88,8 @@ pub struct Sim {
     aids: Vec<AidReading>,
     biases: Vec<Bias>,
     room: Room,
+    /// That of a patrol.
+    route: Option<Route>,
     person: Option<Person>,
     lenses: Vec<Lens>,
     /// Logarithm of the gain every `METER_PERIOD` from the first frame.
@@ -106,11 +113,19 @@ impl Sim {
         for (camera, error) in calibration.cameras.iter_mut().zip(&scenario.camera_errors.extrinsics) {
             camera.body_from_cam = camera.body_from_cam * *error;
         }
-        let (spline, start, first, last) = motion(scenario, &rig)?;
+        let plan = scenario.path.plan();
+        let route = plan.map(Route::new);
+        let (spline, start, first, last) = motion(scenario, &rig, route.as_ref())?;
         let span = (first - start).secs()..(last - start).secs();
-        let (low, high) = bounds(scenario, &spline, span.clone());
-        let path: Vec<Vec3> = sample_path(&spline, span).map(|p| p.as_vec3()).collect();
-        let mut room = furnish::furnish(low, high, &path, scenario.seed, threads);
+        let mut room = if let (Some(plan), Some(route)) = (plan, &route) {
+            // Of the whole route, so that a shorter flight has the same furniture.
+            let path: Vec<Vec3> = route.places().map(|p| p.as_vec3()).collect();
+            building::build(plan, &path, scenario.seed, threads)
+        } else {
+            let (low, high) = bounds(scenario, &spline, span.clone());
+            let path: Vec<Vec3> = sample_path(&spline, span).map(|p| p.as_vec3()).collect();
+            furnish::furnish(low, high, &path, scenario.seed, threads)
+        };
         let person = scenario.person.then(|| Person::new(&mut room, scenario.seed as u32));
         let recorded = match &scenario.path {
             Flight::Recorded(r) => r.imu.as_ref().map(|imu| (imu, &r.biases)),
@@ -147,6 +162,7 @@ impl Sim {
             aids,
             biases,
             room,
+            route,
             person,
             lenses,
             log_gain: Vec::new(),
@@ -253,6 +269,7 @@ impl Sim {
             let camera = |t: f64| spline.at(first + t).pose * self.rig.cameras[0].body_from_cam;
             person.step(&mut self.room, (t - self.stamps[0]).secs(), camera);
         }
+        self.light_up(t);
         let c = &self.rig.cameras[camera];
         let (rolls, n) = (c.readout.0 > 0, c.camera.height);
         let mut rows = std::mem::take(&mut self.rows);
@@ -267,17 +284,25 @@ impl Sim {
         self.rows = rows;
     }
 
+    /// Lights the room as it is at `t`.
+    fn light_up(&mut self, t: Nanos) {
+        self.room.late = self.route.as_ref().map_or(0.0, |route| route.late(t - self.start) as f32);
+    }
+
     fn view(&self, t: Nanos, camera: usize) -> View {
-        View::new(&(self.truth_at(t).pose * self.rig.cameras[camera].body_from_cam))
+        View::new(&self.room, &(self.truth_at(t).pose * self.rig.cameras[camera].body_from_cam))
     }
 
     /// The exposure that a meter on camera 0 would settle on through the run, smoothed.
-    fn metered(&self) -> Vec<f32> {
+    fn metered(&mut self) -> Vec<f32> {
         let n = ((self.last() - self.stamps[0]).secs() / METER_PERIOD).ceil() as usize + 1;
         let at = |k: usize| (self.stamps[0] + Span::from_secs(k as f64 * METER_PERIOD)).min(self.last());
-        let Some(lens) = self.lenses.first() else { return vec![0.0] };
-        let light: Vec<f32> =
-            (0..n).map(|k| render::meter(&self.room, lens, self.view(at(k), 0)).max(1e-3).ln()).collect();
+        let mut light = Vec::with_capacity(n);
+        for t in (0..n).map(at).collect::<Vec<_>>() {
+            self.light_up(t);
+            let Some(lens) = self.lenses.first() else { return vec![0.0] };
+            light.push(render::meter(&self.room, lens, self.view(t, 0)).max(1e-3).ln());
+        }
         let mean = light.iter().sum::<f32>() / n as f32;
         let smooth = |k: usize| (light[k.saturating_sub(1)] + 2.0 * light[k] + light[(k + 1).min(n - 1)]) / 4.0;
         (0..n).map(|k| METER_LEVEL.ln() - mean - METER_STRENGTH * (smooth(k) - mean)).collect()
@@ -311,11 +336,15 @@ fn check(s: &Scenario) -> Result<(), Fault> {
 }
 
 /// The spline, the stamp of its time 0, and the first and last instant to simulate.
-fn motion(scenario: &Scenario, rig: &Calibration) -> Result<(Spline, Nanos, Nanos, Nanos), Fault> {
+fn motion(
+    scenario: &Scenario,
+    rig: &Calibration,
+    route: Option<&Route>,
+) -> Result<(Spline, Nanos, Nanos, Nanos), Fault> {
     let Flight::Recorded(r) = &scenario.path else {
         let cam_from_body = rig.cameras[0].body_from_cam.inverse();
         let look = |t: f64| {
-            let world_from_cam = scenario.path.look(t).unwrap_or_default();
+            let world_from_cam = route.map(|r| r.look(t)).or(scenario.path.look(t)).unwrap_or_default();
             Pose::new(world_from_cam.q * cam_from_body.q, world_from_cam.p)
         };
         let spline = Spline::sampled(scenario.duration.secs(), KNOT, look);
@@ -407,18 +436,22 @@ mod tests {
     /// The tiles' lists of solids leave nothing out: a pixel sees what a test of all solids says.
     #[test]
     fn tile_lists_lose_no_solid() {
-        let mut sim = Sim::with_threads(&Scenario::named("circle").unwrap(), 3).unwrap();
-        for frame in [0, 60, 120, 180] {
-            let view = sim.view(sim.stamp(frame), 1);
-            let rows = [Row { view, gain: 1.0, offset: 0.0 }];
-            render::cast(&sim.room, &sim.lenses[1], Rows(&rows), &mut sim.scratch);
-            let camera = sim.calibration.cameras[1].camera;
-            for i in (0..camera.width * camera.height).step_by(11) {
-                let px = DVec2::new((i % camera.width) as f64, (i / camera.width) as f64);
-                let d = view.turn * camera.unproject(px).unwrap().as_vec3();
-                let (t, face) = sim.room.nearest(view.origin, d);
-                let hit = sim.scratch.hits[i];
-                assert!(hit.face == face || (hit.distance - t).abs() < 1e-4, "frame {frame} pixel {px}");
+        for (name, frames) in
+            [("circle", [0, 60, 120, 180]), ("patrol-two", [52, 165, 385, 612]), ("patrol", [65, 420, 2904, 3875])]
+        {
+            let mut sim = Sim::with_threads(&Scenario::named(name).unwrap(), 3).unwrap();
+            for frame in frames {
+                let view = sim.view(sim.stamp(frame), 1);
+                let rows = [Row { view, gain: 1.0, offset: 0.0 }];
+                render::cast(&sim.room, &sim.lenses[1], Rows(&rows), &mut sim.scratch);
+                let camera = sim.calibration.cameras[1].camera;
+                for i in (0..camera.width * camera.height).step_by(11) {
+                    let px = DVec2::new((i % camera.width) as f64, (i / camera.width) as f64);
+                    let d = view.turn * camera.unproject(px).unwrap().as_vec3();
+                    let (t, face) = sim.room.nearest(view.origin, d);
+                    let hit = sim.scratch.hits[i];
+                    assert!(hit.face == face || (hit.distance - t).abs() < 1e-4, "{name} {frame} pixel {px}");
+                }
             }
         }
     }
@@ -460,8 +493,9 @@ mod tests {
 
     #[test]
     fn a_view_does_not_depend_on_the_heading_s_representation() {
+        let room = Sim::new(&Scenario::named("static").unwrap()).unwrap().room;
         let q = DQuat::from_rotation_y(0.7);
-        let (a, b) = (View::new(&Pose::new(q, DVec3::X)), View::new(&Pose::new(-q, DVec3::X)));
+        let (a, b) = (View::new(&room, &Pose::new(q, DVec3::X)), View::new(&room, &Pose::new(-q, DVec3::X)));
         assert!((a.turn * Vec3::Z - b.turn * Vec3::Z).length() < 1e-6);
     }
 }

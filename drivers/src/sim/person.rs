@@ -6,8 +6,8 @@
 //! rolling shutter. All else of the room, its light and the exposure are those of the flight without it.
 
 use super::room::Room;
-use super::scenario::smooth;
 use super::texture::{PLAID, PRINT};
+use super::way::smooth;
 use crate::types::Pose;
 use glam::{DVec2, DVec3, Vec2, Vec3};
 

@@ -3,7 +3,7 @@
 //! A frame is made in two passes over 16-pixel tiles: `cast` finds distance and face at every pixel centre; `shade` turns
 //! them into grey levels. Textures are filtered to the pixel in closed form, so one sample is enough inside a face; pixels
 //! whose neighbours see another face cast `EDGE x EDGE` rays. For each tile only the solids that meet the tile's cone are
-//! tried, nearest first.
+//! listed, of them for each block of 4 pixels those that meet its cone, and these are tried, nearest first.
 //!
 //! Work is split over threads by tile rows, and every random number is a hash of (seed, frame, camera, pixel), so the image
 //! does not depend on the number of threads. There is no motion blur. Under a rolling shutter every row has a view of its
@@ -16,9 +16,12 @@ use crate::types::Pose;
 use glam::{DVec2, Quat, Vec2, Vec3};
 use std::thread::Builder;
 
-/// Side of a tile, pixels, and of the grid of rays of an edge pixel.
+/// Side of a tile, of the blocks in it, pixels, and of the grid of rays of an edge pixel.
 const TILE: usize = 16;
+const BLOCK: usize = 4;
 const EDGE: usize = 4;
+/// What rounding may take from the radius of a sphere, m.
+const ROUNDED: f32 = 1e-4;
 /// Motion of a rig in half a tile's rows under a rolling shutter, m and rad: 20 m/s and 20 rad/s for 1 ms.
 const ROLL_MOVE: f32 = 0.02;
 const ROLL_TURN: f32 = 0.02;
@@ -52,6 +55,8 @@ pub struct Lens {
     /// Angle a pixel spans, rad.
     pixel_angle: Vec<f32>,
     cones: Vec<Cone>,
+    /// Those of the blocks of 4 pixels, row-major.
+    blocks: Vec<Cone>,
 }
 
 #[derive(Clone, Copy)]
@@ -68,12 +73,15 @@ pub struct View {
     pub origin: Vec3,
     /// `world_from_cam`.
     pub turn: Quat,
+    /// The cell of the room that it is in.
+    pub cell: usize,
 }
 
 impl View {
     /// The view of a camera's pose.
-    pub fn new(world_from_cam: &Pose) -> View {
-        View { origin: world_from_cam.p.as_vec3(), turn: world_from_cam.q.as_quat() }
+    pub fn new(room: &Room, world_from_cam: &Pose) -> View {
+        let origin = world_from_cam.p.as_vec3();
+        View { origin, turn: world_from_cam.q.as_quat(), cell: room.cell_of(origin) }
     }
 }
 
@@ -120,9 +128,20 @@ struct SolidInView {
     solid: u32,
     /// Nearest it can be, m.
     near: f32,
+    /// Centre from the camera, and the radius of the sphere around it that holds the solid, m.
+    centre: Vec3,
+    reach: f32,
     axis: Vec3,
     cos: f32,
     sin: f32,
+}
+
+impl SolidInView {
+    /// Whether a unit ray may meet it.
+    #[inline]
+    fn may_meet(&self, d: Vec3) -> bool {
+        (self.centre - d * self.centre.dot(d)).length_squared() <= self.reach * self.reach
+    }
 }
 
 /// Memory that is reused between frames: nothing here allocates after construction.
@@ -132,10 +151,11 @@ pub struct Scratch {
     pub hits: Vec<Hit>,
 }
 
-/// The lists of one thread: all solids nearest first, and those of a tile.
+/// The lists of one thread: all solids nearest first, those of a tile, and those of a block of it.
 struct Lists {
     seen: Vec<SolidInView>,
     tile: Vec<SolidInView>,
+    block: Vec<SolidInView>,
 }
 
 impl Lists {
@@ -150,7 +170,14 @@ impl Lists {
     fn tile(&mut self, lens: &Lens, rows: Rows, tx: usize, ty: usize) {
         let slack = if rows.roll() { ROLL_TURN } else { 0.0 };
         let cone = &lens.cones[ty * lens.tiles_across() + tx];
-        tile_list(&self.seen, cone, rows.at(ty * TILE + TILE / 2).view, slack, &mut self.tile);
+        list_within(&self.seen, cone, rows.at(ty * TILE + TILE / 2).view, slack, &mut self.tile);
+    }
+
+    /// Lists the solids of a block of a tile that is listed.
+    fn block(&mut self, lens: &Lens, rows: Rows, bx: usize, by: usize) {
+        let slack = if rows.roll() { ROLL_TURN } else { 0.0 };
+        let cone = &lens.blocks[by * lens.width.div_ceil(BLOCK) + bx];
+        list_within(&self.tile, cone, rows.at(by * BLOCK / TILE * TILE + TILE / 2).view, slack, &mut self.block);
     }
 }
 
@@ -160,7 +187,8 @@ impl Scratch {
         let n = room.solids.len();
         Scratch {
             lists: (0..threads.max(1))
-                .map(|_| Lists { seen: Vec::with_capacity(n), tile: Vec::with_capacity(n) })
+                .map(|_| [(); 3].map(|()| Vec::with_capacity(n)))
+                .map(|[seen, tile, block]| Lists { seen, tile, block })
                 .collect(),
             hits: vec![Hit { distance: 0.0, face: NOTHING }; pixels],
         }
@@ -173,25 +201,26 @@ impl Lens {
         let (width, height) = (camera.width, camera.height);
         let at = |i: usize| camera.unproject(DVec2::new((i % width) as f64, (i / width) as f64));
         let bearings: Vec<Vec3> = (0..width * height).map(|i| at(i).map_or(Vec3::ZERO, |b| b.as_vec3())).collect();
-        let mut lens = Lens { width, height, bearings, pixel_angle: vec![0.0; width * height], cones: Vec::new() };
+        let mut lens =
+            Lens { width, height, bearings, pixel_angle: vec![0.0; width * height], cones: vec![], blocks: vec![] };
         for i in 0..width * height {
             if lens.bearings[i] != Vec3::ZERO {
                 let (du, dv) = lens.gradients(i % width, i / width);
                 lens.pixel_angle[i] = du.cross(dv).length().sqrt();
             }
         }
-        for ty in 0..height.div_ceil(TILE) {
-            for tx in 0..width.div_ceil(TILE) {
-                lens.cones.push(lens.cone(tx, ty));
-            }
-        }
+        let cones = |side: usize| -> Vec<Cone> {
+            let (across, down) = (width.div_ceil(side), height.div_ceil(side));
+            (0..across * down).map(|k| lens.cone(side, k % across, k / across)).collect()
+        };
+        (lens.cones, lens.blocks) = (cones(TILE), cones(BLOCK));
         lens
     }
 
-    fn cone(&self, tx: usize, ty: usize) -> Cone {
+    fn cone(&self, side: usize, tx: usize, ty: usize) -> Cone {
         let rays = || {
-            let ys = ty * TILE..((ty + 1) * TILE).min(self.height);
-            let row = move |y: usize| y * self.width + tx * TILE..y * self.width + ((tx + 1) * TILE).min(self.width);
+            let ys = ty * side..((ty + 1) * side).min(self.height);
+            let row = move |y: usize| y * self.width + tx * side..y * self.width + ((tx + 1) * side).min(self.width);
             ys.flat_map(row).filter(|i| self.pixel_angle[*i] > 0.0)
         };
         let axis = rays().map(|i| self.bearings[i]).sum::<Vec3>().normalize_or_zero();
@@ -228,22 +257,22 @@ impl Lens {
 /// Finds distance and face at every pixel centre, into `scratch.hits`.
 pub fn cast(room: &Room, lens: &Lens, rows: Rows, scratch: &mut Scratch) {
     let hits = &mut scratch.hits[..lens.width * lens.height];
-    fill(room, lens, rows, hits, &mut scratch.lists, |tile, x, y| {
+    fill(room, lens, rows, hits, &mut scratch.lists, |block, x, y| {
         let (view, d) = (rows.at(y).view, lens.bearings[y * lens.width + x]);
         if d == Vec3::ZERO {
             return Hit { distance: 0.0, face: NOTHING };
         }
-        meet(room, tile.solids(), view.origin, view.turn * d)
+        meet(room, block.solids(), &view, view.turn * d)
     });
 }
 
 /// Writes grey levels from the hits of the last `cast` of the same rows.
 pub fn shade(room: &Room, lens: &Lens, rows: Rows, exposure: &Exposure, scratch: &mut Scratch, out: &mut [u8]) {
     let hits = &scratch.hits[..lens.width * lens.height];
-    fill(room, lens, rows, out, &mut scratch.lists, |tile, x, y| {
+    fill(room, lens, rows, out, &mut scratch.lists, |block, x, y| {
         let (i, Row { view, gain, offset }) = (y * lens.width + x, *rows.at(y));
         let light = if is_edge(hits, lens, x, y) {
-            edge_radiance(room, lens, view, tile.solids(), (x, y), exposure.channel)
+            edge_radiance(room, lens, view, block.solids(), (x, y), exposure.channel)
         } else if hits[i].face == NOTHING {
             0.0
         } else {
@@ -279,24 +308,32 @@ pub fn depths(lens: &Lens, hits: &[Hit], out: &mut [f32]) {
     }
 }
 
-/// A tile of an image, and the solids that its rays may meet, listed when they are first asked for.
-struct Tile<'a> {
+/// A block of a tile, and the solids that its rays may meet, listed when they are first asked for.
+struct Block<'a> {
     lens: &'a Lens,
     rows: Rows<'a>,
     lists: &'a mut Lists,
+    tile_listed: bool,
     listed: bool,
     x: usize,
     y: usize,
 }
 
-impl Tile<'_> {
+impl Block<'_> {
     #[inline]
     fn solids(&mut self) -> &[SolidInView] {
         if !self.listed {
-            self.lists.tile(self.lens, self.rows, self.x, self.y);
-            self.listed = true;
+            self.list();
         }
-        &self.lists.tile
+        &self.lists.block
+    }
+
+    fn list(&mut self) {
+        if !self.tile_listed {
+            self.lists.tile(self.lens, self.rows, self.x * BLOCK / TILE, self.y * BLOCK / TILE);
+        }
+        self.lists.block(self.lens, self.rows, self.x, self.y);
+        (self.tile_listed, self.listed) = (true, true);
     }
 }
 
@@ -308,7 +345,7 @@ fn fill<T: Send>(
     rows: Rows,
     pixels: &mut [T],
     lists: &mut [Lists],
-    pixel: impl Fn(&mut Tile, usize, usize) -> T + Sync,
+    pixel: impl Fn(&mut Block, usize, usize) -> T + Sync,
 ) {
     let band_rows = lens.height.div_ceil(TILE).div_ceil(lists.len()) * TILE;
     let work = |k: usize, band: &mut [T], lists: &mut Lists| {
@@ -316,10 +353,15 @@ fn fill<T: Send>(
         for ty in first / TILE..end.div_ceil(TILE) {
             lists.look_around(room, rows, ty, ty == first / TILE);
             for tx in 0..lens.tiles_across() {
-                let mut tile = Tile { lens, rows, lists, listed: false, x: tx, y: ty };
-                for y in ty * TILE..((ty + 1) * TILE).min(end) {
-                    for x in tx * TILE..((tx + 1) * TILE).min(lens.width) {
-                        band[(y - first) * lens.width + x] = pixel(&mut tile, x, y);
+                let mut block = Block { lens, rows, lists, tile_listed: false, listed: false, x: 0, y: 0 };
+                for k in 0..(TILE / BLOCK).pow(2) {
+                    (block.x, block.y) =
+                        ((tx * TILE / BLOCK) + k % (TILE / BLOCK), (ty * TILE / BLOCK) + k / (TILE / BLOCK));
+                    block.listed = false;
+                    for y in block.y * BLOCK..((block.y + 1) * BLOCK).min(end) {
+                        for x in block.x * BLOCK..((block.x + 1) * BLOCK).min(lens.width) {
+                            band[(y - first) * lens.width + x] = pixel(&mut block, x, y);
+                        }
                     }
                 }
             }
@@ -339,23 +381,23 @@ fn fill<T: Send>(
     });
 }
 
-/// Lists all solids from a view, nearest first.
+/// Lists all solids that a view may see, nearest first.
 fn look_around(room: &Room, view: View, slack: f32, seen: &mut Vec<SolidInView>) {
     seen.clear();
-    for (k, s) in room.solids.iter().enumerate() {
+    room.visible(view.cell, view.origin, slack, |k, s| {
         let c = s.centre - view.origin;
         let range = c.length().max(1e-6);
         let bound = s.bound + slack;
         let sin = (bound / range).min(1.0);
         let cos = (1.0 - sin * sin).sqrt();
         let near = (range - bound).max(0.0);
-        seen.push(SolidInView { solid: k as u32, near, axis: c / range, cos, sin });
-    }
+        seen.push(SolidInView { solid: k as u32, near, centre: c, reach: bound + ROUNDED, axis: c / range, cos, sin });
+    });
     seen.sort_unstable_by(|a, b| a.near.total_cmp(&b.near).then(a.solid.cmp(&b.solid)));
 }
 
 /// Lists the solids whose bounding sphere may meet the cone.
-fn tile_list(seen: &[SolidInView], cone: &Cone, view: View, slack: f32, list: &mut Vec<SolidInView>) {
+fn list_within(seen: &[SolidInView], cone: &Cone, view: View, slack: f32, list: &mut Vec<SolidInView>) {
     list.clear();
     let axis = view.turn * cone.axis;
     list.extend(seen.iter().filter(|s| {
@@ -367,13 +409,15 @@ fn tile_list(seen: &[SolidInView], cone: &Cone, view: View, slack: f32, list: &m
 }
 
 #[inline]
-fn meet(room: &Room, list: &[SolidInView], o: Vec3, d: Vec3) -> Hit {
-    let mut best = room.shell(o, d);
+fn meet(room: &Room, list: &[SolidInView], view: &View, d: Vec3) -> Hit {
+    let mut best = room.shell(view.cell, view.origin, d);
     for s in list {
         if s.near > best.0 {
             break;
         }
-        room.solids[s.solid as usize].meet(o, d, &mut best);
+        if s.may_meet(d) {
+            room.solids[s.solid as usize].meet(view.origin, d, &mut best);
+        }
     }
     Hit { distance: best.0, face: best.1 }
 }
@@ -410,7 +454,7 @@ fn radiance(room: &Room, view: View, d: Vec3, hit: Hit, angle: f32, channel: Opt
     };
     let footprint = Vec2::new(slide(place.u), slide(place.v)) * (angle * hit.distance);
     let spot = Spot { at: place.at, footprint, size: face.size };
-    let light = texture::albedo(face.material, face.seed, spot) * room.light_map.at(hit.face as usize, place.at);
+    let light = texture::albedo(face.material, face.seed, spot) * room.light(hit.face as usize, place.at);
     channel.map_or(light, |c| light * texture::tint(face.material, face.seed)[c])
 }
 
@@ -429,11 +473,24 @@ fn edge_radiance(
     let (du, dv) = lens.gradients(x, y);
     let (du, dv) = (view.turn * du / EDGE as f32, view.turn * dv / EDGE as f32);
     let corner = view.turn * lens.bearings[y * lens.width + x] - (du + dv) * (0.5 * (EDGE - 1) as f32);
+    let ray = |k: usize| {
+        let d = (corner + du * (k % EDGE) as f32 + dv * (k / EDGE) as f32).normalize();
+        (meet(room, list, &view, d), d)
+    };
+    // In a building what is thinner than a pixel is too far to matter; in one room images are as they always were.
+    if room.cells.len() > 1 {
+        let ends = [0, EDGE - 1, RAYS - EDGE, RAYS - 1].map(ray);
+        let face = ends[0].0.face;
+        if ends.iter().all(|(hit, _)| hit.face == face) {
+            let middle = ends.iter().map(|(hit, d)| *d * hit.distance).sum::<Vec3>() * 0.25;
+            let distance = middle.length();
+            return radiance(room, view, middle / distance, Hit { distance, face }, angle, channel);
+        }
+    }
     let mut parts = [(NOTHING, 0.0f32, Vec3::ZERO); RAYS];
     let mut used = 0;
     for k in 0..RAYS {
-        let d = (corner + du * (k % EDGE) as f32 + dv * (k / EDGE) as f32).normalize();
-        let hit = meet(room, list, view.origin, d);
+        let (hit, d) = ray(k);
         let part = parts[..used].iter().position(|p| p.0 == hit.face).unwrap_or(used);
         used = used.max(part + 1);
         let (_, n, sum) = parts[part];

@@ -1,13 +1,15 @@
 //! The room: solids with analytic ray intersection, faces that carry material and light.
 //!
-//! A `Room` is one box seen from inside and solids in it: blocks (boxes turned about z), balls and drums (upright
+//! A `Room` is a box seen from inside, or several that are joined (`room/cells.rs`), and solids in it: blocks (boxes turned about z), balls and drums (upright
 //! cylinders). `nearest` finds the face that a ray meets first, exactly. Furniture is in `furnish.rs`, baked light in
 //! `room/light.rs`, surface patterns in `texture.rs`. World frame: z up, metres, f32 (1e-7 of a metre is finer than any sensor
 //! here).
 
+mod cells;
 mod light;
 
-pub use light::LightMap;
+pub use cells::{Cell, Opening, CELLS_MAX};
+pub use light::{LightMap, AMBIENT};
 
 use super::texture::{Material, CEILING_TILE, PARQUET};
 use glam::{Vec2, Vec3};
@@ -83,42 +85,66 @@ pub struct Light {
     pub power: f32,
 }
 
-/// A box seen from inside, its furniture and its light.
+/// Boxes seen from inside, their furniture and their light.
 pub struct Room {
     /// Corner of least coordinates, m.
     pub low: Vec3,
     /// Corner of largest coordinates, m.
     pub high: Vec3,
-    /// Furniture.
+    /// One, or those of a building.
+    pub cells: Vec<Cell>,
+    /// Furniture: that of each cell, then what is in no cell's list.
     pub solids: Vec<Solid>,
-    /// The first six are the room's: -x, +x, -y, +y, floor, ceiling.
+    /// The first six are the first cell's: -x, +x, -y, +y, floor, ceiling.
     pub faces: Vec<Face>,
     /// Lamps.
     pub lights: Vec<Light>,
     /// Light of the lamps on every face.
     pub light_map: LightMap,
+    /// Light of other lamps, where it changes.
+    pub later: Option<LightMap>,
+    /// Share of the other light, 0 to 1, a ratio.
+    pub late: f32,
 }
 
 impl Room {
     /// An empty room, dark until `light_map` is baked.
     pub fn empty(low: Vec3, high: Vec3, walls: [Material; 4], seed: u32) -> Room {
+        let [w0, w1, w2, w3] = walls;
+        let mut room = Room {
+            low,
+            high,
+            cells: Vec::new(),
+            solids: Vec::new(),
+            faces: Vec::new(),
+            lights: Vec::new(),
+            light_map: LightMap::default(),
+            later: None,
+            late: 0.0,
+        };
+        room.add_cell(low, high, [w0, w1, w2, w3, PARQUET, CEILING_TILE], seed);
+        room
+    }
+
+    /// Adds a cell without openings and furniture; `materials` of -x, +x, -y, +y, floor and ceiling.
+    pub fn add_cell(&mut self, low: Vec3, high: Vec3, materials: [Material; 6], seed: u32) {
         let e = high - low;
         let (x, y, z) = (Vec3::X, Vec3::Y, Vec3::Z);
         let corner = |x: f32, y: f32| Vec3::new(x, y, low.z);
-        let wall = |origin, u, width: f32, k: usize| {
-            face(origin, u, z, Vec2::new(width, e.z), walls[k], seed.wrapping_add(k as u32))
-        };
+        let (first, at) = (self.faces.len(), self.solids.len());
         let flat = Vec2::new(e.x, e.y);
-        let ceiling = Vec3::new(low.x, high.y, high.z);
-        let faces = vec![
-            wall(corner(low.x, low.y), y, e.y, 0),
-            wall(corner(high.x, high.y), -y, e.y, 1),
-            wall(corner(high.x, low.y), -x, e.x, 2),
-            wall(corner(low.x, high.y), x, e.x, 3),
-            face(corner(low.x, low.y), x, y, flat, PARQUET, seed.wrapping_add(4)),
-            face(ceiling, x, -y, flat, CEILING_TILE, seed.wrapping_add(5)),
+        let charts = [
+            (corner(low.x, low.y), y, z, Vec2::new(e.y, e.z)),
+            (corner(high.x, high.y), -y, z, Vec2::new(e.y, e.z)),
+            (corner(high.x, low.y), -x, z, Vec2::new(e.x, e.z)),
+            (corner(low.x, high.y), x, z, Vec2::new(e.x, e.z)),
+            (corner(low.x, low.y), x, y, flat),
+            (Vec3::new(low.x, high.y, high.z), x, -y, flat),
         ];
-        Room { low, high, solids: Vec::new(), faces, lights: Vec::new(), light_map: LightMap::default() }
+        for (k, ((origin, u, v, size), material)) in charts.into_iter().zip(materials).enumerate() {
+            self.faces.push(face(origin, u, v, size, material, seed.wrapping_add(k as u32)));
+        }
+        self.cells.push(Cell { low, high, face: first as u32, solids: at..at, openings: Vec::new() });
     }
 
     /// Adds a block standing on `base` (the centre of its underside); `turn` is (cos, sin) about z.
@@ -168,32 +194,9 @@ impl Room {
         self.solids.push(Solid { shape, centre, cos: 1.0, sin: 0.0, face: first, bound });
     }
 
-    /// The distance at which a ray from inside leaves the room, and the face.
-    #[inline]
-    pub fn shell(&self, o: Vec3, d: Vec3) -> (f32, u32) {
-        let far = |o: f32, d: f32, low: f32, high: f32, face: u32| {
-            if d > 0.0 {
-                ((high - o) / d, face + 1)
-            } else if d < 0.0 {
-                ((low - o) / d, face)
-            } else {
-                (f32::INFINITY, face)
-            }
-        };
-        let x = far(o.x, d.x, self.low.x, self.high.x, 0);
-        let y = far(o.y, d.y, self.low.y, self.high.y, 2);
-        let z = far(o.z, d.z, self.low.z, self.high.z, 4);
-        let xy = if y.0 < x.0 { y } else { x };
-        if z.0 < xy.0 {
-            z
-        } else {
-            xy
-        }
-    }
-
     /// The first surface along a unit ray: distance and face.
     pub fn nearest(&self, o: Vec3, d: Vec3) -> (f32, u32) {
-        let mut best = self.shell(o, d);
+        let mut best = self.shell(self.cell_of(o), o, d);
         for s in &self.solids {
             if s.may_meet(o, d, best.0) {
                 s.meet(o, d, &mut best);
@@ -202,21 +205,14 @@ impl Room {
         best
     }
 
-    /// Whether a solid stands between `o` and the point `reach` along the unit ray.
-    pub fn blocked(&self, o: Vec3, d: Vec3, reach: f32) -> bool {
-        let mut best = (reach, NOTHING);
-        self.solids.iter().any(|s| {
-            if s.may_meet(o, d, reach) {
-                s.meet(o, d, &mut best);
-            }
-            best.1 != NOTHING
-        })
-    }
-
-    /// Distance from a point to the nearest solid or wall; zero or negative inside one.
-    pub fn clearance(&self, p: Vec3) -> f32 {
-        let wall = (p - self.low).min(self.high - p).min_element();
-        self.solids.iter().map(|s| s.distance(p)).fold(wall, f32::min)
+    /// The light at a surface coordinate of a face.
+    #[inline]
+    pub fn light(&self, face: usize, at: Vec2) -> f32 {
+        let now = self.light_map.at(face, at);
+        match &self.later {
+            Some(later) if self.late > 0.0 => now + self.late * (later.at(face, at) - now),
+            _ => now,
+        }
     }
 }
 

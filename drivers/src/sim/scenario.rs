@@ -1,11 +1,13 @@
 //! What to simulate: a rig, a path and a seed. The same scenario gives the same bytes.
 //!
-//! Named scenarios fly in a room of 8 x 6 x 3.5 m and begin with a second at rest. A recorded scenario takes its path (and,
+//! Named scenarios fly in a room of 8 x 6 x 3.5 m, patrols in a building (`patrol`), and begin with a second at rest. A recorded scenario takes its path (and,
 //! if given, its inertial samples) from csv files in EuRoC's format.
 
 use super::imu::{Bias, ImuErrors};
+use super::patrol::{Extent, Plan, RoomBox, Route};
 use super::recording;
 use super::render::Sensor;
+use super::way::{look, smooth, under_way, REST};
 use crate::calibration::{Calibration, ImuCalibration, ImuCorrection, RigCamera};
 use crate::camera::{Camera, Lens};
 use crate::fault::Fault;
@@ -91,6 +93,8 @@ pub enum Flight {
         rest: f64,
         hover: f64,
     },
+    /// Through a building, every room twice, in other light the second time.
+    Patrol(Extent),
     Recorded(Recording),
 }
 
@@ -105,18 +109,19 @@ pub struct Recording {
     pub imu: Option<Vec<ImuSample>>,
 }
 
-const NAMED: [(&str, Flight, f64); 6] = [
+const NAMED: [(&str, Flight, f64); 8] = [
     ("demo", Flight::Demo, 10.0),
     ("hover", Flight::Hover, 10.0),
     ("circle", Flight::Circle, 12.0),
     ("aggressive", Flight::Aggressive, 12.0),
     ("static", Flight::Static, 5.0),
     ("pauses", Flight::Pauses { rest: 60.0, hover: 20.0 }, 100.0),
+    ("patrol-two", Flight::Patrol(Extent::Two), 85.0),
+    ("patrol", Flight::Patrol(Extent::Whole), 600.0),
 ];
 
-/// Time at rest at the start, and time in which the flight gathers way, s.
-const REST: f64 = 1.2;
-const GATHER: f64 = 1.2;
+/// Frames a second of a patrol: at its speed the view moves by as much between two as elsewhere.
+const PATROL_HZ: f64 = 10.0;
 /// `Pauses`: length of each of its two flights, s; of landing, of taking off and of coming to hover, s; height of the landed
 /// body, m; share of `Hover`'s motion that is left.
 pub const PAUSE_FLIGHT: f64 = 10.0;
@@ -134,11 +139,29 @@ impl Scenario {
     pub fn named(name: &str) -> Option<Scenario> {
         let (name, flight, secs) = NAMED.iter().find(|n| n.0 == name)?;
         let mut scenario = Scenario::flying(name, flight.clone(), *secs);
-        if matches!(flight, Flight::Demo | Flight::Pauses { .. }) {
+        if matches!(flight, Flight::Demo | Flight::Pauses { .. } | Flight::Patrol(_)) {
             // Maps in minutes on a software rasteriser; a flight of minutes.
             scenario.image_divisor = 2;
         }
+        if matches!(flight, Flight::Patrol(_)) {
+            scenario.rate_hz = PATROL_HZ;
+        }
         Some(scenario)
+    }
+
+    /// The rooms of a patrol, and the parts of its corridors; none of another flight.
+    pub fn rooms(&self) -> &'static [RoomBox] {
+        self.path.plan().map_or(&[], |plan| plan.rooms)
+    }
+
+    /// The index of the room in which a point of the world is.
+    pub fn room_at(&self, p: DVec3) -> Option<usize> {
+        self.rooms().iter().position(|r| r.contains(p))
+    }
+
+    /// When the second round of a patrol begins, from the start.
+    pub fn second_round(&self) -> Option<Span> {
+        self.path.plan().map(|plan| Route::new(plan).second_round())
     }
 
     /// The flight of a EuRoC `state_groundtruth_estimate0` csv, with the inertial samples of `imu` (EuRoC `imu0` csv) or,
@@ -267,12 +290,20 @@ impl Flight {
         (PAUSE_FLIGHT + rest..PAUSE_FLIGHT + rest + hover).contains(&t)
     }
 
-    /// `world_from_cam0` of an invented flight, `t` seconds from its start. The room is centred on the origin with its floor
-    /// at z = 0. `None` for a recording.
+    pub(super) fn plan(&self) -> Option<&'static Plan> {
+        if let Flight::Patrol(extent) = self {
+            Some(extent.plan())
+        } else {
+            None
+        }
+    }
+
+    /// `world_from_cam0` of a flight in one room, `t` seconds from its start. The room is centred on the origin with its floor
+    /// at z = 0. `None` for a recording and a patrol.
     pub fn look(&self, t: f64) -> Option<Pose> {
         let s = way(t);
         Some(match self {
-            Flight::Recorded(_) => return None,
+            Flight::Recorded(_) | Flight::Patrol(_) => return None,
             Flight::Static => look(DVec3::new(0.3, -0.4, 1.4), 0.9, -0.1, 0.0),
             Flight::Hover => {
                 let (p, turn) = wobble(s);
@@ -310,17 +341,6 @@ fn way(t: f64) -> f64 {
     under_way(t - REST)
 }
 
-fn under_way(t: f64) -> f64 {
-    let h = (t / GATHER).clamp(0.0, 1.0);
-    GATHER * (h * h * h - 0.5 * h * h * h * h) + (t - GATHER).max(0.0)
-}
-
-/// From 0 at 0 to 1 at 1, with two derivatives that are zero at both.
-pub(super) fn smooth(x: f64) -> f64 {
-    let x = x.clamp(0.0, 1.0);
-    x * x * x * (10.0 - 15.0 * x + 6.0 * x * x)
-}
-
 /// Displacement, m, and turn (yaw, pitch, roll) of a multicopter that holds its place.
 fn wobble(s: f64) -> (DVec3, DVec3) {
     let w = |f: f64| (TAU * f * s).sin();
@@ -335,12 +355,4 @@ fn round(s: f64) -> (DVec3, [f64; 3]) {
     let a = 0.766 * s;
     let p = DVec3::new(1.6 * a.cos(), 1.05 * a.sin(), 1.35 + 0.3 * (2.0 * a).sin());
     (p, [a + 0.35 * (2.0 * a).sin(), -0.12 + 0.14 * (3.0 * a).sin(), 0.08 * (2.5 * a).sin()])
-}
-
-/// `world_from_cam` at `p`, looking along `yaw` (from x towards y) and `pitch` (up), rolled clockwise.
-fn look(p: DVec3, yaw: f64, pitch: f64, roll: f64) -> Pose {
-    let forward = DVec3::new(yaw.cos() * pitch.cos(), yaw.sin() * pitch.cos(), pitch.sin());
-    let right = DVec3::new(yaw.sin(), -yaw.cos(), 0.0);
-    let level = DQuat::from_mat3(&DMat3::from_cols(right, forward.cross(right), forward));
-    Pose::new(level * DQuat::from_rotation_z(roll), p)
 }

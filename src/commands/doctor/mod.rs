@@ -159,7 +159,7 @@ fn gather(input: Input, board: &Board, look_s: f64) -> Result<(Gathered, Flown),
     let observer = move |packet: &FramePacket| shared.lock().unwrap_or_else(PoisonError::into_inner).add(packet);
     let (mut flown, _) = observe(input, board, Some(look_s), None, Box::new(observer), &mut Status::silent())?;
     // The observer's own handle goes with its tracker.
-    flown.tracker = crate::run::tracking::Tracker::Table(vec![]);
+    flown.tracker = crate::run::tracking::Tracker::Table(Default::default());
     let seen =
         Arc::into_inner(seen).expect("the observer is gone").into_inner().unwrap_or_else(PoisonError::into_inner);
     Ok((seen, flown))

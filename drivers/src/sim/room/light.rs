@@ -24,7 +24,7 @@ struct Grid {
 }
 
 /// Ambient light of a point whose whole hemisphere is open.
-const AMBIENT: f32 = 0.6;
+pub const AMBIENT: f32 = 0.6;
 /// Surfaces nearer than this block ambient light, m.
 const AMBIENT_REACH: f32 = 0.9;
 const AMBIENT_RAYS: usize = 24;
@@ -36,8 +36,8 @@ const SOFTEN: f32 = 0.8;
 const FAINT: f32 = 0.02;
 
 impl LightMap {
-    /// Computes the light of a room at nodes every `pitch` metres, two a side at least.
-    pub fn bake(room: &Room, pitch: f32, threads: usize) -> LightMap {
+    /// Computes the light of a room's lamps, and so much ambient light, at nodes every `pitch` metres, two a side at least.
+    pub fn bake(room: &Room, ambient: f32, pitch: f32, threads: usize) -> LightMap {
         let mut grids = Vec::with_capacity(room.faces.len());
         let mut first = 0;
         for face in &room.faces {
@@ -58,7 +58,7 @@ impl LightMap {
                         let f = grids.partition_point(|g| g.first <= i) - 1;
                         let (g, i) = (&grids[f], i - grids[f].first);
                         let at = Vec2::new((i % g.columns) as f32, (i / g.columns) as f32) / g.density;
-                        *node = irradiance(room, &room.faces[f], at, &mut near);
+                        *node = irradiance(room, &room.faces[f], at, ambient, &mut near);
                     }
                 };
                 Builder::new().name("light".into()).spawn_scoped(scope, bake).expect("the system starts a few threads");
@@ -90,19 +90,20 @@ impl LightMap {
 }
 
 /// The irradiance of one node; `near` is scratch.
-fn irradiance(room: &Room, face: &Face, at: Vec2, near: &mut Vec<Solid>) -> f32 {
+fn irradiance(room: &Room, face: &Face, at: Vec2, full: f32, near: &mut Vec<Solid>) -> f32 {
     // Nodes on an edge are pulled in, so that they see what the face sees.
     let margin = face.size.min_element() * 0.02;
     let at = at.clamp(Vec2::splat(margin), face.size - margin);
     let (p, n) = face.point(at);
     let p = p + n * 2e-3;
-    let lamps: f32 = room.lights.iter().map(|l| lamp(room, l, p, n)).sum();
+    let cell = room.cell_of(p);
+    let lamps: f32 = room.lights.iter().map(|l| lamp(room, l, cell, p, n)).sum();
     near.clear();
     near.extend(room.solids.iter().filter(|s| s.centre.distance(p) < s.bound + AMBIENT_REACH));
-    lamps + ambient(room, near, p, n)
+    lamps + ambient(room, near, cell, (p, n), full)
 }
 
-fn lamp(room: &Room, light: &Light, p: Vec3, n: Vec3) -> f32 {
+fn lamp(room: &Room, light: &Light, cell: usize, p: Vec3, n: Vec3) -> f32 {
     let to = light.at - p;
     let full = light.power * n.dot(to).max(0.0) / (to.length() * (to.length_squared() + SOFTEN));
     if full < FAINT {
@@ -113,14 +114,15 @@ fn lamp(room: &Room, light: &Light, p: Vec3, n: Vec3) -> f32 {
         let corner = Vec3::new((k & 1) as f32 - 0.5, (k >> 1) as f32 - 0.5, 0.0) * LAMP;
         let to = light.at + corner - p;
         let reach = to.length();
-        if !room.blocked(p, to / reach, reach) {
+        if !room.blocked(cell, p, to / reach, reach) {
             seen += 0.25;
         }
     }
     full * seen
 }
 
-fn ambient(room: &Room, near: &[Solid], p: Vec3, n: Vec3) -> f32 {
+/// The ambient light of a point; `full` is that of one whose whole hemisphere is open.
+fn ambient(room: &Room, near: &[Solid], cell: usize, (p, n): (Vec3, Vec3), full: f32) -> f32 {
     let (u, v) = n.any_orthonormal_pair();
     let mut open = 0.0;
     for k in 0..AMBIENT_RAYS {
@@ -128,11 +130,11 @@ fn ambient(room: &Room, near: &[Solid], p: Vec3, n: Vec3) -> f32 {
         let r = ((k as f32 + 0.5) / AMBIENT_RAYS as f32).sqrt();
         let (sin, cos) = (k as f32 * 2.399_963).sin_cos();
         let d = u * (r * cos) + v * (r * sin) + n * (1.0 - r * r).sqrt();
-        let mut first = room.shell(p, d);
+        let mut first = room.shell(cell, p, d);
         for s in near {
             s.meet(p, d, &mut first);
         }
         open += (first.0 / AMBIENT_REACH).min(1.0);
     }
-    AMBIENT * open / AMBIENT_RAYS as f32
+    full * open / AMBIENT_RAYS as f32
 }

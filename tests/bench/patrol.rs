@@ -1,0 +1,270 @@
+//! `stipple-bench patrol`: the map of a flight through a building that visits every room twice, by room and by visit.
+//!
+//! The flight is rendered as it is flown, in lockstep: nothing of it is stored, so the program's memory is all there is to
+//! see. A keyframe belongs to the room that its true place is in and to the round of its stamp; a Gaussian to the room that
+//! its mean is in, after the trajectory was put on the truth.
+
+use crate::page::{count, number, text, Page, Part, Table};
+use crate::run::default_board;
+use crate::{ply, table};
+use glam::DVec3;
+use serde_json::json;
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
+use std::sync::Arc;
+use stipple::config::Board;
+use stipple::map::KeyframeScore;
+use stipple::output::metrics::trajectory_error;
+use stipple::output::report::Report;
+use stipple::output::OutputDir;
+use stipple::run::sensors::{Input, Source};
+use stipple::run::{fly, Options, Pace, Spacing, Steps};
+use stipple_drivers::replay::read_trajectory;
+use stipple_drivers::sim::Scenario;
+use stipple_drivers::types::pose_at;
+use stipple_drivers::{host, Fault, FaultKind, Nanos, Pose, Span, TimedPose};
+
+/// Keyframes at true poses: as many as the estimator makes.
+const SPACING: Spacing = Spacing { moved_m: 0.5, turned_rad: 0.262, waited_s: 1.0 };
+/// Every so many keyframes one is held out.
+const HOLDOUT: u32 = 8;
+/// The patrol's cameras are small already.
+const SCALE: &str = "map.scale=1";
+/// Time of flight after which memory has to stay level, s.
+const SETTLED_S: f64 = 60.0;
+/// Truth has a pose every 5 ms.
+const TRUTH_HOLE: Span = Span(100_000_000);
+
+/// The map of a flight that visits every room of a building twice, by room and visit; flown in lockstep
+#[derive(clap::Args)]
+pub struct Args {
+    /// Folder for the results
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+    /// patrol (eight rooms, 10 min) or patrol-two (two rooms, 85 s)
+    #[arg(long, value_name = "NAME", default_value = "patrol")]
+    scenario: String,
+    /// Where poses come from
+    #[arg(long, value_enum, default_value = "odometry")]
+    poses: Poses,
+    /// Board file; without it the one for Vulkan on the CPU
+    #[arg(long, value_name = "FILE")]
+    board: Option<PathBuf>,
+    /// Mapping steps a frame
+    #[arg(long, value_name = "N", default_value_t = 2, value_parser = clap::value_parser!(u32).range(..=1000))]
+    steps: u32,
+    /// Seconds of the flight; without it all of it
+    #[arg(long, value_name = "S", value_parser = crate::seconds)]
+    seconds: Option<f64>,
+    /// Seed of the building and of the sensors' noise; without it the scenario's own
+    #[arg(long, value_name = "N")]
+    seed: Option<u64>,
+    /// Override a key of the board file
+    #[arg(long = "set", value_name = "SECTION.KEY=VALUE")]
+    set: Vec<String>,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, clap::ValueEnum)]
+enum Poses {
+    /// The simulator's, a keyframe each 0.5 m, 15 degrees or second
+    Truth,
+    /// Those of the estimator
+    Odometry,
+}
+
+/// Resident set in flight, bytes.
+#[derive(Default)]
+struct Resident {
+    settled: AtomicU64,
+    last: AtomicU64,
+}
+
+/// Means over the keyframes of a room in one round.
+#[derive(Clone, Debug, Default, PartialEq)]
+struct Visit {
+    keyframes: usize,
+    psnr_db: Option<f64>,
+    psnr_heldout_db: Option<f64>,
+}
+
+struct Row {
+    room: &'static str,
+    gaussians: usize,
+    rounds: [Visit; 2],
+}
+
+pub fn run(args: &Args) -> Result<(), Fault> {
+    let set: Vec<String> = std::iter::once(SCALE.to_string()).chain(args.set.iter().cloned()).collect();
+    let board = match &args.board {
+        Some(path) => Board::load(path, &set)?,
+        None => default_board(&set)?,
+    };
+    let mut scenario = Scenario::named(&args.scenario).filter(|s| !s.rooms().is_empty()).ok_or_else(|| {
+        let fix = "choose patrol or patrol-two";
+        Fault::new(FaultKind::Usage, &args.scenario, "is not a flight through a building", fix)
+    })?;
+    if let Some(s) = args.seconds {
+        scenario.duration = scenario.duration.min(Span::from_secs(s));
+    }
+    scenario.seed = args.seed.unwrap_or(scenario.seed);
+    let out = OutputDir::create(&args.out)?;
+    let resident = Arc::new(Resident::default());
+    let (seen, settled) = (resident.clone(), (SETTLED_S * scenario.rate_hz) as usize);
+    let input = Input::simulated(&scenario, move |frame, of| {
+        if frame == settled.min(of) || frame == of {
+            let bytes = host::rss_bytes().unwrap_or(0);
+            let _ = seen.settled.compare_exchange(0, bytes, Relaxed, Relaxed);
+            seen.last.store(bytes, Relaxed);
+        }
+    })?;
+    let (truth, first) = (input.truth.clone(), first_stamp(&input));
+    let pace = Pace::Lockstep(Steps::PerFrame(args.steps));
+    let at_truth = (args.poses == Poses::Truth).then_some(SPACING);
+    let options = Options { pace, at_truth, holdout: HOLDOUT, ..Options::default() };
+    let report = fly(input, &board, &out, &options, None)?.report;
+    let estimated = read_trajectory(&out.file("trajectory.tum"))?;
+    let world = trajectory_error(&estimated, &truth).map_or(Pose::IDENTITY, |e| e.truth_from_estimate);
+    let map = out.file("map.ply");
+    let means = if map.is_file() { ply::means(&map)? } else { vec![] };
+    let means: Vec<DVec3> = means.into_iter().map(|p| world.transform(p)).collect();
+    let rows = rows(&scenario, &truth, first, &report.quality.keyframe_scores, &means);
+    let page = page(args, &report, &resident, rows);
+    page.write(&out)?;
+    Ok(())
+}
+
+fn first_stamp(input: &Input) -> Nanos {
+    match &input.source {
+        Source::Recorded(r) => r.stamps.first().copied().unwrap_or_default(),
+        Source::Live { .. } => Nanos::default(),
+    }
+}
+
+/// A row for each room, and one for what is in none.
+fn rows(scenario: &Scenario, truth: &[TimedPose], first: Nanos, scores: &[KeyframeScore], means: &[DVec3]) -> Vec<Row> {
+    let names = scenario.rooms().iter().map(|r| Some(r.name)).chain([None]);
+    let place = |p: DVec3| scenario.room_at(p).unwrap_or(scenario.rooms().len());
+    let second = scenario.second_round().unwrap_or_default();
+    let mut seen: Vec<(usize, usize, &KeyframeScore)> = vec![];
+    for score in scores {
+        let t = Nanos(score.t_ns);
+        let Some(pose) = pose_at(truth, t, TRUTH_HOLE) else { continue };
+        seen.push((place(pose.p), usize::from((t - first).0 >= second.0), score));
+    }
+    let mut gaussians = vec![0; scenario.rooms().len() + 1];
+    means.iter().for_each(|p| gaussians[place(*p)] += 1);
+    let visit = |room: usize, round: usize| {
+        let of: Vec<&KeyframeScore> = seen.iter().filter(|s| (s.0, s.1) == (room, round)).map(|s| s.2).collect();
+        let mean = |held_out: bool| {
+            let db: Vec<f64> = of.iter().filter(|s| s.held_out == held_out).filter_map(|s| s.psnr_db).collect();
+            (!db.is_empty()).then(|| db.iter().sum::<f64>() / db.len() as f64)
+        };
+        Visit { keyframes: of.len(), psnr_db: mean(false), psnr_heldout_db: mean(true) }
+    };
+    let row = |(k, name): (usize, Option<&'static str>)| Row {
+        room: name.unwrap_or("elsewhere"),
+        gaussians: gaussians[k],
+        rounds: [0, 1].map(|round| visit(k, round)),
+    };
+    names.enumerate().map(row).collect()
+}
+
+const NOTE: &str = "Rounds 1 and 2 are the first and the second visit of every room. Keyframes are those that the map keeps at the end of the flight, each judged then; PSNR is the mean over them, of those trained on and of those held out.";
+
+fn page(args: &Args, report: &Report, resident: &Resident, rows: Vec<Row>) -> Page {
+    let [settled, last] = [&resident.settled, &resident.last].map(|bytes| bytes.load(Relaxed));
+    let mib = |bytes: u64| bytes as f64 / 1048576.0;
+    let ms = |v: Option<f64>| v.map_or("-".into(), |v| format!("{v:.1} ms"));
+    let db = |v: Option<f64>| v.map_or("-".into(), |v| format!("{v:.2} dB"));
+    let all = format!(
+        "{} frames, {} keyframes, {} Gaussians, {} steps; a step {} at the median, {} at the 99th percentile; training {}, \
+         held out {}; resident set {:.1} MiB after {SETTLED_S:.0} s of flight, {:.1} MiB at its end; {} allocations after \
+         boot; {:.1} MiB on the device; ATE {}; {:.0} s in all",
+        report.frames.unwrap_or(0),
+        report.keyframes.unwrap_or(0),
+        report.splats.unwrap_or(0),
+        report.iterations.unwrap_or(0),
+        ms(report.iteration_ms_p50),
+        ms(report.iteration_ms_p99),
+        db(report.quality.psnr_db),
+        db(report.quality.psnr_heldout_db),
+        mib(settled),
+        mib(last),
+        report.heap_after_seal.unwrap_or(0),
+        mib(report.gpu_bytes.unwrap_or(0)),
+        report.ate_rmse_m.map_or("-".into(), |m| format!("{m:.3} m")),
+        report.wall_s.unwrap_or(0.0),
+    );
+    let table = table(rows);
+    println!("{all}\n\n{}\n{}", table.text(), args.out.join("patrol.html").display());
+    Page {
+        name: "patrol",
+        title: "Patrol: the map by room and visit",
+        what: format!(
+            "{}, poses by {:?}, {} steps a frame, {}",
+            args.scenario,
+            args.poses,
+            args.steps,
+            report.device.as_deref().unwrap_or("no map")
+        ),
+        facts: vec![
+            ("scenario", json!(args.scenario)),
+            ("keyframes", json!(report.keyframes)),
+            ("gaussians", json!(report.splats)),
+            ("iteration_ms_p50", json!(report.iteration_ms_p50)),
+            ("iteration_ms_p99", json!(report.iteration_ms_p99)),
+            ("psnr_db", json!(report.quality.psnr_db)),
+            ("psnr_heldout_db", json!(report.quality.psnr_heldout_db)),
+            ("rss_settled_bytes", json!(settled)),
+            ("rss_last_bytes", json!(last)),
+            ("heap_after_seal", json!(report.heap_after_seal)),
+            ("gpu_bytes", json!(report.gpu_bytes)),
+            ("ate_rmse_m", json!(report.ate_rmse_m)),
+        ],
+        parts: vec![Part::Note(all), Part::Note(NOTE.into()), Part::Table(table)],
+    }
+}
+
+fn table(rows: Vec<Row>) -> Table {
+    table!("patrol", "Rooms", rows, |r| r.room == "elsewhere", [
+        text("room") => r.room,
+        count("Gaussians") => r.gaussians,
+        count("keyframes 1") => r.rounds[0].keyframes,
+        number("PSNR 1", "dB", 2) => r.rounds[0].psnr_db,
+        number("held out 1", "dB", 2) => r.rounds[0].psnr_heldout_db,
+        count("keyframes 2") => r.rounds[1].keyframes,
+        number("PSNR 2", "dB", 2) => r.rounds[1].psnr_db,
+        number("held out 2", "dB", 2) => r.rounds[1].psnr_heldout_db,
+    ])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use stipple_drivers::sim::Sim;
+
+    #[test]
+    fn keyframes_and_gaussians_are_counted_in_their_room_and_round() {
+        let scenario = Scenario::named("patrol-two").expect("a scenario");
+        let sim = Sim::new(&scenario).expect("it makes sense");
+        let (truth, first) = (sim.truth(), sim.stamp(0));
+        let score = |s: f64, held_out: bool, db: f64| KeyframeScore {
+            t_ns: (first + Span::from_secs(s)).0,
+            held_out,
+            psnr_db: Some(db),
+            ..KeyframeScore::default()
+        };
+        // In room a in the first round; in room b in the second.
+        let scores =
+            [score(11.0, false, 20.0), score(12.0, false, 22.0), score(13.0, true, 18.0), score(77.0, false, 25.0)];
+        let means = [DVec3::new(3.0, 2.0, 1.0), DVec3::new(3.0, 50.0, 1.0)];
+        let rows = rows(&scenario, &truth, first, &scores, &means);
+        let visit = |keyframes, psnr_db, psnr_heldout_db| Visit { keyframes, psnr_db, psnr_heldout_db };
+        assert_eq!(
+            rows.iter().map(|r| (r.room, r.gaussians)).collect::<Vec<_>>(),
+            [("room a", 1), ("room b", 0), ("corridor", 0), ("elsewhere", 1)]
+        );
+        assert_eq!(rows[0].rounds, [visit(3, Some(21.0), Some(18.0)), Visit::default()]);
+        assert_eq!(rows[1].rounds, [Visit::default(), visit(1, Some(25.0), None)]);
+    }
+}
