@@ -26,7 +26,12 @@ fn opened(calibration: &Calibration, settings: &[&str], place: Option<Place>) ->
 }
 
 /// Maps a flight, and answers how good the map is.
-fn mapped(calibration: &Calibration, keyframes: &[Keyframe], settings: &[&str], place: Option<Place>) -> (Mapper, Evaluation) {
+fn mapped(
+    calibration: &Calibration,
+    keyframes: &[Keyframe],
+    settings: &[&str],
+    place: Option<Place>,
+) -> (Mapper, Evaluation) {
     let mut mapper = opened(calibration, settings, place);
     for k in keyframes {
         mapper.ingest(k).unwrap();

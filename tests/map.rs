@@ -7,7 +7,6 @@ use flight::{board, flight, train};
 use glam::{DQuat, DVec3};
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
-use stipple::config::Board;
 use stipple::limits::CAMERAS_MAX;
 use stipple::map::{Keyframe, Mapper, Panel, PoseCorrection, StepKind};
 use stipple::mem::{heap_after_seal, seal_thread, CountingAllocator};

@@ -15,8 +15,8 @@ pub use governor::GovernorConfig;
 pub use inject::{InjectConfig, ThreadRule};
 pub use mavlink::{Address, MavlinkConfig, StateMessage};
 pub use method::{
-    Fit, FrontendConfig, GpuConfig, MapConfig, NetworkConfig, Projection, StereoConfig, StereoMethod,
-    StoreConfig, VioConfig,
+    Fit, FrontendConfig, GpuConfig, MapConfig, NetworkConfig, Projection, StereoConfig, StereoMethod, StoreConfig,
+    VioConfig,
 };
 pub use section::{Bound, Key};
 pub use sensors::{BaroConfig, CameraConfig, GpioConfig, ImuConfig, LogConfig, RecordConfig, RigConfig};

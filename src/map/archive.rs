@@ -146,7 +146,7 @@ pub struct Archive {
     pub store: Store,
     disk: Arc<Disk>,
     at_once: bool,
-    run: u32,
+    pub run: u32,
     /// Epoch 0 of this run, in the store.
     epoch_base: u32,
     about: RunAbout,

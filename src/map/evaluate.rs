@@ -101,26 +101,25 @@ pub fn sample(scene: &mut Scene) -> Result<[Option<f64>; 2], GpuError> {
     Ok([probe(false)?, probe(true)?])
 }
 
-/// Scores every keyframe, those on disk too. Allocates.
+/// Scores every keyframe, those on disk too, or `most` of them spread over the run. Allocates.
 pub fn evaluate(
     scene: &mut Scene,
     archive: &mut Option<Archive>,
     weights: &Weights,
+    most: usize,
 ) -> Result<Evaluation, GpuError> {
     let mut ssim_of = Ssim::new(scene.rendered.width, scene.rendered.height);
     // PSNR and SSIM of each kind.
     let mut all: [[Vec<Option<f64>>; 2]; 5] = Default::default();
     let [training, held_out, between, fitted, aligned] = &mut all;
     let mut by_camera: [Vec<Option<f64>>; CAMERAS_MAX] = Default::default();
-<<<<<<< HEAD
-    for i in 0..scene.views.len() {
+    let mut keyframe_scores = Vec::with_capacity(scene.views.len());
+    let (cameras, keyframes) = (scene.views.cameras(), scene.views.len() / scene.views.cameras());
+    let of_keyframe = |keyframe: usize| keyframe * cameras..(keyframe + 1) * cameras;
+    for i in spread(keyframes, most).flat_map(of_keyframe) {
         if !bring(scene, archive, i)? {
             continue;
         }
-=======
-    let mut keyframe_scores = Vec::with_capacity(scene.views.len());
-    for i in 0..scene.views.len() {
->>>>>>> sim
         let observed = observed(scene, i);
         let mut add = |scene: &Scene, [psnr, ssim]: &mut [Vec<Option<f64>>; 2]| {
             let (shown, valid) = (&scene.rendered.colour, &scene.camera(i).valid);
@@ -128,15 +127,11 @@ pub fn evaluate(
             ssim.push(ssim_of.mean(&observed, shown, valid));
         };
         let scored = score(scene, i)?;
-<<<<<<< HEAD
-        if !scene.views.get(i).held_out {
-=======
         if scene.views.camera(i) == 0 {
             let s = scene.views.get(i);
             keyframe_scores.push(KeyframeScore { id: s.id, t_ns: s.t.0, held_out: s.held_out, psnr_db: scored });
         }
         if !scene.views.get(i).held_out {
->>>>>>> sim
             add(scene, training);
             continue;
         }
@@ -167,11 +162,7 @@ pub fn evaluate(
 }
 
 /// Pictures of `count` keyframes spread over the run. Allocates.
-pub fn panels(
-    scene: &mut Scene,
-    archive: &mut Option<Archive>,
-    count: usize,
-) -> Result<Vec<Panel>, GpuError> {
+pub fn panels(scene: &mut Scene, archive: &mut Option<Archive>, count: usize) -> Result<Vec<Panel>, GpuError> {
     let all: Vec<usize> = first_images(scene).collect();
     let mut panels = Vec::with_capacity(count);
     for i in spread(all.len(), count).map(|i| all[i]) {

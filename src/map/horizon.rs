@@ -115,7 +115,8 @@ mod tests {
         // The right half is uncovered.
         (0..H).for_each(|y| rendered.alpha[y * W + W / 2..(y + 1) * W].fill(0.0));
         let (horizon, view) = (Horizon::of(&rendered), view());
-        for (x, z, seen) in [(-0.3, 1.0, true), (-0.3, 2.1, true), (-0.4, 3.0, false), (0.4, 3.0, false), (0.0, -1.0, false)]
+        for (x, z, seen) in
+            [(-0.3, 1.0, true), (-0.3, 2.1, true), (-0.4, 3.0, false), (0.4, 3.0, false), (0.0, -1.0, false)]
         {
             assert_eq!(horizon.sees(&view, DVec3::new(x, 0.1, z)), seen, "{x} {z}");
         }

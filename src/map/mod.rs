@@ -50,8 +50,8 @@ use cameras::RectifiedPair;
 use scene::Scene;
 use std::time::Instant;
 use stipple_drivers::{Calibration, Fault, Pose};
-use views::Views;
 use trainer::Trainer;
+use views::Views;
 
 pub use archive::Place;
 pub use evaluate::{spread, CurvePoint, Evaluation, KeyframeScore, Panel};
@@ -67,9 +67,9 @@ pub use {
     coarseness::Coarseness,
     pool::PruneRule,
     step::{LearningRates, StepStats, Target, Weights},
-    views::Stored,
     tiling::Tiling,
     view::{Fisheye, View},
+    views::Stored,
 };
 
 /// What the mapper did.
@@ -338,10 +338,16 @@ impl Mapper {
         Ok(CurvePoint { t_s, psnr_db, psnr_heldout_db, splats, iterations })
     }
 
-    /// Scores every keyframe. Allocates.
+    /// Scores every keyframe, those on disk too. Allocates.
+    #[cfg(feature = "instruments")]
     pub fn evaluate(&mut self) -> Result<Evaluation, GpuError> {
+        self.evaluate_some(usize::MAX)
+    }
+
+    /// Scores `most` of the keyframes, spread over the run. Allocates.
+    pub fn evaluate_some(&mut self, most: usize) -> Result<Evaluation, GpuError> {
         self.finish_pending()?;
-        evaluate::evaluate(&mut self.scene, &mut self.archive, self.trainer.weights())
+        evaluate::evaluate(&mut self.scene, &mut self.archive, self.trainer.weights(), most)
     }
 
     /// Pictures of `count` keyframes spread over the run. Allocates.
@@ -384,6 +390,11 @@ impl Mapper {
     /// The side of the store that reads and writes, where threads are to do that.
     pub fn disk(&self) -> Option<std::sync::Arc<crate::store::Disk>> {
         self.archive.as_ref().and_then(Archive::disk)
+    }
+
+    /// Number of the run in the map's store.
+    pub fn stored_run(&self) -> Option<u32> {
+        self.archive.as_ref().map(|archive| archive.run)
     }
 
     /// Writes all of the map to its store, if it has one, and answers whether the store has all of it then. Fails where it

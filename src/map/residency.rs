@@ -62,7 +62,13 @@ impl Archive {
     }
 
     /// Chooses what is wanted where a keyframe was taken, and fetches some of it.
-    pub fn arrive(&mut self, scene: &mut Scene, (t, pose): (Nanos, Pose), epoch: u32, busy: bool) -> Result<(), GpuError> {
+    pub fn arrive(
+        &mut self,
+        scene: &mut Scene,
+        (t, pose): (Nanos, Pose),
+        epoch: u32,
+        busy: bool,
+    ) -> Result<(), GpuError> {
         self.leave_other_epochs(scene, epoch)?;
         let ahead = self.choice.last.map_or(pose, |(before, from)| {
             let dt = (t - before).secs();
@@ -141,7 +147,9 @@ impl Archive {
             if b.in_pool || b.asked || b.samples_len == 0 {
                 continue;
             }
-            if asked == PAGED_AT_ONCE || !self.make_room(scene, b.count as usize)? || !self.ask_for_block(&scene.views, block)
+            if asked == PAGED_AT_ONCE
+                || !self.make_room(scene, b.count as usize)?
+                || !self.ask_for_block(&scene.views, block)
             {
                 break;
             }
@@ -234,7 +242,9 @@ impl Archive {
                 let known = &self.blocks[*b];
                 known.in_pool && known.samples_len > 0 && !self.choice.wanted[*b] && !leaving.contains(&known.anchor)
             };
-            let Some(block) = (0..self.blocks.len()).filter(may).max_by(|a, b| far(a).total_cmp(&far(b))) else { break };
+            let Some(block) = (0..self.blocks.len()).filter(may).max_by(|a, b| far(a).total_cmp(&far(b))) else {
+                break;
+            };
             if !self.save_if_changed(scene, block)? {
                 break;
             }

@@ -6,8 +6,8 @@ use super::exposure::{gain_from, median_exposure, Exposure};
 use super::pipeline::Pipeline;
 use super::render::Rendered;
 use super::step::{Stats, Target};
-use super::views::{Stored, Views};
 use super::view::View;
+use super::views::{Stored, Views};
 use crate::counters::Counters;
 use crate::gpu::{Gpu, GpuError};
 use stipple_drivers::Pose;
@@ -44,7 +44,11 @@ impl Scene {
 
     /// What a step on a stored image compares with.
     pub fn target(&self, index: usize) -> Target {
-        Target { image: self.views.image(index) as u32, camera: self.views.camera(index) as u32, exposure: self.views.exposure(index) }
+        Target {
+            image: self.views.image(index) as u32,
+            camera: self.views.camera(index) as u32,
+            exposure: self.views.exposure(index),
+        }
     }
 
     /// Brings the planes of a view that has a place to the device.

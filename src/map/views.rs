@@ -420,7 +420,7 @@ mod tests {
     #[test]
     fn images_of_one_keyframe_share_its_pose_and_not_their_exposure() {
         let mut s = views(7, 2);
-        let mut add = |s: &mut Views, id: u64| {
+        let add = |s: &mut Views, id: u64| {
             assert!(!s.is_full());
             for camera in 0..2 {
                 let index = s.add(&keyframe(id, false), ON_BODY, |_, _| {}).expect("room for six");

@@ -4,10 +4,12 @@
 use super::keyframes::{KeyframeRing, Word};
 use super::status::{print_err, Gauges};
 use super::threads;
+use super::MAP_STORE;
 use crate::config::Board;
 use crate::gpu::GpuError;
 use crate::map::{CurvePoint, Evaluation, Gaussian, Keyframe, Mapper, Place, StepKind};
 use crate::mem::{self, seal_thread, unsealed};
+use crate::output::export::{export, Form, Request};
 use crate::output::metrics::percentile;
 use crate::output::panel::{caption, panel, Picture};
 use crate::output::report::KernelTime;
@@ -48,6 +50,8 @@ pub struct Mapping {
     pub anchors: u64,
     /// Why mapping stopped before the end, if it did; odometry goes on.
     pub failure: Option<String>,
+    /// Keyframes that are scored in the end: all in lockstep, where nobody waits.
+    scored_max: usize,
     /// A step succeeded: the driver can live with its pipeline cache.
     has_worked: bool,
     period_s: f64,
@@ -63,6 +67,7 @@ impl Mapping {
         ring: Arc<KeyframeRing>,
         place: Option<Place>,
     ) -> Result<Mapping, Fault> {
+        let in_lockstep = place.is_some_and(|place| place.at_once);
         let build = || {
             host::lower_priority(NICE);
             Mapper::open_on(calibration, board, place)
@@ -84,6 +89,7 @@ impl Mapping {
             busy_s: 0.0,
             anchors: 0,
             failure: None,
+            scored_max: if in_lockstep { usize::MAX } else { board.budget.keyframes as usize },
             has_worked: false,
             period_s: board.map.curve_period_s,
             next_curve_s: board.map.curve_period_s,
@@ -279,21 +285,40 @@ impl Mapping {
         tell: &mut dyn FnMut(&MapResult),
     ) -> Result<(), String> {
         let gpu = |e: GpuError| e.to_string();
-        let mut splats = self.mapper.splats().map_err(gpu)?;
-        let exposure = self.mapper.median_exposure();
-        for colour in splats.iter_mut().flat_map(|s| &mut s.colour) {
-            *colour = exposure.observed(f64::from(*colour)) as f32;
+        let kept = self.mapper.save().map_err(gpu)?;
+        let run = self.mapper.stored_run().filter(|_| self.mapper.splat_count() > 0);
+        match (kept, run) {
+            (Ok(true), Some(run)) => {
+                let request = Request { run: Some(run), ..Request::default() };
+                export(&out.file(MAP_STORE), &out.file("map.ply"), Form::Ply, &request).map_err(|e| e.to_string())?;
+            }
+            (kept, run) => {
+                if run.is_some() {
+                    let why = kept.err().map_or_else(|| "it is full".into(), |fault| fault.to_string());
+                    let what = "map.ply has what is in memory alone, since the map's store has not all of it";
+                    print_err(format_args!("stipple: warning: {what}: {why}"));
+                }
+                self.write_pool(out)?;
+            }
         }
-        let written = out.write("map.ply", |w| ply::write_ply(w, splats.into_iter()));
-        written.map_err(|fault| fault.to_string())?;
         result.written = true;
         tell(result);
-        result.quality = self.mapper.evaluate().map_err(gpu)?;
+        result.quality = self.mapper.evaluate_some(self.scored_max).map_err(gpu)?;
         tell(result);
         let panels = self.mapper.panels(PANELS).map_err(gpu)?;
         let draw = |p: &crate::map::Panel| Drawn { name: p.name.clone(), caption: caption(p), picture: panel(p) };
         result.drawn = panels.iter().map(draw).collect();
         Ok(())
+    }
+
+    /// Writes the Gaussians in the pool as `map.ply`.
+    fn write_pool(&mut self, out: &OutputDir) -> Result<(), String> {
+        let mut splats = self.mapper.splats().map_err(|e| e.to_string())?;
+        let exposure = self.mapper.median_exposure();
+        for colour in splats.iter_mut().flat_map(|s| &mut s.colour) {
+            *colour = exposure.observed(f64::from(*colour)) as f32;
+        }
+        out.write("map.ply", |w| ply::write_ply(w, splats.into_iter())).map_err(|fault| fault.to_string())
     }
 }
 

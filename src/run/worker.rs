@@ -591,7 +591,7 @@ mod tests {
     fn pauses_grow_only_where_a_worker_lives_shortly() {
         let board = Board::parse("lavapipe.toml", include_str!("../../board-configs/lavapipe.toml"), &[]).unwrap();
         let calibration = Calibration { cameras: vec![], imu: stipple_drivers::ImuCalibration::CONSUMER };
-        let mut worker = Worker::new(ring(), calibration, board, PathBuf::new());
+        let mut worker = Worker::new(ring(), calibration, board, PathBuf::new(), None);
         let now = worker.next_start;
         let mut pause = |life_s| {
             worker.postpone(now, Duration::from_secs(life_s));

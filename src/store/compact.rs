@@ -222,4 +222,3 @@ pub fn rescue_next(shared: &Shared, w: &mut Writer) -> io::Result<bool> {
     }
     Ok(true)
 }
-

@@ -184,7 +184,8 @@ fn read(shared: &Shared, key: &Key, payload: &mut Vec<u8>) -> (Outcome, About) {
             let read = load(shared, place, number, payload);
             shared.state().figures.read_bytes += (SECTOR + place.length as usize) as u64;
             let is_own = |h: &Header| {
-                (h.sequence, h.identity, h.key, h.length, h.form) == (sequence, identity, *key, place.length, Form::Data)
+                (h.sequence, h.identity, h.key, h.length, h.form)
+                    == (sequence, identity, *key, place.length, Form::Data)
             };
             Ok(read?.filter(is_own).filter(|h| crc32c::crc32c(payload) == h.payload_crc))
         };

@@ -63,7 +63,10 @@ fn check(path: &Path, limits: &Limits) -> Result<(), Fault> {
     let record = size(limits.payload_max) as u64;
     let refuse = |what: String, fix: &str| Err(Fault::new(FaultKind::Config, path.display().to_string(), what, fix));
     if limits.segment_bytes % SECTOR as u64 != 0 {
-        return refuse(format!("segments of {} bytes are no whole sectors", limits.segment_bytes), "round up to 512 bytes");
+        return refuse(
+            format!("segments of {} bytes are no whole sectors", limits.segment_bytes),
+            "round up to 512 bytes",
+        );
     }
     if segments_max(limits, 0) < SEGMENTS_MIN {
         let what = format!("{} bytes are fewer than {SEGMENTS_MIN} segments of the store", limits.bytes_max);
@@ -77,7 +80,10 @@ fn check(path: &Path, limits: &Limits) -> Result<(), Fault> {
         return refuse("a store needs a buffer and a place for a record".into(), "raise the limit that is zero");
     }
     if limits.payload_max > i32::MAX as usize {
-        return refuse(format!("payloads of {} bytes are too long", limits.payload_max), "lower the limit of a payload");
+        return refuse(
+            format!("payloads of {} bytes are too long", limits.payload_max),
+            "lower the limit of a payload",
+        );
     }
     Ok(())
 }
@@ -124,4 +130,3 @@ fn mend(
     }
     Ok(())
 }
-

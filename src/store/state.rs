@@ -256,9 +256,7 @@ impl State {
         let needs_files = self.available() <= 2;
         let active_pays = || self.active.is_some_and(|a| State::pays(&self.segments[a])) && self.available() >= 2;
         let pressed = needs_files || self.has_many_tombstones();
-        self.suspect().is_some()
-            || pressed && self.victim().is_some()
-            || self.has_many_tombstones() && active_pays()
+        self.suspect().is_some() || pressed && self.victim().is_some() || self.has_many_tombstones() && active_pays()
     }
 
     /// Raises what is known to be on the disk, unless a segment is in doubt.

@@ -97,7 +97,8 @@ fn judge(folder: &Path, flushed: &BTreeMap<Key, u32>, all: &BTreeMap<Key, Vec<u3
     for (key, versions) in all {
         let found = version(&mut store, &disk, *key).unwrap_or(0);
         let acknowledged = flushed.get(key).copied();
-        let from = acknowledged.map_or(0, |v| versions.iter().rposition(|x| *x == v || (v == 0 && *x == 0)).unwrap_or(0));
+        let from =
+            acknowledged.map_or(0, |v| versions.iter().rposition(|x| *x == v || (v == 0 && *x == 0)).unwrap_or(0));
         let is_new = versions[from..].contains(&found) || (acknowledged.is_none() && found == 0);
         assert!(is_new, "{key:?}: {found} is there, flushed was {acknowledged:?} of {versions:?}");
     }
