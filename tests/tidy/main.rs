@@ -41,7 +41,7 @@ const RUST_LINES_MAX: usize = 600;
 const FUNCTION_LINES_MAX: usize = 90;
 const KERNEL_LINES_MAX: usize = 250;
 /// Lines of code that the product may have, and its estimator, frontend, mapper, GPU core, stereo and kernels together.
-const CODE_MAX: usize = 41_000;
+const CODE_MAX: usize = 43_500;
 const CORE_MAX: usize = 15_750;
 const CORE: [&str; 10] = [
     "src/vio/",
