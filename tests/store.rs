@@ -141,8 +141,10 @@ fn nothing_is_allocated_after_opening() {
         seal_thread();
         let (mut fetches, mut reads) = (0, 0);
         for i in 1..6000u32 {
+            let start = Instant::now();
             while !put(&mut store, i % 200, i, 20_000) {
-                std::thread::yield_now();
+                assert!(start.elapsed() < Duration::from_secs(20), "{i}: {:?}", store.figures());
+                std::thread::sleep(Duration::from_micros(100));
             }
             if i % 5 == 0 {
                 store.remove(key(i % 200));

@@ -206,13 +206,15 @@ impl Store {
         true
     }
 
-    /// Asks for a payload, the one put last; false where no buffer is free or the key is unknown.
+    /// Asks for a payload, the one put last; false where no buffer is free or the key is unknown. Payloads that were asked for
+    /// take three quarters of the buffers at most, until they are given back.
     pub fn fetch(&mut self, key: Key) -> bool {
         let mut state = self.shared.state();
-        if !state.is_known(&key) {
+        if !state.is_known(&key) || !state.may_read() {
             return false;
         }
         let Some(payload) = state.free.pop() else { return false };
+        state.reading += 1;
         state.asked.push_back((key, payload));
         drop(state);
         self.shared.asked.notify_all();
@@ -226,7 +228,9 @@ impl Store {
 
     /// Returns the buffer of a payload.
     pub fn give_back(&mut self, fetched: Fetched) {
-        self.shared.state().take_back(fetched.payload);
+        let mut state = self.shared.state();
+        state.reading = state.reading.saturating_sub(1);
+        state.take_back(fetched.payload);
     }
 
     /// Waits until everything put is on disk and synced; where no thread writes, it does so itself. Fails where writing does:

@@ -46,6 +46,8 @@ pub struct State {
     /// What the writer has taken from the queue and not yet written: key, bytes, whether it is data.
     pub in_flight: Option<(Key, u64, bool)>,
     pub asked: VecDeque<(Key, Vec<u8>)>,
+    /// Buffers of payloads that were asked for and not given back.
+    pub reading: usize,
     pub fetched: VecDeque<Fetched>,
     pub rescues: List<Key, RESCUES>,
     /// Number of the last record that was put, written, and known to be on the disk.
@@ -102,6 +104,7 @@ impl State {
             queue: VecDeque::with_capacity(n + 1),
             in_flight: None,
             asked: VecDeque::with_capacity(n + 1),
+            reading: 0,
             fetched: VecDeque::with_capacity(n + 1),
             rescues: List::default(),
             put: 0,
@@ -202,6 +205,11 @@ impl State {
         let can_count = self.index.get(key).is_none_or(|e| e.generation < u32::MAX - self.limits.buffers as u32);
         // What takes no more than what it replaces is always taken.
         can_count && (live <= self.live_max() || live <= self.planned(None).0)
+    }
+
+    /// Whether one more payload may be asked for: a quarter of the buffers is left to what is put.
+    pub fn may_read(&self) -> bool {
+        self.reading < (self.limits.buffers - self.limits.buffers / 4)
     }
 
     /// Takes a record from the owner.
