@@ -36,7 +36,7 @@ use stipple_drivers::{Calibration, Fault, Image, Nanos, Pose};
 pub const BLOCKS_KNOWN: usize = 2048;
 /// Buffers between here and the disk: what is written and what is read at a time.
 const BUFFERS: usize = 8;
-const SEGMENT_BYTES: u64 = 32 << 20;
+const SEGMENT_BYTES: u64 = 8 << 20;
 /// Training steps after which a block is written again, as a part of those it had, and at least.
 const REWRITTEN_PART: f64 = 0.25;
 const REWRITTEN_MIN: u32 = 100;

@@ -8,6 +8,7 @@
 //! The owner never waits for the disk: what finds no buffer is refused. One short lock guards the index and the queues; no
 //! file is touched under it, so that the owner waits for copies of a few hundred bytes at most.
 
+mod append;
 mod aside;
 mod compact;
 mod disk;
@@ -17,6 +18,7 @@ mod reader;
 mod record;
 mod scan;
 mod segment;
+mod shared;
 mod state;
 #[cfg(test)]
 mod tests;
@@ -28,13 +30,12 @@ pub use reader::Reader;
 pub use record::{About, Key, ABOUT};
 
 use crate::mem::{Footprint, List};
-use disk::Shared;
+use shared::{Shared, Writer};
 use state::State;
 use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 use stipple_drivers::{Fault, FaultKind};
-use writer::Writer;
 
 /// What a store may take; bytes.
 #[derive(Clone, Copy, Debug)]
@@ -205,13 +206,15 @@ impl Store {
         true
     }
 
-    /// Asks for a payload, the one put last; false where no buffer is free or the key is unknown.
+    /// Asks for a payload, the one put last; false where no buffer is free or the key is unknown. Payloads that were asked for
+    /// take three quarters of the buffers at most, until they are given back.
     pub fn fetch(&mut self, key: Key) -> bool {
         let mut state = self.shared.state();
-        if !state.is_known(&key) {
+        if !state.is_known(&key) || !state.may_read() {
             return false;
         }
         let Some(payload) = state.free.pop() else { return false };
+        state.reading += 1;
         state.asked.push_back((key, payload));
         drop(state);
         self.shared.asked.notify_all();
@@ -225,7 +228,9 @@ impl Store {
 
     /// Returns the buffer of a payload.
     pub fn give_back(&mut self, fetched: Fetched) {
-        self.shared.state().take_back(fetched.payload);
+        let mut state = self.shared.state();
+        state.reading = state.reading.saturating_sub(1);
+        state.take_back(fetched.payload);
     }
 
     /// Waits until everything put is on disk and synced; where no thread writes, it does so itself. Fails where writing does:
@@ -243,7 +248,7 @@ impl Store {
             state.flush_to = wanted;
             if state.writers == 0 {
                 drop(state);
-                shared.write_all();
+                disk::write_all(shared);
                 state = shared.state();
             } else {
                 shared.work.notify_all();

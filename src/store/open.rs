@@ -1,12 +1,12 @@
 //! Opens a store: lock, boot scan, and what a power cut left half done.
 
+use super::append::{make, mark_end};
 use super::aside::lock;
-use super::disk::Shared;
 use super::record::{size, Form, Header, SECTOR};
 use super::scan::{io_fault, scan, Found, Use};
 use super::segment::{sync_file, write_at, Folder};
+use super::shared::{Shared, Writer};
 use super::state::{live_max, segments_max, State, ENDS};
-use super::writer::{make, mark_end, Writer};
 use super::Limits;
 use std::fs;
 use std::io;
@@ -49,8 +49,17 @@ pub fn open(path: &Path, identity: u64, limits: &Limits) -> Result<(Shared, Vec<
         return Err(Fault::new(FaultKind::Config, path.display().to_string(), why, "move them away"));
     }
     let shared = Shared::new(state, writer, folder, path.into(), locked);
-    if is_new {
-        make(&shared).map_err(refused)?;
+    let mut files = 0;
+    while shared.state().wants_file() {
+        match make(&shared) {
+            Err(e) if is_new && files < SEGMENTS_MIN => return Err(refused(e)),
+            // What is there can be read; the writer tries again.
+            Err(e) => {
+                shared.count_error(&e);
+                break;
+            }
+            Ok(()) => files += 1,
+        }
     }
     Ok((shared, found.warnings))
 }

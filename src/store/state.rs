@@ -46,6 +46,8 @@ pub struct State {
     /// What the writer has taken from the queue and not yet written: key, bytes, whether it is data.
     pub in_flight: Option<(Key, u64, bool)>,
     pub asked: VecDeque<(Key, Vec<u8>)>,
+    /// Buffers of payloads that were asked for and not given back.
+    pub reading: usize,
     pub fetched: VecDeque<Fetched>,
     pub rescues: List<Key, RESCUES>,
     /// Number of the last record that was put, written, and known to be on the disk.
@@ -63,12 +65,6 @@ pub struct State {
     pub failures: u64,
     pub figures: Figures,
     pub last_error: List<u8, 200>,
-}
-
-impl Default for Key {
-    fn default() -> Key {
-        Key { kind: 0, run: 0, id: 0 }
-    }
 }
 
 /// Segment files that the limits allow, with so many bytes in foreign ones.
@@ -108,6 +104,7 @@ impl State {
             queue: VecDeque::with_capacity(n + 1),
             in_flight: None,
             asked: VecDeque::with_capacity(n + 1),
+            reading: 0,
             fetched: VecDeque::with_capacity(n + 1),
             rescues: List::default(),
             put: 0,
@@ -180,11 +177,17 @@ impl State {
         pending.unwrap_or_else(|| self.index.get(key).is_some_and(|e| !e.is_tombstone))
     }
 
-    /// Bytes that may count.
+    /// Bytes that may count: by the files that are there, not by those that could be made, since others may fill the disk.
     fn live_max(&self) -> u64 {
         let files = self.segments.iter().filter(|s| s.state != Use::Gone).count() as u64;
-        let allowed = segments_max(&self.limits, self.foreign_bytes);
-        live_max(&self.limits, if self.no_room { files.min(allowed) } else { allowed })
+        live_max(&self.limits, files.min(segments_max(&self.limits, self.foreign_bytes)))
+    }
+
+    /// Whether another file is to be made ahead: one always waits, and there is room for what fills all buffers.
+    pub fn wants_file(&self) -> bool {
+        let (max, record) = (self.live_max(), size(self.limits.payload_max) as u64);
+        let ahead = (self.limits.buffers as u64 + 2) * record;
+        self.may_grow() && (self.count(Use::Free) == 0 || max - max / RESERVE < self.live() + ahead)
     }
 
     /// Whether a new key with so many bytes of payload may be put.
@@ -202,6 +205,11 @@ impl State {
         let can_count = self.index.get(key).is_none_or(|e| e.generation < u32::MAX - self.limits.buffers as u32);
         // What takes no more than what it replaces is always taken.
         can_count && (live <= self.live_max() || live <= self.planned(None).0)
+    }
+
+    /// Whether one more payload may be asked for: a quarter of the buffers is left to what is put.
+    pub fn may_read(&self) -> bool {
+        self.reading < (self.limits.buffers - self.limits.buffers / 4)
     }
 
     /// Takes a record from the owner.

@@ -1,4 +1,5 @@
 //! The store against a plain map: random puts, removals, reopening, and compaction.
+#![cfg(test)]
 
 use super::*;
 use proptest::collection::vec;
@@ -195,4 +196,13 @@ fn full_buffers_refuse_and_are_counted() {
     assert!(store.has_room() && store.figures().refused_no_buffer == 2);
     assert!(!put(&mut store, key(9), 1, 6001) && store.figures().refused_too_long == 1);
     assert!(put(&mut store, key(9), 1, 6000));
+    disk.serve();
+    // Payloads that nobody takes leave buffers to what is put.
+    assert_eq!((0..8).filter(|id| store.fetch(key(*id))).count(), 6);
+    disk.serve();
+    assert!(store.has_room() && put(&mut store, key(10), 1, 10));
+    while let Some(fetched) = store.fetched() {
+        store.give_back(fetched);
+    }
+    assert!(store.fetch(key(1)));
 }
