@@ -94,6 +94,7 @@ cfg_if::cfg_if! {
         mod publish;
         mod run;
         mod stereo;
+        #[allow(dead_code)] // the program does not use all that the instruments and tests do
         mod store;
         mod vio;
     }

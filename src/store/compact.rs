@@ -9,25 +9,17 @@
 //! What is freed: copies are synced, then the file gets a new sequence number, and that is synced. Until then its records
 //! count at the next boot; after it they do not, and no tombstone is needed for them.
 
-use super::disk::Shared;
+use super::append::{append, empty, new_header, place_for, seal, sync};
 use super::index::Place;
 use super::record::{Form, Header, Key, SECTOR};
 use super::scan::Use;
 use super::segment::{sync_file, write_at, Walk};
-use super::writer::{append, empty, new_header, place_for, seal, sync, Writer};
-use std::fs::File;
+use super::shared::{Compaction, Shared, Writer};
 use std::io;
 use std::os::unix::fs::FileExt as _;
 
 /// Stale records that are passed over in one portion.
 const PORTION: usize = 64;
-
-/// A segment that is being compacted.
-pub struct Compaction {
-    at: usize,
-    file: File,
-    walk: Walk,
-}
 
 /// Begins compaction, or copies one record, or frees the segment.
 pub fn portion(shared: &Shared, w: &mut Writer) -> io::Result<()> {
@@ -222,4 +214,3 @@ pub fn rescue_next(shared: &Shared, w: &mut Writer) -> io::Result<bool> {
     }
     Ok(true)
 }
-

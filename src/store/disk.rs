@@ -1,82 +1,20 @@
 //! The disk's side: bodies of the two threads, or the same work on the owner's thread.
-//!
-//! Locks are taken in this order: writer or reader, then state. The state's is held for moments; no file is touched under it.
 
 use super::index::Place;
 use super::record::{About, Form, Header, Key, ABOUT, SECTOR};
-use super::segment::Folder;
+use super::shared::Shared;
 use super::state::State;
-use super::writer::{self, Step, Writer};
+use super::writer::{self, Step};
 use super::{Fetched, Outcome};
-use crate::mem::{cut, unsealed};
-use std::fs::File;
 use std::io;
 use std::os::unix::fs::FileExt as _;
-use std::path::PathBuf;
-use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 /// Longest sleep of a thread that nobody wakes.
 const NAP: Duration = Duration::from_millis(200);
 /// Times that a payload is looked up again because compaction moved it while it was read.
 const LOOKUPS: usize = 8;
-
-/// What the owner and the threads share.
-pub struct Shared {
-    state: Mutex<State>,
-    writer: Mutex<Writer>,
-    /// Wakes the writer, the reader, and who waits for what is written.
-    pub work: Condvar,
-    pub asked: Condvar,
-    pub done: Condvar,
-    pub folder: Folder,
-    pub path: PathBuf,
-    /// Held as long as this lives.
-    _lock: File,
-}
-
-impl Shared {
-    pub fn new(state: State, writer: Writer, folder: Folder, path: PathBuf, lock: File) -> Shared {
-        let (state, writer) = (Mutex::new(state), Mutex::new(writer));
-        let (work, asked, done) = Default::default();
-        Shared { state, writer, work, asked, done, folder, path, _lock: lock }
-    }
-
-    pub fn state(&self) -> MutexGuard<'_, State> {
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
-    pub fn writer(&self) -> MutexGuard<'_, Writer> {
-        self.writer.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
-    /// Counts a write error; the first one's text stays.
-    pub fn count_error(&self, e: &io::Error) {
-        let text = unsealed(|| cut(&e.to_string()));
-        let mut state = self.state();
-        state.figures.write_errors += 1;
-        if state.figures.first_error.is_empty() {
-            state.figures.first_error = text.clone();
-        }
-        state.last_error = text;
-    }
-
-    /// Counts an error of what was put: who waits for it hears of it.
-    pub fn failed(&self, e: &io::Error) {
-        self.count_error(e);
-        let mut state = self.state();
-        state.failures += 1;
-        state.flush_to = state.synced;
-        drop(state);
-        self.done.notify_all();
-    }
-
-    /// Writes what waits, without pace.
-    pub fn write_all(&self) {
-        let mut w = self.writer();
-        while let Step::Worked = writer::step(self, &mut w, false) {}
-    }
-}
 
 /// The disk's side: what two threads run, or what the owner's thread runs in lockstep.
 #[derive(Clone)]
@@ -126,7 +64,7 @@ impl Disk {
 
     /// Does all that waits now, on the caller's thread: instead of both threads, deterministically.
     pub fn serve(&self) {
-        self.0.write_all();
+        write_all(&self.0);
         while read_next(&self.0) {}
     }
 
@@ -136,6 +74,12 @@ impl Disk {
         self.0.work.notify_all();
         self.0.asked.notify_all();
     }
+}
+
+/// Writes what waits, without pace.
+pub fn write_all(shared: &Shared) {
+    let mut w = shared.writer();
+    while let Step::Worked = writer::step(shared, &mut w, false) {}
 }
 
 /// Reads one of the payloads that were asked for; false where none can be read now.
@@ -184,7 +128,8 @@ fn read(shared: &Shared, key: &Key, payload: &mut Vec<u8>) -> (Outcome, About) {
             let read = load(shared, place, number, payload);
             shared.state().figures.read_bytes += (SECTOR + place.length as usize) as u64;
             let is_own = |h: &Header| {
-                (h.sequence, h.identity, h.key, h.length, h.form) == (sequence, identity, *key, place.length, Form::Data)
+                (h.sequence, h.identity, h.key, h.length, h.form)
+                    == (sequence, identity, *key, place.length, Form::Data)
             };
             Ok(read?.filter(is_own).filter(|h| crc32c::crc32c(payload) == h.payload_crc))
         };

@@ -8,6 +8,7 @@
 //! The owner never waits for the disk: what finds no buffer is refused. One short lock guards the index and the queues; no
 //! file is touched under it, so that the owner waits for copies of a few hundred bytes at most.
 
+mod append;
 mod aside;
 mod compact;
 mod disk;
@@ -17,6 +18,7 @@ mod reader;
 mod record;
 mod scan;
 mod segment;
+mod shared;
 mod state;
 #[cfg(test)]
 mod tests;
@@ -28,13 +30,12 @@ pub use reader::Reader;
 pub use record::{About, Key, ABOUT};
 
 use crate::mem::{Footprint, List};
-use disk::Shared;
+use shared::{Shared, Writer};
 use state::State;
 use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 use stipple_drivers::{Fault, FaultKind};
-use writer::Writer;
 
 /// What a store may take; bytes.
 #[derive(Clone, Copy, Debug)]
@@ -243,7 +244,7 @@ impl Store {
             state.flush_to = wanted;
             if state.writers == 0 {
                 drop(state);
-                shared.write_all();
+                disk::write_all(shared);
                 state = shared.state();
             } else {
                 shared.work.notify_all();

@@ -1,12 +1,12 @@
 //! Opens a store: lock, boot scan, and what a power cut left half done.
 
+use super::append::{make, mark_end};
 use super::aside::lock;
-use super::disk::Shared;
 use super::record::{size, Form, Header, SECTOR};
 use super::scan::{io_fault, scan, Found, Use};
 use super::segment::{sync_file, write_at, Folder};
+use super::shared::{Shared, Writer};
 use super::state::{live_max, segments_max, State, ENDS};
-use super::writer::{make, mark_end, Writer};
 use super::Limits;
 use std::fs;
 use std::io;
@@ -49,8 +49,17 @@ pub fn open(path: &Path, identity: u64, limits: &Limits) -> Result<(Shared, Vec<
         return Err(Fault::new(FaultKind::Config, path.display().to_string(), why, "move them away"));
     }
     let shared = Shared::new(state, writer, folder, path.into(), locked);
-    if is_new {
-        make(&shared).map_err(refused)?;
+    let mut files = 0;
+    while shared.state().wants_file() {
+        match make(&shared) {
+            Err(e) if is_new && files < SEGMENTS_MIN => return Err(refused(e)),
+            // What is there can be read; the writer tries again.
+            Err(e) => {
+                shared.count_error(&e);
+                break;
+            }
+            Ok(()) => files += 1,
+        }
     }
     Ok((shared, found.warnings))
 }
@@ -63,7 +72,10 @@ fn check(path: &Path, limits: &Limits) -> Result<(), Fault> {
     let record = size(limits.payload_max) as u64;
     let refuse = |what: String, fix: &str| Err(Fault::new(FaultKind::Config, path.display().to_string(), what, fix));
     if limits.segment_bytes % SECTOR as u64 != 0 {
-        return refuse(format!("segments of {} bytes are no whole sectors", limits.segment_bytes), "round up to 512 bytes");
+        return refuse(
+            format!("segments of {} bytes are no whole sectors", limits.segment_bytes),
+            "round up to 512 bytes",
+        );
     }
     if segments_max(limits, 0) < SEGMENTS_MIN {
         let what = format!("{} bytes are fewer than {SEGMENTS_MIN} segments of the store", limits.bytes_max);
@@ -77,7 +89,10 @@ fn check(path: &Path, limits: &Limits) -> Result<(), Fault> {
         return refuse("a store needs a buffer and a place for a record".into(), "raise the limit that is zero");
     }
     if limits.payload_max > i32::MAX as usize {
-        return refuse(format!("payloads of {} bytes are too long", limits.payload_max), "lower the limit of a payload");
+        return refuse(
+            format!("payloads of {} bytes are too long", limits.payload_max),
+            "lower the limit of a payload",
+        );
     }
     Ok(())
 }
@@ -124,4 +139,3 @@ fn mend(
     }
     Ok(())
 }
-

@@ -11,7 +11,7 @@ pub const ABOUT: usize = 464;
 pub type About = [u8; ABOUT];
 
 /// Name of a record. What kind, run and id mean is the owner's.
-#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug, Default)]
 pub struct Key {
     pub kind: u8,
     pub run: u32,

@@ -101,11 +101,21 @@ pub fn scan(
             }
             Err(Stop::Full) => {
                 let why = "the store holds more records than the limits allow";
-                return Err(Fault::new(FaultKind::Config, place.display().to_string(), why, "raise the limit of records"));
+                return Err(Fault::new(
+                    FaultKind::Config,
+                    place.display().to_string(),
+                    why,
+                    "raise the limit of records",
+                ));
             }
             Err(Stop::Long(n)) => {
                 let why = format!("a record of {n} bytes is longer than the limits allow");
-                return Err(Fault::new(FaultKind::Config, place.display().to_string(), why, "raise the limit of a payload"));
+                return Err(Fault::new(
+                    FaultKind::Config,
+                    place.display().to_string(),
+                    why,
+                    "raise the limit of a payload",
+                ));
             }
         }
     }
@@ -243,12 +253,18 @@ fn kind_of(
     if let Some(header) = SegmentHeader::decode(&sector) {
         let text = place.display().to_string();
         if header.version != VERSION {
-            let why = format!("the store has version {} of the form on the disk, this program {VERSION}", header.version);
+            let why =
+                format!("the store has version {} of the form on the disk, this program {VERSION}", header.version);
             return Err(Fault::new(FaultKind::Data, text, why, "begin a new one with --fresh, or name another folder"));
         }
         if identity.is_some_and(|identity| header.identity != identity) {
             let why = "the store is that of another rig or of another shape of the map";
-            return Err(Fault::new(FaultKind::Config, text, why, "begin a new one with --fresh, or name another folder"));
+            return Err(Fault::new(
+                FaultKind::Config,
+                text,
+                why,
+                "begin a new one with --fresh, or name another folder",
+            ));
         }
         return Ok(Some((Kind::Segment(header), bytes)));
     }

@@ -65,12 +65,6 @@ pub struct State {
     pub last_error: List<u8, 200>,
 }
 
-impl Default for Key {
-    fn default() -> Key {
-        Key { kind: 0, run: 0, id: 0 }
-    }
-}
-
 /// Segment files that the limits allow, with so many bytes in foreign ones.
 pub fn segments_max(limits: &Limits, foreign_bytes: u64) -> u64 {
     limits.bytes_max.saturating_sub(foreign_bytes) / limits.segment_bytes.max(1)
@@ -180,11 +174,17 @@ impl State {
         pending.unwrap_or_else(|| self.index.get(key).is_some_and(|e| !e.is_tombstone))
     }
 
-    /// Bytes that may count.
+    /// Bytes that may count: by the files that are there, not by those that could be made, since others may fill the disk.
     fn live_max(&self) -> u64 {
         let files = self.segments.iter().filter(|s| s.state != Use::Gone).count() as u64;
-        let allowed = segments_max(&self.limits, self.foreign_bytes);
-        live_max(&self.limits, if self.no_room { files.min(allowed) } else { allowed })
+        live_max(&self.limits, files.min(segments_max(&self.limits, self.foreign_bytes)))
+    }
+
+    /// Whether another file is to be made ahead: one always waits, and there is room for what fills all buffers.
+    pub fn wants_file(&self) -> bool {
+        let (max, record) = (self.live_max(), size(self.limits.payload_max) as u64);
+        let ahead = (self.limits.buffers as u64 + 2) * record;
+        self.may_grow() && (self.count(Use::Free) == 0 || max - max / RESERVE < self.live() + ahead)
     }
 
     /// Whether a new key with so many bytes of payload may be put.
@@ -256,9 +256,7 @@ impl State {
         let needs_files = self.available() <= 2;
         let active_pays = || self.active.is_some_and(|a| State::pays(&self.segments[a])) && self.available() >= 2;
         let pressed = needs_files || self.has_many_tombstones();
-        self.suspect().is_some()
-            || pressed && self.victim().is_some()
-            || self.has_many_tombstones() && active_pays()
+        self.suspect().is_some() || pressed && self.victim().is_some() || self.has_many_tombstones() && active_pays()
     }
 
     /// Raises what is known to be on the disk, unless a segment is in doubt.

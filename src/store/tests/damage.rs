@@ -1,4 +1,5 @@
 //! Damage to files: cut off anywhere, a bit flipped anywhere.
+#![cfg(test)]
 
 use super::*;
 use std::fs;

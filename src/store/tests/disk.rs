@@ -1,4 +1,5 @@
 //! What the store asked of the disk on this thread, for the tests that cut the power or make a call fail.
+#![cfg(test)]
 
 use std::cell::RefCell;
 use std::fs::File;

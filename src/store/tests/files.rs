@@ -1,4 +1,5 @@
 //! What is in the folder besides: strangers, other versions and rigs, other limits, a store set aside.
+#![cfg(test)]
 
 use super::record::{SegmentHeader, SECTOR};
 use super::*;

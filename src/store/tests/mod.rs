@@ -1,4 +1,5 @@
 //! Tests of the store: against a plain map, against damage, and against a model of a disk that loses power.
+#![cfg(test)]
 #![allow(clippy::unwrap_used)]
 
 mod damage;
@@ -33,7 +34,11 @@ pub fn content(key: Key, version: u32, length: usize) -> (About, Vec<u8>) {
     about[4..8].copy_from_slice(&version.to_le_bytes());
     about[8..12].copy_from_slice(&(length as u32).to_le_bytes());
     let seed = key.id.wrapping_mul(0x9e37_79b9) ^ version.wrapping_mul(0x85eb_ca6b);
-    let payload = (0..length as u32).map(|i| (seed.wrapping_add(i.wrapping_mul(0x27d4_eb2f)) >> 13) as u8).collect();
+    let byte = |i: u32| {
+        let x = i.wrapping_mul(0x9e37_79b1) ^ seed;
+        ((x ^ x >> 15).wrapping_mul(0x85eb_ca6b) >> 13) as u8
+    };
+    let payload = (0..length as u32).map(byte).collect();
     (about, payload)
 }
 

@@ -1,4 +1,5 @@
 //! The store against a plain map: random puts, removals, reopening, and compaction.
+#![cfg(test)]
 
 use super::*;
 use proptest::collection::vec;
