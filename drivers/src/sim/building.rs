@@ -38,7 +38,8 @@ pub fn build(plan: &Plan, path: &[Vec3], seed: u64, threads: usize) -> Room {
         .iter()
         .fold((Vec3::MAX, Vec3::MIN), |(low, high), r| (low.min(r.low.as_vec3()), high.max(r.high.as_vec3())));
     let mut room = Room::empty(low, high, [PLASTER; 4], 0);
-    (room.cells.clear(), room.faces.clear());
+    room.cells.clear();
+    room.faces.clear();
     let shift = rng.random_range(0..WALLS.len());
     for (k, r) in plan.rooms.iter().enumerate() {
         let ([a, b], k) = (WALLS[(k + shift) % WALLS.len()], k + shift);
