@@ -143,7 +143,8 @@ impl Anchors {
             pair.distort(&self.work.depth.metres, &view.camera);
         }
         // Where depth finds what is on disk, nothing is lacking.
-        let hidden = archive.as_mut().and_then(|a| a.hide(&view, &self.work.depth.metres, stereo.views.valid_mask()));
+        let (depth, valid) = (&self.work.depth.metres, stereo.views.valid_mask());
+        let hidden = archive.as_mut().and_then(|a| a.hide(scene, &view, depth, valid));
         let valid = hidden.unwrap_or(stereo.views.valid_mask());
         let coverage = if hidden.is_some() {
             let seen = seen(scene, &self.pair, index, &view, valid, &self.work.depth.metres);

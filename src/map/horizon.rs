@@ -20,6 +20,8 @@ const STEP_LN: f64 = 0.0272;
 /// A surface is as deep as this, by a fraction and m: the error of depth, and Gaussians of a wall behind its middle.
 const THICKNESS: f64 = 0.1;
 const THICKNESS_M: f64 = 0.15;
+/// What is nearer than this part of the farthest in its cell may be something else.
+const SHOWN_PART: f64 = 0.5;
 /// A pixel this opaque shows a surface; a cell with a smaller part of its pixels that do is open.
 const SURFACE_ALPHA: f32 = 0.5;
 const SURFACE_PART: f64 = 0.75;
@@ -70,6 +72,14 @@ impl Horizon {
         let Some((x, y, depth)) = view.project(p_world) else { return false };
         let code = self.0[cell_of(x, y, view.camera.width, view.camera.height)];
         code != OPEN && depth <= metres(code) * (1.0 + THICKNESS) + THICKNESS_M
+    }
+
+    /// Whether a point of a surface is one that the view shows: it is not far before what is farthest there.
+    pub fn shows(&self, view: &View, p_world: DVec3) -> bool {
+        let Some((x, y, depth)) = view.project(p_world) else { return false };
+        let code = self.0[cell_of(x, y, view.camera.width, view.camera.height)];
+        let farthest = metres(code);
+        code != OPEN && depth <= farthest * (1.0 + THICKNESS) + THICKNESS_M && depth >= SHOWN_PART * farthest
     }
 
     /// The part of the cells of which nothing is known.

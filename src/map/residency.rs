@@ -11,7 +11,7 @@
 //! A view is not uncovered where it shows a block that is on disk: where a keyframe's own depth finds such a block, nothing is
 //! seeded (`hide`).
 
-use super::archive::{read_planes, Archive, Arrived, BLOCKS_KNOWN};
+use super::archive::{read_planes, Archive, Arrived, Choice, BLOCKS_KNOWN};
 use super::block::BlockAbout;
 use super::horizon::{cell_of, Horizon, CELLS, COLUMNS, ROWS};
 use super::scene::Scene;
@@ -45,9 +45,9 @@ const NEWEST: usize = 8;
 const DRAWS: usize = 16;
 /// Part of a horizon that may be open.
 const OPEN_MAX: f64 = 0.05;
-/// A sample is what a view shows if its depth is that of the pair within this, by a fraction and m.
-const DEPTH_AGREES: f64 = 0.1;
-const DEPTH_AGREES_M: f64 = 0.2;
+/// Keyframes that are asked whether they show a point, and points of a cell along each axis.
+const ASKED: usize = 48;
+const POINTS: usize = 3;
 /// The disk answers within this, or what it was asked for is done without.
 const PATIENCE: Duration = Duration::from_secs(2);
 
@@ -70,6 +70,7 @@ impl Archive {
         busy: bool,
     ) -> Result<(), GpuError> {
         self.leave_other_epochs(scene, epoch)?;
+        self.look_at_new_blocks(scene, busy)?;
         let ahead = self.choice.last.map_or(pose, |(before, from)| {
             let dt = (t - before).secs();
             let by = (pose.p - from.p) * if dt > 0.0 { AHEAD.secs() / dt } else { 0.0 };
@@ -77,7 +78,22 @@ impl Archive {
         });
         self.choice.last = Some((t, pose));
         self.choose(scene, [pose, ahead], epoch);
+        // What is new finds the reserve, and thins nothing.
+        self.make_room(scene, 0)?;
         self.page(scene, busy)
+    }
+
+    /// Writes the blocks whose burst ended before its time, as another anchor came, and looks who sees them. The newest still
+    /// grows while the trainer is busy with it.
+    fn look_at_new_blocks(&mut self, scene: &mut Scene, busy: bool) -> Result<(), GpuError> {
+        let newest = scene.pipeline.pool.newest().filter(|_| busy);
+        for block in 0..self.blocks.len() {
+            let b = self.blocks[block];
+            if b.in_pool && b.samples_len == 0 && newest != Some(b.anchor) && self.save_block(scene, block)? {
+                self.look_for(scene, block);
+            }
+        }
+        Ok(())
     }
 
     fn choose(&mut self, scene: &Scene, poses: [Pose; 2], epoch: u32) {
@@ -131,6 +147,27 @@ impl Archive {
             self.choice.candidates.push(keyframe);
         }
         self.choice.order = order;
+    }
+
+    /// Wants the blocks that a keyframe sees, those that it sees most of first, as many as fit.
+    fn want_seen_by(&mut self, keyframe: usize, room: usize) {
+        self.choice.wanted.fill(false);
+        self.choice.candidates.clear();
+        let row = &self.sight[keyframe * BLOCKS_KNOWN..][..self.blocks.len()];
+        let blocks = &mut self.choice.blocks;
+        blocks.clear();
+        blocks.extend((0..row.len() as u32).filter(|b| row[*b as usize] > 0));
+        blocks.sort_unstable_by_key(|b| (u8::MAX - row[*b as usize], *b));
+        let mut taken = 0;
+        for b in blocks {
+            let count = self.blocks[*b as usize].count as usize;
+            if taken + count <= room {
+                taken += count;
+                self.choice.wanted[*b as usize] = true;
+            }
+        }
+        let Choice { blocks, wanted, .. } = &mut self.choice;
+        blocks.retain(|b| wanted[*b as usize]);
     }
 
     /// Puts what came from the disk in its place, and asks for more of what is wanted. While a new block grows (`busy`), no
@@ -368,39 +405,41 @@ impl Archive {
         Ok(())
     }
 
-    /// The valid pixels of a view less those that show, by the view's own depth, a block that is on disk; `None` where there
-    /// are none of these.
-    pub fn hide(&mut self, view: &View, depth: &[f32], valid: &[u8]) -> Option<&[u8]> {
-        let (w, h) = (view.camera.width, view.camera.height);
-        let mut range = [[f64::INFINITY, 0.0f64]; CELLS];
-        for (i, z) in depth.iter().enumerate().filter(|(_, z)| **z > 0.0) {
-            let [near, far] = &mut range[cell_of((i % w) as f64, (i / w) as f64, w, h)];
-            (*near, *far) = (near.min(f64::from(*z)), far.max(f64::from(*z)));
+    /// The valid pixels of a view less those that show, by the view's own depth, what is on disk; `None` where there are none of
+    /// these. What is on disk is told by the horizons of the keyframes nearby one of whose blocks is not in the pool: the map
+    /// covered them as far as they see.
+    pub fn hide(&mut self, scene: &Scene, view: &View, depth: &[f32], valid: &[u8]) -> Option<&[u8]> {
+        let (w, h, cameras) = (view.camera.width, view.camera.height, scene.views.cameras());
+        let mut asked = [None; ASKED];
+        let parts = self.choice.order.iter().map(|(_, keyframe)| *keyframe as usize).filter(|k| !self.is_whole(*k));
+        for (to, keyframe) in asked.iter_mut().zip(parts) {
+            let index = keyframe * cameras;
+            *to = Some((scene.view(index), scene.views.get(index).horizon));
         }
-        let mut shows = [false; CELLS];
-        for b in self.blocks.iter().filter(|b| !b.in_pool && b.epoch == view.epoch) {
-            for point in b.points() {
-                let Some((x, y, z)) = view.project(Vec3::from_array(*point).as_dvec3()) else { continue };
-                let cell = cell_of(x, y, w, h);
-                let off = DEPTH_AGREES * z + DEPTH_AGREES_M;
-                // Samples are fewer than cells: one speaks for those around it.
-                let (column, row) = (cell % COLUMNS, cell / COLUMNS);
-                for y in row.saturating_sub(1)..(row + 2).min(ROWS) {
-                    for x in column.saturating_sub(1)..(column + 2).min(COLUMNS) {
-                        let [near, far] = range[y * COLUMNS + x];
-                        shows[y * COLUMNS + x] |= z > near - off && z < far + off;
-                    }
-                }
+        if asked[0].is_none() {
+            return None;
+        }
+        // Points of a cell that have depth, and how many of them are known.
+        let (mut points, mut known) = ([0u8; CELLS], [0u8; CELLS]);
+        let (across, down) = ((w / (COLUMNS * POINTS)).max(1), (h / (ROWS * POINTS)).max(1));
+        for y in (down / 2..h).step_by(down) {
+            for x in (across / 2..w).step_by(across) {
+                let z = f64::from(depth[y * w + x]);
+                let Some(point) = (z > 0.0).then(|| view.point(x, y, z)).flatten() else { continue };
+                let cell = cell_of(x as f64, y as f64, w, h);
+                points[cell] += 1;
+                known[cell] += u8::from(asked.iter().flatten().any(|(view, horizon)| horizon.shows(view, point)));
             }
         }
-        if !shows.contains(&true) {
+        let shows = |cell: usize| points[cell] > 0 && 2 * known[cell] > points[cell];
+        if !(0..CELLS).any(shows) {
             return None;
         }
         let hidden = &mut self.choice.hidden;
         hidden.clear();
         hidden.extend(valid.iter().enumerate().map(|(i, valid)| {
             let cell = cell_of((i % w) as f64, (i / w) as f64, w, h);
-            if shows[cell] {
+            if shows(cell) {
                 0
             } else {
                 *valid
@@ -414,9 +453,7 @@ impl Archive {
     pub fn bring(&mut self, scene: &mut Scene, index: usize) -> Result<bool, GpuError> {
         let keyframe = index / scene.views.cameras();
         self.leave_other_epochs(scene, scene.views.get(index).epoch)?;
-        self.choice.order.clear();
-        self.choice.order.push((0.0, keyframe as u32));
-        self.want_views_of(scene.pipeline.pool.capacity());
+        self.want_seen_by(keyframe, scene.pipeline.pool.capacity());
         let begun = Instant::now();
         let missing = |a: &Archive| a.choice.blocks.iter().any(|b| a.blocks[*b as usize].asked);
         loop {

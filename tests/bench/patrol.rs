@@ -120,7 +120,7 @@ pub fn run(args: &Args) -> Result<(), Fault> {
     let (truth, first) = (input.truth.clone(), first_stamp(&input));
     let pace = Pace::Lockstep(Steps::PerFrame(args.steps));
     let at_truth = (args.poses == Poses::Truth).then_some(SPACING);
-    let options = Options { pace, at_truth, holdout: HOLDOUT, ..Options::default() };
+    let options = Options { pace, at_truth, holdout: HOLDOUT, fresh: true, ..Options::default() };
     let report = fly(input, &board, &out, &options, None)?.report;
     let estimated = read_trajectory(&out.file("trajectory.tum"))?;
     let world = trajectory_error(&estimated, &truth).map_or(Pose::IDENTITY, |e| e.truth_from_estimate);

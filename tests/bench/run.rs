@@ -64,7 +64,7 @@ impl Source {
             }
         };
         let pace = Pace::Lockstep(Steps::EqualTime(job.seconds));
-        let options = Options { pace, poses: self.poses.clone(), holdout: HOLDOUT, ..Options::default() };
+        let options = Options { pace, poses: self.poses.clone(), holdout: HOLDOUT, fresh: true, ..Options::default() };
         Ok(fly(input, &board, out, &options, None)?.report)
     }
 }

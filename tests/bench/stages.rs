@@ -155,7 +155,7 @@ fn whole(flight: &'static str, recording: Option<&Path>, threads: u32, out: &Out
             Input::rendered(&scenario, 0, |_, _| {})?
         }
     };
-    let options = Options { pace: Pace::Lockstep(Steps::PerFrame(0)), ..Options::default() };
+    let options = Options { pace: Pace::Lockstep(Steps::PerFrame(0)), fresh: true, ..Options::default() };
     let dir = OutputDir::create(&out.file(&format!("run-{flight}-{threads}")))?;
     let report = fly(input, &board, &dir, &options, None)?.report;
     Ok(Run { flight, threads, report })
