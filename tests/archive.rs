@@ -16,7 +16,7 @@ const KEYFRAMES: usize = 20;
 const STEPS: u32 = 30;
 
 fn place(folder: &Path, flight: i64) -> Place<'_> {
-    Place { folder, fresh: false, flight, at_once: true }
+    Place { folder, fresh: false, flight: Some(flight), at_once: true }
 }
 
 fn opened(calibration: &Calibration, settings: &[&str], place: Option<Place>) -> Mapper {

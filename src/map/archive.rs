@@ -53,8 +53,8 @@ pub struct Place<'a> {
     /// Whether what is there is set aside.
     pub fresh: bool,
     /// When the flight began, ms since 1970. A mapper of the flight that was there last goes on with its map; another begins
-    /// a run of its own beside the earlier ones.
-    pub flight: i64,
+    /// a run of its own beside the earlier ones. `None`: whatever flight was there last, to look at its map.
+    pub flight: Option<i64>,
     /// Whether what is asked of the disk is done at once, on the mapper's thread: for lockstep.
     pub at_once: bool,
 }
@@ -189,22 +189,23 @@ impl Archive {
         });
         let last = |store: &Store, run: u32| store.about(&run_key(run)).and_then(|about| RunAbout::decode(&about));
         let newest = run.checked_sub(1).and_then(|run| Some((run, last(&store, run)?)));
-        let (run, about, goes_on) = match newest.filter(|(_, about)| about.started_unix_ms == place.flight) {
-            Some((run, about)) => (run, about, true),
-            None => {
-                let about = RunAbout {
-                    epoch_base: epochs,
-                    started_unix_ms: place.flight,
-                    colour: shape.channels == 3,
-                    width: shape.width,
-                    height: shape.height,
-                    cameras: shape.cameras,
-                    channels: shape.channels,
-                    scene_depth_m: 0.0,
-                };
-                (run, about, false)
-            }
-        };
+        let (run, about, goes_on) =
+            match newest.filter(|(_, about)| place.flight.is_none_or(|flight| about.started_unix_ms == flight)) {
+                Some((run, about)) => (run, about, true),
+                None => {
+                    let about = RunAbout {
+                        epoch_base: epochs,
+                        started_unix_ms: place.flight.unwrap_or_default(),
+                        colour: shape.channels == 3,
+                        width: shape.width,
+                        height: shape.height,
+                        cameras: shape.cameras,
+                        channels: shape.channels,
+                        scene_depth_m: 0.0,
+                    };
+                    (run, about, false)
+                }
+            };
         let (blocks, known, sight, choice) = tables(board, shape);
         let mut archive = Archive {
             store,

@@ -12,8 +12,8 @@
 //!
 //! What is known of a keyframe changes as long as the map trains; its pixels do not, and are written once.
 //!
-//! Samples of a block are rounded to 1/65535 of the box around them (0.2 mm in a block of 13 m): they tell where a block is,
-//! and so the poses keep all their digits. Decoding gives `None` for bytes that are not of this form, and never panics.
+//! Samples of a block are rounded to 1/255 of the box around them (5 cm in a block of 13 m): they tell where a block is, and so
+//! the poses keep all their digits and there are many of them. Decoding gives `None` for bytes that are not of this form, and never panics.
 
 use super::coarseness::Coarseness;
 use super::exposure::Exposure;
@@ -32,14 +32,14 @@ pub const KIND_IMAGE: u8 = 4;
 /// `KeyframeAbout::home` of a keyframe that belongs to no block.
 pub const NO_BLOCK: u32 = u32::MAX;
 /// Samples of a block.
-pub const SAMPLES: usize = 32;
+pub const SAMPLES: usize = 104;
 
 /// Version of this form.
 const FORM: u8 = 1;
 /// Bytes of a pose: quaternion xyzw, then position.
 const POSE: usize = 7 * size_of::<f64>();
 /// Steps of a sample's coordinate in the box around all of them.
-const SAMPLE_STEPS: f32 = 65535.0;
+const SAMPLE_STEPS: f32 = 255.0;
 // Arrays are copied as they are in memory.
 const _: () = assert!(cfg!(target_endian = "little"));
 
@@ -255,7 +255,7 @@ impl BlockAbout {
         for sample in samples() {
             for ((at, least), size) in sample.to_array().into_iter().zip(least.to_array()).zip(size.to_array()) {
                 let step = if size > 0.0 { ((at - least) / size * SAMPLE_STEPS).round() } else { 0.0 };
-                w.put((step as u16).to_le_bytes());
+                w.put([step as u8]);
             }
         }
         w.about
@@ -270,7 +270,7 @@ impl BlockAbout {
         let mut samples = [[0.0; 3]; SAMPLES];
         for sample in &mut samples[..usize::from(samples_len)] {
             for axis in 0..3 {
-                let step = f32::from(b.take().map(u16::from_le_bytes)?);
+                let step = f32::from(b.u8()?);
                 sample[axis] = least[axis] + size[axis] * (step / SAMPLE_STEPS);
             }
         }

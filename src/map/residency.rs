@@ -32,7 +32,7 @@ const FACING_M: f64 = 2.0;
 /// blocks over and over.
 const STAYS_M: f64 = 1.0;
 /// A keyframe sees a block if it sees as many of its samples.
-const SEEN_MIN: u8 = 2;
+const SEEN_MIN: u8 = 1;
 /// Part of the pool that is left for what is new.
 const RESERVE_DIVISOR: usize = 8;
 /// Blocks asked for when a keyframe comes: some MiB.
@@ -50,6 +50,11 @@ const ASKED: usize = 48;
 const POINTS: usize = 3;
 /// The disk answers within this, or what it was asked for is done without.
 const PATIENCE: Duration = Duration::from_secs(2);
+
+/// Keyframes, the newest, whose images stay.
+fn newest_kept(views: &Views) -> usize {
+    NEWEST.min(views.places() / 2)
+}
 
 impl Archive {
     fn sees(&self, keyframe: usize, block: usize) -> bool {
@@ -201,7 +206,8 @@ impl Archive {
     /// Tells the views which of them may be trained on.
     pub fn refresh(&self, scene: &mut Scene) {
         let cameras = scene.views.cameras();
-        scene.views.make_ready(|first| {
+        let (stay, of) = (newest_kept(&scene.views), self.choice.candidates.len());
+        scene.views.make_ready(stay, of, |first| {
             let keyframe = first / cameras;
             self.known.get(keyframe).is_none_or(|k| k.asked == 0) && self.is_whole(keyframe)
         });
@@ -346,7 +352,7 @@ impl Archive {
         let cameras = views.cameras();
         let (entry, keyframe) = (views.get(first), first / cameras);
         let newest = views.placed().max().unwrap_or(0) / cameras;
-        let recent = keyframe + NEWEST.min(views.places() / 2) > newest;
+        let recent = keyframe + newest_kept(views) > newest;
         if self.known.get(keyframe)?.asked > 0 || recent && !entry.held_out {
             return None;
         }

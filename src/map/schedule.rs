@@ -29,6 +29,14 @@ struct Burst {
     left: u32,
 }
 
+/// Views that may be trained on now, oldest first: all but the last `newest` come and go, and stand for the `of` views in all.
+#[derive(Clone, Copy, Debug)]
+pub struct Ready<'a> {
+    pub views: &'a [u32],
+    pub newest: usize,
+    pub of: usize,
+}
+
 /// The order of training steps: a new anchor's burst first, then uniform draws. Every other step of a burst is a uniform
 /// draw too, its last the anchor's: twenty on one view alone take 2 to 5 dB from the others (V1_01), which a hundred steps
 /// make good, and where those do not come the map stays so (at 28 steps a second, three splits: 20.4 -> 21.7 dB). A step may
@@ -57,16 +65,26 @@ impl Schedule {
         self.burst.is_some_and(|b| b.asked >= b.left)
     }
 
-    /// The keyframe of the next step out of `training`, or `None` when there is none.
-    pub fn next(&mut self, training: &[u32]) -> Option<usize> {
-        let Some(Burst { anchor, asked, left }) = &mut self.burst else { return self.draw(training) };
+    /// The keyframe of the next step out of those that are `ready`, or `None` when there is none.
+    pub fn next(&mut self, ready: &Ready) -> Option<usize> {
+        let Some(Burst { anchor, asked, left }) = &mut self.burst else { return self.draw(ready) };
         let (anchor, others) = (*anchor, left.saturating_sub(*asked) % 2 == 0);
         *asked += 1;
-        Some(if others { self.draw(training).unwrap_or(anchor) } else { anchor })
+        Some(if others { self.draw(ready).unwrap_or(anchor) } else { anchor })
     }
 
-    fn draw(&mut self, training: &[u32]) -> Option<usize> {
-        (!training.is_empty()).then(|| training[self.rng.below(training.len())] as usize)
+    fn draw(&mut self, &Ready { views, newest, of }: &Ready) -> Option<usize> {
+        let rotating = views.len() - newest;
+        let drawn = match () {
+            () if views.is_empty() => return None,
+            () if of <= views.len() || rotating == 0 => self.rng.below(views.len()),
+            // As often as each of all there are: those that stay are not trained on more than those that come and go.
+            () => match self.rng.below(of) {
+                n if n < newest => rotating + n,
+                _ => self.rng.below(rotating),
+            },
+        };
+        Some(views[drawn] as usize)
     }
 
     /// Takes the oldest step that `next` asked for; the anchor whose burst it ends, if it does.
@@ -85,12 +103,27 @@ impl Schedule {
 mod tests {
     use super::*;
 
+    fn all(views: &[u32]) -> Ready<'_> {
+        Ready { views, newest: 0, of: views.len() }
+    }
+
+    #[test]
+    fn views_that_stay_are_drawn_as_often_as_each_of_those_that_come_and_go() {
+        let mut s = Schedule::new(3);
+        let ready = Ready { views: &[5, 6, 7, 8], newest: 2, of: 20 };
+        let mut drawn = [0u32; 9];
+        (0..10_000).for_each(|_| drawn[s.next(&ready).expect("four to choose from")] += 1);
+        // 500 of each that stays; the other two stand for eighteen. 5 sigma of binomials.
+        assert!((390..610).contains(&drawn[7]) && (390..610).contains(&drawn[8]), "{drawn:?}");
+        assert!((4250..4750).contains(&drawn[5]) && (4250..4750).contains(&drawn[6]), "{drawn:?}");
+    }
+
     #[test]
     fn draws_are_uniform_and_repeat_with_the_seed() {
         let draw = |seed| {
             let mut s = Schedule::new(seed);
             let training: Vec<u32> = (0..10).collect();
-            (0..10_000).map(|_| s.next(&training).expect("ten to choose from")).collect::<Vec<_>>()
+            (0..10_000).map(|_| s.next(&all(&training)).expect("ten to choose from")).collect::<Vec<_>>()
         };
         let a = draw(7);
         assert_eq!(a, draw(7));
@@ -106,10 +139,10 @@ mod tests {
         let mut s = Schedule::new(1);
         s.start_burst(42, 3);
         for (next, ended) in [(42, None), (5, None), (42, Some(42))] {
-            assert_eq!((s.next(&[5]), s.took()), (Some(next), ended));
+            assert_eq!((s.next(&all(&[5])), s.took()), (Some(next), ended));
         }
-        assert_eq!((s.next(&[5]), s.took()), (Some(5), None));
-        assert_eq!(s.next(&[]), None);
+        assert_eq!((s.next(&all(&[5])), s.took()), (Some(5), None));
+        assert_eq!(s.next(&all(&[])), None);
         s.start_burst(42, 0);
         assert!(!s.in_burst() && !s.must_wait());
     }
@@ -118,10 +151,10 @@ mod tests {
     fn steps_asked_for_ahead_count_and_the_end_is_waited_for() {
         let mut s = Schedule::new(1);
         s.start_burst(42, 2);
-        assert_eq!((s.next(&[5]), s.must_wait()), (Some(5), false));
-        assert_eq!((s.next(&[5]), s.must_wait()), (Some(42), true));
+        assert_eq!((s.next(&all(&[5])), s.must_wait()), (Some(5), false));
+        assert_eq!((s.next(&all(&[5])), s.must_wait()), (Some(42), true));
         assert_eq!((s.took(), s.must_wait()), (None, true));
         assert_eq!((s.took(), s.must_wait()), (Some(42), false));
-        assert_eq!((s.next(&[5]), s.took()), (Some(5), None));
+        assert_eq!((s.next(&all(&[5])), s.took()), (Some(5), None));
     }
 }

@@ -80,7 +80,7 @@ impl Trainer {
         if scene.pipeline.pool.count() == 0 || (self.trained_enough(scene) && !burst) {
             return Ok(None);
         }
-        let Some(index) = self.schedule.next(scene.views.ready()) else { return Ok(None) };
+        let Some(index) = self.schedule.next(&scene.views.ready()) else { return Ok(None) };
         let (view, target, rates) = (scene.view(index), scene.target(index), self.rates(scene));
         let step = scene.pipeline.start(&mut scene.gpu, &view, target, &rates, &self.weights)?;
         scene.steps += 1;

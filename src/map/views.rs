@@ -10,6 +10,7 @@ use super::exposure::Exposure;
 use super::horizon::Horizon;
 use super::keyframes::{Keyframe, PoseCorrection};
 use super::refine::Refinement;
+use super::schedule::Ready;
 use super::shape::Shape;
 use stipple_drivers::{Image, Nanos, Pose};
 
@@ -68,8 +69,10 @@ pub struct Views {
     places: Vec<u32>,
     keyframes: Vec<u32>,
     training: Vec<u32>,
-    /// Entries of `training` that may be trained on now.
+    /// Entries of `training` that may be trained on now, and the numbers of `Ready`.
     ready: Vec<u32>,
+    ready_newest: usize,
+    ready_of: usize,
 }
 
 impl Views {
@@ -89,6 +92,8 @@ impl Views {
             keyframes: vec![NONE; places],
             training: Vec::with_capacity(known),
             ready: Vec::with_capacity(places * cameras),
+            ready_newest: 0,
+            ready_of: 0,
         }
     }
 
@@ -333,12 +338,13 @@ impl Views {
     }
 
     /// Entries that may be trained on now.
-    pub fn ready(&self) -> &[u32] {
-        &self.ready
+    pub fn ready(&self) -> Ready<'_> {
+        Ready { views: &self.ready, newest: self.ready_newest, of: self.ready_of.max(self.ready.len()) }
     }
 
-    /// Sets which of the entries that have a place and are not held out may be trained on.
-    pub fn make_ready(&mut self, may: impl Fn(usize) -> bool) {
+    /// Sets which of the entries that have a place and are not held out may be trained on, how many of the newest keyframes
+    /// stay, and for how many keyframes in all they stand.
+    pub fn make_ready(&mut self, stay: usize, of: usize, may: impl Fn(usize) -> bool) {
         self.ready.clear();
         for place in 0..self.keyframes.len() {
             let first = self.keyframes[place] as usize * self.cameras;
@@ -348,6 +354,7 @@ impl Views {
         }
         // Draws depend on the order, and the order not on who had which place before.
         self.ready.sort_unstable();
+        (self.ready_newest, self.ready_of) = ((stay * self.cameras).min(self.ready.len()), of * self.cameras);
     }
 
     pub fn anchors(&self) -> usize {
@@ -446,10 +453,11 @@ mod tests {
         let mut s = views(2, 1);
         (0..2).for_each(|id| _ = s.add(&keyframe(id, false), ON_BODY, |_, i| i.pixels.fill(id as u8)));
         s.unplace(0);
-        assert_eq!((s.len(), s.ready(), s.has_place(0)), (2, &[1][..], false));
+        assert_eq!((s.len(), s.ready().views, s.has_place(0)), (2, &[1][..], false));
         assert!(s.place(0) && !s.place(1), "both places are taken");
-        s.make_ready(|_| true);
-        assert_eq!((s.image(0), s.ready()), (0, &[0, 1][..]));
+        s.make_ready(1, 9, |_| true);
+        let ready = s.ready();
+        assert_eq!((s.image(0), ready.views, ready.newest, ready.of), (0, &[0, 1][..], 1, 9));
         assert_eq!(s.placed().collect::<Vec<_>>(), [0, 1]);
     }
 

@@ -351,7 +351,7 @@ fn open_map(
     let ring = Arc::new(KeyframeRing::new(&input.calibration, board)?);
     let folder = out.file(MAP_STORE);
     let at_once = matches!(options.pace, Pace::Lockstep(_));
-    let place = Place { folder: &folder, fresh: options.fresh, flight: flight(), at_once };
+    let place = Place { folder: &folder, fresh: options.fresh, flight: Some(flight()), at_once };
     let mapping = Mapping::open(&input.calibration, board, ring, board.store.enabled.then_some(place))?;
     input.warnings.extend(mapping.mapper.unkept.as_ref().map(|fault| unkept(fault).to_string()));
     Ok(MapSide::Here(Box::new(mapping)))

@@ -483,7 +483,12 @@ pub fn serve(mut input: impl Read, mut output: impl Write) -> Result<(), Fault> 
         };
         let ring = Arc::new(ring);
         let folder = setup.out.join(super::MAP_STORE);
-        let place = setup.kept.map(|Kept { fresh, flight }| Place { folder: &folder, fresh, flight, at_once: false });
+        let place = setup.kept.map(|Kept { fresh, flight }| Place {
+            folder: &folder,
+            fresh,
+            flight: Some(flight),
+            at_once: false,
+        });
         Ok((ring.clone(), Mapping::open(calibration, board, ring, place)?))
     });
     let (ring, mapping) = match opened {

@@ -12,13 +12,14 @@ use serde_json::json;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 use std::sync::Arc;
+use std::time::Instant;
 use stipple::config::Board;
-use stipple::map::KeyframeScore;
+use stipple::map::{KeyframeScore, Mapper, Place};
 use stipple::output::metrics::trajectory_error;
 use stipple::output::report::Report;
 use stipple::output::OutputDir;
 use stipple::run::sensors::{Input, Source};
-use stipple::run::{fly, Options, Pace, Spacing, Steps};
+use stipple::run::{fly, Options, Pace, Spacing, Steps, MAP_STORE};
 use stipple_drivers::replay::read_trajectory;
 use stipple_drivers::sim::Scenario;
 use stipple_drivers::types::pose_at;
@@ -53,6 +54,9 @@ pub struct Args {
     /// Mapping steps a frame
     #[arg(long, value_name = "N", default_value_t = 2, value_parser = clap::value_parser!(u32).range(..=1000))]
     steps: u32,
+    /// Score the map that an earlier patrol left in DIR/map, without flying
+    #[arg(long)]
+    again: bool,
     /// Seconds of the flight; without it all of it
     #[arg(long, value_name = "S", value_parser = crate::seconds)]
     seconds: Option<f64>,
@@ -108,6 +112,9 @@ pub fn run(args: &Args) -> Result<(), Fault> {
     }
     scenario.seed = args.seed.unwrap_or(scenario.seed);
     let out = OutputDir::create(&args.out)?;
+    if args.again {
+        return again(&scenario, &board, &out);
+    }
     let resident = Arc::new(Resident::default());
     let (seen, settled) = (resident.clone(), (SETTLED_S * scenario.rate_hz) as usize);
     let input = Input::simulated(&scenario, move |frame, of| {
@@ -130,6 +137,29 @@ pub fn run(args: &Args) -> Result<(), Fault> {
     let rows = rows(&scenario, &truth, first, &report.quality.keyframe_scores, &means);
     let page = page(args, &report, &resident, rows);
     page.write(&out)?;
+    Ok(())
+}
+
+/// Scores what is in the store, and prints the rooms' rows.
+fn again(scenario: &Scenario, board: &Board, out: &OutputDir) -> Result<(), Fault> {
+    let input = Input::simulated(scenario, |_, _| ())?;
+    let (folder, begun) = (out.file(MAP_STORE), Instant::now());
+    let place = Place { folder: &folder, fresh: false, flight: None, at_once: true };
+    let mut mapper = Mapper::open_on(&input.calibration, board, Some(place))?;
+    if let Some(fault) = mapper.unkept.take() {
+        return Err(fault);
+    }
+    println!("opened in {:.2} s, device included", begun.elapsed().as_secs_f64());
+    let lost = |e| Fault::new(FaultKind::Unavailable, "the device", format!("{e}"), "see `stipple doctor`");
+    let quality = mapper.evaluate().map_err(lost)?;
+    let db = |psnr: Option<f64>| psnr.map_or("-".into(), |psnr| format!("{psnr:.2}"));
+    let (training, held_out) = (db(quality.psnr_db), db(quality.psnr_heldout_db));
+    println!("{} Gaussians; training {training} dB, held out {held_out} dB", mapper.splat_count());
+    for row in rows(scenario, &input.truth, first_stamp(&input), &quality.keyframe_scores, &[]) {
+        let [a, b] = &row.rounds;
+        let figures = [a.psnr_db, a.psnr_heldout_db, b.psnr_db, b.psnr_heldout_db].map(db).join("  ");
+        println!("{:10} {figures}", row.room);
+    }
     Ok(())
 }
 

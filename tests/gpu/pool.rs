@@ -41,6 +41,28 @@ fn trained(v: &View, n: usize) -> (Gpu, Pipeline) {
     (gpu, p)
 }
 
+/// The first block goes and comes back as the newest: both are as they were, to the bit.
+#[test]
+fn a_block_that_left_comes_back_as_it_was() {
+    let v = view(64, 48);
+    let (mut gpu, mut p) = trained(&v, 300);
+    let read = |gpu: &mut Gpu, p: &mut Pipeline, anchor: u32| {
+        let mut bytes = vec![];
+        let count = p.pool.read_block(gpu, anchor, true, &mut bytes).unwrap();
+        (count, bytes)
+    };
+    let [first, second] = [4, 9].map(|anchor| read(&mut gpu, &mut p, anchor));
+    assert_eq!(p.pool.remove_blocks(&mut gpu, |anchor| anchor == 4).unwrap(), first.0);
+    assert_eq!((p.pool.holds(4), p.pool.block(9)), (false, 0..second.0 as u32));
+    assert_eq!(read(&mut gpu, &mut p, 9), second);
+    let whole = (first.0, true);
+    assert!(!p.pool.insert_block(&mut gpu, (4, 0), whole, &first.1[1..]).unwrap(), "of another length");
+    assert!(p.pool.insert_block(&mut gpu, (4, 0), whole, &first.1).unwrap());
+    assert!(!p.pool.insert_block(&mut gpu, (4, 0), whole, &first.1).unwrap(), "it is there");
+    assert_eq!([4, 9].map(|anchor| read(&mut gpu, &mut p, anchor)), [first, second]);
+    assert_eq!(p.pool.blocks().map(|(anchor, _)| anchor).collect::<Vec<_>>(), [9, 4]);
+}
+
 #[test]
 fn eviction_takes_the_least_valuable_and_keeps_the_order_of_anchors() {
     let v = view(64, 48);
