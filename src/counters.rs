@@ -128,7 +128,7 @@ stipple_drivers::counters! {
     lines_lost,
     /// Times that a thread gave no sign of life for longer than it may.
     threads_silent,
-    /// Times that the mapper's process was started again, with an empty map.
+    /// Times that the mapper's process was started again.
     map_restarts,
     /// GPU submissions that failed.
     gpu_failures,

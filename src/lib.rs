@@ -17,6 +17,8 @@
 //! | term | meaning |
 //! |---|---|
 //! | anchor | a keyframe that seeded Gaussians: its view was not reconstructed; it owns a contiguous block of them |
+//! | archive | what the mapper knows of the map on disk, and what it brings into memory (`map::archive`) |
+//! | block | the Gaussians of one anchor: what goes to disk and comes back whole |
 //! | board | a computer with its sensors, as its board file describes it |
 //! | body | the frame of the inertial unit; poses are `world_from_body`, world z up |
 //! | burst | training steps that follow a new anchor, every other on its own view |
@@ -27,6 +29,7 @@
 //! | gate | what judges and repairs samples and frames before anybody uses them (`run::gate`) |
 //! | generation | the number of a record's version in the store: a newer one replaces an older |
 //! | held out | a keyframe that is never trained on, only evaluated |
+//! | horizon | how far a keyframe sees, in a few cells: which blocks it sees is told by it (`map::horizon`) |
 //! | increment | inertial samples between two frames, integrated (preintegration) |
 //! | keyframe | a frame kept in the estimator's window as a pose, and offered to the map |
 //! | landmark | a point of the estimator: direction and inverse distance in its host keyframe |
@@ -36,6 +39,7 @@
 //! | packet | a frame on its way through tracking, with its inertial samples and results |
 //! | record | what `store` keeps of one block or keyframe: a header and a payload, in a segment |
 //! | seal | the moment after which our threads allocate nothing |
+//! | place | room for a keyframe's images in memory |
 //! | pool | the fixed number of places for Gaussians (*splats* in the budget and in kernels) |
 //! | segment | a file of the store, of fixed size, that is appended to until it is full |
 //! | seed | a new Gaussian at a pixel of an anchor, at its stereo depth |

@@ -158,6 +158,8 @@ pub struct Archive {
     pub sight: Vec<u8>,
     pub choice: Choice,
     pub rng: Rng,
+    /// Training steps from one exchange of images to the next.
+    pub rotation_steps: u64,
     /// The next block and keyframe that are looked at for writing.
     next_block: usize,
     next_state: usize,
@@ -220,6 +222,7 @@ impl Archive {
             sight,
             choice,
             rng: Rng::new(board.map.seed ^ 0x5e7),
+            rotation_steps: u64::from(board.map.rotation_steps.max(1)),
             next_block: 0,
             next_state: 0,
         };

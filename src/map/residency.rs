@@ -37,8 +37,6 @@ const SEEN_MIN: u8 = 1;
 const RESERVE_DIVISOR: usize = 8;
 /// Blocks asked for when a keyframe comes: some MiB.
 const PAGED_AT_ONCE: usize = 8;
-/// Training steps from one exchange of images to the next.
-const ROTATION_STEPS: u64 = 8;
 /// Newest keyframes whose poses odometry still corrects.
 const NEWEST: usize = 8;
 /// Draws until another keyframe is found for a place.
@@ -391,7 +389,7 @@ impl Archive {
 
     /// Exchanges an image now and then.
     pub fn rotate(&mut self, scene: &mut Scene) -> Result<(), GpuError> {
-        if scene.steps % ROTATION_STEPS != 0 || self.choice.candidates.is_empty() {
+        if scene.steps % self.rotation_steps != 0 || self.choice.candidates.is_empty() {
             return Ok(());
         }
         self.receive(scene)?;

@@ -2,7 +2,7 @@
 //!
 //! The process that flies starts `stipple map-worker`, tells it everything on its standard input (TOML), and hands keyframes over
 //! through shared memory (`keyframes`). It looks at the worker fifty times a second: one that has ended is started again,
-//! one that is stopped, hangs or takes too much memory is killed first. A worker that starts again has an empty map, and is
+//! one that is stopped, hangs or takes too much memory is killed first. A worker that starts again goes on with the map on disk, and is
 //! offered the newest keyframes once more. When the run is over the worker writes `map.ply`, evaluates, and answers on its
 //! standard output: frames of four bytes of length (little endian) and JSON.
 
