@@ -39,6 +39,8 @@ const RESERVE_DIVISOR: usize = 8;
 const PAGED_AT_ONCE: usize = 8;
 /// Newest keyframes whose poses odometry still corrects.
 const NEWEST: usize = 8;
+/// Places for each block in the pool, below which a block's last keyframe may go, too.
+const VIEWS_PER_BLOCK: usize = 3;
 /// Draws until another keyframe is found for a place.
 const DRAWS: usize = 16;
 /// Part of a horizon that may be open.
@@ -354,10 +356,13 @@ impl Archive {
         if self.known.get(keyframe)?.asked > 0 || recent && !entry.held_out {
             return None;
         }
-        let last = self.home(keyframe).is_some_and(|home| {
-            let shares = |f: &usize| *f != first && self.home(*f / cameras) == Some(home);
-            self.blocks[home].in_pool && !views.placed().any(|f| shares(&f))
-        });
+        // Where places are few, each would be the last of its block, and none would ever go.
+        let few = views.places() < VIEWS_PER_BLOCK * self.blocks.iter().filter(|b| b.in_pool).count();
+        let last = !few
+            && self.home(keyframe).is_some_and(|home| {
+                let shares = |f: &usize| *f != first && self.home(*f / cameras) == Some(home);
+                self.blocks[home].in_pool && !views.placed().any(|f| shares(&f))
+            });
         let kind = if entry.held_out {
             3
         } else if last {
