@@ -22,7 +22,7 @@ use super::diffusion::Diffusion;
 use super::keyframes::Keyframe;
 use super::occupancy::{self, Occupancy};
 use super::pool::{threshold, PruneRule, FREE_DIVISOR};
-use super::scene::Scene;
+use super::scene::{Scene, EVICTED_DIVISOR, STEPS_JUDGED};
 use super::seeds::{Seed, Seeder};
 use super::view::View;
 use super::views::Views;
@@ -34,13 +34,9 @@ use stipple_drivers::{Fault, Image};
 
 /// Part of a view that must have depth to seed from; the rest is continued from it.
 const DEPTH_MIN: f64 = 0.01;
-/// Fewer steps than this and a Gaussian's importance is not known.
-const STEPS_JUDGED: u32 = 30;
 /// Steps a keyframe that anchors count on, however few they were so far: the first, which is all there is to see, and others.
 const STEPS_FIRST: usize = 40;
 const STEPS_MIN: usize = 8;
-/// One anchor may evict one in so many of the pool.
-const EVICTED_DIVISOR: usize = 16;
 /// A whole uncovered view may take one in so many of the pool where others are evicted for it.
 const POOL_DIVISOR: usize = 16;
 

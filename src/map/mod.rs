@@ -346,13 +346,21 @@ impl Mapper {
 
     /// Scores `most` of the keyframes, spread over the run. Allocates.
     pub fn evaluate_some(&mut self, most: usize) -> Result<Evaluation, GpuError> {
-        self.finish_pending()?;
+        self.finish_for_paging()?;
         evaluate::evaluate(&mut self.scene, &mut self.archive, self.trainer.weights(), most)
+    }
+
+    /// Takes in the step in flight where images are to come and go: a place must not change hands under it.
+    fn finish_for_paging(&mut self) -> Result<(), GpuError> {
+        if self.archive.is_some() {
+            self.finish_pending()?;
+        }
+        Ok(())
     }
 
     /// Pictures of `count` keyframes spread over the run. Allocates.
     pub fn panels(&mut self, count: usize) -> Result<Vec<Panel>, GpuError> {
-        self.finish_pending()?;
+        self.finish_for_paging()?;
         evaluate::panels(&mut self.scene, &mut self.archive, count)
     }
 

@@ -31,8 +31,11 @@ const FACING_M: f64 = 2.0;
 /// A keyframe all of whose blocks are in the pool counts as nearer by this, m: without, two views at a limit would exchange their
 /// blocks over and over.
 const STAYS_M: f64 = 1.0;
-/// A keyframe sees a block if it sees as many of its samples.
-const SEEN_MIN: u8 = 1;
+/// Part of the Gaussians that a keyframe sees that may be missing when it is trained on: what is seen through far doors.
+const AWAY_MAX: f32 = 0.04;
+/// What keyframes nearer than this see is wanted whether or not it fits, m: where it does not, the least important Gaussians
+/// go. A scene that is denser than the pool is thinned, one that is larger is paged.
+const LOCAL_M: f32 = 4.0;
 /// Part of the pool that is left for what is new.
 const RESERVE_DIVISOR: usize = 8;
 /// Blocks asked for when a keyframe comes: some MiB.
@@ -57,13 +60,27 @@ fn newest_kept(views: &Views) -> usize {
 }
 
 impl Archive {
-    fn sees(&self, keyframe: usize, block: usize) -> bool {
-        self.sight[keyframe * BLOCKS_KNOWN + block] >= SEEN_MIN
+    /// Gaussians of a block that a keyframe sees, by the block's samples.
+    fn seen(&self, keyframe: usize, block: usize) -> f32 {
+        let b = &self.blocks[block];
+        let samples = f32::from(self.sight[keyframe * BLOCKS_KNOWN + block]);
+        samples * b.count as f32 / f32::from(b.samples_len.max(1))
     }
 
-    /// Whether all blocks that a keyframe sees are in the pool.
+    /// Whether nearly all Gaussians that a keyframe sees are in blocks that `here` names.
+    fn has_nearly_all(&self, keyframe: usize, here: impl Fn(usize) -> bool) -> bool {
+        let (mut all, mut away) = (0.0, 0.0);
+        for block in 0..self.blocks.len() {
+            let seen = self.seen(keyframe, block);
+            all += seen;
+            away += if here(block) { 0.0 } else { seen };
+        }
+        away <= AWAY_MAX * all
+    }
+
+    /// Whether nearly all Gaussians that a keyframe sees are in the pool.
     fn is_whole(&self, keyframe: usize) -> bool {
-        (0..self.blocks.len()).all(|b| self.blocks[b].in_pool || !self.sees(keyframe, b))
+        self.has_nearly_all(keyframe, |block| self.blocks[block].in_pool)
     }
 
     /// Chooses what is wanted where a keyframe was taken, and fetches some of it.
@@ -135,19 +152,27 @@ impl Archive {
         self.choice.blocks.clear();
         self.choice.candidates.clear();
         let mut taken = 0;
-        for &(_, keyframe) in &order {
-            let more = |a: &Archive, b: usize| a.sees(keyframe as usize, b) && !a.choice.wanted[b];
-            let count: usize =
-                (0..self.blocks.len()).filter(|b| more(self, *b)).map(|b| self.blocks[b].count as usize).sum();
-            if taken + count > room {
-                continue;
+        for &(near, keyframe) in &order {
+            let before = (self.choice.blocks.len(), taken);
+            // What it sees most of first, until nearly all of it is wanted.
+            while !self.has_nearly_all(keyframe as usize, |b| self.choice.wanted[b]) {
+                let more = |b: &usize| !self.choice.wanted[*b] && self.seen(keyframe as usize, *b) > 0.0;
+                let most = (0..self.blocks.len()).filter(more).max_by(|a, b| {
+                    self.seen(keyframe as usize, *a).total_cmp(&self.seen(keyframe as usize, *b)).then(b.cmp(a))
+                });
+                let Some(block) = most else { break };
+                taken += self.blocks[block].count as usize;
+                self.choice.wanted[block] = true;
+                self.choice.blocks.push(block as u32);
             }
-            taken += count;
-            for b in 0..self.blocks.len() {
-                if more(self, b) {
-                    self.choice.wanted[b] = true;
-                    self.choice.blocks.push(b as u32);
+            if taken > room && near > LOCAL_M {
+                // It does not fit, and takes none of the room.
+                while self.choice.blocks.len() > before.0 {
+                    let block = self.choice.blocks.pop().expect("there are more");
+                    self.choice.wanted[block as usize] = false;
                 }
+                taken = before.1;
+                continue;
             }
             self.choice.candidates.push(keyframe);
         }
@@ -296,6 +321,10 @@ impl Archive {
         }
         self.take_out(scene, &leaving)?;
         self.choice.leaving = leaving;
+        let missing = count.saturating_sub(scene.pipeline.pool.room());
+        if missing > 0 {
+            scene.thin(missing)?;
+        }
         Ok(scene.pipeline.pool.room() >= count)
     }
 

@@ -4,6 +4,7 @@ use super::cameras::TrainingCamera;
 use super::coarseness::Coarseness;
 use super::exposure::{gain_from, median_exposure, Exposure};
 use super::pipeline::Pipeline;
+use super::pool::{threshold, PruneRule};
 use super::render::Rendered;
 use super::step::{Stats, Target};
 use super::view::View;
@@ -11,6 +12,11 @@ use super::views::{Stored, Views};
 use crate::counters::Counters;
 use crate::gpu::{Gpu, GpuError};
 use stipple_drivers::Pose;
+
+/// Fewer steps than this and a Gaussian's importance is not known.
+pub const STEPS_JUDGED: u32 = 30;
+/// One in so many of the pool may be evicted at a time.
+pub const EVICTED_DIVISOR: usize = 16;
 
 pub struct Scene {
     pub gpu: Gpu,
@@ -57,6 +63,19 @@ impl Scene {
         for (channel, plane) in self.views.planes(index).iter().enumerate() {
             self.pipeline.loss.set_plane(&mut self.gpu, image, channel, &plane.pixels)?;
         }
+        Ok(())
+    }
+
+    /// Makes room for `wanted` Gaussians in the pool: removes what is faint, huge or not finite, and where that leaves less, the
+    /// least important of those that were judged, `EVICTED_DIVISOR` of the pool at most.
+    pub fn thin(&mut self, wanted: usize) -> Result<(), GpuError> {
+        let (gpu, pool) = (&mut self.gpu, &mut self.pipeline.pool);
+        let bins = pool.importance(gpu, STEPS_JUDGED)?;
+        let (importance_min, evicted) = threshold(&bins, wanted, pool.capacity() / EVICTED_DIVISOR);
+        let removed =
+            pool.prune(gpu, &PruneRule { importance_min, steps_min: STEPS_JUDGED, ..PruneRule::default() })?;
+        self.counters.splats_evicted.add(evicted.min(removed) as u64);
+        self.counters.splats_pruned.add(removed.saturating_sub(evicted) as u64);
         Ok(())
     }
 

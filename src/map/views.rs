@@ -107,11 +107,6 @@ impl Views {
         self.entries.len() + self.cameras > self.known || self.free_place().is_none()
     }
 
-    /// Keyframes that can be known.
-    pub fn keyframes_max(&self) -> usize {
-        self.known / self.cameras
-    }
-
     /// Keyframes that can have a place at once.
     pub fn places(&self) -> usize {
         self.keyframes.len()
@@ -182,7 +177,7 @@ impl Views {
         let (keyframe, Some(place)) = (index / self.cameras, self.free_place()) else { return false };
         (self.places[keyframe], self.keyframes[place]) = (place as u32, keyframe as u32);
         let first = keyframe * self.cameras;
-        self.entries[first..first + self.cameras].iter_mut().for_each(|e| e.steps_here = 0);
+        self.entries.iter_mut().skip(first).take(self.cameras).for_each(|e| e.steps_here = 0);
         true
     }
 
