@@ -11,40 +11,35 @@
 //! what finds no room there is thinned as without a store.
 
 use super::block::{BlockAbout, KeyframeAbout, RunAbout};
-use super::block::{KIND_BLOCK, KIND_IMAGE, KIND_KEYFRAME, KIND_RUN, NO_BLOCK, SAMPLES};
-use super::horizon::{ball, Horizon};
-use super::paging::splat_bytes;
-use super::pool::FREE_DIVISOR;
-use super::refine::Refinement;
+use super::block::{KIND_BLOCK, KIND_IMAGE, KIND_KEYFRAME, NO_BLOCK, SAMPLES};
+use super::choice::Choice;
+use super::filing::{
+    entry, identity, image_id, keyframes_known, limits, payload_max, run_key, state, BLOCKS_KNOWN, MOMENTS,
+};
+use super::horizon::ball;
 use super::scene::Scene;
 use super::schedule::Rng;
 use super::shape::Shape;
-use super::view::View;
-use super::views::{Stored, Views};
+use super::views::Views;
 use crate::config::Board;
 use crate::counters::Counters;
 use crate::gpu::GpuError;
 use crate::limits::CAMERAS_MAX;
 use crate::mem::{unsealed, Footprint};
-use crate::store::{self, Disk, Fetched, Key, Limits, Store};
-use glam::{DVec3, Vec3};
+use crate::store::{self, Disk, Fetched, Key, Store};
+use glam::Vec3;
 use std::path::Path;
 use std::sync::Arc;
-use stipple_drivers::{Calibration, Fault, Image, Nanos, Pose};
+use stipple_drivers::{host, Calibration, Fault, FaultKind, Pose};
 
-/// Blocks that a run may make. One covers some square metres: a large building.
-pub const BLOCKS_KNOWN: usize = 2048;
-/// Buffers between here and the disk: what is written and what is read at a time.
-const BUFFERS: usize = 8;
-const SEGMENT_BYTES: u64 = 8 << 20;
 /// Training steps after which a block is written again, as a part of those it had, and at least.
 const REWRITTEN_PART: f64 = 0.25;
 const REWRITTEN_MIN: u32 = 100;
+/// Least space on the disk that a map is begun with, bytes.
+const BYTES_MIN: u64 = 128 << 20;
 /// Blocks and states of keyframes written when a keyframe comes, at most.
 const BLOCKS_AT_ONCE: usize = 2;
 const STATES_AT_ONCE: usize = 4;
-/// Whether blocks keep Adam's moments on disk.
-const MOMENTS: bool = true;
 
 /// Where the store is, and how it is used.
 #[derive(Clone, Copy, Debug)]
@@ -109,39 +104,6 @@ pub struct Known {
     pub open: bool,
 }
 
-/// What is wanted, and room to find it.
-pub struct Choice {
-    /// Keyframes by how near they are, m.
-    pub order: Vec<(f32, u32)>,
-    pub wanted: Vec<bool>,
-    /// The wanted, most wanted first.
-    pub blocks: Vec<u32>,
-    /// Keyframes all of whose blocks are wanted.
-    pub candidates: Vec<u32>,
-    /// A block on its way to the store.
-    pub page: Vec<u8>,
-    pub leaving: Vec<u32>,
-    /// Pixels that count and do not show what is on disk.
-    pub hidden: Vec<u8>,
-    /// The last keyframe.
-    pub last: Option<(Nanos, Pose)>,
-}
-
-impl Choice {
-    pub fn new(keyframes: usize, payload: usize, pixels: usize) -> Choice {
-        Choice {
-            order: Vec::with_capacity(keyframes),
-            wanted: vec![false; BLOCKS_KNOWN],
-            blocks: Vec::with_capacity(BLOCKS_KNOWN),
-            candidates: Vec::with_capacity(keyframes),
-            page: Vec::with_capacity(payload),
-            leaving: Vec::with_capacity(BLOCKS_KNOWN),
-            hidden: Vec::with_capacity(pixels),
-            last: None,
-        }
-    }
-}
-
 pub struct Archive {
     pub store: Store,
     disk: Arc<Disk>,
@@ -177,7 +139,16 @@ impl Archive {
         if place.fresh {
             store::set_aside(place.folder)?;
         }
-        let limits = limits(board, shape, place.at_once);
+        let mut limits = limits(board, shape, place.at_once);
+        // Others write to the disk, too: the log of the run first of all.
+        let free = place.folder.parent().and_then(host::disk_free).unwrap_or(u64::MAX);
+        limits.bytes_max = limits.bytes_max.min(free / 2);
+        if limits.bytes_max < BYTES_MIN {
+            let what =
+                format!("has {} MiB of free space, less than twice the {} of a map", free >> 20, BYTES_MIN >> 20);
+            let fix = "make room, or name another --out folder";
+            return Err(Fault::new(FaultKind::NoOutput, place.folder.display().to_string(), what, fix));
+        }
         let (store, disk) = Store::open(place.folder, identity(calibration, board, shape), &limits)?;
         let (mut run, mut epochs) = (0, 0);
         store.entries(|key, about| {
@@ -454,49 +425,6 @@ impl Archive {
         true
     }
 
-    /// The block that a keyframe sees most of.
-    pub fn home(&self, keyframe: usize) -> Option<usize> {
-        let row = &self.sight[keyframe * BLOCKS_KNOWN..][..self.blocks.len()];
-        let most = row.iter().copied().max().filter(|n| *n > 0)?;
-        row.iter().position(|n| *n == most)
-    }
-
-    /// Looks again which blocks a view sees, by its horizon.
-    pub fn look_from(&mut self, view: &View, horizon: &Horizon, keyframe: usize) {
-        for block in 0..self.blocks.len() {
-            self.look(view, horizon, keyframe, block);
-        }
-    }
-
-    fn look(&mut self, view: &View, horizon: &Horizon, keyframe: usize, block: usize) {
-        let b = &self.blocks[block];
-        let seen = if b.epoch == view.epoch && in_reach(view, b) {
-            b.points().iter().filter(|p| horizon.sees(view, Vec3::from_array(**p).as_dvec3())).count() as u8
-        } else {
-            0
-        };
-        self.sight[keyframe * BLOCKS_KNOWN + block] = seen;
-    }
-
-    /// Looks from every keyframe that is known.
-    pub fn look_around(&mut self, scene: &Scene) {
-        let cameras = scene.views.cameras();
-        for keyframe in 0..self.known.len() {
-            let horizon = scene.views.get(keyframe * cameras).horizon;
-            self.look_from(&scene.view(keyframe * cameras), &horizon, keyframe);
-        }
-    }
-
-    /// Looks which keyframes see a block.
-    pub fn look_for(&mut self, scene: &Scene, block: usize) {
-        let cameras = scene.views.cameras();
-        for keyframe in 0..self.known.len().min(scene.views.len() / cameras) {
-            let index = keyframe * cameras;
-            let horizon = scene.views.get(index).horizon;
-            self.look(&scene.view(index), &horizon, keyframe, block);
-        }
-    }
-
     /// Counts a training step on a view.
     pub fn trained(&mut self, keyframe: usize) {
         let row = &self.sight[keyframe * BLOCKS_KNOWN..][..self.blocks.len()];
@@ -652,80 +580,6 @@ pub enum Arrived {
     Unknown,
 }
 
-/// Copies an image's planes from its record; false where it is not as large.
-pub fn read_planes(payload: &[u8], planes: &mut [Image]) -> bool {
-    let bytes: usize = planes.iter().map(|p| p.pixels.len()).sum();
-    if payload.len() != bytes {
-        return false;
-    }
-    let mut rest = payload;
-    for plane in planes {
-        let (pixels, after) = rest.split_at(plane.pixels.len());
-        plane.pixels.copy_from_slice(pixels);
-        rest = after;
-    }
-    true
-}
-
-/// Whether a view may see anything of a block: its ball reaches before the camera and into its cone.
-fn in_reach(view: &View, b: &Block) -> bool {
-    let p: DVec3 = view.world_from_cam.inverse().transform(b.centre.as_dvec3());
-    let radius = f64::from(b.radius);
-    if view.fisheye.is_some() || p.length() <= radius {
-        return true;
-    }
-    let c = &view.camera;
-    let half = |size: usize, f: f64| (size as f64 / 2.0 + 1.0).max(c.cx.max(c.cy).min(size as f64)) / f;
-    let cone = half(c.width, c.fx).hypot(half(c.height, c.fy)).atan();
-    let off = p.truncate().length().atan2(p.z) - (radius / p.length()).asin();
-    off <= cone
-}
-
-fn image_id(views: &Views, index: usize) -> u32 {
-    views.get(index).id as u32 * CAMERAS_MAX as u32 + views.camera(index) as u32
-}
-
-fn run_key(run: u32) -> Key {
-    Key { kind: KIND_RUN, run, id: 0 }
-}
-
-fn state(e: &Stored, home: u32, epoch_base: u32) -> KeyframeAbout {
-    KeyframeAbout {
-        t: e.t,
-        epoch: e.epoch + epoch_base,
-        held_out: e.held_out,
-        anchor: e.anchor,
-        home,
-        given: e.given,
-        refined: e.refined.body_from_refined,
-        body_from_cam: e.body_from_cam,
-        body_from_raw: e.body_from_raw,
-        exposure: e.refined.exposure,
-        coarseness: e.coarseness,
-        steps: e.steps,
-        horizon: e.horizon,
-    }
-}
-
-fn entry(id: u32, s: &KeyframeAbout, epoch_base: u32) -> Stored {
-    Stored {
-        id: u64::from(id / CAMERAS_MAX as u32),
-        t: s.t,
-        epoch: s.epoch.saturating_sub(epoch_base),
-        given: s.given,
-        body_from_cam: s.body_from_cam,
-        body_from_raw: s.body_from_raw,
-        placed: s.given * s.body_from_cam,
-        held_out: s.held_out,
-        anchor: false,
-        refined: Refinement::known(s.refined, s.exposure),
-        coarseness: s.coarseness,
-        horizon: s.horizon,
-        steps: s.steps,
-        steps_here: 0,
-    }
-}
-
 fn tables(board: &Board, shape: &Shape) -> (Vec<Block>, Vec<Known>, Vec<u8>, Choice) {
     let keyframes = keyframes_known(board, shape);
     (
@@ -734,40 +588,4 @@ fn tables(board: &Board, shape: &Shape) -> (Vec<Block>, Vec<Known>, Vec<u8>, Cho
         vec![0; keyframes * BLOCKS_KNOWN],
         Choice::new(keyframes, payload_max(board, shape), shape.pixels()),
     )
-}
-
-fn limits(board: &Board, shape: &Shape, at_once: bool) -> Limits {
-    Limits {
-        bytes_max: board.store.max_mib << 20,
-        segment_bytes: SEGMENT_BYTES,
-        records_max: records_max(board, shape),
-        payload_max: payload_max(board, shape),
-        buffers: BUFFERS,
-        write_bytes_per_s: if at_once { 0 } else { (board.store.write_mib_per_s * 1048576.0) as u64 },
-    }
-}
-
-/// Keyframes that are known at once.
-pub fn keyframes_known(board: &Board, shape: &Shape) -> usize {
-    (board.store.keyframes.max(board.budget.keyframes) as usize).max((shape.images / shape.cameras) as usize)
-}
-
-/// A state and an image of each camera of each keyframe, blocks and runs; twice, for the runs before.
-fn records_max(board: &Board, shape: &Shape) -> usize {
-    2 * (2 * keyframes_known(board, shape) * shape.cameras as usize + BLOCKS_KNOWN + 64)
-}
-
-fn payload_max(board: &Board, shape: &Shape) -> usize {
-    let seeds = board.map.seeds_per_anchor.min(shape.splats.div_ceil(FREE_DIVISOR as u32));
-    let splats = (seeds + board.map.densify_max).min(shape.splats) as usize;
-    let block = splats * splat_bytes(shape.channels == 3, MOMENTS);
-    block.max(shape.pixels() * shape.channels as usize)
-}
-
-/// A number of a rig and the form of its images: maps of another are not read.
-fn identity(calibration: &Calibration, board: &Board, shape: &Shape) -> u64 {
-    let Shape { width, height, channels, cameras, .. } = *shape;
-    let text = format!("{:?} {:?} {width} {height} {channels} {cameras}", calibration.cameras, board.map.projection);
-    // FNV-1a.
-    text.bytes().fold(0xcbf2_9ce4_8422_2325, |h, b| (h ^ u64::from(b)).wrapping_mul(0x0100_0000_01b3))
 }

@@ -10,6 +10,7 @@ pub mod archive;
 pub mod backward;
 pub mod block;
 pub mod cameras;
+mod choice;
 mod coarseness;
 pub mod coverage;
 mod densify;
@@ -17,6 +18,7 @@ mod depth_fill;
 mod diffusion;
 mod evaluate;
 pub mod exposure;
+mod filing;
 pub mod horizon;
 mod keyframes;
 pub mod loss;
@@ -31,6 +33,7 @@ mod scene;
 pub mod schedule;
 mod seeds;
 pub mod shape;
+mod sight;
 pub mod sort;
 pub mod ssim;
 pub mod step;
@@ -450,7 +453,7 @@ impl Mapper {
 /// Views that there is room for beside those whose images are in memory.
 fn known(board: &Board, shape: &Shape) -> usize {
     if board.store.enabled {
-        archive::keyframes_known(board, shape) * shape.cameras as usize
+        filing::keyframes_known(board, shape) * shape.cameras as usize
     } else {
         0
     }

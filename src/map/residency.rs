@@ -11,8 +11,10 @@
 //! A view is not uncovered where it shows a block that is on disk: where a keyframe's own depth finds such a block, nothing is
 //! seeded (`hide`).
 
-use super::archive::{read_planes, Archive, Arrived, Choice, BLOCKS_KNOWN};
+use super::archive::{Archive, Arrived};
 use super::block::BlockAbout;
+use super::choice::Choice;
+use super::filing::{read_planes, BLOCKS_KNOWN};
 use super::horizon::{cell_of, Horizon, CELLS, COLUMNS, ROWS};
 use super::scene::Scene;
 use super::view::View;
@@ -454,9 +456,7 @@ impl Archive {
             let index = keyframe * cameras;
             *to = Some((scene.view(index), scene.views.get(index).horizon));
         }
-        if asked[0].is_none() {
-            return None;
-        }
+        asked[0]?;
         // Points of a cell that have depth, and how many of them are known.
         let (mut points, mut known) = ([0u8; CELLS], [0u8; CELLS]);
         let (across, down) = ((w / (COLUMNS * POINTS)).max(1), (h / (ROWS * POINTS)).max(1));

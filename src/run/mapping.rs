@@ -34,6 +34,13 @@ const ITERATION_TIMES: usize = 1 << 16;
 /// Samples of error against run time.
 const CURVE_POINTS: usize = 4096;
 
+/// How the map's store is used: `map::Place`.
+#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
+pub struct Kept {
+    pub fresh: bool,
+    pub flight: i64,
+}
+
 pub struct Mapping {
     pub mapper: Mapper,
     /// Where keyframes and corrections come from.

@@ -67,7 +67,7 @@ use gate::ImuGate;
 use keyframes::{KeyframeRing, Keyframes};
 use log::Log;
 use mailbox::{Capture, Mailbox};
-use mapping::Mapping;
+use mapping::{Kept, Mapping};
 use recorder::Recording;
 pub use reload::BoardSource;
 use sensors::{Input, Playback, Sensors, Source};
@@ -86,7 +86,7 @@ pub use supervisor::Steering;
 pub use table::Spacing;
 use table::Table;
 use tracking::{FramePacket, Inlet, Link, OdometryRun, Tracker};
-use worker::{Kept, MapSide, Worker};
+use worker::{MapSide, Worker};
 use writers::Writers;
 
 /// How frames arrive and mapping steps are spent.

@@ -7,7 +7,7 @@
 //! standard output: frames of four bytes of length (little endian) and JSON.
 
 use super::keyframes::{KeyframeRing, Word};
-use super::mapping::{self, Drawn, MapResult, Mapping};
+use super::mapping::{self, Drawn, Kept, MapResult, Mapping};
 use super::memory;
 use super::status::{print_err, Gauges};
 use super::threads;
@@ -68,13 +68,6 @@ struct Setup {
     parent: u32,
     /// None where the map is not kept on disk.
     kept: Option<Kept>,
-}
-
-/// How the map's store is used: `map::Place`.
-#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
-pub struct Kept {
-    pub fresh: bool,
-    pub flight: i64,
 }
 
 #[derive(Serialize, Deserialize)]
@@ -158,8 +151,8 @@ pub struct Worker {
 
 impl Worker {
     /// A worker that does not run yet, and may be started at once.
-    fn new(ring: KeyframeRing, calibration: Calibration, board: Board, out: PathBuf, kept: Option<Kept>) -> Worker {
-        let now = Instant::now();
+    fn new(ring: KeyframeRing, calibration: Calibration, board: Board, at: (PathBuf, Option<Kept>)) -> Worker {
+        let ((out, kept), now) = (at, Instant::now());
         Worker {
             ring: Arc::new(ring),
             bytes_max: (board.memory_max_mib << 20) + DRIVER_BYTES,
@@ -187,7 +180,7 @@ impl Worker {
         kept: Option<Kept>,
     ) -> Result<Worker, Fault> {
         let ring = KeyframeRing::new(calibration, board)?.with_cloud(Cloud::create())?;
-        let mut worker = Worker::new(ring, calibration.clone(), board.clone(), out.path().to_path_buf(), kept);
+        let mut worker = Worker::new(ring, calibration.clone(), board.clone(), (out.path().to_path_buf(), kept));
         let first = Some((place.to_string(), records));
         worker.spawn(first).map_err(|e| refused(format!("the mapper's process does not start: {e}")))?;
         let (gauges, told) = (Gauges::default(), worker.running.as_ref().map(|r| r.told.clone()));
@@ -215,7 +208,6 @@ impl Worker {
             out: self.out.clone(),
             ring: self.ring.number(),
             cloud: self.ring.cloud.as_ref().map(|cloud| cloud.number()),
-            // One that is started again is not disturbed.
             rules: if first.is_some() { threads::rules() } else { vec![] },
             first,
             run_s: self.begun.elapsed().as_secs_f64(),
@@ -274,8 +266,7 @@ impl Worker {
         };
         let life = now - running.started;
         ring.word(Word::Absent).store(1, Release);
-        let told = self.running.take().map(Running::end);
-        // Before the first is ready its fault is `start`'s to tell.
+        let told = self.running.take().map(Running::end); // before the first is ready its fault is `start`'s to tell
         let said =
             told.and_then(|told| lock(&told).refused.clone()).map_or(String::new(), |fault| format!(" ({fault})"));
         self.postpone(now, life);
@@ -596,7 +587,7 @@ mod tests {
     fn pauses_grow_only_where_a_worker_lives_shortly() {
         let board = Board::parse("lavapipe.toml", include_str!("../../board-configs/lavapipe.toml"), &[]).unwrap();
         let calibration = Calibration { cameras: vec![], imu: stipple_drivers::ImuCalibration::CONSUMER };
-        let mut worker = Worker::new(ring(), calibration, board, PathBuf::new(), None);
+        let mut worker = Worker::new(ring(), calibration, board, (PathBuf::new(), None));
         let now = worker.next_start;
         let mut pause = |life_s| {
             worker.postpone(now, Duration::from_secs(life_s));

@@ -1,0 +1,67 @@
+//! Which keyframes see which blocks: told by horizons and by samples of the blocks, for all that is known, wherever it is.
+
+use super::archive::{Archive, Block};
+use super::filing::BLOCKS_KNOWN;
+use super::horizon::Horizon;
+use super::scene::Scene;
+use super::view::View;
+use glam::{DVec3, Vec3};
+
+impl Archive {
+    /// The block that a keyframe sees most of.
+    pub fn home(&self, keyframe: usize) -> Option<usize> {
+        let row = &self.sight[keyframe * BLOCKS_KNOWN..][..self.blocks.len()];
+        let most = row.iter().copied().max().filter(|n| *n > 0)?;
+        row.iter().position(|n| *n == most)
+    }
+
+    /// Looks again which blocks a view sees, by its horizon.
+    pub fn look_from(&mut self, view: &View, horizon: &Horizon, keyframe: usize) {
+        for block in 0..self.blocks.len() {
+            self.look(view, horizon, keyframe, block);
+        }
+    }
+
+    fn look(&mut self, view: &View, horizon: &Horizon, keyframe: usize, block: usize) {
+        let b = &self.blocks[block];
+        let seen = if b.epoch == view.epoch && in_reach(view, b) {
+            b.points().iter().filter(|p| horizon.sees(view, Vec3::from_array(**p).as_dvec3())).count() as u8
+        } else {
+            0
+        };
+        self.sight[keyframe * BLOCKS_KNOWN + block] = seen;
+    }
+
+    /// Looks from every keyframe that is known.
+    pub fn look_around(&mut self, scene: &Scene) {
+        let cameras = scene.views.cameras();
+        for keyframe in 0..self.known.len() {
+            let horizon = scene.views.get(keyframe * cameras).horizon;
+            self.look_from(&scene.view(keyframe * cameras), &horizon, keyframe);
+        }
+    }
+
+    /// Looks which keyframes see a block.
+    pub fn look_for(&mut self, scene: &Scene, block: usize) {
+        let cameras = scene.views.cameras();
+        for keyframe in 0..self.known.len().min(scene.views.len() / cameras) {
+            let index = keyframe * cameras;
+            let horizon = scene.views.get(index).horizon;
+            self.look(&scene.view(index), &horizon, keyframe, block);
+        }
+    }
+}
+
+/// Whether a view may see anything of a block: its ball reaches before the camera and into its cone.
+fn in_reach(view: &View, b: &Block) -> bool {
+    let p: DVec3 = view.world_from_cam.inverse().transform(b.centre.as_dvec3());
+    let radius = f64::from(b.radius);
+    if view.fisheye.is_some() || p.length() <= radius {
+        return true;
+    }
+    let c = &view.camera;
+    let half = |size: usize, f: f64| (size as f64 / 2.0 + 1.0).max(c.cx.max(c.cy).min(size as f64)) / f;
+    let cone = half(c.width, c.fx).hypot(half(c.height, c.fy)).atan();
+    let off = p.truncate().length().atan2(p.z) - (radius / p.length()).asin();
+    off <= cone
+}
