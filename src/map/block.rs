@@ -311,6 +311,7 @@ impl BlockAbout {
 }
 
 /// The arrays of a block, as the device has them. Those that are not kept are empty.
+#[cfg(feature = "instruments")]
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct BlockArrays<'a> {
     pub splats: &'a [Splat],
@@ -320,6 +321,7 @@ pub struct BlockArrays<'a> {
     pub chroma_moments: &'a [[f32; 4]],
 }
 
+#[cfg(feature = "instruments")]
 impl BlockArrays<'_> {
     /// Appends a payload.
     pub fn encode(&self, out: &mut Vec<u8>) {
@@ -342,6 +344,7 @@ pub struct BlockBytes<'a> {
 }
 
 /// Replaces what is in `to` by the elements of an array in a payload, whole ones. Allocates where `to` has no room.
+#[cfg(feature = "instruments")]
 pub fn copied<T: bytemuck::Pod>(bytes: &[u8], to: &mut Vec<T>) {
     to.clear();
     to.resize(bytes.len() / size_of::<T>(), T::zeroed());

@@ -57,7 +57,7 @@ use trainer::Trainer;
 use views::Views;
 
 pub use archive::Place;
-pub use evaluate::{spread, CurvePoint, Evaluation, KeyframeScore, Panel};
+pub use evaluate::{spread, CurvePoint, Evaluation, Panel};
 pub use exposure::Exposure;
 pub use keyframes::{Keyframe, PoseCorrection};
 pub use pipeline::Pipeline;
@@ -68,6 +68,7 @@ pub use shape::Shape;
 #[cfg(feature = "instruments")]
 pub use {
     coarseness::Coarseness,
+    evaluate::KeyframeScore,
     pool::PruneRule,
     step::{LearningRates, StepStats, Target, Weights},
     tiling::Tiling,
