@@ -420,7 +420,7 @@ fn a_mapper_that_pauses_when_a_run_ends_is_started_for_the_map() {
         let mut mapper = worker(&child);
         // A mapper that dies before the flight begins ends the run.
         wait_for("the flight's log", || out.join("log-0000.mcap").exists().then_some(()));
-        std::thread::sleep(Duration::from_millis(500));
+        std::thread::sleep(Duration::from_millis(1500));
         // It pauses for 0, 1, 2 and 4 seconds.
         for died in 1..=4 + usize::from(dies_again) {
             kill(mapper, "KILL");
