@@ -21,3 +21,13 @@ uint after_step(uint state, float worth) {
     const float importance = count == 1 ? worth : before + NEWEST * (worth - before);
     return ((floatBitsToUint(min(importance, 1e30)) + 0x8000u) & 0xffff0000u) | count;
 }
+
+/// Steps after which a Gaussian's importance is known, and the part of it below which a view hardly shows the Gaussian.
+const uint STEPS_KNOWN = 16;
+const float SHOWN_MIN = 1.0 / 32.0;
+
+/// Whether a view in which a Gaussian has such a worth shows it. What is behind others gets a gradient of noise, which Adam
+/// makes as long a step of as of any other: trained from the next room alone, a wall would be worn away.
+bool shown(uint state, float worth) {
+    return steps_of(state) < STEPS_KNOWN || worth >= SHOWN_MIN * importance_of(state);
+}

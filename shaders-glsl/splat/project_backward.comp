@@ -4,7 +4,7 @@
 //      summed by sum_chunks)
 // out  splats, moments, steps (count and importance of this Gaussian, see importance.glsl); sums[8 group + ..]: gradient by a small
 //      translation (3) and rotation (3) of the camera frame applied to points, count of refused gradients, 0
-// A step whose gradient is not finite is not taken, and counted. Without LEARN, or where the list overflowed, no step is
+// A step whose gradient is not finite is not taken, and counted. What a view hardly shows takes none. Without LEARN, or where the list overflowed, no step is
 // taken and the map stays as it is to the bit: only the sums are written.
 #version 450
 #extension GL_GOOGLE_include_directive : require
@@ -87,7 +87,8 @@ float[7] update(uint rank) {
         v1 += second;
         worth += n == 1 ? abs(second[WORTH - 4]) : isect_gradients[SLOT_QUADS * (i + 1)].x;
     }
-    if (begin >= end) {
+    // Where nothing is compared there is nothing to learn.
+    if (begin >= end || worth == 0.0) {
         return pose;
     }
     const uint slot = slots[rank];
@@ -112,7 +113,7 @@ float[7] update(uint rank) {
 
     // A list that lost Gaussians shows holes, which are nothing to learn from.
     const bool whole = tile_offsets[visible_count[0]] <= push.capacity;
-    if (!(LEARN && whole)) {
+    if (!(LEARN && whole) || !shown(steps[slot], worth)) {
         return pose;
     }
     const uint state = after_step(steps[slot], worth);
