@@ -47,7 +47,7 @@ fn decibels(quality: &Evaluation) -> [f64; 2] {
 
 /// Six places for twenty keyframes: without a store the others are dropped.
 #[test]
-fn few_places_for_images_cost_little() {
+fn few_places_for_images_cost_nothing() {
     let (calibration, keyframes) = flight(KEYFRAMES);
     let dir = tempfile::tempdir().unwrap();
     let (_, all) = mapped(&calibration, &keyframes, &["budget.keyframes=32"], None);
@@ -58,7 +58,8 @@ fn few_places_for_images_cost_little() {
     let count = few.counters();
     assert_eq!((count.keyframe_store_full.get(), few.keyframe_count()), (0, KEYFRAMES));
     assert!(count.images_paged_in.get() > 20 && count.keyframes_lost.get() == 0);
-    assert!((0..2).all(|i| kept[i] > all[i] - 1.0), "{all:?} {kept:?}");
+    // The same views are drawn, whether or not their images have a place.
+    assert_eq!(all, kept);
 }
 
 /// A pool of a third of what the map takes.

@@ -236,8 +236,8 @@ section! {
     burst_rate: f64 = 1.0;
     /// Gaussians added to an anchor after its burst, where none of its picture is right.
     densify_max: u32 = 4096;
-    /// Training steps from one exchange of a keyframe's images to the next, where there are more keyframes than places.
-    rotation_steps: u32 = 2;
+    /// Training steps from one image that is fetched from the disk to the next, at least.
+    rotation_steps: u32 = 1;
     /// A full pool gives its least important Gaussians for new ones.
     evict: bool = true;
     /// Weight of 1 - SSIM beside L1.

@@ -19,6 +19,7 @@ use super::coarseness::Coarseness;
 use super::coverage::{Coverage, KeyframeView};
 use super::densify::{densify, mean};
 use super::diffusion::Diffusion;
+use super::horizon::Horizon;
 use super::keyframes::Keyframe;
 use super::occupancy::{self, Occupancy};
 use super::pool::{threshold, PruneRule, FREE_DIVISOR};
@@ -139,8 +140,12 @@ impl Anchors {
             pair.distort(&self.work.depth.metres, &view.camera);
         }
         // Where depth finds what is on disk, nothing is lacking.
-        let (depth, valid) = (&self.work.depth.metres, stereo.views.valid_mask());
-        let hidden = archive.as_mut().and_then(|a| a.hide(scene, &view, depth, valid));
+        let mut horizon = Horizon::of(&scene.rendered);
+        horizon.fill(&self.work.depth.metres, view.camera.width);
+        if self.pair.is_none() {
+            scene.views.get_mut(index).horizon = horizon;
+        }
+        let hidden = archive.as_mut().and_then(|a| a.hide(&view, &horizon, stereo.views.valid_mask()));
         let valid = hidden.unwrap_or(stereo.views.valid_mask());
         let coverage = if hidden.is_some() {
             let seen = seen(scene, &self.pair, index, &view, valid, &self.work.depth.metres);

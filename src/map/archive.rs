@@ -17,8 +17,8 @@ use super::filing::{
     entry, identity, image_id, keyframes_known, limits, payload_max, run_key, state, BLOCKS_KNOWN, MOMENTS,
 };
 use super::horizon::ball;
+use super::rotation::Rotation;
 use super::scene::Scene;
-use super::schedule::Rng;
 use super::shape::Shape;
 use super::views::Views;
 use crate::config::Board;
@@ -102,6 +102,8 @@ pub struct Known {
     stated: u32,
     /// The horizon was taken from a picture with much of it still open.
     pub open: bool,
+    /// The exchange of blocks after which what is hidden of it was last looked at.
+    pub looked_at: u64,
 }
 
 pub struct Archive {
@@ -119,9 +121,9 @@ pub struct Archive {
     /// How many of a block's samples a keyframe sees: keyframe by keyframe.
     pub sight: Vec<u8>,
     pub choice: Choice,
-    pub rng: Rng,
-    /// Training steps from one exchange of images to the next.
-    pub rotation_steps: u64,
+    /// How often blocks came or went.
+    pub exchanges: u64,
+    pub rotation: Rotation,
     /// The next block and keyframe that are looked at for writing.
     next_block: usize,
     next_state: usize,
@@ -180,6 +182,7 @@ impl Archive {
                 }
             };
         let (blocks, known, sight, choice) = tables(board, shape);
+        let places = (shape.images / shape.cameras) as usize;
         let mut archive = Archive {
             store,
             disk: Arc::new(disk),
@@ -192,8 +195,13 @@ impl Archive {
             known,
             sight,
             choice,
-            rng: Rng::new(board.map.seed ^ 0x5e7),
-            rotation_steps: u64::from(board.map.rotation_steps.max(1)),
+            exchanges: 1,
+            rotation: Rotation::new(
+                board,
+                keyframes_known(board, shape) * shape.cameras as usize,
+                places,
+                place.at_once,
+            ),
             next_block: 0,
             next_state: 0,
         };

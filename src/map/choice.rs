@@ -10,13 +10,13 @@ pub struct Choice {
     pub wanted: Vec<bool>,
     /// The wanted, most wanted first.
     pub blocks: Vec<u32>,
-    /// Keyframes all of whose blocks are wanted.
-    pub candidates: Vec<u32>,
     /// A block on its way to the store.
     pub page: Vec<u8>,
     pub leaving: Vec<u32>,
     /// Pixels that count and do not show what is on disk.
     pub hidden: Vec<u8>,
+    /// The epoch that is mapped.
+    pub epoch: u32,
     /// The last keyframe.
     pub last: Option<(Nanos, Pose)>,
 }
@@ -27,10 +27,10 @@ impl Choice {
             order: Vec::with_capacity(keyframes),
             wanted: vec![false; BLOCKS_KNOWN],
             blocks: Vec::with_capacity(BLOCKS_KNOWN),
-            candidates: Vec::with_capacity(keyframes),
             page: Vec::with_capacity(payload),
             leaving: Vec::with_capacity(BLOCKS_KNOWN),
             hidden: Vec::with_capacity(pixels),
+            epoch: 0,
             last: None,
         }
     }

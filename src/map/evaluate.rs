@@ -9,11 +9,13 @@
 
 use super::archive::Archive;
 use super::exposure::{fitted_exposure, Exposure};
+use super::horizon::Cells;
 use super::refine::Refinement;
 use super::scene::Scene;
 use super::ssim::{mse, psnr_db, Ssim};
 use super::step::{Target, Weights};
 use super::view::View;
+use super::views::Stored;
 use crate::gpu::GpuError;
 use crate::limits::CAMERAS_MAX;
 use serde::{Deserialize, Serialize};
@@ -56,6 +58,8 @@ pub struct KeyframeScore {
     pub id: u64,
     pub t_ns: i64,
     pub held_out: bool,
+    /// Training steps on it.
+    pub steps: u32,
     pub psnr_db: Option<f64>,
 }
 
@@ -129,7 +133,8 @@ pub fn evaluate(
         let scored = score(scene, i)?;
         if scene.views.camera(i) == 0 {
             let s = scene.views.get(i);
-            keyframe_scores.push(KeyframeScore { id: s.id, t_ns: s.t.0, held_out: s.held_out, psnr_db: scored });
+            let Stored { id, t, held_out, steps, .. } = *s;
+            keyframe_scores.push(KeyframeScore { id, t_ns: t.0, held_out, steps, psnr_db: scored });
         }
         if !scene.views.get(i).held_out {
             add(scene, training);
@@ -234,7 +239,7 @@ fn align(scene: &mut Scene, index: usize, observed: &[f32], weights: &Weights) -
     let given = scene.views.get(scene.views.first(index)).given;
     let coarseness = scene.render(&view)?;
     let exposure = fitted_exposure(observed, &scene.rendered.colour, &scene.camera(index).valid);
-    let target = Target { exposure, ..scene.target(index) };
+    let target = Target { exposure, hidden: Cells::default(), ..scene.target(index) };
     let mut refined = Refinement::default();
     let (mut best, mut best_loss) = (refined, f64::INFINITY);
     for k in 0..ALIGN_STEPS {

@@ -1,6 +1,7 @@
 //! What of a view goes to the store and comes back, and how much room the store is given.
 
 use super::block::{KeyframeAbout, KIND_RUN};
+use super::horizon::Cells;
 use super::paging::splat_bytes;
 use super::pool::FREE_DIVISOR;
 use super::refine::Refinement;
@@ -59,8 +60,8 @@ pub fn entry(id: u32, s: &KeyframeAbout, epoch_base: u32) -> Stored {
         refined: Refinement::known(s.refined, s.exposure),
         coarseness: s.coarseness,
         horizon: s.horizon,
+        hidden: Cells::default(),
         steps: s.steps,
-        steps_here: 0,
     }
 }
 

@@ -20,11 +20,31 @@ const STEP_LN: f64 = 0.0272;
 /// A surface is as deep as this, by a fraction and m: the error of depth, and Gaussians of a wall behind its middle.
 const THICKNESS: f64 = 0.1;
 const THICKNESS_M: f64 = 0.15;
-/// What is nearer than this part of the farthest in its cell may be something else.
-const SHOWN_PART: f64 = 0.5;
 /// A pixel this opaque shows a surface; a cell with a smaller part of its pixels that do is open.
 const SURFACE_ALPHA: f32 = 0.5;
 const SURFACE_PART: f64 = 0.75;
+
+/// Some of the cells of a picture.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Cells(pub [u32; CELLS / 32]);
+
+impl Cells {
+    pub fn insert(&mut self, cell: usize) {
+        self.0[cell / 32] |= 1 << (cell % 32);
+    }
+
+    pub fn contains(&self, cell: usize) -> bool {
+        self.0[cell / 32] >> (cell % 32) & 1 == 1
+    }
+
+    pub fn len(&self) -> usize {
+        self.0.iter().map(|word| word.count_ones() as usize).sum()
+    }
+
+    pub fn is_empty(&self) -> bool {
+        self.0 == Self::default().0
+    }
+}
 
 /// Codes of depth, row by row.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -67,19 +87,36 @@ impl Horizon {
         }))
     }
 
+    /// Takes the mean depth of the pixels that have one where nothing is known of how far a cell sees; row by row, zero for none.
+    pub fn fill(&mut self, depth: &[f32], width: usize) {
+        let (mut sum, mut n) = ([0.0f64; CELLS], [0u32; CELLS]);
+        for (i, z) in depth.iter().enumerate().filter(|(_, z)| **z > 0.0) {
+            let cell = cell_of((i % width) as f64, (i / width) as f64, width, depth.len() / width);
+            (sum[cell], n[cell]) = (sum[cell] + f64::from(*z), n[cell] + 1);
+        }
+        for cell in (0..CELLS).filter(|cell| n[*cell] > 0) {
+            if self.0[cell] == OPEN {
+                self.0[cell] = code(sum[cell] / f64::from(n[cell]));
+            }
+        }
+    }
+
     /// Whether a view with this horizon sees a point of the world; not where nothing is known of how far it sees.
     pub fn sees(&self, view: &View, p_world: DVec3) -> bool {
         let Some((x, y, depth)) = view.project(p_world) else { return false };
-        let code = self.0[cell_of(x, y, view.camera.width, view.camera.height)];
-        code != OPEN && depth <= metres(code) * (1.0 + THICKNESS) + THICKNESS_M
+        let cell = cell_of(x, y, view.camera.width, view.camera.height);
+        self.0[cell] != OPEN && self.reaches(cell, depth)
     }
 
-    /// Whether a point of a surface is one that the view shows: it is not far before what is farthest there.
-    pub fn shows(&self, view: &View, p_world: DVec3) -> bool {
-        let Some((x, y, depth)) = view.project(p_world) else { return false };
-        let code = self.0[cell_of(x, y, view.camera.width, view.camera.height)];
-        let farthest = metres(code);
-        code != OPEN && depth <= farthest * (1.0 + THICKNESS) + THICKNESS_M && depth >= SHOWN_PART * farthest
+    /// The cell in which a view with this horizon may see a point of the world: also where nothing is known of how far it sees.
+    pub fn may_see(&self, view: &View, p_world: DVec3) -> Option<usize> {
+        let (x, y, depth) = view.project(p_world)?;
+        let cell = cell_of(x, y, view.camera.width, view.camera.height);
+        self.reaches(cell, depth).then_some(cell)
+    }
+
+    fn reaches(&self, cell: usize, depth: f64) -> bool {
+        self.0[cell] == OPEN || depth <= metres(self.0[cell]) * (1.0 + THICKNESS) + THICKNESS_M
     }
 
     /// The part of the cells of which nothing is known.

@@ -1,12 +1,13 @@
 //! The images to train on, and how far a picture is from one: (1 - λ)|x - y| + λ(1 - SSIM) and its gradient by pixel.
 //!
 //! ```text
-//! ssim_rows -> ssim_columns -> loss_rows -> loss_columns        picture -> gradient by pixel, channel by channel
+//! (mask_cells) -> ssim_rows -> ssim_columns -> loss_rows -> loss_columns        picture -> gradient by pixel, channel by channel
 //! ```
 
+use super::horizon::{COLUMNS, ROWS};
 use super::shape::{Scratch, Shape, RUN};
 use super::step::Target;
-use crate::gpu::kernels::{loss_columns, loss_rows, ssim_columns, ssim_rows};
+use crate::gpu::kernels::{loss_columns, loss_rows, mask_cells, ssim_columns, ssim_rows};
 use crate::gpu::{Arena, Buf, Gpu, GpuError, Kernel, Recorder, Threads};
 use crate::limits::CAMERAS_MAX;
 use stipple_drivers::Fault;
@@ -14,6 +15,7 @@ use stipple_drivers::Fault;
 #[derive(Clone, Copy)]
 pub struct Buffers {
     images: Buf<u32>,
+    /// Of each camera, and one for a view of which not all counts.
     masks: Buf<u32>,
     /// By colour, plane by plane.
     pub pixel_gradient: Buf<f32>,
@@ -28,7 +30,7 @@ impl Buffers {
         let images = (shape.channels * shape.images) as usize;
         Ok(Buffers {
             images: arena.alloc("keyframes: images", shape.image_words() * images)?,
-            masks: arena.alloc("keyframes: masks", shape.cameras as usize * shape.mask_stride())?,
+            masks: arena.alloc("keyframes: masks", (shape.cameras as usize + 1) * shape.mask_stride())?,
             pixel_gradient: arena.alloc("pixels: gradient", shape.channels as usize * shape.pixels())?,
             ssim_sums: arena.alloc("pixels: SSIM by workgroup", groups)?,
             loss_sums: arena.alloc("pixels: L1 and exposure gradient by workgroup", groups)?,
@@ -45,6 +47,7 @@ pub struct Loss {
     valid_pixels: [u32; CAMERAS_MAX],
     /// An image on its way to the device.
     words: Vec<u32>,
+    mask_cells: Kernel<mask_cells::K>,
     ssim_rows: Kernel<ssim_rows::K>,
     ssim_columns: Kernel<ssim_columns::K>,
     ssim_map: Kernel<ssim_columns::K>,
@@ -62,6 +65,7 @@ impl Loss {
             slopes: scratch.slopes,
             valid_pixels: [0; CAMERAS_MAX],
             words: Vec::with_capacity(shape.image_words()),
+            mask_cells: gpu.kernel_in_pieces(mask_cells::Spec::default())?,
             ssim_rows: gpu.kernel_in_pieces(ssim_rows::Spec::default())?,
             ssim_columns: gpu.kernel_in_pieces(ssim_columns::Spec { map: 0 })?,
             ssim_map: gpu.kernel_in_pieces(ssim_columns::Spec { map: 1 })?,
@@ -115,6 +119,7 @@ impl Loss {
     pub fn record(&self, rec: &mut Recorder, rendered: Buf<f32>, target: &Target, ssim_weight: f32) {
         let (b, size) = (&self.buffers, [self.shape.width, self.shape.height]);
         let values = self.values(target) as f32;
+        self.record_mask(rec, target);
         for channel in 0..self.shape.channels {
             let group = channel * self.shape.loss_groups();
             self.record_ssim(rec, rendered, target, channel, &self.ssim_columns, group);
@@ -160,6 +165,7 @@ impl Loss {
         map.resize(n * channels as usize, 1.0);
         for (channel, plane) in map.chunks_exact_mut(n).enumerate() {
             let mut rec = gpu.record();
+            self.record_mask(&mut rec, target);
             self.record_ssim(&mut rec, rendered, target, channel as u32, &self.ssim_map, 0);
             gpu.submit(rec)?;
             gpu.download(self.slopes, 0, plane)?;
@@ -210,8 +216,29 @@ impl Loss {
         );
     }
 
+    /// Makes the mask of a target of which not all counts.
+    fn record_mask(&self, rec: &mut Recorder, target: &Target) {
+        if target.hidden.is_empty() {
+            return;
+        }
+        rec.dispatch(
+            &self.mask_cells,
+            mask_cells::Bind { mask: self.nth_mask(target.camera).read(), masked: self.mask(target).write() },
+            mask_cells::Push {
+                size: [self.shape.width, self.shape.height],
+                grid: [COLUMNS as u32, ROWS as u32],
+                cells: target.hidden.0,
+            },
+            Threads::d1(self.shape.image_words() as u32),
+        );
+    }
+
     fn mask(&self, target: &Target) -> Buf<u32> {
-        self.buffers.masks.part(target.camera as usize * self.shape.mask_stride(), self.shape.image_words())
+        self.nth_mask(if target.hidden.is_empty() { target.camera } else { self.shape.cameras })
+    }
+
+    fn nth_mask(&self, n: u32) -> Buf<u32> {
+        self.buffers.masks.part(n as usize * self.shape.mask_stride(), self.shape.image_words())
     }
 
     /// Where a target's plane begins among the images, words.

@@ -29,6 +29,7 @@ pub mod pool;
 pub mod refine;
 pub mod render;
 mod residency;
+mod rotation;
 mod scene;
 pub mod schedule;
 mod seeds;
@@ -231,7 +232,7 @@ impl Mapper {
         }
         let kind = if keyframe.held_out { self.hold_out(index)? } else { self.train_on(keyframe, index)? };
         if let Some(archive) = &mut self.archive {
-            archive.refresh(&mut self.scene);
+            archive.find_trainable(&self.scene.views);
             archive.save_some(&mut self.scene)?;
         }
         Ok(kind)
@@ -259,6 +260,7 @@ impl Mapper {
         };
         if let Some(archive) = archive {
             archive.open_block(&scene.views, index);
+            archive.find_hidden(scene, index);
             anchor.scene_depth_m.iter().for_each(|depth| archive.set_scene_depth(*depth));
         }
         self.trainer.scene_depth_m = anchor.scene_depth_m.unwrap_or(self.trainer.scene_depth_m);
@@ -295,10 +297,7 @@ impl Mapper {
             if self.trainer.must_wait() {
                 self.finish_pending()?;
             }
-            if let Some(archive) = &mut self.archive {
-                archive.rotate(&mut self.scene)?;
-            }
-            let Some(kind) = self.trainer.step(&mut self.scene)? else {
+            let Some(kind) = self.trainer.step(&mut self.scene, &mut self.archive)? else {
                 self.finish_pending()?;
                 break;
             };
@@ -329,7 +328,7 @@ impl Mapper {
 
     /// Takes in the training step in flight; an anchor whose burst it ends is densified.
     fn finish_pending(&mut self) -> Result<(), GpuError> {
-        match self.trainer.finish_pending(&mut self.scene)? {
+        match self.trainer.finish_pending(&mut self.scene, &self.archive)? {
             Some(anchor) => self.anchors.densify(&mut self.scene, &mut self.archive, anchor),
             None => Ok(()),
         }

@@ -1,24 +1,20 @@
-//! Which blocks and images are in memory.
+//! Which blocks are in memory.
 //!
-//! What is wanted follows from the keyframes that are known: those nearest to where the vehicle is, and to where it will be in two
-//! seconds, are to be trained on, so all blocks that they see are to be in the pool, as many keyframes as the pool allows. A
-//! keyframe one of whose blocks is missing is not trained on: others would be bent to stand for what it lacks. A block that
-//! is not wanted stays until its room is needed.
+//! What is wanted follows from the keyframes that are known: what those see that are nearest to where the vehicle is, and to
+//! where it will be in two seconds, as much as the pool has room for. A block that is not wanted stays until its room is needed.
 //!
-//! Images rotate: while the map trains, keyframes on disk whose blocks are in the pool take, one at a time, the places of those
-//! that were trained on longest, so in the end all are trained on alike. The newest, and the last of a block, stay.
+//! A keyframe may see more than is in the pool. Where it does, its picture says nothing of what is in the pool, and is not
+//! compared (`sight`): other Gaussians would be bent to stand for those that are missing.
 //!
-//! A view is not uncovered where it shows a block that is on disk: where a keyframe's own depth finds such a block, nothing is
-//! seeded (`hide`).
+//! Nor is a view uncovered where its own depth finds a block that is on disk: nothing is seeded there (`hide`).
 
 use super::archive::{Archive, Arrived};
 use super::block::BlockAbout;
 use super::choice::Choice;
-use super::filing::{read_planes, BLOCKS_KNOWN};
-use super::horizon::{cell_of, Horizon, CELLS, COLUMNS, ROWS};
+use super::filing::BLOCKS_KNOWN;
+use super::horizon::{cell_of, Horizon};
 use super::scene::Scene;
 use super::view::View;
-use super::views::Views;
 use crate::gpu::GpuError;
 use crate::store::Fetched;
 use glam::Vec3;
@@ -30,36 +26,16 @@ const AHEAD: Span = Span(2_000_000_000);
 const AHEAD_MAX_M: f64 = 4.0;
 /// A keyframe that looks the other way counts as farther away by this, m.
 const FACING_M: f64 = 2.0;
-/// A keyframe all of whose blocks are in the pool counts as nearer by this, m: without, two views at a limit would exchange their
-/// blocks over and over.
-const STAYS_M: f64 = 1.0;
-/// Part of the Gaussians that a keyframe sees that may be missing when it is trained on: what is seen through far doors.
-const AWAY_MAX: f32 = 0.04;
-/// What keyframes nearer than this see is wanted whether or not it fits, m: where it does not, the least important Gaussians
-/// go. A scene that is denser than the pool is thinned, one that is larger is paged.
-const LOCAL_M: f32 = 4.0;
+/// Part of the Gaussians that a keyframe sees that nobody fetches for it: what is seen through far doors.
+const LEFT_MAX: f32 = 0.04;
 /// Part of the pool that is left for what is new.
 const RESERVE_DIVISOR: usize = 8;
 /// Blocks asked for when a keyframe comes: some MiB.
 const PAGED_AT_ONCE: usize = 8;
-/// Newest keyframes whose poses odometry still corrects.
-const NEWEST: usize = 8;
-/// Places for each block in the pool, below which a block's last keyframe may go, too.
-const VIEWS_PER_BLOCK: usize = 3;
-/// Draws until another keyframe is found for a place.
-const DRAWS: usize = 16;
 /// Part of a horizon that may be open.
 const OPEN_MAX: f64 = 0.05;
-/// Keyframes that are asked whether they show a point, and points of a cell along each axis.
-const ASKED: usize = 48;
-const POINTS: usize = 3;
 /// The disk answers within this, or what it was asked for is done without.
 const PATIENCE: Duration = Duration::from_secs(2);
-
-/// Keyframes, the newest, whose images stay.
-fn newest_kept(views: &Views) -> usize {
-    NEWEST.min(views.places() / 2)
-}
 
 impl Archive {
     /// Gaussians of a block that a keyframe sees, by the block's samples.
@@ -69,20 +45,24 @@ impl Archive {
         samples * b.count as f32 / f32::from(b.samples_len.max(1))
     }
 
-    /// Whether nearly all Gaussians that a keyframe sees are in blocks that `here` names.
-    fn has_nearly_all(&self, keyframe: usize, here: impl Fn(usize) -> bool) -> bool {
+    /// The part of the Gaussians that a keyframe sees that are in blocks that `here` names; all of none.
+    fn part_seen(&self, keyframe: usize, here: impl Fn(usize) -> bool) -> f32 {
         let (mut all, mut away) = (0.0, 0.0);
         for block in 0..self.blocks.len() {
             let seen = self.seen(keyframe, block);
             all += seen;
             away += if here(block) { 0.0 } else { seen };
         }
-        away <= AWAY_MAX * all
+        if away > 0.0 {
+            1.0 - away / all
+        } else {
+            1.0
+        }
     }
 
-    /// Whether nearly all Gaussians that a keyframe sees are in the pool.
-    fn is_whole(&self, keyframe: usize) -> bool {
-        self.has_nearly_all(keyframe, |block| self.blocks[block].in_pool)
+    /// The part of the Gaussians that a keyframe sees that are in the pool.
+    pub fn part_here(&self, keyframe: usize) -> f32 {
+        self.part_seen(keyframe, |block| self.blocks[block].in_pool)
     }
 
     /// Chooses what is wanted where a keyframe was taken, and fetches some of it.
@@ -101,6 +81,7 @@ impl Archive {
             Pose { p: pose.p + by.clamp_length_max(AHEAD_MAX_M), ..pose }
         });
         self.choice.last = Some((t, pose));
+        self.choice.epoch = epoch;
         self.choose(scene, [pose, ahead], epoch);
         // What is new finds the reserve, and thins nothing.
         self.make_room(scene, 0)?;
@@ -139,44 +120,34 @@ impl Archive {
                 let cosine = (look.q * glam::DVec3::Z).dot(from.q * glam::DVec3::Z);
                 (*p - entry.given.p).length() + FACING_M * (1.0 - cosine) / 2.0
             };
-            let near = f64::min(far(&looks[0]), far(&looks[1])) - if self.is_whole(keyframe) { STAYS_M } else { 0.0 };
-            self.choice.order.push((near as f32, keyframe as u32));
+            self.choice.order.push((f64::min(far(&looks[0]), far(&looks[1])) as f32, keyframe as u32));
         }
         self.choice.order.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
         let pool = &scene.pipeline.pool;
         self.want_views_of(pool.capacity() - pool.capacity() / RESERVE_DIVISOR);
     }
 
-    /// Wants all blocks that the keyframes in `order` see, one keyframe after the other, those that do not fit left out.
+    /// Wants the blocks that the keyframes in `order` see, one keyframe after the other, until they fill the room.
     fn want_views_of(&mut self, room: usize) {
         let order = std::mem::take(&mut self.choice.order);
         self.choice.wanted.fill(false);
         self.choice.blocks.clear();
-        self.choice.candidates.clear();
         let mut taken = 0;
-        for &(near, keyframe) in &order {
-            let before = (self.choice.blocks.len(), taken);
+        'full: for &(_, keyframe) in &order {
             // What it sees most of first, until nearly all of it is wanted.
-            while !self.has_nearly_all(keyframe as usize, |b| self.choice.wanted[b]) {
+            while self.part_seen(keyframe as usize, |b| self.choice.wanted[b]) < 1.0 - LEFT_MAX {
                 let more = |b: &usize| !self.choice.wanted[*b] && self.seen(keyframe as usize, *b) > 0.0;
                 let most = (0..self.blocks.len()).filter(more).max_by(|a, b| {
                     self.seen(keyframe as usize, *a).total_cmp(&self.seen(keyframe as usize, *b)).then(b.cmp(a))
                 });
                 let Some(block) = most else { break };
                 taken += self.blocks[block].count as usize;
+                if taken > room {
+                    break 'full;
+                }
                 self.choice.wanted[block] = true;
                 self.choice.blocks.push(block as u32);
             }
-            if taken > room && near > LOCAL_M {
-                // It does not fit, and takes none of the room.
-                while self.choice.blocks.len() > before.0 {
-                    let block = self.choice.blocks.pop().expect("there are more");
-                    self.choice.wanted[block as usize] = false;
-                }
-                taken = before.1;
-                continue;
-            }
-            self.choice.candidates.push(keyframe);
         }
         self.choice.order = order;
     }
@@ -184,7 +155,6 @@ impl Archive {
     /// Wants the blocks that a keyframe sees, those that it sees most of first, as many as fit.
     fn want_seen_by(&mut self, keyframe: usize, room: usize) {
         self.choice.wanted.fill(false);
-        self.choice.candidates.clear();
         let row = &self.sight[keyframe * BLOCKS_KNOWN..][..self.blocks.len()];
         let blocks = &mut self.choice.blocks;
         blocks.clear();
@@ -226,21 +196,11 @@ impl Archive {
             // Done at once, it has come by now.
             self.receive(scene)?;
         }
-        self.refresh(scene);
+        self.find_trainable(&scene.views);
         Ok(())
     }
 
-    /// Tells the views which of them may be trained on.
-    pub fn refresh(&self, scene: &mut Scene) {
-        let cameras = scene.views.cameras();
-        let (stay, of) = (newest_kept(&scene.views), self.choice.candidates.len());
-        scene.views.make_ready(stay, of, |first| {
-            let keyframe = first / cameras;
-            self.known.get(keyframe).is_none_or(|k| k.asked == 0) && self.is_whole(keyframe)
-        });
-    }
-
-    fn receive(&mut self, scene: &mut Scene) -> Result<(), GpuError> {
+    pub fn receive(&mut self, scene: &mut Scene) -> Result<(), GpuError> {
         while let Some((arrived, fetched)) = self.next_fetched(&scene.views) {
             let done = match arrived {
                 Arrived::Block(block) => self.take_block(scene, block, &fetched),
@@ -261,6 +221,7 @@ impl Archive {
             // Damaged: what it was is lost, and its place is uncovered from here on.
             scene.counters.blocks_lost.add(1);
             self.blocks[block].samples_len = 0;
+            self.exchanges += 1;
             return Ok(());
         };
         if b.in_pool || !self.choice.wanted[block] || !self.make_room(scene, about.count as usize)? {
@@ -271,6 +232,7 @@ impl Archive {
         if in_pool {
             self.blocks[block].in_pool = true;
             self.blocks[block].count = count as u32;
+            self.exchanges += 1;
             scene.counters.blocks_paged_in.add(1);
             // What moved while it was away.
             let by = b.placed * about.placed.inverse();
@@ -278,24 +240,6 @@ impl Archive {
                 pool.move_blocks(gpu, std::iter::once((b.anchor, by)))?;
             }
         }
-        Ok(())
-    }
-
-    fn take_image(&mut self, scene: &mut Scene, index: usize, fetched: &Fetched) -> Result<(), GpuError> {
-        let keyframe = index / scene.views.cameras();
-        self.known[keyframe].asked = self.known[keyframe].asked.saturating_sub(1);
-        let placed = scene.views.has_place(index) || (self.make_place(scene)? && scene.views.place(index));
-        if !placed {
-            return Ok(());
-        }
-        if !read_planes(&fetched.payload, scene.views.planes_mut(index)) {
-            scene.counters.keyframes_lost.add(1);
-            self.known[keyframe].saved = false;
-            scene.views.unplace(index);
-            return Ok(());
-        }
-        scene.upload_image(index)?;
-        scene.counters.images_paged_in.add(1);
         Ok(())
     }
 
@@ -323,10 +267,6 @@ impl Archive {
         }
         self.take_out(scene, &leaving)?;
         self.choice.leaving = leaving;
-        let missing = count.saturating_sub(scene.pipeline.pool.room());
-        if missing > 0 {
-            scene.thin(missing)?;
-        }
         Ok(scene.pipeline.pool.room() >= count)
     }
 
@@ -336,6 +276,7 @@ impl Archive {
         }
         scene.pipeline.pool.remove_blocks(&mut scene.gpu, |anchor| anchors.contains(&anchor))?;
         self.blocks.iter_mut().filter(|b| anchors.contains(&b.anchor)).for_each(|b| b.in_pool = false);
+        self.exchanges += 1;
         scene.counters.blocks_paged_out.add(anchors.len() as u64);
         Ok(())
     }
@@ -355,55 +296,6 @@ impl Archive {
         Ok(())
     }
 
-    /// Sees that a place for images is free: takes that of the keyframe that is missed least. False where all must stay.
-    pub fn make_place(&mut self, scene: &mut Scene) -> Result<bool, GpuError> {
-        if scene.views.has_free_place() {
-            return Ok(true);
-        }
-        let cameras = scene.views.cameras();
-        let mut tried = [usize::MAX; 4];
-        for n in 0..tried.len() {
-            let untried = scene.views.placed().filter(|first| !tried.contains(first));
-            let ranked = untried.filter_map(|first| Some((self.rank(&scene.views, first)?, first)));
-            let Some((_, first)) = ranked.max() else { break };
-            tried[n] = first;
-            if self.known[first / cameras].open {
-                self.look_again(scene, first)?;
-            }
-            if self.save_keyframe(&scene.views, first / cameras) {
-                scene.views.unplace(first);
-                return Ok(true);
-            }
-        }
-        Ok(false)
-    }
-
-    /// How much the images of a keyframe may go: by kind, then by training steps since they came; `None` where they must stay.
-    fn rank(&self, views: &Views, first: usize) -> Option<(u8, u32, usize)> {
-        let cameras = views.cameras();
-        let (entry, keyframe) = (views.get(first), first / cameras);
-        let newest = views.placed().max().unwrap_or(0) / cameras;
-        let recent = keyframe + newest_kept(views) > newest;
-        if self.known.get(keyframe)?.asked > 0 || recent && !entry.held_out {
-            return None;
-        }
-        // Where places are few, each would be the last of its block, and none would ever go.
-        let few = views.places() < VIEWS_PER_BLOCK * self.blocks.iter().filter(|b| b.in_pool).count();
-        let last = !few
-            && self.home(keyframe).is_some_and(|home| {
-                let shares = |f: &usize| *f != first && self.home(*f / cameras) == Some(home);
-                self.blocks[home].in_pool && !views.placed().any(|f| shares(&f))
-            });
-        let kind = if entry.held_out {
-            3
-        } else if last {
-            0
-        } else {
-            1 + u8::from(!self.is_whole(keyframe))
-        };
-        Some((kind, entry.steps_here, usize::MAX - first))
-    }
-
     /// Takes the horizon of a view from the scene's last picture, which is of it, and looks from there.
     pub fn saw(&mut self, scene: &mut Scene, first: usize) {
         let (view, horizon) = (scene.view(first), Horizon::of(&scene.rendered));
@@ -411,11 +303,12 @@ impl Archive {
         scene.views.get_mut(first).horizon = horizon;
         if keyframe < self.known.len() {
             self.known[keyframe].open = horizon.open_part() > OPEN_MAX;
+            self.known[keyframe].looked_at = 0;
             self.look_from(&view, &horizon, keyframe);
         }
     }
 
-    fn look_again(&mut self, scene: &mut Scene, first: usize) -> Result<(), GpuError> {
+    pub fn look_again(&mut self, scene: &mut Scene, first: usize) -> Result<(), GpuError> {
         let view = scene.view(first);
         scene.render(&view)?;
         self.saw(scene, first);
@@ -423,61 +316,18 @@ impl Archive {
         Ok(())
     }
 
-    /// Exchanges an image now and then.
-    pub fn rotate(&mut self, scene: &mut Scene) -> Result<(), GpuError> {
-        if scene.steps % self.rotation_steps != 0 || self.choice.candidates.is_empty() {
-            return Ok(());
-        }
-        self.receive(scene)?;
-        let cameras = scene.views.cameras();
-        let waits = self.known.iter().any(|k| k.asked > 0);
-        for _ in 0..if waits { 0 } else { DRAWS } {
-            let n = self.rng.below(self.choice.candidates.len());
-            let keyframe = self.choice.candidates[n] as usize;
-            let known = self.known[keyframe];
-            if known.saved && !scene.views.has_place(keyframe * cameras) && self.is_whole(keyframe) {
-                self.ask_for_images(&scene.views, keyframe);
-                self.receive(scene)?;
-                break;
-            }
-        }
-        self.refresh(scene);
-        Ok(())
-    }
-
-    /// The valid pixels of a view less those that show, by the view's own depth, what is on disk; `None` where there are none of
-    /// these. What is on disk is told by the horizons of the keyframes nearby one of whose blocks is not in the pool: the map
-    /// covered them as far as they see.
-    pub fn hide(&mut self, scene: &Scene, view: &View, depth: &[f32], valid: &[u8]) -> Option<&[u8]> {
-        let (w, h, cameras) = (view.camera.width, view.camera.height, scene.views.cameras());
-        let mut asked = [None; ASKED];
-        let parts = self.choice.order.iter().map(|(_, keyframe)| *keyframe as usize).filter(|k| !self.is_whole(*k));
-        for (to, keyframe) in asked.iter_mut().zip(parts) {
-            let index = keyframe * cameras;
-            *to = Some((scene.view(index), scene.views.get(index).horizon));
-        }
-        asked[0]?;
-        // Points of a cell that have depth, and how many of them are known.
-        let (mut points, mut known) = ([0u8; CELLS], [0u8; CELLS]);
-        let (across, down) = ((w / (COLUMNS * POINTS)).max(1), (h / (ROWS * POINTS)).max(1));
-        for y in (down / 2..h).step_by(down) {
-            for x in (across / 2..w).step_by(across) {
-                let z = f64::from(depth[y * w + x]);
-                let Some(point) = (z > 0.0).then(|| view.point(x, y, z)).flatten() else { continue };
-                let cell = cell_of(x as f64, y as f64, w, h);
-                points[cell] += 1;
-                known[cell] += u8::from(asked.iter().flatten().any(|(view, horizon)| horizon.shows(view, point)));
-            }
-        }
-        let shows = |cell: usize| points[cell] > 0 && 2 * known[cell] > points[cell];
-        if !(0..CELLS).any(shows) {
+    /// The valid pixels of a view less the cells that show what is not in the pool; `None` where there are none of these.
+    pub fn hide(&mut self, view: &View, horizon: &Horizon, valid: &[u8]) -> Option<&[u8]> {
+        let cells = self.hidden_from(view, horizon);
+        if cells.is_empty() {
             return None;
         }
+        let (w, h) = (view.camera.width, view.camera.height);
         let hidden = &mut self.choice.hidden;
         hidden.clear();
         hidden.extend(valid.iter().enumerate().map(|(i, valid)| {
             let cell = cell_of((i % w) as f64, (i / w) as f64, w, h);
-            if shows(cell) {
+            if cells.contains(cell) {
                 0
             } else {
                 *valid
@@ -495,11 +345,16 @@ impl Archive {
         let begun = Instant::now();
         let missing = |a: &Archive| a.choice.blocks.iter().any(|b| a.blocks[*b as usize].asked);
         loop {
+            let before = self.exchanges;
             self.page(scene, false)?;
-            if !missing(self) || begun.elapsed() > PATIENCE {
+            // A page is some blocks; what has no room does not come.
+            let done = !missing(self) && self.exchanges == before;
+            if done || begun.elapsed() > PATIENCE {
                 break;
             }
-            std::thread::sleep(Duration::from_millis(1));
+            if missing(self) {
+                std::thread::sleep(Duration::from_millis(1));
+            }
         }
         if !scene.views.has_place(index) && self.known.get(keyframe).is_some_and(|k| k.saved) {
             while !self.ask_for_images(&scene.views, keyframe) && begun.elapsed() < PATIENCE {

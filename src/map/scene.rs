@@ -4,7 +4,6 @@ use super::cameras::TrainingCamera;
 use super::coarseness::Coarseness;
 use super::exposure::{gain_from, median_exposure, Exposure};
 use super::pipeline::Pipeline;
-use super::pool::{threshold, PruneRule};
 use super::render::Rendered;
 use super::step::{Stats, Target};
 use super::view::View;
@@ -54,6 +53,7 @@ impl Scene {
             image: self.views.image(index) as u32,
             camera: self.views.camera(index) as u32,
             exposure: self.views.exposure(index),
+            hidden: self.views.get(self.views.first(index)).hidden,
         }
     }
 
@@ -63,19 +63,6 @@ impl Scene {
         for (channel, plane) in self.views.planes(index).iter().enumerate() {
             self.pipeline.loss.set_plane(&mut self.gpu, image, channel, &plane.pixels)?;
         }
-        Ok(())
-    }
-
-    /// Makes room for `wanted` Gaussians in the pool: removes what is faint, huge or not finite, and where that leaves less, the
-    /// least important of those that were judged, `EVICTED_DIVISOR` of the pool at most.
-    pub fn thin(&mut self, wanted: usize) -> Result<(), GpuError> {
-        let (gpu, pool) = (&mut self.gpu, &mut self.pipeline.pool);
-        let bins = pool.importance(gpu, STEPS_JUDGED)?;
-        let (importance_min, evicted) = threshold(&bins, wanted, pool.capacity() / EVICTED_DIVISOR);
-        let removed =
-            pool.prune(gpu, &PruneRule { importance_min, steps_min: STEPS_JUDGED, ..PruneRule::default() })?;
-        self.counters.splats_evicted.add(evicted.min(removed) as u64);
-        self.counters.splats_pruned.add(removed.saturating_sub(evicted) as u64);
         Ok(())
     }
 

@@ -19,6 +19,11 @@ impl Rng {
     pub fn below(&mut self, n: usize) -> usize {
         ((u128::from(self.next_u64()) * n as u128) >> 64) as usize
     }
+
+    /// One of some, all as likely.
+    pub fn one_of(&mut self, some: &[u32]) -> Option<u32> {
+        (!some.is_empty()).then(|| some[self.below(some.len())])
+    }
 }
 
 /// Steps of a new anchor: asked for and not taken yet, and left to take.
@@ -27,14 +32,6 @@ struct Burst {
     anchor: usize,
     asked: u32,
     left: u32,
-}
-
-/// Views that may be trained on now, oldest first: all but the last `newest` come and go, and stand for the `of` views in all.
-#[derive(Clone, Copy, Debug)]
-pub struct Ready<'a> {
-    pub views: &'a [u32],
-    pub newest: usize,
-    pub of: usize,
 }
 
 /// The order of training steps: a new anchor's burst first, then uniform draws. Every other step of a burst is a uniform
@@ -65,26 +62,12 @@ impl Schedule {
         self.burst.is_some_and(|b| b.asked >= b.left)
     }
 
-    /// The keyframe of the next step out of those that are `ready`, or `None` when there is none.
-    pub fn next(&mut self, ready: &Ready) -> Option<usize> {
-        let Some(Burst { anchor, asked, left }) = &mut self.burst else { return self.draw(ready) };
+    /// The view of the next step: the anchor's, or one that `draw` answers; `None` when there is none.
+    pub fn next<E>(&mut self, draw: impl FnOnce(&mut Rng) -> Result<Option<usize>, E>) -> Result<Option<usize>, E> {
+        let Some(Burst { anchor, asked, left }) = &mut self.burst else { return draw(&mut self.rng) };
         let (anchor, others) = (*anchor, left.saturating_sub(*asked) % 2 == 0);
         *asked += 1;
-        Some(if others { self.draw(ready).unwrap_or(anchor) } else { anchor })
-    }
-
-    fn draw(&mut self, &Ready { views, newest, of }: &Ready) -> Option<usize> {
-        let rotating = views.len() - newest;
-        let drawn = match () {
-            () if views.is_empty() => return None,
-            () if of <= views.len() || rotating == 0 => self.rng.below(views.len()),
-            // As often as each of all there are: those that stay are not trained on more than those that come and go.
-            () => match self.rng.below(of) {
-                n if n < newest => rotating + n,
-                _ => self.rng.below(rotating),
-            },
-        };
-        Some(views[drawn] as usize)
+        Ok(Some(if others { draw(&mut self.rng)?.unwrap_or(anchor) } else { anchor }))
     }
 
     /// Takes the oldest step that `next` asked for; the anchor whose burst it ends, if it does.
@@ -103,19 +86,10 @@ impl Schedule {
 mod tests {
     use super::*;
 
-    fn all(views: &[u32]) -> Ready<'_> {
-        Ready { views, newest: 0, of: views.len() }
-    }
-
-    #[test]
-    fn views_that_stay_are_drawn_as_often_as_each_of_those_that_come_and_go() {
-        let mut s = Schedule::new(3);
-        let ready = Ready { views: &[5, 6, 7, 8], newest: 2, of: 20 };
-        let mut drawn = [0u32; 9];
-        (0..10_000).for_each(|_| drawn[s.next(&ready).expect("four to choose from")] += 1);
-        // 500 of each that stays; the other two stand for eighteen. 5 sigma of binomials.
-        assert!((390..610).contains(&drawn[7]) && (390..610).contains(&drawn[8]), "{drawn:?}");
-        assert!((4250..4750).contains(&drawn[5]) && (4250..4750).contains(&drawn[6]), "{drawn:?}");
+    /// The next view, out of these.
+    fn next(s: &mut Schedule, views: &[u32]) -> Option<usize> {
+        let drawn: Result<_, ()> = s.next(|rng| Ok(rng.one_of(views).map(|v| v as usize)));
+        drawn.expect("nothing fails")
     }
 
     #[test]
@@ -123,7 +97,7 @@ mod tests {
         let draw = |seed| {
             let mut s = Schedule::new(seed);
             let training: Vec<u32> = (0..10).collect();
-            (0..10_000).map(|_| s.next(&all(&training)).expect("ten to choose from")).collect::<Vec<_>>()
+            (0..10_000).map(|_| next(&mut s, &training).expect("ten to choose from")).collect::<Vec<_>>()
         };
         let a = draw(7);
         assert_eq!(a, draw(7));
@@ -139,10 +113,10 @@ mod tests {
         let mut s = Schedule::new(1);
         s.start_burst(42, 3);
         for (next, ended) in [(42, None), (5, None), (42, Some(42))] {
-            assert_eq!((s.next(&all(&[5])), s.took()), (Some(next), ended));
+            assert_eq!((next(&mut s, &[5]), s.took()), (Some(next), ended));
         }
-        assert_eq!((s.next(&all(&[5])), s.took()), (Some(5), None));
-        assert_eq!(s.next(&all(&[])), None);
+        assert_eq!((next(&mut s, &[5]), s.took()), (Some(5), None));
+        assert_eq!(next(&mut s, &[]), None);
         s.start_burst(42, 0);
         assert!(!s.in_burst() && !s.must_wait());
     }
@@ -151,10 +125,10 @@ mod tests {
     fn steps_asked_for_ahead_count_and_the_end_is_waited_for() {
         let mut s = Schedule::new(1);
         s.start_burst(42, 2);
-        assert_eq!((s.next(&all(&[5])), s.must_wait()), (Some(5), false));
-        assert_eq!((s.next(&all(&[5])), s.must_wait()), (Some(42), true));
+        assert_eq!((next(&mut s, &[5]), s.must_wait()), (Some(5), false));
+        assert_eq!((next(&mut s, &[5]), s.must_wait()), (Some(42), true));
         assert_eq!((s.took(), s.must_wait()), (None, true));
         assert_eq!((s.took(), s.must_wait()), (Some(42), false));
-        assert_eq!((s.next(&all(&[5])), s.took()), (Some(5), None));
+        assert_eq!((next(&mut s, &[5]), s.took()), (Some(5), None));
     }
 }

@@ -2,10 +2,13 @@
 
 use super::archive::{Archive, Block};
 use super::filing::BLOCKS_KNOWN;
-use super::horizon::Horizon;
+use super::horizon::{Cells, Horizon, CELLS, COLUMNS, ROWS};
 use super::scene::Scene;
 use super::view::View;
 use glam::{DVec3, Vec3};
+
+/// Part of what is seen in a cell and beside it that may be missing while the cell still counts.
+const AWAY_MAX: f32 = 0.1;
 
 impl Archive {
     /// The block that a keyframe sees most of.
@@ -30,6 +33,39 @@ impl Archive {
             0
         };
         self.sight[keyframe * BLOCKS_KNOWN + block] = seen;
+    }
+
+    /// The cells of a view that show what is not in the pool, by what their neighbours show, too.
+    pub fn hidden_from(&self, view: &View, horizon: &Horizon) -> Cells {
+        let seen_by_this = |b: &&Block| b.epoch == view.epoch && b.samples_len > 0 && in_reach(view, b);
+        let mut hidden = Cells::default();
+        if self.blocks.iter().filter(seen_by_this).all(|b| b.in_pool) {
+            return hidden;
+        }
+        // Gaussians that are here, and away.
+        let mut seen = [[0.0f32; 2]; CELLS];
+        for b in self.blocks.iter().filter(seen_by_this) {
+            let each = b.count as f32 / f32::from(b.samples_len);
+            for p in b.points() {
+                if let Some(cell) = horizon.may_see(view, Vec3::from_array(*p).as_dvec3()) {
+                    seen[cell][usize::from(!b.in_pool)] += each;
+                }
+            }
+        }
+        for cell in 0..CELLS {
+            let (x, y) = (cell % COLUMNS, cell / COLUMNS);
+            let (mut all, mut away) = (0.0, 0.0);
+            for cy in y.saturating_sub(1)..(y + 2).min(ROWS) {
+                for cx in x.saturating_sub(1)..(x + 2).min(COLUMNS) {
+                    let [here, gone] = seen[cy * COLUMNS + cx];
+                    (all, away) = (all + here + gone, away + gone);
+                }
+            }
+            if away > AWAY_MAX * all {
+                hidden.insert(cell);
+            }
+        }
+        hidden
     }
 
     /// Looks from every keyframe that is known.

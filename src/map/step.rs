@@ -2,6 +2,7 @@
 
 use super::coarseness::Coarseness;
 use super::exposure::Exposure;
+use super::horizon::Cells;
 use super::view::View;
 use crate::gpu::kernels::types::Status;
 use glam::DVec3;
@@ -15,11 +16,13 @@ pub struct Target {
     pub camera: u32,
     /// In which the rendering is compared.
     pub exposure: Exposure,
+    /// Where it is not compared, whatever the mask: the map has more there than is in the pool.
+    pub hidden: Cells,
 }
 
 impl From<u32> for Target {
     fn from(image: u32) -> Target {
-        Target { image, camera: 0, exposure: Exposure::default() }
+        Target { image, camera: 0, exposure: Exposure::default(), hidden: Cells::default() }
     }
 }
 

@@ -4,10 +4,11 @@
 //! is therefore taken in exactly one step late, whenever the device ends it, and before anything else is done with the
 //! map: the same seed and keyframes give the same map to the bit.
 
+use super::archive::Archive;
 use super::coarseness::Coarseness;
 use super::pipeline::Step;
 use super::scene::Scene;
-use super::schedule::Schedule;
+use super::schedule::{Rng, Schedule};
 use super::step::{LearningRates, StepStats, Weights};
 use super::StepKind;
 use crate::config::MapConfig;
@@ -75,17 +76,22 @@ impl Trainer {
     }
 
     /// Starts a step, then finishes the one before it; `None` when there is nothing to train.
-    pub fn step(&mut self, scene: &mut Scene) -> Result<Option<StepKind>, GpuError> {
+    pub fn step(&mut self, scene: &mut Scene, archive: &mut Option<Archive>) -> Result<Option<StepKind>, GpuError> {
         let burst = self.schedule.in_burst();
         if scene.pipeline.pool.count() == 0 || (self.trained_enough(scene) && !burst) {
             return Ok(None);
         }
-        let Some(index) = self.schedule.next(&scene.views.ready()) else { return Ok(None) };
+        let draw = |rng: &mut Rng| match archive.as_mut() {
+            Some(archive) => archive.next_view(scene, rng),
+            None => Ok(rng.one_of(scene.views.training()).map(|index| index as usize)),
+        };
+        let Some(index) = self.schedule.next(draw)? else { return Ok(None) };
         let (view, target, rates) = (scene.view(index), scene.target(index), self.rates(scene));
         let step = scene.pipeline.start(&mut scene.gpu, &view, target, &rates, &self.weights)?;
         scene.steps += 1;
         if let Some(before) = self.in_flight.replace(InFlight { index, step }) {
-            let ended = self.finish(before, scene)?;
+            let beside = archive.as_ref().map(Archive::trained_beside);
+            let ended = self.finish(before, scene, beside)?;
             debug_assert!(ended.is_none(), "the last step of a burst is waited for before another starts");
         }
         Ok(Some(if burst { StepKind::Burst } else { StepKind::Train }))
@@ -93,14 +99,19 @@ impl Trainer {
 
     /// Finishes the step in flight, if any: before anything but training is done with the map. Answers the anchor whose
     /// burst it ended.
-    pub fn finish_pending(&mut self, scene: &mut Scene) -> Result<Option<usize>, GpuError> {
+    pub fn finish_pending(&mut self, scene: &mut Scene, archive: &Option<Archive>) -> Result<Option<usize>, GpuError> {
         match self.in_flight.take() {
-            Some(last) => self.finish(last, scene),
+            Some(last) => self.finish(last, scene, archive.as_ref().map(Archive::trained_beside)),
             None => Ok(None),
         }
     }
 
-    fn finish(&mut self, InFlight { index, step }: InFlight, scene: &mut Scene) -> Result<Option<usize>, GpuError> {
+    fn finish(
+        &mut self,
+        InFlight { index, step }: InFlight,
+        scene: &mut Scene,
+        beside: Option<&[u32]>,
+    ) -> Result<Option<usize>, GpuError> {
         let done = scene.pipeline.finish(&mut scene.gpu, &step)?;
         (self.loss, self.trained) = (done.loss, Some(index));
         let counters = &scene.counters;
@@ -112,16 +123,16 @@ impl Trainer {
         counters.gradients_rejected.add(u64::from(done.gradients_rejected));
         let entry = scene.views.get_mut(index);
         entry.coarseness = scene.pipeline.coarseness_after(&done.stats);
-        (entry.steps, entry.steps_here) = (entry.steps.saturating_add(1), entry.steps_here.saturating_add(1));
+        entry.steps = entry.steps.saturating_add(1);
         // A step on a picture with holes was not taken, and tells nothing of pose and exposure.
         if whole {
-            self.refine(scene, index, &step, &done);
+            self.refine(scene, beside, index, &step, &done);
         }
         Ok(self.schedule.took())
     }
 
     /// One step of the pose of the image's keyframe, and of its exposure.
-    fn refine(&self, scene: &mut Scene, index: usize, step: &Step, done: &StepStats) {
+    fn refine(&self, scene: &mut Scene, beside: Option<&[u32]>, index: usize, step: &Step, done: &StepStats) {
         let part = self.rate_part(scene);
         if self.config.refine_pose {
             let body_from_cam = scene.views.get(index).body_from_cam;
@@ -133,7 +144,7 @@ impl Trainer {
         if self.config.refine_exposure {
             let refined = &mut scene.views.get_mut(index).refined;
             let moved = refined.step_exposure(&done.exposure_gradient, part * self.config.lr_exposure);
-            scene.views.balance_exposure(moved);
+            scene.views.balance_exposure(moved, beside);
         }
     }
 

@@ -7,10 +7,9 @@
 
 use super::coarseness::Coarseness;
 use super::exposure::Exposure;
-use super::horizon::Horizon;
+use super::horizon::{Cells, Horizon};
 use super::keyframes::{Keyframe, PoseCorrection};
 use super::refine::Refinement;
-use super::schedule::Ready;
 use super::shape::Shape;
 use stipple_drivers::{Image, Nanos, Pose};
 
@@ -36,9 +35,10 @@ pub struct Stored {
     pub coarseness: Coarseness,
     /// How far it sees.
     pub horizon: Horizon,
-    /// Training steps on it, and how many of them since its image came to its place.
+    /// Where it shows what is not in the pool.
+    pub hidden: Cells,
+    /// Training steps on it.
     pub steps: u32,
-    pub steps_here: u32,
 }
 
 impl Stored {
@@ -68,11 +68,10 @@ pub struct Views {
     /// The place of each keyframe's images, and the keyframe whose images are at each place.
     places: Vec<u32>,
     keyframes: Vec<u32>,
+    /// How many keyframes had been given a place when that at each place was.
+    arrived: Vec<u64>,
+    arrivals: u64,
     training: Vec<u32>,
-    /// Entries of `training` that may be trained on now, and the numbers of `Ready`.
-    ready: Vec<u32>,
-    ready_newest: usize,
-    ready_of: usize,
 }
 
 impl Views {
@@ -90,10 +89,9 @@ impl Views {
             planes: (0..places * cameras * channels).map(|_| image()).collect(),
             places: Vec::with_capacity(known / cameras),
             keyframes: vec![NONE; places],
+            arrived: vec![0; places],
+            arrivals: 0,
             training: Vec::with_capacity(known),
-            ready: Vec::with_capacity(places * cameras),
-            ready_newest: 0,
-            ready_of: 0,
         }
     }
 
@@ -169,16 +167,23 @@ impl Views {
         if let Some(keyframe) = self.keyframes.get_mut(place as usize) {
             *keyframe = NONE;
         }
-        self.ready.retain(|k| *k as usize / self.cameras != index / self.cameras);
     }
 
     /// Gives an entry's keyframe a free place; false where there is none. Its planes are what was there before.
     pub fn place(&mut self, index: usize) -> bool {
         let (keyframe, Some(place)) = (index / self.cameras, self.free_place()) else { return false };
         (self.places[keyframe], self.keyframes[place]) = (place as u32, keyframe as u32);
-        let first = keyframe * self.cameras;
-        self.entries.iter_mut().skip(first).take(self.cameras).for_each(|e| e.steps_here = 0);
+        self.arrivals += 1;
+        self.arrived[place] = self.arrivals;
         true
+    }
+
+    /// A number that is less the longer an entry's keyframe has had its place.
+    ///
+    /// # Panics
+    /// Where it has none.
+    pub fn arrival(&self, index: usize) -> u64 {
+        self.arrived[self.places[index / self.cameras] as usize]
     }
 
     /// The camera that an image is of.
@@ -233,8 +238,8 @@ impl Views {
             refined,
             coarseness,
             horizon: Horizon::default(),
+            hidden: Cells::default(),
             steps: 0,
-            steps_here: 0,
         };
         if self.camera(index) == 0 && self.free_place().is_none() {
             return None;
@@ -242,9 +247,6 @@ impl Views {
         self.know(stored);
         if self.camera(index) == 0 {
             self.place(index);
-        }
-        if !held_out {
-            self.ready.push(index as u32);
         }
         self.planes_mut(index).iter_mut().enumerate().for_each(|(channel, plane)| draw(channel, plane));
         Some(index)
@@ -318,11 +320,12 @@ impl Views {
         }
     }
 
-    /// After the exposure of one image that is trained on moved: all of them move back by its share, so that their mean
-    /// stays.
-    pub fn balance_exposure(&mut self, moved: [f64; 2]) {
-        let share = moved.map(|x| -x / self.training.len().max(1) as f64);
-        for k in &self.training {
+    /// After the exposure of one image that is trained on moved: those that are trained on beside it, all where they are not
+    /// named, move back by its share, so that their mean stays.
+    pub fn balance_exposure(&mut self, moved: [f64; 2], beside: Option<&[u32]>) {
+        let beside = beside.unwrap_or(&self.training);
+        let share = moved.map(|x| -x / beside.len().max(1) as f64);
+        for k in beside {
             self.entries[*k as usize].refined.shift_exposure(share);
         }
     }
@@ -330,26 +333,6 @@ impl Views {
     /// Entries that are not held out, oldest first.
     pub fn training(&self) -> &[u32] {
         &self.training
-    }
-
-    /// Entries that may be trained on now.
-    pub fn ready(&self) -> Ready<'_> {
-        Ready { views: &self.ready, newest: self.ready_newest, of: self.ready_of.max(self.ready.len()) }
-    }
-
-    /// Sets which of the entries that have a place and are not held out may be trained on, how many of the newest keyframes
-    /// stay, and for how many keyframes in all they stand.
-    pub fn make_ready(&mut self, stay: usize, of: usize, may: impl Fn(usize) -> bool) {
-        self.ready.clear();
-        for place in 0..self.keyframes.len() {
-            let first = self.keyframes[place] as usize * self.cameras;
-            if self.keyframes[place] != NONE && !self.entries[first].held_out && may(first) {
-                self.ready.extend((first..first + self.cameras).map(|i| i as u32));
-            }
-        }
-        // Draws depend on the order, and the order not on who had which place before.
-        self.ready.sort_unstable();
-        (self.ready_newest, self.ready_of) = ((stay * self.cameras).min(self.ready.len()), of * self.cameras);
     }
 
     pub fn anchors(&self) -> usize {
@@ -448,12 +431,10 @@ mod tests {
         let mut s = views(2, 1);
         (0..2).for_each(|id| _ = s.add(&keyframe(id, false), ON_BODY, |_, i| i.pixels.fill(id as u8)));
         s.unplace(0);
-        assert_eq!((s.len(), s.ready().views, s.has_place(0)), (2, &[1][..], false));
+        assert_eq!((s.len(), s.has_place(0), s.has_place(1)), (2, false, true));
         assert!(s.place(0) && !s.place(1), "both places are taken");
-        s.make_ready(1, 9, |_| true);
-        let ready = s.ready();
-        assert_eq!((s.image(0), ready.views, ready.newest, ready.of), (0, &[0, 1][..], 1, 9));
-        assert_eq!(s.placed().collect::<Vec<_>>(), [0, 1]);
+        assert_eq!((s.image(0), s.placed().collect::<Vec<_>>()), (0, vec![0, 1]));
+        assert!(s.arrival(0) > s.arrival(1));
     }
 
     /// An estimator that learns where a camera sits moves the body, not the camera: nor do its image and its Gaussians.

@@ -10,7 +10,7 @@ const EXPOSURE: Exposure = Exposure { gain: 1.3, offset: -0.07 };
 const SSIM: f64 = 0.2;
 
 fn goal() -> Target {
-    Target { image: 1, camera: 0, exposure: EXPOSURE }
+    Target { exposure: EXPOSURE, ..Target::from(1) }
 }
 
 fn levels(image: &[u8]) -> Vec<f64> {

@@ -5,6 +5,7 @@ mod cache;
 mod chroma;
 mod exposure;
 mod fisheye;
+mod hidden;
 mod occupancy;
 mod pool;
 mod raster;

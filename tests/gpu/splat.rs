@@ -448,7 +448,7 @@ fn the_validation_layer_is_silent() {
     p.pool.append(&mut gpu, scene(64, &v, 1)).unwrap();
     p.loss.set_image(&mut gpu, 0, &target(33, 21)).unwrap();
     train(&mut gpu, &mut p, &v, 2);
-    let goal = Target { image: 0, camera: 0, exposure: Exposure { gain: 1.2, offset: 0.1 } };
+    let goal = Target { exposure: Exposure { gain: 1.2, offset: 0.1 }, ..Target::from(0) };
     p.train(&mut gpu, &v, goal, &FAST, &Weights::default()).unwrap();
     render(&mut gpu, &mut p, &v);
     p.pool.prune(&mut gpu, &PruneRule::default()).unwrap();

@@ -1,0 +1,236 @@
+//! Which images are in memory: those of the views that are trained on next.
+//!
+//! Views are drawn ahead of the steps that train on them, and the images of those that have no place are fetched from the
+//! disk meanwhile. So every view is as likely as without a store, however few places there are. Views that come and go in
+//! groups instead, each trained on for a while, cost 0.9 dB (24 places for 121 views, 3255 steps, the simulator's two rooms):
+//! the map then fits the few views of the last group.
+
+use super::archive::Archive;
+use super::filing::read_planes;
+use super::horizon::CELLS;
+use super::scene::Scene;
+use super::schedule::Rng;
+use super::views::Views;
+use crate::config::Board;
+use crate::gpu::GpuError;
+use crate::store::Fetched;
+use std::collections::VecDeque;
+
+/// Views drawn ahead, at most.
+const AHEAD: usize = 8;
+/// Draws until another view is found.
+const DRAWS: usize = 16;
+/// Part of the Gaussians that a keyframe sees, and of its picture, that must be in the pool when it is trained on.
+const HERE_MIN: f32 = 0.5;
+/// Newest keyframes, whose poses odometry still corrects and of which one is an anchor's.
+const NEWEST: usize = 8;
+/// Places for each block in the pool, below which a block's last keyframe may go, too.
+const VIEWS_PER_BLOCK: usize = 3;
+
+/// What is trained on next.
+pub struct Rotation {
+    /// Views that may be trained on: enough of what they see is in the pool.
+    pub trainable: Vec<u32>,
+    /// Views that were drawn, the next one first.
+    pub next: VecDeque<u32>,
+    ahead: usize,
+    /// Training steps from one fetched image to the next, at least, and those at the last one.
+    steps: u64,
+    fetched_at: u64,
+}
+
+impl Rotation {
+    pub fn new(board: &Board, views: usize, places: usize, at_once: bool) -> Rotation {
+        // Beside the newest, the images drawn ahead have places, and as many leave theirs.
+        let ahead = (AHEAD.min((places - newest_kept(places)) / 2)).max(1);
+        Rotation {
+            trainable: Vec::with_capacity(views),
+            next: VecDeque::with_capacity(AHEAD),
+            ahead: if at_once { 1 } else { ahead },
+            steps: u64::from(board.map.rotation_steps.max(1)),
+            fetched_at: 0,
+        }
+    }
+}
+
+/// Keyframes, the newest, whose images stay.
+fn newest_kept(places: usize) -> usize {
+    NEWEST.min(places / 2)
+}
+
+impl Archive {
+    /// Finds the views of the present epoch that may be trained on.
+    pub fn find_trainable(&mut self, views: &Views) {
+        let (cameras, epoch) = (views.cameras(), self.choice.epoch);
+        let mut trainable = std::mem::take(&mut self.rotation.trainable);
+        trainable.clear();
+        for &index in views.training().iter().filter(|i| **i as usize % cameras == 0) {
+            let keyframe = index as usize / cameras;
+            if views.get(index as usize).epoch == epoch && self.part_here(keyframe) >= HERE_MIN {
+                trainable.extend(index..index + cameras as u32);
+            }
+        }
+        self.rotation.trainable = trainable;
+    }
+
+    /// The views that are trained on now.
+    pub fn trained_beside(&self) -> &[u32] {
+        &self.rotation.trainable
+    }
+
+    /// The next view to train on, whose images have a place; `None` when there is none.
+    pub fn next_view(&mut self, scene: &mut Scene, rng: &mut Rng) -> Result<Option<usize>, GpuError> {
+        self.receive(scene)?;
+        // What found no place, or is damaged, does not come any more.
+        let (views, cameras) = (&scene.views, scene.views.cameras());
+        let known = &self.known;
+        let asked = |i: &u32| known.get(*i as usize / cameras).is_some_and(|k| k.asked > 0);
+        self.rotation.next.retain(|i| views.has_place(*i as usize) || asked(i));
+        while self.rotation.next.len() < self.rotation.ahead {
+            let Some(index) = self.draw(scene, rng)? else { break };
+            self.rotation.next.push_back(index);
+        }
+        let drawn =
+            |a: &Archive, scene: &Scene| a.rotation.next.iter().position(|index| a.is_here(&scene.views, *index));
+        while let Some(index) = drawn(self, scene).and_then(|at| self.rotation.next.remove(at)) {
+            // Blocks may have left since it was drawn.
+            if scene.views.get(index as usize).epoch == self.choice.epoch && self.shows_enough(scene, index) {
+                return Ok(Some(index as usize));
+            }
+        }
+        // The disk is slower than the steps: what is here is trained on meanwhile.
+        Ok(self.any_here(scene, rng))
+    }
+
+    /// One of the views whose images are here and that may be trained on.
+    fn any_here(&mut self, scene: &mut Scene, rng: &mut Rng) -> Option<usize> {
+        let (mut found, mut n) = (None, 0);
+        for at in 0..self.rotation.trainable.len() {
+            let index = self.rotation.trainable[at];
+            if self.is_here(&scene.views, index) && self.shows_enough(scene, index) {
+                n += 1;
+                found = if rng.below(n) == 0 { Some(index as usize) } else { found };
+            }
+        }
+        found
+    }
+
+    /// Whether a view's images have a place and have come.
+    fn is_here(&self, views: &Views, index: u32) -> bool {
+        views.has_place(index as usize) && self.has_come(index, views.cameras())
+    }
+
+    fn has_come(&self, index: u32, cameras: usize) -> bool {
+        self.known.get(index as usize / cameras).is_none_or(|k| k.asked == 0)
+    }
+
+    /// Draws a view, and asks for its images where they are on disk.
+    fn draw(&mut self, scene: &mut Scene, rng: &mut Rng) -> Result<Option<u32>, GpuError> {
+        let cameras = scene.views.cameras();
+        for _ in 0..DRAWS {
+            let Some(index) = rng.one_of(&self.rotation.trainable) else { break };
+            let keyframe = index as usize / cameras;
+            if !self.shows_enough(scene, index) {
+                continue;
+            }
+            if scene.views.has_place(index as usize) || !self.has_come(index, cameras) {
+                return Ok(Some(index));
+            }
+            let may = scene.steps >= self.rotation.fetched_at + self.rotation.steps || self.rotation.fetched_at == 0;
+            if may && self.known[keyframe].saved && self.ask_for_images(&scene.views, keyframe) {
+                self.rotation.fetched_at = scene.steps;
+                self.receive(scene)?;
+                return Ok(Some(index));
+            }
+        }
+        Ok(None)
+    }
+
+    /// Whether a view shows enough of what is in the pool.
+    fn shows_enough(&mut self, scene: &mut Scene, index: u32) -> bool {
+        let first = self.find_hidden(scene, index as usize);
+        scene.views.get(first).hidden.len() as f32 <= (1.0 - HERE_MIN) * CELLS as f32
+    }
+
+    /// Finds where a view shows what is not in the pool, if blocks came or went since that was last found; its keyframe's
+    /// first view, which has it.
+    pub fn find_hidden(&mut self, scene: &mut Scene, index: usize) -> usize {
+        let first = scene.views.first(index);
+        let keyframe = first / scene.views.cameras();
+        if self.known.get(keyframe).is_some_and(|k| k.looked_at < self.exchanges) {
+            let horizon = scene.views.get(first).horizon;
+            scene.views.get_mut(first).hidden = self.hidden_from(&scene.view(first), &horizon);
+            self.known[keyframe].looked_at = self.exchanges;
+        }
+        first
+    }
+
+    pub fn take_image(&mut self, scene: &mut Scene, index: usize, fetched: &Fetched) -> Result<(), GpuError> {
+        let keyframe = index / scene.views.cameras();
+        self.known[keyframe].asked = self.known[keyframe].asked.saturating_sub(1);
+        let placed = scene.views.has_place(index) || (self.make_place(scene)? && scene.views.place(index));
+        if !placed {
+            return Ok(());
+        }
+        if !read_planes(&fetched.payload, scene.views.planes_mut(index)) {
+            scene.counters.keyframes_lost.add(1);
+            self.known[keyframe].saved = false;
+            scene.views.unplace(index);
+            return Ok(());
+        }
+        scene.upload_image(index)?;
+        scene.counters.images_paged_in.add(1);
+        Ok(())
+    }
+
+    /// Sees that a place for images is free: takes that of the keyframe that is missed least. False where all must stay.
+    pub fn make_place(&mut self, scene: &mut Scene) -> Result<bool, GpuError> {
+        if scene.views.has_free_place() {
+            return Ok(true);
+        }
+        let cameras = scene.views.cameras();
+        let mut tried = [usize::MAX; 4];
+        for n in 0..tried.len() {
+            let untried = scene.views.placed().filter(|first| !tried.contains(first));
+            let ranked = untried.filter_map(|first| Some((self.rank(&scene.views, first)?, first)));
+            let Some((_, first)) = ranked.max() else { break };
+            tried[n] = first;
+            if self.known[first / cameras].open {
+                self.look_again(scene, first)?;
+            }
+            if self.save_keyframe(&scene.views, first / cameras) {
+                scene.views.unplace(first);
+                return Ok(true);
+            }
+        }
+        Ok(false)
+    }
+
+    /// How much the images of a keyframe may go: by kind, then the longer they were here; `None` where they must stay. What goes
+    /// does not depend on the steps it got, so all are trained on alike.
+    fn rank(&self, views: &Views, first: usize) -> Option<(u8, u64)> {
+        let cameras = views.cameras();
+        let (entry, keyframe) = (views.get(first), first / cameras);
+        let newest = views.placed().max().unwrap_or(0) / cameras;
+        let recent = keyframe + newest_kept(views.places()) > newest;
+        let next = self.rotation.next.iter().any(|i| *i as usize / cameras == keyframe);
+        if self.known.get(keyframe)?.asked > 0 || next || recent && !entry.held_out {
+            return None;
+        }
+        // Where places are few, each would be the last of its block, and none would ever go.
+        let few = views.places() < VIEWS_PER_BLOCK * self.blocks.iter().filter(|b| b.in_pool).count();
+        let last = !few
+            && self.home(keyframe).is_some_and(|home| {
+                let shares = |f: &usize| *f != first && self.home(*f / cameras) == Some(home);
+                self.blocks[home].in_pool && !views.placed().any(|f| shares(&f))
+            });
+        let kind = if entry.held_out {
+            3
+        } else if last {
+            0
+        } else {
+            1 + u8::from(self.part_here(keyframe) < HERE_MIN)
+        };
+        Some((kind, u64::MAX - views.arrival(first)))
+    }
+}
