@@ -155,6 +155,8 @@ fn assignments(variant: &Variant, cap: u32, seconds: f64) -> Vec<String> {
         format!("memory_max_mib={MEMORY_MAX_MIB}"),
         format!("budget.intersections={intersections}"),
         format!("budget.splats={cap}"),
+        // What is on disk would count beside the cap.
+        "store.enabled=false".into(),
         format!("map.curve_period_s={}", seconds / PROBES),
     ];
     shape.into_iter().chain(variant.set.iter().map(|s| s.to_string())).collect()
