@@ -3,7 +3,7 @@
 //! The store on disk is the map: a block of Gaussians for each anchor, and every keyframe with its images. The pool of
 //! Gaussians and the places for images are caches of it, and so the map may be larger than both. What should be in them is
 //! chosen when a keyframe comes (`residency`): blocks go out and come in whole, there and nowhere else, so that no training
-//! step waits for them. Images rotate while the map trains, one at a time.
+//! step waits for them. Images are fetched when a training step on them was drawn (`rotation`).
 //!
 //! Blocks are written once their anchor was densified, again whenever they had a quarter more training steps, and before they
 //! go. Images are written once. Reading and writing are the business of two threads of the store, or, in lockstep, of this one,
@@ -133,6 +133,7 @@ impl Archive {
     /// Bytes on the host.
     pub fn footprint(board: &Board, shape: &Shape, f: &mut Footprint) {
         f.build("map: blocks and keyframes known", || tables(board, shape));
+        f.build("map: views drawn", || Rotation::new(board, shape, false));
         f.extend(Store::footprint(&limits(board, shape, false)));
     }
 
@@ -182,7 +183,6 @@ impl Archive {
                 }
             };
         let (blocks, known, sight, choice) = tables(board, shape);
-        let places = (shape.images / shape.cameras) as usize;
         let mut archive = Archive {
             store,
             disk: Arc::new(disk),
@@ -196,12 +196,7 @@ impl Archive {
             sight,
             choice,
             exchanges: 1,
-            rotation: Rotation::new(
-                board,
-                keyframes_known(board, shape) * shape.cameras as usize,
-                places,
-                place.at_once,
-            ),
+            rotation: Rotation::new(board, shape, place.at_once),
             next_block: 0,
             next_state: 0,
         };

@@ -172,6 +172,31 @@ mod tests {
     }
 
     #[test]
+    fn depth_closes_what_is_open_and_nothing_else() {
+        let mut rendered = black(&[1.0; W * H]);
+        rendered.depth.fill(2.0);
+        (0..H).for_each(|y| rendered.alpha[y * W + W / 2..(y + 1) * W].fill(0.0));
+        let (mut horizon, view) = (Horizon::of(&rendered), view());
+        let behind = DVec3::new(0.4, 0.1, 3.5);
+        assert!(horizon.may_see(&view, behind).is_some(), "nothing is known of how far it sees");
+        horizon.fill(&[3.0; W * H], W);
+        assert_eq!(horizon.open_part(), 0.0);
+        assert!(horizon.sees(&view, DVec3::new(0.4, 0.1, 3.0)) && horizon.may_see(&view, behind * 2.0).is_none());
+        assert!(!horizon.sees(&view, DVec3::new(-0.4, 0.1, 3.0)), "the map is nearer there");
+        let known = horizon;
+        horizon.fill(&[0.0; W * H], W);
+        assert_eq!(horizon, known);
+    }
+
+    #[test]
+    fn cells_are_counted_and_found() {
+        let mut cells = Cells::default();
+        [0, 31, 32, CELLS - 1, 31].into_iter().for_each(|cell| cells.insert(cell));
+        assert_eq!((cells.len(), cells.is_empty(), Cells::default().is_empty()), (4, false, true));
+        assert!(cells.contains(31) && cells.contains(CELLS - 1) && !cells.contains(33));
+    }
+
+    #[test]
     fn a_ball_holds_its_points() {
         let points = [[0.0, 0.0, 0.0], [2.0, 0.0, 0.0], [1.0, 1.0, 0.0]];
         let (centre, radius) = ball(&points);

@@ -6,10 +6,11 @@
 //! the map then fits the few views of the last group.
 
 use super::archive::Archive;
-use super::filing::read_planes;
+use super::filing::{keyframes_known, read_planes};
 use super::horizon::CELLS;
 use super::scene::Scene;
 use super::schedule::Rng;
+use super::shape::Shape;
 use super::views::Views;
 use crate::config::Board;
 use crate::gpu::GpuError;
@@ -40,11 +41,12 @@ pub struct Rotation {
 }
 
 impl Rotation {
-    pub fn new(board: &Board, views: usize, places: usize, at_once: bool) -> Rotation {
+    pub fn new(board: &Board, shape: &Shape, at_once: bool) -> Rotation {
+        let places = (shape.images / shape.cameras) as usize;
         // Beside the newest, the images drawn ahead have places, and as many leave theirs.
         let ahead = (AHEAD.min((places - newest_kept(places)) / 2)).max(1);
         Rotation {
-            trainable: Vec::with_capacity(views),
+            trainable: Vec::with_capacity(keyframes_known(board, shape) * shape.cameras as usize),
             next: VecDeque::with_capacity(AHEAD),
             ahead: if at_once { 1 } else { ahead },
             steps: u64::from(board.map.rotation_steps.max(1)),

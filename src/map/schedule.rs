@@ -112,8 +112,8 @@ mod tests {
     fn burst_trains_the_new_anchor_and_the_others_by_turns() {
         let mut s = Schedule::new(1);
         s.start_burst(42, 3);
-        for (next, ended) in [(42, None), (5, None), (42, Some(42))] {
-            assert_eq!((next(&mut s, &[5]), s.took()), (Some(next), ended));
+        for (wanted, ended) in [(42, None), (5, None), (42, Some(42))] {
+            assert_eq!((next(&mut s, &[5]), s.took()), (Some(wanted), ended));
         }
         assert_eq!((next(&mut s, &[5]), s.took()), (Some(5), None));
         assert_eq!(next(&mut s, &[]), None);
