@@ -12,12 +12,11 @@
 
 use super::block::{BlockAbout, KeyframeAbout, RunAbout};
 use super::block::{KIND_BLOCK, KIND_IMAGE, KIND_KEYFRAME, NO_BLOCK, SAMPLES};
-use super::choice::Choice;
+use super::choice::{Choice, Drawn};
 use super::filing::{
     entry, identity, image_id, keyframes_known, limits, payload_max, run_key, state, BLOCKS_KNOWN, MOMENTS,
 };
 use super::horizon::ball;
-use super::rotation::Rotation;
 use super::scene::Scene;
 use super::shape::Shape;
 use super::views::Views;
@@ -123,7 +122,7 @@ pub struct Archive {
     pub choice: Choice,
     /// How often blocks came or went.
     pub exchanges: u64,
-    pub rotation: Rotation,
+    pub drawn: Drawn,
     /// The next block and keyframe that are looked at for writing.
     next_block: usize,
     next_state: usize,
@@ -133,7 +132,7 @@ impl Archive {
     /// Bytes on the host.
     pub fn footprint(board: &Board, shape: &Shape, f: &mut Footprint) {
         f.build("map: blocks and keyframes known", || tables(board, shape));
-        f.build("map: views drawn", || Rotation::new(board, shape, false));
+        f.build("map: views drawn", || Drawn::new(board, shape, false));
         f.extend(Store::footprint(&limits(board, shape, false)));
     }
 
@@ -196,7 +195,7 @@ impl Archive {
             sight,
             choice,
             exchanges: 1,
-            rotation: Rotation::new(board, shape, place.at_once),
+            drawn: Drawn::new(board, shape, place.at_once),
             next_block: 0,
             next_state: 0,
         };

@@ -1,6 +1,9 @@
-//! Room in which the archive finds what is wanted in memory (`residency`); bought at boot.
+//! Room in which the archive finds what is wanted in memory (`residency`, `rotation`); bought at boot.
 
-use super::filing::BLOCKS_KNOWN;
+use super::filing::{keyframes_known, BLOCKS_KNOWN};
+use super::shape::Shape;
+use crate::config::Board;
+use std::collections::VecDeque;
 use stipple_drivers::{Nanos, Pose};
 
 /// What is wanted, and room to find it.
@@ -34,4 +37,42 @@ impl Choice {
             last: None,
         }
     }
+}
+
+/// Views drawn ahead, at most.
+const AHEAD: usize = 8;
+/// Newest keyframes, whose poses odometry still corrects and of which one is an anchor's.
+const NEWEST: usize = 8;
+
+/// Views to train on, drawn ahead of their steps.
+pub struct Drawn {
+    /// Views that may be trained on: enough of what they see is in the pool.
+    pub trainable: Vec<u32>,
+    /// Views that were drawn, the next one first.
+    pub next: VecDeque<u32>,
+    /// How many are drawn ahead.
+    pub ahead: usize,
+    /// Training steps from one fetched image to the next, at least, and those at the last one.
+    pub steps: u64,
+    pub fetched_at: u64,
+}
+
+impl Drawn {
+    pub fn new(board: &Board, shape: &Shape, at_once: bool) -> Drawn {
+        let places = (shape.images / shape.cameras) as usize;
+        // Beside the newest, the images drawn ahead have places, and as many leave theirs.
+        let ahead = (AHEAD.min((places - newest_kept(places)) / 2)).max(1);
+        Drawn {
+            trainable: Vec::with_capacity(keyframes_known(board, shape) * shape.cameras as usize),
+            next: VecDeque::with_capacity(AHEAD),
+            ahead: if at_once { 1 } else { ahead },
+            steps: u64::from(board.map.rotation_steps.max(1)),
+            fetched_at: 0,
+        }
+    }
+}
+
+/// Keyframes, the newest, whose images stay.
+pub fn newest_kept(places: usize) -> usize {
+    NEWEST.min(places / 2)
 }

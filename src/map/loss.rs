@@ -15,7 +15,7 @@ use stipple_drivers::Fault;
 #[derive(Clone, Copy)]
 pub struct Buffers {
     images: Buf<u32>,
-    /// Of each camera, and one for a view of which not all counts.
+    /// A mask for each camera, and one for a view of which not all counts.
     masks: Buf<u32>,
     /// By colour, plane by plane.
     pub pixel_gradient: Buf<f32>,

@@ -2,69 +2,31 @@
 //!
 //! Views are drawn ahead of the steps that train on them, and the images of those that have no place are fetched from the
 //! disk meanwhile. So every view is as likely as without a store, however few places there are. Views that come and go in
-//! groups instead, each trained on for a while, cost 0.9 dB (24 places for 121 views, 3255 steps, the simulator's two rooms):
+//! groups instead, each trained on for a while, cost 0.75 dB (24 places for 121 views, 3255 steps, the simulator's two rooms):
 //! the map then fits the few views of the last group.
 
 use super::archive::Archive;
-use super::filing::{keyframes_known, read_planes};
+use super::choice::newest_kept;
+use super::filing::read_planes;
 use super::horizon::CELLS;
 use super::scene::Scene;
 use super::schedule::Rng;
-use super::shape::Shape;
 use super::views::Views;
-use crate::config::Board;
 use crate::gpu::GpuError;
 use crate::store::Fetched;
-use std::collections::VecDeque;
 
-/// Views drawn ahead, at most.
-const AHEAD: usize = 8;
 /// Draws until another view is found.
 const DRAWS: usize = 16;
 /// Part of the Gaussians that a keyframe sees, and of its picture, that must be in the pool when it is trained on.
 const HERE_MIN: f32 = 0.5;
-/// Newest keyframes, whose poses odometry still corrects and of which one is an anchor's.
-const NEWEST: usize = 8;
 /// Places for each block in the pool, below which a block's last keyframe may go, too.
 const VIEWS_PER_BLOCK: usize = 3;
-
-/// What is trained on next.
-pub struct Rotation {
-    /// Views that may be trained on: enough of what they see is in the pool.
-    pub trainable: Vec<u32>,
-    /// Views that were drawn, the next one first.
-    pub next: VecDeque<u32>,
-    ahead: usize,
-    /// Training steps from one fetched image to the next, at least, and those at the last one.
-    steps: u64,
-    fetched_at: u64,
-}
-
-impl Rotation {
-    pub fn new(board: &Board, shape: &Shape, at_once: bool) -> Rotation {
-        let places = (shape.images / shape.cameras) as usize;
-        // Beside the newest, the images drawn ahead have places, and as many leave theirs.
-        let ahead = (AHEAD.min((places - newest_kept(places)) / 2)).max(1);
-        Rotation {
-            trainable: Vec::with_capacity(keyframes_known(board, shape) * shape.cameras as usize),
-            next: VecDeque::with_capacity(AHEAD),
-            ahead: if at_once { 1 } else { ahead },
-            steps: u64::from(board.map.rotation_steps.max(1)),
-            fetched_at: 0,
-        }
-    }
-}
-
-/// Keyframes, the newest, whose images stay.
-fn newest_kept(places: usize) -> usize {
-    NEWEST.min(places / 2)
-}
 
 impl Archive {
     /// Finds the views of the present epoch that may be trained on.
     pub fn find_trainable(&mut self, views: &Views) {
         let (cameras, epoch) = (views.cameras(), self.choice.epoch);
-        let mut trainable = std::mem::take(&mut self.rotation.trainable);
+        let mut trainable = std::mem::take(&mut self.drawn.trainable);
         trainable.clear();
         for &index in views.training().iter().filter(|i| **i as usize % cameras == 0) {
             let keyframe = index as usize / cameras;
@@ -72,12 +34,12 @@ impl Archive {
                 trainable.extend(index..index + cameras as u32);
             }
         }
-        self.rotation.trainable = trainable;
+        self.drawn.trainable = trainable;
     }
 
     /// The views that are trained on now.
     pub fn trained_beside(&self) -> &[u32] {
-        &self.rotation.trainable
+        &self.drawn.trainable
     }
 
     /// The next view to train on, whose images have a place; `None` when there is none.
@@ -87,14 +49,13 @@ impl Archive {
         let (views, cameras) = (&scene.views, scene.views.cameras());
         let known = &self.known;
         let asked = |i: &u32| known.get(*i as usize / cameras).is_some_and(|k| k.asked > 0);
-        self.rotation.next.retain(|i| views.has_place(*i as usize) || asked(i));
-        while self.rotation.next.len() < self.rotation.ahead {
+        self.drawn.next.retain(|i| views.has_place(*i as usize) || asked(i));
+        while self.drawn.next.len() < self.drawn.ahead {
             let Some(index) = self.draw(scene, rng)? else { break };
-            self.rotation.next.push_back(index);
+            self.drawn.next.push_back(index);
         }
-        let drawn =
-            |a: &Archive, scene: &Scene| a.rotation.next.iter().position(|index| a.is_here(&scene.views, *index));
-        while let Some(index) = drawn(self, scene).and_then(|at| self.rotation.next.remove(at)) {
+        let drawn = |a: &Archive, scene: &Scene| a.drawn.next.iter().position(|index| a.is_here(&scene.views, *index));
+        while let Some(index) = drawn(self, scene).and_then(|at| self.drawn.next.remove(at)) {
             // Blocks may have left since it was drawn.
             if scene.views.get(index as usize).epoch == self.choice.epoch && self.shows_enough(scene, index) {
                 return Ok(Some(index as usize));
@@ -107,8 +68,8 @@ impl Archive {
     /// One of the views whose images are here and that may be trained on.
     fn any_here(&mut self, scene: &mut Scene, rng: &mut Rng) -> Option<usize> {
         let (mut found, mut n) = (None, 0);
-        for at in 0..self.rotation.trainable.len() {
-            let index = self.rotation.trainable[at];
+        for at in 0..self.drawn.trainable.len() {
+            let index = self.drawn.trainable[at];
             if self.is_here(&scene.views, index) && self.shows_enough(scene, index) {
                 n += 1;
                 found = if rng.below(n) == 0 { Some(index as usize) } else { found };
@@ -130,7 +91,7 @@ impl Archive {
     fn draw(&mut self, scene: &mut Scene, rng: &mut Rng) -> Result<Option<u32>, GpuError> {
         let cameras = scene.views.cameras();
         for _ in 0..DRAWS {
-            let Some(index) = rng.one_of(&self.rotation.trainable) else { break };
+            let Some(index) = rng.one_of(&self.drawn.trainable) else { break };
             let keyframe = index as usize / cameras;
             if !self.shows_enough(scene, index) {
                 continue;
@@ -138,9 +99,9 @@ impl Archive {
             if scene.views.has_place(index as usize) || !self.has_come(index, cameras) {
                 return Ok(Some(index));
             }
-            let may = scene.steps >= self.rotation.fetched_at + self.rotation.steps || self.rotation.fetched_at == 0;
+            let may = scene.steps >= self.drawn.fetched_at + self.drawn.steps || self.drawn.fetched_at == 0;
             if may && self.known[keyframe].saved && self.ask_for_images(&scene.views, keyframe) {
-                self.rotation.fetched_at = scene.steps;
+                self.drawn.fetched_at = scene.steps;
                 self.receive(scene)?;
                 return Ok(Some(index));
             }
@@ -215,7 +176,7 @@ impl Archive {
         let (entry, keyframe) = (views.get(first), first / cameras);
         let newest = views.placed().max().unwrap_or(0) / cameras;
         let recent = keyframe + newest_kept(views.places()) > newest;
-        let next = self.rotation.next.iter().any(|i| *i as usize / cameras == keyframe);
+        let next = self.drawn.next.iter().any(|i| *i as usize / cameras == keyframe);
         if self.known.get(keyframe)?.asked > 0 || next || recent && !entry.held_out {
             return None;
         }
