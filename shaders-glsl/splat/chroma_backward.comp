@@ -2,7 +2,7 @@
 // of its colour is project_backward's, which runs next and counts the step: one thread a rank. Colour maps only.
 // in   visible_count, slots (by depth), tile_offsets, steps (before this one), isect_gradients
 // out  chroma, chroma_moments (first of both, second of both)
-// A step that is not finite is not taken; project_backward counts it.
+// A step that is not finite is not taken; project_backward counts it. What a view hardly shows takes none.
 #version 450
 #extension GL_GOOGLE_include_directive : require
 layout(local_size_x = 64) in;
@@ -41,10 +41,17 @@ void main() {
         return;
     }
     vec2 g = vec2(0.0);
-    for (uint i = begin; i < end; i += slots_at(i, end)) {
+    float worth = 0.0;
+    for (uint i = begin, n; i < end; i += n) {
+        n = slots_at(i, end);
         g += isect_gradients[3 * i + 2].xy;
+        worth += n == 1 ? abs(isect_gradients[3 * i + 1][WORTH - 4]) : isect_gradients[3 * (i + 1)].x;
     }
     const uint slot = slots[rank], step = min(steps_of(steps[slot]) + 1, STEPS_MAX);
+    // As project_backward does.
+    if (worth == 0.0 || !shown(steps[slot], worth)) {
+        return;
+    }
     const vec2 debias = 1.0 / (1.0 - exp2(float(step) * log2(vec2(BETA1, BETA2))));
     const vec4 old = chroma_moments[slot];
     const vec2 m = BETA1 * old.xy + (1.0 - BETA1) * g, v = BETA2 * old.zw + (1.0 - BETA2) * g * g;

@@ -144,6 +144,8 @@ impl Anchors {
         horizon.fill(&self.work.depth.metres, view.camera.width);
         if self.pair.is_none() {
             scene.views.get_mut(index).horizon = horizon;
+            let own = scene.view(index);
+            archive.iter_mut().for_each(|a| a.look_from(&own, &horizon, index / scene.views.cameras()));
         }
         let hidden = archive.as_mut().and_then(|a| a.hide(&view, &horizon, stereo.views.valid_mask()));
         let valid = hidden.unwrap_or(stereo.views.valid_mask());
@@ -236,7 +238,7 @@ impl Anchors {
     pub fn densify(&mut self, scene: &mut Scene, archive: &mut Option<Archive>, index: usize) -> Result<(), GpuError> {
         self.fill_in(scene, index)?;
         let Some(archive) = archive else { return Ok(()) };
-        if let Some(block) = archive.block_of(index as u32) {
+        if let Some(block) = archive.block_of(index as u32).filter(|b| archive.blocks[*b].in_pool) {
             archive.save_block(scene, block)?;
             archive.look_for(scene, block);
             let view = scene.view(index);

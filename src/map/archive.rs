@@ -103,6 +103,8 @@ pub struct Known {
     pub open: bool,
     /// The exchange of blocks after which what is hidden of it was last looked at.
     pub looked_at: u64,
+    /// One of its images could not be had: those that come go.
+    pub in_part: bool,
 }
 
 pub struct Archive {
@@ -120,7 +122,9 @@ pub struct Archive {
     /// How many of a block's samples a keyframe sees: keyframe by keyframe.
     pub sight: Vec<u8>,
     pub choice: Choice,
-    /// How often blocks came or went.
+    /// A new block grows: none comes behind it.
+    pub growing: bool,
+    /// How often blocks came, went, moved or were first sampled.
     pub exchanges: u64,
     pub drawn: Drawn,
     /// The next block and keyframe that are looked at for writing.
@@ -194,6 +198,7 @@ impl Archive {
             known,
             sight,
             choice,
+            growing: false,
             exchanges: 1,
             drawn: Drawn::new(board, shape, place.at_once),
             next_block: 0,
@@ -380,6 +385,7 @@ impl Archive {
     /// Takes a block's samples from its arrays.
     fn look_at(&mut self, block: usize, count: usize, bytes: &[u8]) {
         const SPLAT: usize = size_of::<crate::gpu::kernels::types::Splat>();
+        self.exchanges += u64::from(self.blocks[block].samples_len == 0);
         let b = &mut self.blocks[block];
         (b.count, b.samples_len) = (count as u32, 0);
         for i in 0..SAMPLES.min(count) {
@@ -515,6 +521,7 @@ impl Archive {
             // Moved, it is another one than on disk.
             b.steps += u32::from(b.in_pool);
             self.measure(block);
+            self.exchanges += 1;
         }
     }
 
@@ -532,6 +539,7 @@ impl Archive {
         let cameras = views.cameras();
         for camera in 0..cameras {
             if !self.store.fetch(self.key(KIND_IMAGE, image_id(views, keyframe * cameras + camera))) {
+                self.known[keyframe].in_part = self.known[keyframe].asked > 0;
                 return self.known[keyframe].asked > 0;
             }
             self.known[keyframe].asked += 1;

@@ -55,6 +55,8 @@ pub struct Drawn {
     /// Training steps from one fetched image to the next, at least, and those at the last one.
     pub steps: u64,
     pub fetched_at: u64,
+    /// The exchange of blocks after which the trainable were last found.
+    pub found_at: u64,
 }
 
 impl Drawn {
@@ -68,6 +70,7 @@ impl Drawn {
             ahead: if at_once { 1 } else { ahead },
             steps: u64::from(board.map.rotation_steps.max(1)),
             fetched_at: 0,
+            found_at: 0,
         }
     }
 }

@@ -87,6 +87,11 @@ impl Horizon {
         }))
     }
 
+    /// Keeps what another knows of how far it sees where this one knows nothing.
+    pub fn take_over(&mut self, other: &Horizon) {
+        self.0.iter_mut().zip(other.0).filter(|(code, _)| **code == OPEN).for_each(|(code, known)| *code = known);
+    }
+
     /// Takes the mean depth of the pixels that have one where nothing is known of how far a cell sees; row by row, zero for none.
     pub fn fill(&mut self, depth: &[f32], width: usize) {
         let (mut sum, mut n) = ([0.0f64; CELLS], [0u32; CELLS]);

@@ -297,6 +297,10 @@ impl Mapper {
             if self.trainer.must_wait() {
                 self.finish_pending()?;
             }
+            if let Some(archive) = &mut self.archive {
+                archive.growing = self.trainer.in_burst();
+                archive.receive(&mut self.scene)?;
+            }
             let Some(kind) = self.trainer.step(&mut self.scene, &mut self.archive)? else {
                 self.finish_pending()?;
                 break;

@@ -224,7 +224,7 @@ impl Archive {
             self.exchanges += 1;
             return Ok(());
         };
-        if b.in_pool || !self.choice.wanted[block] || !self.make_room(scene, about.count as usize)? {
+        if self.growing || b.in_pool || !self.choice.wanted[block] || !self.make_room(scene, about.count as usize)? {
             return Ok(());
         }
         let (gpu, pool, count) = (&mut scene.gpu, &mut scene.pipeline.pool, about.count as usize);
@@ -298,7 +298,8 @@ impl Archive {
 
     /// Takes the horizon of a view from the scene's last picture, which is of it, and looks from there.
     pub fn saw(&mut self, scene: &mut Scene, first: usize) {
-        let (view, horizon) = (scene.view(first), Horizon::of(&scene.rendered));
+        let (view, mut horizon) = (scene.view(first), Horizon::of(&scene.rendered));
+        horizon.take_over(&scene.views.get(first).horizon);
         let keyframe = first / scene.views.cameras();
         scene.views.get_mut(first).horizon = horizon;
         if keyframe < self.known.len() {
@@ -339,6 +340,7 @@ impl Archive {
     /// Brings a keyframe's images and all blocks that it sees into memory and waits for them: to be scored and drawn. False
     /// where its images cannot be had.
     pub fn bring(&mut self, scene: &mut Scene, index: usize) -> Result<bool, GpuError> {
+        self.growing = false;
         let keyframe = index / scene.views.cameras();
         self.leave_other_epochs(scene, scene.views.get(index).epoch)?;
         self.want_seen_by(keyframe, scene.pipeline.pool.capacity());

@@ -5,7 +5,7 @@
 //! groups instead, each trained on for a while, cost 0.75 dB (24 places for 121 views, 3255 steps, the simulator's two rooms):
 //! the map then fits the few views of the last group.
 
-use super::archive::Archive;
+use super::archive::{Archive, Block};
 use super::choice::newest_kept;
 use super::filing::read_planes;
 use super::horizon::CELLS;
@@ -35,6 +35,7 @@ impl Archive {
             }
         }
         self.drawn.trainable = trainable;
+        self.drawn.found_at = self.exchanges;
     }
 
     /// The views that are trained on now.
@@ -45,6 +46,9 @@ impl Archive {
     /// The next view to train on, whose images have a place; `None` when there is none.
     pub fn next_view(&mut self, scene: &mut Scene, rng: &mut Rng) -> Result<Option<usize>, GpuError> {
         self.receive(scene)?;
+        if self.drawn.found_at != self.exchanges {
+            self.find_trainable(&scene.views);
+        }
         // What found no place, or is damaged, does not come any more.
         let (views, cameras) = (&scene.views, scene.views.cameras());
         let known = &self.known;
@@ -57,12 +61,17 @@ impl Archive {
         let drawn = |a: &Archive, scene: &Scene| a.drawn.next.iter().position(|index| a.is_here(&scene.views, *index));
         while let Some(index) = drawn(self, scene).and_then(|at| self.drawn.next.remove(at)) {
             // Blocks may have left since it was drawn.
-            if scene.views.get(index as usize).epoch == self.choice.epoch && self.shows_enough(scene, index) {
+            if self.shows_enough(scene, index) {
                 return Ok(Some(index as usize));
             }
         }
         // The disk is slower than the steps: what is here is trained on meanwhile.
-        Ok(self.any_here(scene, rng))
+        let any = self.any_here(scene, rng);
+        if any.is_none() {
+            // No step comes that the next image could wait for.
+            self.drawn.fetched_at = 0;
+        }
+        Ok(any)
     }
 
     /// One of the views whose images are here and that may be trained on.
@@ -99,7 +108,7 @@ impl Archive {
             if scene.views.has_place(index as usize) || !self.has_come(index, cameras) {
                 return Ok(Some(index));
             }
-            let may = scene.steps >= self.drawn.fetched_at + self.drawn.steps || self.drawn.fetched_at == 0;
+            let may = self.drawn.fetched_at == 0 || scene.steps >= self.drawn.fetched_at + self.drawn.steps;
             if may && self.known[keyframe].saved && self.ask_for_images(&scene.views, keyframe) {
                 self.drawn.fetched_at = scene.steps;
                 self.receive(scene)?;
@@ -109,40 +118,43 @@ impl Archive {
         Ok(None)
     }
 
-    /// Whether a view shows enough of what is in the pool.
+    /// Whether a view is of the present epoch and shows enough of what is in the pool.
     fn shows_enough(&mut self, scene: &mut Scene, index: u32) -> bool {
-        let first = self.find_hidden(scene, index as usize);
-        scene.views.get(first).hidden.len() as f32 <= (1.0 - HERE_MIN) * CELLS as f32
+        self.find_hidden(scene, index as usize);
+        let view = scene.views.get(index as usize);
+        view.epoch == self.choice.epoch && view.hidden.len() as f32 <= (1.0 - HERE_MIN) * CELLS as f32
     }
 
-    /// Finds where a view shows what is not in the pool, if blocks came or went since that was last found; its keyframe's
-    /// first view, which has it.
-    pub fn find_hidden(&mut self, scene: &mut Scene, index: usize) -> usize {
-        let first = scene.views.first(index);
-        let keyframe = first / scene.views.cameras();
-        if self.known.get(keyframe).is_some_and(|k| k.looked_at < self.exchanges) {
-            let horizon = scene.views.get(first).horizon;
-            scene.views.get_mut(first).hidden = self.hidden_from(&scene.view(first), &horizon);
-            self.known[keyframe].looked_at = self.exchanges;
+    /// Finds where the views of a keyframe show what is not in the pool, if that has changed since it was last found.
+    pub fn find_hidden(&mut self, scene: &mut Scene, index: usize) {
+        let (first, cameras) = (scene.views.first(index), scene.views.cameras());
+        if self.known.get(first / cameras).is_none_or(|k| k.looked_at == self.exchanges) {
+            return;
         }
-        first
+        for view in first..first + cameras {
+            let horizon = scene.views.get(view).horizon;
+            scene.views.get_mut(view).hidden = self.hidden_from(&scene.view(view), &horizon);
+        }
+        self.known[first / cameras].looked_at = self.exchanges;
     }
 
     pub fn take_image(&mut self, scene: &mut Scene, index: usize, fetched: &Fetched) -> Result<(), GpuError> {
         let keyframe = index / scene.views.cameras();
         self.known[keyframe].asked = self.known[keyframe].asked.saturating_sub(1);
-        let placed = scene.views.has_place(index) || (self.make_place(scene)? && scene.views.place(index));
-        if !placed {
-            return Ok(());
+        let room = scene.views.has_place(index) || (self.make_place(scene)? && scene.views.place(index));
+        if room && read_planes(&fetched.payload, scene.views.planes_mut(index)) {
+            scene.upload_image(index)?;
+            scene.counters.images_paged_in.add(1);
+        } else {
+            // Damaged where it had room.
+            scene.counters.keyframes_lost.add(u64::from(room));
+            self.known[keyframe].saved &= !room;
+            self.known[keyframe].in_part = true;
         }
-        if !read_planes(&fetched.payload, scene.views.planes_mut(index)) {
-            scene.counters.keyframes_lost.add(1);
-            self.known[keyframe].saved = false;
+        // All images of a keyframe, or none.
+        if self.known[keyframe].asked == 0 && std::mem::take(&mut self.known[keyframe].in_part) {
             scene.views.unplace(index);
-            return Ok(());
         }
-        scene.upload_image(index)?;
-        scene.counters.images_paged_in.add(1);
         Ok(())
     }
 
@@ -166,7 +178,12 @@ impl Archive {
                 return Ok(true);
             }
         }
-        Ok(false)
+        // With two places both may be taken by what is new and what is drawn.
+        if self.drawn.next.is_empty() {
+            return Ok(false);
+        }
+        self.drawn.next.clear();
+        self.make_place(scene)
     }
 
     /// How much the images of a keyframe may go: by kind, then the longer they were here; `None` where they must stay. What goes
@@ -177,7 +194,8 @@ impl Archive {
         let newest = views.placed().max().unwrap_or(0) / cameras;
         let recent = keyframe + newest_kept(views.places()) > newest;
         let next = self.drawn.next.iter().any(|i| *i as usize / cameras == keyframe);
-        if self.known.get(keyframe)?.asked > 0 || next || recent && !entry.held_out {
+        let grows = |b: &Block| b.anchor as usize == first && b.in_pool && b.samples_len == 0;
+        if self.blocks.iter().any(grows) || self.known.get(keyframe)?.asked > 0 || next || recent && !entry.held_out {
             return None;
         }
         // Where places are few, each would be the last of its block, and none would ever go.

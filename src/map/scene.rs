@@ -53,7 +53,7 @@ impl Scene {
             image: self.views.image(index) as u32,
             camera: self.views.camera(index) as u32,
             exposure: self.views.exposure(index),
-            hidden: self.views.get(self.views.first(index)).hidden,
+            hidden: self.views.get(index).hidden,
         }
     }
 

@@ -1,4 +1,5 @@
-//! What a view does not show, or where it is not compared, does not change.
+//! What a view does not show, or where it is not compared, does not change. Twin of mask_cells.comp: `both`, the mask less the
+//! hidden cells, made on the host.
 
 use super::splat::{mask, open, psnr, render, scene, shape, target, train, view, wide, worst, FAST, STILL};
 use stipple::gpu::kernels::types::Moments;
