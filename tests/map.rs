@@ -153,8 +153,10 @@ fn cameras_that_sit_elsewhere_than_calibrated_are_taken_over_from_keyframes_and_
         let (at_once, told) = (run(&wrong, Some(1.0)), run(&wrong, Some(0.5)));
         println!("PSNR, rectified anew: right {right:?}, told at once {at_once:?}, told {told:?}, not told {untold:?}");
         assert_eq!((right.1, at_once.1, told.1, untold.1), (0, 1, 2, 0));
-        // The first depths are those of a pair that is half as far askew.
-        assert!(at_once.0 > right.0 - 0.3 && told.0 > 0.5 * (right.0 + untold.0) && untold.0 < right.0 - lost);
+        // The first depths are those of a pair that is half as far askew. Of the coarse map all is within 0.2 dB.
+        let regained = if lost > 0.0 { 0.5 } else { 0.0 };
+        let least = untold.0 + regained * (right.0 - untold.0);
+        assert!(at_once.0 > right.0 - 0.3 && told.0 > least && untold.0 < right.0 - lost);
     }
 }
 

@@ -2,13 +2,11 @@
 //!
 //! The store on disk is the map: a block of Gaussians for each anchor, and every keyframe with its images. The pool of
 //! Gaussians and the places for images are caches of it, and so the map may be larger than both. What should be in them is
-//! chosen when a keyframe comes (`residency`): blocks go out and come in whole, there and nowhere else, so that no training
-//! step waits for them. Images are fetched when a training step on them was drawn (`rotation`).
-//!
+//! chosen when a keyframe comes (`residency`): blocks go out and come in whole, between training steps. Images are fetched
+//! when a step on them was drawn (`rotation`).
 //! Blocks are written once their anchor was densified, again whenever they had a quarter more training steps, and before they
-//! go. Images are written once. Reading and writing are the business of two threads of the store, or, in lockstep, of this one,
-//! so that a run can be repeated to the bit. A full or broken disk costs no map: what cannot be written stays in memory, and
-//! what finds no room there is thinned as without a store.
+//! go; images once. Two threads of the store write and read, in lockstep this one, so that a run can be repeated to the bit. What
+//! cannot be written to a full or broken disk stays in memory, and what finds no room there is thinned as without a store.
 
 use super::block::{BlockAbout, KeyframeAbout, RunAbout};
 use super::block::{KIND_BLOCK, KIND_IMAGE, KIND_KEYFRAME, NO_BLOCK, SAMPLES};
@@ -114,8 +112,8 @@ pub struct Archive {
     pub run: u32,
     /// Epoch 0 of this run, in the store.
     epoch_base: u32,
+    /// The run, and whether it was there before.
     about: RunAbout,
-    /// Whether the run was there before.
     pub goes_on: bool,
     pub blocks: Vec<Block>,
     pub known: Vec<Known>,
