@@ -3,10 +3,10 @@
 //! What is wanted follows from the keyframes that are known: what those see that are nearest to where the vehicle is, and to
 //! where it will be in two seconds, as much as the pool has room for. A block that is not wanted stays until its room is needed.
 //!
-//! A keyframe may see more than is in the pool. Where it does, its picture says nothing of what is in the pool, and is not
-//! compared (`sight`): other Gaussians would be bent to stand for those that are missing.
+//! A keyframe may see blocks that are not in the pool. The cells of its picture that show them are not compared (`sight`):
+//! the Gaussians that are there would be bent to stand for those that are missing.
 //!
-//! Nor is a view uncovered where its own depth finds a block that is on disk: nothing is seeded there (`hide`).
+//! Where the depth of a new view finds a block that is on disk, the view is not uncovered, and nothing is seeded (`hide`).
 
 use super::archive::{Archive, Arrived};
 use super::block::BlockAbout;
