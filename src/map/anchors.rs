@@ -22,8 +22,8 @@ use super::diffusion::Diffusion;
 use super::horizon::Horizon;
 use super::keyframes::Keyframe;
 use super::occupancy::{self, Occupancy};
-use super::pool::{threshold, PruneRule, FREE_DIVISOR};
-use super::scene::{Scene, EVICTED_DIVISOR, STEPS_JUDGED};
+use super::pool::FREE_DIVISOR;
+use super::scene::Scene;
 use super::seeds::{Seed, Seeder};
 use super::view::View;
 use super::views::Views;
@@ -162,7 +162,7 @@ impl Anchors {
         let first = scene.views.anchors() == 0;
         let whole = self.seeds_of_a_view(scene);
         let wanted = (coverage.lacking() * whole as f64).ceil() as usize;
-        let room = self.make_room(scene, wanted)?;
+        let room = scene.make_room(wanted, self.config.evict)?;
         if room == 0 && !self.config.evict {
             return Ok(None);
         }
@@ -258,7 +258,7 @@ impl Anchors {
         let lacking = 0.5 * (1.0 - mean(&self.work.similarity, &scene.camera(index).valid));
         let wanted = (f64::from(self.config.densify_max) * lacking) as usize;
         let wanted = wanted.min(self.affordable(scene));
-        let wanted = wanted.min(self.make_room(scene, wanted)?);
+        let wanted = wanted.min(scene.make_room(wanted, self.config.evict)?);
         let Workspace { depth, diffusion, newcomers, similarity, .. } = &mut self.work;
         let depth = self.pair.as_ref().map_or(&depth.metres, |pair| &pair.distance);
         let planes = scene.views.planes(index);
@@ -286,23 +286,6 @@ impl Anchors {
             0 => usize::MAX,
             limit => limit * steps.max(if scene.views.anchors() == 0 { STEPS_FIRST } else { STEPS_MIN }),
         }
-    }
-
-    /// Removes what is faint, huge or not finite, and where that leaves less room than wanted, the least important.
-    /// Answers the room there is then.
-    fn make_room(&self, scene: &mut Scene, wanted: usize) -> Result<usize, GpuError> {
-        let (gpu, pool) = (&mut scene.gpu, &mut scene.pipeline.pool);
-        let mut rule = PruneRule { steps_min: STEPS_JUDGED, ..PruneRule::default() };
-        let mut evicted = 0;
-        if self.config.evict && pool.room() < wanted {
-            let bins = pool.importance(gpu, STEPS_JUDGED)?;
-            let most = pool.capacity() / EVICTED_DIVISOR;
-            (rule.importance_min, evicted) = threshold(&bins, wanted - pool.room(), most);
-        }
-        let removed = pool.prune(gpu, &rule)?;
-        scene.counters.splats_evicted.add(evicted.min(removed) as u64);
-        scene.counters.splats_pruned.add(removed.saturating_sub(evicted) as u64);
-        Ok(pool.room())
     }
 }
 

@@ -594,6 +594,6 @@ fn tables(board: &Board, shape: &Shape) -> (Vec<Block>, Vec<Known>, Vec<u8>, Cho
         Vec::with_capacity(BLOCKS_KNOWN),
         Vec::with_capacity(keyframes),
         vec![0; keyframes * BLOCKS_KNOWN],
-        Choice::new(keyframes, payload_max(board, shape), shape.pixels()),
+        Choice::new(keyframes, payload_max(board, shape), shape.pixels(), board.map.evict),
     )
 }

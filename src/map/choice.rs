@@ -11,6 +11,10 @@ pub struct Choice {
     /// Keyframes by how near they are, m.
     pub order: Vec<(f32, u32)>,
     pub wanted: Vec<bool>,
+    /// Which blocks the newest keyframes see.
+    pub now_seen: Vec<bool>,
+    /// Whether Gaussians may go where they do not fit.
+    pub evict: bool,
     /// The wanted, most wanted first.
     pub blocks: Vec<u32>,
     /// A block on its way to the store.
@@ -25,10 +29,12 @@ pub struct Choice {
 }
 
 impl Choice {
-    pub fn new(keyframes: usize, payload: usize, pixels: usize) -> Choice {
+    pub fn new(keyframes: usize, payload: usize, pixels: usize, evict: bool) -> Choice {
         Choice {
             order: Vec::with_capacity(keyframes),
             wanted: vec![false; BLOCKS_KNOWN],
+            now_seen: Vec::with_capacity(BLOCKS_KNOWN),
+            evict,
             blocks: Vec::with_capacity(BLOCKS_KNOWN),
             page: Vec::with_capacity(payload),
             leaving: Vec::with_capacity(BLOCKS_KNOWN),
@@ -42,7 +48,7 @@ impl Choice {
 /// Views drawn ahead, at most.
 const AHEAD: usize = 8;
 /// Newest keyframes, whose poses odometry still corrects and of which one is an anchor's.
-const NEWEST: usize = 8;
+pub const NEWEST: usize = 8;
 
 /// Views to train on, drawn ahead of their steps.
 pub struct Drawn {

@@ -2,6 +2,8 @@
 //!
 //! What is wanted follows from the keyframes that are known: what those see that are nearest to where the vehicle is, and to
 //! where it will be in two seconds, as much as the pool has room for. A block that is not wanted stays until its room is needed.
+//! What keyframes nearby that look at the same as the newest see is wanted whether or not it fits; where it does not, the least
+//! important Gaussians go. So a scene that is denser than the pool is thinned, and one that is larger is paged.
 //!
 //! A keyframe may see blocks that are not in the pool. The cells of its picture that show them are not compared (`sight`):
 //! the Gaussians that are there would be bent to stand for those that are missing.
@@ -10,7 +12,7 @@
 
 use super::archive::{Archive, Arrived};
 use super::block::BlockAbout;
-use super::choice::Choice;
+use super::choice::{Choice, NEWEST};
 use super::filing::BLOCKS_KNOWN;
 use super::horizon::{cell_of, Horizon};
 use super::scene::Scene;
@@ -28,6 +30,9 @@ const AHEAD_MAX_M: f64 = 4.0;
 const FACING_M: f64 = 2.0;
 /// Part of the Gaussians that a keyframe sees that nobody fetches for it: what is seen through far doors.
 const LEFT_MAX: f32 = 0.04;
+/// A keyframe as near as this, m, looks at the same as the newest where they, too, see this part of what it sees.
+const LOCAL_M: f32 = 4.0;
+const SHARED_MIN: f32 = 0.5;
 /// Part of the pool that is left for what is new.
 const RESERVE_DIVISOR: usize = 8;
 /// Blocks asked for when a keyframe comes: some MiB.
@@ -127,13 +132,27 @@ impl Archive {
         self.want_views_of(pool.capacity() - pool.capacity() / RESERVE_DIVISOR);
     }
 
-    /// Wants the blocks that the keyframes in `order` see, one keyframe after the other, until they fill the room.
+    /// Finds the blocks that the newest keyframes see.
+    fn find_now_seen(&mut self) {
+        let newest = self.known.len().saturating_sub(NEWEST)..self.known.len();
+        let Archive { choice, sight, blocks, .. } = self;
+        choice.now_seen.clear();
+        choice.now_seen.extend((0..blocks.len()).map(|b| newest.clone().any(|k| sight[k * BLOCKS_KNOWN + b] > 0)));
+    }
+
+    /// Wants the blocks that the keyframes in `order` see, one keyframe after the other, until they fill the room; past that
+    /// those alone that look at what is seen now.
     fn want_views_of(&mut self, room: usize) {
+        self.find_now_seen();
         let order = std::mem::take(&mut self.choice.order);
         self.choice.wanted.fill(false);
         self.choice.blocks.clear();
-        let mut taken = 0;
-        'full: for &(_, keyframe) in &order {
+        let (mut taken, mut full) = (0, false);
+        for &(near, keyframe) in &order {
+            let stays = near <= LOCAL_M && self.part_seen(keyframe as usize, |b| self.choice.now_seen[b]) >= SHARED_MIN;
+            if full && !stays {
+                continue;
+            }
             // What it sees most of first, until nearly all of it is wanted.
             while self.part_seen(keyframe as usize, |b| self.choice.wanted[b]) < 1.0 - LEFT_MAX {
                 let more = |b: &usize| !self.choice.wanted[*b] && self.seen(keyframe as usize, *b) > 0.0;
@@ -141,10 +160,11 @@ impl Archive {
                     self.seen(keyframe as usize, *a).total_cmp(&self.seen(keyframe as usize, *b)).then(b.cmp(a))
                 });
                 let Some(block) = most else { break };
-                taken += self.blocks[block].count as usize;
-                if taken > room {
-                    break 'full;
+                full |= taken + self.blocks[block].count as usize > room;
+                if full && !stays {
+                    break;
                 }
+                taken += self.blocks[block].count as usize;
                 self.choice.wanted[block] = true;
                 self.choice.blocks.push(block as u32);
             }
@@ -243,8 +263,8 @@ impl Archive {
         Ok(())
     }
 
-    /// Makes room in the pool for so many Gaussians beside the reserve, by taking out blocks that are not wanted; whether they
-    /// fit.
+    /// Makes room in the pool for so many Gaussians beside the reserve, by taking out blocks that are not wanted and, where
+    /// they alone do not fit, the least important Gaussians; whether they fit.
     fn make_room(&mut self, scene: &mut Scene, count: usize) -> Result<bool, GpuError> {
         let reserve = scene.pipeline.pool.capacity() / RESERVE_DIVISOR;
         let (mut room, at) = (scene.pipeline.pool.room(), self.choice.last.map(|(_, pose)| pose.p.as_vec3()));
@@ -267,7 +287,8 @@ impl Archive {
         }
         self.take_out(scene, &leaving)?;
         self.choice.leaving = leaving;
-        Ok(scene.pipeline.pool.room() >= count)
+        let room = scene.pipeline.pool.room();
+        Ok(room >= count || scene.make_room(count, self.choice.evict)? >= count)
     }
 
     fn take_out(&mut self, scene: &mut Scene, anchors: &[u32]) -> Result<(), GpuError> {
@@ -340,6 +361,14 @@ impl Archive {
     /// Brings a keyframe's images and all blocks that it sees into memory and waits for them: to be scored and drawn. False
     /// where its images cannot be had.
     pub fn bring(&mut self, scene: &mut Scene, index: usize) -> Result<bool, GpuError> {
+        // Who looks takes no Gaussian out of the map.
+        let evict = std::mem::replace(&mut self.choice.evict, false);
+        let brought = self.bring_all(scene, index);
+        self.choice.evict = evict;
+        brought
+    }
+
+    fn bring_all(&mut self, scene: &mut Scene, index: usize) -> Result<bool, GpuError> {
         self.growing = false;
         let keyframe = index / scene.views.cameras();
         self.leave_other_epochs(scene, scene.views.get(index).epoch)?;

@@ -4,6 +4,7 @@ use super::cameras::TrainingCamera;
 use super::coarseness::Coarseness;
 use super::exposure::{gain_from, median_exposure, Exposure};
 use super::pipeline::Pipeline;
+use super::pool::{threshold, PruneRule};
 use super::render::Rendered;
 use super::step::{Stats, Target};
 use super::view::View;
@@ -13,9 +14,9 @@ use crate::gpu::{Gpu, GpuError};
 use stipple_drivers::Pose;
 
 /// Fewer steps than this and a Gaussian's importance is not known.
-pub const STEPS_JUDGED: u32 = 30;
+const STEPS_JUDGED: u32 = 30;
 /// One in so many of the pool may be evicted at a time.
-pub const EVICTED_DIVISOR: usize = 16;
+const EVICTED_DIVISOR: usize = 16;
 
 pub struct Scene {
     pub gpu: Gpu,
@@ -64,6 +65,23 @@ impl Scene {
             self.pipeline.loss.set_plane(&mut self.gpu, image, channel, &plane.pixels)?;
         }
         Ok(())
+    }
+
+    /// Removes what is faint, huge or not finite, and with `evict`, where that leaves less room than wanted, the least
+    /// important. Answers the room there is then.
+    pub fn make_room(&mut self, wanted: usize, evict: bool) -> Result<usize, GpuError> {
+        let (gpu, pool) = (&mut self.gpu, &mut self.pipeline.pool);
+        let mut rule = PruneRule { steps_min: STEPS_JUDGED, ..PruneRule::default() };
+        let mut evicted = 0;
+        if evict && pool.room() < wanted {
+            let bins = pool.importance(gpu, STEPS_JUDGED)?;
+            let most = pool.capacity() / EVICTED_DIVISOR;
+            (rule.importance_min, evicted) = threshold(&bins, wanted - pool.room(), most);
+        }
+        let removed = pool.prune(gpu, &rule)?;
+        self.counters.splats_evicted.add(evicted.min(removed) as u64);
+        self.counters.splats_pruned.add(removed.saturating_sub(evicted) as u64);
+        Ok(pool.room())
     }
 
     /// Draws the map into `rendered`; how coarsely, that the view might fit.
