@@ -33,7 +33,7 @@ demo: deps
 test: deps
 	@$(MAKE) --no-print-directory target/python/pymavlink || echo "left out: the tests of tests/autopilot, since pip could not fetch pymavlink"
 	@$(MAKE) --no-print-directory target/python/gaussforge || echo "left out: the test of tests/export with a foreign reader, since pip could not fetch gaussforge"
-	cargo check --locked --no-default-features --all-targets
+	cargo check --locked --no-default-features
 	cargo test --workspace --locked --no-fail-fast
 	@$(MAKE) --no-print-directory test-onnx
 	@$(MAKE) --no-print-directory test-bridge
