@@ -42,7 +42,7 @@ pub struct Args {
     /// Folder for the results
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
-    /// patrol (24 rooms, 10 min) or patrol-two (two rooms, 85 s)
+    /// patrol (eight rooms, 10 min) or patrol-two (two rooms, 85 s)
     #[arg(long, value_name = "NAME", default_value = "patrol")]
     scenario: String,
     /// Where poses come from

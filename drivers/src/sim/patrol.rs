@@ -82,7 +82,7 @@ type Visit = (usize, usize, usize);
 pub enum Extent {
     /// Two rooms and the corridor between them.
     Two,
-    /// Twenty-four rooms on both sides of two corridors that are joined at their ends, 40 m x 25 m.
+    /// Eight rooms and two corridors, 40 m x 25 m.
     Whole,
 }
 
@@ -94,8 +94,8 @@ pub(super) struct Plan {
     pub doors: &'static [Door],
     /// Where the flight begins, m.
     start: DVec2,
-    /// Middles of the corridors along y that join those along x, m.
-    links: [f64; 2],
+    /// Where corridors of different directions meet, m.
+    junction: DVec2,
     /// Distance of the ring of a room from its walls, m.
     ring: f64,
     rounds: [&'static [Visit]; 2],
@@ -118,131 +118,45 @@ const fn door(a: usize, b: usize, at: f64) -> Door {
 
 const WHOLE: Plan = Plan {
     rooms: &[
-        room("room a1", [0.0, 0.0], [6.5, 5.2]),
-        room("room a2", [6.7, 0.0], [13.2, 5.2]),
-        room("room a3", [13.4, 0.0], [19.9, 5.2]),
-        room("room a4", [20.1, 0.0], [26.6, 5.2]),
-        room("room a5", [26.8, 0.0], [33.3, 5.2]),
-        room("room a6", [33.5, 0.0], [40.0, 5.2]),
-        room("room b1", [2.2, 7.6], [8.0, 12.4]),
-        room("room b2", [8.2, 7.6], [14.0, 12.4]),
-        room("room b3", [14.2, 7.6], [19.9, 12.4]),
-        room("room b4", [20.1, 7.6], [25.9, 12.4]),
-        room("room b5", [26.1, 7.6], [31.9, 12.4]),
-        room("room b6", [32.1, 7.6], [37.8, 12.4]),
-        room("room c1", [2.2, 12.6], [8.0, 17.4]),
-        room("room c2", [8.2, 12.6], [14.0, 17.4]),
-        room("room c3", [14.2, 12.6], [19.9, 17.4]),
-        room("room c4", [20.1, 12.6], [25.9, 17.4]),
-        room("room c5", [26.1, 12.6], [31.9, 17.4]),
-        room("room c6", [32.1, 12.6], [37.8, 17.4]),
-        room("room d1", [0.0, 19.8], [6.5, 25.0]),
-        room("room d2", [6.7, 19.8], [13.2, 25.0]),
-        room("room d3", [13.4, 19.8], [19.9, 25.0]),
-        room("room d4", [20.1, 19.8], [26.6, 25.0]),
-        room("room d5", [26.8, 19.8], [33.3, 25.0]),
-        room("room d6", [33.5, 19.8], [40.0, 25.0]),
-        corridor("corridor 1", [0.0, 5.4], [20.0, 7.4]),
-        corridor("corridor 2", [20.0, 5.4], [40.0, 7.4]),
-        corridor("corridor 3", [38.0, 7.4], [40.0, 17.6]),
-        corridor("corridor 4", [20.0, 17.6], [40.0, 19.6]),
-        corridor("corridor 5", [0.0, 17.6], [20.0, 19.6]),
-        corridor("corridor 6", [0.0, 7.4], [2.0, 17.6]),
+        room("room a", [0.0, 0.0], [9.8, 10.8]),
+        room("room b", [10.0, 0.0], [19.8, 10.8]),
+        room("room c", [20.0, 0.0], [29.8, 10.8]),
+        room("room d", [30.0, 0.0], [40.0, 10.8]),
+        room("room e", [31.0, 13.6], [40.0, 25.0]),
+        room("room f", [21.8, 13.6], [30.8, 25.0]),
+        room("room g", [9.6, 13.6], [19.0, 25.0]),
+        room("room h", [0.0, 13.6], [9.4, 25.0]),
+        corridor("corridor 1", [0.0, 11.0], [10.0, 13.4]),
+        corridor("corridor 2", [10.0, 11.0], [19.2, 13.4]),
+        corridor("crossing", [19.2, 11.0], [21.6, 13.4]),
+        corridor("corridor 3", [21.6, 11.0], [31.0, 13.4]),
+        corridor("corridor 4", [31.0, 11.0], [40.0, 13.4]),
+        corridor("corridor 5", [19.2, 13.4], [21.6, 25.0]),
     ],
     doors: &[
-        door(0, 24, 3.6),
-        door(1, 24, 9.6),
-        door(2, 24, 17.0),
-        door(3, 25, 23.0),
-        door(4, 25, 30.4),
-        door(5, 25, 36.4),
-        door(6, 24, 4.5),
-        door(7, 24, 11.7),
-        door(8, 24, 16.5),
-        door(9, 25, 23.6),
-        door(10, 25, 28.4),
-        door(11, 25, 35.5),
-        door(12, 28, 5.7),
-        door(13, 28, 10.5),
-        door(14, 28, 17.6),
-        door(15, 27, 22.4),
-        door(16, 27, 29.6),
-        door(17, 27, 34.4),
-        door(18, 28, 2.9),
-        door(19, 28, 10.3),
-        door(20, 28, 16.3),
-        door(21, 27, 23.7),
-        door(22, 27, 29.7),
-        door(23, 27, 37.1),
-        door(0, 1, 2.4),
-        door(2, 3, 2.4),
-        door(4, 5, 2.4),
-        door(18, 19, 22.6),
-        door(20, 21, 22.6),
-        door(22, 23, 22.6),
-        door(24, 25, 6.4),
-        door(25, 26, 39.0),
-        door(26, 27, 39.0),
-        door(27, 28, 18.6),
-        door(28, 29, 1.0),
-        door(29, 24, 1.0),
+        door(0, 8, 4.5),
+        door(1, 9, 14.0),
+        door(2, 11, 26.0),
+        door(3, 12, 35.0),
+        door(4, 12, 36.5),
+        door(5, 13, 20.0),
+        door(6, 13, 17.5),
+        door(7, 8, 5.5),
+        door(0, 1, 5.0),
+        door(2, 3, 6.0),
+        door(6, 7, 20.0),
+        door(8, 9, 12.2),
+        door(9, 10, 12.2),
+        door(10, 11, 12.2),
+        door(11, 12, 12.2),
+        door(10, 13, 20.4),
     ],
-    start: DVec2::new(1.0, 6.4),
-    links: [1.0, 39.0],
-    ring: 1.6,
+    start: DVec2::new(1.5, 12.2),
+    junction: DVec2::new(20.4, 12.2),
+    ring: 2.3,
     rounds: [
-        &[
-            (0, 0, 0),
-            (6, 6, 6),
-            (1, 1, 1),
-            (7, 7, 7),
-            (2, 2, 2),
-            (8, 8, 8),
-            (3, 3, 3),
-            (9, 9, 9),
-            (4, 4, 4),
-            (10, 10, 10),
-            (5, 5, 5),
-            (11, 11, 11),
-            (23, 23, 23),
-            (17, 17, 17),
-            (22, 22, 22),
-            (16, 16, 16),
-            (21, 21, 21),
-            (15, 15, 15),
-            (20, 20, 20),
-            (14, 14, 14),
-            (19, 19, 19),
-            (13, 13, 13),
-            (18, 18, 18),
-            (12, 12, 12),
-        ],
-        &[
-            (0, 0, 24),
-            (1, 24, 1),
-            (6, 6, 6),
-            (7, 7, 7),
-            (2, 2, 25),
-            (3, 25, 3),
-            (8, 8, 8),
-            (9, 9, 9),
-            (4, 4, 26),
-            (5, 26, 5),
-            (10, 10, 10),
-            (11, 11, 11),
-            (23, 23, 29),
-            (22, 29, 22),
-            (17, 17, 17),
-            (16, 16, 16),
-            (21, 21, 28),
-            (20, 28, 20),
-            (15, 15, 15),
-            (14, 14, 14),
-            (19, 19, 27),
-            (18, 27, 18),
-            (13, 13, 13),
-            (12, 12, 12),
-        ],
+        &[(0, 0, 0), (1, 1, 1), (2, 2, 2), (3, 3, 3), (4, 4, 4), (5, 5, 5), (6, 6, 6), (7, 7, 7)],
+        &[(0, 0, 8), (1, 8, 1), (2, 2, 9), (3, 9, 3), (4, 4, 4), (5, 5, 5), (6, 6, 10), (7, 10, 7)],
     ],
     seconds: 600.0,
 };
@@ -255,7 +169,7 @@ const TWO: Plan = Plan {
     ],
     doors: &[door(0, 2, 3.0), door(1, 2, 9.4)],
     start: DVec2::new(1.0, 6.3),
-    links: [0.0; 2],
+    junction: DVec2::ZERO,
     ring: 1.6,
     rounds: [&[(0, 0, 0), (1, 1, 1)], &[(0, 0, 0), (1, 1, 1)]],
     seconds: 85.0,
@@ -326,24 +240,21 @@ impl Route {
 /// The corners of a round that begins at `from`.
 fn waypoints(plan: &Plan, round: usize, from: DVec2) -> Vec<DVec3> {
     let mut way = vec![from];
-    // The last place in a corridor.
-    let mut last = from;
+    // Which corridor it is in: one along x or one along y.
+    let mut along = 0;
     for &(room, enter, leave) in plan.rounds[round] {
         let inset = plan.ring * RING[round];
         let [entry, exit] = [enter, leave].map(|d| inside(plan, &plan.doors[d], room, inset));
-        if let Some(place) = outside(plan, &plan.doors[enter]) {
-            if (place.y - last.y).abs() > 1e-6 {
-                let [near, far] = plan.links;
-                let x = if (last.x - near).abs() < (last.x - far).abs() { near } else { far };
-                way.extend([DVec2::new(x, last.y), DVec2::new(x, place.y)]);
+        if let Some((place, axis)) = outside(plan, &plan.doors[enter]) {
+            if axis != along {
+                way.push(plan.junction);
             }
-            way.push(place);
+            (along, _) = (axis, way.push(place));
         }
         way.push(entry);
         ring(&plan.rooms[room], inset, [entry, exit], round == 1, &mut way);
-        if let Some(place) = outside(plan, &plan.doors[leave]) {
-            last = place;
-            way.push(place);
+        if let Some((place, axis)) = outside(plan, &plan.doors[leave]) {
+            (along, _) = (axis, way.push(place));
         }
     }
     way.into_iter().map(|p| p.extend(FLIES_AT[round])).collect()
@@ -358,13 +269,14 @@ fn inside(plan: &Plan, door: &Door, room: usize, inset: f64) -> DVec2 {
     p
 }
 
-/// The point in the middle of the corridor in front of a door; `None` of a door between rooms.
-fn outside(plan: &Plan, door: &Door) -> Option<DVec2> {
+/// The point in the middle of the corridor in front of a door, and the axis along which that runs; `None` of a door between
+/// rooms.
+fn outside(plan: &Plan, door: &Door) -> Option<(DVec2, usize)> {
     let (axis, _) = door.wall(plan.rooms);
     let c = door.rooms.into_iter().map(|r| &plan.rooms[r]).find(|r| r.corridor)?;
     let mut p = DVec2::splat(door.at);
     p[axis] = 0.5 * (c.low[axis] + c.high[axis]);
-    Some(p)
+    Some((p, 1 - axis))
 }
 
 /// Adds the corners of a room's ring from one of its points to another, or once round, and the last point.
