@@ -288,7 +288,7 @@ impl Archive {
         self.take_out(scene, &leaving)?;
         self.choice.leaving = leaving;
         let room = scene.pipeline.pool.room();
-        Ok(room >= count || scene.make_room(count, self.choice.evict)? >= count)
+        Ok(room >= count || self.choice.evict && scene.make_room(count, true)? >= count)
     }
 
     fn take_out(&mut self, scene: &mut Scene, anchors: &[u32]) -> Result<(), GpuError> {
