@@ -435,7 +435,7 @@ impl Archive {
     pub fn trained(&mut self, keyframe: usize) {
         let row = &self.sight[keyframe * BLOCKS_KNOWN..][..self.blocks.len()];
         for (block, seen) in self.blocks.iter_mut().zip(row) {
-            block.steps += u32::from(*seen > 0);
+            block.steps += u32::from(*seen > 0 && block.in_pool);
         }
     }
 

@@ -11,8 +11,6 @@ pub struct Choice {
     /// Keyframes by how near they are, m.
     pub order: Vec<(f32, u32)>,
     pub wanted: Vec<bool>,
-    /// Which blocks the newest keyframes see.
-    pub now_seen: Vec<bool>,
     /// Whether Gaussians may go where they do not fit.
     pub evict: bool,
     /// The wanted, most wanted first.
@@ -26,6 +24,12 @@ pub struct Choice {
     pub epoch: u32,
     /// The last keyframe.
     pub last: Option<(Nanos, Pose)>,
+    /// The view to whose place the pool is turned; none where the vehicle is.
+    pub elsewhere: Option<u32>,
+    /// Training steps taken where the vehicle is, more than elsewhere.
+    pub steps_ahead: i32,
+    /// Gaussians that the pool is to have room for beside those that are wanted.
+    pub reserve: usize,
 }
 
 impl Choice {
@@ -33,7 +37,6 @@ impl Choice {
         Choice {
             order: Vec::with_capacity(keyframes),
             wanted: vec![false; BLOCKS_KNOWN],
-            now_seen: Vec::with_capacity(BLOCKS_KNOWN),
             evict,
             blocks: Vec::with_capacity(BLOCKS_KNOWN),
             page: Vec::with_capacity(payload),
@@ -41,6 +44,9 @@ impl Choice {
             hidden: Vec::with_capacity(pixels),
             epoch: 0,
             last: None,
+            elsewhere: None,
+            steps_ahead: 0,
+            reserve: 0,
         }
     }
 }

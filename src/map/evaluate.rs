@@ -94,10 +94,13 @@ fn mean(values: &[Option<f64>]) -> Option<f64> {
     (n > 0).then(|| values.iter().flatten().sum::<f64>() / n as f64)
 }
 
-/// Scores a few keyframes spread over the run: those trained on, and those held out. Allocates.
-pub fn sample(scene: &mut Scene) -> Result<[Option<f64>; 2], GpuError> {
+/// Scores a few keyframes spread over those that are in memory with what they see: trained on, and held out. Allocates.
+pub fn sample(scene: &mut Scene, archive: &Option<Archive>) -> Result<[Option<f64>; 2], GpuError> {
+    let shown = |i: usize| archive.as_ref().is_none_or(|archive| archive.is_shown(i));
     let mut probe = |held_out: bool| {
-        let here = |i: &usize| scene.views.has_place(*i) && scene.views.get(*i).held_out == held_out;
+        let cameras = scene.views.cameras();
+        let here =
+            |i: &usize| scene.views.has_place(*i) && scene.views.get(*i).held_out == held_out && shown(*i / cameras);
         let of_kind: Vec<usize> = first_images(scene).filter(here).collect();
         let scores = spread(of_kind.len(), PROBED).map(|i| score(scene, of_kind[i]));
         Ok(mean(&scores.collect::<Result<Vec<_>, GpuError>>()?))

@@ -340,7 +340,7 @@ impl Mapper {
 
     /// Scores a few keyframes at run time `t_s`. Allocates.
     pub fn sample(&mut self, t_s: f64) -> Result<CurvePoint, GpuError> {
-        let [psnr_db, psnr_heldout_db] = evaluate::sample(&mut self.scene)?;
+        let [psnr_db, psnr_heldout_db] = evaluate::sample(&mut self.scene, &self.archive)?;
         let (splats, iterations) = (u64::from(self.scene.pipeline.pool.count()), self.scene.steps);
         Ok(CurvePoint { t_s, psnr_db, psnr_heldout_db, splats, iterations })
     }

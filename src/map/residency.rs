@@ -1,22 +1,24 @@
 //! Which blocks are in memory.
 //!
-//! What is wanted follows from the keyframes that are known: what those see that are nearest to where the vehicle is, and to
-//! where it will be in two seconds, as much as the pool has room for. A block that is not wanted stays until its room is needed.
-//! What keyframes nearby that look at the same as the newest see is wanted whether or not it fits; where it does not, the least
-//! important Gaussians go. So a scene that is denser than the pool is thinned, and one that is larger is paged.
+//! What is wanted follows from the keyframes that are known. When one comes, that is what those see that are nearest to where
+//! the vehicle is, and to where it will be in two seconds, as much as fits beside a reserve for what is new. Between keyframes
+//! the pool turns to other places and back (`rehearse`): the map forgets a place that is never trained on, and a view along a
+//! corridor needs what is seen from none of those nearby. A block that is not wanted stays until its room is needed.
 //!
-//! A keyframe may see blocks that are not in the pool. The cells of its picture that show them are not compared (`sight`):
-//! the Gaussians that are there would be bent to stand for those that are missing.
+//! A keyframe may see blocks that are not in the pool. The cells of its picture that show much of them are not compared
+//! (`sight`): the Gaussians that are there would be bent to stand for those that are missing.
 //!
 //! Where the depth of a new view finds a block that is on disk, the view is not uncovered, and nothing is seeded (`hide`).
 
-use super::archive::{Archive, Arrived};
+use super::archive::{Archive, Arrived, Block};
 use super::block::BlockAbout;
-use super::choice::{Choice, NEWEST};
+use super::choice::Choice;
 use super::filing::BLOCKS_KNOWN;
 use super::horizon::{cell_of, Horizon};
 use super::scene::Scene;
+use super::schedule::Rng;
 use super::view::View;
+use super::views::Views;
 use crate::gpu::GpuError;
 use crate::store::Fetched;
 use glam::Vec3;
@@ -30,13 +32,15 @@ const AHEAD_MAX_M: f64 = 4.0;
 const FACING_M: f64 = 2.0;
 /// Part of the Gaussians that a keyframe sees that nobody fetches for it: what is seen through far doors.
 const LEFT_MAX: f32 = 0.04;
-/// A keyframe as near as this, m, looks at the same as the newest where they, too, see this part of what it sees.
-const LOCAL_M: f32 = 4.0;
-const SHARED_MIN: f32 = 0.5;
-/// Part of the pool that is left for what is new.
+/// Part of the pool that is left for what is new when a keyframe comes.
 const RESERVE_DIVISOR: usize = 8;
-/// Blocks asked for when a keyframe comes: some MiB.
+/// Blocks asked for when a keyframe comes, some MiB, and between training steps.
 const PAGED_AT_ONCE: usize = 8;
+const PAGED_A_STEP: usize = 4;
+/// Training steps at a place before the pool turns to another.
+const STEPS_AT_A_PLACE: i32 = 20;
+/// Views drawn to find another place.
+const PLACES_DRAWN: usize = 4;
 /// Part of a horizon that may be open.
 const OPEN_MAX: f64 = 0.05;
 /// The disk answers within this, or what it was asked for is done without.
@@ -70,6 +74,11 @@ impl Archive {
         self.part_seen(keyframe, |block| self.blocks[block].in_pool)
     }
 
+    /// Whether nearly all that a keyframe sees is in the pool.
+    pub fn is_shown(&self, keyframe: usize) -> bool {
+        self.part_here(keyframe) >= 1.0 - LEFT_MAX
+    }
+
     /// Chooses what is wanted where a keyframe was taken, and fetches some of it.
     pub fn arrive(
         &mut self,
@@ -85,12 +94,43 @@ impl Archive {
             let by = (pose.p - from.p) * if dt > 0.0 { AHEAD.secs() / dt } else { 0.0 };
             Pose { p: pose.p + by.clamp_length_max(AHEAD_MAX_M), ..pose }
         });
-        self.choice.last = Some((t, pose));
-        self.choice.epoch = epoch;
-        self.choose(scene, [pose, ahead], epoch);
+        let choice = &mut self.choice;
+        (choice.last, choice.epoch) = (Some((t, pose)), epoch);
+        choice.elsewhere = None;
+        choice.reserve = scene.pipeline.pool.capacity() / RESERVE_DIVISOR;
+        self.choose(scene, &[pose, ahead]);
         // What is new finds the reserve, and thins nothing.
         self.make_room(scene, 0)?;
-        self.page(scene, busy)
+        self.page(scene, PAGED_AT_ONCE, busy)
+    }
+
+    /// Turns the pool to another place once as many more steps were taken where the vehicle is, and back when as many were
+    /// taken there, or a keyframe comes; between training steps.
+    pub fn rehearse(&mut self, scene: &mut Scene, rng: &mut Rng) -> Result<(), GpuError> {
+        let Some((_, pose)) = self.choice.last else { return Ok(()) };
+        let elsewhere = self.choice.elsewhere.is_some();
+        self.choice.steps_ahead += if elsewhere { -1 } else { 1 };
+        let turns = if elsewhere { self.choice.steps_ahead <= 0 } else { self.choice.steps_ahead >= STEPS_AT_A_PLACE };
+        let away = |b: &Block| !b.in_pool && b.samples_len > 0 && b.epoch == self.choice.epoch;
+        if turns && self.blocks.iter().any(away) {
+            self.choice.elsewhere = if elsewhere { None } else { self.draw_place(&scene.views, rng) };
+            let at = self.choice.elsewhere.map_or(pose, |view| scene.views.world_from_body(view as usize));
+            self.choice.reserve = 0;
+            self.choose(scene, &[at]);
+            // Views of the last place were drawn ahead.
+            self.drawn.next.clear();
+        }
+        self.choice.steps_ahead = self.choice.steps_ahead.clamp(0, STEPS_AT_A_PLACE);
+        self.page(scene, PAGED_A_STEP, false)
+    }
+
+    /// Draws a view whose keyframe sees more than is in the pool: of a few the one with the fewest steps.
+    fn draw_place(&self, views: &Views, rng: &mut Rng) -> Option<u32> {
+        let drawn = (0..PLACES_DRAWN).filter_map(|_| rng.one_of(views.training()));
+        let away = drawn
+            .map(|view| views.first(view as usize))
+            .filter(|first| views.get(*first).epoch == self.choice.epoch && !self.is_shown(*first / views.cameras()));
+        away.min_by_key(|first| views.get(*first).steps).map(|first| first as u32)
     }
 
     /// Writes the blocks whose burst ended before its time, as another anchor came, and looks who sees them. The newest still
@@ -106,65 +146,53 @@ impl Archive {
         Ok(())
     }
 
-    fn choose(&mut self, scene: &Scene, poses: [Pose; 2], epoch: u32) {
+    /// Wants what the keyframes nearest to some poses see.
+    fn choose(&mut self, scene: &Scene, poses: &[Pose]) {
         for (anchor, count) in scene.pipeline.pool.blocks() {
             if let Some(block) = self.block_of(anchor) {
                 self.blocks[block].count = count;
             }
         }
-        let (views, cameras) = (&scene.views, scene.views.cameras());
-        let looks = poses.map(|p| (p.p, p * scene.cameras[0].body_from_cam));
+        let (views, cameras, epoch) = (&scene.views, scene.views.cameras(), self.choice.epoch);
+        let forward = |body: &Pose| (*body * scene.cameras[0].body_from_cam).q * glam::DVec3::Z;
         self.choice.order.clear();
         for &index in views.training().iter().filter(|i| **i as usize % cameras == 0) {
             let (entry, keyframe) = (views.get(index as usize), index as usize / cameras);
             if entry.epoch != epoch {
                 continue;
             }
-            let from = entry.world_from_cam();
-            let far = |(p, look): &(glam::DVec3, Pose)| {
-                let cosine = (look.q * glam::DVec3::Z).dot(from.q * glam::DVec3::Z);
-                (*p - entry.given.p).length() + FACING_M * (1.0 - cosine) / 2.0
+            let looks = entry.world_from_cam().q * glam::DVec3::Z;
+            let far = |pose: &Pose| {
+                let cosine = forward(pose).dot(looks);
+                (pose.p - entry.given.p).length() + FACING_M * (1.0 - cosine) / 2.0
             };
-            self.choice.order.push((f64::min(far(&looks[0]), far(&looks[1])) as f32, keyframe as u32));
+            let nearest = poses.iter().map(far).fold(f64::INFINITY, f64::min);
+            self.choice.order.push((nearest as f32, keyframe as u32));
         }
         self.choice.order.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
-        let pool = &scene.pipeline.pool;
-        self.want_views_of(pool.capacity() - pool.capacity() / RESERVE_DIVISOR);
+        self.want_views_of(scene.pipeline.pool.capacity() - self.choice.reserve);
     }
 
-    /// Finds the blocks that the newest keyframes see.
-    fn find_now_seen(&mut self) {
-        let newest = self.known.len().saturating_sub(NEWEST)..self.known.len();
-        let Archive { choice, sight, blocks, .. } = self;
-        choice.now_seen.clear();
-        choice.now_seen.extend((0..blocks.len()).map(|b| newest.clone().any(|k| sight[k * BLOCKS_KNOWN + b] > 0)));
-    }
-
-    /// Wants the blocks that the keyframes in `order` see, one keyframe after the other, until they fill the room; past that
-    /// those alone that look at what is seen now.
+    /// Wants the blocks that the keyframes in `order` see, one keyframe after the other, until they fill the room.
     fn want_views_of(&mut self, room: usize) {
-        self.find_now_seen();
         let order = std::mem::take(&mut self.choice.order);
         self.choice.wanted.fill(false);
         self.choice.blocks.clear();
-        let (mut taken, mut full) = (0, false);
-        for &(near, keyframe) in &order {
-            let stays = near <= LOCAL_M && self.part_seen(keyframe as usize, |b| self.choice.now_seen[b]) >= SHARED_MIN;
-            if full && !stays {
-                continue;
-            }
+        let mut taken = 0;
+        'full: for (nth, &(_, keyframe)) in order.iter().enumerate() {
+            // All of what the place itself shows; of what others see, what is behind far doors is left out.
+            let left = if nth == 0 && self.choice.elsewhere.is_some() { 0.0 } else { LEFT_MAX };
             // What it sees most of first, until nearly all of it is wanted.
-            while self.part_seen(keyframe as usize, |b| self.choice.wanted[b]) < 1.0 - LEFT_MAX {
+            while self.part_seen(keyframe as usize, |b| self.choice.wanted[b]) < 1.0 - left {
                 let more = |b: &usize| !self.choice.wanted[*b] && self.seen(keyframe as usize, *b) > 0.0;
                 let most = (0..self.blocks.len()).filter(more).max_by(|a, b| {
                     self.seen(keyframe as usize, *a).total_cmp(&self.seen(keyframe as usize, *b)).then(b.cmp(a))
                 });
                 let Some(block) = most else { break };
-                full |= taken + self.blocks[block].count as usize > room;
-                if full && !stays {
-                    break;
-                }
                 taken += self.blocks[block].count as usize;
+                if taken > room {
+                    break 'full;
+                }
                 self.choice.wanted[block] = true;
                 self.choice.blocks.push(block as u32);
             }
@@ -192,9 +220,9 @@ impl Archive {
         blocks.retain(|b| wanted[*b as usize]);
     }
 
-    /// Puts what came from the disk in its place, and asks for more of what is wanted. While a new block grows (`busy`), no
-    /// other comes behind it.
-    pub fn page(&mut self, scene: &mut Scene, busy: bool) -> Result<(), GpuError> {
+    /// Puts what came from the disk in its place, and asks for `most` blocks more of what is wanted. While a new block grows
+    /// (`busy`), no other comes behind it.
+    pub fn page(&mut self, scene: &mut Scene, most: usize, busy: bool) -> Result<(), GpuError> {
         if busy {
             return Ok(());
         }
@@ -206,17 +234,13 @@ impl Archive {
             if b.in_pool || b.asked || b.samples_len == 0 {
                 continue;
             }
-            if asked == PAGED_AT_ONCE
-                || !self.make_room(scene, b.count as usize)?
-                || !self.ask_for_block(&scene.views, block)
-            {
+            if asked == most || !self.make_room(scene, b.count as usize)? || !self.ask_for_block(&scene.views, block) {
                 break;
             }
             asked += 1;
             // Done at once, it has come by now.
             self.receive(scene)?;
         }
-        self.find_trainable(&scene.views);
         Ok(())
     }
 
@@ -266,7 +290,7 @@ impl Archive {
     /// Makes room in the pool for so many Gaussians beside the reserve, by taking out blocks that are not wanted and, where
     /// they alone do not fit, the least important Gaussians; whether they fit.
     fn make_room(&mut self, scene: &mut Scene, count: usize) -> Result<bool, GpuError> {
-        let reserve = scene.pipeline.pool.capacity() / RESERVE_DIVISOR;
+        let reserve = self.choice.reserve;
         let (mut room, at) = (scene.pipeline.pool.room(), self.choice.last.map(|(_, pose)| pose.p.as_vec3()));
         let mut leaving = std::mem::take(&mut self.choice.leaving);
         leaving.clear();
@@ -370,6 +394,7 @@ impl Archive {
 
     fn bring_all(&mut self, scene: &mut Scene, index: usize) -> Result<bool, GpuError> {
         self.growing = false;
+        self.choice.reserve = 0;
         let keyframe = index / scene.views.cameras();
         self.leave_other_epochs(scene, scene.views.get(index).epoch)?;
         self.want_seen_by(keyframe, scene.pipeline.pool.capacity());
@@ -377,7 +402,7 @@ impl Archive {
         let missing = |a: &Archive| a.choice.blocks.iter().any(|b| a.blocks[*b as usize].asked);
         loop {
             let before = self.exchanges;
-            self.page(scene, false)?;
+            self.page(scene, PAGED_AT_ONCE, false)?;
             // A page is some blocks; what has no room does not come.
             let done = !missing(self) && self.exchanges == before;
             if done || begun.elapsed() > PATIENCE {

@@ -18,7 +18,7 @@ use crate::store::Fetched;
 /// Draws until another view is found.
 const DRAWS: usize = 16;
 /// Part of the Gaussians that a keyframe sees, and of its picture, that must be in the pool when it is trained on.
-const HERE_MIN: f32 = 0.5;
+const HERE_MIN: f32 = 0.7;
 /// Places for each block in the pool, below which a block's last keyframe may go, too.
 const VIEWS_PER_BLOCK: usize = 3;
 
@@ -45,7 +45,9 @@ impl Archive {
 
     /// The next view to train on, whose images have a place; `None` when there is none.
     pub fn next_view(&mut self, scene: &mut Scene, rng: &mut Rng) -> Result<Option<usize>, GpuError> {
-        self.receive(scene)?;
+        if !self.growing {
+            self.rehearse(scene, rng)?;
+        }
         if self.drawn.found_at != self.exchanges {
             self.find_trainable(&scene.views);
         }
