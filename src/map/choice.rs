@@ -11,6 +11,8 @@ pub struct Choice {
     /// Keyframes by how near they are, m.
     pub order: Vec<(f32, u32)>,
     pub wanted: Vec<bool>,
+    /// Which blocks the newest keyframes see.
+    pub now_seen: Vec<bool>,
     /// Whether Gaussians may go where they do not fit.
     pub evict: bool,
     /// The wanted, most wanted first.
@@ -37,6 +39,7 @@ impl Choice {
         Choice {
             order: Vec::with_capacity(keyframes),
             wanted: vec![false; BLOCKS_KNOWN],
+            now_seen: Vec::with_capacity(BLOCKS_KNOWN),
             evict,
             blocks: Vec::with_capacity(BLOCKS_KNOWN),
             page: Vec::with_capacity(payload),

@@ -4,6 +4,8 @@
 //! the vehicle is, and to where it will be in two seconds, as much as fits beside a reserve for what is new. Between keyframes
 //! the pool turns to other places and back (`rehearse`): the map forgets a place that is never trained on, and a view along a
 //! corridor needs what is seen from none of those nearby. A block that is not wanted stays until its room is needed.
+//! What keyframes nearby that look at the same as the newest see is wanted whether or not it fits; where it does not, the least
+//! important Gaussians go: a scene that is denser than the pool is thinned, and one that is larger is paged.
 //!
 //! A keyframe may see blocks that are not in the pool. The cells of its picture that show much of them are not compared
 //! (`sight`): the Gaussians that are there would be bent to stand for those that are missing.
@@ -12,7 +14,7 @@
 
 use super::archive::{Archive, Arrived, Block};
 use super::block::BlockAbout;
-use super::choice::Choice;
+use super::choice::{Choice, NEWEST};
 use super::filing::BLOCKS_KNOWN;
 use super::horizon::{cell_of, Horizon};
 use super::scene::Scene;
@@ -32,6 +34,9 @@ const AHEAD_MAX_M: f64 = 4.0;
 const FACING_M: f64 = 2.0;
 /// Part of the Gaussians that a keyframe sees that nobody fetches for it: what is seen through far doors.
 const LEFT_MAX: f32 = 0.04;
+/// A keyframe as near as this, m, looks at the same as the newest where they, too, see this part of what it sees.
+const LOCAL_M: f32 = 2.0;
+const SHARED_MIN: f32 = 0.8;
 /// Part of the pool that is left for what is new when a keyframe comes.
 const RESERVE_DIVISOR: usize = 8;
 /// Blocks asked for when a keyframe comes, some MiB, and between training steps.
@@ -173,15 +178,32 @@ impl Archive {
         self.want_views_of(scene.pipeline.pool.capacity() - self.choice.reserve);
     }
 
-    /// Wants the blocks that the keyframes in `order` see, one keyframe after the other, until they fill the room.
+    /// Finds the blocks that the newest keyframes see.
+    fn find_now_seen(&mut self) {
+        let newest = self.known.len().saturating_sub(NEWEST)..self.known.len();
+        let Archive { choice, sight, blocks, .. } = self;
+        choice.now_seen.clear();
+        choice.now_seen.extend((0..blocks.len()).map(|b| newest.clone().any(|k| sight[k * BLOCKS_KNOWN + b] > 0)));
+    }
+
+    /// Wants the blocks that the keyframes in `order` see, one keyframe after the other, until they fill the room; where the
+    /// vehicle is, past that those alone that look at what is seen now.
     fn want_views_of(&mut self, room: usize) {
+        self.find_now_seen();
+        let here = self.choice.elsewhere.is_none();
         let order = std::mem::take(&mut self.choice.order);
         self.choice.wanted.fill(false);
         self.choice.blocks.clear();
-        let mut taken = 0;
-        'full: for (nth, &(_, keyframe)) in order.iter().enumerate() {
+        let (mut taken, mut full) = (0, false);
+        for (nth, &(near, keyframe)) in order.iter().enumerate() {
+            let looks_at_the_same =
+                |a: &Archive| a.part_seen(keyframe as usize, |b| a.choice.now_seen[b]) >= SHARED_MIN;
+            let stays = here && near <= LOCAL_M && looks_at_the_same(self);
+            if full && !stays {
+                continue;
+            }
             // All of what the place itself shows; of what others see, what is behind far doors is left out.
-            let left = if nth == 0 && self.choice.elsewhere.is_some() { 0.0 } else { LEFT_MAX };
+            let left = if nth == 0 && !here { 0.0 } else { LEFT_MAX };
             // What it sees most of first, until nearly all of it is wanted.
             while self.part_seen(keyframe as usize, |b| self.choice.wanted[b]) < 1.0 - left {
                 let more = |b: &usize| !self.choice.wanted[*b] && self.seen(keyframe as usize, *b) > 0.0;
@@ -189,10 +211,11 @@ impl Archive {
                     self.seen(keyframe as usize, *a).total_cmp(&self.seen(keyframe as usize, *b)).then(b.cmp(a))
                 });
                 let Some(block) = most else { break };
-                taken += self.blocks[block].count as usize;
-                if taken > room {
-                    break 'full;
+                full |= taken + self.blocks[block].count as usize > room;
+                if full && !stays {
+                    break;
                 }
+                taken += self.blocks[block].count as usize;
                 self.choice.wanted[block] = true;
                 self.choice.blocks.push(block as u32);
             }
