@@ -12,7 +12,7 @@
 //!
 //! Where the depth of a new view finds a block that is on disk, the view is not uncovered, and nothing is seeded (`hide`).
 
-use super::archive::{Archive, Arrived, Block};
+use super::archive::{Archive, Arrived};
 use super::block::BlockAbout;
 use super::choice::{Choice, NEWEST};
 use super::filing::BLOCKS_KNOWN;
@@ -109,28 +109,37 @@ impl Archive {
         self.page(scene, PAGED_AT_ONCE, busy)
     }
 
-    /// Turns the pool to another place once as many more steps were taken where the vehicle is, and back when as many were
-    /// taken there, or a keyframe comes; between training steps.
+    /// Turns the pool to another place after so many training steps where the vehicle is, and back after as many there, and
+    /// fetches some of what is wanted. Called between training steps; a keyframe that comes turns it back, too.
     pub fn rehearse(&mut self, scene: &mut Scene, rng: &mut Rng) -> Result<(), GpuError> {
         let Some((_, pose)) = self.choice.last else { return Ok(()) };
         let elsewhere = self.choice.elsewhere.is_some();
-        self.choice.steps_ahead += if elsewhere { -1 } else { 1 };
-        let turns = if elsewhere { self.choice.steps_ahead <= 0 } else { self.choice.steps_ahead >= STEPS_AT_A_PLACE };
-        let away = |b: &Block| !b.in_pool && b.samples_len > 0 && b.epoch == self.choice.epoch;
-        if turns && self.blocks.iter().any(away) {
-            self.choice.elsewhere = if elsewhere { None } else { self.draw_place(&scene.views, rng) };
-            let at = self.choice.elsewhere.map_or(pose, |view| scene.views.world_from_body(view as usize));
-            self.choice.reserve = 0;
-            self.choose(scene, &[at]);
-            // Views of the last place were drawn ahead.
-            self.drawn.next.clear();
+        let by = if elsewhere { -1 } else { 1 };
+        self.choice.steps_ahead = (self.choice.steps_ahead + by).clamp(0, STEPS_AT_A_PLACE);
+        if elsewhere && self.choice.steps_ahead == 0 {
+            self.turn(scene, None, pose);
+        } else if !elsewhere && self.choice.steps_ahead == STEPS_AT_A_PLACE {
+            if let Some(view) = self.draw_place(&scene.views, rng) {
+                self.turn(scene, Some(view), scene.views.world_from_body(view as usize));
+            }
         }
-        self.choice.steps_ahead = self.choice.steps_ahead.clamp(0, STEPS_AT_A_PLACE);
         self.page(scene, PAGED_A_STEP, false)
     }
 
-    /// Draws a view whose keyframe sees more than is in the pool: of a few the one with the fewest steps.
+    /// Wants what is seen at a place, the view's or the vehicle's; no room is left for what is new.
+    fn turn(&mut self, scene: &Scene, elsewhere: Option<u32>, pose: Pose) {
+        (self.choice.elsewhere, self.choice.reserve) = (elsewhere, 0);
+        self.choose(scene, &[pose]);
+        // Views of the last place were drawn ahead.
+        self.drawn.next.clear();
+    }
+
+    /// Draws a view some of which is not in the pool: of a few such the one with the fewest steps.
     fn draw_place(&self, views: &Views, rng: &mut Rng) -> Option<u32> {
+        // A map that fits draws its views as one without a store.
+        if self.blocks.iter().all(|b| b.in_pool || b.samples_len == 0 || b.epoch != self.choice.epoch) {
+            return None;
+        }
         let drawn = (0..PLACES_DRAWN).filter_map(|_| rng.one_of(views.training()));
         let away = drawn
             .map(|view| views.first(view as usize))
