@@ -97,6 +97,11 @@ impl<T> Buf<T> {
         Buf { offset: self.offset + (at * size_of::<T>()) as u64, len, of: PhantomData }
     }
 
+    /// So many elements from a byte of the arena on.
+    pub(super) fn at(offset: u64, len: usize) -> Buf<T> {
+        Buf { offset, len, of: PhantomData }
+    }
+
     /// The same bytes as elements of another type; a remainder is cut off.
     pub fn cast<U>(self) -> Buf<U> {
         Buf { offset: self.offset, len: self.bytes() as usize / size_of::<U>(), of: PhantomData }

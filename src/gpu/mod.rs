@@ -43,6 +43,7 @@ mod record;
 mod submit;
 #[cfg(test)]
 mod tests;
+mod transfers;
 
 pub use cache::cache_folder;
 pub use device::{capability, Caps, DeviceKind};
@@ -65,6 +66,7 @@ use std::sync::atomic::Ordering::Relaxed;
 use std::sync::Arc;
 use stipple_drivers::{Fault, FaultKind};
 use submit::Submitter;
+use transfers::Transfers;
 
 /// Commands that one recording holds.
 pub const COMMANDS_MAX: usize = 1024;
@@ -131,6 +133,8 @@ pub struct Gpu {
     submitter: Submitter,
     pipelines: Pipelines,
     staging: Staging,
+    /// Uploads that wait in staging.
+    uploads: Transfers,
     /// What the arena hands out.
     memory: Backed,
     arena: Arena,
@@ -161,6 +165,7 @@ impl Gpu {
             submitter: Submitter::new(&device, staging.buffer(), config.submission_max_ms)?,
             pipelines: Pipelines::new(&device)?,
             staging,
+            uploads: Transfers::default(),
             memory: arena_buffer(&device, arena_bytes)?,
             arena: Arena::new(arena_bytes, device.caps.binding_max_bytes),
             spare: Some(Recorder::new()),
@@ -242,7 +247,8 @@ impl Gpu {
 
     /// Starts a recording; the one before may still be running. What is recorded sees all that was started before it.
     pub fn start(&mut self, mut rec: Recorder) -> Result<Ticket, GpuError> {
-        let started = match rec.error {
+        let flushed = self.flush();
+        let started = match rec.error.or(flushed.err()) {
             _ if self.lost => Err(GpuError::Lost),
             Some(e) => Err(e),
             None => self.submitter.start(&rec, &mut self.pipelines, &self.memory),
@@ -266,36 +272,79 @@ impl Gpu {
         self.finish(self.submitter.latest())
     }
 
-    /// Copies `items` to `buf[at..]` and waits.
+    /// Copies `items` to `buf[at..]`: before the next recording that is started and the next download. Small uploads gather in
+    /// staging until then and go as one.
     pub fn upload<T: bytemuck::Pod>(&mut self, buf: Buf<T>, at: usize, items: &[T]) -> Result<(), GpuError> {
-        self.wait()?;
         let start = checked(&buf, at, items.len())?;
         let mut done = 0;
         for piece in bytemuck::cast_slice::<T, u8>(items).chunks(TRANSFER_BYTES) {
-            self.staging.bytes_mut()[..piece.len()].copy_from_slice(piece);
-            let size = piece.len() as u64;
-            let region = vk::BufferCopy { src_offset: 0, dst_offset: start + done, size };
-            let moved = self.submitter.transfer(self.staging.buffer(), self.memory.buffer, region);
-            self.note(moved)?;
+            let (size, to) = (piece.len() as u64, start + done);
+            if !self.uploads.fit(piece.len(), to) {
+                self.flush()?;
+            }
+            let from = self.uploads.add(piece.len(), to);
+            self.staging.bytes_mut()[from..from + piece.len()].copy_from_slice(piece);
             done += size;
         }
-        Ok(())
+        match self.lost {
+            true => Err(GpuError::Lost),
+            false => Ok(()),
+        }
+    }
+
+    /// Does the uploads that have gathered, and waits.
+    fn flush(&mut self) -> Result<(), GpuError> {
+        if self.uploads.regions().is_empty() {
+            return Ok(());
+        }
+        let moved = match self.lost {
+            true => Err(GpuError::Lost),
+            false => self.submitter.transfer(self.staging.buffer(), self.memory.buffer, self.uploads.regions()),
+        };
+        self.uploads.clear();
+        self.note(moved)
     }
 
     /// Copies `buf[at..]` to `items` and waits.
     pub fn download<T: bytemuck::Pod>(&mut self, buf: Buf<T>, at: usize, items: &mut [T]) -> Result<(), GpuError> {
-        self.wait()?;
         let start = checked(&buf, at, items.len())?;
-        let mut done = 0;
-        for piece in bytemuck::cast_slice_mut::<T, u8>(items).chunks_mut(TRANSFER_BYTES) {
-            let size = piece.len() as u64;
-            let region = vk::BufferCopy { src_offset: start + done, dst_offset: 0, size };
-            let moved = self.submitter.transfer(self.memory.buffer, self.staging.buffer(), region);
-            self.note(moved)?;
-            piece.copy_from_slice(self.staging.bytes(0, piece.len()));
-            done += size;
+        let bytes = Buf::<u8>::at(start, std::mem::size_of_val(items));
+        self.download_parts(std::iter::once(bytes), bytemuck::cast_slice_mut(items))
+    }
+
+    /// Copies buffers to `bytes`, one after another, with as few submissions as staging takes, and waits.
+    pub fn download_parts(
+        &mut self,
+        parts: impl Iterator<Item = Buf<u8>>,
+        mut bytes: &mut [u8],
+    ) -> Result<(), GpuError> {
+        self.flush()?;
+        self.wait()?;
+        let mut gathered = Transfers::default();
+        for part in parts {
+            for at in (0..part.len()).step_by(TRANSFER_BYTES) {
+                let piece = part.part(at, TRANSFER_BYTES.min(part.len() - at));
+                if !gathered.fit(piece.len(), piece.range().start) {
+                    bytes = self.bring(&mut gathered, bytes)?;
+                }
+                gathered.add(piece.len(), piece.range().start);
+            }
         }
-        Ok(())
+        self.bring(&mut gathered, bytes).map(|_| ())
+    }
+
+    /// Copies what has gathered to staging, and from there to the first of `bytes`; the rest of them.
+    fn bring<'a>(&mut self, gathered: &mut Transfers, bytes: &'a mut [u8]) -> Result<&'a mut [u8], GpuError> {
+        let (taken, rest) = bytes.split_at_mut(gathered.bytes().min(bytes.len()));
+        if taken.is_empty() {
+            return Ok(rest);
+        }
+        gathered.reverse();
+        let moved = self.submitter.transfer(self.memory.buffer, self.staging.buffer(), gathered.regions());
+        gathered.clear();
+        self.note(moved)?;
+        taken.copy_from_slice(self.staging.bytes(0, taken.len()));
+        Ok(rest)
     }
 
     /// What a recording's `Recorder::report` brought to `place`. Waits for that recording alone.

@@ -452,14 +452,14 @@ impl Submitter {
         Ok(())
     }
 
-    /// One copy between staging and the arena, waited for as all before it.
-    pub fn transfer(&mut self, from: vk::Buffer, to: vk::Buffer, region: vk::BufferCopy) -> Result<(), GpuError> {
+    /// Copies between staging and the arena, waited for as all before them.
+    pub fn transfer(&mut self, from: vk::Buffer, to: vk::Buffer, regions: &[vk::BufferCopy]) -> Result<(), GpuError> {
         self.finish_all()?;
         let slot = self.free_slot()?;
         self.begin(slot)?;
         let cb = self.slots[slot].commands;
-        // SAFETY: recording; the caller keeps the region inside both buffers.
-        unsafe { self.device.raw.cmd_copy_buffer(cb, from, to, &[region]) };
+        // SAFETY: recording; the caller keeps the regions inside both buffers and apart.
+        unsafe { self.device.raw.cmd_copy_buffer(cb, from, to, regions) };
         self.barrier_to_host(cb);
         self.end(slot)?;
         self.wait(slot)?;
