@@ -22,6 +22,7 @@ use super::diffusion::Diffusion;
 use super::horizon::Horizon;
 use super::keyframes::Keyframe;
 use super::occupancy::{self, Occupancy};
+use super::parts::PARTS;
 use super::pool::FREE_DIVISOR;
 use super::scene::Scene;
 use super::seeds::{Seed, Seeder};
@@ -166,7 +167,7 @@ impl Anchors {
         if room == 0 && !self.config.evict {
             return Ok(None);
         }
-        if !scene.pipeline.pool.open_block(index as u32, keyframe.epoch) {
+        if !scene.pipeline.pool.open_block(index as u32 * PARTS, keyframe.epoch) {
             scene.counters.blocks_full.add(1);
             return Ok(None);
         }
@@ -238,9 +239,8 @@ impl Anchors {
     pub fn densify(&mut self, scene: &mut Scene, archive: &mut Option<Archive>, index: usize) -> Result<(), GpuError> {
         self.fill_in(scene, index)?;
         let Some(archive) = archive else { return Ok(()) };
-        if let Some(block) = archive.block_of(index as u32).filter(|b| archive.blocks[*b].in_pool) {
-            archive.save_block(scene, block)?;
-            archive.look_for(scene, block);
+        if let Some(block) = archive.block_of(index as u32 * PARTS).filter(|b| archive.blocks[*b].in_pool) {
+            archive.complete(scene, block)?;
             let view = scene.view(index);
             scene.render(&view)?;
             archive.saw(scene, index);
@@ -249,7 +249,7 @@ impl Anchors {
     }
 
     fn fill_in(&mut self, scene: &mut Scene, index: usize) -> Result<(), GpuError> {
-        if self.config.densify_max == 0 || scene.pipeline.pool.newest() != Some(index as u32) {
+        if self.config.densify_max == 0 || scene.pipeline.pool.newest() != Some(index as u32 * PARTS) {
             return Ok(());
         }
         let (view, target) = (scene.view(index), scene.target(index));

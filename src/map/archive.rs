@@ -11,11 +11,11 @@
 use super::block::{BlockAbout, KeyframeAbout, RunAbout};
 use super::block::{KIND_BLOCK, KIND_IMAGE, KIND_KEYFRAME, NO_BLOCK, SAMPLES};
 use super::choice::{Choice, Drawn};
-use super::filing::{
-    entry, identity, image_id, keyframes_known, limits, payload_max, run_key, state, BLOCKS_KNOWN, MOMENTS,
-};
+use super::filing::{entry, identity, image_id, keyframes_known, limits, payload_max, run_key, BLOCKS_KNOWN};
 use super::horizon::ball;
+use super::parts::PARTS;
 use super::scene::Scene;
+use super::seen::Sight;
 use super::shape::Shape;
 use super::views::Views;
 use crate::config::Board;
@@ -24,7 +24,7 @@ use crate::gpu::GpuError;
 use crate::limits::CAMERAS_MAX;
 use crate::mem::{unsealed, Footprint};
 use crate::store::{self, Disk, Fetched, Key, Store};
-use glam::Vec3;
+use glam::{DVec3, Vec3};
 use std::path::Path;
 use std::sync::Arc;
 use stipple_drivers::{host, Calibration, Fault, FaultKind, Pose};
@@ -32,11 +32,11 @@ use stipple_drivers::{host, Calibration, Fault, FaultKind, Pose};
 /// Training steps after which a block is written again, as a part of those it had, and at least.
 const REWRITTEN_PART: f64 = 0.25;
 const REWRITTEN_MIN: u32 = 100;
+/// Training steps on a view at which its horizon is first taken again, and from one time to the next.
+const FIRST_LOOK: u32 = 5;
+const LOOKS_RATIO: u32 = 4;
 /// Least space on the disk that a map is begun with, bytes.
 const BYTES_MIN: u64 = 128 << 20;
-/// Blocks and states of keyframes written when a keyframe comes, at most.
-const BLOCKS_AT_ONCE: usize = 2;
-const STATES_AT_ONCE: usize = 4;
 
 /// Where the store is, and how it is used.
 #[derive(Clone, Copy, Debug)]
@@ -56,10 +56,12 @@ pub struct Place<'a> {
 pub struct Block {
     /// Index of its anchor among the views.
     pub anchor: u32,
+    /// Which part of the anchor's Gaussians it is (`parts`).
+    pub number: u32,
     pub epoch: u32,
     /// Gaussians when it was last looked at.
     pub count: u32,
-    pub samples: [[f32; 3]; SAMPLES],
+    pub samples: [[f32; 4]; SAMPLES],
     pub samples_len: u8,
     pub centre: Vec3,
     pub radius: f32,
@@ -70,22 +72,27 @@ pub struct Block {
     pub asked: bool,
     /// Training steps of views that see it, and how many of them had been taken when it was last written.
     pub steps: u32,
-    written: Option<u32>,
+    pub written: Option<u32>,
 }
 
 impl Block {
-    pub fn points(&self) -> &[[f32; 3]] {
+    pub fn samples(&self) -> &[[f32; 4]] {
         &self.samples[..usize::from(self.samples_len)]
     }
 
-    fn changed(&self) -> bool {
+    pub fn changed(&self) -> bool {
         self.written.is_none_or(|at| self.steps > at)
     }
 
     /// Whether enough steps were taken to write it again.
-    fn is_due(&self) -> bool {
+    pub fn is_due(&self) -> bool {
         self.written.is_none_or(|at| self.steps - at >= REWRITTEN_MIN.max((f64::from(at) * REWRITTEN_PART) as u32))
     }
+}
+
+/// The id of a part of a block in the store.
+pub fn part_id(views: &Views, b: &Block) -> u32 {
+    views.get(b.anchor as usize).id as u32 * PARTS + b.number % PARTS
 }
 
 /// What the archive knows of a keyframe beside its views.
@@ -96,9 +103,11 @@ pub struct Known {
     /// Its images were asked of the disk; how many have not come.
     pub asked: u8,
     /// Its steps when its state was last written.
-    stated: u32,
+    pub stated: u32,
     /// The horizon was taken from a picture with much of it still open.
     pub open: bool,
+    /// Training steps on it at which its horizon is taken again.
+    look_at: u32,
     /// The exchange of blocks after which what is hidden of it was last looked at.
     pub looked_at: u64,
     /// One of its images could not be had: those that come go.
@@ -111,14 +120,15 @@ pub struct Archive {
     at_once: bool,
     pub run: u32,
     /// Epoch 0 of this run, in the store.
-    epoch_base: u32,
+    pub epoch_base: u32,
     /// The run, and whether it was there before.
     about: RunAbout,
     pub goes_on: bool,
     pub blocks: Vec<Block>,
     pub known: Vec<Known>,
-    /// How many of a block's samples a keyframe sees: keyframe by keyframe.
-    pub sight: Vec<u8>,
+    pub sight: Sight,
+    /// The index of the block of each number, or `NO_BLOCK`.
+    numbers: Vec<u32>,
     pub choice: Choice,
     /// A new block grows: none comes behind it.
     pub growing: bool,
@@ -126,8 +136,8 @@ pub struct Archive {
     pub exchanges: u64,
     pub drawn: Drawn,
     /// The next block and keyframe that are looked at for writing.
-    next_block: usize,
-    next_state: usize,
+    pub next_block: usize,
+    pub next_state: usize,
 }
 
 impl Archive {
@@ -183,7 +193,7 @@ impl Archive {
                     (run, about, false)
                 }
             };
-        let (blocks, known, sight, choice) = tables(board, shape);
+        let (blocks, known, sight, choice, numbers) = tables(board, shape);
         let mut archive = Archive {
             store,
             disk: Arc::new(disk),
@@ -195,6 +205,7 @@ impl Archive {
             blocks,
             known,
             sight,
+            numbers,
             choice,
             growing: false,
             exchanges: 1,
@@ -212,7 +223,7 @@ impl Archive {
     }
 
     /// Does what waits for the disk where no threads do.
-    fn serve(&self) {
+    pub fn serve(&self) {
         if self.at_once {
             unsealed(|| self.disk.serve());
         }
@@ -234,7 +245,7 @@ impl Archive {
         self.state_run();
     }
 
-    fn key(&self, kind: u8, id: u32) -> Key {
+    pub fn key(&self, kind: u8, id: u32) -> Key {
         Key { kind, run: self.run, id }
     }
 
@@ -268,12 +279,13 @@ impl Archive {
         });
         found.sort_unstable_by_key(|(id, _)| *id);
         for (id, b) in found {
-            let Some(anchor) = views.index_of(u64::from(id)) else { continue };
+            let Some(anchor) = views.index_of(u64::from(id / PARTS)) else { continue };
             let steps = views.get(anchor).steps;
             let entry = views.get_mut(anchor);
             (entry.anchor, entry.placed) = (true, b.placed);
-            self.blocks.push(Block {
+            self.know_block(Block {
                 anchor: anchor as u32,
+                number: anchor as u32 * PARTS + id % PARTS,
                 epoch: b.epoch - self.epoch_base,
                 count: b.count,
                 samples: b.samples,
@@ -302,9 +314,16 @@ impl Archive {
         self.save_images(&scene.views, index);
     }
 
-    /// The number of the block of an anchor.
-    pub fn block_of(&self, anchor: u32) -> Option<usize> {
-        self.blocks.iter().position(|b| b.anchor == anchor)
+    /// The index of the block of a number.
+    pub fn block_of(&self, number: u32) -> Option<usize> {
+        self.numbers.get(number as usize).filter(|block| **block != NO_BLOCK).map(|block| *block as usize)
+    }
+
+    pub fn know_block(&mut self, block: Block) {
+        if let Some(index) = self.numbers.get_mut(block.number as usize) {
+            *index = self.blocks.len() as u32;
+            self.blocks.push(block);
+        }
     }
 
     /// Takes in the block that was opened for an anchor.
@@ -313,11 +332,12 @@ impl Archive {
             return;
         }
         let entry = views.get(anchor);
-        self.blocks.push(Block {
+        self.know_block(Block {
             anchor: anchor as u32,
+            number: anchor as u32 * PARTS,
             epoch: entry.epoch,
             count: 0,
-            samples: [[0.0; 3]; SAMPLES],
+            samples: [[0.0; 4]; SAMPLES],
             samples_len: 0,
             centre: Vec3::ZERO,
             radius: 0.0,
@@ -335,167 +355,23 @@ impl Archive {
     }
 
     /// A block's ball, from its samples.
-    fn measure(&mut self, block: usize) {
+    pub fn measure(&mut self, block: usize) {
         let b = &mut self.blocks[block];
         (b.centre, b.radius) = ball(&b.samples[..usize::from(b.samples_len)]);
     }
 
-    /// Hands a block in the pool to the store, and looks where its Gaussians are; false where the store takes none now.
-    pub fn save_block(&mut self, scene: &mut Scene, block: usize) -> Result<bool, GpuError> {
-        if !self.store.has_room() {
-            self.serve();
-            if !self.store.has_room() {
-                return Ok(false);
-            }
+    /// Counts a training step on a view, and looks again from where it was taken as its steps grow: what stood before a far
+    /// wall when the view came has become what it is, and what is behind it has been mapped.
+    pub fn trained(&mut self, scene: &mut Scene, index: usize) -> Result<(), GpuError> {
+        let (keyframe, first) = (index / scene.views.cameras(), scene.views.first(index));
+        let steps = scene.views.get(first).steps;
+        if index == first && self.known.get(keyframe).is_some_and(|known| steps >= known.look_at.max(FIRST_LOOK)) {
+            self.known[keyframe].look_at = steps * LOOKS_RATIO;
+            self.look_again(scene, first)?;
         }
-        let b = self.blocks[block];
-        let id = scene.views.get(b.anchor as usize).id as u32;
-        let (gpu, pool) = (&mut scene.gpu, &mut scene.pipeline.pool);
-        // The header tells where the Gaussians are, so they are looked at first.
-        let (mut bytes, mut failed) = (std::mem::take(&mut self.choice.page), None);
-        bytes.clear();
-        match pool.read_block(gpu, b.anchor, MOMENTS, &mut bytes) {
-            Ok(count) => self.look_at(block, count, &bytes),
-            Err(e) => failed = Some(e),
-        }
-        let b = &self.blocks[block];
-        let about = BlockAbout {
-            epoch: b.epoch + self.epoch_base,
-            count: b.count,
-            colour: pool.colour,
-            moments: MOMENTS,
-            placed: b.placed,
-            moved: Pose::IDENTITY,
-            samples: b.samples,
-            samples_len: b.samples_len,
-        };
-        let taken = failed.is_none()
-            && self.store.put(self.key(KIND_BLOCK, id), &about.encode(), |payload| payload.extend_from_slice(&bytes));
-        self.choice.page = bytes;
-        if taken {
-            let b = &mut self.blocks[block];
-            b.written = Some(b.steps);
-        }
-        self.serve();
-        failed.map_or(Ok(taken), Err)
-    }
-
-    /// Takes a block's samples from its arrays.
-    fn look_at(&mut self, block: usize, count: usize, bytes: &[u8]) {
-        const SPLAT: usize = size_of::<crate::gpu::kernels::types::Splat>();
-        self.exchanges += u64::from(self.blocks[block].samples_len == 0);
-        let b = &mut self.blocks[block];
-        (b.count, b.samples_len) = (count as u32, 0);
-        for i in 0..SAMPLES.min(count) {
-            let at = (i * count / SAMPLES.min(count)) * SPLAT;
-            let mean: [f32; 3] = bytemuck::pod_read_unaligned(&bytes[at..at + 12]);
-            if mean.iter().all(|v| v.is_finite()) {
-                b.samples[usize::from(b.samples_len)] = mean;
-                b.samples_len += 1;
-            }
-        }
-        self.measure(block);
-    }
-
-    fn save_images(&mut self, views: &Views, index: usize) {
-        let (keyframe, cameras) = (index / views.cameras(), views.cameras());
-        let Some(known) = self.known.get(keyframe).copied() else { return };
-        if known.saved || !views.has_place(index) {
-            return;
-        }
-        for camera in 0..cameras {
-            let id = image_id(views, keyframe * cameras + camera);
-            let planes = views.planes(keyframe * cameras + camera);
-            let fill = |payload: &mut Vec<u8>| planes.iter().for_each(|p| payload.extend_from_slice(&p.pixels));
-            if !self.store.put(self.key(KIND_IMAGE, id), &[0; store::ABOUT], fill) {
-                return;
-            }
-            self.serve();
-        }
-        self.known[keyframe].saved = true;
-        self.save_state(views, keyframe);
-    }
-
-    /// Hands what is known of a keyframe to the store.
-    fn save_state(&mut self, views: &Views, keyframe: usize) -> bool {
-        let cameras = views.cameras();
-        let home = self.home(keyframe).map_or(NO_BLOCK, |b| views.get(self.blocks[b].anchor as usize).id as u32);
-        for index in keyframe * cameras..(keyframe + 1) * cameras {
-            let about = state(views.get(index), home, self.epoch_base);
-            if !self.store.put(self.key(KIND_KEYFRAME, image_id(views, index)), &about.encode(), |_| ()) {
-                return false;
-            }
-            self.serve();
-        }
-        self.known[keyframe].stated = views.get(keyframe * cameras).steps;
-        true
-    }
-
-    /// Counts a training step on a view.
-    pub fn trained(&mut self, keyframe: usize) {
-        let row = &self.sight[keyframe * BLOCKS_KNOWN..][..self.blocks.len()];
-        for (block, seen) in self.blocks.iter_mut().zip(row) {
-            block.steps += u32::from(*seen > 0 && block.in_pool);
-        }
-    }
-
-    /// Writes a few of the blocks and states that have changed most while the map trained.
-    pub fn save_some(&mut self, scene: &mut Scene) -> Result<(), GpuError> {
-        let mut written = 0;
-        for _ in 0..self.blocks.len() {
-            self.next_block = (self.next_block + 1) % self.blocks.len();
-            let b = self.blocks[self.next_block];
-            // The newest is written when it is densified.
-            let complete = b.samples_len > 0;
-            if b.in_pool && complete && b.is_due() {
-                if written == BLOCKS_AT_ONCE || !self.save_block(scene, self.next_block)? {
-                    break;
-                }
-                written += 1;
-            }
-        }
-        let keyframes = self.known.len();
-        for _ in 0..STATES_AT_ONCE.min(keyframes) {
-            self.next_state = (self.next_state + 1) % keyframes;
-            self.save_keyframe(&scene.views, self.next_state);
-        }
+        let Archive { blocks, sight, .. } = self;
+        sight.blocks(keyframe).for_each(|block| blocks[block].steps += u32::from(blocks[block].in_pool));
         Ok(())
-    }
-
-    /// Writes of a keyframe what was not written yet; whether all of it is in the store.
-    pub fn save_keyframe(&mut self, views: &Views, keyframe: usize) -> bool {
-        let index = keyframe * views.cameras();
-        self.save_images(views, index);
-        let known = self.known[keyframe];
-        known.saved && (known.stated == views.get(index).steps || self.save_state(views, keyframe))
-    }
-
-    /// Writes a block if it has changed since it was written; whether the store has it as it is.
-    pub fn save_if_changed(&mut self, scene: &mut Scene, block: usize) -> Result<bool, GpuError> {
-        Ok(!self.blocks[block].changed() || self.save_block(scene, block)?)
-    }
-
-    /// Writes all that has changed, waits until it is on the disk, and answers whether the store has the whole map. Fails
-    /// where it cannot be written.
-    pub fn flush(&mut self, scene: &mut Scene) -> Result<Result<bool, Fault>, GpuError> {
-        let mut whole = true;
-        for block in 0..self.blocks.len() {
-            if self.blocks[block].in_pool && !self.save_if_changed(scene, block)? {
-                if let Err(fault) = self.store.flush() {
-                    return Ok(Err(fault));
-                }
-                whole &= self.save_if_changed(scene, block)?;
-            }
-        }
-        for keyframe in 0..self.known.len() {
-            if !self.save_keyframe(&scene.views, keyframe) {
-                if let Err(fault) = self.store.flush() {
-                    return Ok(Err(fault));
-                }
-                whole &= self.save_keyframe(&scene.views, keyframe);
-            }
-        }
-        Ok(self.store.flush().map(|()| whole))
     }
 
     /// Gaussians that are on disk alone.
@@ -512,8 +388,9 @@ impl Archive {
             if by.p.length() == 0.0 && by.q.to_scaled_axis().length() == 0.0 {
                 continue;
             }
-            for point in &mut b.samples[..usize::from(b.samples_len)] {
-                *point = by.transform(Vec3::from_array(*point).as_dvec3()).as_vec3().to_array();
+            for sample in &mut b.samples[..usize::from(b.samples_len)] {
+                let [x, y, z, size] = *sample;
+                *sample = by.transform(DVec3::new(x.into(), y.into(), z.into())).as_vec3().extend(size).to_array();
             }
             b.placed = placed;
             // Moved, it is another one than on disk.
@@ -525,7 +402,7 @@ impl Archive {
 
     /// Asks the disk for a block; false where it cannot be asked now.
     pub fn ask_for_block(&mut self, views: &Views, block: usize) -> bool {
-        let key = self.key(KIND_BLOCK, views.get(self.blocks[block].anchor as usize).id as u32);
+        let key = self.key(KIND_BLOCK, part_id(views, &self.blocks[block]));
         let asked = self.blocks[block].asked || self.store.fetch(key);
         self.blocks[block].asked = asked;
         self.serve();
@@ -552,7 +429,8 @@ impl Archive {
         let key = fetched.key;
         let arrived = match key.kind {
             KIND_BLOCK => {
-                let block = views.index_of(u64::from(key.id)).and_then(|anchor| self.block_of(anchor as u32));
+                let anchor = views.index_of(u64::from(key.id / PARTS));
+                let block = anchor.and_then(|anchor| self.block_of(anchor as u32 * PARTS + key.id % PARTS));
                 block.map_or(Arrived::Unknown, Arrived::Block)
             }
             _ => {
@@ -588,12 +466,13 @@ pub enum Arrived {
     Unknown,
 }
 
-fn tables(board: &Board, shape: &Shape) -> (Vec<Block>, Vec<Known>, Vec<u8>, Choice) {
+fn tables(board: &Board, shape: &Shape) -> (Vec<Block>, Vec<Known>, Sight, Choice, Vec<u32>) {
     let keyframes = keyframes_known(board, shape);
     (
         Vec::with_capacity(BLOCKS_KNOWN),
         Vec::with_capacity(keyframes),
-        vec![0; keyframes * BLOCKS_KNOWN],
+        Sight::new(keyframes),
         Choice::new(keyframes, payload_max(board, shape), shape.pixels(), board.map.evict),
+        vec![NO_BLOCK; keyframes * shape.cameras as usize * PARTS as usize],
     )
 }

@@ -32,14 +32,17 @@ pub const KIND_IMAGE: u8 = 4;
 /// `KeyframeAbout::home` of a keyframe that belongs to no block.
 pub const NO_BLOCK: u32 = u32::MAX;
 /// Samples of a block.
-pub const SAMPLES: usize = 104;
+pub const SAMPLES: usize = 32;
 
 /// Version of this form.
-const FORM: u8 = 1;
+const FORM: u8 = 2;
 /// Bytes of a pose: quaternion xyzw, then position.
 const POSE: usize = 7 * size_of::<f64>();
 /// Steps of a sample's coordinate in the box around all of them.
 const SAMPLE_STEPS: f32 = 255.0;
+/// The least size that a sample has, m, and the ratio from one code of a size to the next.
+const SIZE_MIN_M: f32 = 1e-3;
+const SIZE_STEP_LN: f32 = 0.04;
 // Arrays are copied as they are in memory.
 const _: () = assert!(cfg!(target_endian = "little"));
 
@@ -75,8 +78,8 @@ pub struct BlockAbout {
     pub placed: Pose,
     /// Rigid motion that is to be applied to the Gaussians since they were written.
     pub moved: Pose,
-    /// Means of Gaussians spread over the block, in the epoch's frame, m; the first `samples_len` are in use.
-    pub samples: [[f32; 3]; SAMPLES],
+    /// Means of Gaussians spread over the block, in the epoch's frame, and their σ, m; the first `samples_len` are in use.
+    pub samples: [[f32; 4]; SAMPLES],
     pub samples_len: u8,
 }
 
@@ -89,7 +92,7 @@ impl Default for BlockAbout {
             moments: false,
             placed: Pose::IDENTITY,
             moved: Pose::IDENTITY,
-            samples: [[0.0; 3]; SAMPLES],
+            samples: [[0.0; 4]; SAMPLES],
             samples_len: 0,
         }
     }
@@ -233,15 +236,15 @@ impl RunAbout {
 
 impl BlockAbout {
     /// The samples in use.
-    pub fn samples(&self) -> &[[f32; 3]] {
+    pub fn samples(&self) -> &[[f32; 4]] {
         &self.samples[..usize::from(self.samples_len).min(SAMPLES)]
     }
 
     /// Samples that are not finite are left out.
     pub fn encode(&self) -> About {
-        let samples = || self.samples().iter().map(|s| Vec3::from_array(*s)).filter(|s| s.is_finite());
-        let least = samples().reduce(Vec3::min).unwrap_or(Vec3::ZERO);
-        let most = samples().reduce(Vec3::max).unwrap_or(Vec3::ZERO);
+        let samples = || self.samples().iter().map(|s| Vec4::from_array(*s)).filter(|s| s.is_finite());
+        let least = samples().map(Vec4::truncate).reduce(Vec3::min).unwrap_or(Vec3::ZERO);
+        let most = samples().map(Vec4::truncate).reduce(Vec3::max).unwrap_or(Vec3::ZERO);
         // Beyond what is one block by far: the size stays a number.
         let size = (most - least).min(Vec3::splat(f32::MAX));
         let mut w = Writer::new();
@@ -257,6 +260,7 @@ impl BlockAbout {
                 let step = if size > 0.0 { ((at - least) / size * SAMPLE_STEPS).round() } else { 0.0 };
                 w.put([step as u8]);
             }
+            w.put([((sample.w / SIZE_MIN_M).ln() / SIZE_STEP_LN).round() as u8]);
         }
         w.about
     }
@@ -267,12 +271,13 @@ impl BlockAbout {
         let (placed, moved) = (b.pose()?, b.pose()?);
         let samples_len = b.u8().filter(|n| usize::from(*n) <= SAMPLES)?;
         let (least, size) = (b.place()?, b.place()?);
-        let mut samples = [[0.0; 3]; SAMPLES];
+        let mut samples = [[0.0; 4]; SAMPLES];
         for sample in &mut samples[..usize::from(samples_len)] {
             for axis in 0..3 {
                 let step = f32::from(b.u8()?);
                 sample[axis] = least[axis] + size[axis] * (step / SAMPLE_STEPS);
             }
+            sample[3] = SIZE_MIN_M * (f32::from(b.u8()?) * SIZE_STEP_LN).exp();
         }
         Some(BlockAbout { epoch, count, colour, moments, placed, moved, samples, samples_len })
     }

@@ -18,11 +18,11 @@ fn exposure() -> impl Strategy<Value = Exposure> {
 }
 
 fn block() -> impl Strategy<Value = BlockAbout> {
-    let sample = [-500.0..500.0f32, -500.0..500.0f32, -500.0..500.0f32];
+    let sample = [-500.0..500.0f32, -500.0..500.0f32, -500.0..500.0f32, 0.001..20.0f32];
     let samples = proptest::collection::vec(sample, 0..=SAMPLES);
     (any::<(u32, bool, bool)>(), 0..40u32, pose(), pose(), samples).prop_map(|(free, count, placed, moved, used)| {
         let (epoch, colour, moments) = free;
-        let mut samples = [[0.0; 3]; SAMPLES];
+        let mut samples = [[0.0; 4]; SAMPLES];
         samples[..used.len()].copy_from_slice(&used);
         BlockAbout { epoch, count, colour, moments, placed, moved, samples, samples_len: used.len() as u8 }
     })
@@ -70,6 +70,8 @@ proptest! {
             let close = |(a, b): (&f32, &f32)| (a - b).abs() <= (ends[1] - ends[0]) / SAMPLE_STEPS + 1e-4;
             prop_assert!(was.iter().zip(&is).all(close), "{:?} {:?}", was, is);
         }
+        let sizes = block.samples().iter().zip(read.samples()).map(|(was, is)| (is[3] / was[3]).ln().abs());
+        prop_assert!(sizes.fold(0.0, f32::max) <= SIZE_STEP_LN);
     }
 
     #[test]

@@ -1,6 +1,7 @@
 //! Room in which the archive finds what is wanted in memory (`residency`, `rotation`); bought at boot.
 
 use super::filing::{keyframes_known, BLOCKS_KNOWN};
+use super::parts::Ordering;
 use super::shape::Shape;
 use crate::config::Board;
 use std::collections::VecDeque;
@@ -10,16 +11,23 @@ use stipple_drivers::{Nanos, Pose};
 pub struct Choice {
     /// Keyframes by how near they are, m.
     pub order: Vec<(f32, u32)>,
+    /// Gaussians that each of them needs and that are not wanted, and the part of what it sees above which it needs a block.
+    pub lacking: Vec<(usize, f32)>,
     pub wanted: Vec<bool>,
     /// Which blocks the newest keyframes see.
     pub now_seen: Vec<bool>,
     /// Whether Gaussians may go where they do not fit.
     pub evict: bool,
+    /// What must be in the pool where the vehicle is does not fit: the least important goes.
+    pub thins: bool,
     /// The wanted, most wanted first.
     pub blocks: Vec<u32>,
     /// A block on its way to the store.
     pub page: Vec<u8>,
+    pub ordering: Ordering,
     pub leaving: Vec<u32>,
+    /// Blocks by what is seen of them, or by how far they are.
+    pub ranked: Vec<(f32, u32)>,
     /// Pixels that count and do not show what is on disk.
     pub hidden: Vec<u8>,
     /// The epoch that is mapped.
@@ -28,8 +36,8 @@ pub struct Choice {
     pub last: Option<(Nanos, Pose)>,
     /// The view to whose place the pool is turned; none where the vehicle is.
     pub elsewhere: Option<u32>,
-    /// Training steps taken where the vehicle is, more than elsewhere.
-    pub steps_ahead: i32,
+    /// Training steps while a turn to another place may come.
+    pub steps: u64,
     /// Gaussians that the pool is to have room for beside those that are wanted.
     pub reserve: usize,
 }
@@ -38,17 +46,21 @@ impl Choice {
     pub fn new(keyframes: usize, payload: usize, pixels: usize, evict: bool) -> Choice {
         Choice {
             order: Vec::with_capacity(keyframes),
+            lacking: Vec::with_capacity(keyframes),
             wanted: vec![false; BLOCKS_KNOWN],
             now_seen: Vec::with_capacity(BLOCKS_KNOWN),
             evict,
+            thins: false,
             blocks: Vec::with_capacity(BLOCKS_KNOWN),
             page: Vec::with_capacity(payload),
+            ordering: Ordering::new(payload),
             leaving: Vec::with_capacity(BLOCKS_KNOWN),
+            ranked: Vec::with_capacity(BLOCKS_KNOWN),
             hidden: Vec::with_capacity(pixels),
             epoch: 0,
             last: None,
             elsewhere: None,
-            steps_ahead: 0,
+            steps: 0,
             reserve: 0,
         }
     }

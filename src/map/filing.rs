@@ -12,8 +12,8 @@ use crate::limits::CAMERAS_MAX;
 use crate::store::{Key, Limits};
 use stipple_drivers::{Calibration, Image};
 
-/// Blocks that a run may make. One covers some square metres: a large building.
-pub const BLOCKS_KNOWN: usize = 2048;
+/// Blocks that a run may make. An anchor has up to 16, and covers some square metres: a large building.
+pub const BLOCKS_KNOWN: usize = 8192;
 /// Buffers between here and the disk: what is written and what is read at a time.
 pub const BUFFERS: usize = 8;
 pub const SEGMENT_BYTES: u64 = 8 << 20;
@@ -61,6 +61,7 @@ pub fn entry(id: u32, s: &KeyframeAbout, epoch_base: u32) -> Stored {
         coarseness: s.coarseness,
         horizon: s.horizon,
         hidden: Cells::default(),
+        in_part: false,
         steps: s.steps,
     }
 }

@@ -12,6 +12,8 @@ pub const COLUMNS: usize = 16;
 pub const ROWS: usize = 12;
 pub const CELLS: usize = COLUMNS * ROWS;
 
+/// A Gaussian reaches so many σ.
+pub const SIGMAS: f64 = 3.0;
 /// Nothing is known of how far a cell sees.
 const OPEN: u8 = u8::MAX;
 /// The nearest depth that a cell can have, m, and the ratio from one code to the next: 0.1 m to 100 m in steps of 2.8 %.
@@ -106,18 +108,14 @@ impl Horizon {
         }
     }
 
-    /// Whether a view with this horizon sees a point of the world; not where nothing is known of how far it sees.
-    pub fn sees(&self, view: &View, p_world: DVec3) -> bool {
-        let Some((x, y, depth)) = view.project(p_world) else { return false };
-        let cell = cell_of(x, y, view.camera.width, view.camera.height);
-        self.0[cell] != OPEN && self.reaches(cell, depth)
-    }
-
-    /// The cell in which a view with this horizon may see a point of the world: also where nothing is known of how far it sees.
-    pub fn may_see(&self, view: &View, p_world: DVec3) -> Option<usize> {
-        let (x, y, depth) = view.project(p_world)?;
-        let cell = cell_of(x, y, view.camera.width, view.camera.height);
-        self.reaches(cell, depth).then_some(cell)
+    /// The cell in which a view with this horizon sees a point of the world, or, by a margin, px, the nearest cell to it, and how far
+    /// outside the picture the point is, px. A cell of which nothing is known sees all.
+    pub fn sees(&self, view: &View, p_world: DVec3, margin_px: f64) -> Option<(usize, f64)> {
+        let (x, y, depth) = view.project(p_world, margin_px)?;
+        let (width, height) = (view.camera.width, view.camera.height);
+        let cell = cell_of(x, y, width, height);
+        let outside = |v: f64, size: usize| (-0.5 - v).max(v + 0.5 - size as f64).max(0.0);
+        self.reaches(cell, depth).then(|| (cell, outside(x, width).max(outside(y, height))))
     }
 
     fn reaches(&self, cell: usize, depth: f64) -> bool {
@@ -138,12 +136,12 @@ fn metres(code: u8) -> f64 {
     NEAREST_M * (f64::from(code) * STEP_LN).exp()
 }
 
-/// A ball around points, m: its centre is their mean.
-pub fn ball(points: &[[f32; 3]]) -> (Vec3, f32) {
-    let sum: Vec3 = points.iter().map(|p| Vec3::from_array(*p)).sum();
-    let centre = sum / points.len().max(1) as f32;
-    let radius = points.iter().map(|p| centre.distance(Vec3::from_array(*p))).fold(0.0, f32::max);
-    (centre, radius)
+/// A ball around Gaussians, means and σ, m: its centre is the mean of theirs.
+pub fn ball(samples: &[[f32; 4]]) -> (Vec3, f32) {
+    let means = || samples.iter().map(|[x, y, z, _]| Vec3::new(*x, *y, *z));
+    let centre = means().sum::<Vec3>() / samples.len().max(1) as f32;
+    let reach = means().zip(samples).map(|(mean, [.., size])| centre.distance(mean) + SIGMAS as f32 * size);
+    (centre, reach.fold(0.0, f32::max))
 }
 
 #[cfg(test)]
@@ -168,11 +166,11 @@ mod tests {
         (0..H).for_each(|y| rendered.alpha[y * W + W / 2..(y + 1) * W].fill(0.0));
         let (horizon, view) = (Horizon::of(&rendered), view());
         for (x, z, seen) in
-            [(-0.3, 1.0, true), (-0.3, 2.1, true), (-0.4, 3.0, false), (0.4, 3.0, false), (0.0, -1.0, false)]
+            [(-0.3, 1.0, true), (-0.3, 2.1, true), (-0.4, 3.0, false), (0.4, 3.0, true), (0.0, -1.0, false)]
         {
-            assert_eq!(horizon.sees(&view, DVec3::new(x, 0.1, z)), seen, "{x} {z}");
+            assert_eq!(horizon.sees(&view, DVec3::new(x, 0.1, z), 0.0).is_some(), seen, "{x} {z}");
         }
-        assert!(!horizon.sees(&view, DVec3::new(9.0, 0.0, 1.0)), "beside the picture");
+        assert!(horizon.sees(&view, DVec3::new(9.0, 0.0, 1.0), 0.0).is_none(), "beside the picture");
         assert_eq!((horizon.open_part(), Horizon::default().open_part()), (0.5, 1.0));
     }
 
@@ -183,11 +181,14 @@ mod tests {
         (0..H).for_each(|y| rendered.alpha[y * W + W / 2..(y + 1) * W].fill(0.0));
         let (mut horizon, view) = (Horizon::of(&rendered), view());
         let behind = DVec3::new(0.4, 0.1, 3.5);
-        assert!(horizon.may_see(&view, behind).is_some(), "nothing is known of how far it sees");
+        assert!(horizon.sees(&view, behind, 0.0).is_some(), "nothing is known of how far it sees");
         horizon.fill(&[3.0; W * H], W);
         assert_eq!(horizon.open_part(), 0.0);
-        assert!(horizon.sees(&view, DVec3::new(0.4, 0.1, 3.0)) && horizon.may_see(&view, behind * 2.0).is_none());
-        assert!(!horizon.sees(&view, DVec3::new(-0.4, 0.1, 3.0)), "the map is nearer there");
+        assert!(
+            horizon.sees(&view, DVec3::new(0.4, 0.1, 3.0), 0.0).is_some()
+                && horizon.sees(&view, behind * 2.0, 0.0).is_none()
+        );
+        assert!(horizon.sees(&view, DVec3::new(-0.4, 0.1, 3.0), 0.0).is_none(), "the map is nearer there");
         let known = horizon;
         horizon.fill(&[0.0; W * H], W);
         assert_eq!(horizon, known);
@@ -203,9 +204,9 @@ mod tests {
 
     #[test]
     fn a_ball_holds_its_points() {
-        let points = [[0.0, 0.0, 0.0], [2.0, 0.0, 0.0], [1.0, 1.0, 0.0]];
+        let points = [[0.0, 0.0, 0.0, 0.1], [2.0, 0.0, 0.0, 0.0], [1.0, 1.0, 0.0, 0.0]];
         let (centre, radius) = ball(&points);
-        assert!(points.iter().all(|p| centre.distance(Vec3::from_array(*p)) <= radius));
+        assert!(points.iter().all(|[x, y, z, size]| centre.distance(Vec3::new(*x, *y, *z)) + size <= radius));
         assert_eq!(ball(&[]), (Vec3::ZERO, 0.0));
     }
 }

@@ -12,6 +12,9 @@ use crate::gpu::{Arena, Buf, Gpu, GpuError, Kernel, Recorder, Threads};
 use crate::limits::CAMERAS_MAX;
 use stipple_drivers::Fault;
 
+/// Transmittance above which a pixel of a view that the pool does not hold all of is not compared: what fills it is absent.
+const OPEN: f32 = 0.5;
+
 #[derive(Clone, Copy)]
 pub struct Buffers {
     images: Buf<u32>,
@@ -119,7 +122,7 @@ impl Loss {
     pub fn record(&self, rec: &mut Recorder, rendered: Buf<f32>, target: &Target, ssim_weight: f32) {
         let (b, size) = (&self.buffers, [self.shape.width, self.shape.height]);
         let values = self.values(target) as f32;
-        self.record_mask(rec, target);
+        self.record_mask(rec, rendered, target);
         for channel in 0..self.shape.channels {
             let group = channel * self.shape.loss_groups();
             self.record_ssim(rec, rendered, target, channel, &self.ssim_columns, group);
@@ -165,7 +168,7 @@ impl Loss {
         map.resize(n * channels as usize, 1.0);
         for (channel, plane) in map.chunks_exact_mut(n).enumerate() {
             let mut rec = gpu.record();
-            self.record_mask(&mut rec, target);
+            self.record_mask(&mut rec, rendered, target);
             self.record_ssim(&mut rec, rendered, target, channel as u32, &self.ssim_map, 0);
             gpu.submit(rec)?;
             gpu.download(self.slopes, 0, plane)?;
@@ -217,24 +220,30 @@ impl Loss {
     }
 
     /// Makes the mask of a target of which not all counts.
-    fn record_mask(&self, rec: &mut Recorder, target: &Target) {
-        if target.hidden.is_empty() {
+    fn record_mask(&self, rec: &mut Recorder, rendered: Buf<f32>, target: &Target) {
+        if !target.in_part {
             return;
         }
         rec.dispatch(
             &self.mask_cells,
-            mask_cells::Bind { mask: self.nth_mask(target.camera).read(), masked: self.mask(target).write() },
+            mask_cells::Bind {
+                mask: self.nth_mask(target.camera).read(),
+                picture: rendered.read(),
+                masked: self.mask(target).write(),
+            },
             mask_cells::Push {
                 size: [self.shape.width, self.shape.height],
                 grid: [COLUMNS as u32, ROWS as u32],
                 cells: target.hidden.0,
+                plane: self.shape.channels * self.shape.width * self.shape.height,
+                open: OPEN,
             },
             Threads::d1(self.shape.image_words() as u32),
         );
     }
 
     fn mask(&self, target: &Target) -> Buf<u32> {
-        self.nth_mask(if target.hidden.is_empty() { target.camera } else { self.shape.cameras })
+        self.nth_mask(if target.in_part { self.shape.cameras } else { target.camera })
     }
 
     fn nth_mask(&self, n: u32) -> Buf<u32> {

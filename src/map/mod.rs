@@ -24,15 +24,18 @@ mod keyframes;
 pub mod loss;
 pub mod occupancy;
 pub mod paging;
+pub mod parts;
 pub mod pipeline;
 pub mod pool;
 pub mod refine;
 pub mod render;
 mod residency;
 mod rotation;
+mod saving;
 mod scene;
 pub mod schedule;
 mod seeds;
+mod seen;
 pub mod shape;
 mod sight;
 pub mod sort;
@@ -309,7 +312,7 @@ impl Mapper {
             report.iterations += 1;
             report.loss = self.trainer.loss;
             if let (Some(archive), Some(index)) = (&mut self.archive, self.trainer.trained.take()) {
-                archive.trained(index / self.scene.views.cameras());
+                archive.trained(&mut self.scene, index)?;
             }
             if Instant::now() >= deadline {
                 break;

@@ -7,7 +7,6 @@
 use super::pool::{Block, Pool, BLOCKS};
 use crate::gpu::kernels::types::{Moments, Splat};
 use crate::gpu::{Buf, Gpu, GpuError};
-use bytemuck::Pod;
 
 /// Bytes of a Gaussian in memory, of a map in colour or grey, with Adam's moments or without.
 pub fn splat_bytes(colour: bool, moments: bool) -> usize {
@@ -16,38 +15,47 @@ pub fn splat_bytes(colour: bool, moments: bool) -> usize {
 }
 
 impl Pool {
-    /// Whether an anchor has a block here.
-    pub fn holds(&self, anchor: u32) -> bool {
-        self.host.blocks.iter().any(|b| b.anchor == anchor)
+    /// Whether a block is here.
+    pub fn holds(&self, number: u32) -> bool {
+        self.host.blocks.iter().any(|b| b.number == number)
     }
 
-    /// Anchors and sizes of the blocks here, in order.
+    /// Whether so many more blocks may be here.
+    pub fn may_have(&self, more: usize) -> bool {
+        self.host.blocks.len() + more <= BLOCKS
+    }
+
+    /// Numbers and sizes of the blocks here, in order.
     pub fn blocks(&self) -> impl Iterator<Item = (u32, u32)> + '_ {
         let ends = self.host.blocks.iter().skip(1).map(|b| b.first).chain(std::iter::once(self.count));
-        self.host.blocks.iter().zip(ends).map(|(b, end)| (b.anchor, end - b.first))
+        self.host.blocks.iter().zip(ends).map(|(b, end)| (b.number, end - b.first))
     }
 
     /// Appends a block's arrays to `bytes`; how many Gaussians they are of.
     pub fn read_block(
         &mut self,
         gpu: &mut Gpu,
-        anchor: u32,
+        number: u32,
         moments: bool,
         bytes: &mut Vec<u8>,
     ) -> Result<usize, GpuError> {
-        let (slots, b) = (self.block(anchor), self.buffers);
-        let (first, n) = (slots.start as usize, slots.len());
-        read(gpu, b.splats.part(first, n), bytes)?;
-        read(gpu, b.steps.part(first, n), bytes)?;
-        if self.colour {
-            read(gpu, b.chroma.part(first, n), bytes)?;
-        }
-        if moments {
-            read(gpu, b.moments.part(first, n), bytes)?;
-            if self.colour {
-                read(gpu, b.chroma_moments.part(first, n), bytes)?;
-            }
-        }
+        self.read_blocks(gpu, std::iter::once(number), moments, bytes)
+    }
+
+    /// Appends the arrays of several blocks to `bytes`, block by block.
+    pub fn read_blocks(
+        &mut self,
+        gpu: &mut Gpu,
+        numbers: impl Iterator<Item = u32> + Clone,
+        moments: bool,
+        bytes: &mut Vec<u8>,
+    ) -> Result<usize, GpuError> {
+        let n = numbers.clone().map(|number| self.block(number).len()).sum::<usize>();
+        let (start, size) = (bytes.len(), n * splat_bytes(self.colour, moments));
+        bytes.resize(start + size, 0);
+        let slots = numbers.map(|number| self.block(number));
+        let arrays = slots.flat_map(|slots| self.arrays(slots.start as usize, slots.len(), moments));
+        gpu.download_parts(arrays, &mut bytes[start..])?;
         Ok(n)
     }
 
@@ -56,75 +64,98 @@ impl Pool {
     pub fn insert_block(
         &mut self,
         gpu: &mut Gpu,
-        (anchor, epoch): (u32, u32),
+        (number, epoch): (u32, u32),
         (count, moments): (usize, bool),
-        mut bytes: &[u8],
+        bytes: &[u8],
     ) -> Result<bool, GpuError> {
         let blocks = &self.host.blocks;
-        let fits = count <= self.room() && blocks.len() < BLOCKS && !self.holds(anchor);
+        let fits = count <= self.room() && blocks.len() < BLOCKS && !self.holds(number);
         let last = blocks.last().map_or(0, |b| b.epoch);
         if !fits || epoch < last || bytes.len() != count * splat_bytes(self.colour, moments) {
             return Ok(false);
         }
-        let (first, b) = (self.count as usize, self.buffers);
-        write(gpu, b.splats.part(first, count), &mut bytes)?;
-        write(gpu, b.steps.part(first, count), &mut bytes)?;
-        if self.colour {
-            write(gpu, b.chroma.part(first, count), &mut bytes)?;
-        }
-        if moments {
-            write(gpu, b.moments.part(first, count), &mut bytes)?;
-            if self.colour {
-                write(gpu, b.chroma_moments.part(first, count), &mut bytes)?;
-            }
-        } else {
-            let mut rec = gpu.record();
-            rec.fill(b.moments.part(first, count), 0);
-            if self.colour {
-                rec.fill(b.chroma_moments.part(first, count), 0);
-            }
-            gpu.submit(rec)?;
-        }
-        self.host.blocks.push(Block { anchor, epoch, first: self.count });
+        self.write_arrays(gpu, (self.count as usize, count), moments, bytes)?;
+        self.host.blocks.push(Block { number, epoch, first: self.count });
         self.count += count as u32;
         Ok(true)
     }
 
-    /// Takes out the blocks of the anchors that `goes` names; how many Gaussians.
+    /// Writes the arrays of a block that is here, as many and of the same form as were read.
+    pub fn write_block(&mut self, gpu: &mut Gpu, number: u32, moments: bool, bytes: &[u8]) -> Result<(), GpuError> {
+        let slots = self.block(number);
+        self.write_arrays(gpu, (slots.start as usize, slots.len()), moments, bytes)
+    }
+
+    fn write_arrays(
+        &mut self,
+        gpu: &mut Gpu,
+        (first, count): (usize, usize),
+        moments: bool,
+        mut bytes: &[u8],
+    ) -> Result<(), GpuError> {
+        for part in self.arrays(first, count, moments) {
+            let (of_it, rest) = bytes.split_at(part.len());
+            bytes = rest;
+            gpu.upload(part, 0, of_it)?;
+        }
+        if moments {
+            return Ok(());
+        }
+        let (mut rec, b) = (gpu.record(), self.buffers);
+        rec.fill(b.moments.part(first, count), 0);
+        if self.colour {
+            rec.fill(b.chroma_moments.part(first, count), 0);
+        }
+        gpu.submit(rec)
+    }
+
+    /// The bytes of some slots in each of the arrays that a block in memory has, in their order.
+    fn arrays(&self, first: usize, n: usize, moments: bool) -> impl Iterator<Item = Buf<u8>> {
+        let (b, colour) = (self.buffers, self.colour);
+        let part = |is_there: bool, part: Buf<u8>| is_there.then_some(part);
+        let of_one = [
+            part(true, b.splats.part(first, n).cast()),
+            part(true, b.steps.part(first, n).cast()),
+            part(colour, b.chroma.part(first * usize::from(colour), n * usize::from(colour)).cast()),
+            part(moments, b.moments.part(first, n).cast()),
+            part(moments && colour, b.chroma_moments.part(first * usize::from(colour), n * usize::from(colour)).cast()),
+        ];
+        of_one.into_iter().flatten()
+    }
+
+    /// What of a block lies from a slot on becomes another one, behind it.
+    pub fn cut_block(&mut self, number: u32, other: u32, first: u32) {
+        if let Some(at) = self.host.blocks.iter().position(|b| b.number == number) {
+            let block = Block { number: other, first, ..self.host.blocks[at] };
+            self.host.blocks.insert(at + 1, block);
+        }
+    }
+
+    /// Takes out the blocks that `goes` names; how many Gaussians.
     pub fn remove_blocks(&mut self, gpu: &mut Gpu, goes: impl Fn(u32) -> bool) -> Result<usize, GpuError> {
         let (n, b) = (self.count as usize, self.buffers);
         let super::pool::Transfers { blocks, kept, .. } = &mut self.host;
-        if !blocks.iter().any(|block| goes(block.anchor)) {
+        if !blocks.iter().any(|block| goes(block.number)) {
             return Ok(0);
         }
         // Where each slot goes: the exclusive prefix sum of those that stay.
-        kept.resize(n + 1, 0);
+        kept.clear();
         let mut stay = 0;
-        let mut at = 0;
-        for slot in 0..n {
-            while at + 1 < blocks.len() && blocks[at + 1].first as usize <= slot {
-                at += 1;
+        let before_all = blocks.first().map_or(n, |block| block.first as usize);
+        kept.extend(0..before_all as u32);
+        stay += before_all as u32;
+        for (at, block) in blocks.iter().enumerate() {
+            let end = blocks.get(at + 1).map_or(n, |next| next.first as usize);
+            let by = u32::from(!goes(block.number));
+            for _ in block.first as usize..end {
+                kept.push(stay);
+                stay += by;
             }
-            kept[slot] = stay;
-            let before_all = blocks.first().is_none_or(|block| slot < block.first as usize);
-            stay += u32::from(before_all || !goes(blocks[at].anchor));
         }
-        kept[n] = stay;
+        kept.push(stay);
         gpu.upload(b.kept, 0, kept)?;
         let gone = self.close_gaps(gpu)?;
-        self.host.blocks.retain(|block| !goes(block.anchor));
+        self.host.blocks.retain(|block| !goes(block.number));
         Ok(gone)
     }
-}
-
-fn read<T: Pod>(gpu: &mut Gpu, from: Buf<T>, bytes: &mut Vec<u8>) -> Result<(), GpuError> {
-    let start = bytes.len();
-    bytes.resize(start + from.len() * size_of::<T>(), 0);
-    gpu.download(from.cast::<u8>(), 0, &mut bytes[start..])
-}
-
-fn write<T: Pod>(gpu: &mut Gpu, to: Buf<T>, bytes: &mut &[u8]) -> Result<(), GpuError> {
-    let (of_it, rest) = bytes.split_at(to.len() * size_of::<T>());
-    *bytes = rest;
-    gpu.upload(to.cast::<u8>(), 0, of_it)
 }

@@ -74,10 +74,10 @@ impl Default for PruneRule {
     }
 }
 
-/// An anchor's Gaussians begin here and end where the next block begins.
+/// A block's Gaussians begin here and end where the next block begins.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Block {
-    pub anchor: u32,
+    pub number: u32,
     pub epoch: u32,
     pub first: u32,
 }
@@ -92,7 +92,7 @@ const APPENDED_AT_ONCE: usize = 4096;
 /// A block's seeds take one in so many of the free places, so that there is always room for the next.
 pub const FREE_DIVISOR: usize = 8;
 /// Blocks in the pool at once.
-pub const BLOCKS: usize = 1024;
+pub const BLOCKS: usize = 4096;
 
 /// How many Gaussians have which importance.
 pub type Bins = [u32; BINS];
@@ -216,20 +216,20 @@ impl Pool {
         self.capacity as usize
     }
 
-    /// What is appended from now on belongs to `anchor`, of an epoch that is none before the newest's. False, and nothing
-    /// done, where there are as many blocks as there may be.
-    pub fn open_block(&mut self, anchor: u32, epoch: u32) -> bool {
+    /// What is appended from now on belongs to block `number`, of an epoch that is none before the newest's. False, and
+    /// nothing done, where there are as many blocks as there may be.
+    pub fn open_block(&mut self, number: u32, epoch: u32) -> bool {
         let blocks = &mut self.host.blocks;
         let fits = blocks.len() < BLOCKS;
         if fits {
-            blocks.push(Block { anchor, epoch, first: self.count });
+            blocks.push(Block { number, epoch, first: self.count });
         }
         fits
     }
 
-    /// The anchor that what is appended belongs to.
+    /// The number of the block that what is appended belongs to.
     pub fn newest(&self) -> Option<u32> {
-        self.host.blocks.last().map(|b| b.anchor)
+        self.host.blocks.last().map(|b| b.number)
     }
 
     /// The slots of an epoch's Gaussians: all of them where no block was opened.
@@ -247,10 +247,10 @@ impl Pool {
         (epoch, self.slots(epoch))
     }
 
-    /// The slots of an anchor's Gaussians; empty where it has none.
-    pub fn block(&self, anchor: u32) -> Range<u32> {
+    /// The slots of a block's Gaussians; empty where it is not here.
+    pub fn block(&self, number: u32) -> Range<u32> {
         let blocks = &self.host.blocks;
-        match blocks.iter().position(|b| b.anchor == anchor) {
+        match blocks.iter().position(|b| b.number == number) {
             Some(i) => blocks[i].first..blocks.get(i + 1).map_or(self.count, |next| next.first),
             None => 0..0,
         }
@@ -382,16 +382,16 @@ impl Pool {
         Ok(bins)
     }
 
-    /// Moves each anchor's Gaussians: x' = by x, as many anchors in a submission as it has room for.
+    /// Moves each block's Gaussians: x' = by x, as many blocks in a submission as it has room for.
     pub fn move_blocks(&self, gpu: &mut Gpu, moves: impl Iterator<Item = (u32, Pose)>) -> Result<(), GpuError> {
         let b = &self.buffers;
         let mut rec = gpu.record();
-        for (anchor, by) in moves {
+        for (number, by) in moves {
             if rec.room() == 0 {
                 gpu.submit(rec)?;
                 rec = gpu.record();
             }
-            let slots = self.block(anchor);
+            let slots = self.block(number);
             let (r, t) = (by.rotation().transpose(), by.p);
             let row = |i: usize| [r.col(i).x as f32, r.col(i).y as f32, r.col(i).z as f32, t[i] as f32];
             let push = move_block::Push {

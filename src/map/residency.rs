@@ -1,11 +1,12 @@
 //! Which blocks are in memory.
 //!
 //! What is wanted follows from the keyframes that are known. When one comes, that is what those see that are nearest to where
-//! the vehicle is, and to where it will be in two seconds, as much as fits beside a reserve for what is new. Between keyframes
-//! the pool turns to other places and back (`rehearse`): the map forgets a place that is never trained on, and a view along a
-//! corridor needs what is seen from none of those nearby. A block that is not wanted stays until its room is needed.
-//! What keyframes nearby that look at the same as the newest see is wanted whether or not it fits; where it does not, the least
-//! important Gaussians go: a scene that is denser than the pool is thinned, and one that is larger is paged.
+//! the vehicle is, and to where it will be in two seconds; then what those see that lack the fewest Gaussians, so that as many
+//! views as may be can be trained on; as much as fits beside a reserve for what is new. Between keyframes the pool turns to other
+//! places (`rehearse`): the map forgets a place that is never trained on, and a view along a corridor needs what is seen from
+//! none of those nearby. A block that is not wanted stays until its room is needed.
+//! What keyframes nearby that look at the same as the newest see of what is near is wanted whether or not it fits; where it does
+//! not, the least important Gaussians go: a scene that is denser than the pool is thinned, and one that is larger is paged.
 //!
 //! A keyframe may see blocks that are not in the pool. The cells of its picture that show much of them are not compared
 //! (`sight`): the Gaussians that are there would be bent to stand for those that are missing.
@@ -15,10 +16,10 @@
 use super::archive::{Archive, Arrived};
 use super::block::BlockAbout;
 use super::choice::{Choice, NEWEST};
-use super::filing::BLOCKS_KNOWN;
 use super::horizon::{cell_of, Horizon};
 use super::scene::Scene;
 use super::schedule::Rng;
+use super::sight::seen_by;
 use super::view::View;
 use super::views::Views;
 use crate::gpu::GpuError;
@@ -37,13 +38,19 @@ const LEFT_MAX: f32 = 0.04;
 /// A keyframe as near as this, m, looks at the same as the newest where they, too, see this part of what it sees.
 const LOCAL_M: f32 = 2.0;
 const SHARED_MIN: f32 = 0.8;
+/// Keyframes nearest to a place whose blocks may be wanted there.
+const NEAREST: usize = 128;
+/// What is as near as this to the vehicle, m, is thinned rather than left out.
+const NEAR_M: f32 = 8.0;
+/// A block of which a keyframe sees less than this part of what it sees of its blocks on average is not fetched for it.
+const NEEDED_MIN: f32 = 0.25;
 /// Part of the pool that is left for what is new when a keyframe comes.
 const RESERVE_DIVISOR: usize = 8;
 /// Blocks asked for when a keyframe comes, some MiB, and between training steps.
-const PAGED_AT_ONCE: usize = 8;
-const PAGED_A_STEP: usize = 4;
+const PAGED_AT_ONCE: usize = 32;
+const PAGED_A_STEP: usize = 16;
 /// Training steps at a place before the pool turns to another.
-const STEPS_AT_A_PLACE: i32 = 20;
+const STEPS_AT_A_PLACE: u64 = 20;
 /// Views drawn to find another place.
 const PLACES_DRAWN: usize = 4;
 /// Part of a horizon that may be open.
@@ -52,18 +59,10 @@ const OPEN_MAX: f64 = 0.05;
 const PATIENCE: Duration = Duration::from_secs(2);
 
 impl Archive {
-    /// Gaussians of a block that a keyframe sees, by the block's samples.
-    fn seen(&self, keyframe: usize, block: usize) -> f32 {
-        let b = &self.blocks[block];
-        let samples = f32::from(self.sight[keyframe * BLOCKS_KNOWN + block]);
-        samples * b.count as f32 / f32::from(b.samples_len.max(1))
-    }
-
     /// The part of the Gaussians that a keyframe sees that are in blocks that `here` names; all of none.
     fn part_seen(&self, keyframe: usize, here: impl Fn(usize) -> bool) -> f32 {
         let (mut all, mut away) = (0.0, 0.0);
-        for block in 0..self.blocks.len() {
-            let seen = self.seen(keyframe, block);
+        for (block, seen) in seen_by(&self.sight, &self.blocks, keyframe) {
             all += seen;
             away += if here(block) { 0.0 } else { seen };
         }
@@ -109,42 +108,40 @@ impl Archive {
         self.page(scene, PAGED_AT_ONCE, busy)
     }
 
-    /// Turns the pool to another place after so many training steps where the vehicle is, and back after as many there, and
-    /// fetches some of what is wanted. Called between training steps; a keyframe that comes turns it back, too.
+    /// Turns the pool to another place after so many training steps at one, and fetches some of what is wanted. Called between
+    /// training steps; a keyframe that comes turns it to where the vehicle is.
     pub fn rehearse(&mut self, scene: &mut Scene, rng: &mut Rng) -> Result<(), GpuError> {
-        let Some((_, pose)) = self.choice.last else { return Ok(()) };
-        let elsewhere = self.choice.elsewhere.is_some();
-        let by = if elsewhere { -1 } else { 1 };
-        self.choice.steps_ahead = (self.choice.steps_ahead + by).clamp(0, STEPS_AT_A_PLACE);
-        if elsewhere && self.choice.steps_ahead == 0 {
-            self.turn(scene, None, pose);
-        } else if !elsewhere && self.choice.steps_ahead == STEPS_AT_A_PLACE {
+        if self.choice.last.is_none() {
+            return Ok(());
+        }
+        self.choice.steps += 1;
+        if self.choice.steps % STEPS_AT_A_PLACE == 0 {
             if let Some(view) = self.draw_place(&scene.views, rng) {
-                self.turn(scene, Some(view), scene.views.world_from_body(view as usize));
+                self.turn(scene, view, scene.views.world_from_body(view as usize));
             }
         }
         self.page(scene, PAGED_A_STEP, false)
     }
 
-    /// Wants what is seen at a place, the view's or the vehicle's; no room is left for what is new.
-    fn turn(&mut self, scene: &Scene, elsewhere: Option<u32>, pose: Pose) {
-        (self.choice.elsewhere, self.choice.reserve) = (elsewhere, 0);
+    /// Wants what is seen at the place of a view; no room is left for what is new.
+    fn turn(&mut self, scene: &Scene, view: u32, pose: Pose) {
+        (self.choice.elsewhere, self.choice.reserve) = (Some(view), 0);
         self.choose(scene, &[pose]);
         // Views of the last place were drawn ahead.
         self.drawn.next.clear();
     }
 
-    /// Draws a view some of which is not in the pool: of a few such the one with the fewest steps.
+    /// Draws a view: of a few the one with the fewest steps. None where all of it is in the pool.
     fn draw_place(&self, views: &Views, rng: &mut Rng) -> Option<u32> {
         // A map that fits draws its views as one without a store.
         if self.blocks.iter().all(|b| b.in_pool || b.samples_len == 0 || b.epoch != self.choice.epoch) {
             return None;
         }
         let drawn = (0..PLACES_DRAWN).filter_map(|_| rng.one_of(views.training()));
-        let away = drawn
-            .map(|view| views.first(view as usize))
-            .filter(|first| views.get(*first).epoch == self.choice.epoch && !self.is_shown(*first / views.cameras()));
-        away.min_by_key(|first| views.get(*first).steps).map(|first| first as u32)
+        let away =
+            drawn.map(|view| views.first(view as usize)).filter(|first| views.get(*first).epoch == self.choice.epoch);
+        let fewest = away.min_by_key(|first| views.get(*first).steps);
+        fewest.filter(|first| !self.is_shown(*first / views.cameras())).map(|first| first as u32)
     }
 
     /// Writes the blocks whose burst ended before its time, as another anchor came, and looks who sees them. The newest still
@@ -153,8 +150,8 @@ impl Archive {
         let newest = scene.pipeline.pool.newest().filter(|_| busy);
         for block in 0..self.blocks.len() {
             let b = self.blocks[block];
-            if b.in_pool && b.samples_len == 0 && newest != Some(b.anchor) && self.save_block(scene, block)? {
-                self.look_for(scene, block);
+            if b.in_pool && b.samples_len == 0 && newest != Some(b.number) {
+                self.complete(scene, block)?;
             }
         }
         Ok(())
@@ -162,8 +159,8 @@ impl Archive {
 
     /// Wants what the keyframes nearest to some poses see.
     fn choose(&mut self, scene: &Scene, poses: &[Pose]) {
-        for (anchor, count) in scene.pipeline.pool.blocks() {
-            if let Some(block) = self.block_of(anchor) {
+        for (number, count) in scene.pipeline.pool.blocks() {
+            if let Some(block) = self.block_of(number) {
                 self.blocks[block].count = count;
             }
         }
@@ -184,6 +181,7 @@ impl Archive {
             self.choice.order.push((nearest as f32, keyframe as u32));
         }
         self.choice.order.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+        self.choice.order.truncate(NEAREST);
         self.want_views_of(scene.pipeline.pool.capacity() - self.choice.reserve);
     }
 
@@ -192,64 +190,142 @@ impl Archive {
         let newest = self.known.len().saturating_sub(NEWEST)..self.known.len();
         let Archive { choice, sight, blocks, .. } = self;
         choice.now_seen.clear();
-        choice.now_seen.extend((0..blocks.len()).map(|b| newest.clone().any(|k| sight[k * BLOCKS_KNOWN + b] > 0)));
+        choice.now_seen.resize(blocks.len(), false);
+        newest.for_each(|keyframe| sight.blocks(keyframe).for_each(|block| choice.now_seen[block] = true));
     }
 
-    /// Wants the blocks that the keyframes in `order` see, one keyframe after the other, until they fill the room; where the
-    /// vehicle is, past that those alone that look at what is seen now.
+    /// Wants the blocks that the keyframes in `order` see: where the vehicle is, first those of keyframes that look at what is
+    /// seen now, whether or not they fit; then one keyframe after the other, until the room is full.
     fn want_views_of(&mut self, room: usize) {
         self.find_now_seen();
-        let here = self.choice.elsewhere.is_none();
         let order = std::mem::take(&mut self.choice.order);
         self.choice.wanted.fill(false);
         self.choice.blocks.clear();
-        let (mut taken, mut full) = (0, false);
-        for (nth, &(near, keyframe)) in order.iter().enumerate() {
-            let looks_at_the_same =
-                |a: &Archive| a.part_seen(keyframe as usize, |b| a.choice.now_seen[b]) >= SHARED_MIN;
-            let stays = here && near <= LOCAL_M && looks_at_the_same(self);
-            if full && !stays {
-                continue;
-            }
-            // All of what the place itself shows; of what others see, what is behind far doors is left out.
-            let left = if nth == 0 && !here { 0.0 } else { LEFT_MAX };
-            // What it sees most of first, until nearly all of it is wanted.
-            while self.part_seen(keyframe as usize, |b| self.choice.wanted[b]) < 1.0 - left {
-                let more = |b: &usize| !self.choice.wanted[*b] && self.seen(keyframe as usize, *b) > 0.0;
-                let most = (0..self.blocks.len()).filter(more).max_by(|a, b| {
-                    self.seen(keyframe as usize, *a).total_cmp(&self.seen(keyframe as usize, *b)).then(b.cmp(a))
-                });
-                let Some(block) = most else { break };
-                full |= taken + self.blocks[block].count as usize > room;
-                if full && !stays {
-                    break;
+        let mut taken = 0;
+        if self.choice.elsewhere.is_none() {
+            for &(_, keyframe) in order.iter().take_while(|(near, _)| *near <= LOCAL_M) {
+                if self.part_seen(keyframe as usize, |b| self.choice.now_seen[b]) >= SHARED_MIN {
+                    self.want_near(keyframe as usize, &mut taken);
                 }
-                taken += self.blocks[block].count as usize;
-                self.choice.wanted[block] = true;
-                self.choice.blocks.push(block as u32);
+            }
+        }
+        self.choice.thins = taken > room;
+        let local = if self.choice.elsewhere.is_none() { LOCAL_M } else { 0.0 };
+        for (nth, &(_, keyframe)) in order.iter().enumerate().take_while(|(nth, (near, _))| *nth == 0 || *near <= local)
+        {
+            // All of what another place itself shows; of what others see, what is behind far doors is left out.
+            let left = if nth == 0 && self.choice.elsewhere.is_some() { 0.0 } else { LEFT_MAX };
+            if !self.want_until(keyframe as usize, left, room, &mut taken) {
+                break;
             }
         }
         self.choice.order = order;
+        self.want_cheapest(room - taken.min(room));
     }
 
-    /// Wants the blocks that a keyframe sees, those that it sees most of first, as many as fit.
-    fn want_seen_by(&mut self, keyframe: usize, room: usize) {
-        self.choice.wanted.fill(false);
-        let row = &self.sight[keyframe * BLOCKS_KNOWN..][..self.blocks.len()];
-        let blocks = &mut self.choice.blocks;
-        blocks.clear();
-        blocks.extend((0..row.len() as u32).filter(|b| row[*b as usize] > 0));
-        blocks.sort_unstable_by_key(|b| (u8::MAX - row[*b as usize], *b));
-        let mut taken = 0;
-        for b in blocks {
-            let count = self.blocks[*b as usize].count as usize;
-            if taken + count <= room {
-                taken += count;
-                self.choice.wanted[*b as usize] = true;
+    /// Wants what the keyframes see that lack the fewest Gaussians beside what is wanted already, so that there are as many
+    /// views to train on as there may be.
+    fn want_cheapest(&mut self, mut room: usize) {
+        let order = std::mem::take(&mut self.choice.order);
+        let mut lacking = std::mem::take(&mut self.choice.lacking);
+        let Archive { sight, blocks, choice, .. } = self;
+        let lacks = |wanted: &[bool], keyframe: u32, least: f32| -> usize {
+            let seen = seen_by(sight, blocks, keyframe as usize);
+            seen.filter(|(b, n)| *n > least && !wanted[*b]).map(|(b, _)| blocks[b].count as usize).sum()
+        };
+        lacking.clear();
+        for &(_, keyframe) in &order {
+            let (mut all, mut n) = (0.0, 0.0f32);
+            seen_by(sight, blocks, keyframe as usize).for_each(|(_, seen)| (all, n) = (all + seen, n + 1.0));
+            let least = NEEDED_MIN * all / n.max(1.0);
+            lacking.push((lacks(&choice.wanted, keyframe, least), least));
+        }
+        loop {
+            let fits = |i: &usize| (1..=room).contains(&lacking[*i].0);
+            let Some(next) = (0..order.len()).filter(fits).min_by_key(|i| (lacking[*i].0, *i)) else { break };
+            let (keyframe, (count, least)) = (order[next].1, lacking[next]);
+            for (block, seen) in seen_by(sight, blocks, keyframe as usize) {
+                if seen > least && !choice.wanted[block] {
+                    choice.wanted[block] = true;
+                    choice.blocks.push(block as u32);
+                }
+            }
+            room -= count;
+            for (lacking, &(_, other)) in lacking.iter_mut().zip(&order).filter(|(lacking, _)| lacking.0 > 0) {
+                lacking.0 = lacks(&choice.wanted, other, lacking.1);
             }
         }
-        let Choice { blocks, wanted, .. } = &mut self.choice;
-        blocks.retain(|b| wanted[*b as usize]);
+        (self.choice.order, self.choice.lacking) = (order, lacking);
+    }
+
+    /// Wants the blocks that a keyframe sees that are near the vehicle.
+    fn want_near(&mut self, keyframe: usize, taken: &mut usize) {
+        let Archive { sight, blocks, choice, .. } = self;
+        let Some((_, at)) = choice.last else { return };
+        for (block, _) in seen_by(sight, blocks, keyframe) {
+            let b = &blocks[block];
+            if b.centre.distance(at.p.as_vec3()) <= NEAR_M && !choice.wanted[block] {
+                *taken += b.count as usize;
+                choice.wanted[block] = true;
+                choice.blocks.push(block as u32);
+            }
+        }
+    }
+
+    /// Wants the blocks that a keyframe sees most of, until all but a part of what it sees is wanted; false where that is more
+    /// than there is room for.
+    fn want_until(&mut self, keyframe: usize, left: f32, room: usize, taken: &mut usize) -> bool {
+        let Archive { sight, blocks, choice, .. } = self;
+        let Choice { wanted, ranked, blocks: chosen, .. } = choice;
+        let all: f32 = seen_by(sight, blocks, keyframe).map(|(_, seen)| seen).sum();
+        ranked.clear();
+        ranked.extend(seen_by(sight, blocks, keyframe).filter(|(b, _)| !wanted[*b]).map(|(b, seen)| (seen, b as u32)));
+        ranked.sort_unstable_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
+        let mut missing: f32 = ranked.iter().map(|(seen, _)| seen).sum();
+        for &(seen, block) in ranked.iter() {
+            if missing <= left * all {
+                break;
+            }
+            let count = blocks[block as usize].count as usize;
+            if *taken + count > room {
+                return false;
+            }
+            *taken += count;
+            missing -= seen;
+            wanted[block as usize] = true;
+            chosen.push(block);
+        }
+        true
+    }
+
+    /// Wants the blocks that a keyframe sees, those that it sees most of first, then what else is before its camera, the nearest
+    /// first, as many as fit.
+    fn want_seen_by(&mut self, keyframe: usize, view: &View, room: usize) {
+        let mut ranked = std::mem::take(&mut self.choice.ranked);
+        ranked.clear();
+        ranked.extend(seen_by(&self.sight, &self.blocks, keyframe).map(|(b, seen)| (-seen, b as u32)));
+        let seen = ranked.len();
+        for block in self.in_reach(view) {
+            if !ranked[..seen].iter().any(|(_, other)| *other == block as u32) {
+                let far = self.blocks[block].centre.as_dvec3().distance(view.world_from_cam.p);
+                ranked.push((far as f32, block as u32));
+            }
+        }
+        let Archive { blocks, choice, .. } = self;
+        let Choice { wanted, blocks: chosen, .. } = choice;
+        wanted.fill(false);
+        chosen.clear();
+        ranked.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+        let mut taken = 0;
+        for &(_, block) in ranked.iter() {
+            let count = blocks[block as usize].count as usize;
+            if taken + count <= room {
+                taken += count;
+                wanted[block as usize] = true;
+                chosen.push(block);
+            }
+        }
+        choice.ranked = ranked;
     }
 
     /// Puts what came from the disk in its place, and asks for `most` blocks more of what is wanted. While a new block grows
@@ -259,14 +335,23 @@ impl Archive {
             return Ok(());
         }
         self.receive(scene)?;
+        let missing = |a: &Archive, block: usize| {
+            let b = &a.blocks[block];
+            (!b.in_pool && !b.asked && b.samples_len > 0).then_some(b.count as usize)
+        };
+        // Room for all of them at once: what leaves is taken out of the pool's arrays together.
+        let counts = self.choice.blocks.iter().filter_map(|b| missing(self, *b as usize));
+        let wanted: usize = counts.take(most).sum();
+        if wanted == 0 {
+            return Ok(());
+        }
+        self.make_room(scene, wanted)?;
         let mut asked = 0;
         for i in 0..self.choice.blocks.len() {
             let block = self.choice.blocks[i] as usize;
-            let b = self.blocks[block];
-            if b.in_pool || b.asked || b.samples_len == 0 {
-                continue;
-            }
-            if asked == most || !self.make_room(scene, b.count as usize)? || !self.ask_for_block(&scene.views, block) {
+            let Some(count) = missing(self, block) else { continue };
+            let fits = count <= scene.pipeline.pool.room();
+            if asked == most || !fits || !self.ask_for_block(&scene.views, block) {
                 break;
             }
             asked += 1;
@@ -304,7 +389,7 @@ impl Archive {
             return Ok(());
         }
         let (gpu, pool, count) = (&mut scene.gpu, &mut scene.pipeline.pool, about.count as usize);
-        let in_pool = pool.insert_block(gpu, (b.anchor, b.epoch), (count, about.moments), &fetched.payload)?;
+        let in_pool = pool.insert_block(gpu, (b.number, b.epoch), (count, about.moments), &fetched.payload)?;
         if in_pool {
             self.blocks[block].in_pool = true;
             self.blocks[block].count = count as u32;
@@ -313,7 +398,7 @@ impl Archive {
             // What moved while it was away.
             let by = b.placed * about.placed.inverse();
             if by.p.length() > 0.0 || by.q.to_scaled_axis().length() > 0.0 {
-                pool.move_blocks(gpu, std::iter::once((b.anchor, by)))?;
+                pool.move_blocks(gpu, std::iter::once((b.number, by)))?;
             }
         }
         Ok(())
@@ -326,35 +411,47 @@ impl Archive {
         let (mut room, at) = (scene.pipeline.pool.room(), self.choice.last.map(|(_, pose)| pose.p.as_vec3()));
         let mut leaving = std::mem::take(&mut self.choice.leaving);
         leaving.clear();
-        while room < count + reserve {
-            let far = |b: &usize| at.map_or(0.0, |at: Vec3| self.blocks[*b].centre.distance(at));
-            let may = |b: &usize| {
-                let known = &self.blocks[*b];
-                known.in_pool && known.samples_len > 0 && !self.choice.wanted[*b] && !leaving.contains(&known.anchor)
-            };
-            let Some(block) = (0..self.blocks.len()).filter(may).max_by(|a, b| far(a).total_cmp(&far(b))) else {
-                break;
-            };
-            if !self.save_if_changed(scene, block)? {
-                break;
+        if room < count + reserve {
+            // The farthest first.
+            let mut ranked = std::mem::take(&mut self.choice.ranked);
+            ranked.clear();
+            for (number, _) in scene.pipeline.pool.blocks() {
+                let Some(block) = self.block_of(number) else { continue };
+                let b = &self.blocks[block];
+                if b.samples_len > 0 && !self.choice.wanted[block] {
+                    ranked.push((at.map_or(0.0, |at: Vec3| b.centre.distance(at)), block as u32));
+                }
             }
-            room += self.blocks[block].count as usize;
-            leaving.push(self.blocks[block].anchor);
+            ranked.sort_unstable_by(|a, b| b.0.total_cmp(&a.0).then(b.1.cmp(&a.1)));
+            let lacks = |(_, block): &&(f32, u32)| {
+                let lacks = room < count + reserve;
+                room += self.blocks[*block as usize].count as usize;
+                lacks
+            };
+            let leave = ranked.iter().take_while(lacks).count();
+            let leave = self.save_blocks(scene, &ranked[..leave], false)?;
+            leaving.extend(ranked[..leave].iter().map(|(_, block)| self.blocks[*block as usize].number));
+            self.choice.ranked = ranked;
         }
         self.take_out(scene, &leaving)?;
         self.choice.leaving = leaving;
         let room = scene.pipeline.pool.room();
-        Ok(room >= count || self.choice.evict && scene.make_room(count, true)? >= count)
+        let thins = self.choice.evict && self.choice.thins;
+        Ok(room >= count || thins && scene.make_room(count, true)? >= count)
     }
 
-    fn take_out(&mut self, scene: &mut Scene, anchors: &[u32]) -> Result<(), GpuError> {
-        if anchors.is_empty() {
+    fn take_out(&mut self, scene: &mut Scene, numbers: &[u32]) -> Result<(), GpuError> {
+        if numbers.is_empty() {
             return Ok(());
         }
-        scene.pipeline.pool.remove_blocks(&mut scene.gpu, |anchor| anchors.contains(&anchor))?;
-        self.blocks.iter_mut().filter(|b| anchors.contains(&b.anchor)).for_each(|b| b.in_pool = false);
+        scene.pipeline.pool.remove_blocks(&mut scene.gpu, |number| numbers.contains(&number))?;
+        for &number in numbers {
+            if let Some(block) = self.block_of(number) {
+                self.blocks[block].in_pool = false;
+            }
+        }
         self.exchanges += 1;
-        scene.counters.blocks_paged_out.add(anchors.len() as u64);
+        scene.counters.blocks_paged_out.add(numbers.len() as u64);
         Ok(())
     }
 
@@ -365,7 +462,7 @@ impl Archive {
         for block in 0..self.blocks.len() {
             let b = self.blocks[block];
             if b.in_pool && b.epoch != epoch && self.save_if_changed(scene, block)? {
-                leaving.push(b.anchor);
+                leaving.push(b.number);
             }
         }
         self.take_out(scene, &leaving)?;
@@ -376,10 +473,15 @@ impl Archive {
     /// Takes the horizon of a view from the scene's last picture, which is of it, and looks from there.
     pub fn saw(&mut self, scene: &mut Scene, first: usize) {
         let (view, mut horizon) = (scene.view(first), Horizon::of(&scene.rendered));
-        horizon.take_over(&scene.views.get(first).horizon);
         let keyframe = first / scene.views.cameras();
+        if !self.is_shown(keyframe) {
+            // A hole in the picture is what is absent.
+            horizon.take_over(&scene.views.get(first).horizon);
+        }
         scene.views.get_mut(first).horizon = horizon;
         if keyframe < self.known.len() {
+            // Its state is to be written again.
+            self.known[keyframe].stated = u32::MAX;
             self.known[keyframe].open = horizon.open_part() > OPEN_MAX;
             self.known[keyframe].looked_at = 0;
             self.look_from(&view, &horizon, keyframe);
@@ -396,7 +498,7 @@ impl Archive {
 
     /// The valid pixels of a view less the cells that show what is not in the pool; `None` where there are none of these.
     pub fn hide(&mut self, view: &View, horizon: &Horizon, valid: &[u8]) -> Option<&[u8]> {
-        let cells = self.hidden_from(view, horizon);
+        let (cells, _) = self.hidden_from(view, horizon, self.in_reach(view));
         if cells.is_empty() {
             return None;
         }
@@ -429,7 +531,7 @@ impl Archive {
         self.choice.reserve = 0;
         let keyframe = index / scene.views.cameras();
         self.leave_other_epochs(scene, scene.views.get(index).epoch)?;
-        self.want_seen_by(keyframe, scene.pipeline.pool.capacity());
+        self.want_seen_by(keyframe, &scene.view(index), scene.pipeline.pool.capacity());
         let begun = Instant::now();
         let missing = |a: &Archive| a.choice.blocks.iter().any(|b| a.blocks[*b as usize].asked);
         loop {

@@ -5,10 +5,11 @@
 //! groups instead, each trained on for a while, cost 0.75 dB (24 places for 121 views, 3255 steps, the simulator's two rooms):
 //! the map then fits the few views of the last group.
 
-use super::archive::{Archive, Block};
+use super::archive::Archive;
 use super::choice::newest_kept;
 use super::filing::read_planes;
 use super::horizon::CELLS;
+use super::parts::PARTS;
 use super::scene::Scene;
 use super::schedule::Rng;
 use super::views::Views;
@@ -78,15 +79,18 @@ impl Archive {
 
     /// One of the views whose images are here and that may be trained on.
     fn any_here(&mut self, scene: &mut Scene, rng: &mut Rng) -> Option<usize> {
-        let (mut found, mut n) = (None, 0);
-        for at in 0..self.drawn.trainable.len() {
-            let index = self.drawn.trainable[at];
-            if self.is_here(&scene.views, index) && self.shows_enough(scene, index) {
+        for _ in 0..DRAWS {
+            let (mut found, mut n) = (None, 0);
+            for &index in self.drawn.trainable.iter().filter(|index| self.is_here(&scene.views, **index)) {
                 n += 1;
-                found = if rng.below(n) == 0 { Some(index as usize) } else { found };
+                found = if rng.below(n) == 0 { Some(index) } else { found };
+            }
+            let index = found?;
+            if self.shows_enough(scene, index) {
+                return Some(index as usize);
             }
         }
-        found
+        None
     }
 
     /// Whether a view's images have a place and have come.
@@ -135,7 +139,10 @@ impl Archive {
         }
         for view in first..first + cameras {
             let horizon = scene.views.get(view).horizon;
-            scene.views.get_mut(view).hidden = self.hidden_from(&scene.view(view), &horizon);
+            let seen = self.sight.blocks(first / cameras);
+            let (hidden, in_part) = self.hidden_from(&scene.view(view), &horizon, seen);
+            let entry = scene.views.get_mut(view);
+            (entry.hidden, entry.in_part) = (hidden, in_part);
         }
         self.known[first / cameras].looked_at = self.exchanges;
     }
@@ -166,10 +173,13 @@ impl Archive {
             return Ok(true);
         }
         let cameras = scene.views.cameras();
+        // Where places are few, each would be the last of its block, and none would ever go.
+        let anchors = self.blocks.iter().filter(|b| b.in_pool && b.number % PARTS == 0).count();
+        let few = scene.views.places() < VIEWS_PER_BLOCK * anchors;
         let mut tried = [usize::MAX; 4];
         for n in 0..tried.len() {
             let untried = scene.views.placed().filter(|first| !tried.contains(first));
-            let ranked = untried.filter_map(|first| Some((self.rank(&scene.views, first)?, first)));
+            let ranked = untried.filter_map(|first| Some((self.rank(&scene.views, first, few)?, first)));
             let Some((_, first)) = ranked.max() else { break };
             tried[n] = first;
             if self.known[first / cameras].open {
@@ -190,22 +200,26 @@ impl Archive {
 
     /// How much the images of a keyframe may go: by kind, then the longer they were here; `None` where they must stay. What goes
     /// does not depend on the steps it got, so all are trained on alike.
-    fn rank(&self, views: &Views, first: usize) -> Option<(u8, u64)> {
+    fn rank(&self, views: &Views, first: usize, few: bool) -> Option<(u8, u64)> {
         let cameras = views.cameras();
         let (entry, keyframe) = (views.get(first), first / cameras);
         let newest = views.placed().max().unwrap_or(0) / cameras;
         let recent = keyframe + newest_kept(views.places()) > newest;
         let next = self.drawn.next.iter().any(|i| *i as usize / cameras == keyframe);
-        let grows = |b: &Block| b.anchor as usize == first && b.in_pool && b.samples_len == 0;
-        if self.blocks.iter().any(grows) || self.known.get(keyframe)?.asked > 0 || next || recent && !entry.held_out {
+        let grows = |block: usize| self.blocks[block].in_pool && self.blocks[block].samples_len == 0;
+        if self.block_of(first as u32 * PARTS).is_some_and(grows)
+            || self.known.get(keyframe)?.asked > 0
+            || next
+            || recent && !entry.held_out
+        {
             return None;
         }
-        // Where places are few, each would be the last of its block, and none would ever go.
-        let few = views.places() < VIEWS_PER_BLOCK * self.blocks.iter().filter(|b| b.in_pool).count();
         let last = !few
             && self.home(keyframe).is_some_and(|home| {
                 let shares = |f: &usize| *f != first && self.home(*f / cameras) == Some(home);
-                self.blocks[home].in_pool && !views.placed().any(|f| shares(&f))
+                let parts = home * PARTS..(home + 1) * PARTS;
+                let is_here = parts.filter_map(|part| self.block_of(part)).any(|part| self.blocks[part].in_pool);
+                is_here && !views.placed().any(|f| shares(&f))
             });
         let kind = if entry.held_out {
             3

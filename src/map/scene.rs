@@ -3,6 +3,7 @@
 use super::cameras::TrainingCamera;
 use super::coarseness::Coarseness;
 use super::exposure::{gain_from, median_exposure, Exposure};
+use super::parts::PARTS;
 use super::pipeline::Pipeline;
 use super::pool::{threshold, PruneRule};
 use super::render::Rendered;
@@ -55,6 +56,7 @@ impl Scene {
             camera: self.views.camera(index) as u32,
             exposure: self.views.exposure(index),
             hidden: self.views.get(index).hidden,
+            in_part: self.views.get(index).in_part,
         }
     }
 
@@ -107,7 +109,9 @@ impl Scene {
     /// these are counted.
     pub fn apply_corrections(&mut self, tolerance: f64) -> Result<(), GpuError> {
         let displaced = self.views.displaced(tolerance).inspect(|_| self.counters.blocks_moved.add(1));
-        self.pipeline.pool.move_blocks(&mut self.gpu, displaced)
+        let pool = &self.pipeline.pool;
+        let parts = |(anchor, by): (u32, Pose)| (anchor * PARTS..(anchor + 1) * PARTS).map(move |part| (part, by));
+        pool.move_blocks(&mut self.gpu, displaced.flat_map(parts).filter(|(part, _)| pool.holds(*part)))
     }
 
     /// The exposure of the median training view: what takes the map's colours, whose gauge is none of a camera's, to what

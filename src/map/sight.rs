@@ -1,26 +1,37 @@
 //! Which keyframes see which blocks: told by horizons and by samples of the blocks, for all that is known, wherever it is.
 
 use super::archive::{Archive, Block};
-use super::filing::BLOCKS_KNOWN;
-use super::horizon::{Cells, Horizon, CELLS, COLUMNS, ROWS};
+use super::horizon::{Cells, Horizon, CELLS, COLUMNS, ROWS, SIGMAS};
 use super::scene::Scene;
+use super::seen::Sight;
 use super::view::View;
-use glam::{DVec3, Vec3};
+use glam::DVec3;
 
 /// Part of what is seen in a cell and beside it that may be missing while the cell is still compared. Masking more costs more
 /// than the Gaussians that are bent for a while: with 0.1, 0.3 and 0.6 the patrol's first 240 s had 25.6, 26.3 and 26.2 dB.
 const AWAY_MAX: f32 = 0.3;
 
+/// σ in a picture, over the picture's width, of a Gaussian that counts as one, and how many the largest may count as.
+const SIZE_ONE: f64 = 0.015;
+const SIZE_MAX: f64 = 4.0;
+/// The blocks that a keyframe sees, and the Gaussians that it sees of them, by their samples and how large they are in it.
+pub fn seen_by<'a>(sight: &'a Sight, blocks: &'a [Block], keyframe: usize) -> impl Iterator<Item = (usize, f32)> + 'a {
+    sight.of(keyframe).iter().map(|seen| {
+        let b = &blocks[usize::from(seen.block)];
+        (usize::from(seen.block), seen.samples() * b.count as f32 / f32::from(b.samples_len.max(1)))
+    })
+}
+
 impl Archive {
-    /// The block that a keyframe sees most of.
-    pub fn home(&self, keyframe: usize) -> Option<usize> {
-        let row = &self.sight[keyframe * BLOCKS_KNOWN..][..self.blocks.len()];
-        let most = row.iter().copied().max().filter(|n| *n > 0)?;
-        row.iter().position(|n| *n == most)
+    /// The anchor of the block that a keyframe sees most of.
+    pub fn home(&self, keyframe: usize) -> Option<u32> {
+        let most = seen_by(&self.sight, &self.blocks, keyframe).max_by(|a, b| a.1.total_cmp(&b.1).then(b.0.cmp(&a.0)));
+        most.map(|(block, _)| self.blocks[block].anchor)
     }
 
     /// Looks again which blocks a view sees, by its horizon.
     pub fn look_from(&mut self, view: &View, horizon: &Horizon, keyframe: usize) {
+        self.sight.clear(keyframe);
         for block in 0..self.blocks.len() {
             self.look(view, horizon, keyframe, block);
         }
@@ -29,30 +40,36 @@ impl Archive {
     fn look(&mut self, view: &View, horizon: &Horizon, keyframe: usize, block: usize) {
         let b = &self.blocks[block];
         let seen = if b.epoch == view.epoch && in_reach(view, b) {
-            b.points().iter().filter(|p| horizon.sees(view, Vec3::from_array(**p).as_dvec3())).count() as u8
+            b.samples().iter().filter_map(|p| sees(view, horizon, *p)).map(|(_, size)| size).sum()
         } else {
-            0
+            0.0
         };
-        self.sight[keyframe * BLOCKS_KNOWN + block] = seen;
+        self.sight.set(keyframe, block, seen);
     }
 
-    /// The cells of a view that show what is not in the pool, by what their neighbours show, too.
-    pub fn hidden_from(&self, view: &View, horizon: &Horizon) -> Cells {
-        let seen_by_this = |b: &&Block| b.epoch == view.epoch && b.samples_len > 0 && in_reach(view, b);
+    /// The cells of a view that show what of some blocks is not in the pool, by what their neighbours show, too; and whether any shows some of
+    /// that.
+    pub fn hidden_from(
+        &self,
+        view: &View,
+        horizon: &Horizon,
+        blocks: impl Iterator<Item = usize> + Clone,
+    ) -> (Cells, bool) {
         let mut hidden = Cells::default();
-        if self.blocks.iter().filter(seen_by_this).all(|b| b.in_pool) {
-            return hidden;
+        if blocks.clone().all(|block| self.blocks[block].in_pool) {
+            return (hidden, false);
         }
         // Gaussians that are here, and away.
         let mut seen = [[0.0f32; 2]; CELLS];
-        for b in self.blocks.iter().filter(seen_by_this) {
-            let each = b.count as f32 / f32::from(b.samples_len);
-            for p in b.points() {
-                if let Some(cell) = horizon.may_see(view, Vec3::from_array(*p).as_dvec3()) {
-                    seen[cell][usize::from(!b.in_pool)] += each;
+        for b in blocks.map(|block| &self.blocks[block]) {
+            let each = b.count as f32 / f32::from(b.samples_len.max(1));
+            for p in b.samples() {
+                if let Some((cell, size)) = sees(view, horizon, *p) {
+                    seen[cell][usize::from(!b.in_pool)] += each * size;
                 }
             }
         }
+        let in_part = seen.iter().any(|[_, away]| *away > 0.0);
         for cell in 0..CELLS {
             let (x, y) = (cell % COLUMNS, cell / COLUMNS);
             let (mut all, mut away) = (0.0, 0.0);
@@ -66,7 +83,13 @@ impl Archive {
                 hidden.insert(cell);
             }
         }
-        hidden
+        (hidden, in_part)
+    }
+
+    /// The blocks of which a view may see something.
+    pub fn in_reach<'a>(&'a self, view: &'a View) -> impl Iterator<Item = usize> + Clone + 'a {
+        let reached = |b: &Block| b.epoch == view.epoch && b.samples_len > 0 && in_reach(view, b);
+        self.blocks.iter().enumerate().filter(move |(_, b)| reached(b)).map(|(block, _)| block)
     }
 
     /// Looks from every keyframe that is known.
@@ -89,6 +112,18 @@ impl Archive {
     }
 }
 
+/// The cell in which a view sees a sample of a block, and how large it is there: its area over that of one of `SIZE_ONE`. What is
+/// just outside the picture reaches in.
+fn sees(view: &View, horizon: &Horizon, [x, y, z, size_m]: [f32; 4]) -> Option<(usize, f32)> {
+    let (p, width) = (DVec3::new(x.into(), y.into(), z.into()), view.camera.width as f64);
+    let sigma_px = f64::from(size_m) * view.camera.fx / view.world_from_cam.p.distance(p).max(1e-3);
+    let margin_px = (SIGMAS * sigma_px).clamp(f64::MIN_POSITIVE, width);
+    let (cell, outside_px) = horizon.sees(view, p, margin_px)?;
+    let inside = 1.0 - outside_px / margin_px;
+    let size = (sigma_px / (SIZE_ONE * width)).powi(2).min(SIZE_MAX);
+    Some((cell, (size * inside * inside) as f32))
+}
+
 /// Whether a view may see anything of a block: its ball reaches before the camera and into its cone.
 fn in_reach(view: &View, b: &Block) -> bool {
     let p: DVec3 = view.world_from_cam.inverse().transform(b.centre.as_dvec3());
@@ -101,4 +136,25 @@ fn in_reach(view: &View, b: &Block) -> bool {
     let cone = half(c.width, c.fx).hypot(half(c.height, c.fy)).atan();
     let off = p.truncate().length().atan2(p.z) - (radius / p.length()).asin();
     off <= cone
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::map::coverage::tests::view;
+
+    #[test]
+    fn what_reaches_into_the_picture_is_seen_by_its_size() {
+        let (view, open) = (view(), Horizon::default());
+        let size = |p: [f32; 4]| sees(&view, &open, p).map_or(0.0, |(_, size)| size);
+        let (near, far) = (size([0.0, 0.0, 1.0, 0.01]), size([0.0, 0.0, 2.0, 0.01]));
+        assert!((near / far - 4.0).abs() < 1e-3, "{near} {far}");
+        assert_eq!(size([0.0, 0.0, 0.5, 9.0]), SIZE_MAX as f32);
+        // Beside the picture, whose half is as wide as `edge` at 1 m.
+        let edge = view.camera.width as f32 / 2.0 / view.camera.fx as f32;
+        assert!(size([edge + 0.1, 0.0, 1.0, 0.2]) > 0.0 && size([edge + 0.1, 0.0, 1.0, 0.01]) == 0.0);
+        for odd in [[0.0, 0.0, 1.0, 0.0], [0.0; 4], [f32::NAN, 0.0, 1.0, 0.1], [0.0, 0.0, -1.0, 0.1]] {
+            assert!(size(odd) >= 0.0, "{odd:?}");
+        }
+    }
 }

@@ -18,11 +18,13 @@ pub struct Target {
     pub exposure: Exposure,
     /// Where it is not compared, whatever the mask: the map has more there than is in the pool.
     pub hidden: Cells,
+    /// The pool does not hold all that it shows: what the picture leaves open is not compared either.
+    pub in_part: bool,
 }
 
 impl From<u32> for Target {
     fn from(image: u32) -> Target {
-        Target { image, camera: 0, exposure: Exposure::default(), hidden: Cells::default() }
+        Target { image, camera: 0, exposure: Exposure::default(), hidden: Cells::default(), in_part: false }
     }
 }
 

@@ -39,8 +39,9 @@ impl View {
         Some(self.world_from_cam.transform(p_cam * depth))
     }
 
-    /// The pixel that shows a point of the world, and its depth as the raster counts it, m; `None` outside the picture.
-    pub fn project(&self, p_world: DVec3) -> Option<(f64, f64, f64)> {
+    /// The pixel that shows a point of the world, and its depth as the raster counts it, m; `None` where it is outside the picture
+    /// by more than a margin, px.
+    pub fn project(&self, p_world: DVec3, margin_px: f64) -> Option<(f64, f64, f64)> {
         let (p, c) = (self.world_from_cam.inverse().transform(p_world), &self.camera);
         let (px, depth) = match self.fisheye {
             None if p.z <= 0.0 => return None,
@@ -54,7 +55,7 @@ impl View {
                 (Camera { width, height, fx, fy, cx, cy, lens }.project(p)?, p.length())
             }
         };
-        let inside = |v: f64, size: usize| v >= -0.5 && v < size as f64 - 0.5;
+        let inside = |v: f64, size: usize| v >= -0.5 - margin_px && v < size as f64 - 0.5 + margin_px;
         (inside(px.x, c.width) && inside(px.y, c.height)).then_some((px.x, px.y, depth))
     }
 }
