@@ -6,7 +6,7 @@
 //! | kind | id | `About` | payload |
 //! |---|---|---|---|
 //! | `KIND_RUN` | 0 | `RunAbout` | none |
-//! | `KIND_BLOCK` | of its anchor | `BlockAbout` | arrays of `count` elements, one after another: splats (48 bytes each), steps (4), green and blue (8, in colour), Adam's moments (96, if kept), those of green and blue (16, if kept, in colour) |
+//! | `KIND_BLOCK` | of its anchor, times `PARTS`, plus the part (`parts`) | `BlockAbout` | arrays of `count` elements, one after another: splats (48 bytes each), steps (4), green and blue (8, in colour), Adam's moments (96, if kept), those of green and blue (16, if kept, in colour) |
 //! | `KIND_KEYFRAME` | of the keyframe, times `CAMERAS_MAX`, plus the camera | `KeyframeAbout` | none |
 //! | `KIND_IMAGE` | the same | none | the pixels of each plane |
 //!
@@ -34,7 +34,7 @@ pub const NO_BLOCK: u32 = u32::MAX;
 /// Samples of a block.
 pub const SAMPLES: usize = 32;
 
-/// Version of this form.
+/// Version of this form; a store with another is refused by `store::record::VERSION`, which is raised with it.
 const FORM: u8 = 2;
 /// Bytes of a pose: quaternion xyzw, then position.
 const POSE: usize = 7 * size_of::<f64>();

@@ -32,8 +32,8 @@ pub enum Form {
 
 const RECORD_MAGIC: [u8; 4] = *b"StRc";
 const SEGMENT_MAGIC: [u8; 8] = *b"StipSegm";
-/// Version of the form on the disk.
-pub const VERSION: u32 = 1;
+/// Version of the form on the disk, and of what the map puts into it (`map::block`).
+pub const VERSION: u32 = 2;
 const FORMS: [Form; 4] = [Form::Data, Form::Tombstone, Form::End, Form::Void];
 
 /// Header of a record.

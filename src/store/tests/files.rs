@@ -42,10 +42,10 @@ fn other_versions_and_other_rigs_are_refused() {
     let file = &files(dir.path())[0];
     let mut bytes = fs::read(file).unwrap();
     let header = SegmentHeader::decode(&bytes[..SECTOR]).unwrap();
-    bytes[..SECTOR].copy_from_slice(&SegmentHeader { version: 2, ..header }.encode());
+    bytes[..SECTOR].copy_from_slice(&SegmentHeader { version: 1, ..header }.encode());
     fs::write(file, bytes).unwrap();
-    says(Store::open(dir.path(), IDENTITY, &SMALL), &["version 2", "--fresh"]);
-    assert!(Reader::open(dir.path()).err().unwrap().to_string().contains("version 2"));
+    says(Store::open(dir.path(), IDENTITY, &SMALL), &["version 1", "--fresh"]);
+    assert!(Reader::open(dir.path()).err().unwrap().to_string().contains("version 1"));
 }
 
 #[test]
