@@ -34,6 +34,7 @@
 #![allow(unsafe_code)]
 
 mod cache;
+mod copies;
 mod device;
 mod kernel;
 pub mod kernels;
@@ -43,7 +44,6 @@ mod record;
 mod submit;
 #[cfg(test)]
 mod tests;
-mod transfers;
 
 pub use cache::cache_folder;
 pub use device::{capability, Caps, DeviceKind};
@@ -57,6 +57,7 @@ pub use {kernel::PUSH_MAX, memory::STAGING_BYTES, record::GROUPS_MAX};
 use crate::config::GpuConfig;
 use ash::vk;
 use cache::PipelineCache;
+use copies::Copies;
 use device::Device;
 use kernel::Pipelines;
 use memory::{arena_buffer, report_offset, Backed, Staging, TRANSFER_BYTES};
@@ -66,7 +67,6 @@ use std::sync::atomic::Ordering::Relaxed;
 use std::sync::Arc;
 use stipple_drivers::{Fault, FaultKind};
 use submit::Submitter;
-use transfers::Transfers;
 
 /// Commands that one recording holds.
 pub const COMMANDS_MAX: usize = 1024;
@@ -134,7 +134,7 @@ pub struct Gpu {
     pipelines: Pipelines,
     staging: Staging,
     /// Uploads that wait in staging.
-    uploads: Transfers,
+    uploads: Copies,
     /// What the arena hands out.
     memory: Backed,
     arena: Arena,
@@ -165,7 +165,7 @@ impl Gpu {
             submitter: Submitter::new(&device, staging.buffer(), config.submission_max_ms)?,
             pipelines: Pipelines::new(&device)?,
             staging,
-            uploads: Transfers::default(),
+            uploads: Copies::default(),
             memory: arena_buffer(&device, arena_bytes)?,
             arena: Arena::new(arena_bytes, device.caps.binding_max_bytes),
             spare: Some(Recorder::new()),
@@ -320,7 +320,7 @@ impl Gpu {
     ) -> Result<(), GpuError> {
         self.flush()?;
         self.wait()?;
-        let mut gathered = Transfers::default();
+        let mut gathered = Copies::default();
         for part in parts {
             for at in (0..part.len()).step_by(TRANSFER_BYTES) {
                 let piece = part.part(at, TRANSFER_BYTES.min(part.len() - at));
@@ -334,8 +334,11 @@ impl Gpu {
     }
 
     /// Copies what has gathered to staging, and from there to the first of `bytes`; the rest of them.
-    fn bring<'a>(&mut self, gathered: &mut Transfers, bytes: &'a mut [u8]) -> Result<&'a mut [u8], GpuError> {
-        let (taken, rest) = bytes.split_at_mut(gathered.bytes().min(bytes.len()));
+    fn bring<'a>(&mut self, gathered: &mut Copies, bytes: &'a mut [u8]) -> Result<&'a mut [u8], GpuError> {
+        let (len, of) = (gathered.bytes(), bytes.len());
+        let Some((taken, rest)) = bytes.split_at_mut_checked(len) else {
+            return Err(GpuError::OutOfRange { at: 0, len, of });
+        };
         if taken.is_empty() {
             return Ok(rest);
         }

@@ -12,8 +12,8 @@
 //!
 //! What is known of a keyframe changes as long as the map trains; its pixels do not, and are written once.
 //!
-//! Samples of a block are rounded to 1/255 of the box around them (5 cm in a block of 13 m): they tell where a block is, and so
-//! the poses keep all their digits and there are many of them. Decoding gives `None` for bytes that are not of this form, and never panics.
+//! Samples of a block are rounded to 1/255 of the box around them (5 cm in a block of 13 m), and their sizes to 2 %: they tell
+//! where a block is, and the poses keep all their digits. Decoding gives `None` for bytes that are not of this form, and never panics.
 
 use super::coarseness::Coarseness;
 use super::exposure::Exposure;

@@ -11,7 +11,7 @@ use stipple_drivers::{Nanos, Pose};
 pub struct Choice {
     /// Keyframes by how near they are, m.
     pub order: Vec<(f32, u32)>,
-    /// Gaussians that each of them needs and that are not wanted, and the part of what it sees above which it needs a block.
+    /// Gaussians that each of them needs and that are not wanted, and how many of a block it must see to need the block.
     pub lacking: Vec<(usize, f32)>,
     pub wanted: Vec<bool>,
     /// Which blocks the newest keyframes see.
@@ -24,6 +24,7 @@ pub struct Choice {
     pub blocks: Vec<u32>,
     /// A block on its way to the store.
     pub page: Vec<u8>,
+    /// Room to cut a block into parts.
     pub ordering: Ordering,
     pub leaving: Vec<u32>,
     /// Blocks by what is seen of them, or by how far they are.
@@ -34,8 +35,8 @@ pub struct Choice {
     pub epoch: u32,
     /// The last keyframe.
     pub last: Option<(Nanos, Pose)>,
-    /// The view to whose place the pool is turned; none where the vehicle is.
-    pub elsewhere: Option<u32>,
+    /// Whether the pool is turned to another place than the vehicle's.
+    pub elsewhere: bool,
     /// Training steps while a turn to another place may come.
     pub steps: u64,
     /// Gaussians that the pool is to have room for beside those that are wanted.
@@ -59,7 +60,7 @@ impl Choice {
             hidden: Vec::with_capacity(pixels),
             epoch: 0,
             last: None,
-            elsewhere: None,
+            elsewhere: false,
             steps: 0,
             reserve: 0,
         }

@@ -242,7 +242,7 @@ fn align(scene: &mut Scene, index: usize, observed: &[f32], weights: &Weights) -
     let given = scene.views.get(scene.views.first(index)).given;
     let coarseness = scene.render(&view)?;
     let exposure = fitted_exposure(observed, &scene.rendered.colour, &scene.camera(index).valid);
-    let target = Target { exposure, hidden: Cells::default(), in_part: false, ..scene.target(index) };
+    let target = Target { exposure, hidden: Cells::default(), incomplete: false, ..scene.target(index) };
     let mut refined = Refinement::default();
     let (mut best, mut best_loss) = (refined, f64::INFINITY);
     for k in 0..ALIGN_STEPS {

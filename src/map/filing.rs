@@ -61,7 +61,7 @@ pub fn entry(id: u32, s: &KeyframeAbout, epoch_base: u32) -> Stored {
         coarseness: s.coarseness,
         horizon: s.horizon,
         hidden: Cells::default(),
-        in_part: false,
+        incomplete: false,
         steps: s.steps,
     }
 }

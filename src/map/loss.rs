@@ -221,7 +221,7 @@ impl Loss {
 
     /// Makes the mask of a target of which not all counts.
     fn record_mask(&self, rec: &mut Recorder, rendered: Buf<f32>, target: &Target) {
-        if !target.in_part {
+        if !target.incomplete {
             return;
         }
         rec.dispatch(
@@ -243,7 +243,7 @@ impl Loss {
     }
 
     fn mask(&self, target: &Target) -> Buf<u32> {
-        self.nth_mask(if target.in_part { self.shape.cameras } else { target.camera })
+        self.nth_mask(if target.incomplete { self.shape.cameras } else { target.camera })
     }
 
     fn nth_mask(&self, n: u32) -> Buf<u32> {

@@ -100,7 +100,7 @@ impl Archive {
         });
         let choice = &mut self.choice;
         (choice.last, choice.epoch) = (Some((t, pose)), epoch);
-        choice.elsewhere = None;
+        choice.elsewhere = false;
         choice.reserve = scene.pipeline.pool.capacity() / RESERVE_DIVISOR;
         self.choose(scene, &[pose, ahead]);
         // What is new finds the reserve, and thins nothing.
@@ -117,31 +117,31 @@ impl Archive {
         self.choice.steps += 1;
         if self.choice.steps % STEPS_AT_A_PLACE == 0 {
             if let Some(view) = self.draw_place(&scene.views, rng) {
-                self.turn(scene, view, scene.views.world_from_body(view as usize));
+                self.turn(scene, scene.views.world_from_body(view));
             }
         }
         self.page(scene, PAGED_A_STEP, false)
     }
 
-    /// Wants what is seen at the place of a view; no room is left for what is new.
-    fn turn(&mut self, scene: &Scene, view: u32, pose: Pose) {
-        (self.choice.elsewhere, self.choice.reserve) = (Some(view), 0);
+    /// Wants what is seen at another place; no room is left for what is new.
+    fn turn(&mut self, scene: &Scene, pose: Pose) {
+        (self.choice.elsewhere, self.choice.reserve) = (true, 0);
         self.choose(scene, &[pose]);
         // Views of the last place were drawn ahead.
         self.drawn.next.clear();
     }
 
-    /// Draws a view: of a few the one with the fewest steps. None where all of it is in the pool.
-    fn draw_place(&self, views: &Views, rng: &mut Rng) -> Option<u32> {
+    /// Draws a view: of a few the one with the fewest steps. `None` where nearly all that it sees is in the pool.
+    fn draw_place(&self, views: &Views, rng: &mut Rng) -> Option<usize> {
         // A map that fits draws its views as one without a store.
         if self.blocks.iter().all(|b| b.in_pool || b.samples_len == 0 || b.epoch != self.choice.epoch) {
             return None;
         }
         let drawn = (0..PLACES_DRAWN).filter_map(|_| rng.one_of(views.training()));
-        let away =
-            drawn.map(|view| views.first(view as usize)).filter(|first| views.get(*first).epoch == self.choice.epoch);
-        let fewest = away.min_by_key(|first| views.get(*first).steps);
-        fewest.filter(|first| !self.is_shown(*first / views.cameras())).map(|first| first as u32)
+        let firsts = drawn.map(|view| views.first(view as usize));
+        let of_this_epoch = firsts.filter(|first| views.get(*first).epoch == self.choice.epoch);
+        let fewest = of_this_epoch.min_by_key(|first| views.get(*first).steps);
+        fewest.filter(|first| !self.is_shown(*first / views.cameras()))
     }
 
     /// Writes the blocks whose burst ended before its time, as another anchor came, and looks who sees them. The newest still
@@ -202,7 +202,7 @@ impl Archive {
         self.choice.wanted.fill(false);
         self.choice.blocks.clear();
         let mut taken = 0;
-        if self.choice.elsewhere.is_none() {
+        if !self.choice.elsewhere {
             for &(_, keyframe) in order.iter().take_while(|(near, _)| *near <= LOCAL_M) {
                 if self.part_seen(keyframe as usize, |b| self.choice.now_seen[b]) >= SHARED_MIN {
                     self.want_near(keyframe as usize, &mut taken);
@@ -210,11 +210,11 @@ impl Archive {
             }
         }
         self.choice.thins = taken > room;
-        let local = if self.choice.elsewhere.is_none() { LOCAL_M } else { 0.0 };
+        let local = if !self.choice.elsewhere { LOCAL_M } else { 0.0 };
         for (nth, &(_, keyframe)) in order.iter().enumerate().take_while(|(nth, (near, _))| *nth == 0 || *near <= local)
         {
             // All of what another place itself shows; of what others see, what is behind far doors is left out.
-            let left = if nth == 0 && self.choice.elsewhere.is_some() { 0.0 } else { LEFT_MAX };
+            let left = if nth == 0 && self.choice.elsewhere { 0.0 } else { LEFT_MAX };
             if !self.want_until(keyframe as usize, left, room, &mut taken) {
                 break;
             }

@@ -140,9 +140,9 @@ impl Archive {
         for view in first..first + cameras {
             let horizon = scene.views.get(view).horizon;
             let seen = self.sight.blocks(first / cameras);
-            let (hidden, in_part) = self.hidden_from(&scene.view(view), &horizon, seen);
+            let (hidden, incomplete) = self.hidden_from(&scene.view(view), &horizon, seen);
             let entry = scene.views.get_mut(view);
-            (entry.hidden, entry.in_part) = (hidden, in_part);
+            (entry.hidden, entry.incomplete) = (hidden, incomplete);
         }
         self.known[first / cameras].looked_at = self.exchanges;
     }

@@ -41,13 +41,15 @@ impl Archive {
         Ok(())
     }
 
+    /// Cuts a block into parts, in the pool and here; not where it is small or cut already, or more blocks do not fit.
     fn cut(&mut self, scene: &mut Scene, block: usize) -> Result<(), GpuError> {
         let b = self.blocks[block];
         let (gpu, pool): (_, &mut Pool) = (&mut scene.gpu, &mut scene.pipeline.pool);
         let count = pool.block(b.number).len();
         let parts = parts_of(count);
         let fits = self.blocks.len() + parts - 1 <= BLOCKS_CUT && pool.may_have(parts - 1);
-        if parts < 2 || !fits || b.number % PARTS != 0 {
+        let is_cut = b.number % PARTS != 0 || self.block_of(b.number + 1).is_some();
+        if parts < 2 || !fits || is_cut {
             return Ok(());
         }
         let mut bytes = std::mem::take(&mut self.choice.page);
@@ -80,6 +82,7 @@ impl Archive {
         saved
     }
 
+    /// Does what `save_blocks` does, with room for the bytes of some of them.
     fn save_pages(
         &mut self,
         scene: &mut Scene,

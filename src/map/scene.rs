@@ -56,7 +56,7 @@ impl Scene {
             camera: self.views.camera(index) as u32,
             exposure: self.views.exposure(index),
             hidden: self.views.get(index).hidden,
-            in_part: self.views.get(index).in_part,
+            incomplete: self.views.get(index).incomplete,
         }
     }
 

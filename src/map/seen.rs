@@ -16,7 +16,7 @@ pub struct Seen {
 
 const _: () = assert!(BLOCKS_KNOWN <= 1 << 16);
 
-/// What each keyframe sees of which blocks; bought at boot.
+/// What each keyframe sees of which blocks; allocated at boot.
 pub struct Sight {
     seen: Vec<Seen>,
     lens: Vec<u16>,
@@ -30,6 +30,7 @@ impl Seen {
 }
 
 impl Sight {
+    /// For so many keyframes.
     pub fn new(keyframes: usize) -> Sight {
         Sight { seen: vec![Seen::default(); keyframes * SEEN_MAX], lens: vec![0; keyframes] }
     }
@@ -49,7 +50,7 @@ impl Sight {
         self.lens[keyframe] = 0;
     }
 
-    /// States how much a keyframe sees of a block, in samples.
+    /// States how much a keyframe sees of a block, in samples; zero forgets it.
     pub fn set(&mut self, keyframe: usize, block: usize, samples: f32) {
         let amount = (samples * PARTS_OF_A_SAMPLE).ceil() as u16;
         let (row, len) = (&mut self.seen[keyframe * SEEN_MAX..][..SEEN_MAX], &mut self.lens[keyframe]);

@@ -16,9 +16,12 @@ const SIZE_ONE: f64 = 0.015;
 const SIZE_MAX: f64 = 4.0;
 /// The blocks that a keyframe sees, and the Gaussians that it sees of them, by their samples and how large they are in it.
 pub fn seen_by<'a>(sight: &'a Sight, blocks: &'a [Block], keyframe: usize) -> impl Iterator<Item = (usize, f32)> + 'a {
-    sight.of(keyframe).iter().map(|seen| {
-        let b = &blocks[usize::from(seen.block)];
-        (usize::from(seen.block), seen.samples() * b.count as f32 / f32::from(b.samples_len.max(1)))
+    let of_it = sight.of(keyframe).iter().map(|seen| (usize::from(seen.block), seen.samples()));
+    // A block without samples was damaged on the disk.
+    let known = of_it.filter(|(block, _)| blocks[*block].samples_len > 0);
+    known.map(|(block, samples)| {
+        let b = &blocks[block];
+        (block, samples * b.count as f32 / f32::from(b.samples_len))
     })
 }
 
@@ -33,22 +36,15 @@ impl Archive {
     pub fn look_from(&mut self, view: &View, horizon: &Horizon, keyframe: usize) {
         self.sight.clear(keyframe);
         for block in 0..self.blocks.len() {
-            self.look(view, horizon, keyframe, block);
+            let seen = seen_of(&self.blocks[block], view, horizon);
+            if seen > 0.0 {
+                self.sight.set(keyframe, block, seen);
+            }
         }
     }
 
-    fn look(&mut self, view: &View, horizon: &Horizon, keyframe: usize, block: usize) {
-        let b = &self.blocks[block];
-        let seen = if b.epoch == view.epoch && in_reach(view, b) {
-            b.samples().iter().filter_map(|p| sees(view, horizon, *p)).map(|(_, size)| size).sum()
-        } else {
-            0.0
-        };
-        self.sight.set(keyframe, block, seen);
-    }
-
-    /// The cells of a view that show what of some blocks is not in the pool, by what their neighbours show, too; and whether any shows some of
-    /// that.
+    /// The cells of a view that show what of some blocks is not in the pool, by what their neighbours show, too; and whether the
+    /// view shows any of that.
     pub fn hidden_from(
         &self,
         view: &View,
@@ -69,7 +65,7 @@ impl Archive {
                 }
             }
         }
-        let in_part = seen.iter().any(|[_, away]| *away > 0.0);
+        let incomplete = seen.iter().any(|[_, away]| *away > 0.0);
         for cell in 0..CELLS {
             let (x, y) = (cell % COLUMNS, cell / COLUMNS);
             let (mut all, mut away) = (0.0, 0.0);
@@ -83,7 +79,7 @@ impl Archive {
                 hidden.insert(cell);
             }
         }
-        (hidden, in_part)
+        (hidden, incomplete)
     }
 
     /// The blocks of which a view may see something.
@@ -107,9 +103,18 @@ impl Archive {
         for keyframe in 0..self.known.len().min(scene.views.len() / cameras) {
             let index = keyframe * cameras;
             let horizon = scene.views.get(index).horizon;
-            self.look(&scene.view(index), &horizon, keyframe, block);
+            let seen = seen_of(&self.blocks[block], &scene.view(index), &horizon);
+            self.sight.set(keyframe, block, seen);
         }
     }
+}
+
+/// How much a view sees of a block, in samples of the size `SIZE_ONE`.
+fn seen_of(b: &Block, view: &View, horizon: &Horizon) -> f32 {
+    if b.epoch != view.epoch || !in_reach(view, b) {
+        return 0.0;
+    }
+    b.samples().iter().filter_map(|sample| sees(view, horizon, *sample)).map(|(_, size)| size).sum()
 }
 
 /// The cell in which a view sees a sample of a block, and how large it is there: its area over that of one of `SIZE_ONE`. What is

@@ -19,12 +19,12 @@ pub struct Target {
     /// Where it is not compared, whatever the mask: the map has more there than is in the pool.
     pub hidden: Cells,
     /// The pool does not hold all that it shows: what the picture leaves open is not compared either.
-    pub in_part: bool,
+    pub incomplete: bool,
 }
 
 impl From<u32> for Target {
     fn from(image: u32) -> Target {
-        Target { image, camera: 0, exposure: Exposure::default(), hidden: Cells::default(), in_part: false }
+        Target { image, camera: 0, exposure: Exposure::default(), hidden: Cells::default(), incomplete: false }
     }
 }
 

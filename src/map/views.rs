@@ -38,7 +38,7 @@ pub struct Stored {
     /// Where it shows what is not in the pool.
     pub hidden: Cells,
     /// Some of what it shows is not in the pool.
-    pub in_part: bool,
+    pub incomplete: bool,
     /// Training steps on it.
     pub steps: u32,
 }
@@ -241,7 +241,7 @@ impl Views {
             coarseness,
             horizon: Horizon::default(),
             hidden: Cells::default(),
-            in_part: false,
+            incomplete: false,
             steps: 0,
         };
         if self.camera(index) == 0 && self.free_place().is_none() {

@@ -87,6 +87,33 @@ fn arena_starts_as_zero_and_transfers_pass_the_staging_size() {
 }
 
 #[test]
+fn uploads_that_gather_arrive_in_their_order() {
+    let mut gpu = open(1 << 20);
+    let buf = gpu.alloc::<u32>("words", 300).unwrap();
+    // More than one submission holds, then one over several of them.
+    (0..300u32).for_each(|i| gpu.upload(buf, i as usize, &[i]).unwrap());
+    gpu.upload(buf, 100, &[7; 50]).unwrap();
+    gpu.upload(buf, 120, &[8]).unwrap();
+    let expected = |i: u32| {
+        if i == 120 {
+            8
+        } else if (100..150).contains(&i) {
+            7
+        } else {
+            i
+        }
+    };
+    assert_eq!(read(&mut gpu, buf), (0..300).map(expected).collect::<Vec<_>>());
+    // Parts come one after another, whatever their order in the arena.
+    let mut bytes = [0u8; 12];
+    let parts = [buf.part(299, 1), buf.part(120, 1), buf.part(3, 1)].map(|part| part.cast::<u8>());
+    gpu.download_parts(parts.into_iter(), &mut bytes).unwrap();
+    assert_eq!(bytemuck::cast_slice::<u8, u32>(&bytes), [299, 8, 3]);
+    let refused = gpu.download_parts(parts.into_iter(), &mut bytes[..8]);
+    assert_eq!(refused, Err(GpuError::OutOfRange { at: 0, len: 12, of: 8 }));
+}
+
+#[test]
 fn transfers_outside_a_buffer_are_refused() {
     let mut gpu = open(1 << 16);
     let buf = gpu.alloc::<u32>("b", 10).unwrap();

@@ -37,7 +37,7 @@ fn hidden_cells_are_masked_beside_the_mask() {
     };
     let seen = mask(w, h);
     p.loss.set_mask(&mut gpu, 0, &seen).unwrap();
-    let part = Target { hidden, in_part: true, ..Target::from(0) };
+    let part = Target { hidden, incomplete: true, ..Target::from(0) };
     let values = p.loss.values(&part);
     let by_cells = p.train(&mut gpu, &v, part, &STILL, &Weights::default()).unwrap();
     let gradient = pixel_gradient(&mut gpu, &p);
@@ -68,7 +68,8 @@ fn a_view_that_is_hidden_trains_nothing_however_it_is_regularised() {
     assert_eq!(hidden.len(), CELLS);
     let weights = Weights { scale_soft_m: 1e-3, opacity: 0.1, ..Weights::default() };
     for _ in 0..3 {
-        let step = p.train(&mut gpu, &v, Target { hidden, in_part: true, ..Target::from(0) }, &FAST, &weights).unwrap();
+        let step =
+            p.train(&mut gpu, &v, Target { hidden, incomplete: true, ..Target::from(0) }, &FAST, &weights).unwrap();
         assert_eq!((step.pose_gradient.map(f64::abs), step.exposure_gradient), ([0.0; 6], [0.0; 2]));
     }
     let after = p.pool.download(&mut gpu).unwrap();

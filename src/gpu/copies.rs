@@ -1,4 +1,5 @@
-//! Copies between staging and the arena that have gathered: a submission costs as much as copying 100 KiB, so small ones share it.
+//! Copies between staging and the arena that share a submission: one with its wait takes 0.06 to 0.12 ms on an H100, whatever it
+//! copies.
 
 use super::memory::TRANSFER_BYTES;
 use ash::vk;
@@ -7,19 +8,19 @@ use ash::vk;
 const MOST: usize = 64;
 
 /// Copies from staging, where they lie one after another, to the arena.
-pub struct Transfers {
+pub struct Copies {
     regions: [vk::BufferCopy; MOST],
     len: usize,
     bytes: usize,
 }
 
-impl Default for Transfers {
-    fn default() -> Transfers {
-        Transfers { regions: [vk::BufferCopy::default(); MOST], len: 0, bytes: 0 }
+impl Default for Copies {
+    fn default() -> Copies {
+        Copies { regions: [vk::BufferCopy::default(); MOST], len: 0, bytes: 0 }
     }
 }
 
-impl Transfers {
+impl Copies {
     /// Whether one more has room, and touches none of the others: copies of one submission have no order.
     pub fn fit(&self, bytes: usize, to: u64) -> bool {
         let apart = |r: &vk::BufferCopy| to + bytes as u64 <= r.dst_offset || r.dst_offset + r.size <= to;
@@ -34,6 +35,7 @@ impl Transfers {
         from
     }
 
+    /// What Vulkan copies, as they were added.
     pub fn regions(&self) -> &[vk::BufferCopy] {
         &self.regions[..self.len]
     }
@@ -43,13 +45,14 @@ impl Transfers {
         self.bytes
     }
 
-    /// Turns them round: from the arena to staging.
+    /// Turns all of them round: from the arena to staging.
     pub fn reverse(&mut self) {
         for r in &mut self.regions[..self.len] {
             std::mem::swap(&mut r.src_offset, &mut r.dst_offset);
         }
     }
 
+    /// Forgets all of them.
     pub fn clear(&mut self) {
         (self.len, self.bytes) = (0, 0);
     }
@@ -61,7 +64,7 @@ mod tests {
 
     #[test]
     fn what_overlaps_or_is_too_much_does_not_fit() {
-        let mut t = Transfers::default();
+        let mut t = Copies::default();
         assert_eq!((t.add(100, 1000), t.add(50, 1100)), (0, 100));
         assert!(t.fit(10, 1150) && t.fit(10, 990) && !t.fit(11, 990) && !t.fit(1, 1149) && !t.fit(500, 900));
         assert!(t.fit(TRANSFER_BYTES - 150, 2000) && !t.fit(TRANSFER_BYTES - 149, 2000));
