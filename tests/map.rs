@@ -318,6 +318,41 @@ fn full_pool_gives_its_least_valuable_for_a_new_view() {
 }
 
 #[test]
+fn a_room_seen_again_in_other_light_does_not_double() {
+    let (calibration, keyframes) = flight(6);
+    let run = |pause: Span| {
+        let mut mapper = Mapper::open(&calibration, &board(&["map.wrong_after_steps=0"])).unwrap();
+        let mut fly = |keyframes: &[Keyframe]| {
+            for k in keyframes {
+                mapper.ingest(k).unwrap();
+                train(&mut mapper, 60);
+            }
+            (mapper.splat_count(), mapper.counters().anchors_for_error.get())
+        };
+        let (once, for_error) = fly(&keyframes);
+        let mut again = keyframes.clone();
+        for k in &mut again {
+            (k.id, k.t) = (k.id + 6, k.t + Span::from_secs(3.0) + pause);
+            for image in &mut k.images {
+                let width = image.width;
+                image
+                    .pixels
+                    .iter_mut()
+                    .enumerate()
+                    .filter(|(i, _)| i % width < width / 2)
+                    .for_each(|(_, p)| *p = 255 - *p);
+            }
+        }
+        let (twice, for_error_twice) = fly(&again);
+        assert!(for_error_twice > for_error, "nothing of the second visit was wrong");
+        twice as f64 / once as f64
+    };
+    let (same_visit, later) = (run(Span::from_secs(0.5)), run(Span::from_secs(60.0)));
+    println!("{same_visit:.2} of the Gaussians in the same visit, {later:.2} in a later one");
+    assert!(same_visit > 1.3 && later < 1.15, "{same_visit} {later}");
+}
+
+#[test]
 fn steps_allocate_nothing() {
     let (calibration, mut keyframes) = flight(3);
     for (n, k) in keyframes.iter_mut().enumerate() {

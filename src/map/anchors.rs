@@ -11,7 +11,8 @@
 //! well, and exposures start without what earlier ones learnt of blur.
 //!
 //! An anchor opens a block of the pool; what its seeds and its densification need and is not free is taken from the least
-//! important, if the board lets.
+//! important, if the board lets. What it adds where an earlier visit left Gaussians takes the place of as many of the least
+//! important: in other light a room that is seen again is wrong nearly everywhere, and would double with each visit.
 
 use super::archive::Archive;
 use super::cameras::{RectifiedPair, TrainingCamera};
@@ -32,7 +33,7 @@ use crate::config::MapConfig;
 use crate::gpu::{Gpu, GpuError};
 use crate::mem::unsealed;
 use crate::stereo::{DepthMap, RectifiedViews, Stereo};
-use stipple_drivers::{Fault, Image};
+use stipple_drivers::{Fault, Image, Span};
 
 /// Part of a view that must have depth to seed from; the rest is continued from it.
 const DEPTH_MIN: f64 = 0.01;
@@ -41,6 +42,12 @@ const STEPS_FIRST: usize = 40;
 const STEPS_MIN: usize = 8;
 /// A whole uncovered view may take one in so many of the pool where others are evicted for it.
 const POOL_DIVISOR: usize = 16;
+
+/// What was anchored longer ago than this is of an earlier visit.
+const VISIT: Span = Span(30_000_000_000);
+/// Seeds lie where an earlier visit left Gaussians if they share a cell that is so many times as wide as the occupancy grid's:
+/// depth is no better far away.
+const VISIT_CELLS: f32 = 5.0;
 
 /// A keyframe that became an anchor.
 #[derive(Clone, Copy, Debug)]
@@ -59,6 +66,8 @@ pub struct Workspace {
     newcomers: Vec<Seed>,
     /// The occupancy's, by seed.
     answers: Vec<u32>,
+    /// Its answers where only Gaussians of earlier visits count.
+    earlier: Vec<u32>,
     /// SSIM of the newest anchor by pixel, with room for more channels.
     similarity: Vec<f32>,
 }
@@ -72,6 +81,7 @@ impl Workspace {
             diffusion: Diffusion::new(width, height),
             newcomers: Vec::with_capacity(config.densify_max as usize),
             answers: Vec::with_capacity(seeds_max),
+            earlier: Vec::with_capacity(seeds_max),
             similarity: Vec::with_capacity(channels * width * height),
         }
     }
@@ -85,6 +95,8 @@ pub struct Anchors {
     occupancy: Occupancy,
     /// Steps when the last anchor came.
     anchored_at: u64,
+    /// Part of its seeds that lie where an earlier visit left Gaussians.
+    seen_part: f64,
 }
 
 impl Anchors {
@@ -96,7 +108,7 @@ impl Anchors {
         config: &MapConfig,
     ) -> Result<Anchors, Fault> {
         let occupancy = Occupancy::new(gpu, buffers, config.occupancy_cell_m)?;
-        Ok(Anchors { config: config.clone(), pair, work, occupancy, anchored_at: 0 })
+        Ok(Anchors { config: config.clone(), pair, work, occupancy, anchored_at: 0, seen_part: 0.0 })
     }
 
     /// Takes over another rectification.
@@ -163,6 +175,7 @@ impl Anchors {
         let first = scene.views.anchors() == 0;
         let whole = self.seeds_of_a_view(scene);
         let wanted = (coverage.lacking() * whole as f64).ceil() as usize;
+        let before = scene.pipeline.pool.count() as usize;
         let room = scene.make_room(wanted, self.config.evict)?;
         if room == 0 && !self.config.evict {
             return Ok(None);
@@ -171,13 +184,15 @@ impl Anchors {
             scene.counters.blocks_full.add(1);
             return Ok(None);
         }
-        let seeded = self.seed(scene, index, &view, valid, (whole, room))? as u32;
+        let (seeded, again) = self.seed(scene, index, &view, valid, (whole, room))?;
+        self.seen_part = again as f64 / seeded.max(1) as f64;
+        self.replace(scene, before, seeded)?;
         scene.counters.anchors_for_error.add(u64::from(coverage.uncovered <= least));
         self.anchored_at = scene.steps;
         let entry = scene.views.get_mut(index);
         (entry.anchor, entry.placed) = (true, entry.world_from_cam());
         let scene_depth_m = if first { median_depth(&self.work.depth.metres) } else { None };
-        Ok(Some(NewAnchor { seeded, scene_depth_m }))
+        Ok(Some(NewAnchor { seeded: seeded as u32, scene_depth_m }))
     }
 
     /// Draws what the rectified pair should see into the scene, and exposes the new image by what trains.
@@ -217,7 +232,8 @@ impl Anchors {
         enough
     }
 
-    /// Seeds as dense as `whole` for a view, `room` at most; how many.
+    /// Seeds as dense as `whole` for a view, `room` at most; how many, and how many of them where an earlier visit left
+    /// Gaussians.
     fn seed(
         &mut self,
         scene: &mut Scene,
@@ -225,14 +241,33 @@ impl Anchors {
         view: &View,
         valid: &[u8],
         (whole, room): (usize, usize),
-    ) -> Result<usize, GpuError> {
-        let Workspace { depth, seeder, diffusion, answers, .. } = &mut self.work;
+    ) -> Result<(usize, usize), GpuError> {
+        let Workspace { depth, seeder, diffusion, answers, earlier, .. } = &mut self.work;
         let seen = seen(scene, &self.pair, index, view, valid, &depth.metres);
         let points = seeder.seed(&seen, whole, diffusion, &scene.counters);
-        self.occupancy.look_up(&mut scene.gpu, &scene.pipeline.pool, view.epoch, points, answers)?;
-        let (exposure, planes) = (scene.views.exposure(index), planes(&scene.views, &self.pair, index));
-        let splats = seeder.keep(answers, room, &scene.counters).iter().map(|s| s.gaussian(planes, exposure));
-        scene.pipeline.pool.append(&mut scene.gpu, splats)
+        let Scene { gpu, pipeline, views, counters, .. } = scene;
+        let pool = &pipeline.pool;
+        self.occupancy.look_up(gpu, pool, (std::iter::once(pool.slots(view.epoch)), 1.0), points, answers)?;
+        let now = views.get(index).t;
+        let of_earlier = |number: u32| {
+            let anchor = views.get((number / PARTS) as usize);
+            anchor.epoch == view.epoch && now - anchor.t > VISIT
+        };
+        self.occupancy.look_up(gpu, pool, (pool.slots_of(of_earlier), VISIT_CELLS), points, earlier)?;
+        let (exposure, planes) = (views.exposure(index), planes(views, &self.pair, index));
+        let (seeds, again) = seeder.keep(answers, earlier, room, counters);
+        let splats = seeds.iter().map(|s| s.gaussian(planes, exposure));
+        Ok((pipeline.pool.append(gpu, splats)?, again))
+    }
+
+    /// Takes from the pool, which held so many `before`, about as many as were added where an earlier visit left Gaussians.
+    fn replace(&self, scene: &mut Scene, before: usize, added: usize) -> Result<(), GpuError> {
+        let new = (added as f64 * (1.0 - self.seen_part)).ceil() as usize;
+        let surplus = (scene.pipeline.pool.count() as usize).saturating_sub(before + new);
+        if self.config.evict && surplus > 0 {
+            scene.prune(surplus, surplus + surplus / 4)?;
+        }
+        Ok(())
     }
 
     /// Adds Gaussians where the newest anchor's picture is least like its image, through the lens that trains.
@@ -258,6 +293,7 @@ impl Anchors {
         let lacking = 0.5 * (1.0 - mean(&self.work.similarity, &scene.camera(index).valid));
         let wanted = (f64::from(self.config.densify_max) * lacking) as usize;
         let wanted = wanted.min(self.affordable(scene));
+        let before = scene.pipeline.pool.count() as usize;
         let wanted = wanted.min(scene.make_room(wanted, self.config.evict)?);
         let Workspace { depth, diffusion, newcomers, similarity, .. } = &mut self.work;
         let depth = self.pair.as_ref().map_or(&depth.metres, |pair| &pair.distance);
@@ -268,7 +304,7 @@ impl Anchors {
         let splats = newcomers.iter().map(|s| s.gaussian(planes, target.exposure));
         let added = scene.pipeline.pool.append(&mut scene.gpu, splats)?;
         scene.counters.splats_densified.add(added as u64);
-        Ok(())
+        self.replace(scene, before, added)
     }
 
     /// Seeds for a view that is all uncovered.

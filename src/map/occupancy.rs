@@ -9,6 +9,7 @@
 use super::pool::Pool;
 use crate::gpu::kernels::{occupied, occupy};
 use crate::gpu::{Arena, Buf, Gpu, GpuError, Kernel, Threads};
+use std::ops::Range;
 use stipple_drivers::Fault;
 
 /// Points that travel to the GPU at a time.
@@ -56,25 +57,36 @@ impl Occupancy {
         })
     }
 
-    /// Which of `points` lie in cells that hold Gaussians of an epoch of the pool; one answer a point.
+    /// Which of `points` lie in cells that hold Gaussians of some slots of the pool, `width` times as wide as the grid's; one
+    /// answer a point.
     pub fn look_up(
         &self,
         gpu: &mut Gpu,
         pool: &Pool,
-        epoch: u32,
+        (slots, width): (impl Iterator<Item = Range<u32>>, f32),
         points: &[[f32; 4]],
         answers: &mut Vec<u32>,
     ) -> Result<(), GpuError> {
-        let Buffers { cells, points: asked, found } = self.buffers;
-        let (slots, per_metre, mask) = (pool.slots(epoch), self.per_metre, cells.len() as u32 - 1);
-        let mut rec = gpu.record();
-        rec.fill(cells, u32::MAX);
-        let bind = occupy::Bind { splats: pool.buffers.splats.read(), cells: cells.read_write() };
-        let push = occupy::Push { first: slots.start, splats: slots.end, per_metre, mask };
-        rec.dispatch(&self.occupy, bind, push, Threads::d1(slots.end));
-        gpu.submit(rec)?;
         answers.clear();
         answers.resize(points.len(), FREE);
+        let mut slots = slots.peekable();
+        if slots.peek().is_none() {
+            return Ok(());
+        }
+        let Buffers { cells, points: asked, found } = self.buffers;
+        let (per_metre, mask) = (self.per_metre / width, cells.len() as u32 - 1);
+        let mut rec = gpu.record();
+        rec.fill(cells, u32::MAX);
+        for slots in slots {
+            if rec.room() == 0 {
+                gpu.submit(rec)?;
+                rec = gpu.record();
+            }
+            let bind = occupy::Bind { splats: pool.buffers.splats.read(), cells: cells.read_write() };
+            let push = occupy::Push { first: slots.start, splats: slots.end, per_metre, mask };
+            rec.dispatch(&self.occupy, bind, push, Threads::d1(slots.end));
+        }
+        gpu.submit(rec)?;
         for (points, answers) in points.chunks(POINTS).zip(answers.chunks_mut(POINTS)) {
             gpu.upload(asked, 0, points)?;
             let mut rec = gpu.record();

@@ -241,6 +241,19 @@ impl Pool {
         (if before == 0 { 0 } else { begin(before) })..begin(upto)
     }
 
+    /// The slots of the blocks whose numbers are wanted; blocks that lie together have one range.
+    pub fn slots_of<'a>(&'a self, wanted: impl Fn(u32) -> bool + 'a) -> impl Iterator<Item = Range<u32>> + 'a {
+        let blocks = &self.host.blocks;
+        let begin = |i: usize| blocks.get(i).map_or(self.count, |b| b.first);
+        let mut at = 0;
+        std::iter::from_fn(move || {
+            let first = at + blocks[at..].iter().position(|b| wanted(b.number))?;
+            let others = blocks[first..].iter().position(|b| !wanted(b.number));
+            at = others.map_or(blocks.len(), |n| first + n);
+            Some(begin(first)..begin(at))
+        })
+    }
+
     /// The newest epoch, and the slots of its Gaussians.
     pub fn newest_epoch(&self) -> (u32, Range<u32>) {
         let epoch = self.host.blocks.last().map_or(0, |b| b.epoch);

@@ -72,18 +72,25 @@ impl Scene {
     /// Removes what is faint, huge or not finite, and with `evict`, where that leaves less room than wanted, the least
     /// important. Answers the room there is then.
     pub fn make_room(&mut self, wanted: usize, evict: bool) -> Result<usize, GpuError> {
+        let pool = &self.pipeline.pool;
+        let lacks = if evict { wanted.saturating_sub(pool.room()) } else { 0 };
+        self.prune(lacks, pool.capacity() / EVICTED_DIVISOR)?;
+        Ok(self.pipeline.pool.room())
+    }
+
+    /// Removes what is faint, huge or not finite, and about `evicted` of the least important, never more than `most` of them.
+    pub fn prune(&mut self, evicted: usize, most: usize) -> Result<(), GpuError> {
         let (gpu, pool) = (&mut self.gpu, &mut self.pipeline.pool);
         let mut rule = PruneRule { steps_min: STEPS_JUDGED, ..PruneRule::default() };
-        let mut evicted = 0;
-        if evict && pool.room() < wanted {
+        let mut unimportant = 0;
+        if evicted > 0 {
             let bins = pool.importance(gpu, STEPS_JUDGED)?;
-            let most = pool.capacity() / EVICTED_DIVISOR;
-            (rule.importance_min, evicted) = threshold(&bins, wanted - pool.room(), most);
+            (rule.importance_min, unimportant) = threshold(&bins, evicted, most);
         }
         let removed = pool.prune(gpu, &rule)?;
-        self.counters.splats_evicted.add(evicted.min(removed) as u64);
-        self.counters.splats_pruned.add(removed.saturating_sub(evicted) as u64);
-        Ok(pool.room())
+        self.counters.splats_evicted.add(unimportant.min(removed) as u64);
+        self.counters.splats_pruned.add(removed.saturating_sub(unimportant) as u64);
+        Ok(())
     }
 
     /// Draws the map into `rendered`; how coarsely, that the view might fit.

@@ -53,13 +53,15 @@ const DENSITY_FILLED: f64 = 0.5;
 const GRADIENT_DOUBLES: f64 = 6.0;
 /// Below this rendered alpha a pixel takes seeds even in an occupied cell.
 const SEED_ALPHA: f32 = 0.5;
-/// A pixel rendered this far from what was seen takes seeds even in an occupied cell.
-const SEED_ERROR: f64 = 0.1;
+/// A pixel rendered this far from what was seen takes seeds even in an occupied cell, and even where an earlier visit left
+/// Gaussians: in other light nearly all is a little wrong.
+const SEED_ERROR: f32 = 0.1;
+const SEED_ERROR_AGAIN: f32 = 0.25;
 
 /// Picks seeds; owns the scratch it needs.
 pub struct Seeder {
     fill: DepthFill,
-    /// Where each seed is, and whether it is wanted even in an occupied cell.
+    /// Where each seed is, and how far its pixel is rendered from what was seen; infinite where it is not covered.
     points: Vec<[f32; 4]>,
     seeds: Vec<Seed>,
     seeds_max: usize,
@@ -97,23 +99,29 @@ impl Seeder {
         &self.points
     }
 
-    /// Keeps at most `room` of the picked: those whose cell holds nothing yet, or that the rendering lacks.
-    pub fn keep(&mut self, answers: &[u32], room: usize, counters: &Counters) -> &[Seed] {
-        let mut kept = 0;
+    /// Keeps at most `room` of the picked: those whose cell holds nothing yet, neither by `answers` nor by what `earlier` visits
+    /// left, and those that the rendering lacks. Answers them, and how many of them are where earlier visits left something.
+    pub fn keep(&mut self, answers: &[u32], earlier: &[u32], room: usize, counters: &Counters) -> (&[Seed], usize) {
+        let (mut kept, mut again) = (0, 0);
         for i in 0..self.seeds.len() {
-            let lacking = self.points[i][3] != 0.0;
             counters.occupancy_full.add(u64::from(answers[i] == UNKNOWN));
-            if answers[i] == HELD && !lacking {
+            let error_min = match (answers[i], earlier[i]) {
+                (_, HELD) => SEED_ERROR_AGAIN,
+                (HELD, _) => SEED_ERROR,
+                _ => 0.0,
+            };
+            if self.points[i][3] < error_min {
                 counters.seeds_occupied.add(1);
             } else if kept == room {
                 counters.splats_full.add(1);
             } else {
                 self.seeds[kept] = self.seeds[i];
                 kept += 1;
+                again += usize::from(earlier[i] == HELD);
             }
         }
         self.seeds.truncate(kept);
-        &self.seeds
+        (&self.seeds, again)
     }
 
     fn put(&mut self, seen: &KeyframeView, x: usize, y: usize, density: f32) {
@@ -121,9 +129,10 @@ impl Seeder {
         let matched = seen.depth[i] > 0.0;
         let z = f64::from(self.fill.metres[i]);
         let Some(p_world) = seen.view.point(x, y, z) else { return };
-        let lacking = seen.rendered.alpha[i] < SEED_ALPHA || seen.error(i) >= SEED_ERROR;
+        let covered = seen.rendered.alpha[i] >= SEED_ALPHA;
+        let error = if covered { seen.error(i) as f32 } else { f32::INFINITY };
         let [px, py, pz] = p_world.as_vec3().to_array();
-        self.points.push([px, py, pz, f32::from(u8::from(lacking))]);
+        self.points.push([px, py, pz, error]);
         let spacing_px = (1.0 / f64::from(density)).sqrt().clamp(SPACING_PX[0], SPACING_PX[1]);
         self.seeds.push(Seed {
             p_world,
@@ -174,7 +183,30 @@ mod tests {
     fn seed(image: &Image, alpha: f32, answer: u32) -> Vec<Seed> {
         let (mut s, mut d, counters) = (Seeder::new(W, H, 300), Diffusion::new(W, H), Counters::default());
         let n = s.seed(&seen(image, &FAR, &black(&[alpha; W * H])), usize::MAX, &mut d, &counters).len();
-        s.keep(&vec![answer; n], usize::MAX, &counters).to_vec()
+        s.keep(&vec![answer; n], &vec![FREE; n], usize::MAX, &counters).0.to_vec()
+    }
+
+    #[test]
+    fn where_earlier_visits_left_something_only_what_is_quite_wrong_is_kept() {
+        let (mut s, mut d, counters) = (Seeder::new(W, H, 300), Diffusion::new(W, H), Counters::default());
+        // A quarter each is right, a little wrong and quite wrong, and uncovered.
+        let mut image = Image::new(W, H);
+        image.pixels[W * H / 4..W * H / 2].fill(40);
+        image.pixels[W * H / 2..W * H * 3 / 4].fill(100);
+        let alpha: Vec<f32> = (0..W * H).map(|i| if i < W * H * 3 / 4 { 1.0 } else { 0.0 }).collect();
+        let mut kept = |answer: u32, earlier: u32| {
+            let n = s.seed(&seen(&image, &FAR, &black(&alpha)), usize::MAX, &mut d, &counters).len();
+            let (seeds, again) = s.keep(&vec![answer; n], &vec![earlier; n], usize::MAX, &counters);
+            let rows = seeds.iter().map(|seed| seed.pixel as usize / (W * H / 4));
+            let mut of = [false; 4];
+            rows.for_each(|quarter| of[quarter] = true);
+            assert_eq!(again, if earlier == HELD { seeds.len() } else { 0 });
+            of
+        };
+        assert_eq!(kept(FREE, FREE), [true; 4]);
+        assert_eq!(kept(HELD, FREE), [false, true, true, true]);
+        assert_eq!(kept(HELD, HELD), [false, false, true, true]);
+        assert_eq!(kept(FREE, HELD), [false, false, true, true]);
     }
 
     #[test]
@@ -221,7 +253,8 @@ mod tests {
         let v = seen(&image, &FAR, &rendered);
         let n = s.seed(&v, 300, &mut d, &counters).len();
         assert!((270..=300).contains(&n), "{n}");
-        assert_eq!((s.keep(&vec![0; n], 25, &counters).len(), counters.splats_full.get()), (25, n as u64 - 25));
+        let (kept, _) = s.keep(&vec![FREE; n], &vec![FREE; n], 25, &counters);
+        assert_eq!((kept.len(), counters.splats_full.get()), (25, n as u64 - 25));
         assert!(s.seed(&v, 1 << 20, &mut d, &counters).len() <= 300);
     }
 }

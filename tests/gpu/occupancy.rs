@@ -49,7 +49,17 @@ impl Grid {
 
     fn look(&mut self, points: &[[f32; 4]]) -> Vec<u32> {
         let mut out = Vec::new();
-        self.occupancy.look_up(&mut self.gpu, &self.pipeline.pool, 0, points, &mut out).unwrap();
+        let pool = &self.pipeline.pool;
+        self.occupancy.look_up(&mut self.gpu, pool, (std::iter::once(pool.slots(0)), 1.0), points, &mut out).unwrap();
+        out
+    }
+
+    /// Looks among the Gaussians of some blocks, in cells so many times as wide.
+    fn look_for(&mut self, blocks: &[u32], width: f32, points: &[[f32; 4]]) -> Vec<u32> {
+        let mut out = Vec::new();
+        let pool = &self.pipeline.pool;
+        let slots = pool.slots_of(|number| blocks.contains(&number));
+        self.occupancy.look_up(&mut self.gpu, pool, (slots, width), points, &mut out).unwrap();
         out
     }
 }
@@ -80,6 +90,31 @@ fn a_cell_is_held_as_long_as_a_gaussian_is_in_it() {
     let all = PruneRule { opacity_min: 0.9, ..PruneRule::default() };
     assert_eq!(g.pipeline.pool.prune(&mut g.gpu, &all).unwrap(), 1);
     assert_eq!(g.look(&asked), [FREE; 3]);
+}
+
+#[test]
+fn only_gaussians_of_the_blocks_asked_for_hold_cells_as_wide_as_asked_for() {
+    let mut g = Grid::open(4096, false).unwrap();
+    let places = [[0.05, 0.05, 1.05], [1.05, 0.05, 1.05], [2.05, 0.05, 1.05], [3.05, 0.05, 1.05]];
+    for (number, place) in places.into_iter().enumerate() {
+        g.pipeline.pool.open_block(number as u32, 0);
+        g.append(&[place]);
+    }
+    let pool = &g.pipeline.pool;
+    let ranges = |blocks: &[u32]| {
+        let slots = pool.slots_of(|number| blocks.contains(&number));
+        slots.map(|range| (range.start, range.end)).collect::<Vec<_>>()
+    };
+    assert_eq!((ranges(&[1, 2]), ranges(&[0, 3])), (vec![(1, 3)], vec![(0, 1), (3, 4)]));
+    assert_eq!((ranges(&[]), ranges(&[0, 1, 2, 3])), (vec![], vec![(0, 4)]));
+    let asked = places.map(at);
+    assert_eq!(g.look_for(&[0, 1, 2, 3], 1.0, &asked), [HELD; 4]);
+    assert_eq!(g.look_for(&[0, 3], 1.0, &asked), [HELD, FREE, FREE, HELD]);
+    assert_eq!(g.look_for(&[], 1.0, &asked), [FREE; 4]);
+    // 0.4 m beside each, in other cells of 0.125 m and in the same of 0.625 m.
+    let beside = places.map(|[x, y, z]| at([x, y + 0.4, z]));
+    assert_eq!(g.look_for(&[1], 1.0, &beside), [FREE; 4]);
+    assert_eq!(g.look_for(&[1], 5.0, &beside), [FREE, HELD, FREE, FREE]);
 }
 
 #[test]
