@@ -33,7 +33,7 @@ use crate::config::MapConfig;
 use crate::gpu::{Gpu, GpuError};
 use crate::mem::unsealed;
 use crate::stereo::{DepthMap, RectifiedViews, Stereo};
-use stipple_drivers::{Fault, Image, Span};
+use stipple_drivers::{Fault, Image};
 
 /// Part of a view that must have depth to seed from; the rest is continued from it.
 const DEPTH_MIN: f64 = 0.01;
@@ -43,8 +43,6 @@ const STEPS_MIN: usize = 8;
 /// A whole uncovered view may take one in so many of the pool where others are evicted for it.
 const POOL_DIVISOR: usize = 16;
 
-/// What was anchored longer ago than this is of an earlier visit.
-const VISIT: Span = Span(30_000_000_000);
 /// Seeds lie where an earlier visit left Gaussians if they share a cell that is so many times as wide as the occupancy grid's:
 /// depth is no better far away.
 const VISIT_CELLS: f32 = 5.0;
@@ -232,8 +230,7 @@ impl Anchors {
         enough
     }
 
-    /// Seeds as dense as `whole` for a view, `room` at most; how many, and how many of them where an earlier visit left
-    /// Gaussians.
+    /// Seeds as dense as `whole` for a view, `room` at most; how many, and how many where an earlier visit left Gaussians.
     fn seed(
         &mut self,
         scene: &mut Scene,
@@ -248,12 +245,9 @@ impl Anchors {
         let Scene { gpu, pipeline, views, counters, .. } = scene;
         let pool = &pipeline.pool;
         self.occupancy.look_up(gpu, pool, (std::iter::once(pool.slots(view.epoch)), 1.0), points, answers)?;
-        let now = views.get(index).t;
-        let of_earlier = |number: u32| {
-            let anchor = views.get((number / PARTS) as usize);
-            anchor.epoch == view.epoch && now - anchor.t > VISIT
-        };
-        self.occupancy.look_up(gpu, pool, (pool.slots_of(of_earlier), VISIT_CELLS), points, earlier)?;
+        let anchor = |number: u32| views.get((number / PARTS) as usize);
+        let left = pool.slots_of(|n| anchor(n).epoch == view.epoch && anchor(n).visited_again);
+        self.occupancy.look_up(gpu, pool, (left, VISIT_CELLS), points, earlier)?;
         let (exposure, planes) = (views.exposure(index), planes(views, &self.pair, index));
         let (seeds, again) = seeder.keep(answers, earlier, room, counters);
         let splats = seeds.iter().map(|s| s.gaussian(planes, exposure));

@@ -63,6 +63,8 @@ pub fn entry(id: u32, s: &KeyframeAbout, epoch_base: u32) -> Stored {
         hidden: Cells::default(),
         incomplete: false,
         steps: s.steps,
+        near_at: s.t,
+        visited_again: false,
     }
 }
 

@@ -207,6 +207,7 @@ impl Mapper {
     pub fn ingest(&mut self, keyframe: &Keyframe) -> Result<StepKind, GpuError> {
         self.apply_corrections()?;
         self.finish_pending()?;
+        self.scene.views.visit(keyframe.t, keyframe.epoch, keyframe.world_from_body.p);
         if let Some(archive) = &mut self.archive {
             let at = (keyframe.t, keyframe.world_from_body);
             archive.arrive(&mut self.scene, at, keyframe.epoch, self.trainer.in_burst())?;

@@ -11,7 +11,12 @@ use super::horizon::{Cells, Horizon};
 use super::keyframes::{Keyframe, PoseCorrection};
 use super::refine::Refinement;
 use super::shape::Shape;
-use stipple_drivers::{Image, Nanos, Pose};
+use glam::DVec3;
+use stipple_drivers::{Image, Nanos, Pose, Span};
+
+/// A vehicle visits the anchors as near as this, m; a visit ends when none of it was that near for so long.
+const VISIT_NEAR_M: f64 = 5.0;
+const VISIT_AWAY: Span = Span(30_000_000_000);
 
 /// One camera's view of a keyframe.
 #[derive(Clone, Copy, Debug)]
@@ -41,6 +46,9 @@ pub struct Stored {
     pub incomplete: bool,
     /// Training steps on it.
     pub steps: u32,
+    /// When the vehicle was last near it, and whether it had been away before.
+    pub near_at: Nanos,
+    pub visited_again: bool,
 }
 
 impl Stored {
@@ -243,6 +251,8 @@ impl Views {
             hidden: Cells::default(),
             incomplete: false,
             steps: 0,
+            near_at: t,
+            visited_again: false,
         };
         if self.camera(index) == 0 && self.free_place().is_none() {
             return None;
@@ -361,6 +371,15 @@ impl Views {
         true
     }
 
+    /// Takes in that the vehicle is at a place now. An anchor near it is visited again if the vehicle was away for a while.
+    pub fn visit(&mut self, t: Nanos, epoch: u32, p_world: DVec3) {
+        let near = |e: &&mut Stored| e.epoch == epoch && e.given.p.distance(p_world) <= VISIT_NEAR_M;
+        for entry in self.entries.iter_mut().filter(|e| e.anchor).filter(near) {
+            entry.visited_again |= t - entry.near_at > VISIT_AWAY;
+            entry.near_at = t;
+        }
+    }
+
     /// Anchors whose pose was corrected by more than `tolerance` (m, rad) since their Gaussians were put in place, and
     /// by what; they count as in place from here on.
     pub fn displaced(&mut self, tolerance: f64) -> impl Iterator<Item = (u32, Pose)> + '_ {
@@ -381,7 +400,7 @@ impl Views {
 mod tests {
     use super::*;
     use crate::limits::CAMERAS_MAX;
-    use glam::{DQuat, DVec3};
+    use glam::DQuat;
 
     const ON_BODY: [Pose; 2] = [Pose::IDENTITY; 2];
 
@@ -403,6 +422,26 @@ mod tests {
         assert_eq!(s.add(&keyframe(3, false), ON_BODY, |_, _| {}), None);
         assert_eq!(s.training(), [0, 2]);
         assert_eq!((s.len(), s.planes(1)[0].pixels[3]), (3, 9));
+    }
+
+    #[test]
+    fn an_anchor_is_visited_again_when_the_vehicle_was_away_for_a_while() {
+        let mut s = views(3, 1);
+        for (id, epoch) in [(0, 0), (1, 0), (2, 1)] {
+            s.add(&Keyframe { id, epoch, ..Keyframe::default() }, ON_BODY, |_, _| {});
+        }
+        // The second is no anchor, the third is of another epoch.
+        (s.entries[0].anchor, s.entries[2].anchor) = (true, true);
+        let mut again = |seconds: f64, x: f64| {
+            s.visit(Nanos::default() + Span::from_secs(seconds), 0, DVec3::X * x);
+            [0, 1, 2].map(|i| s.entries[i].visited_again)
+        };
+        // Around it for two minutes, and away for half of one.
+        assert!((1..7).all(|k| again(20.0 * f64::from(k), 4.0) == [false; 3]));
+        assert_eq!([again(130.0, 6.0), again(149.0, 4.0)], [[false; 3]; 2]);
+        assert_eq!([again(179.5, 6.0), again(179.6, 4.0)], [[false; 3], [true, false, false]]);
+        // Its Gaussians are those of an earlier visit from then on.
+        assert_eq!(again(180.0, 4.0), [true, false, false]);
     }
 
     #[test]
