@@ -14,7 +14,7 @@ use super::shape::Shape;
 use glam::DVec3;
 use stipple_drivers::{Image, Nanos, Pose, Span};
 
-/// A vehicle visits the anchors as near as this, m; a visit ends when none of it was that near for so long.
+/// The vehicle is with an anchor that is as near as this, m, and has left it when it was with it last so long ago.
 const VISIT_NEAR_M: f64 = 5.0;
 const VISIT_AWAY: Span = Span(30_000_000_000);
 
@@ -46,7 +46,7 @@ pub struct Stored {
     pub incomplete: bool,
     /// Training steps on it.
     pub steps: u32,
-    /// When the vehicle was last near it, and whether it had been away before.
+    /// When the vehicle was last near this anchor, and whether it ever came back after it had left.
     pub near_at: Nanos,
     pub visited_again: bool,
 }
@@ -371,7 +371,7 @@ impl Views {
         true
     }
 
-    /// Takes in that the vehicle is at a place now. An anchor near it is visited again if the vehicle was away for a while.
+    /// Notes where the vehicle is: an anchor that it had left and is near now is visited again.
     pub fn visit(&mut self, t: Nanos, epoch: u32, p_world: DVec3) {
         let near = |e: &&mut Stored| e.epoch == epoch && e.given.p.distance(p_world) <= VISIT_NEAR_M;
         for entry in self.entries.iter_mut().filter(|e| e.anchor).filter(near) {
