@@ -75,7 +75,7 @@ impl Workspace {
         let seeds_max = config.seeds_per_anchor as usize;
         Workspace {
             depth: DepthMap::new(width, height),
-            seeder: Seeder::new(width, height, seeds_max),
+            seeder: Seeder::new(width, height, seeds_max, config.wrong_error),
             diffusion: Diffusion::new(width, height),
             newcomers: Vec::with_capacity(config.densify_max as usize),
             answers: Vec::with_capacity(seeds_max),

@@ -53,10 +53,9 @@ const DENSITY_FILLED: f64 = 0.5;
 const GRADIENT_DOUBLES: f64 = 6.0;
 /// Below this rendered alpha a pixel takes seeds even in an occupied cell.
 const SEED_ALPHA: f32 = 0.5;
-/// A pixel rendered this far from what was seen takes seeds even in an occupied cell, and even where an earlier visit left
-/// Gaussians: in other light nearly all is a little wrong.
+/// A pixel rendered this far from what was seen takes seeds even in an occupied cell. Not where an earlier visit left Gaussians:
+/// in other light nearly all is a little wrong, and only what is `map.wrong_error` off takes seeds.
 const SEED_ERROR: f32 = 0.1;
-const SEED_ERROR_AGAIN: f32 = 0.25;
 
 /// Picks seeds; owns the scratch it needs.
 pub struct Seeder {
@@ -65,15 +64,17 @@ pub struct Seeder {
     points: Vec<[f32; 4]>,
     seeds: Vec<Seed>,
     seeds_max: usize,
+    wrong_error: f32,
 }
 
 impl Seeder {
-    pub fn new(width: usize, height: usize, seeds_max: usize) -> Seeder {
+    pub fn new(width: usize, height: usize, seeds_max: usize, wrong_error: f64) -> Seeder {
         Seeder {
             fill: DepthFill::new(width, height),
             points: Vec::with_capacity(seeds_max),
             seeds: Vec::with_capacity(seeds_max),
             seeds_max,
+            wrong_error: wrong_error as f32,
         }
     }
 
@@ -106,7 +107,7 @@ impl Seeder {
         for i in 0..self.seeds.len() {
             counters.occupancy_full.add(u64::from(answers[i] == UNKNOWN));
             let error_min = match (answers[i], earlier[i]) {
-                (_, HELD) => SEED_ERROR_AGAIN,
+                (_, HELD) => self.wrong_error,
                 (HELD, _) => SEED_ERROR,
                 _ => 0.0,
             };
@@ -181,14 +182,14 @@ mod tests {
 
     /// With a map that is black and `alpha` opaque, and every cell held as `answer` says.
     fn seed(image: &Image, alpha: f32, answer: u32) -> Vec<Seed> {
-        let (mut s, mut d, counters) = (Seeder::new(W, H, 300), Diffusion::new(W, H), Counters::default());
+        let (mut s, mut d, counters) = (Seeder::new(W, H, 300, 0.25), Diffusion::new(W, H), Counters::default());
         let n = s.seed(&seen(image, &FAR, &black(&[alpha; W * H])), usize::MAX, &mut d, &counters).len();
         s.keep(&vec![answer; n], &vec![FREE; n], usize::MAX, &counters).0.to_vec()
     }
 
     #[test]
     fn where_earlier_visits_left_something_only_what_is_quite_wrong_is_kept() {
-        let (mut s, mut d, counters) = (Seeder::new(W, H, 300), Diffusion::new(W, H), Counters::default());
+        let (mut s, mut d, counters) = (Seeder::new(W, H, 300, 0.25), Diffusion::new(W, H), Counters::default());
         // A quarter each is right, a little wrong and quite wrong, and uncovered.
         let mut image = Image::new(W, H);
         image.pixels[W * H / 4..W * H / 2].fill(40);
@@ -248,7 +249,7 @@ mod tests {
 
     #[test]
     fn room_is_never_exceeded() {
-        let (mut s, mut d, counters) = (Seeder::new(W, H, 300), Diffusion::new(W, H), Counters::default());
+        let (mut s, mut d, counters) = (Seeder::new(W, H, 300, 0.25), Diffusion::new(W, H), Counters::default());
         let (image, rendered) = (Image::new(W, H), black(&[0.0; W * H]));
         let v = seen(&image, &FAR, &rendered);
         let n = s.seed(&v, 300, &mut d, &counters).len();
