@@ -11,7 +11,7 @@ const NAMES: [&str; 2] = ["patrol-two", "patrol"];
 
 #[test]
 fn the_path_keeps_clear_of_every_surface_and_is_that_of_a_careful_drone() {
-    for name in NAMES {
+    for name in NAMES.into_iter().chain(["twins", "doors"]) {
         let sim = Sim::new(&Scenario::named(name).unwrap()).unwrap();
         let (mut clear, mut speed, mut turn, mut push) = (f64::INFINITY, 0.0f64, 0.0f64, 0.0f64);
         let mut before: Option<DVec3> = None;
@@ -59,6 +59,27 @@ fn every_room_is_seen_twice_from_opposite_headings() {
             println!("{name}, {}: {other} of {near}", room.name);
             assert!(near > 50 && 2 * other > near, "{name}, {}: {other} of {near}", room.name);
         }
+    }
+}
+
+/// Rooms that look the same are visited in turn; bays that look the same are passed forth and back.
+#[test]
+fn places_that_look_the_same_are_passed_twice() {
+    for (name, among, expected) in [
+        ("twins", &["room a", "room b"][..], "room a, room b, room a, room b"),
+        (
+            "doors",
+            &["bay 1", "bay 5", "bay 8", "room east", "room west"][..],
+            "bay 1, bay 5, bay 8, room east, bay 8, bay 5, bay 1, room west, bay 1",
+        ),
+    ] {
+        let scenario = Scenario::named(name).unwrap();
+        let sim = Sim::new(&scenario).unwrap();
+        let place = |p: DVec3| scenario.room_at(p).unwrap_or_else(|| panic!("{name}: {p} is in no room"));
+        let mut passed: Vec<&str> = sim.truth().iter().map(|s| scenario.rooms()[place(s.pose.p)].name).collect();
+        passed.retain(|room| among.contains(room));
+        passed.dedup();
+        assert_eq!(passed.join(", "), expected, "{name}");
     }
 }
 

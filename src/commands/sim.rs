@@ -7,8 +7,8 @@ use stipple_drivers::{Fault, FaultKind, Span};
 
 #[derive(clap::Args)]
 pub struct Args {
-    /// demo, hover, circle, aggressive, static or pauses; patrol-two or patrol, through a building; or `euroc`, to fly the
-    /// trajectory of --truth
+    /// demo, hover, circle, aggressive, static or pauses; patrol-two or patrol, through a building; twins or doors, past
+    /// places that look the same; or `euroc`, to fly the trajectory of --truth
     scenario: String,
     /// Folder to write
     #[arg(long, value_name = "DIR")]

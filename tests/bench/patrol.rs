@@ -42,7 +42,7 @@ pub struct Args {
     /// Folder for the results
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
-    /// patrol (eight rooms, 10 min) or patrol-two (two rooms, 85 s)
+    /// patrol (eight rooms, 10 min), patrol-two (two rooms, 85 s), twins or doors (places that look the same, 112 and 84 s)
     #[arg(long, value_name = "NAME", default_value = "patrol")]
     scenario: String,
     /// Where poses come from
@@ -104,7 +104,7 @@ pub fn run(args: &Args) -> Result<(), Fault> {
         None => default_board(&set)?,
     };
     let mut scenario = Scenario::named(&args.scenario).filter(|s| !s.rooms().is_empty()).ok_or_else(|| {
-        let fix = "choose patrol or patrol-two";
+        let fix = "choose patrol, patrol-two, twins or doors";
         Fault::new(FaultKind::Usage, &args.scenario, "is not a flight through a building", fix)
     })?;
     if let Some(s) = args.seconds {

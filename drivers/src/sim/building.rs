@@ -1,12 +1,12 @@
 //! The building of a patrol: a cell for each room of the plan and for each doorway, furnished and lit twice.
 //!
 //! Input is the plan, the path that must stay free and a seed. Every room has patterns of its own, and so has every part of a
-//! corridor. In the second light other lamps burn, fewer and lower, and less comes from everywhere: no gain turns one into the
-//! other.
+//! corridor, except where the plan says that a place looks like another: it has the other's patterns, furniture and light. In
+//! the second light other lamps burn, fewer and lower, and less comes from everywhere: no gain turns one into the other.
 
 use super::furnish::{self, Place};
 use super::patrol::{Door, Plan, DOOR};
-use super::room::{Light, LightMap, Opening, Room, AMBIENT, CELLS_MAX};
+use super::room::{Face, Light, LightMap, Opening, Room, AMBIENT, CELLS_MAX};
 use super::texture::{Material, BRICK, CEILING_TILE, CONCRETE, CRATE, MARBLE, PARQUET, PLAID, PLASTER};
 use glam::{Vec2, Vec3};
 use rand::{Rng, SeedableRng};
@@ -46,21 +46,58 @@ pub fn build(plan: &Plan, path: &[Vec3], seed: u64, threads: usize) -> Room {
         let materials = [a, b, b, a, FLOORS[k % FLOORS.len()], CEILINGS[k % CEILINGS.len()]];
         room.add_cell(r.low.as_vec3(), r.high.as_vec3(), materials, rng.random());
     }
-    plan.doors.iter().for_each(|door| open(&mut room, plan, door, rng.random()));
+    let ways: Vec<Option<usize>> = plan.doors.iter().map(|door| open(&mut room, plan, door, rng.random())).collect();
+    let alike = alike(plan, &ways);
+    for &[cell, first] in &alike {
+        let [to, from] = [cell, first].map(|c| room.cells[c].face as usize);
+        for k in 0..6 {
+            room.faces[to + k] = Face { chart: room.faces[to + k].chart, ..room.faces[from + k] };
+        }
+    }
     assert!(room.cells.len() <= CELLS_MAX, "a set of cells is a word");
-    for (k, r) in plan.rooms.iter().enumerate() {
+    for (k, r) in plan.rooms.iter().enumerate().filter(|(k, _)| plan.like(*k) == *k) {
         let first = room.solids.len();
         let place = Place { cell: k, low: r.low.as_vec3(), high: r.high.as_vec3() };
-        furnish::fill(&mut room, &place, path, !r.corridor, &mut rng);
+        let free = free_in_all(plan, k, path);
+        furnish::fill(&mut room, &place, &free, !r.corridor, &mut rng);
         room.cells[k].solids = first..room.solids.len();
+    }
+    for &[cell, first] in alike.iter().filter(|a| a[0] < plan.rooms.len()) {
+        room.furnish_alike(cell, first);
     }
     let end = room.solids.len();
     room.cells[plan.rooms.len()..].iter_mut().for_each(|doorway| doorway.solids = end..end);
     plan.rooms.iter().for_each(|r| furnish::add_lamps(&mut room, r.low.as_vec3(), r.high.as_vec3()));
     room.light_map = LightMap::bake(&room, AMBIENT, LIGHT_PITCH, threads);
-    room.lights = plan.rooms.iter().map(|r| evening(r.low.as_vec3(), r.high.as_vec3(), &mut rng)).collect();
-    room.later = Some(LightMap::bake(&room, EVENING * AMBIENT, LIGHT_PITCH, threads));
+    for &[cell, first] in &alike {
+        room.light_alike(cell, first);
+    }
+    if plan.varied {
+        room.lights = plan.rooms.iter().map(|r| evening(r.low.as_vec3(), r.high.as_vec3(), &mut rng)).collect();
+        room.later = Some(LightMap::bake(&room, EVENING * AMBIENT, LIGHT_PITCH, threads));
+    }
     room
+}
+
+/// The cells that look like another, each with that one: rooms, and their doorways, which are in `ways`, one for each door.
+fn alike(plan: &Plan, ways: &[Option<usize>]) -> Vec<[usize; 2]> {
+    let rooms = (0..plan.rooms.len()).map(|k| [k, plan.like(k)]);
+    let doorways = plan.doors.iter().zip(ways).filter_map(|(door, way)| {
+        let first = plan.doors.iter().position(|d| d.rooms[0] == plan.like(door.rooms[0]))?;
+        (plan.like(door.rooms[0]) != door.rooms[0]).then_some([(*way)?, ways[first]?])
+    });
+    rooms.chain(doorways).filter(|[cell, first]| cell != first).collect()
+}
+
+/// The path, and those of its points that are in or near a room that looks like room `k`, moved to the same place in `k`.
+fn free_in_all(plan: &Plan, k: usize, path: &[Vec3]) -> Vec<Vec3> {
+    let mut free = path.to_vec();
+    for (_, r) in plan.rooms.iter().enumerate().filter(|(j, _)| *j != k && plan.like(*j) == k) {
+        let (low, high) = (r.low.as_vec3() - furnish::KEEP_CLEAR, r.high.as_vec3() + furnish::KEEP_CLEAR);
+        let by = (plan.rooms[k].low - r.low).as_vec3();
+        free.extend(path.iter().filter(|p| p.cmpge(low).all() && p.cmple(high).all()).map(|p| *p + by));
+    }
+    free
 }
 
 /// The one lamp of a room in the evening: low, and near one of its corners.
@@ -74,8 +111,9 @@ fn evening(low: Vec3, high: Vec3, rng: &mut ChaCha8Rng) -> Light {
     Light { at: at.extend(low.z + EVENING_HEIGHT), power }
 }
 
-/// Opens the wall between two cells: by a doorway as deep as the wall, or, where they touch, from wall to wall.
-fn open(room: &mut Room, plan: &Plan, door: &Door, seed: u32) {
+/// Opens the wall between two cells: by a doorway as deep as the wall, or, where they touch, from wall to wall. Returns the
+/// cell of the doorway.
+fn open(room: &mut Room, plan: &Plan, door: &Door, seed: u32) -> Option<usize> {
     let (axis, [below, above]) = door.wall(plan.rooms);
     let (near, far) = (room.cells[below].high[axis], room.cells[above].low[axis]);
     let side = 2 * axis as u32;
@@ -86,7 +124,7 @@ fn open(room: &mut Room, plan: &Plan, door: &Door, seed: u32) {
         (low[axis], high[axis]) = (near, near);
         room.cells[below].openings.push(Opening { side: side + 1, low, high, to: above });
         room.cells[above].openings.push(Opening { side, low, high, to: below });
-        return;
+        return None;
     }
     let across = 1 - axis;
     let half = 0.5 * DOOR.x as f32;
@@ -111,6 +149,7 @@ fn open(room: &mut Room, plan: &Plan, door: &Door, seed: u32) {
         let (low, high) = plane(at);
         room.cells[cell].openings.push(Opening { side, low, high, to });
     }
+    Some(doorway)
 }
 
 #[cfg(test)]
@@ -143,7 +182,7 @@ mod tests {
 
     #[test]
     fn a_ray_leaves_a_room_through_a_doorway_alone() {
-        for extent in [Extent::Two, Extent::Whole] {
+        for extent in [Extent::Two, Extent::Whole, Extent::Twins, Extent::Doors] {
             let (plan, room) = built(extent, 3);
             let mut rng = ChaCha8Rng::seed_from_u64(5);
             let mut left = 0;
@@ -172,28 +211,30 @@ mod tests {
 
     #[test]
     fn walls_of_different_rooms_do_not_look_alike() {
-        let (plan, room) = built(Extent::Whole, 1);
-        // Levels of each room's four walls at the same places.
-        let n = 300;
-        let levels = |wall: usize| -> Vec<f32> {
-            let face = &room.faces[wall];
-            let spot = |k: i32| {
-                let at = Vec2::new((k % 25) as f32 * 0.09 + 0.2, (k / 25) as f32 * 0.2 + 0.2);
-                albedo(face.material, face.seed, Spot { at, footprint: Vec2::splat(0.02), size: face.size })
+        for extent in [Extent::Whole, Extent::Twins, Extent::Doors] {
+            let (plan, room) = built(extent, 1);
+            // Levels of each room's four walls at the same places.
+            let n = 300;
+            let levels = |wall: usize| -> Vec<f32> {
+                let face = &room.faces[wall];
+                let spot = |k: i32| {
+                    let at = Vec2::new((k % 25) as f32 * 0.09 + 0.2, (k / 25) as f32 * 0.2 + 0.2);
+                    albedo(face.material, face.seed, Spot { at, footprint: Vec2::splat(0.02), size: face.size })
+                };
+                let levels: Vec<f32> = (0..n).map(spot).collect();
+                let mean = levels.iter().sum::<f32>() / n as f32;
+                levels.into_iter().map(|v| v - mean).collect()
             };
-            let levels: Vec<f32> = (0..n).map(spot).collect();
-            let mean = levels.iter().sum::<f32>() / n as f32;
-            levels.into_iter().map(|v| v - mean).collect()
-        };
-        let walls: Vec<(usize, Vec<f32>)> = (0..plan.rooms.len())
-            .flat_map(|k| (0..4).map(move |w| (k, 6 * k + w)))
-            .map(|(k, w)| (k, levels(w)))
-            .collect();
-        let norm = |v: &[f32]| v.iter().map(|v| v * v).sum::<f32>().sqrt();
-        for (i, (a, x)) in walls.iter().enumerate() {
-            for (b, y) in walls[..i].iter().filter(|(b, _)| a != b) {
-                let alike = x.iter().zip(y).map(|(x, y)| x * y).sum::<f32>() / (norm(x) * norm(y));
-                assert!(alike < 0.7, "{} and {}: {alike}", plan.rooms[*a].name, plan.rooms[*b].name);
+            let walls: Vec<(usize, Vec<f32>)> = (0..plan.rooms.len())
+                .flat_map(|k| (0..4).map(move |w| (k, 6 * k + w)))
+                .map(|(k, w)| (k, levels(w)))
+                .collect();
+            let norm = |v: &[f32]| v.iter().map(|v| v * v).sum::<f32>().sqrt();
+            for (i, (a, x)) in walls.iter().enumerate() {
+                for (b, y) in walls[..i].iter().filter(|(b, _)| plan.like(*a) != plan.like(*b)) {
+                    let alike = x.iter().zip(y).map(|(x, y)| x * y).sum::<f32>() / (norm(x) * norm(y));
+                    assert!(alike < 0.7, "{} and {}: {alike}", plan.rooms[*a].name, plan.rooms[*b].name);
+                }
             }
         }
     }

@@ -5,6 +5,9 @@
 //! saw from one heading it sees again from the opposite one. The corners of that polyline are rounded by smoothing it along
 //! its length, which also slows the rig down in them; the heading is that of the path a little ahead, smoothed more, with a slow
 //! sweep to both sides.
+//!
+//! Two plans, `TWINS` and `DOORS`, have places that look exactly the same, so that false loop closures between them can be
+//! tested. There the second round is flown like the first and in the same light.
 
 use super::way::{look, smooth, under_way, GATHER, REST};
 use crate::types::{Pose, Span};
@@ -77,21 +80,29 @@ impl Door {
 /// A visit: room, doors in and out.
 type Visit = (usize, usize, usize);
 
-/// How much of a patrol is flown.
+/// What a patrol flies through.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Extent {
     /// Two rooms and the corridor between them.
     Two,
     /// Eight rooms and two corridors, 40 m x 25 m.
     Whole,
+    /// Two rooms that look the same, 8 m apart, and a corridor whose parts do not; the rooms are visited in turn.
+    Twins,
+    /// A corridor of eight bays that look the same, each with a door and a niche behind it, between two rooms; forth and back.
+    Doors,
 }
 
 /// Floor plan and tours of a patrol.
 pub(super) struct Plan {
     /// Rooms, then parts of corridors.
     pub rooms: &'static [RoomBox],
-    /// What joins them.
+    /// What joins them; the first of the two of a door is not the corridor, where only one is.
     pub doors: &'static [Door],
+    /// The room that each looks exactly like: as large, and open on the same sides. Beyond the list, itself.
+    pub like: &'static [usize],
+    /// Whether the second round is flown the other way about, higher and in other light.
+    pub varied: bool,
     /// Where the flight begins, m.
     start: DVec2,
     /// Where corridors of different directions meet, m.
@@ -154,6 +165,8 @@ const WHOLE: Plan = Plan {
     start: DVec2::new(1.5, 12.2),
     junction: DVec2::new(20.4, 12.2),
     ring: 2.3,
+    like: &[],
+    varied: true,
     rounds: [
         &[(0, 0, 0), (1, 1, 1), (2, 2, 2), (3, 3, 3), (4, 4, 4), (5, 5, 5), (6, 6, 6), (7, 7, 7)],
         &[(0, 0, 8), (1, 8, 1), (2, 2, 9), (3, 9, 3), (4, 4, 4), (5, 5, 5), (6, 6, 10), (7, 10, 7)],
@@ -171,15 +184,98 @@ const TWO: Plan = Plan {
     start: DVec2::new(1.0, 6.3),
     junction: DVec2::ZERO,
     ring: 1.6,
+    like: &[],
+    varied: true,
     rounds: [&[(0, 0, 0), (1, 1, 1)], &[(0, 0, 0), (1, 1, 1)]],
     seconds: 85.0,
 };
+
+const TWINS: Plan = Plan {
+    rooms: &[
+        room("room a", [0.0, 0.0], [6.0, 5.0]),
+        room("room b", [14.0, 0.0], [20.0, 5.0]),
+        corridor("entry", [-4.0, 5.2], [0.5, 8.4]),
+        corridor("corridor 1", [0.5, 5.2], [8.0, 7.4]),
+        corridor("corridor 2", [8.0, 5.2], [12.5, 7.4]),
+        corridor("corridor 3", [12.5, 5.2], [20.0, 7.4]),
+    ],
+    doors: &[door(0, 3, 3.0), door(1, 5, 17.0), door(2, 3, 6.3), door(3, 4, 6.3), door(4, 5, 6.3)],
+    start: DVec2::new(-2.0, 6.3),
+    junction: DVec2::ZERO,
+    ring: 1.6,
+    like: &[0, 0],
+    varied: false,
+    rounds: [&[(0, 0, 0), (1, 1, 1)], &[(0, 0, 0), (1, 1, 1)]],
+    seconds: 112.0,
+};
+
+/// Flown from the first bay to the room in the east, back to the one in the west, and to the first bay again. The bays are made
+/// like the third, which of the second to the seventh has the most texture with seeds 1 to 5, and the niches like the one
+/// behind its door.
+const DOORS: Plan = Plan {
+    rooms: &[
+        corridor("bay 1", [0.0, 0.0], [3.0, 2.4]),
+        corridor("bay 2", [3.0, 0.0], [6.0, 2.4]),
+        corridor("bay 3", [6.0, 0.0], [9.0, 2.4]),
+        corridor("bay 4", [9.0, 0.0], [12.0, 2.4]),
+        corridor("bay 5", [12.0, 0.0], [15.0, 2.4]),
+        corridor("bay 6", [15.0, 0.0], [18.0, 2.4]),
+        corridor("bay 7", [18.0, 0.0], [21.0, 2.4]),
+        corridor("bay 8", [21.0, 0.0], [24.0, 2.4]),
+        room("niche 1", [0.2, 2.6], [2.8, 4.6]),
+        room("niche 2", [3.2, 2.6], [5.8, 4.6]),
+        room("niche 3", [6.2, 2.6], [8.8, 4.6]),
+        room("niche 4", [9.2, 2.6], [11.8, 4.6]),
+        room("niche 5", [12.2, 2.6], [14.8, 4.6]),
+        room("niche 6", [15.2, 2.6], [17.8, 4.6]),
+        room("niche 7", [18.2, 2.6], [20.8, 4.6]),
+        room("niche 8", [21.2, 2.6], [23.8, 4.6]),
+        room("room west", [-6.2, -1.3], [-0.2, 3.7]),
+        room("room east", [24.2, -1.3], [30.2, 3.7]),
+    ],
+    doors: &[
+        door(16, 0, 1.2),
+        door(17, 7, 1.2),
+        door(0, 1, 1.2),
+        door(1, 2, 1.2),
+        door(2, 3, 1.2),
+        door(3, 4, 1.2),
+        door(4, 5, 1.2),
+        door(5, 6, 1.2),
+        door(6, 7, 1.2),
+        door(8, 0, 1.5),
+        door(9, 1, 4.5),
+        door(10, 2, 7.5),
+        door(11, 3, 10.5),
+        door(12, 4, 13.5),
+        door(13, 5, 16.5),
+        door(14, 6, 19.5),
+        door(15, 7, 22.5),
+    ],
+    start: DVec2::new(1.0, 1.2),
+    // A door at the end of a corridor counts as a turn of it; the flight turns to both in the last bay.
+    junction: DVec2::new(22.5, 1.2),
+    ring: 1.6,
+    like: &[2, 2, 2, 2, 2, 2, 2, 2, 10, 10, 10, 10, 10, 10, 10, 10],
+    varied: false,
+    rounds: [&[(17, 1, 1)], &[(16, 0, 0)]],
+    seconds: 84.0,
+};
+
+impl Plan {
+    /// The room that a room looks exactly like, or itself.
+    pub fn like(&self, room: usize) -> usize {
+        self.like.get(room).copied().unwrap_or(room)
+    }
+}
 
 impl Extent {
     pub(super) fn plan(self) -> &'static Plan {
         match self {
             Extent::Two => &TWO,
             Extent::Whole => &WHOLE,
+            Extent::Twins => &TWINS,
+            Extent::Doors => &DOORS,
         }
     }
 }
@@ -242,8 +338,9 @@ fn waypoints(plan: &Plan, round: usize, from: DVec2) -> Vec<DVec3> {
     let mut way = vec![from];
     // Which corridor it is in: one along x or one along y.
     let mut along = 0;
+    let manner = if plan.varied { round } else { 0 };
     for &(room, enter, leave) in plan.rounds[round] {
-        let inset = plan.ring * RING[round];
+        let inset = plan.ring * RING[manner];
         let [entry, exit] = [enter, leave].map(|d| inside(plan, &plan.doors[d], room, inset));
         if let Some((place, axis)) = outside(plan, &plan.doors[enter]) {
             if axis != along {
@@ -252,12 +349,12 @@ fn waypoints(plan: &Plan, round: usize, from: DVec2) -> Vec<DVec3> {
             (along, _) = (axis, way.push(place));
         }
         way.push(entry);
-        ring(&plan.rooms[room], inset, [entry, exit], round == 1, &mut way);
+        ring(&plan.rooms[room], inset, [entry, exit], manner == 1, &mut way);
         if let Some((place, axis)) = outside(plan, &plan.doors[leave]) {
             (along, _) = (axis, way.push(place));
         }
     }
-    way.into_iter().map(|p| p.extend(FLIES_AT[round])).collect()
+    way.into_iter().map(|p| p.extend(FLIES_AT[manner])).collect()
 }
 
 /// The point of a room's ring in front of one of its doors.

@@ -194,6 +194,33 @@ impl Room {
         self.solids.push(Solid { shape, centre, cos: 1.0, sin: 0.0, face: first, bound });
     }
 
+    /// Furnishes a cell like another, which has its furniture.
+    pub fn furnish_alike(&mut self, cell: usize, first: usize) {
+        let (by, begin) = (self.cells[cell].low - self.cells[first].low, self.solids.len());
+        for k in self.cells[first].solids.clone() {
+            let (s, face) = (self.solids[k], self.faces.len() as u32);
+            for f in s.faces() {
+                let face = self.faces[f];
+                self.faces.push(Face { chart: face.chart.moved(by), ..face });
+            }
+            self.solids.push(Solid { centre: s.centre + by, face, ..s });
+        }
+        self.cells[cell].solids = begin..self.solids.len();
+    }
+
+    /// Lights a cell and its furniture like another cell, which has the same furniture.
+    pub fn light_alike(&mut self, cell: usize, first: usize) {
+        for (face, as_face) in self.faces_of(cell).zip(self.faces_of(first)).collect::<Vec<_>>() {
+            self.light_map.share(face, as_face);
+        }
+    }
+
+    /// The faces of a cell and of its furniture.
+    pub fn faces_of(&self, cell: usize) -> impl Iterator<Item = usize> + '_ {
+        let Cell { face, solids, .. } = &self.cells[cell];
+        (*face as usize..*face as usize + 6).chain(self.solids[solids.clone()].iter().flat_map(|s| s.faces()))
+    }
+
     /// The first surface along a unit ray: distance and face.
     pub fn nearest(&self, o: Vec3, d: Vec3) -> (f32, u32) {
         let mut best = self.shell(self.cell_of(o), o, d);
@@ -239,7 +266,27 @@ fn face(origin: Vec3, u: Vec3, v: Vec3, size: Vec2, material: Material, seed: u3
     Face { chart: Chart::Flat { origin, u, v }, size, material, seed }
 }
 
+impl Chart {
+    fn moved(self, by: Vec3) -> Chart {
+        match self {
+            Chart::Flat { origin, u, v } => Chart::Flat { origin: origin + by, u, v },
+            Chart::Ball { centre, radius } => Chart::Ball { centre: centre + by, radius },
+            Chart::Drum { base, radius } => Chart::Drum { base: base + by, radius },
+        }
+    }
+}
+
 impl Solid {
+    /// Its faces.
+    fn faces(&self) -> std::ops::Range<usize> {
+        let n = match self.shape {
+            Shape::Block { .. } => 6,
+            Shape::Ball { .. } => 1,
+            Shape::Drum { .. } => 3,
+        };
+        self.face as usize..self.face as usize + n
+    }
+
     /// Whether a ray meets the bounding sphere: a cheap test.
     #[inline]
     fn may_meet(&self, o: Vec3, d: Vec3, reach: f32) -> bool {

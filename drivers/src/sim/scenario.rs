@@ -93,7 +93,7 @@ pub enum Flight {
         rest: f64,
         hover: f64,
     },
-    /// Through a building, every room twice, in other light the second time.
+    /// Through a building in two rounds.
     Patrol(Extent),
     Recorded(Recording),
 }
@@ -109,7 +109,7 @@ pub struct Recording {
     pub imu: Option<Vec<ImuSample>>,
 }
 
-const NAMED: [(&str, Flight, f64); 8] = [
+const NAMED: [(&str, Flight, f64); 10] = [
     ("demo", Flight::Demo, 10.0),
     ("hover", Flight::Hover, 10.0),
     ("circle", Flight::Circle, 12.0),
@@ -118,6 +118,8 @@ const NAMED: [(&str, Flight, f64); 8] = [
     ("pauses", Flight::Pauses { rest: 60.0, hover: 20.0 }, 100.0),
     ("patrol-two", Flight::Patrol(Extent::Two), 85.0),
     ("patrol", Flight::Patrol(Extent::Whole), 600.0),
+    ("twins", Flight::Patrol(Extent::Twins), 112.0),
+    ("doors", Flight::Patrol(Extent::Doors), 84.0),
 ];
 
 /// Frames a second of a patrol: at its speed the view moves by as much between two as elsewhere.

@@ -73,6 +73,11 @@ impl LightMap {
         self.nodes.extend([irradiance; 4]);
     }
 
+    /// Lights a face like another of its size.
+    pub fn share(&mut self, face: usize, as_face: usize) {
+        self.grids[face] = self.grids[as_face];
+    }
+
     /// The irradiance at a surface coordinate of a face, m.
     #[inline]
     pub fn at(&self, face: usize, at: Vec2) -> f32 {
