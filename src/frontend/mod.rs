@@ -37,9 +37,10 @@ use geometry::RigGeometry;
 use patch::{take_stack, Stack, Warp, STEP_MIN};
 use points::{distance, Point, Points, FINE_LEVELS};
 use pyramid::FramePyramids;
+pub use pyramid::Levels;
 use search::{Limits, Search};
 use std::sync::Arc;
-use stipple_drivers::{counters, Calibration, Fault, FaultKind, Frames, Nanos, Pose};
+use stipple_drivers::{counters, Calibration, Fault, FaultKind, Frames, Image, Nanos, Pose};
 
 /// What is known of the motion before the images are looked at.
 #[derive(Clone, Copy, Debug, Default)]
@@ -196,6 +197,33 @@ impl Frontend {
         // Who wrote the frame before may have it back.
         self.before.frames = frames.clone();
         &self.tracks
+    }
+
+    /// Finds corners without any history, and the views of each in all cameras. What was followed before is forgotten, and
+    /// the frame is not kept: its pyramids stay, for `levels`.
+    pub fn detect_anew(&mut self, frames: &Arc<Frames>) -> &Tracks {
+        for i in 0..self.points.list.len() {
+            (0..self.cameras()).for_each(|camera| _ = self.points.lose(i, camera));
+        }
+        self.drop_unseen();
+        self.now.frames = frames.clone();
+        self.frame += 1;
+        self.build_pyramids();
+        for camera in 0..self.cameras() {
+            let (first_new, median) = (self.points.list.len(), self.median_inverse_depth());
+            if self.seeing[camera] {
+                self.detect(camera);
+            }
+            self.find_missing(first_new, median);
+        }
+        self.publish(frames.t);
+        self.now.frames = self.before.frames.clone();
+        &self.tracks
+    }
+
+    /// The pyramid that was built last from an image of a camera.
+    pub fn levels<'a>(&'a self, camera: usize, image: &'a Image) -> Levels<'a> {
+        self.now.pyramids[camera].over(image)
     }
 
     /// Drops the points that the estimator rejected, so that what moves by itself does not keep its places: the cells rest.
