@@ -1,0 +1,307 @@
+//! Acceptance of a loop: which of a keyframe's verifications is to be believed, if any, and why not.
+
+use super::graph::PoseGraph;
+use super::pose4::{turned, wrapped, Pose4};
+use super::verify::Verified;
+use crate::mem::List;
+use nalgebra::{Matrix4, Vector4};
+use stipple_drivers::Nanos;
+
+/// Corners that have to agree, their share of the matches, the cells of twelve that they are in, and how badly they may
+/// agree, in deviations squared.
+const INLIERS_MIN: usize = 25;
+const SHARE_MIN: f64 = 0.4;
+const CELLS_MIN: usize = 4;
+const MISFIT_MAX: f64 = 1.6;
+/// Deviations up to which a verification says where it was taken from: m, rad.
+const SIGMA_MAX: [f64; 2] = [0.2, 0.02];
+/// Two verifications agree within these, and within 3 deviations: m, rad.
+const AGREE: [f64; 2] = [1.0, 0.035];
+/// Verifications of the keyframes before count for so long, s.
+const REMEMBERED_S: f64 = 5.0;
+/// A place with this share of the corners that agree looks the same.
+const AMBIGUOUS_SHARE: f64 = 0.6;
+/// Squared deviations of 4 numbers that odometry may have drifted: 3 deviations of one. For a place that may be confused
+/// with it, which is to be excluded safely: 5 deviations.
+const DRIFT_MAX: f64 = 16.25;
+const EXCLUDED: f64 = 34.6;
+/// Drift of odometry: m² for each m, m² and rad² for each keyframe, rad² for each s, rad² for each rad turned.
+const DRIFT_PER_M: f64 = 4e-5;
+const DRIFT_PER_KEYFRAME: [f64; 2] = [1e-7, 1e-9];
+const DRIFT_PER_S: f64 = 3e-7;
+const DRIFT_PER_RAD: f64 = 1e-7;
+/// By how much more the variance of a long way is, as errors of one keyframe and the next are not independent.
+const CORRELATED: f64 = 10.0;
+
+/// A candidate that was verified.
+#[derive(Clone, Copy, Debug)]
+pub struct Verification {
+    /// The candidate's node.
+    pub node: u16,
+    pub verified: Verified,
+}
+
+impl Default for Verification {
+    fn default() -> Verification {
+        let verified = Verified {
+            candidate_from_query: Pose4::default(),
+            covariance: Matrix4::identity(),
+            inliers: 0,
+            matches: 0,
+            cells: 0,
+            misfit: f64::INFINITY,
+        };
+        Verification { node: 0, verified }
+    }
+}
+
+#[derive(Clone, Copy, Debug)]
+pub enum Verdict {
+    Accepted(Verification),
+    /// No candidate was verified.
+    None,
+    Weak,
+    Alone,
+    Ambiguous,
+    Implausible,
+}
+
+/// A verification of an earlier keyframe: where it puts that keyframe.
+#[derive(Clone, Copy, Debug, Default)]
+struct Remembered {
+    t: Nanos,
+    /// In `odom`, and in the map by the verification.
+    odom: Pose4,
+    map: Pose4,
+    sigma: [f64; 2],
+}
+
+type Strong = (Verification, Remembered);
+
+/// Remembers what the last keyframes were verified with.
+#[derive(Default)]
+pub struct Judge {
+    remembered: List<Remembered, 32>,
+}
+
+impl Judge {
+    /// Judges the verifications of a keyframe at a node of the graph.
+    pub fn judge(
+        &mut self,
+        node: u16,
+        t: Nanos,
+        odom: &Pose4,
+        verified: &[Verification],
+        graph: &mut PoseGraph,
+    ) -> Verdict {
+        self.remembered.retain(|r| (t - r.t).secs().abs() <= REMEMBERED_S);
+        if verified.is_empty() {
+            return Verdict::None;
+        }
+        let mut strong: List<Strong, 16> = List::default();
+        for v in verified.iter().filter(|v| is_strong(&v.verified)) {
+            let map = graph.pose(v.node).compose(&v.verified.candidate_from_query);
+            let c = &v.verified.covariance;
+            let sigma = [(c[(0, 0)] + c[(1, 1)] + c[(2, 2)]).sqrt(), c[(3, 3)].sqrt()];
+            let _ = strong.push((*v, Remembered { t, odom: *odom, map, sigma }));
+        }
+        // Others that agree with one: of this keyframe by other candidates, and of earlier keyframes.
+        let support = |i: usize| {
+            let others = strong.iter().enumerate().filter(|(j, _)| *j != i).map(|(_, (_, r))| r);
+            others.chain(self.remembered.iter()).filter(|r| agree(&strong[i].1, r)).count()
+        };
+        let best = (0..strong.len()).map(|i| (support(i), strong[i].0.verified.inliers, i)).max();
+        let verdict = match best {
+            None => Verdict::Weak,
+            Some((0, ..)) => Verdict::Alone,
+            Some((.., i)) => weigh(node, &strong[i], &strong, graph),
+        };
+        for (_, r) in strong.iter() {
+            if self.remembered.is_full() {
+                self.remembered.rotate_left(1);
+                let last = self.remembered.len() - 1;
+                self.remembered[last] = *r;
+            } else {
+                let _ = self.remembered.push(*r);
+            }
+        }
+        verdict
+    }
+}
+
+/// Whether two verifications put the vehicle at the same place.
+fn agree(a: &Remembered, b: &Remembered) -> bool {
+    let carried = b.map.compose(&b.odom.between(&a.odom));
+    let (far, angle) = ((carried.p - a.map.p).length(), wrapped(carried.yaw - a.map.yaw).abs());
+    let within = |k: usize| AGREE[k].min(3.0 * a.sigma[k].hypot(b.sigma[k]));
+    // The lever of the motion between them turns yaw into distance.
+    let lever = (b.odom.p - a.odom.p).length() * b.sigma[1] * 3.0;
+    far <= (within(0) + lever).min(AGREE[0]) && angle <= within(1)
+}
+
+fn is_strong(v: &Verified) -> bool {
+    let c = &v.covariance;
+    v.inliers >= INLIERS_MIN
+        && v.inliers as f64 >= SHARE_MIN * v.matches as f64
+        && v.cells >= CELLS_MIN
+        && v.misfit <= MISFIT_MAX
+        && (0..3).all(|i| c[(i, i)] < SIGMA_MAX[0] * SIGMA_MAX[0])
+        && c[(3, 3)] < SIGMA_MAX[1] * SIGMA_MAX[1]
+}
+
+/// Compares a verification with what the graph knows, and with its rivals.
+fn weigh(node: u16, best: &Strong, strong: &[Strong], graph: &mut PoseGraph) -> Verdict {
+    let (v, r) = best;
+    let rivals = strong.iter().filter(|(w, s)| {
+        let (far, angle) = ((s.map.p - r.map.p).length(), wrapped(s.map.yaw - r.map.yaw).abs());
+        let looks_alike = w.verified.inliers as f64 >= AMBIGUOUS_SHARE * v.verified.inliers as f64;
+        looks_alike && (far > AGREE[0] || angle > 5.0 * AGREE[1])
+    });
+    let mut ambiguous = false;
+    for (w, _) in rivals {
+        ambiguous |= drift(node, w, graph).is_none_or(|d| d < EXCLUDED);
+    }
+    match drift(node, v, graph) {
+        Some(d) if !(d <= DRIFT_MAX) => Verdict::Implausible,
+        // No odometry leads from one to the other.
+        None => Verdict::Implausible,
+        _ if ambiguous => Verdict::Ambiguous,
+        _ => Verdict::Accepted(*v),
+    }
+}
+
+/// Squared deviations, of 4 numbers, by which a verification contradicts the graph. `None` where nothing connects the two.
+fn drift(node: u16, v: &Verification, graph: &mut PoseGraph) -> Option<f64> {
+    let expected = graph.pose(v.node).between(&graph.pose(node));
+    let found = &v.verified.candidate_from_query;
+    let covariance = graph.covariance_between(v.node, node)? * CORRELATED + v.verified.covariance;
+    let (p, yaw) = (found.p - expected.p, wrapped(found.yaw - expected.yaw));
+    let e = Vector4::new(p.x, p.y, p.z, yaw);
+    Some(e.dot(&covariance.cholesky()?.solve(&e)))
+}
+
+/// Covariance of a motion by odometry in so much time: of position in the first frame, m², and yaw, rad².
+pub fn odometry_covariance(moved: &Pose4, secs: f64) -> Matrix4<f64> {
+    let far = moved.p.length();
+    let p = DRIFT_PER_M * far + DRIFT_PER_KEYFRAME[0];
+    let yaw = DRIFT_PER_S * secs.abs() + DRIFT_PER_RAD * moved.yaw.abs() + DRIFT_PER_KEYFRAME[1];
+    let mut c = Matrix4::from_diagonal(&Vector4::new(p, p, p, yaw));
+    // A yaw that is off turns the motion: half of it on the way.
+    let side = 0.5 * turned(std::f64::consts::FRAC_PI_2, moved.p);
+    let lever = Vector4::new(side.x, side.y, 0.0, 0.0);
+    c += lever * lever.transpose() * yaw;
+    let cross = lever * yaw;
+    for i in 0..2 {
+        c[(i, 3)] += cross[i];
+        c[(3, i)] += cross[i];
+    }
+    c
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::super::graph::Edge;
+    use super::*;
+    use glam::DVec3;
+
+    /// A walk of 60 m out and back, a keyframe each metre and second.
+    fn walk() -> PoseGraph {
+        let mut graph = PoseGraph::new(64, 128, 512);
+        for k in 0..61u16 {
+            let x = if k <= 30 { k } else { 60 - k };
+            let pose = Pose4 { p: DVec3::new(x as f64, 0.0, 0.0), yaw: 0.0 };
+            assert_eq!(graph.add(pose), Some(k));
+            if k > 0 {
+                let measured = graph.pose(k - 1).between(&pose);
+                let covariance = odometry_covariance(&measured, 1.0);
+                graph.link(Edge { from: k - 1, to: k, measured, covariance, is_loop: false }).unwrap();
+            }
+        }
+        graph
+    }
+
+    /// Node 60, which is at node 0, verified by another: at its true place but for `off`.
+    fn verified(graph: &PoseGraph, node: u16, off: DVec3, inliers: usize) -> Verification {
+        let true_pose = graph.pose(node).between(&graph.pose(60));
+        let verified = Verified {
+            candidate_from_query: Pose4 { p: true_pose.p + off, ..true_pose },
+            covariance: Matrix4::identity() * 4e-4,
+            inliers,
+            matches: inliers + 10,
+            cells: 8,
+            misfit: 0.8,
+        };
+        Verification { node, verified }
+    }
+
+    fn judged(list: &[Verification], graph: &mut PoseGraph) -> String {
+        let odom = graph.pose(60);
+        let verdict = Judge::default().judge(60, Nanos(60_000_000_000), &odom, list, graph);
+        format!("{verdict:?}").split(['(', ' ']).next().unwrap().to_string()
+    }
+
+    #[test]
+    fn each_verdict_has_its_reason() {
+        let mut g = walk();
+        let right = |node, g: &PoseGraph| verified(g, node, DVec3::new(0.0, 0.3, 0.0), 60);
+        let (a, b) = (right(0, &g), right(1, &g));
+        assert_eq!(judged(&[], &mut g), "None");
+        assert_eq!(judged(&[a, b], &mut g), "Accepted");
+        assert_eq!(judged(&[a], &mut g), "Alone");
+        let weak = |change: fn(&mut Verified)| {
+            let mut v = [a, b];
+            v.iter_mut().for_each(|v| change(&mut v.verified));
+            v
+        };
+        for change in [
+            (|v| v.inliers = INLIERS_MIN - 1) as fn(&mut Verified),
+            |v| v.matches = 300,
+            |v| v.cells = CELLS_MIN - 1,
+            |v| v.misfit = 3.0,
+            |v| v.misfit = f64::NAN,
+            |v| v.covariance *= 1e4,
+            |v| v.covariance *= f64::NAN,
+        ] {
+            assert_eq!(judged(&weak(change), &mut g), "Weak");
+        }
+        // A twin of the place, 14 m from it: odometry of 60 m does not err so.
+        let far = |node, g: &PoseGraph| verified(g, node, DVec3::new(14.0, 0.0, 0.0), 90);
+        let twins = [far(0, &g), far(1, &g)];
+        assert_eq!(judged(&twins, &mut g), "Implausible");
+        // Beside it the true one is believed all the same, where it is the better one.
+        let better = [verified(&g, 0, DVec3::ZERO, 120), verified(&g, 1, DVec3::ZERO, 120), twins[0], twins[1]];
+        assert_eq!(judged(&better, &mut g), "Accepted");
+        // A rival within what odometry may err.
+        let rival = [a, b, verified(&g, 2, DVec3::new(0.0, -1.0, 0.0), 50)];
+        assert_eq!(judged(&rival, &mut g), "Ambiguous");
+        let small = [a, b, verified(&g, 2, DVec3::new(0.0, -1.0, 0.0), 30)];
+        assert_eq!(judged(&small, &mut g), "Accepted", "it looks much less alike");
+    }
+
+    #[test]
+    fn verifications_of_keyframes_before_count_where_odometry_leads_from_them() {
+        let mut g = walk();
+        let mut judge = Judge::default();
+        let at = |node: u16, by: u16, g: &PoseGraph| {
+            let mut v = verified(g, by, DVec3::ZERO, 60);
+            v.verified.candidate_from_query = g.pose(by).between(&g.pose(node));
+            v
+        };
+        for (node, seconds, accepted) in [(58u16, 58, false), (59, 59, true), (60, 70, false)] {
+            let (odom, v) = (g.pose(node), at(node, 1, &g));
+            let verdict = judge.judge(node, Nanos(seconds * 1_000_000_000), &odom, &[v], &mut g);
+            assert_eq!(matches!(verdict, Verdict::Accepted(_)), accepted, "{node}");
+        }
+    }
+
+    #[test]
+    fn the_covariance_of_odometry_grows_with_the_way_and_is_positive_definite() {
+        for (p, yaw, secs) in [(0.0, 0.0, 0.0), (1.0, 3.0, 0.2), (100.0, -3.0, 60.0), (1e-9, 0.0, 1e6)] {
+            let c = odometry_covariance(&Pose4 { p: DVec3::new(p, -p, 0.1 * p), yaw }, secs);
+            let edge = Edge { from: 0, to: 1, measured: Pose4::default(), covariance: c, is_loop: false };
+            assert!(c.cholesky().is_some(), "{p} {yaw} {secs}");
+            assert!(edge.is_valid());
+        }
+    }
+}

@@ -1,0 +1,371 @@
+//! Keyframe features: corners that camera 0 and another camera see at once, each with its depth and a binary descriptor.
+//!
+//! Descriptor: 256 comparisons of smoothed grey levels in a patch (BRIEF, Calonder et al. 2010), so that gain and offset of
+//! the image do not matter. The patch is turned so that its vertical is gravity's in the image, and covers a stated size on
+//! the surface, within limits in pixels: a corner looks the same from nearer and from a rolled camera.
+
+use crate::config::FrontendConfig;
+use crate::frontend::{Frontend, Levels};
+use crate::limits::{CAMERAS_MAX, PYRAMID_LEVELS, TRACKS};
+use crate::mem::List;
+use glam::{DQuat, DVec2, DVec3, Vec2};
+use std::sync::Arc;
+use stipple_drivers::{Calibration, Camera, Fault, Frames, Image, Pose};
+
+/// Features of a keyframe at most.
+pub const FEATURES: usize = TRACKS;
+/// Deviation of a corner that was aligned in another image, px: what depths are worth.
+const ALIGNED_SIGMA_PX: f64 = 0.5;
+/// Depths are worth nothing beyond this share of deviation.
+const RELATIVE_SIGMA_MAX: f64 = 0.5;
+/// Half a side of a patch: m on the surface, and its limits in pixels.
+const PATCH_M: f64 = 0.2;
+const PATCH_PX: [f64; 2] = [14.0, 40.0];
+/// Half a side of a patch that is compared in level 1 of the pyramid, px; twice as much in level 2, and so on.
+const PATCH_LEVEL_PX: f64 = 8.0;
+
+/// Units of the numbers of a feature: pixels; inverse distances and their deviations, 1/m.
+const PX_UNIT: f64 = 1.0 / 16.0;
+const INVERSE_DEPTH_UNIT: f64 = 1.0 / 4096.0;
+const SIGMA_UNIT: f64 = 1.0 / 65536.0;
+
+/// 256 bits that tell how a corner looks.
+pub type Descriptor = [u64; 4];
+
+/// Bits in which two descriptors differ.
+#[inline]
+pub fn distance(a: &Descriptor, b: &Descriptor) -> u32 {
+    (0..4).map(|k| (a[k] ^ b[k]).count_ones()).sum()
+}
+
+/// A corner of camera 0, in 40 bytes.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Feature {
+    pub descriptor: Descriptor,
+    px: [u16; 2],
+    inverse_depth: u16,
+    sigma: u16,
+}
+
+impl Feature {
+    /// `None` where a number does not fit.
+    pub(super) fn new(descriptor: Descriptor, px: DVec2, inverse_depth: f64, sigma: f64) -> Option<Feature> {
+        let whole = |x: f64, unit: f64| {
+            let n = (x / unit).round();
+            (n >= 0.0 && n <= u16::MAX as f64).then_some(n as u16)
+        };
+        let px = [whole(px.x, PX_UNIT)?, whole(px.y, PX_UNIT)?];
+        // A deviation is rounded up, and a small one is not nothing.
+        let sigma = whole(sigma.min(u16::MAX as f64 * SIGMA_UNIT), SIGMA_UNIT)?.max(1);
+        Some(Feature { descriptor, px, inverse_depth: whole(inverse_depth, INVERSE_DEPTH_UNIT)?, sigma })
+    }
+
+    /// Pixel in camera 0.
+    pub fn px(&self) -> DVec2 {
+        DVec2::new(self.px[0] as f64, self.px[1] as f64) * PX_UNIT
+    }
+
+    /// Inverse distance from camera 0, and its deviation, 1/m.
+    pub fn inverse_depth(&self) -> [f64; 2] {
+        [self.inverse_depth as f64 * INVERSE_DEPTH_UNIT, self.sigma as f64 * SIGMA_UNIT]
+    }
+}
+
+/// A feature as its ray.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Ray {
+    /// Unit bearing, in the level frame of the keyframe: that of the body, turned upright.
+    pub bearing: DVec3,
+    /// 1/m.
+    pub inverse_depth: f64,
+    pub sigma: f64,
+}
+
+/// Finds the features of keyframes of one rig.
+pub struct Extractor {
+    frontend: Frontend,
+    cameras: Vec<Camera>,
+    body_from_cam: [Pose; CAMERAS_MAX],
+    /// Pairs of places in a patch, from -1 to 1.
+    pattern: [[Vec2; 2]; 256],
+}
+
+impl Extractor {
+    /// Fails where the tracker cannot take the rig.
+    pub fn new(calibration: &Calibration, config: &FrontendConfig) -> Result<Extractor, Fault> {
+        let cameras: Vec<Camera> = calibration.cameras.iter().map(|c| c.camera).collect();
+        let cell = cameras.first().map_or(1.0, |c| ((c.width * c.height) as f64 / FEATURES as f64).sqrt().floor());
+        let frontend =
+            Frontend::new(calibration, &FrontendConfig { grid_px: (cell as u32).max(16), ..config.clone() })?;
+        let place = |i: usize| calibration.cameras.get(i).map_or(Pose::IDENTITY, |c| c.body_from_cam);
+        Ok(Extractor { frontend, cameras, body_from_cam: std::array::from_fn(place), pattern: pattern() })
+    }
+
+    /// Finds the features of a frame. `up` is the direction against gravity in the body's frame; `body_from_cam` is where the
+    /// cameras are, where that is estimated.
+    pub fn extract(
+        &mut self,
+        frames: &Arc<Frames>,
+        up: DVec3,
+        body_from_cam: Option<&[Pose; CAMERAS_MAX]>,
+        out: &mut List<Feature, FEATURES>,
+    ) {
+        out.clear();
+        if let Some(places) = body_from_cam {
+            self.body_from_cam = *places;
+            self.frontend.correct(places, 0.0);
+        }
+        let Some(image) = frames.images.first() else { return };
+        if self.cameras.first().is_none_or(|c| (c.width, c.height) != (image.width, image.height)) {
+            return;
+        }
+        let Extractor { frontend, cameras, body_from_cam, pattern } = self;
+        let tracks = frontend.detect_anew(frames).clone();
+        let levels = frontend.levels(0, image);
+        let up = body_from_cam[0].q.inverse() * up;
+        let mut from = [0; CAMERAS_MAX];
+        for corner in tracks.cameras[0].iter() {
+            let px = DVec2::new(corner.px[0] as f64, corner.px[1] as f64);
+            let Some(bearing) = cameras[0].unproject(px) else { continue };
+            // Ids ascend in every camera.
+            let mut depth = Weighted::default();
+            for (c, camera) in cameras.iter().enumerate().skip(1) {
+                let seen = &tracks.cameras[c];
+                from[c] += seen[from[c]..].iter().take_while(|t| t.id < corner.id).count();
+                let Some(view) = seen.get(from[c]).filter(|t| t.id == corner.id) else { continue };
+                let other = camera.unproject(DVec2::new(view.px[0] as f64, view.px[1] as f64));
+                let cam_from_first = body_from_cam[c].inverse() * body_from_cam[0];
+                other.into_iter().for_each(|g| depth.add(bearing, g, &cam_from_first, ALIGNED_SIGMA_PX / camera.fx));
+            }
+            let Some([inverse_depth, sigma]) = depth.mean() else { continue };
+            let radius = (cameras[0].fx * PATCH_M * inverse_depth).clamp(PATCH_PX[0], PATCH_PX[1]);
+            let down = down_in_image(&cameras[0], bearing, up);
+            let Some(descriptor) = describe(pattern, &levels, px.as_vec2(), down, radius) else { continue };
+            if let Some(feature) = Feature::new(descriptor, px, inverse_depth, sigma) {
+                let _ = out.push(feature);
+            }
+        }
+    }
+
+    /// The rays of features in the level frame, and camera 0's place there. `level_from_body` turns the body upright.
+    pub fn rays(&self, features: &[Feature], level_from_body: DQuat, out: &mut List<Ray, FEATURES>) -> DVec3 {
+        out.clear();
+        let Pose { q, p } = self.body_from_cam[0];
+        for f in features {
+            let bearing = self.cameras[0].unproject(f.px()).unwrap_or(DVec3::Z);
+            let [inverse_depth, sigma] = f.inverse_depth();
+            let _ = out.push(Ray { bearing: level_from_body * (q * bearing), inverse_depth, sigma });
+        }
+        level_from_body * p
+    }
+
+    /// Deviation of a pixel's bearing of `sigma_px`, rad.
+    pub fn bearing_sigma(&self, sigma_px: f64) -> f64 {
+        sigma_px / self.cameras[0].fx
+    }
+}
+
+/// The mean of inverse depths, weighted by what each is worth.
+#[derive(Default)]
+struct Weighted {
+    sum: f64,
+    weight: f64,
+}
+
+impl Weighted {
+    /// Adds what a second ray tells: the q that best puts R f + q t on it.
+    fn add(&mut self, f: DVec3, g: DVec3, to_from_first: &Pose, sigma_rad: f64) {
+        let (a, b) = (g.cross(to_from_first.p), g.cross(to_from_first.q * f));
+        let weight = a.length_squared() / (2.0 * sigma_rad * sigma_rad);
+        if weight > 0.0 && weight.is_finite() {
+            self.sum -= weight * a.dot(b) / a.length_squared();
+            self.weight += weight;
+        }
+    }
+
+    /// Inverse depth and deviation, 1/m. `None` where the depth is not known well enough.
+    fn mean(&self) -> Option<[f64; 2]> {
+        let (q, sigma) = (self.sum / self.weight, self.weight.sqrt().recip());
+        (q > 0.0 && sigma < RELATIVE_SIGMA_MAX * q).then_some([q, sigma])
+    }
+}
+
+/// The direction of gravity in the image at a bearing; that of the image's columns where the camera looks along gravity.
+fn down_in_image(camera: &Camera, bearing: DVec3, up: DVec3) -> Vec2 {
+    const STEP: f64 = 1e-3;
+    let side = (up - bearing * bearing.dot(up)).normalize_or_zero();
+    let ends = [-STEP, STEP].map(|s| camera.project(bearing + side * s));
+    let [Some(low), Some(high)] = ends else { return Vec2::Y };
+    let down = (low - high).as_vec2().normalize_or_zero();
+    if down == Vec2::ZERO || side.length() * (up - bearing * bearing.dot(up)).length() < 0.05 {
+        return Vec2::Y;
+    }
+    down
+}
+
+/// Compares the pairs of a patch. `None` where it reaches over the border of the image.
+fn describe(pattern: &[[Vec2; 2]; 256], levels: &Levels, px: Vec2, down: Vec2, radius: f64) -> Option<Descriptor> {
+    let level = 1 + (radius / PATCH_LEVEL_PX).log2().round().clamp(0.0, (PYRAMID_LEVELS - 2) as f64) as usize;
+    let (scale, r) = (1.0 / (1 << level) as f32, radius as f32);
+    let image = levels[level];
+    let centre = px * scale;
+    let reach = r * scale + 1.0;
+    let limit = Vec2::new(image.width as f32 - 1.0, image.height as f32 - 1.0);
+    if centre.min_element() < reach * 0.5 || (limit - centre).min_element() < reach * 0.5 {
+        return None;
+    }
+    let (x_axis, y_axis) = (Vec2::new(down.y, -down.x) * r * scale, down * r * scale);
+    let at = |p: Vec2| sample(image, (centre + x_axis * p.x + y_axis * p.y).clamp(Vec2::ZERO, limit));
+    let mut descriptor = [0u64; 4];
+    for (k, [a, b]) in pattern.iter().enumerate() {
+        descriptor[k / 64] |= u64::from(at(*a) < at(*b)) << (k % 64);
+    }
+    Some(descriptor)
+}
+
+/// Grey level between pixels, in 1/65536, at a place inside the image.
+#[inline]
+fn sample(image: &Image, p: Vec2) -> u32 {
+    let (x, y) = ((p.x as usize).min(image.width - 2), (p.y as usize).min(image.height - 2));
+    let (u, v) = (((p.x - x as f32) * 256.0) as u32, ((p.y - y as f32) * 256.0) as u32);
+    let row = |y: usize| {
+        let i = y * image.width + x;
+        (256 - u) * image.pixels[i] as u32 + u * image.pixels[i + 1] as u32
+    };
+    (256 - v) * row(y) + v * row(y + 1)
+}
+
+/// Pairs of places, denser in the middle: sums of uniform numbers, from a fixed seed, inside the unit circle.
+fn pattern() -> [[Vec2; 2]; 256] {
+    let mut state = 0x9e37_79b9_7f4a_7c15u64;
+    let mut uniform = || {
+        // xorshift64*
+        state ^= state >> 12;
+        state ^= state << 25;
+        state ^= state >> 27;
+        (state.wrapping_mul(0x2545_f491_4f6c_dd1d) >> 40) as f32 / (1u32 << 24) as f32 - 0.5
+    };
+    let mut place = move || loop {
+        let p = Vec2::new(uniform() + uniform() + uniform(), uniform() + uniform() + uniform()) * 0.8;
+        if p.length() <= 1.0 {
+            return p;
+        }
+    };
+    std::array::from_fn(|_| {
+        let mut pair = [place(), place()];
+        while pair[0].distance(pair[1]) < 0.2 {
+            pair[1] = place();
+        }
+        pair
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+    use stipple_drivers::{ImuCalibration, Lens, Nanos, RigCamera};
+
+    const SIZE: usize = 480;
+    const FOCAL: f64 = 400.0;
+    const BASELINE: f64 = 0.1;
+
+    fn calibration() -> Calibration {
+        let lens = Lens::Radtan { k1: 0.0, k2: 0.0, p1: 0.0, p2: 0.0 };
+        let c = (SIZE as f64 - 1.0) / 2.0;
+        let camera = Camera { width: SIZE, height: SIZE, fx: FOCAL, fy: FOCAL, cx: c, cy: c, lens };
+        let right = Pose::new(DQuat::IDENTITY, DVec3::new(BASELINE, 0.0, 0.0));
+        let cameras = vec![RigCamera::new(camera, Pose::IDENTITY), RigCamera::new(camera, right)];
+        Calibration { cameras, imu: ImuCalibration::CONSUMER }
+    }
+
+    /// Blots of random grey on a grid, smooth between.
+    fn grey(x: f64, y: f64) -> f64 {
+        let node = |i: i64, j: i64| {
+            let n = (i.wrapping_mul(73_856_093) ^ j.wrapping_mul(19_349_663)) as u64;
+            (n.wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 40) as f64 / (1u64 << 24) as f64
+        };
+        let octave = |scale: f64| {
+            let (x, y) = (x / scale + 100.0, y / scale + 100.0);
+            let (i, j, u, v) = (x.floor() as i64, y.floor() as i64, x.fract(), y.fract());
+            let row = |j| node(i, j) * (1.0 - u) + node(i + 1, j) * u;
+            row(j) * (1.0 - v) + row(j + 1) * v
+        };
+        255.0 * (0.5 * octave(23.0) + 0.3 * octave(11.0) + 0.2 * octave(5.0))
+    }
+
+    /// A wall at one depth, seen by both cameras; `turn` takes a pixel to the wall's coordinates.
+    fn wall(disparity: f64, gain: f64, turn: impl Fn(f64, f64) -> (f64, f64)) -> Arc<Frames> {
+        let image = |shift: f64| {
+            let mut image = Image::new(SIZE, SIZE);
+            for (i, p) in image.pixels.iter_mut().enumerate() {
+                let (x, y) = turn((i % SIZE) as f64 + shift, (i / SIZE) as f64);
+                *p = (gain * grey(x, y)).round().clamp(0.0, 255.0) as u8;
+            }
+            image
+        };
+        Arc::new(Frames { t: Nanos(0), images: vec![image(0.0), image(disparity)], colours: vec![] })
+    }
+
+    fn features(frames: &Arc<Frames>, up: DVec3) -> Vec<Feature> {
+        let mut extractor = Extractor::new(&calibration(), &FrontendConfig::default()).unwrap();
+        let mut list = List::default();
+        extractor.extract(frames, up, None, &mut list);
+        list.to_vec()
+    }
+
+    #[test]
+    fn depths_are_those_of_stereo_and_what_is_seen_again_in_other_light_looks_the_same() {
+        let disparity = 16.0;
+        let a = features(&wall(disparity, 1.0, |x, y| (x, y)), DVec3::NEG_Y);
+        assert!(a.len() > 120, "{}", a.len());
+        for f in &a {
+            let px = f.px() - DVec2::splat((SIZE as f64 - 1.0) / 2.0);
+            let ray = DVec3::new(px.x, px.y, FOCAL).length() / FOCAL;
+            let [inverse_depth, sigma] = f.inverse_depth();
+            let truth = disparity / (FOCAL * BASELINE) / ray;
+            assert!(
+                (inverse_depth - truth).abs() < 4.0 * sigma && sigma < 0.1 * truth,
+                "{inverse_depth} {truth} {sigma}"
+            );
+        }
+        let dark = features(&wall(disparity, 0.4, |x, y| (x, y)), DVec3::NEG_Y);
+        let same = |f: &&Feature| {
+            let near = dark.iter().filter(|g| (g.px() - f.px()).length() < 1.5);
+            near.map(|g| distance(&g.descriptor, &f.descriptor)).min().is_some_and(|d| d < 30)
+        };
+        assert!(a.iter().filter(same).count() * 2 > a.len());
+    }
+
+    #[test]
+    fn a_camera_on_its_side_sees_the_same_descriptors() {
+        let upright = features(&wall(16.0, 1.0, |x, y| (x, y)), DVec3::NEG_Y);
+        // The wall turned by 90 degrees in the image; gravity is with it.
+        let last = SIZE as f64 - 1.0;
+        let rolled = features(&wall(16.0, 1.0, |x, y| (y, last - x)), DVec3::X);
+        let mut alike = 0;
+        for f in &rolled {
+            let px = DVec2::new(f.px().y, last - f.px().x);
+            let near = upright.iter().filter(|g| (g.px() - px).length() < 1.5);
+            alike += usize::from(near.map(|g| distance(&g.descriptor, &f.descriptor)).min().is_some_and(|d| d < 40));
+        }
+        assert!(alike * 3 > rolled.len(), "{alike} of {}", rolled.len());
+    }
+
+    #[test]
+    fn images_without_corners_or_of_another_size_have_none_and_numbers_that_do_not_fit_are_refused() {
+        assert!(features(&wall(16.0, 0.0, |x, y| (x, y)), DVec3::NEG_Y).is_empty());
+        let small = Frames { t: Nanos(0), images: vec![Image::new(64, 64); 2], colours: vec![] };
+        assert!(features(&Arc::new(small), DVec3::NEG_Y).is_empty());
+        let none = Frames { t: Nanos(0), images: vec![], colours: vec![] };
+        assert!(features(&Arc::new(none), DVec3::NEG_Y).is_empty());
+        let of = |px: f64, inverse_depth: f64, sigma: f64| Feature::new([0; 4], DVec2::splat(px), inverse_depth, sigma);
+        assert!(of(4095.9, 15.9, 0.9).is_some() && of(5000.0, 1.0, 0.1).is_none() && of(1.0, 17.0, 0.1).is_none());
+        assert!(of(f64::NAN, 1.0, 0.1).is_none() && of(1.0, f64::NAN, 0.1).is_none() && of(-1.0, 1.0, 0.1).is_none());
+        assert_eq!(of(1.0, 0.5, 9.0).unwrap().inverse_depth()[1], u16::MAX as f64 * SIGMA_UNIT, "as much as fits");
+        assert_eq!(size_of::<Feature>(), 40);
+        for up in [DVec3::Z, DVec3::NEG_Z, DVec3::ZERO, DVec3::NAN] {
+            features(&wall(16.0, 1.0, |x, y| (x, y)), up);
+        }
+    }
+}

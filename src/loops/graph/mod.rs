@@ -1,0 +1,309 @@
+//! Pose graph of fixed size: a node for each keyframe, with position and yaw; edges by odometry between keyframes that follow
+//! each other, and by recognised places.
+//!
+//! Least squares by Gauss-Newton, with a Cholesky factorisation of 4x4 blocks in the order of minimum degree. A loop edge
+//! may be false: loop edges have the Geman-McClure cost, brought in by graduated non-convexity (Yang et al. 2020), so that
+//! those which the others contradict end without weight. A node that is dropped leaves its two odometry edges as one.
+//!
+//! Errors of a node: position in the world, m, and yaw, rad.
+
+mod edge;
+mod solver;
+#[cfg(test)]
+mod tests;
+
+pub use edge::Edge;
+
+use super::pose4::{turned, wrapped, Pose4};
+use nalgebra::{Matrix4, Vector4};
+use solver::Solver;
+
+/// Squared residual of 4 numbers at which a loop edge counts half: one true loop in a thousand is beyond it.
+const LOOP_SCALE: f64 = 18.47;
+/// Steps of graduated non-convexity and of Gauss-Newton at most, and the step that ends them: m, rad.
+const ITERATIONS: usize = 20;
+const STEP_MIN: f64 = 1e-4;
+/// The scale of the cost shrinks by so much a step.
+const SHRINK: f64 = 4.0;
+/// A loop edge of less weight than this was rejected.
+const REJECTED: f64 = 0.1;
+const NONE: u32 = u32::MAX;
+
+/// What came of an optimisation.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Outcome {
+    pub iterations: usize,
+    /// Half the sum of squared residuals, each loop's bounded.
+    pub cost: f64,
+    pub loops_rejected: usize,
+    /// False: the factor did not fit, or a matrix was not positive definite; poses are as before.
+    pub solved: bool,
+    /// Blocks of the factor.
+    pub blocks: usize,
+}
+
+pub struct PoseGraph {
+    poses: Vec<Pose4>,
+    used: Vec<bool>,
+    edges: Vec<Edge>,
+    /// Weight of each edge: 1 for odometry.
+    weights: Vec<f64>,
+    /// Odometry edges that lead to each node and from it.
+    chain: Vec<[u32; 2]>,
+    /// Poses to go back to.
+    before: Vec<Pose4>,
+    solver: Solver,
+}
+
+impl PoseGraph {
+    /// Room for so many nodes, edges and blocks of the factor.
+    pub fn new(nodes: usize, edges: usize, blocks: usize) -> PoseGraph {
+        PoseGraph {
+            poses: vec![Pose4::default(); nodes],
+            used: vec![false; nodes],
+            edges: Vec::with_capacity(edges),
+            weights: Vec::with_capacity(edges),
+            chain: vec![[NONE; 2]; nodes],
+            before: vec![Pose4::default(); nodes],
+            solver: Solver::new(nodes, blocks),
+        }
+    }
+
+    /// Bytes that it takes.
+    pub fn bytes(&self) -> usize {
+        let node = 2 * size_of::<Pose4>() + size_of::<bool>() + size_of::<[u32; 2]>();
+        let edge = size_of::<Edge>() + size_of::<f64>();
+        size_of::<Self>() + self.poses.len() * node + self.edges.capacity() * edge + self.solver.bytes()
+    }
+
+    /// Adds a node; `None` where all are used, or the pose is not finite.
+    pub fn add(&mut self, pose: Pose4) -> Option<u16> {
+        let free = self.used.iter().position(|used| !used).filter(|_| pose.is_finite())?;
+        (self.used[free], self.poses[free], self.chain[free]) = (true, pose, [NONE; 2]);
+        Some(free as u16)
+    }
+
+    /// Adds an edge; `None` where all are used, a node is not there, it has its odometry already, or the edge is no
+    /// measurement.
+    pub fn link(&mut self, edge: Edge) -> Option<()> {
+        let [from, to] = [edge.from, edge.to].map(usize::from);
+        let there = |n: usize| self.used.get(n) == Some(&true);
+        if self.edges.len() == self.edges.capacity() || from == to || !there(from) || !there(to) || !edge.is_valid() {
+            return None;
+        }
+        let number = self.edges.len() as u32;
+        if !edge.is_loop {
+            if self.chain[from][1] != NONE || self.chain[to][0] != NONE {
+                return None;
+            }
+            (self.chain[from][1], self.chain[to][0]) = (number, number);
+        }
+        self.edges.push(edge);
+        self.weights.push(1.0);
+        Some(())
+    }
+
+    pub fn pose(&self, node: u16) -> Pose4 {
+        self.poses[node as usize]
+    }
+
+    pub fn is_used(&self, node: u16) -> bool {
+        self.used[node as usize]
+    }
+
+    /// Loop edges with their weights: 0 where it was rejected.
+    pub fn loops(&self) -> impl Iterator<Item = (&Edge, f64)> + '_ {
+        self.edges.iter().zip(&self.weights).filter(|(e, _)| e.is_loop).map(|(e, w)| (e, *w))
+    }
+
+    /// The node, of those with odometry to both sides, whose neighbours are the nearest to each other.
+    pub fn closest_neighbours(&self, may: impl Fn(u16) -> bool) -> Option<u16> {
+        let apart = |n: usize| {
+            let [a, b] = self.chain[n];
+            let (a, b) = (self.edges.get(a as usize)?, self.edges.get(b as usize)?);
+            let moved = a.measured.compose(&b.measured);
+            (self.used[n] && may(n as u16)).then(|| (moved.p.length() + 2.0 * moved.yaw.abs(), n as u16))
+        };
+        (0..self.poses.len()).filter_map(apart).min_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, n)| n)
+    }
+
+    /// Removes a node. Its odometry becomes one edge between its neighbours; its loops are those of the nearer neighbour.
+    pub fn drop_node(&mut self, node: u16) {
+        let [to, from] = self.chain[node as usize].map(|e| self.edges.get(e as usize).copied());
+        let nearer = match (&to, &from) {
+            (Some(a), Some(b)) if a.covariance.trace() <= b.covariance.trace() => Some(a.inverse()),
+            (_, Some(b)) => Some(*b),
+            (Some(a), None) => Some(a.inverse()),
+            (None, None) => None,
+        };
+        for i in (0..self.edges.len()).rev() {
+            let edge = self.edges[i];
+            if edge.from != node && edge.to != node {
+                continue;
+            }
+            let moved = nearer.filter(|_| edge.is_loop).map(|near| match edge.from == node {
+                true => near.inverse().then(&edge),
+                false => edge.then(&near),
+            });
+            match moved.filter(|m| m.from != m.to && m.is_valid()) {
+                Some(moved) => self.edges[i] = moved,
+                None => self.remove_edge(i),
+            }
+        }
+        self.used[node as usize] = false;
+        self.chain[node as usize] = [NONE; 2];
+        if let (Some(a), Some(b)) = (to, from) {
+            self.link(a.then(&b));
+        }
+        self.solver.forget();
+    }
+
+    fn remove_edge(&mut self, i: usize) {
+        let unhook = |chain: &mut Vec<[u32; 2]>, edge: &Edge, number: u32| {
+            if !edge.is_loop {
+                (chain[edge.from as usize][1], chain[edge.to as usize][0]) = (number, number);
+            }
+        };
+        let last = self.edges.len() - 1;
+        unhook(&mut self.chain, &self.edges[i], NONE);
+        if i != last {
+            unhook(&mut self.chain, &self.edges[last], i as u32);
+        }
+        self.edges.swap_remove(i);
+        self.weights.swap_remove(i);
+    }
+
+    /// Moves the nodes to where all edges agree best.
+    pub fn optimise(&mut self) -> Outcome {
+        let mut outcome = Outcome::default();
+        self.before.copy_from_slice(&self.poses);
+        self.weights.iter_mut().for_each(|w| *w = 1.0);
+        match self.solver.order(&self.used, &self.edges) {
+            Some(blocks) => outcome.blocks = blocks,
+            None => return outcome,
+        }
+        // The first step is that of least squares; then the cost becomes the robust one in steps.
+        let mut scale = f64::INFINITY;
+        for _ in 0..ITERATIONS {
+            outcome.iterations += 1;
+            self.solver.clear(&self.used);
+            for (edge, weight) in self.edges.iter().zip(&self.weights) {
+                let [a, b] = [edge.from, edge.to].map(|n| &self.poses[n as usize]);
+                self.solver.add(edge, *weight, a, b);
+            }
+            let Some(step) = self.solver.solve() else {
+                self.poses.copy_from_slice(&self.before);
+                return outcome;
+            };
+            let mut moved = 0.0f64;
+            for (n, d) in step {
+                let pose = &mut self.poses[n];
+                pose.p += glam::DVec3::new(d[0], d[1], d[2]);
+                pose.yaw = wrapped(pose.yaw + d[3]);
+                moved = moved.max(d.amax());
+            }
+            let worst = self.chi2_of_loops().fold(0.0, f64::max);
+            scale = match scale.is_infinite() {
+                true => f64::max(1.0, 2.0 * worst / LOOP_SCALE),
+                false => f64::max(1.0, scale / SHRINK),
+            };
+            self.weigh(scale);
+            if !moved.is_finite() {
+                self.poses.copy_from_slice(&self.before);
+                return outcome;
+            }
+            if scale == 1.0 && moved < STEP_MIN {
+                break;
+            }
+        }
+        outcome.solved = true;
+        outcome.loops_rejected = self.loops().filter(|(_, w)| *w < REJECTED).count();
+        outcome.cost = self.edges.iter().map(|e| self.cost(e)).sum();
+        outcome
+    }
+
+    fn chi2_of_loops(&self) -> impl Iterator<Item = f64> + '_ {
+        self.edges.iter().filter(|e| e.is_loop).map(|e| self.chi2(e))
+    }
+
+    fn chi2(&self, edge: &Edge) -> f64 {
+        edge.chi2(&self.poses[edge.from as usize], &self.poses[edge.to as usize])
+    }
+
+    fn cost(&self, edge: &Edge) -> f64 {
+        let chi2 = self.chi2(edge);
+        0.5 * if edge.is_loop { LOOP_SCALE * chi2 / (LOOP_SCALE + chi2) } else { chi2 }
+    }
+
+    fn weigh(&mut self, scale: f64) {
+        for i in 0..self.edges.len() {
+            let edge = &self.edges[i];
+            if edge.is_loop {
+                let c2 = scale * LOOP_SCALE;
+                self.weights[i] = (c2 / (c2 + self.chi2(edge))).powi(2);
+            }
+        }
+    }
+
+    /// Covariance of the pose of `b` in the frame of `a`, as the graph knew it when it was optimised last, and by odometry
+    /// since. `None` where nothing connects the two.
+    pub fn covariance_between(&mut self, a: u16, b: u16) -> Option<Matrix4<f64>> {
+        if !self.solver.is_ordered() {
+            self.factor()?;
+        }
+        let (known_a, tail_a) = self.known(a)?;
+        let (known_b, tail_b) = self.known(b)?;
+        let mut edge = match known_a == known_b {
+            true => Edge::nothing(known_a),
+            false => {
+                let covariance = self.relative(known_a, known_b)?;
+                let measured = self.pose(known_a).between(&self.pose(known_b));
+                Edge { from: known_a, to: known_b, measured, covariance, is_loop: true }
+            }
+        };
+        edge = tail_b.map_or(edge, |tail| edge.then(&tail));
+        edge = tail_a.map_or(edge, |tail| tail.inverse().then(&edge));
+        Some(edge.covariance)
+    }
+
+    /// Factors the normal matrix at the poses as they are.
+    fn factor(&mut self) -> Option<()> {
+        self.solver.order(&self.used, &self.edges)?;
+        self.solver.clear(&self.used);
+        for (edge, weight) in self.edges.iter().zip(&self.weights) {
+            let [a, b] = [edge.from, edge.to].map(|n| &self.poses[n as usize]);
+            self.solver.add(edge, *weight, a, b);
+        }
+        self.solver.solve().map(|_| ())
+    }
+
+    /// The newest node before one that the factor has, and the odometry from there.
+    fn known(&self, node: u16) -> Option<(u16, Option<Edge>)> {
+        let (mut at, mut tail): (u16, Option<Edge>) = (node, None);
+        while !self.solver.has(at) {
+            let edge = *self.edges.get(self.chain[at as usize][0] as usize)?;
+            tail = Some(tail.map_or(edge, |t| edge.then(&t)));
+            at = edge.from;
+        }
+        Some((at, tail))
+    }
+
+    /// Covariance of the pose of one node in the frame of another, both in the factor.
+    fn relative(&mut self, a: u16, b: u16) -> Option<Matrix4<f64>> {
+        let [[aa, ab], [ba, bb]] = self.solver.joint(a, b)?;
+        let (pa, pb) = (self.pose(a), self.pose(b));
+        let [ja, jb] = edge::jacobians(&pa, &pb);
+        let c =
+            ja * aa * ja.transpose() + ja * ab * jb.transpose() + jb * ba * ja.transpose() + jb * bb * jb.transpose();
+        let c = 0.5 * (c + c.transpose());
+        c.iter().all(|x| x.is_finite()).then_some(c)
+    }
+}
+
+/// A residual and its derivatives, for `solver` and tests.
+type Residual = (Vector4<f64>, [Matrix4<f64>; 2]);
+
+/// A position turned into another frame.
+fn in_frame(frame: &Pose4, pose: &Pose4) -> glam::DVec3 {
+    turned(-frame.yaw, pose.p - frame.p)
+}
