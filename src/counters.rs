@@ -57,6 +57,8 @@ stipple_drivers::counters! {
     imu_rejected,
     /// Inertial samples of which one axis was no motion (a flipped bit), and was put between its neighbours.
     imu_repaired,
+    /// Keyframes that went by the loops, as those before were being worked in.
+    loops_busy,
     /// Tracks beyond TRACKS.
     tracks_full,
     /// Landmarks beyond LANDMARKS.

@@ -5,11 +5,11 @@
 //!
 //! ```text
 //! frames -> mailbox(newest) -> frontend -Tracks-> vio -Keyframe(offer)-> map.step(deadline)
-//! imu    -> queue -----------------------------------^                   map -> report, map.ply
+//! imu    -> queue -----------------------------------^      `-> loops -map_from_odom, corrections-^
 //! ```
 //!
 //! Rooms: `math`, `mem`, `limits`, `config` and `counters` are seen by all. `frontend` and `vio` see the vocabulary of
-//! `stipple-drivers`, `vio` also the frontend's `Tracks`; `stereo` and `map` see `gpu`, `map` also `stereo` and `store`; `output` sees what it
+//! `stipple-drivers`, `vio` also the frontend's `Tracks`; `loops` sees `frontend`; `stereo` and `map` see `gpu`, `map` also `stereo` and `store`; `output` sees what it
 //! writes of `map` and `vio`, and `publish` what it tells of `vio`. `run` sees all of these, `commands` see all, and nobody sees `commands`. tests/tidy checks it.
 //!
 //! # Glossary
@@ -22,6 +22,7 @@
 //! | board | a computer with its sensors, as its board file describes it |
 //! | body | the frame of the inertial unit; poses are `world_from_body`, world z up |
 //! | burst | training steps that follow a new anchor, every other on its own view |
+//! | closure | a loop edge of the pose graph: a place that was recognised, and from where it is seen (`loops`) |
 //! | coverage | the part of a view that the map shows, and shows well |
 //! | deviation | standard deviation, wherever an error is stated |
 //! | exposure | gain and offset that take a rendering to what a camera recorded |
@@ -33,7 +34,9 @@
 //! | increment | inertial samples between two frames, integrated (preintegration) |
 //! | keyframe | a frame kept in the estimator's window as a pose, and offered to the map |
 //! | landmark | a point of the estimator: direction and inverse distance in its host keyframe |
+//! | level frame | the frame of the body turned upright: loops are measured between these, in position and yaw |
 //! | lockstep | a deterministic replay: a stated number of training steps a frame |
+//! | map frame | where loops agree; `odom` is the estimator's, which drifts and does not jump; `map_from_odom` leads from one to the other |
 //! | mailbox | where the newest frame and all samples wait for tracking |
 //! | marginalization | taking old frames out of the window; what they knew stays as the prior |
 //! | packet | a frame on its way through tracking, with its inertial samples and results |
@@ -71,6 +74,8 @@ cfg_if::cfg_if! {
         #[doc(hidden)]
         pub mod limits;
         #[doc(hidden)]
+        pub mod loops;
+        #[doc(hidden)]
         pub mod map;
         #[doc(hidden)]
         pub mod math;
@@ -92,6 +97,8 @@ cfg_if::cfg_if! {
         mod frontend;
         mod gpu;
         mod limits;
+        #[allow(dead_code)]
+        mod loops;
         mod map;
         mod math;
         mod output;

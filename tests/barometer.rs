@@ -86,7 +86,7 @@ fn fly(secs: f64, troubles: Vec<(Range<f64>, Trouble)>) -> (Flown, Vec<TimedPose
             sensors,
             sim.calibration(),
             tracker,
-            None,
+            (None, None),
             &options,
             &mut Status::silent(),
             &mut Steering::default(),

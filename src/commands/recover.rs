@@ -66,10 +66,10 @@ fn recover_run(run: &LoggedRun, out: &OutputDir, name: &str) -> Result<u64, Faul
     let kept = modified(&path) >= newest;
     if kept {
         TumWriter::begin(&mut io::sink())
-            .and_then(|mut sink| write_trajectory(&run.files, &mut sink, each))
+            .and_then(|mut sink| write_trajectory(&run.files, &mut sink, |pose| *pose, each))
             .map_err(|e| cannot_read(run, &e))?;
     } else {
-        out.write(name, |w| write_trajectory(&run.files, &mut TumWriter::begin(w)?, each))?;
+        out.write(name, |w| write_trajectory(&run.files, &mut TumWriter::begin(w)?, |pose| *pose, each))?;
     }
     let names: Vec<_> = run.files.iter().filter_map(|f| Some(f.file_name()?.to_string_lossy())).collect();
     let seconds = span.map_or(0.0, |[first, last]| (last - first).secs());

@@ -276,6 +276,13 @@ section! {
 }
 
 section! {
+    /// Loop closure: places that are recognised correct the drift of odometry.
+    LoopsConfig, "loops.";
+    /// Whether places are recognised. It takes two cameras that see the same.
+    enabled: bool = true;
+}
+
+section! {
     /// The map on disk, in `map` of the run's folder: what the mapper's memory does not hold.
     StoreConfig, "store.";
     /// Whether the map is kept there, too. Without, mapping ends when `budget.keyframes` have come, and a restart begins anew.
@@ -285,7 +292,8 @@ section! {
     max_mib: u64 = 2048, Bound::Within(128.0, 1_048_576.0);
     /// Most that is written in a second, MiB, on average.
     write_mib_per_s: f64 = 8.0, Bound::Within(0.1, 4096.0);
-    /// Keyframes that are known: 1 to 2 KiB of memory each, and 2 KiB for the blocks that it may see.
+    /// Keyframes that are known: 1 to 2 KiB of memory each, and 2 KiB for the blocks that it may see; as many are known to loop
+    /// closure, 17 KiB each, and beyond that the ones whose neighbours are the nearest are left out.
     keyframes: u32 = 2048, Bound::Within(2.0, 65_536.0);
 }
 

@@ -15,8 +15,8 @@ pub use governor::GovernorConfig;
 pub use inject::{InjectConfig, ThreadRule};
 pub use mavlink::{Address, MavlinkConfig, StateMessage};
 pub use method::{
-    Fit, FrontendConfig, GpuConfig, MapConfig, NetworkConfig, Projection, StereoConfig, StereoMethod, StoreConfig,
-    VioConfig,
+    Fit, FrontendConfig, GpuConfig, LoopsConfig, MapConfig, NetworkConfig, Projection, StereoConfig, StereoMethod,
+    StoreConfig, VioConfig,
 };
 pub use section::{Bound, Key};
 pub use sensors::{BaroConfig, CameraConfig, GpioConfig, ImuConfig, LogConfig, RecordConfig, RigConfig};
@@ -61,6 +61,8 @@ pub struct Board {
     pub map: MapConfig,
     #[serde(default)]
     pub store: StoreConfig,
+    #[serde(default)]
+    pub loops: LoopsConfig,
     #[serde(default)]
     pub gpu: GpuConfig,
 }
@@ -110,6 +112,7 @@ pub fn keys() -> impl Iterator<Item = &'static Key> {
         NetworkConfig::KEYS,
         MapConfig::KEYS,
         StoreConfig::KEYS,
+        LoopsConfig::KEYS,
         GpuConfig::KEYS,
     ];
     // A key that is a section of its own has its keys listed.

@@ -91,8 +91,9 @@ fn tables(report: &Report) -> String {
     let f = |v: Option<f64>, decimals: usize| v.filter(|v| v.is_finite()).map(|v| format!("{v:.decimals$}"));
     let n = |v: Option<u64>| v.map(grouped);
     let mib = |v: Option<u64>| v.map(|b| format!("{:.1}", b as f64 / (1 << 20) as f64));
-    let odometry: [Row; 12] = [
+    let odometry: [Row; 13] = [
         ("Trajectory error (ATE)", f(report.ate_rmse_m, 4), "m"),
+        ("The same without loops closed", f(report.odometry_ate_rmse_m, 4), "m"),
         ("Error over 1 s (RTE)", f(report.rte_1s_m, 4), "m"),
         ("Rotation over 1 s (RPE)", f(report.rpe_deg, 3), "\u{b0}"),
         ("Tracking rate", f(report.tracking_fps, 1), "fps"),

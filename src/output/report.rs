@@ -25,7 +25,9 @@ pub struct Report {
     /// Frames of reference of the trajectory: one, and one more for each reset and each restart elsewhere.
     pub epochs: Option<u32>,
 
+    /// Error of the poses in the map, with the loops that were closed; `odometry_ate_rmse_m` is that of the estimator's poses.
     pub ate_rmse_m: Option<f64>,
+    pub odometry_ate_rmse_m: Option<f64>,
     pub rte_1s_m: Option<f64>,
     pub rpe_deg: Option<f64>,
     /// Threads of tracking: 1, or 2 for front end and estimator.
@@ -89,6 +91,8 @@ pub struct Report {
 
     /// Error against run time.
     pub curve: Vec<CurvePoint>,
+    /// The first loops that were closed.
+    pub loops: Vec<LoopClosed>,
     /// GPU time by kernel, most expensive first.
     pub kernels: Vec<KernelTime>,
 
@@ -103,6 +107,19 @@ pub struct TimeOffsetFound {
     pub camera: usize,
     pub offset_s: f64,
     pub offset_sigma_s: f64,
+}
+
+/// A loop that was closed: when, with what was seen when, by how many corners, the pose of the vehicle that was measured in
+/// the upright frame of then, and by how much poses in the map moved.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct LoopClosed {
+    pub t_ns: i64,
+    pub with_ns: i64,
+    pub corners: u64,
+    pub p_m: [f64; 3],
+    pub yaw_rad: f64,
+    pub moved_m: f64,
+    pub moved_rad: f64,
 }
 
 /// Whether a part of the rig was found, and what is left of its deviation.
@@ -178,7 +195,7 @@ mod tests {
     use crate::counters::Counters;
 
     const KEYS: &str =
-        "frames keyframes anchors frames_dropped ate_rmse_m rte_1s_m rpe_deg tracking_fps tracking_ms_p50 \
+        "frames keyframes anchors frames_dropped ate_rmse_m odometry_ate_rmse_m rte_1s_m rpe_deg tracking_fps tracking_ms_p50 \
         tracking_ms_p99 tracking_threads tracking_cpu_ms frontend_ms_p50 frontend_ms_p99 estimator_ms_p50 \
         estimator_ms_p99 psnr_db ssim psnr_heldout_db ssim_heldout psnr_heldout_between_db psnr_heldout_fitted_db ssim_heldout_fitted psnr_heldout_aligned_db splats iterations \
         iteration_ms_p50 iteration_ms_p99 seconds_to_25_db gpu_bytes estimator_bytes quality_min quality_p50 quality_under_50 rss_peak_bytes map_rss_peak_bytes heap_after_seal wall_s device vio_hash dataset board pace scale \
@@ -196,6 +213,7 @@ mod tests {
                 && json["convergence"].is_array()
                 && json["extrinsics"].is_array()
                 && json["kernels"].is_array()
+                && json["loops"].is_array()
                 && json["warnings"] == 0
         );
     }

@@ -99,6 +99,8 @@ events! {
     OdometryCarried = 33, "odometry_carried", Warning;
     /// Odometry is lost: dead reckoning, or nothing; told to the autopilot.
     OdometryLost = 34, "odometry_lost", Critical;
+    /// A place was recognised, and the drift since corrected in the map's frame.
+    Loop = 35, "loop", Notice;
     /// A thread gives no sign of life.
     ThreadSilent = 40, "thread_silent", Critical;
     /// The system refuses a priority, resident memory or a socket.

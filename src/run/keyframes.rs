@@ -5,7 +5,8 @@
 //! filled anew, so that a mapper that starts again is offered the newest keyframes once more. While there is no mapper
 //! the oldest keyframe makes room for the newest.
 
-use super::tracking::FramePacket;
+use super::loop_closing::LoopClosing;
+use super::tracking::{FramePacket, Tracked};
 use crate::config::Board;
 use crate::counters::Counters;
 use crate::limits::CAMERAS_MAX;
@@ -21,8 +22,8 @@ use stipple_drivers::{Calibration, Fault, FaultKind, Frames, Image, Nanos, Pose}
 
 /// Keyframes between tracking and the map: as many as come while one or two anchors are being made.
 pub const SLOTS: usize = 12;
-/// Pose corrections that wait: those of four windows.
-const CORRECTIONS: usize = 64;
+/// Pose corrections that wait: those of a window, and what a closed loop moves, which comes as there is room.
+const CORRECTIONS: usize = 512;
 
 /// What the two sides tell each other beside keyframes, a word each.
 #[derive(Clone, Copy)]
@@ -312,40 +313,68 @@ pub struct Keyframes {
     pub count: u64,
     /// Stamps and numbers of the newest.
     recent: VecDeque<(Nanos, u64)>,
+    /// What closes loops, where places are recognised.
+    pub loops: Option<LoopClosing>,
 }
 
 impl Keyframes {
-    pub fn new(holdout: u32) -> Keyframes {
-        Keyframes { holdout, count: 0, recent: VecDeque::with_capacity(RECENT) }
+    pub fn new(holdout: u32, loops: Option<LoopClosing>) -> Keyframes {
+        Keyframes { holdout, count: 0, recent: VecDeque::with_capacity(RECENT), loops }
     }
 
-    /// Hands a tracked frame on: a keyframe to the mapper, and the window's newer poses with it.
+    /// Hands a tracked frame on: a keyframe to the mapper and to what closes loops, and the newer poses of others with it. The
+    /// mapper is told poses in the map.
     pub fn pass_on(&mut self, packet: &FramePacket, ring: Option<&KeyframeRing>, counters: &Counters) {
         let Some(tracked) = packet.tracked.as_ref().filter(|t| t.keyframe) else { return };
-        let Some(ring) = ring else {
-            self.count += 1;
-            return;
-        };
         if packet.blank {
-            counters.keyframes_blank.add(1);
+            counters.keyframes_blank.add(u64::from(ring.is_some()));
+            self.count += u64::from(ring.is_none());
             return;
         }
-        let (id, n) = (self.count, u64::from(self.holdout));
+        let id = self.offer(packet, tracked, ring, counters);
         let body_from_cam = tracked.body_from_cam;
-        let poses = Poses { world_from_body: tracked.world_from_body, body_from_cam };
-        if ring.offer(&packet.frames, id, n > 0 && id % n == n - 1, (packet.epoch, &poses)) {
-            self.count += 1;
-            self.recent.truncate(RECENT - 1);
-            self.recent.push_front((packet.frames.t, id));
-        } else {
-            counters.keyframes_rejected.add(1);
-        }
-        for (t, world_from_body) in tracked.corrections.iter() {
-            if let Some((_, id)) = self.recent.iter().find(|(at, found)| at == t && *found != id) {
-                let pushed = ring.push_correction(*id, &Poses { world_from_body: *world_from_body, body_from_cam });
+        let push = |id: u64, world_from_body: Pose, body_from_cam| {
+            ring.is_none_or(|ring| ring.push_correction(id, &Poses { world_from_body, body_from_cam }))
+        };
+        for (t, odom_from_body) in tracked.corrections.iter() {
+            if let Some((_, found)) = self.recent.iter().find(|(at, found)| at == t && Some(*found) != id) {
+                let pushed = push(*found, self.in_map(odom_from_body), body_from_cam);
                 counters.corrections_full.add(u64::from(!pushed));
             }
         }
+        if let Some(loops) = &mut self.loops {
+            loops.offer(packet, tracked, id, counters);
+            loops.answers(|id, map_from_body| push(id, map_from_body, None));
+        }
+    }
+
+    fn in_map(&self, odom_from_body: &Pose) -> Pose {
+        self.loops.as_ref().map_or(*odom_from_body, |loops| loops.in_map(odom_from_body))
+    }
+
+    /// Offers a keyframe to the mapper, where there is one; answers its number if that took it.
+    fn offer(
+        &mut self,
+        packet: &FramePacket,
+        tracked: &Tracked,
+        ring: Option<&KeyframeRing>,
+        counters: &Counters,
+    ) -> Option<u64> {
+        let Some(ring) = ring else {
+            self.count += 1;
+            return None;
+        };
+        let (id, n) = (self.count, u64::from(self.holdout));
+        let world_from_body = self.in_map(&tracked.world_from_body);
+        let poses = Poses { world_from_body, body_from_cam: tracked.body_from_cam };
+        if !ring.offer(&packet.frames, id, n > 0 && id % n == n - 1, (packet.epoch, &poses)) {
+            counters.keyframes_rejected.add(1);
+            return None;
+        }
+        self.count += 1;
+        self.recent.truncate(RECENT - 1);
+        self.recent.push_front((packet.frames.t, id));
+        Some(id)
     }
 }
 

@@ -14,7 +14,7 @@ use super::status::{Gauges, Status};
 use super::tracking::{FramePacket, Inlet, Link, Tracker};
 use super::waker::{SetOnDrop, Waker};
 use super::worker::MapSide;
-use super::{spawn_tracking, Flown, Options, Steps};
+use super::{spawn_tracking, Flown, Options, Sinks, Steps};
 use crate::counters::Counters;
 use crate::publish::event::EventId;
 use crossbeam_queue::ArrayQueue;
@@ -112,7 +112,7 @@ pub fn fly(
     recorded: Recorded,
     calibration: &Calibration,
     mut tracker: Tracker,
-    map: Option<MapSide>,
+    (map, loops): Sinks,
     options: &Options,
     steps: Steps,
     status: &mut Status,
@@ -122,7 +122,7 @@ pub fn fly(
     let mut mapping = if let Some(MapSide::Here(mapping)) = map { Some(mapping) } else { None };
     let ring = mapping.as_ref().map(|m| m.ring.clone());
     let colours = ring.as_ref().map_or(0, |r| r.colours());
-    let mut keyframes = Keyframes::new(options.holdout);
+    let mut keyframes = Keyframes::new(options.holdout, loops);
     let (total, length_s) = (recorded.stamps.len(), recorded.length_s());
     let mut packets: Vec<Box<FramePacket>> =
         (0..PACKETS.min(total + 1)).map(|_| FramePacket::for_rig(calibration, colours)).collect();
@@ -150,6 +150,7 @@ pub fn fly(
                 let Some(packet) = waker.wait(&ended, || done.pop()) else { return };
                 sent -= 1;
                 keyframes.pass_on(&packet, ring.as_deref(), &counters);
+                keyframes.loops.iter().flat_map(|l| l.queue.closed()).for_each(|(id, line)| status.say(id, &line));
                 gauges.set_epoch(packet.epoch, packet.health);
                 if let Some(line) = status.epoch_begun(&gauges) {
                     status.say(EventId::Epoch, &line);
@@ -187,6 +188,7 @@ pub fn fly(
         counters,
         frames: reading.next,
         keyframes: keyframes.count,
+        loops: keyframes.loops.and_then(|loops| loops.here),
         wall_s: budget.start.elapsed().as_secs_f64(),
         warnings: reading.recorded.images.warnings().to_vec(),
         source: reading.recorded.images.counters(),

@@ -2,7 +2,7 @@
 //!
 //! ```text
 //! camera -> gate -> mailbox(newest) -> frontend -> estimator -> keyframes -> mapping -> report, map.ply
-//! imu ----> gate -> queue -----------------^
+//! imu ----> gate -> queue -----------------^                       `-> loops --^
 //! ```
 //!
 //! | thread | work | heap |
@@ -20,6 +20,7 @@
 //! | autopilot | writes states to an autopilot and hears it, where the board names one | free |
 //! | trigger | starts the cameras' exposures, where a line is wired for it | free |
 //! | led | shows the state of a run, where a line is wired for it | free |
+//! | loops | recognises places and corrects drift, where the board asks for it; low priority | free |
 //! | log | writes states, events and counters to DIR; low priority | free |
 //! | writer | writes what is recorded, if anything is; low priority | free |
 //! | beat | says for the mapper's process that it lives | free |
@@ -37,9 +38,11 @@ mod governor;
 mod keyframes;
 mod lockstep;
 pub mod log;
+mod loop_closing;
 pub mod mailbox;
 pub mod mapping;
 pub mod memory;
+mod opening;
 pub mod recorder;
 mod reload;
 pub mod sensors;
@@ -58,16 +61,16 @@ pub mod writers;
 
 use crate::config::{Board, InjectConfig};
 use crate::counters::Counters;
-use crate::map::Place;
+use crate::loops::Loops;
 use crate::output::report::Report;
 use crate::output::OutputDir;
 use crate::publish::event::{EventId, Notice};
 use crate::publish::status::About;
 use gate::ImuGate;
-use keyframes::{KeyframeRing, Keyframes};
+use keyframes::Keyframes;
 use log::Log;
+use loop_closing::LoopClosing;
 use mailbox::{Capture, Mailbox};
-use mapping::{Kept, Mapping};
 use recorder::Recording;
 pub use reload::BoardSource;
 use sensors::{Input, Playback, Sensors, Source};
@@ -75,9 +78,8 @@ use status::{print_err, Gauges, Status};
 use status_led::StatusLed;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering, Ordering::Relaxed};
-use std::sync::Arc;
 use std::thread::{Builder, JoinHandle, Scope, ScopedJoinHandle};
-use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+use std::time::{Duration, Instant};
 use stipple_drivers::paced::FRAMES_UNREADABLE;
 use stipple_drivers::record::Format;
 use stipple_drivers::replay::read_trajectory;
@@ -86,7 +88,7 @@ pub use supervisor::Steering;
 pub use table::Spacing;
 use table::Table;
 use tracking::{FramePacket, Inlet, Link, OdometryRun, Tracker};
-use worker::{MapSide, Worker};
+use worker::MapSide;
 use writers::Writers;
 
 /// How frames arrive and mapping steps are spent.
@@ -135,6 +137,9 @@ pub struct Options {
     pub source: Option<BoardSource>,
 }
 
+/// Who takes keyframes: the mapper, and what closes loops.
+type Sinks = (Option<MapSide>, Option<LoopClosing>);
+
 /// What a flight left, beside its files.
 pub struct Outcome {
     pub report: Report,
@@ -151,6 +156,8 @@ pub struct Flown {
     pub counters: Counters,
     pub frames: usize,
     pub keyframes: u64,
+    /// What closed loops, where that was asked for.
+    pub loops: Option<Box<Loops>>,
     pub wall_s: f64,
     pub warnings: Vec<String>,
     /// Counters of the sources.
@@ -180,19 +187,19 @@ pub fn fly(
     // In a service the mapper's libraries are its process's business, and so is whether all of it fits.
     let apart = board.map.enabled && options.service && matches!(options.pace, Pace::Recorded);
     let _lock = out.lock()?;
-    prepare(&mut input, &mut board, options, apart)?;
+    opening::prepare(&mut input, &mut board, options, apart)?;
     let board = &board;
     let colours = memory::colours(&input.calibration, board).len();
     input.needs_colour(colours)?;
     let Playback { speed, repeats } = options.playback;
-    let frames = frames_kept(&mut input, options);
+    let frames = opening::frames_kept(&mut input, options);
     let looked_up = |poses| Tracker::Table(Table { poses, spacing: options.at_truth, last: None });
     let mut tracker = match &options.poses {
         Some(path) => looked_up(read_trajectory(path)?),
         None if options.at_truth.is_some() => looked_up(input.truth.clone()),
         None => Tracker::Odometry(Box::new(OdometryRun::new(&input.calibration, board, frames)?)),
     };
-    let map = if board.map.enabled { Some(open_map(&mut input, board, out, options, apart)?) } else { None };
+    let sinks = opening::sinks(&mut input, board, out, options, (apart, tracker.odometry().is_some()))?;
     let title = summary::Title {
         dataset: input.name,
         board: board.name.clone(),
@@ -220,7 +227,7 @@ pub fn fly(
     let (calibration, live) = (&input.calibration, length_s.is_none());
     let (mut flown, recording) = match (input.source, options.pace) {
         (Source::Recorded(recorded), Pace::Lockstep(steps)) => {
-            (lockstep::fly(recorded, calibration, tracker, map, options, steps, &mut status), None)
+            (lockstep::fly(recorded, calibration, tracker, sinks, options, steps, &mut status), None)
         }
         (source, _) => {
             let before = log.epochs_before;
@@ -231,7 +238,7 @@ pub fn fly(
             };
             let mut steering = Steering::new(given, options.source.as_ref(), status.is_managed());
             let told = (&*writers::socket(out.path()), about, &mut steering);
-            play(source, calibration, (tracker, map), (board, options), told, (colours, live, before), &mut status)?
+            play(source, calibration, (tracker, sinks), (board, options), told, (colours, live, before), &mut status)?
         }
     };
     judge_rig(&mut flown, &mut status);
@@ -264,13 +271,13 @@ pub fn fly(
 fn play(
     source: Source,
     calibration: &Calibration,
-    (mut tracker, map): (Tracker, Option<MapSide>),
+    (mut tracker, sinks): (Tracker, Sinks),
     (board, options): (&Board, &Options),
     (socket, about, steering): (&Path, About, &mut Steering),
     (colours, live, before): (usize, bool, u32),
     status: &mut Status,
 ) -> Result<(Flown, Option<Recording>), Fault> {
-    let cloud = map.as_ref().and_then(|map| map.ring().cloud.clone());
+    let cloud = sinks.0.as_ref().and_then(|map| map.ring().cloud.clone());
     let shape = || Frames::in_colour(calibration, colours);
     let stamps = source.stamps(options.playback.speed);
     let sensors = source.sensors(options.playback);
@@ -287,7 +294,7 @@ fn play(
         true => Writers::start(board, stamps, before, (socket, about, cloud), &mut tracker, status)?,
         false => Writers::default(),
     };
-    let mut flown = fly_in_real_time(sensors, calibration, tracker, map, &realtime, status, steering);
+    let mut flown = fly_in_real_time(sensors, calibration, tracker, sinks, &realtime, status, steering);
     writers.finish(&mut flown.source);
     Ok((flown, recording))
 }
@@ -301,69 +308,8 @@ fn judge_rig(flown: &mut Flown, status: &mut Status) {
     }
 }
 
-/// Cuts a recording to the time it is played for; answers how many frames the run keeps to be judged by.
-fn frames_kept(input: &mut Input, options: &Options) -> usize {
-    let Playback { speed, repeats } = options.playback;
-    match &mut input.source {
-        Source::Recorded(_) if repeats => {
-            // It is of the first lap alone.
-            input.truth.clear();
-            FRAMES_KEPT
-        }
-        Source::Recorded(r) => {
-            r.cut(options.duration_s.map(|s| s * speed));
-            r.stamps.len()
-        }
-        // A rate that the camera made a little higher is no reason to lose the end.
-        Source::Live { rate_hz, .. } => {
-            FRAMES_KEPT.min(options.duration_s.map_or(f64::INFINITY, |s| 1.2 * s * *rate_hz + 100.0) as usize)
-        }
-    }
-}
-
-/// Puts what this machine has in the place of what it lacks, and refuses a board that does not fit.
-fn prepare(input: &mut Input, board: &mut Board, options: &Options, apart: bool) -> Result<(), Fault> {
-    if !apart {
-        input.warnings.extend(memory::replace_missing(board).map(|missing| missing.to_string()));
-    }
-    input.warnings.iter().for_each(|warning| print_err(format_args!("stipple: warning: {warning}")));
-    input.calibration.imu.range = input.source.imu_range(board);
-    if !apart {
-        memory::check_fits(&input.place, &input.calibration, board, options.record.is_some())?;
-    }
-    Ok(())
-}
-
-/// Opens the mapper in this process, or `apart` in one of its own.
-fn open_map(
-    input: &mut Input,
-    board: &Board,
-    out: &OutputDir,
-    options: &Options,
-    apart: bool,
-) -> Result<MapSide, Fault> {
-    if apart {
-        let kept = board.store.enabled.then_some(Kept { fresh: options.fresh, flight: flight() });
-        let worker = Worker::start(&input.place, &input.calibration, board, out, options.record.is_some(), kept)?;
-        input.warnings.extend(worker.warning.clone());
-        return Ok(MapSide::Apart(Box::new(worker)));
-    }
-    let ring = Arc::new(KeyframeRing::new(&input.calibration, board)?);
-    let folder = out.file(MAP_STORE);
-    let at_once = matches!(options.pace, Pace::Lockstep(_));
-    let place = Place { folder: &folder, fresh: options.fresh, flight: Some(flight()), at_once };
-    let mapping = Mapping::open(&input.calibration, board, ring, board.store.enabled.then_some(place))?;
-    input.warnings.extend(mapping.mapper.unkept.as_ref().map(|fault| unkept(fault).to_string()));
-    Ok(MapSide::Here(Box::new(mapping)))
-}
-
 /// Folder of the map's store in a run's folder.
 pub const MAP_STORE: &str = "map";
-
-/// The time now, by which a flight is told from others, ms since 1970.
-fn flight() -> i64 {
-    SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_millis() as i64)
-}
 
 /// The fault of a store that cannot be used, and what becomes of the map.
 fn unkept(fault: &Fault) -> Fault {
@@ -392,8 +338,8 @@ pub fn observe(
     let realtime =
         Realtime { holdout: 0, until_s: None, sensors_s: duration_s.filter(|_| live), stop: host::stop_asked_for() };
     let mut steering = Steering::default();
-    let mut flown =
-        fly_in_real_time(sensors, calibration, Tracker::Observer(observer), None, &realtime, status, &mut steering);
+    let (tracker, sinks) = (Tracker::Observer(observer), (None, None));
+    let mut flown = fly_in_real_time(sensors, calibration, tracker, sinks, &realtime, status, &mut steering);
     status.finish();
     flown.source.splice(..0, input.opened);
     let recorded = recording.map_or(Ok(()), |r| r.finish(&mut flown.source));
@@ -434,7 +380,7 @@ pub fn fly_in_real_time(
     mut sensors: Sensors,
     calibration: &Calibration,
     mut tracker: Tracker,
-    map: Option<MapSide>,
+    (map, mut loops): Sinks,
     run: &Realtime,
     status: &mut Status,
     steering: &mut Steering,
@@ -450,21 +396,11 @@ pub fn fly_in_real_time(
         tracking_done: AtomicBool::new(false),
     };
     let (s, link, ring) = (&shared, &Link::default(), ring.as_deref());
-    let mut keyframes = Keyframes::new(run.holdout);
-    let (map, notices) = std::thread::scope(|scope| {
+    let closing = loops.as_mut().and_then(LoopClosing::take_loops);
+    let mut keyframes = Keyframes::new(run.holdout, loops);
+    let (map, loops, notices) = std::thread::scope(|scope| {
         let (taker, keyframes) = (&link.taker, &mut keyframes);
-        let Sensors { frames, imu, aids } = &mut sensors;
-        spawn(scope, "camera", move || {
-            let _ended = waker::SetOnDrop(&s.source_done, Some(taker));
-            mailbox::camera(&s.mailbox, &mut **frames, taker, &s.counters, &s.gauges);
-        });
-        let (gate, carrier) = (ImuGate::new(&calibration.imu), tracker.take_carrier());
-        spawn(scope, "imu", move || {
-            mailbox::inertial(&s.mailbox, &mut **imu, (gate, carrier), taker, &s.source_done, &s.counters)
-        });
-        if let Some(aids) = aids {
-            spawn(scope, "barometer", move || mailbox::aids(&s.mailbox, &mut **aids, &s.source_done, &s.counters));
-        }
+        spawn_sensors(scope, (s, taker), calibration, &mut sensors, tracker.take_carrier());
         let observes = matches!(tracker, Tracker::Observer(_));
         let give = move |packet: Box<FramePacket>| {
             if !packet.imu_only {
@@ -476,6 +412,8 @@ pub fn fly_in_real_time(
             }
             let _ = s.mailbox.spare.push(packet);
         };
+        let say = |closed| status::count_lost(s.mailbox.notices.push(closed));
+        let closing = closing.map(|closing| spawn(scope, "loops", move || closing.run(&s.tracking_done, say)));
         let mut held = None;
         let take = move || s.mailbox.take(&mut held, &s.source_done, &s.counters);
         let ended = waker::SetOnDrop(&s.tracking_done, None);
@@ -495,7 +433,8 @@ pub fn fly_in_real_time(
         let notices = supervisor::supervise(s, run, (worker.as_deref_mut(), ring), mapped, status, steering);
         s.counters.map_restarts.add(worker.as_ref().map_or(0, |w| w.restarts));
         let here = |t: ScopedJoinHandle<_>| t.join().expect("a panic ends the process before");
-        (thread.map(|t| MapSide::Here(Box::new(here(t)))).or(worker.map(MapSide::Apart)), notices)
+        let loops = closing.map(|t| t.join().expect("a panic ends the process before"));
+        (thread.map(|t| MapSide::Here(Box::new(here(t)))).or(worker.map(MapSide::Apart)), loops, notices)
     });
     let warnings = sensors.frames.warnings().to_vec();
     let beside = sensors.aids.as_ref().map_or_else(Vec::new, |aids| aids.counters());
@@ -511,6 +450,7 @@ pub fn fly_in_real_time(
         map,
         frames: arrived as usize,
         keyframes: keyframes.count,
+        loops,
         wall_s: shared.start.elapsed().as_secs_f64(),
         warnings,
         counters: shared.counters,
@@ -518,6 +458,28 @@ pub fn fly_in_real_time(
         capture: shared.mailbox.capture.get().copied(),
         broken: shared.mailbox.broken.pop(),
         notices,
+    }
+}
+
+/// Starts the threads of the sensors.
+fn spawn_sensors<'scope>(
+    scope: &'scope Scope<'scope, '_>,
+    (s, taker): (&'scope Shared, &'scope waker::Waker),
+    calibration: &Calibration,
+    sensors: &'scope mut Sensors,
+    carrier: Option<carrier::Carrier>,
+) {
+    let Sensors { frames, imu, aids } = sensors;
+    spawn(scope, "camera", move || {
+        let _ended = waker::SetOnDrop(&s.source_done, Some(taker));
+        mailbox::camera(&s.mailbox, &mut **frames, taker, &s.counters, &s.gauges);
+    });
+    let gate = ImuGate::new(&calibration.imu);
+    spawn(scope, "imu", move || {
+        mailbox::inertial(&s.mailbox, &mut **imu, (gate, carrier), taker, &s.source_done, &s.counters)
+    });
+    if let Some(aids) = aids {
+        spawn(scope, "barometer", move || mailbox::aids(&s.mailbox, &mut **aids, &s.source_done, &s.counters));
     }
 }
 

@@ -5,11 +5,12 @@ use super::mapping::{Drawn, MapResult};
 use super::memory::mib;
 use super::tracking::{OdometryRun, Tracker};
 use super::Flown;
+use crate::loops::{Closure, Corrections};
 use crate::mem;
 use crate::output::html::{write_html, Evidence};
 use crate::output::metrics::{percentile, trajectory_error};
 use crate::output::panel::Picture;
-use crate::output::report::{seconds_to, Convergence, ExtrinsicsFound, Report, TimeOffsetFound, GOOD_DB};
+use crate::output::report::{seconds_to, Convergence, ExtrinsicsFound, LoopClosed, Report, TimeOffsetFound, GOOD_DB};
 use crate::output::trajectory::{epoch_at, TumWriter};
 use crate::output::{atomically, OutputDir};
 use crate::publish::event::EventId;
@@ -58,13 +59,15 @@ pub fn write_trajectory(
     whole: bool,
     (estimated, epochs): (&[TimedPose], &[(Nanos, u32)]),
     logged: &[PathBuf],
-    out: &OutputDir,
+    (out, name): (&OutputDir, &str),
+    corrections: &Corrections,
 ) -> Result<(), Fault> {
-    out.write("trajectory.tum", |w| {
+    let in_map = |pose: &TimedPose| TimedPose { t: pose.t, pose: corrections.in_map(pose.t, &pose.pose) };
+    out.write(name, |w| {
         let mut file = TumWriter::begin(w)?;
-        let last = if whole { None } else { read::write_trajectory(logged, &mut file, |_, _| {})? };
+        let last = if whole { None } else { read::write_trajectory(logged, &mut file, in_map, |_, _| {})? };
         let mut rest = estimated.iter().filter(|pose| last.is_none_or(|last| pose.t > last));
-        rest.try_for_each(|pose| file.pose(epoch_at(epochs, pose.t), pose))
+        rest.try_for_each(|pose| file.pose(epoch_at(epochs, pose.t), &in_map(pose)))
     })
 }
 
@@ -88,11 +91,23 @@ pub fn conclude(title: Title, mut flown: Flown, logged: &[PathBuf], out: &Output
     let whole = |run: &OdometryRun| run.back.trajectory.is_whole() && !run.back.epochs.is_full();
     let whole = flown.tracker.odometry().is_none_or(whole);
     report.epochs = flown.tracker.odometry().map(|run| run.back.vio.epoch() + 1);
-    let mut fault = write_trajectory(whole, (&estimated, &epochs), logged, out).err().map(|fault| {
+    report.loops = flown.loops.iter().flat_map(|loops| &loops.closures).map(closed).collect();
+    let corrections = flown.loops.as_ref().map_or_else(Corrections::default, |loops| loops.corrections());
+    let write = |name: &str, corrections: &Corrections| {
+        write_trajectory(whole, (&estimated, &epochs), logged, (out, name), corrections)
+    };
+    // Beside poses in the map, where places are recognised, those of the estimator alone.
+    let odometry = flown.loops.as_ref().map_or(Ok(()), |_| write("odometry.tum", &Corrections::default()));
+    let mut fault = odometry.and(write("trajectory.tum", &corrections)).err().map(|fault| {
         let fix = "make room or mend the disk, then `stipple recover` with this folder writes what the log holds";
         Fault { fix: fix.into(), ..fault }
     });
-    let error = trajectory_error(&estimated, &title.truth).filter(|_| flown.tracker.odometry().is_some());
+    let error_of =
+        |poses: &[TimedPose]| trajectory_error(poses, &title.truth).filter(|_| flown.tracker.odometry().is_some());
+    report.odometry_ate_rmse_m = error_of(&estimated).filter(|_| flown.loops.is_some()).map(|e| e.ate_rmse_m);
+    let in_map = |pose: &TimedPose| TimedPose { t: pose.t, pose: corrections.in_map(pose.t, &pose.pose) };
+    let estimated: Vec<TimedPose> = estimated.iter().map(in_map).collect();
+    let error = error_of(&estimated);
     if let Some(e) = &error {
         report.ate_rmse_m = Some(e.ate_rmse_m);
         report.rte_1s_m = e.rte_1s_m;
@@ -151,7 +166,8 @@ fn counted(flown: &Flown, map: Option<&MapResult>, opened: &[(&'static str, u64)
     let owned = |list: &[(&'static str, u64)]| list.iter().map(|(name, n)| ((*name).into(), *n)).collect::<Vec<_>>();
     let mut all = owned(&flown.counters.list());
     let mapper = map.map_or(vec![], |m| m.counters.iter().map(|(name, n)| (name.clone().into(), *n)).collect());
-    let others = [owned(opened), owned(&flown.source), owned(&flown.tracker.counters()), mapper];
+    let loops = flown.loops.as_ref().map_or(vec![], |loops| loops.stats.list());
+    let others = [owned(opened), owned(&flown.source), owned(&flown.tracker.counters()), owned(&loops), mapper];
     for (name, n) in others.into_iter().flatten() {
         match all.iter_mut().find(|(known, _)| *known == name) {
             Some((_, sum)) => *sum += n,
@@ -159,6 +175,13 @@ fn counted(flown: &Flown, map: Option<&MapResult>, opened: &[(&'static str, u64)
         }
     }
     all
+}
+
+/// A closure as the report has it.
+fn closed(c: &Closure) -> LoopClosed {
+    let ([moved_m, moved_rad], corners) = (c.moved, c.inliers as u64);
+    let (p_m, yaw_rad) = (c.measured.p.to_array(), c.measured.yaw);
+    LoopClosed { t_ns: c.t.0, with_ns: c.with.0, corners, p_m, yaw_rad, moved_m, moved_rad }
 }
 
 /// Fills in the tracking figures; answers the trajectory.

@@ -211,8 +211,15 @@ impl Flight {
         let options = Realtime { holdout: 0, until_s: None, sensors_s: None, stop: &AtomicBool::new(false) };
         let mut silent = Status::silent();
         let tracker = Tracker::Odometry(Box::new(run));
-        let played =
-            fly_in_real_time(sensors, calibration, tracker, None, &options, &mut silent, &mut Steering::default());
+        let played = fly_in_real_time(
+            sensors,
+            calibration,
+            tracker,
+            (None, None),
+            &options,
+            &mut silent,
+            &mut Steering::default(),
+        );
         let end_s = case.map_or(STRIKES_S, |c| c.rule.end_s);
         Ok(self.judge(&played, flown, first + Span::from_secs(STRIKES_S), first + Span::from_secs(end_s)))
     }

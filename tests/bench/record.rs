@@ -79,7 +79,7 @@ impl Flight {
             sensors,
             &self.calibration,
             tracker,
-            None,
+            (None, None),
             &options,
             &mut Status::silent(),
             &mut Steering::default(),

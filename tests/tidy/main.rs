@@ -13,14 +13,15 @@ use std::collections::{BTreeMap, BTreeSet};
 const COMMON: [&str; 5] = ["math", "mem", "limits", "config", "counters"];
 /// What else a module may see. `run` sees all of these, `commands` sees `run` too, nobody sees `commands`; a module that is
 /// not here sees only the common ones.
-const EDGES: [(&str, &[&str]); 7] = [
+const EDGES: [(&str, &[&str]); 8] = [
     ("vio", &["frontend"]),
+    ("loops", &["frontend"]),
     ("stereo", &["gpu"]),
     ("map", &["gpu", "stereo", "store"]),
     ("output", &["map", "store", "vio"]),
     ("publish", &["vio"]),
-    ("run", &["frontend", "vio", "gpu", "stereo", "store", "map", "output", "publish"]),
-    ("commands", &["run", "frontend", "vio", "gpu", "stereo", "store", "map", "output", "publish"]),
+    ("run", &["frontend", "vio", "loops", "gpu", "stereo", "store", "map", "output", "publish"]),
+    ("commands", &["run", "frontend", "vio", "loops", "gpu", "stereo", "store", "map", "output", "publish"]),
 ];
 /// Where `unsafe` may stand: the GPU, the allocator, the shims of OpenCV and ONNX Runtime, system calls of drivers.
 const UNSAFE: [&str; 5] =
@@ -41,8 +42,8 @@ const RUST_LINES_MAX: usize = 600;
 const FUNCTION_LINES_MAX: usize = 90;
 const KERNEL_LINES_MAX: usize = 250;
 /// Lines of code that the product may have, and its estimator, frontend, mapper, GPU core, stereo and kernels together.
-const CODE_MAX: usize = 47_000;
-const CORE_MAX: usize = 18_600;
+const CODE_MAX: usize = 49_500;
+const CORE_MAX: usize = 18_650;
 const CORE: [&str; 10] = [
     "src/vio/",
     "src/frontend/",

@@ -240,10 +240,11 @@ pub fn read_files(files: &[PathBuf], mut each: impl FnMut(Nanos, Message) -> io:
     Ok(())
 }
 
-/// Writes the trajectory that the files of a run hold, and shows every message; answers the stamp of the last pose.
+/// Writes the trajectory that the files of a run hold, each pose as `in_map` has it, and shows every message; answers the stamp of the last pose.
 pub fn write_trajectory(
     files: &[PathBuf],
     out: &mut TumWriter<impl Write>,
+    in_map: impl Fn(&TimedPose) -> TimedPose,
     mut each: impl FnMut(Nanos, &Message),
 ) -> io::Result<Option<Nanos>> {
     let mut last = None;
@@ -253,7 +254,7 @@ pub fn write_trajectory(
             return Ok(());
         };
         last = Some(Nanos(t_ns));
-        out.pose(epoch, &TimedPose { t: Nanos(t_ns), pose: estimate.pose() })
+        out.pose(epoch, &in_map(&TimedPose { t: Nanos(t_ns), pose: estimate.pose() }))
     })?;
     Ok(last)
 }

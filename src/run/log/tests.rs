@@ -6,6 +6,7 @@ mod small_disk;
 
 use super::read::{read_files, runs, Message};
 use super::*;
+use crate::loops::Corrections;
 use crate::output::OutputDir;
 use crate::run::summary::write_trajectory;
 use proptest::collection::vec;
@@ -305,7 +306,7 @@ fn a_long_run_takes_its_trajectory_from_the_log_and_what_came_after_from_memory(
     let timed = |i: u64| TimedPose { t: Nanos(state(i).t_ns), pose: state(i).estimate.unwrap().pose() };
     let out = OutputDir::create(dir.path()).unwrap();
     let of = |whole: bool, kept: Vec<TimedPose>, files: &[PathBuf]| {
-        write_trajectory(whole, (&kept, &[]), files, &out).unwrap();
+        write_trajectory(whole, (&kept, &[]), files, (&out, "trajectory.tum"), &Corrections::default()).unwrap();
         fs::read_to_string(dir.path().join("trajectory.tum")).unwrap()
     };
     // The memory of a run of 1200 frames, of which 1000 were logged, and of which it has one in 16.
