@@ -8,6 +8,7 @@ mod faults;
 mod flight;
 mod inputs;
 mod kernels;
+mod loops;
 mod map;
 mod odometry;
 mod page;
@@ -53,6 +54,7 @@ enum Bench {
     Record(record::Args),
     Ply(ply::Args),
     Patrol(patrol::Args),
+    Loops(loops::Args),
 }
 
 fn run(bench: &Bench) -> Result<(), Fault> {
@@ -69,6 +71,7 @@ fn run(bench: &Bench) -> Result<(), Fault> {
         Bench::Record(args) => record::run(args),
         Bench::Ply(args) => ply::run(args),
         Bench::Patrol(args) => patrol::run(args),
+        Bench::Loops(args) => loops::run(args),
     }
 }
 
