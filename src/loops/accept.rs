@@ -9,8 +9,8 @@ use stipple_drivers::Nanos;
 
 /// Corners that have to agree, their share of the matches, the cells of twelve that they are in, and how badly they may
 /// agree, in deviations squared.
-const INLIERS_MIN: usize = 25;
-const SHARE_MIN: f64 = 0.4;
+const INLIERS_MIN: usize = 30;
+const SHARE_MIN: f64 = 0.5;
 const CELLS_MIN: usize = 4;
 const MISFIT_MAX: f64 = 1.6;
 /// Deviations up to which a verification says where it was taken from: m, rad.
