@@ -226,7 +226,7 @@ mod tests {
         let true_pose = graph.pose(node).between(&graph.pose(60));
         let verified = Verified {
             candidate_from_query: Pose4 { p: true_pose.p + off, ..true_pose },
-            covariance: Matrix4::identity() * 4e-4,
+            covariance: Matrix4::identity() * 1e-4,
             inliers,
             matches: inliers + 10,
             cells: 8,

@@ -96,9 +96,10 @@ pub fn conclude(title: Title, mut flown: Flown, logged: &[PathBuf], out: &Output
     let write = |name: &str, corrections: &Corrections| {
         write_trajectory(whole, (&estimated, &epochs), logged, (out, name), corrections)
     };
+    let trajectory = write("trajectory.tum", &corrections);
     // Beside poses in the map, where places are recognised, those of the estimator alone.
     let odometry = flown.loops.as_ref().map_or(Ok(()), |_| write("odometry.tum", &Corrections::default()));
-    let mut fault = odometry.and(write("trajectory.tum", &corrections)).err().map(|fault| {
+    let mut fault = trajectory.and(odometry).err().map(|fault| {
         let fix = "make room or mend the disk, then `stipple recover` with this folder writes what the log holds";
         Fault { fix: fix.into(), ..fault }
     });
