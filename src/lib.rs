@@ -97,7 +97,7 @@ cfg_if::cfg_if! {
         mod frontend;
         mod gpu;
         mod limits;
-        #[allow(dead_code)]
+        #[allow(dead_code)] // the program does not use all that the instruments and tests do
         mod loops;
         mod map;
         mod math;
