@@ -57,7 +57,7 @@ stipple_drivers::counters! {
     imu_rejected,
     /// Inertial samples of which one axis was no motion (a flipped bit), and was put between its neighbours.
     imu_repaired,
-    /// Keyframes that went by the loops, as those before were being worked in.
+    /// Keyframes that loop closure skipped, as it was busy with those before.
     loops_busy,
     /// Tracks beyond TRACKS.
     tracks_full,

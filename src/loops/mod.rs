@@ -62,7 +62,7 @@ counters! {
     loops_ambiguous,
     /// Odometry cannot have drifted that far.
     loops_implausible,
-    /// The graph could not be solved in its memory.
+    /// The graph had no room for the loop, or could not be solved in its memory.
     loops_unsolved,
     /// Keyframes that were taken out of the graph as it was full.
     loop_keyframes_dropped,
@@ -132,11 +132,6 @@ impl Corrections {
         let [x, y] = [a, b].map(|c| c.2.pose() * *odom_from_body);
         x.interpolate(&y, share)
     }
-
-    /// Whether nothing was corrected.
-    pub fn is_empty(&self) -> bool {
-        self.list.is_empty()
-    }
 }
 
 /// The loop closure of one rig.
@@ -155,8 +150,6 @@ pub struct Loops {
     last: Option<u16>,
     last_closed: Option<Nanos>,
     map_from_odom: Pose4,
-    /// Counts changes of `map_from_odom`.
-    pub version: u32,
     pub stats: Stats,
     /// The first closures.
     pub closures: Vec<Closure>,
@@ -184,7 +177,6 @@ impl Loops {
             last: None,
             last_closed: None,
             map_from_odom: Pose4::default(),
-            version: 0,
             stats: Stats::default(),
             closures: Vec::with_capacity(CLOSURES),
             recognised: None,
@@ -218,7 +210,8 @@ impl Loops {
     /// What puts poses of the estimator in the map, at each keyframe of the graph, the oldest first. Allocates.
     pub fn corrections(&self) -> Corrections {
         let correction = |(place, pose): (&Place, Pose4)| (place.epoch, place.t, pose.compose(&place.odom.inverse()));
-        let mut list: Vec<_> = if self.version > 0 { self.places().map(correction).collect() } else { vec![] };
+        let mut list: Vec<_> =
+            if self.stats.loops_closed > 0 { self.places().map(correction).collect() } else { vec![] };
         list.sort_by_key(|(_, t, _)| *t);
         Corrections { list }
     }
@@ -360,17 +353,15 @@ impl Loops {
             is_loop: true,
         };
         let before = self.map_from_odom;
-        self.graph.link(edge)?;
-        let outcome = self.graph.optimise();
-        if !outcome.solved {
+        let outcome = self.graph.link(edge).map(|()| self.graph.optimise()).filter(|outcome| outcome.solved);
+        let Some(outcome) = outcome else {
             self.stats.loops_unsolved += 1;
             return None;
-        }
+        };
         self.stats.loops_rejected = outcome.loops_rejected as u64;
         self.last_closed = Some(t);
         self.stats.loops_closed += 1;
         self.map_from_odom = self.graph.pose(node).compose(&odom.inverse());
-        self.version += 1;
         let (was, now) = (before.compose(&odom), self.map_from_odom.compose(&odom));
         let moved = [(now.p - was.p).length(), pose4::wrapped(now.yaw - was.yaw).abs()];
         let closure = Closure { t, with, inliers: v.inliers, measured: v.candidate_from_query, moved };

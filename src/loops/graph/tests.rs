@@ -303,7 +303,7 @@ fn far_from_the_origin_stiff_and_loose_edges_and_islands_are_solved() {
 }
 
 #[test]
-#[ignore = "a measurement"]
+#[ignore = "prints times at capacity: cargo test --release --lib time_at_capacity -- --ignored --nocapture"]
 fn time_at_capacity() {
     let mut noise = stream(9, 0);
     let (mut graph, truth) = rounds(8, 256, &mut noise);

@@ -240,7 +240,8 @@ pub fn read_files(files: &[PathBuf], mut each: impl FnMut(Nanos, Message) -> io:
     Ok(())
 }
 
-/// Writes the trajectory that the files of a run hold, each pose as `in_map` has it, and shows every message; answers the stamp of the last pose.
+/// Writes the trajectory that the files of a run hold, each pose as `in_map` gives it, and shows every message; answers
+/// the stamp of the last pose.
 pub fn write_trajectory(
     files: &[PathBuf],
     out: &mut TumWriter<impl Write>,
