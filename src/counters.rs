@@ -73,6 +73,8 @@ stipple_drivers::counters! {
     keyframes_blank,
     /// Pose corrections that found their queue full.
     corrections_full,
+    /// Joins of epochs that the mapper could not follow.
+    epochs_kept_apart,
     /// Keyframes dropped because the mapper had no room for them.
     keyframe_store_full,
     /// Anchors not made because there are as many blocks as there may be.

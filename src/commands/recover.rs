@@ -57,7 +57,11 @@ fn recover_run(run: &LoggedRun, out: &OutputDir, name: &str) -> Result<u64, Faul
             }
             Message::Event(e) if e.id == EventId::End => end = Some(e.text.to_string()),
             Message::Event(e) => events.push(format!("{:9.2} s  {}", (at - begun).secs().max(0.0), e.text)),
-            Message::Predicted(_) | Message::Rig(_) | Message::Counters(_) | Message::Clocks(_) => {}
+            Message::Predicted(_)
+            | Message::Rig(_)
+            | Message::MapFromOdom(_)
+            | Message::Counters(_)
+            | Message::Clocks(_) => {}
         }
     };
     let newest = run.files.iter().rev().find_map(|path| modified(path));

@@ -38,6 +38,9 @@ pub struct Args {
     /// Begin with an empty map: what earlier runs left in DIR/map is moved to DIR/previous-map
     #[arg(long)]
     fresh: bool,
+    /// Find the way in the map that earlier runs left in DIR, and change nothing of it
+    #[arg(long, conflicts_with = "fresh")]
+    localise_only: bool,
     /// Record the samples to this folder too, as EuRoC
     #[arg(long, value_name = "DIR")]
     record: Option<PathBuf>,
@@ -59,8 +62,9 @@ pub fn run(args: &Args) -> Result<(), Fault> {
     let playback = Playback { speed: args.speed, repeats: args.repeat };
     threads::end_where_one_hangs(host::stop_asked_for(), super::last_words);
     let source = args.board.board.clone().map(|file| BoardSource { file, set: args.board.set.clone() });
-    let fresh = args.fresh;
-    let options = Options { source, duration_s, record, fresh, inject, service: true, playback, ..Options::default() };
+    let (fresh, localise_only, service) = (args.fresh, args.localise_only, true);
+    let options =
+        Options { source, duration_s, record, fresh, localise_only, inject, service, playback, ..Options::default() };
     finish(fly(input, &board, &out, &options, led)?, &out)
 }
 

@@ -19,6 +19,9 @@ const SIGMA_MAX: [f64; 2] = [0.2, 0.02];
 const AGREE: [f64; 2] = [1.0, 0.035];
 /// Verifications of the keyframes before count for so long, s.
 const REMEMBERED_S: f64 = 5.0;
+/// A place in another frame needs so many verifications that agree with it, one of an earlier keyframe, and so many corners.
+const JOIN_AGREE: usize = 2;
+const JOIN_INLIERS: usize = 40;
 /// A place with this share of the corners that agree looks the same.
 const AMBIGUOUS_SHARE: f64 = 0.6;
 /// Squared deviations of 4 numbers that odometry may have drifted: 3 deviations of one. For a place that may be confused
@@ -58,6 +61,8 @@ impl Default for Verification {
 #[derive(Clone, Copy, Debug)]
 pub enum Verdict {
     Accepted(Verification),
+    /// Accepted, of a place in another frame: nothing led from one to the other so far.
+    Joins(Verification),
     /// No candidate was verified.
     None,
     Weak,
@@ -66,14 +71,28 @@ pub enum Verdict {
     Implausible,
 }
 
+/// A keyframe that is judged.
+#[derive(Clone, Copy, Debug)]
+pub struct Asker {
+    pub node: u16,
+    pub t: Nanos,
+    /// Of the estimator, and its pose there.
+    pub epoch: u32,
+    pub odom: Pose4,
+    /// The frame that its node is in.
+    pub frame: u32,
+}
+
 /// A verification of an earlier keyframe: where it puts that keyframe.
 #[derive(Clone, Copy, Debug, Default)]
 struct Remembered {
     t: Nanos,
-    /// In `odom`, and in the map by the verification.
+    /// In `odom`, and by the verification in the frame of the candidate.
     odom: Pose4,
+    frame: u32,
     map: Pose4,
     sigma: [f64; 2],
+    inliers: usize,
 }
 
 type Strong = (Verification, Remembered);
@@ -82,19 +101,22 @@ type Strong = (Verification, Remembered);
 #[derive(Default)]
 pub struct Judge {
     remembered: List<Remembered, 32>,
+    epoch: u32,
 }
 
 impl Judge {
-    /// Judges the verifications of a keyframe at a node of the graph.
+    /// Judges the verifications of a keyframe; `frame_of` is the frame that a node is in.
     pub fn judge(
         &mut self,
-        node: u16,
-        t: Nanos,
-        odom: &Pose4,
+        asker: &Asker,
         verified: &[Verification],
+        frame_of: impl Fn(u16) -> u32,
         graph: &mut PoseGraph,
     ) -> Verdict {
-        self.remembered.retain(|r| (t - r.t).secs().abs() <= REMEMBERED_S);
+        let &Asker { t, odom, .. } = asker;
+        // Nothing leads from one epoch of the estimator to the next.
+        let goes_on = std::mem::replace(&mut self.epoch, asker.epoch) == asker.epoch;
+        self.remembered.retain(|r| goes_on && (t - r.t).secs().abs() <= REMEMBERED_S);
         if verified.is_empty() {
             return Verdict::None;
         }
@@ -103,18 +125,26 @@ impl Judge {
             let map = graph.pose(v.node).compose(&v.verified.candidate_from_query);
             let c = &v.verified.covariance;
             let sigma = [(c[(0, 0)] + c[(1, 1)] + c[(2, 2)]).sqrt(), c[(3, 3)].sqrt()];
-            let _ = strong.push((*v, Remembered { t, odom: *odom, map, sigma }));
+            let (frame, inliers) = (frame_of(v.node), v.verified.inliers);
+            let _ = strong.push((*v, Remembered { t, odom, frame, map, sigma, inliers }));
         }
         // Others that agree with one: of this keyframe by other candidates, and of earlier keyframes.
         let support = |i: usize| {
             let others = strong.iter().enumerate().filter(|(j, _)| *j != i).map(|(_, (_, r))| r);
             others.chain(self.remembered.iter()).filter(|r| agree(&strong[i].1, r)).count()
         };
-        let best = (0..strong.len()).map(|i| (support(i), strong[i].0.verified.inliers, i)).max();
-        let verdict = match best {
+        let best = |here: bool| {
+            let of_kind = (0..strong.len()).filter(|i| (strong[*i].1.frame == asker.frame) == here);
+            of_kind.map(|i| (support(i), strong[i].0.verified.inliers, i)).max()
+        };
+        let here = match best(true) {
             None => Verdict::Weak,
             Some((0, ..)) => Verdict::Alone,
-            Some((.., i)) => weigh(node, &strong[i], &strong, graph),
+            Some((.., i)) => weigh(asker.node, &strong[i], &strong, graph),
+        };
+        let verdict = match (here, best(false)) {
+            (Verdict::Accepted(_), _) | (_, None) => here,
+            (_, Some((count, _, i))) => self.weigh_join(&strong[i], count, &strong),
         };
         for (_, r) in strong.iter() {
             if self.remembered.is_full() {
@@ -127,16 +157,45 @@ impl Judge {
         }
         verdict
     }
+
+    /// Judges a place in another frame, that so many verifications agree with. No pose excludes a place that looks the same,
+    /// so another keyframe has to say the same, and none may say otherwise.
+    fn weigh_join(&self, (v, r): &Strong, count: usize, strong: &[Strong]) -> Verdict {
+        let before = self.remembered.iter().filter(|s| s.t != r.t && agree(r, s)).count();
+        if before == 0 || count < JOIN_AGREE || r.inliers < JOIN_INLIERS {
+            return Verdict::Alone;
+        }
+        let all = strong.iter().map(|(_, s)| s).chain(self.remembered.iter());
+        let mut rivals = all.filter(|s| s.frame == r.frame && looks_alike(s, r) && is_elsewhere(&carried(s, r), r));
+        match rivals.next() {
+            Some(_) => Verdict::Ambiguous,
+            None => Verdict::Joins(*v),
+        }
+    }
+}
+
+/// Where a verification puts the vehicle at the time of another one.
+fn carried(from: &Remembered, to: &Remembered) -> Pose4 {
+    from.map.compose(&from.odom.between(&to.odom))
+}
+
+fn is_elsewhere(map: &Pose4, r: &Remembered) -> bool {
+    let (far, angle) = ((map.p - r.map.p).length(), wrapped(map.yaw - r.map.yaw).abs());
+    far > AGREE[0] || angle > 5.0 * AGREE[1]
+}
+
+fn looks_alike(rival: &Remembered, best: &Remembered) -> bool {
+    rival.inliers as f64 >= AMBIGUOUS_SHARE * best.inliers as f64
 }
 
 /// Whether two verifications put the vehicle at the same place.
 fn agree(a: &Remembered, b: &Remembered) -> bool {
-    let carried = b.map.compose(&b.odom.between(&a.odom));
+    let carried = carried(b, a);
     let (far, angle) = ((carried.p - a.map.p).length(), wrapped(carried.yaw - a.map.yaw).abs());
     let within = |k: usize| AGREE[k].min(3.0 * a.sigma[k].hypot(b.sigma[k]));
     // The lever of the motion between them turns yaw into distance.
     let lever = (b.odom.p - a.odom.p).length() * b.sigma[1] * 3.0;
-    far <= (within(0) + lever).min(AGREE[0]) && angle <= within(1)
+    a.frame == b.frame && far <= (within(0) + lever).min(AGREE[0]) && angle <= within(1)
 }
 
 fn is_strong(v: &Verified) -> bool {
@@ -152,11 +211,7 @@ fn is_strong(v: &Verified) -> bool {
 /// Compares a verification with what the graph knows, and with its rivals.
 fn weigh(node: u16, best: &Strong, strong: &[Strong], graph: &mut PoseGraph) -> Verdict {
     let (v, r) = best;
-    let rivals = strong.iter().filter(|(w, s)| {
-        let (far, angle) = ((s.map.p - r.map.p).length(), wrapped(s.map.yaw - r.map.yaw).abs());
-        let looks_alike = w.verified.inliers as f64 >= AMBIGUOUS_SHARE * v.verified.inliers as f64;
-        looks_alike && (far > AGREE[0] || angle > 5.0 * AGREE[1])
-    });
+    let rivals = strong.iter().filter(|(_, s)| s.frame == r.frame && looks_alike(s, r) && is_elsewhere(&s.map, r));
     let mut ambiguous = false;
     for (w, _) in rivals {
         ambiguous |= drift(node, w, graph).is_none_or(|d| d < EXCLUDED);
@@ -235,9 +290,12 @@ mod tests {
         Verification { node, verified }
     }
 
+    fn asker(node: u16, seconds: i64, graph: &PoseGraph) -> Asker {
+        Asker { node, t: Nanos(seconds * 1_000_000_000), epoch: 0, odom: graph.pose(node), frame: 0 }
+    }
+
     fn judged(list: &[Verification], graph: &mut PoseGraph) -> String {
-        let odom = graph.pose(60);
-        let verdict = Judge::default().judge(60, Nanos(60_000_000_000), &odom, list, graph);
+        let verdict = Judge::default().judge(&asker(60, 60, graph), list, |_| 0, graph);
         format!("{verdict:?}").split(['(', ' ']).next().unwrap().to_string()
     }
 
@@ -289,8 +347,8 @@ mod tests {
             v
         };
         for (node, seconds, accepted) in [(58u16, 58, false), (59, 59, true), (60, 70, false)] {
-            let (odom, v) = (g.pose(node), at(node, 1, &g));
-            let verdict = judge.judge(node, Nanos(seconds * 1_000_000_000), &odom, &[v], &mut g);
+            let v = at(node, 1, &g);
+            let verdict = judge.judge(&asker(node, seconds, &g), &[v], |_| 0, &mut g);
             assert_eq!(matches!(verdict, Verdict::Accepted(_)), accepted, "{node}");
         }
     }

@@ -39,7 +39,8 @@ pub fn distance(a: &Descriptor, b: &Descriptor) -> u32 {
 }
 
 /// A corner of camera 0, in 40 bytes.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, bytemuck::Pod, bytemuck::Zeroable)]
 pub struct Feature {
     pub descriptor: Descriptor,
     px: [u16; 2],

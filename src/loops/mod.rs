@@ -2,30 +2,36 @@
 //!
 //! ```text
 //! keyframe -> features -> index -> candidates -> verification -> acceptance -> pose graph -> map_from_odom, corrections
-//!                 `----------------> stored with the keyframe      `-> refused, counted by reason
+//!                 `-> places on disk                               `-> refused, counted by reason
 //! ```
 //!
 //! A closure that is false is the worst fault there is: so two verifications have to agree, no other place may look the same
 //! that the drift allows, and the correction has to be one that odometry can have made since (3 deviations).
 //!
 //! Frames: `odom` is that of the estimator, which drifts and never jumps inside an epoch; `map` is the one in which loops
-//! agree. Whoever needs a pose in `map` composes it with `Loops::map_from_odom`.
+//! agree. Whoever needs a pose in `map` composes it with `Loops::map_from_odom`. Each epoch of the estimator, in this flight or
+//! an earlier one, begins in a map of its own, of which nothing is known in another: its frame. Where a place of another frame
+//! is recognised, the two become one: that of this flight moves, and places of earlier flights never do.
 
 pub mod accept;
 pub mod features;
+mod frames;
 pub mod graph;
 pub mod index;
+pub mod kept;
 pub mod pose4;
 pub mod verify;
 
 use crate::config::FrontendConfig;
 use crate::limits::CAMERAS_MAX;
 use crate::mem::List;
-use accept::{Judge, Verdict, Verification};
+use accept::{Asker, Judge, Verdict, Verification};
 use features::{Extractor, Feature, Ray, FEATURES};
 use glam::{DQuat, DVec3};
 use graph::{Edge, PoseGraph};
 use index::{Candidate, PlaceIndex};
+use kept::{Epoch, Keeper};
+use nalgebra::{Matrix4, Vector4};
 use pose4::Pose4;
 use std::sync::Arc;
 use stipple_drivers::{counters, Calibration, Fault, Frames, Nanos, Pose};
@@ -38,6 +44,12 @@ const BY_PLACE: usize = 3;
 const OLD_S: f64 = 20.0;
 /// Once a loop is closed, the next that says the same has to wait so long, s.
 const REST_S: f64 = 1.0;
+/// Candidates by looks of which those are chosen that are not all at one place, where the vehicle may be anywhere: so many, and
+/// of those within this, m, two.
+const ANYWHERE: usize = 32;
+const APART_M: f64 = 2.0;
+/// Deviations of the map of an earlier flight, whose places stay where they are: m, rad.
+const KEPT_SIGMA: [f64; 2] = [0.05, 0.005];
 /// Candidates by place are nearer than this, m, and look within this angle of the same direction, rad.
 const NEAR_M: f64 = 3.0;
 const NEAR_RAD: f64 = 0.8;
@@ -64,6 +76,13 @@ counters! {
     loops_implausible,
     /// The graph had no room for the loop, or could not be solved in its memory.
     loops_unsolved,
+    /// Times that an epoch was found in the map of another, and that two maps of earlier flights were to be joined, which stay
+    /// where they are.
+    epochs_joined,
+    epochs_refused,
+    /// Places of earlier flights that were read, and places that the disk did not take.
+    places_read,
+    places_unkept,
     /// Keyframes that were taken out of the graph as it was full.
     loop_keyframes_dropped,
 }
@@ -86,10 +105,14 @@ pub struct LoopKeyframe<'a> {
 pub struct Place {
     pub t: Nanos,
     pub id: Option<u64>,
-    pub epoch: u32,
+    pub epoch: Epoch,
     /// Pose in `odom`, of the upright frame, and what turns the body upright.
     pub odom: Pose4,
     pub tilt: DQuat,
+    /// Those of one frame have their poses in one map.
+    frame: u32,
+    /// Its key on the disk.
+    number: u32,
     features: u16,
     used: bool,
 }
@@ -106,6 +129,22 @@ pub struct Closure {
     pub measured: Pose4,
     /// By how much `map_from_odom` changed for this keyframe: m, rad.
     pub moved: [f64; 2],
+    /// The epoch of the place, where it was in another frame than this keyframe until now.
+    pub joins: Option<Epoch>,
+}
+
+/// Where `odom` is in the map.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct MapFromOdom {
+    /// Stamp of the keyframe that it was found by.
+    pub t: Nanos,
+    /// How often it has changed in this flight.
+    pub count: u32,
+    /// Epoch of `odom`.
+    pub epoch: u32,
+    pub pose: Pose4,
+    /// Covariance of the vehicle's position, m², and yaw, rad², in the map at that stamp.
+    pub covariance: [[f64; 4]; 4],
 }
 
 /// Closures that are kept for the report, beside their count.
@@ -149,7 +188,16 @@ pub struct Loops {
     /// The newest keyframe's node.
     last: Option<u16>,
     last_closed: Option<Nanos>,
-    map_from_odom: Pose4,
+    map_from_odom: MapFromOdom,
+    /// The frame of the epoch that the estimator is in, and the next one.
+    frame: u32,
+    next_frame: u32,
+    flight: i64,
+    next_number: u32,
+    keeper: Option<Keeper>,
+    /// Places have moved since their poses were written, and when that was.
+    poses_moved: bool,
+    poses_kept: Nanos,
     pub stats: Stats,
     /// The first closures.
     pub closures: Vec<Closure>,
@@ -176,7 +224,14 @@ impl Loops {
             rays: List::default(),
             last: None,
             last_closed: None,
-            map_from_odom: Pose4::default(),
+            map_from_odom: MapFromOdom::default(),
+            frame: 0,
+            next_frame: 0,
+            flight: 0,
+            next_number: 0,
+            keeper: None,
+            poses_moved: false,
+            poses_kept: Nanos(0),
             stats: Stats::default(),
             closures: Vec::with_capacity(CLOSURES),
             recognised: None,
@@ -192,8 +247,13 @@ impl Loops {
     }
 
     /// The frame of the estimator in that of the map, now.
-    pub fn map_from_odom(&self) -> Pose {
-        self.map_from_odom.pose()
+    pub fn map_from_odom(&self) -> MapFromOdom {
+        self.map_from_odom
+    }
+
+    /// When this flight began, ms since 1970.
+    pub fn flight(&self) -> i64 {
+        self.flight
     }
 
     /// Keyframes of the graph with their poses in the map, in no order.
@@ -209,9 +269,11 @@ impl Loops {
 
     /// What puts poses of the estimator in the map, at each keyframe of the graph, the oldest first. Allocates.
     pub fn corrections(&self) -> Corrections {
-        let correction = |(place, pose): (&Place, Pose4)| (place.epoch, place.t, pose.compose(&place.odom.inverse()));
+        let correction =
+            |(place, pose): (&Place, Pose4)| (place.epoch.number, place.t, pose.compose(&place.odom.inverse()));
+        let of_this_flight = self.places().filter(|(place, _)| place.epoch.flight == self.flight);
         let mut list: Vec<_> =
-            if self.stats.loops_closed > 0 { self.places().map(correction).collect() } else { vec![] };
+            if self.stats.loops_closed > 0 { of_this_flight.map(correction).collect() } else { vec![] };
         list.sort_by_key(|(_, t, _)| *t);
         Corrections { list }
     }
@@ -226,29 +288,38 @@ impl Loops {
         let (features, rays) = &mut self.query;
         self.extractor.extract(keyframe.frames, up, keyframe.body_from_cam.as_ref(), features);
         let camera = self.extractor.rays(features, tilt, rays);
+        let epoch = Epoch { flight: self.flight, number: keyframe.epoch };
+        let before = self.last.map(|n| self.places[n as usize].epoch);
+        if before.is_some_and(|before| before != epoch) {
+            (self.frame, self.next_frame) = (self.next_frame, self.next_frame + 1);
+            (self.last, self.map_from_odom.epoch) = (None, keyframe.epoch);
+        }
         let node = self.add_node(keyframe, odom)?;
-        let place = Place {
+        self.places[node as usize] = Place {
             t: keyframe.t,
             id: keyframe.id,
-            epoch: keyframe.epoch,
+            epoch,
             odom,
             tilt,
+            frame: self.frame,
+            number: self.next_number,
             features: self.query.0.len() as u16,
             used: true,
         };
-        self.places[node as usize] = place;
+        self.next_number += 1;
         let verified = self.verify(node, camera);
         let closure = self.decide(node, &verified);
         let start = node as usize * FEATURES;
         self.features[start..][..self.query.0.len()].copy_from_slice(&self.query.0);
         self.index.insert(node, self.query.0.iter().map(|f| &f.descriptor));
         self.last = Some(node);
+        self.keep(node);
         closure
     }
 
     /// A node for a keyframe, linked to the one before by odometry.
     fn add_node(&mut self, keyframe: &LoopKeyframe, odom: Pose4) -> Option<u16> {
-        let last = self.last.filter(|n| self.places[*n as usize].epoch == keyframe.epoch);
+        let last = self.last;
         // The newest estimate of the one before, so that the two are of one window.
         let before = last.map(|n| {
             let place = &self.places[n as usize];
@@ -258,10 +329,10 @@ impl Loops {
         let moved = before.map(|b| b.between(&odom));
         let pose = match (last, &moved) {
             (Some(n), Some(moved)) => self.graph.pose(n).compose(moved),
-            _ => self.map_from_odom.compose(&odom),
+            _ => self.map_from_odom.pose.compose(&odom),
         };
         let node = self.graph.add(pose).or_else(|| {
-            self.drop_one();
+            self.drop_one(last);
             self.graph.add(pose)
         })?;
         if let (Some(n), Some(measured)) = (last, moved) {
@@ -272,64 +343,92 @@ impl Loops {
         Some(node)
     }
 
-    /// Takes the keyframe out of the graph whose neighbours in time are the nearest to each other.
-    fn drop_one(&mut self) {
-        let nearest = self.graph.closest_neighbours(|n| Some(n) != self.last);
+    /// Takes the keyframe out of the graph whose neighbours in time are the nearest to each other; not `last`.
+    fn drop_one(&mut self, last: Option<u16>) {
+        let nearest = self.graph.closest_neighbours(|n| Some(n) != last);
         let Some(node) = nearest else { return };
         let place = &mut self.places[node as usize];
         let start = node as usize * FEATURES;
         let features = &self.features[start..][..place.features as usize];
         self.index.remove(node, features.iter().map(|f| &f.descriptor));
         place.used = false;
+        let number = place.number;
+        self.keeper.iter_mut().for_each(|keeper| keeper.remove(number));
         self.graph.drop_node(node);
         self.stats.loop_keyframes_dropped += 1;
     }
 
     /// Verifies the candidates of a keyframe whose features are in `query`.
     fn verify(&mut self, node: u16, camera: DVec3) -> List<Verification, { BY_LOOKS + BY_PLACE }> {
-        let t = self.places[node as usize].t;
+        let candidates = self.candidates(node);
+        let mut list = List::default();
+        let (features, rays) = &self.query;
+        let query = Seen { features, rays, camera };
+        for candidate in candidates.iter() {
+            let place = &self.places[*candidate as usize];
+            let start = *candidate as usize * FEATURES;
+            let features = &self.features[start..][..place.features as usize];
+            let camera = self.extractor.rays(features, place.tilt, &mut self.rays);
+            let seen = Seen { features, rays: &self.rays, camera };
+            if let Some(mut verified) = self.verifier.verify(&query, &seen) {
+                if self.graph.is_fixed(*candidate) {
+                    let [p, yaw] = KEPT_SIGMA.map(|s| s * s);
+                    verified.covariance += Matrix4::from_diagonal(&Vector4::new(p, p, p, yaw));
+                }
+                let _ = list.push(Verification { node: *candidate, verified });
+            }
+        }
+        self.stats.loop_queries += u64::from(!candidates.is_empty());
+        list
+    }
+
+    /// Places that a keyframe may be at: those that look most like it, and those that are near.
+    fn candidates(&mut self, node: u16) -> List<u16, { BY_LOOKS + BY_PLACE }> {
         let places = &self.places;
-        let old = |n: u16| places[n as usize].used && (t - places[n as usize].t).secs() > OLD_S;
-        let mut candidates = [Candidate::default(); BY_LOOKS + BY_PLACE];
+        let own = places[node as usize];
+        let is_old = |n: u16| {
+            let p = &places[n as usize];
+            p.used && (p.epoch.flight != own.epoch.flight || p.frame != own.frame || (own.t - p.t).secs() > OLD_S)
+        };
+        let mut by_looks = [Candidate::default(); ANYWHERE];
+        let anywhere = self.is_lost();
         let descriptors = self.query.0.iter().map(|f| &f.descriptor);
-        let mut count = self.index.query(descriptors, old, &mut candidates[..BY_LOOKS]);
-        let here = self.graph.pose(node);
+        let most = if anywhere { ANYWHERE } else { BY_LOOKS };
+        let count = self.index.query(descriptors, is_old, &mut by_looks[..most]);
+        let (mut list, graph) = (List::default(), &self.graph);
+        for c in &by_looks[..count] {
+            let there = graph.pose(c.place).p;
+            let beside = |n: &&u16| {
+                let same = places[**n as usize].frame == places[c.place as usize].frame;
+                same && (graph.pose(**n).p - there).length() < APART_M
+            };
+            if list.len() < BY_LOOKS && (!anywhere || list.iter().filter(beside).count() < 2) {
+                let _ = list.push(c.place);
+            }
+        }
+        let here = graph.pose(node);
         for _ in 0..BY_PLACE {
-            let listed = |n: u16| candidates[..count].iter().any(|c| c.place == n);
-            let near = (0..places.len() as u16).filter(|n| old(*n) && !listed(*n)).filter_map(|n| {
-                let there = self.graph.pose(n);
+            let may = |n: &u16| is_old(*n) && places[*n as usize].frame == own.frame && !list.contains(n);
+            let near = (0..places.len() as u16).filter(may).filter_map(|n| {
+                let there = graph.pose(n);
                 let far = (there.p - here.p).length();
                 let turned = pose4::wrapped(there.yaw - here.yaw).abs();
                 (far < NEAR_M && turned < NEAR_RAD).then_some((far, n))
             });
             let Some((_, place)) = near.min_by(|a, b| a.0.total_cmp(&b.0)) else { break };
-            candidates[count] = Candidate { place, votes: 0.0 };
-            count += 1;
+            let _ = list.push(place);
         }
-        let mut list = List::default();
-        let (features, rays) = &self.query;
-        let query = Seen { features, rays, camera };
-        for candidate in &candidates[..count] {
-            let place = &self.places[candidate.place as usize];
-            let start = candidate.place as usize * FEATURES;
-            let features = &self.features[start..][..place.features as usize];
-            let camera = self.extractor.rays(features, place.tilt, &mut self.rays);
-            let seen = Seen { features, rays: &self.rays, camera };
-            if let Some(verified) = self.verifier.verify(&query, &seen) {
-                let _ = list.push(Verification { node: candidate.place, verified });
-            }
-        }
-        self.stats.loop_queries += u64::from(count > 0);
         list
     }
 
     /// Closes the loop that the verifications speak for, or counts why not.
     fn decide(&mut self, node: u16, verified: &[Verification]) -> Option<Closure> {
-        let t = self.places[node as usize].t;
-        let odom = self.places[node as usize].odom;
-        let verdict = self.judge.judge(node, t, &odom, verified, &mut self.graph);
+        let Place { t, epoch, odom, frame, .. } = self.places[node as usize];
+        let asker = Asker { node, t, epoch: epoch.number, odom, frame };
+        let places = &self.places;
+        let verdict = self.judge.judge(&asker, verified, |n| places[n as usize].frame, &mut self.graph);
         let count = match &verdict {
-            Verdict::Accepted(_) => &mut self.stats.loops_recognised,
+            Verdict::Accepted(_) | Verdict::Joins(_) => &mut self.stats.loops_recognised,
             Verdict::None => &mut self.stats.loops_none,
             Verdict::Weak => &mut self.stats.loops_weak,
             Verdict::Alone => &mut self.stats.loops_alone,
@@ -338,10 +437,15 @@ impl Loops {
         };
         *count += 1;
         self.recognised = None;
-        let Verdict::Accepted(best) = verdict else { return None };
+        let (best, joins) = match verdict {
+            Verdict::Accepted(best) => (best, None),
+            Verdict::Joins(best) => (best, Some(self.places[best.node as usize].epoch)),
+            _ => return None,
+        };
         let with = self.places[best.node as usize].t;
         self.recognised = Some((with, best.verified.candidate_from_query));
-        if self.last_closed.is_some_and(|last| (t - last).secs() < REST_S) {
+        let rests = self.last_closed.is_some_and(|last| (t - last).secs() < REST_S);
+        if joins.is_none() && rests {
             return None;
         }
         let v = &best.verified;
@@ -352,19 +456,18 @@ impl Loops {
             covariance: v.covariance,
             is_loop: true,
         };
-        let before = self.map_from_odom;
-        let outcome = self.graph.link(edge).map(|()| self.graph.optimise()).filter(|outcome| outcome.solved);
-        let Some(outcome) = outcome else {
-            self.stats.loops_unsolved += 1;
+        let was = self.map_from_odom.pose.compose(&odom);
+        if !self.link(&edge, joins.is_some()) {
             return None;
-        };
-        self.stats.loops_rejected = outcome.loops_rejected as u64;
+        }
         self.last_closed = Some(t);
         self.stats.loops_closed += 1;
-        self.map_from_odom = self.graph.pose(node).compose(&odom.inverse());
-        let (was, now) = (before.compose(&odom), self.map_from_odom.compose(&odom));
+        let now = self.graph.pose(node);
+        let covariance = self.covariance_in_map(node);
+        let (count, epoch) = (self.map_from_odom.count + 1, epoch.number);
+        self.map_from_odom = MapFromOdom { t, count, epoch, pose: now.compose(&odom.inverse()), covariance };
         let moved = [(now.p - was.p).length(), pose4::wrapped(now.yaw - was.yaw).abs()];
-        let closure = Closure { t, with, inliers: v.inliers, measured: v.candidate_from_query, moved };
+        let closure = Closure { t, with, inliers: v.inliers, measured: v.candidate_from_query, moved, joins };
         if self.closures.len() < CLOSURES {
             self.closures.push(closure);
         }

@@ -311,7 +311,7 @@ impl Anchors {
     /// Gaussians that an anchor may add at the steps a keyframe gets here: more than are trained cost every later step
     /// its time and give nothing back.
     fn affordable(&self, scene: &Scene) -> usize {
-        let steps = (scene.steps / scene.views.training().len().max(1) as u64) as usize;
+        let steps = (scene.steps / scene.views.own_training().len().max(1) as u64) as usize;
         match self.config.seeds_per_step as usize {
             0 => usize::MAX,
             limit => limit * steps.max(if scene.views.anchors() == 0 { STEPS_FIRST } else { STEPS_MIN }),

@@ -9,11 +9,13 @@
 //! cannot be written to a full or broken disk stays in memory, and what finds no room there is thinned as without a store.
 
 use super::block::{BlockAbout, KeyframeAbout, RunAbout};
-use super::block::{KIND_BLOCK, KIND_IMAGE, KIND_KEYFRAME, NO_BLOCK, SAMPLES};
+use super::block::{JoinAbout, KIND_BLOCK, KIND_IMAGE, KIND_JOIN, KIND_KEYFRAME, NO_BLOCK, SAMPLES};
 use super::choice::{Choice, Drawn};
-use super::filing::{entry, identity, image_id, keyframes_known, limits, payload_max, run_key, BLOCKS_KNOWN};
+use super::filing::{entry, identity, keyframes_known, limits, payload_max, run_key, BLOCKS_KNOWN};
+use super::filing::image_id;
 use super::horizon::ball;
 use super::parts::PARTS;
+use super::runs::{Run, Runs};
 use super::scene::Scene;
 use super::seen::Sight;
 use super::shape::Shape;
@@ -27,7 +29,7 @@ use crate::store::{self, Disk, Fetched, Key, Store};
 use glam::{DVec3, Vec3};
 use std::path::Path;
 use std::sync::Arc;
-use stipple_drivers::{host, Calibration, Fault, FaultKind, Pose};
+use stipple_drivers::{host, Calibration, Fault, FaultKind, Nanos, Pose};
 
 /// Training steps after which a block is written again, as a part of those it had, and at least.
 const REWRITTEN_PART: f64 = 0.25;
@@ -35,6 +37,8 @@ const REWRITTEN_MIN: u32 = 100;
 /// Training steps on a view at which its horizon is first taken again, and from one time to the next.
 const FIRST_LOOK: u32 = 5;
 const LOOKS_RATIO: u32 = 4;
+/// Before any stamp.
+const LONG_AGO: Nanos = Nanos(i64::MIN / 4);
 /// Least space on the disk that a map is begun with, bytes.
 const BYTES_MIN: u64 = 128 << 20;
 
@@ -119,11 +123,9 @@ pub struct Archive {
     disk: Arc<Disk>,
     at_once: bool,
     pub run: u32,
-    /// Epoch 0 of this run, in the store.
-    pub epoch_base: u32,
-    /// The run, and whether it was there before.
     about: RunAbout,
-    pub goes_on: bool,
+    /// The runs whose maps are known, this one last.
+    pub runs: Runs,
     pub blocks: Vec<Block>,
     pub known: Vec<Known>,
     pub sight: Sight,
@@ -164,44 +166,26 @@ impl Archive {
             return Err(Fault::new(FaultKind::NoOutput, place.folder.display().to_string(), what, fix));
         }
         let (store, disk) = Store::open(place.folder, identity(calibration, board, shape), &limits)?;
-        let (mut run, mut epochs) = (0, 0);
-        store.entries(|key, about| {
-            run = run.max(key.run + 1);
-            let epoch = match key.kind {
-                KIND_BLOCK => BlockAbout::decode(about).map(|b| b.epoch),
-                KIND_KEYFRAME => KeyframeAbout::decode(about).map(|k| k.epoch),
-                _ => RunAbout::decode(about).map(|r| r.epoch_base),
-            };
-            epochs = epochs.max(epoch.map_or(0, |e| e + 1));
-        });
-        let last = |store: &Store, run: u32| store.about(&run_key(run)).and_then(|about| RunAbout::decode(&about));
-        let newest = run.checked_sub(1).and_then(|run| Some((run, last(&store, run)?)));
-        let (run, about, goes_on) =
-            match newest.filter(|(_, about)| place.flight.is_none_or(|flight| about.started_unix_ms == flight)) {
-                Some((run, about)) => (run, about, true),
-                None => {
-                    let about = RunAbout {
-                        epoch_base: epochs,
-                        started_unix_ms: place.flight.unwrap_or_default(),
-                        colour: shape.channels == 3,
-                        width: shape.width,
-                        height: shape.height,
-                        cameras: shape.cameras,
-                        channels: shape.channels,
-                        scene_depth_m: 0.0,
-                    };
-                    (run, about, false)
-                }
-            };
+        let about = RunAbout {
+            epoch_base: 0,
+            started_unix_ms: place.flight.unwrap_or_default(),
+            colour: shape.channels == 3,
+            width: shape.width,
+            height: shape.height,
+            cameras: shape.cameras,
+            channels: shape.channels,
+            scene_depth_m: 0.0,
+        };
+        let runs = Runs::of(&store, about, place.flight, keyframes_known(board, shape));
+        let Run { run, about, .. } = *runs.newest();
         let (blocks, known, sight, choice, numbers) = tables(board, shape);
         let mut archive = Archive {
             store,
             disk: Arc::new(disk),
             at_once: place.at_once,
             run,
-            epoch_base: about.epoch_base,
             about,
-            goes_on,
+            runs,
             blocks,
             known,
             sight,
@@ -245,15 +229,28 @@ impl Archive {
         self.state_run();
     }
 
+    /// The key of what has a number over all runs.
     pub fn key(&self, kind: u8, id: u32) -> Key {
-        Key { kind, run: self.run, id }
+        self.runs.key(kind, id)
     }
 
-    /// Takes over what the last run left: every keyframe and block is known, and none is in memory.
+    /// Takes over what the runs left: every keyframe and block is known, and none is in memory.
     pub fn resume(&mut self, views: &mut Views) {
-        let (mut states, cameras) = (vec![], views.cameras());
+        for at in 0..self.runs.list.len() {
+            let run = self.runs.list[at];
+            self.resume_keyframes(views, &run);
+            if run.run != self.run {
+                views.earlier = views.len();
+            }
+            self.resume_blocks(views, &run);
+        }
+    }
+
+    fn resume_keyframes(&mut self, views: &mut Views, run: &Run) {
+        let (mut states, cameras, known) = (vec![], views.cameras(), self.known.len());
+        let has_image = |id: u32| self.store.about(&Key { kind: KIND_IMAGE, run: run.run, id }).is_some();
         self.store.entries(|key, about| {
-            if key.kind == KIND_KEYFRAME && key.run == self.run {
+            if key.kind == KIND_KEYFRAME && key.run == run.run {
                 states.extend(KeyframeAbout::decode(about).map(|state| (key.id, state)));
             }
         });
@@ -262,31 +259,40 @@ impl Archive {
         let whole: Vec<_> = states
             .chunk_by(|a, b| a.0 / CAMERAS_MAX as u32 == b.0 / CAMERAS_MAX as u32)
             .filter(|of_one| of_one.len() == cameras)
-            .filter(|of_one| of_one.iter().all(|(id, _)| self.store.about(&self.key(KIND_IMAGE, *id)).is_some()))
+            .filter(|of_one| of_one.iter().all(|(id, _)| has_image(*id)))
             .collect();
         for (id, state) in whole.into_iter().flatten() {
-            views.know(entry(*id, state, self.epoch_base));
+            let mut entry = entry(*id, state);
+            (entry.id, entry.epoch) = (entry.id + run.first, self.runs.resolved(entry.epoch));
+            if run.run != self.run {
+                // The clock of a flight before may have been another.
+                entry.near_at = LONG_AGO;
+            }
+            views.know(entry);
         }
         self.know_keyframes(views.len() / cameras);
-        for (keyframe, known) in self.known.iter_mut().enumerate() {
+        for (keyframe, known) in self.known.iter_mut().enumerate().skip(known) {
             (known.saved, known.stated) = (true, views.get(keyframe * cameras).steps);
         }
+    }
+
+    fn resume_blocks(&mut self, views: &mut Views, run: &Run) {
         let mut found = vec![];
         self.store.entries(|key, about| {
-            if key.kind == KIND_BLOCK && key.run == self.run {
+            if key.kind == KIND_BLOCK && key.run == run.run {
                 found.extend(BlockAbout::decode(about).map(|block| (key.id, block)));
             }
         });
         found.sort_unstable_by_key(|(id, _)| *id);
         for (id, b) in found {
-            let Some(anchor) = views.index_of(u64::from(id / PARTS)) else { continue };
+            let Some(anchor) = views.index_of(u64::from(id / PARTS) + run.first) else { continue };
             let steps = views.get(anchor).steps;
             let entry = views.get_mut(anchor);
             (entry.anchor, entry.placed) = (true, b.placed);
             self.know_block(Block {
                 anchor: anchor as u32,
                 number: anchor as u32 * PARTS + id % PARTS,
-                epoch: b.epoch - self.epoch_base,
+                epoch: self.runs.resolved(b.epoch),
                 count: b.count,
                 samples: b.samples,
                 samples_len: b.samples_len,
@@ -300,6 +306,16 @@ impl Archive {
             });
             self.measure(self.blocks.len() - 1);
         }
+    }
+
+    /// Makes one map of two epochs, by their numbers over all runs.
+    pub fn join(&mut self, from: u32, into: u32) {
+        self.runs.joined.push((from, into));
+        self.blocks.iter_mut().filter(|b| b.epoch == from).for_each(|b| b.epoch = into);
+        self.exchanges += 1;
+        let about = JoinAbout { into }.encode();
+        self.store.put(Key { kind: KIND_JOIN, run: self.run, id: from }, &about, |_| ());
+        self.serve();
     }
 
     fn know_keyframes(&mut self, count: usize) {
@@ -426,7 +442,7 @@ impl Archive {
     /// What came from the disk, told by what it is; buffers are given back by `store.give_back`.
     pub fn next_fetched(&mut self, views: &Views) -> Option<(Arrived, Fetched)> {
         let fetched = self.store.fetched()?;
-        let key = fetched.key;
+        let key = self.runs.over_all(&fetched.key);
         let arrived = match key.kind {
             KIND_BLOCK => {
                 let anchor = views.index_of(u64::from(key.id / PARTS));

@@ -9,6 +9,7 @@
 //! | `KIND_BLOCK` | of its anchor, times `PARTS`, plus the part (`parts`) | `BlockAbout` | arrays of `count` elements, one after another: splats (48 bytes each), steps (4), green and blue (8, in colour), Adam's moments (96, if kept), those of green and blue (16, if kept, in colour) |
 //! | `KIND_KEYFRAME` | of the keyframe, times `CAMERAS_MAX`, plus the camera | `KeyframeAbout` | none |
 //! | `KIND_IMAGE` | the same | none | the pixels of each plane |
+//! | `KIND_JOIN` | of the epoch that is another by now | `JoinAbout` | none |
 //!
 //! What is known of a keyframe changes as long as the map trains; its pixels do not, and are written once.
 //!
@@ -29,6 +30,7 @@ pub const KIND_RUN: u8 = 1;
 pub const KIND_BLOCK: u8 = 2;
 pub const KIND_KEYFRAME: u8 = 3;
 pub const KIND_IMAGE: u8 = 4;
+pub const KIND_JOIN: u8 = 5;
 /// `KeyframeAbout::home` of a keyframe that belongs to no block.
 pub const NO_BLOCK: u32 = u32::MAX;
 /// Samples of a block.
@@ -62,6 +64,13 @@ pub struct RunAbout {
     pub channels: u32,
     /// Median depth of what the first anchor saw, m; zero before there is one.
     pub scene_depth_m: f64,
+}
+
+/// An epoch that is one map with another.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct JoinAbout {
+    /// The other one. Unique over all runs of the store.
+    pub into: u32,
 }
 
 /// What is known of a block without its Gaussians.
@@ -231,6 +240,18 @@ impl RunAbout {
         let [epoch_base, width, height, cameras, channels] = [b.u32()?, b.u32()?, b.u32()?, b.u32()?, b.u32()?];
         let scene_depth_m = b.f64()?;
         Some(RunAbout { epoch_base, started_unix_ms, colour, width, height, cameras, channels, scene_depth_m })
+    }
+}
+
+impl JoinAbout {
+    pub fn encode(&self) -> About {
+        let mut w = Writer::new();
+        w.words(&[self.into]);
+        w.about
+    }
+
+    pub fn decode(about: &About) -> Option<JoinAbout> {
+        Some(JoinAbout { into: Bytes::of(about)?.u32()? })
     }
 }
 

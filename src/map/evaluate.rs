@@ -108,7 +108,7 @@ pub fn sample(scene: &mut Scene, archive: &Option<Archive>) -> Result<[Option<f6
     Ok([probe(false)?, probe(true)?])
 }
 
-/// Scores every keyframe, those on disk too, or `most` of them spread over the run. Allocates.
+/// Scores every keyframe of this run, those on disk too, or `most` of them spread over it. Allocates.
 pub fn evaluate(
     scene: &mut Scene,
     archive: &mut Option<Archive>,
@@ -121,8 +121,9 @@ pub fn evaluate(
     let [training, held_out, between, fitted, aligned] = &mut all;
     let mut by_camera: [Vec<Option<f64>>; CAMERAS_MAX] = Default::default();
     let mut keyframe_scores = Vec::with_capacity(scene.views.len());
-    let (cameras, keyframes) = (scene.views.cameras(), scene.views.len() / scene.views.cameras());
-    let of_keyframe = |keyframe: usize| keyframe * cameras..(keyframe + 1) * cameras;
+    let (cameras, earlier) = (scene.views.cameras(), scene.views.earlier);
+    let keyframes = (scene.views.len() - earlier) / cameras;
+    let of_keyframe = |keyframe: usize| earlier + keyframe * cameras..earlier + (keyframe + 1) * cameras;
     for i in spread(keyframes, most).flat_map(of_keyframe) {
         if !bring(scene, archive, i)? {
             continue;
@@ -137,7 +138,8 @@ pub fn evaluate(
         if scene.views.camera(i) == 0 {
             let s = scene.views.get(i);
             let Stored { id, t, held_out, steps, .. } = *s;
-            keyframe_scores.push(KeyframeScore { id, t_ns: t.0, held_out, steps, psnr_db: scored });
+            let first = archive.as_ref().map_or(0, |archive| archive.runs.newest().first);
+            keyframe_scores.push(KeyframeScore { id: id - first, t_ns: t.0, held_out, steps, psnr_db: scored });
         }
         if !scene.views.get(i).held_out {
             add(scene, training);
@@ -209,7 +211,7 @@ fn score(scene: &mut Scene, index: usize) -> Result<Option<f64>, GpuError> {
 
 /// The first camera's images.
 fn first_images(scene: &Scene) -> impl Iterator<Item = usize> {
-    (0..scene.views.len()).step_by(scene.cameras.len())
+    (scene.views.earlier..scene.views.len()).step_by(scene.cameras.len())
 }
 
 /// Does what `score` does with another refinement of the keyframe for the moment.

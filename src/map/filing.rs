@@ -9,7 +9,7 @@ use super::shape::Shape;
 use super::views::{Stored, Views};
 use crate::config::Board;
 use crate::limits::CAMERAS_MAX;
-use crate::store::{Key, Limits};
+use crate::store::{self, Key, Limits};
 use stipple_drivers::{Calibration, Image};
 
 /// Blocks that a run may make. An anchor has up to 16, and covers some square metres: a large building.
@@ -28,10 +28,10 @@ pub fn run_key(run: u32) -> Key {
     Key { kind: KIND_RUN, run, id: 0 }
 }
 
-pub fn state(e: &Stored, home: u32, epoch_base: u32) -> KeyframeAbout {
+pub fn state(e: &Stored, home: u32) -> KeyframeAbout {
     KeyframeAbout {
         t: e.t,
-        epoch: e.epoch + epoch_base,
+        epoch: e.epoch,
         held_out: e.held_out,
         anchor: e.anchor,
         home,
@@ -46,11 +46,11 @@ pub fn state(e: &Stored, home: u32, epoch_base: u32) -> KeyframeAbout {
     }
 }
 
-pub fn entry(id: u32, s: &KeyframeAbout, epoch_base: u32) -> Stored {
+pub fn entry(id: u32, s: &KeyframeAbout) -> Stored {
     Stored {
         id: u64::from(id / CAMERAS_MAX as u32),
         t: s.t,
-        epoch: s.epoch.saturating_sub(epoch_base),
+        epoch: s.epoch,
         given: s.given,
         body_from_cam: s.body_from_cam,
         body_from_raw: s.body_from_raw,
@@ -114,7 +114,5 @@ pub fn payload_max(board: &Board, shape: &Shape) -> usize {
 /// A number of a rig and the form of its images: maps of another are not read.
 pub fn identity(calibration: &Calibration, board: &Board, shape: &Shape) -> u64 {
     let Shape { width, height, channels, cameras, .. } = *shape;
-    let text = format!("{:?} {:?} {width} {height} {channels} {cameras}", calibration.cameras, board.map.projection);
-    // FNV-1a.
-    text.bytes().fold(0xcbf2_9ce4_8422_2325, |h, b| (h ^ u64::from(b)).wrapping_mul(0x0100_0000_01b3))
+    store::identity(&format!("{:?} {:?} {width} {height} {channels} {cameras}", calibration.cameras, board.map.projection))
 }

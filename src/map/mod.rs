@@ -31,6 +31,7 @@ pub mod refine;
 pub mod render;
 mod residency;
 mod rotation;
+mod runs;
 mod saving;
 mod scene;
 pub mod schedule;
@@ -179,11 +180,11 @@ impl Mapper {
             Some(Err(fault)) => (None, Some(fault)),
             opened => (opened.and_then(Result::ok), None),
         };
-        if let Some(archive) = archive.as_mut().filter(|archive| archive.goes_on) {
+        if let Some(archive) = &mut archive {
             archive.resume(&mut views);
             trainer.scene_depth_m = archive.scene_depth_m().unwrap_or(trainer.scene_depth_m);
         }
-        let steps = (0..views.len()).map(|i| u64::from(views.get(i).steps)).sum();
+        let steps = (views.earlier..views.len()).map(|i| u64::from(views.get(i).steps)).sum();
         let scene = Scene { gpu, pipeline, views, cameras, rendered, steps, counters: Counters::default() };
         archive.iter_mut().for_each(|archive| archive.look_around(&scene));
         Ok(Mapper {
@@ -292,6 +293,33 @@ impl Mapper {
         self.corrected |= self.scene.views.correct(correction);
     }
 
+    /// The numbers over all runs of its store of the first keyframe of this flight and of its first epoch.
+    pub fn first_numbers(&self) -> (u64, u32) {
+        let run = self.archive.as_ref().map(|archive| archive.runs.newest());
+        run.map_or((0, 0), |run| (run.first, run.about.epoch_base))
+    }
+
+    /// Makes one map of an epoch, of this flight or of the one that began at `flight` (ms since 1970), and epoch `into` of this
+    /// flight: what one has, the other sees. Counted where that cannot be.
+    pub fn join(&mut self, flight: Option<i64>, epoch: u32, into: u32) {
+        let Scene { views, pipeline, counters, .. } = &mut self.scene;
+        let found = match &self.archive {
+            Some(Archive { runs, .. }) if runs.may_join() => {
+                runs.epoch(flight, epoch).zip(runs.epoch(None, into)).map(|(a, b)| (runs.resolved(a), runs.resolved(b)))
+            }
+            None if flight.is_none() => Some((epoch, into)),
+            _ => None,
+        };
+        let Some((from, into)) = found.filter(|(from, into)| pipeline.pool.join(*from, *into)) else {
+            counters.epochs_kept_apart.add(1);
+            return;
+        };
+        if from != into {
+            views.join(from, into);
+            self.archive.iter_mut().for_each(|archive| archive.join(from, into));
+        }
+    }
+
     /// Trains until `deadline`, and takes at least one step if there is something to train.
     pub fn step(&mut self, deadline: Instant) -> Result<StepReport, GpuError> {
         let start = Instant::now();
@@ -380,14 +408,14 @@ impl Mapper {
         self.scene.median_exposure()
     }
 
-    /// The newest epoch and its Gaussians. Allocates.
+    /// The newest epoch of this flight and its Gaussians. Allocates.
     pub fn newest_splats(&mut self) -> Result<(u32, Vec<Gaussian>), GpuError> {
         let pool = &self.scene.pipeline.pool;
         let (epoch, slots) = pool.newest_epoch();
         let mut splats = pool.download(&mut self.scene.gpu)?;
         splats.truncate(slots.end as usize);
         splats.drain(..(slots.start as usize).min(splats.len()));
-        Ok((epoch, splats))
+        Ok((epoch.saturating_sub(self.first_numbers().1), splats))
     }
 
     /// The Gaussians alive. Allocates.

@@ -241,6 +241,15 @@ impl Pool {
         (if before == 0 { 0 } else { begin(before) })..begin(upto)
     }
 
+    /// Makes one map of the Gaussians of two epochs; false where those of another are between them.
+    pub fn join(&mut self, from: u32, into: u32) -> bool {
+        let between = from.min(into) + 1..from.max(into);
+        let blocks = &mut self.host.blocks;
+        let may = !blocks.iter().any(|b| between.contains(&b.epoch));
+        blocks.iter_mut().filter(|b| may && b.epoch == from).for_each(|b| b.epoch = into);
+        may
+    }
+
     /// The slots of the blocks whose numbers are wanted; blocks that lie together have one range.
     pub fn slots_of<'a>(&'a self, wanted: impl Fn(u32) -> bool + 'a) -> impl Iterator<Item = Range<u32>> + 'a {
         let blocks = &self.host.blocks;

@@ -138,7 +138,7 @@ impl Archive {
         self.look_at(block, count, bytes);
         let b = &self.blocks[block];
         let about = BlockAbout {
-            epoch: b.epoch + self.epoch_base,
+            epoch: b.epoch,
             count: b.count,
             colour,
             moments: MOMENTS,
@@ -202,7 +202,7 @@ impl Archive {
         let cameras = views.cameras();
         let home = self.home(keyframe).map_or(NO_BLOCK, |anchor| views.get(anchor as usize).id as u32);
         for index in keyframe * cameras..(keyframe + 1) * cameras {
-            let about = state(views.get(index), home, self.epoch_base);
+            let about = state(views.get(index), home);
             if !self.store.put(self.key(KIND_KEYFRAME, image_id(views, index)), &about.encode(), |_| ()) {
                 return false;
             }

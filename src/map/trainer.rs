@@ -152,7 +152,7 @@ impl Trainer {
     /// Steps past this only teach the map the few views it has, and what they do not show looks covered to the next.
     fn trained_enough(&self, scene: &Scene) -> bool {
         let most = u64::from(self.config.steps_per_keyframe_max);
-        most > 0 && scene.steps >= most * scene.views.training().len() as u64
+        most > 0 && scene.steps >= most * scene.views.own_training().len() as u64
     }
 
     /// Smaller as the steps a keyframe has had grow: large ones find the picture, small ones settle it.

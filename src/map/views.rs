@@ -82,6 +82,8 @@ pub struct Views {
     arrived: Vec<u64>,
     arrivals: u64,
     training: Vec<u32>,
+    /// Entries of earlier runs, which come first.
+    pub earlier: usize,
 }
 
 impl Views {
@@ -102,6 +104,7 @@ impl Views {
             arrived: vec![0; places],
             arrivals: 0,
             training: Vec::with_capacity(known),
+            earlier: 0,
         }
     }
 
@@ -348,8 +351,19 @@ impl Views {
         &self.training
     }
 
+    /// Those of them that are of this run.
+    pub fn own_training(&self) -> &[u32] {
+        &self.training[self.training.partition_point(|k| (*k as usize) < self.earlier)..]
+    }
+
+    /// Anchors of this run.
     pub fn anchors(&self) -> usize {
-        self.entries.iter().filter(|e| e.anchor).count()
+        self.entries[self.earlier..].iter().filter(|e| e.anchor).count()
+    }
+
+    /// Makes one map of two epochs.
+    pub fn join(&mut self, from: u32, into: u32) {
+        self.entries.iter_mut().filter(|e| e.epoch == from).for_each(|e| e.epoch = into);
     }
 
     /// A correction moves what was refined along; what is not finite moves nothing. Answers whether there was one to take.

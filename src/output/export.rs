@@ -7,11 +7,12 @@
 
 use super::ply::PlyWriter;
 use super::{atomically, cannot_write, spz};
-use crate::map::block::{BlockAbout, KeyframeAbout, KIND_BLOCK, KIND_KEYFRAME};
+use crate::map::block::{BlockAbout, JoinAbout, KeyframeAbout, RunAbout};
+use crate::map::block::{KIND_BLOCK, KIND_JOIN, KIND_KEYFRAME, KIND_RUN};
 use crate::map::exposure::median_exposure;
 use crate::map::{Exposure, Gaussian};
 use crate::store::{Key, Reader};
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::hash::{DefaultHasher, Hash, Hasher};
 use std::io;
 use std::path::Path;
@@ -33,7 +34,8 @@ pub enum Form {
 /// What is to be exported.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Request {
-    /// Number of a run in the store; the newest that has blocks where it is not said.
+    /// Number of a run in the store; the newest that has blocks where it is not said. Runs that loop closure has joined with it
+    /// are one map with it.
     pub run: Option<u32>,
     /// So many of the most important Gaussians.
     pub most: Option<u64>,
@@ -147,7 +149,32 @@ fn set_aside(stop: Stop, stopped: &mut Option<Stop>) -> io::Error {
     }
 }
 
-/// What a store has of one run.
+/// The runs that are one map with a run, itself among them.
+fn one_map(reader: &Reader, run: u32) -> BTreeSet<u32> {
+    // Runs by their first epochs, and epochs that are one.
+    let (mut begun, mut joined) = (BTreeMap::new(), vec![]);
+    reader.entries(|key, about| match key.kind {
+        KIND_RUN => begun.extend(RunAbout::decode(about).map(|r| (r.epoch_base, key.run))),
+        KIND_JOIN => joined.extend(JoinAbout::decode(about).map(|join| [key.id, join.into])),
+        _ => {}
+    });
+    let of_epoch = |epoch: u32| begun.range(..=epoch).next_back().map(|(_, run)| *run);
+    let pairs: Vec<_> = joined.iter().map(|pair| pair.map(of_epoch)).collect();
+    let mut runs = BTreeSet::from([run]);
+    // Each pass may find one that the next begins from.
+    for _ in 0..pairs.len() {
+        for [a, b] in &pairs {
+            if let (Some(a), Some(b)) = (a, b) {
+                if runs.contains(a) || runs.contains(b) {
+                    runs.extend([a, b]);
+                }
+            }
+        }
+    }
+    runs
+}
+
+/// What a store has of one run, and of those that are one map with it.
 struct Contents {
     run: u32,
     runs: usize,
@@ -174,17 +201,17 @@ impl Contents {
             };
             return Err(Fault::new(FaultKind::Data, folder.display().to_string(), what, fix));
         };
-        let (mut blocks, mut exposures) = (vec![], vec![]);
+        let (mut blocks, mut exposures, one_map) = (vec![], vec![], one_map(reader, run));
         reader.entries(|key, about| match key.kind {
-            KIND_BLOCK if key.run == run => blocks.push(*key),
-            KIND_KEYFRAME if key.run == run => {
+            KIND_BLOCK if one_map.contains(&key.run) => blocks.push(*key),
+            KIND_KEYFRAME if one_map.contains(&key.run) => {
                 let keyframe = KeyframeAbout::decode(about).filter(|k| !k.held_out);
-                exposures.extend(keyframe.map(|k| (key.id, k.exposure)));
+                exposures.extend(keyframe.map(|k| ((key.run, key.id), k.exposure)));
             }
             _ => {}
         });
         blocks.sort_unstable();
-        exposures.sort_unstable_by_key(|(id, _)| *id);
+        exposures.sort_unstable_by_key(|(key, _)| *key);
         let stride = exposures.len().div_ceil(EXPOSURES_MAX).max(1);
         let spread: Vec<Exposure> = exposures.iter().step_by(stride).map(|(_, exposure)| *exposure).collect();
         Ok(Contents { run, runs: runs.len(), blocks, exposure: median_exposure(&spread).unwrap_or_default() })

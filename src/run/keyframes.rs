@@ -5,7 +5,7 @@
 //! filled anew, so that a mapper that starts again is offered the newest keyframes once more. While there is no mapper
 //! the oldest keyframe makes room for the newest.
 
-use super::loop_closing::LoopClosing;
+use super::loop_closing::{Answer, Join, LoopClosing};
 use super::tracking::{FramePacket, Tracked};
 use crate::config::Board;
 use crate::counters::Counters;
@@ -46,6 +46,8 @@ pub enum Word {
     /// Corrections written, and read, so far.
     Written,
     Read,
+    /// Epochs joined so far.
+    Joins,
     /// Share of its time that the mapper may work, 1/1000; 0: the whole.
     Share,
 }
@@ -56,6 +58,11 @@ const POSE: usize = 7;
 const POSES: usize = POSE + 1 + CAMERAS_MAX * POSE;
 /// A correction: number of the keyframe, and poses.
 const CORRECTION: usize = 1 + POSES;
+/// Joined epochs that a flight may have, and the words of one.
+const JOINS: usize = 16;
+const JOIN: usize = 3;
+/// Words before the corrections.
+const FIXED: usize = WORDS + JOINS * JOIN;
 /// Head of a slot: state, number, stamp, whether it is held out, epoch, poses.
 const HEAD: usize = POSES_AT + POSES;
 const POSES_AT: usize = 5;
@@ -130,12 +137,12 @@ impl KeyframeRing {
     }
 
     fn slot(&self, slot: usize) -> &[AtomicU64] {
-        let start = WORDS + CORRECTIONS * CORRECTION + slot * self.slot_words;
+        let start = FIXED + CORRECTIONS * CORRECTION + slot * self.slot_words;
         &self.words[start..start + self.slot_words]
     }
 
     fn correction(&self, number: u64) -> &[AtomicU64] {
-        let start = WORDS + number as usize % CORRECTIONS * CORRECTION;
+        let start = FIXED + number as usize % CORRECTIONS * CORRECTION;
         &self.words[start..start + CORRECTION]
     }
 
@@ -219,6 +226,29 @@ impl KeyframeRing {
         true
     }
 
+    /// Tells that two epochs are one map; false when as many were told as may be.
+    fn push_join(&self, join: &Join) -> bool {
+        let joins = self.word(Word::Joins).load(Relaxed);
+        if joins >= JOINS as u64 {
+            return false;
+        }
+        let start = WORDS + joins as usize * JOIN;
+        // A flight after 1970 has no number 0.
+        let words = [join.flight.unwrap_or(0) as u64, u64::from(join.epoch), u64::from(join.into)];
+        self.words[start..start + JOIN].iter().zip(words).for_each(|(to, word)| to.store(word, Relaxed));
+        self.word(Word::Joins).store(joins + 1, Release);
+        true
+    }
+
+    /// The joined epochs from one number on: a mapper that starts again is told all of them.
+    pub fn joins(&self, from: usize) -> impl Iterator<Item = Join> + '_ {
+        let upto = (self.word(Word::Joins).load(Acquire) as usize).min(JOINS);
+        (from..upto).map(|n| {
+            let [flight, epoch, into] = std::array::from_fn(|i| self.words[WORDS + n * JOIN + i].load(Relaxed));
+            Join { flight: (flight != 0).then_some(flight as i64), epoch: epoch as u32, into: into as u32 }
+        })
+    }
+
     /// Calls `correct` with the corrections that came, which reach keyframes that wait, too.
     pub fn corrections(&self, mut correct: impl FnMut(&PoseCorrection)) {
         let written = self.word(Word::Written).load(Acquire);
@@ -247,7 +277,7 @@ impl KeyframeRing {
 }
 
 fn words(shape: &Keyframe) -> usize {
-    WORDS + CORRECTIONS * CORRECTION + SLOTS * (HEAD + image_words(shape))
+    FIXED + CORRECTIONS * CORRECTION + SLOTS * (HEAD + image_words(shape))
 }
 
 fn image_words(shape: &Keyframe) -> usize {
@@ -325,7 +355,11 @@ impl Keyframes {
     /// Hands a tracked frame on: a keyframe to the mapper and to what closes loops, and the newer poses of others with it. The
     /// mapper is told poses in the map.
     pub fn pass_on(&mut self, packet: &FramePacket, ring: Option<&KeyframeRing>, counters: &Counters) {
-        let Some(tracked) = packet.tracked.as_ref().filter(|t| t.keyframe) else { return };
+        let Some(tracked) = &packet.tracked else { return };
+        if !tracked.keyframe {
+            self.loops.iter_mut().filter(|_| !packet.blank).for_each(|loops| loops.ask(packet, tracked, counters));
+            return;
+        }
         if packet.blank {
             counters.keyframes_blank.add(u64::from(ring.is_some()));
             self.count += u64::from(ring.is_none());
@@ -344,7 +378,15 @@ impl Keyframes {
         }
         if let Some(loops) = &mut self.loops {
             loops.offer(packet, tracked, id, counters);
-            loops.answers(|id, map_from_body| push(id, map_from_body, None));
+            loops.answers(|answer| match answer {
+                Answer::Keyframe { id, map_from_body } => push(*id, *map_from_body, None),
+                Answer::Joined(join) => {
+                    let told = ring.is_none_or(|ring| ring.push_join(join));
+                    counters.corrections_full.add(u64::from(!told));
+                    true
+                }
+                Answer::MapFromOdom(_) => true,
+            });
         }
     }
 

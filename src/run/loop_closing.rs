@@ -1,5 +1,6 @@
 //! Loop closure beside a flight. In lockstep a keyframe is worked in at once; in real time it goes by copy to a thread of its
-//! own, `loops`, which nobody waits for: while that is busy, keyframes go by it and are counted.
+//! own, `loops`, which nobody waits for: while that is busy, keyframes go by it and are counted. A vehicle that does not know
+//! where it is in the map of an earlier epoch asks each second, keyframe or not.
 //!
 //! ```text
 //! tracking -> keyframe (copy) -> loops -> map_from_odom, poses of keyframes in the map -> tracking -> mapper
@@ -10,10 +11,14 @@ use super::waker::Waker;
 use crate::config::Board;
 use crate::counters::Counters;
 use crate::limits::CAMERAS_MAX;
-use crate::loops::{Closure, LoopKeyframe, Loops};
+use crate::loops::kept::{self, Epoch, Keeper};
+use crate::loops::{Closure, LoopKeyframe, Loops, MapFromOdom};
+use crate::mem::Footprint;
 use crate::publish::event::{EventId, Notice};
+use crate::store;
 use crossbeam_queue::ArrayQueue;
-use std::sync::atomic::AtomicBool;
+use std::path::Path;
+use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::sync::Arc;
 use stipple_drivers::{host, Calibration, Fault, Frames, Nanos, Pose};
 
@@ -27,6 +32,16 @@ pub enum Answer {
     MapFromOdom(Pose),
     /// The pose in the map of a keyframe that the mapper has.
     Keyframe { id: u64, map_from_body: Pose },
+    /// Two epochs are one map from now on.
+    Joined(Join),
+}
+
+/// An epoch that is one map with another of this flight; `flight` is that of an earlier one, ms since 1970.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Join {
+    pub flight: Option<i64>,
+    pub epoch: u32,
+    pub into: u32,
 }
 
 /// A keyframe on its way.
@@ -65,19 +80,30 @@ pub struct LoopQueue {
     free: ArrayQueue<Box<Work>>,
     waiting: ArrayQueue<Box<Work>>,
     answers: ArrayQueue<Answer>,
-    closed: ArrayQueue<Closure>,
+    closed: ArrayQueue<(Closure, MapFromOdom)>,
+    /// There is a map that the vehicle does not know its place in.
+    lost: AtomicBool,
     waker: Waker,
 }
 
 /// Keyframes that loop closure knows: at least, and as many as two bytes number.
 const KEYFRAMES_MIN: usize = 64;
 const KEYFRAMES_MAX: usize = 16_384;
+
+fn keyframes(board: &Board) -> usize {
+    (board.store.keyframes as usize).clamp(KEYFRAMES_MIN, KEYFRAMES_MAX)
+}
+
 /// Closures that move poses by less are in the report alone: m, rad.
 const TOLD: [f64; 2] = [0.05, 0.01];
 /// Niceness of the thread: below tracking, above mapping.
 const NICE: i32 = 5;
-/// Lines of closures that wait to be told.
+/// Closures that wait to be told.
 const CLOSED: usize = 16;
+/// Period at which a lost vehicle asks, s.
+const ASKS_S: f64 = 1.0;
+/// Folder of places in a run's folder.
+const PLACES: &str = "places";
 
 impl LoopQueue {
     fn new(calibration: &Calibration, keyframes: usize) -> LoopQueue {
@@ -90,35 +116,45 @@ impl LoopQueue {
             let _ = free.push(Box::new(work));
         }
         // All keyframes of the graph, twice, so that a second closure need not wait for the first to be read.
-        let answers = ArrayQueue::new(2 * keyframes + 2);
-        let closed = ArrayQueue::new(CLOSED);
-        LoopQueue { free, waiting: ArrayQueue::new(KEYFRAMES), answers, closed, waker: Waker::default() }
+        let answers = ArrayQueue::new(2 * keyframes + 4);
+        let (closed, lost) = (ArrayQueue::new(CLOSED), AtomicBool::new(false));
+        LoopQueue { free, waiting: ArrayQueue::new(KEYFRAMES), answers, closed, lost, waker: Waker::default() }
     }
 
     /// Works a keyframe in, and answers what it moved.
     fn work(&self, loops: &mut Loops, keyframe: &LoopKeyframe) {
-        let Some(closure) = loops.add(keyframe) else { return };
-        let _ = self.closed.push(closure);
-        let _ = self.answers.push(Answer::MapFromOdom(loops.map_from_odom()));
+        let closure = loops.add(keyframe);
+        self.lost.store(loops.is_lost(), Relaxed);
+        let Some(closure) = closure else { return };
+        let _ = self.closed.push((closure, loops.map_from_odom()));
+        let _ = self.answers.push(Answer::MapFromOdom(loops.map_from_odom().pose.pose()));
         for (id, map_from_body) in loops.keyframes_in_map() {
             // A full queue has older answers for the same keyframes; they come again with the next closure.
             let _ = self.answers.push(Answer::Keyframe { id, map_from_body });
         }
+        if let Some(Epoch { flight, number: epoch }) = closure.joins {
+            let flight = (flight != loops.flight()).then_some(flight);
+            let _ = self.answers.push(Answer::Joined(Join { flight, epoch, into: keyframe.epoch }));
+        }
     }
 
-    /// Lines about the loops that were closed and moved something.
-    pub fn closed(&self) -> impl Iterator<Item = Notice> + '_ {
-        let told = |c: &Closure| c.moved[0] >= TOLD[0] || c.moved[1] >= TOLD[1];
-        std::iter::from_fn(|| self.closed.pop()).filter(told).map(|c| {
-            let [far, angle] = c.moved;
-            let ago = (c.t - c.with).secs();
-            let text = format!(
-                "place of {ago:.0} s ago recognised by {} corners: poses in the map move by {far:.3} m and {:.2} degrees",
-                c.inliers,
-                angle.to_degrees()
-            );
-            (EventId::Loop, text)
-        })
+    /// Where `odom` is in the map after each loop that was closed, and a line about those that moved something.
+    pub fn closed(&self) -> impl Iterator<Item = (MapFromOdom, Option<Notice>)> + '_ {
+        std::iter::from_fn(|| self.closed.pop())
+            .map(|(closure, placed)| (placed, line(&closure).map(|line| (EventId::Loop, line))))
+    }
+}
+
+/// A line about a loop, where it moved something.
+fn line(c: &Closure) -> Option<String> {
+    let ([far, angle], inliers) = (c.moved, c.inliers);
+    let moves = format!("poses in the map move by {far:.3} m and {:.2} degrees", angle.to_degrees());
+    match c.joins {
+        Some(_) => Some(format!("place of another epoch recognised by {inliers} corners, both are one map now: {moves}")),
+        None if far >= TOLD[0] || angle >= TOLD[1] => {
+            Some(format!("place of {:.0} s ago recognised by {inliers} corners: {moves}", (c.t - c.with).secs()))
+        }
+        None => None,
     }
 }
 
@@ -130,7 +166,7 @@ pub struct LoopThread {
 
 impl LoopThread {
     /// Works keyframes in until `over`, and says what was closed; answers the loops.
-    pub fn run(mut self, over: &AtomicBool, say: impl Fn(Notice)) -> Box<Loops> {
+    pub fn run(mut self, over: &AtomicBool, say: impl Fn((MapFromOdom, Option<Notice>))) -> Box<Loops> {
         host::lower_priority(NICE);
         while let Some(work) = self.queue.waker.wait(over, || self.queue.waiting.pop()) {
             let Work { t, frames, id, epoch, odom_from_body, before, body_from_cam } = &*work;
@@ -153,6 +189,8 @@ pub struct LoopClosing {
     map_from_odom: Pose,
     /// An answer that the mapper had no room for.
     held: Option<Answer>,
+    /// When the vehicle last asked.
+    asked: Option<Nanos>,
 }
 
 impl LoopClosing {
@@ -161,10 +199,43 @@ impl LoopClosing {
         if !board.loops.enabled || calibration.cameras.len() < 2 {
             return Ok(None);
         }
-        let keyframes = (board.store.keyframes as usize).clamp(KEYFRAMES_MIN, KEYFRAMES_MAX);
-        let loops = Loops::new(calibration, &board.frontend, keyframes)?;
+        let keyframes = keyframes(board);
+        let loops = Some(Box::new(Loops::new(calibration, &board.frontend, keyframes)?));
         let queue = Arc::new(LoopQueue::new(calibration, keyframes));
-        Ok(Some(LoopClosing { queue, here: Some(Box::new(loops)), map_from_odom: Pose::IDENTITY, held: None }))
+        Ok(Some(LoopClosing { queue, here: loops, map_from_odom: Pose::IDENTITY, held: None, asked: None }))
+    }
+
+    /// Host memory that it takes.
+    pub fn measured(calibration: &Calibration, board: &Board, f: &mut Footprint) -> Result<(), Fault> {
+        let made = f.build("loops: keyframes, index and graph", || LoopClosing::new(calibration, board))?;
+        if made.is_some() && board.store.enabled {
+            f.extend(Keeper::footprint(keyframes(board)));
+        }
+        Ok(())
+    }
+
+    /// Reads the places of earlier flights in a run's folder, and keeps those of this one there where the board has a store and
+    /// this flight may write; answers how many were read. Loops are closed all the same where it fails.
+    pub fn remember(
+        &mut self,
+        (calibration, board): (&Calibration, &Board),
+        run_folder: &Path,
+        (flight, fresh, read_only): (i64, bool, bool),
+    ) -> Result<usize, Fault> {
+        let Some(loops) = &mut self.here else { return Ok(0) };
+        loops.remember(flight, &[], None);
+        if !board.store.enabled && !read_only {
+            return Ok(0);
+        }
+        let folder = run_folder.join(PLACES);
+        if fresh {
+            store::set_aside(&folder)?;
+        }
+        let places = kept::read(&folder, calibration)?;
+        let keeper = if read_only { None } else { Some(Keeper::open(&folder, calibration, keyframes(board))?) };
+        loops.remember(flight, &places, keeper);
+        self.queue.lost.store(!places.is_empty(), Relaxed);
+        Ok(places.len())
     }
 
     /// A pose of the estimator, in the map.
@@ -180,28 +251,36 @@ impl LoopClosing {
                 (packet.frames.t, &packet.frames, packet.epoch, newest_before(packet, tracked));
             let (odom_from_body, body_from_cam) = (*odom_from_body, *body_from_cam);
             self.queue.work(loops, &LoopKeyframe { t, frames, id, epoch, odom_from_body, before, body_from_cam });
+            self.asked = Some(t);
             return;
         }
         let Some(mut work) = self.queue.free.pop() else {
             counters.loops_busy.add(1);
             return;
         };
+        self.asked = Some(packet.frames.t);
         let filled = work.fill(packet, tracked, id);
         let to = if filled { &self.queue.waiting } else { &self.queue.free };
         let _ = to.push(work);
         self.queue.waker.wake();
     }
 
+    /// Takes a frame that is no keyframe where the vehicle is lost and has not asked for a while.
+    pub fn ask(&mut self, packet: &FramePacket, tracked: &Tracked, counters: &Counters) {
+        let due = self.asked.is_none_or(|asked| (packet.frames.t - asked).secs() >= ASKS_S);
+        if due && self.queue.lost.load(Relaxed) {
+            self.offer(packet, tracked, None, counters);
+        }
+    }
+
     /// Takes the answers that came, as long as `push` has room for what the mapper is to know.
-    pub fn answers(&mut self, mut push: impl FnMut(u64, Pose) -> bool) {
+    pub fn answers(&mut self, mut push: impl FnMut(&Answer) -> bool) {
         while let Some(answer) = self.held.take().or_else(|| self.queue.answers.pop()) {
-            match answer {
-                Answer::MapFromOdom(pose) => self.map_from_odom = pose,
-                Answer::Keyframe { id, map_from_body } if !push(id, map_from_body) => {
-                    self.held = Some(answer);
-                    return;
-                }
-                Answer::Keyframe { .. } => {}
+            if let Answer::MapFromOdom(pose) = answer {
+                self.map_from_odom = pose;
+            } else if !push(&answer) {
+                self.held = Some(answer);
+                return;
             }
         }
     }

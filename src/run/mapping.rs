@@ -2,12 +2,13 @@
 //! run time out.
 
 use super::keyframes::{KeyframeRing, Word};
+use super::loop_closing::Join;
 use super::status::{print_err, Gauges};
 use super::threads;
 use super::MAP_STORE;
 use crate::config::Board;
 use crate::gpu::GpuError;
-use crate::map::{CurvePoint, Evaluation, Gaussian, Keyframe, Mapper, Place, StepKind};
+use crate::map::{CurvePoint, Evaluation, Gaussian, Keyframe, Mapper, Place, PoseCorrection, StepKind};
 use crate::mem::{self, seal_thread, unsealed};
 use crate::output::export::{export, Form, Request};
 use crate::output::metrics::percentile;
@@ -49,6 +50,8 @@ pub struct Mapping {
     keyframe: Keyframe,
     /// Keyframes with lower numbers may be taken.
     collected: u64,
+    /// Joined epochs that were taken over.
+    joined: usize,
     pub curve: Vec<CurvePoint>,
     pub iteration_ms: Vec<f32>,
     pub iterations: u64,
@@ -90,6 +93,7 @@ impl Mapping {
             keyframe: ring.shape().clone(),
             ring,
             collected: 0,
+            joined: 0,
             curve: Vec::with_capacity(CURVE_POINTS),
             iteration_ms: Vec::with_capacity(ITERATION_TIMES),
             iterations: 0,
@@ -105,7 +109,12 @@ impl Mapping {
 
     /// Takes over the keyframes and corrections that came.
     pub fn collect(&mut self) {
-        self.ring.corrections(|correction| self.mapper.correct(correction));
+        let (first, _) = self.mapper.first_numbers();
+        self.ring.corrections(|c| self.mapper.correct(&PoseCorrection { id: first + c.id, ..*c }));
+        for Join { flight, epoch, into } in self.ring.joins(self.joined) {
+            self.mapper.join(flight, epoch, into);
+            self.joined += 1;
+        }
         self.collected = self.ring.offered();
     }
 
@@ -137,6 +146,8 @@ impl Mapping {
 
     fn work(&mut self, deadline: Instant) -> Result<bool, GpuError> {
         while let Some(slot) = self.ring.take(self.collected, &mut self.keyframe) {
+            let (first, epoch) = self.mapper.first_numbers();
+            (self.keyframe.id, self.keyframe.epoch) = (self.keyframe.id + first, self.keyframe.epoch + epoch);
             // A slot at which the device failed stays taken: the next mapper is not offered its keyframe.
             let anchor = matches!(self.mapper.ingest(&self.keyframe)?, StepKind::Anchor { .. });
             self.ring.done(slot);

@@ -28,7 +28,7 @@ pub fn footprint(calibration: &Calibration, board: &Board, records: bool) -> Res
     let mut f = Footprint::default();
     f.build("queues: frames and samples", || Mailbox::new(packets(board.frontend.threads), calibration, colours));
     OdometryRun::measured(calibration, board, FRAMES_KEPT, &mut f)?;
-    f.build("loops: keyframes, index and graph", || LoopClosing::new(calibration, board))?;
+    LoopClosing::measured(calibration, board, &mut f)?;
     log::Queue::measured(&mut f);
     if board.mavlink.address().is_some() {
         f.build("queues: autopilot", || Autopilot::new(&board.mavlink, Stamps::default(), 0))?;

@@ -127,6 +127,8 @@ pub struct Options {
     pub record: Option<PathBuf>,
     /// The map begins with nothing: what an earlier run left in its store is set aside.
     pub fresh: bool,
+    /// The vehicle finds itself in the map of earlier runs, and changes nothing of it: there is no mapper.
+    pub localise_only: bool,
     /// Mapping is done by a process of its own, and threads ask for real-time priority.
     pub service: bool,
     /// Faults added to the sensors of a recording.
@@ -241,6 +243,7 @@ pub fn fly(
             play(source, calibration, (tracker, sinks), (board, options), told, (colours, live, before), &mut status)?
         }
     };
+    flown.loops.iter_mut().for_each(|loops| loops.keep_poses());
     judge_rig(&mut flown, &mut status);
     status.finish();
     flown.warnings.iter().for_each(|warning| print_err(format_args!("stipple: warning: {warning}")));
@@ -412,7 +415,10 @@ pub fn fly_in_real_time(
             }
             let _ = s.mailbox.spare.push(packet);
         };
-        let say = |closed| status::count_lost(s.mailbox.notices.push(closed));
+        let say = |(placed, notice): (_, Option<Notice>)| {
+            s.gauges.set_map_from_odom(placed);
+            status::count_lost(notice.map_or(Ok(()), |notice| s.mailbox.notices.push(notice)));
+        };
         let closing = closing.map(|closing| spawn(scope, "loops", move || closing.run(&s.tracking_done, say)));
         let mut held = None;
         let take = move || s.mailbox.take(&mut held, &s.source_done, &s.counters);

@@ -13,7 +13,7 @@ use crate::map::Place;
 use crate::output::OutputDir;
 use std::sync::Arc;
 use std::time::{SystemTime, UNIX_EPOCH};
-use stipple_drivers::Fault;
+use stipple_drivers::{Fault, FaultKind};
 
 /// Cuts a recording to the time it is played for; answers how many frames the run keeps to be judged by.
 pub fn frames_kept(input: &mut Input, options: &Options) -> usize {
@@ -37,6 +37,7 @@ pub fn frames_kept(input: &mut Input, options: &Options) -> usize {
 
 /// Puts what this machine has in the place of what it lacks, and refuses a board that does not fit.
 pub fn prepare(input: &mut Input, board: &mut Board, options: &Options, apart: bool) -> Result<(), Fault> {
+    board.map.enabled &= !options.localise_only;
     if !apart {
         input.warnings.extend(memory::replace_missing(board).map(|missing| missing.to_string()));
     }
@@ -54,10 +55,10 @@ fn open_map(
     board: &Board,
     out: &OutputDir,
     options: &Options,
-    apart: bool,
+    (apart, flight): (bool, i64),
 ) -> Result<MapSide, Fault> {
     if apart {
-        let kept = board.store.enabled.then_some(Kept { fresh: options.fresh, flight: flight() });
+        let kept = board.store.enabled.then_some(Kept { fresh: options.fresh, flight });
         let worker = Worker::start(&input.place, &input.calibration, board, out, options.record.is_some(), kept)?;
         input.warnings.extend(worker.warning.clone());
         return Ok(MapSide::Apart(Box::new(worker)));
@@ -65,7 +66,7 @@ fn open_map(
     let ring = Arc::new(KeyframeRing::new(&input.calibration, board)?);
     let folder = out.file(MAP_STORE);
     let at_once = matches!(options.pace, Pace::Lockstep(_));
-    let place = Place { folder: &folder, fresh: options.fresh, flight: Some(flight()), at_once };
+    let place = Place { folder: &folder, fresh: options.fresh, flight: Some(flight), at_once };
     let mapping = Mapping::open(&input.calibration, board, ring, board.store.enabled.then_some(place))?;
     input.warnings.extend(mapping.mapper.unkept.as_ref().map(|fault| unkept(fault).to_string()));
     Ok(MapSide::Here(Box::new(mapping)))
@@ -84,7 +85,24 @@ pub fn sinks(
     options: &Options,
     (apart, odometry): (bool, bool),
 ) -> Result<Sinks, Fault> {
-    let loops = if odometry { LoopClosing::new(&input.calibration, board)? } else { None };
-    let map = if board.map.enabled { Some(open_map(input, board, out, options, apart)?) } else { None };
+    let flight = flight();
+    let mut loops = if odometry { LoopClosing::new(&input.calibration, board)? } else { None };
+    let (fresh, read_only) = (options.fresh, options.localise_only);
+    let rig = (&input.calibration, board);
+    let read = loops.as_mut().map_or(Ok(0), |loops| loops.remember(rig, out.path(), (flight, fresh, read_only)));
+    match read {
+        Ok(0) if read_only => {
+            let what = "there is no place of an earlier run to be found in, or loops.enabled is false";
+            let fix = "name the --out folder of a run whose board has store.enabled and loops.enabled";
+            return Err(Fault::new(FaultKind::NoInput, out.path().display().to_string(), what, fix));
+        }
+        Ok(_) => {}
+        Err(fault) if read_only => return Err(fault),
+        Err(fault) => {
+            let what = format!("{}; places of this run are not kept, and those of earlier runs not used", fault.what);
+            input.warnings.push(Fault { what, ..fault }.to_string());
+        }
+    }
+    let map = if board.map.enabled { Some(open_map(input, board, out, options, (apart, flight))?) } else { None };
     Ok((map, loops))
 }

@@ -8,9 +8,10 @@ use super::tracking::FramePacket;
 use crate::config::MavlinkConfig;
 use crate::counters::Counters;
 use crate::frontend::{Verdict, Verdicts};
+use crate::loops::MapFromOdom;
 use crate::publish::event::{EventId, Notice};
 use crate::publish::mavlink::Settings;
-use crate::publish::status::message::{GovernorStatus, MapStatus, Summary};
+use crate::publish::status::message::{GovernorStatus, MapFromOdomMessage, MapStatus, Summary};
 use crate::publish::status::Shared;
 use crate::publish::{Feed, Feeds};
 use crate::vio::{Finding, Findings, Health, Part};
@@ -48,6 +49,8 @@ pub struct Gauges {
     /// `Verdicts` on the cameras, and `Findings` on what is estimated of the rig.
     pub verdicts: AtomicU64,
     pub findings: AtomicU64,
+    /// Where `odom` is in the map; of no count before a place was recognised.
+    pub map_from_odom: Mutex<MapFromOdom>,
 }
 
 impl Gauges {
@@ -64,6 +67,17 @@ impl Gauges {
         self.set_epoch(packet.epoch, packet.health);
         self.set_found(packet);
         self.latency_us_most.fetch_max(packet.begun.elapsed().as_micros() as u64, Relaxed);
+    }
+
+    /// Takes note of where `odom` is in the map.
+    pub fn set_map_from_odom(&self, placed: MapFromOdom) {
+        *self.map_from_odom.lock().unwrap_or_else(PoisonError::into_inner) = placed;
+    }
+
+    /// Where `odom` is in the map, once a place was recognised.
+    fn map_from_odom(&self) -> Option<MapFromOdom> {
+        let placed = *self.map_from_odom.lock().unwrap_or_else(PoisonError::into_inner);
+        (placed.count > 0).then_some(placed)
     }
 
     /// Takes note of what was found of the rig by a frame.
@@ -97,6 +111,8 @@ pub struct Status {
     epoch: u32,
     verdicts: u64,
     findings: u64,
+    /// The count of `map_from_odom` that was logged last.
+    placed: u32,
 }
 
 const LINE_PERIOD: Duration = Duration::from_secs(1);
@@ -135,6 +151,7 @@ impl Status {
             epoch: 0,
             verdicts: 0,
             findings: 0,
+            placed: 0,
         }
     }
 
@@ -227,8 +244,14 @@ impl Status {
         }
     }
 
-    /// Logs counters and gauges once a second, and says it when logging has ended. Cheap to call often.
+    /// Logs where `odom` is in the map when that has changed, counters and gauges once a second, and says it when logging has
+    /// ended. Cheap to call often.
     pub fn log_counters(&mut self, counters: &Counters, g: &Gauges) {
+        let placed = g.map_from_odom().filter(|placed| placed.count != self.placed);
+        if let (Some(placed), Some(log)) = (placed, &self.log) {
+            log.map_from_odom(&placed);
+            self.placed = placed.count;
+        }
         if Instant::now() < self.next_count {
             return;
         }
@@ -267,6 +290,7 @@ impl Status {
                 psnr_db: (psnr > 0).then_some(psnr as f64 * 0.01),
             },
             governor: self.governor.clone(),
+            map_from_odom: g.map_from_odom().map(|placed| MapFromOdomMessage::from(&placed)),
             counters: counters.list().into_iter().map(|(name, n)| (name.into(), n)).collect(),
         });
     }

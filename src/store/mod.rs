@@ -27,7 +27,7 @@ mod writer;
 pub use aside::set_aside;
 pub use disk::Disk;
 pub use reader::Reader;
-pub use record::{About, Key, ABOUT};
+pub use record::{size as record_bytes, About, Key, ABOUT};
 
 use crate::mem::{Footprint, List};
 use shared::{Shared, Writer};
@@ -102,6 +102,12 @@ pub struct Figures {
     pub read_errors: u64,
     /// Text of the first write error.
     pub first_error: List<u8, 200>,
+}
+
+/// A number for what a store is of, by its description: a store of another is not read.
+pub fn identity(text: &str) -> u64 {
+    // FNV-1a.
+    text.bytes().fold(0xcbf2_9ce4_8422_2325, |h, b| (h ^ u64::from(b)).wrapping_mul(0x0100_0000_01b3))
 }
 
 /// The owner's side.

@@ -3,7 +3,8 @@
 //!
 //! Least squares by Gauss-Newton, with a Cholesky factorisation of 4x4 blocks in the order of minimum degree. A loop edge
 //! may be false: loop edges have the Geman-McClure cost, brought in by graduated non-convexity (Yang et al. 2020), so that
-//! those which the others contradict end without weight. A node that is dropped leaves its two odometry edges as one.
+//! those which the others contradict end without weight. A node that is dropped leaves its two odometry edges as one. Nodes of
+//! earlier flights are fixed: what was found in their map stays where it is.
 //!
 //! Errors of a node: position in the world, m, and yaw, rad.
 
@@ -45,6 +46,8 @@ pub struct Outcome {
 pub struct PoseGraph {
     poses: Vec<Pose4>,
     used: Vec<bool>,
+    /// Nodes that never move: those of earlier flights.
+    fixed: Vec<bool>,
     edges: Vec<Edge>,
     /// Weight of each edge: 1 for odometry.
     weights: Vec<f64>,
@@ -61,6 +64,7 @@ impl PoseGraph {
         PoseGraph {
             poses: vec![Pose4::default(); nodes],
             used: vec![false; nodes],
+            fixed: vec![false; nodes],
             edges: Vec::with_capacity(edges),
             weights: Vec::with_capacity(edges),
             chain: vec![[NONE; 2]; nodes],
@@ -71,7 +75,7 @@ impl PoseGraph {
 
     /// Bytes that it takes.
     pub fn bytes(&self) -> usize {
-        let node = 2 * size_of::<Pose4>() + size_of::<bool>() + size_of::<[u32; 2]>();
+        let node = 2 * size_of::<Pose4>() + 2 * size_of::<bool>() + size_of::<[u32; 2]>();
         let edge = size_of::<Edge>() + size_of::<f64>();
         size_of::<Self>() + self.poses.len() * node + self.edges.capacity() * edge + self.solver.bytes()
     }
@@ -80,7 +84,34 @@ impl PoseGraph {
     pub fn add(&mut self, pose: Pose4) -> Option<u16> {
         let free = self.used.iter().position(|used| !used).filter(|_| pose.is_finite())?;
         (self.used[free], self.poses[free], self.chain[free]) = (true, pose, [NONE; 2]);
+        self.fixed[free] = false;
         Some(free as u16)
+    }
+
+    /// Adds a node that never moves.
+    pub fn add_fixed(&mut self, pose: Pose4) -> Option<u16> {
+        let node = self.add(pose)?;
+        self.fixed[node as usize] = true;
+        Some(node)
+    }
+
+    pub fn is_fixed(&self, node: u16) -> bool {
+        self.fixed[node as usize]
+    }
+
+    /// Moves some nodes as one: what lies between them stays.
+    pub fn carry(&mut self, by: &Pose4, which: impl Fn(u16) -> bool) {
+        for n in (0..self.poses.len()).filter(|n| self.used[*n] && which(*n as u16)) {
+            self.poses[n] = by.compose(&self.poses[n]);
+        }
+    }
+
+    /// Takes back the newest loop edge.
+    pub fn drop_newest_loop(&mut self) {
+        if self.edges.last().is_some_and(|edge| edge.is_loop) {
+            self.remove_edge(self.edges.len() - 1);
+            self.solver.forget();
+        }
     }
 
     /// Adds an edge; `None` where all are used, a node is not there, it has its odometry already, or the edge is no
@@ -178,7 +209,7 @@ impl PoseGraph {
         let mut outcome = Outcome::default();
         self.before.copy_from_slice(&self.poses);
         self.weights.iter_mut().for_each(|w| *w = 1.0);
-        match self.solver.order(&self.used, &self.edges) {
+        match self.solver.order(&self.used, &self.fixed, &self.edges) {
             Some(blocks) => outcome.blocks = blocks,
             None => return outcome,
         }
@@ -186,7 +217,7 @@ impl PoseGraph {
         let mut scale = f64::INFINITY;
         for _ in 0..ITERATIONS {
             outcome.iterations += 1;
-            self.solver.clear(&self.used);
+            self.solver.clear(&self.used, &self.fixed);
             for (edge, weight) in self.edges.iter().zip(&self.weights) {
                 let [a, b] = [edge.from, edge.to].map(|n| &self.poses[n as usize]);
                 self.solver.add(edge, *weight, a, b);
@@ -196,7 +227,7 @@ impl PoseGraph {
                 return outcome;
             };
             let mut moved = 0.0f64;
-            for (n, d) in step {
+            for (n, d) in step.filter(|(n, _)| !self.fixed[*n]) {
                 let pose = &mut self.poses[n];
                 pose.p += glam::DVec3::new(d[0], d[1], d[2]);
                 pose.yaw = wrapped(pose.yaw + d[3]);
@@ -251,6 +282,10 @@ impl PoseGraph {
         if !self.solver.is_ordered() {
             self.factor()?;
         }
+        // A chain that began since then leads to nothing that the factor has.
+        if self.known(a).is_none() || self.known(b).is_none() {
+            self.factor()?;
+        }
         let (known_a, tail_a) = self.known(a)?;
         let (known_b, tail_b) = self.known(b)?;
         let mut edge = match known_a == known_b {
@@ -268,8 +303,8 @@ impl PoseGraph {
 
     /// Factors the normal matrix at the poses as they are.
     fn factor(&mut self) -> Option<()> {
-        self.solver.order(&self.used, &self.edges)?;
-        self.solver.clear(&self.used);
+        self.solver.order(&self.used, &self.fixed, &self.edges)?;
+        self.solver.clear(&self.used, &self.fixed);
         for (edge, weight) in self.edges.iter().zip(&self.weights) {
             let [a, b] = [edge.from, edge.to].map(|n| &self.poses[n as usize]);
             self.solver.add(edge, *weight, a, b);

@@ -7,7 +7,7 @@ use super::super::pose4::Pose4;
 use super::Edge;
 use nalgebra::{Matrix4, Vector4};
 
-/// Weight that holds the first node of each component in its place: that of a deviation of 0.1 mm, and rad/10^4.
+/// Weight that holds a node in its place: that of a deviation of 0.1 mm, and rad/10^4.
 const HELD: f64 = 1e8;
 const NOWHERE: u16 = u16::MAX;
 
@@ -28,7 +28,7 @@ pub struct Solver {
     columns: Vec<Column>,
     /// Where in the order each node is.
     rank: Vec<u16>,
-    /// The lowest node of each node's component, which is held in its place.
+    /// A node of each node's component that is held in its place: a fixed one where there is one.
     component: Vec<u16>,
     /// Ranks of the blocks of all columns, ascending in each.
     rows: Vec<u16>,
@@ -85,7 +85,7 @@ impl Solver {
     }
 
     /// Orders the used nodes; answers the blocks of the factor, `None` where they do not fit.
-    pub fn order(&mut self, used: &[bool], edges: &[Edge]) -> Option<usize> {
+    pub fn order(&mut self, used: &[bool], fixed: &[bool], edges: &[Edge]) -> Option<usize> {
         self.forget();
         self.sets.fill(0);
         self.rows.clear();
@@ -98,7 +98,7 @@ impl Solver {
         for n in 0..used.len() {
             self.degrees[n] = if used[n] { count(&self.sets[n * self.words..][..self.words]) } else { NOWHERE };
         }
-        self.find_components(used);
+        self.find_components(used, fixed);
         for rank in 0..used.iter().filter(|u| **u).count() {
             let node = (0..used.len()).min_by_key(|n| self.degrees[*n])?;
             let start = self.rows.len();
@@ -137,10 +137,11 @@ impl Solver {
         Some(self.rows.len())
     }
 
-    /// Finds the components.
-    fn find_components(&mut self, used: &[bool]) {
+    /// Finds the components, those with fixed nodes first.
+    fn find_components(&mut self, used: &[bool], fixed: &[bool]) {
         self.component.fill(NOWHERE);
-        for first in (0..used.len()).filter(|n| used[*n]) {
+        let of_kind = |is_fixed: bool| (0..used.len()).filter(move |n| used[*n] && fixed[*n] == is_fixed);
+        for first in of_kind(true).chain(of_kind(false)) {
             if self.component[first] != NOWHERE {
                 continue;
             }
@@ -167,15 +168,15 @@ impl Solver {
     }
 
     /// Begins anew with the equations of an order.
-    pub fn clear(&mut self, used: &[bool]) {
+    pub fn clear(&mut self, used: &[bool], fixed: &[bool]) {
         self.factored = false;
         self.blocks.clear();
         self.blocks.resize(self.rows.len(), Matrix4::zeros());
         for n in (0..used.len()).filter(|n| used[*n]) {
             let rank = self.rank[n] as usize;
             self.right[rank] = Vector4::zeros();
-            self.diagonals[rank] =
-                if self.component[n] as usize == n { Matrix4::identity() * HELD } else { Matrix4::zeros() };
+            let held = fixed[n] || self.component[n] as usize == n;
+            self.diagonals[rank] = if held { Matrix4::identity() * HELD } else { Matrix4::zeros() };
         }
     }
 

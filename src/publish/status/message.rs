@@ -1,6 +1,7 @@
 //! What the status socket tells, as lines of JSON and as text for Prometheus.
 
 use super::About;
+use crate::loops::MapFromOdom;
 use crate::publish::turned::Turned;
 use crate::publish::{Event, Source, State};
 use glam::DQuat;
@@ -92,6 +93,30 @@ impl Default for GovernorStatus {
     }
 }
 
+/// Where `odom` is in the map, in which loops agree. It changes when a place is recognised, and pose and velocity do not with
+/// it: who wants poses in the map composes the two.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct MapFromOdomMessage {
+    /// Stamp of the picture by which the place was recognised.
+    pub t_ns: i64,
+    /// How often it has changed in this run.
+    pub count: u32,
+    /// Epoch of the `odom` that it is of.
+    pub epoch: u32,
+    pub position: [f64; 3],
+    /// About z, rad.
+    pub yaw: f64,
+    /// Row by row, of the vehicle's position and yaw in the map at that stamp, m and rad.
+    pub covariance: [[f64; 4]; 4],
+}
+
+impl From<&MapFromOdom> for MapFromOdomMessage {
+    fn from(m: &MapFromOdom) -> MapFromOdomMessage {
+        let &MapFromOdom { t, count, epoch, pose, covariance } = m;
+        MapFromOdomMessage { t_ns: t.0, count, epoch, position: pose.p.to_array(), yaw: pose.yaw, covariance }
+    }
+}
+
 /// How a run goes, told by its main thread once a second.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Summary {
@@ -100,6 +125,9 @@ pub struct Summary {
     pub posed: u64,
     pub map: MapStatus,
     pub governor: GovernorStatus,
+    /// `None` before a place was recognised.
+    #[serde(default)]
+    pub map_from_odom: Option<MapFromOdomMessage>,
     pub counters: BTreeMap<Text, u64>,
 }
 

@@ -20,7 +20,8 @@ pub const COUNTERS: &str = "/counters";
 pub const CLOCKS: &str = "/clocks";
 pub const PREDICTED: &str = "/predicted";
 pub const RIG: &str = "/rig";
-const CHANNELS: [(&str, &str, &str); 6] = [
+pub const MAP_FROM_ODOM: &str = "/map_from_odom";
+const CHANNELS: [(&str, &str, &str); 7] = [
     (
         STATE,
         "stipple.State",
@@ -55,6 +56,12 @@ const CHANNELS: [(&str, &str, &str); 6] = [
         "stipple.Rig",
         r#"{"type":"object","properties":{"t_ns":{"type":"integer"},"time_offsets":{"type":"array"},
 "extrinsics":{"type":"array"},"imu_scale":{"type":"array"}}}"#,
+    ),
+    (
+        MAP_FROM_ODOM,
+        "stipple.MapFromOdom",
+        r#"{"type":"object","properties":{"t_ns":{"type":"integer"},"count":{"type":"integer"},"epoch":{"type":"integer"},
+"position":{"type":"array","items":{"type":"number"}},"yaw":{"type":"number"},"covariance":{"type":"array"}}}"#,
     ),
 ];
 /// Name of the file that has the number of epochs begun.
@@ -163,6 +170,7 @@ impl LogFiles {
                 self.message(STATE, at, Some(state.t_ns), state)
             }
             Content::Predicted(state) => self.message(PREDICTED, at, Some(state.t_ns), state),
+            Content::MapFromOdom(placed) => self.message(MAP_FROM_ODOM, at, Some(placed.t_ns), placed),
             Content::Rig(rig) => self.message(RIG, at, Some(rig.t_ns), rig),
             Content::Event(id, text) => {
                 let event = Event { id: *id, epoch: self.epoch, text: String::from_utf8_lossy(text) };

@@ -18,7 +18,9 @@ mod tests;
 use super::threads;
 use crate::limits::CAMERAS_MAX;
 use crate::mem::{cut, Footprint, List};
+use crate::loops::MapFromOdom;
 use crate::publish::event::EventId;
+use crate::publish::status::message::MapFromOdomMessage;
 use crate::publish::TEXT;
 use crate::vio::{Odometry, Predicted, RigEstimate, Update};
 use crossbeam_queue::ArrayQueue;
@@ -235,6 +237,7 @@ enum Content {
     State(State),
     Predicted(PredictedState),
     Rig(Rig),
+    MapFromOdom(MapFromOdomMessage),
     Event(EventId, List<u8, TEXT>),
     /// From a thread that may allocate; none that is zero.
     Counters(Vec<(Cow<'static, str>, u64)>),
@@ -279,6 +282,10 @@ impl LogSender {
 
     pub fn rig(&self, rig: Rig) {
         self.0.push(Content::Rig(rig));
+    }
+
+    pub fn map_from_odom(&self, placed: &MapFromOdom) {
+        self.0.push(Content::MapFromOdom(placed.into()));
     }
 
     /// Half of the queue is left to what comes once a frame, and to events.

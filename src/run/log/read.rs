@@ -1,8 +1,9 @@
 //! Reads logs back, damaged ones and those of a run that was killed or cut off included: every chunk whose checksum holds,
 //! wherever it is found, once, in the order of writing, in memory for one chunk and an index.
 
-use super::file::{logs, topic, CLOCKS, COUNTERS, EVENT, PREDICTED, RIG, STATE};
+use super::file::{logs, topic, CLOCKS, COUNTERS, EVENT, MAP_FROM_ODOM, PREDICTED, RIG, STATE};
 use super::{Clocks, Event, PredictedState, Rig, State};
+use crate::publish::status::message::MapFromOdomMessage;
 use crate::output::trajectory::TumWriter;
 use ::mcap::parse_record;
 use ::mcap::records::{op, Record};
@@ -32,6 +33,7 @@ pub enum Message<'a> {
     State(State),
     Predicted(PredictedState),
     Rig(Rig),
+    MapFromOdom(MapFromOdomMessage),
     Event(Event<'a>),
     Counters(BTreeMap<String, u64>),
     Clocks(Clocks),
@@ -46,6 +48,7 @@ impl Message<'_> {
             STATE => of(data).map(Message::State),
             PREDICTED => of(data).map(Message::Predicted),
             RIG => of(data).map(Message::Rig),
+            MAP_FROM_ODOM => of(data).map(Message::MapFromOdom),
             EVENT => of(data).map(Message::Event),
             COUNTERS => of(data).map(Message::Counters),
             CLOCKS => of(data).map(Message::Clocks),

@@ -1,0 +1,215 @@
+//! Places on disk, beside the map, so that a later flight finds itself in the map of an earlier one.
+//!
+//! A store of its own (`store`) with a record for each keyframe: what `PlaceAbout` says, and its features. Poses in the map
+//! change with every loop, so they are in one more record, `KIND_POSES`, which is written anew when they have moved. Places of
+//! another rig or version are refused, and a record that is damaged is left out.
+
+use super::features::{Feature, FEATURES};
+use super::pose4::Pose4;
+use crate::store::{self, About, Disk, Key, Limits, Reader, Store};
+use bytemuck::{Pod, Zeroable};
+use glam::{DQuat, DVec3};
+use std::path::Path;
+use stipple_drivers::{Calibration, Fault, FaultKind, Nanos};
+
+/// Version of the records' form; places of another are refused.
+const FORM: u32 = 1;
+const KIND_PLACE: u8 = 1;
+const KIND_POSES: u8 = 2;
+const POSES_KEY: Key = Key { kind: KIND_POSES, run: 0, id: 0 };
+const SEGMENT_BYTES: u64 = 4 << 20;
+/// A record put and one that waits for it.
+const BUFFERS: usize = 4;
+// Records are copied as they are in memory.
+const _: () = assert!(cfg!(target_endian = "little"));
+
+/// Name of an epoch over all flights.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Epoch {
+    /// When its flight began, ms since 1970.
+    pub flight: i64,
+    /// Number in the flight.
+    pub number: u32,
+}
+
+/// What is kept of a place beside its features.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct KeptPlace {
+    /// Its key.
+    pub number: u32,
+    pub t: Nanos,
+    pub epoch: Epoch,
+    /// The frame of `map`: places of one frame are one map.
+    pub frame: u32,
+    /// Poses of the level frame in `odom` and in the map, and what turns the body upright.
+    pub odom: Pose4,
+    pub map: Pose4,
+    pub tilt: DQuat,
+}
+
+#[repr(C)]
+#[derive(Clone, Copy, Pod, Zeroable)]
+struct PlaceAbout {
+    flight: i64,
+    t: i64,
+    epoch: u32,
+    frame: u32,
+    /// Position and yaw.
+    odom: [f64; 4],
+    map: [f64; 4],
+    tilt_xyzw: [f64; 4],
+}
+
+#[repr(C)]
+#[derive(Clone, Copy, Pod, Zeroable)]
+struct PlacePose {
+    number: u32,
+    frame: u32,
+    map: [f64; 4],
+}
+
+fn numbers(pose: &Pose4) -> [f64; 4] {
+    [pose.p.x, pose.p.y, pose.p.z, pose.yaw]
+}
+
+fn pose([x, y, z, yaw]: [f64; 4]) -> Pose4 {
+    Pose4 { p: DVec3::new(x, y, z), yaw }
+}
+
+impl KeptPlace {
+    fn encode(&self) -> About {
+        let about = PlaceAbout {
+            flight: self.epoch.flight,
+            t: self.t.0,
+            epoch: self.epoch.number,
+            frame: self.frame,
+            odom: numbers(&self.odom),
+            map: numbers(&self.map),
+            tilt_xyzw: self.tilt.to_array(),
+        };
+        let mut bytes = [0; store::ABOUT];
+        bytes[..size_of::<PlaceAbout>()].copy_from_slice(bytemuck::bytes_of(&about));
+        bytes
+    }
+
+    /// `None` of bytes that are no place.
+    fn decode(number: u32, bytes: &About) -> Option<KeptPlace> {
+        let about: PlaceAbout = bytemuck::pod_read_unaligned(&bytes[..size_of::<PlaceAbout>()]);
+        let place = KeptPlace {
+            number,
+            t: Nanos(about.t),
+            epoch: Epoch { flight: about.flight, number: about.epoch },
+            frame: about.frame,
+            odom: pose(about.odom),
+            map: pose(about.map),
+            tilt: DQuat::from_array(about.tilt_xyzw),
+        };
+        (place.odom.is_finite() && place.map.is_finite() && place.tilt.is_normalized()).then_some(place)
+    }
+}
+
+/// A number of a rig: places that another has seen are not read.
+fn identity(calibration: &Calibration) -> u64 {
+    store::identity(&format!("places {FORM} {:?}", calibration.cameras))
+}
+
+/// Reads the places in a folder, the oldest first; none where there is no store. Fails where they are of another rig or
+/// version. Allocates.
+pub fn read(folder: &Path, calibration: &Calibration) -> Result<Vec<(KeptPlace, Vec<Feature>)>, Fault> {
+    if !folder.is_dir() {
+        return Ok(vec![]);
+    }
+    let mut reader = match Reader::open(folder) {
+        Err(fault) if fault.kind == FaultKind::NoInput => return Ok(vec![]),
+        opened => opened?,
+    };
+    if reader.identity() != identity(calibration) {
+        let what = "the places that are there are of another rig or another version of stipple";
+        let fix = "give the calibration they were seen with, name another folder, or start with --fresh";
+        return Err(Fault::new(FaultKind::Data, folder.display().to_string(), what, fix));
+    }
+    let mut keys = vec![];
+    reader.entries(|key, _| keys.extend((key.kind == KIND_PLACE).then_some(*key)));
+    keys.sort_unstable();
+    let (mut places, mut payload) = (vec![], vec![]);
+    for key in keys {
+        // What is damaged is left out.
+        let Ok(about) = reader.read(key, &mut payload) else { continue };
+        let features = payload.chunks_exact(size_of::<Feature>()).take(FEATURES).map(bytemuck::pod_read_unaligned);
+        places.extend(KeptPlace::decode(key.id, &about).map(|place| (place, features.collect::<Vec<Feature>>())));
+    }
+    if reader.read(POSES_KEY, &mut payload).is_ok() {
+        for bytes in payload.chunks_exact(size_of::<PlacePose>()) {
+            let moved: PlacePose = bytemuck::pod_read_unaligned(bytes);
+            let map = pose(moved.map);
+            let found = places.binary_search_by_key(&moved.number, |(place, _)| place.number);
+            if let (Ok(at), true) = (found, map.is_finite()) {
+                (places[at].0.map, places[at].0.frame) = (map, moved.frame);
+            }
+        }
+    }
+    Ok(places)
+}
+
+/// Writes places as they come, on the thread that finds them.
+pub struct Keeper {
+    store: Store,
+    disk: Disk,
+}
+
+fn limits(places: usize) -> Limits {
+    let place = store::record_bytes(FEATURES * size_of::<Feature>()) as u64;
+    let payload_max = (FEATURES * size_of::<Feature>()).max(places * size_of::<PlacePose>());
+    Limits {
+        // Half of a store holds records; a quarter more for what segments lack at their ends.
+        bytes_max: (5 * place * places as u64 / 2).max(8 * SEGMENT_BYTES),
+        segment_bytes: SEGMENT_BYTES,
+        records_max: places + 64,
+        payload_max,
+        buffers: BUFFERS,
+        write_bytes_per_s: 0,
+    }
+}
+
+impl Keeper {
+    /// Opens or makes the store for so many places. Fails where it cannot be written, or is another rig's.
+    pub fn open(folder: &Path, calibration: &Calibration, places: usize) -> Result<Keeper, Fault> {
+        let (store, disk) = Store::open(folder, identity(calibration), &limits(places))?;
+        Ok(Keeper { store, disk })
+    }
+
+    /// Host memory that it takes.
+    pub fn footprint(places: usize) -> crate::mem::Footprint {
+        Store::footprint(&limits(places))
+    }
+
+    fn serve(&self) {
+        crate::mem::unsealed(|| self.disk.serve());
+    }
+
+    /// Writes a place; false where the disk does not take it.
+    pub fn put(&mut self, place: &KeptPlace, features: &[Feature]) -> bool {
+        let key = Key { kind: KIND_PLACE, run: 0, id: place.number };
+        let fill = |payload: &mut Vec<u8>| payload.extend_from_slice(bytemuck::cast_slice(features));
+        let taken = self.store.put(key, &place.encode(), fill);
+        self.serve();
+        taken
+    }
+
+    /// Writes where places are by now: number, frame, pose.
+    pub fn put_poses(&mut self, places: impl Iterator<Item = (u32, u32, Pose4)>) -> bool {
+        let fill = |payload: &mut Vec<u8>| {
+            for (number, frame, map) in places {
+                payload.extend_from_slice(bytemuck::bytes_of(&PlacePose { number, frame, map: numbers(&map) }));
+            }
+        };
+        let taken = self.store.put(POSES_KEY, &[0; store::ABOUT], fill);
+        self.serve();
+        taken
+    }
+
+    pub fn remove(&mut self, number: u32) {
+        self.store.remove(Key { kind: KIND_PLACE, run: 0, id: number });
+        self.serve();
+    }
+}
