@@ -1,15 +1,147 @@
 //! Loops on whole flights: drift goes, and a place that looks exactly like another is not taken for it.
 #![allow(clippy::unwrap_used)]
 
-use stipple::config::Board;
+use glam::{DQuat, DVec3};
+use std::sync::Arc;
+use stipple::config::{Board, FrontendConfig};
 use stipple::loops::pose4::{wrapped, Pose4};
+use stipple::loops::{LoopKeyframe, Loops};
+use stipple::output::export::{export, Form, Request};
+use stipple::output::metrics::align;
+use stipple::output::report::Report;
 use stipple::output::OutputDir;
 use stipple::run::sensors::Input;
 use stipple::run::{fly, Options, Pace, Steps};
 use stipple_drivers::replay::read_trajectory;
-use stipple_drivers::sim::Scenario;
+use stipple_drivers::sim::{Scenario, Sim};
 use stipple_drivers::types::pose_at;
-use stipple_drivers::{Nanos, Span};
+use stipple_drivers::{Frames, Nanos, Pose, Span, TimedPose};
+
+fn counter(report: &Report, name: &str) -> u64 {
+    report.counted().find(|(n, _)| *n == name).map_or(0, |(_, n)| n)
+}
+
+/// Flies a part of the patrol of two rooms, from `begin_s` on for so long, in lockstep.
+fn patrol(begin_s: f64, seconds: f64, board: &Board, out: &OutputDir, options: &Options) -> (Report, Vec<TimedPose>) {
+    let [begin, duration] = [begin_s, begin_s + seconds].map(Span::from_secs);
+    let scenario = Scenario { begin, duration, ..Scenario::named("patrol-two").unwrap() };
+    let input = Input::simulated(&scenario, |_, _| ()).unwrap();
+    let truth = input.truth.clone();
+    (fly(input, board, out, options, None).unwrap().report, truth)
+}
+
+/// How far the last pose of a run's trajectory is off, where an earlier trajectory tells where the map is.
+fn last_off(out: &OutputDir, truth: &[TimedPose], map: (&[TimedPose], &[TimedPose])) -> f64 {
+    let at = |truth: &[TimedPose], t| pose_at(truth, t, Span(100_000_000)).unwrap().p;
+    let pairs: Vec<_> = map.0.iter().map(|e| (e.pose.p, at(map.1, e.t))).collect();
+    let world_from_map = align(pairs.iter().copied());
+    let last = *read_trajectory(&out.file("trajectory.tum")).unwrap().last().unwrap();
+    (world_from_map.transform(last.pose.p) - at(truth, last.t)).length()
+}
+
+/// The first round is mapped; a flight of the day after starts in mid-air in the second, in other light.
+#[test]
+fn a_later_flight_finds_itself_in_the_stored_map_and_extends_it() {
+    let text = include_str!("../board-configs/lavapipe.toml");
+    let small =
+        ["map.scale=2", "budget.splats=6000", "map.seeds_per_anchor=600", "map.densify_max=300", "budget.keyframes=24"];
+    let board = Board::parse("lavapipe.toml", text, &small.map(String::from)).unwrap();
+    let dir = tempfile::tempdir().unwrap();
+    let out = OutputDir::create(dir.path()).unwrap();
+    let options = Options { pace: Pace::Lockstep(Steps::PerFrame(1)), ..Options::default() };
+    let (_, truth) = patrol(0.0, 16.0, &board, &out, &options);
+    let first = read_trajectory(&out.file("trajectory.tum")).unwrap();
+    let exported = |name: &str| export(&out.file("map"), &out.file(name), Form::Ply, &Request::default()).unwrap();
+    let alone = exported("alone.ply");
+    assert!(alone.gaussians > 1000 && alone.run == 0, "{alone:?}");
+    let kept = |folder: &str| {
+        let files = std::fs::read_dir(out.file(folder)).unwrap().map(|f| f.unwrap().path());
+        let mut all: Vec<_> = files.filter(|f| f.is_file()).map(|f| (f.clone(), std::fs::read(f).unwrap())).collect();
+        all.sort();
+        all
+    };
+
+    // Only to find itself changes nothing of the map.
+    let before = (kept("map"), kept("places"));
+    let localise = Options { localise_only: true, ..options.clone() };
+    let (report, second) = patrol(48.0, 8.0, &board, &out, &localise);
+    assert_eq!(counter(&report, "epochs_joined"), 1, "{:?}", report.loops);
+    assert!(counter(&report, "places_read") > 10 && report.splats.is_none() && report.heap_after_seal == Some(0));
+    let off = last_off(&out, &second, (&first, &truth));
+    assert!(off < 0.15, "{off} m");
+    assert!((kept("map"), kept("places")) == before, "the stored map has changed");
+
+    // A flight that maps extends it, in its frame.
+    let (report, second) = patrol(48.0, 8.0, &board, &out, &options);
+    assert_eq!((counter(&report, "epochs_joined"), counter(&report, "epochs_kept_apart")), (1, 0));
+    let off = last_off(&out, &second, (&first, &truth));
+    assert!(off < 0.15, "{off} m");
+    let both = exported("both.ply");
+    assert!(both.run == 1 && both.runs == 2 && both.gaussians > alone.gaussians, "{alone:?} {both:?}");
+    assert!(report.quality.psnr_db.unwrap() > 15.0, "{:?}", report.quality);
+
+    // Another rig does not see these places, and flies without them.
+    let mut other = Scenario { duration: Span::from_secs(3.0), ..Scenario::named("patrol-two").unwrap() };
+    other.calibration.cameras[0].camera.fx *= 1.01;
+    let input = Input::simulated(&other, |_, _| ()).unwrap();
+    let outcome = fly(input, &board, &out, &options, None).unwrap();
+    assert_eq!(counter(&outcome.report, "places_read"), 0);
+    let input = Input::simulated(&other, |_, _| ()).unwrap();
+    let refused = fly(input, &board, &out, &localise, None).err().map(|fault| fault.to_string());
+    assert!(refused.as_ref().is_some_and(|why| why.contains("another rig")), "{refused:?}");
+}
+
+/// Keyframes at true poses, from `begin_s` on for so long, as an estimator of epoch `epoch` tells them whose frame is `odom_from_world`.
+fn look_around(
+    loops: &mut Loops,
+    scenario: &Scenario,
+    (begin_s, seconds): (f64, f64),
+    epoch: u32,
+    odom_from_world: Pose,
+) {
+    let [begin, duration] = [begin_s, begin_s + seconds].map(Span::from_secs);
+    let mut sim = Sim::new(&Scenario { begin, duration, ..scenario.clone() }).unwrap();
+    for i in (0..sim.frame_count()).step_by(5) {
+        let mut frames = Frames::for_rig(sim.calibration());
+        sim.render(i, &mut frames);
+        let odom_from_body = odom_from_world * sim.truth_at(sim.taken(i)).pose;
+        let (t, frames, before, body_from_cam) = (frames.t, &Arc::new(frames), None, None);
+        loops.add(&LoopKeyframe { t, frames, id: None, epoch, odom_from_body, before, body_from_cam });
+    }
+}
+
+/// A vehicle that is carried elsewhere while its cameras are covered: nothing is known of where it is.
+#[test]
+fn a_kidnapped_vehicle_finds_itself_where_only_one_place_looks_like_it() {
+    let carried = Pose::new(DQuat::from_rotation_z(2.0), DVec3::new(-40.0, 7.0, 3.0));
+    let new = |name: &str| {
+        let scenario = Scenario { seed: 3, ..Scenario::named(name).unwrap() };
+        (Loops::new(&scenario.rig(), &FrontendConfig::default(), 512).unwrap(), scenario)
+    };
+    let (mut loops, patrol) = new("patrol-two");
+    look_around(&mut loops, &patrol, (0.0, 16.0), 0, Pose::IDENTITY);
+    assert!(!loops.is_lost());
+    look_around(&mut loops, &patrol, (49.0, 6.0), 1, carried);
+    assert!((loops.stats.epochs_joined, loops.is_lost()) == (1, false), "{:?}", loops.stats);
+    let placed = loops.map_from_odom();
+    let off = placed.pose.pose() * carried;
+    let at = off.transform(patrol_place()) - patrol_place();
+    assert!(at.length() < 0.3 && off.q.angle_between(DQuat::IDENTITY) < 0.03, "{off:?}");
+    assert!((placed.epoch, placed.count > 0) == (1, true) && placed.covariance[0][0] > 0.0, "{placed:?}");
+
+    // Two rooms that look the same: it is in one of them, and nothing tells which.
+    let (mut loops, twins) = new("twins");
+    look_around(&mut loops, &twins, (0.0, 52.0), 0, Pose::IDENTITY);
+    let before = loops.stats.loops_ambiguous;
+    look_around(&mut loops, &twins, (62.0, 8.0), 1, carried);
+    assert!(loops.stats.epochs_joined == 0 && loops.is_lost(), "{:?}", loops.stats);
+    assert!(loops.stats.loops_ambiguous > before, "{:?}", loops.stats);
+}
+
+/// A place that the patrol passes, m.
+fn patrol_place() -> DVec3 {
+    DVec3::new(2.0, 2.0, 1.2)
+}
 
 /// Two rooms that look the same, 14 m apart: a, b, a, b.
 #[test]
@@ -27,11 +159,10 @@ fn between_rooms_that_look_the_same_each_is_recognised_as_itself() {
     for l in &report.loops {
         let level = |t| Pose4::upright(&pose_at(&truth, Nanos(t), Span(100_000_000)).unwrap()).0;
         let is = level(l.with_ns).between(&level(l.t_ns));
-        let off = (is.p - glam::DVec3::from(l.p_m)).length();
+        let off = (is.p - DVec3::from(l.p_m)).length();
         assert!(off < 0.5 && wrapped(is.yaw - l.yaw_rad).abs() < 0.08, "{off} m: {l:?}");
     }
-    let counter = |name: &str| report.counted().find(|(n, _)| *n == name).map_or(0, |(_, n)| n);
-    assert!(counter("loops_implausible") > 5, "the other room was seen to look the same, and refused");
+    assert!(counter(&report, "loops_implausible") > 5, "the other room was seen to look the same, and refused");
     let (with, without) = (report.ate_rmse_m.unwrap(), report.odometry_ate_rmse_m.unwrap());
     assert!(with < without, "{with} {without}");
     assert_eq!(report.heap_after_seal, Some(0));

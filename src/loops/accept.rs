@@ -1,6 +1,6 @@
 //! Acceptance of a loop: which of a keyframe's verifications is to be believed, if any, and why not.
 
-use super::graph::PoseGraph;
+use super::graph::{Edge, PoseGraph};
 use super::pose4::{turned, wrapped, Pose4};
 use super::verify::Verified;
 use crate::mem::List;
@@ -42,6 +42,22 @@ pub struct Verification {
     /// The candidate's node.
     pub node: u16,
     pub verified: Verified,
+}
+
+impl Verification {
+    /// The edge from the candidate to the keyframe that was verified.
+    pub fn edge(&self, node: u16) -> Edge {
+        let Verified { candidate_from_query: measured, covariance, .. } = self.verified;
+        Edge { from: self.node, to: node, measured, covariance, is_loop: true }
+    }
+
+    /// Whether it is to be believed, and says about the same as the graph.
+    pub fn agrees_with(&self, node: u16, graph: &PoseGraph) -> bool {
+        let expected = graph.pose(self.node).between(&graph.pose(node));
+        let found = &self.verified.candidate_from_query;
+        let (far, angle) = ((found.p - expected.p).length(), wrapped(found.yaw - expected.yaw).abs());
+        is_strong(&self.verified) && far < AGREE[0] && angle < 5.0 * AGREE[1]
+    }
 }
 
 impl Default for Verification {
@@ -256,7 +272,6 @@ pub fn odometry_covariance(moved: &Pose4, secs: f64) -> Matrix4<f64> {
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used)]
-    use super::super::graph::Edge;
     use super::*;
     use glam::DVec3;
 

@@ -1,7 +1,7 @@
 //! Frames: what is known of epochs that began in maps of their own, kept from flight to flight, until a recognised place
 //! makes one map of two.
 
-use super::accept::odometry_covariance;
+use super::accept::{odometry_covariance, Verification};
 use super::features::{Feature, FEATURES};
 use super::graph::Edge;
 use super::kept::{Keeper, KeptPlace};
@@ -79,9 +79,11 @@ impl Loops {
         }
     }
 
-    /// Takes a loop into the graph, and makes one frame of two where it joins them; false, and counted, where that cannot be.
-    pub(super) fn link(&mut self, edge: &Edge, joins: bool) -> bool {
+    /// Takes a loop into the graph; false, and counted, where that cannot be. Where it leads to another frame, makes one of both.
+    /// Takes in the others of `beside` that agree with it: depths of one keyframe err together.
+    pub(super) fn link(&mut self, edge: &Edge, beside: &[Verification]) -> bool {
         let [a, b] = [edge.from, edge.to].map(|n| self.places[n as usize].frame);
+        let joins = a != b;
         let kept = |frame: u32| (0..self.places.len()).any(|n| self.is_kept(n, frame));
         let [a_kept, b_kept] = [a, b].map(kept);
         if joins && a_kept && b_kept {
@@ -103,6 +105,13 @@ impl Loops {
             self.places.iter_mut().filter(|p| p.frame == moves).for_each(|p| p.frame = stays);
             self.frame = if self.frame == moves { stays } else { self.frame };
             self.stats.epochs_joined += 1;
+        }
+        let frame = self.places[edge.to as usize].frame;
+        let others = beside.iter().filter(|v| v.node != edge.from && self.places[v.node as usize].frame == frame);
+        for v in others {
+            if v.agrees_with(edge.to, &self.graph) {
+                self.graph.link(v.edge(edge.to));
+            }
         }
         let outcome = self.graph.optimise();
         self.poses_moved = true;

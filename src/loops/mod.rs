@@ -42,8 +42,10 @@ const BY_LOOKS: usize = 8;
 const BY_PLACE: usize = 3;
 /// A keyframe closes no loop with one younger than this, s.
 const OLD_S: f64 = 20.0;
-/// Once a loop is closed, the next that says the same has to wait so long, s.
+/// Once a loop is closed, the next that says the same has to wait so long, s; not for a while after two frames were joined, which
+/// nothing but loops holds together.
 const REST_S: f64 = 1.0;
+const FRESH_S: f64 = 10.0;
 /// Candidates by looks of which those are chosen that are not all at one place, where the vehicle may be anywhere: so many, and
 /// of those within this, m, two.
 const ANYWHERE: usize = 32;
@@ -188,6 +190,7 @@ pub struct Loops {
     /// The newest keyframe's node.
     last: Option<u16>,
     last_closed: Option<Nanos>,
+    last_joined: Option<Nanos>,
     map_from_odom: MapFromOdom,
     /// The frame of the epoch that the estimator is in, and the next one.
     frame: u32,
@@ -224,9 +227,10 @@ impl Loops {
             rays: List::default(),
             last: None,
             last_closed: None,
+            last_joined: None,
             map_from_odom: MapFromOdom::default(),
             frame: 0,
-            next_frame: 0,
+            next_frame: 1,
             flight: 0,
             next_number: 0,
             keeper: None,
@@ -444,23 +448,18 @@ impl Loops {
         };
         let with = self.places[best.node as usize].t;
         self.recognised = Some((with, best.verified.candidate_from_query));
-        let rests = self.last_closed.is_some_and(|last| (t - last).secs() < REST_S);
-        if joins.is_none() && rests {
+        let since = |last: Option<Nanos>| last.map_or(f64::INFINITY, |last| (t - last).secs());
+        let fresh = joins.is_some() || since(self.last_joined) <= FRESH_S;
+        if !fresh && since(self.last_closed) < REST_S {
+            return None;
+        }
+        let was = self.map_from_odom.pose.compose(&odom);
+        if !self.link(&best.edge(node), if fresh { verified } else { &[] }) {
             return None;
         }
         let v = &best.verified;
-        let edge = Edge {
-            from: best.node,
-            to: node,
-            measured: v.candidate_from_query,
-            covariance: v.covariance,
-            is_loop: true,
-        };
-        let was = self.map_from_odom.pose.compose(&odom);
-        if !self.link(&edge, joins.is_some()) {
-            return None;
-        }
         self.last_closed = Some(t);
+        self.last_joined = joins.map_or(self.last_joined, |_| Some(t));
         self.stats.loops_closed += 1;
         let now = self.graph.pose(node);
         let covariance = self.covariance_in_map(node);

@@ -11,8 +11,8 @@
 use super::block::{BlockAbout, KeyframeAbout, RunAbout};
 use super::block::{JoinAbout, KIND_BLOCK, KIND_IMAGE, KIND_JOIN, KIND_KEYFRAME, NO_BLOCK, SAMPLES};
 use super::choice::{Choice, Drawn};
-use super::filing::{entry, identity, keyframes_known, limits, payload_max, run_key, BLOCKS_KNOWN};
 use super::filing::image_id;
+use super::filing::{entry, identity, keyframes_known, limits, payload_max, run_key, BLOCKS_KNOWN};
 use super::horizon::ball;
 use super::parts::PARTS;
 use super::runs::{Run, Runs};

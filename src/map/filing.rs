@@ -114,5 +114,8 @@ pub fn payload_max(board: &Board, shape: &Shape) -> usize {
 /// A number of a rig and the form of its images: maps of another are not read.
 pub fn identity(calibration: &Calibration, board: &Board, shape: &Shape) -> u64 {
     let Shape { width, height, channels, cameras, .. } = *shape;
-    store::identity(&format!("{:?} {:?} {width} {height} {channels} {cameras}", calibration.cameras, board.map.projection))
+    store::identity(&format!(
+        "{:?} {:?} {width} {height} {channels} {cameras}",
+        calibration.cameras, board.map.projection
+    ))
 }

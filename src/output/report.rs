@@ -120,6 +120,10 @@ pub struct LoopClosed {
     pub yaw_rad: f64,
     pub moved_m: f64,
     pub moved_rad: f64,
+    /// The place was of another epoch, of this flight or an earlier one, and both are one map since then. The stamp is by the
+    /// clock of that flight.
+    #[serde(default)]
+    pub joins: bool,
 }
 
 /// Whether a part of the rig was found, and what is left of its deviation.

@@ -182,7 +182,7 @@ fn counted(flown: &Flown, map: Option<&MapResult>, opened: &[(&'static str, u64)
 fn closed(c: &Closure) -> LoopClosed {
     let ([moved_m, moved_rad], corners) = (c.moved, c.inliers as u64);
     let (p_m, yaw_rad) = (c.measured.p.to_array(), c.measured.yaw);
-    LoopClosed { t_ns: c.t.0, with_ns: c.with.0, corners, p_m, yaw_rad, moved_m, moved_rad }
+    LoopClosed { t_ns: c.t.0, with_ns: c.with.0, corners, p_m, yaw_rad, moved_m, moved_rad, joins: c.joins.is_some() }
 }
 
 /// Fills in the tracking figures; answers the trajectory.

@@ -7,6 +7,7 @@
 
 use crate::inputs::{self, Folders};
 use crate::page::{count, millimetres, number, percent, text, Page, Part, Table};
+use crate::relocalise::{join, joined_table, relocalise, relocalised_table};
 use crate::run::default_board;
 use crate::table;
 use serde_json::json;
@@ -15,7 +16,7 @@ use stipple::config::FrontendConfig;
 use stipple::loops::pose4::{wrapped, Pose4};
 use stipple::loops::{LoopKeyframe, Loops};
 use stipple::output::metrics::percentile;
-use stipple::output::report::Report;
+use stipple::output::report::{LoopClosed, Report};
 use stipple::output::OutputDir;
 use stipple::run::sensors::{Input, Recorded, Source};
 use stipple::run::{fly, Options, Pace, Steps};
@@ -50,7 +51,11 @@ pub struct Args {
     /// Seconds of each flight at most
     #[arg(long, value_name = "S", default_value_t = 1e4, value_parser = crate::seconds)]
     seconds: f64,
-    /// The flights whose name contains this alone, or `places`: that table alone
+    /// Starts in the map of an earlier flight
+    #[arg(long, value_name = "N", default_value_t = 12)]
+    starts: usize,
+    /// The flights whose name contains this alone; `places`, `relocalise` or `resets`: that table alone;
+    /// `relocalise-patrol`: starts in the whole patrol
     #[arg(long, value_name = "NAME")]
     only: Option<String>,
     /// Override a key of the board file
@@ -89,15 +94,31 @@ pub fn run(args: &Args) -> Result<(), Fault> {
     if args.only.as_ref().is_none_or(|only| only == "places") {
         recalls = places(args)?;
     }
-    let wrong: usize = flown.iter().map(|f| f.wrong).sum::<usize>() + recalls.iter().map(|r| r.wrong).sum::<usize>();
-    let (flights, places) = (flights_table(flown), places_table(recalls));
-    println!("{}\n{}\n{wrong} false", flights.text(), places.text());
+    let (mut starts, only) = (vec![], args.only.as_deref());
+    for (name, wanted) in
+        [("patrol-two", only.is_none_or(|only| only == "relocalise")), ("patrol", only == Some("relocalise-patrol"))]
+    {
+        for seed in (1..=args.seeds).filter(|_| wanted) {
+            starts.push(relocalise(name, seed, args.starts, &args.set, &out)?);
+        }
+    }
+    let mut resets = vec![];
+    for seed in (1..=args.seeds).filter(|_| only.is_none_or(|only| only == "resets")) {
+        resets.push(join("patrol-two", seed, &args.set, &out)?);
+    }
+    let wrong: usize = flown.iter().map(|f| f.wrong).sum::<usize>()
+        + recalls.iter().map(|r| r.wrong).sum::<usize>()
+        + starts.iter().map(|r| r.wrong).sum::<usize>()
+        + resets.iter().map(|r| r.wrong).sum::<usize>();
+    let tables = [flights_table(flown), places_table(recalls), relocalised_table(starts), joined_table(resets)];
+    tables.iter().for_each(|table| println!("{}", table.text()));
+    println!("{wrong} false");
     let page = Page {
         name: "loops",
         title: "Loop closure",
         what: "odometry with loops and without, places recognised, cost".into(),
         facts: vec![("false", json!(wrong))],
-        parts: vec![Part::Note(NOTE.into()), Part::Table(flights), Part::Table(places)],
+        parts: std::iter::once(Part::Note(NOTE.into())).chain(tables.map(Part::Table)).collect(),
     };
     page.write(&out)?;
     crate::missed("loops", &if wrong > 0 { vec![format!("{wrong} false closures")] } else { vec![] })
@@ -131,18 +152,19 @@ fn measure(name: String, scenario: &Scenario, args: &Args, out: &OutputDir) -> R
     let options = Options { pace: Pace::Lockstep(Steps::PerFrame(1)), ..Options::default() };
     let flight = OutputDir::create(&out.file(&name.replace([' ', ','], "")))?;
     let report = fly(input, &board, &flight, &options, None)?.report;
-    let off = |l: &&stipple::output::report::LoopClosed| {
-        let measured = Pose4 { p: l.p_m.into(), yaw: l.yaw_rad };
-        is_false(&truth, Nanos(l.with_ns), Nanos(l.t_ns), &measured)
-    };
-    let wrong = report.loops.iter().filter(off).count();
+    let wrong = report.loops.iter().filter(|l| is_false(&truth, l)).count();
     let ate = |m: Option<f64>| m.map_or("-".into(), |m| format!("{:.1} mm", 1e3 * m));
     eprintln!("{name}: {} without loops, {} with", ate(report.odometry_ate_rmse_m), ate(report.ate_rmse_m));
     Ok(Flown { name, report, wrong })
 }
 
+/// Whether a loop that was closed within a flight is not a true one.
+pub fn is_false(truth: &[TimedPose], l: &LoopClosed) -> bool {
+    is_off(truth, Nanos(l.with_ns), Nanos(l.t_ns), &Pose4 { p: l.p_m.into(), yaw: l.yaw_rad })
+}
+
 /// Whether a pose measured between two instants is not the true one.
-fn is_false(truth: &[TimedPose], with: Nanos, t: Nanos, measured: &Pose4) -> bool {
+fn is_off(truth: &[TimedPose], with: Nanos, t: Nanos, measured: &Pose4) -> bool {
     let level = |t| pose_at(truth, t, HOLE).map(|pose| Pose4::upright(&pose).0);
     let (Some(a), Some(b)) = (level(with), level(t)) else { return false };
     let is = a.between(&b);
@@ -215,7 +237,7 @@ fn recall(
             body_from_cam: None,
         });
         ms.push((thread_cpu_now() - begun).as_secs_f64() * 1e3);
-        let right = loops.recognised.map(|(with, measured)| !is_false(truth, with, frames.t, &measured));
+        let right = loops.recognised.map(|(with, measured)| !is_off(truth, with, frames.t, &measured));
         recognised += usize::from(right.is_some());
         wrong += usize::from(right == Some(false));
         let bin = angle.and_then(|a| (0..3).find(|k| a >= ANGLES[*k] && a < ANGLES[*k + 1]));

@@ -16,6 +16,7 @@ mod patrol;
 mod ply;
 mod predict;
 mod record;
+mod relocalise;
 mod run;
 mod stability;
 mod stages;

@@ -116,6 +116,7 @@ impl Sim {
         let plan = scenario.path.plan();
         let route = plan.map(Route::new);
         let (spline, start, first, last) = motion(scenario, &rig, route.as_ref())?;
+        let first = (first + scenario.begin).min(last);
         let span = (first - start).secs()..(last - start).secs();
         let mut room = if let (Some(plan), Some(route)) = (plan, &route) {
             // Of the whole route, so that a shorter flight has the same furniture.

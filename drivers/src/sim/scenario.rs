@@ -25,6 +25,8 @@ pub struct Scenario {
     pub seed: u64,
     /// Length of the run; a recorded path may end sooner.
     pub duration: Span,
+    /// Part of it that is left out at its beginning: the first frame is taken then.
+    pub begin: Span,
     /// Frames per second.
     pub rate_hz: f64,
     /// The rig at full resolution.
@@ -180,6 +182,7 @@ impl Scenario {
             name: name.to_string(),
             seed: 1,
             duration: Span::from_secs(secs),
+            begin: Span(0),
             rate_hz: 20.0,
             calibration: euroc_rig(),
             image_divisor: 1,

@@ -17,8 +17,8 @@ mod tests;
 
 use super::threads;
 use crate::limits::CAMERAS_MAX;
-use crate::mem::{cut, Footprint, List};
 use crate::loops::MapFromOdom;
+use crate::mem::{cut, Footprint, List};
 use crate::publish::event::EventId;
 use crate::publish::status::message::MapFromOdomMessage;
 use crate::publish::TEXT;

@@ -3,8 +3,8 @@
 
 use super::file::{logs, topic, CLOCKS, COUNTERS, EVENT, MAP_FROM_ODOM, PREDICTED, RIG, STATE};
 use super::{Clocks, Event, PredictedState, Rig, State};
-use crate::publish::status::message::MapFromOdomMessage;
 use crate::output::trajectory::TumWriter;
+use crate::publish::status::message::MapFromOdomMessage;
 use ::mcap::parse_record;
 use ::mcap::records::{op, Record};
 use ::mcap::sans_io::linear_reader::{LinearReadEvent, LinearReader, LinearReaderOptions};
