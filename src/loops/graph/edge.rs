@@ -64,12 +64,6 @@ impl Edge {
         let r = Vector4::new(p.x, p.y, p.z, wrapped(b.yaw - a.yaw - self.measured.yaw));
         (r, jacobians(a, b))
     }
-
-    /// Squared residual in deviations.
-    pub fn chi2(&self, a: &Pose4, b: &Pose4) -> f64 {
-        let (r, _) = self.residual(a, b);
-        self.covariance.cholesky().map_or(f64::INFINITY, |c| r.dot(&c.solve(&r)))
-    }
 }
 
 /// Derivatives of the pose of `b` in the frame of `a` by the errors of both.

@@ -3,7 +3,8 @@
 //!
 //! Least squares by Gauss-Newton, with a Cholesky factorisation of 4x4 blocks in the order of minimum degree. A loop edge
 //! may be false: loop edges have the Geman-McClure cost, brought in by graduated non-convexity (Yang et al. 2020), so that
-//! those which the others contradict end without weight. A node that is dropped leaves its two odometry edges as one. Nodes of
+//! those which the others contradict end without weight. Where all new loops say about what the graph says, one step or two from
+//! where it is are enough. A node that is dropped leaves its two odometry edges as one. Nodes of
 //! earlier flights are fixed: what was found in their map stays where it is.
 //!
 //! Errors of a node: position in the world, m, and yaw, rad.
@@ -21,9 +22,11 @@ use solver::Solver;
 
 /// Squared residual of 4 numbers at which a loop edge counts half: one true loop in a thousand is beyond it.
 const LOOP_SCALE: f64 = 18.47;
-/// Steps of graduated non-convexity and of Gauss-Newton at most, and the step that ends them: m, rad.
+/// Steps of graduated non-convexity and of Gauss-Newton at most, and the step after which the next would be nothing: m, rad.
 const ITERATIONS: usize = 20;
-const STEP_MIN: f64 = 1e-4;
+const STEP_MIN: f64 = 1e-3;
+/// A new loop whose squared residual is less agrees with the graph as it is.
+const AGREES: f64 = 0.5 * LOOP_SCALE;
 /// The scale of the cost shrinks by so much a step.
 const SHRINK: f64 = 4.0;
 /// A loop edge of less weight than this was rejected.
@@ -51,6 +54,10 @@ pub struct PoseGraph {
     edges: Vec<Edge>,
     /// Weight of each edge: 1 for odometry.
     weights: Vec<f64>,
+    /// Inverse of each edge's covariance.
+    information: Vec<Matrix4<f64>>,
+    /// Edges with numbers under this were there when the graph was optimised last, and nothing was moved since.
+    settled: usize,
     /// Odometry edges that lead to each node and from it.
     chain: Vec<[u32; 2]>,
     /// Poses to go back to.
@@ -67,6 +74,8 @@ impl PoseGraph {
             fixed: vec![false; nodes],
             edges: Vec::with_capacity(edges),
             weights: Vec::with_capacity(edges),
+            information: Vec::with_capacity(edges),
+            settled: 0,
             chain: vec![[NONE; 2]; nodes],
             before: vec![Pose4::default(); nodes],
             solver: Solver::new(nodes, blocks),
@@ -76,7 +85,7 @@ impl PoseGraph {
     /// Bytes that it takes.
     pub fn bytes(&self) -> usize {
         let node = 2 * size_of::<Pose4>() + 2 * size_of::<bool>() + size_of::<[u32; 2]>();
-        let edge = size_of::<Edge>() + size_of::<f64>();
+        let edge = size_of::<Edge>() + size_of::<f64>() + size_of::<Matrix4<f64>>();
         size_of::<Self>() + self.poses.len() * node + self.edges.capacity() * edge + self.solver.bytes()
     }
 
@@ -104,6 +113,7 @@ impl PoseGraph {
         for n in (0..self.poses.len()).filter(|n| self.used[*n] && which(*n as u16)) {
             self.poses[n] = by.compose(&self.poses[n]);
         }
+        self.settled = 0;
     }
 
     /// Takes back the newest loop edge.
@@ -123,6 +133,7 @@ impl PoseGraph {
             return None;
         }
         let number = self.edges.len() as u32;
+        let information = edge.covariance.cholesky()?.inverse();
         if !edge.is_loop {
             if self.chain[from][1] != NONE || self.chain[to][0] != NONE {
                 return None;
@@ -131,6 +142,7 @@ impl PoseGraph {
         }
         self.edges.push(edge);
         self.weights.push(1.0);
+        self.information.push(information);
         Some(())
     }
 
@@ -177,10 +189,14 @@ impl PoseGraph {
                 false => edge.then(&near),
             });
             match moved.filter(|m| m.from != m.to && m.is_valid()) {
-                Some(moved) => self.edges[i] = moved,
+                Some(moved) => {
+                    self.information[i] = moved.covariance.cholesky().map_or_else(Matrix4::zeros, |c| c.inverse());
+                    self.edges[i] = moved;
+                }
                 None => self.remove_edge(i),
             }
         }
+        self.settled = 0;
         self.used[node as usize] = false;
         self.chain[node as usize] = [NONE; 2];
         if let (Some(a), Some(b)) = (to, from) {
@@ -202,26 +218,31 @@ impl PoseGraph {
         }
         self.edges.swap_remove(i);
         self.weights.swap_remove(i);
+        self.information.swap_remove(i);
+        self.settled = self.settled.min(i);
     }
 
     /// Moves the nodes to where all edges agree best.
     pub fn optimise(&mut self) -> Outcome {
         let mut outcome = Outcome::default();
         self.before.copy_from_slice(&self.poses);
-        self.weights.iter_mut().for_each(|w| *w = 1.0);
+        // The first step is that of least squares; then the cost becomes the robust one in steps.
+        let mut scale = f64::INFINITY;
+        if self.settled > 0 && (self.settled..self.edges.len()).all(|i| self.chi2(i) < AGREES) {
+            scale = 1.0;
+            self.weigh(scale);
+        } else {
+            self.weights.iter_mut().for_each(|w| *w = 1.0);
+        }
+        self.settled = 0;
         match self.solver.order(&self.used, &self.fixed, &self.edges) {
             Some(blocks) => outcome.blocks = blocks,
             None => return outcome,
         }
-        // The first step is that of least squares; then the cost becomes the robust one in steps.
-        let mut scale = f64::INFINITY;
         for _ in 0..ITERATIONS {
             outcome.iterations += 1;
             self.solver.clear(&self.used, &self.fixed);
-            for (edge, weight) in self.edges.iter().zip(&self.weights) {
-                let [a, b] = [edge.from, edge.to].map(|n| &self.poses[n as usize]);
-                self.solver.add(edge, *weight, a, b);
-            }
+            self.add_edges();
             let Some(step) = self.solver.solve() else {
                 self.poses.copy_from_slice(&self.before);
                 return outcome;
@@ -247,31 +268,41 @@ impl PoseGraph {
                 break;
             }
         }
-        outcome.solved = true;
+        (outcome.solved, self.settled) = (true, self.edges.len());
         outcome.loops_rejected = self.loops().filter(|(_, w)| *w < REJECTED).count();
-        outcome.cost = self.edges.iter().map(|e| self.cost(e)).sum();
+        outcome.cost = (0..self.edges.len()).map(|i| self.cost(i)).sum();
         outcome
     }
 
+    /// Puts every edge into the equations.
+    fn add_edges(&mut self) {
+        for ((edge, weight), information) in self.edges.iter().zip(&self.weights).zip(&self.information) {
+            let [a, b] = [edge.from, edge.to].map(|n| &self.poses[n as usize]);
+            self.solver.add(edge, &(information * *weight), a, b);
+        }
+    }
+
     fn chi2_of_loops(&self) -> impl Iterator<Item = f64> + '_ {
-        self.edges.iter().filter(|e| e.is_loop).map(|e| self.chi2(e))
+        (0..self.edges.len()).filter(|i| self.edges[*i].is_loop).map(|i| self.chi2(i))
     }
 
-    fn chi2(&self, edge: &Edge) -> f64 {
-        edge.chi2(&self.poses[edge.from as usize], &self.poses[edge.to as usize])
+    /// Squared residual of an edge in deviations.
+    fn chi2(&self, i: usize) -> f64 {
+        let edge = &self.edges[i];
+        let (r, _) = edge.residual(&self.poses[edge.from as usize], &self.poses[edge.to as usize]);
+        r.dot(&(self.information[i] * r))
     }
 
-    fn cost(&self, edge: &Edge) -> f64 {
-        let chi2 = self.chi2(edge);
+    fn cost(&self, i: usize) -> f64 {
+        let (chi2, edge) = (self.chi2(i), &self.edges[i]);
         0.5 * if edge.is_loop { LOOP_SCALE * chi2 / (LOOP_SCALE + chi2) } else { chi2 }
     }
 
     fn weigh(&mut self, scale: f64) {
         for i in 0..self.edges.len() {
-            let edge = &self.edges[i];
-            if edge.is_loop {
+            if self.edges[i].is_loop {
                 let c2 = scale * LOOP_SCALE;
-                self.weights[i] = (c2 / (c2 + self.chi2(edge))).powi(2);
+                self.weights[i] = (c2 / (c2 + self.chi2(i))).powi(2);
             }
         }
     }
@@ -305,10 +336,7 @@ impl PoseGraph {
     fn factor(&mut self) -> Option<()> {
         self.solver.order(&self.used, &self.fixed, &self.edges)?;
         self.solver.clear(&self.used, &self.fixed);
-        for (edge, weight) in self.edges.iter().zip(&self.weights) {
-            let [a, b] = [edge.from, edge.to].map(|n| &self.poses[n as usize]);
-            self.solver.add(edge, *weight, a, b);
-        }
+        self.add_edges();
         self.solver.solve().map(|_| ())
     }
 

@@ -10,6 +10,8 @@ use nalgebra::{Matrix4, Vector4};
 /// Weight that holds a node in its place: that of a deviation of 0.1 mm, and rad/10^4.
 const HELD: f64 = 1e8;
 const NOWHERE: u16 = u16::MAX;
+/// Neighbours of a node that adds no more of them to others when it is eliminated: most have two, so few need a search.
+const FEW: u16 = 2;
 
 /// A column of the factor: its blocks below the diagonal.
 #[derive(Clone, Copy, Default)]
@@ -25,6 +27,9 @@ pub struct Solver {
     /// `sets[node * words..]`: neighbours of each node.
     sets: Vec<u64>,
     degrees: Vec<u16>,
+    /// Nodes that may be left, and those that have few neighbours, which go next.
+    left: Vec<u16>,
+    few: Vec<u16>,
     columns: Vec<Column>,
     /// Where in the order each node is.
     rank: Vec<u16>,
@@ -47,6 +52,8 @@ impl Solver {
             words,
             sets: vec![0; nodes * words],
             degrees: vec![0; nodes],
+            left: Vec::with_capacity(nodes),
+            few: Vec::with_capacity(nodes),
             columns: Vec::with_capacity(nodes),
             rank: vec![NOWHERE; nodes],
             component: vec![NOWHERE; nodes],
@@ -62,7 +69,7 @@ impl Solver {
 
     /// Bytes on the heap.
     pub fn bytes(&self) -> usize {
-        let node = 6 + size_of::<Column>() + 3 * size_of::<Matrix4<f64>>() + size_of::<Vector4<f64>>();
+        let node = 10 + size_of::<Column>() + 3 * size_of::<Matrix4<f64>>() + size_of::<Vector4<f64>>();
         let block = size_of::<Matrix4<f64>>() + 2;
         self.sets.len() * 8 + self.rank.len() * node + self.blocks.capacity() * block
     }
@@ -99,8 +106,18 @@ impl Solver {
             self.degrees[n] = if used[n] { count(&self.sets[n * self.words..][..self.words]) } else { NOWHERE };
         }
         self.find_components(used, fixed);
-        for rank in 0..used.iter().filter(|u| **u).count() {
-            let node = (0..used.len()).min_by_key(|n| self.degrees[*n])?;
+        self.left.clear();
+        self.left.extend((0..used.len() as u16).filter(|n| used[*n as usize]));
+        self.few.clear();
+        self.few.extend(self.left.iter().filter(|n| self.degrees[**n as usize] <= FEW));
+        for rank in 0..self.left.len() {
+            let node = match self.few.pop() {
+                Some(node) => node as usize,
+                None => {
+                    self.left.retain(|n| self.rank[*n as usize] == NOWHERE);
+                    *self.left.iter().min_by_key(|n| self.degrees[**n as usize])? as usize
+                }
+            };
             let start = self.rows.len();
             let words = node * self.words..(node + 1) * self.words;
             for w in 0..self.words {
@@ -124,7 +141,11 @@ impl Solver {
                 }
                 self.sets[other * self.words + node / 64] &= !(1 << (node % 64));
                 self.sets[other * self.words + other / 64] &= !(1 << (other % 64));
-                self.degrees[other] = count(&self.sets[other * self.words..][..self.words]);
+                let before =
+                    std::mem::replace(&mut self.degrees[other], count(&self.sets[other * self.words..][..self.words]));
+                if before > FEW && self.degrees[other] <= FEW {
+                    self.few.push(other as u16);
+                }
             }
             self.rank[node] = rank as u16;
             self.columns.push(Column { node: node as u16, start: start as u32, len: (self.rows.len() - start) as u32 });
@@ -189,9 +210,8 @@ impl Solver {
     }
 
     /// Adds an edge at the poses of its nodes.
-    pub fn add(&mut self, edge: &Edge, weight: f64, a: &Pose4, b: &Pose4) {
+    pub fn add(&mut self, edge: &Edge, information: &Matrix4<f64>, a: &Pose4, b: &Pose4) {
         let (r, [ja, jb]) = edge.residual(a, b);
-        let Some(information) = edge.covariance.try_inverse().map(|i| i * weight) else { return };
         let [ra, rb] = [edge.from, edge.to].map(|n| self.rank[n as usize]);
         self.diagonals[ra as usize] += ja.transpose() * information * ja;
         self.diagonals[rb as usize] += jb.transpose() * information * jb;
@@ -218,10 +238,13 @@ impl Solver {
             for i in range.clone() {
                 let row = self.rows[i] as usize;
                 let li = self.blocks[i];
-                self.diagonals[row] -= li * li.transpose();
+                let lt = li.transpose();
+                self.diagonals[row] -= li * lt;
+                // The column of that row has all the rows below, in the same order.
+                let mut at = self.columns[row].start as usize;
                 for k in i + 1..range.end {
-                    let update = self.blocks[k] * li.transpose();
-                    let at = self.block(row, self.rows[k]);
+                    at += self.rows[at..].iter().position(|r| *r == self.rows[k]).unwrap_or_default();
+                    let update = self.blocks[k] * lt;
                     self.blocks[at] -= update;
                 }
             }
