@@ -1,13 +1,13 @@
 //! `stipple-bench loops`: what recognising places is worth, and whether it errs.
 //!
-//! Three tables. Flights, in lockstep, by odometry: the error of the whole trajectory with loops and without, what was closed,
+//! Flights, in lockstep, by odometry: the error of the whole trajectory with loops and without, what was closed,
 //! and what was refused and why; a closure is false where it is off the truth. Places, at true poses: of the keyframes that
 //! revisit a place, how many recognise it, by the angle between the two views. Cost: CPU time of each keyframe, and bytes,
-//! with room for 2048 keyframes.
+//! with room for 2048 keyframes. Starts, resets and recordings: `relocalise`.
 
 use crate::inputs::{self, Folders};
 use crate::page::{count, millimetres, number, percent, text, Page, Part, Table};
-use crate::relocalise::{join, joined_table, relocalise, relocalised_table};
+use crate::relocalise::{against_each_other, against_table, join, joined_table, relocalise, relocalised_table};
 use crate::run::default_board;
 use crate::table;
 use serde_json::json;
@@ -38,7 +38,7 @@ const ANGLES: [f64; 4] = [0.0, 30.0, 60.0, 90.0];
 const HOLE: Span = Span(100_000_000);
 /// Keyframes at true poses: this far apart, m, rad.
 const APART: [f64; 2] = [0.3, 0.15];
-const KEYFRAMES: usize = 2048;
+pub const KEYFRAMES: usize = 2048;
 
 /// Loop closure: error with and without, false closures, recall, cost
 #[derive(clap::Args)]
@@ -54,7 +54,8 @@ pub struct Args {
     /// Starts in the map of an earlier flight
     #[arg(long, value_name = "N", default_value_t = 12)]
     starts: usize,
-    /// The flights whose name contains this alone; `places`, `relocalise` or `resets`: that table alone;
+    /// The flights whose name contains this alone; `places`, `relocalise`, `resets` or `recordings`: that table
+    /// alone;
     /// `relocalise-patrol`: starts in the whole patrol
     #[arg(long, value_name = "NAME")]
     only: Option<String>,
@@ -91,26 +92,35 @@ pub fn run(args: &Args) -> Result<(), Fault> {
             flown.push(measure(name, &scenario, args, &out)?);
         }
     }
-    if args.only.as_ref().is_none_or(|only| only == "places") {
+    let asked = |name: &str| args.only.as_ref().is_none_or(|only| only == name);
+    if asked("places") {
         recalls = places(args)?;
     }
-    let (mut starts, only) = (vec![], args.only.as_deref());
+    let (mut starts, mut resets, mut against) = (vec![], vec![], vec![]);
+    let whole = args.only.as_deref() == Some("relocalise-patrol");
     for (name, wanted) in
-        [("patrol-two", only.is_none_or(|only| only == "relocalise")), ("patrol", only == Some("relocalise-patrol"))]
+        ["patrol-two", "twins", "doors"].map(|n| (n, asked("relocalise"))).into_iter().chain([("patrol", whole)])
     {
         for seed in (1..=args.seeds).filter(|_| wanted) {
             starts.push(relocalise(name, seed, args.starts, &args.set, &out)?);
         }
     }
-    let mut resets = vec![];
-    for seed in (1..=args.seeds).filter(|_| only.is_none_or(|only| only == "resets")) {
+    for seed in (1..=args.seeds).filter(|_| asked("resets")) {
         resets.push(join("patrol-two", seed, &args.set, &out)?);
     }
-    let wrong: usize = flown.iter().map(|f| f.wrong).sum::<usize>()
-        + recalls.iter().map(|r| r.wrong).sum::<usize>()
-        + starts.iter().map(|r| r.wrong).sum::<usize>()
-        + resets.iter().map(|r| r.wrong).sum::<usize>();
-    let tables = [flights_table(flown), places_table(recalls), relocalised_table(starts), joined_table(resets)];
+    if asked("recordings") {
+        against = against_each_other(&args.folders.recordings()?)?;
+    }
+    let wrong = flown.iter().map(|f| f.wrong).chain(recalls.iter().map(|r| r.wrong));
+    let wrong = wrong.chain(starts.iter().map(|r| r.wrong)).chain(resets.iter().map(|r| r.wrong));
+    let wrong: usize = wrong.chain(against.iter().map(|r| r.wrong)).sum();
+    let tables = [
+        flights_table(flown),
+        places_table(recalls),
+        relocalised_table(starts),
+        joined_table(resets),
+        against_table(against),
+    ];
     tables.iter().for_each(|table| println!("{}", table.text()));
     println!("{wrong} false");
     let page = Page {
@@ -134,12 +144,33 @@ fn flights(args: &Args) -> Result<Vec<(String, Scenario)>, Fault> {
             list.push((format!("{name}, seed {seed}"), scenario));
         }
     }
+    if args.only.as_ref().is_some_and(|only| MEMS.contains(only.as_str())) {
+        for seed in 1..=args.seeds {
+            list.push((
+                format!("{MEMS}, seed {seed}"),
+                with_mems(Scenario { seed, ..Scenario::named("patrol").expect("a scenario") }),
+            ));
+        }
+    }
     for (name, start_s, [truth, imu]) in inputs::recorded(&args.folders.recordings()?) {
         let mut scenario = Scenario::from_euroc(&truth, Some(&imu))?;
         inputs::cut(&mut scenario, start_s, args.seconds);
         list.push((name.into(), scenario));
     }
     Ok(list)
+}
+
+/// The patrol of ten minutes with another inertial unit: flown where it is named.
+const MEMS: &str = "patrol with a BMI088";
+
+/// A flight with the inertial unit of a data sheet, the BMI088's: noise of 0.014 degrees/s and 175 µg per √Hz, offsets of 1 degree/s
+/// and 20 mg; biases walk as far in ten minutes as they would by 5 K (0.015 degrees/s and 0.2 mg each).
+fn with_mems(mut scenario: Scenario) -> Scenario {
+    let imu = &mut scenario.calibration.imu;
+    (imu.gyro_noise, imu.accel_noise) = (2.44e-4, 1.72e-3);
+    (imu.gyro_walk, imu.accel_walk) = (5.3e-5, 4e-4);
+    (scenario.imu_errors.gyro_bias, scenario.imu_errors.accel_bias) = (0.0175, 0.2);
+    scenario
 }
 
 /// Flies in lockstep without a map.

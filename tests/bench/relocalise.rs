@@ -3,10 +3,14 @@
 //! The first round of a patrol is flown and its places are kept. Then flights of a few seconds begin spread over the second
 //! round, in other light, with a new estimator, and only find their way (`stipple run --localise-only`).
 
-use crate::loops::is_false;
+use crate::inputs::{self, Flight};
+use crate::loops::{is_false, KEYFRAMES};
 use crate::page::{count, millimetres, number, percent, text, Table};
 use crate::run::default_board;
 use crate::table;
+use std::path::Path;
+use stipple::config::FrontendConfig;
+use stipple::loops::{LoopKeyframe, Loops};
 use stipple::output::metrics::{align, percentile};
 use stipple::output::OutputDir;
 use stipple::run::sensors::Input;
@@ -14,7 +18,7 @@ use stipple::run::{fly, Options, Pace, Steps};
 use stipple_drivers::replay::read_trajectory;
 use stipple_drivers::sim::Scenario;
 use stipple_drivers::types::pose_at;
-use stipple_drivers::{Fault, Span};
+use stipple_drivers::{Fault, Nanos, Span};
 
 /// Length of a flight that is to find itself, and the time that it has for it, s.
 const FLIGHT_S: f64 = 6.0;
@@ -83,6 +87,72 @@ pub fn relocalise(name: &str, seed: u64, starts: usize, set: &[String], out: &Ou
         }
     }
     Ok(result)
+}
+
+/// Recordings of one rig one after the other, each as an epoch of its own: which of them are taken for one place.
+pub struct Against {
+    name: String,
+    keyframes: usize,
+    joined: u64,
+    pub wrong: usize,
+}
+
+/// Keyframes are so far apart, s.
+const APART_S: f64 = 0.5;
+/// Length of a flight along a recorded path, s.
+const ALONG_S: f64 = 60.0;
+/// V1_01 was recorded twice, in one room: its keyframes, and a second at rest.
+const SAME_ROOM: &str = "euroc_V1_01";
+
+/// Each recording, and cameras simulated along recorded flights, against all before it.
+pub fn against_each_other(folder: &Path) -> Result<Vec<Against>, Fault> {
+    let mut loops: Option<Loops> = None;
+    let (mut list, mut seen): (Vec<Against>, Vec<String>) = (vec![], vec![]);
+    let recorded = ["euroc_MH_01_easy_11s", "euroc_V1_01_easy_keyframes", "euroc_V1_01_easy_static_1s"];
+    let there = recorded.into_iter().filter(|name| folder.join(name).is_dir());
+    let mut flights: Vec<(String, Flight)> = vec![];
+    for name in there {
+        flights.push((name.into(), inputs::read(&folder.join(name), f64::INFINITY)?));
+    }
+    for (name, start_s, [truth, imu]) in inputs::recorded(folder) {
+        let mut scenario = Scenario::from_euroc(&truth, Some(&imu))?;
+        inputs::cut(&mut scenario, start_s, ALONG_S);
+        // Rooms of one seed have the same pictures on their walls.
+        scenario.seed = flights.len() as u64;
+        flights.push((name.into(), inputs::rendered(scenario, ALONG_S)?));
+    }
+    for (epoch, (name, flight)) in flights.into_iter().enumerate() {
+        let known = match &mut loops {
+            Some(known) => known,
+            // One rig took all of them, by the calibration of the first.
+            None => loops.insert(Loops::new(&flight.calibration, &FrontendConfig::default(), KEYFRAMES)?),
+        };
+        let (before, mut last, mut keyframes) = (known.stats.epochs_joined, None::<Nanos>, 0);
+        for frames in &flight.frames {
+            let Some(odom_from_body) = pose_at(&flight.truth, frames.t, HOLE) else { continue };
+            if last.is_some_and(|last| (frames.t - last).secs() < APART_S) {
+                continue;
+            }
+            (last, keyframes) = (Some(frames.t), keyframes + 1);
+            let (t, id, before, body_from_cam) = (frames.t, None, None, None);
+            known.add(&LoopKeyframe { t, frames, id, epoch: epoch as u32, odom_from_body, before, body_from_cam });
+        }
+        let joined = known.stats.epochs_joined - before;
+        let same = name.starts_with(SAME_ROOM) && seen.iter().any(|s| s.starts_with(SAME_ROOM));
+        let wrong = joined.saturating_sub(u64::from(same)) as usize;
+        seen.push(name.clone());
+        list.push(Against { name, keyframes, joined, wrong });
+    }
+    Ok(list)
+}
+
+pub fn against_table(rows: Vec<Against>) -> Table {
+    table!("against", "Recordings of one rig, each against all before it", rows, |r| r.wrong > 0, [
+        text("recording") => r.name.clone(),
+        count("keyframes") => r.keyframes,
+        count("taken for an earlier one") => r.joined as usize,
+        count("false") => r.wrong,
+    ])
 }
 
 /// A patrol with its cameras black three times, each long enough that the estimator begins anew.
