@@ -22,6 +22,10 @@ const REMEMBERED_S: f64 = 5.0;
 /// A place in another frame needs so many verifications that agree with it, one of an earlier keyframe, and so many corners.
 const JOIN_AGREE: usize = 2;
 const JOIN_INLIERS: usize = 40;
+/// Any other place with this share of its corners speaks against it, be it seen as badly as this: a corridor of equal doors has
+/// 0.36 of them one door further.
+const JOIN_RIVAL_SHARE: f64 = 0.3;
+const RIVAL_MISFIT_MAX: f64 = 2.6;
 /// A place with this share of the corners that agree looks the same.
 const AMBIGUOUS_SHARE: f64 = 0.6;
 /// Squared deviations of 4 numbers that odometry may have drifted: 3 deviations of one. For a place that may be confused
@@ -109,6 +113,8 @@ struct Remembered {
     map: Pose4,
     sigma: [f64; 2],
     inliers: usize,
+    /// It is to be believed; else it only tells that another place may look the same.
+    strong: bool,
 }
 
 type Strong = (Verification, Remembered);
@@ -116,7 +122,7 @@ type Strong = (Verification, Remembered);
 /// Remembers what the last keyframes were verified with.
 #[derive(Default)]
 pub struct Judge {
-    remembered: List<Remembered, 32>,
+    remembered: List<Remembered, 64>,
     epoch: u32,
 }
 
@@ -136,14 +142,16 @@ impl Judge {
         if verified.is_empty() {
             return Verdict::None;
         }
-        let mut strong: List<Strong, 16> = List::default();
-        for v in verified.iter().filter(|v| is_strong(&v.verified)) {
+        let mut seen: List<Strong, 16> = List::default();
+        for v in verified.iter().filter(|v| is_rival(&v.verified)) {
             let map = graph.pose(v.node).compose(&v.verified.candidate_from_query);
             let c = &v.verified.covariance;
             let sigma = [(c[(0, 0)] + c[(1, 1)] + c[(2, 2)]).sqrt(), c[(3, 3)].sqrt()];
-            let (frame, inliers) = (frame_of(v.node), v.verified.inliers);
-            let _ = strong.push((*v, Remembered { t, odom, frame, map, sigma, inliers }));
+            let (frame, inliers, strong) = (frame_of(v.node), v.verified.inliers, is_strong(&v.verified));
+            let _ = seen.push((*v, Remembered { t, odom, frame, map, sigma, inliers, strong }));
         }
+        let mut strong = seen.clone();
+        strong.retain(|(_, r)| r.strong);
         // Others that agree with one: of this keyframe by other candidates, and of earlier keyframes.
         let support = |i: usize| {
             let others = strong.iter().enumerate().filter(|(j, _)| *j != i).map(|(_, (_, r))| r);
@@ -160,9 +168,9 @@ impl Judge {
         };
         let verdict = match (here, best(false)) {
             (Verdict::Accepted(_), _) | (_, None) => here,
-            (_, Some((count, _, i))) => self.weigh_join(&strong[i], count, &strong),
+            (_, Some((count, _, i))) => self.weigh_join(&strong[i], count, &seen),
         };
-        for (_, r) in strong.iter() {
+        for (_, r) in seen.iter() {
             if self.remembered.is_full() {
                 self.remembered.rotate_left(1);
                 let last = self.remembered.len() - 1;
@@ -176,13 +184,14 @@ impl Judge {
 
     /// Judges a place in another frame, that so many verifications agree with. No pose excludes a place that looks the same,
     /// so another keyframe has to say the same, and none may say otherwise.
-    fn weigh_join(&self, (v, r): &Strong, count: usize, strong: &[Strong]) -> Verdict {
+    fn weigh_join(&self, (v, r): &Strong, count: usize, seen: &[Strong]) -> Verdict {
         let before = self.remembered.iter().filter(|s| s.t != r.t && agree(r, s)).count();
         if before == 0 || count < JOIN_AGREE || r.inliers < JOIN_INLIERS {
             return Verdict::Alone;
         }
-        let all = strong.iter().map(|(_, s)| s).chain(self.remembered.iter());
-        let mut rivals = all.filter(|s| s.frame == r.frame && looks_alike(s, r) && is_elsewhere(&carried(s, r), r));
+        let all = seen.iter().map(|(_, s)| s).chain(self.remembered.iter());
+        let alike = |s: &&Remembered| s.inliers as f64 >= JOIN_RIVAL_SHARE * r.inliers as f64;
+        let mut rivals = all.filter(|s| s.frame == r.frame).filter(alike).filter(|s| is_elsewhere(&carried(s, r), r));
         match rivals.next() {
             Some(_) => Verdict::Ambiguous,
             None => Verdict::Joins(*v),
@@ -211,7 +220,7 @@ fn agree(a: &Remembered, b: &Remembered) -> bool {
     let within = |k: usize| AGREE[k].min(3.0 * a.sigma[k].hypot(b.sigma[k]));
     // The lever of the motion between them turns yaw into distance.
     let lever = (b.odom.p - a.odom.p).length() * b.sigma[1] * 3.0;
-    a.frame == b.frame && far <= (within(0) + lever).min(AGREE[0]) && angle <= within(1)
+    b.strong && a.frame == b.frame && far <= (within(0) + lever).min(AGREE[0]) && angle <= within(1)
 }
 
 fn is_strong(v: &Verified) -> bool {
@@ -222,6 +231,11 @@ fn is_strong(v: &Verified) -> bool {
         && v.misfit <= MISFIT_MAX
         && (0..3).all(|i| c[(i, i)] < SIGMA_MAX[0] * SIGMA_MAX[0])
         && c[(3, 3)] < SIGMA_MAX[1] * SIGMA_MAX[1]
+}
+
+/// Whether a verification is good enough to speak against another one.
+fn is_rival(v: &Verified) -> bool {
+    v.cells >= CELLS_MIN && v.misfit <= RIVAL_MISFIT_MAX
 }
 
 /// Compares a verification with what the graph knows, and with its rivals.

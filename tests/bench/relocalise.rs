@@ -1,7 +1,7 @@
 //! Relocalisation: how soon a vehicle that starts anywhere finds itself in the map of an earlier flight, and whether it errs.
 //!
-//! The first round of a patrol is flown and its places are kept. Then flights of a few seconds begin spread over the second
-//! round, in other light, with a new estimator, and only find their way (`stipple run --localise-only`).
+//! A patrol is flown and its places are kept. Then flights of a few seconds begin spread over it, each part in the light of the
+//! other round, with a new estimator, and only find their way (`stipple run --localise-only`).
 
 use crate::inputs::{self, Flight};
 use crate::loops::{is_false, KEYFRAMES};
@@ -39,15 +39,14 @@ pub struct Relocalised {
     ambiguous: usize,
 }
 
-/// Flies one round of a patrol, and `starts` short flights in its map.
+/// Flies a patrol, and `starts` short flights in its map.
 pub fn relocalise(name: &str, seed: u64, starts: usize, set: &[String], out: &OutputDir) -> Result<Relocalised, Fault> {
     let set: Vec<String> = std::iter::once("map.enabled=false".into()).chain(set.iter().cloned()).collect();
     let board = default_board(&set)?;
     let whole = Scenario { seed, ..Scenario::named(name).expect("a scenario") };
-    let second = whole.second_round().expect("a patrol");
     let folder = OutputDir::create(&out.file(&format!("{name}-{seed}-places")))?;
     let options = Options { pace: Pace::Lockstep(Steps::PerFrame(1)), fresh: true, ..Options::default() };
-    let first = Input::simulated(&Scenario { duration: second, ..whole.clone() }, |_, _| ())?;
+    let first = Input::simulated(&whole, |_, _| ())?;
     let truth = first.truth.clone();
     fly(first, &board, &folder, &options, None)?;
     let flown = read_trajectory(&folder.file("trajectory.tum"))?;
@@ -61,11 +60,11 @@ pub fn relocalise(name: &str, seed: u64, starts: usize, set: &[String], out: &Ou
         wrong: 0,
         ambiguous: 0,
     };
-    let room_s = whole.duration.secs() - second.secs() - FLIGHT_S;
+    let room_s = whole.duration.secs() - FLIGHT_S;
     for k in 0..starts {
-        let begin_s = second.secs() + room_s * (k as f64 * SPREAD).fract();
+        let begin_s = room_s * (k as f64 * SPREAD).fract();
         let [begin, duration] = [begin_s, begin_s + FLIGHT_S].map(Span::from_secs);
-        let scenario = Scenario { begin, duration, ..whole.clone() };
+        let scenario = Scenario { begin, duration, other_light: true, ..whole.clone() };
         let input = Input::simulated(&scenario, |_, _| ())?;
         let truth = input.truth.clone();
         let options = Options { localise_only: true, fresh: false, ..options.clone() };

@@ -88,8 +88,9 @@ pub struct Sim {
     aids: Vec<AidReading>,
     biases: Vec<Bias>,
     room: Room,
-    /// That of a patrol.
+    /// That of a patrol, and whether the light of its rounds is exchanged.
     route: Option<Route>,
+    other_light: bool,
     person: Option<Person>,
     lenses: Vec<Lens>,
     /// Logarithm of the gain every `METER_PERIOD` from the first frame.
@@ -164,6 +165,7 @@ impl Sim {
             biases,
             room,
             route,
+            other_light: scenario.other_light,
             person,
             lenses,
             log_gain: Vec::new(),
@@ -287,7 +289,8 @@ impl Sim {
 
     /// Lights the room as it is at `t`.
     fn light_up(&mut self, t: Nanos) {
-        self.room.late = self.route.as_ref().map_or(0.0, |route| route.late(t - self.start) as f32);
+        let late = self.route.as_ref().map_or(0.0, |route| route.late(t - self.start) as f32);
+        self.room.late = if self.other_light { 1.0 - late } else { late };
     }
 
     fn view(&self, t: Nanos, camera: usize) -> View {

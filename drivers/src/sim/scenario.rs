@@ -37,6 +37,8 @@ pub struct Scenario {
     pub sensor: Sensor,
     /// Changes of the exposure.
     pub light: Light,
+    /// A patrol has the light of the second round in the first, and the other way around.
+    pub other_light: bool,
     /// Errors of the cameras beyond the calibration.
     pub camera_errors: CameraErrors,
     /// Errors of the inertial unit beyond the calibration.
@@ -183,6 +185,7 @@ impl Scenario {
             seed: 1,
             duration: Span::from_secs(secs),
             begin: Span(0),
+            other_light: false,
             rate_hz: 20.0,
             calibration: euroc_rig(),
             image_divisor: 1,
