@@ -22,10 +22,12 @@ const REMEMBERED_S: f64 = 5.0;
 /// A place in another frame needs so many verifications that agree with it, one of an earlier keyframe, and so many corners.
 const JOIN_AGREE: usize = 2;
 const JOIN_INLIERS: usize = 40;
-/// Any other place with this share of its corners speaks against it, be it seen as badly as this: a corridor of equal doors has
-/// 0.36 of them one door further.
-const JOIN_RIVAL_SHARE: f64 = 0.3;
-const RIVAL_MISFIT_MAX: f64 = 2.6;
+/// Another place, so far away, with this share of its corners speaks against it, where the corners agree at least so well and say
+/// so precisely where they are seen from: a corridor of equal doors has 0.36 of them one door, 3 m, further.
+const JOIN_RIVAL_SHARE: f64 = 0.35;
+const JOIN_RIVAL_M: f64 = 2.0;
+const RIVAL_MISFIT_MAX: f64 = 2.4;
+const RIVAL_YAW_SIGMA_MAX: f64 = 0.025;
 /// A place with this share of the corners that agree looks the same.
 const AMBIGUOUS_SHARE: f64 = 0.6;
 /// Squared deviations of 4 numbers that odometry may have drifted: 3 deviations of one. For a place that may be confused
@@ -191,7 +193,8 @@ impl Judge {
         }
         let all = seen.iter().map(|(_, s)| s).chain(self.remembered.iter());
         let alike = |s: &&Remembered| s.inliers as f64 >= JOIN_RIVAL_SHARE * r.inliers as f64;
-        let mut rivals = all.filter(|s| s.frame == r.frame).filter(alike).filter(|s| is_elsewhere(&carried(s, r), r));
+        let far = |s: &&Remembered| (carried(s, r).p - r.map.p).length() > JOIN_RIVAL_M;
+        let mut rivals = all.filter(|s| s.frame == r.frame).filter(alike).filter(far);
         match rivals.next() {
             Some(_) => Verdict::Ambiguous,
             None => Verdict::Joins(*v),
@@ -235,7 +238,7 @@ fn is_strong(v: &Verified) -> bool {
 
 /// Whether a verification is good enough to speak against another one.
 fn is_rival(v: &Verified) -> bool {
-    v.cells >= CELLS_MIN && v.misfit <= RIVAL_MISFIT_MAX
+    v.cells >= CELLS_MIN && v.misfit <= RIVAL_MISFIT_MAX && v.covariance[(3, 3)].sqrt() <= RIVAL_YAW_SIGMA_MAX
 }
 
 /// Compares a verification with what the graph knows, and with its rivals.
