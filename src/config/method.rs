@@ -276,7 +276,8 @@ section! {
 }
 
 section! {
-    /// Loop closure: places that are recognised correct the drift of odometry.
+    /// Loop closure: places that are recognised correct the drift of odometry, and join what was mapped before a reset or by an earlier
+    /// run. They are kept in `places` of the run's folder where the board has a store.
     LoopsConfig, "loops.";
     /// Whether places are recognised. It takes two cameras that see the same.
     enabled: bool = true;

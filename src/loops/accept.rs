@@ -98,7 +98,7 @@ pub enum Verdict {
 pub struct Asker {
     pub node: u16,
     pub t: Nanos,
-    /// Of the estimator, and its pose there.
+    /// Epoch of the estimator, and the pose in its frame.
     pub epoch: u32,
     pub odom: Pose4,
     /// The frame that its node is in.

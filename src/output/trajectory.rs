@@ -24,7 +24,7 @@ impl<W: Write> TumWriter<'_, W> {
 
     pub fn pose(&mut self, epoch: u32, pose: &TimedPose) -> io::Result<()> {
         if epoch != self.epoch {
-            writeln!(self.out, "# epoch {epoch}: its frame is where dead reckoning guessed it")?;
+            writeln!(self.out, "# epoch {epoch}: in a frame that dead reckoning guessed, unless a place from before was recognised since")?;
             self.epoch = epoch;
         }
         write_line(self.out, pose)

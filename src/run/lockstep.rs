@@ -150,10 +150,8 @@ pub fn fly(
                 let Some(packet) = waker.wait(&ended, || done.pop()) else { return };
                 sent -= 1;
                 keyframes.pass_on(&packet, ring.as_deref(), &counters);
-                for (placed, notice) in keyframes.loops.iter().flat_map(|l| l.queue.closed()) {
-                    gauges.set_map_from_odom(placed);
-                    notice.iter().for_each(|(id, line)| status.say(*id, line));
-                }
+                let closed = keyframes.loops.iter().flat_map(|l| l.queue.closed());
+                closed.filter_map(|closed| gauges.set_closed(closed)).for_each(|(id, line)| status.say(id, &line));
                 gauges.set_epoch(packet.epoch, packet.health);
                 if let Some(line) = status.epoch_begun(&gauges) {
                     status.say(EventId::Epoch, &line);

@@ -415,8 +415,8 @@ pub fn fly_in_real_time(
             }
             let _ = s.mailbox.spare.push(packet);
         };
-        let say = |(placed, notice): (_, Option<Notice>)| {
-            s.gauges.set_map_from_odom(placed);
+        let say = |closed| {
+            let notice = s.gauges.set_closed(closed);
             status::count_lost(notice.map_or(Ok(()), |notice| s.mailbox.notices.push(notice)));
         };
         let closing = closing.map(|closing| spawn(scope, "loops", move || closing.run(&s.tracking_done, say)));

@@ -69,15 +69,18 @@ impl Gauges {
         self.latency_us_most.fetch_max(packet.begun.elapsed().as_micros() as u64, Relaxed);
     }
 
-    /// Takes note of where `odom` is in the map.
-    pub fn set_map_from_odom(&self, placed: MapFromOdom) {
-        *self.map_from_odom.lock().unwrap_or_else(PoisonError::into_inner) = placed;
+    /// Where `odom` is in the map, once a place was recognised.
+    fn map_from_odom(&self) -> Option<MapFromOdomMessage> {
+        let MapFromOdom { t, count, epoch, pose, covariance } =
+            *self.map_from_odom.lock().unwrap_or_else(PoisonError::into_inner);
+        let (position, yaw) = (pose.p.to_array(), pose.yaw);
+        (count > 0).then_some(MapFromOdomMessage { t_ns: t.0, count, epoch, position, yaw, covariance })
     }
 
-    /// Where `odom` is in the map, once a place was recognised.
-    fn map_from_odom(&self) -> Option<MapFromOdom> {
-        let placed = *self.map_from_odom.lock().unwrap_or_else(PoisonError::into_inner);
-        (placed.count > 0).then_some(placed)
+    /// Takes note of a loop that was closed; answers the line about it.
+    pub fn set_closed(&self, (placed, notice): (MapFromOdom, Option<Notice>)) -> Option<Notice> {
+        *self.map_from_odom.lock().unwrap_or_else(PoisonError::into_inner) = placed;
+        notice
     }
 
     /// Takes note of what was found of the rig by a frame.
@@ -249,7 +252,7 @@ impl Status {
     pub fn log_counters(&mut self, counters: &Counters, g: &Gauges) {
         let placed = g.map_from_odom().filter(|placed| placed.count != self.placed);
         if let (Some(placed), Some(log)) = (placed, &self.log) {
-            log.map_from_odom(&placed);
+            log.map_from_odom(placed);
             self.placed = placed.count;
         }
         if Instant::now() < self.next_count {
@@ -290,7 +293,7 @@ impl Status {
                 psnr_db: (psnr > 0).then_some(psnr as f64 * 0.01),
             },
             governor: self.governor.clone(),
-            map_from_odom: g.map_from_odom().map(|placed| MapFromOdomMessage::from(&placed)),
+            map_from_odom: g.map_from_odom(),
             counters: counters.list().into_iter().map(|(name, n)| (name.into(), n)).collect(),
         });
     }

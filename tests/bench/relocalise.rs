@@ -69,9 +69,11 @@ pub fn relocalise(name: &str, seed: u64, starts: usize, set: &[String], out: &Ou
         let truth = input.truth.clone();
         let options = Options { localise_only: true, fresh: false, ..options.clone() };
         let report = fly(input, &board, &folder, &options, None)?.report;
-        result.ambiguous += report.counted().find(|(n, _)| *n == "loops_ambiguous").map_or(0, |(_, n)| n as usize);
+        let counter = |name: &str| report.counted().find(|(n, _)| *n == name).map_or(0, |(_, n)| n as usize);
+        result.ambiguous += counter("loops_ambiguous");
         let Some(found) = report.loops.iter().find(|l| l.joins) else {
-            eprintln!("{}: not found from {:.1} s on", result.name, begin_s);
+            let why = ["none", "weak", "alone", "ambiguous"].map(|why| counter(&format!("loops_{why}")));
+            eprintln!("{}: not found from {begin_s:.1} s on: none, weak, alone, ambiguous {why:?}", result.name);
             continue;
         };
         result.after_s.push((found.t_ns - truth[0].t.0) as f64 * 1e-9);

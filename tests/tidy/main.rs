@@ -15,7 +15,7 @@ const COMMON: [&str; 5] = ["math", "mem", "limits", "config", "counters"];
 /// not here sees only the common ones.
 const EDGES: [(&str, &[&str]); 8] = [
     ("vio", &["frontend"]),
-    ("loops", &["frontend"]),
+    ("loops", &["frontend", "store"]),
     ("stereo", &["gpu"]),
     ("map", &["gpu", "stereo", "store"]),
     ("output", &["map", "store", "vio"]),
@@ -42,8 +42,8 @@ const RUST_LINES_MAX: usize = 600;
 const FUNCTION_LINES_MAX: usize = 90;
 const KERNEL_LINES_MAX: usize = 250;
 /// Lines of code that the product may have, and its estimator, frontend, mapper, GPU core, stereo and kernels together.
-const CODE_MAX: usize = 49_500;
-const CORE_MAX: usize = 18_650;
+const CODE_MAX: usize = 50_200;
+const CORE_MAX: usize = 18_850;
 const CORE: [&str; 10] = [
     "src/vio/",
     "src/frontend/",

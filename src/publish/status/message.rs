@@ -1,7 +1,6 @@
 //! What the status socket tells, as lines of JSON and as text for Prometheus.
 
 use super::About;
-use crate::loops::MapFromOdom;
 use crate::publish::turned::Turned;
 use crate::publish::{Event, Source, State};
 use glam::DQuat;
@@ -108,13 +107,6 @@ pub struct MapFromOdomMessage {
     pub yaw: f64,
     /// Row by row, of the vehicle's position and yaw in the map at that stamp, m and rad.
     pub covariance: [[f64; 4]; 4],
-}
-
-impl From<&MapFromOdom> for MapFromOdomMessage {
-    fn from(m: &MapFromOdom) -> MapFromOdomMessage {
-        let &MapFromOdom { t, count, epoch, pose, covariance } = m;
-        MapFromOdomMessage { t_ns: t.0, count, epoch, position: pose.p.to_array(), yaw: pose.yaw, covariance }
-    }
 }
 
 /// How a run goes, told by its main thread once a second.

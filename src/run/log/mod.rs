@@ -17,7 +17,6 @@ mod tests;
 
 use super::threads;
 use crate::limits::CAMERAS_MAX;
-use crate::loops::MapFromOdom;
 use crate::mem::{cut, Footprint, List};
 use crate::publish::event::EventId;
 use crate::publish::status::message::MapFromOdomMessage;
@@ -284,8 +283,8 @@ impl LogSender {
         self.0.push(Content::Rig(rig));
     }
 
-    pub fn map_from_odom(&self, placed: &MapFromOdom) {
-        self.0.push(Content::MapFromOdom(placed.into()));
+    pub fn map_from_odom(&self, placed: MapFromOdomMessage) {
+        self.0.push(Content::MapFromOdom(placed));
     }
 
     /// Half of the queue is left to what comes once a frame, and to events.
