@@ -5,7 +5,7 @@ mod flight;
 
 use flight::{board, flight, train};
 use std::path::Path;
-use stipple::map::{Evaluation, Keyframe, Mapper, Place};
+use stipple::map::{Evaluation, Keyframe, Mapper, Place, StepKind};
 use stipple::mem::{heap_after_seal, seal_thread, CountingAllocator};
 use stipple_drivers::Calibration;
 
@@ -93,7 +93,7 @@ fn a_room_denser_than_the_pool_gains_by_a_store() {
 }
 
 #[test]
-fn a_mapper_of_the_same_flight_goes_on_with_what_is_on_disk_and_another_flight_does_not() {
+fn a_mapper_of_the_same_flight_goes_on_with_what_is_on_disk_and_another_flight_when_it_is_joined() {
     let (calibration, keyframes) = flight(8);
     let dir = tempfile::tempdir().unwrap();
     let run = |flight: i64| opened(&calibration, &[], Some(place(dir.path(), flight)));
@@ -112,8 +112,21 @@ fn a_mapper_of_the_same_flight_goes_on_with_what_is_on_disk_and_another_flight_d
     assert!((0..2).all(|i| (after[i] - before[i]).abs() < 0.1), "{before:?} {after:?}");
     train(&mut again, STEPS);
     drop(again);
-    let other = run(2);
-    assert_eq!((other.splat_count(), other.keyframe_count()), (0, 0));
+    // Another knows of it, and nothing of it is its own: a view of the same place is all uncovered, until both are joined.
+    let see_again = |flight: i64, joined: bool| {
+        let mut other = run(flight);
+        let (id, epoch) = other.first_numbers();
+        assert!(other.splat_count() > 0 && other.keyframe_count() as u64 == id && epoch > 0);
+        assert_eq!(other.evaluate().unwrap().psnr_db, None);
+        if joined {
+            other.join(Some(1), 0, 0);
+        }
+        let stored = other.ingest(&Keyframe { id, epoch, ..keyframes[0].clone() }).unwrap();
+        (matches!(stored, StepKind::Anchor { .. }), other.evaluate().unwrap().psnr_db.unwrap())
+    };
+    assert!(see_again(2, false).0, "it makes an anchor of its own");
+    let (anchor, psnr_db) = see_again(3, true);
+    assert!(!anchor && psnr_db > before[0] - 2.0, "{anchor} {psnr_db} {before:?}");
 }
 
 #[test]

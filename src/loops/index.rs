@@ -1,8 +1,8 @@
 //! Place index: which places have descriptors that agree with given ones in some run of bits.
 //!
 //! Hash tables over disjoint runs of 16 bits (locality-sensitive hashing, Indyk and Motwani 1998): descriptors of the same
-//! corner differ in some bits, but hardly in all runs. Each bucket is a list of fixed size; a full one loses an
-//! entry, another with each place. Memory is taken once.
+//! corner differ in some bits, but hardly in all runs. Each bucket is a list of fixed size; of more places it keeps some drawn at
+//! random, each as likely (reservoir sampling, Vitter 1985), or the newest would look like everything. Memory is taken once.
 
 use super::features::Descriptor;
 
@@ -24,6 +24,8 @@ pub struct Candidate {
 pub struct PlaceIndex {
     /// `entries[(table * BUCKETS + bucket) * BUCKET..]`
     entries: Vec<u16>,
+    /// Places that each bucket was given, as far as a byte counts.
+    given: Vec<u8>,
     /// Votes of each place, zero between queries.
     votes: Vec<f32>,
     /// Places that have votes.
@@ -36,6 +38,7 @@ impl PlaceIndex {
         let places = places.min(NONE as usize);
         PlaceIndex {
             entries: vec![NONE; TABLES * BUCKETS * BUCKET],
+            given: vec![0; TABLES * BUCKETS],
             votes: vec![0.0; places],
             voted: Vec::with_capacity(places),
         }
@@ -43,7 +46,7 @@ impl PlaceIndex {
 
     /// Bytes that it takes.
     pub fn bytes(&self) -> usize {
-        size_of::<Self>() + self.entries.len() * 2 + self.votes.len() * 4 + self.voted.capacity() * 2
+        size_of::<Self>() + self.entries.len() * 2 + self.given.len() + self.votes.len() * 4 + self.voted.capacity() * 2
     }
 
     /// Adds the descriptors of a place.
@@ -54,8 +57,13 @@ impl PlaceIndex {
             if list.contains(&place) {
                 continue;
             }
-            let free = list.iter().position(|e| *e == NONE).unwrap_or(place as usize % BUCKET);
-            list[free] = place;
+            let given = usize::from(self.given[bucket]);
+            self.given[bucket] = self.given[bucket].saturating_add(1);
+            let free = list.iter().position(|e| *e == NONE);
+            let at = free.unwrap_or_else(|| drawn(place, bucket) % (given + 1).max(BUCKET));
+            if at < BUCKET {
+                list[at] = place;
+            }
         }
     }
 
@@ -64,6 +72,7 @@ impl PlaceIndex {
         for bucket in descriptors.flat_map(buckets) {
             let list = &mut self.entries[bucket * BUCKET..][..BUCKET];
             list.iter_mut().filter(|e| **e == place).for_each(|e| *e = NONE);
+            self.given[bucket] = self.given[bucket].saturating_sub(1);
         }
     }
 
@@ -102,6 +111,14 @@ impl PlaceIndex {
         }
         found
     }
+}
+
+/// A number that is as good as random for a place in a bucket (the mixing of SplitMix64).
+fn drawn(place: u16, bucket: usize) -> usize {
+    let mut x = (u64::from(place) << 32 | bucket as u64).wrapping_add(0x9e37_79b9_7f4a_7c15);
+    x = (x ^ (x >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+    x = (x ^ (x >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+    (x ^ (x >> 31)) as usize
 }
 
 /// The buckets of a descriptor, one of each table: 16 of every 32 bits.
@@ -171,12 +188,19 @@ mod tests {
     }
 
     #[test]
-    fn a_bucket_that_is_full_loses_one() {
-        let mut index = PlaceIndex::new(32);
+    fn a_bucket_that_is_full_keeps_any_as_likely() {
         let same = [[0x1234_5678_9abc_def0; 4]];
-        (0..=BUCKET as u16).for_each(|place| index.insert(place, same.iter()));
-        let mut best = [Candidate::default(); 32];
-        let n = index.query(same.iter(), |_| true, &mut best);
-        assert_eq!((n, best[..n].iter().any(|c| c.place == 0)), (BUCKET, false));
+        let (mut kept, mut early) = (0, 0);
+        for first in 0..200u16 {
+            let mut index = PlaceIndex::new(8192);
+            (0..28).for_each(|k| index.insert(first * 28 + k, same.iter()));
+            let mut best = [Candidate::default(); 32];
+            let n = index.query(same.iter(), |_| true, &mut best);
+            // The four words are equal, and so are the buckets of each half; a list has 7 of 28.
+            kept += n;
+            early += best[..n].iter().filter(|c| c.place < first * 28 + 14).count();
+        }
+        let share = early as f64 / kept as f64;
+        assert!((0.45..0.55).contains(&share), "{share}: the newest do not push out the oldest");
     }
 }

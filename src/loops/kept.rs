@@ -6,11 +6,12 @@
 
 use super::features::{Feature, FEATURES};
 use super::pose4::Pose4;
+use crate::mem::unsealed;
 use crate::store::{self, About, Disk, Key, Limits, Reader, Store};
 use bytemuck::{Pod, Zeroable};
 use glam::{DQuat, DVec3};
-use std::path::Path;
-use stipple_drivers::{Calibration, Fault, FaultKind, Nanos};
+use std::path::{Path, PathBuf};
+use stipple_drivers::{host, Calibration, Fault, FaultKind, Nanos};
 
 /// Version of the records' form; places of another are refused.
 const FORM: u32 = 1;
@@ -151,18 +152,23 @@ pub fn read(folder: &Path, calibration: &Calibration) -> Result<Vec<(KeptPlace, 
     Ok(places)
 }
 
-/// Writes places as they come, on the thread that finds them.
+/// Writes places as they come, on the thread that finds them. The store is opened when the first one comes, so that a run that
+/// ends before leaves nothing.
 pub struct Keeper {
-    store: Store,
-    disk: Disk,
+    folder: PathBuf,
+    identity: u64,
+    limits: Limits,
+    open: Option<(Store, Disk)>,
+    /// It could not be opened.
+    failed: bool,
 }
 
 fn limits(places: usize) -> Limits {
     let place = store::record_bytes(FEATURES * size_of::<Feature>()) as u64;
     let payload_max = (FEATURES * size_of::<Feature>()).max(places * size_of::<PlacePose>());
     Limits {
-        // Half of a store holds records; a quarter more for what segments lack at their ends.
-        bytes_max: (5 * place * places as u64 / 2).max(8 * SEGMENT_BYTES),
+        // Half of a store holds records, seven eighths of them new ones, less three segments.
+        bytes_max: (7 * place * places as u64 / 2).max(8 * SEGMENT_BYTES),
         segment_bytes: SEGMENT_BYTES,
         records_max: places + 64,
         payload_max,
@@ -172,10 +178,20 @@ fn limits(places: usize) -> Limits {
 }
 
 impl Keeper {
-    /// Opens or makes the store for so many places. Fails where it cannot be written, or is another rig's.
-    pub fn open(folder: &Path, calibration: &Calibration, places: usize) -> Result<Keeper, Fault> {
-        let (store, disk) = Store::open(folder, identity(calibration), &limits(places))?;
-        Ok(Keeper { store, disk })
+    /// For so many places, in the store of a folder. Fails where the disk has no room for them.
+    pub fn new(folder: &Path, calibration: &Calibration, places: usize) -> Result<Keeper, Fault> {
+        let limits = limits(places);
+        let free = folder.parent().and_then(host::disk_free).unwrap_or(u64::MAX);
+        if free < 2 * limits.bytes_max {
+            let what = format!(
+                "has {} MiB of free space, less than twice the {} of places",
+                free >> 20,
+                limits.bytes_max >> 20
+            );
+            let fix = "make room, or name another --out folder";
+            return Err(Fault::new(FaultKind::NoOutput, folder.display().to_string(), what, fix));
+        }
+        Ok(Keeper { folder: folder.into(), identity: identity(calibration), limits, open: None, failed: false })
     }
 
     /// Host memory that it takes.
@@ -183,15 +199,24 @@ impl Keeper {
         Store::footprint(&limits(places))
     }
 
+    /// The store, where it is open or can be opened.
+    fn store(&mut self) -> Option<&mut Store> {
+        if self.open.is_none() && !self.failed {
+            self.open = unsealed(|| Store::open(&self.folder, self.identity, &self.limits)).ok();
+            self.failed = self.open.is_none();
+        }
+        self.open.as_mut().map(|(store, _)| store)
+    }
+
     fn serve(&self) {
-        crate::mem::unsealed(|| self.disk.serve());
+        self.open.iter().for_each(|(_, disk)| unsealed(|| disk.serve()));
     }
 
     /// Writes a place; false where the disk does not take it.
     pub fn put(&mut self, place: &KeptPlace, features: &[Feature]) -> bool {
         let key = Key { kind: KIND_PLACE, run: 0, id: place.number };
         let fill = |payload: &mut Vec<u8>| payload.extend_from_slice(bytemuck::cast_slice(features));
-        let taken = self.store.put(key, &place.encode(), fill);
+        let taken = self.store().is_some_and(|store| store.put(key, &place.encode(), fill));
         self.serve();
         taken
     }
@@ -203,13 +228,14 @@ impl Keeper {
                 payload.extend_from_slice(bytemuck::bytes_of(&PlacePose { number, frame, map: numbers(&map) }));
             }
         };
-        let taken = self.store.put(POSES_KEY, &[0; store::ABOUT], fill);
+        let taken = self.store().is_some_and(|store| store.put(POSES_KEY, &[0; store::ABOUT], fill));
         self.serve();
         taken
     }
 
     pub fn remove(&mut self, number: u32) {
-        self.store.remove(Key { kind: KIND_PLACE, run: 0, id: number });
+        let key = Key { kind: KIND_PLACE, run: 0, id: number };
+        let _ = self.store().is_some_and(|store| store.remove(key));
         self.serve();
     }
 }

@@ -234,7 +234,7 @@ impl LoopClosing {
             store::set_aside(&folder)?;
         }
         let places = kept::read(&folder, calibration)?;
-        let keeper = if read_only { None } else { Some(Keeper::open(&folder, calibration, keyframes(board))?) };
+        let keeper = if read_only { None } else { Some(Keeper::new(&folder, calibration, keyframes(board))?) };
         loops.remember(flight, &places, keeper);
         self.queue.lost.store(!places.is_empty(), Relaxed);
         Ok(places.len())
