@@ -19,7 +19,7 @@ const KIND_PLACE: u8 = 1;
 const KIND_POSES: u8 = 2;
 const POSES_KEY: Key = Key { kind: KIND_POSES, run: 0, id: 0 };
 const SEGMENT_BYTES: u64 = 4 << 20;
-/// A record put and one that waits for it.
+/// Records between here and the disk; each is written at once, so few are enough.
 const BUFFERS: usize = 4;
 // Records are copied as they are in memory.
 const _: () = assert!(cfg!(target_endian = "little"));

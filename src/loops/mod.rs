@@ -46,8 +46,8 @@ const OLD_S: f64 = 20.0;
 /// nothing but loops holds together.
 const REST_S: f64 = 1.0;
 const FRESH_S: f64 = 10.0;
-/// Candidates by looks of which those are chosen that are not all at one place, where the vehicle may be anywhere: so many, and
-/// of those within this, m, two.
+/// Candidates by looks where the vehicle may be anywhere. Of those that are nearer to each other than this, m, two are verified, so
+/// that a place that looks the same is among them.
 const ANYWHERE: usize = 32;
 const APART_M: f64 = 2.0;
 /// Deviations of the map of an earlier flight, whose places stay where they are: m, rad.
