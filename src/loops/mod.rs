@@ -123,8 +123,9 @@ pub struct Place {
 #[derive(Clone, Copy, Debug)]
 pub struct Closure {
     pub t: Nanos,
-    /// Stamp of the keyframe that was recognised.
+    /// Stamp of the keyframe that was recognised, and whether it is of an earlier flight and by the clock of that.
     pub with: Nanos,
+    pub earlier: bool,
     /// Corners that agree.
     pub inliers: usize,
     /// Pose of this keyframe's level frame in that of the one that was recognised.
@@ -446,7 +447,8 @@ impl Loops {
             Verdict::Joins(best) => (best, Some(self.places[best.node as usize].epoch)),
             _ => return None,
         };
-        let with = self.places[best.node as usize].t;
+        let Place { t: with, epoch: seen_in, .. } = self.places[best.node as usize];
+        let earlier = seen_in.flight != self.flight;
         self.recognised = Some((with, best.verified.candidate_from_query));
         let since = |last: Option<Nanos>| last.map_or(f64::INFINITY, |last| (t - last).secs());
         let fresh = joins.is_some() || since(self.last_joined) <= FRESH_S;
@@ -466,7 +468,8 @@ impl Loops {
         let (count, epoch) = (self.map_from_odom.count + 1, epoch.number);
         self.map_from_odom = MapFromOdom { t, count, epoch, pose: now.compose(&odom.inverse()), covariance };
         let moved = [(now.p - was.p).length(), pose4::wrapped(now.yaw - was.yaw).abs()];
-        let closure = Closure { t, with, inliers: v.inliers, measured: v.candidate_from_query, moved, joins };
+        let measured = v.candidate_from_query;
+        let closure = Closure { t, with, earlier, inliers: v.inliers, measured, moved, joins };
         if self.closures.len() < CLOSURES {
             self.closures.push(closure);
         }

@@ -20,12 +20,14 @@ use super::coarseness::Coarseness;
 use super::coverage::{Coverage, KeyframeView};
 use super::densify::{densify, mean};
 use super::diffusion::Diffusion;
+use super::evaluate;
 use super::horizon::Horizon;
 use super::keyframes::Keyframe;
 use super::occupancy::{self, Occupancy};
 use super::parts::PARTS;
 use super::pool::FREE_DIVISOR;
 use super::scene::Scene;
+use super::seam::depth_disagreement;
 use super::seeds::{Seed, Seeder};
 use super::view::View;
 use super::views::Views;
@@ -43,6 +45,8 @@ const STEPS_MIN: usize = 8;
 /// A whole uncovered view may take one in so many of the pool where others are evicted for it.
 const POOL_DIVISOR: usize = 16;
 
+/// Anchors that tell how far the map's surfaces are from those of stereo.
+const JUDGED: usize = 4;
 /// Seeds lie where an earlier visit left Gaussians if they share a cell that is so many times as wide as the occupancy grid's:
 /// depth is no better far away.
 const VISIT_CELLS: f32 = 5.0;
@@ -95,6 +99,8 @@ pub struct Anchors {
     anchored_at: u64,
     /// Part of its seeds that lie where an earlier visit left Gaussians.
     seen_part: f64,
+    /// `depth_disagreement` of the newest.
+    disagreements: [Option<f64>; JUDGED],
 }
 
 impl Anchors {
@@ -106,7 +112,20 @@ impl Anchors {
         config: &MapConfig,
     ) -> Result<Anchors, Fault> {
         let occupancy = Occupancy::new(gpu, buffers, config.occupancy_cell_m)?;
-        Ok(Anchors { config: config.clone(), pair, work, occupancy, anchored_at: 0, seen_part: 0.0 })
+        Ok(Anchors {
+            config: config.clone(),
+            pair,
+            work,
+            occupancy,
+            anchored_at: 0,
+            seen_part: 0.0,
+            disagreements: [None; JUDGED],
+        })
+    }
+
+    /// Mean `depth_disagreement` of the newest anchors.
+    pub fn disagreement(&self) -> Option<f64> {
+        evaluate::mean(&self.disagreements)
     }
 
     /// Takes over another rectification.
@@ -146,6 +165,10 @@ impl Anchors {
         }
         if !self.match_depth(scene, stereo, keyframe) {
             return Ok(None);
+        }
+        if let Some(found) = depth_disagreement(&scene.rendered, &self.work.depth.metres, stereo.views.valid_mask()) {
+            self.disagreements.rotate_right(1);
+            self.disagreements[0] = Some(found);
         }
         if let Some(pair) = &mut self.pair {
             pair.distort(&self.work.depth.metres, &view.camera);

@@ -89,7 +89,7 @@ const ALIGN_RATE: f64 = 2e-3;
 const ALIGN_DECAY: f64 = 0.93;
 
 /// Mean of what could be measured.
-fn mean(values: &[Option<f64>]) -> Option<f64> {
+pub fn mean(values: &[Option<f64>]) -> Option<f64> {
     let n = values.iter().flatten().count();
     (n > 0).then(|| values.iter().flatten().sum::<f64>() / n as f64)
 }
@@ -202,7 +202,7 @@ fn bring(scene: &mut Scene, archive: &mut Option<Archive>, index: usize) -> Resu
 }
 
 /// Renders a keyframe, in its exposure, and compares; `None` where nothing is valid.
-fn score(scene: &mut Scene, index: usize) -> Result<Option<f64>, GpuError> {
+pub fn score(scene: &mut Scene, index: usize) -> Result<Option<f64>, GpuError> {
     let view = scene.view(index);
     scene.render(&view)?;
     show(scene, scene.views.exposure(index));

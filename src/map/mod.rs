@@ -35,6 +35,7 @@ mod runs;
 mod saving;
 mod scene;
 pub mod schedule;
+mod seam;
 mod seeds;
 mod seen;
 pub mod shape;
@@ -57,7 +58,7 @@ use archive::Archive;
 use cameras::RectifiedPair;
 use scene::Scene;
 use std::time::Instant;
-use stipple_drivers::{Calibration, Fault, Pose};
+use stipple_drivers::{Calibration, Fault, Nanos, Pose};
 use trainer::Trainer;
 use views::Views;
 
@@ -68,6 +69,7 @@ pub use keyframes::{Keyframe, PoseCorrection};
 pub use pipeline::Pipeline;
 pub use pool::Gaussian;
 pub use render::Rendered;
+pub use seam::{Seam, SeamScore, SeamScores};
 pub use shape::Shape;
 
 #[cfg(feature = "instruments")]
@@ -375,6 +377,18 @@ impl Mapper {
         let [psnr_db, psnr_heldout_db] = evaluate::sample(&mut self.scene, &self.archive)?;
         let (splats, iterations) = (u64::from(self.scene.pipeline.pool.count()), self.scene.steps);
         Ok(CurvePoint { t_s, psnr_db, psnr_heldout_db, splats, iterations })
+    }
+
+    /// The seam of a loop that is closed now with what was seen at `with`, where that was in this flight.
+    pub fn seam(&self, with: Option<Nanos>) -> Seam {
+        Seam::new(&self.scene, &self.archive, with)
+    }
+
+    /// Scores a seam with all that was corrected. Allocates.
+    pub fn score_seam(&mut self, seam: &Seam) -> Result<SeamScore, GpuError> {
+        self.apply_corrections()?;
+        let (psnr_db, disagreement) = (seam.psnr_db(&mut self.scene)?, self.anchors.disagreement());
+        Ok(SeamScore { psnr_db, disagreement })
     }
 
     /// Scores every keyframe, those on disk too. Allocates.

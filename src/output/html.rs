@@ -8,7 +8,7 @@ use super::metrics::{percentile, TrajectoryError};
 use super::panel::Picture;
 use super::report::{KernelTime, Report, GOOD_DB};
 use super::trajectory::epoch_at;
-use crate::map::spread;
+use crate::map::{spread, SeamScore, SeamScores};
 use glam::DVec3;
 use std::fmt::{Display, Write};
 use std::io;
@@ -19,6 +19,7 @@ const PICTURES_MAX: usize = 6;
 const PICTURE_WIDTH_MAX: usize = 1600;
 const WARNINGS_MAX: usize = 50;
 const KERNELS_MAX: usize = 20;
+const LOOPS_MAX: usize = 12;
 
 /// What the page shows beyond the figures of the report.
 #[derive(Clone, Copy, Debug, Default)]
@@ -130,7 +131,8 @@ fn tables(report: &Report) -> String {
         ("Resident memory of the mapper's process, peak", mib(report.map_rss_peak_bytes), "MiB"),
         ("Heap allocations after seal", n(report.heap_after_seal), ""),
     ];
-    let parts = [table("Odometry", &odometry), table("Map", &map), table("Cost", &cost), table_of_rig(report)];
+    let others = [table_of_rig(report), table_of_loops(report)];
+    let parts = [table("Odometry", &odometry), table("Map", &map), table("Cost", &cost), others.concat()];
     format!("<section class=\"tables\">{}</section>", parts.concat())
 }
 
@@ -173,6 +175,27 @@ fn table_of_rig(report: &Report) -> String {
         return String::new();
     }
     table("Rig, over its calibration", &rows)
+}
+
+/// What closed loops did to the map; empty where none was scored.
+fn table_of_loops(report: &Report) -> String {
+    let scored = report.loops.iter().filter_map(|l| Some((l, l.map?))).take(LOOPS_MAX);
+    let three = |map: SeamScores, of: &dyn Fn(SeamScore) -> Option<f64>, decimals: usize| {
+        let at = |score: Option<SeamScore>| score.and_then(of).map_or("\u{2013}".into(), |v| format!("{v:.decimals$}"));
+        Some([map.before, map.after, map.later].map(at).join(", "))
+    };
+    let start = report.loops.first().map_or(0, |l| l.t_ns);
+    let rows: Vec<RigRow> = scored
+        .flat_map(|(l, map)| {
+            let at = format!("{:.0} s after the first, moves {:.2} m", (l.t_ns - start) as f64 * 1e-9, l.moved_m);
+            let apart = three(map, &|score| score.disagreement.map(|share| 100.0 * share), 1);
+            [(at, three(map, &|score| score.psnr_db, 2), "dB"), ("depth off that of stereo".into(), apart, "%")]
+        })
+        .collect();
+    if rows.is_empty() {
+        return String::new();
+    }
+    table("Views of both visits before a loop is closed, after, 10 s later", &rows)
 }
 
 /// By how much a barometer's height drifted, and of how many frames; `None` without one.

@@ -1,6 +1,6 @@
 //! `report.json`: one flat object. A figure that was not measured is null, never zero.
 
-use crate::map::{CurvePoint, Evaluation};
+use crate::map::{CurvePoint, Evaluation, SeamScores};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::io::{self, Write};
@@ -124,6 +124,9 @@ pub struct LoopClosed {
     /// clock of that flight.
     #[serde(default)]
     pub joins: bool,
+    /// What it did to the map, where that was scored.
+    #[serde(default)]
+    pub map: Option<SeamScores>,
 }
 
 /// Whether a part of the rig was found, and what is left of its deviation.

@@ -5,7 +5,7 @@
 //! filled anew, so that a mapper that starts again is offered the newest keyframes once more. While there is no mapper
 //! the oldest keyframe makes room for the newest.
 
-use super::loop_closing::{Answer, Join, LoopClosing};
+use super::loop_closing::{Answer, Join, LoopClosing, Moved};
 use super::tracking::{FramePacket, Tracked};
 use crate::config::Board;
 use crate::counters::Counters;
@@ -48,11 +48,15 @@ pub enum Word {
     Read,
     /// Epochs joined so far.
     Joins,
+    /// Loops so far that move the map; the newest's stamp and that of what it was closed with, 0 of an earlier flight.
+    Moved,
+    MovedAt,
+    MovedWith,
     /// Share of its time that the mapper may work, 1/1000; 0: the whole.
     Share,
 }
 
-const WORDS: usize = 16;
+const WORDS: usize = 24;
 /// A pose of the body, whether the cameras' are estimated, and these.
 const POSE: usize = 7;
 const POSES: usize = POSE + 1 + CAMERAS_MAX * POSE;
@@ -249,9 +253,31 @@ impl KeyframeRing {
         })
     }
 
-    /// Calls `correct` with the corrections that came, which reach keyframes that wait, too.
-    pub fn corrections(&self, mut correct: impl FnMut(&PoseCorrection)) {
-        let written = self.word(Word::Written).load(Acquire);
+    /// Tells of a loop whose corrections follow.
+    fn push_moved(&self, moved: &Moved) {
+        self.word(Word::MovedAt).store(moved.t.0 as u64, Relaxed);
+        self.word(Word::MovedWith).store(moved.with.map_or(0, |with| with.0 as u64), Relaxed);
+        self.word(Word::Moved).fetch_add(1, Release);
+    }
+
+    /// How many loops moved the map so far, and the newest of them.
+    pub fn moved(&self) -> (u64, Moved) {
+        let count = self.word(Word::Moved).load(Acquire);
+        let [t, with] = [Word::MovedAt, Word::MovedWith].map(|word| Nanos(self.word(word).load(Relaxed) as i64));
+        (count, Moved { t, with: (with != Nanos(0)).then_some(with) })
+    }
+
+    /// Corrections written so far, and read.
+    pub fn corrections_written(&self) -> u64 {
+        self.word(Word::Written).load(Acquire)
+    }
+
+    pub fn corrections_read(&self) -> u64 {
+        self.word(Word::Read).load(Relaxed)
+    }
+
+    /// Calls `correct` with the corrections before number `written`, which reach keyframes that wait, too.
+    pub fn corrections(&self, written: u64, mut correct: impl FnMut(&PoseCorrection)) {
         for number in self.word(Word::Read).load(Relaxed)..written {
             let from = self.correction(number);
             let (id, poses) = (from[0].load(Relaxed), Poses::read(&from[1..]));
@@ -385,6 +411,10 @@ impl Keyframes {
                     counters.corrections_full.add(u64::from(!told));
                     true
                 }
+                Answer::Moved(moved) => {
+                    ring.iter().for_each(|ring| ring.push_moved(moved));
+                    true
+                }
                 Answer::MapFromOdom(_) => true,
             });
         }
@@ -458,7 +488,7 @@ pub mod tests {
         let at = |c: usize| Pose { p: DVec3::new(0.0, c as f64, 0.0), ..Pose::IDENTITY };
         let body_from_cam = Some(std::array::from_fn(at));
         assert!(ring.push_correction(2, &Poses { world_from_body: moved, body_from_cam }));
-        ring.corrections(|c| corrected.push(c.id));
+        ring.corrections(ring.corrections_written(), |c| corrected.push(c.id));
         assert_eq!(corrected, [2]);
         let mut keyframe = ring.shape().clone();
         for id in 0..4 {
@@ -477,7 +507,7 @@ pub mod tests {
     fn corrections_are_bounded() {
         let ring = ring();
         assert!((0..CORRECTIONS).all(|_| ring.push_correction(0, &AT_ORIGIN)) && !ring.push_correction(0, &AT_ORIGIN));
-        ring.corrections(|_| ());
+        ring.corrections(ring.corrections_written(), |_| ());
         assert!(ring.push_correction(0, &AT_ORIGIN));
     }
 

@@ -30,10 +30,20 @@ const KEYFRAMES: usize = 2;
 pub enum Answer {
     /// The frame of the estimator in that of the map, from now on.
     MapFromOdom(Pose),
+    /// The keyframes that follow are moved by this loop.
+    Moved(Moved),
     /// The pose in the map of a keyframe that the mapper has.
     Keyframe { id: u64, map_from_body: Pose },
     /// Two epochs are one map from now on.
     Joined(Join),
+}
+
+/// A loop that moves poses in the map by more than `SCORED`, or joins two maps.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Moved {
+    pub t: Nanos,
+    /// Stamp of what was recognised, where that was in this flight.
+    pub with: Option<Nanos>,
 }
 
 /// An epoch that is one map with another of this flight; `flight` is that of an earlier one, ms since 1970.
@@ -96,6 +106,8 @@ fn keyframes(board: &Board) -> usize {
 
 /// Closures that move poses by less are in the report alone: m, rad.
 const TOLD: [f64; 2] = [0.05, 0.01];
+/// What they do to the map is scored where they move poses by more: a pixel or two of what is 5 m away.
+const SCORED: [f64; 2] = [0.02, 0.004];
 /// Niceness of the thread: below tracking, above mapping.
 const NICE: i32 = 5;
 /// Closures that wait to be told.
@@ -128,6 +140,10 @@ impl LoopQueue {
         let Some(closure) = closure else { return };
         let _ = self.closed.push((closure, loops.map_from_odom()));
         let _ = self.answers.push(Answer::MapFromOdom(loops.map_from_odom().pose.pose()));
+        if is_moved_by(&closure, SCORED) {
+            let moved = Moved { t: closure.t, with: (!closure.earlier).then_some(closure.with) };
+            let _ = self.answers.push(Answer::Moved(moved));
+        }
         for (id, map_from_body) in loops.keyframes_in_map() {
             // A full queue has older answers for the same keyframes; they come again with the next closure.
             let _ = self.answers.push(Answer::Keyframe { id, map_from_body });
@@ -145,19 +161,20 @@ impl LoopQueue {
     }
 }
 
-/// A line about a loop, where it moved something.
+/// Whether a loop joins two maps, or moves poses in the map by so much: m, rad.
+fn is_moved_by(c: &Closure, least: [f64; 2]) -> bool {
+    c.joins.is_some() || c.moved.iter().zip(least).any(|(moved, least)| *moved >= least)
+}
+
+/// A line about a loop that is told of.
 fn line(c: &Closure) -> Option<String> {
     let ([far, angle], inliers) = (c.moved, c.inliers);
     let moves = format!("poses in the map move by {far:.3} m and {:.2} degrees", angle.to_degrees());
-    match c.joins {
-        Some(_) => {
-            Some(format!("place of another epoch recognised by {inliers} corners, both are one map now: {moves}"))
-        }
-        None if far >= TOLD[0] || angle >= TOLD[1] => {
-            Some(format!("place of {:.0} s ago recognised by {inliers} corners: {moves}", (c.t - c.with).secs()))
-        }
-        None => None,
-    }
+    is_moved_by(c, TOLD).then(|| match c.joins {
+        Some(_) => format!("place of another epoch recognised by {inliers} corners, both are one map now: {moves}"),
+        None if c.earlier => format!("place of an earlier flight recognised by {inliers} corners: {moves}"),
+        None => format!("place of {:.0} s ago recognised by {inliers} corners: {moves}", (c.t - c.with).secs()),
+    })
 }
 
 /// The side of the thread `loops`.

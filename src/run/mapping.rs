@@ -3,6 +3,7 @@
 
 use super::keyframes::{KeyframeRing, Word};
 use super::loop_closing::Join;
+use super::seams::{ScoredLoop, Seams};
 use super::status::{print_err, Gauges};
 use super::threads;
 use super::MAP_STORE;
@@ -52,6 +53,8 @@ pub struct Mapping {
     collected: u64,
     /// Joined epochs that were taken over.
     joined: usize,
+    /// What closed loops do to the map.
+    seams: Seams,
     pub curve: Vec<CurvePoint>,
     pub iteration_ms: Vec<f32>,
     pub iterations: u64,
@@ -94,6 +97,7 @@ impl Mapping {
             ring,
             collected: 0,
             joined: 0,
+            seams: Seams::new(),
             curve: Vec::with_capacity(CURVE_POINTS),
             iteration_ms: Vec::with_capacity(ITERATION_TIMES),
             iterations: 0,
@@ -110,7 +114,12 @@ impl Mapping {
     /// Takes over the keyframes and corrections that came.
     pub fn collect(&mut self) {
         let (first, _) = self.mapper.first_numbers();
-        self.ring.corrections(|c| self.mapper.correct(&PoseCorrection { id: first + c.id, ..*c }));
+        let (written, now) = (self.ring.corrections_written(), self.keyframe.t);
+        if self.failure.is_none() {
+            let scored = unsealed(|| self.seams.score(&mut self.mapper, &self.ring, written, now));
+            scored.unwrap_or_else(|e| self.fail(e));
+        }
+        self.ring.corrections(written, |c| self.mapper.correct(&PoseCorrection { id: first + c.id, ..*c }));
         for Join { flight, epoch, into } in self.ring.joins(self.joined) {
             self.mapper.join(flight, epoch, into);
             self.joined += 1;
@@ -244,6 +253,7 @@ pub struct MapResult {
     pub kernels: Vec<KernelTime>,
     pub counters: Vec<(String, u64)>,
     pub quality: Evaluation,
+    pub seams: Vec<ScoredLoop>,
     /// `map.ply` was written.
     pub written: bool,
     /// Why the map is incomplete, where it is.
@@ -281,6 +291,7 @@ impl Mapping {
             gpu_bytes: self.mapper.gpu_bytes(),
             device: self.mapper.device().to_string(),
             curve: self.curve.clone(),
+            seams: self.seams.take(),
             kernels: kernels.into_iter().map(kernel).collect(),
             heap_after_seal: mem::heap_after_seal(),
             ..MapResult::default()

@@ -45,6 +45,7 @@ pub mod memory;
 mod opening;
 pub mod recorder;
 mod reload;
+mod seams;
 pub mod sensors;
 mod service;
 mod spikes;

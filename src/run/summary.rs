@@ -124,6 +124,10 @@ pub fn conclude(title: Title, mut flown: Flown, logged: &[PathBuf], out: &Output
         report.gpu_bytes = Some(m.gpu_bytes);
         report.device = Some(m.device.clone());
         report.curve = m.curve.clone();
+        for scored in &m.seams {
+            let of_it = report.loops.iter_mut().find(|l| l.t_ns == scored.t_ns);
+            of_it.into_iter().for_each(|l| l.map = Some(scored.scores));
+        }
         report.seconds_to_25_db = seconds_to(&report.curve, GOOD_DB);
         report.kernels = m.kernels.clone();
         report.quality = m.quality.clone();
@@ -182,7 +186,8 @@ fn counted(flown: &Flown, map: Option<&MapResult>, opened: &[(&'static str, u64)
 fn closed(c: &Closure) -> LoopClosed {
     let ([moved_m, moved_rad], corners) = (c.moved, c.inliers as u64);
     let (p_m, yaw_rad) = (c.measured.p.to_array(), c.measured.yaw);
-    LoopClosed { t_ns: c.t.0, with_ns: c.with.0, corners, p_m, yaw_rad, moved_m, moved_rad, joins: c.joins.is_some() }
+    let (t_ns, with_ns, joins) = (c.t.0, c.with.0, c.joins.is_some());
+    LoopClosed { t_ns, with_ns, corners, p_m, yaw_rad, moved_m, moved_rad, joins, map: None }
 }
 
 /// Fills in the tracking figures; answers the trajectory.

@@ -4,7 +4,8 @@
 //! see. A keyframe belongs to the room that its true place is in and to the round of its stamp; a Gaussian to the room that
 //! its mean is in, after the trajectory was put on the truth.
 
-use crate::page::{count, number, text, Page, Part, Table};
+use crate::loops::with_mems;
+use crate::page::{count, millimetres, number, percent, text, Page, Part, Table};
 use crate::run::default_board;
 use crate::{ply, table};
 use glam::DVec3;
@@ -14,9 +15,9 @@ use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 use std::sync::Arc;
 use std::time::Instant;
 use stipple::config::Board;
-use stipple::map::{KeyframeScore, Mapper, Place};
+use stipple::map::{KeyframeScore, Mapper, Place, SeamScore, SeamScores};
 use stipple::output::metrics::trajectory_error;
-use stipple::output::report::Report;
+use stipple::output::report::{LoopClosed, Report};
 use stipple::output::OutputDir;
 use stipple::run::sensors::{Input, Source};
 use stipple::run::{fly, Options, Pace, Spacing, Steps, MAP_STORE};
@@ -63,6 +64,9 @@ pub struct Args {
     /// Seed of the building and of the sensors' noise; without it the scenario's own
     #[arg(long, value_name = "N")]
     seed: Option<u64>,
+    /// The inertial unit of a BMI088's data sheet in place of the scenario's
+    #[arg(long)]
+    mems: bool,
     /// Override a key of the board file
     #[arg(long = "set", value_name = "SECTION.KEY=VALUE")]
     set: Vec<String>,
@@ -111,6 +115,9 @@ pub fn run(args: &Args) -> Result<(), Fault> {
         scenario.duration = scenario.duration.min(Span::from_secs(s));
     }
     scenario.seed = args.seed.unwrap_or(scenario.seed);
+    if args.mems {
+        scenario = with_mems(scenario);
+    }
     let out = OutputDir::create(&args.out)?;
     if args.again {
         return again(&scenario, &board, &out);
@@ -225,8 +232,8 @@ fn page(args: &Args, report: &Report, resident: &Resident, rows: Vec<Row>) -> Pa
         report.ate_rmse_m.map_or("-".into(), |m| format!("{m:.3} m")),
         report.wall_s.unwrap_or(0.0),
     );
-    let table = table(rows);
-    println!("{all}\n\n{}\n{}", table.text(), args.out.join("patrol.html").display());
+    let (table, seams) = (table(rows), seams_table(report));
+    println!("{all}\n\n{}\n{}\n{}", table.text(), seams.text(), args.out.join("patrol.html").display());
     Page {
         name: "patrol",
         title: "Patrol: the map by room and visit",
@@ -251,7 +258,7 @@ fn page(args: &Args, report: &Report, resident: &Resident, rows: Vec<Row>) -> Pa
             ("gpu_bytes", json!(report.gpu_bytes)),
             ("ate_rmse_m", json!(report.ate_rmse_m)),
         ],
-        parts: vec![Part::Note(all), Part::Note(NOTE.into()), Part::Table(table)],
+        parts: vec![Part::Note(all), Part::Note(NOTE.into()), Part::Table(table), Part::Table(seams)],
     }
 }
 
@@ -265,6 +272,23 @@ fn table(rows: Vec<Row>) -> Table {
         count("keyframes 2") => r.rounds[1].keyframes,
         number("PSNR 2", "dB", 2) => r.rounds[1].psnr_db,
         number("held out 2", "dB", 2) => r.rounds[1].psnr_heldout_db,
+    ])
+}
+
+/// Loops that moved the map: views of both visits, before, after and ten seconds later.
+fn seams_table(report: &Report) -> Table {
+    let start = report.loops.first().map_or(0, |l| l.t_ns);
+    let scored: Vec<(&LoopClosed, SeamScores)> = report.loops.iter().filter_map(|l| Some((l, l.map?))).collect();
+    let db = |score: Option<SeamScore>| score.and_then(|s| s.psnr_db);
+    let share = |score: Option<SeamScore>| score.and_then(|s| s.disagreement);
+    table!("seams", "Loops that moved the map", scored, |s| s.1.later.is_none(), [
+        number("after the first", "s", 1) => Some((s.0.t_ns - start) as f64 * 1e-9),
+        millimetres("moved", 0) => Some(s.0.moved_m),
+        number("PSNR before", "dB", 2) => db(s.1.before),
+        number("after", "dB", 2) => db(s.1.after),
+        number("10 s later", "dB", 2) => db(s.1.later),
+        percent("depth off stereo's before", 2) => share(s.1.before),
+        percent("10 s after it", 2) => share(s.1.later),
     ])
 }
 

@@ -1,0 +1,74 @@
+//! Scores of the map where loops are closed that move it: before, after, and ten seconds of flight later. One loop at a time;
+//! those that are closed meanwhile go by.
+
+use super::keyframes::KeyframeRing;
+use crate::gpu::GpuError;
+use crate::map::{Mapper, Seam, SeamScores};
+use serde::{Deserialize, Serialize};
+use stipple_drivers::{Nanos, Span};
+
+const LATER: Span = Span(10_000_000_000);
+/// Loops that are scored in a flight.
+const SCORED: usize = 64;
+
+/// A loop by its stamp, and what it did to the map.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ScoredLoop {
+    pub t_ns: i64,
+    pub scores: SeamScores,
+}
+
+/// The loops of a flight and the one that is being scored.
+pub struct Seams {
+    /// Loops that the ring has told of.
+    seen: u64,
+    current: Option<(Seam, ScoredLoop)>,
+    list: Vec<ScoredLoop>,
+}
+
+impl Seams {
+    pub fn new() -> Seams {
+        Seams { seen: 0, current: None, list: Vec::with_capacity(SCORED) }
+    }
+
+    /// Scores what is due, before the corrections up to number `written` are taken. `now` is the stamp of the newest keyframe.
+    pub fn score(
+        &mut self,
+        mapper: &mut Mapper,
+        ring: &KeyframeRing,
+        written: u64,
+        now: Nanos,
+    ) -> Result<(), GpuError> {
+        let (count, moved) = ring.moved();
+        let is_new = count != std::mem::replace(&mut self.seen, count);
+        let Some((seam, ScoredLoop { t_ns, scores })) = &mut self.current else {
+            if is_new && self.list.len() < SCORED {
+                let seam = mapper.seam(moved.with);
+                let before = Some(mapper.score_seam(&seam)?);
+                let scores = SeamScores { before, ..SeamScores::default() };
+                self.current = Some((seam, ScoredLoop { t_ns: moved.t.0, scores }));
+            }
+            return Ok(());
+        };
+        if scores.after.is_none() {
+            // What the loop moves comes piece by piece.
+            if ring.corrections_read() == written {
+                scores.after = Some(mapper.score_seam(seam)?);
+            }
+        } else if now - Nanos(*t_ns) >= LATER {
+            scores.later = Some(mapper.score_seam(seam)?);
+            self.end();
+        }
+        Ok(())
+    }
+
+    fn end(&mut self) {
+        self.list.extend(self.current.take().map(|(_, scored)| scored));
+    }
+
+    /// What was scored. The last one may lack what came too late for it.
+    pub fn take(&mut self) -> Vec<ScoredLoop> {
+        self.end();
+        std::mem::take(&mut self.list)
+    }
+}
