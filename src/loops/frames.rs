@@ -18,8 +18,8 @@ impl Loops {
         (self.flight, self.keeper) = (flight, keeper);
         let mut last: Option<(u16, u32)> = None;
         for (k, features) in kept {
-            self.next_number = self.next_number.max(k.number.saturating_add(1));
-            self.next_frame = self.next_frame.max(k.frame.saturating_add(1));
+            self.next_number = self.next_number.max(k.number + 1);
+            self.next_frame = self.next_frame.max(k.frame + 1);
             let Some(node) = self.graph.add_fixed(k.map).or_else(|| {
                 self.drop_one(last.map(|(n, _)| n));
                 self.graph.add_fixed(k.map)
@@ -108,18 +108,18 @@ impl Loops {
         }
         let frame = self.places[edge.to as usize].frame;
         let others = beside.iter().filter(|v| v.node != edge.from && self.places[v.node as usize].frame == frame);
+        // Of an edge that made one frame of two, the frame stays.
+        let mut may_go = usize::from(!joins);
         for v in others {
             if v.agrees_with(edge.to, &self.graph) {
-                self.graph.link(v.edge(edge.to));
+                may_go += usize::from(self.graph.link(v.edge(edge.to)).is_some());
             }
         }
         let outcome = self.graph.optimise();
         self.poses_moved = true;
         if !outcome.solved {
             self.stats.loops_unsolved += 1;
-            if !joins {
-                self.graph.drop_newest_loop();
-            }
+            (0..may_go).for_each(|_| self.graph.drop_newest_loop());
             return joins;
         }
         self.stats.loops_rejected = outcome.loops_rejected as u64;

@@ -24,6 +24,9 @@ const BUFFERS: usize = 4;
 // Records are copied as they are in memory.
 const _: () = assert!(cfg!(target_endian = "little"));
 
+/// Numbers of places and frames stay below this, so that there is always a next one.
+const NUMBERS: u32 = 1 << 31;
+
 /// Name of an epoch over all flights.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Epoch {
@@ -105,7 +108,8 @@ impl KeptPlace {
             map: pose(about.map),
             tilt: DQuat::from_array(about.tilt_xyzw),
         };
-        (place.odom.is_finite() && place.map.is_finite() && place.tilt.is_normalized()).then_some(place)
+        let has_next = number < NUMBERS && about.frame < NUMBERS;
+        (has_next && place.odom.is_finite() && place.map.is_finite() && place.tilt.is_normalized()).then_some(place)
     }
 }
 
@@ -144,7 +148,7 @@ pub fn read(folder: &Path, calibration: &Calibration) -> Result<Vec<(KeptPlace, 
             let moved: PlacePose = bytemuck::pod_read_unaligned(bytes);
             let map = pose(moved.map);
             let found = places.binary_search_by_key(&moved.number, |(place, _)| place.number);
-            if let (Ok(at), true) = (found, map.is_finite()) {
+            if let (Ok(at), true) = (found, map.is_finite() && moved.frame < NUMBERS) {
                 (places[at].0.map, places[at].0.frame) = (map, moved.frame);
             }
         }
@@ -237,5 +241,27 @@ impl Keeper {
         let key = Key { kind: KIND_PLACE, run: 0, id: number };
         let _ = self.store().is_some_and(|store| store.remove(key));
         self.serve();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_place_is_read_as_it_was_written_and_what_is_none_is_refused() {
+        let (odom, map) = (Pose4 { p: DVec3::X, yaw: 0.5 }, Pose4 { p: DVec3::Y, yaw: -0.5 });
+        let epoch = Epoch { flight: 1_700_000_000_000, number: 3 };
+        let place = KeptPlace { number: 7, t: Nanos(9), epoch, frame: 2, odom, map, tilt: DQuat::from_rotation_x(0.1) };
+        assert_eq!(KeptPlace::decode(7, &place.encode()), Some(place));
+        let broken = [
+            KeptPlace { frame: u32::MAX, ..place },
+            KeptPlace { tilt: DQuat::from_xyzw(0.0, 0.0, 0.0, 2.0), ..place },
+            KeptPlace { map: Pose4 { yaw: f64::NAN, ..map }, ..place },
+            KeptPlace { odom: Pose4 { p: DVec3::splat(f64::INFINITY), yaw: 0.0 }, ..place },
+        ];
+        assert!(broken.iter().all(|place| KeptPlace::decode(7, &place.encode()).is_none()));
+        assert_eq!(KeptPlace::decode(u32::MAX, &place.encode()), None);
+        assert_eq!(KeptPlace::decode(7, &[0; store::ABOUT]), None);
     }
 }
