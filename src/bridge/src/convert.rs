@@ -1,10 +1,11 @@
 //! States in the frames of ROS (REP 103 and 105).
 //!
+//! `map` is the one in which loops agree: poses in it jump when a place is recognised, and the map's Gaussians are in it.
 //! `odom` is the daemon's: z up, its origin at the first pose of an epoch, its x where the start put it, which is not the
 //! vehicle's nose. `base_link` has its origin in the inertial unit, and the vehicle's axes: x forward, y left, z up.
 
 use crate::messages::{Covariance, Header, Odometry, Time, TransformStamped};
-use crate::socket::State;
+use crate::socket::{MapFromOdom, State};
 use glam::{DMat3, DQuat, DVec3, DVec4, EulerRot};
 
 /// Variance that stands for one that is unknown.
@@ -17,6 +18,7 @@ const LENGTH_TOLERANCE: f64 = 1e-3;
 /// Names of the frames, and the turn from the inertial unit to the vehicle.
 #[derive(Clone, Debug)]
 pub struct Frames {
+    pub map: String,
     pub odom: String,
     pub base: String,
     pub base_from_body: DQuat,
@@ -25,12 +27,12 @@ pub struct Frames {
 impl Frames {
     /// `mount_rpy_deg`: roll, pitch and yaw of the inertial unit in the vehicle, as the board key `mavlink.mount_rpy_deg` has
     /// them: about the axes forward, right and down, roll first, degrees. `base` has the axes forward, left and up.
-    pub fn new(odom: &str, base: &str, mount_rpy_deg: [f64; 3]) -> Frames {
+    pub fn new([map, odom, base]: [&str; 3], mount_rpy_deg: [f64; 3]) -> Frames {
         let [roll, pitch, yaw] = mount_rpy_deg.map(f64::to_radians);
         let frd_from_body = DQuat::from_euler(EulerRot::ZYX, yaw, pitch, roll);
         // Half a turn about forward: right and down become left and up.
         let base_from_body = DQuat::from_xyzw(1.0, 0.0, 0.0, 0.0) * frd_from_body;
-        Frames { odom: odom.into(), base: base.into(), base_from_body }
+        Frames { map: map.into(), odom: odom.into(), base: base.into(), base_from_body }
     }
 
     /// The state as a message; `None` where a number of it is not finite, or a matrix or the orientation is none.
@@ -66,6 +68,19 @@ impl Frames {
             twist_covariance,
         };
         is_finite(&odometry).then_some(odometry)
+    }
+
+    /// Where `odom` is in `map`, for /tf, at the stamp of an odometry of an epoch: the same place as long as nothing was recognised
+    /// in that epoch.
+    pub fn map_from_odom(&self, odometry: &Odometry, epoch: u32, told: Option<MapFromOdom>) -> TransformStamped {
+        let is_usable = |m: &MapFromOdom| m.epoch == epoch && DVec3::from(m.position).is_finite() && m.yaw.is_finite();
+        let found = told.filter(is_usable);
+        TransformStamped {
+            header: Header { stamp: odometry.header.stamp, frame_id: self.map.clone() },
+            child_frame_id: self.odom.clone(),
+            translation: found.map_or([0.0; 3], |m| m.position),
+            rotation: DQuat::from_rotation_z(found.map_or(0.0, |m| m.yaw)).to_array(),
+        }
     }
 
     /// Covariance of a vector in the axes of `base`, from that in the body's by rows.

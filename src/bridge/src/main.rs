@@ -16,7 +16,7 @@ use dds::{Participant, Writer};
 use diagnostics::{wall_ns, Monitor};
 use messages::{DiagnosticArray, Header, Odometry, TfMessage};
 use signal_hook::consts::{SIGINT, SIGTERM};
-use socket::{Connection, Heard, Line, State};
+use socket::{Connection, Heard, Line, MapFromOdom, State};
 use std::io::Write;
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -52,7 +52,7 @@ struct Args {
     #[arg(long, value_name = "NAME", default_value = "/stipple", value_parser = namespace)]
     namespace: String,
     /// Names of the frames
-    #[arg(long, num_args = 2, value_names = ["ODOM", "BASE"], default_values = ["odom", "base_link"])]
+    #[arg(long, num_args = 3, value_names = ["MAP", "ODOM", "BASE"], default_values = ["map", "odom", "base_link"])]
     frames: Vec<String>,
     /// Roll, pitch and yaw of the inertial unit in the vehicle, degrees: the numbers of `mavlink.mount_rpy_deg`, about the
     /// vehicle's axes forward, right and down. A unit whose x is forward and z up has 180,0,0
@@ -111,6 +111,7 @@ struct Bridge {
     frames: Frames,
     stamps: Stamps,
     monitor: Monitor,
+    map_from_odom: Option<MapFromOdom>,
     odometry: Writer<Odometry>,
     tf: Writer<TfMessage>,
     diagnostics: Writer<DiagnosticArray>,
@@ -182,7 +183,10 @@ impl Bridge {
     fn take(&mut self, line: Line) {
         let said = match line {
             Line::State(state) => self.publish(&state),
-            Line::Status(status) => self.monitor.status(status),
+            Line::Status(status) => {
+                self.map_from_odom = status.map_from_odom;
+                self.monitor.status(status)
+            }
             Line::Event(event) => {
                 self.monitor.event(event);
                 None
@@ -204,7 +208,8 @@ impl Bridge {
             return None;
         };
         odometry.header.stamp = stamp;
-        let transforms = vec![transform(&odometry)];
+        let map = self.frames.map_from_odom(&odometry, state.epoch, self.map_from_odom);
+        let transforms = vec![transform(&odometry), map];
         let is_sent = [self.odometry.write(odometry), self.tf.write(TfMessage { transforms })];
         self.monitor.count(if is_sent == [true; 2] { "states" } else { "not_sent" });
         self.monitor.state(state, self.stamps.ahead_ns)
@@ -250,9 +255,10 @@ fn run(args: Args) -> Result<(), String> {
         outcomes: send,
     };
     let mut bridge = Bridge {
-        frames: Frames::new(&args.frames[0], &args.frames[1], args.mount_rpy_deg),
+        frames: Frames::new(std::array::from_fn(|i| args.frames[i].as_str()), args.mount_rpy_deg),
         stamps: Stamps::default(),
         monitor: Monitor::new(topic("odometry")),
+        map_from_odom: None,
         odometry: participant.writer(&topic("odometry"), 10, false)?,
         tf: participant.writer("tf", 100, false)?,
         diagnostics: participant.writer("diagnostics", 10, false)?,

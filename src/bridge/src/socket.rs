@@ -78,7 +78,18 @@ pub struct Status {
     pub map: Option<BTreeMap<String, Value>>,
     pub frames: u64,
     pub posed: u64,
+    pub map_from_odom: Option<MapFromOdom>,
     pub governor: Option<BTreeMap<String, Value>>,
+}
+
+/// Where the `odom` of an epoch is in the map, which loops have made agree: told once a place was recognised.
+#[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
+pub struct MapFromOdom {
+    pub epoch: u32,
+    /// m.
+    pub position: [f64; 3],
+    /// About z, rad.
+    pub yaw: f64,
 }
 
 #[derive(Clone, Debug, Deserialize)]

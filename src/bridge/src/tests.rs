@@ -6,7 +6,7 @@ use crate::cloud::cloud;
 use crate::convert::{time, transform, Frames, Stamps, UNKNOWN};
 use crate::diagnostics::{wall_ns, Monitor};
 use crate::messages::{Odometry, Time, ERROR, OK, WARN};
-use crate::socket::{Connection, Event, Heard, Points, State, Status};
+use crate::socket::{Connection, Event, Heard, MapFromOdom, Points, State, Status};
 use glam::{DQuat, DVec3, EulerRot};
 use std::io::{Read, Write};
 use std::os::unix::net::UnixListener;
@@ -31,7 +31,7 @@ fn state(q: DQuat, velocity_body: [f64; 3]) -> State {
 }
 
 fn frames(mount_rpy_deg: [f64; 3]) -> Frames {
-    Frames::new("odom", "base_link", mount_rpy_deg)
+    Frames::new(["map", "odom", "base_link"], mount_rpy_deg)
 }
 
 fn told(frames: &Frames, state: &State) -> Odometry {
@@ -66,6 +66,25 @@ fn vehicle_that_climbs_forward_in_a_left_turn_says_so() {
     let t = transform(&o);
     assert_eq!((t.translation, t.rotation, &t.header), (o.position, o.orientation, &o.header));
     assert_eq!((o.header.frame_id.as_str(), t.child_frame_id.as_str()), ("odom", "base_link"));
+}
+
+#[test]
+fn odom_is_where_a_recognised_place_puts_it_in_its_epoch_alone() {
+    let frames = frames(EUROC);
+    let o = told(&frames, &state(DQuat::IDENTITY, [0.0; 3]));
+    let found = MapFromOdom { epoch: 2, position: [1.0, -2.0, 0.5], yaw: std::f64::consts::FRAC_PI_2 };
+    let t = frames.map_from_odom(&o, 2, Some(found));
+    assert_eq!(
+        (t.header.frame_id.as_str(), t.child_frame_id.as_str(), t.header.stamp),
+        ("map", "odom", o.header.stamp)
+    );
+    assert_eq!(t.translation, found.position);
+    assert!((DQuat::from_array(t.rotation) * DVec3::X - DVec3::Y).length() < 1e-12);
+    let broken = MapFromOdom { yaw: f64::NAN, ..found };
+    for (epoch, told) in [(3, Some(found)), (2, None), (2, Some(broken))] {
+        let t = frames.map_from_odom(&o, epoch, told);
+        assert_eq!((t.translation, t.rotation), ([0.0; 3], [0.0, 0.0, 0.0, 1.0]));
+    }
 }
 
 /// Errors of the state along the columns of a factor of its covariance, and what becomes of them in a message.

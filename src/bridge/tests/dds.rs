@@ -199,7 +199,8 @@ fn state(n: usize) -> Value {
 fn status(uptime_s: f64) -> Value {
     json!({"type": "status", "version": "0.1.0", "board": "drone-pi5", "dataset": "", "t_ns": 1, "wall_ns": 1, "uptime_s": uptime_s,
         "state": null, "health": [], "counters": {"frames_overwritten": 3}, "map": {"anchors": 4, "psnr_db": null},
-        "frames": 10, "posed": 9, "governor": {"share": 1.0, "reason": null}})
+        "frames": 10, "posed": 9, "governor": {"share": 1.0, "reason": null},
+        "map_from_odom": {"t_ns": 1, "count": 2, "epoch": 0, "position": [1.0, 2.0, 3.0], "yaw": 0.5, "covariance": [[0.0; 4]; 4]}})
 }
 
 /// Tells states far below zero until Cyclone hears them: both ends know each other from then on.
@@ -259,6 +260,7 @@ fn every_state_and_cloud_arrives_once_and_as_it_was() {
     assert_eq!(request, "{\"subscribe\":[\"state\",\"event\",\"status\"],\"hz\":0}\n");
     let other = OtherEnd::start(&domain, &[]);
     acquaint(&mut link, &[&other]);
+    tell(&mut link, &status(1.0));
     let told: Vec<Value> = (0..STATES)
         .map(|n| {
             let told = state(n);
@@ -284,7 +286,10 @@ fn every_state_and_cloud_arrives_once_and_as_it_was() {
     assert_eq!((heard.len(), tf.len()), (STATES, STATES), "{:?}", bridge.lines());
     for ((heard, told), tf) in heard.iter().zip(&told).zip(&tf) {
         is_that_state(heard, told);
-        assert_eq!(tf.as_array().unwrap().len(), 1);
+        assert_eq!(tf.as_array().unwrap().len(), 2);
+        let (sin, cos) = 0.25f64.sin_cos();
+        assert_eq!(json!(["stamp", "frame", "child"].map(|key| &tf[1][key])), json!([heard["stamp"], "map", "odom"]));
+        assert_eq!(numbers(&tf[1]["pose"]), [1.0, 2.0, 3.0, 0.0, 0.0, sin, cos]);
         ["stamp", "frame", "child", "pose"].iter().for_each(|key| assert_eq!(tf[0][key], heard[key]));
     }
     for (what, part) in [("alone", &heard[..STATES / 2]), ("beside a cloud", &heard[STATES / 2..])] {
@@ -325,7 +330,7 @@ fn assert_cloud(heard: &[Value], points: &[u8]) {
     let m = &heard[0];
     let shape = ["stamp", "frame", "height", "width", "step", "row", "big", "dense"].map(|key| m[key].clone());
     let stamp = 1_000_000_007_i64 + 65_536;
-    assert_eq!(json!(shape), json!([stamp, "odom", 1, finite.len(), 20, 20 * finite.len(), false, true]));
+    assert_eq!(json!(shape), json!([stamp, "map", 1, finite.len(), 20, 20 * finite.len(), false, true]));
     assert!(m["data"] == hex, "bytes of the cloud");
     assert_eq!(m["fields"][3], json!(["rgb", 12, 7, 1]));
 }
@@ -488,7 +493,7 @@ fn wrong_options_are_refused_and_a_signal_ends_a_bridge_without_a_daemon() {
         ["--mount-rpy-deg", "1,2,nan"],
         ["--namespace", "a b"],
         ["--namespace", "a//b"],
-        ["--frames", "odom"],
+        ["--frames", "odom", "base_link"],
         ["--cloud-period", "-1"],
         ["--rate", "x"],
     ] {
