@@ -7,10 +7,10 @@ use stipple::config::{Board, FrontendConfig};
 use stipple::loops::pose4::{wrapped, Pose4};
 use stipple::loops::{LoopKeyframe, Loops};
 use stipple::output::export::{export, Form, Request};
-use stipple::output::metrics::align;
+use stipple::output::metrics::{align, percentile};
 use stipple::output::report::Report;
 use stipple::output::OutputDir;
-use stipple::run::sensors::Input;
+use stipple::run::sensors::{Input, Playback};
 use stipple::run::{fly, Options, Pace, Steps};
 use stipple_drivers::replay::read_trajectory;
 use stipple_drivers::sim::{Scenario, Sim};
@@ -171,4 +171,46 @@ fn between_rooms_that_look_the_same_each_is_recognised_as_itself() {
     assert_eq!(map.len(), odometry.len());
     let moved = map.iter().zip(&odometry).map(|(a, b)| (a.pose.p - b.pose.p).length()).fold(0.0, f64::max);
     assert!(moved > 0.01 && moved < 1.0, "{moved}");
+}
+
+/// `taskset -c 0,1 cargo test --release --test loops disturbed -- --ignored --nocapture`: ten pairs of the patrol of two rooms at
+/// three times its pace (30 frames a second), with loops and without, a minute of it. Frames of all flights of a kind are pooled.
+#[test]
+#[ignore = "ten minutes, on a machine that does nothing else"]
+fn tracking_is_not_disturbed_by_the_closing_of_loops() {
+    const FLIGHTS: usize = 20;
+    let scenario = Scenario { duration: Span::from_secs(60.0), ..Scenario::named("patrol-two").unwrap() };
+    let mut pooled: [(Vec<f64>, Vec<f64>); 2] = Default::default();
+    let (mut dropped, mut closed) = ([0, 0], 0);
+    for flight in 0..FLIGHTS {
+        let kind = flight % 2;
+        let set = ["map.enabled=false".to_string(), format!("loops.enabled={}", kind == 1)];
+        let board = Board::parse("lavapipe.toml", include_str!("../board-configs/lavapipe.toml"), &set).unwrap();
+        let dir = tempfile::tempdir().unwrap();
+        let out = OutputDir::create(dir.path()).unwrap();
+        let playback = Playback { speed: 3.0, repeats: false };
+        let options = Options { pace: Pace::Recorded, playback, ..Options::default() };
+        let input = Input::rendered(&scenario, 0, |_, _| ()).unwrap();
+        let report = fly(input, &board, &out, &options, None).unwrap().report;
+        dropped[kind] += report.frames_dropped.unwrap();
+        closed += report.loops.len();
+        let log = std::fs::read(out.file("log-0000.mcap")).unwrap();
+        for message in mcap::MessageStream::new(&log).unwrap().map(Result::unwrap) {
+            if message.channel.topic == "/state" {
+                let state: serde_json::Value = serde_json::from_slice(&message.data).unwrap();
+                pooled[kind].0.push(state["latency_ms"].as_f64().unwrap());
+                pooled[kind].1.push(state["cpu_ms"].as_f64().unwrap());
+            }
+        }
+    }
+    let [without, with] = pooled.each_ref().map(|(ms, cpu)| {
+        let at = |list: &[f64], share: f64| percentile(list, share).unwrap();
+        (at(ms, 0.5), at(cpu, 0.99), ms.len())
+    });
+    println!("| | without loops | with, {closed} closed | ratio |\n|---|---|---|---|");
+    println!("| frames; lost | {}; {} | {}; {} | |", without.2, dropped[0], with.2, dropped[1]);
+    println!("| tracking, median | {:.2} ms | {:.2} ms | {:.3} |", without.0, with.0, with.0 / without.0);
+    println!("| CPU a frame, 99 % | {:.2} ms | {:.2} ms | {:.3} |", without.1, with.1, with.1 / without.1);
+    assert!(closed > FLIGHTS && dropped == [0, 0], "{closed} {dropped:?}");
+    assert!(with.0 < 1.05 * without.0 && with.1 < 1.15 * without.1);
 }
