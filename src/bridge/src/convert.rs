@@ -76,7 +76,7 @@ impl Frames {
         let is_usable = |m: &MapFromOdom| m.epoch == epoch && DVec3::from(m.position).is_finite() && m.yaw.is_finite();
         let found = told.filter(is_usable);
         TransformStamped {
-            header: Header { stamp: odometry.header.stamp, frame_id: self.map.clone() },
+            header: Header { stamp: odometry.header.stamp.clone(), frame_id: self.map.clone() },
             child_frame_id: self.odom.clone(),
             translation: found.map_or([0.0; 3], |m| m.position),
             rotation: DQuat::from_rotation_z(found.map_or(0.0, |m| m.yaw)).to_array(),

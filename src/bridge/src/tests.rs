@@ -75,8 +75,8 @@ fn odom_is_where_a_recognised_place_puts_it_in_its_epoch_alone() {
     let found = MapFromOdom { epoch: 2, position: [1.0, -2.0, 0.5], yaw: std::f64::consts::FRAC_PI_2 };
     let t = frames.map_from_odom(&o, 2, Some(found));
     assert_eq!(
-        (t.header.frame_id.as_str(), t.child_frame_id.as_str(), t.header.stamp),
-        ("map", "odom", o.header.stamp)
+        (t.header.frame_id.as_str(), t.child_frame_id.as_str(), &t.header.stamp),
+        ("map", "odom", &o.header.stamp)
     );
     assert_eq!(t.translation, found.position);
     assert!((DQuat::from_array(t.rotation) * DVec3::X - DVec3::Y).length() < 1e-12);
