@@ -70,10 +70,10 @@ impl Frames {
         is_finite(&odometry).then_some(odometry)
     }
 
-    /// Where `odom` is in `map`, for /tf, at the stamp of an odometry of an epoch: the same place as long as nothing was recognised
-    /// in that epoch.
-    pub fn map_from_odom(&self, odometry: &Odometry, epoch: u32, told: Option<MapFromOdom>) -> TransformStamped {
-        let is_usable = |m: &MapFromOdom| m.epoch == epoch && DVec3::from(m.position).is_finite() && m.yaw.is_finite();
+    /// Where `odom` is in `map`, for /tf, at the stamp of an odometry: the identity before a place was recognised. After a reset
+    /// it stays what it was until another is, as it does for the daemon's mapper.
+    pub fn map_from_odom(&self, odometry: &Odometry, told: Option<MapFromOdom>) -> TransformStamped {
+        let is_usable = |m: &MapFromOdom| DVec3::from(m.position).is_finite() && m.yaw.is_finite();
         let found = told.filter(is_usable);
         TransformStamped {
             header: Header { stamp: odometry.header.stamp.clone(), frame_id: self.map.clone() },

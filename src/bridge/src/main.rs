@@ -208,7 +208,7 @@ impl Bridge {
             return None;
         };
         odometry.header.stamp = stamp;
-        let map = self.frames.map_from_odom(&odometry, state.epoch, self.map_from_odom);
+        let map = self.frames.map_from_odom(&odometry, self.map_from_odom);
         let transforms = vec![transform(&odometry), map];
         let is_sent = [self.odometry.write(odometry), self.tf.write(TfMessage { transforms })];
         self.monitor.count(if is_sent == [true; 2] { "states" } else { "not_sent" });

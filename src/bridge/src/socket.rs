@@ -82,10 +82,9 @@ pub struct Status {
     pub governor: Option<BTreeMap<String, Value>>,
 }
 
-/// Where the `odom` of an epoch is in the map, which loops have made agree: told once a place was recognised.
+/// Where `odom` is in the map, which loops have made agree: told once a place was recognised.
 #[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
 pub struct MapFromOdom {
-    pub epoch: u32,
     /// m.
     pub position: [f64; 3],
     /// About z, rad.

@@ -69,11 +69,11 @@ fn vehicle_that_climbs_forward_in_a_left_turn_says_so() {
 }
 
 #[test]
-fn odom_is_where_a_recognised_place_puts_it_in_its_epoch_alone() {
+fn odom_is_where_the_last_recognised_place_puts_it() {
     let frames = frames(EUROC);
     let o = told(&frames, &state(DQuat::IDENTITY, [0.0; 3]));
-    let found = MapFromOdom { epoch: 2, position: [1.0, -2.0, 0.5], yaw: std::f64::consts::FRAC_PI_2 };
-    let t = frames.map_from_odom(&o, 2, Some(found));
+    let found = MapFromOdom { position: [1.0, -2.0, 0.5], yaw: std::f64::consts::FRAC_PI_2 };
+    let t = frames.map_from_odom(&o, Some(found));
     assert_eq!(
         (t.header.frame_id.as_str(), t.child_frame_id.as_str(), &t.header.stamp),
         ("map", "odom", &o.header.stamp)
@@ -81,8 +81,8 @@ fn odom_is_where_a_recognised_place_puts_it_in_its_epoch_alone() {
     assert_eq!(t.translation, found.position);
     assert!((DQuat::from_array(t.rotation) * DVec3::X - DVec3::Y).length() < 1e-12);
     let broken = MapFromOdom { yaw: f64::NAN, ..found };
-    for (epoch, told) in [(3, Some(found)), (2, None), (2, Some(broken))] {
-        let t = frames.map_from_odom(&o, epoch, told);
+    for told in [None, Some(broken)] {
+        let t = frames.map_from_odom(&o, told);
         assert_eq!((t.translation, t.rotation), ([0.0; 3], [0.0, 0.0, 0.0, 1.0]));
     }
 }

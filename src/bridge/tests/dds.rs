@@ -200,7 +200,7 @@ fn status(uptime_s: f64) -> Value {
     json!({"type": "status", "version": "0.1.0", "board": "drone-pi5", "dataset": "", "t_ns": 1, "wall_ns": 1, "uptime_s": uptime_s,
         "state": null, "health": [], "counters": {"frames_overwritten": 3}, "map": {"anchors": 4, "psnr_db": null},
         "frames": 10, "posed": 9, "governor": {"share": 1.0, "reason": null},
-        "map_from_odom": {"t_ns": 1, "count": 2, "epoch": 0, "position": [1.0, 2.0, 3.0], "yaw": 0.5, "covariance": ([[0.0; 4]; 4])}})
+        "map_from_odom": {"t_ns": 1, "count": 2, "epoch": 7, "position": [1.0, 2.0, 3.0], "yaw": 0.5, "covariance": ([[0.0; 4]; 4])}})
 }
 
 /// Tells states far below zero until Cyclone hears them: both ends know each other from then on.
