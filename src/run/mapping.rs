@@ -91,13 +91,14 @@ impl Mapping {
             super::start("store-write", move || writes.write_loop());
             super::start("store-read", move || reads.read_loop());
         }
+        let seams = Seams::new(&ring);
         Ok(Mapping {
             mapper,
             keyframe: ring.shape().clone(),
             ring,
             collected: 0,
             joined: 0,
-            seams: Seams::new(),
+            seams,
             curve: Vec::with_capacity(CURVE_POINTS),
             iteration_ms: Vec::with_capacity(ITERATION_TIMES),
             iterations: 0,

@@ -1,5 +1,5 @@
-//! Scores of the map where loops are closed that move it: before, after, and ten seconds of flight later. One loop at a time;
-//! those that are closed meanwhile go by.
+//! Scores of the map where loops are closed that move it: before, after, and ten seconds of flight after the loop. One loop at a
+//! time; those that are closed meanwhile are not scored.
 
 use super::keyframes::KeyframeRing;
 use crate::gpu::GpuError;
@@ -27,11 +27,13 @@ pub struct Seams {
 }
 
 impl Seams {
-    pub fn new() -> Seams {
-        Seams { seen: 0, current: None, list: Vec::with_capacity(SCORED) }
+    /// None yet. Loops that a ring has told of before are another mapper's.
+    pub fn new(ring: &KeyframeRing) -> Seams {
+        Seams { seen: ring.moved().0, current: None, list: Vec::with_capacity(SCORED) }
     }
 
-    /// Scores what is due, before the corrections up to number `written` are taken. `now` is the stamp of the newest keyframe.
+    /// Scores what is due, before the corrections that tracking has told so far, `written` in number, are taken. `now` is the stamp
+    /// of the newest keyframe.
     pub fn score(
         &mut self,
         mapper: &mut Mapper,
@@ -66,7 +68,7 @@ impl Seams {
         self.list.extend(self.current.take().map(|(_, scored)| scored));
     }
 
-    /// What was scored. The last one may lack what came too late for it.
+    /// What was scored. `after` and `later` of the last one are `None` where the flight ended first.
     pub fn take(&mut self) -> Vec<ScoredLoop> {
         self.end();
         std::mem::take(&mut self.list)
