@@ -1,6 +1,6 @@
-//! What a closed loop does to the map where an earlier visit and this one meet: how well views of both look, and how far the
-//! surfaces that are there are from those that stereo finds. The same views are scored before the loop moves anything, after
-//! it, and a while later.
+//! What a closed loop does to the map. A seam is where an earlier visit and this one meet in the map: how well views of both
+//! look is scored before the loop moves anything, after it, and a while later, the same views each time. Beside it stands how far
+//! the surfaces of the map are from those that stereo finds at the newest anchors, which are other views.
 
 use super::archive::Archive;
 use super::evaluate::{mean, score};
@@ -38,13 +38,13 @@ pub struct SeamScores {
     pub later: Option<SeamScore>,
 }
 
-/// A seam: entries that are trained on, the earlier ones first.
+/// A seam: indices of training views, those of the earlier visit first. There are none of an earlier flight.
 #[derive(Clone, Copy, Debug)]
 pub struct Seam([Option<usize>; 2 * VIEWS]);
 
 impl Seam {
     /// The seam of a loop closed with what was seen at `with`, where that was in this flight: the newest views, and those nearest
-    /// in time to the other. Only what is in memory with all that it sees.
+    /// in time to the other. Only views whose images and Gaussians are in memory.
     pub fn new(scene: &Scene, archive: &Option<Archive>, with: Option<Nanos>) -> Seam {
         let views = &scene.views;
         let shown = |i: usize| archive.as_ref().is_none_or(|archive| archive.is_shown(i / views.cameras()));

@@ -187,15 +187,22 @@ fn table_of_loops(report: &Report) -> String {
     let start = report.loops.first().map_or(0, |l| l.t_ns);
     let rows: Vec<RigRow> = scored
         .flat_map(|(l, map)| {
-            let at = format!("{:.0} s after the first, moves {:.2} m", (l.t_ns - start) as f64 * 1e-9, l.moved_m);
+            let at = format!(
+                "{:.0} s after the first loop, moves {:.2} m: PSNR of views",
+                (l.t_ns - start) as f64 * 1e-9,
+                l.moved_m
+            );
             let apart = three(map, &|score| score.disagreement.map(|share| 100.0 * share), 1);
-            [(at, three(map, &|score| score.psnr_db, 2), "dB"), ("depth off that of stereo".into(), apart, "%")]
+            [
+                (at, three(map, &|score| score.psnr_db, 2), "dB"),
+                ("Depth error against stereo, newest anchors".into(), apart, "%"),
+            ]
         })
         .collect();
     if rows.is_empty() {
         return String::new();
     }
-    table("Views of both visits before a loop is closed, after, 10 s later", &rows)
+    table("Map at closed loops: before, after, 10 s later", &rows)
 }
 
 /// By how much a barometer's height drifted, and of how many frames; `None` without one.

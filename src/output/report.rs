@@ -120,10 +120,12 @@ pub struct LoopClosed {
     pub yaw_rad: f64,
     pub moved_m: f64,
     pub moved_rad: f64,
-    /// The place was of another epoch, of this flight or an earlier one, and both are one map since then. The stamp is by the
-    /// clock of that flight.
+    /// The place was of another epoch, of this flight or an earlier one, and both are one map since then.
     #[serde(default)]
     pub joins: bool,
+    /// The place is of an earlier flight, and `with_ns` by the clock of that.
+    #[serde(default)]
+    pub earlier: bool,
     /// What it did to the map, where that was scored.
     #[serde(default)]
     pub map: Option<SeamScores>,

@@ -187,7 +187,7 @@ fn closed(c: &Closure) -> LoopClosed {
     let ([moved_m, moved_rad], corners) = (c.moved, c.inliers as u64);
     let (p_m, yaw_rad) = (c.measured.p.to_array(), c.measured.yaw);
     let (t_ns, with_ns, joins) = (c.t.0, c.with.0, c.joins.is_some());
-    LoopClosed { t_ns, with_ns, corners, p_m, yaw_rad, moved_m, moved_rad, joins, map: None }
+    LoopClosed { t_ns, with_ns, corners, p_m, yaw_rad, moved_m, moved_rad, joins, earlier: c.earlier, map: None }
 }
 
 /// Fills in the tracking figures; answers the trajectory.
