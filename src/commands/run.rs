@@ -35,10 +35,10 @@ pub struct Args {
     /// Inject the faults into the board's own sensors: for tests on the ground only
     #[arg(long, requires = "inject")]
     allow_injection: bool,
-    /// Begin with an empty map: what earlier runs left in DIR/map is moved to DIR/previous-map
+    /// Begin with an empty map: what earlier runs left in DIR/map and DIR/places is moved to previous-map and previous-places
     #[arg(long)]
     fresh: bool,
-    /// Find the way in the map that earlier runs left in DIR, and change nothing of it
+    /// Find the way in the map that earlier runs left in DIR, and change nothing of DIR/map and DIR/places: nothing is mapped
     #[arg(long, conflicts_with = "fresh")]
     localise_only: bool,
     /// Record the samples to this folder too, as EuRoC

@@ -99,7 +99,7 @@ events! {
     OdometryCarried = 33, "odometry_carried", Warning;
     /// Odometry is lost: dead reckoning, or nothing; told to the autopilot.
     OdometryLost = 34, "odometry_lost", Critical;
-    /// A place was recognised, and the drift since corrected in the map's frame.
+    /// A place was recognised, and the drift since corrected in the map's frame, or the vehicle found itself in the map of an earlier epoch or flight.
     Loop = 35, "loop", Notice;
     /// A thread gives no sign of life.
     ThreadSilent = 40, "thread_silent", Critical;
