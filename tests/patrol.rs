@@ -6,13 +6,13 @@ use std::sync::Arc;
 use stipple::config::Board;
 use stipple::output::OutputDir;
 use stipple::run::sensors::Input;
-use stipple::run::{fly, Options, Pace, Spacing, Steps};
+use stipple::run::{fly, KeyframesAt, Options, Pace, Spacing, Steps};
 use stipple_drivers::sim::Scenario;
 use stipple_drivers::{host, Span};
 
 /// Flies so much of the patrol of two rooms without a map; answers the report, and the resident set after a third of it and at
 /// its end, bytes.
-fn flown(seconds: f64, at_truth: Option<Spacing>) -> (stipple::output::report::Report, [u64; 2]) {
+fn flown(seconds: f64, at_truth: Option<KeyframesAt>) -> (stipple::output::report::Report, [u64; 2]) {
     let board = include_str!("../board-configs/lavapipe.toml");
     let board = Board::parse("lavapipe.toml", board, &["map.enabled=false".into()]).unwrap();
     let scenario = Scenario { duration: Span::from_secs(seconds), ..Scenario::named("patrol-two").unwrap() };
@@ -42,7 +42,7 @@ fn odometry_follows_two_rounds_of_two_rooms_in_memory_that_stays_level() {
 #[test]
 fn keyframes_at_true_poses_are_as_far_apart_as_asked() {
     let spacing = Spacing { moved_m: 0.5, turned_rad: 0.262, waited_s: 1.0 };
-    let (report, _) = flown(12.0, Some(spacing));
+    let (report, _) = flown(12.0, Some(KeyframesAt::Spaced(spacing)));
     // One a second at rest and while it flies straight at 0.9 m/s two a second at most; turns add theirs.
     let keyframes = report.keyframes.unwrap();
     assert!(report.frames == Some(121) && (12..40).contains(&keyframes), "{keyframes}");

@@ -86,6 +86,8 @@ use stipple_drivers::record::Format;
 use stipple_drivers::replay::read_trajectory;
 use stipple_drivers::{host, Calibration, Fault, FaultKind, Frames};
 pub use supervisor::Steering;
+pub use table::KeyframesAt;
+#[cfg(feature = "instruments")]
 pub use table::Spacing;
 use table::Table;
 use tracking::{FramePacket, Inlet, Link, OdometryRun, Tracker};
@@ -119,7 +121,7 @@ pub struct Options {
     /// Table of poses in place of odometry.
     pub poses: Option<PathBuf>,
     /// The input's own true poses in place of odometry, and which frames are keyframes.
-    pub at_truth: Option<Spacing>,
+    pub at_truth: Option<KeyframesAt>,
     /// Every Nth keyframe is evaluated and never trained on; 0: none.
     pub holdout: u32,
     /// Live sensors are stopped after this time. A recording ends there; past its end the mapper goes on alone.
@@ -196,7 +198,7 @@ pub fn fly(
     input.needs_colour(colours)?;
     let Playback { speed, repeats } = options.playback;
     let frames = opening::frames_kept(&mut input, options);
-    let looked_up = |poses| Tracker::Table(Table { poses, spacing: options.at_truth, last: None });
+    let looked_up = |poses| Tracker::Table(Table { poses, keyframes: options.at_truth.clone(), last: None });
     let mut tracker = match &options.poses {
         Some(path) => looked_up(read_trajectory(path)?),
         None if options.at_truth.is_some() => looked_up(input.truth.clone()),

@@ -11,9 +11,18 @@ const POSE_GAP_MAX: Span = Span(100_000_000);
 pub struct Table {
     pub poses: Vec<TimedPose>,
     /// Without it every frame is a keyframe.
-    pub spacing: Option<Spacing>,
+    pub keyframes: Option<KeyframesAt>,
     /// The last keyframe.
     pub last: Option<TimedPose>,
+}
+
+/// Which frames are keyframes.
+#[derive(Clone, Debug, PartialEq)]
+#[cfg_attr(not(feature = "instruments"), allow(dead_code))] // benches and tests ask for it
+pub enum KeyframesAt {
+    Spaced(Spacing),
+    /// Those of these stamps, in order: what another flight chose.
+    Stamps(Vec<Nanos>),
 }
 
 /// What makes a frame a keyframe: any of these since the last one.
@@ -36,8 +45,9 @@ impl Table {
     /// The pose at an instant, and whether it makes a keyframe; `None` where the table does not cover it.
     pub fn at(&mut self, t: Nanos) -> Option<(Pose, bool)> {
         let now = TimedPose { t, pose: pose_at(&self.poses, t, POSE_GAP_MAX)? };
-        let keyframe = match (&self.spacing, &self.last) {
-            (Some(spacing), Some(last)) => spacing.has_passed(last, &now),
+        let keyframe = match (&self.keyframes, &self.last) {
+            (Some(KeyframesAt::Stamps(stamps)), _) => stamps.binary_search(&t).is_ok(),
+            (Some(KeyframesAt::Spaced(spacing)), Some(last)) => spacing.has_passed(last, &now),
             _ => true,
         };
         if keyframe {
@@ -64,5 +74,14 @@ mod tests {
         for later in [at(0.1, 0.6, 0.0), at(0.1, 0.0, -0.3), at(1.0, 0.0, 0.0)] {
             assert!(spacing.has_passed(&first, &later), "{later:?}");
         }
+    }
+
+    #[test]
+    fn keyframes_are_those_of_the_stamps_given() {
+        let poses = [0, 50_000_000, 100_000_000].map(|t| TimedPose { t: Nanos(t), pose: Pose::IDENTITY }).to_vec();
+        let keyframes = Some(KeyframesAt::Stamps(vec![Nanos(50_000_000)]));
+        let mut table = Table { poses, keyframes, last: None };
+        let chosen = [0, 50_000_000, 70_000_000].map(|t| table.at(Nanos(t)).map(|(_, keyframe)| keyframe));
+        assert_eq!(chosen, [Some(false), Some(true), Some(false)]);
     }
 }

@@ -10,7 +10,7 @@ use crate::run::default_board;
 use crate::{ply, table};
 use glam::DVec3;
 use serde_json::json;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 use std::sync::Arc;
 use std::time::Instant;
@@ -20,7 +20,7 @@ use stipple::output::metrics::trajectory_error;
 use stipple::output::report::{LoopClosed, Report};
 use stipple::output::OutputDir;
 use stipple::run::sensors::{Input, Source};
-use stipple::run::{fly, Options, Pace, Spacing, Steps, MAP_STORE};
+use stipple::run::{fly, KeyframesAt, Options, Pace, Spacing, Steps, MAP_STORE};
 use stipple_drivers::replay::read_trajectory;
 use stipple_drivers::sim::Scenario;
 use stipple_drivers::types::pose_at;
@@ -49,6 +49,9 @@ pub struct Args {
     /// Where poses come from
     #[arg(long, value_enum, default_value = "odometry")]
     poses: Poses,
+    /// With true poses: the keyframes are those that the map of an earlier patrol in this folder kept
+    #[arg(long, value_name = "DIR")]
+    keyframes_of: Option<PathBuf>,
     /// Board file; without it the one for Vulkan on the CPU
     #[arg(long, value_name = "FILE")]
     board: Option<PathBuf>,
@@ -61,6 +64,12 @@ pub struct Args {
     /// Seconds of the flight; without it all of it
     #[arg(long, value_name = "S", value_parser = crate::seconds)]
     seconds: Option<f64>,
+    /// Stop in order once this frame is read, with the few that are read together with it
+    #[arg(long, value_name = "N", conflicts_with = "abort_at")]
+    stop_at: Option<usize>,
+    /// Abort when this frame is read, before anything is done with it: nothing more is written, and --again scores what is left
+    #[arg(long, value_name = "N")]
+    abort_at: Option<usize>,
     /// Seed of the building and of the sensors' noise; without it the scenario's own
     #[arg(long, value_name = "N")]
     seed: Option<u64>,
@@ -124,7 +133,14 @@ pub fn run(args: &Args) -> Result<(), Fault> {
     }
     let resident = Arc::new(Resident::default());
     let (seen, settled) = (resident.clone(), (SETTLED_S * scenario.rate_hz) as usize);
+    let (stop_at, abort_at) = (args.stop_at, args.abort_at);
     let input = Input::simulated(&scenario, move |frame, of| {
+        if stop_at == Some(frame) {
+            host::stop_asked_for().store(true, Relaxed);
+        }
+        if abort_at == Some(frame) {
+            std::process::abort();
+        }
         if frame == settled.min(of) || frame == of {
             let bytes = host::rss_bytes().unwrap_or(0);
             let _ = seen.settled.compare_exchange(0, bytes, Relaxed, Relaxed);
@@ -133,7 +149,11 @@ pub fn run(args: &Args) -> Result<(), Fault> {
     })?;
     let (truth, first) = (input.truth.clone(), first_stamp(&input));
     let pace = Pace::Lockstep(Steps::PerFrame(args.steps));
-    let at_truth = (args.poses == Poses::Truth).then_some(SPACING);
+    let at_truth = match (args.poses, &args.keyframes_of) {
+        (Poses::Truth, Some(folder)) => Some(KeyframesAt::Stamps(keyframes_of(folder)?)),
+        (Poses::Truth, None) => Some(KeyframesAt::Spaced(SPACING)),
+        (Poses::Odometry, _) => None,
+    };
     let options = Options { pace, at_truth, holdout: HOLDOUT, fresh: true, ..Options::default() };
     let report = fly(input, &board, &out, &options, None)?.report;
     let estimated = read_trajectory(&out.file("trajectory.tum"))?;
@@ -145,6 +165,16 @@ pub fn run(args: &Args) -> Result<(), Fault> {
     let page = page(args, &report, &resident, rows);
     page.write(&out)?;
     Ok(())
+}
+
+/// Stamps of the keyframes that the map of a patrol kept.
+fn keyframes_of(folder: &Path) -> Result<Vec<Nanos>, Fault> {
+    let file = folder.join("report.json");
+    let fix = "name the folder of a patrol that was flown";
+    let fault = |e: String| Fault::new(FaultKind::NoInput, file.display().to_string(), e, fix);
+    let text = std::fs::read_to_string(&file).map_err(|e| fault(e.to_string()))?;
+    let report: Report = serde_json::from_str(&text).map_err(|e| fault(e.to_string()))?;
+    Ok(report.quality.keyframe_scores.iter().map(|score| Nanos(score.t_ns)).collect())
 }
 
 /// Scores what is in the store, and prints the rooms' rows.
