@@ -33,7 +33,7 @@ use stipple_drivers::{host, Calibration, Fault, FaultKind, Nanos, Pose};
 
 /// Training steps after which a block is written again, as a part of those it had, and at least.
 const REWRITTEN_PART: f64 = 0.25;
-const REWRITTEN_MIN: u32 = 100;
+const REWRITTEN_MIN: u32 = 10;
 /// Training steps on a view at which its horizon is first taken again, and from one time to the next.
 const FIRST_LOOK: u32 = 5;
 const LOOKS_RATIO: u32 = 4;

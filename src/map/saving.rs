@@ -20,8 +20,8 @@ const BLOCKS_CUT: usize = BLOCKS_KNOWN / 4 * 3;
 const GAUSSIANS_A_SAMPLE: usize = 10;
 const SAMPLES_MIN: usize = 8;
 /// Blocks and states of keyframes written when a keyframe comes, at most.
-const BLOCKS_AT_ONCE: usize = 8;
-const STATES_AT_ONCE: usize = 4;
+const BLOCKS_AT_ONCE: usize = 64;
+const STATES_AT_ONCE: usize = 16;
 
 /// A Gaussian's mean and how large its disc is, σ, m: the geometric mean of its two larger axes.
 fn sample(splat: &Splat) -> [f32; 4] {
