@@ -214,19 +214,21 @@ impl Archive {
 
     /// Writes a few of the blocks and states that have changed most while the map trained.
     pub fn save_some(&mut self, scene: &mut Scene) -> Result<(), GpuError> {
-        let mut written = 0;
-        for _ in 0..self.blocks.len() {
-            self.next_block = (self.next_block + 1) % self.blocks.len();
-            let b = self.blocks[self.next_block];
-            // The newest is written when it is densified.
-            let complete = b.samples_len > 0;
-            if b.in_pool && complete && b.is_due() {
-                if written == BLOCKS_AT_ONCE || !self.save_block(scene, self.next_block)? {
-                    break;
-                }
-                written += 1;
-            }
+        let mut due = std::mem::take(&mut self.choice.ranked);
+        due.clear();
+        // The newest is written when it is densified.
+        let is_due = |b: &Block| b.in_pool && b.samples_len > 0 && b.is_due();
+        let blocks = self.blocks.len();
+        let turns = (self.next_block..blocks).chain(0..self.next_block.min(blocks));
+        due.extend(turns.filter(|b| is_due(&self.blocks[*b])).take(BLOCKS_AT_ONCE).map(|b| (0.0, b as u32)));
+        let saved = self.save_blocks(scene, &due, true);
+        if let Ok(saved) = saved {
+            // The first that was not written is the next one.
+            let last = due.last().map_or(self.next_block, |(_, b)| *b as usize + 1);
+            self.next_block = due.get(saved).map_or(last, |(_, b)| *b as usize);
         }
+        self.choice.ranked = due;
+        saved?;
         let keyframes = self.known.len();
         for _ in 0..STATES_AT_ONCE.min(keyframes) {
             self.next_state = (self.next_state + 1) % keyframes;
