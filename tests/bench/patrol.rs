@@ -152,7 +152,11 @@ pub fn run(args: &Args) -> Result<(), Fault> {
     let at_truth = match (args.poses, &args.keyframes_of) {
         (Poses::Truth, Some(folder)) => Some(KeyframesAt::Stamps(keyframes_of(folder)?)),
         (Poses::Truth, None) => Some(KeyframesAt::Spaced(SPACING)),
-        (Poses::Odometry, _) => None,
+        (Poses::Odometry, None) => None,
+        (Poses::Odometry, Some(_)) => {
+            let problem = "is for flights at true poses";
+            return Err(Fault::new(FaultKind::Usage, "--keyframes-of", problem, "add --poses truth"));
+        }
     };
     let options = Options { pace, at_truth, holdout: HOLDOUT, fresh: true, ..Options::default() };
     let report = fly(input, &board, &out, &options, None)?.report;
@@ -174,7 +178,8 @@ fn keyframes_of(folder: &Path) -> Result<Vec<Nanos>, Fault> {
     let fault = |e: String| Fault::new(FaultKind::NoInput, file.display().to_string(), e, fix);
     let text = std::fs::read_to_string(&file).map_err(|e| fault(e.to_string()))?;
     let report: Report = serde_json::from_str(&text).map_err(|e| fault(e.to_string()))?;
-    Ok(report.quality.keyframe_scores.iter().map(|score| Nanos(score.t_ns)).collect())
+    let stamps: Vec<Nanos> = report.quality.keyframe_scores.iter().map(|score| Nanos(score.t_ns)).collect();
+    (!stamps.is_empty()).then_some(stamps).ok_or_else(|| fault("has no keyframes".into()))
 }
 
 /// Scores what is in the store, and prints the rooms' rows.
