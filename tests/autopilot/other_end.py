@@ -90,21 +90,22 @@ class Line:
 
     def read(self, wait):
         readable, _, _ = select.select([self.fd], [], [], wait)
+        now = time.monotonic()
         if not readable:
+            self.free = now
             return b""
         if self.socket:
             data, self.peer = self.socket.recvfrom(4096)
             return data
-        # What a UART gives in a millisecond.
-        now = time.monotonic()
-        if now < self.free:
-            time.sleep(self.free - now)
+        # A UART sends while nobody looks: a late reader finds all that its line carried since the last byte, and no more.
+        time.sleep(max(0.0, self.free + 0.001 - now))
+        carried = int((time.monotonic() - self.free) * self.baud / 10.0)
         try:
-            data = os.read(self.fd, max(1, self.baud // 10000))
+            data = os.read(self.fd, max(1, carried))
         except OSError:
             time.sleep(wait)
             return b""
-        self.free = max(self.free, now) + 10.0 * len(data) / self.baud
+        self.free += 10.0 * len(data) / self.baud
         return data
 
     def write(self, data):
