@@ -16,6 +16,8 @@ use stipple_drivers::{Fault, FaultKind};
 pub const LOCK: &str = "lock";
 /// Foreign files that are named.
 const WARNINGS_MAX: usize = 16;
+/// Threads that read headers ahead of the scan.
+const READERS: usize = 8;
 
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Use {
@@ -77,6 +79,41 @@ pub fn scan(
     mut check: Option<&mut [u8]>,
 ) -> Result<Found, Fault> {
     let mut found = list(path, folder, identity)?;
+    let sealed: Vec<Segment> = found.segments.iter().filter(|s| s.state == Use::Sealed).copied().collect();
+    let identity = found.identity;
+    std::thread::scope(|scope| {
+        for t in 0..READERS {
+            let sealed = &sealed;
+            scope.spawn(move || {
+                sealed.iter().skip(t).step_by(READERS).for_each(|segment| read_ahead(folder, segment, identity));
+            });
+        }
+        take(path, folder, &mut found, index, &mut check)
+    })?;
+    complete(path, folder, &mut found, index)?;
+    for entry in index.entries() {
+        found.segments[entry.newest.segment].live += entry.newest.size();
+    }
+    Ok(found)
+}
+
+/// Brings the headers of a segment into the page cache. Where each is, is known from the one before: of one segment a disk
+/// is asked for one at a time, and most disks serve several in the time of one.
+fn read_ahead(folder: &Folder, segment: &Segment, identity: u64) {
+    let Ok(file) = folder.read(segment.number) else { return };
+    let mut walk = Walk::new(segment.bytes, segment.sequence, identity);
+    let mut sector = [0; SECTOR];
+    while let Ok(Some(_)) = walk.next(&file, &mut sector) {}
+}
+
+/// Takes the records of all segments, in the order in which they were written.
+fn take(
+    path: &Path,
+    folder: &Folder,
+    found: &mut Found,
+    index: &mut Index,
+    check: &mut Option<&mut [u8]>,
+) -> Result<(), Fault> {
     let mut scratch = vec![0; SCRATCH];
     for i in 0..found.segments.len() {
         if found.segments[i].state != Use::Sealed {
@@ -92,12 +129,12 @@ pub fn scan(
             opened => opened.map_err(|e| unreadable(path, number, &e))?,
         };
         let place = path.join(segment::name(number));
-        match walk(&mut found, i, &file, index, &mut scratch, &mut check) {
+        match walk(found, i, &file, index, &mut scratch, check) {
             Ok(()) => {}
             Err(Stop::Io(e)) => {
                 found.read_errors += 1;
                 found.segments[i].is_unreadable = true;
-                warn(&mut found, format!("{}: a part cannot be read: {e}; the disk may be failing", place.display()));
+                warn(found, format!("{}: a part cannot be read: {e}; the disk may be failing", place.display()));
             }
             Err(Stop::Full) => {
                 let why = "the store holds more records than the limits allow";
@@ -119,11 +156,7 @@ pub fn scan(
             }
         }
     }
-    complete(path, folder, &mut found, index)?;
-    for entry in index.entries() {
-        found.segments[entry.newest.segment].live += entry.newest.size();
-    }
-    Ok(found)
+    Ok(())
 }
 
 fn unreadable(path: &Path, number: u32, e: &io::Error) -> Fault {
