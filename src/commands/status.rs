@@ -178,6 +178,17 @@ pub fn screen(s: &StatusMessage) -> String {
             map.keyframes, map.anchors, map.splats, map.iterations
         ),
     );
+    if let Some(m) = &summary.map_from_odom {
+        let ([x, y, z], yaw) = (m.position, m.yaw.to_degrees());
+        let age_s = (s.t_ns - m.t_ns) as f64 * 1e-9;
+        row(
+            "loops",
+            format!(
+                "{}, the last {age_s:.0} s ago: odom is at {x:.2}, {y:.2}, {z:.2} m, {yaw:.1} degrees in the map",
+                m.count
+            ),
+        );
+    }
     let why = summary.governor.reason.as_ref().map(|why| format!(": {why}")).unwrap_or_default();
     row("mapper", format!("{:.0} % of its time{why}", 100.0 * summary.governor.share));
     let counted: Vec<String> =
@@ -206,6 +217,7 @@ mod tests {
             "state":{"t_ns":1000000000,"wall_ns":0,"epoch":2,"quality":7,"source":"dead_reckoned","health":["no_tracks"],
             "position":[1,2,3],"orientation":[0,0,0,1],"velocity_body":[3,0,4],"rate_body":[0,0,0],"pose_covariance":null,
             "velocity_covariance":null},"frames":9,"posed":8,"map":{"keyframes":1,"anchors":1,"splats":5,"iterations":6,"psnr_db":null},
+            "map_from_odom":{"t_ns":-1950000000,"count":4,"epoch":2,"position":[0.5,-0.25,0],"yaw":0.1,"covariance":[[0,0,0,0],[0,0,0,0],[0,0,0,0],[0,0,0,0]]},
             "governor":{"share":0.49,"reason":"cpu is at 90 degrees"},"counters":{"imu_gap":3,"camera_lost":0}}"#;
         let shown = screen(&serde_json::from_str(text).unwrap());
         for part in [
@@ -213,6 +225,7 @@ mod tests {
             "quality 7 %, lost: dead reckoning; no_tracks",
             "epoch 2, the newest pose is of 50 ms ago",
             "1.00, 2.00, 3.00 m, at 5.00 m/s",
+            "loops     4, the last 3 s ago: odom is at 0.50, -0.25, 0.00 m, 5.7 degrees in the map",
             "49 % of its time: cpu is at 90 degrees",
             "counters  imu_gap 3",
         ] {

@@ -42,9 +42,9 @@ const BY_LOOKS: usize = 8;
 const BY_PLACE: usize = 3;
 /// A keyframe closes no loop with one younger than this, s.
 const OLD_S: f64 = 20.0;
-/// Once a loop is closed, the next that says the same has to wait so long, s; not for a while after two frames were joined, which
-/// nothing but loops holds together.
+/// Least time between two loops that are closed, s.
 const REST_S: f64 = 1.0;
+/// For so long after two map frames were joined, s, every recognised place closes a loop: loops alone hold the two together.
 const FRESH_S: f64 = 10.0;
 /// Candidates by looks where the vehicle may be anywhere. Of those that are nearer to each other than this, m, two are verified, so
 /// that a place that looks the same is among them.
@@ -111,7 +111,7 @@ pub struct Place {
     /// Pose in `odom`, of the upright frame, and what turns the body upright.
     pub odom: Pose4,
     pub tilt: DQuat,
-    /// Those of one frame have their poses in one map.
+    /// Number of its map frame. Poses of places with the same number can be compared.
     frame: u32,
     /// Its key on the disk.
     number: u32,

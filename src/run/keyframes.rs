@@ -254,7 +254,7 @@ impl KeyframeRing {
     }
 
     /// Tells of a loop whose corrections follow.
-    fn push_moved(&self, moved: &Moved) {
+    pub(super) fn push_moved(&self, moved: &Moved) {
         self.word(Word::MovedAt).store(moved.t.0 as u64, Relaxed);
         self.word(Word::MovedWith).store(moved.with.map_or(0, |with| with.0 as u64), Relaxed);
         self.word(Word::Moved).fetch_add(1, Release);

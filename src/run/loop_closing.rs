@@ -46,7 +46,8 @@ pub struct Moved {
     pub with: Option<Nanos>,
 }
 
-/// An epoch that is one map with another of this flight; `flight` is that of an earlier one, ms since 1970.
+/// Epoch `epoch`, which has the map frame of epoch `into` of this flight from now on. `flight` is when its flight began, ms since
+/// 1970, where it is of an earlier one.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Join {
     pub flight: Option<i64>,
@@ -91,7 +92,8 @@ pub struct LoopQueue {
     waiting: ArrayQueue<Box<Work>>,
     answers: ArrayQueue<Answer>,
     closed: ArrayQueue<(Closure, MapFromOdom)>,
-    /// There is a map that the vehicle does not know its place in.
+    /// The vehicle's place is unknown in a map that is there, of an earlier epoch or flight: frames that are no keyframes are
+    /// searched too.
     lost: AtomicBool,
     waker: Waker,
 }

@@ -74,3 +74,19 @@ impl Seams {
         std::mem::take(&mut self.list)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::keyframes::tests::ring;
+    use super::super::loop_closing::Moved;
+    use super::*;
+
+    #[test]
+    fn a_mapper_that_starts_again_scores_no_loop_that_was_told_to_the_one_before() {
+        let ring = ring();
+        ring.push_moved(&Moved { t: Nanos(5), with: None });
+        let again = Seams::new(&ring);
+        assert_eq!((again.seen, again.current.is_none()), (ring.moved().0, true));
+        assert_eq!(ring.moved().0, 1);
+    }
+}
