@@ -54,6 +54,9 @@ pub struct Args {
     /// One small case
     #[arg(long)]
     quick: bool,
+    /// Only the cases that are of use without a GPU: 6 000 and 30 000 at 320x240, 50 000 at 752x480
+    #[arg(long, conflicts_with = "quick")]
+    small: bool,
     /// Without subgroups: what every device runs
     #[arg(long)]
     baseline: bool,
@@ -122,14 +125,17 @@ pub fn run(args: &Args) -> Result<(), Fault> {
     if args.quick {
         bench.by_count.push(wall(2_000, (160, 120))?);
     } else {
-        for n in COUNTS {
-            bench.by_count.push(wall(n, SIZE)?);
+        for n in if args.small { &[] } else { &COUNTS[..] } {
+            bench.by_count.push(wall(*n, SIZE)?);
         }
-        for size in SIZES {
-            bench.by_size.push(wall(COUNT, size)?);
+        for size in if args.small { &[] } else { &SIZES[..] } {
+            bench.by_size.push(wall(COUNT, *size)?);
         }
         for n in SMALL.0 {
             bench.single.push(wall(n, SMALL.1)?);
+        }
+        if args.small {
+            bench.single.push(wall(COUNT, SIZE)?);
         }
     }
     if let Some(scene) = &recorded {
@@ -335,7 +341,7 @@ fn growth(cases: &[Case], x: &str) -> Option<String> {
         Series::dots("step, wall", 1, of(&|c| c.wall_ms)),
         Series::dots("step, device", 2, of(&|c| c.device_ms)),
         Series::dots("rasters", 3, part(&["raster_"])),
-        Series::dots("sort", 4, part(&["radix_", "scan_"])),
+        Series::dots("sort", 4, part(&["radix_", "share_", "scan_"])),
     ];
     let title = format!("A training step against {x}");
     Chart { title: &title, x, y: "ms", series, from_zero: true, ..Chart::default() }.svg()
