@@ -3,7 +3,7 @@
 //! What is written is read by people (`target/**/out/kernels.rs`), so it is plain: structs, constants
 //! and one `impl KernelDef` a kernel.
 
-use crate::reflect::{Access, Kernel, Scalar, Struct, Type};
+use crate::reflect::{Access, Buffer, Kernel, Scalar, Struct, Type, BUFFERS_MAX};
 use std::collections::BTreeMap;
 use std::fmt::Write;
 
@@ -20,10 +20,13 @@ pub fn emit(sources: &[Source]) -> Result<String, Vec<String>> {
     let mut types: BTreeMap<String, (Struct, String)> = BTreeMap::new();
     for source in sources {
         let base = &source.variants[0].1;
+        if let Some(buffer) = base.buffers.iter().find(|b| b.texels) {
+            errors.push(format!("{}: `{}` is a buffer of texels in the baseline", source.stem, buffer.name));
+        }
         for (define, other, _) in &source.variants[1..] {
-            if (&base.buffers, &base.push, &base.specs, base.local)
-                != (&other.buffers, &other.push, &other.specs, other.local)
-            {
+            let buffers = base.buffers.len() == other.buffers.len()
+                && base.buffers.iter().zip(&other.buffers).all(|(base, other)| texel_format(base, other).is_some());
+            if !buffers || (&base.push, &base.specs, base.local) != (&other.push, &other.specs, other.local) {
                 errors.push(format!("{}: variant `{define}` has another interface than the baseline", source.stem));
             }
         }
@@ -41,6 +44,39 @@ pub fn emit(sources: &[Source]) -> Result<String, Vec<String>> {
     let mut out = String::new();
     text(&mut out, sources, &types).map_err(|e| vec![e.to_string()])?;
     Ok(out)
+}
+
+/// VkFormat of the texels that a variant reads a buffer of the baseline as: zero where it is the same storage buffer. `None` where
+/// it is neither.
+fn texel_format(base: &Buffer, variant: &Buffer) -> Option<i32> {
+    if base == variant && !base.texels {
+        return Some(0);
+    }
+    let names = field(&base.name) == field(&variant.name) && base.binding == variant.binding;
+    if !names || !variant.texels || base.texels || base.access != Access::Read {
+        return None;
+    }
+    let Type::Scalar(scalar) = variant.element else { return None };
+    // Elements of four words and more are texels of four components.
+    match (scalar, base.element.size()) {
+        _ if !is_all(&base.element, scalar) => None,
+        (Scalar::Uint, 4) => Some(98),
+        (Scalar::Float, 4) => Some(100),
+        (Scalar::Uint, 8) => Some(101),
+        (Scalar::Float, 8) => Some(103),
+        (Scalar::Float, bytes) if bytes % 16 == 0 => Some(109),
+        _ => None,
+    }
+}
+
+/// Whether a type has no other scalars than this.
+fn is_all(ty: &Type, scalar: Scalar) -> bool {
+    match ty {
+        Type::Scalar(s) | Type::Vector(s, _) => *s == scalar,
+        Type::Matrix(_) => scalar == Scalar::Float,
+        Type::Array { of, .. } | Type::Runtime { of, .. } => is_all(of, scalar),
+        Type::Struct(s) => s.members.iter().all(|m| is_all(&m.ty, scalar)),
+    }
 }
 
 fn text(out: &mut String, sources: &[Source], types: &BTreeMap<String, (Struct, String)>) -> std::fmt::Result {
@@ -108,9 +144,13 @@ fn kernel(out: &mut String, source: &Source) -> std::fmt::Result {
     writeln!(out, "    const SPEC_IDS: &'static [u32] = &{ids:?};")?;
     writeln!(out, "    const VARIANTS: &'static [Variant] = &[")?;
     for (define, v, file) in &source.variants {
+        let mut texels = [0; BUFFERS_MAX];
+        for ((format, base), buffer) in texels.iter_mut().zip(&k.buffers).zip(&v.buffers) {
+            *format = texel_format(base, buffer).unwrap_or(0);
+        }
         writeln!(
             out,
-            "        Variant {{ define: {define:?}, name: {:?}, spirv: include_bytes!({file:?}), shared_bytes: {}, capabilities: &{:?} }},",
+            "        Variant {{ define: {define:?}, name: {:?}, spirv: include_bytes!({file:?}), shared_bytes: {}, capabilities: &{:?}, texels: {texels:?} }},",
             variant_name(&source.stem, define),
             v.shared_bytes,
             v.capabilities

@@ -60,7 +60,10 @@ pub struct Buffer {
     pub binding: u32,
     pub name: String,
     pub access: Access,
+    /// Of a texel buffer, the scalar of a component.
     pub element: Type,
+    /// Read as texels: variants alone do so.
+    pub texels: bool,
 }
 
 #[derive(Clone, Debug, PartialEq)]
@@ -172,6 +175,7 @@ const NON_READABLE: u32 = 25;
 const SPEC_ID: u32 = 1;
 const BUILT_IN: u32 = 11;
 const WORKGROUP_SIZE: u32 = 25;
+const STORAGE_CONSTANT: u32 = 0;
 const STORAGE_UNIFORM: u32 = 2;
 const STORAGE_WORKGROUP: u32 = 4;
 const STORAGE_PUSH: u32 = 9;
@@ -239,6 +243,7 @@ impl Module {
                 STORAGE_WORKGROUP => k.shared_bytes += self.ty(pointee, None)?.size(),
                 STORAGE_PUSH => k.push = Some(self.push(pointee)?),
                 STORAGE_BUFFER => k.buffers.push(self.buffer(id, pointee)?),
+                STORAGE_CONSTANT => k.buffers.push(self.texels(id, pointee)?),
                 STORAGE_UNIFORM => {
                     return Err("uniform blocks are not used here: push constants or a readonly buffer".into())
                 }
@@ -276,10 +281,7 @@ impl Module {
             Some(n) if !n.is_empty() => n.clone(),
             _ => s.name.clone(),
         };
-        if self.decorations.get(&(id, 34)).copied().unwrap_or(0) != 0 {
-            return Err(format!("buffer `{name}`: only descriptor set 0 is used"));
-        }
-        let binding = *self.decorations.get(&(id, 33)).ok_or(format!("buffer `{name}` has no binding"))?;
+        let binding = self.binding(id, &name)?;
         let all = |decoration: u32| {
             self.decorations.contains_key(&(id, decoration))
                 || (0..s.members.len() as u32).all(|m| self.member_decorations.contains_key(&(block, m, decoration)))
@@ -304,7 +306,32 @@ impl Module {
                 Type::Struct(s)
             }
         };
-        Ok(Buffer { binding, name, access, element })
+        Ok(Buffer { binding, name, access, element, texels: false })
+    }
+
+    fn binding(&self, id: u32, name: &str) -> Result<u32, String> {
+        if self.decorations.get(&(id, 34)).copied().unwrap_or(0) != 0 {
+            return Err(format!("buffer `{name}`: only descriptor set 0 is used"));
+        }
+        self.decorations.get(&(id, 33)).copied().ok_or(format!("buffer `{name}` has no binding"))
+    }
+
+    /// A `samplerBuffer` or `usamplerBuffer`.
+    fn texels(&self, id: u32, sampled: u32) -> Result<Buffer, String> {
+        const DIM_BUFFER: u32 = 5;
+        let name = self.names.get(&id).cloned().unwrap_or_default();
+        let image = match self.define(sampled)? {
+            (27, w) => self.define(w[0])?,
+            other => other,
+        };
+        match image {
+            (25, w) if w[1] == DIM_BUFFER => {
+                let binding = self.binding(id, &name)?;
+                let element = Type::Scalar(self.scalar(w[0])?);
+                Ok(Buffer { binding, name, access: Access::Read, element, texels: true })
+            }
+            _ => Err(format!("`{name}`: of images only buffers of texels are used here")),
+        }
     }
 
     /// Specialisation constants by id. `local_size_x_id` makes a second, nameless constant of the same id.

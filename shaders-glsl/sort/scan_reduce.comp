@@ -1,11 +1,13 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// First half of an exclusive scan: the sum of each block. In: data[0..n]. Out: sums[block].
+// variants: texels
+// First half of an exclusive scan: the sum of each block. In: data(0..n). Out: sums[block].
 #include "tile_scan.glsl"
+#include "../common/texels.glsl"
 
 layout(local_size_x = 256) in;
 
-layout(set = 0, binding = 0, std430) readonly buffer Data { uint data[]; };
+READ_UINTS(0, Data, data)
 layout(set = 0, binding = 1, std430) writeonly buffer Sums { uint sums[]; };
 
 layout(push_constant) uniform Push {
@@ -19,7 +21,7 @@ void main() {
     if (block >= blocks) return;
     uvec2 range = block_range(n, blocks, block);
     uint sum = 0u;
-    for (uint i = range.x + lane; i < range.y; i += LANES) sum += data[i];
+    for (uint i = range.x + lane; i < range.y; i += LANES) sum += data(i);
     uint total;
     lanes_exclusive(lane, sum, total);
     if (lane == 0u) sums[block] = total;

@@ -5,6 +5,7 @@
 // A step that is not finite is not taken; project_backward counts it. What a view hardly shows takes none.
 #version 450
 #extension GL_GOOGLE_include_directive : require
+// variants: texels
 layout(local_size_x = 64) in;
 
 #include "../common/types.glsl"
@@ -12,17 +13,18 @@ layout(local_size_x = 64) in;
 #include "../common/importance.glsl"
 #include "../common/index.glsl"
 #include "../common/chunks.glsl"
+#include "../common/texels.glsl"
 
 layout(push_constant) uniform Push {
     uint capacity;  // intersections
     float rate;
 } push;
 
-layout(set = 0, binding = 0, std430) readonly buffer VisibleCount { uint visible_count[]; };
-layout(set = 0, binding = 1, std430) readonly buffer Slots { uint slots[]; };
-layout(set = 0, binding = 2, std430) readonly buffer TileOffsets { uint tile_offsets[]; };
-layout(set = 0, binding = 3, std430) readonly buffer Steps { uint steps[]; };
-layout(set = 0, binding = 4, std430) readonly buffer IsectGradients { vec4 isect_gradients[]; };
+READ_UINTS(0, VisibleCount, visible_count)
+READ_UINTS(1, Slots, slot_of)
+READ_UINTS(2, TileOffsets, tile_offset)
+READ_UINTS(3, Steps, step_state)
+READ_VEC4S(4, IsectGradients, isect_gradient)
 layout(set = 0, binding = 5, std430) buffer Chroma { vec2 chroma[]; };
 layout(set = 0, binding = 6, std430) buffer ChromaMoments { vec4 chroma_moments[]; };
 
@@ -32,24 +34,24 @@ const float EPSILON = 1e-15;
 
 void main() {
     const uint rank = thread_index();
-    if (rank >= visible_count[0]) {
+    if (rank >= visible_count(0)) {
         return;
     }
-    const uint begin = tile_offsets[rank], end = min(tile_offsets[rank + 1], push.capacity);
+    const uint begin = tile_offset(rank), end = min(tile_offset(rank + 1), push.capacity);
     // A list that lost Gaussians shows holes, which are nothing to learn from.
-    if (begin >= end || tile_offsets[visible_count[0]] > push.capacity) {
+    if (begin >= end || tile_offset(visible_count(0)) > push.capacity) {
         return;
     }
     vec2 g = vec2(0.0);
     float worth = 0.0;
     for (uint i = begin, n; i < end; i += n) {
         n = slots_at(i, end);
-        g += isect_gradients[3 * i + 2].xy;
-        worth += n == 1 ? abs(isect_gradients[3 * i + 1][WORTH - 4]) : isect_gradients[3 * (i + 1)].x;
+        g += isect_gradient(3 * i + 2).xy;
+        worth += n == 1 ? abs(isect_gradient(3 * i + 1)[WORTH - 4]) : isect_gradient(3 * (i + 1)).x;
     }
-    const uint slot = slots[rank], step = min(steps_of(steps[slot]) + 1, STEPS_MAX);
+    const uint slot = slot_of(rank), step = min(steps_of(step_state(slot)) + 1, STEPS_MAX);
     // As project_backward does.
-    if (worth == 0.0 || !shown(steps[slot], worth)) {
+    if (worth == 0.0 || !shown(step_state(slot), worth)) {
         return;
     }
     const vec2 debias = 1.0 / (1.0 - exp2(float(step) * log2(vec2(BETA1, BETA2))));

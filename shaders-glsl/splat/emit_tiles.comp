@@ -6,11 +6,13 @@
 // padded with a tile past the last, where nothing is drawn, and what it counted too little is dropped.
 #version 450
 #extension GL_GOOGLE_include_directive : require
+// variants: texels
 layout(local_size_x = 64) in;
 
 #include "../common/types.glsl"
 #include "../common/tiles.glsl"
 #include "../common/index.glsl"
+#include "../common/texels.glsl"
 
 layout(push_constant) uniform Push {
     uvec2 size;
@@ -19,10 +21,10 @@ layout(push_constant) uniform Push {
     float coarseness;
 } push;
 
-layout(set = 0, binding = 0, std430) readonly buffer VisibleCount { uint visible_count[]; };
-layout(set = 0, binding = 1, std430) readonly buffer Slots { uint slots[]; };
-layout(set = 0, binding = 2, std430) readonly buffer ProjectedIn { Projected projected[]; };
-layout(set = 0, binding = 3, std430) readonly buffer TileOffsets { uint tile_offsets[]; };
+READ_UINTS(0, VisibleCount, visible_count)
+READ_UINTS(1, Slots, slot_of)
+READ_PROJECTED(2, ProjectedIn, projected)
+READ_UINTS(3, TileOffsets, tile_offset)
 layout(set = 0, binding = 4, std430) writeonly buffer Keys { uint keys[]; };
 layout(set = 0, binding = 5, std430) writeonly buffer Owners { uint owners[]; };
 layout(set = 0, binding = 6, std430) writeonly buffer IsectCount { uint isect_count[]; };
@@ -30,7 +32,7 @@ layout(set = 0, binding = 6, std430) writeonly buffer IsectCount { uint isect_co
 void main() {
     const uint rank = thread_index();
     if (rank == 0) {
-        const uint needed = tile_offsets[push.splats];
+        const uint needed = tile_offset(push.splats);
         const uint listed = min(needed, push.capacity);
         const uint groups = (listed + 63) / 64;
         const uint high = max(1, (groups + 65534) / 65535);
@@ -40,14 +42,14 @@ void main() {
         isect_count[3] = high;
         isect_count[4] = 1;
     }
-    if (rank >= visible_count[0]) {
+    if (rank >= visible_count(0)) {
         return;
     }
-    const uint slot = slots[rank];
+    const uint slot = slot_of(rank);
     const uvec2 grid = tile_grid(push.size);
-    const uint end = min(tile_offsets[rank + 1], push.capacity);
-    uint at = tile_offsets[rank];
-    const Ellipse e = ellipse_of(projected[slot], push.size, push.coarseness);
+    const uint end = min(tile_offset(rank + 1), push.capacity);
+    uint at = tile_offset(rank);
+    const Ellipse e = ellipse_of(projected(slot), push.size, push.coarseness);
     for (int row = e.rows.x; row <= e.rows.y && at < end; ++row) {
         const ivec2 columns = columns_of(e, row, push.size);
         for (int column = columns.x; column <= columns.y && at < end; ++column) {

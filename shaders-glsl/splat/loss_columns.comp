@@ -4,12 +4,14 @@
 // out  grey_gradient, zero where masked; loss_sums[group]: |x - y|, gradient by gain, by offset, 0
 #version 450
 #extension GL_GOOGLE_include_directive : require
+// variants: texels
 #extension GL_EXT_control_flow_attributes : require
 layout(local_size_x = 64) in;
 
 #include "../common/index.glsl"
 #include "../common/ssim.glsl"
 #include "../common/sum64.glsl"
+#include "../common/texels.glsl"
 
 layout(push_constant) uniform Push {
     uvec2 size;
@@ -21,10 +23,10 @@ layout(push_constant) uniform Push {
     float ssim_weight; // λ / valid pixels
 } push;
 
-layout(set = 0, binding = 0, std430) readonly buffer Filtered { float filtered_planes[]; };
-layout(set = 0, binding = 1, std430) readonly buffer Grey { float grey[]; };
-layout(set = 0, binding = 2, std430) readonly buffer Targets { uint targets[]; };
-layout(set = 0, binding = 3, std430) readonly buffer Mask { uint mask[]; };
+READ_FLOATS(0, Filtered, filtered_at)
+READ_FLOATS(1, Grey, grey)
+READ_UINTS(2, Targets, targets)
+READ_UINTS(3, Mask, mask)
 layout(set = 0, binding = 4, std430) writeonly buffer GreyGradient { float grey_gradient[]; };
 layout(set = 0, binding = 5, std430) writeonly buffer LossSums { vec4 loss_sums[]; };
 
@@ -35,7 +37,7 @@ vec3 column_run(uint x, uint y0) {
         float v[REACH];
         [[unroll]] for (uint k = 0; k < REACH; ++k) {
             const int y = int(y0 + k) - int(RADIUS);
-            const float m = filtered_planes[q * plane + uint(clamp(y, 0, int(push.size.y) - 1)) * push.size.x + x];
+            const float m = filtered_at(q * plane + uint(clamp(y, 0, int(push.size.y) - 1)) * push.size.x + x);
             v[k] = y >= 0 && y < int(push.size.y) ? m : 0.0;
         }
         [[unroll]] for (uint k = 0; k < RUN; ++k) {
@@ -48,9 +50,9 @@ vec3 column_run(uint x, uint y0) {
         const uint y = y0 + k;
         if (y < push.size.y) {
             const uint at = y * push.size.x + x, byte = y * stride + x;
-            const bool valid = ((mask[byte / 4] >> (8 * (byte % 4))) & 255u) != 0;
-            const float rendered = grey[push.plane + at];
-            const float b = float((targets[push.target + byte / 4] >> (8 * (byte % 4))) & 255u) / 255.0;
+            const bool valid = ((mask(byte / 4) >> (8 * (byte % 4))) & 255u) != 0;
+            const float rendered = grey(push.plane + at);
+            const float b = float((targets(push.target + byte / 4) >> (8 * (byte % 4))) & 255u) / 255.0;
             float gate;
             const float a = censored(push.exposure[0] * rendered + push.exposure[1], b, gate);
             const float d_ssim = slope[0][k] + 2.0 * a * slope[1][k] + b * slope[2][k];

@@ -3,17 +3,19 @@
 // out  filtered_planes: the three, filtered along rows
 #version 450
 #extension GL_GOOGLE_include_directive : require
+// variants: texels
 #extension GL_EXT_control_flow_attributes : require
 layout(local_size_x = 64) in;
 
 #include "../common/index.glsl"
 #include "../common/ssim.glsl"
+#include "../common/texels.glsl"
 
 layout(push_constant) uniform Push {
     uvec2 size;
 } push;
 
-layout(set = 0, binding = 0, std430) readonly buffer Slopes { float slopes[]; };
+READ_FLOATS(0, Slopes, slope_at)
 layout(set = 0, binding = 1, std430) writeonly buffer Filtered { float filtered_planes[]; };
 
 void main() {
@@ -29,7 +31,7 @@ void main() {
         float v[REACH];
         [[unroll]] for (uint k = 0; k < REACH; ++k) {
             const int x = int(x0 + k) - int(RADIUS);
-            const float s = slopes[q * plane + row + uint(clamp(x, 0, int(push.size.x) - 1))];
+            const float s = slope_at(q * plane + row + uint(clamp(x, 0, int(push.size.x) - 1)));
             v[k] = x >= 0 && x < int(push.size.x) ? s : 0.0;
         }
         [[unroll]] for (uint k = 0; k < RUN; ++k) {

@@ -4,11 +4,13 @@
 // out  masked
 #version 450
 #extension GL_GOOGLE_include_directive : require
+// variants: texels
 #extension GL_EXT_control_flow_attributes : require
 layout(local_size_x = 64) in;
 
 #include "../common/index.glsl"
 #include "../common/ssim.glsl"
+#include "../common/texels.glsl"
 
 layout(push_constant) uniform Push {
     uvec2 size;
@@ -18,8 +20,8 @@ layout(push_constant) uniform Push {
     float open;     // the transmittance above which a pixel does not count
 } push;
 
-layout(set = 0, binding = 0, std430) readonly buffer Mask { uint mask[]; };
-layout(set = 0, binding = 1, std430) readonly buffer Picture { float picture[]; };
+READ_UINTS(0, Mask, mask)
+READ_FLOATS(1, Picture, picture)
 layout(set = 0, binding = 2, std430) writeonly buffer Masked { uint masked[]; };
 
 /// The cell along one axis whose part of the picture has the middle of pixel v.
@@ -39,8 +41,8 @@ void main() {
         const uint x = min(at % words * 4 + byte, push.size.x - 1);
         const uint cell = row + nth(x, push.size.x, push.grid.x);
         const bool hidden = ((push.cells[cell / 32] >> (cell % 32)) & 1u) != 0;
-        const bool open = picture[push.plane + at / words * push.size.x + x] > push.open;
+        const bool open = picture(push.plane + at / words * push.size.x + x) > push.open;
         keep |= hidden || open ? 0u : 255u << (8 * byte);
     }
-    masked[at] = mask[at] & keep;
+    masked[at] = mask(at) & keep;
 }

@@ -4,6 +4,7 @@
 //      not finite
 #version 450
 #extension GL_GOOGLE_include_directive : require
+// variants: texels
 layout(local_size_x = 64) in;
 
 #include "../common/types.glsl"
@@ -11,6 +12,7 @@ layout(local_size_x = 64) in;
 #include "../common/depth_key.glsl"
 #include "../common/tiles.glsl"
 #include "../common/index.glsl"
+#include "../common/texels.glsl"
 
 layout(push_constant) uniform Push {
     Camera camera;
@@ -20,7 +22,7 @@ layout(push_constant) uniform Push {
     float coarseness;
 } push;
 
-layout(set = 0, binding = 0, std430) readonly buffer Splats { Splat splats[]; };
+READ_SPLATS(0, Splats, splat)
 layout(set = 0, binding = 1, std430) writeonly buffer ProjectedOut { Projected projected[]; };
 layout(set = 0, binding = 2, std430) writeonly buffer Keys { uint keys[]; };
 layout(set = 0, binding = 3, std430) buffer Failed { uint failed[]; };
@@ -57,7 +59,7 @@ void main() {
         }
         return;
     }
-    const Splat s = splats[slot];
+    const Splat s = splat(slot);
     keys[slot] = slot < push.first ? NONE : project(s, slot);
     if (!(finite(s.mean_opacity) && finite(s.scale_colour) && finite(s.quat))) {
         atomicAdd(failed[0], 1);

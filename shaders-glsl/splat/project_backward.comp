@@ -8,6 +8,7 @@
 // taken and the map stays as it is to the bit: only the sums are written.
 #version 450
 #extension GL_GOOGLE_include_directive : require
+// variants: texels
 #extension GL_EXT_control_flow_attributes : require
 layout(local_size_x = 64) in;
 layout(constant_id = 2) const uint CHANNELS = 1;
@@ -19,6 +20,7 @@ layout(constant_id = 7) const bool LEARN = true;
 #include "../common/index.glsl"
 #include "../common/importance.glsl"
 #include "../common/chunks.glsl"
+#include "../common/texels.glsl"
 
 layout(push_constant) uniform Push {
     Camera camera;
@@ -35,10 +37,10 @@ layout(push_constant) uniform Push {
     float weight_opacity;
 } push;
 
-layout(set = 0, binding = 0, std430) readonly buffer VisibleCount { uint visible_count[]; };
-layout(set = 0, binding = 1, std430) readonly buffer Slots { uint slots[]; };
-layout(set = 0, binding = 2, std430) readonly buffer TileOffsets { uint tile_offsets[]; };
-layout(set = 0, binding = 3, std430) readonly buffer IsectGradients { vec4 isect_gradients[]; };
+READ_UINTS(0, VisibleCount, visible_count)
+READ_UINTS(1, Slots, slot_of)
+READ_UINTS(2, TileOffsets, tile_offset)
+READ_VEC4S(3, IsectGradients, isect_gradient)
 layout(set = 0, binding = 4, std430) buffer Splats { Splat splats[]; };
 layout(set = 0, binding = 5, std430) buffer MomentsInOut { Moments moments[]; };
 layout(set = 0, binding = 6, std430) buffer Steps { uint steps[]; };
@@ -76,22 +78,22 @@ vec4 adam(inout vec4 m, inout vec4 v, vec4 g, vec4 rate, vec2 debias) {
 /// Takes the step; the six pose terms, or a one in the seventh place.
 float[7] update(uint rank) {
     float pose[7] = float[7](0, 0, 0, 0, 0, 0, 0);
-    const uint begin = tile_offsets[rank], end = min(tile_offsets[rank + 1], push.capacity);
+    const uint begin = tile_offset(rank), end = min(tile_offset(rank + 1), push.capacity);
     vec4 v0 = vec4(0.0), v1 = vec4(0.0);
     // Visibility x opacity x gradient, tile by tile: to first order, what the loss would change without it.
     float worth = 0.0;
     for (uint i = begin, n; i < end; i += n) {
         n = slots_at(i, end);
-        const vec4 second = isect_gradients[SLOT_QUADS * i + 1];
-        v0 += isect_gradients[SLOT_QUADS * i];
+        const vec4 second = isect_gradient(SLOT_QUADS * i + 1);
+        v0 += isect_gradient(SLOT_QUADS * i);
         v1 += second;
-        worth += n == 1 ? abs(second[WORTH - 4]) : isect_gradients[SLOT_QUADS * (i + 1)].x;
+        worth += n == 1 ? abs(second[WORTH - 4]) : isect_gradient(SLOT_QUADS * (i + 1)).x;
     }
     // Where nothing is compared there is nothing to learn.
     if (begin >= end || worth == 0.0) {
         return pose;
     }
-    const uint slot = slots[rank];
+    const uint slot = slot_of(rank);
     Splat s = splats[slot];
     Local l;
     if (!place(push.camera, s, l)) {  // project rounded it in
@@ -99,7 +101,7 @@ float[7] update(uint rank) {
     }
     flatten(push.camera, vec2(push.size), l);
     Gradient g = pull_back(push.camera, l, s.scale_colour.xyz, v0.xy, vec3(v0.zw, v1.x));
-    const float per_splat = 1.0 / float(visible_count[0]);
+    const float per_splat = 1.0 / float(visible_count(0));
     const float opacity = sigmoid(s.mean_opacity.w);
     const float v_logit = (1.0 - opacity) * (v1.y + push.weight_opacity * per_splat * opacity);
     const vec4 d0 = vec4(transpose(cam_from_world(push.camera)) * g.cam, v_logit);
@@ -112,7 +114,7 @@ float[7] update(uint rank) {
     pose = float[7](g.cam.x, g.cam.y, g.cam.z, turn.x, turn.y, turn.z, 0.0);
 
     // A list that lost Gaussians shows holes, which are nothing to learn from.
-    const bool whole = tile_offsets[visible_count[0]] <= push.capacity;
+    const bool whole = tile_offset(visible_count(0)) <= push.capacity;
     if (!(LEARN && whole) || !shown(steps[slot], worth)) {
         return pose;
     }
@@ -142,7 +144,7 @@ shared float terms[7 * 65];
 void main() {
     const uint rank = thread_index(), i = gl_LocalInvocationID.x;
     float pose[7] = float[7](0, 0, 0, 0, 0, 0, 0);
-    if (rank < visible_count[0]) {
+    if (rank < visible_count(0)) {
         pose = update(rank);
     }
     [[unroll]] for (uint q = 0; q < 7; ++q) {

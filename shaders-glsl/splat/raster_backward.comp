@@ -10,7 +10,7 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
-// variants: subgroup
+// variants: subgroup, subgroup_texels
 #ifdef SUBGROUP
 #extension GL_KHR_shader_subgroup_basic : require
 #extension GL_KHR_shader_subgroup_vote : require
@@ -24,6 +24,7 @@ layout(constant_id = 2) const uint CHANNELS = 1;
 #include "../common/tiles.glsl"
 #include "../common/lanes.glsl"
 #include "../common/shade.glsl"
+#include "../common/texels.glsl"
 
 const uint SLOT = CHANNELS == 3 ? 12 : 8;
 
@@ -31,19 +32,19 @@ layout(push_constant) uniform Push {
     uvec2 size;
 } push;
 
-layout(set = 0, binding = 0, std430) readonly buffer Ranges { uvec2 ranges[]; };
-layout(set = 0, binding = 1, std430) readonly buffer Intersections { uint intersections[]; };
-layout(set = 0, binding = 2, std430) readonly buffer Owners { uint owners[]; };
-layout(set = 0, binding = 3, std430) readonly buffer ProjectedIn { Projected projected[]; };
-layout(set = 0, binding = 4, std430) readonly buffer Chroma { vec2 chroma[]; };
-layout(set = 0, binding = 5, std430) readonly buffer Rendered { float rendered[]; };
-layout(set = 0, binding = 6, std430) readonly buffer PixelGradient { float pixel_gradient[]; };
+READ_UVEC2S(0, Ranges, range_of)
+READ_UINTS(1, Intersections, intersection)
+READ_UINTS(2, Owners, owner)
+READ_PROJECTED(3, ProjectedIn, projected)
+READ_VEC2S(4, Chroma, chroma)
+READ_FLOATS(5, Rendered, rendered)
+READ_FLOATS(6, PixelGradient, pixel_gradient)
 layout(set = 0, binding = 7, std430) writeonly buffer IsectGradients { float isect_gradients[]; };
 
 Batch fetch(uint at) {
-    const uint isect = intersections[at];
-    const uint slot = owners[isect];
-    return batch_of(projected[slot], CHANNELS == 3 ? chroma[slot] : vec2(0.0), isect);
+    const uint isect = intersection(at);
+    const uint slot = owner(isect);
+    return batch_of(projected(slot), CHANNELS == 3 ? chroma(slot) : vec2(0.0), isect);
 }
 
 void main() {
@@ -61,14 +62,14 @@ void main() {
         const bool inside = pixel.x < push.size.x && pixel.y + k < push.size.y;
         const uint at = inside ? (pixel.y + k) * push.size.x + pixel.x : 0;
         t[k] = inside ? 1.0 : 0.0;
-        v[k].x = pixel_gradient[at];
-        behind[k] = v[k].x * rendered[at];
+        v[k].x = pixel_gradient(at);
+        behind[k] = v[k].x * rendered(at);
         if (CHANNELS == 3) {
-            v[k].yz = vec2(pixel_gradient[plane + at], pixel_gradient[2 * plane + at]);
-            behind[k] += v[k].y * rendered[plane + at] + v[k].z * rendered[2 * plane + at];
+            v[k].yz = vec2(pixel_gradient(plane + at), pixel_gradient(2 * plane + at));
+            behind[k] += v[k].y * rendered(plane + at) + v[k].z * rendered(2 * plane + at);
         }
     }
-    const uvec2 range = ranges[tile];
+    const uvec2 range = range_of(tile);
     uint base = range.x;
     Batch coming = fetch(min(base + lane(), max(range.y, 1) - 1));
     for (; base < range.y; base += LANES) {
@@ -130,6 +131,6 @@ void main() {
     }
     // Those behind an opaque tile got nothing.
     for (uint i = base * SLOT + lane(); i < range.y * SLOT; i += LANES) {
-        isect_gradients[intersections[i / SLOT] * SLOT + i % SLOT] = 0.0;
+        isect_gradients[intersection(i / SLOT) * SLOT + i % SLOT] = 0.0;
     }
 }

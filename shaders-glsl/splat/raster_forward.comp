@@ -6,7 +6,7 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
-// variants: subgroup
+// variants: subgroup, subgroup_texels
 #ifdef SUBGROUP
 #extension GL_KHR_shader_subgroup_basic : require
 #extension GL_KHR_shader_subgroup_vote : require
@@ -21,21 +21,22 @@ layout(constant_id = 2) const uint CHANNELS = 1;
 #include "../common/tiles.glsl"
 #include "../common/lanes.glsl"
 #include "../common/shade.glsl"
+#include "../common/texels.glsl"
 
 layout(push_constant) uniform Push {
     uvec2 size;
 } push;
 
-layout(set = 0, binding = 0, std430) readonly buffer Ranges { uvec2 ranges[]; };
-layout(set = 0, binding = 1, std430) readonly buffer Intersections { uint intersections[]; };
-layout(set = 0, binding = 2, std430) readonly buffer Owners { uint owners[]; };
-layout(set = 0, binding = 3, std430) readonly buffer ProjectedIn { Projected projected[]; };
-layout(set = 0, binding = 4, std430) readonly buffer Chroma { vec2 chroma[]; };
+READ_UVEC2S(0, Ranges, range_of)
+READ_UINTS(1, Intersections, intersection)
+READ_UINTS(2, Owners, owner)
+READ_PROJECTED(3, ProjectedIn, projected)
+READ_VEC2S(4, Chroma, chroma)
 layout(set = 0, binding = 5, std430) writeonly buffer Rendered { float rendered[]; };
 
 Batch fetch(uint at) {
-    const uint slot = owners[intersections[at]];
-    return batch_of(projected[slot], CHANNELS == 3 ? chroma[slot] : vec2(0.0), 0);
+    const uint slot = owner(intersection(at));
+    return batch_of(projected(slot), CHANNELS == 3 ? chroma(slot) : vec2(0.0), 0);
 }
 
 void main() {
@@ -54,7 +55,7 @@ void main() {
         c[k] = vec3(0.0);
         z[k] = 0.0;
     }
-    const uvec2 range = ranges[tile];
+    const uvec2 range = range_of(tile);
     // The next batch is on its way while this one is drawn.
     Batch coming = fetch(min(range.x + lane(), max(range.y, 1) - 1));
     for (uint base = range.x; base < range.y; base += LANES) {

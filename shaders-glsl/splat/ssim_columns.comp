@@ -4,6 +4,7 @@
 //      with MAP one plane of S itself instead, one where masked
 #version 450
 #extension GL_GOOGLE_include_directive : require
+// variants: texels
 #extension GL_EXT_control_flow_attributes : require
 layout(local_size_x = 64) in;
 layout(constant_id = 0) const uint MAP = 0;
@@ -11,14 +12,15 @@ layout(constant_id = 0) const uint MAP = 0;
 #include "../common/index.glsl"
 #include "../common/ssim.glsl"
 #include "../common/sum64.glsl"
+#include "../common/texels.glsl"
 
 layout(push_constant) uniform Push {
     uvec2 size;
     uint group;  // where this plane's sums begin
 } push;
 
-layout(set = 0, binding = 0, std430) readonly buffer Filtered { float filtered_planes[]; };
-layout(set = 0, binding = 1, std430) readonly buffer Mask { uint mask[]; };
+READ_FLOATS(0, Filtered, filtered_at)
+READ_UINTS(1, Mask, mask)
 layout(set = 0, binding = 2, std430) writeonly buffer Slopes { float slopes[]; };
 layout(set = 0, binding = 3, std430) writeonly buffer SsimSums { float ssim_sums[]; };
 
@@ -30,7 +32,7 @@ float column_run(uint x, uint y0) {
         [[unroll]] for (uint k = 0; k < REACH; ++k) {
             const int y = int(y0 + k) - int(RADIUS);
             const bool inside = y >= 0 && y < int(push.size.y);
-            const float m = filtered_planes[q * plane + uint(clamp(y, 0, int(push.size.y) - 1)) * push.size.x + x];
+            const float m = filtered_at(q * plane + uint(clamp(y, 0, int(push.size.y) - 1)) * push.size.x + x);
             v[k] = inside ? m : 0.0;
         }
         [[unroll]] for (uint k = 0; k < RUN; ++k) {
@@ -42,7 +44,7 @@ float column_run(uint x, uint y0) {
     [[unroll]] for (uint k = 0; k < RUN; ++k) {
         const uint y = y0 + k;
         const uint byte = min(y, push.size.y - 1) * stride + x;
-        const bool valid = y < push.size.y && ((mask[byte / 4] >> (8 * (byte % 4))) & 255u) != 0;
+        const bool valid = y < push.size.y && ((mask(byte / 4) >> (8 * (byte % 4))) & 255u) != 0;
         const float mx = e[0][k], my = e[1][k];
         const float a1 = 2.0 * mx * my + C1, b1 = mx * mx + my * my + C1;
         const float a2 = 2.0 * (e[4][k] - mx * my) + C2;

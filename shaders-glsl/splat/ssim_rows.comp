@@ -4,11 +4,13 @@
 // out  filtered_planes: of E[x], E[y], E[x²], E[y²], E[xy]
 #version 450
 #extension GL_GOOGLE_include_directive : require
+// variants: texels
 #extension GL_EXT_control_flow_attributes : require
 layout(local_size_x = 64) in;
 
 #include "../common/index.glsl"
 #include "../common/ssim.glsl"
+#include "../common/texels.glsl"
 
 layout(push_constant) uniform Push {
     uvec2 size;
@@ -17,9 +19,9 @@ layout(push_constant) uniform Push {
     float exposure[2];  // gain, offset of the keyframe
 } push;
 
-layout(set = 0, binding = 0, std430) readonly buffer Grey { float grey[]; };
-layout(set = 0, binding = 1, std430) readonly buffer Targets { uint targets[]; };
-layout(set = 0, binding = 2, std430) readonly buffer Mask { uint mask[]; };
+READ_FLOATS(0, Grey, grey)
+READ_UINTS(1, Targets, targets)
+READ_UINTS(2, Mask, mask)
 layout(set = 0, binding = 3, std430) writeonly buffer Filtered { float filtered_planes[]; };
 
 void main() {
@@ -36,14 +38,14 @@ void main() {
         const int word = int(x0 / 4 + w) - 2;
         const bool inside = word >= 0 && word < int(words);
         const uint i = y * words + uint(clamp(word, 0, int(words) - 1));
-        const uint m = inside ? mask[i] : 0;
-        const uint t = targets[push.target + i];
+        const uint m = inside ? mask(i) : 0;
+        const uint t = targets(push.target + i);
         [[unroll]] for (uint byte = 0; byte < 4; ++byte) {
             const int k = int(w * 4 + byte) - 3;
             if (k >= 0 && k < int(REACH)) {
                 const bool valid = ((m >> (8 * byte)) & 255u) != 0;
                 const uint x = min(uint(max(word, 0)) * 4 + byte, push.size.x - 1);
-                const float level = push.exposure[0] * grey[push.plane + y * push.size.x + x] + push.exposure[1];
+                const float level = push.exposure[0] * grey(push.plane + y * push.size.x + x) + push.exposure[1];
                 b[k] = valid ? float((t >> (8 * byte)) & 255u) / 255.0 : 0.0;
                 float slope;
                 a[k] = valid ? censored(level, b[k], slope) : 0.0;

@@ -3,32 +3,34 @@
 // out  ranges[tile]
 #version 450
 #extension GL_GOOGLE_include_directive : require
+// variants: texels
 layout(local_size_x = 64) in;
 
 #include "../common/index.glsl"
+#include "../common/texels.glsl"
 
 layout(push_constant) uniform Push {
     uint tiles;  // with the one of emit_tiles' padding
 } push;
 
-layout(set = 0, binding = 0, std430) readonly buffer IsectCount { uint isect_count[]; };
-layout(set = 0, binding = 1, std430) readonly buffer Keys { uint keys[]; };
+READ_UINTS(0, IsectCount, isect_count)
+READ_UINTS(1, Keys, key_at)
 layout(set = 0, binding = 2, std430) writeonly buffer Ranges { uvec2 ranges[]; };
 
 void main() {
     const uint i = thread_index();
-    const uint n = isect_count[0];
+    const uint n = isect_count(0);
     if (i >= n) {
         return;
     }
-    const uint tile = keys[i];
+    const uint tile = key_at(i);
     if (tile >= push.tiles) {
         return;
     }
-    if (i == 0 || keys[i - 1] != tile) {
+    if (i == 0 || key_at(i - 1) != tile) {
         ranges[tile].x = i;
     }
-    if (i + 1 == n || keys[i + 1] != tile) {
+    if (i + 1 == n || key_at(i + 1) != tile) {
         ranges[tile].y = i + 1;
     }
 }

@@ -307,6 +307,6 @@ section! {
     /// less.
     submission_max_ms: f64 = 20.0, Bound::Positive;
     tuning
-    /// Uses subgroup arithmetic where the device has it.
+    /// Uses subgroup arithmetic where the device has it, and texel buffers on a CPU.
     subgroups: bool = true;
 }

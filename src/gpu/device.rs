@@ -45,6 +45,9 @@ pub struct Caps {
     pub subgroup_size: u32,
     /// Bits of VkSubgroupFeatureFlagBits that compute kernels may use; none with `GpuConfig::subgroups = false`.
     pub subgroup_operations: u32,
+    /// Whether kernels read buffers as texels where a variant does: on a CPU, whose driver gathers texels and loads a storage
+    /// buffer lane by lane. Never with `GpuConfig::subgroups = false`.
+    pub texel_buffers: bool,
     pub invocations_max: u32,
     pub shared_max_bytes: u32,
     /// Largest buffer a kernel can bind, bytes.
@@ -60,6 +63,7 @@ pub struct Caps {
 pub mod capability {
     pub const MATRIX: u32 = 0;
     pub const SHADER: u32 = 1;
+    pub const SAMPLED_BUFFER: u32 = 46;
     pub const GROUP: u32 = 61;
     pub const GROUP_VOTE: u32 = 62;
     #[cfg(feature = "instruments")]
@@ -75,6 +79,7 @@ impl Caps {
         match capability {
             // Every Vulkan 1.1 compute queue.
             MATRIX | SHADER | GROUP => true,
+            SAMPLED_BUFFER => self.texel_buffers,
             GROUP_VOTE..=GROUP_QUAD => self.subgroup_operations >> (capability - GROUP) & 1 != 0,
             _ => false,
         }
@@ -127,6 +132,7 @@ impl Device {
         let (physical, family, mut caps) = choose(&instance.raw, config)?;
         if !config.subgroups {
             caps.subgroup_operations = 0;
+            caps.texel_buffers = false;
         }
         let queues = [vk::DeviceQueueCreateInfo::default().queue_family_index(family).queue_priorities(&[1.0])];
         let info = vk::DeviceCreateInfo::default().queue_create_infos(&queues);
@@ -328,16 +334,20 @@ fn describe(instance: &ash::Instance, physical: vk::PhysicalDevice) -> Option<Ch
     let in_compute = subgroup.supported_stages.contains(vk::ShaderStageFlags::COMPUTE);
     let family = families.iter().position(|f| f.queue_flags.contains(vk::QueueFlags::COMPUTE))?;
     let bits = families[family].timestamp_valid_bits;
+    let kind = DeviceKind::new(properties.device_type);
+    let limits = &properties.limits;
     let caps = Caps {
         name: properties.device_name_as_c_str().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default(),
-        kind: DeviceKind::new(properties.device_type),
+        kind,
         subgroup_size: subgroup.subgroup_size,
         subgroup_operations: if in_compute { subgroup.supported_operations.as_raw() } else { 0 },
-        invocations_max: properties.limits.max_compute_work_group_invocations,
-        shared_max_bytes: properties.limits.max_compute_shared_memory_size,
-        binding_max_bytes: u64::from(properties.limits.max_storage_buffer_range),
+        texel_buffers: kind == DeviceKind::Cpu
+            && limits.max_texel_buffer_elements >= limits.max_storage_buffer_range / 4,
+        invocations_max: limits.max_compute_work_group_invocations,
+        shared_max_bytes: limits.max_compute_shared_memory_size,
+        binding_max_bytes: u64::from(limits.max_storage_buffer_range),
         allocation_max_bytes: maintenance.max_memory_allocation_size,
-        timestamp_period_ns: if bits == 0 { 0.0 } else { f64::from(properties.limits.timestamp_period) },
+        timestamp_period_ns: if bits == 0 { 0.0 } else { f64::from(limits.timestamp_period) },
         timestamp_bits: bits,
     };
     Some((physical, family as u32, caps))

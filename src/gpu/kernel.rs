@@ -39,6 +39,8 @@ pub struct Variant {
     pub spirv: &'static [u8],
     pub shared_bytes: u32,
     pub capabilities: &'static [u32],
+    /// VkFormat of the texels that a buffer is read as, by buffer; zero: it is a storage buffer.
+    pub texels: [i32; BUFFERS_MAX],
 }
 
 /// What a module declares, for the test of the baseline.
@@ -94,6 +96,16 @@ pub(super) struct ComputePipeline {
     set_layout: vk::DescriptorSetLayout,
     module: vk::ShaderModule,
     bindings: &'static [(u32, Access)],
+    texels: [i32; BUFFERS_MAX],
+}
+
+impl ComputePipeline {
+    fn descriptor_type(&self, buffer: usize) -> vk::DescriptorType {
+        match self.texels[buffer] {
+            0 => vk::DescriptorType::STORAGE_BUFFER,
+            _ => vk::DescriptorType::UNIFORM_TEXEL_BUFFER,
+        }
+    }
 }
 
 /// All pipelines, and the descriptor sets made for them so far.
@@ -103,16 +115,20 @@ pub(super) struct Pipelines {
     pub cache: Option<PipelineCache>,
     pool: vk::DescriptorPool,
     sets: HashMap<SetKey, vk::DescriptorSet>,
+    /// What the sets see of the arena as texels.
+    views: Vec<vk::BufferView>,
 }
 
 type SetKey = (u32, [Range; BUFFERS_MAX]);
 
 impl Pipelines {
     pub fn new(device: &Arc<Device>) -> Result<Pipelines, Fault> {
-        let sizes = [vk::DescriptorPoolSize::default()
-            .ty(vk::DescriptorType::STORAGE_BUFFER)
-            .descriptor_count((SETS_MAX * BUFFERS_MAX) as u32)];
-        let info = vk::DescriptorPoolCreateInfo::default().max_sets(SETS_MAX as u32).pool_sizes(&sizes);
+        let buffers = SETS_MAX * BUFFERS_MAX;
+        let size = |ty| vk::DescriptorPoolSize::default().ty(ty).descriptor_count(buffers as u32);
+        let sizes = [vk::DescriptorType::STORAGE_BUFFER, vk::DescriptorType::UNIFORM_TEXEL_BUFFER].map(size);
+        let texels = device.caps.texel_buffers;
+        let sizes = &sizes[..if texels { 2 } else { 1 }];
+        let info = vk::DescriptorPoolCreateInfo::default().max_sets(SETS_MAX as u32).pool_sizes(sizes);
         // SAFETY: the device is alive.
         let pool = unsafe { device.raw.create_descriptor_pool(&info, None) }.map_err(boot("vkCreateDescriptorPool"))?;
         Ok(Pipelines {
@@ -121,6 +137,7 @@ impl Pipelines {
             cache: None,
             pool,
             sets: HashMap::with_capacity(SETS_MAX),
+            views: Vec::with_capacity(if texels { buffers } else { 0 }),
         })
     }
 
@@ -164,6 +181,7 @@ impl Pipelines {
             set_layout: vk::DescriptorSetLayout::null(),
             module: vk::ShaderModule::null(),
             bindings: K::BINDINGS,
+            texels: variant.texels,
         });
         let index = self.list.len() - 1;
         let cache = self.cache.as_ref().map_or(vk::PipelineCache::null(), |c| c.raw);
@@ -179,9 +197,18 @@ impl Pipelines {
     /// Call only while the device is idle.
     pub fn forget_sets(&mut self) -> Result<(), GpuError> {
         self.sets.clear();
+        self.destroy_views();
         // SAFETY: no submission that uses these sets is in flight.
         unsafe { self.device.raw.reset_descriptor_pool(self.pool, vk::DescriptorPoolResetFlags::empty()) }
             .map_err(GpuError::of("vkResetDescriptorPool"))
+    }
+
+    /// Call only while nothing in flight uses a set.
+    fn destroy_views(&mut self) {
+        for view in self.views.drain(..) {
+            // SAFETY: it was made by this device, and no submission that uses it is in flight.
+            unsafe { self.device.raw.destroy_buffer_view(view, None) };
+        }
     }
 
     pub fn set(
@@ -212,15 +239,31 @@ impl Pipelines {
         .map_err(GpuError::of("vkAllocateDescriptorSets"))?;
         let mut infos = [vk::DescriptorBufferInfo::default(); BUFFERS_MAX];
         let mut writes = [vk::WriteDescriptorSet::default(); BUFFERS_MAX];
+        let mut views = [vk::BufferView::null(); BUFFERS_MAX];
         for (i, r) in ranges.iter().enumerate().take(pipeline.bindings.len()) {
-            infos[i] = vk::DescriptorBufferInfo { buffer: memory.buffer, offset: r.start, range: r.end - r.start };
+            let bytes = r.end - r.start;
+            infos[i] = vk::DescriptorBufferInfo { buffer: memory.buffer, offset: r.start, range: bytes };
+            if pipeline.texels[i] != 0 {
+                let info = vk::BufferViewCreateInfo::default()
+                    .buffer(memory.buffer)
+                    .format(vk::Format::from_raw(pipeline.texels[i]))
+                    .offset(r.start)
+                    .range(bytes);
+                // SAFETY: the range lies in the buffer; `forget_sets` or `Drop` destroys the view.
+                views[i] = unsafe { self.device.raw.create_buffer_view(&info, None) }
+                    .map_err(GpuError::of("vkCreateBufferView"))?;
+                self.views.push(views[i]);
+            }
         }
-        for ((write, info), &(binding, _)) in writes.iter_mut().zip(&infos).zip(pipeline.bindings) {
-            *write = vk::WriteDescriptorSet::default()
+        for (i, (write, &(binding, _))) in writes.iter_mut().zip(pipeline.bindings).enumerate() {
+            let empty = vk::WriteDescriptorSet::default()
                 .dst_set(set[0])
                 .dst_binding(binding)
-                .descriptor_type(vk::DescriptorType::STORAGE_BUFFER)
-                .buffer_info(std::slice::from_ref(info));
+                .descriptor_type(pipeline.descriptor_type(i));
+            *write = match pipeline.texels[i] {
+                0 => empty.buffer_info(std::slice::from_ref(&infos[i])),
+                _ => empty.texel_buffer_view(std::slice::from_ref(&views[i])),
+            };
         }
         // SAFETY: the set is new, so nothing in flight uses it; the ranges were checked above.
         unsafe { self.device.raw.update_descriptor_sets(&writes[..pipeline.bindings.len()], &[]) };
@@ -243,10 +286,11 @@ impl ComputePipeline {
         let bindings: Vec<_> = self
             .bindings
             .iter()
-            .map(|&(binding, _)| {
+            .enumerate()
+            .map(|(i, &(binding, _))| {
                 vk::DescriptorSetLayoutBinding::default()
                     .binding(binding)
-                    .descriptor_type(vk::DescriptorType::STORAGE_BUFFER)
+                    .descriptor_type(self.descriptor_type(i))
                     .descriptor_count(1)
                     .stage_flags(vk::ShaderStageFlags::COMPUTE)
             })
@@ -301,6 +345,7 @@ impl Drop for Pipelines {
         if self.device.abandoned.load(Relaxed) {
             return;
         }
+        self.destroy_views();
         // SAFETY: `Gpu` waits for the device before its fields are dropped; null handles are ignored.
         unsafe {
             for p in &self.list {

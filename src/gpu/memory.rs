@@ -250,7 +250,12 @@ pub(super) fn arena_buffer(device: &Arc<Device>, bytes: u64) -> Result<Backed, F
         let what = format!("{} MiB asked for; {} allocates at most {most} MiB at once", mib(bytes), caps.name);
         return Err(Fault::new(FaultKind::Config, "gpu arena", what, "lower the board's [budget]"));
     }
-    let usage = vk::BufferUsageFlags::STORAGE_BUFFER
+    let texels = match caps.texel_buffers {
+        true => vk::BufferUsageFlags::UNIFORM_TEXEL_BUFFER,
+        false => vk::BufferUsageFlags::empty(),
+    };
+    let usage = texels
+        | vk::BufferUsageFlags::STORAGE_BUFFER
         | vk::BufferUsageFlags::INDIRECT_BUFFER
         | vk::BufferUsageFlags::TRANSFER_SRC
         | vk::BufferUsageFlags::TRANSFER_DST;

@@ -1,6 +1,6 @@
 //! How a picture is cut into tiles for the raster, and sums over tiles into chunks, by what the device is.
 
-use crate::gpu::capability::{GROUP_SHUFFLE, GROUP_VOTE};
+use crate::gpu::capability::{GROUP_SHUFFLE, GROUP_VOTE, SAMPLED_BUFFER};
 use crate::gpu::{Caps, DeviceKind};
 
 /// The size of a tile, and the variant of the raster that draws it.
@@ -34,8 +34,9 @@ impl Tiling {
         // could save 30 of 103 µs, for 8 bytes an intersection of transmittance and colour where they are cut.
         let column = if caps.kind == DeviceKind::Discrete { 4 } else { Tiling::BASELINE.column };
         let chunk = if caps.kind == DeviceKind::Cpu { 1 } else { CHUNK_GPU };
+        let variant = if caps.allows(SAMPLED_BUFFER) { "subgroup_texels" } else { "subgroup" };
         match caps.subgroup_size {
-            n @ (8 | 16 | 32 | 64) if sub => Tiling { lanes: n.min(32), column, variant: "subgroup", chunk },
+            n @ (8 | 16 | 32 | 64) if sub => Tiling { lanes: n.min(32), column, variant, chunk },
             _ => Tiling { column, chunk, ..Tiling::BASELINE },
         }
     }

@@ -114,6 +114,29 @@ fn variants_share_the_interface_of_the_baseline() {
 }
 
 #[test]
+fn a_variant_may_read_as_texels_what_the_baseline_reads_as_a_buffer() {
+    let texels = |kind: &str| format!("layout(set = 0, binding = 0) uniform {kind} B;");
+    let of = |baseline: &str, kind: &str| emit(&[source("k", &[("", &buffer(baseline)), ("TEXELS", &texels(kind))])]);
+    // The numbers of VkFormat's R32_SFLOAT, R32G32_UINT and R32G32B32A32_SFLOAT.
+    for (baseline, kind, format) in [
+        ("readonly buffer B { float x[]; }", "samplerBuffer", 100),
+        ("readonly buffer B { uvec2 x[]; }", "usamplerBuffer", 101),
+        ("readonly buffer B { vec4 x[]; }", "samplerBuffer", 109),
+    ] {
+        let text = of(baseline, kind).unwrap();
+        assert!(text.contains(&format!("texels: [{format}, 0, 0, 0, 0, 0, 0, 0]")), "{text}");
+    }
+    for (baseline, kind) in [
+        ("readonly buffer B { float x[]; }", "usamplerBuffer"),
+        ("buffer B { float x[]; }", "samplerBuffer"),
+        ("readonly buffer C { float x[]; }", "samplerBuffer"),
+    ] {
+        assert!(of(baseline, kind).unwrap_err()[0].contains("variant `TEXELS`"), "{baseline} {kind}");
+    }
+    assert!(emit(&[source("k", &[("", &texels("samplerBuffer"))])]).unwrap_err()[0].contains("in the baseline"));
+}
+
+#[test]
 fn garbage_is_no_module() {
     assert!(reflect(&[]).is_err());
     assert!(reflect(&[0; 8]).is_err());

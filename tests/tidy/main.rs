@@ -27,12 +27,13 @@ const EDGES: [(&str, &[&str]); 8] = [
 const UNSAFE: [&str; 5] =
     ["src/gpu/", "src/mem.rs", "src/stereo/opencv.rs", "src/stereo/onnx/runtime.rs", "drivers/src/"];
 /// Where threads and processes may start: those of a flight, the recorder's writer, the simulator's renderers, the bridge's,
-/// the programs that pack a report.
-const SPAWNS: [&str; 6] = [
+/// the programs that pack a report, those that read headers ahead as a store opens.
+const SPAWNS: [&str; 7] = [
     "src/bridge/src/main.rs",
     "src/commands/bugreport.rs",
     "src/run/mod.rs",
     "src/run/worker.rs",
+    "src/store/scan.rs",
     "drivers/src/record/mod.rs",
     "drivers/src/sim/",
 ];
@@ -42,8 +43,8 @@ const RUST_LINES_MAX: usize = 600;
 const FUNCTION_LINES_MAX: usize = 90;
 const KERNEL_LINES_MAX: usize = 250;
 /// Lines of code that the product may have, and its estimator, frontend, mapper, GPU core, stereo and kernels together.
-const CODE_MAX: usize = 50_300;
-const CORE_MAX: usize = 18_900;
+const CODE_MAX: usize = 50_600;
+const CORE_MAX: usize = 19_150;
 const CORE: [&str; 10] = [
     "src/vio/",
     "src/frontend/",
