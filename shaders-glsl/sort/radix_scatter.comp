@@ -9,12 +9,10 @@
 //
 // Rank without subgroup operations: each row of 32 lanes sets its bits in the word of their digit, so one word holds
 // all peers of the row, and population counts of the rows above and of the lower lanes are the stable rank. Setting
-// bits and adding commute: deterministic. A CPU runs this with one row and digits of 11 bits, which sort tiles in
-// one pass.
+// bits and adding commute: deterministic.
 #include "split.glsl"
 
-layout(local_size_x = 256, local_size_x_id = 1) in;
-layout(constant_id = 1) const uint LANES = 256;
+layout(local_size_x = 256) in;
 const uint ROWS = LANES / 32;
 
 layout(set = 0, binding = 0, std430) readonly buffer KeysIn { uint keys_in[]; };

@@ -1,11 +1,12 @@
 //! Radix sort and prefix sum on the GPU: stable, deterministic, the element count stays on the device.
 //!
-//! A pass is count and scatter (`shaders-glsl/sort`): least significant digit first, no look-back between
-//! workgroups, no subgroup operations. The number of workgroups is fixed at boot and each walks its share,
-//! so nothing is sized by a count that only the device knows; groups without keys return at once. The first
-//! pass also leaves out what is not to be sorted, which compacts a list for nothing.
+//! A pass is count and scatter (`shaders-glsl/sort`), least significant digit first, no subgroup operations. On a GPU
+//! workgroups rank many keys at a time (`radix_*`); on a CPU each invocation moves a share of the keys one by one (`share_*`), as
+//! barriers and shared memory are dear there. The number of workgroups is fixed at boot and each walks its share, so nothing is
+//! sized by a count that only the device knows. The first pass also leaves out what is not to be sorted, which compacts a list for
+//! nothing.
 
-use crate::gpu::kernels::{radix_count, radix_scatter, scan_apply, scan_reduce};
+use crate::gpu::kernels::{radix_count, radix_scatter, scan_apply, scan_reduce, share_count, share_scatter};
 use crate::gpu::{Arena, Buf, Caps, DeviceKind, Gpu, Kernel, Recorder, Threads};
 use stipple_drivers::Fault;
 
@@ -13,18 +14,19 @@ use stipple_drivers::Fault;
 #[derive(Clone, Copy, Debug)]
 pub struct Cut {
     digit_bits: u32,
+    /// Workgroups at most.
     groups: u32,
-    keys_min: u32,
-    /// Invocations of a scatter workgroup, which are the keys it ranks at a time.
-    lanes: u32,
+    /// A CPU's: by shares.
+    by_shares: bool,
 }
 
-/// A CPU reads memory dear. Every group reads the whole table, so there are few (at most this many, two a core), and a
-/// wide digit saves whole passes.
-pub const CPU: Cut = Cut { digit_bits: 11, groups: 32, keys_min: 1024, lanes: 32 };
+/// Two workgroups a core are enough, and digits of 11 bits sort the tiles of 320x240 in one pass.
+pub const CPU: Cut = Cut { digit_bits: 11, groups: 32, by_shares: true };
 /// A GPU hides latency with many workgroups. 8 KiB of shared memory let many be resident.
-pub const GPU: Cut = Cut { digit_bits: 8, groups: 256, keys_min: 1024, lanes: 256 };
-/// Words of the digit table: digits x workgroups.
+pub const GPU: Cut = Cut { digit_bits: 8, groups: 256, by_shares: false };
+/// Fewest keys of a workgroup on a GPU.
+const KEYS_MIN: u32 = 1024;
+/// Words of the digit table: digits x workgroups. By shares, half of it is the table, digits x shares, and half the places.
 const TABLE_LEN: usize = 1 << 16;
 /// Most blocks of a scan: their sums are scanned by one workgroup.
 const SCAN_BLOCKS_MAX: u32 = 256;
@@ -33,7 +35,7 @@ const SCAN_BLOCKS_CPU: u32 = 16;
 #[cfg(feature = "instruments")]
 pub const NONE: u32 = u32::MAX;
 
-const _: () = assert!((CPU.groups << CPU.digit_bits) as usize <= TABLE_LEN);
+const _: () = assert!((share_count::LOCAL[0] << CPU.digit_bits) as usize <= TABLE_LEN / 2);
 const _: () = assert!((GPU.groups << GPU.digit_bits) as usize <= TABLE_LEN);
 
 impl Cut {
@@ -96,12 +98,16 @@ impl Scan {
 
 /// Sorts (key, payload) pairs by the low bits of the key.
 pub struct Sorter {
-    count: Kernel<radix_count::K>,
-    scatter: Kernel<radix_scatter::K>,
+    kernels: Kernels,
     table: Buf<u32>,
     /// Stands in for a count where all keys of a buffer are sorted.
     pub unlimited: Buf<u32>,
     cut: Cut,
+}
+
+enum Kernels {
+    Ranked(Kernel<radix_count::K>, Kernel<radix_scatter::K>),
+    ByShares(Kernel<share_count::K>, Kernel<share_scatter::K>),
 }
 
 /// Keys and payloads, index by index.
@@ -114,16 +120,18 @@ pub struct Pairs {
 impl Sorter {
     /// The result does not depend on the cut.
     pub fn new(gpu: &mut Gpu, buffers: &Buffers, cut: Cut) -> Result<Sorter, Fault> {
-        let digits_max = 1 << cut.digit_bits;
         let Buffers { table, unlimited, .. } = *buffers;
         gpu.upload(unlimited, 0, &[u32::MAX])?;
-        Ok(Sorter {
-            count: gpu.kernel(radix_count::Spec { digits_max })?,
-            scatter: gpu.kernel(radix_scatter::Spec { digits_max, lanes: cut.lanes })?,
-            table,
-            unlimited,
-            cut,
-        })
+        let kernels = match cut.by_shares {
+            true => Kernels::ByShares(
+                gpu.kernel(share_count::Spec::default())?,
+                gpu.kernel(share_scatter::Spec::default())?,
+            ),
+            false => {
+                Kernels::Ranked(gpu.kernel(radix_count::Spec::default())?, gpu.kernel(radix_scatter::Spec::default())?)
+            }
+        };
+        Ok(Sorter { kernels, table, unlimited, cut })
     }
 
     pub fn passes(&self, bits: u32) -> u32 {
@@ -146,33 +154,33 @@ impl Sorter {
         for pass in 0..passes {
             let (shift, end) = (bits * pass / passes, bits * (pass + 1) / passes);
             let counted = if pass == 0 { count } else { sorted };
-            let push = radix_count::Push {
-                capacity: from.keys.len().min(from.payload.len()).min(to.keys.len()) as u32,
-                groups_max: self.cut.groups,
-                keys_min: self.cut.keys_min,
-                round: self.cut.lanes,
-                shift,
-                digits: 1 << (end - shift),
-                first: u32::from(pass == 0),
-            };
-            self.pass(rec, from, to, counted, sorted, push);
+            let pass = Pass { shift, digits: 1 << (end - shift), first: u32::from(pass == 0) };
+            match &self.kernels {
+                Kernels::Ranked(count, scatter) => {
+                    self.ranked(rec, (*count, *scatter), (from, to), (counted, sorted), pass);
+                }
+                Kernels::ByShares(count, scatter) => {
+                    self.by_shares(rec, (*count, *scatter), (from, to), (counted, sorted), pass);
+                }
+            }
             (from, to) = (to, from);
         }
         from
     }
 
-    fn pass(
+    fn ranked(
         &self,
         rec: &mut Recorder,
-        from: Pairs,
-        to: Pairs,
-        count: Buf<u32>,
-        sorted: Buf<u32>,
-        push: radix_count::Push,
+        (count_keys, scatter): (Kernel<radix_count::K>, Kernel<radix_scatter::K>),
+        (from, to): (Pairs, Pairs),
+        (count, sorted): (Buf<u32>, Buf<u32>),
+        Pass { shift, digits, first }: Pass,
     ) {
-        let threads = Threads::groups(self.cut.groups, 1, 1);
+        let (groups_max, keys_min) = (self.cut.groups, KEYS_MIN);
+        let push = radix_count::Push { capacity: capacity(from, to), groups_max, keys_min, shift, digits, first };
+        let threads = Threads::groups(groups_max, 1, 1);
         let seen = radix_count::Bind { keys: from.keys.read(), count: count.read(), table: self.table.write() };
-        rec.dispatch(&self.count, seen, push, threads);
+        rec.dispatch(&count_keys, seen, push, threads);
         let moved = radix_scatter::Bind {
             keys_in: from.keys.read(),
             payload_in: from.payload.read(),
@@ -182,6 +190,48 @@ impl Sorter {
             payload_out: to.payload.write(),
             sorted_count: sorted.write(),
         };
-        rec.dispatch(&self.scatter, moved, bytemuck::cast(push), threads);
+        rec.dispatch(&scatter, moved, bytemuck::cast(push), threads);
     }
+
+    fn by_shares(
+        &self,
+        rec: &mut Recorder,
+        (count_keys, scatter): (Kernel<share_count::K>, Kernel<share_scatter::K>),
+        (from, to): (Pairs, Pairs),
+        (count, sorted): (Buf<u32>, Buf<u32>),
+        Pass { shift, digits, first }: Pass,
+    ) {
+        let [lanes, ..] = share_count::LOCAL;
+        let half = TABLE_LEN / 2;
+        let (table, places) = (self.table.part(0, half), self.table.part(half, half));
+        let groups = self.cut.groups.min(half as u32 / (lanes * digits));
+        let push = share_count::Push { capacity: capacity(from, to), shares: groups * lanes, shift, digits, first };
+        let threads = Threads::groups(groups, 1, 1);
+        let seen = share_count::Bind { keys: from.keys.read(), count: count.read(), table: table.read_write() };
+        rec.dispatch(&count_keys, seen, push, threads);
+        let moved = share_scatter::Bind {
+            keys_in: from.keys.read(),
+            payload_in: from.payload.read(),
+            count: count.read(),
+            table: table.read(),
+            places: places.read_write(),
+            keys_out: to.keys.write(),
+            payload_out: to.payload.write(),
+            sorted_count: sorted.write(),
+        };
+        rec.dispatch(&scatter, moved, bytemuck::cast(push), threads);
+    }
+}
+
+/// The bits of a key that a pass sorts by; whether it is the first.
+#[derive(Clone, Copy)]
+struct Pass {
+    shift: u32,
+    digits: u32,
+    first: u32,
+}
+
+/// Pairs that there is room for.
+fn capacity(from: Pairs, to: Pairs) -> u32 {
+    from.keys.len().min(from.payload.len()).min(to.keys.len()) as u32
 }

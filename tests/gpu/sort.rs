@@ -5,7 +5,7 @@ use stipple::map::sort::{Buffers, Cut, Pairs, Scan, Sorter, CPU, GPU, NONE};
 
 const CAPACITY: usize = 40_000;
 
-/// Twin of `Sorter::record`, passes of radix_count.comp and radix_scatter.comp: a stable sort of the first `count` keys that are not NONE by the low `bits`.
+/// Twin of `Sorter::record`, passes of radix_count.comp and radix_scatter.comp or of share_count.comp and share_scatter.comp: a stable sort of the first `count` keys that are not NONE by the low `bits`.
 fn sorted(keys: &[u32], count: usize, bits: u32) -> (Vec<u32>, Vec<u32>) {
     let n = count.min(keys.len());
     let mask = u32::MAX >> (32 - bits);
