@@ -1,8 +1,8 @@
 //! Compiles every kernel under shaders-glsl/ and writes the Rust that calls it; builds the OpenCV shim.
 //!
 //! GLSL is the single source: `glslangValidator` makes SPIR-V, `reflect.rs` reads the interface out of
-//! it, `emit.rs` writes `$OUT_DIR/kernels.rs`. A kernel with the line `// variants: subgroup, subgroup_texels` is compiled once
-//! more with `SUBGROUP` defined, and again with `TEXELS` too; the pipeline takes the last variant that the device can run.
+//! it, `emit.rs` writes `$OUT_DIR/kernels.rs`. A kernel with the line `// variants: subgroup, cpu` is compiled once
+//! more with `SUBGROUP` defined, and again with `CPU`; the pipeline takes the last variant that the device can run.
 
 #[path = "../drivers/build.rs"]
 #[allow(dead_code)] // its `main`
@@ -97,7 +97,7 @@ fn glslang(file: &Path, define: &str, spv: &Path) -> Result<(), String> {
     let mut command = Command::new("glslangValidator");
     command.args(["-V", "--quiet", "--target-env", "vulkan1.1", "-Ishaders-glsl", "-o"]).arg(spv);
     if !define.is_empty() {
-        command.args(define.split('_').map(|name| format!("-D{name}")));
+        command.arg(format!("-D{define}"));
     }
     let output = command
         .arg(file)

@@ -1,8 +1,8 @@
-// How a kernel reads a buffer: as it is, or with TEXELS as texels. Mesa's CPU driver loads from a storage buffer lane by lane
+// How a kernel reads a buffer: as it is, or in the variant of a CPU as texels. Mesa's CPU driver loads from a storage buffer lane by lane
 // and component by component, each through the stack; texels it gathers at once.
 // READ_X(binding, name of the block, name of the function that reads an element)
 
-#ifdef TEXELS
+#ifdef CPU
 
 #define READ_FLOATS(at, Block, read)                                                                                            \
     layout(set = 0, binding = at) uniform samplerBuffer Block;                                                                  \

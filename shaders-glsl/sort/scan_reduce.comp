@@ -1,6 +1,6 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// variants: texels
+// variants: cpu
 // First half of an exclusive scan: the sum of each block. In: data(0..n). Out: sums[block].
 #include "tile_scan.glsl"
 #include "../common/texels.glsl"

@@ -1,6 +1,6 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// variants: texels
+// variants: cpu
 // Upsweep of one radix pass on a CPU: how many keys of each digit every share holds.
 // In:  keys[0..count]. Out: table[share * digits + digit].
 // A share is the keys in a row that one invocation counts, in counters of its own: no atomics, no barrier but one.

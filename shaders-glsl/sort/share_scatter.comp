@@ -1,6 +1,6 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// variants: texels
+// variants: cpu
 // Downsweep of one radix pass on a CPU: every key and its payload go to their place, stably ordered by digit.
 // In:  keys_in, payload_in, count, table (of share_count). Out: keys_out, payload_out; sorted_count[0] (first pass); places, which
 // is scratch: places[share * digits + digit], where the share's next key of that digit goes.

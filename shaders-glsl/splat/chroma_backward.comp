@@ -5,7 +5,7 @@
 // A step that is not finite is not taken; project_backward counts it. What a view hardly shows takes none.
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// variants: texels
+// variants: cpu
 layout(local_size_x = 64) in;
 
 #include "../common/types.glsl"

@@ -3,7 +3,7 @@
 // out  tile_counts[rank], for the whole pool and one more, so that its prefix sum ends with the total
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// variants: texels
+// variants: cpu
 layout(local_size_x = 64) in;
 
 #include "../common/types.glsl"

@@ -6,7 +6,7 @@
 // padded with a tile past the last, where nothing is drawn, and what it counted too little is dropped.
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// variants: texels
+// variants: cpu
 layout(local_size_x = 64) in;
 
 #include "../common/types.glsl"

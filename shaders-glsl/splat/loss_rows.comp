@@ -3,7 +3,7 @@
 // out  filtered_planes: the three, filtered along rows
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// variants: texels
+// variants: cpu
 #extension GL_EXT_control_flow_attributes : require
 layout(local_size_x = 64) in;
 

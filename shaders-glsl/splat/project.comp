@@ -4,7 +4,7 @@
 //      not finite
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// variants: texels
+// variants: cpu
 layout(local_size_x = 64) in;
 
 #include "../common/types.glsl"

@@ -8,7 +8,7 @@
 // taken and the map stays as it is to the bit: only the sums are written.
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// variants: texels
+// variants: cpu
 #extension GL_EXT_control_flow_attributes : require
 layout(local_size_x = 64) in;
 layout(constant_id = 2) const uint CHANNELS = 1;

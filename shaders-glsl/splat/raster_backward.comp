@@ -10,7 +10,10 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
-// variants: subgroup, subgroup_texels
+// variants: subgroup, cpu
+#ifdef CPU
+#define SUBGROUP
+#endif
 #ifdef SUBGROUP
 #extension GL_KHR_shader_subgroup_basic : require
 #extension GL_KHR_shader_subgroup_vote : require

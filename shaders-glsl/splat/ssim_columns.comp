@@ -4,7 +4,7 @@
 //      with MAP one plane of S itself instead, one where masked
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// variants: texels
+// variants: cpu
 #extension GL_EXT_control_flow_attributes : require
 layout(local_size_x = 64) in;
 layout(constant_id = 0) const uint MAP = 0;

@@ -4,7 +4,7 @@
 // out  filtered_planes: of E[x], E[y], E[x²], E[y²], E[xy]
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// variants: texels
+// variants: cpu
 #extension GL_EXT_control_flow_attributes : require
 layout(local_size_x = 64) in;
 

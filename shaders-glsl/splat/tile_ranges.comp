@@ -3,7 +3,7 @@
 // out  ranges[tile]
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// variants: texels
+// variants: cpu
 layout(local_size_x = 64) in;
 
 #include "../common/index.glsl"

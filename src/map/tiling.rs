@@ -34,7 +34,7 @@ impl Tiling {
         // could save 30 of 103 µs, for 8 bytes an intersection of transmittance and colour where they are cut.
         let column = if caps.kind == DeviceKind::Discrete { 4 } else { Tiling::BASELINE.column };
         let chunk = if caps.kind == DeviceKind::Cpu { 1 } else { CHUNK_GPU };
-        let variant = if caps.allows(SAMPLED_BUFFER) { "subgroup_texels" } else { "subgroup" };
+        let variant = if caps.allows(SAMPLED_BUFFER) { "cpu" } else { "subgroup" };
         match caps.subgroup_size {
             n @ (8 | 16 | 32 | 64) if sub => Tiling { lanes: n.min(32), column, variant, chunk },
             _ => Tiling { column, chunk, ..Tiling::BASELINE },

@@ -91,7 +91,7 @@ impl Counts {
     pub fn model(&self, name: &str, calls: f64) -> (f64, f64) {
         let Counts { splats: n, visible: v, intersections: i, pixels: p, tile_pixels } = *self;
         let pairs = i * tile_pixels;
-        match name.trim_end_matches("_texels").trim_end_matches("_subgroup") {
+        match name.trim_end_matches("_cpu").trim_end_matches("_subgroup") {
             // Two passes by depth, the rest by tile.
             "radix_count" | "share_count" => (4.0 * (n + v) + 4.0 * i * (calls - 2.0), 0.0),
             "radix_scatter" | "share_scatter" => (12.0 * n + 16.0 * v + 16.0 * i * (calls - 2.0) - 4.0 * i, 0.0),
