@@ -3,7 +3,7 @@
 // variants: cpu
 // Upsweep of one radix pass on a CPU: how many keys of each digit every share holds.
 // In:  keys[0..count]. Out: table[share * digits + digit].
-// A share is the keys in a row that one invocation counts, in counters of its own: no atomics, no barrier but one.
+// A share is the consecutive keys that one invocation counts, in counters of its own: no atomics, no barriers.
 #include "shares.glsl"
 #include "../common/texels.glsl"
 
@@ -15,10 +15,7 @@ layout(set = 0, binding = 2, std430) buffer Table { uint table[]; };
 
 void main() {
     uint share = gl_GlobalInvocationID.x;
-    uint rows = gl_WorkGroupID.x * LANES * digits;
-    for (uint i = gl_LocalInvocationID.x; i < LANES * digits; i += LANES) table[rows + i] = 0u;
-    memoryBarrierBuffer();
-    barrier();
+    for (uint d = 0u; d < digits; ++d) table[share * digits + d] = 0u;
     uvec2 range = range_of(min(count(0u), capacity), share);
     for (uint i = range.x; i < range.y; ++i) {
         uint key = key_at(i);

@@ -15,14 +15,14 @@ READ_UINTS(0, KeysIn, key_in)
 READ_UINTS(1, PayloadIn, payload_in)
 READ_UINTS(2, Count, count)
 READ_UINTS(3, Table, table)
-layout(set = 0, binding = 4, std430) buffer Places { uint places[]; };
+layout(set = 0, binding = 4, std430) coherent buffer Places { uint places[]; };
 layout(set = 0, binding = 5, std430) writeonly buffer KeysOut { uint keys_out[]; };
 layout(set = 0, binding = 6, std430) writeonly buffer PayloadOut { uint payload_out[]; };
 layout(set = 0, binding = 7, std430) writeonly buffer SortedCount { uint sorted_count[]; };
 
 shared uint sums[LANES];
 
-// Each lane takes digits in a row.
+// Each lane takes consecutive digits.
 void find_places(uint lane, uint group) {
     uint each = max(1u, digits / LANES), begin = min(lane * each, digits), end = min(begin + each, digits);
     uint sum = 0u;

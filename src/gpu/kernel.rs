@@ -1,7 +1,7 @@
 //! Pipelines: a kernel's SPIR-V with its specialisation constants, made once at boot.
 //!
 //! `KernelDef` is implemented by what the build writes from GLSL, never by hand. A kernel with faster
-//! variants takes the first one whose SPIR-V capabilities the device has.
+//! variants takes the last one whose SPIR-V capabilities the device has.
 
 use super::cache::PipelineCache;
 use super::device::{boot, Device};

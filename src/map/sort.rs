@@ -16,11 +16,12 @@ pub struct Cut {
     digit_bits: u32,
     /// Workgroups at most.
     groups: u32,
-    /// A CPU's: by shares.
+    /// Whether each invocation sorts a share of the keys alone (`share_*`), as on a CPU; else workgroups rank keys together (`radix_*`).
     by_shares: bool,
 }
 
-/// Two workgroups a core are enough, and digits of 11 bits sort the tiles of 320x240 in one pass.
+/// Digits of 11 bits sort the tiles of 320x240 in one pass, with two workgroups, as the table has no room for more; passes of 8 bits
+/// have up to 16, two a core.
 pub const CPU: Cut = Cut { digit_bits: 11, groups: 32, by_shares: true };
 /// A GPU hides latency with many workgroups. 8 KiB of shared memory let many be resident.
 pub const GPU: Cut = Cut { digit_bits: 8, groups: 256, by_shares: false };

@@ -70,7 +70,7 @@ class Line:
     """A UDP socket, or a pseudo-terminal that is read as fast as a UART of so many baud gives bytes."""
 
     def __init__(self, kind, baud):
-        self.baud, self.free = baud, 0.0
+        self.baud, self.free = baud, time.monotonic()
         if kind == "udp":
             self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
             self.socket.bind(("127.0.0.1", 0))
@@ -99,13 +99,17 @@ class Line:
             return data
         # A UART sends while nobody looks: a late reader finds all that its line carried since the last byte, and no more.
         time.sleep(max(0.0, self.free + 0.001 - now))
-        carried = int((time.monotonic() - self.free) * self.baud / 10.0)
+        now = time.monotonic()
+        carried = max(1, int((now - self.free) * self.baud / 10.0))
         try:
-            data = os.read(self.fd, max(1, carried))
+            data = os.read(self.fd, min(carried, 1 << 16))
         except OSError:
+            # Nobody has the line open.
             time.sleep(wait)
+            self.free = time.monotonic()
             return b""
-        self.free += 10.0 * len(data) / self.baud
+        # A line that had less to carry was idle.
+        self.free = now if len(data) < carried else self.free + 10.0 * len(data) / self.baud
         return data
 
     def write(self, data):

@@ -2,8 +2,9 @@
 
 use crate::commands::checks::Check;
 use crate::config::Board;
+use crate::gpu::capability::SAMPLED_BUFFER;
 use crate::gpu::kernels::ALL;
-use crate::gpu::{DeviceKind, Gpu};
+use crate::gpu::{DeviceKind, Gpu, Reflected};
 use crate::run::memory::{self, mib};
 use std::path::Path;
 use stipple_drivers::{host, Calibration};
@@ -37,7 +38,9 @@ pub fn vulkan(board: &Board) -> Vec<Check> {
         _ => Check::ok(what),
     }];
     let runs = |baseline: bool| {
-        let of = ALL.iter().filter(|k| k.baseline == baseline);
+        // Variants for CPU devices are none that a GPU lacks.
+        let is_meant = |k: &&Reflected| c.kind == DeviceKind::Cpu || !k.capabilities.contains(&SAMPLED_BUFFER);
+        let of = ALL.iter().filter(|k| k.baseline == baseline).filter(is_meant);
         let able = of.clone().filter(|k| k.capabilities.iter().all(|capability| c.allows(*capability)));
         (able.count(), of.count())
     };

@@ -24,7 +24,7 @@ const LIMITS: Limits = Limits {
 /// Keyframes of the graph.
 const KEYFRAMES: usize = 64;
 /// Frames between two keyframes.
-const STEP: usize = 10;
+const STEP: usize = 5;
 
 type Record = (Key, About, Vec<u8>);
 
