@@ -7,6 +7,7 @@ use super::segment;
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, Read as _};
 use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
 use stipple_drivers::{host, Fault, FaultKind};
 
 /// Moves the segments of a store to `previous-NAME` beside its folder, in the place of those that are there, and answers where;
@@ -46,6 +47,10 @@ pub fn set_aside(folder: &Path) -> Result<Option<PathBuf>, Fault> {
     Ok(Some(aside))
 }
 
+/// How long a lock that is taken is asked for again: a process that is being started holds copies of its parent's locks until it
+/// runs its own program.
+const LOCK_PATIENCE: Duration = Duration::from_millis(200);
+
 /// Takes the lock of a store. Fails where another has it, or the folder cannot be written.
 pub fn lock(folder: &Path) -> Result<File, Fault> {
     let place = folder.join(LOCK);
@@ -54,7 +59,12 @@ pub fn lock(folder: &Path) -> Result<File, Fault> {
         let why = format!("the store's folder cannot be written: {e}");
         Fault::new(FaultKind::NoOutput, &text[..], why, "name another folder, or make this one writable")
     })?;
-    host::lock(&file).map_err(|e| {
+    let (begun, mut locked) = (Instant::now(), host::lock(&file));
+    while begun.elapsed() < LOCK_PATIENCE && locked.as_ref().is_err_and(|e| e.kind() == io::ErrorKind::WouldBlock) {
+        std::thread::sleep(LOCK_PATIENCE / 20);
+        locked = host::lock(&file);
+    }
+    locked.map_err(|e| {
         let why = match e.kind() {
             io::ErrorKind::WouldBlock => "another run holds this store".to_string(),
             _ => format!("the store cannot be locked: {e}"),

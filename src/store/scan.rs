@@ -11,6 +11,8 @@ use std::fs::File;
 use std::io;
 use std::os::unix::fs::FileExt as _;
 use std::path::Path;
+use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
+use std::thread::Builder;
 use stipple_drivers::{Fault, FaultKind};
 
 pub const LOCK: &str = "lock";
@@ -80,15 +82,18 @@ pub fn scan(
 ) -> Result<Found, Fault> {
     let mut found = list(path, folder, identity)?;
     let sealed: Vec<Segment> = found.segments.iter().filter(|s| s.state == Use::Sealed).copied().collect();
-    let identity = found.identity;
+    let over = AtomicBool::new(false);
     std::thread::scope(|scope| {
-        for t in 0..READERS {
-            let sealed = &sealed;
-            scope.spawn(move || {
-                sealed.iter().skip(t).step_by(READERS).for_each(|segment| read_ahead(folder, segment, identity));
-            });
+        let readers = if sealed.len() > 1 { READERS.min(sealed.len()) } else { 0 };
+        for t in 0..readers {
+            let own = sealed.iter().skip(t).step_by(readers);
+            let read = || own.for_each(|segment| read_ahead(folder, segment, &over));
+            // Where no thread can start, the scan reads all by itself.
+            let _ = Builder::new().name("store".into()).spawn_scoped(scope, read);
         }
-        take(path, folder, &mut found, index, &mut check)
+        let taken = take(path, folder, &mut found, index, &mut check);
+        over.store(true, Relaxed);
+        taken
     })?;
     complete(path, folder, &mut found, index)?;
     for entry in index.entries() {
@@ -98,12 +103,15 @@ pub fn scan(
 }
 
 /// Brings the headers of a segment into the page cache. Where each is, is known from the one before: of one segment a disk
-/// is asked for one at a time, and most disks serve several in the time of one.
-fn read_ahead(folder: &Folder, segment: &Segment, identity: u64) {
+/// is asked for one at a time, and most disks serve several in the time of one. Ends where there is no header, or when the scan
+/// is over.
+fn read_ahead(folder: &Folder, segment: &Segment, over: &AtomicBool) {
     let Ok(file) = folder.read(segment.number) else { return };
-    let mut walk = Walk::new(segment.bytes, segment.sequence, identity);
-    let mut sector = [0; SECTOR];
-    while let Ok(Some(_)) = walk.next(&file, &mut sector) {}
+    let (mut at, mut sector) = (SECTOR as u64, [0; SECTOR]);
+    while !over.load(Relaxed) && file.read_exact_at(&mut sector, at).is_ok() {
+        let Some(header) = Header::decode(&sector) else { return };
+        at += header.size() as u64;
+    }
 }
 
 /// Takes the records of all segments, in the order in which they were written.
