@@ -1,7 +1,7 @@
 // Lists (tile, intersection) pairs front to back, so that a full list loses the farthest: one thread a rank.
 // in   visible_count, slots (by depth), projected, tile_offsets (prefix sum of tile_counts)
 // out  keys (tile), owners (slot of each);
-//      isect_count[0] those listed, [1] those there are, [2..5] workgroups of 64 over those listed
+//      isect_count[0] those listed, [1] those there are
 // The walk repeats count_tiles'. Should two compilations round differently, what it counted too much is
 // padded with a tile past the last, where nothing is drawn, and what it counted too little is dropped.
 #version 450
@@ -34,13 +34,8 @@ void main() {
     if (rank == 0) {
         const uint needed = tile_offset(push.splats);
         const uint listed = min(needed, push.capacity);
-        const uint groups = (listed + 63) / 64;
-        const uint high = max(1, (groups + 65534) / 65535);
         isect_count[0] = listed;
         isect_count[1] = needed;
-        isect_count[2] = (groups + high - 1) / high;
-        isect_count[3] = high;
-        isect_count[4] = 1;
     }
     if (rank >= visible_count(0)) {
         return;

@@ -256,7 +256,6 @@ pub(super) fn arena_buffer(device: &Arc<Device>, bytes: u64) -> Result<Backed, F
     };
     let usage = texels
         | vk::BufferUsageFlags::STORAGE_BUFFER
-        | vk::BufferUsageFlags::INDIRECT_BUFFER
         | vk::BufferUsageFlags::TRANSFER_SRC
         | vk::BufferUsageFlags::TRANSFER_DST;
     let local = vk::MemoryPropertyFlags::DEVICE_LOCAL;

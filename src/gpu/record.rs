@@ -59,7 +59,6 @@ impl Threads {
 #[derive(Clone, Copy)]
 pub(super) enum Work {
     Dispatch { kernel: u32, ranges: [Range; BUFFERS_MAX], push: [u8; PUSH_MAX], groups: [u32; 3] },
-    Indirect { kernel: u32, ranges: [Range; BUFFERS_MAX], push: [u8; PUSH_MAX], at: u64 },
     Fill { range: Range, value: u32 },
     Report { from: Range, place: usize },
 }
@@ -79,8 +78,8 @@ pub struct Recorder {
     pub(super) error: Option<GpuError>,
 }
 
-/// Ranges open at most: every buffer of every command, and indirect arguments.
-const OPEN_MAX: usize = COMMANDS_MAX * (BUFFERS_MAX + 1);
+/// Ranges open at most: every buffer of every command.
+const OPEN_MAX: usize = COMMANDS_MAX * BUFFERS_MAX;
 
 impl Recorder {
     pub(super) fn new() -> Recorder {
@@ -110,24 +109,6 @@ impl Recorder {
             }
             None => self.fail(GpuError::Groups { kernel: kernel.name() }),
         }
-    }
-
-    /// Starts the workgroups that `args[at..at + 3]` names when the GPU gets there.
-    pub fn dispatch_indirect<K: KernelDef>(
-        &mut self,
-        kernel: &Kernel<K>,
-        bind: K::Bind,
-        push: K::Push,
-        args: Buf<u32>,
-        at: usize,
-    ) {
-        if at + 3 > args.len() {
-            return self.fail(GpuError::OutOfRange { at, len: 3, of: args.len() });
-        }
-        let ranges = K::ranges(&bind);
-        let range = args.part(at, 3).range();
-        let touched = bound::<K>(&ranges).chain(std::iter::once((range, Access::Read)));
-        self.push(Work::Indirect { kernel: kernel.index, ranges, push: padded(&push), at: range.start }, touched);
     }
 
     /// Sets every 32-bit word of `buf`.

@@ -287,7 +287,7 @@ impl Submitter {
 
     fn row_of(&self, command: &Command) -> usize {
         match command.work {
-            Work::Dispatch { kernel, .. } | Work::Indirect { kernel, .. } => self.rows[kernel as usize],
+            Work::Dispatch { kernel, .. } => self.rows[kernel as usize],
             Work::Fill { .. } => FILL,
             Work::Report { .. } => REPORT,
         }
@@ -359,8 +359,7 @@ impl Submitter {
         if command.barrier_before {
             self.barrier(cb);
         }
-        if let Work::Dispatch { kernel, ranges, push, .. } | Work::Indirect { kernel, ranges, push, .. } = &command.work
-        {
+        if let Work::Dispatch { kernel, ranges, push, .. } = &command.work {
             let set = pipelines.set(*kernel, ranges, memory)?;
             let p = pipelines.get(*kernel);
             let point = vk::PipelineBindPoint::COMPUTE;
@@ -379,7 +378,6 @@ impl Submitter {
         };
         match command.work {
             Work::Dispatch { .. } => {}
-            Work::Indirect { at, .. } => inside("indirect", Range { start: at, end: at + 12 })?,
             Work::Fill { range, .. } => inside("fill", range)?,
             Work::Report { from, .. } => inside("report", from)?,
         }
@@ -402,7 +400,6 @@ impl Submitter {
                     }
                     dispatched = x * y * z;
                 }
-                Work::Indirect { at, .. } => raw.cmd_dispatch_indirect(cb, memory, at),
                 Work::Fill { range, value } => {
                     raw.cmd_fill_buffer(cb, memory, range.start, range.end - range.start, value);
                 }
@@ -520,19 +517,16 @@ impl Submitter {
         }
     }
 
-    /// Everything before is done and visible to everything after: kernels, copies, indirect arguments.
+    /// Everything before is done and visible to everything after: kernels, copies.
     fn barrier(&self, cb: vk::CommandBuffer) {
-        let stages = vk::PipelineStageFlags::COMPUTE_SHADER
-            | vk::PipelineStageFlags::TRANSFER
-            | vk::PipelineStageFlags::DRAW_INDIRECT;
+        let stages = vk::PipelineStageFlags::COMPUTE_SHADER | vk::PipelineStageFlags::TRANSFER;
         let barrier = [vk::MemoryBarrier::default()
             .src_access_mask(vk::AccessFlags::SHADER_WRITE | vk::AccessFlags::TRANSFER_WRITE)
             .dst_access_mask(
                 vk::AccessFlags::SHADER_READ
                     | vk::AccessFlags::SHADER_WRITE
                     | vk::AccessFlags::TRANSFER_READ
-                    | vk::AccessFlags::TRANSFER_WRITE
-                    | vk::AccessFlags::INDIRECT_COMMAND_READ,
+                    | vk::AccessFlags::TRANSFER_WRITE,
             )];
         // SAFETY: recording.
         unsafe {

@@ -8,7 +8,7 @@
 //! the same in every run.
 
 use super::pool::Pool;
-use super::render::Renderer;
+use super::render::{walkers, Renderer};
 use super::shape::{Scratch, Shape, GROUP};
 use super::step::{LearningRates, Weights};
 use super::tiling::Tiling;
@@ -51,7 +51,7 @@ impl Backward {
         shape: &Shape,
         tiling: Tiling,
     ) -> Result<Backward, Fault> {
-        let (channels, Tiling { lanes, column, variant, chunk }) = (shape.channels, tiling);
+        let (channels, Tiling { lanes, column, variant, chunk, .. }) = (shape.channels, tiling);
         let mut project =
             |fisheye, learn| gpu.kernel_in_pieces(project_backward::Spec { channels, chunk, fisheye, learn });
         Ok(Backward {
@@ -99,7 +99,7 @@ impl Backward {
                 owners: b.owners.read(),
                 isect_gradients: self.isect_gradients.read_write(),
             };
-            rec.dispatch_indirect(sum_chunks, slots, (), b.isect_count, 2);
+            rec.dispatch(sum_chunks, slots, (), walkers());
         }
         if let (Some(chroma), Some(rates)) = (&self.chroma, rates) {
             let bind = chroma_backward::Bind {

@@ -6,7 +6,7 @@
 //! ```
 //!
 //! Counts stay on the GPU: a dispatch over Gaussians is sized by those alive, never by the pool's capacity, and ends early
-//! past those visible; one over intersections is indirect (3D Gaussian splatting: Kerbl et al. 2023).
+//! past those visible; those over intersections walk them (3D Gaussian splatting: Kerbl et al. 2023).
 
 use super::pool::Pool;
 use super::shape::{Scratch, Shape};
@@ -21,6 +21,12 @@ use stipple_drivers::Fault;
 /// Bits of a depth key: depth_key.glsl.
 const DEPTH_BITS: u32 = 16;
 
+/// What walks the intersections, whose count only the device knows: workgroups enough for a large GPU. (Some drivers of small GPUs run
+/// indirect dispatches on the CPU.)
+pub fn walkers() -> Threads {
+    Threads::groups(1024, 1, 1)
+}
+
 #[derive(Clone, Copy)]
 pub struct Buffers {
     pub projected: Buf<Projected>,
@@ -29,7 +35,7 @@ pub struct Buffers {
     pub visible_count: Buf<u32>,
     /// Tiles that each of the visible touches, then their prefix sum.
     pub tile_offsets: Buf<u32>,
-    /// Intersections by tile; the slot of each; how many are listed, are needed, and workgroups over the listed.
+    /// Intersections by tile; the slot of each; how many are listed, and are needed.
     pub isects: Buf<u32>,
     pub owners: Buf<u32>,
     pub isect_count: Buf<u32>,
@@ -51,7 +57,7 @@ impl Buffers {
             tile_offsets: arena.alloc("splats: tiles touched, then their prefix sum", slots + 1)?,
             isects: arena.alloc("intersections: by tile", isects)?,
             owners: arena.alloc("intersections: slots", isects)?,
-            isect_count: arena.alloc("counts: intersections listed, needed, workgroups", 5)?,
+            isect_count: arena.alloc("counts: intersections listed, needed", 2)?,
             isects_sorted: arena.alloc("counts: intersections sorted", 1)?,
             ranges: arena.alloc("tiles: ranges", shape.tiles_max() + 1)?,
             rendered: arena
@@ -210,12 +216,11 @@ impl Renderer {
         let pairs = self.scratch.pairs(self.scratch.isect_keys, b.isects, self.sorter.passes(bits));
         let sorted = self.sorter.record(rec, pairs, b.isect_count.part(0, 1), b.isects_sorted, bits);
         rec.fill(b.ranges, 0);
-        rec.dispatch_indirect(
+        rec.dispatch(
             &self.tile_ranges,
             tile_ranges::Bind { isect_count: b.isect_count.read(), keys: sorted.keys.read(), ranges: b.ranges.write() },
             tile_ranges::Push { tiles: tiles + 1 },
-            b.isect_count,
-            2,
+            walkers(),
         );
     }
 }

@@ -12,7 +12,7 @@ mod reflect;
 mod timings;
 
 use stipple::config::GpuConfig;
-use stipple::gpu::kernels::{self, args, axpy, group_sum, layouts, types};
+use stipple::gpu::kernels::{self, axpy, group_sum, layouts, types};
 use stipple::gpu::{
     capability, Buf, Gpu, GpuError, GpuOptions, Kernel, Recorder, Threads, ALIGN, COMMANDS_MAX, REPORTS, STAGING_BYTES,
 };
@@ -211,31 +211,6 @@ fn random_recordings_match_sequential_execution() {
         gpu.submit(rec).unwrap();
         assert_eq!(read(&mut gpu, all), twin);
     }
-}
-
-#[test]
-fn indirect_dispatch_runs_the_groups_the_gpu_counted() {
-    let mut gpu = open(1 << 16);
-    let x = floats(&mut gpu, "x", &[1.0; 1024]);
-    let y = gpu.alloc::<f32>("y", 1024).unwrap();
-    let (count, words) = (gpu.alloc::<u32>("count", 1).unwrap(), gpu.alloc::<u32>("args", 3 + 64).unwrap());
-    let k = gpu.kernel::<axpy::K>(axpy::Spec::default()).unwrap();
-    let size = gpu.kernel::<args::K>(args::Spec::default()).unwrap();
-    gpu.upload(count, 0, &[130]).unwrap();
-    let mut rec = gpu.record();
-    let words_at = words.part(64, 3);
-    rec.dispatch(&size, args::Bind { count: count.read(), args: words_at.write() }, (), Threads::d1(1));
-    let bind = axpy::Bind { x: x.read(), y: y.read_write() };
-    rec.dispatch_indirect(&k, bind, axpy::Push { n: 1024, a: 1.0 }, words, 64);
-    // The arguments were read, so changing them waits.
-    rec.fill(words_at, 0);
-    assert_eq!(rec.barriers(), 2);
-    gpu.submit(rec).unwrap();
-    let out = read(&mut gpu, y);
-    assert_eq!(out.iter().filter(|&&v| v == 1.0).count(), 3 * 64, "ceil(130 / 64) groups of 64");
-    let mut rec = gpu.record();
-    rec.dispatch_indirect(&k, bind, axpy::Push { n: 1, a: 1.0 }, words, 65);
-    assert_eq!(gpu.submit(rec), Err(GpuError::OutOfRange { at: 65, len: 3, of: 67 }));
 }
 
 #[test]
@@ -455,8 +430,6 @@ fn steady_state_allocates_nothing() {
     let mut gpu = Gpu::open_with(&GpuConfig::default(), 1 << 20, GpuOptions::default()).unwrap();
     let x = floats(&mut gpu, "x", &[1.0; 1000]);
     let y = gpu.alloc::<f32>("y", 1000).unwrap();
-    let words = gpu.alloc::<u32>("args", 3).unwrap();
-    gpu.upload(words, 0, &[1, 1, 1]).unwrap();
     let k = gpu.kernel::<axpy::K>(axpy::Spec::default()).unwrap();
     let mut items = [0f32; 1000];
     let before = mem::heap_after_seal();
@@ -466,13 +439,6 @@ fn steady_state_allocates_nothing() {
             let mut rec = gpu.record();
             rec.fill(y, 0);
             axpy(&mut rec, &k, x, y, 1.0);
-            rec.dispatch_indirect(
-                &k,
-                axpy::Bind { x: x.read(), y: y.read_write() },
-                axpy::Push { n: 1, a: 1.0 },
-                words,
-                0,
-            );
             gpu.submit(rec).unwrap();
             for place in 0..REPORTS {
                 let mut rec = gpu.record();
