@@ -2,7 +2,8 @@
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
 // Downsweep of one radix pass: every key and its payload go to their place, stably ordered by digit.
-// In:  keys_in, payload_in, count, table (of radix_count). Out: keys_out, payload_out; sorted_count[0] (first pass).
+// In:  keys_in, payload_in, count, table (of radix_count, or of the pass before). Out: keys_out, payload_out;
+//      sorted_count[0] (first pass); next_table, which was zero: the table of the next pass, where this one counts for it.
 //
 // A group finds its places itself, from the whole table: a few hundred reads a lane, in place of a scan of the table
 // in two more dispatches, each of which costs a GPU as much as this kernel.
@@ -14,6 +15,7 @@
 
 layout(local_size_x = 256) in;
 const uint ROWS = LANES / 32;
+const uint READS = 16; // of the table, under way at once
 
 layout(set = 0, binding = 0, std430) readonly buffer KeysIn { uint keys_in[]; };
 layout(set = 0, binding = 1, std430) readonly buffer PayloadIn { uint payload_in[]; };
@@ -22,6 +24,7 @@ layout(set = 0, binding = 3, std430) readonly buffer Table { uint table[]; };
 layout(set = 0, binding = 4, std430) writeonly buffer KeysOut { uint keys_out[]; };
 layout(set = 0, binding = 5, std430) writeonly buffer PayloadOut { uint payload_out[]; };
 layout(set = 0, binding = 6, std430) writeonly buffer SortedCount { uint sorted_count[]; };
+layout(set = 0, binding = 7, std430) buffer NextTable { uint next_table[]; };
 
 shared uint peers_of[ROWS * DIGITS_MAX];
 shared uint next[DIGITS_MAX];
@@ -43,8 +46,8 @@ uint lanes_exclusive(uint lane, uint value, out uint total) {
     return ladder[at + lane] - value;
 }
 
-// next[digit]: where this group's first key of the digit goes. Leaves peers_of zero.
-void find_places(uint lane, uint group, uint groups) {
+// next[digit]: where this group's first key of the digit goes. Leaves peers_of zero. Answers how many keys are sorted.
+uint find_places(uint lane, uint group, uint groups) {
     for (uint d = lane; d < digits; d += LANES) {
         next[d] = 0u;
         peers_of[d] = 0u;
@@ -56,8 +59,8 @@ void find_places(uint lane, uint group, uint groups) {
     for (uint i = lane; i < digits * shares; i += LANES) {
         uint digit = i & (digits - 1u), before = 0u, all = 0u;
         // Several reads under way at once: one after another they would take longer than the rest.
-        for (uint g0 = i / digits; g0 < groups; g0 += ROWS * shares) {
-            [[unroll]] for (uint k = 0u; k < ROWS; ++k) {
+        for (uint g0 = i / digits; g0 < groups; g0 += READS * shares) {
+            [[unroll]] for (uint k = 0u; k < READS; ++k) {
                 uint g = g0 + k * shares;
                 uint n = g < groups ? table[g * digits + digit] : 0u;
                 all += n;
@@ -84,6 +87,17 @@ void find_places(uint lane, uint group, uint groups) {
     barrier();
     for (uint i = lane; i < ROWS * digits; i += LANES) peers_of[i] = 0u;
     barrier();
+    return total;
+}
+
+struct Pair {
+    uint key;
+    uint payload;
+};
+
+Pair read(uint i, uint end) {
+    if (i >= end) return Pair(NONE, 0u);
+    return Pair(keys_in[i], first != 0u ? i : payload_in[i]);
 }
 
 void main() {
@@ -92,14 +106,17 @@ void main() {
     uint n = min(count[0], capacity);
     uint groups = groups_of(n);
     if (group >= groups) return;
-    find_places(lane, group, groups);
     uint row = lane / 32u, bit = 1u << (lane & 31u);
     uvec2 range = range_of(n, groups, group);
+    Pair coming = read(range.x + lane, range.y);
+    uint total = find_places(lane, group, groups);
+    uint next_groups = groups_of(total), next_keys = keys_of(total, next_groups);
     for (uint base = range.x; base < range.y; base += LANES) {
         uint i = base + lane;
-        uint key = i < range.y ? keys_in[i] : NONE;
-        bool live = i < range.y && sorted(key);
-        uint digit = (key >> shift) & (digits - 1u);
+        Pair pair = coming;
+        coming = read(i + LANES, range.y);
+        bool live = i < range.y && sorted(pair.key);
+        uint digit = (pair.key >> shift) & (digits - 1u);
         uint mine = row * digits + digit;
         if (live) atomicOr(peers_of[mine], bit);
         barrier();
@@ -115,8 +132,12 @@ void main() {
                 atomicAdd(next[digit], bitCount(peers));
                 peers_of[mine] = 0u;
             }
-            keys_out[place] = key;
-            payload_out[place] = first != 0u ? i : payload_in[i];
+            keys_out[place] = pair.key;
+            payload_out[place] = pair.payload;
+            if (next_digits != 0u) {
+                uint next_digit = (pair.key >> next_shift) & (next_digits - 1u);
+                atomicAdd(next_table[place / next_keys * next_digits + next_digit], 1u);
+            }
         }
         barrier();
     }

@@ -21,7 +21,7 @@ uint lanes_exclusive(uint lane, uint value, out uint total) {
 }
 
 // Elements of `n` that a block sums: whole tiles, so blocks differ by one tile at most.
-const uint ITEMS = 16u;
+const uint ITEMS = 4u;
 const uint TILE = LANES * ITEMS;
 
 uvec2 block_range(uint n, uint blocks, uint block) {

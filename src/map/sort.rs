@@ -1,10 +1,10 @@
 //! Radix sort and prefix sum on the GPU: stable, deterministic, the element count stays on the device.
 //!
 //! A pass is count and scatter (`shaders-glsl/sort`), least significant digit first, no subgroup operations. On a GPU
-//! workgroups rank many keys at a time (`radix_*`); on a CPU each invocation moves a share of the keys one by one (`share_*`), as
-//! barriers and shared memory are dear there. The number of workgroups is fixed at boot and each walks its share, so nothing is
-//! sized by a count that only the device knows. The first pass also leaves out what is not to be sorted, which compacts a list for
-//! nothing.
+//! workgroups rank many keys at a time (`radix_*`), and every second pass is counted while the one before it scatters, which saves a
+//! dispatch; on a CPU each invocation moves a share of the keys one by one (`share_*`), as barriers and shared memory are dear there.
+//! The number of workgroups is fixed at boot and each walks its share, so nothing is sized by a count that only the device knows. The
+//! first pass also leaves out what is not to be sorted, which compacts a list for nothing.
 
 use crate::gpu::kernels::{radix_count, radix_scatter, scan_apply, scan_reduce, share_count, share_scatter};
 use crate::gpu::{Arena, Buf, Caps, DeviceKind, Gpu, Kernel, Recorder, Threads};
@@ -27,8 +27,8 @@ pub const CPU: Cut = Cut { digit_bits: 11, groups: 32, by_shares: true };
 pub const GPU: Cut = Cut { digit_bits: 8, groups: 256, by_shares: false };
 /// Fewest keys of a workgroup on a GPU.
 const KEYS_MIN: u32 = 1024;
-/// Words of the digit table: digits x workgroups. By shares, half of it is the table, digits x shares, and half the places.
-const TABLE_LEN: usize = 1 << 16;
+/// Words of the digit tables, digits x workgroups, of a pass and of the next. By shares the second half is the places.
+const TABLE_LEN: usize = 1 << 17;
 /// Most blocks of a scan: their sums are scanned by one workgroup.
 const SCAN_BLOCKS_MAX: u32 = 256;
 const SCAN_BLOCKS_CPU: u32 = 16;
@@ -37,7 +37,7 @@ const SCAN_BLOCKS_CPU: u32 = 16;
 pub const NONE: u32 = u32::MAX;
 
 const _: () = assert!((share_count::LOCAL[0] << CPU.digit_bits) as usize <= TABLE_LEN / 2);
-const _: () = assert!((GPU.groups << GPU.digit_bits) as usize <= TABLE_LEN);
+const _: () = assert!((GPU.groups << GPU.digit_bits) as usize <= TABLE_LEN / 2);
 
 impl Cut {
     pub fn of(caps: &Caps) -> Cut {
@@ -153,9 +153,11 @@ impl Sorter {
         let passes = self.passes(bits);
         let (mut from, mut to) = (from, to);
         for pass in 0..passes {
-            let (shift, end) = (bits * pass / passes, bits * (pass + 1) / passes);
+            let nth = |pass| (bits * pass / passes, bits * (pass + 1) / passes);
+            let ((shift, end), (next_shift, next_end)) = (nth(pass), nth(pass + 1));
             let counted = if pass == 0 { count } else { sorted };
-            let pass = Pass { shift, digits: 1 << (end - shift), first: u32::from(pass == 0) };
+            let next_digits = if pass % 2 == 0 && pass + 1 < passes { 1 << (next_end - next_shift) } else { 0 };
+            let pass = Pass { pass, shift, digits: 1 << (end - shift), next_shift, next_digits };
             match &self.kernels {
                 Kernels::Ranked(count, scatter) => {
                     self.ranked(rec, (*count, *scatter), (from, to), (counted, sorted), pass);
@@ -175,21 +177,28 @@ impl Sorter {
         (count_keys, scatter): (Kernel<radix_count::K>, Kernel<radix_scatter::K>),
         (from, to): (Pairs, Pairs),
         (count, sorted): (Buf<u32>, Buf<u32>),
-        Pass { shift, digits, first }: Pass,
+        Pass { pass, shift, digits, next_shift, next_digits }: Pass,
     ) {
-        let (groups_max, keys_min) = (self.cut.groups, KEYS_MIN);
-        let push = radix_count::Push { capacity: capacity(from, to), groups_max, keys_min, shift, digits, first };
+        let (groups_max, keys_min, first) = (self.cut.groups, KEYS_MIN, u32::from(pass == 0));
+        let capacity = capacity(from, to);
+        let push = radix_count::Push { capacity, groups_max, keys_min, shift, digits, first, next_shift, next_digits };
         let threads = Threads::groups(groups_max, 1, 1);
-        let seen = radix_count::Bind { keys: from.keys.read(), count: count.read(), table: self.table.write() };
-        rec.dispatch(&count_keys, seen, push, threads);
+        let half = |i: u32| self.table.part(i as usize % 2 * (TABLE_LEN / 2), TABLE_LEN / 2);
+        let (table, next_table) = (half(pass), half(pass + 1));
+        if pass % 2 == 0 {
+            let (keys, count, table) = (from.keys.read(), count.read(), table.write());
+            let next_table = next_table.write();
+            rec.dispatch(&count_keys, radix_count::Bind { keys, count, table, next_table }, push, threads);
+        }
         let moved = radix_scatter::Bind {
             keys_in: from.keys.read(),
             payload_in: from.payload.read(),
             count: count.read(),
-            table: self.table.read(),
+            table: table.read(),
             keys_out: to.keys.write(),
             payload_out: to.payload.write(),
             sorted_count: sorted.write(),
+            next_table: next_table.read_write(),
         };
         rec.dispatch(&scatter, moved, bytemuck::cast(push), threads);
     }
@@ -200,8 +209,9 @@ impl Sorter {
         (count_keys, scatter): (Kernel<share_count::K>, Kernel<share_scatter::K>),
         (from, to): (Pairs, Pairs),
         (count, sorted): (Buf<u32>, Buf<u32>),
-        Pass { shift, digits, first }: Pass,
+        Pass { pass, shift, digits, .. }: Pass,
     ) {
+        let first = u32::from(pass == 0);
         let [lanes, ..] = share_count::LOCAL;
         let half = TABLE_LEN / 2;
         let (table, places) = (self.table.part(0, half), self.table.part(half, half));
@@ -224,12 +234,14 @@ impl Sorter {
     }
 }
 
-/// The bits of a key that a pass sorts by; whether it is the first.
+/// Number of a pass, the bits of a key that it sorts by, and those of the next, if it counts for it.
 #[derive(Clone, Copy)]
 struct Pass {
+    pass: u32,
     shift: u32,
     digits: u32,
-    first: u32,
+    next_shift: u32,
+    next_digits: u32,
 }
 
 /// Pairs that there is room for.
