@@ -10,6 +10,9 @@ struct Batch {
     uint slot;  // gradient slot
 };
 
+/// One that no pixel sees, in place of those past the end of a list.
+const float LOG2_UNSEEN = -1e5;
+
 #ifdef SUBGROUP
 
 uint lane() {
@@ -35,27 +38,33 @@ bool all_lanes(bool done) {
     return subgroupAll(done);
 }
 
-/// Sums 8 values over the lanes by halving: lane l gets the sum of value l & 7.
-float sum_of_eight(float v[8]) {
-    const uint l = lane();
-    float r[4];
-    [[unroll]] for (uint i = 0; i < 4; ++i) {
-        const bool up = (l & 4u) != 0;
-        r[i] = (up ? v[i + 4] : v[i]) + subgroupShuffleXor(up ? v[i] : v[i + 4], 4);
+/// Gaussians whose gradients are summed over the lanes at once: eight values each, one for every lane. Their sums wait for each
+/// other in a chain; those of several hide that.
+const uint TOGETHER = LANES / 8;
+
+// One step of `sums`: halves the values and doubles the lanes that each is summed over.
+#define HALVE(v, half_width)                                                                          \
+    if (half_width < LANES) {                                                                         \
+        const bool up = (lane() & half_width) != 0;                                                   \
+        [[unroll]] for (uint i = 0; i < half_width; ++i) {                                            \
+            const float mine = up ? v[i + half_width] : v[i], other = up ? v[i] : v[i + half_width];  \
+            v[i] = mine + subgroupShuffleXor(other, half_width);                                      \
+        }                                                                                             \
     }
-    [[unroll]] for (uint i = 0; i < 2; ++i) {
-        const bool up = (l & 2u) != 0;
-        r[i] = (up ? r[i + 2] : r[i]) + subgroupShuffleXor(up ? r[i] : r[i + 2], 2);
-    }
-    const bool up = (l & 1u) != 0;
-    float s = (up ? r[1] : r[0]) + subgroupShuffleXor(up ? r[0] : r[1], 1);
-    if (LANES > 8) {
-        s += subgroupShuffleXor(s, 8);
-    }
-    if (LANES > 16) {
-        s += subgroupShuffleXor(s, 16);
-    }
-    return s;
+
+/// Sums LANES values over the lanes: lane l gets the sum of value l.
+float sums(float v[32]) {
+    HALVE(v, 16u)
+    HALVE(v, 8u)
+    HALVE(v, 4u)
+    HALVE(v, 2u)
+    HALVE(v, 1u)
+    return v[0];
+}
+
+/// Slot of the Gaussian whose value lane l has after `sums`, of those from i on.
+uint slot_of_lane(uint i) {
+    return subgroupShuffle(held.slot, i + lane() / 8);
 }
 
 /// Sums 2 values: lane l gets the sum of value l & 1.
@@ -113,7 +122,9 @@ bool all_lanes(bool done) {
     return pending == 0;
 }
 
-float sum_of_eight(float v[8]) {
+const uint TOGETHER = 1;
+
+float sums(float v[32]) {
     const uint l = lane();
     barrier();
     [[unroll]] for (uint i = 0; i < 8; ++i) {
@@ -131,8 +142,16 @@ float sum_of_eight(float v[8]) {
     return (terms[row] + terms[row + 1]) + (terms[row + 2] + terms[row + 3]);
 }
 
+uint slot_of_lane(uint i) {
+    return batch_slot[i];
+}
+
 float sum_of_two(float a, float b) {
-    return sum_of_eight(float[8](a, b, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0));
+    float v[32];
+    [[unroll]] for (uint i = 0; i < 8; ++i) {
+        v[i] = i == 0 ? a : i == 1 ? b : 0.0;
+    }
+    return sums(v);
 }
 
 #endif

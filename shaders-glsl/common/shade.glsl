@@ -13,12 +13,14 @@ uvec2 column_of(uint tile, uvec2 size) {
     return corner + uvec2(lane() % TILE_W, lane() / TILE_W * COLUMN);
 }
 
-/// What every lane needs of a Gaussian: its record and, in colour, its green and blue.
-Batch batch_of(Projected g, vec2 chroma, uint slot) {
-    return Batch(g.centre_conic, vec4(g.conic_shade.x, log2(g.conic_shade.y), g.conic_shade.zw), chroma, slot);
+/// What every lane needs of a Gaussian: its record and, in colour, its green and blue; past the end of a list one that no
+/// pixel sees.
+Batch batch_of(Projected g, vec2 chroma, uint slot, bool listed) {
+    const float opacity = listed ? log2(g.conic_shade.y) : LOG2_UNSEEN;
+    return Batch(g.centre_conic, vec4(g.conic_shade.x, opacity, g.conic_shade.zw), chroma, slot);
 }
 
-/// A Gaussian as seen by one column: log2 α(y) = peak - y' (slope + curve y'), y' = centre - pixel.
+/// A Gaussian as seen by one column: log2 α of its k-th pixel from the top is peak + k (slope + k curve).
 struct Column {
     vec2 d;       // centre - top pixel, px
     vec3 conic;
@@ -31,17 +33,19 @@ Column column_terms(Batch g, vec2 top) {
     Column c;
     c.d = g.a.xy - top;
     c.conic = vec3(g.a.zw, g.b.x);
-    c.peak = g.b.y - 0.5 * LOG2_E * c.conic.x * c.d.x * c.d.x;  // b.y holds log2 opacity
-    c.slope = LOG2_E * c.conic.y * c.d.x;
-    c.curve = 0.5 * LOG2_E * c.conic.z;
+    c.curve = -0.5 * LOG2_E * c.conic.z;
+    const float across = LOG2_E * c.conic.y * c.d.x;
+    // b.y holds log2 opacity
+    c.peak = g.b.y - 0.5 * LOG2_E * c.conic.x * c.d.x * c.d.x - c.d.y * (across - c.curve * c.d.y);
+    c.slope = across - 2.0 * c.curve * c.d.y;
     c.colour = vec3(g.b.z, g.chroma);
     c.depth = g.b.w;
     return c;
 }
 
-/// Opacity of the Gaussian at a pixel before the cap.
-float alpha_at(Column c, float dy) {
-    return exp2(c.peak - dy * (c.slope + c.curve * dy));
+/// Opacity of the Gaussian at pixel k of the column before the cap.
+float alpha_at(Column c, float k) {
+    return exp2(c.peak + k * (c.slope + k * c.curve));
 }
 
 /// What is blended: nothing where it is invisible or the pixel is already opaque.

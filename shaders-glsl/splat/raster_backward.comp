@@ -44,10 +44,10 @@ READ_FLOATS(5, Rendered, rendered)
 READ_FLOATS(6, PixelGradient, pixel_gradient)
 layout(set = 0, binding = 7, std430) writeonly buffer IsectGradients { float isect_gradients[]; };
 
-Batch fetch(uint at) {
-    const uint isect = intersection(at);
+Batch fetch(uint at, uint end) {
+    const uint isect = intersection(min(at, max(end, 1) - 1));
     const uint slot = owner(isect);
-    return batch_of(projected(slot), CHANNELS == 3 ? chroma(slot) : vec2(0.0), isect);
+    return batch_of(projected(slot), CHANNELS == 3 ? chroma(slot) : vec2(0.0), isect, at < end);
 }
 
 void main() {
@@ -74,53 +74,62 @@ void main() {
     }
     const uvec2 range = range_of(tile);
     uint base = range.x;
-    Batch coming = fetch(min(base + lane(), max(range.y, 1) - 1));
+    Batch coming = fetch(base + lane(), range.y);
     for (; base < range.y; base += LANES) {
         batch_put(coming);
         if (base + LANES < range.y) {
-            coming = fetch(min(base + LANES + lane(), range.y - 1));
+            coming = fetch(base + LANES + lane(), range.y);
         }
         const uint n = min(LANES, range.y - base);
-        for (uint j = 0; j < n; ++j) {
-            const Batch b = batch_get(j);
-            const Column s = column_terms(b, top);
-            // Over the column: moments of v_σ = -α dL/dα, and the gradient by colour.
-            float s0 = 0.0, s1 = 0.0, s2 = 0.0;
-            vec3 by_colour = vec3(0.0);
-            [[unroll]] for (uint k = 0; k < COLUMN; ++k) {
-                const float dy = s.d.y - float(k);
-                const float raw = alpha_at(s, dy);
-                const float alpha = effective(raw, t[k]);
-                const float w = alpha * t[k];
-                const float after = t[k] - w;
-                const float wx = w * v[k].x;
-                float seen = wx * s.colour.x;
-                by_colour.x += wx;
+        for (uint j = 0; j < n; j += TOGETHER) {
+            float terms[32];
+            [[unroll]] for (uint g = 0; g < TOGETHER; ++g) {
+                const Batch b = batch_get(j + g);
+                const Column s = column_terms(b, top);
+                // Over the column: moments of v_σ = -α dL/dα, and the gradient by colour.
+                float s0 = 0.0, s1 = 0.0, s2 = 0.0;
+                vec3 by_colour = vec3(0.0);
+                [[unroll]] for (uint k = 0; k < COLUMN; ++k) {
+                    const float raw = alpha_at(s, float(k));
+                    const float alpha = effective(raw, t[k]);
+                    const float w = alpha * t[k];
+                    const float after = t[k] - w;
+                    const float wx = w * v[k].x;
+                    float seen = wx * s.colour.x;
+                    by_colour.x += wx;
+                    if (CHANNELS == 3) {
+                        const vec2 wyz = w * v[k].yz;
+                        seen += dot(wyz, s.colour.yz);
+                        by_colour.yz += wyz;
+                    }
+                    behind[k] -= seen;
+                    // (1 - α) is at least 0.01.
+                    const float v_sigma = raw > ALPHA_MAX ? 0.0 : behind[k] * (alpha / (1.0 - alpha)) - seen;
+                    s0 += v_sigma;
+                    s1 += v_sigma * float(k);
+                    s2 += v_sigma * float(k * k);
+                    t[k] = after;
+                }
+                // By the distance from the centre in place of that from the top.
+                s2 = s.d.y * (s.d.y * s0 - 2.0 * s1) + s2;
+                s1 = s.d.y * s0 - s1;
+                const float xs = s.d.x * s0;
+                const float of_one[8] = float[8](s.conic.x * xs + s.conic.y * s1, s.conic.y * xs + s.conic.z * s1,
+                                                 0.5 * s.d.x * xs, s.d.x * s1, 0.5 * s2, -s0, by_colour.x, 0.0);
+                [[unroll]] for (uint i = 0; i < 8; ++i) {
+                    terms[8 * g + i] = of_one[i];
+                }
                 if (CHANNELS == 3) {
-                    const vec2 wyz = w * v[k].yz;
-                    seen += dot(wyz, s.colour.yz);
-                    by_colour.yz += wyz;
+                    const float sum2 = sum_of_two(by_colour.y, by_colour.z);
+                    if (lane() < 4 && j + g < n) {
+                        isect_gradients[b.slot * SLOT + 8 + lane()] = lane() < 2 ? sum2 : 0.0;
+                    }
                 }
-                behind[k] -= seen;
-                // (1 - α) is at least 0.01 and T > TRANSMITTANCE_MIN before, so w / after is bounded.
-                const float ratio = w > 0.0 ? alpha / (1.0 - alpha) : 0.0;
-                const float v_sigma = raw > ALPHA_MAX ? 0.0 : behind[k] * ratio - seen;
-                s0 += v_sigma;
-                s1 += v_sigma * dy;
-                s2 += v_sigma * dy * dy;
-                t[k] = after;
             }
-            const float xs = s.d.x * s0;
-            const float sum = sum_of_eight(float[8](s.conic.x * xs + s.conic.y * s1, s.conic.y * xs + s.conic.z * s1,
-                                                    0.5 * s.d.x * xs, s.d.x * s1, 0.5 * s2, -s0, by_colour.x, 0.0));
-            if (lane() < 8) {
-                isect_gradients[b.slot * SLOT + lane()] = sum;
-            }
-            if (CHANNELS == 3) {
-                const float sum2 = sum_of_two(by_colour.y, by_colour.z);
-                if (lane() < 4) {
-                    isect_gradients[b.slot * SLOT + 8 + lane()] = lane() < 2 ? sum2 : 0.0;
-                }
+            const float sum = sums(terms);
+            const uint slot = slot_of_lane(j);
+            if (lane() < 8 * TOGETHER && j + lane() / 8 < n) {
+                isect_gradients[slot * SLOT + lane() % 8] = sum;
             }
         }
         float clearest = t[0];

@@ -37,9 +37,9 @@ READ_PROJECTED(3, ProjectedIn, projected)
 READ_VEC2S(4, Chroma, chroma)
 layout(set = 0, binding = 5, std430) writeonly buffer Rendered { float rendered[]; };
 
-Batch fetch(uint at) {
-    const uint slot = owner(intersection(at));
-    return batch_of(projected(slot), CHANNELS == 3 ? chroma(slot) : vec2(0.0), 0);
+Batch fetch(uint at, uint end) {
+    const uint slot = owner(intersection(min(at, max(end, 1) - 1)));
+    return batch_of(projected(slot), CHANNELS == 3 ? chroma(slot) : vec2(0.0), 0, at < end);
 }
 
 void main() {
@@ -60,25 +60,27 @@ void main() {
     }
     const uvec2 range = range_of(tile);
     // The next batch is on its way while this one is drawn.
-    Batch coming = fetch(min(range.x + lane(), max(range.y, 1) - 1));
+    Batch coming = fetch(range.x + lane(), range.y);
     for (uint base = range.x; base < range.y; base += LANES) {
         batch_put(coming);
         if (base + LANES < range.y) {
-            coming = fetch(min(base + LANES + lane(), range.y - 1));
+            coming = fetch(base + LANES + lane(), range.y);
         }
         const uint n = min(LANES, range.y - base);
-        for (uint j = 0; j < n; ++j) {
-            const Column s = column_terms(batch_get(j), top);
-            [[unroll]] for (uint k = 0; k < COLUMN; ++k) {
-                const float w = effective(alpha_at(s, s.d.y - float(k)), t[k]) * t[k];
-                c[k].x += w * s.colour.x;
-                if (CHANNELS == 3) {
-                    c[k].yz += w * s.colour.yz;
+        for (uint j = 0; j < n; j += TOGETHER) {
+            [[unroll]] for (uint g = 0; g < TOGETHER; ++g) {
+                const Column s = column_terms(batch_get(j + g), top);
+                [[unroll]] for (uint k = 0; k < COLUMN; ++k) {
+                    const float w = effective(alpha_at(s, float(k)), t[k]) * t[k];
+                    c[k].x += w * s.colour.x;
+                    if (CHANNELS == 3) {
+                        c[k].yz += w * s.colour.yz;
+                    }
+                    if (DEPTH) {
+                        z[k] += w * s.depth;
+                    }
+                    t[k] -= w;
                 }
-                if (DEPTH) {
-                    z[k] += w * s.depth;
-                }
-                t[k] -= w;
             }
         }
         float clearest = t[0];
