@@ -26,6 +26,36 @@ float censored(float a, float b, out float slope) {
     return shown;
 }
 
+struct Similarity {
+    float value;     // SSIM
+    float slope[3];  // by E[x], E[x²], E[xy]
+};
+
+/// SSIM from E[x], E[y], E[x²], E[y²], E[xy].
+Similarity similarity(float e[5]) {
+    const float mx = e[0], my = e[1];
+    const float a1 = 2.0 * mx * my + C1, b1 = mx * mx + my * my + C1;
+    const float a2 = 2.0 * (e[4] - mx * my) + C2;
+    const float b2 = max(e[2] - mx * mx, 0.0) + max(e[3] - my * my, 0.0) + C2;
+    const float inv = 1.0 / (b1 * b2);
+    const float s = a1 * a2 * inv;
+    return Similarity(s, float[3](2.0 * (my * (a2 - a1) * inv - mx * s / b1 + mx * s / b2), -s / b2, 2.0 * a1 * inv));
+}
+
+struct Difference {
+    float l1;
+    float gradient;  // of the loss, by the rendering in the keyframe's exposure
+};
+
+/// What a pixel adds to the loss: rendered level, exposure (gain, offset), observed level b, the derivatives of SSIM
+/// filtered once more, and the weights of L1 and SSIM.
+Difference difference(float rendered, float exposure[2], float b, vec3 slope, vec2 weight) {
+    float gate;
+    const float a = censored(exposure[0] * rendered + exposure[1], b, gate);
+    const float d_ssim = slope.x + 2.0 * a * slope.y + b * slope.z;
+    return Difference(abs(a - b), gate * (weight.x * sign(a - b) - weight.y * d_ssim));
+}
+
 /// Bytes a row of a stored 8-bit image takes: whole words, so that a run of 8 is two of them.
 uint byte_stride(uint width) {
     return (width + 3) & ~3u;

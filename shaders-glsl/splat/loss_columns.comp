@@ -1,4 +1,4 @@
-// Last pass of the loss (1 - λ)|x - y| + λ(1 - SSIM), mean over valid pixels, of x = gain · rendered + offset: its
+// Last pass, on a CPU, of the loss (1 - λ)|x - y| + λ(1 - SSIM), mean over valid pixels, of x = gain · rendered + offset: its
 // gradient by the rendered image, by gain and by offset.
 // in   filtered_planes (slopes filtered along rows), grey (rendered), targets, mask
 // out  grey_gradient, zero where masked; loss_sums[group]: |x - y|, gradient by gain, by offset, 0
@@ -10,7 +10,7 @@ layout(local_size_x = 64) in;
 
 #include "../common/index.glsl"
 #include "../common/ssim.glsl"
-#include "../common/sum64.glsl"
+#include "../common/group_sum.glsl"
 #include "../common/texels.glsl"
 
 layout(push_constant) uniform Push {
@@ -53,12 +53,10 @@ vec3 column_run(uint x, uint y0) {
             const bool valid = ((mask(byte / 4) >> (8 * (byte % 4))) & 255u) != 0;
             const float rendered = grey(push.plane + at);
             const float b = float((targets(push.target + byte / 4) >> (8 * (byte % 4))) & 255u) / 255.0;
-            float gate;
-            const float a = censored(push.exposure[0] * rendered + push.exposure[1], b, gate);
-            const float d_ssim = slope[0][k] + 2.0 * a * slope[1][k] + b * slope[2][k];
-            const float v = valid ? gate * (push.l1_weight * sign(a - b) - push.ssim_weight * d_ssim) : 0.0;
-            grey_gradient[push.plane + at] = push.exposure[0] * v;
-            sum += vec3(valid ? abs(a - b) : 0.0, v * rendered, v);
+            const Difference d = difference(rendered, push.exposure, b, vec3(slope[0][k], slope[1][k], slope[2][k]),
+                                            vec2(push.l1_weight, push.ssim_weight));
+            grey_gradient[push.plane + at] = valid ? push.exposure[0] * d.gradient : 0.0;
+            sum += valid ? vec3(d.l1, d.gradient * rendered, d.gradient) : vec3(0.0);
         }
     }
     return sum;
@@ -69,7 +67,7 @@ void main() {
     const uint runs = (push.size.y + RUN - 1) / RUN;
     // All threads stay for the sum.
     const vec3 s = at < push.size.x * runs ? column_run(at % push.size.x, at / push.size.x * RUN) : vec3(0.0);
-    const vec4 total = vec4(sum64(s.x), sum64(s.y), sum64(s.z), 0.0);
+    const vec4 total = vec4(group_sum(s.x), group_sum(s.y), group_sum(s.z), 0.0);
     if (gl_LocalInvocationID.x == 0) {
         loss_sums[push.group + group_index()] = total;
     }

@@ -1,4 +1,4 @@
-// Third pass of SSIM: the window is symmetric, so its adjoint filters the slopes once more, first along rows.
+// Third pass of SSIM on a CPU: the window is symmetric, so its adjoint filters the slopes once more, first along rows.
 // in   slopes
 // out  filtered_planes: the three, filtered along rows
 #version 450

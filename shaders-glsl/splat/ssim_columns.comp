@@ -1,4 +1,4 @@
-// Second pass of SSIM: filters along columns, evaluates SSIM, and writes its derivatives by E[x], E[x²], E[xy].
+// Second pass of SSIM on a CPU: filters along columns, evaluates SSIM, and writes its derivatives by E[x], E[x²], E[xy].
 // in   filtered_planes (moments filtered along rows), mask
 // out  slopes: planes of dS/dE[x], dS/dE[x²], dS/dE[xy], zero where masked; ssim_sums[group] of S over valid pixels;
 //      with MAP one plane of S itself instead, one where masked
@@ -11,7 +11,7 @@ layout(constant_id = 0) const uint MAP = 0;
 
 #include "../common/index.glsl"
 #include "../common/ssim.glsl"
-#include "../common/sum64.glsl"
+#include "../common/group_sum.glsl"
 #include "../common/texels.glsl"
 
 layout(push_constant) uniform Push {
@@ -45,23 +45,18 @@ float column_run(uint x, uint y0) {
         const uint y = y0 + k;
         const uint byte = min(y, push.size.y - 1) * stride + x;
         const bool valid = y < push.size.y && ((mask(byte / 4) >> (8 * (byte % 4))) & 255u) != 0;
-        const float mx = e[0][k], my = e[1][k];
-        const float a1 = 2.0 * mx * my + C1, b1 = mx * mx + my * my + C1;
-        const float a2 = 2.0 * (e[4][k] - mx * my) + C2;
-        const float b2 = max(e[2][k] - mx * mx, 0.0) + max(e[3][k] - my * my, 0.0) + C2;
-        const float inv = 1.0 / (b1 * b2);
-        const float s = a1 * a2 * inv;
+        const Similarity s = similarity(float[5](e[0][k], e[1][k], e[2][k], e[3][k], e[4][k]));
         if (MAP != 0) {
             if (y < push.size.y) {
-                slopes[y * push.size.x + x] = valid ? s : 1.0;
+                slopes[y * push.size.x + x] = valid ? s.value : 1.0;
             }
         } else if (y < push.size.y) {
             const uint at = y * push.size.x + x;
-            slopes[at] = valid ? 2.0 * (my * (a2 - a1) * inv - mx * s / b1 + mx * s / b2) : 0.0;
-            slopes[plane + at] = valid ? -s / b2 : 0.0;
-            slopes[2 * plane + at] = valid ? 2.0 * a1 * inv : 0.0;
+            [[unroll]] for (uint q = 0; q < 3; ++q) {
+                slopes[q * plane + at] = valid ? s.slope[q] : 0.0;
+            }
         }
-        sum += valid ? s : 0.0;
+        sum += valid ? s.value : 0.0;
     }
     return sum;
 }
@@ -71,7 +66,7 @@ void main() {
     const uint runs = (push.size.y + RUN - 1) / RUN;
     // All threads stay for the sum.
     const float s = at < push.size.x * runs ? column_run(at % push.size.x, at / push.size.x * RUN) : 0.0;
-    const float total = sum64(s);
+    const float total = group_sum(s);
     if (gl_LocalInvocationID.x == 0) {
         ssim_sums[push.group + group_index()] = total;
     }

@@ -1,4 +1,4 @@
-// First pass of SSIM: filters both images, their squares and their product along rows.
+// First pass of SSIM on a CPU: filters both images, their squares and their product along rows.
 // in   grey (rendered, put into the keyframe's exposure here), targets (8 bit, four to a word),
 //      mask (8 bit, zero = ignore)
 // out  filtered_planes: of E[x], E[y], E[x²], E[y²], E[xy]

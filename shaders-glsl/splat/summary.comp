@@ -3,9 +3,8 @@
 // out  status
 #version 450
 #extension GL_GOOGLE_include_directive : require
-layout(local_size_x = 64) in;
-
-#include "../common/sum64.glsl"
+#extension GL_EXT_control_flow_attributes : require
+layout(local_size_x = 256) in;
 
 struct Status {
     uint visible;
@@ -33,37 +32,50 @@ layout(set = 0, binding = 4, std430) readonly buffer LossSums { vec4 loss_sums[]
 layout(set = 0, binding = 5, std430) readonly buffer Sums { float sums[]; };
 layout(set = 0, binding = 6, std430) writeonly buffer StatusOut { Status status[]; };
 
+// Sums of SSIM; of |x - y| and the gradients by gain and offset; of the seven terms of project_backward.
+const uint TERMS = 11;
+shared float sums_of[TERMS * gl_WorkGroupSize.x];
+
 void main() {
-    const uint i = gl_LocalInvocationID.x;
-    float s = 0.0, q = 0.0;
-    vec3 l = vec3(0.0);
-    for (uint k = i; k < push.image_groups; k += 64) {
-        s += ssim_sums[k];
-        l += loss_sums[k].xyz;
+    const uint i = gl_LocalInvocationID.x, lanes = gl_WorkGroupSize.x;
+    float sum[TERMS];
+    [[unroll]] for (uint term = 0; term < TERMS; ++term) {
+        sum[term] = 0.0;
     }
-    s = sum64(s);
-    l = vec3(sum64(l.x), sum64(l.y), sum64(l.z));
+    for (uint k = i; k < push.image_groups; k += lanes) {
+        const vec3 loss = loss_sums[k].xyz;
+        sum[0] += ssim_sums[k];
+        sum[1] += loss.x;
+        sum[2] += loss.y;
+        sum[3] += loss.z;
+    }
+    for (uint k = i; k < push.splat_groups; k += lanes) {
+        [[unroll]] for (uint term = 4; term < TERMS; ++term) {
+            sum[term] += sums[k * 8 + term - 4];
+        }
+    }
+    [[unroll]] for (uint term = 0; term < TERMS; ++term) {
+        sums_of[term * lanes + i] = sum[term];
+    }
+    for (uint half_width = lanes / 2; half_width > 0; half_width /= 2) {
+        barrier();
+        if (i < half_width) {
+            [[unroll]] for (uint term = 0; term < TERMS; ++term) {
+                sums_of[term * lanes + i] += sums_of[term * lanes + i + half_width];
+            }
+        }
+    }
     if (i == 0) {
         status[0].visible = visible_count[0];
         status[0].intersections = isect_count[0];
         status[0].intersections_needed = isect_count[1];
         status[0].not_finite = failed[0];
-        status[0].l1_sum = l.x;
-        status[0].ssim_sum = s;
-        status[0].exposure = float[2](l.y, l.z);
-    }
-    for (uint term = 0; term < 7; ++term) {
-        q = 0.0;
-        for (uint k = i; k < push.splat_groups; k += 64) {
-            q += sums[k * 8 + term];
+        status[0].ssim_sum = sums_of[0];
+        status[0].l1_sum = sums_of[lanes];
+        status[0].exposure = float[2](sums_of[2 * lanes], sums_of[3 * lanes]);
+        [[unroll]] for (uint term = 0; term < 6; ++term) {
+            status[0].pose[term] = sums_of[(4 + term) * lanes];
         }
-        q = sum64(q);
-        if (i == 0) {
-            if (term < 6) {
-                status[0].pose[term] = q;
-            } else {
-                status[0].gradients_refused = q;
-            }
-        }
+        status[0].gradients_refused = sums_of[10 * lanes];
     }
 }

@@ -1,13 +1,14 @@
 //! The images to train on, and how far a picture is from one: (1 - λ)|x - y| + λ(1 - SSIM) and its gradient by pixel.
 //!
 //! ```text
-//! (mask_cells) -> ssim_rows -> ssim_columns -> loss_rows -> loss_columns        picture -> gradient by pixel, channel by channel
+//! (mask_cells) -> ssim_tiles -> loss_tiles                                           picture -> gradient by pixel, channel by channel
+//! on a CPU: ssim_rows -> ssim_columns -> loss_rows -> loss_columns
 //! ```
 
 use super::horizon::{COLUMNS, ROWS};
-use super::shape::{Scratch, Shape, RUN};
+use super::shape::{Scratch, Shape, GROUP, RUN};
 use super::step::Target;
-use crate::gpu::kernels::{loss_columns, loss_rows, mask_cells, ssim_columns, ssim_rows};
+use crate::gpu::kernels::{loss_columns, loss_rows, loss_tiles, mask_cells, ssim_columns, ssim_rows, ssim_tiles};
 use crate::gpu::{Arena, Buf, Gpu, GpuError, Kernel, Recorder, Threads};
 use crate::limits::CAMERAS_MAX;
 use stipple_drivers::Fault;
@@ -29,7 +30,7 @@ pub struct Buffers {
 
 impl Buffers {
     pub fn new(arena: &mut Arena, shape: &Shape) -> Result<Buffers, Fault> {
-        let groups = (shape.channels * shape.loss_groups()) as usize;
+        let groups = (shape.channels * shape.loss_tiles().max(shape.loss_runs().div_ceil(GROUP))) as usize;
         let images = (shape.channels * shape.images) as usize;
         Ok(Buffers {
             images: arena.alloc("keyframes: images", shape.image_words() * images)?,
@@ -51,16 +52,50 @@ pub struct Loss {
     /// An image on its way to the device.
     words: Vec<u32>,
     mask_cells: Kernel<mask_cells::K>,
-    ssim_rows: Kernel<ssim_rows::K>,
-    ssim_columns: Kernel<ssim_columns::K>,
-    ssim_map: Kernel<ssim_columns::K>,
-    loss_rows: Kernel<loss_rows::K>,
-    loss_columns: Kernel<loss_columns::K>,
+    kernels: Kernels,
+}
+
+enum Kernels {
+    /// Each pass along one direction, from registers: a CPU's shared memory is slow.
+    ByRuns {
+        ssim_rows: Kernel<ssim_rows::K>,
+        ssim_columns: Kernel<ssim_columns::K>,
+        ssim_map: Kernel<ssim_columns::K>,
+        loss_rows: Kernel<loss_rows::K>,
+        loss_columns: Kernel<loss_columns::K>,
+    },
+    /// Both directions in one, through shared memory.
+    ByTiles { ssim: Kernel<ssim_tiles::K>, ssim_map: Kernel<ssim_tiles::K>, loss: Kernel<loss_tiles::K> },
+}
+
+impl Kernels {
+    fn new(gpu: &mut Gpu, by_tiles: bool) -> Result<Kernels, Fault> {
+        if by_tiles {
+            return Ok(Kernels::ByTiles {
+                ssim: gpu.kernel_in_pieces(ssim_tiles::Spec { map: 0 })?,
+                ssim_map: gpu.kernel_in_pieces(ssim_tiles::Spec { map: 1 })?,
+                loss: gpu.kernel_in_pieces(loss_tiles::Spec::default())?,
+            });
+        }
+        Ok(Kernels::ByRuns {
+            ssim_rows: gpu.kernel_in_pieces(ssim_rows::Spec::default())?,
+            ssim_columns: gpu.kernel_in_pieces(ssim_columns::Spec { map: 0 })?,
+            ssim_map: gpu.kernel_in_pieces(ssim_columns::Spec { map: 1 })?,
+            loss_rows: gpu.kernel_in_pieces(loss_rows::Spec::default())?,
+            loss_columns: gpu.kernel_in_pieces(loss_columns::Spec::default())?,
+        })
+    }
 }
 
 impl Loss {
     /// Every pixel counts until a mask is set.
-    pub fn new(gpu: &mut Gpu, buffers: Buffers, scratch: &Scratch, shape: &Shape) -> Result<Loss, Fault> {
+    pub fn new(
+        gpu: &mut Gpu,
+        buffers: Buffers,
+        scratch: &Scratch,
+        shape: &Shape,
+        by_tiles: bool,
+    ) -> Result<Loss, Fault> {
         let mut loss = Loss {
             buffers,
             shape: *shape,
@@ -69,11 +104,7 @@ impl Loss {
             valid_pixels: [0; CAMERAS_MAX],
             words: Vec::with_capacity(shape.image_words()),
             mask_cells: gpu.kernel_in_pieces(mask_cells::Spec::default())?,
-            ssim_rows: gpu.kernel_in_pieces(ssim_rows::Spec::default())?,
-            ssim_columns: gpu.kernel_in_pieces(ssim_columns::Spec { map: 0 })?,
-            ssim_map: gpu.kernel_in_pieces(ssim_columns::Spec { map: 1 })?,
-            loss_rows: gpu.kernel_in_pieces(loss_rows::Spec::default())?,
-            loss_columns: gpu.kernel_in_pieces(loss_columns::Spec::default())?,
+            kernels: Kernels::new(gpu, by_tiles)?,
         };
         let all = vec![255; shape.pixels()];
         (0..shape.cameras as usize).try_for_each(|camera| loss.set_mask(gpu, camera, &all))?;
@@ -118,41 +149,54 @@ impl Loss {
         f64::from(self.valid_pixels[target.camera as usize].max(1) * self.shape.channels)
     }
 
+    /// Workgroups that sum one channel.
+    fn groups(&self) -> u32 {
+        match self.kernels {
+            Kernels::ByRuns { .. } => self.shape.loss_runs().div_ceil(GROUP),
+            Kernels::ByTiles { .. } => self.shape.loss_tiles(),
+        }
+    }
+
+    /// Sums of a step: those of each channel's workgroups.
+    pub fn sums(&self) -> u32 {
+        self.shape.channels * self.groups()
+    }
+
     /// Channel by channel: each is an image of its own.
     pub fn record(&self, rec: &mut Recorder, rendered: Buf<f32>, target: &Target, ssim_weight: f32) {
-        let (b, size) = (&self.buffers, [self.shape.width, self.shape.height]);
-        let values = self.values(target) as f32;
         self.record_mask(rec, rendered, target);
         for channel in 0..self.shape.channels {
-            let group = channel * self.shape.loss_groups();
-            self.record_ssim(rec, rendered, target, channel, &self.ssim_columns, group);
-            rec.dispatch(
-                &self.loss_rows,
-                loss_rows::Bind { slopes: self.slopes.read(), filtered: self.filtered.write() },
-                loss_rows::Push { size },
-                self.rows(),
-            );
-            rec.dispatch(
-                &self.loss_columns,
-                loss_columns::Bind {
-                    filtered: self.filtered.read(),
-                    grey: rendered.read(),
-                    targets: b.images.read(),
-                    mask: self.mask(target).read(),
-                    grey_gradient: b.pixel_gradient.write(),
-                    loss_sums: b.loss_sums.write(),
-                },
-                loss_columns::Push {
-                    size,
-                    target: self.word_of(target, channel),
-                    plane: channel * size[0] * size[1],
-                    group,
-                    exposure: target.exposure.words(),
-                    l1_weight: (1.0 - ssim_weight) / values,
-                    ssim_weight: ssim_weight / values,
-                },
-                self.columns(),
-            );
+            self.record_ssim(rec, rendered, target, channel, false);
+            self.record_loss(rec, rendered, target, channel, ssim_weight);
+        }
+    }
+
+    fn record_loss(&self, rec: &mut Recorder, rendered: Buf<f32>, target: &Target, channel: u32, ssim_weight: f32) {
+        let (b, size, values) = (&self.buffers, [self.shape.width, self.shape.height], self.values(target) as f32);
+        let (grey, targets, mask) = (rendered.read(), b.images.read(), self.mask(target).read());
+        let (grey_gradient, loss_sums) = (b.pixel_gradient.write(), b.loss_sums.write());
+        let push = loss_tiles::Push {
+            size,
+            target: self.word_of(target, channel),
+            plane: channel * size[0] * size[1],
+            group: channel * self.groups(),
+            exposure: target.exposure.words(),
+            l1_weight: (1.0 - ssim_weight) / values,
+            ssim_weight: ssim_weight / values,
+        };
+        match &self.kernels {
+            Kernels::ByRuns { loss_rows, loss_columns, .. } => {
+                let along = loss_rows::Bind { slopes: self.slopes.read(), filtered: self.filtered.write() };
+                rec.dispatch(loss_rows, along, loss_rows::Push { size }, self.rows());
+                let filtered = self.filtered.read();
+                let bind = loss_columns::Bind { filtered, grey, targets, mask, grey_gradient, loss_sums };
+                rec.dispatch(loss_columns, bind, bytemuck::cast(push), self.columns());
+            }
+            Kernels::ByTiles { loss, .. } => {
+                let slopes = self.slopes.read();
+                let bind = loss_tiles::Bind { slopes, grey, targets, mask, grey_gradient, loss_sums };
+                rec.dispatch(loss, bind, push, self.tiles());
+            }
         }
     }
 
@@ -169,7 +213,7 @@ impl Loss {
         for (channel, plane) in map.chunks_exact_mut(n).enumerate() {
             let mut rec = gpu.record();
             self.record_mask(&mut rec, rendered, target);
-            self.record_ssim(&mut rec, rendered, target, channel as u32, &self.ssim_map, 0);
+            self.record_ssim(&mut rec, rendered, target, channel as u32, true);
             gpu.submit(rec)?;
             gpu.download(self.slopes, 0, plane)?;
         }
@@ -180,43 +224,28 @@ impl Loss {
         Ok(())
     }
 
-    fn record_ssim(
-        &self,
-        rec: &mut Recorder,
-        rendered: Buf<f32>,
-        target: &Target,
-        channel: u32,
-        columns: &Kernel<ssim_columns::K>,
-        group: u32,
-    ) {
+    /// Slopes of SSIM and its sums, or with `map` SSIM by pixel in place of the slopes.
+    fn record_ssim(&self, rec: &mut Recorder, rendered: Buf<f32>, target: &Target, channel: u32, map: bool) {
         let (b, size) = (&self.buffers, [self.shape.width, self.shape.height]);
-        rec.dispatch(
-            &self.ssim_rows,
-            ssim_rows::Bind {
-                grey: rendered.read(),
-                targets: b.images.read(),
-                mask: self.mask(target).read(),
-                filtered: self.filtered.write(),
-            },
-            ssim_rows::Push {
-                size,
-                target: self.word_of(target, channel),
-                plane: channel * size[0] * size[1],
-                exposure: target.exposure.words(),
-            },
-            self.rows(),
-        );
-        rec.dispatch(
-            columns,
-            ssim_columns::Bind {
-                filtered: self.filtered.read(),
-                mask: self.mask(target).read(),
-                slopes: self.slopes.write(),
-                ssim_sums: b.ssim_sums.write(),
-            },
-            ssim_columns::Push { size, group },
-            self.columns(),
-        );
+        let (grey, targets, mask) = (rendered.read(), b.images.read(), self.mask(target).read());
+        let (slopes, ssim_sums) = (self.slopes.write(), b.ssim_sums.write());
+        let (word, plane, exposure) =
+            (self.word_of(target, channel), channel * size[0] * size[1], target.exposure.words());
+        let group = if map { 0 } else { channel * self.groups() };
+        match &self.kernels {
+            Kernels::ByRuns { ssim_rows, ssim_columns, ssim_map, .. } => {
+                let along = ssim_rows::Bind { grey, targets, mask, filtered: self.filtered.write() };
+                rec.dispatch(ssim_rows, along, ssim_rows::Push { size, target: word, plane, exposure }, self.rows());
+                let across = ssim_columns::Bind { filtered: self.filtered.read(), mask, slopes, ssim_sums };
+                let columns = if map { ssim_map } else { ssim_columns };
+                rec.dispatch(columns, across, ssim_columns::Push { size, group }, self.columns());
+            }
+            Kernels::ByTiles { ssim, ssim_map, .. } => {
+                let bind = ssim_tiles::Bind { grey, targets, mask, slopes, ssim_sums };
+                let push = ssim_tiles::Push { size, target: word, plane, group, exposure };
+                rec.dispatch(if map { ssim_map } else { ssim }, bind, push, self.tiles());
+            }
+        }
     }
 
     /// Makes the mask of a target of which not all counts.
@@ -260,6 +289,11 @@ impl Loss {
     }
 
     fn columns(&self) -> Threads {
-        Threads::d1(self.shape.width * self.shape.height.div_ceil(RUN))
+        Threads::d1(self.shape.loss_runs())
+    }
+
+    fn tiles(&self) -> Threads {
+        let [lanes, ..] = ssim_tiles::LOCAL;
+        Threads::d1(self.shape.loss_tiles() * lanes)
     }
 }

@@ -96,7 +96,7 @@ impl Pipeline {
             // Gradients of intersections live for one step.
             pool: Pool::new(gpu, pool, scratch.isect_gradients.cast(), scan, &shape)?,
             renderer: Renderer::new(gpu, render, scratch, &sort, &shape, tiling)?,
-            loss: Loss::new(gpu, loss, &scratch, &shape)?,
+            loss: Loss::new(gpu, loss, &scratch, &shape, tiling.loss_by_tiles)?,
             backward: Backward::new(gpu, backward, &scratch, &shape, tiling)?,
             shape,
             summary: gpu.kernel(summary::Spec::default())?,
@@ -226,7 +226,7 @@ impl Pipeline {
         self.renderer.record(rec, &self.pool, view, false);
         self.loss.record(rec, self.renderer.buffers.rendered, target, weights.ssim);
         self.backward.record(rec, &self.pool, &self.renderer, gradient, view, rates, weights);
-        self.record_summary(rec, shape.channels * shape.loss_groups(), self.pool.slots(view.epoch).end.div_ceil(GROUP));
+        self.record_summary(rec, self.loss.sums(), self.pool.slots(view.epoch).end.div_ceil(GROUP));
     }
 
     fn record_summary(&self, rec: &mut Recorder, image_groups: u32, splat_groups: u32) {

@@ -24,7 +24,9 @@ pub struct Shape {
 
 /// Pixels of a run filtered by one thread of the loss: RUN of ssim.glsl.
 pub const RUN: u32 = 8;
-/// Invocations of a workgroup of every kernel that reduces.
+/// A tile that one workgroup of the loss filters, px: WIDTH and HEIGHT of ssim_tile.glsl.
+const LOSS_TILE: [u32; 2] = [54, 8];
+/// Invocations of a workgroup of the kernels that sum runs of pixels, or Gaussians.
 pub const GROUP: u32 = 64;
 /// Side of the smallest tile, px: 8 lanes with columns of 8, or 32 with columns of 2.
 const TILE_MIN: u32 = 8;
@@ -53,9 +55,15 @@ impl Shape {
         aligned(self.image_words())
     }
 
-    /// Workgroups of the column passes of the loss, each channel's.
-    pub fn loss_groups(&self) -> u32 {
-        (self.width * self.height.div_ceil(RUN)).div_ceil(GROUP)
+    /// Runs of the column passes of the loss, each channel's.
+    pub fn loss_runs(&self) -> u32 {
+        self.width * self.height.div_ceil(RUN)
+    }
+
+    /// Tiles that the loss filters, each channel's.
+    pub fn loss_tiles(&self) -> u32 {
+        let [width, height] = LOSS_TILE;
+        self.width.div_ceil(width) * self.height.div_ceil(height)
     }
 
     /// Words of an intersection's gradient: SLOT of raster_backward.

@@ -13,6 +13,8 @@ pub struct Tiling {
     pub variant: &'static str,
     /// Gradients of one Gaussian that `sum_chunks` sums ahead: CHUNK_GPU, or 1 without it.
     pub chunk: u32,
+    /// Whether the loss filters tiles in shared memory, or runs from registers, as on a CPU.
+    pub loss_by_tiles: bool,
 }
 
 /// Lanes of a chunk in sum_chunks.comp.
@@ -20,7 +22,7 @@ pub const CHUNK_GPU: u32 = 16;
 
 impl Tiling {
     /// What every device runs.
-    pub const BASELINE: Tiling = Tiling { lanes: 32, column: 8, variant: "", chunk: 1 };
+    pub const BASELINE: Tiling = Tiling { lanes: 32, column: 8, variant: "", chunk: 1, loss_by_tiles: true };
 
     pub fn of(caps: &Caps) -> Tiling {
         // Intel's compiler picks a width per kernel, narrower than the one it reports.
@@ -33,11 +35,12 @@ impl Tiling {
         // 752x480 whatever their number; on V1_01 lists are 98 on average and 156 at most, and to cut the long ones
         // could save 30 of 103 µs, for 8 bytes an intersection of transmittance and colour where they are cut.
         let column = if caps.kind == DeviceKind::Discrete { 4 } else { Tiling::BASELINE.column };
-        let chunk = if caps.kind == DeviceKind::Cpu { 1 } else { CHUNK_GPU };
+        let loss_by_tiles = caps.kind != DeviceKind::Cpu;
+        let chunk = if loss_by_tiles { CHUNK_GPU } else { 1 };
         let variant = if caps.allows(SAMPLED_BUFFER) { "cpu" } else { "subgroup" };
         match caps.subgroup_size {
-            n @ (8 | 16 | 32 | 64) if sub => Tiling { lanes: n.min(32), column, variant, chunk },
-            _ => Tiling { column, chunk, ..Tiling::BASELINE },
+            n @ (8 | 16 | 32 | 64) if sub => Tiling { lanes: n.min(32), column, variant, chunk, loss_by_tiles },
+            _ => Tiling { column, chunk, loss_by_tiles, ..Tiling::BASELINE },
         }
     }
 

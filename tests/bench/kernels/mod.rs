@@ -15,7 +15,7 @@ use scene::Scene;
 use serde_json::json;
 use std::path::PathBuf;
 use std::time::Instant;
-use stipple::config::{GpuConfig, StereoConfig};
+use stipple::config::{GpuConfig, StereoConfig, StereoMethod};
 use stipple::gpu::{Gpu, Timing};
 use stipple::map::{LearningRates, Pipeline, Shape, StepStats, Tiling, View, Weights};
 use stipple::output::chart::{bars, Chart, Series};
@@ -109,7 +109,8 @@ pub fn run(args: &Args) -> Result<(), Fault> {
         ..GpuConfig::default()
     };
     // First, so that a wrong folder is told before the sweep.
-    let seeded = |folder: &PathBuf| Scene::recorded(folder, RECORDED, &StereoConfig::default(), &config);
+    let stereo = StereoConfig { method: StereoMethod::Sgm, ..StereoConfig::default() };
+    let seeded = |folder: &PathBuf| Scene::recorded(folder, RECORDED, &stereo, &config);
     let recorded = args.recording.as_ref().map(seeded).transpose()?;
     let out = OutputDir::create(&args.out)?;
     let mut gpu = Gpu::open(&config, model::arena_bytes(args.quick))?;

@@ -93,7 +93,8 @@ impl Counts {
         let pairs = i * tile_pixels;
         match name.trim_end_matches("_cpu").trim_end_matches("_subgroup") {
             // Two passes by depth, the rest by tile.
-            "radix_count" | "share_count" => (4.0 * (n + v) + 4.0 * i * (calls - 2.0), 0.0),
+            "radix_count" => (4.0 * n + 4.0 * i * (calls - 1.0), 0.0),
+            "share_count" => (4.0 * (n + v) + 4.0 * i * (calls - 2.0), 0.0),
             "radix_scatter" | "share_scatter" => (12.0 * n + 16.0 * v + 16.0 * i * (calls - 2.0) - 4.0 * i, 0.0),
             "scan_reduce" => (4.0 * n, n),
             "scan_apply" => (8.0 * n, 2.0 * n),
@@ -104,6 +105,8 @@ impl Counts {
             // α takes 8 operations, blending 5; the way back 21 more.
             "raster_forward" => (40.0 * i + 8.0 * p, 13.0 * pairs),
             "raster_backward" => (72.0 * i + 8.0 * p, 34.0 * pairs),
+            "ssim_tiles" => (18.0 * p, 280.0 * p),
+            "loss_tiles" => (22.0 * p, 146.0 * p),
             "ssim_rows" => (26.0 * p, 130.0 * p),
             "ssim_columns" => (33.0 * p, 150.0 * p),
             "loss_rows" => (24.0 * p, 66.0 * p),

@@ -1,4 +1,4 @@
-//! Twin of ssim_rows.comp, ssim_columns.comp, loss_rows.comp and loss_columns.comp: (1 - λ)|x - y| + λ(1 - SSIM), mean over valid pixels, with the two-dimensional
+//! Twin of ssim_tiles.comp and loss_tiles.comp, and of ssim_rows.comp, ssim_columns.comp, loss_rows.comp and loss_columns.comp: (1 - λ)|x - y| + λ(1 - SSIM), mean over valid pixels, with the two-dimensional
 //! window written out. Where the target is white or black, what lies beyond it is not compared.
 
 pub struct Loss {
