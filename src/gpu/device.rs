@@ -8,7 +8,7 @@ use crate::config::GpuConfig;
 use ash::vk;
 use std::ffi::{c_void, CStr, CString};
 use std::sync::atomic::AtomicBool;
-use std::sync::Mutex;
+use std::sync::{Mutex, OnceLock};
 use stipple_drivers::{Fault, FaultKind};
 
 const VALIDATION_LAYER: &CStr = c"VK_LAYER_KHRONOS_validation";
@@ -185,6 +185,17 @@ impl Drop for Device {
     }
 }
 
+/// Holds one instance until the process ends, so that the driver stays loaded. A driver that is unloaded with its last instance
+/// cannot always be loaded again: NVIDIA's was not found any more after some forty times, and a map that loses its device opens it anew.
+fn keep_loaded(entry: &ash::Entry) {
+    static KEPT: OnceLock<(ash::Entry, ash::Instance)> = OnceLock::new();
+    if KEPT.get().is_none() {
+        if let Ok((raw, _)) = instance(entry, false) {
+            _ = KEPT.set((entry.clone(), raw));
+        }
+    }
+}
+
 type Messenger = (ash::ext::debug_utils::Instance, vk::DebugUtilsMessengerEXT);
 
 impl Instance {
@@ -192,6 +203,7 @@ impl Instance {
         // SAFETY: the library found is the system's Vulkan loader; it has no unsound initialiser.
         let entry = unsafe { ash::Entry::load() }
             .map_err(|e| unavailable(format!("no Vulkan loader (libvulkan.so.1): {e}")))?;
+        keep_loaded(&entry);
         let messages = Box::new(Mutex::new(Vec::with_capacity(MESSAGES_MAX)));
         let (raw, debug) = instance(&entry, validation)?;
         let mut instance = Instance { raw, debug, messenger: None, messages, entry };

@@ -214,6 +214,11 @@ fn random_recordings_match_sequential_execution() {
 }
 
 #[test]
+fn a_device_opens_as_often_as_it_is_lost() {
+    (0..60).for_each(|_| drop(open(1 << 16)));
+}
+
+#[test]
 fn rows_past_65535_groups_wrap() {
     assert_eq!(Threads::d1(64 * 65535).workgroups([64, 1, 1]), Some([65535, 1, 1]));
     let n = 64 * 65535 + 100;
