@@ -21,7 +21,7 @@ uint lanes_exclusive(uint lane, uint value, out uint total) {
 }
 
 // Elements of `n` that a block sums: whole tiles, so blocks differ by one tile at most.
-const uint ITEMS = 4u;
+layout(constant_id = 0) const uint ITEMS = 4; // of a lane
 const uint TILE = LANES * ITEMS;
 
 uvec2 block_range(uint n, uint blocks, uint block) {

@@ -8,7 +8,7 @@
 //! the same in every run.
 
 use super::pool::Pool;
-use super::render::{walkers, Renderer};
+use super::render::Renderer;
 use super::shape::{Scratch, Shape, GROUP};
 use super::step::{LearningRates, Weights};
 use super::tiling::Tiling;
@@ -99,7 +99,7 @@ impl Backward {
                 owners: b.owners.read(),
                 isect_gradients: self.isect_gradients.read_write(),
             };
-            rec.dispatch(sum_chunks, slots, (), walkers());
+            rec.dispatch(sum_chunks, slots, (), renderer.walkers);
         }
         if let (Some(chroma), Some(rates)) = (&self.chroma, rates) {
             let bind = chroma_backward::Bind {

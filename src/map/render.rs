@@ -15,16 +15,16 @@ use super::tiling::Tiling;
 use super::view::View;
 use crate::gpu::kernels::types::Projected;
 use crate::gpu::kernels::{count_tiles, emit_tiles, project, raster_forward, tile_ranges};
-use crate::gpu::{Arena, Buf, Gpu, Kernel, Recorder, Threads};
+use crate::gpu::{Arena, Buf, Caps, DeviceKind, Gpu, Kernel, Recorder, Threads};
 use stipple_drivers::Fault;
 
 /// Bits of a depth key: depth_key.glsl.
 const DEPTH_BITS: u32 = 16;
 
-/// What walks the intersections, whose count only the device knows: workgroups enough for a large GPU. (Some drivers of small GPUs run
+/// Workgroups that walk the intersections, whose count only the device knows: enough for a large GPU. (Some drivers of small GPUs run
 /// indirect dispatches on the CPU.)
-pub fn walkers() -> Threads {
-    Threads::groups(1024, 1, 1)
+fn walkers(caps: &Caps) -> Threads {
+    Threads::groups(if caps.kind == DeviceKind::Cpu { 64 } else { 1024 }, 1, 1)
 }
 
 #[derive(Clone, Copy)]
@@ -92,6 +92,7 @@ pub struct Renderer {
     pub tiling: Tiling,
     scratch: Scratch,
     capacity: u32,
+    pub walkers: Threads,
     scan: Scan,
     sorter: Sorter,
     /// By lens.
@@ -123,6 +124,7 @@ impl Renderer {
             tiling,
             scratch,
             capacity: shape.intersections,
+            walkers: walkers(gpu.caps()),
             scan: Scan::new(gpu, sort)?,
             sorter: Sorter::new(gpu, sort, cut)?,
             project: [project(gpu, false)?, project(gpu, true)?],
@@ -220,7 +222,7 @@ impl Renderer {
             &self.tile_ranges,
             tile_ranges::Bind { isect_count: b.isect_count.read(), keys: sorted.keys.read(), ranges: b.ranges.write() },
             tile_ranges::Push { tiles: tiles + 1 },
-            walkers(),
+            self.walkers,
         );
     }
 }

@@ -27,17 +27,21 @@ pub const CPU: Cut = Cut { digit_bits: 11, groups: 32, by_shares: true };
 pub const GPU: Cut = Cut { digit_bits: 8, groups: 256, by_shares: false };
 /// Fewest keys of a workgroup on a GPU.
 const KEYS_MIN: u32 = 1024;
-/// Words of the digit tables, digits x workgroups, of a pass and of the next. By shares the second half is the places.
-const TABLE_LEN: usize = 1 << 17;
+/// Words of a digit table, digits x workgroups; there is one of a pass and one of the next. By shares half of one is the table and half
+/// the places.
+const TABLE_LEN: usize = 1 << 16;
 /// Most blocks of a scan: their sums are scanned by one workgroup.
 const SCAN_BLOCKS_MAX: u32 = 256;
 const SCAN_BLOCKS_CPU: u32 = 16;
+/// Elements that a lane scans at a time. Few spread a short list over more workgroups; many take fewer barriers.
+const SCAN_ITEMS_GPU: u32 = 4;
+const SCAN_ITEMS_CPU: u32 = 16;
 /// A key that the first pass leaves out.
 #[cfg(feature = "instruments")]
 pub const NONE: u32 = u32::MAX;
 
 const _: () = assert!((share_count::LOCAL[0] << CPU.digit_bits) as usize <= TABLE_LEN / 2);
-const _: () = assert!((GPU.groups << GPU.digit_bits) as usize <= TABLE_LEN / 2);
+const _: () = assert!((GPU.groups << GPU.digit_bits) as usize <= TABLE_LEN);
 
 impl Cut {
     pub fn of(caps: &Caps) -> Cut {
@@ -60,7 +64,7 @@ pub struct Buffers {
 impl Buffers {
     pub fn new(arena: &mut Arena) -> Result<Buffers, Fault> {
         Ok(Buffers {
-            table: arena.alloc("sort: digit table", TABLE_LEN)?,
+            table: arena.alloc("sort: digit tables", 2 * TABLE_LEN)?,
             sums: arena.alloc("scan: block sums", SCAN_BLOCKS_MAX as usize)?,
             unlimited: arena.alloc("sort: unlimited", 1)?,
         })
@@ -78,11 +82,15 @@ pub struct Scan {
 
 impl Scan {
     pub fn new(gpu: &mut Gpu, buffers: &Buffers) -> Result<Scan, Fault> {
+        let (blocks, items) = match gpu.caps().kind {
+            DeviceKind::Cpu => (SCAN_BLOCKS_CPU, SCAN_ITEMS_CPU),
+            _ => (SCAN_BLOCKS_MAX, SCAN_ITEMS_GPU),
+        };
         Ok(Scan {
-            reduce: gpu.kernel(scan_reduce::Spec::default())?,
-            apply: gpu.kernel(scan_apply::Spec::default())?,
+            reduce: gpu.kernel(scan_reduce::Spec { items })?,
+            apply: gpu.kernel(scan_apply::Spec { items })?,
             sums: buffers.sums,
-            blocks: if gpu.caps().kind == DeviceKind::Cpu { SCAN_BLOCKS_CPU } else { SCAN_BLOCKS_MAX },
+            blocks,
         })
     }
 
@@ -183,8 +191,8 @@ impl Sorter {
         let capacity = capacity(from, to);
         let push = radix_count::Push { capacity, groups_max, keys_min, shift, digits, first, next_shift, next_digits };
         let threads = Threads::groups(groups_max, 1, 1);
-        let half = |i: u32| self.table.part(i as usize % 2 * (TABLE_LEN / 2), TABLE_LEN / 2);
-        let (table, next_table) = (half(pass), half(pass + 1));
+        let nth = |i: u32| self.table.part(i as usize % 2 * TABLE_LEN, TABLE_LEN);
+        let (table, next_table) = (nth(pass), nth(pass + 1));
         if pass % 2 == 0 {
             let (keys, count, table) = (from.keys.read(), count.read(), table.write());
             let next_table = next_table.write();
