@@ -13,7 +13,7 @@ use crate::table;
 use model::{Counts, Peaks};
 use scene::Scene;
 use serde_json::json;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::Instant;
 use stipple::config::{GpuConfig, StereoConfig, StereoMethod};
 use stipple::gpu::{Gpu, Timing};
@@ -100,6 +100,8 @@ struct Bench {
     by_count: Vec<Case>,
     by_size: Vec<Case>,
     single: Vec<Case>,
+    /// From opening the device to the end of the first step, s: with no compiled pipelines kept, and with them.
+    start_s: [f64; 2],
 }
 
 pub fn run(args: &Args) -> Result<(), Fault> {
@@ -122,7 +124,8 @@ pub fn run(args: &Args) -> Result<(), Fault> {
     eprintln!("{device}: copies {:.1} GB/s, {:.1} GFLOP/s", peaks.bytes_per_s * 1e-9, peaks.flops_per_s * 1e-9);
     let run = |scene: &Scene| measure(&config, scene, tiling, &peaks, args.quick);
     let wall = |n: usize, (w, h): (usize, usize)| run(&Scene::wall(w, h, n));
-    let mut bench = Bench { device, tiling, peaks, by_count: vec![], by_size: vec![], single: vec![] };
+    let mut bench =
+        Bench { device, tiling, peaks, by_count: vec![], by_size: vec![], single: vec![], start_s: [0.0; 2] };
     if args.quick {
         bench.by_count.push(wall(2_000, (160, 120))?);
     } else {
@@ -142,12 +145,25 @@ pub fn run(args: &Args) -> Result<(), Fault> {
     if let Some(scene) = &recorded {
         bench.single.push(run(scene)?);
     }
+    let scene = recorded.unwrap_or_else(|| {
+        if args.quick {
+            Scene::wall(160, 120, 2_000)
+        } else {
+            Scene::wall(SIZE.0, SIZE.1, COUNT)
+        }
+    });
+    bench.start_s = starts(&config, &scene, tiling, &out.file("pipelines"))?;
+    let [cold, warm] = bench.start_s;
+    eprintln!(
+        "from opening the device to the end of the first step: {cold:.2} s, {warm:.2} s with compiled pipelines kept"
+    );
     page(&bench).write(&out)?;
     println!("{}\n\n{}", cases_table(&bench).text(), out.file("kernels.html").display());
     Ok(())
 }
 
-fn measure(config: &GpuConfig, scene: &Scene, tiling: Tiling, peaks: &Peaks, quick: bool) -> Result<Case, Fault> {
+/// A device and a map of the scene, with pipelines kept in `cache` if there is one.
+fn open(config: &GpuConfig, scene: &Scene, tiling: Tiling, cache: Option<&Path>) -> Result<(Gpu, Pipeline), Fault> {
     let n = scene.splats.len();
     let camera = &scene.view.camera;
     let shape = Shape {
@@ -160,10 +176,34 @@ fn measure(config: &GpuConfig, scene: &Scene, tiling: Tiling, peaks: &Peaks, qui
         channels: 1,
     };
     let mut gpu = Gpu::open(config, Pipeline::arena_bytes(&shape)?)?;
+    cache.iter().for_each(|folder| _ = gpu.reuse_pipelines(folder));
     let mut p = Pipeline::with_tiling(&mut gpu, shape, tiling)?;
+    gpu.keep_pipelines()?;
     p.pool.append(&mut gpu, &scene.splats)?;
     p.loss.set_image(&mut gpu, 0, &scene.image)?;
     p.loss.set_mask(&mut gpu, 0, &scene.mask)?;
+    Ok((gpu, p))
+}
+
+/// Time from opening the device to the end of the first step, s: with an empty `cache` of pipelines, and with one that is filled.
+/// A driver's own cache is the user's to turn off.
+fn starts(config: &GpuConfig, scene: &Scene, tiling: Tiling, cache: &Path) -> Result<[f64; 2], Fault> {
+    OutputDir::create(cache)?;
+    let mut taken = [0.0; 2];
+    for s in &mut taken {
+        let begun = Instant::now();
+        let (mut gpu, mut p) = open(config, scene, tiling, Some(cache))?;
+        p.train(&mut gpu, &scene.view, 0, &RATES, &Weights::default())?;
+        *s = begun.elapsed().as_secs_f64();
+    }
+    _ = std::fs::remove_dir_all(cache);
+    Ok(taken)
+}
+
+fn measure(config: &GpuConfig, scene: &Scene, tiling: Tiling, peaks: &Peaks, quick: bool) -> Result<Case, Fault> {
+    let n = scene.splats.len();
+    let camera = &scene.view.camera;
+    let (mut gpu, mut p) = open(config, scene, tiling, None)?;
     let mut step = |gpu: &mut Gpu| -> Result<f64, Fault> {
         p.train(gpu, &scene.view, 0, &RATES, &Weights::default())?;
         Ok(gpu.last_submit_ms())
@@ -284,6 +324,7 @@ fn page(bench: &Bench) -> Page {
             ("raster", json!({ "lanes": tiling.lanes, "column": tiling.column, "variant": tiling.variant })),
             ("copy_bytes_per_s", json!(peaks.bytes_per_s)),
             ("fma_flops_per_s", json!(peaks.flops_per_s)),
+            ("start_s", json!({ "nothing kept": bench.start_s[0], "pipelines kept": bench.start_s[1] })),
         ],
         parts: vec![
             Part::Note(format!("Measured here: {measured}. {NOTE}")),
