@@ -38,8 +38,8 @@ bool all_lanes(bool done) {
     return subgroupAll(done);
 }
 
-/// Gaussians whose gradients are summed over the lanes at once: eight values each, one for every lane. Their sums wait for each
-/// other in a chain; those of several hide that.
+/// Gaussians whose gradients are summed over the lanes at once: eight values each, one for every lane. A sum is a chain of
+/// dependent shuffles; those of several Gaussians overlap.
 const uint TOGETHER = LANES / 8;
 
 // One step of `sums`: halves the values and doubles the lanes that each is summed over.
@@ -124,6 +124,7 @@ bool all_lanes(bool done) {
 
 const uint TOGETHER = 1;
 
+/// Sums 8 values over the lanes: lane l gets the sum of value l & 7.
 float sums(float v[32]) {
     const uint l = lane();
     barrier();
@@ -142,6 +143,7 @@ float sums(float v[32]) {
     return (terms[row] + terms[row + 1]) + (terms[row + 2] + terms[row + 3]);
 }
 
+/// Slot of the Gaussian whose values `sums` has just summed.
 uint slot_of_lane(uint i) {
     return batch_slot[i];
 }

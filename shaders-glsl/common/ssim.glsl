@@ -1,5 +1,6 @@
 // The window of SSIM (Wang et al. 2004): 11 taps, Gaussian of 1.5 px, separable. Pixels outside the image
-// or the mask are zero in both images. Every thread filters a run of RUN pixels from registers.
+// or the mask are zero in both images. On a CPU every thread filters a run of RUN pixels from registers (`filtered`);
+// GPUs filter tiles (ssim_tile.glsl).
 
 const uint RUN = 8;
 const uint RADIUS = 5;

@@ -1,7 +1,7 @@
-// Sums whole chunks of a Gaussian's slots in place: 16 lanes a chunk, one a word; the workgroups walk the slots. A near Gaussian may cover a thousand
-// tiles, and the one thread that project_backward has for it holds all others up: on an NVIDIA H200, with V1_01's map
-// trained, that kernel takes 33 µs and this one 6 in place of 57, a step 0.384 ms in place of 0.400. Only GPUs run it: a
-// CPU adds as many numbers either way.
+// Sums whole chunks of a Gaussian's slots in place: 16 lanes a chunk, one a word; the workgroups walk the slots. A near
+// Gaussian may cover a thousand tiles, and the one thread that project_backward has for it holds all others up: on an
+// NVIDIA H200, with V1_01's map trained, that kernel took 33 µs and this one 6 in place of 57, a step 0.384 ms in place
+// of 0.400, before other kernels were made faster. Only GPUs run it: a CPU adds as many numbers either way.
 // in   isect_count, owners (slot of the pool, by intersection)
 // out  isect_gradients: of each chunk the first slot becomes the sum, the next word the sum of |α dL/dα|
 #version 450

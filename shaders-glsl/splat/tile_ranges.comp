@@ -1,4 +1,5 @@
-// First and last + 1 of each tile's run in the sorted list, which the workgroups walk; tiles without one keep the zeros they were filled with.
+// First and last + 1 of each tile's run in the sorted list, which the workgroups walk; tiles without one keep the zeros
+// they were filled with.
 // in   isect_count, keys (sorted)
 // out  ranges[tile]
 #version 450

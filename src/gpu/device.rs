@@ -1,4 +1,4 @@
-//! Instance, device, queue: chosen once, destroyed last.
+//! Instance, device, queue: chosen once, destroyed last. One more instance stays until the process ends (`keep_loaded`).
 //!
 //! Everything that owns a Vulkan object holds an `Arc<Device>`, so that the device outlives it whatever
 //! order things are dropped in. The loader is opened at run time: a machine without Vulkan gets a
@@ -8,7 +8,7 @@ use crate::config::GpuConfig;
 use ash::vk;
 use std::ffi::{c_void, CStr, CString};
 use std::sync::atomic::AtomicBool;
-use std::sync::{Mutex, OnceLock};
+use std::sync::Mutex;
 use stipple_drivers::{Fault, FaultKind};
 
 const VALIDATION_LAYER: &CStr = c"VK_LAYER_KHRONOS_validation";
@@ -144,6 +144,7 @@ impl Device {
             let memory = instance.raw.get_physical_device_memory_properties(physical);
             (queue, memory, instance.raw.get_physical_device_properties(physical))
         };
+        keep_loaded(&instance.entry);
         let names = instance.debug.then(|| ash::ext::debug_utils::Device::new(&instance.raw, &raw));
         Ok(Device { raw, queue, family, caps, memory, properties, abandoned: AtomicBool::new(false), names, instance })
     }
@@ -188,11 +189,10 @@ impl Drop for Device {
 /// Holds one instance until the process ends, so that the driver stays loaded. A driver that is unloaded with its last instance
 /// cannot always be loaded again: NVIDIA's was not found any more after some forty times, and a map that loses its device opens it anew.
 fn keep_loaded(entry: &ash::Entry) {
-    static KEPT: OnceLock<(ash::Entry, ash::Instance)> = OnceLock::new();
-    if KEPT.get().is_none() {
-        if let Ok((raw, _)) = instance(entry, false) {
-            _ = KEPT.set((entry.clone(), raw));
-        }
+    static KEPT: Mutex<Option<(ash::Entry, ash::Instance)>> = Mutex::new(None);
+    let Ok(mut kept) = KEPT.lock() else { return };
+    if kept.is_none() {
+        *kept = instance(entry, false).ok().map(|(raw, _)| (entry.clone(), raw));
     }
 }
 
@@ -203,7 +203,6 @@ impl Instance {
         // SAFETY: the library found is the system's Vulkan loader; it has no unsound initialiser.
         let entry = unsafe { ash::Entry::load() }
             .map_err(|e| unavailable(format!("no Vulkan loader (libvulkan.so.1): {e}")))?;
-        keep_loaded(&entry);
         let messages = Box::new(Mutex::new(Vec::with_capacity(MESSAGES_MAX)));
         let (raw, debug) = instance(&entry, validation)?;
         let mut instance = Instance { raw, debug, messenger: None, messages, entry };

@@ -7,8 +7,8 @@
 //!
 //! Command buffers, fences and queries are made once; what a command buffer holds is encoded anew for each part, since
 //! cameras, targets and rates are push constants. Kept encodings would gain nothing: to record, encode and submit a step
-//! takes 0.08 ms on the host of an NVIDIA H200, behind the 0.39 ms of the step before it, and a step of 0.23 ms has the
-//! same 0.02 ms from its end to the beginning of the next as one of 0.97 (`stipple-bench kernels`: wall less device).
+//! takes 0.05 ms on the host of an NVIDIA H200, behind the 0.25 ms of the step before it, and a step of 0.14 ms has the
+//! same 0.02 ms from its end to the beginning of the next as one of 0.78 (`stipple-bench kernels`: wall less device).
 
 use super::device::{boot, Device};
 use super::kernel::Pipelines;
@@ -59,7 +59,7 @@ struct Slot {
     ends: usize,
 }
 
-/// A command whose time is taken: its row, and the workgroups of a direct dispatch.
+/// A command whose time is taken: its row, and its workgroups if it is a dispatch.
 #[derive(Clone, Copy)]
 struct Timed {
     row: usize,
@@ -346,7 +346,7 @@ impl Submitter {
         }
     }
 
-    /// A command, or the slabs of its workgroups that are asked for. Answers how many workgroups of a direct dispatch.
+    /// A command, or the slabs of its workgroups that are asked for. Answers how many workgroups a dispatch has.
     fn encode(
         &self,
         command: &Command,

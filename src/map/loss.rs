@@ -6,7 +6,7 @@
 //! ```
 
 use super::horizon::{COLUMNS, ROWS};
-use super::shape::{Scratch, Shape, GROUP, RUN};
+use super::shape::{Scratch, Shape, GROUP, LOSS_TILE, RUN};
 use super::step::Target;
 use crate::gpu::kernels::{loss_columns, loss_rows, loss_tiles, mask_cells, ssim_columns, ssim_rows, ssim_tiles};
 use crate::gpu::{Arena, Buf, Gpu, GpuError, Kernel, Recorder, Threads};
@@ -15,6 +15,9 @@ use stipple_drivers::Fault;
 
 /// Transmittance above which a pixel of a view that the pool does not hold all of is not compared: what fills it is absent.
 const OPEN: f32 = 0.5;
+
+// Columns of 64 px, in runs of 4: ssim_tile.glsl.
+const _: () = assert!(LOSS_TILE[1] == ssim_tiles::LOCAL[0] / 64 * 4 && loss_tiles::LOCAL[0] == ssim_tiles::LOCAL[0]);
 
 #[derive(Clone, Copy)]
 pub struct Buffers {

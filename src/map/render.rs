@@ -92,6 +92,8 @@ pub struct Renderer {
     pub tiling: Tiling,
     scratch: Scratch,
     capacity: u32,
+    /// What kernels that walk the intersections are dispatched with. They ask how many workgroups there are, so they are made by
+    /// `Gpu::kernel`, never in pieces.
     pub walkers: Threads,
     scan: Scan,
     sorter: Sorter,

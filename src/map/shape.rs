@@ -22,10 +22,10 @@ pub struct Shape {
     pub cameras: u32,
 }
 
-/// Pixels of a run filtered by one thread of the loss: RUN of ssim.glsl.
+/// Pixels of a run filtered by one thread of the loss on a CPU: RUN of ssim.glsl.
 pub const RUN: u32 = 8;
-/// A tile that one workgroup of the loss filters, px: WIDTH and HEIGHT of ssim_tile.glsl.
-const LOSS_TILE: [u32; 2] = [54, 8];
+/// A tile that one workgroup of the loss filters on a GPU, px: WIDTH and HEIGHT of ssim_tile.glsl.
+pub const LOSS_TILE: [u32; 2] = [54, 8];
 /// Invocations of a workgroup of the kernels that sum runs of pixels, or Gaussians.
 pub const GROUP: u32 = 64;
 /// Side of the smallest tile, px: 8 lanes with columns of 8, or 32 with columns of 2.
@@ -98,7 +98,7 @@ pub struct Scratch {
     pub depth_keys: Buf<u32>,
     pub isect_keys: Buf<u32>,
     spare: Pairs,
-    /// In the loss: filtered moments (5 planes) and SSIM slopes (3).
+    /// In the loss: filtered moments (5 planes, used on a CPU) and SSIM slopes (3).
     pub filtered: Buf<f32>,
     pub slopes: Buf<f32>,
     /// In the backward pass.

@@ -23,12 +23,12 @@ pub struct Cut {
 /// Digits of 11 bits sort the tiles of 320x240 in one pass, with two workgroups, as the table has no room for more; passes of 8 bits
 /// have up to 16, two a core.
 pub const CPU: Cut = Cut { digit_bits: 11, groups: 32, by_shares: true };
-/// A GPU hides latency with many workgroups. 8 KiB of shared memory let many be resident.
+/// A GPU hides latency with many workgroups. 11 KiB of shared memory let many be resident.
 pub const GPU: Cut = Cut { digit_bits: 8, groups: 256, by_shares: false };
 /// Fewest keys of a workgroup on a GPU.
 const KEYS_MIN: u32 = 1024;
-/// Words of a digit table, digits x workgroups; there is one of a pass and one of the next. By shares half of one is the table and half
-/// the places.
+/// Words of a digit table, digits x workgroups; there is one of a pass and one of the next. By shares half of the first is the
+/// table and half the places, and the second is not used.
 const TABLE_LEN: usize = 1 << 16;
 /// Most blocks of a scan: their sums are scanned by one workgroup.
 const SCAN_BLOCKS_MAX: u32 = 256;

@@ -29,12 +29,11 @@ impl Tiling {
         let fixed_width = !caps.name.contains("Intel");
         let sub = caps.allows(GROUP_VOTE) && caps.allows(GROUP_SHUFFLE) && fixed_width;
         // A card with more processors than a picture has tiles waits for its longest list, which halves with the tile:
-        // an NVIDIA H200 takes 0.434 ms a step at 52 k Gaussians instead of 0.469, and 0.475 with columns of 2. Where
-        // tiles are plenty, fewer pixels a lane only make more lists. All tiles of such a card are under way at once, so
-        // that to begin with the longest list gains nothing. The backward raster follows it, 0.64 µs a Gaussian at
-        // 752x480 whatever their number; on V1_01 lists are 98 on average and 156 at most, and to cut the long ones
-        // could save 30 of 103 µs, for 8 bytes an intersection of transmittance and colour where they are cut.
+        // an NVIDIA H200 takes 0.248 ms a step at 52 k Gaussians and 752x480, 0.254 with columns of 8 and 0.282 with
+        // columns of 2 (0.185, 0.238 and 0.170 at 320x240). Where tiles are plenty, fewer pixels a lane only make more
+        // lists and move more bytes.
         let column = if caps.kind == DeviceKind::Discrete { 4 } else { Tiling::BASELINE.column };
+        // Measured on an H100 and an H200 alone; a GPU whose shared memory is ordinary memory may be better off with runs.
         let loss_by_tiles = caps.kind != DeviceKind::Cpu;
         let chunk = if loss_by_tiles { CHUNK_GPU } else { 1 };
         let variant = if caps.allows(SAMPLED_BUFFER) { "cpu" } else { "subgroup" };

@@ -5,7 +5,7 @@ use super::twins::chunks;
 use stipple::gpu::kernels::{sum_chunks, types::Moments};
 use stipple::gpu::{Gpu, GpuOptions, Threads};
 use stipple::map::tiling::CHUNK_GPU;
-use stipple::map::{Pipeline, Rendered, Shape, StepStats, Tiling, Weights};
+use stipple::map::{Pipeline, Rendered, Shape, StepStats, Target, Tiling, Weights};
 
 /// The map, to the bit.
 fn map(gpu: &mut Gpu, p: &mut Pipeline) -> Vec<u32> {
@@ -98,6 +98,34 @@ fn sums_of_chunks_equal_their_twin_and_nothing_else_changes() {
             }
             assert!(kept > 0 && (summed > 0) == (count > 500), "{summed} of {count}");
         }
+    }
+}
+
+#[test]
+fn a_loss_filtered_by_tiles_is_that_filtered_by_runs() {
+    let v = view(130, 21);
+    for channels in [1, 3] {
+        let s = Shape { channels, ..shape(&v, 64, 1 << 14) };
+        let of = |loss_by_tiles: bool| {
+            let mut gpu = Gpu::open(&crate::config(), Pipeline::arena_bytes(&s).unwrap()).unwrap();
+            let tiling = Tiling { loss_by_tiles, ..Tiling::of(gpu.caps()) };
+            let mut p = Pipeline::with_tiling(&mut gpu, s, tiling).unwrap();
+            p.pool.append(&mut gpu, scene(64, &v, 9)).unwrap();
+            p.loss.set_image(&mut gpu, 0, &target(130, 21).repeat(channels as usize)).unwrap();
+            let step = p.evaluate(&mut gpu, &v, 0, &Weights::default()).unwrap();
+            let mut gradient = vec![0f32; p.loss.buffers.pixel_gradient.len()];
+            gpu.download(p.loss.buffers.pixel_gradient, 0, &mut gradient).unwrap();
+            let mut map = Vec::new();
+            p.similarity(&mut gpu, &Target::from(0), &mut map).unwrap();
+            (step, gradient, map)
+        };
+        let ((a, gradient_a, map_a), (b, gradient_b, map_b)) = (of(true), of(false));
+        assert!((a.loss - b.loss).abs() < 1e-6 && (a.ssim - b.ssim).abs() < 1e-6, "{a:?} {b:?}");
+        let off = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+        let most = gradient_a.iter().fold(0f32, |m, g| m.max(g.abs()));
+        let (by_gradient, by_map) = (off(&gradient_a, &gradient_b), off(&map_a, &map_b));
+        assert!(most > 0.0 && by_gradient < 1e-4 * most, "{by_gradient} of {most}");
+        assert!(by_map < 1e-4, "{by_map}");
     }
 }
 

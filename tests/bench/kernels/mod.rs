@@ -185,7 +185,7 @@ fn open(config: &GpuConfig, scene: &Scene, tiling: Tiling, cache: Option<&Path>)
     Ok((gpu, p))
 }
 
-/// Time from opening the device to the end of the first step, s: with an empty `cache` of pipelines, and with one that is filled.
+/// Time from opening the device to the end of the first step in a process that has loaded the driver, s: with an empty `cache` of pipelines, and with one that is filled.
 /// A driver's own cache is the user's to turn off.
 fn starts(config: &GpuConfig, scene: &Scene, tiling: Tiling, cache: &Path) -> Result<[f64; 2], Fault> {
     OutputDir::create(cache)?;
