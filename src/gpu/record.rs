@@ -56,6 +56,8 @@ impl Threads {
     }
 }
 
+// Recordings keep their room, so a boxed dispatch would gain nothing.
+#[allow(clippy::large_enum_variant)]
 #[derive(Clone, Copy)]
 pub(super) enum Work {
     Dispatch { kernel: u32, ranges: [Range; BUFFERS_MAX], push: [u8; PUSH_MAX], groups: [u32; 3] },
