@@ -1,6 +1,8 @@
 //! The splat kernels: each stage against its twin, the twins against finite differences, and what must hold
 //! whatever the picture: determinism, capacity, bad input, odd sizes, convergence.
 
+pub use super::twins::compare::STILL;
+use super::twins::compare::{compare, SSIM};
 use super::twins::{self, project::Parameters};
 use glam::{DQuat, DVec3};
 use stipple::config::GpuConfig;
@@ -11,9 +13,6 @@ use stipple::map::{
 };
 use stipple::stereo::Pinhole;
 use stipple_drivers::Pose;
-
-pub const STILL: LearningRates = LearningRates { position: 0.0, scale: 0.0, rotation: 0.0, opacity: 0.0, colour: 0.0 };
-const SSIM: f32 = 0.2;
 
 /// SplitMix64.
 pub struct Rng(pub u64);
@@ -148,79 +147,15 @@ pub fn compare_differences(v: &View, splats: &[Gaussian]) {
 /// Everything a step leaves behind, beside what its twin says.
 pub fn compare_step(v: &View, splats: &[Gaussian], tiling: Option<Tiling>) {
     let (w, h) = (v.camera.width, v.camera.height);
-    let n = splats.len();
-    let s = shape(v, n as u32, 1 << 16);
+    let s = shape(v, splats.len() as u32, 1 << 16);
     let mut gpu = Gpu::open(&crate::config(), Pipeline::arena_bytes(&s).unwrap()).unwrap();
     let mut p = match tiling {
         Some(tiling) => Pipeline::with_tiling(&mut gpu, s, tiling).unwrap(),
         None => Pipeline::new(&mut gpu, s).unwrap(),
     };
-    assert_eq!(p.pool.append(&mut gpu, splats).unwrap(), n);
-    p.loss.set_image(&mut gpu, 1, &target(w, h)).unwrap();
-    p.loss.set_mask(&mut gpu, 0, &mask(w, h)).unwrap();
-
-    let doubles: Vec<Parameters> = splats.iter().map(twins::project::parameters).collect();
-    let goal: Vec<f64> = target(w, h).iter().map(|g| f64::from(*g) / 255.0).collect();
-    let twin = twins::step(&doubles, v, &[0.0; 6], &goal, &mask(w, h), f64::from(SSIM));
-
-    // project
-    let picture = render(&mut gpu, &mut p, v);
-    let mut projected = vec![Default::default(); n];
-    gpu.download(p.renderer.buffers.projected, 0, &mut projected).unwrap();
-    for (i, t) in twins::project_all(&doubles, v, &[0.0; 6]).iter().enumerate() {
-        // Those off the image are culled by the kernel and keep zeros.
-        let (Some(t), true) = (t, projected[i].conic_shade[3] != 0.0) else { continue };
-        let (a, b) = (projected[i].centre_conic, projected[i].conic_shade);
-        let got = [a[0] - 0.5, a[1] - 0.5, a[2], a[3], b[0], b[1], b[2], b[3]];
-        for (k, (g, t)) in got.iter().zip(t).enumerate() {
-            let error = (f64::from(*g) - t.v).abs() / (1.0 + t.v.abs());
-            assert!(error < 2e-5, "splat {i} projected {k}: {g} against {}", t.v);
-        }
-    }
-
-    // raster_forward: a decision on the alpha floor may fall either way, which is worth 1/255 of a grey level.
-    let flip = if twin.rendered.margin > 1e-5 { 0.0 } else { 1.0 / 255.0 };
-    let alpha = twin.rendered.transmittance.iter().map(|t| 1.0 - t);
-    assert!(worst(wide(&picture.colour), twin.rendered.planes.colour[0].iter().copied()) < 1e-5 + flip);
-    assert!(worst(wide(&picture.alpha), alpha) < 1e-5 + flip);
-    assert!(worst(wide(&picture.depth), twin.rendered.depth.iter().copied()) < 1e-3 + 4.0 * flip);
-
-    // loss
-    let weights = Weights { ssim: SSIM, needle: 0.0, scale: 0.0, scale_soft_m: 1.0, opacity: 0.0 };
-    let step = p.train(&mut gpu, v, 1, &STILL, &weights).unwrap();
-    let mut gradient = vec![0f32; w * h];
-    gpu.download(p.loss.buffers.pixel_gradient, 0, &mut gradient).unwrap();
-    let scale = twin.loss.gradient.iter().fold(0.0f64, |m, g| m.max(g.abs()));
-    assert!((step.l1 - twin.loss.l1).abs() < 1e-5 + flip && (step.ssim - twin.loss.ssim).abs() < 1e-4 + flip);
-    let error = worst(wide(&gradient), twin.loss.gradient.iter().copied());
-    assert!(error < (2e-3 + 50.0 * flip) * scale, "loss gradient off by {error} of {scale}");
-
-    // raster_backward and project_backward: after one step from rest Adam's first moment is a tenth of the gradient.
-    let mut moments = vec![Default::default(); n];
-    gpu.download(p.pool.buffers.moments, 0, &mut moments).unwrap();
-    let groups: [(&str, std::ops::Range<usize>); 5] =
-        [("mean", 0..3), ("log scale", 3..6), ("quaternion", 6..10), ("opacity", 10..11), ("grey", 11..12)];
-    for (name, range) in groups {
-        let scale = twin.splats.iter().flat_map(|g| &g[range.clone()]).fold(0.0f64, |m, g| m.max(g.abs()));
-        for (i, m) in moments.iter().enumerate() {
-            let [a, b, q] = m.m;
-            let got = [a[0], a[1], a[2], b[0], b[1], b[2], q[0], q[1], q[2], q[3], a[3], b[3]];
-            for k in range.clone() {
-                let error = (f64::from(got[k]) * 10.0 - twin.splats[i][k]).abs();
-                // The loss is of order one: a billionth of it is nothing, and what rounding leaves of zero.
-                let bound = (1e-3 + 50.0 * flip) * scale + 1e-9;
-                assert!(error < bound, "splat {i} {name} {k}: {} against {}", got[k] * 10.0, twin.splats[i][k]);
-            }
-        }
-    }
-
-    // pose: R <- R Exp(θ) moves points by Exp(-θ), p <- p + δ by -Rᵀδ.
-    let (rho, phi) = (DVec3::from_slice(&twin.twist[..3]), DVec3::from_slice(&twin.twist[3..]));
-    let dp = -(v.world_from_cam.q * rho);
-    let want = [dp.x, dp.y, dp.z, -phi.x, -phi.y, -phi.z];
-    let scale = want.iter().fold(0.0f64, |m, g| m.max(g.abs()));
-    let error = worst(step.pose_gradient, want);
-    assert!(error < (1e-3 + 50.0 * flip) * scale, "pose gradient off by {error} of {scale}");
+    assert_eq!(p.pool.append(&mut gpu, splats).unwrap(), splats.len());
+    let errors = compare(&mut gpu, &mut p, v, splats, [&target(w, h), &mask(w, h)]).unwrap();
+    assert_eq!(errors.complaint(1.0), None, "{errors:?}");
 }
 
 #[test]

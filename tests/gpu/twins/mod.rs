@@ -1,6 +1,7 @@
 //! f64 references of the kernels, by stage, for scenes of a few dozen Gaussians.
 
 pub mod chunks;
+pub mod compare;
 pub mod dual;
 pub mod loss;
 pub mod occupancy;
