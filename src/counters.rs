@@ -71,6 +71,8 @@ stipple_drivers::counters! {
     keyframes_rejected,
     /// Keyframes not offered to the map, since a camera saw nothing.
     keyframes_blank,
+    /// Keyframes refused by the mapper, as their pose is not finite.
+    keyframes_not_finite,
     /// Pose corrections that found their queue full.
     corrections_full,
     /// Joins of epochs that the mapper could not follow.

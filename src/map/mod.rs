@@ -206,8 +206,13 @@ impl Mapper {
         self.scene.gpu.keep_pipelines()
     }
 
-    /// Stores a keyframe, and makes it an anchor when the map does not show its view, or not well.
+    /// Stores a keyframe, and makes it an anchor when the map does not show its view, or not well. One whose pose is not finite is
+    /// refused.
     pub fn ingest(&mut self, keyframe: &Keyframe) -> Result<StepKind, GpuError> {
+        if !keyframe.world_from_body.is_finite() {
+            self.scene.counters.keyframes_not_finite.add(1);
+            return Ok(StepKind::Dropped);
+        }
         self.apply_corrections()?;
         self.finish_pending()?;
         self.scene.views.visit(keyframe.t, keyframe.epoch, keyframe.world_from_body.p);
