@@ -106,8 +106,8 @@ impl Scene {
         if self.views.training().first() == Some(&(index as u32)) {
             return;
         }
-        let offset = self.views.get(index).refined.exposure.offset;
-        if let Some(gain) = gain_from(self.views.planes(index), offset, &self.rendered, &self.camera(index).valid) {
+        let guess = self.views.get(index).refined.exposure;
+        if let Some(gain) = gain_from(self.views.planes(index), guess, &self.rendered, &self.camera(index).valid) {
             self.views.get_mut(index).refined.exposure.gain = gain;
         }
     }
