@@ -26,8 +26,9 @@ pub fn mse(observed: &[f32], rendered: &[f32], valid: &[u8]) -> Option<f64> {
     (n > 0).then(|| sum / f64::from(n))
 }
 
+/// PSNR of a mean squared error, dB; 100 at most, and not a number where the error is none.
 pub fn psnr_db(mse: f64) -> f64 {
-    -10.0 * mse.max(MSE_MIN).log10()
+    -10.0 * (if mse < MSE_MIN { MSE_MIN } else { mse }).log10()
 }
 
 /// Weights of the 1-D window, sum 1; the 2-D window is their product.
