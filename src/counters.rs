@@ -98,6 +98,8 @@ stipple_drivers::counters! {
     store_records_damaged,
     store_refused_full,
     store_write_errors,
+    /// Keyframes whose pair was not matched, as the map shows their view.
+    views_covered,
     /// Anchors not made because their pair could not be matched.
     depth_failures,
     /// Anchors not made because their pair showed no depth: a camera is covered, or nothing has detail.

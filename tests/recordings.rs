@@ -199,13 +199,21 @@ fn whole_pipeline_is_silent_under_validation() {
         .unwrap();
     assert!(made.status.success());
     let poses = flight.join("mav0/state_groundtruth_estimate0/data.csv");
-    for extra in
-        [&["--set", "map.burst_iterations=3"][..], &["--poses", poses.to_str().unwrap(), "--duration", "1"][..]]
-    {
+    for extra in [
+        &["--set", "map.burst_iterations=3", "--set", "map.steps_per_keyframe_max=4"][..],
+        &["--poses", poses.to_str().unwrap(), "--duration", "1"][..],
+    ] {
         let args = [&["replay", flight.to_str().unwrap(), "--pace", "lockstep", "--holdout", "2"][..], extra].concat();
         let run = stipple(&args, true);
         assert!(!run.said.contains("vulkan validation:"), "{}", run.said);
         assert!(run.number("iterations") > 0.0 && run.number("splats") > 0.0, "{}", run.said);
+        let left_out = run.report["left_out"].as_array().unwrap();
+        let kind = |what: &str| left_out.iter().find(|l| l["what"].as_str().unwrap().starts_with(what)).unwrap();
+        let [times, of] = ["times", "of"].map(|name| kind("Training steps")[name].as_f64().unwrap());
+        assert_eq!(of, times + run.number("iterations"), "{left_out:?}");
+        assert_eq!(times > 0.0, extra[1].starts_with("map."), "only where keyframes had their steps: {left_out:?}");
+        let pairs = kind("Stereo depth")["of"].as_f64().unwrap();
+        assert!(pairs > 0.0 && pairs <= run.number("keyframes"), "those held out are neither: {left_out:?}");
     }
 }
 

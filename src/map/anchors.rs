@@ -35,6 +35,7 @@ use crate::config::MapConfig;
 use crate::gpu::{Gpu, GpuError};
 use crate::mem::unsealed;
 use crate::stereo::{DepthMap, RectifiedViews, Stereo};
+use std::time::Instant;
 use stipple_drivers::{Fault, Image};
 
 /// Part of a view that must have depth to seed from; the rest is continued from it.
@@ -101,6 +102,8 @@ pub struct Anchors {
     seen_part: f64,
     /// `depth_disagreement` of the newest.
     disagreements: [Option<f64>; JUDGED],
+    /// Pairs that were matched, and the time it took, s.
+    pub matched: (u64, f64),
 }
 
 impl Anchors {
@@ -120,6 +123,7 @@ impl Anchors {
             anchored_at: 0,
             seen_part: 0.0,
             disagreements: [None; JUDGED],
+            matched: (0, 0.0),
         })
     }
 
@@ -161,6 +165,7 @@ impl Anchors {
         let least = self.config.anchor_missing_min;
         let proven = scene.steps - self.anchored_at >= u64::from(self.config.wrong_after_steps);
         if coverage.uncovered <= least && (coverage.lacking() <= least || !proven) {
+            scene.counters.views_covered.add(1);
             return Ok(None);
         }
         if !self.match_depth(scene, stereo, keyframe) {
@@ -244,7 +249,10 @@ impl Anchors {
     fn match_depth(&mut self, scene: &mut Scene, stereo: &mut Stereo, keyframe: &Keyframe) -> bool {
         let depth = &mut self.work.depth;
         let [left, right, ..] = &keyframe.images[..] else { return false };
-        let Ok(found) = unsealed(|| stereo.depth(Some(&mut scene.gpu), left, right, depth)) else {
+        let start = Instant::now();
+        let found = unsealed(|| stereo.depth(Some(&mut scene.gpu), left, right, depth));
+        self.matched = (self.matched.0 + 1, self.matched.1 + start.elapsed().as_secs_f64());
+        let Ok(found) = found else {
             scene.counters.depth_failures.add(1);
             return false;
         };

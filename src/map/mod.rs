@@ -327,6 +327,21 @@ impl Mapper {
         }
     }
 
+    /// Whether images had `steps_per_keyframe_max` steps on average: more would teach the map its few views by heart.
+    pub fn is_trained_enough(&self) -> bool {
+        self.scene.pipeline.pool.count() > 0 && self.trainer.trained_enough(&self.scene)
+    }
+
+    /// Stereo pairs that were matched, and the time it took, s.
+    pub fn matched(&self) -> (u64, f64) {
+        self.anchors.matched
+    }
+
+    /// Gaussians of the map that are on disk alone, and neither drawn nor trained.
+    pub fn away(&self) -> u64 {
+        self.archive.as_ref().map_or(0, Archive::away) as u64
+    }
+
     /// Trains until `deadline`, and takes at least one step if there is something to train.
     pub fn step(&mut self, deadline: Instant) -> Result<StepReport, GpuError> {
         let start = Instant::now();
@@ -450,7 +465,7 @@ impl Mapper {
 
     /// Gaussians of the map, in the pool and on disk.
     pub fn splat_count(&self) -> usize {
-        self.scene.pipeline.pool.count() as usize + self.archive.as_ref().map_or(0, Archive::away)
+        self.scene.pipeline.pool.count() as usize + self.away() as usize
     }
 
     /// The side of the store that reads and writes, where threads are to do that.

@@ -150,7 +150,7 @@ impl Trainer {
     }
 
     /// Steps past this only teach the map the few views it has, and what they do not show looks covered to the next.
-    fn trained_enough(&self, scene: &Scene) -> bool {
+    pub fn trained_enough(&self, scene: &Scene) -> bool {
         let most = u64::from(self.config.steps_per_keyframe_max);
         most > 0 && scene.steps >= most * scene.views.own_training().len() as u64
     }

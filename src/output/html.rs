@@ -131,7 +131,7 @@ fn tables(report: &Report) -> String {
         ("Resident memory of the mapper's process, peak", mib(report.map_rss_peak_bytes), "MiB"),
         ("Heap allocations after seal", n(report.heap_after_seal), ""),
     ];
-    let others = [table_of_rig(report), table_of_loops(report)];
+    let others = [table_of_left_out(report), table_of_rig(report), table_of_loops(report)];
     let parts = [table("Odometry", &odometry), table("Map", &map), table("Cost", &cost), others.concat()];
     format!("<section class=\"tables\">{}</section>", parts.concat())
 }
@@ -175,6 +175,21 @@ fn table_of_rig(report: &Report) -> String {
         return String::new();
     }
     table("Rig, over its calibration", &rows)
+}
+
+/// What nothing needed; empty where all was done.
+fn table_of_left_out(report: &Report) -> String {
+    let rows = report.left_out.iter().filter(|l| l.times > 0).map(|l| {
+        let share = 100.0 * l.times as f64 / l.of.max(1) as f64;
+        let saved = l.saved_ms.map_or(String::new(), |ms| format!(", about {:.1} s", 1e-3 * ms));
+        (l.what.as_str(), Some(format!("{} of {}{saved}", grouped(l.times), grouped(l.of))), format!("{share:.0} %"))
+    });
+    let rows: Vec<_> = rows.collect();
+    let rows: Vec<Row> = rows.iter().map(|(what, shown, share)| (*what, shown.clone(), share.as_str())).collect();
+    if rows.is_empty() {
+        return String::new();
+    }
+    table("Left out, as nothing needed it", &rows)
 }
 
 /// What closed loops did to the map; empty where none was scored.

@@ -95,6 +95,8 @@ pub struct Report {
     pub loops: Vec<LoopClosed>,
     /// GPU time by kernel, most expensive first.
     pub kernels: Vec<KernelTime>,
+    /// Work that nothing in this run needed.
+    pub left_out: Vec<LeftOut>,
 
     /// `count_<name>` of every counter, `health_<bit>_frames` of every bit of the odometry's health.
     #[serde(flatten)]
@@ -151,6 +153,24 @@ pub struct ExtrinsicsFound {
     pub p_sigma_m: [f64; 3],
     pub theta_rad: [f64; 3],
     pub theta_sigma_rad: [f64; 3],
+}
+
+/// Work of a kind that was not done where nothing needed it: `times` out of `of`, and the time that it would have taken at the mean of
+/// what was done of it, ms.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct LeftOut {
+    pub what: String,
+    pub times: u64,
+    pub of: u64,
+    pub saved_ms: Option<f64>,
+}
+
+impl LeftOut {
+    /// `times` left out, beside `done` that took `done_s` together, s.
+    pub fn beside(what: &str, times: u64, (done, done_s): (u64, f64)) -> LeftOut {
+        let saved_ms = (done > 0).then(|| 1e3 * done_s * times as f64 / done as f64);
+        LeftOut { what: what.into(), times, of: times + done, saved_ms }
+    }
 }
 
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -222,6 +242,7 @@ mod tests {
                 && json["convergence"].is_array()
                 && json["extrinsics"].is_array()
                 && json["kernels"].is_array()
+                && json["left_out"].is_array()
                 && json["loops"].is_array()
                 && json["warnings"] == 0
         );
@@ -251,6 +272,13 @@ mod tests {
         assert_eq!(nested.count(), 0);
         assert_eq!(serde_json::from_slice::<Report>(&bytes).unwrap(), report);
         assert_eq!(report.counted().collect::<Vec<_>>(), [("outliers", 7), ("health_imu_gap_frames", 3)]);
+    }
+
+    #[test]
+    fn what_is_left_out_would_have_taken_as_long_as_the_rest_of_its_kind() {
+        let of = |times, done| LeftOut::beside("steps", times, done);
+        assert_eq!(of(30, (10, 0.5)), LeftOut { what: "steps".into(), times: 30, of: 40, saved_ms: Some(1500.0) });
+        assert_eq!(of(30, (0, 0.0)), LeftOut { what: "steps".into(), times: 30, of: 30, saved_ms: None });
     }
 
     #[test]

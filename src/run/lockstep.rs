@@ -71,7 +71,7 @@ impl Budget {
         }
         let due = self.due(frames, since_first);
         for _ in 0..due.saturating_sub(self.spent) {
-            m.step(Instant::now(), gauges);
+            m.step_due(gauges);
         }
         self.spent = due;
         m.sample_if_due(self.run_s(since_first.secs()), gauges);
@@ -96,7 +96,7 @@ impl Budget {
                 let (mut played_s, steps) = (length_s, self.due(frames as u64, Span::from_secs(s - length_s)));
                 for _ in (0..steps).take_while(|_| !host::stop_asked_for().load(Relaxed)) {
                     played_s += (s - length_s) / steps as f64;
-                    m.step(Instant::now(), gauges);
+                    m.step_due(gauges);
                     m.sample_if_due(self.run_s(played_s), gauges);
                     status.show(gauges);
                 }

@@ -14,7 +14,7 @@ use crate::mem::{self, seal_thread, unsealed};
 use crate::output::export::{export, Form, Request};
 use crate::output::metrics::percentile;
 use crate::output::panel::{caption, panel, Picture};
-use crate::output::report::KernelTime;
+use crate::output::report::{KernelTime, LeftOut};
 use crate::output::{ply, OutputDir};
 use crate::publish::cloud::{Point, POINTS};
 use serde::{Deserialize, Serialize};
@@ -58,8 +58,12 @@ pub struct Mapping {
     pub curve: Vec<CurvePoint>,
     pub iteration_ms: Vec<f32>,
     pub iterations: u64,
-    /// Time spent in steps, s.
+    /// Time spent in steps, s; that of training steps, with densification and paging.
     pub busy_s: f64,
+    training_s: f64,
+    /// Steps that were due while the mapper rested, in lockstep, and the time that it rested otherwise, s.
+    rested: u64,
+    rested_s: f64,
     pub anchors: u64,
     /// Why mapping stopped before the end, if it did; odometry goes on.
     pub failure: Option<String>,
@@ -103,6 +107,9 @@ impl Mapping {
             iteration_ms: Vec::with_capacity(ITERATION_TIMES),
             iterations: 0,
             busy_s: 0.0,
+            training_s: 0.0,
+            rested: 0,
+            rested_s: 0.0,
             anchors: 0,
             failure: None,
             scored_max: if in_lockstep { usize::MAX } else { board.budget.keyframes as usize },
@@ -154,6 +161,12 @@ impl Mapping {
         worked
     }
 
+    /// One step that is due in lockstep.
+    pub fn step_due(&mut self, gauges: &Gauges) {
+        let rests = !self.step(Instant::now(), gauges) && self.failure.is_none() && self.mapper.is_trained_enough();
+        self.rested += u64::from(rests);
+    }
+
     fn work(&mut self, deadline: Instant) -> Result<bool, GpuError> {
         while let Some(slot) = self.ring.take(self.collected, &mut self.keyframe) {
             let (first, epoch) = self.mapper.first_numbers();
@@ -167,6 +180,7 @@ impl Mapping {
             }
         }
         let report = self.mapper.step(deadline)?;
+        self.training_s += if report.iterations > 0 { 1e-3 * report.ms } else { 0.0 };
         self.iterations += u64::from(report.iterations);
         if report.iterations > 0 && self.iteration_ms.len() < ITERATION_TIMES {
             self.iteration_ms.push((report.ms / f64::from(report.iterations)) as f32);
@@ -252,6 +266,7 @@ pub struct MapResult {
     pub device: String,
     pub curve: Vec<CurvePoint>,
     pub kernels: Vec<KernelTime>,
+    pub left_out: Vec<LeftOut>,
     pub counters: Vec<(String, u64)>,
     pub quality: Evaluation,
     pub seams: Vec<ScoredLoop>,
@@ -275,6 +290,21 @@ pub struct Drawn {
 }
 
 impl Mapping {
+    /// What the mapper did not do as nothing needed it.
+    fn left_out(&self) -> Vec<LeftOut> {
+        let steps = (self.iterations, self.training_s);
+        let by_time = if self.training_s > 0.0 { self.rested_s * steps.0 as f64 / steps.1 } else { 0.0 };
+        let (covered, away) = (self.mapper.counters().views_covered.get(), self.mapper.away());
+        let shown = "Stereo depth of keyframes whose view the map shows";
+        let rested = "Training steps while images had had map.steps_per_keyframe_max on average";
+        let on_disk = "Gaussians on disk at the end: neither drawn nor trained";
+        vec![
+            LeftOut::beside(shown, covered, self.mapper.matched()),
+            LeftOut::beside(rested, self.rested + by_time as u64, steps),
+            LeftOut { what: on_disk.into(), times: away, of: self.mapper.splat_count() as u64, saved_ms: None },
+        ]
+    }
+
     /// Writes `map.ply`, evaluates and draws, in this order, and calls `tell` with what there is after each, so that a
     /// process whose time is over has told the most important first.
     pub fn conclude(&mut self, out: &OutputDir, tell: &mut dyn FnMut(&MapResult)) -> MapResult {
@@ -294,6 +324,7 @@ impl Mapping {
             curve: self.curve.clone(),
             seams: self.seams.take(),
             kernels: kernels.into_iter().map(kernel).collect(),
+            left_out: self.left_out(),
             heap_after_seal: mem::heap_after_seal(),
             ..MapResult::default()
         };
@@ -386,7 +417,11 @@ pub fn map(
         if rests {
             std::thread::sleep((resumes - now).min(SLICE));
         } else if !worked {
+            let asleep = Instant::now();
             std::thread::sleep(IDLE);
+            if mapping.failure.is_none() && mapping.mapper.is_trained_enough() {
+                mapping.rested_s += asleep.elapsed().as_secs_f64();
+            }
         }
     }
     unsealed(|| mapping.sample(start.elapsed().as_secs_f64(), gauges));

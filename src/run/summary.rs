@@ -130,6 +130,7 @@ pub fn conclude(title: Title, mut flown: Flown, logged: &[PathBuf], out: &Output
         }
         report.seconds_to_25_db = seconds_to(&report.curve, GOOD_DB);
         report.kernels = m.kernels.clone();
+        report.left_out = m.left_out.clone();
         report.quality = m.quality.clone();
         report.heap_after_seal = Some(heap + m.heap_after_seal);
         report.map_rss_peak_bytes = Some(m.rss_peak_bytes).filter(|bytes| *bytes > 0);
