@@ -1,4 +1,5 @@
-//! `stipple-bench stability`: one row for each thing that goes wrong on a flight.
+//! `stipple-bench stability`: one row for each thing that goes wrong on a flight, for odometry here, for a training step on the GPU in
+//! `steps`, for the map in `mapping`.
 //!
 //! A row says what became of the estimator (survived within stated bounds; detected, when it was wrong
 //! and said so; reset, and by what reason; missed, when it was wrong and silent), the error of the part of the
@@ -7,7 +8,9 @@
 //! rows are asserted by `tests`.
 
 mod cases;
+mod mapping;
 mod rendered;
+mod steps;
 #[cfg(test)]
 mod tests;
 
@@ -294,16 +297,16 @@ fn worst_of(rows: impl Iterator<Item = Row>) -> Option<Row> {
     rows.reduce(Row::worst)
 }
 
-/// Every case, flown with each seed.
-pub fn rows(seeds: &[u64]) -> Result<Vec<Row>, Fault> {
+/// Cases whose name contains `only`, flown with each seed.
+pub fn rows(seeds: &[u64], only: &str) -> Result<Vec<Row>, Fault> {
     let mut rows = Vec::new();
-    for case in cases::all() {
+    for case in cases::all().into_iter().filter(|case| case.name.contains(only)) {
         rows.extend(worst_of(seeds.iter().map(|seed| {
             let (records, vio) = record(&case.plan, *seed);
             judge(&case, &records, &vio)
         })));
     }
-    rows.extend(rendered::rows()?);
+    rows.extend(rendered::rows(only)?);
     Ok(rows)
 }
 
@@ -348,7 +351,7 @@ fn counters(rows: &[Row]) -> Table {
     })
 }
 
-/// Outcome of everything that may go wrong on a flight: one row a case
+/// Outcome of everything that may go wrong on a flight, for odometry and for the map: one row a case
 #[derive(clap::Args)]
 pub struct Args {
     /// Folder for the results
@@ -357,23 +360,48 @@ pub struct Args {
     /// Flights of each case; the worst is shown
     #[arg(long, value_name = "N", default_value = "5", value_parser = clap::value_parser!(u64).range(1..=1000))]
     seeds: u64,
+    /// Only cases whose name contains this
+    #[arg(long, value_name = "TEXT", default_value = "")]
+    only: String,
+    /// 100 000 training steps in the map's longest case, not 2000: 20 s on a GPU
+    #[arg(long)]
+    long: bool,
 }
 
 pub fn run(args: &Args) -> Result<(), Fault> {
     let out = OutputDir::create(&args.out)?;
     let seeds: Vec<u64> = (1..=args.seeds).collect();
-    let rows = rows(&seeds)?;
-    let shown = table(&rows);
-    println!("{}", shown.text());
+    let only = args.only.as_str();
+    let rows = rows(&seeds, only)?;
+    let (steps, maps) = (steps::rows(only)?, mapping::rows(args.long, only)?);
+    let shown = [table(&rows), steps::table(&steps), mapping::table(&maps)];
+    shown.iter().for_each(|table| println!("{}", table.text()));
+    let [odometry, kernels, map] = shown;
     let page = Page {
         name: "stability",
-        title: "Odometry: stability",
-        what: format!("{} cases; made-up tracks are the worst of {} seeded flights each", rows.len(), seeds.len()),
+        title: "Stability",
+        what: format!(
+            "odometry: {} cases, made-up tracks are the worst of {} seeded flights each; kernels: {}; map: {}",
+            rows.len(),
+            seeds.len(),
+            steps.len(),
+            maps.len()
+        ),
         facts: vec![],
-        parts: vec![Part::Note(NOTE.into()), Part::Table(shown), Part::Table(counters(&rows))],
+        parts: vec![
+            Part::Note(NOTE.into()),
+            Part::Table(odometry),
+            Part::Table(counters(&rows)),
+            Part::Note(steps::NOTE.into()),
+            Part::Table(kernels),
+            Part::Note(mapping::NOTE.into()),
+            Part::Table(map),
+        ],
     };
     page.write(&out)?;
     println!("{}", out.file("stability.html").display());
-    let complaints: Vec<String> = rows.iter().filter_map(Row::complaint).collect();
+    let mut complaints: Vec<String> = rows.iter().filter_map(Row::complaint).collect();
+    complaints.extend(steps.iter().filter_map(steps::Row::complaint));
+    complaints.extend(maps.iter().filter_map(mapping::Row::complaint));
     missed("stability", &complaints)
 }

@@ -71,7 +71,7 @@ fn clipped_samples_harm_less_when_the_range_is_known() {
 
 #[test]
 fn flights_gone_wrong_are_survived_or_noticed() {
-    let rows = rows(&[1]).unwrap();
+    let rows = rows(&[1], "").unwrap();
     eprintln!("{}", table(&rows).text());
     let complaints: Vec<String> = rows.iter().filter_map(|r| r.complaint()).collect();
     assert!(complaints.is_empty(), "{complaints:#?}");
