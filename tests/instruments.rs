@@ -88,6 +88,19 @@ fn quick_map_bench_gives_every_run_the_same_time_and_draws_it() {
 }
 
 #[test]
+fn quick_work_of_the_map_trains_as_long_as_it_says() {
+    let dir = tempfile::tempdir().unwrap();
+    let out = dir.path().join("out");
+    bench(&["map", "--work", "--quick", "--set", "map.scale=4", "--set", "map.burst_iterations=2"], &out);
+
+    let json = json(&out.join("map-work.json"));
+    let rows = json["map-work"].as_array().unwrap();
+    let steps: Vec<f64> = rows.iter().map(|row| row["steps"].as_f64().unwrap()).collect();
+    assert!(steps.len() == 2 && steps[0] > 0.0 && steps[1] > 1.5 * steps[0], "{json}");
+    assert!(rows.iter().all(|row| row["training_s"].as_f64().unwrap() > 0.0), "{json}");
+}
+
+#[test]
 fn quick_kernel_bench_times_every_kernel_of_a_step() {
     let dir = tempfile::tempdir().unwrap();
     let out = dir.path().join("out");

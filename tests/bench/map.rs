@@ -1,4 +1,5 @@
-//! `stipple-bench map`: what a map is worth at equal time, against the cap of Gaussians and without parts of the method.
+//! `stipple-bench map`: what a map is worth at equal time, against the cap of Gaussians and without parts of the method; with `--work`
+//! against the number of training steps, of which the default is where the mapper rests.
 //!
 //! Every run plays the same input through the program with the same seconds of mapping, spread evenly over its frames
 //! (lockstep by time: what a step costs is part of what is measured, so figures repeat only as well as the clock
@@ -13,6 +14,7 @@ use std::time::Instant;
 use stipple::output::chart::{Chart, Series};
 use stipple::output::report::Report;
 use stipple::output::OutputDir;
+use stipple::run::Steps;
 use stipple_drivers::Fault;
 
 /// Seconds of mapping a run when not stated.
@@ -29,6 +31,10 @@ const INTERSECTIONS: u32 = 15;
 const INTERSECTIONS_MIN: u32 = 300_000;
 /// Points of each run's curve.
 const PROBES: f64 = 20.0;
+/// Steps a keyframe of the work-precision diagram, after which the mapper rests, and which of them is the default.
+const WORK: [u32; 7] = [25, 50, 100, 150, 300, 600, 1200];
+const QUICK_WORK: [u32; 2] = [4, 8];
+const WORK_DEFAULT: u32 = 300;
 /// The caps are what is limited here.
 const MEMORY_MAX_MIB: u32 = 8192;
 
@@ -55,12 +61,17 @@ const LINES: [Variant; 2] = [
 ];
 
 /// The method without, or with, one part. The first row of the table is the default.
-const ABLATIONS: [Variant; 11] = [
+const ABLATIONS: [Variant; 12] = [
     variant("no burst", "a new anchor waits for its turn", &["map.burst_iterations=0"]),
     variant("no densification", "seeds on bare depth only", &["map.densify_max=0"]),
     variant("no eviction", "a full pool takes no more", &["map.evict=false"]),
     variant("any seeds", "as many as the pool has room for, whatever the steps", &["map.seeds_per_step=0"]),
     variant("anchors by alpha", "covered but wrong views are not anchors", &["map.wrong_error=1"]),
+    variant(
+        "nearly every view an anchor",
+        "stereo depth and seeds wherever anything is missing",
+        &["map.anchor_missing_min=0"],
+    ),
     variant("no SSIM", "L1 alone", &["map.ssim_weight=0"]),
     variant("no needle loss", "axes of any ratio", &["map.needle_weight=0"]),
     variant("no scale loss", "axes of any length", &["map.scale_weight=0"]),
@@ -86,7 +97,11 @@ pub struct Args {
     /// Seconds of mapping of each run
     #[arg(long, value_name = "S", value_parser = crate::seconds)]
     seconds: Option<f64>,
-    /// Two small caps and one ablation
+    /// In place of all that: quality against training steps a keyframe and their time, with as many frames of the mapper as it
+    /// asks for; 3 min on an H200, hours without a GPU
+    #[arg(long)]
+    work: bool,
+    /// Two small caps and one ablation, or two small numbers of steps
     #[arg(long)]
     quick: bool,
     /// Override a key of the board file in every run
@@ -113,13 +128,16 @@ pub fn run(args: &Args) -> Result<(), Fault> {
     let out_dir = OutputDir::create(&args.out)?;
     let Args { dataset, board, poses, set, .. } = args;
     let source = Source { dataset: dataset.clone(), board: board.clone(), poses: poses.clone(), set: set.clone() };
+    if args.work {
+        return work(args, &source, &out_dir);
+    }
     let seconds = args.seconds.unwrap_or(if args.quick { QUICK_SECONDS } else { SECONDS });
     let start = Instant::now();
     let measure = |folder: &str, variant: Variant, cap: u32| -> Result<Row, Fault> {
         let name = format!("{folder}-{}-{cap}", variant.name.replace(' ', "-"));
         let set = assignments(&variant, cap, seconds);
         let dir = OutputDir::create(&args.out.join("runs").join(name))?;
-        let report = source.play(&Job { set: &set, seconds, quick: args.quick }, &dir)?;
+        let report = source.play(&Job { set: &set, steps: Steps::EqualTime(seconds), quick: args.quick }, &dir)?;
         let db = |v: Option<f64>| v.map_or("-".into(), |v| format!("{v:.2} dB"));
         eprintln!(
             "{:6.1} s  {:<24} cap {cap:>6}: {} Gaussians, {} steps, {} training, {} held out",
@@ -147,6 +165,75 @@ pub fn run(args: &Args) -> Result<(), Fault> {
     }
     println!("{}\n\n{}\n{}", table(&sweep).text(), conclusion(&sweep), out_dir.file("map.html").display());
     Ok(())
+}
+
+/// Quality against the training that keyframes get: a run for each number of steps, in lockstep.
+fn work(args: &Args, source: &Source, out: &OutputDir) -> Result<(), Fault> {
+    let mut rows: Vec<(u32, Report)> = vec![];
+    for &steps in if args.quick { &QUICK_WORK[..] } else { &WORK } {
+        let mut set = assignments(&LINES[0], ABLATED_CAP, SECONDS);
+        set.push(format!("map.steps_per_keyframe_max={steps}"));
+        let dir = OutputDir::create(&args.out.join("runs").join(format!("work-{steps}")))?;
+        // As many as it takes, whatever share of the frames are keyframes.
+        let report = source.play(&Job { set: &set, steps: Steps::PerFrame(steps), quick: args.quick }, &dir)?;
+        let db = |v: Option<f64>| v.map_or("-".into(), |v| format!("{v:.2} dB"));
+        eprintln!("{steps} steps a keyframe: {} training", db(report.quality.psnr_db));
+        rows.push((steps, report));
+        work_page(&rows).write(out)?;
+    }
+    println!("{}\n{}", work_table(&rows).text(), out.file("map-work.html").display());
+    Ok(())
+}
+
+/// Time of a run's training steps, s.
+fn training_s(report: &Report) -> Option<f64> {
+    Some(1e-3 * report.iteration_ms_p50? * report.iterations? as f64)
+}
+
+fn work_table(rows: &[(u32, Report)]) -> Table {
+    table!("map-work", "Quality against training", rows, |r| r.0 == WORK_DEFAULT, [
+        count("steps a keyframe") => r.0,
+        count("steps") => r.1.iterations,
+        number("training", "s", 1) => training_s(&r.1),
+        count("anchors") => r.1.anchors,
+        count("Gaussians") => r.1.splats,
+        number("PSNR", "dB", 2) => r.1.quality.psnr_db,
+        number("held out", "dB", 2) => r.1.quality.psnr_heldout_db,
+        number("held out exposure fitted", "dB", 2) => r.1.quality.psnr_heldout_fitted_db,
+        number("held out pose refined", "dB", 2) => r.1.quality.psnr_heldout_aligned_db,
+    ])
+}
+
+fn work_page(rows: &[(u32, Report)]) -> Page {
+    let first = rows.first().map(|r| &r.1);
+    let named = |v: Option<&String>| v.cloned().unwrap_or("-".into());
+    let (dataset, device) = (first.and_then(|r| r.dataset.as_ref()), first.and_then(|r| r.device.as_ref()));
+    let line = |get: fn(&Report) -> Option<f64>| -> Vec<(f64, f64)> {
+        rows.iter().filter_map(|r| Some((training_s(&r.1)?, get(&r.1)?))).collect()
+    };
+    let chart = |title, get: fn(&Report) -> Option<f64>| {
+        let default = rows.iter().filter(|r| r.0 == WORK_DEFAULT).filter_map(|r| Some((training_s(&r.1)?, get(&r.1)?)));
+        let series =
+            vec![Series::dots("every number of steps", 1, line(get)), Series::dots("default", 2, default.collect())];
+        Chart { title, x: "training, s", y: "PSNR, dB", series, ..Chart::default() }.svg()
+    };
+    Page {
+        name: "map-work",
+        title: "Map: quality against training",
+        what: format!("{}, {}; lockstep, at most {ABLATED_CAP} Gaussians", named(dataset), named(device)),
+        facts: vec![("dataset", json!(dataset)), ("device", json!(device))],
+        parts: vec![
+            Part::Note("The mapper rests when keyframes had their steps on average. Time is that of the steps: their number times the median of one.".into()),
+            Part::Charts(
+                "Quality against training",
+                vec![
+                    chart("Training views", |r| r.quality.psnr_db),
+                    chart("Held out, exposure fitted", |r| r.quality.psnr_heldout_fitted_db),
+                ],
+            ),
+            Part::Table(work_table(rows)),
+        ],
+    }
 }
 
 fn assignments(variant: &Variant, cap: u32, seconds: f64) -> Vec<String> {

@@ -38,8 +38,8 @@ pub struct Source {
 pub struct Job<'a> {
     /// Overrides the board and the source's own; the last wins.
     pub set: &'a [String],
-    /// Time of mapping, spread evenly over the frames, s.
-    pub seconds: f64,
+    /// The mapper's pace.
+    pub steps: Steps,
     /// A small input will do.
     pub quick: bool,
 }
@@ -63,7 +63,7 @@ impl Source {
                 Input::rendered(&scenario, memory::colours(&scenario.calibration, &board).len(), |_, _| {})?
             }
         };
-        let pace = Pace::Lockstep(Steps::EqualTime(job.seconds));
+        let pace = Pace::Lockstep(job.steps);
         let options = Options { pace, poses: self.poses.clone(), holdout: HOLDOUT, fresh: true, ..Options::default() };
         Ok(fly(input, &board, out, &options, None)?.report)
     }

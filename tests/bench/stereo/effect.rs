@@ -6,6 +6,7 @@
 use crate::run::{Job, Source};
 use stipple::output::report::Report;
 use stipple::output::OutputDir;
+use stipple::run::Steps;
 use stipple_drivers::{Fault, FaultKind};
 
 /// Methods, and how a board asks for each.
@@ -29,7 +30,7 @@ pub fn map(seconds: f64, out: &OutputDir, source: &Source) -> Result<Vec<Effect>
     for (method, set) in METHODS {
         let set: Vec<String> = set.iter().map(|s| s.to_string()).collect();
         let dir = OutputDir::create(&out.file(&format!("map-{method}")))?;
-        match source.play(&Job { set: &set, seconds, quick: false }, &dir) {
+        match source.play(&Job { set: &set, steps: Steps::EqualTime(seconds), quick: false }, &dir) {
             Ok(report) => {
                 let effect = Effect { method, report };
                 eprintln!("{}", effect.line());
