@@ -177,15 +177,13 @@ fn table_of_rig(report: &Report) -> String {
     table("Rig, over its calibration", &rows)
 }
 
-/// What nothing needed; empty where all was done.
+/// What nothing needed, and the time that it would have taken; empty where all was done.
 fn table_of_left_out(report: &Report) -> String {
-    let rows = report.left_out.iter().filter(|l| l.times > 0).map(|l| {
-        let share = 100.0 * l.times as f64 / l.of.max(1) as f64;
-        let saved = l.saved_ms.map_or(String::new(), |ms| format!(", about {:.1} s", 1e-3 * ms));
-        (l.what.as_str(), Some(format!("{} of {}{saved}", grouped(l.times), grouped(l.of))), format!("{share:.0} %"))
-    });
-    let rows: Vec<_> = rows.collect();
-    let rows: Vec<Row> = rows.iter().map(|(what, shown, share)| (*what, shown.clone(), share.as_str())).collect();
+    let saved = |ms: Option<f64>| ms.map_or(String::new(), |ms| format!("{:.1} s", 1e-3 * ms));
+    let left = report.left_out.iter().filter(|l| l.times > 0);
+    let rows: Vec<_> =
+        left.map(|l| (l, format!("{} of {}", grouped(l.times), grouped(l.of)), saved(l.saved_ms))).collect();
+    let rows: Vec<Row> = rows.iter().map(|(l, n, s)| (l.what.as_str(), Some(n.clone()), s.as_str())).collect();
     if rows.is_empty() {
         return String::new();
     }

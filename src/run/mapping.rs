@@ -296,7 +296,7 @@ impl Mapping {
         let by_time = if self.training_s > 0.0 { self.rested_s * steps.0 as f64 / steps.1 } else { 0.0 };
         let (covered, away) = (self.mapper.counters().views_covered.get(), self.mapper.away());
         let shown = "Stereo depth of keyframes whose view the map shows";
-        let rested = "Training steps while images had had map.steps_per_keyframe_max on average";
+        let rested = "Training steps after images had had their number";
         let on_disk = "Gaussians on disk at the end: neither drawn nor trained";
         vec![
             LeftOut::beside(shown, covered, self.mapper.matched()),
