@@ -118,18 +118,18 @@ fn cases(longest: bool) -> Vec<Case> {
         passing("noise for two keyframes", |k| noise(k, 0..2)),
         passing("right image of noise for two keyframes", |k| noise(k, 1..2)),
         stepping("exposure of half for two keyframes", |k| light(k, 0.5)),
-        stepping("exposure x2 for two keyframes", |k| light(k, 2.0)),
         stepping("exposure of an eighth for two keyframes", |k| light(k, 0.125)),
-        // Most of the picture is white and tells little.
+        // What is white tells nothing.
+        stepping("exposure x2 for two keyframes", |k| light(k, 2.0)).within(4.0),
         stepping("exposure x8 for two keyframes", |k| light(k, 8.0)).within(4.0),
-        passing("depths of half", |k| shift(k, true)),
-        passing("depths of far away", |k| shift(k, false)),
-        passing("poses off by 1 m and 30°", |k| {
+        passing("depths of half for two keyframes", |k| shift(k, true)),
+        passing("depths of far away for two keyframes", |k| shift(k, false)),
+        passing("poses off by 1 m and 30° for two keyframes", |k| {
             k.world_from_body = k.world_from_body * Pose::new(DQuat::from_rotation_z(0.52), DVec3::new(0.6, -0.8, 0.0));
         }),
         Case {
             says: &["keyframes_not_finite"],
-            ..passing("poses that are not numbers", |k| k.world_from_body.p.x = f64::NAN)
+            ..passing("poses that are not numbers for two keyframes", |k| k.world_from_body.p.x = f64::NAN)
         },
         set("no room for Gaussians: 500", &["budget.splats=500"]).losing(&["splats_full", "splats_evicted"]),
         set("no room for intersections: 4000", &["budget.splats=4000", "budget.intersections=4000"])
@@ -311,14 +311,16 @@ fn rows_of(cases: &[Case]) -> Result<Vec<Row>, Fault> {
     cases.iter().map(row).collect()
 }
 
-/// Counters of what the mapper does on any flight.
-const USUAL: [&str; 6] = [
+/// Counters of what the mapper does on any flight, some of it now and then.
+const USUAL: [&str; 8] = [
     "seeds_occupied",
     "splats_densified",
     "splats_pruned",
     "intersections_most",
     "anchors_for_error",
     "rectified_anew",
+    "views_covered",
+    "occupancy_full",
 ];
 
 pub const NOTE: &str = "Map: eight keyframes of a simulated flight at true poses, 188x120, 40 steps after each. Lost: PSNR of the keyframes that nothing is wrong with, beside the same of the flight without the fault (trained on; held out, given pose). Survived: at most 1.5 dB. Detected: more, and a counter says so that the sound flight does not have. Worse: more, and nothing says so. Losses of held-out keyframes are shown and not judged. Everything must stay finite. Where images are wrong throughout, or settings, the loss has no bound.";
@@ -349,10 +351,10 @@ mod tests {
         }
     }
 
-    /// The quickest of each kind; `stipple-bench stability` flies them all.
+    /// Two of the cases; `stipple-bench stability` flies them all.
     #[test]
-    fn the_map_survives_wrong_settings_images_depths_and_poses() {
-        let some = ["learning rates x100", "noise for two keyframes", "depths of half", "poses that are not numbers"];
+    fn the_map_survives_changes_of_light_and_poses_that_are_not_numbers() {
+        let some = ["exposure of an eighth for two keyframes", "poses that are not numbers for two keyframes"];
         let cases: Vec<Case> = cases(false).into_iter().filter(|c| some.contains(&c.name)).collect();
         let rows = rows_of(&cases).expect("a device");
         println!("{}", table(&rows).text());

@@ -157,7 +157,7 @@ fn small(v: f64) -> String {
 }
 
 pub fn table(rows: &[Row]) -> Table {
-    let mut heads: Vec<Head> = ["case", "grey level", "pixel gradient"].map(text).to_vec();
+    let mut heads: Vec<Head> = ["case", "picture, of 1", "pixel gradient"].map(text).to_vec();
     heads.extend(GROUPS.iter().map(|(name, _)| text(name)));
     heads.extend([text("pose"), text("close decision"), number("loss", "", 3), number("at the end", "", 3)]);
     Table::new("steps", "Kernels against their twin in f64", rows, &heads, |r| {
