@@ -97,9 +97,9 @@ pub struct Args {
     /// Seconds of mapping of each run
     #[arg(long, value_name = "S", value_parser = crate::seconds)]
     seconds: Option<f64>,
-    /// In place of all that: quality against training steps a keyframe and their time, with as many frames of the mapper as it
-    /// asks for; 3 min on an H200, hours without a GPU
-    #[arg(long)]
+    /// In place of all that: quality against the number of training steps a keyframe, and their time; 2 min on an H200, hours
+    /// without a GPU
+    #[arg(long, conflicts_with = "seconds")]
     work: bool,
     /// Two small caps and one ablation, or two small numbers of steps
     #[arg(long)]
@@ -174,7 +174,7 @@ fn work(args: &Args, source: &Source, out: &OutputDir) -> Result<(), Fault> {
         let mut set = assignments(&LINES[0], ABLATED_CAP, SECONDS);
         set.push(format!("map.steps_per_keyframe_max={steps}"));
         let dir = OutputDir::create(&args.out.join("runs").join(format!("work-{steps}")))?;
-        // As many as it takes, whatever share of the frames are keyframes.
+        // So many are offered at every frame that the limit a keyframe decides.
         let report = source.play(&Job { set: &set, steps: Steps::PerFrame(steps), quick: args.quick }, &dir)?;
         let db = |v: Option<f64>| v.map_or("-".into(), |v| format!("{v:.2} dB"));
         eprintln!("{steps} steps a keyframe: {} training", db(report.quality.psnr_db));

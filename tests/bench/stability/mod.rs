@@ -25,7 +25,7 @@ use stipple::output::metrics::trajectory_error;
 use stipple::output::OutputDir;
 use stipple::vio::instruments::Stats;
 use stipple::vio::{Health, Vio};
-use stipple_drivers::{Fault, TimedPose};
+use stipple_drivers::{Fault, FaultKind, TimedPose};
 
 /// A quality this low says that the estimate is not to be relied on.
 const QUALITY_LOW: u8 = 20;
@@ -374,6 +374,10 @@ pub fn run(args: &Args) -> Result<(), Fault> {
     let only = args.only.as_str();
     let rows = rows(&seeds, only)?;
     let (steps, maps) = (steps::rows(only)?, mapping::rows(args.long, only)?);
+    if rows.is_empty() && steps.is_empty() && maps.is_empty() {
+        let fix = "the first column of the tables has the names; without --only all cases are flown";
+        return Err(Fault::new(FaultKind::Usage, "--only", format!("no case has {only:?} in its name"), fix));
+    }
     let shown = [table(&rows), steps::table(&steps), mapping::table(&maps)];
     shown.iter().for_each(|table| println!("{}", table.text()));
     let [odometry, kernels, map] = shown;
