@@ -109,6 +109,10 @@ pub struct Args {
     set: Vec<String>,
 }
 
+fn db(v: Option<f64>) -> String {
+    v.map_or("-".into(), |v| format!("{v:.2} dB"))
+}
+
 /// A run and its report.
 struct Row {
     variant: Variant,
@@ -138,7 +142,6 @@ pub fn run(args: &Args) -> Result<(), Fault> {
         let set = assignments(&variant, cap, seconds);
         let dir = OutputDir::create(&args.out.join("runs").join(name))?;
         let report = source.play(&Job { set: &set, steps: Steps::EqualTime(seconds), quick: args.quick }, &dir)?;
-        let db = |v: Option<f64>| v.map_or("-".into(), |v| format!("{v:.2} dB"));
         eprintln!(
             "{:6.1} s  {:<24} cap {cap:>6}: {} Gaussians, {} steps, {} training, {} held out",
             start.elapsed().as_secs_f64(),
@@ -176,7 +179,6 @@ fn work(args: &Args, source: &Source, out: &OutputDir) -> Result<(), Fault> {
         let dir = OutputDir::create(&args.out.join("runs").join(format!("work-{steps}")))?;
         // So many are offered at every frame that the limit a keyframe decides.
         let report = source.play(&Job { set: &set, steps: Steps::PerFrame(steps), quick: args.quick }, &dir)?;
-        let db = |v: Option<f64>| v.map_or("-".into(), |v| format!("{v:.2} dB"));
         eprintln!("{steps} steps a keyframe: {} training", db(report.quality.psnr_db));
         rows.push((steps, report));
         work_page(&rows).write(out)?;

@@ -2,6 +2,7 @@
 //! where it has a meaning; elsewhere everything stays finite and the neighbours do not notice.
 
 use super::splat::{compare_step, mask, open, render, scene, shape, target, train, view, Rng, FAST};
+use super::twins::compare::finite;
 use glam::DVec3;
 use stipple::gpu::kernels::types::Moments;
 use stipple::map::{Gaussian, Rendered, View, Weights};
@@ -15,10 +16,6 @@ fn splat(v: &View, p_cam: DVec3, log_scale: [f32; 3], opacity_logit: f32) -> Gau
         opacity_logit,
         colour: [0.6; 3],
     }
-}
-
-fn finite(s: &Gaussian) -> bool {
-    bytemuck::cast_slice::<_, f32>(std::slice::from_ref(s)).iter().all(|v| v.is_finite())
 }
 
 /// Trains, and everything there is stays finite.

@@ -5,13 +5,14 @@
 #[allow(dead_code)] // the tests of the mapper take more of it
 mod keyframes;
 
+use super::steps::twins::compare::finite;
 use crate::page::{count, number, text, Table};
 use crate::table;
 use glam::{DQuat, DVec3};
-use keyframes::flight;
+use keyframes::{board, flight};
 use std::time::Instant;
 use stipple::config::Board;
-use stipple::map::{Gaussian, Keyframe, Mapper, StepKind};
+use stipple::map::{Keyframe, Mapper, StepKind};
 use stipple_drivers::{Calibration, Fault, FaultKind, Pose};
 
 /// Keyframes of the flight, every fourth of them held out, and steps after each.
@@ -19,9 +20,6 @@ const KEYFRAMES: usize = 8;
 const STEPS: u32 = 40;
 /// Keyframes that a passing fault spoils; their neighbours 3 and 7 are held out.
 const BAD: [u64; 2] = [4, 5];
-/// The board of all cases. Stereo on the GPU is the same on every device.
-const BOARD: &str = "name = \"stability\"\nmemory_max_mib = 2048\n[budget]\nsplats = 20000\nintersections = 400000\n\
-    keyframes = 16\nimage_width_max = 1024\nimage_height_max = 1024\n[stereo]\nmethod = \"sgm\"\n";
 /// Steps of the long row, and of the longest.
 const LONG: u32 = 2_000;
 const LONGEST: u32 = 100_000;
@@ -152,6 +150,11 @@ impl Case {
         Case { lost_max, ..self }
     }
 
+    /// The board of the mapper's tests, with stereo on the GPU, which is the same on every device.
+    fn board(&self) -> Board {
+        board(&[&["stereo.method=sgm"][..], self.set].concat())
+    }
+
     fn is_bad(&self, id: u64) -> bool {
         self.bad.contains(&id)
     }
@@ -216,16 +219,10 @@ impl Flown {
     }
 }
 
-pub fn finite(s: &Gaussian) -> bool {
-    bytemuck::cast_slice::<_, f32>(std::slice::from_ref(s)).iter().all(|v| v.is_finite())
-}
-
 fn fly(case: &Case, (calibration, flight): &(Calibration, Vec<Keyframe>)) -> Result<Flown, Fault> {
     let lost =
         |e| Fault::new(FaultKind::Unavailable, case.name, format!("{e:?}"), "check the device with `stipple doctor`");
-    let set: Vec<String> = case.set.iter().map(|s| s.to_string()).collect();
-    let board = Board::parse(case.name, BOARD, &set)?;
-    let mut mapper = Mapper::open(calibration, &board)?;
+    let mut mapper = Mapper::open(calibration, &case.board())?;
     let mut flown = Flown { finite: true, ..Flown::default() };
     for (n, sound) in flight.iter().take(case.keyframes).enumerate() {
         let mut keyframe = sound.clone();
@@ -346,8 +343,7 @@ mod tests {
     #[test]
     fn every_case_has_a_board() {
         for case in cases(false) {
-            let set: Vec<String> = case.set.iter().map(|s| s.to_string()).collect();
-            assert_eq!(Board::parse(case.name, BOARD, &set).err(), None);
+            case.board();
         }
     }
 

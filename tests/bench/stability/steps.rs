@@ -3,9 +3,8 @@
 
 #[path = "../../gpu/twins/mod.rs"]
 #[allow(dead_code, clippy::unwrap_used)] // the tests of the kernels take more of it
-mod twins;
+pub mod twins;
 
-use super::mapping::finite;
 use crate::page::{number, text, Head, Table};
 use glam::{DQuat, DVec3};
 use stipple::config::GpuConfig;
@@ -14,7 +13,7 @@ use stipple::map::schedule::Rng;
 use stipple::map::{Gaussian, LearningRates, Pipeline, Shape, View, Weights};
 use stipple::stereo::Pinhole;
 use stipple_drivers::{Fault, Pose};
-use twins::compare::{compare, Errors, GROUPS};
+use twins::compare::{compare, finite, Errors, GROUPS};
 
 /// Size of the picture, px.
 const SIZE: [usize; 2] = [33, 21];

@@ -59,6 +59,11 @@ impl Errors {
     }
 }
 
+/// Whether every parameter of a Gaussian is finite.
+pub fn finite(s: &Gaussian) -> bool {
+    bytemuck::cast_slice::<_, f32>(std::slice::from_ref(s)).iter().all(|v| v.is_finite())
+}
+
 fn largest(values: impl IntoIterator<Item = f64>) -> f64 {
     // NaN stays, as `f64::max` would drop it.
     values.into_iter().fold(0.0, |m: f64, v: f64| if m.is_nan() || v.abs() <= m { m } else { v.abs() })
