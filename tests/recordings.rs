@@ -137,6 +137,7 @@ fn simulated_flight_gives_the_same_bits_on_one_thread_and_on_two() {
     }
     let run = gives_the_same_bits(&flight);
     assert_eq!(run.number("count_frames_unreadable"), 1.0);
+    assert!(run.number("count_frames_carried") > 10.0, "it hovers at first: {}", run.number("count_frames_carried"));
     assert!(run.number("ate_rmse_m") < 0.02, "{}", run.said);
 }
 

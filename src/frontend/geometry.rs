@@ -50,6 +50,11 @@ impl RigGeometry {
         self.refresh();
     }
 
+    /// The longest focal length, px.
+    pub fn focal_px(&self) -> f64 {
+        self.cameras.iter().fold(0.0, |f, c| f.max(c.camera.fx))
+    }
+
     /// Takes the images of two cameras for each other's; the second time as before. Masks stay with their images.
     pub fn exchange(&mut self, [a, b]: [usize; 2]) {
         self.cameras.swap(a, b);

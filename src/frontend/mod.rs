@@ -199,6 +199,13 @@ impl Frontend {
         &self.tracks
     }
 
+    /// About how far the view has moved by a motion since the last frame, px: what turns it, and what moves the point of median
+    /// distance aside.
+    pub fn flow_px(&mut self, prev_from_now: &Pose) -> f64 {
+        let angle = 2.0 * prev_from_now.q.xyz().length().min(1.0).asin();
+        self.rig.focal_px() * (angle + self.median_inverse_depth() * prev_from_now.p.length())
+    }
+
     /// Finds corners without any history, and the views of each in all cameras. What was followed before is forgotten, and
     /// the frame is not kept: its pyramids stay, for `levels`.
     pub fn detect_anew(&mut self, frames: &Arc<Frames>) -> &Tracks {

@@ -55,7 +55,7 @@ impl State {
 /// Where a state comes from.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Source {
-    /// The estimate of a frame.
+    /// The estimate of a frame, tracked or left to inertia.
     Frame,
     /// The estimate of the last frame, carried on by inertial samples.
     Carried,

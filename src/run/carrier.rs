@@ -22,9 +22,9 @@ type Given = (Update, [DVec3; 2]);
 pub struct Newest(Arc<Mutex<Option<Given>>>);
 
 impl Newest {
-    /// Replaces what was not taken yet. A frame that was refused replaces nothing.
+    /// Replaces what was not taken yet. A frame that was refused or left to inertia replaces nothing.
     pub fn set(&self, update: &Update, imu_scale: [DVec3; 2]) {
-        if !update.health.has(Health::FRAME_REJECTED) {
+        if !update.health.has(Health::FRAME_REJECTED) && !update.carried {
             *self.0.lock().unwrap_or_else(PoisonError::into_inner) = Some((*update, imu_scale));
         }
     }

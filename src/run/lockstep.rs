@@ -220,9 +220,8 @@ struct Reading {
 }
 
 impl Reading {
-    /// Decodes frames into every packet but the last, or until the recording ends, hands them over together, and answers
-    /// how many. Packets come back in order: the last is the one the front end still reads. A frame that cannot be read or
-    /// is refused leaves its samples to the next.
+    /// Decodes frames into every packet but the one that the front end still reads, or until the recording ends, hands them over
+    /// together, and answers how many. A frame that cannot be read or is refused leaves its samples to the next.
     fn batch(
         &mut self,
         packets: &mut Vec<Box<FramePacket>>,
@@ -233,6 +232,9 @@ impl Reading {
         let (frame_gate, imu_gate) = &mut self.gates;
         let mut sent = 0;
         let writable = packets.len() - 1;
+        if let Some(held) = packets.iter_mut().position(|packet| packet.writable().is_none()) {
+            packets[held..].rotate_left(1);
+        }
         for packet in &mut packets[..writable] {
             packet.clear();
             let mut read = false;
@@ -257,7 +259,7 @@ impl Reading {
                     self.aids += 1;
                     packet.push_aid(reading, counters);
                 }
-                let frames = packet.writable().expect("it is not the last that came back");
+                let frames = packet.writable().expect("the front end reads one packet, the last here");
                 read = images.read(i, frames).is_ok();
                 counters.frames_unreadable.add(u64::from(!read));
                 read = read && frame_gate.admit(frames, stamps[i], counters);

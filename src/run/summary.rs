@@ -130,7 +130,7 @@ pub fn conclude(title: Title, mut flown: Flown, logged: &[PathBuf], out: &Output
         }
         report.seconds_to_25_db = seconds_to(&report.curve, GOOD_DB);
         report.kernels = m.kernels.clone();
-        report.left_out = m.left_out.clone();
+        report.left_out.extend(m.left_out.clone());
         report.quality = m.quality.clone();
         report.heap_after_seal = Some(heap + m.heap_after_seal);
         report.map_rss_peak_bytes = Some(m.rss_peak_bytes).filter(|bytes| *bytes > 0);
@@ -247,6 +247,7 @@ fn track_figures(report: &mut Report, flown: &Flown) -> Vec<TimedPose> {
         }
     }
     (report.height_bias_m, report.height_bias_sigma_m) = run.back.vio.height_bias().map(|[b, s]| (b, s)).unzip();
+    report.left_out.push(run.left_out());
     report.estimator_bytes = Some(run.bytes);
     if let Some((least, median, under)) = run.back.vio.quality_summary() {
         (report.quality_min, report.quality_p50) = (Some(least.into()), Some(median.into()));

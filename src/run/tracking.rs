@@ -10,6 +10,9 @@
 //! points that it rejected. The front end begins frame k when the answer to frame k-2 has come, and predicts from that even
 //! where the one to k-1 is known: so neither queue can fill, and poses are the same bit for bit on one thread and on two.
 //!
+//! Where the view hardly moves the front end leaves a frame to inertia, and the back end carries its last estimate to it
+//! (`vio/carried.rs`).
+//!
 //! With `--poses` the poses come from a table, odometry is skipped, and every frame is a keyframe, or those that are apart by
 //! a stated spacing.
 
@@ -23,8 +26,9 @@ use crate::counters::Counters;
 use crate::frontend::{Frontend, Prediction, Rejected, Tracks, Verdicts};
 use crate::limits::{CAMERAS_MAX, FRAMES, IMU_BETWEEN_FRAMES};
 use crate::mem::{seal_thread, Footprint, List, Thinned};
+use crate::output::report::LeftOut;
 use crate::publish::Feeds;
-use crate::vio::{Findings, Health, Known, Predictor, Vio};
+use crate::vio::{Findings, Health, Known, Predictor, Schedule, Update, Vio};
 use crossbeam_queue::ArrayQueue;
 use std::sync::atomic::AtomicBool;
 use std::sync::Arc;
@@ -55,6 +59,8 @@ pub struct FramePacket {
     pub imu_only: bool,
     /// A camera saw nothing: no view to train a map on.
     pub blank: bool,
+    /// Left to inertia: no point was followed.
+    pub carried: bool,
     pub imu: List<ImuSample, IMU_BETWEEN_FRAMES>,
     pub aids: AidBatch,
     pub tracks: Tracks,
@@ -79,6 +85,7 @@ impl FramePacket {
             frames: Arc::new(Frames::in_colour(calibration, colours)),
             imu_only: false,
             blank: false,
+            carried: false,
             imu: List::default(),
             aids: AidBatch::default(),
             tracks: Tracks::default(),
@@ -142,6 +149,8 @@ pub struct OdometryRun {
 #[derive(Clone)]
 pub struct Answer {
     known: Known,
+    /// Odometry is sure.
+    is_sure: bool,
     rejected: Rejected,
 }
 
@@ -150,7 +159,10 @@ pub struct Front {
     frontend: Frontend,
     predictor: Predictor,
     clock: Clock,
-    /// Wall time of each frame, ms.
+    schedule: Schedule,
+    /// Motion of the view below which a frame may be left to inertia, px.
+    carried_px: f64,
+    /// Wall time of each tracked frame, ms.
     pub ms: Thinned<f64>,
     /// Wall time of all frames, with what was waited for the back end, s.
     pub busy_s: f64,
@@ -178,6 +190,12 @@ impl Front {
         if self.clock.went_back(Stream::Frames, t) {
             self.predictor.change_clock();
         }
+        packet.carried = self.leaves_out(t, answer);
+        if packet.carried {
+            packet.cpu = thread_cpu_now() - cpu;
+            return;
+        }
+        self.schedule.track(t);
         if let Some((body_from_cam, sigma_rad)) = self.predictor.cameras_at(t, &answer.known) {
             self.frontend.correct(&body_from_cam, sigma_rad);
         }
@@ -191,6 +209,15 @@ impl Front {
     }
 }
 
+impl Front {
+    /// Whether the frame at `t` is left to inertia.
+    fn leaves_out(&mut self, t: Nanos, answer: &Answer) -> bool {
+        let has_time = self.schedule.has_time(t) && answer.is_sure && self.predictor.is_sound(t);
+        let motion = self.predictor.motion_since_last(t, answer.known.odometry.as_ref()).filter(|_| has_time);
+        motion.is_some_and(|motion| self.frontend.flow_px(&motion) < self.carried_px)
+    }
+}
+
 /// Epochs that a run is judged by.
 const EPOCHS: usize = 64;
 
@@ -198,15 +225,17 @@ const EPOCHS: usize = 64;
 /// recording, and are thinned in a run without an end, of which the log has every frame.
 pub struct Back {
     pub vio: Vio,
+    /// What the newest frame led to.
+    update: Update,
     clock: Clock,
     pub trajectory: Thinned<TimedPose>,
-    /// Wall time of each frame, ms.
+    /// Wall time of each tracked frame, ms.
     pub ms: Thinned<f64>,
     /// Wall time of all frames, s.
     pub busy_s: f64,
     /// Health of every frame, with a pose or without.
     pub health: Thinned<(Nanos, Health)>,
-    /// Time from when the front end took a frame until its pose was there, ms.
+    /// Time from when the front end took a tracked frame until its pose was there, ms.
     pub frame_ms: Thinned<(Nanos, f64)>,
     pub cpu_s: Option<f64>,
     pub log: Option<LogSender>,
@@ -237,16 +266,17 @@ impl Back {
         if self.clock.went_back(Stream::Frames, t) {
             self.vio.change_clock(t, RELEARN);
         }
-        let update = self.vio.on_tracks(&packet.tracks);
+        let update = if packet.carried { self.vio.carry(t, &self.update) } else { self.vio.on_tracks(&packet.tracks) };
+        self.update = update;
         (packet.epoch, packet.health) = (update.epoch, update.health);
         packet.findings = self.vio.rig_findings();
         if self.epochs.last().is_none_or(|(_, last)| *last != update.epoch) {
             let _ = self.epochs.push((packet.frames.t, update.epoch));
         }
         let known = self.vio.known();
-        let exposed = self.vio.window().last().map(|(_, pose, _)| pose);
-        packet.tracked = update.odometry.zip(exposed).map(|(_, world_from_body)| Tracked {
-            world_from_body,
+        let exposed = self.vio.window().last().map(|(_, pose, _)| pose).filter(|_| !update.carried);
+        packet.tracked = update.odometry.map(|odometry| Tracked {
+            world_from_body: exposed.unwrap_or(odometry.world_from_body),
             keyframe: update.keyframe,
             body_from_cam: known.cameras.map(|cameras| cameras.body_from_cam),
             corrections: if update.keyframe { self.keyframe_poses() } else { List::default() },
@@ -256,10 +286,12 @@ impl Back {
         }
         let secs = begun.elapsed().as_secs_f64();
         self.busy_s += secs;
-        self.ms.push(secs * 1e3);
-        self.health.push((packet.frames.t, update.health));
+        self.health.push((t, update.health));
         let latency_ms = packet.begun.elapsed().as_secs_f64() * 1e3;
-        self.frame_ms.push((packet.frames.t, latency_ms));
+        if !packet.carried {
+            self.ms.push(secs * 1e3);
+            self.frame_ms.push((t, latency_ms));
+        }
         if let Some(newest) = &self.newest {
             newest.set(&update, known.imu_scale);
         }
@@ -276,7 +308,8 @@ impl Back {
 
     /// What the front end is to hear, once a frame.
     pub fn answer(&mut self) -> Answer {
-        Answer { rejected: self.vio.take_rejected(), known: self.vio.known() }
+        let is_sure = self.update.is_sure();
+        Answer { rejected: self.vio.take_rejected(), known: self.vio.known(), is_sure }
     }
 
     fn keyframe_poses(&self) -> List<(Nanos, Pose), FRAMES> {
@@ -315,9 +348,19 @@ impl OdometryRun {
         let frame_ms = f.build("tracking: latencies of frames", || Thinned::with_capacity(frames));
         footprint.extend(f);
         Ok(OdometryRun {
-            front: Front { frontend, predictor, clock: Clock::default(), ms: front_ms, busy_s: 0.0, cpu_s: None },
+            front: Front {
+                frontend,
+                predictor,
+                clock: Clock::default(),
+                schedule: Schedule::default(),
+                carried_px: board.frontend.carried_px,
+                ms: front_ms,
+                busy_s: 0.0,
+                cpu_s: None,
+            },
             back: Back {
                 vio,
+                update: Update::default(),
                 clock: Clock::default(),
                 trajectory,
                 ms,
@@ -339,15 +382,31 @@ impl OdometryRun {
     /// Frames a second while there are frames to track: over the time in which the busier thread was
     /// not waiting for one.
     pub fn fps(&self) -> Option<f64> {
+        let busy = self.busy_s();
+        (busy > 0.0).then(|| self.back.health.seen as f64 / busy)
+    }
+
+    /// Time in which the busier thread was not waiting for a frame, s.
+    fn busy_s(&self) -> f64 {
         let (front, back) = (self.front.busy_s, self.back.busy_s);
-        let busy = if self.threads == 1 { front + back } else { front.max(back) };
-        (busy > 0.0).then(|| self.back.ms.seen as f64 / busy)
+        if self.threads == 1 {
+            front + back
+        } else {
+            front.max(back)
+        }
+    }
+
+    /// Frames that inertia carried, beside those that were tracked.
+    pub fn left_out(&self) -> LeftOut {
+        let what = "Tracking of frames in which the view hardly moved";
+        let carried = self.back.vio.stats().frames_carried;
+        LeftOut::beside(what, carried, (self.back.ms.seen, self.busy_s()))
     }
 
     /// CPU time of all threads of tracking, ms a frame.
     pub fn cpu_ms(&self) -> Option<f64> {
         let total = self.front.cpu_s? + if self.threads == 1 { 0.0 } else { self.back.cpu_s? };
-        let frames = self.back.ms.seen;
+        let frames = self.back.health.seen;
         (frames > 0).then(|| 1e3 * total / frames as f64)
     }
 }
@@ -377,7 +436,7 @@ impl Tracker {
         let Some(run) = self.odometry() else { return vec![] };
         let mut list = run.front.frontend.stats().list();
         // The first frames of a run that starts in motion, and those after a reset.
-        list.push(("frames_without_odometry", run.back.frame_ms.seen.saturating_sub(run.back.trajectory.seen)));
+        list.push(("frames_without_odometry", run.back.health.seen.saturating_sub(run.back.trajectory.seen)));
         list.extend(run.back.vio.stats().list());
         list
     }
@@ -512,87 +571,5 @@ pub fn seal() {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::super::gate::{ImuGate, StampCounters, Stamps};
-    use super::*;
-    use crate::world::{Path, World, FRAME_SECS, RATE_HZ};
-    use stipple_drivers::source::ImuReading;
-
-    const PATH: Path = Path { rest: -1.0 };
-    /// Time at which both clocks go back, and by how much, s.
-    const STEP_AT: f64 = 12.0;
-    const BACK: f64 = 10.0;
-
-    fn stamp(arrival: f64) -> Nanos {
-        Nanos(((arrival - if arrival < STEP_AT { 0.0 } else { BACK }) * 1e9).round() as i64)
-    }
-
-    /// A frame with a pose: when it came, its epoch, by how much its place is off and the stated deviation of that, m.
-    struct Posed {
-        arrival: f64,
-        epoch: u32,
-        error_m: f64,
-        sigma_m: f64,
-    }
-
-    #[test]
-    fn clocks_that_go_back_for_good_begin_an_epoch_within_seconds() {
-        let board = include_str!("../../board-configs/lavapipe.toml");
-        let board = Board::parse("lavapipe.toml", board, &[]).expect("a board of ours");
-        let mut world = World::new(PATH);
-        let run = OdometryRun::new(&world.rig, &board, 1000).expect("a rig of two cameras");
-        let OdometryRun { mut front, mut back, .. } = run;
-        let (counters, mut imu, mut stamps) = (Counters::default(), ImuGate::new(&world.rig.imu), Stamps::default());
-        let frame_counters = StampCounters {
-            missing: &counters.frames_missing,
-            not_newer: &counters.frames_not_newer,
-            jumped: &counters.frames_timestamp_jump,
-        };
-        let mut packets = [(); 3].map(|()| FramePacket::for_rig(&world.rig, 0));
-        let start = back.answer();
-        let (mut answer, mut next, mut sample) = (start.clone(), start, 0);
-        let (mut posed, mut resets): (Vec<Posed>, usize) = (vec![], 0);
-        let mut world_from_truth = None;
-        for frame in 0..400 {
-            let arrival = f64::from(frame) * FRAME_SECS + 0.0012;
-            let packet = &mut packets[0];
-            while f64::from(sample) / RATE_HZ < arrival + 1.0 / RATE_HZ {
-                let at = f64::from(sample) / RATE_HZ;
-                let now = Nanos((at * 1e9) as i64);
-                let sample_now = ImuSample { t: stamp(at), ..world.imu(at) };
-                let reading = ImuReading { sample: sample_now, ..ImuReading::default() };
-                imu.pass(&reading, now, &counters, &mut |s| packet.push_imu(s, &counters));
-                sample += 1;
-            }
-            let mut tracks = Tracks::default();
-            world.tracks(arrival, &mut tracks);
-            tracks.t = stamp(arrival);
-            if !stamps.admit(tracks.t, Nanos((arrival * 1e9) as i64), &frame_counters) {
-                continue;
-            }
-            packet.writable().expect("two frames were tracked since").t = tracks.t;
-            front.track(packet, &answer);
-            packet.tracks = tracks;
-            back.estimate(packet);
-            (answer, next) = (next, back.answer());
-            resets += usize::from(packet.health.has(Health::FRAME_GAP_RESET));
-            if let (Some(tracked), Some(c)) = (&packet.tracked, back.vio.covariance()) {
-                let (pose, truth) = (tracked.world_from_body, PATH.pose(arrival));
-                let world_from_truth = *world_from_truth.get_or_insert(pose * truth.inverse());
-                let error_m = (pose.p - (world_from_truth * truth).p).length();
-                let sigma_m = c[0][0].max(c[1][1]).max(c[2][2]).sqrt();
-                posed.push(Posed { arrival, epoch: packet.epoch, error_m, sigma_m });
-            }
-            packet.clear();
-            packets.rotate_left(1);
-        }
-        let before = posed.iter().rfind(|p| p.arrival < STEP_AT).expect("it flies before");
-        assert!(before.epoch == 0 && before.arrival > STEP_AT - 0.1);
-        let after = posed.iter().find(|p| p.arrival > STEP_AT).expect("it flies after");
-        eprintln!("back after {:.2} s, {:.2} m off of {:.2} m", after.arrival - STEP_AT, after.error_m, after.sigma_m);
-        assert!(after.arrival < STEP_AT + 4.0 && after.error_m < 3.0 * after.sigma_m);
-        assert!((after.epoch, resets, back.vio.stats().resets_frame_gap) == (1, 1, 1));
-        let last = posed.last().expect("it flies to the end");
-        assert!(last.epoch == 1 && last.arrival > 19.9, "{} at {}", last.epoch, last.arrival);
-    }
-}
+#[path = "clock_tests.rs"]
+mod clock_tests;

@@ -15,6 +15,7 @@
 //! bit-identical output; `hash` compares keyframe poses. Nothing is allocated after `new`.
 
 mod alignment;
+mod carried;
 mod convergence;
 mod elimination;
 mod estimator;
@@ -45,6 +46,7 @@ mod triangulation;
 mod window;
 mod zero_velocity;
 
+pub use carried::Schedule;
 pub use convergence::{Finding, Findings, Judged, Part};
 pub use health::Health;
 pub use predictor::{Predicted, Predictor};
@@ -134,6 +136,8 @@ pub struct Update {
     pub odometry: Option<Odometry>,
     /// The last state that was trusted, carried on by inertia, while there is no `odometry`.
     pub dead_reckoned: Option<Odometry>,
+    /// Nobody looked at the frame: inertia carried the odometry of the one before.
+    pub carried: bool,
     /// Covariance of whichever of the two there is, as `Vio::covariance`.
     pub covariance: Option<[[f64; 15]; 15]>,
     pub keyframe: bool,
@@ -272,11 +276,7 @@ impl Vio {
             update.quality = update.quality.min(QUALITY_SUSPECT);
         }
         (update.epoch, update.covariance) = (self.epoch, self.covariance);
-        if update.odometry.is_none() {
-            let carried = self.recovery.dead_reckoned(tracks.t, &self.imu, &self.estimator.model.noise).unzip();
-            (update.dead_reckoned, update.covariance) = (carried.0.map(|m| Odometry::new(tracks.t, &m)), carried.1);
-        }
-        update.health.set(Health::DEAD_RECKONED, update.dead_reckoned.is_some());
+        self.dead_reckon(tracks.t, &mut update);
         self.stats.camera_blind += u64::from(update.health.has(Health::ONE_CAMERA_BLIND));
         self.tally.add(update.health, update.odometry.map(|_| update.quality));
         match (self.estimator.newest(), &self.covariance) {
@@ -284,6 +284,15 @@ impl Vio {
             _ => self.recovery.invalidate(),
         }
         update
+    }
+
+    /// Fills in where inertia puts the vehicle at `t`, where there is no odometry.
+    fn dead_reckon(&mut self, t: Nanos, update: &mut Update) {
+        if update.odometry.is_none() {
+            let carried = self.recovery.dead_reckoned(t, &self.imu, &self.estimator.model.noise).unzip();
+            (update.dead_reckoned, update.covariance) = (carried.0.map(|m| Odometry::new(t, &m)), carried.1);
+        }
+        update.health.set(Health::DEAD_RECKONED, update.dead_reckoned.is_some());
     }
 
     /// The tracks that a tracker of this rig can give: no cameras it has not, no pixels that are none, ids in order.

@@ -80,6 +80,12 @@ impl Predictor {
         }
     }
 
+    /// Whether the samples up to `t` are there and sound, so that a frame at `t` may be left to them.
+    pub fn is_sound(&self, t: Nanos) -> bool {
+        let sound = |s: &ImuSample| !s.doubted && s.saturated == [false; 2] && !self.noise.is_gap((t - s.t).secs());
+        self.imu.newest().is_some_and(|s| sound(s))
+    }
+
     /// Takes the factors less one by which readings are to be multiplied, as `Vio::known` has them.
     pub fn set_scale(&mut self, scale: [DVec3; 2]) {
         self.imu.scale = scale;
@@ -114,7 +120,14 @@ impl Predictor {
     /// `state` is what the estimator knew after the frame two before this one; without it, or with one of a clock that was
     /// ahead, only the gyro predicts, a rotation. Samples up to `t` must have come; the newest is held where they have not.
     pub fn motion_to(&mut self, t: Nanos, state: Option<&Odometry>) -> Option<Pose> {
-        let last = self.last.replace(t)?;
+        let motion = self.motion_since_last(t, state);
+        self.last = Some(t);
+        motion
+    }
+
+    /// The same without taking the frame at `t` to be the one before the next.
+    pub fn motion_since_last(&self, t: Nanos, state: Option<&Odometry>) -> Option<Pose> {
+        let last = self.last?;
         let Some(state) = state.filter(|s| s.t <= t) else {
             let inc = self.imu.integrate_scaled(last, t, DVec3::ZERO, DVec3::ZERO, &self.noise);
             return Some(Pose::new(inc.q, DVec3::ZERO));

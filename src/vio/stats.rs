@@ -13,6 +13,8 @@ counters! {
     imu_gaps,
     /// Frames not newer than the last.
     frames_rejected,
+    /// Frames that were left to inertia.
+    frames_carried,
     /// Tracks of cameras the rig has not, with pixels that are none, or out of order.
     tracks_rejected,
     /// Views of known landmarks too far from where these must be.
