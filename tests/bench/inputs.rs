@@ -8,8 +8,13 @@ use stipple_drivers::sim::{self, rig_named, Scenario, Sim};
 use stipple_drivers::{Calibration, Fault, FaultKind, Frames, ImuSample, Span, TimedPose};
 
 /// Name, scenario and rig: two cameras, or one, whose window says less and needs more iterations.
-const NAMED: [(&str, &str, Option<&str>); 3] =
-    [("demo", "demo", None), ("aggressive", "aggressive", None), ("demo, one camera", "demo", Some("mono"))];
+const NAMED: [(&str, &str, Option<&str>); 5] = [
+    ("demo", "demo", None),
+    ("aggressive", "aggressive", None),
+    ("demo, one camera", "demo", Some("mono")),
+    ("hover", "hover", None),
+    ("pauses", "pauses", None),
+];
 pub const RECORDING: &str = "euroc_MH_01_easy_11s";
 /// Recorded flights and where in them to begin, s: at rest, just before taking off.
 const RECORDED: [(&str, f64); 3] = [("MH_04_difficult", 16.0), ("V1_02_medium", 1.0), ("V2_02_medium", 0.0)];

@@ -16,7 +16,7 @@ use serde_json::json;
 use settings::{curves, Setting, DEFAULT};
 use std::time::Instant;
 use stipple::output::OutputDir;
-use stipple_drivers::Fault;
+use stipple_drivers::{Fault, FaultKind};
 
 /// Length of each input when not stated, and at most, s: an input is in memory whole, 14 MB a second.
 const SECONDS: f64 = 12.0;
@@ -42,6 +42,9 @@ pub struct Args {
     /// The default settings only: a row a flight
     #[arg(long, conflicts_with = "quick")]
     defaults: bool,
+    /// One parameter of the sweep alone, beside the default
+    #[arg(long, value_name = "SECTION.KEY", conflicts_with_all = ["quick", "defaults"])]
+    only: Option<String>,
 }
 
 /// One input at one setting.
@@ -78,17 +81,21 @@ pub fn run(args: &Args) -> Result<(), Fault> {
     let out = OutputDir::create(&args.folders.out)?;
     let (inputs, settings, seconds) = match args.quick {
         true => (inputs::quick(), settings::quick(), args.seconds.unwrap_or(QUICK_SECONDS)),
-        false => (
-            inputs::all(&args.folders)?,
-            if args.defaults { settings::default() } else { settings::all() },
-            args.seconds.unwrap_or(SECONDS).min(SECONDS_MAX),
-        ),
+        false => (inputs::all(&args.folders)?, chosen(args)?, args.seconds.unwrap_or(SECONDS).min(SECONDS_MAX)),
     };
     let sweep = fly(&inputs, settings, seconds)?;
     page(&sweep).write(&out)?;
     out.write("odometry.svg", |w| charts::picture(w, &sweep))?;
     println!("{}\n{}", conclusion(&sweep), out.file("odometry.html").display());
     Ok(())
+}
+
+fn chosen(args: &Args) -> Result<Vec<Setting>, Fault> {
+    let Some(key) = &args.only else {
+        return Ok(if args.defaults { settings::default() } else { settings::all() });
+    };
+    let fix = format!("name one of {}", settings::keys().join(", "));
+    settings::of(key).ok_or_else(|| Fault::new(FaultKind::Usage, key, "is no parameter of the sweep", fix))
 }
 
 fn fly(inputs: &[Input], settings: Vec<Setting>, seconds: f64) -> Result<Sweep, Fault> {
@@ -245,6 +252,7 @@ fn figures(sweep: &Sweep) -> Table {
         number("iterations a frame", "", 1) => r.figures.iterations_per_frame,
         count("frames") => sweep.inputs[r.input].frames,
         count("frames with pose") => r.figures.tracked,
+        count("left to inertia") => r.figures.carried,
         count("keyframes") => r.figures.keyframes,
         count("resets") => r.figures.resets,
         text("hash") => format!("{:016x}", r.figures.hash),

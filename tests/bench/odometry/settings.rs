@@ -5,7 +5,8 @@ use crate::run::default_board;
 use stipple::config::Board;
 
 /// Parameter and values; the default joins them where it is not among them.
-const PARAMETERS: [(&str, &[f64]); 10] = [
+const PARAMETERS: [(&str, &[f64]); 11] = [
+    ("frontend.carried_px", &[0.0, 2.0, 4.0, 8.0, 16.0, 1000.0]),
     ("frontend.grid_px", &[40.0, 50.0, 60.0, 70.0, 80.0]),
     ("frontend.fast_threshold_min", &[5.0, 10.0, 20.0]),
     ("frontend.iterations", &[2.0, 3.0, 5.0, 8.0]),
@@ -66,6 +67,19 @@ pub fn all() -> Vec<Setting> {
     let owned = |set: &[&str]| set.iter().map(|s| s.to_string()).collect();
     all.extend(SHAPES.iter().map(|(name, set)| setting(format!("shape {name}"), owned(set))));
     all
+}
+
+/// Parameters of the sweep.
+pub fn keys() -> [&'static str; PARAMETERS.len()] {
+    PARAMETERS.map(|(key, _)| key)
+}
+
+/// The default and the other values of one parameter; `None` where the sweep has no such parameter.
+pub fn of(key: &str) -> Option<Vec<Setting>> {
+    let prefix = format!("{key}=");
+    let settings: Vec<Setting> =
+        all().into_iter().filter(|s| s.set.is_empty() || s.set.len() == 1 && s.name.starts_with(&prefix)).collect();
+    (settings.len() > 1).then_some(settings)
 }
 
 /// The default alone.
