@@ -11,8 +11,10 @@ use stipple_drivers::{Nanos, Pose};
 pub struct Choice {
     /// Keyframes by how near they are, m.
     pub order: Vec<(f32, u32)>,
-    /// Gaussians that each of them needs and that are not wanted, and how many of a block it must see to need the block.
-    pub lacking: Vec<(usize, f32)>,
+    /// Gaussians that each of them needs and that are not wanted.
+    pub lacking: Vec<usize>,
+    /// For each block a bit for each keyframe of `order` that needs it; none once it is wanted.
+    pub needed_by: Vec<u128>,
     pub wanted: Vec<bool>,
     /// Which blocks the newest keyframes see.
     pub now_seen: Vec<bool>,
@@ -48,6 +50,7 @@ impl Choice {
         Choice {
             order: Vec::with_capacity(keyframes),
             lacking: Vec::with_capacity(keyframes),
+            needed_by: vec![0; BLOCKS_KNOWN],
             wanted: vec![false; BLOCKS_KNOWN],
             now_seen: Vec::with_capacity(BLOCKS_KNOWN),
             evict,

@@ -38,8 +38,8 @@ const LEFT_MAX: f32 = 0.04;
 /// A keyframe as near as this, m, looks at the same as the newest where they, too, see this part of what it sees.
 const LOCAL_M: f32 = 2.0;
 const SHARED_MIN: f32 = 0.8;
-/// Keyframes nearest to a place whose blocks may be wanted there.
-const NEAREST: usize = 128;
+/// Keyframes nearest to a place whose blocks may be wanted there: as many as `Choice::needed_by` has bits.
+const NEAREST: usize = u128::BITS as usize;
 /// What is as near as this to the vehicle, m, is thinned rather than left out.
 const NEAR_M: f32 = 8.0;
 /// A block of which a keyframe sees less than this part of what it sees of its blocks on average is not fetched for it.
@@ -229,30 +229,38 @@ impl Archive {
         let order = std::mem::take(&mut self.choice.order);
         let mut lacking = std::mem::take(&mut self.choice.lacking);
         let Archive { sight, blocks, choice, .. } = self;
-        let lacks = |wanted: &[bool], keyframe: u32, least: f32| -> usize {
-            let seen = seen_by(sight, blocks, keyframe as usize);
-            seen.filter(|(b, n)| *n > least && !wanted[*b]).map(|(b, _)| blocks[b].count as usize).sum()
-        };
         lacking.clear();
-        for &(_, keyframe) in &order {
+        choice.needed_by.fill(0);
+        debug_assert!(order.len() <= NEAREST);
+        for (nth, &(_, keyframe)) in order.iter().enumerate() {
             let (mut all, mut n) = (0.0, 0.0f32);
             seen_by(sight, blocks, keyframe as usize).for_each(|(_, seen)| (all, n) = (all + seen, n + 1.0));
             let least = NEEDED_MIN * all / n.max(1.0);
-            lacking.push((lacks(&choice.wanted, keyframe, least), least));
-        }
-        loop {
-            let fits = |i: &usize| (1..=room).contains(&lacking[*i].0);
-            let Some(next) = (0..order.len()).filter(fits).min_by_key(|i| (lacking[*i].0, *i)) else { break };
-            let (keyframe, (count, least)) = (order[next].1, lacking[next]);
+            let mut lacks = 0;
             for (block, seen) in seen_by(sight, blocks, keyframe as usize) {
                 if seen > least && !choice.wanted[block] {
-                    choice.wanted[block] = true;
-                    choice.blocks.push(block as u32);
+                    choice.needed_by[block] |= 1 << nth;
+                    lacks += blocks[block].count as usize;
                 }
             }
-            room -= count;
-            for (lacking, &(_, other)) in lacking.iter_mut().zip(&order).filter(|(lacking, _)| lacking.0 > 0) {
-                lacking.0 = lacks(&choice.wanted, other, lacking.1);
+            lacking.push(lacks);
+        }
+        loop {
+            let fits = |i: &usize| (1..=room).contains(&lacking[*i]);
+            let Some(next) = (0..order.len()).filter(fits).min_by_key(|i| (lacking[*i], *i)) else { break };
+            room -= lacking[next];
+            for block in sight.blocks(order[next].1 as usize) {
+                if choice.needed_by[block] >> next & 1 == 0 {
+                    continue;
+                }
+                choice.wanted[block] = true;
+                choice.blocks.push(block as u32);
+                // All who need it lack less.
+                let mut needed_by = std::mem::take(&mut choice.needed_by[block]);
+                while needed_by != 0 {
+                    lacking[needed_by.trailing_zeros() as usize] -= blocks[block].count as usize;
+                    needed_by &= needed_by - 1;
+                }
             }
         }
         (self.choice.order, self.choice.lacking) = (order, lacking);
