@@ -16,12 +16,12 @@ section! {
     grid_px: u32 = 60, Bound::Within(16.0, 200.0);
     /// Least contrast of a corner, grey levels. Raise it to spend less time on faint corners.
     fast_threshold_min: u32 = 5, Bound::Within(1.0, 255.0);
-    /// Where odometry is sure, a frame in which the view has moved less than this since the last tracked one is left to inertia,
-    /// px: of frames at 20 Hz every other one at most. 0: every frame is tracked, for up to twice the CPU time.
-    carried_px: f64 = 16.0, Bound::Within(0.0, 1000.0);
     tuning
     /// FAST threshold that detection begins with, grey levels; it is halved down to `fast_threshold_min`.
     fast_threshold: u32 = 40;
+    /// Motion of the view since the last tracked frame, px, below which a frame is left to inertia where odometry is sure; none
+    /// is where it is 0.
+    carried_px: f64 = 16.0;
     /// Inverse-compositional iterations a level.
     iterations: u32 = 3;
     /// Largest distance between a point and its match followed back, px.

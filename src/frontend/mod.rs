@@ -199,8 +199,8 @@ impl Frontend {
         &self.tracks
     }
 
-    /// About how far the view has moved by a motion since the last frame, px: what turns it, and what moves the point of median
-    /// distance aside.
+    /// Estimates how far the view has moved by a motion since the last frame, px: focal length times the rotation and what moves
+    /// the point of median distance aside.
     pub fn flow_px(&mut self, prev_from_now: &Pose) -> f64 {
         let angle = 2.0 * prev_from_now.q.xyz().length().min(1.0).asin();
         self.rig.focal_px() * (angle + self.median_inverse_depth() * prev_from_now.p.length())

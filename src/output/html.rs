@@ -187,7 +187,7 @@ fn table_of_left_out(report: &Report) -> String {
     if rows.is_empty() {
         return String::new();
     }
-    table("Left out, as nothing needed it", &rows)
+    table("Work left out", &rows)
 }
 
 /// What closed loops did to the map; empty where none was scored.
@@ -324,7 +324,7 @@ fn tracking_time(frames: &[(Nanos, f64)]) -> [Option<String>; 2] {
     let most = (2.0 * p99).max(f64::MIN_POSITIVE);
     let points = frames.iter().map(|&(t, ms)| ((t - start).secs(), ms)).collect();
     let over_time = Chart {
-        title: "Tracking time of each frame",
+        title: "Tracking time of each tracked frame",
         x: "time, s",
         y: "ms",
         from_zero: true,

@@ -57,7 +57,7 @@ fn clocks_that_go_back_for_good_begin_an_epoch_within_seconds() {
         if !stamps.admit(tracks.t, Nanos((arrival * 1e9) as i64), &frame_counters) {
             continue;
         }
-        packet.writable().expect("two frames were tracked since").t = tracks.t;
+        packet.writable().expect("the front end holds another").t = tracks.t;
         front.track(packet, &answer);
         packet.tracks = tracks;
         back.estimate(packet);

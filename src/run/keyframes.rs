@@ -383,7 +383,10 @@ impl Keyframes {
     pub fn pass_on(&mut self, packet: &FramePacket, ring: Option<&KeyframeRing>, counters: &Counters) {
         let Some(tracked) = &packet.tracked else { return };
         if !tracked.keyframe {
-            self.loops.iter_mut().filter(|_| !packet.blank).for_each(|loops| loops.ask(packet, tracked, counters));
+            self.loops
+                .iter_mut()
+                .filter(|_| !packet.blank && !packet.carried)
+                .for_each(|loops| loops.ask(packet, tracked, counters));
             return;
         }
         if packet.blank {

@@ -1,4 +1,4 @@
-//! The deterministic pace: every frame is tracked, and mapping gets a stated number of steps. For comparisons at equal
+//! The deterministic pace: no frame is dropped, and mapping gets a stated number of steps. For comparisons at equal
 //! time mapping gets an equal part of a stated time a frame instead; then only tracking is deterministic.
 //!
 //! Frames are decoded a batch at a time into memory and tracked when the batch is there, so decoding is in no figure and

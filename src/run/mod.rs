@@ -100,7 +100,7 @@ pub enum Pace {
     /// Frames arrive at their time; what is not done in time is not done.
     #[default]
     Recorded,
-    /// Deterministic: every frame is tracked, and mapping takes a stated number of steps.
+    /// Deterministic: no frame is dropped, and mapping takes a stated number of steps.
     Lockstep(Steps),
 }
 

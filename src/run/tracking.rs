@@ -53,7 +53,7 @@ pub struct Tracked {
 
 /// One frame on its way through tracking: its images, the inertial samples since the frame before, and the result.
 pub struct FramePacket {
-    /// Shared with the front end until it has tracked the frame after this.
+    /// Shared with the front end until it has tracked a later frame.
     pub frames: Arc<Frames>,
     /// Holds samples alone: no frame came for so long that they would not fit before the next.
     pub imu_only: bool,
@@ -164,7 +164,7 @@ pub struct Front {
     carried_px: f64,
     /// Wall time of each tracked frame, ms.
     pub ms: Thinned<f64>,
-    /// Wall time of all frames, with what was waited for the back end, s.
+    /// Wall time of tracked frames, with what was waited for the back end, s.
     pub busy_s: f64,
     /// CPU time of the thread, s; that of both halves where they share one.
     pub cpu_s: Option<f64>,
@@ -192,6 +192,7 @@ impl Front {
         }
         packet.carried = self.leaves_out(t, answer);
         if packet.carried {
+            packet.verdicts = self.frontend.verdicts();
             packet.cpu = thread_cpu_now() - cpu;
             return;
         }
@@ -212,8 +213,10 @@ impl Front {
 impl Front {
     /// Whether the frame at `t` is left to inertia.
     fn leaves_out(&mut self, t: Nanos, answer: &Answer) -> bool {
-        let has_time = self.schedule.has_time(t) && answer.is_sure && self.predictor.is_sound(t);
-        let motion = self.predictor.motion_since_last(t, answer.known.odometry.as_ref()).filter(|_| has_time);
+        if !self.schedule.has_time(t) || !answer.is_sure || !self.predictor.is_sound(t) {
+            return false;
+        }
+        let motion = self.predictor.motion_since_last(t, answer.known.odometry.as_ref());
         motion.is_some_and(|motion| self.frontend.flow_px(&motion) < self.carried_px)
     }
 }
@@ -225,7 +228,7 @@ const EPOCHS: usize = 64;
 /// recording, and are thinned in a run without an end, of which the log has every frame.
 pub struct Back {
     pub vio: Vio,
-    /// What the newest frame led to.
+    /// What the newest frame led to that was not refused.
     update: Update,
     clock: Clock,
     pub trajectory: Thinned<TimedPose>,
@@ -267,7 +270,9 @@ impl Back {
             self.vio.change_clock(t, RELEARN);
         }
         let update = if packet.carried { self.vio.carry(t, &self.update) } else { self.vio.on_tracks(&packet.tracks) };
-        self.update = update;
+        if !update.health.has(Health::FRAME_REJECTED) {
+            self.update = update;
+        }
         (packet.epoch, packet.health) = (update.epoch, update.health);
         packet.findings = self.vio.rig_findings();
         if self.epochs.last().is_none_or(|(_, last)| *last != update.epoch) {
@@ -379,28 +384,20 @@ impl OdometryRun {
         })
     }
 
-    /// Frames a second while there are frames to track: over the time in which the busier thread was
+    /// Tracked frames a second while there are frames to track: over the time in which the busier thread was
     /// not waiting for one.
     pub fn fps(&self) -> Option<f64> {
-        let busy = self.busy_s();
-        (busy > 0.0).then(|| self.back.health.seen as f64 / busy)
-    }
-
-    /// Time in which the busier thread was not waiting for a frame, s.
-    fn busy_s(&self) -> f64 {
         let (front, back) = (self.front.busy_s, self.back.busy_s);
-        if self.threads == 1 {
-            front + back
-        } else {
-            front.max(back)
-        }
+        let busy = if self.threads == 1 { front + back } else { front.max(back) };
+        (busy > 0.0).then(|| self.back.ms.seen as f64 / busy)
     }
 
-    /// Frames that inertia carried, beside those that were tracked.
+    /// Frames that were left to inertia, beside those that were tracked.
     pub fn left_out(&self) -> LeftOut {
-        let what = "Tracking of frames in which the view hardly moved";
-        let carried = self.back.vio.stats().frames_carried;
-        LeftOut::beside(what, carried, (self.back.ms.seen, self.busy_s()))
+        let mean_ms = |ms: &[f64]| ms.iter().sum::<f64>() / ms.len().max(1) as f64;
+        let (carried, tracked) = (self.back.vio.stats().frames_carried, self.back.ms.seen);
+        let each_s = 1e-3 * (mean_ms(&self.front.ms) + mean_ms(&self.back.ms));
+        LeftOut::beside("Frames in which the view hardly moved", carried, (tracked, each_s * tracked as f64))
     }
 
     /// CPU time of all threads of tracking, ms a frame.
@@ -570,6 +567,9 @@ pub fn seal() {
     seal_thread();
 }
 
+#[cfg(test)]
+#[path = "carried_tests.rs"]
+mod carried_tests;
 #[cfg(test)]
 #[path = "clock_tests.rs"]
 mod clock_tests;

@@ -9,7 +9,7 @@ use super::recovery::DeadReckoning;
 use super::{Odometry, Update, Vio};
 use stipple_drivers::Nanos;
 
-/// Time between two tracked frames, at most, s: at 20 Hz one frame of two is tracked.
+/// A frame may be left out when the next is expected within this after the last tracked one, s: at 20 Hz one of two.
 const APART_S: f64 = 0.11;
 /// Quality from which odometry is sure.
 const SURE: u8 = 60;
@@ -45,12 +45,30 @@ impl Schedule {
 }
 
 impl Vio {
-    /// A frame at `t` that nobody looked at. `last` is what the frame before it led to: health, landmarks and quality remain
-    /// those, less what the velocity has become uncertain by.
+    /// Whether a frame is newer than all before it.
+    pub(super) fn admits(&mut self, t: Nanos) -> bool {
+        let newer = self.stamp.is_none_or(|stamp| t > stamp);
+        self.stamp = if newer { Some(t) } else { self.stamp };
+        newer
+    }
+
+    /// What a frame leads to that is refused.
+    pub(super) fn rejected(&mut self) -> Update {
+        self.stats.frames_rejected += 1;
+        self.tally.add(Health::FRAME_REJECTED, None);
+        Update { epoch: self.epoch, health: Health::FRAME_REJECTED, ..Update::default() }
+    }
+
+    /// Carries the estimate to a frame at `t` that was not tracked. `last` is what the newest frame led to that was not refused:
+    /// its landmarks remain; its health, with what the samples since suffered; and its quality, less what the velocity has
+    /// become uncertain by. A frame that is not newer than the last is refused and counted.
     pub fn carry(&mut self, t: Nanos, last: &Update) -> Update {
+        if !self.admits(t) {
+            return self.rejected();
+        }
         self.stats.frames_carried += 1;
         // A reset was told with its frame.
-        let health = Health(last.health.0 & !Health::RESETS.0);
+        let health = Health(last.health.0 & !Health::RESETS.0) | self.pending;
         let mut update = Update { epoch: self.epoch, health, keyframe: false, odometry: None, carried: false, ..*last };
         if let Some(newest) = self.estimator.newest() {
             let mut state = DeadReckoning::new(newest.t, &newest.now, &self.covariance.unwrap_or_default());

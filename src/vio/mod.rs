@@ -136,7 +136,7 @@ pub struct Update {
     pub odometry: Option<Odometry>,
     /// The last state that was trusted, carried on by inertia, while there is no `odometry`.
     pub dead_reckoned: Option<Odometry>,
-    /// Nobody looked at the frame: inertia carried the odometry of the one before.
+    /// The frame was left to inertia, which carried the odometry of the last tracked one.
     pub carried: bool,
     /// Covariance of whichever of the two there is, as `Vio::covariance`.
     pub covariance: Option<[[f64; 15]; 15]>,
@@ -159,7 +159,8 @@ pub struct Vio {
     convergence: Convergence,
     /// Covariance of the newest state in the world of the first start.
     covariance: Option<Covariance>,
-    /// Stamp of the newest frame.
+    /// Stamp of the newest frame, and of the newest that was tracked.
+    stamp: Option<Nanos>,
     last: Option<Nanos>,
     /// What the inertial samples since then suffered.
     pending: Health,
@@ -180,6 +181,7 @@ impl Vio {
             monitor: Monitor::default(),
             recovery: Recovery::default(),
             covariance: None,
+            stamp: None,
             last: None,
             pending: Health::default(),
             stats: Stats::default(),
@@ -247,13 +249,10 @@ impl Vio {
     /// Takes what the cameras saw at one instant. Inertial samples up to it must have come before;
     /// where they have not, the last is taken as constant. A frame that is not newer than the last is refused and counted.
     pub fn on_tracks(&mut self, tracks: &Tracks) -> Update {
-        let last = self.last;
-        if last.is_some_and(|t| tracks.t <= t) {
-            self.stats.frames_rejected += 1;
-            self.tally.add(Health::FRAME_REJECTED, None);
-            return Update { epoch: self.epoch, health: Health::FRAME_REJECTED, ..Update::default() };
+        if !self.admits(tracks.t) {
+            return self.rejected();
         }
-        self.last = Some(tracks.t);
+        let last = self.last.replace(tracks.t);
         let tracks = &self.admitted(tracks);
         let mut reset = None;
         if self.is_running() && last.is_some_and(|t| (tracks.t - t).secs() > FRAME_GAP_MAX) {
@@ -423,7 +422,7 @@ impl Vio {
         self.recovery.interrupt(t - unheard - newest);
         self.imu.clear();
         self.estimator.heights.iter_mut().for_each(Heights::forget_readings);
-        self.last = None;
+        (self.stamp, self.last) = (None, None);
         self.pending.set(Reset::FrameGap.bit(), true);
         self.reset_for(Reset::FrameGap);
     }

@@ -28,7 +28,7 @@ use stipple_drivers::{Calibration, ImuSample, Nanos, Pose, Span};
 pub struct Predictor {
     noise: Noise,
     imu: ImuRing,
-    /// Stamp of the frame before.
+    /// Stamp of the last tracked frame.
     last: Option<Nanos>,
     newest: Option<Newest>,
 }
@@ -80,10 +80,9 @@ impl Predictor {
         }
     }
 
-    /// Whether the samples up to `t` are there and sound, so that a frame at `t` may be left to them.
+    /// Whether the samples since the last tracked frame are there and sound, so that one at `t` may be left to them.
     pub fn is_sound(&self, t: Nanos) -> bool {
-        let sound = |s: &ImuSample| !s.doubted && s.saturated == [false; 2] && !self.noise.is_gap((t - s.t).secs());
-        self.imu.newest().is_some_and(|s| sound(s))
+        self.last.is_some_and(|last| self.imu.is_sound(last, t, &self.noise))
     }
 
     /// Takes the factors less one by which readings are to be multiplied, as `Vio::known` has them.
@@ -116,7 +115,7 @@ impl Predictor {
         Some((places, cameras.rotation_sigma + cameras.time_sigma * twist.w.length()))
     }
 
-    /// Motion of the body from the frame before to the one at `t`, `before_from_now`; `None` at the first frame.
+    /// Motion of the body from the last tracked frame to the one at `t`, which is the last from now on, `before_from_now`; `None` at the first frame.
     /// `state` is what the estimator knew after the frame two before this one; without it, or with one of a clock that was
     /// ahead, only the gyro predicts, a rotation. Samples up to `t` must have come; the newest is held where they have not.
     pub fn motion_to(&mut self, t: Nanos, state: Option<&Odometry>) -> Option<Pose> {
@@ -125,7 +124,7 @@ impl Predictor {
         motion
     }
 
-    /// The same without taking the frame at `t` to be the one before the next.
+    /// Motion as `motion_to` gives it, without the frame at `t` becoming the last.
     pub fn motion_since_last(&self, t: Nanos, state: Option<&Odometry>) -> Option<Pose> {
         let last = self.last?;
         let Some(state) = state.filter(|s| s.t <= t) else {

@@ -58,6 +58,18 @@ impl ImuRing {
         self.samples.front().is_some_and(|s| s.t <= t)
     }
 
+    /// Whether the samples from `from` to `to` are there, believed and within the sensor's range.
+    pub fn is_sound(&self, from: Nanos, to: Nanos, noise: &Noise) -> bool {
+        let mut at = from;
+        let mut sound = |s: &ImuSample| {
+            let gap = noise.is_gap((s.t - at).secs());
+            at = s.t;
+            !gap && !s.doubted && s.saturated == [false; 2]
+        };
+        let all = self.samples.range(self.after(from)..self.after(to)).all(&mut sound);
+        all && self.covers(from) && !noise.is_gap((to - at).secs())
+    }
+
     #[cfg(test)]
     pub fn iter(&self) -> impl Iterator<Item = &ImuSample> {
         self.samples.iter()

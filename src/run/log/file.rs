@@ -28,7 +28,7 @@ const CHANNELS: [(&str, &str, &str); 7] = [
         r#"{"type":"object","properties":{"t_ns":{"type":"integer"},"time_offsets_ns":{"type":"array","items":{"type":"integer"}},"epoch":{"type":"integer"},"estimate":{"type":"object","properties":{
 "p_m":{"type":"array","items":{"type":"number"}},"q_xyzw":{"type":"array","items":{"type":"number"}},
 "v_world":{"type":"array","items":{"type":"number"}},"gyro_bias":{"type":"array","items":{"type":"number"}},
-"accel_bias":{"type":"array","items":{"type":"number"}}}},"dead_reckoned":{"type":"boolean"},
+"accel_bias":{"type":"array","items":{"type":"number"}}}},"dead_reckoned":{"type":"boolean"},"carried":{"type":"boolean"},
 "sigma":{"type":"array","items":{"type":"number"}},"health":{"type":"integer"},"quality":{"type":"integer"},
 "keyframe":{"type":"boolean"},"latency_ms":{"type":"number"},"cpu_ms":{"type":"number"}}}"#,
     ),

@@ -108,6 +108,9 @@ pub struct State {
     pub estimate: Option<Estimate>,
     /// The estimate is the last one that was trusted, carried on by inertia: no estimator runs.
     pub dead_reckoned: bool,
+    /// The frame was not tracked: the estimate is that of the last tracked one, carried on by inertia.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub carried: bool,
     /// Standard deviations of the estimate: position, m, and velocity, m/s, in the world; rotation, rad, in the body.
     pub sigma: Option<[f32; 9]>,
     /// The bits of `Health`, which the channel names.
@@ -162,6 +165,7 @@ impl State {
             epoch: update.epoch,
             estimate,
             dead_reckoned: update.dead_reckoned.is_some(),
+            carried: update.carried,
             sigma: sigma.filter(|_| estimate.is_some()),
             health: update.health.0,
             quality: update.quality,

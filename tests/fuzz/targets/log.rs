@@ -30,6 +30,7 @@ fn state(i: i64) -> State {
         estimate,
         time_offsets_ns: (i % 3 == 0).then_some([4, -4, 0, 0]),
         dead_reckoned: i % 7 == 0,
+        carried: i % 3 == 0,
         sigma: estimate.map(|_| [0.25; 9]),
         health: 1,
         quality: 9,
