@@ -208,9 +208,7 @@ impl Front {
         self.ms.push(secs * 1e3);
         packet.cpu = thread_cpu_now() - cpu;
     }
-}
 
-impl Front {
     /// Whether the frame at `t` is left to inertia.
     fn leaves_out(&mut self, t: Nanos, answer: &Answer) -> bool {
         if !self.schedule.has_time(t) || !answer.is_sure || !self.predictor.is_sound(t) {
