@@ -112,8 +112,12 @@ pub struct Known {
     pub open: bool,
     /// Training steps on it at which its horizon is taken again.
     look_at: u32,
-    /// The exchange of blocks after which what is hidden of it was last looked at.
-    pub looked_at: u64,
+    /// The part of the Gaussians that it sees that are not in the pool.
+    pub away: f32,
+    /// The anchor of the block that it sees most of.
+    pub home: Option<u32>,
+    /// Where its views show what is not in the pool was found for what is there now.
+    pub is_masked: bool,
     /// One of its images could not be had: those that come go.
     pub in_part: bool,
 }
@@ -311,8 +315,12 @@ impl Archive {
     /// Makes one map of two epochs, by their numbers over all runs.
     pub fn join(&mut self, from: u32, into: u32) {
         self.runs.joined.push((from, into));
-        self.blocks.iter_mut().filter(|b| b.epoch == from).for_each(|b| b.epoch = into);
-        self.exchanges += 1;
+        for block in 0..self.blocks.len() {
+            if self.blocks[block].epoch == from {
+                self.blocks[block].epoch = into;
+                self.exchanged(block);
+            }
+        }
         let about = JoinAbout { into }.encode();
         self.store.put(Key { kind: KIND_JOIN, run: self.run, id: from }, &about, |_| ());
         self.serve();
@@ -365,6 +373,12 @@ impl Archive {
         });
     }
 
+    /// Notes that a block came, went, moved or was first sampled.
+    pub fn exchanged(&mut self, block: usize) {
+        self.exchanges += 1;
+        self.sight.touch(block);
+    }
+
     /// Whether another block can be made.
     pub fn is_full(&self) -> bool {
         self.blocks.len() == BLOCKS_KNOWN
@@ -412,7 +426,7 @@ impl Archive {
             // Moved, it is another one than on disk.
             b.steps += u32::from(b.in_pool);
             self.measure(block);
-            self.exchanges += 1;
+            self.exchanged(block);
         }
     }
 

@@ -7,6 +7,7 @@
 use super::render::Rendered;
 use super::view::View;
 use glam::{DVec3, Vec3};
+use std::sync::LazyLock;
 
 pub const COLUMNS: usize = 16;
 pub const ROWS: usize = 12;
@@ -108,10 +109,10 @@ impl Horizon {
         }
     }
 
-    /// The cell in which a view with this horizon sees a point of the world, or, by a margin, px, the nearest cell to it, and how far
-    /// outside the picture the point is, px. A cell of which nothing is known sees all.
-    pub fn sees(&self, view: &View, p_world: DVec3, margin_px: f64) -> Option<(usize, f64)> {
-        let (x, y, depth) = view.project(p_world, margin_px)?;
+    /// The cell in which a view with this horizon sees a point of its camera's frame, or, by a margin, px, the nearest cell to it,
+    /// and how far outside the picture the point is, px. A cell of which nothing is known sees all.
+    pub fn sees(&self, view: &View, p_cam: DVec3, margin_px: f64) -> Option<(usize, f64)> {
+        let (x, y, depth) = view.project(p_cam, margin_px)?;
         let (width, height) = (view.camera.width, view.camera.height);
         let cell = cell_of(x, y, width, height);
         let outside = |v: f64, size: usize| (-0.5 - v).max(v + 0.5 - size as f64).max(0.0);
@@ -119,7 +120,7 @@ impl Horizon {
     }
 
     fn reaches(&self, cell: usize, depth: f64) -> bool {
-        self.0[cell] == OPEN || depth <= metres(self.0[cell]) * (1.0 + THICKNESS) + THICKNESS_M
+        self.0[cell] == OPEN || depth <= METRES[usize::from(self.0[cell])] * (1.0 + THICKNESS) + THICKNESS_M
     }
 
     /// The part of the cells of which nothing is known.
@@ -131,6 +132,9 @@ impl Horizon {
 fn code(depth_m: f64) -> u8 {
     ((depth_m / NEAREST_M).ln() / STEP_LN).ceil().clamp(0.0, f64::from(OPEN)) as u8
 }
+
+/// What each code stands for, m.
+static METRES: LazyLock<[f64; 256]> = LazyLock::new(|| std::array::from_fn(|code| metres(code as u8)));
 
 fn metres(code: u8) -> f64 {
     NEAREST_M * (f64::from(code) * STEP_LN).exp()

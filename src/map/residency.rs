@@ -73,14 +73,9 @@ impl Archive {
         }
     }
 
-    /// The part of the Gaussians that a keyframe sees that are in the pool.
-    pub fn part_here(&self, keyframe: usize) -> f32 {
-        self.part_seen(keyframe, |block| self.blocks[block].in_pool)
-    }
-
     /// Whether nearly all that a keyframe sees is in the pool.
     pub fn is_shown(&self, keyframe: usize) -> bool {
-        self.part_here(keyframe) >= 1.0 - LEFT_MAX
+        self.part_seen(keyframe, |block| self.blocks[block].in_pool) >= 1.0 - LEFT_MAX
     }
 
     /// Chooses what is wanted where a keyframe was taken, and fetches some of it.
@@ -390,7 +385,7 @@ impl Archive {
             // Damaged: what it was is lost, and its place is uncovered from here on.
             scene.counters.blocks_lost.add(1);
             self.blocks[block].samples_len = 0;
-            self.exchanges += 1;
+            self.exchanged(block);
             return Ok(());
         };
         if self.growing || b.in_pool || !self.choice.wanted[block] || !self.make_room(scene, about.count as usize)? {
@@ -401,7 +396,7 @@ impl Archive {
         if in_pool {
             self.blocks[block].in_pool = true;
             self.blocks[block].count = count as u32;
-            self.exchanges += 1;
+            self.exchanged(block);
             scene.counters.blocks_paged_in.add(1);
             // What moved while it was away.
             let by = b.placed * about.placed.inverse();
@@ -456,9 +451,9 @@ impl Archive {
         for &number in numbers {
             if let Some(block) = self.block_of(number) {
                 self.blocks[block].in_pool = false;
+                self.exchanged(block);
             }
         }
-        self.exchanges += 1;
         scene.counters.blocks_paged_out.add(numbers.len() as u64);
         Ok(())
     }
@@ -491,7 +486,7 @@ impl Archive {
             // Its state is to be written again.
             self.known[keyframe].stated = u32::MAX;
             self.known[keyframe].open = horizon.open_part() > OPEN_MAX;
-            self.known[keyframe].looked_at = 0;
+            self.known[keyframe].is_masked = false;
             self.look_from(&view, &horizon, keyframe);
         }
     }

@@ -26,17 +26,22 @@ const VIEWS_PER_BLOCK: usize = 3;
 impl Archive {
     /// Finds the views of the present epoch that may be trained on.
     pub fn find_trainable(&mut self, views: &Views) {
+        self.look_at_changed();
         let (cameras, epoch) = (views.cameras(), self.choice.epoch);
         let mut trainable = std::mem::take(&mut self.drawn.trainable);
         trainable.clear();
         for &index in views.training().iter().filter(|i| **i as usize % cameras == 0) {
             let keyframe = index as usize / cameras;
-            if views.get(index as usize).epoch == epoch && self.part_here(keyframe) >= HERE_MIN {
+            if views.get(index as usize).epoch == epoch && self.shows_enough_of(keyframe) {
                 trainable.extend(index..index + cameras as u32);
             }
         }
         self.drawn.trainable = trainable;
         self.drawn.found_at = self.exchanges;
+    }
+
+    fn shows_enough_of(&self, keyframe: usize) -> bool {
+        self.known.get(keyframe).is_none_or(|known| known.away <= 1.0 - HERE_MIN)
     }
 
     /// The views that are trained on now.
@@ -134,7 +139,8 @@ impl Archive {
     /// Finds where the views of a keyframe show what is not in the pool, if that has changed since it was last found.
     pub fn find_hidden(&mut self, scene: &mut Scene, index: usize) {
         let (first, cameras) = (scene.views.first(index), scene.views.cameras());
-        if self.known.get(first / cameras).is_none_or(|k| k.looked_at == self.exchanges) {
+        self.look_at_changed();
+        if self.known.get(first / cameras).is_none_or(|k| k.is_masked) {
             return;
         }
         for view in first..first + cameras {
@@ -144,7 +150,7 @@ impl Archive {
             let entry = scene.views.get_mut(view);
             (entry.hidden, entry.incomplete) = (hidden, incomplete);
         }
-        self.known[first / cameras].looked_at = self.exchanges;
+        self.known[first / cameras].is_masked = true;
     }
 
     pub fn take_image(&mut self, scene: &mut Scene, index: usize, fetched: &Fetched) -> Result<(), GpuError> {
@@ -172,6 +178,7 @@ impl Archive {
         if scene.views.has_free_place() {
             return Ok(true);
         }
+        self.look_at_changed();
         let cameras = scene.views.cameras();
         // Where places are few, each would be the last of its block, and none would ever go.
         let anchors = self.blocks.iter().filter(|b| b.in_pool && b.number % PARTS == 0).count();
@@ -214,10 +221,11 @@ impl Archive {
         {
             return None;
         }
+        let home = |keyframe: usize| self.known.get(keyframe)?.home;
         let last = !few
-            && self.home(keyframe).is_some_and(|home| {
-                let shares = |f: &usize| *f != first && self.home(*f / cameras) == Some(home);
-                let parts = home * PARTS..(home + 1) * PARTS;
+            && home(keyframe).is_some_and(|home_here| {
+                let shares = |f: &usize| *f != first && home(*f / cameras) == Some(home_here);
+                let parts = home_here * PARTS..(home_here + 1) * PARTS;
                 let is_here = parts.filter_map(|part| self.block_of(part)).any(|part| self.blocks[part].in_pool);
                 is_here && !views.placed().any(|f| shares(&f))
             });
@@ -226,7 +234,7 @@ impl Archive {
         } else if last {
             0
         } else {
-            1 + u8::from(self.part_here(keyframe) < HERE_MIN)
+            1 + u8::from(!self.shows_enough_of(keyframe))
         };
         Some((kind, u64::MAX - views.arrival(first)))
     }

@@ -161,7 +161,9 @@ impl Archive {
     fn look_at(&mut self, block: usize, count: usize, bytes: &[u8]) {
         let splat =
             |at: usize| bytemuck::pod_read_unaligned::<Splat>(&bytes[at * size_of::<Splat>()..][..size_of::<Splat>()]);
-        self.exchanges += u64::from(self.blocks[block].samples_len == 0);
+        if self.blocks[block].samples_len == 0 {
+            self.exchanged(block);
+        }
         let b = &mut self.blocks[block];
         (b.count, b.samples_len) = (count as u32, 0);
         let samples = (count / GAUSSIANS_A_SAMPLE).clamp(SAMPLES_MIN, SAMPLES).min(count);
@@ -199,8 +201,9 @@ impl Archive {
 
     /// Hands what is known of a keyframe to the store.
     fn save_state(&mut self, views: &Views, keyframe: usize) -> bool {
-        let cameras = views.cameras();
-        let home = self.home(keyframe).map_or(NO_BLOCK, |anchor| views.get(anchor as usize).id as u32);
+        self.look_at_changed();
+        let (cameras, home) = (views.cameras(), self.known[keyframe].home);
+        let home = home.map_or(NO_BLOCK, |anchor| views.get(anchor as usize).id as u32);
         for index in keyframe * cameras..(keyframe + 1) * cameras {
             let about = state(views.get(index), home);
             if !self.store.put(self.key(KIND_KEYFRAME, image_id(views, index)), &about.encode(), |_| ()) {

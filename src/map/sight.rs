@@ -6,6 +6,7 @@ use super::scene::Scene;
 use super::seen::Sight;
 use super::view::View;
 use glam::DVec3;
+use stipple_drivers::Pose;
 
 /// Part of what is seen in a cell and beside it that may be missing while the cell is still compared. Masking more costs more
 /// than the Gaussians that are bent for a while: with 0.1, 0.3 and 0.6 the patrol's first 240 s had 25.6, 26.3 and 26.2 dB.
@@ -26,17 +27,31 @@ pub fn seen_by<'a>(sight: &'a Sight, blocks: &'a [Block], keyframe: usize) -> im
 }
 
 impl Archive {
-    /// The anchor of the block that a keyframe sees most of.
-    pub fn home(&self, keyframe: usize) -> Option<u32> {
-        let most = seen_by(&self.sight, &self.blocks, keyframe).max_by(|a, b| a.1.total_cmp(&b.1).then(b.0.cmp(&a.0)));
-        most.map(|(block, _)| self.blocks[block].anchor)
+    /// Looks anew at the keyframes of which what they see, or a block of that, has changed: how much of it is in the pool, and
+    /// which block is their home.
+    pub fn look_at_changed(&mut self) {
+        while let Some(keyframe) = self.sight.next_changed() {
+            let (mut all, mut away, mut most) = (0.0, 0.0, (0.0, None));
+            for (block, seen) in seen_by(&self.sight, &self.blocks, keyframe) {
+                let b = &self.blocks[block];
+                all += seen;
+                away += if b.in_pool { 0.0 } else { seen };
+                if seen > most.0 {
+                    most = (seen, Some(b.anchor));
+                }
+            }
+            let Some(known) = self.known.get_mut(keyframe) else { continue };
+            known.away = if away > 0.0 { away / all } else { 0.0 };
+            (known.home, known.is_masked) = (most.1, false);
+        }
     }
 
     /// Looks again which blocks a view sees, by its horizon.
     pub fn look_from(&mut self, view: &View, horizon: &Horizon, keyframe: usize) {
         self.sight.clear(keyframe);
+        let eye = Eye::new(view);
         for block in 0..self.blocks.len() {
-            let seen = seen_of(&self.blocks[block], view, horizon);
+            let seen = eye.seen_of(&self.blocks[block], horizon);
             if seen > 0.0 {
                 self.sight.set(keyframe, block, seen);
             }
@@ -56,11 +71,11 @@ impl Archive {
             return (hidden, false);
         }
         // Gaussians that are here, and away.
-        let mut seen = [[0.0f32; 2]; CELLS];
+        let (mut seen, eye) = ([[0.0f32; 2]; CELLS], Eye::new(view));
         for b in blocks.map(|block| &self.blocks[block]) {
             let each = b.count as f32 / f32::from(b.samples_len.max(1));
             for p in b.samples() {
-                if let Some((cell, size)) = sees(view, horizon, *p) {
+                if let Some((cell, size)) = eye.sees(horizon, *p) {
                     seen[cell][usize::from(!b.in_pool)] += each * size;
                 }
             }
@@ -84,7 +99,8 @@ impl Archive {
 
     /// The blocks of which a view may see something.
     pub fn in_reach<'a>(&'a self, view: &'a View) -> impl Iterator<Item = usize> + Clone + 'a {
-        let reached = |b: &Block| b.epoch == view.epoch && b.samples_len > 0 && in_reach(view, b);
+        let eye = Eye::new(view);
+        let reached = move |b: &Block| b.samples_len > 0 && eye.may_see(b);
         self.blocks.iter().enumerate().filter(move |(_, b)| reached(b)).map(|(block, _)| block)
     }
 
@@ -103,44 +119,58 @@ impl Archive {
         for keyframe in 0..self.known.len().min(scene.views.len() / cameras) {
             let index = keyframe * cameras;
             let horizon = scene.views.get(index).horizon;
-            let seen = seen_of(&self.blocks[block], &scene.view(index), &horizon);
+            let seen = Eye::new(&scene.view(index)).seen_of(&self.blocks[block], &horizon);
             self.sight.set(keyframe, block, seen);
         }
     }
 }
 
-/// How much a view sees of a block, in samples of the size `SIZE_ONE`.
-fn seen_of(b: &Block, view: &View, horizon: &Horizon) -> f32 {
-    if b.epoch != view.epoch || !in_reach(view, b) {
-        return 0.0;
-    }
-    b.samples().iter().filter_map(|sample| sees(view, horizon, *sample)).map(|(_, size)| size).sum()
+/// A view that is looked from, with what is the same for every point.
+#[derive(Clone, Copy)]
+struct Eye<'a> {
+    view: &'a View,
+    cam_from_world: Pose,
+    /// Half the angle of a cone around the picture, rad.
+    cone: f64,
 }
 
-/// The cell in which a view sees a sample of a block, and how large it is there: its area over that of one of `SIZE_ONE`. What is
-/// just outside the picture reaches in.
-fn sees(view: &View, horizon: &Horizon, [x, y, z, size_m]: [f32; 4]) -> Option<(usize, f32)> {
-    let (p, width) = (DVec3::new(x.into(), y.into(), z.into()), view.camera.width as f64);
-    let sigma_px = f64::from(size_m) * view.camera.fx / view.world_from_cam.p.distance(p).max(1e-3);
-    let margin_px = (SIGMAS * sigma_px).clamp(f64::MIN_POSITIVE, width);
-    let (cell, outside_px) = horizon.sees(view, p, margin_px)?;
-    let inside = 1.0 - outside_px / margin_px;
-    let size = (sigma_px / (SIZE_ONE * width)).powi(2).min(SIZE_MAX);
-    Some((cell, (size * inside * inside) as f32))
-}
-
-/// Whether a view may see anything of a block: its ball reaches before the camera and into its cone.
-fn in_reach(view: &View, b: &Block) -> bool {
-    let p: DVec3 = view.world_from_cam.inverse().transform(b.centre.as_dvec3());
-    let radius = f64::from(b.radius);
-    if view.fisheye.is_some() || p.length() <= radius {
-        return true;
+impl<'a> Eye<'a> {
+    fn new(view: &'a View) -> Eye<'a> {
+        let c = &view.camera;
+        let half = |size: usize, f: f64| (size as f64 / 2.0 + 1.0).max(c.cx.max(c.cy).min(size as f64)) / f;
+        let cone = half(c.width, c.fx).hypot(half(c.height, c.fy)).atan();
+        Eye { view, cam_from_world: view.world_from_cam.inverse(), cone }
     }
-    let c = &view.camera;
-    let half = |size: usize, f: f64| (size as f64 / 2.0 + 1.0).max(c.cx.max(c.cy).min(size as f64)) / f;
-    let cone = half(c.width, c.fx).hypot(half(c.height, c.fy)).atan();
-    let off = p.truncate().length().atan2(p.z) - (radius / p.length()).asin();
-    off <= cone
+
+    /// How much is seen of a block, in samples of the size `SIZE_ONE`.
+    fn seen_of(&self, b: &Block, horizon: &Horizon) -> f32 {
+        if !self.may_see(b) {
+            return 0.0;
+        }
+        b.samples().iter().filter_map(|sample| self.sees(horizon, *sample)).map(|(_, size)| size).sum()
+    }
+
+    /// The cell in which a sample of a block is seen, and how large it is there: its area over that of one of `SIZE_ONE`. What is
+    /// just outside the picture reaches in.
+    fn sees(&self, horizon: &Horizon, [x, y, z, size_m]: [f32; 4]) -> Option<(usize, f32)> {
+        let p = self.cam_from_world.transform(DVec3::new(x.into(), y.into(), z.into()));
+        let width = self.view.camera.width as f64;
+        let sigma_px = f64::from(size_m) * self.view.camera.fx / p.length().max(1e-3);
+        let margin_px = (SIGMAS * sigma_px).clamp(f64::MIN_POSITIVE, width);
+        let (cell, outside_px) = horizon.sees(self.view, p, margin_px)?;
+        let inside = 1.0 - outside_px / margin_px;
+        let size = (sigma_px / (SIZE_ONE * width)).powi(2).min(SIZE_MAX);
+        Some((cell, (size * inside * inside) as f32))
+    }
+
+    /// Whether anything of a block may be seen: it is of the view's epoch, and its ball reaches before the camera and into its cone.
+    fn may_see(&self, b: &Block) -> bool {
+        let (p, radius) = (self.cam_from_world.transform(b.centre.as_dvec3()), f64::from(b.radius));
+        if b.epoch != self.view.epoch || self.view.fisheye.is_some() || p.length() <= radius {
+            return b.epoch == self.view.epoch;
+        }
+        p.truncate().length().atan2(p.z) - (radius / p.length()).asin() <= self.cone
+    }
 }
 
 #[cfg(test)]
@@ -151,7 +181,7 @@ mod tests {
     #[test]
     fn what_reaches_into_the_picture_is_seen_by_its_size() {
         let (view, open) = (view(), Horizon::default());
-        let size = |p: [f32; 4]| sees(&view, &open, p).map_or(0.0, |(_, size)| size);
+        let size = |p: [f32; 4]| Eye::new(&view).sees(&open, p).map_or(0.0, |(_, size)| size);
         let (near, far) = (size([0.0, 0.0, 1.0, 0.01]), size([0.0, 0.0, 2.0, 0.01]));
         assert!((near / far - 4.0).abs() < 1e-3, "{near} {far}");
         assert_eq!(size([0.0, 0.0, 0.5, 9.0]), SIZE_MAX as f32);
