@@ -414,10 +414,10 @@ impl Archive {
         for block in 0..self.blocks.len() {
             let b = &mut self.blocks[block];
             let placed = views.get(b.anchor as usize).placed;
-            let by = placed * b.placed.inverse();
-            if by.p.length() == 0.0 && by.q.to_scaled_axis().length() == 0.0 {
+            if placed == b.placed {
                 continue;
             }
+            let by = placed * b.placed.inverse();
             for sample in &mut b.samples[..usize::from(b.samples_len)] {
                 let [x, y, z, size] = *sample;
                 *sample = by.transform(DVec3::new(x.into(), y.into(), z.into())).as_vec3().extend(size).to_array();

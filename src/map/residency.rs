@@ -399,9 +399,8 @@ impl Archive {
             self.exchanged(block);
             scene.counters.blocks_paged_in.add(1);
             // What moved while it was away.
-            let by = b.placed * about.placed.inverse();
-            if by.p.length() > 0.0 || by.q.to_scaled_axis().length() > 0.0 {
-                pool.move_blocks(gpu, std::iter::once((b.number, by)))?;
+            if b.placed != about.placed {
+                pool.move_blocks(gpu, std::iter::once((b.number, b.placed * about.placed.inverse())))?;
             }
         }
         Ok(())
