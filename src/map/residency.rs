@@ -46,8 +46,7 @@ const NEAR_M: f32 = 8.0;
 const NEEDED_MIN: f32 = 0.25;
 /// Part of the pool that is left for what is new when a keyframe comes.
 const RESERVE_DIVISOR: usize = 8;
-/// Blocks asked for when a keyframe comes, some MiB, and between training steps.
-const PAGED_AT_ONCE: usize = 32;
+/// Blocks asked for between training steps.
 const PAGED_A_STEP: usize = 16;
 /// Training steps at a place before the pool turns to another.
 const STEPS_AT_A_PLACE: u64 = 20;
@@ -55,7 +54,8 @@ const STEPS_AT_A_PLACE: u64 = 20;
 const PLACES_DRAWN: usize = 4;
 /// Part of a horizon that may be open.
 const OPEN_MAX: f64 = 0.05;
-/// The disk answers within this, or what it was asked for is done without.
+/// The disk answers within this, or what it was asked for is done without: when a keyframe comes, and when a picture is drawn.
+const PATIENCE_IN_FLIGHT: Duration = Duration::from_millis(50);
 const PATIENCE: Duration = Duration::from_secs(2);
 
 impl Archive {
@@ -78,7 +78,8 @@ impl Archive {
         self.part_seen(keyframe, |block| self.blocks[block].in_pool) >= 1.0 - LEFT_MAX
     }
 
-    /// Chooses what is wanted where a keyframe was taken, and fetches some of it.
+    /// Chooses what is wanted where a keyframe was taken, and fetches it: what is here decides how much of the view is new, and
+    /// the Gaussians of a new anchor grow beside it. Not while those of the last one do (`busy`).
     pub fn arrive(
         &mut self,
         scene: &mut Scene,
@@ -86,6 +87,7 @@ impl Archive {
         epoch: u32,
         busy: bool,
     ) -> Result<(), GpuError> {
+        self.growing = busy;
         self.leave_other_epochs(scene, epoch)?;
         self.look_at_new_blocks(scene, busy)?;
         let ahead = self.choice.last.map_or(pose, |(before, from)| {
@@ -100,7 +102,10 @@ impl Archive {
         self.choose(scene, &[pose, ahead]);
         // What is new finds the reserve, and thins nothing.
         self.make_room(scene, 0)?;
-        self.page(scene, PAGED_AT_ONCE, busy)
+        if busy {
+            return Ok(());
+        }
+        self.fetch_wanted(scene, PATIENCE_IN_FLIGHT)
     }
 
     /// Turns the pool to another place after so many training steps at one, and fetches some of what is wanted. Called between
@@ -115,7 +120,7 @@ impl Archive {
                 self.turn(scene, scene.views.world_from_body(view));
             }
         }
-        self.page(scene, PAGED_A_STEP, false)
+        self.page(scene, PAGED_A_STEP)
     }
 
     /// Wants what is seen at another place; no room is left for what is new.
@@ -331,12 +336,25 @@ impl Archive {
         choice.ranked = ranked;
     }
 
-    /// Puts what came from the disk in its place, and asks for `most` blocks more of what is wanted. While a new block grows
-    /// (`busy`), no other comes behind it.
-    pub fn page(&mut self, scene: &mut Scene, most: usize, busy: bool) -> Result<(), GpuError> {
-        if busy {
-            return Ok(());
+    /// Fetches what is wanted and waits for it, as long as `patience`.
+    fn fetch_wanted(&mut self, scene: &mut Scene, patience: Duration) -> Result<(), GpuError> {
+        let begun = Instant::now();
+        loop {
+            let before = self.exchanges;
+            self.page(scene, usize::MAX)?;
+            let waits = self.choice.blocks.iter().any(|b| self.blocks[*b as usize].asked);
+            // What has no room does not come.
+            if !waits && self.exchanges == before || begun.elapsed() > patience {
+                return Ok(());
+            }
+            if waits {
+                std::thread::sleep(Duration::from_micros(200));
+            }
         }
+    }
+
+    /// Puts what came from the disk in its place, and asks for `most` blocks more of what is wanted.
+    fn page(&mut self, scene: &mut Scene, most: usize) -> Result<(), GpuError> {
         self.receive(scene)?;
         let missing = |a: &Archive, block: usize| {
             let b = &a.blocks[block];
@@ -535,19 +553,7 @@ impl Archive {
         self.leave_other_epochs(scene, scene.views.get(index).epoch)?;
         self.want_seen_by(keyframe, &scene.view(index), scene.pipeline.pool.capacity());
         let begun = Instant::now();
-        let missing = |a: &Archive| a.choice.blocks.iter().any(|b| a.blocks[*b as usize].asked);
-        loop {
-            let before = self.exchanges;
-            self.page(scene, PAGED_AT_ONCE, false)?;
-            // A page is some blocks; what has no room does not come.
-            let done = !missing(self) && self.exchanges == before;
-            if done || begun.elapsed() > PATIENCE {
-                break;
-            }
-            if missing(self) {
-                std::thread::sleep(Duration::from_millis(1));
-            }
-        }
+        self.fetch_wanted(scene, PATIENCE)?;
         if !scene.views.has_place(index) && self.known.get(keyframe).is_some_and(|k| k.saved) {
             while !self.ask_for_images(&scene.views, keyframe) && begun.elapsed() < PATIENCE {
                 self.receive(scene)?;
