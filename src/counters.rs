@@ -98,6 +98,8 @@ stipple_drivers::counters! {
     store_records_damaged,
     store_refused_full,
     store_write_errors,
+    /// Snapshots of what the store does not have yet (`map/latest`) that could not be written; one where there is no place for any.
+    snapshot_errors,
     /// Keyframes whose pair was not matched, as the map shows their view.
     views_covered,
     /// Anchors not made because their pair could not be matched.

@@ -129,6 +129,44 @@ fn a_mapper_of_the_same_flight_goes_on_with_what_is_on_disk_and_another_flight_w
     assert!(!anchor && psnr_db > before[0] - 2.0, "{anchor} {psnr_db} {before:?}");
 }
 
+/// What is on the disk when a mapper dies is the map of its last keyframe, also of an anchor whose burst has just begun; what the
+/// store alone has by then is worse.
+#[test]
+fn a_mapper_that_dies_leaves_the_map_of_its_last_keyframe() {
+    let (calibration, keyframes) = flight(8);
+    let (dir, died) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+    let mut mapper = opened(&calibration, &[], Some(place(dir.path(), 1)));
+    for k in &keyframes {
+        train(&mut mapper, STEPS);
+        mapper.ingest(k).unwrap();
+    }
+    let copied = |without: &str| {
+        let to = died.path().join(format!("without {without}"));
+        std::fs::create_dir(&to).unwrap();
+        for file in std::fs::read_dir(dir.path()).unwrap().map(|entry| entry.unwrap()) {
+            if file.file_name() != without {
+                std::fs::copy(file.path(), to.join(file.file_name())).unwrap();
+            }
+        }
+        to
+    };
+    let [whole, store_alone] = ["lock", "latest"].map(copied);
+    assert_eq!(mapper.counters().snapshot_errors.get(), 0);
+    let before = decibels(&mapper.evaluate().unwrap());
+    let score = |folder: &Path| {
+        let mut again = opened(&calibration, &[], Some(place(folder, 1)));
+        (again.splat_count(), decibels(&again.evaluate().unwrap()))
+    };
+    let ((count, after), (_, worse)) = (score(&whole), score(&store_alone));
+    println!("before {before:.3?}, after {after:.3?}, of the store alone {worse:.3?} dB");
+    assert_eq!(count, mapper.splat_count());
+    assert!((0..2).all(|i| (after[i] - before[i]).abs() < 0.1), "{before:?} {after:?}");
+    assert!(worse[0] < before[0] - 0.1, "{before:?} {worse:?}");
+    // Once it is taken over it is in the store.
+    std::fs::remove_file(whole.join("latest")).unwrap();
+    assert_eq!(score(&whole).1, after);
+}
+
 #[test]
 fn paging_repeats_to_the_bit_and_allocates_nothing() {
     let (calibration, keyframes) = flight(12);

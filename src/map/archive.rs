@@ -5,14 +5,15 @@
 //! chosen when a keyframe comes (`residency`): blocks go out and come in whole, between training steps. Images are fetched
 //! when a step on them was drawn (`rotation`).
 //! Blocks are written once their anchor was densified, again whenever they had a quarter more training steps, and before they
-//! go; images once. Two threads of the store write and read, in lockstep this one, so that a run can be repeated to the bit. What
-//! cannot be written to a full or broken disk stays in memory, and what finds no room there is thinned as without a store.
+//! go; images once. Two threads of the store write and read, in lockstep this one, so that a run can be repeated to the bit. With
+//! each keyframe all that has changed since is written at once beside the store (`latest`), for a mapper that dies. What cannot
+//! be written to a full or broken disk stays in memory, and what finds no room there is thinned as without a store.
 
 use super::block::{BlockAbout, KeyframeAbout, RunAbout};
 use super::block::{JoinAbout, KIND_BLOCK, KIND_IMAGE, KIND_JOIN, KIND_KEYFRAME, NO_BLOCK, SAMPLES};
 use super::choice::{Choice, Drawn};
 use super::filing::image_id;
-use super::filing::{entry, identity, keyframes_known, limits, payload_max, run_key, BLOCKS_KNOWN};
+use super::filing::{entry, identity, keyframes_known, latest_max, limits, payload_max, run_key, BLOCKS_KNOWN};
 use super::horizon::ball;
 use super::parts::PARTS;
 use super::runs::{Run, Runs};
@@ -25,8 +26,9 @@ use crate::counters::Counters;
 use crate::gpu::GpuError;
 use crate::limits::CAMERAS_MAX;
 use crate::mem::{unsealed, Footprint};
-use crate::store::{self, Disk, Fetched, Key, Store};
+use crate::store::{self, Disk, Fetched, Key, Snapshot, Store};
 use glam::{DVec3, Vec3};
+use std::io;
 use std::path::Path;
 use std::sync::Arc;
 use stipple_drivers::{host, Calibration, Fault, FaultKind, Nanos, Pose};
@@ -39,6 +41,8 @@ const FIRST_LOOK: u32 = 5;
 const LOOKS_RATIO: u32 = 4;
 /// Before any stamp.
 const LONG_AGO: Nanos = Nanos(i64::MIN / 4);
+/// A snapshot takes at most this part of the space that the store may take.
+const LATEST_DIVISOR: u64 = 4;
 /// Least space on the disk that a map is begun with, bytes.
 const BYTES_MIN: u64 = 128 << 20;
 
@@ -141,6 +145,9 @@ pub struct Archive {
     /// How often blocks came, went, moved or were first sampled.
     pub exchanges: u64,
     pub drawn: Drawn,
+    /// What a mapper that dies leaves; none where there is no room or another's file in its place.
+    pub latest: Option<Snapshot>,
+    pub latest_due: Nanos,
     /// The next block and keyframe that are looked at for writing.
     pub next_block: usize,
     pub next_state: usize,
@@ -169,7 +176,12 @@ impl Archive {
             let fix = "make room, or name another --out folder";
             return Err(Fault::new(FaultKind::NoOutput, place.folder.display().to_string(), what, fix));
         }
-        let (store, disk) = Store::open(place.folder, identity(calibration, board, shape), &limits)?;
+        let (of, most) = (identity(calibration, board, shape), latest_max(board, shape));
+        let is_small = 2 * most < limits.bytes_max / LATEST_DIVISOR;
+        limits.bytes_max -= if is_small { 2 * most } else { 0 };
+        let (mut store, disk) = Store::open(place.folder, of, &limits)?;
+        let latest = is_small.then(|| Snapshot::open(place.folder, of).ok()).flatten();
+        let latest = latest.and_then(|latest| take_over(latest, most, place.fresh, &mut store).ok());
         let about = RunAbout {
             epoch_base: 0,
             started_unix_ms: place.flight.unwrap_or_default(),
@@ -198,6 +210,8 @@ impl Archive {
             growing: false,
             exchanges: 1,
             drawn: Drawn::new(board, shape, place.at_once),
+            latest,
+            latest_due: LONG_AGO,
             next_block: 0,
             next_state: 0,
         };
@@ -485,6 +499,22 @@ impl Archive {
             counter.raise(value);
         }
     }
+}
+
+/// Hands what a mapper that died left in its snapshot to the store, unless the map begins anew, and makes room for the next one.
+fn take_over(mut latest: Snapshot, bytes: u64, fresh: bool, store: &mut Store) -> io::Result<Snapshot> {
+    if !fresh {
+        latest.read(|key, about, payload| {
+            if !store.has_room() {
+                // What cannot be written is counted by the store.
+                let _ = store.flush();
+            }
+            store.put(key, about, |buffer| buffer.extend_from_slice(payload));
+        })?;
+        store.flush().map_err(|fault| io::Error::other(fault.to_string()))?;
+    }
+    latest.make(bytes)?;
+    Ok(latest)
 }
 
 /// What came from the disk.

@@ -3,7 +3,7 @@
 use super::block::{KeyframeAbout, KIND_RUN};
 use super::horizon::Cells;
 use super::paging::splat_bytes;
-use super::pool::FREE_DIVISOR;
+use super::pool::{BLOCKS, FREE_DIVISOR};
 use super::refine::Refinement;
 use super::shape::Shape;
 use super::views::{Stored, Views};
@@ -109,6 +109,12 @@ pub fn payload_max(board: &Board, shape: &Shape) -> usize {
     let splats = (seeds + board.map.densify_max).min(shape.splats) as usize;
     let block = splats * splat_bytes(shape.channels == 3, MOMENTS);
     block.max(shape.pixels() * shape.channels as usize)
+}
+
+/// Bytes of a snapshot of all that may be in the pool and of all keyframes.
+pub fn latest_max(board: &Board, shape: &Shape) -> u64 {
+    let states = keyframes_known(board, shape) * shape.cameras as usize;
+    store::snapshot_bytes(BLOCKS + states, shape.splats as usize * splat_bytes(shape.channels == 3, MOMENTS))
 }
 
 /// A number of a rig and the form of its images: maps of another are not read.

@@ -21,6 +21,7 @@ pub mod exposure;
 mod filing;
 pub mod horizon;
 mod keyframes;
+mod latest;
 pub mod loss;
 pub mod occupancy;
 pub mod paging;
@@ -178,16 +179,18 @@ impl Mapper {
         let known = if place.is_some() { known(board, &shape) } else { 0 };
         let (mut views, rendered) = (Views::new(&shape, known), Rendered::new(w, h, channels));
         let mut trainer = Trainer::new(config);
+        let counters = Counters::default();
         let (mut archive, unkept) = match place.map(|place| Archive::open(place, calibration, board, &shape)) {
             Some(Err(fault)) => (None, Some(fault)),
             opened => (opened.and_then(Result::ok), None),
         };
         if let Some(archive) = &mut archive {
             archive.resume(&mut views);
+            counters.snapshot_errors.add(u64::from(archive.latest.is_none()));
             trainer.scene_depth_m = archive.scene_depth_m().unwrap_or(trainer.scene_depth_m);
         }
         let steps = (views.earlier..views.len()).map(|i| u64::from(views.get(i).steps)).sum();
-        let scene = Scene { gpu, pipeline, views, cameras, rendered, steps, counters: Counters::default() };
+        let scene = Scene { gpu, pipeline, views, cameras, rendered, steps, counters };
         archive.iter_mut().for_each(|archive| archive.look_around(&scene));
         Ok(Mapper {
             scene,
@@ -246,6 +249,7 @@ impl Mapper {
         if let Some(archive) = &mut self.archive {
             archive.find_trainable(&self.scene.views);
             archive.save_some(&mut self.scene)?;
+            archive.save_latest(&mut self.scene, keyframe.t)?;
         }
         Ok(kind)
     }

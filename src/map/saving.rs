@@ -29,6 +29,39 @@ fn sample(splat: &Splat) -> [f32; 4] {
     [x, y, z, ((a + b + c - a.min(b).min(c)) / 2.0).exp()]
 }
 
+impl Block {
+    /// Takes samples of so many Gaussians from their arrays.
+    pub fn look_at(&mut self, count: usize, bytes: &[u8]) {
+        let splat =
+            |at: usize| bytemuck::pod_read_unaligned::<Splat>(&bytes[at * size_of::<Splat>()..][..size_of::<Splat>()]);
+        (self.count, self.samples_len) = (count as u32, 0);
+        let samples = (count / GAUSSIANS_A_SAMPLE).clamp(SAMPLES_MIN, SAMPLES).min(count);
+        for i in 0..samples {
+            // The largest of each few: what is seen from afar, and reaches farthest.
+            let few = (i * count / samples)..((i + 1) * count / samples);
+            let sampled = few.map(|at| sample(&splat(at))).filter(|s| s.iter().all(|v| v.is_finite()));
+            if let Some(largest) = sampled.max_by(|a, b| a[3].total_cmp(&b[3])) {
+                self.samples[usize::from(self.samples_len)] = largest;
+                self.samples_len += 1;
+            }
+        }
+    }
+
+    /// What the store keeps in its header.
+    pub fn about(&self, colour: bool) -> BlockAbout {
+        BlockAbout {
+            epoch: self.epoch,
+            count: self.count,
+            colour,
+            moments: MOMENTS,
+            placed: self.placed,
+            moved: Pose::IDENTITY,
+            samples: self.samples,
+            samples_len: self.samples_len,
+        }
+    }
+}
+
 impl Archive {
     /// Cuts a block that is complete into its parts, hands them to the store and looks who sees them.
     pub fn complete(&mut self, scene: &mut Scene, block: usize) -> Result<(), GpuError> {
@@ -96,32 +129,54 @@ impl Archive {
                 return Ok(0);
             }
         }
+        let (mut done, colour) = (0, scene.pipeline.pool.colour);
+        while done < blocks.len() {
+            // What has not changed is there as it is.
+            let goes = |(_, block): &&(f32, u32)| all || self.blocks[*block as usize].changed();
+            done += blocks[done..].iter().take_while(|block| !goes(block)).count();
+            let upto = done + blocks[done..].iter().take_while(goes).count();
+            let put = self.read_pages(scene, &blocks[done..upto], bytes, |archive, views, block, count, own| {
+                archive.put_block(views, block, colour, count, own)
+            })?;
+            done += put;
+            if done < upto {
+                break;
+            }
+        }
+        Ok(done)
+    }
+
+    /// Reads blocks in the pool, some at once as `bytes` has room, and hands each one's arrays over; how many were taken, from
+    /// the first on.
+    pub fn read_pages(
+        &mut self,
+        scene: &mut Scene,
+        blocks: &[(f32, u32)],
+        bytes: &mut Vec<u8>,
+        mut take: impl FnMut(&mut Archive, &Views, usize, usize, &[u8]) -> bool,
+    ) -> Result<usize, GpuError> {
         let (gpu, pool) = (&mut scene.gpu, &mut scene.pipeline.pool);
         let each = splat_bytes(pool.colour, MOMENTS);
-        let goes = |a: &Archive, block: u32| all || a.blocks[block as usize].changed();
         let mut done = 0;
         while done < blocks.len() {
-            // As many as are read at once.
+            let number = |at: usize| self.blocks[blocks[at].1 as usize].number;
             let (mut upto, mut size) = (done, 0);
-            while let Some(&(_, block)) = blocks.get(upto) {
-                let more = usize::from(goes(self, block)) * pool.block(self.blocks[block as usize].number).len() * each;
+            while upto < blocks.len() {
+                let more = pool.block(number(upto)).len() * each;
                 if size > 0 && size + more > bytes.capacity() {
                     break;
                 }
                 (upto, size) = (upto + 1, size + more);
             }
             bytes.clear();
-            let read = blocks[done..upto].iter().map(|(_, block)| *block).filter(|block| goes(self, *block));
-            pool.read_blocks(gpu, read.map(|block| self.blocks[block as usize].number), MOMENTS, bytes)?;
+            pool.read_blocks(gpu, (done..upto).map(number), MOMENTS, bytes)?;
             let mut rest = &bytes[..];
-            for (_, block) in &blocks[done..upto] {
-                if goes(self, *block) {
-                    let count = pool.block(self.blocks[*block as usize].number).len();
-                    let (own, after) = rest.split_at(count * each);
-                    rest = after;
-                    if !self.put_block(&scene.views, *block as usize, pool.colour, count, own) {
-                        return Ok(done);
-                    }
+            for &(_, block) in &blocks[done..upto] {
+                let count = pool.block(self.blocks[block as usize].number).len();
+                let (own, after) = rest.split_at(count * each);
+                rest = after;
+                if !take(self, &scene.views, block as usize, count, own) {
+                    return Ok(done);
                 }
                 done += 1;
             }
@@ -137,16 +192,7 @@ impl Archive {
         // The header tells where the Gaussians are, so they are looked at first.
         self.look_at(block, count, bytes);
         let b = &self.blocks[block];
-        let about = BlockAbout {
-            epoch: b.epoch,
-            count: b.count,
-            colour,
-            moments: MOMENTS,
-            placed: b.placed,
-            moved: Pose::IDENTITY,
-            samples: b.samples,
-            samples_len: b.samples_len,
-        };
+        let about = b.about(colour);
         let key = self.key(KIND_BLOCK, part_id(views, b));
         let taken = self.store.put(key, &about.encode(), |payload| payload.extend_from_slice(bytes));
         if taken {
@@ -159,23 +205,10 @@ impl Archive {
 
     /// Takes a block's samples from its arrays.
     fn look_at(&mut self, block: usize, count: usize, bytes: &[u8]) {
-        let splat =
-            |at: usize| bytemuck::pod_read_unaligned::<Splat>(&bytes[at * size_of::<Splat>()..][..size_of::<Splat>()]);
         if self.blocks[block].samples_len == 0 {
             self.exchanged(block);
         }
-        let b = &mut self.blocks[block];
-        (b.count, b.samples_len) = (count as u32, 0);
-        let samples = (count / GAUSSIANS_A_SAMPLE).clamp(SAMPLES_MIN, SAMPLES).min(count);
-        for i in 0..samples {
-            // The largest of each few: what is seen from afar, and reaches farthest.
-            let few = (i * count / samples)..((i + 1) * count / samples);
-            let sampled = few.map(|at| sample(&splat(at))).filter(|s| s.iter().all(|v| v.is_finite()));
-            if let Some(largest) = sampled.max_by(|a, b| a[3].total_cmp(&b[3])) {
-                b.samples[usize::from(b.samples_len)] = largest;
-                b.samples_len += 1;
-            }
-        }
+        self.blocks[block].look_at(count, bytes);
         self.measure(block);
     }
 
@@ -273,6 +306,11 @@ impl Archive {
                 whole &= self.save_keyframe(&scene.views, keyframe);
             }
         }
-        Ok(self.store.flush().map(|()| whole))
+        let flushed = self.store.flush();
+        if whole && flushed.is_ok() {
+            // What stays would be written to the store once more.
+            self.latest.iter_mut().for_each(|latest| _ = latest.clear());
+        }
+        Ok(flushed.map(|()| whole))
     }
 }

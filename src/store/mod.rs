@@ -19,6 +19,7 @@ mod record;
 mod scan;
 mod segment;
 mod shared;
+mod snapshot;
 mod state;
 #[cfg(test)]
 mod tests;
@@ -28,6 +29,7 @@ pub use aside::set_aside;
 pub use disk::Disk;
 pub use reader::Reader;
 pub use record::{size as record_bytes, About, Key, ABOUT};
+pub use snapshot::{bytes as snapshot_bytes, Snapshot};
 
 use crate::mem::{Footprint, List};
 use shared::{Shared, Writer};

@@ -7,6 +7,7 @@
 use super::index::{Full, Index, Place};
 use super::record::{Form, Header, SegmentHeader, SECTOR, VERSION};
 use super::segment::{self, Folder, Walk, SCRATCH};
+use super::snapshot;
 use std::fs::File;
 use std::io;
 use std::os::unix::fs::FileExt as _;
@@ -196,7 +197,7 @@ fn list(path: &Path, folder: &Folder, identity: Option<u64>) -> Result<Found, Fa
         let name = entry.map_err(refused)?.file_name();
         match name.to_str().and_then(segment::number) {
             Some(number) => numbers.push(number),
-            None if name.to_str() == Some(LOCK) => {}
+            None if matches!(name.to_str(), Some(LOCK | snapshot::NAME)) => {}
             None => strangers.push(name.to_string_lossy().into_owned()),
         }
     }

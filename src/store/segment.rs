@@ -108,7 +108,7 @@ pub fn sync_file(file: &File) -> io::Result<()> {
     file.sync_data()
 }
 
-fn allocate(file: &File, bytes: u64) -> io::Result<()> {
+pub fn allocate(file: &File, bytes: u64) -> io::Result<()> {
     use rustix::io::Errno;
     loop {
         match rustix::fs::fallocate(file, FallocateFlags::empty(), 0, bytes) {

@@ -7,6 +7,7 @@ pub mod disk;
 mod files;
 mod model;
 mod power;
+mod snapshot;
 
 use super::*;
 use std::collections::BTreeMap;
