@@ -4,7 +4,7 @@
 mod flight;
 
 use flight::{board, flight, train};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use stipple::map::{Evaluation, Keyframe, Mapper, Place, StepKind};
 use stipple::mem::{heap_after_seal, seal_thread, CountingAllocator};
 use stipple_drivers::Calibration;
@@ -129,6 +129,34 @@ fn a_mapper_of_the_same_flight_goes_on_with_what_is_on_disk_and_another_flight_w
     assert!(!anchor && psnr_db > before[0] - 2.0, "{anchor} {psnr_db} {before:?}");
 }
 
+/// A copy of a map's folder without one of its files.
+fn copied(from: &Path, to: &Path, without: &str) -> PathBuf {
+    let to = to.join(format!("without {without}"));
+    std::fs::create_dir(&to).unwrap();
+    for file in std::fs::read_dir(from).unwrap().map(|entry| entry.unwrap()) {
+        if file.file_name() != without {
+            std::fs::copy(file.path(), to.join(file.file_name())).unwrap();
+        }
+    }
+    to
+}
+
+/// A snapshot with an anchor that grows, after which the anchor was completed: what the store has of it is newer.
+#[test]
+fn a_mapper_that_dies_after_a_burst_leaves_its_anchor_once() {
+    let (calibration, keyframes) = flight(1);
+    let (dir, died) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+    let mut mapper = opened(&calibration, &[], Some(place(dir.path(), 1)));
+    assert!(matches!(mapper.ingest(&keyframes[0]).unwrap(), StepKind::Anchor { .. }));
+    let growing = (mapper.splat_count(), copied(dir.path(), died.path(), "lock"));
+    train(&mut mapper, STEPS);
+    let complete = (mapper.splat_count(), copied(dir.path(), died.path(), "nothing"));
+    for (count, folder) in [growing, complete] {
+        let again = opened(&calibration, &[], Some(place(&folder, 1)));
+        assert_eq!(again.splat_count(), count);
+    }
+}
+
 /// What is on the disk when a mapper dies is the map of its last keyframe, also of an anchor whose burst has just begun; what the
 /// store alone has by then is worse.
 #[test]
@@ -140,17 +168,7 @@ fn a_mapper_that_dies_leaves_the_map_of_its_last_keyframe() {
         train(&mut mapper, STEPS);
         mapper.ingest(k).unwrap();
     }
-    let copied = |without: &str| {
-        let to = died.path().join(format!("without {without}"));
-        std::fs::create_dir(&to).unwrap();
-        for file in std::fs::read_dir(dir.path()).unwrap().map(|entry| entry.unwrap()) {
-            if file.file_name() != without {
-                std::fs::copy(file.path(), to.join(file.file_name())).unwrap();
-            }
-        }
-        to
-    };
-    let [whole, store_alone] = ["lock", "latest"].map(copied);
+    let [whole, store_alone] = ["lock", "latest"].map(|without| copied(dir.path(), died.path(), without));
     assert_eq!(mapper.counters().snapshot_errors.get(), 0);
     let before = decibels(&mapper.evaluate().unwrap());
     let score = |folder: &Path| {

@@ -291,10 +291,10 @@ section! {
     StoreConfig, "store.";
     /// Whether the map is kept there, too. Without, mapping ends when `budget.keyframes` have come, and a restart begins anew.
     enabled: bool = true;
-    /// Space on the disk, MiB, taken in files of 8 MiB as it is needed; half of it, less twice the bytes of a full pool, holds records. A keyframe of 376x240 in grey takes 90 kB, a thousand
+    /// Space on the disk, MiB, taken in files of 8 MiB as it is needed; half of it, less the bytes of a full pool, holds records. A keyframe of 376x240 in grey takes 90 kB, a thousand
     /// Gaussians 150 kB.
     max_mib: u64 = 2048, Bound::Within(128.0, 1_048_576.0);
-    /// Most that is written in a second, MiB, on average.
+    /// Most that is written in a second, MiB, on average, beside the snapshots (`map/latest`) that are overwritten with each keyframe.
     write_mib_per_s: f64 = 8.0, Bound::Within(0.1, 4096.0);
     /// Keyframes that are known: 1 to 2 KiB of memory each, and 2 KiB for the blocks that it may see; as many are known to loop
     /// closure, 17 KiB each, and beyond that the ones whose neighbours are the nearest are left out.

@@ -129,7 +129,7 @@ pub struct Known {
 pub struct Archive {
     pub store: Store,
     disk: Arc<Disk>,
-    at_once: bool,
+    pub at_once: bool,
     pub run: u32,
     about: RunAbout,
     /// The runs whose maps are known, this one last.
@@ -329,6 +329,7 @@ impl Archive {
     /// Makes one map of two epochs, by their numbers over all runs.
     pub fn join(&mut self, from: u32, into: u32) {
         self.runs.joined.push((from, into));
+        self.exchanges += 1;
         for block in 0..self.blocks.len() {
             if self.blocks[block].epoch == from {
                 self.blocks[block].epoch = into;
@@ -504,14 +505,20 @@ impl Archive {
 /// Hands what a mapper that died left in its snapshot to the store, unless the map begins anew, and makes room for the next one.
 fn take_over(mut latest: Snapshot, bytes: u64, fresh: bool, store: &mut Store) -> io::Result<Snapshot> {
     if !fresh {
-        latest.read(|key, about, payload| {
-            if !store.has_room() {
-                // What cannot be written is counted by the store.
-                let _ = store.flush();
+        let is_new = store.figures().records == 0;
+        let mut lost = false;
+        latest.read(|key, generation, about, payload| {
+            if is_new || store.generation(&key).0 != generation {
+                return;
             }
-            store.put(key, about, |buffer| buffer.extend_from_slice(payload));
+            let put = |store: &mut Store| store.put(key, about, |buffer| buffer.extend_from_slice(payload));
+            // Where its buffers are full it is written first.
+            lost |= !put(store) && (store.flush().is_err() || !put(store));
         })?;
         store.flush().map_err(|fault| io::Error::other(fault.to_string()))?;
+        if lost {
+            return Err(io::ErrorKind::StorageFull.into());
+        }
     }
     latest.make(bytes)?;
     Ok(latest)

@@ -114,7 +114,8 @@ pub fn payload_max(board: &Board, shape: &Shape) -> usize {
 /// Bytes of a snapshot of all that may be in the pool and of all keyframes.
 pub fn latest_max(board: &Board, shape: &Shape) -> u64 {
     let states = keyframes_known(board, shape) * shape.cameras as usize;
-    store::snapshot_bytes(BLOCKS + states, shape.splats as usize * splat_bytes(shape.channels == 3, MOMENTS))
+    let splats = shape.splats as usize * splat_bytes(shape.channels == 3, MOMENTS);
+    store::snapshot_bytes(BLOCKS + states + BUFFERS, splats + BUFFERS * payload_max(board, shape))
 }
 
 /// A number of a rig and the form of its images: maps of another are not read.

@@ -2,11 +2,11 @@
 //! since its last keyframe, not all since each block was last written.
 
 use super::archive::{part_id, Archive};
-use super::block::{KIND_BLOCK, KIND_KEYFRAME, NO_BLOCK};
+use super::block::{KIND_BLOCK, KIND_IMAGE, KIND_KEYFRAME, NO_BLOCK};
 use super::filing::{image_id, state};
 use super::scene::Scene;
 use crate::gpu::GpuError;
-use crate::store::Snapshot;
+use crate::store::{Snapshot, ABOUT};
 use std::io;
 use stipple_drivers::{Nanos, Span};
 
@@ -34,13 +34,16 @@ impl Archive {
         Ok(())
     }
 
-    /// Writes the blocks in the pool that have changed, one that grows too, and the states of the keyframes of this run; bytes.
+    /// Writes the blocks in the pool that have changed, one that grows too, the states of keyframes, and what waits in buffers of
+    /// the store; bytes.
     fn write_latest(&mut self, scene: &mut Scene, snapshot: &mut Snapshot) -> Result<io::Result<u64>, GpuError> {
         snapshot.begin();
         let mut blocks = std::mem::take(&mut self.choice.ranked);
         blocks.clear();
         for block in scene.pipeline.pool.blocks().filter_map(|(number, _)| self.block_of(number)) {
-            if self.blocks[block].changed() {
+            let b = &self.blocks[block];
+            // What waits in a buffer of the store dies with it.
+            if b.changed() || self.store.generation(&self.key(KIND_BLOCK, part_id(&scene.views, b))).1 {
                 blocks.push((0.0, block as u32));
             }
         }
@@ -49,21 +52,36 @@ impl Archive {
         let read = self.read_pages(scene, &blocks, &mut bytes, |archive, views, block, count, own| {
             let mut b = archive.blocks[block];
             b.look_at(count, own);
-            added = snapshot.add(&archive.key(KIND_BLOCK, part_id(views, &b)), &b.about(colour).encode(), own);
+            let key = archive.key(KIND_BLOCK, part_id(views, &b));
+            added = snapshot.add(&key, archive.store.generation(&key).0, &b.about(colour).encode(), own);
             matches!(added, Ok(true))
         });
-        (self.choice.ranked, self.choice.page) = (blocks, bytes);
-        read?;
+        self.choice.ranked = blocks;
+        if read.is_err() {
+            self.choice.page = bytes;
+            return read.map(|_| Err(io::ErrorKind::Other.into()));
+        }
         self.look_at_changed();
         let (views, cameras) = (&scene.views, scene.views.cameras());
-        for index in views.earlier..self.known.len() * cameras {
-            let known = self.known[index / cameras];
-            if known.saved && matches!(added, Ok(true)) {
-                let home = known.home.map_or(NO_BLOCK, |anchor| views.get(anchor as usize).id as u32);
-                let about = state(views.get(index), home).encode();
-                added = snapshot.add(&self.key(KIND_KEYFRAME, image_id(views, index)), &about, &[]);
+        for index in 0..self.known.len() * cameras {
+            let (known, entry) = (self.known[index / cameras], views.get(index));
+            let is_due = known.saved && (index >= views.earlier || known.stated != entry.steps);
+            if !is_due || !matches!(added, Ok(true)) {
+                continue;
+            }
+            let home = known.home.map_or(NO_BLOCK, |anchor| views.get(anchor as usize).id as u32);
+            let key = self.key(KIND_KEYFRAME, image_id(views, index));
+            added = snapshot.add(&key, self.store.generation(&key).0, &state(entry, home).encode(), &[]);
+            let image = self.key(KIND_IMAGE, image_id(views, index));
+            if let (Ok(true), (generation, true), true) =
+                (&added, self.store.generation(&image), views.has_place(index))
+            {
+                bytes.clear();
+                views.planes(index).iter().for_each(|plane| bytes.extend_from_slice(&plane.pixels));
+                added = snapshot.add(&image, generation, &[0; ABOUT], &bytes);
             }
         }
+        self.choice.page = bytes;
         Ok(match added {
             Ok(true) => snapshot.end(),
             Ok(false) => Err(io::ErrorKind::StorageFull.into()),

@@ -186,6 +186,8 @@ impl Mapper {
         };
         if let Some(archive) = &mut archive {
             archive.resume(&mut views);
+            // Parts of an anchor that were written before and after it was moved.
+            archive.follow(&views);
             counters.snapshot_errors.add(u64::from(archive.latest.is_none()));
             trainer.scene_depth_m = archive.scene_depth_m().unwrap_or(trainer.scene_depth_m);
         }

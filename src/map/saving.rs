@@ -209,6 +209,9 @@ impl Archive {
             self.exchanged(block);
         }
         self.blocks[block].look_at(count, bytes);
+        if self.blocks[block].samples_len == 0 {
+            self.exchanged(block);
+        }
         self.measure(block);
     }
 
@@ -308,7 +311,7 @@ impl Archive {
         }
         let flushed = self.store.flush();
         if whole && flushed.is_ok() {
-            // What stays would be written to the store once more.
+            // The store has later generations of what stays.
             self.latest.iter_mut().for_each(|latest| _ = latest.clear());
         }
         Ok(flushed.map(|()| whole))

@@ -4,6 +4,7 @@
 use super::record::{SegmentHeader, SECTOR};
 use super::scan::LOCK;
 use super::segment;
+use super::snapshot;
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, Read as _};
 use std::path::{Path, PathBuf};
@@ -74,22 +75,28 @@ pub fn lock(folder: &Path) -> Result<File, Fault> {
     Ok(file)
 }
 
-/// Names of the segments in a folder: files that have the name of one, and its header or nothing in them.
+/// Names of the segments in a folder and of its snapshot: files that have the name of one, and its header or nothing in them.
 fn segments(folder: &Path) -> io::Result<Vec<String>> {
     let mut found = vec![];
     for entry in fs::read_dir(folder)? {
         let entry = entry?;
         let name = entry.file_name().to_string_lossy().into_owned();
-        if segment::number(&name).is_none() || !entry.file_type()?.is_file() {
+        let is_snapshot = name == snapshot::NAME;
+        if segment::number(&name).is_none() && !is_snapshot || !entry.file_type()?.is_file() {
             continue;
         }
         let (mut sector, mut got) = ([0; SECTOR], vec![]);
         File::open(entry.path())?.take(SECTOR as u64).read_to_end(&mut got)?;
         sector[..got.len()].copy_from_slice(&got);
-        if SegmentHeader::decode(&sector).is_some() || sector == [0; SECTOR] {
+        let is_ours = match is_snapshot {
+            true => sector.starts_with(&snapshot::MAGIC),
+            false => SegmentHeader::decode(&sector).is_some(),
+        };
+        if is_ours || sector == [0; SECTOR] {
             found.push(name);
         }
     }
-    found.sort();
+    // The snapshot first: it never lies beside segments that it is not of.
+    found.sort_by_key(|name| (name != snapshot::NAME, name.clone()));
     Ok(found)
 }

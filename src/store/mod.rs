@@ -162,6 +162,12 @@ impl Store {
         state.index.about(state.index.get(key)?).copied()
     }
 
+    /// The generation on disk of a key, 0 for none, and whether another waits to be written.
+    pub fn generation(&self, key: &Key) -> (u32, bool) {
+        let state = self.shared.state();
+        (state.index.get(key).map_or(0, |entry| entry.generation), state.is_pending(key))
+    }
+
     /// Whether a buffer is free and the disk takes a new key.
     pub fn has_room(&self) -> bool {
         let state = self.shared.state();

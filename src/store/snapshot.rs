@@ -2,8 +2,10 @@
 //! anew in turn.
 //!
 //! A store has each record as it was when it was last put. A snapshot has all that have changed since, of one age, and is
-//! written often: what is overwritten before the kernel writes it back, some half a minute later, costs the disk nothing. It is
-//! never synced and survives the process alone: after a boot it is not read.
+//! written often: the kernel writes it to the disk about each half a minute, and what was overwritten by then never. It is not
+//! synced and survives the process alone: after a boot it is not read.
+//!
+//! Each record has the generation that the store had of it: where the store has a later one, that is newer.
 
 use super::record::{About, Key, ABOUT, SECTOR};
 use rustix::fs::OFlags;
@@ -14,9 +16,10 @@ use std::path::Path;
 
 /// Its file in the store's folder.
 pub const NAME: &str = "latest";
-const MAGIC: [u8; 8] = *b"StipLast";
-/// What precedes a payload: key, length and what the owner keeps of it.
-const ENTRY: usize = 13 + ABOUT;
+/// The first bytes of both halves.
+pub const MAGIC: [u8; 8] = *b"StipLast";
+/// What precedes a payload: key, generation, length and what the owner keeps of it.
+const ENTRY: usize = 17 + ABOUT;
 /// Characters that name a boot.
 const BOOT: usize = 36;
 /// Where the checksum of a half's first sector lies.
@@ -57,7 +60,9 @@ impl Snapshot {
         let mut file = options.open(folder.join(NAME))?;
         let mut magic = MAGIC;
         let about = file.metadata()?;
-        let is_ours = about.is_file() && (about.len() == 0 || file.read_exact(&mut magic).is_ok() && magic == MAGIC);
+        // Of a file that a power cut left without its content, there are zeros.
+        let mut is_known = || file.read_exact(&mut magic).is_ok() && [MAGIC, [0; 8]].contains(&magic);
+        let is_ours = about.is_file() && (about.len() == 0 || is_known());
         if !is_ours {
             return Err(io::Error::new(io::ErrorKind::AlreadyExists, "it is no snapshot of a map"));
         }
@@ -67,8 +72,9 @@ impl Snapshot {
         Ok(Snapshot { file, half, head: Head { identity, sequence: 0, bytes: 0, crc: 0, boot } })
     }
 
-    /// Visits the records of the newest whole half, if it is of this map and this boot. Allocates.
-    pub fn read(&self, mut visit: impl FnMut(Key, &About, &[u8])) -> io::Result<()> {
+    /// Visits the records of the newest whole half, with the generations that the store had of them, if it is of this map and this
+    /// boot. Allocates.
+    pub fn read(&self, mut visit: impl FnMut(Key, u32, &About, &[u8])) -> io::Result<()> {
         let mut newest: Option<(Head, Vec<u8>)> = None;
         for at in [0, self.half] {
             let mut sector = [0; SECTOR];
@@ -91,29 +97,29 @@ impl Snapshot {
         let mut rest = &entries[..];
         while let Some((entry, after)) = rest.split_first_chunk::<ENTRY>() {
             let u32_at = |at: usize| u32::from_le_bytes(std::array::from_fn(|i| entry[at + i]));
-            let about = std::array::from_fn(|i| entry[13 + i]);
-            let Some((payload, after)) = after.split_at_checked(u32_at(9) as usize) else { break };
-            visit(Key { kind: entry[0], run: u32_at(1), id: u32_at(5) }, &about, payload);
+            let about = std::array::from_fn(|i| entry[17 + i]);
+            let Some((payload, after)) = after.split_at_checked(u32_at(13) as usize) else { break };
+            visit(Key { kind: entry[0], run: u32_at(1), id: u32_at(5) }, u32_at(9), &about, payload);
             rest = after;
         }
         Ok(())
     }
 
-    /// Makes the file new, empty and with halves of so many bytes, whose space is taken.
+    /// Makes the file new, empty and with halves of so many bytes, whose space is taken. Where there is too little, none is.
     pub fn make(&mut self, half: u64) -> io::Result<()> {
-        self.clear()?;
+        self.file.set_len(0)?;
         self.half = half;
-        self.file.set_len(2 * half)?;
-        super::segment::allocate(&self.file, 2 * half)?;
-        self.clear()
+        super::segment::allocate(&self.file, 2 * half).and_then(|()| self.clear()).inspect_err(|_| {
+            let _ = self.file.set_len(0);
+        })
     }
 
-    /// Forgets what is there: all of it is in the store.
+    /// Forgets what is there: all of it is in the store. The older half goes first.
     pub fn clear(&mut self) -> io::Result<()> {
         let mut none = [0; SECTOR];
         none[..MAGIC.len()].copy_from_slice(&MAGIC);
-        self.file.write_all_at(&none, self.half)?;
-        self.file.write_all_at(&none, 0)
+        self.file.write_all_at(&none, self.half - self.start())?;
+        self.file.write_all_at(&none, self.start())
     }
 
     /// Begins another; the one before it stays until this one is ended.
@@ -121,14 +127,14 @@ impl Snapshot {
         (self.head.sequence, self.head.bytes, self.head.crc) = (self.head.sequence + 1, 0, 0);
     }
 
-    /// Adds a record; false where it does not fit.
-    pub fn add(&mut self, key: &Key, about: &About, payload: &[u8]) -> io::Result<bool> {
+    /// Adds a record of which the store has a generation; false where it does not fit.
+    pub fn add(&mut self, key: &Key, generation: u32, about: &About, payload: &[u8]) -> io::Result<bool> {
         let mut entry = [0; ENTRY];
         entry[0] = key.kind;
-        for (at, number) in [(1, key.run), (5, key.id), (9, payload.len() as u32)] {
+        for (at, number) in [(1, key.run), (5, key.id), (9, generation), (13, payload.len() as u32)] {
             entry[at..at + 4].copy_from_slice(&number.to_le_bytes());
         }
-        entry[13..].copy_from_slice(about);
+        entry[17..].copy_from_slice(about);
         let more = (ENTRY + payload.len()) as u64;
         if SECTOR as u64 + self.head.bytes + more > self.half {
             return Ok(false);

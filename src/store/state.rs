@@ -177,6 +177,11 @@ impl State {
         pending.unwrap_or_else(|| self.index.get(key).is_some_and(|e| !e.is_tombstone))
     }
 
+    /// Whether a record of a key waits to be written.
+    pub fn is_pending(&self, key: &Key) -> bool {
+        self.pending().any(|p| p.0 == *key)
+    }
+
     /// Bytes that may count: by the files that are there, not by those that could be made, since others may fill the disk.
     fn live_max(&self) -> u64 {
         let files = self.segments.iter().filter(|s| s.state != Use::Gone).count() as u64;

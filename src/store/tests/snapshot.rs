@@ -2,7 +2,8 @@
 #![cfg(test)]
 #![allow(clippy::unwrap_used)]
 
-use super::{content, key, IDENTITY};
+use super::{content, key, open, IDENTITY, SMALL};
+use crate::store::set_aside;
 use crate::store::snapshot::{bytes, Snapshot, NAME};
 use crate::store::Key;
 use std::path::Path;
@@ -23,7 +24,7 @@ fn made(folder: &Path) -> Snapshot {
 fn add(snapshot: &mut Snapshot, version: u32, records: usize) {
     for id in 0..records as u32 {
         let (about, payload) = content(key(id), version, LENGTH);
-        assert!(snapshot.add(&key(id), &about, &payload).unwrap());
+        assert!(snapshot.add(&key(id), version + 7, &about, &payload).unwrap());
     }
 }
 
@@ -36,9 +37,12 @@ fn write(snapshot: &mut Snapshot, version: u32, records: usize) {
 /// The versions of the records that are read back, each of which is checked.
 fn versions(snapshot: &Snapshot) -> Vec<(Key, u32)> {
     let mut found = vec![];
-    let read = snapshot.read(|key, about, payload| {
+    let read = snapshot.read(|key, generation, about, payload| {
         let version = u32::from_le_bytes(about[4..8].try_into().unwrap());
-        assert_eq!((*about, payload.to_vec()), content(key, version, LENGTH));
+        assert_eq!((*about, payload.to_vec(), generation), {
+            let (about, payload) = content(key, version, LENGTH);
+            (about, payload, version + 7)
+        });
         found.push((key, version));
     });
     read.unwrap();
@@ -71,8 +75,36 @@ fn the_last_that_was_ended_is_read() {
     snapshot.begin();
     add(&mut snapshot, 5, 1);
     let (about, payload) = content(key(1), 5, LENGTH);
-    assert!(!snapshot.add(&key(1), &about, &payload).unwrap(), "it is full");
+    assert!(!snapshot.add(&key(1), 0, &about, &payload).unwrap(), "it is full");
     assert_eq!(versions(&opened(dir.path())), all(4, 1));
+}
+
+/// The space of a file may be there after a power cut, and nothing that was written to it.
+#[test]
+fn a_file_of_zeros_is_an_empty_snapshot() {
+    let dir = tempfile::tempdir().unwrap();
+    std::fs::write(dir.path().join(NAME), [0; 4096]).unwrap();
+    assert_eq!(versions(&opened(dir.path())), []);
+    write(&mut made(dir.path()), 1, RECORDS);
+    assert_eq!(versions(&opened(dir.path())), all(1, RECORDS));
+}
+
+/// A store that is set aside takes its snapshot along, and a foreign file stays.
+#[test]
+fn a_store_that_begins_anew_has_no_snapshot() {
+    let dir = tempfile::tempdir().unwrap();
+    let (map, aside) = (dir.path().join("map"), dir.path().join("previous-map"));
+    for version in 1..3 {
+        drop(open(&map, &SMALL));
+        write(&mut made(&map), version, RECORDS);
+        assert_eq!(set_aside(&map).unwrap(), Some(aside.clone()));
+        assert_eq!(versions(&opened(&aside)), all(version, RECORDS));
+        assert!(!map.join(NAME).exists());
+    }
+    drop(open(&map, &SMALL));
+    std::fs::write(map.join(NAME), b"my notes").unwrap();
+    set_aside(&map).unwrap();
+    assert_eq!(std::fs::read(map.join(NAME)).unwrap(), b"my notes");
 }
 
 #[test]
