@@ -46,7 +46,8 @@ const NEAR_M: f32 = 8.0;
 const NEEDED_MIN: f32 = 0.25;
 /// Part of the pool that is left for what is new when a keyframe comes.
 const RESERVE_DIVISOR: usize = 8;
-/// Blocks asked for between training steps.
+/// Blocks asked for when a keyframe comes whose surroundings do not fit, and between training steps.
+const PAGED_WHERE_THINNED: usize = 32;
 const PAGED_A_STEP: usize = 16;
 /// Training steps at a place before the pool turns to another.
 const STEPS_AT_A_PLACE: u64 = 20;
@@ -336,15 +337,19 @@ impl Archive {
         choice.ranked = ranked;
     }
 
-    /// Fetches what is wanted and waits for it, as long as `patience`.
+    /// Fetches what is wanted and waits for it, as long as `patience`; where the disk is read on this thread until it is here.
     fn fetch_wanted(&mut self, scene: &mut Scene, patience: Duration) -> Result<(), GpuError> {
+        if self.choice.evict && self.choice.thins {
+            // Not all of it fits: each page makes the scene thinner, one at a time.
+            return self.page(scene, PAGED_WHERE_THINNED);
+        }
         let begun = Instant::now();
         loop {
             let before = self.exchanges;
             self.page(scene, usize::MAX)?;
             let waits = self.choice.blocks.iter().any(|b| self.blocks[*b as usize].asked);
             // What has no room does not come.
-            if !waits && self.exchanges == before || begun.elapsed() > patience {
+            if !waits && self.exchanges == before || !self.at_once && begun.elapsed() > patience {
                 return Ok(());
             }
             if waits {

@@ -191,6 +191,7 @@ impl Archive {
             tried[n] = first;
             if self.known[first / cameras].open {
                 self.look_again(scene, first)?;
+                self.look_at_changed();
             }
             if self.save_keyframe(&scene.views, first / cameras) {
                 scene.views.unplace(first);
