@@ -291,7 +291,7 @@ section! {
     StoreConfig, "store.";
     /// Whether the map is kept there, too. Without, mapping ends when `budget.keyframes` have come, and a restart begins anew.
     enabled: bool = true;
-    /// Space on the disk, MiB, taken in files of 8 MiB as it is needed; half of it, less the bytes of a full pool, holds records. A keyframe of 376x240 in grey takes 90 kB, a thousand
+    /// Space on the disk, MiB, taken in files of 8 MiB as it is needed; half of it holds records. A snapshot, of twice the bytes of a full pool, lies beside it. A keyframe of 376x240 in grey takes 90 kB, a thousand
     /// Gaussians 150 kB.
     max_mib: u64 = 2048, Bound::Within(128.0, 1_048_576.0);
     /// Most that is written in a second, MiB, on average, beside the snapshots (`map/latest`) that are overwritten with each keyframe.

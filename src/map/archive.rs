@@ -120,8 +120,8 @@ pub struct Known {
     pub away: f32,
     /// The anchor of the block that it sees most of.
     pub home: Option<u32>,
-    /// Where its views show what is not in the pool was found for what is there now.
-    pub is_masked: bool,
+    /// The cells of its views that show what is not in the pool were found for what is there now.
+    pub hidden_found: bool,
     /// One of its images could not be had: those that come go.
     pub in_part: bool,
 }
@@ -177,11 +177,14 @@ impl Archive {
             return Err(Fault::new(FaultKind::NoOutput, place.folder.display().to_string(), what, fix));
         }
         let (of, most) = (identity(calibration, board, shape), latest_max(board, shape));
-        let is_small = 2 * most < limits.bytes_max / LATEST_DIVISOR;
-        limits.bytes_max -= if is_small { 2 * most } else { 0 };
         let (mut store, disk) = Store::open(place.folder, of, &limits)?;
-        let latest = is_small.then(|| Snapshot::open(place.folder, of).ok()).flatten();
-        let latest = latest.and_then(|latest| take_over(latest, most, place.fresh, &mut store).ok());
+        let latest = Snapshot::open(place.folder, of).and_then(|mut latest| {
+            take_over(&latest, place.fresh, &mut store, &disk)?;
+            // Of a small disk the store has all.
+            latest.make(if 2 * most < limits.bytes_max / LATEST_DIVISOR { most } else { 0 })?;
+            Ok(latest)
+        });
+        let latest = latest.ok().filter(Snapshot::has_room);
         let about = RunAbout {
             epoch_base: 0,
             started_unix_ms: place.flight.unwrap_or_default(),
@@ -502,26 +505,28 @@ impl Archive {
     }
 }
 
-/// Hands what a mapper that died left in its snapshot to the store, unless the map begins anew, and makes room for the next one.
-fn take_over(mut latest: Snapshot, bytes: u64, fresh: bool, store: &mut Store) -> io::Result<Snapshot> {
-    if !fresh {
-        let is_new = store.figures().records == 0;
-        let mut lost = false;
-        latest.read(|key, generation, about, payload| {
-            if is_new || store.generation(&key).0 != generation {
-                return;
-            }
-            let put = |store: &mut Store| store.put(key, about, |buffer| buffer.extend_from_slice(payload));
-            // Where its buffers are full it is written first.
-            lost |= !put(store) && (store.flush().is_err() || !put(store));
-        })?;
-        store.flush().map_err(|fault| io::Error::other(fault.to_string()))?;
-        if lost {
-            return Err(io::ErrorKind::StorageFull.into());
-        }
+/// Hands what a mapper that died left in its snapshot to the store, unless the map begins anew. What finds no room in the store is
+/// lost, as without a snapshot.
+fn take_over(latest: &Snapshot, fresh: bool, store: &mut Store, disk: &Disk) -> io::Result<()> {
+    if fresh || store.figures().records == 0 {
+        return Ok(());
     }
-    latest.make(bytes)?;
-    Ok(latest)
+    latest.read(|key, generation, about, payload| {
+        // An anchor that grew then may have been cut into parts since, of which the first was not stored.
+        let is_whole = key.kind == KIND_BLOCK && key.id % PARTS == 0 && generation == 0;
+        let has = |key: &Key| store.generation(key) != (0, false);
+        let is_cut = is_whole && (1..PARTS).any(|part| has(&Key { id: key.id + part, ..key }));
+        if is_cut || store.generation(&key).0 != generation {
+            return;
+        }
+        let put = |store: &mut Store| store.put(key, about, |buffer| buffer.extend_from_slice(payload));
+        if !put(store) {
+            // Its buffers are full.
+            disk.serve();
+            put(store);
+        }
+    })?;
+    store.flush().map_err(|fault| io::Error::other(fault.to_string()))
 }
 
 /// What came from the disk.

@@ -218,6 +218,15 @@ impl Mapper {
             self.scene.counters.keyframes_not_finite.add(1);
             return Ok(StepKind::Dropped);
         }
+        if self.archive.is_some() && self.scene.views.index_of(keyframe.id).is_some() {
+            // The mapper before this one had it, and left it on the disk.
+            self.correct(&PoseCorrection {
+                id: keyframe.id,
+                world_from_body: keyframe.world_from_body,
+                body_from_cam: None,
+            });
+            return Ok(StepKind::Stored);
+        }
         self.apply_corrections()?;
         self.finish_pending()?;
         self.scene.views.visit(keyframe.t, keyframe.epoch, keyframe.world_from_body.p);

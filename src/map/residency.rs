@@ -508,7 +508,7 @@ impl Archive {
             // Its state is to be written again.
             self.known[keyframe].stated = u32::MAX;
             self.known[keyframe].open = horizon.open_part() > OPEN_MAX;
-            self.known[keyframe].is_masked = false;
+            self.known[keyframe].hidden_found = false;
             self.look_from(&view, &horizon, keyframe);
         }
     }

@@ -40,6 +40,7 @@ impl Archive {
         self.drawn.found_at = self.exchanges;
     }
 
+    /// Whether enough of what a keyframe sees is in the pool.
     fn shows_enough_of(&self, keyframe: usize) -> bool {
         self.known.get(keyframe).is_none_or(|known| known.away <= 1.0 - HERE_MIN)
     }
@@ -140,7 +141,7 @@ impl Archive {
     pub fn find_hidden(&mut self, scene: &mut Scene, index: usize) {
         let (first, cameras) = (scene.views.first(index), scene.views.cameras());
         self.look_at_changed();
-        if self.known.get(first / cameras).is_none_or(|k| k.is_masked) {
+        if self.known.get(first / cameras).is_none_or(|k| k.hidden_found) {
             return;
         }
         for view in first..first + cameras {
@@ -150,7 +151,7 @@ impl Archive {
             let entry = scene.views.get_mut(view);
             (entry.hidden, entry.incomplete) = (hidden, incomplete);
         }
-        self.known[first / cameras].is_masked = true;
+        self.known[first / cameras].hidden_found = true;
     }
 
     pub fn take_image(&mut self, scene: &mut Scene, index: usize, fetched: &Fetched) -> Result<(), GpuError> {
@@ -224,9 +225,9 @@ impl Archive {
         }
         let home = |keyframe: usize| self.known.get(keyframe)?.home;
         let last = !few
-            && home(keyframe).is_some_and(|home_here| {
-                let shares = |f: &usize| *f != first && home(*f / cameras) == Some(home_here);
-                let parts = home_here * PARTS..(home_here + 1) * PARTS;
+            && home(keyframe).is_some_and(|anchor| {
+                let shares = |f: &usize| *f != first && home(*f / cameras) == Some(anchor);
+                let parts = anchor * PARTS..(anchor + 1) * PARTS;
                 let is_here = parts.filter_map(|part| self.block_of(part)).any(|part| self.blocks[part].in_pool);
                 is_here && !views.placed().any(|f| shares(&f))
             });

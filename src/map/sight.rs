@@ -42,7 +42,7 @@ impl Archive {
             }
             let Some(known) = self.known.get_mut(keyframe) else { continue };
             known.away = if away > 0.0 { away / all } else { 0.0 };
-            (known.home, known.is_masked) = (most.1, false);
+            (known.home, known.hidden_found) = (most.1, false);
         }
     }
 

@@ -39,10 +39,10 @@ impl View {
         Some(self.world_from_cam.transform(p_cam * depth))
     }
 
-    /// The pixel that shows a point of the camera's frame, and its depth as the raster counts it, m; `None` where it is outside
+    /// The pixel that shows a point in the camera's frame, and its depth as the raster counts it, m; `None` where it is outside
     /// the picture by more than a margin, px.
-    pub fn project(&self, p: DVec3, margin_px: f64) -> Option<(f64, f64, f64)> {
-        let c = &self.camera;
+    pub fn project(&self, p_cam: DVec3, margin_px: f64) -> Option<(f64, f64, f64)> {
+        let (p, c) = (p_cam, &self.camera);
         let (px, depth) = match self.fisheye {
             None if p.z <= 0.0 => return None,
             None => (DVec2::new(c.fx * p.x / p.z + c.cx, c.fy * p.y / p.z + c.cy), p.z),

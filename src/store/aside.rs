@@ -24,8 +24,10 @@ pub fn set_aside(folder: &Path) -> Result<Option<PathBuf>, Fault> {
     aside.push(name);
     let aside = folder.with_file_name(aside);
     let ours = segments(folder).map_err(|e| fault(folder, e))?;
-    if ours.is_empty() {
-        return Ok(None);
+    if ours.iter().all(|name| name == snapshot::NAME) {
+        // Without its segments it is nothing.
+        let removed = ours.iter().try_for_each(|name| fs::remove_file(folder.join(name)));
+        return removed.map(|()| None).map_err(|e| fault(folder, e));
     }
     let move_all = || {
         fs::create_dir_all(&aside)?;

@@ -43,6 +43,8 @@ pub struct Snapshot {
     /// Bytes of a half.
     half: u64,
     head: Head,
+    /// The sequence number of the last that was ended.
+    ended: u64,
 }
 
 /// Bytes of a snapshot of so many records with so many bytes of payloads in all.
@@ -69,7 +71,7 @@ impl Snapshot {
         let boot = std::fs::read("/proc/sys/kernel/random/boot_id")?;
         let boot = boot.trim_ascii().try_into().map_err(|_| io::Error::other("the kernel does not name its boot"))?;
         let half = file.metadata()?.len() / 2;
-        Ok(Snapshot { file, half, head: Head { identity, sequence: 0, bytes: 0, crc: 0, boot } })
+        Ok(Snapshot { file, half, head: Head { identity, sequence: 0, bytes: 0, crc: 0, boot }, ended: 0 })
     }
 
     /// Visits the records of the newest whole half, with the generations that the store had of them, if it is of this map and this
@@ -105,13 +107,21 @@ impl Snapshot {
         Ok(())
     }
 
-    /// Makes the file new, empty and with halves of so many bytes, whose space is taken. Where there is too little, none is.
+    /// Makes the file new, empty and with halves of so many bytes, whose space is taken; of none where there is too little.
     pub fn make(&mut self, half: u64) -> io::Result<()> {
         self.file.set_len(0)?;
         self.half = half;
+        if half == 0 {
+            return Ok(());
+        }
         super::segment::allocate(&self.file, 2 * half).and_then(|()| self.clear()).inspect_err(|_| {
             let _ = self.file.set_len(0);
         })
+    }
+
+    /// Whether there is room for anything.
+    pub fn has_room(&self) -> bool {
+        self.half > 0
     }
 
     /// Forgets what is there: all of it is in the store. The older half goes first.
@@ -124,7 +134,7 @@ impl Snapshot {
 
     /// Begins another; the one before it stays until this one is ended.
     pub fn begin(&mut self) {
-        (self.head.sequence, self.head.bytes, self.head.crc) = (self.head.sequence + 1, 0, 0);
+        (self.head.sequence, self.head.bytes, self.head.crc) = (self.ended + 1, 0, 0);
     }
 
     /// Adds a record of which the store has a generation; false where it does not fit.
@@ -150,6 +160,7 @@ impl Snapshot {
     /// Ends what was begun: from here on it is what `read` answers. Its bytes.
     pub fn end(&mut self) -> io::Result<u64> {
         self.file.write_all_at(&self.head.encode(), self.start())?;
+        self.ended = self.head.sequence;
         Ok(self.head.bytes)
     }
 
