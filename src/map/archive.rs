@@ -179,10 +179,10 @@ impl Archive {
         let (of, most) = (identity(calibration, board, shape), latest_max(board, shape));
         let (mut store, disk) = Store::open(place.folder, of, &limits)?;
         let latest = Snapshot::open(place.folder, of).and_then(|mut latest| {
-            take_over(&latest, place.fresh, &mut store, &disk)?;
-            // Of a small disk the store has all.
+            let taken = take_over(&latest, place.fresh, &mut store, &disk);
+            // Of a small disk the store has all. What was not taken over must not come back in a later run.
             latest.make(if 2 * most < limits.bytes_max / LATEST_DIVISOR { most } else { 0 })?;
-            Ok(latest)
+            taken.map(|()| latest)
         });
         let latest = latest.ok().filter(Snapshot::has_room);
         let about = RunAbout {
