@@ -1,6 +1,7 @@
 // Replays the blend front to back and writes, for every intersection, the sum over its tile's pixels of
 // the loss gradient: one slot has one writer, so there are no atomics and every run sums in the same order.
-// in   ranges, intersections, owners, projected, chroma; rendered (planes of raster_forward); pixel_gradient, by
+// in   ranges, intersections, owners, projected, chroma; rendered (planes of raster_forward, filled by fill_absent where
+//      something is absent); pixel_gradient, by
 //      the colour's CHANNELS
 // out  isect_gradients[SLOT e + ..]: centre x, y; conic a, b, c; α dL/dα; grey or red; 0;
 //      with three CHANNELS green, blue, 0, 0

@@ -121,7 +121,7 @@ pub struct Known {
     /// The anchor of the block that it sees most of.
     pub home: Option<u32>,
     /// The cells of its views that show what is not in the pool were found for what is there now.
-    pub hidden_found: bool,
+    pub absent_found: bool,
     /// One of its images could not be had: those that come go.
     pub in_part: bool,
 }

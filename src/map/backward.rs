@@ -66,7 +66,7 @@ impl Backward {
     }
 
     /// Takes a step at `rates`, or none: then only the gradient by the pose is summed. The picture is the one that
-    /// `renderer` has just drawn.
+    /// `renderer` has just drawn, as the loss has compared it.
     pub fn record(
         &self,
         rec: &mut Recorder,

@@ -9,7 +9,6 @@
 
 use super::archive::Archive;
 use super::exposure::{fitted_exposure, Exposure};
-use super::horizon::Cells;
 use super::refine::Refinement;
 use super::scene::Scene;
 use super::ssim::{mse, psnr_db, Ssim};
@@ -244,7 +243,7 @@ fn align(scene: &mut Scene, index: usize, observed: &[f32], weights: &Weights) -
     let given = scene.views.get(scene.views.first(index)).given;
     let coarseness = scene.render(&view)?;
     let exposure = fitted_exposure(observed, &scene.rendered.colour, &scene.camera(index).valid);
-    let target = Target { exposure, hidden: Cells::default(), incomplete: false, ..scene.target(index) };
+    let target = Target { exposure, absent: None, ..scene.target(index) };
     let mut refined = Refinement::default();
     let (mut best, mut best_loss) = (refined, f64::INFINITY);
     for k in 0..ALIGN_STEPS {

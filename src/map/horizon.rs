@@ -49,6 +49,15 @@ impl Cells {
     }
 }
 
+/// The cells of a view that show what is not in the pool.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Absent {
+    /// Much of it: not compared.
+    pub hidden: Cells,
+    /// Some of it: the image stands in for it. Those of `hidden` among them.
+    pub filled: Cells,
+}
+
 /// Codes of depth, row by row.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Horizon(pub [u8; CELLS]);

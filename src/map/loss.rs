@@ -1,19 +1,19 @@
 //! The images to train on, and how far a picture is from one: (1 - λ)|x - y| + λ(1 - SSIM) and its gradient by pixel.
 //!
 //! ```text
-//! (mask_cells) -> ssim_tiles -> loss_tiles                                           picture -> gradient by pixel, channel by channel
+//! (fill_absent) -> ssim_tiles -> loss_tiles                                           picture -> gradient by pixel, channel by channel
 //! on a CPU: ssim_rows -> ssim_columns -> loss_rows -> loss_columns
 //! ```
 
-use super::horizon::{COLUMNS, ROWS};
+use super::horizon::{Absent, COLUMNS, ROWS};
 use super::shape::{Scratch, Shape, GROUP, LOSS_TILE, RUN};
 use super::step::Target;
-use crate::gpu::kernels::{loss_columns, loss_rows, loss_tiles, mask_cells, ssim_columns, ssim_rows, ssim_tiles};
+use crate::gpu::kernels::{fill_absent, loss_columns, loss_rows, loss_tiles, ssim_columns, ssim_rows, ssim_tiles};
 use crate::gpu::{Arena, Buf, Gpu, GpuError, Kernel, Recorder, Threads};
 use crate::limits::CAMERAS_MAX;
 use stipple_drivers::Fault;
 
-/// Transmittance above which a pixel of a view that the pool does not hold all of is not compared: what fills it is absent.
+/// Transmittance above which a pixel of a view that the pool does not hold all of is not compared: most of it is absent.
 const OPEN: f32 = 0.5;
 
 // Columns of 64 px, in runs of 4: ssim_tile.glsl.
@@ -22,7 +22,7 @@ const _: () = assert!(LOSS_TILE[1] == ssim_tiles::LOCAL[0] / 64 * 4 && loss_tile
 #[derive(Clone, Copy)]
 pub struct Buffers {
     images: Buf<u32>,
-    /// A mask for each camera, and one for a view of which not all counts.
+    /// A mask for each camera, and one for a view of which something is absent.
     masks: Buf<u32>,
     /// By colour, plane by plane.
     pub pixel_gradient: Buf<f32>,
@@ -54,7 +54,7 @@ pub struct Loss {
     valid_pixels: [u32; CAMERAS_MAX],
     /// An image on its way to the device.
     words: Vec<u32>,
-    mask_cells: Kernel<mask_cells::K>,
+    fill_absent: Kernel<fill_absent::K>,
     kernels: Kernels,
 }
 
@@ -106,7 +106,7 @@ impl Loss {
             slopes: scratch.slopes,
             valid_pixels: [0; CAMERAS_MAX],
             words: Vec::with_capacity(shape.image_words()),
-            mask_cells: gpu.kernel_in_pieces(mask_cells::Spec::default())?,
+            fill_absent: gpu.kernel_in_pieces(fill_absent::Spec::default())?,
             kernels: Kernels::new(gpu, by_tiles)?,
         };
         let all = vec![255; shape.pixels()];
@@ -167,7 +167,7 @@ impl Loss {
 
     /// Channel by channel: each is an image of its own.
     pub fn record(&self, rec: &mut Recorder, rendered: Buf<f32>, target: &Target, ssim_weight: f32) {
-        self.record_mask(rec, rendered, target);
+        self.record_fill(rec, rendered, target);
         for channel in 0..self.shape.channels {
             self.record_ssim(rec, rendered, target, channel, false);
             self.record_loss(rec, rendered, target, channel, ssim_weight);
@@ -203,7 +203,8 @@ impl Loss {
         }
     }
 
-    /// SSIM by pixel of a picture against an image, mean of its channels; one where masked. `map` has room for them all.
+    /// SSIM by pixel of a picture against an image, mean of its channels; one where masked. `map` has room for them all. Fills the
+    /// picture where something is absent: once for a picture.
     pub fn similarity(
         &self,
         gpu: &mut Gpu,
@@ -215,7 +216,9 @@ impl Loss {
         map.resize(n * channels as usize, 1.0);
         for (channel, plane) in map.chunks_exact_mut(n).enumerate() {
             let mut rec = gpu.record();
-            self.record_mask(&mut rec, rendered, target);
+            if channel == 0 {
+                self.record_fill(&mut rec, rendered, target);
+            }
             self.record_ssim(&mut rec, rendered, target, channel as u32, true);
             gpu.submit(rec)?;
             gpu.download(self.slopes, 0, plane)?;
@@ -251,31 +254,33 @@ impl Loss {
         }
     }
 
-    /// Makes the mask of a target of which not all counts.
-    fn record_mask(&self, rec: &mut Recorder, rendered: Buf<f32>, target: &Target) {
-        if !target.incomplete {
-            return;
-        }
+    /// Makes the mask of a target of which something is absent, and puts its image behind the picture there. Once for a picture.
+    fn record_fill(&self, rec: &mut Recorder, rendered: Buf<f32>, target: &Target) {
+        let Some(Absent { hidden, filled }) = target.absent else { return };
         rec.dispatch(
-            &self.mask_cells,
-            mask_cells::Bind {
+            &self.fill_absent,
+            fill_absent::Bind {
                 mask: self.nth_mask(target.camera).read(),
-                picture: rendered.read(),
+                targets: self.buffers.images.read(),
+                picture: rendered.read_write(),
                 masked: self.mask(target).write(),
             },
-            mask_cells::Push {
+            fill_absent::Push {
                 size: [self.shape.width, self.shape.height],
                 grid: [COLUMNS as u32, ROWS as u32],
-                cells: target.hidden.0,
-                plane: self.shape.channels * self.shape.width * self.shape.height,
+                hidden: hidden.0,
+                filled: filled.0,
+                target: self.word_of(target, 0),
+                channels: self.shape.channels,
                 open: OPEN,
+                exposure: target.exposure.words(),
             },
             Threads::d1(self.shape.image_words() as u32),
         );
     }
 
     fn mask(&self, target: &Target) -> Buf<u32> {
-        self.nth_mask(if target.incomplete { self.shape.cameras } else { target.camera })
+        self.nth_mask(if target.absent.is_some() { self.shape.cameras } else { target.camera })
     }
 
     fn nth_mask(&self, n: u32) -> Buf<u32> {

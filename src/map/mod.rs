@@ -287,7 +287,7 @@ impl Mapper {
         };
         if let Some(archive) = archive {
             archive.open_block(&scene.views, index);
-            archive.find_hidden(scene, index);
+            archive.find_absent(scene, index);
             anchor.scene_depth_m.iter().for_each(|depth| archive.set_scene_depth(*depth));
         }
         self.trainer.scene_depth_m = anchor.scene_depth_m.unwrap_or(self.trainer.scene_depth_m);

@@ -140,7 +140,7 @@ impl Pipeline {
         stats.coarseness.after(stats.needed(), self.shape.intersections)
     }
 
-    /// SSIM by pixel of what was rendered last against an image.
+    /// SSIM by pixel of what was rendered last against an image; once for a picture, which it fills where something is absent.
     pub fn similarity(&self, gpu: &mut Gpu, target: &Target, map: &mut Vec<f32>) -> Result<(), GpuError> {
         self.loss.similarity(gpu, self.renderer.buffers.rendered, target, map)
     }

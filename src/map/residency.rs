@@ -8,8 +8,9 @@
 //! What keyframes nearby that look at the same as the newest see of what is near is wanted whether or not it fits; where it does
 //! not, the least important Gaussians go: a scene that is denser than the pool is thinned, and one that is larger is paged.
 //!
-//! A keyframe may see blocks that are not in the pool. The cells of its picture that show much of them are not compared
-//! (`sight`): the Gaussians that are there would be bent to stand for those that are missing.
+//! A keyframe may see blocks that are not in the pool. Where its picture shows some of them the image stands in for them, and
+//! where it shows much of them it is not compared (`sight`): the Gaussians that are there would be bent to stand for those
+//! that are missing.
 //!
 //! Where the depth of a new view finds a block that is on disk, the view is not uncovered, and nothing is seeded (`hide`).
 
@@ -508,7 +509,7 @@ impl Archive {
             // Its state is to be written again.
             self.known[keyframe].stated = u32::MAX;
             self.known[keyframe].open = horizon.open_part() > OPEN_MAX;
-            self.known[keyframe].hidden_found = false;
+            self.known[keyframe].absent_found = false;
             self.look_from(&view, &horizon, keyframe);
         }
     }
@@ -523,7 +524,7 @@ impl Archive {
 
     /// The valid pixels of a view less the cells that show what is not in the pool; `None` where there are none of these.
     pub fn hide(&mut self, view: &View, horizon: &Horizon, valid: &[u8]) -> Option<&[u8]> {
-        let (cells, _) = self.hidden_from(view, horizon, self.in_reach(view));
+        let cells = self.absent_from(view, horizon, self.in_reach(view))?.hidden;
         if cells.is_empty() {
             return None;
         }

@@ -132,26 +132,25 @@ impl Archive {
 
     /// Whether a view is of the present epoch and shows enough of what is in the pool.
     fn shows_enough(&mut self, scene: &mut Scene, index: u32) -> bool {
-        self.find_hidden(scene, index as usize);
+        self.find_absent(scene, index as usize);
         let view = scene.views.get(index as usize);
-        view.epoch == self.choice.epoch && view.hidden.len() as f32 <= (1.0 - HERE_MIN) * CELLS as f32
+        let hidden = view.absent.map_or(0, |absent| absent.hidden.len());
+        view.epoch == self.choice.epoch && hidden as f32 <= (1.0 - HERE_MIN) * CELLS as f32
     }
 
     /// Finds where the views of a keyframe show what is not in the pool, if that has changed since it was last found.
-    pub fn find_hidden(&mut self, scene: &mut Scene, index: usize) {
+    pub fn find_absent(&mut self, scene: &mut Scene, index: usize) {
         let (first, cameras) = (scene.views.first(index), scene.views.cameras());
         self.look_at_changed();
-        if self.known.get(first / cameras).is_none_or(|k| k.hidden_found) {
+        if self.known.get(first / cameras).is_none_or(|k| k.absent_found) {
             return;
         }
         for view in first..first + cameras {
             let horizon = scene.views.get(view).horizon;
             let seen = self.sight.blocks(first / cameras);
-            let (hidden, incomplete) = self.hidden_from(&scene.view(view), &horizon, seen);
-            let entry = scene.views.get_mut(view);
-            (entry.hidden, entry.incomplete) = (hidden, incomplete);
+            scene.views.get_mut(view).absent = self.absent_from(&scene.view(view), &horizon, seen);
         }
-        self.known[first / cameras].hidden_found = true;
+        self.known[first / cameras].absent_found = true;
     }
 
     pub fn take_image(&mut self, scene: &mut Scene, index: usize, fetched: &Fetched) -> Result<(), GpuError> {

@@ -55,8 +55,7 @@ impl Scene {
             image: self.views.image(index) as u32,
             camera: self.views.camera(index) as u32,
             exposure: self.views.exposure(index),
-            hidden: self.views.get(index).hidden,
-            incomplete: self.views.get(index).incomplete,
+            absent: self.views.get(index).absent,
         }
     }
 

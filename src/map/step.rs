@@ -2,7 +2,7 @@
 
 use super::coarseness::Coarseness;
 use super::exposure::Exposure;
-use super::horizon::Cells;
+use super::horizon::Absent;
 use super::view::View;
 use crate::gpu::kernels::types::Status;
 use glam::DVec3;
@@ -16,15 +16,13 @@ pub struct Target {
     pub camera: u32,
     /// In which the rendering is compared.
     pub exposure: Exposure,
-    /// Where it is not compared, whatever the mask: the map has more there than is in the pool.
-    pub hidden: Cells,
-    /// The pool does not hold all that it shows: what the picture leaves open is not compared either.
-    pub incomplete: bool,
+    /// Where the map has more than is in the pool; `None` where all that it shows is there.
+    pub absent: Option<Absent>,
 }
 
 impl From<u32> for Target {
     fn from(image: u32) -> Target {
-        Target { image, camera: 0, exposure: Exposure::default(), hidden: Cells::default(), incomplete: false }
+        Target { image, camera: 0, exposure: Exposure::default(), absent: None }
     }
 }
 

@@ -86,7 +86,7 @@ impl Trainer {
             None => Ok(rng.one_of(scene.views.training()).map(|index| index as usize)),
         };
         let Some(index) = self.schedule.next(draw)? else { return Ok(None) };
-        archive.iter_mut().for_each(|archive| archive.find_hidden(scene, index));
+        archive.iter_mut().for_each(|archive| archive.find_absent(scene, index));
         let (view, target, rates) = (scene.view(index), scene.target(index), self.rates(scene));
         let step = scene.pipeline.start(&mut scene.gpu, &view, target, &rates, &self.weights)?;
         scene.steps += 1;

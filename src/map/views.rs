@@ -7,7 +7,7 @@
 
 use super::coarseness::Coarseness;
 use super::exposure::Exposure;
-use super::horizon::{Cells, Horizon};
+use super::horizon::{Absent, Horizon};
 use super::keyframes::{Keyframe, PoseCorrection};
 use super::refine::Refinement;
 use super::shape::Shape;
@@ -40,10 +40,8 @@ pub struct Stored {
     pub coarseness: Coarseness,
     /// How far it sees.
     pub horizon: Horizon,
-    /// Where it shows what is not in the pool.
-    pub hidden: Cells,
-    /// Some of what it shows is not in the pool.
-    pub incomplete: bool,
+    /// Where it shows what is not in the pool, if it does.
+    pub absent: Option<Absent>,
     /// Training steps on it.
     pub steps: u32,
     /// When the vehicle was last near this anchor, and whether it ever came back after it had left.
@@ -251,8 +249,7 @@ impl Views {
             refined,
             coarseness,
             horizon: Horizon::default(),
-            hidden: Cells::default(),
-            incomplete: false,
+            absent: None,
             steps: 0,
             near_at: t,
             visited_again: false,

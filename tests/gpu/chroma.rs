@@ -54,7 +54,7 @@ fn picture_loss_and_gradients_agree_with_the_twin_of_each_channel() {
         gradient.colour[c] = own.gradient.iter().map(|g| g / 3.0).collect();
         l1 += own.l1 / 3.0;
     }
-    let by_splat = backward(&flats, W, H, &gradient);
+    let by_splat = backward(&flats, W, H, &gradient, &[0.0; W * H]);
 
     let (mut gpu, mut p) = open(in_colour(&v, 60));
     p.pool.append(&mut gpu, &splats).unwrap();

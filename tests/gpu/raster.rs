@@ -48,7 +48,7 @@ fn raster_twin_agrees_with_finite_differences() {
     let loss = |s: &[Flat]| v.dot(&forward(&some(s), W, H).planes);
     let margin = forward(&some(&splats), W, H).margin;
     assert!(margin > 1e-4, "a decision is too close for differences: {margin}");
-    let gradient = backward(&some(&splats), W, H, &v);
+    let gradient = backward(&some(&splats), W, H, &v, &[0.0; W * H]);
     for i in 0..splats.len() {
         for k in 0..10 {
             let moved = |h: f64| {
@@ -172,7 +172,7 @@ fn both_rasters_agree_with_their_twin_in_grey_and_colour_with_depth_and_without(
         for (channels, depth) in [(1, false), (1, true), (3, false), (3, true)] {
             let case = format!("{:?}, {channels} channels, depth {depth}", rig.tiling);
             let v = planes(channels as usize, 6);
-            let want = backward(&some, W, H, &v);
+            let want = backward(&some, W, H, &v, &[0.0; W * H]);
             let (picture, got) = rig.run(&splats, &v, channels, depth);
             let plane = |p: usize| picture[p * W * H..][..W * H].iter().copied();
             let channels = channels as usize;

@@ -108,15 +108,26 @@ fn twin_gradients_agree_with_finite_differences() {
     compare_differences(&v, &scene(24, &v, 3));
 }
 
+#[test]
+fn twin_gradients_before_a_backdrop_agree_with_finite_differences() {
+    let v = view(23, 17);
+    let backdrop: Vec<f64> = (0..23 * 17).map(|i| 0.5 + 0.4 * (0.7 * f64::from(i)).sin()).collect();
+    compare_differences_before(&backdrop, &v, &scene(24, &v, 3));
+}
+
 /// The twin's gradient by every parameter of every Gaussian and by the pose.
 pub fn compare_differences(v: &View, splats: &[Gaussian]) {
+    compare_differences_before(&vec![0.0; v.camera.width * v.camera.height], v, splats);
+}
+
+fn compare_differences_before(backdrop: &[f64], v: &View, splats: &[Gaussian]) {
     const STEP: f64 = 1e-6;
     let (w, h) = (v.camera.width, v.camera.height);
     let splats: Vec<Parameters> = splats.iter().map(twins::project::parameters).collect();
     let goal: Vec<f64> = target(w, h).iter().map(|g| f64::from(*g) / 255.0).collect();
     let seen = mask(w, h);
     let lambda = f64::from(SSIM);
-    let run = |s: &[Parameters], twist: &[f64; 6]| twins::step(s, v, twist, &goal, &seen, lambda);
+    let run = |s: &[Parameters], twist: &[f64; 6]| twins::step_before(backdrop, s, v, twist, &goal, &seen, lambda);
     let at = run(&splats, &[0.0; 6]);
     assert!(at.rendered.margin > 1e-5, "a decision is too close for differences: {}", at.rendered.margin);
     let slope = |f: &dyn Fn(f64) -> f64| (f(STEP) - f(-STEP)) / (2.0 * STEP);

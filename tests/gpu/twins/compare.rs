@@ -125,7 +125,7 @@ pub fn compare(
 }
 
 /// Errors of the gradients of the first step from rest: Adam's first moment is a tenth of the gradient after it.
-fn by_group(gpu: &mut Gpu, p: &Pipeline, twins: &[[f64; 12]]) -> Result<[f64; 5], GpuError> {
+pub fn by_group(gpu: &mut Gpu, p: &Pipeline, twins: &[[f64; 12]]) -> Result<[f64; 5], GpuError> {
     let mut moments = vec![stipple::gpu::kernels::types::Moments::default(); twins.len()];
     gpu.download(p.pool.buffers.moments, 0, &mut moments)?;
     Ok(GROUPS.map(|(_, range)| {

@@ -35,11 +35,28 @@ pub fn step(
     mask: &[u8],
     ssim_weight: f64,
 ) -> Step {
+    let black = vec![0.0; target.len()];
+    step_before(&black, splats, view, twist, target, mask, ssim_weight)
+}
+
+/// A step of a picture before a backdrop.
+pub fn step_before(
+    backdrop: &[f64],
+    splats: &[Parameters],
+    view: &View,
+    twist: &[f64; 6],
+    target: &[f64],
+    mask: &[u8],
+    ssim_weight: f64,
+) -> Step {
     let (w, h) = (view.camera.width, view.camera.height);
     let projected = project_all(splats, view, twist);
-    let rendered = raster::forward(&flat(&projected), w, h);
+    let mut rendered = raster::forward(&flat(&projected), w, h);
+    let lights = rendered.transmittance.iter().zip(backdrop).map(|(t, b)| t * b);
+    rendered.planes.colour[0].iter_mut().zip(lights).for_each(|(c, light)| *c += light);
     let loss = loss::loss(&rendered.planes.colour[0], target, mask, w, h, ssim_weight);
-    let (splats, twist) = descend(&projected, view, &raster::Planes::grey(&loss.gradient));
+    let worth: Vec<f64> = loss.gradient.iter().zip(backdrop).map(|(v, b)| v * b).collect();
+    let (splats, twist) = descend(&projected, view, &raster::Planes::grey(&loss.gradient), &worth);
     Step { rendered, loss, splats, twist }
 }
 
@@ -47,9 +64,15 @@ pub fn flat(projected: &[Option<Projected>]) -> Vec<Option<raster::Flat>> {
     projected.iter().map(|p| p.as_ref().map(raster::flat)).collect()
 }
 
-/// From a gradient by pixel to that by every parameter and the pose twist.
-pub fn descend(projected: &[Option<Projected>], view: &View, v: &raster::Planes) -> (Vec<[f64; 12]>, [f64; 6]) {
-    let image = raster::backward(&flat(projected), view.camera.width, view.camera.height, v);
+/// From a gradient by pixel, and what light that passes all Gaussians of a pixel is worth, to that by every parameter and the
+/// pose twist.
+pub fn descend(
+    projected: &[Option<Projected>],
+    view: &View,
+    v: &raster::Planes,
+    behind: &[f64],
+) -> (Vec<[f64; 12]>, [f64; 6]) {
+    let image = raster::backward(&flat(projected), view.camera.width, view.camera.height, v, behind);
     let (mut splats, mut twist) = (vec![[0.0; 12]; projected.len()], [0.0; 6]);
     for (i, p) in projected.iter().enumerate() {
         let Some(p) = p else { continue };

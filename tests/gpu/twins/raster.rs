@@ -119,13 +119,13 @@ pub fn forward(splats: &[Option<Flat>], width: usize, height: usize) -> Rendered
     out
 }
 
-/// From the gradient by what is blended to that by each Gaussian.
-pub fn backward(splats: &[Option<Flat>], width: usize, height: usize, v: &Planes) -> Vec<Flat> {
+/// From the gradient by what is blended, and what light from beyond all Gaussians of a pixel is worth, to the gradient by each.
+pub fn backward(splats: &[Option<Flat>], width: usize, height: usize, v: &Planes, beyond: &[f64]) -> Vec<Flat> {
     let order = order(splats);
     let mut out = vec![[0.0; 10]; splats.len()];
     for i in 0..width * height {
         // What one unit of light that gets here is worth: what lies behind, seen through nothing else.
-        let mut behind = 0.0;
+        let mut behind = beyond[i];
         for s in contributions(splats, &order, i % width, i / width, &mut 1.0).iter().rev() {
             let Some(p) = &splats[s.splat] else { continue };
             let g = &mut out[s.splat];
