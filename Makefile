@@ -102,7 +102,7 @@ lint:
 	cargo clippy --workspace --all-targets --locked -- -D warnings
 	cargo clippy --locked --bin stipple -- -D warnings
 	cargo fmt --manifest-path tests/fuzz/Cargo.toml --check
-	CARGO_TARGET_DIR=target/fuzz RUSTFLAGS="--cfg fuzzing" cargo clippy --locked --manifest-path tests/fuzz/Cargo.toml -- -D warnings
+	CARGO_TARGET_DIR=target cargo clippy --locked --manifest-path tests/fuzz/Cargo.toml -- -D warnings
 	cargo fmt $(BRIDGE_MANIFEST) --check
 	$(BRIDGE) clippy --all-targets --locked $(BRIDGE_MANIFEST) -- -D warnings
 
