@@ -135,7 +135,7 @@ fn gradients_before_the_image_agree_with_their_twin() {
     let backdrop: Vec<f64> = goal.iter().enumerate().map(|(i, g)| if is_filled(i) { *g } else { 0.0 }).collect();
     let seen: Vec<u8> = alpha.iter().map(|a| if *a < 0.5 { 0 } else { 255 }).collect();
     let doubles: Vec<_> = splats.iter().map(twins::project::parameters).collect();
-    let twin = twins::step_before(&backdrop, &doubles, &v, &[0.0; 6], &goal, &seen, 0.2);
+    let twin = twins::step(&backdrop, &doubles, &v, &[0.0; 6], &goal, &seen, 0.2);
     // A mean over all pixels, and over those that are compared.
     let part = seen.iter().filter(|s| **s != 0).count() as f64 / (w * h) as f64;
     assert!(part > 0.2 && (step.l1 - twin.loss.l1 * part).abs() < 1e-5, "{} {}", step.l1, twin.loss.l1 * part);

@@ -127,7 +127,7 @@ fn compare_differences_before(backdrop: &[f64], v: &View, splats: &[Gaussian]) {
     let goal: Vec<f64> = target(w, h).iter().map(|g| f64::from(*g) / 255.0).collect();
     let seen = mask(w, h);
     let lambda = f64::from(SSIM);
-    let run = |s: &[Parameters], twist: &[f64; 6]| twins::step_before(backdrop, s, v, twist, &goal, &seen, lambda);
+    let run = |s: &[Parameters], twist: &[f64; 6]| twins::step(backdrop, s, v, twist, &goal, &seen, lambda);
     let at = run(&splats, &[0.0; 6]);
     assert!(at.rendered.margin > 1e-5, "a decision is too close for differences: {}", at.rendered.margin);
     let slope = |f: &dyn Fn(f64) -> f64| (f(STEP) - f(-STEP)) / (2.0 * STEP);

@@ -86,7 +86,7 @@ pub fn compare(
     p.loss.set_mask(gpu, 0, mask)?;
     let doubles: Vec<Parameters> = splats.iter().map(super::project::parameters).collect();
     let wanted: Vec<f64> = goal.iter().map(|g| f64::from(*g) / 255.0).collect();
-    let twin = super::step(&doubles, v, &[0.0; 6], &wanted, mask, f64::from(SSIM));
+    let twin = super::step(&vec![0.0; goal.len()], &doubles, v, &[0.0; 6], &wanted, mask, f64::from(SSIM));
 
     let mut picture = Rendered::default();
     p.render(gpu, v, &mut picture)?;

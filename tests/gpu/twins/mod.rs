@@ -27,20 +27,8 @@ pub fn project_all(splats: &[Parameters], view: &View, twist: &[f64; 6]) -> Vec<
     splats.iter().map(|p| project::project(p, view, twist).filter(visible)).collect()
 }
 
+/// A step on a picture before a backdrop, by pixel.
 pub fn step(
-    splats: &[Parameters],
-    view: &View,
-    twist: &[f64; 6],
-    target: &[f64],
-    mask: &[u8],
-    ssim_weight: f64,
-) -> Step {
-    let black = vec![0.0; target.len()];
-    step_before(&black, splats, view, twist, target, mask, ssim_weight)
-}
-
-/// A step of a picture before a backdrop.
-pub fn step_before(
     backdrop: &[f64],
     splats: &[Parameters],
     view: &View,
