@@ -100,6 +100,8 @@ struct Resident {
 #[derive(Clone, Debug, Default, PartialEq)]
 struct Visit {
     keyframes: usize,
+    /// Training steps on the first camera's view of a keyframe that is trained on, until the end of the flight.
+    steps: Option<f64>,
     psnr_db: Option<f64>,
     psnr_heldout_db: Option<f64>,
 }
@@ -227,11 +229,16 @@ fn rows(scenario: &Scenario, truth: &[TimedPose], first: Nanos, scores: &[Keyfra
     means.iter().for_each(|p| gaussians[place(*p)] += 1);
     let visit = |room: usize, round: usize| {
         let of: Vec<&KeyframeScore> = seen.iter().filter(|s| (s.0, s.1) == (room, round)).map(|s| s.2).collect();
-        let mean = |held_out: bool| {
-            let db: Vec<f64> = of.iter().filter(|s| s.held_out == held_out).filter_map(|s| s.psnr_db).collect();
-            (!db.is_empty()).then(|| db.iter().sum::<f64>() / db.len() as f64)
+        let mean = |held_out: bool, of_one: fn(&KeyframeScore) -> Option<f64>| {
+            let values: Vec<f64> = of.iter().filter(|s| s.held_out == held_out).filter_map(|s| of_one(s)).collect();
+            (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
         };
-        Visit { keyframes: of.len(), psnr_db: mean(false), psnr_heldout_db: mean(true) }
+        Visit {
+            keyframes: of.len(),
+            steps: mean(false, |s| Some(f64::from(s.steps))),
+            psnr_db: mean(false, |s| s.psnr_db),
+            psnr_heldout_db: mean(true, |s| s.psnr_db),
+        }
     };
     let row = |(k, name): (usize, Option<&'static str>)| Row {
         room: name.unwrap_or("elsewhere"),
@@ -302,9 +309,11 @@ fn table(rows: Vec<Row>) -> Table {
         text("room") => r.room,
         count("Gaussians") => r.gaussians,
         count("keyframes 1") => r.rounds[0].keyframes,
+        number("steps 1", "", 0) => r.rounds[0].steps,
         number("PSNR 1", "dB", 2) => r.rounds[0].psnr_db,
         number("held out 1", "dB", 2) => r.rounds[0].psnr_heldout_db,
         count("keyframes 2") => r.rounds[1].keyframes,
+        number("steps 2", "", 0) => r.rounds[1].steps,
         number("PSNR 2", "dB", 2) => r.rounds[1].psnr_db,
         number("held out 2", "dB", 2) => r.rounds[1].psnr_heldout_db,
     ])
@@ -341,6 +350,7 @@ mod tests {
             t_ns: (first + Span::from_secs(s)).0,
             held_out,
             psnr_db: Some(db),
+            steps: 10 * s as u32,
             ..KeyframeScore::default()
         };
         // In room a in the first round; in room b in the second.
@@ -348,12 +358,12 @@ mod tests {
             [score(11.0, false, 20.0), score(12.0, false, 22.0), score(13.0, true, 18.0), score(77.0, false, 25.0)];
         let means = [DVec3::new(3.0, 2.0, 1.0), DVec3::new(3.0, 50.0, 1.0)];
         let rows = rows(&scenario, &truth, first, &scores, &means);
-        let visit = |keyframes, psnr_db, psnr_heldout_db| Visit { keyframes, psnr_db, psnr_heldout_db };
+        let visit = |keyframes, steps, psnr_db, psnr_heldout_db| Visit { keyframes, steps, psnr_db, psnr_heldout_db };
         assert_eq!(
             rows.iter().map(|r| (r.room, r.gaussians)).collect::<Vec<_>>(),
             [("room a", 1), ("room b", 0), ("corridor", 0), ("elsewhere", 1)]
         );
-        assert_eq!(rows[0].rounds, [visit(3, Some(21.0), Some(18.0)), Visit::default()]);
-        assert_eq!(rows[1].rounds, [Visit::default(), visit(1, Some(25.0), None)]);
+        assert_eq!(rows[0].rounds, [visit(3, Some(115.0), Some(21.0), Some(18.0)), Visit::default()]);
+        assert_eq!(rows[1].rounds, [Visit::default(), visit(1, Some(770.0), Some(25.0), None)]);
     }
 }
