@@ -62,6 +62,7 @@ pub fn entry(id: u32, s: &KeyframeAbout) -> Stored {
         horizon: s.horizon,
         absent: None,
         steps: s.steps,
+        trained_at: 0,
         near_at: s.t,
         visited_again: false,
     }

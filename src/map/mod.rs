@@ -1,9 +1,9 @@
 //! The mapper: keyframes in, a map of Gaussians out, a bounded amount of work at a time.
 //!
 //! `ingest` stores a keyframe. One whose view the map does not cover becomes an anchor: stereo depth, seeds, then a burst
-//! of training steps on it (`anchors`). `step` trains, on keyframes drawn uniformly at random otherwise: the map sees its
-//! past as often as its present, so it does not forget (`trainer`). Held-out keyframes are stored, never trained on, never
-//! anchors. Read `pipeline` for what a training step does on the GPU.
+//! of training steps on it (`anchors`). `step` trains, otherwise, on the keyframe of a few drawn at random that was trained
+//! on the longest ago: the map sees its past as often as its present, so it does not forget (`trainer`). Held-out keyframes are
+//! stored, never trained on, never anchors. Read `pipeline` for what a training step does on the GPU.
 
 pub mod anchors;
 pub mod archive;

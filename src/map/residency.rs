@@ -53,7 +53,7 @@ const PAGED_A_STEP: usize = 16;
 /// Training steps at a place before the pool turns to another.
 const STEPS_AT_A_PLACE: u64 = 20;
 /// Views drawn to find another place.
-const PLACES_DRAWN: usize = 4;
+const PLACES_DRAWN: usize = 16;
 /// Part of a horizon that may be open.
 const OPEN_MAX: f64 = 0.05;
 /// The disk answers within this, or what it was asked for is done without: when a keyframe comes, and when a picture is drawn.
@@ -133,17 +133,22 @@ impl Archive {
         self.drawn.next.clear();
     }
 
-    /// Draws a view: of a few the one with the fewest steps. `None` where nearly all that it sees is in the pool.
+    /// Draws a view: of some the one with the fewest steps, and every other time the one that was trained on the longest ago, for
+    /// what it shows is trained on from elsewhere, too. `None` where nearly all that it sees is in the pool.
     fn draw_place(&self, views: &Views, rng: &mut Rng) -> Option<usize> {
-        // A map that fits draws its views as one without a store.
+        // A map that fits needs no other place.
         if self.blocks.iter().all(|b| b.in_pool || b.samples_len == 0 || b.epoch != self.choice.epoch) {
             return None;
         }
         let drawn = (0..PLACES_DRAWN).filter_map(|_| rng.one_of(views.training()));
         let firsts = drawn.map(|view| views.first(view as usize));
         let of_this_epoch = firsts.filter(|first| views.get(*first).epoch == self.choice.epoch);
-        let fewest = of_this_epoch.min_by_key(|first| views.get(*first).steps);
-        fewest.filter(|first| !self.is_shown(*first / views.cameras()))
+        let place = if self.choice.steps / STEPS_AT_A_PLACE % 2 == 0 {
+            of_this_epoch.min_by_key(|first| views.get(*first).steps)
+        } else {
+            views.least_recent(of_this_epoch.map(|first| first as u32)).map(|first| first as usize)
+        };
+        place.filter(|first| !self.is_shown(*first / views.cameras()))
     }
 
     /// Writes the blocks whose burst ended before its time, as another anchor came, and looks who sees them. The newest still

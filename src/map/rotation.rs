@@ -1,12 +1,12 @@
 //! Which images are in memory: those of the views that are trained on next.
 //!
 //! Views are drawn ahead of the steps that train on them, and the images of those that have no place are fetched from the
-//! disk meanwhile. So every view is as likely as without a store, however few places there are. Views that come and go in
+//! disk meanwhile: of a few the one that was trained on the longest ago, as others have changed since what it shows. Views that come and go in
 //! groups instead, each trained on for a while, cost 0.75 dB (24 places for 121 views, 3255 steps, the simulator's two rooms):
 //! the map then fits the few views of the last group.
 
 use super::archive::Archive;
-use super::choice::newest_kept;
+use super::choice::{newest_kept, Drawn};
 use super::filing::read_planes;
 use super::horizon::CELLS;
 use super::parts::PARTS;
@@ -112,7 +112,8 @@ impl Archive {
     fn draw(&mut self, scene: &mut Scene, rng: &mut Rng) -> Result<Option<u32>, GpuError> {
         let cameras = scene.views.cameras();
         for _ in 0..DRAWS {
-            let Some(index) = rng.one_of(&self.drawn.trainable) else { break };
+            let Drawn { trainable, next, .. } = &self.drawn;
+            let Some(index) = scene.views.draw(trainable, |index| !next.contains(&index), rng) else { continue };
             let keyframe = index as usize / cameras;
             if !self.shows_enough(scene, index) {
                 continue;

@@ -1,4 +1,4 @@
-//! Which keyframe is trained on next: uniformly at random, from a seed, so that a run can be repeated.
+//! Which keyframe is trained on next: a new anchor's, or one drawn at random, from a seed, so that a run can be repeated.
 
 /// SplitMix64 (Steele, Lea & Flood, OOPSLA 2014).
 pub struct Rng(u64);
@@ -34,10 +34,10 @@ struct Burst {
     left: u32,
 }
 
-/// The order of training steps: a new anchor's burst first, then uniform draws. Every other step of a burst is a uniform
-/// draw too, its last the anchor's: twenty on one view alone take 2 to 5 dB from the others (V1_01), which a hundred steps
-/// make good, and where those do not come the map stays so (at 28 steps a second, three splits: 20.4 -> 21.7 dB). A step may
-/// be asked for before the one asked for last was taken; what is asked for after the end of a burst must wait for it.
+/// The order of training steps: a new anchor's burst first, then draws. Every other step of a burst is a draw, too, its last
+/// the anchor's: twenty on one view alone take 2 to 5 dB from the others (V1_01), which a hundred steps make good, and where
+/// those do not come the map stays so (at 28 steps a second, three splits: 20.4 -> 21.7 dB). A step may be asked for before the
+/// one asked for last was taken; what is asked for after the end of a burst must wait for it.
 pub struct Schedule {
     rng: Rng,
     burst: Option<Burst>,
@@ -93,7 +93,7 @@ mod tests {
     }
 
     #[test]
-    fn draws_are_uniform_and_repeat_with_the_seed() {
+    fn numbers_are_uniform_and_repeat_with_the_seed() {
         let draw = |seed| {
             let mut s = Schedule::new(seed);
             let training: Vec<u32> = (0..10).collect();

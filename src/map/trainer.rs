@@ -83,13 +83,14 @@ impl Trainer {
         }
         let draw = |rng: &mut Rng| match archive.as_mut() {
             Some(archive) => archive.next_view(scene, rng),
-            None => Ok(rng.one_of(scene.views.training()).map(|index| index as usize)),
+            None => Ok(scene.views.draw(scene.views.training(), |_| true, rng).map(|index| index as usize)),
         };
         let Some(index) = self.schedule.next(draw)? else { return Ok(None) };
         archive.iter_mut().for_each(|archive| archive.find_absent(scene, index));
         let (view, target, rates) = (scene.view(index), scene.target(index), self.rates(scene));
         let step = scene.pipeline.start(&mut scene.gpu, &view, target, &rates, &self.weights)?;
         scene.steps += 1;
+        scene.views.get_mut(index).trained_at = scene.steps;
         if let Some(before) = self.in_flight.replace(InFlight { index, step }) {
             let beside = archive.as_ref().map(Archive::trained_beside);
             let ended = self.finish(before, scene, beside)?;

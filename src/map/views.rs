@@ -10,6 +10,7 @@ use super::exposure::Exposure;
 use super::horizon::{Absent, Horizon};
 use super::keyframes::{Keyframe, PoseCorrection};
 use super::refine::Refinement;
+use super::schedule::Rng;
 use super::shape::Shape;
 use glam::DVec3;
 use stipple_drivers::{Image, Nanos, Pose, Span};
@@ -44,6 +45,8 @@ pub struct Stored {
     pub absent: Option<Absent>,
     /// Training steps on it.
     pub steps: u32,
+    /// The step of this run that was last started on it; zero for none.
+    pub trained_at: u64,
     /// When the vehicle was last near this anchor, and whether it ever came back after it had left.
     pub near_at: Nanos,
     pub visited_again: bool,
@@ -60,6 +63,9 @@ impl Stored {
         self.given * self.refined.body_from_refined
     }
 }
+
+/// Views drawn, of which one is trained on next.
+const VIEWS_DRAWN: usize = 4;
 
 /// No place, or nobody's.
 const NONE: u32 = u32::MAX;
@@ -251,6 +257,7 @@ impl Views {
             horizon: Horizon::default(),
             absent: None,
             steps: 0,
+            trained_at: 0,
             near_at: t,
             visited_again: false,
         };
@@ -346,6 +353,16 @@ impl Views {
     /// Entries that are not held out, oldest first.
     pub fn training(&self) -> &[u32] {
         &self.training
+    }
+
+    /// A view of `some` to train on next: of a few that are drawn and that `may` be taken the one that was trained on the longest ago.
+    pub fn draw(&self, some: &[u32], may: impl Fn(u32) -> bool, rng: &mut Rng) -> Option<u32> {
+        self.least_recent((0..VIEWS_DRAWN).filter_map(|_| rng.one_of(some)).filter(|index| may(*index)))
+    }
+
+    /// The entry of some that was trained on the longest ago.
+    pub fn least_recent(&self, some: impl Iterator<Item = u32>) -> Option<u32> {
+        some.min_by_key(|index| self.get(*index as usize).trained_at)
     }
 
     /// Those of them that are of this run.
@@ -453,6 +470,17 @@ mod tests {
         assert_eq!([again(179.5, 6.0), again(179.6, 4.0)], [[false; 3], [true, false, false]]);
         // Its Gaussians are those of an earlier visit from then on.
         assert_eq!(again(180.0, 4.0), [true, false, false]);
+    }
+
+    #[test]
+    fn the_view_trained_on_the_longest_ago_is_one_that_never_was() {
+        let mut s = views(3, 1);
+        for (id, trained_at) in [(0, 7), (1, 0), (2, 5)] {
+            s.add(&keyframe(id, false), ON_BODY, |_, _| {});
+            s.get_mut(id as usize).trained_at = trained_at;
+        }
+        let of = |some: &[u32]| s.least_recent(some.iter().copied());
+        assert_eq!([of(&[0, 1, 2]), of(&[0, 2, 2]), of(&[0]), of(&[])], [Some(1), Some(2), Some(0), None]);
     }
 
     #[test]
