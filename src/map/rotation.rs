@@ -1,9 +1,10 @@
 //! Which images are in memory: those of the views that are trained on next.
 //!
-//! Views are drawn ahead of the steps that train on them, and the images of those that have no place are fetched from the
-//! disk meanwhile: of a few the one that was trained on the longest ago, as others have changed since what it shows. Views that come and go in
-//! groups instead, each trained on for a while, cost 0.75 dB (24 places for 121 views, 3255 steps, the simulator's two rooms):
-//! the map then fits the few views of the last group.
+//! Views are drawn ahead of the steps that train on them, of a few the one trained on the longest ago, for steps on others
+//! have changed what it shows (`Views::draw`); images that have no place are fetched from the disk meanwhile. Where none of
+//! the drawn has come, one of those that are here is drawn uniformly. Views that come and go in groups instead, each trained
+//! on for a while, cost 0.75 dB (24 places for 121 views, 3255 steps, the simulator's two rooms): the map then fits the few
+//! views of the last group.
 
 use super::archive::Archive;
 use super::choice::{newest_kept, Drawn};
@@ -18,6 +19,8 @@ use crate::store::Fetched;
 
 /// Draws until another view is found.
 const DRAWS: usize = 16;
+/// Views that may be trained on for each that is drawn ahead, at least.
+const TRAINABLE_AN_AHEAD: usize = 4;
 /// Part of the Gaussians that a keyframe sees, and of its picture, that must be in the pool when it is trained on.
 const HERE_MIN: f32 = 0.7;
 /// Places for each block in the pool, below which a block's last keyframe may go, too.
@@ -63,7 +66,9 @@ impl Archive {
         let known = &self.known;
         let asked = |i: &u32| known.get(*i as usize / cameras).is_some_and(|k| k.asked > 0);
         self.drawn.next.retain(|i| views.has_place(*i as usize) || asked(i));
-        while self.drawn.next.len() < self.drawn.ahead {
+        // Were most of them drawn ahead, their order would be fixed.
+        let ahead = self.drawn.ahead.min(self.drawn.trainable.len() / TRAINABLE_AN_AHEAD).max(1);
+        while self.drawn.next.len() < ahead {
             let Some(index) = self.draw(scene, rng)? else { break };
             self.drawn.next.push_back(index);
         }

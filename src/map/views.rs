@@ -45,7 +45,7 @@ pub struct Stored {
     pub absent: Option<Absent>,
     /// Training steps on it.
     pub steps: u32,
-    /// The step of this run that was last started on it; zero for none.
+    /// The training step that was last started on it since the mapper was opened; zero for none.
     pub trained_at: u64,
     /// When the vehicle was last near this anchor, and whether it ever came back after it had left.
     pub near_at: Nanos,
@@ -64,8 +64,11 @@ impl Stored {
     }
 }
 
-/// Views drawn, of which one is trained on next.
+/// Views that are drawn, at most, of which one is trained on next.
 const VIEWS_DRAWN: usize = 4;
+/// Views that there are for each that is drawn, at least. Where most of a few are drawn their order is nearly fixed, and the map is
+/// worse: four fisheye views, densified, had 22.9 dB with one drawn, 23.1 with two, and 22.6 with three or four.
+const VIEWS_A_DRAW: usize = 4;
 
 /// No place, or nobody's.
 const NONE: u32 = u32::MAX;
@@ -355,9 +358,11 @@ impl Views {
         &self.training
     }
 
-    /// A view of `some` to train on next: of a few that are drawn and that `may` be taken the one that was trained on the longest ago.
+    /// A view of `some` to train on next: of a few that are drawn, and that `may` be taken, the one that was trained on the longest
+    /// ago.
     pub fn draw(&self, some: &[u32], may: impl Fn(u32) -> bool, rng: &mut Rng) -> Option<u32> {
-        self.least_recent((0..VIEWS_DRAWN).filter_map(|_| rng.one_of(some)).filter(|index| may(*index)))
+        let drawn = (some.len() / VIEWS_A_DRAW).clamp(1, VIEWS_DRAWN);
+        self.least_recent((0..drawn).filter_map(|_| rng.one_of(some)).filter(|index| may(*index)))
     }
 
     /// The entry of some that was trained on the longest ago.
@@ -481,6 +486,27 @@ mod tests {
         }
         let of = |some: &[u32]| s.least_recent(some.iter().copied());
         assert_eq!([of(&[0, 1, 2]), of(&[0, 2, 2]), of(&[0]), of(&[])], [Some(1), Some(2), Some(0), None]);
+    }
+
+    #[test]
+    fn of_many_views_the_oldest_are_drawn_and_of_few_any() {
+        let often = |views: u64| {
+            let (mut s, mut rng) = (views_of_one_camera(views), Rng::new(1));
+            let some: Vec<u32> = (0..views as u32).collect();
+            // The first half was trained on.
+            (0..views / 2).for_each(|id| s.get_mut(id as usize).trained_at = 1);
+            let draws = (0..1000).map(|_| s.draw(&some, |index| index > 0, &mut rng));
+            draws.flatten().filter(|index| u64::from(*index) < views / 2).count()
+        };
+        // Of 4 views one is drawn; of 40 four, all of which are of the first half once in sixteen times.
+        assert!((200..300).contains(&often(4)) && (30..100).contains(&often(40)), "{} {}", often(4), often(40));
+        assert_eq!(views_of_one_camera(1).draw(&[], |_| true, &mut Rng::new(1)), None);
+    }
+
+    fn views_of_one_camera(keyframes: u64) -> Views {
+        let mut s = views(keyframes as u32, 1);
+        (0..keyframes).for_each(|id| _ = s.add(&keyframe(id, false), ON_BODY, |_, _| {}));
+        s
     }
 
     #[test]
