@@ -248,7 +248,7 @@ fn rows(scenario: &Scenario, truth: &[TimedPose], first: Nanos, scores: &[Keyfra
     names.enumerate().map(row).collect()
 }
 
-const NOTE: &str = "Rounds 1 and 2 are the first and the second visit of every room. Keyframes are those that the map keeps at the end of the flight, each judged then; PSNR is the mean over them, of those trained on and of those held out.";
+const NOTE: &str = "Rounds 1 and 2 are the first and the second visit of every room. Keyframes are those that the map keeps at the end of the flight, each judged then; PSNR is the mean over them, of those trained on and of those held out; steps are the mean of those that are trained on, of their first camera, until the end.";
 
 fn page(args: &Args, report: &Report, resident: &Resident, rows: Vec<Row>) -> Page {
     let [settled, last] = [&resident.settled, &resident.last].map(|bytes| bytes.load(Relaxed));
