@@ -18,7 +18,7 @@ fn board(overrides: &[&str]) -> Board {
     Board::parse("tests/colour.rs", BOARD, &overrides.iter().map(|s| s.to_string()).collect::<Vec<_>>()).unwrap()
 }
 
-/// Five frames a second and a second of the demo after its start at rest, at 188 x 120 px.
+/// Frames, 2.5 a second, of the demo after its start at rest, at 188 x 120 px.
 fn written(dir: &Path) {
     let mut scenario = Scenario::named("demo").unwrap();
     (scenario.image_divisor, scenario.rate_hz, scenario.duration) = (4, 2.5, Span::from_secs(3.6));
@@ -35,6 +35,12 @@ fn psnr_db(p: &Panel, rendered: usize, observed: usize) -> f64 {
         n += 1;
     }
     -10.0 * (sum / f64::from(n)).log10()
+}
+
+fn train(mapper: &mut Mapper, steps: usize) {
+    for _ in 0..steps {
+        assert_ne!(mapper.step(Instant::now()).unwrap().kind, StepKind::Idle);
+    }
 }
 
 #[test]
@@ -56,10 +62,10 @@ fn a_colour_recording_becomes_a_map_in_its_colours() {
         let keyframe =
             Keyframe { id: i as u64, t: frame.t, world_from_body, images, colours, held_out, ..Keyframe::default() };
         mapper.ingest(&keyframe).unwrap();
-        for _ in 0..40 {
-            assert_ne!(mapper.step(Instant::now()).unwrap().kind, StepKind::Idle);
-        }
+        train(&mut mapper, 40);
     }
+    // The last view has had little more than its burst.
+    train(&mut mapper, 80);
     let q = mapper.evaluate().unwrap();
     println!("{q:?}");
     assert!(mapper.counters().splats_densified.get() > 100);
@@ -68,7 +74,8 @@ fn a_colour_recording_becomes_a_map_in_its_colours() {
         let swapped: Vec<f64> = (0..3).map(|c| psnr_db(&p, c, (c + 1) % 3)).collect();
         println!("{}: {own:.1?} dB, swapped {swapped:.1?}", p.name);
         assert!(own.iter().all(|db| *db > 21.0), "{}: {own:?}", p.name);
-        assert!(swapped.iter().all(|db| *db < 19.0), "{}: {swapped:?}", p.name);
+        // 3 dB: the squared error to another channel is at least twice that to its own.
+        assert!(own.iter().zip(&swapped).all(|(own, swapped)| own - swapped > 3.0), "{}: {own:?}, {swapped:?}", p.name);
     }
     let splats = mapper.splats().unwrap();
     assert!(splats.iter().filter(|s| (s.colour[0] - s.colour[2]).abs() > 0.05).count() * 2 > splats.len());
