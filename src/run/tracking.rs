@@ -72,7 +72,7 @@ pub struct FramePacket {
     pub verdicts: Verdicts,
     /// What was found so far of what is estimated of the rig.
     pub findings: Findings,
-    /// When the front end took it.
+    /// When tracking took it.
     pub begun: Instant,
     /// CPU time that following its points took.
     cpu: Duration,
@@ -494,6 +494,7 @@ pub fn without_odometry(
     mut give: impl FnMut(Box<FramePacket>),
 ) {
     while let Some(mut packet) = inlet.next(link) {
+        packet.begun = Instant::now();
         see(&mut packet);
         give(packet);
     }
@@ -571,3 +572,23 @@ mod carried_tests;
 #[cfg(test)]
 #[path = "clock_tests.rs"]
 mod clock_tests;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_latency_of_a_frame_without_odometry_counts_from_when_it_is_taken() {
+        let mut packet =
+            Some(FramePacket::for_rig(&crate::world::World::new(crate::world::Path { rest: -1.0 }).rig, 0));
+        let made = Instant::now();
+        let (link, over) = (Link::default(), AtomicBool::new(false));
+        let take = || {
+            over.store(packet.is_none(), std::sync::atomic::Ordering::Relaxed);
+            packet.take()
+        };
+        let mut begun = None;
+        without_odometry(&link, Inlet { take, over: &over }, |_| (), |packet| begun = Some(packet.begun));
+        assert!(begun.is_some_and(|begun| begun >= made));
+    }
+}
