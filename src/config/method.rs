@@ -312,4 +312,6 @@ section! {
     tuning
     /// Uses subgroup arithmetic where the device has it, and texel buffers on a CPU.
     subgroups: bool = true;
+    /// Name of a `Profile` whose limits count beside those of the device; empty: none.
+    profile: String = String::new();
 }

@@ -8,6 +8,8 @@ mod governor;
 mod inject;
 mod mavlink;
 mod method;
+#[cfg(feature = "instruments")]
+mod profile;
 mod section;
 mod sensors;
 
@@ -18,6 +20,8 @@ pub use method::{
     Fit, FrontendConfig, GpuConfig, LoopsConfig, MapConfig, NetworkConfig, Projection, StereoConfig, StereoMethod,
     StoreConfig, VioConfig,
 };
+#[cfg(feature = "instruments")]
+pub use profile::{Profile, PROFILES};
 pub use section::{Bound, Key};
 pub use sensors::{BaroConfig, CameraConfig, GpioConfig, ImuConfig, LogConfig, RecordConfig, RigConfig};
 

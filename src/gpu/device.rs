@@ -48,6 +48,8 @@ pub struct Caps {
     /// Whether kernels read buffers as texels where a variant does: on a CPU, whose driver gathers texels and loads a storage
     /// buffer lane by lane. Never with `GpuConfig::subgroups = false`.
     pub texel_buffers: bool,
+    /// Whether the compiler picks a width of subgroup for each kernel, narrower than the one reported: Intel's.
+    pub subgroup_size_varies: bool,
     pub invocations_max: u32,
     pub shared_max_bytes: u32,
     /// Largest buffer a kernel can bind, bytes.
@@ -83,6 +85,26 @@ impl Caps {
             GROUP_VOTE..=GROUP_QUAD => self.subgroup_operations >> (capability - GROUP) & 1 != 0,
             _ => false,
         }
+    }
+
+    /// Limits what the device can do to the profile that the board names. Subgroups of another width than its are not used.
+    #[cfg(feature = "instruments")]
+    fn limit(&mut self, config: &GpuConfig) -> Result<(), Fault> {
+        let Some(p) = crate::config::Profile::of(&config.profile)? else { return Ok(()) };
+        self.name = format!("{} as {}", self.name, p.name);
+        (self.kind, self.texel_buffers) = (DeviceKind::Integrated, false);
+        self.subgroup_size_varies = p.subgroup_size_varies;
+        let same_width = self.subgroup_size == p.subgroup_size;
+        self.subgroup_operations &=
+            if same_width { p.subgroup_operations } else { vk::SubgroupFeatureFlags::BASIC.as_raw() };
+        self.invocations_max = self.invocations_max.min(p.invocations_max);
+        self.shared_max_bytes = self.shared_max_bytes.min(p.shared_max_bytes);
+        self.binding_max_bytes = self.binding_max_bytes.min(p.binding_max_bytes);
+        self.allocation_max_bytes = self.allocation_max_bytes.min(p.allocation_max_bytes);
+        if !p.timestamps {
+            (self.timestamp_period_ns, self.timestamp_bits) = (0.0, 0);
+        }
+        Ok(())
     }
 }
 
@@ -134,6 +156,8 @@ impl Device {
             caps.subgroup_operations = 0;
             caps.texel_buffers = false;
         }
+        #[cfg(feature = "instruments")]
+        caps.limit(config)?;
         let queues = [vk::DeviceQueueCreateInfo::default().queue_family_index(family).queue_priorities(&[1.0])];
         let info = vk::DeviceCreateInfo::default().queue_create_infos(&queues);
         // SAFETY: `physical` belongs to `instance`, and `family` is one of its queue families.
@@ -347,8 +371,10 @@ fn describe(instance: &ash::Instance, physical: vk::PhysicalDevice) -> Option<Ch
     let bits = families[family].timestamp_valid_bits;
     let kind = DeviceKind::new(properties.device_type);
     let limits = &properties.limits;
+    let name = properties.device_name_as_c_str().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default();
     let caps = Caps {
-        name: properties.device_name_as_c_str().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default(),
+        subgroup_size_varies: name.contains("Intel"),
+        name,
         kind,
         subgroup_size: subgroup.subgroup_size,
         subgroup_operations: if in_compute { subgroup.supported_operations.as_raw() } else { 0 },

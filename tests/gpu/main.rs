@@ -8,6 +8,7 @@ mod fisheye;
 mod hidden;
 mod occupancy;
 mod pool;
+mod profiles;
 mod raster;
 #[path = "../program/small_disk.rs"]
 mod small_disk;
@@ -37,7 +38,7 @@ fn the_map_holds_on_the_baseline() {
     }
     let o = std::process::Command::new(std::env::current_exe().unwrap())
         .env(BASELINE, "1")
-        .args(["--test-threads", "2", "--skip", "validation", "--skip", "noise", "--skip", "stereo"])
+        .args("--test-threads 2 --skip validation --skip noise --skip stereo --skip profiles".split(' '))
         .output()
         .unwrap();
     let said = String::from_utf8_lossy(&o.stdout);
