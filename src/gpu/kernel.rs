@@ -1,4 +1,4 @@
-//! Pipelines: a kernel's SPIR-V with its specialisation constants, made once at boot.
+//! Pipelines: a kernel's SPIR-V with its specialisation constants, made at boot and compiled together, on up to four cores.
 //!
 //! `KernelDef` is implemented by what the build writes from GLSL, never by hand. A kernel with faster
 //! variants takes the last one whose SPIR-V capabilities the device has.
@@ -10,8 +10,10 @@ use super::{GpuError, COMMANDS_MAX};
 use ash::vk;
 use std::collections::HashMap;
 use std::marker::PhantomData;
+use std::mem::take;
 use std::sync::atomic::Ordering::Relaxed;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::thread::{available_parallelism, scope, Builder};
 use stipple_drivers::{Fault, FaultKind};
 
 /// Storage buffers and specialisation constants of one kernel; the build refuses more.
@@ -22,6 +24,8 @@ pub const PUSH_MAX: usize = 128;
 /// Distinct (kernel, buffers) combinations remembered; past it the cache starts over. Twice what one
 /// recording can ask for, so that a recording always fits after a restart and restarts are rare.
 const SETS_MAX: usize = 2 * COMMANDS_MAX;
+/// Threads that compile at once, at most.
+const COMPILERS_MAX: usize = 4;
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Access {
@@ -87,7 +91,6 @@ impl<K> Kernel<K> {
 }
 
 pub(super) struct ComputePipeline {
-    pub name: &'static str,
     pub raw: vk::Pipeline,
     pub layout: vk::PipelineLayout,
     pub push_bytes: usize,
@@ -96,12 +99,14 @@ pub(super) struct ComputePipeline {
     set_layout: vk::DescriptorSetLayout,
     module: vk::ShaderModule,
     bindings: &'static [(u32, Access)],
-    texels: [i32; BUFFERS_MAX],
+    variant: &'static Variant,
+    spec_ids: &'static [u32],
+    spec_words: [u32; SPECS_MAX],
 }
 
 impl ComputePipeline {
     fn descriptor_type(&self, buffer: usize) -> vk::DescriptorType {
-        match self.texels[buffer] {
+        match self.variant.texels[buffer] {
             0 => vk::DescriptorType::STORAGE_BUFFER,
             _ => vk::DescriptorType::UNIFORM_TEXEL_BUFFER,
         }
@@ -112,6 +117,8 @@ impl ComputePipeline {
 pub(super) struct Pipelines {
     device: Arc<Device>,
     list: Vec<ComputePipeline>,
+    /// How many of them are compiled.
+    compiled: usize,
     pub cache: Option<PipelineCache>,
     pool: vk::DescriptorPool,
     sets: HashMap<SetKey, vk::DescriptorSet>,
@@ -134,6 +141,7 @@ impl Pipelines {
         Ok(Pipelines {
             device: device.clone(),
             list: Vec::new(),
+            compiled: 0,
             cache: None,
             pool,
             sets: HashMap::with_capacity(SETS_MAX),
@@ -145,7 +153,8 @@ impl Pipelines {
         &self.list[index as usize]
     }
 
-    /// Makes the pipeline of variant `define`, or of the fastest the device has.
+    /// Makes the pipeline of variant `define`, or of the fastest the device has. `compile` must come before its use, and says whether
+    /// the driver takes it.
     pub fn make<K: KernelDef>(
         &mut self,
         spec: &K::Spec,
@@ -171,9 +180,7 @@ impl Pipelines {
                 variant.shared_bytes, caps.name, caps.invocations_max, caps.shared_max_bytes
             )));
         }
-        // Filled step by step: a failure half-way drops what is there through `Pipelines`.
         self.list.push(ComputePipeline {
-            name: variant.name,
             raw: vk::Pipeline::null(),
             layout: vk::PipelineLayout::null(),
             push_bytes: size_of::<K::Push>(),
@@ -181,12 +188,33 @@ impl Pipelines {
             set_layout: vk::DescriptorSetLayout::null(),
             module: vk::ShaderModule::null(),
             bindings: K::BINDINGS,
-            texels: variant.texels,
+            variant,
+            spec_ids: K::SPEC_IDS,
+            spec_words: K::spec_words(spec),
         });
-        let index = self.list.len() - 1;
-        let cache = self.cache.as_ref().map_or(vk::PipelineCache::null(), |c| c.raw);
-        self.list[index].build(&self.device, cache, variant, K::SPEC_IDS, &K::spec_words(spec))?;
-        Ok(Kernel { index: index as u32, local, name: variant.name, of: PhantomData })
+        Ok(Kernel { index: self.list.len() as u32 - 1, local, name: variant.name, of: PhantomData })
+    }
+
+    /// Compiles what was made since it was last called. Mesa takes up to 50 ms of a core for each, and a map has 20 to 40.
+    pub fn compile(&mut self) -> Result<(), Fault> {
+        let all = self.list.len();
+        let made = &mut self.list[self.compiled..];
+        if made.is_empty() {
+            return Ok(());
+        }
+        let (device, cache) = (&*self.device, self.cache.as_ref().map_or(vk::PipelineCache::null(), |c| c.raw));
+        let threads = available_parallelism().map_or(1, |n| n.get()).min(COMPILERS_MAX).min(made.len());
+        let rest = Mutex::new(made.iter_mut());
+        let next = || rest.lock().unwrap_or_else(PoisonError::into_inner).next();
+        let work = || std::iter::from_fn(next).try_for_each(|pipeline| pipeline.build(device, cache));
+        scope(|scope| {
+            // Where there are no threads to be had, this one does it all.
+            let spawn = |_| Builder::new().name("pipelines".into()).spawn_scoped(scope, work).ok();
+            let others: Vec<_> = (1..threads).filter_map(spawn).collect();
+            others.into_iter().fold(work(), |done, other| done.and(other.join().expect("nothing in it panics")))
+        })?;
+        self.compiled = all;
+        Ok(())
     }
 
     /// Whether fewer than `commands` sets are left: `forget_sets` makes room.
@@ -225,7 +253,7 @@ impl Pipelines {
             let bindable =
                 r.start % ALIGN == 0 && r.start < r.end && r.end - r.start <= self.device.caps.binding_max_bytes;
             if !bindable || r.end > memory.bytes {
-                return Err(GpuError::Binding { kernel: pipeline.name, start: r.start, end: r.end });
+                return Err(GpuError::Binding { kernel: pipeline.variant.name, start: r.start, end: r.end });
             }
         }
         let layouts = [pipeline.set_layout];
@@ -243,10 +271,10 @@ impl Pipelines {
         for (i, r) in ranges.iter().enumerate().take(pipeline.bindings.len()) {
             let bytes = r.end - r.start;
             infos[i] = vk::DescriptorBufferInfo { buffer: memory.buffer, offset: r.start, range: bytes };
-            if pipeline.texels[i] != 0 {
+            if pipeline.variant.texels[i] != 0 {
                 let info = vk::BufferViewCreateInfo::default()
                     .buffer(memory.buffer)
-                    .format(vk::Format::from_raw(pipeline.texels[i]))
+                    .format(vk::Format::from_raw(pipeline.variant.texels[i]))
                     .offset(r.start)
                     .range(bytes);
                 // SAFETY: the range lies in the buffer; `forget_sets` or `Drop` destroys the view.
@@ -260,7 +288,7 @@ impl Pipelines {
                 .dst_set(set[0])
                 .dst_binding(binding)
                 .descriptor_type(pipeline.descriptor_type(i));
-            *write = match pipeline.texels[i] {
+            *write = match pipeline.variant.texels[i] {
                 0 => empty.buffer_info(std::slice::from_ref(&infos[i])),
                 _ => empty.texel_buffer_view(std::slice::from_ref(&views[i])),
             };
@@ -273,14 +301,10 @@ impl Pipelines {
 }
 
 impl ComputePipeline {
-    fn build(
-        &mut self,
-        device: &Device,
-        cache: vk::PipelineCache,
-        variant: &Variant,
-        ids: &[u32],
-        words: &[u32; SPECS_MAX],
-    ) -> Result<(), Fault> {
+    /// Fills its handles step by step: a failure half-way leaves what is there to `Pipelines`, or to the next attempt.
+    fn build(&mut self, device: &Device, cache: vk::PipelineCache) -> Result<(), Fault> {
+        self.destroy(device);
+        let (variant, ids, words) = (self.variant, self.spec_ids, self.spec_words);
         let code = ash::util::read_spv(&mut std::io::Cursor::new(variant.spirv))
             .map_err(|e| Fault::new(FaultKind::Internal, variant.name, format!("bad SPIR-V: {e}"), "build again"))?;
         let bindings: Vec<_> = self
@@ -309,7 +333,7 @@ impl ComputePipeline {
         }];
         let pushes = if self.push_bytes == 0 { &pushes[..0] } else { &pushes[..] };
         // SAFETY: the device is alive, each object is made from ones made just before, and every pointer
-        // outlives its call. The SPIR-V comes from the build's own compiler.
+        // outlives its call. Several threads may make objects of one device, with one cache. The SPIR-V comes from the build's own compiler.
         unsafe {
             let info = vk::DescriptorSetLayoutCreateInfo::default().bindings(&bindings);
             self.set_layout =
@@ -338,6 +362,16 @@ impl ComputePipeline {
         device.name(self.raw, variant.name);
         Ok(())
     }
+
+    fn destroy(&mut self, device: &Device) {
+        // SAFETY: nothing uses them: `Gpu` waits for the device before its fields are dropped; null handles are ignored.
+        unsafe {
+            device.raw.destroy_pipeline(take(&mut self.raw), None);
+            device.raw.destroy_pipeline_layout(take(&mut self.layout), None);
+            device.raw.destroy_shader_module(take(&mut self.module), None);
+            device.raw.destroy_descriptor_set_layout(take(&mut self.set_layout), None);
+        }
+    }
 }
 
 impl Drop for Pipelines {
@@ -346,15 +380,8 @@ impl Drop for Pipelines {
             return;
         }
         self.destroy_views();
-        // SAFETY: `Gpu` waits for the device before its fields are dropped; null handles are ignored.
-        unsafe {
-            for p in &self.list {
-                self.device.raw.destroy_pipeline(p.raw, None);
-                self.device.raw.destroy_pipeline_layout(p.layout, None);
-                self.device.raw.destroy_shader_module(p.module, None);
-                self.device.raw.destroy_descriptor_set_layout(p.set_layout, None);
-            }
-            self.device.raw.destroy_descriptor_pool(self.pool, None);
-        }
+        self.list.iter_mut().for_each(|p| p.destroy(&self.device));
+        // SAFETY: `Gpu` waits for the device before its fields are dropped.
+        unsafe { self.device.raw.destroy_descriptor_pool(self.pool, None) };
     }
 }

@@ -196,18 +196,24 @@ impl Gpu {
         self.arena.alloc(name, len)
     }
 
-    /// Takes from `folder` what the driver compiled in earlier runs, for the pipelines made from now on; how many bytes there were.
+    /// Takes from `folder` what the driver compiled in earlier runs, for the kernels compiled from now on; how many bytes there were.
     pub fn reuse_pipelines(&mut self, folder: &Path) -> usize {
         self.pipelines.cache = PipelineCache::open(&self.device, folder).ok();
         self.pipelines.cache.as_ref().map_or(0, |c| c.taken)
     }
 
+    /// Compiles the kernels made so far; those made later are compiled when a recording is started.
+    pub fn compile(&mut self) -> Result<(), Fault> {
+        self.pipelines.compile()
+    }
+
     /// Writes to the folder of `reuse_pipelines` what was compiled since, and ends its use.
     pub fn keep_pipelines(&mut self) -> Result<(), Fault> {
+        self.compile()?;
         self.pipelines.cache.take().map_or(Ok(()), |mut cache| cache.keep())
     }
 
-    /// Makes a pipeline, of the fastest variant of the kernel that the device has.
+    /// Makes a pipeline, of the fastest variant of the kernel that the device has; compiled later (`compile`).
     pub fn kernel<K: KernelDef>(&mut self, spec: K::Spec) -> Result<Kernel<K>, Fault> {
         self.make(&spec, None, false)
     }
@@ -247,8 +253,10 @@ impl Gpu {
 
     /// Starts a recording; the one before may still be running. What is recorded sees all that was started before it.
     pub fn start(&mut self, mut rec: Recorder) -> Result<Ticket, GpuError> {
+        let failed = GpuError::of("vkCreateComputePipelines");
+        let compiled = self.compile().map_err(|_| failed(vk::Result::ERROR_UNKNOWN));
         let flushed = self.flush();
-        let started = match rec.error.or(flushed.err()) {
+        let started = match rec.error.or(compiled.err()).or(flushed.err()) {
             _ if self.lost => Err(GpuError::Lost),
             Some(e) => Err(e),
             None => self.submitter.start(&rec, &mut self.pipelines, &self.memory),

@@ -1,7 +1,9 @@
 //! Controls: what the tests of the public interface rely on to notice mistakes does notice them.
 #![allow(clippy::unwrap_used)]
 
+use super::kernel::{Access, KernelDef, Variant, BUFFERS_MAX, SPECS_MAX};
 use super::kernels::axpy;
+use super::memory::Range;
 use super::*;
 
 fn open() -> Gpu {
@@ -55,4 +57,50 @@ fn a_device_that_hangs_is_lost_and_closing_it_does_not_wait() {
     let closing = std::time::Instant::now();
     drop(gpu);
     assert!(closing.elapsed().as_millis() < 50, "{:?}", closing.elapsed());
+}
+
+/// A kernel that no driver takes.
+struct Bad;
+
+impl KernelDef for Bad {
+    type Push = u32;
+    type Spec = ();
+    type Bind = ();
+    const NAME: &'static str = "bad";
+    const BINDINGS: &'static [(u32, Access)] = &[];
+    const SPEC_IDS: &'static [u32] = &[];
+    const VARIANTS: &'static [Variant] = &[Variant {
+        define: "",
+        name: "bad",
+        spirv: b"bad",
+        shared_bytes: 0,
+        capabilities: &[],
+        texels: [0; BUFFERS_MAX],
+    }];
+
+    fn local(_: &()) -> [u32; 3] {
+        [1; 3]
+    }
+
+    fn spec_words(_: &()) -> [u32; SPECS_MAX] {
+        [0; SPECS_MAX]
+    }
+
+    fn ranges(_: &()) -> [Range; BUFFERS_MAX] {
+        unreachable!("it is never dispatched")
+    }
+}
+
+#[test]
+fn a_kernel_that_does_not_compile_is_a_fault_each_time_and_nothing_starts() {
+    let mut gpu = open();
+    gpu.kernel::<axpy::K>(axpy::Spec::default()).unwrap();
+    gpu.kernel::<Bad>(()).unwrap();
+    for _ in 0..2 {
+        assert!(gpu.compile().unwrap_err().to_string().contains("bad SPIR-V"));
+        assert!(gpu.keep_pipelines().is_err());
+        let rec = gpu.record();
+        assert!(matches!(gpu.submit(rec), Err(GpuError::Vulkan { .. })));
+    }
+    assert_eq!(gpu.validation_messages(), Vec::<String>::new());
 }

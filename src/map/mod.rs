@@ -175,6 +175,7 @@ impl Mapper {
         let pair = RectifiedPair::new(&stereo.views, &cameras[0], channels);
         let work = Workspace::new(w, h, channels, config);
         let anchors = Anchors::new(&mut gpu, cells, work, pair, config)?;
+        gpu.compile()?;
         gpu.time_commands(TIMED_IN);
         let known = if place.is_some() { known(board, &shape) } else { 0 };
         let (mut views, rendered) = (Views::new(&shape, known), Rendered::new(w, h, channels));

@@ -14,7 +14,7 @@
 //! | tracking | front end and back end in turns; offers keyframes | sealed |
 //! | or frontend | follows points (`frontend.threads = 2`) | sealed |
 //! | and estimator | estimates, one frame behind at most; offers keyframes | sealed |
-//! | mapping | rectification, depth, training; low priority, as are the CPU device's own threads; `stipple run` has it in a process of its own | sealed; OpenCV and the driver allocate behind it |
+//! | mapping | rectification, depth, training; low priority, as are the CPU device's own threads and, at boot, those that compile kernels; `stipple run` has it in a process of its own | sealed; OpenCV and the driver allocate behind it |
 //! | map-answers | reads what that process tells | free |
 //! | store-write, store-read | write and read the map on disk, in the mapper's process | free |
 //! | autopilot | writes states to an autopilot and hears it, where the board names one | free |

@@ -436,6 +436,7 @@ fn steady_state_allocates_nothing() {
     let x = floats(&mut gpu, "x", &[1.0; 1000]);
     let y = gpu.alloc::<f32>("y", 1000).unwrap();
     let k = gpu.kernel::<axpy::K>(axpy::Spec::default()).unwrap();
+    gpu.compile().unwrap();
     let mut items = [0f32; 1000];
     let before = mem::heap_after_seal();
     let gpu = std::thread::spawn(move || {

@@ -27,10 +27,11 @@ const EDGES: [(&str, &[&str]); 8] = [
 const UNSAFE: [&str; 5] =
     ["src/gpu/", "src/mem.rs", "src/stereo/opencv.rs", "src/stereo/onnx/runtime.rs", "drivers/src/"];
 /// Where threads and processes may start: those of a flight, the recorder's writer, the simulator's renderers, the bridge's,
-/// the programs that pack a report, those that read headers ahead as a store opens.
-const SPAWNS: [&str; 7] = [
+/// the programs that pack a report, those that read headers ahead as a store opens, those that compile kernels.
+const SPAWNS: [&str; 8] = [
     "src/bridge/src/main.rs",
     "src/commands/bugreport.rs",
+    "src/gpu/kernel.rs",
     "src/run/mod.rs",
     "src/run/worker.rs",
     "src/store/scan.rs",
