@@ -58,7 +58,7 @@ impl Backward {
             buffers,
             isect_gradients: scratch.isect_gradients,
             capacity: shape.intersections,
-            project: [[project(false, false)?, project(false, true)?], [project(true, false)?, project(true, true)?]],
+            project: shape.by_lens(|fisheye| Ok([project(fisheye, false)?, project(fisheye, true)?]))?,
             raster: gpu.kernel_variant(raster_backward::Spec { lanes, column, channels }, variant)?,
             sum_chunks: (chunk > 1).then(|| gpu.kernel(sum_chunks::Spec { channels, chunk })).transpose()?,
             chroma: (channels == 3).then(|| gpu.kernel_in_pieces(chroma_backward::Spec { chunk })).transpose()?,

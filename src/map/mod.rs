@@ -49,7 +49,7 @@ mod trainer;
 pub mod view;
 mod views;
 
-use crate::config::Board;
+use crate::config::{Board, Projection};
 use crate::counters::Counters;
 use crate::gpu::{cache_folder, Arena, Gpu, GpuError, Timing};
 use crate::mem::Footprint;
@@ -565,5 +565,6 @@ fn shape(calibration: &Calibration, board: &Board) -> Shape {
         images: b.keyframes * cameras,
         channels: cameras::channels(&board.map) as u32,
         cameras,
+        fisheye: board.map.projection == Projection::Fisheye,
     }
 }

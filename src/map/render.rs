@@ -99,6 +99,7 @@ pub struct Renderer {
     sorter: Sorter,
     /// By lens.
     project: [Kernel<project::K>; 2],
+    fisheye: bool,
     count_tiles: Kernel<count_tiles::K>,
     emit_tiles: Kernel<emit_tiles::K>,
     tile_ranges: Kernel<tile_ranges::K>,
@@ -129,7 +130,8 @@ impl Renderer {
             walkers: walkers(gpu.caps()),
             scan: Scan::new(gpu, sort)?,
             sorter: Sorter::new(gpu, sort, cut)?,
-            project: [project(gpu, false)?, project(gpu, true)?],
+            project: shape.by_lens(|fisheye| project(gpu, fisheye))?,
+            fisheye: shape.fisheye,
             count_tiles: gpu.kernel_in_pieces(count_tiles::Spec { lanes, column })?,
             emit_tiles: gpu.kernel_in_pieces(emit_tiles::Spec { lanes, column })?,
             tile_ranges: gpu.kernel(tile_ranges::Spec::default())?,
@@ -165,6 +167,7 @@ impl Renderer {
 
     /// The visible, front to back.
     fn record_order(&self, rec: &mut Recorder, pool: &Pool, view: &View) {
+        assert!(self.fisheye || view.fisheye.is_none(), "views are of the lenses that the map was made with");
         let (b, slots, coarseness) = (&self.buffers, pool.slots(view.epoch), view.coarseness.level());
         let (first, n) = (slots.start, slots.end);
         rec.fill(b.failed, 0);

@@ -20,6 +20,8 @@ pub struct Shape {
     pub channels: u32,
     /// Cameras that train, each with a mask.
     pub cameras: u32,
+    /// Whether views may be of a fisheye, beside pinholes.
+    pub fisheye: bool,
 }
 
 /// Pixels of a run filtered by one thread of the loss on a CPU: RUN of ssim.glsl.
@@ -39,6 +41,12 @@ impl Shape {
         }
         let what = format!("{self:?} has a zero, neither 1 nor 3 channels, or no or too many cameras");
         Err(Fault::new(FaultKind::Config, "map", what, "raise the board's [budget]"))
+    }
+
+    /// Makes one for pinholes and one for fisheyes; a map without fisheyes has the first twice.
+    pub fn by_lens<T: Copy>(&self, mut make: impl FnMut(bool) -> Result<T, Fault>) -> Result<[T; 2], Fault> {
+        let pinhole = make(false)?;
+        Ok([pinhole, if self.fisheye { make(true)? } else { pinhole }])
     }
 
     pub fn pixels(&self) -> usize {

@@ -72,7 +72,7 @@ pub fn mask(width: usize, height: usize) -> Vec<u8> {
 
 pub fn shape(v: &View, splats: u32, intersections: u32) -> Shape {
     let (width, height) = (v.camera.width as u32, v.camera.height as u32);
-    Shape { width, height, splats, intersections, images: 2, channels: 1, cameras: 1 }
+    Shape { width, height, splats, intersections, images: 2, channels: 1, cameras: 1, fisheye: v.fisheye.is_some() }
 }
 
 pub fn open(shape: Shape) -> (Gpu, Pipeline) {

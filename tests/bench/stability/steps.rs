@@ -123,8 +123,16 @@ impl Row {
 fn row(case: &Case) -> Result<Row, Fault> {
     let [width, height] = SIZE.map(|px| px as u32);
     let (view, splats) = (case.view(), case.splats(&case.view()));
-    let shape =
-        Shape { width, height, splats: SPLATS as u32, intersections: 1 << 14, images: 2, channels: 1, cameras: 1 };
+    let shape = Shape {
+        width,
+        height,
+        splats: SPLATS as u32,
+        intersections: 1 << 14,
+        images: 2,
+        channels: 1,
+        cameras: 1,
+        fisheye: false,
+    };
     let mut gpu = Gpu::open(&GpuConfig::default(), Pipeline::arena_bytes(&shape)?)?;
     let mut p = Pipeline::new(&mut gpu, shape)?;
     p.pool.append(&mut gpu, &splats)?;
