@@ -208,7 +208,7 @@ impl Pipelines {
         let next = || rest.lock().unwrap_or_else(PoisonError::into_inner).next();
         let work = || std::iter::from_fn(next).try_for_each(|pipeline| pipeline.build(device, cache));
         scope(|scope| {
-            // Where there are no threads to be had, this one does it all.
+            // This thread compiles, too; alone where the system gives it no others.
             let spawn = |_| Builder::new().name("pipelines".into()).spawn_scoped(scope, work).ok();
             let others: Vec<_> = (1..threads).filter_map(spawn).collect();
             others.into_iter().fold(work(), |done, other| done.and(other.join().expect("nothing in it panics")))
@@ -333,7 +333,8 @@ impl ComputePipeline {
         }];
         let pushes = if self.push_bytes == 0 { &pushes[..0] } else { &pushes[..] };
         // SAFETY: the device is alive, each object is made from ones made just before, and every pointer
-        // outlives its call. Several threads may make objects of one device, with one cache. The SPIR-V comes from the build's own compiler.
+        // outlives its call. Vulkan lets several threads make objects of one device with one cache. The SPIR-V comes from the build's
+        // own compiler.
         unsafe {
             let info = vk::DescriptorSetLayoutCreateInfo::default().bindings(&bindings);
             self.set_layout =
@@ -364,7 +365,8 @@ impl ComputePipeline {
     }
 
     fn destroy(&mut self, device: &Device) {
-        // SAFETY: nothing uses them: `Gpu` waits for the device before its fields are dropped; null handles are ignored.
+        // SAFETY: nothing uses them: no recording starts before all kernels are compiled, and `Gpu` waits for the device before its
+        // fields are dropped. Null handles are ignored.
         unsafe {
             device.raw.destroy_pipeline(take(&mut self.raw), None);
             device.raw.destroy_pipeline_layout(take(&mut self.layout), None);
