@@ -146,3 +146,30 @@ impl Scratch {
         (Pairs { keys, payload: from }, Pairs { keys: self.spare.keys, payload: to })
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_a_lens_needs_is_made_for_the_lenses_there_are() {
+        let shape = Shape {
+            width: 8,
+            height: 8,
+            splats: 1,
+            intersections: 1,
+            images: 1,
+            channels: 1,
+            cameras: 1,
+            fisheye: false,
+        };
+        let mut made = vec![];
+        let mut make = |fisheye| {
+            made.push(fisheye);
+            Ok(made.len())
+        };
+        assert_eq!(shape.by_lens(&mut make).ok(), Some([1, 1]));
+        assert_eq!(Shape { fisheye: true, ..shape }.by_lens(&mut make).ok(), Some([2, 3]));
+        assert_eq!(made, [false, false, true]);
+    }
+}

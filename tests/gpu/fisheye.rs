@@ -4,7 +4,7 @@
 use super::splat::{compare_differences, compare_step, open, render, shape, train, view, Rng};
 use super::twins;
 use glam::{DVec2, DVec3};
-use stipple::map::{Fisheye, Gaussian, View};
+use stipple::map::{Fisheye, Gaussian, Shape, View};
 use stipple::stereo::Pinhole;
 use stipple_drivers::{Camera, Lens};
 
@@ -122,4 +122,13 @@ fn a_map_trains_on_a_fisheye_image() {
     p.loss.set_image(&mut gpu, 0, &goal).unwrap();
     let steps = train(&mut gpu, &mut p, &v, 100);
     assert!(steps[99].loss < 0.5 * steps[0].loss, "{} -> {}", steps[0].loss, steps[99].loss);
+}
+
+#[test]
+#[should_panic(expected = "views are of the lenses that the map was made with")]
+fn a_map_without_fisheyes_takes_no_view_of_one() {
+    let v = wide_view(64, 48);
+    let (mut gpu, mut p) = open(Shape { fisheye: false, ..shape(&v, 60, 1 << 12) });
+    p.pool.append(&mut gpu, around(60, &v, 7)).unwrap();
+    render(&mut gpu, &mut p, &v);
 }
