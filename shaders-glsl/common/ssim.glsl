@@ -1,5 +1,5 @@
 // The window of SSIM (Wang et al. 2004): 11 taps, Gaussian of 1.5 px, separable. Pixels outside the image
-// or the mask are zero in both images. On a CPU every thread filters a run of RUN pixels from registers (`filtered`);
+// or the mask are zero in both images. On a CPU every thread filters a run of RUN pixels from registers (`FILTERED`);
 // GPUs filter tiles (ssim_tile.glsl).
 
 const uint RUN = 8;
@@ -10,14 +10,13 @@ const float WINDOW[11] = float[11](0.00102838, 0.00759876, 0.03600077, 0.1093606
 const float C1 = 1e-4;  // (0.01)², for a range of 1
 const float C2 = 9e-4;  // (0.03)²
 
-/// Filtered value of pixel k of the run.
-float filtered(float v[REACH], uint k) {
-    float sum = WINDOW[5] * v[k + 5];
-    [[unroll]] for (uint i = 0; i < 5; ++i) {
-        sum += WINDOW[i] * (v[k + i] + v[k + 10 - i]);
-    }
-    return sum;
-}
+/// The value of array `v` filtered by the window whose first tap is at `k`. A macro, since arrays have several sizes, and one
+/// lies in shared memory.
+#define FILTERED(v, k)                                                                             \
+    (WINDOW[5] * v[(k) + 5]                                                                        \
+     + WINDOW[0] * (v[k] + v[(k) + 10]) + WINDOW[1] * (v[(k) + 1] + v[(k) + 9])                    \
+     + WINDOW[2] * (v[(k) + 2] + v[(k) + 8]) + WINDOW[3] * (v[(k) + 3] + v[(k) + 7])               \
+     + WINDOW[4] * (v[(k) + 4] + v[(k) + 6]))
 
 /// What is compared with the observed level b: an image that is white or black tells no more than that a is beyond.
 /// The slope is by a.

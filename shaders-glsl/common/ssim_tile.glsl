@@ -30,20 +30,12 @@ void filter_run(uint q, float v[SPAN]) {
     const uint lane = gl_LocalInvocationID.x;
     const uint at = lane / COLUMNS * ROWS * COLUMNS + lane % COLUMNS;
     [[unroll]] for (uint k = 0; k < ROWS; ++k) {
-        float sum = WINDOW[5] * v[k + 5];
-        [[unroll]] for (uint i = 0; i < 5; ++i) {
-            sum += WINDOW[i] * (v[k + i] + v[k + 10 - i]);
-        }
-        strip[q * STRIP + at + k * COLUMNS] = sum;
+        strip[q * STRIP + at + k * COLUMNS] = FILTERED(v, k);
     }
 }
 
 /// Value of plane `q` at a pixel of the tile, filtered in both directions.
 float filtered_at(uint q, uvec2 pixel) {
     const uint at = q * STRIP + pixel.y * COLUMNS + pixel.x;
-    float sum = WINDOW[5] * strip[at + 5];
-    [[unroll]] for (uint i = 0; i < 5; ++i) {
-        sum += WINDOW[i] * (strip[at + i] + strip[at + 10 - i]);
-    }
-    return sum;
+    return FILTERED(strip, at);
 }

@@ -41,7 +41,7 @@ vec3 column_run(uint x, uint y0) {
             v[k] = y >= 0 && y < int(push.size.y) ? m : 0.0;
         }
         [[unroll]] for (uint k = 0; k < RUN; ++k) {
-            slope[q][k] = filtered(v, k);
+            slope[q][k] = FILTERED(v, k);
         }
     }
     const uint stride = byte_stride(push.size.x);

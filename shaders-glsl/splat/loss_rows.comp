@@ -36,7 +36,7 @@ void main() {
         }
         [[unroll]] for (uint k = 0; k < RUN; ++k) {
             if (k < n) {
-                filtered_planes[q * plane + row + x0 + k] = filtered(v, k);
+                filtered_planes[q * plane + row + x0 + k] = FILTERED(v, k);
             }
         }
     }

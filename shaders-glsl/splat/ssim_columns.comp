@@ -36,7 +36,7 @@ float column_run(uint x, uint y0) {
             v[k] = inside ? m : 0.0;
         }
         [[unroll]] for (uint k = 0; k < RUN; ++k) {
-            e[q][k] = filtered(v, k);
+            e[q][k] = FILTERED(v, k);
         }
     }
     const uint stride = byte_stride(push.size.x);

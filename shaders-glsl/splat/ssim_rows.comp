@@ -61,7 +61,7 @@ void main() {
         }
         [[unroll]] for (uint k = 0; k < RUN; ++k) {
             if (k < n) {
-                filtered_planes[q * plane + out0 + k] = filtered(product, k);
+                filtered_planes[q * plane + out0 + k] = FILTERED(product, k);
             }
         }
     }
