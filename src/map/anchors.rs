@@ -159,7 +159,7 @@ impl Anchors {
         let view = View { world_from_cam, camera: rect.pinhole, fisheye: None, coarseness, epoch };
         self.render(scene, archive, index, &view)?;
         let coverage = {
-            let seen = seen(scene, &self.pair, index, &view, stereo.views.valid_mask(), &self.work.depth.metres);
+            let seen = seen(scene, &self.pair, index, &view, stereo.views.valid_mask(), &self.work.depth);
             Coverage::new(&seen, self.config.covered_alpha, self.config.wrong_error)
         };
         let least = self.config.anchor_missing_min;
@@ -176,7 +176,7 @@ impl Anchors {
             self.disagreements[0] = Some(found);
         }
         if let Some(pair) = &mut self.pair {
-            pair.distort(&self.work.depth.metres, &view.camera);
+            pair.distort(&self.work.depth, &view.camera);
         }
         // Where depth finds what is on disk, nothing is lacking.
         let mut horizon = Horizon::of(&scene.rendered);
@@ -189,7 +189,7 @@ impl Anchors {
         let hidden = archive.as_mut().and_then(|a| a.hide(&view, &horizon, stereo.views.valid_mask()));
         let valid = hidden.unwrap_or(stereo.views.valid_mask());
         let coverage = if hidden.is_some() {
-            let seen = seen(scene, &self.pair, index, &view, valid, &self.work.depth.metres);
+            let seen = seen(scene, &self.pair, index, &view, valid, &self.work.depth);
             Coverage::new(&seen, self.config.covered_alpha, self.config.wrong_error)
         } else {
             coverage
@@ -271,7 +271,7 @@ impl Anchors {
         (whole, room): (usize, usize),
     ) -> Result<(usize, usize), GpuError> {
         let Workspace { depth, seeder, diffusion, answers, earlier, .. } = &mut self.work;
-        let seen = seen(scene, &self.pair, index, view, valid, &depth.metres);
+        let seen = seen(scene, &self.pair, index, view, valid, depth);
         let points = seeder.seed(&seen, whole, diffusion, &scene.counters);
         let Scene { gpu, pipeline, views, counters, .. } = scene;
         let pool = &pipeline.pool;
@@ -321,10 +321,10 @@ impl Anchors {
         let before = scene.pipeline.pool.count() as usize;
         let wanted = wanted.min(scene.make_room(wanted, self.config.evict)?);
         let Workspace { depth, diffusion, newcomers, similarity, .. } = &mut self.work;
-        let depth = self.pair.as_ref().map_or(&depth.metres, |pair| &pair.distance);
+        let DepthMap { metres: depth, sigma_m, .. } = self.pair.as_ref().map_or(&*depth, |pair| &pair.distance);
         let planes = scene.views.planes(index);
         let (valid, rendered, exposure) = (&scene.cameras[0].valid, &scene.rendered, target.exposure);
-        let seen = KeyframeView { planes, valid, depth, rendered, exposure, view };
+        let seen = KeyframeView { planes, valid, depth, sigma_m, rendered, exposure, view };
         densify(&seen, similarity, wanted, diffusion, newcomers, &scene.counters);
         let splats = newcomers.iter().map(|s| s.gaussian(planes, target.exposure));
         let added = scene.pipeline.pool.append(&mut scene.gpu, splats)?;
@@ -362,10 +362,10 @@ fn seen<'a>(
     index: usize,
     view: &View,
     valid: &'a [u8],
-    depth: &'a [f32],
+    DepthMap { metres: depth, sigma_m, .. }: &'a DepthMap,
 ) -> KeyframeView<'a> {
     let (planes, exposure) = (planes(&scene.views, pair, index), scene.views.exposure(index));
-    KeyframeView { planes, valid, depth, rendered: &scene.rendered, exposure, view: *view }
+    KeyframeView { planes, valid, depth, sigma_m, rendered: &scene.rendered, exposure, view: *view }
 }
 
 /// Median of the pixels that have depth, by counting them in 256 bins of 1/depth; allocates nothing.

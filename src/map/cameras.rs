@@ -6,7 +6,7 @@
 use super::view::{Fisheye, View};
 use crate::config::{MapConfig, Projection};
 use crate::stereo::rectify::box_average;
-use crate::stereo::{Pinhole, RectifiedViews};
+use crate::stereo::{DepthMap, Pinhole, RectifiedViews};
 use glam::{DVec2, DVec3};
 use stipple_drivers::{Fault, FaultKind, Image, Lens, Pose, RigCamera};
 
@@ -62,8 +62,8 @@ pub fn channels(config: &MapConfig) -> usize {
 pub struct RectifiedPair {
     /// Grey, or red, green and blue.
     pub planes: Vec<Image>,
-    /// m; zero where there is none.
-    pub distance: Vec<f32>,
+    /// Along each pixel's ray.
+    pub distance: DepthMap,
     /// By raw pixel at mapping resolution: the rectified one, or `NONE`.
     rectified: Vec<u32>,
 }
@@ -77,7 +77,7 @@ impl RectifiedPair {
         let Pinhole { width, height, .. } = views.camera().pinhole;
         let mut pair = RectifiedPair {
             planes: vec![Image::new(width, height); channels],
-            distance: vec![0.0; width * height],
+            distance: DepthMap::new(width, height),
             rectified: vec![NONE; width * height],
         };
         pair.adjust(views, left);
@@ -100,11 +100,13 @@ impl RectifiedPair {
     }
 
     /// Takes over depth along the rectified axis.
-    pub fn distort(&mut self, depth: &[f32], rect: &Pinhole) {
-        for (to, &from) in self.distance.iter_mut().zip(&self.rectified) {
-            let (x, y) = ((from as usize % rect.width) as f64, (from as usize / rect.width) as f64);
+    pub fn distort(&mut self, depth: &DepthMap, rect: &Pinhole) {
+        for (i, from) in self.rectified.iter().map(|from| *from as usize).enumerate() {
+            let (x, y) = ((from % rect.width) as f64, (from / rect.width) as f64);
             let stretch = DVec3::new((x - rect.cx) / rect.fx, (y - rect.cy) / rect.fy, 1.0).length() as f32;
-            *to = depth.get(from as usize).map_or(0.0, |z| z * stretch);
+            let stretched = |of: &[f32]| of.get(from).map_or(0.0, |z| z * stretch);
+            self.distance.metres[i] = stretched(&depth.metres);
+            self.distance.sigma_m[i] = stretched(&depth.sigma_m);
         }
     }
 }
@@ -221,10 +223,11 @@ mod tests {
         let (w, h) = (rect.pinhole.width, rect.pinhole.height);
         let metres: Vec<f32> = (0..w * h).map(|i| floor(i % w, i / w)).collect();
         let mut pair = RectifiedPair::new(&views, &left, 1).expect("a fisheye trains");
-        pair.distort(&metres, &rect.pinhole);
+        pair.distort(&DepthMap { sigma_m: metres.clone(), ..DepthMap::of(w, h, metres) }, &rect.pinhole);
+        assert_eq!(pair.distance.metres, pair.distance.sigma_m);
         let raw = View::new(left.body_from_cam, left.camera, left.fisheye);
         let (mut seen, mut worst) = (0, 0.0f64);
-        for (i, &r) in pair.distance.iter().enumerate().filter(|(_, r)| **r > 0.0) {
+        for (i, &r) in pair.distance.metres.iter().enumerate().filter(|(_, r)| **r > 0.0) {
             let p = raw.point(i % w, i / w, f64::from(r)).expect("inside the lens");
             // Half a rectified pixel off, of a floor seen at a slant.
             let slant = f64::from(r).powi(2) / 0.5 / rect.pinhole.fx;
@@ -232,6 +235,6 @@ mod tests {
             seen += 1;
         }
         assert!(seen > 1000 && worst < 0.6, "{seen} px, off by {worst} px");
-        assert!(pair.distance[..w].iter().all(|r| *r == 0.0), "the ceiling has no depth");
+        assert!(pair.distance.metres[..w].iter().all(|r| *r == 0.0), "the ceiling has no depth");
     }
 }

@@ -7,7 +7,7 @@
 
 use super::coverage::KeyframeView;
 use super::diffusion::Diffusion;
-use super::seeds::{Seed, SPACING_PX, SPREAD};
+use super::seeds::{initial_opacity, Seed, SPACING_PX, SPREAD};
 use crate::counters::Counters;
 use glam::DVec3;
 
@@ -56,7 +56,7 @@ pub fn densify(
         seeds.push(Seed {
             p_world,
             sigma_m: z / seen.view.camera.fx,
-            opacity: if matched { OPACITY_MATCHED } else { OPACITY_RENDERED },
+            opacity: if matched { initial_opacity(OPACITY_MATCHED, seen.sigma_m[i]) } else { OPACITY_RENDERED },
             pixel: i as u32,
         });
     });

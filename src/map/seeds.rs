@@ -2,7 +2,7 @@
 //!
 //! Pixels are picked by error diffusion of a density that follows the image gradient: denser on detail, and the spacing is
 //! known, so the size of a Gaussian is the distance to its neighbours. Where there is only filled-in depth, seeds are few
-//! and faint, so that others overrule them.
+//! and faint, so that others overrule them; where depth is uncertain, as on a wall that is far away, they are faint.
 
 use super::coverage::KeyframeView;
 use super::depth_fill::DepthFill;
@@ -47,6 +47,9 @@ pub const SPACING_PX: [f64; 2] = [1.0, 12.0];
 /// Faint: what stands wrongly before other views hides little of them.
 const OPACITY_MATCHED: f64 = 0.35;
 const OPACITY_FILLED: f64 = 0.25;
+/// Standard deviation of depth, m, above which a Gaussian begins with less opacity, and the least part of it that is left.
+const SIGMA_SURE_M: f64 = 0.2;
+const FAINTEST: f64 = 0.1;
 /// Density of a filled pixel over that of a matched one: bare walls need few Gaussians.
 const DENSITY_FILLED: f64 = 0.5;
 /// Gradient, grey levels a pixel, that doubles the density of a flat area.
@@ -56,6 +59,12 @@ const SEED_ALPHA: f32 = 0.5;
 /// A pixel rendered this far from what was seen takes seeds even in an occupied cell. Not where an earlier visit left Gaussians:
 /// in other light nearly all is a little wrong, and only what is `map.wrong_error` off takes seeds.
 const SEED_ERROR: f32 = 0.1;
+
+/// Opacity that a Gaussian begins with at a depth of standard deviation `sigma_m`. Those of a wall that is far away lie before
+/// it and behind it; behind a thin wall that is the next room, where they hide from its views what these see.
+pub fn initial_opacity(opacity: f64, sigma_m: f32) -> f64 {
+    opacity * (SIGMA_SURE_M / f64::from(sigma_m)).clamp(FAINTEST, 1.0)
+}
 
 /// Picks seeds; owns the scratch it needs.
 pub struct Seeder {
@@ -138,7 +147,7 @@ impl Seeder {
         self.seeds.push(Seed {
             p_world,
             sigma_m: SPREAD * spacing_px * z / seen.view.camera.fx,
-            opacity: if matched { OPACITY_MATCHED } else { OPACITY_FILLED },
+            opacity: if matched { initial_opacity(OPACITY_MATCHED, seen.sigma_m[i]) } else { OPACITY_FILLED },
             pixel: i as u32,
         });
     }
@@ -208,6 +217,17 @@ mod tests {
         assert_eq!(kept(HELD, FREE), [false, true, true, true]);
         assert_eq!(kept(HELD, HELD), [false, false, true, true]);
         assert_eq!(kept(FREE, HELD), [false, false, true, true]);
+    }
+
+    #[test]
+    fn uncertain_depth_makes_faint_seeds() {
+        let opacities = [0.0, 0.2, 0.4, 1e9, f32::INFINITY].map(|sigma_m| initial_opacity(0.5, sigma_m));
+        assert_eq!(opacities.map(|o| (1e4 * o).round()), [5000.0, 5000.0, 2500.0, 500.0, 500.0]);
+        let (image, rendered) = (Image::new(W, H), black(&[0.0; W * H]));
+        let view = KeyframeView { sigma_m: &[0.8; W * H], ..seen(&image, &FAR, &rendered) };
+        let (mut s, mut d) = (Seeder::new(W, H, 300, 0.25), Diffusion::new(W, H));
+        assert!(s.seed(&view, 300, &mut d, &Counters::default()).len() > 100);
+        assert!(s.seeds.iter().all(|k| (k.opacity - 0.25 * OPACITY_MATCHED).abs() < 1e-6));
     }
 
     #[test]
