@@ -16,11 +16,10 @@ const OPERATIONS_V3D: u32 = 0xbb;
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Profile {
     pub name: &'static str,
-    pub subgroup_size: u32,
+    /// The least and the greatest width of subgroup; where they differ, the compiler picks one for each kernel.
+    pub subgroup_sizes: [u32; 2],
     /// Bits of VkSubgroupFeatureFlagBits.
     pub subgroup_operations: u32,
-    /// Whether the compiler picks a width of subgroup for each kernel.
-    pub subgroup_size_varies: bool,
     pub invocations_max: u32,
     /// Invocations of a workgroup in each dimension; like `buffers_max`, `push_max_bytes` and `alignment` for tests alone, as
     /// the build or `gpu::ALIGN` keeps every kernel within the least of them.
@@ -42,9 +41,8 @@ pub struct Profile {
 pub const PROFILES: [Profile; 4] = [
     Profile {
         name: "V3D 7.1",
-        subgroup_size: 16,
+        subgroup_sizes: [16; 2],
         subgroup_operations: OPERATIONS_V3D,
-        subgroup_size_varies: false,
         invocations_max: 256,
         local_max: [256; 3],
         shared_max_bytes: 16 * KIB,
@@ -57,9 +55,8 @@ pub const PROFILES: [Profile; 4] = [
     },
     Profile {
         name: "Mali-G610",
-        subgroup_size: 16,
+        subgroup_sizes: [16; 2],
         subgroup_operations: OPERATIONS_ALL,
-        subgroup_size_varies: false,
         invocations_max: 1024,
         local_max: [1024; 3],
         shared_max_bytes: 32 * KIB,
@@ -72,9 +69,8 @@ pub const PROFILES: [Profile; 4] = [
     },
     Profile {
         name: "Intel Gen12",
-        subgroup_size: 32,
+        subgroup_sizes: [8, 32],
         subgroup_operations: OPERATIONS_ALL,
-        subgroup_size_varies: true,
         invocations_max: 1024,
         local_max: [1024; 3],
         shared_max_bytes: 48 * KIB,
@@ -87,9 +83,8 @@ pub const PROFILES: [Profile; 4] = [
     },
     Profile {
         name: "Orin",
-        subgroup_size: 32,
+        subgroup_sizes: [32; 2],
         subgroup_operations: OPERATIONS_ALL,
-        subgroup_size_varies: false,
         invocations_max: 1024,
         local_max: [1024, 1024, 64],
         shared_max_bytes: 48 * KIB,

@@ -12,6 +12,9 @@ use std::sync::Mutex;
 use stipple_drivers::{Fault, FaultKind};
 
 const VALIDATION_LAYER: &CStr = c"VK_LAYER_KHRONOS_validation";
+/// Width of subgroup that is asked for where the compiler would choose: that of a tile. With 32 an invocation on Intel's Gen12 has
+/// half as many registers.
+const SUBGROUP_SIZE: u32 = 16;
 /// Validation messages kept; the rest are only counted out by the log of the layer itself.
 const MESSAGES_MAX: usize = 256;
 
@@ -42,6 +45,7 @@ impl DeviceKind {
 pub struct Caps {
     pub name: String,
     pub kind: DeviceKind,
+    /// Invocations of a subgroup, in kernels that use its operations.
     pub subgroup_size: u32,
     /// Bits of VkSubgroupFeatureFlagBits that compute kernels may use; none with `GpuConfig::subgroups = false`.
     pub subgroup_operations: u32,
@@ -50,6 +54,10 @@ pub struct Caps {
     pub texel_buffers: bool,
     /// Whether the compiler picks a width of subgroup for each kernel, narrower than the one reported: Intel's.
     pub subgroup_size_varies: bool,
+    /// Whether kernels that use subgroups ask the compiler for `subgroup_size`, which would vary otherwise.
+    pub subgroup_size_required: bool,
+    /// The least and the greatest width that a kernel can ask for (VK_EXT_subgroup_size_control).
+    subgroup_sizes: Option<[u32; 2]>,
     pub invocations_max: u32,
     pub shared_max_bytes: u32,
     /// Largest buffer a kernel can bind, bytes.
@@ -87,16 +95,24 @@ impl Caps {
         }
     }
 
+    /// Has kernels ask for one width of subgroup where the compiler would choose and takes such requests.
+    fn require_subgroup_size(&mut self) {
+        let Some([least, most]) = self.subgroup_sizes.filter(|_| self.subgroup_size_varies) else { return };
+        self.subgroup_size = SUBGROUP_SIZE.clamp(least, most);
+        (self.subgroup_size_varies, self.subgroup_size_required) = (false, true);
+    }
+
     /// Limits what the device can do to the profile that the board names. Subgroups of another width than its are not used.
     #[cfg(feature = "instruments")]
     fn limit(&mut self, config: &GpuConfig) -> Result<(), Fault> {
         let Some(p) = crate::config::Profile::of(&config.profile)? else { return Ok(()) };
         self.name = format!("{} as {}", self.name, p.name);
         (self.kind, self.texel_buffers) = (DeviceKind::Integrated, false);
-        self.subgroup_size_varies = p.subgroup_size_varies;
-        let same_width = self.subgroup_size == p.subgroup_size;
+        let [least, most] = p.subgroup_sizes;
+        self.subgroup_size_varies = least < most;
+        let has_width = (least..=most).contains(&self.subgroup_size);
         self.subgroup_operations &=
-            if same_width { p.subgroup_operations } else { vk::SubgroupFeatureFlags::BASIC.as_raw() };
+            if has_width { p.subgroup_operations } else { vk::SubgroupFeatureFlags::BASIC.as_raw() };
         self.invocations_max = self.invocations_max.min(p.invocations_max);
         self.shared_max_bytes = self.shared_max_bytes.min(p.shared_max_bytes);
         self.binding_max_bytes = self.binding_max_bytes.min(p.binding_max_bytes);
@@ -158,8 +174,16 @@ impl Device {
         }
         #[cfg(feature = "instruments")]
         caps.limit(config)?;
+        caps.require_subgroup_size();
         let queues = [vk::DeviceQueueCreateInfo::default().queue_family_index(family).queue_priorities(&[1.0])];
-        let info = vk::DeviceCreateInfo::default().queue_create_infos(&queues);
+        let mut info = vk::DeviceCreateInfo::default().queue_create_infos(&queues);
+        let extensions = [ash::ext::subgroup_size_control::NAME.as_ptr()];
+        let mut features = vk::PhysicalDeviceSubgroupSizeControlFeatures::default()
+            .subgroup_size_control(true)
+            .compute_full_subgroups(true);
+        if caps.subgroup_size_required {
+            info = info.enabled_extension_names(&extensions).push_next(&mut features);
+        }
         // SAFETY: `physical` belongs to `instance`, and `family` is one of its queue families.
         let raw = unsafe { instance.raw.create_device(physical, &info, None) }.map_err(boot("vkCreateDevice"))?;
         // SAFETY: one queue of this family was requested above; `physical` is alive.
@@ -329,6 +353,25 @@ unsafe extern "system" fn collect(
     vk::FALSE
 }
 
+/// The least and the greatest width of subgroup that a compute kernel can ask for; `None` where it cannot.
+fn subgroup_sizes(instance: &ash::Instance, physical: vk::PhysicalDevice) -> Option<[u32; 2]> {
+    let mut features = vk::PhysicalDeviceSubgroupSizeControlFeatures::default();
+    let mut sizes = vk::PhysicalDeviceSubgroupSizeControlProperties::default();
+    // SAFETY: `physical` is of this instance and has Vulkan 1.1; the structures are those of an extension that it has.
+    unsafe {
+        let extensions = instance.enumerate_device_extension_properties(physical).ok()?;
+        let name = Ok(ash::ext::subgroup_size_control::NAME);
+        extensions.iter().find(|e| e.extension_name_as_c_str() == name)?;
+        let mut all = vk::PhysicalDeviceFeatures2::default().push_next(&mut features);
+        instance.get_physical_device_features2(physical, &mut all);
+        let mut all = vk::PhysicalDeviceProperties2::default().push_next(&mut sizes);
+        instance.get_physical_device_properties2(physical, &mut all);
+    }
+    let able = [features.subgroup_size_control, features.compute_full_subgroups] == [vk::TRUE; 2];
+    let in_compute = sizes.required_subgroup_size_stages.contains(vk::ShaderStageFlags::COMPUTE);
+    (able && in_compute).then_some([sizes.min_subgroup_size, sizes.max_subgroup_size])
+}
+
 type Choice = (vk::PhysicalDevice, u32, Caps);
 
 fn choose(instance: &ash::Instance, config: &GpuConfig) -> Result<Choice, Fault> {
@@ -374,6 +417,8 @@ fn describe(instance: &ash::Instance, physical: vk::PhysicalDevice) -> Option<Ch
     let name = properties.device_name_as_c_str().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default();
     let caps = Caps {
         subgroup_size_varies: name.contains("Intel"),
+        subgroup_size_required: false,
+        subgroup_sizes: subgroup_sizes(instance, physical),
         name,
         kind,
         subgroup_size: subgroup.subgroup_size,

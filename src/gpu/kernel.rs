@@ -4,7 +4,7 @@
 //! variants takes the last one whose SPIR-V capabilities the device has.
 
 use super::cache::PipelineCache;
-use super::device::{boot, Device};
+use super::device::{boot, capability::GROUP, Device};
 use super::memory::{Backed, Range, ALIGN};
 use super::{GpuError, COMMANDS_MAX};
 use ash::vk;
@@ -326,6 +326,8 @@ impl ComputePipeline {
             .collect();
         let specialisation =
             vk::SpecializationInfo::default().map_entries(&entries).data(bytemuck::cast_slice(&words[..ids.len()]));
+        let mut width = vk::PipelineShaderStageRequiredSubgroupSizeCreateInfo::default()
+            .required_subgroup_size(device.caps.subgroup_size);
         let pushes = [vk::PushConstantRange {
             stage_flags: vk::ShaderStageFlags::COMPUTE,
             offset: 0,
@@ -344,11 +346,14 @@ impl ComputePipeline {
             self.layout = device.raw.create_pipeline_layout(&info, None).map_err(boot("vkCreatePipelineLayout"))?;
             let info = vk::ShaderModuleCreateInfo::default().code(&code);
             self.module = device.raw.create_shader_module(&info, None).map_err(boot("vkCreateShaderModule"))?;
-            let stage = vk::PipelineShaderStageCreateInfo::default()
+            let mut stage = vk::PipelineShaderStageCreateInfo::default()
                 .stage(vk::ShaderStageFlags::COMPUTE)
                 .module(self.module)
                 .name(c"main")
                 .specialization_info(&specialisation);
+            if device.caps.subgroup_size_required && variant.capabilities.contains(&GROUP) {
+                stage = stage.flags(vk::PipelineShaderStageCreateFlags::REQUIRE_FULL_SUBGROUPS).push_next(&mut width);
+            }
             let flags = match self.in_pieces {
                 true => vk::PipelineCreateFlags::DISPATCH_BASE,
                 false => vk::PipelineCreateFlags::empty(),

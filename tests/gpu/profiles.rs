@@ -6,7 +6,7 @@ use std::process::Command;
 use std::time::Instant;
 use stipple::config::{Board, GpuConfig, Profile, PROFILES};
 use stipple::gpu::{capability, kernels, DeviceKind, Gpu, ALIGN};
-use stipple::map::{Keyframe, Mapper};
+use stipple::map::{Keyframe, Mapper, Tiling};
 use stipple_drivers::replay::{OpenOptions, Recording};
 use stipple_drivers::sim::{write_euroc, Scenario, Sim};
 use stipple_drivers::types::pose_at;
@@ -54,6 +54,17 @@ fn every_kernel_and_the_variants_that_a_gpu_takes_fit_it() {
     }
 }
 
+/// Lavapipe takes such a request, for the one width that it has.
+#[test]
+fn a_width_of_subgroup_is_asked_for_where_the_compiler_would_choose() {
+    let open = |profile: &str| Gpu::open(&limited_to(profile), 1 << 16).unwrap().caps().clone();
+    let (own, intel, v3d) = (open(""), open("Intel Gen12"), open("V3D 7.1"));
+    assert!(!own.subgroup_size_required && !v3d.subgroup_size_required);
+    assert!(intel.subgroup_size_required && !intel.subgroup_size_varies, "{intel:?}");
+    assert_eq!((intel.subgroup_size, Tiling::of(&intel).lanes), (own.subgroup_size, own.subgroup_size));
+    assert_eq!(Tiling::of(&intel).variant, "subgroup");
+}
+
 #[test]
 fn boards_with_two_grey_cameras_fit_their_gpus_at_the_largest_images() {
     for (name, file) in BOARDS {
@@ -92,8 +103,13 @@ fn one_map_within_one_profile() {
     board.gpu = limited_to(&name);
     let gpu = Gpu::open(&board.gpu, 1 << 16).unwrap();
     if let (Some(p), DeviceKind::Integrated) = (Profile::of(&name).unwrap(), gpu.caps().kind) {
-        let wide = gpu.caps().subgroup_size == p.subgroup_size;
-        assert_eq!(gpu.caps().allows(capability::GROUP_SHUFFLE), wide, "subgroups of {} lanes", p.subgroup_size);
+        let ([least, most], width) = (p.subgroup_sizes, gpu.caps().subgroup_size);
+        let has_width = (least..=most).contains(&width);
+        assert_eq!(
+            gpu.caps().allows(capability::GROUP_SHUFFLE),
+            has_width,
+            "subgroups of {width} in {least} to {most}"
+        );
     }
     let mut scenario = Scenario::named("demo").unwrap();
     (scenario.image_divisor, scenario.rate_hz) = (4, 2.5);

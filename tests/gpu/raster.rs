@@ -2,6 +2,7 @@
 
 use super::splat::{worst, Rng};
 use super::twins::raster::{backward, forward, Flat, Planes};
+use stipple::config::GpuConfig;
 use stipple::gpu::kernels::{raster_backward, raster_forward, types::Projected};
 use stipple::gpu::{Buf, Gpu, Threads};
 use stipple::map::Tiling;
@@ -143,17 +144,21 @@ impl Rig {
 }
 
 fn rigs() -> Vec<Rig> {
-    let open = |baseline, column| {
-        let gpu = Gpu::open(&crate::config(), 8 << 20).unwrap();
+    let open_as = |profile: &str, baseline, column| {
+        let config = GpuConfig { profile: profile.into(), ..crate::config() };
+        let gpu = Gpu::open(&config, 8 << 20).unwrap();
         let tiling = if baseline { Tiling::BASELINE } else { Tiling::of(gpu.caps()) };
         Rig { gpu, tiling: Tiling { column, ..tiling } }
     };
+    let open = |baseline, column| open_as("", baseline, column);
     // A CPU reads texels; what a GPU with subgroups runs is compared too.
     let mut of_a_gpu = open(false, 8);
     if of_a_gpu.tiling.variant == "cpu" {
         of_a_gpu.tiling.variant = "subgroup";
     }
-    vec![open(true, 8), open(true, 4), open(false, 8), open(false, 4), open(false, 2), of_a_gpu]
+    // Of an Intel GPU, whose kernels ask for a width of subgroup.
+    let asks = open_as("Intel Gen12", false, 8);
+    vec![open(true, 8), open(true, 4), open(false, 8), open(false, 4), open(false, 2), of_a_gpu, asks]
 }
 
 fn close(got: impl IntoIterator<Item = f32>, want: &[f64], tolerance: f64, what: &str) {
