@@ -191,6 +191,9 @@ pub fn screen(s: &StatusMessage) -> String {
     }
     let why = summary.governor.reason.as_ref().map(|why| format!(": {why}")).unwrap_or_default();
     row("mapper", format!("{:.0} % of its time{why}", 100.0 * summary.governor.share));
+    if let Some(power) = summary.power {
+        row("power", format!("{:.1} W, {:.0} J since the start", power.watts, power.joules));
+    }
     let counted: Vec<String> =
         summary.counters.iter().filter(|(_, n)| **n > 0).map(|(name, n)| format!("{name} {n}")).collect();
     row("counters", if counted.is_empty() { "all zero".into() } else { counted.join(", ") });
@@ -218,7 +221,7 @@ mod tests {
             "position":[1,2,3],"orientation":[0,0,0,1],"velocity_body":[3,0,4],"rate_body":[0,0,0],"pose_covariance":null,
             "velocity_covariance":null},"frames":9,"posed":8,"map":{"keyframes":1,"anchors":1,"splats":5,"iterations":6,"psnr_db":null},
             "map_from_odom":{"t_ns":-1950000000,"count":4,"epoch":2,"position":[0.5,-0.25,0],"yaw":0.1,"covariance":[[0,0,0,0],[0,0,0,0],[0,0,0,0],[0,0,0,0]]},
-            "governor":{"share":0.49,"reason":"cpu is at 90 degrees"},"counters":{"imu_gap":3,"camera_lost":0}}"#;
+            "governor":{"share":0.49,"reason":"cpu is at 90 degrees"},"power":{"watts":7.25,"joules":26995.5},"counters":{"imu_gap":3,"camera_lost":0}}"#;
         let shown = screen(&serde_json::from_str(text).unwrap());
         for part in [
             "for 1 h 2 min",
@@ -227,6 +230,7 @@ mod tests {
             "1.00, 2.00, 3.00 m, at 5.00 m/s",
             "loops     4, the last 3 s ago: odom is at 0.50, -0.25, 0.00 m, 5.7 degrees in the map",
             "49 % of its time: cpu is at 90 degrees",
+            "power     7.2 W, 26996 J since the start",
             "counters  imu_gap 3",
         ] {
             assert!(shown.contains(part), "{part}\n{shown}");

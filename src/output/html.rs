@@ -121,8 +121,10 @@ fn tables(report: &Report) -> String {
         ("Iteration time, median", f(report.iteration_ms_p50, 1), "ms"),
         ("Time until training views stay at 25 dB", f(report.seconds_to_25_db, 0), "s"),
     ];
-    let cost: [Row; 8] = [
+    let cost: [Row; 10] = [
         ("Run time", f(report.wall_s, 1), "s"),
+        ("Energy of the board", f(report.energy_j, 0), "J"),
+        ("Power of the board, mean", f(report.power_mean_w, 1), "W"),
         ("Keyframes", n(report.keyframes), ""),
         ("Anchors", n(report.anchors), ""),
         ("Tracker and estimator", mib(report.estimator_bytes), "MiB"),

@@ -86,6 +86,9 @@ pub struct Report {
     pub map_rss_peak_bytes: Option<u64>,
     pub heap_after_seal: Option<u64>,
     pub wall_s: Option<f64>,
+    /// Energy that the board took, where it has sensors that may be read, and the mean power while they were.
+    pub energy_j: Option<f64>,
+    pub power_mean_w: Option<f64>,
     /// Number of warnings about the input.
     pub warnings: u64,
 
@@ -227,7 +230,7 @@ mod tests {
         "frames keyframes anchors frames_dropped ate_rmse_m odometry_ate_rmse_m rte_1s_m rpe_deg tracking_fps tracking_ms_p50 \
         tracking_ms_p99 tracking_threads tracking_cpu_ms frontend_ms_p50 frontend_ms_p99 estimator_ms_p50 \
         estimator_ms_p99 psnr_db ssim psnr_heldout_db ssim_heldout psnr_heldout_between_db psnr_heldout_fitted_db ssim_heldout_fitted psnr_heldout_aligned_db splats iterations \
-        iteration_ms_p50 iteration_ms_p99 seconds_to_25_db gpu_bytes estimator_bytes quality_min quality_p50 quality_under_50 rss_peak_bytes map_rss_peak_bytes heap_after_seal wall_s device vio_hash dataset board pace scale \
+        iteration_ms_p50 iteration_ms_p99 seconds_to_25_db gpu_bytes estimator_bytes quality_min quality_p50 quality_under_50 rss_peak_bytes map_rss_peak_bytes heap_after_seal wall_s energy_j power_mean_w device vio_hash dataset board pace scale \
         camera_cpu_ms camera_kernel_ms camera_copies height_bias_m height_bias_sigma_m gyro_scale gyro_scale_sigma accel_scale accel_scale_sigma epochs";
 
     #[test]

@@ -1,5 +1,5 @@
-//! The mapper's share of its time, by how hot the board is, what power it takes, whether Linux throttles it, and how long
-//! tracking takes: the map slows down before odometry does. Linux's own files are read, and none is written.
+//! The mapper's share of its time, by how hot the board is, what power it takes (`power`), whether Linux throttles it, and how
+//! long tracking takes: the map slows down before odometry does. Linux's own files are read, and none is written.
 
 use crate::config::GovernorConfig;
 use std::fs;
@@ -32,9 +32,6 @@ struct Zone {
 /// What the files of Linux say.
 struct Board {
     zones: Vec<Zone>,
-    /// Files in µW, and pairs of files in mV and mA.
-    powers: Vec<PathBuf>,
-    currents: Vec<(PathBuf, PathBuf)>,
     /// Files with the highest clock that a core may have now, and its value at the start, kHz.
     clocks: Vec<(PathBuf, f64)>,
 }
@@ -67,16 +64,18 @@ pub struct Governor {
     overwritten: u64,
 }
 
-fn number(path: &Path) -> Option<f64> {
+/// The number that a file holds.
+pub(super) fn number(path: &Path) -> Option<f64> {
     fs::read_to_string(path).ok()?.trim().parse().ok()
 }
 
-fn text(path: PathBuf) -> String {
+/// The line that a file holds; empty where it cannot be read.
+pub(super) fn text(path: PathBuf) -> String {
     fs::read_to_string(path).map(|text| text.trim().to_string()).unwrap_or_default()
 }
 
 /// Entries of a folder whose names begin so, in order.
-fn entries(folder: &Path, prefix: &str) -> Vec<PathBuf> {
+pub(super) fn entries(folder: &Path, prefix: &str) -> Vec<PathBuf> {
     let mut all: Vec<_> = fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path()).collect();
     all.retain(|path| path.file_name().is_some_and(|name| name.to_string_lossy().starts_with(prefix)));
     all.sort();
@@ -96,7 +95,6 @@ impl Board {
             Zone { name: text(path.join("type")), temp: path.join("temp"), passive_c }
         };
         let mut zones: Vec<Zone> = entries(&sys.join("class/thermal"), "thermal_zone").into_iter().map(zone).collect();
-        let (mut powers, mut currents) = (vec![], vec![]);
         for hwmon in entries(&sys.join("class/hwmon"), "hwmon") {
             let name = text(hwmon.join("name"));
             let is_processor =
@@ -106,28 +104,12 @@ impl Board {
                 let passive_c = number(&max).filter(|m| *m > 0.0).map(|m| m / 1e3);
                 zones.push(Zone { name: name.clone(), temp, passive_c });
             }
-            let average =
-                entries(&hwmon, "power").into_iter().filter(|path| path.to_string_lossy().ends_with("_average"));
-            let before = powers.len();
-            powers.extend(average);
-            if powers.len() == before {
-                powers.extend(entries(&hwmon, "power").into_iter().filter(|path| path.ends_with_input()));
-            }
-            if name == "ina3221" || name == "ina219" {
-                // Each current has the voltage of its number; those of sums have none.
-                let pair = |current: PathBuf| {
-                    let voltage = PathBuf::from(current.to_string_lossy().replace("/curr", "/in"));
-                    voltage.exists().then_some((voltage, current))
-                };
-                let found = entries(&hwmon, "curr").into_iter().filter(|path| path.ends_with_input());
-                currents.extend(found.filter_map(pair));
-            }
         }
         let cores = entries(&sys.join("devices/system/cpu/cpufreq"), "policy").into_iter();
         let gpus = entries(&sys.join("class/devfreq"), "").into_iter().map(|path| path.join("max_freq"));
         let clocks = cores.map(|path| path.join("scaling_max_freq")).chain(gpus);
         let clocks = clocks.filter_map(|path| Some((number(&path)?, path))).map(|(at_start, path)| (path, at_start));
-        Board { zones, powers, currents, clocks: clocks.collect() }
+        Board { zones, clocks: clocks.collect() }
     }
 
     /// Temperatures above `limit_c`, or where that is 0 above what each sensor itself allows.
@@ -139,11 +121,8 @@ impl Board {
             // Sensors that are off say 0, or nonsense.
             Some((c - limit?, c, zone.name.clone())).filter(|_| (1.0..200.0).contains(&c))
         };
-        let of_files = self.powers.iter().filter_map(|path| number(path)).map(|uw| uw * 1e-6);
-        let of_pairs = self.currents.iter().filter_map(|(v, i)| Some(number(v)? * number(i)? * 1e-6));
         Measured {
             hottest: self.zones.iter().filter_map(above).max_by(|a, b| a.0.total_cmp(&b.0)),
-            power_w: of_files.chain(of_pairs).reduce(|a, b| a + b),
             throttled: self
                 .clocks
                 .iter()
@@ -189,11 +168,12 @@ impl Governor {
         (STEP.powi(self.steps as i32), self.reason.as_deref())
     }
 
-    /// Looks once a second; answers a line where the share changed. `frames` and `overwritten` count from the start,
-    /// `latency_most` is the longest that tracking took a frame since the last look: it is asked for then alone.
+    /// Looks once a second; answers a line where the share changed. `power_w` is what the board takes, where that is known, `frames`
+    /// and `overwritten` count from the start, `latency_most` is the longest that tracking took a frame since the last look: it is asked for then alone.
     pub fn look(
         &mut self,
         now: Instant,
+        power_w: Option<f64>,
         frames: u64,
         overwritten: u64,
         latency_most: impl FnOnce() -> Duration,
@@ -208,7 +188,7 @@ impl Governor {
         let latency_s = latency_most().as_secs_f64() / f64::from(self.threads);
         let frame_share = latency_s * (new_frames + overwritten) as f64 / elapsed.as_secs_f64();
         let measured = match self.config.enabled {
-            true => Measured { frame_share, overwritten, ..self.board.measure(self.config.temperature_max_c) },
+            true => Measured { frame_share, overwritten, power_w, ..self.board.measure(self.config.temperature_max_c) },
             false => Measured::default(),
         };
         self.judge(&measured)
@@ -265,11 +245,11 @@ impl Governor {
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
 
-    fn write(root: &Path, files: &[(&str, &str)]) {
+    pub fn write(root: &Path, files: &[(&str, &str)]) {
         for (name, content) in files {
             let path = root.join(name);
             fs::create_dir_all(path.parent().unwrap()).unwrap();
@@ -297,12 +277,6 @@ mod tests {
                 ("class/hwmon/hwmon1/name", "nvme"),
                 ("class/hwmon/hwmon1/temp1_input", "99000"),
                 ("class/hwmon/hwmon1/temp1_max", "70000"),
-                ("class/hwmon/hwmon2/name", "ina3221"),
-                ("class/hwmon/hwmon2/in1_input", "5000"),
-                ("class/hwmon/hwmon2/curr1_input", "2000"),
-                ("class/hwmon/hwmon2/curr4_input", "9999"),
-                ("class/hwmon/hwmon3/name", "amdgpu"),
-                ("class/hwmon/hwmon3/power1_average", "1500000"),
                 ("devices/system/cpu/cpufreq/policy0/scaling_max_freq", "2400000"),
                 ("class/devfreq/17000000.gpu/max_freq", "624750000"),
             ],
@@ -317,7 +291,7 @@ mod tests {
         let m = board.measure(0.0);
         let (above, c, name) = m.hottest.unwrap();
         assert_eq!((above, c, name.as_str()), (61.0 - 75.0, 61.0, "cpu-thermal"), "the closest to its own limit");
-        assert!((m.power_w.unwrap() - 11.5).abs() < 1e-9 && !m.throttled);
+        assert!(!m.throttled);
         assert_eq!(board.measure(50.0).hottest.unwrap().0, 11.0);
         write(dir.path(), &[("class/devfreq/17000000.gpu/max_freq", "306000000")]);
         assert!(board.measure(0.0).throttled);
@@ -363,9 +337,9 @@ mod tests {
     fn time_that_tracking_takes_is_compared_with_the_time_between_frames() {
         let mut g = Governor::new(&GovernorConfig::default(), 2, Path::new("/nowhere"));
         let start = g.next;
-        assert_eq!(g.look(start, 20, 0, || Duration::from_millis(40)), None, "40 % of twice 50 ms");
-        assert_eq!(g.look(start, 20, 0, || panic!("not yet")), None);
-        let line = g.look(start + PERIOD, 40, 0, || Duration::from_millis(90));
+        assert_eq!(g.look(start, None, 20, 0, || Duration::from_millis(40)), None, "40 % of twice 50 ms");
+        assert_eq!(g.look(start, None, 20, 0, || panic!("not yet")), None);
+        let line = g.look(start + PERIOD, None, 40, 0, || Duration::from_millis(90));
         assert!(line.unwrap().contains("tracking takes 90 %"));
     }
 }

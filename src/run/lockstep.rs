@@ -131,8 +131,7 @@ pub fn fly(
     let (waker, link, stop) = (Waker::default(), Link::default(), host::stop_asked_for());
     let mut budget = Budget { steps, total, spent: 0, start: Instant::now() };
     let gates = (FrameGate::new(&packets[0].frames), ImuGate::new(&calibration.imu));
-    let mut notices = vec![];
-    let mut reading = Reading { recorded, gates, next: 0, samples: 0, aids: 0 };
+    let (mut notices, mut reading) = (vec![], Reading { recorded, gates, next: 0, samples: 0, aids: 0 });
     std::thread::scope(|scope| {
         let (taken, given, woken) = (&waiting, &done, &waker);
         let give = move |packet| {
@@ -191,6 +190,7 @@ pub fn fly(
         keyframes: keyframes.count,
         loops: keyframes.loops.and_then(|loops| loops.here),
         wall_s: budget.start.elapsed().as_secs_f64(),
+        energy: None,
         warnings: reading.recorded.images.warnings().to_vec(),
         source: reading.recorded.images.counters(),
         capture: None,

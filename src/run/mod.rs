@@ -43,6 +43,7 @@ pub mod mailbox;
 pub mod mapping;
 pub mod memory;
 mod opening;
+mod power;
 pub mod recorder;
 mod reload;
 mod seams;
@@ -72,6 +73,7 @@ use keyframes::Keyframes;
 use log::Log;
 use loop_closing::LoopClosing;
 use mailbox::{Capture, Mailbox};
+use power::Energy;
 use recorder::Recording;
 pub use reload::BoardSource;
 use sensors::{Input, Playback, Sensors, Source};
@@ -164,6 +166,8 @@ pub struct Flown {
     /// What closed loops, where that was asked for.
     pub loops: Option<Box<Loops>>,
     pub wall_s: f64,
+    /// Energy that the board took, where it can measure it; none in lockstep.
+    pub energy: Option<Energy>,
     pub warnings: Vec<String>,
     /// Counters of the sources.
     pub source: Vec<(&'static str, u64)>,
@@ -461,6 +465,7 @@ pub fn fly_in_real_time(
         keyframes: keyframes.count,
         loops,
         wall_s: shared.start.elapsed().as_secs_f64(),
+        energy: steering.energy(),
         warnings,
         counters: shared.counters,
         source,

@@ -11,7 +11,7 @@ use crate::frontend::{Verdict, Verdicts};
 use crate::loops::MapFromOdom;
 use crate::publish::event::{EventId, Notice};
 use crate::publish::mavlink::Settings;
-use crate::publish::status::message::{GovernorStatus, MapFromOdomMessage, MapStatus, Summary};
+use crate::publish::status::message::{GovernorStatus, MapFromOdomMessage, MapStatus, PowerStatus, Summary};
 use crate::publish::status::Shared;
 use crate::publish::{Feed, Feeds};
 use crate::vio::{Finding, Findings, Health, Part};
@@ -106,6 +106,7 @@ pub struct Status {
     readers: Option<Arc<Shared>>,
     /// What share of its time the mapper works, and why.
     pub governor: GovernorStatus,
+    pub power: Option<PowerStatus>,
     /// When counters are logged next.
     next_count: Instant,
     /// Whether it was said that logging ended.
@@ -149,6 +150,7 @@ impl Status {
             autopilot: None,
             readers: None,
             governor: GovernorStatus::default(),
+            power: None,
             next_count,
             log_ended: false,
             epoch: 0,
@@ -293,6 +295,7 @@ impl Status {
                 psnr_db: (psnr > 0).then_some(psnr as f64 * 0.01),
             },
             governor: self.governor.clone(),
+            power: self.power,
             map_from_odom: g.map_from_odom(),
             counters: counters.list().into_iter().map(|(name, n)| (name.into(), n)).collect(),
         });

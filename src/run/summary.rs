@@ -82,6 +82,8 @@ pub fn conclude(title: Title, mut flown: Flown, logged: &[PathBuf], out: &Output
         scale: Some(title.scale),
         keyframes: Some(flown.keyframes),
         wall_s: Some(flown.wall_s),
+        energy_j: flown.energy.map(|energy| energy.joules),
+        power_mean_w: flown.energy.map(|energy| energy.joules / energy.seconds),
         heap_after_seal: Some(heap),
         warnings: flown.warnings.len() as u64,
         ..Report::default()

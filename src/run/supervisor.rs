@@ -2,6 +2,7 @@
 
 use super::governor::Governor;
 use super::keyframes::{KeyframeRing, Word};
+use super::power::{Energy, PowerMeter};
 use super::reload::{BoardSource, Reload};
 use super::status::{Gauges, Status};
 use super::worker::Worker;
@@ -19,6 +20,7 @@ use stipple_drivers::host;
 #[derive(Default)]
 pub struct Steering {
     governor: Option<Governor>,
+    power: Option<PowerMeter>,
     /// Where the board is read again when the flag is set, and the one that flies.
     reload: Option<(BoardSource, Board, &'static AtomicBool)>,
 }
@@ -27,11 +29,10 @@ impl Steering {
     /// Governs the mapper of `board`, and reads the board of a `managed` run again at SIGHUP.
     pub fn new(board: &Board, source: Option<&BoardSource>, managed: bool) -> Steering {
         let reload = source.filter(|_| managed).map(|source| (source.clone(), board.clone(), host::reload_asked_for()));
+        let sys = Path::new("/sys");
         Steering {
-            governor: board
-                .map
-                .enabled
-                .then(|| Governor::new(&board.governor, board.frontend.threads, Path::new("/sys"))),
+            power: Some(PowerMeter::find(sys, Instant::now())),
+            governor: board.map.enabled.then(|| Governor::new(&board.governor, board.frontend.threads, sys)),
             reload,
         }
     }
@@ -55,12 +56,31 @@ impl Steering {
         })
     }
 
-    /// Looks whether the mapper is to work less or more.
-    fn govern(&mut self, ring: &KeyframeRing, c: &Counters, g: &Gauges, status: &mut Status) -> Option<Notice> {
+    /// Energy of the run so far, where the board can measure it.
+    pub fn energy(&self) -> Option<Energy> {
+        self.power.as_ref()?.energy()
+    }
+
+    /// Looks what power the board takes.
+    fn meter(&mut self, status: &mut Status) -> Option<f64> {
+        let power = self.power.as_mut()?;
+        let watts = power.look(Instant::now());
+        status.power = power.status();
+        watts
+    }
+
+    /// Looks whether the mapper is to work less or more; `power_w` is what the board takes, where that is known.
+    fn govern(
+        &mut self,
+        ring: &KeyframeRing,
+        power_w: Option<f64>,
+        (c, g): (&Counters, &Gauges),
+        status: &mut Status,
+    ) -> Option<Notice> {
         let governor = self.governor.as_mut()?;
         let latency_most = || Duration::from_micros(g.latency_us_most.swap(0, Relaxed));
         let (frames, overwritten) = (g.frames.load(Relaxed), c.frames_overwritten.get());
-        let line = governor.look(Instant::now(), frames, overwritten, latency_most)?;
+        let line = governor.look(Instant::now(), power_w, frames, overwritten, latency_most)?;
         let (share, reason) = governor.share();
         ring.word(Word::Share).store((share * 1000.0) as u64, Relaxed);
         status.governor = GovernorStatus { share, reason: reason.map(|why| why.to_string().into()) };
@@ -103,7 +123,8 @@ pub fn supervise(
         said.extend(worker.as_mut().and_then(|w| w.watch(&s.gauges)));
         said.extend(std::iter::from_fn(|| s.mailbox.notices.pop()));
         said.extend(status.writers_said());
-        said.extend(ring.and_then(|ring| steering.govern(ring, &s.counters, &s.gauges, status)));
+        let power_w = steering.meter(status);
+        said.extend(ring.and_then(|ring| steering.govern(ring, power_w, (&s.counters, &s.gauges), status)));
         said.extend(steering.reload(status));
         for (id, line) in said {
             status.say(id, &line);

@@ -171,9 +171,12 @@ impl Monitor {
         tell("daemon.uptime_s", format!("{:.1}", s.uptime_s));
         tell("daemon.frames", s.frames.to_string());
         tell("daemon.posed", s.posed.to_string());
-        for (room, members) in
-            [("counters", Some(&s.counters)), ("map", s.map.as_ref()), ("governor", s.governor.as_ref())]
-        {
+        for (room, members) in [
+            ("counters", Some(&s.counters)),
+            ("map", s.map.as_ref()),
+            ("governor", s.governor.as_ref()),
+            ("power", s.power.as_ref()),
+        ] {
             members.into_iter().flatten().for_each(|(name, value)| tell(&format!("{room}.{name}"), plain(value)));
         }
         DiagnosticStatus {

@@ -80,6 +80,7 @@ pub struct Status {
     pub posed: u64,
     pub map_from_odom: Option<MapFromOdom>,
     pub governor: Option<BTreeMap<String, Value>>,
+    pub power: Option<BTreeMap<String, Value>>,
 }
 
 /// Where `odom` is in the map, which loops have made agree: told once a place was recognised.

@@ -92,6 +92,13 @@ impl Default for GovernorStatus {
     }
 }
 
+/// The power that the board takes, and the energy since the start.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct PowerStatus {
+    pub watts: f64,
+    pub joules: f64,
+}
+
 /// Where `odom` is in the map, in which loops agree. It changes when a place is recognised, and pose and velocity do not with
 /// it: who wants poses in the map composes the two.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -117,6 +124,9 @@ pub struct Summary {
     pub posed: u64,
     pub map: MapStatus,
     pub governor: GovernorStatus,
+    /// `None` where the board has no sensor of power that may be read.
+    #[serde(default)]
+    pub power: Option<PowerStatus>,
     /// `None` before a place was recognised.
     #[serde(default)]
     pub map_from_odom: Option<MapFromOdomMessage>,
@@ -221,6 +231,10 @@ pub fn metrics(
     add("map_iterations_total", "counter", map.iterations as f64);
     map.psnr_db.into_iter().for_each(|db| add("map_psnr_db", "gauge", db));
     add("mapper_share", "gauge", summary.governor.share);
+    if let Some(power) = summary.power {
+        add("power_watts", "gauge", power.watts);
+        add("energy_joules_total", "counter", power.joules);
+    }
     for (name, n) in &summary.counters {
         match name.ends_with("_most") {
             true => add(name, "gauge", *n as f64),
