@@ -52,10 +52,10 @@ pub struct Caps {
     /// Whether kernels read buffers as texels where a variant does: on a CPU, whose driver gathers texels and loads a storage
     /// buffer lane by lane. Never with `GpuConfig::subgroups = false`.
     pub texel_buffers: bool,
-    /// Whether the compiler picks a width of subgroup for each kernel, narrower than the one reported: Intel's.
-    pub subgroup_size_varies: bool,
-    /// Whether kernels that use subgroups ask the compiler for `subgroup_size`, which would vary otherwise.
+    /// Whether kernels that use subgroups ask the compiler for `subgroup_size`, since it would pick a width for each.
     pub subgroup_size_required: bool,
+    /// Whether the compiler picks a width of subgroup for each kernel, narrower than the one reported: Intel's.
+    subgroup_size_varies: bool,
     /// The least and the greatest width that a kernel can ask for (VK_EXT_subgroup_size_control).
     subgroup_sizes: Option<[u32; 2]>,
     pub invocations_max: u32,
@@ -95,21 +95,35 @@ impl Caps {
         }
     }
 
-    /// Has kernels ask for one width of subgroup where the compiler would choose and takes such requests.
-    fn require_subgroup_size(&mut self) {
-        let Some([least, most]) = self.subgroup_sizes.filter(|_| self.subgroup_size_varies) else { return };
-        self.subgroup_size = SUBGROUP_SIZE.clamp(least, most);
-        (self.subgroup_size_varies, self.subgroup_size_required) = (false, true);
+    /// Has kernels ask for one width of subgroup where the compiler would pick one for each; where it takes no such request, or
+    /// subgroups are not to be used, kernels do without them.
+    fn settle_subgroup_size(&mut self) {
+        if !self.subgroup_size_varies {
+            return;
+        }
+        match self.subgroup_sizes {
+            Some([least, most]) if self.allows(capability::GROUP_VOTE) => {
+                self.subgroup_size = SUBGROUP_SIZE.clamp(least, most);
+                self.subgroup_size_required = true;
+            }
+            _ => self.subgroup_operations &= vk::SubgroupFeatureFlags::BASIC.as_raw(),
+        }
     }
 
-    /// Limits what the device can do to the profile that the board names. Subgroups of another width than its are not used.
+    /// Width of subgroup that a module with these capabilities asks for; `None`: it takes what there is.
+    pub(super) fn asks_for(&self, capabilities: &[u32]) -> Option<u32> {
+        (self.subgroup_size_required && capabilities.contains(&capability::GROUP)).then_some(self.subgroup_size)
+    }
+
+    /// Limits what the device can do to the profile that the board names. Subgroups of a width that it does not have are not used.
     #[cfg(feature = "instruments")]
     fn limit(&mut self, config: &GpuConfig) -> Result<(), Fault> {
         let Some(p) = crate::config::Profile::of(&config.profile)? else { return Ok(()) };
         self.name = format!("{} as {}", self.name, p.name);
         (self.kind, self.texel_buffers) = (DeviceKind::Integrated, false);
         let [least, most] = p.subgroup_sizes;
-        self.subgroup_size_varies = least < most;
+        self.subgroup_size_varies |= least < most;
+        self.subgroup_sizes = self.subgroup_sizes.map(|[a, b]| [a.max(least), b.min(most)]);
         let has_width = (least..=most).contains(&self.subgroup_size);
         self.subgroup_operations &=
             if has_width { p.subgroup_operations } else { vk::SubgroupFeatureFlags::BASIC.as_raw() };
@@ -174,7 +188,7 @@ impl Device {
         }
         #[cfg(feature = "instruments")]
         caps.limit(config)?;
-        caps.require_subgroup_size();
+        caps.settle_subgroup_size();
         let queues = [vk::DeviceQueueCreateInfo::default().queue_family_index(family).queue_priorities(&[1.0])];
         let mut info = vk::DeviceCreateInfo::default().queue_create_infos(&queues);
         let extensions = [ash::ext::subgroup_size_control::NAME.as_ptr()];
@@ -416,8 +430,8 @@ fn describe(instance: &ash::Instance, physical: vk::PhysicalDevice) -> Option<Ch
     let limits = &properties.limits;
     let name = properties.device_name_as_c_str().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default();
     let caps = Caps {
-        subgroup_size_varies: name.contains("Intel"),
         subgroup_size_required: false,
+        subgroup_size_varies: name.contains("Intel"),
         subgroup_sizes: subgroup_sizes(instance, physical),
         name,
         kind,
@@ -433,4 +447,66 @@ fn describe(instance: &ash::Instance, physical: vk::PhysicalDevice) -> Option<Ch
         timestamp_bits: bits,
     };
     Some((physical, family as u32, caps))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Caps of an Intel GPU, as its driver reports them.
+    fn intel() -> Caps {
+        Caps {
+            name: "Intel(R) Graphics".into(),
+            kind: DeviceKind::Integrated,
+            subgroup_size: 32,
+            subgroup_operations: 0xff,
+            texel_buffers: false,
+            subgroup_size_required: false,
+            subgroup_size_varies: true,
+            subgroup_sizes: Some([8, 32]),
+            invocations_max: 1024,
+            shared_max_bytes: 48 << 10,
+            binding_max_bytes: 1 << 30,
+            allocation_max_bytes: 2 << 30,
+            timestamp_period_ns: 0.0,
+            timestamp_bits: 0,
+        }
+    }
+
+    /// Width, and what kernels ask for with subgroups and without.
+    fn settled(mut caps: Caps) -> (u32, [Option<u32>; 2]) {
+        caps.settle_subgroup_size();
+        let with = [capability::SHADER, capability::GROUP, capability::GROUP_VOTE];
+        (caps.subgroup_size, [caps.asks_for(&with), caps.asks_for(&with[..1])])
+    }
+
+    #[test]
+    fn one_width_is_asked_for_where_the_compiler_would_pick() {
+        assert_eq!(settled(intel()), (16, [Some(16), None]));
+        assert_eq!(settled(Caps { subgroup_sizes: Some([32, 32]), ..intel() }), (32, [Some(32), None]));
+        assert_eq!(settled(Caps { subgroup_size_varies: false, ..intel() }), (32, [None; 2]));
+        assert_eq!(settled(Caps { subgroup_operations: 0, ..intel() }), (32, [None; 2]), "the board forbids subgroups");
+    }
+
+    #[test]
+    fn subgroups_are_not_used_where_their_width_varies_and_cannot_be_asked_for() {
+        let mut caps = Caps { subgroup_sizes: None, ..intel() };
+        assert!(caps.allows(capability::GROUP_VOTE));
+        caps.settle_subgroup_size();
+        assert!(!caps.allows(capability::GROUP_VOTE) && !caps.subgroup_size_required);
+    }
+
+    #[test]
+    #[cfg(feature = "instruments")]
+    fn a_profile_narrows_what_is_asked_for() {
+        let limited = |profile: &str| {
+            let mut caps = intel();
+            let known = caps.limit(&GpuConfig { profile: profile.into(), ..GpuConfig::default() });
+            assert!(known.is_ok(), "{profile}");
+            settled(caps)
+        };
+        assert_eq!(limited("Intel Gen12"), (16, [Some(16), None]));
+        assert_eq!(limited("Orin"), (32, [Some(32), None]));
+        assert_eq!(limited("V3D 7.1"), (32, [None; 2]), "of another width");
+    }
 }

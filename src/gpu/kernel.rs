@@ -4,7 +4,7 @@
 //! variants takes the last one whose SPIR-V capabilities the device has.
 
 use super::cache::PipelineCache;
-use super::device::{boot, capability::GROUP, Device};
+use super::device::{boot, Device};
 use super::memory::{Backed, Range, ALIGN};
 use super::{GpuError, COMMANDS_MAX};
 use ash::vk;
@@ -326,8 +326,7 @@ impl ComputePipeline {
             .collect();
         let specialisation =
             vk::SpecializationInfo::default().map_entries(&entries).data(bytemuck::cast_slice(&words[..ids.len()]));
-        let mut width = vk::PipelineShaderStageRequiredSubgroupSizeCreateInfo::default()
-            .required_subgroup_size(device.caps.subgroup_size);
+        let mut width = vk::PipelineShaderStageRequiredSubgroupSizeCreateInfo::default();
         let pushes = [vk::PushConstantRange {
             stage_flags: vk::ShaderStageFlags::COMPUTE,
             offset: 0,
@@ -351,7 +350,8 @@ impl ComputePipeline {
                 .module(self.module)
                 .name(c"main")
                 .specialization_info(&specialisation);
-            if device.caps.subgroup_size_required && variant.capabilities.contains(&GROUP) {
+            if let Some(size) = device.caps.asks_for(variant.capabilities) {
+                width = width.required_subgroup_size(size);
                 stage = stage.flags(vk::PipelineShaderStageCreateFlags::REQUIRE_FULL_SUBGROUPS).push_next(&mut width);
             }
             let flags = match self.in_pieces {

@@ -321,10 +321,11 @@ impl Anchors {
         let before = scene.pipeline.pool.count() as usize;
         let wanted = wanted.min(scene.make_room(wanted, self.config.evict)?);
         let Workspace { depth, diffusion, newcomers, similarity, .. } = &mut self.work;
-        let DepthMap { metres: depth, sigma_m, .. } = self.pair.as_ref().map_or(&*depth, |pair| &pair.distance);
+        let DepthMap { metres: depth, sigma_m: depth_sigma_m, .. } =
+            self.pair.as_ref().map_or(&*depth, |pair| &pair.distance);
         let planes = scene.views.planes(index);
         let (valid, rendered, exposure) = (&scene.cameras[0].valid, &scene.rendered, target.exposure);
-        let seen = KeyframeView { planes, valid, depth, sigma_m, rendered, exposure, view };
+        let seen = KeyframeView { planes, valid, depth, depth_sigma_m, rendered, exposure, view };
         densify(&seen, similarity, wanted, diffusion, newcomers, &scene.counters);
         let splats = newcomers.iter().map(|s| s.gaussian(planes, target.exposure));
         let added = scene.pipeline.pool.append(&mut scene.gpu, splats)?;
@@ -362,10 +363,10 @@ fn seen<'a>(
     index: usize,
     view: &View,
     valid: &'a [u8],
-    DepthMap { metres: depth, sigma_m, .. }: &'a DepthMap,
+    DepthMap { metres: depth, sigma_m: depth_sigma_m, .. }: &'a DepthMap,
 ) -> KeyframeView<'a> {
     let (planes, exposure) = (planes(&scene.views, pair, index), scene.views.exposure(index));
-    KeyframeView { planes, valid, depth, sigma_m, rendered: &scene.rendered, exposure, view: *view }
+    KeyframeView { planes, valid, depth, depth_sigma_m, rendered: &scene.rendered, exposure, view: *view }
 }
 
 /// Median of the pixels that have depth, by counting them in 256 bins of 1/depth; allocates nothing.

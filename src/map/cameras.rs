@@ -223,8 +223,9 @@ mod tests {
         let (w, h) = (rect.pinhole.width, rect.pinhole.height);
         let metres: Vec<f32> = (0..w * h).map(|i| floor(i % w, i / w)).collect();
         let mut pair = RectifiedPair::new(&views, &left, 1).expect("a fisheye trains");
-        pair.distort(&DepthMap { sigma_m: metres.clone(), ..DepthMap::of(w, h, metres) }, &rect.pinhole);
-        assert_eq!(pair.distance.metres, pair.distance.sigma_m);
+        let sigma_m = metres.iter().map(|z| 0.125 * z).collect();
+        pair.distort(&DepthMap { sigma_m, ..DepthMap::of(w, h, metres) }, &rect.pinhole);
+        assert!(pair.distance.metres.iter().zip(&pair.distance.sigma_m).all(|(m, sigma)| 0.125 * m == *sigma));
         let raw = View::new(left.body_from_cam, left.camera, left.fisheye);
         let (mut seen, mut worst) = (0, 0.0f64);
         for (i, &r) in pair.distance.metres.iter().enumerate().filter(|(_, r)| **r > 0.0) {

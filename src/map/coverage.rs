@@ -14,8 +14,8 @@ pub struct KeyframeView<'a> {
     pub valid: &'a [u8],
     /// Matched depth as the raster counts it, m; zero where there is none.
     pub depth: &'a [f32],
-    /// Its standard deviation, m.
-    pub sigma_m: &'a [f32],
+    /// Standard deviation of `depth`, m; of no meaning where that is zero.
+    pub depth_sigma_m: &'a [f32],
     pub rendered: &'a Rendered,
     /// The image's; renderings and seeds are in the map's.
     pub exposure: Exposure,
@@ -88,7 +88,7 @@ pub mod tests {
     pub fn seen<'a>(image: &'a Image, depth: &'a [f32], rendered: &'a Rendered) -> KeyframeView<'a> {
         let planes = std::slice::from_ref(image);
         let (valid, exposure) = (&[1; W * H], Exposure::default());
-        KeyframeView { planes, valid, depth, sigma_m: &[0.0; W * H], rendered, exposure, view: view() }
+        KeyframeView { planes, valid, depth, depth_sigma_m: &[0.0; W * H], rendered, exposure, view: view() }
     }
 
     #[test]

@@ -56,7 +56,7 @@ pub fn densify(
         seeds.push(Seed {
             p_world,
             sigma_m: z / seen.view.camera.fx,
-            opacity: if matched { initial_opacity(OPACITY_MATCHED, seen.sigma_m[i]) } else { OPACITY_RENDERED },
+            opacity: if matched { initial_opacity(OPACITY_MATCHED, seen.depth_sigma_m[i]) } else { OPACITY_RENDERED },
             pixel: i as u32,
         });
     });
@@ -114,6 +114,10 @@ mod tests {
         let px = |k: &Seed| k.sigma_m / k.p_world.z * 50.0;
         let mean = seeds.iter().map(px).sum::<f64>() / seeds.len() as f64;
         assert!((0.3 * 2.8..0.7 * 2.8).contains(&mean), "{mean}");
+        let uncertain = KeyframeView { depth_sigma_m: &[0.8; W * H], ..v };
+        densify(&uncertain, &similarity, 200, &mut d, &mut seeds, &counters);
+        let opacity = |k: &Seed| if k.p_world.z < 2.5 { 0.25 * OPACITY_MATCHED } else { OPACITY_RENDERED };
+        assert!(seeds.iter().all(|k| (k.opacity - opacity(k)).abs() < 1e-6));
         densify(&v, &[1.0; W * H], 200, &mut d, &mut seeds, &counters);
         assert!(seeds.is_empty());
     }

@@ -2,7 +2,8 @@
 //!
 //! Pixels are picked by error diffusion of a density that follows the image gradient: denser on detail, and the spacing is
 //! known, so the size of a Gaussian is the distance to its neighbours. Where there is only filled-in depth, seeds are few
-//! and faint, so that others overrule them; where depth is uncertain, as on a wall that is far away, they are faint.
+//! and faint, so that others overrule them; where depth is uncertain, as on a wall that is far away, they are faint. Filled-in
+//! depth has no deviation of its own, and its seeds are as faint beside uncertain matches as beside others.
 
 use super::coverage::KeyframeView;
 use super::depth_fill::DepthFill;
@@ -60,8 +61,8 @@ const SEED_ALPHA: f32 = 0.5;
 /// in other light nearly all is a little wrong, and only what is `map.wrong_error` off takes seeds.
 const SEED_ERROR: f32 = 0.1;
 
-/// Opacity that a Gaussian begins with at a depth of standard deviation `sigma_m`. Those of a wall that is far away lie before
-/// it and behind it; behind a thin wall that is the next room, where they hide from its views what these see.
+/// Opacity that a Gaussian begins with where depth has the standard deviation `sigma_m`. Gaussians of a wall that is far away lie
+/// before it and behind it. Behind a thin wall they stand in the next room, and hide the wall from the views there.
 pub fn initial_opacity(opacity: f64, sigma_m: f32) -> f64 {
     opacity * (SIGMA_SURE_M / f64::from(sigma_m)).clamp(FAINTEST, 1.0)
 }
@@ -147,7 +148,7 @@ impl Seeder {
         self.seeds.push(Seed {
             p_world,
             sigma_m: SPREAD * spacing_px * z / seen.view.camera.fx,
-            opacity: if matched { initial_opacity(OPACITY_MATCHED, seen.sigma_m[i]) } else { OPACITY_FILLED },
+            opacity: if matched { initial_opacity(OPACITY_MATCHED, seen.depth_sigma_m[i]) } else { OPACITY_FILLED },
             pixel: i as u32,
         });
     }
@@ -224,7 +225,7 @@ mod tests {
         let opacities = [0.0, 0.2, 0.4, 1e9, f32::INFINITY].map(|sigma_m| initial_opacity(0.5, sigma_m));
         assert_eq!(opacities.map(|o| (1e4 * o).round()), [5000.0, 5000.0, 2500.0, 500.0, 500.0]);
         let (image, rendered) = (Image::new(W, H), black(&[0.0; W * H]));
-        let view = KeyframeView { sigma_m: &[0.8; W * H], ..seen(&image, &FAR, &rendered) };
+        let view = KeyframeView { depth_sigma_m: &[0.8; W * H], ..seen(&image, &FAR, &rendered) };
         let (mut s, mut d) = (Seeder::new(W, H, 300, 0.25), Diffusion::new(W, H));
         assert!(s.seed(&view, 300, &mut d, &Counters::default()).len() > 100);
         assert!(s.seeds.iter().all(|k| (k.opacity - 0.25 * OPACITY_MATCHED).abs() < 1e-6));

@@ -25,7 +25,7 @@ impl Tiling {
     pub const BASELINE: Tiling = Tiling { lanes: 32, column: 8, variant: "", chunk: 1, loss_by_tiles: true };
 
     pub fn of(caps: &Caps) -> Tiling {
-        let sub = caps.allows(GROUP_VOTE) && caps.allows(GROUP_SHUFFLE) && !caps.subgroup_size_varies;
+        let sub = caps.allows(GROUP_VOTE) && caps.allows(GROUP_SHUFFLE);
         // A card with more processors than a picture has tiles waits for its longest list, which halves with the tile:
         // an NVIDIA H200 takes 0.248 ms a step at 52 k Gaussians and 752x480, 0.254 with columns of 8 and 0.282 with
         // columns of 2 (0.185, 0.238 and 0.170 at 320x240). Where tiles are plenty, fewer pixels a lane only make more
