@@ -10,7 +10,7 @@ section! {
     enabled: bool = true;
     /// Above this temperature of any sensor of processor or GPU, °C, the mapper slows down; 0: 5 below where Linux itself does.
     temperature_max_c: f64 = 0.0, Bound::Within(0.0, 150.0);
-    /// Above this power, W, summed over the board's power sensors, the mapper slows down; 0: at none.
+    /// Above this power, W, as `stipple status` tells it, the mapper slows down; 0: at none.
     power_max_w: f64 = 0.0, Bound::Within(0.0, 1000.0);
     /// The mapper slows down where tracking takes more than this share of the time that it has for a frame.
     frame_share_max: f64 = 0.8, Bound::Within(0.05, 1.0);

@@ -115,7 +115,8 @@ impl Caps {
         (self.subgroup_size_required && capabilities.contains(&capability::GROUP)).then_some(self.subgroup_size)
     }
 
-    /// Limits what the device can do to the profile that the board names. Subgroups of a width that it does not have are not used.
+    /// Limits what the device can do to the profile that the board names. Where the width of subgroup that the device reports is
+    /// none of the profile's, subgroups are not used.
     #[cfg(feature = "instruments")]
     fn limit(&mut self, config: &GpuConfig) -> Result<(), Fault> {
         let Some(p) = crate::config::Profile::of(&config.profile)? else { return Ok(()) };

@@ -62,7 +62,7 @@ pub fn channels(config: &MapConfig) -> usize {
 pub struct RectifiedPair {
     /// Grey, or red, green and blue.
     pub planes: Vec<Image>,
-    /// Along each pixel's ray.
+    /// Distance along the ray of each pixel.
     pub distance: DepthMap,
     /// By raw pixel at mapping resolution: the rectified one, or `NONE`.
     rectified: Vec<u32>,

@@ -123,8 +123,8 @@ fn tables(report: &Report) -> String {
     ];
     let cost: [Row; 10] = [
         ("Run time", f(report.wall_s, 1), "s"),
-        ("Energy of the board", f(report.energy_j, 0), "J"),
-        ("Power of the board, mean", f(report.power_mean_w, 1), "W"),
+        ("Energy that was measured", f(report.energy_j, 0), "J"),
+        ("Power that was measured, mean", f(report.power_mean_w, 1), "W"),
         ("Keyframes", n(report.keyframes), ""),
         ("Anchors", n(report.anchors), ""),
         ("Tracker and estimator", mib(report.estimator_bytes), "MiB"),

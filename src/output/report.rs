@@ -86,7 +86,7 @@ pub struct Report {
     pub map_rss_peak_bytes: Option<u64>,
     pub heap_after_seal: Option<u64>,
     pub wall_s: Option<f64>,
-    /// Energy that the board took, where it has sensors that may be read, and the mean power while they were.
+    /// Energy that was measured on the board, where it has sensors that may be read, and the mean power while they were.
     pub energy_j: Option<f64>,
     pub power_mean_w: Option<f64>,
     /// Number of warnings about the input.

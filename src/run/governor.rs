@@ -169,7 +169,8 @@ impl Governor {
     }
 
     /// Looks once a second; answers a line where the share changed. `power_w` is what the board takes, where that is known, `frames`
-    /// and `overwritten` count from the start, `latency_most` is the longest that tracking took a frame since the last look: it is asked for then alone.
+    /// and `overwritten` count from the start, `latency_most` is the longest that tracking took a frame since the last look: it is
+    /// asked for then alone.
     pub fn look(
         &mut self,
         now: Instant,
@@ -341,5 +342,8 @@ pub(super) mod tests {
         assert_eq!(g.look(start, None, 20, 0, || panic!("not yet")), None);
         let line = g.look(start + PERIOD, None, 40, 0, || Duration::from_millis(90));
         assert!(line.unwrap().contains("tracking takes 90 %"));
+        g.set(&GovernorConfig { power_max_w: 10.0, ..GovernorConfig::default() });
+        let line = g.look(start + 2 * PERIOD, Some(12.0), 60, 0, || Duration::from_millis(40));
+        assert!(line.unwrap().contains("the board takes 12.0 W"));
     }
 }

@@ -92,7 +92,7 @@ impl Default for GovernorStatus {
     }
 }
 
-/// The power that the board takes, and the energy since the start.
+/// The power that is measured on the board, and the energy since the start.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct PowerStatus {
     pub watts: f64,
