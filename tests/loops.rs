@@ -105,8 +105,8 @@ fn look_around(
         let mut frames = Frames::for_rig(sim.calibration());
         sim.render(i, &mut frames);
         let odom_from_body = odom_from_world * sim.truth_at(sim.taken(i)).pose;
-        let (t, frames, before, body_from_cam) = (frames.t, &Arc::new(frames), None, None);
-        loops.add(&LoopKeyframe { t, frames, id: None, epoch, odom_from_body, before, body_from_cam });
+        let (t, frames, body_from_cam) = (frames.t, &Arc::new(frames), None);
+        loops.add(&LoopKeyframe { t, frames, id: None, epoch, odom_from_body, window: &[], body_from_cam });
     }
 }
 

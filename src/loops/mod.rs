@@ -23,7 +23,7 @@ pub mod pose4;
 pub mod verify;
 
 use crate::config::FrontendConfig;
-use crate::limits::CAMERAS_MAX;
+use crate::limits::{CAMERAS_MAX, FRAMES};
 use crate::mem::List;
 use accept::{Asker, Judge, Verdict, Verification};
 use features::{Extractor, Feature, Ray, FEATURES};
@@ -97,8 +97,8 @@ pub struct LoopKeyframe<'a> {
     pub id: Option<u64>,
     pub epoch: u32,
     pub odom_from_body: Pose,
-    /// The newest estimate of the keyframe before it.
-    pub before: Option<(Nanos, Pose)>,
+    /// Newest estimates of the keyframes in the estimator's window, by stamp, the oldest first.
+    pub window: &'a [(Nanos, Pose)],
     pub body_from_cam: Option<[Pose; CAMERAS_MAX]>,
 }
 
@@ -174,6 +174,11 @@ impl Corrections {
         let [x, y] = [a, b].map(|c| c.2.pose() * *odom_from_body);
         x.interpolate(&y, share)
     }
+}
+
+/// Upright pose and tilt of the keyframe with stamp `t`, where the estimator's window still holds it.
+fn newest(window: &[(Nanos, Pose)], t: Nanos) -> Option<(Pose4, DQuat)> {
+    window.iter().find(|(at, _)| *at == t).map(|(_, pose)| Pose4::upright(pose))
 }
 
 /// The loop closure of one rig.
@@ -299,6 +304,7 @@ impl Loops {
             (self.frame, self.next_frame) = (self.next_frame, self.next_frame + 1);
             (self.last, self.map_from_odom.epoch) = (None, keyframe.epoch);
         }
+        self.measure_again(keyframe.window);
         let node = self.add_node(keyframe, odom)?;
         self.places[node as usize] = Place {
             t: keyframe.t,
@@ -328,8 +334,7 @@ impl Loops {
         // The newest estimate of the one before, so that the two are of one window.
         let before = last.map(|n| {
             let place = &self.places[n as usize];
-            let newest = keyframe.before.filter(|(t, _)| *t == place.t).map(|(_, pose)| Pose4::upright(&pose).0);
-            newest.unwrap_or(place.odom)
+            newest(keyframe.window, place.t).map_or(place.odom, |(odom, _)| odom)
         });
         let moved = before.map(|b| b.between(&odom));
         let pose = match (last, &moved) {
@@ -346,6 +351,30 @@ impl Loops {
             self.graph.link(Edge { from: n, to: node, measured, covariance, is_loop: false });
         }
         Some(node)
+    }
+
+    /// Measures the odometry between the newest keyframes again, from what the estimator's window says of them by now: it has
+    /// seen what came after them.
+    fn measure_again(&mut self, window: &[(Nanos, Pose)]) {
+        let mut nodes: List<u16, FRAMES> = List::default();
+        let mut at = self.last;
+        while let Some(node) = at.filter(|n| newest(window, self.places[*n as usize].t).is_some()) {
+            if nodes.push(node).is_err() {
+                break;
+            }
+            at = self.graph.before(node);
+        }
+        let estimates = |n: u16| newest(window, self.places[n as usize].t);
+        let mut moved: List<(u16, Pose4), FRAMES> = List::default();
+        for pair in nodes.windows(2).rev() {
+            let [Some((to, _)), Some((from, _))] = [pair[0], pair[1]].map(estimates) else { continue };
+            let _ = moved.push((pair[0], from.between(&to)));
+        }
+        self.graph.measure_again(&moved);
+        for n in nodes.iter() {
+            let place = &mut self.places[*n as usize];
+            place.tilt = newest(window, place.t).map_or(place.tilt, |(_, tilt)| tilt);
+        }
     }
 
     /// Takes the keyframe out of the graph whose neighbours in time are the nearest to each other; not `last`.

@@ -10,10 +10,10 @@ use super::tracking::{FramePacket, Tracked};
 use super::waker::Waker;
 use crate::config::Board;
 use crate::counters::Counters;
-use crate::limits::CAMERAS_MAX;
+use crate::limits::{CAMERAS_MAX, FRAMES};
 use crate::loops::kept::{self, Epoch, Keeper};
 use crate::loops::{Closure, LoopKeyframe, Loops, MapFromOdom};
-use crate::mem::Footprint;
+use crate::mem::{Footprint, List};
 use crate::publish::event::{EventId, Notice};
 use crate::store;
 use crossbeam_queue::ArrayQueue;
@@ -62,7 +62,7 @@ struct Work {
     id: Option<u64>,
     epoch: u32,
     odom_from_body: Pose,
-    before: Option<(Nanos, Pose)>,
+    window: List<(Nanos, Pose), FRAMES>,
     body_from_cam: Option<[Pose; CAMERAS_MAX]>,
 }
 
@@ -75,15 +75,10 @@ impl Work {
         frames.images.iter_mut().zip(&packet.frames.images).for_each(|(to, from)| to.copy_from(from));
         (self.t, self.id, self.epoch) = (packet.frames.t, id, packet.epoch);
         self.odom_from_body = tracked.world_from_body;
-        self.before = newest_before(packet, tracked);
+        self.window.clone_from(&tracked.corrections);
         self.body_from_cam = tracked.body_from_cam;
         fits
     }
-}
-
-/// The newest estimate of the keyframe before.
-fn newest_before(packet: &FramePacket, tracked: &Tracked) -> Option<(Nanos, Pose)> {
-    tracked.corrections.iter().filter(|(t, _)| *t < packet.frames.t).max_by_key(|(t, _)| *t).copied()
 }
 
 /// Keyframes to the thread and answers from it.
@@ -124,9 +119,9 @@ impl LoopQueue {
         let free = ArrayQueue::new(KEYFRAMES);
         for _ in 0..KEYFRAMES {
             let frames = Arc::new(Frames::for_rig(calibration));
-            let (id, before, body_from_cam) = (None, None, None);
+            let (id, window, body_from_cam) = (None, List::default(), None);
             let work =
-                Work { frames, t: Nanos(0), id, epoch: 0, odom_from_body: Pose::IDENTITY, before, body_from_cam };
+                Work { frames, t: Nanos(0), id, epoch: 0, odom_from_body: Pose::IDENTITY, window, body_from_cam };
             let _ = free.push(Box::new(work));
         }
         // All keyframes of the graph, twice, so that a second closure need not wait for the first to be read.
@@ -190,10 +185,10 @@ impl LoopThread {
     pub fn run(mut self, over: &AtomicBool, say: impl Fn((MapFromOdom, Option<Notice>))) -> Box<Loops> {
         host::lower_priority(NICE);
         while let Some(work) = self.queue.waker.wait(over, || self.queue.waiting.pop()) {
-            let Work { t, frames, id, epoch, odom_from_body, before, body_from_cam } = &*work;
+            let Work { t, frames, id, epoch, odom_from_body, window, body_from_cam } = &*work;
             let (t, id, epoch) = (*t, *id, *epoch);
-            let (odom_from_body, before, body_from_cam) = (*odom_from_body, *before, *body_from_cam);
-            let keyframe = LoopKeyframe { t, frames, id, epoch, odom_from_body, before, body_from_cam };
+            let (odom_from_body, body_from_cam) = (*odom_from_body, *body_from_cam);
+            let keyframe = LoopKeyframe { t, frames, id, epoch, odom_from_body, window, body_from_cam };
             self.queue.work(&mut self.loops, &keyframe);
             self.queue.closed().for_each(&say);
             let _ = self.queue.free.push(work);
@@ -268,10 +263,9 @@ impl LoopClosing {
     pub fn offer(&mut self, packet: &FramePacket, tracked: &Tracked, id: Option<u64>, counters: &Counters) {
         let Tracked { world_from_body: odom_from_body, body_from_cam, .. } = tracked;
         if let Some(loops) = &mut self.here {
-            let (t, frames, epoch, before) =
-                (packet.frames.t, &packet.frames, packet.epoch, newest_before(packet, tracked));
+            let (t, frames, epoch, window) = (packet.frames.t, &packet.frames, packet.epoch, &tracked.corrections);
             let (odom_from_body, body_from_cam) = (*odom_from_body, *body_from_cam);
-            self.queue.work(loops, &LoopKeyframe { t, frames, id, epoch, odom_from_body, before, body_from_cam });
+            self.queue.work(loops, &LoopKeyframe { t, frames, id, epoch, odom_from_body, window, body_from_cam });
             self.asked = Some(t);
             return;
         }

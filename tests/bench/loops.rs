@@ -279,7 +279,7 @@ fn recall(
             id: None,
             epoch: 0,
             odom_from_body: pose,
-            before: None,
+            window: &[],
             body_from_cam: None,
         });
         ms.push((thread_cpu_now() - begun).as_secs_f64() * 1e3);

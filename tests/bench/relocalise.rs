@@ -135,8 +135,9 @@ pub fn against_each_other(folder: &Path) -> Result<Vec<Against>, Fault> {
                 continue;
             }
             (last, keyframes) = (Some(frames.t), keyframes + 1);
-            let (t, id, before, body_from_cam) = (frames.t, None, None, None);
-            known.add(&LoopKeyframe { t, frames, id, epoch: epoch as u32, odom_from_body, before, body_from_cam });
+            let (t, id, body_from_cam) = (frames.t, None, None);
+            let epoch = epoch as u32;
+            known.add(&LoopKeyframe { t, frames, id, epoch, odom_from_body, window: &[], body_from_cam });
         }
         let joined = known.stats.epochs_joined - before;
         let same = name.starts_with(SAME_ROOM) && seen.iter().any(|s| s.starts_with(SAME_ROOM));

@@ -146,6 +146,27 @@ impl PoseGraph {
         Some(())
     }
 
+    /// The node before one, where odometry leads from there.
+    pub fn before(&self, node: u16) -> Option<u16> {
+        self.edges.get(self.chain[node as usize][0] as usize).map(|edge| edge.from)
+    }
+
+    /// Replaces what odometry measured from the node before each of these, which follow each other in time. Each moves by as
+    /// much as its measurement changed, and with the one before it.
+    pub fn measure_again(&mut self, measured: &[(u16, Pose4)]) {
+        let mut was = None;
+        for (node, measured) in measured {
+            let (n, number) = (*node as usize, self.chain[*node as usize][0] as usize);
+            let Some(edge) = self.edges.get_mut(number) else { continue };
+            let from = edge.from as usize;
+            let before = was.filter(|(of, _)| *of == from).map_or(self.poses[from], |(_, pose)| pose);
+            let changed = edge.measured.inverse().compose(measured);
+            was = Some((n, self.poses[n]));
+            self.poses[n] = self.poses[from].compose(&before.between(&self.poses[n])).compose(&changed);
+            edge.measured = *measured;
+        }
+    }
+
     pub fn pose(&self, node: u16) -> Pose4 {
         self.poses[node as usize]
     }

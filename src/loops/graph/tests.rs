@@ -244,6 +244,37 @@ fn a_dropped_node_leaves_the_optimum_of_the_others() {
 }
 
 #[test]
+fn what_odometry_measures_again_moves_what_follows_and_keeps_what_loops_did() {
+    let mut noise = stream(8, 0);
+    let (mut graph, truth) = rounds(2, 12, &mut noise);
+    assert!(graph.optimise().solved);
+    let n = truth.len() as u16 - 1;
+    let was: Vec<Pose4> = (0..=n).map(|k| graph.pose(k)).collect();
+    let chain = |k: u16, graph: &PoseGraph| graph.edges.iter().position(|e| !e.is_loop && e.to == k).unwrap();
+    let measured = |k: u16, graph: &PoseGraph| graph.edges[chain(k, graph)].measured;
+    // The same again moves nothing.
+    let same: Vec<(u16, Pose4)> = (n - 3..=n).map(|k| (k, measured(k, &graph))).collect();
+    graph.measure_again(&same);
+    assert!((0..=n).all(|k| (graph.pose(k).p - was[k as usize].p).length() < 1e-9));
+    // One that is longer by a change takes all that follow along by it.
+    let change = Pose4 { p: DVec3::new(0.1, 0.0, 0.0), yaw: 0.01 };
+    let longer: Vec<(u16, Pose4)> =
+        same.iter().map(|(k, m)| (*k, if *k == n - 2 { m.compose(&change) } else { *m })).collect();
+    graph.measure_again(&longer);
+    let moved = was[n as usize - 2].compose(&change);
+    for k in n - 2..=n {
+        let expected = moved.compose(&was[n as usize - 2].between(&was[k as usize]));
+        assert!((graph.pose(k).p - expected.p).length() < 1e-9, "{k}");
+        assert!(wrapped(graph.pose(k).yaw - expected.yaw).abs() < 1e-9, "{k}");
+    }
+    assert_eq!(measured(n - 2, &graph), longer[1].1);
+    assert!((0..n - 2).all(|k| (graph.pose(k).p - was[k as usize].p).length() < 1e-9));
+    // A node that no odometry leads to stays.
+    graph.measure_again(&[(0, change)]);
+    assert!((graph.pose(0).p - was[0].p).length() < 1e-12);
+}
+
+#[test]
 fn what_is_no_measurement_is_refused_and_what_is_full_says_so() {
     let mut graph = PoseGraph::new(3, 3, 9);
     assert_eq!(graph.add(Pose4 { p: DVec3::NAN, yaw: 0.0 }), None);

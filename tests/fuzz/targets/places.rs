@@ -47,7 +47,7 @@ fn loops(scenario: &Scenario) -> Loops {
 fn add_all(loops: &mut Loops, keyframes: &[(Arc<Frames>, Pose)], epoch: u32) {
     for (frames, odom_from_body) in keyframes {
         let (t, odom_from_body) = (frames.t, *odom_from_body);
-        loops.add(&LoopKeyframe { t, frames, id: None, epoch, odom_from_body, before: None, body_from_cam: None });
+        loops.add(&LoopKeyframe { t, frames, id: None, epoch, odom_from_body, window: &[], body_from_cam: None });
     }
 }
 
