@@ -2,14 +2,14 @@
 //!
 //! Descriptors are matched mutually; RANSAC on two matches finds yaw and translation between the level frames of both, as
 //! gravity gives the rest; matches near where the found motion says are added; all that agree refine it by least squares,
-//! with the deviation of each depth. The result has the count of agreeing corners, their spread over the image, and how well
-//! they agree with their stated deviations.
+//! with the deviation of each depth, and with roll and pitch near zero, as gravity is not known exactly. The result has the
+//! count of agreeing corners, their spread over the image, and how well they agree with their stated deviations.
 
 use super::features::{distance, Feature, Ray, FEATURES};
 use super::pose4::{wrapped, Pose4};
 use crate::mem::List;
-use glam::{DMat3, DVec3};
-use nalgebra::{Matrix3x4, Matrix4, Vector3, Vector4};
+use glam::{DMat3, DQuat, DVec2, DVec3};
+use nalgebra::{Matrix3x6, Matrix4, Matrix6, Vector3, Vector6};
 
 /// Bits in which two descriptors of a corner may differ; more where the place of the match is known.
 const DISTANCE_MAX: u32 = 72;
@@ -30,6 +30,8 @@ pub const MATCHES_MIN: usize = 12;
 const ITERATIONS: usize = 8;
 /// Deviations below which no verification is believed: m, rad.
 const FLOOR: [f64; 2] = [0.01, 0.002];
+/// Deviation of the roll and of the pitch between two level frames, rad.
+const TILT_SIGMA: f64 = 0.003;
 /// Image cells, across and down, that corners are counted by.
 const CELLS: [usize; 2] = [4, 3];
 
@@ -55,6 +57,14 @@ pub struct Verified {
     pub cells: usize,
     /// Mean normalised squared residual of a number; 1 where deviations are as stated.
     pub misfit: f64,
+}
+
+/// A motion from the candidate to the query: the pose of the query's level frame, and by how much that is not level, as
+/// angles about its x and y, rad.
+#[derive(Clone, Copy, Debug, Default)]
+struct Motion {
+    pose: Pose4,
+    tilt: DVec2,
 }
 
 #[derive(Clone, Copy, Debug, Default)]
@@ -97,16 +107,16 @@ impl Verifier {
             return None;
         }
         let matches = self.matches.len();
-        let mut pose = self.ransac(query, candidate)?;
+        let mut motion = self.ransac(query, candidate)?;
         for round in 0..3 {
-            self.collect(query, candidate, &pose, round > 0);
+            self.collect(query, candidate, &motion, round > 0);
             if self.best.len() < MATCHES_MIN / 2 {
                 return None;
             }
-            pose = self.refine(query, candidate, pose)?.0;
+            motion = self.refine(query, candidate, motion)?.0;
         }
-        self.collect(query, candidate, &pose, true);
-        let (pose, covariance, misfit) = self.refine(query, candidate, pose)?;
+        self.collect(query, candidate, &motion, true);
+        let (Motion { pose, .. }, covariance, misfit) = self.refine(query, candidate, motion)?;
         let mut cells = 0u32;
         for m in self.best.iter() {
             let px = query.features[m.query as usize].px();
@@ -142,7 +152,7 @@ impl Verifier {
     }
 
     /// The motion of two matches that the others agree with best (MSAC, Torr and Zisserman 2000).
-    fn ransac(&mut self, query: &Seen, candidate: &Seen) -> Option<Pose4> {
+    fn ransac(&mut self, query: &Seen, candidate: &Seen) -> Option<Motion> {
         let near = |r: &Ray| r.sigma < DRAWN_SIGMA_MAX * r.inverse_depth;
         let mut near_matches = self.matches.clone();
         near_matches.retain(|m| near(&query.rays[m.query as usize]) && near(&candidate.rays[m.candidate as usize]));
@@ -156,14 +166,15 @@ impl Verifier {
             draw += 1;
             let (a, b) = (self.uniform(n), self.uniform(n));
             let Some(pose) = motion_of_two(query, candidate, near_matches[a], near_matches[b]) else { continue };
+            let motion = Motion { pose, tilt: DVec2::ZERO };
             let (mut agree, mut cost) = (0, 0.0);
             for m in self.matches.iter() {
-                let misfit = self.misfit(query, candidate, &pose, m);
+                let misfit = self.misfit(query, candidate, &motion, m);
                 agree += usize::from(misfit <= AGREES);
                 cost += misfit.min(AGREES);
             }
             if cost < least {
-                (best, most, least) = (Some(pose), agree, cost);
+                (best, most, least) = (Some(motion), agree, cost);
                 let share = agree as f64 / self.matches.len() as f64;
                 let needed = MISSED.ln() / (1.0 - share * share).max(1e-12).ln();
                 draws = DRAWS.min(3 * needed.max(0.0) as usize + 10);
@@ -181,15 +192,15 @@ impl Verifier {
         (((self.random.wrapping_mul(0x2545_f491_4f6c_dd1d) >> 32) * n as u64) >> 32) as usize
     }
 
-    fn agrees(&self, query: &Seen, candidate: &Seen, pose: &Pose4, m: &Match) -> bool {
-        self.misfit(query, candidate, pose, m) <= AGREES
+    fn agrees(&self, query: &Seen, candidate: &Seen, motion: &Motion, m: &Match) -> bool {
+        self.misfit(query, candidate, motion, m) <= AGREES
     }
 
     /// Normalised squared residual of a match, its three numbers taken as independent: a bound from above on the exact one
     /// along the depth, which is cheap.
-    fn misfit(&self, query: &Seen, candidate: &Seen, pose: &Pose4, m: &Match) -> f64 {
+    fn misfit(&self, query: &Seen, candidate: &Seen, motion: &Motion, m: &Match) -> f64 {
         let (q, c) = (&query.rays[m.query as usize], &candidate.rays[m.candidate as usize]);
-        let Some(p) = Predicted::new(query, candidate, pose, c) else { return f64::INFINITY };
+        let Some(p) = Predicted::new(query, candidate, motion, c) else { return f64::INFINITY };
         if p.bearing.dot(q.bearing) < 0.9 {
             return f64::INFINITY;
         }
@@ -201,11 +212,11 @@ impl Verifier {
     }
 
     /// Fills in `best`: the matches that agree with a motion, and, guided by it, corners that match where it says.
-    fn collect(&mut self, query: &Seen, candidate: &Seen, pose: &Pose4, guided: bool) {
+    fn collect(&mut self, query: &Seen, candidate: &Seen, motion: &Motion, guided: bool) {
         self.best.clear();
         if !guided {
             for k in 0..self.matches.len() {
-                if self.agrees(query, candidate, pose, &self.matches[k]) {
+                if self.agrees(query, candidate, motion, &self.matches[k]) {
                     let m = self.matches[k];
                     let _ = self.best.push(m);
                 }
@@ -215,14 +226,14 @@ impl Verifier {
         self.backward.fill((0, u16::MAX));
         self.forward.fill((0, u16::MAX));
         for j in 0..candidate.rays.len() {
-            let Some(p) = Predicted::new(query, candidate, pose, &candidate.rays[j]) else { continue };
+            let Some(p) = Predicted::new(query, candidate, motion, &candidate.rays[j]) else { continue };
             for i in 0..query.rays.len() {
                 if p.bearing.dot(query.rays[i].bearing) < 0.995 {
                     continue;
                 }
                 let d = distance(&query.features[i].descriptor, &candidate.features[j].descriptor);
                 let m = Match { query: i as u16, candidate: j as u16 };
-                if d > DISTANCE_GUIDED_MAX || !self.agrees(query, candidate, pose, &m) {
+                if d > DISTANCE_GUIDED_MAX || !self.agrees(query, candidate, motion, &m) {
                     continue;
                 }
                 if (d as u16) < self.backward[j].1 {
@@ -241,16 +252,19 @@ impl Verifier {
         }
     }
 
-    /// Refines a motion by the matches in `best` (Gauss-Newton, Geman-McClure weights at the gate): pose, covariance, misfit.
-    fn refine(&self, query: &Seen, candidate: &Seen, start: Pose4) -> Option<(Pose4, Matrix4<f64>, f64)> {
-        let mut pose = start;
-        let (mut h, mut sum) = (Matrix4::zeros(), 0.0);
+    /// Refines a motion by the matches in `best` (Gauss-Newton, Geman-McClure weights at the gate): motion, covariance of its
+    /// pose, misfit.
+    fn refine(&self, query: &Seen, candidate: &Seen, start: Motion) -> Option<(Motion, Matrix4<f64>, f64)> {
+        let level = TILT_SIGMA.powi(-2);
+        let mut motion = start;
+        let (mut h, mut sum) = (Matrix6::zeros(), 0.0);
         for iteration in 0..=ITERATIONS {
-            h = Matrix4::zeros();
-            let (mut b, mut weights) = (Vector4::zeros(), 0.0);
+            h = Matrix6::from_diagonal(&Vector6::new(0.0, 0.0, 0.0, 0.0, level, level));
+            let mut b = Vector6::new(0.0, 0.0, 0.0, 0.0, level * motion.tilt.x, level * motion.tilt.y);
+            let mut weights = 0.0;
             sum = 0.0;
             for m in self.best.iter() {
-                let Some((r, j)) = self.residual(query, candidate, &pose, m) else { continue };
+                let Some((r, j)) = self.residual(query, candidate, &motion, m) else { continue };
                 let chi2 = r.norm_squared();
                 let weight = (AGREES / (AGREES + chi2)).powi(2);
                 h += j.transpose() * j * weight;
@@ -263,34 +277,35 @@ impl Verifier {
                 break;
             }
             let step = h.cholesky()?.solve(&b);
-            pose.p -= DVec3::new(step[0], step[1], step[2]);
-            pose.yaw = wrapped(pose.yaw - step[3]);
+            motion.pose.p -= DVec3::new(step[0], step[1], step[2]);
+            motion.pose.yaw = wrapped(motion.pose.yaw - step[3]);
+            motion.tilt -= DVec2::new(step[4], step[5]);
             if step.norm() < 1e-9 {
                 break;
             }
         }
-        let mut covariance = h.cholesky()?.inverse() * sum.max(1.0);
+        let mut covariance = h.cholesky()?.inverse().fixed_view::<4, 4>(0, 0) * sum.max(1.0);
         for i in 0..4 {
             covariance[(i, i)] += FLOOR[i / 3].powi(2);
         }
-        (pose.p.is_finite() && covariance.iter().all(|c| c.is_finite())).then_some((pose, covariance, sum))
+        (motion.pose.p.is_finite() && covariance.iter().all(|c| c.is_finite())).then_some((motion, covariance, sum))
     }
 
-    /// Whitened residual of a match (two of bearing, one of inverse depth) and its derivative by position and yaw.
+    /// Whitened residual of a match (two of bearing, one of inverse depth) and its derivative by position, yaw and tilt.
     fn residual(
         &self,
         query: &Seen,
         candidate: &Seen,
-        pose: &Pose4,
+        motion: &Motion,
         m: &Match,
-    ) -> Option<(Vector3<f64>, Matrix3x4<f64>)> {
+    ) -> Option<(Vector3<f64>, Matrix3x6<f64>)> {
         let (q, c) = (&query.rays[m.query as usize], &candidate.rays[m.candidate as usize]);
-        let p = Predicted::new(query, candidate, pose, c)?;
+        let p = Predicted::new(query, candidate, motion, c)?;
         let (u, v) = q.bearing.any_orthonormal_pair();
         let rows = |d: DVec3, depth: f64| Vector3::new(u.dot(d), v.dot(d), depth);
         let r = rows(p.bearing - q.bearing, p.inverse_depth - q.inverse_depth);
-        let mut j = Matrix3x4::zeros();
-        for (k, (bearing, depth)) in p.by_pose().into_iter().enumerate() {
+        let mut j = Matrix3x6::zeros();
+        for (k, (bearing, depth)) in p.by_motion().into_iter().enumerate() {
             j.set_column(k, &rows(bearing, depth));
         }
         let by_depth = rows(p.bearing_by_depth, p.depth_by_depth) * c.sigma;
@@ -322,8 +337,10 @@ struct Predicted {
 
 impl Predicted {
     /// `None` where the corner would be in the camera itself.
-    fn new(query: &Seen, candidate: &Seen, pose: &Pose4, ray: &Ray) -> Option<Predicted> {
-        let rotation = DMat3::from_rotation_z(-pose.yaw);
+    fn new(query: &Seen, candidate: &Seen, motion: &Motion, ray: &Ray) -> Option<Predicted> {
+        let Motion { pose, tilt } = motion;
+        let rotation = DQuat::from_scaled_axis(-tilt.extend(0.0)) * DQuat::from_rotation_z(-pose.yaw);
+        let rotation = DMat3::from_quat(rotation);
         let rho = ray.inverse_depth;
         let turned = rotation * (ray.bearing + rho * (candidate.camera - pose.p));
         let w = turned - rho * query.camera;
@@ -346,12 +363,12 @@ impl Predicted {
         })
     }
 
-    /// Derivatives of bearing and inverse depth by the position and the yaw of the motion.
-    fn by_pose(&self) -> [(DVec3, f64); 4] {
+    /// Derivatives of bearing and inverse depth by the position and the yaw of the motion, and, where it is small, by its tilt.
+    fn by_motion(&self) -> [(DVec3, f64); 6] {
         let rho = self.candidate_inverse_depth;
         let columns = [self.rotation.x_axis, self.rotation.y_axis, self.rotation.z_axis].map(|c| -rho * c);
-        let yaw = -DVec3::Z.cross(self.turned);
-        [columns[0], columns[1], columns[2], yaw].map(|d| {
+        let [yaw, x, y] = [self.rotation.z_axis, DVec3::X, DVec3::Y].map(|axis| -axis.cross(self.turned));
+        [columns[0], columns[1], columns[2], yaw, x, y].map(|d| {
             let along = self.bearing.dot(d);
             ((d - self.bearing * along) / self.length, -rho * along / (self.length * self.length))
         })
@@ -384,6 +401,7 @@ mod tests {
     use super::super::features::Descriptor;
     use super::*;
     use crate::world::{stream, Noise};
+    use nalgebra::Vector4;
 
     /// A keyframe of a world of points, with the noise of corners and stereo.
     struct View {
@@ -446,22 +464,22 @@ mod tests {
         let (a, b) = (Pose4::default(), Pose4 { p: DVec3::new(0.4, -0.3, 0.1), yaw: 0.3 });
         let (query, candidate) = (View::new(&b, &world, 0, &mut rng), View::new(&a, &world, 0, &mut rng));
         let (q, c) = (query.seen(), candidate.seen());
-        let pose = Pose4 { p: DVec3::new(0.5, -0.2, 0.0), yaw: 0.35 };
+        let motion = Motion { pose: Pose4 { p: DVec3::new(0.5, -0.2, 0.0), yaw: 0.35 }, tilt: DVec2::ZERO };
         for ray in &candidate.rays {
-            let at = |pose: &Pose4| {
-                let p = Predicted::new(&q, &c, pose, ray).unwrap();
+            let at = |motion: &Motion| {
+                let p = Predicted::new(&q, &c, motion, ray).unwrap();
                 (p.bearing, p.inverse_depth)
             };
-            let by_pose = Predicted::new(&q, &c, &pose, ray).unwrap().by_pose();
-            for (k, (bearing, depth)) in by_pose.into_iter().enumerate() {
+            let by_motion = Predicted::new(&q, &c, &motion, ray).unwrap().by_motion();
+            for (k, (bearing, depth)) in by_motion.into_iter().enumerate() {
                 let moved = |by: f64| {
-                    let mut pose = pose;
-                    if k < 3 {
-                        pose.p[k] += by;
-                    } else {
-                        pose.yaw += by;
+                    let mut motion = motion;
+                    match k {
+                        0..3 => motion.pose.p[k] += by,
+                        3 => motion.pose.yaw += by,
+                        _ => motion.tilt[k - 4] += by,
                     }
-                    at(&pose)
+                    at(&motion)
                 };
                 let h = 1e-6;
                 let (plus, minus) = (moved(h), moved(-h));
@@ -470,10 +488,10 @@ mod tests {
             }
             let far = |by: f64| {
                 let ray = Ray { inverse_depth: ray.inverse_depth + by, ..*ray };
-                let p = Predicted::new(&q, &c, &pose, &ray).unwrap();
+                let p = Predicted::new(&q, &c, &motion, &ray).unwrap();
                 (p.bearing, p.inverse_depth)
             };
-            let p = Predicted::new(&q, &c, &pose, ray).unwrap();
+            let p = Predicted::new(&q, &c, &motion, ray).unwrap();
             let (plus, minus) = (far(1e-6), far(-1e-6));
             assert!(((plus.0 - minus.0) / 2e-6 - p.bearing_by_depth).length() < 1e-7);
             assert!(((plus.1 - minus.1) / 2e-6 - p.depth_by_depth).abs() < 1e-7);
@@ -503,6 +521,27 @@ mod tests {
             nees += e.dot(&v.covariance.cholesky().unwrap().solve(&e)) / n as f64;
         }
         assert!(nees < 6.0, "4 where deviations are as stated: {nees}");
+    }
+
+    /// Gravity of the query is off by 4 mrad, which moves what it sees by as much as 2 cm would.
+    #[test]
+    fn a_frame_that_is_not_level_does_not_shift_the_motion() {
+        let mut rng = stream(5, 0);
+        let mut verifier = Verifier::new(SIGMA_RAD, [640, 480]);
+        let (mut off, n) = (0.0, 20);
+        for k in 0..n {
+            let world = points(120, &mut rng);
+            let truth = Pose4 { p: DVec3::new(0.8, -0.5, 0.2), yaw: 0.2 };
+            let candidate = View::new(&Pose4::default(), &world, 12, &mut rng);
+            let mut query = View::new(&truth, &world, 12, &mut rng);
+            let axis = DVec3::new((k as f64).cos(), (k as f64).sin(), 0.0);
+            let tilt = DQuat::from_scaled_axis(axis * 0.004);
+            query.rays.iter_mut().for_each(|ray| ray.bearing = tilt * ray.bearing);
+            query.camera = tilt * query.camera;
+            let v = verifier.verify(&query.seen(), &candidate.seen()).unwrap();
+            off += (v.candidate_from_query.p - truth.p).length() / n as f64;
+        }
+        assert!(off < 0.01, "{off} m");
     }
 
     #[test]
