@@ -176,9 +176,13 @@ impl Corrections {
     }
 }
 
-/// Upright pose and tilt of the keyframe with stamp `t`, where the estimator's window still holds it.
-fn newest(window: &[(Nanos, Pose)], t: Nanos) -> Option<(Pose4, DQuat)> {
-    window.iter().find(|(at, _)| *at == t).map(|(_, pose)| Pose4::upright(pose))
+/// Upright pose and tilt of a keyframe by the newest estimate of it, where the estimator's window still holds it. Yaw and tilt
+/// are parted as they were for the place: with a camera that looks ahead and a body whose x points up, a corrected roll would
+/// otherwise count as yaw.
+fn newest(window: &[(Nanos, Pose)], place: &Place) -> Option<(Pose4, DQuat)> {
+    let (_, pose) = window.iter().find(|(at, _)| *at == place.t)?;
+    let (upright, more) = Pose4::upright(&Pose::new(pose.q * place.tilt.inverse(), pose.p));
+    Some((upright, more * place.tilt))
 }
 
 /// The loop closure of one rig.
@@ -334,7 +338,7 @@ impl Loops {
         // The newest estimate of the one before, so that the two are of one window.
         let before = last.map(|n| {
             let place = &self.places[n as usize];
-            newest(keyframe.window, place.t).map_or(place.odom, |(odom, _)| odom)
+            newest(keyframe.window, place).map_or(place.odom, |(odom, _)| odom)
         });
         let moved = before.map(|b| b.between(&odom));
         let pose = match (last, &moved) {
@@ -358,13 +362,13 @@ impl Loops {
     fn measure_again(&mut self, window: &[(Nanos, Pose)]) {
         let mut nodes: List<u16, FRAMES> = List::default();
         let mut at = self.last;
-        while let Some(node) = at.filter(|n| newest(window, self.places[*n as usize].t).is_some()) {
+        while let Some(node) = at.filter(|n| newest(window, &self.places[*n as usize]).is_some()) {
             if nodes.push(node).is_err() {
                 break;
             }
             at = self.graph.before(node);
         }
-        let estimates = |n: u16| newest(window, self.places[n as usize].t);
+        let estimates = |n: u16| newest(window, &self.places[n as usize]);
         let mut moved: List<(u16, Pose4), FRAMES> = List::default();
         for pair in nodes.windows(2).rev() {
             let [Some((to, _)), Some((from, _))] = [pair[0], pair[1]].map(estimates) else { continue };
@@ -373,7 +377,7 @@ impl Loops {
         self.graph.measure_again(&moved);
         for n in nodes.iter() {
             let place = &mut self.places[*n as usize];
-            place.tilt = newest(window, place.t).map_or(place.tilt, |(_, tilt)| tilt);
+            place.tilt = newest(window, place).map_or(place.tilt, |(_, tilt)| tilt);
         }
     }
 
@@ -503,5 +507,26 @@ impl Loops {
             self.closures.push(closure);
         }
         Some(closure)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A body whose x points up, as that of EuRoC's rig: a roll that is corrected by 3 degrees is no yaw.
+    #[test]
+    fn a_corrected_tilt_turns_no_place_about_the_vertical() {
+        let (t, p) = (Nanos(5), DVec3::new(1.0, 2.0, 3.0));
+        let first = Pose::new(DQuat::from_rotation_z(0.4) * DQuat::from_rotation_y(-1.5), p);
+        let (odom, tilt) = Pose4::upright(&first);
+        let place = Place { t, odom, tilt, used: true, ..Place::default() };
+        for axis in [DVec3::X, DVec3::Y, DVec3::new(0.6, -0.8, 0.0)] {
+            let second = Pose::new(DQuat::from_axis_angle(axis, 0.05) * first.q, p);
+            let (now, tilt) = newest(&[(Nanos(4), first), (t, second)], &place).expect("a place in the window");
+            assert!((now.yaw - odom.yaw).abs() < 1e-3 && now.p == p, "{axis}: {now:?}, {odom:?}");
+            assert!(((now.pose().q * tilt).dot(second.q).abs() - 1.0).abs() < 1e-12, "{axis}");
+        }
+        assert!(newest(&[(Nanos(4), first)], &place).is_none());
     }
 }
