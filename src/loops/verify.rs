@@ -21,7 +21,7 @@ const DRAWS: usize = 400;
 const MISSED: f64 = 1e-3;
 /// Normalised squared residual, of 3 numbers, up to which a match agrees: one in a thousand is lost.
 const AGREES: f64 = 16.3;
-/// Least horizontal distance of two points that tell yaw, m, and by how much it may differ, as a share and in deviations.
+/// Least horizontal distance of two points that tell yaw, m.
 const LEVER_MIN: f64 = 0.2;
 /// Depths that RANSAC draws from: share of deviation at most.
 const DRAWN_SIGMA_MAX: f64 = 0.15;
@@ -61,10 +61,19 @@ pub struct Verified {
 
 /// A motion from the candidate to the query: the pose of the query's level frame, and by how much that is not level, as
 /// angles about its x and y, rad.
-#[derive(Clone, Copy, Debug, Default)]
+#[derive(Clone, Copy, Debug)]
 struct Motion {
     pose: Pose4,
     tilt: DVec2,
+    /// Rotation by both, from the candidate's level frame to the query's.
+    rotation: DMat3,
+}
+
+impl Motion {
+    fn new(pose: Pose4, tilt: DVec2) -> Motion {
+        let rotation = DQuat::from_scaled_axis(-tilt.extend(0.0)) * DQuat::from_rotation_z(-pose.yaw);
+        Motion { pose, tilt, rotation: DMat3::from_quat(rotation) }
+    }
 }
 
 #[derive(Clone, Copy, Debug, Default)]
@@ -166,7 +175,7 @@ impl Verifier {
             draw += 1;
             let (a, b) = (self.uniform(n), self.uniform(n));
             let Some(pose) = motion_of_two(query, candidate, near_matches[a], near_matches[b]) else { continue };
-            let motion = Motion { pose, tilt: DVec2::ZERO };
+            let motion = Motion::new(pose, DVec2::ZERO);
             let (mut agree, mut cost) = (0, 0.0);
             for m in self.matches.iter() {
                 let misfit = self.misfit(query, candidate, &motion, m);
@@ -277,9 +286,9 @@ impl Verifier {
                 break;
             }
             let step = h.cholesky()?.solve(&b);
-            motion.pose.p -= DVec3::new(step[0], step[1], step[2]);
-            motion.pose.yaw = wrapped(motion.pose.yaw - step[3]);
-            motion.tilt -= DVec2::new(step[4], step[5]);
+            let Motion { pose: Pose4 { p, yaw }, tilt, .. } = motion;
+            let pose = Pose4 { p: p - DVec3::new(step[0], step[1], step[2]), yaw: wrapped(yaw - step[3]) };
+            motion = Motion::new(pose, tilt - DVec2::new(step[4], step[5]));
             if step.norm() < 1e-9 {
                 break;
             }
@@ -338,9 +347,7 @@ struct Predicted {
 impl Predicted {
     /// `None` where the corner would be in the camera itself.
     fn new(query: &Seen, candidate: &Seen, motion: &Motion, ray: &Ray) -> Option<Predicted> {
-        let Motion { pose, tilt } = motion;
-        let rotation = DQuat::from_scaled_axis(-tilt.extend(0.0)) * DQuat::from_rotation_z(-pose.yaw);
-        let rotation = DMat3::from_quat(rotation);
+        let Motion { pose, rotation, .. } = *motion;
         let rho = ray.inverse_depth;
         let turned = rotation * (ray.bearing + rho * (candidate.camera - pose.p));
         let w = turned - rho * query.camera;
@@ -458,28 +465,32 @@ mod tests {
     }
 
     #[test]
-    fn derivatives_are_those_of_the_residual() {
+    fn derivatives_are_those_of_what_is_predicted() {
         let mut rng = stream(1, 0);
         let world = points(30, &mut rng);
         let (a, b) = (Pose4::default(), Pose4 { p: DVec3::new(0.4, -0.3, 0.1), yaw: 0.3 });
         let (query, candidate) = (View::new(&b, &world, 0, &mut rng), View::new(&a, &world, 0, &mut rng));
         let (q, c) = (query.seen(), candidate.seen());
-        let motion = Motion { pose: Pose4 { p: DVec3::new(0.5, -0.2, 0.0), yaw: 0.35 }, tilt: DVec2::ZERO };
-        for ray in &candidate.rays {
+        let pose = Pose4 { p: DVec3::new(0.5, -0.2, 0.0), yaw: 0.35 };
+        // Those by the tilt itself hold where there is none.
+        for (ray, tilt, known) in
+            candidate.rays.iter().flat_map(|r| [(r, DVec2::ZERO, 6), (r, DVec2::new(0.3, -0.2), 4)])
+        {
+            let motion = Motion::new(pose, tilt);
             let at = |motion: &Motion| {
                 let p = Predicted::new(&q, &c, motion, ray).unwrap();
                 (p.bearing, p.inverse_depth)
             };
             let by_motion = Predicted::new(&q, &c, &motion, ray).unwrap().by_motion();
-            for (k, (bearing, depth)) in by_motion.into_iter().enumerate() {
+            for (k, (bearing, depth)) in by_motion.into_iter().take(known).enumerate() {
                 let moved = |by: f64| {
-                    let mut motion = motion;
+                    let (mut pose, mut tilt) = (pose, tilt);
                     match k {
-                        0..3 => motion.pose.p[k] += by,
-                        3 => motion.pose.yaw += by,
-                        _ => motion.tilt[k - 4] += by,
+                        0..3 => pose.p[k] += by,
+                        3 => pose.yaw += by,
+                        _ => tilt[k - 4] += by,
                     }
-                    at(&motion)
+                    at(&Motion::new(pose, tilt))
                 };
                 let h = 1e-6;
                 let (plus, minus) = (moved(h), moved(-h));
