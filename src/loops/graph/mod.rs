@@ -165,6 +165,10 @@ impl PoseGraph {
             self.poses[n] = self.poses[from].compose(&before.between(&self.poses[n])).compose(&changed);
             edge.measured = *measured;
         }
+        // Loops of nodes that moved may no longer agree.
+        let moved = |n: u16| measured.iter().any(|(node, _)| *node == n);
+        let loosened = self.edges.iter().position(|e| e.is_loop && (moved(e.from) || moved(e.to)));
+        self.settled = loosened.map_or(self.settled, |i| self.settled.min(i));
     }
 
     pub fn pose(&self, node: u16) -> Pose4 {
