@@ -118,14 +118,26 @@ fn identity(calibration: &Calibration) -> u64 {
     store::identity(&format!("places {FORM} {:?}", calibration.cameras))
 }
 
-/// Reads the places in a folder, the oldest first; none where there is no store. Fails where they are of another rig or
-/// version. Allocates.
-pub fn read(folder: &Path, calibration: &Calibration) -> Result<Vec<(KeptPlace, Vec<Feature>)>, Fault> {
+/// What was read of a folder of places.
+#[derive(Default)]
+pub struct Kept {
+    /// With their features, the oldest first.
+    pub places: Vec<(KeptPlace, Vec<Feature>)>,
+    /// Lines about what is damaged, and left out.
+    pub warnings: Vec<String>,
+}
+
+/// Reads the places in a folder; none where there is no store. Fails where they are of another rig or version. Allocates.
+pub fn read(folder: &Path, calibration: &Calibration) -> Result<Kept, Fault> {
     if !folder.is_dir() {
-        return Ok(vec![]);
+        return Ok(Kept::default());
     }
     let mut reader = match Reader::open(folder) {
-        Err(fault) if fault.kind == FaultKind::NoInput => return Ok(vec![]),
+        Err(fault) if fault.kind == FaultKind::NoInput => {
+            let is_empty = std::fs::read_dir(folder).is_ok_and(|mut files| files.next().is_none());
+            let warnings = if is_empty { vec![] } else { vec![fault.to_string()] };
+            return Ok(Kept { warnings, ..Kept::default() });
+        }
         opened => opened?,
     };
     if reader.identity() != identity(calibration) {
@@ -136,7 +148,7 @@ pub fn read(folder: &Path, calibration: &Calibration) -> Result<Vec<(KeptPlace, 
     let mut keys = vec![];
     reader.entries(|key, _| keys.extend((key.kind == KIND_PLACE).then_some(*key)));
     keys.sort_unstable();
-    let (mut places, mut payload) = (vec![], vec![]);
+    let (mut places, mut payload, records) = (vec![], vec![], keys.len());
     for key in keys {
         // What is damaged is left out.
         let Ok(about) = reader.read(key, &mut payload) else { continue };
@@ -153,7 +165,12 @@ pub fn read(folder: &Path, calibration: &Calibration) -> Result<Vec<(KeptPlace, 
             }
         }
     }
-    Ok(places)
+    let mut warnings = reader.warnings().to_vec();
+    if places.len() < records {
+        let damaged = records - places.len();
+        warnings.push(format!("{}: {damaged} of {records} places are damaged, and left out", folder.display()));
+    }
+    Ok(Kept { places, warnings })
 }
 
 /// Writes places as they come, on the thread that finds them. The store is opened when the first one comes, so that a run that

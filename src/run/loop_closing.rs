@@ -11,7 +11,7 @@ use super::waker::Waker;
 use crate::config::Board;
 use crate::counters::Counters;
 use crate::limits::{CAMERAS_MAX, FRAMES};
-use crate::loops::kept::{self, Epoch, Keeper};
+use crate::loops::kept::{self, Epoch, Keeper, Kept};
 use crate::loops::{Closure, LoopKeyframe, Loops, MapFromOdom};
 use crate::mem::{Footprint, List};
 use crate::publish::event::{EventId, Notice};
@@ -237,21 +237,21 @@ impl LoopClosing {
         (calibration, board): (&Calibration, &Board),
         run_folder: &Path,
         (flight, fresh, read_only): (i64, bool, bool),
-    ) -> Result<usize, Fault> {
-        let Some(loops) = &mut self.here else { return Ok(0) };
+    ) -> Result<(usize, Vec<String>), Fault> {
+        let Some(loops) = &mut self.here else { return Ok((0, vec![])) };
         loops.remember(flight, &[], None);
         if !board.store.enabled && !read_only {
-            return Ok(0);
+            return Ok((0, vec![]));
         }
         let folder = run_folder.join(PLACES);
         if fresh {
             store::set_aside(&folder)?;
         }
-        let places = kept::read(&folder, calibration)?;
+        let Kept { places, warnings } = kept::read(&folder, calibration)?;
         let keeper = if read_only { None } else { Some(Keeper::new(&folder, calibration, keyframes(board))?) };
         loops.remember(flight, &places, keeper);
         self.queue.lost.store(!places.is_empty(), Relaxed);
-        Ok(places.len())
+        Ok((places.len(), warnings))
     }
 
     /// A pose of the estimator, in the map.

@@ -89,20 +89,28 @@ pub fn sinks(
     let mut loops = if odometry { LoopClosing::new(&input.calibration, board)? } else { None };
     let (fresh, read_only) = (options.fresh, options.localise_only);
     let rig = (&input.calibration, board);
-    let read = loops.as_mut().map_or(Ok(0), |loops| loops.remember(rig, out.path(), (flight, fresh, read_only)));
-    match read {
-        Ok(0) if read_only => {
-            let what = "there is no place of an earlier run to be found in, or loops.enabled is false";
+    let read = loops.as_mut().map(|loops| loops.remember(rig, out.path(), (flight, fresh, read_only)));
+    let warnings = match read {
+        None if read_only => {
+            let (what, fix) = ("no place is recognised without loops", "set loops.enabled = true");
+            return Err(Fault::new(FaultKind::Config, "loops.enabled", what, fix));
+        }
+        Some(Ok((0, warnings))) if read_only => {
+            let what = ["there is no place of an earlier run to be found in".into()];
+            let what = what.into_iter().chain(warnings).collect::<Vec<String>>().join("; ");
             let fix = "name the --out folder of a run whose board has store.enabled and loops.enabled";
             return Err(Fault::new(FaultKind::NoInput, out.path().display().to_string(), what, fix));
         }
-        Ok(_) => {}
-        Err(fault) if read_only => return Err(fault),
-        Err(fault) => {
+        Some(Err(fault)) if read_only => return Err(fault),
+        Some(Err(fault)) => {
             let what = format!("{}; places of this run are not kept, and those of earlier runs not used", fault.what);
-            input.warnings.push(Fault { what, ..fault }.to_string());
+            vec![Fault { what, ..fault }.to_string()]
         }
-    }
+        Some(Ok((_, warnings))) => warnings,
+        None => vec![],
+    };
+    warnings.iter().for_each(|warning| print_err(format_args!("stipple: warning: {warning}")));
+    input.warnings.extend(warnings);
     let map = if board.map.enabled { Some(open_map(input, board, out, options, (apart, flight))?) } else { None };
     Ok((map, loops))
 }

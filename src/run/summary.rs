@@ -5,7 +5,7 @@ use super::mapping::{Drawn, MapResult};
 use super::memory::mib;
 use super::tracking::{OdometryRun, Tracker};
 use super::Flown;
-use crate::loops::{Closure, Corrections};
+use crate::loops::{Closure, Corrections, Stats};
 use crate::mem;
 use crate::output::html::{write_html, Evidence};
 use crate::output::metrics::{percentile, trajectory_error};
@@ -85,7 +85,6 @@ pub fn conclude(title: Title, mut flown: Flown, logged: &[PathBuf], out: &Output
         energy_j: flown.energy.map(|energy| energy.joules),
         power_mean_w: flown.energy.map(|energy| energy.joules / energy.seconds),
         heap_after_seal: Some(heap),
-        warnings: flown.warnings.len() as u64,
         ..Report::default()
     };
     let estimated = track_figures(&mut report, &flown);
@@ -143,6 +142,7 @@ pub fn conclude(title: Title, mut flown: Flown, logged: &[PathBuf], out: &Output
     if !map.as_ref().is_some_and(|m| m.written) {
         fault = fault.or(out.remove("map.ply").err());
     }
+    flown.loops.iter().flat_map(|loops| place_warnings(&loops.stats)).for_each(|what| warn(&mut flown.warnings, what));
     if flown.tracker.odometry().is_some_and(|run| run.back.trajectory.is_empty()) {
         let why = "no frame got a pose, odometry never started: its health and the counters in report.json say why";
         warn(&mut flown.warnings, why.into());
@@ -152,16 +152,30 @@ pub fn conclude(title: Title, mut flown: Flown, logged: &[PathBuf], out: &Output
         report.camera_copies = capture.copies(&flown.source);
     }
     flown.counters.lines_lost.add(super::status::lines_lost());
-    report.rss_peak_bytes = host::rss_peak_bytes();
     report.set_counters(&counted(&flown, map.as_ref(), &title.opened));
     if let Some(run) = flown.tracker.odometry() {
         report.set_health(run.back.vio.health_frames());
     }
+    (report.warnings, report.rss_peak_bytes) = (flown.warnings.len() as u64, host::rss_peak_bytes());
     let tracking_ms: &[(Nanos, f64)] = flown.tracker.odometry().map_or(&[], |run| &run.back.frame_ms);
     let (estimated, truth, error, warnings) = (&estimated[..], &title.truth[..], error.as_ref(), &flown.warnings[..]);
     let evidence = Evidence { estimated, epochs: &epochs, truth, error, tracking_ms, pictures: &[], warnings };
     let written = write_files(&report, &evidence, map.map_or(vec![], |m| m.drawn), out);
     (report, fault.or(written))
+}
+
+/// What a later run would miss: places that are not on the disk, or are in another frame than those of earlier runs.
+fn place_warnings(stats: &Stats) -> Vec<String> {
+    let mut warnings = vec![];
+    if stats.places_unkept > 0 {
+        let n = stats.places_unkept;
+        warnings.push(format!("places/: {n} places could not be written: a later run will not find itself there; check the folder and the disk"));
+    }
+    if stats.places_read > 0 && stats.epochs_joined == 0 {
+        let what = "no place of the earlier runs in this folder was recognised: trajectory.tum is in a frame of its own, not in that of their map";
+        warnings.push(what.into());
+    }
+    warnings
 }
 
 fn warn(warnings: &mut Vec<String>, what: String) {

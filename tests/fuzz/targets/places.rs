@@ -103,7 +103,7 @@ fuzz_target!(|data: &[u8]| {
     }
     store.flush().expect("it can be written");
     drop((store, disk));
-    let places = kept::read(dir.path(), &scenario.rig()).expect("it is of this rig");
+    let places = kept::read(dir.path(), &scenario.rig()).expect("it is of this rig").places;
     let mut loops = loops(scenario);
     loops.remember(2, &places, None);
     add_all(&mut loops, &keyframes[..3.min(keyframes.len())], 0);
