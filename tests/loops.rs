@@ -4,6 +4,7 @@
 use glam::{DQuat, DVec3};
 use std::sync::Arc;
 use stipple::config::{Board, FrontendConfig};
+use stipple::loops::kept::{self, Keeper};
 use stipple::loops::pose4::{wrapped, Pose4};
 use stipple::loops::{LoopKeyframe, Loops};
 use stipple::output::export::{export, Form, Request};
@@ -136,6 +137,49 @@ fn a_kidnapped_vehicle_finds_itself_where_only_one_place_looks_like_it() {
     look_around(&mut loops, &twins, (62.0, 8.0), 1, carried);
     assert!(loops.stats.epochs_joined == 0 && loops.is_lost(), "{:?}", loops.stats);
     assert!(loops.stats.loops_ambiguous > before, "{:?}", loops.stats);
+}
+
+/// While an estimator converges it turns keyframes of the past: what is on the disk follows. What is damaged there is told.
+#[test]
+fn a_tilt_that_is_found_later_is_on_the_disk() {
+    let scenario = Scenario { duration: Span::from_secs(2.0), ..Scenario::named("patrol-two").unwrap() };
+    let (rig, dir) = (scenario.rig(), tempfile::tempdir().unwrap());
+    let folder = dir.path().join("places");
+    let mut loops = Loops::new(&rig, &FrontendConfig::default(), 64).unwrap();
+    loops.remember(1, &[], Some(Keeper::new(&folder, &rig, 64).unwrap()));
+    let mut sim = Sim::new(&scenario).unwrap();
+    let mut window = vec![];
+    for (i, tilt) in [(0, 0.05), (10, 0.0)] {
+        let mut frames = Frames::for_rig(sim.calibration());
+        sim.render(i, &mut frames);
+        let (t, truth) = (frames.t, sim.truth_at(sim.taken(i)).pose);
+        let odom_from_body = Pose::new(DQuat::from_rotation_x(tilt) * truth.q, truth.p);
+        let (frames, window_now) = (&Arc::new(frames), &window[..]);
+        loops.add(&LoopKeyframe {
+            t,
+            frames,
+            id: None,
+            epoch: 0,
+            odom_from_body,
+            window: window_now,
+            body_from_cam: None,
+        });
+        window.push((t, truth));
+    }
+    assert_eq!(loops.stats.places_unkept, 0);
+    drop(loops);
+    let kept = kept::read(&folder, &rig).unwrap();
+    assert!((kept.places.len(), kept.warnings.len()) == (2, 0), "{:?}", kept.warnings);
+    let up = kept.places[0].0.tilt * (window[0].1.q.inverse() * DVec3::Z);
+    assert!(up.angle_between(DVec3::Z) < 1e-6, "{up}");
+
+    let segment =
+        std::fs::read_dir(&folder).unwrap().map(|f| f.unwrap().path()).find(|f| f.metadata().unwrap().len() > 1 << 20);
+    let mut bytes = std::fs::read(segment.as_ref().unwrap()).unwrap();
+    bytes[6000..].iter_mut().step_by(900).for_each(|byte| *byte ^= 1);
+    std::fs::write(segment.unwrap(), bytes).unwrap();
+    let kept = kept::read(&folder, &rig).unwrap();
+    assert!(kept.places.len() < 2 && kept.warnings.iter().any(|w| w.contains("damaged")), "{:?}", kept.warnings);
 }
 
 /// A place that the patrol passes, m.

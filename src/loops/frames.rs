@@ -7,6 +7,7 @@ use super::graph::Edge;
 use super::kept::{Keeper, KeptPlace};
 use super::{Loops, Place};
 use nalgebra::Matrix4;
+use stipple_drivers::Nanos;
 
 /// Poses of kept places are written again after so long, s.
 const POSES_KEPT_S: f64 = 10.0;
@@ -68,11 +69,16 @@ impl Loops {
 
     /// Writes a place to the disk.
     pub(super) fn keep(&mut self, node: u16) {
-        let Place { t, epoch, odom, tilt, frame, number, .. } = self.places[node as usize];
+        let Place { t, epoch, odom, tilt, frame, number, features, .. } = self.places[node as usize];
         let place = KeptPlace { number, t, epoch, frame, odom, map: self.graph.pose(node), tilt };
+        let features = &self.features[node as usize * FEATURES..][..features as usize];
         if let Some(keeper) = &mut self.keeper {
-            self.stats.places_unkept += u64::from(!keeper.put(&place, &self.query.0));
+            self.stats.places_unkept += u64::from(!keeper.put(&place, features));
         }
+    }
+
+    /// Writes where places are by now, once in a while.
+    pub(super) fn keep_poses_in_time(&mut self, t: Nanos) {
         if (t - self.poses_kept).secs().abs() >= POSES_KEPT_S {
             self.poses_kept = t;
             self.keep_poses();

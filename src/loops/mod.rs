@@ -55,6 +55,8 @@ const KEPT_SIGMA: [f64; 2] = [0.05, 0.005];
 /// Candidates by place are nearer than this, m, and look within this angle of the same direction, rad.
 const NEAR_M: f64 = 3.0;
 const NEAR_RAD: f64 = 0.8;
+/// A tilt that changes at once by more than this is written to the disk again, rad: a third of what a verification allows.
+const TILT_KEPT: f64 = 0.001;
 
 counters! {
     /// What became of keyframes that looked for a loop.
@@ -108,7 +110,8 @@ pub struct Place {
     pub t: Nanos,
     pub id: Option<u64>,
     pub epoch: Epoch,
-    /// Pose in `odom`, of the upright frame, and what turns the body upright.
+    /// First estimate of the pose of the upright frame in `odom`, which is what a run told others, and the newest of what turns
+    /// the body upright.
     pub odom: Pose4,
     pub tilt: DQuat,
     /// Number of its map frame. Poses of places with the same number can be compared.
@@ -176,7 +179,7 @@ impl Corrections {
     }
 }
 
-/// Upright pose and tilt of a keyframe by the newest estimate of it, where the estimator's window still holds it. Yaw and tilt
+/// Upright pose and tilt of a keyframe by the newest estimate of it, where the estimator's window still holds that. Yaw and tilt
 /// are parted as they were for the place: with a camera that looks ahead and a body whose x points up, a corrected roll would
 /// otherwise count as yaw.
 fn newest(window: &[(Nanos, Pose)], place: &Place) -> Option<(Pose4, DQuat)> {
@@ -329,6 +332,7 @@ impl Loops {
         self.index.insert(node, self.query.0.iter().map(|f| &f.descriptor));
         self.last = Some(node);
         self.keep(node);
+        self.keep_poses_in_time(keyframe.t);
         closure
     }
 
@@ -375,9 +379,15 @@ impl Loops {
             let _ = moved.push((pair[0], from.between(&to)));
         }
         self.graph.measure_again(&moved);
+        self.poses_moved |= !moved.is_empty();
         for n in nodes.iter() {
             let place = &mut self.places[*n as usize];
-            place.tilt = newest(window, place).map_or(place.tilt, |(_, tilt)| tilt);
+            let was = place.tilt;
+            place.tilt = newest(window, place).map_or(was, |(_, tilt)| tilt);
+            // While the estimator converges: what is on disk is of no use to a later flight.
+            if place.tilt.angle_between(was) > TILT_KEPT {
+                self.keep(*n);
+            }
         }
     }
 
