@@ -24,7 +24,7 @@ use stipple_drivers::host::thread_cpu_now;
 use stipple_drivers::replay::{OpenOptions, Recording};
 use stipple_drivers::sim::Scenario;
 use stipple_drivers::types::pose_at;
-use stipple_drivers::{Fault, Frames, Nanos, Pose, Span, TimedPose};
+use stipple_drivers::{Fault, FaultKind, Frames, Nanos, Pose, Span, TimedPose};
 
 /// A closure further off the truth than this is false: m, rad. The drift of odometry is not in it. A true one is believed to
 /// 0.2 m and 1.1 degrees or better, one deviation.
@@ -132,6 +132,15 @@ pub fn run(args: &Args) -> Result<(), Fault> {
         joined_table(resets),
         against_table(against),
     ];
+    if tables.iter().all(Table::is_empty) {
+        let (place, fix) = (args.only.clone().unwrap_or("--seeds 0".into()), "see `stipple-bench loops --help`");
+        return Err(Fault::new(
+            FaultKind::Usage,
+            place,
+            "nothing is measured by this name, of these seeds and recordings",
+            fix,
+        ));
+    }
     tables.iter().for_each(|table| println!("{}", table.text()));
     println!("{wrong} false");
     let page = Page {

@@ -144,6 +144,10 @@ pub struct Table {
 }
 
 impl Table {
+    pub fn is_empty(&self) -> bool {
+        self.rows.is_empty()
+    }
+
     /// `cells` answers whether a row is marked, and a cell a column.
     pub fn new<T>(
         name: &'static str,
