@@ -135,8 +135,11 @@ pub fn read(folder: &Path, calibration: &Calibration) -> Result<Kept, Fault> {
     let mut reader = match Reader::open(folder) {
         Err(fault) if fault.kind == FaultKind::NoInput => {
             let is_empty = std::fs::read_dir(folder).is_ok_and(|mut files| files.next().is_none());
-            let warnings = if is_empty { vec![] } else { vec![fault.to_string()] };
-            return Ok(Kept { warnings, ..Kept::default() });
+            let what = format!(
+                "{}: no place can be read from the files that are there, which stay as they are",
+                folder.display()
+            );
+            return Ok(Kept { warnings: if is_empty { vec![] } else { vec![what] }, ..Kept::default() });
         }
         opened => opened?,
     };
@@ -166,9 +169,11 @@ pub fn read(folder: &Path, calibration: &Calibration) -> Result<Kept, Fault> {
         }
     }
     let mut warnings = reader.warnings().to_vec();
-    if places.len() < records {
-        let damaged = records - places.len();
-        warnings.push(format!("{}: {damaged} of {records} places are damaged, and left out", folder.display()));
+    let damaged = (records - places.len()) as u64 + reader.damaged();
+    if damaged > 0 {
+        let n = places.len();
+        warnings
+            .push(format!("{}: {damaged} records are damaged and left out; {n} places can be read", folder.display()));
     }
     Ok(Kept { places, warnings })
 }

@@ -47,6 +47,11 @@ impl Reader {
         &self.found.warnings
     }
 
+    /// Stretches without a whole record that were found at opening.
+    pub fn damaged(&self) -> u64 {
+        self.found.damaged
+    }
+
     /// Visits the newest generation of every record.
     pub fn entries(&self, mut visit: impl FnMut(&Key, &About)) {
         for entry in self.index.entries().iter().filter(|e| !e.is_tombstone) {
