@@ -182,7 +182,7 @@ impl Corrections {
 /// Upright pose and tilt of a keyframe by the newest estimate of it, where the estimator's window still holds that. Yaw and tilt
 /// are parted as they were for the place: with a camera that looks ahead and a body whose x points up, a corrected roll would
 /// otherwise count as yaw.
-fn newest(window: &[(Nanos, Pose)], place: &Place) -> Option<(Pose4, DQuat)> {
+fn newest_estimate(window: &[(Nanos, Pose)], place: &Place) -> Option<(Pose4, DQuat)> {
     let (_, pose) = window.iter().find(|(at, _)| *at == place.t)?;
     let (upright, more) = Pose4::upright(&Pose::new(pose.q * place.tilt.inverse(), pose.p));
     Some((upright, more * place.tilt))
@@ -342,7 +342,7 @@ impl Loops {
         // The newest estimate of the one before, so that the two are of one window.
         let before = last.map(|n| {
             let place = &self.places[n as usize];
-            newest(keyframe.window, place).map_or(place.odom, |(odom, _)| odom)
+            newest_estimate(keyframe.window, place).map_or(place.odom, |(odom, _)| odom)
         });
         let moved = before.map(|b| b.between(&odom));
         let pose = match (last, &moved) {
@@ -366,13 +366,13 @@ impl Loops {
     fn measure_again(&mut self, window: &[(Nanos, Pose)]) {
         let mut nodes: List<u16, FRAMES> = List::default();
         let mut at = self.last;
-        while let Some(node) = at.filter(|n| newest(window, &self.places[*n as usize]).is_some()) {
+        while let Some(node) = at.filter(|n| newest_estimate(window, &self.places[*n as usize]).is_some()) {
             if nodes.push(node).is_err() {
                 break;
             }
             at = self.graph.before(node);
         }
-        let estimates = |n: u16| newest(window, &self.places[n as usize]);
+        let estimates = |n: u16| newest_estimate(window, &self.places[n as usize]);
         let mut moved: List<(u16, Pose4), FRAMES> = List::default();
         for pair in nodes.windows(2).rev() {
             let [Some((to, _)), Some((from, _))] = [pair[0], pair[1]].map(estimates) else { continue };
@@ -383,7 +383,7 @@ impl Loops {
         for n in nodes.iter() {
             let place = &mut self.places[*n as usize];
             let was = place.tilt;
-            place.tilt = newest(window, place).map_or(was, |(_, tilt)| tilt);
+            place.tilt = newest_estimate(window, place).map_or(was, |(_, tilt)| tilt);
             // While the estimator converges: what is on disk is of no use to a later flight.
             if place.tilt.angle_between(was) > TILT_KEPT {
                 self.keep(*n);
@@ -533,10 +533,11 @@ mod tests {
         let place = Place { t, odom, tilt, used: true, ..Place::default() };
         for axis in [DVec3::X, DVec3::Y, DVec3::new(0.6, -0.8, 0.0)] {
             let second = Pose::new(DQuat::from_axis_angle(axis, 0.05) * first.q, p);
-            let (now, tilt) = newest(&[(Nanos(4), first), (t, second)], &place).expect("a place in the window");
+            let (now, tilt) =
+                newest_estimate(&[(Nanos(4), first), (t, second)], &place).expect("a place in the window");
             assert!((now.yaw - odom.yaw).abs() < 1e-3 && now.p == p, "{axis}: {now:?}, {odom:?}");
             assert!(((now.pose().q * tilt).dot(second.q).abs() - 1.0).abs() < 1e-12, "{axis}");
         }
-        assert!(newest(&[(Nanos(4), first)], &place).is_none());
+        assert!(newest_estimate(&[(Nanos(4), first)], &place).is_none());
     }
 }

@@ -125,11 +125,14 @@ impl PoseGraph {
     }
 
     /// Adds an edge; `None` where all are used, a node is not there, it has its odometry already, or the edge is no
-    /// measurement.
+    /// measurement. Loops leave room for the odometry of all nodes.
     pub fn link(&mut self, edge: Edge) -> Option<()> {
         let [from, to] = [edge.from, edge.to].map(usize::from);
         let there = |n: usize| self.used.get(n) == Some(&true);
-        if self.edges.len() == self.edges.capacity() || from == to || !there(from) || !there(to) || !edge.is_valid() {
+        let alike = self.edges.iter().filter(|e| e.is_loop == edge.is_loop).count();
+        let odometry = self.poses.len().saturating_sub(1);
+        let room = if edge.is_loop { self.edges.capacity().saturating_sub(odometry) } else { odometry };
+        if alike >= room || from == to || !there(from) || !there(to) || !edge.is_valid() {
             return None;
         }
         let number = self.edges.len() as u32;

@@ -299,6 +299,11 @@ fn what_is_no_measurement_is_refused_and_what_is_full_says_so() {
     assert!(graph.link(edge(1, 2, 1.0, 1.0, false)).is_some() && graph.link(edge(0, 2, 2.0, 1.0, true)).is_some());
     assert_eq!(graph.link(edge(0, 2, 1.0, 1.0, true)), None, "full");
     assert!(graph.optimise().solved);
+    let mut looped = PoseGraph::new(3, 3, 9);
+    (0..3).for_each(|_| assert!(looped.add(Pose4::default()).is_some()));
+    assert!(looped.link(edge(0, 2, 2.0, 1.0, true)).is_some() && looped.link(edge(0, 1, 1.0, 1.0, true)).is_none());
+    let odometry = [edge(0, 1, 1.0, 1.0, false), edge(1, 2, 1.0, 1.0, false)];
+    odometry.into_iter().for_each(|edge| assert!(looped.link(edge).is_some(), "room that loops do not take"));
     let mut small = PoseGraph::new(4, 9, 1);
     (0..4).for_each(|_| assert!(small.add(Pose4::default()).is_some()));
     let all = (0..4).flat_map(|a| (a + 1..4).map(move |b| (a, b)));
