@@ -27,7 +27,10 @@ const LEVER_MIN: f64 = 0.2;
 const DRAWN_SIGMA_MAX: f64 = 0.15;
 /// Fewest matches that are worth a search.
 pub const MATCHES_MIN: usize = 12;
-const ITERATIONS: usize = 8;
+/// Steps of a search while it is still found out which corners agree, and of the last one.
+const ITERATIONS: [usize; 2] = [3, 8];
+/// A step that ends a search: m and rad, far below `FLOOR`.
+const CONVERGED: f64 = 1e-5;
 /// Deviations below which no verification is believed: m, rad.
 const FLOOR: [f64; 2] = [0.01, 0.002];
 /// Deviation of the roll and of the pitch between two level frames, rad.
@@ -122,10 +125,10 @@ impl Verifier {
             if self.best.len() < MATCHES_MIN / 2 {
                 return None;
             }
-            motion = self.refine(query, candidate, motion)?.0;
+            motion = self.refine(query, candidate, motion, ITERATIONS[0])?.0;
         }
         self.collect(query, candidate, &motion, true);
-        let (Motion { pose, .. }, covariance, misfit) = self.refine(query, candidate, motion)?;
+        let (Motion { pose, .. }, covariance, misfit) = self.refine(query, candidate, motion, ITERATIONS[1])?;
         let mut cells = 0u32;
         for m in self.best.iter() {
             let px = query.features[m.query as usize].px();
@@ -263,11 +266,17 @@ impl Verifier {
 
     /// Refines a motion by the matches in `best` (Gauss-Newton, Geman-McClure weights at the gate): motion, covariance of its
     /// pose, misfit.
-    fn refine(&self, query: &Seen, candidate: &Seen, start: Motion) -> Option<(Motion, Matrix4<f64>, f64)> {
+    fn refine(
+        &self,
+        query: &Seen,
+        candidate: &Seen,
+        start: Motion,
+        steps: usize,
+    ) -> Option<(Motion, Matrix4<f64>, f64)> {
         let level = TILT_SIGMA.powi(-2);
         let mut motion = start;
         let (mut h, mut sum) = (Matrix6::zeros(), 0.0);
-        for iteration in 0..=ITERATIONS {
+        for round in 0..=steps {
             h = Matrix6::from_diagonal(&Vector6::new(0.0, 0.0, 0.0, 0.0, level, level));
             let mut b = Vector6::new(0.0, 0.0, 0.0, 0.0, level * motion.tilt.x, level * motion.tilt.y);
             let mut weights = 0.0;
@@ -282,14 +291,14 @@ impl Verifier {
                 weights += 3.0 * weight;
             }
             sum /= f64::max(weights - 4.0, 1.0);
-            if iteration == ITERATIONS {
+            if round == steps {
                 break;
             }
             let step = h.cholesky()?.solve(&b);
             let Motion { pose: Pose4 { p, yaw }, tilt, .. } = motion;
             let pose = Pose4 { p: p - DVec3::new(step[0], step[1], step[2]), yaw: wrapped(yaw - step[3]) };
             motion = Motion::new(pose, tilt - DVec2::new(step[4], step[5]));
-            if step.norm() < 1e-9 {
+            if step.norm() < CONVERGED {
                 break;
             }
         }
