@@ -165,17 +165,12 @@ pub fn conclude(title: Title, mut flown: Flown, logged: &[PathBuf], out: &Output
 }
 
 /// What a later run would miss: places that are not on the disk, or are in another frame than those of earlier runs.
-fn place_warnings(stats: &Stats) -> Vec<String> {
-    let mut warnings = vec![];
-    if stats.places_unkept > 0 {
-        let n = stats.places_unkept;
-        warnings.push(format!("places/: {n} places could not be written: a later run will not find itself there; check the folder and the disk"));
-    }
-    if stats.places_read > 0 && stats.epochs_joined == 0 {
-        let what = "no place of the earlier runs in this folder was recognised: trajectory.tum is in a frame of its own, not in that of their map";
-        warnings.push(what.into());
-    }
-    warnings
+fn place_warnings(stats: &Stats) -> impl Iterator<Item = String> {
+    let n = stats.places_unkept;
+    let unkept = format!("places/: {n} places could not be written: a later run will not find itself there; check the folder and the disk");
+    let apart = "no place of the earlier runs in this folder was recognised: trajectory.tum is in a frame of its own, not in that of their map";
+    let is_apart = stats.places_read > 0 && stats.epochs_joined == 0;
+    (n > 0).then_some(unkept).into_iter().chain(is_apart.then(|| apart.into()))
 }
 
 fn warn(warnings: &mut Vec<String>, what: String) {
