@@ -154,16 +154,8 @@ fn a_tilt_that_is_found_later_is_on_the_disk() {
         sim.render(i, &mut frames);
         let (t, truth) = (frames.t, sim.truth_at(sim.taken(i)).pose);
         let odom_from_body = Pose::new(DQuat::from_rotation_x(tilt) * truth.q, truth.p);
-        let (frames, window_now) = (&Arc::new(frames), &window[..]);
-        loops.add(&LoopKeyframe {
-            t,
-            frames,
-            id: None,
-            epoch: 0,
-            odom_from_body,
-            window: window_now,
-            body_from_cam: None,
-        });
+        let (frames, id, epoch, body_from_cam) = (&Arc::new(frames), None, 0, None);
+        loops.add(&LoopKeyframe { t, frames, id, epoch, odom_from_body, window: &window, body_from_cam });
         window.push((t, truth));
     }
     assert_eq!(loops.stats.places_unkept, 0);

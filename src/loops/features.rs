@@ -14,8 +14,8 @@ use stipple_drivers::{Calibration, Camera, Fault, Frames, Image, Pose};
 
 /// Features of a keyframe at most.
 pub const FEATURES: usize = TRACKS;
-/// Deviation of a corner that was aligned in another image, px: what depths are worth. In simulated images two of three err by less than
-/// 0.06; with 0.15 fewer places of V1_01, which is real, are recognised.
+/// Deviation of a corner that was aligned in another image, px: what depths are worth. In simulated images two of three err by
+/// less than 0.06; with 0.15 fewer places of V1_01, which is real, are recognised.
 const ALIGNED_SIGMA_PX: f64 = 0.25;
 /// Depths are worth nothing beyond this share of deviation.
 const RELATIVE_SIGMA_MAX: f64 = 0.5;

@@ -58,6 +58,11 @@ impl Loops {
         self.places.iter().any(|p| p.used && p.frame != self.frame)
     }
 
+    /// Whether the vehicle is in the map of an earlier flight.
+    pub fn is_in_earlier_map(&self) -> bool {
+        self.has_kept(self.frame)
+    }
+
     /// Writes where places are by now, if they have moved.
     pub fn keep_poses(&mut self) {
         let places = self.places.iter().enumerate().filter(|(_, p)| p.used);
@@ -77,7 +82,7 @@ impl Loops {
         }
     }
 
-    /// Writes where places are by now, once in a while.
+    /// Does so once in `POSES_KEPT_S`.
     pub(super) fn keep_poses_in_time(&mut self, t: Nanos) {
         if (t - self.poses_kept).secs().abs() >= POSES_KEPT_S {
             self.poses_kept = t;
@@ -90,8 +95,7 @@ impl Loops {
     pub(super) fn link(&mut self, edge: &Edge, beside: &[Verification]) -> bool {
         let [a, b] = [edge.from, edge.to].map(|n| self.places[n as usize].frame);
         let joins = a != b;
-        let kept = |frame: u32| (0..self.places.len()).any(|n| self.is_kept(n, frame));
-        let [a_kept, b_kept] = [a, b].map(kept);
+        let [a_kept, b_kept] = [a, b].map(|frame| self.has_kept(frame));
         if joins && a_kept && b_kept {
             self.stats.epochs_refused += 1;
             return false;
@@ -132,10 +136,10 @@ impl Loops {
         true
     }
 
-    /// Whether a node is a place of an earlier flight in a frame.
-    fn is_kept(&self, node: usize, frame: u32) -> bool {
-        let place = &self.places[node];
-        place.used && place.frame == frame && self.graph.is_fixed(node as u16)
+    /// Whether places of an earlier flight are in a frame.
+    fn has_kept(&self, frame: u32) -> bool {
+        let mut places = self.places.iter().enumerate();
+        places.any(|(n, place)| place.used && place.frame == frame && self.graph.is_fixed(n as u16))
     }
 
     /// Covariance of a node's pose in its map; that of nothing where it is not known.

@@ -171,8 +171,8 @@ pub fn read(folder: &Path, calibration: &Calibration) -> Result<Kept, Fault> {
     let mut warnings = reader.warnings().to_vec();
     let damaged = (records - places.len()) as u64 + reader.damaged();
     if damaged > 0 {
-        let (n, place) = (places.len(), folder.display());
-        warnings.push(format!("{place}: {damaged} records are damaged and left out; {n} places can be read"));
+        let (whole, folder) = (places.len(), folder.display());
+        warnings.push(format!("{folder}: {damaged} records are damaged and left out; {whole} places can be read"));
     }
     Ok(Kept { places, warnings })
 }

@@ -55,7 +55,7 @@ const KEPT_SIGMA: [f64; 2] = [0.05, 0.005];
 /// Candidates by place are nearer than this, m, and look within this angle of the same direction, rad.
 const NEAR_M: f64 = 3.0;
 const NEAR_RAD: f64 = 0.8;
-/// A tilt that changes at once by more than this is written to the disk again, rad: a third of what a verification allows.
+/// A tilt that one keyframe corrects by more than this is written to the disk again, rad: a third of what a verification allows.
 const TILT_KEPT: f64 = 0.001;
 
 counters! {
@@ -110,9 +110,9 @@ pub struct Place {
     pub t: Nanos,
     pub id: Option<u64>,
     pub epoch: Epoch,
-    /// First estimate of the pose of the upright frame in `odom`, which is what a run told others, and the newest of what turns
-    /// the body upright.
+    /// Pose of the upright frame in `odom` by the first estimate, which is the one that the run published.
     pub odom: Pose4,
+    /// Rotation of the body in its upright frame, by the newest estimate.
     pub tilt: DQuat,
     /// Number of its map frame. Poses of places with the same number can be compared.
     frame: u32,
@@ -179,9 +179,9 @@ impl Corrections {
     }
 }
 
-/// Upright pose and tilt of a keyframe by the newest estimate of it, where the estimator's window still holds that. Yaw and tilt
-/// are parted as they were for the place: with a camera that looks ahead and a body whose x points up, a corrected roll would
-/// otherwise count as yaw.
+/// Upright pose and tilt of a place by the newest estimate of its keyframe; `None` where the estimator's window no longer holds
+/// it. Yaw is the turn about z since the tilt that the place has: `Pose4::upright` of the new pose alone would take a corrected
+/// roll for yaw where the body's x points up.
 fn newest_estimate(window: &[(Nanos, Pose)], place: &Place) -> Option<(Pose4, DQuat)> {
     let (_, pose) = window.iter().find(|(at, _)| *at == place.t)?;
     let (upright, more) = Pose4::upright(&Pose::new(pose.q * place.tilt.inverse(), pose.p));
@@ -364,29 +364,27 @@ impl Loops {
     /// Measures the odometry between the newest keyframes again, from what the estimator's window says of them by now: it has
     /// seen what came after them.
     fn measure_again(&mut self, window: &[(Nanos, Pose)]) {
-        let mut nodes: List<u16, FRAMES> = List::default();
+        let mut nodes: List<(u16, Pose4, DQuat), FRAMES> = List::default();
         let mut at = self.last;
-        while let Some(node) = at.filter(|n| newest_estimate(window, &self.places[*n as usize]).is_some()) {
-            if nodes.push(node).is_err() {
+        while let Some(node) = at {
+            let Some((upright, tilt)) = newest_estimate(window, &self.places[node as usize]) else { break };
+            if nodes.push((node, upright, tilt)).is_err() {
                 break;
             }
             at = self.graph.before(node);
         }
-        let estimates = |n: u16| newest_estimate(window, &self.places[n as usize]);
         let mut moved: List<(u16, Pose4), FRAMES> = List::default();
         for pair in nodes.windows(2).rev() {
-            let [Some((to, _)), Some((from, _))] = [pair[0], pair[1]].map(estimates) else { continue };
-            let _ = moved.push((pair[0], from.between(&to)));
+            let [(to, newer, _), (_, older, _)] = [pair[0], pair[1]];
+            let _ = moved.push((to, older.between(&newer)));
         }
         self.graph.measure_again(&moved);
         self.poses_moved |= !moved.is_empty();
-        for n in nodes.iter() {
-            let place = &mut self.places[*n as usize];
-            let was = place.tilt;
-            place.tilt = newest_estimate(window, place).map_or(was, |(_, tilt)| tilt);
-            // While the estimator converges: what is on disk is of no use to a later flight.
-            if place.tilt.angle_between(was) > TILT_KEPT {
-                self.keep(*n);
+        for (node, _, tilt) in nodes.iter() {
+            let was = std::mem::replace(&mut self.places[*node as usize].tilt, *tilt);
+            // A later flight would verify places with a tilt from before the estimator had converged.
+            if tilt.angle_between(was) > TILT_KEPT {
+                self.keep(*node);
             }
         }
     }

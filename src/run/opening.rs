@@ -95,9 +95,9 @@ pub fn sinks(
             let (what, fix) = ("no place is recognised without loops", "set loops.enabled = true");
             return Err(Fault::new(FaultKind::Config, "loops.enabled", what, fix));
         }
-        Some(Ok((0, warnings))) if read_only => {
-            let what = ["there is no place of an earlier run to be found in".into()];
-            let what = what.into_iter().chain(warnings).collect::<Vec<String>>().join("; ");
+        Some(Ok((0, mut warnings))) if read_only => {
+            warnings.insert(0, "there is no place of an earlier run to be found in".into());
+            let what = warnings.join("; ");
             let fix = "name the --out folder of a run whose board has store.enabled and loops.enabled";
             return Err(Fault::new(FaultKind::NoInput, out.path().display().to_string(), what, fix));
         }

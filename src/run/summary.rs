@@ -5,7 +5,7 @@ use super::mapping::{Drawn, MapResult};
 use super::memory::mib;
 use super::tracking::{OdometryRun, Tracker};
 use super::Flown;
-use crate::loops::{Closure, Corrections, Stats};
+use crate::loops::{Closure, Corrections, Loops};
 use crate::mem;
 use crate::output::html::{write_html, Evidence};
 use crate::output::metrics::{percentile, trajectory_error};
@@ -142,7 +142,7 @@ pub fn conclude(title: Title, mut flown: Flown, logged: &[PathBuf], out: &Output
     if !map.as_ref().is_some_and(|m| m.written) {
         fault = fault.or(out.remove("map.ply").err());
     }
-    flown.loops.iter().flat_map(|loops| place_warnings(&loops.stats)).for_each(|what| warn(&mut flown.warnings, what));
+    flown.loops.iter().flat_map(|loops| place_warnings(loops)).for_each(|what| warn(&mut flown.warnings, what));
     if flown.tracker.odometry().is_some_and(|run| run.back.trajectory.is_empty()) {
         let why = "no frame got a pose, odometry never started: its health and the counters in report.json say why";
         warn(&mut flown.warnings, why.into());
@@ -165,11 +165,11 @@ pub fn conclude(title: Title, mut flown: Flown, logged: &[PathBuf], out: &Output
 }
 
 /// What a later run would miss: places that are not on the disk, or are in another frame than those of earlier runs.
-fn place_warnings(stats: &Stats) -> impl Iterator<Item = String> {
-    let n = stats.places_unkept;
+fn place_warnings(loops: &Loops) -> impl Iterator<Item = String> {
+    let n = loops.stats.places_unkept;
     let unkept = format!("places/: {n} places could not be written: a later run will not find itself there; check the folder and the disk");
     let apart = "no place of the earlier runs in this folder was recognised: trajectory.tum is in a frame of its own, not in that of their map";
-    let is_apart = stats.places_read > 0 && stats.epochs_joined == 0;
+    let is_apart = loops.stats.places_read > 0 && !loops.is_in_earlier_map();
     (n > 0).then_some(unkept).into_iter().chain(is_apart.then(|| apart.into()))
 }
 
