@@ -37,7 +37,7 @@ use geometry::RigGeometry;
 use patch::{take_stack, Stack, Warp, STEP_MIN};
 use points::{distance, Point, Points, FINE_LEVELS};
 use pyramid::FramePyramids;
-pub use pyramid::Levels;
+pub use pyramid::{Levels, Pyramid};
 use search::{Limits, Search};
 use std::sync::Arc;
 use stipple_drivers::{counters, Calibration, Fault, FaultKind, Frames, Image, Nanos, Pose};
@@ -231,6 +231,30 @@ impl Frontend {
     /// The pyramid that was built last from an image of a camera.
     pub fn levels<'a>(&'a self, camera: usize, image: &'a Image) -> Levels<'a> {
         self.now.pyramids[camera].over(image)
+    }
+
+    /// Hands out the pyramid that was built last from an image of camera 0, in exchange for another one.
+    pub fn exchange_pyramid(&mut self, pyramid: &mut Pyramid) {
+        std::mem::swap(&mut self.now.pyramids[0], pyramid);
+    }
+
+    /// Finds in an earlier image of camera 0 what is at `px` of `image`, its newest one, at an inverse distance, 1/m. Answers the
+    /// pixel; `None` where nothing there looks the same.
+    pub fn find_earlier(
+        &mut self,
+        image: &Image,
+        (earlier, earlier_from_now): (&Levels, &Pose),
+        px: [f32; 2],
+        inverse_depth: f64,
+    ) -> Option<[f32; 2]> {
+        let motion = self.rig.motion(0, &earlier_from_now.inverse());
+        let start = self.rig.transfer(0, 0, &motion, px, inverse_depth)?;
+        let from = self.now.pyramids[0].over(image);
+        take_stack(&mut self.source, &from, px, 0..FINE_LEVELS);
+        let search = Search { from, to: *earlier, px, start, coarsest: FINE_LEVELS - 1, limits: self.limits };
+        let (found, left) = search.find(&self.source[..FINE_LEVELS])?;
+        let alike = left <= UNEXPLAINED_MATCH_MAX && search.returns(&mut self.scratch, found, found.px());
+        alike.then_some(found.px())
     }
 
     /// Drops the points that the estimator rejected, so that what moves by itself does not keep its places: the cells rest.

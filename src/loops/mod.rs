@@ -302,12 +302,17 @@ impl Loops {
             return None;
         }
         let up = keyframe.odom_from_body.q.inverse() * DVec3::Z;
-        let (features, rays) = &mut self.query;
-        self.extractor.extract(keyframe.frames, up, keyframe.body_from_cam.as_ref(), features);
-        let camera = self.extractor.rays(features, tilt, rays);
         let epoch = Epoch { flight: self.flight, number: keyframe.epoch };
-        let before = self.last.map(|n| self.places[n as usize].epoch);
-        if before.is_some_and(|before| before != epoch) {
+        let before = self.last.map(|n| self.places[n as usize]);
+        let before_from_now = before.filter(|p| p.epoch == epoch).map(|place| {
+            let (upright, tilt) = newest_estimate(keyframe.window, &place).unwrap_or((place.odom, place.tilt));
+            let odom_from_before = upright.pose() * Pose::new(tilt, DVec3::ZERO);
+            (place.t, odom_from_before.inverse() * keyframe.odom_from_body)
+        });
+        let (features, rays) = &mut self.query;
+        self.extractor.extract(keyframe.frames, up, keyframe.body_from_cam.as_ref(), before_from_now, features);
+        let camera = self.extractor.rays(features, tilt, rays);
+        if before.is_some_and(|before| before.epoch != epoch) {
             (self.frame, self.next_frame) = (self.next_frame, self.next_frame + 1);
             (self.last, self.map_from_odom.epoch) = (None, keyframe.epoch);
         }
