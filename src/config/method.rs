@@ -11,8 +11,8 @@ section! {
     /// 1: tracker and estimator take turns; 2: a thread each, with the same poses bit for bit. Take 1 on a board whose other
     /// cores are busy.
     threads: u32 = 2, Bound::Within(1.0, 2.0);
-    /// Side of a detection cell, at most; one point is followed in each. Larger cells take less CPU time and lose accuracy: 80 px
-    /// take six tenths of the time for nearly twice the error. An image has 54 cells at least: those of 376x240 are of 40 px.
+    /// Side of a detection cell; one point is followed in each. Larger cells take less CPU time and lose accuracy: 80 px take
+    /// six tenths of the time for nearly twice the error.
     grid_px: u32 = 60, Bound::Within(16.0, 200.0);
     /// Least contrast of a corner, grey levels. Raise it to spend less time on faint corners.
     fast_threshold_min: u32 = 5, Bound::Within(1.0, 255.0);

@@ -12,10 +12,6 @@ use stipple_drivers::Image;
 pub const BORDER: usize = 19;
 /// Widest cell a board file may ask for, px.
 const CELL_MAX: usize = 200;
-/// Cells of an image at least, and their least side, px. Images of 376x240 have 24 of 60 px; with 24, 54 and 96 odometry of three
-/// flights was 32, 28 and 25 mm off in the mean, in 1.5, 2.7 and 4.6 ms of CPU time a frame.
-const CELLS_MIN: usize = 54;
-const CELL_MIN: usize = 16;
 /// A cell whose point was rejected is not looked at for so long, s, 16 frames at 20 Hz: a new point of what moves there would
 /// be a landmark before it is rejected too. Chosen from 0 to 2 s on four flights past a person; neighbours differ little.
 const REST: f64 = 0.775;
@@ -54,7 +50,7 @@ pub struct Detector {
 
 impl Detector {
     pub fn new(width: usize, height: usize, config: &FrontendConfig) -> Detector {
-        let cell = (config.grid_px as usize).min(CELL_MAX).min((width * height / CELLS_MIN).isqrt().max(CELL_MIN));
+        let cell = (config.grid_px as usize).min(CELL_MAX);
         let (columns, rows) = (width / cell, height / cell);
         Detector {
             cell,
@@ -67,11 +63,6 @@ impl Detector {
             threshold: config.fast_threshold.min(255) as u8,
             threshold_min: config.fast_threshold_min.clamp(1, 255) as u8,
         }
-    }
-
-    /// Side of a cell, px.
-    pub fn cell(&self) -> usize {
-        self.cell
     }
 
     /// Marks each cell by the cameras that see its middle.
@@ -291,13 +282,6 @@ mod tests {
             });
             assert_eq!(rested.count(), frames, "{frame_hz} Hz");
         }
-    }
-
-    #[test]
-    fn a_small_image_has_smaller_cells() {
-        let side = |w, h, grid_px| Detector::new(w, h, &FrontendConfig { grid_px, ..FrontendConfig::default() }).cell();
-        assert_eq!([side(752, 480, 60), side(640, 480, 60), side(640, 400, 70)], [60, 60, 68]);
-        assert_eq!([side(376, 240, 60), side(376, 240, 30), side(76, 76, 60), side(76, 76, 16)], [40, 30, 16, 16]);
     }
 
     #[test]

@@ -136,12 +136,11 @@ impl Frontend {
             return Err(Fault::new(FaultKind::Config, "calibration", what, "use a calibration of this rig"));
         }
         let rig = RigGeometry::new(calibration, config.epipolar_max);
-        let detectors: Vec<_> = (0..n).map(|camera| detector(calibration, &rig, camera, config)).collect();
         Ok(Frontend {
-            spacing_px: SPACING * detectors.iter().map(Detector::cell).min().unwrap_or(0) as f32,
-            detectors,
+            detectors: (0..n).map(|camera| detector(calibration, &rig, camera, config)).collect(),
             rig,
             limits: Limits::new(config),
+            spacing_px: SPACING * config.grid_px as f32,
             now: FramePyramids::new(calibration),
             before: FramePyramids::new(calibration),
             seeing: [false; CAMERAS_MAX],
