@@ -254,7 +254,7 @@ impl Frontend {
         let search = Search { from, to: *earlier, px, start, coarsest: FINE_LEVELS - 1, limits: self.limits };
         let (found, left) = search.find(&self.source[..FINE_LEVELS])?;
         let alike = left <= UNEXPLAINED_MATCH_MAX && search.returns(&mut self.scratch, found, found.px());
-        alike.then_some(found.px())
+        Some(found.px()).filter(|px| alike && !self.rig.is_masked(0, *px))
     }
 
     /// Drops the points that the estimator rejected, so that what moves by itself does not keep its places: the cells rest.

@@ -188,6 +188,12 @@ fn newest_estimate(window: &[(Nanos, Pose)], place: &Place) -> Option<(Pose4, DQ
     Some((upright, more * place.tilt))
 }
 
+/// The motion of the body from a place to a keyframe, by the newest estimate of both.
+fn motion_since(place: &Place, keyframe: &LoopKeyframe) -> Pose {
+    let (upright, tilt) = newest_estimate(keyframe.window, place).unwrap_or((place.odom, place.tilt));
+    (upright.pose() * Pose::new(tilt, DVec3::ZERO)).inverse() * keyframe.odom_from_body
+}
+
 /// The loop closure of one rig.
 pub struct Loops {
     extractor: Extractor,
@@ -304,11 +310,8 @@ impl Loops {
         let up = keyframe.odom_from_body.q.inverse() * DVec3::Z;
         let epoch = Epoch { flight: self.flight, number: keyframe.epoch };
         let before = self.last.map(|n| self.places[n as usize]);
-        let before_from_now = before.filter(|p| p.epoch == epoch).map(|place| {
-            let (upright, tilt) = newest_estimate(keyframe.window, &place).unwrap_or((place.odom, place.tilt));
-            let odom_from_before = upright.pose() * Pose::new(tilt, DVec3::ZERO);
-            (place.t, odom_from_before.inverse() * keyframe.odom_from_body)
-        });
+        let before_from_now =
+            before.filter(|p| p.epoch == epoch).map(|place| (place.t, motion_since(&place, keyframe)));
         let (features, rays) = &mut self.query;
         self.extractor.extract(keyframe.frames, up, keyframe.body_from_cam.as_ref(), before_from_now, features);
         let camera = self.extractor.rays(features, tilt, rays);
@@ -542,5 +545,13 @@ mod tests {
             assert!(((now.pose().q * tilt).dot(second.q).abs() - 1.0).abs() < 1e-12, "{axis}");
         }
         assert!(newest_estimate(&[(Nanos(4), first)], &place).is_none());
+        let moved = Pose::new(DQuat::from_rotation_x(0.3), DVec3::new(0.1, 0.2, 0.4));
+        let newest = Pose::new(DQuat::from_rotation_x(0.02) * first.q, p + DVec3::X);
+        for (window, at) in [(&[(t, newest)][..], newest), (&[], first)] {
+            let (frames, id, body_from_cam) = (&Arc::new(Frames::default()), None, None);
+            let keyframe = LoopKeyframe { t, frames, id, epoch: 0, odom_from_body: at * moved, window, body_from_cam };
+            let off = motion_since(&place, &keyframe).inverse() * moved;
+            assert!(off.p.length() < 1e-9 && off.q.xyz().length() < 1e-9, "{off:?}");
+        }
     }
 }

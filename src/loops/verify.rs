@@ -29,8 +29,8 @@ const DRAWN_SIGMA_MAX: f64 = 0.15;
 pub const MATCHES_MIN: usize = 12;
 /// Steps of a search while it is still found out which corners agree, and of the last one.
 const ITERATIONS: [usize; 2] = [3, 8];
-/// Deviations of depths in the last search, over those that are stated, by which corners agree: in simulated images four depths of
-/// five err by less than 0.4 of those.
+/// Share of the stated deviation of a depth in the last search: in simulated images four depths of five err by less than 0.4 of
+/// what is stated, which is what corners may differ by and still agree.
 const DEPTHS_REFINED: f64 = 0.5;
 /// A step that ends a search: m and rad, far below `FLOOR`.
 const CONVERGED: f64 = 1e-5;
