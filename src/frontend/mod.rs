@@ -238,8 +238,8 @@ impl Frontend {
         std::mem::swap(&mut self.now.pyramids[0], pyramid);
     }
 
-    /// Finds in an earlier image of camera 0 what is at `px` of `image`, its newest one, at an inverse distance, 1/m. Answers the
-    /// pixel; `None` where nothing there looks the same.
+    /// Finds in an earlier image of camera 0 what is at `px` of `image`, its newest one, at an inverse distance, 1/m, by the motion
+    /// of the camera between them. Answers the pixel; `None` where nothing there looks the same.
     pub fn find_earlier(
         &mut self,
         image: &Image,
@@ -247,8 +247,7 @@ impl Frontend {
         px: [f32; 2],
         inverse_depth: f64,
     ) -> Option<[f32; 2]> {
-        let motion = self.rig.motion(0, &earlier_from_now.inverse());
-        let start = self.rig.transfer(0, 0, &motion, px, inverse_depth)?;
+        let start = self.rig.transfer(0, 0, earlier_from_now, px, inverse_depth)?;
         let from = self.now.pyramids[0].over(image);
         take_stack(&mut self.source, &from, px, 0..FINE_LEVELS);
         let search = Search { from, to: *earlier, px, start, coarsest: FINE_LEVELS - 1, limits: self.limits };

@@ -149,7 +149,6 @@ impl Extractor {
         let up = body_from_cam[0].q.inverse() * up;
         let earlier = before_from_now.filter(|(t, _)| before.t == Some(*t)).map(|(_, motion)| Earlier {
             levels: before.pyramid.over(&before.image),
-            body_from_now: motion,
             cam_from_now: body_from_cam[0].inverse() * motion * body_from_cam[0],
         });
         let mut from = [0; CAMERAS_MAX];
@@ -168,8 +167,7 @@ impl Extractor {
             }
             let Some(mut known) = depth.mean() else { continue };
             if let Some(earlier) = &earlier {
-                let found =
-                    frontend.find_earlier(image, (&earlier.levels, &earlier.body_from_now), corner.px, known[0]);
+                let found = frontend.find_earlier(image, (&earlier.levels, &earlier.cam_from_now), corner.px, known[0]);
                 known = found.and_then(|at| earlier.improved(&depth, bearing, at, &cameras[0])).unwrap_or(known);
             }
             let [inverse_depth, sigma] = known;
@@ -204,16 +202,15 @@ impl Extractor {
     }
 }
 
-/// The keyframe before, and the motion since.
+/// Camera 0 in the keyframe before: its image, and its motion since.
 struct Earlier<'a> {
     levels: Levels<'a>,
-    body_from_now: Pose,
     cam_from_now: Pose,
 }
 
 impl Earlier<'_> {
-    /// Inverse depth and deviation, 1/m, of what other cameras know the `depth` of, where it was at the pixel `at`. `None` where
-    /// that contradicts them or the motion.
+    /// Combines the depth of a corner by the other cameras with the pixel at which this image shows it: inverse depth and deviation,
+    /// 1/m. `None` where the two contradict each other.
     fn improved(&self, depth: &Weighted, bearing: DVec3, at: [f32; 2], camera: &Camera) -> Option<[f64; 2]> {
         let [q, sigma] = depth.mean()?;
         let seen = camera.unproject(DVec2::new(at[0] as f64, at[1] as f64))?;
