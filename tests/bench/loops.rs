@@ -8,11 +8,11 @@
 use crate::inputs::{self, Folders};
 use crate::page::{count, millimetres, number, percent, text, Page, Part, Table};
 use crate::relocalise::{against_each_other, against_table, join, joined_table, relocalise, relocalised_table};
-use crate::run::default_board;
+use crate::run::{default_board, settings_for};
 use crate::table;
 use serde_json::json;
 use std::sync::Arc;
-use stipple::config::FrontendConfig;
+use stipple::config::{Board, FrontendConfig};
 use stipple::loops::pose4::{wrapped, Pose4};
 use stipple::loops::{LoopKeyframe, Loops};
 use stipple::output::metrics::percentile;
@@ -193,10 +193,15 @@ pub fn with_mems(mut scenario: Scenario) -> Scenario {
     scenario
 }
 
+/// The board of flights without a map.
+pub fn board_without_map(scenario: &Scenario, set: &[String]) -> Result<Board, Fault> {
+    let set: Vec<String> = std::iter::once("map.enabled=false".into()).chain(settings_for(scenario, set)).collect();
+    default_board(&set)
+}
+
 /// Flies in lockstep without a map.
 fn measure(name: String, scenario: &Scenario, args: &Args, out: &OutputDir) -> Result<Flown, Fault> {
-    let set: Vec<String> = std::iter::once("map.enabled=false".into()).chain(args.set.iter().cloned()).collect();
-    let board = default_board(&set)?;
+    let board = board_without_map(scenario, &args.set)?;
     let scenario = Scenario { duration: scenario.duration.min(Span::from_secs(args.seconds)), ..scenario.clone() };
     let input = Input::simulated(&scenario, |_, _| ())?;
     let truth = input.truth.clone();

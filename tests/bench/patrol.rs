@@ -6,7 +6,7 @@
 
 use crate::loops::with_mems;
 use crate::page::{count, millimetres, number, percent, text, Page, Part, Table};
-use crate::run::default_board;
+use crate::run::{default_board, settings_for};
 use crate::{ply, table};
 use glam::DVec3;
 use serde_json::json;
@@ -30,8 +30,6 @@ use stipple_drivers::{host, Fault, FaultKind, Nanos, Pose, Span, TimedPose};
 const SPACING: Spacing = Spacing { moved_m: 0.5, turned_rad: 0.262, waited_s: 1.0 };
 /// Every so many keyframes one is held out.
 const HOLDOUT: u32 = 8;
-/// The patrol's cameras are small already.
-const SCALE: &str = "map.scale=1";
 /// Time of flight after which memory has to stay level, s.
 const SETTLED_S: f64 = 60.0;
 /// Truth has a pose every 5 ms.
@@ -113,15 +111,15 @@ struct Row {
 }
 
 pub fn run(args: &Args) -> Result<(), Fault> {
-    let set: Vec<String> = std::iter::once(SCALE.to_string()).chain(args.set.iter().cloned()).collect();
-    let board = match &args.board {
-        Some(path) => Board::load(path, &set)?,
-        None => default_board(&set)?,
-    };
     let mut scenario = Scenario::named(&args.scenario).filter(|s| !s.rooms().is_empty()).ok_or_else(|| {
         let fix = "choose patrol, patrol-two, twins or doors";
         Fault::new(FaultKind::Usage, &args.scenario, "is not a flight through a building", fix)
     })?;
+    let set = settings_for(&scenario, &args.set);
+    let board = match &args.board {
+        Some(path) => Board::load(path, &set)?,
+        None => default_board(&set)?,
+    };
     if let Some(s) = args.seconds {
         scenario.duration = scenario.duration.min(Span::from_secs(s));
     }

@@ -4,9 +4,8 @@
 //! other round, with a new estimator, and only find their way (`stipple run --localise-only`).
 
 use crate::inputs::{self, Flight};
-use crate::loops::{is_false, KEYFRAMES};
+use crate::loops::{board_without_map, is_false, KEYFRAMES};
 use crate::page::{count, millimetres, number, percent, text, Table};
-use crate::run::default_board;
 use crate::table;
 use std::path::Path;
 use stipple::config::FrontendConfig;
@@ -41,9 +40,8 @@ pub struct Relocalised {
 
 /// Flies a patrol, and `starts` short flights in its map.
 pub fn relocalise(name: &str, seed: u64, starts: usize, set: &[String], out: &OutputDir) -> Result<Relocalised, Fault> {
-    let set: Vec<String> = std::iter::once("map.enabled=false".into()).chain(set.iter().cloned()).collect();
-    let board = default_board(&set)?;
     let whole = Scenario { seed, ..Scenario::named(name).expect("a scenario") };
+    let board = board_without_map(&whole, set)?;
     let folder = OutputDir::create(&out.file(&format!("{name}-{seed}-places")))?;
     let options = Options { pace: Pace::Lockstep(Steps::PerFrame(1)), fresh: true, ..Options::default() };
     let first = Input::simulated(&whole, |_, _| ())?;
@@ -175,9 +173,8 @@ const BLACK_S: f64 = 4.0;
 const WORSE_MAX_M: f64 = 0.05;
 
 pub fn join(name: &str, seed: u64, set: &[String], out: &OutputDir) -> Result<Joined, Fault> {
-    let set: Vec<String> = std::iter::once("map.enabled=false".into()).chain(set.iter().cloned()).collect();
-    let board = default_board(&set)?;
     let whole = Scenario { seed, ..Scenario::named(name).expect("a scenario") };
+    let board = board_without_map(&whole, set)?;
     let steps = BLACK_AT.map(|at| at * whole.duration.secs()).into_iter();
     let steps = steps.flat_map(|at| [(Span::from_secs(at), 0.0, 0.0), (Span::from_secs(at + BLACK_S), 1.0, 0.0)]);
     let mut black = whole.clone();
