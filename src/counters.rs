@@ -127,6 +127,8 @@ stipple_drivers::counters! {
     /// Steps not taken because their (Gaussian, tile) list overflowed; pictures and steps drawn coarser so that it did not.
     intersections_overflow,
     views_coarsened,
+    /// Training steps that drew and compared their view at half the size (`map.half_size_steps`).
+    steps_at_half_size,
     /// The most (Gaussian, tile) pairs that a picture or a step needed. Where views_coarsened is zero, budget.intersections need
     /// not be larger.
     intersections_most,

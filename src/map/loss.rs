@@ -21,9 +21,9 @@ const _: () = assert!(LOSS_TILE[1] == ssim_tiles::LOCAL[0] / 64 * 4 && loss_tile
 
 #[derive(Clone, Copy)]
 pub struct Buffers {
-    images: Buf<u32>,
-    /// A mask for each camera, and one for a view of which something is absent.
-    masks: Buf<u32>,
+    whole: Images,
+    /// The same at half the size, where steps draw that.
+    half: Option<Images>,
     /// By colour, plane by plane.
     pub pixel_gradient: Buf<f32>,
     pub ssim_sums: Buf<f32>,
@@ -31,13 +31,63 @@ pub struct Buffers {
     pub loss_sums: Buf<[f32; 4]>,
 }
 
+/// The images to train on at one size.
+#[derive(Clone, Copy)]
+struct Images {
+    shape: Shape,
+    words: Buf<u32>,
+    /// A mask for each camera, and one for a view of which something is absent.
+    masks: Buf<u32>,
+}
+
+impl Images {
+    fn new(arena: &mut Arena, shape: Shape, [images, masks]: [&'static str; 2]) -> Result<Images, Fault> {
+        Ok(Images {
+            shape,
+            words: arena.alloc(images, shape.image_words() * (shape.channels * shape.images) as usize)?,
+            masks: arena.alloc(masks, (shape.cameras as usize + 1) * shape.mask_stride())?,
+        })
+    }
+
+    fn size(&self) -> [u32; 2] {
+        [self.shape.width, self.shape.height]
+    }
+
+    fn mask(&self, target: &Target) -> Buf<u32> {
+        self.nth_mask(if target.absent.is_some() { self.shape.cameras } else { target.camera })
+    }
+
+    fn nth_mask(&self, n: u32) -> Buf<u32> {
+        self.masks.part(n as usize * self.shape.mask_stride(), self.shape.image_words())
+    }
+
+    /// Where a target's plane begins among the images, words.
+    fn word_of(&self, target: &Target, channel: u32) -> u32 {
+        (target.image * self.shape.channels + channel) * self.shape.image_words() as u32
+    }
+
+    fn rows(&self) -> Threads {
+        Threads::d1(self.shape.width.div_ceil(RUN) * self.shape.height)
+    }
+
+    fn columns(&self) -> Threads {
+        Threads::d1(self.shape.loss_runs())
+    }
+
+    fn tiles(&self) -> Threads {
+        let [lanes, ..] = ssim_tiles::LOCAL;
+        Threads::d1(self.shape.loss_tiles() * lanes)
+    }
+}
+
 impl Buffers {
     pub fn new(arena: &mut Arena, shape: &Shape) -> Result<Buffers, Fault> {
         let groups = (shape.channels * shape.loss_tiles().max(shape.loss_runs().div_ceil(GROUP))) as usize;
-        let images = (shape.channels * shape.images) as usize;
         Ok(Buffers {
-            images: arena.alloc("keyframes: images", shape.image_words() * images)?,
-            masks: arena.alloc("keyframes: masks", (shape.cameras as usize + 1) * shape.mask_stride())?,
+            whole: Images::new(arena, *shape, ["keyframes: images", "keyframes: masks"])?,
+            half: (shape.halved())
+                .map(|half| Images::new(arena, half, ["keyframes: images, half size", "keyframes: masks, half size"]))
+                .transpose()?,
             pixel_gradient: arena.alloc("pixels: gradient", shape.channels as usize * shape.pixels())?,
             ssim_sums: arena.alloc("pixels: SSIM by workgroup", groups)?,
             loss_sums: arena.alloc("pixels: L1 and exposure gradient by workgroup", groups)?,
@@ -47,13 +97,13 @@ impl Buffers {
 
 pub struct Loss {
     pub buffers: Buffers,
-    shape: Shape,
     filtered: Buf<f32>,
     slopes: Buf<f32>,
-    /// Pixels that count, by camera.
-    valid_pixels: [u32; CAMERAS_MAX],
-    /// An image on its way to the device.
+    /// Pixels that count, by size and camera.
+    valid_pixels: [[u32; CAMERAS_MAX]; 2],
+    /// An image on its way to the device, and one at half the size.
     words: Vec<u32>,
+    halved: Vec<u8>,
     fill_absent: Kernel<fill_absent::K>,
     kernels: Kernels,
 }
@@ -101,11 +151,11 @@ impl Loss {
     ) -> Result<Loss, Fault> {
         let mut loss = Loss {
             buffers,
-            shape: *shape,
             filtered: scratch.filtered,
             slopes: scratch.slopes,
-            valid_pixels: [0; CAMERAS_MAX],
+            valid_pixels: [[0; CAMERAS_MAX]; 2],
             words: Vec::with_capacity(shape.image_words()),
+            halved: Vec::with_capacity(shape.halved_pixels()),
             fill_absent: gpu.kernel_in_pieces(fill_absent::Spec::default())?,
             kernels: Kernels::new(gpu, by_tiles)?,
         };
@@ -114,75 +164,88 @@ impl Loss {
         Ok(loss)
     }
 
-    /// Stores one channel of an image: row-major, stride = width.
+    /// Stores one channel of an image, and the same at half the size: row-major, stride = width.
     pub fn set_plane(&mut self, gpu: &mut Gpu, image: u32, channel: usize, plane: &[u8]) -> Result<(), GpuError> {
-        self.pack(plane);
-        let at = (image as usize * self.shape.channels as usize + channel) * self.shape.image_words();
-        gpu.upload(self.buffers.images, at, &self.words)
+        let Buffers { whole, half, .. } = self.buffers;
+        let at = image as usize * whole.shape.channels as usize + channel;
+        pack(plane, &whole.shape, &mut self.words);
+        gpu.upload(whole.words, at * whole.shape.image_words(), &self.words)?;
+        if let Some(half) = half {
+            halve(plane, whole.shape.width as usize, mean, &mut self.halved);
+            pack(&self.halved, &half.shape, &mut self.words);
+            gpu.upload(half.words, at * half.shape.image_words(), &self.words)?;
+        }
+        Ok(())
     }
 
     /// Stores an image, plane by plane.
     #[cfg(feature = "instruments")]
     pub fn set_image(&mut self, gpu: &mut Gpu, image: u32, planes: &[u8]) -> Result<(), GpuError> {
-        let mut planes = planes.chunks_exact(self.shape.pixels()).enumerate();
+        let mut planes = planes.chunks_exact(self.buffers.whole.shape.pixels()).enumerate();
         planes.try_for_each(|(channel, plane)| self.set_plane(gpu, image, channel, plane))
     }
 
-    /// Pixels that count, of every image of a camera: zero is ignored.
+    /// Pixels that count, of every image of a camera: zero is ignored. At half the size those count that are of four that do.
     pub fn set_mask(&mut self, gpu: &mut Gpu, camera: usize, mask: &[u8]) -> Result<(), GpuError> {
-        self.valid_pixels[camera] = mask.iter().filter(|m| **m != 0).count() as u32;
-        self.pack(mask);
-        gpu.upload(self.buffers.masks, camera * self.shape.mask_stride(), &self.words)
+        let Buffers { whole, half, .. } = self.buffers;
+        let valid = |mask: &[u8]| mask.iter().filter(|m| **m != 0).count() as u32;
+        self.valid_pixels[0][camera] = valid(mask);
+        pack(mask, &whole.shape, &mut self.words);
+        gpu.upload(whole.masks, camera * whole.shape.mask_stride(), &self.words)?;
+        if let Some(half) = half {
+            halve(mask, whole.shape.width as usize, least, &mut self.halved);
+            self.valid_pixels[1][camera] = valid(&self.halved);
+            pack(&self.halved, &half.shape, &mut self.words);
+            gpu.upload(half.masks, camera * half.shape.mask_stride(), &self.words)?;
+        }
+        Ok(())
     }
 
-    fn pack(&mut self, image: &[u8]) {
-        assert_eq!(image.len(), self.shape.pixels(), "images are of the shape the map was made with");
-        self.words.clear();
-        for row in image.chunks_exact(self.shape.width as usize) {
-            self.words.extend(row.chunks(4).map(|c| {
-                let mut b = [0; 4];
-                b[..c.len()].copy_from_slice(c);
-                u32::from_le_bytes(b)
-            }));
-        }
+    /// The images of a target's size.
+    fn images(&self, target: &Target) -> &Images {
+        let Buffers { whole, half, .. } = &self.buffers;
+        half.as_ref().filter(|_| target.half_size).unwrap_or(whole)
     }
 
     /// How many values a target compares: valid pixels, each channel's.
     pub fn values(&self, target: &Target) -> f64 {
-        f64::from(self.valid_pixels[target.camera as usize].max(1) * self.shape.channels)
+        let valid = self.valid_pixels[usize::from(target.half_size)][target.camera as usize];
+        f64::from(valid.max(1) * self.images(target).shape.channels)
     }
 
     /// Workgroups that sum one channel.
-    fn groups(&self) -> u32 {
+    fn groups(&self, target: &Target) -> u32 {
+        let shape = &self.images(target).shape;
         match self.kernels {
-            Kernels::ByRuns { .. } => self.shape.loss_runs().div_ceil(GROUP),
-            Kernels::ByTiles { .. } => self.shape.loss_tiles(),
+            Kernels::ByRuns { .. } => shape.loss_runs().div_ceil(GROUP),
+            Kernels::ByTiles { .. } => shape.loss_tiles(),
         }
     }
 
     /// Sums of a step: those of each channel's workgroups.
-    pub fn sums(&self) -> u32 {
-        self.shape.channels * self.groups()
+    pub fn sums(&self, target: &Target) -> u32 {
+        self.images(target).shape.channels * self.groups(target)
     }
 
     /// Channel by channel: each is an image of its own.
     pub fn record(&self, rec: &mut Recorder, rendered: Buf<f32>, target: &Target, ssim_weight: f32) {
         self.record_fill(rec, rendered, target);
-        for channel in 0..self.shape.channels {
+        for channel in 0..self.images(target).shape.channels {
             self.record_ssim(rec, rendered, target, channel, false);
             self.record_loss(rec, rendered, target, channel, ssim_weight);
         }
     }
 
     fn record_loss(&self, rec: &mut Recorder, rendered: Buf<f32>, target: &Target, channel: u32, ssim_weight: f32) {
-        let (b, size, values) = (&self.buffers, [self.shape.width, self.shape.height], self.values(target) as f32);
-        let (grey, targets, mask) = (rendered.read(), b.images.read(), self.mask(target).read());
+        let (b, images, values) = (&self.buffers, self.images(target), self.values(target) as f32);
+        let (size, grey, targets) = (images.size(), rendered.read(), images.words.read());
+        let mask = images.mask(target).read();
         let (grey_gradient, loss_sums) = (b.pixel_gradient.write(), b.loss_sums.write());
         let push = loss_tiles::Push {
             size,
-            target: self.word_of(target, channel),
+            target: images.word_of(target, channel),
             plane: channel * size[0] * size[1],
-            group: channel * self.groups(),
+            group: channel * self.groups(target),
             exposure: target.exposure.words(),
             l1_weight: (1.0 - ssim_weight) / values,
             ssim_weight: ssim_weight / values,
@@ -190,15 +253,15 @@ impl Loss {
         match &self.kernels {
             Kernels::ByRuns { loss_rows, loss_columns, .. } => {
                 let along = loss_rows::Bind { slopes: self.slopes.read(), filtered: self.filtered.write() };
-                rec.dispatch(loss_rows, along, loss_rows::Push { size }, self.rows());
+                rec.dispatch(loss_rows, along, loss_rows::Push { size }, images.rows());
                 let filtered = self.filtered.read();
                 let bind = loss_columns::Bind { filtered, grey, targets, mask, grey_gradient, loss_sums };
-                rec.dispatch(loss_columns, bind, bytemuck::cast(push), self.columns());
+                rec.dispatch(loss_columns, bind, bytemuck::cast(push), images.columns());
             }
             Kernels::ByTiles { loss, .. } => {
                 let slopes = self.slopes.read();
                 let bind = loss_tiles::Bind { slopes, grey, targets, mask, grey_gradient, loss_sums };
-                rec.dispatch(loss, bind, push, self.tiles());
+                rec.dispatch(loss, bind, push, images.tiles());
             }
         }
     }
@@ -212,7 +275,8 @@ impl Loss {
         target: &Target,
         map: &mut Vec<f32>,
     ) -> Result<(), GpuError> {
-        let (n, channels) = (self.shape.pixels(), self.shape.channels);
+        let shape = &self.images(target).shape;
+        let (n, channels) = (shape.pixels(), shape.channels);
         map.resize(n * channels as usize, 1.0);
         for (channel, plane) in map.chunks_exact_mut(n).enumerate() {
             let mut rec = gpu.record();
@@ -232,24 +296,25 @@ impl Loss {
 
     /// Slopes of SSIM and its sums, or with `map` SSIM by pixel in place of the slopes.
     fn record_ssim(&self, rec: &mut Recorder, rendered: Buf<f32>, target: &Target, channel: u32, map: bool) {
-        let (b, size) = (&self.buffers, [self.shape.width, self.shape.height]);
-        let (grey, targets, mask) = (rendered.read(), b.images.read(), self.mask(target).read());
-        let (slopes, ssim_sums) = (self.slopes.write(), b.ssim_sums.write());
+        let images = self.images(target);
+        let (size, grey, targets) = (images.size(), rendered.read(), images.words.read());
+        let (mask, slopes, ssim_sums) =
+            (images.mask(target).read(), self.slopes.write(), self.buffers.ssim_sums.write());
         let (word, plane, exposure) =
-            (self.word_of(target, channel), channel * size[0] * size[1], target.exposure.words());
-        let group = if map { 0 } else { channel * self.groups() };
+            (images.word_of(target, channel), channel * size[0] * size[1], target.exposure.words());
+        let group = if map { 0 } else { channel * self.groups(target) };
         match &self.kernels {
             Kernels::ByRuns { ssim_rows, ssim_columns, ssim_map, .. } => {
                 let along = ssim_rows::Bind { grey, targets, mask, filtered: self.filtered.write() };
-                rec.dispatch(ssim_rows, along, ssim_rows::Push { size, target: word, plane, exposure }, self.rows());
+                rec.dispatch(ssim_rows, along, ssim_rows::Push { size, target: word, plane, exposure }, images.rows());
                 let across = ssim_columns::Bind { filtered: self.filtered.read(), mask, slopes, ssim_sums };
                 let columns = if map { ssim_map } else { ssim_columns };
-                rec.dispatch(columns, across, ssim_columns::Push { size, group }, self.columns());
+                rec.dispatch(columns, across, ssim_columns::Push { size, group }, images.columns());
             }
             Kernels::ByTiles { ssim, ssim_map, .. } => {
                 let bind = ssim_tiles::Bind { grey, targets, mask, slopes, ssim_sums };
                 let push = ssim_tiles::Push { size, target: word, plane, group, exposure };
-                rec.dispatch(if map { ssim_map } else { ssim }, bind, push, self.tiles());
+                rec.dispatch(if map { ssim_map } else { ssim }, bind, push, images.tiles());
             }
         }
     }
@@ -257,51 +322,57 @@ impl Loss {
     /// Makes the mask of a target of which something is absent, and puts its image behind the picture there. Once for a picture.
     fn record_fill(&self, rec: &mut Recorder, rendered: Buf<f32>, target: &Target) {
         let Some(Absent { hidden, filled }) = target.absent else { return };
+        let images = self.images(target);
         rec.dispatch(
             &self.fill_absent,
             fill_absent::Bind {
-                mask: self.nth_mask(target.camera).read(),
-                targets: self.buffers.images.read(),
+                mask: images.nth_mask(target.camera).read(),
+                targets: images.words.read(),
                 picture: rendered.read_write(),
-                masked: self.mask(target).write(),
+                masked: images.mask(target).write(),
             },
             fill_absent::Push {
-                size: [self.shape.width, self.shape.height],
+                size: images.size(),
                 grid: [COLUMNS as u32, ROWS as u32],
                 hidden: hidden.0,
                 filled: filled.0,
-                target: self.word_of(target, 0),
-                channels: self.shape.channels,
+                target: images.word_of(target, 0),
+                channels: images.shape.channels,
                 open: OPEN,
                 exposure: target.exposure.words(),
             },
-            Threads::d1(self.shape.image_words() as u32),
+            Threads::d1(images.shape.image_words() as u32),
         );
     }
+}
 
-    fn mask(&self, target: &Target) -> Buf<u32> {
-        self.nth_mask(if target.absent.is_some() { self.shape.cameras } else { target.camera })
+/// Words of four pixels, rows padded to whole words.
+fn pack(image: &[u8], shape: &Shape, words: &mut Vec<u32>) {
+    assert_eq!(image.len(), shape.pixels(), "images are of the shape the map was made with");
+    words.clear();
+    for row in image.chunks_exact(shape.width as usize) {
+        words.extend(row.chunks(4).map(|c| {
+            let mut b = [0; 4];
+            b[..c.len()].copy_from_slice(c);
+            u32::from_le_bytes(b)
+        }));
     }
+}
 
-    fn nth_mask(&self, n: u32) -> Buf<u32> {
-        self.buffers.masks.part(n as usize * self.shape.mask_stride(), self.shape.image_words())
+/// Half the size: of two by two pixels `one_of` makes one. An odd row or column is left off.
+fn halve(image: &[u8], width: usize, one_of: fn([u8; 4]) -> u8, half: &mut Vec<u8>) {
+    half.clear();
+    for rows in image.chunks_exact(2 * width) {
+        let (above, below) = rows.split_at(width);
+        let pairs = above.chunks_exact(2).zip(below.chunks_exact(2));
+        half.extend(pairs.map(|(a, b)| one_of([a[0], a[1], b[0], b[1]])));
     }
+}
 
-    /// Where a target's plane begins among the images, words.
-    fn word_of(&self, target: &Target, channel: u32) -> u32 {
-        (target.image * self.shape.channels + channel) * self.shape.image_words() as u32
-    }
+fn mean(four: [u8; 4]) -> u8 {
+    ((four.iter().map(|v| u32::from(*v)).sum::<u32>() + 2) / 4) as u8
+}
 
-    fn rows(&self) -> Threads {
-        Threads::d1(self.shape.width.div_ceil(RUN) * self.shape.height)
-    }
-
-    fn columns(&self) -> Threads {
-        Threads::d1(self.shape.loss_runs())
-    }
-
-    fn tiles(&self) -> Threads {
-        let [lanes, ..] = ssim_tiles::LOCAL;
-        Threads::d1(self.shape.loss_tiles() * lanes)
-    }
+fn least(four: [u8; 4]) -> u8 {
+    four.into_iter().min().unwrap_or(0)
 }

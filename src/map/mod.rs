@@ -146,7 +146,13 @@ impl Mapper {
         f.build("map: rectified view of a fisheye", || RectifiedPair::new(&views, &cameras[0], channels));
         f.build("map: rendering", || Rendered::new(w, h, channels));
         f.build("map: depth, seeds and densification", || Workspace::new(w, h, channels, &board.map));
-        f.build("map: transfers", || (pool::Transfers::new(&shape), Vec::<u32>::with_capacity(shape.image_words())));
+        f.build("map: transfers", || {
+            (
+                pool::Transfers::new(&shape),
+                Vec::<u32>::with_capacity(shape.image_words()),
+                Vec::<u8>::with_capacity(shape.halved_pixels()),
+            )
+        });
         f.extend(buffers(calibration, board)?.footprint());
         Ok(f)
     }
@@ -566,5 +572,6 @@ fn shape(calibration: &Calibration, board: &Board) -> Shape {
         channels: cameras::channels(&board.map) as u32,
         cameras,
         fisheye: board.map.projection == Projection::Fisheye,
+        half_size: board.map.half_size_steps > 0,
     }
 }

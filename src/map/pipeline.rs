@@ -219,14 +219,18 @@ impl Pipeline {
     ) {
         let shape = &self.shape;
         assert!(
-            view.size() == [shape.width, shape.height] && target.image < shape.images,
+            view.size() == [shape.width, shape.height]
+                && target.image < shape.images
+                && (shape.half_size || !target.half_size),
             "training views are of the shape the map was made with"
         );
+        let halved = view.halved();
+        let view = if target.half_size { &halved } else { view };
         let gradient = self.loss.buffers.pixel_gradient;
         self.renderer.record(rec, &self.pool, view, false);
         self.loss.record(rec, self.renderer.buffers.rendered, target, weights.ssim);
         self.backward.record(rec, &self.pool, &self.renderer, gradient, view, rates, weights);
-        self.record_summary(rec, self.loss.sums(), self.pool.slots(view.epoch).end.div_ceil(GROUP));
+        self.record_summary(rec, self.loss.sums(target), self.pool.slots(view.epoch).end.div_ceil(GROUP));
     }
 
     fn record_summary(&self, rec: &mut Recorder, image_groups: u32, splat_groups: u32) {

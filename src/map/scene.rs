@@ -49,13 +49,14 @@ impl Scene {
         View { coarseness, epoch, ..View::new(world_from_body * body_from_cam, camera, fisheye) }
     }
 
-    /// What a step on a stored image compares with.
+    /// What a picture of a stored image is compared with, at its full size.
     pub fn target(&self, index: usize) -> Target {
         Target {
             image: self.views.image(index) as u32,
             camera: self.views.camera(index) as u32,
             exposure: self.views.exposure(index),
             absent: self.views.get(index).absent,
+            half_size: false,
         }
     }
 

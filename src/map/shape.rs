@@ -22,6 +22,8 @@ pub struct Shape {
     pub cameras: u32,
     /// Whether views may be of a fisheye, beside pinholes.
     pub fisheye: bool,
+    /// Whether steps may draw and compare views at half the size, too.
+    pub half_size: bool,
 }
 
 /// Pixels of a run filtered by one thread of the loss on a CPU: RUN of ssim.glsl.
@@ -51,6 +53,16 @@ impl Shape {
 
     pub fn pixels(&self) -> usize {
         self.width as usize * self.height as usize
+    }
+
+    /// The same at half the size, an odd row or column left off; where steps draw that.
+    pub fn halved(&self) -> Option<Shape> {
+        self.half_size.then_some(Shape { width: self.width / 2, height: self.height / 2, ..*self })
+    }
+
+    /// Pixels of an image at half the size.
+    pub fn halved_pixels(&self) -> usize {
+        self.halved().map_or(0, |half| half.pixels())
     }
 
     /// Words of one stored 8-bit image; rows are padded to whole words.
@@ -162,6 +174,7 @@ mod tests {
             channels: 1,
             cameras: 1,
             fisheye: false,
+            half_size: false,
         };
         let mut made = vec![];
         let mut make = |fisheye| {

@@ -18,11 +18,13 @@ pub struct Target {
     pub exposure: Exposure,
     /// Where the map has more than is in the pool; `None` where all that it shows is there.
     pub absent: Option<Absent>,
+    /// Both are drawn and compared at half the size.
+    pub half_size: bool,
 }
 
 impl From<u32> for Target {
     fn from(image: u32) -> Target {
-        Target { image, camera: 0, exposure: Exposure::default(), absent: None }
+        Target { image, camera: 0, exposure: Exposure::default(), absent: None, half_size: false }
     }
 }
 

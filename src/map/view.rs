@@ -102,6 +102,14 @@ impl View {
         usize::from(self.fisheye.is_some())
     }
 
+    /// The same view at half the size: pixels of two by two become one.
+    pub(super) fn halved(&self) -> View {
+        let Pinhole { width, height, fx, fy, cx, cy } = self.camera;
+        let [cx, cy] = [cx, cy].map(|c| 0.5 * (c + 0.5) - 0.5);
+        let camera = Pinhole { width: width / 2, height: height / 2, fx: 0.5 * fx, fy: 0.5 * fy, cx, cy };
+        View { camera, ..*self }
+    }
+
     /// Width and height, px.
     pub(super) fn size(&self) -> [u32; 2] {
         [self.camera.width as u32, self.camera.height as u32]

@@ -442,8 +442,17 @@ mod tests {
     }
 
     fn views(images: u32, cameras: u32) -> Views {
-        let shape =
-            Shape { width: 2, height: 2, splats: 1, intersections: 1, images, channels: 1, cameras, fisheye: false };
+        let shape = Shape {
+            width: 2,
+            height: 2,
+            splats: 1,
+            intersections: 1,
+            images,
+            channels: 1,
+            cameras,
+            fisheye: false,
+            half_size: false,
+        };
         Views::new(&shape, 0)
     }
 

@@ -88,7 +88,8 @@ const MADE: &str = "mean PSNR of all views, dB: ";
 fn one_map_within_one_profile() {
     let name = std::env::var(PROFILE).unwrap();
     let file = BOARDS.iter().find(|(gpu, _)| *gpu == name).map_or("raspberry-pi-5", |(_, file)| file);
-    let mut board = board(file, &["stereo.method=\"sgm\"", "map.scale=1", "store.enabled=false"]);
+    let alike = ["stereo.method=\"sgm\"", "map.scale=1", "map.half_size_steps=5", "store.enabled=false"];
+    let mut board = board(file, &alike);
     board.gpu = limited_to(&name);
     let gpu = Gpu::open(&board.gpu, 1 << 16).unwrap();
     if let (Some(p), DeviceKind::Integrated) = (Profile::of(&name).unwrap(), gpu.caps().kind) {

@@ -72,7 +72,17 @@ pub fn mask(width: usize, height: usize) -> Vec<u8> {
 
 pub fn shape(v: &View, splats: u32, intersections: u32) -> Shape {
     let (width, height) = (v.camera.width as u32, v.camera.height as u32);
-    Shape { width, height, splats, intersections, images: 2, channels: 1, cameras: 1, fisheye: v.fisheye.is_some() }
+    Shape {
+        width,
+        height,
+        splats,
+        intersections,
+        images: 2,
+        channels: 1,
+        cameras: 1,
+        fisheye: v.fisheye.is_some(),
+        half_size: false,
+    }
 }
 
 pub fn open(shape: Shape) -> (Gpu, Pipeline) {
@@ -218,6 +228,48 @@ pub const FAST: LearningRates =
 
 pub fn train(gpu: &mut Gpu, p: &mut Pipeline, v: &View, steps: usize) -> Vec<StepStats> {
     (0..steps).map(|_| p.train(gpu, v, 0, &FAST, &Weights::default()).unwrap()).collect()
+}
+
+/// Of each two by two pixels one, an odd row and column left off.
+fn halved(image: &[u8], width: usize, one_of: fn([u8; 4]) -> u8) -> Vec<u8> {
+    let (w, h) = (width / 2, image.len() / width / 2);
+    let at = |i: usize, dx: usize, dy: usize| image[(2 * (i / w) + dy) * width + 2 * (i % w) + dx];
+    (0..w * h).map(|i| one_of([at(i, 0, 0), at(i, 1, 0), at(i, 0, 1), at(i, 1, 1)])).collect()
+}
+
+#[test]
+fn a_step_at_half_size_is_one_of_a_camera_with_pixels_twice_as_wide() {
+    let (w, h) = (65, 47);
+    let v = view(w, h);
+    let c = v.camera;
+    // The middle of pixel (0, 0) is that of four: (0.5, 0.5).
+    let camera = Pinhole {
+        width: w / 2,
+        height: h / 2,
+        fx: c.fx / 2.0,
+        fy: c.fy / 2.0,
+        cx: (c.cx - 0.5) / 2.0,
+        cy: (c.cy - 0.5) / 2.0,
+    };
+    let small = View { camera, ..v };
+    let (image, seen) = (target(w, h), mask(w, h));
+    let mean = |four: [u8; 4]| (four.iter().map(|p| f64::from(*p)).sum::<f64>() / 4.0 + 0.5) as u8;
+    let all = |four: [u8; 4]| if four.contains(&0) { 0 } else { 255 };
+    let run = |view: &View, shape: Shape, image: &[u8], seen: &[u8], half_size: bool| {
+        let (mut gpu, mut p) = open(shape);
+        p.pool.append(&mut gpu, scene(500, &v, 9)).unwrap();
+        p.loss.set_image(&mut gpu, 0, image).unwrap();
+        p.loss.set_mask(&mut gpu, 0, seen).unwrap();
+        let target = Target { half_size, ..Target::from(0) };
+        let steps: Vec<_> =
+            (0..5).map(|_| p.train(&mut gpu, view, target, &FAST, &Weights::default()).unwrap()).collect();
+        (steps, p.pool.download(&mut gpu).unwrap())
+    };
+    let halves = run(&v, Shape { half_size: true, ..shape(&v, 512, 1 << 16) }, &image, &seen, true);
+    let alone = run(&small, shape(&small, 512, 1 << 16), &halved(&image, w, mean), &halved(&seen, w, all), false);
+    assert!(halves.0[0].loss > 0.0 && halves == alone, "{:?}, {:?}", halves.0, alone.0);
+    let whole = run(&v, Shape { half_size: true, ..shape(&v, 512, 1 << 16) }, &image, &seen, false);
+    assert!(whole == run(&v, shape(&v, 512, 1 << 16), &image, &seen, false) && whole != halves);
 }
 
 #[test]

@@ -175,6 +175,7 @@ fn open(config: &GpuConfig, scene: &Scene, tiling: Tiling, cache: Option<&Path>)
         cameras: 1,
         channels: 1,
         fisheye: false,
+        half_size: false,
     };
     let mut gpu = Gpu::open(config, Pipeline::arena_bytes(&shape)?)?;
     cache.iter().for_each(|folder| _ = gpu.reuse_pipelines(folder));

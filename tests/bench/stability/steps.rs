@@ -132,6 +132,7 @@ fn row(case: &Case) -> Result<Row, Fault> {
         channels: 1,
         cameras: 1,
         fisheye: false,
+        half_size: false,
     };
     let mut gpu = Gpu::open(&GpuConfig::default(), Pipeline::arena_bytes(&shape)?)?;
     let mut p = Pipeline::new(&mut gpu, shape)?;
