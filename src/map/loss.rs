@@ -38,6 +38,8 @@ struct Images {
     words: Buf<u32>,
     /// A mask for each camera, and one for a view of which something is absent.
     masks: Buf<u32>,
+    /// Pixels that count, by camera.
+    valid_pixels: [u32; CAMERAS_MAX],
 }
 
 impl Images {
@@ -46,6 +48,7 @@ impl Images {
             shape,
             words: arena.alloc(images, shape.image_words() * (shape.channels * shape.images) as usize)?,
             masks: arena.alloc(masks, (shape.cameras as usize + 1) * shape.mask_stride())?,
+            valid_pixels: [0; CAMERAS_MAX],
         })
     }
 
@@ -99,8 +102,6 @@ pub struct Loss {
     pub buffers: Buffers,
     filtered: Buf<f32>,
     slopes: Buf<f32>,
-    /// Pixels that count, by size and camera.
-    valid_pixels: [[u32; CAMERAS_MAX]; 2],
     /// An image on its way to the device, and one at half the size.
     words: Vec<u32>,
     halved: Vec<u8>,
@@ -153,7 +154,6 @@ impl Loss {
             buffers,
             filtered: scratch.filtered,
             slopes: scratch.slopes,
-            valid_pixels: [[0; CAMERAS_MAX]; 2],
             words: Vec::with_capacity(shape.image_words()),
             halved: Vec::with_capacity(shape.halved_pixels()),
             fill_absent: gpu.kernel_in_pieces(fill_absent::Spec::default())?,
@@ -187,14 +187,14 @@ impl Loss {
 
     /// Pixels that count, of every image of a camera: zero is ignored. At half the size those count that are of four that do.
     pub fn set_mask(&mut self, gpu: &mut Gpu, camera: usize, mask: &[u8]) -> Result<(), GpuError> {
-        let Buffers { whole, half, .. } = self.buffers;
+        let Buffers { whole, half, .. } = &mut self.buffers;
         let valid = |mask: &[u8]| mask.iter().filter(|m| **m != 0).count() as u32;
-        self.valid_pixels[0][camera] = valid(mask);
+        whole.valid_pixels[camera] = valid(mask);
         pack(mask, &whole.shape, &mut self.words);
         gpu.upload(whole.masks, camera * whole.shape.mask_stride(), &self.words)?;
         if let Some(half) = half {
             halve(mask, whole.shape.width as usize, least, &mut self.halved);
-            self.valid_pixels[1][camera] = valid(&self.halved);
+            half.valid_pixels[camera] = valid(&self.halved);
             pack(&self.halved, &half.shape, &mut self.words);
             gpu.upload(half.masks, camera * half.shape.mask_stride(), &self.words)?;
         }
@@ -209,8 +209,8 @@ impl Loss {
 
     /// How many values a target compares: valid pixels, each channel's.
     pub fn values(&self, target: &Target) -> f64 {
-        let valid = self.valid_pixels[usize::from(target.half_size)][target.camera as usize];
-        f64::from(valid.max(1) * self.images(target).shape.channels)
+        let images = self.images(target);
+        f64::from(images.valid_pixels[target.camera as usize].max(1) * images.shape.channels)
     }
 
     /// Workgroups that sum one channel.

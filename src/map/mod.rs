@@ -49,9 +49,9 @@ mod trainer;
 pub mod view;
 mod views;
 
-use crate::config::{Board, Projection};
+use crate::config::{Board, MapConfig, Projection};
 use crate::counters::Counters;
-use crate::gpu::{cache_folder, Arena, Gpu, GpuError, Timing};
+use crate::gpu::{cache_folder, Arena, DeviceKind, Gpu, GpuError, Timing};
 use crate::mem::Footprint;
 use crate::stereo::{self, Stereo};
 use anchors::{Anchors, Workspace};
@@ -170,6 +170,9 @@ impl Mapper {
         cache_folder().iter().for_each(|folder| _ = gpu.reuse_pipelines(folder));
         let stereo = Stereo::new(calibration, &board.stereo, board.map.scale, Some(&mut gpu))?;
         let config = &board.map;
+        // There a step takes the time of its launches, however few its pixels are.
+        let is_discrete = gpu.caps().kind == DeviceKind::Discrete;
+        let half_size_steps = if is_discrete { 0 } else { config.half_size_steps };
         let shape = shape(calibration, board);
         let (w, h, channels) = (shape.width as usize, shape.height as usize, shape.channels as usize);
         let cameras = cameras::training(&stereo.views, config)?;
@@ -185,7 +188,7 @@ impl Mapper {
         gpu.time_commands(TIMED_IN);
         let known = if place.is_some() { known(board, &shape) } else { 0 };
         let (mut views, rendered) = (Views::new(&shape, known), Rendered::new(w, h, channels));
-        let mut trainer = Trainer::new(config);
+        let mut trainer = Trainer::new(&MapConfig { half_size_steps, ..config.clone() });
         let counters = Counters::default();
         let (mut archive, unkept) = match place.map(|place| Archive::open(place, calibration, board, &shape)) {
             Some(Err(fault)) => (None, Some(fault)),

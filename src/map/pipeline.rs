@@ -66,7 +66,7 @@ pub struct Step {
     /// Its place among the reports.
     place: usize,
     pub view: View,
-    target: Target,
+    pub target: Target,
     ssim_weight: f32,
 }
 

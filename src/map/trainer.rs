@@ -127,7 +127,10 @@ impl Trainer {
         counters.splats_not_finite.add(u64::from(done.stats.failed));
         counters.gradients_rejected.add(u64::from(done.gradients_rejected));
         let entry = scene.views.get_mut(index);
-        entry.coarseness = scene.pipeline.coarseness_after(&done.stats);
+        // A list at half the size has room where a whole one has not.
+        if !(whole && step.target.half_size) {
+            entry.coarseness = scene.pipeline.coarseness_after(&done.stats);
+        }
         entry.steps = entry.steps.saturating_add(1);
         // A step on a picture with holes was not taken, and tells nothing of pose and exposure.
         if whole {

@@ -294,16 +294,13 @@ impl Mapping {
     fn left_out(&self) -> Vec<LeftOut> {
         let steps = (self.iterations, self.training_s);
         let by_time = if self.training_s > 0.0 { self.rested_s * steps.0 as f64 / steps.1 } else { 0.0 };
-        let (counters, away) = (self.mapper.counters(), self.mapper.away());
-        let (covered, at_half_size) = (counters.views_covered.get(), counters.steps_at_half_size.get());
+        let (covered, away) = (self.mapper.counters().views_covered.get(), self.mapper.away());
         let shown = "Stereo depth of keyframes whose view the map shows";
         let rested = "Training steps after images had had their number";
-        let halved = "Training steps at the full size, in place of half of it";
         let on_disk = "Gaussians on disk at the end: neither drawn nor trained";
         vec![
             LeftOut::beside(shown, covered, self.mapper.matched()),
             LeftOut::beside(rested, self.rested + by_time as u64, steps),
-            LeftOut { what: halved.into(), times: at_half_size, of: self.iterations, saved_ms: None },
             LeftOut { what: on_disk.into(), times: away, of: self.mapper.splat_count() as u64, saved_ms: None },
         ]
     }

@@ -21,12 +21,12 @@ const QUICK_FLIGHT_S: f64 = 3.0;
 
 /// Settings of a flight whose images are made at half the cameras' resolution, to be rendered in less time: the map is drawn at
 /// the images' full size, and the tracker's cells are half as wide, so that there are as many points as in whole images.
-const HALF_SIZE: [&str; 2] = ["map.scale=1", "frontend.grid_px=30"];
+const SMALL_IMAGES: [&str; 2] = ["map.scale=1", "frontend.grid_px=30"];
 
 /// The settings that a scenario's images ask for, and after them those given, which may change them.
 pub fn settings_for(scenario: &Scenario, set: &[String]) -> Vec<String> {
-    let half_size: &[&str] = if scenario.image_divisor == 2 { &HALF_SIZE } else { &[] };
-    half_size.iter().map(|s| s.to_string()).chain(set.iter().cloned()).collect()
+    let small: &[&str] = if scenario.image_divisor == 2 { &SMALL_IMAGES } else { &[] };
+    small.iter().map(|s| s.to_string()).chain(set.iter().cloned()).collect()
 }
 
 pub fn default_board(set: &[String]) -> Result<Board, Fault> {

@@ -129,6 +129,9 @@ fn one_map_within_one_profile() {
     println!("{MADE}{psnr:.2}");
     assert!(mapper.device().contains(&name) && mapper.splat_count() > 100);
     assert_eq!(mapper.counters().gpu_failures.get(), 0);
+    // Five on each view, or one more where it was drawn twice in a row.
+    let halved = mapper.counters().steps_at_half_size.get();
+    assert!((20..=30).contains(&halved), "{halved} steps at half the size");
 }
 
 fn psnr_within(profile: &str) -> f64 {

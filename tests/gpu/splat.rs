@@ -252,24 +252,31 @@ fn a_step_at_half_size_is_one_of_a_camera_with_pixels_twice_as_wide() {
         cy: (c.cy - 0.5) / 2.0,
     };
     let small = View { camera, ..v };
-    let (image, seen) = (target(w, h), mask(w, h));
     let mean = |four: [u8; 4]| (four.iter().map(|p| f64::from(*p)).sum::<f64>() / 4.0 + 0.5) as u8;
     let all = |four: [u8; 4]| if four.contains(&0) { 0 } else { 255 };
-    let run = |view: &View, shape: Shape, image: &[u8], seen: &[u8], half_size: bool| {
-        let (mut gpu, mut p) = open(shape);
-        p.pool.append(&mut gpu, scene(500, &v, 9)).unwrap();
-        p.loss.set_image(&mut gpu, 0, image).unwrap();
-        p.loss.set_mask(&mut gpu, 0, seen).unwrap();
-        let target = Target { half_size, ..Target::from(0) };
-        let steps: Vec<_> =
-            (0..5).map(|_| p.train(&mut gpu, view, target, &FAST, &Weights::default()).unwrap()).collect();
-        (steps, p.pool.download(&mut gpu).unwrap())
-    };
-    let halves = run(&v, Shape { half_size: true, ..shape(&v, 512, 1 << 16) }, &image, &seen, true);
-    let alone = run(&small, shape(&small, 512, 1 << 16), &halved(&image, w, mean), &halved(&seen, w, all), false);
-    assert!(halves.0[0].loss > 0.0 && halves == alone, "{:?}, {:?}", halves.0, alone.0);
-    let whole = run(&v, Shape { half_size: true, ..shape(&v, 512, 1 << 16) }, &image, &seen, false);
-    assert!(whole == run(&v, shape(&v, 512, 1 << 16), &image, &seen, false) && whole != halves);
+    let seen = mask(w, h);
+    for channels in [1, 3] {
+        // The second image and camera, so that no offset is zero.
+        let planes: Vec<Vec<u8>> =
+            (0..channels).map(|c| target(w, h).iter().map(|p| p.rotate_left(c)).collect()).collect();
+        let run = |view: &View, half_size: bool, planes: &[Vec<u8>], seen: &[u8], is_half: bool| {
+            let shape = Shape { channels, cameras: 2, half_size, ..shape(view, 512, 1 << 16) };
+            let (mut gpu, mut p) = open(shape);
+            p.pool.append(&mut gpu, scene(500, &v, 9)).unwrap();
+            p.loss.set_image(&mut gpu, 1, &planes.concat()).unwrap();
+            p.loss.set_mask(&mut gpu, 1, seen).unwrap();
+            let target = Target { camera: 1, half_size: is_half, ..Target::from(1) };
+            let mut step = || p.train(&mut gpu, view, target, &FAST, &Weights::default()).unwrap();
+            let steps: Vec<_> = (0..5).map(|_| step()).collect();
+            (steps, p.pool.download(&mut gpu).unwrap())
+        };
+        let small_planes: Vec<_> = planes.iter().map(|plane| halved(plane, w, mean)).collect();
+        let halves = run(&v, true, &planes, &seen, true);
+        let alone = run(&small, false, &small_planes, &halved(&seen, w, all), false);
+        assert!(halves.0[0].loss > 0.0 && halves == alone, "{:?}, {:?}", halves.0, alone.0);
+        let whole = run(&v, true, &planes, &seen, false);
+        assert!(whole == run(&v, false, &planes, &seen, false) && whole != halves);
+    }
 }
 
 #[test]
