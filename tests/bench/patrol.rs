@@ -50,7 +50,7 @@ pub struct Args {
     /// With true poses: the keyframes are those that the map of an earlier patrol in this folder kept
     #[arg(long, value_name = "DIR")]
     keyframes_of: Option<PathBuf>,
-    /// Board file; without it the one for Vulkan on the CPU
+    /// Board file; without it the one for Vulkan on the CPU. Settings for small images come on top: map.scale=1, frontend.grid_px=30
     #[arg(long, value_name = "FILE")]
     board: Option<PathBuf>,
     /// Mapping steps a frame
