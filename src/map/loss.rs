@@ -359,7 +359,7 @@ fn pack(image: &[u8], shape: &Shape, words: &mut Vec<u32>) {
     }
 }
 
-/// Half the size: of two by two pixels `one_of` makes one. An odd row or column is left off.
+/// Writes an image at half the size into `half`: `one_of` makes one pixel of two by two; an odd row or column is left off.
 fn halve(image: &[u8], width: usize, one_of: fn([u8; 4]) -> u8, half: &mut Vec<u8>) {
     half.clear();
     for rows in image.chunks_exact(2 * width) {

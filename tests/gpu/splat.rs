@@ -230,7 +230,7 @@ pub fn train(gpu: &mut Gpu, p: &mut Pipeline, v: &View, steps: usize) -> Vec<Ste
     (0..steps).map(|_| p.train(gpu, v, 0, &FAST, &Weights::default()).unwrap()).collect()
 }
 
-/// Of each two by two pixels one, an odd row and column left off.
+/// Image at half the size: `one_of` makes one pixel of two by two; an odd row or column is left off.
 fn halved(image: &[u8], width: usize, one_of: fn([u8; 4]) -> u8) -> Vec<u8> {
     let (w, h) = (width / 2, image.len() / width / 2);
     let at = |i: usize, dx: usize, dy: usize| image[(2 * (i / w) + dy) * width + 2 * (i % w) + dx];
