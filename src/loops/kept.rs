@@ -134,7 +134,9 @@ pub fn read(folder: &Path, calibration: &Calibration) -> Result<Kept, Fault> {
     }
     let mut reader = match Reader::open(folder) {
         Err(fault) if fault.kind == FaultKind::NoInput => {
-            let is_empty = std::fs::read_dir(folder).is_ok_and(|mut files| files.next().is_none());
+            // A store that was set aside leaves its lock.
+            let is_empty = std::fs::read_dir(folder)
+                .is_ok_and(|mut files| files.all(|file| file.is_ok_and(|file| file.file_name() == store::LOCK)));
             let what = format!(
                 "{}: no place can be read from the files that are there, which stay as they are",
                 folder.display()
@@ -268,6 +270,18 @@ impl Keeper {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_folder_without_a_store_is_told_of_where_something_else_is_in_it() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let calibration = stipple_drivers::sim::Scenario::named("demo").expect("a scenario").calibration;
+        let warnings = || read(folder.path(), &calibration).expect("no store").warnings.len();
+        assert_eq!(warnings(), 0);
+        std::fs::write(folder.path().join(store::LOCK), []).expect("written");
+        assert_eq!(warnings(), 0, "the lock of a store that was set aside");
+        std::fs::write(folder.path().join("0000.seg"), [1; 99]).expect("written");
+        assert_eq!(warnings(), 1);
+    }
 
     #[test]
     fn a_place_is_read_as_it_was_written_and_what_is_none_is_refused() {

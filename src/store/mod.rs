@@ -29,6 +29,7 @@ pub use aside::set_aside;
 pub use disk::Disk;
 pub use reader::Reader;
 pub use record::{size as record_bytes, About, Key, ABOUT};
+pub use scan::LOCK;
 pub use snapshot::{bytes as snapshot_bytes, Snapshot};
 
 use crate::mem::{Footprint, List};
