@@ -103,7 +103,10 @@ pub fn sinks(
         }
         Some(Err(fault)) if read_only => return Err(fault),
         Some(Err(fault)) => {
-            let what = format!("{}; places of this run are not kept, and those of earlier runs not used", fault.what);
+            let what = format!(
+                "{}; places of earlier runs are not used, and those of this run not kept: no later run finds itself in its map",
+                fault.what
+            );
             vec![Fault { what, ..fault }.to_string()]
         }
         Some(Ok((_, warnings))) => warnings,
