@@ -20,7 +20,7 @@ use crate::config::Board;
 use crate::output::OutputDir;
 use crate::run::sensors::Input;
 use crate::run::status::print_out;
-use crate::run::summary::seven_lines;
+use crate::run::summary;
 use crate::run::Outcome;
 use clap::{Args, Parser, Subcommand};
 use std::path::{Path, PathBuf};
@@ -178,7 +178,7 @@ fn open_input(dataset: Option<&Path>, args: &BoardArgs, board: &Board) -> Result
 
 /// Prints what a flight came to.
 fn finish(outcome: Outcome, out: &OutputDir) -> Result<(), Fault> {
-    print_out(seven_lines(&outcome.report, out));
+    print_out(summary::lines(&outcome.report, out));
     outcome.capture.into_iter().for_each(|line| print_out(format_args!("cameras     {line}")));
     outcome.fault.map_or(Ok(()), Err)
 }

@@ -1,4 +1,4 @@
-//! What a finished flight leaves: the end of its log, the report, the files of DIR, seven lines of text.
+//! What a finished flight leaves: the end of its log, the report, the files of DIR, some lines of text.
 
 use super::log::{read, Log};
 use super::mapping::{Drawn, MapResult};
@@ -285,17 +285,19 @@ fn write_files(report: &Report, evidence: &Evidence, drawn: Vec<Drawn>, out: &Ou
     [renders, page, figures].into_iter().find_map(Result::err)
 }
 
-/// Seven lines of figures for a person to read.
-pub fn seven_lines(r: &Report, out: &OutputDir) -> String {
+/// Lines of figures for a person to read.
+pub fn lines(r: &Report, out: &OutputDir) -> String {
     let or_dash = |v: Option<f64>, digits: usize, unit: &str| {
         v.map_or_else(|| "-".to_string(), |v| format!("{v:.digits$} {unit}"))
     };
     let count = |v: Option<u64>| v.map_or_else(|| "-".to_string(), |v| v.to_string());
     let bytes = |v: Option<u64>| or_dash(v.map(mib), 1, "MiB");
+    let counted = |name: &str| r.counted().find(|(n, _)| *n == name).map_or(0, |(_, n)| n);
     format!(
         "trajectory  ATE {}, 1 s: {} {}\n\
          tracking    {} frames ({} dropped), {} a frame, {} at the 99th percentile\n\
          odometry    {} frames/s on {} threads, {} of CPU a frame, {}, quality {}, hash {}\n\
+         loops       {} closed of {} places recognised by {} keyframes; {} epochs joined\n\
          map         {} keyframes, {} anchors, {} Gaussians, {} iterations of {}\n\
          quality     {} PSNR, {} SSIM; held out {} ({} with the exposure fitted, {} with the pose too)\n\
          memory      GPU {}, resident {}, {} heap allocations after the seal\n\
@@ -313,6 +315,10 @@ pub fn seven_lines(r: &Report, out: &OutputDir) -> String {
         bytes(r.estimator_bytes),
         count(r.quality_p50.map(u64::from)),
         r.vio_hash.as_deref().unwrap_or("-"),
+        counted("loops_closed"),
+        counted("loops_recognised"),
+        counted("loop_queries"),
+        counted("epochs_joined"),
         count(r.keyframes),
         count(r.anchors),
         count(r.splats),
