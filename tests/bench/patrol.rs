@@ -255,8 +255,9 @@ fn page(args: &Args, report: &Report, resident: &Resident, rows: Vec<Row>) -> Pa
     let db = |v: Option<f64>| v.map_or("-".into(), |v| format!("{v:.2} dB"));
     let all = format!(
         "{} frames, {} keyframes, {} Gaussians, {} steps; a step {} at the median, {} at the 99th percentile; training {}, \
-         held out {}; resident set {:.1} MiB after {SETTLED_S:.0} s of flight, {:.1} MiB at its end; {} allocations after \
-         boot; {:.1} MiB on the device; ATE {}; {:.0} s in all",
+         held out {}, {} with the pose correction between their neighbours in time; resident set {:.1} MiB after \
+         {SETTLED_S:.0} s of flight, {:.1} MiB at its end; {} allocations after boot; {:.1} MiB on the device; ATE {}; {:.0} s \
+         in all",
         report.frames.unwrap_or(0),
         report.keyframes.unwrap_or(0),
         report.splats.unwrap_or(0),
@@ -265,6 +266,7 @@ fn page(args: &Args, report: &Report, resident: &Resident, rows: Vec<Row>) -> Pa
         ms(report.iteration_ms_p99),
         db(report.quality.psnr_db),
         db(report.quality.psnr_heldout_db),
+        db(report.quality.psnr_heldout_between_db),
         mib(settled),
         mib(last),
         report.heap_after_seal.unwrap_or(0),
@@ -292,6 +294,7 @@ fn page(args: &Args, report: &Report, resident: &Resident, rows: Vec<Row>) -> Pa
             ("iteration_ms_p99", json!(report.iteration_ms_p99)),
             ("psnr_db", json!(report.quality.psnr_db)),
             ("psnr_heldout_db", json!(report.quality.psnr_heldout_db)),
+            ("psnr_heldout_between_db", json!(report.quality.psnr_heldout_between_db)),
             ("rss_settled_bytes", json!(settled)),
             ("rss_last_bytes", json!(last)),
             ("heap_after_seal", json!(report.heap_after_seal)),
