@@ -297,7 +297,7 @@ pub fn lines(r: &Report, out: &OutputDir) -> String {
         "trajectory  ATE {}, 1 s: {} {}\n\
          tracking    {} frames ({} dropped), {} a frame, {} at the 99th percentile\n\
          odometry    {} frames/s on {} threads, {} of CPU a frame, {}, quality {}, hash {}\n\
-         loops       {} closed of {} places recognised by {} keyframes; {} epochs joined\n\
+         loops       {} closed; {} of {} keyframes that looked for a place recognised one; {} epochs joined\n\
          map         {} keyframes, {} anchors, {} Gaussians, {} iterations of {}\n\
          quality     {} PSNR, {} SSIM; held out {} ({} with the exposure fitted, {} with the pose too)\n\
          memory      GPU {}, resident {}, {} heap allocations after the seal\n\
