@@ -12,7 +12,7 @@ use stipple_drivers::Fault;
 pub struct Args {
     #[command(flatten)]
     board: BoardArgs,
-    /// Folder for trajectory, map, renders and report. A map that is there is set aside, in the place of one set aside before
+    /// Folder for trajectory, map, renders and report. A map that is there moves to DIR/previous-map, and the one that was there is deleted
     #[arg(long, value_name = "DIR", default_value = "out/demo")]
     out: PathBuf,
 }

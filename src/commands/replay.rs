@@ -14,7 +14,7 @@ pub struct Args {
     dataset: PathBuf,
     #[command(flatten)]
     board: BoardArgs,
-    /// Folder for trajectory, map, renders and report. A map that is there is set aside, in the place of one set aside before
+    /// Folder for trajectory, map, renders and report. A map that is there moves to DIR/previous-map, and the one that was there is deleted
     #[arg(long, value_name = "DIR", default_value = "out/replay")]
     out: PathBuf,
     #[arg(long, value_enum, default_value = "recorded")]

@@ -272,7 +272,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_folder_without_a_store_is_told_of_where_something_else_is_in_it() {
+    fn reading_a_folder_without_a_store_warns_of_foreign_files_and_not_of_a_lock() {
         let folder = tempfile::tempdir().expect("a folder");
         let calibration = stipple_drivers::sim::Scenario::named("demo").expect("a scenario").calibration;
         let warnings = || read(folder.path(), &calibration).expect("no store").warnings.len();

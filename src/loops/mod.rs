@@ -57,10 +57,9 @@ const NEAR_M: f64 = 3.0;
 const NEAR_RAD: f64 = 0.8;
 /// A tilt that one keyframe corrects by more than this is written to the disk again, rad: a third of what a verification allows.
 const TILT_KEPT: f64 = 0.001;
-
-/// Share of its keyframes that a full graph drops at once: what is dropped changes the graph, so that the next loop has to factor
-/// and search all of it.
-const DROPPED_SHARE: usize = 16;
+/// Number of keyframes of which a full graph drops one, many at a time: after a drop the next loop has to factor and search the
+/// whole graph.
+const ONE_DROPPED_OF: usize = 16;
 
 counters! {
     /// What became of keyframes that looked for a loop.
@@ -362,7 +361,7 @@ impl Loops {
             _ => self.map_from_odom.pose.compose(&odom),
         };
         let node = self.graph.add(pose).or_else(|| {
-            (0..self.places.len().div_ceil(DROPPED_SHARE)).for_each(|_| self.drop_one(last));
+            (0..self.places.len().div_ceil(ONE_DROPPED_OF)).for_each(|_| self.drop_one(last));
             self.graph.add(pose)
         })?;
         if let (Some(n), Some(measured)) = (last, moved) {

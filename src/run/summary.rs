@@ -1,4 +1,4 @@
-//! What a finished flight leaves: the end of its log, the report, the files of DIR, some lines of text.
+//! What a finished flight leaves: the end of its log, the report, the files of DIR, a few lines of text.
 
 use super::log::{read, Log};
 use super::mapping::{Drawn, MapResult};
