@@ -1,6 +1,9 @@
 //! The program as a stranger meets it: bad input is named, explained, and leaves nothing behind.
 #![allow(clippy::unwrap_used)]
 
+mod program;
+
+use program::{flight, text, BOARD};
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
@@ -11,26 +14,13 @@ const NOINPUT: i32 = 66;
 const UNAVAILABLE: i32 = 69;
 const CANTCREATE: i32 = 73;
 const CONFIG: i32 = 78;
-const BOARD: &str = "board-configs/lavapipe.toml";
 
 fn root() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR"))
 }
 
 fn stipple(args: &[&str]) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_stipple")).args(args).current_dir(root()).output().unwrap()
-}
-
-fn text(o: &Output) -> String {
-    String::from_utf8_lossy(&o.stderr).into_owned() + &String::from_utf8_lossy(&o.stdout)
-}
-
-/// A short flight on disk, one for each test that damages it.
-fn flight(dir: &Path, seconds: &str) -> PathBuf {
-    let out = dir.join("flight");
-    let o = stipple(&["sim", "demo", "--out", out.to_str().unwrap(), "--duration", seconds]);
-    assert!(o.status.success(), "{}", text(&o));
-    out
+    program::stipple().args(args).output().unwrap()
 }
 
 fn replay(dataset: &Path, out: &Path, more: &[&str]) -> Output {

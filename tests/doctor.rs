@@ -2,28 +2,18 @@
 //! axis of the gyro turned round, a clock that is off, or its cameras exchanged is told so.
 #![allow(clippy::unwrap_used)]
 
+mod program;
+
+use program::{flight, text, BOARD};
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 
-const BOARD: &str = "board-configs/lavapipe.toml";
 const UNAVAILABLE: i32 = 69;
 const CONFIG: i32 = 78;
 
 fn stipple(args: &[&str]) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_stipple")).args(args).current_dir(env!("CARGO_MANIFEST_DIR")).output().unwrap()
-}
-
-fn text(o: &Output) -> String {
-    String::from_utf8_lossy(&o.stderr).into_owned() + &String::from_utf8_lossy(&o.stdout)
-}
-
-fn flight(dir: &Path, more: &[&str]) -> PathBuf {
-    let out = dir.join("flight");
-    let args = [&["sim", "demo", "--duration", "7", "--out", out.to_str().unwrap()], more].concat();
-    let o = stipple(&args);
-    assert!(o.status.success(), "{}", text(&o));
-    out
+    program::stipple().args(args).output().unwrap()
 }
 
 fn doctor(data: &Path) -> Output {
@@ -66,7 +56,7 @@ fn turn_y_round(data: &Path) {
 #[test]
 fn a_whole_recording_passes_every_check() {
     let dir = tempfile::tempdir().unwrap();
-    let data = flight(dir.path(), &[]);
+    let data = flight(dir.path(), "7");
     let (said, o) = (check(&data), doctor(&data));
     for words in ["time offset", "axes", "extrinsics", "gyro bias", "vertical disparity"] {
         assert_eq!(verdict(&said, words).0, "ok", "{said}");
@@ -93,7 +83,7 @@ fn a_whole_recording_passes_every_check() {
 #[test]
 fn an_axis_turned_round_is_named() {
     let dir = tempfile::tempdir().unwrap();
-    let data = flight(dir.path(), &[]);
+    let data = flight(dir.path(), "7");
     turn_y_round(&data);
     let said = check(&data);
     let (verdict, line) = verdict(&said, "axes");
@@ -103,7 +93,9 @@ fn an_axis_turned_round_is_named() {
 #[test]
 fn a_clock_twenty_milliseconds_off_is_measured() {
     let dir = tempfile::tempdir().unwrap();
-    let data = flight(dir.path(), &["--time-offset", "0.02"]);
+    let data = dir.path().join("flight");
+    let args = ["sim", "demo", "--duration", "7", "--time-offset", "0.02", "--out", data.to_str().unwrap()];
+    assert!(stipple(&args).status.success());
     let said = check(&data);
     let (verdict, line) = verdict(&said, "time offset");
     let mut words = line.split("clock is ").nth(1).unwrap().split(' ');
@@ -115,7 +107,7 @@ fn a_clock_twenty_milliseconds_off_is_measured() {
 #[test]
 fn cameras_exchanged_are_told_and_the_doctor_says_no() {
     let dir = tempfile::tempdir().unwrap();
-    let data = flight(dir.path(), &[]);
+    let data = flight(dir.path(), "7");
     let mav = data.join("mav0");
     for name in ["data", "data.csv"] {
         fs::rename(mav.join("cam0").join(name), mav.join("other")).unwrap();
@@ -139,7 +131,7 @@ fn a_board_without_sensors_is_told_what_to_write() {
 #[test]
 fn each_part_of_a_board_is_looked_for_where_one_is_not_there() {
     let dir = tempfile::tempdir().unwrap();
-    let data = flight(dir.path(), &[]);
+    let data = flight(dir.path(), "7");
     let board = dir.path().join("board.toml");
     let plain = fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join(BOARD)).unwrap();
     let sensors = format!(
@@ -165,7 +157,7 @@ fn each_part_of_a_board_is_looked_for_where_one_is_not_there() {
 #[test]
 fn what_is_missing_of_a_recording_is_said_and_whoever_reads_may_stop() {
     let dir = tempfile::tempdir().unwrap();
-    let data = flight(dir.path(), &[]);
+    let data = flight(dir.path(), "7");
     let images: Vec<PathBuf> = fs::read_dir(data.join("mav0/cam1/data")).unwrap().map(|e| e.unwrap().path()).collect();
     images.iter().step_by(2).for_each(|image| fs::remove_file(image).unwrap());
     let said = check(&data);

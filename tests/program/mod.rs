@@ -2,6 +2,8 @@
 
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output};
+use std::sync::Mutex;
+use std::time::UNIX_EPOCH;
 
 #[allow(dead_code)] // not every binary of tests does
 pub const BOARD: &str = "board-configs/lavapipe.toml";
@@ -47,11 +49,33 @@ pub fn shared_library(source: &str, definitions: &[&str], to: &Path) {
     assert!(compiler.status().unwrap().success(), "{compiler:?}");
 }
 
+/// A copy of a simulated flight in `dir`. One is rendered for each duration and build of the program, in target/tmp.
 #[allow(dead_code)] // not every binary of tests does
 pub fn flight(dir: &Path, seconds: &str) -> PathBuf {
+    static ONE_AT_A_TIME: Mutex<()> = Mutex::new(());
+    let _guard = ONE_AT_A_TIME.lock();
+    let built = std::fs::metadata(env!("CARGO_BIN_EXE_stipple")).unwrap().modified().unwrap();
+    let built = built.duration_since(UNIX_EPOCH).unwrap().as_nanos();
+    let flights = Path::new(env!("CARGO_TARGET_TMPDIR")).join("flights");
+    let rendered = flights.join(format!("{built}/{seconds}"));
+    if !rendered.exists() {
+        remove_all_but(&flights, &built.to_string());
+        let unfinished = flights.join(format!("{built}/{seconds}-{}", std::process::id()));
+        let args = ["sim", "demo", "--duration", seconds, "--out", unfinished.to_str().unwrap()];
+        let o = stipple().args(args).output().unwrap();
+        assert!(o.status.success(), "{}", text(&o));
+        // Another process may have been as quick.
+        assert!(std::fs::rename(&unfinished, &rendered).is_ok() || rendered.exists());
+    }
     let out = dir.join("flight");
-    let args = ["sim", "demo", "--duration", seconds, "--out", out.to_str().unwrap()];
-    let o = stipple().args(args).output().unwrap();
-    assert!(o.status.success(), "{}", text(&o));
+    assert!(Command::new("cp").arg("-r").args([&rendered, &out]).status().unwrap().success());
     out
+}
+
+fn remove_all_but(folder: &Path, name: &str) {
+    for entry in std::fs::read_dir(folder).into_iter().flatten().flatten() {
+        if entry.file_name() != name {
+            let _ = std::fs::remove_dir_all(entry.path());
+        }
+    }
 }
