@@ -405,7 +405,8 @@ mod tests {
     #[test]
     fn error_falls_as_quality_rises() {
         // Few frames lie between 10 and 20: those of a start that is not trusted yet, which may be as good as others.
-        let bins = by_quality(&stability::flights(1), &[20, 65, 100]);
+        let (flights, _) = stability::tests::flown();
+        let bins = by_quality(flights, &[20, 65, 100]);
         assert_eq!(bins.len(), 3);
         for pair in bins.windows(2) {
             let [a, b] = pair else { continue };

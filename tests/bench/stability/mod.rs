@@ -12,7 +12,7 @@ mod mapping;
 mod rendered;
 mod steps;
 #[cfg(test)]
-mod tests;
+pub mod tests;
 
 use crate::consistency::agrees;
 use crate::flight::{record, Plan, Record};
