@@ -206,8 +206,8 @@ impl Frontend {
         self.rig.focal_px() * (angle + self.median_inverse_depth() * prev_from_now.p.length())
     }
 
-    /// Finds corners without any history, and the views of each in all cameras. What was followed before is forgotten, and
-    /// the frame is not kept: its pyramids stay, for `levels`.
+    /// Finds corners of camera 0 without any history, and the views of each in all cameras. What was followed before is forgotten,
+    /// and the frame is not kept: its pyramids stay, for `levels`.
     pub fn detect_anew(&mut self, frames: &Arc<Frames>) -> &Tracks {
         for i in 0..self.points.list.len() {
             (0..self.cameras()).for_each(|camera| _ = self.points.lose(i, camera));
@@ -216,13 +216,11 @@ impl Frontend {
         self.now.frames = frames.clone();
         self.frame += 1;
         self.build_pyramids();
-        for camera in 0..self.cameras() {
-            let (first_new, median) = (self.points.list.len(), self.median_inverse_depth());
-            if self.seeing[camera] {
-                self.detect(camera);
-            }
-            self.find_missing(first_new, median);
+        if self.seeing[0] {
+            self.detect(0);
         }
+        let median = self.median_inverse_depth();
+        self.find_missing(0, median);
         self.publish(frames.t);
         self.now.frames = self.before.frames.clone();
         &self.tracks
