@@ -18,8 +18,6 @@ section! {
     /// Least contrast of a corner, grey levels. Raise it to spend less time on faint corners.
     fast_threshold_min: u32 = 5, Bound::Within(1.0, 255.0);
     tuning
-    /// FAST threshold that detection begins with, grey levels; it is halved down to `fast_threshold_min`.
-    fast_threshold: u32 = 40;
     /// Motion of the view since the last tracked frame, px, below which a frame is left to inertia where odometry is sure; none
     /// is where it is 0.
     carried_px: f64 = 16.0;

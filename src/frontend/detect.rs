@@ -1,8 +1,7 @@
 //! Corners: FAST-9 (Rosten and Drummond, ECCV 2006), the strongest of each free grid cell.
 //!
-//! The score of a pixel is the largest threshold at which it is still a corner, so the strongest
-//! corner of a cell does not depend on the threshold it was found with; halving the threshold
-//! only saves time where there is texture. Ties go to the first in scan order.
+//! The score of a pixel is the largest threshold at which it is still a corner. Every pixel of a cell is scored, many at once,
+//! which takes less time than choosing those that may be corners. Ties go to the first in scan order.
 
 use crate::config::FrontendConfig;
 use crate::math::wide::wide;
@@ -17,8 +16,7 @@ const CELL_MAX: usize = 200;
 const REST: f64 = 0.775;
 /// A frame counts for no longer, s: while frames are missing, no point is looked for either.
 const FRAME_MAX: f64 = 0.05;
-/// Neighbouring pixels of the ring that must differ, and the ring, from the top clockwise.
-const ARC: usize = 9;
+/// The ring, from the top clockwise.
 #[rustfmt::skip]
 const RING: [(isize, isize); 16] = [
     (0, -3), (1, -3), (2, -2), (3, -1), (3, 0), (3, 1), (2, 2), (1, 3),
@@ -45,7 +43,6 @@ pub struct Detector {
     rests: Vec<f64>,
     corners: Vec<Corner>,
     threshold: u8,
-    threshold_min: u8,
 }
 
 impl Detector {
@@ -60,8 +57,7 @@ impl Detector {
             shared: vec![0; columns * rows],
             rests: vec![0.0; columns * rows],
             corners: Vec::with_capacity(columns * rows),
-            threshold: config.fast_threshold.min(255) as u8,
-            threshold_min: config.fast_threshold_min.clamp(1, 255) as u8,
+            threshold: config.fast_threshold_min.clamp(1, 255) as u8,
         }
     }
 
@@ -113,7 +109,7 @@ impl Detector {
             if !self.taken[k] && self.shared[k] & others == 0 {
                 let x = self.origin[0] + (k % self.columns) * self.cell;
                 let y = self.origin[1] + (k / self.columns) * self.cell;
-                let corner = strongest(image, [x, y], self.cell, self.threshold, self.threshold_min);
+                let corner = strongest(image, [x, y], self.cell, self.threshold);
                 self.corners.extend(corner); // one a cell: the capacity is the number of cells
             }
         }
@@ -126,94 +122,77 @@ impl Detector {
     }
 }
 
+/// Pixels of a row that are scored at once.
+const LANES: usize = 32;
+type Lanes = [u8; LANES];
+
 wide! {
-    /// The strongest corner of the square cell at `at`, if any exceeds the least threshold.
-    pub fn strongest<'a>(
-        image: &'a Image,
-        at: [usize; 2],
-        cell: usize,
-        threshold: u8,
-        threshold_min: u8,
-    ) -> Option<Corner> {
-        let mut t = threshold.max(threshold_min);
-        loop {
-            let best = scan(image, at, cell, t);
-            if best.is_some() || t == threshold_min {
-                return best;
-            }
-            t = (t / 2).max(threshold_min);
-        }
-    }
-}
-
-/// The strongest corner whose score exceeds `threshold`.
-#[inline(always)]
-fn scan(image: &Image, at: [usize; 2], cell: usize, threshold: u8) -> Option<Corner> {
-    let w = image.width;
-    let x0 = at[0].max(BORDER);
-    let x1 = (at[0] + cell).min(w.saturating_sub(BORDER));
-    let y1 = (at[1] + cell).min(image.height.saturating_sub(BORDER));
-    let mut best = Corner { x: 0, y: 0, score: threshold };
-    let mut maybe = [false; CELL_MAX];
-    if x0 >= x1 {
-        return None;
-    }
-    for y in at[1].max(BORDER)..y1 {
-        let row = y * w + x0;
-        candidates(&image.pixels, row, w, best.score, &mut maybe[..x1 - x0]);
-        for (x, _) in maybe[..x1 - x0].iter().enumerate().filter(|(_, m)| **m) {
-            let s = score(&image.pixels, row + x, w);
-            if s > best.score {
-                best = Corner { x: x0 + x, y, score: s };
+    /// The strongest corner of the square cell at `at`, if any exceeds the threshold.
+    pub fn strongest<'a>(image: &'a Image, at: [usize; 2], cell: usize, threshold: u8) -> Option<Corner> {
+        let w = image.width;
+        let x0 = at[0].max(BORDER);
+        let x1 = (at[0] + cell).min(w.saturating_sub(BORDER));
+        let y1 = (at[1] + cell).min(image.height.saturating_sub(BORDER));
+        let mut best = Corner { x: 0, y: 0, score: threshold };
+        for y in at[1].max(BORDER)..y1 {
+            for x in (x0..x1).step_by(LANES) {
+                // What lies beyond the cell, or in the next row, is not looked at: the image has `BORDER` rows below.
+                let scores = scores(&image.pixels, y * w + x, w);
+                if scores.iter().fold(0, |most, s| most.max(*s)) <= best.score {
+                    continue;
+                }
+                for (x, score) in (x..x1).zip(scores) {
+                    if score > best.score {
+                        best = Corner { x, y, score };
+                    }
+                }
             }
         }
-    }
-    (best.score > threshold).then_some(best)
-}
-
-/// Marks the pixels of a row that can be corners: an arc of nine of sixteen holds one of every
-/// opposite pair. Four pairs are looked at, many pixels at once.
-#[inline(always)]
-fn candidates(pixels: &[u8], row: usize, stride: usize, threshold: u8, maybe: &mut [bool]) {
-    let n = maybe.len();
-    let ring = |k: usize| {
-        let start = (row as isize + RING[k].1 * stride as isize + RING[k].0) as usize;
-        &pixels[start..start + n]
-    };
-    let centre = &pixels[row..row + n];
-    let (a0, a1, b0, b1) = (ring(0), ring(8), ring(4), ring(12));
-    let (c0, c1, d0, d1) = (ring(2), ring(10), ring(6), ring(14));
-    for i in 0..n {
-        let high = centre[i].saturating_add(threshold);
-        let low = centre[i].saturating_sub(threshold);
-        let brighter = a0[i].max(a1[i]).min(b0[i].max(b1[i])).min(c0[i].max(c1[i])).min(d0[i].max(d1[i]));
-        let darker = a0[i].min(a1[i]).max(b0[i].min(b1[i])).max(c0[i].min(c1[i])).max(d0[i].min(d1[i]));
-        maybe[i] = (brighter > high) | (darker < low);
+        (best.score > threshold).then_some(best)
     }
 }
 
-/// The largest difference exceeded in one direction by nine neighbouring pixels of the ring, or 0.
+/// The largest difference from each of the pixels from `at` on that nine neighbouring pixels of its ring exceed in one direction,
+/// or 0.
 #[inline(always)]
-fn score(pixels: &[u8], at: usize, stride: usize) -> u8 {
-    let c = pixels[at] as i16;
-    let mut d = [0i16; 32];
-    for k in 0..16 {
-        d[k] = pixels[(at as isize + RING[k].1 * stride as isize + RING[k].0) as usize] as i16 - c;
-        d[k + 16] = d[k];
+fn scores(pixels: &[u8], at: usize, stride: usize) -> Lanes {
+    let mut ring = [[0; LANES]; 16];
+    for (lanes, (dx, dy)) in ring.iter_mut().zip(RING) {
+        let from = (at as isize + dy * stride as isize + dx) as usize;
+        lanes.copy_from_slice(&pixels[from..from + LANES]);
     }
-    // Extremes of windows of 2, 4, 8, 9 by doubling.
-    let (mut low, mut high) = (d, d);
-    for step in [1, 2, 4] {
-        for k in 0..32 - step {
-            low[k] = low[k].min(low[k + step]);
-            high[k] = high[k].max(high[k + step]);
-        }
+    // Least and most of windows of two and of four, then of arcs of nine: two of these share eight pixels.
+    let mut two = [([0; LANES], [0; LANES]); 8];
+    for k in 0..8 {
+        let (a, b) = (&ring[2 * k + 1], &ring[(2 * k + 2) % 16]);
+        two[k] = (each(a, b, u8::min), each(a, b, u8::max));
     }
-    let mut best = 0;
-    for k in 0..16 {
-        best = best.max(low[k].min(d[k + ARC - 1])).max(-high[k].max(d[k + ARC - 1]));
+    let mut four = two;
+    for k in 0..8 {
+        let (a, b) = (&two[k], &two[(k + 1) % 8]);
+        four[k] = (each(&a.0, &b.0, u8::min), each(&a.1, &b.1, u8::max));
     }
-    best as u8
+    let (mut brightest, mut darkest) = ([0; LANES], [u8::MAX; LANES]);
+    for k in 0..8 {
+        let (first, last) = (&ring[2 * k], &ring[(2 * k + 9) % 16]);
+        let (a, b) = (&four[k], &four[(k + 2) % 8]);
+        let least = each(&each(&a.0, &b.0, u8::min), &each(first, last, u8::max), u8::min);
+        let most = each(&each(&a.1, &b.1, u8::max), &each(first, last, u8::min), u8::max);
+        (brightest, darkest) = (each(&brightest, &least, u8::max), each(&darkest, &most, u8::min));
+    }
+    let centre = &pixels[at..at + LANES];
+    let mut scores = [0; LANES];
+    for i in 0..LANES {
+        scores[i] = brightest[i].saturating_sub(centre[i]).max(centre[i].saturating_sub(darkest[i]));
+    }
+    scores
+}
+
+#[inline(always)]
+fn each(a: &Lanes, b: &Lanes, of: impl Fn(u8, u8) -> u8) -> Lanes {
+    let mut lanes = *a;
+    (0..LANES).for_each(|i| lanes[i] = of(a[i], b[i]));
+    lanes
 }
 
 #[cfg(test)]
@@ -221,6 +200,8 @@ mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
     use proptest::prelude::*;
+
+    const ARC: usize = 9;
 
     /// The definition, word by word.
     fn is_corner(image: &Image, x: usize, y: usize, t: i32) -> bool {
@@ -260,7 +241,7 @@ mod tests {
                         }
                     }
                 }
-                let got = strongest(&image, cell, 30, 40, 5);
+                let got = strongest(&image, cell, 30, 5);
                 prop_assert_eq!(got.map(|c| (c.x, c.y)), expect);
                 prop_assert_eq!(got.map_or(5, |c| c.score as i32), best);
             }
