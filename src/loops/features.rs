@@ -10,6 +10,7 @@
 use crate::config::FrontendConfig;
 use crate::frontend::{Frontend, Levels, Pyramid};
 use crate::limits::{CAMERAS_MAX, PYRAMID_LEVELS, TRACKS};
+use crate::math::wide::wide;
 use crate::mem::List;
 use glam::{DQuat, DVec2, DVec3, Vec2};
 use std::sync::Arc;
@@ -107,8 +108,7 @@ pub struct Extractor {
     cameras: Vec<Camera>,
     body_from_cam: [Pose; CAMERAS_MAX],
     before: Before,
-    /// Pairs of places in a patch, from -1 to 1.
-    pattern: [[Vec2; 2]; 256],
+    pattern: Pattern,
 }
 
 impl Extractor {
@@ -263,8 +263,11 @@ fn down_in_image(camera: &Camera, bearing: DVec3, up: DVec3) -> Vec2 {
     down
 }
 
+/// Side of the part of a level in which a patch lies, px: half a side of a patch is less than 0.71 of `PATCH_LEVEL_PX` there.
+const BLOCK: usize = 16;
+
 /// Compares the pairs of a patch. `None` where it reaches over the border of the image.
-fn describe(pattern: &[[Vec2; 2]; 256], levels: &Levels, px: Vec2, down: Vec2, radius: f64) -> Option<Descriptor> {
+fn describe(pattern: &Pattern, levels: &Levels, px: Vec2, down: Vec2, radius: f64) -> Option<Descriptor> {
     let level = 1 + (radius / PATCH_LEVEL_PX).log2().round().clamp(0.0, (PYRAMID_LEVELS - 2) as f64) as usize;
     let (scale, r) = (1.0 / (1 << level) as f32, radius as f32);
     let image = levels[level];
@@ -274,29 +277,54 @@ fn describe(pattern: &[[Vec2; 2]; 256], levels: &Levels, px: Vec2, down: Vec2, r
     if centre.min_element() < reach * 0.5 || (limit - centre).min_element() < reach * 0.5 {
         return None;
     }
-    let (x_axis, y_axis) = (Vec2::new(down.y, -down.x) * r * scale, down * r * scale);
-    let at = |p: Vec2| sample(image, (centre + x_axis * p.x + y_axis * p.y).clamp(Vec2::ZERO, limit));
-    let mut descriptor = [0u64; 4];
-    for (k, [a, b]) in pattern.iter().enumerate() {
-        descriptor[k / 64] |= u64::from(at(*a) < at(*b)) << (k % 64);
+    let from = centre.floor() - (BLOCK / 2 - 1) as f32;
+    let mut block = [0; BLOCK * (BLOCK + 2)];
+    for (j, row) in block.chunks_exact_mut(BLOCK).take(BLOCK).enumerate() {
+        let y = (from.y as isize + j as isize).clamp(0, image.height as isize - 1) as usize;
+        let line = &image.pixels[y * image.width..][..image.width];
+        for (i, p) in row.iter_mut().enumerate() {
+            *p = line[(from.x as isize + i as isize).clamp(0, image.width as isize - 1) as usize];
+        }
     }
-    Some(descriptor)
+    Some(compare(pattern, &block, centre - from, down * r * scale))
 }
 
-/// Grey level between pixels, in 1/65536, at a place inside the image.
-#[inline]
-fn sample(image: &Image, p: Vec2) -> u32 {
-    let (x, y) = ((p.x as usize).min(image.width - 2), (p.y as usize).min(image.height - 2));
-    let (u, v) = (((p.x - x as f32) * 256.0) as u32, ((p.y - y as f32) * 256.0) as u32);
-    let row = |y: usize| {
-        let i = y * image.width + x;
-        (256 - u) * image.pixels[i] as u32 + u * image.pixels[i + 1] as u32
-    };
-    (256 - v) * row(y) + v * row(y + 1)
+wide! {
+    /// Compares the pairs around a place in a block. `axis` is the patch's vertical, half a side long, px.
+    fn compare<'a>(pattern: &'a Pattern, block: &'a [u8; BLOCK * (BLOCK + 2)], centre: Vec2, axis: Vec2) -> Descriptor {
+        let mut grey = [[0u32; 256]; 2];
+        for (grey, places) in grey.iter_mut().zip(pattern) {
+            let (mut at, mut u, mut v) = ([0u32; 256], [0u32; 256], [0u32; 256]);
+            for k in 0..256 {
+                // 1/256 of a pixel.
+                let x = ((centre.x + axis.y * places[0][k] + axis.x * places[1][k]) * 256.0) as i32 as u32;
+                let y = ((centre.y - axis.x * places[0][k] + axis.y * places[1][k]) * 256.0) as i32 as u32;
+                (at[k], u[k], v[k]) = ((y >> 8) * BLOCK as u32 + (x >> 8), x & 255, y & 255);
+            }
+            let mut quad = [0u32; 256];
+            for k in 0..256 {
+                let q = at[k] as usize % (BLOCK * BLOCK);
+                let pair = |q: usize| u16::from_le_bytes([block[q], block[q + 1]]) as u32;
+                quad[k] = pair(q) | pair(q + BLOCK) << 16;
+            }
+            for k in 0..256 {
+                let (a, b, c, d) = (quad[k] & 255, quad[k] >> 8 & 255, quad[k] >> 16 & 255, quad[k] >> 24);
+                grey[k] = (256 - v[k]) * ((256 - u[k]) * a + u[k] * b) + v[k] * ((256 - u[k]) * c + u[k] * d);
+            }
+        }
+        let mut descriptor = [0u64; 4];
+        for k in 0..256 {
+            descriptor[k / 64] |= u64::from(grey[0][k] < grey[1][k]) << (k % 64);
+        }
+        descriptor
+    }
 }
+
+/// Places in a patch, from -1 to 1: x and y of the first ones of 256 pairs, and of the second ones.
+type Pattern = [[[f32; 256]; 2]; 2];
 
 /// Pairs of places, denser in the middle: sums of uniform numbers, from a fixed seed, inside the unit circle.
-fn pattern() -> [[Vec2; 2]; 256] {
+fn pattern() -> Pattern {
     let mut state = 0x9e37_79b9_7f4a_7c15u64;
     let mut uniform = || {
         // xorshift64*
@@ -311,13 +339,15 @@ fn pattern() -> [[Vec2; 2]; 256] {
             return p;
         }
     };
-    std::array::from_fn(|_| {
+    let mut pattern = [[[0.0; 256]; 2]; 2];
+    for k in 0..256 {
         let mut pair = [place(), place()];
         while pair[0].distance(pair[1]) < 0.2 {
             pair[1] = place();
         }
-        pair
-    })
+        (0..2).for_each(|i| [pattern[i][0][k], pattern[i][1][k]] = pair[i].to_array());
+    }
+    pattern
 }
 
 #[cfg(test)]
