@@ -11,6 +11,9 @@ const DISPARITY_SLACK_PX: f64 = 2.0;
 /// Least distance of a point, m.
 const DEPTH_MIN: f64 = 0.1;
 
+/// Rays of the middle of a patch and of a pixel beside it.
+pub type PatchRays = (DVec3, Option<DVec3>);
+
 /// The cameras of a rig and where they sit.
 pub struct RigGeometry {
     cameras: Vec<RigCamera>,
@@ -86,23 +89,25 @@ impl RigGeometry {
         self.between[to * self.cameras.len() + from]
     }
 
-    /// Place and rotation in camera `to` of a patch at an inverse distance, 1/m; `None` where it is not seen.
-    pub fn transfer(
-        &self,
-        from: usize,
-        to: usize,
-        to_from_from: &Pose,
-        px: [f32; 2],
-        inverse_depth: f64,
-    ) -> Option<Warp> {
-        let send = |px: [f32; 2]| {
-            let p = to_from_from.q * self.bearing(from, px)? + to_from_from.p * inverse_depth;
-            let at = self.cameras[to].camera.project(p)?;
+    /// Rays of a pixel and of the one that shows how a patch there is turned; `None` where a pixel has none.
+    pub fn rays(&self, camera: usize, px: [f32; 2]) -> Option<PatchRays> {
+        Some((self.bearing(camera, px)?, self.bearing(camera, [px[0] + LEVER_PX, px[1]])))
+    }
+
+    /// Place and rotation in camera `to` of a patch at an inverse distance `q`, 1/m; `None` where it is not seen.
+    pub fn transfer(&self, from: usize, to: usize, to_from_from: &Pose, px: [f32; 2], q: f64) -> Option<Warp> {
+        self.transfer_rays(to, to_from_from, &self.rays(from, px)?, q)
+    }
+
+    /// The same of a patch whose rays are known.
+    pub fn transfer_rays(&self, to: usize, to_from_from: &Pose, rays: &PatchRays, q: f64) -> Option<Warp> {
+        let send = |ray: DVec3| {
+            let at = self.cameras[to].camera.project(to_from_from.q * ray + to_from_from.p * q)?;
             self.cameras[to].camera.contains(at, 0.0).then_some([at.x as f32, at.y as f32])
         };
-        let centre = send(px)?;
+        let centre = send(rays.0)?;
         let mut warp = Warp::upright(centre);
-        if let Some(side) = send([px[0] + LEVER_PX, px[1]]) {
+        if let Some(side) = rays.1.and_then(send) {
             warp.rotate(side[0] - centre[0], side[1] - centre[1]);
         }
         Some(warp)

@@ -219,11 +219,35 @@ impl Frontend {
         if self.seeing[0] {
             self.detect(0);
         }
-        let median = self.median_inverse_depth();
-        self.find_missing(0, median);
+        self.find_views_anew();
         self.publish(frames.t);
         self.now.frames = self.before.frames.clone();
         &self.tracks
+    }
+
+    /// Looks for the other views of corners of camera 0 of which nothing is known: each at the distance of the nearest one that was
+    /// found, over the fine levels; where it is not there, along the epipolar curve.
+    fn find_views_anew(&mut self) {
+        for i in 0..self.points.list.len() {
+            let (found, rest) = self.points.list.split_at(i);
+            let (Some(px), patch) = (rest[0].views[0], rest[0].patches[0]) else { continue };
+            let apart = |p: &Point| p.views[0].map_or(f32::MAX, |[x, y]| (x - px[0]).powi(2) + (y - px[1]).powi(2));
+            let known = found.iter().filter_map(|p| Some((apart(p), p.inverse_depth?)));
+            let q = known.min_by(|a, b| a.0.total_cmp(&b.0)).map_or(INVERSE_DEPTH_START, |(_, q)| q);
+            self.source[..FINE_LEVELS].copy_from_slice(&self.points.patches[0][patch].last);
+            for to in 1..self.cameras() {
+                if !self.seeing[to] {
+                    continue;
+                }
+                let guess = self.rig.transfer(0, to, &self.rig.between(0, to), px, q);
+                let view = guess.and_then(|guess| self.match_view((0, to), px, guess, FINE_LEVELS - 1)).or_else(|| {
+                    take_stack(&mut self.source, &self.now.levels(0), px, FINE_LEVELS..SEARCH_LEVEL + 1);
+                    self.search_curve((0, to), px)
+                });
+                view.into_iter().for_each(|view| self.points.add_view(i, to, view, &self.scratch));
+            }
+            self.gate(i);
+        }
     }
 
     /// The pyramid that was built last from an image of a camera.
@@ -445,6 +469,12 @@ impl Frontend {
         }
         let wait = (2 * point.search_wait[to]).clamp(1, SEARCH_WAIT_MAX);
         (self.points.list[i].search_at[to], self.points.list[i].search_wait[to]) = (self.frame + wait, wait);
+        self.search_curve((from, to), px)
+    }
+
+    /// Searches along the epipolar curve of the other camera for the source patch at `px`.
+    fn search_curve(&mut self, (from, to): (usize, usize), px: [f32; 2]) -> Option<[f32; 2]> {
+        let (relative, rays) = (self.rig.between(from, to), self.rig.rays(from, px)?);
         let template = &self.source[SEARCH_LEVEL];
         if !template.usable() {
             return None;
@@ -453,7 +483,7 @@ impl Frontend {
         let mut best = [(f32::MAX, Warp::default()); SEARCH_TRIES];
         for k in 0..SEARCH_STEPS {
             let q = SEARCH_INVERSE_DEPTH_MAX * k as f64 / (SEARCH_STEPS - 1) as f64;
-            let Some(warp) = self.rig.transfer(from, to, &relative, px, q) else { continue };
+            let Some(warp) = self.rig.transfer_rays(to, &relative, &rays, q) else { continue };
             let small = warp.at_level(SEARCH_LEVEL);
             let Some(left) = template.unexplained(image, &small) else { continue };
             let at = best.partition_point(|b| b.0 <= left);
