@@ -532,6 +532,7 @@ impl Loops {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use stipple_drivers::{Camera, Image, ImuCalibration, Lens, RigCamera};
 
     /// A body whose x points up, as that of EuRoC's rig: a roll that is corrected by 3 degrees is no yaw.
     #[test]
@@ -556,5 +557,28 @@ mod tests {
             let off = motion_since(&place, &keyframe).inverse() * moved;
             assert!(off.p.length() < 1e-9 && off.q.xyz().length() < 1e-9, "{off:?}");
         }
+    }
+
+    #[test]
+    fn a_full_graph_drops_a_sixteenth_of_its_keyframes_where_they_are_closest_together() {
+        const SIZE: usize = 128;
+        let lens = Lens::Radtan { k1: 0.0, k2: 0.0, p1: 0.0, p2: 0.0 };
+        let camera = Camera { width: SIZE, height: SIZE, fx: 100.0, fy: 100.0, cx: 63.5, cy: 63.5, lens };
+        let places = [0.0, 0.1].map(|x| Pose::new(DQuat::IDENTITY, DVec3::new(x, 0.0, 0.0)));
+        let cameras = places.map(|place| RigCamera::new(camera, place)).to_vec();
+        let rig = Calibration { cameras, imu: ImuCalibration::CONSUMER };
+        let mut loops = Loops::new(&rig, &FrontendConfig::default(), 64).expect("a rig");
+        let frames = Arc::new(Frames { t: Nanos(0), images: vec![Image::new(SIZE, SIZE); 2], colours: vec![] });
+        // A metre apart up to the fortieth, a centimetre after it.
+        let x = |k: i64| k.min(39) as f64 + 0.01 * (k - 39).max(0) as f64;
+        for (k, known) in (0..70).zip((1..=64).chain([61, 62, 63, 64, 61, 62])) {
+            let (t, odom_from_body) = (Nanos(k), Pose::new(DQuat::IDENTITY, DVec3::new(x(k), 0.0, 0.0)));
+            let (frames, id, window, body_from_cam) = (&frames, None, &[][..], None);
+            loops.add(&LoopKeyframe { t, frames, id, epoch: 0, odom_from_body, window, body_from_cam });
+            assert_eq!(loops.places().count(), known, "after {k}");
+            let at = |k: i64| loops.places().find(|(place, _)| place.t == Nanos(k)).map(|(_, pose)| pose.p.x);
+            assert!((0..=k).filter(|n| *n < 39 || *n == k).all(|n| at(n).is_some_and(|at| (at - x(n)).abs() < 1e-9)));
+        }
+        assert_eq!(loops.stats.loop_keyframes_dropped, 8);
     }
 }
