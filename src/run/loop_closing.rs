@@ -167,11 +167,13 @@ fn is_moved_by(c: &Closure, least: [f64; 2]) -> bool {
 fn line(c: &Closure) -> Option<String> {
     let ([far, angle], inliers) = (c.moved, c.inliers);
     let moves = format!("poses in the map move by {far:.3} m and {:.2} degrees", angle.to_degrees());
-    is_moved_by(c, TOLD).then(|| match c.joins {
-        Some(_) => format!("place of another epoch recognised by {inliers} corners, both are one map now: {moves}"),
-        None if c.earlier => format!("place of an earlier flight recognised by {inliers} corners: {moves}"),
-        None => format!("place of {:.0} s ago recognised by {inliers} corners: {moves}", (c.t - c.with).secs()),
-    })
+    let of = match c.joins {
+        _ if c.earlier => "an earlier flight".into(),
+        Some(_) => "another epoch".into(),
+        None => format!("{:.0} s ago", (c.t - c.with).secs()),
+    };
+    let joined = if c.joins.is_some() { ", both are one map now" } else { "" };
+    is_moved_by(c, TOLD).then(|| format!("place of {of} recognised by {inliers} corners{joined}: {moves}"))
 }
 
 /// The side of the thread `loops`.
