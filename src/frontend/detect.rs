@@ -1,6 +1,6 @@
 //! Corners: FAST-9 (Rosten and Drummond, ECCV 2006), the strongest of each free grid cell.
 //!
-//! The score of a pixel is the largest threshold at which it is still a corner. Every pixel of a cell is scored, many at once,
+//! The score of a pixel is the least threshold at which it is no corner any more, grey levels. Every pixel of a cell is scored, many at once,
 //! which takes less time than choosing those that may be corners. Ties go to the first in scan order.
 
 use crate::config::FrontendConfig;
@@ -9,8 +9,6 @@ use stipple_drivers::Image;
 
 /// Corners keep this far from the image border, so that coarse levels see most of the patch, px.
 pub const BORDER: usize = 19;
-/// Widest cell a board file may ask for, px.
-const CELL_MAX: usize = 200;
 /// A cell whose point was rejected is not looked at for so long, s, 16 frames at 20 Hz: a new point of what moves there would
 /// be a landmark before it is rejected too. Chosen from 0 to 2 s on four flights past a person; neighbours differ little.
 const REST: f64 = 0.775;
@@ -23,7 +21,7 @@ const RING: [(isize, isize); 16] = [
     (0, 3), (-1, 3), (-2, 2), (-3, 1), (-3, 0), (-3, -1), (-2, -2), (-1, -3),
 ];
 
-/// A corner at an integer pixel, and the largest threshold at which it is one.
+/// A corner at an integer pixel, and the least threshold at which it is none, grey levels.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Corner {
     pub x: usize,
@@ -47,7 +45,7 @@ pub struct Detector {
 
 impl Detector {
     pub fn new(width: usize, height: usize, config: &FrontendConfig) -> Detector {
-        let cell = (config.grid_px as usize).min(CELL_MAX);
+        let cell = config.grid_px as usize;
         let (columns, rows) = (width / cell, height / cell);
         Detector {
             cell,
@@ -136,7 +134,7 @@ wide! {
         let mut best = Corner { x: 0, y: 0, score: threshold };
         for y in at[1].max(BORDER)..y1 {
             for x in (x0..x1).step_by(LANES) {
-                // What lies beyond the cell, or in the next row, is not looked at: the image has `BORDER` rows below.
+                // Scores beyond the cell, which may be of the next row, are left out; `BORDER` rows below hold what is read.
                 let scores = scores(&image.pixels, y * w + x, w);
                 if scores.iter().fold(0, |most, s| most.max(*s)) <= best.score {
                     continue;
@@ -152,8 +150,8 @@ wide! {
     }
 }
 
-/// The largest difference from each of the pixels from `at` on that nine neighbouring pixels of its ring exceed in one direction,
-/// or 0.
+/// The largest difference, in grey levels, from each of the pixels from `at` on that nine neighbouring pixels of its ring reach
+/// in one direction, or 0.
 #[inline(always)]
 fn scores(pixels: &[u8], at: usize, stride: usize) -> Lanes {
     let mut ring = [[0; LANES]; 16];
@@ -161,7 +159,7 @@ fn scores(pixels: &[u8], at: usize, stride: usize) -> Lanes {
         let from = (at as isize + dy * stride as isize + dx) as usize;
         lanes.copy_from_slice(&pixels[from..from + LANES]);
     }
-    // Least and most of windows of two and of four, then of arcs of nine: two of these share eight pixels.
+    // Least and most of windows of two and of four, then of arcs of nine: two neighbouring arcs share eight pixels.
     let mut two = [([0; LANES], [0; LANES]); 8];
     for k in 0..8 {
         let (a, b) = (&ring[2 * k + 1], &ring[(2 * k + 2) % 16]);
@@ -213,8 +211,8 @@ mod tests {
         (0..16).any(|s| (s..s + ARC).all(|k| at(k) > c + t) || (s..s + ARC).all(|k| at(k) < c - t))
     }
 
-    fn noise(seed: u64, contrast: u64, block: usize) -> Image {
-        let mut image = Image::new(96, 90);
+    fn noise([width, height]: [usize; 2], seed: u64, contrast: u64, block: usize) -> Image {
+        let mut image = Image::new(width, height);
         for y in 0..image.height {
             for x in 0..image.width {
                 let cell = (x / block) as u64 * 7919 + (y / block) as u64 * 104729;
@@ -230,18 +228,25 @@ mod tests {
         #![proptest_config(ProptestConfig::with_cases(48))]
         #[test]
         fn strongest_corner_is_that_of_the_definition(seed in any::<u64>(), contrast in 2u64..256, block in 1usize..6) {
-            let image = noise(seed, contrast, block);
-            for cell in [[0, 0], [30, 20], [60, 60]] {
+            // Wider than the pixels that are scored at once, and up to the end of the least image.
+            for ([width, height], cell, side) in [
+                ([96, 90], [0, 0], 30),
+                ([96, 90], [30, 20], 30),
+                ([96, 90], [60, 60], 30),
+                ([96, 90], [21, 18], 70),
+                ([76, 76], [0, 0], 76),
+            ] {
+                let image = noise([width, height], seed, contrast, block);
                 let (mut expect, mut best) = (None, 5);
-                for y in cell[1].max(BORDER)..(cell[1] + 30).min(image.height - BORDER) {
-                    for x in cell[0].max(BORDER)..(cell[0] + 30).min(image.width - BORDER) {
+                for y in cell[1].max(BORDER)..(cell[1] + side).min(height - BORDER) {
+                    for x in cell[0].max(BORDER)..(cell[0] + side).min(width - BORDER) {
                         while is_corner(&image, x, y, best) {
                             best += 1;
                             expect = Some((x, y));
                         }
                     }
                 }
-                let got = strongest(&image, cell, 30, 5);
+                let got = strongest(&image, cell, side, 5);
                 prop_assert_eq!(got.map(|c| (c.x, c.y)), expect);
                 prop_assert_eq!(got.map_or(5, |c| c.score as i32), best);
             }
@@ -250,7 +255,7 @@ mod tests {
 
     #[test]
     fn cells_rest_as_long_at_every_frame_rate_from_twenty_on() {
-        let image = noise(3, 256, 4);
+        let image = noise([96, 90], 3, 256, 4);
         let config = FrontendConfig { grid_px: 20, ..FrontendConfig::default() };
         for (frame_hz, frames) in [(10.0, 16), (20.0, 16), (60.0, 47)] {
             let mut detector = Detector::new(image.width, image.height, &config);
@@ -267,7 +272,7 @@ mod tests {
 
     #[test]
     fn taken_cells_are_skipped_and_full_rooms_keep_the_strongest() {
-        let image = noise(3, 256, 4);
+        let image = noise([96, 90], 3, 256, 4);
         let config = FrontendConfig { grid_px: 20, ..FrontendConfig::default() };
         let mut detector = Detector::new(image.width, image.height, &config);
         let all = detector.detect(&image, std::iter::empty(), 0, 100).0.to_vec();

@@ -214,7 +214,6 @@ impl Frontend {
         }
         self.drop_unseen();
         self.now.frames = frames.clone();
-        self.frame += 1;
         self.build_pyramids();
         if self.seeing[0] {
             self.detect(0);
@@ -225,8 +224,8 @@ impl Frontend {
         &self.tracks
     }
 
-    /// Looks for the other views of corners of camera 0 of which nothing is known: each at the distance of the nearest one that was
-    /// found, over the fine levels; where it is not there, along the epipolar curve.
+    /// Looks for the other views of corners of camera 0 of which nothing is known: each at the distance of the corner nearest in the
+    /// image that has another view, over the fine levels; where it is not there, along the epipolar curve.
     fn find_views_anew(&mut self) {
         for i in 0..self.points.list.len() {
             let (found, rest) = self.points.list.split_at(i);

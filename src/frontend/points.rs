@@ -104,7 +104,7 @@ impl Points {
 
     /// Whether one of the first `n` points is nearer to a pixel of a camera than `spacing_px`.
     pub fn is_near(&self, n: usize, camera: usize, px: [f32; 2], spacing_px: f32) -> bool {
-        // Most are further off along one axis alone, which takes no root to tell.
+        // Most are further off along one axis already: that takes no root.
         let near = |q: [f32; 2]| (0..2).all(|k| (px[k] - q[k]).abs() < spacing_px) && distance(px, q) < spacing_px;
         self.list[..n].iter().any(|p| p.views[camera].is_some_and(near))
     }

@@ -265,6 +265,8 @@ fn down_in_image(camera: &Camera, bearing: DVec3, up: DVec3) -> Vec2 {
 
 /// Side of the part of a level in which a patch lies, px: half a side of a patch is less than 0.71 of `PATCH_LEVEL_PX` there.
 const BLOCK: usize = 16;
+/// Pixels of it, and two rows so that any place that is taken modulo `BLOCK`² is read unchecked, with those beside and below.
+const BLOCK_PIXELS: usize = BLOCK * (BLOCK + 2);
 
 /// Compares the pairs of a patch. `None` where it reaches over the border of the image.
 fn describe(pattern: &Pattern, levels: &Levels, px: Vec2, down: Vec2, radius: f64) -> Option<Descriptor> {
@@ -278,7 +280,7 @@ fn describe(pattern: &Pattern, levels: &Levels, px: Vec2, down: Vec2, radius: f6
         return None;
     }
     let from = centre.floor() - (BLOCK / 2 - 1) as f32;
-    let mut block = [0; BLOCK * (BLOCK + 2)];
+    let mut block = [0; BLOCK_PIXELS];
     for (j, row) in block.chunks_exact_mut(BLOCK).take(BLOCK).enumerate() {
         let y = (from.y as isize + j as isize).clamp(0, image.height as isize - 1) as usize;
         let line = &image.pixels[y * image.width..][..image.width];
@@ -291,7 +293,7 @@ fn describe(pattern: &Pattern, levels: &Levels, px: Vec2, down: Vec2, radius: f6
 
 wide! {
     /// Compares the pairs around a place in a block. `axis` is the patch's vertical, half a side long, px.
-    fn compare<'a>(pattern: &'a Pattern, block: &'a [u8; BLOCK * (BLOCK + 2)], centre: Vec2, axis: Vec2) -> Descriptor {
+    fn compare<'a>(pattern: &'a Pattern, block: &'a [u8; BLOCK_PIXELS], centre: Vec2, axis: Vec2) -> Descriptor {
         let mut grey = [[0u32; 256]; 2];
         for (grey, places) in grey.iter_mut().zip(pattern) {
             let (mut at, mut u, mut v) = ([0u32; 256], [0u32; 256], [0u32; 256]);
