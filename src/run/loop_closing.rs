@@ -172,7 +172,7 @@ fn line(c: &Closure) -> Option<String> {
         Some(_) => "another epoch".into(),
         None => format!("{:.0} s ago", (c.t - c.with).secs()),
     };
-    let joined = if c.joins.is_some() { ", both are one map now" } else { "" };
+    let joined = if c.joins.is_some() { ", the two maps are one now" } else { "" };
     is_moved_by(c, TOLD).then(|| format!("place of {of} recognised by {inliers} corners{joined}: {moves}"))
 }
 
