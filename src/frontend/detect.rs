@@ -1,7 +1,7 @@
 //! Corners: FAST-9 (Rosten and Drummond, ECCV 2006), the strongest of each free grid cell.
 //!
-//! The score of a pixel is the least threshold at which it is no corner any more, grey levels. Every pixel of a cell is scored, many at once,
-//! which takes less time than choosing those that may be corners. Ties go to the first in scan order.
+//! The score of a pixel is the least threshold at which it is no corner any more, grey levels. Every pixel of a cell is scored,
+//! many at once, which takes less time than choosing those that may be corners. Ties go to the first in scan order.
 
 use crate::config::FrontendConfig;
 use crate::math::wide::wide;

@@ -89,7 +89,8 @@ impl RigGeometry {
         self.between[to * self.cameras.len() + from]
     }
 
-    /// Rays of a pixel, and of the one beside it that shows how a patch is turned, where that has one; `None` where the pixel has none.
+    /// Rays of a pixel, and of the one beside it that shows how a patch is turned, where that has one; `None` where the pixel has
+    /// none.
     pub fn rays(&self, camera: usize, px: [f32; 2]) -> Option<PatchRays> {
         Some((self.bearing(camera, px)?, self.bearing(camera, [px[0] + LEVER_PX, px[1]])))
     }
