@@ -306,6 +306,12 @@ impl Loops {
 
     /// Takes a keyframe, and looks for a loop that it closes.
     pub fn add(&mut self, keyframe: &LoopKeyframe) -> Option<Closure> {
+        let camera = self.extract(keyframe)?;
+        self.close(keyframe, camera)
+    }
+
+    /// Finds the features of a keyframe, and camera 0 in its level frame, m; `None` where its pose is not finite.
+    pub fn extract(&mut self, keyframe: &LoopKeyframe) -> Option<DVec3> {
         let (odom, tilt) = Pose4::upright(&keyframe.odom_from_body);
         if !odom.is_finite() {
             return None;
@@ -317,7 +323,14 @@ impl Loops {
             before.filter(|p| p.epoch == epoch).map(|place| (place.t, motion_since(&place, keyframe)));
         let (features, rays) = &mut self.query;
         self.extractor.extract(keyframe.frames, up, keyframe.body_from_cam.as_ref(), before_from_now, features);
-        let camera = self.extractor.rays(features, tilt, rays);
+        Some(self.extractor.rays(features, tilt, rays))
+    }
+
+    /// Adds the keyframe whose features were found last, with `camera` as they were, and looks for a loop that it closes.
+    pub fn close(&mut self, keyframe: &LoopKeyframe, camera: DVec3) -> Option<Closure> {
+        let (odom, tilt) = Pose4::upright(&keyframe.odom_from_body);
+        let epoch = Epoch { flight: self.flight, number: keyframe.epoch };
+        let before = self.last.map(|n| self.places[n as usize]);
         if before.is_some_and(|before| before.epoch != epoch) {
             (self.frame, self.next_frame) = (self.next_frame, self.next_frame + 1);
             (self.last, self.map_from_odom.epoch) = (None, keyframe.epoch);

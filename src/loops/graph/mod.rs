@@ -60,6 +60,8 @@ pub struct PoseGraph {
     settled: usize,
     /// Odometry edges that lead to each node and from it.
     chain: Vec<[u32; 2]>,
+    /// How far the neighbours of each node are from each other, m and twice rad; infinite without odometry to both sides.
+    apart: Vec<f64>,
     /// Poses to go back to.
     before: Vec<Pose4>,
     solver: Solver,
@@ -77,6 +79,7 @@ impl PoseGraph {
             information: Vec::with_capacity(edges),
             settled: 0,
             chain: vec![[NONE; 2]; nodes],
+            apart: vec![f64::INFINITY; nodes],
             before: vec![Pose4::default(); nodes],
             solver: Solver::new(nodes, blocks),
         }
@@ -84,7 +87,7 @@ impl PoseGraph {
 
     /// Bytes that it takes.
     pub fn bytes(&self) -> usize {
-        let node = 2 * size_of::<Pose4>() + 2 * size_of::<bool>() + size_of::<[u32; 2]>();
+        let node = 2 * size_of::<Pose4>() + 2 * size_of::<bool>() + size_of::<[u32; 2]>() + size_of::<f64>();
         let edge = size_of::<Edge>() + size_of::<f64>() + size_of::<Matrix4<f64>>();
         size_of::<Self>() + self.poses.len() * node + self.edges.capacity() * edge + self.solver.bytes()
     }
@@ -146,6 +149,7 @@ impl PoseGraph {
         self.edges.push(edge);
         self.weights.push(1.0);
         self.information.push(information);
+        self.space([from, to]);
         Some(())
     }
 
@@ -167,6 +171,7 @@ impl PoseGraph {
             was = Some((n, self.poses[n]));
             self.poses[n] = self.poses[from].compose(&before.between(&self.poses[n])).compose(&changed);
             edge.measured = *measured;
+            self.space([from, n]);
         }
         // Loops of nodes that moved may no longer agree.
         let moved = |n: u16| measured.iter().any(|(node, _)| *node == n);
@@ -178,35 +183,31 @@ impl PoseGraph {
         self.poses[node as usize]
     }
 
-    pub fn is_used(&self, node: u16) -> bool {
-        self.used[node as usize]
-    }
-
     /// Loop edges with their weights: 0 where it was rejected.
     pub fn loops(&self) -> impl Iterator<Item = (&Edge, f64)> + '_ {
         self.edges.iter().zip(&self.weights).filter(|(e, _)| e.is_loop).map(|(e, w)| (e, *w))
     }
 
+    /// Measures how far the neighbours of each of two nodes are from each other.
+    fn space(&mut self, nodes: [usize; 2]) {
+        for node in nodes {
+            let [before, after] = self.chain[node].map(|e| self.edges.get(e as usize).map(|edge| edge.measured));
+            let moved = before.zip(after).map(|(a, b)| a.compose(&b));
+            self.apart[node] = moved.map_or(f64::INFINITY, |m| m.p.length() + 2.0 * m.yaw.abs());
+        }
+    }
+
     /// The node, of those with odometry to both sides, whose neighbours are the nearest to each other.
     pub fn closest_neighbours(&self, may: impl Fn(u16) -> bool) -> Option<u16> {
-        let apart = |n: usize| {
-            let [a, b] = self.chain[n];
-            let (a, b) = (self.edges.get(a as usize)?, self.edges.get(b as usize)?);
-            let moved = a.measured.compose(&b.measured);
-            (self.used[n] && may(n as u16)).then(|| (moved.p.length() + 2.0 * moved.yaw.abs(), n as u16))
-        };
-        (0..self.poses.len()).filter_map(apart).min_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, n)| n)
+        let some = (0..self.poses.len()).filter(|n| self.apart[*n].is_finite() && may(*n as u16));
+        some.min_by(|a, b| self.apart[*a].total_cmp(&self.apart[*b])).map(|n| n as u16)
     }
 
     /// Removes a node. Its odometry becomes one edge between its neighbours; its loops are those of the nearer neighbour.
     pub fn drop_node(&mut self, node: u16) {
         let [to, from] = self.chain[node as usize].map(|e| self.edges.get(e as usize).copied());
-        let nearer = match (&to, &from) {
-            (Some(a), Some(b)) if a.covariance.trace() <= b.covariance.trace() => Some(a.inverse()),
-            (_, Some(b)) => Some(*b),
-            (Some(a), None) => Some(a.inverse()),
-            (None, None) => None,
-        };
+        let ways = [to.map(|a| (a.covariance.trace(), a.inverse())), from.map(|b| (b.covariance.trace(), b))];
+        let nearer = ways.into_iter().flatten().min_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, way)| way);
         for i in (0..self.edges.len()).rev() {
             let edge = self.edges[i];
             if edge.from != node && edge.to != node {
@@ -239,7 +240,7 @@ impl PoseGraph {
                 (chain[edge.from as usize][1], chain[edge.to as usize][0]) = (number, number);
             }
         };
-        let last = self.edges.len() - 1;
+        let (last, ends) = (self.edges.len() - 1, [self.edges[i].from, self.edges[i].to].map(usize::from));
         unhook(&mut self.chain, &self.edges[i], NONE);
         if i != last {
             unhook(&mut self.chain, &self.edges[last], i as u32);
@@ -248,6 +249,7 @@ impl PoseGraph {
         self.weights.swap_remove(i);
         self.information.swap_remove(i);
         self.settled = self.settled.min(i);
+        self.space(ends);
     }
 
     /// Moves the nodes to where all edges agree best.
@@ -263,10 +265,8 @@ impl PoseGraph {
             self.weights.iter_mut().for_each(|w| *w = 1.0);
         }
         self.settled = 0;
-        match self.solver.order(&self.used, &self.fixed, &self.edges) {
-            Some(blocks) => outcome.blocks = blocks,
-            None => return outcome,
-        }
+        let Some(blocks) = self.solver.order(&self.used, &self.fixed, &self.edges) else { return outcome };
+        outcome.blocks = blocks;
         for _ in 0..ITERATIONS {
             outcome.iterations += 1;
             self.solver.clear(&self.used, &self.fixed);
@@ -327,21 +327,16 @@ impl PoseGraph {
     }
 
     fn weigh(&mut self, scale: f64) {
-        for i in 0..self.edges.len() {
-            if self.edges[i].is_loop {
-                let c2 = scale * LOOP_SCALE;
-                self.weights[i] = (c2 / (c2 + self.chi2(i))).powi(2);
-            }
+        let c2 = scale * LOOP_SCALE;
+        for i in (0..self.edges.len()).filter(|i| self.edges[*i].is_loop) {
+            self.weights[i] = (c2 / (c2 + self.chi2(i))).powi(2);
         }
     }
 
     /// Covariance of the pose of `b` in the frame of `a`, as the graph knew it when it was optimised last, and by odometry
     /// since. `None` where nothing connects the two.
     pub fn covariance_between(&mut self, a: u16, b: u16) -> Option<Matrix4<f64>> {
-        if !self.solver.is_ordered() {
-            self.factor()?;
-        }
-        // A chain that began since then leads to nothing that the factor has.
+        // There is no factor, or a chain that began since then leads to nothing that it has.
         if self.known(a).is_none() || self.known(b).is_none() {
             self.factor()?;
         }

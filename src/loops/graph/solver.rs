@@ -81,11 +81,6 @@ impl Solver {
         self.factored = false;
     }
 
-    /// Whether there is a factor of the nodes that there were.
-    pub fn is_ordered(&self) -> bool {
-        self.factored
-    }
-
     /// Whether the factor has a node.
     pub fn has(&self, node: u16) -> bool {
         self.factored && self.rank[node as usize] != NOWHERE

@@ -233,9 +233,9 @@ fn a_dropped_node_leaves_the_optimum_of_the_others() {
     for node in [5u16, 22, 41, 43, 30] {
         less.drop_node(node);
     }
-    assert_eq!((less.is_used(5), less.edges.iter().filter(|e| !e.is_loop).count()), (false, 54));
+    assert_eq!((less.used[5], less.edges.iter().filter(|e| !e.is_loop).count()), (false, 54));
     assert!(less.optimise().solved);
-    for k in (0..60u16).filter(|k| less.is_used(*k)) {
+    for k in (0..60u16).filter(|k| less.used[*k as usize]) {
         let apart = (less.pose(k).p - graph.pose(k).p).length();
         assert!(apart < 0.03, "{k}: {apart}");
     }
@@ -272,6 +272,35 @@ fn what_odometry_measures_again_moves_what_follows_and_keeps_what_loops_did() {
     // A node that no odometry leads to stays.
     graph.measure_again(&[(0, change)]);
     assert!((graph.pose(0).p - was[0].p).length() < 1e-12);
+}
+
+#[test]
+fn the_node_to_drop_is_that_of_the_definition_after_links_drops_and_new_measurements() {
+    let mut noise = stream(12, 0);
+    let (mut graph, _) = rounds(3, 20, &mut noise);
+    let defined = |graph: &PoseGraph, not: u16| {
+        let edge = |n: u16, k: usize| graph.edges.get(graph.chain[n as usize][k] as usize).map(|e| e.measured);
+        let apart = |n: u16| {
+            let moved = edge(n, 0)?.compose(&edge(n, 1)?);
+            (n != not).then_some((n, moved.p.length() + 2.0 * moved.yaw.abs()))
+        };
+        (0..60).filter_map(apart).min_by(|a, b| a.1.total_cmp(&b.1)).map(|(n, _)| n)
+    };
+    for round in 0..50u16 {
+        let not = round % 60;
+        let node = graph.closest_neighbours(|n| n != not);
+        assert_eq!(node, defined(&graph, not), "round {round}");
+        match (round % 3, node) {
+            (0, Some(node)) => graph.measure_again(&[(node, pose(&mut noise, 1.0, 0.3))]),
+            (_, Some(node)) => graph.drop_node(node),
+            (_, None) => {}
+        }
+    }
+    let used = graph.used.iter().filter(|used| **used).count();
+    assert_eq!(used, 60 - 33, "two of three rounds drop one");
+    // A place that was given up is free for a node without odometry.
+    let node = graph.add(Pose4::default()).unwrap();
+    assert_eq!(graph.apart[node as usize], f64::INFINITY);
 }
 
 #[test]
