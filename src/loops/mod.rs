@@ -326,7 +326,7 @@ impl Loops {
         Some(self.extractor.rays(features, tilt, rays))
     }
 
-    /// Adds the keyframe whose features were found last, with `camera` as they were, and looks for a loop that it closes.
+    /// Adds the keyframe whose features `extract` found last, with what it answered, m, and looks for a loop that it closes.
     pub fn close(&mut self, keyframe: &LoopKeyframe, camera: DVec3) -> Option<Closure> {
         let (odom, tilt) = Pose4::upright(&keyframe.odom_from_body);
         let epoch = Epoch { flight: self.flight, number: keyframe.epoch };

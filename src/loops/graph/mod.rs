@@ -60,7 +60,8 @@ pub struct PoseGraph {
     settled: usize,
     /// Odometry edges that lead to each node and from it.
     chain: Vec<[u32; 2]>,
-    /// How far the neighbours of each node are from each other, m and twice rad; infinite without odometry to both sides.
+    /// How far the neighbours of each node are from each other: distance, m, plus twice the turn, rad; infinite where odometry
+    /// does not lead to both.
     apart: Vec<f64>,
     /// Poses to go back to.
     before: Vec<Pose4>,
@@ -149,7 +150,7 @@ impl PoseGraph {
         self.edges.push(edge);
         self.weights.push(1.0);
         self.information.push(information);
-        self.space([from, to]);
+        self.measure_apart([from, to]);
         Some(())
     }
 
@@ -171,7 +172,7 @@ impl PoseGraph {
             was = Some((n, self.poses[n]));
             self.poses[n] = self.poses[from].compose(&before.between(&self.poses[n])).compose(&changed);
             edge.measured = *measured;
-            self.space([from, n]);
+            self.measure_apart([from, n]);
         }
         // Loops of nodes that moved may no longer agree.
         let moved = |n: u16| measured.iter().any(|(node, _)| *node == n);
@@ -189,7 +190,7 @@ impl PoseGraph {
     }
 
     /// Measures how far the neighbours of each of two nodes are from each other.
-    fn space(&mut self, nodes: [usize; 2]) {
+    fn measure_apart(&mut self, nodes: [usize; 2]) {
         for node in nodes {
             let [before, after] = self.chain[node].map(|e| self.edges.get(e as usize).map(|edge| edge.measured));
             let moved = before.zip(after).map(|(a, b)| a.compose(&b));
@@ -249,7 +250,7 @@ impl PoseGraph {
         self.weights.swap_remove(i);
         self.information.swap_remove(i);
         self.settled = self.settled.min(i);
-        self.space(ends);
+        self.measure_apart(ends);
     }
 
     /// Moves the nodes to where all edges agree best.
@@ -337,7 +338,7 @@ impl PoseGraph {
     /// since. `None` where nothing connects the two.
     pub fn covariance_between(&mut self, a: u16, b: u16) -> Option<Matrix4<f64>> {
         // There is no factor, or a chain that began since then leads to nothing that it has.
-        if self.known(a).is_none() || self.known(b).is_none() {
+        if !self.solver.factored || self.known(a).is_none() || self.known(b).is_none() {
             self.factor()?;
         }
         let (known_a, tail_a) = self.known(a)?;

@@ -42,7 +42,8 @@ pub struct Solver {
     right: Vec<Vector4<f64>>,
     /// Right sides of a covariance: 8 columns as two blocks.
     wide: Vec<[Matrix4<f64>; 2]>,
-    factored: bool,
+    /// Whether there is a factor of the nodes that there were.
+    pub factored: bool,
 }
 
 impl Solver {
