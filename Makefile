@@ -31,8 +31,8 @@ demo: deps
 	target/release/stipple demo --board board-configs/lavapipe.toml --out $(OUT)
 
 test: deps
-	@$(MAKE) --no-print-directory target/python/pymavlink || echo "left out: the tests of tests/autopilot, since pip could not fetch pymavlink"
-	@$(MAKE) --no-print-directory target/python/gaussforge || echo "left out: the test of tests/export with a foreign reader, since pip could not fetch gaussforge"
+	@$(MAKE) --no-print-directory target/python/pymavlink || echo "left out: the tests of tests/program/autopilot.rs, since pip could not fetch pymavlink"
+	@$(MAKE) --no-print-directory target/python/gaussforge || echo "left out: the test of tests/program/export.rs with a foreign reader, since pip could not fetch gaussforge"
 	cargo check --locked --no-default-features
 	cargo test --workspace --locked --no-fail-fast
 	@$(MAKE) --no-print-directory test-onnx

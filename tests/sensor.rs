@@ -272,7 +272,7 @@ fn a_rolling_shutter_costs_little_once_modelled() {
     assert!(modelled.ate < 1.7 * clean.ate && not.ate > 3.0 * modelled.ate);
 }
 
-/// Half a pixel at 2 m, one without a pair, a hundredth with one camera (`RIG_ERRORS` in tests/cli.rs), but never wider than the
+/// Half a pixel at 2 m, one without a pair, a hundredth with one camera (`RIG_ERRORS` in program/cli.rs), but never wider than the
 /// earlier bound, which was one and a half times what was met (`mono`, `four`).
 #[test]
 fn rigs_of_one_to_four_cameras_are_followed() {

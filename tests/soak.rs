@@ -9,15 +9,16 @@
 #![allow(clippy::unwrap_used)]
 
 #[allow(dead_code)] // each test takes of it what it needs
-mod program;
+#[path = "program/start.rs"]
+mod start;
 #[allow(dead_code)] // each test takes of it what it needs
 #[path = "bench/world.rs"]
 mod world;
 
 use glam::DVec3;
-use program::{children, stipple, BOARD};
 use proptest::prelude::*;
 use proptest::test_runner::{Config, TestRunner};
+use start::{children, stipple, BOARD};
 use std::f64::consts::{PI, TAU};
 use std::process::Stdio;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};

@@ -8,9 +8,9 @@
 mod devices;
 mod flown;
 mod plugged;
-#[path = "../program/mod.rs"]
+#[path = "../program/start.rs"]
 #[allow(dead_code)] // its recording is grey
-mod program;
+mod start;
 mod unit;
 
 use devices::{environment, sensors_of_a_board, Devices, MAP, MS};

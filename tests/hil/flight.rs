@@ -15,15 +15,15 @@ mod flown;
 #[path = "../program/panics.rs"]
 mod panics;
 mod plugged;
-#[path = "../program/mod.rs"]
+#[path = "../program/start.rs"]
 #[allow(dead_code)] // its recording is of the simulator
-mod program;
+mod start;
 mod unit;
 
 use devices::{environment, sensors_of_a_board, wait_until, Devices, MS};
 use flown::{count, counted, report, stipple};
 use panics::{panic_after, Panicked};
-use program::text;
+use start::text;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Stdio;
@@ -109,7 +109,7 @@ impl Devices {
 
     /// A board file of them.
     fn board(&self, dir: &Path) -> PathBuf {
-        let plain = fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join(program::BOARD)).unwrap();
+        let plain = fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join(start::BOARD)).unwrap();
         let path = dir.join("board.toml");
         let sensors = sensors_of_a_board(&format!("{}/mav0", self.flight.display()), self.fps);
         // All frames are recorded: PNG is slow here, and written when there is time.
@@ -280,7 +280,7 @@ fn flight_goes_on_after_a_plug_was_pulled() {
     assert_eq!(last + 1, devices.stamps.len(), "the last picture has a pose");
 }
 
-/// The thread that no recording has (tests/mission.rs has the others): ten panics at moments of their own.
+/// The thread that no recording has (tests/program/mission.rs has the others): ten panics at moments of their own.
 #[test]
 #[ignore = "needs the machine of tests/hil/flight.sh"]
 fn flight_ends_at_once_when_the_trigger_panics() {

@@ -1,7 +1,7 @@
 //! `stipple run` beside devices that play a recording, and what its report says of that.
 
 use super::devices::{wait_until, Devices, MS};
-use super::program::signal;
+use super::start::signal;
 use serde_json::Value;
 use std::fs;
 use std::path::Path;

@@ -9,15 +9,15 @@
 mod devices;
 mod manager;
 mod plugged;
-#[path = "../program/mod.rs"]
+#[path = "../program/start.rs"]
 #[allow(dead_code)] // the program is started by the manager
-mod program;
+mod start;
 mod unit;
 
 use devices::{environment, sensors_of_a_board, wait_until, Devices, MAP, MS};
 use manager::{journal, properties, systemctl, tried, wait_for, BOARD, OUT};
-use program::{children, kill};
 use serde_json::Value;
+use start::{children, kill};
 use std::fs;
 use std::net::UdpSocket;
 use std::path::Path;

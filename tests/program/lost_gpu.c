@@ -1,5 +1,5 @@
-/* Loaded by tests/mission.rs in the place of libvulkan.so.1, which REAL_VULKAN names: when the file LOST_GPU is there, the next
- * submission removes it and answers VK_ERROR_DEVICE_LOST, as after a driver's reset. */
+/* Loaded by tests/program/mission.rs in the place of libvulkan.so.1, which REAL_VULKAN names: when the file LOST_GPU is there,
+ * the next submission removes it and answers VK_ERROR_DEVICE_LOST, as after a driver's reset. */
 #include <dlfcn.h>
 #include <stddef.h>
 #include <stdlib.h>

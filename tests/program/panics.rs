@@ -1,6 +1,6 @@
 //! A thread of a run that panics because `--inject` asks for it, and what the run leaves behind.
 
-use crate::program::{stipple, text};
+use super::start::{stipple, text};
 use std::fs;
 use std::io::{BufRead, BufReader};
 use std::os::unix::process::ExitStatusExt;

@@ -1,5 +1,5 @@
-/* Preloaded by tests/log.rs: once the file PULLED_FLAG is there, every call that would change what is below PULLED_DISK fails
- * with PULLED_ERRNO: 5 (EIO) for a disk that was pulled out, 30 (EROFS) for one that was made read-only. */
+/* Preloaded by tests/program/log.rs: once the file PULLED_FLAG is there, every call that would change what is below PULLED_DISK
+ * fails with PULLED_ERRNO: 5 (EIO) for a disk that was pulled out, 30 (EROFS) for one that was made read-only. */
 #define _GNU_SOURCE
 #include <dlfcn.h>
 #include <errno.h>

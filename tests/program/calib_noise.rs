@@ -1,15 +1,9 @@
 //! `stipple calib-noise` as its users meet it: what it prints is what a calibration reads, and a log that is not that of a
 //! unit at rest is refused with the reason.
-#![allow(clippy::unwrap_used)]
 
-#[allow(dead_code)]
-mod program;
-#[allow(dead_code)]
-#[path = "bench/world.rs"]
-mod world;
-
+use crate::start::{flight, stipple, text};
+use crate::world::Noise;
 use glam::DVec3;
-use program::{stipple, text};
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Output;
@@ -19,7 +13,6 @@ use stipple_drivers::replay::read_calibration;
 use stipple_drivers::sim::euroc_rig;
 use stipple_drivers::source::ImuReading;
 use stipple_drivers::{Frames, ImuCalibration, ImuSample, Nanos};
-use world::Noise;
 
 const RATE: f64 = 100.0;
 const SECS: f64 = 900.0;
@@ -76,7 +69,7 @@ fn what_it_prints_is_read_as_a_calibration_and_is_the_noise_of_the_unit_from_a_f
     let printed = String::from_utf8(o.stdout).unwrap();
 
     // Into a calibration, in the place of the figures there.
-    let flight = program::flight(dir.path(), "0.2");
+    let flight = flight(dir.path(), "0.2");
     let yaml = flight.join("mav0/imu0/sensor.yaml");
     let stated = fs::read_to_string(&yaml).unwrap();
     let kept: Vec<&str> = stated.lines().filter(|l| !l.contains("_density") && !l.contains("_walk")).collect();

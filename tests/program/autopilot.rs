@@ -1,15 +1,11 @@
-//! What an autopilot hears of a run, by pymavlink as the other end (other_end.py), which has models of the gates of PX4 and of
-//! ArduPilot: over UDP and over a pseudo-terminal that is read as fast as a UART gives bytes; through resets, a cut line, a
-//! reader that stalls, and damaged messages.
-#![allow(clippy::unwrap_used)]
+//! What an autopilot hears of a run, by pymavlink as the other end (tests/autopilot/other_end.py), which has models of the gates of
+//! PX4 and of ArduPilot: over UDP and over a pseudo-terminal that is read as fast as a UART gives bytes; through resets, a cut
+//! line, a reader that stalls, and damaged messages.
 
-#[path = "../program/mod.rs"]
-mod program;
-
+use crate::start::{flight, stipple, text, BOARD};
 use glam::{DQuat, DVec3, EulerRot};
 use mavlink::dialects::common::{MavAutopilot, HEARTBEAT_DATA};
 use mavlink::{MAVLinkV2MessageRaw, MavHeader};
-use program::{flight, stipple, text, BOARD};
 use serde_json::Value;
 use std::fs;
 use std::io::{BufRead, BufReader, Read, Write};
@@ -340,7 +336,7 @@ fn age_of_poses_at_the_other_end() {
 
 /// Twenty minutes with a fault each minute: a camera that is unplugged for long, an inertial unit that is, and a line that is cut.
 #[test]
-#[ignore = "20 minutes: cargo test --release --test autopilot twenty -- --ignored --nocapture"]
+#[ignore = "20 minutes: cargo test --release --test program autopilot::twenty -- --ignored --nocapture"]
 fn twenty_minutes_with_faults_lose_no_message_and_count_every_reset_once() {
     let dir = tempfile::tempdir().unwrap();
     let data = flight(dir.path(), "60");

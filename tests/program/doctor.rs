@@ -1,10 +1,7 @@
 //! `stipple doctor` and `stipple calib-check` on recordings in the place of sensors: a whole one passes, and one with an
 //! axis of the gyro turned round, a clock that is off, or its cameras exchanged is told so.
-#![allow(clippy::unwrap_used)]
 
-mod program;
-
-use program::{flight, text, BOARD};
+use crate::start::{self, flight, text, BOARD};
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
@@ -13,7 +10,7 @@ const UNAVAILABLE: i32 = 69;
 const CONFIG: i32 = 78;
 
 fn stipple(args: &[&str]) -> Output {
-    program::stipple().args(args).output().unwrap()
+    start::stipple().args(args).output().unwrap()
 }
 
 fn doctor(data: &Path) -> Output {

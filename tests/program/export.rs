@@ -1,12 +1,9 @@
 //! A map that lies in a store, exported: as PLY and as `.spz`, whole or the part that was asked for, from a store that is damaged
-//! or written to meanwhile. What reads the files back is gaussforge (`to_ply.py`), whose reader of `.spz` is Niantic's.
-#![allow(clippy::unwrap_used)]
+//! or written to meanwhile. What reads the files back is gaussforge (tests/export/to_ply.py), whose reader of `.spz` is
+//! Niantic's.
 
-#[path = "../program/mod.rs"]
-mod program;
-
+use crate::start::{stipple, text};
 use glam::{DQuat, DVec3};
-use program::{stipple, text};
 use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -338,7 +335,9 @@ fn exporting_a_building_takes_the_memory_of_a_block() {
         kept.close();
     }
     let mut child = Command::new(std::env::current_exe().unwrap());
-    child.args(["exporting_a_building_takes_the_memory_of_a_block", "--exact", "--nocapture"]).env(CHILD, dir.path());
+    child
+        .args(["export::exporting_a_building_takes_the_memory_of_a_block", "--exact", "--nocapture"])
+        .env(CHILD, dir.path());
     let begun = Instant::now();
     let o = child.output().unwrap();
     let said = text(&o);

@@ -1,9 +1,6 @@
 //! The program as a stranger meets it: bad input is named, explained, and leaves nothing behind.
-#![allow(clippy::unwrap_used)]
 
-mod program;
-
-use program::{flight, text, BOARD};
+use crate::start::{self, flight, text, BOARD};
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
@@ -20,7 +17,7 @@ fn root() -> &'static Path {
 }
 
 fn stipple(args: &[&str]) -> Output {
-    program::stipple().args(args).output().unwrap()
+    start::stipple().args(args).output().unwrap()
 }
 
 fn replay(dataset: &Path, out: &Path, more: &[&str]) -> Output {

@@ -1,14 +1,9 @@
 //! What may happen to `stipple run` in the field, with the map on: its mapper dies, hangs or is stopped, a thread panics, it
 //! is asked to stop in every way, and nobody reads what it says. Odometry goes on, or the process ends at once and the
 //! next one starts.
-#![allow(clippy::unwrap_used)]
 
-#[path = "program/panics.rs"]
-mod panics;
-mod program;
-
-use panics::{panic_after, Panicked};
-use program::{children, flight, kill, shared_library, signal, stipple, text, BOARD};
+use crate::panics::{panic_after, Panicked};
+use crate::start::{children, flight, kill, shared_library, signal, stipple, text, BOARD};
 use serde_json::Value;
 use std::fs;
 use std::io::{BufRead, BufReader, Read, Write};
@@ -398,7 +393,7 @@ fn a_panic_in_any_other_thread_ends_the_process_at_once() {
     panics_end_the_process_at_once(&THREADS[THREADS.len() / 2..]);
 }
 
-/// `cargo test --release --test mission panics -- --ignored --nocapture`: each thread ten times, at moments of its own.
+/// `cargo test --release --test program mission::panics -- --ignored --nocapture`: each thread ten times, at moments of its own.
 #[test]
 #[ignore = "a quarter of an hour, on a machine that does nothing else"]
 fn panics_of_each_thread() {
@@ -450,7 +445,7 @@ fn a_mapper_that_pauses_when_a_run_ends_is_started_for_the_map() {
     }
 }
 
-/// `cargo test --release --test mission disturbed -- --ignored --nocapture`: passes of MH_01, every other one with its
+/// `cargo test --release --test program not_disturbed -- --ignored --nocapture`: passes of MH_01, every other one with its
 /// mapper killed (20) or stopped (5) at a random moment. Frames of all passes of a kind are pooled.
 #[test]
 #[ignore = "ten minutes, on a machine that does nothing else"]

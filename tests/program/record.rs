@@ -1,10 +1,7 @@
 //! `stipple record` and `stipple run --record`: what was recorded before a kill reads back whole, and recording takes
 //! nothing from odometry.
-#![allow(clippy::unwrap_used)]
 
-mod program;
-
-use program::{flight, stipple, text, BOARD};
+use crate::start::{flight, stipple, text, BOARD};
 use std::fs;
 use std::path::Path;
 use std::process::{Child, Stdio};

@@ -1,10 +1,7 @@
 //! `stipple run` on a recording in the place of sensors: it ends as a replay ends, stops when asked, and outlives what
 //! `--inject` does to it, with every fault that was injected counted by what detected it.
-#![allow(clippy::unwrap_used)]
 
-mod program;
-
-use program::{flight, signal, stipple, text, BOARD};
+use crate::start::{flight, signal, stipple, text, BOARD};
 use serde_json::Value;
 use std::fs;
 use std::path::Path;

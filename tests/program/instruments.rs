@@ -1,9 +1,6 @@
 //! `stipple-bench .. --quick` leaves figures that can be read and drawn.
-#![allow(clippy::unwrap_used)]
 
-mod program;
-
-use program::{flight, text};
+use crate::start::{self, flight, text};
 use std::fs;
 use std::os::unix::process::ExitStatusExt;
 use std::path::Path;
@@ -202,7 +199,7 @@ fn a_viewer_shows_the_map_as_the_report_scores_it() {
     let [from, to, poses] = [&data, &out, &poses].map(|p| p.to_str().unwrap());
     let args = ["replay", from, "--poses", poses, "--pace", "lockstep", "--steps", "15", "--scale", "1", "--out", to];
     // Each frame is a keyframe and gets 15 steps: with most of them at half the size poses and exposures are not found yet.
-    let o = program::stipple().args(args).args(["--set", "map.half_size_steps=0"]).output().unwrap();
+    let o = start::stipple().args(args).args(["--set", "map.half_size_steps=0"]).output().unwrap();
     assert!(o.status.success(), "{}", text(&o));
     let psnr = json(&out.join("report.json"))["psnr_db"].as_f64().unwrap();
     let said = bench(&["ply", out.join("map.ply").to_str().unwrap(), from, "--poses", poses], &scored);

@@ -1,6 +1,5 @@
 //! A barometer in a live run on a simulated flight: its readings reach the estimator, and a run goes on without them. What
 //! becomes of one that falls silent, comes late, is unplugged or breaks is counted and said.
-#![allow(clippy::unwrap_used)]
 
 use std::ops::Range;
 use std::path::Path;

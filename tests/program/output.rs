@@ -1,6 +1,5 @@
 //! A whole output folder from a synthetic run: every file is there, complete, and says the same.
 //! It stays in the build folder (`tmp/output`) to be looked at.
-#![allow(clippy::unwrap_used)]
 
 use glam::{DQuat, DVec3};
 use std::path::{Path, PathBuf};

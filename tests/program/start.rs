@@ -5,7 +5,6 @@ use std::process::{Child, Command, Output};
 use std::sync::Mutex;
 use std::time::UNIX_EPOCH;
 
-#[allow(dead_code)] // not every binary of tests does
 pub const BOARD: &str = "board-configs/lavapipe.toml";
 
 pub fn stipple() -> Command {
@@ -19,18 +18,15 @@ pub fn text(o: &Output) -> String {
 }
 
 /// Asks it to stop: with `kill` of the shell, since Debian's own is in a package that not every machine has.
-#[allow(dead_code)] // not every binary of tests does
 pub fn signal(child: &Child, name: &str) {
     kill(child.id(), name);
 }
 
-#[allow(dead_code)] // not every binary of tests does
 pub fn kill(pid: u32, name: &str) {
     assert!(Command::new("sh").args(["-c", &format!("kill -{name} {pid}")]).status().unwrap().success());
 }
 
 /// The processes that `parent` has started.
-#[allow(dead_code)] // not every binary of tests does
 pub fn children(parent: u32) -> Vec<u32> {
     let all = std::fs::read_dir("/proc").unwrap().filter_map(|e| e.unwrap().file_name().to_str()?.parse::<u32>().ok());
     let parent_of = |pid: &u32| {
@@ -41,7 +37,6 @@ pub fn children(parent: u32) -> Vec<u32> {
 }
 
 /// Compiles a source of tests/program or drivers/tests, with these definitions, into a library that a program can be given.
-#[allow(dead_code)] // not every binary of tests does
 pub fn shared_library(source: &str, definitions: &[&str], to: &Path) {
     let source = Path::new(env!("CARGO_MANIFEST_DIR")).join(source);
     let mut compiler = Command::new("cc");
@@ -50,7 +45,6 @@ pub fn shared_library(source: &str, definitions: &[&str], to: &Path) {
 }
 
 /// A copy of a simulated flight in `dir`. One is rendered for each duration and build of the program, in target/tmp.
-#[allow(dead_code)] // not every binary of tests does
 pub fn flight(dir: &Path, seconds: &str) -> PathBuf {
     static ONE_AT_A_TIME: Mutex<()> = Mutex::new(());
     let _guard = ONE_AT_A_TIME.lock();

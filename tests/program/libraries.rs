@@ -1,7 +1,6 @@
 //! What the program needs of a machine to start, and what it does where OpenCV is missing.
-#![cfg(feature = "opencv")]
-#![allow(clippy::unwrap_used)]
 
+use crate::start::{self, text};
 use std::collections::BTreeSet;
 use std::fs;
 use std::path::Path;
@@ -11,12 +10,7 @@ const STIPPLE: &str = env!("CARGO_BIN_EXE_stipple");
 
 /// Runs the program where the loader looks into `libraries` first.
 fn stipple(libraries: &Path, args: &[&str]) -> Output {
-    let root = env!("CARGO_MANIFEST_DIR");
-    Command::new(STIPPLE).args(args).current_dir(root).env("LD_LIBRARY_PATH", libraries).output().unwrap()
-}
-
-fn text(o: &Output) -> String {
-    String::from_utf8_lossy(&o.stderr).into_owned() + &String::from_utf8_lossy(&o.stdout)
+    start::stipple().args(args).env("LD_LIBRARY_PATH", libraries).output().unwrap()
 }
 
 /// A folder in which the libraries of OpenCV that the program's shim asks for are files that are none.

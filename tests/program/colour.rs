@@ -1,8 +1,7 @@
 //! Colour from file to map: a flight written as RGB images is read back, mapped, and shown in its colours.
-#![allow(clippy::unwrap_used)]
 
+use crate::start;
 use std::path::Path;
-use std::process::Command;
 use std::time::Instant;
 use stipple::config::Board;
 use stipple::map::{Keyframe, Mapper, Panel, StepKind};
@@ -15,7 +14,8 @@ const BOARD: &str = "name = \"test\"\nmemory_max_mib = 2048\n[budget]\nsplats = 
                      keyframes = 16\nimage_width_max = 1024\nimage_height_max = 1024\n";
 
 fn board(overrides: &[&str]) -> Board {
-    Board::parse("tests/colour.rs", BOARD, &overrides.iter().map(|s| s.to_string()).collect::<Vec<_>>()).unwrap()
+    Board::parse("tests/program/colour.rs", BOARD, &overrides.iter().map(|s| s.to_string()).collect::<Vec<_>>())
+        .unwrap()
 }
 
 /// Frames, 2.5 a second, of the demo after its start at rest, at 188 x 120 px.
@@ -90,7 +90,7 @@ fn the_program_replays_colour_and_refuses_grey_where_colour_is_asked_for() {
         std::fs::write(&board, BOARD).unwrap();
         let (flight, out) = (dir.path().join("flight"), dir.path().join("out"));
         let truth = flight.join("mav0/state_groundtruth_estimate0/data.csv");
-        let mut c = Command::new(env!("CARGO_BIN_EXE_stipple"));
+        let mut c = start::stipple();
         c.args(["replay", "--pace", "lockstep", "--set", "map.colour=true"]).args(args);
         c.arg("--board").arg(board).arg("--out").arg(out).arg("--poses").arg(truth).arg(flight).output().unwrap()
     };
@@ -111,7 +111,7 @@ fn the_program_replays_colour_and_refuses_grey_where_colour_is_asked_for() {
     assert!(coloured.count() * 2 > count, "less than half of {count} Gaussians are coloured");
 
     std::fs::remove_dir_all(dir.path().join("flight")).unwrap();
-    let sim = Command::new(env!("CARGO_BIN_EXE_stipple"))
+    let sim = start::stipple()
         .args(["sim", "demo", "--duration", "1", "--out"])
         .arg(dir.path().join("flight"))
         .output()

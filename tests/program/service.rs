@@ -1,9 +1,6 @@
 //! `stipple run` as a systemd service: what it tells the manager, and the unit that starts it.
-#![allow(clippy::unwrap_used)]
 
-mod program;
-
-use program::{children, flight, signal, stipple, text, BOARD};
+use crate::start::{children, flight, signal, stipple, text, BOARD};
 use std::fs;
 use std::os::linux::net::SocketAddrExt;
 use std::os::unix::net::{SocketAddr, UnixDatagram};
@@ -86,7 +83,7 @@ fn manager_hears_that_a_run_ends_by_itself_and_its_mapper_goes_first_where_memor
     assert!(child.wait().unwrap().success());
 }
 
-/// Ready is a promise: poses follow. `cargo test --release --test service first_pose -- --nocapture` prints when.
+/// Ready is a promise: poses follow. `cargo test --release --test program first_pose -- --nocapture` prints when.
 #[test]
 fn first_pose_comes_within_three_seconds_after_ready() {
     let dir = tempfile::tempdir().unwrap();

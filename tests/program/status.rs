@@ -1,9 +1,6 @@
 //! The status socket of `stipple run`, and what asks it: `stipple status`, Prometheus, bridges; reload; `stipple bugreport`.
-#![allow(clippy::unwrap_used)]
 
-mod program;
-
-use program::{flight, signal, stipple, text, BOARD};
+use crate::start::{flight, signal, stipple, text, BOARD};
 use serde_json::Value;
 use std::fs;
 use std::io::{BufRead, BufReader, Read, Write};

@@ -1,14 +1,9 @@
 //! The log of a run, and what `stipple recover` makes of it: after an end, after SIGKILL at any moment, with damage,
 //! and on a disk that is full or gone.
-#![allow(clippy::unwrap_used)]
 
-mod program;
-#[path = "program/small_disk.rs"]
-mod small_disk;
-
-use program::{children, flight, kill, shared_library, stipple, text, BOARD};
+use crate::small_disk::on_a_small_disk;
+use crate::start::{children, flight, kill, shared_library, stipple, text, BOARD};
 use serde_json::Value;
-use small_disk::on_a_small_disk;
 use std::fs;
 use std::io::{BufRead, BufReader};
 use std::path::Path;
@@ -129,7 +124,7 @@ fn a_folder_without_a_log_is_told_so() {
 /// A disk with a little more room than the log leaves to others: the log ends, and the run does not.
 #[test]
 fn a_disk_that_fills_ends_the_log_and_not_the_run() {
-    on_a_small_disk("65600k", "a_disk_that_fills_ends_the_log_and_not_the_run", |disk| {
+    on_a_small_disk("65600k", "log::a_disk_that_fills_ends_the_log_and_not_the_run", |disk| {
         let dir = tempfile::tempdir().unwrap();
         let (data, out) = (flight(dir.path(), "8"), disk.join("out"));
         let o = fly(&["run", "--dataset", data.to_str().unwrap()], &out).output().unwrap();

@@ -1,9 +1,8 @@
 //! The whole program on recordings: what the README claims of them holds.
-#![allow(clippy::unwrap_used)]
 
+use crate::start::{self, text, BOARD};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
-use std::process::Command;
 use stipple::counters::Counters;
 use stipple::run::gate::ImuGate;
 use stipple_drivers::replay::{OpenOptions, Recording};
@@ -11,8 +10,6 @@ use stipple_drivers::sim::scenario::Flight;
 use stipple_drivers::sim::{euroc_rig, Scenario};
 use stipple_drivers::source::ImuReading;
 use stipple_drivers::ImuSample;
-
-const BOARD: &str = "board-configs/lavapipe.toml";
 
 /// The recording, or `None` after saying that the test of this name is ignored: where there is no
 /// recording at all the build knows it (`cfg(recordings)`), and the test is listed as ignored.
@@ -42,13 +39,13 @@ impl Run {
 fn stipple(args: &[&str], validation: bool) -> Run {
     let dir = tempfile::tempdir().unwrap();
     let out = dir.path().join("out");
-    let mut command = Command::new(env!("CARGO_BIN_EXE_stipple"));
+    let mut command = start::stipple();
     command.args(args).args(["--board", BOARD, "--out", out.to_str().unwrap()]);
     if validation {
         command.env("STIPPLE_VALIDATION", "1");
     }
-    let output = command.current_dir(env!("CARGO_MANIFEST_DIR")).output().unwrap();
-    let said = String::from_utf8_lossy(&output.stderr).into_owned() + &String::from_utf8_lossy(&output.stdout);
+    let output = command.output().unwrap();
+    let said = text(&output);
     assert!(output.status.success(), "{said}");
     for file in ["trajectory.tum", "report.html", "report.json"] {
         assert!(out.join(file).metadata().unwrap().len() > 0, "{file}");
@@ -123,10 +120,8 @@ fn machine_hall_gives_the_same_bits_on_one_thread_and_on_two() {
 fn simulated_flight_gives_the_same_bits_on_one_thread_and_on_two() {
     let dir = tempfile::tempdir().unwrap();
     let flight = dir.path().join("flight");
-    let made = Command::new(env!("CARGO_BIN_EXE_stipple"))
-        .args(["sim", "demo", "--out", flight.to_str().unwrap(), "--duration", "4"])
-        .output()
-        .unwrap();
+    let made =
+        start::stipple().args(["sim", "demo", "--out", flight.to_str().unwrap(), "--duration", "4"]).output().unwrap();
     assert!(made.status.success());
     // A frame that cannot be read leaves its samples to the next on either number of threads.
     for camera in ["cam0", "cam1"] {
@@ -147,7 +142,7 @@ fn simulated_flight_gives_the_same_bits_on_one_thread_and_on_two() {
 fn a_person_in_view_does_not_carry_the_estimate_along() {
     let dir = tempfile::tempdir().unwrap();
     let flight = dir.path().join("flight");
-    let made = Command::new(env!("CARGO_BIN_EXE_stipple"))
+    let made = start::stipple()
         .args(["sim", "hover", "--seed", "22", "--person", "--out", flight.to_str().unwrap()])
         .output()
         .unwrap();
@@ -194,7 +189,7 @@ fn vicon_room_reaches_twenty_decibels_from_its_true_poses() {
 fn whole_pipeline_is_silent_under_validation() {
     let dir = tempfile::tempdir().unwrap();
     let flight = dir.path().join("flight");
-    let made = Command::new(env!("CARGO_BIN_EXE_stipple"))
+    let made = start::stipple()
         .args(["sim", "demo", "--out", flight.to_str().unwrap(), "--duration", "2.5"])
         .output()
         .unwrap();
