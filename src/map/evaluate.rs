@@ -2,7 +2,7 @@
 //!
 //! A keyframe is compared in its exposure: the one refined beside the map, or, held out, the one between its
 //! neighbours in time, and at the pose it came with; nothing of a held-out image goes into these figures, nor into the
-//! next: at that pose with the correction between its neighbours, where a picture of the map would be taken from.
+//! next: at that pose with the correction between its neighbours, as in keyframes.tum.
 //! Held-out keyframes are scored twice more, to tell the error's shares: with gain and offset fitted to the image, and
 //! with the pose refined on it too.
 //! Evaluation changes nothing: a run goes on from it as if there had been none.

@@ -59,7 +59,7 @@ use archive::Archive;
 use cameras::RectifiedPair;
 use scene::Scene;
 use std::time::Instant;
-use stipple_drivers::{Calibration, Fault, Nanos, Pose};
+use stipple_drivers::{Calibration, Fault, Nanos, Pose, TimedPose};
 use trainer::Trainer;
 use views::Views;
 
@@ -486,6 +486,18 @@ impl Mapper {
     #[cfg(feature = "instruments")]
     pub fn keyframe(&self, index: usize) -> &Stored {
         self.scene.views.get(index * self.scene.cameras.len())
+    }
+
+    /// Epochs and poses of this flight's keyframes, in their order: with the correction that training found, held out with what
+    /// is interpolated between their neighbours in time.
+    pub fn keyframe_poses(&self) -> impl Iterator<Item = (u32, TimedPose)> + '_ {
+        let (views, first_epoch) = (&self.scene.views, self.first_numbers().1);
+        (views.earlier..views.len()).step_by(views.cameras()).map(move |i| {
+            let e = views.get(i);
+            let refined = if e.held_out { views.between(i) } else { e.refined };
+            let pose = TimedPose { t: e.t, pose: e.given * refined.body_from_refined };
+            (e.epoch.saturating_sub(first_epoch), pose)
+        })
     }
 
     /// Gaussians of the map, in the pool and on disk.

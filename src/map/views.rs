@@ -57,11 +57,6 @@ impl Stored {
     pub fn world_from_cam(&self) -> Pose {
         self.given * self.body_from_cam
     }
-
-    /// Odometry's pose with the mapper's own correction.
-    pub fn world_from_refined(&self) -> Pose {
-        self.given * self.refined.body_from_refined
-    }
 }
 
 /// Views that are drawn, at most, of which one is trained on next.
@@ -222,7 +217,8 @@ impl Views {
 
     /// Where the body was when an image was taken: odometry's pose with the mapper's own correction.
     pub fn world_from_body(&self, index: usize) -> Pose {
-        self.get(self.first(index)).world_from_refined()
+        let e = self.get(self.first(index));
+        e.given * e.refined.body_from_refined
     }
 
     /// Takes the next camera of a keyframe, whose planes `draw` makes one by one; `None` when there is no room. Both poses are

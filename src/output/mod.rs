@@ -52,7 +52,8 @@ fn absent(removed: io::Result<()>) -> io::Result<()> {
 }
 
 /// What a run writes at its end.
-const RESULTS: [&str; 6] = ["trajectory.tum", "odometry.tum", "map.ply", "renders", "report.html", "report.json"];
+const RESULTS: [&str; 7] =
+    ["trajectory.tum", "odometry.tum", "keyframes.tum", "map.ply", "renders", "report.html", "report.json"];
 
 /// The folder of `--out`: created and proved writable before any work starts.
 #[derive(Clone, Debug)]

@@ -15,6 +15,7 @@ use crate::output::export::{export, Form, Request};
 use crate::output::metrics::percentile;
 use crate::output::panel::{caption, panel, Picture};
 use crate::output::report::{KernelTime, LeftOut};
+use crate::output::trajectory::TumWriter;
 use crate::output::{ply, OutputDir};
 use crate::publish::cloud::{Point, POINTS};
 use serde::{Deserialize, Serialize};
@@ -305,7 +306,7 @@ impl Mapping {
         ]
     }
 
-    /// Writes `map.ply`, evaluates and draws, in this order, and calls `tell` with what there is after each, so that a
+    /// Writes `map.ply` and `keyframes.tum`, evaluates and draws, in this order, and calls `tell` with what there is after each, so that a
     /// process whose time is over has told the most important first.
     pub fn conclude(&mut self, out: &OutputDir, tell: &mut dyn FnMut(&MapResult)) -> MapResult {
         let ms: Vec<f64> = self.iteration_ms.iter().map(|v| f64::from(*v)).collect();
@@ -338,7 +339,8 @@ impl Mapping {
         result
     }
 
-    /// Writes the Gaussians as viewers show them, in the exposure of most images; then figures, then pictures.
+    /// Writes the Gaussians as viewers show them, in the exposure of most images, and the poses of keyframes; then figures, then
+    /// pictures.
     fn measure(
         &mut self,
         out: &OutputDir,
@@ -364,12 +366,16 @@ impl Mapping {
         }
         result.written = true;
         tell(result);
+        let posed = out.write("keyframes.tum", |w| {
+            let mut file = TumWriter::begin(w)?;
+            self.mapper.keyframe_poses().try_for_each(|(epoch, pose)| file.pose(epoch, &pose))
+        });
         result.quality = self.mapper.evaluate_some(self.scored_max).map_err(gpu)?;
         tell(result);
         let panels = self.mapper.panels(PANELS).map_err(gpu)?;
         let draw = |p: &crate::map::Panel| Drawn { name: p.name.clone(), caption: caption(p), picture: panel(p) };
         result.drawn = panels.iter().map(draw).collect();
-        Ok(())
+        posed.map_err(|fault| fault.to_string())
     }
 
     /// Writes the Gaussians in the pool as `map.ply`.

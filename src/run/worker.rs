@@ -3,8 +3,8 @@
 //! The process that flies starts `stipple map-worker`, tells it everything on its standard input (TOML), and hands keyframes over
 //! through shared memory (`keyframes`). It looks at the worker fifty times a second: one that has ended is started again,
 //! one that is stopped, hangs or takes too much memory is killed first. A worker that starts again goes on with the map on disk, and is
-//! offered the newest keyframes once more. When the run is over the worker writes `map.ply`, evaluates, and answers on its
-//! standard output: frames of four bytes of length (little endian) and JSON.
+//! offered the newest keyframes once more. When the run is over the worker writes `map.ply` and `keyframes.tum`, evaluates, and
+//! answers on its standard output: frames of four bytes of length (little endian) and JSON.
 
 use super::keyframes::{KeyframeRing, Word};
 use super::mapping::{self, Drawn, Kept, MapResult, Mapping};

@@ -83,6 +83,12 @@ fn a_run_maps_while_it_tracks() {
     // A tenth of the range of grey off at most. One grey for each of the demo's views, its mean, is 11.8 to 13.7 dB.
     assert!(r["psnr_db"].as_f64().unwrap() > 20.0, "{said}");
     assert_eq!(count(&r, "gpu_failures"), 0, "{said}");
+    let [keyframes, frames] = ["keyframes.tum", "trajectory.tum"].map(|name| read_trajectory(&out.join(name)).unwrap());
+    assert!(keyframes.len() as u64 >= r["anchors"].as_u64().unwrap(), "{said}");
+    for keyframe in &keyframes {
+        let frame = frames.iter().find(|frame| frame.t == keyframe.t).unwrap();
+        assert!((keyframe.pose.p - frame.pose.p).length() < 0.02, "{keyframe:?} {frame:?}");
+    }
 }
 
 #[test]
