@@ -248,7 +248,7 @@ fn align(scene: &mut Scene, index: usize, observed: &[f32], weights: &Weights) -
     let (mut best, mut best_loss) = (refined, f64::INFINITY);
     for k in 0..ALIGN_STEPS {
         let view = View { coarseness, ..scene.view_from(index, given * refined.body_from_refined) };
-        let done = scene.pipeline.evaluate(&mut scene.gpu, &view, target, weights)?;
+        let done = scene.pipeline.train(&mut scene.gpu, &view, target, None, weights)?;
         if done.loss < best_loss {
             (best, best_loss) = (refined, done.loss);
         }

@@ -145,42 +145,21 @@ impl Pipeline {
         self.loss.similarity(gpu, self.renderer.buffers.rendered, target, map)
     }
 
-    /// One step on an image. The view must have the shape's size.
-    #[cfg(feature = "instruments")]
+    /// One step on an image, whose view must have the shape's size. Without rates the map, Adam's moments included, stays as it
+    /// is to the bit.
     pub fn train(
         &mut self,
         gpu: &mut Gpu,
         view: &View,
         target: impl Into<Target>,
-        rates: &LearningRates,
-        weights: &Weights,
-    ) -> Result<StepStats, GpuError> {
-        self.pass(gpu, view, &target.into(), Some(rates), weights)
-    }
-
-    /// What `train` would answer; the map, Adam's moments included, stays as it is to the bit.
-    pub fn evaluate(
-        &mut self,
-        gpu: &mut Gpu,
-        view: &View,
-        target: impl Into<Target>,
-        weights: &Weights,
-    ) -> Result<StepStats, GpuError> {
-        self.pass(gpu, view, &target.into(), None, weights)
-    }
-
-    fn pass(
-        &mut self,
-        gpu: &mut Gpu,
-        view: &View,
-        target: &Target,
         rates: Option<&LearningRates>,
         weights: &Weights,
     ) -> Result<StepStats, GpuError> {
+        let target = target.into();
         let mut rec = gpu.record();
-        self.record_step(&mut rec, view, target, rates, weights);
+        self.record_step(&mut rec, view, &target, rates, weights);
         let status = self.status(gpu, rec)?;
-        Ok(StepStats::new(&status, view, self.loss.values(target), weights.ssim))
+        Ok(StepStats::new(&status, view, self.loss.values(&target), weights.ssim))
     }
 
     /// Starts what `train` does. `finish` must have its answer before the step after next is started.

@@ -63,7 +63,7 @@ fn picture_loss_and_gradients_agree_with_the_twin_of_each_channel() {
     let want: Vec<f64> = rendered.planes.colour.concat();
     let worst = wide(&picture.colour).iter().zip(&want).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
     assert!(worst < 2e-5, "colour off by {worst}");
-    let step = p.train(&mut gpu, &v, 0, &STILL, &PLAIN).unwrap();
+    let step = p.train(&mut gpu, &v, 0, Some(&STILL), &PLAIN).unwrap();
     assert!((step.l1 - l1).abs() < 1e-5, "{} against {l1}", step.l1);
     // Adam's first moment after one step from rest: a tenth of the gradient.
     let mut moments = vec![Moments::default(); 60];
@@ -100,7 +100,7 @@ fn a_map_learns_a_coloured_picture() {
     p.pool.append(&mut gpu, scene(400, &v, 8)).unwrap();
     p.loss.set_image(&mut gpu, 0, &planes).unwrap();
     let losses: Vec<StepStats> =
-        (0..STEPS).map(|_| p.train(&mut gpu, &v, 0, &super::splat::FAST, &PLAIN).unwrap()).collect();
+        (0..STEPS).map(|_| p.train(&mut gpu, &v, 0, Some(&super::splat::FAST), &PLAIN).unwrap()).collect();
     assert!(losses[STEPS - 1].loss < 0.4 * losses[0].loss, "{} -> {}", losses[0].loss, losses[STEPS - 1].loss);
     let out = super::splat::render(&mut gpu, &mut p, &v);
     for (c, shown) in out.colour.chunks(W * H).enumerate() {
@@ -121,6 +121,6 @@ fn the_validation_layer_is_silent_in_colour() {
     let mut p = Pipeline::new(&mut gpu, s).unwrap();
     p.pool.append(&mut gpu, coloured(32, &v)).unwrap();
     p.loss.set_image(&mut gpu, 0, &target()).unwrap();
-    p.train(&mut gpu, &v, 0, &STILL, &PLAIN).unwrap();
+    p.train(&mut gpu, &v, 0, Some(&STILL), &PLAIN).unwrap();
     assert_eq!(gpu.validation_messages(), Vec::<String>::new());
 }

@@ -65,7 +65,7 @@ fn exposed_loss_agrees_with_its_twin() {
     let weights = Weights { ssim: SSIM as f32, needle: 0.0, scale: 0.0, ..Weights::default() };
     let (y, seen) = (levels(&harsh()), mask(w, h));
 
-    let step = p.train(&mut gpu, &v, goal(), &STILL, &weights).unwrap();
+    let step = p.train(&mut gpu, &v, goal(), Some(&STILL), &weights).unwrap();
     let (twin, by_exposure) = exposed(&picture, &y, &seen, SIZE, SSIM, [EXPOSURE.gain, EXPOSURE.offset]);
     let mut gradient = vec![0f32; w * h];
     gpu.download(p.loss.buffers.pixel_gradient, 0, &mut gradient).unwrap();
@@ -77,7 +77,7 @@ fn exposed_loss_agrees_with_its_twin() {
     assert!(error < 1e-3 * by_exposure[1].abs().max(by_exposure[0].abs()), "{step:?} against {by_exposure:?}");
 
     // Without one the image is compared as it is.
-    let plain = p.train(&mut gpu, &v, 1, &STILL, &weights).unwrap();
+    let plain = p.train(&mut gpu, &v, 1, Some(&STILL), &weights).unwrap();
     assert!((plain.l1 - loss(&picture, &y, &seen, w, h, SSIM).l1).abs() < 1e-5);
 }
 
@@ -99,10 +99,10 @@ fn evaluation_tells_what_training_would_and_changes_nothing() {
     p.pool.append(&mut gpu, scene(500, &v, 9)).unwrap();
     p.loss.set_image(&mut gpu, 1, &target(w, h)).unwrap();
     for _ in 0..3 {
-        p.train(&mut gpu, &v, goal(), &FAST, &Weights::default()).unwrap();
+        p.train(&mut gpu, &v, goal(), Some(&FAST), &Weights::default()).unwrap();
     }
     let before = state(&mut gpu, &p);
-    let looked = p.evaluate(&mut gpu, &v, goal(), &Weights::default()).unwrap();
+    let looked = p.train(&mut gpu, &v, goal(), None, &Weights::default()).unwrap();
     assert!(before == state(&mut gpu, &p));
-    assert_eq!(looked, p.train(&mut gpu, &v, goal(), &FAST, &Weights::default()).unwrap());
+    assert_eq!(looked, p.train(&mut gpu, &v, goal(), Some(&FAST), &Weights::default()).unwrap());
 }

@@ -40,7 +40,7 @@ fn hidden_cells_are_masked_beside_the_mask() {
     p.loss.set_mask(&mut gpu, 0, &seen).unwrap();
     let part = Target { absent: Some(Absent { hidden, filled: hidden }), ..Target::from(0) };
     let values = p.loss.values(&part);
-    let by_cells = p.train(&mut gpu, &v, part, &STILL, &Weights::default()).unwrap();
+    let by_cells = p.train(&mut gpu, &v, part, Some(&STILL), &Weights::default()).unwrap();
     let gradient = pixel_gradient(&mut gpu, &p);
 
     let both: Vec<u8> = seen.iter().enumerate().map(|(i, m)| if is_hidden(i) { 0 } else { *m }).collect();
@@ -48,7 +48,7 @@ fn hidden_cells_are_masked_beside_the_mask() {
     let whole = Target::from(0);
     // Each is a mean over the pixels of its camera's mask.
     let ratio = p.loss.values(&whole) / values;
-    let by_mask = p.train(&mut gpu, &v, whole, &STILL, &Weights::default()).unwrap();
+    let by_mask = p.train(&mut gpu, &v, whole, Some(&STILL), &Weights::default()).unwrap();
     let wanted: Vec<f64> = pixel_gradient(&mut gpu, &p).iter().map(|g| g * ratio).collect();
     assert!((by_cells.l1 - by_mask.l1 * ratio).abs() < 1e-6, "{} and {}", by_cells.l1, by_mask.l1 * ratio);
     let scale = wanted.iter().fold(0.0f64, |m, g| m.max(g.abs()));
@@ -70,7 +70,7 @@ fn a_view_that_is_hidden_trains_nothing_however_it_is_regularised() {
     let weights = Weights { scale_soft_m: 1e-3, opacity: 0.1, ..Weights::default() };
     for _ in 0..3 {
         let absent = Some(Absent { hidden, filled: hidden });
-        let step = p.train(&mut gpu, &v, Target { absent, ..Target::from(0) }, &FAST, &weights).unwrap();
+        let step = p.train(&mut gpu, &v, Target { absent, ..Target::from(0) }, Some(&FAST), &weights).unwrap();
         assert_eq!((step.pose_gradient.map(f64::abs), step.exposure_gradient), ([0.0; 6], [0.0; 2]));
     }
     let after = p.pool.download(&mut gpu).unwrap();
@@ -103,7 +103,7 @@ fn the_image_stands_in_behind_the_picture_in_its_exposure() {
         let picture = render(&mut gpu, &mut p, &v);
         let exposure = Exposure { gain: 1.3, offset: -0.07 };
         let part = Target { absent: Some(filled()), exposure, ..Target::from(1) };
-        p.train(&mut gpu, &v, part, &STILL, &Weights::default()).unwrap();
+        p.train(&mut gpu, &v, part, Some(&STILL), &Weights::default()).unwrap();
         let mut got = vec![0f32; planes.len()];
         gpu.download(p.renderer.buffers.rendered, 0, &mut got).unwrap();
         let through = |i: usize| if is_filled(i) { 1.0 - f64::from(picture.alpha[i]) } else { 0.0 };
@@ -129,7 +129,7 @@ fn gradients_before_the_image_agree_with_their_twin() {
     let alpha = render(&mut gpu, &mut p, &v).alpha;
     let weights = Weights { ssim: 0.2, needle: 0.0, scale: 0.0, scale_soft_m: 1.0, opacity: 0.0 };
     let part = Target { absent: Some(filled()), ..Target::from(1) };
-    let step = p.train(&mut gpu, &v, part, &STILL, &weights).unwrap();
+    let step = p.train(&mut gpu, &v, part, Some(&STILL), &weights).unwrap();
 
     let goal: Vec<f64> = target(w, h).iter().map(|level| f64::from(*level) / 255.0).collect();
     let backdrop: Vec<f64> = goal.iter().enumerate().map(|(i, g)| if is_filled(i) { *g } else { 0.0 }).collect();

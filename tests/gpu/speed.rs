@@ -112,7 +112,7 @@ fn a_loss_filtered_by_tiles_is_that_filtered_by_runs() {
             let mut p = Pipeline::with_tiling(&mut gpu, s, tiling).unwrap();
             p.pool.append(&mut gpu, scene(64, &v, 9)).unwrap();
             p.loss.set_image(&mut gpu, 0, &target(130, 21).repeat(channels as usize)).unwrap();
-            let step = p.evaluate(&mut gpu, &v, 0, &Weights::default()).unwrap();
+            let step = p.train(&mut gpu, &v, 0, None, &Weights::default()).unwrap();
             let mut gradient = vec![0f32; p.loss.buffers.pixel_gradient.len()];
             gpu.download(p.loss.buffers.pixel_gradient, 0, &mut gradient).unwrap();
             let mut map = Vec::new();

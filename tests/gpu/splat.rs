@@ -206,7 +206,7 @@ fn one_pixel_and_odd_sizes_agree_with_their_twin() {
         let picture = render(&mut gpu, &mut p, &v);
         assert!(worst(wide(&picture.colour), twin.planes.colour[0].clone()) < 1e-5, "{w}x{h}");
         p.loss.set_image(&mut gpu, 0, &target(w, h)).unwrap();
-        assert!(p.train(&mut gpu, &v, 0, &STILL, &Weights::default()).unwrap().loss.is_finite());
+        assert!(p.train(&mut gpu, &v, 0, Some(&STILL), &Weights::default()).unwrap().loss.is_finite());
     }
 }
 
@@ -217,7 +217,7 @@ fn an_empty_map_renders_nothing_and_trains() {
     let picture = render(&mut gpu, &mut p, &v);
     assert!(picture.colour.iter().chain(&picture.alpha).chain(&picture.depth).all(|x| *x == 0.0));
     p.loss.set_image(&mut gpu, 0, &target(33, 21)).unwrap();
-    let step = p.train(&mut gpu, &v, 0, &STILL, &Weights::default()).unwrap();
+    let step = p.train(&mut gpu, &v, 0, Some(&STILL), &Weights::default()).unwrap();
     assert_eq!((step.stats.visible, step.stats.intersections), (0, 0));
     assert!(step.l1 > 0.1);
     assert_eq!(step.pose_gradient.map(f64::abs), [0.0; 6]);
@@ -227,7 +227,7 @@ pub const FAST: LearningRates =
     LearningRates { position: 4e-3, scale: 2e-2, rotation: 1e-2, opacity: 5e-2, colour: 2e-2 };
 
 pub fn train(gpu: &mut Gpu, p: &mut Pipeline, v: &View, steps: usize) -> Vec<StepStats> {
-    (0..steps).map(|_| p.train(gpu, v, 0, &FAST, &Weights::default()).unwrap()).collect()
+    (0..steps).map(|_| p.train(gpu, v, 0, Some(&FAST), &Weights::default()).unwrap()).collect()
 }
 
 /// Image at half the size: `one_of` makes one pixel of two by two; an odd row or column is left off.
@@ -266,7 +266,7 @@ fn a_step_at_half_size_is_one_of_a_camera_with_pixels_twice_as_wide() {
             p.loss.set_image(&mut gpu, 1, &planes.concat()).unwrap();
             p.loss.set_mask(&mut gpu, 1, seen).unwrap();
             let target = Target { camera: 1, half_size: is_half, ..Target::from(1) };
-            let mut step = || p.train(&mut gpu, view, target, &FAST, &Weights::default()).unwrap();
+            let mut step = || p.train(&mut gpu, view, target, Some(&FAST), &Weights::default()).unwrap();
             let steps: Vec<_> = (0..5).map(|_| step()).collect();
             (steps, p.pool.download(&mut gpu).unwrap())
         };
@@ -456,7 +456,7 @@ fn the_validation_layer_is_silent() {
     p.loss.set_image(&mut gpu, 0, &target(33, 21)).unwrap();
     train(&mut gpu, &mut p, &v, 2);
     let goal = Target { exposure: Exposure { gain: 1.2, offset: 0.1 }, ..Target::from(0) };
-    p.train(&mut gpu, &v, goal, &FAST, &Weights::default()).unwrap();
+    p.train(&mut gpu, &v, goal, Some(&FAST), &Weights::default()).unwrap();
     render(&mut gpu, &mut p, &v);
     p.pool.prune(&mut gpu, &PruneRule::default()).unwrap();
     assert_eq!(gpu.validation_messages(), Vec::<String>::new());

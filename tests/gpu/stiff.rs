@@ -186,7 +186,7 @@ fn noise(steps: usize) {
         }
         let mut v = base;
         v.world_from_cam.p += DVec3::new(r.uniform(-1.0, 1.0), r.uniform(-1.0, 1.0), r.uniform(-3.0, 2.0));
-        let s = p.train(&mut gpu, &v, 0, &FAST, &Weights::default()).unwrap();
+        let s = p.train(&mut gpu, &v, 0, Some(&FAST), &Weights::default()).unwrap();
         assert!(s.loss.is_finite() && s.pose_gradient.iter().all(|g| g.is_finite()), "{step}: {s:?}");
     }
     let map = p.pool.download(&mut gpu).unwrap();

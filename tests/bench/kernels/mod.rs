@@ -195,7 +195,7 @@ fn starts(config: &GpuConfig, scene: &Scene, tiling: Tiling, cache: &Path) -> Re
     for s in &mut taken {
         let begun = Instant::now();
         let (mut gpu, mut p) = open(config, scene, tiling, Some(cache))?;
-        p.train(&mut gpu, &scene.view, 0, &RATES, &Weights::default())?;
+        p.train(&mut gpu, &scene.view, 0, Some(&RATES), &Weights::default())?;
         *s = begun.elapsed().as_secs_f64();
     }
     _ = std::fs::remove_dir_all(cache);
@@ -207,7 +207,7 @@ fn measure(config: &GpuConfig, scene: &Scene, tiling: Tiling, peaks: &Peaks, qui
     let camera = &scene.view.camera;
     let (mut gpu, mut p) = open(config, scene, tiling, None)?;
     let mut step = |gpu: &mut Gpu| -> Result<f64, Fault> {
-        p.train(gpu, &scene.view, 0, &RATES, &Weights::default())?;
+        p.train(gpu, &scene.view, 0, Some(&RATES), &Weights::default())?;
         Ok(gpu.last_submit_ms())
     };
     let first = Instant::now();

@@ -144,7 +144,7 @@ fn row(case: &Case) -> Result<Row, Fault> {
     let errors = compare(&mut gpu, &mut p, &view, &splats, [&goal, &vec![255; pixels]])?;
     let (mut losses, mut refused) = ([f64::NAN; 2], 0);
     for step in 0..STEPS {
-        let done = p.train(&mut gpu, &view, 1, &FAST, &Weights::default())?;
+        let done = p.train(&mut gpu, &view, 1, Some(&FAST), &Weights::default())?;
         losses[usize::from(step > 0)] = done.loss;
         refused += u64::from(done.stats.failed) + u64::from(done.gradients_rejected);
     }

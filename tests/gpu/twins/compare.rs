@@ -104,7 +104,7 @@ pub fn compare(
     let grey = worst(&picture.colour, &twin.rendered.planes.colour[0]);
 
     let weights = Weights { ssim: SSIM, needle: 0.0, scale: 0.0, scale_soft_m: 1.0, opacity: 0.0 };
-    let step = p.train(gpu, v, 1, &STILL, &weights)?;
+    let step = p.train(gpu, v, 1, Some(&STILL), &weights)?;
     let mut gradient = vec![0f32; goal.len()];
     gpu.download(p.loss.buffers.pixel_gradient, 0, &mut gradient)?;
     // R <- R Exp(θ) moves points by Exp(-θ), p <- p + δ by -Rᵀδ.
