@@ -379,48 +379,54 @@ impl Keyframes {
     }
 
     /// Hands a tracked frame on: a keyframe to the mapper and to what closes loops, and the newer poses of others with it. The
-    /// mapper is told poses in the map.
+    /// mapper is told poses in the map. What loop closure answers reaches it with any frame: a vehicle that has come home may
+    /// give no further keyframe.
     pub fn pass_on(&mut self, packet: &FramePacket, ring: Option<&KeyframeRing>, counters: &Counters) {
-        let Some(tracked) = &packet.tracked else { return };
-        if !tracked.keyframe {
-            self.loops
-                .iter_mut()
-                .filter(|_| !packet.blank && !packet.carried)
-                .for_each(|loops| loops.ask(packet, tracked, counters));
-            return;
+        match (&packet.tracked, &mut self.loops) {
+            (Some(tracked), _) if tracked.keyframe => self.pass_keyframe_on(packet, tracked, ring, counters),
+            (Some(tracked), Some(loops)) if !packet.blank && !packet.carried => loops.ask(packet, tracked, counters),
+            _ => {}
         }
+        let Some(loops) = &mut self.loops else { return };
+        loops.answers(|answer| match answer {
+            Answer::Keyframe { id, map_from_body } => {
+                let poses = Poses { world_from_body: *map_from_body, body_from_cam: None };
+                ring.is_none_or(|ring| ring.push_correction(*id, &poses))
+            }
+            Answer::Joined(join) => {
+                let told = ring.is_none_or(|ring| ring.push_join(join));
+                counters.corrections_full.add(u64::from(!told));
+                true
+            }
+            Answer::Moved(moved) => {
+                ring.iter().for_each(|ring| ring.push_moved(moved));
+                true
+            }
+            Answer::MapFromOdom(_) => true,
+        });
+    }
+
+    fn pass_keyframe_on(
+        &mut self,
+        packet: &FramePacket,
+        tracked: &Tracked,
+        ring: Option<&KeyframeRing>,
+        counters: &Counters,
+    ) {
         if packet.blank {
             counters.keyframes_blank.add(u64::from(ring.is_some()));
             self.count += u64::from(ring.is_none());
             return;
         }
-        let id = self.offer(packet, tracked, ring, counters);
-        let body_from_cam = tracked.body_from_cam;
-        let push = |id: u64, world_from_body: Pose, body_from_cam| {
-            ring.is_none_or(|ring| ring.push_correction(id, &Poses { world_from_body, body_from_cam }))
-        };
+        let (id, body_from_cam) = (self.offer(packet, tracked, ring, counters), tracked.body_from_cam);
         for (t, odom_from_body) in tracked.corrections.iter() {
             if let Some((_, found)) = self.recent.iter().find(|(at, found)| at == t && Some(*found) != id) {
-                let pushed = push(*found, self.in_map(odom_from_body), body_from_cam);
+                let poses = Poses { world_from_body: self.in_map(odom_from_body), body_from_cam };
+                let pushed = ring.is_none_or(|ring| ring.push_correction(*found, &poses));
                 counters.corrections_full.add(u64::from(!pushed));
             }
         }
-        if let Some(loops) = &mut self.loops {
-            loops.offer(packet, tracked, id, counters);
-            loops.answers(|answer| match answer {
-                Answer::Keyframe { id, map_from_body } => push(*id, *map_from_body, None),
-                Answer::Joined(join) => {
-                    let told = ring.is_none_or(|ring| ring.push_join(join));
-                    counters.corrections_full.add(u64::from(!told));
-                    true
-                }
-                Answer::Moved(moved) => {
-                    ring.iter().for_each(|ring| ring.push_moved(moved));
-                    true
-                }
-                Answer::MapFromOdom(_) => true,
-            });
-        }
+        self.loops.iter_mut().for_each(|loops| loops.offer(packet, tracked, id, counters));
     }
 
     fn in_map(&self, odom_from_body: &Pose) -> Pose {

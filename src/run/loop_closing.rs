@@ -307,3 +307,34 @@ impl LoopClosing {
         self.here.take().map(|loops| LoopThread { queue: self.queue.clone(), loops })
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::keyframes::{self, Keyframes};
+    use super::*;
+    use stipple_drivers::{Camera, ImuCalibration, Lens, RigCamera};
+
+    #[test]
+    fn an_answer_reaches_the_mapper_without_a_further_keyframe() {
+        let lens = Lens::Radtan { k1: 0.0, k2: 0.0, p1: 0.0, p2: 0.0 };
+        let camera = Camera { width: 128, height: 128, fx: 100.0, fy: 100.0, cx: 63.5, cy: 63.5, lens };
+        let cameras = vec![RigCamera::new(camera, Pose::IDENTITY); 2];
+        let rig = Calibration { cameras, imu: ImuCalibration::CONSUMER };
+        let board = Board::parse("a board", include_str!("../../board-configs/lavapipe.toml"), &[]).expect("of ours");
+        let closing = LoopClosing::new(&rig, &board).expect("a rig").expect("a board with loops");
+        let answer = Answer::Keyframe { id: 7, map_from_body: Pose::IDENTITY };
+        assert!(closing.queue.answers.push(answer).is_ok());
+        let (mut passes, ring) = (Keyframes::new(0, Some(closing)), keyframes::tests::ring());
+        let mut packet = FramePacket::for_rig(&rig, 0);
+        packet.tracked = Some(Tracked {
+            world_from_body: Pose::IDENTITY,
+            keyframe: false,
+            body_from_cam: None,
+            corrections: List::default(),
+        });
+        passes.pass_on(&packet, Some(&ring), &Counters::default());
+        let mut corrected = vec![];
+        ring.corrections(ring.corrections_written(), |c| corrected.push(c.id));
+        assert_eq!(corrected, [7]);
+    }
+}
