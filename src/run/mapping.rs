@@ -306,8 +306,8 @@ impl Mapping {
         ]
     }
 
-    /// Writes `map.ply` and `keyframes.tum`, evaluates and draws, in this order, and calls `tell` with what there is after each, so that a
-    /// process whose time is over has told the most important first.
+    /// Writes `map.ply` and `keyframes.tum`, evaluates and draws, in this order, and calls `tell` with what there is after each,
+    /// so that a process whose time is over has told the most important first.
     pub fn conclude(&mut self, out: &OutputDir, tell: &mut dyn FnMut(&MapResult)) -> MapResult {
         let ms: Vec<f64> = self.iteration_ms.iter().map(|v| f64::from(*v)).collect();
         let mut kernels = self.mapper.kernel_times();
