@@ -63,14 +63,15 @@ fn a_later_flight_finds_itself_in_the_stored_map_and_extends_it() {
     };
 
     // Only to find itself changes nothing of the map.
-    let before = (kept("map"), kept("places"));
+    let before = (kept("map"), kept("places"), kept("renders"));
     let localise = Options { localise_only: true, ..options.clone() };
     let (report, second) = patrol(48.0, 8.0, &board, &out, &localise);
     assert_eq!(counter(&report, "epochs_joined"), 1, "{:?}", report.loops);
     assert!(counter(&report, "places_read") > 10 && report.splats.is_none() && report.heap_after_seal == Some(0));
     let off = last_off(&out, &second, (&first, &truth));
     assert!(off < 0.15, "{off} m");
-    assert!((kept("map"), kept("places")) == before, "the stored map has changed");
+    assert!((kept("map"), kept("places"), kept("renders")) == before, "the stored map has changed");
+    assert!(["map.ply", "keyframes.tum"].iter().all(|name| out.file(name).exists()), "its results are gone");
 
     // A flight that maps extends it, in its frame.
     let (report, second) = patrol(48.0, 8.0, &board, &out, &options);

@@ -323,19 +323,25 @@ impl Views {
         refined
     }
 
-    /// What the keyframes trained on before and after one were refined by, at its time.
+    /// What the keyframes of its run and epoch that are trained on before and after one were refined by, at its time. Where there
+    /// are none, the exposure of another's.
     pub fn between(&self, index: usize) -> Refinement {
-        let t = self.get(index).t;
+        let Stored { t, epoch, .. } = self.entries[index];
         let at = self.training.partition_point(|k| (*k as usize) < index);
         let same = |k: &&u32| self.camera(**k as usize) == self.camera(index);
-        let of = |k: &u32| (self.get(*k as usize).t, self.refined(*k as usize));
-        let after = self.training[at..].iter().find(same).map(of);
-        let before = self.training[..at].iter().rev().find(same).map(of);
-        match (before, after) {
-            (Some((t0, a)), Some((t1, b))) if t1 > t0 => {
-                a.towards(&b, ((t - t0).secs() / (t1 - t0).secs()).clamp(0.0, 1.0))
+        let before = self.training[..at].iter().rev().find(same).map(|k| *k as usize);
+        let after = self.training[at..].iter().find(same).map(|k| *k as usize);
+        let own = |k: &usize| self.get(*k).epoch == epoch && (*k < self.earlier) == (index < self.earlier);
+        match (before.filter(own), after.filter(own)) {
+            (Some(a), Some(b)) => {
+                let [t0, t1] = [a, b].map(|k| self.get(k).t);
+                let share = if t1 > t0 { (t - t0).secs() / (t1 - t0).secs() } else { 0.0 };
+                self.refined(a).towards(&self.refined(b), share.clamp(0.0, 1.0))
             }
-            (one, other) => one.or(other).map_or_else(Refinement::default, |(_, refined)| refined),
+            (Some(k), None) | (None, Some(k)) => self.refined(k),
+            (None, None) => before
+                .or(after)
+                .map_or_else(Refinement::default, |k| Refinement::known(Pose::IDENTITY, self.refined(k).exposure)),
         }
     }
 
@@ -537,6 +543,24 @@ mod tests {
         add(&mut s, 2);
         assert_eq!([0, 1, 4, 5].map(|i| s.exposure(i).gain), [1.0, 2.0, 1.0, 3.0]);
         assert!(s.is_full(), "one image more is no keyframe");
+    }
+
+    /// Keyframes 0 and 1 are of an earlier run; of this one 3 is alone in epoch 0, 5 has 4 and 7 beside it in epoch 1, and 6, held
+    /// out as well, is of epoch 2.
+    #[test]
+    fn a_held_out_keyframe_has_the_corrections_of_its_own_run_and_epoch() {
+        let mut s = views(8, 1);
+        s.earlier = 2;
+        let all = [(0, false), (0, true), (0, false), (0, true), (1, false), (1, true), (2, true), (1, false)];
+        for (id, (epoch, held_out)) in all.into_iter().enumerate() {
+            let t = Nanos::default() + Span::from_secs(id as f64);
+            s.add(&Keyframe { t, epoch, ..keyframe(id as u64, held_out) }, ON_BODY, |_, _| {});
+            let refined = &mut s.get_mut(id).refined;
+            refined.body_from_refined.p.x = id as f64;
+            refined.exposure.gain = 10.0 + id as f64;
+        }
+        let found = [1, 3, 5, 6].map(|i| s.between(i)).map(|r| [r.body_from_refined.p.x, r.exposure.gain]);
+        assert_eq!(found, [[0.0, 10.0], [2.0, 12.0], [5.0, 15.0], [0.0, 14.0]]);
     }
 
     #[test]

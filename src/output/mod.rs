@@ -51,9 +51,9 @@ fn absent(removed: io::Result<()>) -> io::Result<()> {
     removed.or_else(|e| if e.kind() == io::ErrorKind::NotFound { Ok(()) } else { Err(e) })
 }
 
-/// What a run writes at its end.
-const RESULTS: [&str; 7] =
-    ["trajectory.tum", "odometry.tum", "keyframes.tum", "map.ply", "renders", "report.html", "report.json"];
+/// What a run writes at its end: of its flight, and of its map.
+const OF_FLIGHT: [&str; 4] = ["trajectory.tum", "odometry.tum", "report.html", "report.json"];
+const OF_MAP: [&str; 3] = ["keyframes.tum", "map.ply", "renders"];
 
 /// The folder of `--out`: created and proved writable before any work starts.
 #[derive(Clone, Debug)]
@@ -71,7 +71,7 @@ impl OutputDir {
             io::ErrorKind::AlreadyExists => Ok(()),
             _ => Err(e),
         });
-        probed.and_then(|()| absent(fs::remove_file(&probe))).map_err(|e| cannot_create(path, &e))?;
+        probed.and_then(|()| absent(fs::remove_file(&probe))).map_err(|e| not_writable(path, "takes no file", &e))?;
         own_files(&path.join("renders"))?;
         Ok(OutputDir { path: path.to_path_buf() })
     }
@@ -118,12 +118,14 @@ impl OutputDir {
     }
 
     /// Renames the results of an earlier run, if there are any, to `previous-map.ply` and so on, and removes what had these
-    /// names: after a kill they are not taken for results of this run.
-    pub fn set_aside(&self) -> Result<(), Fault> {
+    /// names: after a kill they are not taken for results of this run. Where this run maps nothing, the map's stay.
+    pub fn set_aside(&self, maps: bool) -> Result<(), Fault> {
         let previous = |name: &str| format!("previous-{name}");
-        let mut there = RESULTS.into_iter().filter(|name| self.file(name).symlink_metadata().is_ok()).peekable();
+        let of_map: &[&str] = if maps { &OF_MAP } else { &[] };
+        let results = || OF_FLIGHT.iter().chain(of_map);
+        let mut there = results().filter(|name| self.file(name).symlink_metadata().is_ok()).peekable();
         if there.peek().is_some() {
-            RESULTS.iter().try_for_each(|name| self.remove(&previous(name)))?;
+            results().try_for_each(|name| self.remove(&previous(name)))?;
         }
         there.try_for_each(|name| {
             let path = self.file(name);
@@ -204,7 +206,11 @@ fn partial_name(path: &Path) -> PathBuf {
 }
 
 fn cannot_create(path: &Path, e: &io::Error) -> Fault {
-    let (place, what) = (path.display().to_string(), format!("cannot be created: {e}"));
+    not_writable(path, "cannot be created", e)
+}
+
+fn not_writable(path: &Path, what: &str, e: &io::Error) -> Fault {
+    let (place, what) = (path.display().to_string(), format!("{what}: {e}"));
     Fault::new(FaultKind::NoOutput, place, what, "choose an --out folder that can be written to")
 }
 
@@ -269,13 +275,20 @@ mod tests {
         out.replace_folder("renders", |d| atomically(&d.join("1.png"), |w| w.write_all(b"x"))).unwrap();
         // The second of two finds nothing: a run between them was killed.
         for _ in 0..2 {
-            out.set_aside().unwrap();
+            out.set_aside(true).unwrap();
             assert_eq!(names(dir.path()), ["log-0000.mcap", "previous-map.ply", "previous-renders"]);
             assert_eq!(names(&dir.path().join("previous-renders")), [LIST, "1.png"]);
         }
         out.write("report.json", |w| w.write_all(b"2")).unwrap();
-        out.set_aside().unwrap();
+        out.set_aside(true).unwrap();
         assert_eq!(names(dir.path()), ["log-0000.mcap", "previous-report.json"]);
+        // Runs that map nothing leave the map of the one before.
+        out.write("map.ply", |w| w.write_all(b"3")).unwrap();
+        for report in [b"3", b"4"] {
+            out.write("report.json", |w| w.write_all(report)).unwrap();
+            out.set_aside(false).unwrap();
+            assert_eq!(names(dir.path()), ["log-0000.mcap", "map.ply", "previous-report.json"]);
+        }
     }
 
     #[test]

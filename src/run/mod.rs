@@ -219,10 +219,11 @@ pub fn fly(
         },
         scale: board.map.scale,
         truth: input.truth,
+        keeps_map: options.localise_only,
         opened: input.opened,
     };
     let length_s = input.source.length_s().filter(|_| !repeats);
-    out.set_aside()?;
+    out.set_aside(!options.localise_only)?;
     let told = options.service && board.mavlink.address().is_some();
     let start = if told { Log::start_counting_epochs } else { Log::start };
     let log = start(out.path().into(), log::LIMITS, &title.to_string());

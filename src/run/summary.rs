@@ -28,6 +28,8 @@ pub struct Title {
     pub pace: &'static str,
     pub scale: u32,
     pub truth: Vec<TimedPose>,
+    /// Whether the map of an earlier run stays, as this one was only to find itself in it.
+    pub keeps_map: bool,
     /// Counters of opening the recording.
     pub opened: Vec<(&'static str, u64)>,
 }
@@ -139,7 +141,7 @@ pub fn conclude(title: Title, mut flown: Flown, logged: &[PathBuf], out: &Output
             warn(&mut flown.warnings, format!("the map is incomplete: {why}"));
         }
     }
-    if !map.as_ref().is_some_and(|m| m.written) {
+    if !title.keeps_map && !map.as_ref().is_some_and(|m| m.written) {
         fault = fault.or(out.remove("map.ply").err());
     }
     flown.loops.iter().flat_map(|loops| place_warnings(loops)).for_each(|what| warn(&mut flown.warnings, what));
@@ -160,7 +162,8 @@ pub fn conclude(title: Title, mut flown: Flown, logged: &[PathBuf], out: &Output
     let tracking_ms: &[(Nanos, f64)] = flown.tracker.odometry().map_or(&[], |run| &run.back.frame_ms);
     let (estimated, truth, error, warnings) = (&estimated[..], &title.truth[..], error.as_ref(), &flown.warnings[..]);
     let evidence = Evidence { estimated, epochs: &epochs, truth, error, tracking_ms, pictures: &[], warnings };
-    let written = write_files(&report, &evidence, map.map_or(vec![], |m| m.drawn), out);
+    let drawn = map.map_or(vec![], |m| m.drawn);
+    let written = write_files(&report, &evidence, (drawn, title.keeps_map), out);
     (report, fault.or(written))
 }
 
@@ -269,8 +272,14 @@ fn track_figures(report: &mut Report, flown: &Flown) -> Vec<TimedPose> {
 }
 
 /// Writes the files of DIR, and answers the first fault; `evidence` is without its pictures.
-fn write_files(report: &Report, evidence: &Evidence, drawn: Vec<Drawn>, out: &OutputDir) -> Option<Fault> {
+fn write_files(
+    report: &Report,
+    evidence: &Evidence,
+    (drawn, keeps_map): (Vec<Drawn>, bool),
+    out: &OutputDir,
+) -> Option<Fault> {
     let renders = match drawn.is_empty() {
+        true if keeps_map => Ok(()),
         true => out.remove("renders"),
         false => out.replace_folder("renders", |dir| {
             let mut all = drawn.iter();

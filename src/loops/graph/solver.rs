@@ -42,7 +42,7 @@ pub struct Solver {
     right: Vec<Vector4<f64>>,
     /// Right sides of a covariance: 8 columns as two blocks.
     wide: Vec<[Matrix4<f64>; 2]>,
-    /// Whether there is a factor of the nodes that there were.
+    /// Whether the last factorisation succeeded. Nodes that came after it are not in its factor (`has`).
     pub factored: bool,
 }
 
