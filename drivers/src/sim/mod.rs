@@ -97,6 +97,8 @@ pub struct Sim {
     log_gain: Vec<f32>,
     scratch: Scratch,
     rows: Vec<Row>,
+    /// Red, green and blue of the pixels of an image.
+    colours: Vec<[u8; 3]>,
 }
 
 impl Sim {
@@ -171,6 +173,7 @@ impl Sim {
             log_gain: Vec::new(),
             scratch,
             rows: Vec::new(),
+            colours: Vec::new(),
         };
         sim.log_gain = sim.metered();
         Ok(sim)
@@ -239,20 +242,19 @@ impl Sim {
             self.expose(t, camera);
             let (rows, lens) = (Rows(&self.rows), &self.lenses[camera]);
             render::cast(&self.room, lens, rows, &mut self.scratch);
-            let pixels = &mut out.images[camera].pixels;
+            let (view, sensor, pixels) = ((&self.room, lens, rows), self.sensor, &mut out.images[camera].pixels);
             let Some(planes) = out.colours.get_mut(camera) else {
-                let exposure = Exposure { sensor: self.sensor, stream, channel: None };
-                render::shade(&self.room, lens, rows, &exposure, &mut self.scratch, pixels);
+                let exposure = Exposure { sensor, streams: [stream] };
+                render::shade(view, &exposure, &mut self.scratch, pixels, |[grey]| grey);
                 continue;
             };
-            for (c, plane) in planes.iter_mut().enumerate() {
-                let stream = texture::hash(c as i32, 0, stream);
-                let exposure = Exposure { sensor: self.sensor, stream, channel: Some(c) };
-                render::shade(&self.room, lens, rows, &exposure, &mut self.scratch, &mut plane.pixels);
+            let exposure = Exposure { sensor, streams: [0, 1, 2].map(|c| texture::hash(c, 0, stream)) };
+            self.colours.resize(pixels.len(), [0; 3]);
+            render::shade(view, &exposure, &mut self.scratch, &mut self.colours, |rgb| rgb);
+            for (i, rgb) in self.colours.iter().enumerate() {
+                pixels[i] = luma(rgb[0], rgb[1], rgb[2]);
+                planes.iter_mut().zip(rgb).for_each(|(plane, level)| plane.pixels[i] = *level);
             }
-            let [red, green, blue] = planes;
-            let rgb = red.pixels.iter().zip(&green.pixels).zip(&blue.pixels);
-            pixels.iter_mut().zip(rgb).for_each(|(grey, ((r, g), b))| *grey = luma(*r, *g, *b));
         }
     }
 
@@ -543,10 +545,11 @@ mod tests {
     fn shot(sim: &mut Sim, world_from_cam: &Pose) -> Vec<(u32, u8)> {
         let Camera { width, height, .. } = sim.rig.cameras[0].camera;
         let rows = [Row { view: View::new(&sim.room, world_from_cam), gain: 120.0, offset: 0.0 }];
-        let exposure = Exposure { sensor: sim.sensor, stream: 0, channel: None };
+        let exposure = Exposure { sensor: sim.sensor, streams: [0] };
         let mut pixels = vec![0; width * height];
         render::cast(&sim.room, &sim.lenses[0], Rows(&rows), &mut sim.scratch);
-        render::shade(&sim.room, &sim.lenses[0], Rows(&rows), &exposure, &mut sim.scratch, &mut pixels);
+        let seen = (&sim.room, &sim.lenses[0], Rows(&rows));
+        render::shade(seen, &exposure, &mut sim.scratch, &mut pixels, |[grey]| grey);
         let hits = &sim.scratch.hits;
         let inside = |i: usize| {
             let around = [i.wrapping_sub(1), i + 1, i.wrapping_sub(width), i + width];

@@ -111,15 +111,13 @@ impl Rows<'_> {
     }
 }
 
-/// The sensor and the noise stream of one image.
+/// The sensor and the noise streams of an image of `N` channels: one of grey, or three of red, green and blue.
 #[derive(Clone, Copy)]
-pub struct Exposure {
+pub struct Exposure<const N: usize> {
     /// Noise and vignette.
     pub sensor: Sensor,
-    /// Differs for every image of a run.
-    pub stream: u32,
-    /// Red, green or blue of a colour image.
-    pub channel: Option<usize>,
+    /// Differ for every plane of a run.
+    pub streams: [u32; N],
 }
 
 /// A solid as seen from a view, for the tile tests.
@@ -266,20 +264,25 @@ pub fn cast(room: &Room, lens: &Lens, rows: Rows, scratch: &mut Scratch) {
     });
 }
 
-/// Writes grey levels from the hits of the last `cast` of the same rows.
-pub fn shade(room: &Room, lens: &Lens, rows: Rows, exposure: &Exposure, scratch: &mut Scratch, out: &mut [u8]) {
+/// Writes what `pixel` makes of the levels, from the hits of the last `cast` of the same rows.
+pub fn shade<const N: usize, T: Send>(
+    (room, lens, rows): (&Room, &Lens, Rows),
+    exposure: &Exposure<N>,
+    scratch: &mut Scratch,
+    out: &mut [T],
+    pixel: impl Fn([u8; N]) -> T + Sync,
+) {
     let hits = &scratch.hits[..lens.width * lens.height];
     fill(room, lens, rows, out, &mut scratch.lists, |block, x, y| {
         let (i, Row { view, gain, offset }) = (y * lens.width + x, *rows.at(y));
         let light = if is_edge(hits, lens, x, y) {
-            edge_radiance(room, lens, view, block.solids(), (x, y), exposure.channel)
+            edge_radiance(room, lens, view, block.solids(), (x, y))
         } else if hits[i].face == NOTHING {
-            0.0
+            [0.0; N]
         } else {
-            let d = view.turn * lens.bearings[i];
-            radiance(room, view, d, hits[i], lens.pixel_angle[i], exposure.channel)
+            radiance(room, view, view.turn * lens.bearings[i], hits[i], lens.pixel_angle[i])
         };
-        develop(light * gain, offset, lens.bearings[i].z, i, exposure)
+        pixel(std::array::from_fn(|c| develop(light[c] * gain, offset, lens.bearings[i].z, i, c, exposure)))
     });
 }
 
@@ -293,7 +296,8 @@ pub fn meter(room: &Room, lens: &Lens, view: View) -> f32 {
             if lens.pixel_angle[i] > 0.0 {
                 let d = view.turn * lens.bearings[i];
                 let (distance, face) = room.nearest(view.origin, d);
-                sum += radiance(room, view, d, Hit { distance, face }, lens.pixel_angle[i] * STEP as f32, None);
+                let [light] = radiance(room, view, d, Hit { distance, face }, lens.pixel_angle[i] * STEP as f32);
+                sum += light;
                 n += 1.0;
             }
         }
@@ -441,9 +445,9 @@ fn is_edge(hits: &[Hit], lens: &Lens, x: usize, y: usize) -> bool {
     differs && !outside
 }
 
-/// The light that leaves a surface towards the camera, of all colours or of one.
+/// The light that leaves a surface towards the camera: of all colours, or red, green and blue.
 #[inline]
-fn radiance(room: &Room, view: View, d: Vec3, hit: Hit, angle: f32, channel: Option<usize>) -> f32 {
+fn radiance<const N: usize>(room: &Room, view: View, d: Vec3, hit: Hit, angle: f32) -> [f32; N] {
     let face = &room.faces[hit.face as usize];
     let place = face.place(view.origin + d * hit.distance);
     // A ray turned by `angle` slides by angle·distance·|u - n (u·d)/(n·d)| along u.
@@ -455,19 +459,19 @@ fn radiance(room: &Room, view: View, d: Vec3, hit: Hit, angle: f32, channel: Opt
     let footprint = Vec2::new(slide(place.u), slide(place.v)) * (angle * hit.distance);
     let spot = Spot { at: place.at, footprint, size: face.size };
     let light = texture::albedo(face.material, face.seed, spot) * room.light(hit.face as usize, place.at);
-    channel.map_or(light, |c| light * texture::tint(face.material, face.seed)[c])
+    let tint = if N == 1 { [1.0; 3] } else { texture::tint(face.material, face.seed) };
+    std::array::from_fn(|c| light * tint[c])
 }
 
 /// The light of a pixel that several faces share: its rays are gathered by face, and each face is shaded once, where its rays
 /// meet it on average.
-fn edge_radiance(
+fn edge_radiance<const N: usize>(
     room: &Room,
     lens: &Lens,
     view: View,
     list: &[SolidInView],
     (x, y): (usize, usize),
-    channel: Option<usize>,
-) -> f32 {
+) -> [f32; N] {
     const RAYS: usize = EDGE * EDGE;
     let angle = lens.pixel_angle[y * lens.width + x];
     let (du, dv) = lens.gradients(x, y);
@@ -484,7 +488,7 @@ fn edge_radiance(
         if ends.iter().all(|(hit, _)| hit.face == face) {
             let middle = ends.iter().map(|(hit, d)| *d * hit.distance).sum::<Vec3>() * 0.25;
             let distance = middle.length();
-            return radiance(room, view, middle / distance, Hit { distance, face }, angle, channel);
+            return radiance(room, view, middle / distance, Hit { distance, face }, angle);
         }
     }
     let mut parts = [(NOTHING, 0.0f32, Vec3::ZERO); RAYS];
@@ -496,25 +500,27 @@ fn edge_radiance(
         let (_, n, sum) = parts[part];
         parts[part] = (hit.face, n + 1.0, sum + d * hit.distance);
     }
-    let mut light = 0.0;
+    let mut light = [0.0; N];
     for (face, n, sum) in &parts[..used] {
         let distance = sum.length() / n;
         let hit = Hit { distance, face: *face };
         let share = n / RAYS as f32;
-        light += share * radiance(room, view, *sum / (distance * n), hit, angle * share.sqrt(), channel);
+        let part: [f32; N] = radiance(room, view, *sum / (distance * n), hit, angle * share.sqrt());
+        light.iter_mut().zip(part).for_each(|(light, part)| *light += share * part);
     }
     light
 }
 
-/// The grey level of a pixel: vignette, exposure, shot and read noise, quantisation.
+/// The level of a pixel in a channel, `cos` of the angle off the axis: vignette, exposure, shot and read noise, quantisation.
 #[inline]
-fn develop(light: f32, offset: f32, cos_off_axis: f32, pixel: usize, e: &Exposure) -> u8 {
-    let lost = e.sensor.vignette as f32 * 2.0 * (1.0 - cos_off_axis * cos_off_axis);
+fn develop<const N: usize>(light: f32, offset: f32, cos: f32, pixel: usize, channel: usize, e: &Exposure<N>) -> u8 {
+    let (stream, Sensor { read_noise, shot_noise, vignette }) = (e.streams[channel], e.sensor);
+    let lost = vignette as f32 * 2.0 * (1.0 - cos * cos);
     let level = (light * (1.0 - lost).max(0.0) + offset).max(0.0);
-    let read = e.sensor.read_noise as f32;
-    let sigma = (read * read + e.sensor.shot_noise as f32 * level).sqrt();
-    let a = texture::hash(pixel as i32, 0, e.stream);
-    let b = texture::hash(pixel as i32, 1, e.stream);
+    let read = read_noise as f32;
+    let sigma = (read * read + shot_noise as f32 * level).sqrt();
+    let a = texture::hash(pixel as i32, 0, stream);
+    let b = texture::hash(pixel as i32, 1, stream);
     // The sum of four uniform numbers, scaled to unit variance.
     let sum = (a & 0xFFFF) + (a >> 16) + (b & 0xFFFF) + (b >> 16);
     let normal = (sum as f32 / 65536.0 - 2.0) * 1.732_050_8;
