@@ -181,7 +181,7 @@ impl Archive {
 
     /// Sees that a place for images is free: takes that of the keyframe that is missed least. False where all must stay.
     pub fn make_place(&mut self, scene: &mut Scene) -> Result<bool, GpuError> {
-        if scene.views.has_free_place() {
+        if scene.views.free_place().is_some() {
             return Ok(true);
         }
         self.look_at_changed();

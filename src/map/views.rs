@@ -142,17 +142,13 @@ impl Views {
         (low < keyframes && id_at(low) == id).then_some(low * self.cameras)
     }
 
-    /// Whether a keyframe would find a place for its images.
-    pub fn has_free_place(&self) -> bool {
-        self.free_place().is_some()
-    }
-
     /// Whether no other keyframe can be known.
     pub fn knows_all_it_can(&self) -> bool {
         self.entries.len() + self.cameras > self.known
     }
 
-    fn free_place(&self) -> Option<usize> {
+    /// A free place for the images of a keyframe.
+    pub fn free_place(&self) -> Option<usize> {
         self.keyframes.iter().position(|k| *k == NONE)
     }
 
@@ -323,8 +319,7 @@ impl Views {
         refined
     }
 
-    /// What the keyframes of its run and epoch that are trained on before and after one were refined by, at its time. Where there
-    /// are none, the exposure of another's.
+    /// What keyframes of its run and epoch beside one were refined by, at its time; where there are none, another's exposure.
     pub fn between(&self, index: usize) -> Refinement {
         let Stored { t, epoch, .. } = self.entries[index];
         let at = self.training.partition_point(|k| (*k as usize) < index);
@@ -545,19 +540,16 @@ mod tests {
         assert!(s.is_full(), "one image more is no keyframe");
     }
 
-    /// Keyframes 0 and 1 are of an earlier run; of this one 3 is alone in epoch 0, 5 has 4 and 7 beside it in epoch 1, and 6, held
-    /// out as well, is of epoch 2.
+    /// Keyframes 0 and 1 are of an earlier run; of this one 3 follows 2 in epoch 0, and 5 is between 4 and 7 in epoch 1.
     #[test]
     fn a_held_out_keyframe_has_the_corrections_of_its_own_run_and_epoch() {
         let mut s = views(8, 1);
         s.earlier = 2;
-        let all = [(0, false), (0, true), (0, false), (0, true), (1, false), (1, true), (2, true), (1, false)];
-        for (id, (epoch, held_out)) in all.into_iter().enumerate() {
-            let t = Nanos::default() + Span::from_secs(id as f64);
-            s.add(&Keyframe { t, epoch, ..keyframe(id as u64, held_out) }, ON_BODY, |_, _| {});
-            let refined = &mut s.get_mut(id).refined;
-            refined.body_from_refined.p.x = id as f64;
-            refined.exposure.gain = 10.0 + id as f64;
+        for (id, epoch) in (0..).zip([0, 0, 0, 0, 1, 1, 2, 1]) {
+            let of = Keyframe { t: Nanos(id as i64), epoch, ..keyframe(id, [1, 3, 5, 6].contains(&id)) };
+            s.add(&of, ON_BODY, |_, _| {});
+            let (p, exposure) = (DVec3::X * id as f64, Exposure { gain: 10.0 + id as f64, offset: 0.0 });
+            s.get_mut(id as usize).refined = Refinement::known(Pose { p, ..Pose::IDENTITY }, exposure);
         }
         let found = [1, 3, 5, 6].map(|i| s.between(i)).map(|r| [r.body_from_refined.p.x, r.exposure.gain]);
         assert_eq!(found, [[0.0, 10.0], [2.0, 12.0], [5.0, 15.0], [0.0, 14.0]]);

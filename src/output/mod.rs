@@ -71,7 +71,7 @@ impl OutputDir {
             io::ErrorKind::AlreadyExists => Ok(()),
             _ => Err(e),
         });
-        probed.and_then(|()| absent(fs::remove_file(&probe))).map_err(|e| not_writable(path, "takes no file", &e))?;
+        probed.and_then(|()| absent(fs::remove_file(&probe))).map_err(|e| cannot_create(path, &e))?;
         own_files(&path.join("renders"))?;
         Ok(OutputDir { path: path.to_path_buf() })
     }
@@ -107,9 +107,8 @@ impl OutputDir {
         atomically(&self.file(name), write)
     }
 
-    /// Removes what an earlier run left under `name`, a file or a folder, and this one does not write. Fails where it cannot
-    /// be removed.
-    pub fn remove(&self, name: &str) -> Result<(), Fault> {
+    /// Removes a file or a folder of results. Fails where it cannot be removed.
+    fn remove(&self, name: &str) -> Result<(), Fault> {
         let path = self.file(name);
         match path.is_dir() {
             true => clear(&path),
@@ -206,11 +205,7 @@ fn partial_name(path: &Path) -> PathBuf {
 }
 
 fn cannot_create(path: &Path, e: &io::Error) -> Fault {
-    not_writable(path, "cannot be created", e)
-}
-
-fn not_writable(path: &Path, what: &str, e: &io::Error) -> Fault {
-    let (place, what) = (path.display().to_string(), format!("{what}: {e}"));
+    let (place, what) = (path.display().to_string(), format!("cannot be created or written to: {e}"));
     Fault::new(FaultKind::NoOutput, place, what, "choose an --out folder that can be written to")
 }
 

@@ -271,8 +271,6 @@ pub struct MapResult {
     pub counters: Vec<(String, u64)>,
     pub quality: Evaluation,
     pub seams: Vec<ScoredLoop>,
-    /// `map.ply` was written.
-    pub written: bool,
     /// Why the map is incomplete, where it is.
     pub failure: Option<String>,
     /// Figures of a process of its own; zero without one.
@@ -364,7 +362,6 @@ impl Mapping {
                 self.write_pool(out)?;
             }
         }
-        result.written = true;
         tell(result);
         let posed = out.write("keyframes.tum", |w| {
             let mut file = TumWriter::begin(w)?;

@@ -219,7 +219,6 @@ pub fn fly(
         },
         scale: board.map.scale,
         truth: input.truth,
-        keeps_map: options.localise_only,
         opened: input.opened,
     };
     let length_s = input.source.length_s().filter(|_| !repeats);

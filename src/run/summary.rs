@@ -17,7 +17,7 @@ use crate::publish::event::EventId;
 use crate::vio::Part;
 use std::borrow::Cow;
 use std::fmt;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering::Relaxed;
 use stipple_drivers::{host, Fault, Nanos, TimedPose};
 
@@ -28,8 +28,6 @@ pub struct Title {
     pub pace: &'static str,
     pub scale: u32,
     pub truth: Vec<TimedPose>,
-    /// Whether the map of an earlier run stays, as this one was only to find itself in it.
-    pub keeps_map: bool,
     /// Counters of opening the recording.
     pub opened: Vec<(&'static str, u64)>,
 }
@@ -102,7 +100,7 @@ pub fn conclude(title: Title, mut flown: Flown, logged: &[PathBuf], out: &Output
     let trajectory = write("trajectory.tum", &corrections);
     // Beside poses in the map, where places are recognised, those of the estimator alone.
     let odometry = flown.loops.as_ref().map_or(Ok(()), |_| write("odometry.tum", &Corrections::default()));
-    let mut fault = trajectory.and(odometry).err().map(|fault| {
+    let fault = trajectory.and(odometry).err().map(|fault| {
         let fix = "make room or mend the disk, then `stipple recover` with this folder writes what the log holds";
         Fault { fix: fix.into(), ..fault }
     });
@@ -141,9 +139,6 @@ pub fn conclude(title: Title, mut flown: Flown, logged: &[PathBuf], out: &Output
             warn(&mut flown.warnings, format!("the map is incomplete: {why}"));
         }
     }
-    if !title.keeps_map && !map.as_ref().is_some_and(|m| m.written) {
-        fault = fault.or(out.remove("map.ply").err());
-    }
     flown.loops.iter().flat_map(|loops| place_warnings(loops)).for_each(|what| warn(&mut flown.warnings, what));
     if flown.tracker.odometry().is_some_and(|run| run.back.trajectory.is_empty()) {
         let why = "no frame got a pose, odometry never started: its health and the counters in report.json say why";
@@ -162,8 +157,7 @@ pub fn conclude(title: Title, mut flown: Flown, logged: &[PathBuf], out: &Output
     let tracking_ms: &[(Nanos, f64)] = flown.tracker.odometry().map_or(&[], |run| &run.back.frame_ms);
     let (estimated, truth, error, warnings) = (&estimated[..], &title.truth[..], error.as_ref(), &flown.warnings[..]);
     let evidence = Evidence { estimated, epochs: &epochs, truth, error, tracking_ms, pictures: &[], warnings };
-    let drawn = map.map_or(vec![], |m| m.drawn);
-    let written = write_files(&report, &evidence, (drawn, title.keeps_map), out);
+    let written = write_files(&report, &evidence, map.map_or(vec![], |m| m.drawn), out);
     (report, fault.or(written))
 }
 
@@ -272,20 +266,11 @@ fn track_figures(report: &mut Report, flown: &Flown) -> Vec<TimedPose> {
 }
 
 /// Writes the files of DIR, and answers the first fault; `evidence` is without its pictures.
-fn write_files(
-    report: &Report,
-    evidence: &Evidence,
-    (drawn, keeps_map): (Vec<Drawn>, bool),
-    out: &OutputDir,
-) -> Option<Fault> {
-    let renders = match drawn.is_empty() {
-        true if keeps_map => Ok(()),
-        true => out.remove("renders"),
-        false => out.replace_folder("renders", |dir| {
-            let mut all = drawn.iter();
-            all.try_for_each(|d| atomically(&dir.join(format!("{}.png", d.name)), |w| d.picture.write_png(w)))
-        }),
+fn write_files(report: &Report, evidence: &Evidence, drawn: Vec<Drawn>, out: &OutputDir) -> Option<Fault> {
+    let write = |dir: &Path| {
+        drawn.iter().try_for_each(|d| atomically(&dir.join(format!("{}.png", d.name)), |w| d.picture.write_png(w)))
     };
+    let renders = if drawn.is_empty() { Ok(()) } else { out.replace_folder("renders", write) };
     let pictures: Vec<(String, Picture)> = drawn.into_iter().map(|d| (d.caption, d.picture)).collect();
     let evidence = Evidence { pictures: &pictures, ..*evidence };
     let page = out.write("report.html", |w| write_html(w, report, &evidence));
