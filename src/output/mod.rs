@@ -116,8 +116,8 @@ impl OutputDir {
         }
     }
 
-    /// Renames the results of an earlier run, if there are any, to `previous-map.ply` and so on, and removes what had these
-    /// names: after a kill they are not taken for results of this run. Where this run maps nothing, the map's stay.
+    /// Renames the results of an earlier run, if there are any, to `previous-report.html` and so on, and removes what had these
+    /// names: after a kill they are not taken for results of this run. Those of the map only where this run `maps`.
     pub fn set_aside(&self, maps: bool) -> Result<(), Fault> {
         let previous = |name: &str| format!("previous-{name}");
         let of_map: &[&str] = if maps { &OF_MAP } else { &[] };
