@@ -117,10 +117,10 @@ impl OutputDir {
     }
 
     /// Renames the results of an earlier run, if there are any, to `previous-report.html` and so on, and removes what had these
-    /// names: after a kill they are not taken for results of this run. Those of the map only where this run `maps`.
-    pub fn set_aside(&self, maps: bool) -> Result<(), Fault> {
+    /// names: after a kill they are not taken for results of this run. Those of the map stay without `with_map`.
+    pub fn set_aside(&self, with_map: bool) -> Result<(), Fault> {
         let previous = |name: &str| format!("previous-{name}");
-        let of_map: &[&str] = if maps { &OF_MAP } else { &[] };
+        let of_map: &[&str] = if with_map { &OF_MAP } else { &[] };
         let results = || OF_FLIGHT.iter().chain(of_map);
         let mut there = results().filter(|name| self.file(name).symlink_metadata().is_ok()).peekable();
         if there.peek().is_some() {
@@ -277,7 +277,7 @@ mod tests {
         out.write("report.json", |w| w.write_all(b"2")).unwrap();
         out.set_aside(true).unwrap();
         assert_eq!(names(dir.path()), ["log-0000.mcap", "previous-report.json"]);
-        // Runs that map nothing leave the map of the one before.
+        // Runs that only localise leave the map of the one before.
         out.write("map.ply", |w| w.write_all(b"3")).unwrap();
         for report in [b"3", b"4"] {
             out.write("report.json", |w| w.write_all(report)).unwrap();
