@@ -31,7 +31,6 @@ struct Local {
     vec2 centre;    // px, half-integer pixel centres
 };
 
-const float NEAR = 0.05;            // m
 const float LOW_PASS = 0.3;         // px², keeps every Gaussian about a pixel wide
 const float LOG_SCALE_MIN = -11.5;  // 1e-5 m
 const float LOG_SCALE_MAX = 4.6;    // 100 m

@@ -19,6 +19,19 @@ struct Projected {
     vec4 conic_shade;   // conic c; opacity; grey level or red; depth, m
 };
 
+// What a picture counts; all zero before it.
+struct Counts {
+    uint visible;     // Gaussians that touch a tile
+    uint not_finite;  // Gaussians
+    uint listed;      // intersections that have a place in the list,
+    uint needed;      // and all there are
+    uint shared_out;  // places that tiles have taken for their lists
+    uint longest;     // list
+};
+
+// Nothing nearer is drawn, m.
+const float NEAR = 0.05;
+
 // Colours are trained within 0 and this: the map is in one keyframe's exposure, and what another shows as white may be
 // brighter than white there.
 const float COLOUR_MAX = 8.0;

@@ -1,7 +1,6 @@
 // Sums each visible Gaussian's intersection gradients in fixed order, carries them back to its parameters
-// and to the camera pose, adds the regularisers, and takes one Adam step: one thread a rank.
-// in   visible_count, slots (by depth), tile_offsets, isect_gradients (slots of raster_backward, chunks
-//      summed by sum_chunks)
+// and to the camera pose, adds the regularisers, and takes one Adam step: one thread a slot.
+// in   counts, runs, isect_gradients (slots of raster_backward, chunks summed by sum_chunks)
 // out  splats, moments, steps (count and importance of this Gaussian, see importance.glsl); sums[8 group + ..]: gradient by a small
 //      translation (3) and rotation (3) of the camera frame applied to points, count of refused gradients, 0
 // A step whose gradient is not finite is not taken, and counted. What a view hardly shows takes none. Without LEARN, or where the list overflowed, no step is
@@ -25,6 +24,7 @@ layout(constant_id = 7) const bool LEARN = true;
 layout(push_constant) uniform Push {
     Camera camera;
     uvec2 size;
+    uint splats;              // end of the slots
     uint capacity;            // intersections
     float rate_position;      // Adam step sizes: m, ln m, 1, logit, grey
     float rate_scale;
@@ -37,14 +37,13 @@ layout(push_constant) uniform Push {
     float weight_opacity;
 } push;
 
-READ_UINTS(0, VisibleCount, visible_count)
-READ_UINTS(1, Slots, slot_of)
-READ_UINTS(2, TileOffsets, tile_offset)
-READ_VEC4S(3, IsectGradients, isect_gradient)
-layout(set = 0, binding = 4, std430) buffer Splats { Splat splats[]; };
-layout(set = 0, binding = 5, std430) buffer MomentsInOut { Moments moments[]; };
-layout(set = 0, binding = 6, std430) buffer Steps { uint steps[]; };
-layout(set = 0, binding = 7, std430) writeonly buffer Sums { float sums[]; };
+layout(set = 0, binding = 0, std430) readonly buffer CountsIn { Counts counts[]; };
+READ_UVEC2S(1, Runs, run_of)
+READ_VEC4S(2, IsectGradients, isect_gradient)
+layout(set = 0, binding = 3, std430) buffer Splats { Splat splats[]; };
+layout(set = 0, binding = 4, std430) buffer MomentsInOut { Moments moments[]; };
+layout(set = 0, binding = 5, std430) buffer Steps { uint steps[]; };
+layout(set = 0, binding = 6, std430) writeonly buffer Sums { float sums[]; };
 
 const uint SLOT_QUADS = CHANNELS == 3 ? 3 : 2;
 const float BETA1 = 0.9;
@@ -76,9 +75,9 @@ vec4 adam(inout vec4 m, inout vec4 v, vec4 g, vec4 rate, vec2 debias) {
 }
 
 /// Takes the step; the six pose terms, or a one in the seventh place.
-float[7] update(uint rank) {
+float[7] update(uint slot) {
     float pose[7] = float[7](0, 0, 0, 0, 0, 0, 0);
-    const uint begin = tile_offset(rank), end = min(tile_offset(rank + 1), push.capacity);
+    const uint begin = run_of(slot).x, end = run_of(slot).y;
     vec4 v0 = vec4(0.0), v1 = vec4(0.0);
     // Visibility x opacity x gradient, tile by tile: to first order, what the loss would change without it.
     float worth = 0.0;
@@ -93,7 +92,6 @@ float[7] update(uint rank) {
     if (begin >= end || worth == 0.0) {
         return pose;
     }
-    const uint slot = slot_of(rank);
     Splat s = splats[slot];
     Local l;
     if (!place(push.camera, s, l)) {  // project rounded it in
@@ -101,7 +99,7 @@ float[7] update(uint rank) {
     }
     flatten(push.camera, vec2(push.size), l);
     Gradient g = pull_back(push.camera, l, s.scale_colour.xyz, v0.xy, vec3(v0.zw, v1.x));
-    const float per_splat = 1.0 / float(visible_count(0));
+    const float per_splat = 1.0 / float(counts[0].visible);
     const float opacity = sigmoid(s.mean_opacity.w);
     const float v_logit = (1.0 - opacity) * (v1.y + push.weight_opacity * per_splat * opacity);
     const vec4 d0 = vec4(transpose(cam_from_world(push.camera)) * g.cam, v_logit);
@@ -114,7 +112,7 @@ float[7] update(uint rank) {
     pose = float[7](g.cam.x, g.cam.y, g.cam.z, turn.x, turn.y, turn.z, 0.0);
 
     // A list that lost Gaussians shows holes, which are nothing to learn from.
-    const bool whole = tile_offset(visible_count(0)) <= push.capacity;
+    const bool whole = counts[0].needed <= push.capacity;
     if (!(LEARN && whole) || !shown(steps[slot], worth)) {
         return pose;
     }
@@ -142,10 +140,10 @@ float[7] update(uint rank) {
 shared float terms[7 * 65];
 
 void main() {
-    const uint rank = thread_index(), i = gl_LocalInvocationID.x;
+    const uint slot = thread_index(), i = gl_LocalInvocationID.x;
     float pose[7] = float[7](0, 0, 0, 0, 0, 0, 0);
-    if (rank < visible_count(0)) {
-        pose = update(rank);
+    if (slot < push.splats) {
+        pose = update(slot);
     }
     [[unroll]] for (uint q = 0; q < 7; ++q) {
         terms[q * 65 + i] = pose[q];

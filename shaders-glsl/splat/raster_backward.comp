@@ -54,7 +54,7 @@ Batch fetch(uint at, uint end) {
 void main() {
     const uint tile = tile_index();
     const uvec2 grid = tile_grid(push.size);
-    if (tile > grid.x * grid.y) {  // the one past the last holds emit_tiles' padding, which gets zeros
+    if (tile >= grid.x * grid.y) {
         return;
     }
     const uvec2 pixel = column_of(tile, push.size);

@@ -1,10 +1,12 @@
 // Gathers what a step reports into the one thing the host reads: one workgroup, fixed order of sums.
-// in   visible_count, isect_count, failed, ssim_sums, loss_sums, sums (of project_backward)
+// in   counts, ssim_sums, loss_sums, sums (of project_backward)
 // out  status
 #version 450
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
 layout(local_size_x = 128) in;
+
+#include "../common/types.glsl"
 
 struct Status {
     uint visible;
@@ -24,13 +26,11 @@ layout(push_constant) uniform Push {
     uint splat_groups;
 } push;
 
-layout(set = 0, binding = 0, std430) readonly buffer VisibleCount { uint visible_count[]; };
-layout(set = 0, binding = 1, std430) readonly buffer IsectCount { uint isect_count[]; };
-layout(set = 0, binding = 2, std430) readonly buffer Failed { uint failed[]; };
-layout(set = 0, binding = 3, std430) readonly buffer SsimSums { float ssim_sums[]; };
-layout(set = 0, binding = 4, std430) readonly buffer LossSums { vec4 loss_sums[]; };
-layout(set = 0, binding = 5, std430) readonly buffer Sums { float sums[]; };
-layout(set = 0, binding = 6, std430) writeonly buffer StatusOut { Status status[]; };
+layout(set = 0, binding = 0, std430) readonly buffer CountsIn { Counts counts[]; };
+layout(set = 0, binding = 1, std430) readonly buffer SsimSums { float ssim_sums[]; };
+layout(set = 0, binding = 2, std430) readonly buffer LossSums { vec4 loss_sums[]; };
+layout(set = 0, binding = 3, std430) readonly buffer Sums { float sums[]; };
+layout(set = 0, binding = 4, std430) writeonly buffer StatusOut { Status status[]; };
 
 // Sums of SSIM; of |x - y| and the gradients by gain and offset; of the seven terms of project_backward.
 const uint TERMS = 11;
@@ -66,10 +66,10 @@ void main() {
         }
     }
     if (i == 0) {
-        status[0].visible = visible_count[0];
-        status[0].intersections = isect_count[0];
-        status[0].intersections_needed = isect_count[1];
-        status[0].not_finite = failed[0];
+        status[0].visible = counts[0].visible;
+        status[0].intersections = counts[0].listed;
+        status[0].intersections_needed = counts[0].needed;
+        status[0].not_finite = counts[0].not_finite;
         status[0].ssim_sum = sums_of[0];
         status[0].l1_sum = sums_of[lanes];
         status[0].exposure = float[2](sums_of[2 * lanes], sums_of[3 * lanes]);

@@ -1,35 +1,47 @@
-// First and last + 1 of each tile's run in the sorted list, which the workgroups walk; tiles without one keep the zeros
-// they were filled with.
-// in   isect_count, keys (sorted)
-// out  ranges[tile]
+// Gives each tile as many places in a row as it has intersections: one thread a tile. Which tile comes first differs from run to run,
+// what its list holds does not.
+// in   tile_lengths
+// out  ranges[tile]: its first place, twice, as fill_lists moves the second to the end; counts.listed, .shared_out, .longest
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// variants: cpu
 layout(local_size_x = 64) in;
 
+#include "../common/types.glsl"
 #include "../common/index.glsl"
-#include "../common/texels.glsl"
 
 layout(push_constant) uniform Push {
-    uint tiles;  // with the one of emit_tiles' padding
+    uint tiles;
+    uint capacity;  // intersections
 } push;
 
-READ_UINTS(0, IsectCount, isect_count)
-READ_UINTS(1, Keys, key_at)
-layout(set = 0, binding = 2, std430) writeonly buffer Ranges { uvec2 ranges[]; };
+layout(set = 0, binding = 0, std430) readonly buffer TileLengths { uint tile_lengths[]; };
+layout(set = 0, binding = 1, std430) writeonly buffer Ranges { uvec2 ranges[]; };
+layout(set = 0, binding = 2, std430) buffer CountsOut { Counts counts[]; };
+
+shared uint together;  // places of the workgroup's tiles, then the first of them
+shared uint longest;
 
 void main() {
-    const uint n = isect_count(0);
-    for (uint i = thread_index(); i < n; i += gl_NumWorkGroups.x * gl_WorkGroupSize.x) {
-        const uint tile = key_at(i);
-        if (tile >= push.tiles) {
-            continue;
-        }
-        if (i == 0 || key_at(i - 1) != tile) {
-            ranges[tile].x = i;
-        }
-        if (i + 1 == n || key_at(i + 1) != tile) {
-            ranges[tile].y = i + 1;
-        }
+    const uint tile = thread_index();
+    const bool leads = gl_LocalInvocationID.x == 0;
+    if (leads) {
+        together = 0;
+        longest = 0;
+    }
+    barrier();
+    const uint length = tile < push.tiles ? tile_lengths[tile] : 0;
+    const uint before = atomicAdd(together, length);
+    atomicMax(longest, length);
+    barrier();
+    if (leads) {
+        together = atomicAdd(counts[0].shared_out, together);
+        atomicMax(counts[0].longest, longest);
+    }
+    barrier();
+    if (tile < push.tiles) {
+        ranges[tile] = uvec2(together + before);
+    }
+    if (tile == 0) {
+        counts[0].listed = min(counts[0].needed, push.capacity);
     }
 }

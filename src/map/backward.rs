@@ -77,42 +77,42 @@ impl Backward {
         rates: Option<&LearningRates>,
         weights: &Weights,
     ) {
-        let b = &renderer.buffers;
+        let b = &renderer.lists.buffers;
         rec.dispatch(
             &self.raster,
             raster_backward::Bind {
                 ranges: b.ranges.read(),
-                intersections: b.isects.read(),
+                intersections: b.lists.read(),
                 owners: b.owners.read(),
-                projected_in: b.projected.read(),
+                projected_in: renderer.projected.read(),
                 chroma: pool.buffers.chroma.read(),
-                rendered: b.rendered.read(),
+                rendered: renderer.rendered.read(),
                 pixel_gradient: pixel_gradient.read(),
                 isect_gradients: self.isect_gradients.write(),
             },
             raster_backward::Push { size: view.size() },
-            Threads::d1((renderer.tiles(view) + 1) * renderer.tiling.lanes),
+            Threads::d1(renderer.tiles(view) * renderer.tiling.lanes),
         );
         if let Some(sum_chunks) = &self.sum_chunks {
             let slots = sum_chunks::Bind {
-                isect_count: b.isect_count.read(),
+                counts_in: b.counts.read(),
                 owners: b.owners.read(),
                 isect_gradients: self.isect_gradients.read_write(),
             };
-            rec.dispatch(sum_chunks, slots, (), renderer.walkers);
+            rec.dispatch(sum_chunks, slots, (), renderer.lists.walkers);
         }
         if let (Some(chroma), Some(rates)) = (&self.chroma, rates) {
             let bind = chroma_backward::Bind {
-                visible_count: b.visible_count.read(),
-                slots: b.ranked.read(),
-                tile_offsets: b.tile_offsets.read(),
+                counts_in: b.counts.read(),
+                runs: b.runs.read(),
                 steps: pool.buffers.steps.read(),
                 isect_gradients: self.isect_gradients.cast().read(),
                 chroma: pool.buffers.chroma.read_write(),
                 chroma_moments: pool.buffers.chroma_moments.read_write(),
             };
-            let push = chroma_backward::Push { capacity: self.capacity, rate: rates.colour };
-            rec.dispatch(chroma, bind, push, Threads::d1(pool.slots(view.epoch).end));
+            let splats = pool.slots(view.epoch).end;
+            let push = chroma_backward::Push { splats, capacity: self.capacity, rate: rates.colour };
+            rec.dispatch(chroma, bind, push, Threads::d1(splats));
         }
         self.record_project(rec, pool, renderer, view, rates, weights);
     }
@@ -126,15 +126,14 @@ impl Backward {
         rates: Option<&LearningRates>,
         weights: &Weights,
     ) {
-        let b = &renderer.buffers;
+        let (b, splats) = (&renderer.lists.buffers, pool.slots(view.epoch).end);
         let kernel = &self.project[view.lens()][usize::from(rates.is_some())];
         let rates = rates.copied().unwrap_or_default();
         rec.dispatch(
             kernel,
             project_backward::Bind {
-                visible_count: b.visible_count.read(),
-                slots: b.ranked.read(),
-                tile_offsets: b.tile_offsets.read(),
+                counts_in: b.counts.read(),
+                runs: b.runs.read(),
                 isect_gradients: self.isect_gradients.cast().read(),
                 splats: pool.buffers.splats.read_write(),
                 moments_in_out: pool.buffers.moments.read_write(),
@@ -144,6 +143,7 @@ impl Backward {
             project_backward::Push {
                 camera: view.words(),
                 size: view.size(),
+                splats,
                 capacity: self.capacity,
                 rate_position: rates.position,
                 rate_scale: rates.scale,
@@ -155,7 +155,7 @@ impl Backward {
                 log_scale_soft: weights.scale_soft_m.ln(),
                 weight_opacity: weights.opacity,
             },
-            Threads::d1(pool.slots(view.epoch).end),
+            Threads::d1(splats),
         );
     }
 }

@@ -12,8 +12,8 @@ use super::coarseness::Coarseness;
 use super::loss::{self, Loss};
 use super::pool::{self, Pool};
 use super::render::{self, Rendered, Renderer};
+use super::scan::{self, Scan};
 use super::shape::{Scratch, Shape, GROUP};
-use super::sort::{self, Scan};
 use super::step::{LearningRates, Stats, StepStats, Target, Weights};
 use super::tiling::Tiling;
 use super::view::View;
@@ -29,7 +29,7 @@ pub struct Buffers {
     render: render::Buffers,
     loss: loss::Buffers,
     backward: backward::Buffers,
-    sort: sort::Buffers,
+    scan: scan::Buffers,
     status: Buf<Status>,
 }
 
@@ -41,7 +41,7 @@ impl Buffers {
             loss: loss::Buffers::new(arena, shape)?,
             backward: backward::Buffers::new(arena, shape)?,
             scratch: Scratch::new(arena, shape)?,
-            sort: sort::Buffers::new(arena)?,
+            scan: scan::Buffers::new(arena)?,
             status: arena.alloc("status", 1)?,
         })
     }
@@ -90,12 +90,12 @@ impl Pipeline {
     /// Does what `new` does with the raster chosen.
     pub fn with_tiling(gpu: &mut Gpu, shape: Shape, tiling: Tiling) -> Result<Pipeline, Fault> {
         shape.check()?;
-        let Buffers { scratch, pool, render, loss, backward, sort, status } = Buffers::new(gpu.arena(), &shape)?;
-        let scan = Scan::new(gpu, &sort)?;
+        let Buffers { scratch, pool, render, loss, backward, scan, status } = Buffers::new(gpu.arena(), &shape)?;
+        let scan = Scan::new(gpu, &scan)?;
         Ok(Pipeline {
             // Gradients of intersections live for one step.
             pool: Pool::new(gpu, pool, scratch.isect_gradients.cast(), scan, &shape)?,
-            renderer: Renderer::new(gpu, render, scratch, &sort, &shape, tiling)?,
+            renderer: Renderer::new(gpu, render, scratch, &shape, tiling)?,
             loss: Loss::new(gpu, loss, &scratch, &shape, tiling.loss_by_tiles)?,
             backward: Backward::new(gpu, backward, &scratch, &shape, tiling)?,
             shape,
@@ -129,7 +129,7 @@ impl Pipeline {
         let planes = [(0, channels, &mut out.colour), (channels, 1, &mut out.alpha), (channels + 1, 1, &mut out.depth)];
         for (plane, count, pixels) in planes {
             pixels.resize(count * n, 0.0);
-            gpu.download(self.renderer.buffers.rendered, plane * n, pixels)?;
+            gpu.download(self.renderer.rendered, plane * n, pixels)?;
         }
         out.alpha.iter_mut().for_each(|t| *t = 1.0 - *t);
         Ok(stats)
@@ -142,7 +142,7 @@ impl Pipeline {
 
     /// SSIM by pixel of what was rendered last against an image; once for a picture, which it fills where something is absent.
     pub fn similarity(&self, gpu: &mut Gpu, target: &Target, map: &mut Vec<f32>) -> Result<(), GpuError> {
-        self.loss.similarity(gpu, self.renderer.buffers.rendered, target, map)
+        self.loss.similarity(gpu, self.renderer.rendered, target, map)
     }
 
     /// One step on an image, whose view must have the shape's size. Without rates the map, Adam's moments included, stays as it
@@ -207,19 +207,17 @@ impl Pipeline {
         let view = if target.half_size { &halved } else { view };
         let gradient = self.loss.buffers.pixel_gradient;
         self.renderer.record(rec, &self.pool, view, false);
-        self.loss.record(rec, self.renderer.buffers.rendered, target, weights.ssim);
+        self.loss.record(rec, self.renderer.rendered, target, weights.ssim);
         self.backward.record(rec, &self.pool, &self.renderer, gradient, view, rates, weights);
         self.record_summary(rec, self.loss.sums(target), self.pool.slots(view.epoch).end.div_ceil(GROUP));
     }
 
     fn record_summary(&self, rec: &mut Recorder, image_groups: u32, splat_groups: u32) {
-        let (picture, loss) = (&self.renderer.buffers, &self.loss.buffers);
+        let loss = &self.loss.buffers;
         rec.dispatch(
             &self.summary,
             summary::Bind {
-                visible_count: picture.visible_count.read(),
-                isect_count: picture.isect_count.read(),
-                failed: picture.failed.read(),
+                counts_in: self.renderer.lists.buffers.counts.read(),
                 ssim_sums: loss.ssim_sums.read(),
                 loss_sums: loss.loss_sums.read(),
                 sums: self.backward.buffers.pose_sums.read(),

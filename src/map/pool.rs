@@ -6,8 +6,8 @@
 //! costs two copies of the pool (200 k: 60 MB) and is rare: at keyframes only. Who leaves a full pool is read off a
 //! histogram of importance; nothing is sorted. Whole blocks come and go by `paging`.
 
+use super::scan::Scan;
 use super::shape::Shape;
-use super::sort::Scan;
 use crate::gpu::kernels::types::{Moments, Splat};
 use crate::gpu::kernels::{importance, move_block, prune, repack};
 use crate::gpu::{Arena, Buf, Gpu, GpuError, Kernel, Recorder, Threads};

@@ -1,6 +1,5 @@
 //! How large the buffers of the splat kernels are, and the bytes that the stages of a step use in turn.
 
-use super::sort::Pairs;
 use crate::gpu::{Arena, Buf, ALIGN};
 use crate::limits::CAMERAS_MAX;
 use stipple_drivers::{Fault, FaultKind};
@@ -32,17 +31,30 @@ pub const RUN: u32 = 8;
 pub const LOSS_TILE: [u32; 2] = [54, 8];
 /// Invocations of a workgroup of the kernels that sum runs of pixels, or Gaussians.
 pub const GROUP: u32 = 64;
+/// What fits into an element of a list: tile_depth.glsl.
+const TILES_MAX: usize = (1 << 16) - 1;
+const SLOTS_MAX: u32 = 1 << 22;
+const INTERSECTIONS_MAX: u32 = 1 << 26;
 /// Side of the smallest tile, px: 8 lanes with columns of 8, or 32 with columns of 2.
 const TILE_MIN: u32 = 8;
 
 impl Shape {
     pub fn check(&self) -> Result<(), Fault> {
+        let fault = |what, fix| Err(Fault::new(FaultKind::Config, "map", what, fix));
         let sizes = [self.width, self.height, self.splats, self.intersections, self.images];
-        if !sizes.contains(&0) && [1, 3].contains(&self.channels) && (1..=CAMERAS_MAX as u32).contains(&self.cameras) {
-            return Ok(());
+        if sizes.contains(&0) || ![1, 3].contains(&self.channels) || !(1..=CAMERAS_MAX as u32).contains(&self.cameras) {
+            let what = format!("{self:?} has a zero, neither 1 nor 3 channels, or no or too many cameras");
+            return fault(what, "raise the board's [budget]");
         }
-        let what = format!("{self:?} has a zero, neither 1 nor 3 channels, or no or too many cameras");
-        Err(Fault::new(FaultKind::Config, "map", what, "raise the board's [budget]"))
+        if self.tiles_max() > TILES_MAX {
+            let what = format!("images of {} x {} px are more than {TILES_MAX} tiles", self.width, self.height);
+            return fault(what, "raise map.scale, or lower budget.image_width_max and image_height_max");
+        }
+        if self.splats > SLOTS_MAX || self.intersections > INTERSECTIONS_MAX {
+            let what = format!("{} Gaussians or {} intersections are too many", self.splats, self.intersections);
+            return fault(what, "lower budget.splats or budget.intersections");
+        }
+        Ok(())
     }
 
     /// Makes one for pinholes and one for fisheyes; a map without fisheyes has the first twice.
@@ -110,14 +122,14 @@ impl Shape {
     }
 }
 
-/// Bytes used in turn: to sort, then by the loss, then for the gradients of intersections. What a step needs after its
+/// Bytes used in turn: to list, then by the loss, then for the gradients of intersections. What a step needs after its
 /// stage is not here.
 #[derive(Clone, Copy)]
 pub struct Scratch {
-    /// While sorting. Keys of Gaussians and of intersections are not needed at the same time, so they are the same.
-    pub depth_keys: Buf<u32>,
-    pub isect_keys: Buf<u32>,
-    spare: Pairs,
+    /// While lists are made: the tile and the depth of each intersection, then elements of lists, and room to sort long ones.
+    pub tile_depths: Buf<u32>,
+    pub unsorted: Buf<[u32; 2]>,
+    pub spare: Buf<[u32; 2]>,
     /// In the loss: filtered moments (5 planes, used on a CPU) and SSIM slopes (3).
     pub filtered: Buf<f32>,
     pub slopes: Buf<f32>,
@@ -132,30 +144,19 @@ fn aligned(n: usize) -> usize {
 
 impl Scratch {
     pub fn new(arena: &mut Arena, shape: &Shape) -> Result<Scratch, Fault> {
-        let (slots, isects, pixels) = (shape.splats as usize + 1, shape.intersections as usize, shape.pixels());
-        let keys = slots.max(isects);
+        let (isects, pixels) = (shape.intersections as usize, shape.pixels());
         let planes = aligned(5 * pixels) + 3 * pixels;
         let gradients = shape.gradient_words() * isects;
-        let words = planes.max(gradients).max(3 * aligned(keys));
-        let all = arena.alloc::<u32>("intersections: gradients, over sort keys and loss planes", words)?;
-        let nth = |i: usize| all.part(i * aligned(keys), keys);
+        let words = planes.max(gradients).max(aligned(isects) + aligned(2 * isects) + 4 * isects);
+        let all = arena.alloc::<u32>("intersections: gradients, over lists in the making and loss planes", words)?;
         Ok(Scratch {
-            depth_keys: nth(0).part(0, slots),
-            isect_keys: nth(0).part(0, isects),
-            spare: Pairs { keys: nth(1), payload: nth(2) },
+            tile_depths: all.part(0, isects),
+            unsorted: all.part(aligned(isects), 2 * isects).cast(),
+            spare: all.part(aligned(isects) + aligned(2 * isects), 4 * isects).cast(),
             filtered: all.part(0, 5 * pixels).cast(),
             slopes: all.part(aligned(5 * pixels), 3 * pixels).cast(),
             isect_gradients: all.part(0, gradients).cast(),
         })
-    }
-
-    /// What to sort `keys` from and to, so that after `passes` the payload is in `into`.
-    pub fn pairs(&self, keys: Buf<u32>, into: Buf<u32>, passes: u32) -> (Pairs, Pairs) {
-        let (from, to) = match passes % 2 {
-            0 => (into, self.spare.payload),
-            _ => (self.spare.payload, into),
-        };
-        (Pairs { keys, payload: from }, Pairs { keys: self.spare.keys, payload: to })
     }
 }
 
@@ -163,26 +164,43 @@ impl Scratch {
 mod tests {
     use super::*;
 
+    const SMALL: Shape = Shape {
+        width: 8,
+        height: 8,
+        splats: 1,
+        intersections: 1,
+        images: 1,
+        channels: 1,
+        cameras: 1,
+        fisheye: false,
+        half_size: false,
+    };
+
+    #[test]
+    fn what_does_not_fit_into_an_element_of_a_list_is_refused() {
+        let shape = Shape { width: 752, height: 480, splats: 1 << 22, intersections: 1 << 26, ..SMALL };
+        assert_eq!(shape.check(), Ok(()));
+        assert_eq!(Shape { width: 2000, height: 2000, ..shape }.check(), Ok(()));
+        for (what, refused) in [
+            ("2100 x 2100 px", Shape { width: 2100, height: 2100, ..shape }),
+            ("4194305 Gaussians", Shape { splats: (1 << 22) + 1, ..shape }),
+            ("67108865 intersections", Shape { intersections: (1 << 26) + 1, ..shape }),
+            ("zero", Shape { images: 0, ..shape }),
+        ] {
+            let fault = refused.check().err().map(|f| f.what).unwrap_or_default();
+            assert!(fault.contains(what), "{fault}");
+        }
+    }
+
     #[test]
     fn what_a_lens_needs_is_made_for_the_lenses_there_are() {
-        let shape = Shape {
-            width: 8,
-            height: 8,
-            splats: 1,
-            intersections: 1,
-            images: 1,
-            channels: 1,
-            cameras: 1,
-            fisheye: false,
-            half_size: false,
-        };
         let mut made = vec![];
         let mut make = |fisheye| {
             made.push(fisheye);
             Ok(made.len())
         };
-        assert_eq!(shape.by_lens(&mut make).ok(), Some([1, 1]));
-        assert_eq!(Shape { fisheye: true, ..shape }.by_lens(&mut make).ok(), Some([2, 3]));
+        assert_eq!(SMALL.by_lens(&mut make).ok(), Some([1, 1]));
+        assert_eq!(Shape { fisheye: true, ..SMALL }.by_lens(&mut make).ok(), Some([2, 3]));
         assert_eq!(made, [false, false, true]);
     }
 }

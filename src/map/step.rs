@@ -61,7 +61,7 @@ impl Default for Weights {
 pub struct Stats {
     pub visible: u32,
     pub intersections: u32,
-    /// Intersections there was no room for: the farthest. None of a picture, which is drawn coarser until it fits.
+    /// Intersections there was no room for. None of a picture, which is drawn coarser until it fits.
     pub overflow: u32,
     /// Gaussians culled for not being finite.
     pub failed: u32,

@@ -5,7 +5,7 @@ use std::fs;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
-use stipple::gpu::kernels::{axpy, radix_count, radix_scatter, scan_apply, scan_reduce};
+use stipple::gpu::kernels::{axpy, scan_apply, scan_reduce, summary, tile_ranges};
 use stipple::gpu::{cache_folder, Gpu, GpuOptions};
 use stipple_drivers::Fault;
 
@@ -17,8 +17,8 @@ fn open() -> Gpu {
 fn start(gpu: &mut Gpu, folder: &Path) -> (usize, Result<(), Fault>) {
     let taken = gpu.reuse_pipelines(folder);
     gpu.kernel::<axpy::K>(axpy::Spec::default()).unwrap();
-    gpu.kernel::<radix_count::K>(radix_count::Spec::default()).unwrap();
-    gpu.kernel::<radix_scatter::K>(radix_scatter::Spec::default()).unwrap();
+    gpu.kernel::<summary::K>(summary::Spec::default()).unwrap();
+    gpu.kernel::<tile_ranges::K>(tile_ranges::Spec::default()).unwrap();
     gpu.kernel::<scan_apply::K>(scan_apply::Spec::default()).unwrap();
     gpu.kernel::<scan_reduce::K>(scan_reduce::Spec::default()).unwrap();
     (taken, gpu.keep_pipelines())

@@ -73,11 +73,10 @@ fn every_angle_projects_as_the_calibrated_camera_does() {
     let (mut gpu, mut p) = open(shape(&v, 100, 1 << 16));
     p.pool.append(&mut gpu, &splats).unwrap();
     render(&mut gpu, &mut p, &v);
-    let (mut count, mut visible, mut projected) = ([0], vec![0u32; 100], vec![Default::default(); 100]);
-    gpu.download(p.renderer.buffers.visible_count, 0, &mut count).unwrap();
-    gpu.download(p.renderer.buffers.ranked, 0, &mut visible).unwrap();
-    visible.truncate(count[0] as usize);
-    gpu.download(p.renderer.buffers.projected, 0, &mut projected).unwrap();
+    let (mut runs, mut projected) = (vec![[0u32; 2]; 100], vec![Default::default(); 100]);
+    gpu.download(p.renderer.lists.buffers.runs, 0, &mut runs).unwrap();
+    let visible = runs.iter().map(|[from, to]| from < to).collect::<Vec<_>>();
+    gpu.download(p.renderer.projected, 0, &mut projected).unwrap();
     let mut drawn = 0;
     for (i, s) in splats.iter().enumerate() {
         let twin = twins::project::project(&twins::project::parameters(s), &v, &[0.0; 6]);
@@ -85,13 +84,13 @@ fn every_angle_projects_as_the_calibrated_camera_does() {
             assert_eq!(twin.is_some(), angles[i] < f.theta_max, "{}", angles[i]);
         }
         let Some(twin) = twin else {
-            assert!(!visible.contains(&(i as u32)), "{} rad is beyond the lens", angles[i]);
+            assert!(!visible[i], "{} rad is beyond the lens", angles[i]);
             continue;
         };
         let p_cam = v.world_from_cam.inverse().transform(glam::Vec3::from(s.mean).as_dvec3());
         let px = camera.project(p_cam).unwrap();
         assert!((px - DVec2::new(twin[0].v, twin[1].v)).length() < 1e-9, "{}", angles[i]);
-        if visible.contains(&(i as u32)) {
+        if visible[i] {
             let got = projected[i].centre_conic;
             let error = DVec2::new(f64::from(got[0]) - 0.5 - px.x, f64::from(got[1]) - 0.5 - px.y).length();
             assert!(error < 1e-3, "{} rad: off by {error} px", angles[i]);

@@ -105,7 +105,7 @@ fn the_image_stands_in_behind_the_picture_in_its_exposure() {
         let part = Target { absent: Some(filled()), exposure, ..Target::from(1) };
         p.train(&mut gpu, &v, part, Some(&STILL), &Weights::default()).unwrap();
         let mut got = vec![0f32; planes.len()];
-        gpu.download(p.renderer.buffers.rendered, 0, &mut got).unwrap();
+        gpu.download(p.renderer.rendered, 0, &mut got).unwrap();
         let through = |i: usize| if is_filled(i) { 1.0 - f64::from(picture.alpha[i]) } else { 0.0 };
         let want = planes.into_iter().enumerate().map(|(i, level)| {
             let light = (f64::from(level) / 255.0 - exposure.offset) / exposure.gain;

@@ -6,13 +6,14 @@ mod chroma;
 mod exposure;
 mod fisheye;
 mod hidden;
+mod lists;
 mod occupancy;
 mod pool;
 mod profiles;
 mod raster;
+mod scan;
 #[path = "../program/small_disk.rs"]
 mod small_disk;
-mod sort;
 mod speed;
 mod splat;
 mod stereo;
@@ -59,11 +60,11 @@ fn subgroups_are_as_wide_as_lavapipe_was_told() {
 
 /// Too narrow for the subgroup variants, as wide as on most CPUs, and as wide as on V3D and Mali.
 #[test]
-fn rasters_lists_and_sorts_hold_with_subgroups_of_4_8_and_16() {
+fn rasters_and_lists_hold_with_subgroups_of_4_8_and_16() {
     for bits in ["128", "256", "512"] {
         let o = std::process::Command::new(std::env::current_exe().unwrap())
             .env(WIDTH, bits)
-            .args(["--test-threads", "2", "both_rasters", "sort::", "lists_of_tiles", "subgroups_are"])
+            .args(["--test-threads", "2", "both_rasters", "lists_of_tiles", "subgroups_are"])
             .output()
             .unwrap();
         let said = String::from_utf8_lossy(&o.stdout);

@@ -121,19 +121,13 @@ fn importance_is_the_mean_of_what_the_opacity_gradient_says() {
     let mut expected = vec![0u32; 60];
     for _ in 0..3 {
         train(&mut gpu, &mut p, &v, 1);
-        let (mut offsets, mut ranks, mut seen) = (vec![0u32; 61], vec![0u32; 60], [0u32]);
-        gpu.download(p.renderer.buffers.tile_offsets, 0, &mut offsets).unwrap();
-        gpu.download(p.renderer.buffers.ranked, 0, &mut ranks).unwrap();
-        gpu.download(p.renderer.buffers.visible_count, 0, &mut seen).unwrap();
-        let mut gradients = vec![0f32; 8 * offsets[seen[0] as usize] as usize];
+        let mut runs = vec![[0u32; 2]; 60];
+        gpu.download(p.renderer.lists.buffers.runs, 0, &mut runs).unwrap();
+        let mut gradients = vec![0f32; 8 << 16];
         gpu.download(p.backward.isect_gradients, 0, &mut gradients).unwrap();
-        for r in 0..seen[0] as usize {
-            let tiles = offsets[r] as usize..offsets[r + 1] as usize;
-            if !tiles.is_empty() {
-                let worth = chunks::worth(&gradients, 8, tiles, Tiling::of(gpu.caps()).chunk as usize);
-                let state = &mut expected[ranks[r] as usize];
-                *state = pool::after_step(*state, worth);
-            }
+        for ([from, to], state) in runs.into_iter().zip(&mut expected).filter(|([from, to], _)| from < to) {
+            let chunk = Tiling::of(gpu.caps()).chunk as usize;
+            *state = pool::after_step(*state, chunks::worth(&gradients, 8, from as usize..to as usize, chunk));
         }
     }
     for (got, want) in states(&mut gpu, &p).iter().zip(&expected) {

@@ -2,7 +2,8 @@
 
 use super::splat::{open, scene, shape, target, train, view, Rng, FAST};
 use super::twins::chunks;
-use stipple::gpu::kernels::{sum_chunks, types::Moments};
+use stipple::gpu::kernels::sum_chunks;
+use stipple::gpu::kernels::types::{Counts, Moments};
 use stipple::gpu::{Gpu, GpuOptions, Threads};
 use stipple::map::tiling::CHUNK_GPU;
 use stipple::map::{Pipeline, Rendered, Shape, StepStats, Target, Tiling, Weights};
@@ -66,8 +67,8 @@ fn sums_of_chunks_equal_their_twin_and_nothing_else_changes() {
         for count in [0, 15, 16, 2048, CAPACITY - 7] {
             let before: Vec<f32> = (0..CAPACITY * words).map(|_| r.uniform(-1.0, 1.5) as f32).collect();
             let mut gpu = Gpu::open(&crate::config(), 1 << 20).unwrap();
-            let isect_count = gpu.alloc::<u32>("count", 1).unwrap();
-            gpu.upload(isect_count, 0, &[count as u32]).unwrap();
+            let counts = gpu.alloc::<Counts>("counts", 1).unwrap();
+            gpu.upload(counts, 0, &[Counts { listed: count as u32, ..Counts::default() }]).unwrap();
             let on_gpu = gpu.alloc::<u32>("owners", CAPACITY).unwrap();
             gpu.upload(on_gpu, 0, &owners).unwrap();
             let slots = gpu.alloc::<f32>("slots", before.len()).unwrap();
@@ -75,7 +76,7 @@ fn sums_of_chunks_equal_their_twin_and_nothing_else_changes() {
             let k = gpu.kernel::<sum_chunks::K>(sum_chunks::Spec { channels, chunk: CHUNK_GPU }).unwrap();
             let mut rec = gpu.record();
             let bind = sum_chunks::Bind {
-                isect_count: isect_count.read(),
+                counts_in: counts.read(),
                 owners: on_gpu.read(),
                 isect_gradients: slots.read_write(),
             };

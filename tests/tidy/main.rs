@@ -54,7 +54,7 @@ const CORE: [&str; 10] = [
     "src/stereo/",
     "shaders-glsl/splat/",
     "shaders-glsl/stereo/",
-    "shaders-glsl/sort/",
+    "shaders-glsl/scan/",
     "shaders-glsl/common/",
     "shaders-glsl/selftest/",
 ];

@@ -279,7 +279,7 @@ fn overlapped(gpu: &mut Gpu, p: &mut Pipeline, view: &View, steps: usize) -> Res
 fn costs(timings: &[Timing], before: &[(u64, f64)], counts: &Counts, peaks: &Peaks, per: f64) -> Vec<Cost> {
     let cost = |(t, before): (&Timing, &(u64, f64))| {
         let calls = (t.count - before.0) as f64 * per;
-        let (bytes, flops) = counts.model(t.name, calls);
+        let (bytes, flops) = counts.model(t.name);
         let ms = (t.total_ms - before.1) * per;
         Cost { name: t.name, calls, ms, bytes, flops, roof_ms: peaks.ms(bytes, flops) }
     };
@@ -291,7 +291,7 @@ fn costs(timings: &[Timing], before: &[(u64, f64)], counts: &Counts, peaks: &Pea
 
 /// Mean and largest length of the lists of tiles, of those that have one.
 fn lists(gpu: &mut Gpu, p: &Pipeline) -> Result<(f64, u32), Fault> {
-    let ranges = p.renderer.buffers.ranges;
+    let ranges = p.renderer.lists.buffers.ranges;
     let mut all = vec![[0u32; 2]; ranges.len()];
     gpu.download(ranges, 0, &mut all).map_err(Fault::from)?;
     let lengths: Vec<u32> = all.iter().map(|[from, to]| to - from).filter(|n| *n > 0).collect();
@@ -385,7 +385,7 @@ fn growth(cases: &[Case], x: &str) -> Option<String> {
         Series::dots("step, wall", 1, of(&|c| c.wall_ms)),
         Series::dots("step, device", 2, of(&|c| c.device_ms)),
         Series::dots("rasters", 3, part(&["raster_"])),
-        Series::dots("sort", 4, part(&["radix_", "share_", "scan_"])),
+        Series::dots("lists", 4, part(&["project", "tile_ranges", "fill_lists", "sort_lists"])),
     ];
     let title = format!("A training step against {x}");
     Chart { title: &title, x, y: "ms", series, from_zero: true, ..Chart::default() }.svg()

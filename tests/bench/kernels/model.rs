@@ -88,20 +88,13 @@ pub struct Counts {
 
 impl Counts {
     /// Bytes and operations of one step in the kernel of this name, for grey without depth.
-    pub fn model(&self, name: &str, calls: f64) -> (f64, f64) {
+    pub fn model(&self, name: &str) -> (f64, f64) {
         let Counts { splats: n, visible: v, intersections: i, pixels: p, tile_pixels } = *self;
         let pairs = i * tile_pixels;
         match name.trim_end_matches("_cpu").trim_end_matches("_subgroup") {
-            // Two passes by depth, the rest by tile.
-            "radix_count" => (4.0 * n + 4.0 * i * (calls - 1.0), 0.0),
-            "share_count" => (4.0 * (n + v) + 4.0 * i * (calls - 2.0), 0.0),
-            "radix_scatter" | "share_scatter" => (12.0 * n + 16.0 * v + 16.0 * i * (calls - 2.0) - 4.0 * i, 0.0),
-            "scan_reduce" => (4.0 * n, n),
-            "scan_apply" => (8.0 * n, 2.0 * n),
-            "project" => (52.0 * n + 32.0 * v, 220.0 * v),
-            "count_tiles" => (40.0 * v, 80.0 * v),
-            "emit_tiles" => (40.0 * v + 8.0 * i, 80.0 * v),
-            "tile_ranges" => (4.0 * i, 0.0),
+            "project" => (56.0 * n + 32.0 * v + 8.0 * i, 300.0 * v),
+            "fill_lists" => (16.0 * i, 0.0),
+            "sort_lists" => (12.0 * i, 0.0),
             // α takes 8 operations, blending 5; the way back 21 more.
             "raster_forward" => (40.0 * i + 8.0 * p, 13.0 * pairs),
             "raster_backward" => (72.0 * i + 8.0 * p, 34.0 * pairs),
@@ -113,7 +106,7 @@ impl Counts {
             "loss_columns" => (22.0 * p, 80.0 * p),
             // Where all Gaussians are small.
             "sum_chunks" => (0.5 * i, 0.0),
-            "project_backward" => (32.0 * i + (8.0 + 2.0 * 148.0) * v, 600.0 * v + 8.0 * i),
+            "project_backward" => (32.0 * i + 8.0 * n + 2.0 * 148.0 * v, 600.0 * v + 8.0 * i),
             _ => (0.0, 0.0),
         }
     }

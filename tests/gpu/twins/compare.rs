@@ -91,7 +91,7 @@ pub fn compare(
     let mut picture = Rendered::default();
     p.render(gpu, v, &mut picture)?;
     let mut projected = vec![Default::default(); splats.len()];
-    gpu.download(p.renderer.buffers.projected, 0, &mut projected)?;
+    gpu.download(p.renderer.projected, 0, &mut projected)?;
     let mut error: f64 = 0.0;
     for (t, got) in super::project_all(&doubles, v, &[0.0; 6]).iter().zip(&projected) {
         // Those off the image are culled by the kernel and keep zeros.

@@ -3,6 +3,7 @@
 pub mod chunks;
 pub mod compare;
 pub mod dual;
+pub mod lists;
 pub mod loss;
 pub mod occupancy;
 pub mod pool;

@@ -1,12 +1,12 @@
 //! Twin of raster_forward.comp and raster_backward.comp: every pixel against every Gaussian, the
 //! backward pass from the back to the front.
 
+use super::lists::depth_key;
 use super::project::Projected;
 
 pub const ALPHA_MIN: f64 = 1.0 / 255.0;
 const ALPHA_MAX: f64 = 0.99;
 const TRANSMITTANCE_MIN: f64 = 1e-4;
-const NEAR: f32 = 0.05;
 
 /// A Gaussian on the image, and a gradient by it, in the order of a gradient slot: centre x, y (integer = pixel
 /// centre); conic a, b, c; opacity; grey or red; depth; green, blue.
@@ -71,9 +71,7 @@ struct Seen {
 
 fn order(splats: &[Option<Flat>]) -> Vec<usize> {
     let mut order: Vec<usize> = (0..splats.len()).filter(|i| splats[*i].is_some()).collect();
-    // Depths are compared as the kernels see them: depth_key.glsl.
-    let bits = |z: f64| (z as f32).max(NEAR).to_bits() - NEAR.to_bits();
-    order.sort_by_key(|i| splats[*i].as_ref().map(|p| bits(p[DEPTH]) >> 11));
+    order.sort_by_key(|i| splats[*i].as_ref().map(|p| depth_key(p[DEPTH] as f32)));
     order
 }
 
