@@ -31,12 +31,16 @@ struct Similarity {
     float slope[3];  // by E[x], E[x²], E[xy]
 };
 
-/// SSIM from E[x], E[y], E[x²], E[y²], E[xy].
-Similarity similarity(float e[5]) {
+/// What is filtered for SSIM, plane by plane: x, y, x² + y², xy. The squares are only needed together.
+const uint MOMENTS = 4;
+#define MOMENT(q, x, y) (q == 0 ? x : q == 1 ? y : q == 2 ? x * x + y * y : x * y)
+
+/// SSIM from E[x], E[y], E[x² + y²], E[xy].
+Similarity similarity(float e[MOMENTS]) {
     const float mx = e[0], my = e[1];
     const float a1 = 2.0 * mx * my + C1, b1 = mx * mx + my * my + C1;
-    const float a2 = 2.0 * (e[4] - mx * my) + C2;
-    const float b2 = max(e[2] - mx * mx, 0.0) + max(e[3] - my * my, 0.0) + C2;
+    const float a2 = 2.0 * (e[3] - mx * my) + C2;
+    const float b2 = max(e[2] - mx * mx - my * my, 0.0) + C2;
     const float inv = 1.0 / (b1 * b2);
     const float s = a1 * a2 * inv;
     return Similarity(s, float[3](2.0 * (my * (a2 - a1) * inv - mx * s / b1 + mx * s / b2), -s / b2, 2.0 * a1 * inv));

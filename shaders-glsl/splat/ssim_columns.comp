@@ -26,8 +26,8 @@ layout(set = 0, binding = 3, std430) writeonly buffer SsimSums { float ssim_sums
 
 float column_run(uint x, uint y0) {
     const uint plane = push.size.x * push.size.y;
-    float e[5][RUN];
-    [[unroll]] for (uint q = 0; q < 5; ++q) {
+    float e[MOMENTS][RUN];
+    [[unroll]] for (uint q = 0; q < MOMENTS; ++q) {
         float v[REACH];
         [[unroll]] for (uint k = 0; k < REACH; ++k) {
             const int y = int(y0 + k) - int(RADIUS);
@@ -45,7 +45,7 @@ float column_run(uint x, uint y0) {
         const uint y = y0 + k;
         const uint byte = min(y, push.size.y - 1) * stride + x;
         const bool valid = y < push.size.y && ((mask(byte / 4) >> (8 * (byte % 4))) & 255u) != 0;
-        const Similarity s = similarity(float[5](e[0][k], e[1][k], e[2][k], e[3][k], e[4][k]));
+        const Similarity s = similarity(float[MOMENTS](e[0][k], e[1][k], e[2][k], e[3][k]));
         if (MAP != 0) {
             if (y < push.size.y) {
                 slopes[y * push.size.x + x] = valid ? s.value : 1.0;

@@ -1,7 +1,7 @@
-// First pass of SSIM on a CPU: filters both images, their squares and their product along rows.
+// First pass of SSIM on a CPU: filters both images, the sum of their squares and their product along rows.
 // in   grey (rendered, put into the keyframe's exposure here), targets (8 bit, four to a word),
 //      mask (8 bit, zero = ignore)
-// out  filtered_planes: of E[x], E[y], E[x²], E[y²], E[xy]
+// out  filtered_planes: of E[x], E[y], E[x² + y²], E[xy]
 #version 450
 #extension GL_GOOGLE_include_directive : require
 // variants: cpu
@@ -55,9 +55,9 @@ void main() {
     const uint plane = push.size.x * push.size.y;
     const uint out0 = y * push.size.x + x0;
     const uint n = min(RUN, push.size.x - x0);
-    [[unroll]] for (uint q = 0; q < 5; ++q) {
+    [[unroll]] for (uint q = 0; q < MOMENTS; ++q) {
         [[unroll]] for (uint k = 0; k < REACH; ++k) {
-            product[k] = q == 0 ? a[k] : q == 1 ? b[k] : q == 2 ? a[k] * a[k] : q == 3 ? b[k] * b[k] : a[k] * b[k];
+            product[k] = MOMENT(q, a[k], b[k]);
         }
         [[unroll]] for (uint k = 0; k < RUN; ++k) {
             if (k < n) {

@@ -10,7 +10,7 @@
 layout(local_size_x = 128) in;
 layout(constant_id = 0) const uint MAP = 0;
 
-#define PLANES 5
+#define PLANES 5  // four of moments, and room for both images as they come
 #include "../common/index.glsl"
 #include "../common/ssim.glsl"
 #include "../common/ssim_tile.glsl"
@@ -62,9 +62,9 @@ void filter_columns() {
         b[k] = strip[STAGED + top + k * COLUMNS];
     }
     barrier();
-    [[unroll]] for (uint q = 0; q < 5; ++q) {
+    [[unroll]] for (uint q = 0; q < MOMENTS; ++q) {
         [[unroll]] for (uint k = 0; k < SPAN; ++k) {
-            product[k] = q == 0 ? a[k] : q == 1 ? b[k] : q == 2 ? a[k] * a[k] : q == 3 ? b[k] * b[k] : a[k] * b[k];
+            product[k] = MOMENT(q, a[k], b[k]);
         }
         filter_run(q, product);
     }
@@ -84,8 +84,8 @@ void main() {
             continue;
         }
         const bool compared = valid(p.y * byte_stride(push.size.x) + p.x);
-        const Similarity s = similarity(float[5](filtered_at(0, pixel), filtered_at(1, pixel), filtered_at(2, pixel),
-                                                 filtered_at(3, pixel), filtered_at(4, pixel)));
+        const Similarity s = similarity(float[MOMENTS](filtered_at(0, pixel), filtered_at(1, pixel), filtered_at(2, pixel),
+                                                       filtered_at(3, pixel)));
         const uint at = p.y * push.size.x + p.x;
         if (MAP != 0) {
             slopes[at] = compared ? s.value : 1.0;

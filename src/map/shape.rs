@@ -27,6 +27,8 @@ pub struct Shape {
 
 /// Pixels of a run filtered by one thread of the loss on a CPU: RUN of ssim.glsl.
 pub const RUN: u32 = 8;
+/// Planes that are filtered for SSIM: MOMENTS of ssim.glsl.
+const MOMENTS: usize = 4;
 /// A tile that one workgroup of the loss filters on a GPU, px: WIDTH and HEIGHT of ssim_tile.glsl.
 pub const LOSS_TILE: [u32; 2] = [54, 8];
 /// Invocations of a workgroup of the kernels that sum runs of pixels, or Gaussians.
@@ -130,7 +132,7 @@ pub struct Scratch {
     pub tile_depths: Buf<u32>,
     pub unsorted: Buf<[u32; 2]>,
     pub spare: Buf<[u32; 2]>,
-    /// In the loss: filtered moments (5 planes, used on a CPU) and SSIM slopes (3).
+    /// In the loss: filtered moments (4 planes, used on a CPU) and SSIM slopes (3).
     pub filtered: Buf<f32>,
     pub slopes: Buf<f32>,
     /// In the backward pass.
@@ -145,7 +147,7 @@ fn aligned(n: usize) -> usize {
 impl Scratch {
     pub fn new(arena: &mut Arena, shape: &Shape) -> Result<Scratch, Fault> {
         let (isects, pixels) = (shape.intersections as usize, shape.pixels());
-        let planes = aligned(5 * pixels) + 3 * pixels;
+        let planes = aligned(MOMENTS * pixels) + 3 * pixels;
         let gradients = shape.gradient_words() * isects;
         let words = planes.max(gradients).max(aligned(isects) + aligned(2 * isects) + 4 * isects);
         let all = arena.alloc::<u32>("intersections: gradients, over lists in the making and loss planes", words)?;
@@ -153,8 +155,8 @@ impl Scratch {
             tile_depths: all.part(0, isects),
             unsorted: all.part(aligned(isects), 2 * isects).cast(),
             spare: all.part(aligned(isects) + aligned(2 * isects), 4 * isects).cast(),
-            filtered: all.part(0, 5 * pixels).cast(),
-            slopes: all.part(aligned(5 * pixels), 3 * pixels).cast(),
+            filtered: all.part(0, MOMENTS * pixels).cast(),
+            slopes: all.part(aligned(MOMENTS * pixels), 3 * pixels).cast(),
             isect_gradients: all.part(0, gradients).cast(),
         })
     }

@@ -98,10 +98,10 @@ impl Counts {
             // α takes 8 operations, blending 5; the way back 21 more.
             "raster_forward" => (40.0 * i + 8.0 * p, 13.0 * pairs),
             "raster_backward" => (72.0 * i + 8.0 * p, 34.0 * pairs),
-            "ssim_tiles" => (18.0 * p, 280.0 * p),
+            "ssim_tiles" => (18.0 * p, 236.0 * p),
             "loss_tiles" => (22.0 * p, 146.0 * p),
-            "ssim_rows" => (26.0 * p, 130.0 * p),
-            "ssim_columns" => (33.0 * p, 150.0 * p),
+            "ssim_rows" => (22.0 * p, 106.0 * p),
+            "ssim_columns" => (29.0 * p, 128.0 * p),
             "loss_rows" => (24.0 * p, 66.0 * p),
             "loss_columns" => (22.0 * p, 80.0 * p),
             // Where all Gaussians are small.
