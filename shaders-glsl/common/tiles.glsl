@@ -15,7 +15,9 @@ struct Ellipse {
     vec2 centre;
     vec3 conic;
     float t;         // 2τ
-    float det;
+    float per_a;     // 1/a
+    float extent;    // half the height, px
+    float y_right;   // of the rightmost point, from the centre; the leftmost lies opposite
     ivec2 rows;      // first and last tile row; last < first when nothing is touched
 };
 
@@ -35,10 +37,12 @@ Ellipse ellipse_of(Projected g, uvec2 size, float coarseness) {
     e.conic = vec3(g.centre_conic.zw, g.conic_shade.x);
     // A hair wide: the raster decides about each pixel, this only must not lose one.
     e.t = level_of(g.conic_shade.y, coarseness) * 1.001 + 0.001;
-    e.det = max(e.conic.x * e.conic.z - e.conic.y * e.conic.y, 1e-12);
-    const float extent = sqrt(e.t * e.conic.x / e.det);
-    const float top = clamp(e.centre.y - extent, -1.0, float(size.y + TILE_H));
-    const float bottom = clamp(e.centre.y + extent, -1.0, float(size.y + TILE_H));
+    const float per_det = e.t / max(e.conic.x * e.conic.z - e.conic.y * e.conic.y, 1e-12);
+    e.per_a = 1.0 / e.conic.x;
+    e.extent = sqrt(e.conic.x * per_det);
+    e.y_right = -(e.conic.y / e.conic.z) * sqrt(e.conic.z * per_det);
+    const float top = clamp(e.centre.y - e.extent, -1.0, float(size.y + TILE_H));
+    const float bottom = clamp(e.centre.y + e.extent, -1.0, float(size.y + TILE_H));
     // pixel centres of row r of tiles: r·H + ½ .. (r+1)·H - ½
     e.rows.x = max(0, int(ceil((top - float(TILE_H) + 0.5) / float(TILE_H))));
     e.rows.y = min(int(tile_grid(size).y) - 1, int(floor((bottom - 0.5) / float(TILE_H))));
@@ -48,19 +52,16 @@ Ellipse ellipse_of(Projected g, uvec2 size, float coarseness) {
 /// First and last tile column touched in tile row `row`.
 ivec2 columns_of(Ellipse e, int row, uvec2 size) {
     const float a = e.conic.x, b = e.conic.y, c = e.conic.z;
-    const float extent = sqrt(e.t * a / e.det);
-    const float y0 = max(float(row) * float(TILE_H) + 0.5 - e.centre.y, -extent);
-    const float y1 = min(float(row + 1) * float(TILE_H) - 0.5 - e.centre.y, extent);
+    const float y0 = max(float(row) * float(TILE_H) + 0.5 - e.centre.y, -e.extent);
+    const float y1 = min(float(row + 1) * float(TILE_H) - 0.5 - e.centre.y, e.extent);
     if (y0 > y1) {
         return ivec2(0, -1);
     }
-    // The rightmost point of the whole ellipse sits at y = -(b/c) x_max.
-    const float y_right = -(b / c) * sqrt(e.t * c / e.det);
-    const float v1 = clamp(y_right, y0, y1), v0 = clamp(-y_right, y0, y1);
+    const float v1 = clamp(e.y_right, y0, y1), v0 = clamp(-e.y_right, y0, y1);
     const float d1 = sqrt(max(0.0, b * b * v1 * v1 - a * (c * v1 * v1 - e.t)));
     const float d0 = sqrt(max(0.0, b * b * v0 * v0 - a * (c * v0 * v0 - e.t)));
-    const float right = clamp(e.centre.x + (-b * v1 + d1) / a, -1.0, float(size.x + TILE_W));
-    const float left = clamp(e.centre.x + (-b * v0 - d0) / a, -1.0, float(size.x + TILE_W));
+    const float right = clamp(e.centre.x + (d1 - b * v1) * e.per_a, -1.0, float(size.x + TILE_W));
+    const float left = clamp(e.centre.x - (d0 + b * v0) * e.per_a, -1.0, float(size.x + TILE_W));
     return ivec2(max(0, int(ceil((left - float(TILE_W) + 0.5) / float(TILE_W)))),
                  min(int(tile_grid(size).x) - 1, int(floor((right - 0.5) / float(TILE_W)))));
 }

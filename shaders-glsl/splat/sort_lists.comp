@@ -36,7 +36,7 @@ READ_UVEC2S(2, Unsorted, unsorted)
 layout(set = 0, binding = 3, std430) coherent buffer Spare { uvec2 spare[]; };
 layout(set = 0, binding = 4, std430) writeonly buffer Lists { uint lists[]; };
 
-const uint RUN = 512;
+const uint RUN = 256;
 #ifdef CPU
 #define WIDTH gl_SubgroupSize  // lanes that share a block
 const uint OWN = 4;            // elements of a lane that are compared at a time
