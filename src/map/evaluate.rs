@@ -241,7 +241,7 @@ fn observed(scene: &Scene, index: usize) -> Vec<f32> {
 fn align(scene: &mut Scene, index: usize, observed: &[f32], weights: &Weights) -> Result<Refinement, GpuError> {
     let (body_from_cam, view) = (scene.views.get(index).body_from_cam, scene.view(index));
     let given = scene.views.get(scene.views.first(index)).given;
-    let coarseness = scene.render(&view)?;
+    let mut coarseness = scene.render(&view)?;
     let exposure = fitted_exposure(observed, &scene.rendered.colour, &scene.camera(index).valid);
     let target = Target { exposure, absent: None, ..scene.target(index) };
     let mut refined = Refinement::default();
@@ -249,6 +249,11 @@ fn align(scene: &mut Scene, index: usize, observed: &[f32], weights: &Weights) -
     for k in 0..ALIGN_STEPS {
         let view = View { coarseness, ..scene.view_from(index, given * refined.body_from_refined) };
         let done = scene.pipeline.train(&mut scene.gpu, &view, target, None, weights)?;
+        if done.stats.overflow > 0 {
+            // A picture with holes tells nothing; the next is coarser.
+            coarseness = scene.pipeline.coarseness_after(&done.stats);
+            continue;
+        }
         if done.loss < best_loss {
             (best, best_loss) = (refined, done.loss);
         }

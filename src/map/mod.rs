@@ -571,7 +571,9 @@ fn known(board: &Board, shape: &Shape) -> usize {
 fn buffers(calibration: &Calibration, board: &Board) -> Result<Arena, Fault> {
     let mut arena = Arena::counting();
     stereo::Buffers::new(&mut arena, calibration, &board.stereo)?;
-    pipeline::Buffers::new(&mut arena, &shape(calibration, board))?;
+    let shape = shape(calibration, board);
+    shape.check()?;
+    pipeline::Buffers::new(&mut arena, &shape)?;
     occupancy::Buffers::new(&mut arena, board.map.occupancy_cells)?;
     Ok(arena)
 }

@@ -118,9 +118,9 @@ impl Trainer {
         beside: Option<&[u32]>,
     ) -> Result<Option<usize>, GpuError> {
         let done = scene.pipeline.finish(&mut scene.gpu, &step)?;
-        (self.loss, self.trained) = (done.loss, Some(index));
         let counters = &scene.counters;
         let whole = done.stats.overflow == 0;
+        (self.loss, self.trained) = (if whole { done.loss } else { self.loss }, Some(index));
         counters.intersections_overflow.add(u64::from(!whole));
         counters.intersections_most.raise(u64::from(done.stats.needed()));
         counters.views_coarsened.add(u64::from(whole && step.view.coarseness > Coarseness::default()));
