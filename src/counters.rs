@@ -129,7 +129,7 @@ stipple_drivers::counters! {
     views_coarsened,
     /// Training steps that drew and compared their view at half the size (`map.half_size_steps`).
     steps_at_half_size,
-    /// The most (Gaussian, tile) pairs that a picture or a step needed. Where views_coarsened is zero, budget.intersections need
+    /// The most places for (Gaussian, tile) pairs that a picture or a step needed. Where views_coarsened is zero, budget.intersections need
     /// not be larger.
     intersections_most,
     /// Gaussians left out of a step because a parameter was not finite.

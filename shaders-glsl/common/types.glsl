@@ -23,10 +23,10 @@ struct Projected {
 struct Counts {
     uint visible;     // Gaussians that touch a tile
     uint not_finite;  // Gaussians
-    uint listed;      // intersections that have a place in the list,
-    uint needed;      // and all there are
+    uint needed;      // places for intersections, gaps between those of workgroups included,
+    uint listed;      // and those there are
     uint shared_out;  // places that tiles have taken for their lists
-    uint longest;     // list
+    uint long_lists;  // tiles whose lists are sorted apart
 };
 
 // Nothing nearer is drawn, m.

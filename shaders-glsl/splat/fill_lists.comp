@@ -3,7 +3,6 @@
 // out  ranges[tile]: first place, and one past the last; unsorted (elements, by tile)
 #version 450
 #extension GL_GOOGLE_include_directive : require
-#extension GL_EXT_control_flow_attributes : require
 // variants: cpu
 layout(local_size_x = 64) in;
 

@@ -1,6 +1,6 @@
 // Puts every Gaussian of an epoch on the image, and makes its intersections with the tiles it touches: one thread a slot, those of earlier
-// epochs included. A workgroup takes places for its intersections in a row, from a multiple of CHUNK_MOST on, so that which chunks a Gaussian
-// has does not depend on which workgroup comes first.
+// epochs included. A workgroup takes places for its intersections in a row, from a multiple of CHUNK on, so that which chunks a Gaussian has
+// does not depend on which workgroup comes first.
 // in   splats; tile_lengths, counts: zero
 // out  projected[slot]; runs[slot]: where its intersections begin and end; tile_depths, owners (tile and depth, and slot, of each
 //      intersection; both NOWHERE in gaps); tile_lengths[tile]: its intersections; counts.visible, .not_finite, .needed
@@ -17,6 +17,7 @@ layout(local_size_x = 64) in;
 #include "../common/camera.glsl"
 #include "../common/tiles.glsl"
 #include "../common/tile_depth.glsl"
+#include "../common/chunks.glsl"
 #include "../common/index.glsl"
 #include "../common/texels.glsl"
 
@@ -38,9 +39,11 @@ layout(set = 0, binding = 5, std430) buffer TileLengths { uint tile_lengths[]; }
 layout(set = 0, binding = 6, std430) buffer CountsOut { Counts counts[]; };
 
 const uint WIDTH = gl_WorkGroupSize.x;
-const uint CHUNK_MOST = 16;
-/// One visible Gaussian, beside the tiles that WIDTH of them touch.
+/// A word holds how many Gaussians are visible, from this bit on, and below how many tiles they touch: WIDTH of them fewer than 2^24, as
+/// there are fewer than 2^16 tiles.
 const uint ONE_VISIBLE = 1u << 24;
+/// More places than any list has. No more are taken, so that their number does not begin anew.
+const uint TOO_MANY = 1u << 31;
 
 shared uint sums[2 * WIDTH];
 shared uint place_of_first;
@@ -118,9 +121,12 @@ void main() {
     }
     const uvec2 sum = sum_to(count > 0 ? ONE_VISIBLE + count : 0);
     const uint all = sum.y;
-    const uint places = all % ONE_VISIBLE, taken = (places + CHUNK_MOST - 1) / CHUNK_MOST * CHUNK_MOST;
+    const uint places = all % ONE_VISIBLE, taken = (places + CHUNK - 1) / CHUNK * CHUNK;
     if (lane == 0 && all > 0) {
         place_of_first = atomicAdd(counts[0].needed, taken);
+        if (place_of_first > TOO_MANY) {
+            atomicAdd(counts[0].needed, -taken);
+        }
         atomicAdd(counts[0].visible, all / ONE_VISIBLE);
     }
     barrier();

@@ -1,8 +1,8 @@
-// Sorts the list of each tile front to back, by depth and then by slot: one workgroup a tile; with WALK workgroups walk the tiles.
+// Sorts the list of each tile front to back, by depth and then by slot: one workgroup a tile; with LONG a long tile.
 // 1. A run of up to RUN elements is cut into blocks. The place of an element in its block is the number of those before it.
 // 2. Its place in the run is that in its block, and for each other block, by binary search, the number of those before it.
 // 3. Neighbouring runs of a longer list are merged in the same way, in spare, until one is left.
-// in   counts.longest, ranges, unsorted (elements, by tile)
+// in   ranges, unsorted (elements, by tile); long_tiles, counts.long_lists
 // out  lists (intersections, by tile); spare (twice as many elements), for lists longer than RUN
 // No two elements are equal, so that the result does not depend on the order before: deterministic.
 #version 450
@@ -21,24 +21,23 @@ layout(local_size_x = 128, local_size_x_id = 0) in;
 #include "../common/texels.glsl"
 
 layout(constant_id = 0) const uint LANES = 128;
-layout(constant_id = 1) const bool WALK = false;
+layout(constant_id = 1) const bool LONG = false;
 
 layout(push_constant) uniform Push {
-    uint tiles;
-    uint longer_than;  // lists that are sorted: from more elements
-    uint up_to;        // to so many
-    uint capacity;     // of the lists
+    uint capacity;  // of the lists
+    uint up_to;     // longer ones are left to LONG
 } push;
 
 layout(set = 0, binding = 0, std430) readonly buffer CountsIn { Counts counts[]; };
 READ_UVEC2S(1, Ranges, range_of)
-READ_UVEC2S(2, Unsorted, unsorted)
-layout(set = 0, binding = 3, std430) coherent buffer Spare { uvec2 spare[]; };
-layout(set = 0, binding = 4, std430) writeonly buffer Lists { uint lists[]; };
+READ_UINTS(2, LongTiles, long_tile)
+READ_UVEC2S(3, Unsorted, unsorted)
+layout(set = 0, binding = 4, std430) coherent buffer Spare { uvec2 spare[]; };
+layout(set = 0, binding = 5, std430) writeonly buffer Lists { uint lists[]; };
 
 const uint RUN = 256;
 #ifdef CPU
-#define WIDTH gl_SubgroupSize  // lanes that share a block
+#define WIDTH gl_SubgroupSize  // lanes that share a block: a subgroup is full, and its invocations follow one another
 const uint OWN = 4;            // elements of a lane that are compared at a time
 const uint BLOCK = 128;
 #else
@@ -168,18 +167,12 @@ void sort_list(uvec2 range) {
 }
 
 void main() {
-    if (WALK && counts[0].longest <= push.longer_than) {
+    const uint group = group_index();
+    if (LONG && group >= counts[0].long_lists) {
         return;
     }
-    for (uint tile = group_index(); tile < push.tiles; tile += gl_NumWorkGroups.x * gl_NumWorkGroups.y) {
-        const uvec2 range = range_of(tile);
-        const uint length = range.y - range.x;
-        if (length > push.longer_than && length <= push.up_to) {
-            sort_list(range);
-        }
-        if (!WALK) {
-            break;
-        }
-        barrier();
+    const uvec2 range = range_of(LONG ? long_tile(group) : group);
+    if (LONG || range.y - range.x <= push.up_to) {
+        sort_list(range);
     }
 }

@@ -1,6 +1,6 @@
 //! How much a view leaves out where its list of (Gaussian, tile) pairs would not fit.
 //!
-//! A list has a fixed size. One that overflows would lose the farthest Gaussians, and the view would show holes: what they
+//! A list has a fixed size. One that overflows would lose some Gaussians, and the view would show holes: what they
 //! hid looks uncovered, is seeded once more, and the list overflows the more. So a view that needs more is drawn coarser:
 //! each Gaussian is listed only as far as it is brighter than a level, the faint ones not at all (`level_of`, tiles.glsl).
 //! What is left is trained to look right. The level rises until the list fits, and falls again when there is room.

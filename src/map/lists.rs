@@ -13,13 +13,12 @@ use crate::gpu::kernels::{fill_lists, sort_lists, tile_ranges};
 use crate::gpu::{Arena, Buf, Caps, DeviceKind, Gpu, Kernel, Recorder, Threads, ALIGN};
 use stipple_drivers::Fault;
 
-/// Invocations that sort a list: on a GPU; on a CPU a subgroup, but for long ones.
+/// Invocations of a workgroup that sorts a list on a GPU. On a CPU they are a subgroup.
 const SORT_LANES: u32 = 128;
-const SORT_LANES_LONG: u32 = 256;
-/// Lists longer than this are sorted apart on a CPU, as Mesa's driver leaves a shader after 65 535 rounds of its loops; by so many
-/// workgroups.
-const LONG: u32 = 2048;
-const LONG_GROUPS: u32 = 64;
+/// Lists longer than this are sorted apart on a CPU, by this many invocations each: Mesa's driver leaves a shader after 65 535 rounds of
+/// its loops. That bounds the length of a list at some 57 000 there, as it does in the raster.
+const LONG: u32 = 1024;
+const LONG_LANES: u32 = 256;
 
 /// Workgroups that walk the intersections, whose count only the device knows: enough for a large GPU. (Some drivers of small GPUs run
 /// indirect dispatches on the CPU.)
@@ -41,6 +40,13 @@ pub struct Buffers {
     /// Where the list of each tile begins and ends, and the intersections in it.
     pub ranges: Buf<[u32; 2]>,
     pub lists: Buf<u32>,
+    /// Tiles whose lists are long.
+    long_tiles: Buf<u32>,
+}
+
+/// Lists longer than LONG that there may be.
+fn long_lists_most(shape: &Shape) -> u32 {
+    shape.intersections / LONG + 1
 }
 
 impl Buffers {
@@ -56,39 +62,44 @@ impl Buffers {
             owners: arena.alloc("intersections: slots", isects)?,
             ranges: arena.alloc("tiles: ranges", tiles)?,
             lists: arena.alloc("intersections: by tile", isects)?,
+            long_tiles: arena.alloc("tiles: of long lists", long_lists_most(shape) as usize)?,
         })
     }
 }
 
 pub struct Lists {
     pub buffers: Buffers,
+    /// Tile and depth of each intersection, from `project`; then elements of lists, and room to sort long ones.
+    pub tile_depths: Buf<u32>,
+    unsorted: Buf<[u32; 2]>,
+    spare: Buf<[u32; 2]>,
     /// What kernels that walk the intersections are dispatched with. They ask how many workgroups there are, so they are made by
     /// `Gpu::kernel`, never in pieces.
     pub walkers: Threads,
-    scratch: Scratch,
     pub capacity: u32,
     ranges: Kernel<tile_ranges::K>,
     fill: Kernel<fill_lists::K>,
     sort: Kernel<sort_lists::K>,
-    /// The same for long lists, on a CPU.
-    sort_long: Option<Kernel<sort_lists::K>>,
+    /// On a CPU the same for long lists, and how many there may be.
+    sort_long: Option<(Kernel<sort_lists::K>, u32)>,
 }
 
 impl Lists {
-    pub fn new(gpu: &mut Gpu, buffers: Buffers, scratch: Scratch, shape: &Shape) -> Result<Lists, Fault> {
+    pub fn new(gpu: &mut Gpu, buffers: Buffers, scratch: &Scratch, shape: &Shape) -> Result<Lists, Fault> {
         let (walkers, on_cpu) = (walkers(gpu.caps()), gpu.caps().kind == DeviceKind::Cpu);
         let lanes = if on_cpu { gpu.caps().subgroup_size } else { SORT_LANES };
+        let long = sort_lists::Spec { lanes: LONG_LANES, long: true };
         Ok(Lists {
             buffers,
+            tile_depths: scratch.tile_depths,
+            unsorted: scratch.unsorted,
+            spare: scratch.spare,
             walkers,
-            scratch,
             capacity: shape.intersections,
             ranges: gpu.kernel(tile_ranges::Spec::default())?,
             fill: gpu.kernel(fill_lists::Spec::default())?,
-            sort: gpu.kernel(sort_lists::Spec { lanes, walk: false })?,
-            sort_long: on_cpu
-                .then(|| gpu.kernel(sort_lists::Spec { lanes: SORT_LANES_LONG, walk: true }))
-                .transpose()?,
+            sort: gpu.kernel_in_pieces(sort_lists::Spec { lanes, long: false })?,
+            sort_long: on_cpu.then(|| gpu.kernel(long).map(|k| (k, long_lists_most(shape)))).transpose()?,
         })
     }
 
@@ -99,34 +110,35 @@ impl Lists {
 
     /// Makes the lists of a picture of so many tiles, after `project`.
     pub fn record(&self, rec: &mut Recorder, tiles: u32) {
-        let (b, s, capacity) = (&self.buffers, &self.scratch, self.capacity);
+        let (b, capacity) = (&self.buffers, self.capacity);
+        let up_to = if self.sort_long.is_some() { LONG } else { u32::MAX };
         let ranges = tile_ranges::Bind {
             tile_lengths: b.lengths.read(),
             ranges: b.ranges.write(),
+            long_tiles: b.long_tiles.write(),
             counts_out: b.counts.read_write(),
         };
-        rec.dispatch(&self.ranges, ranges, tile_ranges::Push { tiles, capacity }, Threads::d1(tiles));
+        rec.dispatch(&self.ranges, ranges, tile_ranges::Push { tiles, capacity, up_to }, Threads::d1(tiles));
         let fill = fill_lists::Bind {
             counts_in: b.counts.read(),
-            tile_depths: s.tile_depths.read(),
+            tile_depths: self.tile_depths.read(),
             owners: b.owners.read(),
             ranges: b.ranges.read_write(),
-            unsorted: s.unsorted.write(),
+            unsorted: self.unsorted.write(),
         };
         rec.dispatch(&self.fill, fill, (), self.walkers);
         let sort = sort_lists::Bind {
             counts_in: b.counts.read(),
             ranges: b.ranges.read(),
-            unsorted: s.unsorted.read(),
-            spare: s.spare.read_write(),
+            long_tiles: b.long_tiles.read(),
+            unsorted: self.unsorted.read(),
+            spare: self.spare.read_write(),
             lists: b.lists.write(),
         };
-        let up_to = if self.sort_long.is_some() { LONG } else { u32::MAX };
-        let push = sort_lists::Push { tiles, longer_than: 0, up_to, capacity };
+        let push = sort_lists::Push { capacity, up_to };
         rec.dispatch(&self.sort, sort, push, Threads::groups(tiles, 1, 1));
-        if let Some(long) = &self.sort_long {
-            let push = sort_lists::Push { tiles, longer_than: LONG, up_to: u32::MAX, capacity };
-            rec.dispatch(long, sort, push, Threads::groups(LONG_GROUPS, 1, 1));
+        if let Some((long, most)) = self.sort_long {
+            rec.dispatch(&long, sort, push, Threads::groups(most, 1, 1));
         }
     }
 }

@@ -60,7 +60,6 @@ pub struct Renderer {
     pub projected: Buf<Projected>,
     pub rendered: Buf<f32>,
     pub lists: Lists,
-    tile_depths: Buf<u32>,
     pub tiling: Tiling,
     /// By lens.
     project: [Kernel<project::K>; 2],
@@ -77,16 +76,15 @@ impl Renderer {
         shape: &Shape,
         tiling: Tiling,
     ) -> Result<Renderer, Fault> {
-        let Tiling { lanes, column, variant, .. } = tiling;
+        let Tiling { lanes, column, variant, chunk, .. } = tiling;
         let raster = |gpu: &mut Gpu, depth| {
             gpu.kernel_variant(raster_forward::Spec { lanes, column, depth, channels: shape.channels }, variant)
         };
-        let project = |gpu: &mut Gpu, fisheye| gpu.kernel_in_pieces(project::Spec { lanes, column, fisheye });
+        let project = |gpu: &mut Gpu, fisheye| gpu.kernel_in_pieces(project::Spec { lanes, column, fisheye, chunk });
         Ok(Renderer {
             projected,
             rendered,
-            tile_depths: scratch.tile_depths,
-            lists: Lists::new(gpu, lists, scratch, shape)?,
+            lists: Lists::new(gpu, lists, &scratch, shape)?,
             tiling,
             project: shape.by_lens(|fisheye| project(gpu, fisheye))?,
             fisheye: shape.fisheye,
@@ -112,7 +110,7 @@ impl Renderer {
                 splats: pool.buffers.splats.read(),
                 projected_out: self.projected.write(),
                 runs: lists.runs.write(),
-                tile_depths: self.tile_depths.write(),
+                tile_depths: self.lists.tile_depths.write(),
                 owners: lists.owners.write(),
                 tile_lengths: lists.lengths.read_write(),
                 counts_out: lists.counts.read_write(),

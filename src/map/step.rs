@@ -60,8 +60,9 @@ impl Default for Weights {
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Stats {
     pub visible: u32,
+    /// Places of the list that are taken: one for each (Gaussian, tile) pair, and gaps of fewer than 16 after those of 64 slots.
     pub intersections: u32,
-    /// Intersections there was no room for. None of a picture, which is drawn coarser until it fits.
+    /// Places there was no room for. None of a picture, which is drawn coarser until it fits.
     pub overflow: u32,
     /// Gaussians culled for not being finite.
     pub failed: u32,
@@ -81,7 +82,7 @@ impl Stats {
         }
     }
 
-    /// Intersections that the picture would have had in a list with room.
+    /// Places that the picture would have taken in a list with room.
     pub fn needed(&self) -> u32 {
         self.intersections + self.overflow
     }

@@ -27,8 +27,8 @@ impl Tiling {
     pub fn of(caps: &Caps) -> Tiling {
         let sub = caps.allows(GROUP_VOTE) && caps.allows(GROUP_SHUFFLE);
         // A card with more processors than a picture has tiles waits for its longest list, which halves with the tile:
-        // an NVIDIA H200 takes 0.248 ms a step at 52 k Gaussians and 752x480, 0.254 with columns of 8 and 0.282 with
-        // columns of 2 (0.185, 0.238 and 0.170 at 320x240). Where tiles are plenty, fewer pixels a lane only make more
+        // an NVIDIA H200 takes 0.203 ms a step at 52 k Gaussians and 752x480, 0.210 with columns of 8 and 0.235 with
+        // columns of 2 (30 k at 320x240: 0.159, 0.222 and 0.142). Where tiles are plenty, fewer pixels a lane only make more
         // lists and move more bytes.
         let column = if caps.kind == DeviceKind::Discrete { 4 } else { Tiling::BASELINE.column };
         // Measured on an H100 and an H200 alone; a GPU whose shared memory is ordinary memory may be better off with runs.

@@ -10,6 +10,8 @@ use stipple::map::{Gaussian, Pipeline, Rendered, Tiling};
 /// Relative to the level: nearer than this a tile may fall either way in f32.
 const UNDECIDED: f64 = 2e-3;
 const CAPACITY: usize = 1 << 16;
+/// Workgroups of `project` for 400 slots; each may leave a gap.
+const GROUPS: u32 = 7;
 
 fn read<T: bytemuck::Pod + Default>(gpu: &mut Gpu, buf: Buf<T>, n: usize) -> Vec<T> {
     let mut out = vec![T::default(); n];
@@ -71,7 +73,7 @@ fn lists_of_tiles_equal_their_twins() {
         assert_eq!(counts.visible as usize, runs.iter().filter(|[from, to]| to > from).count());
         assert_eq!(counts.shared_out as usize, lists.iter().map(Vec::len).sum::<usize>());
         assert!(
-            (counts.shared_out..counts.shared_out + 7 * 16).contains(&counts.needed) && counts.listed == counts.needed
+            (0..GROUPS * tiling.chunk).contains(&(counts.needed - counts.shared_out)) && counts.listed == counts.needed
         );
         for (slot, ([from, to], g)) in runs.iter().zip(&projected).enumerate() {
             assert!(owners[*from as usize..*to as usize].iter().all(|o| *o == slot as u32), "{slot}");
@@ -86,7 +88,7 @@ fn lists_of_tiles_equal_their_twins() {
             let of = |slot: &u32| (*slot, projected[*slot as usize]);
             assert_eq!(*list, sorted(list.iter().map(of)), "{lanes} lanes: front to back, and by slot at one depth");
         }
-        assert!(lists.iter().any(|l| l.len() > 128) && projected.iter().all(|g| g.conic_shade[3] >= 0.0));
+        assert!(lists.iter().any(|l| l.len() > 128));
     }
 }
 
@@ -108,14 +110,14 @@ fn lists_of_tiles_that_do_not_fit_are_counted_and_drawn_coarser() {
     assert!(render(&mut gpu, &mut p, &v).alpha.iter().any(|a| *a > 0.5));
 }
 
-/// From none to a hundred runs, of depths as they may be: all different, few, one; in order, against it, shuffled.
+/// From one element to two hundred runs, of depths as they may be: all different, few, one; in order, against it, shuffled.
 #[test]
 fn lists_of_tiles_are_sorted_at_any_length() {
     const MOST: usize = 50_000;
     let v = view(8, 8);
     let (mut gpu, mut p) = open(shape(&v, MOST as u32, CAPACITY as u32));
     let mut r = Rng(6);
-    for n in [1, 2, 31, 33, 63, 64, 65, 127, 128, 129, 511, 512, 513, 1023, 1024, 1025, 2049, 5000, MOST] {
+    for n in [1, 2, 31, 63, 64, 65, 127, 128, 129, 255, 256, 257, 511, 513, 1023, 1024, 1025, 2049, 5000, MOST] {
         for (what, depths) in [("all", 1e6), ("few", 3.0), ("one", 1.0)] {
             for order in ["shuffled", "rising", "falling"] {
                 let mut z: Vec<f64> = (0..n).map(|_| 1.0 + r.uniform(0.0, depths).floor() / depths).collect();

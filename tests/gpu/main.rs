@@ -19,7 +19,7 @@ mod splat;
 mod stereo;
 mod stereo_scenes;
 mod stiff;
-mod tiles;
+mod summary;
 mod twins;
 
 use stipple::config::GpuConfig;

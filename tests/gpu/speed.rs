@@ -5,6 +5,7 @@ use super::twins::chunks;
 use stipple::gpu::kernels::sum_chunks;
 use stipple::gpu::kernels::types::{Counts, Moments};
 use stipple::gpu::{Gpu, GpuOptions, Threads};
+use stipple::map::step::Stats;
 use stipple::map::tiling::CHUNK_GPU;
 use stipple::map::{Pipeline, Rendered, Shape, StepStats, Target, Tiling, Weights};
 
@@ -154,7 +155,10 @@ fn gradients_summed_in_chunks_are_those_summed_one_by_one() {
             (step, first, states)
         };
         let ((one, a, states), (chunked, b, chunked_states)) = (of(1), of(CHUNK_GPU));
-        assert!(one.stats.intersections > 20 * CHUNK_GPU && one.stats == chunked.stats);
+        // Two workgroups of `project`, each of which may leave a gap before a chunk.
+        let gaps = chunked.stats.intersections - one.stats.intersections;
+        assert!(one.stats.intersections > 20 * CHUNK_GPU && gaps < 2 * CHUNK_GPU);
+        assert_eq!(one.stats, Stats { intersections: one.stats.intersections, ..chunked.stats });
         assert!((one.loss - chunked.loss).abs() == 0.0);
         let most = a.iter().fold(0f32, |m, v| m.max(v.abs()));
         let worst = a.iter().zip(&b).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);

@@ -1,7 +1,7 @@
 //! The summary against its twin, and that every kernel has a twin.
 
 use super::splat::{open, scene, shape, train, view, Rng};
-use super::twins::tiles::summary as summed;
+use super::twins::summary::summary as summed;
 use stipple::config::GpuConfig;
 use stipple::gpu::kernels::types::{Camera, Counts, Moments, Splat, Status};
 use stipple::gpu::kernels::{project_backward, summary};

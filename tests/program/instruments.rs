@@ -108,7 +108,16 @@ fn quick_kernel_bench_times_every_kernel_of_a_step() {
     let case = &json["cases"][0];
     assert!(case["throughput_steps_per_s"].as_f64().unwrap() > 0.0 && case["visible"].as_f64().unwrap() > 1900.0);
     let kernels = json["kernels"].as_array().unwrap();
-    for name in ["project", "scan_apply", "raster_forward", "raster_backward", "ssim_", "loss_", "project_backward"] {
+    for name in [
+        "project",
+        "fill_lists",
+        "sort_lists",
+        "raster_forward",
+        "raster_backward",
+        "ssim_",
+        "loss_",
+        "project_backward",
+    ] {
         let is_it = |k: &&serde_json::Value| k["kernel"].as_str().unwrap().starts_with(name);
         let k = kernels.iter().find(is_it).unwrap_or_else(|| panic!("{name} is missing: {kernels:?}"));
         assert!(k["time_ms"].as_f64().unwrap() > 0.0 && k["moved_bytes"].as_f64().unwrap() > 0.0, "{k}");

@@ -10,7 +10,7 @@ pub mod pool;
 pub mod project;
 pub mod raster;
 pub mod stereo;
-pub mod tiles;
+pub mod summary;
 
 use project::{Parameters, Projected};
 use stipple::map::View;
