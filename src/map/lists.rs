@@ -15,10 +15,12 @@ use stipple_drivers::Fault;
 
 /// Invocations of a workgroup that sorts a list on a GPU. On a CPU they are a subgroup.
 const SORT_LANES: u32 = 128;
-/// Lists longer than this are sorted apart on a CPU, by this many invocations each: Mesa's driver leaves a shader after 65 535 rounds of
-/// its loops. That bounds the length of a list at some 57 000 there, as it does in the raster.
-const LONG: u32 = 1024;
+/// Lists of more elements for each lane than this are sorted apart on a CPU, by LONG_LANES invocations each: Mesa's driver leaves a shader
+/// after 65 535 rounds of its loops. That bounds the length of a list at some 57 000 there, as it does in the raster.
+const LONG_A_LANE: u32 = 256;
 const LONG_LANES: u32 = 256;
+/// Fewest lanes of a subgroup of a CPU.
+const LANES_LEAST: u32 = 4;
 
 /// Workgroups that walk the intersections, whose count only the device knows: enough for a large GPU. (Some drivers of small GPUs run
 /// indirect dispatches on the CPU.)
@@ -44,9 +46,9 @@ pub struct Buffers {
     long_tiles: Buf<u32>,
 }
 
-/// Lists longer than LONG that there may be.
-fn long_lists_most(shape: &Shape) -> u32 {
-    shape.intersections / LONG + 1
+/// Long lists that there may be where a list is sorted by so many lanes.
+fn long_lists_most(shape: &Shape, lanes: u32) -> u32 {
+    shape.intersections / (LONG_A_LANE * lanes) + 1
 }
 
 impl Buffers {
@@ -62,7 +64,7 @@ impl Buffers {
             owners: arena.alloc("intersections: slots", isects)?,
             ranges: arena.alloc("tiles: ranges", tiles)?,
             lists: arena.alloc("intersections: by tile", isects)?,
-            long_tiles: arena.alloc("tiles: of long lists", long_lists_most(shape) as usize)?,
+            long_tiles: arena.alloc("tiles: of long lists", long_lists_most(shape, LANES_LEAST) as usize)?,
         })
     }
 }
@@ -77,6 +79,8 @@ pub struct Lists {
     /// `Gpu::kernel`, never in pieces.
     pub walkers: Threads,
     pub capacity: u32,
+    /// Longer lists are sorted apart.
+    up_to: u32,
     ranges: Kernel<tile_ranges::K>,
     fill: Kernel<fill_lists::K>,
     sort: Kernel<sort_lists::K>,
@@ -89,6 +93,7 @@ impl Lists {
         let (walkers, on_cpu) = (walkers(gpu.caps()), gpu.caps().kind == DeviceKind::Cpu);
         let lanes = if on_cpu { gpu.caps().subgroup_size } else { SORT_LANES };
         let long = sort_lists::Spec { lanes: LONG_LANES, long: true };
+        let most = long_lists_most(shape, lanes.max(LANES_LEAST));
         Ok(Lists {
             buffers,
             tile_depths: scratch.tile_depths,
@@ -98,8 +103,9 @@ impl Lists {
             capacity: shape.intersections,
             ranges: gpu.kernel(tile_ranges::Spec::default())?,
             fill: gpu.kernel(fill_lists::Spec::default())?,
+            up_to: if on_cpu { LONG_A_LANE * lanes.max(LANES_LEAST) } else { u32::MAX },
             sort: gpu.kernel_in_pieces(sort_lists::Spec { lanes, long: false })?,
-            sort_long: on_cpu.then(|| gpu.kernel(long).map(|k| (k, long_lists_most(shape)))).transpose()?,
+            sort_long: on_cpu.then(|| gpu.kernel(long).map(|k| (k, most))).transpose()?,
         })
     }
 
@@ -110,8 +116,7 @@ impl Lists {
 
     /// Makes the lists of a picture of so many tiles, after `project`.
     pub fn record(&self, rec: &mut Recorder, tiles: u32) {
-        let (b, capacity) = (&self.buffers, self.capacity);
-        let up_to = if self.sort_long.is_some() { LONG } else { u32::MAX };
+        let (b, capacity, up_to) = (&self.buffers, self.capacity, self.up_to);
         let ranges = tile_ranges::Bind {
             tile_lengths: b.lengths.read(),
             ranges: b.ranges.write(),

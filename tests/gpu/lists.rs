@@ -117,7 +117,7 @@ fn lists_of_tiles_are_sorted_at_any_length() {
     let v = view(8, 8);
     let (mut gpu, mut p) = open(shape(&v, MOST as u32, CAPACITY as u32));
     let mut r = Rng(6);
-    for n in [1, 2, 31, 63, 64, 65, 127, 128, 129, 255, 256, 257, 511, 513, 1023, 1024, 1025, 2049, 5000, MOST] {
+    for n in [1, 2, 31, 63, 64, 65, 127, 128, 129, 255, 256, 257, 511, 513, 1023, 1024, 1025, 2048, 2049, 5000, MOST] {
         for (what, depths) in [("all", 1e6), ("few", 3.0), ("one", 1.0)] {
             for order in ["shuffled", "rising", "falling"] {
                 let mut z: Vec<f64> = (0..n).map(|_| 1.0 + r.uniform(0.0, depths).floor() / depths).collect();
