@@ -22,6 +22,7 @@ layout(local_size_x = 128, local_size_x_id = 0) in;
 
 layout(constant_id = 0) const uint LANES = 128;
 layout(constant_id = 1) const bool LONG = false;
+layout(constant_id = 2) const uint SUBGROUP_LANES = 8;  // on a CPU
 
 layout(push_constant) uniform Push {
     uint capacity;  // of the lists
@@ -37,7 +38,7 @@ layout(set = 0, binding = 5, std430) writeonly buffer Lists { uint lists[]; };
 
 const uint RUN = 256;
 #ifdef CPU
-#define WIDTH gl_SubgroupSize  // lanes that share a block: a subgroup is full, and its invocations follow one another
+#define WIDTH SUBGROUP_LANES  // lanes that share a block: a subgroup is full, and its invocations follow one another
 const uint OWN = 4;            // elements of a lane that are compared at a time
 const uint BLOCK = 128;
 #else

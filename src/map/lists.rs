@@ -92,7 +92,8 @@ impl Lists {
     pub fn new(gpu: &mut Gpu, buffers: Buffers, scratch: &Scratch, shape: &Shape) -> Result<Lists, Fault> {
         let (walkers, on_cpu) = (walkers(gpu.caps()), gpu.caps().kind == DeviceKind::Cpu);
         let lanes = if on_cpu { gpu.caps().subgroup_size } else { SORT_LANES };
-        let long = sort_lists::Spec { lanes: LONG_LANES, long: true };
+        let subgroup_lanes = gpu.caps().subgroup_size;
+        let long = sort_lists::Spec { lanes: LONG_LANES, long: true, subgroup_lanes };
         let most = long_lists_most(shape, lanes.max(LANES_LEAST));
         Ok(Lists {
             buffers,
@@ -104,7 +105,7 @@ impl Lists {
             ranges: gpu.kernel(tile_ranges::Spec::default())?,
             fill: gpu.kernel(fill_lists::Spec::default())?,
             up_to: if on_cpu { LONG_A_LANE * lanes.max(LANES_LEAST) } else { u32::MAX },
-            sort: gpu.kernel_in_pieces(sort_lists::Spec { lanes, long: false })?,
+            sort: gpu.kernel_in_pieces(sort_lists::Spec { lanes, long: false, subgroup_lanes })?,
             sort_long: on_cpu.then(|| gpu.kernel(long).map(|k| (k, most))).transpose()?,
         })
     }
