@@ -385,7 +385,7 @@ fn growth(cases: &[Case], x: &str) -> Option<String> {
         Series::dots("step, wall", 1, of(&|c| c.wall_ms)),
         Series::dots("step, device", 2, of(&|c| c.device_ms)),
         Series::dots("rasters", 3, part(&["raster_"])),
-        Series::dots("lists", 4, part(&["project", "tile_ranges", "fill_lists", "sort_lists"])),
+        Series::dots("lists", 4, part(&["tile_ranges", "fill_lists", "sort_lists"])),
     ];
     let title = format!("A training step against {x}");
     Chart { title: &title, x, y: "ms", series, from_zero: true, ..Chart::default() }.svg()
